@@ -312,6 +312,25 @@ class Replay(Command, Shown):
 
 
 @dataclasses.dataclass
+class Studio(Command, RunOrDesign):
+    """Open a page with the hand in 3D and a slider for each parameter of its design.
+
+    A moved slider is simulated at once; trials and the verdict follow. Designs can be saved,
+    exported, improved by a short search, and those of a run looked through. The page is served on
+    this machine alone, to the browser that opens the printed address.
+    """
+
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("studio")
+    """Folder of what is saved from the page."""
+    open: Flag = False
+    """Open the page in the browser."""
+    port: int = 0
+    """Port of the page; 0: one that is free."""
+    host: Annotated[str, tyro.conf.arg(metavar="HOST")] = "127.0.0.1"
+    """Name or address to serve at; other machines reach any but loopback, with the token."""
+
+
+@dataclasses.dataclass
 class Finger(Command, flags.Subject):
     """Predict one finger's bending and forces over pressure, and compare it with measurements.
 
@@ -341,6 +360,7 @@ COMMANDS = (
     | Sample
     | Report
     | Replay
+    | Studio
     | Render
     | Export
     | Finger

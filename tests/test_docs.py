@@ -15,7 +15,17 @@ import pytest
 import yaml
 
 from codesign_jax import cli
-from codesign_jax.commands import check, evaluate, export, finger, landscape, render, replay, report
+from codesign_jax.commands import (
+    check,
+    evaluate,
+    export,
+    finger,
+    landscape,
+    render,
+    replay,
+    report,
+    studio,
+)
 from tests.helpers import tiny_run
 from tests.helpers.toy_engine import TINY
 
@@ -98,6 +108,8 @@ def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch)
     elif arguments[0] == "landscape":
         for name in ("simulated_designs", "summarize", "print_summary", "write_files"):
             monkeypatch.setattr(landscape, name, lambda *rest: reached.append(rest))
+    elif arguments[0] == "studio":
+        monkeypatch.setattr(studio, "serve", lambda *rest: reached.append(rest))
     elif arguments[0] == "render":
         monkeypatch.setattr(render, "draw", lambda *rest: reached.append(rest))
     elif arguments[0] == "replay" and "failures" in example:
@@ -110,7 +122,7 @@ def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("example", [e for e in CODESIGN if "failures" not in e])
+@pytest.mark.parametrize("example", [e for e in CODESIGN if not re.search("failures|studio", e)])
 def test_every_command_runs_at_a_small_size(example, here, monkeypatch):
     size = {"optimize": [*SMALL, "--fresh"], "evaluate": ["--trials", "3"]}
     size["export"] = ["--overwrite", "--trials", "0", "--tolerance-trials", "1"]

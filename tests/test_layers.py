@@ -275,7 +275,7 @@ def test_what_is_imported_is_there():
 MOST_LINES = {
     "codesign_jax": 40_000,
     "codesign_jax/codesign": 600,
-    "codesign_jax/commands": 3_280,
+    "codesign_jax/commands": 4_050,
     "codesign_jax/compiler": 3_100,
     "codesign_jax/engines": 12_800,
     "codesign_jax/export": 1_800,
@@ -285,7 +285,7 @@ MOST_LINES = {
     "codesign_jax/runs": 3_270,
     "codesign_jax/scene": 5_400,
     "scripts": 5_200,
-    "tests": 25_650,
+    "tests": 26_000,
 }
 
 

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from codesign_jax import codesign, optimize, runs, sampling
 from codesign_jax.commands import common, preflight, reference
-from codesign_jax.commands.common import PRESET, find_case
+from codesign_jax.commands.common import find_case
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.report.statistics import wilson
 from codesign_jax.runs import Settings, choice
@@ -144,7 +144,7 @@ def _settings(options: "Check", case: Case) -> Settings:
         return runs.read_run(options.run_folder)[1]
     objects = len(case.scene.objects.object)
     how = {"optimizer": optimize.DEFAULT, "objects": objects}
-    preset = options.preset or PRESET
+    preset = common.preset_of(options)
     return runs.make_settings(preset, "concurrent", "morphology", case.engine, 0, **how)
 
 

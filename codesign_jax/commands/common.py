@@ -61,7 +61,7 @@ def find_case(options: Subject, *, tell: Tell = warn) -> Case:
     """The design that the flags name: the best of a run, or one given by its parameters."""
     if options.run_folder is None:
         scene, words = load_scene(options), [*chain.from_iterable(options.design)]
-        space = design_space(scene.hand, options.preset or open_designs(words)[1] or PRESET)
+        space = design_space(scene.hand, preset_of(options))
         design = find_design(space, words)
         return Case(scene, space, design, options.engine or engines.DEFAULT)
     own = {"--hand": options.hand, "--scene": options.scene, "--preset": options.preset}
@@ -72,6 +72,12 @@ def find_case(options: Subject, *, tell: Tell = warn) -> Case:
         )
     how = {"objects": options.objects, "accuracy": options.accuracy, "engine": options.engine}
     return choice.case_of_run(options.run_folder, overrides=changes(options), tell=tell, **how)
+
+
+def preset_of(options: Subject) -> str:
+    """The design space of a design that is given by its parameters."""
+    words = [*chain.from_iterable(options.design)]
+    return options.preset or open_designs(words)[1] or PRESET
 
 
 @dataclasses.dataclass(frozen=True)

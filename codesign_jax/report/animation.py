@@ -24,7 +24,7 @@ from codesign_jax import files, model, rollout
 from codesign_jax.engines import Engine
 from codesign_jax.report import sketch
 from codesign_jax.scene import Scene
-from codesign_jax.types import Outcome, Params, Trial
+from codesign_jax.types import Outcome, Params, Trace, Trial
 
 STRIP = ".png"
 """Ending of a strip of pictures; films are .gif or .mp4."""
@@ -65,12 +65,14 @@ class Replay(NamedTuple):
       trial: Object and noise, likewise.
       outcome: How it ended, likewise.
       qpos: Generalized positions at every time step, shape (time, nq).
+      trace: What else was recorded of it, likewise; None if that is not known.
     """
 
     params: Params
     trial: Trial
     outcome: Outcome
     qpos: np.ndarray
+    trace: Trace | None = None
 
 
 def replay(scene: Scene, engine: Engine, params: Params, trials: Trial) -> list[Replay]:
@@ -90,7 +92,7 @@ def replay(scene: Scene, engine: Engine, params: Params, trials: Trial) -> list[
         return jax.tree.map(lambda v: np.asarray(v)[i], tree)
 
     return [
-        Replay(one(worlds, i), one(trials, i), one(outcomes, i), trace.qpos[i])
+        Replay(*(one(v, i) for v in (worlds, trials, outcomes, trace.qpos, trace)))
         for i in range(count)
     ]
 

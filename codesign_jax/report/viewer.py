@@ -40,7 +40,8 @@ _FRAGMENT = """
 </div>
 <p class="note turn">Drag to turn, scroll to zoom, shift-drag to move; click a phase to go there.
 A square of the table is 5 cm.</p>
-<script>startReplay(document.getElementById("{name}"), {data});</script>
+"""
+_START = """<script>startReplay(document.getElementById("{name}"), {data});</script>
 """
 
 _PAGE = """<!DOCTYPE html>
@@ -61,9 +62,15 @@ def fragment(scene: Scene, grasp: Replay, name: str = "replay") -> str:
       grasp: The grasp.
       name: Identifier of its element in the page.
     """
+    shown = data(scene, grasp) | {"strip": _strip(scene, grasp)}
     # "<" appears in no JSON but inside strings, where its escape means the same.
-    data = json.dumps(_data(scene, grasp)).replace("<", "\\u003c")
-    return _FRAGMENT.format(name=html.escape(name), data=data)
+    text = json.dumps(shown).replace("<", "\\u003c")
+    return element(name) + _START.format(name=html.escape(name), data=text)
+
+
+def element(name: str) -> str:
+    """HTML of the place where `web/replay.js` shows a grasp."""
+    return _FRAGMENT.format(name=html.escape(name))
 
 
 def page(title: str, body: str, *scripts: str) -> str:
@@ -74,9 +81,13 @@ def page(title: str, body: str, *scripts: str) -> str:
       body: HTML of its body.
       scripts: JavaScript that the body calls, beside the viewer.
     """
-    script = "\n".join([*scripts, (_WEB / "replay.js").read_text(encoding="utf-8")])
-    style = (_WEB / "style.css").read_text(encoding="utf-8")
-    return _PAGE.format(title=html.escape(title), style=style, script=script, body=body)
+    script = "\n".join([*scripts, web("replay.js")])
+    return _PAGE.format(title=html.escape(title), style=web("style.css"), script=script, body=body)
+
+
+def web(name: str) -> str:
+    """Text of a file of the folder `web`."""
+    return (_WEB / name).read_text(encoding="utf-8")
 
 
 def write(scene: Scene, grasp: Replay, path: Path, *, title: str, text: list[str]) -> Path:
@@ -99,8 +110,8 @@ def write(scene: Scene, grasp: Replay, path: Path, *, title: str, text: list[str
     return path
 
 
-def _data(scene: Scene, grasp: Replay) -> dict[str, Any]:
-    """What web/replay.js reads."""
+def data(scene: Scene, grasp: Replay) -> dict[str, Any]:
+    """What web/replay.js reads of a grasp, of JSON's types."""
     motion, parts = bodies.motion(scene, grasp), bodies.parts(scene, grasp)
     frames, count = motion.pose.shape[:2]
     return {
@@ -113,8 +124,7 @@ def _data(scene: Scene, grasp: Replay) -> dict[str, Any]:
         "phases": phases(scene),
         "still": scene.phase_ends["lift"],
         "table": _TABLE,
-        "camera": {"target": [0.0, 0.0, 0.14], "distance": 0.54, "azimuth": -0.9, "elevation": 0.3},
-        "strip": _strip(scene, grasp),
+        "camera": {"target": [0.0, 0.0, 0.15], "distance": 0.6, "azimuth": -0.9, "elevation": 0.3},
     }
 
 

@@ -3,7 +3,8 @@
 // Why not a library: plotly redraws a figure of such meshes in 0.2 s and ignores the mouse while it
 // plays, and three.js is in no Python package of its own.
 //
-// startReplay(root, data) fills an element.  data has
+// startReplay(root, data) fills an element; `load` of what it returns shows another grasp there, from where the
+// camera stands and at the same time.  The element gets an event "time" for each frame.  data has
 //   parts   name, color [r, g, b], and base64 arrays: first, second (float32, 3 a vertex: places in the
 //           frames of two bodies), body (uint16, 2 a vertex), weight (float32, of the second body) and
 //           face (uint32, 3 a triangle).  A vertex is (1 - w) T_first(first) + w T_second(second).
@@ -30,8 +31,6 @@ function showStrip(root, strip) {
 
 function startReplay(root, data) {
   const decode = (text, type) => new type(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
-  const poses = decode(data.poses, Float32Array);
-  const end = (data.frames - 1) / data.rate;
   const find = (name) => root.querySelector(`.${name}`);
   const canvas = find("view"), slider = find("time"), button = find("play"), label = find("label");
   const gl = canvas.getContext("webgl2", { alpha: false, antialias: true, stencil: true,
@@ -42,14 +41,23 @@ function startReplay(root, data) {
   }
 
   // ---- meshes: triangles with vertices of their own, so that faces are flat
-  const parts = data.parts.map((p) => {
-    const face = decode(p.face, Uint32Array), buffer = gl.createBuffer();
-    const first = decode(p.first, Float32Array), second = decode(p.second, Float32Array);
-    const vertices = new Float32Array(first.length), corners = new Float32Array(3 * face.length);
-    return { ...p, face, first, second, buffer, vertices, corners,
-      body: decode(p.body, Uint16Array), weight: decode(p.weight, Float32Array) };
-  });
-  const now = new Float32Array(7 * data.bodies);  // poses at the time shown
+  let parts = [], poses, end, now;  // now: poses at the time shown
+  function take(grasp) {
+    data = grasp;
+    for (const p of parts) gl.deleteBuffer(p.buffer);
+    poses = decode(data.poses, Float32Array);
+    end = (data.frames - 1) / data.rate;
+    now = new Float32Array(7 * data.bodies);
+    parts = data.parts.map((p) => {
+      const face = decode(p.face, Uint32Array), buffer = gl.createBuffer();
+      const first = decode(p.first, Float32Array), second = decode(p.second, Float32Array);
+      const vertices = new Float32Array(first.length), corners = new Float32Array(3 * face.length);
+      return { ...p, face, first, second, buffer, vertices, corners,
+        body: decode(p.body, Uint16Array), weight: decode(p.weight, Float32Array) };
+    });
+    slider.max = end;
+  }
+  take(data);
 
   // Poses between two frames: positions and (normalised) quaternions are interpolated linearly.
   function poseAt(time) {
@@ -204,12 +212,14 @@ function startReplay(root, data) {
     slider.value = time;
     const height = 1000 * now[7 * data.object + 2];
     label.textContent = `${time.toFixed(2)} s, ${phase(time)}; object's centre ${height.toFixed(0)} mm above the table`;
+    root.dispatchEvent(new CustomEvent("time", { detail: time }));
   }
   function step(stamp) {
     queued = false;
     if (playing) {
       time += Math.min(stamp - before, 100) / 1000 * Number(find("speed").value);
       before = stamp;
+      if (time >= end && data.loop) time = 0;
       if (time >= end) { time = end; pause(); }
       if (playing) request();
     }
@@ -236,8 +246,13 @@ function startReplay(root, data) {
     request();
   }
 
+  function load(grasp) {
+    take(grasp);
+    time = Math.min(time, end);
+    request();
+  }
+
   // ---- controls
-  slider.max = end;
   button.addEventListener("click", () => (playing ? pause() : play()));
   slider.addEventListener("input", () => { pause(); seek(slider.value); });
   find("home").addEventListener("click", () => { camera = home(); request(); });
@@ -284,7 +299,7 @@ function startReplay(root, data) {
   }, { passive: false });
   new ResizeObserver(request).observe(canvas);
   show();
-  root.replay = { play, pause, seek, end, time: () => time, playing: () => playing, camera: () => camera,
+  root.replay = { load, play, pause, seek, end: () => end, time: () => time, playing: () => playing, camera: () => camera,
     vertices: (name) => Array.from(parts.find((p) => p.name === name).vertices) };
   return root.replay;
 }

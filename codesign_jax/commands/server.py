@@ -1,0 +1,125 @@
+"""A page for one user: served on loopback, by a token, with a WebSocket that strangers cannot open.
+
+As Jupyter does it: the address that is printed has a random token; the page then has it as a
+cookie, which no other site's page makes the browser send (`SameSite=Strict`). A WebSocket is
+opened with that cookie, and by a page of this server only: browsers say in `Origin` whose page
+asks. On loopback the `Host` must be a loopback name as well, so that no name of a stranger's that
+points here is served.
+"""
+
+import base64
+import hashlib
+import hmac
+import logging
+import re
+import secrets
+from collections.abc import Callable
+from http import HTTPStatus
+from http.cookies import CookieError, SimpleCookie
+from urllib.parse import parse_qs, urlsplit
+
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+from websockets.sync.server import Server, ServerConnection, serve
+
+LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
+SOCKET = "/socket"
+MOST_BYTES = 1 << 16
+"""Largest message that a page may send."""
+_MISSING = (
+    "This page is its user's: open the address that `codesign studio` printed, with its token.\n"
+)
+
+
+class Guard:
+    """Who is answered, and with what, before a WebSocket is opened.
+
+    Attributes:
+      token: What the address that the user opens has.
+    """
+
+    def __init__(self, page: str, *, everywhere: bool) -> None:
+        """Takes the page, and whether hosts other than loopback are served."""
+        self.token = secrets.token_urlsafe(24)
+        self._everywhere = everywhere
+        self._body = page.encode()
+        digests = [
+            base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+            for script in re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
+        ]
+        sources = " ".join(f"'sha256-{digest}'" for digest in digests)
+        self._policy = (
+            f"default-src 'none'; script-src {sources}; style-src 'unsafe-inline'; img-src data:; "
+            "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        )
+
+    def answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """The page, a refusal, or None: a WebSocket may be opened."""
+        headers, url = request.headers, urlsplit(request.path)
+        hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+        port = connection.local_address[1]
+        if len(hosts) != 1 or not (
+            self._everywhere or hosts[0].lower() in [f"{name}:{port}" for name in LOOPBACK]
+        ):
+            return connection.respond(HTTPStatus.FORBIDDEN, "Not a name of this server.\n")
+        cookie = f"codesign-studio-{port}"  # cookies of one host are shared by its ports
+        if url.path == SOCKET:
+            if origins != [f"http://{hosts[0]}"] or not self._known(_cookie(headers, cookie)):
+                return connection.respond(HTTPStatus.FORBIDDEN, _MISSING)
+            return None
+        if url.path != "/":
+            return connection.respond(HTTPStatus.NOT_FOUND, "There is the page / alone.\n")
+        given = parse_qs(url.query).get("token", [""])[0]
+        if not (self._known(given) or self._known(_cookie(headers, cookie))):
+            return connection.respond(HTTPStatus.FORBIDDEN, _MISSING)
+        more = Headers()
+        more["Content-Type"] = "text/html; charset=utf-8"
+        more["Content-Length"] = str(len(self._body))
+        more["Connection"] = "close"
+        more["Content-Security-Policy"] = self._policy
+        more["Cache-Control"] = "no-store"
+        more["Referrer-Policy"] = "no-referrer"
+        more["X-Content-Type-Options"] = "nosniff"
+        more["Set-Cookie"] = f"{cookie}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+        return Response(HTTPStatus.OK, "OK", more, self._body)
+
+    def _known(self, token: str) -> bool:
+        return hmac.compare_digest(token.encode(), self.token.encode())
+
+
+def _cookie(headers: Headers, name: str) -> str:
+    """The value of a cookie; empty without one."""
+    for text in headers.get_all("Cookie"):
+        try:
+            if found := SimpleCookie(text).get(name):
+                return found.value
+        except CookieError:
+            continue
+    return ""
+
+
+def listen(guard: Guard, tab: Callable[[ServerConnection], None], host: str, port: int) -> Server:
+    """A server that listens, and serves once `serve_forever` is called.
+
+    Args:
+      guard: Who is answered.
+      tab: Takes the connection of one tab, and returns when that is over.
+      host: Name or address to listen at.
+      port: Port; 0 for one that is free.
+
+    Raises:
+      OSError: If it cannot listen there.
+    """
+    quiet = logging.getLogger(__name__)
+    quiet.setLevel(logging.CRITICAL)  # what strangers send is no error of ours
+    return serve(
+        tab,
+        host,
+        port,
+        process_request=guard.answer,
+        compression=None,  # which takes longer than loopback
+        max_size=MOST_BYTES,
+        close_timeout=1,
+        logger=quiet,
+        server_header=None,
+    )

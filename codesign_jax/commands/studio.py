@@ -1,0 +1,175 @@
+"""`codesign studio`: a hand on a page, simulated again as its sliders move.
+
+Each tab of a browser is a `Tab` with a design of its own. One thread simulates for all of them in
+turns, a step at a time, so that none waits long for another. A tab that was closed asks for
+nothing.
+"""
+
+import contextlib
+import functools
+import json
+import socket
+import threading
+import webbrowser
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.server import Server, ServerConnection
+
+from codesign_jax.codesign import VERDICTS
+from codesign_jax.commands import common, preflight, server
+from codesign_jax.commands.tab import COUNTS, Desk, Tab
+from codesign_jax.report import viewer
+from codesign_jax.runs import choice, tables
+from codesign_jax.runs.progress import Busy
+from codesign_jax.scene.schema import InputError
+
+if TYPE_CHECKING:
+    from codesign_jax.cli import Studio as Options
+
+
+def main(options: "Options") -> int:
+    """Runs the command and returns the exit status."""
+    common.use_compilation_cache()
+    problems = common.number_problems(("--port", options.port, 0, 65535))
+    common.refuse(problems + common.place_problems("--out", options.out, folder=True))
+    console = Console(highlight=False, soft_wrap=True)
+    desk = Desk(options)
+    scene, space = desk.case.scene, desk.case.space
+    for note in preflight.notes(scene, space, {"the design": desk.case.design}):
+        console.print(note, markup=False)
+    serve(desk, console)
+    return 0
+
+
+def serve(desk: Desk, console: Console) -> None:
+    """Compiles what a moved slider needs, and serves the studio until Ctrl-C."""
+    with Busy(console, "compiling the simulation"):
+        desk.bench("").warm(desk.case.design)
+    options, studio = desk.options, Studio(desk)
+    listening, address = studio.listen(options.host, options.port)
+    if options.host not in LOCAL:
+        common.warn(
+            f"--host {options.host}: other machines can reach this page. Its token guards it, but "
+            "crosses the network unencrypted, as all else; an ssh tunnel to loopback is safer"
+        )
+    console.print(f"the studio: {address}\nfor this user's browser; Ctrl-C ends it", markup=False)
+    if options.open:
+        webbrowser.open(address)
+    with listening:
+        try:
+            listening.serve_forever()
+        finally:
+            studio.close()
+
+
+LOCAL = ("127.0.0.1", "localhost", "::1")
+"""Hosts that only this machine reaches."""
+
+
+class Studio:
+    """The tabs, and the thread that simulates for them."""
+
+    def __init__(self, desk: Desk) -> None:
+        """Has no tab yet."""
+        self.desk = desk
+        self.tabs: list[Tab] = []
+        self._wake = threading.Event()
+        self._ended = False
+
+    def listen(self, host: str, port: int) -> tuple[Server, str]:
+        """A server whose `serve_forever` serves the studio, and the page's address.
+
+        Raises:
+          InputError: If it cannot listen there.
+        """
+        guard = server.Guard(_page(), everywhere=host not in LOCAL)
+        try:
+            listening = server.listen(guard, self.serve, host, port)
+        except OSError as error:
+            raise InputError([f"--host {host} --port {port}: {error.strerror}"]) from error
+        named = socket.gethostname() if host in ("0.0.0.0", "::") else host
+        named = f"[{named}]" if ":" in named else named
+        port = listening.socket.getsockname()[1]
+        threading.Thread(target=self._work, daemon=True).start()
+        return listening, f"http://{named}:{port}/?token={guard.token}"
+
+    def serve(self, connection: ServerConnection) -> None:
+        """Serves one tab until it is closed."""
+        tab = Tab(self.desk)
+        self.tabs.append(tab)
+        threading.Thread(target=_deliver, args=(tab, connection), daemon=True).start()
+        tab.send("about", about(self.desk))
+        with contextlib.suppress(ConnectionClosed):
+            for text in connection:
+                tab.receive(text)
+                self._wake.set()
+        self.tabs.remove(tab)
+        tab.close()
+
+    def close(self) -> None:
+        """Ends the work after its step."""
+        self._ended = True
+        self._wake.set()
+
+    def _work(self) -> None:
+        while not self._ended:
+            self._wake.clear()
+            if not any([tab.step() for tab in list(self.tabs)]):
+                self._wake.wait()
+
+
+def _deliver(tab: Tab, connection: ServerConnection) -> None:
+    """Sends a tab's messages until it is closed."""
+    with contextlib.suppress(ConnectionClosed, OSError):
+        while (messages := tab.messages()) is not None:
+            for kind, content in messages.items():
+                connection.send(json.dumps({kind: content}))
+
+
+@functools.cache
+def _page() -> str:
+    body = viewer.web("studio.html").replace("REPLAY", viewer.element("replay"))
+    return viewer.page("codesign studio", body, viewer.web("studio.js"))
+
+
+def about(desk: Desk) -> dict[str, Any]:
+    """What a page is told first: the design's parameters, and what there is to choose from."""
+    scene, space = desk.case.scene, desk.case.space
+    own, others = tables.by_finger(space)
+    fingers = range(scene.num_fingers if own else 0)
+    groups = {f"Finger {f}": {k[f]: name for name, k in own.items()} for f in fingers}
+    for title, morphology in (("Hand", True), ("Control", False)):
+        groups[title] = {k: space.names[k] for k in others if space.is_morphology[k] == morphology}
+    low, high, design = (space.in_units(v) for v in (space.low, space.high, desk.case.design))
+    parameters = [
+        {
+            "name": space.names[k],
+            "label": next(members[k] for members in groups.values() if k in members),
+            "unit": space.units[k],
+            "low": round(float(low[k]), 9),  # bounds went to SI and back
+            "high": round(float(high[k]), 9),
+            "step": float(high[k] - low[k]) / 400,
+        }
+        for k in range(space.num_parameters)
+    ]
+    run = None
+    if desk.record:
+        chosen = choice.choose(scene, desk.record)
+        particles = desk.record.history.cost.shape[1]
+        run = {"episodes": desk.record.done, "particles": particles}
+        run["chosen"] = [chosen.episode + 1, chosen.row]
+    source = f"run {desk.options.run_folder}" if run else f"hand {scene.hand.name}"
+    return {
+        "title": f"{source}, objects {scene.objects.name}, design space {desk.preset}",
+        "parameters": parameters,
+        "groups": [{"title": t, "members": [*members]} for t, members in groups.items() if members],
+        "design": design.tolist(),
+        "objects": [shape.name for shape in scene.objects.object],
+        "accuracies": desk.accuracies,
+        "counts": COUNTS,
+        "ends": VERDICTS,
+        "worst": scene.cost.maximum,
+        "run": run,
+    }

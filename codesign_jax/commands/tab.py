@@ -1,0 +1,456 @@
+"""What one tab of `codesign studio` shows: grasps of a design, their verdict, a search from there.
+
+A tab takes messages of its page at any time (`Tab.receive`), and simulates a step at a time when
+it is told to (`Tab.step`): first the newest grasp that is asked for, and once the sliders rest,
+trial by trial, what the verdict needs. What was asked for in between is dropped.
+"""
+
+import collections
+import dataclasses
+import functools
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from codesign_jax import Task, codesign, files, rollout, runs
+from codesign_jax.codesign import VERDICTS
+from codesign_jax.commands import common
+from codesign_jax.engines import Engine, make_engine
+from codesign_jax.model import overlap
+from codesign_jax.report import animation, bodies, stress, verdicts, viewer
+from codesign_jax.runs import choice
+from codesign_jax.runs.choice import Case
+from codesign_jax.scene import Scene, library
+from codesign_jax.scene.loading import with_accuracy
+from codesign_jax.scene.schema import InputError
+from codesign_jax.types import Outcome, Params, Trial, failed
+
+if TYPE_CHECKING:
+    from codesign_jax.cli import Studio as Options
+
+COUNTS = (24, 48, 96, 240)
+"""Numbers of trials that a verdict may have."""
+BATCH = 3
+"""Trials of one step: more would keep the next grasp waiting."""
+PARTICLES, EPISODES, SIGMA = 20, 15, 0.05
+"""Of `improve`: designs of an episode, episodes, and how far the first ones lie from the design, as
+a standard deviation in shares of the parameters' ranges."""
+LOOKED_AT = 15
+"""States of a grasp in which overlaps are sought: a tenth of a second."""
+
+
+class View(NamedTuple):
+    """What a tab asks to be shown.
+
+    Attributes:
+      design: The design [SI units], shape (parameter,).
+      accuracy: Name of an accuracy; empty for the scene's own.
+      shape: Index of the object, where there is no noise.
+      noise: Which of the trials of the verdict it is, with its object; None without noise.
+      trials: Number of trials of the verdict.
+      resting: Whether the sliders rest, so that the verdict may follow.
+      number: The tab's own number of the request; None for a design that the studio puts there.
+    """
+
+    design: np.ndarray
+    accuracy: str
+    shape: int
+    noise: int | None
+    trials: int
+    resting: bool
+    number: int | None
+
+
+class Bench:
+    """A scene at one accuracy, with the programs that simulate it."""
+
+    def __init__(self, found: Case) -> None:
+        """Takes scene, space and the engine's name."""
+        self.case = found
+        self.engine = make_engine(found.engine, found.scene)
+        self.objects = len(found.scene.objects.object)
+
+    @functools.cached_property
+    def trials(self) -> Trial:
+        """The first trials of `codesign evaluate --seed 0`."""
+        drawn = rollout.sample_trials(self.case.scene, jax.random.key(0), max(COUNTS) + BATCH)
+        return jax.tree.map(np.asarray, drawn)
+
+    @functools.cached_property
+    def task(self) -> Task:
+        """What `improve` searches by."""
+        return Task(self.case.scene, self.case.space, max(self.objects, BATCH), self.engine)
+
+    def params(self, design: np.ndarray) -> Params:
+        """Parameters of a design as they are simulated."""
+        return self.case.space.params(jnp.asarray(design, jnp.float32))
+
+    def grasp(self, view: View) -> animation.Replay:
+        """Simulates what is shown."""
+        trial = rollout.nominal_trial(self.case.scene, view.shape)
+        if view.noise is not None:
+            trial = jax.tree.map(lambda v: v[view.noise], self.trials)
+        trials = jax.tree.map(lambda v: jnp.asarray(v)[None], trial)
+        return animation.replay(self.case.scene, self.engine, self.params(view.design), trials)[0]
+
+    def outcomes(self, design: np.ndarray, first: int) -> Outcome:
+        """Outcomes of the next `BATCH` trials, arrays of shape (trial,)."""
+        trials = jax.tree.map(lambda v: v[first : first + BATCH], self.trials)
+        found = _outcomes(self.case.scene, self.engine, self.params(design), trials)
+        return jax.tree.map(np.asarray, found)
+
+    def warm(self, design: np.ndarray) -> None:
+        """Compiles the two programs that a moved slider needs."""
+        self.grasp(View(design, "", 0, None, 0, False, None))
+        self.outcomes(design, 0)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _outcomes(scene: Scene, engine: Engine, params: Params, trials: Trial) -> Outcome:
+    hands = jax.tree.map(lambda v: v[None], params)
+    return jax.tree.map(lambda v: v[0], rollout.evaluate(scene, engine, hands, trials))
+
+
+class Desk:
+    """What all tabs share: a case with its programs, its run, and where files go."""
+
+    def __init__(self, options: "Options") -> None:
+        """Reads scene, design and run; simulates nothing."""
+        self.options = options
+        self.case = common.find_case(options)
+        common.refuse(common.engine_problems(self.case.engine))
+        self.preset, self.record = common.preset_of(options), None
+        if folder := options.run_folder:
+            self.preset = runs.read_run(folder)[1].preset
+            self.record = choice.read_record(folder, tell=lambda text: None)  # `find_case` said it
+        self.accuracies = ("", *library.available("accuracy"))
+        self.benches: dict[str, Bench] = {}
+
+    def bench(self, accuracy: str) -> Bench:
+        """The programs of an accuracy."""
+        if accuracy not in self.benches:
+            found = self.case
+            if accuracy:
+                found = found._replace(scene=with_accuracy(found.scene, accuracy))
+            self.benches[accuracy] = Bench(found)
+        return self.benches[accuracy]
+
+    def flags(self, accuracy: str) -> list[str]:
+        """Flags that name the same scene and engine to another command."""
+        given, scene = self.options, self.options.scene
+        if given.run_folder:
+            scene = str(given.run_folder / "scene.toml")
+        named = {"scene": scene, "hand": given.hand, "objects": given.objects}
+        named |= {"accuracy": accuracy or given.accuracy, "engine": self.case.engine}
+        found = [word for k, v in named.items() if v is not None for word in (f"--{k}", v)]
+        for words in given.overrides:
+            found += ["--set", *words]
+        return found + ["--robust"] * given.robust
+
+    def place(self, stem: str, ending: str = "") -> Path:
+        """A path in the folder of what is saved that is not there yet."""
+        k = 1
+        while (path := self.options.out / f"{stem}-{k}{ending}").exists():
+            k += 1
+        return path
+
+
+class Shown(NamedTuple):
+    """What a tab shows: what was asked for, with a legal design, and the grasp that came of it."""
+
+    view: View
+    bench: Bench
+    grasp: animation.Replay
+
+
+class Tab:
+    """What one tab of a browser shows and asks for."""
+
+    def __init__(self, desk: Desk) -> None:
+        """Shows nothing yet."""
+        self._desk = desk
+        self._asked: collections.deque[View] = collections.deque(maxlen=1)  # the newest
+        self._actions: collections.deque[Callable[[], None]] = collections.deque()
+        self._shown: Shown | None = None
+        self._looked = False
+        self._outcomes: list[Outcome] = []  # of trials of the design that is shown
+        self._search: tuple[Any, Any, int] | None = None  # optimiser, state, episodes done
+        self._outbox: dict[str, Any] = {}
+        self._filled = threading.Condition()
+        self._closed = False
+
+    # ---- messages: the newest one of each kind, so that a slow browser holds up nobody
+
+    def send(self, kind: str, content: Any) -> None:
+        """Puts a message in place of an older one of its kind that was not sent yet."""
+        with self._filled:
+            self._outbox.pop(kind, None)
+            self._outbox[kind] = content
+            self._filled.notify()
+
+    def messages(self) -> dict[str, Any] | None:
+        """Waits for messages, by kind; None once the tab is closed."""
+        with self._filled:
+            self._filled.wait_for(lambda: self._outbox or self._closed)
+            found, self._outbox = self._outbox, {}
+            return None if self._closed else found
+
+    def close(self) -> None:
+        """There are no more messages."""
+        with self._filled:
+            self._closed = True
+            self._filled.notify()
+
+    def receive(self, text: str | bytes) -> None:
+        """Takes a message of the page; what is none is answered by an error."""
+        actions = {"improve": self._begin, "save": self._save, "export": self._export}
+        actions |= {"page": self._page, "report": self._report}
+        try:
+            [(kind, content)] = json.loads(text).items()
+            if kind == "show":
+                self._asked.append(self._view(**content))
+            elif kind == "run":
+                place = content and [int(v) for v in content]
+                self._actions.append(lambda: self._of_run(place))
+            else:
+                self._actions.append(actions[kind])
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+            self.send("error", f"not a message of this page: {error}"[:300])
+
+    def _view(
+        self,
+        number: int,
+        resting: bool,
+        design: list[float],
+        object: int,
+        noise: int | None,
+        accuracy: str,
+        trials: int,
+    ) -> View:
+        """What a message asks for; ValueError if there is no such thing."""
+        space, values = self._desk.case.space, np.array(design, float)
+        if values.shape != space.low.shape or not np.isfinite(values).all():
+            raise ValueError(f"a design has {space.num_parameters} numbers")
+        shapes = range(len(self._desk.case.scene.objects.object))
+        for value, known in (
+            (object, shapes),
+            (noise, [None, *range(max(COUNTS))]),
+            (accuracy, self._desk.accuracies),
+            (trials, COUNTS),
+        ):
+            if value not in known:
+                raise ValueError(f"{value!r} is not one of the choices")
+        legal = np.clip(values * np.array(space.scale), space.low, space.high)
+        return View(legal, accuracy, object, noise, trials, bool(resting), int(number))
+
+    # ---- the worker's part
+
+    def step(self) -> bool:
+        """Does the next thing, if there is one; an error is shown and ends what it was about."""
+        try:
+            return self._next()
+        except Exception as error:  # the studio goes on with another design
+            self._shown = None
+            self._end_search()
+            name = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+            self.send("error", f"{name}{error}"[:1000])
+            return True
+
+    def _next(self) -> bool:
+        shown = self._shown
+        if self._actions:
+            try:
+                self._actions.popleft()()
+            except InputError as error:  # what is shown stays
+                self.send("error", str(error))
+        elif self._asked:
+            view = self._asked.popleft()
+            if view.number is not None:  # the page's: a slider was moved
+                self._end_search()
+            self._show(view)
+        elif shown and shown.view.resting and self._total < shown.view.trials:
+            left = shown.view.trials - self._total
+            found = shown.bench.outcomes(shown.view.design, self._total)
+            self._outcomes.append(jax.tree.map(lambda v: v[:left], found))
+            self._tell_verdict(shown)
+        elif shown and shown.view.resting and not self._looked:
+            self._looked = True
+            self.send("overlap", _deepest(shown))
+        elif shown and self._search:
+            self._improve(shown, *self._search)
+        else:
+            return False
+        return True
+
+    @property
+    def _total(self) -> int:
+        return sum(len(part.cost) for part in self._outcomes)
+
+    def _show(self, view: View) -> None:
+        """Simulates a grasp and sends it."""
+        if view.accuracy not in self._desk.benches:
+            self.send("state", "compiling for this accuracy: up to a minute the first time ...")
+        bench, before = self._desk.bench(view.accuracy), self._shown
+        legal = np.asarray(bench.case.space.project(view.design), float)
+        shown = Shown(view._replace(design=legal), bench, bench.grasp(view._replace(design=legal)))
+        if not (before and before.bench is bench and np.array_equal(before.view.design, legal)):
+            self._outcomes = []
+        self._shown, self._looked = shown, False
+        self.send("grasp", _told(shown))
+        if view.resting:
+            self._tell_verdict(shown)
+
+    def _tell_verdict(self, shown: Shown) -> None:
+        view, scene = shown.view, shown.bench.case.scene
+        ends: list[int] = []
+        sentence, cost = "the verdict comes ...", None
+        if self._outcomes:
+            found = jax.tree.map(lambda *v: np.concatenate(v)[: view.trials], *self._outcomes)
+            ends = codesign.verdicts(found).tolist()
+            sentence = str(verdicts.Judged(scene, found, grasps="grasps"))
+            if not failed(found.status).all():
+                cost = float(codesign.particle_cost(scene, found))
+        design = shown.bench.case.space.in_units(view.design).tolist()
+        told = {"number": view.number, "total": view.trials, "design": design}
+        self.send("verdict", told | {"ends": ends, "sentence": sentence, "cost": cost})
+
+    # ---- a search from here
+
+    def _begin(self) -> None:
+        """Begins a search from the design that is shown, or ends the one that goes on."""
+        shown = self._current()
+        if self._search:
+            self._end_search()
+            self._asked.append(shown.view._replace(resting=True, number=None))
+            return
+        optimizer: Any = codesign.make_optimizer("screened-es", shown.bench.case.space)
+        optimizer = dataclasses.replace(optimizer, screening=0, retests=0, sigma=SIGMA)
+        state = optimizer.init(jax.random.key(0), shown.view.design, PARTICLES)
+        self._search = optimizer, state, 0
+        self.send("improving", True)
+        self.send("state", f"improving: compiling, then {EPISODES} steps ...")
+
+    def _end_search(self) -> None:
+        if self._search:
+            self._search = None
+            self.send("improving", False)
+
+    def _improve(self, shown: Shown, optimizer: Any, state: Any, done: int) -> None:
+        """One episode, whose answer so far is shown."""
+        state, info = shown.bench.task.episode(optimizer, state)
+        ends = codesign.verdicts(jax.tree.map(np.asarray, info.outcomes))
+        if self._asked:  # a slider was moved meanwhile
+            return
+        done += 1
+        self._search = optimizer, state, done
+        answer = np.asarray(state.particles, float)[0]
+        resting = done == EPISODES
+        self._asked.append(shown.view._replace(design=answer, resting=resting, number=None))
+        share = 100 * (ends == VERDICTS.index("kept")).mean()
+        self.send("state", f"improving: {done} of {EPISODES}, designs around it keep {share:.0f} %")
+        if resting:
+            self._end_search()
+
+    # ---- the run, and what is written
+
+    def _current(self) -> Shown:
+        if self._shown is None:
+            raise InputError(["there is no grasp of a design yet"])
+        return self._shown
+
+    def _of_run(self, place: list[int] | None) -> None:
+        """Shows a particle of an episode, counted from 1; the chosen design without a place."""
+        found, desk = self._desk.case.design, self._desk
+        if place is not None and desk.record is not None:
+            e, p = place
+            found = choice.find_grasp(desk.case.scene, desk.record, episode=e, particle=p).design
+        view = self._current().view
+        self._asked.append(view._replace(design=found, resting=True, number=None))
+
+    def _save(self) -> None:
+        words = ["codesign", "evaluate", *self._saved()]
+        self.send("done", f"saved; to open it again:\n{subprocess.list2cmdline(words)}")
+
+    def _saved(self) -> list[str]:
+        """Saves the design that is shown; flags that name it to another command."""
+        view, space = self._current().view, self._desk.case.space
+        with files.atomically(path := self._desk.place("design", ".toml")) as part:
+            text = common.design_text(space, self._desk.preset, view.design)
+            part.write_text(text, encoding="utf-8")
+        return ["--design", str(path), *self._desk.flags(view.accuracy)]
+
+    def _page(self) -> None:
+        view, bench, grasp = self._current()
+        path, space = self._desk.place("grasp", ".html"), bench.case.space
+        lines = [runs.describe(space, view.design), choice.ending(grasp.outcome)]
+        viewer.write(bench.case.scene, grasp, path, title="A grasp in 3D", text=lines)
+        self.send("done", f"written: {path}, for any browser, offline")
+
+    def _export(self) -> None:
+        self._command("export", *self._saved(), "--out", str(self._desk.place("export")))
+
+    def _report(self) -> None:
+        self._command("report", str(self._desk.options.run_folder))
+
+    def _command(self, *words: str) -> None:
+        """Runs another command beside the simulation, and shows what it says."""
+        line = subprocess.list2cmdline(["codesign", *words])
+        self.send("done", f"{line}\n...")
+
+        def wait() -> None:
+            whole = [sys.executable, "-m", "codesign_jax.cli", *words]
+            ended = subprocess.run(whole, capture_output=True, text=True, check=False)
+            self.send("done", f"{line}\n{ended.stdout[-3000:]}{ended.stderr[-3000:]}")
+
+        threading.Thread(target=wait, daemon=True).start()
+
+
+def _told(shown: Shown) -> dict[str, Any]:
+    """A grasp as the page shows it."""
+    view, bench, grasp = shown
+    scene, space = bench.case.scene, bench.case.space
+    replay = viewer.data(scene, grasp) | {"loop": True}
+    step = max(1, round(1 / (replay["rate"] * scene.discretization.timestep)))
+    series: dict[str, Any] = {
+        name: np.round(1e3 * np.asarray(getattr(grasp.trace, name))[::step], 1).tolist()
+        for name in ("distance", "height")
+    }
+    caps = np.asarray(scene.hand.pressure_limit.of(grasp.params.height, grasp.params.wall))
+    limits: list[float | None] = []
+    for name, scale in zip(space.names, space.scale, strict=True):
+        row, _, finger = name.partition("[")
+        cap = caps[int(finger[:-1])] if finger else caps.min()
+        limits.append(float(cap / scale) if row == "pressure" else None)
+    return {
+        "number": view.number,
+        "replay": replay,
+        "design": space.in_units(view.design).tolist(),
+        "limits": limits,
+        "ending": choice.ending(grasp.outcome),
+        "cost": float(grasp.outcome.cost),
+        "warnings": stress.of_design(scene, grasp.params),
+        "series": series | {"lost": 1e3 * scene.cost.lost_distance},
+    }
+
+
+def _deepest(shown: Shown) -> str:
+    """The deepest overlap of a grasp between its approach and its end or loss, in words."""
+    scene, grasp = shown.bench.case.scene, shown.grasp
+    motion = bodies.motion(scene, grasp)
+    end = min(scene.window[1], float(grasp.outcome.lost_time))
+    times = np.linspace(min(scene.phases.approach, end), end, LOOKED_AT)
+    pose = motion.pose[np.minimum((times * motion.rate).astype(int), len(motion.pose) - 1)]
+    turns = Rotation.from_quat(pose[..., 3:].reshape(-1, 4), scalar_first=True).as_matrix()
+    turns = turns.reshape(*pose.shape[:2], 3, 3)
+    found = overlap.overlaps(scene, grasp.params, pose[..., :3], turns)
+    fingers, palm = (1e3 * depth.max() for depth in found)
+    return f"Deepest overlap: {fingers:.1f} mm in fingers, {palm:.1f} mm in the palm"

@@ -121,7 +121,7 @@ def key(*parts: object, traced: bool = True) -> str | None:
     return None if code is None else digest(code, *map(_version, _COMPILERS), *parts)
 
 
-_COMPILERS = ("jax", "jaxlib", "llvmlite", "numpy", "scipy", "trimesh")
+_COMPILERS = ("jax", "jaxlib", "libigl", "llvmlite", "numpy", "scipy", "trimesh")
 _version = functools.cache(importlib.metadata.version)
 
 

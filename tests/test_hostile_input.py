@@ -22,7 +22,7 @@ from codesign_jax import engines, make_engine, rollout, scene
 from codesign_jax.engines.structured.laws import meshes as lanes
 from codesign_jax.runs import scene_files
 from codesign_jax.scene import InputError, constants, library, meshes, objects, reach
-from codesign_jax.scene.meshes import reading, surface
+from codesign_jax.scene.meshes import reading
 from codesign_jax.scene.parameters import design_space
 from scripts import faults
 from scripts.faults import shim  # noqa: F401  (a fixture)
@@ -218,18 +218,6 @@ def test_numbers_so_large_that_they_have_no_differences(tmp_path):
     far.export(tmp_path / "far.off", digits=17)
     problems = refusals(load_mesh, tmp_path / "far.off", repaired=True)
     assert any("outside [5, 500] mm" in p for p in problems)
-
-
-def test_thin_faces_are_not_cut_into_millions(monkeypatch):
-    """And distances are the same, of however many pieces."""
-    rod = trimesh.creation.cylinder(0.002, 0.2, sections=8)
-    points = np.random.default_rng(0).uniform(-0.1, 0.1, (50, 3))
-    usual = surface.prepare(rod.vertices, rod.faces)
-    monkeypatch.setattr(surface, "MOST_PIECES", 500)
-    few = surface.prepare(rod.vertices, rod.faces)
-    assert len(few.piece) <= 500 < len(usual.piece)
-    expected = surface.signed_distance(usual, points)
-    np.testing.assert_allclose(surface.signed_distance(few, points), expected, atol=1e-15)
 
 
 def test_a_run_has_the_bytes_that_were_read(tmp_path):

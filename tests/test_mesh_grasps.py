@@ -81,14 +81,14 @@ def test_household_distances_in_lanes(household):
     distance, gradient = jax.jit(mesh_lanes.signed_distance)(lanes, jnp.asarray(points))
     np.testing.assert_allclose(jnp.linalg.norm(gradient, axis=0), 1.0, atol=1e-5)
     for i, s in enumerate(household):
-        prepared = surface.prepare(s.mesh.vertices, s.mesh.faces)
-        exact = 1.03 * surface.signed_distance(prepared, points[..., i].T / 1.03)
+        body = s.mesh.vertices, s.mesh.faces
+        exact = 1.03 * surface.signed_distance(*body, points[..., i].T / 1.03)
         error = np.abs(distance[:, i] - exact)
         # Points are around vertices, so often at edges, where half a cell is the limit.
         assert np.quantile(error, 0.9) < 5e-4 and error.max() < 0.6 * s.mesh.grid.cell, s.name
         away = exact > 0.004
         step = points[..., i].T + 1e-4 * np.asarray(gradient[..., i]).T
-        slope = (1.03 * surface.signed_distance(prepared, step / 1.03) - exact) / 1e-4
+        slope = (1.03 * surface.signed_distance(*body, step / 1.03) - exact) / 1e-4
         assert np.median(slope[away]) > 0.99, s.name  # it is the way out
 
 

@@ -58,6 +58,7 @@ def main(options: "Optimize") -> int:
     devices, chunk = options.devices, options.chunk
     trials = reference.number_of_trials(options.reference_trials, settings)
     after = trials * reference.steps_and_links(scene)
+    after += reference.STRESS_TRIALS * stress.sets(scene) if trials else 0
     how = {"fresh": options.fresh, "after": after, "devices": devices, "chunk": chunk}
     found = runs.optimize(plans, sys.argv, **how)
     results: dict[Path, RunResult | None] = {}

@@ -137,8 +137,8 @@ class Progress(Live):
         super().__init__(console, *columns, rich.progress.TimeElapsedColumn())
         self.total, self._test, self._after = total, runs * test, runs * after
         self._reports: list[Report] = []
-        self._seconds, self._grasps, self._told = 0.0, 0, 0.0
-        self._part, self._tested = 0, 0
+        self._seconds, self._grasps, self._told = 0.0, 0.0, 0.0
+        self._part, self._tested, self._done = 0, 0, 0
 
     def add(self, report: "Report") -> None:
         """Takes a run's report of an episode for the line of this round."""
@@ -180,9 +180,11 @@ class Progress(Live):
         )
 
     def _pace(self, grasps: int, seconds: float, left: float) -> str:
-        """Counts grasps that took so long; the rate so far and the time left, in words."""
-        self._seconds, self._grasps = self._seconds + seconds, self._grasps + grasps
-        self._bar.update(self._task, completed=self._grasps, total=self._grasps + left)
+        """Counts grasps that took so long; their rate of late and the time left, in words."""
+        self._done += grasps
+        self._bar.update(self._task, completed=self._done, total=self._done + left)
+        # A search begins with hands that lose their objects, which ends a grasp early.
+        self._seconds, self._grasps = 0.8 * self._seconds + seconds, 0.8 * self._grasps + grasps
         rate = self._grasps / max(self._seconds, 1e-9)
         return f"{rate:.1f} grasps/s  ETA {duration(left / rate)}"
 

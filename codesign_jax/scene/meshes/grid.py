@@ -7,16 +7,14 @@ import numpy as np
 import trimesh
 
 from codesign_jax import reuse, store
-from codesign_jax.scene.meshes import surface as surfaces
-from codesign_jax.scene.meshes.surface import Surface
+from codesign_jax.scene.meshes.surface import signed_distance
 
 # The error grows in proportion to the cell at edges and with its square elsewhere.
 COARSEST = 0.0025
 MAX_NODES = 3_000_000  # 12 MB in float32
 # Looking for a node's nearest faces takes longest where all are equally far, as in a ball's middle:
-# 36 s of processor time for a ball of 82,000 faces and 800,000 nodes.
+# 13 s of processor time for a ball of 82,000 faces and 800,000 nodes.
 MAX_WORK = 3e10  # faces times nodes
-_LARGE = 300_000  # nodes; more take a second
 _NEAR = 0.002  # how far from the surface "near the surface" goes [m]
 WORTH_KEEPING = 0.1  # time to build from which a grid is kept [s]; reading one takes milliseconds
 
@@ -55,11 +53,10 @@ def build(vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float) -
     Raises:
       ValueError: if the grid would have more than `MAX_NODES` nodes, or take more than `MAX_WORK`.
     """
-    surface = surfaces.prepare(vertices, faces)
     points = near_surface(vertices, faces, 3000)
-    exact = surfaces.signed_distance(surface, points)
+    exact = signed_distance(vertices, faces, points)
     low, extent = vertices.min(0) - reach, np.ptp(vertices, axis=0) + 2 * reach
-    cell = _cell(surface, points, exact, low, bound)
+    cell = _cell(vertices, faces, points[::4], exact[::4], low, bound)
     while True:
         shape = np.ceil(extent / cell).astype(int) + 1
         if shape.prod() > MAX_NODES:
@@ -73,10 +70,7 @@ def build(vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float) -
                 f"{len(faces):,} faces are too many for a grid of {shape.prod():,} nodes: "
                 "use fewer faces or a larger voxel_error"
             )
-        if shape.prod() > _LARGE and _too_coarse(surface, points, exact, low, cell, bound):
-            cell *= 0.9
-            continue
-        values = surfaces.signed_distance(surface, _nodes(low, cell, shape), proven=False)
+        values = signed_distance(vertices, faces, _nodes(low, cell, shape))
         grid = Grid(low, cell, values.astype(np.float32).reshape(shape), 0.0, 0.0)
         error = np.abs(interpolate(grid, points) - exact)
         if np.quantile(error, 0.99) <= bound:
@@ -117,38 +111,24 @@ def _blend(corners: np.ndarray, part: np.ndarray) -> np.ndarray:
 
 
 def _cell(
-    surface: Surface, points: np.ndarray, exact: np.ndarray, low: np.ndarray, bound: float
-) -> float:
-    """Cell that meets the bound, tried at a few points without building the grid."""
-    points, exact, cell = points[::4], exact[::4], COARSEST
-    while True:
-        worst = np.quantile(_errors(surface, points, exact, low, cell), 0.99)
-        if worst <= bound or cell < 2e-4:
-            return cell
-        cell *= max(0.5, min(0.95, bound / worst))
-
-
-def _too_coarse(
-    surface: Surface,
+    vertices: np.ndarray,
+    faces: np.ndarray,
     points: np.ndarray,
     exact: np.ndarray,
     low: np.ndarray,
-    cell: float,
     bound: float,
-) -> bool:
-    """Whether a grid that was built would clearly not meet the bound, float32 or not."""
-    return bool(np.quantile(_errors(surface, points, exact, low, cell), 0.99) > 1.001 * bound)
-
-
-def _errors(
-    surface: Surface, points: np.ndarray, exact: np.ndarray, low: np.ndarray, cell: float
-) -> np.ndarray:
-    """Errors of interpolation at points of a grid that begins at `low`, without building it."""
-    base = low + np.floor((points - low) / cell) * cell
-    offsets = np.array(list(np.ndindex(2, 2, 2))) * cell
-    corners = (base[:, None] + offsets).reshape(-1, 3)
-    values = surfaces.signed_distance(surface, corners, proven=False).reshape(-1, 8)
-    return np.abs(_blend(values, (points - base) / cell) - exact)
+) -> float:
+    """Cell that meets the bound at points, without building the grid; it begins at `low`."""
+    cell, offsets = COARSEST, np.array(list(np.ndindex(2, 2, 2)))
+    while True:
+        base = low + np.floor((points - low) / cell) * cell
+        corners = (base[:, None] + offsets * cell).reshape(-1, 3)
+        values = signed_distance(vertices, faces, corners).reshape(-1, 8)
+        error = np.abs(_blend(values, (points - base) / cell) - exact)
+        worst = np.quantile(error, 0.99)
+        if worst <= bound or cell < 2e-4:
+            return cell
+        cell *= max(0.5, min(0.95, bound / worst))
 
 
 def _nodes(low: np.ndarray, cell: float, shape: np.ndarray) -> np.ndarray:

@@ -1,13 +1,14 @@
-"""Repairs of a triangle mesh: only on request, and with a line for everything that was changed."""
+"""Repairs of a triangle mesh: only on request, and with a line for everything that was changed.
 
-from collections import deque
+trimesh closes holes of at most four edges; manifold3d takes only what is closed already.
+"""
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from codesign_jax.scene.meshes.surface import winding
+from codesign_jax.scene.meshes.surface import turned_alike, winding
 
 _MERGE = 1e-5  # vertices closer than this fraction of the size are one
 
@@ -25,7 +26,10 @@ def repair(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
     report: list[str] = []
     vertices, faces = _merge(vertices, faces, report)
     faces = _drop(faces, report)
-    faces, part, turned = _turn_alike(faces)
+    if not len(faces):
+        return vertices, faces, report
+    alike, part = turned_alike(faces)
+    faces, turned = alike, (alike != faces).any(1)
     vertices, faces, part = _close(vertices, faces, part, report)
     faces, outwards = _turn_outwards(vertices, faces, part)
     turned = np.concatenate([turned, np.zeros(len(faces) - len(turned), bool)]) ^ outwards
@@ -61,32 +65,6 @@ def half_edges(faces: np.ndarray) -> np.ndarray:
     return np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2)
 
 
-def _turn_alike(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Turns faces so that neighbours agree; also the part of each, and which were turned."""
-    edges = half_edges(faces)
-    _, which, count = np.unique(np.sort(edges, 1), axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(which.reshape(-1), kind="stable")
-    start = np.concatenate([[0], np.cumsum(count)])
-    neighbours: list[list[tuple[int, bool]]] = [[] for _ in faces]
-    for e in np.flatnonzero(count == 2):
-        i, j = order[start[e] : start[e + 1]]
-        same = bool((edges[i] == edges[j]).all())  # neighbours that agree run it in two directions
-        neighbours[i // 3].append((j // 3, same))
-        neighbours[j // 3].append((i // 3, same))
-    turned, part = np.zeros(len(faces), bool), np.full(len(faces), -1)
-    for seed in range(len(faces)):
-        if part[seed] >= 0:
-            continue
-        part[seed], queue = seed, deque([seed])
-        while queue:
-            f = queue.popleft()
-            for g, same in neighbours[f]:
-                if part[g] < 0:
-                    part[g], turned[g] = seed, turned[f] ^ same
-                    queue.append(g)
-    return np.where(turned[:, None], faces[:, ::-1], faces), part, turned
-
-
 def _close(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, report: list[str]):
     """Closes each hole by a fan around its middle; holes that touch each other are left open."""
     directed = {(int(i), int(j)): f // 3 for f, (i, j) in enumerate(half_edges(faces))}
@@ -116,12 +94,10 @@ def _turn_outwards(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray):
     a, b, c = corner[:, 0], corner[:, 1], corner[:, 2]
     names, own = np.unique(part, return_inverse=True)
     volume = np.bincount(own, weights=np.einsum("fi,fi->f", a, np.cross(b, c)))
-    each = [corner[own == k] for k in range(len(names))]
-    low, high = (np.array([f(x, (0, 1)) for x in each]) for f in (np.min, np.max))
-    cavity = np.zeros(len(names), bool)
-    for k, mine in enumerate(each):
-        around = np.flatnonzero((low < low[k]).all(1) & (high > high[k]).all(1))
-        enclosed = [abs(winding(each[j], mine[0, :1])[0]) > 0.5 for j in around]
-        cavity[k] = sum(enclosed) % 2 == 1
+    each = [faces[own == k] for k in range(len(names))]
+    firsts = vertices[[mine[0, 0] for mine in each]]
+    enclosed = [abs(winding(vertices, mine, firsts)) > 0.5 for mine in each]
+    np.fill_diagonal(around := np.array(enclosed), False)
+    cavity = around.sum(0) % 2 == 1
     inward = ((volume < 0) != cavity)[own]
     return np.where(inward[:, None], faces[:, ::-1], faces), inward

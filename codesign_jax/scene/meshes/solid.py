@@ -112,7 +112,7 @@ class Solid:
     def _inner_share(self) -> float:
         """Share of the surface whose outer side lies inside the body, by random points of it."""
         points = grid.near_surface(self.vertices, self.faces, 400, 1e-5 * self.radius)
-        return float((surface.winding(self.vertices[self.faces], points) > 0.5).mean())
+        return float((surface.winding(self.vertices, self.faces, points) > 0.5).mean())
 
 
 def load(

@@ -289,7 +289,7 @@ def _before(
         population = optimizer.ask(state, mask)
         noise = episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
         worlds = rollout.crossed(jax.vmap(space.params)(population), noise)
-        fields, ctrl, initial = rollout.prepare(scene, *worlds, constants)
+        fields, ctrl, initial = rollout.prepare(scene, *worlds, constants, engine)
         blocks = staged(engine, lanes).pack(fields, ctrl)
         return _Packed(
             population, worlds[1], initial, *blocks, None if recording.cost is None else ctrl

@@ -10,12 +10,33 @@
 ((900, 10), 120000)
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.scene import Scene, key_frames
 from codesign_jax.types import Params, Trial
+
+
+class Plan(NamedTuple):
+    """What the key frames command over a grasp, and what a grasp adds to any command.
+
+    Attributes:
+      pose: Pose of the arm frame: x, y, z [m], roll, pitch, yaw [rad], shape (time, 6); positive
+        pitch points the fingers towards +x.
+      pressure: Wanted pressure of each finger [Pa], shape (time, finger).
+      shake: Roll and pitch that the disturbance adds [rad], shape (time, 2).
+      tilt: Roll and pitch of the trial's noise [rad], shape (2,).
+      params: Parameters of the hand.
+    """
+
+    pose: jax.Array
+    pressure: jax.Array
+    shake: jax.Array
+    tilt: jax.Array
+    params: Params
 
 
 def commands(scene: Scene, params: Params, trial: Trial) -> jax.Array:
@@ -30,22 +51,33 @@ def commands(scene: Scene, params: Params, trial: Trial) -> jax.Array:
       params: Parameters of one hand.
       trial: Its trial; the arm frame carries the trial's roll and pitch noise.
     """
+    planned = plan(scene, params, trial)
+    pressure = planned.pressure
+    if scene.effects.pressure_dynamics:
+        pressure = supplied(scene, pressure)[0]
+    return actuated(planned.pose, pressure, planned.shake, planned.tilt)
+
+
+def plan(scene: Scene, params: Params, trial: Trial) -> Plan:
+    """The key frames over the time steps of a grasp; arguments as in `commands`."""
     time = np.arange(scene.num_steps) * scene.discretization.timestep - scene.phases.settle
     place = _place(scene, params, time)
-    x, y, z, roll, pitch, yaw = _between(place, key_frames.poses(scene, params)).T
-    shaken_roll, shaken_pitch = _shake(scene, time)
-    # Positive pitch points the fingers towards +x, so that Table I's x = -20 mm with 15 degrees
-    # aims the hand at the object [ours]; the wrist's hinge turns about +y, which points them
-    # towards -x.
-    roll = roll + trial.arm_tilt[0] + shaken_roll
-    pitch = shaken_pitch - pitch + trial.arm_tilt[1]
+    pose = _between(place, key_frames.poses(scene, params))
     pressure = jnp.zeros((len(time), scene.num_fingers), jnp.result_type(params.pressure))
     for value, factors in key_frames.pressures(scene, params):
         pressure = pressure + value * _between(place, factors)
-    pressure = pressure.T
-    if scene.effects.pressure_dynamics:
-        pressure = supplied(scene, pressure)
-    return jnp.concatenate([jnp.stack([x, y, z, roll, yaw, pitch]), pressure]).T
+    return Plan(pose, pressure, jnp.stack(_shake(scene, time), 1), trial.arm_tilt, params)
+
+
+def actuated(pose: jax.Array, pressure: jax.Array, shake: jax.Array, tilt: jax.Array) -> jax.Array:
+    """Controls, shape (time, nu), from what `Plan` has of as many time steps."""
+    x, y, z, roll, pitch, yaw = pose.T
+    # Positive pitch points the fingers towards +x, so that Table I's x = -20 mm with 15 degrees
+    # aims the hand at the object [ours]; the wrist's hinge turns about +y, which points them
+    # towards -x.
+    roll = roll + tilt[0] + shake[:, 0]
+    pitch = shake[:, 1] - pitch + tilt[1]
+    return jnp.concatenate([jnp.stack([x, y, z, roll, yaw, pitch], 1), pressure], 1)
 
 
 def _place(scene: Scene, params: Params, time: np.ndarray) -> tuple[jax.Array, ...]:
@@ -66,8 +98,10 @@ def _between(place: tuple[jax.Array, ...], knots: jax.Array) -> jax.Array:
     return knots[before] + share[:, None] * (knots[after] - knots[before])
 
 
-def supplied(scene: Scene, wanted: jax.Array) -> jax.Array:
-    """Chamber pressures that the air supply reaches, from the wanted ones, both (finger, time).
+def supplied(
+    scene: Scene, wanted: jax.Array, start: jax.Array | None = None
+) -> tuple[jax.Array, jax.Array]:
+    """Chamber pressures that the air supply reaches from the wanted ones, both (time, finger).
 
     tau dp/dt = min(wanted, maximum) - p with |dp/dt| <= rate, from the first wanted pressure on.
     `wanted` is held over each time step, over which the lag is solved exactly.  The chamber's
@@ -76,16 +110,26 @@ def supplied(scene: Scene, wanted: jax.Array) -> jax.Array:
     Args:
       scene: The scene; its `pneumatics` have the constants.
       wanted: Wanted pressures [Pa].
+      start: Pressures at the beginning, shape (finger,), instead of the first wanted ones.
+
+    Returns:
+      The pressures, and those at the end of the last step, shape (finger,).
     """
     p, h = scene.pneumatics, scene.discretization.timestep
     lagging = p.lag > 0
     gain = jnp.where(lagging, -jnp.expm1(-h / jnp.where(lagging, p.lag, 1.0)), 1.0)
-    target = jnp.minimum(wanted, p.maximum)
+    target = reachable(scene, wanted)
 
     def step(now: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
         return now + jnp.clip(gain * (goal - now), -p.rate * h, p.rate * h), now
 
-    return jax.lax.scan(step, target[:, 0], target.T)[1].T
+    end, found = jax.lax.scan(step, target[0] if start is None else start, target)
+    return found, end
+
+
+def reachable(scene: Scene, wanted: jax.Array) -> jax.Array:
+    """Wanted pressures [Pa] as far as the air supply has them."""
+    return jnp.minimum(wanted, scene.pneumatics.maximum)
 
 
 def _shake(scene: Scene, time: np.ndarray) -> tuple[jax.Array, jax.Array]:

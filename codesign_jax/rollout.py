@@ -167,7 +167,7 @@ def simulate(
         traced ones no values are known.
     """
     constants = _checked(scene, engine, params, trials, constants)
-    fields, ctrl, initial = prepare(scene, params, trials, constants)
+    fields, ctrl, initial = prepare(scene, params, trials, constants, engine)
     trace = recorded(engine.rollout, fields, ctrl, record_qpos, stop_when_lost)
     how = {"record_qpos": record_qpos, "stop_when_lost": stop_when_lost, "cost": cost}
     return judge(scene, trace, ctrl, initial, trials, constants, **how), trace
@@ -230,8 +230,8 @@ def grasp(
         raise schema.InputError([f"steps = {steps}: the grasp has 1 to {scene.num_steps}"])
     params, trial = jax.tree.map(lambda v: jnp.asarray(v)[None], (params, trial))
     constants = _checked(scene, engine, params, trial, constants)
-    fields, ctrl, _ = prepare(scene, params, trial, constants)
-    trace = recorded(engine.rollout, fields, ctrl[:, :steps], record_qpos, stop_when_lost)
+    fields, ctrl, _ = prepare(scene, params, trial, constants, engine)
+    trace = recorded(engine.rollout, fields, first(ctrl, steps), record_qpos, stop_when_lost)
     return jax.tree.map(lambda v: v[0], trace)
 
 
@@ -253,9 +253,21 @@ def _checked(
     return constants
 
 
+def first(ctrl: Any, steps: int | None) -> Any:
+    """The first time steps of what `prepare` makes for an engine."""
+    if isinstance(ctrl, control.Plan):
+        series = {k: getattr(ctrl, k)[:, :steps] for k in ("pose", "pressure", "shake")}
+        return ctrl._replace(**series)
+    return ctrl[:, :steps]
+
+
 def prepare(
-    scene: Scene, params: Params, trials: Trial, constants: Constants
-) -> tuple[model.ModelFields, jax.Array, jax.Array]:
+    scene: Scene,
+    params: Params,
+    trials: Trial,
+    constants: Constants,
+    engine: Engine | None = None,
+) -> tuple[model.ModelFields, Any, jax.Array]:
     """What a batch of worlds is, before an engine simulates it.
 
     Args:
@@ -263,9 +275,11 @@ def prepare(
       params: Parameters with leading axis (world,).
       trials: Trials with leading axis (world,).
       constants: Numbers of the worlds, leaves of shape () or (world,).
+      engine: The engine, if it may be one that asks a policy, see `policy.ControlLoop`.
 
     Returns:
-      Model fields, controls of shape (world, time, nu), and bits of `Status` that the worlds start
+      Model fields, controls of shape (world, time, nu), or a `control.Plan` for such an engine,
+      and bits of `Status` that the worlds start
       with, shape (world,).
 
     Raises:
@@ -274,18 +288,23 @@ def prepare(
     reuse.begin()
     constants = jax.tree.map(lambda v: jnp.asarray(v, float), constants)
     every = (0, 0, batch_axes(constants))
-    world = partial(_world, scene.structure)
+    commands = getattr(engine, "commands", control.commands)
+    world = partial(_world, scene.structure, commands)
     fields, ctrl = jax.vmap(world, in_axes=every)(params, trials, constants)
     return fields, ctrl, invalid_start(scene, fields)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jax.jit, static_argnums=(0, 1))
 def _world(
-    structure: Scene, params: Params, trial: Trial, constants: Constants
-) -> tuple[model.ModelFields, jax.Array]:
+    structure: Scene,
+    commands: Callable[..., Any],
+    params: Params,
+    trial: Trial,
+    constants: Constants,
+) -> tuple[model.ModelFields, Any]:
     """Model fields and controls of a world; a process traces them once for batches of any size."""
     own = structure.with_constants(constants)
-    return model.model_fields(own, params, trial), control.commands(own, params, trial)
+    return model.model_fields(own, params, trial), commands(own, params, trial)
 
 
 def judge(
@@ -313,6 +332,8 @@ def judge(
       stop_when_lost: As in `simulate`, with which the trace was made.
       cost: As in `simulate`.
     """
+    if trace.ctrl is not None:
+        ctrl = trace.ctrl
 
     def world(t: Trace, u: jax.Array | None, i: jax.Array, trial: Trial, c: Constants) -> Outcome:
         own = scene.with_constants(c)

@@ -177,6 +177,7 @@ class Trace(NamedTuple):
         velocities, and what else a rollout that goes on from there needs, see `model.State`.
       residual: Residual of the step taken from each state, see `Outcome`, 0 of one that converged,
         shape (time,), or None if the engine does not tell.
+      ctrl: Controls that a policy gave, shape (time, nu); None of those that were known beforehand.
 
     An object that leaves the hand after six seconds, as its cost sees it:
 
@@ -196,6 +197,7 @@ class Trace(NamedTuple):
     status: jax.Array | None = None
     last: jax.Array | None = None
     residual: jax.Array | None = None
+    ctrl: jax.Array | None = None
 
     def at(self, scene: Phased, phase: str | None = None) -> "Trace":
         """The trace in the last time step of a phase, without the axis time.
@@ -211,7 +213,7 @@ class Trace(NamedTuple):
             `effects.disturb` is off.
 
         Returns:
-          A trace whose arrays have lost their axis time; `last` and `residual` are None.
+          A trace whose arrays have lost their axis time; `last`, `residual` and `ctrl` are None.
 
         Raises:
           InputError: If the grasp has no such phase.

@@ -75,7 +75,7 @@ def test_lag_is_exponential():
     wanted = np.full((1, 100), 100e3)
     wanted[0, 0] = 0.0
     with jax.enable_x64(True):
-        reached = np.asarray(control.supplied(scene, jnp.asarray(wanted)))[0]
+        reached = np.asarray(control.supplied(scene, jnp.asarray(wanted).T)[0]).T[0]
     # Row k is the pressure at time k h; the demand jumps at h.
     expected = 100e3 * -np.expm1(-np.maximum(np.arange(100) - 1, 0) * h / 0.2)
     np.testing.assert_allclose(reached, expected, rtol=1e-12, atol=1e-9)
@@ -98,7 +98,7 @@ def test_supply_against_an_integrator():
     keys = [p.approach, p.inflate, end, end + p.deflate_time]
     wanted = 130e3 * np.interp(time, keys, [0.0, 1.0, 1.0, 0.0])[None]
     with jax.enable_x64(True):
-        reached = np.asarray(control.supplied(scene, jnp.asarray(wanted)))[0]
+        reached = np.asarray(control.supplied(scene, jnp.asarray(wanted).T)[0]).T[0]
 
     def rate(t, p):
         goal = min(wanted[0, min(int(t / h + 1e-9), count - 1)], 90e3)
@@ -115,7 +115,7 @@ def test_supply_against_an_integrator():
 def test_constant_pressure_passes_the_supply():
     scene = supply()
     wanted = jnp.full((2, 50), 80e3)
-    np.testing.assert_array_equal(control.supplied(scene, wanted), wanted)
+    np.testing.assert_array_equal(control.supplied(scene, wanted)[0], wanted)
 
 
 # --- rigid arm, weight, torsion ------------------------------------------------------------------

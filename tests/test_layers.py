@@ -21,7 +21,7 @@ types provenance compiler optimize
 scene
 axes model control verdict
 engines cost
-start
+start policy
 rollout
 own
 codesign finger fit sampling

@@ -1,0 +1,371 @@
+"""A policy in the loop: a pure function that commands the hand by what it observes.
+
+A policy is called every `period` seconds with what it remembers and an `Observation`, and returns
+both what it remembers and a `Command`.  `ControlLoop` is an engine that calls it inside the
+rollout; whatever takes an engine takes it.
+
+>>> from codesign_jax import make_engine, parameters, policy, rollout, scene
+>>> grasping = scene.load("paper")
+>>> def gentle(carry, seen):  # half the pressures of the key frames
+...     return carry, seen.plan._replace(pressure=0.5 * seen.plan.pressure)
+>>> loop = policy.ControlLoop(make_engine("structured", grasping), gentle)
+>>> space = parameters.design_space(grasping.hand, "2d")
+>>> hand, trial = space.params(space.default()), rollout.nominal_trial(grasping)
+>>> trace = rollout.grasp(grasping, loop, hand, trial, steps=250)
+>>> round(float(trace.ctrl[-1, 6]))  # a third of the way to 60 kPa [Pa]
+19600
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax import control, model
+from codesign_jax.control import Plan
+from codesign_jax.engines.base import Engine, Equal
+from codesign_jax.engines.structured import coordinates
+from codesign_jax.engines.structured.laws.kinematics import kinematics
+from codesign_jax.engines.structured.world_model import WorldModel, world_constants
+from codesign_jax.model import ModelFields
+from codesign_jax.model.layout import WRIST, layout
+from codesign_jax.scene import Scene
+from codesign_jax.scene.schema import InputError
+from codesign_jax.types import Params, Trace
+
+PERIOD = 0.05
+"""Seconds between two calls of a policy that does not say so itself."""
+
+
+class Pose(NamedTuple):
+    """Where a body is, in the world frame.
+
+    Attributes:
+      position: Origin of its frame [m], shape (..., 3).
+      rotation: Its axes as the columns of a matrix, shape (..., 3, 3).
+    """
+
+    position: jax.Array
+    rotation: jax.Array
+
+
+class Command(NamedTuple):
+    """What the hand is told to do over a period.
+
+    The disturbance and the trial's noise are added to the pose, and the air supply acts on the
+    pressures.  A pressure below zero or above the limit of the finger's wall is moved to that end.
+
+    Attributes:
+      pose: Pose of the arm frame: x, y, z [m], roll, pitch, yaw [rad], shape (6,), held over the
+        period, or (step, 6), one for each time step.
+      pressure: Pressures of the fingers [Pa], shape (finger,) or (step, finger).
+    """
+
+    pose: jax.Array
+    pressure: jax.Array
+
+
+class Observation(NamedTuple):
+    """What a policy observes of its world at the beginning of a period.
+
+    Attributes:
+      time: Time since the beginning of the grasp [s], shape ().
+      phase: Index of the present phase in `Scene.phase_ends`, shape () int32.
+      phase_time: Time since that phase began [s], shape ().
+      plan: What the scene's key frames command over this period, a `Command` of shape (step, ...).
+      pressure: Pressures in the chambers [Pa], shape (finger,).
+      joint: Angles of the fingers' joints [rad], shape (finger, link, axis).
+      joint_velocity: Their velocities [rad/s], likewise.
+      palm: Pose of the palm.
+      link: Poses of the fingers' links, whose origins are at their joints, shape (finger, link).
+      object: Pose of the object, whose origin is its centre of mass.
+      object_velocity: Its linear [m/s] and angular [rad/s] velocity, shape (6,).
+    """
+
+    time: jax.Array
+    phase: jax.Array
+    phase_time: jax.Array
+    plan: Command
+    pressure: jax.Array
+    joint: jax.Array
+    joint_velocity: jax.Array
+    palm: Pose
+    link: Pose
+    object: Pose
+    object_velocity: jax.Array
+
+
+Policy = Callable[[Any, Observation], tuple[Any, Command]]
+"""From what it remembers and an observation of one world to both what it remembers and a command.
+
+Attributes that it may have:
+  period: Seconds from call to call, a whole number of time steps; without it `PERIOD`.
+  init: A function of the hand's `Params` to what it remembers at first, a tree of arrays of fixed
+    shape and type; without it ().
+  parameters: Numbers that a search may move, rows as [[parameter]] of a control file; `init` finds
+    their values by name in `Params.control` [SI].
+"""
+
+
+class World(NamedTuple):
+    """Worlds between two periods, every array with a leading axis (world,).
+
+    Attributes:
+      state: Their states, see `model.State`, shape (world, n).
+      pressure: Pressures in the chambers [Pa], shape (world, finger).
+    """
+
+    state: jax.Array
+    pressure: jax.Array
+
+
+class ControlLoop(Equal):
+    """An engine that asks a policy for its commands; of equal engine and policy equal.
+
+    The rollout is one program.  A rollout's `Trace.ctrl` has the commands that were given.
+    """
+
+    def __init__(self, engine: Engine, policy: Policy):
+        """Takes the engine that simulates, and the policy.
+
+        Raises:
+          InputError: If the policy cannot be called, or its period is not a whole number of time
+            steps.
+        """
+        if not callable(policy):
+            words = f"policy is {policy!r:.60}, not a function of (carry, observation)"
+            raise InputError([words])
+        self.engine, self.policy, self.name = engine, policy, engine.name
+        self.scene: Scene = engine.scene  # type: ignore[attr-defined]
+        self.steps = period_steps(self.scene, getattr(policy, "period", PERIOD))
+
+    def _key(self) -> tuple:
+        return self.engine, self.policy, self.scene.hand.pressure_limit
+
+    commands = staticmethod(control.plan)
+    """What `rollout.prepare` makes for `rollout`: the plan instead of controls."""
+
+    def rollout(self, fields: ModelFields, ctrl: Plan, *, trajectory: bool = False) -> Trace:
+        """See `Engine.rollout`; `ctrl` is a plan, every array with a leading axis (world,).
+
+        Raises:
+          InputError: If the policy does not return what it should, or, where nothing is traced,
+            a command that is not finite: inside of `jax.jit` such a world has failed (NONFINITE).
+        """
+        plan, hand = ctrl, world_constants(self.scene, fields)
+        series = {"pose": plan.pose, "pressure": plan.pressure, "shake": plan.shake}
+
+        def period(carry: tuple, now: dict[str, jax.Array]) -> tuple[tuple, Trace]:
+            world, memory = carry
+            ahead = plan._replace(**now)
+            seen = observe(self.scene, hand, fields, world, ahead)
+            answer = jax.vmap(self.policy)(memory, seen)
+            if not (isinstance(answer, tuple) and [*map(type, answer[1:])] == [Command]):
+                raise InputError([f"{self._called} must return (carry, policy.Command)"])
+            told, command = answer
+            self._refuse_memory(memory, told)
+            command = self._spread(command, ahead)
+            world, trace = advance(self.engine, fields, world, ahead, command, trajectory)
+            return (world, told), trace._replace(last=None)
+
+        carry, found = (begin(self.scene, fields, plan), self._remembered(plan.params)), []
+        periods, rest = divmod(plan.pose.shape[1], self.steps)
+        if periods:
+            now = {k: _split(v[:, : periods * self.steps], periods) for k, v in series.items()}
+            carry, traces = jax.lax.scan(period, carry, now)
+            found.append(jax.tree.map(_joined, traces))
+        if rest:
+            carry, trace = period(carry, {k: v[:, -rest:] for k, v in series.items()})
+            found.append(trace)
+        trace = jax.tree.map(lambda *v: jnp.concatenate(v, 1), *found)
+        self._refuse_nonfinite(trace.ctrl)
+        return trace._replace(last=carry[0].state)
+
+    @property
+    def _called(self) -> str:
+        return f"policy {getattr(self.policy, '__name__', type(self.policy).__name__)}"
+
+    def _remembered(self, params: Params) -> Any:
+        """What the policy remembers at first, with a leading axis (world,)."""
+        init = getattr(self.policy, "init", None)
+        if init is None:
+            return ()
+
+        def one(params: Params) -> Any:
+            return jax.tree.map(jnp.asarray, init(params))
+
+        return jax.vmap(one)(params)
+
+    def _refuse_memory(self, before: Any, after: Any) -> None:
+        """Refuses what could not be given to the next call."""
+        trees = [jax.tree.flatten(tree) for tree in (before, after)]
+        kinds = [[(v.shape[1:], v.dtype.name) for v in map(jnp.asarray, t[0])] for t in trees]
+        if trees[0][1] != trees[1][1] or kinds[0] != kinds[1]:
+            words = [f"{k}, in the tree {t[1]}" for k, t in zip(kinds, trees, strict=True)]
+            raise InputError(
+                [
+                    f"{self._called} must remember arrays like those of its init: {words[0]}; "
+                    f"it returned {words[1]}"
+                ]
+            )
+
+    def _spread(self, command: Command, plan: Plan) -> Command:
+        """The command over the time steps of a period, pressures within their limits."""
+        problems, found = [], []
+        for name, like in (("pose", plan.pose), ("pressure", plan.pressure)):
+            given = jnp.asarray(getattr(command, name), like.dtype)
+            if given.shape == (len(like), like.shape[2]):
+                given = jnp.broadcast_to(given[:, None], like.shape)
+            elif given.shape != like.shape:
+                shapes = given.shape[1:], like.shape[2:], like.shape[1:]
+                words = "returned {} of shape {}, not {} or {}".format(name, *shapes)
+                problems.append(f"{self._called} {words}")
+            found.append(given)
+        if problems:
+            raise InputError(problems)
+        return limited(self.scene, plan.params, Command(*found))
+
+    def _refuse_nonfinite(self, ctrl: Any) -> None:
+        """Refuses commands that are no numbers; of traced ones nothing is known."""
+        if isinstance(ctrl, jax.core.Tracer) or np.isfinite(ctrl).all():
+            return
+        world, step, column = np.argwhere(~np.isfinite(np.asarray(ctrl)))[0]
+        names = [*WRIST, *(f"pressure[{i}]" for i in range(ctrl.shape[2] - 6))]
+        time = f"{step * self.scene.discretization.timestep:.4g} s"
+        value = f"{names[column]} = {float(ctrl[world, step, column])}"
+        raise InputError([f"{self._called} commands {value} at {time} in world {world}"])
+
+
+def period_steps(scene: Scene, period: float) -> int:
+    """Time steps of a period [s].
+
+    Raises:
+      InputError: If they are not a whole number.
+    """
+    h = scene.discretization.timestep
+    steps = round(period / h) if np.isfinite(period) else 0
+    if steps < 1 or abs(steps * h - period) > 1e-6 * h:
+        raise InputError([f"period = {period:g} s is not a whole number of time steps of {h:g} s"])
+    return steps
+
+
+def begin(scene: Scene, fields: ModelFields, plan: Plan) -> World:
+    """The worlds at the beginning of a grasp, or in the state that the fields start from."""
+    state = jnp.concatenate(model.split(scene, fields.start), -1)
+    first = plan.pressure[:, 0]
+    if scene.effects.pressure_dynamics:
+        first = jax.vmap(lambda c, p: control.reachable(scene.with_constants(c), p))(
+            fields.constants, first
+        )
+    return World(state, first)
+
+
+def observe(
+    scene: Scene, hand: WorldModel, fields: ModelFields, world: World, plan: Plan
+) -> Observation:
+    """What policies observe, every array with a leading axis (world,).
+
+    Args:
+      scene: The scene.
+      hand: Constants of the worlds, `world_constants` of their fields.
+      fields: Model fields of the worlds.
+      world: The worlds.
+      plan: Their plan over the period that begins.
+    """
+    state = coordinates.reset(scene, fields._replace(start=world.state))
+    found = kinematics(hand, layout(scene).axes, state)
+
+    def pose(place: jax.Array, columns: jax.Array) -> Pose:
+        """From lanes (3, ...) about the object and (column, 3, ...) with the worlds last."""
+        place = place + state.position.reshape(3, *[1] * (place.ndim - 2), -1)
+        return Pose(
+            jnp.moveaxis(place, (-1, 0), (0, -1)), jnp.moveaxis(columns, (-1, 1, 0), (0, -2, -1))
+        )
+
+    none = jnp.zeros_like(found.place)
+    velocity = found.object_vel[:, 0].T
+    step = model.split(scene, world.state).step[:, 0]
+    phase, since = jax.vmap(lambda c, k: _phase(scene.with_constants(c), k))(fields.constants, step)
+    joint, rate = (jnp.moveaxis(v, (3, 2), (0, 1)) for v in (state.finger, state.finger_vel))
+    palm, thing = (
+        pose(found.place[:, 0], found.palm[:, :, 0]),
+        pose(none[:, 0], found.object[:, :, 0]),
+    )
+    return Observation(
+        time=step * scene.discretization.timestep,
+        phase=phase,
+        phase_time=since,
+        plan=Command(plan.pose, plan.pressure),
+        pressure=world.pressure,
+        joint=joint,
+        joint_velocity=rate,
+        palm=palm,
+        link=pose(jnp.swapaxes(found.origin, 1, 2), jnp.swapaxes(found.link, 2, 3)),
+        object=thing,
+        object_velocity=jnp.concatenate([velocity[:, 3:], velocity[:, :3]], 1),
+    )
+
+
+def _phase(scene: Scene, step: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Index of the phase that a time step belongs to, and the time since it began [s]."""
+    ends = jnp.stack(
+        [jnp.asarray(scene.steps_to(t), step.dtype) for t in scene.phase_ends.values()]
+    )
+    phase = jnp.minimum((step >= ends).sum(), len(ends) - 1)
+    start = jnp.where(phase > 0, ends[phase - 1], 0.0)
+    return phase.astype(jnp.int32), (step - start) * scene.discretization.timestep
+
+
+def limited(scene: Scene, params: Params, command: Command) -> Command:
+    """Commands of shape (world, step, ...) whose pressures the fingers stand.
+
+    The upper end is the limit of the wall, or the design's own pressure where that is higher.
+    """
+    top = jax.vmap(scene.hand.pressure_limit.of)(params.height, params.wall)
+    top = jnp.maximum(top, params.pressure)[:, None]
+    # Comparisons let what is no number pass, and have the derivative of what is at an end.
+    pressure = jnp.where(command.pressure < 0, 0.0, command.pressure)
+    return command._replace(pressure=jnp.where(pressure > top, top, pressure))
+
+
+def advance(
+    engine: Engine,
+    fields: ModelFields,
+    world: World,
+    plan: Plan,
+    command: Command,
+    trajectory: bool,
+) -> tuple[World, Trace]:
+    """Simulates a period under commands of shape (world, step, ...).
+
+    Returns:
+      The worlds after it, and the trace with the controls that the engine was given.
+    """
+    scene: Scene = engine.scene  # type: ignore[attr-defined]
+
+    def controls(constants: Any, now: jax.Array, shake: jax.Array, tilt: jax.Array, told: Command):
+        pressure, end = told.pressure, told.pressure[-1]
+        if scene.effects.pressure_dynamics:
+            pressure, end = control.supplied(scene.with_constants(constants), pressure, now)
+        return control.actuated(told.pose, pressure, shake, tilt), end
+
+    given = fields.constants, world.pressure, plan.shake, plan.tilt, command
+    ctrl, pressure = jax.vmap(controls)(*given)
+    trace = engine.rollout(fields._replace(start=world.state), ctrl, trajectory=trajectory)
+    if trace.last is None:
+        raise InputError([f"engine {engine.name} does not tell states to go on from"])
+    return World(trace.last, pressure), trace._replace(ctrl=ctrl)
+
+
+def _split(series: jax.Array, periods: int) -> jax.Array:
+    """(world, time, n) to (period, world, step, n)."""
+    return jnp.moveaxis(series.reshape(len(series), periods, -1, series.shape[2]), 1, 0)
+
+
+def _joined(series: jax.Array) -> jax.Array:
+    """(period, world, step, ...) to (world, time, ...)."""
+    periods, worlds, steps = series.shape[:3]
+    return jnp.moveaxis(series, 0, 1).reshape(worlds, periods * steps, *series.shape[3:])

@@ -1,0 +1,177 @@
+"""Policies in the loop: the open loop's bits, MuJoCo's poses, derivatives, what is refused."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from codesign_jax import model, policy, rollout
+from codesign_jax.engines import make_engine
+from codesign_jax.engines.mujoco import world_model
+from codesign_jax.engines.structured.world_model import world_constants
+from codesign_jax.model.layout import layout
+from codesign_jax.scene.schema import InputError
+from codesign_jax.types import Status
+from tests.helpers import grasps
+
+
+def replay(carry, seen):
+    return carry, seen.plan
+
+
+def loop(scene, step, **attributes):
+    """A control loop of a policy with attributes."""
+    named = partial(step)
+    for name, value in attributes.items():
+        setattr(named, name, value)
+    return policy.ControlLoop(make_engine("structured", scene), named)
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["ideal", "supply"])
+def worlds(request):
+    """A short scene, with an ideal air supply or a real one, and four random worlds."""
+    effects = dataclasses.replace(
+        grasps.short_grasp().effects, pressure_dynamics=request.param, disturb=True
+    )
+    phases = dataclasses.replace(grasps.short_grasp().phases, disturb=0.6)
+    scene = dataclasses.replace(grasps.short_grasp(), effects=effects, phases=phases)
+    return scene, *grasps.random_worlds(scene, 1, 4)
+
+
+def simulate(scene, engine, params, trials):
+    return jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t))(params, trials)
+
+
+def test_who_replays_the_key_frames_simulates_the_open_loop(worlds):
+    """To the bit: poses and pressures are the same numbers. The last period is a shorter one."""
+    scene, params, trials = worlds
+    outcome, trace = simulate(scene, make_engine("structured", scene), params, trials)
+    engine = loop(scene, replay, period=0.25)
+    assert scene.num_steps % engine.steps
+    again, found = simulate(scene, engine, params, trials)
+    ctrl = jax.jit(lambda p, t: rollout.prepare(scene, p, t, scene.constants())[1])(params, trials)
+    np.testing.assert_array_equal(found.ctrl, ctrl)
+    both = (outcome, trace), (again, found._replace(ctrl=None))
+    jax.tree.map(np.testing.assert_array_equal, *both)
+
+
+def test_what_is_observed_is_where_mujoco_has_it(worlds):
+    scene, params, trials = worlds
+    engine = make_engine("structured", scene)
+
+    def look(params, trials):
+        prepared = rollout.prepare(scene, params, trials, scene.constants())
+        fields, ctrl, _ = prepared
+        last = engine.rollout(fields, ctrl).last
+        plan = rollout.prepare(scene, params, trials, scene.constants(), loop(scene, replay))[1]
+        world = policy.begin(scene, fields, plan)._replace(state=last)
+        return (
+            last,
+            fields,
+            policy.observe(scene, world_constants(scene, fields), fields, world, plan),
+        )
+
+    last, fields, seen = grasps.nth(jax.jit(look)(params, trials), ...)
+    state, lay = model.split(scene, last), layout(scene)
+    bodies = {"palm": 1, "object": lay.object}
+    for w in range(len(last)):
+        own = world_model(scene, grasps.nth(fields, w))
+        data = mujoco.MjData(own)
+        data.qpos, data.qvel = state.qpos[w], state.qvel[w]
+        mujoco.mj_kinematics(own, data)
+        mujoco.mj_comPos(own, data)
+        mujoco.mj_comVel(own, data)
+        for name, body in [*bodies.items(), ("link", lay.bodies)]:
+            pose = jax.tree.map(lambda v, w=w: v[w], getattr(seen, name))
+            # Chains of a few rotations in float32, over 0.2 m.
+            np.testing.assert_allclose(pose.position, data.xpos[body], atol=2e-6)
+            matrix = data.xmat[body].reshape(*np.shape(body), 3, 3)
+            np.testing.assert_allclose(pose.rotation, matrix, atol=5e-6)
+        speed = np.zeros(6)
+        mujoco.mj_objectVelocity(own, data, mujoco.mjtObj.mjOBJ_BODY, lay.object, speed, 0)
+        np.testing.assert_allclose(seen.object_velocity[w], speed[[3, 4, 5, 0, 1, 2]], atol=1e-5)
+    np.testing.assert_allclose(seen.time, scene.end_time, rtol=1e-6)
+    assert (seen.phase == len(scene.phase_ends) - 1).all()
+    rest = np.asarray(scene.end_time - [*scene.phase_ends.values()][-2])
+    np.testing.assert_allclose(seen.phase_time, rest, rtol=1e-5)
+
+
+def test_the_derivative_of_a_closed_loop_is_that_of_differences():
+    """By a gain that its policy remembers, and acts on what it observes with."""
+    scene = grasps.short_grasp()
+
+    def react(gain, seen):
+        pressure = seen.plan.pressure + gain * (1.0 + seen.joint[..., 0].mean(1))
+        pose = seen.plan.pose.at[:, 0].add(gain[0] * 1e-6 * seen.object.position[0])
+        return gain, policy.Command(pose, pressure)
+
+    params, trial = grasps.hand_world(scene)
+
+    def distance(gain):
+        engine = loop(scene, react, init=lambda params: params.pressure * 0 + gain, period=0.1)
+        return rollout.grasp(scene, engine, params, trial, steps=30).distance[-1]
+
+    with jax.enable_x64(True):
+        slope = float(jax.jit(jax.grad(distance))(5e3))
+        one, two = (float(jax.jit(distance)(5e3 + d)) for d in (50.0, -50.0))
+    assert abs(slope) > 1e-9
+    # Differences of 1e-12 m, of contacts that bend over the 100 Pa.
+    np.testing.assert_allclose(slope, (one - two) / 100.0, rtol=1e-4)
+
+
+def test_pressures_stay_within_what_the_walls_stand():
+    scene = grasps.short_grasp()
+    params, trials = grasps.random_worlds(scene, 1, 4)
+
+    def wild(carry, seen):
+        return carry, seen.plan._replace(pressure=jnp.array([1e9, -1.0]))
+
+    ctrl = np.asarray(simulate(scene, loop(scene, wild), params, trials)[1].ctrl)
+    limit = jax.vmap(scene.hand.pressure_limit.of)(params.height, params.wall)
+    top = np.maximum(limit, params.pressure)[:, None, 0]
+    np.testing.assert_allclose(ctrl[..., 6], np.broadcast_to(top, ctrl.shape[:2]), rtol=1e-6)
+    assert (ctrl[..., 7] == 0).all()
+
+
+def no_number(carry, seen):
+    late = seen.time > 0.2
+    pressure = jnp.where(late, jnp.nan, seen.plan.pressure)
+    return carry, seen.plan._replace(pressure=pressure)
+
+
+def test_a_command_that_is_no_number_fails_its_world():
+    """And is told where it is, if nothing is traced."""
+    scene = grasps.short_grasp()
+    params, trials = grasps.random_worlds(scene, 1, 2)
+    engine = loop(scene, no_number, period=0.1)
+    outcome, _ = simulate(scene, engine, params, trials)
+    assert (np.asarray(outcome.status) & Status.NONFINITE).all()
+    assert (np.asarray(outcome.bad_step) == 31).all()
+    with pytest.raises(InputError, match=r"commands pressure\[0\] = nan at 0.3 s in world 0"):
+        rollout.simulate(scene, engine, params, trials)
+
+
+@pytest.mark.parametrize(
+    ("step", "attributes", "problem"),
+    [
+        (lambda c, s: (c, s.plan._replace(pressure=jnp.ones(3))), {}, r"shape \(3,\), not \(2,\)"),
+        (lambda c, s: (c, s.plan._replace(pose=jnp.ones((4, 6)))), {}, r"not \(6,\) or \(5, 6\)"),
+        (lambda c, s: (c, s.plan.pressure), {}, "must return .carry, policy.Command"),
+        (lambda c, s: (s.time, s.plan), {}, "must remember arrays like those of its init"),
+        (replay, {"period": 0.013}, "not a whole number of time steps of 0.01 s"),
+        (replay, {"period": 0.0}, "not a whole number of time steps"),
+    ],
+)
+def test_what_is_no_policy_is_refused(step, attributes, problem):
+    scene = grasps.short_grasp()
+    with pytest.raises(InputError, match=problem):
+        jax.eval_shape(
+            partial(rollout.grasp, scene, loop(scene, step, **attributes)),
+            *grasps.hand_world(scene),
+        )
+    with pytest.raises(InputError, match="not a function"):
+        policy.ControlLoop(make_engine("structured", scene), "react")

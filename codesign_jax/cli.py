@@ -60,6 +60,9 @@ class Optimize(Command, flags.SceneFlags):
     cost: Text = None
     """MODULE:FUNCTION, a cost of your own instead of the scene's: a number from scene, trace and
     controls of a grasp (docs/command_line.md)."""
+    policy: Text = None
+    """MODULE:CLASS, a policy of your own that commands the hand by what it observes; its parameters
+    are searched too (docs/control.md)."""
     engine: Engine = None
     particles: Annotated[int | None, _size("particles", "Particles")] = None
     trials: Annotated[
@@ -251,6 +254,8 @@ class Report(Command):
     """The file; default: report.html in the run folder."""
     engine: Text = None
     """Engine that simulates the best grasp again; default: the run's."""
+    policy: Text = None
+    """MODULE:CLASS, the policy of a run that has one, to simulate it again."""
     no_replay: Flag = False
     """Leave the grasp in 3D out: nothing is simulated."""
 

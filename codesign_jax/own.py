@@ -1,4 +1,4 @@
-"""An optimiser or a cost of the user's own, named on the command line as `module:name`.
+"""An optimiser, a cost or a policy of the user's own, named on the command line as `module:name`.
 
 The module is looked for in the working directory first, then among the installed packages.  It is
 imported for a command line that names it and for nothing else: no file can ask for it.
@@ -18,7 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import rollout
+from codesign_jax.engines import DEFAULT, make_engine
 from codesign_jax.optimize import Optimizer, Space, State
+from codesign_jax.policy import ControlLoop, Policy, searched
 from codesign_jax.rollout import CostFunction
 from codesign_jax.scene import InputError, Scene
 from codesign_jax.scene.parameters import design_space
@@ -94,6 +96,32 @@ def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
     trace = Trace(series, series, series, qpos)
     _tried(flag, cost, lambda: jax.eval_shape(judge, trace, *one))
     return cost, stops
+
+
+def make_policy(name: str, scene: Scene) -> tuple[Policy, Scene]:
+    """Imports a policy, or a class that makes one of a scene, and tries it without values.
+
+    Args:
+      name: Its name.
+      scene: The scene whose hand it is to drive.
+
+    Returns:
+      The policy, and the scene with what it lets a search move, see `policy.searched`.
+
+    Raises:
+      InputError: If it is none as `policy.Policy` describes them.
+    """
+    flag, found = f"--policy {name}", _load(name, "--policy")
+    code = found
+    if inspect.isclass(found):
+        _refuse_signature(flag, found, ("scene",))
+        found = _tried(flag, code, lambda: code(scene))
+    _refuse_signature(flag, found, ("carry", "observation"))
+    scene = _tried(flag, code, lambda: searched(scene, found))
+    loop = ControlLoop(make_engine(DEFAULT, scene), found)
+    world = _hand(scene), rollout.nominal_trial(scene)
+    _tried(flag, code, lambda: jax.eval_shape(loop.first_command, *world))
+    return found, scene
 
 
 def make_optimizer(name: str, space: Space, num_particles: int | None = None) -> Optimizer:

@@ -16,7 +16,9 @@ rollout; whatever takes an engine takes it.
 19600
 """
 
+import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -32,9 +34,9 @@ from codesign_jax.engines.structured.laws.kinematics import kinematics
 from codesign_jax.engines.structured.world_model import WorldModel, world_constants
 from codesign_jax.model import ModelFields
 from codesign_jax.model.layout import WRIST, layout
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, key_frames
 from codesign_jax.scene.schema import InputError
-from codesign_jax.types import Params, Trace
+from codesign_jax.types import Params, Trace, Trial
 
 PERIOD = 0.05
 """Seconds between two calls of a policy that does not say so itself."""
@@ -102,7 +104,7 @@ Policy = Callable[[Any, Observation], tuple[Any, Command]]
 """From what it remembers and an observation of one world to both what it remembers and a command.
 
 Attributes that it may have:
-  period: Seconds from call to call, a whole number of time steps; without it `PERIOD`.
+  period: Seconds from call to call, a whole number of time steps; without it about `PERIOD`.
   init: A function of the hand's `Params` to what it remembers at first, a tree of arrays of fixed
     shape and type; without it ().
   parameters: Numbers that a search may move, rows as [[parameter]] of a control file; `init` finds
@@ -140,7 +142,7 @@ class ControlLoop(Equal):
             raise InputError([words])
         self.engine, self.policy, self.name = engine, policy, engine.name
         self.scene: Scene = engine.scene  # type: ignore[attr-defined]
-        self.steps = period_steps(self.scene, getattr(policy, "period", PERIOD))
+        self.steps = period_steps(self.scene, getattr(policy, "period", None))
 
     def _key(self) -> tuple:
         return self.engine, self.policy, self.scene.hand.pressure_limit
@@ -148,26 +150,21 @@ class ControlLoop(Equal):
     commands = staticmethod(control.plan)
     """What `rollout.prepare` makes for `rollout`: the plan instead of controls."""
 
-    def rollout(self, fields: ModelFields, ctrl: Plan, *, trajectory: bool = False) -> Trace:
+    def rollout(self, fields: ModelFields, ctrl: Any, *, trajectory: bool = False) -> Trace:
         """See `Engine.rollout`; `ctrl` is a plan, every array with a leading axis (world,).
 
         Raises:
           InputError: If the policy does not return what it should, or, where nothing is traced,
             a command that is not finite: inside of `jax.jit` such a world has failed (NONFINITE).
         """
-        plan, hand = ctrl, world_constants(self.scene, fields)
+        plan: Plan = ctrl
+        hand = world_constants(self.scene, fields)
         series = {"pose": plan.pose, "pressure": plan.pressure, "shake": plan.shake}
 
         def period(carry: tuple, now: dict[str, jax.Array]) -> tuple[tuple, Trace]:
             world, memory = carry
             ahead = plan._replace(**now)
-            seen = observe(self.scene, hand, fields, world, ahead)
-            answer = jax.vmap(self.policy)(memory, seen)
-            if not (isinstance(answer, tuple) and [*map(type, answer[1:])] == [Command]):
-                raise InputError([f"{self._called} must return (carry, policy.Command)"])
-            told, command = answer
-            self._refuse_memory(memory, told)
-            command = self._spread(command, ahead)
+            told, command = self._asked(hand, fields, world, memory, ahead)
             world, trace = advance(self.engine, fields, world, ahead, command, trajectory)
             return (world, told), trace._replace(last=None)
 
@@ -183,6 +180,31 @@ class ControlLoop(Equal):
         trace = jax.tree.map(lambda *v: jnp.concatenate(v, 1), *found)
         self._refuse_nonfinite(trace.ctrl)
         return trace._replace(last=carry[0].state)
+
+    def first_command(self, params: Params, trial: Trial) -> Command:
+        """What the policy commands over a grasp's first period: it is asked, nothing is simulated.
+
+        Raises:
+          InputError: As `rollout`.
+        """
+        params, trial = jax.tree.map(lambda v: jnp.asarray(v)[None], (params, trial))
+        fields = jax.vmap(partial(model.model_fields, self.scene))(params, trial)
+        plan = jax.vmap(partial(control.plan, self.scene))(params, trial)
+        series = {k: getattr(plan, k)[:, : self.steps] for k in ("pose", "pressure", "shake")}
+        hand, world = world_constants(self.scene, fields), begin(self.scene, fields, plan)
+        memory = self._remembered(params)
+        command = self._asked(hand, fields, world, memory, plan._replace(**series))[1]
+        return jax.tree.map(lambda v: v[0], command)
+
+    def _asked(
+        self, hand: WorldModel, fields: ModelFields, world: World, memory: Any, plan: Plan
+    ) -> tuple[Any, Command]:
+        """What the policies remember, and command over the period of the plan."""
+        answer = jax.vmap(self.policy)(memory, observe(self.scene, hand, fields, world, plan))
+        if not (isinstance(answer, tuple) and [*map(type, answer[1:])] == [Command]):
+            raise InputError([f"{self._called} must return (carry, policy.Command)"])
+        self._refuse_memory(memory, answer[0])
+        return answer[0], self._spread(answer[1], plan)
 
     @property
     def _called(self) -> str:
@@ -239,13 +261,32 @@ class ControlLoop(Equal):
         raise InputError([f"{self._called} commands {value} at {time} in world {world}"])
 
 
-def period_steps(scene: Scene, period: float) -> int:
-    """Time steps of a period [s].
+def searched(scene: Scene, policy: Policy) -> Scene:
+    """The scene with the policy's parameters beside those of its key frames.
+
+    Raises:
+      InputError: If they are not rows as those of a control file, or have a name that is taken.
+    """
+    rows = key_frames.read_parameters(getattr(policy, "parameters", ()), "policy.parameters")
+    there = {row.name: row for row in scene.control.parameter}
+    new = tuple(row for row in rows if there.get(row.name) != row)
+    if taken := [row.name for row in new if row.name in there]:
+        words = f"{', '.join(taken)} of the policy: the scene's control has such a parameter"
+        raise InputError([words])
+    more = dataclasses.replace(scene.control, parameter=(*scene.control.parameter, *new))
+    hand = key_frames.with_parameters(scene.hand, dataclasses.replace(more, parameter=new))
+    return dataclasses.replace(scene, control=more, hand=hand)
+
+
+def period_steps(scene: Scene, period: float | None) -> int:
+    """Time steps of a period [s]; None for about `PERIOD`.
 
     Raises:
       InputError: If they are not a whole number.
     """
     h = scene.discretization.timestep
+    if period is None:
+        return max(1, round(PERIOD / h))
     steps = round(period / h) if np.isfinite(period) else 0
     if steps < 1 or abs(steps * h - period) > 1e-6 * h:
         raise InputError([f"period = {period:g} s is not a whole number of time steps of {h:g} s"])

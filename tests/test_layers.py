@@ -273,7 +273,7 @@ def test_what_is_imported_is_there():
 # As `find DIR -name '*.py' | xargs cat | wc -l` counts.  A larger number is a line of a review: say
 # there what users have of it, and what could go in its place.
 MOST_LINES = {
-    "codesign_jax": 40_000,
+    "codesign_jax": 40_800,
     "codesign_jax/codesign": 600,
     "codesign_jax/commands": 4_050,
     "codesign_jax/compiler": 3_100,
@@ -282,10 +282,10 @@ MOST_LINES = {
     "codesign_jax/model": 1_650,
     "codesign_jax/optimize": 1_400,
     "codesign_jax/report": 2_200,
-    "codesign_jax/runs": 3_270,
+    "codesign_jax/runs": 3_340,
     "codesign_jax/scene": 5_400,
     "scripts": 5_200,
-    "tests": 26_000,
+    "tests": 26_400,
 }
 
 

@@ -92,6 +92,38 @@ def turned(scene, trace, ctrl):
     return jnp.abs(trace.at(scene, "disturb").qpos[3])
 
 
+class Pull:
+    """Moves the hand aside by a searched share of a metre, once fingers move."""
+
+    period = 0.1
+    parameters = [{"name": "share", "unit": "1", "low": 0.0, "high": 1.0, "default": 0.3}]
+
+    def __init__(self, scene):
+        self.fingers = scene.num_fingers
+
+    def init(self, params):
+        return params.control["share"]
+
+    def __call__(self, share, seen):
+        moving = jnp.abs(seen.joint_velocity).max() > 0.1
+        pose = seen.plan.pose[0].at[0].add(jnp.where(moving, share, 0.0))
+        return share, seen.plan._replace(pose=pose)
+
+
+class Narrow(Pull):
+    def __call__(self, share, seen):
+        return share, seen.plan._replace(pressure=jnp.zeros(7))
+
+
+class Taken(Pull):
+    parameters = [{"name": "length", "unit": "mm", "low": 0, "high": 1, "default": 0}]
+
+
+class Unknown(Pull):
+    def __call__(self, share, seen):
+        return share, seen.plan._replace(pressure=seen.touch)
+
+
 def until_lost(scene, trace, ctrl):
     return trace.distance.mean()
 
@@ -187,6 +219,29 @@ def test_changed_code_is_refused_with_what_changed(here, capsys):
     assert snapshot(here / "run") == before
 
 
+def test_a_policy_is_searched_and_said_wherever_it_acts(here, capsys):
+    """Its parameter is one of the design's; no command simulates its designs without it."""
+    run = [*RUN, "--policy", "mine:Pull", "--optimizer", "random", "--episodes", "1"]
+    assert cli.main([*run, "--out", "run"]) == 0
+    assert "share" in capsys.readouterr().out
+    the_scene, settings = runs.read_run(here / "run")
+    assert settings.policy == "mine:Pull" and the_scene.control.parameter[0].name == "share"
+    assert cli.main([*run, "--out", "run"]) == 0  # resumes
+    assert cli.main([*run[:-4], "--policy", "mine:Narrow", "--out", "run"]) == 2
+    capsys.readouterr()
+    trials = ["--trials", "2", "--run", "run"]
+    assert cli.main(["evaluate", *trials]) == 2
+    assert "the run was made with --policy mine:Pull" in capsys.readouterr().err
+    kept = []
+    for share in ("0", "1"):
+        design = ["--scene", str(TINY), "--design", f"share={share}"]
+        table = ["--out", f"{share}.csv"]
+        cli.main(["evaluate", "--policy", "mine:Pull", *design, "--trials", "2", *table])
+        kept.append((here / f"{share}.csv").read_text())
+    assert kept[0] != kept[1]
+    assert cli.main(["evaluate", *trials, "--policy", "mine:Pull"]) in (0, 1)
+
+
 WRONG = {
     "--cost low": "'low' must be MODULE:NAME",
     "--cost mine:": "'mine:' must be MODULE:NAME",
@@ -199,6 +254,10 @@ WRONG = {
     "--cost mine:misspelt": "AttributeError: 'Trace' object has no attribute 'hight' (",
     "--cost mine:reads_too_much": "ValueError: a cost reads trace.qpos",
     "--cost broken:low": "importing it fails: ZeroDivisionError: division by zero (",
+    "--policy mine:Narrow": "returned pressure of shape (7,), not (2,) or (5, 2)",
+    "--policy mine:Taken": "policy.parameters[0].name = 'length' must be a lower-case word not",
+    "--policy mine:Unknown": "AttributeError: 'Observation' object has no attribute 'touch' (",
+    "--policy mine:low": "it must be a function of (carry, observation)",
     "--optimizer mine:NoTree": "it is no pytree",
     "--optimizer mine:NoTell": "it lacks tell of optimize.Optimizer",
     "--optimizer mine:Forgetful": "tell must return a state, with the arrays of init's",

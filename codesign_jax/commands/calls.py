@@ -29,7 +29,7 @@ class Trials(NamedTuple):
 
     Attributes:
       scene: The scene.
-      engine: Name of the engine that simulates.
+      engine: Name of the engine that simulates, and of a policy.
       space: Design space of the designs.
       count: Trials of each design.
       seed: Root of the trials' noise.

@@ -14,7 +14,7 @@ from rich.console import Console
 from codesign_jax import codesign, optimize, runs, sampling
 from codesign_jax.commands import common, preflight, reference
 from codesign_jax.commands.common import find_case
-from codesign_jax.engines import Engine, make_engine
+from codesign_jax.engines import Engine
 from codesign_jax.report.statistics import wilson
 from codesign_jax.runs import Settings, choice
 from codesign_jax.runs.choice import Case
@@ -88,7 +88,7 @@ def simulate(
 
     The second are the first of the first ones: the same designs and trials.
     """
-    engines = [make_engine(case.engine, scene) for scene in (case.scene, finer)]
+    engines = [case.make_engine(scene) for scene in (case.scene, finer)]
     trials = len(case.scene.objects.object)
     count = max(_LEAST, (options.grasps or settings.particles * settings.trials) // trials)
     with Busy(console, "compiling") as busy:

@@ -20,6 +20,7 @@ from rich.table import Table
 from codesign_jax import engines
 from codesign_jax import scene as scenes
 from codesign_jax.commands.flags import SceneFlags, Subject, TrialFlags
+from codesign_jax.own import make_policy
 from codesign_jax.reuse import use_compilation_cache as use_compilation_cache
 from codesign_jax.runs import choice, tables
 from codesign_jax.runs.choice import Case
@@ -61,9 +62,12 @@ def find_case(options: Subject, *, tell: Tell = warn) -> Case:
     """The design that the flags name: the best of a run, or one given by its parameters."""
     if options.run_folder is None:
         scene, words = load_scene(options), [*chain.from_iterable(options.design)]
+        if options.policy:
+            scene = make_policy(options.policy, scene)[1]
         space = design_space(scene.hand, preset_of(options))
         design = find_design(space, words)
-        return Case(scene, space, design, options.engine or engines.DEFAULT)
+        how = options.engine or engines.DEFAULT, options.policy or ""
+        return Case(scene, space, design, *how)
     own = {"--hand": options.hand, "--scene": options.scene, "--preset": options.preset}
     given = ["--design"] * bool(options.design) + [f for f, v in own.items() if v is not None]
     if given:
@@ -71,7 +75,9 @@ def find_case(options: Subject, *, tell: Tell = warn) -> Case:
             [f"--run brings design, hand and scene of its own; leave out {' and '.join(given)}"]
         )
     how = {"objects": options.objects, "accuracy": options.accuracy, "engine": options.engine}
-    return choice.case_of_run(options.run_folder, overrides=changes(options), tell=tell, **how)
+    case = choice.case_of_run(options.run_folder, overrides=changes(options), tell=tell, **how)
+    choice.refuse_other_policy(case.policy, options.policy)
+    return case
 
 
 def preset_of(options: Subject) -> str:

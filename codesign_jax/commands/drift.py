@@ -30,7 +30,7 @@ def simulate(
 
     steps, count = options.tolerance_steps, options.tolerance_trials
     planned = study(case, options)
-    trials = Trials(case.scene, case.engine, planned.space, count, options.seed)
+    trials = Trials(case.scene, case.commanded, planned.space, count, options.seed)
     first = 1 + int(planned.room.sum())
     size = calls.equal(first, calls.most_designs(trials))
     _announce(planned, options, console)

@@ -12,7 +12,6 @@ from rich.console import Console
 from codesign_jax import engines, rollout, runs, types
 from codesign_jax.commands import common, preflight, reference
 from codesign_jax.commands.common import find_case
-from codesign_jax.engines import make_engine
 from codesign_jax.report import stress, verdicts
 from codesign_jax.runs import choice, tables
 from codesign_jax.runs.choice import Case
@@ -28,7 +27,7 @@ def main(options: "Evaluate") -> int:
     common.use_compilation_cache()
     case = _of_particle(find_case(options), options)
     _check(options, case.engine)
-    engine = make_engine(case.engine, case.scene)
+    engine = case.make_engine()
     notes = preflight.notes(case.scene, case.space, {"the design": case.design})
     console = Console(highlight=False, soft_wrap=True)
     if options.run_folder:

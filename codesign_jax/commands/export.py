@@ -14,7 +14,6 @@ from rich.console import Console
 from codesign_jax import engines, files, provenance, rollout, runs
 from codesign_jax.commands import common, drift, preflight, reference
 from codesign_jax.commands.common import find_case
-from codesign_jax.engines import make_engine
 from codesign_jax.export import grasps, plain, process, tables
 from codesign_jax.export.process import Process, Size
 from codesign_jax.runs.choice import Case
@@ -37,8 +36,10 @@ def main(options: "Export") -> int:
     params = _params(case)
     sizes = [] if options.no_parts and options.no_sheet else _sizes(case, params, options)
     notes = preflight.notes(case.scene, case.space, {"the design": case.design})
+    if case.policy:
+        notes.append(f"commands are those of the key frames: policy {case.policy} is left out")
     simulating = options.tolerance != "off" and not options.no_sheet
-    engine = make_engine(case.engine, case.scene) if simulating else None
+    engine = case.make_engine() if simulating else None
     console = Console(highlight=False, soft_wrap=True)
     if options.run_folder:
         console.print(f"best final design of {options.run_folder}", markup=False)

@@ -79,6 +79,9 @@ class Subject(SceneFlags):
     preset: Text = None
     """Design space that the names belong to; default: the run's, the design file's, or 2d."""
     engine: Engine = None
+    policy: Text = None
+    """MODULE:CLASS, a policy of your own that commands the hand (docs/control.md); with --run that
+    of the run."""
 
 
 @dataclasses.dataclass

@@ -10,7 +10,6 @@ import numpy as np
 from codesign_jax import rollout, runs
 from codesign_jax.commands import common
 from codesign_jax.commands.common import find_case
-from codesign_jax.engines import make_engine
 from codesign_jax.runs import choice
 from codesign_jax.runs.choice import Case
 from codesign_jax.scene.schema import InputError
@@ -82,7 +81,7 @@ def simulate(asked: Asked) -> "Replay":
     case = asked.case
     params = case.space.params(jnp.asarray(case.design, jnp.float32))
     trials = jax.tree.map(lambda v: v[None], asked.trial)
-    return animation.replay(case.scene, make_engine(case.engine, case.scene), params, trials)[0]
+    return animation.replay(case.scene, case.make_engine(), params, trials)[0]
 
 
 def description(asked: Asked, shown: "Replay") -> list[str]:

@@ -12,7 +12,6 @@ from codesign_jax.commands import calls, common, preflight
 from codesign_jax.commands.calls import Calls, Trials
 from codesign_jax.commands.common import find_case
 from codesign_jax.cost import particle_cost
-from codesign_jax.engines import make_engine
 from codesign_jax.report import landscape
 from codesign_jax.report.landscape import Landscape
 from codesign_jax.runs.choice import Case
@@ -134,7 +133,7 @@ def _dry_run(case: Case, designs: np.ndarray, options: "Options", console: Conso
 
 
 def _trials(case: Case, options: "Options") -> Trials:
-    return Trials(case.scene, case.engine, case.space, options.trials, options.seed)
+    return Trials(case.scene, case.commanded, case.space, options.trials, options.seed)
 
 
 def simulated_designs(
@@ -147,7 +146,7 @@ def simulated_designs(
     trials = _trials(case, options)
     size = calls.equal(len(designs), calls.most_designs(trials))
     grasps = len(designs) * trials.count
-    engine = make_engine(case.engine, case.scene)
+    engine = case.make_engine()
     simulate = Calls(trials, engine, size, part, designs)
     console.print(f"grasps: {grasps} in {common.counted(-(-len(designs) // size), 'call')}")
     if simulate.refused:

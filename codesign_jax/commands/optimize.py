@@ -7,7 +7,7 @@ import shlex
 import sys
 import traceback
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -16,7 +16,7 @@ from rich.console import Console
 from codesign_jax import codesign, engines, files, optimize, runs
 from codesign_jax.commands import common, compare, hosts, preflight, reference, status
 from codesign_jax.commands.compare import Compared
-from codesign_jax.own import is_own
+from codesign_jax.own import is_own, make_policy
 from codesign_jax.report import stress, verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import Plan, RunResult, Settings, columns
@@ -242,6 +242,8 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
     try:
         problems += common.engine_problems(options.engine or engines.DEFAULT, options.overrides)
         scene = common.load_scene(options)
+        if options.policy:
+            scene = make_policy(options.policy, scene)[1]
     except InputError as error:
         problems += error.problems
     schedules = options.schedule.split(",")
@@ -263,6 +265,7 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
         test_trials=options.test_trials,
         optimizer=optimizer or optimize.DEFAULT,
         cost=options.cost or runs.SCENE_COST,
+        policy=options.policy or "",
         objects=len(scene.objects.object) if scene else 1,
     )
     problems += _flag_problems(options)
@@ -297,9 +300,9 @@ def _of_the_runs(options: "Optimize", scene: Scene) -> tuple[str | None, int | N
     An optimiser of somebody's own is not among them: only a command line has code imported.
     """
     optimizer, cost = options.optimizer, options.cost or runs.SCENE_COST
-    usual = runs.make_settings(
-        options.preset, "", "", "", 0, optimizer=optimizer or optimize.DEFAULT, cost=cost
-    )
+    own: dict[str, Any] = {"optimizer": optimizer or optimize.DEFAULT, "cost": cost}
+    own["policy"] = options.policy or ""
+    usual = runs.make_settings(options.preset, "", "", "", 0, **own)
     folders = runs_of(options, scene, usual)
     if optimizer is None:
         found = runs.setting_of(folders, "optimizer")
@@ -342,6 +345,7 @@ def _folder(options: "Optimize", scene: Scene, settings: Settings) -> Path:
         return options.out.joinpath(*inside)
     names = [scene.hand.name, settings.preset, settings.schedule, str(settings.seed)]
     others = (settings.optimizer, optimize.DEFAULT), (settings.cost, runs.SCENE_COST)
+    others = *others, (settings.policy, "")
     names[3:3] = [asked.replace(":", ".") for asked, usual in others if asked != usual]
     name = "-".join(names)
     # Whoever wrote the files would choose a place on this disk.

@@ -11,8 +11,8 @@ from rich.console import Console
 
 from codesign_jax import rollout, runs
 from codesign_jax.commands import common, grasp
-from codesign_jax.engines import make_engine
 from codesign_jax.runs import failures
+from codesign_jax.runs.choice import Case, refuse_other_policy
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.scene.schema import InputError
@@ -32,7 +32,7 @@ def main(options: "Replay") -> int:
         if options.run_folder is not None:
             raise InputError([f"{options.path} and --run {options.run_folder}: give one of them"])
         if not options.path.is_dir():
-            return explain(options.path, options.engine)
+            return explain(options.path, options.engine, options.policy)
         options.run_folder = options.path
     path = options.out or (options.run_folder or Path()) / "replay.html"
     common.refuse(common.place_problems("--out", path, ".html"))
@@ -71,10 +71,11 @@ def show_failures(folder: Path) -> None:
         print(f"and {len(found) - MOST} more in {folder / failures.FOLDER}")
 
 
-def explain(path: Path, engine: str | None) -> int:
+def explain(path: Path, engine: str | None, policy: str | None) -> int:
     """Says how a failed world failed, and what happens when it is simulated again."""
     failure = failures.load(path)
     scene, settings = runs.read_run(path.resolve().parent.parent)
+    refuse_other_policy(settings.policy, policy)
     name = engine or settings.engine
     common.refuse(common.engine_problems(name))
     space, h = design_space(scene.hand, settings.preset), scene.discretization.timestep
@@ -86,7 +87,8 @@ def explain(path: Path, engine: str | None) -> int:
     place = " ".join(f"{flag} {number}" for flag, number in numbers)
     print(f"in 3D: codesign replay {path.parent.parent} {place}")
     world = space.params(jnp.asarray(failure.design)), failure.trial
-    run = jax.jit(lambda p, t: rollout.simulate(scene, make_engine(name, scene), p, t))
+    simulator = Case(scene, space, failure.design, name, settings.policy).make_engine()
+    run = jax.jit(lambda p, t: rollout.simulate(scene, simulator, p, t))
     found = run(*jax.tree.map(lambda v: jnp.asarray(v)[None], world))
     outcome, trace = jax.tree.map(lambda v: np.asarray(v)[0], found)
     bad = int(outcome.bad_step)

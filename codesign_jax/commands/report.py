@@ -24,6 +24,8 @@ def main(options: "Report") -> int:
     """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     scene, settings = runs.read_run(options.folder)
+    if not options.no_replay:
+        choice.refuse_other_policy(settings.policy, options.policy)
     name = options.engine or settings.engine
     common.refuse(common.engine_problems(name))
     try:
@@ -70,6 +72,7 @@ def best_grasp(
 ) -> "tuple[choice.Grasp, animation.Replay]":
     """The best grasp of the chosen design, simulated again to see how it moves."""
     planned = choice.find_grasp(scene, record)
-    case = Case(scene, design_space(scene.hand, settings.preset), planned.design, engine)
+    space = design_space(scene.hand, settings.preset)
+    case = Case(scene, space, planned.design, engine, settings.policy)
     with Busy(console, "simulating the best grasp again"):
         return planned, grasp.simulate(grasp.Asked(case, planned.trial, "", None))

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from codesign_jax import Task, codesign, files, rollout, runs
 from codesign_jax.codesign import VERDICTS
 from codesign_jax.commands import common
-from codesign_jax.engines import Engine, make_engine
+from codesign_jax.engines import Engine
 from codesign_jax.model import overlap
 from codesign_jax.report import animation, bodies, stress, verdicts, viewer
 from codesign_jax.runs import choice
@@ -76,7 +76,7 @@ class Bench:
     def __init__(self, found: Case) -> None:
         """Takes scene, space and the engine's name."""
         self.case = found
-        self.engine = make_engine(found.engine, found.scene)
+        self.engine = found.make_engine()
         self.objects = len(found.scene.objects.object)
 
     @functools.cached_property

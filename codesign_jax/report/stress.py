@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from codesign_jax import codesign, model, rollout
-from codesign_jax.engines import Engine, make_engine
+from codesign_jax.engines import Engine
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.model import morphology, overlap
 from codesign_jax.model.overlap import Overlaps
@@ -102,7 +102,7 @@ class Stress(NamedTuple):
 def simulate(case: Case, trials: int, key: jax.Array) -> Stress:
     """Simulates the design under every condition, in the same trials."""
     scene, conditions, kept = case.scene, [], []
-    run = _program(scene, case.engine, case.space, trials)
+    run = _program(scene, case, trials)
     design = jnp.asarray(case.design, jnp.float32)
     found, qpos, drawn = interruptible(run, design, key)
     params = jax.tree.map(np.asarray, jax.jit(case.space.params)(design))
@@ -113,7 +113,7 @@ def simulate(case: Case, trials: int, key: jax.Array) -> Stress:
     other = dataclasses.replace(scene, effects=dataclasses.replace(scene.effects, neo_hookean=law))
     name = f"{'neo-Hookean' if law else 'linear'} bending law"
     try:
-        run = _program(other, case.engine, case.space, trials)
+        run = _program(other, case, trials)
     except InputError:  # an engine that has one law only
         pass
     else:
@@ -159,8 +159,8 @@ def _changed(table: Any, path: tuple[str, ...], change: Callable[[float], float]
     return table._replace(**{path[0]: _changed(getattr(table, path[0]), path[1:], change)})
 
 
-def _program(scene: Scene, engine: str, space: DesignSpace, trials: int) -> Program:
-    return Program(scene, _recorded(scene, make_engine(engine, scene), space, trials))
+def _program(scene: Scene, case: Case, trials: int) -> Program:
+    return Program(scene, _recorded(scene, case.make_engine(scene), case.space, trials))
 
 
 @shared

@@ -8,9 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from codesign_jax import own
 from codesign_jax.codesign import Task, episode_trials
 from codesign_jax.cost import particle_cost
-from codesign_jax.engines import make_engine
+from codesign_jax.engines import Engine, make_engine
+from codesign_jax.policy import ControlLoop
 from codesign_jax.runs import scene_files
 from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.reading import Tell, load_record, read_run
@@ -68,23 +70,45 @@ class Case(NamedTuple):
       space: The design space.
       design: The design [SI units], shape (parameter,).
       engine: Name of the engine.
+      policy: Name of the user's own policy that commands the hand; empty for the key frames alone.
     """
 
     scene: Scene
     space: DesignSpace
     design: np.ndarray
     engine: str
+    policy: str = ""
+
+    @property
+    def commanded(self) -> str:
+        """Names of engine and policy."""
+        return f"{self.engine} {self.policy}".strip()
+
+    def make_engine(self, scene: Scene | None = None) -> Engine:
+        """The engine of the scene, or of one that differs from it, with the policy if any."""
+        scene = scene or self.scene
+        engine = make_engine(self.engine, scene)
+        if not self.policy:
+            return engine
+        return ControlLoop(engine, own.make_policy(self.policy, scene)[0])
 
     def simulate(self, trials: int, key: jax.Array) -> Outcome:
         """Outcomes in trials that depend on objects and key alone, arrays of shape (trial,)."""
-        task = Task(self.scene, self.space, trials, make_engine(self.engine, self.scene))
+        task = Task(self.scene, self.space, trials, self.make_engine())
         population = jnp.asarray(self.design, jnp.float32)[None]
         found = interruptible(task.evaluate, population, key)
         return jax.tree.map(lambda v: np.asarray(v)[0], found)
 
     def digest(self, *numbers: int) -> str:
         """Digest of what determines outcomes, beside code, versions and device."""
-        return scene_files.digest(self.scene, self.engine, self.design, *numbers)
+        return scene_files.digest(self.scene, self.commanded, self.design, *numbers)
+
+
+def refuse_other_policy(policy: str, given: str | None) -> None:
+    """Refuses to import a run's policy that the command line does not name, or to leave it out."""
+    if policy != (given or ""):
+        made = f"--policy {policy}" if policy else "no policy"
+        raise InputError([f"the run was made with {made}; --policy is {given or 'not given'}"])
 
 
 def case_of_run(
@@ -111,7 +135,7 @@ def case_of_run(
                 f"{settings.preset!r}; the run's designs have {len(chosen.design)}"
             ]
         )
-    return Case(scene, space, chosen.design, engine or settings.engine)
+    return Case(scene, space, chosen.design, engine or settings.engine, settings.policy)
 
 
 def read_record(folder: Path, *, tell: Tell | None = None) -> Record:

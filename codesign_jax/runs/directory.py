@@ -161,13 +161,13 @@ def _resume(path: Path, settings: Settings, command: list[str]) -> list[str]:
 
 def _contents(scene: Scene, settings: Settings) -> dict[str, bytes]:
     """Files that a run is made from: the scene's, and the user's own code."""
-    return scene_files.contents(scene) | own.contents((settings.optimizer, settings.cost))
+    return scene_files.contents(scene) | own.contents(settings.own)
 
 
 def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str, Any]) -> None:
     problems, extension = [], []
     for name, value in dataclasses.asdict(settings).items():
-        stood = stored["settings"][name]
+        stood = stored["settings"].get(name, "")
         if name == "episodes":
             extension = _extension_problems(scene, settings, stood)
         elif stood != value:
@@ -209,7 +209,7 @@ def _is_cut_short(path: Path, scene: Scene, settings: Settings, stored: dict[str
 def _other_code(path: Path, settings: Settings, stored: dict[str, Any]) -> list[str]:
     """How the user's own optimiser and cost differ from those that the run was made with."""
     found = []
-    for name, content in own.contents((settings.optimizer, settings.cost)).items():
+    for name, content in own.contents(settings.own).items():
         if manifest.digests({name: content})[name] != stored["files"].get(name):
             diff = _diff(path, name, content.decode())
             found += [f"{Path(name).stem} was changed since the run was made:", *diff]

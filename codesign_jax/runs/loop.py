@@ -20,6 +20,7 @@ from codesign_jax.batch import Request
 from codesign_jax.codesign import EpisodeInfo, FinalTest, Task
 from codesign_jax.engines import make_engine
 from codesign_jax.optimize import NoSeed, Optimizer, State, translated
+from codesign_jax.policy import ControlLoop
 from codesign_jax.runs import failures, reading, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs.checkpoint import Checkpoints
@@ -119,10 +120,12 @@ def prepare(scene: Scene, settings: Settings) -> Plan:
       settings: Settings without `settings.check`'s problems.
 
     Raises:
-      InputError: If an optimiser or a cost of the user's own is none; see `own`.
+      InputError: If an optimiser, a cost or a policy of the user's own is none; see `own`.
     """
     space, mask = design_space(scene.hand, settings.preset), masks_of(scene, settings)
     engine = make_engine(settings.engine, scene)
+    if settings.policy:
+        engine = ControlLoop(engine, own.make_policy(settings.policy, scene)[0])
     n = settings.particles
     optimizer = codesign.make_optimizer(settings.optimizer, space, num_particles=n)
     task, key = Task(scene, space, settings.trials, engine), jax.random.key(settings.seed)

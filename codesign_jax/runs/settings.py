@@ -32,6 +32,7 @@ class Settings:
         `trials`; 0 for no test.
       optimizer: One of `optimize.NAMES`, or MODULE:NAME of one of the user's own.
       cost: `SCENE_COST`, or MODULE:NAME of a cost of the user's own.
+      policy: MODULE:NAME of a policy of the user's own; empty without one.
     """
 
     preset: str
@@ -45,6 +46,12 @@ class Settings:
     test_trials: int
     optimizer: str = optimize.PAPER
     cost: str = SCENE_COST
+    policy: str = ""
+
+    @property
+    def own(self) -> tuple[str, ...]:
+        """Names of the user's own code, beside those of this package."""
+        return self.optimizer, self.cost, self.policy
 
     @property
     def test_rounds(self) -> int:
@@ -74,6 +81,7 @@ def make_settings(
     test_trials: int | None = None,
     optimizer: str = optimize.PAPER,
     cost: str = SCENE_COST,
+    policy: str = "",
     objects: int = 3,
 ) -> Settings:
     """Fills sizes that are not given: those of `sizes`, in a scene with so many `objects`."""
@@ -84,7 +92,7 @@ def make_settings(
         usual = usual._replace(trials=max(objects, usual.trials))
     asked = (particles, trials, episodes, test_trials)
     n, t, e, test = (s if a is None else a for a, s in zip(asked, usual, strict=True))
-    return Settings(preset, schedule, first, engine, n, t, e, seed, test, optimizer, cost)
+    return Settings(preset, schedule, first, engine, n, t, e, seed, test, optimizer, cost, policy)
 
 
 def masks_of(scene: Scene, settings: Settings) -> np.ndarray:
@@ -116,6 +124,8 @@ def check(settings: Settings, hand: Hand | None) -> list[str]:
     found += [f"--optimizer: {problem}"] if problem else []
     if settings.cost != SCENE_COST and (problem := own.problem(settings.cost)):
         found.append(f"--cost: {problem}")
+    if settings.policy and (problem := own.problem(settings.policy)):
+        found.append(f"--policy: {problem}")
     space = None
     if hand is not None:
         try:

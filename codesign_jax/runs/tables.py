@@ -131,10 +131,13 @@ def describe(space: DesignSpace, design: np.ndarray, title: str = "design") -> s
     other parameters.
     """
     own, others = by_finger(space)
-    values, units = [f"{value:.4g}" for value in space.in_units(design)], space.units
+    values = [f"{value:.4g}" for value in space.in_units(design)]
+    units = ["" if unit == "1" else unit for unit in space.units]
     if not own:
         pairs = zip(space.names, values, units, strict=True)
-        return f"{title}: " + " ".join(f"{name}={value} {unit}" for name, value, unit in pairs)
+        return f"{title}: " + " ".join(
+            f"{name}={value} {unit}".rstrip() for name, value, unit in pairs
+        )
     fingers = [[name, units[at[0]], *(values[k] for k in at)] for name, at in own.items()]
     index = ["finger", "", *map(str, range(len(fingers[0]) - 2))]
     hand = [[space.names[k], units[k], values[k]] for k in others]

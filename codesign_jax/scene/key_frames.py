@@ -216,6 +216,23 @@ def load(name: str | Path, hand: Hand, *, overrides: Mapping[Any, Any] | None = 
     return control
 
 
+def read_parameters(rows: Any, where: str) -> tuple[ControlParameter, ...]:
+    """Parameters from rows as those of a file, for what else than key frames has some.
+
+    Raises:
+      InputError: With every problem, by key path.
+    """
+    problems: list[str] = []
+    reader = _Reader({}, where, 0, problems)
+    found = [schema.parse(ControlParameter, row, where, problems) for row in rows]
+    for i, row in enumerate(found):
+        if row is not None:
+            reader.parameter(row, f"{where}[{i}]")
+    if problems:
+        raise schema.InputError(problems)
+    return tuple(row for row in found if row is not None)
+
+
 def with_parameters(hand: Hand, control: Control) -> Hand:
     """The hand with the control's parameters in its table."""
     return dataclasses.replace(
@@ -376,7 +393,7 @@ class _Reader:
         if file is None:
             return None
         for i, row in enumerate(file.parameter):
-            self._parameter(row, f"{self.where}.parameter[{i}]")
+            self.parameter(row, f"{self.where}.parameter[{i}]")
         for name, fingers in file.group.items():
             self._group(name, fingers)
         frames, now = [], (Pascals(0.0),) * self.fingers
@@ -388,7 +405,7 @@ class _Reader:
             self.problems.append(f"{self.where}.frame[0].time must be 0: a grasp begins with it")
         return Control(file.name, file.description, tuple(frames), file.parameter)
 
-    def _parameter(self, row: ControlParameter, path: str) -> None:
+    def parameter(self, row: ControlParameter, path: str) -> None:
         if not _NAME.fullmatch(row.name) or row.name in self.units or row.name in PARAMETERS:
             self.problems.append(
                 f"{path}.name = {schema.shown(row.name)} must be a lower-case word not taken"

@@ -14,7 +14,8 @@ import pytest
 from codesign_jax import cli, codesign
 from codesign_jax.commands import preflight, status
 from codesign_jax.scene import effects
-from tests.helpers.command_runs import EPISODES, RUN, command, finished_run, own_workplace  # noqa: F401
+from tests.helpers.command_runs import EPISODES, command, finished_run, own_workplace  # noqa: F401
+from tests.helpers.tiny_run import RUN
 from tests.helpers.toy_engine import TINY
 
 
@@ -146,7 +147,7 @@ def test_wrong_hand_file_reports_every_problem(tmp_path, workplace, capsys):
 def test_dry_run_writes_nothing(workplace, capsys):
     assert command(*RUN, "--out", "run", "--dry-run") == 0
     output = capsys.readouterr().out
-    assert "timestep = 0.02  # s" in output and f"grasps: {EPISODES * 8 + 16}" in output
+    assert "timestep = 0.02  # s" in output and f"grasps: {EPISODES * 12 + 24}" in output
     assert "MB" in output
     assert list(workplace.iterdir()) == []
 

@@ -24,7 +24,6 @@ from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import (
-    RUN,
     assert_same_run,
     command,
     launch,
@@ -33,6 +32,7 @@ from tests.helpers.command_runs import (
     stored,
     without,
 )
+from tests.helpers.tiny_run import RUN
 from tests.helpers.toy_engine import TINY
 
 BASE = [a for a in RUN if a not in ("--seed", "3")]

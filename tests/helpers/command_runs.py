@@ -10,18 +10,9 @@ import pytest
 from codesign_jax import cli, runs
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.record import to_arrays
-from tests.helpers.toy_engine import TINY
+from tests.helpers.tiny_run import copied
 
-EPISODES = 14  # enough that a signal after the third finds the run on its way
-
-
-RUN = [
-    *("optimize", "--scene", str(TINY), "--seed", "3", "--engine", "mujoco"),
-    *("--optimizer", "particle-filter"),
-    *("--particles", "4", "--trials", "2", "--episodes", str(EPISODES), "--test-trials", "4"),
-]
-
-
+EPISODES = 3  # of RUN
 RESULTS = ("episodes.csv", "particles.csv", "trials.csv", "tests.csv")
 
 
@@ -75,10 +66,8 @@ def stored(folder):
 
 @pytest.fixture(scope="module", name="finished")
 def finished_run(tmp_path_factory):
-    """A run that nothing interrupted; copy it to change it."""
-    folder = tmp_path_factory.mktemp("finished") / "run"
-    assert command(*RUN, "--out", folder) == 0
-    return folder
+    """The run RUN, which nothing interrupted; copy it to change it."""
+    return copied(tmp_path_factory.mktemp("finished") / "run")
 
 
 def assert_same_run(folder, finished):

@@ -82,6 +82,7 @@ class Sensitive(ToyEngine):
         return trace._replace(distance=distance, speed=speed)
 
 
+@pytest.mark.slow  # quick: numbers of a batch are those of single worlds (test_constants)
 def test_a_wave_is_one_program_goes_on_and_has_the_costs_of_each_set_alone():
     the_scene, space, _ = tiny()
     fingers = tuple(

@@ -13,7 +13,7 @@ from tests.helpers import grasps
 
 SCENE = scene.load("paper_spheres")
 STEPS, LOST = SCENE.num_steps, SCENE.cost.lost_distance
-repeatable = settings(max_examples=50, deadline=None, derandomize=True)
+repeatable = settings(max_examples=30, deadline=None, derandomize=True)
 evaluate = jax.jit(lambda trace: cost.outcome(SCENE, trace))
 judge = jax.jit(lambda trace, trial: cost.outcome(SCENE, trace, 0, trial))
 

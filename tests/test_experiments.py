@@ -103,6 +103,7 @@ class Killed(BaseException):
     """What no driver catches."""
 
 
+@pytest.mark.slow  # quick: a killed run goes on (test_resume)
 def test_a_run_that_is_killed_between_checkpoints_repeats_what_came_after(
     finished, tmp_path, monkeypatch
 ):
@@ -142,6 +143,7 @@ def test_runs_that_are_no_variants_of_one_are_refused(toy, tmp_path):
     assert simulate.gather(PLAN, tmp_path / "nothing", SEED) is None
 
 
+@pytest.mark.slow  # quick: the command's landscape goes on (test_showing)
 def test_landscape_resumes_and_knows_its_axes(toy, tmp_path, monkeypatch):
     whole, found = points(tmp_path / "whole.part")
     assert found == 0 and whole["status"].shape == (4, 4, 5)
@@ -279,6 +281,7 @@ def test_what_was_not_run_is_said(tmp_path):
     assert report.label("switch-16") == "16"
 
 
+@pytest.mark.slow  # quick: figures and page are made of such files, above
 def test_the_command_writes_what_the_runs_have(toy, finished, tmp_path, monkeypatch):
     monkeypatch.setitem(simulate.SIZES, "tiny", ({"2d": PLAN}, ()))
     command = ["scripts.experiments", "2d", "--size", "tiny", "--scene", str(TINY)]

@@ -21,7 +21,7 @@ from codesign_jax.optimize import (
     strictly_below,
 )
 
-repeatable = settings(max_examples=100, deadline=None, derandomize=True)
+repeatable = settings(max_examples=30, deadline=None, derandomize=True)
 
 LOW = np.array([0.01, -50.0, 0.0, 15.0, -1.0], np.float32)
 HIGH = np.array([0.18, 150.0, 110.0, 25.0, 1.0], np.float32)

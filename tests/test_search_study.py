@@ -4,6 +4,7 @@ import json
 
 import jax
 import numpy as np
+import pytest
 
 from codesign_jax import codesign
 from codesign_jax.cost import particle_cost
@@ -29,6 +30,7 @@ def finish(made):
     return made
 
 
+@pytest.mark.slow  # quick: a vmapped run is that of each seed alone (test_codesign)
 def test_seeds_are_runs_of_the_library_and_go_on(tmp_path):
     whole = finish(make(tmp_path / "whole.npz", "screened-es"))
     begun = make(tmp_path / "begun.npz", "screened-es")
@@ -52,6 +54,7 @@ def test_seeds_are_runs_of_the_library_and_go_on(tmp_path):
     assert whole.tested == 4 * 36
 
 
+@pytest.mark.slow  # quick: what is reported of stored rows, below
 def test_what_is_recommended_was_chosen_by_fresh_trials(tmp_path):
     """The particle of the lowest cost in the mark's own trials, by the library's evaluation."""
     made = finish(make(tmp_path / "one.npz", "particle-filter"))

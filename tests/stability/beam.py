@@ -121,7 +121,7 @@ def by_quadrature(rod):
     return 4 * rod.bench.scene.hand.material.shear_modulus * second, first
 
 
-@case(2, "roll-up to a full circle", "tip to root over length", engines=BOTH, quick="mujoco")
+@case(2, "roll-up to a full circle", "tip to root over length", engines=BOTH)
 def roll_up(engine, step, precision):
     """M = 2 pi E I / L closes the midpoint chain exactly; pressure grows for 2 s, rests for 3.
 

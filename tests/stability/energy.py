@@ -84,7 +84,7 @@ def damped_release(engine, step, precision):
     return Found(rise / energy[0], {"float64": 1e-12, "float32": 1e-6}[precision])
 
 
-@case(5, "damped release", "energy against the mode's recurrence", engines=BOTH, quick="mujoco")
+@case(5, "damped release", "energy against the mode's recurrence", engines=BOTH)
 def damping_law(engine, step, precision):
     """The first mode at 0.01 rad against its recurrence, for the time in which half of it is lost.
 
@@ -109,7 +109,7 @@ def damping_law(engine, step, precision):
 JUMP = (8, "pressure step of 120 kPa in one time step")
 
 
-@case(*JUMP, "error of the angles at rest, relative", engines=BOTH, quick="mujoco")
+@case(*JUMP, "error of the angles at rest, relative", engines=BOTH)
 def pressure_step(engine, step, precision):
     """120 kPa in one time step; settles at the free curvature M / E I in every joint."""
     rod = Rod(engine, step, precision)

@@ -22,7 +22,7 @@ HALF = 0.030  # half a side of the cuboid, and radius of the sphere [m]
 # --- 11: sliding -----------------------------------------------------------------------------
 
 
-@case(11, "cuboid slides to rest", "error of v / mu g, relative", engines=BOTH, quick="mujoco")
+@case(11, "cuboid slides to rest", "error of v / mu g, relative", engines=BOTH)
 def slides_to_rest(engine, step, precision):
     """The cuboid, pushed at 2 m/s over the table, stops after v / mu g = 0.41 s.
 

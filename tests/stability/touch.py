@@ -56,7 +56,7 @@ def rest(engine, step, precision):
     return Found(np.abs(late - late[:, :1]).max(), 1e-4)
 
 
-@case(10, "objects at rest for 90 s", "penetration", unit="m", engines=BOTH, quick="structured")
+@case(10, "objects at rest for 90 s", "penetration", unit="m", engines=BOTH)
 def sunk(engine, step, precision):
     """Depth of the lowest point below the table at rest."""
     b = bench(pinch(), engine, step, precision)

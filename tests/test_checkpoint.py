@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from codesign_jax.runs.checkpoint import Checkpoints, digest
+from scripts import faults
 
 PACKAGE = Path(__file__).parent.parent / "codesign_jax"
 
@@ -84,19 +85,11 @@ def test_empty_folder_has_no_step(tmp_path):
     assert found.step is None and found.arrays == {}
 
 
-@pytest.mark.parametrize("damage", ["flip", "truncate", "remove"])
-def test_damage_of_any_file_falls_back_to_the_step_before(folder, damage):
+@pytest.mark.parametrize("way", ["flipped", "longer", "deleted"])
+def test_damage_of_any_file_falls_back_to_the_step_before(folder, way):
     for path in [p for p in sorted((folder / "4").rglob("*")) if p.is_file()]:
         content = path.read_bytes()
-        if damage == "remove":
-            path.unlink()
-        elif damage == "truncate":
-            path.write_bytes(content[: len(content) // 2] if content else b"x")
-        else:
-            middle = len(content) // 2
-            path.write_bytes(
-                content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
-            )
+        faults.damaged(path, way)
         found = restore(folder)
         assert found.step == 3, path
         assert equal(found.arrays, arrays(3))

@@ -15,6 +15,7 @@ from codesign_jax.commands import status
 from codesign_jax.runs import checkpoint, choice, directory, manifest, tables
 from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.scene.schema import InputError
+from scripts import faults
 from tests.helpers.command_runs import (  # noqa: F401
     assert_same_run,
     command,
@@ -39,45 +40,12 @@ def run(whole, tmp_path):
     return shutil.copytree(whole, tmp_path / "run")
 
 
-def damage(path, how):
-    """One of ten ways in which a file of a checkpoint is damaged."""
-    content = bytearray(path.read_bytes())
-    if how in ("first", "middle", "last"):
-        place = {"first": 0, "middle": len(content) // 2, "last": -1}[how]
-        content[place] ^= 1
-        path.write_bytes(content)
-    elif how == "zeros":
-        path.write_bytes(bytes(len(content)))
-    elif how == "append":
-        path.write_bytes(content + b"x")
-    elif how.startswith("truncate"):
-        ends = {"truncate 0": 0, "truncate half": len(content) // 2, "truncate -1": -1}
-        path.write_bytes(content[: ends[how]])
-    elif how == "older":
-        older = str(path).replace(f"/{NEWEST}/", f"/{NEWEST - 1}/")
-        if not os.path.exists(older):  # data files are named anew in each step
-            older = f"{older.split(f'/{NEWEST - 1}/')[0]}/{NEWEST - 1}/default/manifest.ocdbt"
-        shutil.copy(older, path)
-    else:
-        path.unlink()
-        if how == "rename":
-            path.with_name("other").write_bytes(content)
-        elif how == "symlink":
-            path.symlink_to(path)
-        elif how == "directory":
-            path.mkdir()
-
-
-DAMAGES = ("truncate 0", "truncate half", "truncate -1", "first", "middle", "last", "zeros")
-DAMAGES += ("delete", "rename", "append", "older", "symlink", "directory")
-
-
-@pytest.mark.parametrize("how", DAMAGES)
+@pytest.mark.parametrize("how", faults.WAYS)
 def test_damage_of_the_newest_checkpoint_is_said_and_nothing_is_changed(how, run):
     """Of another file in each way; `test_checkpoint` has every file."""
     step = run / "checkpoints" / str(NEWEST)
     paths = [p for p in sorted(step.rglob("*")) if p.stat().st_size and p.is_file()]
-    damage(paths[DAMAGES.index(how) % len(paths)], how)
+    faults.damaged(paths[faults.WAYS.index(how) % len(paths)], how)
     before, said = sorted(os.walk(run)), []
     record = runs.load_record(run, tell=said.append)
     assert record is not None and record.test is None and record.done == 3
@@ -89,19 +57,19 @@ def test_damage_of_the_newest_checkpoint_is_said_and_nothing_is_changed(how, run
         runs.load_record(run)
 
 
-@pytest.mark.parametrize("how", ["truncate 0", "middle", "zeros", "delete", "directory"])
+@pytest.mark.parametrize("how", ["emptied", "flipped", "zeros", "deleted", "a folder"])
 def test_a_damaged_file_of_digests_is_damage(how, run):
-    damage(run / "checkpoints" / f"{NEWEST}.sha256", how)
+    faults.damaged(run / "checkpoints" / f"{NEWEST}.sha256", how)
     said = []
     runs.load_record(run, tell=said.append)
     assert f"{NEWEST}: " in said[0]
 
 
-@pytest.mark.parametrize(("name", "how"), [("sha256", "directory"), ("d", "middle")])
+@pytest.mark.parametrize(("name", "how"), [("sha256", "a folder"), ("d", "flipped")])
 def test_a_resumption_mends_damage_and_says_so(name, how, run, whole, capsys):
     """From the older checkpoint, to the same bits: of the file of digests, and of the data."""
     largest = max((run / "checkpoints" / str(NEWEST)).rglob("d/*"), key=lambda p: p.stat().st_size)
-    damage(largest if name == "d" else run / "checkpoints" / f"{NEWEST}.sha256", how)
+    faults.damaged(largest if name == "d" else run / "checkpoints" / f"{NEWEST}.sha256", how)
     assert command(*RUN, "--out", run) == 0
     assert f"checkpoint {NEWEST} is lost" in capsys.readouterr().out
     assert f"checkpoint {NEWEST} is lost" in (run / "events.log").read_text()
@@ -110,7 +78,7 @@ def test_a_resumption_mends_damage_and_says_so(name, how, run, whole, capsys):
 
 def test_every_command_says_which_checkpoint_it_takes(run, tmp_path, capsys):
     """All but export, which refuses; what is simulated is not asked for."""
-    damage(run / "checkpoints" / str(NEWEST) / "default" / "manifest.ocdbt", "middle")
+    faults.damaged(run / "checkpoints" / str(NEWEST) / "default" / "manifest.ocdbt", "flipped")
     before = snapshot(run)
     words = f"Read instead is checkpoint {NEWEST - 1}"
     page = tmp_path / "report.html"
@@ -235,7 +203,7 @@ def test_a_step_that_cannot_be_read_now_is_kept(number, run, monkeypatch, capsys
 
 
 def test_a_damaged_step_that_cannot_be_deleted_is_said(run, monkeypatch, capsys):
-    damage(run / "checkpoints" / f"{NEWEST}.sha256", "delete")
+    faults.damaged(run / "checkpoints" / f"{NEWEST}.sha256", "deleted")
 
     def refused(path):
         raise PermissionError(errno.EACCES, "Permission denied", str(path))

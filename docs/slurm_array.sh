@@ -11,10 +11,10 @@ set -uo pipefail
 folder=${1:?"sbatch slurm_array.sh FOLDER [flags of codesign optimize]"}
 shift
 seed=$SLURM_ARRAY_TASK_ID
+# Two minutes before the time limit: the run saves its episode and stops with status 143.
+trap 'kill -TERM $(jobs -p)' TERM
 codesign optimize --seed "$seed" --out "$folder/seed-$seed" "$@" &
 run=$!
-# Two minutes before the time limit: the run saves its episode and stops with status 143.
-trap 'kill -TERM "$run"' TERM
 wait "$run"   # ends early when the signal comes
 wait "$run"
 status=$?

@@ -35,7 +35,7 @@ from tests.helpers.command_runs import (
 from tests.helpers.tiny_run import RUN
 from tests.helpers.toy_engine import TINY
 
-BASE = [a for a in RUN if a not in ("--seed", "3")]
+BASE = without(RUN, "--seed")
 
 
 TWO = [*BASE, "--episodes", "2", "--seeds", "2-3"]

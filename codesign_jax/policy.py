@@ -204,7 +204,7 @@ class ControlLoop(Equal):
         if not (isinstance(answer, tuple) and [*map(type, answer[1:])] == [Command]):
             raise InputError([f"{self._called} must return (carry, policy.Command)"])
         self._refuse_memory(memory, answer[0])
-        return answer[0], self._spread(answer[1], plan)
+        return answer[0], spread(self.scene, answer[1], plan, of=self._called)
 
     @property
     def _called(self) -> str:
@@ -233,22 +233,6 @@ class ControlLoop(Equal):
                     f"it returned {words[1]}"
                 ]
             )
-
-    def _spread(self, command: Command, plan: Plan) -> Command:
-        """The command over the time steps of a period, pressures within their limits."""
-        problems, found = [], []
-        for name, like in (("pose", plan.pose), ("pressure", plan.pressure)):
-            given = jnp.asarray(getattr(command, name), like.dtype)
-            if given.shape == (len(like), like.shape[2]):
-                given = jnp.broadcast_to(given[:, None], like.shape)
-            elif given.shape != like.shape:
-                shapes = given.shape[1:], like.shape[2:], like.shape[1:]
-                words = "returned {} of shape {}, not {} or {}".format(name, *shapes)
-                problems.append(f"{self._called} {words}")
-            found.append(given)
-        if problems:
-            raise InputError(problems)
-        return limited(self.scene, plan.params, Command(*found))
 
     def _refuse_nonfinite(self, ctrl: Any) -> None:
         """Refuses commands that are no numbers; of traced ones nothing is known."""
@@ -360,16 +344,36 @@ def _phase(scene: Scene, step: jax.Array) -> tuple[jax.Array, jax.Array]:
     return phase.astype(jnp.int32), (step - start) * scene.discretization.timestep
 
 
-def limited(scene: Scene, params: Params, command: Command) -> Command:
-    """Commands of shape (world, step, ...) whose pressures the fingers stand.
+def spread(scene: Scene, command: Command, plan: Plan, *, of: str) -> Command:
+    """Commands over the time steps of a period, with pressures that the fingers stand.
 
-    The upper end is the limit of the wall, or the design's own pressure where that is higher.
+    Args:
+      scene: The scene.
+      command: Commands with a leading axis (world,).
+      plan: The plan of the worlds over the period.
+      of: Who commands, for the error.
+
+    Raises:
+      InputError: If their shapes are not those of `Command`.
     """
-    top = jax.vmap(scene.hand.pressure_limit.of)(params.height, params.wall)
-    top = jnp.maximum(top, params.pressure)[:, None]
+    problems, found = [], []
+    for name, like in (("pose", plan.pose), ("pressure", plan.pressure)):
+        given = jnp.asarray(getattr(command, name), like.dtype)
+        if given.shape == (len(like), like.shape[2]):
+            given = jnp.broadcast_to(given[:, None], like.shape)
+        elif given.shape != like.shape:
+            shapes = given.shape[1:], like.shape[2:], like.shape[1:]
+            problems.append("{} returned {} of shape {}, not {} or {}".format(of, name, *shapes))
+        found.append(given)
+    if problems:
+        raise InputError(problems)
+    # The upper end is the limit of the wall, or the design's own pressure where that is higher.
+    top = jax.vmap(scene.hand.pressure_limit.of)(plan.params.height, plan.params.wall)
+    top = jnp.maximum(top, plan.params.pressure)[:, None]
     # Comparisons let what is no number pass, and have the derivative of what is at an end.
-    pressure = jnp.where(command.pressure < 0, 0.0, command.pressure)
-    return command._replace(pressure=jnp.where(pressure > top, top, pressure))
+    pose, pressure = found
+    pressure = jnp.where(pressure < 0, 0.0, pressure)
+    return Command(pose, jnp.where(pressure > top, top, pressure))
 
 
 def advance(

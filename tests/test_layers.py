@@ -24,7 +24,7 @@ engines cost
 start policy
 rollout
 own
-codesign finger fit sampling
+codesign env finger fit sampling
 batch
 runs
 report
@@ -277,6 +277,7 @@ MOST_LINES = {
     "codesign_jax/codesign": 600,
     "codesign_jax/commands": 4_050,
     "codesign_jax/compiler": 3_100,
+    "codesign_jax/env": 400,
     "codesign_jax/engines": 12_800,
     "codesign_jax/export": 1_800,
     "codesign_jax/model": 1_650,

@@ -1,0 +1,245 @@
+"""One grasp as an environment, whose observation, action and reward are methods."""
+
+import dataclasses
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax import control, model, policy, rollout, verdict
+from codesign_jax.control import Plan
+from codesign_jax.engines import DEFAULT, Engine, make_engine
+from codesign_jax.engines.structured.world_model import world_constants
+from codesign_jax.model import ModelFields
+from codesign_jax.policy import Command, Observation, World
+from codesign_jax.scene import Scene
+from codesign_jax.scene.parameters import design_space
+from codesign_jax.types import Params, Trace, Trial
+
+
+class Data(NamedTuple):
+    """A world between two actions.
+
+    Attributes:
+      trial: Its object and noise.
+      fields: Its model fields.
+      plan: What the key frames command over the grasp.
+      world: Its state and the pressures in its chambers.
+      seen: What is observed of it.
+      period: Number of actions since the grasp began, shape () int32.
+    """
+
+    trial: Trial
+    fields: ModelFields
+    plan: Plan
+    world: World
+    seen: Observation
+    period: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class State:
+    """What `reset` and `step` return; names are those of Brax and MuJoCo Playground.
+
+    Attributes:
+      data: The world.
+      obs: What the agent observes, shape (observation,).
+      reward: Reward of the last action, shape ().
+      done: One after the end of the grasp, and of one that lost its object or failed, shape ().
+      metrics: Numbers to watch, which the trainers add up over an episode.
+      info: What wrappers keep.
+    """
+
+    data: Any
+    obs: jax.Array
+    reward: jax.Array
+    done: jax.Array
+    metrics: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
+    info: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def pipeline_state(self) -> Any:
+        """`data` by Brax's name."""
+        return self.data
+
+    def replace(self, **changes: Any) -> "State":
+        """The state with other fields."""
+        if "pipeline_state" in changes:
+            changes["data"] = changes.pop("pipeline_state")
+        return dataclasses.replace(self, **changes)
+
+
+class GraspEnv:
+    """Grasps of one hand, each of an object of the set with noise of its own.
+
+    Attributes:
+      scene: The scene.
+      params: Parameters of the hand.
+      dt: Seconds of an action.
+      length: Actions of a whole grasp.
+    """
+
+    backend = "codesign"
+
+    def __init__(
+        self,
+        scene: Scene,
+        params: Params | None = None,
+        *,
+        engine: Engine | None = None,
+        period: float = policy.PERIOD,
+    ):
+        """Takes scene and hand.
+
+        Args:
+          scene: The scene; its key frames move the arm, and its phases say when a lost object
+            counts.
+          params: Parameters of the hand, as `DesignSpace.params` makes them; default: the hand
+            file's.
+          engine: Engine of the scene; default: structured.
+          period: Seconds of an action, a whole number of time steps.
+
+        Raises:
+          InputError: If the period is not a whole number of time steps.
+        """
+        if params is None:
+            space = design_space(scene.hand)
+            params = space.params(space.default())
+        self.scene, self.params = scene, params
+        self.engine = make_engine(DEFAULT, scene) if engine is None else engine
+        self._steps = policy.period_steps(scene, period)
+        self.dt, self.length = period, -(-scene.num_steps // self._steps)
+
+    def observe(self, seen: Observation) -> jax.Array:
+        """What the agent observes: what a hand feels, and not where the object is.
+
+        Time of the grasp and of the phase [s]; and of each finger its pressure over the limit of
+        its wall, how far it is bent [rad], and how fast that changes [rad/s].
+        """
+        bend, rate = seen.joint[..., 0].sum(-1), seen.joint_velocity[..., 0].sum(-1)
+        times = jnp.stack([seen.time, seen.phase_time])
+        return jnp.concatenate([times, seen.pressure / self.limit, bend, 0.1 * rate])
+
+    def act(self, seen: Observation, action: jax.Array) -> Command:
+        """The command of an action: pressures from zero, at -1, to the limit of the walls, at 1."""
+        share = (jnp.clip(action, -1.0, 1.0) + 1.0) / 2
+        return seen.plan._replace(pressure=share * self.limit)
+
+    def reward(
+        self, before: Observation, command: Command, after: Observation, held: jax.Array
+    ) -> jax.Array:
+        """Reward of a period, shape (): how much of the time that counts the object was held.
+
+        Args:
+          before: What was observed before it.
+          command: The command, of shape (step, ...).
+          after: What is observed after it.
+          held: Share of the scene's window in which the object was held during this period, so
+            that a grasp's sum is 1 - cost / `cost.maximum` by the scene's cost.
+        """
+        return held
+
+    @property
+    def limit(self) -> jax.Array:
+        """Pressures that the fingers' walls stand [Pa], shape (finger,)."""
+        return self.scene.hand.pressure_limit.of(self.params.height, self.params.wall)
+
+    @property
+    def action_size(self) -> int:
+        """Numbers of an action."""
+        return self.scene.num_fingers
+
+    @functools.cached_property
+    def observation_size(self) -> int:
+        """Numbers of an observation."""
+        return jax.eval_shape(self.reset, jax.random.key(0)).obs.shape[0]
+
+    @property
+    def unwrapped(self) -> "GraspEnv":
+        """The environment itself."""
+        return self
+
+    def reset(self, rng: jax.Array) -> State:
+        """The beginning of a grasp in a random trial.
+
+        Args:
+          rng: A key, or the data of one, as Brax has keys.
+        """
+        if not jnp.issubdtype(rng.dtype, jax.dtypes.prng_key):
+            rng = jax.random.wrap_key_data(rng)
+        noise, choice = jax.random.split(rng)
+        trial = jax.tree.map(lambda v: v[0], rollout.sample_trials(self.scene, noise, 1))
+        shape = jax.random.randint(choice, (), 0, len(self.scene.objects.object))
+        return self.begin(trial._replace(shape=shape))
+
+    def begin(self, trial: Trial) -> State:
+        """The beginning of a grasp in a given trial."""
+        fields = model.model_fields(self.scene, self.params, trial)
+        plan = control.plan(self.scene, self.params, trial)
+        world = policy.begin(self.scene, *_batch((fields, plan)))
+        zero = jnp.zeros((), plan.pose.dtype)
+        data = Data(trial, fields, plan, _one(world), None, jnp.int32(0))  # type: ignore[arg-type]
+        data = data._replace(seen=self._seen(data))
+        metrics = {"held": zero, "distance": zero}
+        return State(data, self.observe(data.seen), zero, zero, metrics)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """The world after an action of shape (action,), each number of it in [-1, 1]."""
+        data: Data = state.data
+        plan = self._ahead(data)
+        told = _batch(self.act(data.seen, action))
+        command = policy.spread(self.scene, told, _batch(plan), of="act")
+        fields, world, ahead = _batch((data.fields, data.world, plan))
+        advanced = policy.advance(self.engine, fields, world, ahead, command, False)
+        world, trace = _one(advanced)
+        after = data._replace(world=world, period=data.period + 1)
+        after = after._replace(seen=self._seen(after))
+        held, ended = self._held(data, trace, world)
+        reward = self.reward(data.seen, _one(command), after.seen, held)
+        done = ended | (after.period >= self.length)
+        metrics = state.metrics | {"held": held, "distance": trace.distance[-1]}
+        return state.replace(
+            data=after,
+            obs=self.observe(after.seen),
+            reward=reward,
+            done=done.astype(reward.dtype),
+            metrics=metrics,
+        )
+
+    def _ahead(self, data: Data) -> Plan:
+        """The plan over the period that begins; a last one that is shorter overlaps."""
+        first = data.period * self._steps
+
+        def cut(series: jax.Array) -> jax.Array:
+            return jax.lax.dynamic_slice_in_dim(series, first, self._steps)
+
+        plan = data.plan
+        return plan._replace(
+            pose=cut(plan.pose), pressure=cut(plan.pressure), shake=cut(plan.shake)
+        )
+
+    def _seen(self, data: Data) -> Observation:
+        fields, world, plan = _batch((data.fields, data.world, self._ahead(data)))
+        hand = world_constants(self.scene, fields)
+        return _one(policy.observe(self.scene, hand, fields, world, plan))
+
+    def _held(self, data: Data, trace: Trace, world: World) -> tuple[jax.Array, jax.Array]:
+        """Share of the window in which the object was held, and whether the grasp is decided."""
+        bounds = verdict.bounds(self.scene.with_constants(data.fields.constants))
+        steps = data.period * self._steps + jnp.arange(self._steps)
+        counts = (steps >= bounds.start) & (steps < bounds.end) & (steps < self.scene.num_steps)
+        away = jnp.cumsum(verdict.lost(bounds, trace.distance, steps)) > 0
+        good = jnp.cumsum(verdict.failures(self.scene, trace) != 0) == 0
+        ended = model.split(self.scene, world.state).going[0] == 0
+        held = (counts & ~away & good).sum() / (bounds.end - bounds.start)
+        return held.astype(trace.distance.dtype), ended
+
+
+def _batch(tree: Any) -> Any:
+    return jax.tree.map(lambda v: jnp.asarray(v)[None], tree)
+
+
+def _one(tree: Any) -> Any:
+    return jax.tree.map(lambda v: v[0], tree)

@@ -5,17 +5,18 @@ evaluate` with the arguments below; further arguments go to the former, such as 
 The scene has its skinned hull and contact between fingers.
 """
 
-import csv
 import sys
 from pathlib import Path
 
-from codesign_jax import cli
+from codesign_jax import cli, runs
+from codesign_jax.report.verdicts import Judged
+from codesign_jax.runs import choice
 
 FOLDER = Path("runs") / "demo"
 
 
 def main() -> int:
-    """Runs the demo and returns the exit status: 0 only if a final particle passed its test."""
+    """Runs the demo and returns the exit status: 0 only if the design is good."""
     run = ["optimize", "--scene", "paper", "--preset", "23d", "--seed", "3"]
     run += ["--reference-trials", "0", "--out", str(FOLDER)]
     status = cli.main([*run, *sys.argv[1:]])
@@ -27,16 +28,15 @@ def main() -> int:
         cli.main(["evaluate", "--run", str(FOLDER), "--trials", "3", "--render", str(path)])
     print()
     cli.main(["report", str(FOLDER)])
-    with (FOLDER / "tests.csv").open(newline="") as file:
-        good = [row for row in csv.DictReader(file) if int(row.pop("paper_success"))]
-    # Copies of a design have its trials, and count once.
-    successes = len({(*row.values(),)[1:] for row in good})
-    print(f"\n{successes} final designs passed the test (mean cost below 0.01)")
+    scene, _ = runs.read_run(FOLDER)
+    trials = choice.choose(scene, choice.read_record(FOLDER)).outcomes
+    judged = Judged(scene, trials, grasps="grasps of its final test")
+    print(f"\nthe design {judged}")
     print("the run, cost by cost:  ", FOLDER / "episodes.csv")
     print("the cost's evolution:   ", FOLDER / "figures" / "cost_evolution.png")
     print("the best grasp, moving: ", pictures[1])
     print("all of it, for a browser:", FOLDER / "report.html")
-    return 0 if successes else 1
+    return 0 if judged.verdict.word == "good" else 1
 
 
 if __name__ == "__main__":

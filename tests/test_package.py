@@ -117,11 +117,25 @@ def test_extras_that_are_named_exist():
     assert {"report", "export", "parquet"} <= named <= extras
 
 
-@pytest.mark.parametrize("way", ["osmesa", "no way"])
-def test_simulation_needs_no_opengl(way):
-    """Ways that are named and not there (or, osmesa, may be): MuJoCo is imported all the same."""
+HIDDEN = """
+import ctypes
+
+class Hidden(ctypes.CDLL):
+    def __init__(self, name, *rest, **more):
+        if "EGL" in str(name):
+            raise OSError(f"{name}: cannot open shared object file")
+        super().__init__(name, *rest, **more)
+
+ctypes.CDLL, ctypes.cdll = Hidden, ctypes.LibraryLoader(Hidden)
+"""
+
+
+@pytest.mark.parametrize("way", ["egl", "no way"])
+def test_simulation_needs_no_opengl(way, tmp_path):
+    """Ways that are named and not there, of a machine without libEGL: MuJoCo is imported."""
+    (tmp_path / "sitecustomize.py").write_text(HIDDEN)
     script = "import codesign_jax, mujoco, os; codesign_jax.model; print(os.environ['MUJOCO_GL'])"
-    environment = os.environ | {"MUJOCO_GL": way, "PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"MUJOCO_GL": way, "PYTHONPATH": f"{tmp_path}:{ROOT}"}
     command = [sys.executable, "-c", script]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, f"{way}\n"), done.stderr

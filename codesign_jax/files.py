@@ -51,35 +51,28 @@ def naming(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def whole_folder(path: Path, keep: str) -> Iterator[Path]:
+def whole_folder(path: Path) -> Iterator[Path]:
     """Fills a folder as a whole: what is written appears there when the block ends.
 
     Args:
       path: The folder; new files replace those of the same names, others stay.
-      keep: Name of a file that another attempt may go on from.
 
     Yields:
       The folder to write to, beside the other with a name in .part. If the block raises or the
-      process is killed, the other folder stays as it was, and the next attempt finds `keep` here.
+      process is killed, the other folder stays as it was.
 
     Raises:
       OSError: If the folder cannot be written.
     """
     path = path.resolve()
     part = path.with_name(f".{path.name}.part")
-    part.mkdir(parents=True, exist_ok=True)
-    for old in part.iterdir():
-        if old.is_dir():
-            shutil.rmtree(old)
-        elif old.name != keep:
-            old.unlink()
+    remove(part)
+    part.mkdir(parents=True)
     try:
         yield part
     except BaseException:
-        if not (part / keep).exists():
-            shutil.rmtree(part)
+        shutil.rmtree(part)
         raise
-    (part / keep).unlink(missing_ok=True)
     try:
         os.replace(part, path)  # where there is no folder, or an empty one
     except OSError:

@@ -12,7 +12,6 @@ from rich.console import Console
 from codesign_jax import codesign, runs
 from codesign_jax import scene as scenes
 from codesign_jax.batch import Batch
-from codesign_jax.scene import InputError
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import Outcome
 from scripts.experiments import __main__ as experiments
@@ -51,10 +50,10 @@ def finished(toy, tmp_path_factory):
     return folder, simulate.gather(PLAN, folder, SEED)
 
 
-def points(part, seed=SEED):
+def points():
     """The landscape with the toy, in calls of six points."""
-    how = {"seed": seed, "chunk": 30, "devices": None, "console": Console(quiet=True)}
-    return simulate.landscape(GRID, scenes.load(TINY), "structured", part, **how)
+    how = {"seed": SEED, "chunk": 30, "devices": None, "console": Console(quiet=True)}
+    return simulate.landscape(GRID, scenes.load(TINY), "structured", **how)
 
 
 def test_counts_are_the_papers():
@@ -144,26 +143,8 @@ def test_runs_that_are_no_variants_of_one_are_refused(toy, tmp_path):
 
 
 @pytest.mark.slow  # quick: the command's landscape goes on (test_showing)
-def test_landscape_resumes_and_knows_its_axes(toy, tmp_path, monkeypatch):
-    whole, found = points(tmp_path / "whole.part")
-    assert found == 0 and whole["status"].shape == (4, 4, 5)
-    append, written = simulate.calls.Store.append, []
-
-    def dies(parts, arrays):
-        if len(written) == 2:
-            raise KeyboardInterrupt
-        written.append(arrays)
-        append(parts, arrays)
-
-    monkeypatch.setattr(simulate.calls.Store, "append", dies)
-    with pytest.raises(KeyboardInterrupt):
-        points(tmp_path / "x.part")
-    monkeypatch.undo()
-    again, found = points(tmp_path / "x.part")
-    assert found == 60, "two calls of six points"
-    assert all(np.array_equal(again[name], value) for name, value in whole.items())
-    with pytest.raises(InputError, match="x.part is of another design or other settings"):
-        points(tmp_path / "x.part", seed=1)
+def test_landscape_knows_its_axes(toy):
+    whole = points()
     scene, space, _ = tiny()
     kept = simulate.of_landscape(scene, space, whole)
     ends = space.in_units(np.array([space.low, space.high]))
@@ -247,7 +228,7 @@ def write_small(finished, folder):
         notes = {"settings": {"plan": plan, "scene": "paper"}, "commit": "0123abc"}
         notes |= {"grasps": PLAN.grasps}
         simulate.write(folder, name, summarized(finished), notes)
-    kept = simulate.of_landscape(*tiny()[:2], points(folder / "landscape.part")[0])
+    kept = simulate.of_landscape(*tiny()[:2], points())
     notes = {"grasps": 80, "commit": "0123abc"}
     simulate.write(folder, "landscape", kept, notes)
 

@@ -275,7 +275,7 @@ def test_what_is_imported_is_there():
 MOST_LINES = {
     "codesign_jax": 40_800,
     "codesign_jax/codesign": 600,
-    "codesign_jax/commands": 4_050,
+    "codesign_jax/commands": 3_950,
     "codesign_jax/compiler": 3_100,
     "codesign_jax/env": 400,
     "codesign_jax/engines": 12_800,
@@ -285,7 +285,7 @@ MOST_LINES = {
     "codesign_jax/report": 2_200,
     "codesign_jax/runs": 3_340,
     "codesign_jax/scene": 5_400,
-    "scripts": 5_200,
+    "scripts": 5_150,
     "tests": 26_350,
 }
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from codesign_jax import cli, codesign, reuse, runs, scene
+from codesign_jax import cli, codesign, runs, scene
 from codesign_jax.commands import calls, replay, status
 from codesign_jax.commands import landscape as command
 from codesign_jax.engines import make_engine
@@ -265,55 +265,7 @@ def test_stopped_landscape_leaves_nothing(workplace, monkeypatch, capsys):
 
     monkeypatch.setattr(command, "simulated_designs", stop)
     assert cli.main(["landscape", *DESIGN, "--points", "2"]) == 130
-    assert not list(workplace.iterdir()) and "stopped" in capsys.readouterr().out
-
-
-def test_an_interrupted_landscape_goes_on(workplace, monkeypatch, capsys):
-    """After the first of three calls; another seed begins anew.  Costs are made of the designs."""
-    monkeypatch.setitem(calls.WORLDS, "cpu", 3)
-    monkeypatch.setattr(
-        reuse, "code_digest", lambda: "this code"
-    )  # in spite of what is replaced here
-    count = []
-
-    def made(task, designs, key):
-        cost = np.asarray(designs)[:, :1]
-        return Outcome(cost, np.zeros(cost.shape, int), cost, np.zeros(cost.shape, int))
-
-    def stopping(task, designs, key):
-        count.append(len(designs))
-        if len(count) == 2:
-            raise KeyboardInterrupt
-        return made(task, designs, key)
-
-    grid = ["landscape", *DESIGN, "--points", "3", "--trials", "1", "--out"]
-    monkeypatch.setattr(codesign.Task, "evaluate", made)
-    assert cli.main([*grid, "whole"]) == 0
-    monkeypatch.setattr(codesign.Task, "evaluate", stopping)
-    assert cli.main([*grid, "part"]) == 130
-    assert "the same command goes on" in capsys.readouterr().out
-    assert (workplace / "part" / command.PART).exists()
-    assert cli.main([*grid, "part"]) == 0
-    assert "going on after 1 call," in capsys.readouterr().out and count == [3, 3, 3, 3]
-    for name in (landscape.FILE, landscape.TABLE):
-        assert (workplace / "part" / name).read_bytes() == (workplace / "whole" / name).read_bytes()
-    assert not (workplace / "part" / command.PART).exists()
-    count.clear()
-    assert cli.main([*grid, "part"]) == 130
-    monkeypatch.setattr(codesign.Task, "evaluate", made)
-    assert cli.main([*grid, "part", "--seed", "1"]) == 0
-    said = capsys.readouterr().out
-    assert (
-        "going on" not in said
-        and f"{command.PART} is of another design or other settings: simulated again" in said
-    )
-    monkeypatch.setattr(codesign.Task, "evaluate", stopping)
-    count.clear()
-    assert cli.main([*grid, "part"]) == 130
-    monkeypatch.setattr(reuse, "code_digest", lambda: "other code")
-    assert cli.main([*grid, "part"]) == 0
-    said = capsys.readouterr().out
-    assert "going on" not in said and "is of another version of the code: simulated again" in said
+    assert not list(workplace.iterdir()) and "stopped" in capsys.readouterr().err
 
 
 def test_missing_extra_is_one_line(monkeypatch, capsys):

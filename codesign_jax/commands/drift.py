@@ -1,12 +1,12 @@
 """The grasps of `codesign export` that say how far parameters of a design may drift."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+import jax
 from rich.console import Console
 
-from codesign_jax.commands import calls, common
-from codesign_jax.commands.calls import Calls, Trials
+from codesign_jax.codesign import Task
+from codesign_jax.commands import calls
 from codesign_jax.engines import Engine
 from codesign_jax.optimize import answer
 from codesign_jax.report.statistics import Interval
@@ -18,32 +18,22 @@ if TYPE_CHECKING:
     from codesign_jax.export import sheet
     from codesign_jax.export.tolerance import Study
 
-PART = "tolerance.part"
-"""What is simulated of a design's tolerance, until it is finished."""
 
-
-def simulate(
-    case: Case, engine: Engine, options: "Export", folder: Path, console: Console
-) -> "sheet.Drift":
+def simulate(case: Case, engine: Engine, options: "Export", console: Console) -> "sheet.Drift":
     """Tolerances of the design: says how many grasps they take at most, and simulates."""
     from codesign_jax.export import sheet, tolerance  # with the extra
 
     steps, count = options.tolerance_steps, options.tolerance_trials
     planned = study(case, options)
-    trials = Trials(case.scene, case.commanded, planned.space, count, options.seed)
-    first = 1 + int(planned.room.sum())
-    size = calls.equal(first, calls.most_designs(trials))
+    task = Task(case.scene, planned.space, count, engine)
+    size, key = calls.size(1 + int(planned.room.sum()), count), jax.random.key(options.seed)
     _announce(planned, options, console)
-    run = Calls(trials, engine, size, folder / PART, planned.designs)
-    if run.refused:
-        console.print(f"{folder / PART} {run.refused}: simulated again", markup=False)
-    if run.found:
-        console.print(f"going on after {common.counted(run.found * count, 'grasp')}")
     with Meter("tolerance", planned.most * count, console) as meter:
 
         def reply(asked: tolerance.Round) -> list[Interval]:
             meter.total = meter.done + count * (len(asked.designs) + asked.most)
-            return tolerance.shares(run(planned.designs[asked.designs], meter))
+            designs = planned.designs[asked.designs]
+            return tolerance.shares(calls.simulate(task, key, designs, size, meter))
 
         found = answer(tolerance.search(planned, size), reply)
     known = found[0].value >= tolerance.WANTED

@@ -47,13 +47,10 @@ def main(options: "Export") -> int:
     for note in notes:
         console.print(note, markup=False)
     try:
-        with files.whole_folder(options.out, drift.PART) as folder:
+        with files.whole_folder(options.out) as folder:
             write_files(case, params, sizes, engine, folder, options, console)
     except OSError as error:
         raise InputError([f"--out {options.out}: {error.strerror}"]) from error
-    except KeyboardInterrupt:
-        console.print("stopped, nothing is exported; the same command goes on")
-        return 130
     _tell(case, options, console)
     return 0
 
@@ -117,7 +114,7 @@ def write_files(
     if not options.no_parts:
         _parts(sizes, folder, options, console)
     if not options.no_sheet:
-        found = drift.simulate(case, engine, options, folder, console) if engine else None
+        found = drift.simulate(case, engine, options, console) if engine else None
         with Busy(console, "writing the build sheet"):
             _sheet(case, params, sizes, found, folder, options)
 

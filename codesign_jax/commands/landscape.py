@@ -8,8 +8,8 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import codesign, files, runs
+from codesign_jax.codesign import Task
 from codesign_jax.commands import calls, common, preflight
-from codesign_jax.commands.calls import Calls, Trials
 from codesign_jax.commands.common import find_case
 from codesign_jax.cost import particle_cost
 from codesign_jax.report import landscape
@@ -22,9 +22,6 @@ from codesign_jax.types import Outcome, failed
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Landscape as Options
-
-PART = "landscape.part"
-"""What is done of a landscape, until it is finished."""
 
 
 class Plane(NamedTuple):
@@ -54,19 +51,15 @@ def main(options: "Options") -> int:
         console.print(runs.describe(case.space, case.design, "around"), markup=False)
     for note in preflight.notes(case.scene, case.space, {"the design": case.design}):
         console.print(note, markup=False)
+    size = calls.size(len(made.designs), options.trials)
+    count = common.counted(-(-len(made.designs) // size), "call")
+    console.print(f"grasps: {len(made.designs) * options.trials} in {count}")
     if options.dry_run:
-        _dry_run(case, made.designs, options, console)
         return 0
-    part = folder / PART
-    try:
-        simulated = simulated_designs(case, made.designs, options, console, part)
-    except KeyboardInterrupt:
-        console.print("stopped; the same command goes on")
-        return 130
+    simulated = simulated_designs(case, made.designs, size, options, console)
     found = summarize(case, made, simulated, options.seed)
     print_summary(case, found, console)
     write_files(found, folder, console)
-    part.unlink(missing_ok=True)
     return 0
 
 
@@ -125,38 +118,13 @@ def make_plane(case: Case, columns: tuple[int, int], points: int) -> Plane:
     return Plane(columns, (axes[0], axes[1]), np.asarray(projected))
 
 
-def _dry_run(case: Case, designs: np.ndarray, options: "Options", console: Console) -> None:
-    trials = _trials(case, options)
-    size = calls.equal(len(designs), calls.most_designs(trials))
-    grasps = len(designs) * trials.count
-    console.print(f"grasps: {grasps} in {common.counted(-(-len(designs) // size), 'call')}")
-
-
-def _trials(case: Case, options: "Options") -> Trials:
-    return Trials(case.scene, case.commanded, case.space, options.trials, options.seed)
-
-
 def simulated_designs(
-    case: Case, designs: np.ndarray, options: "Options", console: Console, part: Path
+    case: Case, designs: np.ndarray, size: int, options: "Options", console: Console
 ) -> Outcome:
-    """Simulates all designs in the same trials, some at a time; outcomes (design, trial).
-
-    What is done is kept in a file, from which the same command goes on.
-    """
-    trials = _trials(case, options)
-    size = calls.equal(len(designs), calls.most_designs(trials))
-    grasps = len(designs) * trials.count
-    engine = case.make_engine()
-    simulate = Calls(trials, engine, size, part, designs)
-    console.print(f"grasps: {grasps} in {common.counted(-(-len(designs) // size), 'call')}")
-    if simulate.refused:
-        console.print(f"{part} {simulate.refused}: simulated again", markup=False)
-    if simulate.found:
-        done = simulate.found // size
-        console.print(f"going on after {common.counted(done, 'call')}, from {part}", markup=False)
-    with Meter("landscape", grasps, console) as meter:
-        found = simulate(designs, meter)
-    return found
+    """Simulates all designs in the same trials, some at a time; outcomes (design, trial)."""
+    task = Task(case.scene, case.space, options.trials, case.make_engine())
+    with Meter("landscape", len(designs) * options.trials, console) as meter:
+        return calls.simulate(task, jax.random.key(options.seed), designs, size, meter)
 
 
 def summarize(case: Case, made: Plane, found: Outcome, seed: int) -> Landscape:

@@ -1,6 +1,5 @@
 """`codesign sample`."""
 
-import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,7 +7,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import batch, sampling
+from codesign_jax import sampling
 from codesign_jax.codesign import VERDICTS, verdicts
 from codesign_jax.commands import calls, common, preflight
 from codesign_jax.engines import Engine, make_engine
@@ -80,8 +79,7 @@ def _question(options: "Sample", scene: Scene) -> Question:
     design_space(scene.hand, options.preset)
     before = dataset.begun(options.out)
     if before is None or options.chunk is not None:
-        grasps = options.chunk or calls.WORLDS.get(jax.default_backend(), batch.LIMIT)
-        chunk = calls.equal(options.designs, max(1, grasps // options.trials))
+        chunk = calls.size(options.designs, options.trials, most=options.chunk)
     else:
         chunk = before["chunk"]
     return Question(scene, options.engine, options.preset, options.trials, options.seed, chunk)
@@ -93,20 +91,6 @@ def _amount(options: "Sample") -> str:
     return f"{each}: {common.counted(options.designs * options.trials, 'grasp')}"
 
 
-@dataclasses.dataclass
-class _Tally:
-    """How grasps ended, numbers by `codesign.VERDICTS`."""
-
-    counts: np.ndarray
-
-    def add(self, question: Question, shard: int, designs: int, found: Outcome) -> int:
-        """Counts the wanted grasps of a shard; returns how many they are."""
-        wanted = min(question.chunk, designs - shard * question.chunk)
-        ends = verdicts(found)[:wanted]
-        self.counts += np.bincount(ends.ravel(), minlength=len(self.counts))
-        return ends.size
-
-
 def _simulate(
     designs: int,
     question: Question,
@@ -114,34 +98,35 @@ def _simulate(
     outcomes: Store,
     interrupts: Interrupts,
     console: Console,
-) -> _Tally:
-    """Simulates the shards that are missing."""
+) -> np.ndarray:
+    """Simulates the shards that are missing; numbers of grasps by `codesign.VERDICTS`."""
     simulate = sampling.make_simulate(question.scene, engine, question.space)
-    tally = _Tally(np.zeros(len(VERDICTS), int))
-    total = question.shards(designs)
+    counts, total = np.zeros(len(VERDICTS), int), question.shards(designs)
+
+    def count(shard: int, found: Outcome) -> int:
+        wanted = min(question.chunk, designs - shard * question.chunk)
+        ends = np.bincount(verdicts(found)[:wanted].ravel(), minlength=len(counts))
+        counts[:] += ends
+        return int(ends.sum())
+
     with Meter("sample", designs * question.trials, console) as meter:
         for shard, arrays in zip(range(total), outcomes, strict=False):
-            meter.found(tally.add(question, shard, designs, Outcome(**arrays)))
+            meter.found(count(shard, Outcome(**arrays)))
         done = min(len(outcomes), total)
         if done:
-            words = (
-                f"going on after {done} of {common.counted(total, 'call')}, from {outcomes.path}"
-            )
-            console.print(words, markup=False)
+            calls = common.counted(total, "call")
+            meter.message(f"going on after {done} of {calls}, from {outcomes.path}")
         for shard in range(done, total):
             found = interrupts.call(lambda s=shard: simulate(*question.drawn(s)))
             outcome = jax.tree.map(np.asarray, found)
             outcomes.append(outcome._asdict())
-            meter.advance(tally.add(question, shard, designs, outcome))
-            if shard == done:
-                meter.compiled()
-    return tally
+            meter.advance(count(shard, outcome))
+    return counts
 
 
-def _report(path: Path, found: _Tally, console: Console) -> None:
-    total = int(found.counts.sum())
-    ends = zip(VERDICTS, found.counts.tolist(), strict=True)
+def _report(path: Path, counts: np.ndarray, console: Console) -> None:
+    total = int(counts.sum())
+    ends = zip(VERDICTS, counts.tolist(), strict=True)
     words = ", ".join(f"{name} {n} ({100 * n / total:.1f} %)" for name, n in ends)
     console.print(f"of {total} grasps: {words}")
-    size = path.stat().st_size / 1e6
-    console.print(f"table: {path} ({size:.1f} MB)", markup=False)
+    console.print(f"table: {path} ({path.stat().st_size / 1e6:.1f} MB)", markup=False)

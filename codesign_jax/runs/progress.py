@@ -109,19 +109,15 @@ class Meter(Live):
         self._bar.update(self._task, completed=self.done, total=self.total)
 
     def advance(self, grasps: int) -> None:
-        """Counts grasps that were just simulated."""
+        """Counts grasps that were just simulated; the first call compiled, and has no rate."""
         self.found(grasps)
         now, text = time.monotonic(), f"{self._name}: {self.done} of {self.total} grasps"
         self.say(text)
-        if self._compiled and not self.console.is_terminal and now - self._told >= SECONDS:
-            start, before = self._compiled
+        start, before = self._compiled = self._compiled or (now, self.done)
+        if now > start and not self.console.is_terminal and now - self._told >= SECONDS:
             self._told, rate = now, (self.done - before) / max(now - start, 1e-9)
             left = duration(max(self.total - self.done, 0) / rate)
             self.message(f"{text}, {rate:.1f} grasps/s, about {left} left")
-
-    def compiled(self) -> None:
-        """Leaves the call before, which compiled, out of the rate."""
-        self._compiled = time.monotonic(), self.done
 
 
 class Progress(Live):

@@ -86,15 +86,9 @@ def _strategies(args: argparse.Namespace, the_plan: simulate.Strategies, the_sce
 
 
 def _landscape(args: argparse.Namespace, the_plan: simulate.Landscape, the_scene: Scene) -> Found:
-    console, part = Console(highlight=False, soft_wrap=True), args.out / f"{args.experiment}.part"
-    if args.fresh:
-        part.unlink(missing_ok=True)
-    how = {"seed": args.seed, "chunk": args.chunk, "devices": args.devices, "console": console}
-    try:
-        found, _ = simulate.landscape(the_plan, the_scene, args.engine, part, **how)
-    except KeyboardInterrupt:
-        print("stopped; the same command goes on")
-        return 130, None, 0
+    how = {"seed": args.seed, "chunk": args.chunk, "devices": args.devices}
+    how["console"] = Console(highlight=False, soft_wrap=True)
+    found = simulate.landscape(the_plan, the_scene, args.engine, **how)
     space = parameters.design_space(the_scene.hand, the_plan.preset)
     return 0, simulate.of_landscape(the_scene, space, found), the_plan.grasps
 

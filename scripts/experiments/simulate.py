@@ -12,13 +12,12 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import batch, runs
+from codesign_jax import batch, codesign, runs
 from codesign_jax.commands import calls
-from codesign_jax.commands.calls import Calls, Trials
 from codesign_jax.engines import make_engine
 from codesign_jax.runs import Record
 from codesign_jax.runs.progress import Meter
-from codesign_jax.scene import InputError, Scene
+from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.types import Status, failed
 from scripts.shared import output, provenance
@@ -213,34 +212,29 @@ def landscape(
     plan: Landscape,
     scene: Scene,
     engine: str,
-    part: Path,
     *,
     seed: int,
     chunk: int,
     devices: int | None,
     console: Console,
-) -> tuple[Arrays, int]:
-    """Simulates every point in the same trials; the same call goes on where it stopped.
+) -> Arrays:
+    """Simulates every point in the same trials.
 
     Returns:
-      `designs` (point, point, parameter), `trial_cost` and `status` (point, point, trial); and how
-      many grasps were found in the file.
+      `designs` (point, point, parameter), `trial_cost` and `status` (point, point, trial).
     """
     space = design_space(scene.hand, plan.preset)
     designs = grid(space, plan.points)
     flat = designs.reshape(-1, designs.shape[-1])
-    trials = Trials(scene, engine, space, plan.trials, seed, (STREAM_GRID,))
-    most = max(1, chunk // plan.trials)
-    size = calls.equal(len(flat), min(most, -(-len(flat) // len(batch.take(devices)))))
-    run = Calls(trials, make_engine(engine, scene), size, part, flat, devices=devices)
-    if run.refused:
-        raise InputError([f"{part} {run.refused}: choose another --out, or delete it"])
+    task = codesign.Task(scene, space, plan.trials, make_engine(engine, scene))
+    key = codesign.stream_key(jax.random.key(seed), STREAM_GRID)
+    size = calls.size(len(flat), plan.trials, most=chunk, devices=len(batch.take(devices)))
     with Meter(plan.name, plan.grasps, console) as meter:
-        outcome = run(flat, meter)
+        outcome = calls.simulate(task, key, flat, size, meter, devices=devices)
     shape = (plan.points, plan.points, plan.trials)
     found = {"trial_cost": outcome.cost, "status": outcome.status.astype(np.uint8)}
     found = {name: values.reshape(shape) for name, values in found.items()}
-    return {"designs": designs, **found}, run.found * plan.trials
+    return {"designs": designs, **found}
 
 
 # --- what is kept ---------------------------------------------------------------------------------

@@ -24,7 +24,7 @@ help:
 	@echo "make quick       a minute of them, for another Python: PYTHON=python3.13 VENV=.venv-other MUJOCO='mujoco<4'"
 	@echo "make test-gpu    the tests that need an NVIDIA GPU, GPU=file.json"
 	@echo "make test-ptx    kernels for GPUs, assembled without one"
-	@echo "make test-browser  the report in a headless Chromium"
+	@echo "make test-browser  report and studio in a headless Chromium"
 	@echo "make stability   the hard cases and their margins, docs/notes/stability.md"
 	@echo "make faults      kills, full disks, damage, hostile input: FAULTS=100"
 	@echo "make notebooks   execute them         make lint types  ruff, pyright"
@@ -45,7 +45,7 @@ CORE := layers scene parameters optimizers compiler planted_faults codesign run_
 quick: $(QUICK)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(CORE:%=tests/test_%.py)
 
-# What needs a browser: the report and its 3D replay in a headless Chromium.
+# What needs a browser: the report, its 3D replay and the studio in a headless Chromium.
 test-browser: $(STAMP)
 	$(BIN)/python -m pytest -q -m browser -rs $$(grep -l mark.browser tests/test_*.py)
 

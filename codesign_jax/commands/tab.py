@@ -41,7 +41,7 @@ COUNTS = (24, 48, 96, 240)
 """Numbers of trials that a verdict may have."""
 BATCH = 3
 """Trials of one step: more would keep the next grasp waiting."""
-PARTICLES, EPISODES, SIGMA = 20, 15, 0.05
+PARTICLES, EPISODES, SIGMA = 20, 15, 0.12
 """Of `improve`: designs of an episode, episodes, and how far the first ones lie from the design, as
 a standard deviation in shares of the parameters' ranges."""
 LOOKED_AT = 15
@@ -267,16 +267,18 @@ class Tab:
 
     def _next(self) -> bool:
         shown = self._shown
-        if self._actions:
-            try:
-                self._actions.popleft()()
-            except InputError as error:  # what is shown stays
-                self.send("error", str(error))
-        elif self._asked:
+        if self._asked:
             view = self._asked.popleft()
             if view.number is not None:  # the page's: a slider was moved
                 self._end_search()
             self._show(view)
+        elif self._actions:
+            try:
+                self._actions.popleft()()
+            except InputError as error:  # what is shown stays
+                self.send("error", str(error))
+        elif shown and self._search:
+            self._improve(shown, *self._search)
         elif shown and shown.view.resting and self._total < shown.view.trials:
             left = shown.view.trials - self._total
             found = shown.bench.outcomes(shown.view.design, self._total)
@@ -285,8 +287,6 @@ class Tab:
         elif shown and shown.view.resting and not self._looked:
             self._looked = True
             self.send("overlap", _deepest(shown))
-        elif shown and self._search:
-            self._improve(shown, *self._search)
         else:
             return False
         return True
@@ -343,6 +343,7 @@ class Tab:
         if self._search:
             self._search = None
             self.send("improving", False)
+            self.send("state", "")
 
     def _improve(self, shown: Shown, optimizer: Any, state: Any, done: int) -> None:
         """One episode, whose answer so far is shown."""

@@ -132,7 +132,7 @@ function startStudio(root) {
     else if (!stage.classList.contains("still") && startReplay(stage, { ...grasp.replay, strip: [] })) stage.replay.play();
     if (grasp.number === null || grasp.number === asked) {  // else a slider has moved on
       grasp.design.forEach((value, k) => set(rows[k], value));
-      find("state").textContent = "";
+      if (grasp.number !== null) find("state").textContent = "";
     }
     rows.forEach((row, k) => {
       const limit = grasp.limits[k];

@@ -77,32 +77,32 @@ def test_a_design_is_opened_from_its_file(workplace, capsys):
 def test_evaluate_takes_the_best_of_a_run(finished, capsys):
     rows = [line.split(",") for line in (finished / "tests.csv").read_text().splitlines()[1:]]
     best = min(rows, key=lambda row: float(row[1]))
-    assert command("evaluate", "--run", finished, "--trials", "1") == 0
+    assert command("evaluate", "--run", finished, "--trials", "3") == 0
     output = capsys.readouterr().out
-    assert command("evaluate", finished, "--trials", "1") == 0  # as report and replay take it
+    assert command("evaluate", finished, "--trials", "3") == 0  # as report and replay take it
     assert capsys.readouterr().out == output
     assert command("evaluate", finished, "--run", finished) == 2
     assert f"length={float(best[-2]):.4g} mm" in output
-    assert "of 1, " in output and " % of 1 fresh grasps (" in output
+    assert "of 3, " in output and " % of 3 fresh grasps (" in output
 
 
 def test_a_table_of_trials_has_noise_and_endings(finished, tmp_path, capsys):
     """Of any final particle: the noise is that of the seed, and endings add up to the verdict."""
     rows = [line.split(",") for line in (finished / "tests.csv").read_text().splitlines()[1:]]
     table, seed = tmp_path / "new" / "trials.csv", 4
-    asked = ["evaluate", finished, "--particle", "1", "--trials", "2", "--seed", seed]
+    asked = ["evaluate", finished, "--particle", "1", "--trials", "3", "--seed", seed]
     assert command(*asked, "--out", table) == 0
     output = capsys.readouterr().out
     assert f"particle 1 of {finished}" in output and f"length={float(rows[1][-2]):.4g} mm" in output
     with table.open(newline="") as file:
         found = [*csv.DictReader(file)]
     assert [*found[0]] == [*columns.MORE[columns.REFERENCE].columns]
-    drawn = rollout.sample_trials(runs.read_run(finished)[0], jax.random.key(seed), 2)
+    drawn = rollout.sample_trials(runs.read_run(finished)[0], jax.random.key(seed), 3)
     for row, x, mass in zip(found, drawn.position[:, 0], drawn.mass, strict=True):
         assert float(row["noise_x_m"]) == pytest.approx(float(x), rel=1e-6)
         assert float(row["noise_mass_factor"]) == pytest.approx(float(mass), rel=1e-6)
     kept = sum(row["verdict"] == "kept" for row in found)
-    assert f"all: kept {kept} of 2, " in output
+    assert f"all: kept {kept} of 3, " in output
     for wrong, words in (
         ([finished, "--particle", "99"], "--particle = 99 is outside"),
         (["--particle", "0"], "--particle is one of a run"),
@@ -309,5 +309,5 @@ def test_evaluate_refuses_wrong_input(arguments, part, workplace, capsys):
 
 def test_bounds_themselves_are_designs(capsys):
     space_low = ["length=10", "arm_z=-50"]
-    engine = ["--engine", "mujoco", "--trials", "1"]
+    engine = ["--engine", "mujoco", "--trials", "3"]
     assert command("evaluate", "--scene", TINY, "--design", *space_low, *engine) == 0

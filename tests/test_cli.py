@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from codesign_jax import cli, codesign
-from codesign_jax.commands import preflight, status
+from codesign_jax import cli, codesign, preflight
+from codesign_jax.commands import status
 from codesign_jax.scene import effects
 from tests.helpers.command_runs import EPISODES, command, finished_run, own_workplace  # noqa: F401
 from tests.helpers.tiny_run import RUN

@@ -23,7 +23,7 @@ axes model control verdict
 engines cost
 start policy
 rollout
-own
+own preflight
 codesign env finger fit sampling
 batch
 runs

@@ -8,8 +8,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from codesign_jax import scene
-from codesign_jax.commands import preflight
+from codesign_jax import preflight, scene
 from codesign_jax.engines.structured.laws import shapes
 from codesign_jax.scene import meshes, objects, schema
 from codesign_jax.scene.meshes import grid, mass, repair, surface

@@ -7,8 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import model, scene
-from codesign_jax.commands import preflight
+from codesign_jax import model, preflight, scene
 from codesign_jax.scene import constants, hand, schema
 from tests.helpers.grasps import DATA, hand_world
 

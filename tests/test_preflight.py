@@ -9,8 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import model, scene, start
-from codesign_jax.commands import preflight
+from codesign_jax import model, preflight, scene, start
 from codesign_jax.model.layout import first_on_palm
 from codesign_jax.scene import parameters
 from tests.helpers.grasps import hand_world, pinch, random_worlds, still

@@ -7,8 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from codesign_jax import scene
-from codesign_jax.commands import preflight
+from codesign_jax import preflight, scene
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.runs import scene_files
 from codesign_jax.scene import objects, rigid, schema

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, optimize, runs, sampling
-from codesign_jax.commands import common, preflight, reference
+from codesign_jax import codesign, optimize, preflight, runs, sampling
+from codesign_jax.commands import common, reference
 from codesign_jax.commands.common import find_case
 from codesign_jax.engines import Engine
 from codesign_jax.report.statistics import wilson
@@ -74,9 +74,9 @@ def main(options: "Check") -> int:
     case = find_case(options)
     finer = with_accuracy(case.scene, reference.ACCURACY)
     _refuse(options, case, finer)
-    console = Console(highlight=False, soft_wrap=True)
+    console = common.console()
     for line in _head(case, load):
-        console.print(line, markup=False)
+        console.print(line)
     settings = _settings(options, case)
     return tell(case, settings, *simulate(case, settings, finer, options, console), console)
 
@@ -227,5 +227,5 @@ def tell(
         f"{duration(usual.compiling + grasps / usual.rate)}{test if tested else ''}",
     ]
     for line in lines:
-        console.print(line, markup=False)
+        console.print(line)
     return int(any(failed(m.outcomes.status).all() for m in (usual, fine)))

@@ -211,6 +211,11 @@ def by_default(space: DesignSpace, words: Sequence[str]) -> str:
     return f"not given, so the hand file's defaults: {', '.join(groups)}"
 
 
+def console() -> Console:
+    """Prints texts as they are, in lines as long as they are."""
+    return Console(highlight=False, soft_wrap=True, markup=False)
+
+
 def refuse(problems: list[str]) -> None:
     """Ends the command if anything is wrong with its input."""
     if problems:
@@ -247,7 +252,7 @@ def number_problems(*numbers: tuple[str, float | None, float, float]) -> list[st
 
 def print_table(console: Console, table: Table) -> None:
     """Prints a table as wide as it is: a log takes long lines, and a terminal folds them."""
-    Console(file=console.file, width=1000).print(table)
+    Console(file=console.file, width=1000, markup=False).print(table)
 
 
 def picture_problems(flag: str, path: Path | None) -> list[str]:

@@ -78,11 +78,11 @@ def main(options: "Compare") -> int:
     common.refuse(problems + common.place_problems("--out", options.out, ".csv"))
     pair = [] if options.trials is None else _pair(options, folders)
     every = read_all({folder: runs.read_run(folder) for folder in folders})
-    console = Console(highlight=False, soft_wrap=True)
+    console = common.console()
     compare(every, console, named=True)
     if options.out is not None:
         write_table(every, options.out)
-        console.print(f"table: {options.out}", markup=False)
+        console.print(f"table: {options.out}")
     if pair:
         _compare_pair(pair, [str(folder) for folder in folders], options, console)
     return 0
@@ -127,10 +127,10 @@ def _compare_pair(pair: list[Case], names: list[str], options: "Compare", consol
     for case, name in zip(pair, names, strict=True):
         with Busy(console, f"simulating {common.counted(count, 'grasp')}"):
             outcome = case.simulate(count, jax.random.key(options.seed))
-        console.print(f"{name} {Judged(case.scene, outcome, options.accuracy)}", markup=False)
+        console.print(f"{name} {Judged(case.scene, outcome, options.accuracy)}")
         kept.append(codesign.verdicts(outcome) == codesign.VERDICTS.index("kept"))
     for line in difference(*kept, names=names):
-        console.print(line, markup=False)
+        console.print(line)
 
 
 def difference(first: np.ndarray, second: np.ndarray, names: list[str]) -> list[str]:

@@ -57,6 +57,5 @@ def _announce(planned: "Study", options: "Export", console: Console) -> None:
     others = {"free": "all moves the hand's whole table", "all": "free moves fewer"}
     console.print(
         f"tolerance of {moved}: simulating at most {most} grasps "
-        f"(--tolerance {others[options.tolerance]}, off none)",
-        markup=False,
+        f"(--tolerance {others[options.tolerance]}, off none)"
     )

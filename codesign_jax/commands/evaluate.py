@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import engines, rollout, runs, types
-from codesign_jax.commands import common, preflight, reference
+from codesign_jax import engines, preflight, rollout, runs, types
+from codesign_jax.commands import common, reference
 from codesign_jax.commands.common import find_case
 from codesign_jax.report import stress, verdicts
 from codesign_jax.runs import choice, tables
@@ -29,17 +29,17 @@ def main(options: "Evaluate") -> int:
     _check(options, case.engine)
     engine = case.make_engine()
     notes = preflight.notes(case.scene, case.space, {"the design": case.design})
-    console = Console(highlight=False, soft_wrap=True)
+    console = common.console()
     if options.run_folder:
         which = "best final design" if options.particle is None else f"particle {options.particle}"
-        console.print(f"{which} of {options.run_folder}", markup=False)
-    console.print(runs.describe(case.space, case.design), markup=False)
+        console.print(f"{which} of {options.run_folder}")
+    console.print(runs.describe(case.space, case.design))
     if not options.run_folder:
         words = [*chain.from_iterable(options.design)]
         if note := common.by_default(case.space, words):
-            console.print(note, markup=False)
+            console.print(note)
     for note in [*_untried(case, options), *notes]:
-        console.print(note, markup=False)
+        console.print(note)
     if options.dry_run:
         more = f", {stress.sets(case.scene) * options.trials} more" if options.stress else ""
         console.print(f"grasps: {options.trials}{more}")
@@ -81,15 +81,15 @@ def simulate(case: Case, options: "Evaluate", console: Console) -> types.Outcome
     names = [shape.name for shape in case.scene.objects.object]
     for k, name in enumerate(names[: options.trials]):
         own = jax.tree.map(lambda v, k=k: v[k :: len(names)], one)
-        console.print(f"{name:>12}: {verdicts.of_trials(case.scene, own)}", markup=False)
+        console.print(f"{name:>12}: {verdicts.of_trials(case.scene, own)}")
     judged = verdicts.Judged(case.scene, one, options.accuracy)
     lines = [f"{'all':>12}: {judged.details}", *verdicts.solver(one), *verdicts.warnings(judged)]
     for line in [*lines, f"verdict: {judged}"]:
-        console.print(line, markup=False)
+        console.print(line)
     if options.out:
         drawn = rollout.sample_trials(case.scene, jax.random.key(options.seed), options.trials)
         tables.write_grasps(options.out, case.scene, jax.tree.map(np.asarray, drawn), one)
-        console.print(f"table: {options.out}", markup=False)
+        console.print(f"table: {options.out}")
     return one
 
 
@@ -117,4 +117,4 @@ def draw(case: Case, engine: engines.Engine, options: "Evaluate", console: Conso
     write = animation.write_strip if path.suffix == animation.STRIP else animation.write_film
     with Busy(console, "drawing"):
         write(case.scene, grasps, path, notify=console.print)
-    console.print(f"picture: {path}", markup=False)
+    console.print(f"picture: {path}")

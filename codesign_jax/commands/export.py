@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import engines, files, provenance, rollout, runs
-from codesign_jax.commands import common, drift, preflight, reference
+from codesign_jax import engines, files, preflight, provenance, rollout, runs
+from codesign_jax.commands import common, drift, reference
 from codesign_jax.commands.common import find_case
 from codesign_jax.export import grasps, plain, process, tables
 from codesign_jax.export.process import Process, Size
@@ -40,12 +40,12 @@ def main(options: "Export") -> int:
         notes.append(f"commands are those of the key frames: policy {case.policy} is left out")
     simulating = options.tolerance != "off" and not options.no_sheet
     engine = case.make_engine() if simulating else None
-    console = Console(highlight=False, soft_wrap=True)
+    console = common.console()
     if options.run_folder:
-        console.print(f"best final design of {options.run_folder}", markup=False)
-    console.print(runs.describe(case.space, case.design), markup=False)
+        console.print(f"best final design of {options.run_folder}")
+    console.print(runs.describe(case.space, case.design))
     for note in notes:
-        console.print(note, markup=False)
+        console.print(note)
     try:
         with files.whole_folder(options.out) as folder:
             write_files(case, params, sizes, engine, folder, options, console)
@@ -122,16 +122,16 @@ def write_files(
 def _tell(case: Case, options: "Export", console: Console) -> None:
     from codesign_jax.export import sheet
 
-    console.print(f"exported: {options.out}", markup=False)
+    console.print(f"exported: {options.out}")
     models = sorted((options.out / tables.MODELS).glob("*.mjb"))
     if models:
         player = f"python {grasps.PLAYER.name} {models[0].name}"
-        console.print(f"  {tables.MODELS}/: models for plain MuJoCo; there: {player}", markup=False)
-    console.print(f"  {tables.COMMANDS}: commands of arm and valves", markup=False)
+        console.print(f"  {tables.MODELS}/: models for plain MuJoCo; there: {player}")
+    console.print(f"  {tables.COMMANDS}: commands of arm and valves")
     if not options.no_parts:
-        console.print("  parts/: fingers and moulds, in millimetres", markup=False)
+        console.print("  parts/: fingers and moulds, in millimetres")
     if not options.no_sheet:
-        console.print(f"  {sheet.NAME}.md, {sheet.NAME}.pdf: build sheet", markup=False)
+        console.print(f"  {sheet.NAME}.md, {sheet.NAME}.pdf: build sheet")
         if options.tolerance == "off":
             most = drift.study(case, options).most * options.tolerance_trials
             console.print(
@@ -149,7 +149,7 @@ def _parts(sizes: list[Size], folder: Path, options: "Export", console: Console)
         for part in meshes.write(folder, sizes, how):
             edges = " x ".join(f"{v:.1f}" for v in part.extents)
             line = f"part {part.name}: {edges} mm, {part.volume / 1e3:.1f} cm^3"
-            console.print(line, markup=False)
+            console.print(line)
     for i, size in enumerate(sizes):
         if how.inlet and not process.inlet(size, how):
             low = min(size.chamber[1:])
@@ -160,14 +160,14 @@ def _parts(sizes: list[Size], folder: Path, options: "Export", console: Console)
 
 def _models(case: Case, params: Params, folder: Path, options: "Export", console: Console) -> None:
     for difference in plain.differences(case.scene):
-        console.print(f"note: {difference} (docs/export.md)", markup=False)
+        console.print(f"note: {difference} (docs/export.md)")
     folder = folder / tables.MODELS
     folder.mkdir(exist_ok=True)
     trials = _trials(case, options)
     built = _built(case, params, trials)
     with Busy(console, f"simulating {common.counted(len(trials), 'grasp')} in plain MuJoCo"):
         for line in tables.write_grasps(folder, case.scene, trials, built):
-            console.print(f"in plain MuJoCo: {line}", markup=False)
+            console.print(f"in plain MuJoCo: {line}")
 
 
 def _built(case: Case, params: Params, trials: list[tuple[str, Trial]]) -> Iterator[grasps.Grasp]:

@@ -45,12 +45,12 @@ def main(options: "Options") -> int:
     common.refuse(problems + common.place_problems("--out", options.out, ".csv"))
     measured = options.measured and fingers.read(options.measured)
     mine = fingers.of_design(case.scene, params, options.finger)
-    console = Console(highlight=False, soft_wrap=True)
-    console.print(_about(mine, options.finger, case.scene.hand.name), markup=False)
+    console = common.console()
+    console.print(_about(mine, options.finger, case.scene.hand.name))
     if not options.run_folder:
         given = [*chain.from_iterable(options.design)]
         if note := common.by_default(case.space, given):
-            console.print(note, markup=False)
+            console.print(note)
     table = measured
     if table is None:
         top = float(np.asarray(params.pressure)[options.finger])
@@ -92,10 +92,10 @@ def compare(
     common.print_table(console, shown)
     if options.measured:
         for which, values in found.items():
-            console.print(f"{which}: {_errors(table, values)}", markup=False)
+            console.print(f"{which}: {_errors(table, values)}")
     if fit:
         for line in _of_fit(fit, table):
-            console.print(line, markup=False)
+            console.print(line)
     if options.out:
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows(
@@ -103,7 +103,7 @@ def compare(
         )
         with files.atomically(options.out) as temporary:
             temporary.write_text(text.getvalue(), encoding="utf-8")
-        console.print(f"table: {options.out}", markup=False)
+        console.print(f"table: {options.out}")
 
 
 def _number(value: float) -> str:

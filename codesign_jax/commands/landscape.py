@@ -7,9 +7,9 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, files, runs
+from codesign_jax import codesign, files, preflight, runs
 from codesign_jax.codesign import Task
-from codesign_jax.commands import calls, common, preflight
+from codesign_jax.commands import calls, common
 from codesign_jax.commands.common import find_case
 from codesign_jax.cost import particle_cost
 from codesign_jax.report import landscape
@@ -45,12 +45,12 @@ def main(options: "Options") -> int:
     _check(options, case)
     folder = _folder(options, case)
     made = make_plane(case, _columns(case, options.parameters), options.points)
-    console = Console(highlight=False, soft_wrap=True)
+    console = common.console()
     others = [k for k in range(case.space.num_parameters) if k not in made.columns]
     if others:
-        console.print(runs.describe(case.space, case.design, "around"), markup=False)
+        console.print(runs.describe(case.space, case.design, "around"))
     for note in preflight.notes(case.scene, case.space, {"the design": case.design}):
-        console.print(note, markup=False)
+        console.print(note)
     size = calls.size(len(made.designs), options.trials)
     count = common.counted(-(-len(made.designs) // size), "call")
     console.print(f"grasps: {len(made.designs) * options.trials} in {count}")
@@ -159,8 +159,7 @@ def print_summary(case: Case, found: Landscape, console: Console) -> None:
     )
     console.print(
         f"{good} of {found.cost.size} points have a mean cost below {codesign.SUCCESS_COST}; "
-        f"lowest: {found.cost[i, j]:.4f} at {place}",
-        markup=False,
+        f"lowest: {found.cost[i, j]:.4f} at {place}"
     )
     bad = int((int(found.trials) - found.counted).sum())
     if bad:
@@ -171,10 +170,10 @@ def write_files(found: Landscape, folder: Path, console: Console) -> None:
     """Writes the arrays and the figure."""
     folder.mkdir(parents=True, exist_ok=True)
     for path in landscape.save(found, folder):
-        console.print(f"landscape: {path}", markup=False)
+        console.print(f"landscape: {path}")
     from codesign_jax.report import figures
 
     path = folder / "figures" / "landscape.png"
     with files.naming(path):
         figures.landscape(found, path)
-    console.print(f"figure: {path}", markup=False)
+    console.print(f"figure: {path}")

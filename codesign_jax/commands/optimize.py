@@ -13,8 +13,8 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, engines, files, optimize, runs
-from codesign_jax.commands import common, compare, hosts, preflight, reference, status
+from codesign_jax import codesign, engines, files, optimize, preflight, runs
+from codesign_jax.commands import common, compare, hosts, reference, status
 from codesign_jax.commands.compare import Compared
 from codesign_jax.own import is_own, make_policy
 from codesign_jax.report import stress, verdicts
@@ -69,7 +69,7 @@ def main(options: "Optimize") -> int:
             _tell_error(f"{called[folder]}: " if called else "", result)
     if found.signum:
         return 128 + found.signum
-    console = Console(highlight=False, soft_wrap=True)
+    console = common.console()
     _tell(options, plans, results, called, console)
     if called:
         pairs = {folder: (scene, own) for folder, own in every.items()}
@@ -104,7 +104,7 @@ def _compare_all(options: "Optimize") -> int:
     scene, settings = resolve(options)
     every = runs_of(options, scene, settings)
     found = compare.read_all({folder: (scene, own) for folder, own in every.items()})
-    _compare(options, found, Console(highlight=False, soft_wrap=True))
+    _compare(options, found, common.console())
     return int(any(run.result is None for run in found.values()))
 
 
@@ -112,7 +112,7 @@ def _compare(options: "Optimize", every: dict[Path, Compared], console: Console)
     compare.compare(every, console)
     table = table_folder(options) / columns.SEEDS
     compare.write_table(every, table)
-    console.print(f"table: {table}", markup=False)
+    console.print(f"table: {table}")
 
 
 def _tell(
@@ -181,8 +181,7 @@ def _summarize(plan: Plan, result: RunResult, console: Console) -> None:
     if plan.task.cost is not None:
         console.print(
             f"lowest mean cost of an episode, by {plan.settings.cost}: "
-            f"{history.cost.mean(1).min():.4g}",
-            markup=False,
+            f"{history.cost.mean(1).min():.4g}"
         )
     elif converged is None:
         console.print(f"not converged: the mean cost does not stay below {codesign.CONVERGED_COST}")
@@ -193,7 +192,7 @@ def _summarize(plan: Plan, result: RunResult, console: Console) -> None:
         console.print(f"converged from episode {converged + 1} on, after {grasps} grasps")
     if result.test is not None:
         best = particles[int(np.asarray(result.test.cost).argmin())]
-        console.print(runs.describe(plan.space, best, "best final particle"), markup=False)
+        console.print(runs.describe(plan.space, best, "best final particle"))
 
 
 def _judge(
@@ -217,13 +216,13 @@ def _judge(
     judged = test if fresh is None else fresh
     last = [f"verdict: {judged}", f"more fresh trials: {again}"]
     for line in [*lines, *verdicts.warnings(judged), *last]:
-        console.print(line, markup=False)
+        console.print(line)
 
 
 def _say_places(result: RunResult, folder: Path, console: Console) -> None:
     _figures(result, folder, console)
-    console.print(f"results: {folder}", markup=False)
-    console.print(f"to look at: {shlex.join(['codesign', 'report', str(folder)])}", markup=False)
+    console.print(f"results: {folder}")
+    console.print(f"to look at: {shlex.join(['codesign', 'report', str(folder)])}")
 
 
 def _figures(result: RunResult, folder: Path, console: Console) -> None:
@@ -233,7 +232,7 @@ def _figures(result: RunResult, folder: Path, console: Console) -> None:
         from codesign_jax.report import figures
 
         figures.cost_evolution(result.record.history.cost, path)
-    console.print(f"figure: {path}", markup=False)
+    console.print(f"figure: {path}")
 
 
 def resolve(options: "Optimize") -> tuple[Scene, Settings]:

@@ -47,7 +47,7 @@ def test(folder: Path, settings: Settings, trials: int, console: Console) -> Out
     if found is not None and found.cost.size == trials:
         return found
     if why:
-        console.print(f"{folder / FILE} {why}: simulated again", markup=False)
+        console.print(f"{folder / FILE} {why}: simulated again")
     case, key = _finer(folder, settings), _noise(settings, STREAM_REFERENCE)
     with Busy(console, f"reference test, {counted(trials, 'grasp')}"):
         found = case.simulate(trials, key)
@@ -95,7 +95,7 @@ def tell_stress(case: Case, found: Stress, console: Console) -> None:
     params = jax.tree.map(np.asarray, case.space.params(jnp.asarray(case.design)))
     warnings = [*stress.of_design(case.scene, params), *found.warnings]
     for line in [*found.lines(), *(f"warning: {words}" for words in warnings)]:
-        console.print(line, markup=False)
+        console.print(line)
 
 
 def stress_run(folder: Path, settings: Settings, console: Console) -> None:

@@ -23,7 +23,7 @@ def main(options: "Render") -> int:
     end = asked.case.scene.end_time
     late = [t for t in options.times if not 0 <= t <= end]
     common.refuse([f"--times {t:g} is outside [0, {end:g}] s, a grasp" for t in late])
-    draw(asked, options, camera, Console(highlight=False, soft_wrap=True))
+    draw(asked, options, camera, common.console())
     return 0
 
 
@@ -83,7 +83,7 @@ def draw(asked: grasp.Asked, options: "Render", camera: "Camera", console: Conso
         shown = grasp.simulate(asked)
     from codesign_jax.report import animation
 
-    console.print("\n".join(grasp.description(asked, shown)), markup=False)
+    console.print("\n".join(grasp.description(asked, shown)))
     scene, size = asked.case.scene, (options.size, options.size)
     with Busy(console, "drawing"):
         how: Any = {"size": size, "camera": camera, "notify": console.print}
@@ -91,4 +91,4 @@ def draw(asked: grasp.Asked, options: "Render", camera: "Camera", console: Conso
             animation.write_strip(scene, [shown], options.out, times=options.times or None, **how)
         else:
             animation.write_film(scene, [shown], options.out, **how)
-    console.print(f"picture: {options.out}", markup=False)
+    console.print(f"picture: {options.out}")

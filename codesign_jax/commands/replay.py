@@ -37,12 +37,12 @@ def main(options: "Replay") -> int:
     path = options.out or (options.run_folder or Path()) / "replay.html"
     common.refuse(common.place_problems("--out", path, ".html"))
     asked = grasp.find(options)
-    console = Console(highlight=False, soft_wrap=True)
+    console = common.console()
     places = options.episode, options.particle, options.trial, options.object
     if options.run_folder is not None and places == (None,) * 4:
         show_failures(options.run_folder)
     write_page(asked, path, console)
-    console.print(f"replay: {path} (for any browser, offline)", markup=False)
+    console.print(f"replay: {path} (for any browser, offline)")
     if options.open:
         webbrowser.open(path.resolve().as_uri())
     return 0
@@ -55,7 +55,7 @@ def write_page(asked: grasp.Asked, path: Path, console: Console) -> Path:
     from codesign_jax.report import viewer
 
     lines = grasp.description(asked, shown)
-    console.print("\n".join(lines), markup=False)
+    console.print("\n".join(lines))
     return viewer.write(asked.case.scene, shown, path, title="A grasp in 3D", text=lines)
 
 

@@ -56,14 +56,14 @@ def main(options: "Report") -> int:
         tuple(notes),
         reference.stored_stress(options.folder, settings),
     )
-    console = Console(highlight=False, soft_wrap=True)
+    console = common.console()
     if why:
-        console.print(f"{options.folder / reference.FILE} {why}: left out", markup=False)
+        console.print(f"{options.folder / reference.FILE} {why}: left out")
     shown = None if options.no_replay else best_grasp(scene, settings, record, name, console)
     with Busy(console, "writing the report"):
         page.write(run, shown, path)
     size = path.stat().st_size / 1e6
-    console.print(f"report: {path} ({size:.1f} MB, for any browser, offline)", markup=False)
+    console.print(f"report: {path} ({size:.1f} MB, for any browser, offline)")
     return 0
 
 

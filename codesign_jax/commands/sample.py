@@ -7,9 +7,9 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import sampling
+from codesign_jax import preflight, sampling
 from codesign_jax.codesign import VERDICTS, verdicts
-from codesign_jax.commands import calls, common, preflight
+from codesign_jax.commands import calls, common
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.runs import dataset
 from codesign_jax.runs.dataset import Question
@@ -34,11 +34,11 @@ def main(options: "Sample") -> int:
     _check(options)
     scene = common.load_scene(options)
     question, engine = _question(options, scene), make_engine(options.engine, scene)
-    console = Console(highlight=False, soft_wrap=True)
+    console = common.console()
     outcomes = dataset.outcomes(options.out, question)
     designs = {"the default design": question.space.default()}
     for note in preflight.notes(scene, question.space, designs):
-        console.print(note, markup=False)
+        console.print(note)
     count = question.shards(options.designs)
     console.print(f"{_amount(options)} in {common.counted(count, 'call')}")
     if options.dry_run:
@@ -129,4 +129,4 @@ def _report(path: Path, counts: np.ndarray, console: Console) -> None:
     ends = zip(VERDICTS, counts.tolist(), strict=True)
     words = ", ".join(f"{name} {n} ({100 * n / total:.1f} %)" for name, n in ends)
     console.print(f"of {total} grasps: {words}")
-    console.print(f"table: {path} ({path.stat().st_size / 1e6:.1f} MB)", markup=False)
+    console.print(f"table: {path} ({path.stat().st_size / 1e6:.1f} MB)")

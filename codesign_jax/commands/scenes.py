@@ -23,7 +23,7 @@ def main(options: "Scenes") -> int:
     names = library.available("scenes") if options.name is None else [options.name]
     console = Console(highlight=False)
     for scene in [scenes.load(name) for name in names]:
-        console.print(f"{scene.name}: {scene.description}", markup=False)
+        console.print(f"{scene.name}: {scene.description}")
         console.print(_table(scene, engines))
     return 0
 

@@ -17,8 +17,9 @@ from rich.console import Console
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import Server, ServerConnection
 
+from codesign_jax import preflight
 from codesign_jax.codesign import VERDICTS
-from codesign_jax.commands import common, preflight, server
+from codesign_jax.commands import common, server
 from codesign_jax.commands.tab import COUNTS, Desk, Tab
 from codesign_jax.report import viewer
 from codesign_jax.runs import choice, tables
@@ -34,11 +35,11 @@ def main(options: "Options") -> int:
     common.use_compilation_cache()
     problems = common.number_problems(("--port", options.port, 0, 65535))
     common.refuse(problems + common.place_problems("--out", options.out, folder=True))
-    console = Console(highlight=False, soft_wrap=True)
+    console = common.console()
     desk = Desk(options)
     scene, space = desk.case.scene, desk.case.space
     for note in preflight.notes(scene, space, {"the design": desk.case.design}):
-        console.print(note, markup=False)
+        console.print(note)
     serve(desk, console)
     return 0
 
@@ -54,7 +55,7 @@ def serve(desk: Desk, console: Console) -> None:
             f"--host {options.host}: other machines can reach this page. Its token guards it, but "
             "crosses the network unencrypted, as all else; an ssh tunnel to loopback is safer"
         )
-    console.print(f"the studio: {address}\nfor this user's browser; Ctrl-C ends it", markup=False)
+    console.print(f"the studio: {address}\nfor this user's browser; Ctrl-C ends it")
     if options.open:
         webbrowser.open(address)
     with listening:

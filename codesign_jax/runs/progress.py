@@ -61,7 +61,7 @@ class Live:
 
     def message(self, text: str) -> None:
         """Prints a line above the bar."""
-        self.console.print(text, markup=False)
+        self.console.print(text)
         self._spoken = time.monotonic()
 
     def tick(self) -> None:
@@ -128,7 +128,7 @@ class Progress(Live):
 
     def __init__(self, total: int, runs: int = 1, *, test: int = 0, after: float = 0.0):
         """Takes episodes, grasps of the test and of what comes afterwards, of each of the runs."""
-        console = rich.console.Console(highlight=False, soft_wrap=True)
+        console = rich.console.Console(highlight=False, soft_wrap=True, markup=False)
         columns = rich.progress.BarColumn(), rich.progress.TextColumn("{task.description}")
         super().__init__(console, *columns, rich.progress.TimeElapsedColumn())
         self.total, self._test, self._after = total, runs * test, runs * after

@@ -4,6 +4,7 @@ import dataclasses
 import importlib
 import importlib.metadata
 import sys
+import warnings
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -386,6 +387,8 @@ def main(arguments: list[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
 
     def run() -> int:
+        if arguments is None:
+            warnings.showwarning = lambda text, *_: print(f"warning: {text}", file=sys.stderr)
         if given == ["--version"]:
             return _version()
         bad = [a for a in given if a.encode(errors="replace").decode() != a]

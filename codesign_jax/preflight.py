@@ -78,11 +78,6 @@ def mesh_notes(scene: Scene) -> list[str]:
 
 def _scene_warnings(scene: Scene) -> list[str]:
     h, found = scene.discretization.timestep, []
-    if scene.contact.time_constant < 2 * h:
-        found.append(
-            f"contact.time_constant = {scene.contact.time_constant:g} s is below two time steps "
-            f"({2 * h:g} s): MuJoCo raises it (refsafe), the contact is softer than asked for"
-        )
     rate = scene.arm.shake_frequency
     if scene.effects.disturb and rate * h * SHAKE_STEPS > 1:
         found.append(

@@ -57,20 +57,6 @@ def test_the_command_line_takes_a_preset(capsys):
     assert "'fastest' unknown; did you mean 'fast'" in capsys.readouterr().err
 
 
-def test_a_long_step_needs_a_longer_contact_time_constant():
-    """The scene refuses 20 ms as it is; with a longer constant the stiffness stays the same."""
-    with pytest.raises(schema.InputError, match="time_constant"):
-        scene.load("paper", overrides={"discretization.timestep": 0.02})
-    long = {"discretization.timestep": 0.02, "contact.time_constant": 0.04}
-    for overrides in ({}, long):
-        found = scene.load("paper", overrides=overrides)
-        c = found.contact
-        # k_n of model.contact_invweight's docstring, from what MuJoCo is given.
-        k = c.impedance / (c.impedance * c.time_constant) ** 2
-        stiffness = k * c.impedance / ((1 - c.impedance) * 2 * model.contact_invweight(found))
-        assert stiffness == pytest.approx(4000.0, rel=1e-12)
-
-
 def test_mujoco_converges_with_the_scene_s_own_limits():
     """A line search that ends early looks like convergence: 20 iterations were too few.
 

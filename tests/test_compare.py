@@ -14,6 +14,7 @@ from codesign_jax.report import statistics
 from tests.helpers.command_runs import command, own_workplace  # noqa: F401
 from tests.helpers.tiny_run import copied
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*contacts of today have no such numbers")
 DATA = Path(__file__).parent / "data"
 
 

@@ -23,8 +23,7 @@ WITHOUT = ("cost", "limits", "pneumatics", "objects.noise", "arm.shake", "hand.p
 MOVING = {
     "gravity",
     "contact.normal_stiffness",
-    "contact.time_constant",
-    "contact.impedance",
+    "contact.dissipation_time",
     "contact.friction_ratio",
     "hand.material.shear_modulus",
     "hand.material.damping_time",

@@ -246,8 +246,8 @@ BAD = {
     },
     "constants.gravity = 'down' must be a number": {"gravity": "down"},
     "constants.phases.inflate = 0.05 s must come after approach = 0.1 s": {"phases.inflate": 0.05},
-    "constants.contact.time_constant = 0.01 s must be at least two time steps": {
-        "contact.time_constant": 0.01
+    "constants.contact.dissipation_time = 2.0 is outside [0, 1] s": {
+        "contact.dissipation_time": 2.0
     },
 }
 

@@ -2,11 +2,15 @@
 
 import dataclasses
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import scipy.optimize
 
 from codesign_jax import model
+from codesign_jax.engines.structured.laws import cones, contact
 from tests.helpers.grasps import SHAPES, hand_world, pinch
 from tests.helpers.tables import GRAVITY, MASS, MU, Table
 
@@ -34,14 +38,13 @@ def test_resting_object(shape):
     assert total == pytest.approx(MASS * GRAVITY, rel=1e-6)
 
 
-@pytest.mark.parametrize("time_constant, impedance", [(0.02, 0.9), (0.04, 0.9), (0.02, 0.98)])
+@pytest.mark.parametrize("dissipation_time", [0.006, 0.03])
 @pytest.mark.parametrize("timestep", [0.01, 0.005])
-def test_stiffness_is_a_material_number(time_constant, impedance, timestep):
-    """k_n does not depend on time step, time constant or impedance: invweight makes up for them."""
+def test_stiffness_is_a_material_number(dissipation_time, timestep):
+    """k_n does not depend on time step or dissipation: invweight makes up for them."""
     table = Table(
         "sphere",
-        contact__time_constant=time_constant,
-        contact__impedance=impedance,
+        contact__dissipation_time=dissipation_time,
         discretization__timestep=timestep,
     )
     position, _ = table.run(3.0)
@@ -49,17 +52,61 @@ def test_stiffness_is_a_material_number(time_constant, impedance, timestep):
     assert sunk == pytest.approx(MASS * GRAVITY / 4000.0, rel=1e-3)
 
 
-def creep(table, shape, angle):
-    """Steady speed below the cone: m g sin(angle) w (1 - d) timeconst / (2 n impratio).
+@pytest.mark.parametrize("dissipation", [0.0, 0.006, 0.03])
+@pytest.mark.parametrize("timestep", [0.01, 0.001])
+def test_a_step_ends_with_the_force_at_its_end(dissipation, timestep):
+    """A ball falls on the table and bounces: f = -k (g + (h + tau) v) of each step's end, no pull.
 
-    A sticking contact is a damper: R f = -b v with R = w (1 - d) / (d impratio) and
-    b = 2 / (d timeconst); n contacts share m g sin(angle).
+    MuJoCo C with our numbers, at any time step; g is the gap at the beginning of the step.  What
+    does not act ahead of touch dissipates over one and a half steps at least.
+    """
+    table = Table(
+        "sphere", contact__dissipation_time=dissipation, discretization__timestep=timestep
+    )
+    tau = max(dissipation, 1.5 * timestep)
+    touch = table.data.qpos[-5]
+    table.data.qpos[-5] += 0.02
+    position, velocity = table.run(0.3)
+    k, h, ends = 2 * table.scene.contact.normal_stiffness, timestep, velocity[:, 2]
+    gaps = position[:, 2] - h * ends - touch  # at the beginning of each step
+    force = np.where(gaps < 0, np.maximum(-k * (gaps + (h + tau) * ends), 0), 0)
+    before = np.append(0, ends[:-1])
+    assert (force > 0).sum() > 3
+    np.testing.assert_allclose(ends, before + h * (force / MASS - GRAVITY), atol=1e-6)
+
+
+@pytest.mark.parametrize("gap", [-2e-3, -1e-5, 1e-5, 2e-3])
+@pytest.mark.parametrize("speed", [-2.0, -0.1, 0.3])
+def test_a_contact_is_the_least_of_a_convex_problem(gap, speed):
+    """A free mass under our cone against the law in closed form, in touch and ahead of it.
+
+    Ahead of touch the gap closes within the step at the earliest: f = -k (h + tau) (v + g / h).
+    """
+    scene = pinch("sphere", links=1)
+    h = scene.discretization.timestep
+    tau = max(scene.contact.dissipation_time, 1.5 * h)
+    with jax.enable_x64(True):
+        cone = cones.make_cone(scene, MU, bodies=2)
+        up = jnp.array([0.0, 0.0, 1.0])
+        one = contact.Contacts(0.0 * up, up, jnp.float64(gap), cone)
+        wanted = one.reference(speed * up)
+        pushed = jax.jit(lambda a: contact.constraint_update(one, a * up - wanted).force[2])
+        found = scipy.optimize.brentq(lambda a: MASS * (a + GRAVITY) - float(pushed(a)), -1e4, 1e4)
+    k = scene.contact.normal_stiffness
+    coming = gap / h if gap > 0 else gap / (h + tau)
+    after = (MASS * (speed / h - GRAVITY) - k * (h + tau) * coming) / (MASS / h + k * (h + tau))
+    after = after if -k * (h + tau) * (after + coming) > 0 else speed - h * GRAVITY
+    assert speed + h * found == pytest.approx(after, abs=1e-9)
+
+
+def creep(table, shape, angle):
+    """Steady speed below the cone: F / (n k r 40 ms) for a friction ratio r, whatever the step.
+
+    The table's contacts are twice as stiff; n of them share m g sin(angle).
     """
     contact, n = table.scene.contact, CORNERS[shape]
-    weight = model.contact_invweight(table.scene)
-    resistance = (1 - contact.impedance) / contact.impedance * weight / contact.friction_ratio
-    damping = 2 / (contact.impedance * contact.time_constant)
-    return MASS * GRAVITY * np.sin(angle) * resistance / (n * damping)
+    damper = 2 * contact.normal_stiffness * contact.friction_ratio * 0.04
+    return MASS * GRAVITY * np.sin(angle) / (n * damper)
 
 
 @pytest.mark.parametrize("shape", ["box", "cylinder"])
@@ -80,11 +127,12 @@ def test_incline_above_the_friction_angle_slides(shape):
     """At 1.1 of the friction angle: a = g (sin - mu cos), on average.
 
     MuJoCo's elliptic cone couples slip into the normal direction, so that a sliding object floats
-    up and hops; over many hops the impulses obey Coulomb's law.
+    up and hops; over many hops the impulses obey Coulomb's law, within 3 % of friction at 10 ms:
+    the acceleration is what is left of friction and weight.
     """
     angle = 1.1 * np.arctan(MU)
     expected = GRAVITY * (np.sin(angle) - MU * np.cos(angle))
-    for timestep, error in ((0.01, 0.15), (0.002, 0.05)):
+    for timestep, error in ((0.01, 0.3), (0.002, 0.08)):
         table = Table(shape, angle, flat=True, discretization__timestep=timestep)
         _, velocity = table.run(1.0)
         assert velocity[-1, 0] == pytest.approx(expected, rel=error)
@@ -118,8 +166,8 @@ def test_a_sliding_sphere_comes_to_roll():
     _, velocity = table.run(1.0)
     before, after = round(0.7 * time / 0.01), round(2 * time / 0.01)
     # It hops as it slides (see above): Coulomb's law on average.
-    assert velocity[before - 1, 0] == pytest.approx(v0 - MU * GRAVITY * before * 0.01, rel=0.05)
-    assert velocity[after, 0] == pytest.approx(5 / 7 * v0, rel=5e-3)
+    assert velocity[before - 1, 0] == pytest.approx(v0 - MU * GRAVITY * before * 0.01, rel=0.08)
+    assert velocity[after, 0] == pytest.approx(5 / 7 * v0, rel=1e-2)
 
 
 @pytest.mark.parametrize("ratio, falls", [(0.8, False), (1.25, True)])

@@ -1,14 +1,13 @@
 """Distances of finger spheres to objects against MuJoCo's own distance function."""
 
-from types import SimpleNamespace
-
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax.engines.structured.laws import shapes
+from codesign_jax.engines.structured.laws import rings, shapes
+from codesign_jax.engines.structured.world_model import apply_columns
 from tests.helpers import grasps
 
 SIZES = {
@@ -65,18 +64,11 @@ def engine_contacts(kind, position, quat, centre):
     with jax.enable_x64(True):
         alone = grasps.pinch(kind)
         size = np.broadcast_to(np.array(SIZES[kind])[:, None, None], (3, 1, POSES))
-        hand = SimpleNamespace(
-            object_size=jnp.asarray(size),
-            object_id=jnp.zeros((1, POSES), jnp.int32),
-            cones=SimpleNamespace(hand_object=None),
-        )
-        frames = columns.reshape(POSES, 3, 3).transpose(2, 1, 0)[
-            :, :, None
-        ]  # column, row, 1, world
-        kin = SimpleNamespace(object=jnp.asarray(frames))
-        return shapes.spheres_on_object(
-            alone, hand, kin, jnp.asarray((centre - position).T[:, None]), RADIUS
-        )
+        frames = jnp.asarray(columns.reshape(POSES, 3, 3).transpose(2, 1, 0)[:, :, None])
+        at = jnp.asarray((centre - position).T[:, None])  # frames: column, row, 1, world
+        local, shape = shapes.in_object(frames, at), jnp.zeros((1, POSES), jnp.int32)
+        distance, gradient = shapes.primitive_distance(alone, jnp.asarray(size), shape, local)
+        return rings.ball_on_field(RADIUS, at, distance, apply_columns(frames, gradient))
 
 
 @pytest.mark.parametrize("kind", grasps.SHAPES)
@@ -85,7 +77,7 @@ def test_distances_equal_mujoco(kind):
     position, quat, centre = poses(kind, 7)
     want, normal = reference(kind, position, quat, centre)
     got = engine_contacts(kind, position, quat, centre)
-    gap = np.asarray(got.distance)[0]
+    gap = np.asarray(got.gap)[0]
     outside = gap > 1e-6
     assert 0.2 < outside.mean() < 0.99  # both kinds of poses are tried
     # Both are closed forms in float64; they differ by rounding of lengths below a metre.
@@ -106,7 +98,7 @@ def test_penetrations_equal_mujoco(kind):
     """The depth of a sphere that overlaps the object."""
     position, quat, centre = poses(kind, 8)
     want, _ = reference(kind, position, quat, centre)
-    gap = np.asarray(engine_contacts(kind, position, quat, centre).distance)[0]
+    gap = np.asarray(engine_contacts(kind, position, quat, centre).gap)[0]
     inside = gap < -1e-6
     assert inside.sum() > 100
     np.testing.assert_allclose(gap[inside], want[inside], rtol=0, atol=1e-14)

@@ -11,6 +11,7 @@ from codesign_jax import runs
 from codesign_jax.runs import choice
 from tests.helpers.command_runs import command, own_workplace  # noqa: F401
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*contacts of today have no such numbers")
 DATA = Path(__file__).parent / "data"
 # Archive, run folder in it, episodes that are done and those that were asked for. The search in 23D
 # was stopped; the seeds grasp a sphere and a mesh.
@@ -52,3 +53,4 @@ def test_an_earlier_run_is_evaluated_and_goes_on(tmp_path, capsys):
     assert command("optimize", *asked, "--out", folder) == 0
     assert "resuming episode 4/4" in capsys.readouterr().out
     assert (folder / "trials.csv").read_text().startswith(before)
+    assert command("evaluate", "--run", folder, "--trials", "2") == 0

@@ -91,7 +91,6 @@ def test_supply_against_an_integrator():
         pneumatics__rate=120e3,
         pneumatics__maximum=90e3,
         discretization__timestep=h,
-        contact__time_constant=0.02,
     )
     time = np.arange(count) * h
     p, end = scene.phases, scene.window[1]

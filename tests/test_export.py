@@ -15,12 +15,23 @@ from codesign_jax import cli, rollout, scene
 from codesign_jax.cost import outcome
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import MujocoEngine
+from codesign_jax.engines.structured.kernel import packing
 from codesign_jax.export import grasps, mjcf, plain, skin, tables
 from codesign_jax.export.play import play
-from codesign_jax.model import build_spec, hull
+from codesign_jax.model import build_spec
 from codesign_jax.scene import parameters
 from codesign_jax.types import Status, Trial, failed
-from tests.helpers.grasps import batch_inputs, hand_world, nth, pinch, random_designs, stack
+from tests.helpers.grasps import (
+    batch_inputs,
+    hand_world,
+    lanes,
+    nth,
+    pinch,
+    random_designs,
+    repeat,
+    stack,
+    world_inputs,
+)
 from tests.helpers.toy_engine import TINY
 
 # A grasp in 2.2 s, with all joints and contacts.
@@ -152,19 +163,18 @@ def test_contacts_have_the_declared_stiffness(friction):
 
 
 def test_what_plain_mujoco_does_not_simulate_is_named():
-    ours = ["lateral_threshold", "neo_hookean", "soft_touch"]
+    ours = ["lateral_threshold", "neo_hookean"]
     found = plain.differences(pinch(**{f"effects__{name}": True for name in ours}))
     assert sorted(text.split("effects.")[1].split(":")[0] for text in found) == ours
-    of_hull = {"friction_memory": "finger_finger", "speculative_palm": "finger_palm"}
-    default, word = scene.load("paper"), "the model is without effects.{}"
-    for name, contact in of_hull.items():
-        assert any(word.format(name) in text for text in plain.differences(default))
-        off = scene.load("paper", overrides={f"effects.{contact}": False})
-        assert not any(name in text for text in plain.differences(off))
+    default, word = scene.load("paper"), "the model is without effects.friction_memory"
+    assert any(word in text for text in plain.differences(default))
+    contacts = dict.fromkeys(("effects.finger_finger", "effects.finger_itself"), False)
+    off = scene.load("paper", overrides=contacts)
+    assert not any("friction_memory" in text for text in plain.differences(off))
     household = plain.differences(scene.load("paper", object_set="household"))
     assert any("mesh 'mug' as its convex hull" in text for text in household)
-    assert any('effects.surface = "hull" as points' in text for text in household)
-    spheres = pinch(**{f"effects__{name}": True for name in [*of_hull, *of_hull.values()]})
+    assert any('effects.surface = "hull" as spheres' in text for text in household)
+    spheres = pinch(effects__friction_memory=True, effects__finger_finger=True)
     assert not plain.differences(spheres), "spheres never have these effects"
 
 
@@ -180,39 +190,22 @@ def skinned():
     return alone, params, trial, spec, skin.add(alone, spec, params)
 
 
-def test_points_of_two_links_stand_in_for_a_blended_vertex(skinned):
-    """Weighted, both are where the skin's vertex is, however the finger bends."""
-    alone, params, _, spec, shares = skinned
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    data.qpos[:] = np.random.default_rng(0).uniform(-0.4, 0.4, model.nq)
-    mujoco.mj_kinematics(model, data)
-    links = range(alone.discretization.links + 1)
-    bodies = [data.body(f"finger_1_link_{i}") for i in links]
-    position = np.array([body.xpos for body in bodies])
-    rotation = np.array([body.xmat.reshape(3, 3) for body in bodies])
-    length, height = params.length[1], params.height[1]
-    vertices = hull.pose(alone, length, height, position, rotation)
-    found: dict[tuple, list] = {}
-    for name, share in shares.items():
-        _, finger, _, row, k, _ = name.split("_")
-        if finger == "1":
-            found.setdefault((int(row), int(k)), []).append((share, data.geom(name).xpos))
-    means = {key: sum(s * x for s, x in v) / sum(s for s, _ in v) for key, v in found.items()}
-    ring = alone.discretization.hull_points
-    for (row, k), mean in means.items():
-        rows = row * alone.discretization.hull_rings * ring + k
-        vertex = vertices[min(1 + ring + rows, len(vertices) - 1)]  # the tip's last ring is a point
-        np.testing.assert_allclose(mean, vertex, atol=1e-12)
-    # The skin without its base: four sides of 80 mm, and the tip's face; the half rows at the base
-    # belong to the palm.
-    width, segment = alone.hand.section.width, length / alone.discretization.links
-    sides = 2 * (width + height) * (length - segment / alone.discretization.hull_rings / 2)
+def test_spheres_stand_where_the_engine_has_its_rings(skinned):
+    """In the engine's own table of rings; their shares are the finger's length in widths."""
+    alone, params, trial, _, shares = skinned
+    fields, _ = world_inputs(alone, params, trial)
+    hand = lanes(alone, repeat(fields, 1))
+    rings = np.asarray(packing.ring_numbers(alone, hand, 2))[:, :, 1, 0]
+    segment = params.length[1] / alone.discretization.links
+    found = skin.balls(alone, 1, float(params.length[1]), float(params.height[1]))
+    np.testing.assert_allclose([b.place for b in found], rings[:, :3], atol=1e-6)
+    np.testing.assert_allclose([b.share for b in found], rings[:, 6], rtol=1e-5)
     total = sum(share for name, share in shares.items() if name.startswith("finger_1"))
-    assert total == pytest.approx((sides + width * height) / width**2)
+    length = params.length[1] - segment / 2  # the half link at the palm is the palm's
+    assert total == pytest.approx(length / alone.hand.section.width)
 
 
-def test_a_point_is_as_stiff_as_its_share_of_the_surface(skinned):
+def test_a_sphere_is_as_stiff_as_its_share_of_the_finger(skinned):
     """K I, B and R of every constraint row of the file and of the model with declared weights."""
     alone, _, _, spec, shares = skinned
     rows = []
@@ -233,7 +226,7 @@ def test_a_point_is_as_stiff_as_its_share_of_the_surface(skinned):
         expected = share * alone.contact.normal_stiffness * 2 / bodies
         assert stiffness[contact.efc_address] == pytest.approx(expected, rel=1e-9)
         touching += share < 1
-    assert touching > 10
+    assert touching > 2
 
 
 def test_a_grasp_of_the_skin_is_its_file_s(skinned):

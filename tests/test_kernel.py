@@ -13,6 +13,7 @@ from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.world_model import world_constants
+from codesign_jax.model.layout import friction_ratio
 from codesign_jax.start import invalid_start
 from codesign_jax.types import Status
 from tests.helpers import grasps, oracles
@@ -169,7 +170,9 @@ def test_in_float32_an_object_moves_as_in_float64_under_a_far_hand(grasp, steppe
     own = grasps.nth(fields, 0)
     ratio = np.float32(30)  # as in the scene `paper`
     contact = own.constants.contact._replace(friction_ratio=ratio)
-    own = own._replace(impratio=ratio, constants=own.constants._replace(contact=contact))
+    constants = own.constants._replace(contact=contact)
+    impratio = friction_ratio(scene, ratio)
+    own = own._replace(impratio=impratio, constants=constants)
     qpos, qvel = (np.zeros((count, n)) for n in (own.start.size, own.start.size - 1))
     qpos, u = qpos + own.start, np.repeat(np.asarray(ctrl[:1, 0]), count, 0)
     qpos[:, 2], qpos[:, -5] = 2.0, qpos[:, -5] - random.uniform(1e-5, 5e-4, count)

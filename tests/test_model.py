@@ -295,10 +295,13 @@ def test_every_kind_of_pair_has_its_own_numbers():
         kind = tuple(sorted(compiled.geom(g).name.split("_")[0] for g in pair))
         friction = [want[kind]] * 2 + [0.003, 0.0004, 0.0004]
         np.testing.assert_allclose(compiled.pair_friction[i], friction, rtol=1e-12)
-        # Normal stiffness is proportional to 1 / (1 - d), see contact_invweight.
         stiffness = 5000.0 if kind == ("finger", "palm") else c.normal_stiffness
-        soft = (1 - c.impedance) / (1 - compiled.pair_solimp[i, :2])
-        np.testing.assert_allclose(soft, stiffness / c.normal_stiffness, rtol=1e-9)
-        np.testing.assert_allclose(compiled.pair_solref[i], [c.time_constant, 1.0], rtol=1e-12)
+        d, h = compiled.pair_solimp[i, 0], the_scene.discretization.timestep
+        mass = d / (1 - d) / (2 * model.contact_invweight(the_scene))
+        wanted = stiffness * h * (h + max(c.dissipation_time, 1.5 * h))
+        np.testing.assert_allclose(mass, wanted, rtol=1e-9)
+        # MuJoCo divides by d^2 and multiplies by d.
+        spring, damper = -compiled.pair_solref[i] / d
+        np.testing.assert_allclose([spring * mass, damper * h], [stiffness, 1.0], rtol=1e-9)
         found.add(kind)
     assert found == set(want)

@@ -1,4 +1,7 @@
-"""Contact of fingers with the palm, in float64: MuJoCo C, a dense solve and planted faults."""
+"""Contact of spheres with the palm, in float64: MuJoCo C and planted faults.
+
+That of rings stands in `test_planted_contacts`.
+"""
 
 import functools
 from functools import partial
@@ -11,7 +14,7 @@ import pytest
 
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.lanewise import lanes, lanewise
-from tests.helpers import curled_hands, dense_steps, grasps
+from tests.helpers import curled_hands, grasps
 from tests.helpers.curled_hands import curled
 from tests.helpers.planted_faults import Fault, cone_of, planted, simulate
 
@@ -29,71 +32,30 @@ SETTINGS = {
 
 def flipped(right, *args):
     """Both sides of a contact with the palm are pushed the wrong way."""
-    mine, other = right(*args)
-    return (mine[0], -mine[1], *mine[2:]), (other[0], -other[1], *other[2:])
+    found = right(*args)
+    return found._replace(normal=-found.normal)
 
 
-def not_pushed(right, mine, self, item, wrench):
+def not_pushed(right, mine, self, item, field, more, *rest):
     """The palm does not feel the contact."""
-    left = jnp.where(mine, 0.0, 1.0)
-    right(self, item, lanewise(lambda w, k: w * k, wrench, lanes([left], (), wide=True)))
+    left = lanewise(lambda m, k: m * k, more, lanes([jnp.where(mine, 0.0, 1.0)], (), wide=True))
+    right(self, item, field, left if field == "other" else more, *rest)
 
 
-def moving(right, mine, self, motion, palm):
-    """Motions that contacts with the palm see are not relative to it."""
-    found = right(self, motion, palm)
-    return lanewise(lambda m, a, b: jnp.where(m, a, b), lanes([mine], (), wide=True), motion, found)
-
-
-def seen_late(right, timestep, mine, vel):
-    """A contact ahead of touch sees the gap that is there."""
-    (point, normal, _, *rest), seen = right(timestep, mine, vel)
-    return (point, normal, mine[2], *rest), seen
-
-
-def not_closing(right, sums):
-    """A contact ahead of touch stops a finger where it is."""
-    one, other, (inside, closing) = right(sums)
-    return one, other, (inside, 0.0 * closing)
-
-
-ON_PALM = {"hull": "on_palm", "ahead": "on_palm", "spheres": "ball_on_palm"}
 FAULTS = {
-    surface: {
-        "the palm pulls": Fault({stage: flipped}),
-        "the palm does not feel fingers": Fault(
-            {}, methods={(BoundPairs, "_push_palm"): not_pushed}
-        ),
-        "contacts move with the palm": Fault({}, methods={(BoundPairs, "beside_palm"): moving}),
-        "the palm rubs as fingers do": cone_of("finger_palm", "finger_finger"),
-    }
-    for surface, stage in ON_PALM.items()
-}
-FAULTS["ahead"] |= {
-    "contacts ahead see the gap that is there": Fault({"ahead": seen_late}),
-    "contacts ahead stop a finger where it is": Fault({"pressure_ahead": not_closing}),
+    "the palm pulls": Fault({"ball_on_field": flipped}),
+    "the palm does not feel fingers": Fault({}, methods={(BoundPairs, "_add_wrench"): not_pushed}),
+    "the palm rubs as fingers do": cone_of("finger_palm", "finger_finger"),
 }
 
 
-def scene_of(surface):
-    """Spheres, the hull, or the hull that touches the palm ahead."""
-    density = {"discretization__spheres_per_link": 2}
-    if surface != "spheres":
-        density = {"discretization__hull_rings": 2, "discretization__hull_points": 8}
-        density |= {"effects__surface": "hull", "effects__speculative_palm": surface == "ahead"}
-    return grasps.pinch("sphere", links=2, **SETTINGS, **density)
+def scene_of():
+    return grasps.pinch("sphere", links=2, discretization__spheres_per_link=2, **SETTINGS)
 
 
-def accelerations(scene, model, data):
-    """By MuJoCo C, with the hull by a dense solve; all kinds of contacts are there."""
+def accelerations(model, data):
+    """By MuJoCo C; all kinds of contacts are there."""
     mujoco.mj_forward(model, data)
-    if scene.effects.surface == "hull":
-        with jax.enable_x64(True):
-            hand, _ = grasps.hand_world(scene, length=0.1)
-        dense = dense_steps.DensePairs(scene, model, data, hand)
-        print(dense.on_palm, dense.ahead, dense.pairs, dense.num_hull)
-        assert dense.on_palm > 2 and dense.pairs > 3 and dense.num_hull > 20
-        return dense.solve()
     assert on_palm(model, data) > 0
     return data.qacc.copy()
 
@@ -104,41 +66,30 @@ def on_palm(model, data):
 
 
 @functools.cache
-def simulated(surface):
+def simulated():
     """Relative errors of a step's accelerations, of each fault's world and of a sound one."""
     with jax.enable_x64(True):
-        scene, faults = scene_of(surface), FAULTS[surface]
+        scene = scene_of()
         state = curled(scene, *STATE)
-        each = [state] * (len(faults) + 1)
+        each = [state] * (len(FAULTS) + 1)
         fields, qpos, qvel, ctrl = curled_hands.batched(each)
-        with planted(faults):
+        with planted(FAULTS):
             run = jax.jit(partial(simulate, scene, iterations=30))
             ctrl = jnp.asarray(np.repeat(ctrl[:, None], 2, 1))
             found = run(fields, (qpos, qvel), ctrl, np.arange(len(each)))
-        expected = accelerations(scene, *state[:2])
+        expected = accelerations(*state[:2])
     acc = (np.asarray(found["qvel"])[:, 1] - qvel) / scene.discretization.timestep
     return np.linalg.norm(acc - expected, axis=1) / np.linalg.norm(expected)
 
 
-# A kernel each. The hull that touches ahead has the hull's own contacts with the palm as well, and
-# their faults are planted there too.
-SLOW = pytest.mark.slow
-SURFACES = [pytest.param("hull", marks=SLOW), "ahead", "spheres"]
+def test_accelerations_equal_mujoco():
+    assert simulated()[-1] < BOUND
 
 
-@pytest.mark.parametrize("surface", SURFACES)
-def test_accelerations_equal_the_oracle(surface):
-    assert simulated(surface)[-1] < BOUND
-
-
-@pytest.mark.parametrize(
-    ("surface", "name"),
-    [pytest.param(s, n, marks=SLOW if s == "hull" else ()) for s in FAULTS for n in FAULTS[s]],
-)
-def test_a_planted_fault_is_noticed(surface, name):
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_planted_fault_is_noticed(name):
     """By a hundred times the bound."""
-    error = simulated(surface)[[*FAULTS[surface]].index(name)]
-    assert not error < 100 * BOUND
+    assert not simulated()[[*FAULTS].index(name)] < 100 * BOUND
 
 
 @pytest.mark.slow  # quick: one state of hulls and of spheres above

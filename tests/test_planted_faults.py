@@ -24,7 +24,7 @@ STEPS = 8
 
 # Stages of the kernel: functions that it evaluates lane by lane.
 PALM, LINK = "palm_and_object", "link_forces"
-JAR = "BoundContacts.begin.<locals>.jar"
+JAR = "begun"
 RESPONSE = "BoundContacts._push.<locals>.response"
 RAY, SLOPES = "BoundContacts.line.<locals>.ray", "BoundContacts._slopes.<locals>.both"
 SOLVE, ELIMINATE = "Elimination.at_palm.<locals>.solve", "Elimination.backward.<locals>.eliminate"
@@ -61,7 +61,10 @@ def cones(change: Callable):
     def stage(right, place, cone, *rest):
         return right(place, change(cone), *rest)
 
-    return dict.fromkeys((JAR, RESPONSE, RAY, SLOPES), stage)
+    def begun(right, margin, place, cone, *rest):
+        return right(margin, place, change(cone), *rest)
+
+    return dict.fromkeys((RESPONSE, RAY, SLOPES), stage) | {JAR: begun}
 
 
 def without_moment(right, *args):
@@ -71,8 +74,7 @@ def without_moment(right, *args):
 
 def without_reaction(right, node, *rest):
     """The fingers' contacts push the fingers, and the object does not feel it."""
-    found, kept, work = right(node, *rest)
-    return found._replace(r_object=node.r_object), kept, work
+    return right(node, *rest)._replace(r_object=node.r_object)
 
 
 def at_palm(**change: Callable):
@@ -115,10 +117,10 @@ FAULTS = {
     "object and palm without weight": Fault(at_palm(gravity=jnp.zeros_like)),
     "no gyroscopic forces": Fault({LINK: without_gyroscopic}),
     "no implicit inertia": Fault(
-        {ELIMINATE: lambda f, *a: f(*a[:6], jnp.zeros_like(a[6]), *a[7:])}
+        {ELIMINATE: lambda f, *a: f(*a[:2], jnp.zeros_like(a[2]), *a[3:])}
     ),
     "no moment of contact forces": Fault({RESPONSE: without_moment}),
-    "no reaction on the object": Fault({ELIMINATE: without_reaction}),
+    "no reaction on the object": Fault({"_add": without_reaction}),
     "no table under the object": Fault({SOLVE: without_table}),
     # stale state
     "angles of the step before": Fault(
@@ -132,7 +134,7 @@ FAULTS = {
         }
     ),
     "contacts without velocity": Fault(
-        {JAR: lambda f, place, cone, motion, velocity: f(place, cone, motion, 0 * velocity)}
+        {JAR: lambda f, margin, place, cone, motion, vel: f(margin, place, cone, motion, 0 * vel)}
     ),
     "contacts of the iteration before": Fault(
         {"tree_add_scaled": lambda f, alpha, value, change: value}

@@ -36,23 +36,18 @@ from tests.helpers import grasps
 from tests.helpers.differences import Case, curled, weights_of
 from tests.helpers.planted_faults import chosen, name_of
 
-DATA, STEP = grasps.DATA, 1e-6
+DATA, STEP = grasps.DATA, 3e-7
 BOUND = 1e-8
 """Of the largest derivative of any group.  Differences lose rounding of 1e-15 over the step, and
-the step times the kink where a vertex of the hull enters a section within it: the quick tests'
-state has none, by two steps' differences that agree to 2e-10."""
+the step times the kinks within it; with ten times the step they err by 5e-8."""
 EVERYTHING = {
     "effects__surface": "hull",
     "effects__finger_finger": True,
     "effects__finger_palm": True,
-    "effects__speculative_palm": True,
+    "effects__finger_itself": True,
     "effects__neo_hookean": True,
-    "effects__soft_touch": True,
     "effects__friction_memory": True,
-    "contact__touch_depth": 2.7e-3,  # within the depths of the state, and of none exactly
     "contact__finger_finger_friction": 0.6,  # not the object's
-    "discretization__hull_rings": 2,
-    "discretization__hull_points": 4,
 }
 
 
@@ -123,17 +118,14 @@ FAULTS = {
     "the object's frame stands still": Fault(names=("columns",)),
     "the object's velocity does nothing": Fault(names=("object_vel",)),
     "the table stands still": Fault(names=("height",)),
-    "no power of a vertex's joint": Fault(results={"of_vertex": without(1)}),
-    "no power of vertices behind a joint": Fault(results={"of_vertex": without(3, "frame")}),
-    "sections of one size": Fault(names=("section_box",)),
-    "rows push without their sums": Fault(results={"between_rows": without(0)}),
-    "halves of a row on the palm push without their sums": Fault(
-        results={"row_on_palm": without(0)}
-    ),
-    "the palm sees no velocity of vertices": Fault(results={"ahead_sums": without(3)}),
-    "the palm's disc stands still": Fault(results={"ahead_sums": without(2)}),
-    "the other finger's row stands still": Fault(results={"vertex_sums": without(2)}),
-    "fingers held nothing in the step before": Fault(results={"between_rows": without(4)}),
+    "rings hand nothing to their link": Fault(results={"of_rings": without(0)}),
+    "rings of one size": Fault(names=("ring",)),
+    "a palm of one size": Fault(names=("palm_ring",)),
+    "rings on fingers stand still": Fault(results={"between_rings": without(0)}),
+    "the other finger's segment stands still": Fault(results={"between_rings": without(1)}),
+    "a segment's neighbours stand still": Fault(results={"between_rings": without(1, "frames")}),
+    "fingers held nothing in the step before": Fault(results={"between_rings": without(3)}),
+    "the palm's disc stands still": Fault(results={"on_palm": without(1)}),
     "what fingers hold asks nothing of accelerations": Fault(
         results={"push.<locals>.of_held": without(0)}
     ),
@@ -267,8 +259,8 @@ def checked(wrong=False):
     faults = FAULTS if wrong else {}
     with jax.enable_x64(True):
         case = Case(
-            the_scene := grasps.pinch("box", links=2, **EVERYTHING),
-            curled(the_scene, 3, bend=1.9, height=0.045, seed=3),
+            the_scene := grasps.pinch("box", links=8, **EVERYTHING),
+            curled(the_scene, 3, bend=0.8, height=0.03, seed=3),
         )
         first, second = (weights_of(case.start, seed) for seed in (0, 1))
         both = type(first)(*(a + 2.0 * b for a, b in zip(first, second, strict=True)))
@@ -304,8 +296,12 @@ def test_derivatives_by_every_group_equal_central_differences():
     for name, *row in zip(c.names, slope, c.difference, strict=True):
         print(name, *(f"{v:.6e}" for v in row))
     cones = [abs(s) for n, s in zip(c.names, slope, strict=True) if n.startswith("cone.")]
-    cones += [abs(s) for n, s in zip(c.names, slope, strict=True) if n.startswith("palm_")]
-    assert len(cones) == 11 and min(cones) > 1e-6 * largest  # all bodies touch
+    cones += [
+        abs(s)
+        for n, s in zip(c.names, slope, strict=True)
+        if n.startswith("palm_") and n != "palm_disc"
+    ]
+    assert len(cones) == 9 and min(cones) > 1e-6 * largest  # all bodies touch
     assert np.abs(slope - c.difference).max() < BOUND * largest
 
 
@@ -384,8 +380,6 @@ def loaded(hand, objects, settings):
 def test_derivatives_of_scenes(name, tmp_path):
     """Each group as above; of two difference steps the one with the smaller error counts."""
     settings = dict(SCENES[name])
-    if "hull" in settings.values():
-        settings |= {"discretization__hull_rings": 2, "discretization__hull_points": 4}
     with jax.enable_x64(True):
         if name.startswith("mesh"):
             the_scene = loaded(DATA / "pinch.toml", mixed(tmp_path), settings)

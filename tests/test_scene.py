@@ -120,9 +120,8 @@ WRONG_PATHS = {
     "hand.parameter.pressure.default=141e3": "hand.parameter.pressure.default = 141000.0 is",
     "hand.finger[1].tilt=900": "hand.finger[1].tilt = 900 is outside",
     "discretization.links=10.0": "discretization.links = 10.0 must be a whole number in [1, 200]",
-    # A number without a unit has no slip of units; a contact takes two steps at the least.
+    # A number without a unit has no slip of units.
     "cost.maximum=2000": "cost.maximum = 2000 is outside [0.1, 100]",
-    "discretization.timestep=0.02": "time_constant = 0.02 s must be at least two time steps (0.04",
     "phases.deflate_time=1.5": "phases.deflate_time = 1.5 s does not fit",
 }
 
@@ -184,6 +183,15 @@ def test_phases_out_of_order():
         "paper.toml.phases.deflate_time = 0.5 s does not fit between disturb = 8.6 s "
         "and ungrasp = 9 s",
     ]
+
+
+def test_keys_of_earlier_scene_files_are_read_with_a_warning():
+    gone = {"contact.time_constant": 0.04, "effects.soft_touch": True}
+    with pytest.warns(UserWarning, match="without effects.soft_touch, contact.time_constant:"):
+        found = scene.load("paper", overrides=gone)
+    assert found == scene.load("paper")
+    with pytest.raises(schema.InputError, match="contact.impedence"):
+        scene.load("paper", overrides={"contact.impedence": 0.9})
 
 
 def test_all_problems_of_all_files_at_once(tmp_path):

@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -11,6 +12,7 @@ from codesign_jax.compiler import launch
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import Limits, Program, teams
+from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.world_model import world_constants
 from scripts.shared import work
 from tests.helpers import gpu_cases
@@ -40,7 +42,7 @@ def test_teams_follow_the_same_path_in_contact():
     with jax.enable_x64(True):
         scene = scenes.load("paper", overrides={"effects": {"friction_memory": True}})
         plain = scenes.load("paper", overrides={"effects": {"surface": "spheres"}})
-        worlds = work.make_worlds(scene, 8)
+        worlds = work.make_worlds(scene, 64)
         fields, ctrl = work.inputs(plain, worlds)
         first = round(plain.phases.inflate / plain.discretization.timestep)
         curled = MujocoEngine(plain).rollout(fields, ctrl[:, :first], trajectory=True)
@@ -74,3 +76,47 @@ def test_one_finger_is_one_team():
     assert 4 * program.onchip.rows * program.columns <= launch.SHARED_BYTES
     pinch = Program(gpu_cases.short_scene("hull and fingers"), limits)
     assert (pinch.fingers, pinch.block, pinch.columns, pinch.size) == (2, 1, 2, 16)
+
+
+@pytest.mark.parametrize(
+    ("itself", "team"),
+    [
+        (False, teams.TEAM),
+        pytest.param(True, teams.TEAM, marks=pytest.mark.slow),
+        pytest.param(True, 1, marks=pytest.mark.slow),
+    ],
+)
+def test_a_step_reads_nothing_that_it_has_not_written(monkeypatch, itself, team):
+    """Scratch memory that is no number when a step begins makes no number of it.
+
+    A GPU's memory holds whatever was there before, so that a fault of this kind comes and goes.
+    """
+    effects = gpu_cases.EFFECTS["hull and fingers"]
+    effects = {name.removeprefix("effects__"): value for name, value in effects.items()}
+    effects |= {"finger_itself": itself, "finger_palm": itself}
+    scene = scenes.load("paper_spheres", overrides={"effects": effects})
+    fields, ctrl = work.inputs(scene, work.make_worlds(scene, 64))
+    advance = Step.advance
+
+    def spoiled(self, *args, **how):
+        for ref in (self.scratch, self.onchip):
+            if ref is not None:
+                none = jnp.full(ref.shape[-1:], np.nan, ref.dtype)
+
+                def spoil(row, x, ref=ref, none=none):
+                    ref[row] = none
+                    return x
+
+                jax.lax.fori_loop(0, ref.shape[-2], spoil, jnp.int32(0))
+        return advance(self, *args, **how)
+
+    monkeypatch.setattr(Step, "advance", spoiled)
+    # Kernels are kept by their scene and limits: nobody else has this tolerance.
+    program = Program(scene, Limits(8, 8, 1.02e-6), backend="cpu", width=16 * team, team=team)
+    start = StructuredEngine(scene).reset(fields)
+    run = jax.jit(lambda f, c: program.simulate(world_constants(scene, f), start, c))
+    found, last = run(fields, ctrl[:, :5])
+    moved = np.asarray(found["distance"])
+    assert np.isfinite(moved).all() and (np.diff(moved, axis=1) != 0).all()
+    assert np.isfinite(found["residual"]).all() and np.isfinite(last.finger).all()
+    assert np.abs(np.asarray(last.grip)).max() > 0  # some start with their fingers in one another

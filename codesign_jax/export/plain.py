@@ -7,11 +7,10 @@ stiffness.  It enters a contact of bodies 1 and 2 only through the regularizatio
 with d the pair's impedance, which is constant here.  The pair's impedance can therefore take up
 the difference: with W the declared and w the compiled sum of the two,
   (1 - d') / d' = (1 - d) / d W / w.
-The reference acceleration a = -B v - K d r of a violation r stays with MuJoCo's direct format
-solref = (-k, -b), for which K = k / d'^2 and B = b / d', if
-  k = d' / (d tau^2),  b = 2 d' / (d tau),
-since K = 1 / (d tau)^2 and B = 2 / (d tau) for the time constant tau and damping ratio 1.  Friction
-follows from the normal's R and B.  Formulas of MuJoCo: documentation, Computation, "Parameters".
+The reference acceleration -B v - K d r of a violation r has in MuJoCo's direct format
+solref = (-k, -b) the coefficients K = k / d^2 and B = b / d: it stays if both are multiplied by
+d' / d.  Friction follows from the normal's R and B.  Formulas of MuJoCo: documentation,
+Computation, "Parameters".
 """
 
 import dataclasses
@@ -23,7 +22,7 @@ import numpy as np
 
 from codesign_jax.export import mjcf
 from codesign_jax.model import contact_invweight
-from codesign_jax.model.layout import pairings_held, palm_ahead
+from codesign_jax.model.layout import pairings_held
 from codesign_jax.model.pairs import SOLIMP
 from codesign_jax.scene import Scene
 from codesign_jax.types import Trial
@@ -35,9 +34,7 @@ _SOFTNESS = (1e-4 / (1 - 1e-4), (1 - 1e-4) / 1e-4)
 _LEFT_OUT = {
     "neo_hookean": "joints have the linear law of bending, which is stiffer at large strain",
     "lateral_threshold": "pressure does not resist sideways bending",
-    "soft_touch": "damping and friction of a contact are whole from the first touch",
     "friction_memory": "fingers that hold one another creep",
-    "speculative_palm": "fingers touch the palm's disc once they are in it",
 }
 """What a model is like without an effect that plain MuJoCo does not have."""
 
@@ -51,7 +48,7 @@ class Inexpressible(ValueError):
 def differences(scene: Scene) -> list[str]:
     """What of a scene the model lacks or has in another form, a sentence each."""
     acts = {name: getattr(scene.effects, name) for name in _LEFT_OUT}
-    acts |= {"friction_memory": pairings_held(scene) > 0, "speculative_palm": palm_ahead(scene)}
+    acts |= {"friction_memory": pairings_held(scene) > 0}
     found = [
         f"the model is without effects.{name}: {how}"
         for name, how in _LEFT_OUT.items()
@@ -59,7 +56,7 @@ def differences(scene: Scene) -> list[str]:
     ]
     if scene.effects.surface == "hull":
         found.append(
-            'the model has effects.surface = "hull" as points on the links that its vertices follow'
+            'the model has effects.surface = "hull" as spheres at its rings and capsules of fingers'
         )
     return found + [
         f"the model has the mesh {shape.name!r} as its convex hull"
@@ -88,7 +85,7 @@ def engine_model(
         spec = spec.copy()
         for pair in spec.pairs:
             if (share := _share(pair, shares)) < 1:
-                _absorb(scene, pair, 1 / share)
+                _absorb(pair, 1 / share)
     model = spec.compile()
     model.body_invweight0[1:] = contact_invweight(scene)
     return model
@@ -111,7 +108,7 @@ def text(scene: Scene, spec: mujoco.MjSpec, shares: Mapping[str, float] = NONE) 
         names = pair.geomname1, pair.geomname2
         bodies = [body_of[name] for name in names]
         wanted = declared * sum(body > 0 for body in bodies) / _share(pair, shares)
-        if not _absorb(scene, pair, wanted / compiled[bodies].sum()):
+        if not _absorb(pair, wanted / compiled[bodies].sum()):
             why = "" if scene.effects.wrist else ", for effects.wrist = false makes the palm heavy"
             raise Inexpressible(
                 f"the contact of {names[0]} and {names[1]} would need an impedance outside of "
@@ -125,19 +122,18 @@ def _share(pair: mujoco.MjsPair, shares: Mapping[str, float]) -> float:
     return min(shares.get(name, 1.0) for name in (pair.geomname1, pair.geomname2))
 
 
-def _absorb(scene: Scene, pair: mujoco.MjsPair, ratio: float) -> bool:
+def _absorb(pair: mujoco.MjsPair, ratio: float) -> bool:
     """Gives a pair the impedance and reference of the module's formulas; False if it cannot.
 
     Args:
-      scene: The scene.
       pair: The pair.
       ratio: Declared over compiled inverse weight.
     """
-    d, tau = float(pair.solimp[0]), scene.contact.time_constant
+    d = float(pair.solimp[0])
     softness = (1 - d) / d * ratio
     if not _SOFTNESS[0] <= softness <= _SOFTNESS[1]:
         return False
     impedance = 1 / (1 + softness)
     pair.solimp = [impedance, impedance, *SOLIMP]
-    pair.solref = [-impedance / (d * tau**2), -2 * impedance / (d * tau)]
+    pair.solref = [impedance / d * float(v) for v in pair.solref]
     return True

@@ -11,6 +11,7 @@ from codesign_jax.model import morphology, pairs
 from codesign_jax.model.layout import (
     Layout,
     contact_invweight,
+    friction_ratio,
     geom_bounds,
     implicit_damping,
     layout,
@@ -167,7 +168,7 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
         pair_solref=solref,
         pair_solimp=solimp,
         gravity=_filled(np.zeros(3), dtype, (2, -scene.gravity_on)),
-        impratio=scene.contact.friction_ratio,
+        impratio=friction_ratio(scene, scene.contact.friction_ratio),
         start=_start(scene, params, trial),
         constants=scene.constants(),
         section=_section(scene, params),

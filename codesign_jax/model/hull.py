@@ -1,22 +1,23 @@
-"""The finger's hull as a skinned triangle mesh, for contact, pictures and export.
+"""The finger's hull as a skinned triangle mesh, for pictures and export.
 
-Rings of vertices on the rectangular section's outline stand along the finger, from the base to the
-tip, which a grid of smaller rings closes.  A vertex follows the two nearest links by linear blend
-skinning: its weight on link i is a hat function of its place along the straight finger, one at the
-link's middle and zero at the middles of its neighbours.  The half segment at the palm counts as
-link 0 with its middle at the base, the last half segment's middle is the tip.  A vertex at x =
-(j + w) segments, 0 <= w <= 1, thus has weight w on link j + 1 and 1 - w on link j, and moves with
-joint j + 1 between them alone:
+Rings of vertices on the section's outline, |y/a|^4 + |z/b|^4 = 1 or a rectangle, stand along the
+finger, from the base to the tip, which a grid of smaller rings closes.  A vertex follows the two
+nearest links by linear blend skinning: its weight on link i is a hat function of its place along
+the straight finger, one at the link's middle and zero at the middles of its neighbours.  The half
+segment at the palm counts as link 0 with its middle at the base, the last half segment's middle is
+the tip.  A vertex at x = (j + w) segments, 0 <= w <= 1, thus has weight w on link j + 1 and 1 - w
+on link j, and moves with joint j + 1 between them alone:
   position = (1 - w) T_j(v) + w T_{j+1}(v), T the rigid motions of the links.
 The topology is the scene's; sizes are the parameters', so that fingers of a batch share it.
 """
 
+import functools
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from codesign_jax.scene import Scene, by_structure
+from codesign_jax.scene import Scene
 
 
 class Hull(NamedTuple):
@@ -36,92 +37,38 @@ class Hull(NamedTuple):
     face: np.ndarray
 
 
-class Slots(NamedTuple):
-    """The hull's vertices as contact points in rows of equal length, one row a joint.
-
-    Row j < N has the vertices between the links j and j + 1; row N those inside the tip's face,
-    which follow link N alone.  The ring at the base is part of the palm and no contact point.
-
-    Attributes:
-      along: Distance from the row's joint in segments, shape (row, k).
-      across: In widths from the middle, same shape.
-      up: In heights from the bottom layer, same shape.
-      weight: Weight on link j + 1, same shape; zero in the last row.
-      area: Share of the surface, as factors of (segment x width, segment x height, width x height),
-        shape (3, row, k).
-    """
-
-    along: np.ndarray
-    across: np.ndarray
-    up: np.ndarray
-    weight: np.ndarray
-    area: np.ndarray
-
-
-def outline(points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points on the section's outline, anticlockwise about x from a bottom corner.
+def outline(points: int, *, square: bool = False) -> np.ndarray:
+    """Points on the section's outline (width, height), anticlockwise about x, shape (point, 2).
 
     Args:
-      points: Their number, a multiple of four: all sides have as many, corners included.
-
-    Returns:
-      Places (width, height), shape (point, 2), and each point's share of the outline as factors of
-      the width and the height, same shape.
+      points: Their number, a multiple of four.
+      square: Whether the section is the paper's rectangle and not the superellipse that touches.
     """
     m = points // 4
     t = np.arange(m) / m
     sides = [(t - 0.5, 0 * t), (0 * t + 0.5, t), (0.5 - t, 0 * t + 1), (0 * t - 0.5, 1 - t)]
     place = np.concatenate([np.stack(s, -1) for s in sides])
-    # Half the way to the neighbours on either side.
-    steps = np.abs(np.roll(place, -1, 0) - place)
-    return place, (steps + np.roll(steps, 1, 0)) / 2
+    if square:
+        return place
+    middle = np.array([0.0, 0.5])
+    away = place - middle
+    return middle + away / (((2 * away) ** 4).sum(1, keepdims=True)) ** 0.25
 
 
-@by_structure
-def slots(scene: Scene) -> Slots:
-    """The contact points of a scene's fingers."""
-    d = scene.discretization
-    links, rings, points = d.links, d.hull_rings, d.hull_points
-    place, share = outline(points)
-    one, zero = np.ones((rings, points)), np.zeros((rings, points))
-    weight = np.repeat(np.arange(1, rings + 1) / rings, points).reshape(rings, points)
-    span = np.stack([share[:, 0] * one / rings, share[:, 1] * one / rings, zero])
-    last = span * np.where(np.arange(rings) == rings - 1, 0.5, 1.0)[None, :, None]
-    # Rings inside the tip's face at 1 - 1/R, 1 - 2/R, ..., 0 of the section; the outer one, at 1,
-    # is the last ring along the finger.  By area, each takes the band half way to its neighbours.
-    scale = 1.0 - np.arange(rings + 1) / rings
-    bounds = np.clip([scale + 0.5 / rings, scale - 0.5 / rings], 0.0, 1.0) ** 2
-    band = (bounds[0] - bounds[1]) / points
-    last[2, -1] += band[0]
-    inner = np.stack([zero, zero, band[1:, None] * one])
-    tip = place * scale[1:, None, None] + np.array([0, 0.5]) * (1 - scale[1:, None, None])
-
-    def rows(body: np.ndarray, end: np.ndarray) -> np.ndarray:
-        return np.stack([*[body.ravel()] * links, end.ravel()])
-
-    area = [rows(span[i], inner[i]) for i in range(3)]
-    for i in range(3):
-        area[i][links - 1] = last[i].ravel()
-    return Slots(
-        along=rows(weight - 0.5, 0.5 * one),
-        across=rows(place[:, 0] * one, tip[..., 0]),
-        up=rows(place[:, 1] * one, tip[..., 1]),
-        weight=rows(weight, zero),
-        area=np.stack(area),
-    )
-
-
-@by_structure
-def hull(scene: Scene) -> Hull:
-    """The closed mesh of a scene's fingers: base, rings, tip."""
-    d, s = scene.discretization, slots(scene)
-    links, rings, points = d.links, d.hull_rings, d.hull_points
-    ring, _ = outline(points)
+@functools.lru_cache(maxsize=64)
+def _hull(links: int, rings: int, points: int, square: bool) -> Hull:
+    ring = outline(points, square=square)
+    along = np.arange(1, links * rings + 1) / rings
+    scale = 1.0 - np.arange(1, rings + 1) / rings  # rings inside the tip's face
+    if not square:  # the cap over the last quarter of a segment; see `rings`
+        along[-rings:] = np.minimum(along[-rings:], links - 0.25)
+        along[-1] = links - 0.25
+    inner = np.stack([ring * x + np.array([0, 0.5]) * (1 - x) for x in scale])
+    at = np.full(rings, float(links)) if square else links - 0.25 + 0.25 * (1 - scale**4) ** 0.25
+    places = [np.column_stack([np.full(points, x), ring]) for x in along]
+    places += [np.column_stack([np.full(points, x), r]) for x, r in zip(at, inner, strict=True)]
     base = np.column_stack([np.zeros(points), ring])
-    along = s.along + np.arange(links + 1)[:, None] + 0.5  # the last row hangs on link N
-    along[-1] -= 1.0
-    body = np.stack([along, s.across, s.up], -1).reshape(-1, 3)
-    body = body[: len(body) - points + 1]  # the last ring has shrunk to one point
+    body = np.concatenate(places)[: len(places) * points - points + 1]  # the last is one point
     place = np.concatenate([[[0.0, 0.0, 0.5]], base, body])
     lower = np.clip(np.ceil(place[:, 0] - 1e-9).astype(int) - 1, 0, links - 1)
     upper_weight = place[:, 0] - lower
@@ -131,6 +78,12 @@ def hull(scene: Scene) -> Hull:
         np.stack([1.0 - upper_weight, upper_weight], -1),
         _faces(links * rings + rings, points),
     )
+
+
+def hull(scene: Scene, *, square: bool = False) -> Hull:
+    """The closed mesh of a scene's fingers: base, rings, tip; square: see `outline`."""
+    d = scene.discretization
+    return _hull(d.links, d.hull_rings, d.hull_points, square)
 
 
 def _faces(rings: int, points: int) -> np.ndarray:
@@ -152,16 +105,17 @@ def _faces(rings: int, points: int) -> np.ndarray:
     return np.concatenate([base, sides, tip])
 
 
-def rest(scene: Scene, length: float, height: float) -> np.ndarray:
+def rest(scene: Scene, length: float, height: float, *, square: bool = False) -> np.ndarray:
     """Vertices of the straight finger in the frame of its base [m], shape (vertex, 3).
 
     Args:
       scene: The scene.
       length: Length of the finger [m].
       height: Height of its section [m].
+      square: See `outline`.
     """
     unit = length / scene.discretization.links, scene.hand.section.width, height
-    return hull(scene).place * np.array(unit)
+    return hull(scene, square=square).place * np.array(unit)
 
 
 def link_origins(scene: Scene, length: float) -> np.ndarray:

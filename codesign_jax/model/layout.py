@@ -136,27 +136,53 @@ def implicit_damping(scene: Scene, stiffness: Any, damping: Any) -> Any:
     return damping + (added - damping) * (added > damping)
 
 
+IMPEDANCE = 0.9
+"""MuJoCo's impedance d of a contact, constant; a body's declared weight makes up for it."""
+CREEP = 0.04
+"""Time in which a contact of friction ratio 1 creeps by what its normal stiffness yields [s]."""
+
+
+def dissipation(scene: Scene, *, ahead: bool = False) -> Any:
+    """Dissipation time of contacts [s].
+
+    Args:
+      scene: The scene.
+      ahead: Whether contacts act ahead of touch. MuJoCo's do not: one that is to end its step apart
+        is gone in the next one, and what should rest hops, unless its dissipation takes longer than
+        a step. A tall box on an incline hops with 6 ms at steps of 10 ms and rests with 15.
+    """
+    tau, least = scene.contact.dissipation_time, 1.5 * scene.discretization.timestep
+    return tau if ahead else tau + (least - tau) * (least > tau)
+
+
+def contact_mass(scene: Scene, *, ahead: bool = False) -> Any:
+    """D = k h (h + tau) of a contact of two bodies, see `laws.contact` [kg]."""
+    h = scene.discretization.timestep
+    return scene.contact.normal_stiffness * h * (h + dissipation(scene, ahead=ahead))
+
+
+def friction_ratio(scene: Scene, ratio: Any, *, ahead: bool = False) -> Any:
+    """MuJoCo's impratio D_t / D for a ratio of `[contact]`.
+
+    A contact creeps by h / D_t per newton: for a ratio r that is 1 / (k r `CREEP`) at any step.
+    """
+    return ratio * CREEP / (scene.discretization.timestep + dissipation(scene, ahead=ahead))
+
+
 def contact_invweight(scene: Scene) -> Any:
     """Inverse weight declared for every body in contact [1/kg].
 
-    MuJoCo's soft contact has normal stiffness k_n = k d / ((1 - d) sum(invweight)) with
-    k = d / (d timeconst)^2 for a constant impedance d and damping ratio 1 (MuJoCo multiplies its
-    reference stiffness by d).  Declaring invweight instead of deriving it from masses makes k_n a
-    material number in N/m, independent of finger size and time step.  A finger-object contact sums
-    two bodies; a contact with the table has one and is twice as stiff.
+    MuJoCo's R is (1 - d) / d times the sum of the bodies' inverse weights, for a constant impedance
+    d. Declaring them instead of deriving them from masses makes D = 1/R a material number,
+    independent of finger size. A contact with the table has one body and is twice as stiff.
     """
-    c = scene.contact
-    return 1.0 / ((1.0 - c.impedance) * c.time_constant**2 * 2.0 * c.normal_stiffness)
+    return IMPEDANCE / ((1.0 - IMPEDANCE) * 2.0 * contact_mass(scene))
 
 
 def palm_impedance(scene: Scene) -> Any:
-    """Impedance d_p at which contacts of fingers with the palm have a stiffness of their own.
-
-    With the declared weights and the time constant of all contacts the normal stiffness is
-    proportional to 1 / (1 - d), see `contact_invweight`.
-    """
-    c = scene.contact
-    return 1.0 - (1.0 - c.impedance) * c.normal_stiffness / c.finger_palm_stiffness
+    """Impedance at which contacts of fingers with the palm have a stiffness of their own."""
+    stiffer = scene.contact.finger_palm_stiffness / scene.contact.normal_stiffness
+    return 1.0 / (1.0 + (1.0 - IMPEDANCE) / (IMPEDANCE * stiffer))
 
 
 def palm_touches(scene: Scene) -> bool:
@@ -167,19 +193,19 @@ def palm_touches(scene: Scene) -> bool:
 def pairings_held(scene: Scene) -> int:
     """Pairings of fingers whose friction is kept from step to step; see the kernel's `pairing`.
 
-    Spheres keep none: their contact is MuJoCo's, which has no state.
+    Number 0 is each finger with itself. Spheres keep none: their contact is MuJoCo's, which has no
+    state.
     """
     e, fingers = scene.effects, len(layout(scene).dofs)
-    kept = e.friction_memory and e.finger_finger and e.surface == "hull"
+    kept = e.friction_memory and e.surface == "hull" and (e.finger_finger or e.finger_itself)
     if not kept or e.friction == "none":
         return 0
-    return (1 << (fingers - 1).bit_length()) - 1
+    return 1 << (fingers - 1).bit_length()
 
 
-def palm_ahead(scene: Scene) -> bool:
-    """Whether fingers touch the palm ahead of their contact; spheres never do, as MuJoCo's."""
-    e = scene.effects
-    return e.finger_palm and e.speculative_palm and e.surface == "hull"
+def touches_itself(scene: Scene) -> bool:
+    """Whether fingers touch themselves; spheres do not."""
+    return scene.effects.finger_itself and scene.effects.surface == "hull"
 
 
 PALM_FROM = 0.25

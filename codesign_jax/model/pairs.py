@@ -6,7 +6,7 @@ below, which count from the last of `frictions`.
 
 from typing import Any
 
-from codesign_jax.model.layout import palm_impedance
+from codesign_jax.model.layout import IMPEDANCE, dissipation, palm_impedance
 from codesign_jax.scene import Scene
 
 OBJECT_TABLE, HAND_TABLE, FINGERS, PALM = -4, -3, -2, -1
@@ -23,7 +23,7 @@ def frictions(scene: Scene) -> list[Any]:
 
 def impedances(scene: Scene) -> list[Any]:
     """Impedance of each kind of pair."""
-    return [scene.contact.impedance] * (len(scene.objects.object) + 3) + [palm_impedance(scene)]
+    return [IMPEDANCE] * (len(scene.objects.object) + 3) + [palm_impedance(scene)]
 
 
 def numbers(scene: Scene, friction: Any, impedance: Any) -> tuple[list, list, list]:
@@ -36,4 +36,7 @@ def numbers(scene: Scene, friction: Any, impedance: Any) -> tuple[list, list, li
     """
     c = scene.contact
     turning = [c.torsional_friction, c.rolling_friction, c.rolling_friction]
-    return [friction, friction, *turning], [c.time_constant, 1.0], [impedance] * 2 + [*SOLIMP]
+    h = scene.discretization.timestep
+    spring, damper = 1.0 / (h * (h + dissipation(scene))), 1.0 / h
+    reference = [-impedance * spring, -impedance * damper]
+    return [friction, friction, *turning], reference, [impedance] * 2 + [*SOLIMP]

@@ -16,6 +16,7 @@ from codesign_jax.model.layout import (
     WRIST,
     contact_invweight,
     first_on_palm,
+    friction_ratio,
     implicit_damping,
     layout,
     mounts,
@@ -130,7 +131,8 @@ def _options(scene: Scene, spec: mujoco.MjSpec) -> None:
     o.integrator, o.cone = mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtCone.mjCONE_ELLIPTIC
     o.solver = mujoco.mjtSolver.mjSOL_NEWTON
     o.iterations, o.ls_iterations = scene.solver.iterations, scene.solver.ls_iterations
-    o.tolerance, o.impratio = scene.solver.tolerance, scene.contact.friction_ratio
+    o.tolerance = scene.solver.tolerance
+    o.impratio = friction_ratio(scene, scene.contact.friction_ratio)
     bits = mujoco.mjtDisableBit
     # Without autoreset a world that went bad stays bad, so that it is seen.
     o.disableflags = bits.mjDSBL_EULERDAMP | bits.mjDSBL_AUTORESET | bits.mjDSBL_ISLAND

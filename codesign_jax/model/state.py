@@ -53,8 +53,8 @@ def split(scene: Scene, start: Any) -> State:
     >>> hand = space.params(space.default())
     >>> fields = model.model_fields(grasping, hand, rollout.nominal_trial(grasping))
     >>> state = model.split(grasping, fields.start)
-    >>> float(state.going[0]), state.held.shape  # 3 numbers for 3 pairings of 4 fingers
-    (1.0, (36,))
+    >>> float(state.going[0]), state.held.shape  # 3 numbers for 4 pairings of 4 fingers
+    (1.0, (48,))
     """
     fingers, nv = len(layout(scene).dofs), 12 + layout(scene).dofs.size
     sizes = State(nv + 1, nv, nv, 1, 1, 1, 3 * pairings_held(scene) * fingers)

@@ -88,8 +88,9 @@ def open_run(
             manifest.write(path, manifest.new(settings, contents, command))
         else:
             notes = _resume(path, settings, command)
-        if any(not (path / name).exists() for name in contents):
-            scene_files.write_scene(scene, path, contents)
+        # Files of an earlier version stay as they are: their digests are noted.
+        if missing := {n: c for n, c in contents.items() if not (path / n).exists()}:
+            scene_files.write_scene(scene, path, missing)
         for name in _all(path):  # temporaries that killed processes left
             if _named(name) != name and _is_of_a_run(path, name):
                 (path / name).unlink()

@@ -35,8 +35,6 @@ _PRESCRIBED = (
 
 _SKIN = "its geoms are rigid parts of single bodies"
 
-_IMPEDANCE = "MuJoCo's impedance grows with depth in the elastic force as well"
-
 _SPRINGS = "the springs of its joints are constants of a rollout"
 
 EFFECTS: Mapping[str, Effect] = {
@@ -53,21 +51,14 @@ EFFECTS: Mapping[str, Effect] = {
     "object_table": Effect("the object rests on the table"),
     "finger_finger": Effect("fingers touch one another"),
     "finger_palm": Effect("fingers touch the palm's disc"),
-    "speculative_palm": Effect(
-        "the hull touches the palm already in the step that would carry it in; spheres do not",
-        hull=True,
-    ),
+    "finger_itself": Effect("skinned fingers touch themselves; spheres do not", hull=True),
     "surface": Effect(
-        "the fingers' contact points: spheres, or the vertices of the skinned hull",
+        "the fingers' contact: spheres, or rings of the section, a skinned hull",
         {"mjx": {"hull": _SKIN}, "mujoco": {"hull": _SKIN}},
     ),
     "friction": Effect(
         "of all contacts: none, coulomb, or full with torsion and rolling",
         {"mjx": {"none": "MJX has no frictionless contacts with elliptic cones"}},
-    ),
-    "soft_touch": Effect(
-        "damping and friction of a contact grow with its depth, from none at first touch",
-        {"mujoco": {True: _IMPEDANCE}, "mjx": {True: _IMPEDANCE}},
     ),
     "friction_memory": Effect(
         "skinned fingers hold one another without creep: their friction is kept from step to step",

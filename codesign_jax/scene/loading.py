@@ -1,6 +1,7 @@
 """Scene files: read with hand, objects and a preset of accuracy, and checked as a whole."""
 
 import dataclasses
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,9 @@ from codesign_jax.scene import hand, key_frames, keypaths, library, objects, rea
 from codesign_jax.scene.description import Scene, SceneFile
 from codesign_jax.scene.tables import Accuracy
 
+GONE = ("effects.soft_touch", "effects.speculative_palm", "contact.touch_depth")
+GONE += ("contact.time_constant", "contact.impedance")
+"""Keys of earlier scene files, which have no effect any more; see docs/hull.md."""
 _OF_ACCURACY = ("discretization", "solver", "newton")
 """Tables of a scene that a preset of accuracy replaces values of."""
 
@@ -40,6 +44,7 @@ def load(
     table = library.read(path)
     problems: list[str] = []
     changes = keypaths.flatten(_preset(accuracy, problems)) | keypaths.flatten(overrides or {})
+    _leave_out(table, changes, path.name)
     inside = {key: keypaths.below(changes, key) for key in ("hand", "objects", "control")}
     own = {p: v for p, v in changes.items() if p[0] not in inside or len(p) == 1}
     places = keypaths.apply(table, own, path.name, problems)
@@ -79,6 +84,21 @@ def load(
     if problems := key_frames.check(scene, "control"):
         raise schema.InputError(problems)
     return scene
+
+
+def _leave_out(table: dict, changes: dict[tuple, Any], where: str) -> None:
+    """Takes the keys of `GONE` out of a scene's table and its changes, with a warning."""
+    found = []
+    for key in (tuple(name.split(".")) for name in GONE):
+        inside = table.get(key[0])
+        if isinstance(inside, dict) and inside.pop(key[1], None) is not None:
+            found.append(".".join(key))
+        if changes.pop(key, None) is not None:
+            found.append(".".join(key))
+    if found:
+        names = ", ".join(found)
+        text = f"{where} is read without {names}: contacts of today have no such numbers"
+        warnings.warn(text, stacklevel=3)
 
 
 def load_accuracy(name: str | Path) -> Accuracy:
@@ -166,12 +186,6 @@ def check_together(scene: SceneFile, where: str) -> list[str]:
         problems.append(
             f"{where}.phases.deflate_time = {p.deflate_time:g} s does not fit between "
             f"disturb = {p.disturb:g} s and ungrasp = {p.ungrasp:g} s"
-        )
-    if scene.contact.time_constant < 2 * h:
-        problems.append(
-            f"{where}.contact.time_constant = {scene.contact.time_constant:g} s "
-            f"must be at least two time steps ({2 * h:g} s): "
-            "a stiffer contact is unstable (MuJoCo's refsafe)"
         )
     if scene.effects.lateral_threshold and not scene.effects.lateral_bending:
         problems.append(

@@ -26,10 +26,9 @@ class Effects:
     object_table: bool = True
     finger_finger: bool = False
     finger_palm: bool = False
-    speculative_palm: bool = False
+    finger_itself: bool = False
     surface: str = choice("spheres", "hull", default="spheres")
     friction: str = choice("none", "coulomb", "full", default="coulomb")
-    soft_touch: bool = False
     friction_memory: bool = False
     disturb: bool = True
     ungrasp: bool = True
@@ -106,45 +105,42 @@ class Cost:
 
 @dataclasses.dataclass(frozen=True)
 class Contact:
-    """MuJoCo's soft contact as the rubber skin's own numbers; see `model.contact_invweight`.
+    """Contact of the rubber skin; see docs/hull.md.
 
     A contact of normal force N resists spin with `torsional_friction` N and rolling with
     `rolling_friction` N, both lengths as in MuJoCo, if the effect `friction` is "full".
 
     Attributes:
-      normal_stiffness: Normal stiffness of one finger-object contact, the same for every morphology
-        and time step; a contact with the table is twice as stiff.
-      time_constant: MuJoCo's `solref` time constant, with damping ratio 1; at least two time steps.
-      impedance: MuJoCo's `solimp` impedance, constant over the depth.
-      friction_ratio: MuJoCo's `impratio`: how much harder friction is than the normal direction.
+      normal_stiffness: Normal stiffness of a skin of the finger's width squared, the same for every
+        morphology and time step, and of a contact sphere; a contact with the table is twice as
+        stiff.
+      dissipation_time: Time constant of the skin's dissipation: its damping over its stiffness.
+      friction_ratio: How little friction creeps: D_t / D at a step and dissipation of 40 ms
+        together; MuJoCo's `impratio` follows from it.
       finger_table_friction: Coulomb coefficient of fingers and palm on the table.
       torsional_friction: Length by which a contact's normal force resists spin, only with
         `effects.friction = "full"`.
       rolling_friction: Length by which a contact's normal force resists rolling, only with
         `effects.friction = "full"`.
-      finger_finger_friction: Coulomb coefficient of fingers on fingers, only with
-        `effects.finger_finger`.
-      finger_finger_friction_ratio: `friction_ratio` of the hulls of fingers on one another and on
+      finger_finger_friction: Coulomb coefficient of fingers on fingers and on themselves, only with
+        `effects.finger_finger` or `effects.finger_itself`.
+      finger_finger_friction_ratio: `friction_ratio` of fingers on one another, on themselves and on
         the palm; spheres have that of all contacts.
       finger_palm_friction: Coulomb coefficient of fingers on the palm, only with
         `effects.finger_palm`.
       finger_palm_stiffness: As `normal_stiffness`, of fingers on the palm.
-      touch_depth: Depth over which damping and friction of a contact grow to their full strength,
-        only with `effects.soft_touch`.
     """
 
     normal_stiffness: float = quantity("N/m", 10, 1e6)
-    time_constant: float = quantity("s", 1e-4, 1)
-    impedance: float = quantity("", 0.01, 0.9999)
     friction_ratio: float = quantity("", 0.01, 1000)
     finger_table_friction: float = quantity("", 0, 5)
+    dissipation_time: float = quantity("s", 0, 1, default=0.006)
     torsional_friction: float = quantity("m", 1e-5, 0.1, default=0.003)
     rolling_friction: float = quantity("m", 1e-5, 0.1, default=0.0005)
     finger_finger_friction: float = quantity("", 0, 5, default=0.8)
     finger_finger_friction_ratio: float = quantity("", 0.01, 1000, default=1.0)
     finger_palm_friction: float = quantity("", 0, 5, default=0.8)
     finger_palm_stiffness: float = quantity("N/m", 10, 1e6, default=20e3)
-    touch_depth: float = quantity("m", 1e-6, 0.01, default=0.3e-3)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,8 +166,8 @@ class Discretization:
       timestep: Time step.
       links: Segments of a finger, with joints at their midpoints; the paper has ten.
       spheres_per_link: Contact spheres of a link, only with `effects.surface = "spheres"`.
-      hull_rings: Rings of vertices of a link, only with `effects.surface = "hull"`.
-      hull_points: Vertices of a ring, a multiple of four, only with `effects.surface = "hull"`.
+      hull_rings: Rings of a link, only with `effects.surface = "hull"`.
+      hull_points: Vertices of a ring of the mesh that is drawn, a multiple of four.
       spring_damping: How much of the time step h the implicit springs add to a joint's damping time
         beta: "added" acts as beta + h, "least" as max(beta, h); see docs/physics.md.
     """

@@ -53,12 +53,10 @@ CHANGES = (
     Change("least damping alone", "standard", "least", NUMERICS),
     Change("step, links and skin at once: the truth", "standard", "truth", NUMERICS),
     Change("the truth refined again", "truth", "finer", NUMERICS),
-    Change("the palm acts once a finger is in it", CPUS, "palm once inside", NUMERICS),
     Change(
         "MuJoCo C in place of this engine, with spheres", "spheres", "spheres, MuJoCo C", NUMERICS
     ),
     Change("fingers creep on one another", CPUS, "fingers creep", MODELS),
-    Change("soft touch", CPUS, "soft touch", MODELS),
     Change("pressure resists sideways bending", CPUS, "lateral threshold", MODELS),
     Change("neo-Hookean bending", "standard", "neo-Hookean", MODELS),
     Change("spheres in place of the skin", "standard", "spheres", MODELS),

@@ -1,4 +1,6 @@
-"""A step of hulls in contact, with all Jacobians written out and solved by SciPy."""
+"""A step of rings in contact, with all Jacobians written out and solved by SciPy."""
+
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -6,11 +8,11 @@ import scipy.optimize
 
 from codesign_jax import model
 from codesign_jax.engines.mujoco import world_model
-from codesign_jax.model import hull, layout
+from codesign_jax.model import layout
 from tests.helpers import grasps
 
-CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-BOX = [(CORNERS[k], CORNERS[(k + 1) % 4]) for k in range(4)]
+FLOOR = 1e-6
+"""Under the roots of the law, which have no slope at zero; see `laws.rings`."""
 
 
 def hull_scene(shape, links=3, **density):
@@ -61,86 +63,88 @@ class Dense:
         self.mass = np.zeros((oracle.nv, oracle.nv))
         mujoco.mj_fullM(oracle, data, self.mass)
         self.smooth = data.qfrc_smooth.copy()
+        self.scene, self.oracle, self.data = scene, oracle, data
+        self.fingers = [Rings(scene, data, hand, f) for f in range(scene.num_fingers)]
         self.rows = []  # (Jacobian (3, nv), reference (3,), R of normal and tangent, friction)
-        for c in data.contact:
-            if c.efc_address < 0:  # apart
-                continue
-            rows = slice(c.efc_address, c.efc_address + 3)
-            jac = data.efc_J.reshape(-1, oracle.nv)[rows]
-            self.rows.append((jac, data.efc_aref[rows], 1 / data.efc_D[rows][:2], c.friction[0]))
         self.num_hull, self.held = 0, []
-        for f in range(scene.num_fingers):
-            self._add_finger(scene, oracle, data, hand, f)
+        self._on_table()
+        for finger in self.fingers:
+            for ring in finger.rings:
+                self._on_fields(ring)
 
-    def _add_finger(self, scene, oracle, data, hand, f):
-        s, lay, width = hull.slots(scene), model.layout(scene), scene.hand.section.width
-        segment, height = hand.length[f] / lay.links, hand.height[f]
-        bodies = [lay.stubs[f], *lay.bodies[f]]
-        for row, k in np.ndindex(s.along.shape):
-            joint = bodies[min(row + 1, lay.links)]
-            before = bodies[row]
-            v = np.array(
-                [s.along[row, k] * segment, s.across[row, k] * width, s.up[row, k] * height]
-            )
-            # The joint is the origin of the link's frame and half or one segment along its parent.
-            step = 0 if row == lay.links else segment / 2 if row == 0 else segment
-            w = s.weight[row, k]
-            images = [
-                data.xpos[b] + data.xmat[b].reshape(3, 3) @ p
-                for b, p in ((before, v + [step, 0, 0]), (joint, v))
-            ]
-            point = (1 - w) * images[0] + w * images[1]
-            area = s.area[:, row, k] @ [segment * width, segment * height, width * height]
-            share = area / width**2
-            gap, normal = distance(scene, data, point[None])
-            to_object = gap[0], normal[0], scene.objects.object[0].friction, lay.object
-            to_table = point[2], np.array([0, 0, 1.0]), scene.contact.finger_table_friction, 0
-            for gap, normal, friction, other in (to_object, to_table):
-                if gap < 0:
-                    arm = -normal * gap / 2
-                    jac = self._jac(oracle, data, [x + arm for x in images], (before, joint), w)
-                    jac = jac - self._jac(oracle, data, [point + arm], (other,), 1.0)
-                    self._add(scene, data, jac, normal, gap, friction, share, 2 if other else 1)
+    def _on_table(self):
+        """The object's lowest point, or the lower corners of a box, on the table."""
+        shape, body = self.scene.objects.object[0], self.data.body("object")
+        half, turn = np.array(shape.half_sizes), body.xmat.reshape(3, 3)
+        if shape.type == "sphere":
+            points = [[0, 0, -half[0]]]
+        else:
+            signs = np.array(list(np.ndindex(2, 2, 2))) * 2 - 1
+            points = [p for p in (signs * half) @ turn.T if p[2] < 0]
+        up = np.array([0, 0, 1.0])
+        for point in points:
+            gap = (body.xpos + point)[2]
+            ends = model.layout(self.scene).object, 0
+            friction = self.scene.objects.table.friction
+            self._add(body.xpos + point - gap / 2 * up, up, gap, 1.0, ends, friction, 1)
 
-    @staticmethod
-    def _jac(oracle, data, points, bodies, weight):
-        total = 0.0
-        for point, body, w in zip(
-            points, bodies, (1 - weight, weight)[-len(points) :], strict=True
+    def _on_fields(self, ring):
+        scene, lay = self.scene, model.layout(self.scene)
+
+        def from_object(point):
+            gap, normal = distance(scene, self.data, point[None])
+            return gap[0], normal[0]
+
+        def from_table(point):
+            return point[2], np.array([0, 0, 1.0])
+
+        on = (from_object, scene.objects.object[0].friction, lay.object, 2)
+        for field, friction, other, bodies in (
+            on,
+            (from_table, scene.contact.finger_table_friction, 0, 1),
         ):
-            jac = np.zeros((3, oracle.nv))
-            mujoco.mj_jac(oracle, data, jac, None, point, body)
-            total = total + w * jac
-        return total
+            place = on_field(ring, field)
+            self._add(*place, (ring.body, other), friction, bodies)
+
+    def jac(self, point, body):
+        """Jacobian of a body's point, (3, nv)."""
+        found = np.zeros((3, self.oracle.nv))
+        mujoco.mj_jac(self.oracle, self.data, found, None, point, body)
+        return found
 
     def _add(
         self,
-        scene,
-        data,
-        jac,
+        point,
         normal,
         gap,
-        friction,
         share,
-        bodies,
+        ends,
+        friction,
+        bodies=2,
         ratio=None,
-        impedance=None,
         grip=None,
-        closing=0.0,
+        sign=1.0,
+        name=None,
     ):
-        c = scene.contact
-        ratio = c.friction_ratio if ratio is None else ratio
+        """Adds a contact, if it may act within the step."""
+        c, h = self.scene.contact, self.scene.discretization.timestep
+        own, other = (self.jac(point, body) for body in ends)
         frame = np.linalg.svd(normal[None])[2]
         frame[0] = normal
-        jac, d = frame @ jac, c.impedance if impedance is None else impedance
-        r = (1 - d) / d * model.contact_invweight(scene) * bodies / share
-        reference = -2 / (d * c.time_constant) * (jac @ data.qvel + [closing, 0, 0])
-        reference[0] -= gap * d / (d * c.time_constant) ** 2
+        jac = frame @ (own - other)
+        speed = jac @ self.data.qvel
+        if gap >= max(0.001, -h * speed[0]):
+            return
+        stiffness = c.normal_stiffness * share * 2 / bodies
+        mass = stiffness * h * (h + c.dissipation_time)
+        creep = stiffness * h * 0.04 * (c.friction_ratio if ratio is None else ratio)
+        reference = -speed / h
+        reference[0] -= gap / (h * (h + c.dissipation_time) if gap < 0 else h * h)
         if grip is not None:  # a share of the elastic normal force, which it is held by
-            elastic = -gap * d / (d * c.time_constant) ** 2 / r
-            reference[1:] -= elastic * r / ratio * (frame[1:] @ grip)
-            self.held.append((len(self.rows), frame, elastic, grip))
-        self.rows.append((jac, reference, np.array([r, r / ratio]), friction))
+            elastic = stiffness * max(-gap, 0)
+            reference[1:] -= elastic / creep * (frame[1:] @ grip)
+            self.held.append((len(self.rows), frame, elastic, grip, sign, name))
+        self.rows.append((jac, reference, 1 / np.array([mass, creep]), friction))
         self.num_hull += 1
 
     def solve(self):
@@ -203,167 +207,220 @@ def project(z, slope):
 
 
 class DensePairs(Dense):
-    """A step's problem with the contacts of the hulls of different fingers, and of the palm."""
+    """A step's problem with the contacts of fingers with each other, themselves and the palm."""
 
-    def __init__(self, scene, model, data, hand, grip=None):
-        """Grip: friction coefficient that the first of two fingers uses on the second one, (3,)."""
-        super().__init__(scene, model, data, hand)
-        self.grip = grip
-        self.pairs = self.merged = self.on_palm = self.ahead = 0
-        if scene.effects.finger_palm:
-            for f in range(scene.num_fingers):
-                self._add_palm(scene, model, data, hand, f)
-        for f, other in np.ndindex(scene.num_fingers, scene.num_fingers):
-            if f != other:
-                self._add_rows(scene, model, data, hand, f, other)
+    def __init__(self, scene, oracle, data, hand, grip=None, own=None):
+        """As `Dense`.
 
-    def _add_rows(self, scene, model, data, hand, f, other):
-        """Resultants of the vertices of a finger's rows in the sections of another one's."""
-        lay = layout(scene)
-        for row, j in np.ndindex(lay.links + 1, lay.links):
-            found = []
-            for place, out, w, share in outline(scene, hand, f, row):
-                point, jac_at, normal = self._point(scene, model, data, hand, f, row, place, w, out)
-                section = self._section(scene, data, hand, other, j, point)
-                if section is not None:
-                    gap, at, weight = section
-                    arm = -normal * gap / 2
-                    behind = lay.stubs[other] + j, lay.stubs[other] + j + 1
-                    jac = jac_at(arm) - self._jac(model, data, [point + arm], behind[:1], 1.0)
-                    ends = [self._jac(model, data, [at + arm], (body,), 1.0) for body in behind]
-                    jac = jac - weight * (ends[1] - ends[0])
-                    found.append((0.5 * share, -gap, normal, jac))
-            if found:
-                c = scene.contact
-                rest = c.finger_finger_friction, c.finger_finger_friction_ratio, c.impedance
-                sign = 1.0 if f < other else -1.0
-                if self.grip is None:
-                    self._add_resultant(scene, data, found, *rest)
-                else:
-                    self._add_resultant(scene, data, found, *rest, sign * self.grip)
-                    self.held[-1] += (sign,)
-                self.pairs += 1
-                self.merged = max(self.merged, len(found))
-
-    def _add_palm(self, scene, model, data, hand, f):
-        """Resultants of the vertices of a finger's rows in the palm's disc, from a quarter on."""
-        c, links, palm = scene.contact, scene.discretization.links, data.body("palm")
-        frame = palm.xmat.reshape(3, 3)
-        stiffer = c.finger_palm_stiffness / c.normal_stiffness
-        impedance = 1 - (1 - c.impedance) / stiffer
-        for row in range(int(np.ceil(links / 4)), links + 1):
-            vertices = []
-            for k in range(hull.slots(scene).along.shape[1]):
-                point, jac_at, share = self._vertex(scene, model, data, hand, f, row, k)
-                gap, normal = from_disc(scene.hand.palm, (point - palm.xpos) @ frame)
-                normal = frame @ normal
-                arm = -normal * gap / 2
-                jac = jac_at(arm) - self._jac(model, data, [point + arm], (palm.id,), 1.0)
-                vertices.append((2 * share, -gap, normal, jac))
-            rest = c.finger_palm_friction, c.finger_finger_friction_ratio, impedance
-            if scene.effects.speculative_palm:
-                self._add_ahead(scene, data, row, vertices, rest)
-            elif found := [v for v in vertices if v[1] > 0]:
-                self._add_resultant(scene, data, found, *rest)
-                self.on_palm += 1
-
-    def _add_ahead(self, scene, data, row, vertices, rest):
-        """Contacts of a row's halves with the palm that act in the step that carries them in."""
-        h, across = scene.discretization.timestep, hull.slots(scene).across[row]
-        for side in (-1, 1):
-            found, later = [], []
-            for (share, depth, normal, jac), place in zip(vertices, across, strict=True):
-                part = 0.5 if abs(place) < 1e-9 else float(np.sign(place) == side)
-                if part:
-                    later.append(max(depth, depth - h * normal @ jac @ data.qvel))
-                    found.append((part * share, later[-1], normal, jac, depth))
-            if max(later) <= 0:  # none will be inside: the nearest one may come in
-                near = np.argmax(later)
-                found = [(found[near][0], 1e-6, *found[near][2:])] if later[near] > -0.006 else []
-            found = [v for v in found if v[1] > 0]
-            if found:
-                share, _, _, _, depth = (np.array([v[k] for v in found]) for k in range(5))
-                share = share / share.sum()
-                gaps = share @ np.minimum(-depth, 0), share @ np.maximum(-depth, 0) / h
-                self._add_resultant(scene, data, found, *rest, gaps=gaps)
-                self.on_palm += 1
-                self.ahead += gaps[0] == 0
-
-    def _vertex(self, scene, model, data, hand, f, row, k):
-        """Place of a vertex, its Jacobian as a function of an offset, and half its share."""
-        s, width = hull.slots(scene), scene.hand.section.width
-        segment, height = hand.length[f] / scene.discretization.links, hand.height[f]
-        v = np.array([s.along[row, k] * segment, s.across[row, k] * width, s.up[row, k] * height])
-        area = s.area[:, row, k] @ [segment * width, segment * height, width * height]
-        found = self._point(scene, model, data, hand, f, row, v, s.weight[row, k], v)
-        return *found[:2], 0.5 * area / width**2
-
-    def _point(self, scene, model, data, hand, f, row, v, w, out):
-        """Place of a point on two links, its Jacobian by an offset, and minus a direction."""
-        lay, segment = layout(scene), hand.length[f] / scene.discretization.links
-        bodies = [lay.stubs[f], *lay.bodies[f]]
-        pair = bodies[row], bodies[min(row + 1, lay.links)]
-        step = 0 if row == lay.links else segment / 2 if row == 0 else segment
-        images = [
-            data.xpos[b] + data.xmat[b].reshape(3, 3) @ p
-            for b, p in zip(pair, (v + [step, 0, 0], v), strict=True)
-        ]
-        point = (1 - w) * images[0] + w * images[1]
-        turned = [data.xmat[b].reshape(3, 3) @ out for b in pair]
-
-        def jac_at(arm):
-            return self._jac(model, data, [x + arm for x in images], pair, w)
-
-        return point, jac_at, -((1 - w) * turned[0] + w * turned[1])
-
-    def _add_resultant(self, scene, data, found, friction, ratio, impedance, grip=None, gaps=None):
-        """One contact of all vertices of a row in another row, weighted by their forces.
-
-        gaps: Of a contact ahead of touch the mean of the gaps below zero, and the speed that
-        closes the mean of those above it in a step.
+        grip: Friction coefficient that the first of two fingers uses on the second one, (3,).
+        own: That each finger's outer part uses on its inner one, (finger, 3).
         """
-        share, depth = (np.array([v[k] for v in found]) for k in (0, 1))
-        force = share * depth / (share @ depth)
-        normal, jac = (np.tensordot(force, [v[k] for v in found], 1) for k in (2, 3))
-        length = np.linalg.norm(normal)
-        gap, closing = gaps or (-(share @ depth) / share.sum(), 0.0)
-        cone = friction, share.sum(), 2, ratio, impedance, grip
-        self._add(scene, data, jac, normal / length, length * gap, *cone, closing=length * closing)
+        super().__init__(scene, oracle, data, hand)
+        self.grip, self.own = grip, own
+        self.pairs = self.on_palm = self.itself = self.ahead = 0
+        for f, finger in enumerate(self.fingers):
+            for ring in finger.rings:
+                if scene.effects.finger_palm and ring.link >= np.ceil(finger.links / 4):
+                    self._on_palm(ring)
+                if scene.effects.finger_itself:
+                    self._on_itself(f, ring)
+                for g in range(scene.num_fingers):
+                    if scene.effects.finger_finger and f < g:
+                        self._on_finger(f, g, ring)
 
-    def next_grip(self):
+    def _count(self, name, before):
+        setattr(self, name, getattr(self, name) + len(self.rows) - before)
+
+    def _on_palm(self, ring):
+        c, palm, before = self.scene.contact, self.data.body("palm"), len(self.rows)
+        frame = palm.xmat.reshape(3, 3)
+
+        def field(point):
+            gap, normal = from_disc(self.scene.hand.palm, (point - palm.xpos) @ frame)
+            return gap, frame @ normal
+
+        point, normal, gap, share = on_field(ring, field)
+        share = share * c.finger_palm_stiffness / c.normal_stiffness
+        rest = c.finger_palm_friction, 2, c.finger_finger_friction_ratio
+        self._add(point, normal, gap, share, (ring.body, palm.id), *rest)
+        self._count("on_palm", before)
+        self.ahead += len(self.rows) > before and gap > 0
+
+    def _on_itself(self, f, ring):
+        c, finger, before = self.scene.contact, self.fingers[f], len(self.rows)
+        end = ring.along - max(3.0, 1.8 * finger.height / finger.segment)
+        if end >= 0.5:
+            point, normal, gap, share, body = between(ring, finger, 0.5, end)
+            grip = None if self.own is None else self.own[f]
+            rest = c.finger_finger_friction, 2, c.finger_finger_friction_ratio, grip, 1.0, f
+            self._add(point, normal, gap, share, (ring.body, body), *rest)
+        self._count("itself", before)
+
+    def _on_finger(self, f, g, ring):
+        c, before = self.scene.contact, len(self.rows)
+        point, normal, gap, share, body = between(ring, self.fingers[g], 0.0, self.fingers[g].links)
+        rest = c.finger_finger_friction, 2, c.finger_finger_friction_ratio, self.grip, 1.0, "two"
+        self._add(point, normal, gap, share, (ring.body, body), *rest)
+        self._count("pairs", before)
+
+    def next_grip(self, name="two"):
         """What the first finger uses in the solution: tangential over normal forces, or elastic."""
         above = below = 0.0
-        for row, frame, elastic, grip, sign in self.held:
+        for row, frame, elastic, grip, sign, which in self.held:
+            if which != name:
+                continue
             force = self.force(row)
             weight = max(force[0], elastic)
             held = weight * frame[0] * (frame[0] @ grip) - frame[1:].T @ force[1:]
             above, below = above + sign * held, below + weight
-        return above / below
+        return above / below if below else np.zeros(3)
 
-    @staticmethod
-    def _section(scene, data, hand, f, row, point):
-        """Gap of a point in a finger's row, its material point, and its weight."""
-        links, width = scene.discretization.links, scene.hand.section.width
-        half, up = hand.length[f] / links / 2, hand.height[f] / 2
-        body = layout(scene).stubs[f] + row
-        frames = [data.xmat[b].reshape(3, 3) for b in (body, body + 1)]
-        joint = data.xpos[body + 1]
-        first, second = (frame.T @ (point - joint) for frame in frames)
-        start, end, last = first[0] + half, half - second[0], row == links - 1
-        if start < 0 or (end <= 0 and not last) or start + end <= 0:
-            return None
-        w = np.clip(start / (start + end), 0, 1)
-        local = (1 - w) * first + w * second
-        cap = max(second[0], 0) / half if last else 0.0
-        units, sides = (
-            np.array([cap, *((local[1:] - [0, up]) / [width / 2, up])]),
-            [half, width / 2, up],
-        )
-        phi = (units**4).sum() ** 0.25
-        slope = np.linalg.norm(units**3 / phi**3 / sides)
-        if phi >= 1:
-            return None
-        return (phi - 1) / slope, joint + frames[1] @ local, w
+
+class Ring(NamedTuple):
+    """A ring: body and number of its link, place along the finger in links, and its shape."""
+
+    body: int
+    link: int
+    along: float
+    centre: np.ndarray
+    frame: np.ndarray
+    half: np.ndarray
+    length: float
+    tip: bool
+
+
+class Rings:
+    """A finger's rings and its centre line, from MuJoCo's poses of its links."""
+
+    def __init__(self, scene, data, hand, f):
+        lay, width, k = layout(scene), scene.hand.section.width, scene.discretization.hull_rings
+        self.bodies, self.links = [lay.stubs[f], *lay.bodies[f]], lay.links
+        self.height, self.segment = float(hand.height[f]), float(hand.length[f]) / lay.links
+        self.frames = [data.xmat[b].reshape(3, 3) for b in self.bodies]
+        self.rings = []
+        for link in range(1, lay.links + 1):
+            last = link == lay.links
+            for j in range(k):
+                tip, size = last and j == k - 1, (0.5 if last else 1.0) / k
+                at = 0.25 if tip else (j + 0.5) * size
+                half = np.array([0.25 if tip else 0.6 * size, 0, 0]) * self.segment
+                half[1:] = width / 2, self.height / 2
+                body, frame = self.bodies[link], self.frames[link]
+                centre = data.xpos[body] + frame @ [at * self.segment, 0, self.height / 2]
+                ring = body, link, link - 0.5 + at, centre, frame, half, size * self.segment / width
+                self.rings.append(Ring(*ring, tip))
+        up = [f[:, 2] * self.height / 2 for f in self.frames]
+        joints = [data.xpos[b] for b in self.bodies]
+        self.points = [joints[0] + up[0]]
+        self.points += [joints[i] + (up[i - 1] + up[i]) / 2 for i in range(1, lay.links + 1)] + [
+            self.rings[-1].centre
+        ]
+        self.places = np.array([0.0, *(np.arange(lay.links) + 0.5), self.rings[-1].along])
+
+    def section(self, i, t):
+        """Orthonormal frame of the section at a share t of segment i."""
+        near = min(max(i + (1 if t >= 0.5 else -1), 0), self.links)
+        mean = self.frames[i] + abs(t - 0.5) * (self.frames[near] - self.frames[i])
+        x = mean[:, 0] / np.linalg.norm(mean[:, 0])
+        y = mean[:, 1] - (mean[:, 1] @ x) * x
+        y /= np.linalg.norm(y)
+        return np.stack([x, y, np.cross(x, y)], 1)
+
+    def nearest(self, point, low, high):
+        """Segment and share of it that is nearest to a point, between two places along."""
+        found = ()
+        for i, (a, b) in enumerate(zip(self.points, self.points[1:], strict=False)):
+            start, end = self.places[i : i + 2]
+            if i == 0 and low > 0:
+                continue  # of a finger itself the half link at the palm does not count
+            ends = np.clip((np.array([low, high]) - start) / (end - start), 0, 1)
+            if high < start or low > end:
+                continue
+            t = np.clip((point - a) @ (b - a) / ((b - a) @ (b - a)), *ends)
+            square = ((point - a - t * (b - a)) ** 2).sum()
+            if not found or square < (1 - 1e-4) * found[0]:
+                found = square, i, t
+        return found[1:]
+
+
+def reach(half, direction):
+    """Support of |x/e|^4 + |y/a|^4 + |z/b|^4 = 1 in a direction, and where it is reached."""
+    along = half * direction
+    largest = np.linalg.norm(along)
+    unit = along / largest
+    size = largest * ((unit**2 + FLOOR) ** (2 / 3)).sum() ** 0.75
+    return size, along / size
+
+
+def cap(unit, u):
+    """Area of the cap of |y|^4 + |z|^4 = 1 at the relative depth u; see docs/hull.md."""
+    y, z = np.sqrt(unit[1:] ** 2 + FLOOR)
+    t = min(y, z) / max(y, z)
+    face, edge = 2.26 * u**1.25 * (1 - 0.11 * u), 1.56 * u**1.5 * (1 + 0.1 * u)
+    return edge + (face - edge) / (1 + (t / (0.5 * u ** (2 / 3))) ** 2)
+
+
+def secant(ring, size, unit, axial, gap):
+    """Share of the scene's stiffness of a ring at a gap."""
+    depth = max(-gap, 0.5e-3)
+    u, (_, a, b) = min(depth / size, 1), ring.half
+    side = ring.length * b / 2 * cap(unit, u) / depth
+    end = 2.6 * a * b * np.sqrt(u) / (2 * a) ** 2
+    ahead = max(axial, 0) ** 2 if ring.tip else 0.0
+    return (1 - ahead) * side + ahead * end
+
+
+def centre_of(ring, size, unit, gap):
+    """Centre of the cap, from the ring's centre."""
+    eps = 1.15 * (min(max(-gap, 0) / size, 1) + FLOOR) ** 0.75
+    return ring.frame @ (ring.half * unit / np.cbrt(unit**2 + eps**2))
+
+
+def own_normal(half, local):
+    """Outward normal of a section where a ray leaves it."""
+    out = np.array([0.0, local[1] ** 3 / half[1] ** 4, local[2] ** 3 / half[2] ** 4])
+    return out / np.linalg.norm(out)
+
+
+def on_field(ring, field):
+    """Point, normal, gap and share of a ring on what a distance field describes."""
+    first, slope = field(ring.centre)
+    offset = np.zeros(3)
+    if first > 0 and not ring.tip:
+        local = -first * ring.frame.T @ slope
+        local[0] = 0
+        offset = ring.frame @ (local - np.linalg.norm(local) * own_normal(ring.half, local))
+    gap, normal = field(ring.centre + offset)
+    toward = -ring.frame.T @ normal
+    size, unit = reach(ring.half, toward)
+    gap = gap - normal @ offset - size
+    point = ring.centre + centre_of(ring, size, unit, gap) - gap / 2 * normal
+    return point, normal, gap, secant(ring, size, unit, toward[0], gap)
+
+
+def between(ring, other, low, high):
+    """Point, normal, gap and share of a ring on a finger's centre line; and its body there."""
+    i, t = other.nearest(ring.centre, low, high)
+    a, b = other.points[i : i + 2]
+    away, section = ring.centre - a - t * (b - a), other.section(i, t)
+    apart = np.linalg.norm(away)
+    line, normal = away / apart, 0.0
+    half = np.array([other.rings[-1].half[0] if i == other.links else 0.0, *ring.half[1:]])
+    half[1:] = other.rings[-1].half[1:]
+    for frame, size, sign in ((ring.frame, ring.half, -1), (section, half, 1)):
+        own = sign * frame @ own_normal(size, sign * frame.T @ away)
+        along = (line @ frame[:, 0]) ** 2
+        normal = normal + (1 - along) * own + along * line
+    normal = normal / np.linalg.norm(normal)
+    back, toward = section.T @ normal, -ring.frame.T @ normal
+    if t < 1 or back[0] <= 0:
+        half[0] = 0.0
+    size, unit = reach(ring.half, toward)
+    gap = normal @ away - size - reach(half, back)[0]
+    fade = apart / np.hypot(apart, 1e-3)
+    share = fade * secant(ring, size, unit, toward[0], gap / 2)
+    point = ring.centre + centre_of(ring, size, unit, gap) - gap / 2 * normal
+    return point, normal, gap, share, other.bodies[i]
 
 
 def from_disc(palm, point):
@@ -378,43 +435,3 @@ def from_disc(palm, point):
         gap = np.hypot(*excess)
         return gap, (excess[0] * out + excess[1] * up) / gap
     return (excess[0], out) if excess[0] > excess[1] else (excess[1], up)
-
-
-def outline(scene, hand, f, row):
-    """Points of a finger's row on its outline: place, outward normal, weight, share of the surface.
-
-    On |x/c|^4 + |y/a|^4 + |z/b|^4 = 1, with x from the last joint to the tip only.
-    """
-    d, width, height = scene.discretization, scene.hand.section.width, hand.height[f]
-    links, rings = d.links, d.hull_rings
-    segment, sides = hand.length[f] / links, np.array([width, height]) / 2
-    around = np.concatenate([np.linspace(a, b, d.hull_points // 2, endpoint=False) for a, b in BOX])
-    around = around / (around**4).sum(1, keepdims=True) ** 0.25
-    ends = np.roll(around, -1, 0) * sides - around * sides
-    arc = np.linalg.norm(ends, axis=1)
-    arc = (arc + np.roll(arc, 1)) / 2
-    x, y = (around * sides).T
-    area = abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
-    rim, tip = 2**-0.25, row == links
-    along = np.linspace(-1, 1, rings + 1)
-    scale = rim * (1 - np.arange(rings + 1) / rings)
-    bounds = np.append(np.append(rim, (scale[1:] + scale[:-1]) / 2), 0.0) ** 2
-    if row == links - 1:
-        along[-1] = rim
-        along = np.minimum(along, rim)
-    if tip:
-        along = np.append(rim, (1 - scale[1:] ** 4) ** 0.25)
-    for r in range(1, rings + 1):
-        at = along[r]
-        cap = at if row >= links - 1 and at > 0 else 0.0
-        size = (1 - cap**4) ** 0.25
-        ahead = along[r + 1] if r < rings else 2 / rings + 1 if row < links - 1 else at
-        span = 0.0 if tip else (ahead - along[r - 1]) / 2 * segment / 2
-        band = bounds[r] - bounds[r + 1] if tip else 0.0
-        if row == links - 1 and r == rings:
-            band = bounds[0] - bounds[1]
-        for unit, part in zip(around, arc, strict=True):
-            place = np.array([at * segment / 2, *(size * unit * sides + [0, sides[1]])])
-            out = np.array([cap**3 / (segment / 2), *((size * unit) ** 3 / sides)])
-            share = (size * part * span + band * area / len(around)) / width**2
-            yield place, out / np.linalg.norm(out), 0.0 if tip else (at + 1) / 2, share

@@ -29,7 +29,7 @@ FIXED = (
     "penetration",
     "share",
 )
-FIXED += ("ball", "support", "grid_first", "grid_nodes", "grid_reach")
+FIXED += ("support", "grid_first", "grid_nodes", "grid_reach")
 """Rows of the tables that no derivative is asked for: indices, bounds, and what only saves time."""
 TABLES = ("hand", "world", "finger_state", "world_state", "arm", "pressure")
 
@@ -140,9 +140,9 @@ class Case:
         """The rows of "grip" of values (row, finger), equal and opposite for two fingers."""
         found, fingers = np.zeros_like(values), np.arange(values.shape[1])
         for item, row in enumerate(np.arange(values.shape[0])[self.rows(2, "grip")][::3]):
-            other = fingers ^ (item + 1)
-            mine = values[row : row + 3] * (fingers < other)
-            found[row : row + 3] = mine - mine[:, other]
+            other = fingers ^ item
+            mine = values[row : row + 3] * ((fingers < other) | (item == 0))
+            found[row : row + 3] = mine - mine[:, other] * (item > 0)
         return found
 
     def directions(self):

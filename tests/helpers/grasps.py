@@ -92,7 +92,7 @@ def lanes(the_scene, fields):
 def random_constants(the_scene, seed, count=None):
     """A scene's numbers, each up to 20 % larger or smaller, leaves of shape () or (count,).
 
-    They stay in their ranges, the phases in order, and the contact's time constant above two steps.
+    They stay in their ranges, and the phases in order.
     """
     random = np.random.default_rng(seed)
     shape = () if count is None else (count,)
@@ -103,11 +103,7 @@ def random_constants(the_scene, seed, count=None):
         ranges,
     )
     slow = jax.tree.map(lambda v: v * random.uniform(0.97, 1.03, shape), the_scene.constants())
-    contact = found.contact._replace(
-        time_constant=the_scene.contact.time_constant * random.uniform(1.0, 1.2, shape),
-        impedance=the_scene.contact.impedance * random.uniform(0.8, 1.05, shape),
-    )
-    return found._replace(contact=contact, phases=slow.phases)
+    return found._replace(phases=slow.phases)
 
 
 def still(shape=0):

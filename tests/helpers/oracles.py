@@ -150,7 +150,7 @@ def residual_power(problem: Problem, velocity: Spatial, acc: Acc, virtual: Acc) 
 
         def pushed(c: Contacts, motion: Spatial, velocity: Spatial, along: Spatial, name=name):
             force = constraint_update(c, _jar(name, c, motion, velocity)).force
-            each = dot(force, c.relative(relative(name, along, c)))
+            each = dot(force, c.relative(relative(name, along)))
             return each.reshape(-1, each.shape[-1]).sum(0, keepdims=True)
 
         power = power - once(pushed, c, motion, velocity, along)
@@ -159,8 +159,8 @@ def residual_power(problem: Problem, velocity: Spatial, acc: Acc, virtual: Acc) 
 
 def _jar(name: str, c: Contacts, motion: Spatial, velocity: Spatial) -> jax.Array:
     """J a - aref of a set of contacts."""
-    speed = c.relative(relative(name, velocity, c))
-    return c.relative(relative(name, motion, c)) - c.reference(speed)
+    speed = c.relative(relative(name, velocity))
+    return c.relative(relative(name, motion)) - c.reference(speed)
 
 
 def inertial_forces(problem: Problem, acc: Acc, motion: Spatial) -> Forces:

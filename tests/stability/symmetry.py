@@ -168,7 +168,10 @@ def scaled_scene(base, s):
         for x in o.object
     )
     contact = dataclasses.replace(
-        c, normal_stiffness=s**2 * c.normal_stiffness, time_constant=t * c.time_constant
+        c,
+        normal_stiffness=s**2 * c.normal_stiffness,
+        dissipation_time=t * c.dissipation_time,
+        friction_ratio=t * c.friction_ratio,  # of a time, see `layout.friction_ratio`
     )
     phases = {f.name: t * getattr(base.phases, f.name) for f in dataclasses.fields(base.phases)}
     arm = base.arm

@@ -40,8 +40,8 @@ class WorldModel(NamedTuple):
       palm_point: Centres of the palm's contact spheres in the palm frame, shape (3, sphere, world);
         empty without palm contacts.
       palm_radius: Their radii, shape (sphere, world).
-      palm_disc: Radius and half the thickness of the palm's disc, shape (2, 1, world); None without
-        the effect `finger_palm`.
+      palm_disc: Radius and half the thickness of the palm's disc, shape (2, 1, world); None where
+        nothing touches it.
       wrist_stiffness: Stiffness of the wrist's springs, shape (6, 1, world).
       wrist_damping: Damping with the implicit term, shape (6, 1, world).
       wrist_armature: Armature with the implicit terms, shape (6, 1, world).
@@ -203,8 +203,13 @@ def _world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
         gravity=-fields.gravity[None, :, 2] if scene.effects.gravity else None,
         section=None if fields.section is None else fields.section.transpose(2, 1, 0),
         threshold=None if fields.threshold is None else fields.threshold.transpose(2, 1, 0),
-        palm_disc=last(fields.geom_size[:, lay.disc[0], :2])[:, None] if lay.disc.size else None,
+        palm_disc=_disc(numbers) if lay.disc.size or lay.palm.size else None,
     )
+
+
+def _disc(scene: Scene) -> jax.Array:
+    palm = scene.hand.palm
+    return jnp.stack([jnp.asarray(palm.radius), jnp.asarray(palm.thickness) / 2])
 
 
 def _palm(fields: ModelFields, stubs: np.ndarray, mount: jax.Array, stub_centre: jax.Array, last):

@@ -75,7 +75,7 @@ class AdjointProgram(Program):
         """As `Program`, a lane a finger."""
         super().__init__(*args, **{**how, "team": 1})
 
-    remembers = {"hull": ("vertex",), "pairs": ("owner", "sphere")}
+    remembers = ("owner", "ring")
 
     def _tables(self) -> None:
         super()._tables()

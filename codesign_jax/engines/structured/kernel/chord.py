@@ -41,7 +41,6 @@ class Chord:
         """Whether no contact of a world goes to another zone along the last step, (lane,)."""
         problem, count = self.problem, zeros((), self.like)
         sets = [(self.links, c) for c in problem.fingers]
-        sets += [(self.links + 1, c) for c in problem.skin]
         sets += [(c.set.count, c) for c in problem.slots]
         for items, contacts in sets:
 
@@ -67,41 +66,33 @@ class Chord:
         if problem.pairs:
             problem.pairs.update_wrenches(alpha)
 
-        def again(alpha, carry, body, moved, forces, factors, rows, pushes, pair):
+        def again(alpha, carry, body, moved, forces, factors, pushes, pair):
             (r, ro, work), (axes, armature, *kept) = carry, factors
             acc, motion = (a + alpha * b for a, b in moved)
             smooth, tau = forces
             push = total([smooth - make_body(*body).times(motion), *pushes.values()])
             ro = total([ro, *(-w for name, w in pushes.items() if name == "finger_object")])
             tau = tau - armature * acc
-            turned = [wrench[6:] for _, wrench in rows]
-            if pair is not None:
-                push, turned = push + pair[0], [*turned, *([] if pair[1] is None else [pair[1]])]
-            for moment in turned:
-                tau = tau + contract(axes[:, :3], moment[None], 1)
-            r = r + push
+            r = r + push if pair is None else r + push + pair
             y = contract(axes, r[None], 1) + tau
             kept = el.Kept(el.Factors(kept[0], kept[1], kept[0]), kept[2])
             r, ro, new = el.eliminate_again(axes, kept, r, ro, tau)
-            r, ro = with_rows(r, ro, rows)
             return (r, ro, work + dot(y, new.z)), new.z
 
         def one(i: Any, carry: tuple) -> tuple:
             names = [("acc", "step_acc"), ("motion", "step_motion")]
             moved = [problem.read(*pair, item=i) for pair in names]
-            rows = [(c.set.on_object, c.wrench(i, alpha)) for c in problem.skin]
             pushes = {c.set.name: c.wrench(i, alpha) for c in problem.fingers}
-            pair = problem.pair_push(i) if problem.pairs else None
+            pair = problem.pairs.pushed(i + 1) if problem.pairs else None
             factors = problem.read("axes", "armature", "w", "g", "inverse", item=i)
             forces = problem.read("smooth", "tau", item=i)
-            args = alpha, carry, problem.body_of(i), moved, forces, factors, rows, pushes, pair
+            args = alpha, carry, problem.body_of(i), moved, forces, factors, pushes, pair
             carry, z = lanewise(again, *args)
             problem.write("z_again", z, i)
             return carry
 
         none = zeros((6,), self.like)
-        tip = [(c.set.on_object, c.wrench(self.links, alpha)) for c in problem.skin]
-        start = (*lanewise(with_rows, none, none, tip), zeros((), self.like))
+        start = none, none, zeros((), self.like)
         r, ro, work = loop(self.links, one, start, self.block.size, reverse=True)
         r = problem.add_first(r) if problem.pairs else r
         r, ro, work = self.block.sum((r, ro, work))
@@ -169,11 +160,3 @@ class Chord:
             return motion
 
         loop(self.links, one, problem.widened(step.palm_motion), self.block.size)
-
-
-def with_rows(r: jax.Array, ro: jax.Array, rows: list[tuple[bool, jax.Array]]) -> tuple:
-    """Adds the wrenches of rows on the link before them, and what the object gets of them."""
-    for on_object, wrench in rows:
-        r = r + wrench[:6]
-        ro = ro - wrench[:6] if on_object else ro
-    return r, ro

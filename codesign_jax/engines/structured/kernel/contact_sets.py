@@ -4,20 +4,20 @@ Where no lane of the block has an active contact, the item is skipped.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import objects
 from codesign_jax.engines.structured.kernel.memory import MemoryLayout, anywhere, full, solid, upper
-from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.solver import tree_add_scaled
-from codesign_jax.engines.structured.lanes import sum_axis
+from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.laws import contact, shapes
+from codesign_jax.engines.structured.laws import contact
 from codesign_jax.engines.structured.laws.cones import which_cone
 from codesign_jax.engines.structured.laws.contact import Cone, Contacts, Line
+from codesign_jax.engines.structured.laws.rings import Place
 from codesign_jax.scene import Scene
 
 # Rows of a contact's jar and numbers of its line, by friction model.
@@ -32,10 +32,7 @@ NEEDLESS = {
 
 def cone_fields(scene: Scene) -> list[str]:
     """Fields of the cones of a scene's contacts."""
-    absent = NEEDLESS[scene.effects.friction]
-    if not scene.effects.soft_touch:
-        absent += ("growth", "least")
-    return [name for name in Cone._fields if name not in absent]
+    return [name for name in Cone._fields if name not in NEEDLESS[scene.effects.friction]]
 
 
 def cone_of(scene: Scene, numbers: Any) -> Cone:
@@ -68,15 +65,11 @@ class ContactSet:
         self.scene, self.name, self.count, self.k, self.size = scene, name, count, k, size
         self.on_object = name.endswith("_object")
 
-    places: tuple[str, ...] = ("point", "normal", "gap")
-    """Fields that say where contacts are, in the order of `contacts`' argument."""
-    of_lines: tuple[str, ...] = ("gap",)
-    """Fields that a line search needs."""
-
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         """The set's part of the scratch table."""
         rows, ray = ROWS[self.scene.effects.friction]
-        fields = {"point": 3, "normal": 3, "gap": 1, "jar": rows, "step": rows, "ray": ray}
+        fields = {name: 3 for name in ("point", "normal")} | {"gap": 1, "share": 1}
+        fields |= {"jar": rows, "step": rows, "ray": ray}
         return {f"{self.name}.{f}": (self.count, (n, self.k)) for f, n in fields.items()}
 
     def bind(self, table: MemoryLayout, ref: Any, read: Callable[[str], Lanes]) -> "BoundContacts":
@@ -93,16 +86,14 @@ class ContactSet:
         return cone_of(self.scene, numbers)
 
     @staticmethod
-    def contacts(place: tuple, cone: Cone) -> Contacts:
-        """Contacts of (point, normal, gap), and what else the set keeps of them."""
-        point, normal, gap = place
-        return Contacts(point, normal, gap[0], cone)
+    def contacts(place: Place, cone: Cone) -> Contacts:
+        """Contacts of places."""
+        return Contacts(place.point, place.normal, place.gap[0], cone.of_share(place.share[0]))
 
     @staticmethod
-    def of_line(gap: tuple, cone: Cone) -> Contacts:
-        """What a line search needs of contacts: their gaps and cones."""
-        (gap,) = gap
-        return Contacts(gap, gap, gap[0], cone)
+    def of_line(share: jax.Array, cone: Cone) -> Contacts:
+        """What a line search needs of contacts."""
+        return Contacts(share, share, share[0], cone.of_share(share[0]))
 
 
 class BoundContacts:
@@ -122,10 +113,10 @@ class BoundContacts:
 
     def touching(self, item: Any) -> jax.Array:
         """Whether any lane's contact is active, a scalar."""
-        gaps = self.read("gap", item).parts.ravel()
-        mask = gaps[0] < 0
-        for gap in gaps[1:]:
-            mask = mask | (gap < 0)
+        shares = self.read("share", item).parts.ravel()
+        mask = shares[0] > 0
+        for share in shares[1:]:
+            mask = mask | (share > 0)
         return anywhere(mask)
 
     def if_touching(self, item: Any, compute: Callable, parts: list[tuple]) -> list[Lanes]:
@@ -139,42 +130,30 @@ class BoundContacts:
 
         return rebuild(jax.lax.cond(self.touching(item), some, lambda: none))
 
-    def create(self, item: Any, geometry: Any, motion: Lanes, velocity: Lanes) -> None:
-        """Stores contacts (point, normal, gap) and their jar for relative motions (6, ...)."""
-        self.write("gap", geometry[2], item)
+    def create(self, item: Any, place: Place, motion: Lanes, velocity: Lanes) -> None:
+        """Stores contacts of a link's or a group's places, for relative motions (6, ...)."""
+        place, jar = self.begin(place, motion, velocity)
+        self.write("share", place.share, item)
 
         def store() -> None:
-            for field, value in self.begin(geometry, motion, velocity).items():
+            for field, value in kept(place, jar).items():
                 self.write(field, value, item)
 
         jax.lax.cond(self.touching(item), store, lambda: None)
 
-    def begin(
-        self, place: tuple, motion: Lanes, velocity: Lanes, ahead: tuple | None = None
-    ) -> dict[str, Lanes]:
-        """What is kept of new contacts, by field, for relative motions of their bodies.
+    def begin(self, place: Place, motion: Lanes, velocity: Lanes) -> tuple[Place, Lanes]:
+        """Places whose share is zero where no candidate is, and their jar.
 
         Args:
-          place: Where they are, see `ContactSet.places`.
-          motion: Relative acceleration.
+          place: Where they are, with an axis of their own.
+          motion: Relative acceleration of their bodies.
           velocity: Relative velocity.
-          ahead: See `sections.ahead`; None for contacts that act from touch on.
         """
-        contacts = self.set.contacts
+        return lanewise(partial(begun, margin(self.set.scene)), place, self.cone, motion, velocity)
 
-        def jar(place, cone, motion, velocity, *ahead):
-            c = contacts(place, cone)
-            c = c._replace(ahead=tuple(part[0] for part in ahead) or None)
-            reference = c.reference(c.relative(velocity[:, None]))
-            return c.relative(motion[:, None]) - reference
-
-        value = lanewise(jar, place, self.cone, motion, velocity, *(ahead or ()))
-        fields = dict(zip(self.set.places, place, strict=True))
-        return {**fields, "jar": value, "step": lanewise(jnp.zeros_like, value)}
-
-    def place(self, item: Any) -> tuple[Lanes, ...]:
-        """Where the contacts are, see `ContactSet.places`."""
-        return tuple(self.read(field, item) for field in self.set.places)
+    def place(self, item: Any) -> Place:
+        """Where the contacts are."""
+        return Place(*(self.read(field, item) for field in Place._fields))
 
     def push(self, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
         """Adds the last step of the line search to jar.
@@ -224,13 +203,13 @@ class BoundContacts:
     def _changes(self, item: Any, alpha: Lanes) -> Lanes:
         of_line = self.set.of_line
 
-        def count(gap, cone, ray, alpha):
-            c = of_line(gap, cone)
+        def count(share, cone, ray, alpha):
+            c = of_line(share, cone)
             line = Line(*(ray[i] if i < ray.shape[0] else None for i in range(5)))
             return sum_axis(jnp.where(contact.same_zone(c, line, alpha), 0.0, 1.0), 0)
 
-        gap = tuple(self.read(field, item) for field in self.set.of_lines)
-        return lanewise(count, gap, self.cone, self.read("ray", item), alpha)
+        share = self.read("share", item)
+        return lanewise(count, share, self.cone, self.read("ray", item), alpha)
 
     def prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:
         """Stores the contacts' cost along a relative motion (6, ...); returns its slope at 0."""
@@ -266,50 +245,32 @@ class BoundContacts:
     def _slopes(self, item: Any, alpha: Lanes) -> list[Lanes]:
         of_line = self.set.of_line
 
-        def both(gap, cone, ray, alpha):
-            c = of_line(gap, cone)
+        def both(share, cone, ray, alpha):
+            c = of_line(share, cone)
             line = Line(*(ray[i] if i < ray.shape[0] else None for i in range(5)))
             first, second = contact.slopes(c, line, alpha)
             return [sum_axis(first, 0), sum_axis(second, 0)]
 
-        gap = tuple(self.read(field, item) for field in self.set.of_lines)
-        return lanewise(both, gap, self.cone, self.read("ray", item), alpha)
+        share = self.read("share", item)
+        return lanewise(both, share, self.cone, self.read("ray", item), alpha)
 
 
-def sphere_on_object(
-    scene: Scene,
-    thing: WorldObject,
-    columns: Lanes,
-    centre: Lanes,
-    radius: Lanes | float,
-) -> tuple[Lanes, Lanes, Lanes]:
-    """Contacts of spheres with the objects: the one way to them for all that may touch.
-
-    It reads the kernel's memory where an object is a mesh, so that it is called on lanes and not
-    from within `lanewise`.  Points without a size, such as a hull's vertices, have radius 0.
-
-    Args:
-      scene: The scene.
-      thing: The block's objects, see `objects.read`.
-      columns: Columns of their orientation, shape (3, 3).
-      centre: Sphere centres from the objects' [m], shape (3, k).
-      radius: Sphere radii [m], shape (k,).
-
-    Returns:
-      Contact points [m] and unit normals from object to hand, shape (3, k), and gaps [m], negative
-      in contact, shape (1, k).
-    """
-    local = lanewise(shapes.in_object, columns, centre)
-    distance, gradient = objects.signed_distance(scene, thing, local)
-
-    def place(*args):
-        point, normal, gap = shapes.on_surface(*args)
-        return point, normal, gap[None]
-
-    return lanewise(place, columns, centre, radius, distance, gradient)
+def margin(scene: Scene) -> float:
+    """See `contact.candidates`."""
+    return contact.MARGIN if scene.effects.surface == "hull" else 0.0
 
 
-def sphere_on_table(height, centre, radius):
-    """Point, normal and gap of spheres (3, k, ...) against the table."""
-    c = shapes.spheres_on_table(None, height, centre, radius)  # type: ignore[arg-type]
-    return c.point, c.normal, c.distance[None]
+def kept(place: Place, jar: Lanes) -> dict[str, Lanes]:
+    """What is kept of new contacts, by field."""
+    return {**place._asdict(), "jar": jar, "step": lanewise(jnp.zeros_like, jar)}
+
+
+def begun(
+    margin: float, place: Place, cone: Cone, motion: jax.Array, velocity: jax.Array
+) -> tuple[Place, jax.Array]:
+    """See `BoundContacts.begin`."""
+    c = ContactSet.contacts(place, cone)
+    speed = c.relative(velocity[:, None])
+    approach = -dot(place.normal, speed)
+    share = contact.candidates(place.share[0], place.gap[0], approach, cone, margin)
+    return place._replace(share=share[None]), c.relative(motion[:, None]) - c.reference(speed)

@@ -219,9 +219,8 @@ class Coupling:
 
         def step(i: Any, carry: tuple) -> tuple:
             names = ("axes", "w", "g", "inverse")
-            r, ro, z = lanewise(
-                _again, carry, self.problem.read(*names, item=i), *self.problem.pair_push(i)
-            )
+            push, factors = self.pairs.pushed(i + 1), self.problem.read(*names, item=i)
+            r, ro, z = lanewise(_again, carry, factors, push)
             self.problem.write("z_again", z, i)
             return r, ro
 
@@ -256,20 +255,18 @@ class Coupling:
                 return el.substitute(axes, el.Factors(*factors), parent, obj)[1]
 
             moved = lanewise(move, axes, factors, parent, step.object_motion)
-            self.pairs.put_link(i, parent, moved)
+            self.pairs.put("motion", moved, i + 1)
             return moved
 
         parent = self.problem.widened(step.palm_motion)
-        self.pairs.put_palm(parent)
+        self.pairs.put("motion", parent, 0)
         loop(self.links, one, parent, self.block.size)
 
 
-def _again(carry, factors, push, turned):
-    """`elimination.eliminate_again` of a link, with forces on the link and on its joint."""
+def _again(carry, factors, push):
+    """`elimination.eliminate_again` of a link, with a force on it."""
     (r, ro), (axes, w, g, inverse) = carry, factors
     r = r + push
     y = contract(axes, r[None], 1)
-    if turned is not None:
-        y = y + contract(axes[:, :3], turned[None], 1)
     ro = ro + contract(g, y[:, None], 0)
     return r - contract(w, y[:, None], 0), ro, contract(inverse, y[None], 1)

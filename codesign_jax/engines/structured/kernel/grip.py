@@ -33,7 +33,7 @@ def of_row(step: "Step", pairs: BoundPairs, row: Any) -> list[Lanes]:
     """What the fingers of a pairing's row hold, (3,) or nothing if the scene has no such state."""
     if not step.p.held:
         return []
-    return [step.p.finger_state.read(step.finger_state, "grip", row - int(pairs.set.palm))]
+    return [step.p.finger_state.read(step.finger_state, "grip", row + pairs.set.first)]
 
 
 def clear(step: "Step") -> None:
@@ -54,19 +54,21 @@ def store(step: "Step", good: jax.Array) -> None:
 
 def sums(pairs: BoundPairs, row: Any, alpha: Lanes, grip: Lanes) -> Lanes:
     """Sums of `holding.hold`, (4,), of a row's contacts where the last step has moved jar."""
-    contacts = pairs.set.contacts
+    contacts, pairing = pairs.set.contacts, pairs.pairing(row)
 
-    def add(sums, place, cone, alpha, jar, step, grip):
+    def add(sums, place, cone, alpha, jar, step, grip, counts):
         c = contacts(place, cone)
         force = contact.constraint_update(c, tree_add_scaled(alpha, jar, step)).force
-        return sums + sum_axis(holding.hold(c, force, grip[:, None]), 1)
+        return sums + counts * sum_axis(holding.hold(c, force, grip[:, None]), 1)
 
     def one(item: Any, sums: Lanes) -> Lanes:
         jar, step = pairs.read("jar", item), pairs.read("step", item)
-        return lanewise(add, sums, pairs.place(item), pairs.cone, alpha, jar, step, grip)
+        counts = pairs.holds(item, pairing)
+        with pairs.with_cone(row, item):
+            args = sums, pairs.place(item), pairs.cone, alpha, jar, step, grip, counts
+            return lanewise(add, *args)
 
-    with pairs.with_cone(row):
-        found = pairs.fold(row, one, zeros((4,), jnp.zeros((pairs.set.size,), pairs.ref.dtype)))
+    found = pairs.fold(row, one, zeros((4,), jnp.zeros((pairs.set.size,), pairs.ref.dtype)))
     return found if pairs.block.team == 1 else team_sum(pairs.block, found)
 
 
@@ -76,15 +78,15 @@ def settle(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
     assert pairs is not None
 
     def keep() -> None:
-        mask, palm = lanes([which], (), wide=True), int(pairs.set.palm)
+        mask, first = lanes([which], (), wide=True), pairs.set.first
 
         def one(row: jax.Array, x: jax.Array) -> jax.Array:
-            before, old = problem.read("grip", "new_grip", item=row - palm)
+            before, old = problem.read("grip", "new_grip", item=row + first)
             new = lanewise(holding.quotient, sums(pairs, row, alpha, before))
-            problem.write("new_grip", lanewise(jnp.where, mask, new, old), row - palm)
+            problem.write("new_grip", lanewise(jnp.where, mask, new, old), row + first)
             return x
 
-        jax.lax.fori_loop(palm, pairs.set.rows, one, jnp.int32(0))
+        jax.lax.fori_loop(0, pairs.set.rows, one, jnp.int32(0))
 
     with only([pairs], which):
         any_of(which & pairs.touching_worlds(), keep)

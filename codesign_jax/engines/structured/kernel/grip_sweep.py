@@ -38,19 +38,21 @@ def reverse(step: "ReverseStep", pairs: BoundPairs, go: Lanes) -> None:
     state, still = step.p.finger_state, zeros((), step.like)
 
     for item in range(step.p.held):
-        row = item + int(pairs.set.palm)
-        mine = state.read(step.bars.finger_state, "grip", item)
-        found = grip.sums(pairs, row, still, state.read(step.finger_state, "grip", item))
-        both = only_on(go, lanewise(jnp.subtract, mine, pairs.pairing(row).swap(mine)))
-        (bars,) = pull(holding.quotient, (found,), (), both)
+        row, mine = item - pairs.set.first, state.read(step.bars.finger_state, "grip", item)
+        bars = zeros((4,), step.like)
+        if 0 <= row < pairs.set.rows:
+            found = grip.sums(pairs, row, still, state.read(step.finger_state, "grip", item))
+            theirs = pairs.pairing(row).swap(mine)
+            both = lanewise(jnp.subtract, mine, theirs) if item else mine
+            (bars,) = pull(holding.quotient, (found,), (), only_on(go, both))
         step.p.scratch.write(step.scratch, "grip_bar", bars, item)
         rest = only_on(lanewise(jnp.logical_not, go), mine)
         state.write(step.bars.finger_state, "grip", rest, item)
 
 
 def _item(pairing: Pairing) -> jax.Array:
-    """Number of a pairing's state on the lanes; any for the palm, which has none."""
-    return jnp.maximum(pairing.number - 1, 0)
+    """Number of a pairing's state on the lanes."""
+    return pairing.number
 
 
 def at(step: "ReverseStep", pairing: Pairing) -> tuple[Lanes, ...]:
@@ -95,8 +97,7 @@ def push(problem: Problem, pairs: BoundPairs) -> None:
         bars = table.gather(ref, "grip_bar", which, lane)
         one = lanes([problem.like + 1.0], (), wide=True)
         (r,) = pull(of_held, (force,), (side.place, pairs.cone, held, bars), one)
-        if pairing.palm is not None:
-            r = only_on(lanewise(jnp.logical_not, pairing.palm), r)
+        r = lanewise(jnp.multiply, pairs.holds(item, pairing), r)
         change = lanewise(jnp.negative, pairs.stiff(pairs.read("hessian", item), r))
         pairs.load(item, side, change, pairing)
 

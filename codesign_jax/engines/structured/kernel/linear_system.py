@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,29 +12,10 @@ from codesign_jax.engines.structured.kernel.coupling import Eliminated
 from codesign_jax.engines.structured.kernel.memory import choose, either, full, loop, upper
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem, make_body
-from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.lanes import contract, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 from codesign_jax.engines.structured.linear import elimination as el
 from codesign_jax.engines.structured.linear.tree import Forces, Matrices
-
-
-class Row(NamedTuple):
-    """What a row of the hull adds to the elimination.
-
-    Attributes:
-      held: Whether its contacts are with the object.
-      used: Whether there are any, a scalar.
-      terms: What they add to the row's joint.
-      matrix: Contact inertia of the link before it, upper triangle (21,).
-      force: Its wrench.
-    """
-
-    held: bool
-    used: jax.Array
-    terms: el.JointTerms
-    matrix: Lanes
-    force: Lanes
 
 
 class Elimination:
@@ -59,18 +40,16 @@ class Elimination:
         if problem.pairs:
             self.between_fingers(problem.pairs, alpha)
 
-        def eliminate(node, body, motion, smooth, tau, axes, armature, acc, pushes, terms, pairs):
+        def load(node, body, motion, smooth, pair):
             link = make_body(*body)
-            push, tau = smooth - link.times(motion), tau - armature * acc
-            if pairs is not None:
-                wrench, turned = pairs
-                push = push + wrench
-                tau = tau if turned is None else tau + contract(axes[:, :3], turned[None], 1)
-            node = el.add_link(node, el.link_terms(link.matrix(), push, pushes))
+            push = smooth - link.times(motion)
+            push = push if pair is None else push + pair
+            return node._replace(p=node.p + link.matrix(), r=node.r + push)
+
+        def eliminate(node, axes, armature, tau, acc):
+            tau = tau - armature * acc
             y = contract(axes, node.r[None], 1) + tau
-            node, kept = el.eliminate(node, axes, armature, tau, terms)
-            if terms is not None:
-                y = y + terms.y
+            node, kept = el.eliminate(node, axes, armature, tau)
             return node, kept, dot(y, kept.factors.z)
 
         def free(node, *forces):
@@ -82,15 +61,14 @@ class Elimination:
         def step(i: Any, carry: tuple) -> tuple:
             node, work = carry
             acc, motion = self.accelerations(i, alpha)
-            pushes = {c.set.name: self.push(c, i, alpha) for c in problem.fingers}
             smooth, tau = self.smooth(i)
             axes, armature = problem.read("axes", "armature", item=i)
+            pair = problem.pairs.pushed(i + 1) if problem.pairs else None
             node = node._replace(p=full(node.p), q=full(node.q))
-            rows = [self.row(c, i, axes, alpha) for c in problem.skin]
-            terms = add_terms([r.terms for r in rows]) if rows else None
-            pairs = problem.pair_push(i) if problem.pairs else None
-            forces = (motion, smooth, tau, axes, armature, acc, pushes, terms, pairs)
-            forces = (problem.body_of(i), *forces)
+            node = lanewise(load, node, problem.body_of(i), motion, smooth, pair)
+            for contacts in problem.fingers:
+                node = self.touch(node, contacts, i, alpha)
+            forces = axes, armature, tau, acc
 
             def eliminated(how: Callable) -> tuple[el.Quadratic, Lanes]:
                 new, kept, more = lanewise(how, node, *forces)
@@ -101,15 +79,11 @@ class Elimination:
                 return new._replace(p=upper(new.p), q=upper(new.q)), more
 
             ways = (partial(eliminated, eliminate), partial(eliminated, free))
-            node, more = either(i <= held, *ways, self.block.size) if rows else ways[0]()
-            if problem.pairs:
-                work = lanewise(jnp.add, work, more)
-            return self.add_rows(node, rows), work
+            node, more = ways[1]() if held is None else either(i <= held, *ways, self.block.size)
+            return node, lanewise(jnp.add, work, more) if problem.pairs else work
 
         empty = [zeros(s, self.like) for s in ((21,), (6, 6), (21,), (6,), (6,))]
-        tip = [self.row(c, self.links, None, alpha) for c in problem.skin]
-        node = self.add_rows(el.Quadratic(*empty), tip)
-        start, held = (node, zeros((), self.like)), self.last_on_object()
+        start, held = (el.Quadratic(*empty), zeros((), self.like)), self.last_on_object()
         node, work = loop(self.links, step, start, self.block.size, reverse=True)
         if problem.pairs:
             node, work = node._replace(r=problem.add_first(node.r)), self.block.sum(work)
@@ -134,53 +108,22 @@ class Elimination:
         """Prepares contacts between fingers, see `BoundPairs.update_constraints`."""
         pairs.update_constraints(alpha)
 
-    # Rows of the hull
+    def touch(self, node: el.Quadratic, contacts: BoundContacts, i: Any, alpha: Lanes) -> Any:
+        """Adds a link's contacts with object or table, if there are any."""
 
-    def row(self, slots: BoundSlots, row: Any, axes: Lanes | None, alpha: Lanes) -> "Row":
-        """What a row of the hull adds to the elimination, see `hull.row_terms`.
+        def add() -> el.Quadratic:
+            return lanewise(_add, node, *self.push(contacts, i, alpha), contacts.set.on_object)
 
-        Args:
-          slots: The row's contacts with the object or the table.
-          row: The row.
-          axes: Motion subspace of its joint; None for the tip, which has none.
-          alpha: Length of the last step.
-        """
-        number = 1 if axes is None else axes.shape[0]
-        shapes = ((number, number), (number, 6), (number, 6), (number,), (21,), (6,))
-        empty = [zeros(s, self.like) for s in shapes]
-        used = slots.used(row) > 0
+        return choose(contacts.touching(i), add, node, self.block.size)
 
-        def compute() -> list[Lanes]:
-            inertia, wrench = self.push(slots, row, alpha)
-            if axes is None:
-                return [*empty[:4], upper(inertia[:6, :6]), wrench[:6]]
-            terms, matrix, force = lanewise(el.row_terms, axes, inertia, wrench)
-            return [*terms, upper(matrix), force]
+    def last_on_object(self) -> jax.Array | None:
+        """Last link with contacts with the object, -1 for none; None if the scene has none."""
+        held = [c for c in self.problem.fingers if c.set.on_object]
 
-        *terms, matrix, force = choose(used, compute, empty, self.block.size)
-        if not slots.set.on_object:
-            terms[2] = zeros(shapes[2], self.like)
-        return Row(slots.set.on_object, used, el.JointTerms(*terms), matrix, force)
+        def later(i: Any, last: jax.Array) -> jax.Array:
+            return jnp.where(held[0].touching(i), jnp.asarray(i, jnp.int32), last)
 
-    def last_on_object(self) -> jax.Array:
-        """Last row of the hull with contacts with the object, a scalar; -1 if there is none."""
-        held = [c for c in self.problem.skin if c.set.on_object]
-
-        def later(row: Any, last: jax.Array) -> jax.Array:
-            used = [c.used(row) > 0 for c in held]
-            return jnp.where(used[0], jnp.asarray(row, jnp.int32), last) if used else last
-
-        return jax.lax.fori_loop(0, self.links + 1, later, jnp.int32(-1))
-
-    def add_rows(self, node: el.Quadratic, rows: list["Row"]) -> el.Quadratic:
-        """Adds the rows' contacts to the links before them; p and q as triangles."""
-        for row in rows:
-
-            def add(row: Row = row, node: el.Quadratic = node) -> el.Quadratic:
-                return lanewise(_add_row, node, row.matrix, full(row.matrix), row.force, row.held)
-
-            node = choose(row.used, add, node, self.block.size)
-        return node
+        return jax.lax.fori_loop(0, self.links, later, jnp.int32(-1)) if held else None
 
     def slot_pushes(self, alpha: Lanes) -> dict[str, tuple[Lanes, Lanes]]:
         """Contact inertia and wrench of the palm's and the object's contacts; see `backward`."""
@@ -244,16 +187,9 @@ def with_palm(
     return el.add_palm(node, matrices, force, pushes), force
 
 
-def add_terms(terms: list[el.JointTerms]) -> el.JointTerms:
-    """Sums what the rows of several pairs of bodies add to a joint."""
-    if len(terms) == 1:
-        return terms[0]
-    return lanewise(lambda *t: jax.tree.map(lambda *v: total(v), *t), *terms)
-
-
-def _add_row(node: el.Quadratic, matrix, square, force, held: bool) -> el.Quadratic:
+def _add(node: el.Quadratic, matrix, wrench, held: bool) -> el.Quadratic:
     p, c, q, r, ro = node
-    p, r = p + matrix, r + force
+    p, r = p + matrix, r + wrench
     if held:
-        c, q, ro = c + square, q + matrix, ro - force
+        c, q, ro = c + matrix, q + matrix, ro - wrench
     return el.Quadratic(p, c, q, r, ro)

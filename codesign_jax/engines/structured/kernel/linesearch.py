@@ -1,6 +1,5 @@
 """How far to go along a Newton step: the cost's slopes along it, and where it is lowest."""
 
-from functools import partial
 from typing import Any
 
 import jax
@@ -19,7 +18,6 @@ from codesign_jax.engines.structured.kernel.problem import (
 from codesign_jax.engines.structured.kernel.slots import only
 from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.laws import hull
 from codesign_jax.engines.structured.linear import elimination as el
 
 LINE_TOLERANCE = 0.01
@@ -65,12 +63,11 @@ class LineSearch:
             problem.write("step_acc", a, i)
             problem.write("step_motion", moved, i)
             if problem.pairs:
-                problem.pairs.put_link(i, parent, moved)
+                problem.pairs.put("motion", moved, i + 1)
             terms = [touch]
             for contacts in problem.fingers:
                 rel = relative(contacts.set.name, moved, step.palm_motion, step.object_motion)
                 terms.append(contacts.prepare_linesearch(i, rel))
-            terms += self.prepare_row(i, parent, moved, step)
             touch = lanewise(lambda t: total(t), terms)
             slope, curvature = lanewise(lambda a, b, c, d: (a + b, c + d), slope, s, curvature, c)
             return moved, slope, curvature, touch
@@ -78,13 +75,12 @@ class LineSearch:
         none = zeros((), self.like)
         parent = problem.widened(step.palm_motion)
         if problem.pairs:
-            problem.pairs.put_palm(parent)
-        last, slope, curvature, touch = loop(
+            problem.pairs.put("motion", parent, 0)
+        _, slope, curvature, touch = loop(
             self.links, one, (parent, none, none, none), self.block.size
         )
-        tip = self.prepare_row(self.links, last, last, step)
         between = [problem.pairs.prepare_all()] if problem.pairs else []
-        touch = self.prepare_slots(lanewise(lambda t: total(t), [touch, *tip, *between]), step)
+        touch = self.prepare_slots(lanewise(lambda t: total(t), [touch, *between]), step)
         slope, curvature, touch = self.block.sum((slope, curvature, touch))
         slope, curvature = lanewise(_rest, now, step, problem.palm, slope, curvature)
         return slope, curvature, touch
@@ -99,17 +95,6 @@ class LineSearch:
 
             touch = loop(contacts.set.count, add, touch, self.block.size)
         return touch
-
-    def prepare_row(self, row: Any, before: Lanes, after: Lanes, step: Iterate) -> list[Lanes]:
-        """Slopes of a row's contacts along the step of the links before and behind it."""
-        if not self.problem.skin:
-            return []
-        moved = lanewise(partial(hull.across, obj=None), before, after)
-        names = [
-            (c, relative(c.set.name, moved, step.palm_motion, step.object_motion))
-            for c in self.problem.skin
-        ]
-        return [c.prepare_linesearch(row, motion) for c, motion in names]
 
     def total(self, sums: list[Lanes]) -> list[Lanes]:
         """What the lanes of a world have found, summed."""
@@ -126,10 +111,8 @@ class LineSearch:
 
         problem = self.problem
         sums = [zeros((), self.like)] * 2
-        links, surface = (self.links, problem.fingers), (self.links + 1, problem.skin)
-        for count, sets in (links, surface):
-            if sets:
-                sums = loop(count, lambda i, s, c=sets: add(i, s, c), sums, self.block.size)
+        if sets := problem.fingers:
+            sums = loop(self.links, lambda i, s: add(i, s, sets), sums, self.block.size)
         for c in problem.slots:
             sums = loop(c.set.count, lambda i, s, c=c: add(i, s, [c]), sums, self.block.size)
         if problem.pairs:

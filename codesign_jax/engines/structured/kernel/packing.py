@@ -4,12 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured.kernel import objects, skin
+from codesign_jax.engines.structured.kernel import objects
 from codesign_jax.engines.structured.kernel.memory import lengthened
-from codesign_jax.engines.structured.kernel.tables import Tables
+from codesign_jax.engines.structured.kernel.pair_search import TIP, ring_places
+from codesign_jax.engines.structured.kernel.tables import PALM, Tables
 from codesign_jax.engines.structured.laws.kinematics import Acc, State
 from codesign_jax.engines.structured.world_model import WorldModel
 from codesign_jax.model.layout import palm_touches
+from codesign_jax.scene import Scene
 
 
 class Packing(Tables):
@@ -19,7 +21,7 @@ class Packing(Tables):
         """The hand's tables; padded fingers have no mass."""
         worlds, n = hand.object_id.shape[1], self.num_fingers
         dtype, lane = hand.mass.dtype, (n, worlds)
-        links_first = ("centre", "inertia", "sphere")
+        links_first = ("centre", "inertia")
         arrays = {
             k: jnp.moveaxis(v, 1, 0) if k in links_first and v.size else v
             for k, v in hand._asdict().items()
@@ -34,23 +36,20 @@ class Packing(Tables):
         share[[0, -1]] = 0.5
         arrays["share"] = jnp.broadcast_to(share[:, None, None], (self.links + 1, *lane))
         if palm_touches(self.scene):
-            arrays |= self._palm_slots(hand)
+            arrays["palm_ring"] = self._palm_slots(hand)
         if hand.section is not None:
             arrays["section"] = hand.section[None]
         if hand.threshold is not None:
             arrays["threshold"] = hand.threshold[None]
-        if self.scene.effects.surface == "hull":
-            arrays |= skin.pack(self.scene, hand)
+        if self.k:
+            arrays["ring"] = ring_numbers(self.scene, hand, self.k)
         if hand.mesh is not None:
             arrays |= objects.rows(hand.mesh, self.fingers, dtype)
         extra = self.fingers - n
         if extra:
-            for name in ("share", "mass", "inertia", "gain"):
+            for name in ("share", "mass", "inertia", "gain", *(["ring"] if self.k else [])):
                 pad = [(0, 0)] * (arrays[name].ndim - 2) + [(0, extra), (0, 0)]
                 arrays[name] = jnp.pad(arrays[name], pad)
-            if self.k:
-                pad = [(0, 0)] * (hand.radius.ndim - 2) + [(0, extra), (0, 0)]
-                arrays["radius"] = jnp.pad(hand.radius, pad, constant_values=-1e3)
         wide = {k: self._widen(arrays[k]) for k in self.hand.groups}
         arrays["object_id"] = hand.object_id.astype(dtype)
         narrow = {k: arrays[k] for k in self.world.groups}
@@ -64,16 +63,11 @@ class Packing(Tables):
         """Fingers up to a power of two."""
         return lengthened(array, array.ndim - 2, self.fingers)
 
-    def _palm_slots(self, hand: WorldModel) -> dict[str, jax.Array]:
-        """The palm's contact spheres, shared out among the lanes."""
-        f, g, worlds = self.fingers, self.palm_groups, hand.palm_radius.shape[1]
-        missing = (0, g * f - len(hand.palm_radius))
-        place = jnp.pad(hand.palm_point, [(0, 0), missing, (0, 0)]).reshape(3, g, 1, f, worlds)
-        size = jnp.pad(hand.palm_radius, [missing, (0, 0)], constant_values=-1e3)
-        return {
-            "palm_point": jnp.moveaxis(place, 0, 1),
-            "palm_radius": size.reshape(g, 1, f, worlds),
-        }
+    def _palm_slots(self, hand: WorldModel) -> jax.Array:
+        """The palm's rings or spheres, shared out among the lanes."""
+        numbers, f = palm_numbers(self.scene, hand), self.fingers
+        padded = jnp.pad(numbers, [(0, self.palm_groups * f - len(numbers)), (0, 0), (0, 0)])
+        return jnp.moveaxis(padded.reshape(self.palm_groups, f, 8, -1), 1, 2)
 
     def pack_state(self, state: State) -> tuple[jax.Array, jax.Array]:
         """The state's tables; padded worlds do not go on."""
@@ -177,3 +171,41 @@ class Packing(Tables):
         narrow = self.world_state.unpack(world_state, 1, 1, worlds)
         acc = Acc(narrow.pop("acc_wrist"), wide.pop("acc"), narrow.pop("acc_object"))
         return State(**wide, **narrow, acc=acc)
+
+
+def ring_numbers(scene: Scene, hand: WorldModel, k: int) -> jax.Array:
+    """Numbers of the fingers' rings or spheres, see `rings.Ring`, (link * k, 8, finger, world)."""
+    if scene.effects.surface == "spheres":
+        one = jnp.ones_like(hand.radius)
+        rows = [*hand.sphere, *[hand.radius] * 3, one, 0.0 * one]
+        return jnp.stack(rows, 2).reshape(-1, 8, *one.shape[2:])
+    assert hand.section is not None
+    height, _, segment, width = hand.section
+    links = scene.discretization.links
+    along = ring_places(links, k)
+    length = np.full((links, k), 1.0 / k)
+    length[-1] *= 0.5
+    half = 0.6 * length
+    half[-1, -1] = TIP
+    along, length, half = (v.reshape(-1, 1, 1) for v in (along, length, half))
+    tip = (np.arange(links * k) == links * k - 1).reshape(-1, 1, 1)
+    rows = [along * segment, 0.0, 0.5 * height, half * segment, 0.5 * width, 0.5 * height]
+    rows += [length * segment / width, tip.astype(width.dtype)]
+    shape = (links * k, *width.shape)
+    return jnp.stack([jnp.broadcast_to(jnp.asarray(v, width.dtype), shape) for v in rows], 1)
+
+
+def palm_numbers(scene: Scene, hand: WorldModel) -> jax.Array:
+    """Numbers of the rings or spheres of the palm, as `ring_numbers`, (item, 8, world)."""
+    if scene.effects.surface == "spheres":
+        one = jnp.ones_like(hand.palm_radius)
+        rows = [*hand.palm_point, *[hand.palm_radius] * 3, one, 0.0 * one]
+        return jnp.stack(rows, 1)
+    assert hand.palm_disc is not None and hand.section is not None
+    (radius, thick), width = hand.palm_disc[:, 0], hand.section[3, 0]
+    half = 0.5 * radius
+    rows = [
+        [x * half, y * half, thick, half, half, thick, 4.0 * half**2 / width**2, 0.0 * half]
+        for x, y in PALM
+    ]
+    return jnp.stack([jnp.stack(row) for row in rows])

@@ -1,10 +1,9 @@
-"""Finds where fingers touch each other and the palm: spheres, or the hull's vertices.
+"""Finds where fingers touch each other, themselves and the palm: rings or spheres.
 
-A vertex of the hull touches another finger's row (the stretch between the middles of two links)
-where it stands inside the row's section, whose frame turns from one link's to the other's along
-the row: rows neither overlap nor leave gaps, however the finger bends.  Both fingers' vertices
-are tried, each with half its share of the surface.  All vertices of a row that stand in the same
-row of another finger are one contact, see `sections.pressure`; so are those in the palm's disc.
+A ring meets the nearest place of another finger's centre line, or of its own on the way back to the
+palm that is `arc` away along the finger.  Of two fingers the first one's rings look: with both
+fingers' there would be twice as many contacts, which is what a step's time goes to.  The lanes of a
+team, see `teams`, look with a ring each.
 """
 
 from collections.abc import Callable
@@ -13,403 +12,453 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from codesign_jax.engines.structured.kernel import grip, skin
-from codesign_jax.engines.structured.kernel.contact_sets import zeros
-from codesign_jax.engines.structured.kernel.memory import anywhere, choose, loop
+from codesign_jax.engines.structured.kernel import grip
+from codesign_jax.engines.structured.kernel.contact_sets import (
+    ContactSet,
+    begun,
+    kept,
+    margin,
+    zeros,
+)
+from codesign_jax.engines.structured.kernel.memory import loop
 from codesign_jax.engines.structured.kernel.pairing import Pairing
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.slots import any_of
-from codesign_jax.engines.structured.kernel.teams import team_sum, where
+from codesign_jax.engines.structured.lanes import cross, dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.laws import holding, hull, sections
+from codesign_jax.engines.structured.laws import contact, holding, rings, shapes
+from codesign_jax.engines.structured.laws.rings import Place, Ring, Segment
 from codesign_jax.engines.structured.world_model import apply_columns
-from codesign_jax.model.layout import first_on_palm, palm_ahead
+from codesign_jax.model.layout import first_on_palm, touches_itself
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.step import Step
 
+SURELY = 1.0 - 1e-4
+"""At a joint two segments have one nearest place, which is the first one's, whatever is rounded."""
+REACH = 1.2
+"""Farthest point of a section over the larger one of its half axes."""
 
-def fields(links: int, spheres: int) -> dict[str, tuple[int, tuple[int, ...]]]:
-    """Where the fingers are, for the lanes of the others; with the hull there are no spheres."""
-    if spheres:
-        return {"pair.sphere": (links * spheres, (4,))}
+
+def fields(links: int) -> dict[str, tuple[int, tuple[int, ...]]]:
+    """Where the fingers are, for the lanes of the others."""
     rows = links + 1
-    return {"pair.frame": (rows, (3, 3)), "pair.joint": (rows, (3,)), "pair.ball": (rows, (4,))}
+    found = {"frame": (rows, (3, 3)), "joint": (rows, (3,)), "end": (rows + 1, (3,))}
+    found |= {"line": (rows, (7,)), "other": (rows, (7,)), "fastest": (1, ())}
+    return {f"pair.{name}": group for name, group in found.items()}
 
 
 class Search:
-    """Gives a slot to each contact between fingers."""
+    """Gives a slot to each contact of fingers with one another, with themselves and the palm."""
 
     def __init__(self, step: "Step", pairs: BoundPairs, at: dict[str, Any]):
         """Takes a step's memory and geometry, see `Step`."""
         self.step, self.pairs, self.p = step, pairs, step.p
-        self.moves, self.palm = (at["now"].palm_motion, at["vel"]), ()
-        if pairs.set.palm:
-            self.palm = at["place"], at["frame"], step.constant("palm_disc")
-        self.ahead = palm_ahead(step.p.scene)
-        self.timestep = step.p.scene.discretization.timestep
         self.scratch, self.ref, self.block = step.p.scratch, step.scratch, step.block
         self.like = jnp.zeros((step.p.size,), step.finger_state.dtype)
+        self.count, self.palm_vel = self.p.links * self.p.k, at["vel"]
+        self.hull = step.p.scene.effects.surface == "hull"
+        self.palm = None
+        if step.p.scene.effects.finger_palm:
+            self.palm = at["place"], at["frame"], step.constant("palm_disc")
 
-    def write(self, name: str, value: Lanes, item: Any) -> None:
+    # Where fingers are
+
+    def write(self, name: str, value: Lanes, item: Any = 0) -> None:
         """Stores where a finger is."""
         self.scratch.write(self.ref, f"pair.{name}", value, item)
 
-    def read(self, name: str, item: Any, pairing: Pairing | None = None) -> Lanes:
-        """Where the lanes' own fingers are, or those that they are paired with."""
-        if pairing is not None and self.block.team > 1:
-            return self.scratch.gather(self.ref, f"pair.{name}", item, pairing.lane)
-        own = self.scratch.read(self.ref, f"pair.{name}", item)
-        return own if pairing is None else pairing.swap(own)
+    def read(self, name: str, item: Any = 0, lane: jax.Array | None = None) -> Lanes:
+        """Where the lanes' own fingers are, or those of other lanes; items may be of lanes."""
+        if lane is None and not jnp.ndim(item):
+            return self.scratch.read(self.ref, f"pair.{name}", item)
+        return self._gathered(self.scratch, self.ref, f"pair.{name}", item, lane)
+
+    def _gathered(self, table: Any, ref: Any, name: str, item: Any, lane: Any) -> Lanes:
+        item = jnp.zeros_like(self.block.own) + item
+        return table.gather(ref, name, item, self.block.own if lane is None else lane)
+
+    def ring(self, item: Any, lane: jax.Array | None = None) -> Lanes:
+        """Numbers of a ring, see `rings.Ring`."""
+        if lane is None and not jnp.ndim(item):
+            return self.p.hand.read(self.step.hand, "ring", item)
+        return self._gathered(self.p.hand, self.step.hand, "ring", item, lane)
 
     def start(self, motion: Lanes, vel: Lanes, frame: Lanes, base: Lanes) -> None:
         """Empties the slots; stores what belongs to the palm."""
         for row in range(self.pairs.set.rows):
             self.pairs.clear(row)
         grip.clear(self.step)
+        self.write("fastest", zeros((), self.like))
         self._side(0, motion, vel, frame, base)
+        self.write("end", lanewise(above, base, frame, frame, self.ring(self.count - 1)), 0)
 
     def link(self, i: Any, motion: Lanes, vel: Lanes, frame: Lanes, origin: Lanes) -> None:
         """Stores where a link is and how it moves."""
+        before = self.read("frame", i)
         self._side(i + 1, motion, vel, frame, origin)
-        for a in range(self.p.k):
-            sphere, radius = (self.p.hand.read(self.step.hand, n, i) for n in ("sphere", "radius"))
-
-            def ball(o, f, s, r, a: int = a):
-                return jnp.concatenate([o + apply_columns(f, s[:, a]), r[a][None]])
-
-            self.write("sphere", lanewise(ball, origin, frame, sphere, radius), i * self.p.k + a)
+        self.write("end", lanewise(above, origin, before, frame, self.ring(self.count - 1)), i + 1)
+        size = self.read("fastest"), vel, self.palm_vel, origin, self.ring(0)
+        self.write("fastest", lanewise(_faster, *size))
 
     def _side(self, row: Any, motion: Lanes, vel: Lanes, frame: Lanes, joint: Lanes) -> None:
-        for name, value, palm in zip(("motion", "vel"), (motion, vel), self.moves, strict=True):
-            self.pairs.put(name, self.pairs.beside_palm(value, palm), row)
-        if not self.p.k:
-            self.write("frame", frame, row)
-            self.write("joint", joint, row)
+        self.pairs.put("motion", motion, row)
+        self.pairs.put("vel", vel, row)
+        self.write("frame", frame, row)
+        self.write("joint", joint, row)
+
+    def side_of(self, name: str, row: Any, lane: jax.Array | None = None) -> Lanes:
+        """Motions of links, see `BoundPairs.put`; arguments as `read`."""
+        if lane is None and not jnp.ndim(row):
+            return self.pairs.table.read(self.pairs.ref, f"side.{name}", row)
+        return self._gathered(self.pairs.table, self.pairs.ref, f"side.{name}", row, lane)
+
+    def _lines(self) -> None:
+        """Ends the centre lines at the tips' rings; stores their segments."""
+        tip = self.ring(self.count - 1)
+        place = self.read("joint", self.p.links), self.read("frame", self.p.links)
+        self.write("end", lanewise(ring_centre, *place, tip), self.p.links + 1)
+
+        def one(row: Any) -> None:
+            ends = self.read("end", row), self.read("end", row + 1)
+            self.write("line", lanewise(_line, *ends), row)
+
+        each(self.p.links + 1, one)
+
+    def body(self, item: Any) -> tuple[Any, Lanes, Lanes, Lanes]:
+        """A ring's link, its numbers, the link's frame and the ring's centre."""
+        row = jax.lax.div(item, jnp.full_like(item, self.p.k)) + 1
+        frame, numbers = self.read("frame", row), self.ring(item)
+        return row, numbers, frame, lanewise(ring_centre, self.read("joint", row), frame, numbers)
 
     def find(self) -> None:
-        """Looks at all pairs of fingers, and at the palm."""
-        if not self.p.k:
-            self._balls()
-        if self.palm:
-            (self._spheres_on_palm if self.p.k else self._rows_on_palm)()
+        """Looks at all pairs of fingers, at each finger and at the palm."""
+        scene = self.p.scene
+        if self.hull:
+            self._lines()
+        if self.palm is not None:
+            self._each_ring(first_on_palm(self.p.links) - 1, self._on_palm)
+        if touches_itself(scene):
+            self._each_ring(0, self._on_itself)
+        if not scene.effects.finger_finger:
+            return
 
         def pairing(row: jax.Array, x: jax.Array) -> jax.Array:
             pairing = self.pairs.pairing(row)
             other = jax.lax.div(pairing.lane, jnp.int32(self.p.block))
-            there = (self.block.finger < self.p.num_fingers) & (other < self.p.num_fingers)
-            first = self.block.finger < other
-            (self._spheres if self.p.k else self._rows)(row, pairing, there, first)
+            owner = (self.block.finger < other) & (other < self.p.num_fingers)
+            if self.hull:
+                self._copy(pairing)
+            one = self._on_finger if self.hull else self._on_spheres
+            self._each_ring(0, lambda *ring: one(row, pairing, owner, *ring))
             return x
 
-        jax.lax.fori_loop(int(self.pairs.set.palm), self.pairs.set.rows, pairing, jnp.int32(0))
+        jax.lax.fori_loop(int(self.pairs.set.alone), self.pairs.set.rows, pairing, jnp.int32(0))
 
-    # The palm
+    def _each_ring(self, link: int, one: Callable) -> None:
+        """Runs one(item, lanes that have it) for all rings from a link on, dealt to the lanes."""
+        first = link * self.p.k
+        count = self.count - first
 
-    def _spheres_on_palm(self) -> None:
-        """Enters contacts of spheres."""
-        first = (first_on_palm(self.p.links) - 1) * self.p.k
+        def ring(k: Any) -> None:
+            item, mine = self.block.dealt(count, k)
+            one(item + first, self.like > -1 if mine is None else mine)
 
-        def one(j: Any) -> None:
-            number, ball = j + first, self.read("sphere", j + first)
-            mine, _ = lanewise(sections.ball_on_palm, ball, self.palm)
-            row = jax.lax.div(number, jnp.asarray(self.p.k, number.dtype)) + 1
-            self._enter_on_palm(mine, row, number)
+        each(self.block.rounds(count), ring)
 
-        each(self.p.links * self.p.k - first, one)
+    def _copy(self, pairing: Pairing) -> None:
+        """Stores the segments of the other finger's centre line."""
+        each(self.p.links + 1, lambda i: self.write("other", pairing.swap(self.read("line", i)), i))
 
-    def _rows_on_palm(self) -> None:
-        """Enters one contact of all vertices of a row."""
-        first = first_on_palm(self.p.links)
+    # Contacts
 
-        def one(i: Any) -> None:
-            row = i + first
-            any_of(self._near_palm(row), lambda: self._row_on_palm(row, None))
+    def _near(self, square: jax.Array, mine: Lanes, theirs: Lanes, speed: Lanes) -> jax.Array:
+        """Lanes whose ring may be near enough to a place at a squared distance."""
+        h = self.p.scene.discretization.timestep
 
-        each(self.p.links + 1 - first, one)
+        def reach(mine, theirs, speed):
+            most = [REACH * jnp.maximum(r[4], r[5]) for r in (mine, theirs)]
+            return most[0] + most[1] + jnp.maximum(contact.MARGIN, h * speed)
 
-    def _near_palm(self, row: Any) -> jax.Array:
-        """Lanes on which a vertex of a row may touch the palm, with `ahead` in this step."""
-        ball = self.read("ball", row)
-        (_, _, gap), _ = lanewise(sections.ball_on_palm, ball, self.palm)
-        if not self.ahead:
-            return gap.lane < 0
-        joint = self.read("joint", jnp.minimum(row + 1, self.p.links))
-        speed = lanewise(sections.fastest, ball, joint, self.pairs.side("vel", row))
-        return gap.lane < sections.REACH + self.timestep * speed.lane
+        far = lanewise(reach, mine, theirs, speed).lane
+        return square < far * far
 
-    def _row_on_palm(self, row: Any, there: jax.Array | None) -> None:
-        """Enters one contact of all vertices of a row; there: lanes that have one to try."""
-        d, links = self.p.scene.discretization, self._links(row)
-        count, kind = d.hull_rings * d.hull_points, skin.kind_of(row, self.p.links)
+    def _begun(
+        self, place: Place, cone: Any, rows: tuple, lane: jax.Array | None, held: list[Lanes]
+    ) -> dict[str, Lanes]:
+        """Fields of a contact of a link with another one on a lane, see `BoundContacts.begin`."""
 
-        vel = self.pairs.side("vel", row) if self.ahead else None
+        def moved(name: str) -> Lanes:
+            mine, theirs = self.side_of(name, rows[0]), self.side_of(name, rows[1], lane)
+            return lanewise(jnp.subtract, mine, theirs)
 
-        def add(k: Any, sums: Any) -> Any:
-            k, mine = self.block.dealt(count, k)
-            vertex = self.p.hand.read(self.step.hand, "vertex", kind * count + k)
-            one, other = lanewise(sections.on_palm, vertex, links, self.palm)
-            if vel is None:
-                new = lanewise(sections.add_vertex, sums, one, other)
-            else:
-                one, seen = lanewise(partial(sections.ahead, self.timestep), one, vel)
-                new = lanewise(sections.add_to_halves, sums, vertex, one, other, seen)
-            return new if mine is None else where(mine, new, sums)
+        place = lanewise(with_axis, place)
+        run = partial(begun, margin(self.p.scene))
+        place, jar = lanewise(run, place, cone, moved("motion"), moved("vel"))
+        for g in held:
+            jar = lanewise(_with_held, jar, place, cone, g)
+        return kept(place, jar) | {"row": self._number(rows[0])}
 
-        if vel is None:
-            start = zeros((sections.SUMS,), self.like)
-            sums = loop(self.block.rounds(count), add, start, self.block.size)
-            place = lanewise(sections.pressure, team_sum(self.block, sums))[0]
-            return self._enter_on_palm(place, row, there=there)
-        one = lanewise(sections.none_ahead, lanes([self.like], (), wide=True))
-        halves = loop(self.block.rounds(count), add, (one, one), self.block.size)
-        for number, sums in enumerate(halves):
-            place, _, seen = lanewise(sections.pressure_ahead, self._team_sum(sums))
-            self._enter_on_palm(place, row, number, there, seen)
+    def _number(self, value: Any) -> Lanes:
+        return lanes([self.like + jnp.asarray(value, self.like.dtype)], (1, 1), wide=True)
 
-    def _team_sum(self, sums: Lanes) -> Lanes:
-        """Sums of a team's lanes; with `ahead` of those with the lowest gap, or one below 0."""
-        if self.block.team == 1 or not self.ahead:
-            return team_sum(self.block, sums)
-        own = sums[-1].lane
-        lowest = self.block.over_team(own, jnp.minimum)
-        counts = lanes([(own < 0) | (own == lowest)], (), wide=True)
-        parts = team_sum(self.block, lanewise(lambda c, s: jnp.where(c, s, 0.0), counts, sums[:-1]))
-        return lanewise(_appended, parts, lanes([lowest], (1,), wide=True))
+    def _alone(self, place: Place, cone: Any, rows: tuple, held: list, item: Any, mine: Any):
+        """Gives a slot to a contact of a finger with the palm or itself."""
+        found = self._begun(place, cone, rows, None, held) | {"other": self._number(rows[1])}
+        found |= self.pairs.remembered({"owner": 1.0, "ring": item})
+        which = mine & (found["share"].lane > 0)
+        any_of(which, lambda: self.pairs.add(0, which, found, self.block.own))
 
-    def _enter_on_palm(
-        self,
-        place: tuple,
-        row: Any,
-        sphere: Any = 0,
-        there: jax.Array | None = None,
-        seen: tuple | None = None,
-    ) -> None:
-        """Gives a slot to a contact with the palm, whose motion the sides' are relative to."""
-        pairs = self.pairs
-        which = (place[2].lane < 0) & (self.block.finger < self.p.num_fingers)
-        which = which if there is None else self.block.alone(which & there)
+    def _on_palm(self, item: Any, mine: jax.Array) -> None:
+        row, numbers, frame, centre = self.body(item)
+        field = lanewise(palm_distance, centre, self.palm)
+        near = self._near_palm(field[0], numbers)
 
         def enter() -> None:
-            motion, vel = (pairs.side(name, row) for name in ("motion", "vel"))
-            with pairs.with_cone(0):
-                fields = pairs.begin(place, motion, vel, ahead=seen)
-            number = lanes([self.like + jnp.asarray(row, self.like.dtype)], (1, 1), wide=True)
-            fields |= {"row": number} | pairs.remembered({"owner": 1.0, "sphere": sphere})
-            pairs.add(0, which, fields, self.block.own)
+            if self.hull:
+                offset = lanewise(aimed, numbers, frame, *field)
+                there = lanewise(jnp.add, centre, offset)
+                again = lanewise(palm_distance, there, self.palm)
+                place = lanewise(on_field, numbers, frame, centre, offset, *again)
+            else:
+                place = lanewise(ball_on_field, numbers, centre, *field)
+            rows = row, jnp.zeros_like(jnp.asarray(row))
+            self._alone(place, self.pairs.of_row(0), rows, [], item, mine)
 
-        any_of(which, enter)
+        any_of(mine & near, enter)
+
+    def _near_palm(self, distance: Lanes, numbers: Lanes) -> jax.Array:
+        size = lanewise(jnp.maximum, distance, zeros((), self.like)).lane
+        none = lanewise(jnp.zeros_like, numbers)
+        return self._near(size * size, numbers, none, self.read("fastest"))
+
+    def _on_itself(self, item: Any, mine: jax.Array) -> None:
+        row, numbers, frame, centre = self.body(item)
+        square, other, t = self._nearest("line", centre, item)
+        near = mine & self._near(square, numbers, numbers, self.read("fastest"))
+
+        def enter() -> None:
+            place = self._between(numbers, frame, centre, other, t, None)
+            cone, held = self.pairs.of_row(1), grip.of_row(self.step, self.pairs, 0)
+            self._alone(place, cone, (row + jnp.zeros_like(other), other), held, item, near)
+
+        any_of(near, enter)
+
+    def _end(self, item: Any) -> jax.Array:
+        """The last place along a finger [links] that one of its rings touches."""
+        return self._along(item) - lanewise(arc, self.ring(self.count - 1)).lane
+
+    def last_of(self, item: Any, row: Any) -> jax.Array:
+        """The last place on a segment, 0 to 1, that rings of the same finger touch."""
+        start = self.like + jnp.asarray(row).astype(self.like.dtype) - 0.5
+        length = jnp.where(jnp.equal(row, self.p.links), self.like + TIP, 1.0)
+        return jnp.minimum((self._end(item) - start) / length, 1.0)
+
+    def _along(self, item: Any) -> jax.Array:
+        """Place of a ring along the finger, in links from its base."""
+        item = jnp.zeros_like(self.block.own) + item
+        k = jnp.full_like(item, self.p.k)
+        link, number = jax.lax.div(item, k), jax.lax.rem(item, k)
+        places = ring_places(self.p.links, self.p.k)
+        part = (number.astype(self.like.dtype) + 0.5) / self.p.k
+        last = jnp.where(number == k - 1, places[-1, -1], 0.5 * part)
+        own = jnp.where(link == self.p.links - 1, last, part)
+        return link.astype(self.like.dtype) + (0.5 + own)
+
+    def _on_finger(
+        self, row: Any, pairing: Pairing, owner: jax.Array, item: Any, mine: Any
+    ) -> None:
+        link, numbers, frame, centre = self.body(item)
+        square, other, t = self._nearest("other", centre)
+        speed = lanewise(jnp.add, *(self.read("fastest", 0, at) for at in (None, pairing.lane)))
+        theirs = self.ring(self.count - 1, pairing.lane)
+        near = owner & mine & self._near(square, numbers, theirs, speed)
+
+        def enter() -> None:
+            place = self._between(numbers, frame, centre, other, t, pairing.lane)
+            held = grip.of_row(self.step, self.pairs, row)
+            cone, link_ = self.pairs.of_row(row), link + jnp.zeros_like(other)
+            found = self._begun(place, cone, (link_, other), pairing.lane, held)
+            self._enter(row, near, owner, found, other, item)
+
+        any_of(near, enter)
+
+    def _enter(
+        self, row: Any, near: Any, owner: jax.Array, mine: dict, other: Any, item: Any
+    ) -> None:
+        """Gives contacts of two fingers a slot; other: the second one's links."""
+        which = near & (mine["share"].lane > 0)
+        step = mine.pop("step")
+        theirs = mine | {"row": self._number(other)}
+        theirs |= {name: lanewise(jnp.negative, mine[name]) for name in ("normal", "jar")}
+        none = {"other": zeros((1, 1), self.like)} if self.pairs.set.alone else {}
+
+        alike = self.pairs.remembered({"owner": owner, "ring": item}) | none | {"step": step}
+        any_of(which, lambda: self.pairs.enter(row, which, owner, mine, theirs, alike))
+
+    def _nearest(self, name: str, centre: Lanes, itself: Any = None) -> tuple:
+        """The nearest place of a centre line: squared distance, segment, and where along it.
+
+        Args:
+          name: "line" or "other".
+          centre: Places, lanes.
+          itself: Of the finger's own line: the ring whose place it is.
+        """
+        last = self.p.links
+
+        def compare(segment, centre, best, number, end):
+            start, along = segment[:3], segment[3:6]
+            away = centre - start
+            t = dot(away, along) * segment[6]
+            t = jnp.minimum(jnp.maximum(t, 0.0), end)
+            left = away - t * along
+            square = jnp.where(end >= 0, dot(left, left), 1.0)
+            better = square < SURELY * best[0]
+            new = jnp.stack([square, number + 0.0 * square, t])
+            return jnp.where(better, new, best)
+
+        def one(row: Any, best: Lanes) -> Lanes:
+            number = self.like + jnp.asarray(row).astype(self.like.dtype)
+            end = self.like + 1.0 if itself is None else self.last_of(itself, row)
+            place, end = (lanes([v], (), wide=True) for v in (number, end))
+            return lanewise(compare, self.read(name, row), centre, best, place, end)
+
+        best = lanes([self.like + 1.0, self.like, self.like], (3,), wide=True)
+        first = int(itself is not None)  # a finger's half link at the palm is the palm's
+        best = loop(last + 1 - first, lambda k, b: one(k + first, b), best, self.block.size)
+        square, number, t = (best[k].lane for k in range(3))
+        return square, number.astype(jnp.int32), t
+
+    def _between(
+        self, numbers: Lanes, frame: Lanes, centre: Lanes, row: jax.Array, t: Any, lane: Any
+    ) -> Place:
+        """Contact of the lanes' rings with segments of a lane's finger; `rings.between`."""
+        rows = neighbours(row, self.p.links)
+        frames = tuple(self.read("frame", r, lane) for r in rows)
+        ends = self.read("end", row, lane), self.read("end", row + 1, lane)
+        tip = self.ring(self.count - 1, lane)
+        last = lanes([jnp.where(row == self.p.links, self.like + 1.0, self.like)], (), wide=True)
+        where = lanes([t], (), wide=True)
+        return lanewise(between, numbers, frame, centre, (ends, frames, tip, last), where)
 
     # Spheres
 
-    def _spheres(self, row: Any, pairing: Pairing, there: jax.Array, first: jax.Array) -> None:
-        count, owner = self.p.links * self.p.k, there & first
-
-        def outer(i: Any) -> None:
-            theirs = self.read("sphere", i, pairing)
-
-            def inner(j: Any) -> None:
-                mine = self.read("sphere", j)
-                which = owner & (lanewise(sections.apart, mine, theirs).lane < 0)
-
-                def enter() -> None:
-                    one, other = lanewise(sections.between, mine, theirs)
-                    rows = tuple(jax.lax.div(v, jnp.asarray(self.p.k, v.dtype)) + 1 for v in (j, i))
-                    moves = self._moves(rows, pairing)
-                    self._enter(row, which, owner, (one, other), rows, moves, (j, i))
-
-                any_of(which, enter)
-
-            each(count, inner)
-
-        each(count, outer)
-
-    # The hull
-
-    def _balls(self) -> None:
-        """Balls around the vertices of every row."""
-
-        def one(row: Any) -> None:
-            row, _ = self.block.dealt(self.p.links + 1, row)
-            kind = skin.kind_of(row, self.p.links)
-            ball = self.p.hand.read(self.step.hand, "ball", kind)
-            joint, before, after = self._links(row)
-            centre, reach = lanewise(hull.ball_around, joint, before, after, ball)
-            whole = lanewise(lambda c, r: jnp.concatenate([c[:, 0], r]), centre, reach)
-            self.write("ball", whole, row)
-
-        each(self.block.rounds(self.p.links + 1), one)
-
-    def _links(self, row: Any, pairing: Pairing | None = None) -> tuple[Lanes, Lanes, Lanes]:
-        """Joint of a row, and the frames of the links before and behind it."""
-        behind = jnp.minimum(row + 1, self.p.links)
-        places = (("joint", behind), ("frame", row), ("frame", behind))
-        return tuple(self.read(name, r, pairing) for name, r in places)  # type: ignore[return-value]
-
-    def _size(self) -> Lanes:
-        """Half the width, the height and a segment of the lanes' own fingers."""
-        return self.p.hand.read(self.step.hand, "section_box")
-
-    def _rows(self, row: Any, pairing: Pairing, there: jax.Array, first: jax.Array) -> None:
-        links = self.p.links
-        self_size = self._size()
-        size = pairing.swap(self_size)
-        side = first.astype(jnp.int32)
-
-        def outer(i: Any) -> None:
-            theirs, ball = self._links(i, pairing), self.read("ball", i, pairing)
-            last = jnp.where(i == links - 1, self.like + 1.0, self.like)
-
-            def inner(j: Any) -> None:
-                near = there & (lanewise(sections.apart, self.read("ball", j), ball).lane < 0)
-
-                def boxes() -> None:
-                    own, kind = self._links(j), skin.kind_of(j, links)
-                    apart = lanewise(
-                        sections.separated,
-                        own,
-                        self_size,
-                        theirs,
-                        size,
-                        lanes([last], (), wide=True),
-                    )
-
-                    def vertices() -> None:
-                        other = theirs, size, last
-                        found = row, pairing, there, side
-                        self._row_contact(*found, tried, (own, kind), other, (j, i))
-
-                    tried = near & (apart.lane < 0)
-                    any_of(tried, vertices)
-
-                any_of(near, boxes)
-
-            each(links + 1, inner)
-
-        each(links, outer)
-
-    def _row_contact(
-        self,
-        pairing_row: Any,
-        pairing: Pairing,
-        there: jax.Array,
-        side: jax.Array,
-        tried: jax.Array,
-        own: tuple,
-        other: tuple,
-        rows: tuple,
+    def _on_spheres(
+        self, row: Any, pairing: Pairing, owner: jax.Array, item: Any, mine: Any
     ) -> None:
-        """Enters the one contact of a row with another finger's row, see `sections.pressure`.
+        """A sphere of the finger that comes first, with all of the other one's."""
+        link, numbers, _, centre = self.body(item)
+        apart = self.p.k
 
-        Args:
-          pairing_row: Number of the pairing.
-          pairing: The pairing.
-          there: Lanes whose finger and partner exist.
-          side: Lanes' side of the pairing, 0 or 1.
-          tried: Lanes whose two rows may have a point in common.
-          own: Links of the lanes' own row, see `_links`, and its kind.
-          other: Links of their partners' row, its size, and whether it is the last one.
-          rows: Numbers of both rows.
-        """
-        count, (links, kind), (theirs, size, last) = skin.pair_points(self.p.scene), own, other
-        rings, own_size = self.p.scene.discretization.hull_rings, self._size()
-        each_ring, start = count // rings, zeros((sections.SUMS,), self.like)
+        def with_other(j: Any) -> None:
+            theirs = pairing.swap(self.body(j)[1:])
+            place = lanewise(balls, numbers, centre, theirs[0], theirs[2])
+            near = owner & (place.gap.lane < 0)
 
-        def read(k: Any) -> Lanes:
-            return self.p.hand.read(self.step.hand, "pair_vertex", k)
+            def enter() -> None:
+                other = jnp.zeros_like(self.block.own) + jax.lax.div(j, jnp.full_like(j, apart)) + 1
+                link_ = link + jnp.zeros_like(other)
+                cone, lane = self.pairs.of_row(row), pairing.lane
+                found = self._begun(place, cone, (link_, other), lane, [])
+                number = item + self.count * j
+                self._enter(row, near, owner, found, other, number)
 
-        def ring(r: Any, sums: Lanes) -> Lanes:
-            first = kind * count + r * each_ring
-            ring = lanewise(sections.ring_in_section, read(first), links, theirs)
-            away = lanewise(sections.ring_outside, ring, own_size, size).lane
+            any_of(near, enter)
 
-            def add(k: Any, sums: Lanes) -> Lanes:
-                k, _ = self.block.dealt(each_ring, k)  # of which teams have a multiple of theirs
-                vertex = read(first + k)
-                away = lanewise(sections.outside, vertex, ring, size).lane
-
-                def within() -> Lanes:
-                    end = lanes([last], (), wide=True)
-                    ends = lanewise(sections.inside, vertex, links, theirs, size, end)
-                    return lanewise(sections.add_vertex, sums, *ends)
-
-                return choose(anywhere(tried & ~away), within, sums, self.block.size)
-
-            def points() -> Lanes:
-                return loop(self.block.rounds(each_ring), add, sums, self.block.size)
-
-            return choose(anywhere(tried & ~away), points, sums, self.block.size)
-
-        sums = team_sum(self.block, loop(rings, ring, start, self.block.size))
-        one, two = lanewise(sections.pressure, sums)
-        which = self.block.alone(there & (one[2].lane < 0))
-
-        def enter() -> None:
-            moves = self._moves(rows, pairing)
-
-            def way(turn: Any) -> None:
-                owner = there & (side == turn)
-                found = which & owner
-                any_of(
-                    found,
-                    lambda: self._enter(pairing_row, found, owner, (one, two), rows, moves),
-                )
-
-            each(2, way)
-
-        any_of(which, enter)
-
-    def _moves(self, rows: tuple, pairing: Pairing) -> list[tuple[Lanes, Lanes]]:
-        """Accelerations and velocities of the lanes' own row and of their partners' row."""
-        own, theirs = ([self.pairs.side(n, row) for n in ("motion", "vel")] for row in rows)
-        return list(zip(own, pairing.swap(theirs), strict=True))
-
-    def _enter(
-        self,
-        row: Any,
-        which: jax.Array,
-        owner: jax.Array,
-        ends: tuple,
-        rows: tuple,
-        moves: list[tuple[Lanes, Lanes]],
-        spheres: tuple = (0, 0),
-    ) -> None:
-        """Gives contacts a slot; places on either side, the sides' rows, and how they move."""
-        pairs, contacts = self.pairs, self.pairs.set.contacts
-
-        def jar(one, other, cone, held, motion, vel):
-            a, b = (contacts(place, cone) for place in (one, other))
-
-            def relative(m):
-                return a.relative(m[0][:, None]) - b.relative(m[1][:, None])
-
-            value = relative(motion) - a.reference(relative(vel))
-            for g in held:
-                value = value + holding.held(a, g[:, None])
-            return value, -value, jnp.zeros_like(value)
-
-        cone = pairs.of_row(row)
-        held = grip.of_row(self.step, pairs, row)
-        mine, theirs, none = lanewise(jar, ends[0], ends[1], cone, held, moves[0], moves[1])
-        kept = [
-            dict(zip(pairs.set.places, place, strict=True)) | {"jar": value}
-            for place, value in zip(ends, (mine, theirs), strict=True)
-        ]
-        if self.block.team > 1:  # each finger of a pair may have found another contact
-            for side, number in zip(kept, rows, strict=True):
-                side["row"] = lanes([number.astype(self.like.dtype)], (1, 1), wide=True)
-            return pairs.enter(row, which, owner, kept[0], kept[1], {"step": none})
-        numbers = [v.astype(self.like.dtype) for v in rows]
-        side = jnp.where(owner, self.like + numbers[0], self.like + numbers[1])
-        alike = {"row": lanes([side], (1, 1), wide=True), "step": none}
-        if pairs.set.remembers:
-            alike |= pairs.remembered({"owner": owner, "sphere": jnp.where(owner, *spheres)})
-        pairs.enter(row, which, owner, kept[0], kept[1], alike)
+        each(self.count, with_other)
 
 
-def _appended(one: jax.Array, other: jax.Array) -> jax.Array:
-    return jnp.concatenate([one, other])
+TIP = 0.25
+"""Length of the last link's segment, which ends in the tip's ring, in links."""
+
+
+def ring_places(links: int, k: int) -> np.ndarray:
+    """Places of the rings from their links' joints, in links, shape (link, k)."""
+    places = np.tile((np.arange(k) + 0.5) / k, (links, 1))
+    places[-1] *= 0.5
+    places[-1, -1] = TIP
+    return places
+
+
+def neighbours(row: jax.Array, links: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The link before each of some links, itself, and the next one; the ends are their own."""
+    return jnp.maximum(row - 1, 0), row, jnp.minimum(row + 1, links)
+
+
+def ring_centre(origin, frame, numbers):
+    """Centre of a ring, shape (3, ...)."""
+    return origin + apply_columns(frame, numbers[:3])
+
+
+def aimed(numbers, frame, distance, gradient):
+    """See `rings.aim`."""
+    return rings.aim(Ring.of(numbers), frame, distance, gradient)
+
+
+def on_field(numbers, frame, centre, offset, distance, normal):
+    """See `rings.on_field`."""
+    return rings.on_field(Ring.of(numbers), frame, centre, offset, distance, normal)
+
+
+def ball_on_field(numbers, centre, distance, normal):
+    """See `rings.ball_on_field`; of a sphere all half axes are the radius."""
+    return rings.ball_on_field(numbers[3] * numbers[6], centre, distance, normal)
+
+
+def palm_distance(point, palm):
+    """Signed distance of a point from the palm's disc, and its gradient."""
+    return shapes.disc_distance(point, *palm)
+
+
+def arc(tip):
+    """Least distance along a finger at which it touches itself, in links."""
+    return jnp.maximum(3.0, 1.8 * 2.0 * tip[5] / (tip[3] / TIP))
+
+
+def between(numbers, frame, centre, other, t):
+    """See `rings.between`; other: ends, frames, the tip's ring, and whether it is the last one."""
+    ends, frames, tip, last = other
+    segment = Segment(ends, frames, jnp.stack([last * tip[3], tip[4], tip[5]]))
+    return rings.between(Ring.of(numbers), frame, centre, segment, t)
+
+
+def balls(numbers, centre, theirs, their_centre):
+    """Contact of two spheres."""
+    return rings.ball_on_ball(numbers[3] * numbers[6], centre, theirs[3] * theirs[6], their_centre)
+
+
+def above(origin, before, frame, numbers):
+    """Where the centre line passes a joint."""
+    return origin + 0.5 * numbers[5] * (before[2] + frame[2])
+
+
+def where_on(ends, point, last):
+    """Where between its ends a segment is nearest to a point, see `rings.nearest`."""
+    return rings.nearest(point, Segment(ends, None, None), last)  # type: ignore[arg-type]
+
+
+def _line(start, end):
+    along = end - start
+    return jnp.concatenate([start, along, (1.0 / dot(along, along))[None]])
+
+
+def _faster(most, vel, palm, origin, numbers):
+    """Bound of the speed of a finger's surface relative to the palm [m/s]."""
+    moving = vel - palm
+    speed = moving[3:] + cross(moving[:3], origin)
+    turning = jnp.sqrt(dot(moving[:3], moving[:3])) * 4.0 * numbers[5]
+    return jnp.maximum(most, jnp.sqrt(dot(speed, speed)) + turning)
+
+
+def with_axis(place: Place) -> Place:
+    """A place with an axis of one contact, as sets keep them."""
+    return Place(*(v[:, None] for v in place[:2]), *(v[None, None] for v in place[2:]))
+
+
+def _with_held(jar, place, cone, grip):
+    return jar + holding.held(ContactSet.contacts(place, cone), grip[:, None])
 
 
 def each(count: int, body: Callable[[Any], None]) -> None:

@@ -12,21 +12,21 @@ from codesign_jax.engines.structured.lanewise import lanes
 class Pairing:
     """Fingers in pairs: those whose numbers differ by an exclusive or with the pairing's number.
 
-    Each finger is its own partner in the pairing 0, which is for contacts with the palm.
+    Each finger is its own partner in the pairing 0, for contacts with itself and with the palm.
 
     Attributes:
       lane: Lane of the finger that each lane's finger is paired with, shape (lane,).
-      palm: Whether the number is 0, on the lanes; None if it never is.
+      alone: Whether the number is 0, shape (lane,); None if it never is.
       half: The share of a contact that a lane counts: two fingers' is on two lanes.
     """
 
-    def __init__(self, block: Block, number: Any, dtype: Any, *, palm: bool):
-        """Takes the number, a scalar, and the type of shares; palm: whether it may be 0."""
+    def __init__(self, block: Block, number: Any, dtype: Any, *, alone: bool):
+        """Takes the number, a scalar, and the type of shares; alone: whether it may be 0."""
         self.block = block
         self.number = (jnp.zeros_like(block.finger) + number).astype(jnp.int32)
-        alone, one = self.number == 0, jnp.ones_like(block.finger, dtype)
-        self.palm = lanes([alone], (), wide=True) if palm else None
-        self.half = lanes([jnp.where(alone, one, 0.5 * one) if palm else 0.5 * one], (), wide=True)
+        same, one = self.number == 0, jnp.ones_like(block.finger, dtype)
+        self.alone = same if alone else None
+        self.half = lanes([jnp.where(same, one, 0.5 * one) if alone else 0.5 * one], (), wide=True)
         other = jax.lax.bitwise_xor(block.finger, self.number)
         self.lane = other * block.worlds + block.world
 

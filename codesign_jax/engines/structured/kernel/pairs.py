@@ -4,11 +4,10 @@ A contact is stored on the lanes of both fingers; each lane keeps its own finger
 Fingers are paired by the exclusive or of their indices with 1, 2, and so on, which reaches every
 pair; a row of slots belongs to one such number.  Both lanes of a pair put the same contact into the
 same slot, so that they process it at the same time and exchange numbers in registers.  The side of
-a contact is a joint's row as in `laws.hull`; a sphere follows the link before that joint.
+a contact is a link, 0 for the palm with the half links that are fixed to it.
 
-Contacts of fingers with the palm are a row of slots as well, with the number 0: they are on the
-finger's lane alone.  The sides' motions are relative to the palm's then, which changes nothing
-between two fingers, as a rigid body's velocity is affine in the point.
+Contacts of a finger with the palm or with itself are a row of slots as well, with the number 0:
+they are on the finger's lane alone, which has both sides.
 """
 
 import contextlib
@@ -18,29 +17,39 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel.contact_sets import ROWS, ContactSet, zeros
-from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout, loop, solid
+from codesign_jax.engines.structured.kernel.contact_sets import ROWS, zeros
+from codesign_jax.engines.structured.kernel.memory import (
+    Block,
+    MemoryLayout,
+    anywhere,
+    either,
+    loop,
+    solid,
+)
 from codesign_jax.engines.structured.kernel.pairing import Pairing
-from codesign_jax.engines.structured.kernel.slots import BoundSlots, HullSet, any_of
+from codesign_jax.engines.structured.kernel.slots import BoundSlots, SlotSet, any_of
 from codesign_jax.engines.structured.kernel.solver import tree_add_scaled
 from codesign_jax.engines.structured.lanes import dot, sum_axis, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact
-from codesign_jax.engines.structured.laws.contact import Contacts
-from codesign_jax.engines.structured.laws.hull import across
+from codesign_jax.engines.structured.laws.rings import Place
+from codesign_jax.model.layout import touches_itself
 from codesign_jax.scene import Scene
 
 
 def pair_slots(scene: Scene) -> int:
-    """Slots of a pair of fingers; a world with more contacts fails (CONTACT_OVERFLOW)."""
-    d = scene.discretization
-    if scene.effects.surface == "hull":
-        return 8 * (d.links + 1) * max(1, d.hull_rings * d.hull_points // 16)
+    """Slots of a pair of fingers; a world with more contacts fails (CONTACT_OVERFLOW).
+
+    A ring has one contact with another finger, one with its own and one with the palm.
+    """
+    d, e = scene.discretization, scene.effects
+    if e.surface == "hull":
+        return d.links * d.hull_rings * (2 if e.finger_palm and touches_itself(scene) else 1)
     return min(4 * d.links * d.spheres_per_link, (d.links * d.spheres_per_link) ** 2)
 
 
-class PairSet(HullSet):
-    """Contacts between fingers; a row is a pairing of all fingers."""
+class PairSet(SlotSet):
+    """Contacts between fingers, with themselves and the palm; a row is a pairing of all fingers."""
 
     def __init__(
         self,
@@ -64,19 +73,17 @@ class PairSet(HullSet):
         """
         fingers, worlds = block
         e = scene.effects
-        self.palm, self.first = e.finger_palm, int(not e.finger_palm)
+        self.alone = e.finger_palm or touches_itself(scene)
+        self.first = int(not self.alone)
         rows = fingers - self.first if e.finger_finger else 1
         how = "finger_finger", rows, slots, fingers * worlds
         super().__init__(scene, *how, gathers=gathers, remembers=remembers)
         self.block, self.links = block, links
-        self.skin = scene.effects.surface == "hull"
-        if not self.skin:
-            self.places, self.of_lines = ContactSet.places, ContactSet.of_lines
         n = ROWS[scene.effects.friction][0]
         self.more = {"row": 1, "hessian": n * (n + 1) // 2}
         self.more |= {f: n for f in ("first", "left", "answer", "along", "moved", "sum")}
-        if self.skin:
-            self.more |= HullSet.more
+        if self.alone:
+            self.more |= {"other": 1}
 
     def cone_rows(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         """See `ContactSet`; one cone between fingers and one on the palm, if there are both."""
@@ -85,30 +92,14 @@ class PairSet(HullSet):
 
     def _names(self) -> list[str]:
         e = self.scene.effects
-        on = {"finger_finger": e.finger_finger, "finger_palm": e.finger_palm}
+        between = e.finger_finger or touches_itself(self.scene)
+        on = {"finger_finger": between, "finger_palm": e.finger_palm}
         return [name for name in on if on[name]]
-
-    @property
-    def components(self) -> int:
-        """Components of a side's motion and wrench."""
-        return 9 if self.skin else 6
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         """See `ContactSet`; and the sides of all fingers, from the palm to the tips."""
-        sides = {"motion": 6, "vel": 6, "push": self.components}
-        sides |= {"turn": 3} if self.skin else {}
-        rows = {f"side.{name}": (self.links + 1, (n,)) for name, n in sides.items()}
-        return super().groups() | rows
-
-    @property
-    def contacts(self) -> Callable[[tuple, contact.Cone], Contacts]:
-        """See `ContactSet`; a lever is that of the lane's own side."""
-        return (HullSet if self.skin else ContactSet).contacts
-
-    @property
-    def of_line(self) -> Callable[[tuple, contact.Cone], Contacts]:
-        """See `ContactSet`."""
-        return (HullSet if self.skin else ContactSet).of_line
+        sides = {f"side.{name}": (self.links + 1, (6,)) for name in ("motion", "vel", "push")}
+        return super().groups() | sides
 
     def bind(self, table: MemoryLayout, ref: Any, read: Callable[[str], Lanes]) -> "BoundPairs":
         """See `ContactSet`."""
@@ -123,12 +114,12 @@ class OwnSide(NamedTuple):
     waits a second time for what is read behind a store.
 
     Attributes:
-      place: Where the contact is, see `ContactSet.places`.
+      place: Where the contact is.
       row: Row of each lane's side, int32, shape (lane,); None where lanes do not gather.
-      wrench: Wrench of all contacts so far on that row, (6 or 9, ...); None likewise.
+      wrench: Wrench of all contacts so far on that row, (6, ...); None likewise.
     """
 
-    place: tuple[Lanes, ...]
+    place: Place
     row: jax.Array | None
     wrench: Lanes | None
 
@@ -142,60 +133,44 @@ class BoundPairs(BoundSlots):
         """See `ContactSet.bind`; the cones by name."""
         super().__init__(of, table, ref, next(iter(cones.values())))
         self.block, self._cones = Block(*of.block), cones
-        self._palm: Lanes | None = None
 
     def pairing(self, row: Any) -> Pairing:
         """A row's pairing of the fingers."""
-        return Pairing(self.block, row + self.set.first, self.ref.dtype, palm=self.set.palm)
+        return Pairing(self.block, row + self.set.first, self.ref.dtype, alone=self.set.alone)
 
-    def of_row(self, row: Any) -> contact.Cone:
-        """The cone of a row's contacts."""
+    def of_row(self, row: Any, other: Any = None) -> contact.Cone:
+        """The cone of a row's contacts; other: second sides, of which 0 is the palm."""
         if len(self._cones) == 1:
             return self.cone
-        here = lanes([jnp.full((self.set.size,), jnp.equal(row, 0))], (), wide=False)
-        between, palm = (self._cones[name] for name in ("finger_finger", "finger_palm"))
-        return lanewise(_where, here, palm, between)
+        palm = jnp.full((self.set.size,), jnp.equal(row, 0))
+        if other is not None:
+            palm &= other < 0.5
+        here = lanes([palm], (), wide=other is not None)
+        return lanewise(_where, here, self._cones["finger_palm"], self._cones["finger_finger"])
 
     @contextlib.contextmanager
-    def with_cone(self, row: Any) -> Iterator[None]:
-        """Within this context contacts have the cone of a row's."""
-        before, self.cone = self.cone, self.of_row(row)
+    def with_cone(self, row: Any, item: Any = None) -> Iterator[None]:
+        """Within this context contacts have the cone of a row's slot, or of the palm's."""
+        mixed = item is not None and self.set.alone and touches_itself(self.set.scene)
+        before = self.cone
+        self.cone = self.of_row(row, self.read("other", item).lane if mixed else None)
         yield
         self.cone = before
 
-    def side(self, name: str, row: Any) -> Lanes:
-        """Motion of a row, (6 or 9, ...): of the link before a joint, and the joint's turning."""
-        before = self.table.read(self.ref, f"side.{name}", row)
-        if not self.set.skin:
-            return before
-        behind = jnp.minimum(row + 1, self.set.links)
-        after = self.table.read(self.ref, f"side.{name}", behind)
-        return lanewise(lambda a, b: across(a, b, None), before, after)
+    def holds(self, item: Any, pairing: Pairing) -> Lanes:
+        """One for contacts whose friction is kept, zero for those with the palm, see `grip`."""
+        kept = jnp.ones((self.set.size,), self.ref.dtype)
+        if pairing.alone is not None:
+            palm = pairing.alone & (self.read("other", item).lane < 0.5)
+            kept = jnp.where(palm, 0.0, kept)
+        return lanes([kept], (), wide=True)
 
     def put(self, name: str, value: Lanes, row: Any) -> None:
-        """Stores what a row's link before its joint does; row 0 is the palm's."""
+        """Stores a link's "motion", "vel" or "push"; row 0 is the palm's."""
         self.table.write(self.ref, f"side.{name}", value, row)
 
-    def beside_palm(self, motion: Lanes, palm: Lanes | None) -> Lanes:
-        """A motion relative to the palm's, where contacts with the palm need it."""
-        return motion if palm is None or not self.set.palm else lanewise(_minus, motion, palm)
-
-    def put_palm(self, motion: Lanes) -> None:
-        """Stores the palm's motion along a step; the tip, which has no joint, does not turn."""
-        self._palm = motion
-        self.put("motion", self.beside_palm(motion, motion), 0)
-        if self.set.skin:
-            like = jnp.zeros((self.set.size,), self.ref.dtype)
-            self.put("turn", zeros((3,), like), self.set.links)
-
-    def put_link(self, i: Any, before: Lanes, motion: Lanes) -> None:
-        """Stores a link's motion along a step, and how the joint between it and `before` turns."""
-        self.put("motion", self.beside_palm(motion, self._palm), i + 1)
-        if self.set.skin:
-            self.put("turn", lanewise(lambda a, b: b[:3] - a[:3], before, motion), i)
-
     def pushed(self, row: Any) -> Lanes:
-        """Wrench of all contacts of a row's own side, (6 or 9, ...)."""
+        """Wrench of all contacts on a link, (6, ...)."""
         return self.table.read(self.ref, "side.push", row)
 
     def rows(self) -> int:
@@ -217,15 +192,13 @@ class BoundPairs(BoundSlots):
           other: What its partner keeps.
           alike: What every lane knows of its own side.
         """
-        gap = lanewise(
-            lambda w, g: jnp.where(w, g, 1.0), lanes([which], (), wide=True), other["gap"]
-        )
-        theirs = self.pairing(row).swap(other | {"gap": gap})
+        share = only_where(which, other["share"])
+        theirs = self.pairing(row).swap(other | {"share": share})
         side = lanes([owner], (), wide=True)
         fields = {
             field: lanewise(jnp.where, side, value, theirs[field]) for field, value in mine.items()
         }
-        touch = which | (~owner & (fields["gap"].lane < 0))
+        touch = which | (~owner & (fields["share"].lane > 0))
         self.add(row, touch, fields | alike, self.block.own)
 
     def each(self, body: Callable, start: Any) -> Any:
@@ -233,8 +206,12 @@ class BoundPairs(BoundSlots):
 
         def of_row(row: Any, carry: Any) -> Any:
             pairing = self.pairing(row)
-            with self.with_cone(row):
-                return self.fold(row, lambda item, c: body(item, pairing, c), carry)
+
+            def one(item: Any, c: Any) -> Any:
+                with self.with_cone(row, item):
+                    return body(item, pairing, c)
+
+            return self.fold(row, one, carry)
 
         return loop(self.set.rows, of_row, start, self.set.size)
 
@@ -265,42 +242,44 @@ class BoundPairs(BoundSlots):
 
     def relative(self, item: Any, pairing: Pairing) -> Lanes:
         """How the links' motion moves a slot's sides to each other, on its own side's lanes."""
-        names = ("motion", "turn") if self.set.skin else ("motion",)
-        parts = self._on_rows(item, names)
-        contacts = self.set.contacts
+        contacts, place = self.set.contacts, self.place(item)
 
-        def moved(place, cone, parts):
-            return contacts(place, cone).relative(jnp.concatenate(parts)[:, None])
+        def of_side(field: str) -> Lanes:
+            motion = self._on_rows(item, field)
 
-        own = lanewise(moved, self.place(item), self.cone, parts)
-        if pairing.palm is None:
+            def moved(place, cone, motion):
+                return contacts(place, cone).relative(motion[:, None])
+
+            return lanewise(moved, place, self.cone, motion)
+
+        own = of_side("row")
+        if pairing.alone is None:
             return lanewise(jnp.subtract, own, pairing.swap(own))
-        return lanewise(_without, pairing.palm, own, pairing.swap(own))
+        ways = (lambda: of_side("other")), (lambda: pairing.swap(own))
+        theirs = either(anywhere(pairing.alone), *ways, self.set.size)
+        return lanewise(jnp.subtract, own, theirs)
 
-    def _on_rows(self, item: Any, names: tuple[str, ...]) -> list[Lanes]:
-        """What sides have at the rows of a slot's lanes; zeros where nothing touches."""
-        groups = self.table.groups
+    def _on_rows(self, item: Any, field: str) -> Lanes:
+        """Motions of the links in a field of a slot's lanes; zeros where nothing touches."""
         if self.set.gathers:
-            row, lane = self.read("row", item).lane.astype(jnp.int32), self.block.own
-            return [self.table.gather(self.ref, f"side.{name}", row, lane) for name in names]
-        like = jnp.zeros((self.set.size,), self.ref.dtype)
-        start = [zeros(groups[f"side.{name}"][1], like) for name in names]
+            row = self.read(field, item).lane.astype(jnp.int32)
+            return self.table.gather(self.ref, "side.motion", row, self.block.own)
+        start = zeros((6,), jnp.zeros((self.set.size,), self.ref.dtype))
 
-        def take(row: Any, chosen: jax.Array, found: list[Lanes]) -> list[Lanes]:
-            new = [self.table.read(self.ref, f"side.{name}", row) for name in names]
-            mask = lanes([chosen], (), wide=True)
-            return [lanewise(jnp.where, mask, n, f) for n, f in zip(new, found, strict=True)]
+        def take(row: Any, chosen: jax.Array, found: Lanes) -> Lanes:
+            new = self.table.read(self.ref, "side.motion", row)
+            return lanewise(jnp.where, lanes([chosen], (), wide=True), new, found)
 
-        return self._each_row(item, take, start)
+        return self._each_row(item, field, take, start)
 
-    def _each_row(self, item: Any, body: Callable, start: Any) -> Any:
+    def _each_row(self, item: Any, field: str, body: Callable, start: Any) -> Any:
         """Folds body(row, lanes that touch there, tree of lanes) over the rows of a slot's lanes.
 
         Few lanes of a block touch in one slot, at two rows if it is one contact: on CPUs whose
         vectors gather number by number that is faster than to gather.
         """
-        gap = self.read("gap", item).lane
-        left = jnp.where(gap < 0, self.read("row", item).lane.astype(jnp.int32), -1)
+        touches = self.read("share", item).lane > 0
+        left = jnp.where(touches, self.read(field, item).lane.astype(jnp.int32), -1)
         arrays, rebuild = solid(start, self.set.size)
 
         def step(carry: list) -> list:
@@ -318,7 +297,7 @@ class BoundPairs(BoundSlots):
         like = jnp.zeros((self.set.size,), self.ref.dtype)
 
         def clear(row: Any, x: jax.Array) -> jax.Array:
-            self.put("push", zeros((self.set.components,), like), row)
+            self.put("push", zeros((6,), like), row)
             return x
 
         jax.lax.fori_loop(0, self.rows(), clear, jnp.int32(0))
@@ -332,18 +311,35 @@ class BoundPairs(BoundSlots):
         return OwnSide(self.place(item), row, wrench)
 
     def load(self, item: Any, own: OwnSide, force: Lanes, pairing: Pairing) -> None:
-        """Adds a slot's force to its own side's wrench, and the opposite one to the palm's."""
+        """Adds a slot's force to its own side's wrench, and takes it from the other side's."""
         contacts = self.set.contacts
 
         def wrench(place, cone, force):
             return sum_axis(contact.contact_wrench(contacts(place, cone), force), 1)
 
         more = lanewise(wrench, own.place, self.cone, force)
-        if pairing.palm is not None:
-            any_of(pairing.palm.lane, lambda: self._push_palm(item, more))
-        if own.row is not None and own.wrench is not None:
-            sums = lanewise(jnp.add, own.wrench, more)
-            self.table.scatter(self.ref, "side.push", sums, own.row, self.block.own)
+        self._add_wrench(item, "row", more, own.wrench, own.row)
+        if pairing.alone is not None:
+
+            def opposite() -> None:
+                self._add_wrench(item, "other", lanewise(jnp.negative, more))
+
+            any_of(pairing.alone, opposite)
+
+    def _add_wrench(
+        self,
+        item: Any,
+        field: str,
+        more: Lanes,
+        sums: Lanes | None = None,
+        row: jax.Array | None = None,
+    ) -> None:
+        if self.set.gathers:
+            if row is None or sums is None:
+                row = self.read(field, item).lane.astype(jnp.int32)
+                sums = self.table.gather(self.ref, "side.push", row, self.block.own)
+            sums = lanewise(jnp.add, sums, more)
+            self.table.scatter(self.ref, "side.push", sums, row, self.block.own)
             return
 
         def add(row: Any, chosen: jax.Array, nothing: list) -> list:
@@ -351,18 +347,7 @@ class BoundPairs(BoundSlots):
             self.put("push", lanewise(_add_where, mask, self.pushed(row), more), row)
             return nothing
 
-        self._each_row(item, add, [])
-
-    def _push_palm(self, item: Any, wrench: Lanes) -> None:
-        """Takes a slot's wrench from the palm, where the slot touches."""
-        touches = lanes([self.read("gap", item).lane < 0], (), wide=True)
-        rest = self.set.components - 6
-
-        def take(touches, sums, wrench):
-            away = jnp.where(touches, wrench[:6], 0.0)
-            return sums - jnp.concatenate([away, jnp.zeros((rest, *away.shape[1:]), away.dtype)])
-
-        self.put("push", lanewise(take, touches, self.pushed(0), wrench), 0)
+        self._each_row(item, field, add, [])
 
     # Newton's method
 
@@ -416,12 +401,9 @@ class BoundPairs(BoundSlots):
         return self.each(add, sums)
 
 
-def _minus(motion, palm):
-    return motion - palm
-
-
-def _without(palm, own, theirs):
-    return own - jnp.where(palm, 0.0, theirs)
+def only_where(which: jax.Array, value: Lanes) -> Lanes:
+    """A number of lanes, zero on others."""
+    return lanewise(lambda w, v: jnp.where(w, v, 0.0), lanes([which], (), wide=True), value)
 
 
 def _where(mask, one, other):

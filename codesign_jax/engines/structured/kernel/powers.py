@@ -11,13 +11,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import objects
-from codesign_jax.engines.structured.kernel.contact_sets import cone_of, sphere_on_table
+from codesign_jax.engines.structured.kernel import fields, objects, pair_search
+from codesign_jax.engines.structured.kernel.contact_sets import ContactSet, cone_of
 from codesign_jax.engines.structured.kernel.problem import make_body
-from codesign_jax.engines.structured.kernel.slots import HullSet
 from codesign_jax.engines.structured.kernel.step import link_forces, palm_and_object
 from codesign_jax.engines.structured.lanes import dot, sum_axis
-from codesign_jax.engines.structured.laws import contact, holding, hull, sections, shapes
+from codesign_jax.engines.structured.laws import contact, holding, shapes
 from codesign_jax.engines.structured.laws.cones import which_cone
 from codesign_jax.engines.structured.laws.contact import Contacts
 from codesign_jax.engines.structured.linear.tree import next_motion, palm_motion
@@ -55,86 +54,56 @@ class Place(NamedTuple):
     along: Any
 
 
-class RowSide(NamedTuple):
-    """A link as the vertices of a row of the hull follow it: as `Chain`."""
-
-    frame: Any
-    vel: Any
-    motion: Any
-    along: Any
-
-
 def of_contacts(contacts: Contacts, vel: jax.Array, motion: jax.Array, along: jax.Array):
-    """Power of contacts for relative motions, (6 or 9, ...), with an axis for the items."""
+    """Power of contacts for relative motions, (6, ...), with an axis for the items."""
     jar = contacts.relative(motion) - contacts.reference(contacts.relative(vel))
     force = contact.constraint_update(contacts, jar).force
     return sum_axis(dot(force, contacts.relative(along)), 0)
 
 
-def geometry(scene: Scene, name: str, centre, radius, at: dict, still: dict):
-    """Point, normal and gap of points of the hand on the object or the table."""
+def field(scene: Scene, name: str, point, at: dict, still: dict, values: Any = None):
+    """Distance of points of the hand from object or table, and its gradient, world axes."""
     if not name.endswith("_object"):
-        return sphere_on_table(at["height"], centre, radius)
-    local = shapes.in_object(at["columns"], centre)
+        return shapes.table_distance(at["height"], point)
+    local = shapes.in_object(at["columns"], point)
+    still = still if values is None else still | {"values": values}
     distance, gradient = objects.distance_of(scene, local, at, still)
-    point, normal, gap = shapes.on_surface(at["columns"], centre, radius, distance, gradient)
-    return point, normal, gap[None]
+    return distance, apply_columns(at["columns"], gradient)
 
 
-def sphere_centre(place: Place, sphere: jax.Array) -> jax.Array:
-    """Centres (3, k, ...) of a body's spheres."""
-    return place.origin[:, None] + apply_columns(place.frame[:, :, None], sphere)
-
-
-def of_spheres(
-    scene: Scene, name: str, place: Place, sphere, radius, at: dict, still: dict
-) -> jax.Array:
-    """Power of the contacts of a link's or the palm's spheres.
+def of_rings(scene: Scene, name: str, place: Place, numbers, at: dict, still: dict) -> jax.Array:
+    """Power of the contacts of the rings, or spheres, of a link or the palm.
 
     Args:
       scene: The scene.
       name: Pair of bodies, as in `problem.relative`.
       place: The body.
-      sphere: Centres of its spheres in its frame, shape (3, k, ...).
-      radius: Their radii, shape (k, ...).
+      numbers: Numbers of its rings, see `rings.Ring`, shape (8, k, ...).
       at: The object and the constants of the contacts, by name.
-      still: What has no derivative here: accelerations, indices and values of grids.
+      still: What has no derivative here: accelerations, indices and values of grids, and "share" of
+        the contacts, which tells which are candidates.
     """
-    point, normal, gap = geometry(scene, name, sphere_centre(place, sphere), radius, at, still)
+    centre = fields.ring_centres(place.origin, place.frame, numbers)
+    first = field(scene, name, centre, at, still, still.get("values"))
+    if scene.effects.surface == "spheres":
+        found = fields.balls_on_field(numbers, centre, *first)
+    else:
+        offset, again = jnp.zeros_like(centre), first
+        if name.endswith("_object"):
+            offset = fields.aimed(numbers, place.frame, *first)
+            again = field(scene, name, centre + offset, at, still, still.get("values_again"))
+        found = fields.rings_on_field(numbers, place.frame, centre, offset, *again)
+    found = found._replace(share=jnp.where(still["share"] > 0, found.share, 0.0))
+    contacts = ContactSet.contacts(found, _cone(scene, name, at))
     moves = _from_object(name, place[2:], at, still)
-    return of_contacts(
-        Contacts(point, normal, gap[0], _cone(scene, name, at)), *(m[:, None] for m in moves)
-    )
+    return of_contacts(contacts, *(m[:, None] for m in moves))
 
 
-def vertex_point(vertex, joint, before: RowSide, after: RowSide):
-    """Place of a vertex of the hull, shape (3, 1, ...)."""
-    return hull.placed(vertex, joint, before.frame, after.frame)[0]
-
-
-def of_vertex(
-    scene: Scene, name: str, vertex, joint, before: RowSide, after: RowSide, at: dict, still: dict
-) -> jax.Array:
-    """Power of a vertex of the hull.
-
-    Args:
-      scene: The scene.
-      name: Pair of bodies, as in `problem.relative`.
-      vertex: Place, weight and share, shape (5, ...).
-      joint: Place of its row's joint.
-      before: The link before it.
-      after: The link behind it.
-      at: As in `of_spheres`.
-      still: As in `of_spheres`.
-    """
-    point, image, weight, share = hull.placed(vertex, joint, before.frame, after.frame)
-    where, normal, gap = geometry(scene, name, point, 0.0, at, still)
-    lever = hull.lever(weight, image, where, point)
-    contacts = HullSet.contacts((where, normal, gap, lever, share), _cone(scene, name, at))
-    first = _from_object(name, before[1:], at, still)
-    turning = [b[:3] - a[:3] for a, b in zip(before[1:], after[1:], strict=True)]
-    moves = [jnp.concatenate(m)[:, None] for m in zip(first, turning, strict=True)]
-    return of_contacts(contacts, *moves)
+def aim(scene: Scene, name: str, place: Place, numbers, at: dict, still: dict) -> jax.Array:
+    """Where rings look at a field once more, shape (3, k, ...)."""
+    centre = fields.ring_centres(place.origin, place.frame, numbers)
+    first = field(scene, name, centre, at, still, still.get("values"))
+    return centre + fields.aimed(numbers, place.frame, *first)
 
 
 def of_table(scene: Scene, fingers: int, item: int, at: dict, finger, still: dict) -> jax.Array:
@@ -157,10 +126,9 @@ def of_table(scene: Scene, fingers: int, item: int, at: dict, finger, still: dic
             lane = jnp.where(finger == k - item * fingers, place[..., k, None, :], lane)
         dealt.append(lane)
     point, normal, gap = dealt
-    used = finger < 4 - item * fingers
-    contacts = Contacts(
-        point[:, None], normal[:, None], jnp.where(used, gap, 1.0)[None], _cone(scene, TABLE, at)
-    )
+    used = (finger < 4 - item * fingers) & (still["share"][0, 0] > 0)
+    cone = _cone(scene, TABLE, at).of_share(jnp.where(used, 1.0, 0.0)[None])
+    contacts = Contacts(point[:, None], normal[:, None], gap[None], cone)
     moves = at["object_vel"], still["object_motion"], still["object_along"]
     return of_contacts(contacts, *(m[:, None] for m in moves))
 
@@ -213,144 +181,79 @@ def of_palm(timestep: float, state: dict, arm, constants: dict, still: dict) -> 
     return place, found["columns"], found["object_vel"], height, now.wrist, -power
 
 
-def sphere_ball(place: Place, sphere, radius, which):
-    """Centre and radius (4, ...) of one of a link's spheres; which: its number."""
-    centre = place.origin + apply_columns(place.frame, _item(sphere, which))
-    return jnp.concatenate([centre, _item(radius[None], which)])
-
-
-def between_spheres(
-    scene: Scene,
-    mine: tuple[Place, Any, Any],
-    theirs: tuple[Place, Any, Any],
-    numbers: Any,
-    which: tuple,
-) -> jax.Array:
-    """Power of two fingers' spheres on one another.
+def on_palm(scene: Scene, mine: tuple[Place, Any], palm: Place, size, numbers) -> jax.Array:
+    """Power of a finger's ring or sphere on the palm.
 
     Args:
       scene: The scene.
-      mine: Link, and centres and radii of its spheres, on the lane's own side.
-      theirs: The same of the other finger.
-      numbers: Numbers of the cone.
-      which: Number of the sphere on either link.
-    """
-    balls = sphere_ball(*mine, which[0]), sphere_ball(*theirs, which[1])
-    one, other = sections.between(*balls)
-    cone = cone_of(scene, numbers)
-    ends = [Contacts(point, normal, gap[0], cone) for point, normal, gap in (one, other)]
-    return _between(ends, mine[0][2:], theirs[0][2:])
-
-
-def sphere_on_palm(scene: Scene, mine: tuple, palm: Place, size, numbers: Any, which) -> jax.Array:
-    """Power of a finger's sphere on the palm.
-
-    Args:
-      scene: The scene.
-      mine: Link, and centres and radii of its spheres.
+      mine: Link, and the ring's numbers.
       palm: The palm.
       size: Radius and half the thickness of its disc.
       numbers: Numbers of the cone.
-      which: Number of the sphere on the link.
     """
-    ball = sphere_ball(mine[0], mine[1], mine[2], which)
-    cone = cone_of(scene, numbers)
-    found = sections.ball_on_palm(ball, (*palm[:2], size))
-    ends = [Contacts(point, normal, gap[0], cone) for point, normal, gap in found]
-    return _between(ends, mine[0][2:], palm[2:])
+    place, ring = mine
+    centre, disc = pair_search.ring_centre(*place[:2], ring), (*palm[:2], size)
+    first = pair_search.palm_distance(centre, disc)
+    if scene.effects.surface == "spheres":
+        found = pair_search.ball_on_field(ring, centre, *first)
+    else:
+        offset = pair_search.aimed(ring, place.frame, *first)
+        again = pair_search.palm_distance(centre + offset, disc)
+        found = pair_search.on_field(ring, place.frame, centre, offset, *again)
+    return _between(scene, found, place[2:], palm[2:], numbers)
 
 
-def palm_sums(vertex, mine: tuple, palm: tuple) -> jax.Array:
-    """What a vertex of a row adds to `sections.pressure` of the palm.
+def between_spheres(scene: Scene, mine: tuple, theirs: tuple, numbers: Any) -> jax.Array:
+    """Power of two fingers' spheres on one another: links, and the spheres' numbers."""
+    one, other = (
+        pair_search.ring_centre(place.origin, place.frame, ring) for place, ring in (mine, theirs)
+    )
+    found = pair_search.balls(mine[1], one, theirs[1], other)
+    return _between(scene, found, mine[0][2:], theirs[0][2:], numbers)
 
-    Args:
-      vertex: Place, weight and share of the vertex.
-      mine: Joint of its row, and frames of the links before and behind it.
-      palm: See `sections.palm_distance`.
+
+class Line(NamedTuple):
+    """A segment of a finger's centre line.
+
+    Attributes:
+      places: Its link, as `Place`.
+      origins: Places of the joints at its ends.
+      frames: Of the links before it and behind it.
+      tip: Numbers of the finger's last ring.
     """
-    none = jnp.zeros((sections.SUMS, *mine[0].shape[1:]), mine[0].dtype)
-    return sections.add_vertex(none, *sections.on_palm(vertex, mine, palm))
+
+    place: Place
+    origin: Any
+    frames: tuple[Any, Any]
+    tip: Any
 
 
-def ahead_gap(timestep: float, vertex, mine: tuple, palm: tuple, vels: tuple, side):
-    """The gap of a vertex of a half row as `sections.add_ahead` has it; see `ahead_sums`."""
-    return _half_ahead(timestep, vertex, mine, palm, vels, side)[0][2][0, 0]
-
-
-def ahead_sums(timestep: float, vertex, mine: tuple, palm: tuple, vels: tuple, side, lowest):
-    """What a vertex of a half row adds to `sections.pressure_ahead`.
-
-    Args:
-      timestep: Time step [s].
-      vertex: As in `palm_sums`.
-      mine: As in `palm_sums`.
-      palm: As in `palm_sums`.
-      vels: Velocities of the links before and behind its joint and of the palm.
-      side: Side of the half row, see `sections.half_of_row`.
-      lowest: The lowest gap of the half row.
-    """
-    half, other, seen = _half_ahead(timestep, vertex, mine, palm, vels, side)
-    return sections.part_ahead(half, other, seen, lowest + ROUNDING)
-
-
-ROUNDING = 0.1 * sections.TOUCH
-"""By how much the lowest gap may differ when it is computed again [m]."""
-
-
-def _half_ahead(timestep: float, vertex, mine: tuple, palm: tuple, vels: tuple, side) -> tuple:
-    own, other = sections.on_palm(vertex, mine, palm)
-    own, seen = sections.ahead(timestep, own, hull.across(*vels))
-    return sections.half_of_row(vertex, own, side), other, seen
-
-
-def vertex_sums(vertex, mine: tuple, theirs: tuple, last) -> jax.Array:
-    """What a vertex of the own row adds to `sections.pressure` of another finger's row.
-
-    Args:
-      vertex: Place, weight and share of the vertex.
-      mine: Joint of its row, frames of the links before and behind it, and half sizes.
-      theirs: The same of the other row.
-      last: Whether the other row is the last one, see `sections.inside`.
-    """
-    *own, _ = mine
-    *other, size = theirs
-    none = jnp.zeros((sections.SUMS, *own[0].shape[1:]), own[0].dtype)
-    return sections.add_vertex(none, *sections.inside(vertex, tuple(own), tuple(other), size, last))
-
-
-def between_rows(scene: Scene, sums, mine: tuple, theirs: tuple, numbers, held: tuple = ()):
-    """Power of a row on another finger's row, or the palm.
+def between_rings(
+    scene: Scene, mine: tuple[Place, Any], theirs: Line, numbers, held: tuple, still: dict
+) -> jax.Array:
+    """Power of a ring on another finger, or its own.
 
     Args:
       scene: The scene.
-      sums: See `sections.pressure`.
-      mine: Sides before and behind the row.
-      theirs: The same of the other row.
+      mine: Link, and the ring's numbers.
+      theirs: Segment that it touches.
       numbers: Numbers of the cone.
       held: What the fingers hold, see `holding.held`, and cotangents of the sums of
         `holding.hold`; nothing where they have no such state.
+      still: Whether the segment is the last one, "last", and where it may be touched at the most,
+        "end".
     """
-    cone = cone_of(scene, numbers)
-    ends = [HullSet.contacts(end, cone) for end in sections.pressure(sums)]
-    return _between(ends, *_row_moves(mine, theirs), held)
-
-
-def row_on_palm(scene: Scene, sums, mine: tuple, theirs: tuple, numbers):
-    """As `between_rows`, of a half row on the palm ahead of touch."""
-    cone = cone_of(scene, numbers)
-    *places, seen = sections.pressure_ahead(sums)
-    one, other = (HullSet.contacts(end, cone) for end in places)
-    one = one._replace(ahead=tuple(part[0] for part in seen))
-    return _between([one, other], *_row_moves(mine, theirs))
-
-
-def _row_moves(mine: tuple, theirs: tuple) -> tuple[list, list]:
-    """Velocity, acceleration and virtual acceleration of two rows, of nine components each."""
-    one, other = (
-        [hull.across(a, b, None) for a, b in zip(before[1:], after[1:], strict=True)]
-        for before, after in (mine, theirs)
-    )
-    return one, other
+    place, ring = mine
+    link, before, after = theirs.place, *theirs.frames
+    start = pair_search.above(link.origin, before, link.frame, theirs.tip)
+    behind = pair_search.above(theirs.origin, link.frame, after, theirs.tip)
+    tip = pair_search.ring_centre(link.origin, link.frame, theirs.tip)
+    ends = start, jnp.where(still["last"] > 0, tip, behind)
+    centre = pair_search.ring_centre(*place[:2], ring)
+    t = pair_search.where_on(ends, centre, still["end"])
+    other = ends, (before, link.frame, after), theirs.tip, still["last"]
+    found = pair_search.between(ring, place.frame, centre, other, t)
+    return _between(scene, found, place[2:], link[2:], numbers, held)
 
 
 def held_work(contacts: Contacts, force: jax.Array, grip: jax.Array, bars: jax.Array) -> jax.Array:
@@ -358,12 +261,11 @@ def held_work(contacts: Contacts, force: jax.Array, grip: jax.Array, bars: jax.A
     return sum_axis(dot(bars[:, None], holding.hold(contacts, force, grip[:, None])), 0)
 
 
-def _between(ends: list[Contacts], mine: Any, theirs: Any, held: tuple = ()) -> jax.Array:
-    one, other = ends
-    vel, motion, along = (
-        one.relative(a[:, None]) - other.relative(b[:, None])
-        for a, b in zip(mine, theirs, strict=True)
-    )
+def _between(
+    scene: Scene, found: Any, mine: Any, theirs: Any, numbers: Any, held: tuple = ()
+) -> jax.Array:
+    one = ContactSet.contacts(pair_search.with_axis(found), cone_of(scene, numbers))
+    vel, motion, along = (one.relative((a - b)[:, None]) for a, b in zip(mine, theirs, strict=True))
     jar = motion - one.reference(vel)
     if not held:
         force = contact.constraint_update(one, jar).force
@@ -383,11 +285,3 @@ def _from_object(name: str, moves: Any, at: dict, still: dict) -> list:
 
 def _cone(scene: Scene, name: str, at: dict) -> contact.Cone:
     return cone_of(scene, at[f"cone.{which_cone(name)}"])
-
-
-def _item(values: jax.Array, which: jax.Array) -> jax.Array:
-    """The item of a number, of values (component, k, ...)."""
-    found = values[:, 0]
-    for k in range(1, values.shape[1]):
-        found = jnp.where(which == k, values[:, k], found)
-    return found

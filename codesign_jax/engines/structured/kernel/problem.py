@@ -9,7 +9,6 @@ from codesign_jax.engines.structured.kernel import solver
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
-from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 from codesign_jax.engines.structured.laws.inertia import Body, Centred
 
@@ -69,10 +68,9 @@ class Problem:
       palm: Palm, wrist and object.
       rigid: Whether the wrist's accelerations are known, see `problem.Problem.palm_acc`.
       pairs: Contacts between fingers, if there are any.
-      fingers: Contacts of the fingers' spheres.
-      skin: Contacts of the hull.
+      fingers: Contacts of the fingers with the object and the table.
       slots: Contacts of the palm, and of the object with the table.
-      slotted: Those of `skin` and `pairs`, in slots.
+      slotted: Those of `pairs`, in slots.
       like: Zeros of the lanes' shape and type.
     """
 
@@ -81,11 +79,8 @@ class Problem:
         self.links, self.block, self.m, self.palm, self.rigid = links, block, m, palm, rigid
         self.pairs: BoundPairs | None = m.contacts.get("finger_finger")  # type: ignore[assignment]
         self.fingers = [m.contacts[n] for n in ("finger_object", "finger_table") if n in m.contacts]
-        self.skin: list[BoundSlots] = [  # type: ignore[assignment]  # hull sets are slots
-            c for n, c in m.contacts.items() if n.startswith("hull_")
-        ]
-        self.slots = [c for n, c in m.contacts.items() if not n.startswith(("finger", "hull_"))]
-        self.slotted = [*self.skin, *([self.pairs] if self.pairs else [])]
+        self.slots = [c for n, c in m.contacts.items() if not n.startswith("finger")]
+        self.slotted = [self.pairs] if self.pairs else []
         self.like = jnp.zeros((block.size,), palm.armature.dtype)
 
     def read(self, *names: str, item: Any = 0) -> list[Lanes]:
@@ -116,18 +111,10 @@ class Problem:
         """Arguments of `make_body` for a link."""
         return self.read("mass", "body_centre", "tensor", item=item)
 
-    def pair_push(self, i: Any) -> tuple[Lanes, Lanes | None]:
-        """Forces of the contacts between fingers on a link and on the joint before it."""
-        assert self.pairs is not None
-        push = self.pairs.pushed(i + 1)[:6]
-        return push, self.pairs.pushed(i)[6:] if self.pairs.set.skin else None
-
     def add_first(self, r: Lanes) -> Lanes:
-        """Adds the contacts between fingers that act on the palm, those of the first joints."""
+        """Adds the contacts between fingers that act on the palm."""
         assert self.pairs is not None
-        if not self.pairs.set.skin and not self.pairs.set.palm:
-            return r
-        return lanewise(jnp.add, r, self.pairs.pushed(0)[:6])
+        return lanewise(jnp.add, r, self.pairs.pushed(0))
 
     def widened(self, motion: Lanes) -> Lanes:
         """What belongs to a world, on all fingers."""
@@ -141,9 +128,7 @@ def relative(name: str, link: Any, palm: Lanes, obj: Lanes) -> Lanes:
         return lanewise(difference, link, obj)
     if name == "palm_object":
         return lanewise(difference, palm, obj)
-    if name == "hull_object":
-        return lanewise(lambda m, o: jnp.concatenate([m[:6] - o, m[6:]]), link, obj)
-    alone = {"finger_table": link, "hull_table": link, "palm_table": palm, "object_table": obj}
+    alone = {"finger_table": link, "palm_table": palm, "object_table": obj}
     return alone[name]
 
 

@@ -15,17 +15,12 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, ContactSet, zeros
 from codesign_jax.engines.structured.kernel.counts import Counts
-from codesign_jax.engines.structured.kernel.memory import MemoryLayout, anywhere, full, solid
+from codesign_jax.engines.structured.kernel.memory import MemoryLayout, anywhere, solid
 from codesign_jax.engines.structured.kernel.solver import tree_add_scaled
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact
-from codesign_jax.engines.structured.laws.contact import Cone, Contacts
+from codesign_jax.engines.structured.laws.rings import Place
 from codesign_jax.scene import Scene
-
-
-def hull_slots(scene: Scene) -> int:
-    """Slots of a row of the hull for each of its pairs of bodies."""
-    return scene.discretization.hull_rings * scene.discretization.hull_points
 
 
 class SlotSet(ContactSet):
@@ -73,32 +68,6 @@ class SlotSet(ContactSet):
     def bind(self, table: MemoryLayout, ref: Any, read: Callable[[str], Lanes]) -> "BoundSlots":
         """See `ContactSet`."""
         return BoundSlots(self, table, ref, self.cone(read))
-
-
-class HullSet(SlotSet):
-    """Contacts of the skinned hull's vertices; rows are the joints and the tip, see `hull`."""
-
-    more = {"lever": 3, "share": 1}
-    places = ("point", "normal", "gap", "lever", "share")
-    of_lines = ("gap", "share")
-
-    @staticmethod
-    def contacts(place: tuple, cone: Cone) -> Contacts:
-        """See `ContactSet`."""
-        point, normal, gap, lever, share = place
-        return Contacts(point, normal, gap[0], _soft(cone, share[0]), lever)
-
-    @staticmethod
-    def of_line(gap: tuple, cone: Cone) -> Contacts:
-        """See `ContactSet`."""
-        distance, share = (x[0] for x in gap)
-        return Contacts(gap[0], gap[0], distance, _soft(cone, share))
-
-
-def _soft(cone: Cone, share: jax.Array) -> Cone:
-    """The cone of a vertex, which has a share of the stiffness."""
-    tangent = None if cone.tangent is None else cone.tangent * share
-    return cone._replace(normal=cone.normal * share, tangent=tangent)
 
 
 class Slot(NamedTuple):
@@ -150,16 +119,19 @@ class BoundSlots(BoundContacts):
         found = [self.read("count", row).lane.astype(jnp.int32) for row in rows]
         self._counts = Counts.of_rows([jnp.minimum(n, most) for n in found], most)
         if self.set.gathers:
-            self._write_empty()
+            self.write_empty(self.set.fields(), self.set.count - 1)
 
-    def _write_empty(self) -> None:
-        """Stores what lanes read in slots that are not theirs: a contact that does not touch."""
+    def write_empty(self, fields: dict[str, tuple[int, tuple[int, ...]]], item: int) -> None:
+        """Stores what lanes read in slots that are not theirs: a contact that does not touch.
+
+        All fields of it, as a number that is none, times no share, is none.
+        """
         none = jnp.zeros((self.set.size,), self.ref.dtype)
         one, prefix = jnp.ones_like(none), f"{self.set.name}."
-        sound = {"gap": [one], "share": [one], "normal": [none, none, one]}
-        for name, (_, shape) in self.set.fields().items():
+        sound = {"gap": [one], "normal": [none, none, one]}
+        for name, (_, shape) in fields.items():
             values = sound.get(name.removeprefix(prefix), [none] * math.prod(shape))
-            self.table.write(self.ref, name, lanes(values, shape, wide=True), self.set.count - 1)
+            self.table.write(self.ref, name, lanes(values, shape, wide=True), item)
 
     def used(self, row: Any) -> jax.Array:
         """Number of slots that any lane has filled, a scalar; within `only` any of its lanes."""
@@ -214,7 +186,7 @@ class BoundSlots(BoundContacts):
             # Lanes without a contact in a slot have sound numbers there, and no touch.
             fresh = first + jnp.minimum(jnp.max(filled), self.set.slots)
             for field, value in fields.items():
-                away = lanewise(jnp.ones_like, value) if field == "gap" else value
+                away = lanewise(jnp.zeros_like, value) if field == "share" else value
                 self.write(field, away, fresh)
         mine = jnp.where(which, jnp.minimum(filled, self.set.slots), self.set.slots)
         for field, value in fields.items():
@@ -242,7 +214,7 @@ class BoundSlots(BoundContacts):
         empty, spare = self.set.count - 1, self.set.slots  # that of the first row
         return Slot(*(jnp.where(mine, item, jnp.int32(away)) for away in (empty, spare)))
 
-    def update_constraint(self, item: Any, place: tuple, alpha: Lanes) -> Lanes:
+    def update_constraint(self, item: Any, place: Place, alpha: Lanes) -> Lanes:
         """Adds the last step to jar; stores the Hessian and returns the force, of one slot."""
         contacts = self.set.contacts
 
@@ -255,49 +227,6 @@ class BoundSlots(BoundContacts):
         hessian, force = lanewise(response, place, self.cone, jar)
         self.write("hessian", hessian, item)
         return force
-
-    def push(self, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
-        """Adds the last step to jar; the row's contact inertia (9, 9) and wrench (9,)."""
-
-        def add(slot: Any, sums: list[Lanes]) -> list[Lanes]:
-            return lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), sums, self._push(slot, alpha))
-
-        triangle, wrench = self.fold(item, add, self._zeros((45,), (9,)))
-        return full(triangle), wrench
-
-    def wrench(self, item: Any, alpha: Lanes) -> Lanes:
-        """Wrench (9,) of the row's contacts where the last step has moved jar, which is kept."""
-
-        def add(slot: Any, sums: Lanes) -> Lanes:
-            return lanewise(jnp.add, sums, self._wrench(slot, alpha))
-
-        return self.fold(item, add, self._zeros((9,))[0])
-
-    def changes(self, item: Any, alpha: Lanes) -> Lanes:
-        """How many of the row's contacts the last step takes to another zone of the cone."""
-
-        def add(slot: Any, sums: Lanes) -> Lanes:
-            return lanewise(jnp.add, sums, self._changes(slot, alpha))
-
-        return self.fold(item, add, self._zeros(())[0])
-
-    def prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:
-        """Stores the contacts' cost along a relative motion (9, ...); returns its slope at 0."""
-
-        def add(slot: Any, sums: Lanes) -> Lanes:
-            return lanewise(jnp.add, sums, self._prepare_linesearch(slot, step))
-
-        return self.fold(item, add, self._zeros(())[0])
-
-    def slopes(self, item: Any, alpha: Lanes) -> list[Lanes]:
-        """First and second derivative of the row's cost by the step length, at alpha."""
-
-        def add(slot: Any, sums: list[Lanes]) -> list[Lanes]:
-            return lanewise(
-                lambda a, b: jax.tree.map(jnp.add, a, b), sums, self._slopes(slot, alpha)
-            )
-
-        return self.fold(item, add, self._zeros((), ()))
 
     def _zeros(self, *shapes: tuple[int, ...]) -> list[Lanes]:
         like = jnp.zeros((self.set.size,), self.ref.dtype)

@@ -8,21 +8,14 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import advance, objects
-from codesign_jax.engines.structured.kernel.contact_sets import (
-    sphere_on_object,
-    sphere_on_table,
-    zeros,
-)
+from codesign_jax.engines.structured.kernel.contact_sets import zeros
+from codesign_jax.engines.structured.kernel.fields import FieldContacts
 from codesign_jax.engines.structured.kernel.memory import Block, loop
 from codesign_jax.engines.structured.kernel.newton import Newton
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.pair_search import Search
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.problem import Iterate, Memory, Palm, Problem, triangle
-from codesign_jax.engines.structured.kernel.skin import Side, Skin
-from codesign_jax.engines.structured.kernel.slots import BoundSlots
-from codesign_jax.engines.structured.kernel.spheres import Spheres
-from codesign_jax.engines.structured.kernel.team_search import TeamSearch
 from codesign_jax.engines.structured.kernel.team_solver import team_rows
 from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
@@ -165,7 +158,7 @@ class Step:
 
     def _overflow(self, bound: dict[str, Any], waiting: jax.Array) -> jax.Array:
         """One for worlds that had too few slots for their contacts in this step, else zero."""
-        lists = [c.overflow() for c in bound.values() if isinstance(c, BoundSlots)]
+        lists = [c.overflow() for c in bound.values() if isinstance(c, BoundPairs)]
         most = self.block.fold(total(lists), jnp.maximum)
         return jnp.where(waiting & (most > 0), 1.0, 0.0).astype(most.dtype)
 
@@ -199,17 +192,15 @@ class Step:
         )
 
         pairs = m.contacts.get("finger_finger")
-        looks = Search if p.team == 1 else TeamSearch
-        search = looks(self, pairs, at) if isinstance(pairs, BoundPairs) else None
+        search = Search(self, pairs, at) if isinstance(pairs, BoundPairs) else None
+        self.search = search
         if search:
             search.start(motion, vel, frame, origin)
-        spheres = Spheres(self, at, m, thing)
-        skin = Skin(self, at, m, thing) if any(n.startswith("hull_") for n in m.contacts) else None
+        fields = FieldContacts(self, at, m, thing)
 
         def link(i: Any, carry: tuple) -> tuple:
             origin, frame, vel, bias, motion, middle = carry
             self.keep(i, carry[:5])
-            before = Side(frame, motion, vel)
             joint = self.joint(i) | {"pressure": pressure}
             run = partial(link_forces, p.scene)
             constants = self.link_constants(i)
@@ -223,36 +214,25 @@ class Step:
                 table.write(ref, name, value, i)
             share = p.hand.read(self.hand, "share", i + 1)
             middle = lanewise(lambda m, c, s: m + s * c, middle, centre, share)
-            spheres.of_link(i, carry)
+            fields.of_link(i, carry)
             if search:
                 search.link(i, carry[4], carry[2], carry[1], carry[0])
-            if skin:
-                skin.row(i, carry[0], before, Side(carry[1], carry[4], carry[2]))
             return (*carry, middle)
 
         start = (origin, frame, vel, bias, motion, weight)
         origin, frame, vel, bias, motion, middle = loop(p.links, link, start, p.size)
         self.keep(p.links, (origin, frame, vel, bias, motion))
-        if skin:
-            tip = Side(frame, motion, vel)
-            skin.row(p.links, origin, tip, tip)
         if search:
             search.find()
+        if search and p.team > 1:
+            fields.of_rings(search)
         for contacts in m.contacts.values():
-            if isinstance(contacts, BoundSlots):
+            if isinstance(contacts, BoundPairs):
                 contacts.keep_counts()
-        spheres.of_palm_and_object(state)
+        fields.of_palm_and_object(state)
         count = p.num_fingers * p.links
         middle = self.block.sum(middle)
         return now, lanewise(lambda c: c / count, middle)
-
-    def geometry(self, name: str, centre: Lanes, radius: Any, at: dict, thing: WorldObject):
-        """Point, normal and gap of spheres of the hand against the object or the table."""
-        scene = self.p.scene
-        if name.endswith("_object"):
-            return sphere_on_object(scene, thing, at["columns"], centre, radius)
-        height = self.p.world_state.read(self.world_state, "position", 0, self.block.world)[2]
-        return lanewise(sphere_on_table, height, centre, radius)
 
 
 def palm_and_object(timestep: float, state: dict, arm, constants: dict) -> dict[str, Any]:

@@ -1,20 +1,20 @@
 """The reverse pass of a step through palm, fingers and contacts, from the tips inwards."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import objects, powers
+from codesign_jax.engines.structured.kernel import fields, objects, powers
 from codesign_jax.engines.structured.kernel.bars import Bars
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import choose, loop
 from codesign_jax.engines.structured.kernel.objects import WorldObject
-from codesign_jax.engines.structured.kernel.powers import Chain, Place, RowSide
+from codesign_jax.engines.structured.kernel.powers import Chain, Place
 from codesign_jax.engines.structured.kernel.problem import Iterate, Memory
-from codesign_jax.engines.structured.kernel.pull import only_on, plus, pull
-from codesign_jax.engines.structured.kernel.slots import BoundSlots
+from codesign_jax.engines.structured.kernel.pull import plus, pull
 from codesign_jax.engines.structured.kernel.step import LINK_CONSTANTS
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import shapes
@@ -83,27 +83,18 @@ class Sweep:
           Cotangents of what the palm hands on, on each finger's lanes.
         """
         p, tips = self.p, self.p.links
-        rows = [c for n, c in self.m.contacts.items() if n.startswith("hull_")]
         touching = [n for n in ("finger_object", "finger_table") if n in self.m.contacts]
 
         def link(i: Any, after: Chain) -> Chain:
-            found = [self.row(c, i) for c in rows]
-            for joint, _, behind in found:
-                after = _add(after, origin=joint, **behind._asdict())
             if touching:
                 place = _place(self.chain(i + 1))
                 for name in touching:
-                    new = self.spheres(name, i, place, ("sphere", "radius"))
+                    new = self.rings(name, i, place)
                     after = _add(after, **new._asdict())
             before = self._link(i, after, pressure, centre_bar)
-            for _, ahead, _ in found:
-                before = _add(before, **ahead._asdict())
             return self.more(before, i)
 
         after = Chain(*(zeros(shape, self.like) for shape in SHAPES))
-        for c in rows:
-            joint, ahead, behind = self.row(c, tips)
-            after = _add(_add(after, origin=joint, **ahead._asdict()), **behind._asdict())
         after = self.more(after, tips)
         base = loop(tips, link, after, p.size, reverse=True)
         return self._mount(base, centre_bar)
@@ -151,7 +142,7 @@ class Sweep:
     # Contacts
 
     def palm_and_table(self, base: Chain) -> Chain:
-        """Adds the contacts of the palm's spheres, and of the object with the table."""
+        """Adds the contacts of the palm's rings or spheres, and of the object with the table."""
         names = [n for n in ("palm_object", "palm_table") if n in self.m.contacts]
         at, now = self.at, self.at["now"]
         place = Place(
@@ -162,55 +153,41 @@ class Sweep:
             base = _add(base, **{n: read(f"palmbar.{n}") for n in Place._fields})
         for i in range(self.p.palm_groups if names else 0):
             for name in names:
-                new = self.spheres(name, i, place, ("palm_point", "palm_radius"))
+                new = self.rings(name, i, place, "palm_ring")
                 base = _add(base, **new._asdict())
         if powers.TABLE in self.m.contacts:
             self._table()
         return base
 
-    def spheres(self, name: str, i: Any, place: Place, constants: tuple[str, str]) -> Place:
-        """Cotangents of a body, of an item of the contacts of its spheres."""
-        given = [self.p.hand.read(self.step.hand, n, i) for n in constants]
-        at = self._object(name)
+    def rings(self, name: str, i: Any, place: Place, table: str = "ring") -> Place:
+        """Cotangents of a body, of an item of the contacts of its rings."""
+        k = self.p.k if table == "ring" else 1
+        rows = [self.p.hand.read(self.step.hand, table, i * k + j) for j in range(k)]
+        numbers = lanewise(lambda rows: jnp.stack(rows, 1), rows)
 
-        def compute() -> Place:
-            still = self.still
+        def compute(at: dict, still: dict) -> Place:
             if "meshed" in still and name.endswith("_object"):
-                centre = lanewise(powers.sphere_centre, place, given[0])
+                centre = lanewise(fields.ring_centres, place.origin, place.frame, numbers)
                 still = still | {"values": self._values(centre)}
-            run = partial(powers.of_spheres, self.p.scene, name)
-            found, *own, shared = pull(run, (place, *given, at), (still,), self.one)
-            self.bars.add(dict(zip(constants, own, strict=True)), i)
+                if self.p.hull:
+                    run = partial(powers.aim, self.p.scene, name)
+                    again = lanewise(run, place, numbers, at, still)
+                    still = still | {"values_again": self._values(again)}
+            run = partial(powers.of_rings, self.p.scene, name)
+            found, own, shared = pull(run, (place, numbers, at), (still,), self.one)
+            for j in range(k):
+                self.bars.add({table: own[:, j]}, i * k + j)
             self.bars.add(shared)
             return found
 
-        empty = Place(*(self.none(n) for n in Place._fields))
-        return choose(self.m.contacts[name].touching(i), compute, empty, self.p.size)
+        return self._touching(name, i, compute)
 
-    def row(self, slots: BoundSlots, i: Any) -> tuple[Lanes, RowSide, RowSide]:
-        """Cotangents of a row's joint and of the links before and behind it."""
-        name, p, lane = slots.set.name, self.p, self.block.lane
-        behind = jnp.minimum(i + 1, p.links)
-        chains = self.chain(i), self.chain(behind)
-        sides = chains[1].origin, *(_side(c) for c in chains)
-        at, run = self._object(name), partial(powers.of_vertex, p.scene, name)
-
-        def add(slot: Any, sums: tuple) -> tuple:
-            item = slots.read("vertex", slot).lane.astype(jnp.int32)
-            vertex = p.hand.gather(self.step.hand, "vertex", item, lane)
-            live = lanes([slots.read("gap", slot).lane < 0], (), wide=True)
-            still = self.still
-            if "meshed" in still and slots.set.on_object:
-                point = lanewise(powers.vertex_point, vertex, *sides)
-                still = still | {"values": self._values(point)}
-            own, *found, shared = only_on(live, pull(run, (vertex, *sides, at), (still,), self.one))
-            self.bars.add({"vertex": own}, item, lane)
-            self.bars.add(shared)
-            return plus(sums, tuple(found))
-
-        side = RowSide(*(zeros(getattr(SHAPES, n), self.like) for n in RowSide._fields))
-        empty = zeros((3,), self.like), side, side
-        return choose(slots.used(i) > 0, lambda: slots.fold(i, add, empty), empty, p.size)
+    def _touching(self, name: str, i: Any, compute: Callable[[dict, dict], Place]) -> Place:
+        """What is computed of an item's contacts if there are any."""
+        at, empty = self._object(name), Place(*(self.none(n) for n in Place._fields))
+        contacts = self.m.contacts[name]
+        still = self.still | {"share": contacts.read("share", i)}
+        return choose(contacts.touching(i), lambda: compute(at, still), empty, self.p.size)
 
     def _table(self) -> None:
         contacts, p = self.m.contacts[powers.TABLE], self.p
@@ -224,7 +201,8 @@ class Sweep:
 
             def compute(i: int = i) -> None:
                 run = partial(powers.of_table, p.scene, p.fingers, i)
-                (found,) = pull(run, (at,), (finger, still), self.one)
+                shares = {"share": contacts.read("share", i)}
+                (found,) = pull(run, (at,), (finger, still | shares), self.one)
                 self.bars.add(found)
 
             jax.lax.cond(contacts.touching(i), compute, lambda: None)
@@ -257,10 +235,6 @@ def _turned_back(columns: jax.Array, points: jax.Array) -> jax.Array:
 
 def _place(chain: Chain) -> Place:
     return Place(*(getattr(chain, n) for n in Place._fields))
-
-
-def _side(chain: Chain) -> RowSide:
-    return RowSide(*(getattr(chain, n) for n in RowSide._fields))
 
 
 def _add(bars: Chain, **more: Lanes) -> Chain:

@@ -3,19 +3,30 @@
 from functools import partial
 
 from codesign_jax import verdict
-from codesign_jax.engines.structured.kernel import objects, pair_search, skin, teams
+from codesign_jax.engines.structured.kernel import objects, pair_search, teams
 from codesign_jax.engines.structured.kernel.contact_sets import ContactSet
 from codesign_jax.engines.structured.kernel.memory import MemoryLayout
 from codesign_jax.engines.structured.kernel.pairs import PairSet, pair_slots
-from codesign_jax.engines.structured.kernel.slots import HullSet, SlotSet, hull_slots
-from codesign_jax.engines.structured.kernel.team_slots import TeamHullSet, TeamPairSet
+from codesign_jax.engines.structured.kernel.slots import SlotSet
+from codesign_jax.engines.structured.kernel.team_slots import TeamFieldSet, TeamPairSet
 from codesign_jax.engines.structured.laws import shapes
 from codesign_jax.model import layout
-from codesign_jax.model.layout import pairings_held, palm_touches
+from codesign_jax.model.layout import pairings_held, palm_touches, touches_itself
 from codesign_jax.scene import Scene
 
+PALM = ((1, 0), (0, 1), (-1, 0), (0, -1))
+"""Places of the rings that the palm's disc is made of, and their half axes, in half radii."""
 GATHERING = ("gpu",)
 """Backends whose lanes read rows of their own as fast as a common one."""
+
+
+def rings_of_link(scene: Scene) -> int:
+    """Rings or contact spheres of a link."""
+    e, spheres = scene.effects, layout(scene).spheres
+    if e.surface == "spheres":
+        return spheres.shape[-1] if spheres.size else 0
+    between = e.finger_finger or e.finger_palm or e.finger_itself
+    return scene.discretization.hull_rings * int(between or e.finger_object or e.finger_table)
 
 
 class Tables:
@@ -26,19 +37,20 @@ class Tables:
       fingers: Fingers of a block, a power of two; `num_fingers`: those of the scene.
       block: Worlds of a block; `size`: its lanes.
       team: Lanes of a finger; `columns`: columns of the tables of fingers, which they share.
-      k: Contact spheres of a link; `palm_groups`: of the palm, for each finger's lanes.
+      k: Rings or contact spheres of a link; `palm_groups`: of the palm, for each finger's lanes.
       sets: The contacts.
       hand: Rows of the hand's table; likewise `world`, `finger_state`, `world_state`, `scratch`,
         and with teams `onchip`.
     """
 
-    remembers: dict[str, tuple[str, ...]] = {"hull": (), "pairs": ()}
-    """Further numbers of the slots of the hull and of contacts between fingers."""
+    remembers: tuple[str, ...] = ()
+    """Further numbers of the slots of contacts between fingers."""
 
     def __init__(self, scene: Scene, *, backend: str, width: int, team: int | None = None):
         """Lays out the memory, see `Program`."""
         self.backend = backend
         self.scene, self.lay = scene, layout(scene)
+        self.hull = scene.effects.surface == "hull"
         n, self.links, self.axes = self.lay.dofs.shape
         self.fingers = 1 << (n - 1).bit_length()
         self.team = team or teams.lanes_of_a_finger(scene, backend, self.fingers)
@@ -48,8 +60,10 @@ class Tables:
         self.block = 1 if alone else max(1, width // (self.fingers * self.team))
         self.columns = self.fingers * self.block
         self.size = self.columns * self.team
-        self.k = self.lay.spheres.shape[-1] if self.lay.spheres.size else 0
-        self.palm_groups = -(-self.lay.palm.size // self.fingers)
+        e = scene.effects
+        self.between = (e.finger_finger and n > 1) or e.finger_palm or touches_itself(scene)
+        self.k = rings_of_link(scene)
+        self.palm_groups = -(-(len(PALM) if self.hull else self.lay.palm.size) // self.fingers)
         self.meshes = bool(shapes.mesh_indices(scene))
         self.sets = self._sets()
         self.held = pairings_held(scene)
@@ -59,18 +73,12 @@ class Tables:
     def _sets(self) -> list[ContactSet]:
         e, k = self.scene.effects, self.k
         make = partial(ContactSet, self.scene, size=self.size)
-        sets = []
-        if k and e.finger_object:
-            sets.append(make("finger_object", self.links, k))
-        if k and e.finger_table:
-            sets.append(make("finger_table", self.links, k))
-        on = {"hull_object": e.finger_object, "hull_table": e.finger_table}
-        if e.surface == "hull":
-            sets += [self._skin(name) for name in on if on[name]]
-        between = e.finger_finger and self.num_fingers > 1
-        if between or e.finger_palm:
+        on = {"finger_object": e.finger_object, "finger_table": e.finger_table}
+        fields = make if self.team == 1 else partial(TeamFieldSet, self.scene, self)
+        sets = [fields(name, self.links, k) for name in on if on[name]]
+        if self.between:
             block, slots = (self.fingers, self.block), pair_slots(self.scene)
-            how = {"gathers": self.gathers, "remembers": self.remembers["pairs"]}
+            how = {"gathers": self.gathers, "remembers": self.remembers}
             if self.team == 1:
                 sets.append(PairSet(self.scene, block, self.links, slots, **how))
             else:
@@ -86,28 +94,16 @@ class Tables:
         """Whether lanes read rows of their own."""
         return self.backend in GATHERING or self.team > 1
 
-    def _skin(self, name: str) -> HullSet:
-        how = name, self.links + 1, hull_slots(self.scene), self.size
-        if self.team > 1:
-            return TeamHullSet(self.scene, *how, (self.fingers, self.block, self.team))
-        kept = self.remembers["hull"]
-        return HullSet(self.scene, *how, gathers=self.gathers, remembers=kept)
-
     def _tables(self) -> None:
         n, a = self.links, self.axes
         one: tuple[int, ...] = ()
-        more = {"sphere": (n, (3, self.k)), "radius": (n, (self.k,))} if self.k else {}
+        more = {"ring": (n * self.k, (8,))} if self.k else {}
         if palm_touches(self.scene):
-            more |= {
-                "palm_point": (self.palm_groups, (3, 1)),
-                "palm_radius": (self.palm_groups, (1,)),
-            }
+            more |= {"palm_ring": (self.palm_groups, (8,))}
         if self.scene.effects.neo_hookean:
             more |= {"section": (1, (4,))}
         if self.scene.effects.lateral_threshold:
             more |= {"threshold": (1, (3,))}
-        if self.scene.effects.surface == "hull":
-            more |= skin.fields(self.scene)
         support, grid = objects.tables(self.scene, self.fingers)
         self.hand = MemoryLayout(
             True,
@@ -182,7 +178,7 @@ class Tables:
         if self.slotted:
             fields |= {"inverse": (n, (a, a)), "z_again": (n, (a,))}
         if any(isinstance(s, PairSet) for s in self.sets):
-            fields |= pair_search.fields(n, self.k)
+            fields |= pair_search.fields(n)
         if self.team > 1:
             onchip = teams.fields(n, a)
             self.onchip = MemoryLayout.by_item(True, **onchip)

@@ -72,7 +72,7 @@ class Team:
         return lanewise(pick, matrix, forces, self.forces, masks)
 
     def eliminate(
-        self, node: list[Lanes], axes: Lanes, armature: Lanes, more: tuple[Lanes, ...]
+        self, node: list[Lanes], axes: Lanes, armature: Lanes, more: Lanes
     ) -> tuple[list[Lanes], el.Kept, Lanes]:
         """`elimination.eliminate_and_keep` by columns.
 
@@ -80,20 +80,19 @@ class Team:
           node: The lanes' columns of P with r, of C, and of Q with r_o, shape (6,) each.
           axes: Motion subspace, on all lanes.
           armature: Diagonal joint inertia.
-          more: What contacts and joint forces add to the columns of U with y and of H, and to D.
+          more: What joint forces add to the columns of U with y.
 
         Returns:
           The columns left; those of w with z and of g, and D^-1; the lane's part of y'z.
         """
 
-        def project(node, axes, more):
-            return [contract(axes, v[None], 1) + m for v, m in zip(node, more, strict=True)]
+        def project(p, c, axes, more):
+            return contract(axes, p[None], 1) + more, contract(axes, c[None], 1)
 
-        def invert(axes, u, armature, more):
+        def invert(axes, u, armature):
             n = axes.shape[0]
             eye = jnp.eye(n, dtype=axes.dtype)[:, :, None, None]
-            own = contract(axes[:, None], u[None], 2) + eye * armature[:, None]
-            return inverse_spd(own + jnp.swapaxes(more, 0, 1))
+            return inverse_spd(contract(axes[:, None], u[None], 2) + eye * armature[:, None])
 
         def reduce(node, u, h, columns, inverse, forces):
             w, g = (contract(inverse, v[None], 1) for v in columns)
@@ -104,10 +103,9 @@ class Team:
             c, q = c - contract(u, g[:, None], 0), q - contract(h, g[:, None], 0)
             return [p, c, q], w, g, work
 
-        columns = lanewise(project, node[:2], axes, more[:2])
-        u, h, d = self.spread(u=columns[0], h=columns[1], d=more[2])
-        u, h, d = u[:, :6], h[:, :6], d[:, : axes.shape[0]]
-        inverse = lanewise(invert, axes, u, armature, d)
+        columns = lanewise(project, *node[:2], axes, more)
+        u, h = (v[:, :6] for v in self.spread(u=columns[0], h=columns[1]))
+        inverse = lanewise(invert, axes, u, armature)
         node, w, g, work = lanewise(reduce, node, u, h, columns, inverse, self.forces)
         return node, el.Kept(el.Factors(w, g, None), inverse), work  # type: ignore[arg-type]
 
@@ -133,7 +131,7 @@ class Team:
         found = team_sum(self.block, lanewise(part, w, g, self.one(parent), self.one(obj), own))
         return found if z is None else lanewise(jnp.add, found, z)
 
-    def again(self, axes: list, kept: el.Kept, r: jax.Array, ro: jax.Array, turned: Any) -> tuple:
+    def again(self, axes: list, kept: el.Kept, r: jax.Array, ro: jax.Array) -> tuple:
         """`elimination.eliminate_again` of the lanes' components; also the joint accelerations.
 
         Args:
@@ -141,9 +139,8 @@ class Team:
           kept: Columns of w and g, and D^-1.
           r: Component of the force.
           ro: Component of the force on the object.
-          turned: What is added to it for the joint alone.
         """
-        y = [self.block.over_team(s * (r + turned), jnp.add) for s in axes]
+        y = [self.block.over_team(s * r, jnp.add) for s in axes]
 
         def reduce(kept, r, ro, y):
             w, g, _ = kept.factors
@@ -163,13 +160,6 @@ class Team:
         a = self.accelerations(self.link(i), parent, obj, None, at)
         axes = self.chip.rows("axes", i)
         return a, lanewise(lambda p, s, a: p + dot(s, a), self.one(parent), axes, a).lane
-
-    def put_link(self, i: Any, before: jax.Array, motion: jax.Array, palm: jax.Array) -> None:
-        """`BoundPairs.put_link` by components."""
-        pairs = self.problem.pairs
-        assert pairs is not None
-        self.scratch.put("side.motion", motion - palm if pairs.set.palm else motion, i + 1)
-        self.scratch.put("side.turn", motion - before, i)
 
     def narrowed(self, value: Lanes) -> Lanes:
         """What is the same on all lanes of a world, as its own."""
@@ -193,28 +183,24 @@ class TeamElimination(Elimination):
     def __init__(self, problem: Problem):
         """Takes the problem."""
         super().__init__(problem)
-        self.team = Team(problem)
+        self.team, self.rings = Team(problem), rings_of_link(problem)
         one = jnp.ones_like(self.like)
-        mate = self.block.mate
-        unit = [jnp.where(mate == k, one, 0.0) for k in range(6)]
-        none = jnp.zeros_like(self.like)
-        self.unit = lanes([*unit, none, none, none], (9,), wide=True)
+        unit = [jnp.where(self.block.mate == k, one, 0.0) for k in range(6)]
+        self.unit = lanes(unit, (6,), wide=True)
 
     def backward(self, alpha: Lanes) -> tuple[Any, Lanes]:
         """See `Elimination`; the node is the lanes' columns of P with r, C, and Q with r_o."""
         problem, team, pairs = self.problem, self.team, self.problem.pairs
         assert pairs is not None
         pairs.update_constraints(alpha)
-        for contacts in problem.skin:
+        for contacts in problem.fingers:
             contacts.update_constraints(alpha)  # type: ignore[attr-defined]
 
         def add_link(p, forces, force, column):
             return p + jnp.where(forces, force, column)
 
-        def joint(axes, armature, tau, acc, turned, row, held, spin, forces):
-            tau = tau - armature * acc + contract(axes[:, :3], turned[None], 1)
-            u, h, d = (contract(axes[:, :3], v[None], 1) for v in (row[6:], held[6:], spin))
-            return u + jnp.where(forces, tau, 0.0), h, d
+        def joint(armature, tau, acc, forces):
+            return jnp.where(forces, tau - armature * acc, 0.0)
 
         def step(i: Any, carry: tuple) -> tuple:
             (p, c, q), work = carry
@@ -227,52 +213,33 @@ class TeamElimination(Elimination):
             force = team.vector(force + team.scratch.get("side.push", i + 1))
             p = lanewise(add_link, p, team.forces, force, column)
             tau, armature = problem.read("tau", "armature", item=i)
-            turned = pairs.pushed(i)[6:]
-            row, held, spin = self.columns(i, axes)
-            more = lanewise(joint, axes, armature, tau, acc, turned, row, held, spin, team.forces)
-            node, kept, done = team.eliminate([p, c, q], axes, armature, more)
+            more = lanewise(joint, armature, tau, acc, team.forces)
+            node, kept, done = team.eliminate(self.touched([p, c, q], i), axes, armature, more)
             for name, value in zip("wg", kept.factors[:2], strict=True):
                 team.chip.put_rows(name, value, i)
             problem.write("inverse", kept.inverse, i)
-            return self.add_columns(node, row, held), lanewise(jnp.add, work, done)
+            return node, lanewise(jnp.add, work, done)
 
         none = zeros((6,), self.like)
-        row, held, _ = self.columns(self.links, None)
-        start = self.add_columns([none] * 3, row, held), zeros((), self.like)
+        start = [none] * 3, zeros((), self.like)
         (p, c, q), work = loop(self.links, step, start, self.block.size, reverse=True)
-        first = pairs.pushed(0)[:6]
+        first = pairs.pushed(0)
         p = lanewise(add_link, p, team.forces, first, none)
         whole = self.block.fold(self.block.over_team(work.lane, jnp.add), jnp.add)
         return self.block.sum((p, c, q)), lanes([whole], (), wide=False)
 
-    def columns(self, row: Any, axes: Lanes | None) -> tuple[Lanes, Lanes, Lanes]:
-        """What a row's contacts add, see `TeamHull.columns`: all, those held, and to D."""
-        team = self.team
-        if axes is None:
-            second = zeros((9,), self.like)
-        else:
-            # D = S U' + ..., where U has the contacts' part already: the joint's own columns of
-            # X'KX, less that part.
-            own = [team.chip.get("axes", row, k, TEAM) for k in range(6)]
-            axis = lanes(own, (6,), wide=True)
-            second = lanewise(lambda s: jnp.concatenate([-s, s[:3]]), axis)
-        held, found = zeros((9,), self.like), []
-        for contacts in self.problem.skin:
-            found.append(contacts.columns(row, self.unit, second, team.forces))  # type: ignore[attr-defined]
-            if contacts.set.on_object:
-                held = found[-1][0]
-        whole, spin = lanewise(lambda f: jax.tree.map(lambda *x: total(x), *f), found)
-        return whole, held, spin
+    def touched(self, node: list[Lanes], i: Any) -> list[Lanes]:
+        """Adds a link's contacts with object and table."""
 
-    def add_columns(self, node: list[Lanes], row: Lanes, held: Lanes) -> list[Lanes]:
-        """Adds a row's contacts to the link before it."""
-
-        def add(node, row, held, forces):
+        def add(node, own, held, forces):
             p, c, q = node
-            held = held[:6]
-            return [p + row[:6], c + held, q + jnp.where(forces, -held, held)]
+            return [p + own, c + held, q + jnp.where(forces, -held, held)]
 
-        return lanewise(add, node, row, held, self.team.forces)
+        none, forces = zeros((6,), self.like), self.team.forces
+        for contacts in self.problem.fingers:
+            own = contacts.columns(i, self.rings, self.unit, forces)  # type: ignore[attr-defined]
+            node = lanewise(add, node, own, own if contacts.set.on_object else none, forces)
+        return node
 
     def at_palm(self, now: Iterate, node: Any, slots: dict) -> tuple[Iterate, Eliminated]:
         """See `Elimination`."""
@@ -299,8 +266,7 @@ class TeamElimination(Elimination):
             if rigid:
                 break
             y = lanewise(lambda t, f: jnp.where(f, t, 0.0), twist[joint], team.forces)
-            none = zeros((3,), self.like)
-            node, new, done = team.eliminate(node, axes[k], palm.armature[joint], (y, none, none))
+            node, new, done = team.eliminate(node, axes[k], palm.armature[joint], y)
             kept.append(new)
             work.append(done)
         (q,) = team.spread(q=node[2])
@@ -326,14 +292,12 @@ class TeamCoupling(Coupling):
     def again(self) -> Iterate:
         """See `Coupling`."""
         team, none = self.team, jnp.zeros_like(self.problem.like)
-        turns = self.block.mate < 3
 
         def step(i: Any, carry: tuple) -> tuple:
             r, ro = (v.lane for v in carry)
             axes = [team.chip.get("axes", i, TEAM * k) for k in range(self._axes)]
             r = r + team.scratch.get("side.push", i + 1)
-            turned = jnp.where(turns, team.scratch.get("side.push", i, 6), 0.0)
-            r, ro, z = team.again(axes, team.link(i), r, ro, turned)
+            r, ro, z = team.again(axes, team.link(i), r, ro)
             for k, part in enumerate(z.parts.ravel()):
                 self._row(i, k, AGAIN, part)
             return team.one(r), team.one(ro)
@@ -372,7 +336,7 @@ class TeamCoupling(Coupling):
             if own is None:
                 break
             parts = [chosen(self.block, axes[k][n]) for n in range(3)]
-            r, ro, new = team.again(parts, own, r, ro, 0.0)
+            r, ro, new = team.again(parts, own, r, ro)
             z.append(new)
         force = team.narrowed(team.vector(ro))
         obj = lanewise(el.solve_object, done.q, force)
@@ -388,10 +352,10 @@ class TeamCoupling(Coupling):
 
         def one(i: Any, parent: Lanes) -> Lanes:
             _, motion = team.outward(i, parent.lane, obj, at)
-            team.put_link(i, parent.lane, motion, palm)
+            team.scratch.put("side.motion", motion, i + 1)
             return team.one(motion)
 
-        self.pairs.put_palm(self.problem.widened(step.palm_motion))
+        self.pairs.put("motion", self.problem.widened(step.palm_motion), 0)
         loop(self.links, one, team.one(palm + 0 * obj), self.block.size)
 
 
@@ -401,7 +365,7 @@ class TeamLineSearch(LineSearch):
     def __init__(self, problem: Problem):
         """Takes the problem."""
         super().__init__(problem)
-        self.team = Team(problem)
+        self.team, self.rings = Team(problem), rings_of_link(problem)
 
     def prepare(self, now: Iterate, step: Iterate) -> tuple[Lanes, Lanes, Lanes]:
         """See `LineSearch`."""
@@ -422,7 +386,7 @@ class TeamLineSearch(LineSearch):
             a, part = team.outward(i, parent.lane, obj, FORCES)
             problem.write("step_acc", a, i)
             team.chip.put("step_motion", part, i)
-            team.put_link(i, parent.lane, part, palm)
+            team.scratch.put("side.motion", part, i + 1)
             numbers = problem.read("armature", "acc", "tau", item=i)
             push, column = team.one(team.scratch.get("smooth", i)), team.chip.rows("matrix", i)
             motion, moved = problem.read("motion", "step_motion", item=i)
@@ -431,14 +395,13 @@ class TeamLineSearch(LineSearch):
             )
             return team.one(part), sums
 
-        wide = problem.widened(step.palm_motion)
-        pairs.put_palm(wide)
+        pairs.put("motion", problem.widened(step.palm_motion), 0)
         start = team.one(palm + 0 * obj), [zeros((), self.like)] * 2
         _, (slope, curvature) = loop(self.links, one, start, self.block.size)
         touch = self.prepare_slots(zeros((), self.like), step)
         terms = [lanewise(jnp.multiply, touch, first), pairs.prepare_all()]
-        for contacts in problem.skin:
-            terms.append(contacts.prepare_all(pairs, step.palm_motion, step.object_motion))  # type: ignore[attr-defined]
+        for contacts in problem.fingers:
+            terms.append(contacts.prepare_all(pairs, self.rings, step.object_motion))  # type: ignore[attr-defined]
         touch = lanewise(lambda t: total(t), terms)
         slope, curvature, touch = self.total([slope, curvature, touch])
         slope, curvature = lanewise(_rest, now, step, problem.palm, slope, curvature)
@@ -460,10 +423,15 @@ class TeamLineSearch(LineSearch):
             add = lambda i, s, c=c: plus(s, c.slopes(i, alpha))  # noqa: E731
             sums = loop(c.set.count, add, sums, self.block.size)
         sums = [lanewise(jnp.multiply, v, first) for v in sums]
-        for c in problem.skin:
-            sums = c.fold(None, lambda item, s, c=c: plus(s, c._slopes(item, alpha)), sums)
+        for c in problem.fingers:
+            sums = c.every(lambda item, _, s, c=c: plus(s, c.slopes(item, alpha)), sums)  # type: ignore[attr-defined]
         assert problem.pairs is not None
         return problem.pairs.slopes_of_all(alpha, sums)
+
+
+def rings_of_link(problem: Problem) -> int:
+    """Rings of a link."""
+    return problem.m.hand.groups["ring"][0] // problem.links
 
 
 def team_rows(stored: dict[str, Lanes], body: tuple) -> dict[str, Lanes]:

@@ -8,7 +8,7 @@ What is not shared out is computed by all of them, with the same bits.
   `elimination`.  One recursion P -= U'W, Q -= H'G then updates the forces as well, if G of lane 6
   is -z.  Rows that all lanes need (U and H, three numbers a column) go through shared memory.
 * Right sides: lane k < 6 has component k; products are sums over the team.
-* Contacts: slot k is lane k modulo the team's.  The hull's are a list a finger, row after row.
+* Contacts: slot or ring k is lane k modulo the team's.
 """
 
 from functools import partial
@@ -51,7 +51,7 @@ def fields(links: int, axes: int) -> dict[str, tuple[int, tuple[int, ...]]]:
     found |= {"inverse": (axes, axes), "matrix": (6, TEAM)}
     for name in ("motion", "step_motion"):
         found |= {name: (6,), f"{name}_spare": (TEAM - 6,)}
-    shared = {"u": rows, "h": rows, "d": rows, "q": (6, TEAM), "f": (TEAM,)}
+    shared = {"u": rows, "h": rows, "q": (6, TEAM), "f": (TEAM,)}
     return {name: (links, shape) for name, shape in found.items()} | {
         f"shared.{name}": (1, shape) for name, shape in shared.items()
     }

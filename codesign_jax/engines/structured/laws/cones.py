@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.laws.contact import Cone
-from codesign_jax.model import contact_invweight
-from codesign_jax.model.layout import palm_impedance
+from codesign_jax.model.layout import contact_mass, dissipation, friction_ratio
 from codesign_jax.scene import Scene
 
 
@@ -16,10 +15,10 @@ class Cones(NamedTuple):
     """Cones by what touches; their numbers have shape (1, world).  None where nothing of it does.
 
     Attributes:
-      hand_object: Fingers, hull or palm on the object.
-      hand_table: Fingers, hull or palm on the table.
+      hand_object: Fingers or palm on the object.
+      hand_table: Fingers or palm on the table.
       object_table: The object on the table.
-      finger_finger: Fingers on one another.
+      finger_finger: Fingers on one another and on themselves.
       finger_palm: Fingers on the palm's disc.
     """
 
@@ -38,32 +37,25 @@ def which_cone(pair: str) -> str:
 
 
 def make_cone(
-    scene: Scene, friction: Any, *, bodies: int, impratio: Any = None, impedance: Any = None
+    scene: Scene, friction: Any, *, bodies: int, ratio: Any = None, stiffer: Any = 1.0
 ) -> Cone:
-    """MuJoCo's contact parameters for constant impedance (its Computation chapter).
+    """A contact's parameters, see `contact`.
 
     Args:
       scene: The scene; its numbers may be arrays.
       friction: Coulomb coefficient.
-      bodies: Bodies other than the world in the contact, whose declared inverse weights add.
-      impratio: MuJoCo's impratio, by default `contact.friction_ratio`.
-      impedance: By default `contact.impedance`.
+      bodies: Bodies other than the world in the contact: against the world it is twice as stiff.
+      ratio: How much harder friction is, by default `contact.friction_ratio`.
+      stiffer: Stiffness over `contact.normal_stiffness`.
     """
-    c = scene.contact
-    impratio = c.friction_ratio if impratio is None else impratio
-    impedance = c.impedance if impedance is None else impedance
-    grows = {}
-    if scene.effects.soft_touch:
-        spring, _ = _reference(scene, impedance)
-        least = scene.discretization.timestep**2 * spring
-        grows = {"growth": 1.0 / c.touch_depth + 0.0 * least, "least": least}
-    regularizer = (1.0 - impedance) / impedance * contact_invweight(scene) * bodies
-    reference = _reference(scene, impedance)
+    c, h = scene.contact, scene.discretization.timestep
+    how = {"ahead": scene.effects.surface == "hull"}
+    normal = 2.0 / bodies * stiffer * contact_mass(scene, **how)
+    reference = 1.0 / (h * (h + dissipation(scene, **how))), 1.0 / h + 0.0 * normal
     if scene.effects.friction == "none":
-        return Cone(1.0 / regularizer, None, None, None, *reference, **grows)
-    ratio = friction / jnp.sqrt(impratio)
-    tangent = impratio / regularizer
-    cone = Cone(1.0 / regularizer, tangent, friction, ratio, *reference, **grows)
+        return Cone(normal, None, None, None, *reference)  # type: ignore[arg-type]
+    impratio = friction_ratio(scene, c.friction_ratio if ratio is None else ratio, **how)
+    cone = Cone(normal, impratio * normal, friction, friction / jnp.sqrt(impratio), *reference)
     if scene.effects.friction != "full":
         return cone
     least = jnp.maximum(friction, 1e-5)  # MuJoCo's mjMINMU
@@ -84,20 +76,17 @@ def make_cones(scene: Scene, shape: jax.Array) -> Cones:
     two, one = partial(make_cone, scene, bodies=2), partial(make_cone, scene, bodies=1)
     # MuJoCo has one impratio for all contacts, so that spheres, which it simulates too, do here.
     between = c.finger_finger_friction_ratio if e.surface == "hull" else c.friction_ratio
+    stiffer = c.finger_palm_stiffness / c.normal_stiffness
     return Cones(
         hand_object=two(on_object) if e.finger_object or e.palm_object else None,
         hand_table=one(c.finger_table_friction) if e.finger_table or e.palm_table else None,
         object_table=one(scene.objects.table.friction) if e.object_table else None,
-        finger_finger=two(c.finger_finger_friction, impratio=between) if e.finger_finger else None,
-        finger_palm=(
-            two(c.finger_palm_friction, impratio=between, impedance=palm_impedance(scene))
-            if e.finger_palm
+        finger_finger=(
+            two(c.finger_finger_friction, ratio=between)
+            if e.finger_finger or e.finger_itself
             else None
         ),
+        finger_palm=(
+            two(c.finger_palm_friction, ratio=between, stiffer=stiffer) if e.finger_palm else None
+        ),
     )
-
-
-def _reference(scene: Scene, impedance: Any) -> tuple[Any, Any]:
-    """Spring and damper coefficients of aref."""
-    time = scene.contact.time_constant
-    return 1.0 / (impedance * time) ** 2 * impedance, 2.0 / (impedance * time)

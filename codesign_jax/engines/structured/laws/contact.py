@@ -1,4 +1,9 @@
-"""Contacts: signed distances of spheres to the object and the table, and MuJoCo's elliptic cone.
+"""Contacts: implicit compliance in the problem of MuJoCo's elliptic cone.
+
+A contact has a stiffness k and a dissipation time tau.  Its normal force is that of the end of the
+step h, f = -k (g + (h + tau) v+) and never a pull, for the gap g at its beginning, v+ = v + h a.
+In the solver's terms that is a row of D = k h (h + tau) with aref = -v/h - K g, in contact
+K = 1/(h (h + tau)).  A gap closes within the step at the earliest: there K = 1/h^2.
 
 A contact's relative velocity and acceleration are those of the hand's (or, on the table, the
 object's) point minus the other body's, with the normal pointing the same way; jar = J a - aref as
@@ -14,24 +19,24 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.lanes import cross, dot
 
+MARGIN = 1e-3
+"""Gap below which a contact is a candidate, whatever its velocity [m]."""
+
 
 class Cone(NamedTuple):
-    """MuJoCo's contact parameters, as numbers or arrays that broadcast to the contacts.
+    """A contact's parameters, as numbers or arrays that broadcast to the contacts.
 
     What a friction model does not need is None: it has no place in the program.
 
     Attributes:
-      normal: D = 1/R of the normal row [kg].
-      tangent: D of the tangential rows, impratio times as much [kg].
+      normal: D of the normal row at the scene's stiffness [kg].
+      tangent: D of the tangential rows [kg].
       friction: Coulomb coefficient mu.
-      ratio: mu / sqrt(impratio), MuJoCo's regularized cone.
-      spring: Coefficient of the penetration in aref [1/s^2].
-      damper: Coefficient of the velocity in aref [1/s].
+      ratio: mu sqrt(D / D_t), MuJoCo's regularized cone.
+      spring: K, coefficient of the penetration in aref [1/s^2].
+      damper: Coefficient of the velocity in aref, 1/h [1/s].
       spin: Torsional friction over Coulomb friction [m].
       roll: Rolling friction over Coulomb friction [m].
-      growth: Inverse of the depth over which a contact's damping and friction grow [1/m], see
-        `Contacts.grown`.
-      least: Share of D that a contact of no depth has, h^2 spring.
     """
 
     normal: jax.Array | float
@@ -42,20 +47,11 @@ class Cone(NamedTuple):
     damper: jax.Array | float
     spin: jax.Array | float | None = None
     roll: jax.Array | float | None = None
-    growth: jax.Array | float | None = None
-    least: jax.Array | float | None = None
 
-
-class Ends(NamedTuple):
-    """The two links of contacts between fingers.
-
-    Attributes:
-      link: Index of the links in (link, finger), shape (2, slot, 1, world) int32.
-      touching: Number of pairs that touch, also of those without a slot, shape (1, world) int32.
-    """
-
-    link: jax.Array
-    touching: jax.Array
+    def of_share(self, share: jax.Array) -> "Cone":
+        """That of contacts with a share of the scene's stiffness; 0 of what is none."""
+        tangent = None if self.tangent is None else self.tangent * share
+        return self._replace(normal=self.normal * share, tangent=tangent)
 
 
 class Contacts(NamedTuple):
@@ -65,26 +61,18 @@ class Contacts(NamedTuple):
       point: Contact points, shape (3, ...).
       normal: Unit normals, shape (3, ...).
       distance: Signed distance [m], negative in contact, shape (...).
-      cone: Their parameters.
-      lever: Of points that follow a joint's rotation in part, see `hull`: their velocity is the
-        joint's angular velocity x lever, shape (3, ...).
-      ends: Of contacts between fingers their links, see `finger_pairs`.
-      ahead: Of contacts that act ahead of touch, see `sections.ahead`: the distance as far as it is
-        negative [m], and the speed that would close in a step what is left of it [m/s], (...).
+      cone: Their parameters, see `Cone.of_share`.
     """
 
     point: jax.Array
     normal: jax.Array
     distance: jax.Array
     cone: Cone
-    lever: jax.Array | None = None
-    ends: "Ends | None" = None
-    ahead: tuple[jax.Array, jax.Array] | None = None
 
     @property
     def active(self) -> jax.Array:
         """Which contacts exist, shape (...)."""
-        return self.distance < 0
+        return jnp.asarray(self.cone.normal > 0)
 
     @property
     def direction(self) -> jax.Array:
@@ -94,13 +82,8 @@ class Contacts(NamedTuple):
         return jnp.concatenate([self.normal, jnp.zeros_like(self.normal)])
 
     def relative(self, motion: jax.Array) -> jax.Array:
-        """Point motion, (3, ...), of a relative spatial motion, (6, ...); see `turning`.
-
-        With a lever of a motion of nine components.
-        """
+        """Point motion, (3, ...), of a relative spatial motion, (6, ...); see `turning`."""
         moving = motion[3:6] + cross(motion[:3], self.point)
-        if self.lever is not None:
-            moving = moving + cross(motion[6:], self.lever)
         if self.cone.spin is None:
             return moving
         turning = self.turning(motion[:3])
@@ -118,39 +101,27 @@ class Contacts(NamedTuple):
         assert cone.spin is not None and cone.roll is not None
         return cone.roll * omega + (cone.spin - cone.roll) * dot(n, omega) * n
 
-    @property
-    def grown(self) -> Cone:
-        """The cone of a contact of this depth.
-
-        MuJoCo's normal force is -D (a + b v) - D k r with spring k, damper b and distance r: at
-        first touch its second part is zero and its first part at once what it is at any depth.
-        With the effect `soft_touch` D is D c of the ramp c = min(1, -r / depth), and k is k / c:
-        damping and friction grow with the depth, and the elastic force stays.  The ramp begins at
-        h^2 k: c = h^2 k + (1 - h^2 k) min(1, -r / depth).  At no depth the force is so that of a
-        linearly implicit spring, -D k (r + b h^2 v + h^2 a), stable at any step; it vanishes with
-        the step h.  A contact with c = 0 would be an explicit spring on a link of a few grams.
-        """
-        cone = self.cone
-        if cone.growth is None or cone.least is None:
-            return cone
-        share = jnp.minimum(jnp.maximum(-self.distance * cone.growth, 0.0), 1.0)
-        share = cone.least + (1.0 - cone.least) * share
-        tangent = None if cone.tangent is None else cone.tangent * share
-        spring = cone.spring / share
-        return cone._replace(normal=cone.normal * share, tangent=tangent, spring=spring)
-
     def reference(self, velocity: jax.Array) -> jax.Array:
-        """Reference acceleration aref from the relative point velocity, shaped as that.
+        """Reference acceleration aref from the relative point velocity, shaped as that."""
+        cone, gap = self.cone, self.distance
+        spring = jnp.where(gap < 0, cone.spring, cone.damper**2) * gap
+        return -cone.damper * velocity - spring * self.direction
 
-        MuJoCo's is -b v - k r.  A contact that acts ahead of touch, at a distance r > 0, has
-        -b (v + r/h) in the step h: it takes from the velocity what would carry it below the
-        surface (speculative contact).  At r = 0 both are one.
-        """
-        cone, distance = self.grown, self.distance
-        if self.ahead is not None:
-            distance, closing = self.ahead
-            velocity = velocity + closing * self.direction
-        return -cone.damper * velocity - cone.spring * distance * self.direction
+
+def candidates(
+    share: jax.Array, gap: jax.Array, approach: jax.Array, cone: Cone, margin: float
+) -> jax.Array:
+    """Shares of the contacts that may act within the step, 0 of the others; the solver decides.
+
+    Args:
+      share: Shares of the scene's stiffness, shape (...).
+      gap: Their gaps [m].
+      approach: Speed at which they close [m/s].
+      cone: Their parameters.
+      margin: `MARGIN`; 0 of balls, which act from touch on, as MuJoCo's.
+    """
+    reach = jnp.maximum(margin, approach / cone.damper) if margin else 0.0
+    return jnp.where(gap < reach, share, 0.0)
 
 
 class Response(NamedTuple):
@@ -175,7 +146,7 @@ def constraint_update(contacts: Contacts, jar: jax.Array) -> Response:
     the middle zone 1/2 D_m (w_n - mu |w_t|)^2 with D_m = D_n / (1 + mu^2 / impratio), the top zone
     zero.
     """
-    cone, n = contacts.grown, contacts.direction
+    cone, n = contacts.cone, contacts.direction
     if cone.friction is None:
         return _update_frictionless(contacts, jar)
     normal = dot(n, jar)
@@ -211,14 +182,14 @@ def _update_frictionless(contacts: Contacts, jar: jax.Array) -> Response:
     """One row a contact: quadratic in the normal part where that is negative."""
     n = contacts.normal
     normal = dot(n, jar)
-    stiff = jnp.where(contacts.active & (normal < 0), contacts.grown.normal, 0.0)
+    stiff = jnp.where(contacts.active & (normal < 0), contacts.cone.normal, 0.0)
     pairs = [(i, j) for i in range(3) for j in range(i, 3)]
     hessian = jnp.stack([stiff * n[i] * n[j] for i, j in pairs])
     return Response(-stiff * normal * n, hessian, 0.5 * stiff * normal**2)
 
 
 def _zones(contacts: Contacts, normal: jax.Array, length: jax.Array) -> tuple[jax.Array, jax.Array]:
-    cone = contacts.grown
+    cone = contacts.cone
     # With D_n / D_t = 1 / impratio; where friction is zero nothing sticks.
     bottom = contacts.active & (cone.friction * cone.normal * normal + cone.tangent * length <= 0)
     middle = contacts.active & ~bottom & (normal < cone.friction * length)
@@ -268,7 +239,7 @@ def same_zone(contacts: Contacts, ray: Line, alpha: jax.Array) -> jax.Array:
 
 def slopes(contacts: Contacts, ray: Line, alpha: jax.Array) -> tuple[jax.Array, jax.Array]:
     """First and second derivative of the cost along the line, shape (...)."""
-    cone = contacts.grown
+    cone = contacts.cone
     normal = ray.n0 + alpha * ray.n1
     if cone.friction is None:
         stiff = jnp.where(contacts.active & (normal < 0), cone.normal, 0.0)
@@ -292,18 +263,13 @@ def slopes(contacts: Contacts, ray: Line, alpha: jax.Array) -> tuple[jax.Array, 
 def contact_inertia(contacts: Contacts, hessian: jax.Array) -> jax.Array:
     """X'KX with X = [-[r], 1]: a contact's Hessian in spatial accelerations, rows (6, 6, ...).
 
-    With full friction X = [-[r], 1; S, 0], see `Contacts.turning`; with a lever
-    X = [-[r], 1, -[lever]], rows (9, 9, ...).
+    With full friction X = [-[r], 1; S, 0], see `Contacts.turning`.
     """
     if contacts.cone.spin is not None:
         return _full_inertia(contacts, hessian)
     xx, xy, xz, yy, yz, zz = hessian
     k = [jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])]
     r = contacts.point
-    if contacts.lever is not None:
-        lever = contacts.lever
-        rows = [*_crossed(r, k), *k, *_crossed(lever, k)]
-        return jnp.stack([jnp.concatenate([cross(r, w), w, cross(lever, w)]) for w in rows])
     # Rows of [r]K, then of -[r]K[r]: cross products, never the skew matrix's zeros.
     y = _crossed(r, k)
     upper = [jnp.concatenate([cross(r, row), row]) for row in y]
@@ -317,10 +283,9 @@ def _crossed(r: jax.Array, k: list[jax.Array]) -> list[jax.Array]:
 
 
 def contact_wrench(contacts: Contacts, force: jax.Array) -> jax.Array:
-    """Spatial force (moment about the origin, force), (6, ...); with a lever its moment as well."""
+    """Spatial force (moment about the origin, force), shape (6, ...)."""
     if contacts.cone.spin is None:
-        lever = [] if contacts.lever is None else [cross(contacts.lever, force)]
-        return jnp.concatenate([cross(contacts.point, force), force, *lever])
+        return jnp.concatenate([cross(contacts.point, force), force])
     moment = cross(contacts.point, force[:3]) + contacts.turning(force[3:])
     return jnp.concatenate([moment, force[:3]])
 

@@ -21,7 +21,7 @@ def held(contacts: Contacts, grip: jax.Array) -> jax.Array:
       contacts: The contacts.
       grip: g, world axes, shape (3, ...).
     """
-    cone, n = contacts.grown, contacts.normal
+    cone, n = contacts.cone, contacts.normal
     # A slot in which a lane has no contact may have no stiffness either.
     some = contacts.active & (cone.tangent > 0)
     share = jnp.where(some, _elastic(contacts) / jnp.where(some, cone.tangent, 1.0), 0.0)
@@ -52,7 +52,7 @@ def hold(contacts: Contacts, force: jax.Array, grip: jax.Array) -> jax.Array:
 
 def _elastic(contacts: Contacts) -> jax.Array:
     """Normal force of a contact at rest."""
-    cone = contacts.grown
+    cone = contacts.cone
     return cone.normal * cone.spring * jnp.maximum(-contacts.distance, 0.0)
 
 

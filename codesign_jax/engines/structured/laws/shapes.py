@@ -10,7 +10,6 @@ import numpy as np
 
 from codesign_jax.engines.structured.lanes import cross, dot, once
 from codesign_jax.engines.structured.laws import meshes
-from codesign_jax.engines.structured.laws.contact import Cone, Contacts
 from codesign_jax.engines.structured.laws.kinematics import Kinematics
 from codesign_jax.engines.structured.world_model import WorldModel, apply_columns, apply_rows
 from codesign_jax.scene import Scene, primitives
@@ -18,78 +17,32 @@ from codesign_jax.scene import Scene, primitives
 _TINY = 1e-12
 
 
-def spheres_on_object(
-    scene: Scene,
-    hand: WorldModel,
-    kin: Kinematics,
-    centre: jax.Array,
-    radius: jax.Array | float,
-) -> Contacts:
-    """Contacts of spheres with the object, normals pointing from the object to the hand.
-
-    Args:
-      scene: The scene.
-      hand: The hand.
-      kin: Kinematics.
-      centre: Sphere centres from the object's, shape (3, ...).
-      radius: Sphere radii, broadcasting to (...).
-    """
-
-    def measure(columns: jax.Array, centre: jax.Array):
-        return signed_distance(scene, hand, in_object(columns, centre))
-
-    def place(columns: jax.Array, centre: jax.Array, distance: jax.Array, gradient: jax.Array):
-        return on_surface(columns, centre, radius, distance, gradient)
-
-    distance, gradient = once(measure, kin.object, centre)
-    point, normal, gap = once(place, kin.object, centre, distance, gradient)
-    return Contacts(point, normal, gap, hand.cones.hand_object)
-
-
 def in_object(columns: jax.Array, point: jax.Array) -> jax.Array:
     """Points (3, ...) from the object's centre along the world's axes in the object's frame."""
     return apply_rows(columns, point)
 
 
-def on_surface(
-    columns: jax.Array,
-    centre: jax.Array,
-    radius: jax.Array | float,
-    distance: jax.Array,
-    gradient: jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Contacts of spheres with the object: point (3, ...), normal (3, ...) and gap (...).
+def table_distance(height: jax.Array, point: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Height of points (3, ...) above the table, and its gradient; `height` is the origin's."""
+    gap = point[2] + height
+    zero = jnp.zeros_like(gap)
+    return gap, jnp.stack([zero, zero, zero + 1.0])
+
+
+def disc_distance(
+    point: jax.Array, place: jax.Array, frame: jax.Array, size: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Signed distance of a point from the palm's disc, and its gradient.
 
     Args:
-      columns: Columns of the object's orientation.
-      centre: Sphere centres from the object's, shape (3, ...).
-      radius: Sphere radii.
-      distance: Signed distance of the centres from the object, shape (...).
-      gradient: Its unit gradient in the object's frame, shape (3, ...).
+      point: The point, shape (3, ...).
+      place: Place of the palm's frame, which is on the disc's underside.
+      frame: Columns of its orientation.
+      size: Radius and half the thickness of the disc.
     """
-    normal, gap = apply_columns(columns, gradient), distance - radius
-    return centre - normal * (radius + 0.5 * gap), normal, gap
-
-
-def spheres_on_table(
-    cone: Cone, height: jax.Array, centre: jax.Array, radius: jax.Array | float
-) -> Contacts:
-    """Contacts of spheres with the table; `height` is the object's, the origin's, (1, world)."""
-    gap = centre[2] + height - radius
-    zero = jnp.zeros_like(gap)
-    normal = jnp.stack([zero, zero, zero + 1.0])
-    point = centre - normal * (radius + 0.5 * gap)
-    return Contacts(point, normal, gap, cone)
-
-
-def finger_spheres(hand: WorldModel, kin: Kinematics) -> jax.Array:
-    """Centres of the finger spheres from the object's, shape (3, link, k, finger, world)."""
-    return kin.origin[:, :, None] + apply_columns(kin.link[:, :, :, None], hand.sphere)
-
-
-def palm_spheres(hand: WorldModel, kin: Kinematics) -> jax.Array:
-    """Centres of the palm spheres from the object's, shape (3, sphere, world)."""
-    return kin.place + apply_columns(kin.palm, hand.palm_point)
+    local = apply_rows(frame, point - place)
+    distance, slope = cylinder(size, jnp.stack([local[0], local[1], local[2] - size[1]]))
+    return distance, apply_columns(frame, slope)
 
 
 def signed_distance(
@@ -187,8 +140,10 @@ def _capsule(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
     return _sphere(size, jnp.stack([p[0], p[1], p[2] - nearest]))
 
 
-def object_on_table(scene: Scene, hand: WorldModel, kin: Kinematics, height: jax.Array) -> Contacts:
-    """Contacts of the object with the table, four slots as in MuJoCo's plane colliders.
+def object_on_table(
+    scene: Scene, hand: WorldModel, kin: Kinematics, height: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Point, normal and gap of the object on the table, four slots as in MuJoCo's plane colliders.
 
     The points are the four lower corners of a box; the lower rim's lowest point, its upper
     counterpart and two more on the lower rim, 120 degrees apart, of a cylinder; the lowest point of
@@ -206,8 +161,7 @@ def object_on_table(scene: Scene, hand: WorldModel, kin: Kinematics, height: jax
             arms = new if arms is None else jnp.where(mine, new, arms)
         return on_table(arms, height)
 
-    point, normal, gap = once(points, hand.object_size[:, 0], kin.object[:, :, 0], height)
-    return Contacts(point, normal, gap, hand.cones.object_table)
+    return once(points, hand.object_size[:, 0], kin.object[:, :, 0], height)
 
 
 def primitive_points(

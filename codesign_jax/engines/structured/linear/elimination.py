@@ -63,30 +63,11 @@ class Kept(NamedTuple):
     inverse: jax.Array
 
 
-class JointTerms(NamedTuple):
-    """A quadratic in a joint's accelerations a, its parent's v and the object's v_o.
-
-    1/2 a'd a + a'u v - a'h v_o - a'y: contacts of points that follow the joint in part.
-
-    Attributes:
-      d: Shape (axis, axis, finger, world).
-      u: Shape (axis, 6, finger, world).
-      h: Same shape.
-      y: Shape (axis, finger, world).
-    """
-
-    d: jax.Array
-    u: jax.Array
-    h: jax.Array
-    y: jax.Array
-
-
 def eliminate(
     node: Quadratic,
     axes: jax.Array,
     armature: jax.Array,
     tau: jax.Array,
-    terms: JointTerms | None = None,
 ) -> tuple[Quadratic, Kept]:
     """Minimises over the accelerations of a joint.
 
@@ -95,19 +76,13 @@ def eliminate(
       axes: Motion subspace S, shape (axis, 6, finger, world).
       armature: Diagonal joint inertia (armature with implicit terms), shape (axis, finger, world).
       tau: Joint force, same shape.
-      terms: More of the objective that the joint's accelerations are in.
 
     Returns:
       The objective in the parent's acceleration, the factors for `substitute`, and what else
       `eliminate_again` needs.
     """
     u, h, y = _project(node.p, node.c, node.r, axes, tau)
-    if terms is None:
-        inverse = _joint_inverse(axes, u, armature)
-    else:
-        inverse = _joint_inverse(axes, u, armature, terms.d)
-        u, y = u + terms.u, y + terms.y
-        h = None if h is None else h + terms.h
+    inverse = _joint_inverse(axes, u, armature)
     factors = Factors(*_factor(inverse, u, h, y))
     return Quadratic(*_reduce(node, u, h, factors)), Kept(factors, inverse)
 
@@ -148,14 +123,12 @@ def _project(p: jax.Array, c: jax.Array | None, r: jax.Array, axes: jax.Array, t
     return u, h, contract(axes, r[None], 1) + tau
 
 
-def _joint_inverse(
-    axes: jax.Array, u: jax.Array, armature: jax.Array, more: jax.Array | None = None
-) -> jax.Array:
-    """D^-1 with D = S'P S + armature, and more if there is more."""
+def _joint_inverse(axes: jax.Array, u: jax.Array, armature: jax.Array) -> jax.Array:
+    """D^-1 with D = S'P S + armature."""
     n = axes.shape[0]
     eye = jnp.eye(n, dtype=axes.dtype)[:, :, None, None]
     own = contract(axes[:, None], u[None], 2) + eye * armature[:, None]
-    return inverse_spd(own if more is None else own + more)
+    return inverse_spd(own)
 
 
 def _factor(inverse: jax.Array, u: jax.Array, h: jax.Array | None, y: jax.Array):
@@ -210,37 +183,6 @@ def solve_object(q: jax.Array, r: jax.Array) -> jax.Array:
     return jnp.concatenate([contract(top, left[None], 1), second])
 
 
-class Own(NamedTuple):
-    """A link's own inertia, forces and contacts.
-
-    Attributes:
-      matrix: Inertia with that of all contacts, shape (6, 6, link, finger, world).
-      push: Force with that of all contacts, shape (6, link, finger, world).
-      object: The contacts with the object alone, alike, if the scene has them.
-    """
-
-    matrix: jax.Array
-    push: jax.Array
-    object: tuple[jax.Array, jax.Array] | None
-
-
-def link_terms(matrix: jax.Array, push: jax.Array, terms: dict) -> Own:
-    """Sums inertia, forces and contacts of the links."""
-    for inertia, wrench in terms.values():
-        matrix, push = matrix + inertia, push + wrench
-    return Own(matrix, push, terms.get("finger_object"))
-
-
-def add_link(node: Quadratic, own: Own) -> Quadratic:
-    """Adds a link's own inertia, forces and contacts to what its children left."""
-    p, c, q, r, ro = node
-    p, r = p + own.matrix, r + own.push
-    if own.object is not None:
-        coupling, wrench = own.object
-        c, q, ro = c + coupling, q + coupling, ro - wrench
-    return Quadratic(p, c, q, r, ro)
-
-
 def add_palm(node: Quadratic, matrix: Matrices, force: Forces, pushes: dict) -> Quadratic:
     """Sums the fingers and adds the palm, the object and their contacts."""
     sums: Any = [None if v is None else sum_fingers(v) for v in node]
@@ -265,24 +207,3 @@ def wrist_slides(like: jax.Array) -> jax.Array:
     """Motion subspace of the three wrist slides, shape (3, 6, 1, world)."""
     eye = jnp.eye(3, 6, 3, dtype=like.dtype)[:, :, None, None]
     return jnp.broadcast_to(eye, (3, 6, *like.shape[1:]))
-
-
-def row_terms(
-    axes: jax.Array, inertia: jax.Array, wrench: jax.Array
-) -> tuple[JointTerms, jax.Array, jax.Array]:
-    """What a row adds to its joint, as if it touched the object, and to the link before it.
-
-    Args:
-      axes: Motion subspace of the joint, shape (axis, 6, finger, world).
-      inertia: Contact inertia of the row, shape (9, 9, finger, world).
-      wrench: Its wrench, shape (9, finger, world).
-
-    Returns:
-      The terms of the joint, and the contact inertia (6, 6) and wrench (6,) of the link.
-    """
-    turn = axes[:, :3]
-    mixed = contract(turn[:, :, None], inertia[None, 6:], 1)  # (axis, 9, ...)
-    parent = mixed[:, :6]
-    own = contract(turn[:, None], mixed[None, :, 6:], 2)
-    force = contract(turn, wrench[None, 6:], 1)
-    return JointTerms(own, parent, parent, force), inertia[:6, :6], wrench[:6]

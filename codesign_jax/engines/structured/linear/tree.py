@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.lanes import once, scan_links, spatial, total
-from codesign_jax.engines.structured.laws import finger_pairs, hull
 from codesign_jax.engines.structured.laws.contact import Contacts
 from codesign_jax.engines.structured.laws.inertia import Bodies, Smooth
 from codesign_jax.engines.structured.laws.kinematics import Acc, Kinematics
@@ -76,22 +75,9 @@ def propagate(kin: Kinematics, acc: Acc) -> Spatial:
     return Spatial(palm, jnp.moveaxis(links, 0, 1), acc.object)
 
 
-def relative(name: str, motion: Spatial, c: Contacts | None = None) -> jax.Array:
-    """Relative spatial motion of a pair of bodies, with axes for the contacts' items.
-
-    Args:
-      name: The pair.
-      motion: Motion of all bodies.
-      c: The contacts, of which those between fingers tell their links.
-    """
+def relative(name: str, motion: Spatial) -> jax.Array:
+    """Relative spatial motion of a pair of bodies, with axes for the contacts' items."""
     obj = motion.object
-    if c is not None and c.ends is not None:
-        return finger_pairs.relative(motion.link, c.ends.link)
-    if name.startswith("hull"):
-        moved = hull.across_joints(motion.palm, motion.link)
-        if name == "hull_object":
-            moved = jnp.concatenate([moved[:6] - obj[:, None], moved[6:]])
-        return moved[:, :, None]
     if name == "finger_object":
         return jnp.stack([motion.link[i] - obj[i] for i in range(6)])[:, :, None]
     return {

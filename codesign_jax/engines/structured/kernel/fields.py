@@ -1,0 +1,201 @@
+"""Contacts with what distance fields describe, and of the object's points with the table.
+
+They have a place in memory each, whether they touch or not.  What is far from all lanes is not
+looked at further.
+"""
+
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured.kernel import objects
+from codesign_jax.engines.structured.kernel.contact_sets import zeros
+from codesign_jax.engines.structured.kernel.objects import WorldObject
+from codesign_jax.engines.structured.kernel.pair_search import Search
+from codesign_jax.engines.structured.kernel.problem import Memory, relative
+from codesign_jax.engines.structured.kernel.slots import any_of
+from codesign_jax.engines.structured.lanes import cross, dot
+from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.laws import contact, rings, shapes
+from codesign_jax.engines.structured.laws.rings import Place, Ring
+from codesign_jax.engines.structured.world_model import apply_columns
+
+if TYPE_CHECKING:
+    from codesign_jax.engines.structured.kernel.step import Step
+
+OUTSIDE = 1.5
+"""Farthest point of a ring over the largest of its half axes."""
+
+
+class FieldContacts:
+    """Enters the contacts of fingers, palm and object with object and table."""
+
+    def __init__(self, step: "Step", at: dict[str, Any], m: Memory, thing: WorldObject):
+        """Takes a step's memory and geometry, see `Step`."""
+        self.step, self.p, self.at, self.m, self.thing = step, step.p, at, m, thing
+        self.names = [n for n in ("finger_object", "finger_table") if n in m.contacts]
+        self.hull = step.p.scene.effects.surface == "hull"
+
+    def field(self, name: str, point: Lanes) -> tuple[Lanes, Lanes]:
+        """Distance (k,) of points (3, k) from object or table, and its gradient, world axes."""
+        if not name.endswith("_object"):
+            height = self.p.world_state.read(
+                self.step.world_state, "position", 0, self.step.block.world
+            )[2]
+            return lanewise(shapes.table_distance, height, point)
+        columns = self.at["columns"]
+        local = lanewise(shapes.in_object, columns, point)
+        distance, gradient = objects.signed_distance(self.p.scene, self.thing, local)
+        return distance, lanewise(apply_columns, columns, gradient)
+
+    def moves(self, name: str, motion: Lanes | None, vel: Lanes | None) -> tuple[Lanes, Lanes]:
+        """Relative acceleration and velocity of a pair of bodies."""
+        at, now = self.at, self.at["now"]
+        return (
+            relative(name, motion, now.palm_motion, now.object_motion),
+            relative(name, vel, at["vel"], at["object_vel"]),
+        )
+
+    def of_link(self, i: Any, carry: tuple) -> None:
+        """Contacts of a link; carry: its origin, frame, velocity, bias and motion."""
+        if self.p.team > 1:  # see `of_rings`
+            return
+        origin, frame, vel, _, motion = carry
+        for name in self.names:
+            numbers = self.numbers(i)
+            centre = lanewise(ring_centres, origin, frame, numbers)
+            self.on_field(name, i, numbers, frame, centre, self.moves(name, motion, vel))
+
+    def of_rings(self, search: Search) -> None:
+        """Contacts of the fingers' rings, dealt to the lanes of a team."""
+        for name in self.names:
+            contacts = self.m.contacts[name]
+            contacts.begin_step()  # type: ignore[attr-defined]
+
+            def one(slot: Any, item: jax.Array, nothing: list, name: str = name) -> list:
+                row, numbers, frame, centre = search.body(item)
+                numbers, centre = (lanewise(one_of, v) for v in (numbers, centre))
+                moves = self.moves(name, *(search.side_of(n, row) for n in ("motion", "vel")))
+                self.on_field(name, slot, numbers, frame, centre, moves)
+                return nothing
+
+            contacts.every(one, [])  # type: ignore[attr-defined]
+
+    def numbers(self, i: Any) -> Lanes:
+        """Numbers of a link's rings, shape (8, k)."""
+        k, read = self.p.k, partial(self.p.hand.read, self.step.hand, "ring")
+        return lanewise(lambda rows: jnp.stack(rows, 1), [read(i * k + j) for j in range(k)])
+
+    def on_field(self, name: str, i: Any, numbers: Lanes, frame: Lanes, centre: Lanes, moves: Any):
+        """Creates contacts of rings or balls of a body."""
+        contacts = self.m.contacts[name]
+        distance, gradient = self.field(name, centre)
+        if not self.hull:
+            place = lanewise(balls_on_field, numbers, centre, distance, gradient)
+            return contacts.create(i, place, *moves)
+        h = self.p.scene.discretization.timestep
+        near = lanewise(partial(may_touch, h), numbers, centre, distance, moves[1])
+        like = jnp.zeros((self.p.size,), self.step.finger_state.dtype)
+        contacts.write("share", zeros((1, contacts.set.k), like), i)
+
+        def create() -> None:
+            if name.endswith("_object"):
+                offset = lanewise(aimed, numbers, frame, distance, gradient)
+                again = self.field(name, lanewise(jnp.add, centre, offset))
+            else:
+                offset, again = lanewise(jnp.zeros_like, centre), (distance, gradient)
+            place = lanewise(rings_on_field, numbers, frame, centre, offset, *again)
+            contacts.create(i, place, *moves)
+
+        any_of(near.lane > 0, create)
+
+    def of_palm_and_object(self, state: dict) -> None:
+        """Contacts of the palm's rings or spheres, and of the object with the table."""
+        p, m, at = self.p, self.m, self.at
+        palm = [name for name in ("palm_object", "palm_table") if name in m.contacts]
+        for i in range(p.palm_groups if palm else 0):
+            numbers = lanewise(one_of, p.hand.read(self.step.hand, "palm_ring", i))
+            centre = lanewise(ring_centres, at["place"], at["frame"], numbers)
+            for name in palm:
+                moves = self.moves(name, None, None)
+                self.on_field(name, i, numbers, at["frame"], centre, moves)
+        on_table = m.contacts.get("object_table")
+        slots = self._table_points(state) if on_table else []
+        for i in range(on_table.set.count if on_table else 0):
+            part = [slots[k] for k in range(i * p.fingers, min((i + 1) * p.fingers, len(slots)))]
+            place = self._deal(part)
+            m.contacts["object_table"].create(i, place, *self.moves("object_table", None, None))
+
+    def _table_points(self, state: dict) -> list[Place]:
+        """Each slot of the object on the table, lanes of a world."""
+        at = self.at
+        height = state["position"][2]
+        arms = objects.table_points(self.p.scene, self.thing, at["columns"], height)
+
+        def compute(arms, height):
+            point, normal, gap = shapes.on_table(arms, height)
+            one = jnp.ones_like(gap)
+            return [
+                Place(*(v[:, k : k + 1] for v in (point, normal, gap[None], one[None])))
+                for k in range(gap.shape[0])
+            ]
+
+        return lanewise(compute, arms, height)
+
+    def _deal(self, slots: list[Place]) -> Place:
+        """Deals the slots (component, 1, world) out to the finger lanes."""
+        none = jnp.zeros((self.p.size,), self.step.finger_state.dtype)
+        dealt = []
+        for field in range(len(Place._fields)):
+            values: list[Any] = [s[field] for s in slots]
+            parts = []
+            for c in range(values[0].parts.shape[0]):
+                lane = none
+                for k, value in enumerate(values):
+                    lane = jnp.where(self.step.block.finger == k, value.parts[c].item(), lane)
+                parts.append(lane)
+            dealt.append(lanes(parts, (len(parts), 1), wide=True))
+        return Place(*dealt)
+
+
+def ring_centres(origin, frame, numbers):
+    """Centres of a body's rings, shape (3, k, ...)."""
+    return origin[:, None] + apply_columns(frame[:, :, None], numbers[:3])
+
+
+def may_touch(timestep, numbers, centre, distance, vel):
+    """One where any of a link's rings may touch within the step, else zero."""
+    half, moving = numbers[3:6], vel[3:, None] + cross(vel[:3, None], centre)
+    most = OUTSIDE * jnp.maximum(jnp.maximum(half[0], half[1]), half[2])
+    speed = jnp.sqrt(dot(moving, moving)) + most * jnp.sqrt(dot(vel[:3], vel[:3]))
+    near = distance < most + jnp.maximum(contact.MARGIN, timestep * speed)
+    found = jnp.where(near & (numbers[6] > 0), 1.0, 0.0)
+    return sum(found[k] for k in range(found.shape[0]))
+
+
+def aimed(numbers, frame, distance, gradient):
+    """See `rings.aim`; of a link's rings."""
+    return rings.aim(Ring.of(numbers), frame[:, :, None], distance, gradient)
+
+
+def as_kept(place: Place) -> Place:
+    """Gaps and shares with an axis of one component, as sets keep them."""
+    return place._replace(gap=place.gap[None], share=place.share[None])
+
+
+def rings_on_field(numbers, frame, centre, offset, distance, normal):
+    """See `rings.on_field`; of a link's rings."""
+    frame = frame[:, :, None]
+    return as_kept(rings.on_field(Ring.of(numbers), frame, centre, offset, distance, normal))
+
+
+def balls_on_field(numbers, centre, distance, normal):
+    """Contacts of a body's spheres, whose half axes are the radius."""
+    return as_kept(rings.ball_on_field(numbers[3] * numbers[6], centre, distance, normal))
+
+
+def one_of(numbers):
+    """Numbers of one ring, with an axis of their own."""
+    return numbers[:, None]

@@ -1,0 +1,299 @@
+"""Contact of fingers: rings with a support function, against distance fields and centre lines.
+
+A finger is a chain of rings on its links.  A ring is a superellipsoid |x/e|^4 + |y/a|^4 + |z/b|^4
+= 1 about its centre, b up and a across as the finger's section, e along it.  Its support
+  h(m) = (|e m_x|^(4/3) + |a m_y|^(4/3) + |b m_z|^(4/3))^(3/4)
+says how far it reaches in a direction m: faces, edges and all.  A depth d has the force of a
+skin on the cap that the other side cuts off, F(d) = K w (l/w) a b G(d/h)/w^2 for a stiffness K, a
+length l of the finger and its width w, and acts at the cap's centre.  A contact's stiffness is the
+secant F(d)/d at the step's beginning, with d no less than `NOMINAL`.
+
+All functions take components in front and any axes behind; frames are columns (3, 3, ...).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured.lanes import cross, dot, total
+from codesign_jax.engines.structured.world_model import apply_columns, apply_rows
+
+NOMINAL = 0.5e-3
+"""Least depth of which a contact has the stiffness, also before it touches [m]."""
+FADE = 1e-3
+"""Distance of two centre lines at which their contact has lost 3 parts in 10 of its force [m]."""
+SMALL = 1e-18
+"""Of squared lengths [m^2], likewise."""
+FLOOR = 1e-6
+"""Of squares of numbers up to one, where the slope of a root would have none."""
+
+
+class Ring(NamedTuple):
+    """Rings on a link.
+
+    Attributes:
+      centre: In the link's frame [m], shape (3, ...).
+      half: Half axes e, a and b [m], shape (3, ...).
+      length: Length of the finger that it stands for, in widths; 0 where there is no ring.
+      tip: 1 of the last ring of a finger, else 0.
+    """
+
+    centre: jax.Array
+    half: jax.Array
+    length: jax.Array
+    tip: jax.Array
+
+    @classmethod
+    def of(cls, numbers: jax.Array) -> "Ring":
+        """From numbers in this order, shape (8, ...)."""
+        return cls(numbers[:3], numbers[3:6], numbers[6], numbers[7])
+
+
+class Segment(NamedTuple):
+    """A stretch of a finger's centre line on one link.
+
+    Attributes:
+      ends: Where it begins and ends [m], shape (3, ...) each.
+      frames: Of the link before it, of its own and of the next one.
+      half: Half axes of its sections; the first is that of the tip, 0 before it.
+    """
+
+    ends: tuple[jax.Array, jax.Array]
+    frames: tuple[jax.Array, jax.Array, jax.Array]
+    half: jax.Array
+
+
+class Place(NamedTuple):
+    """A contact.
+
+    Attributes:
+      point: Where it acts [m], shape (3, ...).
+      normal: From the other side to the ring, shape (3, ...).
+      gap: Negative in contact [m], shape (...).
+      share: Its stiffness over `contact.normal_stiffness`, same shape.
+    """
+
+    point: jax.Array
+    normal: jax.Array
+    gap: jax.Array
+    share: jax.Array
+
+
+def cube_root(x: jax.Array) -> jax.Array:
+    """Cube root of numbers from 1e-9 to 10: Halley's iteration from the fourth root."""
+    y = 0.6 * jnp.sqrt(jnp.sqrt(x))
+    for _ in range(4):
+        cube = y * y * y
+        y = y * (cube + 2.0 * x) / (2.0 * cube + x)
+    return y
+
+
+def support(half: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Support (...), and half axes times the direction over it (3, ...).
+
+    Args:
+      half: Half axes, shape (3, ...).
+      direction: Unit vector in the ring's frame, shape (3, ...).
+    """
+    along = half * direction
+    largest = jnp.sqrt(dot(along, along) + SMALL)
+    unit = along / largest
+    squares = [u * u + FLOOR for u in jnp.unstack(unit)]
+    root = jnp.sqrt(total([s / cube_root(s) for s in squares]))  # of the sum of |u|^(4/3)
+    reach = root * jnp.sqrt(root)
+    return largest * reach, unit / reach
+
+
+def cap(unit: jax.Array, u: jax.Array) -> jax.Array:
+    """Area of the part of |y|^4 + |z|^4 = 1 beyond a line at the share 1 - u of its support.
+
+    A fit within 10 %: P on a face, E on an edge, by t from 0 to 1 in between.
+    """
+    root = jnp.sqrt(u)
+    y, z = (jnp.sqrt(v * v + FLOOR) for v in (unit[1], unit[2]))
+    t = jnp.minimum(y, z) / jnp.maximum(y, z)
+    face = 2.26 * u * jnp.sqrt(root) * (1.0 - 0.11 * u)
+    edge = 1.56 * u * root * (1.0 + 0.1 * u)
+    turn = t * cube_root(u) / (0.5 * u)
+    return edge + (face - edge) / (1.0 + turn * turn)
+
+
+def stiffness(ring: Ring, reach: jax.Array, unit: jax.Array, axial: jax.Array, gap: jax.Array):
+    """Share of the scene's stiffness at a gap (...), see `Place`.
+
+    Args:
+      ring: The ring.
+      reach: Its support, and `unit` what else `support` returns.
+      unit: See there.
+      axial: Component along the finger of the direction to the other side; the tip's end is flat.
+      gap: The gap.
+    """
+    depth = jnp.maximum(-gap, NOMINAL)
+    u = jnp.minimum(depth / reach, 1.0)
+    _, a, b = jnp.unstack(ring.half)
+    side = 0.5 * ring.length * b * cap(unit, u) / depth
+    end = 0.65 * b / a * jnp.sqrt(u)
+    ahead = ring.tip * jnp.maximum(axial, 0.0) ** 2
+    return jnp.where(ring.length > 0, side + ahead * (end - side), 0.0)
+
+
+def arm(ring: Ring, reach: jax.Array, unit: jax.Array, gap: jax.Array) -> jax.Array:
+    """Centre of the cap from the ring's centre, in its frame, shape (3, ...)."""
+    root = jnp.sqrt(jnp.minimum(jnp.maximum(-gap, 0.0) / reach, 1.0) + 1e-6)
+    spread = 1.15 * root * jnp.sqrt(root)
+    return ring.half * unit / cube_root(unit * unit + spread * spread)
+
+
+def section_normal(half: jax.Array, local: jax.Array) -> jax.Array:
+    """Outward normal of a section where a ray in its plane leaves it, shape (3, ...).
+
+    Args:
+      half: Half axes.
+      local: Direction of the ray in the section's frame, of any length, shape (3, ...).
+    """
+    y, z = local[1] / half[1], local[2] / half[2]
+    largest = jnp.maximum(jnp.maximum(jnp.abs(y), jnp.abs(z)), 1e-6)
+    y, z = (y / largest) ** 3 / half[1], (z / largest) ** 3 / half[2]
+    size = jnp.sqrt(y * y + z * z + SMALL)
+    return jnp.stack([jnp.zeros_like(y), y / size, z / size])
+
+
+# Against distance fields
+
+
+def aim(ring: Ring, frame: jax.Array, distance: jax.Array, gradient: jax.Array) -> jax.Array:
+    """From a ring's centre to where the field is looked at once more, shape (3, ...).
+
+    The nearest point is seen from a place behind it along the section's own normal: from the centre
+    flat faces would be pushed along the line to the nearest edge.
+
+    Args:
+      ring: The ring.
+      frame: Its link's.
+      distance: Signed distance of its centre.
+      gradient: Unit gradient there, world axes.
+    """
+    local = apply_rows(frame, -jnp.maximum(distance, 0.0) * gradient)
+    normal = section_normal(ring.half, local)
+    length = jnp.sqrt(local[1] ** 2 + local[2] ** 2 + SMALL)
+    away = jnp.stack([0.0 * length, local[1] - length * normal[1], local[2] - length * normal[2]])
+    moves = (distance > 0) & (ring.tip < 0.5)
+    return apply_columns(frame, jnp.where(moves, away, 0.0))
+
+
+def on_field(
+    ring: Ring,
+    frame: jax.Array,
+    centre: jax.Array,
+    offset: jax.Array,
+    distance: jax.Array,
+    normal: jax.Array,
+) -> Place:
+    """A ring's contact with what a distance field describes.
+
+    Args:
+      ring: The ring.
+      frame: Its link's.
+      centre: Where its centre is.
+      offset: See `aim`; any where the field is that of a plane.
+      distance: Signed distance at centre + offset.
+      normal: Its unit gradient there, world axes.
+    """
+    toward = -apply_rows(frame, normal)
+    reach, unit = support(ring.half, toward)
+    gap = distance - dot(normal, offset) - reach
+    place = centre + apply_columns(frame, arm(ring, reach, unit, gap)) - 0.5 * gap * normal
+    return Place(place, normal, gap, stiffness(ring, reach, unit, toward[0], gap))
+
+
+def ball_on_field(
+    radius: jax.Array, centre: jax.Array, distance: jax.Array, normal: jax.Array
+) -> Place:
+    """The round case of `on_field`."""
+    gap = distance - radius
+    one = jnp.where(radius > 0, jnp.ones_like(gap), 0.0)
+    return Place(centre - normal * (radius + 0.5 * gap), normal, gap, one)
+
+
+# Against centre lines
+
+
+def nearest(point: jax.Array, segment: Segment, last: jax.Array | float = 1.0) -> jax.Array:
+    """Where between its ends, 0 to 1 or `last`, a segment is nearest to a point, shape (...)."""
+    start, end = segment.ends
+    along = end - start
+    return jnp.minimum(jnp.maximum(dot(point - start, along) / dot(along, along), 0.0), last)
+
+
+def on_line(segment: Segment, t: jax.Array) -> jax.Array:
+    """The place of a parameter of `nearest`, shape (3, ...)."""
+    start, end = segment.ends
+    return start + t * (end - start)
+
+
+def section_frame(segment: Segment, t: jax.Array) -> jax.Array:
+    """Frame of the section there: it turns from one link's middle to the next one's."""
+    before, own, after = segment.frames
+    aside = t - 0.5
+    other = jnp.where(aside < 0, before, after)
+    mean = own + jnp.abs(aside) * (other - own)
+    x = mean[0] / jnp.sqrt(dot(mean[0], mean[0]))
+    y = mean[1] - dot(mean[1], x) * x
+    y = y / jnp.sqrt(dot(y, y))
+    return jnp.stack([x, y, cross(x, y)])
+
+
+def between(
+    ring: Ring, frame: jax.Array, centre: jax.Array, segment: Segment, t: jax.Array
+) -> Place:
+    """A ring's contact with another finger, or with its own; the other side's rings look for none.
+
+    The normal is the mean of both sections' own, where the line between the centres leaves them;
+    along a finger, as at its ends, it is that line.
+
+    Args:
+      ring: The ring.
+      frame: Its link's.
+      centre: Where its centre is.
+      segment: Segment of the other centre line.
+      t: Where that is nearest to the ring's centre, see `nearest`.
+    """
+    other = section_frame(segment, t)
+    away = centre - on_line(segment, t)
+    apart = jnp.sqrt(dot(away, away) + SMALL)
+    line, normal = away / apart, jnp.zeros_like(away)
+    for axes, half, side in ((frame, ring.half, -1.0), (other, segment.half, 1.0)):
+        own = apply_columns(axes, side * section_normal(half, side * apply_rows(axes, away)))
+        along = dot(line, axes[0]) ** 2
+        normal = normal + own + along * (line - own)
+    normal = normal / jnp.sqrt(dot(normal, normal) + SMALL)
+    toward, back = -apply_rows(frame, normal), apply_rows(other, normal)
+    beyond = jnp.where((t >= 1.0) & (back[0] > 0), segment.half[0], 0.0)
+    theirs, _ = support(jnp.stack([beyond, segment.half[1], segment.half[2]]), back)
+    reach, unit = support(ring.half, toward)
+    gap = dot(normal, away) - reach - theirs
+    # Both sides yield by half of the depth.
+    share = stiffness(ring, reach, unit, toward[0], 0.5 * gap) * _fade(apart)
+    place = centre + apply_columns(frame, arm(ring, reach, unit, gap)) - 0.5 * gap * normal
+    return Place(place, normal, gap, share)
+
+
+def _fade(apart: jax.Array) -> jax.Array:
+    """What is left of a force where two centre lines come together, whose normal has no sense."""
+    return apart / jnp.sqrt(apart * apart + FADE * FADE)
+
+
+def ball_on_ball(
+    radius: jax.Array, centre: jax.Array, their_radius: jax.Array, their_centre: jax.Array
+) -> Place:
+    """Contact of two balls; concentric ones have MuJoCo's normal, the x axis."""
+    away = centre - their_centre
+    square = dot(away, away)
+    apart = square > 0
+    length = jnp.sqrt(jnp.where(apart, square, 1.0))
+    one = jnp.ones_like(square)
+    normal = jnp.where(apart, away / length, jnp.stack([-one, 0 * one, 0 * one]))
+    gap = jnp.where(apart, length, 0.0) - radius - their_radius
+    some = jnp.where((radius > 0) & (their_radius > 0), one, 0.0)
+    return Place(centre - normal * (radius + 0.5 * gap), normal, gap, some)

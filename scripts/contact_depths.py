@@ -1,0 +1,316 @@
+"""How deep fingers, object and palm stand in one another over grasps, from recorded poses alone.
+
+python -m scripts.contact_depths docs/data/experiments/23d.npz --trials 2 --out runs/depths.json
+python -m scripts.contact_depths runs/ten --trials 18 --batch 1024 --out runs/depths.json
+
+A file is the 23d.npz of the experiments (the best particle of each run), a .json whose `designs`
+have a `vector` each, as --out has, or a folder of runs.  One program simulates all grasps, --batch
+at a time.  A finger's surface is the one that touches, whatever the law: |y/a|^4 + |z/b|^4 = 1
+along its blended links, with a cap over the last quarter of a segment.  The depth of a body in
+another is that of its deepest point from the other's surface, in every step from the inflation on.
+"""
+
+import argparse
+import json
+import multiprocessing
+import os
+import shlex
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from codesign_jax import files, model, provenance, rollout, types
+from codesign_jax import scene as scenes
+from codesign_jax.codesign import SUCCESS_COST
+from codesign_jax.engines import make_engine
+from codesign_jax.scene import InputError, Scene, keypaths, parameters
+from codesign_jax.scene.primitives import PRIMITIVES
+
+STATIONS, TIP = 4, 0.25  # sections a link; the cap's length in links, that of one section
+CAP = 0.5, 0.8, 0.95, 1.0  # places of its rings
+ARC = 3.0, 1.8  # links and heights along a finger from which on its parts touch one another
+ON_PALM = 0.25  # share of a finger at its base that is fixed to the palm and may stand in it
+LIMITS = dict(self_mm=3.0, finger_share=1 / 3, finger_deep_s=0.5, palm_mm=2.0)
+LIMITS |= dict(object_held_mm=4.0, object_palm_mm=2.0)  # beyond which kept grasps are counted
+
+
+_TURN, _UP = (v.ravel() for v in np.meshgrid(*[np.linspace(0, np.pi / 2, n) for n in (25, 7)]))
+AHEAD = np.stack([np.sin(_UP), np.cos(_UP) * np.cos(_TURN), np.cos(_UP) * np.sin(_TURN)], 1)
+ACROSS = AHEAD[_UP == 0]
+_CIRCLE = np.stack([f(np.pi / 10 * np.arange(20)) for f in (np.cos, np.sin)], 1)
+OUTLINE = _CIRCLE / (_CIRCLE**4).sum(1, keepdims=True) ** 0.25
+RING = np.concatenate([OUTLINE, OUTLINE / 2, [[0, 0]]])
+
+
+class Tube(NamedTuple):
+    """A finger in states.
+
+    Centres (state, station, 3) and frames (state, station, 3, 3) of sections with their places
+    along it, a link's length, the cap's half axes, and rings of points (state, ring, point, 3) with
+    their places.
+    """
+
+    centre: np.ndarray
+    frame: np.ndarray
+    along: np.ndarray
+    segment: float
+    half: np.ndarray
+    rings: np.ndarray
+    place: np.ndarray
+
+
+def tube(joints: np.ndarray, turn: np.ndarray, size: tuple[float, float, float]) -> Tube:
+    """A finger from joints, frames with that of the half link at the palm first, and its sizes."""
+    links = joints.shape[1]
+    segment, half = size[0] / links, np.array([2 * TIP * size[0] / links, *size[1:]]) / 2
+    along = segment * np.arange(STATIONS * links) / STATIONS
+    row = np.clip(np.ceil(along / segment - 1e-9).astype(int) - 1, 0, links - 1)
+    blend = np.minimum(along / segment - row, 1)[:, None, None]
+    mean = turn[:, row] + blend * (turn[:, row + 1] - turn[:, row])  # linear blend skinning
+    ahead, across, up = np.moveaxis(mean, -1, 0)
+    centre = joints[:, row] + (along - (row + 0.5) * segment)[:, None] * ahead + half[2] * up
+    ahead = ahead / np.linalg.norm(ahead, axis=-1, keepdims=True)
+    across = across - (across * ahead).sum(-1, keepdims=True) * ahead
+    across /= np.linalg.norm(across, axis=-1, keepdims=True)
+    frame = np.stack([ahead, across, np.cross(ahead, across)], -1)
+    body = centre[:, :, None] + (RING * half[1:]) @ frame[..., 1:].swapaxes(-1, -2)
+    cap = [np.insert(RING * (1 - u**4) ** 0.25, 0, u, axis=1) for u in CAP]
+    cap = centre[:, -1:, None] + (np.stack(cap) * half) @ frame[:, -1:].swapaxes(-1, -2)
+    place = np.append(along, np.full(len(CAP), along[-1]))
+    return Tube(centre, frame, along, segment, half, np.concatenate([body, cap], 1), place)
+
+
+def in_tube(rings: np.ndarray, solid: Tube, own: tuple[np.ndarray, float] | None = None) -> Any:
+    """Depth of the deepest point of each state in a finger [m], 0 where none is, shape (state,).
+
+    Args:
+      rings: Points around their last one, shape (state, ring, point, 3).
+      solid: The finger.
+      own: Of the finger's own rings their places along it, and from which distance on they count.
+    """
+    found, last = np.zeros(len(rings)), len(solid.along) - 1
+    reach = np.linalg.norm(solid.half[1:]) + solid.along[1]
+    wide = np.linalg.norm(rings - rings[:, :, -1:], axis=-1).max()
+    gap = rings[:, :, -1, None].astype(np.float32) - solid.centre[:, None].astype(np.float32)
+    near = np.einsum("sijk,sijk->sij", gap, gap) < (reach + wide) ** 2
+    if own is not None:
+        near &= np.abs(own[0][:, None] - solid.along) > own[1]
+    for s in np.flatnonzero(near.any((1, 2))):
+        ring, k = np.nonzero(near[s])
+        away = rings[s, ring] - solid.centre[s, k][:, None]
+        pair, point = np.nonzero((away**2).sum(-1) < reach**2)
+        if not len(pair):
+            continue
+        k = k[pair]
+        p, after = rings[s, ring[pair], point], np.minimum(k + 1, last)
+        local, beyond = (
+            np.einsum("nij,ni->nj", solid.frame[s, i], p - solid.centre[s, i]) for i in (k, after)
+        )
+        tip, whole = k == last, local[:, 0] - beyond[:, 0]
+        inside = (local[:, 0] >= 0) & (tip | (beyond[:, 0] < 0) & (whole > 0))
+        share = np.where(inside & ~tip, local[:, 0] / np.where(whole > 0, whole, 1), 0)
+        to_tip = solid.along[-1] + solid.half[0] - solid.along[k] - share * solid.along[1]
+        local = local + share[:, None] * (beyond - local)
+        local[~tip, 0] = 0
+        inside &= ((local / solid.half) ** 2**2).sum(1) < 1
+        for some, directions in ((inside & ~tip, ACROSS), (inside & tip, AHEAD)):
+            if some.any():  # the nearest tangent of a convex section
+                support = ((directions * solid.half) ** (4 / 3)).sum(1) ** 0.75
+                depth = (support - np.abs(local[some]) @ directions.T).min(1)
+                depth = np.where(tip[some], depth, np.minimum(depth, to_tip[some]))
+                found[s] = max(found[s], depth.max())
+    return found
+
+
+def in_disc(palm: Any, place: np.ndarray, turn: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Depth of the deepest point (state, ring, point, 3) in the palm's disc from below or aside."""
+    points = points.reshape(len(place), -1, 3) - place[:, None]
+    x, y, z = np.moveaxis(points @ turn, -1, 0)
+    inside = np.minimum(palm.radius - np.hypot(x, y), z)
+    return np.where(z < palm.thickness, np.maximum(inside, 0), 0).max(1)
+
+
+def in_object(kind: str, size: np.ndarray, local: np.ndarray) -> np.ndarray:
+    """Depth of the deepest point in a primitive, in whose frame the points are [m]."""
+    beyond = np.abs(local) - size
+    if kind == "sphere":
+        beyond = np.linalg.norm(local, axis=-1, keepdims=True) - size[0]
+    elif kind == "cylinder":
+        across = np.linalg.norm(local[..., :2], axis=-1) - size[0]
+        beyond = np.stack([across, np.abs(local[..., 2]) - size[1]], -1)
+    return np.maximum(-beyond.max(-1).min(1), 0)
+
+
+def surface(shape: Any, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points on a primitive's edges, and on all of it, in its frame [m]."""
+    mesh = PRIMITIVES[shape.type].triangles(size)
+    sharp = mesh.vertices[mesh.face_adjacency_edges[mesh.face_adjacency_angles > 0.5]]
+    between = np.linspace(0, 1, 41 if shape.type == "box" else 3)[:, None, None]
+    edges = sharp[:, 0] + between * (sharp[:, 1] - sharp[:, 0])
+    return edges.reshape(-1, 3), np.asarray(mesh.subdivide_to_size(0.005).vertices)
+
+
+def measured(scene: Scene, params: Any, trial: Any, qpos: np.ndarray) -> dict[str, float]:
+    """Depths [mm], durations [s], and bending while held, of a grasp in states (state, nq)."""
+    h, lay, palm = scene.discretization.timestep, model.layout(scene), scene.hand.palm
+    compiled = model.compile_model(scene, params, trial)
+    data, place, turn = mujoco.MjData(compiled), [], []
+    for state in qpos:
+        data.qpos[:] = state
+        mujoco.mj_kinematics(compiled, data)
+        place.append(data.xpos.copy())
+        turn.append(data.xmat.reshape(-1, 3, 3).copy())
+    place, turn = np.stack(place), np.stack(turn)
+    shape = scene.objects.object[int(trial.shape)]
+    size = float(trial.size) * np.array(shape.half_sizes)
+    centre, frame = place[:, lay.object], turn[:, lay.object]
+    edges, skin = (centre[:, None] + v @ frame.swapaxes(-1, -2) for v in surface(shape, size))
+    tubes = []
+    for f, bodies in enumerate(lay.bodies):
+        sizes = float(params.length[f]), scene.hand.section.width, float(params.height[f])
+        tubes.append(tube(place[:, bodies], turn[:, [lay.stubs[f], *bodies]], sizes))
+    series = {name: np.zeros(len(qpos)) for name in ("self", "finger", "share", "palm", "object")}
+
+    def deeper(name: str, depth: np.ndarray) -> None:
+        series[name] = np.maximum(series[name], depth)
+
+    for f, one in enumerate(tubes):
+        least = max(ARC[0] * one.segment, ARC[1] * 2 * one.half[2])
+        deeper("self", in_tube(one.rings, one, (one.place, least)))
+        for other in tubes[:f] + tubes[f + 1 :]:
+            depth = in_tube(one.rings, other)
+            deeper("finger", depth)
+            deeper("share", depth / (2 * other.half[1:].min()))
+        free = one.rings[:, one.place > ON_PALM * lay.links * one.segment]
+        deeper("palm", in_disc(palm, place[:, 1], turn[:, 1], free))
+        points = one.rings.reshape(len(qpos), -1, 3) - centre[:, None]
+        deeper("object", in_object(shape.type, size, points @ frame))
+        deeper("object", in_tube(edges[:, :, None], one))
+    first, begin, end = (int(scene.last_step(p)) for p in ("approach", "inflate", "disturb"))
+    hold = slice(begin - first, end - first)
+    in_palm = in_disc(palm, place[:, 1], turn[:, 1], skin[:, :, None])
+    hinges = 6 + np.arange(lay.dofs.size).reshape(lay.dofs.shape)[..., 0]
+    bend = np.median(qpos[hold][:, hinges], 0)
+    curved = np.abs(bend).max(1) * np.asarray(params.height) / np.array([t.segment for t in tubes])
+    depths = {name: series[name].max() for name in ("self", "finger", "palm", "object")}
+    depths |= {"object_held": series["object"][hold].max(), "object_palm": in_palm[hold].max()}
+    depths["object_held_median"] = np.median(series["object"][hold])
+
+    def lasting(name: str, limit: float) -> float:
+        return round(h * int((series[name] > limit).sum()), 3)
+
+    return {f"{k}_mm": round(1e3 * float(v), 2) for k, v in depths.items()} | {
+        "self_deep_s": lasting("self", 1e-3 * LIMITS["self_mm"]),
+        "finger_share": round(float(series["share"].max()), 3),
+        "finger_deep_s": lasting("share", LIMITS["finger_share"]),
+        "palm_deep_s": lasting("palm", 1e-3 * LIMITS["palm_mm"]),
+        "angle": round(float(np.degrees(bend.sum(1).max())), 0),
+        "strain": round(float(curved.max()), 2),
+    }
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Quantiles over the kept grasps, and how many of them are beyond a limit."""
+    kept = [r for r in rows if r["kept"]]
+    found: dict[str, Any] = {"grasps": len(rows), "kept": len(kept)}
+    found["failed"] = sum(r["failed"] for r in rows)
+    for key in list(kept[0])[4:] if kept else ():  # behind what a lost grasp has as well
+        values = np.array([r[key] for r in kept])
+        quantiles = np.quantile(values, [0.5, 0.9, 0.95, 0.99, 1]).round(2).tolist()
+        found[key] = dict(zip(("median", "90%", "95%", "99%", "most"), quantiles, strict=True))
+        if key in LIMITS:
+            found[key] |= {"limit": LIMITS[key], "beyond": int((values > LIMITS[key]).sum())}
+    return found
+
+
+def grasps(scene: Scene, designs: np.ndarray, args: argparse.Namespace) -> list[dict[str, Any]]:
+    """Rows of all designs in all trials."""
+    space = parameters.design_space(scene.hand, args.preset)
+    engine = make_engine("structured", scene)
+    key = jax.random.fold_in(jax.random.key(args.seed), 0x64657074)  # no search has met them
+    trials = jax.tree.map(np.asarray, rollout.sample_trials(scene, key, args.trials))
+    hands = jax.jit(jax.vmap(space.params))(jnp.asarray(designs, jnp.float32))
+    hands, total = jax.tree.map(np.asarray, hands), len(designs) * args.trials
+    size, start = min(args.batch, total), int(scene.last_step("approach"))
+    run = jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t, record_qpos=True))
+    rows: list[dict[str, Any]] = []
+    os.environ["JAX_PLATFORMS"] = "cpu"  # of the processes that measure
+    with ProcessPoolExecutor(args.workers, multiprocessing.get_context("spawn")) as pool:
+        for first in range(0, total, size):
+            world = np.minimum(first + np.arange(size), total - 1)
+            p = jax.tree.map(lambda v, w=world: v[w // args.trials], hands)
+            t = jax.tree.map(lambda v, w=world: v[w % args.trials], trials)
+            outcome, trace = jax.tree.map(np.asarray, run(p, t))
+            bad, found = types.failed(outcome.status), []
+            kept = ~bad & (outcome.cost < SUCCESS_COST)
+            for i in range(min(size, total - first)):
+                own, trial = jax.tree.map(lambda v, i=i: v[i], (p, t))
+                row = {"design": int(world[i]) // args.trials, "kept": bool(kept[i])}
+                row |= {
+                    "object": scene.objects.object[int(trial.shape)].name,
+                    "failed": bool(bad[i]),
+                }
+                rows.append(row)
+                if kept[i]:
+                    states = trace.qpos[i, start:]
+                    found.append((row, pool.submit(measured, scene, own, trial, states)))
+            for row, depths in found:
+                row |= depths.result()
+            print(f"{len(rows):,} of {total:,}", flush=True)
+    return rows
+
+
+def designs_of(path: Path) -> list[np.ndarray]:
+    """Designs of a file or of run folders [SI units]."""
+    if path.is_dir():
+        from codesign_jax.runs import choice, read_run
+
+        folders = sorted(p.parent for p in path.rglob("provenance.json"))
+        return [choice.choose(read_run(p)[0], choice.read_record(p)).design for p in folders]
+    if path.suffix == ".json":
+        return [np.array(d["vector"]) for d in json.loads(path.read_text())["designs"]]
+    with np.load(path, allow_pickle=False) as stored:
+        particles, cost = stored["final_particles"][-1], stored["test_exclude"][-1]
+    return list(particles[np.arange(len(cost)), np.nanargmin(cost, axis=1)])
+
+
+def main() -> None:
+    """Command line."""
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
+    parser.add_argument("files", type=Path, nargs="+")
+    parser.add_argument("--count", type=int, help="designs of each file; all without")
+    parser.add_argument("--trials", type=int, default=3, help="of a design, objects in turn")
+    parser.add_argument("--batch", type=int, default=96, help="worlds of a call")
+    parser.add_argument("--workers", type=int, help="processes that measure")
+    parser.add_argument("--preset", default="23d", help="the designs' parameters")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--commit", help="commit of the code where there is no repository to ask")
+    parser.add_argument("--out", type=Path, required=True)
+    args = parser.parse_args()
+    scene = scenes.load("paper", overrides=keypaths.parse(args.set))
+    designs = np.stack([v for path in args.files for v in designs_of(path)[: args.count]])
+    rows = grasps(scene, designs, args)
+    made = {"command": shlex.join(["python", "-m", "scripts.contact_depths", *sys.argv[1:]])}
+    made |= {**provenance.git_state(args.commit), **provenance.environment()}
+    found = [{"vector": v.tolist()} for v in designs]
+    for row in rows:
+        found[row["design"]].setdefault("grasps", []).append(row)
+    with files.atomically(args.out) as part:
+        text = json.dumps({**made, "summary": summary(rows), "designs": found}, indent=1)
+        part.write_text(text + "\n")
+    print(json.dumps(summary(rows), indent=1))
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as error:
+        sys.exit(f"error: {error}")

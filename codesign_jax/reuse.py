@@ -145,19 +145,14 @@ def _environment() -> tuple[str, str]:
 def problems() -> list[str]:
     """What is wrong with the environment variables, in words."""
     switch, most = _environment()
-    number = most.isascii() and most.isdecimal() and len(most) <= 18
     found = [] if switch in ("on", "off") else [f"CODESIGN_CACHE = {switch!r} must be on or off"]
-    return found + [f"CODESIGN_CACHE_BYTES = {most[:40]!r} must be a number of bytes"] * (
-        not number
-    )
+    if not (most.isascii() and most.isdecimal() and len(most) <= 18):
+        found.append(f"CODESIGN_CACHE_BYTES = {most[:40]!r} must be a number of bytes")
+    return found
 
 
 def limit() -> int | None:
-    """The most bytes of each cache; None if caches are off or there is no folder for them.
-
-    Raises:
-      ValueError: If an environment variable has a wrong value.
-    """
+    """The most bytes of each cache; None if caches are off or there is no folder for them."""
     if wrong := problems():
         raise ValueError("; ".join(wrong))
     switch, most = _environment()
@@ -323,9 +318,8 @@ def _relieve() -> None:
 def shared(build: Callable[..., Callable]) -> Callable[..., Callable]:
     """Jits what build(scene, engine, space, *more) returns once for each structure.
 
-    The program reads numbers from its constants alone (`Scene.constants`), so that another file of
-    the same structure traces and compiles nothing; with a `cost` of the user's own, which may read
-    whatever else, and once the code is not known, nothing is shared.
+    The program reads numbers from its constants alone, so that another scene of the same structure
+    compiles nothing; with a `cost` of the user's own, or code that is not known, nothing is shared.
     """
 
     def jitted(*arguments: Any) -> Callable:
@@ -382,11 +376,7 @@ os.register_at_fork(after_in_child=lambda: process.update(forked=process["begun"
 
 
 def begin() -> None:
-    """A program is about to run.
-
-    Raises:
-      RuntimeError: If the process was forked from one in which programs had run.
-    """
+    """A program is about to run: an error if the process was forked from one that had run some."""
     if process["forked"]:
         raise RuntimeError(
             "this process was forked from one that had simulated, and would wait for ever for "

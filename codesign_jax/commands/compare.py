@@ -98,17 +98,15 @@ def _runs_in(folder: Path) -> list[Path]:
 
 
 def read_all(every: Mapping[Path, tuple[Scene, Settings]]) -> dict[Path, Compared]:
-    """The runs in folders as they are, by folder."""
-    results = {folder: read(scene, folder) for folder, (scene, _) in every.items()}
-    return with_fresh(every, results)
-
-
-def with_fresh(
-    every: Mapping[Path, tuple[Scene, Settings]], results: dict[Path, RunResult | None]
-) -> dict[Path, Compared]:
-    """Results of runs with the fresh trials that their folders have."""
-    fresh = reference.of_runs(results)
-    return {f: Compared(*every[f], result, fresh[f]) for f, result in results.items()}
+    """The runs in folders as they are, with the fresh trials that these have, by folder."""
+    found = {}
+    for folder, (scene, settings) in every.items():
+        result, fresh = read(scene, folder), None
+        if result is not None and result.test is not None and (folder / reference.FILE).exists():
+            kept, _ = reference.stored(folder, settings)
+            fresh = None if kept is None else reference.judged(scene, kept)
+        found[folder] = Compared(scene, settings, result, fresh)
+    return found
 
 
 def _pair(options: "Compare", folders: list[Path]) -> list[Case]:
@@ -221,7 +219,8 @@ def write_table(every: Mapping[Path, Compared], path: Path) -> None:
             relative = Path(os.path.relpath(place, path.parent)).as_posix()
             own = {"seed": run.settings.seed, "run": relative}
             own |= {"schedule": run.settings.schedule, "first": run.settings.first}
-            own["finished"] = int(run.result is not None)
+            record = run.result and run.result.record
+            own["finished"] = int(bool(record) and record.done == run.settings.episodes)
             writer.writerow(own | _values(run) | _fresh_values(run.fresh))
 
 

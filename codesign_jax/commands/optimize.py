@@ -15,7 +15,6 @@ from rich.console import Console
 
 from codesign_jax import codesign, engines, files, optimize, preflight, runs
 from codesign_jax.commands import common, compare, hosts, reference, status
-from codesign_jax.commands.compare import Compared
 from codesign_jax.own import is_own, make_policy
 from codesign_jax.report import stress, verdicts
 from codesign_jax.report.verdicts import Judged
@@ -70,11 +69,13 @@ def main(options: "Optimize") -> int:
     if found.signum:
         return 128 + found.signum
     console = common.console()
-    _tell(options, plans, results, called, console)
-    if called:
-        pairs = {folder: (scene, own) for folder, own in every.items()}
-        _compare(options, compare.with_fresh(pairs, results), console)
-    return int(any(result is None for result in results.values()))
+    for folder, result in results.items():
+        if result is not None and result.record is not None:
+            if called:
+                console.print(f"{called[folder]}:")
+            _tell(plans[folder], result, folder, trials, console)
+    failed = int(None in results.values())
+    return (_compare(options) if called else 0) or failed
 
 
 def _tell_error(name: str, error: Exception) -> None:
@@ -92,53 +93,45 @@ def _distributed(options: "Optimize") -> int:
         problems.append("--distributed needs --seeds: the hosts share the runs of several seeds")
     if options.dry_run:
         problems.append("--dry-run knows one host: leave out --distributed")
-    if problems:
-        raise InputError(problems)
+    common.refuse(problems)
     code, index = hosts.run(options)
     if index or code == 2 or code >= 128:
         return code
-    return hosts.in_a_process(functools.partial(_compare_all, options)) or code
+    return hosts.in_a_process(functools.partial(_compare, options)) or code
 
 
-def _compare_all(options: "Optimize") -> int:
-    scene, settings = resolve(options)
+def _compare(options: "Optimize") -> int:
+    """Compares the command's runs as their folders have them; whether one of them failed."""
+    scene, settings = resolve(dataclasses.replace(options, fresh=False))
     every = runs_of(options, scene, settings)
     found = compare.read_all({folder: (scene, own) for folder, own in every.items()})
-    _compare(options, found, common.console())
+    console, table = common.console(), (options.out or Path("runs")) / columns.SEEDS
+    compare.compare(found, console)
+    compare.write_table(found, table)
+    console.print(f"table: {table}")
     return int(any(run.result is None for run in found.values()))
 
 
-def _compare(options: "Optimize", every: dict[Path, Compared], console: Console) -> None:
-    compare.compare(every, console)
-    table = table_folder(options) / columns.SEEDS
-    compare.write_table(every, table)
-    console.print(f"table: {table}")
+def _tell(plan: Plan, result: RunResult, folder: Path, trials: int, console: Console) -> None:
+    """Says how a run ended, and tests its design at reference and under other conditions."""
+    _summarize(plan, result, console)
+    fresh = None
+    if trials and result.test is not None:
+        found = reference.test(folder, plan.settings, trials, console)
+        fresh = reference.judged(plan.scene, found)
+    if result.test is not None:
+        _judge(plan, result, fresh, folder, console)
+    if fresh is not None:
+        reference.stress_run(folder, plan.settings, console)
+    assert result.record is not None
+    path = folder / "figures" / "cost_evolution.png"
+    with Busy(console, "drawing"), files.naming(path):
+        from codesign_jax.report import figures
 
-
-def _tell(
-    options: "Optimize",
-    plans: dict[Path, Plan],
-    results: dict[Path, RunResult | None],
-    called: dict[Path, str],
-    console: Console,
-) -> None:
-    """Says how each run ended, and tests its design at reference; several are `called` so."""
-    for folder, result in results.items():
-        if result is None or result.record is None:
-            continue
-        if called:
-            console.print(f"{called[folder]}:")
-        own, fresh = plans[folder], None
-        _summarize(own, result, console)
-        trials = reference.number_of_trials(options.reference_trials, own.settings)
-        if trials and result.test is not None:
-            found = reference.test(folder, own.settings, trials, console)
-            fresh = reference.judged(own.scene, found)
-        if result.test is not None:
-            _judge(own, result, fresh, folder, console)
-            if fresh is not None:
-                reference.stress_run(folder, own.settings, console)
-        _say_places(result, folder, console)
+        figures.cost_evolution(result.record.history.cost, path)
+    console.print(f"figure: {path}")
+    console.print(f"results: {folder}")
+    console.print(f"to look at: {shlex.join(['codesign', 'report', str(folder)])}")
 
 
 def _ends(space: DesignSpace) -> dict[str, np.ndarray]:
@@ -217,22 +210,6 @@ def _judge(
     last = [f"verdict: {judged}", f"more fresh trials: {again}"]
     for line in [*lines, *verdicts.warnings(judged), *last]:
         console.print(line)
-
-
-def _say_places(result: RunResult, folder: Path, console: Console) -> None:
-    _figures(result, folder, console)
-    console.print(f"results: {folder}")
-    console.print(f"to look at: {shlex.join(['codesign', 'report', str(folder)])}")
-
-
-def _figures(result: RunResult, folder: Path, console: Console) -> None:
-    assert result.record is not None
-    path = folder / "figures" / "cost_evolution.png"
-    with Busy(console, "drawing"), files.naming(path):
-        from codesign_jax.report import figures
-
-        figures.cost_evolution(result.record.history.cost, path)
-    console.print(f"figure: {path}")
 
 
 def resolve(options: "Optimize") -> tuple[Scene, Settings]:
@@ -319,21 +296,11 @@ def runs_of(options: "Optimize", scene: Scene, settings: Settings) -> dict[Path,
     """Settings of each run by its folder: of every strategy those of every seed."""
     found = {}
     for name in options.schedule.split(","):
-        for seed in seeds_of(options):
+        for seed in [options.seed] if options.seeds is None else common.parse_seeds(options.seeds):
             first = DOMAINS[seed % 2] if options.first == ALTERNATE else options.first
             own = dataclasses.replace(settings, schedule=name, first=first, seed=seed)
             found[_folder(options, scene, own)] = own
     return found
-
-
-def table_folder(options: "Optimize") -> Path:
-    """Folder of the table that compares runs."""
-    return Path("runs") if options.out is None else options.out
-
-
-def seeds_of(options: "Optimize") -> list[int]:
-    """Seeds of the runs."""
-    return [options.seed] if options.seeds is None else common.parse_seeds(options.seeds)
 
 
 def _folder(options: "Optimize", scene: Scene, settings: Settings) -> Path:

@@ -18,7 +18,7 @@ from codesign_jax.commands.common import counted
 from codesign_jax.report import stress
 from codesign_jax.report.stress import Stress
 from codesign_jax.report.verdicts import Judged
-from codesign_jax.runs import RunResult, Settings, columns, read_run, tables
+from codesign_jax.runs import Settings, columns, tables
 from codesign_jax.runs.choice import Case, case_of_run
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene, with_accuracy
@@ -60,17 +60,6 @@ def test(folder: Path, settings: Settings, trials: int, console: Console) -> Out
 def judged(scene: Scene, found: Outcome) -> Judged:
     """Outcomes of the test with the scene that was simulated."""
     return Judged(with_accuracy(scene, ACCURACY), found, ACCURACY)
-
-
-def of_runs(results: dict[Path, RunResult | None]) -> dict[Path, Judged | None]:
-    """What `test` kept of each run, by its folder; None where there is nothing."""
-    kept: dict[Path, Judged | None] = dict.fromkeys(results)
-    for folder, result in results.items():
-        if result is not None and result.test is not None and (folder / FILE).exists():
-            scene, settings = read_run(folder)
-            found, _ = stored(folder, settings)
-            kept[folder] = None if found is None else judged(scene, found)
-    return kept
 
 
 def steps_and_links(scene: Scene) -> float:

@@ -91,6 +91,8 @@ def read_provenance(path: Path) -> dict[str, Any]:
         stored = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise _damaged(file, "it is no valid JSON") from error
+    if isinstance(stored, dict) and isinstance(stored.get("settings"), dict):
+        stored["settings"] = {"policy": ""} | stored["settings"]  # older runs have none
     if problem := _problem(stored):
         raise _damaged(file, problem)
     if stored["schema"] > SCHEMA:

@@ -48,7 +48,7 @@ class Guard:
             for script in re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
         ]
         sources = " ".join(f"'sha256-{digest}'" for digest in digests)
-        self._policy = (
+        self._sources = (
             f"default-src 'none'; script-src {sources}; style-src 'unsafe-inline'; img-src data:; "
             "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
         )
@@ -76,7 +76,7 @@ class Guard:
         more["Content-Type"] = "text/html; charset=utf-8"
         more["Content-Length"] = str(len(self._body))
         more["Connection"] = "close"
-        more["Content-Security-Policy"] = self._policy
+        more["Content-Security-Policy"] = self._sources
         more["Cache-Control"] = "no-store"
         more["Referrer-Policy"] = "no-referrer"
         more["X-Content-Type-Options"] = "nosniff"

@@ -74,7 +74,7 @@ class Bench:
     """A scene at one accuracy, with the programs that simulate it."""
 
     def __init__(self, found: Case) -> None:
-        """Takes scene, space and the engine's name."""
+        """Takes scene, space and what simulates them."""
         self.case = found
         self.engine = found.make_engine()
         self.objects = len(found.scene.objects.object)
@@ -151,6 +151,7 @@ class Desk:
             scene = str(given.run_folder / "scene.toml")
         named = {"scene": scene, "hand": given.hand, "objects": given.objects}
         named |= {"accuracy": accuracy or given.accuracy, "engine": self.case.engine}
+        named["policy"] = given.policy
         found = [word for k, v in named.items() if v is not None for word in (f"--{k}", v)]
         for words in given.overrides:
             found += ["--set", *words]

@@ -1,7 +1,8 @@
 // A grasp in 3D on a WebGL 2 canvas: skinned meshes over time, orbit camera, play, pause, slider.
 //
-// Why not a library: plotly redraws a figure of such meshes in 0.2 s and ignores the mouse while it
-// plays, and three.js is in no Python package of its own.
+// Why not a library: plotly redraws a figure of such meshes in 0.2 s and ignores the mouse while it plays.  viser 1.1
+// has skinned meshes, but plays by messages of its server, which has no hook for a token or an origin and needs
+// older versions of rich and websockets; its player would add 0.8 MB to each page.
 //
 // startReplay(root, data) fills an element; `load` of what it returns shows another grasp there, from where the
 // camera stands and at the same time.  The element gets an event "time" for each frame.  data has

@@ -9,7 +9,7 @@ import numpy as np
 
 from codesign_jax.scene import Constants, Scene
 from codesign_jax.scene.schema import InputError
-from codesign_jax.types import Params, Trial
+from codesign_jax.types import Params, Tip, Trial
 
 _TRIAL = Trial._make([(), (2,), (), (2,), (), (), (), (), (), (2,)])
 """Shapes of one trial."""
@@ -29,8 +29,12 @@ def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -
     """
     fingers = (scene.num_fingers,)
     one = Params(*[fingers, fingers, fingers, (), (6,), fingers])  # type: ignore[list-item]
-    problems = _problems("params", params._replace(control=None), one, axes[0])
+    problems = _problems("params", params._replace(control=None, tip=None), one, axes[0])
     problems += _control_problems(scene, params)
+    if scene.hand.section.tapered != (params.tip is not None):
+        problems.append("params.tip is for hands with section.tapered, which need it")
+    elif params.tip is not None:
+        problems += _problems("params.tip", params.tip, Tip(fingers, fingers, fingers), axes[0])
     problems += _problems("trials", trials, _TRIAL, axes[1])
     if not problems and axes[0] == axes[1]:
         counts = len(params.length), len(trials.yaw)

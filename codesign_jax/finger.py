@@ -63,23 +63,19 @@ class Finger(NamedTuple):
     Attributes:
       segment: Length of a segment [m].
       links: Number of segments and of joints N.
-      height: Outer height of the section [m].
-      wall: Wall thickness [m].
-      width: Outer width [m].
+      section: Its section at each joint, shape (N,), or one where they are the same.
       shear_modulus: G [Pa].
-      stiffness: Of a joint at small angles [N m/rad].
-      gain: Moment per pressure [m^3].
+      stiffness: Of each joint at small angles [N m/rad], likewise.
+      gain: Moment per pressure of each joint [m^3], likewise.
       neo_hookean: Whether a joint softens as the effect `neo_hookean` says.
     """
 
     segment: float
     links: int
-    height: float
-    wall: float
-    width: float
+    section: morphology.Section
     shear_modulus: float
-    stiffness: float
-    gain: float
+    stiffness: np.ndarray
+    gain: np.ndarray
     neo_hookean: bool
 
     @property
@@ -99,9 +95,8 @@ class Finger(NamedTuple):
         linear = self.stiffness * angle
         if not self.neo_hookean:
             return linear
-        lacking = morphology.softening(
-            angle / self.segment, np.asarray(self.height), np.asarray(self.wall), width=self.width
-        )
+        height, wall, width = self.section
+        lacking = morphology.softening(angle / self.segment, height, wall, width=width)
         return linear * (1 - np.asarray(lacking))
 
 
@@ -115,17 +110,16 @@ def of_design(scene: Scene, params: Params, index: int) -> Finger:
     """
     hand, links = scene.hand, scene.discretization.links
     params = jax.tree.map(lambda v: np.asarray(v, float), params)
-    beams = morphology.finger_beams(hand, params)
+    beams = morphology.finger_beams(hand, params, links)
     springs, _ = morphology.joint_springs(hand, params, beams, links, ("bend",))
+    sections = morphology.sections(hand, params, morphology.at_joints(links))
     return Finger(
         float(params.length[index]) / links,
         links,
-        float(params.height[index]),
-        float(params.wall[index]),
-        float(hand.section.width),
+        morphology.Section(*(v[min(index, len(v) - 1)] for v in sections)),
         float(hand.material.shear_modulus),
-        float(springs[index, 0]),
-        float(beams.moment_per_pressure[index]),
+        np.asarray(springs[index, :, 0]),
+        np.asarray(beams.moment_per_pressure[index]),
         scene.effects.neo_hookean,
     )
 
@@ -165,7 +159,7 @@ class Rest(NamedTuple):
         Raises:
           ValueError: If no rest is found.
         """
-        n, moment = finger.links, pressure * finger.gain
+        n, moment, unit = finger.links, pressure * finger.gain, float(finger.stiffness[0])
         reach = finger.segment * np.append(np.ones(n - 1), 0.5)  # of the bodies behind the joints
 
         def tip(angles: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -177,18 +171,18 @@ class Rest(NamedTuple):
             return float(rise[0]), lever, -rise[np.maximum(*np.indices((n, n)))]
 
         def force(x: np.ndarray) -> float:
-            return float(x[n]) * finger.stiffness / finger.length if held else load
+            return float(x[n]) * unit / finger.length if held else load
 
         def residual(x: np.ndarray) -> np.ndarray:
             height, lever, _ = tip(x[:n])
-            out = (finger.moment(x[:n]) - moment + force(x) * lever) / finger.stiffness
+            out = (finger.moment(x[:n]) - moment + force(x) * lever) / unit
             return np.append(out, height / finger.length) if held else out
 
         def slopes(x: np.ndarray) -> np.ndarray:
             _, lever, second = tip(x[:n])
             small = 1e-5
             tangent = (finger.moment(x[:n] + small) - finger.moment(x[:n] - small)) / (2 * small)
-            out = (np.diag(tangent) + force(x) * second) / finger.stiffness
+            out = (np.diag(tangent) + force(x) * second) / unit
             if not held:
                 return out
             border = lever[:, None] / finger.length
@@ -197,7 +191,7 @@ class Rest(NamedTuple):
         first = np.zeros(n + held)
         if start is not None:
             first[:n] = start.angles
-            first[n:] = start.force * finger.length / finger.stiffness
+            first[n:] = start.force * finger.length / unit
         found = optimize.root(residual, first, jac=slopes, tol=1e-12)
         if np.abs(residual(found.x)).max() > 1e-8:
             raise ValueError(
@@ -233,7 +227,7 @@ def predict(finger: Finger, table: Mapping[str, np.ndarray]) -> dict[str, np.nda
             held = Rest.of(finger, pressure, held=True, start=held)
             found["tip_force"][row] = held.force
         if "blocked_force" in asked:
-            found["blocked_force"][row] = pressure * finger.gain / finger.length
+            found["blocked_force"][row] = pressure * finger.gain[0] / finger.length
     return found
 
 

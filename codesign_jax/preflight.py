@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import model, rollout, start
+from codesign_jax.model import morphology
 from codesign_jax.scene import Constants, Scene, key_frames
 from codesign_jax.scene.parameters import DesignSpace, params_of
 from codesign_jax.scene.schema import InputError
@@ -52,7 +53,7 @@ def warnings(scene: Scene, designs: Params, names: list[str]) -> list[str]:
 
 def refusals(scene: Scene, designs: Params, names: list[str]) -> list[str]:
     """Why designs, arrays with leading axis (design,), must not be simulated."""
-    limit = np.asarray(scene.hand.pressure_limit.of(designs.height, designs.wall))
+    limit = morphology.pressure_limits(scene.hand, designs)
     found = [
         f"{names[i]}: finger {f}: pressure {designs.pressure[i, f]:.4g} Pa is above the limit of "
         f"{limit[i, f]:.4g} Pa for a wall of {designs.wall[i, f]:g} m"

@@ -249,7 +249,8 @@ def _checked(
     axes.refuse_constants(constants, len(trials.yaw), "world")
     unit_slips.refuse(params)
     if not isinstance(params.height, jax.core.Tracer):
-        reach.refuse(scene.objects, float(np.asarray(params.height).max()) / 2)
+        heights = [params.height] if params.tip is None else [params.height, params.tip.height]
+        reach.refuse(scene.objects, float(np.max(heights)) / 2)
     return constants
 
 

@@ -76,6 +76,20 @@ def failed(status: Any) -> Any:
     return (status & _FAILURES) != 0
 
 
+class Tip(NamedTuple):
+    """Sections at the tips of tapered fingers; between base and tip they change linearly.
+
+    Attributes:
+      height: Section height [m], shape (finger,).
+      wall: Hull thickness [m], shape (finger,).
+      width: Section width [m], shape (finger,).
+    """
+
+    height: Any
+    wall: Any
+    width: Any
+
+
 class Params(NamedTuple):
     """Morphology and control parameters of one hand (Table I), SI units and radians.
 
@@ -87,6 +101,8 @@ class Params(NamedTuple):
       arm: Arm pose X_D after the approach: x, y, z [m], roll, pitch, yaw [rad], shape (6,).
       pressure: Chamber gauge pressure while grasping p_i [Pa], shape (finger,).
       control: Parameters of the scene's control by name [SI], shape () or (finger,); None without.
+      tip: Sections at the tips of a hand whose fingers are tapered; height and wall are those at
+        the base. None of a hand whose fingers are not.
 
     A design space makes them of the numbers that are free, given in the units of the hand file:
 
@@ -104,6 +120,7 @@ class Params(NamedTuple):
     arm: jax.Array
     pressure: jax.Array
     control: dict[str, jax.Array] | None = None
+    tip: Tip | None = None
 
 
 class Trial(NamedTuple):

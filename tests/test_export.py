@@ -197,7 +197,7 @@ def test_spheres_stand_where_the_engine_has_its_rings(skinned):
     hand = lanes(alone, repeat(fields, 1))
     rings = np.asarray(packing.ring_numbers(alone, hand, 2))[:, :, 1, 0]
     segment = params.length[1] / alone.discretization.links
-    found = skin.balls(alone, 1, float(params.length[1]), float(params.height[1]))
+    found = skin.balls(alone, 1, params)
     np.testing.assert_allclose([b.place for b in found], rings[:, :3], atol=1e-6)
     np.testing.assert_allclose([b.share for b in found], rings[:, 6], rtol=1e-5)
     total = sum(share for name, share in shares.items() if name.startswith("finger_1"))

@@ -9,13 +9,21 @@ import pytest
 import trimesh
 from numpy.polynomial import Polynomial
 
-from codesign_jax import cli
+from codesign_jax import cli, scene
 from codesign_jax.export import casting, meshes, process
-from codesign_jax.export.process import Process, Size
+from codesign_jax.export.process import Process, Section, Size
 from codesign_jax.scene import schema
+from codesign_jax.types import Params
 from tests.helpers.toy_engine import TINY
 
-USUAL, FLAT, SHORT = Size(95, 20, 20, 5, 5), Size(170, 20, 15, 7, 7), Size(12, 20, 25, 2, 2)
+
+def uniform(length, width, height, wall):
+    section = Section(width, height, wall)
+    return Size(length, section, section, wall)
+
+
+USUAL, FLAT, SHORT = uniform(95, 20, 20, 5), uniform(170, 20, 15, 7), uniform(12, 20, 25, 2)
+TAPERED = Size(120, Section(24, 22, 5), Section(16, 14, 3), 4.0)
 # STL holds float32: seven digits of lengths of up to 200 mm.
 EXACT = 1e-4
 
@@ -55,8 +63,9 @@ def test_files_hold_closed_bodies_in_millimetres(written):
 def test_walls_and_chamber_are_the_design_s(written, name, size):
     """Rays through the finger meet its surfaces at the thickness of the walls."""
     surface = trimesh.load_mesh(written[0] / f"finger_{name}.stl")
-    x, y, z = size.length / 2, 0.3 * size.chamber[1] / 2, size.wall + 0.3 * size.chamber[2]
-    thick = {0: size.end, 1: size.wall, 2: size.wall}
+    wall, (across, up) = size.base.wall, size.base.chamber
+    x, y, z = size.length / 2, 0.3 * across / 2, wall + 0.3 * up
+    thick = {0: size.end, 1: wall, 2: wall}
     for axis in range(3):
         origin, direction = np.array([x, y, z]), np.zeros(3)
         origin[axis] = surface.bounds[0, axis] - 10
@@ -98,7 +107,7 @@ def test_what_the_moulds_hold_is_the_finger(tmp_path, draft):
     """The closed mould's cavity, from the files: the shell; the base's pocket: the bottom wall."""
     size, how = USUAL, Process(draft=draft, inlet=0.0)
     meshes.write(tmp_path, [size], how)
-    length, width, height, wall, _ = size
+    length, (width, height, wall) = size.length, size.base
     # Back into the frame of the finger: the tray was turned over, the core's bars stood below it.
     tray = solid(tmp_path / "finger_0_tray.stl").translate([0, 0, -height - how.mould_wall])
     tray = tray.rotate([180, 0, 0])
@@ -113,7 +122,8 @@ def test_what_the_moulds_hold_is_the_finger(tmp_path, draft):
         integral = ((a + 2 * side) * (b + 2 * side)).integ()
         return integral(high) - integral(low)
 
-    shell = prism(length, width, wall, height) - prism(*size.chamber[:2], wall, height - wall)
+    chamber = length - 2 * wall, size.base.chamber[0]
+    shell = prism(length, width, wall, height) - prism(*chamber, wall, height - wall)
     assert cast.volume() == pytest.approx(shell, rel=EXACT)
     base = solid(tmp_path / "finger_0_base.stl").translate([0, 0, -how.mould_wall])
     pocket = box([-2, -width / 2 - 2, 0], [length + 2, width / 2 + 2, wall]) - base
@@ -123,9 +133,36 @@ def test_what_the_moulds_hold_is_the_finger(tmp_path, draft):
         assert cast.volume() + pocket.volume() == pytest.approx(size.volume, rel=EXACT)
     # The walls keep their thickness: what is between core and tray at any height.
     for height_at in (wall + 1, height - wall - 1):
-        [ray] = cast.ray_cast([50.0, -50, height_at], [50.0, -size.chamber[1] / 2, height_at])[:1]
+        [ray] = cast.ray_cast([50.0, -50, height_at], [50.0, -chamber[1] / 2, height_at])[:1]
         inner = cast.ray_cast([50.0, -50, height_at], [50.0, 0, height_at])[1]
         assert inner.position[1] - ray.position[1] == pytest.approx(wall, abs=1e-3)
+
+
+def test_moulds_of_a_tapered_finger_hold_it(tmp_path):
+    """Shell and bottom wall are the finger, by Simpson's rule over its sections; walls have the
+    thickness of the place."""
+    how = Process(inlet=0.0)
+    meshes.write(tmp_path, [TAPERED], how)
+    finger, tray, core, base = (
+        solid(tmp_path / f"finger_0{kind}.stl") for kind in ("", "_tray", "_core", "_base")
+    )
+    assert finger.volume() == pytest.approx(TAPERED.volume, rel=EXACT)
+    made = casting.parts(TAPERED, how)
+    for part, file in zip(made, (finger, tray, core, base), strict=True):
+        assert part.volume() == pytest.approx(file.volume(), rel=EXACT)
+    assert (made.tray ^ made.core).volume() == pytest.approx(0, abs=1e-6)
+    assert core.genus() == 2 * len(casting.bars_of(TAPERED))
+    x, half = (-2.0, 122.0), casting._shifted(casting._half(TAPERED), 2.0)
+    rim, top = casting._rim(TAPERED), lambda x: TAPERED.at(x).height
+    shell = casting._solid(x, half, rim, top) - made.tray - made.core
+    pocket = casting._solid(x, half, lambda x: 0.0, rim) - made.base
+    assert shell.volume() + pocket.volume() == pytest.approx(TAPERED.volume, rel=1e-6)
+    for x in (10.0, 110.0):
+        top = TAPERED.at(x).height
+        hits = finger.ray_cast([x, 0.3, top + 5], [x, 0.3, -5])
+        at = sorted(hit.position[2] for hit in hits)
+        wall = TAPERED.at(x).wall
+        np.testing.assert_allclose(at, [0, wall, top - wall, top], atol=1e-3)
 
 
 def test_the_core_is_one_piece_with_openings_to_pour(written):
@@ -138,12 +175,17 @@ def test_the_core_is_one_piece_with_openings_to_pour(written):
 
 
 def test_a_finger_without_a_chamber_is_refused():
+    hand = scene.load("paper").hand
+    one = np.ones(2)
+    params = Params(one, 0.02 * one, 0.005 * one, 0.0, np.zeros(6), one)
+    params = params._replace(length=np.array([0.01, 0.1]))
     with pytest.raises(schema.InputError) as error:
-        process.sizes([0.01, 0.1], 0.02, [0.02, 0.02], [0.005, 0.005], Process())
+        process.sizes(hand, params, Process())
     [problem] = error.value.problems
     assert "finger 0 of 10 mm" in problem and "--end-wall" in problem
-    sizes = process.sizes([0.01], 0.02, [0.02], [0.005], Process(end_wall=1.5))
-    assert sizes == [Size(10, 20, 20, 5, 1.5)] and sizes[0].chamber == (7, 10, 10)
+    found, _ = process.sizes(hand, params, Process(end_wall=1.5))
+    width = 1e3 * hand.section.width
+    assert found.chamber_ends == (1.5, 8.5) and found.base.chamber == (width - 10, 10)
 
 
 def test_a_damaged_file_is_noticed(monkeypatch, tmp_path):

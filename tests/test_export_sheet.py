@@ -143,8 +143,7 @@ def page():
     the_scene = scene.load("paper_spheres")
     space = parameters.design_space(the_scene.hand, "full")
     params = jax.tree.map(np.asarray, space.params(space.default()))
-    width = the_scene.hand.section.width
-    sizes = process.sizes(params.length, width, params.height, params.wall, Process())
+    sizes = process.sizes(the_scene.hand, params, Process())
     planned = tolerance.study(the_scene, space, space.default(), STEPS, free=False)
     good = np.abs(planned.designs - space.default())[:, 0] < 0.02
     shares = tolerance.shares(outcomes(np.where(good, 1.0, 0.4)))
@@ -194,7 +193,7 @@ def test_text_stands_apart_from_the_drawings(page):
     for (text, one), (other, two) in itertools.combinations(boxes.items(), 2):
         assert not one.overlaps(two), (text, other)
     for axes in figure.axes[:2]:
-        drawn = [axes.transData.transform_bbox(patch.get_bbox()) for patch in axes.patches[:1]]
+        drawn = [patch.get_window_extent() for patch in axes.patches[:1]]
         for text, box in boxes.items():
             assert not any(box.overlaps(patch) for patch in drawn), text
     assert min(box.y0 for box in boxes.values()) > 0, "all of it is on the page"

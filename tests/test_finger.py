@@ -26,8 +26,9 @@ def made(links=10, **effects):
 def test_closed_forms_of_beams(links):
     """M L / EI; M / L; 3 M / 2 L and P L^3 / 3 EI, both up to the chain's 1 - 1 / (4 N^2)."""
     mine, chain = made(links), 1 - 1 / (4 * links**2)
-    moment, rigidity = 1e-3 * mine.stiffness, mine.stiffness * mine.segment  # 1e-3 rad a joint
-    pressure = moment / mine.gain
+    [stiffness], [gain] = mine.stiffness, mine.gain
+    moment, rigidity = 1e-3 * stiffness, stiffness * mine.segment  # 1e-3 rad a joint
+    pressure = moment / gain
     load = 0.1 * moment / mine.length
     table = {n: np.array([pressure]) for n in ("pressure", *finger.MEASURED)}
     table["load"] = np.array([load])
@@ -44,7 +45,7 @@ def test_closed_forms_of_beams(links):
 def test_a_large_load_gives_the_elastica(alpha):
     """Bisshopp and Drucker's tip; at 40 links the chain errs by 3e-4 at most."""
     mine = made(40)
-    load = alpha * mine.stiffness * mine.segment / mine.length**2
+    load = alpha * mine.stiffness[0] * mine.segment / mine.length**2
     rest = finger.Rest.of(mine, 0.0, load)
     assert -rest.height / mine.length == pytest.approx(beams.elastica(alpha)[0], rel=3e-4)
 
@@ -52,14 +53,15 @@ def test_a_large_load_gives_the_elastica(alpha):
 def test_neo_hookean_bending_is_the_law_s_quadrature():
     mine = made(neo_hookean=True)
     pressure = 60e3
-    y = np.linspace(0, mine.height, 20001)
-    solid = (y < mine.wall) | (y > mine.height - mine.wall)
-    width = np.where(solid, mine.width, 2 * mine.wall)
+    [height], [wall], [outer] = mine.section
+    y = np.linspace(0, height, 20001)
+    solid = (y < wall) | (y > height - wall)
+    width = np.where(solid, outer, 2 * wall)
 
     def missing(curvature):
         stretch = 1 + curvature * y
-        wall = mine.shear_modulus * integrate.trapezoid((stretch - stretch**-3) * y * width, y)
-        return wall - pressure * mine.gain
+        moment = mine.shear_modulus * integrate.trapezoid((stretch - stretch**-3) * y * width, y)
+        return moment - pressure * mine.gain[0]
 
     curvature = optimize.brentq(missing, 1e-3, 200.0)
     found = finger.Rest.of(mine, pressure).angles.sum()

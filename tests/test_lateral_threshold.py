@@ -25,9 +25,10 @@ SETTINGS = {"effects__lateral_threshold": True}
 def hand_and_numbers(the_scene):
     """Parameters of the hand, and the numbers of its first finger's joints."""
     params, _ = grasps.hand_world(the_scene, length=0.1)
-    beams = morphology.finger_beams(the_scene.hand, params)
     links = the_scene.discretization.links
-    return params, beams, morphology.thresholds(the_scene.hand, params, beams, links)[0]
+    beams = morphology.finger_beams(the_scene.hand, params, links)
+    numbers = morphology.thresholds(the_scene.hand, params, beams, links)[0, 0]
+    return params, jax.tree.map(lambda v: v[:, 0], beams), numbers
 
 
 # --- the law -------------------------------------------------------------------------------------
@@ -163,7 +164,7 @@ def stiffen(the_scene, model_, data, fields):
     angles = data.qpos[lay.dofs]
     for f, j in np.ndindex(*lay.dofs.shape[:2]):
         bend, lateral = lay.dofs[f, j, :2]
-        numbers, (q, s) = np.asarray(fields.threshold)[0, f], angles[f, j, :2]
+        numbers, (q, s) = np.asarray(fields.threshold)[0, f, 0], angles[f, j, :2]
         moment = max(numbers[0] * data.ctrl[6 + f] - numbers[1] * q, 0.0)
         length = np.hypot(s, numbers[2])
         added = moment / length

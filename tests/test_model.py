@@ -12,6 +12,7 @@ from codesign_jax import model, rollout, scene
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.model import spec
 from tests.helpers.grasps import (
+    DATA,
     hand_world,
     nth,
     pinch,
@@ -65,10 +66,11 @@ SCENES = {
         effects__palm_table=False,
     ),
     "one link": lambda: pinch("cylinder", links=1),
+    "tapered": lambda: scene.load("paper_spheres", hand_name=DATA / "tapered.toml"),
 }
 
 
-QUICK = ("pneuflex4", "tripod3, two spheres")
+QUICK = ("pneuflex4", "tripod3, two spheres", "tapered")
 
 
 @pytest.fixture(

@@ -12,7 +12,7 @@ from scipy import integrate
 from codesign_jax import scene
 from codesign_jax.model import morphology
 from codesign_jax.scene import primitives
-from codesign_jax.types import Params
+from codesign_jax.types import Params, Tip
 
 repeatable = settings(max_examples=100, deadline=None, derandomize=True)
 heights, walls = st.floats(0.015, 0.025), st.floats(0.002, 0.007)
@@ -130,9 +130,9 @@ def test_segments_are_a_finger_cut_in_pieces(links):
     """Mass, centre and inertia about the base of one block as long; its springs in series."""
     hand = scene.load("paper").hand
     params = Params(*np.array([[0.09, 0.13], [0.018, 0.021], [0.004, 0.005]]), 0.0, None, None)
-    beams = morphology.finger_beams(hand, params)
-    found = morphology.segments(hand, params, beams, links)
-    length, height, mass = params.length, params.height, beams.line_density * params.length
+    beams = morphology.finger_beams(hand, params, links)
+    found = morphology.segments(hand, params, links)
+    length, height, mass = params.length, params.height, beams.line_density[:, 0] * params.length
     joint = np.cumsum(found.offset, 1)
     # A joint stands in the middle of each segment.
     np.testing.assert_allclose(joint, np.outer(length, (np.arange(links) + 0.5) / links))
@@ -145,12 +145,70 @@ def test_segments_are_a_finger_cut_in_pieces(links):
     np.testing.assert_allclose(about, mass * (length**2 / 3 + height**2 / 12))
     for name, rigidity in (("bend", "bending"), ("lateral", "lateral"), ("twist", "torsion")):
         stiffness, damping = morphology.joint_springs(hand, params, beams, links, (name,))
-        np.testing.assert_allclose(links / stiffness[:, 0], length / getattr(beams, rigidity))
+        whole = length / getattr(beams, rigidity)[:, 0]
+        np.testing.assert_allclose(links / stiffness[:, 0, 0], whole)
         np.testing.assert_allclose(damping, hand.material.damping_time * stiffness)
     spheres = morphology.sphere_places(found.extent, 3)
     assert spheres.shape == (2, links, 3)
     np.testing.assert_allclose(spheres.mean(2), found.extent[:, 1:] / 2)
     np.testing.assert_allclose(np.diff(spheres, axis=2).max(2), found.extent[:, 1:] / 3)
+
+
+def tapered():
+    """Two fingers of the paper's hand whose sections shrink towards the tips."""
+    hand = scene.load("paper").hand
+    base = Params(*np.array([[0.09, 0.13], [0.022, 0.021], [0.005, 0.004]]), 0.0, None, None)
+    tip = Tip(np.array([0.013, 0.016]), np.array([0.003, 0.0035]), np.array([0.016, 0.02]))
+    return hand, base._replace(tip=tip)
+
+
+def test_a_tapered_finger_is_the_integral_of_its_sections():
+    """Mass, centre and compliance by SciPy's quadrature over the sections, as links go to many."""
+    hand, params = tapered()
+    for f in range(2):
+
+        def beam(s, f=f):
+            base = np.array([params.height[f], params.wall[f], hand.section.width])
+            h, d, w = base + s * (np.array([v[f] for v in params.tip]) - base)
+            m = hand.material
+            return h, morphology.beam(
+                h, d, width=w, shear_modulus=m.shear_modulus, density=m.density
+            )
+
+        def integral(weight, f=f):
+            return params.length[f] * integrate.quad(weight, 0, 1, epsabs=1e-14)[0]
+
+        mass = integral(lambda s: beam(s)[1].line_density)
+        along = integral(lambda s, f=f: params.length[f] * s * beam(s)[1].line_density) / mass
+        up = integral(lambda s: beam(s)[0] / 2 * beam(s)[1].line_density) / mass
+        bend = integral(lambda s: beam(s)[1].moment_per_pressure / beam(s)[1].bending)
+        for links in (1, 3, 10):
+            found = morphology.segments(hand, params, links)
+            start = np.concatenate([[0], np.cumsum(found.offset[f])])
+            assert found.mass[f].sum() == pytest.approx(mass, rel=1e-12)
+            centre = start + found.along[f]
+            assert (centre * found.mass[f]).sum() / mass == pytest.approx(along, rel=1e-12)
+            assert (found.up[f] * found.mass[f]).sum() / mass == pytest.approx(up, rel=1e-12)
+            # Midpoints: the error of a joint's angle goes with the square of its segment.
+            beams = morphology.finger_beams(hand, params, links)
+            springs, _ = morphology.joint_springs(hand, params, beams, links, ("bend",))
+            chain = (beams.moment_per_pressure[f] / springs[f, :, 0]).sum()
+            assert chain == pytest.approx(bend, rel=0.12 / links**2)
+        free = morphology.free_bends(hand, params._replace(pressure=np.full(2, 1e5)))
+        assert free[f] == pytest.approx(1e5 * bend, rel=1e-4)
+
+
+def test_a_taper_of_nothing_is_a_uniform_finger():
+    hand, params = tapered()
+    width = np.full(2, hand.section.width)
+    same = params._replace(tip=Tip(params.height, params.wall, width))
+    plain = params._replace(tip=None)
+    for found, expected in (
+        (morphology.segments(hand, p, 4) for p in (same, plain)),
+        (morphology.finger_beams(hand, p, 4) for p in (same, plain)),
+    ):
+        for a, b in zip(found, expected, strict=True):
+            np.testing.assert_allclose(a, np.broadcast_to(b, a.shape), rtol=1e-14)
 
 
 def test_beams_differentiate():

@@ -348,6 +348,12 @@ SCENES = {
     "mesh and hull": {"effects__surface": "hull"},
     "three fingers": {"effects__finger_finger": True, "effects__friction_memory": True},
     "capsule": {},
+    "tapered": {
+        "effects__surface": "hull",
+        "effects__finger_finger": True,
+        "effects__finger_itself": True,
+        "effects__neo_hookean": True,
+    },
 }
 
 
@@ -383,8 +389,9 @@ def test_derivatives_of_scenes(name, tmp_path):
     with jax.enable_x64(True):
         if name.startswith("mesh"):
             the_scene = loaded(DATA / "pinch.toml", mixed(tmp_path), settings)
-        elif name == "three fingers":
-            the_scene = loaded("tripod3", DATA / "sphere.toml", settings)
+        elif name in ("three fingers", "tapered"):
+            hand = "tripod3" if name == "three fingers" else DATA / "tapered.toml"
+            the_scene = loaded(hand, DATA / "sphere.toml", settings)
         else:
             shape = "capsule" if name == "capsule" else "sphere"
             the_scene = grasps.pinch(shape, links=2, **settings)

@@ -31,7 +31,7 @@ def _numbers(height, segment, width):
     scene = load("paper")
     section = np.array([height, 0.0, segment, width])[:, None, None]
     with jax.enable_x64(True):
-        hand = SimpleNamespace(section=jnp.asarray(section))
+        hand = SimpleNamespace(section=jnp.asarray(section), tip=None)
         found = packing.ring_numbers(scene, hand, scene.discretization.hull_rings)
         return np.asarray(found)[..., 0, 0].T
 

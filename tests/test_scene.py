@@ -295,6 +295,20 @@ def test_a_wrong_hand_file(tmp_path, old, new, expected):
     assert len([p for p in problems if expected in p]) == 1, problems
 
 
+def test_sections_at_the_tips_are_for_tapered_fingers():
+    def told(hand_name, changes):
+        with pytest.raises(schema.InputError) as error:
+            scene.load("paper", hand_name=hand_name, overrides=changes)
+        return " ".join(error.value.problems)
+
+    missing = told("pneuflex4", {"hand.section.tapered": True})
+    assert "parameter 'tip_wall' must be given once, not 0 times" in missing
+    needless = told("tapered4", {"hand.section.tapered": False})
+    assert "parameter 'tip_width' needs section.tapered = true" in needless
+    thick = told("tapered4", {"hand.parameter.tip_height.low": 7})
+    assert "a tip_height of 0.007 m leaves no air chamber between walls of 0.004 m" in thick
+
+
 def test_bounds_of_fingers_that_share_nothing_cannot_be_tied(tmp_path):
     shared = ("tied = true\nlow = 10\nhigh = 180", "tied = true")
     (problem,) = hand_problems(tmp_path, (TABLE, APART), shared)

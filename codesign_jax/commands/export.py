@@ -67,8 +67,7 @@ def _process(options: "Export") -> Process:
 
 
 def _sizes(case: Case, params: Params, options: "Export") -> list[Size]:
-    width = case.scene.hand.section.width
-    return process.sizes(params.length, width, params.height, params.wall, _process(options))
+    return process.sizes(case.scene.hand, params, _process(options))
 
 
 def _check(options: "Export", case: Case) -> None:
@@ -152,7 +151,7 @@ def _parts(sizes: list[Size], folder: Path, options: "Export", console: Console)
             console.print(line)
     for i, size in enumerate(sizes):
         if how.inlet and not process.inlet(size, how):
-            low = min(size.chamber[1:])
+            low = min(size.base.chamber)
             console.print(
                 f"finger {i} has no inlet: its chamber of {low:g} mm is narrower than the tube"
             )

@@ -65,8 +65,11 @@ def main(options: "Options") -> int:
 
 def _about(mine: Finger, number: int, hand: str) -> str:
     law = "neo-Hookean" if mine.neo_hookean else "linear"
-    size = f"{1e3 * mine.length:.4g} mm long, section {1e3 * mine.width:.4g} x "
-    size += f"{1e3 * mine.height:.4g} mm, walls {1e3 * mine.wall:.4g} mm"
+    ends = [
+        "section {2:.4g} x {0:.4g} mm, walls {1:.4g} mm".format(*(1e3 * v[k] for v in mine.section))
+        for k in (0, -1)
+    ]
+    size = f"{1e3 * mine.length:.4g} mm long, {' to '.join(dict.fromkeys(ends))}"
     return (
         f"finger {number} of {hand}: {size}; bending law {law}, G = "
         f"{1e-3 * mine.shear_modulus:.4g} kPa, {mine.links} links, without weight"

@@ -25,6 +25,9 @@ from codesign_jax.model import (
 from codesign_jax.scene import Scene, effects
 from codesign_jax.types import Trace
 
+_STATIC = ("wrap_prm",)
+"""Fields that MJX takes for constants: what a world has of its own is applied as a force."""
+
 
 class MjxEngine(Equal):
     """Steps every world with `mjx.step` under vmap and scan."""
@@ -48,7 +51,8 @@ class MjxEngine(Equal):
         NumPy fields become JAX arrays: MJX takes a NumPy field for the same at every body of a
         depth of the tree, and refuses fingers whose mounts lie at different points.
         """
-        values = {name: jnp.asarray(value) for name, value in fields.of_model.items()}
+        given = {k: v for k, v in fields.of_model.items() if k not in _STATIC}
+        values = {name: jnp.asarray(value) for name, value in given.items()}
         return self.template.tree_replace(values)  # type: ignore[arg-type]
 
     def reset(self, fields: ModelFields) -> mjx.Data:
@@ -57,9 +61,14 @@ class MjxEngine(Equal):
 
     def step(self, fields: ModelFields, data: mjx.Data, ctrl: jax.Array) -> mjx.Data:
         """Advances one world by one time step under controls of shape (nu,)."""
+        bend, moments = layout(self.scene).dofs[..., 0], None
         if self.scene.effects.neo_hookean:
-            bend = layout(self.scene).dofs[..., 0]
             moments = softening_moments(self.scene, fields, data.qpos[bend])
+        if fields.wrap_prm is not None:
+            share = (fields.wrap_prm - self.template.wrap_prm).reshape(bend.shape)
+            more = share * (fields.actuator_gainprm[6:, 0] * ctrl[6:])[:, None]
+            moments = more if moments is None else moments + more
+        if moments is not None:
             data = data.replace(qfrc_applied=data.qfrc_applied.at[bend].set(moments))
         return mjx.step(self.model(fields), data.replace(ctrl=ctrl))
 

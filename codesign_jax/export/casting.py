@@ -2,8 +2,8 @@
 
 Frame: that of the finger's base, x along the finger, y across, z up from the inextensible bottom
 layer.  The finger is the design's: a block of length x width x height around a chamber with walls
-of one thickness on all sides.  The design is a beam and says nothing of ends, inlet and moulds; how
-they are made is ours.
+of one thickness on all sides, each of which may change linearly from base to tip.  The design is a
+beam and says nothing of ends, inlet and moulds; how they are made is ours.
 
 A finger is cast in two steps.  First the shell, all but the bottom wall, back downwards in a tray
 around a core that hangs from bars over the tray's rim; the mould is open between the bars, where
@@ -12,12 +12,16 @@ the floor of a second tray; the cured shell is set into it and bonds.
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import manifold3d
 import numpy as np
 
 from codesign_jax.export.process import Process, Size, inlet
+
+Line = Callable[[float], float]
+"""A number that changes linearly along a finger."""
 
 BAR, SPACING, OVERLAP = 6.0, 40.0, 5.0
 """Width of the core's bars, largest distance between two, and how deep parts sit in a mould."""
@@ -52,83 +56,117 @@ def parts(size: Size, process: Process) -> Parts:
                  _base(size, process))  # fmt: skip
 
 
-def _box(x: tuple[float, float], y: float, z: tuple[float, float]) -> manifold3d.Manifold:
-    """A box from x[0] to x[1], -y to y and z[0] to z[1]."""
-    cube = manifold3d.Manifold.cube([x[1] - x[0], 2 * y, z[1] - z[0]])
-    return cube.translate([x[0], -y, z[0]])
-
-
-def _chamber(size: Size) -> tuple[tuple[float, float], float, tuple[float, float]]:
-    """Bounds of the chamber, as `_box` takes them."""
-    across = (size.end, size.length - size.end)
-    return across, size.chamber[1] / 2, (size.wall, size.height - size.wall)
-
-
-def _finger(size: Size, process: Process) -> manifold3d.Manifold:
-    block = _box((0, size.length), size.width / 2, (0, size.height))
-    found = block - _box(*_chamber(size))
-    radius = inlet(size, process) / 2
-    if radius:
-        reach = size.end + min(1.0, size.chamber[0] / 2) + 1.0
-        tube = manifold3d.Manifold.cylinder(reach, radius, radius, SEGMENTS)
-        found -= tube.rotate([0, 90, 0]).translate([-1.0, 0, size.height / 2])
-    return found
-
-
-def slope(size: Size, process: Process, z: float) -> float:
-    """How much wider than the design side faces of tray and core are at a height, on each side."""
-    middle = (size.wall + size.height) / 2
-    return math.tan(math.radians(process.draft)) * (middle - z)
-
-
-def _drafted(
-    size: Size, process: Process, x: tuple[float, float], y: float, z: tuple[float, float]
+def _solid(
+    x: tuple[float, float], half: Line, low: Line, high: Line, grow: Callable | None = None
 ) -> manifold3d.Manifold:
-    """A box whose side faces have the draft."""
+    """The body from x[0] to x[1], -half to half and low to high, whose faces are plane.
+
+    Args:
+      x: Where it begins and ends.
+      half: Half of its width.
+      low: Its underside.
+      high: Its top.
+      grow: How far its four upright faces are moved outwards, at a place along and a height.
+    """
     corners = []
-    for height in z:
-        s = slope(size, process, height)
-        corners += [[a, b, height] for a in (x[0] - s, x[1] + s) for b in (-y - s, y + s)]
+    for end, side in zip(x, (-1, 1), strict=True):
+        for level in (low, high):
+            at = end + side * grow(end, level(end)) if grow else end
+            z = level(at)
+            wide = half(at) + (grow(at, z) if grow else 0.0)
+            corners += [[at, -wide, z], [at, wide, z]]
     return manifold3d.Manifold.hull_points(np.array(corners))
 
 
-def _around(size: Size, grow: float, z: tuple[float, float]) -> manifold3d.Manifold:
-    """A box around the finger's outline, grown by as much on each side."""
-    return _box((-grow, size.length + grow), size.width / 2 + grow, z)
+def _rim(size: Size) -> Line:
+    """Top of the bottom wall, where shell and bottom meet."""
+    return lambda x: size.at(x).wall
+
+
+def _shifted(line: Line, by: float) -> Line:
+    return lambda x: line(x) + by
+
+
+def _half(size: Size) -> Line:
+    return lambda x: size.at(x).width / 2
+
+
+def _chamber(size: Size) -> tuple[Line, Line, Line]:
+    """Half of the chamber's width, its underside and its top."""
+    return (
+        lambda x: size.at(x).chamber[0] / 2,
+        _rim(size),
+        lambda x: size.at(x).height - size.at(x).wall,
+    )
+
+
+def _finger(size: Size, process: Process) -> manifold3d.Manifold:
+    block = _solid((0.0, size.length), _half(size), lambda x: 0.0, lambda x: size.at(x).height)
+    found = block - _solid(size.chamber_ends, *_chamber(size))
+    radius = inlet(size, process) / 2
+    if radius:
+        start, end = size.chamber_ends
+        reach = start + min(1.0, (end - start) / 2) + 1.0
+        tube = manifold3d.Manifold.cylinder(reach, radius, radius, SEGMENTS)
+        found -= tube.rotate([0, 90, 0]).translate([-1.0, 0, size.base.height / 2])
+    return found
+
+
+def slope(size: Size, process: Process, x: float, z: float) -> float:
+    """How much wider than the design side faces of tray and core are there, on each side."""
+    middle = (size.at(x).wall + size.at(x).height) / 2
+    return math.tan(math.radians(process.draft)) * (middle - z)
+
+
+def _around(size: Size, grow: Line, low: Line, high: Line) -> manifold3d.Manifold:
+    """A body around the finger's outline, grown by as much on each side."""
+    return _solid((0.0, size.length), _half(size), low, high, lambda x, z: grow(x))
 
 
 def _tray(size: Size, process: Process) -> manifold3d.Manifold:
-    wall, opening = process.mould_wall, size.wall
-    outer = _around(size, _outside(size, process), (opening, size.height + wall))
+    rim, top = _rim(size), lambda x: size.at(x).height
+    outer = _around(size, _outside(size, process), rim, _shifted(top, process.mould_wall))
     # The cavity goes on below its opening, so that no two faces coincide there.
-    cavity = (0, size.length), size.width / 2, (opening - 1.0, size.height)
-    return outer - _drafted(size, process, *cavity)
+    cavity = (0.0, size.length), _half(size), _shifted(rim, -1.0), top
+    return outer - _solid(*cavity, lambda x, z: slope(size, process, x, z))
 
 
-def _outside(size: Size, process: Process) -> float:
+def _at_rim(size: Size, process: Process) -> Line:
+    """How far the shell goes beyond the finger's outline at its rim, by the draft."""
+    return lambda x: slope(size, process, x, size.at(x).wall)
+
+
+def _outside(size: Size, process: Process) -> Line:
     """How far the tray goes beyond the finger's outline on each side."""
-    return process.mould_wall + slope(size, process, size.wall)
+    return _shifted(_at_rim(size, process), process.mould_wall)
+
+
+def _overlap(size: Size) -> float:
+    """How deep parts sit in one another."""
+    return min(OVERLAP, *((s.height - s.wall) / 2 for s in (size.base, size.tip)))
 
 
 def _core(size: Size, process: Process) -> manifold3d.Manifold:
     """Core, spine and bars, and a frame that lies on the tray's rim and reaches around it."""
-    wall, rim = process.mould_wall, size.wall
-    (start, end), half, (low, high) = _chamber(size)
-    core = _drafted(size, process, (start, end), half, (low - wall / 2, high))
-    inside = _outside(size, process) + process.clearance
-    depth = min(OVERLAP, (size.height - rim) / 2)
-    frame = _around(size, inside + wall, (rim - wall, rim + depth))
-    frame -= _around(size, inside, (rim, rim + depth + 1.0))
-    frame -= _around(size, slope(size, process, rim), (rim - wall - 1.0, rim + 1.0))
-    spine = _box((start, end), half, (rim - wall, rim))
-    across = size.width / 2 + inside
-    bars = [_box((x - w / 2, x + w / 2), across, (rim - wall, rim)) for x, w in bars_of(size)]
+    wall, rim, ends = process.mould_wall, _rim(size), size.chamber_ends
+    half, low, high = _chamber(size)
+    drafted = lambda x, z: slope(size, process, x, z)  # noqa: E731
+    core = _solid(ends, half, _shifted(low, -wall / 2), high, drafted)
+    inside = _shifted(_outside(size, process), process.clearance)
+    below, depth = _shifted(rim, -wall), _overlap(size)
+    frame = _around(size, _shifted(inside, wall), below, _shifted(rim, depth))
+    frame -= _around(size, inside, rim, _shifted(rim, depth + 1.0))
+    opening = _at_rim(size, process)
+    frame -= _around(size, opening, _shifted(below, -1.0), _shifted(rim, 1.0))
+    spine = _solid(ends, half, below, rim)
+    across = lambda x: size.at(x).width / 2 + inside(x)  # noqa: E731
+    bars = [_solid((x - w / 2, x + w / 2), across, below, rim) for x, w in bars_of(size)]
     return manifold3d.Manifold.batch_boolean([core, frame, spine, *bars], manifold3d.OpType.Add)
 
 
 def bars_of(size: Size) -> list[tuple[float, float]]:
     """Middle along the finger, and width, of the bars that hold the core."""
-    start, end = size.end, size.length - size.end
+    start, end = size.chamber_ends
     width = min(BAR, end - start)
     span = end - start - width
     if span < 2 * BAR:  # no opening is left between two
@@ -139,8 +177,8 @@ def bars_of(size: Size) -> list[tuple[float, float]]:
 
 def _base(size: Size, process: Process) -> manifold3d.Manifold:
     """A tray as deep as the bottom wall, and above that wide enough to set the shell into it."""
-    wall, wide = process.mould_wall, slope(size, process, size.wall)
-    top = size.wall + min(OVERLAP, (size.height - size.wall) / 2)
-    outer = _around(size, wide + process.clearance + wall, (-wall, top))
-    outer -= _around(size, wide, (0.0, top + 1.0))
-    return outer - _around(size, wide + process.clearance, (size.wall, top + 1.0))
+    wall, rim, wide = process.mould_wall, _rim(size), _at_rim(size, process)
+    top, room = _shifted(rim, _overlap(size)), _shifted(wide, process.clearance)
+    outer = _around(size, _shifted(room, wall), lambda x: -wall, top)
+    outer -= _around(size, wide, lambda x: 0.0, _shifted(top, 1.0))
+    return outer - _around(size, room, rim, _shifted(top, 1.0))

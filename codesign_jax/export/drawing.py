@@ -142,28 +142,37 @@ def _rectangle(axes: Axes, low: tuple[float, float], size: Sequence[float], colo
 
 
 def _section(axes: Axes, size: Size) -> None:
-    """Cross-section of finger 0 with its measures."""
-    _rectangle(axes, (-size.width / 2, 0), (size.width, size.height), "0.8")
-    _rectangle(axes, (-size.chamber[1] / 2, size.wall), (size.chamber[1], size.chamber[2]), "white")
-    axes.plot([-size.width / 2, size.width / 2], [0, 0], color="tab:red", lw=2)
-    axes.text(0, -0.06 * size.height, f"{size.width:.1f}", ha="center", va="top", fontsize=6)
-    axes.text(-0.53 * size.width, size.height / 2, f"{size.height:.1f}", ha="right", fontsize=6)
-    axes.text(0, size.wall / 2, f"{size.wall:.1f}", ha="center", va="center", fontsize=6)
-    _finish(axes, "section of finger 0 [mm]; red: fabric")
-    axes.set(xlim=(-0.85 * size.width, 0.85 * size.width), ylim=(-5, size.height + 2))
+    """Cross-section of finger 0 with its measures, of a tapered one at the base."""
+    (width, height, wall), chamber = size.base, size.base.chamber
+    _rectangle(axes, (-width / 2, 0), (width, height), "0.8")
+    _rectangle(axes, (-chamber[0] / 2, wall), chamber, "white")
+    axes.plot([-width / 2, width / 2], [0, 0], color="tab:red", lw=2)
+    axes.text(0, -0.06 * height, f"{width:.1f}", ha="center", va="top", fontsize=6)
+    axes.text(-0.53 * width, height / 2, f"{height:.1f}", ha="right", fontsize=6)
+    axes.text(0, wall / 2, f"{wall:.1f}", ha="center", va="center", fontsize=6)
+    where = "" if size.base == size.tip else " at its base"
+    _finish(axes, f"section of finger 0{where} [mm]; red: fabric")
+    axes.set(xlim=(-0.85 * width, 0.85 * width), ylim=(-5, height + 2))
 
 
 def _side_view(axes: Axes, size: Size) -> None:
     """Longitudinal section of finger 0."""
-    _rectangle(axes, (0, 0), (size.length, size.height), "0.8")
-    chamber = (size.chamber[0], size.chamber[2])
-    _rectangle(axes, (size.end, size.wall), chamber, "white")
+    start, end = size.chamber_ends
+    first, last = size.at(start), size.at(end)
+    outer = [(0, 0), (size.length, 0), (size.length, size.tip.height), (0, size.base.height)]
+    inner = [(start, first.wall), (end, last.wall)]
+    inner += [(end, last.height - last.wall), (start, first.height - first.wall)]
+    for corners, color in ((outer, "0.8"), (inner, "white")):
+        axes.add_patch(
+            matplotlib.patches.Polygon(corners, facecolor=color, edgecolor="0.3", lw=0.8)
+        )
     axes.plot([0, size.length], [0, 0], color="tab:red", lw=2)
     axes.text(size.length / 2, -1.5, f"{size.length:.1f}", ha="center", va="top", fontsize=6)
-    text = f"chamber {size.chamber[0]:.1f} x {size.chamber[1]:.1f} x {size.chamber[2]:.1f}"
-    axes.text(size.length / 2, size.height / 2, text, ha="center", va="center", fontsize=6)
+    chambers = dict.fromkeys("{:.1f} x {:.1f}".format(*s.chamber) for s in (first, last))
+    text = f"chamber {end - start:.1f} x {' to '.join(chambers)}"
+    axes.text(size.length / 2, size.tip.height / 2, text, ha="center", va="center", fontsize=6)
     _finish(axes, "along finger 0 [mm], base on the left")
-    axes.set(xlim=(-3, size.length + 3), ylim=(-8, size.height + 3))
+    axes.set(xlim=(-3, size.length + 3), ylim=(-8, size.base.height + 3))
 
 
 def _palm(axes: Axes, scene: Scene, params: Params) -> None:

@@ -2,10 +2,12 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
+from codesign_jax.scene.hand import Hand
 from codesign_jax.scene.schema import InputError, quantity, range_problem
+from codesign_jax.types import Params
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,66 +32,90 @@ class Process:
     draft: float = quantity("deg", 0, 10, default=0.0)
 
 
+class Section(NamedTuple):
+    """A finger's section [mm].
+
+    Attributes:
+      width: Outer width.
+      height: Outer height.
+      wall: Thickness of bottom, top and sides.
+    """
+
+    width: float
+    height: float
+    wall: float
+
+    @property
+    def chamber(self) -> tuple[float, float]:
+        """Width and height of the chamber."""
+        return self.width - 2 * self.wall, self.height - 2 * self.wall
+
+
 class Size(NamedTuple):
     """Dimensions of a finger [mm].
 
     Attributes:
       length: Length.
-      width: Outer width.
-      height: Outer height.
-      wall: Thickness of bottom, top and sides.
+      base: Its section at the base.
+      tip: Its section at the tip, the same unless the finger is tapered.
       end: Thickness of the walls at base and tip.
     """
 
     length: float
-    width: float
-    height: float
-    wall: float
+    base: Section
+    tip: Section
     end: float
 
+    def at(self, place: float) -> Section:
+        """The section at a place along the finger [mm]."""
+        share = place / self.length
+        return Section(*(a + (b - a) * share for a, b in zip(self.base, self.tip, strict=True)))
+
     @property
-    def chamber(self) -> tuple[float, float, float]:
-        """Length, width and height of the chamber."""
-        wall = 2 * self.wall
-        return self.length - 2 * self.end, self.width - wall, self.height - wall
+    def chamber_ends(self) -> tuple[float, float]:
+        """Where the chamber begins and ends [mm]."""
+        return self.end, self.length - self.end
 
     @property
     def chamber_volume(self) -> float:
         """Volume of the chamber [mm^3]."""
-        return math.prod(self.chamber)
+        start, end = self.chamber_ends
+        return _simpson(lambda x: math.prod(self.at(x).chamber), start, end)
 
     @property
     def volume(self) -> float:
         """Volume of the silicone, with no inlet [mm^3]."""
-        return self.length * self.width * self.height - self.chamber_volume
+        whole = _simpson(lambda x: self.at(x).width * self.at(x).height, 0.0, self.length)
+        return whole - self.chamber_volume
 
 
-def sizes(
-    lengths: Iterable[Any],
-    width: float,
-    heights: Iterable[Any],
-    walls: Iterable[Any],
-    process: Process,
-) -> list[Size]:
+def _simpson(area: Callable[[float], float], start: float, end: float) -> float:
+    """Volume of a body between two places, exact for areas of the second degree."""
+    middle = (start + end) / 2
+    return (end - start) * (area(start) + 4 * area(middle) + area(end)) / 6
+
+
+def sizes(hand: Hand, params: Params, process: Process) -> list[Size]:
     """Dimensions of a hand's fingers.
 
     Args:
-      lengths: Their lengths [m].
-      width: Outer width of all [m].
-      heights: Outer heights [m].
-      walls: Wall thicknesses [m].
+      hand: The hand.
+      params: Its parameters as concrete arrays.
       process: The process.
 
     Raises:
       InputError: With every finger that has no room for a chamber.
     """
     found, problems = [], []
-    for i, given in enumerate(zip(lengths, heights, walls, strict=True)):
+    for i, length in enumerate(params.length):
+        base = hand.section.width, params.height[i], params.wall[i]
+        tip = base if params.tip is None else [params.tip[k][i] for k in (2, 0, 1)]
         # A design is in float32, which knows no more than a tenth of a micrometre.
-        length, height, wall, across = (round(1e3 * float(v), 4) for v in (*given, width))
-        size = Size(length, across, height, wall, process.end_wall or wall)
+        length, *both = (round(1e3 * float(v), 4) for v in (length, *base, *tip))
+        ends = Section(*both[:3]), Section(*both[3:])
+        size = Size(length, *ends, process.end_wall or ends[0].wall)
         found.append(size)
-        if size.chamber[0] < 1.0:
+        if size.length - 2 * size.end < 1.0:
             problems.append(
                 f"finger {i} of {length:g} mm has no room for a chamber of 1 mm between end walls "
                 f"of {size.end:g} mm; give --end-wall (mm), or --no-parts and --no-sheet"
@@ -101,7 +127,7 @@ def sizes(
 
 def inlet(size: Size, process: Process) -> float:
     """Diameter of a finger's inlet [mm]: none if it would be wider than the chamber."""
-    return process.inlet if process.inlet < min(size.chamber[1:]) else 0.0
+    return process.inlet if process.inlet < min(size.base.chamber) else 0.0
 
 
 def problems(process: Process) -> list[str]:

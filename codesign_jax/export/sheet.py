@@ -88,20 +88,22 @@ def _tests(scene: Scene, params: Params, verdict: str | None, found: Stress | No
 
 def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSection:
     density = scene.hand.material.density
-    rows = []
+    rows, limits = [], morphology.pressure_limits(scene.hand, params)
     for i, (size, angle) in enumerate(
         zip(sizes, morphology.free_bends(scene.hand, params), strict=True)
     ):
         pressure = float(params.pressure[i])
-        limit = scene.hand.pressure_limit.of(float(params.height[i]), float(params.wall[i]))
-        chamber = " x ".join(f"{v:.1f}" for v in size.chamber)
-        numbers = [size.length, size.width, size.height]
+        limit = limits[i]
+        ends = list(dict.fromkeys((size.base, size.tip)))  # one, unless it is tapered
+        start, end = size.chamber_ends
+        chambers = [" x ".join(f"{v:.1f}" for v in size.at(x).chamber) for x in (start, end)]
         rows.append(
             (
                 str(i),
-                *(f"{v:.1f}" for v in numbers),
-                _castable(size.wall),
-                chamber,
+                f"{size.length:.1f}",
+                *(" to ".join(f"{s[k]:.1f}" for s in ends) for k in range(2)),
+                " to ".join(_castable(s.wall) for s in ends),
+                f"{end - start:.1f} x {' to '.join(dict.fromkeys(chambers))}",
                 f"{size.volume / 1e3:.1f}",
                 f"{1e-6 * size.volume * density:.1f}",
                 f"{pressure / 1e3:.1f} ({limit / 1e3:.0f})",
@@ -111,7 +113,7 @@ def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSectio
     head = ("finger", "length mm", "width mm", "height mm", "wall mm", "chamber mm")
     head += ("silicone cm³", "mass g", "pressure kPa (limit)", "free bend °")
     ends = "as thick as the others"
-    if any(size.end != size.wall for size in sizes):
+    if any(size.end != size.base.wall for size in sizes):
         ends = f"{', '.join(dict.fromkeys(_castable(size.end) for size in sizes))} mm"
     notes = [
         f"Walls to 0.05 mm; at base and tip: {ends}. Free bend: predicted by beam theory for a "

@@ -15,6 +15,7 @@ import numpy as np
 from codesign_jax.engines.structured.kernel.pair_search import ring_places
 from codesign_jax.model import pairs
 from codesign_jax.model.layout import first_on_palm, touches_itself
+from codesign_jax.model.morphology import at_joints, sections
 from codesign_jax.model.spec import add_pair
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
@@ -38,19 +39,29 @@ class Ball(NamedTuple):
     share: float
 
 
-def balls(scene: Scene, finger: int, length: float, height: float) -> list[Ball]:
-    """The spheres of a finger.
+def balls(scene: Scene, finger: int, params: Params) -> list[Ball]:
+    """The spheres of a finger, as high as the section on the inside of its bottom layer.
 
     Args:
       scene: A scene with rings.
-      finger: Index of the finger, for names.
-      length: Its length [m].
-      height: Height of its section [m].
+      finger: Index of the finger.
+      params: Parameters of the hand as concrete arrays.
     """
-    links, k = scene.discretization.links, scene.discretization.hull_rings
-    segment, found = length / links, []
-    for (i, j), at in np.ndenumerate(ring_places(links, k)):
-        share = segment / k * (0.5 if i == links - 1 else 1.0) / scene.hand.section.width
+    links, k, width = (
+        scene.discretization.links,
+        scene.discretization.hull_rings,
+        scene.hand.section.width,
+    )
+    along, found = ring_places(links, k), []
+    segment = float(params.length[finger]) / links
+    places = (along + at_joints(links)[:, None] * links) / links
+    size = sections(scene.hand, params, places.ravel())
+    heights, widths = (
+        np.broadcast_to(v, (scene.num_fingers, along.size)) for v in (size.height, size.width)
+    )
+    for (i, j), at in np.ndenumerate(along):
+        height, across = heights[finger, i * k + j], widths[finger, i * k + j]
+        share = segment / k * (0.5 if i == links - 1 else 1.0) * across / width**2
         place = np.array([at * segment, 0.0, height / 2])
         found.append(Ball(f"finger_{finger}_ring_{i + 1}_{j}", i + 1, place, float(share)))
     return found
@@ -70,9 +81,8 @@ def add(scene: Scene, spec: mujoco.MjSpec, params: Params) -> dict[str, float]:
     shares: dict[str, float] = {}
     e = scene.effects
     for f in range(scene.num_fingers):
-        length, height = float(params.length[f]), float(params.height[f])
-        for ball in balls(scene, f, length, height):
-            name, size = ball.name, [height / 2, 0, 0]
+        for ball in balls(scene, f, params):
+            name, size = ball.name, [ball.place[2], 0, 0]
             spec.body(f"finger_{f}_link_{ball.link}").add_geom(
                 name=name, pos=ball.place, size=size, **_PASSIVE
             )
@@ -91,8 +101,9 @@ def add(scene: Scene, spec: mujoco.MjSpec, params: Params) -> dict[str, float]:
 def _capsules(scene: Scene, spec: mujoco.MjSpec, params: Params) -> None:
     """Capsules around the links, with which fingers touch each other and themselves."""
     links, names = scene.discretization.links, []
+    heights = sections(scene.hand, params, (np.arange(links) + 1.0) / links).height
     for f, i in itertools.product(range(scene.num_fingers), range(1, links + 1)):
-        length, up = float(params.length[f]), float(params.height[f]) / 2
+        length, up = float(params.length[f]), float(heights[f, min(i, heights.shape[1]) - 1]) / 2
         extent = length / links * (0.25 if i == links else 1.0)
         spec.body(f"finger_{f}_link_{i}").add_geom(
             name=f"finger_{f}_capsule_{i}",

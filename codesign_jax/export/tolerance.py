@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from codesign_jax.codesign import VERDICTS, verdicts
+from codesign_jax.model import morphology
 from codesign_jax.report import statistics
 from codesign_jax.report.statistics import Interval
 from codesign_jax.scene import Scene
@@ -154,14 +155,14 @@ def _limits(
             for i in np.nonzero([n.split("[")[0] == name.split("[")[0] for n in whole.names])[0]:
                 low[i], high[i] = min(low[i], space.low[j]), max(high[i], space.high[j])
     limit, params = whole.hand.pressure_limit, whole.params(centre)
-    caps = limit.of(np.asarray(params.height), np.asarray(params.wall))
+    caps = morphology.pressure_limits(whole.hand, params)
     floors = np.asarray(params.pressure) / limit.per_wall
     for i, name in enumerate(whole.names):
         row, _, index = name.partition("[")
         fingers = slice(int(index[:-1]), int(index[:-1]) + 1) if index else slice(None)
         if row == "pressure":
             high[i] = min(high[i], caps[fingers].min())
-        if row == "wall":
+        if row in ("wall", "tip_wall"):
             low[i] = max(low[i], floors[fingers].max())
     return np.minimum(low, centre), np.maximum(high, centre)
 

@@ -31,10 +31,11 @@ class ModelFields(NamedTuple):
     """The fields of mjModel that depend on parameters, trial and constants, and the start state.
 
     Every array has MuJoCo's name and shape for one world, `gravity` and `impratio` those of
-    mjOption, but for four: `start` is the initial qpos, shape (nq,), or the state in which another
+    mjOption, but for five: `start` is the initial qpos, shape (nq,), or the state in which another
     rollout ended, `Trace.last`, see `State`; `section` has height, wall, segment length and width
     of the fingers [m], shape (finger, 4), with the effect `neo_hookean` or the surface "hull";
-    `threshold` has the numbers of `morphology.thresholds`, with the effect `lateral_threshold`; and
+    `threshold` has the numbers of `morphology.thresholds`, with the effect `lateral_threshold`;
+    `tip` has height, wall and width at the tips of tapered fingers, shape (finger, 3), and
     `constants` are the world's numbers with the trial's factors, from which engines take what
     MuJoCo has no field for: limits, the cost's window, and friction by pair of bodies.
     """
@@ -65,6 +66,8 @@ class ModelFields(NamedTuple):
     constants: Constants
     section: jax.Array | None = None
     threshold: jax.Array | None = None
+    tip: jax.Array | None = None
+    wrap_prm: jax.Array | None = None
 
     @property
     def qpos(self) -> jax.Array:
@@ -81,8 +84,10 @@ class ModelFields(NamedTuple):
     @property
     def of_model(self) -> dict[str, jax.Array]:
         """The fields of mjModel by name, those of its mjOption as "opt.name"."""
-        others, options = ("start", "section", "threshold", "constants"), ("gravity", "impratio")
-        fields = {k: v for k, v in self._asdict().items() if k not in others}
+        others = ("start", "section", "threshold", "tip", "constants")
+        options = ("gravity", "impratio")
+        given = {k: v for k, v in self._asdict().items() if v is not None}
+        fields = {k: v for k, v in given.items() if k not in others}
         return {f"opt.{k}" if k in options else k: v for k, v in fields.items()}
 
 
@@ -93,9 +98,9 @@ def joint_springs(scene: Scene, params: Params) -> tuple[jax.Array, jax.Array]:
     file; the object's are free.
     """
     lay, hand = layout(scene), scene.hand
-    beams = morphology.finger_beams(hand, params)
+    beams = morphology.finger_beams(hand, params, lay.links)
     each = morphology.joint_springs(hand, params, beams, lay.links, lay.axes)
-    finger, own = (jnp.broadcast_to(v[:, None, :], lay.dofs.shape).reshape(-1) for v in each)
+    finger, own = (jnp.broadcast_to(v, lay.dofs.shape).reshape(-1) for v in each)
     springs = wrist_springs(scene)
     wrist, wrist_damping = (jnp.stack([jnp.asarray(x, finger.dtype) for x in v]) for v in springs)
     free = jnp.zeros(6, finger.dtype)
@@ -113,12 +118,12 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
     """
     template, lay, dtype = compile_template(scene), layout(scene), params.length.dtype
     scene = _in_type(with_trial(scene, trial), dtype)
-    beam = morphology.finger_beams(scene.hand, params)
+    beam = morphology.finger_beams(scene.hand, params, lay.links)
 
     def filled(name: str, *parts: tuple[Any, Any]) -> jax.Array:
         return _filled(getattr(template, name), dtype, *parts)
 
-    links = morphology.segments(scene.hand, params, beam, lay.links)
+    links, gains = morphology.segments(scene.hand, params, lay.links), beam.moment_per_pressure
     extents, masses = links.extent, links.mass
     size, object_mass, object_inertia = object_size(scene.objects, trial)
     bodies = np.concatenate([lay.stubs[:, None], lay.bodies], 1)
@@ -134,8 +139,8 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
         body_quat=filled("body_quat", (lay.stubs, mount_quat)),
         body_ipos=filled(
             "body_ipos",
-            ((bodies, 0), extents / 2),
-            ((bodies, 2), params.height[:, None] / 2),
+            ((bodies, 0), links.along),
+            ((bodies, 2), links.up),
             ((1, 2), palm.thickness / 2),
         ),
         body_mass=filled("body_mass", (1, palm.mass), (bodies, masses), (lay.object, object_mass)),
@@ -159,7 +164,7 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
         actuator_gainprm=filled(
             "actuator_gainprm",
             ((slice(6), 0), stiffness[:6]),
-            ((slice(6, None), 0), beam.moment_per_pressure),
+            ((slice(6, None), 0), gains[:, 0]),
         ),
         actuator_biasprm=filled("actuator_biasprm", ((slice(6), 1), -stiffness[:6])),
         # Declared, not derived; see contact_invweight.  The world keeps zero.
@@ -177,6 +182,8 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
             if scene.effects.lateral_threshold
             else None
         ),
+        wrap_prm=None if params.tip is None else (gains / gains[:, :1]).reshape(-1),
+        tip=None if params.tip is None else jnp.stack(params.tip, -1),
     )
 
 
@@ -261,6 +268,10 @@ def softening_moments(scene: Scene, fields: ModelFields, angles: Any) -> Any:
     """
     assert fields.section is not None
     height, wall, segment, width = (fields.section[..., i : i + 1] for i in range(4))
+    if fields.tip is not None:
+        places = morphology.at_joints(layout(scene).links)
+        ends = zip((height, wall, width), range(3), strict=True)
+        height, wall, width = (a + (fields.tip[..., i : i + 1] - a) * places for a, i in ends)
     stiffness = fields.jnt_stiffness[..., layout(scene).dofs[..., 0]]
     return stiffness * angles * morphology.softening(angles / segment, height, wall, width=width)
 
@@ -281,8 +292,9 @@ def _sphere_positions(scene: Scene, params: Params, extents: jax.Array) -> list[
         parts.append(((lay.disc, 2), jnp.asarray(scene.hand.palm.thickness) / 2))
     if not lay.spheres.size:
         return parts
-    along = morphology.sphere_places(extents, lay.spheres.shape[2])
-    up = params.height[:, None, None] / 2
+    count = lay.spheres.shape[2]
+    along = morphology.sphere_places(extents, count)
+    up = morphology.sphere_radii(scene.hand, params, lay.links, count)
     return [*parts, ((lay.spheres, 0), along), ((lay.spheres, 2), up)]
 
 
@@ -297,7 +309,9 @@ def _geom_fields(
     palm = scene.hand.palm
     spheres = [(lay.palm, palm.contact_radius)] if lay.palm.size else []
     if lay.spheres.size:
-        spheres.append((lay.spheres, params.height[:, None, None] / 2))
+        count = lay.spheres.shape[2]
+        radius = morphology.sphere_radii(scene.hand, params, lay.links, count)
+        spheres.append((lay.spheres, radius))
     for where, radius in spheres:
         sizes.append(((where, 0), radius))
         radii.append((where, radius))

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from codesign_jax.scene import Scene
+from codesign_jax.types import Tip
 
 
 class Hull(NamedTuple):
@@ -105,17 +106,24 @@ def _faces(rings: int, points: int) -> np.ndarray:
     return np.concatenate([base, sides, tip])
 
 
-def rest(scene: Scene, length: float, height: float, *, square: bool = False) -> np.ndarray:
+def rest(
+    scene: Scene, length: float, height: float, *, square: bool = False, tip: Tip | None = None
+) -> np.ndarray:
     """Vertices of the straight finger in the frame of its base [m], shape (vertex, 3).
 
     Args:
       scene: The scene.
       length: Length of the finger [m].
-      height: Height of its section [m].
+      height: Height of its section [m], of a tapered one at the base.
       square: See `outline`.
+      tip: The section at the tip of a tapered one.
     """
-    unit = length / scene.discretization.links, scene.hand.section.width, height
-    return hull(scene, square=square).place * np.array(unit)
+    links, place = scene.discretization.links, hull(scene, square=square).place
+    size = np.array([length / links, scene.hand.section.width, height])
+    if tip is not None:
+        end = np.array([length / links, tip.width, tip.height])
+        size = size + (end - size) * place[:, :1] / links
+    return place * size
 
 
 def link_origins(scene: Scene, length: float) -> np.ndarray:

@@ -13,18 +13,23 @@ import jax
 import numpy as np
 
 from codesign_jax.scene.beams import Beam, beam, softening
-from codesign_jax.scene.hand import Hand
+from codesign_jax.scene.hand import Hand, highest_pressure
 from codesign_jax.scene.primitives import block_inertia
 from codesign_jax.types import Params
 
 __all__ = [
     "Beam",
+    "Section",
     "Segments",
+    "at_joints",
     "beam",
     "finger_beams",
     "free_bends",
     "joint_springs",
+    "pressure_limits",
+    "sections",
     "segments",
+    "sphere_radii",
     "softening",
     "sphere_places",
     "threshold_moments",
@@ -32,13 +37,52 @@ __all__ = [
 ]
 
 
-def finger_beams(hand: Hand, params: Params) -> Beam:
-    """Returns the beam properties of every finger of a hand, shape (finger,)."""
-    material = hand.material
+def pressure_limits(hand: Hand, params: Params) -> np.ndarray:
+    """Highest pressures of a hand's fingers [Pa], shaped as their heights."""
+    height, wall, tip = jax.tree.map(
+        lambda v: np.asarray(v, float), (params.height, params.wall, params.tip)
+    )
+    return np.asarray(highest_pressure(hand, height, wall, tip))
+
+
+class Section(NamedTuple):
+    """Outer height, wall and outer width of sections along fingers [m], shape (finger, place).
+
+    There is one place where they are the same all along.
+    """
+
+    height: Any
+    wall: Any
+    width: Any
+
+
+def sections(hand: Hand, params: Params, places: np.ndarray) -> Section:
+    """The sections of fingers at places, shares of their length from 0 to 1, shape (place,)."""
+    numpy = params.height.__array_namespace__()
+    base = Section(
+        params.height[:, None], params.wall[:, None], numpy.asarray(hand.section.width)[None, None]
+    )
+    if params.tip is None:
+        return base
+    tip = Section(*(v[:, None] for v in params.tip))
+    return Section(*(a + (b - a) * places for a, b in zip(base, tip, strict=True)))
+
+
+def at_joints(links: int) -> np.ndarray:
+    """Places of a finger's joints, the middles of its segments, shape (N,)."""
+    return (np.arange(links) + 0.5) / links
+
+
+def finger_beams(hand: Hand, params: Params, links: int) -> Beam:
+    """Returns the beam properties of every finger at its joints, shape (finger, N).
+
+    N is 1 where they are the same all along.
+    """
+    material, own = hand.material, sections(hand, params, at_joints(links))
     found = beam(
-        params.height,
-        params.wall,
-        width=hand.section.width,
+        own.height,
+        own.wall,
+        width=own.width,
         shear_modulus=material.shear_modulus,
         density=material.density,
     )
@@ -50,9 +94,10 @@ def finger_beams(hand: Hand, params: Params) -> Beam:
 
 def free_bends(hand: Hand, params: Params) -> np.ndarray:
     """Angles by which free fingers bend at their pressures [rad], by the linear law, (finger,)."""
-    beams = finger_beams(hand, jax.tree.map(lambda v: np.asarray(v, float), params))
-    curvature = np.asarray(params.pressure) * beams.moment_per_pressure / beams.bending
-    return np.asarray(curvature * np.asarray(params.length))
+    exact = jax.tree.map(lambda v: np.asarray(v, float), params)
+    beams = finger_beams(hand, exact, 1 if params.tip is None else 100)
+    curvature = np.asarray(exact.pressure)[:, None] * beams.moment_per_pressure / beams.bending
+    return np.asarray(curvature.mean(1) * exact.length)
 
 
 class Segments(NamedTuple):
@@ -63,37 +108,76 @@ class Segments(NamedTuple):
       extent: Length of each body, half a segment at both ends [m], shape (finger, N + 1).
       mass: Their masses [kg], shape (finger, N + 1).
       inertia: Of solid blocks as large, principal [kg m^2], shape (finger, N + 1, 3).
+      along: Centres of mass from the start of the body [m], shape (finger, N + 1).
+      up: Their height over the bottom layer [m], shape (finger, N + 1), or (finger, 1) if alike.
     """
 
     offset: jax.Array
     extent: jax.Array
     mass: jax.Array
     inertia: jax.Array
+    along: jax.Array
+    up: jax.Array
 
 
-def segments(hand: Hand, params: Params, beams: Beam, links: int) -> Segments:
-    """Returns the bodies of every finger, in NumPy if that is what the beams are in.
+def segments(hand: Hand, params: Params, links: int) -> Segments:
+    """Returns the bodies of every finger, in NumPy if that is what the parameters are in.
+
+    Those of tapered fingers have the mass and its centre by Simpson's rule, which is exact for
+    them, and the inertia of the block with the section in their middle.
 
     Args:
       hand: The hand.
       params: Parameters.
-      beams: Of `finger_beams`.
       links: Links N of a finger.
     """
-    numpy = beams.line_density.__array_namespace__()  # traced if any number is
     factor = np.ones(links + 1)
     factor[[0, -1]] = 0.5
     segment = params.length[:, None] / links
     extent, offset = segment * factor, segment * factor[:-1]
-    mass = beams.line_density[:, None] * extent
-    width, height = numpy.asarray(hand.section.width), params.height[:, None]
-    inertia = numpy.stack(block_inertia(mass, extent, width, height), -1)
-    return Segments(offset, extent, mass, inertia)
+    start = np.concatenate([[0.0], at_joints(links)])
+    density, along, up = _contents(hand, params, start, factor / links)
+    mass, middle = density * extent, sections(hand, params, start + factor / links / 2)
+    numpy = mass.__array_namespace__()  # traced if any number is
+    inertia = numpy.stack(block_inertia(mass, extent, middle.width, middle.height), -1)
+    return Segments(offset, extent, mass, inertia, along * extent, up)
+
+
+def _contents(hand: Hand, params: Params, start: np.ndarray, span: np.ndarray) -> tuple:
+    """Mean mass per length of bodies, and their centres along, as a share, and up [m]."""
+
+    def at(places: np.ndarray) -> tuple[Any, Any]:
+        own, material = sections(hand, params, places), hand.material
+        density = beam(
+            own.height,
+            own.wall,
+            width=own.width,
+            shear_modulus=material.shear_modulus,
+            density=material.density,
+        ).line_density
+        return density, own.height / 2
+
+    if params.tip is None:
+        density, up = at(start)
+        return density, 0.5, up
+    (a, low), (b, middle), (c, high) = (at(start + share * span) for share in (0.0, 0.5, 1.0))
+    mean = (a + 4 * b + c) / 6
+    up = (a * low + 4 * b * middle + c * high) / 6 / mean
+    return mean, (2 * b + c) / 6 / mean, up
 
 
 def sphere_places(extent: jax.Array, count: int) -> jax.Array:
     """Places along each moving link of spheres that are spread evenly [m], (finger, N, count)."""
     return extent[:, 1:, None] * (np.arange(count) + 0.5) / count
+
+
+def sphere_radii(hand: Hand, params: Params, links: int, count: int) -> Any:
+    """Their radii, half the height there [m], of that shape, or (finger, 1, 1) if all are alike."""
+    span = np.append(np.ones(links - 1), 0.5)[:, None] / links
+    places = at_joints(links)[:, None] + span * (np.arange(count) + 0.5) / count
+    heights = sections(hand, params, places.ravel()).height
+    shape = (1, 1) if params.tip is None else places.shape
+    return heights.reshape(len(heights), *shape) / 2
 
 
 def joint_springs(
@@ -109,11 +193,13 @@ def joint_springs(
       axes: Axes of a joint, as in `Layout`.
 
     Returns:
-      Stiffness [N m/rad] and damping [N m s/rad] of each finger's joints, shape (finger, axis).
+      Stiffness [N m/rad] and damping [N m s/rad] of each finger's joints, shape (finger, N, axis)
+      with the beams' N.
     """
     numpy = beams.bending.__array_namespace__()
     by_axis = {"bend": beams.bending, "lateral": beams.lateral, "twist": beams.torsion}
-    stiffness = numpy.stack([by_axis[name] / (params.length / links) for name in axes], -1)
+    segment = (params.length / links)[:, None]
+    stiffness = numpy.stack([by_axis[name] / segment for name in axes], -1)
     return stiffness, hand.material.damping_time * stiffness
 
 
@@ -141,11 +227,12 @@ def thresholds(hand: Hand, params: Params, beams: Beam, links: int) -> jax.Array
 
     Returns:
       Of each finger's joints the moment per pressure A_c w/2 [m^3], its loss by the bend angle
-      4 G S w/2 / l [N m/rad], and the angle of `SLACK` [rad], shape (finger, 3).
+      4 G S w/2 / l [N m/rad], and the angle of `SLACK` [rad], shape (finger, N, 3) with the beams'
+      N.
     """
     numpy = beams.bending.__array_namespace__()
-    height, width = params.height, numpy.asarray(hand.section.width)
-    segment = params.length / links
+    height, _, width = sections(hand, params, at_joints(links))
+    segment = (params.length / links)[:, None]
     area = beams.line_density / hand.material.density
     loss = 4 * hand.material.shear_modulus * area * height / 2 * width / 2 / segment
     angle = SLACK / width * segment

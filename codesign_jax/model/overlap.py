@@ -7,9 +7,11 @@ that is nearer.
 
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from codesign_jax.model.layout import first_on_palm, layout
+from codesign_jax.model.morphology import at_joints, sections
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
 
@@ -50,15 +52,19 @@ def overlaps(scene: Scene, params: Params, place: np.ndarray, turn: np.ndarray) 
     unit = np.stack([np.cos(angle), np.sin(angle)], 1)
     unit /= ((unit**4).sum(1) ** 0.25)[:, None]
     points, owners, sizes = [], [], []
+    middles = (np.arange(links) + 0.5 + whole / 2) / links
+    size = sections(scene.hand, jax.tree.map(lambda v: np.asarray(v, float), params), middles)
+    halves = np.stack(
+        [np.broadcast_to(v, (count, links)) / 2 for v in (size.width, size.height)], -1
+    )
     for f, bodies in enumerate(lay.bodies):
-        half = np.array([scene.hand.section.width, float(params.height[f])]) / 2
-        span = float(params.length[f]) / links * whole
+        half, span = halves[f], float(params.length[f]) / links * whole
         local = [
-            np.c_[np.full(_AROUND, part * s), unit * half + [0, half[1]]]
-            for s in span
+            np.c_[np.full(_AROUND, part * s), unit * own + [0, own[1]]]
+            for s, own in zip(span, half, strict=True)
             for part in _ALONG
         ]
-        face = np.concatenate([unit * half * part for part in _INNER]) + [0, half[1]]
+        face = np.concatenate([unit * half[-1] * part for part in _INNER]) + [0, half[-1, 1]]
         local.append(np.c_[np.full(len(face), span[-1]), face])
         own = np.repeat(np.arange(links), _AROUND * len(_ALONG))
         own = np.append(own, np.full(len(face), links - 1))
@@ -66,7 +72,7 @@ def overlaps(scene: Scene, params: Params, place: np.ndarray, turn: np.ndarray) 
         moved = np.einsum("spij,pj->spi", turn[:, at], np.concatenate(local))
         points.append(place[:, at] + moved)
         owners.append(own)
-        sizes.append((span, *half))
+        sizes.append((span, *half.T))
     found = np.zeros((len(place), count, count))
     palm = np.zeros((len(place), count))
     for i, own in enumerate(owners):
@@ -84,13 +90,21 @@ def overlaps(scene: Scene, params: Params, place: np.ndarray, turn: np.ndarray) 
     return Overlaps(found, palm)
 
 
-def _depths(local: np.ndarray, span: np.ndarray, a: float, b: float) -> np.ndarray:
-    """Depths of points in the frames of links, shape (state, link, point, 3), in these links."""
+def _depths(local: np.ndarray, span: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Depths of points in the frames of links, shape (state, link, point, 3), in these links.
+
+    Args:
+      local: The points.
+      span: Lengths of the links, shape (link,).
+      a: Half of their widths in the middle, same shape.
+      b: Half of their heights, likewise.
+    """
     x, y, z = np.moveaxis(local, -1, 0)
+    a, b = a[:, None], b[:, None]
     units = np.abs([y / a, (z - b) / b])
     phi = np.maximum((units**4).sum(0) ** 0.25, 1e-9)
     slope = np.sqrt((units[0] / phi) ** 6 / a**2 + (units[1] / phi) ** 6 / b**2)
-    slope = np.where(slope > 0, slope, 1 / min(a, b))  # on the axis
+    slope = np.where(slope > 0, slope, 1 / np.minimum(a, b))  # on the axis
     inside = (x >= 0) & (x <= span[:, None]) & (phi < 1)
     last = np.arange(len(span)) == len(span) - 1
     to_face = np.where(last[:, None], span[:, None] - x, np.inf)
@@ -105,5 +119,7 @@ def bend_angles(scene: Scene, qpos: Any) -> np.ndarray:
 
 def wall_strain(scene: Scene, params: Params, bends: np.ndarray) -> np.ndarray:
     """Strain of the walls farthest from the bottom layer, kappa h, shaped as `bends`."""
-    segment = np.asarray(params.length) / layout(scene).links
-    return bends * (np.asarray(params.height) / segment)[:, None]
+    links = layout(scene).links
+    exact = jax.tree.map(np.asarray, params)
+    height = sections(scene.hand, exact, at_joints(links)).height
+    return bends * (height / (exact.length / links)[:, None])

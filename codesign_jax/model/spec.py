@@ -32,7 +32,7 @@ from codesign_jax.scene.constants import with_trial
 from codesign_jax.scene.hand import Hand
 from codesign_jax.scene.objects import ObjectSet
 from codesign_jax.scene.primitives import PRIMITIVES
-from codesign_jax.types import Params, Trial
+from codesign_jax.types import Params, Tip, Trial
 
 
 @by_structure
@@ -49,6 +49,8 @@ def template_world(scene: Scene) -> tuple[Params, Trial]:
     """Parameters and trial of the template, as NumPy arrays."""
     one = np.ones(scene.num_fingers)
     params = Params(0.1 * one, 0.02 * one, 0.004 * one, np.zeros(()), np.zeros(6), 0.0 * one)
+    if scene.hand.section.tapered:
+        params = params._replace(tip=Tip(0.015 * one, 0.003 * one, 0.02 * one))
     zero, unit = np.zeros(()), np.ones(())
     return params, Trial(np.int32(0), np.zeros(2), zero, np.zeros(2), *[unit] * 5)
 
@@ -81,9 +83,14 @@ def compile_model(
     return model
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
 def _numbers(
-    hand: Hand, objects: ObjectSet, constants: Constants, params: Params, trial: Trial
+    hand: Hand,
+    objects: ObjectSet,
+    links: int,
+    constants: Constants,
+    params: Params,
+    trial: Trial,
 ) -> tuple:
     """Beams, mounts, and the object's size and orientation; one program, not one an operation.
 
@@ -91,7 +98,8 @@ def _numbers(
     """
     hand = schema.with_numbers(hand, constants.hand)
     objects = schema.with_numbers(objects, constants.objects)
-    beams, place = morphology.finger_beams(hand, params), mounts(hand, params.spread)
+    beams = morphology.finger_beams(hand, params, links)
+    place = mounts(hand, params.spread)
     return beams, place, object_size(objects, trial), object_pose(objects, trial)
 
 
@@ -108,7 +116,7 @@ def build_spec(
     concrete = jax.tree.map(np.asarray, (scene.constants(), params, trial))
     bodies = scene.structure
     beams, place, solid, pose = jax.tree.map(
-        np.asarray, _numbers(bodies.hand, bodies.objects, *concrete)
+        np.asarray, _numbers(bodies.hand, bodies.objects, layout(scene).links, *concrete)
     )
     for f in range(scene.num_fingers):
         _add_finger(scene, spec, concrete[1], f, beams, (place[0][f], place[1][f]), visual)
@@ -200,11 +208,20 @@ def _add_finger(
     mount: tuple[np.ndarray, np.ndarray],
     visual: bool,
 ) -> None:
-    lay, width, h = layout(scene), scene.hand.section.width, scene.discretization.timestep
-    length, height = float(params.length[f]), float(params.height[f])
-    links = morphology.segments(scene.hand, params, beams, lay.links)
-    springs = morphology.joint_springs(scene.hand, params, beams, lay.links, lay.axes)
-    spheres = morphology.sphere_places(links.extent, lay.spheres.shape[2])
+    lay, hand, h = layout(scene), scene.hand, scene.discretization.timestep
+    count, many = lay.spheres.shape[2], (lay.links, lay.spheres.shape[2])
+    links = morphology.segments(hand, params, lay.links)
+    springs = [
+        np.broadcast_to(v[f], (lay.links, len(lay.axes)))
+        for v in morphology.joint_springs(hand, params, beams, lay.links, lay.axes)
+    ]
+    spheres = morphology.sphere_places(links.extent, count)[f]
+    radii = np.broadcast_to(morphology.sphere_radii(hand, params, *many)[f], many)
+    up = np.broadcast_to(links.up[f], lay.links + 1)
+    gains = np.broadcast_to(beams.moment_per_pressure[f], lay.links)
+    width = np.broadcast_to(
+        morphology.sections(hand, params, np.linspace(0, 1, lay.links + 1)).width[0], lay.links + 1
+    )
     tendon = spec.add_tendon(name=f"chamber_{f}")
     body = spec.body("palm")
     for i in range(lay.links + 1):
@@ -215,17 +232,17 @@ def _add_finger(
             body.pos = [links.offset[f, i - 1], 0, 0]
         extent = links.extent[f, i]
         body.explicitinertial, body.mass = True, links.mass[f, i]
-        body.ipos = [extent / 2, 0, height / 2]
+        body.ipos = [links.along[f, i], 0, up[i]]
         body.inertia = links.inertia[f, i]
         if visual and scene.effects.surface == "spheres":
-            kind, half = mujoco.mjtGeom.mjGEOM_BOX, [extent / 2, width / 2, height / 2]
+            kind, half = mujoco.mjtGeom.mjGEOM_BOX, [extent / 2, width[i] / 2, up[i]]
             name = f"finger_{f}_block_{i}"
             body.add_geom(
                 name=name, type=kind, size=half, pos=body.ipos, rgba=_COLORS["finger"], **_PASSIVE
             )
         if i == 0:
             continue
-        for name, stiffness, own in zip(lay.axes, *(v[f] for v in springs), strict=True):
+        for name, stiffness, own in zip(lay.axes, *(v[i - 1] for v in springs), strict=True):
             implicit = implicit_damping(scene, stiffness, own)
             joint = f"finger_{f}_{name}_{i}"
             _hinge(
@@ -236,24 +253,26 @@ def _add_finger(
                 damping=implicit,
                 armature=h * implicit,
             )
-        tendon.wrap_joint(f"finger_{f}_bend_{i}", 1.0)
-        for j, x in enumerate(spheres[f, i - 1]):
-            _sphere(body, f"finger_{f}_sphere_{i}_{j}", [x, 0, height / 2], height / 2)
+        tendon.wrap_joint(f"finger_{f}_bend_{i}", gains[i - 1] / gains[0])
+        for j, (x, radius) in enumerate(zip(spheres[i - 1], radii[i - 1], strict=True)):
+            _sphere(body, f"finger_{f}_sphere_{i}_{j}", [x, 0, radius], radius)
     actuator = spec.add_actuator(
         name=f"pressure_{f}", target=f"chamber_{f}", trntype=mujoco.mjtTrn.mjTRN_TENDON
     )
     # Pressure [Pa] in, bending moment [N m] at every joint out: a constant torque, not a moving
     # rest angle.
-    actuator.gainprm[0] = beams.moment_per_pressure[f]
+    actuator.gainprm[0] = gains[0]
     if visual and scene.effects.surface == "hull":
-        _add_skin(scene, spec, f, length, height)
+        _add_skin(scene, spec, params, f)
 
 
-def _add_skin(scene: Scene, spec: mujoco.MjSpec, f: int, length: float, height: float) -> None:
+def _add_skin(scene: Scene, spec: mujoco.MjSpec, params: Params, f: int) -> None:
     """The finger's hull as MuJoCo's skin, which is for looking at only."""
+    length, height = float(params.length[f]), float(params.height[f])
+    tip = None if params.tip is None else Tip(*(float(v[f]) for v in params.tip))
     mesh, origins = hull.hull(scene), hull.link_origins(scene, length)
     skin = spec.add_skin(name=f"finger_{f}_hull", rgba=_COLORS["finger"])
-    skin.vert = hull.rest(scene, length, height).ravel()
+    skin.vert = hull.rest(scene, length, height, tip=tip).ravel()
     skin.face = mesh.face.ravel()
     followed = [np.nonzero((mesh.link == i) & (mesh.weight > 0)) for i in range(len(origins))]
     skin.bodyname = [f"finger_{f}_link_{i}" for i in range(len(origins))]

@@ -14,6 +14,7 @@ from codesign_jax.model import hull
 from codesign_jax.report.animation import Replay
 from codesign_jax.scene import Scene
 from codesign_jax.scene.primitives import PRIMITIVES
+from codesign_jax.types import Tip
 
 FINGER, OBJECT, PALM = (0.36, 0.57, 0.80), (0.95, 0.58, 0.20), (0.36, 0.38, 0.43)
 _MOST_FACES = 40_000
@@ -122,7 +123,9 @@ def vertices(part: Part, pose: np.ndarray) -> np.ndarray:
 
 def _finger(scene: Scene, grasp: Replay, f: int, lay: model.Layout) -> Part:
     length, height = float(grasp.params.length[f]), float(grasp.params.height[f])
-    mesh, straight = hull.hull(scene), hull.rest(scene, length, height)
+    tip = grasp.params.tip
+    tip = None if tip is None else Tip(*(float(v[f]) for v in tip))
+    mesh, straight = hull.hull(scene), hull.rest(scene, length, height, tip=tip)
     along = np.zeros((2, *straight.shape))
     along[..., 0] = hull.link_origins(scene, length)[mesh.link.T]
     bodies = np.array([lay.stubs[f], *lay.bodies[f]])

@@ -222,8 +222,9 @@ def of_design(scene: Scene, params: Params) -> list[str]:
       params: Its parameters, numbers.
     """
     found: list[str] = []
+    limits = morphology.pressure_limits(scene.hand, params)
     for f, bend in enumerate(morphology.free_bends(scene.hand, params)):
-        limit = scene.hand.pressure_limit.of(float(params.height[f]), float(params.wall[f]))
+        limit = limits[f]
         if float(params.pressure[f]) > 0.99 * limit:
             found.append(f"finger {f}: its pressure is at its limit, {limit / 1e3:.0f} kPa")
         if bend > TURN:
@@ -274,7 +275,9 @@ def of_overlaps(scene: Scene, params: Params, depths: list[Overlaps]) -> list[st
         return []
     fingers = np.concatenate([d.fingers for d in depths]).max(0)
     palm = np.concatenate([d.palm for d in depths]).max(0)
-    thin = np.minimum(np.asarray(params.height), scene.hand.section.width)
+    ends = [(params.height, scene.hand.section.width)]
+    ends += [] if params.tip is None else [(params.tip.height, params.tip.width)]
+    thin = np.min([np.minimum(*map(np.asarray, pair)) for pair in ends], 0)
     found = []
     for i, j in np.argwhere(fingers > DEEP):
         deep = f"{1e3 * fingers[i, j]:.0f} mm"

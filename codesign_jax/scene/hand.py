@@ -17,6 +17,7 @@ from typing import Any
 from codesign_jax.scene import keypaths, library, schema
 from codesign_jax.scene.hand_tables import (
     PARAMETERS,
+    TIP,
     UNITS,
     Finger,
     Free,
@@ -30,6 +31,7 @@ from codesign_jax.scene.hand_tables import (
     PressureLimit,
     Section,
     Wrist,
+    highest_pressure,
     per_finger,
     with_strain,
 )
@@ -100,7 +102,10 @@ def _check_table(hand: Hand, where: str, problems: list[str]) -> dict[str, Param
     """Checks the parameter table; returns by name the rows whose values may be looked at."""
     names, rows = [p.name for p in hand.parameter], {}
     for name in PARAMETERS:
-        if names.count(name) != 1:
+        if name in TIP and not hand.section.tapered:
+            if name in names:
+                problems.append(f"{where}.parameter {name!r} needs section.tapered = true")
+        elif names.count(name) != 1:
             problems.append(
                 f"{where}.parameter {name!r} must be given once, not {names.count(name)} times"
             )
@@ -228,11 +233,26 @@ def _check_sections(hand: Hand, where: str, problems: list[str]) -> None:
     """Every section that the table or a preset allows needs an air chamber and a legal pressure."""
     places = [where, *(f"{where}.preset {preset.name}" for preset in hand.preset)]
     for path, bounds in zip(places, all_bounds(hand), strict=True):
-        lowest, walls = {name: low for name, (low, _) in bounds.items()}, bounds["wall"][1]
-        fingers = zip(lowest["height"], walls, lowest["wall"], lowest["pressure"], strict=True)
+        lowest = {name: low for name, (low, _) in bounds.items()}
+        width = (hand.section.width,) * len(hand.finger)
+        ends = [("", "section.width", width)]
+        if hand.section.tapered:
+            ends.append(("tip_", "tip_width", lowest["tip_width"]))
         # Equal fingers have the same problems, which are told once.
-        for height, wall, thinnest, pressure in dict.fromkeys(fingers):
-            for name, size in (("height", height), ("section.width", hand.section.width)):
+        fingers = dict.fromkeys(
+            (own, across, *numbers)
+            for own, across, widths in ends
+            for numbers in zip(
+                lowest[f"{own}height"],
+                widths,
+                bounds[f"{own}wall"][1],
+                lowest[f"{own}wall"],
+                lowest["pressure"],
+                strict=True,
+            )
+        )
+        for own, across, height, width, wall, thinnest, pressure in fingers:
+            for name, size in ((f"{own}height", height), (across, width)):
                 if size <= 2 * wall:
                     problems.append(
                         f"{path}: a {name} of {size:g} m leaves no air chamber "
@@ -280,6 +300,7 @@ __all__ = [
     "PressureLimit",
     "Section",
     "Wrist",
+    "highest_pressure",
     "load",
     "structure",
     "with_strain",

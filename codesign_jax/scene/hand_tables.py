@@ -49,8 +49,13 @@ PARAMETERS = {
     "arm_x": Kind("hand", "m", -1.0, 1.0, "position x of the arm frame X_D"),
     "arm_y": Kind("hand", "m", -1.0, 1.0, "position y of the arm frame X_D"),
     "pressure": Kind("finger", "Pa", 0.0, 1e6, "gauge pressure of a chamber while grasping"),
+    "tip_height": Kind("finger", "m", 1e-3, 0.1, "height at the tip, if `section.tapered`"),
+    "tip_wall": Kind("finger", "m", 1e-4, 0.05, "wall at the tip, if `section.tapered`"),
+    "tip_width": Kind("finger", "m", 1e-3, 0.1, "width at the tip, if `section.tapered`"),
 }
 """Every parameter that the hand model understands."""
+TIP = ("tip_height", "tip_wall", "tip_width")
+"""Those of tapered fingers alone."""
 
 
 Numbers = float | tuple[float, ...]
@@ -109,10 +114,13 @@ class Section:
     """Rectangular hollow cross-section; height and wall are parameters of the table.
 
     Attributes:
-      width: Outer width of the section.
+      width: Outer width of the section, of a tapered finger at its base.
+      tapered: Whether height, wall and width change linearly along a finger, from those at its base
+        to the parameters `tip_height`, `tip_wall` and `tip_width`.
     """
 
     width: float = quantity("m", 0.005, 0.1)
+    tapered: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -217,15 +225,36 @@ class PressureLimit:
         default=None, metadata={"in_file": False}
     )
 
-    def of(self, height: Any, wall: Any) -> Any:
-        """Highest pressure of fingers of a height and wall [m], any shape [Pa]."""
+    def of(self, height: Any, wall: Any, width: Any = None) -> Any:
+        """Highest pressure of sections of a height, wall and width [m], any shape [Pa].
+
+        Without a width it is the hand's.
+        """
         highest = self.per_wall * wall
         if self.strain is None:
             return highest
-        strain, width, modulus, neo_hookean = self.strain
-        how = {"width": width, "shear_modulus": modulus, "neo_hookean": neo_hookean}
+        strain, own, modulus, neo_hookean = self.strain
+        how: dict[str, Any] = {"width": own if width is None else width}
+        how |= {"shear_modulus": modulus, "neo_hookean": neo_hookean}
         stretched = strain_pressure(strain, height, wall, **how)
         return highest + (stretched - highest) * (stretched < highest)
+
+
+def highest_pressure(hand: "Hand", height: Any, wall: Any, tip: Any = None) -> Any:
+    """Highest pressure of fingers of a height and wall [m], any shape [Pa].
+
+    Args:
+      hand: The hand.
+      height: Section height, of tapered fingers at the base.
+      wall: Wall thickness, likewise.
+      tip: Height, wall and width at the tip, the lower of whose limits counts; None without taper.
+    """
+    limit = hand.pressure_limit.of
+    highest = limit(height, wall)
+    if tip is None:
+        return highest
+    there = limit(*tip)
+    return highest + (there - highest) * (there < highest)
 
 
 def with_strain(hand: "Hand", strain: float | None, *, neo_hookean: bool) -> "Hand":

@@ -545,7 +545,9 @@ def _falling(frames: tuple[Frame, ...], ends: Mapping, where: str) -> Iterator[s
 def _walls(hand: Hand) -> Iterator[tuple]:
     """Lowest and highest pressures, and lowest and highest limits of the walls, by finger."""
     for bounds in hands.all_bounds(hand):
-        walls = [[hand.pressure_limit.per_wall * w for w in side] for side in bounds["wall"]]
+        both = zip(bounds["wall"], bounds.get("tip_wall", bounds["wall"]), strict=True)
+        thinnest = [map(min, *ends) for ends in both]  # of a tapered finger
+        walls = [[hand.pressure_limit.per_wall * w for w in side] for side in thinnest]
         yield *bounds["pressure"], list(zip(*walls, strict=True))
 
 

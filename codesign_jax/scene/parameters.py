@@ -20,7 +20,7 @@ import dataclasses
 import functools
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -30,8 +30,8 @@ import numpy as np
 
 from codesign_jax.scene import schema, unit_slips
 from codesign_jax.scene.hand import UNITS, Free, Hand, Parameter, Preset, structure
-from codesign_jax.scene.hand_tables import PARAMETERS, per_finger
-from codesign_jax.types import Params
+from codesign_jax.scene.hand_tables import PARAMETERS, TIP, highest_pressure, per_finger
+from codesign_jax.types import Params, Tip
 
 # The limit is strict (p_i < d_i * 80 kPa / 2 mm); this margin keeps it so in float32.
 _STRICT = 1.0 - 1e-6
@@ -226,8 +226,7 @@ class DesignSpace:
         source, start = np.asarray(self.source), _offsets(self.hand)
         full = np.where(source >= 0, rows[:, np.maximum(source, 0)], np.asarray(self.base))
         fingers = np.arange(len(self.hand.finger))
-        sizes = (full[:, start[name] + fingers] for name in ("height", "wall"))
-        caps = self.hand.pressure_limit.of(*sizes)
+        caps = _caps(self.hand, lambda name: full[:, start[name] + fingers])
         # A pressure at its limit is a legal one, also as a float32.
         above = full[:, start["pressure"] + fingers] > caps * (1 + 1e-6)
         return int(above.any(1).sum())
@@ -297,14 +296,20 @@ class DesignSpace:
 def _projected(space: DesignSpace, design: jax.Array) -> jax.Array:
     """`DesignSpace.project` of a design whose units are known to be right; one program a space."""
     full, offsets = space.expand(design), _offsets(space.hand)
-    height, wall = (full[offsets[n] :][: len(space.hand.finger)] for n in ("height", "wall"))
-    caps = space.hand.pressure_limit.of(height, wall) * _STRICT
+    fingers = len(space.hand.finger)
+    caps = _caps(space.hand, lambda name: full[offsets[name] :][:fingers]) * _STRICT
     start = offsets["pressure"]
     for i in range(len(space.hand.finger)):
         j = space.source[start + i]
         if j >= 0:
             design = design.at[j].min(caps[i])
     return design
+
+
+def _caps(hand: Hand, value: Callable[[str], Any]) -> Any:
+    """Highest pressures of fingers, from the values of their parameters by name."""
+    tip = [value(name) for name in TIP] if hand.section.tapered else None
+    return highest_pressure(hand, value("height"), value("wall"), tip)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -360,6 +365,7 @@ def unflatten(hand: Hand, full: jax.Array) -> Params:
         arm=jnp.stack(arm),
         pressure=take("pressure"),
         control={p.name: take(p.name) for p in hand.parameter if p.name not in PARAMETERS} or None,
+        tip=Tip(*(take(name) for name in TIP)) if hand.section.tapered else None,
     )
 
 

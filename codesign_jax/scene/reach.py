@@ -39,7 +39,7 @@ def contact_radius(hand: Hand) -> float:
     heights = [
         high * UNITS[row.unit][1]
         for row in hand.parameter
-        if row.name == "height"
+        if row.name in ("height", "tip_height")
         for numbers in [row.high, *_widened(hand)]
         for high in per_finger(numbers, 1)
     ]
@@ -48,7 +48,8 @@ def contact_radius(hand: Hand) -> float:
 
 def _widened(hand: Hand) -> list[Numbers]:
     """Upper bounds of the height that presets give instead of the table's, in its unit."""
-    free = [f for preset in hand.preset for f in preset.free if f.name == "height"]
+    names = ("height", "tip_height")
+    free = [f for preset in hand.preset for f in preset.free if f.name in names]
     return [f.high for f in free if f.high is not None]
 
 

@@ -1,5 +1,6 @@
 """Constants of a rollout in lane layout, taken from the same model fields as every engine uses."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -10,7 +11,8 @@ import numpy as np
 from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.laws.cones import Cones, make_cones
 from codesign_jax.engines.structured.laws.meshes import MeshLanes, mesh_lanes
-from codesign_jax.model import ModelFields, compile_template, layout
+from codesign_jax.model import Layout, ModelFields, layout
+from codesign_jax.model.morphology import at_joints
 from codesign_jax.scene import Scene
 from codesign_jax.verdict import Bounds, bounds
 
@@ -29,7 +31,8 @@ class WorldModel(NamedTuple):
       stiffness: Joint stiffness, shape (link, axis, finger, world).
       damping: Joint damping with the implicit term, same shape.
       armature: Joint armature with the implicit terms, same shape.
-      gain: Bending moment per pressure, shape (finger, world).
+      gain: Bending moment per pressure, shape (finger, world); of tapered fingers (link, finger,
+        world).
       sphere: Sphere centres in the link frame, shape (3, link, k, finger, world).
       radius: Sphere radii, shape (link, k, finger, world).
       stub_centre: Centre of the half segments at the palm in the palm frame, shape (3, finger,
@@ -53,10 +56,11 @@ class WorldModel(NamedTuple):
       cones: Parameters of the contacts.
       bounds: When a world is decided, of shape (1, world) each.
       gravity: Magnitude of gravity [m/s^2], shape (1, world); None without the effect.
-      section: Height, wall, segment length and width of the fingers, shape (4, finger, world); None
-        without the effect `neo_hookean` and the surface "hull".
-      threshold: Numbers of `model.morphology.thresholds`, shape (3, finger, world); None without
-        the effect `lateral_threshold`.
+      section: Height, wall, segment length and width of the fingers at their bases, shape (4,
+        finger, world); None without the effect `neo_hookean` and the surface "hull".
+      tip: Height, wall and width at the tips, shape (3, finger, world); None without taper.
+      threshold: Numbers of `model.morphology.thresholds`, shape (1, 3, finger, world), of tapered
+        fingers (link, 3, finger, world); None without the effect `lateral_threshold`.
     """
 
     mount: jax.Array
@@ -89,8 +93,30 @@ class WorldModel(NamedTuple):
     bounds: Bounds
     gravity: jax.Array | None = None
     section: jax.Array | None = None
+    tip: jax.Array | None = None
     palm_disc: jax.Array | None = None
     threshold: jax.Array | None = None
+
+
+def sections(hand: WorldModel, places: np.ndarray) -> tuple[Any, Any, Any]:
+    """Height, wall and width of fingers at shares of their length, (place, finger, world) each.
+
+    The axis of the places has length 1 where fingers are not tapered.
+    """
+    assert hand.section is not None
+    base = [hand.section[k][None] for k in (0, 1, 3)]
+    if hand.tip is None:
+        return base[0], base[1], base[2]
+    share = np.asarray(places, hand.section.dtype)[:, None, None]
+    found = [a + share * (b - a) for a, b in zip(base, hand.tip, strict=True)]
+    return found[0], found[1], found[2]
+
+
+def joint_sections(hand: WorldModel, links: int) -> jax.Array:
+    """As `WorldModel.section`, at each joint, shape (link, 4, finger, world); see `sections`."""
+    assert hand.section is not None
+    height, wall, width = sections(hand, at_joints(links))
+    return jnp.stack([height, wall, 0 * height + hand.section[2], width], 1)
 
 
 def rotation_columns(quat: jax.Array) -> jax.Array:
@@ -147,7 +173,7 @@ def world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
 
 @partial(jax.jit, static_argnums=0)
 def _world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
-    lay, template = layout(scene), compile_template(scene)
+    lay = layout(scene)
 
     def last(array: jax.Array) -> jax.Array:
         return jnp.moveaxis(array, 0, -1)
@@ -181,7 +207,7 @@ def _world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
         stiffness=by_link(fields.jnt_stiffness, lay.dofs),
         damping=by_link(fields.dof_damping, lay.dofs),
         armature=by_link(fields.dof_armature, lay.dofs),
-        gain=last(fields.actuator_gainprm[:, 6 : template.nu, 0]),
+        gain=_gain(fields, lay, last),
         sphere=jnp.zeros((0,)) if no_spheres else vectors(fields.geom_pos, lay.spheres),
         radius=jnp.zeros((0,)) if no_spheres else by_link(fields.geom_size[..., 0], lay.spheres),
         stub_centre=stub_centre,
@@ -202,7 +228,8 @@ def _world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
         bounds=bounds(numbers),
         gravity=-fields.gravity[None, :, 2] if scene.effects.gravity else None,
         section=None if fields.section is None else fields.section.transpose(2, 1, 0),
-        threshold=None if fields.threshold is None else fields.threshold.transpose(2, 1, 0),
+        tip=None if fields.tip is None else fields.tip.transpose(2, 1, 0),
+        threshold=None if fields.threshold is None else fields.threshold.transpose(2, 3, 1, 0),
         palm_disc=_disc(numbers) if lay.disc.size or lay.palm.size else None,
     )
 
@@ -210,6 +237,15 @@ def _world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
 def _disc(scene: Scene) -> jax.Array:
     palm = scene.hand.palm
     return jnp.stack([jnp.asarray(palm.radius), jnp.asarray(palm.thickness) / 2])
+
+
+def _gain(fields: ModelFields, lay: Layout, last: Callable) -> jax.Array:
+    """Bending moment per pressure, see `WorldModel`."""
+    of_finger = last(fields.actuator_gainprm[:, 6 : 6 + len(lay.stubs), 0])
+    if fields.wrap_prm is None:
+        return of_finger
+    share = fields.wrap_prm.reshape(-1, len(lay.stubs), lay.links)
+    return share.transpose(2, 1, 0) * of_finger
 
 
 def _palm(fields: ModelFields, stubs: np.ndarray, mount: jax.Array, stub_centre: jax.Array, last):

@@ -9,7 +9,7 @@ from codesign_jax.engines.structured.kernel.memory import lengthened
 from codesign_jax.engines.structured.kernel.pair_search import TIP, ring_places
 from codesign_jax.engines.structured.kernel.tables import PALM, Tables
 from codesign_jax.engines.structured.laws.kinematics import Acc, State
-from codesign_jax.engines.structured.world_model import WorldModel
+from codesign_jax.engines.structured.world_model import WorldModel, joint_sections, sections
 from codesign_jax.model.layout import palm_touches
 from codesign_jax.scene import Scene
 
@@ -37,10 +37,8 @@ class Packing(Tables):
         arrays["share"] = jnp.broadcast_to(share[:, None, None], (self.links + 1, *lane))
         if palm_touches(self.scene):
             arrays["palm_ring"] = self._palm_slots(hand)
-        if hand.section is not None:
-            arrays["section"] = hand.section[None]
-        if hand.threshold is not None:
-            arrays["threshold"] = hand.threshold[None]
+        if "section" in self.hand.groups:
+            arrays["section"] = joint_sections(hand, self.links)
         if self.k:
             arrays["ring"] = ring_numbers(self.scene, hand, self.k)
         if hand.mesh is not None:
@@ -180,9 +178,11 @@ def ring_numbers(scene: Scene, hand: WorldModel, k: int) -> jax.Array:
         rows = [*hand.sphere, *[hand.radius] * 3, one, 0.0 * one]
         return jnp.stack(rows, 2).reshape(-1, 8, *one.shape[2:])
     assert hand.section is not None
-    height, _, segment, width = hand.section
+    segment, own = hand.section[2:]
     links = scene.discretization.links
     along = ring_places(links, k)
+    places = (along + np.arange(links)[:, None] + 0.5) / links
+    height, _, width = sections(hand, places.ravel())
     length = np.full((links, k), 1.0 / k)
     length[-1] *= 0.5
     half = 0.6 * length
@@ -190,8 +190,10 @@ def ring_numbers(scene: Scene, hand: WorldModel, k: int) -> jax.Array:
     along, length, half = (v.reshape(-1, 1, 1) for v in (along, length, half))
     tip = (np.arange(links * k) == links * k - 1).reshape(-1, 1, 1)
     rows = [along * segment, 0.0, 0.5 * height, half * segment, 0.5 * width, 0.5 * height]
-    rows += [length * segment / width, tip.astype(width.dtype)]
-    shape = (links * k, *width.shape)
+    # The skin is as stiff everywhere: a narrower section stands for less of it.
+    widths = length * segment / width if hand.tip is None else length * segment * width / own**2
+    rows += [widths, tip.astype(width.dtype)]
+    shape = (links * k, *segment.shape)
     return jnp.stack([jnp.broadcast_to(jnp.asarray(v, width.dtype), shape) for v in rows], 1)
 
 

@@ -86,6 +86,21 @@ class Search:
             return self.p.hand.read(self.step.hand, "ring", item)
         return self._gathered(self.p.hand, self.step.hand, "ring", item, lane)
 
+    def ring_at(self, row: Any) -> Any:
+        """The ring whose section a finger has where a segment of its centre line begins.
+
+        All sections are alike but for a tapered finger's: there it is the ring before that place.
+        """
+        if not self.p.tapered:
+            return self.count - 1
+        first = (jnp.asarray(row) - 1) * self.p.k - 1
+        return jnp.maximum(first, 0)
+
+    def largest(self, lane: jax.Array | None = None) -> Lanes:
+        """Numbers of the largest ring of a finger: of its last one, or of either end's."""
+        tip = self.ring(self.count - 1, lane)
+        return lanewise(jnp.maximum, tip, self.ring(0, lane)) if self.p.tapered else tip
+
     def start(self, motion: Lanes, vel: Lanes, frame: Lanes, base: Lanes) -> None:
         """Empties the slots; stores what belongs to the palm."""
         for row in range(self.pairs.set.rows):
@@ -93,13 +108,14 @@ class Search:
         grip.clear(self.step)
         self.write("fastest", zeros((), self.like))
         self._side(0, motion, vel, frame, base)
-        self.write("end", lanewise(above, base, frame, frame, self.ring(self.count - 1)), 0)
+        self.write("end", lanewise(above, base, frame, frame, self.ring(self.ring_at(0))), 0)
 
     def link(self, i: Any, motion: Lanes, vel: Lanes, frame: Lanes, origin: Lanes) -> None:
         """Stores where a link is and how it moves."""
         before = self.read("frame", i)
         self._side(i + 1, motion, vel, frame, origin)
-        self.write("end", lanewise(above, origin, before, frame, self.ring(self.count - 1)), i + 1)
+        numbers = self.ring(self.ring_at(i + 1))
+        self.write("end", lanewise(above, origin, before, frame, numbers), i + 1)
         size = self.read("fastest"), vel, self.palm_vel, origin, self.ring(0)
         self.write("fastest", lanewise(_faster, *size))
 
@@ -237,7 +253,8 @@ class Search:
     def _on_itself(self, item: Any, mine: jax.Array) -> None:
         row, numbers, frame, centre = self.body(item)
         square, other, t = self._nearest("line", centre, item)
-        near = mine & self._near(square, numbers, numbers, self.read("fastest"))
+        theirs = self.largest() if self.p.tapered else numbers
+        near = mine & self._near(square, numbers, theirs, self.read("fastest"))
 
         def enter() -> None:
             place = self._between(numbers, frame, centre, other, t, None)
@@ -248,7 +265,8 @@ class Search:
 
     def _end(self, item: Any) -> jax.Array:
         """The last place along a finger [links] that one of its rings touches."""
-        return self._along(item) - lanewise(arc, self.ring(self.count - 1)).lane
+        tip = self.ring(self.count - 1)
+        return self._along(item) - lanewise(arc, tip, self.largest()).lane
 
     def last_of(self, item: Any, row: Any) -> jax.Array:
         """The last place on a segment, 0 to 1, that rings of the same finger touch."""
@@ -273,7 +291,7 @@ class Search:
         link, numbers, frame, centre = self.body(item)
         square, other, t = self._nearest("other", centre)
         speed = lanewise(jnp.add, *(self.read("fastest", 0, at) for at in (None, pairing.lane)))
-        theirs = self.ring(self.count - 1, pairing.lane)
+        theirs = self.largest(pairing.lane)
         near = owner & mine & self._near(square, numbers, theirs, speed)
 
         def enter() -> None:
@@ -338,7 +356,7 @@ class Search:
         rows = neighbours(row, self.p.links)
         frames = tuple(self.read("frame", r, lane) for r in rows)
         ends = self.read("end", row, lane), self.read("end", row + 1, lane)
-        tip = self.ring(self.count - 1, lane)
+        tip = self.ring(self.ring_at(row + 1), lane)
         last = lanes([jnp.where(row == self.p.links, self.like + 1.0, self.like)], (), wide=True)
         where = lanes([t], (), wide=True)
         return lanewise(between, numbers, frame, centre, (ends, frames, tip, last), where)
@@ -412,13 +430,13 @@ def palm_distance(point, palm):
     return shapes.disc_distance(point, *palm)
 
 
-def arc(tip):
+def arc(tip, largest):
     """Least distance along a finger at which it touches itself, in links."""
-    return jnp.maximum(3.0, 1.8 * 2.0 * tip[5] / (tip[3] / TIP))
+    return jnp.maximum(3.0, 1.8 * 2.0 * largest[5] / (tip[3] / TIP))
 
 
 def between(numbers, frame, centre, other, t):
-    """See `rings.between`; other: ends, frames, the tip's ring, and whether it is the last one."""
+    """See `rings.between`; other: ends, frames, a ring's section, whether it is the last one."""
     ends, frames, tip, last = other
     segment = Segment(ends, frames, jnp.stack([last * tip[3], tip[4], tip[5]]))
     return rings.between(Ring.of(numbers), frame, centre, segment, t)

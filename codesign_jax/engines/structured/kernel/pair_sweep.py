@@ -136,8 +136,8 @@ class PairSweep:
         number, row, ring = self._ring(item)
         before, own, after = pair_search.neighbours(other, self.p.links)
         frames = tuple(self._chain("frame", r, lane) for r in (before, after))
-        tip = self._numbers(jnp.full_like(other, self._count - 1), pairing, lane)
-        line = Line(self._body(own, lane), self._chain("origin", after, lane), frames, tip)
+        sections = [self._numbers(n, pairing, lane) for n in self._sections(other)]
+        line = Line(self._body(own, lane), self._chain("origin", after, lane), frames, *sections)
         still |= {"last": self._float(jnp.where(other == self.p.links, self.like + 1.0, self.like))}
         held = grip_sweep.at(self.sweep.step, pairing)
         args = (self._body(row), ring), line, self.sweep.step.constant(CONE), held
@@ -154,8 +154,16 @@ class PairSweep:
         self._leave(line.place._asdict(), own)
         self._leave({"frame": line.frames[0]}, before)
         self._leave({"origin": line.origin, "frame": line.frames[1]}, after)
-        tip = jnp.full_like(row, self._count - 1)
-        self.bars.add({"ring": line.tip}, tip, self.lane)
+        bars = line.tip, line.first
+        for ring, bar in zip(self._sections(row), bars, strict=False):
+            self.bars.add({"ring": bar}, ring, self.lane)
+
+    def _sections(self, row: jax.Array) -> list[jax.Array]:
+        """Rings whose sections segments have, and the one before has; see `Search.ring_at`."""
+        search = self.sweep.step.search
+        assert search is not None
+        places = (1, 0) if self.p.tapered else (1,)
+        return [jnp.zeros_like(row) + search.ring_at(row + k) for k in places]
 
     # Both
 

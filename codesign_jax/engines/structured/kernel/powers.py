@@ -219,13 +219,16 @@ class Line(NamedTuple):
       places: Its link, as `Place`.
       origins: Places of the joints at its ends.
       frames: Of the links before it and behind it.
-      tip: Numbers of the finger's last ring.
+      tip: Numbers of the ring whose section it has, see `Search.ring_at`; on the last segment of
+        the finger's last one.
+      first: Of that which the segment before it has, of a tapered finger; else None.
     """
 
     place: Place
     origin: Any
     frames: tuple[Any, Any]
     tip: Any
+    first: Any = None
 
 
 def between_rings(
@@ -245,7 +248,8 @@ def between_rings(
     """
     place, ring = mine
     link, before, after = theirs.place, *theirs.frames
-    start = pair_search.above(link.origin, before, link.frame, theirs.tip)
+    first = theirs.tip if theirs.first is None else theirs.first
+    start = pair_search.above(link.origin, before, link.frame, first)
     behind = pair_search.above(theirs.origin, link.frame, after, theirs.tip)
     tip = pair_search.ring_centre(link.origin, link.frame, theirs.tip)
     ends = start, jnp.where(still["last"] > 0, tip, behind)

@@ -48,7 +48,8 @@ PALM_CONSTANTS = (
 LINK_CONSTANTS = ("offset", "mass", "centre", "inertia", "stiffness", "damping", "armature")
 """Constants of each link that `link_forces` takes."""
 FINGER_CONSTANTS = ("gain", "section", "threshold")
-"""Constants of each finger that it takes; some scenes lack all but the first."""
+"""Constants of each finger, of each link of tapered ones, that it takes; some scenes lack all but
+the first."""
 
 
 class Step:
@@ -91,7 +92,8 @@ class Step:
         """Constants that `link_forces` takes, by name, of those that the scene has."""
         read = partial(self.p.hand.read, self.hand)
         found = {n: read(n, i) for n in LINK_CONSTANTS}
-        found |= {n: read(n) for n in FINGER_CONSTANTS if n in self.p.hand.groups}
+        row = i if self.p.tapered else 0
+        found |= {n: read(n, row) for n in FINGER_CONSTANTS if n in self.p.hand.groups}
         if "gravity" in self.p.world.groups:
             found["gravity"] = self.constant("gravity")
         return found

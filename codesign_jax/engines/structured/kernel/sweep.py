@@ -15,7 +15,7 @@ from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.powers import Chain, Place
 from codesign_jax.engines.structured.kernel.problem import Iterate, Memory
 from codesign_jax.engines.structured.kernel.pull import plus, pull
-from codesign_jax.engines.structured.kernel.step import LINK_CONSTANTS
+from codesign_jax.engines.structured.kernel.step import FINGER_CONSTANTS, LINK_CONSTANTS
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import shapes
 from codesign_jax.engines.structured.laws.cones import which_cone
@@ -119,6 +119,8 @@ class Sweep:
         run, joint = partial(powers.of_link, self.p.scene), joint | {"pressure": pressure}
         before, own, moved = pull(run, (self.chain(i), numbers, joint), (still,), (after, self.one))
         self.bars.add({n: own.pop(n) for n in LINK_CONSTANTS}, i)
+        sections = {n: own.pop(n) for n in FINGER_CONSTANTS if n in own}
+        self.bars.add(sections, i if self.p.tapered else 0)
         self.bars.add(own | {"pressure": moved.pop("pressure")})
         self.bars.add_joint(moved, i)
         return before

@@ -90,6 +90,16 @@ class Tables:
         return [*sets, *on_table]
 
     @property
+    def tapered(self) -> bool:
+        """Whether the sections of fingers change along them."""
+        return self.scene.hand.section.tapered
+
+    @property
+    def rows(self) -> int:
+        """Rows of what each finger has one of, or each of its links if it is tapered."""
+        return self.links if self.tapered else 1
+
+    @property
     def gathers(self) -> bool:
         """Whether lanes read rows of their own."""
         return self.backend in GATHERING or self.team > 1
@@ -101,9 +111,9 @@ class Tables:
         if palm_touches(self.scene):
             more |= {"palm_ring": (self.palm_groups, (8,))}
         if self.scene.effects.neo_hookean:
-            more |= {"section": (1, (4,))}
+            more |= {"section": (self.rows, (4,))}
         if self.scene.effects.lateral_threshold:
-            more |= {"threshold": (1, (3,))}
+            more |= {"threshold": (self.rows, (3,))}
         support, grid = objects.tables(self.scene, self.fingers)
         self.hand = MemoryLayout(
             True,
@@ -111,7 +121,7 @@ class Tables:
             base=(1, (3,)),
             stub_centre=(1, (3,)),
             share=(n + 1, one),
-            gain=(1, one),
+            gain=(self.rows, one),
             offset=(n, one),
             mass=(n, one),
             centre=(n, (3,)),

@@ -7,7 +7,12 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.lanes import cross, dot, once, spatial, total
 from codesign_jax.engines.structured.laws.kinematics import Kinematics, State
-from codesign_jax.engines.structured.world_model import WorldModel, apply_columns, turn_columns
+from codesign_jax.engines.structured.world_model import (
+    WorldModel,
+    apply_columns,
+    joint_sections,
+    turn_columns,
+)
 from codesign_jax.model.morphology import softening, threshold_moments
 from codesign_jax.scene import Scene
 
@@ -230,8 +235,9 @@ def joint_springs(scene: Scene, hand: WorldModel, state: State, pressure: jax.Ar
     each = hand.stiffness, hand.damping, hand.armature
     if hand.threshold is None:
         return springs(scene, each, None, pressure, state.finger)
-    run = jax.vmap(lambda c, q: springs(scene, c, hand.threshold, pressure, q))
-    return run(each, state.finger)
+    every = jnp.broadcast_to(hand.threshold, (len(state.finger), *hand.threshold.shape[1:]))
+    run = jax.vmap(lambda c, q, numbers: springs(scene, c, numbers, pressure, q))
+    return run(each, state.finger, every)
 
 
 def _with_lateral(axes: jax.Array, lateral: jax.Array) -> jax.Array:
@@ -265,12 +271,13 @@ def smooth_forces(
         wrist = wrist - hand.wrist_damping * state.wrist_vel
     joint = joint_springs(scene, hand, state, pressure)
     finger = -joint.stiffness * state.finger - joint.damping * state.finger_vel
-    bend = finger[:, :1] + hand.gain * pressure
+    gain = hand.gain if hand.tip is None else hand.gain[:, None]
+    bend = finger[:, :1] + gain * pressure
     if joint.moment is not None:
         bend = bend + joint.moment
     if scene.effects.neo_hookean:
-        assert hand.section is not None
-        bend = bend + softening_moment(hand.section, hand.stiffness[:, :1], state.finger[:, :1])
+        section = jnp.moveaxis(joint_sections(hand, len(state.finger)), 1, 0)[:, :, None]
+        bend = bend + softening_moment(section, hand.stiffness[:, :1], state.finger[:, :1])
     finger = jnp.concatenate([bend, finger[:, 1:]], 1)
     links = once(lambda b, v, a: b.smooth_force(v, a, g), body.link, kin.vel, kin.bias)
     return Smooth(

@@ -40,7 +40,7 @@ def pytest_configure(config):
 # worker waits for the other.
 LONG = """
 test_resume test_reverse test_sample test_kernel test_compose test_effects test_containment
-test_many_runs test_palm_contact test_engines test_experiments test_mesh_grasps test_batch
+test_many_runs test_engines test_experiments test_mesh_grasps test_batch
 test_search_study test_own test_run_reading test_library test_preflight test_calibration
 test_planted_faults test_hard_cases test_accuracy_report test_planted_contacts
 test_scene test_runtime test_constants test_report_page test_docs test_codesign

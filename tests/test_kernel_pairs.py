@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.helpers import grasps
-from tests.helpers.curled_hands import SETTINGS, batched, curled, kinds, one_step
+from tests.helpers.curled_hands import SETTINGS, batched, curled, kinds, on_palm, one_step
 from tests.helpers.dense_steps import DensePairs
 
 # The quick tests have one state of spheres and one of hulls against the same oracles, among worlds
@@ -42,6 +42,26 @@ def test_accelerations_equal_mujoco_on_curled_hands(friction):
         again, _ = run(*jax.tree.map(lambda x: np.asarray(x)[order], inputs))
         np.testing.assert_array_equal(again, qvel[order])
         assert not trace["overflow"].any() and trace["residual"].max() < 1e-20
+
+
+@pytest.mark.parametrize("friction", ["coulomb", "none", "full"])
+@pytest.mark.parametrize("between", [True, False])
+def test_accelerations_equal_mujoco_on_the_palm(friction, between):
+    """Up to eight spheres on the palm, with and without contact between fingers."""
+    settings = {"effects__finger_finger": between, "effects__friction": friction}
+    settings |= {"effects__finger_palm": True, "contact__finger_palm_friction": 0.4}
+    settings |= {"contact__finger_finger_friction": 0.6}  # neither the object's nor the palm's
+    with jax.enable_x64(True):
+        scene = grasps.pinch("sphere", **SETTINGS | settings)
+        bends = (1.3, 1.5, 1.6, 1.2, 1.8, 0.3)
+        worlds = [curled(scene, s, bend, height=0.12) for s, bend in enumerate(bends)]
+        inputs = batched(worlds)
+        qvel, _ = one_step(scene)(*inputs)
+        acc = (np.asarray(qvel) - inputs[2]) / scene.discretization.timestep
+        for mine, (model, data, _), bend in zip(acc, worlds, bends, strict=True):
+            mujoco.mj_forward(model, data)
+            assert (on_palm(model, data) > 1) == (bend > 1)
+            assert np.linalg.norm(mine - data.qacc) < 1e-8 * np.linalg.norm(data.qacc)
 
 
 def test_rings_equal_a_dense_solve():

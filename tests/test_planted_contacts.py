@@ -23,7 +23,7 @@ from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.lanewise import lanes, lanewise
 from codesign_jax.engines.structured.laws.rings import Place
 from tests.helpers import curled_hands, dense_steps, grasps
-from tests.helpers.curled_hands import curled, kinds
+from tests.helpers.curled_hands import curled, kinds, on_palm
 from tests.helpers.planted_faults import Fault, chosen, cone_of, planted, simulate
 
 BOUND = 1e-8
@@ -129,6 +129,12 @@ def one_side(right, mine, self, item, field, more, *rest):
     right(self, item, field, left, *rest)
 
 
+def pulled(right, *args):
+    """Both sides of a sphere's contact with the palm are pushed the wrong way."""
+    found = right(*args)
+    return found._replace(normal=-found.normal)
+
+
 def passed_over(right, mine, self, busy):
     """Contacts of a world that still iterates are passed over."""
     return right(self, busy & ~mine)
@@ -203,6 +209,9 @@ HULL = {
     **PAIRS,
 }
 SPHERES = {
+    "the palm pulls": Fault({"ball_on_field": pulled}),
+    "the palm does not feel fingers": Fault({}, methods={(BoundPairs, "_add_wrench"): one_side}),
+    "the palm rubs as fingers do": cone_of("finger_palm", "finger_finger"),
     "contacts between spheres in the centre": place(BALLS, point=lambda v: 0.9 * v),
     "spheres half as deep": place(BALLS, gap=lambda v: 0.5 * v),
     "normals between spheres point inwards": place(BALLS, normal=jnp.negative),
@@ -211,7 +220,7 @@ SPHERES = {
 SURFACES = {"hull": HULL, "spheres": SPHERES}
 STATES = {
     "hull": {"main": (5, 0.9, 0.06), "overflow": (1, 1.5, 0.045)},
-    "spheres": {"main": (1, 1.2, 0.06)},
+    "spheres": {"main": (3, 1.9, 0.045)},
 }
 """Arguments of `curled`: seed, bend and height [m]. Contacts of every kind, with rings more than
 `SLOTS` of one kind in the other."""
@@ -245,11 +254,12 @@ class Worlds(NamedTuple):
 def scene_of(surface):
     settings = {"effects__finger_finger": True, "effects__surface": surface}
     settings |= {"effects__palm_object": False, "effects__palm_table": False}
-    settings |= {"contact__finger_finger_friction": 0.6}  # not the object's
+    settings |= {"effects__finger_palm": True}
+    settings |= {"contact__finger_finger_friction": 0.6}  # neither the object's nor the palm's
+    settings |= {"contact__finger_palm_friction": 0.4}
     if surface == "spheres":
-        return grasps.pinch("sphere", links=2, **settings)
-    settings |= {"effects__friction_memory": True, "contact__finger_palm_friction": 0.4}
-    settings |= {"effects__finger_palm": True, "effects__finger_itself": True}
+        return grasps.pinch("sphere", links=2, discretization__spheres_per_link=2, **settings)
+    settings |= {"effects__friction_memory": True, "effects__finger_itself": True}
     return grasps.pinch("sphere", links=8, **settings)
 
 
@@ -274,6 +284,7 @@ def simulated(surface):
     held = np.zeros(3), np.zeros((scene.num_fingers, 3))
     start = solve(found["qpos"][start, 0], found["qvel"][start, 0], held)
     assert surface == "hull" or min(kinds(*states["main"][:2])) > 0
+    assert surface == "hull" or on_palm(*states["main"][:2]) > 0
     return Worlds(faults, found, solve, start, scene.discretization.timestep)
 
 

@@ -42,6 +42,11 @@ def kinds(oracle, data):
     return fingers.count(2), held
 
 
+def on_palm(oracle, data):
+    """Number of contacts with the palm's disc."""
+    return int((data.contact.geom == oracle.geom("palm_disc").id).any(1).sum())
+
+
 def one_step(scene, limits=None):
     """The compiled step of worlds from qpos and qvel under ctrl: qvel after it, and the trace."""
     engine = StructuredEngine(scene)

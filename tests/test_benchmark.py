@@ -72,6 +72,7 @@ def test_winners_are_the_best_final_particle_of_each_concurrent_run():
     assert np.bincount(random.trials.shape).tolist() == [60 // objects] * objects
 
 
+@pytest.mark.slow  # quick: what is told of records
 def test_a_batch_is_measured_and_judged(monkeypatch):
     """Its verdicts are those of the engine; the rate is that of the shortest call."""
     monkeypatch.setattr(benchmark, "SECONDS", 0.0)

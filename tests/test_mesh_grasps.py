@@ -74,7 +74,7 @@ def test_household_distances_in_lanes(household):
     shape = jnp.arange(count)[None]
     size = 1.03 * np.array([s.half_sizes for s in household]).T[:, None]
     rng = np.random.default_rng(4)
-    points = np.stack([s.mesh.vertices[rng.integers(len(s.mesh.vertices), size=200)]
+    points = np.stack([s.mesh.vertices[rng.integers(len(s.mesh.vertices), size=80)]
                        for s in household], -1).swapaxes(0, 1)  # fmt: skip
     points = 1.03 * (points + rng.normal(scale=0.005, size=points.shape))
     lanes = mesh_lanes.mesh_lanes(the_scene, shape, jnp.asarray(size, jnp.float32))

@@ -154,7 +154,7 @@ def misspelt(scene, trace, ctrl):
     return trace.hight.mean()
 '''
 RUN = [
-    *("optimize", "--scene", str(TINY), "--particles", "4", "--trials", "2", "--test-trials", "2"),
+    *("optimize", "--scene", str(TINY), "--particles", "4", "--trials", "3", "--test-trials", "2"),
     # On MuJoCo C: the kernel makes no difference to the rules here, and takes longer to compile.
     *("--engine", "mujoco", "--reference-trials", "0", "--seed", "3"),
 ]
@@ -191,7 +191,7 @@ def test_a_run_of_ones_own_code_goes_on_bit_for_bit(here, capsys):
     assert record is not None
     low = sys.modules["mine"].low
     engine = make_engine("mujoco", the_scene)
-    evaluate = codesign.Task(the_scene, space, 2, engine, cost=low, record_qpos=True).evaluate
+    evaluate = codesign.Task(the_scene, space, 3, engine, cost=low, record_qpos=True).evaluate
     noise = codesign.stream_key(jax.random.key(3), codesign.STREAM_TRIAL, 1)
     again = evaluate(jnp.asarray(record.history.population[1]), noise)
     # Two programs round model fields differently, and 0.3 s of contact let that grow.

@@ -1,10 +1,9 @@
-"""Hard case 34: two hull fingers pressed together, at a depth and by a force."""
+"""Hard case 34: two hull fingers pressed together by a force; its law: tests/test_rings.py."""
 
 import dataclasses
 import functools
 
 import numpy as np
-from scipy import integrate
 
 from codesign_jax import model, scene
 from tests.helpers import grasps
@@ -14,32 +13,23 @@ from tests.stability.table import Found, case
 HEAVY = 1e9
 """Armature of what is to stay where it is [kg m^2]."""
 LENGTH = 0.11
-DEPTHS = np.array([0.5e-3, 1e-3])
-PLACES = 8
-"""Random places along both fingers at which they cross."""
 ROLLED = {"flat on flat": 0.0, "edge on flat": np.pi / 4}
 """Turn of the lower finger about its own axis."""
 
 
 @functools.cache
-def crossed(links=10, rings=2, points=8, memory=False):
+def crossed(memory=False):
     """The default scene's contact between two opposed fingers, and no other.
 
     Args:
-      links: Links of a finger.
-      rings: Rings of vertices a link.
-      points: Vertices a ring.
       memory: `effects.friction_memory`.
     """
-    others = ("finger_object", "palm_object", "finger_table", "palm_table", "finger_palm")
-    size = {"links": links, "hull_rings": rings, "hull_points": points}
+    others = ("finger_object", "palm_object", "finger_table", "palm_table")
+    others += ("finger_palm", "finger_itself")
     base = scene.load(
         "paper",
         hand_name=grasps.DATA / "pinch.toml",
-        overrides={
-            "effects": dict.fromkeys(others, False) | {"friction_memory": memory},
-            "discretization": size,
-        },
+        overrides={"effects": dict.fromkeys(others, False) | {"friction_memory": memory}},
     )
     return dataclasses.replace(base, gravity=0.0)
 
@@ -75,125 +65,16 @@ def lowest(roll, a, b):
     return (y ** (4 / 3) + z ** (4 / 3)) ** 0.75
 
 
-def force(b, fields):
-    """Force of the first finger on the second one along z [N], by the moments about its joints.
-
-    All joints are so heavy that the step moves nothing.  Two joints before the crossing feel
-    moments that differ by the force times the distance between them.
-    """
-    lay = model.layout(b.scene)
-    fields.dof_armature[:, : int(lay.dofs.max()) + 1] = HEAVY
-    ctrl = b.hold(b.h, *np.c_[fields.start[:, :6], np.zeros((len(fields.start), 2))])
-    speed = b.run(fields, ctrl).qvel[:, 0, lay.dofs[1, :2, 0]]
-    moment = HEAVY * speed / b.h
-    return np.abs(moment[:, 0] - moment[:, 1]) / (LENGTH / lay.links)
-
-
-def overlap(depth, a, b, roll):
-    """Integral of the depth over the overlap of the two outlines [m^3], by quadrature.
-
-    Depth is what is left between the upper outline of the one and the lower outline of the other,
-    along the normal of the plane in which they cross.
-    """
-
-    def below(x, turn):
-        """How far the outline at x is below its highest tangent plane."""
-        top = lowest(turn, a, b)
-        if turn == 0.0:
-            return top - b * (1 - min(abs(x) / a, 1.0) ** 4) ** 0.25
-        # Support function of the outline: its height is the least over all tangents.
-        angles = np.linspace(-0.7, 0.7, 4001)
-        return top - np.min((lowest(turn + angles, a, b) - x * np.sin(angles)) / np.cos(angles))
-
-    def profile(turn):
-        x = np.linspace(-a, a, 801)
-        return x, np.array([below(v, turn) for v in x])
-
-    x, one = profile(0.0)
-    y, other = profile(roll)
-    left = np.maximum(depth - one[:, None] - other[None], 0.0)
-    return integrate.simpson(integrate.simpson(left, x=y, axis=1), x=x)
-
-
-def expected(b, depths, roll):
-    """Force of an elastic skin of stiffness k / w^2 an area on both fingers' outlines [N]."""
-    width, height = b.scene.hand.section.width, grasps.hand_world(b.scene)[0].height[0]
-    stiffness = b.scene.contact.normal_stiffness / width**2
-    return stiffness * np.array([overlap(d, width / 2, height / 2, roll) for d in depths])
-
-
-def against_quadrature(b, roll):
-    """Root mean square of the relative errors, at random places and two depths."""
-    places = np.random.default_rng(34).uniform(0.4, 0.9, (PLACES, 2))
-    depths = np.tile(DEPTHS, PLACES)
-    fields = straight(b, np.repeat(places, len(DEPTHS), 0), depths, roll)
-    wanted = np.tile(expected(b, DEPTHS, roll), PLACES)
-    return np.sqrt(np.mean((force(b, fields) / wanted - 1) ** 2)), wanted[: len(DEPTHS)]
-
-
-# --- the force at a depth ------------------------------------------------------------------------
-
 ONCE = {"steps": (1.0,), "precisions": ("float64",)}  # a force at rest does not know the step
 FINGERS = "two crossed hull fingers"
 HALF = f"{FINGERS} that hold by friction_memory, half the friction limit"
-BY = "error of the force against the quadrature of the overlap, relative"
 EXACT = 1e-24
 """Newton decrement: steps are solved to rounding."""
-MESHES = ((2, 8), (4, 16), (8, 32))
-"""Rings a link and points a ring; the first is the default."""
-WITHIN = 0.1
-"""What was asked of the default mesh: flats that touch at 0.5 and 1 mm."""
 
 
-def exact(step, precision, *size):
-    """The bench of a mesh."""
-    return bench(crossed(*size), "structured", step, precision, EXACT)
-
-
-@case(34, f"{FINGERS}, flat on flat", f"{BY}; default mesh", precisions=("float64",))
-def on_flat(engine, step, precision):
-    """The default mesh, and beside it the force of faces without rounding, k d A / w^2."""
-    error, wanted = against_quadrature(exact(step, precision), 0.0)
-    forces = " and ".join(f"{f:.2f}" for f in wanted)
-    return Found(error, WITHIN, f"{forces} N at 0.5 and 1 mm; sharp edges would have 2 and 4 N")
-
-
-@case(
-    34,
-    f"{FINGERS}, flat on flat",
-    f"{BY}; worst of 5, 10 and 20 links",
-    fails="with five links rings of vertices stand 11 mm apart, twice as far as by default: the "
-    "error falls with the square of that",
-    **ONCE,
-)
-def by_links(engine, step, precision):
-    """Straight fingers are the same with any number of links: worst of 5, 10 and 20."""
-    errors = [against_quadrature(exact(step, precision, n), 0.0)[0] for n in (5, 10, 20)]
-    return Found(max(errors), WITHIN, ", ".join(f"{e:.1%}" for e in errors))
-
-
-def by_mesh(roll, engine, step, precision):
-    """Converges; the finest mesh has 256 points a link."""
-    errors = [against_quadrature(exact(step, precision, 10, *mesh), roll)[0] for mesh in MESHES]
-    parts = zip(MESHES, errors, strict=True)
-    note = ", ".join(f"{r} x {p}: {error:.1%}" for (r, p), error in parts)
-    assert errors[0] > errors[1] > errors[2], note
-    return Found(errors[-1], 0.05, note)
-
-
-def falls(roll, engine, step, precision):
-    """Largest fall of the force while the depth grows to half a section, over its largest."""
-    b, depths = exact(step, precision), np.linspace(0.2e-3, 10e-3, 50)
-    worst, where = 0.0, 0.0
-    for place in np.random.default_rng(35).uniform(0.4, 0.9, (4, 2)):
-        fields = straight(b, np.tile(place, (len(depths), 1)), depths, roll)
-        found = force(b, fields)
-        fall = (np.maximum.accumulate(found) - found) / found.max()
-        if fall.max() > worst:
-            worst, where = fall.max(), depths[fall.argmax()]
-    note = f"up to {found.max():.0f} N" + (f", falls at {1e3 * where:.1f} mm" if worst else "")
-    # The law is monotone; the mesh is not: its force ripples by 5 % along a finger (`on_flat`).
-    return Found(worst, 0.05, note)
+def exact(step, precision):
+    """The bench, which solves a step to rounding."""
+    return bench(crossed(), "structured", step, precision, EXACT)
 
 
 # --- the depth under a force ---------------------------------------------------------------------
@@ -311,16 +192,10 @@ def creeps_without(engine, step, precision):
 
 
 for kind, turn in ROLLED.items():
-    title, own = f"{FINGERS}, {kind}", kind.split()[0]
-    for function, what, more in (
-        (by_mesh, f"{BY}; 256 points a link", ONCE),
-        (falls, "fall of the force with the depth, relative", ONCE),
-        (sinks, "depth under 15 N over that of meeting axes", {"precisions": ("float64",)}),
-        (
-            snaps,
-            "depth under a growing and a falling load of 1 to 15 N, largest difference",
-            {"precisions": ("float64",), "unit": "m"},
-        ),
+    for function, what, unit in (
+        (sinks, "depth under 15 N over that of meeting axes", ""),
+        (snaps, "depth under a growing and a falling load of 1 to 15 N, largest difference", "m"),
     ):
-        name = f"{function.__name__.removeprefix('by_')}_{own}"
-        case(34, title, what, name=name, **more)(functools.partial(function, turn))
+        own = {"name": f"{function.__name__}_{kind.split()[0]}", "precisions": ("float64",)}
+        register = case(34, f"{FINGERS}, {kind}", what, unit=unit, **own)
+        register(functools.partial(function, turn))

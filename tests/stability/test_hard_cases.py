@@ -18,7 +18,6 @@ from tests.stability import (  # noqa: F401  (they register their cases)
     laws,
     momentum,
     moved,
-    skin,
     symmetry,
     table,
     touch,

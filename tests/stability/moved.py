@@ -13,7 +13,7 @@ from tests.stability.bench import bench, pinch
 from tests.stability.hold import lifted
 from tests.stability.oracle import Reader, along
 from tests.stability.table import BOTH, Found, case
-from tests.stability.touch import CUBOID, SPHERE, at_height, held, worlds
+from tests.stability.touch import CUBOID, at_height, held, worlds
 
 AGAINST_C = "accelerations along the path against MuJoCo C, relative"
 HALF = 0.030  # half a side of the cuboid, and radius of the sphere [m]
@@ -121,28 +121,6 @@ def edges(engine, step, precision):
 @functools.cache
 def full():
     return pinch(effects__friction="full")
-
-
-@case(
-    28,
-    "full friction: a sphere spins on the table",
-    "error of its slowing, relative",
-    engines=BOTH,
-)
-def torsion(engine, step, precision):
-    """A sphere that spins on the table: d omega / dt = -torsional_friction g / (2/5 r^2)."""
-    base = full()
-    b = bench(base, engine, step, precision)
-    fields = worlds(b, SPHERE)
-    qpos, qvel = fields.start.copy(), np.zeros((1, fields.start.shape[1] - 1))
-    depth = 0.1 * GRAVITY / (2 * base.contact.normal_stiffness)
-    qpos[0, 2], qpos[0, -5], qvel[0, -1] = 1.0, HALF - depth, 20.0
-    raised = fields._replace(start=qpos)
-    history = b.run(raised, held(b, raised, 0.2), qpos, qvel)
-    slowing = (20.0 - history.qvel[0, -1, -1]) / 0.2
-    expected = base.contact.torsional_friction * GRAVITY / (0.4 * HALF**2)
-    # A sliding contact's normal force differs from the weight as it hops (docs/physics.md).
-    return Found(abs(slowing / expected - 1), 0.15)
 
 
 def spun(b):

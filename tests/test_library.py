@@ -184,7 +184,7 @@ def measured(page, name, make_engine, *designs):
 def only_heights(monkeypatch):
     """Worlds are prepared without model fields, which would compile for seconds."""
 
-    def prepare(the_scene, params, trials, constants):
+    def prepare(the_scene, params, trials, constants, engine):
         ctrl = jnp.tile(params.arm[:, None, 2:3], (1, the_scene.num_steps, 3))
         return None, ctrl, jnp.zeros(len(ctrl), jnp.int32)
 

@@ -1,7 +1,9 @@
 """Policies in the loop: the open loop's bits, MuJoCo's poses, derivatives, what is refused."""
 
 import dataclasses
+import re
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +19,8 @@ from codesign_jax.model.layout import layout
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Status
 from tests.helpers import grasps
+
+PAGE = Path(__file__).parents[1] / "docs" / "control.md"
 
 
 def replay(carry, seen):
@@ -153,6 +157,33 @@ def test_a_command_that_is_no_number_fails_its_world():
     assert (np.asarray(outcome.bad_step) == 31).all()
     with pytest.raises(InputError, match=r"commands pressure\[0\] = nan at 0.3 s in world 0"):
         rollout.simulate(scene, engine, params, trials)
+
+
+def test_the_page_s_policy_and_environment_do_what_they_say(monkeypatch):
+    """Pressures rise where the object slips in the hand, and nowhere else."""
+    scene = grasps.short_grasp()
+    blocks = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.S | re.M)
+    names = {}
+    exec(blocks[0], names)
+    firmer = names["Firmer"](scene)
+    scene = policy.searched(scene, firmer)
+    engine = policy.ControlLoop(make_engine("structured", scene), firmer)
+    params, trials = grasps.random_worlds(scene, 3, 4)
+    plan = rollout.prepare(scene, params, trials, scene.constants(), engine)[1]
+    found = {}
+    for gain in (0.0, 50.0):
+        control = {"gain": jnp.full(4, gain)}
+        trace = simulate(scene, engine, params._replace(control=control), trials)[1]
+        found[gain] = np.asarray(trace.ctrl)[..., 6:] / np.maximum(plan.pressure, 1.0)
+    closed = round(scene.phases.inflate / scene.discretization.timestep)
+    np.testing.assert_allclose(found[0.0][:, 1 + closed :], 1.0, rtol=1e-5)
+    np.testing.assert_allclose(found[50.0][:, :closed], found[0.0][:, :closed], rtol=1e-6)
+    assert (found[50.0][:, -1] > 1.01).any() and (
+        np.diff(found[50.0][:, closed:], axis=1) >= -1e-5
+    ).all()
+    monkeypatch.setattr("codesign_jax.scene.load", lambda name: grasps.short_grasp())
+    exec(blocks[1], names)
+    assert names["state"].obs.shape == (8, names["grasping"].observation_size)
 
 
 @pytest.mark.parametrize(

@@ -288,7 +288,8 @@ def object_pose(objects: ObjectSet, trial: Trial) -> tuple[jax.Array, jax.Array]
 
 def _turn(angle: jax.Array, axis: int) -> jax.Array:
     """Quaternion (4,) of a turn about an axis: 1 for x, 2 for y, 3 for z."""
-    return jnp.zeros(4, angle.dtype).at[0].set(jnp.cos(angle / 2)).at[axis].set(jnp.sin(angle / 2))
+    half = jnp.asarray(angle) / 2  # of JAX's type, whatever NumPy's was
+    return jnp.zeros(4, half.dtype).at[0].set(jnp.cos(half)).at[axis].set(jnp.sin(half))
 
 
 def _after(second: jax.Array, first: jax.Array) -> jax.Array:

@@ -68,7 +68,6 @@ class Measured(NamedTuple):
 
 
 def main(options: "Check") -> int:
-    """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     load = os.getloadavg()[0]
     case = find_case(options)

@@ -178,7 +178,7 @@ def parse_design(
         if name not in values:
             problems.append(f"{where} {name!r} is not a parameter; {schema.nearest(name, values)}")
             continue
-        value = _number(text)
+        value = number(text)
         # Bounds went to SI and back; the last bit of that is no reason to refuse one.
         low, high = (round(float(b[name]), 9) for b in (lows, highs))
         if value is None:
@@ -280,7 +280,7 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-def _number(text: str) -> float | None:
+def number(text: str) -> float | None:
     try:
         value = float(text)
     except ValueError:

@@ -20,9 +20,8 @@ from codesign_jax.commands import common, flags, reference
 from codesign_jax.commands.common import find_case
 from codesign_jax.report import statistics, verdicts
 from codesign_jax.report.verdicts import Judged
-from codesign_jax.runs import RunResult, Settings, columns
+from codesign_jax.runs import RunResult, Settings, columns, manifest
 from codesign_jax.runs.choice import Case
-from codesign_jax.runs.manifest import PROVENANCE
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import InputError
@@ -66,7 +65,6 @@ class Compared(NamedTuple):
 
 
 def main(options: "Compare") -> int:
-    """Runs the command and returns the exit status."""
     folders = [run for folder in options.folders for run in _runs_in(folder)]
     problems = common.number_problems(
         ("--trials", options.trials, 1, 100_000), ("--seed", options.seed, 0, 2**31 - 1)
@@ -89,12 +87,12 @@ def main(options: "Compare") -> int:
 
 
 def _runs_in(folder: Path) -> list[Path]:
-    """The folder, or the runs in it, seed-2 before seed-10."""
-    found = [file.parent for file in folder.glob(f"**/{PROVENANCE}")]
-    if (folder / PROVENANCE).exists() or not found:
+    """The folder, or the runs in it."""
+    found = manifest.runs_inside(folder, "**")
+    if (folder / manifest.PROVENANCE).exists() or not found:
         runs.read_run(folder)  # which says what is wrong
         return [folder]
-    return sorted(found, key=lambda path: (path.parent, len(path.name), path.name))
+    return found
 
 
 def read_all(every: Mapping[Path, tuple[Scene, Settings]]) -> dict[Path, Compared]:

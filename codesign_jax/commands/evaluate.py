@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 
 def main(options: "Evaluate") -> int:
-    """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     case = _of_particle(find_case(options), options)
     _check(options, case.engine)
@@ -114,7 +113,6 @@ def draw(case: Case, engine: engines.Engine, options: "Evaluate", console: Conso
     with Busy(console, "simulating what is drawn"):
         grasps = animation.replay(case.scene, engine, params, trials)
     path: Path = options.render  # type: ignore[assignment]
-    write = animation.write_strip if path.suffix == animation.STRIP else animation.write_film
     with Busy(console, "drawing"):
-        write(case.scene, grasps, path, notify=console.print)
+        animation.write(case.scene, grasps, path, notify=console.print)
     console.print(f"picture: {path}")

@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib.util
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
 
 
 def main(options: "Export") -> int:
-    """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     doubts: list[str] = []
     case = find_case(options, tell=doubts.append)
@@ -147,8 +145,7 @@ def _parts(sizes: list[Size], folder: Path, options: "Export", console: Console)
     with Busy(console, "making fingers and moulds"):
         for part in meshes.write(folder, sizes, how):
             edges = " x ".join(f"{v:.1f}" for v in part.extents)
-            line = f"part {part.name}: {edges} mm, {part.volume / 1e3:.1f} cm^3"
-            console.print(line)
+            console.print(f"part {part.name}: {edges} mm, {part.volume / 1e3:.1f} cm^3")
     for i, size in enumerate(sizes):
         if how.inlet and not process.inlet(size, how):
             low = min(size.base.chamber)
@@ -163,15 +160,10 @@ def _models(case: Case, params: Params, folder: Path, options: "Export", console
     folder = folder / tables.MODELS
     folder.mkdir(exist_ok=True)
     trials = _trials(case, options)
-    built = _built(case, params, trials)
+    built = (grasps.grasp(case.scene, params, trial) for _, trial in trials)
     with Busy(console, f"simulating {common.counted(len(trials), 'grasp')} in plain MuJoCo"):
         for line in tables.write_grasps(folder, case.scene, trials, built):
             console.print(f"in plain MuJoCo: {line}")
-
-
-def _built(case: Case, params: Params, trials: list[tuple[str, Trial]]) -> Iterator[grasps.Grasp]:
-    for _, trial in trials:
-        yield grasps.grasp(case.scene, params, trial)
 
 
 def _trials(case: Case, options: "Export") -> list[tuple[str, Trial]]:

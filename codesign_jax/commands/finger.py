@@ -36,7 +36,6 @@ POINTS = 11
 
 
 def main(options: "Options") -> int:
-    """Runs the command and returns the exit status."""
     case = find_case(options)
     params = case.space.params(np.asarray(case.design))
     problems = common.number_problems(("--finger", options.finger, 0, case.scene.num_fingers - 1))

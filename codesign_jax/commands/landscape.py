@@ -39,7 +39,6 @@ class Plane(NamedTuple):
 
 
 def main(options: "Options") -> int:
-    """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     case = find_case(options)
     _check(options, case)

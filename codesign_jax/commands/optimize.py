@@ -36,7 +36,6 @@ _LONGEST = 200
 
 
 def main(options: "Optimize") -> int:
-    """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     if options.distributed is not None:
         return _distributed(options)

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 
 def main(options: "Render") -> int:
-    """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     _check(options)
     camera = _camera(options.camera)
@@ -43,38 +42,28 @@ def _camera(words: Sequence[str]) -> "Camera":
     """The camera that --camera names: a view, and numbers that replace its own."""
     from codesign_jax.report.animation import CAMERA, VIEWS
 
-    camera, problems = CAMERA, []
-    for word in sorted(words, key=lambda word: "=" in word):  # numbers replace those of the view
+    camera, problems, numbers = CAMERA, [], {}
+    for word in words:
         name, given, text = word.partition("=")
         if not given and name in VIEWS:
             camera = VIEWS[name]
-        elif name not in _LIMITS:
+            continue
+        if name not in _LIMITS:
             hint = schema.nearest(name, [*VIEWS, *_LIMITS])
             problems.append(f"--camera {name!r} is no view and no number of a camera; {hint}")
-        elif not given:
-            problems.append(f"--camera {name} must say {name}=NUMBER")
+            continue
+        (unit, most), value = _LIMITS[name], common.number(text)
+        least = 0.05 if name == "distance" else -most  # MuJoCo cuts what is nearer than 1 cm
+        if value is None:
+            problems.append(f"--camera {name}={text} must be a number [{unit}]")
+        elif problem := schema.range_problem(f"--camera {name}", value, unit, least, most):
+            problems.append(problem)
         else:
-            problem, value = _number(name, text)
-            if problem:
-                problems.append(problem)
-            elif name in "xyz":
-                at = list(camera.lookat)
-                at["xyz".index(name)] = value
-                camera = camera._replace(lookat=tuple(at))
-            else:
-                camera = camera._replace(**{name: value})
+            numbers[name] = value
     common.refuse(problems)
-    return camera
-
-
-def _number(name: str, text: str) -> tuple[str | None, float]:
-    unit, most = _LIMITS[name]
-    try:
-        value = float(text)
-    except ValueError:
-        return f"--camera {name}={text} must be a number [{unit}]", 0.0
-    least = 0.05 if name == "distance" else -most  # MuJoCo cuts what is nearer than 1 cm
-    return schema.range_problem(f"--camera {name}", value, unit, least, most), value
+    place = zip("xyz", camera.lookat, strict=True)
+    at = tuple(numbers.pop(axis, value) for axis, value in place)
+    return camera._replace(lookat=at, **numbers)
 
 
 def draw(asked: grasp.Asked, options: "Render", camera: "Camera", console: Console) -> None:
@@ -87,8 +76,7 @@ def draw(asked: grasp.Asked, options: "Render", camera: "Camera", console: Conso
     scene, size = asked.case.scene, (options.size, options.size)
     with Busy(console, "drawing"):
         how: Any = {"size": size, "camera": camera, "notify": console.print}
-        if options.out.suffix == animation.STRIP:
-            animation.write_strip(scene, [shown], options.out, times=options.times or None, **how)
-        else:
-            animation.write_film(scene, [shown], options.out, **how)
+        if options.times:
+            how["times"] = options.times
+        animation.write(scene, [shown], options.out, **how)
     console.print(f"picture: {options.out}")

@@ -26,7 +26,6 @@ MOST = 10
 
 
 def main(options: "Replay") -> int:
-    """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     if options.path is not None:
         if options.run_folder is not None:

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 
 def main(options: "Report") -> int:
-    """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     scene, settings = runs.read_run(options.folder)
     if not options.no_replay:

@@ -29,7 +29,6 @@ MOST = 1_000_000_000
 
 
 def main(options: "Sample") -> int:
-    """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     _check(options)
     scene = common.load_scene(options)

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 
 def main(options: "Scenes") -> int:
-    """Runs the command and returns the exit status."""
     if options.engine is not None and options.engine not in effects.ENGINES:
         hint = schema.nearest(options.engine, effects.ENGINES)
         raise InputError([f"--engine {options.engine!r} is not valid; {hint}"])

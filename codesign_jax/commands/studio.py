@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 
 def main(options: "Options") -> int:
-    """Runs the command and returns the exit status."""
     common.use_compilation_cache()
     problems = common.number_problems(("--port", options.port, 0, 65535))
     common.refuse(problems + common.place_problems("--out", options.out, folder=True))

@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -253,6 +253,11 @@ def write_strip(
         kind = Image.registered_extensions().get(path.suffix.lower(), "PNG")
         Image.fromarray(picture).quantize(128).save(part, kind)
     return path
+
+
+def write(scene: Scene, grasps: list[Replay], path: Path, **how: Any) -> Path:
+    """Writes a strip or a film, by the path's ending; see `write_strip` and `write_film`."""
+    return (write_strip if path.suffix == STRIP else write_film)(scene, grasps, path, **how)
 
 
 def _announce(notify: Callable[[str], None]) -> None:

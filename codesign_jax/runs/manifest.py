@@ -84,7 +84,7 @@ def read_provenance(path: Path) -> dict[str, Any]:
             why = f"it has no {PROVENANCE}" if path.exists() else "there is no such folder"
         else:
             why = f"{PROVENANCE} cannot be read: {error.strerror}"
-        raise InputError([f"{path} is not a run folder: {why}{_runs_inside(path)}"]) from error
+        raise InputError([f"{path} is not a run folder: {why}{_hint(path)}"]) from error
     except UnicodeDecodeError as error:
         raise _damaged(file, "it is no text in UTF-8") from error
     try:
@@ -156,17 +156,18 @@ def _digest(path: Path) -> str:
         return ""
 
 
-def _runs_inside(path: Path) -> str:
+def runs_inside(path: Path, pattern: str = "*") -> list[Path]:
+    """The run folders in a folder, seed-2 before seed-10."""
+    found = [file.parent for file in path.glob(f"{pattern}/{PROVENANCE}")]
+    return sorted(found, key=lambda folder: (folder.parent, len(folder.name), folder.name))
+
+
+def _hint(path: Path) -> str:
     """A hint at the runs in a folder of several, such as that of --seeds."""
-    try:
-        inside = sorted(file.parent for file in path.glob(f"*/{PROVENANCE}"))
-    except OSError:
-        return ""
-    inside.sort(key=lambda folder: (len(folder.name), folder.name))  # seed-2 before seed-10
-    if not inside:
-        return ""
-    some = f"{inside[0]} or {inside[1]}" if len(inside) > 1 else str(inside[0])
-    return f"; it holds {len(inside)} run{'s' * (len(inside) > 1)}: give one, such as {some}"
+    inside = runs_inside(path)
+    some = " or ".join(map(str, inside[:2]))
+    several = f"{len(inside)} run{'s' * (len(inside) > 1)}"
+    return f"; it holds {several}: give one, such as {some}" if inside else ""
 
 
 def _problem(stored: Any) -> str:

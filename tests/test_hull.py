@@ -6,7 +6,6 @@ import pytest
 import trimesh
 
 from codesign_jax import model, scene
-from codesign_jax.engines import make_engine
 from codesign_jax.model import hull
 from codesign_jax.scene.schema import InputError
 from tests.helpers import grasps
@@ -73,14 +72,6 @@ def test_skinning_equals_mujoco(tmp_path):
     path = hull.write(tmp_path / "hand.ply", fingers, mesh.face)
     read = trimesh.load(path)
     assert read.is_watertight and len(read.split()) == len(fingers)
-
-
-@pytest.mark.parametrize("engine", ["mujoco", "mjx"])
-def test_other_engines_refuse_the_hull(engine):
-    with pytest.raises(
-        InputError, match=f'engine {engine}: effects.surface = "hull".*use engine structured'
-    ):
-        make_engine(engine, hull_scene())
 
 
 def test_bad_settings_are_refused():

@@ -1,4 +1,4 @@
-"""The record of each primitive against MuJoCo's compiler, its own distance and its surface."""
+"""The record of each primitive against MuJoCo: compiler, distances, surface."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax.engines.structured.laws import shapes
+from codesign_jax.engines.structured.laws import rings, shapes
+from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.scene import primitives, rigid
 from tests.helpers import grasps
 
@@ -84,3 +85,84 @@ def test_outline_and_triangles_lie_on_the_surface(kind):
 def test_a_shape_without_record_or_distance_is_refused_at_import(names):
     with pytest.raises(TypeError, match=KINDS[0] if len(names) < len(KINDS) else "cone"):
         primitives.check("distances", names)
+
+
+# --- distances of finger spheres ------------------------------------------------------------------
+
+
+RADIUS, POSES = 0.010, 4000
+
+
+def world(kind):
+    """MuJoCo's model of a free sphere and an object of a kind, and its data."""
+    size = " ".join(map(str, SIZES[kind]))
+    xml = f"""<mujoco><worldbody>
+      <body mocap="true"><geom type="{kind}" size="{size}"/></body>
+      <body mocap="true"><geom type="sphere" size="{RADIUS}"/></body>
+    </worldbody></mujoco>"""
+    compiled = mujoco.MjModel.from_xml_string(xml)
+    return compiled, mujoco.MjData(compiled)
+
+
+def poses(kind, seed):
+    """Random object poses and sphere centres from deep inside to a hand's breadth away."""
+    rng = np.random.default_rng(seed)
+    quat = rng.standard_normal((POSES, 4))
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    position = rng.uniform(-0.2, 0.2, (POSES, 3))
+    # A third of the centres around the object's surface and edges, where regions meet.
+    spread = np.where(np.arange(POSES) % 3 == 0, 0.05, 0.12)[:, None]
+    return position, quat, position + rng.uniform(-spread, spread, (POSES, 3))
+
+
+def reference(kind, position, quat, centre):
+    """MuJoCo's distances and the normals from the object to the sphere where they are defined."""
+    compiled, data = world(kind)
+    distance, normal = np.zeros(POSES), np.zeros((POSES, 3))
+    points = np.zeros(6)
+    for i in range(POSES):
+        data.mocap_pos[:] = position[i], centre[i]
+        data.mocap_quat[0] = quat[i]
+        mujoco.mj_kinematics(compiled, data)
+        distance[i] = mujoco.mj_geomDistance(compiled, data, 0, 1, 1.0, points)
+        away = (points[3:] - points[:3]) * np.sign(distance[i])
+        normal[i] = away / max(np.linalg.norm(away), 1e-300)
+    return distance, normal
+
+
+def engine_contacts(kind, position, quat, centre):
+    """The engine's contacts for the same poses, one sphere a world, in float64."""
+    columns = np.zeros((POSES, 9))
+    for i in range(POSES):
+        mujoco.mju_quat2Mat(columns[i], quat[i])
+    with jax.enable_x64(True):
+        alone = grasps.pinch(kind)
+        size = np.broadcast_to(np.array(SIZES[kind])[:, None, None], (3, 1, POSES))
+        frames = jnp.asarray(columns.reshape(POSES, 3, 3).transpose(2, 1, 0)[:, :, None])
+        at = jnp.asarray((centre - position).T[:, None])  # frames: column, row, 1, world
+        local, shape = shapes.in_object(frames, at), jnp.zeros((1, POSES), jnp.int32)
+        distance, gradient = shapes.primitive_distance(alone, jnp.asarray(size), shape, local)
+        return rings.ball_on_field(RADIUS, at, distance, apply_columns(frames, gradient))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_distances_equal_mujoco(kind):
+    """Distance and normal of spheres outside of an object, and the depth of those that overlap."""
+    position, quat, centre = poses(kind, 7)
+    want, normal = reference(kind, position, quat, centre)
+    got = engine_contacts(kind, position, quat, centre)
+    gap = np.asarray(got.gap)[0]
+    outside, inside = gap > 1e-6, gap < -1e-6
+    assert 0.2 < outside.mean() < 0.99 and inside.sum() > 100  # both kinds of poses are tried
+    # Both are closed forms in float64; they differ by rounding of lengths below a metre.
+    both = outside | inside
+    np.testing.assert_allclose(gap[both], want[both], rtol=0, atol=1e-14)
+    found = np.asarray(got.normal)[:, 0].T
+    # The witness points give the direction; two of them wrong by rounding, a gap apart, turn it.
+    angle = np.linalg.norm(found - normal, axis=1)
+    near = outside & (gap > 1e-3)
+    assert np.all(angle[near] < 1e-14 / gap[near])
+    # Contact points lie half way between the surfaces.
+    point = np.asarray(got.point)[:, 0].T
+    back = centre - position - point
+    np.testing.assert_allclose(np.linalg.norm(back, axis=1), np.abs(RADIUS + gap / 2), atol=1e-12)

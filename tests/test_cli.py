@@ -1,4 +1,4 @@
-"""The command line: wrong input is said in words and creates nothing; Ctrl-C."""
+"""The command line: wrong input is said in words and creates nothing; Ctrl-C; SLURM."""
 
 import os
 import signal
@@ -201,3 +201,43 @@ def test_ctrl_c_is_one_line_and_ends_the_process(monkeypatch, capsys):
     assert cli.main() == 130 and left == [130]
     assert time.monotonic() - start < 20  # of the 30 that the simulation goes on
     assert capsys.readouterr().err == "stopped\n"
+
+
+# --- the SLURM script of the documentation --------------------------------------------------------
+
+
+SCRIPT = Path(__file__).parents[1] / "docs" / "slurm_array.sh"
+# Says what it was asked for and ends as the test wants it, or, as `codesign optimize` does, with
+# 143 when it is stopped.
+CODESIGN = """#!/usr/bin/env bash
+trap 'exit 143' TERM
+echo "$@" > asked
+[ "$STATUS" = wait ] || exit "$STATUS"
+while true; do sleep 0.05; done
+"""
+
+
+@pytest.mark.parametrize(
+    ("status", "code", "requeued"),
+    [("0", 0, None), ("1", 1, None), ("wait", 143, "requeue 7\n")],
+)
+def test_a_job_is_one_run_and_goes_on_after_its_time_limit(status, code, requeued, tmp_path):
+    for name, text in (("codesign", CODESIGN), ("scontrol", '#!/bin/sh\necho "$@" > told\n')):
+        (tmp_path / name).write_text(text)
+        (tmp_path / name).chmod(0o755)
+    slurm = {"SLURM_ARRAY_TASK_ID": "3", "SLURM_JOB_ID": "7", "STATUS": status}
+    path = f"{tmp_path}:{os.environ['PATH']}"
+    job = subprocess.Popen(
+        ["bash", SCRIPT, "my runs", "--preset", "23d"],
+        cwd=tmp_path,
+        env={**os.environ, **slurm, "PATH": path},
+    )
+    if status == "wait":
+        while not (tmp_path / "asked").exists():
+            time.sleep(0.01)
+        job.send_signal(signal.SIGTERM)  # as SLURM's --signal=B:TERM@120
+    assert job.wait(30) == code
+    asked = (tmp_path / "asked").read_text()
+    assert asked == "optimize --seed 3 --out my runs/seed-3 --preset 23d\n"
+    told = tmp_path / "told"
+    assert (told.read_text() if told.exists() else None) == requeued

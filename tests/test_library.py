@@ -1,9 +1,10 @@
-"""The Python examples of README and docs/library.md run, in their order, on a short grasp.
+"""Examples of README, docs/library.md and docstrings run, in their order, on a short grasp.
 
 What examples measure of a grasp, and minimise, tells a held object from a lost one.
 """
 
 import ast
+import doctest
 import re
 import subprocess
 import sys
@@ -249,3 +250,31 @@ def test_numerical_modules_need_no_report(imported):
 
 def test_importing_everything_leaves_jax_as_it_was_and_says_nothing(imported):
     assert imported[1:] == ["[]"]
+
+
+# --- examples of docstrings -----------------------------------------------------------------------
+
+
+FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
+
+
+def examples(name):
+    """Tests of a public name: its own docstring and, of a module, those of what it defines."""
+    found = doctest.DocTestFinder(exclude_empty=True).find(getattr(codesign_jax, name), name)
+    return [test for test in found if test.examples]
+
+
+@pytest.mark.parametrize("name", codesign_jax.__all__)
+def test_examples_are_right(name, capsys):
+    tests = examples(name)
+    assert tests, f"codesign_jax.{name} has no example"
+    runner = doctest.DocTestRunner(optionflags=FLAGS)
+    for test in tests:
+        test.globs = {}  # an example imports what it takes
+        runner.run(test)
+    assert not runner.failures, capsys.readouterr().out
+
+
+def test_a_wrong_example_is_found():
+    test = doctest.DocTestParser().get_doctest(">>> 1 + 1\n3\n", {}, "wrong", None, 0)
+    assert doctest.DocTestRunner().run(test, out=lambda _: None).failed == 1

@@ -58,10 +58,10 @@ class Section(NamedTuple):
 
 def sections(hand: Hand, params: Params, places: np.ndarray) -> Section:
     """The sections of fingers at places, shares of their length from 0 to 1, shape (place,)."""
-    numpy = params.height.__array_namespace__()
-    base = Section(
-        params.height[:, None], params.wall[:, None], numpy.asarray(hand.section.width)[None, None]
-    )
+    width = hand.section.width  # traced it is JAX's, also where the design is of NumPy
+    if not isinstance(width, jax.Array):
+        width = params.height.__array_namespace__().asarray(width)
+    base = Section(params.height[:, None], params.wall[:, None], width[None, None])
     if params.tip is None:
         return base
     tip = Section(*(v[:, None] for v in params.tip))

@@ -4,13 +4,14 @@ import itertools
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from rich.console import Console
 
-from codesign_jax import cli, codesign, files, scene
-from codesign_jax.export import drawing, process, sheet, tolerance
+from codesign_jax import cli, codesign, files, model, rollout, scene
+from codesign_jax.export import casting, drawing, process, sheet, tolerance
 from codesign_jax.export.process import Process
 from codesign_jax.model import morphology
 from codesign_jax.optimize import answer
@@ -186,28 +187,57 @@ def test_text_stands_apart_from_the_drawings(page):
     lines = [f"Best final design of {'runs/a/' * 60}", "Scene x"]
     shown = {"scene": the_scene, "params": params, "sizes": sizes, "drift": drift}
     figure = drawing.page("Build sheet", lines, sheet.sheet_sections(*page), **shown)
+    boxes = apart(figure, 2)
+    assert any("runs/a/" in text for text in boxes) and len(boxes) > 10
+
+
+def apart(figure, drawings):
+    """Boxes of a page's texts, which stand apart from each other and from the first drawings."""
     FigureCanvasAgg(figure).draw()
     texts = [*figure.texts, *(axes.title for axes in figure.axes)]
     boxes = {t.get_text(): t.get_window_extent() for t in texts if t.get_text()}
-    assert any("runs/a/" in text for text in boxes) and len(boxes) > 10
     for (text, one), (other, two) in itertools.combinations(boxes.items(), 2):
         assert not one.overlaps(two), (text, other)
-    for axes in figure.axes[:2]:
+    for axes in figure.axes[:drawings]:
         drawn = [patch.get_window_extent() for patch in axes.patches[:1]]
         for text, box in boxes.items():
             assert not any(box.overlaps(patch) for patch in drawn), text
     assert min(box.y0 for box in boxes.values()) > 0, "all of it is on the page"
+    return boxes
 
 
-def test_drawing_is_one_page(page, tmp_path):
+def test_drawing_is_two_pages(page, tmp_path):
     the_scene, params, sizes, drift = page
     content = sheet.sheet_sections(*page)
+    assembly = sheet.assembly_sections(the_scene, params, sizes, Process())
     path = drawing.write(
         *(tmp_path, "Build sheet", ["Design: x"], content),
         **{"scene": the_scene, "params": params, "sizes": sizes, "drift": drift},
+        assembly=assembly,
     )
     data = path.read_bytes()
-    assert data.startswith(b"%PDF") and b"/Count 1" in data and len(data) > 10_000
+    assert data.startswith(b"%PDF") and b"/Count 2" in data and len(data) > 10_000
+    parts = {row[0]: row[1:] for row in assembly[0].rows}
+    solids = [casting.parts(size, Process(inlet=0)).finger.volume() for size in sizes]
+    assert parts["silicone"][1].startswith(f"{sum(solids) / 1e3:.0f} cm³")
+    second = drawing.second_page(assembly, the_scene, params, sizes)
+    apart(second, 3)
+
+
+def test_the_assembly_stands_as_mujoco_has_it(page):
+    """By its kinematics: frames of the fingers' first bodies, lengths along x, up from z = 0."""
+    the_scene, params, sizes, _ = page
+    nominal = jax.tree.map(np.asarray, rollout.nominal_trial(the_scene))
+    data = mujoco.MjData(compiled := model.compile_model(the_scene, params, nominal))
+    mujoco.mj_kinematics(compiled, data)
+    palm = data.xmat[1].reshape(3, 3)
+    drawn = sheet.corners(the_scene, params, sizes)
+    for stub, size, found in zip(model.layout(the_scene).stubs, sizes, drawn, strict=True):
+        place = 1e3 * (data.xpos[stub] - data.xpos[1]) @ palm
+        turn = palm.T @ data.xmat[stub].reshape(3, 3)
+        half, high = size.base.width / 2, size.tip.height
+        np.testing.assert_allclose(found[0], place + turn @ [0, -half, 0], atol=1e-3)
+        np.testing.assert_allclose(found[6], place + turn @ [size.length, half, high], atol=1e-3)
 
 
 TOY = ["export", "--scene", str(TINY), "--no-parts", "--design", "length=100", "arm_z=40"]

@@ -210,6 +210,7 @@ def _sheet(
         f"{' with changes' if code.get('modified') else ''}. Predictions of a simulation, not "
         "measurements.",
     ]
-    sheet.write(folder, title, lines, content)
+    assembly = sheet.assembly_sections(case.scene, params, sizes, _process(options))
+    sheet.write(folder, title, lines, [*content, *assembly])
     shown = {"scene": case.scene, "params": params, "sizes": sizes, "drift": found}
-    drawing.write(folder, title, lines, content, **shown)
+    drawing.write(folder, title, lines, content, assembly=assembly, **shown)

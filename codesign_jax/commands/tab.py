@@ -25,7 +25,7 @@ from codesign_jax import Task, codesign, files, rollout, runs
 from codesign_jax.codesign import VERDICTS
 from codesign_jax.commands import common
 from codesign_jax.engines import Engine
-from codesign_jax.model import overlap
+from codesign_jax.model import morphology, overlap
 from codesign_jax.report import animation, bodies, stress, verdicts, viewer
 from codesign_jax.runs import choice
 from codesign_jax.runs.choice import Case
@@ -426,7 +426,7 @@ def _told(shown: Shown) -> dict[str, Any]:
         name: np.round(1e3 * np.asarray(getattr(grasp.trace, name))[::step], 1).tolist()
         for name in ("distance", "height")
     }
-    caps = np.asarray(scene.hand.pressure_limit.of(grasp.params.height, grasp.params.wall))
+    caps = np.asarray(morphology.pressure_limits(scene.hand, grasp.params))
     limits: list[float | None] = []
     for name, scale in zip(space.names, space.scale, strict=True):
         row, _, finger = name.partition("[")

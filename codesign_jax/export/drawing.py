@@ -1,4 +1,4 @@
-"""The build sheet as one page of PDF, drawn by matplotlib."""
+"""The build sheet as two pages of PDF, drawn by matplotlib."""
 
 import textwrap
 from collections.abc import Sequence
@@ -9,9 +9,11 @@ import matplotlib.figure
 import matplotlib.patches
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_pdf import PdfPages
+from scipy.spatial import ConvexHull
 
 from codesign_jax.export.process import Size
-from codesign_jax.export.sheet import NAME, Drift, SheetSection, places
+from codesign_jax.export.sheet import NAME, Drift, SheetSection, corners, places
 from codesign_jax.export.tolerance import Side
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
@@ -21,10 +23,19 @@ _SMALL = 5.6
 _LINE = 0.0095  # height of a line of that size in the figure's
 
 
-def write(folder: Path, *content: Any, **shown: Any) -> Path:
-    """Writes the sheet to a folder as one page of PDF; the other arguments are those of `page`."""
+def write(folder: Path, *content: Any, assembly: Sequence[SheetSection], **shown: Any) -> Path:
+    """Writes the sheet to a folder as two pages of PDF.
+
+    Args:
+      folder: The folder.
+      content: As of `page`.
+      assembly: The second page's sections, see `sheet.assembly_sections`.
+      shown: As of `page`.
+    """
     path = folder / f"{NAME}.pdf"
-    page(*content, **shown).savefig(path)
+    with PdfPages(path) as pages:
+        pages.savefig(page(*content, **shown))
+        pages.savefig(second_page(assembly, shown["scene"], shown["params"], shown["sizes"]))
     return path
 
 
@@ -67,6 +78,55 @@ def page(
     return figure
 
 
+def second_page(
+    content: Sequence[SheetSection], scene: Scene, params: Params, sizes: Sequence[Size]
+) -> matplotlib.figure.Figure:
+    """Draws the hand from three sides, and below it the sections; arguments as of `page`."""
+    figure = matplotlib.figure.Figure(figsize=_A4)
+    figure.text(0.06, 0.965, "Assembly", fontsize=13, weight="bold")
+    found = corners(scene, params, sizes)
+    _view(figure.add_axes((0.08, 0.66, 0.40, 0.27)), scene, found, "front: x, z", 0, 2)
+    _view(figure.add_axes((0.54, 0.66, 0.40, 0.27)), scene, found, "side: y, z", 1, 2)
+    _view(figure.add_axes((0.08, 0.36, 0.40, 0.26)), scene, found, "from above: x, y", 0, 1)
+    extent = np.ptp(np.concatenate(found), axis=0)
+    words = (
+        f"Straight fingers, without pressure, span {extent[0]:.0f} x {extent[1]:.0f} x "
+        f"{extent[2]:.0f} mm. Red: fabric, which faces inwards. z = 0: the palm's underside. "
+        "Numbers of fingers at their tips."
+    )
+    _notes(figure, 0.58, textwrap.wrap(words, 60), left=0.54)
+    top = 0.34
+    for section in content:
+        top = _table(figure, top, section)
+    return figure
+
+
+def _view(axes: Axes, scene: Scene, fingers: np.ndarray, title: str, across: int, up: int) -> None:
+    """The palm and the straight fingers [mm] in two of their coordinates, the nearest last."""
+    radius, thick = 1e3 * scene.hand.palm.radius, 1e3 * scene.hand.palm.thickness
+    depth = 3 - across - up
+    near = -1 if depth == 1 else 1  # the front is seen from -y
+    order = np.argsort(near * fingers[..., depth].mean(1))
+    disc: Any = matplotlib.patches.Circle((0, 0), radius)
+    if up == 2:
+        disc = matplotlib.patches.Rectangle((-radius, 0), 2 * radius, thick)
+    disc.set(facecolor="0.93", edgecolor="0.4", lw=0.7)
+    axes.add_patch(disc)
+    for i in order:
+        flat = fingers[i][:, [across, up]]
+        outline = flat[ConvexHull(flat).vertices]
+        axes.fill(*outline.T, facecolor="#cfdcec", edgecolor="black", lw=0.7)
+        fabric = flat[[0, 1, 5, 4, 0]]
+        axes.plot(*fabric.T, color="tab:red", lw=0.9)
+        x, y = flat[4:].mean(0)
+        axes.text(x, y, str(i), ha="center", va="center", fontsize=8)
+    _finish(axes, f"{title} [mm]")
+    axes.axis("on")
+    axes.tick_params(labelsize=_SMALL)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.margins(0.05)
+
+
 def _lines(text: str) -> list[str]:
     return textwrap.wrap(text, 165)
 
@@ -92,9 +152,11 @@ def _table(figure: matplotlib.figure.Figure, top: float, section: SheetSection) 
     return _notes(figure, top, section.notes)
 
 
-def _notes(figure: matplotlib.figure.Figure, top: float, notes: Sequence[str]) -> float:
+def _notes(
+    figure: matplotlib.figure.Figure, top: float, notes: Sequence[str], left: float = 0.06
+) -> float:
     text = [line for note in notes for line in _lines(note)]
-    figure.text(0.06, top, "\n".join(text), fontsize=_SMALL, va="top", linespacing=1.3)
+    figure.text(left, top, "\n".join(text), fontsize=_SMALL, va="top", linespacing=1.3)
     return top - _LINE * len(text) - 0.010
 
 
@@ -162,9 +224,9 @@ def _side_view(axes: Axes, size: Size) -> None:
     outer = [(0, 0), (size.length, 0), (size.length, size.tip.height), (0, size.base.height)]
     inner = [(start, first.wall), (end, last.wall)]
     inner += [(end, last.height - last.wall), (start, first.height - first.wall)]
-    for corners, color in ((outer, "0.8"), (inner, "white")):
+    for outline, color in ((outer, "0.8"), (inner, "white")):
         axes.add_patch(
-            matplotlib.patches.Polygon(corners, facecolor=color, edgecolor="0.3", lw=0.8)
+            matplotlib.patches.Polygon(outline, facecolor=color, edgecolor="0.3", lw=0.8)
         )
     axes.plot([0, size.length], [0, 0], color="tab:red", lw=2)
     axes.text(size.length / 2, -1.5, f"{size.length:.1f}", ha="center", va="top", fontsize=6)

@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from codesign_jax.export.process import Size
+from codesign_jax.export.process import Process, Size, inlet
 from codesign_jax.export.tolerance import NEAREST, WANTED, Side, Tolerance
 from codesign_jax.model import morphology
 from codesign_jax.model.layout import mounts
@@ -120,6 +121,75 @@ def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSectio
         "straight finger at its pressure, without load; measure it first."
     ]
     return SheetSection("Fingers", head, rows, notes)
+
+
+FLAP, PITCH = 15.0, 2.0
+"""Fabric that reaches over the base to hold the finger, and a turn of thread, in mm [ours]."""
+
+
+def assembly_sections(
+    scene: Scene, params: Params, sizes: Sequence[Size], process: Process
+) -> list[SheetSection]:
+    """What the hand is made of, and in what order; arguments as of `sheet_sections`."""
+    palm, material, count = scene.hand.palm, scene.hand.material, len(sizes)
+    volume = sum(size.volume for size in sizes) / 1e3
+    strips = (f"{z.length + FLAP:.0f} x {max(z.base.width, z.tip.width):.0f}" for z in sizes)
+    middle = [(size, size.at(size.length / 2)) for size in sizes]
+    thread = sum(z.length / PITCH * 2 * (m.width + m.height) for z, m in middle) / 1e3
+    tubes = [d for size in sizes if (d := inlet(size, process))]
+    highest = float(np.max(np.asarray(params.pressure))) / 1e3
+    tilts = dict.fromkeys(f"{90 - finger.tilt:g}°" for finger in scene.hand.finger)
+    disc = f"disc of radius {1e3 * palm.radius:.0f} mm, {1e3 * palm.thickness:.0f} mm thick"
+    shear = f"shear modulus {material.shear_modulus / 1e3:g} kPa"
+    rows = [
+        ("palm", "1", f"{disc}; {1e3 * palm.mass:.0f} g with all that it bears but the fingers"),
+        ("seats", str(count), f"cut back into the palm's underside by {', '.join(tilts)}, see 6"),
+        ("silicone", f"{1e-3 * volume * material.density:.0f} g", f"{volume:.0f} cm³, {shear}"),
+        ("fabric", str(count), f"inextensible, {', '.join(strips)} mm"),
+        ("thread", f"{thread:.1f} m", f"around the fingers, a turn every {PITCH:g} mm [ours]"),
+        ("tubes", str(len(tubes)), ", ".join(dict.fromkeys(f"{d:g} mm" for d in tubes)) or "–"),
+        ("valves", str(count), f"a channel for each finger, up to {highest:.0f} kPa"),
+        ("moulds", str(3 * len(set(sizes))), "tray, core and base of each finger: parts/"),
+    ]
+    steps = (
+        "Print the moulds.",
+        "Cast each shell: core on the tray, pour between the bars up to the rim, cure.",
+        "Close it: fabric on the floor of the base mould, its flap out over the base end, pour to "
+        "the step, set the shell in before it cures.",
+        "Wind the thread around the finger and hold its ends with a drop of silicone.",
+        "Set the tube into the base and seal it. Raise the pressure slowly to the design's, and "
+        "compare the bend with the table of fingers: a stiffer silicone bends less.",
+        "Fix each finger: its base is square to its axis and would stand in the palm. So cut the "
+        "palm's underside back, from the line at the base point outwards, until the base lies "
+        "flat in this seat; glue it there, and clamp the flap of fabric, which runs inwards on "
+        "the underside, under a bar. The simulation has rigid bases and no seats [ours].",
+        "Fix the palm to the wrist's springs and these to the arm; find z = 0, where the palm's "
+        "underside lies on the table.",
+        "Play commands.csv, first without an object and without pressure.",
+    )
+    notes = [f"{k}. {step}" for k, step in enumerate(steps, 1)]
+    return [
+        SheetSection("Parts", ("part", "number", "what"), rows, []),
+        SheetSection("Order of work", (), [], notes),
+    ]
+
+
+def corners(scene: Scene, params: Params, sizes: Sequence[Size]) -> np.ndarray:
+    """Corners of the straight fingers in the palm's frame [mm], shape (finger, 8, 3).
+
+    The first four are those of the base, around it, the first two on the fabric.
+    """
+    position, turn = (np.asarray(v) for v in mounts(scene.hand, np.asarray(params.spread)))
+    found = []
+    for size, place, (w, x, y, z) in zip(sizes, position, turn, strict=True):
+        ends = [(0.0, size.base), (size.length, size.tip)]
+        own = [
+            (along, side * section.width / 2, up * section.height)
+            for along, section in ends
+            for side, up in ((-1, 0), (1, 0), (1, 1), (-1, 1))
+        ]
+        found.append(1e3 * place + Rotation.from_quat([x, y, z, w]).apply(own))
+    return np.array(found)
 
 
 def _castable(thickness: float) -> str:

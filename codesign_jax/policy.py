@@ -28,7 +28,7 @@ import numpy as np
 
 from codesign_jax import control, model
 from codesign_jax.control import Plan
-from codesign_jax.engines.base import Engine, Equal
+from codesign_jax.engines.base import Engine, Equal, recording
 from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.laws.kinematics import kinematics
 from codesign_jax.engines.structured.world_model import WorldModel, world_constants
@@ -146,6 +146,10 @@ class ControlLoop(Equal):
 
     def _key(self) -> tuple:
         return self.engine, self.policy, self.scene.hand.pressure_limit
+
+    def recording(self) -> "ControlLoop":
+        """As an engine whose traces have the contact forces."""
+        return ControlLoop(recording(self.engine), self.policy)
 
     commands = staticmethod(control.plan)
     """What `rollout.prepare` makes for `rollout`: the plan instead of controls."""

@@ -26,6 +26,7 @@ from jax.scipy.stats import norm
 from codesign_jax import axes, control, model, reuse
 from codesign_jax.cost import outcome, shown
 from codesign_jax.engines import Engine
+from codesign_jax.engines.base import recording
 from codesign_jax.scene import Constants, Scene, reach, schema, unit_slips
 from codesign_jax.scene.constants import batch_axes
 from codesign_jax.start import invalid_start
@@ -139,6 +140,7 @@ def simulate(
     *,
     record_qpos: bool = False,
     stop_when_lost: bool | None = None,
+    record_forces: bool = False,
     cost: CostFunction | None = None,
     constants: Constants | None = None,
 ) -> tuple[Outcome, Trace]:
@@ -152,6 +154,8 @@ def simulate(
       record_qpos: Whether the trace holds qpos of every step; such worlds go on when they are lost.
       stop_when_lost: Whether a world that lost its object stops there, see `Trace`; None for True,
         but a cost of one's own that reads the trace must say which.
+      record_forces: Whether the trace has the contact forces, see `Forces`; engine structured
+        alone, and without derivatives.
       cost: A cost of one's own in place of the scene's, see `CostFunction`.
       constants: Numbers instead of the scene's, see `Scene.constants`; leaves of shape () or
         (world,). The engine may be that of any scene of the same structure.
@@ -167,6 +171,7 @@ def simulate(
         traced ones no values are known.
     """
     constants = _checked(scene, engine, params, trials, constants)
+    engine = recording(engine) if record_forces else engine
     fields, ctrl, initial = prepare(scene, params, trials, constants, engine)
     trace = recorded(engine.rollout, fields, ctrl, record_qpos, stop_when_lost)
     how = {"record_qpos": record_qpos, "stop_when_lost": stop_when_lost, "cost": cost}
@@ -206,6 +211,7 @@ def grasp(
     steps: int | None = None,
     record_qpos: bool = False,
     stop_when_lost: bool | None = None,
+    record_forces: bool = False,
     constants: Constants | None = None,
 ) -> Trace:
     """Simulates one world, or the beginning of it; `jax.vmap` makes a batch of it.
@@ -218,6 +224,7 @@ def grasp(
       steps: How many time steps are simulated; None for the whole grasp.
       record_qpos: As in `simulate`.
       stop_when_lost: As in `simulate`.
+      record_forces: As in `simulate`.
       constants: Numbers instead of the scene's, leaves of shape ().
 
     Returns:
@@ -230,6 +237,7 @@ def grasp(
         raise schema.InputError([f"steps = {steps}: the grasp has 1 to {scene.num_steps}"])
     params, trial = jax.tree.map(lambda v: jnp.asarray(v)[None], (params, trial))
     constants = _checked(scene, engine, params, trial, constants)
+    engine = recording(engine) if record_forces else engine
     fields, ctrl, _ = prepare(scene, params, trial, constants, engine)
     trace = recorded(engine.rollout, fields, first(ctrl, steps), record_qpos, stop_when_lost)
     return jax.tree.map(lambda v: v[0], trace)

@@ -169,6 +169,33 @@ class Phased(Protocol):
         ...
 
 
+class Forces(NamedTuple):
+    """Contact forces over time steps, world frame; a step that was not taken has none.
+
+    The forces on the object add up to its mass times its acceleration minus gravity, up to what the
+    solver left (`Outcome.residual`).
+
+    Attributes:
+      finger: Force of each finger on the object [N], shape (..., finger, 3).
+      palm: Force of the palm on the object [N], shape (..., 3).
+      table: Force of the table on the object [N], shape (..., 3).
+      grip: Sum of the normal forces of each finger on the object [N], shape (..., finger).
+      finger_table: Force of the table on each finger [N], shape (..., finger, 3).
+      palm_table: Force of the table on the palm [N], shape (..., 3).
+      depth: Largest depth at the step's beginning [m], 0 where nothing touches, by kind of contact
+        as far as the scene has it: "finger_object", "finger_table", "palm_object", "palm_table",
+        "object_table", shape (...).
+    """
+
+    finger: jax.Array
+    palm: jax.Array
+    table: jax.Array
+    grip: jax.Array
+    finger_table: jax.Array
+    palm_table: jax.Array
+    depth: dict[str, jax.Array]
+
+
 class Trace(NamedTuple):
     """What a rollout reports of every time step; entry k describes the state at time k * timestep.
 
@@ -195,6 +222,7 @@ class Trace(NamedTuple):
       residual: Residual of the step taken from each state, see `Outcome`, 0 of one that converged,
         shape (time,), or None if the engine does not tell.
       ctrl: Controls that a policy gave, shape (time, nu); None of those that were known beforehand.
+      forces: Contact forces over the step taken from each state, if they were recorded.
 
     An object that leaves the hand after six seconds, as its cost sees it:
 
@@ -215,6 +243,7 @@ class Trace(NamedTuple):
     last: jax.Array | None = None
     residual: jax.Array | None = None
     ctrl: jax.Array | None = None
+    forces: "Forces | None" = None
 
     def at(self, scene: Phased, phase: str | None = None) -> "Trace":
         """The trace in the last time step of a phase, without the axis time.
@@ -230,7 +259,7 @@ class Trace(NamedTuple):
             `effects.disturb` is off.
 
         Returns:
-          A trace whose arrays have lost their axis time; `last`, `residual` and `ctrl` are None.
+          A trace whose arrays have lost their axis time; `last` and what comes after it are None.
 
         Raises:
           InputError: If the grasp has no such phase.

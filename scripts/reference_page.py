@@ -307,7 +307,7 @@ def _named() -> str:
         "Named tuples of `codesign_jax.types` and `codesign_jax.model`, shapes without the leading "
         "axes of a batch.",
     ]
-    for kind in (data.Params, data.Trial, data.Trace, State, data.Outcome):
+    for kind in (data.Params, data.Trial, data.Trace, data.Forces, State, data.Outcome):
         rows = [(f"`{name}`", text) for name, text in attributes(kind).items()]
         parts.append(
             f"### `{kind.__name__}`\n\n{_text(kind)}\n\n{_table(('field', 'meaning'), rows)}"

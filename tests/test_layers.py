@@ -113,6 +113,7 @@ KERNEL = "engines.structured.kernel."
 GIVEN = {
     "compiler.rules": ["compiler.writer"],
     "compiler.trigonometry": ["compiler.writer"],
+    "engines.structured.forces": ["engines.structured.engine"],
     "engines.structured.segments": ["engines.structured.engine"],
     "engines.structured.transforms": ["engines.structured.engine"],
     "report.sketch": ["report.animation"],

@@ -90,6 +90,18 @@ def staged(engine: Engine, lanes: int | None = None, *, trajectory: bool = False
     )
 
 
+def recording(engine: Engine) -> Engine:
+    """The engine as one whose traces have the contact forces.
+
+    Raises:
+      InputError: If it does not tell them.
+    """
+    own: Any = getattr(engine, "recording", None)
+    if own is None:
+        raise InputError([f"engine {engine.name} records no forces; engine structured does"])
+    return own()
+
+
 class Equal:
     """Equality and hash of engines by their kind and what `_key` returns."""
 

@@ -10,6 +10,7 @@ from codesign_jax.compiler import launch
 from codesign_jax.compiler.launch import KernelUnavailable
 from codesign_jax.engines.base import Equal, Staged
 from codesign_jax.engines.structured import coordinates, transforms
+from codesign_jax.engines.structured.forces import Recording
 from codesign_jax.engines.structured.kernel import Limits, Program, lanes_here
 from codesign_jax.engines.structured.kernel.adjoint import Path, recorded
 from codesign_jax.engines.structured.kernel.memory import lengthened
@@ -170,6 +171,27 @@ class StructuredEngine(Equal):
         except KernelUnavailable as error:
             raise _unavailable(str(error)) from error
         return self._trace(*program.outputs(out, len(ctrl), trajectory=trajectory), trajectory)
+
+    def recording(self) -> Recording:
+        """As an engine whose traces have the contact forces."""
+        return Recording(self)
+
+    def states(
+        self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False
+    ) -> tuple[Trace, dict[str, jax.Array]]:
+        """`simulate`, and qpos, qvel and the accelerations of every step, see `Program.simulate`.
+
+        Raises:
+          KernelUnavailable: As `simulate`.
+        """
+        program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl))
+        how = {"trajectory": trajectory, "states": True}
+        try:
+            out = program.execute(self._inputs(program, fields, ctrl), **how)
+        except KernelUnavailable as error:
+            raise _unavailable(str(error)) from error
+        found, end = program.outputs(out, len(ctrl), **how)
+        return self._trace(found, end, trajectory), found
 
     def _inputs(self, program: Program, fields: ModelFields, ctrl: jax.Array) -> tuple:
         """The kernel's arguments, see `Program.inputs`.

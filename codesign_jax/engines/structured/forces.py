@@ -1,0 +1,126 @@
+"""Contact forces of a step, from the state before it and the accelerations that it found.
+
+A step's contact forces are those that its accelerations leave to the contacts: the laws of contact
+at both.  They are functions of what a rollout records, and no part of the kernel.
+"""
+
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.base import Equal
+from codesign_jax.engines.structured import assembly, coordinates, transforms
+from codesign_jax.engines.structured.lanes import dot, once
+from codesign_jax.engines.structured.laws.contact import Contacts, constraint_update
+from codesign_jax.engines.structured.laws.kinematics import Acc, State, kinematics
+from codesign_jax.engines.structured.linear.tree import Spatial, propagate, relative
+from codesign_jax.engines.structured.world_model import WorldModel, world_constants
+from codesign_jax.model import ModelFields, layout
+from codesign_jax.scene import Scene
+from codesign_jax.types import Forces, Trace
+
+if TYPE_CHECKING:
+    from codesign_jax.engines.structured.engine import StructuredEngine
+
+
+class Recording(Equal):
+    """The engine `structured` as one whose traces have `Trace.forces`; without derivatives."""
+
+    def __init__(self, engine: "StructuredEngine"):
+        """Takes the engine, which simulates."""
+        self.engine, self.scene, self.name = engine, engine.scene, engine.name
+
+    def _key(self) -> tuple:
+        return (self.engine,)
+
+    def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
+        """See `Engine.rollout`.
+
+        Raises:
+          NotImplementedError: If it is differentiated.
+        """
+        run = jax.custom_vjp(transforms.folded(partial(self._simulate, trajectory)))
+
+        def refuse(*_: Any) -> Any:
+            raise NotImplementedError("a rollout with record_forces=True has no derivative")
+
+        run.defvjp(refuse, refuse)
+        return run(fields, ctrl)
+
+    def _simulate(self, trajectory: bool, fields: ModelFields, ctrl: jax.Array) -> Trace:
+        trace, found = self.engine.states(fields, ctrl, trajectory=trajectory)
+        hand = world_constants(self.scene, fields)
+
+        def step(now: tuple) -> Forces:
+            qpos, qvel, acc, moved = now
+            state = coordinates.make(self.scene, qpos, qvel, acc)
+            every = forces(self.scene, hand, state, state.acc)
+            return jax.tree.map(
+                lambda v: jnp.where(moved.reshape(-1, *[1] * (v.ndim - 1)) > 0, v, 0.0), every
+            )
+
+        series = tuple(jnp.moveaxis(found[k], 1, 0) for k in ("qpos", "qvel", "acc", "moved"))
+        every = jax.lax.map(step, series)
+        return trace._replace(forces=jax.tree.map(lambda v: jnp.moveaxis(v, 0, 1), every))
+
+
+def forces(scene: Scene, hand: WorldModel, state: State, acc: Acc) -> Forces:
+    """Forces of a step of a batch, every array with a leading axis (world,).
+
+    Args:
+      scene: The scene.
+      hand: Constants of the worlds.
+      state: States before the step.
+      acc: Accelerations that the step found.
+    """
+    kin = kinematics(hand, layout(scene).axes, state)
+    velocity = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
+    motion = propagate(kin, acc)
+    found = assembly.contacts(scene, hand, kin, state.position[2], velocity)
+    fingers, worlds = scene.num_fingers, state.wrist.shape[-1]
+    none = jnp.zeros((3, fingers, worlds), state.wrist.dtype)
+    net = {name: none[:, :1] for name in ("palm_object", "palm_table", "object_table")}
+    net |= {name: none for name in ("finger_object", "finger_table")}
+    grip, depth = none[0], {}
+    for name, contacts in found.items():
+        force, normal = once(partial(_acting, name), contacts, motion, velocity)
+        net[name] = force
+        if name == "finger_object":
+            grip = normal
+        deepest = jnp.where(contacts.active, jnp.maximum(-contacts.distance, 0.0), 0.0)
+        depth[name] = deepest.reshape(-1, worlds).max(0)
+
+    def each(force: jax.Array) -> jax.Array:
+        return jnp.moveaxis(force, (2, 1), (0, 1))
+
+    def alone(force: jax.Array) -> jax.Array:
+        return force[:, 0].T
+
+    return Forces(
+        finger=-each(net["finger_object"]),
+        palm=-alone(net["palm_object"]),
+        table=alone(net["object_table"]),
+        grip=grip.T,
+        finger_table=each(net["finger_table"]),
+        palm_table=alone(net["palm_table"]),
+        depth=depth,
+    )
+
+
+def _acting(
+    name: str, contacts: Contacts, motion: Spatial, velocity: Spatial
+) -> tuple[jax.Array, jax.Array]:
+    """Sums over a set's contacts: forces on the first body, (3, finger or 1, world), and normal.
+
+    The first body is the finger, the palm, or the object on the table.
+    """
+    speed = contacts.relative(relative(name, velocity))
+    jar = contacts.relative(relative(name, motion)) - contacts.reference(speed)
+    force = constraint_update(contacts, jar).force[:3]
+    force = jnp.where(contacts.active, force, 0.0)
+    normal, lanes = dot(contacts.normal, force), force.shape[-2:]
+    if not name.startswith("finger"):
+        lanes = 1, lanes[1]
+    return force.reshape(3, -1, *lanes).sum(1), normal.reshape(-1, *lanes).sum(0)

@@ -1,0 +1,125 @@
+"""Recorded contact forces: momentum, MuJoCo's own, and that recording changes nothing."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from codesign_jax import model, policy, rollout
+from codesign_jax.engines import make_engine
+from codesign_jax.engines.mujoco import world_model
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.scene.schema import InputError
+from tests.helpers import grasps
+
+HELD = {"links": 3, "effects__disturb": False, "effects__ungrasp": False}
+
+
+def grasp_of(surface):
+    """Scene, inputs, states and trace of one grasp that lifts its box and drops it, float64."""
+    scene = grasps.pinch("box", effects__surface=surface, **HELD)
+    with jax.enable_x64(True):
+        engine = StructuredEngine(scene, iterations=100, tolerance=1e-24)
+        hand, trial = grasps.hand_world(scene)
+        trial = trial._replace(arm_tilt=np.array([0.02, -0.03]), yaw=np.array(0.1))
+        fields, ctrl = grasps.world_inputs(scene, hand, trial)
+        one = jax.tree.map(lambda v: np.asarray(v)[None], (fields, ctrl))
+
+        def run(fields, ctrl):
+            recorded = engine.recording().rollout(fields, ctrl, trajectory=True)
+            return engine.states(fields, ctrl, trajectory=True)[1], recorded
+
+        found, trace = jax.tree.map(np.asarray, jax.jit(run)(*one))
+    return scene, one, found, trace
+
+
+@pytest.fixture(scope="module", params=["spheres", "hull"])
+def grasp(request):
+    return grasp_of(request.param)
+
+
+def test_forces_on_the_object_are_what_its_momentum_gains(grasp):
+    scene, (fields, _), found, trace = grasp
+    h, forces = scene.discretization.timestep, trace.forces
+    mass = fields.body_mass[0, model.layout(scene).object]
+    gained = np.diff(found["qvel"][0, :, -6:-3], axis=0) / h + [0, 0, scene.gravity]
+    total = (forces.finger.sum(2) + forces.palm + forces.table)[0, :-1]
+    # What 100 Newton iterations leave, of a weight of one newton.
+    np.testing.assert_allclose(total, mass * gained, atol=1e-4 * mass * scene.gravity)
+    assert forces.table[0, 150, 2] == pytest.approx(mass * scene.gravity, rel=1e-3)
+    held = (forces.grip[0] > 0).any(1)
+    assert held.sum() > 20 and forces.depth["finger_object"][0, held].max() > 1e-4
+
+
+def test_forces_are_mujocos():
+    """Of every contact, by its own solver, at the states and velocities of the path."""
+    scene, (fields, ctrl), found, trace = grasp_of("spheres")
+    own = world_model(scene, grasps.nth(fields, 0))
+    own.opt.tolerance, own.opt.iterations, own.opt.ls_iterations = 0.0, 200, 50
+    data, lay, touched = mujoco.MjData(own), model.layout(scene), 0
+    weight = fields.body_mass[0, lay.object] * scene.gravity
+    kinds = {body: ("finger", f) for f, row in enumerate(lay.bodies) for body in row}
+    kinds |= {1: ("palm",), 0: ("table",)}
+    for k in range(5, ctrl.shape[1], 7):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = (
+            found["qpos"][0, k],
+            found["qvel"][0, k],
+            ctrl[0, k],
+        )
+        mujoco.mj_forward(own, data)
+        forces = jax.tree.map(lambda v, k=k: v[0, k], trace.forces)
+        sums = {"finger": np.zeros((2, 3)), "palm": np.zeros(3), "table": np.zeros(3)}
+        for i in range(data.ncon):
+            contact, force = data.contact[i], np.zeros(6)
+            mujoco.mj_contactForce(own, data, i, force)
+            bodies = own.geom_bodyid[contact.geom]
+            if lay.object in bodies:
+                sign = 1 if bodies[1] == lay.object else -1  # the force on the second body
+                kind, *index = kinds[int(bodies[bodies != lay.object][0])]
+                sums[kind][tuple(index)] += sign * contact.frame.reshape(3, 3).T @ force[:3]
+        touched += data.ncon
+        for name, expected in sums.items():
+            np.testing.assert_allclose(getattr(forces, name), expected, atol=1e-6 * weight)
+    assert touched > 100
+
+
+def test_recording_changes_no_bit_and_a_lost_object_has_no_forces():
+    scene = grasps.short_grasp()
+    params, trials = grasps.random_worlds(scene, 1, 4)
+    engine = make_engine("structured", scene)
+
+    def run(**how):
+        return jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t, **how))(params, trials)
+
+    plain, (outcome, trace) = run(), run(record_forces=True)
+    jax.tree.map(np.testing.assert_array_equal, plain, (outcome, trace._replace(forces=None)))
+    lost = np.asarray(outcome.lost_time)
+    assert np.isfinite(lost).any()
+    for world in np.flatnonzero(np.isfinite(lost)):
+        after = round(lost[world] / scene.discretization.timestep)
+        rest = jax.tree.map(lambda v, w=world, a=after: np.abs(v[w, a:]).max(), trace.forces)
+        assert max(jax.tree.leaves(rest)) == 0
+    looped = policy.ControlLoop(engine, lambda carry, seen: (carry, seen.plan))
+    again = jax.jit(lambda p, t: rollout.simulate(scene, looped, p, t, record_forces=True)[1])
+    for a, b in zip(
+        *map(jax.tree.leaves, (again(params, trials).forces, trace.forces)), strict=True
+    ):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
+
+
+def test_what_records_no_forces_is_refused():
+    scene = grasps.short_grasp()
+    world = grasps.hand_world(scene)
+    with pytest.raises(InputError, match="engine mujoco records no forces"):
+        rollout.grasp(scene, make_engine("mujoco", scene), *world, record_forces=True)
+    engine = make_engine("structured", scene)
+
+    def end(height):
+        params = world[0]._replace(arm=world[0].arm + height)
+        return rollout.grasp(scene, engine, params, world[1], steps=3, record_forces=True).height[
+            -1
+        ]
+
+    with pytest.raises(NotImplementedError, match="has no derivative"):
+        jax.grad(end)(jnp.zeros(()))

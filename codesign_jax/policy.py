@@ -30,13 +30,15 @@ from codesign_jax import control, model
 from codesign_jax.control import Plan
 from codesign_jax.engines.base import Engine, Equal, recording
 from codesign_jax.engines.structured import coordinates
-from codesign_jax.engines.structured.laws.kinematics import kinematics
+from codesign_jax.engines.structured.forces import forces
+from codesign_jax.engines.structured.laws.integration import before
+from codesign_jax.engines.structured.laws.kinematics import State, kinematics
 from codesign_jax.engines.structured.world_model import WorldModel, world_constants
 from codesign_jax.model import ModelFields
 from codesign_jax.model.layout import WRIST, layout
 from codesign_jax.scene import Scene, key_frames
 from codesign_jax.scene.schema import InputError
-from codesign_jax.types import Params, Trace, Trial
+from codesign_jax.types import Forces, Params, Trace, Trial
 
 PERIOD = 0.05
 """Seconds between two calls of a policy that does not say so itself."""
@@ -85,6 +87,8 @@ class Observation(NamedTuple):
       link: Poses of the fingers' links, whose origins are at their joints, shape (finger, link).
       object: Pose of the object, whose origin is its centre of mass.
       object_velocity: Its linear [m/s] and angular [rad/s] velocity, shape (6,).
+      forces: Contact forces over the time step before, zero at the beginning; they have no
+        derivative. None with another engine than structured.
     """
 
     time: jax.Array
@@ -98,6 +102,7 @@ class Observation(NamedTuple):
     link: Pose
     object: Pose
     object_velocity: jax.Array
+    forces: Forces | None = None
 
 
 Policy = Callable[[Any, Observation], tuple[Any, Command]]
@@ -204,7 +209,7 @@ class ControlLoop(Equal):
         self, hand: WorldModel, fields: ModelFields, world: World, memory: Any, plan: Plan
     ) -> tuple[Any, Command]:
         """What the policies remember, and command over the period of the plan."""
-        answer = jax.vmap(self.policy)(memory, observe(self.scene, hand, fields, world, plan))
+        answer = jax.vmap(self.policy)(memory, observe(self.engine, hand, fields, world, plan))
         if not (isinstance(answer, tuple) and [*map(type, answer[1:])] == [Command]):
             raise InputError([f"{self._called} must return (carry, policy.Command)"])
         self._refuse_memory(memory, answer[0])
@@ -293,17 +298,18 @@ def begin(scene: Scene, fields: ModelFields, plan: Plan) -> World:
 
 
 def observe(
-    scene: Scene, hand: WorldModel, fields: ModelFields, world: World, plan: Plan
+    engine: Engine, hand: WorldModel, fields: ModelFields, world: World, plan: Plan
 ) -> Observation:
     """What policies observe, every array with a leading axis (world,).
 
     Args:
-      scene: The scene.
+      engine: The engine that simulates them.
       hand: Constants of the worlds, `world_constants` of their fields.
       fields: Model fields of the worlds.
       world: The worlds.
       plan: Their plan over the period that begins.
     """
+    scene: Scene = engine.scene  # type: ignore[attr-defined]
     state = coordinates.reset(scene, fields._replace(start=world.state))
     found = kinematics(hand, layout(scene).axes, state)
 
@@ -335,7 +341,20 @@ def observe(
         link=pose(jnp.swapaxes(found.origin, 1, 2), jnp.swapaxes(found.link, 2, 3)),
         object=thing,
         object_velocity=jnp.concatenate([velocity[:, 3:], velocity[:, :3]], 1),
+        forces=_forces(scene, hand, state) if hasattr(engine, "recording") else None,
     )
+
+
+def _forces(scene: Scene, hand: WorldModel, state: State) -> Forces:
+    """Contact forces of the steps that led to states."""
+    state = jax.lax.stop_gradient(state)
+    found = forces(scene, hand, before(state, scene.discretization.timestep), state.acc)
+    moved = (state.step[0, 0] > 0) & (state.going[0, 0] > 0)
+
+    def kept(v: jax.Array) -> jax.Array:
+        return jnp.where(moved.reshape(-1, *[1] * (v.ndim - 1)), v, 0.0)
+
+    return jax.tree.map(kept, found)
 
 
 def _phase(scene: Scene, step: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -11,12 +11,12 @@ a vector environment of Gymnasium, an extra.
 >>> from codesign_jax import env, scene
 >>> grasping = env.GraspEnv(scene.load("paper"), period=0.1)
 >>> grasping.observation_size, grasping.action_size
-(14, 4)
+(22, 4)
 >>> keys = jax.random.split(jax.random.key(0), 8)
 >>> state = jax.jit(jax.vmap(grasping.reset))(keys)
 >>> state = jax.jit(jax.vmap(grasping.step))(state, jnp.zeros((8, 4)))  # half of what walls stand
 >>> state.obs.shape, state.reward.shape
-((8, 14), (8,))
+((8, 22), (8,))
 """
 
 from codesign_jax.env.grasp import Data, GraspEnv, State

@@ -98,7 +98,7 @@ class GraspEnv:
             counts.
           params: Parameters of the hand, as `DesignSpace.params` makes them; default: the hand
             file's.
-          engine: Engine of the scene; default: structured.
+          engine: Engine of the scene; default: structured, which alone tells forces.
           period: Seconds of an action, a whole number of time steps.
 
         Raises:
@@ -116,11 +116,14 @@ class GraspEnv:
         """What the agent observes: what a hand feels, and not where the object is.
 
         Time of the grasp and of the phase [s]; and of each finger its pressure over the limit of
-        its wall, how far it is bent [rad], and how fast that changes [rad/s].
+        its wall, how far it is bent [rad], how fast that changes [rad/s], how hard it presses on
+        the object [N], and how much of the object it carries [N].
         """
+        assert seen.forces is not None
         bend, rate = seen.joint[..., 0].sum(-1), seen.joint_velocity[..., 0].sum(-1)
         times = jnp.stack([seen.time, seen.phase_time])
-        return jnp.concatenate([times, seen.pressure / self.limit, bend, 0.1 * rate])
+        touch = [seen.forces.grip, seen.forces.finger[:, 2]]
+        return jnp.concatenate([times, seen.pressure / self.limit, bend, 0.1 * rate, *touch])
 
     def act(self, seen: Observation, action: jax.Array) -> Command:
         """The command of an action: pressures from zero, at -1, to the limit of the walls, at 1."""
@@ -223,7 +226,7 @@ class GraspEnv:
     def _seen(self, data: Data) -> Observation:
         fields, world, plan = _batch((data.fields, data.world, self._ahead(data)))
         hand = world_constants(self.scene, fields)
-        return _one(policy.observe(self.scene, hand, fields, world, plan))
+        return _one(policy.observe(self.engine, hand, fields, world, plan))
 
     def _held(self, data: Data, trace: Trace, world: World) -> tuple[jax.Array, jax.Array]:
         """Share of the window in which the object was held, and whether the grasp is decided."""

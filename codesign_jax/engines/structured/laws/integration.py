@@ -5,6 +5,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.lanes import total
 from codesign_jax.engines.structured.laws.kinematics import Acc, State
+from codesign_jax.engines.structured.world_model import rotation_columns
 
 
 def integrate(state: State, columns: jax.Array, acc: Acc, h: float) -> State:
@@ -29,6 +30,24 @@ def integrate(state: State, columns: jax.Array, acc: Acc, h: float) -> State:
         linear,
         angular,
         acc,
+    )
+
+
+def before(state: State, h: float) -> State:
+    """The state from which `integrate` leads to this one, by the accelerations that it has."""
+    acc = state.acc
+    quat = _turn(state.quat, -state.angular_vel, h)
+    columns = rotation_columns(quat)
+    local = jnp.stack([total([columns[k, i] * acc.object[i] for i in range(3)]) for k in range(3)])
+    return state._replace(
+        wrist=state.wrist - h * state.wrist_vel,
+        finger=state.finger - h * state.finger_vel,
+        position=state.position - h * state.linear_vel,
+        quat=quat,
+        wrist_vel=state.wrist_vel - h * acc.wrist,
+        finger_vel=state.finger_vel - h * acc.finger,
+        linear_vel=state.linear_vel - h * acc.object[3:],
+        angular_vel=state.angular_vel - h * local,
     )
 
 

@@ -300,17 +300,13 @@ class Scenes(Command):
 
 
 @dataclasses.dataclass
-class Replay(Command, Shown):
+class Replay(Command, Shown, RunOrDesign):
     """Show one grasp in 3D in a browser, or say how a failed world of a run failed.
 
     A page of its own that works offline: the best grasp of a run, any row of its trials.csv, or a
-    design. A failed world (a file of the run folder's failures/) is simulated again.
+    design. A failed world (RUN is a file of a run folder's failures/) is simulated again.
     """
 
-    path: Annotated[
-        Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PATH]", help_behavior_hint="")
-    ] = None
-    """A run folder (as --run), or a file of its failures/."""
     out: File = None
     """The page; default: replay.html in the run folder, or here."""
     open: Flag = False

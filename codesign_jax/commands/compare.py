@@ -3,7 +3,6 @@
 `codesign optimize` ends with it where there are several seeds or strategies.
 """
 
-import csv
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,12 +14,12 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from codesign_jax import codesign, cost, files, runs
+from codesign_jax import codesign, cost, runs
 from codesign_jax.commands import common, flags, reference
 from codesign_jax.commands.common import find_case
 from codesign_jax.report import statistics, verdicts
 from codesign_jax.report.verdicts import Judged
-from codesign_jax.runs import RunResult, Settings, columns, manifest
+from codesign_jax.runs import RunResult, Settings, columns, manifest, tables
 from codesign_jax.runs.choice import Case
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene
@@ -210,46 +209,36 @@ def _summary(own: list[Compared]) -> tuple[str, ...]:
 
 def write_table(every: Mapping[Path, Compared], path: Path) -> None:
     """Writes a row for each run; see `runs.columns.MORE`."""
-    with files.atomically(path) as part, part.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [*columns.MORE[columns.SEEDS].columns])
-        writer.writeheader()
-        for place, run in every.items():
-            relative = Path(os.path.relpath(place, path.parent)).as_posix()
-            own = {"seed": run.settings.seed, "run": relative}
-            own |= {"schedule": run.settings.schedule, "first": run.settings.first}
-            record = run.result and run.result.record
-            own["finished"] = int(bool(record) and record.done == run.settings.episodes)
-            writer.writerow(own | _values(run) | _fresh_values(run.fresh))
+    head = [*columns.MORE[columns.SEEDS].columns]
+    tables.write(path, head, (_values(place, run, path) for place, run in every.items()))
 
 
-def _values(run: Compared) -> dict[str, object]:
-    found: dict[str, object] = {"converged_episode": run.converged}
+def _values(place: Path, run: Compared, path: Path) -> dict[str, object]:
+    """The row of a run in a place, for a table's path; what is not known is empty."""
+    found: dict[str, object] = dict.fromkeys(columns.MORE[columns.SEEDS].columns, "")
+    found["run"] = Path(os.path.relpath(place, path.parent)).as_posix()
+    found |= {name: getattr(run.settings, name) for name in ("seed", "schedule", "first")}
+    record = run.result and run.result.record
+    found["finished"] = int(bool(record) and record.done == run.settings.episodes)
+    found["converged_episode"] = run.converged or ""
     if run.result is None or run.result.record is None or run.result.test is None:
         return found
-    test = run.result.test
-    costs = np.asarray(test.cost)
-    best = int(costs.argmin())
-    own = verdicts.tally(jax.tree.map(lambda v: np.asarray(v)[best], test.outcomes))
+    test, chosen = run.result.test, of_test(run.scene, run.result)
     first = np.unique(np.asarray(run.result.record.state.particles), axis=0, return_index=True)[1]
-    judged = run.judged
-    return found | {
-        "best_test_cost": f"{costs[best]:.9g}",
-        "kept_trials": own.kept,
-        "trials": own.total,
+    found |= {
+        "best_test_cost": f"{np.asarray(test.cost).min():.9g}",
+        "kept_trials": verdicts.tally(chosen.outcomes).kept,
+        "trials": chosen.outcomes.cost.size,
         "paper_successes": int(np.asarray(test.paper_success)[first].sum()),
         "particles": first.size,
-        "verdict": judged and judged.verdict.word,
+        "verdict": (run.fresh or chosen).verdict.word,
     }
-
-
-def _fresh_values(judged: Judged | None) -> dict[str, object]:
-    """Kept, lost, stuck and failed fresh trials, and their mean cost, by column."""
-    if judged is None:
-        return {}
-    mean = float(cost.particle_cost(judged.scene, judged.outcomes))
-    counts = verdicts.tally(judged.outcomes)
-    found: dict[str, object] = {f"fresh_{n}_trials": v for n, v in counts._asdict().items()}
-    return found | {"fresh_cost": f"{mean:.9g}"}
+    if run.fresh is not None:
+        counts = verdicts.tally(run.fresh.outcomes)._asdict()
+        found |= {f"fresh_{name}_trials": number for name, number in counts.items()}
+        mean = float(cost.particle_cost(run.fresh.scene, run.fresh.outcomes))
+        found["fresh_cost"] = f"{mean:.9g}"
+    return found
 
 
 def _row(run: Compared) -> tuple[str, ...]:

@@ -1,7 +1,5 @@
 """`codesign finger`."""
 
-import csv
-import io
 import math
 from itertools import chain
 from typing import TYPE_CHECKING
@@ -11,11 +9,11 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from codesign_jax import files
 from codesign_jax import finger as fingers
 from codesign_jax.commands import common
 from codesign_jax.commands.common import find_case
 from codesign_jax.finger import Finger, Fit
+from codesign_jax.runs import tables
 from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
@@ -99,17 +97,10 @@ def compare(
         for line in _of_fit(fit, table):
             console.print(line)
     if options.out:
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows(
-            [[*columns], *([_number(v) for v in r] for r in zip(*columns.values(), strict=True))]
-        )
-        with files.atomically(options.out) as temporary:
-            temporary.write_text(text.getvalue(), encoding="utf-8")
+        texts = {n: ["" if math.isnan(v) else f"{v:.9g}" for v in c] for n, c in columns.items()}
+        rows = (dict(zip(texts, row, strict=True)) for row in zip(*texts.values(), strict=True))
+        tables.write(options.out, [*texts], rows)
         console.print(f"table: {options.out}")
-
-
-def _number(value: float) -> str:
-    return "" if math.isnan(value) else f"{value:.9g}"
 
 
 def _columns(

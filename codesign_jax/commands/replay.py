@@ -15,7 +15,6 @@ from codesign_jax.runs import failures
 from codesign_jax.runs.choice import Case, refuse_other_policy
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.parameters import design_space
-from codesign_jax.scene.schema import InputError
 from codesign_jax.types import MEANINGS, Status, Trace
 
 if TYPE_CHECKING:
@@ -27,12 +26,8 @@ MOST = 10
 
 def main(options: "Replay") -> int:
     common.use_compilation_cache()
-    if options.path is not None:
-        if options.run_folder is not None:
-            raise InputError([f"{options.path} and --run {options.run_folder}: give one of them"])
-        if not options.path.is_dir():
-            return explain(options.path, options.engine, options.policy)
-        options.run_folder = options.path
+    if options.first is not None and not options.first.is_dir():
+        return explain(options.first, options.engine, options.policy)
     path = options.out or (options.run_folder or Path()) / "replay.html"
     common.refuse(common.place_problems("--out", path, ".html"))
     asked = grasp.find(options)

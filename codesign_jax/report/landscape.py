@@ -1,13 +1,12 @@
 """The mean cost of designs over a grid of two parameters: its files and its figure."""
 
-import csv
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from codesign_jax import files, store
-from codesign_jax.runs import columns
+from codesign_jax import store
+from codesign_jax.runs import columns, tables
 from codesign_jax.scene.schema import InputError
 
 FILE = "landscape.npz"
@@ -50,16 +49,15 @@ def save(found: Landscape, folder: Path) -> list[Path]:
         f"{n}_{u}".replace("[", "_").replace("]", "")
         for n, u in zip(found.names, found.units, strict=True)
     ]
-    with files.atomically(table) as part, part.open("w", newline="", encoding="utf-8") as file:
-        names = [*axes, *columns.MORE[TABLE].columns]
-        writer = csv.DictWriter(file, names, lineterminator="\n")
-        writer.writeheader()
-        for i, j in np.ndindex(*found.cost.shape):
-            place = dict(zip(axes, (found.first[i], found.second[j]), strict=True))
-            numbers = {n: f"{v:.9g}" for n, v in (place | {"mean_cost": found.cost[i, j]}).items()}
-            counts = {"kept_trials": found.kept[i, j], "counted_trials": found.counted[i, j]}
-            counts["trials"] = found.trials
-            writer.writerow(numbers | {name: int(v) for name, v in counts.items()})
+
+    def row(i: int, j: int) -> tables.Row:
+        place = dict(zip(axes, (found.first[i], found.second[j]), strict=True))
+        numbers = {n: f"{v:.9g}" for n, v in (place | {"mean_cost": found.cost[i, j]}).items()}
+        counts = {"kept_trials": found.kept[i, j], "counted_trials": found.counted[i, j]}
+        return numbers | {n: int(v) for n, v in (counts | {"trials": found.trials}).items()}
+
+    head = [*axes, *columns.MORE[TABLE].columns]
+    tables.write(table, head, (row(*place) for place in np.ndindex(*found.cost.shape)))
     return [npz, table]
 
 

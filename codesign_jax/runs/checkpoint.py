@@ -248,12 +248,6 @@ class Checkpoints:
                 path.unlink(missing_ok=True)
 
 
-def newest(folder: Path) -> int:
-    """Number of the newest step in a folder, good or damaged, by its files alone; -1 for none."""
-    steps = (path.stem for path in folder.glob("*.sha256"))
-    return max((int(stem) for stem in steps if stem.isdigit()), default=-1)
-
-
 def digest(arrays: Arrays) -> str:
     """Returns the SHA-256 digest of nested arrays: names, types, shapes and bytes."""
     total = hashlib.sha256()

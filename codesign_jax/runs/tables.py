@@ -109,9 +109,7 @@ def write_grasps(path: Path, scene: Scene, trials: Trial, outcomes: Outcome) -> 
         drawn = {name: _number(v[t]) for name, v in noise.items()}
         return found | drawn | {"verdict": VERDICTS[verdicts(one)]} | _ending(one)
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    rows = (row(t) for t in range(len(outcomes.cost)))
-    _replace(path, written([*MORE[REFERENCE].columns], rows))
+    write(path, [*MORE[REFERENCE].columns], (row(t) for t in range(len(outcomes.cost))))
 
 
 def by_finger(space: DesignSpace) -> tuple[dict[str, list[int]], list[int]]:
@@ -255,6 +253,11 @@ def _of_test(space: DesignSpace, particles: np.ndarray, test: FinalTest) -> Iter
             "paper_success": int(test.paper_success[i]),
             **design,
         }
+
+
+def write(path: Path, head: list[str], rows: Iterable[Row]) -> None:
+    """Writes a table as a whole or not at all."""
+    _replace(path, written(head, rows))
 
 
 def _text(table: str, space: DesignSpace, rows: Iterable[Row], *, named: bool = True) -> str:

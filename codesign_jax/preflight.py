@@ -138,13 +138,14 @@ def _overlaps(scene: Scene, designs: Params, names: list[str]) -> list[str]:
     numbers = jax.tree.map(np.float32, scene.constants())
     singles = jax.tree.map(np.float32, designs)
     with_objects, fingers, palm = map(np.asarray, _depths(scene.structure, numbers, singles))
+    fixtures = ", a fixture" if scene.fixture else ""
     limit = scene.limits.penetration
     found = []
     for i, name in enumerate(names):
         inside = [
             (
                 deep,
-                f"starts {1e3 * deep:.0f} mm inside the table or object {shape.name!r}",
+                f"starts {1e3 * deep:.0f} mm inside the table{fixtures} or object {shape.name!r}",
                 f"raise arm.start_height = {scene.arm.start_height:g} m",
             )
             for shape, deep in zip(scene.objects.object, with_objects[:, i], strict=True)

@@ -70,9 +70,9 @@ def depth(scene: Scene, fields: ModelFields) -> jax.Array:
       Shape (world,); 0 where nothing may touch.
     """
     alone = dataclasses.replace(scene.effects, finger_finger=False)
-    hand, kin, height = _straight(scene.structure, fields)
+    hand, kin, position = _straight(scene.structure, fields)
     scene = dataclasses.replace(scene, effects=alone)
-    every = contacts(scene, hand, kin, height)
+    every = contacts(scene, hand, kin, position)
     found = [(-c.distance).reshape(-1, c.distance.shape[-1]).max(0) for c in every.values()]
     if not found:
         return jnp.zeros(fields.body_mass.shape[0], fields.body_mass.dtype)
@@ -129,6 +129,6 @@ def depth_in_palm(scene: Scene, fields: ModelFields) -> jax.Array:
 
 @partial(jax.jit, static_argnums=0)
 def _straight(scene: Scene, fields: ModelFields) -> tuple[WorldModel, Kinematics, jax.Array]:
-    """Worlds with straight fingers, and the height of the object above the table, (1, world)."""
+    """Worlds with straight fingers, and the place of the object's centre, (3, 1, world)."""
     state, hand = reset(scene, fields), world_constants(scene, fields)
-    return hand, straight(hand, state), state.position[2]
+    return hand, straight(hand, state), state.position

@@ -23,10 +23,28 @@ from codesign_jax.model import (
     split,
 )
 from codesign_jax.scene import Scene, effects
+from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Trace
 
 _STATIC = ("wrap_prm",)
 """Fields that MJX takes for constants: what a world has of its own is applied as a force."""
+
+
+def _refuse_fixtures(scene: Scene) -> None:
+    """Refuses objects and fixtures that MJX does not collide: a box and a cylinder.
+
+    Raises:
+      InputError: With a line for each two.
+    """
+    problems = [
+        f"not supported by engine mjx: object {shape.name!r}, a {shape.type}, with fixture "
+        f"{fixture.name!r}, a {fixture.type}; use engine structured or mujoco"
+        for shape in scene.objects.object
+        for fixture in scene.fixture
+        if scene.effects.object_table and {shape.type, fixture.type} == {"box", "cylinder"}
+    ]
+    if problems:
+        raise InputError(problems)
 
 
 class MjxEngine(Equal):
@@ -38,6 +56,7 @@ class MjxEngine(Equal):
         """Puts the scene's template on the device; the float type is jax's at this moment."""
         refuse_meshes(scene, self.name)
         effects.refuse(scene.effects, self.name)
+        _refuse_fixtures(scene)
         self.scene = scene
         self.template = mjx.put_model(compile_template(scene))
         self.data = mjx.make_data(self.template)

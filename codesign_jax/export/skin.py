@@ -16,7 +16,7 @@ from codesign_jax.engines.structured.kernel.pair_search import ring_places
 from codesign_jax.model import pairs
 from codesign_jax.model.layout import first_on_palm, touches_itself
 from codesign_jax.model.morphology import at_joints, sections
-from codesign_jax.model.spec import add_pair
+from codesign_jax.model.spec import add_pair, surroundings
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
 
@@ -89,8 +89,8 @@ def add(scene: Scene, spec: mujoco.MjSpec, params: Params) -> dict[str, float]:
             shares[name] = ball.share
             if e.finger_object:
                 add_pair(scene, spec, name, "object_0", 0)
-            if e.finger_table:
-                add_pair(scene, spec, "table", name, pairs.HAND_TABLE)
+            for other in surroundings(scene) if e.finger_table else []:
+                add_pair(scene, spec, other, name, pairs.HAND_TABLE)
             if e.finger_palm and ball.link >= first_on_palm(scene.discretization.links):
                 add_pair(scene, spec, name, "palm_disc", pairs.PALM)
     if e.finger_finger or touches_itself(scene):

@@ -232,7 +232,7 @@ def _pair_kinds(scene: Scene) -> np.ndarray:
     kinds = np.zeros(template.npair, np.int32)  # see layout: one width in every precision
     for i, pair in enumerate(zip(template.pair_geom1, template.pair_geom2, strict=True)):
         touched = np.isin(lay.object_geoms, pair)
-        if 0 in pair:  # the table
+        if min(pair) <= len(scene.fixture):  # the table or a fixture
             kinds[i] = pairs.OBJECT_TABLE if touched.any() else pairs.HAND_TABLE
         elif np.isin(lay.disc, pair).any():
             kinds[i] = pairs.PALM

@@ -75,9 +75,10 @@ def layout(scene: Scene) -> Layout:
     own = e.finger_object or e.finger_table or e.finger_finger or e.finger_palm
     touching = e.surface == "spheres" and own
     k = scene.discretization.spheres_per_link if touching else 0
-    palm = 1 + np.arange(len(_PALM_RING) if palm_touches(scene) else 0)
-    disc = 1 + len(palm) + np.arange(int(e.finger_palm))
-    first = 1 + len(palm) + len(disc)
+    still = 1 + len(scene.fixture)  # the table and the fixtures, of the world
+    palm = still + np.arange(len(_PALM_RING) if palm_touches(scene) else 0)
+    disc = still + len(palm) + np.arange(int(e.finger_palm))
+    first = still + len(palm) + len(disc)
     spheres = first + np.arange(n * links * k).reshape(n, links, k)
     shapes = first + n * links * k + np.arange(len(scene.objects.object))
     weights = np.zeros(3 + n * (links + 1))

@@ -112,6 +112,14 @@ def build_spec(
     _options(scene, spec)
     world = spec.worldbody
     world.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 0.05], **_PASSIVE)
+    for i, fixture in enumerate(scene.fixture):
+        plane = fixture.type == "plane"
+        geom = getattr(mujoco.mjtGeom, f"mjGEOM_{fixture.type.upper()}")
+        size = [1, 1, 0.05] if plane else fixture.half_sizes
+        place = {"pos": fixture.position, "quat": fixture.quaternion, "rgba": _COLORS["fixture"]}
+        world.add_geom(name=f"fixture_{i}", type=geom, size=size, **place, **_PASSIVE)
+    if not scene.effects.table:
+        world.geoms[0].rgba = [0, 0, 0, 0]
     _add_palm(scene, spec, visual)
     concrete = jax.tree.map(np.asarray, (scene.constants(), params, trial))
     bodies = scene.structure
@@ -130,6 +138,7 @@ _COLORS = {
     "object": (0.85, 0.55, 0.2, 1),
     "finger": (0.35, 0.55, 0.75, 1),
     "palm": (0.3, 0.3, 0.35, 1),
+    "fixture": (0.62, 0.6, 0.55, 1),
 }
 
 
@@ -329,6 +338,11 @@ def add_pair(scene: Scene, spec: mujoco.MjSpec, first: str, second: str, kind: i
     pair.friction, pair.solref, pair.solimp = pairs.numbers(scene, *own)
 
 
+def surroundings(scene: Scene) -> list[str]:
+    """Names of the geoms of table and fixtures that may be touched."""
+    return ["table"] * scene.effects.table + [f"fixture_{i}" for i in range(len(scene.fixture))]
+
+
 def _add_pairs(scene: Scene, spec: mujoco.MjSpec) -> None:
     """Explicit contact pairs: the contact list is the scene's, not a filter's."""
     e, lay = scene.effects, layout(scene)
@@ -336,12 +350,13 @@ def _add_pairs(scene: Scene, spec: mujoco.MjSpec) -> None:
     palm = [f"palm_{i}" for i in range(len(lay.palm))]
     add = functools.partial(add_pair, scene, spec)
     for i in range(len(scene.objects.object)):
-        if e.object_table:
-            add("table", f"object_{i}", pairs.OBJECT_TABLE)
+        for other in surroundings(scene) if e.object_table else []:
+            add(other, f"object_{i}", pairs.OBJECT_TABLE)
         for name in (fingers if e.finger_object else []) + (palm if e.palm_object else []):
             add(name, f"object_{i}", i)
     for name in (fingers if e.finger_table else []) + (palm if e.palm_table else []):
-        add("table", name, pairs.HAND_TABLE)
+        for other in surroundings(scene):
+            add(other, name, pairs.HAND_TABLE)
     if e.finger_finger:
         for first, second in itertools.combinations(fingers, 2):
             if first.split("_")[1] != second.split("_")[1]:

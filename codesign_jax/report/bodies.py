@@ -14,9 +14,11 @@ from codesign_jax.model import hull
 from codesign_jax.report.animation import Replay
 from codesign_jax.scene import Scene
 from codesign_jax.scene.primitives import PRIMITIVES
+from codesign_jax.scene.tables import Fixture
 from codesign_jax.types import Tip
 
 FINGER, OBJECT, PALM = (0.36, 0.57, 0.80), (0.95, 0.58, 0.20), (0.36, 0.38, 0.43)
+FIXTURE = (0.62, 0.60, 0.55)
 _MOST_FACES = 40_000
 """Faces of an object's mesh above which a coarser one is drawn: pages are to stay small."""
 
@@ -62,6 +64,8 @@ def parts(scene: Scene, grasp: Replay) -> list[Part]:
     disc = PRIMITIVES["cylinder"].triangles((palm.radius, palm.thickness / 2))
     disc.apply_translation([0, 0, palm.thickness / 2])
     found.append(_rigid("palm", PALM, disc.vertices, disc.faces, 1))
+    for fixture in scene.fixture:
+        found += _fixture(fixture)
     vertices, faces = object_mesh(scene, int(grasp.trial.shape))
     return [*found, _rigid("object", OBJECT, vertices * float(grasp.trial.size), faces, lay.object)]
 
@@ -133,6 +137,17 @@ def _finger(scene: Scene, grasp: Replay, f: int, lay: model.Layout) -> Part:
     return Part(
         f"finger {f}", FINGER, first, second, bodies[mesh.link], mesh.weight[:, 1], mesh.face
     )
+
+
+def _fixture(fixture: Fixture) -> list[Part]:
+    """A fixture; of a plane nothing is drawn."""
+    if fixture.type == "plane":
+        return []
+    body = PRIMITIVES[fixture.type].triangles(fixture.half_sizes)
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, np.array(fixture.quaternion))
+    vertices = body.vertices @ turn.reshape(3, 3).T + fixture.position
+    return [_rigid(fixture.name, FIXTURE, vertices, np.asarray(body.faces), 0)]
 
 
 def _rigid(name: str, color, vertices: np.ndarray, faces: np.ndarray, body: int) -> Part:

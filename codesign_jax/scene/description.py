@@ -18,6 +18,7 @@ from codesign_jax.scene.tables import (
     Cost,
     Discretization,
     Effects,
+    Fixture,
     Limits,
     Newton,
     Phases,
@@ -66,6 +67,7 @@ class SceneFile:
         file.
       control: Name of a built-in control, or the path of a control file, relative to the scene
         file; docs/control.md.
+      fixture: Static bodies beside the table.
       gravity: Acceleration of gravity, only with `effects.gravity`.
     """
 
@@ -84,6 +86,7 @@ class SceneFile:
     pneumatics: Pneumatics = Pneumatics()
     newton: Newton = Newton()
     control: str = "paper"
+    fixture: tuple[Fixture, ...] = ()
     gravity: float = quantity("m/s^2", 0, 100, kw_only=True)
 
 
@@ -146,6 +149,7 @@ class Scene(SceneFile):
             hand=hand.structure(fixed.hand),
             objects=objects.structure(fixed.objects),
             control=key_frames.structure(fixed.control),
+            fixture=tuple(dataclasses.replace(f, name="") for f in self.fixture),
         )
 
     @property

@@ -49,6 +49,7 @@ EFFECTS: Mapping[str, Effect] = {
     "finger_table": Effect("fingers touch the table"),
     "palm_table": Effect("the palm touches the table"),
     "object_table": Effect("the object rests on the table"),
+    "table": Effect("the plane z = 0; without it these touch the scene's fixtures alone"),
     "finger_finger": Effect("fingers touch one another"),
     "finger_palm": Effect("fingers touch the palm's disc"),
     "finger_itself": Effect("skinned fingers touch themselves; spheres do not", hull=True),

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from codesign_jax.scene import hand, key_frames, keypaths, library, objects, reach, schema
+from codesign_jax.scene import hand, key_frames, keypaths, library, objects, reach, rigid, schema
 from codesign_jax.scene.description import Scene, SceneFile
-from codesign_jax.scene.tables import Accuracy
+from codesign_jax.scene.primitives import PRIMITIVES
+from codesign_jax.scene.tables import Accuracy, Fixture
 
 GONE = ("effects.soft_touch", "effects.speculative_palm", "contact.touch_depth")
 GONE += ("contact.time_constant", "contact.impedance")
@@ -155,6 +156,8 @@ def _beside(path: Path, name: str) -> str | Path:
 
 def _check(scene: SceneFile, where: str, problems: list[str]) -> None:
     problems += check_together(scene, where)
+    for fixture in scene.fixture:
+        problems += _fixture_problems(fixture, f"{where}.fixture {fixture.name}")
     e = scene.effects
     if e.surface == "hull" and e.friction == "full":
         problems.append(
@@ -166,6 +169,19 @@ def _check(scene: SceneFile, where: str, problems: list[str]) -> None:
             f"{where}.discretization.hull_points = {scene.discretization.hull_points} "
             "must be a multiple of 4: every side of the section has as many"
         )
+
+
+def _fixture_problems(fixture: Fixture, where: str) -> list[str]:
+    sizes = PRIMITIVES[fixture.type].sizes if fixture.type in PRIMITIVES else ()
+    found = []
+    if len(fixture.position) != 3:
+        found.append(f"{where}: position must have three coordinates")
+    if len(fixture.size or ()) != len(sizes):
+        words = f"{len(sizes)} values ({', '.join(sizes)})" if sizes else "no size"
+        found.append(f"{where}: a {fixture.type} has {words}, not {list(fixture.size or ())}")
+    if fixture.orientation and (why := rigid.orientation_problem(fixture.orientation)):
+        found.append(f"{where}: orientation {why}")
+    return found
 
 
 def check_together(scene: SceneFile, where: str) -> list[str]:

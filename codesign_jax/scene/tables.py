@@ -6,6 +6,7 @@ and ranges of the fields, see `scripts/reference_page.py`.
 
 import dataclasses
 
+from codesign_jax.scene import rigid
 from codesign_jax.scene.schema import choice, quantity
 
 
@@ -24,6 +25,7 @@ class Effects:
     finger_table: bool = True
     palm_table: bool = True
     object_table: bool = True
+    table: bool = True
     finger_finger: bool = False
     finger_palm: bool = False
     finger_itself: bool = False
@@ -36,6 +38,42 @@ class Effects:
     lateral_threshold: bool = False
     pressure_dynamics: bool = False
     gravity: bool = True
+
+
+@dataclasses.dataclass(frozen=True)
+class Fixture:
+    """A static body of the surroundings, which fingers, palm and object touch as the table.
+
+    Its friction is the table's: `contact.finger_table_friction` with the hand, `[table]` of the
+    object file with the object.
+
+    Attributes:
+      name: What it is, for messages.
+      type: Its shape; a plane has its body below it.
+      position: Its centre, of a plane a point of it; the table is z = 0, the object at the origin.
+      size: Half lengths of a box, or radius and half height of a cylinder.
+      orientation: Roll, pitch and yaw, which turn about x, y and z in this order, or a unit
+        quaternion w, x, y, z. An unturned cylinder stands, the normal of a plane is z.
+    """
+
+    name: str
+    type: str = choice("box", "cylinder", "plane")
+    position: tuple[float, ...] = quantity("m", -2, 2, structure=True)
+    size: tuple[float, ...] | None = quantity("m", 0.001, 2, structure=True, default=None)
+    orientation: tuple[float, ...] | None = quantity(
+        "deg or quaternion", -360, 360, structure=True, default=None
+    )
+
+    @property
+    def quaternion(self) -> tuple[float, ...]:
+        """Its orientation, a unit quaternion (w, x, y, z)."""
+        still = (1.0, 0.0, 0.0, 0.0)
+        return still if self.orientation is None else rigid.turned(self.orientation, still)
+
+    @property
+    def half_sizes(self) -> tuple[float, ...]:
+        """Three numbers as MuJoCo's geom has them [m]."""
+        return (*(self.size or ()), 0.0, 0.0, 0.0)[:3]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,6 +4,9 @@ The kernel puts a step together link by link; here the same functions are called
 for what looks at a state and simulates nothing.
 """
 
+from collections.abc import Callable
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
@@ -11,7 +14,7 @@ from codesign_jax.engines.structured.kernel import packing
 from codesign_jax.engines.structured.kernel.contact_sets import margin
 from codesign_jax.engines.structured.kernel.tables import rings_of_link
 from codesign_jax.engines.structured.lanes import dot, once
-from codesign_jax.engines.structured.laws import rings, shapes
+from codesign_jax.engines.structured.laws import rings, shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import which_cone
 from codesign_jax.engines.structured.laws.contact import Cone, Contacts, candidates
 from codesign_jax.engines.structured.laws.inertia import bodies, joint_springs, smooth_forces
@@ -34,7 +37,7 @@ def problem(
     smooth = smooth_forces(hand, kin, body, state, ctrl, scene)
     matrix = Matrices(*(once(lambda b: b.matrix(), b) for b in body))
     velocity = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
-    found = contacts(scene, hand, kin, state.position[2], velocity)
+    found = contacts(scene, hand, kin, state.position, velocity)
     h, palm_acc = scene.discretization.timestep, None
     if not scene.effects.wrist:
         palm_acc = rigid_arm(ctrl[:6, None], state.wrist, state.wrist_vel, h)
@@ -47,7 +50,7 @@ def contacts(
     scene: Scene,
     hand: WorldModel,
     kin: Kinematics,
-    height: jax.Array,
+    position: jax.Array,
     velocity: Spatial | None = None,
 ) -> dict[str, Contacts]:
     """Contacts that the scene's effects call for but those between fingers, by pair of bodies.
@@ -56,7 +59,7 @@ def contacts(
       scene: The scene.
       hand: Constants of the worlds.
       kin: Kinematics.
-      height: Height of the object's centre above the table, shape (1, world).
+      position: The object's centre, shape (3, 1, world).
       velocity: Of the bodies; none where they are at rest.
     """
     e, found = scene.effects, {}
@@ -73,9 +76,7 @@ def contacts(
 
         found[name] = once(act, place, cone, velocity)
 
-    def field(name: str, point: jax.Array) -> tuple[jax.Array, jax.Array]:
-        if name.endswith("_table"):
-            return shapes.table_distance(height, point)
+    def of_object(point: jax.Array) -> tuple[jax.Array, jax.Array]:
         local = shapes.in_object(kin.object, point)
         distance, gradient = once(lambda p: shapes.signed_distance(scene, hand, p), local)
         return distance, apply_columns(kin.object, gradient)
@@ -83,13 +84,19 @@ def contacts(
     def of_body(names: dict[str, bool], ring: Ring, origin: jax.Array, frame: jax.Array) -> None:
         centre = origin + apply_columns(frame, ring.centre)
         for name in (n for n in names if names[n]):
-            first = field(name, centre)
-            if e.surface == "spheres":
-                add(name, rings.ball_on_field(ring.half[0], centre, *first))
-                continue
-            offset = once(rings.aim, ring, frame, *first)
-            again = field(name, centre + offset)
-            add(name, once(rings.on_field, ring, frame, centre, offset, *again))
+            around = [partial(f, position) for f in surroundings.fields(scene)]
+            looks = around if name.endswith("_table") else [of_object]
+            places = []
+            for look in looks:
+                first = look(centre)
+                if e.surface == "spheres":
+                    places.append(rings.ball_on_field(ring.half[0], centre, *first))
+                    continue
+                offset = once(rings.aim, ring, frame, *first)
+                again = look(centre + offset)
+                places.append(once(rings.on_field, ring, frame, centre, offset, *again))
+            if places:
+                add(name, _joined(places, int(name.startswith("finger"))))
 
     if count := rings_of_link(scene):
         numbers = packing.ring_numbers(scene, hand, count)
@@ -100,7 +107,38 @@ def contacts(
         numbers = jnp.moveaxis(packing.palm_numbers(scene, hand), 1, 0)
         on = {"palm_object": e.palm_object, "palm_table": e.palm_table}
         of_body(on, Ring.of(numbers), kin.place, kin.palm)
-    if e.object_table:
-        place = shapes.object_on_table(scene, hand, kin, height)
-        add("object_table", Place(*place, jnp.ones_like(place[2])))
+    if e.object_table and surroundings.slots(scene):
+        places = _of_object(scene, hand, kin, position, of_object)
+        add("object_table", _joined(places, 0))
     return found
+
+
+def _joined(places: list[Place], axis: int) -> Place:
+    """Contacts with several fields, one behind the other along an axis of the items."""
+    if len(places) == 1:
+        return places[0]
+    axes = (axis + 1, axis + 1, axis, axis)
+    fields = zip(axes, zip(*places, strict=True), strict=True)
+    return Place(*(jnp.concatenate(values, at) for at, values in fields))
+
+
+def _of_object(
+    scene: Scene, hand: WorldModel, kin: Kinematics, position: jax.Array, of_object: Callable
+) -> list[Place]:
+    """Contacts of the object with table and fixtures, items first."""
+    places, one = [], jnp.ones_like
+    if scene.effects.table:
+        place = shapes.object_on_table(scene, hand, kin.object, position[2])
+        places.append(Place(*place, one(place[2])))
+    flat = [i for i, s in enumerate(scene.objects.object) if s.type not in surroundings.ROUND]
+    for fixture in scene.fixture:
+        _, rows = surroundings.towards(fixture, position)
+        arms = shapes.lowest_points(scene, hand, surroundings.faced(rows, kin.object))
+        place = surroundings.object_on(fixture, position, rows[:, :, 0], arms)
+        places.append(Place(*place, one(place[2])))
+        if flat and surroundings.EDGES[fixture.type]:
+            point = surroundings.edges(fixture, position)
+            on, normal, gap = (v[..., 0, :] for v in surroundings.edge_on(point, *of_object(point)))
+            mine = jnp.isin(hand.object_id, jnp.array(flat))
+            places.append(Place(on, normal, gap, jnp.where(mine, one(gap), 0.0)))
+    return places

@@ -23,6 +23,7 @@ from codesign_jax.engines.structured.kernel.program import Program, block_spec
 from codesign_jax.engines.structured.kernel.reverse import ReverseStep, Shown
 from codesign_jax.engines.structured.kernel.sweep import SHAPES
 from codesign_jax.engines.structured.lanewise import lanes, of_code
+from codesign_jax.scene.schema import InputError
 
 
 class Path(NamedTuple):
@@ -74,6 +75,8 @@ class AdjointProgram(Program):
     def __init__(self, *args: Any, **how: Any):
         """As `Program`, a lane a finger."""
         super().__init__(*args, **{**how, "team": 1})
+        if self.scene.fixture:
+            raise InputError(["a scene with fixtures has no derivative in engine structured"])
 
     remembers = ("owner", "ring")
 

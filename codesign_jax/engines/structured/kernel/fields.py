@@ -4,6 +4,7 @@ They have a place in memory each, whether they touch or not.  What is far from a
 looked at further.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -16,9 +17,9 @@ from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.pair_search import Search
 from codesign_jax.engines.structured.kernel.problem import Memory, relative
 from codesign_jax.engines.structured.kernel.slots import any_of
-from codesign_jax.engines.structured.lanes import cross, dot
+from codesign_jax.engines.structured.lanes import cross, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.laws import contact, rings, shapes
+from codesign_jax.engines.structured.laws import contact, rings, shapes, surroundings
 from codesign_jax.engines.structured.laws.rings import Place, Ring
 from codesign_jax.engines.structured.world_model import apply_columns
 
@@ -38,13 +39,19 @@ class FieldContacts:
         self.names = [n for n in ("finger_object", "finger_table") if n in m.contacts]
         self.hull = step.p.scene.effects.surface == "hull"
 
-    def field(self, name: str, point: Lanes) -> tuple[Lanes, Lanes]:
-        """Distance (k,) of points (3, k) from object or table, and its gradient, world axes."""
-        if not name.endswith("_object"):
-            height = self.p.world_state.read(
-                self.step.world_state, "position", 0, self.step.block.world
-            )[2]
-            return lanewise(shapes.table_distance, height, point)
+    def looks(self, name: str) -> list[Callable[[Lanes], tuple[Lanes, Lanes]]]:
+        """What bodies of a pair touch: from points (3, k) to distances (k,) and gradients.
+
+        It is the object, or the table and the fixtures.
+        """
+        if name.endswith("_object"):
+            return [self._object]
+        position = self.p.world_state.read(
+            self.step.world_state, "position", 0, self.step.block.world
+        )
+        return [partial(lanewise, field, position) for field in surroundings.fields(self.p.scene)]
+
+    def _object(self, point: Lanes) -> tuple[Lanes, Lanes]:
         columns = self.at["columns"]
         local = lanewise(shapes.in_object, columns, point)
         distance, gradient = objects.signed_distance(self.p.scene, self.thing, local)
@@ -90,26 +97,29 @@ class FieldContacts:
 
     def on_field(self, name: str, i: Any, numbers: Lanes, frame: Lanes, centre: Lanes, moves: Any):
         """Creates contacts of rings or balls of a body."""
-        contacts = self.m.contacts[name]
-        distance, gradient = self.field(name, centre)
+        contacts, looks = self.m.contacts[name], self.looks(name)
+        found = [look(centre) for look in looks]
         if not self.hull:
-            place = lanewise(balls_on_field, numbers, centre, distance, gradient)
-            return contacts.create(i, place, *moves)
-        h = self.p.scene.discretization.timestep
-        near = lanewise(partial(may_touch, h), numbers, centre, distance, moves[1])
+            places = [lanewise(balls_on_field, numbers, centre, *first) for first in found]
+            return contacts.create(i, joined(places), *moves)
+        run = partial(may_touch, self.p.scene.discretization.timestep)
+        near = [lanewise(run, numbers, centre, first[0], moves[1]).lane for first in found]
         like = jnp.zeros((self.p.size,), self.step.finger_state.dtype)
         contacts.write("share", zeros((1, contacts.set.k), like), i)
+        flat = not name.endswith("_object") and self.p.scene.effects.table
 
         def create() -> None:
-            if name.endswith("_object"):
-                offset = lanewise(aimed, numbers, frame, distance, gradient)
-                again = self.field(name, lanewise(jnp.add, centre, offset))
-            else:
-                offset, again = lanewise(jnp.zeros_like, centre), (distance, gradient)
-            place = lanewise(rings_on_field, numbers, frame, centre, offset, *again)
-            contacts.create(i, place, *moves)
+            places = []
+            for n, (look, first) in enumerate(zip(looks, found, strict=True)):
+                if flat and n == 0:  # the table is a plane
+                    offset, again = lanewise(jnp.zeros_like, centre), first
+                else:
+                    offset = lanewise(aimed, numbers, frame, *first)
+                    again = look(lanewise(jnp.add, centre, offset))
+                places.append(lanewise(rings_on_field, numbers, frame, centre, offset, *again))
+            contacts.create(i, joined(places), *moves)
 
-        any_of(near.lane > 0, create)
+        any_of(total(near) > 0, create)
 
     def of_palm_and_object(self, state: dict) -> None:
         """Contacts of the palm's rings or spheres, and of the object with the table."""
@@ -129,20 +139,37 @@ class FieldContacts:
             m.contacts["object_table"].create(i, place, *self.moves("object_table", None, None))
 
     def _table_points(self, state: dict) -> list[Place]:
-        """Each slot of the object on the table, lanes of a world."""
-        at = self.at
-        height = state["position"][2]
-        arms = objects.table_points(self.p.scene, self.thing, at["columns"], height)
+        """Each slot of the object on the table and the fixtures, lanes of a world."""
+        scene, columns, found = self.p.scene, self.at["columns"], []
+        position = state["position"]
+        if scene.effects.table:
+            arms = objects.table_points(scene, self.thing, columns, position[2])
+            found += lanewise(lambda a, h: slots_of(*shapes.on_table(a, h)), arms, position[2])
+        kinds = [shape.type in surroundings.ROUND for shape in scene.objects.object]
+        for fixture in scene.fixture:
+            gap, rows = lanewise(partial(surroundings.towards, fixture), position)
+            turned = lanewise(surroundings.faced, rows, columns)
+            arms = objects.table_points(scene, self.thing, turned, gap)
 
-        def compute(arms, height):
-            point, normal, gap = shapes.on_table(arms, height)
-            one = jnp.ones_like(gap)
-            return [
-                Place(*(v[:, k : k + 1] for v in (point, normal, gap[None], one[None])))
-                for k in range(gap.shape[0])
-            ]
+            def on(position, rows, arms, fixture=fixture):
+                return slots_of(*surroundings.object_on(fixture, position, rows, arms))
 
-        return lanewise(compute, arms, height)
+            found += lanewise(on, position, rows, arms)
+            if all(kinds) or fixture.type == "plane":
+                continue
+            point = lanewise(partial(surroundings.edges, fixture), position)
+            distance, gradient = self._object(point)
+
+            def back(point, distance, gradient, shape):
+                touched = [v[:, :, 0] if v.ndim == 4 else v[:, 0] for v in
+                           surroundings.edge_on(point, distance, gradient)]  # fmt: skip
+                slots = slots_of(*touched)
+                flat = [i for i, sphere in enumerate(kinds) if not sphere]
+                mine = jnp.isin(shape.astype(jnp.int32), jnp.array(flat))
+                return [s._replace(share=jnp.where(mine, s.share, 0.0)) for s in slots]
+
+            found += lanewise(back, point, distance, gradient, self.thing.shape)
+        return found
 
     def _deal(self, slots: list[Place]) -> Place:
         """Deals the slots (component, 1, world) out to the finger lanes."""
@@ -163,6 +190,24 @@ class FieldContacts:
 def ring_centres(origin, frame, numbers):
     """Centres of a body's rings, shape (3, k, ...)."""
     return origin[:, None] + apply_columns(frame[:, :, None], numbers[:3])
+
+
+def joined(places: list[Place]) -> Place:
+    """Contacts with several fields, one behind the other."""
+    if len(places) == 1:
+        return places[0]
+    return lanewise(
+        lambda *p: Place(*(jnp.concatenate(v, 1) for v in zip(*p, strict=True))), *places
+    )
+
+
+def slots_of(point, normal, gap):
+    """Contacts of an object's points (3, point, world) as a place each."""
+    one = jnp.ones_like(gap)
+    return [
+        Place(*(v[:, k : k + 1] for v in (point, normal, gap[None], one[None])))
+        for k in range(gap.shape[0])
+    ]
 
 
 def may_touch(timestep, numbers, centre, distance, vel):

@@ -9,7 +9,7 @@ from codesign_jax.engines.structured.kernel.memory import MemoryLayout
 from codesign_jax.engines.structured.kernel.pairs import PairSet, pair_slots
 from codesign_jax.engines.structured.kernel.slots import SlotSet
 from codesign_jax.engines.structured.kernel.team_slots import TeamFieldSet, TeamPairSet
-from codesign_jax.engines.structured.laws import shapes
+from codesign_jax.engines.structured.laws import shapes, surroundings
 from codesign_jax.model import layout
 from codesign_jax.model.layout import pairings_held, palm_touches, touches_itself
 from codesign_jax.scene import Scene
@@ -54,6 +54,8 @@ class Tables:
         n, self.links, self.axes = self.lay.dofs.shape
         self.fingers = 1 << (n - 1).bit_length()
         self.team = team or teams.lanes_of_a_finger(scene, backend, self.fingers)
+        if scene.fixture:  # a slot of a team is one contact, a ring's are as many as the fields
+            self.team = 1
         # On a GPU a team's block is one world: nothing depends on what others do.
         alone = self.team > 1 and backend == "gpu"
         self.num_fingers = n
@@ -71,11 +73,11 @@ class Tables:
         self._tables()
 
     def _sets(self) -> list[ContactSet]:
-        e, k = self.scene.effects, self.k
+        e, k, n = self.scene.effects, self.k, len(surroundings.fields(self.scene))
         make = partial(ContactSet, self.scene, size=self.size)
-        on = {"finger_object": e.finger_object, "finger_table": e.finger_table}
+        on = {"finger_object": k * e.finger_object, "finger_table": n * k * e.finger_table}
         fields = make if self.team == 1 else partial(TeamFieldSet, self.scene, self)
-        sets = [fields(name, self.links, k) for name in on if on[name]]
+        sets = [fields(name, self.links, on[name]) for name in on if on[name]]
         if self.between:
             block, slots = (self.fingers, self.block), pair_slots(self.scene)
             how = {"gathers": self.gathers, "remembers": self.remembers}
@@ -84,9 +86,10 @@ class Tables:
             else:
                 block = (*block, self.team)
                 sets.append(TeamPairSet(self.scene, block, self.links, slots, **how))
-        on = {"palm_object": e.palm_object, "palm_table": e.palm_table}
-        sets += [make(name, self.palm_groups, 1) for name in on if on[name]]
-        on_table = [make("object_table", -(-4 // self.fingers), 1)] if e.object_table else []
+        on = {"palm_object": int(e.palm_object), "palm_table": n * e.palm_table}
+        sets += [make(name, self.palm_groups, on[name]) for name in on if on[name]]
+        groups = -(-surroundings.slots(self.scene) // self.fingers)
+        on_table = [make("object_table", groups, 1)] if e.object_table and groups else []
         return [*sets, *on_table]
 
     @property

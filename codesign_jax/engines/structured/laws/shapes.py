@@ -10,7 +10,6 @@ import numpy as np
 
 from codesign_jax.engines.structured.lanes import cross, dot, once
 from codesign_jax.engines.structured.laws import meshes
-from codesign_jax.engines.structured.laws.kinematics import Kinematics
 from codesign_jax.engines.structured.world_model import WorldModel, apply_columns, apply_rows
 from codesign_jax.scene import Scene, primitives
 
@@ -141,17 +140,22 @@ def _capsule(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def object_on_table(
-    scene: Scene, hand: WorldModel, kin: Kinematics, height: jax.Array
+    scene: Scene, hand: WorldModel, columns: jax.Array, height: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Point, normal and gap of the object on the table, four slots as in MuJoCo's plane colliders.
+    """Point, normal and gap of the object on the table, see `lowest_points` and `on_table`."""
+    return once(on_table, lowest_points(scene, hand, columns), height)
 
-    The points are the four lower corners of a box; the lower rim's lowest point, its upper
-    counterpart and two more on the lower rim, 120 degrees apart, of a cylinder; the lowest point of
-    each cap of a capsule (two slots); that of a sphere (one); four spread-out ones among the lowest
-    support points of a mesh.
+
+def lowest_points(scene: Scene, hand: WorldModel, columns: jax.Array) -> jax.Array:
+    """Points of the object that may touch a table, from its centre, shape (3, 4, world).
+
+    Four slots as in MuJoCo's plane colliders: the four lower corners of a box; the lower rim's
+    lowest point, its upper counterpart and two more on the lower rim, 120 degrees apart, of a
+    cylinder; the lowest point of each cap of a capsule (two slots); that of a sphere (one); four
+    spread-out ones among the lowest support points of a mesh.
     """
 
-    def points(size: jax.Array, columns: jax.Array, height: jax.Array):
+    def points(size: jax.Array, columns: jax.Array) -> jax.Array:
         indices, arms = mesh_indices(scene), None
         if len(indices) < len(scene.objects.object):
             arms = primitive_points(scene, size, hand.object_id, columns)
@@ -159,9 +163,10 @@ def object_on_table(
             new = meshes.table_points(hand.mesh, columns)  # type: ignore[arg-type]
             mine = jnp.isin(hand.object_id, jnp.array(indices))
             arms = new if arms is None else jnp.where(mine, new, arms)
-        return on_table(arms, height)
+        assert arms is not None
+        return arms
 
-    return once(points, hand.object_size[:, 0], kin.object[:, :, 0], height)
+    return once(points, hand.object_size[:, 0], columns[:, :, 0])
 
 
 def primitive_points(

@@ -11,27 +11,18 @@ INTERRUPTED = 128 + signal.SIGINT
 """Exit status of a command that Ctrl-C ended."""
 
 
-_REMEDIES = {
-    errno.ENOSPC: "make room, and give the same command again: what was saved is whole",
-    errno.EDQUOT: "make room, and give the same command again: what was saved is whole",
-    errno.EIO: "the disk or the network to it fails; when it works, give the same command again: "
-    "what was saved is whole",
-}
+_REMEDIES = dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "make room")
+_REMEDIES[errno.EIO] = "the disk or the network to it fails; when it works"
 
 
 def words(error: Exception) -> str:
     """What an error says to a user, in a line; of a full or broken disk also what to do."""
     if not isinstance(error, OSError) or error.strerror is None:
         return str(error)
-    place = "a file" if error.filename is None else ascii_name(error.filename)
-    remedy = _REMEDIES.get(error.errno or 0, "")
-    return f"{place}: {error.strerror}" + (f"; {remedy}" if remedy else "")
-
-
-def ascii_name(name: object) -> str:
-    """A file's name, with bytes that are no text as escapes."""
-    text = os.fsdecode(name) if isinstance(name, bytes | os.PathLike) else str(name)
-    return text.encode("utf-8", "backslashreplace").decode()
+    found = f"{'a file' if error.filename is None else error.filename}: {error.strerror}"
+    if remedy := _REMEDIES.get(error.errno or 0):
+        found += f"; {remedy}, and give the same command again: what was saved is whole"
+    return found
 
 
 def of(run: Callable[[], int]) -> int:

@@ -111,8 +111,8 @@ def check(settings: Settings, hand: Hand | None) -> list[str]:
     """
     found = []
     for name, (low, high) in _RANGES.items():
-        problem = schema.range_problem(f"--{_flag(name)}", getattr(settings, name), "", low, high)
-        if problem:
+        flag = f"--{name.replace('_', '-')}"
+        if problem := schema.range_problem(flag, getattr(settings, name), "", low, high):
             found.append(problem)
     if settings.engine not in engines.NAMES:
         hint = schema.nearest(settings.engine, engines.NAMES)
@@ -145,7 +145,3 @@ def _schedule_problems(settings: Settings, space: DesignSpace | None) -> list[st
     except ValueError as error:
         return [f"--schedule: {error}"]
     return []
-
-
-def _flag(name: str) -> str:
-    return name.replace("_", "-")

@@ -19,7 +19,8 @@ def words(error: Exception) -> str:
     """What an error says to a user, in a line; of a full or broken disk also what to do."""
     if not isinstance(error, OSError) or error.strerror is None:
         return str(error)
-    found = f"{'a file' if error.filename is None else error.filename}: {error.strerror}"
+    name = os.fsdecode(error.filename or "a file").encode("utf-8", "backslashreplace").decode()
+    found = f"{name}: {error.strerror}"
     if remedy := _REMEDIES.get(error.errno or 0):
         found += f"; {remedy}, and give the same command again: what was saved is whole"
     return found

@@ -95,6 +95,6 @@ FILES = {
         "landscape.npz",
         LANDSCAPE,
     ),
-    *("landscape.part", "reference.npz", REFERENCE, "stress.npz", "replay.html", "report.html"),
+    *("reference.npz", REFERENCE, "stress.npz", "replay.html", "report.html"),
 }
 """Names at the top of a run folder, beside those of `TABLES`."""

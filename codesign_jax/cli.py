@@ -137,6 +137,12 @@ class Evaluate(Command, RunOrDesign):
     stress: Flag = False
     """Then the same trials with heavier objects, less friction, the other bending law and other
     constants, and warnings of the design itself (docs/command_line.md); best with --trials 24."""
+    forces: File = None
+    """Write contact forces and depths of the first trial of each object, a row for each time step
+    (.csv, docs/files.md), and say how hard the fingers grip."""
+    pull: Flag = False
+    """Then say how hard each object can be pulled down before it leaves the hand, which stands
+    still [N]."""
     render: File = None
     """Draw the first trial of each object: a film (.gif, .mp4) or a strip of pictures (.png)."""
     dry_run: Flag = False

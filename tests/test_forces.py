@@ -1,17 +1,25 @@
 """Recorded contact forces: momentum, MuJoCo's own, and that recording changes nothing."""
 
+import csv
+import dataclasses
+import re
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import model, policy, rollout
+from codesign_jax import cli, model, policy, rollout
+from codesign_jax.commands import forces as push
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.report import charts
+from codesign_jax.scene import load, parameters
 from codesign_jax.scene.schema import InputError
 from tests.helpers import grasps
+from tests.helpers.toy_engine import TINY
 
 HELD = {"links": 3, "effects__disturb": False, "effects__ungrasp": False}
 
@@ -94,6 +102,9 @@ def test_recording_changes_no_bit_and_a_lost_object_has_no_forces():
 
     plain, (outcome, trace) = run(), run(record_forces=True)
     jax.tree.map(np.testing.assert_array_equal, plain, (outcome, trace._replace(forces=None)))
+    chart = charts.grip_chart(grasps.nth(trace.forces, 0), scene)
+    assert [line.name for line in chart.data] == ["finger 0", "finger 1", "palm"]
+    assert len(chart.data[0].y) == scene.num_steps
     lost = np.asarray(outcome.lost_time)
     assert np.isfinite(lost).any()
     for world in np.flatnonzero(np.isfinite(lost)):
@@ -123,3 +134,40 @@ def test_what_records_no_forces_is_refused():
 
     with pytest.raises(NotImplementedError, match="has no derivative"):
         jax.grad(end)(jnp.zeros(()))
+
+
+def test_a_pull_takes_the_object_as_mujocos_does():
+    """A weight of two newtons more, by engines that share no step; held, not held, and too much."""
+    scene = load(TINY)
+    space = parameters.design_space(scene.hand, "2d")
+    hand = space.params(space.default())
+    one = jax.tree.map(lambda v: np.asarray(v)[None], rollout.nominal_trial(scene))
+    found = [
+        push.pull(scene, make_engine(n, scene), hand, one)[0] for n in ("structured", "mujoco")
+    ]
+    # It grows by 0.2 N at a time, and float32 grips a little later.
+    np.testing.assert_allclose(found[0], found[1], rtol=0.15)
+    assert found[0] > 3 * scene.objects.object[0].mass
+    assert push.in_words(np.nan).startswith("not held") and "more than 50 N" in push.in_words(
+        np.inf
+    )
+    with pytest.raises(InputError, match="effects.gravity is off"):
+        floating = dataclasses.replace(scene.effects, gravity=False)
+        floating = dataclasses.replace(scene, effects=floating)
+        push.pull(floating, make_engine("structured", floating), hand, one)
+
+
+def test_a_table_of_forces_has_each_step(tmp_path, capsys):
+    path = tmp_path / "forces.csv"
+    assert cli.main(["evaluate", "--scene", str(TINY), "--trials", "1", "--forces", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"sphere: grip [\d.e-]+ \+ [\d.e-]+ N by finger", said) and " mm" in said
+    scene = load(TINY)
+    with path.open() as file:
+        rows = [*csv.DictReader(file)]
+    assert len(rows) == scene.num_steps and rows[-1]["object"] == "sphere"
+    held = rows[int(scene.last_step("lift"))]
+    push_up = sum(float(held[f"finger_{i}_z_N"]) for i in (0, 1)) + float(held["palm_z_N"])
+    # Carried, in the last step of the lift; the trial's object has 15 % of noise in its mass.
+    assert push_up == pytest.approx(scene.gravity * scene.objects.object[0].mass, rel=0.5)
+    assert float(held["table_z_N"]) == 0 and float(held["depth_finger_object_mm"]) > 0

@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import engines, preflight, rollout, runs, types
-from codesign_jax.commands import common, reference
+from codesign_jax.commands import common, forces, reference
 from codesign_jax.commands.common import find_case
 from codesign_jax.report import stress, verdicts
 from codesign_jax.runs import choice, tables
@@ -50,6 +50,8 @@ def main(options: "Evaluate") -> int:
         reference.tell_stress(case, found, console)
     if options.render:
         draw(case, engine, options, console)
+    if options.forces or options.pull:
+        push(case, engine, options, console)
     return int(types.failed(one.status).all())  # no trial says anything of the design
 
 
@@ -70,6 +72,7 @@ def _check(options: "Evaluate", engine: str) -> None:
     )
     problems += common.picture_problems("--render", options.render)
     problems += common.place_problems("--out", options.out, ".csv")
+    problems += common.place_problems("--forces", options.forces, ".csv")
     common.refuse(problems + common.engine_problems(engine, options.overrides))
 
 
@@ -101,6 +104,25 @@ def _untried(case: Case, options: "Evaluate") -> list[str]:
         f"warning: --trials {options.trials} tries {options.trials} of {len(names)} objects, and "
         f"not {', '.join(left)}; --trials {len(names)} tries each once"
     ]
+
+
+def push(case: Case, engine: engines.Engine, options: "Evaluate", console: Console) -> None:
+    """Records forces of the first trial of each object, and pulls at what is held."""
+    count = min(options.trials, len(case.scene.objects.object))
+    trials = rollout.sample_trials(case.scene, jax.random.key(options.seed), count)
+    params = case.space.params(jnp.asarray(case.design, jnp.float32))
+    if options.forces:
+        with Busy(console, "recording forces"):
+            trace = forces.record(case, params, trials)
+        forces.tell(case.scene, trace, trials, console)
+        forces.write(options.forces, case.scene, trace, trials)
+        console.print(f"table: {options.forces}")
+    if options.pull:
+        with Busy(console, "pulling"):
+            found = forces.pull(case.scene, engine, params, trials)
+        for shape, force in zip(np.asarray(trials.shape), found, strict=True):
+            name = case.scene.objects.object[int(shape)].name
+            console.print(f"{name:>12}: {forces.in_words(force)}")
 
 
 def draw(case: Case, engine: engines.Engine, options: "Evaluate", console: Console) -> None:

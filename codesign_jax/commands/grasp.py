@@ -10,6 +10,7 @@ import numpy as np
 from codesign_jax import rollout, runs
 from codesign_jax.commands import common
 from codesign_jax.commands.common import find_case
+from codesign_jax.engines.base import recording, tells_forces
 from codesign_jax.runs import choice
 from codesign_jax.runs.choice import Case
 from codesign_jax.scene.schema import InputError
@@ -74,14 +75,17 @@ def _nominal(case: Case, shape: int | str) -> Asked:
     return Asked(case, trial, f"object {name}, without noise", None)
 
 
-def simulate(asked: Asked) -> "Replay":
-    """Simulates the grasp and keeps its trajectory."""
+def simulate(asked: Asked, *, forces: bool = False) -> "Replay":
+    """Simulates the grasp and keeps its trajectory, with the forces where an engine tells them."""
     from codesign_jax.report import animation
 
     case = asked.case
     params = case.space.params(jnp.asarray(case.design, jnp.float32))
     trials = jax.tree.map(lambda v: v[None], asked.trial)
-    return animation.replay(case.scene, case.make_engine(), params, trials)[0]
+    engine = case.make_engine()
+    if forces and tells_forces(engine):
+        engine = recording(engine)
+    return animation.replay(case.scene, engine, params, trials)[0]
 
 
 def description(asked: Asked, shown: "Replay") -> list[str]:

@@ -90,6 +90,11 @@ def staged(engine: Engine, lanes: int | None = None, *, trajectory: bool = False
     )
 
 
+def tells_forces(engine: Engine) -> bool:
+    """Whether the engine tells contact forces; one that asks a policy, whether its own does."""
+    return hasattr(getattr(engine, "engine", engine), "recording")
+
+
 def recording(engine: Engine) -> Engine:
     """The engine as one whose traces have the contact forces.
 
@@ -97,7 +102,7 @@ def recording(engine: Engine) -> Engine:
       InputError: If it does not tell them.
     """
     own: Any = getattr(engine, "recording", None)
-    if own is None:
+    if own is None or not tells_forces(engine):
         raise InputError([f"engine {engine.name} records no forces; engine structured does"])
     return own()
 

@@ -10,8 +10,9 @@ from plotly.subplots import make_subplots
 from codesign_jax.codesign import CONVERGED_COST
 from codesign_jax.report.landscape import Landscape
 from codesign_jax.runs.record import History
+from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
-from codesign_jax.types import WARNINGS, Status
+from codesign_jax.types import WARNINGS, Forces, Status
 
 _BLUE, _ORANGE, _GREY = "#2f6fab", "#e08a1e", "#5a6776"
 _LAYOUT = {
@@ -182,6 +183,25 @@ def _heatmap(found: Landscape) -> go.Heatmap:
     bar = {"title": "mean cost", "x": 1.12}
     x, y, z = found.first, found.second, found.cost.T
     return go.Heatmap(x=x, y=y, z=z, colorscale="Greys", colorbar=bar, **limits)
+
+
+def grip_chart(forces: Forces, scene: Scene) -> go.Figure:
+    """Normal force of each finger on the object, and the palm's force, over time.
+
+    Args:
+      forces: Forces of a grasp, arrays of shape (time, ...).
+      scene: Its scene, whose phases are marked.
+    """
+    figure = go.Figure()
+    time = scene.discretization.timestep * np.arange(len(forces.grip))
+    series = {f"finger {i}": forces.grip[:, i] for i in range(forces.grip.shape[1])}
+    series["palm"] = np.linalg.norm(forces.palm, axis=1)
+    for name, force in series.items():
+        figure.add_scatter(x=time, y=force, mode="lines", name=name, line={"width": 1.5})
+    for name, end in scene.phase_ends.items():
+        figure.add_vline(end, line={"dash": "dot", "width": 1}, annotation_text=f"end of {name}")
+    figure.update_layout(xaxis_title="time [s]", yaxis_title="force [N]", height=320, **_LAYOUT)
+    return figure
 
 
 def failure_chart(status: np.ndarray) -> go.Figure:

@@ -115,6 +115,13 @@ def _grasp(run: Run, grasp: tuple[Grasp, Replay] | None) -> str:
             "rounds differently."
         )
         parts = [markup.paragraph(text, "warning"), *parts]
+    if shown.trace is not None and (forces := shown.trace.forces) is not None:
+        text = (
+            "Below: the fingers' normal forces on the object, and the palm's force. Largest depths "
+            f"in one another over this grasp: {verdicts.depths(forces)}."
+        )
+        chart = charts.html(charts.grip_chart(forces, run.scene), "grip")
+        parts += [markup.paragraph(text), chart]
     return markup.section("Best grasp", markup.paragraph(note), *parts)
 
 

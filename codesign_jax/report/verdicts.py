@@ -14,7 +14,7 @@ from codesign_jax import codesign, cost, runs
 from codesign_jax.report import statistics
 from codesign_jax.report.statistics import Interval
 from codesign_jax.scene import Scene
-from codesign_jax.types import Outcome, failed
+from codesign_jax.types import Forces, Outcome, failed
 
 RELIABLE = 0.95
 """Share of its grasps that a good design keeps at least."""
@@ -54,6 +54,13 @@ class Verdict(NamedTuple):
             return text
         some = f"{self.more:,}" if self.more <= _MOST else f"more than {_MOST:,}"
         return f"{text}, {some} more at this share would decide"
+
+
+def depths(forces: Forces) -> str:
+    """The largest depth of each kind of contact over forces of any shape, in words."""
+    found = {k.replace("_", " on "): 1e3 * float(np.max(v)) for k, v in forces.depth.items()}
+    words = [f"{k} {v:.2g} mm" for k, v in found.items() if v > 0]
+    return ", ".join(words) or "nothing touched"
 
 
 def judge(kept: int, total: int) -> Verdict:

@@ -41,7 +41,8 @@ def cost_evolution(
     axes.axhline(threshold, color="black", lw=1, ls="--", label="convergence threshold")
     axes.set(xlabel="episode", ylabel="cost", title=title, xlim=(0, len(cost) + 1))
     axes.set_ylim(bottom=-0.05)
-    axes.legend(loc="upper right", frameon=False)
+    axes.locator_params(axis="x", integer=True)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False)
     return _save(figure, path)
 
 

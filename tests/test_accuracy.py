@@ -16,7 +16,7 @@ from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.scene import parameters, schema
 from scripts.accuracy import budget, report
 from scripts.shared import output, work
-from tests.helpers.grasps import pinch, still
+from tests.helpers.grasps import pinch, still, world_inputs
 
 DATA = Path(__file__).parents[1] / "docs" / "data" / "experiments"
 
@@ -99,7 +99,7 @@ def test_tips_lie_a_segment_behind_the_last_joint():
     small = pinch("box", links=2)
     space = parameters.design_space(small.hand)
     params = space.params(space.default())
-    fields = jax.tree.map(np.asarray, model.model_fields(small, params, still()))
+    fields = jax.tree.map(np.asarray, world_inputs(small, params, still())[0])
     compiled = world_model(small, fields)
     data = mujoco.MjData(compiled)
     data.qpos[:] = fields.start

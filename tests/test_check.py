@@ -1,6 +1,7 @@
 """`codesign check`: its counts are those of the grasps simulated again, and refusals."""
 
 import re
+from functools import partial
 
 import jax
 import numpy as np
@@ -50,9 +51,9 @@ def test_its_counts_are_those_of_the_grasps_simulated_again(capsys):
         key = jax.random.fold_in(jax.random.key(0), 1)
         drawn = sampling.draw(the_scene, space, key, first=0, n=4, num_trials=1)
         trials = jax.tree.map(lambda v: v[: counts[1], 0], drawn.trials)
-        params = jax.vmap(space.params)(np.tile(design, (counts[1], 1)))
-        engine = make_engine("mujoco", the_scene)
-        kept.append(np.asarray(rollout.simulate(the_scene, engine, params, trials)[0].cost) < 0.01)
+        params = jax.jit(jax.vmap(space.params))(np.tile(design, (counts[1], 1)))
+        simulate = partial(rollout.simulate, the_scene, make_engine("mujoco", the_scene))
+        kept.append(np.asarray(jax.jit(simulate)(params, trials)[0].cost) < 0.01)
     assert counts == [kept[0].sum(), kept[0].size, kept[1].sum(), (kept[0] != kept[1]).sum()]
     assert rates[0][1] == 4 and rates[1][1] == counts[1]
     interval = stats.binomtest(counts[3], counts[1]).proportion_ci(method="wilson")

@@ -81,16 +81,16 @@ def test_a_vector_environment_begins_ended_grasps_with_new_noise(episode):
     from codesign_jax.env.vector import VectorEnv
 
     grasp, _ = episode
-    worlds = VectorEnv(grasp, 3, seed=1)
+    worlds = VectorEnv(grasp, 4, seed=1)
     with pytest.raises(gymnasium.error.ResetNeeded):
         worlds.step(worlds.action_space.sample())
     first, _ = worlds.reset(seed=2)
     assert worlds.observation_space.contains(first)
     before = np.asarray(worlds._state.data.trial.yaw)
     for k in range(grasp.length):
-        obs, reward, ended, cut, info = worlds.step(np.zeros((3, 2), np.float32))
+        obs, reward, ended, cut, info = worlds.step(np.zeros((4, 2), np.float32))
         assert ended.all() == (k == grasp.length - 1) and not cut.any()
-    again, reward, ended, *_ = worlds.step(np.zeros((3, 2), np.float32))
+    again, reward, ended, *_ = worlds.step(np.zeros((4, 2), np.float32))
     assert not ended.any() and (reward == 0).all() and obs.dtype == np.float32
     assert set(info) == {"held", "distance"}
     assert not (np.asarray(worlds._state.data.trial.yaw) == before).any()

@@ -264,7 +264,14 @@ def examples(name):
     return [test for test in found if test.examples]
 
 
-@pytest.mark.parametrize("name", codesign_jax.__all__)
+# They compile kernels of the default scene, 20 s; quick: test_policy and test_env, the same calls.
+LONG = {"env", "policy"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.slow] * (n in LONG)) for n in codesign_jax.__all__],
+)
 def test_examples_are_right(name, capsys):
     tests = examples(name)
     assert tests, f"codesign_jax.{name} has no example"

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from jax.experimental import pallas as pl
 
-from codesign_jax.compiler import nvptx, prefetch, thread, vector
+from codesign_jax.compiler import thread, vector
 from codesign_jax.compiler.launch import Kernel, describe, kernel_jaxpr, launch
-from codesign_jax.compiler.layout import Array, Layout
+from codesign_jax.compiler.values import Array, Layout
 
 pytestmark = pytest.mark.usefixtures("optimized_kernels")
 BACKENDS = ["cpu", pytest.param("gpu", marks=pytest.mark.gpu)]
@@ -230,7 +230,7 @@ def test_what_lanes_sum_after_an_exchange_has_the_same_bits_on_all(backend):
     for function, sign in ((sum_of_pairs, "fadd"), (difference_of_pairs, "fsub")):
         for text in write(function, np.float32, np.float32):
             assert sign in text and f"{sign} contract" not in text
-        ptx = nvptx.assembly(text)
+        ptx = thread.assembly(text)
         assert f"{sign[1:]}.rn.f32" in ptx and "fma" not in ptx
 
 
@@ -336,7 +336,7 @@ def test_text_is_valid_for_both_targets():
     for dtype in (np.float32, np.float64):
         with jax.enable_x64(True):
             _, text = write(function, dtype, dtype)
-        ptx = nvptx.assembly(text)
+        ptx = thread.assembly(text)
         bits = 32 if dtype == np.float32 else 64
         assert ".target sm_80" in ptx and "shfl.sync.bfly.b32" in ptx and ".maxntid 32" in ptx
         assert f"fma.rn.f{bits}" in ptx and (bits == 64) == ("div.rn.f64" in ptx)
@@ -427,7 +427,7 @@ def test_a_gpu_exchanges_on_its_chip_between_barriers():
     steps = [meets or access for meets, access in steps]
     once = ["bar", "store", "bar", *["load"] * 4]
     assert steps == ["load", *once, "load", *once, "store"]
-    ptx = nvptx.assembly(text)
+    ptx = thread.assembly(text)
     assert ".shared .align 16 .b8 s3[128]" in ptx and "st.shared" in ptx and "ld.shared" in ptx
     _, large, _ = exchange(32, "gpu")
     large[2] = jax.ShapeDtypeStruct((BLOCKS, 1000, 8), jnp.float32)
@@ -464,6 +464,6 @@ def test_a_loop_asks_for_what_it_reads_later(reverse):
     )
     reads = [k for k, line in enumerate(lines) if " load " in line and begin < k < end]
     assert len(reads) == 2 and rounds == int(rounds) >= 1 and asked < reads[0]
-    assert rounds == prefetch.rounds_ahead(end - begin, 60) == 12
+    assert rounds == thread.rounds_ahead(end - begin, 60) == 12
     # Two rows: lane 0 asks for the first one, all others for the second one.
     assert any("umin.i32(i32 %lane, i32 1)" in line for line in lines)

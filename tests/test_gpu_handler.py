@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from codesign_jax.compiler import ffi, gpu, launch
-from codesign_jax.compiler.layout import OUTPUT, Array, Layout
+from codesign_jax.compiler.values import OUTPUT, Array, Layout
 from tests.helpers import call_frames, kernels
 
 KERNEL, CONTEXT, PRIMARY = 0xCAFE, 0xC0, 0xC1

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from codesign_jax.compiler import cpu, ffi, gpu, host, launch, vector
-from codesign_jax.compiler.layout import OUTPUT, SCRATCH, Array, Layout
+from codesign_jax.compiler import cpu, ffi, gpu, handlers, launch, vector
+from codesign_jax.compiler.values import OUTPUT, SCRATCH, Array, Layout
 from tests.helpers import call_frames, kernels
 
 pytestmark = pytest.mark.usefixtures("optimized_kernels")
@@ -40,7 +40,7 @@ def handler():
     x, table = (jax.ShapeDtypeStruct(v.shape, v.dtype) for v in kernels.numbers(4))
     jaxpr = launch.kernel_jaxpr(kernels.call(x, table)[0], [x, table])
     text = cpu.block_code(jaxpr, LAYOUT) + cpu.handler_code("plain", LAYOUT)
-    return host.Loaded(host.compile(text)).function("plain")
+    return handlers.Loaded(handlers.compile(text)).function("plain")
 
 
 @pytest.fixture
@@ -170,8 +170,8 @@ def test_kept_code_runs_in_another_process_on_several_devices(folder):
     """Shares of `shard_map` use the pool together; XLA knows that their results differ."""
     x, table = kernels.numbers(12)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(host, "known", lambda name: False)  # another test may have compiled it
-        patch.setattr(host, "register", lambda *_: None)
+        patch.setattr(handlers, "known", lambda name: False)  # another test may have compiled it
+        patch.setattr(handlers, "register", lambda *_: None)
         jax.jit(kernels.run).lower(x, table)
     assert list(folder.rglob("*.kept"))
     here = {**os.environ, "PYTHONPATH": os.pathsep.join([".", *sys.path])}
@@ -191,12 +191,12 @@ def test_code_that_is_not_optimized_is_other_code_with_the_same_result(folder, m
     x, table = kernels.numbers(3)
     found = []
     for level in ("2", "0"):
-        monkeypatch.setenv(host.OPTIMIZATION, level)
+        monkeypatch.setenv(handlers.OPTIMIZATION, level)
         found.append(jax.jit(partial(kernels.run, rounds=8))(x, table))
         assert len(list(folder.rglob("*.kept"))) == len(found)
     # The chaotic map multiplies a difference by up to 3.9 in each of eight rounds.
     np.testing.assert_allclose(*found, atol=3.9**8 * 6e-8)
-    monkeypatch.setenv(host.OPTIMIZATION, "3")
+    monkeypatch.setenv(handlers.OPTIMIZATION, "3")
     with pytest.raises(ValueError, match="CODESIGN_KERNEL_OPTIMIZATION = '3' must be 0 or 2"):
         jax.jit(kernels.run)(x, table)
 
@@ -248,7 +248,7 @@ def test_missing_memory_is_an_error(threads):
     """Scratch memory of a petabyte: the call fails, and says why."""
     large = Layout((*LAYOUT.arrays[:3], Array((2**40, 256), "float32", SCRATCH)), 8)
     block = "define internal void @block(ptr %a, ptr %b, ptr %c, ptr %d) {\nret void\n}\n"
-    loaded = host.Loaded(host.compile(block + cpu.handler_code("large", large)))
+    loaded = handlers.Loaded(handlers.compile(block + cpu.handler_code("large", large)))
     (x, table), out = kernels.numbers(8), np.zeros((8, 1, 8), np.float32)
     xla = call_frames.Xla(threads, "threads")
     code, message = xla.call(loaded.function("large"), [x, table], [out])

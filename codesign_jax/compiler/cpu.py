@@ -13,10 +13,9 @@ from ctypes import c_int64
 from typing import Any
 
 from codesign_jax import reuse
-from codesign_jax.compiler import ffi, host, vector
-from codesign_jax.compiler.code import Code
-from codesign_jax.compiler.handler import Handler
-from codesign_jax.compiler.layout import SCRATCH, Layout
+from codesign_jax.compiler import ffi, handlers, vector
+from codesign_jax.compiler.handlers import Code, Handler
+from codesign_jax.compiler.values import SCRATCH, Layout
 
 _ALIGNMENT = 64  # bytes: a line of the cache
 _YIELDS, _SLEEP = 100, 50_000  # times that a handler looks again at once, then pauses [ns]
@@ -64,22 +63,22 @@ def register(
       trace: Returns the kernel's jaxpr; its arguments are references to a block of each array.
       layout: Its arrays.
       keep: Whether its machine code may be kept on disk and be found there.
-      level: LLVM's level of optimisation, see `host.compile`.
+      level: LLVM's level of optimisation, see `handlers.compile`.
 
     Raises:
       KernelUnavailable: If XLA does not take the handler.
       NotImplementedError: If the kernel does something that has no instruction.
     """
-    name = "kernel_" + reuse.digest("cpu", origin, layout, level, *host.identity())
+    name = "kernel_" + reuse.digest("cpu", origin, layout, level, *handlers.identity())
 
     def build() -> bytes:
         text = block_code(trace(), layout) + handler_code(name, layout)
-        return host.compile(_declared_once(text), level)
+        return handlers.compile(_declared_once(text), level)
 
-    with host.LOCK:
-        if not host.known(name):
+    with handlers.LOCK:
+        if not handlers.known(name):
             code = reuse.kept(reuse.kernel_file(name) if keep else None, build)
-            host.register(name, host.Loaded(code), "cpu")
+            handlers.register(name, handlers.Loaded(code), "cpu")
     return name
 
 

@@ -18,10 +18,10 @@ from typing import Any
 import jax
 
 from codesign_jax import reuse
-from codesign_jax.compiler import ffi, host, nvptx, thread
+from codesign_jax.compiler import ffi, handlers, thread
 from codesign_jax.compiler.ffi import KernelUnavailable
-from codesign_jax.compiler.handler import Handler
-from codesign_jax.compiler.layout import ONCHIP, Layout
+from codesign_jax.compiler.handlers import Handler
+from codesign_jax.compiler.values import ONCHIP, Layout
 
 ENTRY = "kernel"
 """Name of the device code's entry point."""
@@ -48,7 +48,7 @@ def device_code(jaxpr: Any, layout: Layout) -> str:
     Raises:
       NotImplementedError: If the kernel does something that has no instruction.
     """
-    return nvptx.assembly(thread.write(jaxpr, layout, ENTRY))
+    return thread.assembly(thread.write(jaxpr, layout, ENTRY))
 
 
 class Driver:
@@ -145,9 +145,9 @@ def _translate(driver: Driver, kernel: ctypes.c_void_p, device: int) -> None:
         driver("cuDevicePrimaryCtxRelease_v2", device)
 
 
-def prepare(name: str, layout: Layout, kernel: int, driver: Driver) -> host.Loaded:
+def prepare(name: str, layout: Layout, kernel: int, driver: Driver) -> handlers.Loaded:
     """The handler of a kernel, compiled and told the kernel's handle and the driver's functions."""
-    loaded = host.Loaded(host.compile(handler_code(name, layout)))
+    loaded = handlers.Loaded(handlers.compile(handler_code(name, layout)))
     table = loaded.numbers(f"{name}_table", 1 + len(CALLS))
     table[0] = kernel
     for k, function in enumerate(CALLS):
@@ -162,17 +162,17 @@ def register(origin: str, trace: Callable[[], Any], layout: Layout, *, keep: boo
       KernelUnavailable: If the driver does not take the kernel, or XLA the handler.
       NotImplementedError: If the kernel does something that has no instruction.
     """
-    name = "kernel_" + reuse.digest("cuda", origin, layout, *host.identity()[:2])
+    name = "kernel_" + reuse.digest("cuda", origin, layout, *handlers.identity()[:2])
 
     def build() -> bytes:
         return device_code(trace(), layout).encode()
 
-    with host.LOCK:
-        if not host.known(name):
+    with handlers.LOCK:
+        if not handlers.known(name):
             text = reuse.kept(reuse.kernel_file(name) if keep else None, build).decode()
             device = jax.local_devices(backend="cuda")[0].local_hardware_id or 0
             loaded = prepare(name, layout, load(driver(), text, device), driver())
-            host.register(name, loaded, "CUDA")
+            handlers.register(name, loaded, "CUDA")
     return name
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from codesign_jax import reuse
 from codesign_jax.compiler import ffi
 from codesign_jax.compiler.ffi import KernelUnavailable
-from codesign_jax.compiler.layout import INPUT, ONCHIP, OUTPUT, SCRATCH, Array, Layout
+from codesign_jax.compiler.values import INPUT, ONCHIP, OUTPUT, SCRATCH, Array, Layout
 
 OLDEST_LLVMLITE = (0, 45)
 OLDEST_GPU = (8, 0)
@@ -85,9 +85,9 @@ def block_lanes(platform: str, dtype: Any, total: int | None = None) -> int:
       total: Lanes of all worlds of the batch, if they are known.
     """
     if platform == "cpu":
-        from codesign_jax.compiler import host
+        from codesign_jax.compiler import handlers
 
-        return host.vector_bytes() // np.dtype(dtype).itemsize
+        return handlers.vector_bytes() // np.dtype(dtype).itemsize
     lanes = 32
     if total is not None:
         while lanes > FEWEST_LANES and 2 * total <= lanes * WARPS_EACH * multiprocessors():

@@ -1,16 +1,59 @@
 """A block as one warp of an NVIDIA GPU: a value over the lanes is a scalar of each thread.
 
-Source of the instructions: NVIDIA, Parallel Thread Execution ISA 8; LLVM, User Guide for NVPTX.
+A loop asks for rows of memory ahead of their use, and LLVM makes PTX of the whole, which drivers
+translate.
+
+Sources: NVIDIA, Parallel Thread Execution ISA 8; LLVM, User Guide for NVPTX.
 """
 
-from typing import Any
+import re
+from typing import Any, NamedTuple
 
+import llvmlite.binding as binding
 import numpy as np
 
-from codesign_jax.compiler.layout import ONCHIP, Layout
-from codesign_jax.compiler.prefetch import Ahead, adjacent, rounds_ahead
-from codesign_jax.compiler.values import LLVM_TYPES, SIZES, Ref, Value, kind_of
+from codesign_jax.compiler.values import LLVM_TYPES, ONCHIP, SIZES, Layout, Ref, Value, kind_of
 from codesign_jax.compiler.writer import Writer
+
+AHEAD = 300
+"""Lines of a loop between asking for a row and reading it, about the time that memory takes."""
+
+
+class Ahead(NamedTuple):
+    """Rows that a loop reads at an address, and reads again further on in the next round.
+
+    Attributes:
+      line: Line behind which the address is known.
+      offsets: Offsets of the rows from the address [bytes].
+    """
+
+    line: int
+    offsets: list[int]
+
+
+def rounds_ahead(lines: int, length: int) -> int:
+    """How many rounds ahead of its use a loop prefetches a row.
+
+    As many as memory takes, but few against the loop's length: what is asked for in the last rounds
+    lies behind the rows that the loop reads.
+
+    Args:
+      lines: Lines of the loop's body.
+      length: Its number of rounds.
+    """
+    return min(-(-AHEAD // max(1, lines)), max(1, length // 5))
+
+
+def adjacent(offsets: list[int], row: int, lanes: int) -> list[tuple[int, int]]:
+    """Runs of adjacent rows: first offset and number, at most as many as lanes."""
+    found: list[tuple[int, int]] = []
+    for offset in offsets:
+        if found and offset == found[-1][0] + row * found[-1][1] and found[-1][1] < lanes:
+            found[-1] = (found[-1][0], found[-1][1] + 1)
+        else:
+            found.append((offset, 1))
+    return found
+
 
 LANES = 32
 """Threads of a warp, of which a block may have the first few."""
@@ -342,3 +385,37 @@ def write(jaxpr: Any, layout: Layout, name: str) -> str:
         + f'\nattributes #0 = {{ nounwind "nvvm.maxntid"="{lanes},1,1" }}\n'
         "attributes #1 = { nounwind memory(inaccessiblemem: readwrite) }\n"
     )
+
+
+TARGET, FEATURES = "sm_80", "+ptx78"
+"""The oldest GPU and the version of PTX that the code is written for; newer ones run it too."""
+
+_CONDITIONAL = re.compile(r"^(\s*@!?%p\d+ )bra(\s)", re.MULTILINE)
+
+
+def assembly(text: str) -> str:
+    """PTX of a kernel.
+
+    Passes are few on purpose: the kernel's own text has loops and little that is computed twice,
+    and passes that move loads out of loops make values live longer than there are registers.
+
+    Args:
+      text: The kernel in LLVM's language, see `thread.write`.
+    """
+    binding.initialize_all_targets()
+    binding.initialize_all_asmprinters()
+    target = binding.Target.from_triple("nvptx64-nvidia-cuda")
+    machine = target.create_target_machine(cpu=TARGET, features=FEATURES, opt=0)
+    module = binding.parse_assembly(text)
+    module.data_layout = str(machine.target_data)
+    module.verify()
+    passes = binding.create_new_function_pass_manager()
+    passes.add_new_gvn_pass()
+    passes.add_aggressive_dce_pass()
+    options = binding.create_pipeline_tuning_options(speed_level=1)
+    builder = binding.create_pass_builder(machine, options)
+    for function in module.functions:
+        if not function.is_declaration:
+            passes.run(function, builder)
+    # Conditions are the same on all lanes, which LLVM does not know: threads need not meet again.
+    return _CONDITIONAL.sub(r"\1bra.uni\2", machine.emit_assembly(module))

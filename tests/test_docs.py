@@ -199,7 +199,7 @@ def test_links_are_found():
     assert links(text) == ["b.png", "d.md#e", "l.md"]
 
 
-@pytest.mark.parametrize("page", ["CONTRIBUTING.md", "docs/extending.md"])
+@pytest.mark.parametrize("page", ["CONTRIBUTING.md", "docs/notes/extending.md"])
 def test_the_files_that_contributors_are_sent_to_are_there(page):
     """As paths in the checkout, the package, its engines or the structured engine."""
     text = (ROOT / page).read_text()

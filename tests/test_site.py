@@ -104,7 +104,7 @@ def test_the_layout_of_qpos_is_that_of_mujocos_model():
 @pytest.mark.parametrize(
     "link, page, expected",
     [
-        ("[a](../CONTRIBUTING.md#rules)", "extending.md", "[a](contributing.md#rules)"),
+        ("[a](../CONTRIBUTING.md#rules)", "limits.md", "[a](contributing.md#rules)"),
         ("[`CONTRIBUTING.md`](../CONTRIBUTING.md)", "limits.md", "[contributing](contributing.md)"),
         ("[`a_b.md`](a_b.md)", "limits.md", "[a b](a_b.md)"),
         ("[a](docs/effects.md)", "index.md", "[a](effects.md)"),

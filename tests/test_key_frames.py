@@ -1,5 +1,6 @@
 """Key frames: files against NumPy's interpolation of what they say, and files that are refused."""
 
+import csv
 import re
 import tomllib
 from pathlib import Path
@@ -10,9 +11,10 @@ import numpy as np
 import pytest
 import tomli_w
 
-from codesign_jax import control, parameters, rollout, scene
+from codesign_jax import cli, control, parameters, rollout, scene
 from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import key_frames, library
+from tests.helpers.toy_engine import TINY
 
 CONTROLS = library.available("controls")
 PAGE = Path(__file__).parent.parent / "docs" / "control.md"
@@ -230,3 +232,32 @@ def test_sums_are_read():
     found = key_frames.read_sum("-2e-1 + .5 arm_z - arm_x + 0.3", kind)
     assert found.number == pytest.approx(0.1)
     assert [(t.name, t.factor) for t in found.term] == [("arm_z", 0.5), ("arm_x", -1.0)]
+
+
+SUNK = """
+name = "sunk"
+description = "Lower by a number that a search moves"
+parameter = [{ name = "sink", unit = "mm", low = 0, high = 20, default = 5 }]
+frame = [
+    { time = 0, z = "start_height", pressure = 0 },
+    { time = "approach", z = "zero_height + arm_z - sink" },
+    { time = "inflate", pressure = "pressure" },
+    { time = "lift", z = "start_height" },
+    { time = "release" },
+    { time = "release + deflate_time", pressure = 0 },
+]
+"""
+
+
+def test_optimize_searches_a_parameter_of_the_control(tmp_path):
+    """Beside those of the design space, within its bounds; the run keeps the control."""
+    (tmp_path / "sunk.toml").write_text(SUNK)
+    sizes = ["--particles", "4", "--trials", "2", "--episodes", "2", "--test-trials", "2"]
+    how = ["--optimizer", "screened-es", "--engine", "mujoco", "--reference-trials", "0"]
+    run = ["--scene", str(TINY), "--set", f"control={tmp_path / 'sunk.toml'}"]
+    assert cli.main(["optimize", *run, *sizes, *how, "--out", str(tmp_path / "run")]) == 0
+    with (tmp_path / "run" / "tests.csv").open() as file:
+        sinks = [float(row["sink_mm"]) for row in csv.DictReader(file)]
+    assert len({*sinks}) > 1 and min(sinks) >= 0 and max(sinks) <= 20
+    kept = tomllib.loads((tmp_path / "run" / "control.toml").read_text())
+    assert kept["parameter"][0]["name"] == "sink"

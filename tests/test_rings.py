@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from codesign_jax import rollout
+from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured.kernel import packing
 from codesign_jax.engines.structured.laws import rings
-from codesign_jax.scene import load
+from codesign_jax.scene import load, parameters
 from tests.helpers import dense_skin
 from tests.helpers.dense_skin import turned
 
@@ -361,3 +363,18 @@ def _reference(name, body, field, place):
     middle = -body.base @ body.frames[0][:, 0]
     window = {"low": middle - 0.025, "high": middle + 0.025}
     return dense_skin.on_field(body, field, PER_AREA, **window, along=250, around=400)
+
+
+def test_hands_grasp_whose_fingers_are_no_power_of_two():
+    """Lanes that pad three fingers to four hold no finger: what they calculate is a number too."""
+    off = dict.fromkeys(("disturb", "ungrasp", "finger_finger", "finger_itself"), False)
+    ends = {"approach": 0.5, "inflate": 1.0, "lift": 1.2}
+    how = {"discretization": {"links": 2}, "effects": off, "phases": ends}
+    the_scene = load("paper", hand_name="tripod3", overrides=how)
+    space = parameters.design_space(the_scene.hand)
+    params, trial = space.params(space.default()), rollout.nominal_trial(the_scene, "sphere")
+    worlds = jax.tree.map(lambda v: jnp.asarray(v)[None], (params, trial))
+    engine = make_engine("structured", the_scene)
+    outcome, trace = jax.jit(lambda p, t: rollout.simulate(the_scene, engine, p, t))(*worlds)
+    assert outcome.status[0] == 0 and outcome.cost[0] == 0
+    assert float(trace.height[0, -1]) > 0.1, "lifted"

@@ -13,6 +13,9 @@ from codesign_jax.engines.structured.world_model import WorldModel, joint_sectio
 from codesign_jax.model.layout import palm_touches
 from codesign_jax.scene import Scene
 
+LENGTH = 6
+"""Which of a ring's numbers is its length: with none it is no ring, but can be divided by."""
+
 
 class Packing(Tables):
     """Packs the constants, states and controls of worlds; unpacks states and recorded rows."""
@@ -45,9 +48,12 @@ class Packing(Tables):
             arrays |= objects.rows(hand.mesh, self.fingers, dtype)
         extra = self.fingers - n
         if extra:
-            for name in ("share", "mass", "inertia", "gain", *(["ring"] if self.k else [])):
+            for name in ("share", "mass", "inertia", "gain"):
                 pad = [(0, 0)] * (arrays[name].ndim - 2) + [(0, extra), (0, 0)]
                 arrays[name] = jnp.pad(arrays[name], pad)
+            if self.k:
+                ring = jnp.pad(arrays["ring"], [(0, 0), (0, 0), (0, extra), (0, 0)], "edge")
+                arrays["ring"] = ring.at[:, LENGTH, n:].set(0.0)
         wide = {k: self._widen(arrays[k]) for k in self.hand.groups}
         arrays["object_id"] = hand.object_id.astype(dtype)
         narrow = {k: arrays[k] for k in self.world.groups}
@@ -64,7 +70,9 @@ class Packing(Tables):
     def _palm_slots(self, hand: WorldModel) -> jax.Array:
         """The palm's rings or spheres, shared out among the lanes."""
         numbers, f = palm_numbers(self.scene, hand), self.fingers
-        padded = jnp.pad(numbers, [(0, self.palm_groups * f - len(numbers)), (0, 0), (0, 0)])
+        extra = self.palm_groups * f - len(numbers)
+        padded = jnp.pad(numbers, [(0, extra), (0, 0), (0, 0)], "edge")
+        padded = padded.at[len(numbers) :, LENGTH].set(0.0)
         return jnp.moveaxis(padded.reshape(self.palm_groups, f, 8, -1), 1, 2)
 
     def pack_state(self, state: State) -> tuple[jax.Array, jax.Array]:

@@ -67,12 +67,16 @@ def test_nominal_trials_have_no_noise():
 # --- commands ------------------------------------------------------------------------------------
 
 
+# One program for each scene; operation by operation they are eighty.
+commanded = jax.jit(control.commands, static_argnums=0)
+
+
 def commands(**changes):
     params, trial = hand_world(PAPER, pressure=100e3)
     arm = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.3])  # x y z roll pitch yaw
     trial = trial._replace(**changes)
     params, trial = jax.tree.map(jnp.asarray, (params._replace(arm=arm), trial))
-    return np.asarray(control.commands(PAPER, params, trial))
+    return np.asarray(commanded(PAPER, params, trial))
 
 
 def test_commands_of_a_grasp():
@@ -133,7 +137,7 @@ def test_the_arm_carries_the_trials_tilt():
 def test_effects_that_are_off_have_no_phase():
     calm = scene.load("paper_spheres", overrides={"effects": {"disturb": False, "ungrasp": False}})
     params, trial = jax.tree.map(jnp.asarray, hand_world(calm))
-    u = np.asarray(control.commands(calm, params, trial))
+    u = np.asarray(commanded(calm, params, trial))
     assert u.shape == (450, 10)
     np.testing.assert_array_equal(u[:, 3:6], 0.0)
 
@@ -216,9 +220,7 @@ def test_a_grasp_starts_where_its_commands_do():
     trial = trial._replace(arm_tilt=np.array([0.05, -0.07]))
     params, trial = jax.tree.map(jnp.asarray, (params._replace(arm=arm), trial))
     fields = jax.jit(lambda p, t: model.model_fields(PAPER, p, t))(params, trial)
-    np.testing.assert_allclose(
-        fields.start[:6], control.commands(PAPER, params, trial)[0, :6], rtol=1e-6
-    )
+    np.testing.assert_allclose(fields.start[:6], commanded(PAPER, params, trial)[0, :6], rtol=1e-6)
 
 
 @pytest.mark.parametrize("axis, sign, column", [(4, 1, 0), (3, 1, 1)])
@@ -230,7 +232,7 @@ def test_pitch_points_the_fingers_to_x_and_roll_to_y(axis, sign, column):
     params = params._replace(arm=arm)
     compiled = model.compile_model(PAPER, params, trial)
     data = mujoco.MjData(compiled)
-    u = control.commands(PAPER, *jax.tree.map(jnp.asarray, (params, trial)))
+    u = commanded(PAPER, *jax.tree.map(jnp.asarray, (params, trial)))
     data.qpos[:6] = u[0, :6]
     mujoco.mj_kinematics(compiled, data)
     centre = model.layout(PAPER).centre_weights @ data.xipos - data.xpos[1]

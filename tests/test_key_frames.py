@@ -60,8 +60,11 @@ def by_numpy(the_scene, table, params):
                     pressure[where] = values[where]
                 now["pressure"] = pressure
             elif key in POSE:
-                number = isinstance(value, float | int) and key in POSE[3:]
-                now[key] = np.deg2rad(value) if number else eval(str(value), {}, names)
+                text = str(value)
+                if key in POSE[3:]:  # numbers are degrees, but for factors
+                    numbers = r"(?<![\w.])(\d+\.?\d*)(?![\d.]*\s*\*)"
+                    text = re.sub(numbers, lambda m: f"np.deg2rad({m[1]})", text)
+                now[key] = eval(text, {"np": np}, names)
         times.append(eval(str(frame["time"]), {}, names))
         rows.append([now[axis] for axis in POSE] + [*now["pressure"]])
         held.append(frame.get("interpolation") == "held")

@@ -287,7 +287,7 @@ MOST_LINES = {
     "codesign_jax/runs": 3_340,
     "codesign_jax/scene": 5_400,
     "scripts": 5_500,
-    "tests": 26_350,
+    "tests": 26_450,
 }
 
 

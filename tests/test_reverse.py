@@ -348,6 +348,7 @@ SCENES = {
     "mesh and hull": {"effects__surface": "hull"},
     "three fingers": {"effects__finger_finger": True, "effects__friction_memory": True},
     "capsule": {},
+    "fixtures": {"effects__surface": "hull"},
     "tapered": {
         "effects__surface": "hull",
         "effects__finger_finger": True,
@@ -355,6 +356,22 @@ SCENES = {
         "effects__neo_hookean": True,
     },
 }
+
+
+FIXTURES = """
+[[fixture]]
+name = "slope"
+type = "plane"
+position = [0.0, 0.03, 0.0]
+orientation = [70, 0, 0]
+
+[[fixture]]
+name = "block"
+type = "box"
+position = [0.06, 0.0, 0.03]
+size = [0.03, 0.1, 0.03]
+orientation = [0, 10, 0]
+"""
 
 
 def mixed(folder):
@@ -389,6 +406,12 @@ def test_derivatives_of_scenes(name, tmp_path):
     with jax.enable_x64(True):
         if name.startswith("mesh"):
             the_scene = loaded(DATA / "pinch.toml", mixed(tmp_path), settings)
+        elif name == "fixtures":
+            text = scene.library.available("scenes")["paper_spheres"].read_text() + FIXTURES
+            (tmp_path / "fixtures.toml").write_text(text)
+            overrides = {"discretization.links": 2, "effects.surface": "hull"}
+            where = {"hand_name": DATA / "pinch.toml", "object_set": DATA / "box.toml"}
+            the_scene = scene.load(tmp_path / "fixtures.toml", **where, overrides=overrides)
         elif name in ("three fingers", "tapered"):
             hand = "tripod3" if name == "three fingers" else DATA / "tapered.toml"
             the_scene = loaded(hand, DATA / "sphere.toml", settings)

@@ -15,7 +15,7 @@ from jax.experimental import pallas as pl
 
 from codesign_jax import reuse
 from codesign_jax.compiler.launch import Kernel, launch
-from codesign_jax.engines.structured.kernel.bars import STEP, Bars
+from codesign_jax.engines.structured.kernel.bars import Bars, of_step
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
 from codesign_jax.engines.structured.kernel.pairs import PairSet
 from codesign_jax.engines.structured.kernel.powers import Place
@@ -23,7 +23,6 @@ from codesign_jax.engines.structured.kernel.program import Program, block_spec
 from codesign_jax.engines.structured.kernel.reverse import ReverseStep, Shown
 from codesign_jax.engines.structured.kernel.sweep import SHAPES
 from codesign_jax.engines.structured.lanewise import lanes, of_code
-from codesign_jax.scene.schema import InputError
 
 
 class Path(NamedTuple):
@@ -75,8 +74,6 @@ class AdjointProgram(Program):
     def __init__(self, *args: Any, **how: Any):
         """As `Program`, a lane a finger."""
         super().__init__(*args, **{**how, "team": 1})
-        if self.scene.fixture:
-            raise InputError(["a scene with fixtures has no derivative in engine structured"])
 
     remembers = ("owner", "ring")
 
@@ -87,7 +84,7 @@ class AdjointProgram(Program):
         more |= {"acc_bar": (n, (a,)), "virtual": (n, (a,))}
         if self.held:
             more |= {"grip_bar": (self.held, (4,))}
-        more |= {f"bar.{k}": (1, shape) for k, shape in STEP.items()}
+        more |= {f"bar.{k}": (1, shape) for k, shape in of_step(self.scene).items()}
         if any(isinstance(s, PairSet) for s in self.sets):
             more |= {f"pairbar.{k}": (n + 1, getattr(SHAPES, k)) for k in Place._fields}
         if self.scene.effects.finger_palm:

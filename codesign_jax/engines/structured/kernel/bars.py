@@ -9,12 +9,18 @@ from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import Block
 from codesign_jax.engines.structured.kernel.pull import only_on, plus
 from codesign_jax.engines.structured.lanewise import Lanes, lanes
+from codesign_jax.scene import Scene
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram
 
 STEP = {"columns": (3, 3), "object_vel": (6,), "height": (), "pressure": ()}
 """What several parts of a step add to, beside constants: names and shapes."""
+
+
+def of_step(scene: Scene) -> dict[str, tuple[int, ...]]:
+    """`STEP`, with the object's place where fixtures are touched."""
+    return STEP | ({"position": (3,)} if scene.fixture else {})
 
 
 class Bars:
@@ -32,10 +38,11 @@ class Bars:
         self.p, self.block, self.scratch = program, block, scratch
         self.hand, self.world, self.finger_state, self.world_state = refs
         self.like = jnp.zeros((program.size,), scratch.dtype)
+        self.names = of_step(program.scene)
 
     def begin(self) -> None:
         """Sets to zero what belongs to one step."""
-        for name, shape in STEP.items():
+        for name, shape in self.names.items():
             self.p.scratch.write(self.scratch, f"bar.{name}", zeros(shape, self.like))
 
     def of_step(self, name: str) -> Lanes:
@@ -70,7 +77,7 @@ class Bars:
             table.write(ref, name, plus(table.read(ref, name, i), value), i)
 
     def _place(self, name: str) -> tuple:
-        if name in STEP:
+        if name in self.names:
             return self.p.scratch, self.scratch, f"bar.{name}"
         if name in self.p.hand.groups:
             return self.p.hand, self.hand, name

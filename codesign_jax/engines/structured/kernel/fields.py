@@ -194,11 +194,14 @@ def ring_centres(origin, frame, numbers):
 
 def joined(places: list[Place]) -> Place:
     """Contacts with several fields, one behind the other."""
+    return places[0] if len(places) == 1 else lanewise(lambda *p: beside(list(p)), *places)
+
+
+def beside(places: list[Place]) -> Place:
+    """The same of arrays."""
     if len(places) == 1:
         return places[0]
-    return lanewise(
-        lambda *p: Place(*(jnp.concatenate(v, 1) for v in zip(*p, strict=True))), *places
-    )
+    return Place(*(jnp.concatenate(v, 1) for v in zip(*places, strict=True)))
 
 
 def slots_of(point, normal, gap):

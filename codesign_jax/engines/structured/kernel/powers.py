@@ -6,6 +6,8 @@ and object.  Here is what each of them adds, as a function of one link or of the
 item, over arrays as in `lanewise`, made of the functions that the forward pass calls.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +18,7 @@ from codesign_jax.engines.structured.kernel.contact_sets import ContactSet, cone
 from codesign_jax.engines.structured.kernel.problem import make_body
 from codesign_jax.engines.structured.kernel.step import link_forces, palm_and_object
 from codesign_jax.engines.structured.lanes import dot, sum_axis
-from codesign_jax.engines.structured.laws import contact, holding, shapes
+from codesign_jax.engines.structured.laws import contact, holding, shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import which_cone
 from codesign_jax.engines.structured.laws.contact import Contacts
 from codesign_jax.engines.structured.linear.tree import next_motion, palm_motion
@@ -61,14 +63,19 @@ def of_contacts(contacts: Contacts, vel: jax.Array, motion: jax.Array, along: ja
     return sum_axis(dot(force, contacts.relative(along)), 0)
 
 
-def field(scene: Scene, name: str, point, at: dict, still: dict, values: Any = None):
-    """Distance of points of the hand from object or table, and its gradient, world axes."""
-    if not name.endswith("_object"):
-        return shapes.table_distance(at["height"], point)
+def look(scene: Scene, point, at: dict, still: dict, values: Any = None):
+    """Distance of points of the hand from the object, and its gradient, world axes."""
     local = shapes.in_object(at["columns"], point)
     still = still if values is None else still | {"values": values}
     distance, gradient = objects.distance_of(scene, local, at, still)
     return distance, apply_columns(at["columns"], gradient)
+
+
+def around(scene: Scene, at: dict) -> list[Callable]:
+    """Distance fields of table and fixtures: from points to distances and their gradients."""
+    if not scene.fixture:
+        return [partial(shapes.table_distance, at["height"])]
+    return [partial(field, at["position"]) for field in surroundings.fields(scene)]
 
 
 def of_rings(scene: Scene, name: str, place: Place, numbers, at: dict, still: dict) -> jax.Array:
@@ -83,16 +90,21 @@ def of_rings(scene: Scene, name: str, place: Place, numbers, at: dict, still: di
       still: What has no derivative here: accelerations, indices and values of grids, and "share" of
         the contacts, which tells which are candidates.
     """
-    centre = fields.ring_centres(place.origin, place.frame, numbers)
-    first = field(scene, name, centre, at, still, still.get("values"))
-    if scene.effects.surface == "spheres":
-        found = fields.balls_on_field(numbers, centre, *first)
-    else:
+    centre, places = fields.ring_centres(place.origin, place.frame, numbers), []
+    on_object = name.endswith("_object")
+    looks = around(scene, at) if not on_object else [partial(look, scene, at=at, still=still)]
+    for n, one in enumerate(looks):
+        values = [{"values": still.get(k)} if on_object else {} for k in ("values", "values_again")]
+        first = one(centre, **values[0])
+        if scene.effects.surface == "spheres":
+            places.append(fields.balls_on_field(numbers, centre, *first))
+            continue
         offset, again = jnp.zeros_like(centre), first
-        if name.endswith("_object"):
+        if on_object or n >= scene.effects.table:  # the table is a plane
             offset = fields.aimed(numbers, place.frame, *first)
-            again = field(scene, name, centre + offset, at, still, still.get("values_again"))
-        found = fields.rings_on_field(numbers, place.frame, centre, offset, *again)
+            again = one(centre + offset, **values[1])
+        places.append(fields.rings_on_field(numbers, place.frame, centre, offset, *again))
+    found = fields.beside(places)
     found = found._replace(share=jnp.where(still["share"] > 0, found.share, 0.0))
     contacts = ContactSet.contacts(found, _cone(scene, name, at))
     moves = _from_object(name, place[2:], at, still)
@@ -102,7 +114,7 @@ def of_rings(scene: Scene, name: str, place: Place, numbers, at: dict, still: di
 def aim(scene: Scene, name: str, place: Place, numbers, at: dict, still: dict) -> jax.Array:
     """Where rings look at a field once more, shape (3, k, ...)."""
     centre = fields.ring_centres(place.origin, place.frame, numbers)
-    first = field(scene, name, centre, at, still, still.get("values"))
+    first = look(scene, centre, at, still, still.get("values"))
     return centre + fields.aimed(numbers, place.frame, *first)
 
 
@@ -117,20 +129,42 @@ def of_table(scene: Scene, fingers: int, item: int, at: dict, finger, still: dic
       finger: Number of each lane's finger.
       still: As in `of_spheres`, with the motions of the object.
     """
-    arms = objects.points_of(scene, at, still)
-    places = shapes.on_table(arms, at["height"])
-    dealt = []
+    places, dealt = _of_object(scene, at, still), []
+    slots = surroundings.slots(scene)
     for place in places:
         lane = jnp.zeros_like(place[..., 0, None, :]) + 0 * finger
-        for k in range(item * fingers, min((item + 1) * fingers, 4)):
+        for k in range(item * fingers, min((item + 1) * fingers, slots)):
             lane = jnp.where(finger == k - item * fingers, place[..., k, None, :], lane)
         dealt.append(lane)
     point, normal, gap = dealt
-    used = (finger < 4 - item * fingers) & (still["share"][0, 0] > 0)
+    used = (finger < slots - item * fingers) & (still["share"][0, 0] > 0)
     cone = _cone(scene, TABLE, at).of_share(jnp.where(used, 1.0, 0.0)[None])
     contacts = Contacts(point[:, None], normal[:, None], gap[None], cone)
     moves = at["object_vel"], still["object_motion"], still["object_along"]
     return of_contacts(contacts, *(m[:, None] for m in moves))
+
+
+def _of_object(scene: Scene, at: dict, still: dict) -> tuple:
+    """Point, normal (3, slot, world) and gap of the object on table and fixtures."""
+    found = []
+    if scene.effects.table:
+        found.append(shapes.on_table(objects.points_of(scene, at, still), at["height"]))
+    flat = any(shape.type not in surroundings.ROUND for shape in scene.objects.object)
+    for j, fixture in enumerate(scene.fixture):
+        position = at["position"]
+        _, rows = surroundings.towards(fixture, position)
+        turned = at | {"columns": surroundings.faced(rows, at["columns"])}
+        own = still | {"support": still[f"support_{j}"]} if "meshed" in still else still
+        arms = objects.points_of(scene, turned, own)
+        found.append(surroundings.object_on(fixture, position, rows[:, :, 0], arms))
+        if flat and surroundings.EDGES[fixture.type]:
+            point = surroundings.edges(fixture, position)
+            seen = look(scene, point, at, still, still.get(f"values_{j}"))
+            edge = surroundings.edge_on(point, *seen)
+            found.append(tuple(v[..., 0, :] for v in edge))
+    if len(found) == 1:
+        return found[0]
+    return tuple(jnp.concatenate(v, -2) for v in zip(*found, strict=True))
 
 
 TABLE = "object_table"

@@ -137,7 +137,7 @@ class ReverseStep(Step):
         p, (now, virtual, wrist_bar) = self.p, accelerations
         still = {"acc_wrist": now.wrist, "acc_object": now.object_motion}
         still |= {"virtual_wrist": virtual.wrist, "object_along": virtual.object_motion}
-        own = {n: self.bars.of_step(n) for n in ("columns", "object_vel", "height")}
+        own = {n: self.bars.of_step(n) for n in self.bars.names if n != "pressure"}
         base, own = self.block.sum((base, own))
         one = lanes([self.like + 1.0], (), wide=False)
         given = {n: state[n] for n in MOVED}, arm, self.palm_constants()
@@ -147,6 +147,8 @@ class ReverseStep(Step):
         bars = base, own["columns"], own["object_vel"], height, acc, one
         found, arm_bar, constant_bars = pull(run, given, (still,), bars)
         self.bars.add_once(constant_bars)
+        if p.scene.fixture:
+            found["position"] = plus(found["position"], own["position"])
         for name, value in plus(found, before).items():
             p.world_state.write(self.bars.world_state, name, value, 0, self.block.world)
         any_of(shown.speed != 0, lambda: speed.add(self, state, shown.speed))

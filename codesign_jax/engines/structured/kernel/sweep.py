@@ -17,7 +17,7 @@ from codesign_jax.engines.structured.kernel.problem import Iterate, Memory
 from codesign_jax.engines.structured.kernel.pull import plus, pull
 from codesign_jax.engines.structured.kernel.step import FINGER_CONSTANTS, LINK_CONSTANTS
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.laws import shapes
+from codesign_jax.engines.structured.laws import shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import which_cone
 from codesign_jax.engines.structured.laws.kinematics import mounted
 from codesign_jax.engines.structured.world_model import apply_columns
@@ -58,6 +58,8 @@ class Sweep:
         self.one = lanes([self.like + 1.0], (), wide=True)
         self.object = {"columns": at["columns"], "object_vel": at["object_vel"]}
         self.object |= {"height": state["position"][2]}
+        if self.p.scene.fixture:
+            self.object |= {"position": state["position"]}
         names = ("object_size", "grid_origin", "grid_cell", "grid_factor")
         self.object |= {n: step.constant(n) for n in names if n in step.p.world.groups}
         self.still: dict[str, Any] = {"object_id": step.constant("object_id")}
@@ -196,9 +198,17 @@ class Sweep:
         finger = lanes([self.block.finger.astype(self.like.dtype)], (), wide=True)
         at, still = self._object(powers.TABLE), self.still
         if "meshed" in still:
-            factor, columns = self.object["grid_factor"], self.at["columns"]
-            points = objects.table_points(p.scene, self.thing, columns, self.object["height"])
-            still = still | {"factor": factor, "support": lanewise(_turned_back, columns, points)}
+            columns = self.at["columns"]
+            still = still | {"factor": self.object["grid_factor"]}
+            still |= {"support": self._support(columns, self.object["height"])}
+            for j, fixture in enumerate(p.scene.fixture):
+                position = self.object["position"]
+                gap, rows = lanewise(partial(surroundings.towards, fixture), position)
+                turned = lanewise(surroundings.faced, rows, columns)
+                still |= {f"support_{j}": self._support(turned, gap)}
+                if surroundings.EDGES[fixture.type]:
+                    point = lanewise(partial(surroundings.edges, fixture), position)
+                    still |= {f"values_{j}": self._values(point)}
         for i in range(contacts.set.count):
 
             def compute(i: int = i) -> None:
@@ -212,13 +222,19 @@ class Sweep:
     def _object(self, name: str) -> dict[str, Lanes]:
         """What contacts of a pair of bodies depend on beside the hand, by name."""
         cone = f"cone.{which_cone(name)}"
-        names = {"height"}
+        surrounded = bool(self.p.scene.fixture)
+        names = {"height", "position"} if surrounded else {"height"}
         if not name.endswith("_table"):
-            names = set(self.object) - {"height"}
+            names = set(self.object) - names
         if name == powers.TABLE:
-            names = set(self.object) - {"grid_origin", "grid_cell"}
+            names = set(self.object) - (set() if surrounded else {"grid_origin", "grid_cell"})
         chosen = {n: v for n, v in self.object.items() if n in names}
         return chosen | {cone: self.step.constant(cone)}
+
+    def _support(self, columns: Lanes, height: Lanes) -> Lanes:
+        """Points that may touch a table of these axes, in the object's frame."""
+        points = objects.table_points(self.p.scene, self.thing, columns, height)
+        return lanewise(_turned_back, columns, points)
 
     def _values(self, centre: Lanes) -> Lanes:
         local = lanewise(shapes.in_object, self.at["columns"], centre)

@@ -347,8 +347,8 @@ def observe(
 
 def _forces(scene: Scene, hand: WorldModel, state: State) -> Forces:
     """Contact forces of the steps that led to states."""
-    state = jax.lax.stop_gradient(state)
     found = forces(scene, hand, before(state, scene.discretization.timestep), state.acc)
+    found = jax.lax.stop_gradient(found)  # accelerations of a rollout have no derivative
     moved = (state.step[0, 0] > 0) & (state.going[0, 0] > 0)
 
     def kept(v: jax.Array) -> jax.Array:

@@ -35,7 +35,11 @@ def loop(scene, step, **attributes):
     return policy.ControlLoop(make_engine("structured", scene), named)
 
 
-@pytest.fixture(scope="module", params=[False, True], ids=["ideal", "supply"])
+# Slow is what a supply leaves out; quick: the same with one.
+IDEAL = pytest.param(False, id="ideal", marks=pytest.mark.slow)
+
+
+@pytest.fixture(scope="module", params=[IDEAL, pytest.param(True, id="supply")])
 def worlds(request):
     """A short scene, with an ideal air supply or a real one, and four random worlds."""
     effects = dataclasses.replace(
@@ -175,10 +179,10 @@ def test_the_page_s_policy_and_environment_do_what_they_say(monkeypatch):
     engine = policy.ControlLoop(make_engine("structured", scene), firmer)
     params, trials = grasps.random_worlds(scene, 3, 4)
     plan = rollout.prepare(scene, params, trials, scene.constants(), engine)[1]
-    found = {}
+    found, run = {}, jax.jit(partial(rollout.simulate, scene, engine))
     for gain in (0.0, 50.0):
         control = {"gain": jnp.full(4, gain)}
-        trace = simulate(scene, engine, params._replace(control=control), trials)[1]
+        trace = run(params._replace(control=control), trials)[1]
         found[gain] = np.asarray(trace.ctrl)[..., 6:] / np.maximum(plan.pressure, 1.0)
     closed = round(scene.phases.inflate / scene.discretization.timestep)
     np.testing.assert_allclose(found[0.0][:, 1 + closed :], 1.0, rtol=1e-5)

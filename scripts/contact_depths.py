@@ -95,6 +95,8 @@ def in_tube(rings: np.ndarray, solid: Tube, own: tuple[np.ndarray, float] | None
       own: Of the finger's own rings their places along it, and from which distance on they count.
     """
     found, last = np.zeros(len(rings)), len(solid.along) - 1
+    if not rings.size:
+        return found  # a ball has no edges
     reach = np.linalg.norm(solid.half[1:]) + solid.along[1]
     wide = np.linalg.norm(rings - rings[:, :, -1:], axis=-1).max()
     gap = rings[:, :, -1, None].astype(np.float32) - solid.centre[:, None].astype(np.float32)

@@ -25,6 +25,7 @@ from codesign_jax import Task, codesign, files, rollout, runs
 from codesign_jax.codesign import VERDICTS
 from codesign_jax.commands import common
 from codesign_jax.engines import Engine
+from codesign_jax.engines.base import recording, tells_forces
 from codesign_jax.model import morphology, overlap
 from codesign_jax.report import animation, bodies, stress, verdicts, viewer
 from codesign_jax.runs import choice
@@ -77,6 +78,7 @@ class Bench:
         """Takes scene, space and what simulates them."""
         self.case = found
         self.engine = found.make_engine()
+        self.recorder = recording(self.engine) if tells_forces(self.engine) else self.engine
         self.objects = len(found.scene.objects.object)
 
     @functools.cached_property
@@ -100,7 +102,9 @@ class Bench:
         if view.noise is not None:
             trial = jax.tree.map(lambda v: v[view.noise], self.trials)
         trials = jax.tree.map(lambda v: jnp.asarray(v)[None], trial)
-        return animation.replay(self.case.scene, self.engine, self.params(view.design), trials)[0]
+        # Forces take as long as the grasp: they wait until the sliders rest.
+        engine = self.recorder if view.resting else self.engine
+        return animation.replay(self.case.scene, engine, self.params(view.design), trials)[0]
 
     def outcomes(self, design: np.ndarray, first: int) -> Outcome:
         """Outcomes of the next `BATCH` trials, arrays of shape (trial,)."""
@@ -109,8 +113,9 @@ class Bench:
         return jax.tree.map(np.asarray, found)
 
     def warm(self, design: np.ndarray) -> None:
-        """Compiles the two programs that a moved slider needs."""
-        self.grasp(View(design, "", 0, None, 0, False, None))
+        """Compiles the programs that a moved slider needs."""
+        for resting in (False, True):
+            self.grasp(View(design, "", 0, None, 0, resting, None))
         self.outcomes(design, 0)
 
 
@@ -426,6 +431,9 @@ def _told(shown: Shown) -> dict[str, Any]:
         name: np.round(1e3 * np.asarray(getattr(grasp.trace, name))[::step], 1).tolist()
         for name in ("distance", "height")
     }
+    forces = grasp.trace and grasp.trace.forces
+    if forces:
+        series["grip"] = np.round(np.asarray(forces.grip)[::step].T, 2).tolist()
     caps = np.asarray(morphology.pressure_limits(scene.hand, grasp.params))
     limits: list[float | None] = []
     for name, scale in zip(space.names, space.scale, strict=True):

@@ -16,7 +16,7 @@ function startStudio(root) {
     return element;
   };
   const socket = new WebSocket(`ws://${location.host}/socket`);
-  let about, grasp, asked = 0, rows = [], tried = [], cursor = null;
+  let about, grasp, asked = 0, rows = [], tried = [];
   const send = (message) => socket.send(JSON.stringify(message));
 
   // ---- what is asked for
@@ -86,26 +86,37 @@ function startStudio(root) {
     find(name).replaceChildren(...parts);
   };
   const right = (name) => find(name).clientWidth - 4;
-  const across = (time) => left + (right("distance") - left) * time / stage.replay.end();
+  const across = (name, time) => left + (right(name) - left) * time / stage.replay.end();
   const level = (name, y, text) => [svg("line", { x1: left, x2: right(name), y1: y, y2: y, stroke: "#e4e9ef" }),
     svg("text", { x: left - 6, y: y + 4, "text-anchor": "end" }, text)];
-  function plotGrasp() {
-    if (!stage.replay) return;  // no WebGL
-    const { distance, height, lost } = grasp.series, top = Math.max(250, ...distance, ...height);
-    const up = (value) => bottom - 86 * Math.max(value, 0) / top, parts = [];
-    const line = (values, color) => svg("polyline", { fill: "none", stroke: color, "stroke-width": 1.6,
-      points: values.map((v, k) => `${across(k / grasp.replay.rate).toFixed(1)},${up(v).toFixed(1)}`).join(" ") });
-    const step = top > 600 ? 500 : 100;
-    for (let v = 0; v <= top; v += step) parts.push(...level("distance", up(v), v));
+  // Lines over the time of the grasp, [values, colour] each, with its phases and a cursor.
+  function plotLines(name, lines, least, dashed = null) {
+    const top = Math.max(least, ...lines.flatMap(([values]) => values)), parts = [];
+    const up = (value) => bottom - 86 * Math.max(value, 0) / top;
+    const step = [1, 2, 5, 10, 20, 50, 100, 200, 500].find((v) => top / v <= 4) || 1000;
+    for (let v = 0; v <= top; v += step) parts.push(...level(name, up(v), v));
     let from = 0;
-    for (const [name, end] of grasp.replay.phases) {
-      parts.push(svg("line", { x1: across(end), x2: across(end), y1: 6, y2: bottom, stroke: "#d7dde4" }),
-        svg("text", { x: across((from + end) / 2), y: 106, "text-anchor": "middle" }, name));
+    for (const [phase, end] of grasp.replay.phases) {
+      parts.push(svg("line", { x1: across(name, end), x2: across(name, end), y1: 6, y2: bottom, stroke: "#d7dde4" }),
+        svg("text", { x: across(name, (from + end) / 2), y: 106, "text-anchor": "middle" }, phase));
       from = end;
     }
-    parts.push(svg("line", { x1: left, x2: right("distance"), y1: up(lost), y2: up(lost), stroke: "#cf4b3f", "stroke-dasharray": "4 3" }));
-    cursor = svg("line", { x1: left, x2: left, y1: 6, y2: bottom, stroke: "#1d2733" });
-    drawn("distance", ...parts, line(height, "#c96a10"), line(distance, "#2f6fab"), cursor);
+    if (dashed !== null) parts.push(svg("line", { x1: left, x2: right(name), y1: up(dashed), y2: up(dashed), stroke: "#cf4b3f", "stroke-dasharray": "4 3" }));
+    for (const [values, stroke] of lines)
+      parts.push(svg("polyline", { fill: "none", stroke, "stroke-width": 1.6,
+        points: values.map((v, k) => `${across(name, k / grasp.replay.rate).toFixed(1)},${up(v).toFixed(1)}`).join(" ") }));
+    drawn(name, ...parts, svg("line", { class: "cursor", x1: left, x2: left, y1: 6, y2: bottom, stroke: "#1d2733" }));
+  }
+  const colors = ["#2f6fab", "#c96a10", "#3d9a5f", "#8a63b3", "#cf4b3f", "#5a6776", "#b59f00", "#00909e"];
+  function plotGrasp() {
+    if (!stage.replay) return;  // no WebGL
+    const { distance, height, lost, grip } = grasp.series;
+    if (grip) find("gripping").hidden = false;  // before the widths of the others are asked for
+    plotLines("distance", [[height, "#c96a10"], [distance, "#2f6fab"]], 250, lost);
+    find("grip").style.opacity = grip ? 1 : 0.3;  // of the grasp before, while a slider moves
+    if (!grip) return;
+    plotLines("grip", grip.map((values, f) => [values, colors[f % colors.length]]), 2);
+    find("fingers").replaceChildren(...grip.map((_, f) => make("span", { textContent: ` ${f}`, style: `color: ${colors[f % colors.length]}` })));
   }
   function plotTried() {
     const last = tried.slice(-40), up = (cost) => bottom - 82 * Math.min(cost / about.worst, 1);
@@ -121,8 +132,9 @@ function startStudio(root) {
   }
   new ResizeObserver(() => { if (grasp) { plotGrasp(); plotTried(); } }).observe(find("charts"));
   stage.addEventListener("time", (event) => {
-    if (!cursor) return;
-    for (const end of ["x1", "x2"]) cursor.setAttribute(end, across(event.detail));
+    for (const name of ["distance", "grip"])
+      for (const cursor of find(name).querySelectorAll(".cursor"))
+        for (const end of ["x1", "x2"]) cursor.setAttribute(end, across(name, event.detail));
   });
 
   // ---- what comes

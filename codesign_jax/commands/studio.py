@@ -23,6 +23,7 @@ from codesign_jax.commands import common, server
 from codesign_jax.commands.tab import COUNTS, Desk, Tab
 from codesign_jax.report import viewer
 from codesign_jax.runs import choice, tables
+from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.schema import InputError
 
@@ -46,7 +47,7 @@ def main(options: "Options") -> int:
 def serve(desk: Desk, console: Console) -> None:
     """Compiles what a moved slider needs, and serves the studio until Ctrl-C."""
     with Busy(console, "compiling the simulation"):
-        desk.bench("").warm(desk.case.design)
+        interruptible(desk.bench("").warm, desk.case.design)
     options, studio = desk.options, Studio(desk)
     listening, address = studio.listen(options.host, options.port)
     if options.host not in LOCAL:

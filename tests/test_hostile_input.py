@@ -282,7 +282,7 @@ def test_hands_that_reach_beyond_the_distances_are_refused(tmp_path):
     params = space.params(space.default())
     params = params._replace(height=params.height * 0 + 0.09)
     trial = rollout.nominal_trial(usual)
-    one = [type(p)(*(np.asarray(v)[None] for v in p)) for p in (params, trial)]
+    one = jax.tree.map(lambda v: np.asarray(v)[None], (params, trial))
     engine = engines.make_engine("structured", usual)
     (problem,) = refusals(rollout.simulate, usual, engine, *one)
     assert "radius 45 mm" in problem

@@ -37,6 +37,7 @@ from codesign_jax.engines.structured.world_model import WorldModel, world_consta
 from codesign_jax.model import ModelFields
 from codesign_jax.model.layout import WRIST, layout
 from codesign_jax.scene import Scene, key_frames
+from codesign_jax.scene.hand import highest_pressure
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Forces, Params, Trace, Trial
 
@@ -391,8 +392,9 @@ def spread(scene: Scene, command: Command, plan: Plan, *, of: str) -> Command:
     if problems:
         raise InputError(problems)
     # The upper end is the limit of the wall, or the design's own pressure where that is higher.
-    top = jax.vmap(scene.hand.pressure_limit.of)(plan.params.height, plan.params.wall)
-    top = jnp.maximum(top, plan.params.pressure)[:, None]
+    p = plan.params
+    top = jax.vmap(partial(highest_pressure, scene.hand))(p.height, p.wall, p.tip)
+    top = jnp.maximum(top, p.pressure)[:, None]
     # Comparisons let what is no number pass, and have the derivative of what is at an end.
     pose, pressure = found
     pressure = jnp.where(pressure < 0, 0.0, pressure)

@@ -112,7 +112,6 @@ def for_types(name, other):
 KERNEL = "engines.structured.kernel."
 GIVEN = {
     "compiler.rules": ["compiler.writer"],
-    "compiler.trigonometry": ["compiler.writer"],
     "engines.structured.forces": ["engines.structured.engine"],
     "engines.structured.segments": ["engines.structured.engine"],
     "engines.structured.transforms": ["engines.structured.engine"],

@@ -11,11 +11,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import model, policy, rollout
+from codesign_jax import control, model, policy, rollout
+from codesign_jax import scene as scenes
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured.world_model import world_constants
+from codesign_jax.model import morphology
 from codesign_jax.model.layout import layout
+from codesign_jax.scene import parameters
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Status
 from tests.helpers import grasps
@@ -148,6 +151,18 @@ def test_pressures_stay_within_what_the_walls_stand():
     top = np.maximum(limit, params.pressure)[:, None, 0]
     np.testing.assert_allclose(ctrl[..., 6], np.broadcast_to(top, ctrl.shape[:2]), rtol=1e-6)
     assert (ctrl[..., 7] == 0).all()
+    # The tip of a tapered finger stands less than its base.
+    tapered = scenes.load("paper", hand_name="tapered4")
+    space = parameters.design_space(tapered.hand, "full")
+    one = jax.tree.map(lambda v: jnp.asarray(v)[None], space.params(space.default()))
+    thin = one._replace(tip=one.tip._replace(wall=0.5 * one.wall), pressure=0.0 * one.pressure)
+    none = jnp.zeros((1, 2, 6)), jnp.full((1, 2, tapered.num_fingers), 1e9)
+    plan = control.Plan(*[None] * len(control.Plan._fields))._replace(
+        pose=none[0], pressure=none[1], params=thin
+    )
+    found = policy.spread(tapered, policy.Command(*none), plan, of="policy").pressure
+    want = morphology.pressure_limits(tapered.hand, thin)[:, None]
+    np.testing.assert_allclose(found, np.broadcast_to(want, found.shape), rtol=1e-6)
 
 
 def no_number(carry, seen):

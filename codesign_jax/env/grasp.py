@@ -14,6 +14,7 @@ from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.model import ModelFields
 from codesign_jax.policy import Command, Observation, World
 from codesign_jax.scene import Scene
+from codesign_jax.scene.hand import highest_pressure
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import Params, Trace, Trial
 
@@ -147,7 +148,8 @@ class GraspEnv:
     @property
     def limit(self) -> jax.Array:
         """Pressures that the fingers' walls stand [Pa], shape (finger,)."""
-        return self.scene.hand.pressure_limit.of(self.params.height, self.params.wall)
+        p = self.params
+        return highest_pressure(self.scene.hand, p.height, p.wall, p.tip)
 
     @property
     def action_size(self) -> int:

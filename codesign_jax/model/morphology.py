@@ -79,17 +79,16 @@ def finger_beams(hand: Hand, params: Params, links: int) -> Beam:
     N is 1 where they are the same all along.
     """
     material, own = hand.material, sections(hand, params, at_joints(links))
-    found = beam(
-        own.height,
-        own.wall,
-        width=own.width,
-        shear_modulus=material.shear_modulus,
-        density=material.density,
-    )
+    found = _beam(hand, own)
     return found._replace(
         lateral=material.lateral_factor * found.lateral,
         torsion=material.torsion_factor * found.torsion,
     )
+
+
+def _beam(hand: Hand, own: Section) -> Beam:
+    modulus, density = hand.material.shear_modulus, hand.material.density
+    return beam(own.height, own.wall, width=own.width, shear_modulus=modulus, density=density)
 
 
 def free_bends(hand: Hand, params: Params) -> np.ndarray:
@@ -147,15 +146,8 @@ def _contents(hand: Hand, params: Params, start: np.ndarray, span: np.ndarray) -
     """Mean mass per length of bodies, and their centres along, as a share, and up [m]."""
 
     def at(places: np.ndarray) -> tuple[Any, Any]:
-        own, material = sections(hand, params, places), hand.material
-        density = beam(
-            own.height,
-            own.wall,
-            width=own.width,
-            shear_modulus=material.shear_modulus,
-            density=material.density,
-        ).line_density
-        return density, own.height / 2
+        own = sections(hand, params, places)
+        return _beam(hand, own).line_density, own.height / 2
 
     if params.tip is None:
         density, up = at(start)

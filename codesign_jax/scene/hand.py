@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from codesign_jax.scene import keypaths, library, schema
+from codesign_jax.scene import keypaths, schema
 from codesign_jax.scene.hand_tables import (
     PARAMETERS,
     TIP,
@@ -59,11 +59,8 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Han
     Raises:
       InputError: with every problem in the file.
     """
-    path = library.find("hands", name)
     problems: list[str] = []
-    table = library.read(path)
-    changes = keypaths.flatten(overrides or {})
-    places = keypaths.apply(table, changes, path.name, problems, root="hand")
+    table, path, places = keypaths.read("hands", name, overrides, problems)
     hand = schema.parse(Hand, table, path.name, problems)
     if hand is not None and not hand.finger:
         problems.append(f"{path.name}.finger must name at least one finger")

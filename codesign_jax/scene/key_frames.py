@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.scene import hand as hands
-from codesign_jax.scene import keypaths, library, schema
+from codesign_jax.scene import keypaths, schema
 from codesign_jax.scene.hand_tables import PARAMETERS, UNITS, Hand, Parameter
 from codesign_jax.scene.schema import choice, quantity
 from codesign_jax.types import Params
@@ -205,11 +205,8 @@ def load(name: str | Path, hand: Hand, *, overrides: Mapping[Any, Any] | None = 
     Raises:
       InputError: With every problem of the file.
     """
-    path = library.find("controls", name)
     problems: list[str] = []
-    table = library.read(path)
-    changes = keypaths.flatten(overrides or {})
-    places = keypaths.apply(table, changes, path.name, problems, root="control")
+    table, path, places = keypaths.read("controls", name, overrides, problems)
     control = _Reader(table, path.name, len(hand.finger), problems).control()
     if problems or control is None:
         raise schema.InputError(keypaths.as_given(problems, places))

@@ -5,6 +5,7 @@ entry of a list is named by its `name` or by its index: `objects.object.sphere.m
 `hand.finger.0.tilt` or `hand.finger[0].tilt`.
 """
 
+import pathlib
 import re
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -14,6 +15,20 @@ from codesign_jax.scene import library, schema
 Path = tuple[str, ...]
 
 _INDEX = re.compile(r"\[(\d+)\]")
+
+
+def read(
+    kind: str, name: str | pathlib.Path, overrides: Mapping[Any, Any] | None, problems: list[str]
+) -> tuple[dict, pathlib.Path, Any]:
+    """Reads a file of hands, objects or controls, with other values in it.
+
+    Returns:
+      Its table, its path, and what `as_given` takes to name the values as they were given.
+    """
+    path = library.find(kind, name)
+    table, changes = library.read(path), flatten(overrides or {})
+    root = kind.removesuffix("s") if kind != "objects" else kind
+    return table, path, apply(table, changes, path.name, problems, root=root)
 
 
 def parse(pairs: Iterable[str]) -> dict[Path, Any]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from codesign_jax.scene import keypaths, library, rigid, schema
+from codesign_jax.scene import keypaths, rigid, schema
 from codesign_jax.scene.primitives import PRIMITIVES, Primitive
 from codesign_jax.scene.schema import choice, quantity
 
@@ -258,11 +258,8 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Obj
     Raises:
       InputError: with every problem in the file and in its meshes.
     """
-    path = library.find("objects", name)
     problems: list[str] = []
-    table = library.read(path)
-    changes = keypaths.flatten(overrides or {})
-    places = keypaths.apply(table, changes, path.name, problems, root="objects")
+    table, path, places = keypaths.read("objects", name, overrides, problems)
     parsed = schema.parse(_ObjectSetFile, table, path.name, problems)
     problems = keypaths.as_given(problems, places)
     if parsed is None:

@@ -1,7 +1,5 @@
 """Depths that `scripts.contact_depths` tells, of poses whose depth is known."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -34,14 +32,6 @@ def test_a_finger_is_as_deep_in_another_one_as_it_was_moved(angle, depth):
             np.testing.assert_allclose(found, [max(depth, 0)], atol=0.05e-3)
 
 
-def test_a_coil_is_in_itself():
-    """A finger wound by 450 degrees: its end lies in its beginning, which a quarter does not."""
-    for bend, deep in ((np.radians(45), True), (np.radians(20), False)):
-        one = tube(dense_skin.finger(0.15, bend=bend))
-        found = contact_depths.in_tube(one.rings, one, (one.place, 0.045))
-        assert (found > 5e-3).all() == deep and (found > 0).all() == deep
-
-
 @pytest.mark.parametrize("kind", ["box", "cylinder"])
 def test_an_edge_of_an_object_is_in_a_finger(kind):
     """An object that stands with an edge in a finger; and a finger in its face."""
@@ -57,10 +47,3 @@ def test_an_edge_of_an_object_is_in_a_finger(kind):
     np.testing.assert_allclose(found, depth, atol=0.1e-3)
     away = one.rings.reshape(1, -1, 3) - [0.055, 0, HEIGHT - depth + size[2]]
     np.testing.assert_allclose(contact_depths.in_object(kind, size, away), depth, atol=1e-6)
-
-
-def test_designs_are_read_from_data_of_experiments_and_of_its_own():
-    data = Path(__file__).parents[1] / "docs/data"
-    for name, count in (("experiments/23d.npz", 30), ("picture_winners.json", 12)):
-        found = contact_depths.designs_of(data / name)
-        assert len(found) == count and all(v.shape == (23,) for v in found)

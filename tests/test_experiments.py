@@ -11,10 +11,7 @@ from rich.console import Console
 
 from codesign_jax import codesign, runs
 from codesign_jax import scene as scenes
-from codesign_jax.batch import Batch
-from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import Outcome
-from scripts.experiments import __main__ as experiments
 from scripts.experiments import fresh, report, simulate
 from scripts.experiments.simulate import PAPER, TOTAL_GRASPS, Landscape, Strategies, write
 from scripts.shared import statistics
@@ -63,98 +60,6 @@ def test_counts_are_the_papers():
     assert (PAPER["2d"].worlds, PAPER["23d"].worlds) == (14_400, 32_400)
 
 
-@pytest.mark.parametrize("name", ["2d", "23d"])
-def test_masks_open_one_domain_and_start_equally_often_in_either(name, monkeypatch):
-    scene = scenes.load("paper")
-    monkeypatch.setattr(runs.loop, "make_engine", lambda name, scene: ToyEngine(scene))
-    space = design_space(scene.hand, "2d" if name == "2d" else "full")
-    plans = simulate.plans(PAPER[name], scene, "structured", Path(), 0)
-    shape = len(PAPER[name].strategies), 30, PAPER[name].episodes, space.num_parameters
-    masks, names = np.array([p.mask for p in plans.values()]).reshape(shape), PAPER[name].strategies
-    assert [p.settings.seed for p in plans.values()] == [*range(30)] * len(names)
-    domain = np.array(space.is_morphology)
-    in_morphology = (masks == domain).all(-1)
-    in_control = (masks == ~domain).all(-1)
-    for s, strategy in enumerate(names[:-1]):
-        assert (in_morphology[s] ^ in_control[s]).all()
-        assert in_morphology[s, :, 0].sum() == in_control[s, :, 0].sum() == 15
-        switches = np.diff(in_morphology[s].astype(int), axis=-1) != 0
-        expected = 0 if strategy == "single" else int(strategy.removeprefix("switch-"))
-        np.testing.assert_array_equal(switches.sum(-1), expected)
-    assert names[-1] == "concurrent" and masks[-1].all()
-
-
-def test_one_program_serves_seeds_episodes_and_tests(toy, finished):
-    assert toy.traced <= 2, "one for the shapes, one to compile"
-
-
-def test_strategies_share_seeds_and_runs_do_not(finished):
-    _, got = finished
-    first = got["cost"][:, :, 0]
-    assert (got["seeds"][0] != got["seeds"][1]).any()
-    assert (got["seed_cost"] > codesign.SEED_COST).all()
-    # A closed length keeps the seed's: run 1 starts in control, so it kept the length throughout.
-    np.testing.assert_array_equal(got["particles"][0, 1, :, 0], got["seeds"][1, 0])
-    np.testing.assert_array_equal(first[0], first[1])  # both open the same domain at first
-
-
-class Killed(BaseException):
-    """What no driver catches."""
-
-
-@pytest.mark.slow  # quick: a killed run goes on (test_resume)
-def test_a_run_that_is_killed_between_checkpoints_repeats_what_came_after(
-    finished, tmp_path, monkeypatch
-):
-    """Every third episode is kept: killed in the fifth, the runs go on after the third."""
-    begin, calls = Batch.begin, []
-
-    def dies(batch, requests):
-        calls.append(len(requests))
-        steps = [int(np.asarray(request.state.episode)) for request in requests]
-        if min(steps) == 4:
-            raise Killed
-        return begin(batch, requests)
-
-    monkeypatch.setattr(Batch, "begin", dies)
-    with pytest.raises(Killed):
-        optimize(tmp_path, every=3)
-    monkeypatch.setattr(Batch, "begin", begin)
-    part = simulate.gather(PLAN, tmp_path, SEED)
-    assert part["cost"].shape[2] == 3 and "test_cost" not in part
-    kept = simulate.of_strategies(PLAN, *tiny()[:2], part)
-    stopped = report.Study(dataclasses.asdict(PLAN), {}, kept)
-    assert stopped.episodes == 3 and not stopped.tested and not stopped.success().any()
-    optimize(tmp_path, every=3)
-    again, whole = simulate.gather(PLAN, tmp_path, SEED), finished[1]
-    assert again.keys() == whole.keys() and len(whole) == 10
-    for name, value in whole.items():
-        np.testing.assert_array_equal(again[name], value, err_msg=name)
-
-
-def test_runs_that_are_no_variants_of_one_are_refused(toy, tmp_path):
-    plans = simulate.plans(PLAN, scenes.load(TINY), "structured", tmp_path, SEED)
-    folder, last = [*plans.items()][-1]
-    plans[folder] = last._replace(settings=dataclasses.replace(last.settings, trials=5))
-    with pytest.raises(ValueError, match="differs from"):
-        runs.optimize(plans, ["test"])
-    assert not any(tmp_path.iterdir())
-    assert simulate.gather(PLAN, tmp_path / "nothing", SEED) is None
-
-
-@pytest.mark.slow  # quick: the command's landscape goes on (test_showing)
-def test_landscape_knows_its_axes(toy):
-    whole = points()
-    scene, space, _ = tiny()
-    kept = simulate.of_landscape(scene, space, whole)
-    ends = space.in_units(np.array([space.low, space.high]))
-    np.testing.assert_allclose(kept["first_axis"][[0, -1]], ends[:, 0], rtol=1e-5)
-    np.testing.assert_allclose(kept["second_axis"][[0, -1]], ends[:, 1], rtol=1e-5)
-    # Toy physics: a grasp with longer fingers lasts longer.
-    change = np.diff(np.where(whole["status"], 0.0, whole["trial_cost"]), axis=0)
-    assert (change <= 0).all() and (change < 0).any()
-
-
 def test_means_by_either_rule():
     scene, *_ = tiny()
     cost = np.array([[0.0, 1.0, 3.0], [3.0, 3.0, 3.0]], np.float32)
@@ -188,12 +93,6 @@ def test_paired_tests():
     assert statistics.wilcoxon(slow, fast, 64) < 1e-3 < statistics.wilcoxon(fast, fast, 64)
     assert statistics.trend(np.arange(4.0)[:, None] + np.zeros((4, 30))) < 1e-3
     assert statistics.trend(np.zeros((4, 30))) == 1.0
-
-
-def test_several_comparisons():
-    # The step-down procedure by hand: 4 * 0.005, 3 * 0.01, 2 * 0.03, and no smaller than that.
-    found = statistics.holm([0.01, 0.04, 0.03, 0.005])
-    np.testing.assert_allclose(found, [0.03, 0.06, 0.06, 0.02])
 
 
 def test_both_readings_of_converged():
@@ -233,6 +132,7 @@ def write_small(finished, folder):
     simulate.write(folder, "landscape", kept, notes)
 
 
+@pytest.mark.slow  # quick: the tables of stored runs are those of the page
 def test_figures_and_page_are_made_from_files_alone(finished, tmp_path):
     write_small(finished, tmp_path)
     page = tmp_path / "page.md"
@@ -256,25 +156,6 @@ def test_the_page_has_the_tables_of_its_data():
     assert text in (ROOT / "docs" / "notes" / "results.md").read_text(encoding="utf-8")
 
 
-def test_what_was_not_run_is_said(tmp_path):
-    text = report.make(tmp_path, tmp_path / "figures")
-    assert text.count("not run") == 3
-    assert report.label("switch-16") == "16"
-
-
-@pytest.mark.slow  # quick: figures and page are made of such files, above
-def test_the_command_writes_what_the_runs_have(toy, finished, tmp_path, monkeypatch):
-    monkeypatch.setitem(simulate.SIZES, "tiny", ({"2d": PLAN}, ()))
-    command = ["scripts.experiments", "2d", "--size", "tiny", "--scene", str(TINY)]
-    command += ["--out", str(tmp_path), "--seed", str(SEED), "--commit", "xyz"]
-    monkeypatch.setattr(sys, "argv", command)
-    assert experiments.main() == 0
-    arrays, notes = report.load(tmp_path, "2d")
-    assert (notes["commit"], notes["grasps"]) == ("xyz", PLAN.grasps)
-    whole = simulate.of_strategies(PLAN, *tiny()[:2], finished[1])
-    assert all(np.array_equal(arrays[name], value) for name, value in whole.items())
-
-
 # --- winners on fresh trials ----------------------------------------------------------------------
 
 
@@ -294,16 +175,6 @@ def experiment(folder, tested=True):
     plan = {"name": "2d", "runs": 2, "particles": 3, "trials": 3, "episodes": 2}
     write(folder, "2d", arrays, {"settings": {"plan": plan}})
     return particles[1] * 1.01
-
-
-def test_the_particle_that_tested_best_is_taken(tmp_path):
-    best = experiment(tmp_path)
-    names, found = fresh.winners(tmp_path, "2d")
-    assert names == ["single", "concurrent"] and found.shape == (2, 2, 2)
-    np.testing.assert_allclose(found, np.broadcast_to(best, (2, 2, 2)), rtol=1e-6)
-    experiment(tmp_path, tested=False)
-    with pytest.raises(FileNotFoundError, match="no 2d with a final test"):
-        fresh.winners(tmp_path, "2d")
 
 
 def test_the_command_simulates_once_and_reports(tmp_path, monkeypatch, capsys):

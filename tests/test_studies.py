@@ -1,26 +1,18 @@
 """Studies: sets of constants and waves, rates and their worlds, searches in lock step."""
 
-import dataclasses
 import json
 import re
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
 
-from codesign_jax import codesign, rollout, scene
-from codesign_jax.codesign import stream_key
-from codesign_jax.cost import particle_cost
-from codesign_jax.engines import make_engine
+from codesign_jax import scene
 from codesign_jax.scene import parameters, schema
-from codesign_jax.types import failed
 from scripts import benchmark, calibration, search
-from scripts.calibration import OPEN, Wave
-from scripts.search import Study, make_case
-from scripts.shared import statistics, work
-from tests.helpers.toy_engine import ToyEngine, tiny
+from scripts.calibration import OPEN
+from scripts.shared import statistics
 
 
 def test_sets_fill_their_ranges_and_every_beginning_does():
@@ -75,52 +67,6 @@ def test_numbers_of_a_set_are_those_of_the_files():
         calibration.numbers(scene.load("paper_spheres"), calibration.values(units))
 
 
-class Sensitive(ToyEngine):
-    """Keeps the object longer the larger impratio is, and fails the worlds of the heaviest set."""
-
-    def rollout(self, fields, ctrl, *, trajectory=False):
-        trace = super().rollout(fields, ctrl, trajectory=trajectory)
-        ratio = fields.constants.contact.friction_ratio
-        time = np.arange(ctrl.shape[1]) * self.scene.discretization.timestep
-        kept = time[None] < 0.4 + 0.1 * jnp.log(ratio)[:, None]
-        heavy = fields.body_mass[:, -1] > 0.12
-        distance = jnp.where(kept, 0.0, trace.distance)
-        speed = jnp.where(heavy[:, None], jnp.nan, trace.speed)
-        return trace._replace(distance=distance, speed=speed)
-
-
-@pytest.mark.slow  # quick: numbers of a batch are those of single worlds (test_constants)
-def test_a_wave_is_one_program_goes_on_and_has_the_costs_of_each_set_alone():
-    the_scene, space, _ = tiny()
-    fingers = tuple(
-        dataclasses.replace(f, radius=None, base=(side * 0.035, 0.0))
-        for f, side in zip(the_scene.hand.finger, (1, -1), strict=True)
-    )
-    hand = dataclasses.replace(the_scene.hand, finger=fingers)
-    the_scene = dataclasses.replace(the_scene, hand=hand)
-    engine, units = Sensitive(the_scene), calibration.space_filling(5, seed=2)
-    wave = Wave(the_scene, engine, space, units, points=4, trials=2, seed=7, chunk=70)
-    said = []
-    costs = wave.costs([], lambda parts: said.append(len(np.concatenate(parts))))
-    assert costs.shape == (5, 4, 4, 2) and engine.traced == 1 and said == [2, 4, 5]
-    again = wave.costs([costs[:4]], lambda parts: None)
-    np.testing.assert_array_equal(again, costs)
-    numbers = calibration.numbers(the_scene, calibration.values(units))
-    one = jax.tree.map(lambda v: np.float32(v[3] if np.ndim(v) else v), numbers)
-    key = stream_key(jax.random.key(7), calibration.STREAM_WAVE, 3)
-    trials = rollout.sample_trials(the_scene, key, 2)
-    params = jax.vmap(space.params)(wave.designs().reshape(-1, 2))
-    alone = Sensitive(the_scene)
-    evaluate = jax.jit(lambda p, t, c: rollout.evaluate(the_scene, alone, p, t, constants=c))
-    outcome = jax.tree.map(np.asarray, evaluate(params, trials, one))
-    expected = np.where(failed(outcome.status), np.nan, outcome.cost).reshape(4, 4, 2)
-    np.testing.assert_allclose(costs[3], expected, atol=1e-6)  # float32 of a cost of 3
-    masses = calibration.values(units)["mass"]
-    # 5 % of noise on the mass: all worlds of the heaviest fail, and not all of the light ones.
-    assert (masses > 150).any() and np.isnan(costs[masses > 150]).all()
-    assert not np.isnan(costs[masses < 90]).all()
-
-
 def wells(ridge=2.6, floor=2.6):
     """Two wells of 12 and 6 cells on a plain; the row between them has the ridge's cost."""
     cost = np.full((12, 12), floor)
@@ -151,22 +97,7 @@ def test_statements_rule_out_what_they_should():
     assert good["two regions"] == bad["two regions"] == pytest.approx(1 / 0.3)
 
 
-def test_both_readings_of_converged():
-    """Below 1 in the second episode, above in the third, and below from the fourth on."""
-    mean = np.array([[2.0, 0.5, 1.5, 0.9, 0.2], [2.0] * 5])
-    np.testing.assert_array_equal(calibration.episodes_to_converge(mean, stays=True), [4, np.inf])
-    np.testing.assert_array_equal(calibration.episodes_to_converge(mean, stays=False), [2, np.inf])
-
-
-def test_the_sets_that_are_left_are_those_of_the_note():
-    assert calibration.left().shape == (44, len(OPEN))
-
-
 # --- rates ----------------------------------------------------------------------------------------
-
-
-LINKS = {"discretization": {"links": 2}}
-LIFTED = LINKS | {"effects": {"disturb": False, "ungrasp": False}}  # half of a grasp's steps
 
 
 @pytest.mark.parametrize("ties", (False, True))
@@ -176,35 +107,6 @@ def test_rank_correlation_equals_its_definition(ties):
     a, b = (np.round(a), np.round(b)) if ties else (a, b)
     x, y = (scipy.stats.rankdata(v) for v in (a, a + b))
     assert statistics.spearman(a, a + b) == pytest.approx(np.corrcoef(x, y)[0, 1], abs=1e-12)
-
-
-def test_rank_correlation_of_constants_is_undefined():
-    assert np.isnan(statistics.spearman([1, 1, 1], [1, 2, 3]))
-
-
-def test_a_small_batch_is_the_start_of_a_large_one():
-    """The same worlds whatever the batch, so that engines and sizes compare."""
-    chosen = scene.load("paper_spheres")
-    few, many = (work.make_worlds(chosen, n) for n in (7, 31))
-    for a, b in zip(jax.tree.leaves(few), jax.tree.leaves(many), strict=True):
-        np.testing.assert_array_equal(a, b[:7])
-
-
-@pytest.mark.parametrize("change", ({"overrides": LINKS}, {"hand_name": "tripod3"}))
-def test_other_hands_have_good_designs(change):
-    """Every second design is a good one of that hand, the first of them the middle itself."""
-    chosen = scene.load("paper_spheres", **change)
-    worlds = work.make_worlds(chosen, 12)
-    assert worlds.params.length.shape == (12, chosen.num_fingers)
-    np.testing.assert_allclose(worlds.params.length[6:], work.GOOD["length"][0] * 1e-3, rtol=1e-6)
-
-
-def test_a_micrometre_moves_the_objects_and_nothing_else():
-    worlds = work.make_worlds(scene.load("paper_spheres", overrides=LINKS), 60)
-    moved = work.nudged(worlds.trials)
-    difference = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - b).max(), moved, worlds.trials)
-    assert float(difference.position) == pytest.approx(1e-6, rel=0.02)  # float32 of centimetres
-    assert not any(np.any(d) for d in difference._replace(position=0.0))
 
 
 def test_winners_are_the_best_final_particle_of_each_concurrent_run():
@@ -223,20 +125,6 @@ def test_winners_are_the_best_final_particle_of_each_concurrent_run():
     random = benchmark.make_worlds(chosen, "random", 60)
     assert len(np.unique(random.params.length, axis=0)) == 60 // objects
     assert np.bincount(random.trials.shape).tolist() == [60 // objects] * objects
-
-
-@pytest.mark.slow  # quick: what is told of records
-def test_a_batch_is_measured_and_judged(monkeypatch):
-    """Its verdicts are those of the engine; the rate is that of the shortest call."""
-    monkeypatch.setattr(benchmark, "SECONDS", 0.0)
-    chosen = scene.load("paper_spheres", overrides=LIFTED)
-    record = benchmark.measured(chosen, "mixed", "mujoco", 12, calls=3)
-    worlds = work.make_worlds(chosen, 12)
-    outcomes, _ = rollout.simulate(chosen, make_engine("mujoco", chosen), *worlds)
-    assert record["verdicts"] == "".join("01"[int(c < 0.01)] for c in np.asarray(outcomes.cost))
-    assert "0" in record["verdicts"] and "1" in record["verdicts"]
-    assert record["grasps_per_s"] == pytest.approx(12 / min(record["seconds"]), abs=0.1)
-    assert record["kept"] == pytest.approx(record["verdicts"].count("1") / 12, abs=1e-4)
 
 
 RUN = {"platform": "cpu", "cpus": 2, "commit": "0123456789", "jax": "0.1", "date": "2026-01-02T03"}
@@ -278,63 +166,6 @@ def test_tables_of_the_pages_are_those_of_the_data(page):
 
 
 # --- searches -------------------------------------------------------------------------------------
-
-
-SIZES = "particles=4,trials=2"
-
-
-def make(path, name):
-    budget = 176 if name == "screened-es" else 140  # its final test is larger
-    the_scene, space, engine = tiny()
-    case = make_case(f"{name}:{SIZES}", space, "2d")
-    how = {"seeds": 3, "budget": budget, "tests": 5, "chunk": 20}
-    return Study(case, the_scene, engine, space, **how, path=path)
-
-
-def finish(made):
-    while not made.finished:
-        made.step()
-    made.save()
-    return made
-
-
-@pytest.mark.slow  # quick: a vmapped run is that of each seed alone (test_codesign)
-def test_seeds_are_runs_of_the_library_and_go_on(tmp_path):
-    whole = finish(make(tmp_path / "whole.npz", "screened-es"))
-    begun = make(tmp_path / "begun.npz", "screened-es")
-    for _ in range(3):
-        begun.step()
-    begun.save()
-    again = finish(make(tmp_path / "begun.npz", "screened-es"))
-    assert again.row() == whole.row()
-    np.testing.assert_array_equal(again.state.particles, whole.state.particles)
-    # The same by the library, of one seed alone.
-    the_scene, space, engine = tiny()
-    optimizer = whole.case.optimizer
-    task = codesign.Task(the_scene, space, 2, engine)
-    state = jax.tree.map(lambda v: v[1], make(tmp_path / "none.npz", "screened-es").state)
-    for _ in range(whole.done):
-        state, _ = task.episode(optimizer, state)
-    # Two programs round in the last bit.
-    np.testing.assert_allclose(whole.state.particles[1], state.particles, rtol=1e-4, atol=1e-6)
-    # All grasps are counted: the episodes and the test.
-    assert whole.row()["grasps"][-1] == 8 * whole.done + whole.tested
-    assert whole.tested == 4 * 36
-
-
-@pytest.mark.slow  # quick: what is reported of stored rows, below
-def test_what_is_recommended_was_chosen_by_fresh_trials(tmp_path):
-    """The particle of the lowest cost in the mark's own trials, by the library's evaluation."""
-    made = finish(make(tmp_path / "one.npz", "particle-filter"))
-    the_scene, space, engine = tiny()
-    task = codesign.Task(the_scene, space, search.ROUNDS, engine)
-    # All grasps are counted: those that find a poor seed, the episodes, and the test.
-    assert made.row()["grasps"][-1] == 8 + 8 * made.done + made.tested
-    assert made.tested == 4 * search.ROUNDS and made.last is not None
-    candidates = made.last[0][2][np.argsort(made.last[1][2], stable=True)]
-    noise = codesign.stream_key(made.keys[2], codesign.STREAM_TEST, made.done)
-    costs = particle_cost(the_scene, task.evaluate(candidates, noise))
-    np.testing.assert_array_equal(made.designs[made.done][2], candidates[np.argmin(costs)])
 
 
 def test_the_page_gets_a_table_and_a_figure(tmp_path):

@@ -1,4 +1,4 @@
-"""Hard case 34: two hull fingers pressed together by a force; its law: tests/test_rings.py."""
+"""Hard case 34: a hull finger that is pulled along another one; its law: tests/test_rings.py."""
 
 import dataclasses
 import functools
@@ -13,23 +13,17 @@ from tests.stability.table import Found, case
 HEAVY = 1e9
 """Armature of what is to stay where it is [kg m^2]."""
 LENGTH = 0.11
-ROLLED = {"flat on flat": 0.0, "edge on flat": np.pi / 4}
-"""Turn of the lower finger about its own axis."""
 
 
 @functools.cache
-def crossed(memory=False):
-    """The default scene's contact between two opposed fingers, and no other.
-
-    Args:
-      memory: `effects.friction_memory`.
-    """
+def crossed():
+    """The default scene's contact between two opposed fingers, and no other."""
     others = ("finger_object", "palm_object", "finger_table", "palm_table")
     others += ("finger_palm", "finger_itself")
     base = scene.load(
         "paper",
         hand_name=grasps.DATA / "pinch.toml",
-        overrides={"effects": dict.fromkeys(others, False) | {"friction_memory": memory}},
+        overrides={"effects": dict.fromkeys(others, False)},
     )
     return dataclasses.replace(base, gravity=0.0)
 
@@ -65,46 +59,10 @@ def lowest(roll, a, b):
     return (y ** (4 / 3) + z ** (4 / 3)) ** 0.75
 
 
-ONCE = {"steps": (1.0,), "precisions": ("float64",)}  # a force at rest does not know the step
-FINGERS = "two crossed hull fingers"
-HALF = f"{FINGERS} that hold by friction_memory, half the friction limit"
-EXACT = 1e-24
-"""Newton decrement: steps are solved to rounding."""
-
-
-def exact(step, precision):
-    """The bench, which solves a step to rounding."""
-    return bench(crossed(), "structured", step, precision, EXACT)
-
-
-# --- the depth under a force ---------------------------------------------------------------------
-
-LOADS = np.r_[np.arange(16), np.arange(14, -1, -1)]
-"""Forces that press the fingers together, one after the other [N]."""
-HOLD = 0.4
-"""Time of each [s]: ten times the 1/25 s in which a contact settles."""
+HALF = "two crossed hull fingers that hold by friction_memory, half the friction limit"
 HINGE = 0.02
 """Damping of the hinge [N m s/rad]: at rest after 10 ms on a skin of 4 kN/m at 60 mm."""
 PLACED = np.array([[0.6, 0.6], [0.63, 0.57], [0.65, 0.7]])
-
-
-@functools.cache
-def pressed(roll, step, precision):
-    """Depths at the end of each load [m], shape (world, load), of rigid fingers.
-
-    The upper one turns about its first joint.  The torque about that joint, by the pressure, is
-    the load times the distance of the crossing.
-    """
-    b, start = exact(step, precision), -0.3e-3  # they do not touch yet
-    worlds, lay = len(PLACED), model.layout(b.scene)
-    fields, (hinge,) = hinged(b, PLACED, start, roll, (1,))
-    arm = LENGTH * (PLACED[:, 1] - 0.5 / lay.links)
-    each = round(HOLD / b.h)
-    ctrl = b.hold(HOLD * len(LOADS), *np.c_[fields.start[:, :6], np.zeros((worlds, 2))])
-    torque = np.repeat(LOADS, each) * arm[:, None]
-    ctrl[:, :, 7] = torque / fields.actuator_gainprm[:, -1:, 0]
-    turned = b.run(fields, ctrl).qpos[:, each - 1 :: each, hinge]
-    return start + np.tan(turned) * arm[:, None]
 
 
 def hinged(b, places, depth, roll, fingers):
@@ -119,27 +77,6 @@ def hinged(b, places, depth, roll, fingers):
     return fields, hinges
 
 
-def sinks(roll, engine, step, precision):
-    """Depth under 15 N, over that at which the fingers' axes meet."""
-    depth, b = pressed(roll, step, precision), exact(step, precision)
-    half = grasps.hand_world(b.scene)[0].height[0] / 2
-    middle = half + lowest(roll, b.scene.hand.section.width / 2, half)
-    under = depth[:, LOADS.argmax()]
-    assert np.all(depth[:, 5] > 5e-4), "the load does not press them together"
-    return Found(under.max() / middle, 1.0, f"{1e3 * under.max():.1f} of {1e3 * middle:.1f} mm")
-
-
-def snaps(roll, engine, step, precision):
-    """Largest difference between the depths under one load of 1 to 15 N as it grows and falls."""
-    depth = pressed(roll, step, precision)
-    change = np.abs(depth - depth[:, ::-1])[:, 1 : len(LOADS) // 2]
-    # A snap is of millimetres: 3.5 mm by the law before this one.  A mesh with points 5 mm apart
-    # slides from one to the next over a few tenths.
-    return Found(change.max(), 5e-4, f"at {1 + change.max(0).argmax()} N")
-
-
-# --- friction below and above its limit ----------------------------------------------------------
-
 PRESSED = np.array([5.0, 15.0])
 """Forces that press the fingers together [N]."""
 PRESS, PULL, REST = 0.7, 0.1, 1.0
@@ -148,7 +85,7 @@ CREEPS = 4.5
 """Time from the pull on [s]: that of a grasp from lift to release."""
 
 
-def pulled(share, seconds, step, precision, *, memory=True):
+def pulled(share, seconds, step, precision):
     """Way [m] of a finger that is pulled along the other one by a share of the friction limit.
 
     The upper finger presses on the edge of the lower one, which lies on its side, so that it bends
@@ -157,7 +94,7 @@ def pulled(share, seconds, step, precision, *, memory=True):
     Returns:
       Ways from the pull on, shape (world, time); worlds are `PLACED` times `PRESSED`.
     """
-    b = bench(crossed(memory=memory), "structured", step, precision)
+    b = bench(crossed(), "structured", step, precision)
     places = np.repeat(PLACED, len(PRESSED), 0)
     load = np.tile(PRESSED, len(PLACED))
     fields, hinges = hinged(b, places, -0.3e-3, np.pi / 2, (0, 1))
@@ -183,19 +120,3 @@ def creeps(engine, step, precision):
     assert np.abs(pulled(1.3, 0.5, step, precision)).max(1).min() > 5e-3, "it holds above its limit"
     last = np.abs(way[:, -1] - way[:, round(-way.shape[1] / CREEPS)]).max()
     return Found(np.abs(way).max(), 1e-3, f"{1e9 * last:.2g} nm in the last second")
-
-
-@case(34, HALF, "way in a second without that effect", unit="m", lower=True, **ONCE)
-def creeps_without(engine, step, precision):
-    """A damper: 12 to 21 mm/s; after a second the finger turns away."""
-    return Found(pulled(0.5, 1.0, step, precision, memory=False)[:, -1].min(), 5e-3)
-
-
-for kind, turn in ROLLED.items():
-    for function, what, unit in (
-        (sinks, "depth under 15 N over that of meeting axes", ""),
-        (snaps, "depth under a growing and a falling load of 1 to 15 N, largest difference", "m"),
-    ):
-        own = {"name": f"{function.__name__}_{kind.split()[0]}", "precisions": ("float64",)}
-        register = case(34, f"{FINGERS}, {kind}", what, unit=unit, **own)
-        register(functools.partial(function, turn))

@@ -1,4 +1,4 @@
-"""Hard cases 6, 7, 16, 17, 19, 20 and 23: whole grasps of the paper's hand."""
+"""Hard cases 6, 7, 16, 17, 19, 20, 23 and 25: whole grasps of the paper's hand."""
 
 import dataclasses
 import functools
@@ -7,11 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import model, rollout, scene
+from codesign_jax import rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import parameters
-from codesign_jax.types import Params, failed
-from scripts.shared.work import NUDGE
+from codesign_jax.types import WARNINGS, Params, Status, failed
 from tests.helpers import grasps
 from tests.helpers.grasps import GOOD
 from tests.stability.bench import CREEP, FIRM, bench, floats, refined
@@ -42,39 +41,6 @@ def whole_inputs(the_bench, designs, shapes=(0,)):
     params = [p for p in designs for _ in shapes]
     trials = [grasps.still(s) for _ in designs for s in shapes]
     return the_bench.fields(params, trials), the_bench.commands(params, trials)
-
-
-def kinetic(the_bench, inputs, displaced=0.0) -> tuple[float, float]:
-    """Largest kinetic energy of the hand in all worlds [J], and its largest speed [rad/s].
-
-    Args:
-      the_bench: What steps the worlds.
-      inputs: Function of it that returns fields and controls.
-      displaced: How far the objects start from their places [m].
-    """
-    fields, ctrl = inputs(the_bench)
-    start, worst = np.array(fields.start), 0.0
-    start[:, -7] += displaced
-    history = the_bench.run(fields, ctrl, start)
-    if not (np.isfinite(history.qpos).all() and np.isfinite(history.qvel).all()):
-        return np.inf, np.inf
-    moving = slice(0, int(model.layout(the_bench.scene).dofs.max()) + 1)
-    for world in range(len(ctrl)):
-        reader, every = Reader(the_bench.scene, fields, world), max(1, ctrl.shape[1] // 900)
-        states = zip(history.qpos[world, ::every], history.qvel[world, ::every], strict=True)
-        worst = max(worst, *(reader.kinetic(q, v, moving) for q, v in states))
-    return float(worst), float(history.speed.max())
-
-
-@functools.cache
-def fine_kinetic(base, inputs):
-    """The same in MuJoCo C at an eighth of the paper's step: the largest of three starts.
-
-    Where fingers start in one place (spread 0) the peak is a matter of chance: objects that start
-    a micrometre to either side make it 25.5 mJ, and 9.8 mJ where they start in between.
-    """
-    fine = bench(base(), "mujoco", 1 / 8, "float64")
-    return max(kinetic(fine, inputs, x)[0] for x in (-NUDGE, 0.0, NUDGE))
 
 
 def resting(the_bench, fields, ctrl, until, last) -> Found:
@@ -130,33 +96,24 @@ def slow():
     return dataclasses.replace(base, phases=type(base.phases)(**phases), arm=still)
 
 
-def register(number, title, base, inputs, *, energy=True, steps=(1.0, 0.5), rounding=1.0):
-    """A grasp's accelerations step by step, and its energy in the engine and in MuJoCo C."""
+def register(number, title, base, inputs, *, steps=(1.0, 0.5), rounding=1.0):
+    """A grasp's accelerations step by step."""
 
     def accelerations(engine, step, precision):
         return along(base(), step, precision, inputs, rounding=rounding)
 
-    def energies(engine, step, precision):
-        found, speed = kinetic(bench(base(), engine, step, precision), inputs)
-        # A step damps and must not excite; contacts make a path, and its peak, uncertain.
-        return Found(found / fine_kinetic(base, inputs), 2.0, f"fastest {speed:.0f} rad/s")
-
-    name = f"{base.__name__}_{inputs.__name__}"
-    case(number, title, AGAINST_C, name=f"{name}_accelerations", steps=steps)(accelerations)
-    if energy:
-        what = number, title, "largest kinetic energy over MuJoCo C's at h/8"
-        as_shipped = {"engines": BOTH, "precisions": ("float32",)}
-        case(*what, name=f"{name}_energy", **as_shipped)(energies)
+    name = f"{base.__name__}_{inputs.__name__}_accelerations"
+    case(number, title, AGAINST_C, name=name, steps=steps)(accelerations)
 
 
 AGAINST_C = "accelerations along the path against MuJoCo C, relative"
 corner = "corner of Table I, 9 s"
-register(6, f"stiffest {corner}", paper, stiffest, energy=False)
+register(6, f"stiffest {corner}", paper, stiffest)
 # Its tips are 0.18 m from the palm, where floats are twice as far apart.
 register(7, f"softest {corner}", paper, softest, rounding=2.0)
 register(16, "shake of 90 degrees at 3 Hz", shaken, good)
-register(17, "all fingers on the object and the table", paper, pressing, energy=False)
-register(20, "ten times the episode, 90 s", slow, good, energy=False, steps=(1.0,))
+register(17, "all fingers on the object and the table", paper, pressing)
+register(20, "ten times the episode, 90 s", slow, good, steps=(1.0,))
 register(23, "edges of the parameters", paper, edge_designs)
 
 
@@ -246,3 +203,20 @@ def long_hold(engine, step, precision):
             places.append(data.xmat[1].reshape(3, 3).T @ away)
         worst = max(worst, np.linalg.norm(places[1] - places[0]))
     return Found(worst, 34.5 * CREEP)
+
+
+@case(
+    25,
+    "2,048 random designs of Table I, default scene",
+    "share of numerical failures",
+    steps=(1.0,),
+    precisions=("float32",),
+)
+def random_failures(engine, step, precision):
+    """Of a million and of 114,688 such grasps 1e-6 and 9e-6 failed (docs/notes/stability.md)."""
+    base = scene.load("paper")
+    run = jax.jit(lambda p, t: rollout.simulate(base, make_engine(engine, base), p, t)[0].status)
+    found = [np.asarray(run(*grasps.random_worlds(base, seed, 256))) for seed in range(8)]
+    counted = np.concatenate(found) & ~int(WARNINGS)
+    stuck = np.mean(counted == Status.STUCK)
+    return Found(np.mean((counted & ~int(Status.STUCK)) != 0), 1e-4, f"{stuck:.2%} are STUCK")

@@ -59,29 +59,6 @@ MOMENTUM = {"float32": 1e-4, "float64": 1e-10}
 FREE = "free hand and object collide"
 
 
-@case(
-    9,
-    FREE,
-    "drift of linear momentum, relative",
-    engines=BOTH,
-    fails="semi-implicit Euler changes the fingers' inertia matrix after the step's impulse: "
-    "linear momentum is kept to first order in h only, in MuJoCo C as well; contact forces are "
-    "equal and opposite",
-)
-def momentum(engine, step, precision):
-    """Momentum of the state after each step."""
-    compiled, history, first = collision(floating(), engine, step, precision)
-    data, worst = mujoco.MjData(compiled), 0.0
-    for q, v in zip(history.qpos[0], history.qvel[0], strict=True):
-        data.qpos[:], data.qvel[:] = q, v
-        mujoco.mj_fwdPosition(compiled, data)
-        mujoco.mj_fwdVelocity(compiled, data)
-        mujoco.mj_subtreeVel(compiled, data)
-        total = data.subtree_linvel[0] * compiled.body_subtreemass[0]
-        worst = max(worst, np.abs(total - first).max())
-    return Found(worst / np.linalg.norm(first), MOMENTUM[precision])
-
-
 def impulses(base, engine, step, precision, **start):
     """What each step's accelerations add to linear and angular momentum, relative, (2,)."""
     compiled, history, first = collision(base, engine, step, precision, **start)

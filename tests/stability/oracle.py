@@ -1,4 +1,4 @@
-"""MuJoCo C as the judge of single steps, and energies that it reads off states."""
+"""MuJoCo C as the judge of single steps, and forces that it reads off states."""
 
 import mujoco
 import numpy as np
@@ -21,11 +21,6 @@ STATES = 250
 """States of a world's path that are compared with MuJoCo C, spread evenly over it."""
 
 
-def exact(base, step, precision):
-    """The structured engine's bench that solves every step to rounding."""
-    return bench(base, "structured", step, precision, TIGHT[precision])
-
-
 def along(base, step, precision, make, least=1, rounding=1.0) -> Found:
     """Accelerations along whole paths of the structured engine against MuJoCo C.
 
@@ -42,7 +37,7 @@ def along(base, step, precision, make, least=1, rounding=1.0) -> Found:
       decides there whether a pair a few nanometres apart touches, and a contact's damping acts at
       once.
     """
-    b = exact(base, step, precision)
+    b = bench(base, "structured", step, precision, TIGHT[precision])
     fields, ctrl, *start = make(b)
     found = b.path(fields, ctrl, *start)
     stride = max(1, ctrl.shape[1] // STATES)
@@ -63,7 +58,6 @@ class Reader:
         self.model = world_model(the_scene, self.fields)
         self.model.opt.tolerance, self.model.opt.iterations = 0.0, 200
         self.data = mujoco.MjData(self.model)
-        self.armature = np.diag(self.model.dof_armature)
 
     def at(self, qpos, qvel=None, ctrl=None):
         """Sets a state and computes everything of it; returns MuJoCo's data."""
@@ -74,18 +68,6 @@ class Reader:
             d.ctrl[:] = ctrl
         mujoco.mj_forward(self.model, d)
         return d
-
-    def kinetic(self, qpos, qvel, dofs=slice(None)):
-        """Kinetic energy [J] of some velocities, without what implicit springs add."""
-        self.data.qpos[:] = qpos
-        mujoco.mj_kinematics(self.model, self.data)
-        mujoco.mj_comPos(self.model, self.data)
-        mujoco.mj_crb(self.model, self.data)
-        full = np.zeros((self.model.nv, self.model.nv))
-        mujoco.mj_fullM(self.model, self.data, full)
-        moving = np.zeros(self.model.nv)
-        moving[dofs] = np.asarray(qvel)[dofs]
-        return 0.5 * moving @ (full - self.armature) @ moving
 
     def pushes(self):
         """Contacts of the present state: names of both geoms, normal force [N] and MuJoCo's row."""

@@ -46,25 +46,6 @@ def middle_of_finger(compiled, data, qpos):
 # --- 10: rest --------------------------------------------------------------------------------
 
 
-@case(10, "objects at rest for 90 s", "drift", unit="m", engines=BOTH)
-def rest(engine, step, precision):
-    """All three objects for 90 s; sideways and vertical drift after the first five."""
-    b = bench(pinch(), engine, step, precision)
-    fields = worlds(b, CUBOID, CYLINDER, SPHERE)
-    history = b.run(fields, held(b, fields, 90.0))
-    late = history.object[:, round(5 / b.h) :]
-    return Found(np.abs(late - late[:, :1]).max(), 1e-4)
-
-
-@case(10, "objects at rest for 90 s", "penetration", unit="m", engines=BOTH)
-def sunk(engine, step, precision):
-    """Depth of the lowest point below the table at rest."""
-    b = bench(pinch(), engine, step, precision)
-    fields = worlds(b, CUBOID, CYLINDER, SPHERE)
-    history = b.run(fields, held(b, fields, 5.0))
-    return Found((fields.start[:, -5] - history.object[:, -1, 2]).max(), 5e-4)
-
-
 # --- 14: spawned inside ----------------------------------------------------------------------
 
 
@@ -135,22 +116,3 @@ def tunnelling(engine, step, precision):
     # Half of the converged impulse: the finger was met, not passed through.
     note = f"converged impulse {converged_throw():.2f} m/s of 5"
     return Found(found / converged_throw(), 0.5, note)
-
-
-@functools.cache
-def converged_velocity():
-    return thrown(bench(weightless(), "mujoco", 1 / 64, "float64")).object_velocity[0, -1]
-
-
-@case(
-    *FAST,
-    "error of the velocity over that of passing through",
-    engines=BOTH,
-    fails="it moves 50 mm in a step and touches for two steps: half a step is needed",
-    fails_at=(1.0,),
-)
-def passing(engine, step, precision):
-    """Error of the sphere's velocity afterwards over that of passing through unhindered."""
-    found = thrown(bench(weightless(), engine, step, precision)).object_velocity[0, -1]
-    unhindered = np.linalg.norm([0, -5, 0] - converged_velocity())
-    return Found(np.linalg.norm(found - converged_velocity()) / unhindered, 0.5)

@@ -8,22 +8,23 @@ faster, and XLA would round it differently in the last bit, after which contact 
 """
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from codesign_jax import rollout
-from codesign_jax.codesign import EpisodeInfo, Task, episode_trials
-from codesign_jax.cost import particle_cost
+from codesign_jax.codesign import EpisodeInfo, Task, asked, episode_trials, told
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import block_lanes, staged
 from codesign_jax.optimize import Optimizer, State
 from codesign_jax.reuse import Program, shared
 from codesign_jax.scene import Constants, Scene
 from codesign_jax.scene.parameters import DesignSpace
-from codesign_jax.types import Trial
+from codesign_jax.types import Outcome, Trial
 
 Device = Any
 """A `jax.Device`, which type checkers do not know."""
@@ -76,15 +77,6 @@ class _Launched(NamedTuple):
     packed: list[_Packed]
     drawn: list[Trial]
     running: list[tuple]
-
-
-class _Stages(NamedTuple):
-    """The programs of an episode, see `engines.base.Staged`."""
-
-    draw: Program
-    before: Program
-    launch: Any
-    after: Program
 
 
 class Batch:
@@ -184,12 +176,10 @@ class Batch:
         if self._parts is None:
             task, joined = self._task, min(runs, self._group(request))
             worlds = -(-joined * self._worlds(request) // len(self.devices))
-            scene, engine, space, trials, recording = task.how
-            how = scene, engine, space, block_lanes(engine, worlds), trials, recording
-            draw, before, after = (
-                Program(scene, make(*how), self._optimizer) for make in (_draw, _before, _after)
-            )
-            self._parts = _Stages(draw, before, _launch(*how), after)
+            scene, engine, space, trials, options = task.how
+            made = _stages(scene, engine, space, block_lanes(engine, worlds), trials, options)
+            ours = {n: Program(scene, getattr(made, n), self._optimizer) for n in _OURS}
+            self._parts = made._replace(**ours)
         return self._parts
 
     def _launched(self, requests: Sequence[Request]) -> _Launched:
@@ -257,88 +247,118 @@ class Batch:
         return self._programs[name, shapes]
 
 
+class _Stages(NamedTuple):
+    """The programs of an episode, see `engines.base.Staged`."""
+
+    draw: Any
+    before: Any
+    launch: Any
+    after: Any
+
+
+_OURS = "draw", "before", "after"
+"""Programs that get an optimiser and the scene's numbers."""
+
+
 @shared
-def _draw(
+def _stages(
     scene: Scene,
     engine: Engine,
     space: DesignSpace,
     lanes: int | None,
     num_trials: int,
-    recording: rollout.Recording,
-) -> Callable:
-    """Draws an episode's trials."""
+    options: rollout.Options,
+) -> _Stages:
+    """Draws an episode's trials; moves particles and prepares worlds; simulates them; judges."""
+    stages = staged(engine, lanes, trajectory=options.to_end)
 
     def draw(state: State, mask: Any, constants: Constants, optimizer: Optimizer) -> Trial:
         return episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
 
-    return draw
-
-
-@shared
-def _before(
-    scene: Scene,
-    engine: Engine,
-    space: DesignSpace,
-    lanes: int | None,
-    num_trials: int,
-    recording: rollout.Recording,
-) -> Callable:
-    """Moves a run's particles and prepares their worlds."""
-
     def before(state: State, mask: Any, constants: Constants, optimizer: Optimizer) -> _Packed:
-        population = optimizer.ask(state, mask)
-        noise = episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
-        worlds = rollout.crossed(jax.vmap(space.params)(population), noise)
-        fields, ctrl, initial = rollout.prepare(scene, *worlds, constants, engine)
-        blocks = staged(engine, lanes).pack(fields, ctrl)
-        return _Packed(
-            population, worlds[1], initial, *blocks, None if recording.cost is None else ctrl
-        )
-
-    return before
-
-
-@shared
-def _launch(
-    scene: Scene,
-    engine: Engine,
-    space: DesignSpace,
-    lanes: int | None,
-    num_trials: int,
-    recording: rollout.Recording,
-) -> Callable:
-    return staged(engine, lanes, trajectory=recording.to_end).launch
-
-
-@shared
-def _after(
-    scene: Scene,
-    engine: Engine,
-    space: DesignSpace,
-    lanes: int | None,
-    num_trials: int,
-    recording: rollout.Recording,
-) -> Callable:
-    """Judges a run's worlds and tells its optimiser."""
+        own = state, mask, constants, optimizer
+        population, (hands, trials, numbers) = asked(scene, space, num_trials, *own)
+        fields, ctrl, initial = rollout.prepare(scene, hands, trials, numbers, engine)
+        blocks = stages.pack(fields, ctrl)
+        return _Packed(population, trials, initial, *blocks, None if options.cost is None else ctrl)
 
     def after(
-        asked: tuple[State, _Packed],
+        begun: tuple[State, _Packed],
         found: tuple[Any, tuple],
         constants: Constants,
         optimizer: Optimizer,
     ) -> tuple[State, EpisodeInfo]:
-        (state, packed), (mask, out) = asked, found
-        shape = packed.population.shape[0], num_trials
-        stages = staged(engine, lanes, trajectory=recording.to_end)
-        trace = stages.unpack(out, shape[0] * shape[1])
+        (state, packed), (mask, out) = begun, found
+        trace = stages.unpack(out, len(packed.population) * num_trials)
         judged = trace, packed.ctrl, packed.initial, packed.trials, constants
-        outcome = rollout.judge(scene, *judged, **recording._asdict())
-        trials, last = rollout.grid((outcome, trace.last), shape)
-        costs = particle_cost(scene.with_constants(constants), trials)
-        new, selection = optimizer.tell(state, packed.population, costs, mask)
-        return new, EpisodeInfo(packed.population, trials, selection, last)
+        outcome = rollout.judge(scene, *judged, options)
+        own = state, mask, constants, optimizer
+        return told(scene, num_trials, *own, packed.population, (outcome, trace.last))
 
-    return after
+    return _Stages(draw, before, stages.launch, after)
+
+
+WORLDS = {"cpu": 512}
+"""Most worlds of a call of `evaluate` by platform: few enough to see progress, enough to fill the
+cores."""
+
+
+def size(designs: int, trials: int, *, most: int | None = None, devices: int = 1) -> int:
+    """Designs of each of equal calls for so many devices: a short last one would be filled up."""
+    worlds = most or WORLDS.get(jax.default_backend(), LIMIT)
+    at_most = min(max(1, worlds // trials), -(-designs // devices))
+    return -(-designs // -(-designs // at_most))
+
+
+def evaluate(
+    task: Task,
+    key: jax.Array,
+    designs: np.ndarray,
+    size: int,
+    advance: Callable[[int], Any] = lambda worlds: None,
+    *,
+    devices: int | None = 1,
+) -> Outcome:
+    """Outcomes of designs [SI units] in a task's trials, arrays of shape (design, trial).
+
+    So many designs at a time, and `advance` is told the worlds of each call.
+    """
+
+    def run(rows: np.ndarray, device: Device) -> Outcome:
+        part = jnp.asarray(designs[rows], jnp.float32)
+        return task.evaluate(*jax.device_put((part, key), device))
+
+    found = []
+    for outcome in in_chunks(run, len(designs), size, take(devices)):
+        found.append(outcome)
+        advance(outcome.cost.size)
+    return jax.tree.map(lambda *v: np.concatenate(v), *found)
+
+
+def in_chunks(
+    run: Callable[[np.ndarray, Device], Any],
+    count: int,
+    size: int,
+    devices: Sequence[Device] = (None,),
+) -> Iterator[Any]:
+    """What run(rows, device) returns of rows 0 to count, as NumPy arrays, in their order.
+
+    Each call has `size` rows, so that there is one program: the last is filled up with its last
+    row, and cut. The devices take turns.
+    """
+    running: deque[tuple[int, Any]] = deque()
+
+    def arrived() -> Any:
+        rows, found = running.popleft()
+        return jax.tree.map(lambda v: np.asarray(v)[:rows], found)
+
+    for start, device in zip(range(0, count, size), itertools.cycle(devices), strict=False):
+        if len(running) == len(devices):
+            yield arrived()
+        rows = np.minimum(np.arange(start, start + size), count - 1)
+        running.append((min(size, count - start), run(rows, device)))
+    while running:
+        yield arrived()
 
 
 def take(count: int | None) -> list[Device]:

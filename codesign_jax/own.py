@@ -84,8 +84,8 @@ def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
 
     def judge(trace: Trace, params: Params, trials: Any) -> Outcome:
         _, ctrl, initial = rollout.prepare(scene, params, trials, constants)
-        how = {"record_qpos": not stops, "stop_when_lost": stops, "cost": cost}
-        return rollout.judge(scene, trace, ctrl, initial, trials, constants, **how)
+        how = rollout.Options(record_qpos=not stops, stop_when_lost=stops, cost=cost)
+        return rollout.judge(scene, trace, ctrl, initial, trials, constants, how)
 
     one = jax.tree.map(lambda v: jnp.asarray(v)[None], (_hand(scene), rollout.nominal_trial(scene)))
     fields, _, _ = jax.eval_shape(lambda p, t: rollout.prepare(scene, p, t, constants), *one)

@@ -315,24 +315,24 @@ def _relieve() -> None:
         gc.collect()
 
 
-def shared(build: Callable[..., Callable]) -> Callable[..., Callable]:
-    """Jits what build(scene, engine, space, *more) returns once for each structure.
+def shared(build: Callable[..., Any]) -> Callable[..., Any]:
+    """Jits the functions that build(scene, engine, space, *more) returns once for each structure.
 
     The program reads numbers from its constants alone, so that another scene of the same structure
     compiles nothing; with a `cost` of the user's own, or code that is not known, nothing is shared.
     """
 
-    def jitted(*arguments: Any) -> Callable:
+    def jitted(*arguments: Any) -> Any:
         import jax
 
         _relieve()
-        return jax.jit(build(*arguments))
+        return jax.tree.map(jax.jit, build(*arguments))
 
     found = functools.lru_cache(maxsize=32)(jitted)
     forgetters.append(found.cache_clear)
 
     @functools.wraps(build)
-    def find(scene: Any, engine: Any, space: Any, *arguments: Any) -> Callable:
+    def find(scene: Any, engine: Any, space: Any, *arguments: Any) -> Any:
         if getattr(arguments[-1], "cost", None) is not None:
             return jitted(scene, engine, space, *arguments)
         known = isinstance(engine, Hashable) and code_digest() is not None

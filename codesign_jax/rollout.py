@@ -45,17 +45,34 @@ a grasp up to the loss of the object only, and its qpos needs `record_qpos=True`
 """
 
 
-class Recording(NamedTuple):
-    """What of a rollout is recorded, when its worlds stop, and what it costs; see `simulate`."""
+class Options(NamedTuple):
+    """How worlds are simulated and judged: keywords of `simulate`, `grasp` and `evaluate`.
+
+    Attributes:
+      record_qpos: Whether the trace holds qpos of every step; such worlds go on when they are lost.
+      stop_when_lost: Whether a world that lost its object stops there, see `Trace`; None for True,
+        but a cost of one's own that reads the trace must say which.
+      record_forces: Whether the trace has the contact forces, see `Forces`; engine structured
+        alone, and without derivatives.
+      cost: A cost of one's own in place of the scene's, see `CostFunction`.
+    """
 
     record_qpos: bool = False
     stop_when_lost: bool | None = None
+    record_forces: bool = False
     cost: CostFunction | None = None
 
     @property
     def to_end(self) -> bool:
-        """See `goes_on`."""
-        return goes_on(self.record_qpos, self.stop_when_lost)
+        """Whether worlds are simulated to the end though they are lost.
+
+        Raises:
+          InputError: If they are to stop, and to be recorded: an engine records whole grasps.
+        """
+        if self.record_qpos and self.stop_when_lost:
+            problem = "record_qpos=True records whole grasps: leave out stop_when_lost=True"
+            raise schema.InputError([problem])
+        return self.record_qpos or self.stop_when_lost is False
 
 
 # Folded into a trial's key for draws that came later, so that earlier ones stay as they are.
@@ -138,11 +155,8 @@ def simulate(
     params: Params,
     trials: Trial,
     *,
-    record_qpos: bool = False,
-    stop_when_lost: bool | None = None,
-    record_forces: bool = False,
-    cost: CostFunction | None = None,
     constants: Constants | None = None,
+    **options: Any,
 ) -> tuple[Outcome, Trace]:
     """Simulates a batch of worlds; jit it, with scene and engine closed over.
 
@@ -151,14 +165,9 @@ def simulate(
       engine: The engine.
       params: Parameters with leading axis (world,).
       trials: Trials with leading axis (world,).
-      record_qpos: Whether the trace holds qpos of every step; such worlds go on when they are lost.
-      stop_when_lost: Whether a world that lost its object stops there, see `Trace`; None for True,
-        but a cost of one's own that reads the trace must say which.
-      record_forces: Whether the trace has the contact forces, see `Forces`; engine structured
-        alone, and without derivatives.
-      cost: A cost of one's own in place of the scene's, see `CostFunction`.
       constants: Numbers instead of the scene's, see `Scene.constants`; leaves of shape () or
         (world,). The engine may be that of any scene of the same structure.
+      **options: See `Options`.
 
     Returns:
       Outcome and trace with leading axis (world,).
@@ -170,36 +179,10 @@ def simulate(
         finger is so high that its contacts begin farther from a mesh than distances reach; of
         traced ones no values are known.
     """
+    how = Options(**options)
     constants = _checked(scene, engine, params, trials, constants)
-    engine = recording(engine) if record_forces else engine
-    fields, ctrl, initial = prepare(scene, params, trials, constants, engine)
-    trace = recorded(engine.rollout, fields, ctrl, record_qpos, stop_when_lost)
-    how = {"record_qpos": record_qpos, "stop_when_lost": stop_when_lost, "cost": cost}
-    return judge(scene, trace, ctrl, initial, trials, constants, **how), trace
-
-
-def goes_on(record_qpos: bool, stop_when_lost: bool | None) -> bool:
-    """Whether worlds are simulated to the end though they are lost.
-
-    Raises:
-      InputError: If they are to stop, and to be recorded: an engine records whole grasps.
-    """
-    if record_qpos and stop_when_lost:
-        problem = "record_qpos=True records whole grasps: leave out stop_when_lost=True"
-        raise schema.InputError([problem])
-    return record_qpos or stop_when_lost is False
-
-
-def recorded(
-    simulate: Callable[..., Trace],
-    fields: Any,
-    ctrl: jax.Array,
-    record_qpos: bool,
-    stop_when_lost: bool | None,
-) -> Trace:
-    """What an engine's `rollout` returns, with qpos only where that is asked for."""
-    trace = simulate(fields, ctrl, trajectory=goes_on(record_qpos, stop_when_lost))
-    return trace if record_qpos else trace._replace(qpos=trace.qpos[..., :0])
+    trace, ctrl, initial = _traced(scene, engine, params, trials, constants, how)
+    return judge(scene, trace, ctrl, initial, trials, constants, how), trace
 
 
 def grasp(
@@ -209,10 +192,8 @@ def grasp(
     trial: Trial,
     *,
     steps: int | None = None,
-    record_qpos: bool = False,
-    stop_when_lost: bool | None = None,
-    record_forces: bool = False,
     constants: Constants | None = None,
+    **options: Any,
 ) -> Trace:
     """Simulates one world, or the beginning of it; `jax.vmap` makes a batch of it.
 
@@ -222,10 +203,8 @@ def grasp(
       params: Parameters of one hand.
       trial: One trial.
       steps: How many time steps are simulated; None for the whole grasp.
-      record_qpos: As in `simulate`.
-      stop_when_lost: As in `simulate`.
-      record_forces: As in `simulate`.
       constants: Numbers instead of the scene's, leaves of shape ().
+      **options: See `Options`.
 
     Returns:
       Trace of shape (steps,).
@@ -237,10 +216,61 @@ def grasp(
         raise schema.InputError([f"steps = {steps}: the grasp has 1 to {scene.num_steps}"])
     params, trial = jax.tree.map(lambda v: jnp.asarray(v)[None], (params, trial))
     constants = _checked(scene, engine, params, trial, constants)
-    engine = recording(engine) if record_forces else engine
-    fields, ctrl, _ = prepare(scene, params, trial, constants, engine)
-    trace = recorded(engine.rollout, fields, first(ctrl, steps), record_qpos, stop_when_lost)
+    how = Options(**options)
+    trace, *_ = _traced(scene, engine, params, trial, constants, how, steps)
     return jax.tree.map(lambda v: v[0], trace)
+
+
+def evaluate(
+    scene: Scene,
+    engine: Engine,
+    params: Params,
+    trials: Trial,
+    *,
+    constants: Constants | None = None,
+    **options: Any,
+) -> Outcome:
+    """Evaluates all particles in all trials as one batch of particle * trial worlds.
+
+    Args:
+      scene: The scene.
+      engine: The engine.
+      params: Parameters with leading axis (particle,).
+      trials: Trials with leading axis (trial,): common random numbers, every particle meets the
+        same ones.
+      constants: Numbers instead of the scene's; leaves of shape () or (trial,).
+      **options: See `Options`.
+
+    Returns:
+      Outcomes, every array of shape (particle, trial).
+
+    Raises:
+      InputError: See `simulate`.
+    """
+    axes.refuse(scene, params, trials, ("particle", "trial"))
+    if constants is not None:
+        axes.refuse_constants(constants, len(trials.yaw), "trial")
+    shape = params.length.shape[0], trials.yaw.shape[0]
+    worlds = crossed(params, trials, constants)
+    result, _ = simulate(scene, engine, *worlds[:2], constants=worlds[2], **options)
+    return grid(result, shape)
+
+
+def crossed(params: Params, trials: Trial, constants: Any = None) -> tuple[Params, Trial, Any]:
+    """Every particle in all trials, arrays with leading axis (particle * trial,), particles slow.
+
+    Of the constants those with an axis have the trials'.
+    """
+    particles, count = params.length.shape[0], trials.yaw.shape[0]
+    every_p = jax.tree.map(lambda v: jnp.repeat(v, count, axis=0), params)
+    every_t = jax.tree.map(lambda v: jnp.tile(v, (particles,) + (1,) * (v.ndim - 1)), trials)
+    every_c = jax.tree.map(lambda v: jnp.tile(v, particles) if jnp.ndim(v) else v, constants)
+    return every_p, every_t, every_c
+
+
+def grid(tree: Any, shape: tuple[int, ...]) -> Any:
+    """Arrays whose leading axis (particle * trial,) becomes two, (particle, trial)."""
+    return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]), tree)
 
 
 def _checked(
@@ -262,12 +292,26 @@ def _checked(
     return constants
 
 
-def first(ctrl: Any, steps: int | None) -> Any:
-    """The first time steps of what `prepare` makes for an engine."""
-    if isinstance(ctrl, control.Plan):
+def _traced(
+    scene: Scene,
+    engine: Engine,
+    params: Params,
+    trials: Trial,
+    constants: Constants,
+    how: Options,
+    steps: int | None = None,
+) -> tuple[Trace, Any, jax.Array]:
+    """The trace of the first steps, and the controls and bits of `Status` that it began with."""
+    engine = recording(engine) if how.record_forces else engine
+    ctrl: Any
+    fields, ctrl, initial = prepare(scene, params, trials, constants, engine)
+    if steps is not None and isinstance(ctrl, control.Plan):
         series = {k: getattr(ctrl, k)[:, :steps] for k in ("pose", "pressure", "shake")}
-        return ctrl._replace(**series)
-    return ctrl[:, :steps]
+        ctrl = ctrl._replace(**series)
+    elif steps is not None:
+        ctrl = ctrl[:, :steps]
+    trace = engine.rollout(fields, ctrl, trajectory=how.to_end)
+    return trace if how.record_qpos else trace._replace(qpos=trace.qpos[..., :0]), ctrl, initial
 
 
 def prepare(
@@ -323,10 +367,7 @@ def judge(
     initial: jax.Array,
     trials: Trial,
     constants: Constants,
-    *,
-    record_qpos: bool = False,
-    stop_when_lost: bool | None = None,
-    cost: CostFunction | None = None,
+    how: Options,
 ) -> Outcome:
     """Outcomes of a batch of worlds, with leading axis (world,).
 
@@ -337,9 +378,7 @@ def judge(
       initial: Bits of `Status` that they started with, shape (world,).
       trials: Their trials, with leading axis (world,).
       constants: Their numbers, leaves of shape () or (world,).
-      record_qpos: As in `simulate`, with which the trace was made.
-      stop_when_lost: As in `simulate`, with which the trace was made.
-      cost: As in `simulate`.
+      how: How the trace was made.
     """
     if trace.ctrl is not None:
         ctrl = trace.ctrl
@@ -347,9 +386,10 @@ def judge(
     def world(t: Trace, u: jax.Array | None, i: jax.Array, trial: Trial, c: Constants) -> Outcome:
         own = scene.with_constants(c)
         result = outcome(own, t, i, trial)
-        if cost is None:
+        if how.cost is None:
             return result
-        return _by_own(own, cost, shown(t, record_qpos, stop_when_lost), u, result)
+        seen = shown(t, how.record_qpos, how.stop_when_lost)
+        return _by_own(own, how.cost, seen, u, result)
 
     every = trace, ctrl, initial, trials, constants
     return jax.vmap(world, in_axes=(0, 0, 0, 0, batch_axes(constants)))(*every)
@@ -370,92 +410,6 @@ def _by_own(
     status = result.status | as_bit(~jnp.isfinite(value), Status.NONFINITE)
     value = jnp.where(failed(status), scene.cost.maximum, value)
     return result._replace(cost=value.astype(result.cost.dtype), status=status)
-
-
-def evaluate(
-    scene: Scene,
-    engine: Engine,
-    params: Params,
-    trials: Trial,
-    *,
-    record_qpos: bool = False,
-    stop_when_lost: bool | None = None,
-    cost: CostFunction | None = None,
-    constants: Constants | None = None,
-) -> Outcome:
-    """Evaluates all particles in all trials as one batch of particle * trial worlds.
-
-    Args:
-      scene: The scene.
-      engine: The engine.
-      params: Parameters with leading axis (particle,).
-      trials: Trials with leading axis (trial,): common random numbers, every particle meets the
-        same ones.
-      record_qpos: As in `simulate`; for a cost of one's own.
-      stop_when_lost: As in `simulate`; for a cost of one's own.
-      cost: As in `simulate`.
-      constants: Numbers instead of the scene's; leaves of shape () or (trial,).
-
-    Returns:
-      Outcomes, every array of shape (particle, trial).
-
-    Raises:
-      InputError: See `simulate`.
-    """
-    return evaluate_to_end(
-        scene,
-        engine,
-        params,
-        trials,
-        record_qpos=record_qpos,
-        stop_when_lost=stop_when_lost,
-        cost=cost,
-        constants=constants,
-    )[0]
-
-
-def evaluate_to_end(
-    scene: Scene,
-    engine: Engine,
-    params: Params,
-    trials: Trial,
-    *,
-    record_qpos: bool = False,
-    stop_when_lost: bool | None = None,
-    cost: CostFunction | None = None,
-    constants: Constants | None = None,
-) -> tuple[Outcome, jax.Array | None]:
-    """As `evaluate`, with the states at the end, `Trace.last`, shape (particle, trial, n).
-
-    They are None if the engine does not tell them.
-    """
-    axes.refuse(scene, params, trials, ("particle", "trial"))
-    if constants is not None:
-        axes.refuse_constants(constants, len(trials.yaw), "trial")
-    shape = params.length.shape[0], trials.yaw.shape[0]
-    result, trace = simulate(
-        scene,
-        engine,
-        *crossed(params, trials),
-        record_qpos=record_qpos,
-        stop_when_lost=stop_when_lost,
-        cost=cost,
-        constants=jax.tree.map(lambda v: jnp.tile(v, shape[0]) if jnp.ndim(v) else v, constants),
-    )
-    return grid((result, trace.last), shape)
-
-
-def crossed(params: Params, trials: Trial) -> tuple[Params, Trial]:
-    """Every particle in all trials: both with leading axis (particle * trial,), particles slow."""
-    particles, count = params.length.shape[0], trials.yaw.shape[0]
-    every_p = jax.tree.map(lambda v: jnp.repeat(v, count, axis=0), params)
-    every_t = jax.tree.map(lambda v: jnp.tile(v, (particles,) + (1,) * (v.ndim - 1)), trials)
-    return every_p, every_t
-
-
-def grid(tree: Any, shape: tuple[int, ...]) -> Any:
-    """Arrays whose leading axis (particle * trial,) becomes two, (particle, trial)."""
-    return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]), tree)
 
 
 reuse.note()  # what programs are traced from has been imported

@@ -106,19 +106,19 @@ def make_simulate(
       engine: Engine that simulates.
       space: Space of the designs.
     """
-    return Program(scene, _simulation(scene, engine, space, rollout.Recording()))
+    return Program(scene, _simulation(scene, engine, space, rollout.Options()))
 
 
 @shared
 def _simulation(
-    scene: Scene, engine: Engine, space: DesignSpace, recording: rollout.Recording
+    scene: Scene, engine: Engine, space: DesignSpace, options: rollout.Options
 ) -> Callable[[jax.Array, Trial, Constants], Outcome]:
     def simulate(designs: jax.Array, trials: Trial, constants: Constants) -> Outcome:
         shape = trials.yaw.shape
         hands = jax.vmap(space.params)(jnp.repeat(designs, shape[1], axis=0))
         flat = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), trials)
-        how = recording._asdict()
-        found, _ = rollout.simulate(scene, engine, hands, flat, constants=constants, **how)
+        how = {"constants": constants} | options._asdict()
+        found, _ = rollout.simulate(scene, engine, hands, flat, **how)
         return rollout.grid(found, shape)
 
     return simulate

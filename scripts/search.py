@@ -28,6 +28,7 @@ from matplotlib import ticker
 
 from codesign_jax import codesign, optimize, rollout, runs, use_compilation_cache
 from codesign_jax import scene as scenes
+from codesign_jax.batch import in_chunks
 from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine, make_engine
@@ -237,12 +238,14 @@ class Study:
         trials = jax.tree.map(np.asarray, jax.vmap(draw)(keys))
         shape = (*populations.shape[:2], count)
         seed, particle, trial = np.indices(shape).reshape(3, -1)
-        designs, parts = np.asarray(populations), []
-        for start in range(0, len(seed), self.batch):
-            rows = np.minimum(np.arange(start, start + self.batch), len(seed) - 1)
-            own = jax.tree.map(lambda v, at=(seed[rows], trial[rows]): v[at], trials)
-            parts.append(self.simulate(designs[seed[rows], particle[rows]], own))
-        found = jax.tree.map(lambda *v: np.concatenate(v)[: len(seed)], *parts)
+        designs = np.asarray(populations)
+
+        def run(rows: np.ndarray, device: Any) -> Outcome:
+            own = jax.tree.map(lambda v: v[seed[rows], trial[rows]], trials)
+            return self.simulate(designs[seed[rows], particle[rows]], own)
+
+        parts = in_chunks(run, len(seed), self.batch)
+        found = jax.tree.map(lambda *v: np.concatenate(v), *parts)
         return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]), found)
 
     def _simulate(self, designs: jax.Array, trials: Trial) -> Outcome:

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from codesign_jax import cli, codesign, runs, scene
-from codesign_jax.commands import calls, replay, status
+from codesign_jax import batch, cli, codesign, runs, scene
 from codesign_jax.commands import landscape as command
+from codesign_jax.commands import replay, status
 from codesign_jax.engines import make_engine
 from codesign_jax.report import animation, landscape
 from codesign_jax.runs import choice
@@ -179,7 +179,7 @@ def test_what_cannot_be_written_in_the_end_is_said_in_words(capsys):
 
 def test_landscape_has_every_point(run, monkeypatch, capsys):
     """Cut into calls, it is what one evaluation of all designs says; files and report agree."""
-    monkeypatch.setitem(calls.WORLDS, "cpu", 10)  # five designs; the last call is filled up
+    monkeypatch.setitem(batch.WORLDS, "cpu", 10)  # five designs; the last call is filled up
     sizes = ["--points", "3", "--trials", "2", "--seed", "5"]
     assert cli.main(["landscape", "--run", str(run), *sizes]) == 0
     assert "grasps: 18 in 2 calls" in capsys.readouterr().out

@@ -18,9 +18,11 @@ from codesign_jax.codesign.episode import (
     EpisodeFunction,
     EpisodeInfo,
     Task,
+    asked,
     closed,
     episode_trials,
     stream_key,
+    told,
 )
 from codesign_jax.codesign.experiment import (
     CONVERGED_COST,
@@ -51,6 +53,7 @@ __all__ = [
     "EpisodeInfo",
     "FinalTest",
     "Task",
+    "asked",
     "closed",
     "convergence_episode",
     "episode_trials",
@@ -61,5 +64,6 @@ __all__ = [
     "stream_key",
     "summarize_test",
     "testing",
+    "told",
     "verdicts",
 ]

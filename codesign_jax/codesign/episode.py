@@ -18,7 +18,7 @@ from codesign_jax.optimize import Info, Optimizer, ParticleFilter, State
 from codesign_jax.reuse import Program, shared
 from codesign_jax.scene import Constants, InputError, Scene
 from codesign_jax.scene.parameters import DesignSpace
-from codesign_jax.types import Outcome, Trial
+from codesign_jax.types import Outcome, Params, Trial
 
 # Four ASCII letters, as the optimiser's streams and `experiment`'s, so that no two streams of a
 # seed meet.
@@ -61,8 +61,8 @@ class Task:
       trials: Trials of each particle in an evaluation or an episode.
       engine: Engine that simulates; by default the engine `structured` of the scene.
       cost: A cost of one's own in place of the scene's, see `rollout.CostFunction`.
-      record_qpos: As in `rollout.simulate`, for a cost of one's own.
-      stop_when_lost: As in `rollout.simulate`, for a cost of one's own.
+      record_qpos: As in `rollout.Options`, for a cost of one's own.
+      stop_when_lost: As in `rollout.Options`, for a cost of one's own.
 
     >>> from codesign_jax import Task, parameters, scene
     >>> grasping = scene.load("paper")
@@ -97,13 +97,13 @@ class Task:
         if self.engine is None:
             object.__setattr__(self, "engine", engines.make_engine(engines.DEFAULT, self.scene))
         axes.refuse_other(self.scene, self.engine)
-        rollout.goes_on(self.record_qpos, self.stop_when_lost)
+        self.how[-1].to_end  # noqa: B018  # refuses options that exclude each other
 
     @property
     def how(self) -> tuple[Any, ...]:
         """What its programs are built from, see `reuse.shared`."""
-        recording = rollout.Recording(self.record_qpos, self.stop_when_lost, self.cost)
-        return self.scene, self.engine, self.space, self.trials, recording
+        options = rollout.Options(self.record_qpos, self.stop_when_lost, cost=self.cost)
+        return self.scene, self.engine, self.space, self.trials, options
 
     def evaluate(
         self,
@@ -217,9 +217,9 @@ def _evaluation(
     engine: Engine,
     space: DesignSpace,
     num_trials: int,
-    recording: rollout.Recording,
+    options: rollout.Options,
 ) -> Callable[..., Outcome]:
-    how = recording._asdict()
+    how = options._asdict()
 
     def simulate(population: jax.Array, key: jax.Array, constants: Constants) -> Outcome:
         trials = rollout.sample_trials(scene, key, num_trials, constants=constants)
@@ -229,16 +229,46 @@ def _evaluation(
     return simulate
 
 
+def asked(
+    scene: Scene,
+    space: DesignSpace,
+    num_trials: int,
+    state: State,
+    mask: jax.typing.ArrayLike,
+    constants: Constants,
+    optimizer: Optimizer,
+) -> tuple[jax.Array, tuple[Params, Trial, Constants]]:
+    """The first part of an episode: the particles, and the worlds that they ask for."""
+    population = optimizer.ask(state, mask)
+    noise = episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
+    return population, rollout.crossed(jax.vmap(space.params)(population), noise, constants)
+
+
+def told(
+    scene: Scene,
+    num_trials: int,
+    state: State,
+    mask: jax.typing.ArrayLike,
+    constants: Constants,
+    optimizer: Optimizer,
+    population: jax.Array,
+    found: tuple[Outcome, jax.Array | None],
+) -> tuple[State, EpisodeInfo]:
+    """The last part of an episode: costs of the worlds' outcomes and states at the end."""
+    outcomes, last = rollout.grid(found, (len(population), num_trials))
+    costs = particle_cost(scene.with_constants(constants), outcomes)
+    new, selection = optimizer.tell(state, population, costs, mask)
+    return new, EpisodeInfo(population, outcomes, selection, last)
+
+
 @shared
 def _episode(
     scene: Scene,
     engine: Engine,
     space: DesignSpace,
     num_trials: int,
-    recording: rollout.Recording,
+    options: rollout.Options,
 ) -> EpisodeFunction:
-    how = recording._asdict()
-
     def episode(
         state: State,
         mask: jax.typing.ArrayLike,
@@ -247,14 +277,11 @@ def _episode(
     ) -> tuple[State, EpisodeInfo]:
         _refuse_mask(space, mask)
         space.refuse_population(state.particles)
-        population = optimizer.ask(state, mask)
-        noise = episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
-        hands = jax.vmap(space.params)(population)
-        worlds = scene, engine, hands, noise
-        outcomes, last = rollout.evaluate_to_end(*worlds, constants=constants, **how)
-        costs = particle_cost(scene.with_constants(constants), outcomes)
-        new, selection = optimizer.tell(state, population, costs, mask)
-        return new, EpisodeInfo(population, outcomes, selection, last)
+        own = state, mask, constants, optimizer
+        population, (hands, trials, numbers) = asked(scene, space, num_trials, *own)
+        how = {"constants": numbers} | options._asdict()
+        outcomes, trace = rollout.simulate(scene, engine, hands, trials, **how)
+        return told(scene, num_trials, *own, population, (outcomes, trace.last))
 
     return episode
 

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 import jax
 from rich.console import Console
 
+from codesign_jax import batch
 from codesign_jax.codesign import Task
-from codesign_jax.commands import calls
 from codesign_jax.engines import Engine
 from codesign_jax.optimize import answer
 from codesign_jax.report.statistics import Interval
@@ -26,14 +26,14 @@ def simulate(case: Case, engine: Engine, options: "Export", console: Console) ->
     steps, count = options.tolerance_steps, options.tolerance_trials
     planned = study(case, options)
     task = Task(case.scene, planned.space, count, engine)
-    size, key = calls.size(1 + int(planned.room.sum()), count), jax.random.key(options.seed)
+    size, key = batch.size(1 + int(planned.room.sum()), count), jax.random.key(options.seed)
     _announce(planned, options, console)
     with Meter("tolerance", planned.most * count, console) as meter:
 
         def reply(asked: tolerance.Round) -> list[Interval]:
             meter.total = meter.done + count * (len(asked.designs) + asked.most)
             designs = planned.designs[asked.designs]
-            return tolerance.shares(calls.simulate(task, key, designs, size, meter))
+            return tolerance.shares(batch.evaluate(task, key, designs, size, meter.advance))
 
         found = answer(tolerance.search(planned, size), reply)
     known = found[0].value >= tolerance.WANTED

@@ -7,9 +7,9 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import codesign, files, preflight, runs
+from codesign_jax import batch, codesign, files, preflight, runs
 from codesign_jax.codesign import Task
-from codesign_jax.commands import calls, common
+from codesign_jax.commands import common
 from codesign_jax.commands.common import find_case
 from codesign_jax.cost import particle_cost
 from codesign_jax.report import landscape
@@ -50,7 +50,7 @@ def main(options: "Options") -> int:
         console.print(runs.describe(case.space, case.design, "around"))
     for note in preflight.notes(case.scene, case.space, {"the design": case.design}):
         console.print(note)
-    size = calls.size(len(made.designs), options.trials)
+    size = batch.size(len(made.designs), options.trials)
     count = common.counted(-(-len(made.designs) // size), "call")
     console.print(f"grasps: {len(made.designs) * options.trials} in {count}")
     if options.dry_run:
@@ -123,7 +123,7 @@ def simulated_designs(
     """Simulates all designs in the same trials, some at a time; outcomes (design, trial)."""
     task = Task(case.scene, case.space, options.trials, case.make_engine())
     with Meter("landscape", len(designs) * options.trials, console) as meter:
-        return calls.simulate(task, jax.random.key(options.seed), designs, size, meter)
+        return batch.evaluate(task, jax.random.key(options.seed), designs, size, meter.advance)
 
 
 def summarize(case: Case, made: Plane, found: Outcome, seed: int) -> Landscape:

@@ -7,9 +7,9 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import preflight, sampling
+from codesign_jax import batch, preflight, sampling
 from codesign_jax.codesign import VERDICTS, verdicts
-from codesign_jax.commands import calls, common
+from codesign_jax.commands import common
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.runs import dataset
 from codesign_jax.runs.dataset import Question
@@ -78,7 +78,7 @@ def _question(options: "Sample", scene: Scene) -> Question:
     design_space(scene.hand, options.preset)
     before = dataset.begun(options.out)
     if before is None or options.chunk is not None:
-        chunk = calls.size(options.designs, options.trials, most=options.chunk)
+        chunk = batch.size(options.designs, options.trials, most=options.chunk)
     else:
         chunk = before["chunk"]
     return Question(scene, options.engine, options.preset, options.trials, options.seed, chunk)

@@ -13,7 +13,6 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import batch, codesign, runs
-from codesign_jax.commands import calls
 from codesign_jax.engines import make_engine
 from codesign_jax.runs import Record
 from codesign_jax.runs.progress import Meter
@@ -228,9 +227,9 @@ def landscape(
     flat = designs.reshape(-1, designs.shape[-1])
     task = codesign.Task(scene, space, plan.trials, make_engine(engine, scene))
     key = codesign.stream_key(jax.random.key(seed), STREAM_GRID)
-    size = calls.size(len(flat), plan.trials, most=chunk, devices=len(batch.take(devices)))
+    size = batch.size(len(flat), plan.trials, most=chunk, devices=len(batch.take(devices)))
     with Meter(plan.name, plan.grasps, console) as meter:
-        outcome = calls.simulate(task, key, flat, size, meter, devices=devices)
+        outcome = batch.evaluate(task, key, flat, size, meter.advance, devices=devices)
     shape = (plan.points, plan.points, plan.trials)
     found = {"trial_cost": outcome.cost, "status": outcome.status.astype(np.uint8)}
     found = {name: values.reshape(shape) for name, values in found.items()}

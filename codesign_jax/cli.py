@@ -32,10 +32,12 @@ def _size(name: str, meaning: str) -> Any:
 class Command:
     """A command: its flags are fields, its work is `main` of the module of its name."""
 
+    folder = "commands"
+
     def run(self) -> int:
         """Runs the command and returns the exit status."""
-        name = type(self).__name__.lower()
-        return importlib.import_module(f"codesign_jax.commands.{name}").main(self)
+        name = f"{self.folder}.{type(self).__name__.lower()}"
+        return importlib.import_module(f"codesign_jax.{name}").main(self)
 
 
 @dataclasses.dataclass
@@ -327,6 +329,8 @@ class Studio(Command, RunOrDesign):
     exported, improved by a short search, and those of a run looked through. The page is served on
     this machine alone, to the browser that opens the printed address.
     """
+
+    folder = "studio"
 
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("studio")
     """Folder of what is saved from the page."""

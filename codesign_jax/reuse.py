@@ -30,7 +30,7 @@ from typing import Any
 from codesign_jax import files  # NumPy and JAX are imported where they are used: `--help` is quick
 
 ROOT = Path(__file__).parent
-UNRELATED = ("commands", "export", "optimize", "report", "runs")
+UNRELATED = ("commands", "export", "optimize", "report", "runs", "studio")
 """Folders that no simulation depends on: they import engines, never the other way."""
 _UNTRACED = ("compiler", "files", "reuse", "store")
 """What is not traced: to replace a name there is to change the machinery and no physics."""

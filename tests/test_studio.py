@@ -11,11 +11,11 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from codesign_jax import cli
-from codesign_jax.commands import server
-from codesign_jax.commands import tab as tabs
-from codesign_jax.commands.studio import Studio, about
-from codesign_jax.commands.tab import COUNTS, Desk, Tab
 from codesign_jax.runs import choice
+from codesign_jax.studio import server
+from codesign_jax.studio import tab as tabs
+from codesign_jax.studio.studio import Studio, about
+from codesign_jax.studio.tab import COUNTS, Desk, Tab
 from tests.helpers import tiny_run
 from tests.helpers.browsers import chromium, chromium_launcher  # noqa: F401
 from tests.helpers.command_runs import command, own_workplace  # noqa: F401

@@ -19,13 +19,14 @@ from websockets.sync.server import Server, ServerConnection
 
 from codesign_jax import preflight
 from codesign_jax.codesign import VERDICTS
-from codesign_jax.commands import common, server
-from codesign_jax.commands.tab import COUNTS, Desk, Tab
+from codesign_jax.commands import common
 from codesign_jax.report import viewer
 from codesign_jax.runs import choice, tables
 from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.schema import InputError
+from codesign_jax.studio import server
+from codesign_jax.studio.tab import COUNTS, Desk, Tab
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Studio as Options

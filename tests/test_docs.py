@@ -24,8 +24,8 @@ from codesign_jax.commands import (
     render,
     replay,
     report,
-    studio,
 )
+from codesign_jax.studio import studio
 from tests.helpers import tiny_run
 from tests.helpers.toy_engine import TINY
 

@@ -275,7 +275,7 @@ def test_what_is_imported_is_there():
 # there what users have of it, and what could go in its place.
 MOST_LINES = {
     "codesign_jax": 40_800,
-    "codesign_jax/codesign": 600,
+    "codesign_jax/codesign": 601,
     "codesign_jax/commands": 2_950,
     "codesign_jax/compiler": 3_100,
     "codesign_jax/env": 400,

@@ -15,7 +15,6 @@ The front page has an optimisation in ten lines; `notebooks/` go on from there.
 
 from codesign_jax.codesign.episode import (
     STREAM_TRIAL,
-    EpisodeFunction,
     EpisodeInfo,
     Task,
     asked,
@@ -49,7 +48,6 @@ __all__ = [
     "STREAM_TRIAL",
     "SUCCESS_COST",
     "VERDICTS",
-    "EpisodeFunction",
     "EpisodeInfo",
     "FinalTest",
     "Task",

@@ -25,8 +25,6 @@ from codesign_jax.types import Outcome, Params, Trial
 STREAM_TRIAL = 0x7472696C
 """Stream of the noise of an episode's trials ("tril")."""
 
-EpisodeFunction = Callable[..., tuple[State, "EpisodeInfo"]]
-
 
 class EpisodeInfo(NamedTuple):
     """What one episode reports.
@@ -126,7 +124,7 @@ class Task:
         """
         self.space.refuse_population(population)
         self.space.check(population)
-        return Program(self.scene, self._evaluation)(jnp.asarray(population), key, constants)
+        return Program(self.scene, self._programs.evaluate)(jnp.asarray(population), key, constants)
 
     def episode(
         self,
@@ -149,7 +147,7 @@ class Task:
             `cost.maximum`, which is one number.
         """
         mask = np.ones(self.space.num_parameters, bool) if mask is None else mask
-        return self._joined(self._episode, optimizer)(state, mask, constants)
+        return self._joined(self._programs.episode, optimizer)(state, mask, constants)
 
     def run(
         self,
@@ -174,19 +172,11 @@ class Task:
         Returns:
           The state at the end, and reports with leading axis (episode,).
         """
-        return self._joined(self._run, optimizer)(state, masks, constants)
+        return self._joined(self._programs.run, optimizer)(state, masks, constants)
 
     @functools.cached_property
-    def _evaluation(self) -> Callable[..., Outcome]:
-        return _evaluation(*self.how)
-
-    @functools.cached_property
-    def _episode(self) -> Callable:
-        return _episode(*self.how)
-
-    @functools.cached_property
-    def _run(self) -> Callable:
-        return _run(*self.how)
+    def _programs(self) -> "_Programs":
+        return _programs(*self.how)
 
     def _joined(self, program: Callable, optimizer: Optimizer) -> Program:
         """A program with its optimiser, which warns where that does not see costs of one's own."""
@@ -209,24 +199,6 @@ class _Weighing(Program):
                 stacklevel=2,
             )
         return found
-
-
-@shared
-def _evaluation(
-    scene: Scene,
-    engine: Engine,
-    space: DesignSpace,
-    num_trials: int,
-    options: rollout.Options,
-) -> Callable[..., Outcome]:
-    how = options._asdict()
-
-    def simulate(population: jax.Array, key: jax.Array, constants: Constants) -> Outcome:
-        trials = rollout.sample_trials(scene, key, num_trials, constants=constants)
-        hands = jax.vmap(space.params)(population)
-        return rollout.evaluate(scene, engine, hands, trials, constants=constants, **how)
-
-    return simulate
 
 
 def asked(
@@ -261,14 +233,30 @@ def told(
     return new, EpisodeInfo(population, outcomes, selection, last)
 
 
+class _Programs(NamedTuple):
+    """What a task runs."""
+
+    evaluate: Any
+    episode: Any
+    run: Any
+
+
 @shared
-def _episode(
+def _programs(
     scene: Scene,
     engine: Engine,
     space: DesignSpace,
     num_trials: int,
     options: rollout.Options,
-) -> EpisodeFunction:
+) -> _Programs:
+    how = options._asdict()
+
+    def evaluate(population: jax.Array, key: jax.Array, constants: Constants) -> Outcome:
+        trials = rollout.sample_trials(scene, key, num_trials, constants=constants)
+        hands = jax.vmap(space.params)(population)
+        return rollout.evaluate(scene, engine, hands, trials, constants=constants, **how)
+
+    @jax.jit  # is traced once for itself and for `run`
     def episode(
         state: State,
         mask: jax.typing.ArrayLike,
@@ -279,11 +267,21 @@ def _episode(
         space.refuse_population(state.particles)
         own = state, mask, constants, optimizer
         population, (hands, trials, numbers) = asked(scene, space, num_trials, *own)
-        how = {"constants": numbers} | options._asdict()
-        outcomes, trace = rollout.simulate(scene, engine, hands, trials, **how)
+        outcomes, trace = rollout.simulate(scene, engine, hands, trials, constants=numbers, **how)
         return told(scene, num_trials, *own, population, (outcomes, trace.last))
 
-    return episode
+    def run(
+        state: State,
+        masks: jax.typing.ArrayLike,
+        constants: Constants,
+        optimizer: Optimizer,
+    ) -> tuple[State, EpisodeInfo]:
+        def one(state: State, mask: jax.Array) -> tuple[State, EpisodeInfo]:
+            return episode(state, mask, constants, optimizer)
+
+        return jax.lax.scan(one, state, jnp.asarray(masks))
+
+    return _Programs(evaluate, episode, run)
 
 
 def _refuse_mask(space: DesignSpace, mask: jax.typing.ArrayLike) -> None:
@@ -297,24 +295,6 @@ def _refuse_mask(space: DesignSpace, mask: jax.typing.ArrayLike) -> None:
         raise InputError(
             [f"the mask has shape {np.shape(mask)}, not ({space.num_parameters},), that is {names}"]
         )
-
-
-@shared
-def _run(scene: Scene, *how: Any) -> EpisodeFunction:
-    episode = _episode(scene, *how)
-
-    def run(
-        state: State,
-        masks: jax.typing.ArrayLike,
-        constants: Constants,
-        optimizer: Optimizer,
-    ) -> tuple[State, EpisodeInfo]:
-        def one(state: State, mask: jax.Array) -> tuple[State, EpisodeInfo]:
-            return episode(state, mask, constants, optimizer)
-
-        return jax.lax.scan(one, state, jnp.asarray(masks))
-
-    return run
 
 
 def episode_trials(

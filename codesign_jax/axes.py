@@ -66,7 +66,6 @@ def refuse_other(scene: Any, engine: Any) -> None:
     """Refuses a scene that is not one that the engine was made for.
 
     Args:
-      scene: What should be a scene.
       engine: What should be an engine. Those of one's own without an attribute `scene` take all.
 
     Raises:
@@ -102,7 +101,6 @@ def refuse_constants(constants: Constants, count: int, axis: str) -> None:
     Args:
       constants: The constants, leaves of shape () or (n,).
       count: Length of the axis.
-      axis: Its name.
 
     Raises:
       InputError: With the first leaf of another length.
@@ -120,7 +118,6 @@ def refuse_draws(key: Any, count: int) -> None:
 
     Args:
       key: What should be one typed key of JAX.
-      count: What should be a number of trials.
 
     Raises:
       InputError: If `key` is anything but one typed key, or `count` is no whole number or below 1.

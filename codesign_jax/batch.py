@@ -91,8 +91,6 @@ class Batch:
         """Compiles nothing yet.
 
         Args:
-          task: What is simulated.
-          optimizer: Optimiser over the task's space.
           devices: Number of devices that simulate; None for all of this process.
           limit: Most worlds of one device in one call.
 

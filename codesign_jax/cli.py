@@ -32,11 +32,11 @@ def _size(name: str, meaning: str) -> Any:
 class Command:
     """A command: its flags are fields, its work is `main` of the module of its name."""
 
-    folder = "commands"
+    package = "commands"
 
     def run(self) -> int:
         """Runs the command and returns the exit status."""
-        name = f"{self.folder}.{type(self).__name__.lower()}"
+        name = f"{self.package}.{type(self).__name__.lower()}"
         return importlib.import_module(f"codesign_jax.{name}").main(self)
 
 
@@ -330,7 +330,7 @@ class Studio(Command, RunOrDesign):
     this machine alone, to the browser that opens the printed address.
     """
 
-    folder = "studio"
+    package = "studio"
 
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("studio")
     """Folder of what is saved from the page."""

@@ -37,11 +37,7 @@ def atomically(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Gives an error of writing to a file, such as of a full disk, the file's name.
-
-    Args:
-      path: The file that the block writes.
-    """
+    """Gives an error of writing to a file, such as of a full disk, the file's name."""
     try:
         yield
     except OSError as error:

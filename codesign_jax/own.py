@@ -64,7 +64,6 @@ def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
     """Imports a cost and tries it on arrays without values.
 
     Args:
-      name: Its name.
       scene: The scene whose grasps it is to judge.
 
     Returns:
@@ -102,7 +101,6 @@ def make_policy(name: str, scene: Scene) -> tuple[Policy, Scene]:
     """Imports a policy, or a class that makes one of a scene, and tries it without values.
 
     Args:
-      name: Its name.
       scene: The scene whose hand it is to drive.
 
     Returns:
@@ -128,8 +126,6 @@ def make_optimizer(name: str, space: Space, num_particles: int | None = None) ->
     """Imports an optimiser's class, or whatever makes one from a space.
 
     Args:
-      name: Its name.
-      space: Bounds and constraint of the parameters.
       num_particles: Particles of a run, with which its functions are tried on a cost of zero.
 
     Raises:

@@ -32,7 +32,6 @@ def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
     drive them apart with energy that no actuator gave.
 
     Args:
-      scene: The scene.
       fields: Model fields with leading axis (world,).
     """
     fields = jax.lax.stop_gradient(fields)  # a verdict has no derivative
@@ -63,7 +62,6 @@ def depth(scene: Scene, fields: ModelFields) -> jax.Array:
     are straight; how deep they stand in one another says `depth_between`.
 
     Args:
-      scene: The scene.
       fields: Model fields with leading axis (world,).
 
     Returns:

@@ -154,7 +154,6 @@ class Store:
         """Reads what is there, up to the first damaged part; what cannot be read counts as none.
 
         Args:
-          path: The file.
           about: See `head`.
         """
         self.path, self._own, self.about, self.refused = path, about, None, ""

@@ -49,7 +49,6 @@ def lost(bounds: Bounds, distance: Any, step: Any) -> Any:
     """Whether the object is lost: far from the hand, and within the window of the cost.
 
     Args:
-      bounds: What decides a world.
       distance: Object centre to hand centre [m].
       step: Index of the time step, broadcast against the distance.
     """
@@ -60,7 +59,6 @@ def sound(bounds: Bounds, distance: Any, height: Any) -> Any:
     """Whether a state consists of numbers and its object is not below the table.
 
     Args:
-      bounds: What decides a world.
       distance: Object centre to hand centre [m].
       height: Object centre above the table [m].
     """
@@ -80,10 +78,8 @@ def goes_on(
     The step is kept if the state after it is `slow` as well, else the world stays where it was.
 
     Args:
-      bounds: What decides a world.
       distance: Object centre to hand centre [m].
       height: Object centre above the table [m].
-      speed: Largest absolute generalized velocity.
       step: Index of the time step.
       to_end: Whether worlds that lost their object are simulated to the end all the same.
     """
@@ -95,7 +91,6 @@ def failures(scene: Scene, trace: Trace) -> jax.Array:
     """Why each state of a trace is not sound, or its step not valid; bits of `Status`, else 0.
 
     Args:
-      scene: The scene.
       trace: Trace of one world, arrays of shape (time,).
 
     Returns:

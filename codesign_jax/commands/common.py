@@ -154,10 +154,7 @@ def parse_design(
     """Reads changes of a design given as NAME=VALUE in the hand file's units.
 
     Args:
-      space: The design space.
-      pairs: The changes.
       base: What is changed [SI units], shape (parameter,).
-      where: Where the pairs stand, for messages.
 
     Returns:
       The design [SI units], shape (parameter,).

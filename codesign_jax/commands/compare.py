@@ -133,8 +133,6 @@ def difference(first: np.ndarray, second: np.ndarray, names: list[str]) -> list[
 
     Args:
       first: Which trials the first design kept, shape (trial,) bool.
-      second: Those of the second.
-      names: What to call them.
     """
     only = int((first & ~second).sum()), int((~first & second).sum())
     both, total = int((first & second).sum()), len(first)

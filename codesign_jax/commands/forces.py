@@ -90,9 +90,6 @@ def pull(scene: Scene, engine: Engine, params: Params, trials: Trial) -> np.ndar
     no pull up to `MOST` takes is infinite.
 
     Args:
-      scene: The scene.
-      engine: Its engine.
-      params: Parameters of the hand.
       trials: Trials with leading axis (trial,).
 
     Raises:

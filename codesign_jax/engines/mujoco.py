@@ -33,7 +33,6 @@ class MujocoEngine(Equal):
         """Prepares the engine.
 
         Args:
-          scene: The scene.
           num_threads: Threads to use; 0 for all cores.
         """
         refuse_meshes(scene, self.name)

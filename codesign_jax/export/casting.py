@@ -46,12 +46,7 @@ class Parts(NamedTuple):
 
 
 def parts(size: Size, process: Process) -> Parts:
-    """Builds a finger and its moulds.
-
-    Args:
-      size: The finger's dimensions.
-      process: What the design does not say.
-    """
+    """Builds a finger and its moulds."""
     return Parts(_finger(size, process), _tray(size, process), _core(size, process),
                  _base(size, process))  # fmt: skip
 
@@ -62,10 +57,6 @@ def _solid(
     """The body from x[0] to x[1], -half to half and low to high, whose faces are plane.
 
     Args:
-      x: Where it begins and ends.
-      half: Half of its width.
-      low: Its underside.
-      high: Its top.
       grow: How far its four upright faces are moved outwards, at a place along and a height.
     """
     corners = []

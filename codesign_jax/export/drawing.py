@@ -27,7 +27,6 @@ def write(folder: Path, *content: Any, assembly: Sequence[SheetSection], **shown
     """Writes the sheet to a folder as two pages of PDF.
 
     Args:
-      folder: The folder.
       content: As of `page`.
       assembly: The second page's sections, see `sheet.assembly_sections`.
       shown: As of `page`.
@@ -52,12 +51,8 @@ def page(
     """Draws the sheet on one page.
 
     Args:
-      title: Its title.
-      lines: What it is about, below the title.
       content: The sections, see `sheet.sheet_sections`.
-      scene: The scene.
       params: Parameters of the design as concrete arrays.
-      sizes: Dimensions of the fingers.
       drift: Tolerances, or None.
     """
     # A figure of its own instead of pyplot's: no state and no display is touched.

@@ -91,7 +91,6 @@ def timed_controls(scene: Scene, params: Params, trial: Trial) -> np.ndarray:
     """Time [s] and controls of each step of a grasp in float64, shape (time, 1 + nu).
 
     Args:
-      scene: The scene.
       params: Parameters as concrete arrays.
       trial: The trial as concrete arrays.
     """

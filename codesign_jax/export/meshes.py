@@ -39,8 +39,6 @@ def write(folder: Path, sizes: list[Size], process: Process) -> list[Part]:
 
     Args:
       folder: An existing folder.
-      sizes: Dimensions of the fingers.
-      process: The process.
 
     Returns:
       The parts.

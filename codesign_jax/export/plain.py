@@ -77,7 +77,6 @@ def engine_model(
     """Compiles a spec to the model of the engine `mujoco`: inverse weights are the declared ones.
 
     Args:
-      scene: The scene.
       spec: A spec of `model.build_spec`; it stays as it is.
       shares: Stiffness of geoms that are not as stiff as declared, see `skin.add`.
     """
@@ -95,7 +94,6 @@ def text(scene: Scene, spec: mujoco.MjSpec, shares: Mapping[str, float] = NONE) 
     """MJCF which plain MuJoCo compiles to a model of the same dynamics as `engine_model`.
 
     Args:
-      scene: The scene.
       spec: A spec of `model.build_spec`; its contact pairs are rewritten.
       shares: As in `engine_model`.
 
@@ -123,12 +121,7 @@ def _share(pair: mujoco.MjsPair, shares: Mapping[str, float]) -> float:
 
 
 def _absorb(pair: mujoco.MjsPair, ratio: float) -> bool:
-    """Gives a pair the impedance and reference of the module's formulas; False if it cannot.
-
-    Args:
-      pair: The pair.
-      ratio: Declared over compiled inverse weight.
-    """
+    """Gives a pair the impedance and reference of the module's formulas; False if it cannot."""
     d = float(pair.solimp[0])
     softness = (1 - d) / d * ratio
     if not _SOFTNESS[0] <= softness <= _SOFTNESS[1]:

@@ -99,9 +99,7 @@ def sizes(hand: Hand, params: Params, process: Process) -> list[Size]:
     """Dimensions of a hand's fingers.
 
     Args:
-      hand: The hand.
       params: Its parameters as concrete arrays.
-      process: The process.
 
     Raises:
       InputError: With every finger that has no room for a chamber.

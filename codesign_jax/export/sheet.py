@@ -62,9 +62,7 @@ def sheet_sections(
     """The sheet's content.
 
     Args:
-      scene: The scene.
       params: Parameters of the design as concrete arrays.
-      sizes: Dimensions of the fingers.
       drift: Tolerances, or None if they were not asked for.
       tested: The verdict of the run that found the design, and its grasps under other conditions.
     """
@@ -307,13 +305,7 @@ def _percent(share: Interval) -> str:
 
 
 def markdown(title: str, lines: Sequence[str], content: Sequence[SheetSection]) -> str:
-    """The sheet as Markdown.
-
-    Args:
-      title: Its title.
-      lines: What it is about, below the title.
-      content: The sections.
-    """
+    """The sheet as Markdown."""
     text = [f"# {title}", "", *(f"{line}  " for line in lines)]
     for section in content:
         text += ["", f"## {section.title}"]

@@ -43,7 +43,6 @@ def balls(scene: Scene, finger: int, params: Params) -> list[Ball]:
     """The spheres of a finger, as high as the section on the inside of its bottom layer.
 
     Args:
-      scene: A scene with rings.
       finger: Index of the finger.
       params: Parameters of the hand as concrete arrays.
     """
@@ -71,8 +70,6 @@ def add(scene: Scene, spec: mujoco.MjSpec, params: Params) -> dict[str, float]:
     """Adds spheres and capsules to a spec, with their pairs.
 
     Args:
-      scene: A scene with rings and one object.
-      spec: Its spec, which is changed.
       params: Parameters of the hand as concrete arrays.
 
     Returns:

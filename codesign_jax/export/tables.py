@@ -61,7 +61,6 @@ def write_commands(folder: Path, scene: Scene, schedule: np.ndarray) -> Path:
 
     Args:
       folder: An existing folder.
-      scene: The scene.
       schedule: Time and controls, see `grasps.timed_controls`.
 
     Returns:
@@ -86,8 +85,6 @@ def write_grasps(
 
     Args:
       folder: An existing folder.
-      scene: The scene.
-      trials: Name and trial of each grasp.
       grasps: The grasps, which are asked for one after the other.
 
     Yields:

@@ -120,10 +120,8 @@ def study(scene: Scene, space: DesignSpace, design: np.ndarray, steps: int, *, f
     """Plans the steps.
 
     Args:
-      scene: The scene.
       space: The design space in which the design was found.
       design: The design [SI units], shape (parameter,).
-      steps: Steps on each side.
       free: Whether to move the parameters of that space, or all of the hand's table.
     """
     whole = space if free else design_space(scene.hand)
@@ -183,7 +181,6 @@ def search(planned: Study, size: int) -> Generator[Round, list[Interval], dict[i
     """Asks for the successes that the tolerances need: those of each side up to its end.
 
     Args:
-      planned: The designs.
       size: Most designs to ask for at a time.
 
     Yields:
@@ -211,7 +208,6 @@ def tolerances(planned: Study, found: Mapping[int, Interval]) -> list[Tolerance]
     """Reads the tolerances off the successes.
 
     Args:
-      planned: The designs.
       found: Shares of successful grasps by index of the design, see `search`.
     """
     space, results, room = planned.space, [], planned.room

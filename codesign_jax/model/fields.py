@@ -193,8 +193,6 @@ def _filled(base: np.ndarray, dtype: Any, *parts: tuple[Any, Any]) -> jax.Array:
     One gather of all numbers: a CPU's XLA makes a loop of every `.at[places].set(values)`.
 
     Args:
-      base: The array.
-      dtype: Type of the result.
       *parts: Places, as NumPy's indices, and numbers that broadcast to what is there.
     """
     source = np.arange(base.size, dtype=np.int32).reshape(base.shape)

@@ -42,7 +42,6 @@ def outline(points: int, *, square: bool = False) -> np.ndarray:
     """Points on the section's outline (width, height), anticlockwise about x, shape (point, 2).
 
     Args:
-      points: Their number, a multiple of four.
       square: Whether the section is the paper's rectangle and not the superellipse that touches.
     """
     m = points // 4
@@ -112,7 +111,6 @@ def rest(
     """Vertices of the straight finger in the frame of its base [m], shape (vertex, 3).
 
     Args:
-      scene: The scene.
       length: Length of the finger [m].
       height: Height of its section [m], of a tapered one at the base.
       square: See `outline`.
@@ -138,7 +136,6 @@ def pose(
     """Vertices of a bent finger by linear blend skinning [m], shape (vertex, 3).
 
     Args:
-      scene: The scene.
       length: Length of the finger [m].
       height: Height of its section [m].
       position: Frame origins of its links, from the half segment on, shape (N + 1, 3).

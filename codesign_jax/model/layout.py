@@ -123,7 +123,6 @@ def implicit_damping(scene: Scene, stiffness: Any, damping: Any) -> Any:
     keeps its own damping.
 
     Args:
-      scene: The scene.
       stiffness: Stiffness K [N/m, N m/rad].
       damping: The joint's own damping D [N s/m, N m s/rad], shaped as the stiffness.
 
@@ -147,7 +146,6 @@ def dissipation(scene: Scene, *, ahead: bool = False) -> Any:
     """Dissipation time of contacts [s].
 
     Args:
-      scene: The scene.
       ahead: Whether contacts act ahead of touch. MuJoCo's do not: one that is to end its step apart
         is gone in the next one, and what should rest hops, unless its dissipation takes longer than
         a step. A tall box on an incline hops with 6 ms at steps of 10 ms and rests with 15.
@@ -233,7 +231,6 @@ def mount_points(hand: Hand, spread: Any, numpy: Any = jnp) -> tuple[Any, Any, A
     """Base points (finger, 3) [m], azimuths and tilts (finger,) [rad] in the palm frame.
 
     Args:
-      hand: The hand.
       spread: Spread between the finger pairs [rad].
       numpy: What computes, `jax.numpy` or NumPy.
     """

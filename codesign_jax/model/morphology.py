@@ -124,11 +124,6 @@ def segments(hand: Hand, params: Params, links: int) -> Segments:
 
     Those of tapered fingers have the mass and its centre by Simpson's rule, which is exact for
     them, and the inertia of the block with the section in their middle.
-
-    Args:
-      hand: The hand.
-      params: Parameters.
-      links: Links N of a finger.
     """
     factor = np.ones(links + 1)
     factor[[0, -1]] = 0.5
@@ -178,10 +173,7 @@ def joint_springs(
     """Stiffness k = EI / l or GJ / l of a segment's length l, and damping beta k (Kelvin-Voigt).
 
     Args:
-      hand: The hand.
-      params: Parameters.
       beams: Of `finger_beams`.
-      links: Links of a finger.
       axes: Axes of a joint, as in `Layout`.
 
     Returns:
@@ -212,10 +204,7 @@ def thresholds(hand: Hand, params: Params, beams: Beam, links: int) -> jax.Array
     nothing bends sideways below the moment T w/2.  See `threshold_moments`.
 
     Args:
-      hand: The hand.
-      params: Parameters.
       beams: Of `finger_beams`.
-      links: Links of a finger.
 
     Returns:
       Of each finger's joints the moment per pressure A_c w/2 [m^3], its loss by the bend angle

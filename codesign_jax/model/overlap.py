@@ -40,8 +40,6 @@ def overlaps(scene: Scene, params: Params, place: np.ndarray, turn: np.ndarray) 
     """Overlaps in states of one hand.
 
     Args:
-      scene: The scene.
-      params: The hand.
       place: Origins of the bodies' frames [m], shape (state, body, 3).
       turn: Their orientations, shape (state, body, 3, 3).
     """
@@ -94,10 +92,8 @@ def _depths(local: np.ndarray, span: np.ndarray, a: np.ndarray, b: np.ndarray) -
     """Depths of points in the frames of links, shape (state, link, point, 3), in these links.
 
     Args:
-      local: The points.
       span: Lengths of the links, shape (link,).
       a: Half of their widths in the middle, same shape.
-      b: Half of their heights, likewise.
     """
     x, y, z = np.moveaxis(local, -1, 0)
     a, b = a[:, None], b[:, None]

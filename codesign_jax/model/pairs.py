@@ -27,13 +27,7 @@ def impedances(scene: Scene) -> list[Any]:
 
 
 def numbers(scene: Scene, friction: Any, impedance: Any) -> tuple[list, list, list]:
-    """MuJoCo's friction (5), solref (2) and solimp (5) of a pair.
-
-    Args:
-      scene: The scene.
-      friction: Its Coulomb coefficient.
-      impedance: Its impedance.
-    """
+    """MuJoCo's friction (5), solref (2) and solimp (5) of a pair."""
     c = scene.contact
     turning = [c.torsional_friction, c.rolling_friction, c.rolling_friction]
     h = scene.discretization.timestep

@@ -326,10 +326,6 @@ def add_pair(scene: Scene, spec: mujoco.MjSpec, first: str, second: str, kind: i
     """Adds a contact pair.
 
     Args:
-      scene: The scene.
-      spec: The spec.
-      first: Name of a geom.
-      second: Name of the other.
       kind: What they are, see `pairs`.
     """
     condim = {"none": 1, "coulomb": 3, "full": 6}[scene.effects.friction]

@@ -79,8 +79,6 @@ def replay(scene: Scene, engine: Engine, params: Params, trials: Trial) -> list[
     """Simulates one hand in several trials and keeps the trajectories.
 
     Args:
-      scene: The scene.
-      engine: The engine.
       params: Parameters of one hand, no leading axis.
       trials: Trials with leading axis (trial,).
     """
@@ -113,11 +111,7 @@ def frames(
     """Draws a grasp at given times.
 
     Args:
-      scene: The scene.
-      grasp: The grasp.
       times: Times of the frames [s], shape (frame,).
-      size: Width and height in pixels.
-      camera: Where it is seen from.
 
     Returns:
       Frames, uint8, shape (frame, height, width, 3).
@@ -168,13 +162,10 @@ def write_film(
     """Writes grasps side by side as a film, GIF or MP4 (H.264) by the path's ending.
 
     Args:
-      scene: The scene.
-      grasps: Grasps to draw.
       path: File to write; its folder is made.
       frames_per_second: Frames of a second of simulated time, which is shown in real time; default:
         12.5 of a GIF, 25 of an MP4.
       size: Width and height of one grasp's picture in pixels.
-      camera: Where it is seen from.
       notify: Told in one line if there is no OpenGL.
 
     Returns:
@@ -232,12 +223,9 @@ def write_strip(
     """Writes a film strip, one row a grasp, by default one frame at the end of each phase.
 
     Args:
-      scene: The scene.
-      grasps: Grasps to draw.
       path: Image file to write; its folder is made.
       times: Times of the frames [s].
       size: Width and height of a frame in pixels.
-      camera: Where it is seen from.
       notify: Told in one line if there is no OpenGL.
 
     Returns:

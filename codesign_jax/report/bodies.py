@@ -74,8 +74,6 @@ def motion(scene: Scene, grasp: Replay, *, rate: float = 25.0) -> Motion:
     """Poses of all bodies of a grasp by MuJoCo's kinematics.
 
     Args:
-      scene: The scene.
-      grasp: The grasp.
       rate: Wanted frames of a second; the nearest that whole time steps allow is taken.
     """
     h = scene.discretization.timestep
@@ -94,7 +92,6 @@ def object_mesh(scene: Scene, index: int) -> tuple[np.ndarray, np.ndarray]:
     """Surface of an object of the set, without noise, in its body's frame.
 
     Args:
-      scene: The scene.
       index: Index of the object.
 
     Returns:
@@ -111,7 +108,6 @@ def vertices(part: Part, pose: np.ndarray) -> np.ndarray:
     """Vertices of a part in the world [m], shape (vertex, 3).
 
     Args:
-      part: The part.
       pose: Poses of the bodies, shape (body, 7).
     """
     turn = np.zeros((len(pose), 9))

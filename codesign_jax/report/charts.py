@@ -72,8 +72,6 @@ def parameter_chart(history: History, space: DesignSpace, chosen: np.ndarray) ->
     """Distribution of every parameter over the episodes: range, quartiles and median.
 
     Args:
-      history: The run's history.
-      space: Its design space.
       chosen: The chosen design [SI units], shape (parameter,), drawn as a line.
     """
     count = space.num_parameters
@@ -138,8 +136,6 @@ def designs(
     """All particles of a run with two parameters, over the landscape where there is one.
 
     Args:
-      history: The run's history.
-      space: A design space of two parameters.
       chosen: The chosen design [SI units], shape (2,).
       landscape: The cost over the same two parameters, or None.
     """
@@ -190,7 +186,6 @@ def grip_chart(forces: Forces, scene: Scene) -> go.Figure:
 
     Args:
       forces: Forces of a grasp, arrays of shape (time, ...).
-      scene: Its scene, whose phases are marked.
     """
     figure = go.Figure()
     time = scene.discretization.timestep * np.arange(len(forces.grip))

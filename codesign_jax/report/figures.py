@@ -22,8 +22,6 @@ def cost_evolution(
     Args:
       cost: Particle costs, shape (episode, particle).
       path: File to write; its folder is made.
-      threshold: Cost of the dashed line.
-      title: Text above the figure.
 
     Returns:
       The path.
@@ -52,7 +50,6 @@ def landscape(found: Landscape, path: Path) -> Path:
     Lines enclose where the mean cost is below the thresholds of convergence and of success.
 
     Args:
-      found: The landscape.
       path: File to write; its folder is made.
 
     Returns:

@@ -22,7 +22,6 @@ def write(run: Run, grasp: tuple[Grasp, Replay] | None, path: Path) -> Path:
     """Writes the report of a run.
 
     Args:
-      run: The run.
       grasp: The grasp to show and what happened when it was simulated again, or None.
       path: The file; its folder is made.
 

@@ -17,7 +17,6 @@ def render(
     """Renders one frame for each row of qpos.
 
     Args:
-      model: Model to draw.
       qpos: Generalized positions, shape (frame, nq).
       camera: Azimuth and elevation [deg], distance [m] and point looked at [m], six numbers.
       frames: What becomes the frames, uint8, shape (frame, height, width, 3).

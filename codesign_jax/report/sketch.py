@@ -25,12 +25,8 @@ def draw(
     """Draws one frame for each row of qpos.
 
     Args:
-      scene: The scene.
-      model: Model of the hand and object.
       qpos: Generalized positions, shape (frame, nq).
       shape: Index of the object's shape.
-      size: Width and height in pixels.
-      camera: Where it is seen from.
 
     Returns:
       Frames, uint8, shape (frame, height, width, 3).

@@ -16,7 +16,6 @@ def wilson(successes: int, total: int) -> Interval:
     """Share of successes with Wilson's score interval (Wilson 1927).
 
     Args:
-      successes: Number of successes.
       total: Number of trials, at least one.
     """
     from scipy import stats  # takes half a second to import: commands do so once they are done
@@ -32,9 +31,7 @@ def paired(both: int, first: int, second: int, total: int) -> Interval:
     two differ it has a width, unlike Wald's and the bootstrap's.
 
     Args:
-      both: Trials in which both succeeded.
       first: Those in which the first alone did.
-      second: Those in which the second alone did.
       total: All trials, at least one.
     """
     one, other = wilson(both + first, total), wilson(both + second, total)
@@ -59,7 +56,6 @@ def mcnemar(first: int, second: int) -> float:
 
     Args:
       first: Trials in which the first alone succeeded.
-      second: Those in which the second alone did.
     """
     from scipy import stats
 

@@ -215,12 +215,7 @@ def _poses(
 
 
 def of_design(scene: Scene, params: Params) -> list[str]:
-    """Warnings of a design itself, of which nothing is simulated.
-
-    Args:
-      scene: The scene.
-      params: Its parameters, numbers.
-    """
+    """Warnings of a design itself, of which nothing is simulated."""
     found: list[str] = []
     limits = morphology.pressure_limits(scene.hand, params)
     for f, bend in enumerate(morphology.free_bends(scene.hand, params)):
@@ -264,13 +259,7 @@ def of_bends(strain: np.ndarray, held: np.ndarray) -> list[str]:
 
 
 def of_overlaps(scene: Scene, params: Params, depths: list[Overlaps]) -> list[str]:
-    """Warnings of fingers that stand in something while the object is held.
-
-    Args:
-      scene: The scene.
-      params: The hand.
-      depths: Overlaps of a grasp each.
-    """
+    """Warnings of fingers that stand in something while the object is held."""
     if not depths:
         return []
     fingers = np.concatenate([d.fingers for d in depths]).max(0)

@@ -72,7 +72,6 @@ def judge(kept: int, total: int) -> Verdict:
     decision stays.
 
     Args:
-      kept: Grasps that it kept.
       total: All grasps, at least one.
     """
     good = kept / total > RELIABLE - 1e-9

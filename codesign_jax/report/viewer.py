@@ -55,13 +55,7 @@ _PAGE = """<!DOCTYPE html>
 
 
 def fragment(scene: Scene, grasp: Replay, name: str = "replay") -> str:
-    """HTML of a grasp, for a page that `page` makes.
-
-    Args:
-      scene: The scene.
-      grasp: The grasp.
-      name: Identifier of its element in the page.
-    """
+    """HTML of a grasp, for a page that `page` makes."""
     shown = data(scene, grasp) | {"strip": _strip(scene, grasp)}
     # "<" appears in no JSON but inside strings, where its escape means the same.
     text = json.dumps(shown).replace("<", "\\u003c")
@@ -77,8 +71,6 @@ def page(title: str, body: str, *scripts: str) -> str:
     """A whole page.
 
     Args:
-      title: Its title, plain text.
-      body: HTML of its body.
       scripts: JavaScript that the body calls, beside the viewer.
     """
     script = "\n".join([*scripts, web("replay.js")])
@@ -94,11 +86,7 @@ def write(scene: Scene, grasp: Replay, path: Path, *, title: str, text: list[str
     """Writes a grasp alone as an HTML file.
 
     Args:
-      scene: The scene.
-      grasp: The grasp.
       path: The file; its folder is made.
-      title: Title of the page, plain text.
-      text: Lines above the picture, plain text.
 
     Returns:
       The path.

@@ -71,10 +71,8 @@ class Checkpoints:
         """Opens the folder, and makes it if it is missing.
 
         Args:
-          folder: Folder of the steps.
           run: Identity of the run, 32 hexadecimal digits, which every step carries; None for steps
             of no run.
-          keep: Newest steps to keep.
           tell: Called when the folder is closed, with a message, if a step could not be deleted;
             from then on orbax deletes none.
           read_only: Opens a folder that exists and changes nothing in it, not even what a process

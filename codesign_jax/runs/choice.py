@@ -202,7 +202,6 @@ def find_grasp(
     """A grasp of a run, by the numbers of trials.csv.
 
     Args:
-      scene: The run's scene.
       record: The run, with a finished episode at least.
       episode: Number of the episode, from 1; None for the chosen particle's, or the last if
         `particle` is given.

@@ -103,7 +103,6 @@ def strain_pressure(
     the neo-Hookean law is known, so that both laws have a closed form.
 
     Args:
-      strain: The strain.
       height: Outer height h [m], any shape.
       wall: Wall thickness d [m], same shape.
       width: Outer width w [m].

@@ -82,7 +82,6 @@ def refusals(effects: Any, engine: str) -> dict[str, str]:
 
     Args:
       effects: The scene's `Effects`.
-      engine: Name of the engine.
     """
     values = dataclasses.asdict(effects)
     found = {name: EFFECTS[name].refused.get(engine, {}).get(v) for name, v in values.items()}
@@ -94,7 +93,6 @@ def refuse(effects: Any, engine: str) -> None:
 
     Args:
       effects: The scene's `Effects`.
-      engine: Name of the engine.
 
     Raises:
       InputError: With a line for each effect that it cannot do.

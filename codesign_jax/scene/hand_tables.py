@@ -95,7 +95,6 @@ class Finger:
 
         Args:
           cosine: Cosine of azimuth + spread * gamma, of any shape; may be traced.
-          sine: Its sine.
         """
         if self.base is not None:
             return self.base[0], self.base[1]
@@ -244,9 +243,7 @@ def highest_pressure(hand: "Hand", height: Any, wall: Any, tip: Any = None) -> A
     """Highest pressure of fingers of a height and wall [m], any shape [Pa].
 
     Args:
-      hand: The hand.
       height: Section height, of tapered fingers at the base.
-      wall: Wall thickness, likewise.
       tip: Height, wall and width at the tip, the lower of whose limits counts; None without taper.
     """
     limit = hand.pressure_limit.of

@@ -199,7 +199,6 @@ def load(name: str | Path, hand: Hand, *, overrides: Mapping[Any, Any] | None = 
 
     Args:
       name: Name of a built-in control, or a path ending in .toml.
-      hand: The hand that it drives.
       overrides: Values by key path that replace the file's; see `keypaths`.
 
     Raises:
@@ -499,7 +498,6 @@ def check(scene: Any, where: str) -> list[str]:
 
     Args:
       scene: The scene, its numbers not traced.
-      where: Key path of the control.
     """
     own = {row.name: _ends(row.row) for row in scene.control.parameter}
     fixed = {name: (value, value) for name, value in _scene_times(scene).items()}

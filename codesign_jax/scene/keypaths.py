@@ -94,10 +94,7 @@ def apply(
     """Changes values of a file that was read; the file's schema checks keys and values afterwards.
 
     Args:
-      table: The file's content, which is changed.
       changes: Values by path.
-      where: The file's name, for messages.
-      problems: List that collects the messages.
       root: Key of the scene that leads into the file, such as "objects".
 
     Returns:

@@ -175,11 +175,6 @@ PRIMITIVES = {
 
 
 def check(kind: str, names: Any) -> None:
-    """Raises an error if what is given by name is not given for exactly the primitives.
-
-    Args:
-      kind: What it is, for the message.
-      names: The names that it is given for.
-    """
+    """Raises an error if what is given by name is not given for exactly the primitives."""
     if wrong := set(names) ^ set(PRIMITIVES):
         raise TypeError(f"{kind} and primitives have other names: {', '.join(sorted(wrong))}")

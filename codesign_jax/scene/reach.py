@@ -25,7 +25,6 @@ def of(radius: float, size_noise: float) -> float:
 
     Args:
       radius: Largest radius of a contact sphere [m].
-      size_noise: Standard deviation of the object's size, relative.
     """
     needed = radius / (1 - _DEVIATIONS * size_noise)
     return LEAST if needed <= LEAST else math.ceil(needed / _STEP - 1e-9) * _STEP
@@ -69,7 +68,6 @@ def refuse(objects: ObjectSet, radius: float, size_noise: float | None = None) -
     """Refuses contact spheres that are larger than the distances of the set's meshes reach.
 
     Args:
-      objects: The set.
       radius: Largest radius of a contact sphere [m].
       size_noise: Standard deviation of the object's size instead of the set's.
 

@@ -80,9 +80,6 @@ def quantity(
     """Declares a numeric dataclass field with its unit and closed range [low, high].
 
     Args:
-      unit: Unit, for messages and files.
-      low: Smallest allowed value.
-      high: Largest allowed value.
       structure: Whether compiled programs depend on the number; the others are traced values, see
         `numbers`.
       typical: A usual value, see `typical`; by default one well inside the range.
@@ -151,15 +148,7 @@ def _slips(unit: str) -> typing.Iterator[tuple[float, str]]:
 
 
 def range_problem(path: str, value: float, unit: str, low: float, high: float) -> str | None:
-    """Returns why a value lies outside its range, or None.
-
-    Args:
-      path: Key path shown to the user.
-      value: The number read.
-      unit: Its unit.
-      low: Smallest allowed value.
-      high: Largest allowed value.
-    """
+    """Returns why a value lies outside its range, or None."""
     if low <= value <= high:
         return None
     message = f"{path} = {shown(value)} is outside [{low:g}, {high:g}] {unit}".rstrip()
@@ -179,9 +168,6 @@ def parse(cls: type[T], table: Any, path: str, problems: list[str]) -> T | None:
     Args:
       cls: Dataclass to build; fields may be numbers, strings, booleans, dataclasses or tuples of
         these.
-      table: The parsed TOML value.
-      path: Key path of the table, for messages.
-      problems: List that collects the messages.
 
     Returns:
       The dataclass, or None if this table has a problem.

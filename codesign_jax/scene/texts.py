@@ -35,8 +35,6 @@ def problem(path: str, text: str, *, lines: bool = False) -> str | None:
     """Returns why a text is none that a file, a table or a terminal could hold, or None.
 
     Args:
-      path: Key path shown to the user.
-      text: The text.
       lines: Whether it may have several lines.
     """
     if len(text) > MOST_LETTERS:

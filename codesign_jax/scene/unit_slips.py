@@ -51,10 +51,6 @@ def outside(name: str, unit: str, low: float, high: float, values: np.ndarray) -
     """What is wrong with the first value, if any, that is outside of bounds, or None.
 
     Args:
-      name: What the values are of.
-      unit: Their unit.
-      low: Lower bound.
-      high: Upper bound.
       values: The values, shape (n,).
     """
     slack = 1e-6 * max(abs(low), abs(high))  # bounds that went to SI and back, also as float32

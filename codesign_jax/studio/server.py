@@ -102,9 +102,7 @@ def listen(guard: Guard, tab: Callable[[ServerConnection], None], host: str, por
     """A server that listens, and serves once `serve_forever` is called.
 
     Args:
-      guard: Who is answered.
       tab: Takes the connection of one tab, and returns when that is over.
-      host: Name or address to listen at.
       port: Port; 0 for one that is free.
 
     Raises:

@@ -56,9 +56,6 @@ def contacts(
     """Contacts that the scene's effects call for but those between fingers, by pair of bodies.
 
     Args:
-      scene: The scene.
-      hand: Constants of the worlds.
-      kin: Kinematics.
       position: The object's centre, shape (3, 1, world).
       velocity: Of the bodies; none where they are at rest.
     """

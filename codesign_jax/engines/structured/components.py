@@ -35,8 +35,6 @@ def evaluate(jaxpr: Any, consts: Any, args: list[np.ndarray]) -> list[np.ndarray
     """The results of a jaxpr whose arguments are given as components.
 
     Args:
-      jaxpr: The jaxpr.
-      consts: Its constants.
       args: Object arrays, see `lanewise.Lanes.parts`.
 
     Raises:

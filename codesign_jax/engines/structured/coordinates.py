@@ -18,7 +18,6 @@ def make(scene: Scene, qpos: jax.Array, qvel: jax.Array, acc: jax.Array) -> Stat
     """The state at MuJoCo's coordinates, at the beginning of a grasp.
 
     Args:
-      scene: The scene.
       qpos: Generalized positions, shape (world, nq).
       qvel: Generalized velocities, shape (world, nv).
       acc: Accelerations, the solver's warm start, in the order of qvel, the object's as in

@@ -67,7 +67,6 @@ class StructuredEngine(Equal):
         """Prepares the engine.
 
         Args:
-          scene: The scene.
           iterations: Largest number of Newton iterations a step instead of the scene's, see
             `scene.Newton`.
           evaluations: Largest number of line-search evaluations of an iteration.
@@ -142,8 +141,6 @@ class StructuredEngine(Equal):
         Only worlds whose state is not a number, or with too few slots for their contacts, stay.
 
         Args:
-          hand: Constants of the worlds.
-          state: Their states.
           ctrl: Controls, shape (world, time, nu).
 
         Returns:

@@ -67,14 +67,7 @@ class Recording(Equal):
 
 
 def forces(scene: Scene, hand: WorldModel, state: State, acc: Acc) -> Forces:
-    """Forces of a step of a batch, every array with a leading axis (world,).
-
-    Args:
-      scene: The scene.
-      hand: Constants of the worlds.
-      state: States before the step.
-      acc: Accelerations that the step found.
-    """
+    """Forces of a step of a batch, every array with a leading axis (world,)."""
     kin = kinematics(hand, layout(scene).axes, state)
     velocity = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
     motion = propagate(kin, acc)

@@ -36,8 +36,6 @@ def reverse(
 
     Args:
       engine: The engine, which says how long segments are, if there are any.
-      program: The program of the derivative.
-      inputs: The rollout's inputs.
       path: What was stored of it, as tables of blocks.
       bars: Cotangents of its results, as tables of blocks.
       trajectory: As in `Engine.rollout`.

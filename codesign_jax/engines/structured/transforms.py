@@ -41,7 +41,6 @@ def rollout(
     """`StructuredEngine.simulate`'s trace, under any of JAX's transformations but forward mode.
 
     Args:
-      engine: The engine.
       fields: As in `Engine.rollout`.
       ctrl: As in `Engine.rollout`.
       trajectory: As in `Engine.rollout`.
@@ -116,11 +115,7 @@ def _adjoint(
     """Cotangents of fields and controls.
 
     Args:
-      engine: The engine.
       trajectory: As in `Engine.rollout`.
-      fields: Model fields of the rollout.
-      ctrl: Its controls.
-      path: Its steps.
       speed: Its largest velocities, as in `Trace`.
       cotangent: Cotangent of its trace, without status and residual.
     """
@@ -156,7 +151,6 @@ def _gathered(taken: jax.Array, x: jax.Array) -> jax.Array:
     Args:
       taken: Number of steps that each world took, shape (world, 1): later entries show the state
         at its end.
-      x: The cotangents.
     """
     step, end = jnp.arange(x.shape[1])[:, None], taken[:, None]
     rest = jnp.where(step >= end, x, 0.0).sum(1, keepdims=True)

@@ -100,7 +100,6 @@ def eliminate_again(
 
     Args:
       axes: Motion subspace S, shape (axis, 6, finger, world).
-      kept: What the elimination left.
       r: Force on the subtree's base link, shape (6, finger, world).
       r_object: Force on the object, same shape.
       tau: Force on the joint, shape (axis, finger, world); None for none.
@@ -160,7 +159,6 @@ def substitute(
 
     Args:
       axes: Motion subspace, shape (axis, 6, finger, world).
-      factors: Its factors.
       parent: Spatial acceleration of the parent, shape (6, finger or 1, world).
       object_acc: Spatial acceleration of the object, shape (6, 1, world).
 

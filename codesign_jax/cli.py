@@ -278,7 +278,7 @@ class Sample(Command, flags.SceneFlags):
     """
 
     out: Annotated[Path, tyro.conf.arg(metavar="PATH")]
-    """The file, .parquet; what is done of it is kept in a file beside it until it is finished."""
+    """The file, .parquet; what is done of it is kept in a folder beside it until it is finished."""
     designs: int = 1000
     """Number of designs."""
     trials: int = 3

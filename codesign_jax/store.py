@@ -4,15 +4,12 @@ The checksums of zip leave out names and lengths, and what reads them has an err
 each damage; here there is one.
 """
 
-import contextlib
-import fcntl
 import hashlib
 import io
 import json
-import os
 import uuid
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -24,8 +21,7 @@ MOST = 2**30
 """Most bytes of arrays that a file may unpack to."""
 SCHEMA = 2
 """Layout of results, in which their arrays have names and shapes."""
-_DIGEST, _NUMBER, _HEADS = "digest", "number of the part", ("about", "code", "schema")
-_HEAD = 8  # bytes of a part's length
+_DIGEST, _HEADS = "digest", ("about", "code", "schema")
 
 Arrays = Mapping[str, Any]
 
@@ -136,88 +132,3 @@ def found(path: Path, about: Any) -> tuple[dict[str, Any] | None, str]:
     if why := refusal(arrays, about):
         return None, why
     return {name: value for name, value in arrays.items() if name not in _HEADS}, ""
-
-
-class Store:
-    """Results that grow part by part in one file, and are found again by the same case and code.
-
-    A process that is killed leaves the parts before. They are checked when the file is opened, and
-    read again one by one: memory does not grow with the file.
-
-    Attributes:
-      about: What the results that are there are of; None without any.
-      refused: Why they are not taken, with the file as subject; empty if they are. The next part
-        then takes their place.
-    """
-
-    def __init__(self, path: Path, about: Any):
-        """Reads what is there, up to the first damaged part; what cannot be read counts as none.
-
-        Args:
-          about: See `head`.
-        """
-        self.path, self._own, self.about, self.refused = path, about, None, ""
-        self._ends = [0]
-        with contextlib.suppress(OSError, StoreError), path.open("rb") as file:
-            while part := self._next(file, path):
-                if len(self._ends) == 1:
-                    self.refused = refusal(part, about)
-                    self.about = json.loads(str(part.get("about", "null")))
-                self._ends.append(file.tell())
-        if self.refused:
-            self._ends = [0]
-
-    def _next(self, file: BinaryIO, path: Path) -> dict[str, np.ndarray] | None:
-        """The part that begins here; None at the end of what is whole."""
-        size = int.from_bytes(file.read(_HEAD), "little")
-        if not 0 < size <= MOST:
-            return None
-        part = unpacked(io.BytesIO(file.read(size)), path)
-        # A damaged length may reach over a whole part: a zip file is read from its end.
-        return part if part.pop(_NUMBER, None) == len(self._ends) - 1 else None
-
-    def __len__(self) -> int:
-        """Number of parts."""
-        return max(len(self._ends) - 2, 0)
-
-    def __iter__(self) -> Iterator[dict[str, Any]]:
-        """The parts' arrays, in their order."""
-        with open(self.path if len(self) else os.devnull, "rb") as file:
-            for start, end in zip(self._ends[1:-1], self._ends[2:], strict=True):
-                file.seek(start + _HEAD)
-                part = unpacked(io.BytesIO(file.read(end - start - _HEAD)), self.path)
-                del part[_NUMBER]
-                yield part
-
-    def append(self, arrays: Arrays) -> None:
-        """Adds a part after the others.
-
-        Raises:
-          OSError: If the file cannot be written.
-        """
-        if len(self._ends) == 1:
-            self._write(head(self._own))
-        self._write(arrays)
-
-    def _write(self, arrays: Arrays) -> None:
-        content = packed({**arrays, _NUMBER: np.array(len(self._ends) - 1)})
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.open("r+b" if self.path.exists() else "wb") as file:
-            file.truncate(self._ends[-1])  # without what a killed process began
-            file.seek(self._ends[-1])
-            file.write(len(content).to_bytes(_HEAD, "little") + content)
-            file.flush()
-            os.fsync(file.fileno())
-        self._ends.append(self._ends[-1] + _HEAD + len(content))
-
-    @contextlib.contextmanager
-    def alone(self) -> Iterator[bool]:
-        """Whether no other process has the file; none gets it meanwhile."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.open("ab") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                free = True
-            except OSError:
-                free = False
-            yield free

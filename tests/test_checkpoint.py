@@ -14,7 +14,6 @@ from codesign_jax import files, store
 from codesign_jax.runs import failures
 from codesign_jax.runs.checkpoint import Checkpoints, digest
 from codesign_jax.scene.schema import InputError
-from codesign_jax.store import Store
 from codesign_jax.types import Trial
 from scripts import faults
 
@@ -262,77 +261,26 @@ def test_a_failed_world_with_any_damage_is_refused_or_whole(tmp_path):
             failures.load(path)
 
 
-def over_two(content, first):
-    """Three parts of equal length, the second of which claims to reach to the end."""
-    third = (len(content) - first) // 3
-    length = (2 * third - 8).to_bytes(8, "little")
-    return content[: first + third] + length + content[first + third + 8 :]
-
-
-def numbers(path, about="a"):
-    """What the parts of a file hold, and why they are not taken."""
-    found = Store(path, about)
-    return [int(part["k"]) for part in found], found.refused
-
-
-def test_parts_are_added_and_a_torn_one_is_left_out(tmp_path):
-    path = tmp_path / "new" / "x.part"
-    parts = Store(path, "a")
-    for k in range(3):
-        parts.append({"k": np.array(k)})
-    content = path.read_bytes()
-    assert numbers(path) == ([0, 1, 2], "") and len(Store(path, "a")) == 3
-    first = 8 + int.from_bytes(content[:8], "little")  # what the results are of
-    third = (len(content) - first) // 3
-    for other, left in (
-        (content[:-1], 2),
-        (content[: first + third + 3], 1),
-        (content + b"\xff" * 9, 3),
-        (flipped(content, first + third + third // 2), 1),
-        (flipped(content, first + third + 7), 1),  # a length of many bytes
-        (over_two(content, first), 1),
-        (b"", 0),
-    ):
-        path.write_bytes(other)
-        again = Store(path, "a")
-        assert [int(p["k"]) for p in again] == [*range(left)]
-        again.append({"k": np.array(7)})
-        assert numbers(path) == ([*range(left), 7], "")
-
-
 def test_results_are_those_of_one_case_and_one_code(tmp_path, monkeypatch):
-    path = tmp_path / "x.part"
-    parts = Store(path, "a")
-    for k in range(2):
-        parts.append({"k": np.array(k)})
-    assert numbers(path) == ([0, 1], "")
-    assert numbers(path, "b") == ([], "is of another design or other settings")
-    assert Store(path, {"seed": 1}).about == "a"
+    path = tmp_path / "x.npz"
+    assert store.found(path, "a") == (None, "")
+    store.keep(path, {"seed": 1}, {"k": np.array(3)})
+    assert store.found(path, {"seed": 1}) == ({"k": 3}, "")
+    assert store.found(path, "b") == (None, "is of another design or other settings")
     for owner, name, value in (
         (store, "SCHEMA", 0),
         (store.reuse, "code_digest", lambda: "other"),
+        (store.reuse, "code_digest", lambda: None),  # code that is not known is nobody's
     ):
         with monkeypatch.context() as patch:
             patch.setattr(owner, name, value)
-            assert numbers(path) == ([], "is of another version of the code")
-    with monkeypatch.context() as patch:  # code that is not known is nobody's, not even its own
+            assert store.found(path, {"seed": 1}) == (None, "is of another version of the code")
+    with monkeypatch.context() as patch:  # not even its own
         patch.setattr(store.reuse, "code_digest", lambda: None)
-        Store(tmp_path / "y.part", "a").append({"k": np.array(0)})
-        assert Store(tmp_path / "y.part", "a").refused
-    content = path.read_bytes()
-    path.write_bytes(content[:-1])
-    assert numbers(path) == ([0], ""), "the last part is torn"
-    path.write_bytes(content)
-    Store(path, "b").append({"k": np.array(7)})
-    assert numbers(path, "b") == ([7], "")
-
-
-def test_one_process_has_a_file(tmp_path):
-    one, other = (Store(tmp_path / "x.part", "a") for _ in range(2))
-    with one.alone() as free, other.alone() as again:
-        assert free and not again
-    with other.alone() as free:
-        assert free
+        store.keep(path, "a", {"k": np.array(3)})
+        assert store.found(path, "a")[0] is None
+    path.write_bytes(path.read_bytes()[:-1])
+    assert store.found(path, "a") == (None, "is damaged, or of another version of the code")
 
 
 def test_two_writers_of_one_file_do_not_share_a_temporary_file(tmp_path):

@@ -9,10 +9,9 @@ import pytest
 
 from codesign_jax import cli, codesign, objects, rollout, sampling, scene
 from codesign_jax.commands import sample
-from codesign_jax.runs import dataset
+from codesign_jax.runs import dataset, directory
 from codesign_jax.runs.tables import design_columns
 from codesign_jax.scene import parameters
-from codesign_jax.store import Store
 from codesign_jax.types import Outcome, Status
 from tests.helpers.grasps import nth
 from tests.helpers.toy_engine import TINY, ToyEngine, tiny
@@ -64,16 +63,16 @@ def test_robust_draws_what_the_paper_keeps():
 
 def killed_after(saves, monkeypatch, **sizes):
     """Runs the command until so many shards have been saved."""
-    append, done = Store.append, []
+    save, done = dataset.Shards.save, []
 
-    def counted(self, arrays):
+    def counted(self, shard, found):
         if len(done) == saves:
             raise Killed
-        done.append(len(self))
-        append(self, arrays)
+        done.append(shard)
+        save(self, shard, found)
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(Store, "append", counted)
+        patch.setattr(dataset.Shards, "save", counted)
         run(**sizes)
     return done
 
@@ -202,7 +201,7 @@ def test_a_killed_command_goes_on_to_the_same_bytes(place, monkeypatch, capsys):
 def test_a_damaged_part_is_simulated_again(place, monkeypatch):
     assert run(out="whole.parquet") == 0
     killed_after(2, monkeypatch)
-    part = place / "a.parquet.part"
+    part = place / "a.parquet.part" / "0.npz"
     part.write_bytes(part.read_bytes()[:-20])
     assert run() == 0
     assert (place / "a.parquet").read_bytes() == (place / "whole.parquet").read_bytes()
@@ -235,11 +234,11 @@ def test_fewer_designs_of_what_was_begun_are_enough(place, monkeypatch):
 )
 def test_another_question_is_refused(more, differ, place, monkeypatch, capsys):
     killed_after(1, monkeypatch)
-    part = (place / "a.parquet.part").read_bytes()
+    part = (place / "a.parquet.part" / "0.npz").read_bytes()
     assert run(*more) == 2
     words = f"a.parquet.part has a part of other grasps ({differ} differ); choose another --out"
     assert words in capsys.readouterr().err
-    assert (place / "a.parquet.part").read_bytes() == part
+    assert (place / "a.parquet.part" / "0.npz").read_bytes() == part
 
 
 def test_a_file_that_is_there_is_never_replaced(place, monkeypatch, capsys):
@@ -257,10 +256,11 @@ def test_a_file_of_somebody_else_is_left_alone(place, capsys):
 
 
 def test_two_processes_do_not_write_one_file(place, capsys):
-    question = sample.Question(THREE, "structured", "2d", 2, 3, 4)
-    with dataset.outcomes(place / "a.parquet", question).alone():
+    part = place / "a.parquet.part"
+    part.mkdir()
+    with directory.locked(part):
         assert run() == 2
-    assert "--out a.parquet is in use by another process" in capsys.readouterr().err
+    assert "--out a.parquet.part is in use by process" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

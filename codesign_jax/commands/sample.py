@@ -7,18 +7,17 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import batch, preflight, sampling
+from codesign_jax import batch, files, preflight, sampling
 from codesign_jax.codesign import VERDICTS, verdicts
 from codesign_jax.commands import common
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.runs import dataset
-from codesign_jax.runs.dataset import Question
+from codesign_jax.runs.dataset import Question, Shards
+from codesign_jax.runs.directory import locked
 from codesign_jax.runs.interrupts import Interrupts, Stopped
 from codesign_jax.runs.progress import Meter
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
-from codesign_jax.scene.schema import InputError
-from codesign_jax.store import Store
 from codesign_jax.types import Outcome
 
 if TYPE_CHECKING:
@@ -34,7 +33,8 @@ def main(options: "Sample") -> int:
     scene = common.load_scene(options)
     question, engine = _question(options, scene), make_engine(options.engine, scene)
     console = common.console()
-    outcomes = dataset.outcomes(options.out, question)
+    outcomes = Shards(options.out)
+    outcomes.refuse_other(question)
     designs = {"the default design": question.space.default()}
     for note in preflight.notes(scene, question.space, designs):
         console.print(note)
@@ -42,9 +42,9 @@ def main(options: "Sample") -> int:
     console.print(f"{_amount(options)} in {common.counted(count, 'call')}")
     if options.dry_run:
         return 0
-    with outcomes.alone() as free:
-        if not free:
-            raise InputError([f"--out {options.out} is in use by another process"])
+    outcomes.folder.mkdir(parents=True, exist_ok=True)
+    with locked(outcomes.folder):
+        outcomes.begin(question)
         for left in options.out.parent.glob(f"{options.out.name}.*.tmp"):
             left.unlink()  # what a killed process was writing
         with Interrupts(console.print) as interrupts:
@@ -54,7 +54,7 @@ def main(options: "Sample") -> int:
                 console.print("stopped; the same command goes on")
                 return 128 + stopped.signum
         dataset.write(options.out, question, options.designs, outcomes)
-        outcomes.path.unlink()
+        files.remove(outcomes.folder)
     _report(options.out, found, console)
     return 0
 
@@ -76,7 +76,7 @@ def _check(options: "Sample") -> None:
 def _question(options: "Sample", scene: Scene) -> Question:
     """What is asked; without --chunk calls are as large as those that made what is there."""
     design_space(scene.hand, options.preset)
-    before = dataset.begun(options.out)
+    before = Shards(options.out).question
     if before is None or options.chunk is not None:
         chunk = batch.size(options.designs, options.trials, most=options.chunk)
     else:
@@ -94,7 +94,7 @@ def _simulate(
     designs: int,
     question: Question,
     engine: Engine,
-    outcomes: Store,
+    outcomes: Shards,
     interrupts: Interrupts,
     console: Console,
 ) -> np.ndarray:
@@ -109,16 +109,20 @@ def _simulate(
         return int(ends.sum())
 
     with Meter("sample", designs * question.trials, console) as meter:
-        for shard, arrays in zip(range(total), outcomes, strict=False):
-            meter.found(count(shard, Outcome(**arrays)))
-        done = min(len(outcomes), total)
-        if done:
+        left = []
+        for shard in range(total):
+            outcome = outcomes.load(shard)
+            if outcome is None:
+                left.append(shard)
+            else:
+                meter.found(count(shard, outcome))
+        if done := total - len(left):
             calls = common.counted(total, "call")
-            meter.message(f"going on after {done} of {calls}, from {outcomes.path}")
-        for shard in range(done, total):
-            found = interrupts.call(lambda s=shard: simulate(*question.drawn(s)))
-            outcome = jax.tree.map(np.asarray, found)
-            outcomes.append(outcome._asdict())
+            meter.message(f"going on after {done} of {calls}, from {outcomes.folder}")
+        for shard in left:
+            answer = interrupts.call(lambda s=shard: simulate(*question.drawn(s)))
+            outcome = jax.tree.map(np.asarray, answer)
+            outcomes.save(shard, outcome)
             meter.advance(count(shard, outcome))
     return counts
 

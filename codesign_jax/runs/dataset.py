@@ -1,7 +1,7 @@
 """Grasps of random designs in one Parquet file (extra `parquet`), in steps that survive a kill.
 
 A row follows from the question (scene, design space, seed, ...) and the indices of design and
-trial, but for its outcome.  So a file beside the unfinished one holds outcomes alone, a shard for
+trial, but for its outcome.  So a folder beside the unfinished file holds outcomes alone, a file for
 each call of the engine, a few bytes a grasp; the rest is drawn again when the file is written.
 """
 
@@ -17,17 +17,17 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from codesign_jax import files, reuse, sampling
+from codesign_jax import files, reuse, sampling, store
 from codesign_jax.codesign import VERDICTS, verdicts
 from codesign_jax.provenance import environment
 from codesign_jax.runs.columns import GRASPS, MAY_BE_EMPTY
+from codesign_jax.runs.directory import LOCK
 from codesign_jax.runs.scene_files import contents, scene_texts
 from codesign_jax.runs.tables import design_columns, noise_values, status_names
 from codesign_jax.sampling import Drawn
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.scene.schema import InputError
-from codesign_jax.store import Store
 from codesign_jax.types import Outcome, Status
 
 ROWS = 1 << 16
@@ -73,26 +73,53 @@ class Question:
         return -(-designs // self.chunk)
 
 
-def part_of(path: Path) -> Path:
-    """File of the outcomes of an unfinished file."""
-    return path.with_name(f"{path.name}.part")
+class Shards:
+    """Outcomes of calls, a file each in a folder that names their question."""
 
+    def __init__(self, path: Path):
+        """Of the data set at a path; changes nothing."""
+        self.folder = path.with_name(f"{path.name}.part")
+        self._question = self.folder / "question.json"
 
-def begun(path: Path) -> dict[str, Any] | None:
-    """The question of an unfinished file, as `Question.described`; None if there is none."""
-    return Store(part_of(path), None).about
+    @property
+    def question(self) -> dict[str, Any] | None:
+        """`Question.described` of what has begun; None if nothing has."""
+        try:
+            found = json.loads(self._question.read_text("utf-8"))
+        except (OSError, ValueError):
+            return None
+        return found if isinstance(found, dict) else None
 
+    def refuse_other(self, question: Question) -> None:
+        """Refuses what is there if it is of another question, or no part of a data set."""
+        part, before = self.folder, self.question
+        if part.exists() and before is None and not (part.is_dir() and {*self.names} <= {LOCK}):
+            raise InputError([f"{part} is no part of a data set; choose another --out"])
+        others = [n for n, v in question.described.items() if before and before.get(n) != v]
+        if others:
+            what = f"{part} has a part of other grasps ({', '.join(others)} differ)"
+            raise InputError([f"{what}; choose another --out, or delete the folder"])
 
-def outcomes(path: Path, question: Question) -> Store:
-    """The outcomes that were simulated for a file, a part for each call; changes nothing."""
-    part, before = part_of(path), begun(path)
-    if part.exists() and before is None and (part.is_dir() or part.stat().st_size):
-        raise InputError([f"{part} is no part of a data set; choose another --out"])
-    others = [n for n, v in question.described.items() if before and before.get(n) != v]
-    if others:
-        what = f"{part} has a part of other grasps ({', '.join(others)} differ)"
-        raise InputError([f"{what}; choose another --out, or delete the file"])
-    return Store(part, question.described)
+    @property
+    def names(self) -> list[str]:
+        """Names in the folder."""
+        return [path.name for path in self.folder.iterdir()] if self.folder.is_dir() else []
+
+    def begin(self, question: Question) -> None:
+        """Writes whose outcomes will be there."""
+        with files.atomically(self._question) as temporary:
+            temporary.write_text(json.dumps(question.described), encoding="utf-8")
+
+    def load(self, shard: int) -> Outcome | None:
+        """Outcomes of a call, or None if they are not there, or damaged."""
+        try:
+            return Outcome(**store.load(self.folder / f"{shard}.npz"))
+        except (OSError, store.StoreError):
+            return None
+
+    def save(self, shard: int, found: Outcome) -> None:
+        """Writes the outcomes of a call."""
+        store.save(self.folder / f"{shard}.npz", found._asdict())
 
 
 class Names(NamedTuple):
@@ -163,7 +190,7 @@ def rows(question: Question, shard: int, drawn: Drawn, found: Outcome) -> dict[s
     return values | {name: designs[:, k, None] for k, name in enumerate(own)}
 
 
-def write(path: Path, question: Question, designs: int, outcomes: Store) -> None:
+def write(path: Path, question: Question, designs: int, outcomes: Shards) -> None:
     """Writes the file from its outcomes, as a whole or not at all."""
     pa = pyarrow_module("--out")
     notes = {"question": question.described, "designs": designs, "environment": environment()}
@@ -174,8 +201,10 @@ def write(path: Path, question: Question, designs: int, outcomes: Store) -> None
         files.atomically(path) as temporary,
         pa.parquet.ParquetWriter(temporary, schema, compression="zstd") as writer,
     ):
-        for shard, arrays in zip(range(question.shards(designs)), outcomes, strict=False):
-            values = rows(question, shard, question.drawn(shard), Outcome(**arrays))
+        for shard in range(question.shards(designs)):
+            found = outcomes.load(shard)
+            assert found is not None
+            values = rows(question, shard, question.drawn(shard), found)
             group.append(_table(pa, schema, values, shape).slice(0, left))
             left -= group[-1].num_rows
             if not left or sum(table.num_rows for table in group) >= ROWS:

@@ -34,7 +34,7 @@ _MOST_LINES = 16
 """Lines of a file's differences that an error shows."""
 
 
-_LOCK = ".lock"
+LOCK = ".lock"
 _INSIDE = {
     own.FOLDER: re.compile(r"[A-Za-z_][\w.]*\.py"),
     "checkpoints": re.compile(r"[0-9]+(\.sha256|\.orbax-checkpoint-tmp.*)?"),
@@ -77,7 +77,7 @@ def open_run(
     """Opens a run folder: makes it, or checks that it is this very run; locks it meanwhile."""
     check_folder(path, scene, settings, fresh=fresh)
     path.mkdir(parents=True, exist_ok=True)
-    with _locked(path):
+    with locked(path):
         # Again: another process may have been here.
         check_folder(path, scene, settings, fresh=fresh)
         contents, run, notes = _contents(scene, settings), RunDirectory(path), []
@@ -128,9 +128,9 @@ def setting_of(paths: Iterable[Path], name: str) -> Any:
 
 
 @contextlib.contextmanager
-def _locked(path: Path) -> Iterator[None]:
+def locked(path: Path) -> Iterator[None]:
     """Holds the folder's lock; the kernel releases it with the process, however it ends."""
-    place = os.open(path / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+    place = os.open(path / LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     with os.fdopen(place, "r+") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -267,7 +267,7 @@ def _refuse_foreign(path: Path) -> None:
         raise InputError([f"--out {path} is a symbolic link to nothing"])
     if path.exists() and not path.is_dir():
         raise InputError([f"--out {path} is a file"])
-    others = [name for name in _all(path) if name != _LOCK and _named(name) != PROVENANCE]
+    others = [name for name in _all(path) if name != LOCK and _named(name) != PROVENANCE]
     if others and not (path / PROVENANCE).exists():
         hint = "choose another folder, or delete these files yourself, if nobody needs them"
         if (path / "checkpoints").exists():
@@ -291,7 +291,7 @@ def _refuse_to_delete(path: Path) -> None:
 def _delete_run(path: Path) -> None:
     """Deletes a run's files, those that make it one last; see `_refuse_to_delete`."""
     for name in _all(path):
-        if name not in (_LOCK, PROVENANCE) and _is_of_a_run(path, name):
+        if name not in (LOCK, PROVENANCE) and _is_of_a_run(path, name):
             files.remove(path / name)
     for name in _INSIDE:
         with contextlib.suppress(FileNotFoundError):
@@ -327,7 +327,7 @@ def _is_of_a_run(path: Path, name: str) -> bool:
     folder, _, inside = name.rpartition("/")
     if folder:
         return _INSIDE[folder].fullmatch(_named(inside)) is not None
-    return _named(name) in {*FILES, *TABLES, _LOCK} - {*_INSIDE} and not (path / name).is_dir()
+    return _named(name) in {*FILES, *TABLES, LOCK} - {*_INSIDE} and not (path / name).is_dir()
 
 
 def _some(names: list[str]) -> str:

@@ -28,7 +28,8 @@ class Bounds(NamedTuple):
       start: The first time step at which a lost object counts.
       end: The first time step at which it no longer does.
       speed: Largest velocity of a world that has not failed [rad/s or m/s].
-      penetration: How far below the table the object's centre may be [m].
+      penetration: How far below the table the object's centre may be [m]; `FAR` without a table,
+        where what falls is lost as soon as the window begins.
     """
 
     lost_distance: Any
@@ -42,7 +43,8 @@ def bounds(scene: Scene) -> Bounds:
     """The bounds of a scene, whose numbers may be arrays or traced."""
     start, end = map(scene.steps_to, scene.window)
     limits = scene.limits
-    return Bounds(scene.cost.lost_distance, start, end, limits.speed, limits.penetration)
+    deep = limits.penetration if scene.effects.table else FAR + 0 * limits.penetration
+    return Bounds(scene.cost.lost_distance, start, end, limits.speed, deep)
 
 
 def lost(bounds: Bounds, distance: Any, step: Any) -> Any:
@@ -99,7 +101,7 @@ def failures(scene: Scene, trace: Trace) -> jax.Array:
     numbers = jnp.isfinite(trace.speed) & jnp.isfinite(trace.distance) & jnp.isfinite(trace.height)
     bits = as_bit(~numbers, Status.NONFINITE)
     bits |= as_bit(trace.speed > scene.limits.speed, Status.SPEED)
-    bits |= as_bit(trace.height < -scene.limits.penetration, Status.PENETRATION)
+    bits |= as_bit(trace.height < -bounds(scene).penetration, Status.PENETRATION)
     if trace.status is not None:
         told = jnp.asarray(trace.status, jnp.int32)
         bits |= jnp.where(failed(told), told, jnp.zeros_like(told))

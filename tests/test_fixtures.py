@@ -143,8 +143,7 @@ def test_the_kernel_balances_rings_and_edges(tmp_path, shape):
 def test_an_object_rests_on_a_shelf_or_tips_over_its_edge(tmp_path, overhang, stays):
     """A box of 60 mm with its face `overhang` beyond the edge, as in MuJoCo C after a second."""
     shelf = SHELF.replace("-0.1, 0.0", f"{-0.08 - overhang:g}, 0.0")  # ends at x = 30 mm - overhang
-    changes = {"effects.table": False, "limits.penetration": 1.0}
-    the_scene = loaded(tmp_path, shelf, "box", **changes)
+    the_scene = loaded(tmp_path, shelf, "box", **{"effects.table": False})
     fields, ctrl = a_grasp(the_scene)
     flat = jnp.array([0.0, 0.0, 0.03, 1.0, 0.0, 0.0, 0.0], fields.start.dtype)
     fields = fields._replace(start=fields.start.at[:, -7:].set(flat))
@@ -152,7 +151,7 @@ def test_an_object_rests_on_a_shelf_or_tips_over_its_edge(tmp_path, overhang, st
     for name in ("structured", "mujoco"):
         run = partial(make_engine(name, the_scene).rollout, trajectory=True)
         height = float(jax.jit(run)(fields, held).height[0, -1])
-        assert (abs(height - 0.03) < 1e-3) == stays, (name, height)
+        assert abs(height - 0.03) < 1e-3 if stays else height < -0.1, (name, height)  # no failure
 
 
 @pytest.mark.parametrize(

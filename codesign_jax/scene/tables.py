@@ -281,7 +281,8 @@ class Limits:
 
     Attributes:
       speed: Largest velocity of any joint.
-      penetration: How far the object's centre may be below the table.
+      penetration: How far the object's centre may be below the table, if there is one, and any body
+        in another at the start.
       strain: Largest strain of the walls of a free finger at its pressure; pressures of a search
         are lowered to it, as to the hand's pressure limit. Not given: no such limit.
     """

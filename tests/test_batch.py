@@ -8,11 +8,9 @@ import jax
 import numpy as np
 import pytest
 
-from codesign_jax import cli, codesign, scene
-from codesign_jax.batch import LIMIT, Batch, Request, take
-from codesign_jax.compiler import launch
+from codesign_jax import codesign, scene
+from codesign_jax.batch import Batch, Request, take
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.kernel import Limits
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.scene import parameters
 from tests.helpers.command_runs import stored
@@ -133,55 +131,3 @@ def test_a_test_of_few_particles_runs_beside_episodes():
         [(_, alone)] = together([request])
         np.testing.assert_array_equal(info.population, request.state.particles)
         np.testing.assert_array_equal(info.outcomes.cost, alone.outcomes.cost)
-
-
-def test_devices_that_there_are_not_and_calls_without_grasps(tmp_path, capsys):
-    assert cli.main([*RUN, "--devices", "99", "--out", str(tmp_path / "no")]) == 2
-    assert "--devices = 99 is not valid; this process has" in capsys.readouterr().err
-    assert cli.main([*RUN, "--chunk", "0", "--out", str(tmp_path / "no")]) == 2
-    assert "--chunk" in capsys.readouterr().err
-    with pytest.raises(ValueError, match="99 devices asked for, "):
-        take(99)
-    assert take(None) == jax.local_devices()
-
-
-@pytest.fixture
-def gpu(monkeypatch):
-    """As on a GPU of 132 multiprocessors; programs are laid out and nothing is compiled."""
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(launch, "multiprocessors", lambda: 132)
-
-
-def packed_lanes(particles, runs, devices=1, limit=LIMIT):
-    """Lanes and number of the blocks of one of several joined runs, of six trials a particle."""
-    the_scene, space, _ = tiny()
-    filter_ = codesign.make_filter(space)
-    engine = object.__new__(StructuredEngine)  # its constructor looks for the GPU
-    engine.scene, engine.limits = the_scene, Limits(4, 2, 1e-6)
-    engine.segment, engine.truncate = None, False
-    task = codesign.Task(the_scene, space, 6, engine)
-    batch = Batch(task, filter_, devices=1, limit=limit)
-    batch.devices = batch.devices * devices
-    state = filter_.init(jax.random.key(0), space.default(), particles)
-    request = Request(state, np.ones(2, bool))
-    packed = jax.eval_shape(batch._stages(request, runs).before, *request)
-    later = batch._stages(request, 1)
-    assert later is batch._stages(request, runs), "runs that end change no program"
-    count, _, lanes = packed.blocks[0].shape
-    return lanes, count
-
-
-def test_blocks_are_as_narrow_as_the_joined_batch_asks_for(gpu):
-    """Two fingers: 2 lanes a world; 132 multiprocessors have four schedulers each.
-
-    As long as there is a scheduler for every block, blocks have 8 lanes (up to 528 x 8) or 16.
-    """
-    fingers = 2
-    assert len(tiny()[0].hand.finger) == fingers
-    assert packed_lanes(10, 1) == (8, 15)  # 60 worlds, four to a block
-    assert packed_lanes(10, 35)[0] == 8  # 4,200 lanes
-    assert packed_lanes(10, 36) == (16, 8)  # 4,320 lanes; a run's last block has gaps
-    assert packed_lanes(10, 70)[0] == 16  # 8,400 lanes
-    assert packed_lanes(10, 71) == (32, 4)  # 8,520 lanes: whole warps
-    assert packed_lanes(10, 71, devices=2)[0] == 16  # on each of two
-    assert packed_lanes(10, 71, limit=600)[0] == 8  # ten runs in a call

@@ -71,15 +71,6 @@ def test_pressure_curls_towards_the_bottom_layer():
     np.testing.assert_allclose(frame[:, 0], [-1, 0, 0], atol=1e-6)
 
 
-def test_free_curvature_does_not_depend_on_the_load_path():
-    """A constant moment, not a moving rest angle: pressure and an opposed tip moment cancel."""
-    finger = Finger(10)
-    pressure = 60e3
-    moment = pressure * finger.beam.moment_per_pressure
-    position, _ = finger.settle(pressure=pressure, torque=(0, -moment, 0))
-    np.testing.assert_allclose(position, [finger.length, 0, 0], atol=1e-8)
-
-
 @pytest.mark.parametrize("links", [5, 20])
 def test_self_weight(links):
     """w L^4 / 8 E I, for the midpoint chain times exactly 1 - 1 / (2 N^2)."""

@@ -79,31 +79,6 @@ def test_replay_plays_in_a_browser(opened, tmp_path):
     assert complaints == []
 
 
-def test_camera_turns_while_it_plays(opened, tmp_path):
-    page, complaints = opened
-    camera = "document.getElementById('replay').replay.camera()"
-    before = page.evaluate(camera)
-    page.locator("#replay .speed").select_option("0.1")
-    page.locator("#replay .play").click()  # scrolls there, too
-    box = page.locator("#replay .view").bounding_box()
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    page.mouse.move(x, y)
-    page.mouse.down()
-    page.mouse.move(x + 100, y + 30, steps=5)
-    page.mouse.up()
-    page.mouse.wheel(0, -300)
-    page.wait_for_timeout(200)
-    after = page.evaluate(camera)
-    assert after["azimuth"] == pytest.approx(before["azimuth"] - 1.0)
-    assert after["elevation"] == pytest.approx(before["elevation"] + 0.3)
-    assert after["distance"] < before["distance"]
-    assert page.evaluate("document.getElementById('replay').replay.playing()")
-    assert_hand_and_object(picture(page, tmp_path))
-    page.locator("#replay .home").click()
-    assert page.evaluate(camera) == before
-    assert complaints == []
-
-
 def test_a_browser_without_webgl_shows_a_film_strip(run, flat_browser, tmp_path):
     """Pictures at the ends of the phases, and no controls of what is not there."""
     page = flat_browser.new_page(viewport={"width": 1000, "height": 900})

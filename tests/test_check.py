@@ -12,7 +12,6 @@ from codesign_jax import rollout, sampling, scene
 from codesign_jax.commands import reference
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import parameters
-from tests.helpers import tiny_run
 from tests.helpers.command_runs import command, own_workplace  # noqa: F401
 from tests.helpers.toy_engine import TINY
 
@@ -62,16 +61,6 @@ def test_its_counts_are_those_of_the_grasps_simulated_again(capsys):
     grasps, minutes, seconds = map(int, searched)
     # Beside what compiling takes; the rate is told with three digits.
     assert 60 * minutes + seconds >= 0.99 * grasps / rates[0][0] - 1
-
-
-def test_designs_are_those_of_a_run_or_a_mixture(tmp_path, capsys):
-    *_, output = told(capsys)
-    assert "half of them random, half the best of" in output
-    tiny_run.copied(tmp_path / "run")
-    assert command("check", tmp_path / "run", "--grasps", 4) == 0
-    output = capsys.readouterr().out
-    assert re.search(r"designs: the \d final particles? of \S*run that differ", output)
-    assert "a search (particle-filter, preset 2d, 60 grasps)" in output  # 3 x 4 x 3 and 4 x 6
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ import pytest
 
 from codesign_jax import codesign
 from codesign_jax.optimize import schedule
-from codesign_jax.optimize.schedule import NAMES
 from codesign_jax.types import Outcome
 from tests.helpers import episodes
 from tests.helpers.toy_engine import ToyEngine, tiny
@@ -39,19 +38,6 @@ def outcomes(cost, status=0):
     cost = jnp.asarray(cost, jnp.float32)
     whole = jnp.broadcast_to(jnp.asarray(status, jnp.int32), cost.shape)
     return Outcome(cost, whole, jnp.full_like(cost, jnp.inf), -jnp.ones_like(whole))
-
-
-def test_one_compile_serves_every_schedule_and_seed(setup):
-    the_scene, space, engine, optimizer, episode = setup
-    episode(start(optimizer), np.array([True, True]))
-    traced = engine.traced
-    for seed, name in enumerate(NAMES):
-        mask = schedule(name, np.array(space.is_morphology), 40)
-        state, _ = episode(start(optimizer, seed), mask[0])
-        episode(state, mask[-1])
-    search = codesign.seed_search(the_scene, optimizer, jax.random.key(0), batch=PARTICLES)
-    episodes.answered(search, episodes.evaluate_by(episode, optimizer))
-    assert engine.traced == traced > 0
 
 
 def test_other_bounds_and_defaults_share_the_program(setup):
@@ -85,15 +71,6 @@ def test_episode_is_move_evaluate_weigh_and_resample(setup):
     assert int(new.episode) == 1
 
 
-def test_particles_share_their_trials(setup):
-    _, _, _, optimizer, episode = setup
-    closed = np.zeros(2, bool)
-    _, info = episode(start(optimizer), closed)  # nothing moves: all particles are the same
-    cost = np.asarray(info.outcomes.cost)
-    np.testing.assert_array_equal(cost, np.broadcast_to(cost[0], cost.shape))
-    assert len(np.unique(cost[0])) > 1, "trials of one particle have noise of their own"
-
-
 def test_noise_differs_between_episodes_seeds_and_the_test(setup):
     the_scene, space, engine, optimizer, episode = setup
     closed = np.zeros(2, bool)
@@ -105,18 +82,6 @@ def test_noise_differs_between_episodes_seeds_and_the_test(setup):
     rows = [i.outcomes.cost[0] for i in seen]
     rows += [test.outcomes.cost[0, :TRIALS], test.outcomes.cost[0, TRIALS:]]
     assert len(np.unique(np.asarray(rows), axis=0)) == 5
-
-
-def test_concurrent_design_of_the_toy_converges(setup):
-    the_scene, space, _, optimizer, episode = setup
-    state, means = start(optimizer), []
-    for mask in schedule("concurrent", np.array(space.is_morphology), 60):
-        state, info = episode(state, mask)
-        means.append(float(info.selection.mean_cost))
-    assert means[0] > codesign.SEED_COST
-    assert np.mean(means[-20:]) < codesign.CONVERGED_COST
-    # Toy physics: longer fingers hold longer.  The start was 50 mm of 10 to 180 mm.
-    assert float(state.particles[:, 0].mean()) > 0.07
 
 
 @pytest.fixture(scope="module")
@@ -137,13 +102,6 @@ def test_failed_trials_are_left_out_of_the_mean(failing):
     assert float(info.selection.cost[1]) == the_scene.cost.maximum
 
 
-def test_noise_does_not_depend_on_the_number_of_particles(setup, failing):
-    *_, optimizer, episode = setup
-    few = failing[1].outcomes.cost[2]  # which does not fail
-    many = episode(start(optimizer), np.zeros(2, bool))[1].outcomes.cost
-    np.testing.assert_array_equal(few, many[0])
-
-
 def test_a_run_vmaps_over_seeds_and_is_the_loop_of_its_episodes(setup):
     """Each seed of a batch with its own schedule, as a loop over single episodes."""
     the_scene, space, engine, optimizer, episode = setup
@@ -161,18 +119,6 @@ def test_a_run_vmaps_over_seeds_and_is_the_loop_of_its_episodes(setup):
             np.testing.assert_allclose(infos.outcomes.cost[k, e], want.outcomes.cost, atol=3 * step)
         np.testing.assert_allclose(ends.particles[k], state.particles, rtol=1e-5)
     assert np.ptp(infos.outcomes.cost) > 0.1
-
-
-def test_evaluate_by_an_episode_equals_evaluate(setup):
-    the_scene, space, engine, optimizer, episode = setup
-    population = jnp.asarray(np.random.default_rng(0).uniform([0.03, -0.05], [0.17, 0.1], (8, 2)))
-    key = jax.random.key(3)
-    by_episode = episodes.evaluate_by(episode, optimizer)(population, key)
-    evaluate = codesign.Task(the_scene, space, TRIALS, engine).evaluate
-    direct = evaluate(population, codesign.stream_key(key, codesign.STREAM_TRIAL))
-    # Two programs round the noise differently, which may move a loss by one time step.
-    step = the_scene.discretization.timestep
-    np.testing.assert_allclose(by_episode.lost_time, direct.lost_time, atol=1.01 * step)
 
 
 def test_seed_is_poor_and_reproducible(setup):

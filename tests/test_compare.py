@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from codesign_jax.commands import compare
 from codesign_jax.report import statistics
 from tests.helpers.command_runs import command, own_workplace  # noqa: F401
 from tests.helpers.tiny_run import copied
@@ -92,18 +91,3 @@ def test_the_interval_of_a_difference_covers_as_often_as_it_says():
         covered.append(weights[inside].sum())
     # Newcombe's own evaluation has a mean of 0.95 and no less than 0.92 at such sizes.
     assert min(covered) > 0.92 and np.mean(covered) < 0.995
-
-
-def test_the_interval_in_closed_form():
-    """No trial differs: Wilson's bounds lie on both sides; exchanged designs change the sign."""
-    for both in (0, 7, 20):
-        value, low, high = statistics.paired(both, 0, 0, 20)
-        assert value == 0 and low == pytest.approx(-high) and high > 0
-    value, low, high = statistics.paired(5, 9, 2, 20)
-    assert statistics.paired(5, 2, 9, 20) == pytest.approx((-value, -high, -low))
-    assert value == pytest.approx(7 / 20) and low > 0
-    first = np.arange(20) < 14
-    second = (np.arange(20) < 5) | (np.arange(20) >= 18)
-    lines = compare.difference(first, second, ["a", "b"])
-    assert lines[0].endswith("5 were kept by both, 9 by a alone, 2 by b alone, and 4 by neither")
-    assert lines[1].endswith("p = 0.065): a keeps more")  # 2 (1 + 11 + 55) / 2^11

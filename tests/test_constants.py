@@ -13,7 +13,7 @@ from codesign_jax.compiler import launch
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.scene import schema
-from tests.helpers.grasps import hand_world, nth, pinch, random_constants, random_worlds, repeat
+from tests.helpers.grasps import hand_world, nth, pinch, random_constants
 
 # Compiling takes longer than all that is done with a program here.
 QUICK = {"xla_backend_optimization_level": 0}
@@ -118,34 +118,6 @@ def test_changing_any_number_compiles_nothing(monkeypatch):
     other_engine = make_engine("structured", again)
     jax.eval_shape(lambda: rollout.simulate(again, other_engine, params, trials))
     assert len(compiled) == 2 and len(set(compiled)) == 1
-
-
-def test_numbers_of_a_batch_equal_those_of_single_worlds():
-    """Every world of a batch has its own numbers, in MuJoCo's fields and in the lanes."""
-    the_scene = short(effects__friction="full", effects__neo_hookean=True)
-    constants = random_constants(the_scene, 5, 3)
-
-    def fields_of(p, t, c):
-        return model.model_fields(the_scene.with_constants(c), p, t)
-
-    def lanes(*world):
-        fields = jax.vmap(fields_of)(*world)
-        return fields, world_constants(the_scene, fields)
-
-    with jax.enable_x64(True):
-        params, trials = random_worlds(the_scene, 1, 3)
-        run = jax.jit(lanes)
-        fields, hand = run(params, trials, constants)
-        # The second world thrice: a batch of as many is the same program.
-        alone, mine = run(*repeat(nth((params, trials, constants), 1), 3))
-    for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(fields), strict=True):
-        np.testing.assert_allclose(a[0], b[1], rtol=1e-12, atol=1e-15)
-    for a, b in zip(jax.tree.leaves(mine), jax.tree.leaves(hand), strict=True):
-        a, b = np.asarray(a)[..., 0], np.asarray(b)[..., 1]
-        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-15)
-    friction = np.asarray(hand.cones.hand_object.friction)[0]
-    wanted = constants.objects.object[0].friction * np.asarray(trials.friction)
-    np.testing.assert_allclose(friction, wanted, rtol=1e-6)
 
 
 def test_derivatives_equal_differences():

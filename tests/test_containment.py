@@ -135,15 +135,6 @@ def test_the_depth_is_mujocos(starting):
         assert deep == pytest.approx(-data.contact.dist.min(), abs=1e-6)
 
 
-def test_a_scene_without_contacts_starts_and_is_as_deep_as_the_fingers_alone():
-    """Where nothing may touch there is no depth to look for: it was an error."""
-    pairs = ("finger_object", "finger_table", "palm_object", "palm_table", "object_table")
-    the_scene = pinch("box", **{f"effects__{pair}": False for pair in pairs})
-    fields, _ = both(the_scene, stack(hand_world(the_scene, length=0.18)[0]), stack(still()))
-    assert np.asarray(start.depth(the_scene, fields)).tolist() == [0.0]
-    assert not np.asarray(start.invalid_start(the_scene, fields)).any()
-
-
 def test_an_invalid_start_is_in_the_outcome(starting):
     the_scene, _ = starting
     params = stack(*(hand_world(the_scene, length=x)[0] for x in (0.08, 0.18)))
@@ -229,9 +220,3 @@ def test_all_failed_stops_with_a_diagnosis(tmp_path, capsys):
     assert doubt in capsys.readouterr().err
     assert cli.main(["export", str(folder), "--out", str(tmp_path / "models")]) == 2
     assert "Nothing is exported" in capsys.readouterr().err and not (tmp_path / "models").exists()
-
-
-def test_the_progress_line_counts_by_cause():
-    status = np.array([[0, Status.SPEED, 8], [Status.SPEED | 8, Status.STUCK, 0]])
-    assert runs.failure_counts(status) == "SPEED 2, STUCK 1"
-    assert runs.warning_counts(status) == "SOLVER_CAP 2"

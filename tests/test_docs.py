@@ -3,12 +3,9 @@
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
-from typing import get_args
 
 import numpy as np
 import pytest
@@ -54,12 +51,6 @@ def examples(program):
 
 
 CODESIGN = list(dict.fromkeys(shlex.join(words) for words in examples("codesign")))
-
-
-def test_the_pages_have_examples():
-    kinds = {example.split()[0] for example in CODESIGN}
-    flags = [argument.__name__.lower() for argument in get_args(cli.COMMANDS)]
-    assert kinds == {*flags} and len(CODESIGN) > 10
 
 
 @pytest.fixture(scope="module")
@@ -162,11 +153,6 @@ def commits(text):
     return re.findall(r"\b(?=[0-9a-f]*[a-f])(?=[0-9a-f]*[0-9])[0-9a-f]{7,40}\b", text)
 
 
-def test_commits_are_found():
-    text = "made by f608312, not 1234567, `defaced` or 5,760"
-    assert commits(text) == ["f608312"]
-
-
 def test_the_citation_names_software_and_paper():
     found = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -194,11 +180,6 @@ def test_what_a_page_links_to_is_there(page):
     assert not missing
 
 
-def test_links_are_found():
-    text = "![a](b.png) and [c](d.md#e), [f](https://g.h) [i](#j)\n[k]: l.md\n"
-    assert links(text) == ["b.png", "d.md#e", "l.md"]
-
-
 @pytest.mark.parametrize("page", ["CONTRIBUTING.md", "docs/notes/extending.md"])
 def test_the_files_that_contributors_are_sent_to_are_there(page):
     """As paths in the checkout, the package, its engines or the structured engine."""
@@ -208,24 +189,3 @@ def test_the_files_that_contributors_are_sent_to_are_there(page):
     places = [ROOT, package, package / "engines", package / "engines" / "structured"]
     missing = [p for p in paths if not any((place / p).exists() for place in places)]
     assert len(paths) > 15 and not missing
-
-
-def test_every_target_of_make_is_there():
-    words = {word for words in examples("make") for word in words}
-    named = {word for word in words if not re.match("[A-Z]+=", word)}  # without variables
-    rules = set(re.findall(r"^([a-z][a-z-]*):", (ROOT / "Makefile").read_text(), re.M))
-    assert named and named <= rules
-
-
-SCRIPTS = sorted({words[1] for words in examples("python")})
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("script", SCRIPTS)
-def test_every_script_has_the_flags_of_its_examples(script):
-    program = [sys.executable, "-m", script, "--help"]
-    text = subprocess.run(program, cwd=ROOT, check=True, capture_output=True, text=True).stdout
-    for words in examples("python"):
-        if words[1] == script:
-            missing = [w for w in words if w.startswith("--") and w not in text]
-            assert not missing

@@ -61,19 +61,6 @@ def test_neo_hookean_fingers_at_rest():
     assert kappa > 1.1 * pressure * linear.moment_per_pressure / linear.bending
 
 
-def test_angle_of_the_worked_example():
-    """h = w = 20, d = 5 mm, 120 kPa, G = 70 kPa: 58 degrees per 100 mm linear, 75 with the law."""
-    beam = morphology.beam(0.020, 0.005, width=WIDTH, shear_modulus=G, density=1.0)
-    linear = 120e3 * beam.moment_per_pressure / beam.bending
-
-    def law(kappa):
-        share = morphology.softening(np.float64(kappa), 0.020, 0.005, width=WIDTH)
-        return beam.bending * kappa * (1 - share) - 120e3 * beam.moment_per_pressure
-
-    assert np.degrees(0.1 * linear) == pytest.approx(58, abs=0.5)
-    assert np.degrees(0.1 * optimize.brentq(law, 1, 50)) == pytest.approx(75, abs=0.5)
-
-
 # --- air supply ----------------------------------------------------------------------------------
 
 
@@ -81,18 +68,6 @@ def supply(**values):
     return grasps.pinch(
         effects__pressure_dynamics=True, **{f"pneumatics__{k}": v for k, v in values.items()}
     )
-
-
-def test_lag_is_exponential():
-    scene = supply(lag=0.2, rate=1e9)
-    h = scene.discretization.timestep
-    wanted = np.full((1, 100), 100e3)
-    wanted[0, 0] = 0.0
-    with jax.enable_x64(True):
-        reached = np.asarray(control.supplied(scene, jnp.asarray(wanted).T)[0]).T[0]
-    # Row k is the pressure at time k h; the demand jumps at h.
-    expected = 100e3 * -np.expm1(-np.maximum(np.arange(100) - 1, 0) * h / 0.2)
-    np.testing.assert_allclose(reached, expected, rtol=1e-12, atol=1e-9)
 
 
 def test_supply_against_an_integrator():
@@ -125,12 +100,6 @@ def test_supply_against_an_integrator():
     assert np.abs(np.diff(reached)).max() <= 120e3 * h * (1 + 1e-9)
 
 
-def test_constant_pressure_passes_the_supply():
-    scene = supply()
-    wanted = jnp.full((2, 50), 80e3)
-    np.testing.assert_array_equal(control.supplied(scene, wanted)[0], wanted)
-
-
 # --- rigid arm, weight, torsion ------------------------------------------------------------------
 
 
@@ -144,14 +113,6 @@ def test_the_palm_is_where_the_arm_frame_is():
         mujoco.mj_step(oracle, data)
         np.testing.assert_allclose(data.qpos[:6], ctrl[k, :6], rtol=0, atol=1e-10)
     assert np.ptp(ctrl[:460, 2]) > 0.1
-
-
-def test_without_gravity_nothing_falls():
-    scene, oracle, fields, ctrl = setting({"gravity": False, "object_table": False})
-    data = mujoco.MjData(oracle)
-    data.qpos[:], data.ctrl[:] = fields.start, ctrl[0]
-    mujoco.mj_step(oracle, data, nstep=100)
-    np.testing.assert_allclose(data.qpos, fields.start, atol=1e-15)
 
 
 @pytest.mark.parametrize("model_of_friction,expected", [("full", 1.0), ("coulomb", 0.0)])
@@ -224,18 +185,6 @@ def test_force_and_inertia_are_derivatives_of_the_cost(friction):
     # sticking.
     expected = {"none": {0, 1}, "coulomb": {0, 2, 3}, "full": {0, 5, 6}}[friction]
     assert expected <= set(ranks)
-
-
-@jax.enable_x64(True)
-def test_normal_motion_needs_no_friction_model():
-    """Pressed straight on and not turning, the three models push alike."""
-    forces = []
-    for friction in ("none", "coulomb", "full"):
-        c = some_contacts(friction, np.random.default_rng(1), 1)
-        forces.append(np.asarray(pushes(c, -2.0 * c.direction)[0]))
-    np.testing.assert_allclose(forces[1], forces[0], rtol=1e-6)
-    np.testing.assert_allclose(forces[2], forces[0], rtol=1e-6)
-    assert np.abs(forces[0]).max() > 0
 
 
 @jax.enable_x64(True)

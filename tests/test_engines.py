@@ -164,13 +164,6 @@ def test_other_worlds_are_bitwise_unaffected(mjx_traces):
             np.testing.assert_array_equal(a[index], b[index])
 
 
-def test_mujoco_worlds_are_unaffected_too(mujoco_traces):
-    good, bad = mujoco_traces
-    for index in (GOOD, OTHER):
-        for a, b in zip(*map(jax.tree.leaves, (good, bad)), strict=True):
-            np.testing.assert_array_equal(a[index], b[index])
-
-
 def test_decided_worlds_are_not_simulated_further(hurried, monkeypatch):
     """MuJoCo leaves worlds that are lost or failed; their traces repeat the last entry."""
     the_scene, (fields, ctrl), _ = hurried
@@ -191,19 +184,6 @@ def test_decided_worlds_are_not_simulated_further(hurried, monkeypatch):
     np.testing.assert_array_equal(trace.distance[1, last:], trace.distance[1, last - 1])
     result = grasps.outcome(the_scene, nth(trace, 1))
     np.testing.assert_allclose(result.cost, the_scene.cost.maximum, rtol=1e-6)
-
-
-def test_batches_do_not_depend_on_order_or_size(hurried):
-    """MuJoCo solves each world by itself: any permutation and any batch gives the same numbers."""
-    the_scene, (fields, ctrl), _ = hurried
-    engine = make_engine("mujoco", the_scene)
-    whole = engine.rollout(fields, ctrl)
-    order = np.array([5, 0])
-    part = engine.rollout(nth(fields, order), nth(ctrl, order))
-    again = engine.rollout(fields, ctrl)
-    for a, b, c in zip(*map(jax.tree.leaves, (whole, part, again)), strict=True):
-        np.testing.assert_array_equal(np.asarray(a)[order], b)
-        np.testing.assert_array_equal(a, c)
 
 
 def test_unknown_engine_names_the_nearest():

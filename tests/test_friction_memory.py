@@ -1,7 +1,7 @@
 """Friction that fingers hold from step to step: its law on contacts alone, and who has it.
 
 The kernel's steps are compared with a dense solve in `test_planted_contacts`, its derivatives with
-differences in `test_reverse`; hard case 34 has the creep of two crossed fingers.
+differences in `test_reverse`.
 """
 
 from functools import partial
@@ -127,17 +127,3 @@ def test_a_rollout_in_pieces_is_that_of_one_piece(crossed):
     with jax.enable_x64(True):
         found = [jax.jit(partial(pieces, size=n))(start, ctrl)[1] for n in (STEPS, 1)]
     jax.tree.map(np.testing.assert_array_equal, *found)
-
-
-@pytest.mark.slow  # four kernels; quick: the test before, and derivatives of a piece (test_reverse)
-def test_pieces_have_one_derivative(crossed):
-    """By the start and by every command."""
-    start, ctrl, pieces = crossed
-    with jax.enable_x64(True):
-        slope = partial(jax.value_and_grad, argnums=(0, 1), has_aux=True)
-        found = [jax.jit(slope(partial(pieces, size=n)))(start, ctrl) for n in (STEPS, 1)]
-    jax.tree.map(np.testing.assert_array_equal, found[0][0], found[1][0])
-    for a, b in zip(found[0][1], found[1][1], strict=True):
-        # Sums over steps are rounded in another order.
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * np.abs(a).max())
-    assert np.abs(found[0][1][0][:, -12:]).max() > 0  # by what the fingers hold

@@ -1,11 +1,10 @@
 """The hull's mesh: closed, as large as the finger, skinned as MuJoCo's renderer skins it."""
 
-import mujoco
 import numpy as np
 import pytest
 import trimesh
 
-from codesign_jax import model, scene
+from codesign_jax import scene
 from codesign_jax.model import hull
 from codesign_jax.scene.schema import InputError
 from tests.helpers import grasps
@@ -41,37 +40,6 @@ def test_what_is_drawn_is_the_section_that_touches():
     volume = (LENGTH - cap + cap * 0.8106 / 0.9270) * 0.9270 * width * HEIGHT
     assert body.is_watertight
     np.testing.assert_allclose(body.volume, volume, rtol=0.01)
-
-
-def bent(the_scene, seed=0):
-    """Model and data of a hand with random joint angles of up to 0.4 rad."""
-    params, trial = grasps.hand_world(the_scene, length=LENGTH, height=HEIGHT)
-    compiled = model.compile_model(the_scene, params, trial, visual=True)
-    data = mujoco.MjData(compiled)
-    turn = np.random.default_rng(seed).uniform(-0.4, 0.4, data.qpos.shape)
-    data.qpos[:-7] += turn[:-7]
-    mujoco.mj_kinematics(compiled, data)
-    return compiled, data
-
-
-def test_skinning_equals_mujoco(tmp_path):
-    """Bent fingers have the vertices of MuJoCo's own linear blend skinning, and are exported."""
-    the_scene = hull_scene()
-    compiled, data = bent(the_scene)
-    view = mujoco.MjvScene(compiled, maxgeom=100)
-    mujoco.mj_forward(compiled, data)
-    every, camera = int(mujoco.mjtCatBit.mjCAT_ALL), mujoco.MjvCamera()
-    mujoco.mjv_updateScene(compiled, data, mujoco.MjvOption(), None, camera, every, view)
-    lay, mesh, fingers = model.layout(the_scene), hull.hull(the_scene), []
-    for f in range(the_scene.num_fingers):
-        links = [lay.stubs[f], *lay.bodies[f]]
-        turn = data.xmat[links].reshape(-1, 3, 3)
-        fingers.append(hull.pose(the_scene, LENGTH, HEIGHT, data.xpos[links], turn))
-    theirs = np.asarray(view.skinvert).reshape(len(fingers), -1, 3)
-    np.testing.assert_allclose(np.stack(fingers), theirs, atol=1e-7)  # theirs are float32
-    path = hull.write(tmp_path / "hand.ply", fingers, mesh.face)
-    read = trimesh.load(path)
-    assert read.is_watertight and len(read.split()) == len(fingers)
 
 
 def test_bad_settings_are_refused():

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from scipy import integrate, optimize
+from scipy import integrate
 
 from codesign_jax import model, scene
 from codesign_jax.model import morphology
@@ -18,7 +18,7 @@ from tests.helpers.curled_hands import batched, curled
 from tests.helpers.planted_faults import Fault, planted, simulate
 
 BOUND = 1e-8
-"""As in test_kernel_pairs.py."""
+"""As in test_effects.py."""
 SETTINGS = {"effects__lateral_threshold": True}
 
 
@@ -92,35 +92,6 @@ def test_moments_are_those_of_the_stored_energy(lateral):
         mine = float(mine[0] - numbers[1] * numbers[2]), float(mine[1])
         assert float(stiffness) * abs(lateral) * segment > 0.01 and float(moment) > 1e-3
     np.testing.assert_allclose(mine, slopes, rtol=1e-3)
-
-
-def test_nothing_bends_below_the_threshold_and_the_rest_bends_as_without():
-    """A joint at rest under a lateral moment, by minimising what it stores with the load's work."""
-    with jax.enable_x64(True):
-        the_scene = scene.load("paper", overrides={"effects.lateral_threshold": True})
-        params, beams, numbers = hand_and_numbers(the_scene)
-        links, pressure = the_scene.discretization.links, 100e3
-        spring = float(beams.lateral[0] / (params.length[0] / links))
-        most = pressure * float(numbers[0])
-
-        def angle(moment):
-            def unbalanced(q):
-                add, _ = morphology.threshold_moments(
-                    tuple(map(np.asarray, numbers)), pressure, np.zeros(()), np.asarray(q)
-                )
-                return spring * q + float(add) * q - moment
-
-            return optimize.brentq(unbalanced, 0.0, 10.0, xtol=1e-14)
-
-        small_angle = float(numbers[2])
-        assert angle(0.5 * most) < small_angle < 1.0 * np.pi / 180
-        beyond = most + spring * 0.3
-        assert angle(beyond) == pytest.approx(0.3, rel=0.02)
-        # Without pressure the layer is slack once the finger is bent.
-        add, moment = morphology.threshold_moments(
-            tuple(map(np.asarray, numbers)), 0.0, np.asarray(0.1), np.asarray(0.2)
-        )
-        assert add == 0 and moment == 0
 
 
 def test_it_needs_sideways_bending():

@@ -197,11 +197,6 @@ def test_an_import_against_the_arrows_would_be_found(name, other, forbidden):
     assert bool(wrong(name, other)) == forbidden
 
 
-def test_no_module_of_the_engine_has_the_name_of_another():
-    names = [n.split(".")[-1] for n in modules() if n.startswith(f"{ENGINE}.")]
-    assert sorted(names) == sorted(set(names))
-
-
 def test_no_modules_import_in_a_circle():
     """A folder's `__init__` is not what its modules import: it only lists them."""
     names = modules()
@@ -288,7 +283,7 @@ MOST_LINES = {
     "codesign_jax/scene": 5_400,
     "codesign_jax/studio": 790,
     "scripts": 5_500,
-    "tests": 24_300,
+    "tests": 21_350,
 }
 
 
@@ -303,15 +298,6 @@ def test_every_folder_has_its_most_lines():
     folders = {path.parts[len(package.parts)] for path in package.rglob("*/*.py")}
     wanted = {"codesign_jax", "scripts", "tests"} | {f"codesign_jax/{name}" for name in folders}
     assert set(MOST_LINES) == wanted
-
-
-def test_what_imports_are_seen_in_a_file():
-    text = "import a.b\nfrom a import b, c\nif TYPE_CHECKING:\n    from a import d\n"
-    text += "def f():\n    from a import d\n"
-    names = {"a", "a.b", "a.d"}
-    assert list(imports(ast.parse(text), names)) == ["a.b", "a.b", "a", "a.d", "a.d"]
-    assert list(imports(ast.parse(text), names, types=False)) == ["a.b", "a.b", "a", "a.d"]
-    assert list(imports(ast.parse(text), names, inside=False)) == ["a.b", "a.b", "a", "a.d"]
 
 
 def imported(tree):

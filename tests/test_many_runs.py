@@ -4,9 +4,7 @@ import contextlib
 import csv
 import dataclasses
 import io
-import json
 import os
-import shutil
 import signal
 import socket
 from pathlib import Path
@@ -28,7 +26,6 @@ from tests.helpers.command_runs import (
     command,
     launch,
     own_workplace,  # noqa: F401
-    snapshot,
     stored,
     without,
 )
@@ -48,19 +45,6 @@ def compared(tmp_path_factory):
     with contextlib.redirect_stdout(text):
         assert command(*TWO, "--out", folder) == 0
     return folder, text.getvalue()
-
-
-def test_runs_of_different_lengths_need_episodes(compared, tmp_path, capsys):
-    both = shutil.copytree(compared[0], tmp_path / "both")
-    path = both / "seed-3" / "provenance.json"
-    content = json.loads(path.read_text())
-    content["settings"]["episodes"] = 7
-    path.write_text(json.dumps(content))
-    before = snapshot(both)
-    assert command(*without(TWO, "--episodes"), "--out", both) == 2
-    error = capsys.readouterr().err
-    assert "seed-2 has 2 episodes and" in error and "seed-3 7: say by --episodes" in error
-    assert snapshot(both) == before
 
 
 def test_seeds_are_compared(compared):

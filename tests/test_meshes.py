@@ -8,10 +8,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from codesign_jax import preflight, scene
 from codesign_jax.engines.structured.laws import shapes
 from codesign_jax.scene import meshes, objects, schema
-from codesign_jax.scene.meshes import grid, mass, repair, surface
+from codesign_jax.scene.meshes import grid, repair, surface
 from tests.helpers.solids import box, bracket, object_file
 
 
@@ -63,14 +62,6 @@ def test_mass_of_round_bodies(tmp_path):
     # 5120 faces with edges of 0.07 r lie up to (0.07 r)^2 / (6 r) = 0.08 % r below the sphere.
     assert found.volume == pytest.approx(4 / 3 * np.pi * r**3, rel=3e-3)
     np.testing.assert_allclose(found.inertia, 0.4 * r**2, rtol=3e-3)
-
-
-def test_axes_of_a_symmetric_body_stay_those_of_the_file():
-    np.testing.assert_array_equal(mass.principal_axes(np.diag([2.0, 2.0, 1.0])), np.eye(3))
-    tensor = np.array([[2.0, 0.1, 0.0], [0.1, 1.0, 0.0], [0.0, 0.0, 3.0]])
-    axes = mass.principal_axes(tensor)
-    assert np.linalg.det(axes) == pytest.approx(1.0)
-    assert (np.diag(axes) > 0.9).all()  # turned by the few degrees that it takes, not renamed
 
 
 # --- distance ------------------------------------------------------------------------------------
@@ -153,11 +144,6 @@ def test_unit_slips(tmp_path, size, unit, hint):
     assert hint in problem
 
 
-def test_no_unit_fits(tmp_path):
-    (problem,) = problems(tmp_path, box(1e6, 1e6, 1e6))
-    assert "outside [5, 500] mm" in problem and "looks like" not in problem
-
-
 def test_all_problems_at_once(tmp_path):
     """Of the file and of its meshes."""
     mesh = box(60, 60, 60)
@@ -218,18 +204,6 @@ def test_bodies_that_are_thin_for_the_cells_do_not_cut_through_themselves(tmp_pa
     assert thin.grid.error <= 5e-4
 
 
-def test_winding_of_bodies_in_one_another():
-    """One in a ball, two in a second one inside of it, none in a cavity and outside."""
-    outer, inner = (trimesh.creation.icosphere(2, r) for r in (0.03, 0.02))
-    points = np.array([[0.0, 0.001, 0.0], [0.0, 0.0, 0.024], [0.05, 0.0, 0.0]])
-    both = trimesh.util.concatenate([outer, inner])
-    np.testing.assert_allclose(surface.winding(both.vertices, both.faces, points), [2, 1, 0])
-    inner.invert()
-    both = trimesh.util.concatenate([outer, inner])
-    found = surface.winding(both.vertices, both.faces, points)
-    np.testing.assert_allclose(found, [0, 1, 0], atol=1e-9)
-
-
 def test_too_fine_a_grid(tmp_path, monkeypatch):
     monkeypatch.setattr(grid, "MAX_NODES", 1000)
     with pytest.raises(schema.InputError, match="more than 1,000"):
@@ -269,18 +243,6 @@ def test_repair_mends_and_says_what(tmp_path):
     )
 
 
-def test_repair_of_a_good_mesh_changes_nothing(tmp_path):
-    mesh = bracket()
-    vertices, faces, report = repair.repair(mesh.vertices, mesh.faces)
-    assert not report
-    np.testing.assert_array_equal(faces, mesh.faces)
-    np.testing.assert_array_equal(vertices, mesh.vertices)
-    inverted = trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1])
-    assert solid(tmp_path, inverted, repaired=True).repairs == (
-        "turned 20 of 20 faces, so that all point outwards",
-    )
-
-
 def test_repair_keeps_and_makes_cavities(tmp_path):
     """A ball in the cavity of a ball, beside another one: right and with every part turned."""
     parts = [trimesh.creation.icosphere(2, r) for r in (0.03, 0.02, 0.01, 0.008)]
@@ -293,21 +255,3 @@ def test_repair_keeps_and_makes_cavities(tmp_path):
     turned = repair.repair(right.vertices, right.faces[:, ::-1])[1]
     mended = trimesh.Trimesh(right.vertices, turned, process=False)
     assert mended.volume == pytest.approx(right.volume, rel=1e-12)
-
-
-def test_what_cannot_be_repaired_is_still_refused(tmp_path):
-    """Two boxes that share an edge: four faces meet there, and no order of them is right."""
-    other = box()
-    other.apply_translation([0.04, 0.05, 0])
-    said = problems(tmp_path, trimesh.util.concatenate([box(), other]), repaired=True)
-    assert any("more than two faces; even after the repair" in p for p in said)
-
-
-def test_users_are_told_of_repairs_and_errors(tmp_path):
-    mesh = box(40, 50, 60)
-    trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1]).export(tmp_path / "inverted.off")
-    entry = 'name = "a"; type = "mesh"; file = "inverted.off"; unit = "mm"; mass = 0.1; '
-    path = object_file(tmp_path, entry + "friction = 1; repair = true; voxel_error = 0.001")
-    notes = preflight.mesh_notes(scene.load("paper_spheres", object_set=path))
-    assert notes[0] == "object a: turned 12 of 12 faces, so that all point outwards"
-    assert notes[1].startswith("object a: distances on 2.5 mm cells, error near the surface")

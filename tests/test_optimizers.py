@@ -15,12 +15,10 @@ from codesign_jax.optimize import (
     EVOSAX,
     NAMES,
     Evolution,
-    ParticleFilter,
     Screened,
     Space,
     evolution,
     make_optimizer,
-    names,
     schedule,
     screened,
     strictly_below,
@@ -215,17 +213,6 @@ def test_with_few_parameters_the_final_test_takes_the_best_screened_designs_too(
             assert (np.asarray(infos[-1].ancestors)[3:6] == -1).all()
 
 
-def test_an_optimiser_of_the_package_needs_no_evosax(monkeypatch):
-    """A second own one is built by its entry, without evosax; NAMES keeps the two kinds apart."""
-    monkeypatch.setattr(names, "OWN", {**names.OWN, "wide": lambda s: ParticleFilter(s, sigma=0.5)})
-    monkeypatch.setattr(names, "NAMES", (*names.OWN, *EVOSAX))
-    monkeypatch.setitem(sys.modules, "evosax", None)
-    made = make_optimizer("wide", SPACE)
-    assert isinstance(made, ParticleFilter) and made.sigma == 0.5
-    assert names.problem("wide") is None
-    assert set(NAMES) - set(EVOSAX) == {"particle-filter", *optimize.SCREENED}
-
-
 def test_bounds_and_constraint_hold(optimizer):
     _, populations, _ = run(optimizer, start(optimizer), OPEN[:8])
     assert (populations >= LOW).all() and (populations <= HIGH).all()
@@ -248,14 +235,6 @@ def test_closed_parameters_keep_their_bits(optimizer):
     if isinstance(optimizer, Evolution):  # the closed values are the best design's
         best = sphere(populations[:4].reshape(-1, WIDTH)).argmin()
         np.testing.assert_array_equal(second - first.reshape(-1, 9)[best], 0)
-
-
-def test_with_all_closed_the_particles_come_back(optimizer):
-    """How `episodes.evaluate_by` tests particles; every row is its own."""
-    rows = np.linspace(LOW, SEED, PARTICLES).astype(np.float32)
-    rows[:, LIMITED] = LOW[LIMITED]
-    state = start(optimizer)._replace(particles=jnp.asarray(rows))
-    np.testing.assert_array_equal(ask(optimizer, state, np.zeros(WIDTH, bool)), rows)
 
 
 def test_a_resumed_run_equals_the_uninterrupted_one_bitwise(optimizer):
@@ -324,22 +303,6 @@ def test_a_missing_extra_is_one_line_with_the_command(monkeypatch):
     assert make_optimizer("particle-filter", SPACE).space is SPACE
 
 
-def test_steps_of_openai_es_go_two_thirds_of_the_way():
-    """On a bowl without noise, near its minimum, and nowhere on a plateau: ties share a rank."""
-    made = make_optimizer("open-es", Space(np.zeros(WIDTH), np.ones(WIDTH)))
-    middle, count = np.full(WIDTH, 0.5), 4000
-    state = made.init(jax.random.key(0), middle + np.eye(WIDTH)[0] * 0.03, count)
-    population = made.ask(state, np.ones(WIDTH, bool))
-    flat, _ = made.tell(state, population, np.zeros(count))
-    moved, _ = made.tell(state, population, ((population - middle) ** 2).sum(1))
-    assert state.memory and flat.memory and moved.memory
-    start, steady, mean = (s.memory["strategy"]["mean"] for s in (state, flat, moved))
-    np.testing.assert_allclose(steady, start, atol=1e-6)
-    # The step's own noise is learning_rate * std(rank) / sqrt(count) / sigma, 0.005 of 0.02.
-    np.testing.assert_allclose(mean[0] - start[0], -0.02, atol=0.015)
-    assert mean[0] < start[0]
-
-
 # --- schedules ------------------------------------------------------------------------------------
 
 
@@ -353,19 +316,6 @@ def open_domain(mask):
     return morphology
 
 
-def test_concurrent_opens_everything():
-    mask = schedule("concurrent", IS_MORPHOLOGY, 64, first="control")
-    assert mask.dtype == bool and mask.shape == (64, 23) and mask.all()
-
-
-@pytest.mark.parametrize("first", ["morphology", "control"])
-def test_single_domains_never_change(first):
-    assert open_domain(schedule("morphology", IS_MORPHOLOGY, 8, first=first)).all()
-    assert not open_domain(schedule("control", IS_MORPHOLOGY, 8, first=first)).any()
-    single = schedule("single", IS_MORPHOLOGY, 8, first=first)
-    np.testing.assert_array_equal(single, schedule(first, IS_MORPHOLOGY, 8))
-
-
 @pytest.mark.parametrize("first", ["morphology", "control"])
 @pytest.mark.parametrize("episodes", [33, 64, 100, 128])
 @pytest.mark.parametrize("switches", [1, 2, 3, 4, 8, 16, 32])
@@ -376,17 +326,6 @@ def test_switches_are_exact_and_even(switches, episodes, first):
     assert domain[0] == (first == "morphology")
     lengths = np.diff(np.concatenate([[0], at, [episodes]]))
     assert lengths.max() - lengths.min() <= 1
-
-
-def test_as_many_switches_as_possible_alternate():
-    domain = open_domain(schedule("switch-7", IS_MORPHOLOGY, 8))
-    np.testing.assert_array_equal(domain, [True, False] * 4)
-
-
-def test_first_swaps_the_domains():
-    one = schedule("switch-4", IS_MORPHOLOGY, 64, first="morphology")
-    other = schedule("switch-4", IS_MORPHOLOGY, 64, first="control")
-    np.testing.assert_array_equal(one, ~other)
 
 
 @pytest.mark.parametrize(
@@ -404,16 +343,3 @@ def test_first_swaps_the_domains():
 def test_bad_names_are_errors(name, message):
     with pytest.raises(ValueError, match=message):
         schedule(name, IS_MORPHOLOGY, 64)
-
-
-def test_bad_arguments_are_errors():
-    with pytest.raises(ValueError, match="bool"):
-        schedule("concurrent", [0, 1, 1], 4)
-    with pytest.raises(ValueError, match="bool"):
-        schedule("concurrent", IS_MORPHOLOGY[None], 4)
-    with pytest.raises(ValueError, match="episodes"):
-        schedule("concurrent", IS_MORPHOLOGY, 0)
-    with pytest.raises(ValueError, match="first"):
-        schedule("single", IS_MORPHOLOGY, 4, first="both")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="no parameters"):
-        schedule("switch-1", np.array([True, True]), 4)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from codesign_jax import cli, codesign, own, parameters, runs, scene
+from codesign_jax import cli, codesign, parameters, runs, scene
 from codesign_jax.engines import make_engine
 from tests.helpers.command_runs import assert_same_run, snapshot
 from tests.helpers.toy_engine import TINY
@@ -275,11 +275,3 @@ def test_what_is_wrong_is_said_before_anything_is_created(asked, here, capsys):
     assert said.startswith(f"error: {asked.split()[0]}") and WRONG[asked] in said, said
     sys.modules.pop("broken", None)
     assert {k: v for k, v in snapshot(here).items() if "__pycache__" not in str(k)} == before
-
-
-def test_costs_see_as_much_of_a_grasp_as_they_say(here):
-    the_scene = scene.load(TINY)
-    assert own.make_cost("mine:turned", the_scene)[1] is False
-    assert own.make_cost("mine:until_lost", the_scene)[1] is True
-    with pytest.raises(scene.InputError, match="builtins has no file of Python code"):
-        own.contents(["scene", "builtins:pow"])

@@ -85,19 +85,6 @@ print(json.dumps([cli.__file__, "optimize" in text.getvalue()]))
     assert "codesign = codesign_jax.cli:main" in entry.read_text()
 
 
-def test_type_checkers_find_the_types(installed):
-    """PEP 561; `make types` checks `tests/typed_use.py` as a user's program."""
-    assert (installed / "codesign_jax" / "py.typed").exists()
-
-
-def test_dependencies_are_bounded():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    extras = [r for rows in project["optional-dependencies"].values() for r in rows]
-    for requirement in [*project["dependencies"], *extras]:
-        own = requirement.startswith("codesign-jax")
-        assert own or (">=" in requirement and "<" in requirement), requirement
-
-
 def test_extras_that_are_named_exist():
     """In pages, notebooks and messages: pip only warns of one that does not."""
     extras = {

@@ -11,7 +11,7 @@ import pytest
 
 from codesign_jax import model, preflight, scene, start
 from codesign_jax.model.layout import first_on_palm
-from codesign_jax.scene import constants, hand, parameters, schema
+from codesign_jax.scene import constants, hand, schema
 from tests.helpers.grasps import DATA, hand_world, pinch, random_worlds, still
 
 
@@ -69,24 +69,6 @@ def test_fingers_and_palm_are_as_deep_in_one_another_as_mujocos_geoms():
     assert {line.split(":")[0] for line in found} == {str(i) for i in np.flatnonzero(deep)}
 
 
-def test_starts_inside_table_or_object_are_refused():
-    """Straight fingers of 180 mm, 75 degrees down from 150 mm: as deep as MuJoCo C finds."""
-    the_scene = pinch(arm__start_height=0.15)
-    worlds = [hand_world(the_scene, length=length)[0] for length in (0.08, 0.18)]
-    designs = jax.tree.map(lambda *v: np.stack(v), *worlds)
-    [refusal] = preflight.refusals(the_scene, designs, ["short", "long"])
-    assert refusal.startswith("long: starts 17 mm inside the table or object 'box'")
-    assert refusal.endswith("raise arm.start_height = 0.15 m")
-
-
-def test_a_pressure_above_its_limit_is_refused():
-    scene = pinch()
-    space = parameters.design_space(scene.hand, "2d")
-    designs = jax.vmap(space.params)(space.default()[None])
-    wrong = designs._replace(pressure=0 * designs.pressure + 5e5)
-    assert "above the limit of" in preflight.refusals(scene, wrong, ["a design"])[0]
-
-
 @pytest.mark.parametrize("surface", ["spheres", "hull"])
 def test_fingers_inside_one_another_are_refused(surface):
     """Without a spread two pairs of the paper's fingers stand in one place: 20 mm deep."""
@@ -116,65 +98,9 @@ def test_a_tilt_in_radians_is_warned_of():
 # --- mounts of fingers ----------------------------------------------------------------------------
 
 
-SPREADS = np.deg2rad([0.0, 30.0, 60.0, 90.0, 110.0])
-CORNERS = list(itertools.product((0.010, 0.180), (0.015, 0.025)))  # lengths and heights of Table I
-
-
 def coarse(name, **effects):
     """A built-in scene with one joint a finger, whose straight fingers are the same boxes."""
     return scene.load(name, overrides={"discretization": {"links": 1}, "effects": effects})
-
-
-def closest(the_scene, **changes):
-    """Smallest distance between boxes of two straight fingers by MuJoCo C [m], by pair."""
-    params, trial = hand_world(the_scene, **changes)
-    compiled = model.compile_model(the_scene, params, trial, visual=True)
-    data = mujoco.MjData(compiled)
-    mujoco.mj_forward(compiled, data)
-    names = [compiled.geom(g).name for g in range(compiled.ngeom)]
-    blocks = [
-        [g for g, name in enumerate(names) if name.startswith(f"finger_{f}_block")]
-        for f in range(the_scene.num_fingers)
-    ]
-    assert [len(b) for b in blocks] == [2] * the_scene.num_fingers  # stub and link
-    return {
-        (a, b): min(
-            mujoco.mj_geomDistance(compiled, data, g, h, 1.0, None)
-            for g, h in itertools.product(blocks[a], blocks[b])
-        )
-        for a, b in itertools.combinations(range(the_scene.num_fingers), 2)
-    }
-
-
-def test_sections_of_the_papers_hand_do_not_overlap_at_any_spread():
-    """Lengths and heights only move faces outwards: the largest boxes contain all others.
-
-    So equal fingers of the table's corners are enough; MuJoCo C measures the boxes.
-    """
-    the_scene = coarse("paper", surface="spheres", finger_finger=False)
-    for (length, height), spread in itertools.product(CORNERS, SPREADS):
-        gaps = closest(the_scene, length=length, height=height, spread=spread)
-        # Centres of a pair are 26 mm apart and sections 20 mm wide: turning outwards moves no
-        # edge nearer to the plane between them. 1 nm is rounding.
-        assert min(gaps[0, 1], gaps[2, 3]) > 0.006 - 1e-9
-        # Inner edges of the two pairs stand at least 25 mm - 10 mm sin(55 degrees) from the centre.
-        assert min(gaps[pair] for pair in ((0, 2), (0, 3), (1, 2), (1, 3))) > 0.033
-
-
-def test_sections_on_a_circle_do_overlap():
-    """What the test above can see: bases on a circle stand in one another below 44 degrees."""
-    the_scene = coarse("paper_spheres")
-    assert closest(the_scene, spread=np.deg2rad(30.0))[0, 1] < -0.003
-    assert closest(the_scene, spread=np.deg2rad(50.0))[0, 1] > 0.0
-
-
-def test_contact_between_fingers_finds_none_at_rest():
-    the_scene = coarse("paper")
-    corners = itertools.product(CORNERS, SPREADS[[0, -1]])
-    worlds = [hand_world(the_scene, length=n, height=h, spread=s)[0] for (n, h), s in corners]
-    designs = jax.tree.map(lambda *v: np.stack(v), *worlds)
-    thin = designs._replace(wall=0 * designs.wall + 0.005)
-    assert not preflight.refusals(the_scene, thin, [*map(str, range(len(worlds)))])
 
 
 @pytest.mark.parametrize("spread", [0.0, 1.1])

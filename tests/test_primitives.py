@@ -32,10 +32,6 @@ def on_table(kind):
     return mujoco.MjModel.from_xml_string(text)
 
 
-def test_every_primitive_is_tried():
-    assert set(SIZES) == set(KINDS) == set(grasps.SHAPES)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_inertia_and_bounds_are_those_of_mujocos_compiler(kind):
     compiled, shape, size = on_table(kind), primitives.PRIMITIVES[kind], SIZES[kind]
@@ -57,18 +53,6 @@ def test_inertia_is_in_the_shapes_own_axes(kind):
     np.testing.assert_allclose(mesh.bounds[1], shape.half_extents(size), rtol=2e-3)
     way = np.array([0.48, -0.6, 0.64])
     assert shape.reach(size, way) == pytest.approx((mesh.vertices @ way).max(), rel=2e-3)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_shape_rests_on_the_table_and_stays(kind):
-    """It touches the plane to rounding at its start, and has not turned after a second."""
-    compiled = on_table(kind)
-    data = mujoco.MjData(compiled)
-    mujoco.mj_forward(compiled, data)
-    assert np.abs(data.contact.dist).min() < 1e-12
-    mujoco.mj_step(compiled, data, 500)
-    # MuJoCo's contacts sink in by less than a micrometre a newton; nothing turns or falls.
-    np.testing.assert_allclose(data.qpos[3:], primitives.PRIMITIVES[kind].upright, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", KINDS)

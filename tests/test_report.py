@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from codesign_jax import cli, model, rollout, scene
+from codesign_jax import model, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.report import animation, bodies, figures
 from codesign_jax.scene import parameters
@@ -34,12 +34,6 @@ def grasp():
 @pytest.fixture
 def no_opengl(monkeypatch):
     monkeypatch.setattr(animation, "opengl_backend", lambda: None)
-
-
-def test_replay_keeps_the_trajectory(grasp):
-    the_scene, replay = grasp
-    assert replay.qpos.shape[0] == the_scene.num_steps
-    assert np.isfinite(replay.qpos).all() and np.ptp(replay.qpos, axis=0).max() > 0.05
 
 
 def test_sketch_shows_hand_and_object_moving(grasp, no_opengl):
@@ -81,37 +75,6 @@ def test_mp4_plays_in_real_time_with_even_sides(grasp, no_opengl, tmp_path):
     assert np.abs(pictures[0][:61, :81].astype(int) - drawn).mean() < 6
 
 
-def test_strip_has_a_row_a_grasp_and_a_column_a_phase(grasp, no_opengl, tmp_path):
-    the_scene, replay = grasp
-    path = animation.write_strip(the_scene, [replay] * 2, tmp_path / "s.png", size=(50, 40))
-    with Image.open(path) as image:
-        assert image.size == (6 * 50, 2 * 40)
-
-
-def test_renderer_draws_hand_and_object(grasp):
-    the_scene, replay = grasp
-    if animation.opengl_backend() is None:
-        pytest.skip("no OpenGL on this machine")
-    frames = animation.frames(the_scene, replay, TIMES, size=(160, 120))
-    assert frames.shape == (3, 120, 160, 3)
-    r, g, b = np.moveaxis(frames.astype(int), -1, 0)
-    assert ((r > 150) & (b < 80)).any(axis=(1, 2)).all(), "an orange object in every frame"
-    assert ((b > r + 40) & (b > 90)).any(axis=(1, 2)).all(), "blue fingers in every frame"
-
-
-def test_pictures_are_larger_than_mujoco_s_own_buffer(grasp):
-    """640 x 480 unless the model says otherwise: 481 rows ended in a traceback."""
-    the_scene, replay = grasp
-    if animation.opengl_backend() is None:
-        pytest.skip("no OpenGL on this machine")
-    small, large = (
-        animation.frames(the_scene, replay, TIMES[:1], size=size)[0].astype(int)
-        for size in ((70, 50), (700, 500))
-    )
-    blocks = large.reshape(50, 10, 70, 10, 3).mean((1, 3))
-    assert np.abs(blocks - small).mean() < 8, "the same picture, but for the edges"
-
-
 @pytest.mark.parametrize("opengl", [True, False])
 def test_camera_moves(grasp, opengl, monkeypatch):
     """Closer is larger, and what is beside the point looked at is beside the middle."""
@@ -138,20 +101,6 @@ def test_camera_moves(grasp, opengl, monkeypatch):
     assert row < 60 and column < 60 and abs(usual[2] - 60) < 8
 
 
-def test_broken_opengl_falls_back(grasp, monkeypatch, tmp_path):
-    the_scene, replay = grasp
-    animation.opengl_backend.cache_clear()
-    monkeypatch.setenv("MUJOCO_GL", "no-such-way")
-    try:
-        said = []
-        animation.write_strip(
-            the_scene, [replay], tmp_path / "s.png", size=(40, 40), notify=said.append
-        )
-        assert len(said) == 1
-    finally:
-        animation.opengl_backend.cache_clear()
-
-
 def test_cost_evolution_marks_particles_mean_and_threshold(tmp_path):
     cost = np.random.default_rng(0).uniform(0, 3, (20, 10))
     path = figures.cost_evolution(cost, tmp_path / "figures" / "cost.png")
@@ -161,19 +110,6 @@ def test_cost_evolution_marks_particles_mean_and_threshold(tmp_path):
     assert (b > r + 60).sum() > 200, "blue dots"
     assert (r > b + 100).sum() > 200, "orange mean"
     assert ((pixels.max(-1) < 60).sum(1) > 0.2 * pixels.shape[1]).any(), "black threshold"
-
-
-def test_cost_evolution_of_an_unfinished_run(tmp_path):
-    figures.cost_evolution(np.ones((1, 1)), tmp_path / "one.png")
-
-
-@pytest.mark.parametrize("name", ["grasp.gif", "grasp.mp4", "grasp.png"])
-def test_evaluate_renders(name, tmp_path, monkeypatch, capsys, no_opengl):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    out = tmp_path / name
-    run = ["evaluate", "--scene", str(TINY), "--engine", "mujoco", "--trials", "1"]
-    assert cli.main([*run, "--render", str(out)]) == 0
-    assert out.exists() and f"picture: {out}" in capsys.readouterr().out
 
 
 # --- what a viewer draws --------------------------------------------------------------------------
@@ -216,11 +152,3 @@ def test_objects_have_their_size(name):
     assert mesh.is_watertight
     # A prism of 64 sides has 0.16 % less than its cylinder, an icosphere of 5120 faces 0.2 %.
     assert mesh.volume == pytest.approx(solid[name], rel=3e-3)
-
-
-def test_large_meshes_are_drawn_coarser():
-    fine = trimesh.creation.icosphere(7, 0.03)  # 327,680 faces
-    vertices, faces = bodies._coarse(np.asarray(fine.vertices), np.asarray(fine.faces))
-    assert len(faces) <= bodies._MOST_FACES
-    distance = np.linalg.norm(vertices[faces].mean(1), axis=1)
-    assert np.abs(distance - 0.03).max() < 0.001  # of a cell of at most 0.06 m / 84

@@ -13,7 +13,6 @@ from scipy import stats
 
 from codesign_jax import cli, runs, store
 from codesign_jax.commands import reference
-from codesign_jax.report import landscape
 from codesign_jax.runs import choice
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome, Status, failed
@@ -52,13 +51,6 @@ def test_report_is_one_small_file_that_names_its_origin(run, text):
     assert "&lt;run&gt; &amp; 1" in text and "<run>" not in text, "names are text, not HTML"
     page = re.sub(r"<script.*?</script>", "", text, flags=re.S)
     assert not re.search(r"(src|href)\s*=", page), "nothing is loaded from elsewhere"
-
-
-def test_failures_count_the_trials_of_the_table(run, text):
-    with (run / "trials.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    bad = sum(row["status"] not in ("OK", "SOLVER_CAP") for row in rows)
-    assert f"{bad} of {len(rows)} trials failed" in text
 
 
 def test_grasp_is_the_one_of_the_table(run):
@@ -124,26 +116,6 @@ def test_fresh_trials_at_reference_are_in_the_report(run, tmp_path, capsys):
         assert ("1 of 5 trials failed (STUCK 1)" in text) == words
 
 
-@pytest.mark.parametrize("moved", [False, True])
-def test_landscape_of_two_among_many_says_around_what_it_is(run, tmp_path, moved):
-    copy = tmp_path / "run"
-    shutil.copytree(run, copy)
-    the_scene, _ = runs.read_run(run)
-    design = choice.choose(the_scene, choice.read_record(run)).design
-    names, units = np.array(["wall[0]", "arm_z"]), np.array(["mm", "mm"])
-    cost, count = np.array([[2.9, 3.0], [3.0, 3.0]]), np.full((2, 2), 4)
-    found = landscape.Landscape(
-        names, units, np.arange(2.0), np.arange(2.0), cost, 0 * count, count,
-        np.array(4), np.array(0), design * (0.9 if moved else 1.0),
-    )  # fmt: skip
-    landscape.save(found, copy)
-    assert cli.main(["report", str(copy), "--no-replay"]) == 0
-    page = (copy / "report.html").read_text(encoding="utf-8")
-    own = "The other parameters are those of the chosen design." in page
-    assert "The other parameters are those of" in page and own != moved
-    assert '"zmin":0.0,"zmax":3.0' in page or '"zmax":3.0,"zmin":0.0' in page
-
-
 def test_errors_are_words(run, tmp_path, capsys, monkeypatch):
     assert cli.main(["report", str(tmp_path)]) == 2
     assert "is not a run folder" in capsys.readouterr().err
@@ -170,10 +142,3 @@ def test_errors_are_words(run, tmp_path, capsys, monkeypatch):
     assert cli.main(["report", str(run)]) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert "plotly" in line and "pip install '.[report]' in the checkout" in line
-
-
-@pytest.mark.parametrize(("episodes", "step"), [(1, 1), (4, 1), (24, 5), (29, 5), (128, 20)])
-def test_axes_of_episodes_have_ticks_at_whole_ones(episodes, step):
-    from codesign_jax.report import charts  # needs plotly
-
-    assert charts.failure_chart(np.full((episodes, 2, 3), Status.STUCK)).layout.xaxis.dtick == step

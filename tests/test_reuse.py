@@ -1,8 +1,6 @@
 """What is reused belongs to the code that this process imported, and is what was kept."""
 
 import os
-import subprocess
-import sys
 import types
 import warnings
 import zlib
@@ -50,22 +48,6 @@ def folder(tmp_path):
     jax.config.update("jax_compilation_cache_dir", str(tmp_path / "jax"))
     yield tmp_path / "jax"
     jax.config.update("jax_compilation_cache_dir", previous)
-
-
-def test_every_file_but_those_left_out_is_part_of_the_digest(code, monkeypatch):
-    first = reuse.code_digest()
-    assert first
-    (code / "report" / "c.py").write_text("other")
-    assert reuse.code_digest() == first
-    for name, text in (("deep/b.py", "other"), ("new.py", ""), ("a.py", "more")):
-        (code / name).write_text(text)
-        imported(monkeypatch)
-        assert reuse.code_digest() not in (None, first)
-    (code / "new.py").unlink()
-    (code / "deep/b.py").write_text("deep/b.py")
-    (code / "a.py").write_text("a.py")
-    imported(monkeypatch)
-    assert reuse.code_digest() == first
 
 
 def set_back(path):
@@ -154,25 +136,12 @@ def test_nothing_traced_is_found_once_the_code_is_not_known(monkeypatch):
         assert keep().currsize == 0
 
 
-def test_another_process_has_the_same_digest():
-    program = "from codesign_jax import reuse; print(reuse.code_digest())"
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=reuse.ROOT.parent, capture_output=True, text=True
-    )
-    assert done.stdout.split() == [reuse.code_digest()], done.stderr
-
-
 # Memory maps and processes
 
 
 def full(monkeypatch, share):
     """The process has this share of the maps that it may have."""
     monkeypatch.setattr(reuse, "memory_maps", lambda: (int(share * 65_530), 65_530))
-
-
-def test_the_system_tells_how_many_maps_there_are():
-    now, most = reuse.memory_maps()
-    assert 100 < now < most
 
 
 def test_programs_go_when_many_maps_are_taken(monkeypatch):
@@ -283,14 +252,6 @@ def test_a_wrong_limit_is_refused_before_anything_is_done(text, monkeypatch, cap
         reuse.use_compilation_cache()
 
 
-def test_a_wrong_switch_is_refused_and_all_that_is_wrong_is_said(monkeypatch, capsys):
-    monkeypatch.setenv("CODESIGN_CACHE", "maybe")
-    monkeypatch.setenv("CODESIGN_CACHE_BYTES", "many")
-    assert cli.main(["scenes", "hands"]) == 2
-    assert len(capsys.readouterr().err.splitlines()) == 2
-    assert reuse.problems()[0] == "CODESIGN_CACHE = 'maybe' must be on or off"
-
-
 def cube():
     """Vertices and faces of a cube of 2 cm."""
     import trimesh
@@ -321,44 +282,6 @@ def test_one_switch_turns_all_caches_off(place, monkeypatch):
     names = {(p.parent.name, p.name.rpartition("-")[2]) for p in place.rglob("*") if p.is_file()}
     assert {("jax", "cache"), ("jax", "atime")} <= names
     assert len([*place.glob("meshes/*.kept")]) == len([*place.glob("jax/kernels/*.kept")]) == 1
-
-
-def test_a_user_without_a_home_has_no_caches(monkeypatch):
-    """No HOME, and no entry in passwd: commands and the library work without."""
-    for variable in ("HOME", "XDG_CACHE_HOME", "CODESIGN_CACHE"):
-        monkeypatch.delenv(variable, raising=False)
-    monkeypatch.setattr(os, "getuid", lambda: 4_000_000_000)
-    assert reuse.limit() is None
-    monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
-    assert reuse.limit()
-
-
-def test_jax_deletes_what_was_not_used_for_the_longest_time(place, monkeypatch):
-    """By its own limit of size, also among programs from before there was one."""
-    monkeypatch.setenv("CODESIGN_CACHE_BYTES", "20000")
-    (place / "jax").mkdir(parents=True)
-    old = place / "jax" / "jit_old-0-cache"
-    old.write_bytes(zlib.compress(os.urandom(9000)))
-    os.utime(old, (1, 1))
-    reuse.use_compilation_cache()
-    assert old.exists()
-    for k in range(8):
-        jax.jit(lambda v, k=k: jnp.sin(v) * 1.5 + k)(jnp.ones(5))
-    programs = [*(place / "jax").glob("*-cache")]
-    assert not old.exists() and 0 < sum(p.stat().st_size for p in programs) <= 20000
-
-
-def test_a_grid_in_the_place_of_another_is_not_taken(place, monkeypatch):
-    monkeypatch.setattr(grid, "WORTH_KEEPING", 0.0)
-    vertices, faces = cube()
-    first = grid.cached("a", vertices, faces, 1e-3, 0.014)
-    grid.cached("b", 0.5 * vertices, faces, 1e-3, 0.014)
-    one, other = sorted((place / "meshes").iterdir(), key=lambda p: p.stat().st_size)
-    content = one.read_bytes()
-    one.write_bytes(other.read_bytes())
-    other.write_bytes(content)
-    again = grid.cached("a", vertices, faces, 1e-3, 0.014)
-    np.testing.assert_array_equal(again.values, first.values)
 
 
 def test_what_is_kept_is_found_and_damage_is_seen(folder):

@@ -524,21 +524,6 @@ def test_segments_have_the_bits_of_the_whole_path():
     assert (cut[1][:2, :20] != whole[1][:2, :20]).any()
 
 
-@pytest.mark.slow
-def test_segments_need_a_fifth_of_the_memory():
-    """Temporary memory of the compiled gradient, which has all that is stored of the steps."""
-    the_scene = grasps.pinch("sphere", links=2, **SHORT)
-    fields, ctrl = grasps.batch_inputs(the_scene, *grasps.random_worlds(the_scene, 3, 64))
-    sizes = {}
-    for segment in (None, 30):
-        engine = StructuredEngine(the_scene, segment=segment)
-        slope = jax.grad(lambda f, engine=engine: engine.rollout(f, ctrl[:, :900]).distance.sum())
-        sizes[segment] = jax.jit(slope).lower(fields).compile().memory_analysis().temp_size_in_bytes
-    print(sizes)
-    # 30 states of 900, and the 30 steps of one segment: a fifteenth, beside cotangents by step.
-    assert sizes[30] < 0.2 * sizes[None]
-
-
 def test_segments_are_asked_for_in_words():
     the_scene = grasps.pinch("sphere", links=2)
     with pytest.raises(ValueError, match="at least"):

@@ -38,13 +38,6 @@ def tilted(degrees, *sizes):
     return mesh
 
 
-def turn(shape):
-    """Rotation matrix of an object from the frame of its file to the world."""
-    back = Rotation.from_quat(np.roll(shape.mesh.upright, -1)).inv() if shape.mesh else 1
-    whole = Rotation.from_quat(np.roll(shape.upright, -1))
-    return (whole * back if shape.mesh else whole).as_matrix()
-
-
 # --- poses ---------------------------------------------------------------------------------------
 
 

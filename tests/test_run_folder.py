@@ -1,6 +1,5 @@
 """Run folders: nothing is deleted that is not a run's."""
 
-import json
 import os
 import shutil
 
@@ -12,7 +11,7 @@ from codesign_jax.runs.directory import open_run
 from codesign_jax.scene.schema import InputError
 from tests.helpers.command_runs import command, own_workplace, snapshot, without  # noqa: F401
 from tests.helpers.tiny_run import RUN, copied
-from tests.helpers.toy_engine import TINY, tiny
+from tests.helpers.toy_engine import tiny
 
 SETTINGS = runs.make_settings("2d", "concurrent", "control", "mujoco", 0, particles=4, episodes=2)
 
@@ -100,19 +99,6 @@ def test_a_start_that_was_cut_short_goes_on(moment, tmp_path, monkeypatch):
     assert scene.load(folder / "scene.toml") == tiny()[0]
 
 
-def test_a_start_that_was_cut_short_is_of_its_own_scene(tmp_path, monkeypatch):
-    folder = tmp_path / "run"
-    with monkeypatch.context() as patch:
-        patch.setattr(scene_files, "write_scene", lambda *_: (_ for _ in ()).throw(OSError))
-        with pytest.raises(OSError):
-            start(folder)
-    with pytest.raises(InputError, match="is missing since the run was made"):
-        other = tiny(**{"discretization.timestep": 0.01})[0]
-        with open_run(folder, other, SETTINGS, ["codesign"]):
-            pass
-    assert start(folder, fresh=True) == []
-
-
 @pytest.mark.parametrize("kind", ["file", "folder", "link", "dangling"])
 def test_fresh_deletes_no_file_that_is_not_the_runs(kind, run, tmp_path):
     other = tmp_path / "other"
@@ -131,14 +117,6 @@ def test_fresh_deletes_no_file_that_is_not_the_runs(kind, run, tmp_path):
     words = {"file": "figures/my own.png in", "folder": "tests.csv in"}
     assert words.get(kind, "failures in") in str(refused.value)
     assert snapshot(run) == before and (other / "picture.png").exists()
-
-
-def test_fresh_reads_its_scene_before_it_deletes_it(run):
-    """The scene in the folder itself: it is written again, as it was."""
-    before = (run / "scene.toml").read_bytes()
-    again = [str(run / "scene.toml") if a == str(TINY) else a for a in RUN]
-    assert command(*again, "--out", run, "--fresh", "--episodes", "1", "--test-trials", "0") == 0
-    assert (run / "scene.toml").read_bytes() == before
 
 
 def test_fresh_that_was_cut_short_can_be_given_again(run, monkeypatch):
@@ -163,25 +141,9 @@ def test_fresh_that_was_cut_short_can_be_given_again(run, monkeypatch):
     assert not (run / "checkpoints").exists() and not (run / "figures").exists()
 
 
-def test_another_hand_is_said_in_a_line(run, capsys):
-    assert command(*RUN, "--hand", "tripod3", "--out", run) == 2
-    error = capsys.readouterr().err
-    assert "error: --hand: the run has " in error and ", asked for is tripod3\n" in error
-    assert "run/hand.toml" not in error and len(error.splitlines()) == 2
-
-
 def test_a_run_has_no_files_but_its_own(run):
     """What `--fresh` deletes is all that a run makes."""
     assert command("report", run, "--no-replay") == 0
     directory._refuse_to_delete(run)
     directory._delete_run(run)
     assert os.listdir(run) == [".lock"]
-
-
-def test_a_new_run_has_an_identity_of_its_own(tmp_path):
-    start(tmp_path / "a")
-    start(tmp_path / "b")
-    first, second = (json.loads((tmp_path / n / "provenance.json").read_text()) for n in "ab")
-    assert first["schema"] == second["schema"] == manifest.SCHEMA
-    assert first["id"] != second["id"] and first["files"] == second["files"]
-    assert [*first["files"]] == ["scene.toml", "hand.toml", "objects.toml", "control.toml"]

@@ -5,7 +5,6 @@ import io
 import os
 import re
 import signal
-import threading
 import time
 from functools import partial
 from pathlib import Path
@@ -23,11 +22,10 @@ from codesign_jax.runs import record as records
 from codesign_jax.runs import settings as settings_module
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.interrupts import Interrupts, Stopped
-from codesign_jax.runs.progress import Busy, Live, Progress, Report, Voice, duration
+from codesign_jax.runs.progress import Live, Progress, Report, Voice
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import effects, library, parameters
-from codesign_jax.types import Status
 from tests.helpers import episodes
 from tests.helpers.toy_engine import tiny
 
@@ -76,41 +74,6 @@ def test_resolved_scene_reads_back_the_same(tmp_path, name, hand):
     again = scene.load(tmp_path / "scene.toml")
     assert again == original and hash(again) == hash(original)
     assert parameters.design_space(again.hand) == parameters.design_space(original.hand)
-
-
-def test_resolved_scene_ignores_the_working_directory(tmp_path, monkeypatch):
-    (tmp_path / "a").mkdir()
-    write_scene(scene.load(), tmp_path / "a")
-    (tmp_path / "hand.toml").write_text("another = 'hand'")
-    monkeypatch.chdir(tmp_path)
-    assert scene.load("a/scene.toml") == scene.load()
-
-
-def test_resolved_scene_names_units(tmp_path):
-    write_scene(scene.load("paper_spheres"), tmp_path)
-    text = (tmp_path / "scene.toml").read_text()
-    assert "timestep = 0.01  # s\n" in text and 'hand = "hand.toml"\n' in text
-    hand = (tmp_path / "hand.toml").read_text()
-    assert "shear_modulus = 56000.0  # Pa\n" in hand
-    assert "finger = [  # azimuth in deg, tilt in deg, radius in m, base in m\n" in hand
-    assert "size = [  # m\n" in (tmp_path / "objects.toml").read_text()
-
-
-def test_a_scene_with_other_constants_is_written(tmp_path):
-    original = scene.load()
-    numbers = original.constants()
-    numbers = numbers._replace(contact=numbers.contact._replace(normal_stiffness=4321.0))
-    write_scene(original.with_constants(numbers), tmp_path)
-    again = scene.load(tmp_path / "scene.toml")
-    assert again.contact.normal_stiffness == 4321.0
-    assert again.hand == original.hand and again.cost == original.cost
-
-
-def test_text_survives_the_scene_file(tmp_path):
-    odd = 'quote " backslash \\ newline \n return \r\n tab \t = # é 🖐'
-    original = scene.load(overrides={"description": odd})
-    write_scene(original, tmp_path)
-    assert scene.load(tmp_path / "scene.toml").description == odd
 
 
 def test_sizes_default_to_the_papers():
@@ -198,12 +161,6 @@ def test_record_survives_its_arrays_bitwise(run):
     assert again.done == 3 and jnp.issubdtype(again.state.key.dtype, jax.dtypes.prng_key)
 
 
-def test_history_of_a_restored_record_can_be_written(run):
-    _, _, record, _ = run
-    arrays = jax.tree.map(lambda v: np.asarray(jnp.asarray(v)), records.to_arrays(record))
-    records.from_arrays(arrays).history.cost[0] = 1.0
-
-
 def read(path):
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
@@ -241,29 +198,6 @@ def test_every_file_and_column_is_described_on_the_page(run, tmp_path):
     assert named == {n: [*t.columns] for n, t in (columns.TABLES | columns.MORE).items()}
 
 
-def test_tables_by_episode_equal_tables_at_once(run, tmp_path):
-    the_scene, space, record, _ = run
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    for folder in (whole, parts):
-        folder.mkdir()
-    tables.write_episodes(whole, the_scene, space, record.history, 0, 3)
-    for e in range(3):
-        tables.write_episodes(parts, the_scene, space, record.history, e, e + 1)
-    for path in whole.iterdir():
-        assert (parts / path.name).read_bytes() == path.read_bytes()
-
-
-def test_status_names():
-    assert tables.status_names(0) == "OK"
-    assert tables.status_names(Status.SPEED) == "SPEED"
-    assert tables.status_names(Status.NONFINITE | Status.PENETRATION) == "NONFINITE+PENETRATION"
-
-
-def test_design_columns_carry_units():
-    columns = tables.design_columns(parameters.design_space(scene.load().hand, "23d"))
-    assert columns[0] == "length_0_mm" and columns[-1] == "pressure_3_kPa" and len(columns) == 23
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signal_lets_the_step_finish(number):
     before, said = signal.getsignal(number), []
@@ -281,27 +215,6 @@ def test_signal_lets_the_step_finish(number):
     assert signal.getsignal(number) is before
 
 
-def test_interrupts_leave_signals_alone_outside_the_main_thread():
-    result = []
-
-    def work():
-        with Interrupts(lambda _: None) as interrupts:
-            result.append(interrupts.call(lambda: 5))
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join()
-    assert result == [5]
-
-
-def test_error_in_a_step_is_passed_on():
-    def step():
-        raise ValueError("broken")
-
-    with Interrupts(lambda _: None) as interrupts, pytest.raises(ValueError, match="broken"):
-        interrupts.call(step)
-
-
 def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path):
     path = tmp_path / "new" / "file.txt"
     with files.atomically(path) as part:
@@ -311,15 +224,6 @@ def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path):
         part.write_text("half")
         raise RuntimeError
     assert path.read_text() == "old" and list(path.parent.iterdir()) == [path]
-
-
-def test_progress_line(capsys):
-    with Progress(64) as progress:
-        line = Voice(progress).episode(Report(16, 1.5, 0.25, 1, 60, "STUCK 1"))
-        progress.round(10.0)
-    assert line == "episode 16/64  mean 1.500  best 0.250  failed 1/60 (STUCK 1)"
-    told = f"{line}  6.0 grasps/s  ETA 8:00"  # 48 episodes of 10 s
-    assert capsys.readouterr().out == f"{told}\n"
 
 
 def test_time_left_includes_the_tests(capsys):
@@ -335,21 +239,6 @@ def test_time_left_includes_the_tests(capsys):
     assert lines[0].endswith("ETA 10:00") and lines[1].endswith("ETA 2:00")
     assert lines[2] == "final test 300/600 grasps  6.0 grasps/s  ETA 1:10"
     assert len(lines) == 3  # the second part came at once: a line now and then
-
-
-def test_time_left_of_many_runs(capsys):
-    """Two runs, at 2 x 60 grasps in 10 s: two episodes are left, and 60 of the test for each."""
-    with Progress(3, 2, test=60) as progress:
-        for k in (0, 1):
-            Voice(progress, f"seed {k}").episode(Report(1, 1.0, k, 0, 60))
-        progress.round(10.0)
-        for _ in range(2):
-            progress.tested(60)
-        progress.round(10.0)
-    lines = capsys.readouterr().out.splitlines()
-    assert "1/3  2 runs  mean 1.000 to 1.000  best 0.000 to 1.000  failed 0/120  " in lines[0]
-    assert lines[0].endswith("12.0 grasps/s  ETA 0:30")
-    assert lines[1] == "final test 120/120 grasps  12.0 grasps/s  ETA 0:00"
 
 
 def test_silence_is_broken_where_there_is_no_terminal(monkeypatch, capsys):
@@ -369,24 +258,3 @@ def test_silence_is_broken_where_there_is_no_terminal(monkeypatch, capsys):
     told = {second: text for second, text in said.items() if text}
     assert list(told) == [5, 10, 15, 23, 28]
     assert told[5] == "simulating: 0:05\n" and told[28] == "simulating: 0:28\n"
-
-
-def test_what_is_busy_says_so_where_there_is_no_terminal(monkeypatch, capsys):
-    told = threading.Event()
-    monkeypatch.setattr("codesign_jax.runs.progress.SILENCE", 0.0)
-    monkeypatch.setattr(Live, "tick", lambda self, tick=Live.tick: (tick(self), told.set()))
-    with Busy(Console(file=io.StringIO()), "simulating"):
-        assert told.wait(60)
-    assert "simulating: 0:00" in capsys.readouterr().err
-    told.clear()
-    bar = io.StringIO()
-    with Busy(Console(file=bar, force_terminal=True), "simulating"):
-        pass
-    assert "simulating" in bar.getvalue() and capsys.readouterr().err == ""
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(0, "0:00"), (59.6, "1:00"), (600, "10:00"), (3725, "1:02:05")]
-)
-def test_duration(seconds, text):
-    assert duration(seconds) == text

@@ -1,7 +1,6 @@
 """How kernels reach XLA on a CPU: threads, checks, versions, fallback, and kept machine code."""
 
 import ctypes
-import gc
 import importlib.metadata
 import os
 import shutil
@@ -17,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from codesign_jax.compiler import cpu, ffi, gpu, handlers, launch, vector
+from codesign_jax.compiler import cpu, ffi, gpu, handlers, launch
 from codesign_jax.compiler.values import OUTPUT, SCRATCH, Array, Layout
 from tests.helpers import call_frames, kernels
 
@@ -77,25 +76,6 @@ def test_any_number_of_threads_gives_the_same_bits(handler, pool, threads, block
     np.testing.assert_array_equal(out, alone)
 
 
-def test_all_cores_work():
-    """XLA's threads take a real part of the blocks of one device."""
-    if len(os.sched_getaffinity(0)) < 2:
-        pytest.skip("one core")
-    x, table = map(jnp.asarray, kernels.numbers(200))
-    run = jax.jit(partial(kernels.run, rounds=300_000)).lower(x, table).compile()
-
-    def spent():  # nanoseconds on a core, by thread
-        tasks = Path("/proc/self/task").iterdir()
-        return {t.name: int((t / "schedstat").read_text().split()[0]) for t in tasks}
-
-    before = spent()
-    jax.block_until_ready(run(x, table))
-    took = sorted(v - before.get(k, 0) for k, v in spent().items())
-    # To start a thread takes far less than a millisecond; on the busiest one the blocks take 50.
-    assert took[-1] > 1e6
-    assert took[-2] > 0.1 * took[-1]
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_calls_of_one_program_and_of_many_threads(dtype):
     """Several calls at once, in one program and from several threads, find the pool busy."""
@@ -117,23 +97,6 @@ def test_calls_of_one_program_and_of_many_threads(dtype):
     assert len(found) == 4
     for got in [alone, *found]:
         jax.tree.map(np.testing.assert_array_equal, want, got)
-
-
-def test_subnormal_numbers_are_the_same_on_every_thread():
-    """XLA's threads and the caller's treat numbers near 0 alike."""
-    x, table = kernels.numbers(400)
-    x[:, 0], x[:, 1], table[:] = 0.3, 0.0, 1e-40
-    got = np.asarray(jax.jit(partial(kernels.run, rounds=5000))(x, table))
-    assert len(np.unique(got)) == 1
-
-
-def test_blocks_of_another_number_need_no_other_code(monkeypatch):
-    """The machine code does not know how many blocks there are."""
-    jax.jit(kernels.run)(*kernels.numbers(2))
-    monkeypatch.setattr(vector, "write", lambda *_: pytest.fail("written again"))
-    x, table = kernels.numbers(5)
-    got = jax.jit(kernels.run)(x, table)
-    np.testing.assert_allclose(got, kernels.expected(x, table), atol=2**10 * 4 * 6e-8)
 
 
 DEVICES = """
@@ -231,18 +194,6 @@ def test_arrays_of_another_kind_are_refused():
                 call(*arguments)
 
 
-@pytest.mark.parametrize("structure", ["args", "buffer"])
-def test_smaller_structures_are_refused(handler, structure, monkeypatch):
-    """A structure that ends early is not read."""
-    (x, table), out = kernels.numbers(2), np.zeros((2, 1, 8), np.float32)
-    kind = {"args": ffi.Arguments, "buffer": ffi.Buffer}[structure]
-    size = ffi.size
-    monkeypatch.setattr(ffi, "size", lambda s: size(s) - 8 * (s is kind))
-    xla = call_frames.Xla()
-    code, message = xla.call(handler, [x, table], [out])
-    assert code == ffi.INVALID_ARGUMENT and "plain needs" in message and not out.any()
-
-
 @pytest.mark.parametrize("threads", [1, 4])
 def test_missing_memory_is_an_error(threads):
     """Scratch memory of a petabyte: the call fails, and says why."""
@@ -254,32 +205,6 @@ def test_missing_memory_is_an_error(threads):
     code, message = xla.call(loaded.function("large"), [x, table], [out])
     xla.run_late()
     assert code == ffi.RESOURCE_EXHAUSTED and "scratch" in message
-
-
-def test_garbage_is_not_searched_for_while_a_kernel_is_compiled(monkeypatch):
-    """And is again afterwards, also if it cannot be compiled."""
-    found = []
-
-    def register(*args, **kwargs):
-        found.append(gc.isenabled())
-        raise NotImplementedError("no instruction")
-
-    monkeypatch.setattr(cpu, "register", register)
-    with pytest.raises(NotImplementedError, match="no instruction"):
-        kernels.run(*kernels.numbers(2))
-    assert found == [False] and gc.isenabled()
-
-
-def test_wrong_arguments_of_a_launch():
-    """Before anything is compiled."""
-    x, table = kernels.numbers(3)
-    with pytest.raises(ValueError, match=r"array 1 of shape \(3, 1, 8\) is shared"):
-        jax.jit(kernels.run)(x, np.concatenate([table] * 3))
-    function, outputs = kernels.call(x, table)
-    with pytest.raises(ValueError, match=r"array 1 of shape \(1, 1, 8\) must have 3 blocks"):
-        launch.launch(function, (x, table), outputs, launch.Kernel("none", "cpu", 8))
-    with pytest.raises(ValueError, match="array 2 is an output"):
-        launch.describe((x[:1],), [table, table], launch.Kernel("none", "cpu", 8, shared=(2,)))
 
 
 # The interface's version and structures

@@ -1,7 +1,5 @@
 """`codesign sample`: rows that follow from keys, what a kill leaves, and other questions."""
 
-import json
-
 import jax
 import numpy as np
 import pyarrow.parquet as pq
@@ -10,9 +8,7 @@ import pytest
 from codesign_jax import cli, codesign, objects, rollout, sampling, scene
 from codesign_jax.commands import sample
 from codesign_jax.runs import dataset, directory
-from codesign_jax.runs.tables import design_columns
 from codesign_jax.scene import parameters
-from codesign_jax.types import Outcome, Status
 from tests.helpers.grasps import nth
 from tests.helpers.toy_engine import TINY, ToyEngine, tiny
 
@@ -80,23 +76,6 @@ def killed_after(saves, monkeypatch, **sizes):
 # --- draws ---------------------------------------------------------------------------------------
 
 
-def test_any_part_is_drawn_alone():
-    whole = sampling.draw(THREE, SPACE, KEY, first=0, n=9, num_trials=2)
-    part = sampling.draw(THREE, SPACE, KEY, first=4, n=5, num_trials=2)
-    for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(part), strict=True):
-        np.testing.assert_array_equal(a[4:], b)
-    assert len(np.unique(whole.trials.yaw)) == 18  # noise of its own for each grasp
-    np.testing.assert_array_equal(np.bincount(np.ravel(whole.trials.shape)), [6, 6, 6])
-
-
-def test_objects_take_turns_with_one_trial_and_at_large_indices():
-    first = 2**31 - 8
-    drawn = sampling.draw(THREE, SPACE, KEY, first=first, n=6, num_trials=1)
-    np.testing.assert_array_equal(drawn.trials.shape[:, 0], (first + np.arange(6)) % 3)
-    with pytest.raises(scene.InputError, match="num_trials = 0 must be"):
-        sampling.draw(THREE, SPACE, KEY, first=0, n=6, num_trials=0)
-
-
 def test_outcomes_are_those_of_each_grasp_by_itself():
     drawn = sampling.draw(THREE, SPACE, KEY, first=4, n=4, num_trials=2)
     engine = ToyEngine(THREE)
@@ -152,36 +131,6 @@ def test_a_row_has_design_noise_and_outcome(place, capsys):
     assert f"of 20 grasps: {said}" in capsys.readouterr().out and counts["lost"] > 0
 
 
-def test_units_and_the_question_are_in_the_schema(place):
-    assert run("--preset", "full", designs=1, trials=1) == 0
-    schema = pq.read_schema("a.parquet")
-    space = parameters.design_space(THREE.hand, "full")
-    for column, name, unit in zip(design_columns(space), space.names, space.units, strict=True):
-        metadata = schema.field(column).metadata
-        assert (metadata[b"unit"].decode(), metadata[b"parameter"].decode()) == (unit, name)
-    assert schema.field("noise_yaw_rad").metadata[b"unit"] == b"rad"
-    assert all(field.metadata[b"description"] for field in schema)
-    question = json.loads(schema.metadata[b"question"])
-    assert (question["seed"], question["trials"], question["preset"]) == (3, 1, "full")
-    assert {"scene.toml", "hand.toml", "objects.toml", "control.toml"} == set(question["scene"])
-
-
-def test_row_groups_end_where_memory_would_grow(place, monkeypatch):
-    monkeypatch.setattr(dataset, "ROWS", 12)
-    assert run() == 0
-    found = pq.ParquetFile("a.parquet").metadata
-    assert [found.row_group(k).num_rows for k in range(found.num_row_groups)] == [16, 4]
-
-
-def test_verdicts_are_the_losses_and_the_status():
-    """A warning fails no trial, and a loss that costs next to nothing is one."""
-    status = np.array([Status.OK, Status.SOLVER_CAP, Status.OK, Status.STUCK, Status.SPEED])
-    cost = np.array([0.0, 0.0, 0.007, 3.0, 3.0])
-    lost = np.array([np.inf, np.inf, 7.99, np.inf, np.inf])
-    found = codesign.verdicts(Outcome(cost, status, lost, status))
-    assert [codesign.VERDICTS[k] for k in found] == ["kept", "kept", "lost", "stuck", "failed"]
-
-
 # --- kills ---------------------------------------------------------------------------------------
 
 
@@ -196,28 +145,6 @@ def test_a_killed_command_goes_on_to_the_same_bytes(place, monkeypatch, capsys):
     assert "going on after 2 of 3 calls, from a.parquet.part" in capsys.readouterr().out
     assert (place / "a.parquet").read_bytes() == (place / "whole.parquet").read_bytes()
     assert sorted(p.name for p in place.iterdir()) == ["a.parquet", "whole.parquet"]
-
-
-def test_a_damaged_part_is_simulated_again(place, monkeypatch):
-    assert run(out="whole.parquet") == 0
-    killed_after(2, monkeypatch)
-    part = place / "a.parquet.part" / "0.npz"
-    part.write_bytes(part.read_bytes()[:-20])
-    assert run() == 0
-    assert (place / "a.parquet").read_bytes() == (place / "whole.parquet").read_bytes()
-
-
-def test_fewer_designs_of_what_was_begun_are_enough(place, monkeypatch):
-    """And a command that was killed while it wrote writes again."""
-    assert run(out="whole.parquet") == 0
-    killed_after(2, monkeypatch)
-    with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(dataset, "_table", lambda *_: (_ for _ in ()).throw(Killed))
-        run(designs=7, chunk=None)
-    assert not (place / "a.parquet").exists()
-    assert run(designs=7, chunk=None) == 0
-    seven = pq.read_table("a.parquet")
-    assert seven.equals(pq.read_table("whole.parquet").slice(0, 14))
 
 
 # --- what is refused -----------------------------------------------------------------------------
@@ -246,13 +173,6 @@ def test_a_file_that_is_there_is_never_replaced(place, monkeypatch, capsys):
     assert run() == 2
     assert "--out a.parquet is there already" in capsys.readouterr().err
     assert (place / "a.parquet").read_bytes() == b"mine"
-
-
-def test_a_file_of_somebody_else_is_left_alone(place, capsys):
-    (place / "a.parquet.part").write_bytes(b"mine")
-    assert run() == 2
-    assert "a.parquet.part is no part of a data set" in capsys.readouterr().err
-    assert (place / "a.parquet.part").read_bytes() == b"mine"
 
 
 def test_two_processes_do_not_write_one_file(place, capsys):

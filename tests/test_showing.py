@@ -1,9 +1,7 @@
 """`codesign render`, `replay` and `landscape`: one grasp is simulated, a grid is complete."""
 
 import csv
-import errno
 import json
-import os
 import re
 import sys
 
@@ -14,7 +12,6 @@ from PIL import Image
 
 from codesign_jax import batch, cli, codesign, runs, scene
 from codesign_jax.commands import landscape as command
-from codesign_jax.commands import replay, status
 from codesign_jax.engines import make_engine
 from codesign_jax.report import animation, landscape
 from codesign_jax.runs import choice
@@ -90,21 +87,6 @@ def test_replay_writes_the_best_grasp_of_a_run(run, simulated, tmp_path, capsys)
     assert not re.search(r"(src|href)\s*=\s*[\"']", page), "nothing is loaded from elsewhere"
 
 
-def test_failed_worlds_are_listed_where_no_grasp_was_asked_for(run, tmp_path, monkeypatch):
-    listed = []
-    monkeypatch.setattr(replay, "show_failures", listed.append)
-    monkeypatch.setattr(replay, "write_page", lambda *arguments: None)
-    own = ["replay", str(run), "--out", str(tmp_path / "r.html")]
-    for more in (["--trial", "0"], ["--episode", "1"], ["--object", "sphere"]):
-        assert cli.main([*own, *more]) == 0 and not listed
-    assert cli.main(own) == 0 and listed == [run]
-
-
-def test_replay_of_a_design_goes_here_unless_told(workplace, simulated):
-    assert cli.main(["replay", *DESIGN, "--object", "sphere"]) == 0
-    assert (workplace / "replay.html").exists() and simulated == [1]
-
-
 def test_wrong_grasps_are_refused_in_words(run, workplace, capsys):
     own = ["--run", str(run)]
     cases = {
@@ -167,16 +149,6 @@ def test_places_that_cannot_be_written_are_said_before_a_simulation(
     assert simulated == [] and [p.name for p in workplace.iterdir()] == ["file"]
 
 
-def test_what_cannot_be_written_in_the_end_is_said_in_words(capsys):
-    def full() -> int:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "grasp.gif")
-
-    assert status.of(full) == 1
-    error = capsys.readouterr().err
-    assert error.startswith("error: grasp.gif: No space left on device; make room")
-    assert error.count("\n") == 1
-
-
 def test_landscape_has_every_point(run, monkeypatch, capsys):
     """Cut into calls, it is what one evaluation of all designs says; files and report agree."""
     monkeypatch.setitem(batch.WORLDS, "cpu", 10)  # five designs; the last call is filled up
@@ -237,55 +209,9 @@ def test_landscape_varies_two_of_many_and_counts_what_it_should():
     assert found.first[-1] == pytest.approx(made.axes[0][-1] / 1e3)
 
 
-def test_a_file_that_is_no_landscape_is_refused(tmp_path):
-    for content in (b"", b"nothing"):
-        (tmp_path / "x.npz").write_bytes(content)
-        with pytest.raises(scene.InputError, match="is not a landscape of this version"):
-            landscape.load(tmp_path / "x.npz")
-
-
-def test_a_landscape_of_another_scene_stays_out_of_the_run(run, workplace, monkeypatch):
-    simulated = []
-
-    def simulate(case, designs, *rest):
-        simulated.append(case.scene.gravity)
-        zero = np.zeros((len(designs), 1))
-        return Outcome(zero, zero.astype(int), zero, zero.astype(int))
-
-    monkeypatch.setattr(command, "simulated_designs", simulate)
-    before = (run / landscape.FILE).exists()
-    sizes = ["--points", "2", "--trials", "1"]
-    assert cli.main(["landscape", "--run", str(run), *sizes, "--set", "gravity=3.7"]) == 0
-    assert (run / landscape.FILE).exists() == before
-    assert simulated == [3.7] and (workplace / "landscape" / landscape.FILE).exists()
-    assert landscape.load(workplace / "landscape" / landscape.FILE).cost.shape == (2, 2)
-
-
-def test_stopped_landscape_leaves_nothing(workplace, monkeypatch, capsys):
-    def stop(*rest):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(command, "simulated_designs", stop)
-    assert cli.main(["landscape", *DESIGN, "--points", "2"]) == 130
-    assert not list(workplace.iterdir()) and "stopped" in capsys.readouterr().err
-
-
 def test_missing_extra_is_one_line(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "av", None)
     for arguments in (["render", *DESIGN, "--out"], ["evaluate", *DESIGN, "--render"]):
         assert cli.main([*arguments, "a.mp4"]) == 2
         [line] = capsys.readouterr().err.splitlines()
         assert ".mp4 needs PyAV: pip install '.[report]' in the checkout" in line
-
-
-def test_camera_of_render(workplace, monkeypatch):
-    """A view, and numbers that replace its own in whatever order."""
-    cameras = []
-    monkeypatch.setattr(animation, "write_strip", lambda *_, camera, **__: cameras.append(camera))
-    words = ["z=0.2", "side", "distance=0.3"]
-    for given in ([], words):
-        flags = ["--camera", *given] if given else []
-        assert cli.main(["render", *DESIGN, "--out", "a.png", *flags]) == 0
-    side = animation.VIEWS["side"]
-    wanted = side._replace(distance=0.3, lookat=(0.0, 0.0, 0.2))
-    assert cameras == [animation.CAMERA, wanted]

@@ -11,7 +11,7 @@ from scipy import integrate, optimize
 
 from codesign_jax import codesign, constants, model, runs, scene
 from codesign_jax.commands import reference
-from codesign_jax.model import morphology, overlap
+from codesign_jax.model import overlap
 from codesign_jax.report import stress
 from codesign_jax.scene import beams, parameters
 from tests.helpers.command_runs import command, finished_run, own_workplace  # noqa: F401
@@ -146,24 +146,6 @@ def test_no_design_of_a_space_is_beyond_the_strain(law):
         state, _ = tell(state, population, cost, mask)
         assert highest(population).max() <= 1
     assert highest(state.particles).max() <= 1
-
-
-def test_warnings_of_a_design():
-    assert stress.of_design(PAPER, HAND) == []
-    limit = PAPER.hand.pressure_limit.per_wall * 0.003
-    changed = HAND._replace(
-        wall=HAND.wall * 0 + 0.003,
-        length=HAND.length * 0 + [0.05, 0.05, 0.05, 0.175],
-        pressure=np.array([0.0, 0.9 * limit, limit, 0.9 * limit]),
-        arm=np.array([0, 0, -0.02, np.radians(40), 0, 0]),
-    )
-    free = np.degrees(morphology.free_bends(PAPER.hand, changed))
-    palm = 45 * np.sin(np.radians(40)) + 20 - 1e3 * PAPER.arm.zero_height
-    assert stress.of_design(PAPER, changed) == [
-        "finger 2: its pressure is at its limit, 120 kPa",
-        f"finger 3 bends by {free[3]:.0f}° without load, more than a turn",
-        f"the palm's rim is commanded {palm:.0f} mm below the table",
-    ]
 
 
 def test_stress_is_told_kept_and_reported(finished, capsys):

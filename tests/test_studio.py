@@ -5,7 +5,6 @@ import json
 import threading
 import time
 
-import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
@@ -267,38 +266,3 @@ def test_two_tabs_work_and_a_closed_one_costs_nothing(page, opened, monkeypatch)
     assert len(simulated) == done < 240 / 3 - 8, "it had trials left"
     page.locator("#studio .object").select_option("0")
     assert page.locator(".verdict").inner_text()
-
-
-@pytest.mark.browser
-def test_an_error_of_the_simulation_is_shown_and_not_fatal(page, opened, monkeypatch):
-    bench = opened[0].desk.bench("")
-    with monkeypatch.context() as patch:
-
-        def fails(view):
-            raise RuntimeError("<b>no memory")
-
-        patch.setattr(bench, "grasp", fails)
-        page.locator(LENGTH).press("Home")
-        error = page.locator("#studio .error")
-        error.wait_for(state="visible")
-        assert error.inner_text() == "RuntimeError: <b>no memory"
-    page.locator(LENGTH).press("End")
-    error.wait_for(state="hidden")
-    page.wait_for_selector(COMPLETE)
-
-
-@pytest.mark.browser
-def test_a_stranger_s_page_in_the_same_browser_is_refused(page, opened):
-    """By its origin: cookies of this context go to all ports of the host."""
-    address = opened[1].split("/")[2]
-    stranger = page.context.new_page()
-    stranger.route("http://127.0.0.1:1/**", lambda route: route.fulfill(body="<p>hello"))
-    stranger.goto("http://127.0.0.1:1/")
-    script = f"""new Promise((done) => {{
-      const socket = new WebSocket("ws://{address}/socket");
-      socket.onopen = () => done("open");
-      socket.onerror = () => done("refused");
-    }})"""
-    assert stranger.evaluate(script) == "refused"
-    assert page.evaluate(script) == "open"
-    assert np.all(page.evaluate("document.cookie") == ""), "no script reads the token"

@@ -12,7 +12,6 @@ The topology is the scene's; sizes are the parameters', so that fingers of a bat
 """
 
 import functools
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -128,42 +127,3 @@ def link_origins(scene: Scene, length: float) -> np.ndarray:
     """Frames of a straight finger's links along it [m], the half segment first, shape (N + 1,)."""
     segment = length / scene.discretization.links
     return np.concatenate([[0.0], segment * (np.arange(scene.discretization.links) + 0.5)])
-
-
-def pose(
-    scene: Scene, length: float, height: float, position: np.ndarray, rotation: np.ndarray
-) -> np.ndarray:
-    """Vertices of a bent finger by linear blend skinning [m], shape (vertex, 3).
-
-    Args:
-      length: Length of the finger [m].
-      height: Height of its section [m].
-      position: Frame origins of its links, from the half segment on, shape (N + 1, 3).
-      rotation: Their orientations, shape (N + 1, 3, 3).
-    """
-    mesh, straight = hull(scene), rest(scene, length, height)
-    origin = link_origins(scene, length)
-    result = np.zeros_like(straight)
-    for link, weight in zip(mesh.link.T, mesh.weight.T, strict=True):
-        local = straight - origin[link, None] * np.array([1.0, 0.0, 0.0])
-        moved = position[link] + np.einsum("vij,vj->vi", rotation[link], local)
-        result += weight[:, None] * moved
-    return result
-
-
-def write(path: Path, fingers: list[np.ndarray], face: np.ndarray) -> Path:
-    """Exports the hulls of a hand's fingers as one mesh file, in the format of its ending.
-
-    Args:
-      path: File to write, in any format that trimesh writes, such as .stl, .ply or .obj.
-      fingers: Vertices of each finger [m], as from `pose`.
-      face: The faces, `hull(scene).face`.
-
-    Returns:
-      The path.
-    """
-    import trimesh
-
-    bodies = [trimesh.Trimesh(v, face, process=False) for v in fingers]
-    trimesh.util.concatenate(bodies).export(path)
-    return path

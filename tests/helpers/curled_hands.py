@@ -5,12 +5,7 @@ import mujoco
 import numpy as np
 
 from codesign_jax import model
-from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.kernel import Limits, Program
-from codesign_jax.engines.structured.world_model import world_constants
 from tests.helpers import grasps
-
-SETTINGS = {"effects__finger_finger": True, "discretization__spheres_per_link": 2}
 
 
 def curled(the_scene, seed, bend, height):
@@ -45,20 +40,6 @@ def kinds(oracle, data):
 def on_palm(oracle, data):
     """Number of contacts with the palm's disc."""
     return int((data.contact.geom == oracle.geom("palm_disc").id).any(1).sum())
-
-
-def one_step(scene, limits=None):
-    """The compiled step of worlds from qpos and qvel under ctrl: qvel after it, and the trace."""
-    engine = StructuredEngine(scene)
-    program = Program.here(scene, limits or Limits(100, 40, 1e-24), np.float64)
-
-    @jax.jit
-    def run(fields, qpos, qvel, ctrl):
-        start = engine.place(engine.reset(fields), qpos, qvel)
-        trace, end = program.simulate(world_constants(scene, fields), start, ctrl[:, None])
-        return engine.qvel(end), trace
-
-    return run
 
 
 def batched(worlds):

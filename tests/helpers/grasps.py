@@ -121,16 +121,6 @@ def hand_world(the_scene, **changes):
     return params._replace(**changes), still()
 
 
-@functools.lru_cache(maxsize=4)
-def _placing(engine):
-    return jax.jit(lambda fields, qpos, qvel: engine.place(engine.reset(fields), qpos, qvel))
-
-
-def lanes_state(engine, scene, fields, qpos, qvel):
-    """The engine's state, one world, from MuJoCo's coordinates, with a cold start."""
-    return _placing(engine)(fields, jnp.asarray(qpos)[None], jnp.asarray(qvel)[None])
-
-
 def nth(tree, index):
     """Entry of every array of a batch, as NumPy arrays."""
     return jax.tree.map(lambda v: np.asarray(v)[index], tree)

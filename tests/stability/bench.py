@@ -68,15 +68,13 @@ def pinch(**settings) -> Scene:
 
 
 @functools.lru_cache(maxsize=8)
-def bench(
-    base: Scene, engine: str, step: float, precision: str, tolerance: float = 1e-6
-) -> "Bench":
+def bench(base: Scene, engine: str, step: float, precision: str) -> "Bench":
     """The bench of a scene, engine, time step and precision; compiled once while in use.
 
     Only the last few are kept: XLA's programs take 1,200 memory maps each, of 65,530 that Linux
     gives a process, and at the limit XLA aborts (docs/notes/structured-engine.md).
     """
-    return Bench(refined(base, step), engine, precision, tolerance)
+    return Bench(refined(base, step), engine, precision)
 
 
 @contextlib.contextmanager
@@ -95,12 +93,8 @@ def floats(wide: bool):
 class Bench:
     """A scene in one engine and precision."""
 
-    def __init__(self, the_scene: Scene, engine: str, precision: str, tolerance: float = 1e-6):
-        """Tolerance: the structured engine's; MuJoCo's is the scene's."""
-        self.tolerance = tolerance
+    def __init__(self, the_scene: Scene, engine: str, precision: str):
         self.scene, self.engine, self.wide = the_scene, engine, precision == "float64"
-        # As far as rounding allows where a case asks for more than the scene's tolerance.
-        self.limits = {"iterations": 100, "evaluations": 40} if tolerance < 1e-6 else {}
         assert self.wide or engine == "structured"  # MuJoCo C is built for float64
         self.h = the_scene.discretization.timestep
 
@@ -141,12 +135,6 @@ class Bench:
             np.concatenate([path.qpos[:, 1:], last], 1),
             np.concatenate([path.qvel[:, 1:], speed], 1),
         )
-
-    def path(self, fields, ctrl, qpos=None, qvel=None) -> oracles.Path:
-        """As `run` in the structured engine: the states before every step."""
-        qpos = fields.start if qpos is None else np.asarray(qpos)
-        qvel = np.zeros((len(ctrl), qpos.shape[1] - 1)) if qvel is None else np.asarray(qvel)
-        return self._structured(fields, ctrl, qpos, qvel)[0]
 
     def _mujoco(self, fields, ctrl, qpos, qvel, masses) -> History:
         out = []
@@ -190,7 +178,7 @@ class Bench:
     @functools.cached_property
     def _program(self):
         """Compiled start, and compiled chunk of steps."""
-        engine = StructuredEngine(self.scene, tolerance=self.tolerance, **self.limits)
+        engine = StructuredEngine(self.scene)
 
         def start(fields, qvel):
             return world_constants(self.scene, fields), moving(engine, fields, qvel)

@@ -1,52 +1,11 @@
-"""MuJoCo C as the judge of single steps, and forces that it reads off states."""
+"""MuJoCo C, which reads contacts and their forces off states."""
 
 import mujoco
 import numpy as np
 
 from codesign_jax import model
 from codesign_jax.engines.mujoco import world_model
-from tests.helpers import grasps, oracles
-from tests.stability.bench import bench
-from tests.stability.table import Found
-
-TIGHT = {"float32": 1e-10, "float64": 1e-24}
-"""Newton decrement at which only a precision's rounding is left of a step's forces."""
-
-ROUNDING = {"float32": 1e-4, "float64": 1e-8}
-"""Relative error of accelerations.  Float64: a difference of velocities over a step loses two of 16
-digits, and MuJoCo's own Newton stops at rounding of its cost.  Float32: places 0.1 m from the palm
-are rounded to 1e-8 m, which a contact of 2 to 4 kN/m turns into 4e-5 N, and links weigh 5 g."""
-
-STATES = 250
-"""States of a world's path that are compared with MuJoCo C, spread evenly over it."""
-
-
-def along(base, step, precision, make, least=1, rounding=1.0) -> Found:
-    """Accelerations along whole paths of the structured engine against MuJoCo C.
-
-    Args:
-      base: The scene.
-      step: Factor on its time step.
-      precision: The precision.
-      make: A bench to (fields, ctrl) or (fields, ctrl, qpos, qvel).
-      least: Contacts that must exist at once somewhere, so that a path that touches nothing fails.
-      rounding: Factor on float32's bound, where what it assumes does not hold.
-
-    Returns:
-      The largest relative error of all compared states, in float32 that of 19 of 20: rounding
-      decides there whether a pair a few nanometres apart touches, and a contact's damping acts at
-      once.
-    """
-    b = bench(base, "structured", step, precision, TIGHT[precision])
-    fields, ctrl, *start = make(b)
-    found = b.path(fields, ctrl, *start)
-    stride = max(1, ctrl.shape[1] // STATES)
-    errors, _, touching = oracles.against_mujoco(b.scene, fields, ctrl, found, stride)
-    assert touching.max() >= least, "nothing touches: the case would be vacuous"
-    error = errors.max() if precision == "float64" else np.quantile(errors, 0.95)
-    note = f"{errors.size} states, up to {touching.max()} contacts"
-    bound = ROUNDING[precision] * (rounding if precision == "float32" else 1.0)
-    return Found(error if np.isfinite(found.qpos).all() else np.inf, bound, note)
+from tests.helpers import grasps
 
 
 class Reader:

@@ -7,10 +7,8 @@ docs/notes/stability.md.
 import pytest
 
 from tests.stability import (  # noqa: F401  (they register their cases)
-    crossed,
     grasp,
     hold,
-    momentum,
     table,
     touch,
 )

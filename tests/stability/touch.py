@@ -12,7 +12,8 @@ from tests.helpers import grasps
 from tests.stability.bench import bench, pinch
 from tests.stability.table import BOTH, Found, case
 
-CUBOID, CYLINDER, SPHERE = range(3)
+SPHERE = 2
+"""Place of the sphere in the paper's set."""
 
 
 def worlds(the_bench, *shapes, **changes):

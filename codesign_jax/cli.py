@@ -142,9 +142,9 @@ class Evaluate(Command, RunOrDesign):
     forces: File = None
     """Write contact forces and depths of the first trial of each object, a row for each time step
     (.csv, docs/files.md), and say how hard the fingers grip."""
-    pull: Flag = False
-    """Then say how hard each object can be pulled down before it leaves the hand, which stands
-    still [N]."""
+    pull: Annotated[Text, tyro.conf.arg(metavar="down|x|y|z|X,Y,Z")] = None
+    """Then say how hard each object can be pulled in a direction of the world frame before it
+    leaves the hand, which stands still [N]."""
     render: File = None
     """Draw the first trial of each object: a film (.gif, .mp4) or a strip of pictures (.png)."""
     dry_run: Flag = False

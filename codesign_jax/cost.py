@@ -20,7 +20,7 @@ import numpy as np
 
 from codesign_jax import verdict
 from codesign_jax.scene import Scene
-from codesign_jax.types import Outcome, Status, Trace, Trial, failed
+from codesign_jax.types import Forces, Outcome, Status, Trace, Trial, failed
 
 _ROUNDING = 1.001
 """A ball's centre rests just as high as its radius: in float32 it may be a little higher."""
@@ -98,9 +98,27 @@ def shown(trace: Trace, record_qpos: bool, stop_when_lost: bool | None) -> Trace
     Returns:
       The trace, whose fields raise ValueError when they are read if they are not to be.
     """
+    if trace.forces is None:
+        trace = trace._replace(forces=_NO_FORCES)
     if record_qpos:
         return trace
     return (_UNASKED if stop_when_lost is None else _WITHOUT_QPOS)(*trace)
+
+
+@jax.tree_util.register_static
+class _NoForces:
+    """In the place of forces that were not recorded: to read them is an error in words."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name in Forces._fields:
+            raise ValueError(
+                "a cost reads trace.forces, which are not recorded: give it the attribute "
+                "record_forces = True, or pass record_forces=True beside cost="
+            )
+        raise AttributeError(name)
+
+
+_NO_FORCES: Any = _NoForces()
 
 
 def _refusing(name: str, problems: dict[str, str]) -> type:

@@ -19,6 +19,7 @@ import numpy as np
 
 from codesign_jax import rollout
 from codesign_jax.engines import DEFAULT, make_engine
+from codesign_jax.engines.base import recording
 from codesign_jax.optimize import Optimizer, Space, State
 from codesign_jax.policy import ControlLoop, Policy, searched
 from codesign_jax.rollout import CostFunction
@@ -79,6 +80,9 @@ def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
     if not isinstance(stops, bool):
         raise InputError([f"{flag}: its attribute stop_when_lost must be True or False"])
 
+    forces = getattr(cost, "record_forces", False)
+    if not isinstance(forces, bool):
+        raise InputError([f"{flag}: its attribute record_forces must be True or False"])
     constants = scene.constants()
 
     def judge(trace: Trace, params: Params, trials: Any) -> Outcome:
@@ -87,12 +91,15 @@ def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
         return rollout.judge(scene, trace, ctrl, initial, trials, constants, how)
 
     one = jax.tree.map(lambda v: jnp.asarray(v)[None], (_hand(scene), rollout.nominal_trial(scene)))
-    fields, _, _ = jax.eval_shape(lambda p, t: rollout.prepare(scene, p, t, constants), *one)
+    fields, ctrl, _ = jax.eval_shape(lambda p, t: rollout.prepare(scene, p, t, constants), *one)
     dtype = jnp.result_type(float)
     series: Any = jax.ShapeDtypeStruct((1, scene.num_steps), dtype)
     size = (1, scene.num_steps, fields.start.shape[-1] if not stops else 0)
     qpos: Any = jax.ShapeDtypeStruct(size, dtype)
     trace = Trace(series, series, series, qpos)
+    if forces:
+        engine = recording(make_engine(DEFAULT, scene))
+        trace = trace._replace(forces=jax.eval_shape(engine.rollout, fields, ctrl).forces)
     _tried(flag, cost, lambda: jax.eval_shape(judge, trace, *one))
     return cost, stops
 

@@ -53,7 +53,7 @@ class Options(NamedTuple):
       stop_when_lost: Whether a world that lost its object stops there, see `Trace`; None for True,
         but a cost of one's own that reads the trace must say which.
       record_forces: Whether the trace has the contact forces, see `Forces`; engine structured
-        alone, and without derivatives.
+        alone, and without derivatives.  A cost's attribute of this name says the same.
       cost: A cost of one's own in place of the scene's, see `CostFunction`.
     """
 
@@ -302,7 +302,8 @@ def _traced(
     steps: int | None = None,
 ) -> tuple[Trace, Any, jax.Array]:
     """The trace of the first steps, and the controls and bits of `Status` that it began with."""
-    engine = recording(engine) if how.record_forces else engine
+    forces = how.record_forces or getattr(how.cost, "record_forces", False)
+    engine = recording(engine) if forces else engine
     ctrl: Any
     fields, ctrl, initial = prepare(scene, params, trials, constants, engine)
     if steps is not None and isinstance(ctrl, control.Plan):

@@ -182,9 +182,12 @@ class Forces(NamedTuple):
       grip: Sum of the normal forces of each finger on the object [N], shape (..., finger).
       finger_table: Force of the table on each finger [N], shape (..., finger, 3).
       palm_table: Force of the table on the palm [N], shape (..., 3).
+      finger_finger: Sum of the normal forces of each finger on each other one and, on the diagonal,
+        on itself [N], shape (..., finger, finger).
+      finger_palm: Sum of the normal forces of each finger on the palm [N], shape (..., finger).
       depth: Largest depth at the step's beginning [m], 0 where nothing touches, by kind of contact
         as far as the scene has it: "finger_object", "finger_table", "palm_object", "palm_table",
-        "object_table", shape (...).
+        "object_table", "finger_finger", "finger_itself", "finger_palm", shape (...).
     """
 
     finger: jax.Array
@@ -193,6 +196,8 @@ class Forces(NamedTuple):
     grip: jax.Array
     finger_table: jax.Array
     palm_table: jax.Array
+    finger_finger: jax.Array
+    finger_palm: jax.Array
     depth: dict[str, jax.Array]
 
 

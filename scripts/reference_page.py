@@ -114,7 +114,7 @@ def _inner(schema: type, field: dataclasses.Field) -> type | None:
     """The dataclass of a table or of an array of tables, None of a value."""
     hint = field.metadata.get("table", typing.get_type_hints(schema)[field.name])
     for kind in (hint, *typing.get_args(hint)):
-        if dataclasses.is_dataclass(kind) and not _number_of(kind):
+        if dataclasses.is_dataclass(kind) and kind is not key_frames.Sum:
             return typing.cast(type, kind)
     return None
 
@@ -158,7 +158,9 @@ def _text(described: Any) -> str:
 def _limits(schema: type, field: dataclasses.Field) -> tuple[str, str, str]:
     """Unit, range and default of a field."""
     hint, limits = typing.get_type_hints(schema)[field.name], field.metadata
-    limits = _number_of(hint) or limits
+    if "unit" in limits and "low" not in limits:  # a sum of a control file
+        low, high = key_frames.RANGES[limits["unit"]]
+        limits = {**limits, "low": low, "high": high, "structure": False}
     if "low" in limits:
         mark = f"{_SPACE}◆" if limits["structure"] else ""
         span = _range(limits["low"], limits["high"]) + mark
@@ -169,13 +171,6 @@ def _limits(schema: type, field: dataclasses.Field) -> tuple[str, str, str]:
         if any(typing.get_origin(kind) is tuple for kind in typing.get_args(hint)):
             span += ", or one for each finger"
     return limits.get("unit", ""), span, _default(field)
-
-
-def _number_of(hint: Any) -> Any:
-    """Unit and range of the number in a sum of a control file; None of other values."""
-    if isinstance(hint, type) and issubclass(hint, key_frames.Sum):
-        return next(f.metadata for f in dataclasses.fields(hint) if f.name == "number")
-    return next(filter(None, map(_number_of, typing.get_args(hint))), None)
 
 
 def _base(hint: Any) -> Any:

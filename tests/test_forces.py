@@ -1,7 +1,6 @@
 """Recorded contact forces: momentum, MuJoCo's own, and that recording changes nothing."""
 
 import csv
-import dataclasses
 import re
 
 import jax
@@ -136,25 +135,53 @@ def test_what_records_no_forces_is_refused():
         jax.grad(end)(jnp.zeros(()))
 
 
-def test_a_pull_takes_the_object_as_mujocos_does():
-    """A weight of two newtons more, by engines that share no step; held, not held, and too much."""
-    scene = load(TINY)
+@pytest.mark.parametrize("text", ["down", "1,1,0"])
+def test_a_pull_takes_the_object_as_mujocos_external_force_does(text):
+    """Stepped by MuJoCo alone, with `xfrc_applied`; by engines that share no step; and too much."""
+    scene, along = load(TINY), push.direction(text)
     space = parameters.design_space(scene.hand, "2d")
     hand = space.params(space.default())
     one = jax.tree.map(lambda v: np.asarray(v)[None], rollout.nominal_trial(scene))
     found = [
-        push.pull(scene, make_engine(n, scene), hand, one)[0] for n in ("structured", "mujoco")
+        push.pull(scene, make_engine(n, scene), hand, one, along)[0]
+        for n in ("structured", "mujoco")
     ]
-    # It grows by 0.2 N at a time, and float32 grips a little later.
-    np.testing.assert_allclose(found[0], found[1], rtol=0.15)
-    assert found[0] > 3 * scene.objects.object[0].mass
+    expected = pulled_by_mujoco(scene, hand, one, along)
+    # A step of the pull, for rounding; float32 grips a little later.
+    assert abs(found[1] - expected) < 1.5 * push.RATE * scene.discretization.timestep
+    np.testing.assert_allclose(found[0], expected, rtol=0.15)
+    assert found[0] > 1
+
+
+def pulled_by_mujoco(scene, hand, trials, along):
+    """The force [N] at which the object has left its place."""
+    fields, ctrl = grasps.world_inputs(scene, hand, grasps.nth(trials, 0))
+    own, lay, h = world_model(scene, fields), model.layout(scene), scene.discretization.timestep
+    data, count = mujoco.MjData(own), int(scene.last_step("lift")) + 1
+    data.qpos[:] = fields.start[: own.nq]
+
+    def place():
+        return data.qpos[-7:-4] - data.qpos[:3]
+
+    force = 0.0
+    for k in range(10_000):
+        if k == count:
+            first = place()
+        if k > count and np.linalg.norm(place() - first) > push.OUT:
+            return force
+        force = push.RATE * h * max(0, k - count + 1)
+        data.ctrl[:], data.xfrc_applied[lay.object, :3] = ctrl[min(k, count - 1)], force * along
+        mujoco.mj_step(own, data)
+    return np.inf
+
+
+def test_what_cannot_be_pulled_is_said(capsys):
     assert push.in_words(np.nan).startswith("not held") and "more than 50 N" in push.in_words(
         np.inf
     )
-    with pytest.raises(InputError, match="effects.gravity is off"):
-        floating = dataclasses.replace(scene.effects, gravity=False)
-        floating = dataclasses.replace(scene, effects=floating)
-        push.pull(floating, make_engine("structured", floating), hand, one)
+    for text in ("up", "1,2", "0,0,0", "1,nan,0"):
+        assert cli.main(["evaluate", "--scene", str(TINY), "--pull", text]) == 2
+        assert f"--pull {text} must be down, x, y, z" in capsys.readouterr().err
 
 
 def test_a_table_of_forces_has_each_step(tmp_path, capsys):

@@ -270,8 +270,8 @@ def test_what_is_imported_is_there():
 # there what users have of it, and what could go in its place.
 MOST_LINES = {
     "codesign_jax": 40_800,
-    "codesign_jax/codesign": 601,
-    "codesign_jax/commands": 2_950,
+    "codesign_jax/codesign": 610,
+    "codesign_jax/commands": 2_970,
     "codesign_jax/compiler": 3_100,
     "codesign_jax/env": 400,
     "codesign_jax/engines": 12_800,

@@ -131,6 +131,18 @@ def until_lost(scene, trace, ctrl):
 until_lost.stop_when_lost = True
 
 
+def gripped(scene, trace, ctrl):
+    """Less for a harder grip [N]."""
+    return 1.0 + jnp.exp(-trace.forces.grip.max())
+
+
+gripped.record_forces = True
+
+
+def unrecorded(scene, trace, ctrl):
+    return trace.forces.grip.max()
+
+
 def reads_too_much(scene, trace, ctrl):
     return trace.qpos.mean()
 
@@ -197,6 +209,19 @@ def test_a_run_of_ones_own_code_goes_on_bit_for_bit(here, capsys):
     # Two programs round model fields differently, and 0.3 s of contact let that grow.
     np.testing.assert_allclose(again.cost, record.history.outcomes.cost[1], rtol=1e-3, atol=1e-5)
     assert np.ptp(again.cost) > 0.01
+
+
+def test_a_cost_reads_forces_if_it_asks_for_them(here, capsys):
+    assert cli.main([*RUN, "--cost", "mine:gripped", "--out", "run"]) == 2
+    assert "engine mujoco records no forces" in capsys.readouterr().err
+    assert cli.main([*RUN, "--cost", "mine:unrecorded", "--out", "run"]) == 2
+    assert "give it the attribute record_forces = True" in capsys.readouterr().err
+    sizes = ["--particles", "2", "--trials", "1", "--test-trials", "0", "--reference-trials", "0"]
+    run = ["optimize", "--scene", str(TINY), *sizes, "--cost", "mine:gripped", "--out", "run"]
+    assert cli.main([*run, "--optimizer", "random", "--episodes", "2", "--seed", "3"]) == 0
+    record = runs.load_record(here / "run")
+    costs = np.asarray(record.history.outcomes.cost)
+    assert (costs >= 1).all() and (costs <= 2).all() and (costs < 2).any()
 
 
 def test_changed_code_is_refused_with_what_changed(here, capsys):

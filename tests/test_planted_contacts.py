@@ -16,12 +16,16 @@ import mujoco
 import numpy as np
 import pytest
 
+from codesign_jax.engines.structured import coordinates
+from codesign_jax.engines.structured.forces import forces
 from codesign_jax.engines.structured.kernel import tables
 from codesign_jax.engines.structured.kernel.counts import Counts
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.lanewise import lanes, lanewise
 from codesign_jax.engines.structured.laws.rings import Place
+from codesign_jax.engines.structured.world_model import world_constants
+from codesign_jax.model import layout
 from tests.helpers import curled_hands, dense_steps, grasps
 from tests.helpers.curled_hands import curled, kinds, on_palm
 from tests.helpers.planted_faults import Fault, chosen, cone_of, planted, simulate
@@ -233,7 +237,7 @@ class Worlds(NamedTuple):
       faults: The faults by name; a sound world of each of `STATES` follows.
       found: The kernel's trace with its states.
       solve: Accelerations of the oracle, of qpos and qvel.
-      start: The same of the state in which the worlds start, and what its fingers hold then.
+      start: The same of the state in which the worlds start, see `solved`.
       timestep: Of the scene [s].
     """
 
@@ -289,11 +293,14 @@ def simulated(surface):
 
 
 def solved(scene, model, data, qpos, qvel, held):
-    """Accelerations by MuJoCo C, of rings by a dense solve; and what the fingers hold then."""
+    """Accelerations by MuJoCo C, of rings by a dense solve; what fingers hold then; how they press.
+
+    The last is a matrix of normal forces, of each finger and, in the last row, of the palm.
+    """
     data.qpos[:], data.qvel[:] = qpos, qvel
     mujoco.mj_forward(model, data)
     if scene.effects.surface != "hull":
-        return data.qacc.copy(), None
+        return data.qacc.copy(), None, pressing(scene, model, data)
     with jax.enable_x64(True):
         hand, _ = grasps.hand_world(scene, length=0.1)
     dense = dense_steps.DensePairs(scene, model, data, hand, *held)
@@ -302,7 +309,50 @@ def solved(scene, model, data, qpos, qvel, held):
     assert not first or min(dense.pairs, dense.on_palm, dense.itself, 4 * dense.ahead) > 3
     found = dense.solve()
     own = np.array([dense.next_grip(f) for f in range(scene.num_fingers)])
-    return found, (dense.next_grip(), own)
+    return found, (dense.next_grip(), own), dense.normal_forces(scene.num_fingers + 1)
+
+
+def pressing(scene, model, data):
+    """MuJoCo's normal forces between fingers and, last, on the palm."""
+    lay, found = layout(scene), np.zeros([scene.num_fingers + 1] * 2)
+    sides = {body: f for f, row in enumerate(lay.bodies) for body in (*row, lay.stubs[f])}
+    sides[model.body("palm").id] = -1
+    for i in range(data.ncon):
+        force, ends = (
+            np.zeros(6),
+            [sides.get(int(b)) for b in model.geom_bodyid[data.contact[i].geom]],
+        )
+        mujoco.mj_contactForce(model, data, i, force)
+        if None not in ends:
+            found[*ends] += force[0]
+            found[*ends[::-1]] += force[0]
+    return found
+
+
+@pytest.mark.parametrize("surface", SURFACES)
+def test_recorded_forces_are_the_oracle_s(surface):
+    """How fingers press on one another, on themselves and on the palm, in the two steps."""
+    worlds, scene = simulated(surface), scene_of(surface)
+    sound, fingers = len(worlds.faults), scene.num_fingers
+    names = [n for n in ("qpos", "qvel", "acc", "held") if n in worlds.found]
+    state = [worlds.found[n][sound, :2] for n in names]
+    with jax.enable_x64(True):
+        fields = grasps.nth(curled(scene, *STATES[surface]["main"])[2], 0)
+        fields = grasps.repeat(fields, 2)
+
+        @jax.jit
+        def run(fields, state):
+            here = coordinates.make(scene, *state)
+            return forces(scene, world_constants(scene, fields), here, here.acc)
+
+        found = jax.tree.map(np.asarray, run(fields, state))
+    second = worlds.solve(state[0][1], state[1][1], worlds.start[1])
+    for k, expected in enumerate((worlds.start[2], second[2])):
+        largest = expected.max()
+        np.testing.assert_allclose(found.finger_finger[k], expected[:-1, :-1], atol=1e-6 * largest)
+        np.testing.assert_allclose(found.finger_palm[k], expected[-1, :-1], atol=1e-6 * largest)
+        assert (expected[0, 1] > 0) and (expected[-1] > 0).any()
+        assert np.diag(expected[:fingers, :fingers]).any() == (surface == "hull")
 
 
 @pytest.mark.parametrize("surface", SURFACES)

@@ -14,6 +14,7 @@ import numpy as np
 from codesign_jax import axes, engines, rollout
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
+from codesign_jax.engines.base import recording
 from codesign_jax.optimize import Info, Optimizer, ParticleFilter, State
 from codesign_jax.reuse import Program, shared
 from codesign_jax.scene import Constants, InputError, Scene
@@ -58,7 +59,8 @@ class Task:
       space: Design space of the particles.
       trials: Trials of each particle in an evaluation or an episode.
       engine: Engine that simulates; by default the engine `structured` of the scene.
-      cost: A cost of one's own in place of the scene's, see `rollout.CostFunction`.
+      cost: A cost of one's own in place of the scene's, see `rollout.CostFunction`.  If it has the
+        attribute `record_forces = True`, its trace has the contact forces.
       record_qpos: As in `rollout.Options`, for a cost of one's own.
       stop_when_lost: As in `rollout.Options`, for a cost of one's own.
 
@@ -82,7 +84,8 @@ class Task:
 
         Raises:
           InputError: If the space is none, or there are no trials, or the engine is that of a scene
-            of another structure, or worlds are to be recorded and to stop.
+            of another structure or records no forces where they are asked for, or worlds are to be
+            recorded and to stop.
         """
         problems = []
         if not isinstance(self.space, DesignSpace):
@@ -94,6 +97,8 @@ class Task:
             raise InputError(problems)
         if self.engine is None:
             object.__setattr__(self, "engine", engines.make_engine(engines.DEFAULT, self.scene))
+        if getattr(self.cost, "record_forces", False):
+            object.__setattr__(self, "engine", recording(self.engine))
         axes.refuse_other(self.scene, self.engine)
         self.how[-1].to_end  # noqa: B018  # refuses options that exclude each other
 

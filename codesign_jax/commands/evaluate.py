@@ -73,6 +73,8 @@ def _check(options: "Evaluate", engine: str) -> None:
     problems += common.picture_problems("--render", options.render)
     problems += common.place_problems("--out", options.out, ".csv")
     problems += common.place_problems("--forces", options.forces, ".csv")
+    if options.pull:
+        forces.direction(options.pull)
     common.refuse(problems + common.engine_problems(engine, options.overrides))
 
 
@@ -119,7 +121,8 @@ def push(case: Case, engine: engines.Engine, options: "Evaluate", console: Conso
         console.print(f"table: {options.forces}")
     if options.pull:
         with Busy(console, "pulling"):
-            found = forces.pull(case.scene, engine, params, trials)
+            along = forces.direction(options.pull)
+            found = forces.pull(case.scene, engine, params, trials, along)
         for shape, force in zip(np.asarray(trials.shape), found, strict=True):
             name = case.scene.objects.object[int(shape)].name
             console.print(f"{name:>12}: {forces.in_words(force)}")

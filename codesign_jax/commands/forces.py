@@ -1,7 +1,7 @@
 """`codesign evaluate --forces` and `--pull`: contact forces of grasps, and the force that ends one.
 
-The pull is a weight that grows: downwards, on the object's centre of mass, slowly enough that only
-its size matters.  On a test stand it is a string at the held object and a bucket.
+The pull is a force on the object's centre of mass that grows, beside its weight, slowly enough that
+only its size matters.  On a test stand it is a string at the held object and a bucket.
 """
 
 from pathlib import Path
@@ -27,8 +27,6 @@ MOST = 50.0
 """Largest pull [N]."""
 OUT = 0.02
 """How far the object's centre is then from where the hand held it [m]."""
-_PERIOD = 0.05
-"""Seconds after which it grows [s]."""
 
 
 def record(case: Case, params: Params, trials: Trial) -> Trace:
@@ -52,7 +50,11 @@ def columns(forces: Forces) -> dict[str, Any]:
         each |= {f"{name}_{i}": value[:, i] for i in range(value.shape[1] if not each else 0)}
         for who, vector in each.items():
             found |= {f"{who}_{axis}_N": vector[:, k] for k, axis in enumerate("xyz")}
-    found |= {f"grip_{i}_N": forces.grip[:, i] for i in range(forces.grip.shape[1])}
+    fingers = range(forces.grip.shape[1])
+    found |= {f"grip_{i}_N": forces.grip[:, i] for i in fingers}
+    pairs = [(i, j) for i in fingers for j in fingers[i:]]
+    found |= {f"finger_finger_{i}_{j}_N": forces.finger_finger[:, i, j] for i, j in pairs}
+    found |= {f"finger_palm_{i}_N": forces.finger_palm[:, i] for i in fingers}
     return found | {f"depth_{kind}_mm": 1e3 * depth for kind, depth in forces.depth.items()}
 
 
@@ -83,51 +85,77 @@ def tell(scene: Scene, trace: Trace, trials: Trial, console: Console) -> None:
         )
 
 
-def pull(scene: Scene, engine: Engine, params: Params, trials: Trial) -> np.ndarray:
-    """Pull downwards at which each held object has left its place [N], shape (trial,).
+def direction(text: str) -> np.ndarray:
+    """Unit vector of what `--pull` was given: down, x, y, z, or three numbers such as 1,0,-1.
+
+    Raises:
+      InputError: If it is none of these.
+    """
+    axes = {"down": (0, 0, -1), "x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
+    try:
+        found = np.array(axes[text] if text in axes else text.split(","), float)
+    except ValueError:
+        found = np.zeros(0)
+    if found.shape != (3,) or not np.isfinite(found).all() or not found.any():
+        words = "must be down, x, y, z or three numbers in the world frame, such as 1,0,-1"
+        raise InputError([f"--pull {text} {words}"])
+    return found / np.linalg.norm(found)
+
+
+def pull(
+    scene: Scene, engine: Engine, params: Params, trials: Trial, along: np.ndarray
+) -> np.ndarray:
+    """Force at which each held object has left its place [N], shape (trial,).
 
     The hand stands still as at the end of the lift.  What it does not hold by then is NaN, and what
-    no pull up to `MOST` takes is infinite.
+    no force up to `MOST` takes is infinite.
 
     Args:
       trials: Trials with leading axis (trial,).
+      along: Direction of the force on the object's centre of mass, world frame, shape (3,).
 
     Raises:
-      InputError: If the scene has no gravity, or a policy commands the hand.
+      InputError: If a policy commands the hand.
     """
-    if not scene.effects.gravity:
-        raise InputError(["--pull is a weight, and effects.gravity is off"])
     if isinstance(engine, ControlLoop):
         raise InputError(["--pull holds the hand as key frames do: leave out --policy"])
-    held = int(scene.last_step("lift")) + 1
-    steps = max(1, round(_PERIOD / scene.discretization.timestep))
-    count = round(MOST / RATE / steps / scene.discretization.timestep)
+    held, step = int(scene.last_step("lift")) + 1, scene.discretization.timestep
     hands = jax.tree.map(lambda v: jnp.repeat(v[None], len(trials.yaw), 0), params)
+    lay = model.layout(scene)
+    joints, three = lay.dofs.size, np.arange(3)
+    linear = 19 + 2 * joints + three  # the object's velocity in a state, see `model.State`
+
+    def place(state: jax.Array) -> jax.Array:  # of the object, from the palm's
+        return state[:, 6 + joints + three] - state[:, three]
 
     @jax.jit
-    def run(hands: Params, trials: Trial) -> tuple[jax.Array, jax.Array]:
+    def run(hands: Params, trials: Trial) -> jax.Array:
         fields, ctrl, _ = rollout.prepare(scene, hands, trials, scene.constants())
         begun = engine.rollout(fields, ctrl[:, :held], trajectory=True)
+        still = ctrl[:, held - 1 : held]
         assert begun.last is not None
-        still = jnp.repeat(ctrl[:, held - 1 : held], steps, 1)
-        body = model.layout(scene).object
+        first = place(begun.last)
+        mass = fields.body_mass[:, lay.object, None]
 
-        def period(state: jax.Array, force: jax.Array) -> tuple[jax.Array, jax.Array]:
-            mass = fields.body_mass.at[:, body].add(force / scene.gravity)
-            trace = engine.rollout(
-                fields._replace(body_mass=mass, start=state), still, trajectory=True
-            )
+        def goes_on(carry: tuple) -> jax.Array:
+            return (carry[0] < MOST) & (jnp.isinf(carry[2]) & kept).any()
+
+        def pulled(carry: tuple) -> tuple:
+            # A step finds the velocities at its end, v + h a, from contacts at these: what a force
+            # adds to v before it is exact.
+            force, state, found = carry
+            force = force + RATE * step
+            start = state.at[:, linear].add(step * force / mass * along)
+            trace = engine.rollout(fields._replace(start=start), still, trajectory=True)
             assert trace.last is not None
-            return trace.last, trace.distance[:, -1]
+            out = jnp.linalg.norm(place(trace.last) - first, axis=1) > OUT
+            return force, trace.last, jnp.where(out, jnp.minimum(found, force), found)
 
-        force = RATE * steps * scene.discretization.timestep * jnp.arange(1, count + 1)
-        return begun.distance[:, -1], jax.lax.scan(period, begun.last, force)[1].T
+        kept = begun.distance[:, -1] < scene.cost.lost_distance
+        start = jnp.zeros(()), begun.last, jnp.full_like(begun.distance[:, -1], jnp.inf)
+        return jnp.where(kept, jax.lax.while_loop(goes_on, pulled, start)[2], jnp.nan)
 
-    first, distance = map(np.asarray, run(hands, trials))
-    out = distance > first[:, None] + OUT
-    force = RATE * steps * scene.discretization.timestep * np.arange(1, count + 1)
-    found = np.where(out.any(1), force[out.argmax(1)], np.inf)
-    return np.where(first < scene.cost.lost_distance, found, np.nan)
+    return np.asarray(run(hands, trials))
 
 
 def in_words(force: float) -> str:

@@ -5,8 +5,8 @@ each with a factor if need be: `"zero_height + arm_z - 0.01"`, `"0.5 * pressure"
 has the names. A sum stays a sum: its numbers are data, as those of the other files.
 
 >>> from codesign_jax.scene import key_frames
->>> key_frames.read_sum("zero_height + 0.5 * arm_z", key_frames.Metres)
-Metres(number=None, term=(Term(name='zero_height', factor=None), Term(name='arm_z', factor=0.5)))
+>>> key_frames.read_sum("zero_height + 0.5 * arm_z", "m").term
+(Term(name='zero_height', factor=None), Term(name='arm_z', factor=0.5))
 """
 
 import dataclasses
@@ -33,6 +33,8 @@ _OF_SCENE = {
     "Pa": ("pressure",),
 }
 """Names that every scene has, by the SI unit of what may use them."""
+RANGES = {"s": (-60, 60), "m": (-2, 2), "deg": (-360, 360), "Pa": (-1e6, 1e6)}
+"""Smallest and largest number of a sum, by its unit."""
 _NAME = re.compile(r"[a-z]\w*", re.ASCII)
 _TERM = re.compile(
     r"\s*([+-]?)\s*(?:(\d+\.?\d*(?:[eE][+-]?\d+)?|\.\d+)\s*(\*)?)?\s*([A-Za-z]\w*)?\s*", re.ASCII
@@ -54,38 +56,22 @@ class Term:
 
 @dataclasses.dataclass(frozen=True)
 class Sum:
-    """A number and named terms; the subclasses have the number's unit and range."""
+    """A number and named terms.
 
-    number: float | None = None
+    Attributes:
+      unit: Unit of the number, of `RANGES`; the names stand for SI units.
+      number: The number; None for none.
+      term: The terms.
+    """
+
+    unit: str
+    number: float | None = quantity("", -1e6, 1e6, default=None)
     term: tuple[Term, ...] = ()
 
 
-@dataclasses.dataclass(frozen=True)
-class Seconds(Sum):
-    """A time."""
-
-    number: float | None = quantity("s", -60, 60, default=None)
-
-
-@dataclasses.dataclass(frozen=True)
-class Metres(Sum):
-    """A coordinate."""
-
-    number: float | None = quantity("m", -2, 2, default=None)
-
-
-@dataclasses.dataclass(frozen=True)
-class Degrees(Sum):
-    """An angle; its names stand for radians, its number for degrees."""
-
-    number: float | None = quantity("deg", -360, 360, default=None)
-
-
-@dataclasses.dataclass(frozen=True)
-class Pascals(Sum):
-    """A gauge pressure."""
-
-    number: float | None = quantity("Pa", -1e6, 1e6, default=None)
+def _sum(unit: str, **kwargs: Any) -> Any:
+    """A field of a frame that is a sum, or has one for each finger."""
+    return dataclasses.field(metadata={"unit": unit}, **kwargs)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,14 +94,14 @@ class Frame:
       interpolation: How the next frame is reached: linearly, or by a jump when its time has come.
     """
 
-    time: Seconds
-    x: Metres | None = None
-    y: Metres | None = None
-    z: Metres | None = None
-    roll: Degrees | None = None
-    pitch: Degrees | None = None
-    yaw: Degrees | None = None
-    pressure: tuple[Pascals, ...] | None = None
+    time: Sum = _sum("s")
+    x: Sum | None = _sum("m", default=None)
+    y: Sum | None = _sum("m", default=None)
+    z: Sum | None = _sum("m", default=None)
+    roll: Sum | None = _sum("deg", default=None)
+    pitch: Sum | None = _sum("deg", default=None)
+    yaw: Sum | None = _sum("deg", default=None)
+    pressure: tuple[Sum, ...] | None = _sum("Pa", default=None)
     interpolation: str = choice("linear", "held", default="linear")
 
 
@@ -306,8 +292,7 @@ def _value(total: Sum, names: Mapping[str, Any]) -> Any:
     own = ((1.0 if t.factor is None else t.factor, names[t.name]) for t in total.term)
     parts = [factor * value for factor, value in own]
     if total.number is not None:
-        factor = UNITS["deg"][1] if isinstance(total, Degrees) else 1.0
-        parts.insert(0, total.number * factor)
+        parts.insert(0, total.number * (UNITS["deg"][1] if total.unit == "deg" else 1.0))
     value = parts[0] if parts else 0.0
     for part in parts[1:]:
         value = value + part
@@ -323,15 +308,15 @@ def _factors(total: Sum) -> dict[str, Any]:
 # --- reading -------------------------------------------------------------------------------------
 
 
-def read_sum(value: Any, kind: type[Sum]) -> Sum | str:
+def read_sum(value: Any, unit: str) -> Sum | str:
     """A value of a file as a sum, or what is wrong with it.
 
     Args:
       value: A number, or text such as "zero_height + 0.5 * arm_z - 0.01".
-      kind: The subclass, by the unit.
+      unit: Its unit.
     """
     if isinstance(value, int | float) and not isinstance(value, bool):
-        return kind(float(value))
+        return Sum(unit, float(value))
     if not isinstance(value, str) or not value.strip():
         return 'must be a number, or a sum of numbers and names such as "zero_height + arm_z"'
     number, terms, place = None, {}, 0
@@ -350,7 +335,7 @@ def read_sum(value: Any, kind: type[Sum]) -> Sum | str:
         else:
             number = factor + (number or 0.0)
         place = found.end()
-    return kind(number, tuple(Term(n, None if f == 1.0 else f) for n, f in terms.items()))
+    return Sum(unit, number, tuple(Term(n, None if f == 1.0 else f) for n, f in terms.items()))
 
 
 def _text(total: Sum) -> str | float:
@@ -371,8 +356,7 @@ def _frame_table(frame: Frame) -> dict[str, Any]:
     return found
 
 
-_KINDS = {"time": Seconds, "x": Metres, "y": Metres, "z": Metres, "pressure": Pascals}
-_KINDS |= dict.fromkeys(("roll", "pitch", "yaw"), Degrees)
+_UNITS = {f.name: f.metadata["unit"] for f in dataclasses.fields(Frame) if "unit" in f.metadata}
 
 
 class _Reader:
@@ -392,12 +376,12 @@ class _Reader:
             self.parameter(row, f"{self.where}.parameter[{i}]")
         for name, fingers in file.group.items():
             self._group(name, fingers)
-        frames, now = [], (Pascals(0.0),) * self.fingers
+        frames, now = [], (Sum("Pa", 0.0),) * self.fingers
         for i, entry in enumerate(file.frame):
             frame = self._frame(entry, f"{self.where}.frame[{i}]", now)
             frames.append(frame)
             now = frame.pressure or now
-        if not frames or frames[0].time != Seconds(0.0):
+        if not frames or frames[0].time != Sum("s", 0.0):
             self.problems.append(f"{self.where}.frame[0].time must be 0: a grasp begins with it")
         return Control(file.name, file.description, tuple(frames), file.parameter)
 
@@ -426,9 +410,9 @@ class _Reader:
             fingers = []
         self.groups[name] = fingers
 
-    def _frame(self, entry: dict, path: str, now: tuple[Pascals, ...]) -> Frame:
+    def _frame(self, entry: dict, path: str, now: tuple[Sum, ...]) -> Frame:
         known = [f.name for f in dataclasses.fields(Frame)]
-        values: dict[str, Any] = {"time": Seconds(0.0)}
+        values: dict[str, Any] = {"time": Sum("s", 0.0)}
         for key, value in entry.items():
             if key not in known:
                 why = schema.nearest(key, known)
@@ -440,12 +424,12 @@ class _Reader:
             elif key == "pressure":
                 values[key] = self._pressure(value, f"{path}.{key}", now)
             else:
-                values[key] = self._sum(value, f"{path}.{key}", _KINDS[key])
+                values[key] = self._sum(value, f"{path}.{key}", _UNITS[key])
         if "time" not in entry:
             self.problems.append(f"{path}.time is missing (unit s)")
         return Frame(**values)
 
-    def _pressure(self, value: Any, path: str, now: tuple[Pascals, ...]) -> tuple[Sum, ...]:
+    def _pressure(self, value: Any, path: str, now: tuple[Sum, ...]) -> tuple[Sum, ...]:
         if isinstance(value, dict):
             found: list[Sum] = list(now)
             for name, entry in value.items():
@@ -453,7 +437,7 @@ class _Reader:
                     why = schema.nearest(name, self.groups)
                     self.problems.append(f"{path}.{name} is not a group; {why}")
                     continue
-                given = self._sum(entry, f"{path}.{name}", Pascals)
+                given = self._sum(entry, f"{path}.{name}", "Pa")
                 for finger in self.groups[name]:
                     found[finger] = given
         elif isinstance(value, list):
@@ -461,20 +445,18 @@ class _Reader:
                 self.problems.append(
                     f"{path} has {len(value)} entries, the hand {self.fingers} fingers"
                 )
-            found = [self._sum(v, f"{path}[{i}]", Pascals) for i, v in enumerate(value)]
+            found = [self._sum(v, f"{path}[{i}]", "Pa") for i, v in enumerate(value)]
         else:
-            found = [self._sum(value, path, Pascals)] * self.fingers
+            found = [self._sum(value, path, "Pa")] * self.fingers
         return tuple(found)
 
-    def _sum(self, value: Any, path: str, kind: type[Sum]) -> Any:
-        total = read_sum(value, kind)
+    def _sum(self, value: Any, path: str, unit: str) -> Sum:
+        total = read_sum(value, unit)
         if isinstance(total, str):
             self.problems.append(f"{path} = {schema.shown(value)} {total}")
-            return kind(0.0)
-        limits = next(f for f in dataclasses.fields(kind) if f.name == "number").metadata
-        unit = limits["unit"]
+            return Sum(unit, 0.0)
         if total.number is not None:
-            why = schema.range_problem(path, total.number, unit, limits["low"], limits["high"])
+            why = schema.range_problem(path, total.number, unit, *RANGES[unit])
             self.problems += [why] if why else []
         wanted = UNITS[unit][0]
         fitting = [name for name, u in self.units.items() if u == wanted]

@@ -218,20 +218,30 @@ class DensePairs(Dense):
         super().__init__(scene, oracle, data, hand)
         self.grip, self.own = grip, own
         self.pairs = self.on_palm = self.itself = self.ahead = 0
+        self.sides = {}
         for f, finger in enumerate(self.fingers):
             for ring in finger.rings:
                 if scene.effects.finger_palm and ring.link >= np.ceil(finger.links / 4):
-                    self._on_palm(ring)
+                    self._on_palm(f, ring)
                 if scene.effects.finger_itself:
                     self._on_itself(f, ring)
                 for g in range(scene.num_fingers):
                     if scene.effects.finger_finger and f < g:
                         self._on_finger(f, g, ring)
 
-    def _count(self, name, before):
+    def _count(self, name, before, *fingers):
         setattr(self, name, getattr(self, name) + len(self.rows) - before)
+        self.sides |= {row: fingers for row in range(before, len(self.rows))}
 
-    def _on_palm(self, ring):
+    def normal_forces(self, size):
+        """Sums by first and second finger, or a size less one for the palm, in the solution."""
+        found = np.zeros((size, size))
+        for row, sides in self.sides.items():
+            for ends in {sides, sides[::-1]}:
+                found[ends] += self.force(row)[0]
+        return found
+
+    def _on_palm(self, f, ring):
         c, palm, before = self.scene.contact, self.data.body("palm"), len(self.rows)
         frame = palm.xmat.reshape(3, 3)
 
@@ -243,7 +253,7 @@ class DensePairs(Dense):
         share = share * c.finger_palm_stiffness / c.normal_stiffness
         rest = c.finger_palm_friction, 2, c.finger_finger_friction_ratio
         self._add(point, normal, gap, share, (ring.body, palm.id), *rest)
-        self._count("on_palm", before)
+        self._count("on_palm", before, f, -1)
         self.ahead += len(self.rows) > before and gap > 0
 
     def _on_itself(self, f, ring):
@@ -254,14 +264,14 @@ class DensePairs(Dense):
             grip = None if self.own is None else self.own[f]
             rest = c.finger_finger_friction, 2, c.finger_finger_friction_ratio, grip, 1.0, f
             self._add(point, normal, gap, share, (ring.body, body), *rest)
-        self._count("itself", before)
+        self._count("itself", before, f, f)
 
     def _on_finger(self, f, g, ring):
         c, before = self.scene.contact, len(self.rows)
         point, normal, gap, share, body = between(ring, self.fingers[g], 0.0, self.fingers[g].links)
         rest = c.finger_finger_friction, 2, c.finger_finger_friction_ratio, self.grip, 1.0, "two"
         self._add(point, normal, gap, share, (ring.body, body), *rest)
-        self._count("pairs", before)
+        self._count("pairs", before, f, g)
 
     def next_grip(self, name="two"):
         """What the first finger uses in the solution: tangential over normal forces, or elastic."""

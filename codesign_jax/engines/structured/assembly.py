@@ -6,26 +6,31 @@ for what looks at a state and simulates nothing.
 
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from codesign_jax.engines.structured.kernel import packing
+from codesign_jax.engines.structured.kernel import packing, pair_search
 from codesign_jax.engines.structured.kernel.contact_sets import margin
 from codesign_jax.engines.structured.kernel.tables import rings_of_link
 from codesign_jax.engines.structured.lanes import dot, once
-from codesign_jax.engines.structured.laws import rings, shapes, surroundings
+from codesign_jax.engines.structured.laws import holding, rings, shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import which_cone
 from codesign_jax.engines.structured.laws.contact import Cone, Contacts, candidates
 from codesign_jax.engines.structured.laws.inertia import bodies, joint_springs, smooth_forces
 from codesign_jax.engines.structured.laws.integration import rigid_arm
-from codesign_jax.engines.structured.laws.kinematics import Kinematics, State, kinematics
+from codesign_jax.engines.structured.laws.kinematics import Kinematics, State, kinematics, mounted
 from codesign_jax.engines.structured.laws.rings import Place, Ring
 from codesign_jax.engines.structured.linear.tree import Matrices, Problem, Spatial, relative
 from codesign_jax.engines.structured.world_model import WorldModel, apply_columns
 from codesign_jax.model import layout
-from codesign_jax.model.layout import palm_touches
+from codesign_jax.model.layout import first_on_palm, palm_touches, touches_itself
 from codesign_jax.scene import Scene
+
+FAR = 1.0
+"""Squared distance at which nothing touches [m^2]."""
 
 
 def problem(
@@ -53,7 +58,7 @@ def contacts(
     position: jax.Array,
     velocity: Spatial | None = None,
 ) -> dict[str, Contacts]:
-    """Contacts that the scene's effects call for but those between fingers, by pair of bodies.
+    """Contacts that the scene's effects call for but those of `hand_contacts`, by pair of bodies.
 
     Args:
       position: The object's centre, shape (3, 1, world).
@@ -65,11 +70,8 @@ def contacts(
         cone = getattr(hand.cones, which_cone(name))
 
         def act(place: Place, cone: Cone, velocity: Spatial | None) -> Contacts:
-            c, approach = Contacts(*place[:3], cone.of_share(place.share)), 0.0 * place.gap
-            if velocity is not None:
-                approach = -dot(c.normal, c.relative(relative(name, velocity)))
-            share = candidates(place.share, place.gap, approach, cone, margin(scene))
-            return c._replace(cone=cone.of_share(share))
+            moving = None if velocity is None else relative(name, velocity)
+            return _candidates(scene, place, cone, moving)
 
         found[name] = once(act, place, cone, velocity)
 
@@ -85,13 +87,7 @@ def contacts(
             looks = around if name.endswith("_table") else [of_object]
             places = []
             for look in looks:
-                first = look(centre)
-                if e.surface == "spheres":
-                    places.append(rings.ball_on_field(ring.half[0], centre, *first))
-                    continue
-                offset = once(rings.aim, ring, frame, *first)
-                again = look(centre + offset)
-                places.append(once(rings.on_field, ring, frame, centre, offset, *again))
+                places.append(_on_field(scene, look, ring, frame, centre))
             if places:
                 add(name, _joined(places, int(name.startswith("finger"))))
 
@@ -108,6 +104,26 @@ def contacts(
         places = _of_object(scene, hand, kin, position, of_object)
         add("object_table", _joined(places, 0))
     return found
+
+
+def _candidates(scene: Scene, place: Place, cone: Cone, moving: jax.Array | None) -> Contacts:
+    """Contacts at places, for relative velocities of their bodies or bodies at rest."""
+    c, approach = Contacts(*place[:3], cone.of_share(place.share)), 0.0 * place.gap
+    if moving is not None:
+        approach = -dot(c.normal, c.relative(moving))
+    share = candidates(place.share, place.gap, approach, cone, margin(scene))
+    return c._replace(cone=cone.of_share(share))
+
+
+def _on_field(
+    scene: Scene, look: Callable, ring: Ring, frame: jax.Array, centre: jax.Array
+) -> Place:
+    """Contacts of rings or spheres with what `look` tells the distance of, and its gradient."""
+    first = look(centre)
+    if scene.effects.surface == "spheres":
+        return rings.ball_on_field(ring.half[0], centre, *first)
+    offset = once(rings.aim, ring, frame, *first)
+    return once(rings.on_field, ring, frame, centre, offset, *look(centre + offset))
 
 
 def _joined(places: list[Place], axis: int) -> Place:
@@ -139,3 +155,186 @@ def _of_object(
             mine = jnp.isin(hand.object_id, jnp.array(flat))
             places.append(Place(on, normal, gap, jnp.where(mine, one(gap), 0.0)))
     return places
+
+
+class HandContacts(NamedTuple):
+    """Contacts of rings or spheres with other fingers, their own or the palm.
+
+    Attributes:
+      contacts: The contacts, shape (item, pair, world); a pair is two fingers, or one.
+      links: Their links on the first finger, 1 for the first one that moves, shape (item,).
+      others: Links of the other side, 0 for the palm, shape (item, pair, world).
+      fingers: First and second finger of the pairs, shape (2, pair).
+      grip: What the pairs hold of friction, see `holding.held`, shape (3, 1, pair, world), or None.
+    """
+
+    contacts: Contacts
+    links: jax.Array
+    others: jax.Array
+    fingers: jax.Array
+    grip: jax.Array | None = None
+
+    def relative(self, motion: Spatial) -> jax.Array:
+        """Motion of the first side to the other one, shape (6, item, pair, world)."""
+        palm = jnp.broadcast_to(motion.palm[:, None], motion.link[:, :1].shape)
+        every = jnp.concatenate([palm, motion.link], 1)
+        mine = every[:, self.links][:, :, self.fingers[0]]
+        return mine - _of_others(every, self.others, self.fingers[1])
+
+    def jar(self, motion: Spatial, velocity: Spatial) -> jax.Array:
+        """J a - aref of accelerations of the bodies, with the friction that is held."""
+        c = self.contacts
+        jar = c.relative(self.relative(motion)) - c.reference(c.relative(self.relative(velocity)))
+        return jar if self.grip is None else jar + holding.held(c, self.grip)
+
+
+def hand_contacts(
+    scene: Scene, hand: WorldModel, kin: Kinematics, velocity: Spatial, grip: jax.Array | None
+) -> dict[str, HandContacts]:
+    """Contacts of fingers with one another, with themselves and with the palm, by these names.
+
+    Args:
+      scene: The scene.
+      hand: Constants of the worlds.
+      kin: Kinematics.
+      velocity: Of the bodies.
+      grip: As in `State`.
+    """
+    e, found, links = scene.effects, {}, scene.discretization.links
+    k, n = rings_of_link(scene), scene.num_fingers
+    on_itself, hull = touches_itself(scene), e.surface == "hull"
+    if not k or not (e.finger_finger or e.finger_palm or on_itself):
+        return {}
+    numbers = jnp.moveaxis(packing.ring_numbers(scene, hand, k), 1, 0)
+    numbers = jnp.broadcast_to(numbers, (*numbers.shape[:2], n, kin.place.shape[-1]))
+    item = np.arange(links * k)
+    link = item // k + 1
+    base_frame, base = mounted(kin.place, kin.palm, hand.mount, hand.base)
+    frames = jnp.concatenate([base_frame[:, :, None], kin.link], 2)
+    joints = jnp.concatenate([base[:, None], kin.origin], 1)
+    frame = frames[:, :, link]
+    centre = once(pair_search.ring_centre, joints[:, link], frame, numbers)
+    lines = _centre_lines(scene, frames, joints, numbers, centre) if hull else None
+    alone, two = np.stack([np.arange(n)] * 2), np.stack(np.triu_indices(n, 1))
+
+    def add(name: str, place: Place, link: np.ndarray, others: jax.Array, fingers: np.ndarray):
+        shape = place.gap.shape
+        cone = getattr(hand.cones, "finger_palm" if name == "finger_palm" else "finger_finger")
+        held = None
+        if grip is not None and name != "finger_palm":
+            held = jnp.moveaxis(grip[fingers[0] ^ fingers[1], :, fingers[0]], 1, 0)[:, None]
+        others = jnp.broadcast_to(others, shape)
+        met = HandContacts(None, jnp.asarray(link), others, jnp.asarray(fingers), held)  # type: ignore[arg-type]
+        run = partial(_candidates, scene)
+        found[name] = met._replace(contacts=once(run, place, cone, met.relative(velocity)))
+
+    def with_lines(first: np.ndarray, second: np.ndarray, own: bool) -> tuple[Place, jax.Array]:
+        assert lines is not None
+        ring, mine, at = numbers[:, :, first], frame[:, :, :, first], centre[:, :, first]
+        square, other, t = lines.nearest(at, second, lines.last(numbers) if own else None)
+        place = once(pair_search.between, ring, mine, at, lines.sections(other, second), t)
+        return place._replace(share=jnp.where(square < FAR, place.share, 0.0)), other
+
+    if e.finger_palm:
+        assert hand.palm_disc is not None
+        disc = kin.place[:, None], kin.palm[:, :, None], hand.palm_disc[:, None]
+        some = item >= (first_on_palm(links) - 1) * k
+        look = partial(pair_search.palm_distance, palm=disc)
+        ring = Ring.of(numbers[:, some])
+        place = _on_field(scene, look, ring, frame[:, :, some], centre[:, some])
+        add("finger_palm", place, link[some], jnp.int32(0), alone)
+    if on_itself:
+        place, other = with_lines(*alone, own=True)
+        add("finger_itself", place, link, other, alone)
+    if e.finger_finger and hull:
+        place, other = with_lines(*two, own=False)
+        add("finger_finger", place, link, other, two)
+    elif e.finger_finger:
+        mine, theirs = (v.ravel() for v in np.meshgrid(item, item, indexing="ij"))
+        sides = [
+            (v[:, i][:, :, f])
+            for i, f in ((mine, two[0]), (theirs, two[1]))
+            for v in (numbers, centre)
+        ]
+        place = once(pair_search.balls, *sides)
+        add("finger_finger", place, link[mine], jnp.asarray(link[theirs])[:, None, None], two)
+    return found
+
+
+class _CentreLines(NamedTuple):
+    """Centre lines of fingers, and what `pair_search.between` takes of them.
+
+    Attributes:
+      scene: The scene.
+      ends: Where segments begin and the last one ends [m], shape (3, link + 2, finger, world).
+      frames: Of the links, the palm's half one first, shape (3, 3, link + 1, finger, world).
+      sizes: Numbers of the ring whose section a segment has, shape (8, link + 1, finger, world).
+    """
+
+    scene: Scene
+    ends: jax.Array
+    frames: jax.Array
+    sizes: jax.Array
+
+    def last(self, numbers: jax.Array) -> jax.Array:
+        """The last place on segments that rings of the same finger touch; see `last_of`."""
+        links, k = self.scene.discretization.links, rings_of_link(self.scene)
+        along = (pair_search.ring_places(links, k) + np.arange(links)[:, None] + 0.5).ravel()
+        largest = jnp.maximum(numbers[:, -1], numbers[:, 0])
+        end = along[:, None, None] - pair_search.arc(numbers[:, -1], largest)
+        row = np.arange(links + 1)[:, None, None, None]
+        length = np.where(row == links, pair_search.TIP, 1.0)
+        last = jnp.minimum((end - (row - 0.5)) / length, 1.0)
+        return jnp.where(row > 0, last, -1.0)  # a finger's half link at the palm is the palm's
+
+    def nearest(
+        self, centre: jax.Array, second: np.ndarray, last: jax.Array | None
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Squared distances of places, their nearest segments and where on them; see `Search`."""
+        start = self.ends[:, :-1, second]
+        along = self.ends[:, 1:, second] - start
+        if last is None:
+            last = jnp.ones((along.shape[1], 1, 1, 1), centre.dtype)
+
+        def one(best: tuple, row: tuple) -> tuple:
+            number, start, along, last = row
+            t = dot(centre - start[:, None], along[:, None]) / dot(along, along)
+            t = jnp.minimum(jnp.maximum(t, 0.0), last)
+            away = centre - start[:, None] - t * along[:, None]
+            square = jnp.where(last >= 0, dot(away, away), FAR)
+            better = square < pair_search.SURELY * best[0]
+            new = square, number, t
+            return tuple(jnp.where(better, a, b) for a, b in zip(new, best, strict=True)), None
+
+        none = 0.0 * centre[0]
+        rows = np.arange(along.shape[1], dtype=np.int32)
+        over = rows, jnp.moveaxis(start, 1, 0), jnp.moveaxis(along, 1, 0), last
+        first = none + FAR, jnp.zeros(none.shape, jnp.int32), none
+        return jax.lax.scan(one, first, over)[0]
+
+    def sections(self, row: jax.Array, second: np.ndarray) -> tuple:
+        """Ends, frames and sizes of segments, and whether they are the last ones."""
+        links = self.scene.discretization.links
+        ends = tuple(_of_others(self.ends, r, second) for r in (row, row + 1))
+        near = pair_search.neighbours(row, links)
+        frames = tuple(_of_others(self.frames, r, second) for r in near)
+        return ends, frames, _of_others(self.sizes, row, second), 1.0 * (row == links)
+
+
+def _centre_lines(
+    scene: Scene, frames: jax.Array, joints: jax.Array, numbers: jax.Array, centre: jax.Array
+) -> _CentreLines:
+    count = numbers.shape[1]
+    row = np.arange(scene.discretization.links + 2)
+    ring = np.full(row.shape, count - 1)
+    if scene.hand.section.tapered:
+        ring = np.maximum((row - 1) * rings_of_link(scene) - 1, 0)
+    before = frames[:, :, np.maximum(row[:-1] - 1, 0)]
+    passed = once(pair_search.above, joints, before, frames, numbers[:, ring[:-1]])
+    ends = jnp.concatenate([passed, centre[:, -1:]], 1)
+    return _CentreLines(scene, ends, frames, numbers[:, ring[1:]])
+
+
+def _of_others(every: jax.Array, row: jax.Array, second: jax.Array | np.ndarray) -> jax.Array:
+    """Numbers (..., row, finger, world) at rows (item, pair, world) of pairs' second fingers."""
+    return every[..., row, jnp.asarray(second)[:, None], jnp.arange(every.shape[-1])]

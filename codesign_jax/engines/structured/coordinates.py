@@ -14,7 +14,13 @@ def reset(scene: Scene, fields: ModelFields) -> State:
     return _in_lanes(scene, model.split(scene, fields.start))
 
 
-def make(scene: Scene, qpos: jax.Array, qvel: jax.Array, acc: jax.Array) -> State:
+def make(
+    scene: Scene,
+    qpos: jax.Array,
+    qvel: jax.Array,
+    acc: jax.Array,
+    held: jax.Array | None = None,
+) -> State:
     """The state at MuJoCo's coordinates, at the beginning of a grasp.
 
     Args:
@@ -22,8 +28,10 @@ def make(scene: Scene, qpos: jax.Array, qvel: jax.Array, acc: jax.Array) -> Stat
       qvel: Generalized velocities, shape (world, nv).
       acc: Accelerations, the solver's warm start, in the order of qvel, the object's as in
         `kinematics.Acc`, shape (world, nv).
+      held: What fingers hold on one another, as in `model.State`; None for nothing.
     """
     start = model.split(scene, jnp.concatenate([qpos, qvel], 1))
+    start = start if held is None else start._replace(held=held)
     return _in_lanes(scene, start._replace(acc=acc))
 
 

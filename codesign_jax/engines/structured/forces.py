@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.base import Equal
 from codesign_jax.engines.structured import assembly, coordinates, transforms
+from codesign_jax.engines.structured.assembly import HandContacts
 from codesign_jax.engines.structured.lanes import dot, once
 from codesign_jax.engines.structured.laws.contact import Contacts, constraint_update
 from codesign_jax.engines.structured.laws.kinematics import Acc, State, kinematics
@@ -35,6 +36,10 @@ class Recording(Equal):
     def _key(self) -> tuple:
         return (self.engine,)
 
+    def recording(self) -> "Recording":
+        """Itself."""
+        return self
+
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
         """See `Engine.rollout`.
 
@@ -54,20 +59,24 @@ class Recording(Equal):
         hand = world_constants(self.scene, fields)
 
         def step(now: tuple) -> Forces:
-            qpos, qvel, acc, moved = now
-            state = coordinates.make(self.scene, qpos, qvel, acc)
+            qpos, qvel, acc, moved, *held = now
+            state = coordinates.make(self.scene, qpos, qvel, acc, *held)
             every = forces(self.scene, hand, state, state.acc)
             return jax.tree.map(
                 lambda v: jnp.where(moved.reshape(-1, *[1] * (v.ndim - 1)) > 0, v, 0.0), every
             )
 
-        series = tuple(jnp.moveaxis(found[k], 1, 0) for k in ("qpos", "qvel", "acc", "moved"))
+        names = [k for k in ("qpos", "qvel", "acc", "moved", "held") if k in found]
+        series = tuple(jnp.moveaxis(found[k], 1, 0) for k in names)
         every = jax.lax.map(step, series)
         return trace._replace(forces=jax.tree.map(lambda v: jnp.moveaxis(v, 0, 1), every))
 
 
 def forces(scene: Scene, hand: WorldModel, state: State, acc: Acc) -> Forces:
-    """Forces of a step of a batch, every array with a leading axis (world,)."""
+    """Forces of a step of a batch, every array with a leading axis (world,).
+
+    The states are those before the step, with what fingers held on one another then.
+    """
     kin = kinematics(hand, layout(scene).axes, state)
     velocity = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
     motion = propagate(kin, acc)
@@ -82,8 +91,17 @@ def forces(scene: Scene, hand: WorldModel, state: State, acc: Acc) -> Forces:
         net[name] = force
         if name == "finger_object":
             grip = normal
-        deepest = jnp.where(contacts.active, jnp.maximum(-contacts.distance, 0.0), 0.0)
-        depth[name] = deepest.reshape(-1, worlds).max(0)
+        depth[name] = _deepest(contacts)
+    between = jnp.zeros((fingers, fingers, worlds), state.wrist.dtype)
+    on_palm = none[0]
+    met = assembly.hand_contacts(scene, hand, kin, velocity, state.grip)
+    for name, these in met.items():
+        normal, depth[name] = once(_pressing, these, motion, velocity), _deepest(these.contacts)
+        one, two = these.fingers
+        if name == "finger_palm":
+            on_palm = normal
+        else:
+            between = between.at[one, two].set(normal).at[two, one].set(normal)
 
     def each(force: jax.Array) -> jax.Array:
         return jnp.moveaxis(force, (2, 1), (0, 1))
@@ -98,6 +116,8 @@ def forces(scene: Scene, hand: WorldModel, state: State, acc: Acc) -> Forces:
         grip=grip.T,
         finger_table=each(net["finger_table"]),
         palm_table=alone(net["palm_table"]),
+        finger_finger=jnp.moveaxis(between, -1, 0),
+        finger_palm=on_palm.T,
         depth=depth,
     )
 
@@ -111,9 +131,25 @@ def _acting(
     """
     speed = contacts.relative(relative(name, velocity))
     jar = contacts.relative(relative(name, motion)) - contacts.reference(speed)
-    force = constraint_update(contacts, jar).force[:3]
-    force = jnp.where(contacts.active, force, 0.0)
+    force = _force(contacts, jar)
     normal, lanes = dot(contacts.normal, force), force.shape[-2:]
     if not name.startswith("finger"):
         lanes = 1, lanes[1]
     return force.reshape(3, -1, *lanes).sum(1), normal.reshape(-1, *lanes).sum(0)
+
+
+def _pressing(met: HandContacts, motion: Spatial, velocity: Spatial) -> jax.Array:
+    """Sums of the normal forces of the pairs' contacts, shape (pair, world)."""
+    force = _force(met.contacts, met.jar(motion, velocity))
+    return dot(met.contacts.normal, force).sum(0)
+
+
+def _force(contacts: Contacts, jar: jax.Array) -> jax.Array:
+    """Forces on the first body, shape (3, ...)."""
+    return jnp.where(contacts.active, constraint_update(contacts, jar).force[:3], 0.0)
+
+
+def _deepest(contacts: Contacts) -> jax.Array:
+    """Largest depth of a set's contacts, shape (world,)."""
+    depth = jnp.where(contacts.active, jnp.maximum(-contacts.distance, 0.0), 0.0)
+    return depth.reshape(-1, depth.shape[-1]).max(0)

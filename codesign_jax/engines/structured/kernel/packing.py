@@ -126,6 +126,12 @@ class Packing(Tables):
             rows = np.concatenate([np.arange(first, first + count) for first, count in where])
             rest = jnp.moveaxis(worlds[:, :, rows], 3, 1).reshape(-1, steps, rows.size)
             found[name] = jnp.concatenate([rest[..., :6], joints, rest[..., 6:]], -1)
+        if states and self.held:
+            count = 3 * self.held
+            rows = self.finger_state.offset["grip"] + np.arange(count)
+            held = fingers[:, :, rows].reshape(-1, steps, count, self.fingers, self.block)
+            held = jnp.moveaxis(held[..., : self.num_fingers, :], 4, 1)
+            found["held"] = held.reshape(-1, steps, count * self.num_fingers)
         return found
 
     def rows_of(self, qpos: jax.Array, qvel: jax.Array | None = None) -> tuple:

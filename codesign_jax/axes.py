@@ -19,9 +19,6 @@ def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -
     """Refuses hands and trials without their leading axes.
 
     Args:
-      scene: The scene, which says how many fingers there are.
-      params: Parameters that should have the leading axis `axes[0]`.
-      trials: Trials that should have the leading axis `axes[1]`.
       axes: Names of the axes; where they are the same the arrays have to be as long.
 
     Raises:

@@ -90,10 +90,6 @@ class Batch:
     ):
         """Compiles nothing yet.
 
-        Args:
-          devices: Number of devices that simulate; None for all of this process.
-          limit: Most worlds of one device in one call.
-
         Raises:
           ValueError: If there are fewer devices.
         """

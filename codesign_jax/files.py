@@ -12,9 +12,6 @@ from pathlib import Path
 def atomically(path: Path) -> Iterator[Path]:
     """Replaces a file as a whole: whoever reads it, and whenever, finds the old one or the new one.
 
-    Args:
-      path: The file; its folder is made if it is missing.
-
     Yields:
       The path to write to, beside the file. It takes the file's place, on disk, when the block ends
       and is removed if the block raises; a killed process leaves it behind, with a name in .tmp.

@@ -64,9 +64,6 @@ def contents(names: Iterable[str]) -> dict[str, bytes]:
 def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
     """Imports a cost and tries it on arrays without values.
 
-    Args:
-      scene: The scene whose grasps it is to judge.
-
     Returns:
       The function and whether a grasp ends where the object is lost: the function's attribute
       `stop_when_lost`, False if it has none.
@@ -106,9 +103,6 @@ def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
 
 def make_policy(name: str, scene: Scene) -> tuple[Policy, Scene]:
     """Imports a policy, or a class that makes one of a scene, and tries it without values.
-
-    Args:
-      scene: The scene whose hand it is to drive.
 
     Returns:
       The policy, and the scene with what it lets a search move, see `policy.searched`.
@@ -198,11 +192,7 @@ def _hand(scene: Scene) -> Params:
 
 
 def _load(name: str, flag: str = "") -> Any:
-    """The object of a name.
-
-    Raises:
-      InputError: If there is none, or its module cannot be imported.
-    """
+    """The object of a name."""
     begin = f"{flag} {name}".strip()
     if words := problem(name):
         raise InputError([f"{flag}: {words}".removeprefix(": ")])
@@ -229,11 +219,7 @@ def _load(name: str, flag: str = "") -> Any:
 
 
 def _source(name: str, module: str) -> Path:
-    """File of Python code that a module was read from.
-
-    Raises:
-      InputError: If there is none, such as of a module in C.
-    """
+    """File of Python code that a module was read from."""
     try:
         return Path(inspect.getsourcefile(sys.modules[module]) or "").resolve(strict=True)
     except (TypeError, OSError) as error:
@@ -243,11 +229,7 @@ def _source(name: str, module: str) -> Path:
 
 
 def _refuse_signature(flag: str, function: Any, arguments: tuple[str, ...]) -> None:
-    """Refuses what cannot be called with so many arguments.
-
-    Raises:
-      InputError: With the arguments that it gets.
-    """
+    """Refuses what cannot be called with so many arguments."""
     wanted = f"a function of ({', '.join(arguments)})"
     if not callable(function):
         raise InputError([f"{flag}: it is {type(function).__name__}, not {wanted}"])
@@ -260,11 +242,7 @@ def _refuse_signature(flag: str, function: Any, arguments: tuple[str, ...]) -> N
 
 
 def _tried(flag: str, code: Any, call: Callable[[], Any]) -> Any:
-    """Returns what the user's code returns.
-
-    Raises:
-      InputError: With the error that it raises, and its line.
-    """
+    """Returns what the user's code returns."""
     try:
         return call()
     except Exception as error:

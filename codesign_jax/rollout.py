@@ -276,11 +276,7 @@ def grid(tree: Any, shape: tuple[int, ...]) -> Any:
 def _checked(
     scene: Scene, engine: Engine, params: Params, trials: Trial, constants: Constants | None
 ) -> Constants:
-    """The numbers of a batch of worlds that is as `simulate` asks for.
-
-    Raises:
-      InputError: See `simulate`.
-    """
+    """The numbers of a batch of worlds that is as `simulate` asks for."""
     axes.refuse_other(scene, engine)
     constants = scene.numbers(constants)
     axes.refuse(scene, params, trials, ("world", "world"))

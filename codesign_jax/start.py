@@ -30,9 +30,6 @@ def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
     damper is negative (walls that leave no chamber, a negative length), or if at the start any two
     bodies that may touch overlap by more than the scene's limit of penetration: soft contacts would
     drive them apart with energy that no actuator gave.
-
-    Args:
-      fields: Model fields with leading axis (world,).
     """
     fields = jax.lax.stop_gradient(fields)  # a verdict has no derivative
     deep = jnp.maximum(depth(scene, fields), depth_between(scene, fields))
@@ -60,9 +57,6 @@ def depth(scene: Scene, fields: ModelFields) -> jax.Array:
 
     The structured engine's contacts serve every engine: same spheres, shapes and pairs.  Fingers
     are straight; how deep they stand in one another says `depth_between`.
-
-    Args:
-      fields: Model fields with leading axis (world,).
 
     Returns:
       Shape (world,); 0 where nothing may touch.

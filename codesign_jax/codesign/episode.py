@@ -290,11 +290,7 @@ def _programs(
 
 
 def _refuse_mask(space: DesignSpace, mask: jax.typing.ArrayLike) -> None:
-    """Refuses a mask that is not one of the space's parameters.
-
-    Raises:
-      InputError: If its shape is another one.
-    """
+    """Refuses a mask that is not one of the space's parameters."""
     if np.shape(mask) != (space.num_parameters,):
         names = ", ".join(space.names)
         raise InputError(

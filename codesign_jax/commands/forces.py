@@ -111,7 +111,6 @@ def pull(
     no force up to `MOST` takes is infinite.
 
     Args:
-      trials: Trials with leading axis (trial,).
       along: Direction of the force on the object's centre of mass, world frame, shape (3,).
 
     Raises:

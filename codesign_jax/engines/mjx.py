@@ -31,11 +31,7 @@ _STATIC = ("wrap_prm",)
 
 
 def _refuse_fixtures(scene: Scene) -> None:
-    """Refuses objects and fixtures that MJX does not collide: a box and a cylinder.
-
-    Raises:
-      InputError: With a line for each two.
-    """
+    """Refuses objects and fixtures that MJX does not collide: a box and a cylinder."""
     problems = [
         f"not supported by engine mjx: object {shape.name!r}, a {shape.type}, with fixture "
         f"{fixture.name!r}, a {fixture.type}; use engine structured or mujoco"

@@ -217,9 +217,6 @@ def _rollout(
 
     Contacts, constraints and solver share one arena.  Where it is full MuJoCo leaves out contacts
     and warns, or raises; records of the latter worlds are not numbers.
-
-    Raises:
-      SimulationError: For any other error.
     """
     m, shape = batch.model, (len(ids), ctrl.shape[1])
     names = {"xipos": (m.nbody, 3), "qvel": (m.nv,), "qpos": (m.nq,), _TIME: (1,)}

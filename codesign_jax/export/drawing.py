@@ -27,9 +27,7 @@ def write(folder: Path, *content: Any, assembly: Sequence[SheetSection], **shown
     """Writes the sheet to a folder as two pages of PDF.
 
     Args:
-      content: As of `page`.
       assembly: The second page's sections, see `sheet.assembly_sections`.
-      shown: As of `page`.
     """
     path = folder / f"{NAME}.pdf"
     with PdfPages(path) as pages:
@@ -51,8 +49,6 @@ def page(
     """Draws the sheet on one page.
 
     Args:
-      content: The sections, see `sheet.sheet_sections`.
-      params: Parameters of the design as concrete arrays.
       drift: Tolerances, or None.
     """
     # A figure of its own instead of pyplot's: no state and no display is touched.

@@ -40,13 +40,7 @@ class Grasp(NamedTuple):
 
 
 def grasp(scene: Scene, params: Params, trial: Trial) -> Grasp:
-    """Builds a grasp and plays it in plain MuJoCo, for its key frames and its outcome.
-
-    Args:
-      scene: The scene; `plain.differences` says what its model lacks.
-      params: Parameters as concrete arrays.
-      trial: The trial as concrete arrays.
-    """
+    """Builds a grasp and plays it in plain MuJoCo, for its key frames and its outcome."""
     scene, trial = plain.single_object(scene, trial)
     wide = _wide(params), _wide(trial)
     start, controls = _float64(_start, scene, *wide), timed_controls(scene, params, trial)
@@ -88,12 +82,7 @@ def _spec(scene: Scene, params: Params, trial: Trial) -> tuple[mujoco.MjSpec, Ma
 
 
 def timed_controls(scene: Scene, params: Params, trial: Trial) -> np.ndarray:
-    """Time [s] and controls of each step of a grasp in float64, shape (time, 1 + nu).
-
-    Args:
-      params: Parameters as concrete arrays.
-      trial: The trial as concrete arrays.
-    """
+    """Time [s] and controls of each step of a grasp in float64, shape (time, 1 + nu)."""
     ctrl = _float64(_commands, scene, _wide(params), _wide(trial))
     return np.column_stack([np.arange(len(ctrl)) * scene.discretization.timestep, ctrl])
 

@@ -37,12 +37,6 @@ class Part(NamedTuple):
 def write(folder: Path, sizes: list[Size], process: Process) -> list[Part]:
     """Writes fingers and moulds, equal fingers once, as they stand on a printer's bed.
 
-    Args:
-      folder: An existing folder.
-
-    Returns:
-      The parts.
-
     Raises:
       RuntimeError: If a file does not hold a closed surface of the solid's volume.
     """

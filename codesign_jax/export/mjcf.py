@@ -22,9 +22,6 @@ _NOT_PHYSICS = ("signature", "names")
 def text(spec: mujoco.MjSpec) -> str:
     """Returns MJCF that plain MuJoCo compiles to the same model as the spec, to rounding.
 
-    Args:
-      spec: A spec of named bodies, joints, geoms, actuators, pairs and keys; compiled here.
-
     Raises:
       RuntimeError: If a number of the model is lost on the way.
     """

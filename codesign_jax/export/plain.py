@@ -77,7 +77,6 @@ def engine_model(
     """Compiles a spec to the model of the engine `mujoco`: inverse weights are the declared ones.
 
     Args:
-      spec: A spec of `model.build_spec`; it stays as it is.
       shares: Stiffness of geoms that are not as stiff as declared, see `skin.add`.
     """
     if shares:
@@ -92,10 +91,6 @@ def engine_model(
 
 def text(scene: Scene, spec: mujoco.MjSpec, shares: Mapping[str, float] = NONE) -> str:
     """MJCF which plain MuJoCo compiles to a model of the same dynamics as `engine_model`.
-
-    Args:
-      spec: A spec of `model.build_spec`; its contact pairs are rewritten.
-      shares: As in `engine_model`.
 
     Raises:
       Inexpressible: If a contact would need an impedance that MuJoCo does not take.

@@ -98,9 +98,6 @@ def _simpson(area: Callable[[float], float], start: float, end: float) -> float:
 def sizes(hand: Hand, params: Params, process: Process) -> list[Size]:
     """Dimensions of a hand's fingers.
 
-    Args:
-      params: Its parameters as concrete arrays.
-
     Raises:
       InputError: With every finger that has no room for a chamber.
     """

@@ -62,7 +62,6 @@ def sheet_sections(
     """The sheet's content.
 
     Args:
-      params: Parameters of the design as concrete arrays.
       drift: Tolerances, or None if they were not asked for.
       tested: The verdict of the run that found the design, and its grasps under other conditions.
     """

@@ -40,12 +40,7 @@ class Ball(NamedTuple):
 
 
 def balls(scene: Scene, finger: int, params: Params) -> list[Ball]:
-    """The spheres of a finger, as high as the section on the inside of its bottom layer.
-
-    Args:
-      finger: Index of the finger.
-      params: Parameters of the hand as concrete arrays.
-    """
+    """The spheres of a finger, as high as the section on the inside of its bottom layer."""
     links, k, width = (
         scene.discretization.links,
         scene.discretization.hull_rings,
@@ -68,9 +63,6 @@ def balls(scene: Scene, finger: int, params: Params) -> list[Ball]:
 
 def add(scene: Scene, spec: mujoco.MjSpec, params: Params) -> dict[str, float]:
     """Adds spheres and capsules to a spec, with their pairs.
-
-    Args:
-      params: Parameters of the hand as concrete arrays.
 
     Returns:
       Stiffness of a contact of each sphere, by the geom's name, as a share of the scene's.

@@ -60,11 +60,7 @@ def write_commands(folder: Path, scene: Scene, schedule: np.ndarray) -> Path:
     """Writes commands.csv in mm, degrees and kPa.
 
     Args:
-      folder: An existing folder.
       schedule: Time and controls, see `grasps.timed_controls`.
-
-    Returns:
-      The file's path.
     """
     factors = [1e3] * 3 + [180 / np.pi] * 3 + [1e-3] * scene.num_fingers
     names, ends = zip(*scene.phase_ends.items(), strict=True)
@@ -82,10 +78,6 @@ def write_grasps(
     folder: Path, scene: Scene, trials: Sequence[tuple[str, Trial]], grasps: Iterable[Grasp]
 ) -> Iterator[str]:
     """Writes notes, models, controls, player and grasps.csv, as far as its lines are asked for.
-
-    Args:
-      folder: An existing folder.
-      grasps: The grasps, which are asked for one after the other.
 
     Yields:
       What became of each grasp, a line each, as it is written.

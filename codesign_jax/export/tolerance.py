@@ -121,7 +121,6 @@ def study(scene: Scene, space: DesignSpace, design: np.ndarray, steps: int, *, f
 
     Args:
       space: The design space in which the design was found.
-      design: The design [SI units], shape (parameter,).
       free: Whether to move the parameters of that space, or all of the hand's table.
     """
     whole = space if free else design_space(scene.hand)
@@ -169,9 +168,6 @@ def shares(outcomes: Outcome) -> list[Interval]:
     """Share of successful grasps of each design, with its 95 % interval.
 
     A success keeps the object and lets go of it; a trial that failed, for whatever reason, is none.
-
-    Args:
-      outcomes: Outcomes, arrays of shape (design, trial).
     """
     kept = verdicts(outcomes) == VERDICTS.index("kept")
     return [statistics.wilson(int(n), kept.shape[1]) for n in kept.sum(1)]

@@ -110,9 +110,6 @@ def rest(
     """Vertices of the straight finger in the frame of its base [m], shape (vertex, 3).
 
     Args:
-      length: Length of the finger [m].
-      height: Height of its section [m], of a tapered one at the base.
-      square: See `outline`.
       tip: The section at the tip of a tapered one.
     """
     links, place = scene.discretization.links, hull(scene, square=square).place

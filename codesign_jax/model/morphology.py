@@ -173,7 +173,6 @@ def joint_springs(
     """Stiffness k = EI / l or GJ / l of a segment's length l, and damping beta k (Kelvin-Voigt).
 
     Args:
-      beams: Of `finger_beams`.
       axes: Axes of a joint, as in `Layout`.
 
     Returns:
@@ -202,9 +201,6 @@ def thresholds(hand: Hand, params: Params, beams: Beam, links: int) -> jax.Array
       |lambda| w/2 T,  T = p A_c - 4 G kappa S,
     with S = A h/2 the walls' moment of area about the bottom layer: T is the layer's tension, and
     nothing bends sideways below the moment T w/2.  See `threshold_moments`.
-
-    Args:
-      beams: Of `finger_beams`.
 
     Returns:
       Of each finger's joints the moment per pressure A_c w/2 [m^3], its loss by the bend angle

@@ -76,12 +76,7 @@ class Replay(NamedTuple):
 
 
 def replay(scene: Scene, engine: Engine, params: Params, trials: Trial) -> list[Replay]:
-    """Simulates one hand in several trials and keeps the trajectories.
-
-    Args:
-      params: Parameters of one hand, no leading axis.
-      trials: Trials with leading axis (trial,).
-    """
+    """Simulates one hand in several trials and keeps the trajectories."""
     count = trials.yaw.shape[0]
     worlds = jax.tree.map(lambda v: jnp.broadcast_to(v, (count, *jnp.shape(v))), params)
     outcomes, trace = jax.tree.map(np.asarray, _simulate(scene, engine, worlds, trials))
@@ -162,14 +157,9 @@ def write_film(
     """Writes grasps side by side as a film, GIF or MP4 (H.264) by the path's ending.
 
     Args:
-      path: File to write; its folder is made.
       frames_per_second: Frames of a second of simulated time, which is shown in real time; default:
         12.5 of a GIF, 25 of an MP4.
-      size: Width and height of one grasp's picture in pixels.
       notify: Told in one line if there is no OpenGL.
-
-    Returns:
-      The path.
 
     Raises:
       ImportError: Without PyAV, which writes MP4.
@@ -223,13 +213,8 @@ def write_strip(
     """Writes a film strip, one row a grasp, by default one frame at the end of each phase.
 
     Args:
-      path: Image file to write; its folder is made.
       times: Times of the frames [s].
-      size: Width and height of a frame in pixels.
       notify: Told in one line if there is no OpenGL.
-
-    Returns:
-      The path.
     """
     _announce(notify)
     p = scene.phases
@@ -329,11 +314,7 @@ def opengl_backend() -> str | None:
 def _render(
     compiled: mujoco.MjModel, qpos: np.ndarray, size: tuple[int, int], camera: Camera, way: str
 ) -> np.ndarray:
-    """Renders in a child process; see `renderer`.
-
-    Raises:
-      CalledProcessError: If this way to OpenGL does not work.
-    """
+    """Renders in a child process; see `renderer`."""
     with tempfile.TemporaryDirectory() as folder:
         places = [str(Path(folder) / name) for name in ("model.mjb", "qpos.npy", "frames.npy")]
         mujoco.mj_saveModel(compiled, places[0])

@@ -91,9 +91,6 @@ def motion(scene: Scene, grasp: Replay, *, rate: float = 25.0) -> Motion:
 def object_mesh(scene: Scene, index: int) -> tuple[np.ndarray, np.ndarray]:
     """Surface of an object of the set, without noise, in its body's frame.
 
-    Args:
-      index: Index of the object.
-
     Returns:
       Vertices [m], shape (vertex, 3), and triangles, shape (face, 3).
     """

@@ -21,10 +21,6 @@ def cost_evolution(
 
     Args:
       cost: Particle costs, shape (episode, particle).
-      path: File to write; its folder is made.
-
-    Returns:
-      The path.
     """
     cost = np.asarray(cost)
     episode = np.arange(1, len(cost) + 1)
@@ -48,12 +44,6 @@ def landscape(found: Landscape, path: Path) -> Path:
     """Draws the mean cost over a grid of two parameters as Fig. 8 of the paper: white where low.
 
     Lines enclose where the mean cost is below the thresholds of convergence and of success.
-
-    Args:
-      path: File to write; its folder is made.
-
-    Returns:
-      The path.
     """
     figure = matplotlib.figure.Figure(figsize=(5.6, 4.4), dpi=120, layout="constrained")
     axes = figure.add_subplot()

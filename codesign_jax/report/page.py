@@ -23,10 +23,6 @@ def write(run: Run, grasp: tuple[Grasp, Replay] | None, path: Path) -> Path:
 
     Args:
       grasp: The grasp to show and what happened when it was simulated again, or None.
-      path: The file; its folder is made.
-
-    Returns:
-      The path.
     """
     sections = [
         *(markup.paragraph(f"Warning: {note}.", "warning") for note in run.notes),

@@ -26,7 +26,6 @@ def draw(
 
     Args:
       qpos: Generalized positions, shape (frame, nq).
-      shape: Index of the object's shape.
 
     Returns:
       Frames, uint8, shape (frame, height, width, 3).

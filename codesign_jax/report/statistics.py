@@ -13,11 +13,7 @@ class Interval(NamedTuple):
 
 
 def wilson(successes: int, total: int) -> Interval:
-    """Share of successes with Wilson's score interval (Wilson 1927).
-
-    Args:
-      total: Number of trials, at least one.
-    """
+    """Share of successes with Wilson's score interval (Wilson 1927)."""
     from scipy import stats  # takes half a second to import: commands do so once they are done
 
     found = stats.binomtest(successes, total).proportion_ci(0.95, method="wilson")
@@ -29,10 +25,6 @@ def paired(both: int, first: int, second: int, total: int) -> Interval:
 
     It joins Wilson's intervals of the two shares by their correlation: with no trial in which the
     two differ it has a width, unlike Wald's and the bootstrap's.
-
-    Args:
-      first: Those in which the first alone did.
-      total: All trials, at least one.
     """
     one, other = wilson(both + first, total), wilson(both + second, total)
     neither = total - both - first - second

@@ -70,9 +70,6 @@ def judge(kept: int, total: int) -> Verdict:
     z^2 p_0 (1 - p_0) / (p - p_0)^2 grasps on: the number that decides has a closed form.  A kept
     grasp more never makes a verdict worse, a lost one never better, and at a constant share a
     decision stays.
-
-    Args:
-      total: All grasps, at least one.
     """
     good = kept / total > RELIABLE - 1e-9
     limit = UNRELIABLE if good else RELIABLE
@@ -167,12 +164,7 @@ class Judged(NamedTuple):
 
 
 def of_trials(scene: Scene, outcomes: Outcome) -> str:
-    """Says how trials ended: numbers of them, mean cost, warnings.
-
-    Args:
-      scene: The scene, with its rule for failed trials.
-      outcomes: Outcomes, NumPy arrays of shape (trial,).
-    """
+    """Says how trials ended: numbers of them, mean cost, warnings."""
     warnings = runs.warning_counts(outcomes.status)
     found = tally(outcomes)
     causes = f" ({runs.failure_counts(outcomes.status)})" if found.failed else ""
@@ -194,11 +186,7 @@ def mean_cost(scene: Scene, outcomes: Outcome) -> str:
 
 
 def solver(outcomes: Outcome) -> list[str]:
-    """Says in a line how often the solver stopped at its limit; no line if it never did.
-
-    Args:
-      outcomes: Outcomes, arrays of any shape.
-    """
+    """Says in a line how often the solver stopped at its limit; no line if it never did."""
     shares, residuals = (_told(v) for v in (outcomes.capped, outcomes.residual))
     if not shares.any():
         return []

@@ -83,14 +83,7 @@ def web(name: str) -> str:
 
 
 def write(scene: Scene, grasp: Replay, path: Path, *, title: str, text: list[str]) -> Path:
-    """Writes a grasp alone as an HTML file.
-
-    Args:
-      path: The file; its folder is made.
-
-    Returns:
-      The path.
-    """
+    """Writes a grasp alone as an HTML file."""
     lines = "".join(f"<p>{html.escape(line)}</p>\n" for line in text)
     body = f"<h1>{html.escape(title)}</h1>\n{lines}{fragment(scene, grasp)}"
     with files.atomically(path) as part:

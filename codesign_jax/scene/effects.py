@@ -78,11 +78,7 @@ EFFECTS: Mapping[str, Effect] = {
 
 
 def refusals(effects: Any, engine: str) -> dict[str, str]:
-    """Returns why an engine cannot do a scene's effects, by effect; empty if it can.
-
-    Args:
-      effects: The scene's `Effects`.
-    """
+    """Returns why an engine cannot do a scene's effects, by effect; empty if it can."""
     values = dataclasses.asdict(effects)
     found = {name: EFFECTS[name].refused.get(engine, {}).get(v) for name, v in values.items()}
     return {name: reason for name, reason in found.items() if reason}
@@ -90,9 +86,6 @@ def refusals(effects: Any, engine: str) -> dict[str, str]:
 
 def refuse(effects: Any, engine: str) -> None:
     """Checks that an engine can do what a scene asks for.
-
-    Args:
-      effects: The scene's `Effects`.
 
     Raises:
       InputError: With a line for each effect that it cannot do.

@@ -112,7 +112,6 @@ def as_given(problems: list[str], places: Mapping[str, str]) -> list[str]:
 
     Args:
       problems: Messages that begin with a key path in a file.
-      places: See `apply`.
     """
     longest = sorted(places, key=len, reverse=True)
     return [_as_given(problem, longest, places) for problem in problems]

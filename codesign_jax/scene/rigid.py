@@ -173,7 +173,6 @@ def inertia_problem(inertia: Sequence[float], mass: float, radius: float) -> str
     """Why no body has this inertia about its centre of mass, or None.
 
     Args:
-      inertia: As in `tensor` [kg m^2].
       mass: Its mass [kg].
       radius: Distance of its farthest point from the centre of mass [m].
     """

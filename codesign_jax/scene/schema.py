@@ -198,9 +198,6 @@ def numbers(table: Any) -> Any:
 
     Field names are those of the file; arrays of tables and of numbers are tuples. A table without
     such numbers is left out, and None in an array of tables.
-
-    Args:
-      table: A dataclass whose numeric fields are made by `quantity`.
     """
     return _collect(table, lambda field, value: value)
 
@@ -214,7 +211,6 @@ def with_numbers(table: T, values: Any) -> T:
     """The dataclass with other numbers.
 
     Args:
-      table: A dataclass whose numeric fields are made by `quantity`.
       values: Its numbers, nested as `numbers(table)`; may be arrays or traced.
     """
     changes = {}

@@ -48,7 +48,6 @@ def lanes(values: Any, shape: tuple[int, ...], *, wide: bool) -> Lanes:
     """Lanes of components given flat, of a finger each (wide) or of a world.
 
     Args:
-      values: Values over the lanes, as many as `shape` has elements.
       shape: Shape of the components.
       wide: Whether the lanes are (finger, world) and not (1, world).
     """

@@ -35,10 +35,8 @@ def reverse(
     """Cotangents of a rollout's inputs, see `AdjointProgram.adjoint`.
 
     Args:
-      engine: The engine, which says how long segments are, if there are any.
       path: What was stored of it, as tables of blocks.
       bars: Cotangents of its results, as tables of blocks.
-      trajectory: As in `Engine.rollout`.
     """
     if engine.segment is None:
         hand_bar, world_bar, *rest = program.adjoint(inputs, path, bars)

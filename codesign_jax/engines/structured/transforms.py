@@ -40,11 +40,6 @@ def rollout(
 ) -> Trace:
     """`StructuredEngine.simulate`'s trace, under any of JAX's transformations but forward mode.
 
-    Args:
-      fields: As in `Engine.rollout`.
-      ctrl: As in `Engine.rollout`.
-      trajectory: As in `Engine.rollout`.
-
     Raises:
       NotImplementedError: If a derivative is differentiated again.
     """
@@ -115,7 +110,6 @@ def _adjoint(
     """Cotangents of fields and controls.
 
     Args:
-      trajectory: As in `Engine.rollout`.
       speed: Its largest velocities, as in `Trace`.
       cotangent: Cotangent of its trace, without status and residual.
     """

@@ -37,8 +37,6 @@ def body(
     """Mass properties of a watertight mesh, those of a homogeneous body where none are given.
 
     Args:
-      vertices: Positions in the file's frame [m], shape (vertex, 3).
-      faces: Vertex indices, shape (face, 3).
       centre: Centre of mass in the file's frame [m], shape (3,).
       tensor: Inertia about the centre of mass per mass [m^2], in the file's axes, shape (3, 3).
     """

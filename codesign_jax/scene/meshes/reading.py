@@ -78,11 +78,7 @@ def read(path: Path) -> Read:
 
 
 def _parse(content: bytes, kind: str) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of a file's bytes.
-
-    Raises:
-      Exception: Of any type, if they are no mesh; trimesh's parsers have no type of their own.
-    """
+    """Vertices and faces of a file's bytes."""
     options: dict[str, Any] = {}
     if kind in ("glb", "gltf"):
         _check_gltf(content)
@@ -107,11 +103,7 @@ def _is_binary_stl(content: bytes) -> bool:
 
 
 def _check_gltf(content: bytes) -> None:
-    """Refuses glTF that needs other files, or grows when it is read.
-
-    Raises:
-      ValueError: With the reason.
-    """
+    """Refuses glTF that needs other files, or grows when it is read."""
     text = content[20 : 20 + int.from_bytes(content[12:16], "little")]
     tree = json.loads(text if content[:4] == b"glTF" else content)
     parts = {key: tree.get(key, []) for key in ("buffers", "nodes", "meshes", "accessors")}

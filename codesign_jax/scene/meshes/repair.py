@@ -16,10 +16,6 @@ _MERGE = 1e-5  # vertices closer than this fraction of the size are one
 def repair(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Merges vertices, drops degenerate and duplicate faces, turns faces alike and closes holes.
 
-    Args:
-      vertices: Positions, any unit, shape (vertex, 3).
-      faces: Vertex indices, shape (face, 3).
-
     Returns:
       Vertices, faces and what was changed, a line each; no line if nothing was.
     """

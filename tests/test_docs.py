@@ -86,7 +86,7 @@ def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch)
         arguments.append("--dry-run")
     elif arguments[0] == "evaluate":
         kept = SimpleNamespace(status=np.zeros(1, int))  # of which the exit code is made
-        for name in ("simulate", "draw"):
+        for name in ("simulate", "of_objects"):
             monkeypatch.setattr(evaluate, name, lambda *rest: reached.append(rest) or kept)
         monkeypatch.setattr(evaluate.stress, "simulate", lambda *rest: reached.append(rest))
         monkeypatch.setattr(evaluate.reference, "tell_stress", lambda *rest: None)

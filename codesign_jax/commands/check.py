@@ -49,7 +49,6 @@ class Measured(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Grasps a second."""
         return self.outcomes.cost.size / self.seconds
 
     @property

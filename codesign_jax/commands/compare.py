@@ -206,7 +206,6 @@ def _summary(own: list[Compared]) -> tuple[str, ...]:
 
 
 def write_table(every: Mapping[Path, Compared], path: Path) -> None:
-    """Writes a row for each run; see `runs.columns.MORE`."""
     head = [*columns.MORE[columns.SEEDS].columns]
     tables.write(path, head, (_values(place, run, path) for place, run in every.items()))
 

@@ -1,7 +1,6 @@
 """`codesign evaluate`."""
 
 from itertools import chain
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import jax
@@ -9,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from codesign_jax import engines, preflight, rollout, runs, types
+from codesign_jax import preflight, rollout, runs, types
 from codesign_jax.commands import common, forces, reference
 from codesign_jax.commands.common import find_case
+from codesign_jax.engines import Engine
+from codesign_jax.engines.base import recording
 from codesign_jax.report import stress, verdicts
 from codesign_jax.runs import choice, tables
 from codesign_jax.runs.choice import Case
@@ -48,10 +49,8 @@ def main(options: "Evaluate") -> int:
         with Busy(console, "simulating other conditions"):
             found = stress.simulate(case, options.trials, jax.random.key(options.seed))
         reference.tell_stress(case, found, console)
-    if options.render:
-        draw(case, engine, options, console)
-    if options.forces or options.pull:
-        push(case, engine, options, console)
+    if options.render or options.forces or options.pull:
+        of_objects(case, engine, options, console)
     return int(types.failed(one.status).all())  # no trial says anything of the design
 
 
@@ -108,36 +107,31 @@ def _untried(case: Case, options: "Evaluate") -> list[str]:
     ]
 
 
-def push(case: Case, engine: engines.Engine, options: "Evaluate", console: Console) -> None:
-    """Records forces of the first trial of each object, and pulls at what is held."""
-    count = min(options.trials, len(case.scene.objects.object))
-    trials = rollout.sample_trials(case.scene, jax.random.key(options.seed), count)
+def of_objects(case: Case, engine: Engine, options: "Evaluate", console: Console) -> None:
+    """Of the first trial of each object: its forces, the pull that ends it, and a drawing."""
+    from codesign_jax.report import animation
+
+    scene, count = case.scene, min(options.trials, len(case.scene.objects.object))
+    trials = rollout.sample_trials(scene, jax.random.key(options.seed), count)
     params = case.space.params(jnp.asarray(case.design, jnp.float32))
+    grasps = []
     if options.forces:
         with Busy(console, "recording forces"):
-            trace = forces.record(case, params, trials)
-        forces.tell(case.scene, trace, trials, console)
-        forces.write(options.forces, case.scene, trace, trials)
+            grasps = animation.replay(scene, recording(engine), params, trials)
+        forces.tell(scene, grasps, console)
+        forces.write(options.forces, scene, grasps)
         console.print(f"table: {options.forces}")
     if options.pull:
         with Busy(console, "pulling"):
             along = forces.direction(options.pull)
-            found = forces.pull(case.scene, engine, params, trials, along)
+            found = forces.pull(scene, engine, params, trials, along)
         for shape, force in zip(np.asarray(trials.shape), found, strict=True):
-            name = case.scene.objects.object[int(shape)].name
+            name = scene.objects.object[int(shape)].name
             console.print(f"{name:>12}: {forces.in_words(force)}")
-
-
-def draw(case: Case, engine: engines.Engine, options: "Evaluate", console: Console) -> None:
-    """Simulates grasps of the first objects and draws them."""
-    from codesign_jax.report import animation
-
-    count = min(options.trials, len(case.scene.objects.object))
-    trials = rollout.sample_trials(case.scene, jax.random.key(options.seed), count)
-    params = case.space.params(jnp.asarray(case.design, jnp.float32))
-    with Busy(console, "simulating what is drawn"):
-        grasps = animation.replay(case.scene, engine, params, trials)
-    path: Path = options.render  # type: ignore[assignment]
-    with Busy(console, "drawing"):
-        animation.write(case.scene, grasps, path, notify=console.print)
-    console.print(f"picture: {path}")
+    if options.render:
+        if not grasps:
+            with Busy(console, "simulating what is drawn"):
+                grasps = animation.replay(scene, engine, params, trials)
+        with Busy(console, "drawing"):
+            animation.write(scene, grasps, options.render, notify=console.print)
+        console.print(f"picture: {options.render}")

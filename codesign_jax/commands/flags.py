@@ -94,7 +94,6 @@ class RunOrDesign(Subject):
     """A run folder (as --run)."""
 
     def __post_init__(self) -> None:
-        """Takes the run that comes first."""
         if self.first is not None and self.run_folder is not None:
             raise ValueError(f"{self.first} and --run {self.run_folder}: give one of them")
         self.run_folder = self.first or self.run_folder

@@ -16,10 +16,10 @@ from codesign_jax import model, rollout
 from codesign_jax.engines import Engine
 from codesign_jax.policy import ControlLoop
 from codesign_jax.report import verdicts
+from codesign_jax.report.animation import Replay
 from codesign_jax.runs import tables
-from codesign_jax.runs.choice import Case
 from codesign_jax.scene import InputError, Scene
-from codesign_jax.types import Forces, Params, Trace, Trial
+from codesign_jax.types import Forces, Params, Trial
 
 RATE = 5.0
 """How fast the pull grows [N/s]."""
@@ -27,18 +27,6 @@ MOST = 50.0
 """Largest pull [N]."""
 OUT = 0.02
 """How far the object's centre is then from where the hand held it [m]."""
-
-
-def record(case: Case, params: Params, trials: Trial) -> Trace:
-    """Whole grasps of the case's design with their forces, arrays of shape (trial, time, ...)."""
-    engine, count = case.make_engine(), len(trials.yaw)
-    hands = jax.tree.map(lambda v: jnp.repeat(v[None], count, 0), params)
-
-    def run(hands: Params, trials: Trial) -> Trace:
-        worlds = case.scene, engine, hands, trials
-        return rollout.simulate(*worlds, stop_when_lost=False, record_forces=True)[1]
-
-    return jax.tree.map(np.asarray, jax.jit(run)(hands, trials))
 
 
 def columns(forces: Forces) -> dict[str, Any]:
@@ -58,31 +46,36 @@ def columns(forces: Forces) -> dict[str, Any]:
     return found | {f"depth_{kind}_mm": 1e3 * depth for kind, depth in forces.depth.items()}
 
 
-def write(path: Path, scene: Scene, trace: Trace, trials: Trial) -> None:
-    """Writes a row for each time step of each trial."""
-    assert trace.forces is not None
+def write(path: Path, scene: Scene, grasps: list[Replay]) -> None:
+    """Writes a row for each time step of each grasp."""
     rows, step = [], scene.discretization.timestep
-    for trial in range(len(trials.yaw)):
-        forces = jax.tree.map(lambda v, t=trial: v[t], trace.forces)
-        name = scene.objects.object[int(trials.shape[trial])].name
-        named = columns(forces)
-        for k in range(trace.distance.shape[1]):
-            head = {"trial": trial, "object": name, "time_s": step * k}
+    for trial, grasp in enumerate(grasps):
+        named = columns(_forces(grasp))
+        for k in range(len(grasp.qpos)):
+            head = {"trial": trial, "object": _object(scene, grasp), "time_s": step * k}
             rows.append(head | {column: series[k] for column, series in named.items()})
     tables.write(path, [*rows[0]], rows)
 
 
-def tell(scene: Scene, trace: Trace, trials: Trial, console: Console) -> None:
-    """Prints grip and depths of each trial while a lost object counts."""
-    assert trace.forces is not None
+def tell(scene: Scene, grasps: list[Replay], console: Console) -> None:
+    """Prints grip and depths of each grasp while a lost object counts."""
     start, end = (int(scene.steps_to(t)) for t in scene.window)
-    for trial in range(len(trials.yaw)):
-        forces = jax.tree.map(lambda v, t=trial: v[t, start:end], trace.forces)
-        name = scene.objects.object[int(trials.shape[trial])].name
+    for grasp in grasps:
+        forces = jax.tree.map(lambda v: v[start:end], _forces(grasp))
         grip = " + ".join(f"{v:.2g}" for v in np.median(forces.grip, 0))
         console.print(
-            f"{name:>12}: grip {grip} N by finger (median); depths: {verdicts.depths(forces)}"
+            f"{_object(scene, grasp):>12}: grip {grip} N by finger (median); depths: "
+            f"{verdicts.depths(forces)}"
         )
+
+
+def _forces(grasp: Replay) -> Forces:
+    assert grasp.trace is not None and grasp.trace.forces is not None
+    return grasp.trace.forces
+
+
+def _object(scene: Scene, grasp: Replay) -> str:
+    return scene.objects.object[int(grasp.trial.shape)].name
 
 
 def direction(text: str) -> np.ndarray:

@@ -120,7 +120,6 @@ def make_plane(case: Case, columns: tuple[int, int], points: int) -> Plane:
 def simulated_designs(
     case: Case, designs: np.ndarray, size: int, options: "Options", console: Console
 ) -> Outcome:
-    """Simulates all designs in the same trials, some at a time; outcomes (design, trial)."""
     task = Task(case.scene, case.space, options.trials, case.make_engine())
     with Meter("landscape", len(designs) * options.trials, console) as meter:
         return batch.evaluate(task, jax.random.key(options.seed), designs, size, meter.advance)
@@ -166,7 +165,6 @@ def print_summary(case: Case, found: Landscape, console: Console) -> None:
 
 
 def write_files(found: Landscape, folder: Path, console: Console) -> None:
-    """Writes the arrays and the figure."""
     folder.mkdir(parents=True, exist_ok=True)
     for path in landscape.save(found, folder):
         console.print(f"landscape: {path}")

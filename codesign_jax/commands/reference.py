@@ -89,24 +89,26 @@ def tell_stress(case: Case, found: Stress, console: Console) -> None:
 
 def stress_run(folder: Path, settings: Settings, console: Console) -> None:
     """Tells what the run's design keeps under other conditions, simulated if not yet."""
-    case, found = case_of_run(folder, engine=settings.engine), stored_stress(folder, settings)
+    (case, about), found = _stress_case(folder, settings), stored_stress(folder, settings)
     if found is None:
         with Busy(console, f"stress, {counted(STRESS_TRIALS, 'grasp')} of each condition"):
             found = stress.simulate(case, STRESS_TRIALS, _noise(settings, stress.STREAM))
-        about = case.digest(STRESS_TRIALS, settings.seed)
         store.keep(folder / STRESS_FILE, about, found._asdict())
     tell_stress(case, found, console)
 
 
 def stored_stress(folder: Path, settings: Settings) -> Stress | None:
     """What `stress_run` kept in a run folder, if it is of its design today."""
-    case = case_of_run(folder, engine=settings.engine)
-    about = case.digest(STRESS_TRIALS, settings.seed)
-    arrays, _ = store.found(folder / STRESS_FILE, about)
+    arrays, _ = store.found(folder / STRESS_FILE, _stress_case(folder, settings)[1])
     if arrays is None:
         return None
     texts = {k: tuple(arrays[k].tolist()) for k in ("conditions", "warnings")}
     return Stress(kept=arrays["kept"], trials=int(arrays["trials"]), **texts)
+
+
+def _stress_case(folder: Path, settings: Settings) -> tuple[Case, str]:
+    case = case_of_run(folder, engine=settings.engine)
+    return case, case.digest(STRESS_TRIALS, settings.seed)
 
 
 def _finer(folder: Path, settings: Settings) -> Case:

@@ -67,7 +67,6 @@ def _camera(words: Sequence[str]) -> "Camera":
 
 
 def draw(asked: grasp.Asked, options: "Render", camera: "Camera", console: Console) -> None:
-    """Simulates the grasp and draws it."""
     with Busy(console, "simulating the grasp"):
         shown = grasp.simulate(asked)
     from codesign_jax.report import animation

@@ -43,7 +43,6 @@ def main(options: "Replay") -> int:
 
 
 def write_page(asked: grasp.Asked, path: Path, console: Console) -> Path:
-    """Simulates the grasp and writes its page."""
     with Busy(console, "simulating the grasp"):
         shown = grasp.simulate(asked)
     from codesign_jax.report import viewer

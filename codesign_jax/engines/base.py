@@ -114,11 +114,9 @@ class Equal:
         raise NotImplementedError
 
     def __eq__(self, other: object) -> bool:
-        """Whether the other engine runs the same program."""
         return type(self) is type(other) and self._key() == other._key()  # type: ignore[attr-defined]
 
     def __hash__(self) -> int:
-        """As equality asks for."""
         return hash((type(self), self._key()))
 
 

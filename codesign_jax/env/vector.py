@@ -21,7 +21,6 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}
 
     def __init__(self, env: GraspEnv, num_envs: int, *, seed: int = 0):
-        """Takes the environment, how many worlds there are, and the root of their noise."""
         self.env, self.num_envs = env, num_envs
         size = env.observation_size, env.action_size
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, size[:1], np.float32)

@@ -47,7 +47,6 @@ class Run(NamedTuple):
 
     @property
     def space(self) -> DesignSpace:
-        """The design space."""
         return design_space(self.scene.hand, self.settings.preset)
 
     @property

@@ -97,7 +97,6 @@ class Checkpoints:
         self._manager = ocp.CheckpointManager(self.folder, options=options)
 
     def __enter__(self) -> "Checkpoints":
-        """Returns itself."""
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -257,7 +256,6 @@ def digest(arrays: Arrays) -> str:
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file's bytes."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 

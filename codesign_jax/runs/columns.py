@@ -15,11 +15,8 @@ class CsvTable(NamedTuple):
     designs: str | None = None
 
     def head(self, designs: list[str]) -> list[str]:
-        """Names of all columns."""
-        return [
-            *self.columns,
-            *(self.designs + name for name in designs if self.designs is not None),
-        ]
+        own = [] if self.designs is None else [self.designs + name for name in designs]
+        return [*self.columns, *own]
 
 
 _OUTCOME = "cost", "lost_time_s", "status", "first_bad_step", "steps_at_limit", "residual"
@@ -56,11 +53,7 @@ GRASPS = {
     "cost": ("float32", "", "0 if kept, cost.maximum if lost as the lift begins or failed"),
     "lost_time_s": ("float32", "s", "when the object was lost; inf if it was kept"),
     "status": ("name", "", "OK, or the bits of codesign_jax.types.Status joined by +"),
-    "first_bad_step": (
-        "int32",
-        "",
-        "time step at which the trial failed; missing if none did",
-    ),
+    "first_bad_step": ("int32", "", "time step at which the trial failed; missing if none did"),
     "steps_at_limit": ("float32", "", "share of the steps in which the solver did not converge"),
     "residual": ("float32", "", "largest residual of such a step, in weights of palm and object"),
 }
@@ -85,16 +78,8 @@ MORE = {
 """Tables that are not of a run alone."""
 
 FILES = {
-    *("scene.toml", "hand.toml", "objects.toml", "control.toml", "meshes", "code"),
-    *(
-        "provenance.json",
-        "checkpoints",
-        "events.log",
-        "failures",
-        "figures",
-        "landscape.npz",
-        LANDSCAPE,
-    ),
+    *("scene.toml", "hand.toml", "objects.toml", "control.toml", "meshes", "code", "checkpoints"),
+    *("provenance.json", "events.log", "failures", "figures", "landscape.npz", LANDSCAPE),
     *("reference.npz", REFERENCE, "stress.npz", "replay.html", "report.html"),
 }
 """Names at the top of a run folder, beside those of `TABLES`."""

@@ -48,7 +48,6 @@ class Question:
 
     @functools.cached_property
     def space(self) -> DesignSpace:
-        """The design space."""
         return design_space(self.scene.hand, self.preset)
 
     @functools.cached_property
@@ -77,7 +76,6 @@ class Shards:
     """Outcomes of calls, a file each in a folder that names their question."""
 
     def __init__(self, path: Path):
-        """Of the data set at a path; changes nothing."""
         self.folder = path.with_name(f"{path.name}.part")
         self._question = self.folder / "question.json"
 
@@ -102,23 +100,19 @@ class Shards:
 
     @property
     def names(self) -> list[str]:
-        """Names in the folder."""
         return [path.name for path in self.folder.iterdir()] if self.folder.is_dir() else []
 
     def begin(self, question: Question) -> None:
-        """Writes whose outcomes will be there."""
         with files.atomically(self._question) as temporary:
             temporary.write_text(json.dumps(question.described), encoding="utf-8")
 
     def load(self, shard: int) -> Outcome | None:
-        """Outcomes of a call, or None if they are not there, or damaged."""
         try:
             return Outcome(**store.load(self.folder / f"{shard}.npz"))
         except (OSError, store.StoreError):
             return None
 
     def save(self, shard: int, found: Outcome) -> None:
-        """Writes the outcomes of a call."""
         store.save(self.folder / f"{shard}.npz", found._asdict())
 
 
@@ -130,7 +124,6 @@ class Names(NamedTuple):
 
 
 def pyarrow_module(what: str) -> ModuleType:
-    """Returns pyarrow."""
     try:
         import pyarrow
         import pyarrow.parquet

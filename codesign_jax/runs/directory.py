@@ -49,11 +49,9 @@ class RunDirectory:
     """An open run folder; see `open_run`."""
 
     def __init__(self, path: Path):
-        """Refers to a folder that `open_run` has prepared."""
         self.path = path
 
     def store(self, *, tell: Callable[[str], None]) -> Checkpoints:
-        """Opens the run's checkpoints, see there."""
         identity = manifest.read_provenance(self.path)["id"]
         return Checkpoints(self.path / "checkpoints", run=identity, tell=tell)
 

@@ -58,7 +58,6 @@ def save(folder: Path, episode: int, info: EpisodeInfo) -> list[Path]:
 
 
 def load(path: Path) -> Failure:
-    """Reads a failed world."""
     if not path.exists():
         raise InputError([f"{path}: there is no such file or folder"])
     try:

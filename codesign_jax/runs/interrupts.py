@@ -38,7 +38,6 @@ class Stopped(Exception):
     """The user asked to stop, and nothing is left to save."""
 
     def __init__(self, signum: int):
-        """Takes the signal's number."""
         super().__init__(f"stopped by signal {signum}")
         self.signum = signum
 
@@ -51,7 +50,6 @@ class Interrupts:
     """
 
     def __init__(self, notify: Callable[[str], None]):
-        """Takes what tells the user that the signal was understood."""
         self.signum = 0
         self._notify = notify
         self._before: dict[int, Any] = {}
@@ -65,7 +63,6 @@ class Interrupts:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Puts the earlier handlers back."""
         for number, handler in self._before.items():
             signal.signal(number, handler)
         self._worker.shutdown()

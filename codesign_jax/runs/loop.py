@@ -70,12 +70,10 @@ class Plan(NamedTuple):
 
     @property
     def scene(self) -> Scene:
-        """The scene."""
         return self.task.scene
 
     @property
     def space(self) -> DesignSpace:
-        """The design space."""
         return self.task.space
 
     @property
@@ -88,7 +86,6 @@ class Plan(NamedTuple):
 
     @property
     def test_grasps(self) -> int:
-        """Grasps of the final test."""
         return self.finalists * self.settings.trials * self.settings.test_rounds
 
     @property

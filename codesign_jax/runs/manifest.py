@@ -55,24 +55,20 @@ def new(settings: Settings, contents: Mapping[str, bytes], command: list[str]) -
 
 
 def start_note(command: list[str]) -> dict[str, Any]:
-    """Time and command line of a start."""
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     return {"time": now, "command": command}
 
 
 def digests(contents: Mapping[str, bytes]) -> dict[str, str]:
-    """SHA-256 digests of files' contents by name."""
     return {name: sha256(content).hexdigest() for name, content in contents.items()}
 
 
 def write(path: Path, content: dict[str, Any]) -> None:
-    """Writes provenance.json of a run folder."""
     with files.atomically(path / PROVENANCE) as part:
         part.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def read_provenance(path: Path) -> dict[str, Any]:
-    """Reads provenance.json of a run folder."""
     file = path / PROVENANCE
     try:
         size = file.stat().st_size

@@ -29,7 +29,6 @@ class Live:
     """
 
     def __init__(self, console: rich.console.Console, *columns: rich.progress.ProgressColumn):
-        """Takes where to tell, and the bar's columns."""
         self.console = console
         self._bar = rich.progress.Progress(
             *columns, console=console, transient=True, disable=not console.is_terminal
@@ -38,19 +37,16 @@ class Live:
         self._stop, self.text, self._since, self._spoken = threading.Event(), "", 0.0, 0.0
 
     def __enter__(self) -> Self:
-        """Shows the bar."""
         self._bar.start()
         if not self.console.is_terminal:
             threading.Thread(target=self._run, daemon=True).start()
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Removes it; lines stay."""
         self._stop.set()
         self._bar.stop()
 
     def begin(self, text: str) -> None:
-        """Something else goes on from now."""
         self._since = self._spoken = time.monotonic()
         self.say(text)
 
@@ -60,7 +56,6 @@ class Live:
         self._bar.update(self._task, description=text)
 
     def message(self, text: str) -> None:
-        """Prints a line above the bar."""
         self.console.print(text)
         self._spoken = time.monotonic()
 
@@ -81,7 +76,6 @@ class Busy(Live):
     """Shows that something of unknown progress goes on, and for how long."""
 
     def __init__(self, console: rich.console.Console, text: str):
-        """Takes what goes on."""
         columns = rich.progress.SpinnerColumn(), rich.progress.TextColumn("{task.description}")
         super().__init__(console, *columns, rich.progress.TimeElapsedColumn())
         self.begin(text)
@@ -96,7 +90,6 @@ class Meter(Live):
     """
 
     def __init__(self, text: str, total: int, console: rich.console.Console):
-        """Takes what is simulated, the number of grasps, and where to tell."""
         columns = rich.progress.Progress.get_default_columns()[:-1]
         super().__init__(console, *columns, rich.progress.TimeRemainingColumn())
         self.total, self.done, self._name, self._compiled = total, 0, text, None
@@ -127,7 +120,6 @@ class Progress(Live):
     """
 
     def __init__(self, total: int, runs: int = 1, *, test: int = 0, after: float = 0.0):
-        """Takes episodes, grasps of the test and of what comes afterwards, of each of the runs."""
         console = rich.console.Console(highlight=False, soft_wrap=True, markup=False)
         columns = rich.progress.BarColumn(), rich.progress.TextColumn("{task.description}")
         super().__init__(console, *columns, rich.progress.TimeElapsedColumn())
@@ -197,7 +189,6 @@ class Report(NamedTuple):
     warnings: str = ""
 
     def line(self, total: int) -> str:
-        """The report in words."""
         line = f"episode {self.done:>{len(str(total))}}/{total}  mean {self.mean:.3f}  "
         line += f"best {self.best:.3f}  failed {self.failed}/{self.grasps}"
         line += f" ({self.causes})" if self.causes else ""
@@ -208,12 +199,10 @@ class Voice:
     """What one of the runs says; its name precedes its messages where there are several."""
 
     def __init__(self, progress: Progress, name: str = ""):
-        """Takes the runs' common progress and what to call this one."""
         self._progress, self._name = progress, f"{name}: " if name else ""
         self.begin, self.tested = progress.begin, progress.tested
 
     def message(self, text: str) -> None:
-        """Prints a line that begins with the run's name."""
         self._progress.message(f"{self._name}{text}")
 
     def episode(self, report: Report) -> str:

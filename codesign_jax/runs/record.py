@@ -103,7 +103,6 @@ class Record:
 
     @property
     def done(self) -> int:
-        """Number of finished episodes."""
         return int(self.state.episode)
 
     def failed_status(self) -> np.ndarray | None:

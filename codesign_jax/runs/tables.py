@@ -47,7 +47,6 @@ def write_episodes(
 
 
 def write_tests(folder: Path, space: DesignSpace, particles: np.ndarray, test: FinalTest) -> None:
-    """Writes the final particles and their test."""
     _replace(folder / TESTS, _text(TESTS, space, _of_test(space, particles, test)))
 
 
@@ -266,7 +265,6 @@ def _text(table: str, space: DesignSpace, rows: Iterable[Row], *, named: bool = 
 
 
 def written(head: list[str], rows: Iterable[Row], *, named: bool = True) -> str:
-    """Text of a table."""
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, head, lineterminator="\n")
     if named:

@@ -74,7 +74,6 @@ class Studio:
     """The tabs, and the thread that simulates for them."""
 
     def __init__(self, desk: Desk) -> None:
-        """Has no tab yet."""
         self.desk = desk
         self.tabs: list[Tab] = []
         self._wake = threading.Event()

@@ -75,7 +75,6 @@ class Bench:
     """A scene at one accuracy, with the programs that simulate it."""
 
     def __init__(self, found: Case) -> None:
-        """Takes scene, space and what simulates them."""
         self.case = found
         self.engine = found.make_engine()
         self.recorder = recording(self.engine) if tells_forces(self.engine) else self.engine
@@ -129,7 +128,6 @@ class Desk:
     """What all tabs share: a case with its programs, its run, and where files go."""
 
     def __init__(self, options: "Options") -> None:
-        """Reads scene, design and run; simulates nothing."""
         self.options = options
         self.case = common.find_case(options)
         common.refuse(common.engine_problems(self.case.engine))
@@ -182,7 +180,6 @@ class Tab:
     """What one tab of a browser shows and asks for."""
 
     def __init__(self, desk: Desk) -> None:
-        """Shows nothing yet."""
         self._desk = desk
         self._asked: collections.deque[View] = collections.deque(maxlen=1)  # the newest
         self._actions: collections.deque[Callable[[], None]] = collections.deque()

@@ -30,7 +30,6 @@ class Recording(Equal):
     """The engine `structured` as one whose traces have `Trace.forces`; without derivatives."""
 
     def __init__(self, engine: "StructuredEngine"):
-        """Takes the engine, which simulates."""
         self.engine, self.scene, self.name = engine, engine.scene, engine.name
 
     def _key(self) -> tuple:

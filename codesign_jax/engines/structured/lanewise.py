@@ -30,7 +30,6 @@ class Lanes:
     """
 
     def __init__(self, parts: np.ndarray, shape: tuple[int, ...], dtype: Any):
-        """See the attributes."""
         self.parts, self.shape, self.dtype = parts, shape, np.dtype(dtype)
 
     def __getitem__(self, index: Any) -> "Lanes":

@@ -58,11 +58,9 @@ class Solid:
         return dataclasses.replace(self, reach=reach, digest=digest)
 
     def __eq__(self, other: object) -> bool:
-        """Compares the digests."""
         return isinstance(other, Solid) and self.digest == other.digest
 
     def __hash__(self) -> int:
-        """Hash of the digest."""
         return hash(self.digest)
 
     @functools.cached_property

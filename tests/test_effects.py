@@ -101,6 +101,7 @@ CONSTANTS = {
     "friction": ("contact", "torsional_friction", 0.017),
     "disturb": ("arm", "shake_amplitude", 13.0),
     "pressure_dynamics": ("pneumatics", "lag", 0.3),
+    "air_mass": ("pneumatics", "exponent", 1.3),
     "gravity": ("", "gravity", 1.6),
 }
 OFF = {
@@ -111,6 +112,7 @@ OFF = {
     "friction": "coulomb",
     "disturb": False,
     "pressure_dynamics": False,
+    "air_mass": False,
     "gravity": False,
 }
 
@@ -232,7 +234,7 @@ def check_combination(values, shape):
     """Every engine takes a step that is finite, or traces one, or says what it cannot do.
 
     The hull has no friction with torsion and rolling, and the threshold of sideways bending needs
-    that hinge.
+    that hinge and pressures that are known beforehand.
     """
     chosen = {f"effects__{k}": v for k, v in values.items()}
     if values["surface"] == "hull" and values["friction"] == "full":
@@ -241,6 +243,10 @@ def check_combination(values, shape):
         return
     if values["lateral_threshold"] and not values["lateral_bending"]:
         with pytest.raises(schema.InputError, match="lateral_bending = false leaves out"):
+            grasps.pinch(shape, links=1, **chosen)
+        return
+    if values["lateral_threshold"] and values["air_mass"]:
+        with pytest.raises(schema.InputError, match="air_mass = true has a volume"):
             grasps.pinch(shape, links=1, **chosen)
         return
     scene = grasps.pinch(shape, links=1, **chosen)

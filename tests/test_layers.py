@@ -269,12 +269,12 @@ def test_what_is_imported_is_there():
 # As `find DIR -name '*.py' | xargs cat | wc -l` counts.  A larger number is a line of a review: say
 # there what users have of it, and what could go in its place.
 MOST_LINES = {
-    "codesign_jax": 40_800,
+    "codesign_jax": 41_000,
     "codesign_jax/codesign": 610,
     "codesign_jax/commands": 2_970,
     "codesign_jax/compiler": 3_100,
     "codesign_jax/env": 400,
-    "codesign_jax/engines": 12_800,
+    "codesign_jax/engines": 12_850,
     "codesign_jax/export": 2_000,
     "codesign_jax/model": 1_800,
     "codesign_jax/optimize": 1_400,
@@ -283,7 +283,7 @@ MOST_LINES = {
     "codesign_jax/scene": 5_400,
     "codesign_jax/studio": 790,
     "scripts": 5_500,
-    "tests": 20_600,
+    "tests": 20_730,
 }
 
 

@@ -47,6 +47,8 @@ EVERYTHING = {
     "effects__finger_itself": True,
     "effects__neo_hookean": True,
     "effects__friction_memory": True,
+    "effects__air_mass": True,
+    "pneumatics__exponent": 1.3,
     "contact__finger_finger_friction": 0.6,  # not the object's
 }
 
@@ -120,6 +122,7 @@ FAULTS = {
     "the table stands still": Fault(names=("height",)),
     "rings hand nothing to their link": Fault(results={"of_rings": without(0)}),
     "rings of one size": Fault(names=("ring",)),
+    "chambers of one volume": Fault(names=("volume",)),
     "a palm of one size": Fault(names=("palm_ring",)),
     "rings on fingers stand still": Fault(results={"between_rings": without(0)}),
     "the other finger's segment stands still": Fault(results={"between_rings": without(1)}),
@@ -354,6 +357,7 @@ SCENES = {
         "effects__finger_finger": True,
         "effects__finger_itself": True,
         "effects__neo_hookean": True,
+        "effects__air_mass": True,
     },
 }
 

@@ -34,6 +34,7 @@ _SOFTNESS = (1e-4 / (1 - 1e-4), (1 - 1e-4) / 1e-4)
 _LEFT_OUT = {
     "neo_hookean": "joints have the linear law of bending, which is stiffer at large strain",
     "lateral_threshold": "pressure does not resist sideways bending",
+    "air_mass": "pressures are what the valves ask for, whatever the chambers' volumes do",
     "friction_memory": "fingers that hold one another creep",
 }
 """What a model is like without an effect that plain MuJoCo does not have."""

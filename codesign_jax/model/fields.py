@@ -33,7 +33,7 @@ class ModelFields(NamedTuple):
     Every array has MuJoCo's name and shape for one world, `gravity` and `impratio` those of
     mjOption, but for five: `start` is the initial qpos, shape (nq,), or the state in which another
     rollout ended, `Trace.last`, see `State`; `section` has height, wall, segment length and width
-    of the fingers [m], shape (finger, 4), with the effect `neo_hookean` or the surface "hull";
+    of the fingers [m], shape (finger, 4), where `neo_hookean`, `air_mass` or a hull needs them;
     `threshold` has the numbers of `morphology.thresholds`, with the effect `lateral_threshold`;
     `tip` has height, wall and width at the tips of tapered fingers, shape (finger, 3), and
     `constants` are the world's numbers with the trial's factors, from which engines take what
@@ -216,7 +216,8 @@ def _in_type(scene: Scene, dtype: Any) -> Scene:
 
 
 def _section(scene: Scene, params: Params) -> jax.Array | None:
-    if not (scene.effects.neo_hookean or scene.effects.surface == "hull"):
+    e = scene.effects
+    if not (e.neo_hookean or e.air_mass or e.surface == "hull"):
         return None
     width = scene.hand.section.width + 0 * params.height
     return jnp.stack([params.height, params.wall, params.length / layout(scene).links, width], -1)

@@ -73,6 +73,10 @@ EFFECTS: Mapping[str, Effect] = {
         {"mujoco": {True: _SPRINGS}, "mjx": {True: _SPRINGS}},
     ),
     "pressure_dynamics": Effect("chambers fill with a lag and under the supply's limits"),
+    "air_mass": Effect(
+        "valves meter air: its pressure falls as a chamber grows",
+        {"mujoco": {True: _SPRINGS}, "mjx": {True: _SPRINGS}},
+    ),
     "gravity": Effect("everything has weight"),
 }
 

@@ -208,6 +208,11 @@ def check_together(scene: SceneFile, where: str) -> list[str]:
             f"{where}.effects.lateral_threshold = true resists sideways bending, which "
             "effects.lateral_bending = false leaves out"
         )
+    if scene.effects.air_mass and scene.effects.lateral_threshold:
+        problems.append(
+            f"{where}.effects.air_mass = true has a volume that sideways bending does not change, "
+            "which effects.lateral_threshold = true says it does"
+        )
     if isinstance(scene, Scene):
         problems += key_frames.check(scene, f"{where}.control")
     if isinstance(scene, Scene) and round(scene.end_time / h) != scene.num_steps:

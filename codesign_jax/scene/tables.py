@@ -37,6 +37,7 @@ class Effects:
     neo_hookean: bool = False
     lateral_threshold: bool = False
     pressure_dynamics: bool = False
+    air_mass: bool = False
     gravity: bool = True
 
 
@@ -183,17 +184,21 @@ class Contact:
 
 @dataclasses.dataclass(frozen=True)
 class Pneumatics:
-    """Dynamics of the chambers' pressure, used with the effect `pressure_dynamics`.
+    """Air of the chambers: its supply, with `pressure_dynamics`, and its law, with `air_mass`.
 
     Attributes:
       lag: Time constant of the first-order lag of valve and tube.
       rate: Fastest change of pressure.
       maximum: Highest pressure of the supply.
+      exponent: n of p V^n = const for a mass of air: 1 isothermal, 1.4 adiabatic.
+      atmosphere: Pressure around the hand, which gauge pressures are above.
     """
 
     lag: float = quantity("s", 0, 10, default=0.1)
     rate: float = quantity("Pa/s", 1e3, 1e9, default=400e3)
     maximum: float = quantity("Pa", 1e3, 1e6, default=200e3)
+    exponent: float = quantity("", 1, 1.7, default=1.0)
+    atmosphere: float = quantity("Pa", 1e4, 2e5, default=101325.0)
 
 
 @dataclasses.dataclass(frozen=True)

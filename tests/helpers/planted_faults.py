@@ -20,6 +20,7 @@ from codesign_jax.engines.structured.kernel import (
     Limits,
     Program,
     advance,
+    chambers,
     contact_sets,
     coupling,
     fields,
@@ -52,7 +53,7 @@ MODULES = (
     pairs,
     problem,
 )
-MODULES += (slots, step)
+MODULES += (slots, step, chambers)
 
 
 class Fault(NamedTuple):

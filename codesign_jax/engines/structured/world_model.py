@@ -57,10 +57,12 @@ class WorldModel(NamedTuple):
       bounds: When a world is decided, of shape (1, world) each.
       gravity: Magnitude of gravity [m/s^2], shape (1, world); None without the effect.
       section: Height, wall, segment length and width of the fingers at their bases, shape (4,
-        finger, world); None without the effect `neo_hookean` and the surface "hull".
+        finger, world); None where no effect needs them, see `ModelFields`.
       tip: Height, wall and width at the tips, shape (3, finger, world); None without taper.
       threshold: Numbers of `model.morphology.thresholds`, shape (1, 3, finger, world), of tapered
         fingers (link, 3, finger, world); None without the effect `lateral_threshold`.
+      air: Exponent of the air and the atmosphere's pressure, shape (2, 1, world); None without the
+        effect `air_mass`.
     """
 
     mount: jax.Array
@@ -96,6 +98,7 @@ class WorldModel(NamedTuple):
     tip: jax.Array | None = None
     palm_disc: jax.Array | None = None
     threshold: jax.Array | None = None
+    air: jax.Array | None = None
 
 
 def sections(hand: WorldModel, places: np.ndarray) -> tuple[Any, Any, Any]:
@@ -231,12 +234,18 @@ def _world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
         tip=None if fields.tip is None else fields.tip.transpose(2, 1, 0),
         threshold=None if fields.threshold is None else fields.threshold.transpose(2, 3, 1, 0),
         palm_disc=_disc(numbers) if lay.disc.size or lay.palm.size else None,
+        air=_air(numbers) if scene.effects.air_mass else None,
     )
 
 
 def _disc(scene: Scene) -> jax.Array:
     palm = scene.hand.palm
     return jnp.stack([jnp.asarray(palm.radius), jnp.asarray(palm.thickness) / 2])
+
+
+def _air(scene: Scene) -> jax.Array:
+    p = scene.pneumatics
+    return jnp.stack([jnp.asarray(p.exponent), jnp.asarray(p.atmosphere)])
 
 
 def _gain(fields: ModelFields, lay: Layout, last: Callable) -> jax.Array:

@@ -63,6 +63,8 @@ class Chord:
           fingers, which is the squared decrement.
         """
         problem = self.problem
+        if chambers := problem.chambers:
+            chambers.move(alpha)
         if problem.pairs:
             problem.pairs.update_wrenches(alpha)
 
@@ -94,9 +96,16 @@ class Chord:
         none = zeros((6,), self.like)
         start = none, none, zeros((), self.like)
         r, ro, work = loop(self.links, one, start, self.block.size, reverse=True)
+        if chambers:
+            r, ro, less = chambers.close_again("z_again", r, ro)
+            work = lanewise(jnp.subtract, work, less)
         r = problem.add_first(r) if problem.pairs else r
         r, ro, work = self.block.sum((r, ro, work))
-        return lanewise(self._at_palm, now, problem.palm, done, r, ro, work, self._pushes(alpha))
+        given = now, problem.palm, done, r, ro, work, self._pushes(alpha)
+        step, work = lanewise(self._at_palm, *given)
+        if chambers:
+            chambers.settle("z_again", step)
+        return step, work
 
     def _pushes(self, alpha: Lanes) -> dict[str, Lanes]:
         """Wrenches of the contacts of palm and object, by name."""

@@ -225,8 +225,13 @@ class Coupling:
             return r, ro
 
         r, ro = loop(self.links, step, (none, none), self.block.size, reverse=True)
+        if chambers := self.problem.chambers:
+            r, ro, _ = chambers.close_again("z_again", r, ro)
         r = self.problem.add_first(r)
-        return self._palm(*self.block.sum((r, ro)))
+        found = self._palm(*self.block.sum((r, ro)))
+        if chambers:
+            chambers.settle("z_again", found)
+        return found
 
     def _palm(self, r: Lanes, ro: Lanes) -> Iterate:
         def solve(done: Eliminated, axes, armature, r, ro):

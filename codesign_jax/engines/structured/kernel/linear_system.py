@@ -37,6 +37,8 @@ class Elimination:
           The sum over the fingers, and the product of their forces with the step so far.
         """
         problem = self.problem
+        if problem.chambers:
+            problem.chambers.move(alpha)
         if problem.pairs:
             self.between_fingers(problem.pairs, alpha)
 
@@ -74,7 +76,7 @@ class Elimination:
                 new, kept, more = lanewise(how, node, *forces)
                 for name, value in zip(("w", "g", "z"), kept.factors, strict=True):
                     problem.write(name, value, i)
-                if problem.slotted:
+                if problem.slotted or problem.chambers:
                     problem.write("inverse", kept.inverse, i)
                 return new._replace(p=upper(new.p), q=upper(new.q)), more
 
@@ -85,6 +87,8 @@ class Elimination:
         empty = [zeros(s, self.like) for s in ((21,), (6, 6), (21,), (6,), (6,))]
         start, held = (el.Quadratic(*empty), zeros((), self.like)), self.last_on_object()
         node, work = loop(self.links, step, start, self.block.size, reverse=True)
+        if problem.chambers:
+            node, work = problem.chambers.close(node, work)
         if problem.pairs:
             node, work = node._replace(r=problem.add_first(node.r)), self.block.sum(work)
         node = self.block.sum(node)
@@ -169,7 +173,10 @@ class Elimination:
             work = total([*work, dot(node.r_object, obj)])
             return step, Eliminated(kept[0], kept[1], node.q, work)
 
-        return lanewise(solve, now, self.problem.palm, node, slots)
+        step, done = lanewise(solve, now, self.problem.palm, node, slots)
+        if self.problem.chambers:
+            self.problem.chambers.settle("z", step)
+        return step, done
 
 
 def with_palm(

@@ -79,6 +79,8 @@ class LineSearch:
         _, slope, curvature, touch = loop(
             self.links, one, (parent, none, none, none), self.block.size
         )
+        if problem.chambers:
+            curvature = lanewise(jnp.add, curvature, problem.chambers.curvature())
         between = [problem.pairs.prepare_all()] if problem.pairs else []
         touch = self.prepare_slots(lanewise(lambda t: total(t), [touch, *between]), step)
         slope, curvature, touch = self.block.sum((slope, curvature, touch))

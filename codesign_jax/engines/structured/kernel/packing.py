@@ -8,6 +8,7 @@ from codesign_jax.engines.structured.kernel import objects
 from codesign_jax.engines.structured.kernel.memory import lengthened
 from codesign_jax.engines.structured.kernel.pair_search import TIP, ring_places
 from codesign_jax.engines.structured.kernel.tables import PALM, Tables
+from codesign_jax.engines.structured.laws.air import volumes
 from codesign_jax.engines.structured.laws.kinematics import Acc, State
 from codesign_jax.engines.structured.world_model import WorldModel, joint_sections, sections
 from codesign_jax.model.layout import palm_touches
@@ -42,6 +43,8 @@ class Packing(Tables):
             arrays["palm_ring"] = self._palm_slots(hand)
         if "section" in self.hand.groups:
             arrays["section"] = joint_sections(hand, self.links)
+        if hand.air is not None:
+            arrays["volume"] = volumes(hand, self.links)
         if self.k:
             arrays["ring"] = ring_numbers(self.scene, hand, self.k)
         if hand.mesh is not None:

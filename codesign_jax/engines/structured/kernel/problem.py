@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import solver
+from codesign_jax.engines.structured.kernel.chambers import Chambers
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
 from codesign_jax.engines.structured.kernel.pairs import BoundPairs
@@ -71,6 +72,7 @@ class Problem:
       fingers: Contacts of the fingers with the object and the table.
       slots: Contacts of the palm, and of the object with the table.
       slotted: Those of `pairs`, in slots.
+      chambers: Chambers with a mass of air; None without the effect.
       like: Zeros of the lanes' shape and type.
     """
 
@@ -82,6 +84,7 @@ class Problem:
         self.slots = [c for n, c in m.contacts.items() if not n.startswith("finger")]
         self.slotted = [self.pairs] if self.pairs else []
         self.like = jnp.zeros((block.size,), palm.armature.dtype)
+        self.chambers = Chambers(self) if "air_step" in m.scratch.groups else None
 
     def read(self, *names: str, item: Any = 0) -> list[Lanes]:
         """Reads names from the table that has them.

@@ -22,6 +22,7 @@ from codesign_jax.engines.structured.kernel.memory import Block, anywhere
 from codesign_jax.engines.structured.kernel.packing import Packing
 from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.lanewise import lanes, of_code
+from codesign_jax.engines.structured.laws import air
 from codesign_jax.engines.structured.laws.kinematics import State
 from codesign_jax.engines.structured.world_model import WorldModel
 from codesign_jax.model import layout
@@ -160,6 +161,8 @@ class Program(Packing):
 
     def inputs(self, hand: WorldModel, state: State, ctrl: jax.Array) -> tuple:
         """The kernel's arguments, which have a leading axis of blocks; the last may be shared."""
+        if self.scene.effects.air_mass:
+            ctrl = air.charged(self.scene, hand, ctrl)
         inputs = (*self.pack_hand(hand), *self.pack_state(state), *self.pack_controls(ctrl))
         return inputs if hand.mesh is None else (*inputs, hand.mesh.values[None])
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import advance, grip_sweep, powers, speed
+from codesign_jax.engines.structured.kernel import advance, chambers, grip_sweep, powers, speed
 from codesign_jax.engines.structured.kernel.bars import Bars
 from codesign_jax.engines.structured.kernel.memory import Block
 from codesign_jax.engines.structured.kernel.pair_sweep import PairSweep
@@ -81,7 +81,11 @@ class ReverseStep(Step):
         sweep = Sweep(self, m, state, at, thing, virtual, bars)
         if problem.pairs:
             PairSweep(sweep, problem.pairs).run()
-        base = sweep.fingers(pressure, self._centre_bar(centre, shown.distance))
+        metered = p.scene.effects.air_mass
+        end = chambers.end_pressures(self, pressure) if metered else pressure
+        base = sweep.fingers(end, self._centre_bar(centre, shown.distance))
+        if metered:
+            chambers.reverse(self, pressure)
         base = sweep.palm_and_table(base)
         return self._palm_bars(state, arm, base, before, (now, virtual, acc_bar[0]), shown)
 

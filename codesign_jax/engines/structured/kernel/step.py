@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import advance, objects
+from codesign_jax.engines.structured.kernel import advance, chambers, objects
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.fields import FieldContacts
 from codesign_jax.engines.structured.kernel.memory import Block, loop
@@ -108,7 +108,7 @@ class Step:
 
         Args:
           arm: Commands of the arm frame, shape (6, 1, world).
-          pressure: Chamber pressures, lanes.
+          pressure: Chamber pressures, lanes; with `air_mass` the chambers' charges, see `laws.air`.
           undecided: Whether a world takes this step, from distance and height before it.
           waiting: Undecided worlds, which must converge.
           speed: Largest velocity before the step.
@@ -193,6 +193,8 @@ class Step:
             lanewise(jnp.add, v, wide) for v in (at["vel"], at["bias"], now.palm_motion)
         )
 
+        if p.scene.effects.air_mass:
+            pressure = chambers.end_pressures(self, pressure)
         pairs = m.contacts.get("finger_finger")
         search = Search(self, pairs, at) if isinstance(pairs, BoundPairs) else None
         self.search = search

@@ -3,7 +3,7 @@
 from functools import partial
 
 from codesign_jax import verdict
-from codesign_jax.engines.structured.kernel import objects, pair_search, teams
+from codesign_jax.engines.structured.kernel import chambers, objects, pair_search, teams
 from codesign_jax.engines.structured.kernel.contact_sets import ContactSet
 from codesign_jax.engines.structured.kernel.memory import MemoryLayout
 from codesign_jax.engines.structured.kernel.pairs import PairSet, pair_slots
@@ -54,7 +54,8 @@ class Tables:
         n, self.links, self.axes = self.lay.dofs.shape
         self.fingers = 1 << (n - 1).bit_length()
         self.team = team or teams.lanes_of_a_finger(scene, backend, self.fingers)
-        if scene.fixture:  # a slot of a team is one contact, a ring's are as many as the fields
+        # A slot of a team is one contact, a ring's are as many as the fields.
+        if scene.fixture or scene.effects.air_mass:
             self.team = 1
         # On a GPU a team's block is one world: nothing depends on what others do.
         alone = self.team > 1 and backend == "gpu"
@@ -117,6 +118,8 @@ class Tables:
             more |= {"section": (self.rows, (4,))}
         if self.scene.effects.lateral_threshold:
             more |= {"threshold": (self.rows, (3,))}
+        if self.scene.effects.air_mass:
+            more |= {"volume": (1, one)}
         support, grid = objects.tables(self.scene, self.fingers)
         self.hand = MemoryLayout(
             True,
@@ -144,6 +147,8 @@ class Tables:
             some |= {"wrist_stiffness": (1, (6,))}
         if self.scene.effects.finger_palm:
             some |= {"palm_disc": (1, (2,))}
+        if self.scene.effects.air_mass:
+            some |= {"air": (1, (2,))}
         self.world = MemoryLayout(
             False,
             palm_mass=(1, one),
@@ -188,7 +193,9 @@ class Tables:
             fields |= {"new_grip": (self.held, (3,))}
         for contacts in self.sets:
             fields |= contacts.groups()
-        if self.slotted:
+        if self.scene.effects.air_mass:
+            fields |= chambers.fields(n, a)
+        if self.slotted or self.scene.effects.air_mass:
             fields |= {"inverse": (n, (a, a)), "z_again": (n, (a,))}
         if any(isinstance(s, PairSet) for s in self.sets):
             fields |= pair_search.fields(n)

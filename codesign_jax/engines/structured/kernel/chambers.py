@@ -1,0 +1,210 @@
+"""Chambers with a mass of air inside the kernel: a stiffness of rank one for each finger.
+
+The pressure at a step's end is linear in the accelerations a, see `laws.air`, so that a finger adds
+c/2 (g'a)^2 to the objective, g the moments per pressure of its bend hinges.  That is the largest
+value of l g'a - l^2/(2 c) over a pressure l.  What the elimination of the joints leaves is linear
+in l: forces r - l r_1 on the palm and r_o - l r_o1 on the object, where a pressure of one is a
+further right side.  With its forces y_1 on the joints, D^-1 of `elimination`, s = sum y_1'z and
+e = sum y_1'D^-1 y_1 the best pressure is l = w (s + r_1'v + r_o1'v_o), w = c / (1 + c e), for
+accelerations v and v_o of palm and object.  These two get the square of the sum, times w/2, and
+once they are known the joints get z - l D^-1 y_1.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured.kernel.contact_sets import zeros
+from codesign_jax.engines.structured.kernel.memory import loop, upper
+from codesign_jax.engines.structured.kernel.pull import pull
+from codesign_jax.engines.structured.lanes import contract, dot
+from codesign_jax.engines.structured.lanewise import Lanes, lanewise
+from codesign_jax.engines.structured.laws.air import end_pressure
+from codesign_jax.engines.structured.linear import elimination as el
+
+if TYPE_CHECKING:
+    from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
+    from codesign_jax.engines.structured.kernel.reverse import ReverseStep
+    from codesign_jax.engines.structured.kernel.step import Step
+
+JOINT = ("finger", "finger_vel", "acc")
+"""Angles of a joint and their derivatives by time, which move the volume and its derivatives."""
+
+
+def fields(links: int, axes: int) -> dict[str, tuple[int, tuple[int, ...]]]:
+    """Rows of scratch memory: c, g'a of the last step, w, s, r_1, r_o1, and y_1 of the joints."""
+    found = dict.fromkeys(("air_stiffness", "air_step", "air_share", "air_sum"), (1, ()))
+    return {**found, "air_palm": (1, (6,)), "air_object": (1, (6,)), "air_joint": (links, (axes,))}
+
+
+def end_pressures(step: "Step", charge: Lanes) -> Lanes:
+    """Pressures at a step's end by the accelerations of its warm start; leaves c behind."""
+    pressure, stiffness = lanewise(_law(step), *_given(step, charge))
+    step.p.scratch.write(step.scratch, "air_stiffness", stiffness)
+    step.p.scratch.write(step.scratch, "air_step", lanewise(jnp.zeros_like, stiffness))
+    return pressure
+
+
+def reverse(step: "ReverseStep", charge: Lanes) -> None:
+    """Makes the cotangents of the pressures at a step's end those of the charges."""
+    p, bars, law = step.p, step.bars, _law(step)
+    given, bar = _given(step, charge), bars.of_step("pressure")
+    charge, volume, air, grown = pull(lambda *v: law(*v)[0], given, (), bar)
+    bars.add({"volume": volume, "air": air})
+    p.scratch.write(step.scratch, "bar.pressure", charge)
+
+    def moments(gain, joint, grown):
+        turned = [jnp.stack([gain * v] + [0 * v] * (p.axes - 1)) for v in grown[:2]]
+        return turned, sum(joint[n][0] * v for n, v in zip(JOINT, grown, strict=True))
+
+    def one(i: Any, x: jax.Array) -> jax.Array:
+        row = i if p.tapered else 0
+        gain = p.hand.read(step.hand, "gain", row)
+        turned, own = lanewise(moments, gain, step.joint(i), grown)
+        bars.add_joint(dict(zip(JOINT[:2], turned, strict=True)), i)
+        bars.add({"gain": own}, row)
+        return x
+
+    jax.lax.fori_loop(0, p.links, one, jnp.int32(0))
+
+
+def _law(step: "Step") -> Callable:
+    return partial(end_pressure, step.p.scene.discretization.timestep)
+
+
+def _given(step: "Step", charge: Lanes) -> tuple:
+    """Arguments of `end_pressure`."""
+    p, like = step.p, jnp.zeros((step.p.size,), step.finger_state.dtype)
+
+    def add(sums, gain, joint):
+        return [v + gain * joint[n][0] for v, n in zip(sums, JOINT, strict=True)]
+
+    def one(i: Any, sums: list[Lanes]) -> list[Lanes]:
+        gain = p.hand.read(step.hand, "gain", i if p.tapered else 0)
+        return lanewise(add, sums, gain, step.joint(i))
+
+    grown = loop(p.links, one, [zeros((), like)] * 3, p.size)
+    return charge, p.hand.read(step.hand, "volume"), step.constant("air"), grown
+
+
+class Chambers:
+    """The chambers' part of a step's problem."""
+
+    def __init__(self, problem: "Problem"):
+        """Takes the problem."""
+        self.problem, self.links = problem, problem.links
+        self.tapered = problem.m.hand.groups["gain"][0] > 1
+
+    def move(self, alpha: Lanes) -> None:
+        """Moves the pressures, which are part of "tau", by the last step, and forgets that step."""
+        fall = lanewise(lambda c, a, t: c * a * t, *self._of_finger("stiffness", "step"), alpha)
+
+        def push(tau, gain, fall):
+            return jnp.concatenate([tau[:1] - gain * fall, tau[1:]])
+
+        self._change("tau", push, "gain", fall)
+        self.problem.write("air_step", lanewise(jnp.zeros_like, fall), 0)
+
+    def close(self, node: el.Quadratic, work: Lanes) -> tuple[el.Quadratic, Lanes]:
+        """Adds the chambers to eliminated fingers.
+
+        Args:
+          node: What is left of each finger, P and Q as their upper triangles.
+          work: Product of the fingers' forces with the step so far.
+        """
+        problem, none = self.problem, zeros((6,), self.problem.like)
+
+        def again(carry, gain, axes, w, g, inverse):
+            r, ro, give = carry
+            tau = jnp.stack([gain] + [jnp.zeros_like(gain)] * (len(axes) - 1))
+            y = contract(axes, r[None], 1) + tau
+            r, ro, new = el.eliminate_again(axes, el.Kept(el.Factors(w, g, y), inverse), r, ro, tau)
+            return (r, ro, give + dot(y, new.z)), y
+
+        def one(i: Any, carry: tuple) -> tuple:
+            carry, y = lanewise(again, carry, *self._read(i, "gain", "axes", "w", "g", "inverse"))
+            problem.write("air_joint", y, i)
+            return carry
+
+        start = none, none, zeros((), problem.like)
+        palm, obj, give = loop(self.links, one, start, problem.block.size, reverse=True)
+        share = lanewise(lambda c, e: c / (1 + c * e), *self._of_finger("stiffness"), give)
+        for name, value in (("palm", palm), ("object", obj), ("share", share)):
+            problem.write(f"air_{name}", value, 0)
+
+        def square(share, a, b):
+            return share * a[:, None] * b[None]
+
+        pp, po, oo = (lanewise(square, share, *v) for v in ((palm, palm), (palm, obj), (obj, obj)))
+        r, ro, less = self.close_again("z", node.r, node.r_object)
+        p, q = lanewise(jnp.add, node.p, upper(pp)), lanewise(jnp.add, node.q, upper(oo))
+        c, work = lanewise(jnp.subtract, node.c, po), lanewise(jnp.subtract, work, less)
+        return el.Quadratic(p, c, q, r, ro), work
+
+    def close_again(self, z: str, r: Lanes, ro: Lanes) -> tuple[Lanes, Lanes, Lanes]:
+        """Adds the chambers to another right side of the same matrix.
+
+        Args:
+          z: Name of the joints' factors.
+          r: Forces that the fingers leave to the palm.
+          ro: Forces that they leave to the object.
+
+        Returns:
+          Both forces, and what the chambers take of the product of all forces with the step.
+        """
+        total = self._sum(dot, "air_joint", z)
+        self.problem.write("air_sum", total, 0)
+
+        def less(r, ro, total, share, palm, obj):
+            return r - share * total * palm, ro - share * total * obj, share * total * total
+
+        return lanewise(less, r, ro, total, *self._of_finger("share", "palm", "object"))
+
+    def settle(self, z: str, step: "Iterate") -> None:
+        """Takes the chambers' part from the joints' factors, once palm and object are known."""
+
+        def pressure(share, total, palm, obj, motion, object_motion):
+            return share * (total + dot(palm, motion) + dot(obj, object_motion))
+
+        known = self._of_finger("share", "sum", "palm", "object")
+        change = lanewise(pressure, *known, step.palm_motion, step.object_motion)
+
+        def take(z, y, inverse, change):
+            return z - change * contract(inverse, y[None], 1)
+
+        self._change(z, take, "air_joint", "inverse", change)
+
+    def curvature(self) -> Lanes:
+        """Curvature along the joints' step, on each finger's lanes; leaves g'a behind."""
+        moved = self._sum(lambda gain, a: gain * a[0], "gain", "step_acc")
+        self.problem.write("air_step", moved, 0)
+        return lanewise(lambda c, a: c * a * a, *self._of_finger("stiffness"), moved)
+
+    def _of_finger(self, *names: str) -> list[Lanes]:
+        return self.problem.read(*(f"air_{n}" for n in names))
+
+    def _read(self, i: Any, *names: Any) -> list[Lanes]:
+        """What is kept of a joint by name, beside what is given."""
+        row = {"gain": i if self.tapered else 0}
+        read = self.problem.read
+        return [read(n, item=row.get(n, i))[0] if isinstance(n, str) else n for n in names]
+
+    def _change(self, name: str, function: Callable, *names: Any) -> None:
+        """Replaces what is kept of each joint by a function of it and of more."""
+
+        def one(i: Any, x: jax.Array) -> jax.Array:
+            self.problem.write(name, lanewise(function, *self._read(i, name, *names)), i)
+            return x
+
+        jax.lax.fori_loop(0, self.links, one, jnp.int32(0))
+
+    def _sum(self, function: Callable, *names: str) -> Lanes:
+        """Sum over the joints of a function of what is kept of each."""
+
+        def one(i: Any, total: Lanes) -> Lanes:
+            return lanewise(lambda t, *v: t + function(*v), total, *self._read(i, *names))
+
+        return loop(self.links, one, zeros((), self.problem.like), self.problem.block.size)

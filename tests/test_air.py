@@ -1,0 +1,250 @@
+"""A mass of air in each chamber, in float64: closed forms, energy, MuJoCo C's tendons, faults."""
+
+import dataclasses
+import functools
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy import optimize
+
+from codesign_jax import model
+from codesign_jax.engines import make_engine
+from codesign_jax.engines.mujoco import world_model
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured.laws import air
+from codesign_jax.engines.structured.world_model import world_constants
+from codesign_jax.model import morphology
+from codesign_jax.scene import schema
+from tests.helpers import grasps
+from tests.helpers.curled_hands import batched, curled
+from tests.helpers.planted_faults import Fault, planted, simulate
+
+BOUND = 1e-8
+"""As in test_kernel_pairs.py."""
+WANTED, ATMOSPHERE = 60e3, 101325.0
+
+
+def test_power_is_numpy_s():
+    """To sixteen times rounding, by which the last four squarings multiply it."""
+    base, exponent = np.geomspace(0.05, 20, 500), np.linspace(1, 1.7, 8)[:, None]
+    found = air.power(jnp.float32(base), jnp.float32(exponent))
+    np.testing.assert_allclose(found, base**exponent, rtol=4e-6)
+    with jax.enable_x64(True):
+        found = air.power(jnp.asarray(base), exponent)
+    np.testing.assert_allclose(found, base**exponent, rtol=1e-13)
+
+
+# --- one finger of one joint, by its section ------------------------------------------------------
+
+
+def root(function):
+    """An angle [rad]."""
+    return float(optimize.brentq(function, -2, 9, xtol=1e-14))  # pyright: ignore[reportArgumentType]
+
+
+class Finger:
+    """A finger of one joint in the plane in which it bends; everything from its section."""
+
+    def __init__(self, the_scene, params, exponent, neo_hookean=False):
+        """Takes its dimensions; SI units."""
+        length, height, wall = (float(v[0]) for v in (params.length, params.height, params.wall))
+        width, shear = the_scene.hand.section.width, the_scene.hand.material.shear_modulus
+        area = (width - 2 * wall) * (height - 2 * wall)
+        self.gain, self.straight, self.exponent = area * height / 2, area * length, exponent
+        second = width * height**3 - (width - 2 * wall) * ((height - wall) ** 3 - wall**3)
+        self.stiffness = 4 * shear * second / 3 / length
+
+        def carried(angle):
+            share = morphology.softening(np.float64(angle) / length, height, wall, width=width)
+            return self.stiffness * angle * (1 - neo_hookean * share)
+
+        self.free = root(lambda q: carried(q) - self.gain * WANTED)
+
+    def volume(self, angle):
+        return self.straight + self.gain * angle
+
+    def pressure(self, angle):
+        """Gauge pressure of the air that has the wanted one in the free finger."""
+        ratio = self.volume(self.free) / self.volume(angle)
+        return (WANTED + ATMOSPHERE) * ratio**self.exponent - ATMOSPHERE
+
+    def energy(self, angle):
+        """Of the wall, and of air and atmosphere, isothermal."""
+        volume = self.volume(angle)
+        mass = (WANTED + ATMOSPHERE) * self.volume(self.free)
+        wall = self.stiffness * angle**2 / 2
+        return wall, ATMOSPHERE * volume - mass * np.log(volume / self.straight)
+
+
+@pytest.mark.parametrize("neo_hookean", [False, True])
+def test_a_free_finger_has_the_wanted_pressure(neo_hookean):
+    with jax.enable_x64(True):
+        how = {"effects__neo_hookean": neo_hookean, "pneumatics__exponent": 1.4}
+        the_scene = grasps.pinch("sphere", links=1, effects__air_mass=True, **how)
+        params, trial = grasps.hand_world(the_scene, wall=0.003, length=0.1)
+        fields, ctrl = grasps.world_inputs(the_scene, params, trial)
+        hand = grasps.lanes(the_scene, jax.tree.map(lambda v: v[None], fields))
+        wanted = jnp.asarray(ctrl)[None, :1].at[..., 6:].set(WANTED)
+        charge = air.charged(the_scene, hand, wanted)[0, 0, 6]
+        mine = Finger(the_scene, params, 1.4, neo_hookean)
+        grown = mine.gain * mine.free, 0.0, 0.0
+        given = air.volumes(hand, 1)[0, 0], hand.air[:, 0, 0], grown
+        pressure, fall = air.end_pressure(1.0, charge, *given)
+    assert pressure == pytest.approx(WANTED, rel=1e-9)
+    ends = (mine.pressure(mine.free + a) for a in (1e-6, -1e-6))
+    slope = np.subtract(*ends) / (2e-6 * mine.gain)
+    assert fall == pytest.approx(-slope, rel=1e-6)  # of central differences
+
+
+BARE = ("finger_object", "finger_table", "palm_object", "palm_table", "object_table", "wrist")
+BARE += ("twist", "lateral_bending", "disturb")
+
+
+@functools.cache
+def swung():
+    """Scene, parameters, fields, and angles and speeds (world, time) of a finger of one joint.
+
+    In the first world it is heavy and damped, in the second one weightless, undamped and bent
+    further than at rest.
+    """
+    off = {f"effects__{name}": False for name in BARE}
+    off |= {"effects__air_mass": True, "discretization__timestep": 1e-3}
+    plain = grasps.pinch("sphere", links=1, **off)
+    with jax.enable_x64(True):
+        params, trial = grasps.hand_world(plain, wall=0.003, length=0.1)
+        worlds = []
+        for gravity, damping, start in ((100.0, 0.05, 0.0), (0.0, 0.0, 2.0)):
+            heavy = {"damping_time": damping, "density": 10000.0}
+            material = dataclasses.replace(plain.hand.material, **heavy)
+            hand = dataclasses.replace(plain.hand, material=material)
+            the_scene = dataclasses.replace(plain, hand=hand, gravity=gravity)
+            fields, ctrl = grasps.world_inputs(the_scene, params, trial)
+            worlds.append(fields._replace(start=jnp.asarray(fields.start).at[6].set(start)))
+        fields = jax.tree.map(lambda *v: jnp.stack(v), *worlds)
+        held = jnp.repeat(jnp.asarray(ctrl)[None, :1].at[..., 6:].set(WANTED), 1000, 1)
+        engine = StructuredEngine(plain, tolerance=1e-24)
+
+        @jax.jit
+        def run(fields, ctrl):
+            return engine.advance(world_constants(plain, fields), engine.reset(fields), ctrl)[0]
+
+        found = run(fields, jnp.repeat(held, 2, 0))
+    return plain, params, fields, *(np.asarray(found[n])[..., 6] for n in ("qpos", "qvel"))
+
+
+def test_a_loaded_finger_rests_where_the_closed_form_does():
+    """The torque of its weight, by MuJoCo C, against wall and air: a root of one variable."""
+    the_scene, params, fields, angles, speeds = swung()
+    mine, oracle = Finger(the_scene, params, 1.0), world_model(the_scene, grasps.nth(fields, 0))
+    data = mujoco.MjData(oracle)
+
+    def unbalanced(angle, pressure):
+        data.qpos[:] = fields.start[0]
+        data.qpos[6] = angle
+        mujoco.mj_forward(oracle, data)
+        return mine.stiffness * angle - mine.gain * pressure + data.qfrc_bias[6]
+
+    rest, ideal = (
+        root(lambda q, p=p: unbalanced(q, p(q))) for p in (mine.pressure, lambda q: WANTED)
+    )
+    # A second is 20 times the damping time of 50 ms; mass and air leave 1e-7 of the motion.
+    assert angles[0, -1] == pytest.approx(rest, abs=1e-6)
+    assert abs(rest - ideal) > 0.05
+
+
+def test_a_free_swing_keeps_its_energy():
+    """Of wall, air, atmosphere and motion, less what implicit Euler takes, to the third order."""
+    the_scene, params, fields, angles, speeds = swung()
+    mine, oracle = Finger(the_scene, params, 1.0), world_model(the_scene, grasps.nth(fields, 1))
+    data, mass = mujoco.MjData(oracle), np.zeros((oracle.nv, oracle.nv))
+    data.qpos[:] = fields.start[1]
+    mujoco.mj_forward(oracle, data)
+    mujoco.mj_fullM(oracle, data, mass)
+    inertia = mass[6, 6] - oracle.dof_armature[6]
+    q, v = angles[1], speeds[1]
+    wall, gas = mine.energy(q)
+    fall = (mine.pressure(q) + ATMOSPHERE) / mine.volume(q)
+    turned, faster = np.diff(q), np.diff(v)
+    lost = inertia * faster**2 + (mine.stiffness + fall[:-1] * mine.gain**2) * turned**2
+    total = wall + gas + inertia * v**2 / 2
+    left = total[1:] + np.cumsum(lost) / 2 - total[0]
+    # The air's energy to the third order in a step's change of volume: 1e-5 of what is lost.
+    assert np.abs(left).max() < 1e-4 * (total[0] - total[-1])
+    assert np.ptp(gas) > 0.5 * np.ptp(wall) and np.count_nonzero(np.diff(np.sign(v))) > 8
+
+
+# --- the kernel -----------------------------------------------------------------------------------
+
+
+FAULTS = {
+    "air is isothermal": Fault(
+        {
+            "end_pressure": lambda right, h, c, v, a, g: right(
+                h, c, v, jnp.stack([a[0] / 1.4, a[1]]), g
+            )
+        }
+    ),
+    "the pressure of a step is that of its start": Fault(
+        {"end_pressure": lambda right, h, *given: right(0 * h, *given)}
+    ),
+    "pressures of a step's end stay": Fault(
+        {"Chambers.move.<locals>.push": lambda right, tau, *_: tau}
+    ),
+}
+SETTINGS = {"effects__air_mass": True, "pneumatics__exponent": 1.4}
+
+
+@functools.cache
+def simulated():
+    """Relative errors of a step's accelerations, of each fault's world and of a sound one."""
+    with jax.enable_x64(True):
+        the_scene = grasps.pinch("sphere", links=2, **SETTINGS)
+        model_, data, fields = curled(the_scene, 3, 0.4, 0.09)
+        fields_, qpos, qvel, ctrl = batched([(model_, data, fields)] * (len(FAULTS) + 1))
+        with planted(FAULTS):
+            run = jax.jit(partial(simulate, the_scene))
+            ctrl = jnp.asarray(np.repeat(ctrl[:, None], 2, 1))
+            found = run(fields_, (qpos, qvel), ctrl, np.arange(len(qpos)))
+    h, lay, n = the_scene.discretization.timestep, model.layout(the_scene), 1.4
+    for f, joints in enumerate(lay.dofs[..., 0]):
+        gain = float(fields.actuator_gainprm[0, 6 + f, 0])
+        height, _, segment, _ = np.asarray(fields.section)[0, f]
+        stiffness, straight = model_.jnt_stiffness[joints[0]], 4 * gain / height * segment
+        wanted, volume = data.ctrl[6 + f], straight + gain * data.qpos[joints].sum()
+        free = straight + gain * len(joints) * gain * wanted / stiffness
+        absolute = (wanted + ATMOSPHERE) * (free / volume) ** n
+        fall = n * absolute / volume
+        # MuJoCo's tendon of the chamber has the joints' angles as its length.
+        data.ctrl[6 + f] = absolute - ATMOSPHERE - h * fall * gain * data.qvel[joints].sum()
+        model_.tendon_armature[f] = h * h * fall * gain**2
+    mujoco.mj_forward(model_, data)
+    assert data.ncon > 3
+    acc = (np.asarray(found["qvel"])[:, 1] - qvel) / h
+    return np.linalg.norm(acc - data.qacc, axis=1) / np.linalg.norm(data.qacc)
+
+
+def test_accelerations_equal_mujoco_with_the_chambers_as_tendons():
+    assert simulated()[-1] < BOUND
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_planted_fault_is_noticed(name):
+    """By a hundred times the bound."""
+    assert not simulated()[[*FAULTS].index(name)] < 100 * BOUND
+
+
+# --- what it is refused with ----------------------------------------------------------------------
+
+
+def test_it_is_refused_where_it_is_not_simulated():
+    with pytest.raises(schema.InputError, match="effects.air_mass = true has a volume that"):
+        grasps.pinch(effects__air_mass=True, effects__lateral_threshold=True)
+    with pytest.raises(schema.InputError, match=r"pneumatics.exponent = 0.9 is outside \[1, 1.7\]"):
+        grasps.pinch(pneumatics__exponent=0.9)
+    for name in ("mujoco", "mjx"):
+        with pytest.raises(schema.InputError, match="effects.air_mass = true .* engine structured"):
+            make_engine(name, grasps.pinch(effects__air_mass=True))

@@ -39,11 +39,11 @@ def pytest_configure(config):
 # Files of more than ten seconds, the longest first: what is left for the end is short, so that no
 # worker waits for the other.
 LONG = """
-test_resume test_reverse test_compose test_rollout test_docs test_effects test_mesh_grasps
-test_kernel test_export test_constants test_many_runs test_optimizers test_sample test_codesign
-test_containment test_stress test_run_reading test_evaluate test_report test_batch test_experiments
-test_engines test_own test_planted_contacts test_check test_friction_memory test_showing
-test_preflight test_library test_teams test_hard_cases
+test_resume test_reverse test_compose test_rollout test_docs test_steps test_effects
+test_mesh_grasps test_kernel test_export test_constants test_many_runs test_optimizers test_sample
+test_codesign test_containment test_stress test_run_reading test_evaluate test_report test_batch
+test_experiments test_engines test_own test_planted_contacts test_check test_friction_memory
+test_showing test_preflight test_library test_teams test_hard_cases
 """.split()
 
 

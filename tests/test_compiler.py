@@ -275,15 +275,6 @@ def test_operations_on_integers(backend, dtype):
         compare(exact, np.array(pairs, dtype).T, backend, dtype)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_remainder(backend):
-    """Of floats, as far as a GPU's product of quotient and divisor is exact."""
-    size = BLOCKS * lanes_of(backend)
-    rng = np.random.default_rng(2)
-    x, y = (9 * rng.standard_normal((2, size))).astype(np.float32)
-    compare({"rem": (lambda x, y: jax.lax.rem(x, y), 2e-5)}, (x, y), backend, np.float32)
-
-
 def write(function, *kinds, lanes=8):
     """A function of vectors in LLVM's language, as vectors and as threads."""
 
@@ -432,38 +423,3 @@ def test_a_gpu_exchanges_on_its_chip_between_barriers():
     _, large, _ = exchange(32, "gpu")
     large[2] = jax.ShapeDtypeStruct((BLOCKS, 1000, 8), jnp.float32)
     assert describe((x,), large, kind).arrays[3].role == "output"
-
-
-def loop_text(reverse, rows=128, count=60):
-    """A loop that reads rows 2 k + 3 and 2 k + 4 in round k."""
-
-    def kernel(x, out):
-        def body(k, total):
-            at = 2 * (count - 1 - k if reverse else k)
-            return total + x[at + 3, :] * x[at + 4, :]
-
-        out[0, :] = jax.lax.fori_loop(0, count, body, x[0, :])
-
-    spec = pl.BlockSpec((None, rows, 32), lambda i: (i, 0, 0))
-    shape = jax.ShapeDtypeStruct((1, rows, 32), jnp.float32)
-    call = pl.pallas_call(kernel, grid=(1,), in_specs=[spec], out_specs=spec, out_shape=shape)
-    (equation,) = jax.make_jaxpr(call)(shape).eqns
-    layout = Layout((Array((rows, 32), "float32"),) * 2, 32)
-    return thread.write(equation.params["jaxpr"], layout, "test").splitlines()
-
-
-@pytest.mark.parametrize("reverse", [False, True])
-def test_a_loop_asks_for_what_it_reads_later(reverse):
-    """Rows 2 k + 3 and 2 k + 4 of round k: as many rounds on as memory takes, in their order."""
-    lines = loop_text(reverse)
-    (asked,) = [k for k, line in enumerate(lines) if "prefetch.global.L1" in line]
-    offset = int(lines[asked - 1].split("i64 ")[-1])
-    rounds = (offset / 128 - 3) / (-2 if reverse else 2)
-    begin, end = (
-        next(k for k, line in enumerate(lines) if text in line) for text in ("phi", "br i1")
-    )
-    reads = [k for k, line in enumerate(lines) if " load " in line and begin < k < end]
-    assert len(reads) == 2 and rounds == int(rounds) >= 1 and asked < reads[0]
-    assert rounds == thread.rounds_ahead(end - begin, 60) == 12
-    # Two rows: lane 0 asks for the first one, all others for the second one.
-    assert any("umin.i32(i32 %lane, i32 1)" in line for line in lines)

@@ -12,7 +12,6 @@ import pytest
 from codesign_jax import codesign, control, model, rollout
 from codesign_jax.engines.mujoco import MujocoEngine, world_model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.types import Status
 from tests.helpers import grasps, toy_engine
 
 # A grasp in 1.2 s with few contacts: what is tested here does not depend on them.
@@ -103,7 +102,7 @@ def decided():
 
 
 # By the kernel a trajectory is another program: quick tests compare its path with MuJoCo C step by
-# step (test_kernel, test_effects).
+# step (test_kernel, test_steps).
 TRAJECTORY = [False, pytest.param(True, marks=pytest.mark.slow)]
 
 
@@ -140,21 +139,6 @@ def test_a_trace_means_the_same_on_every_engine(decided, trajectory):
         assert np.isnan(trace.speed[2, 11:]).all() and np.isnan(trace.last).sum() == 1
 
 
-@pytest.mark.parametrize("name", ["mujoco", pytest.param("structured", marks=pytest.mark.slow)])
-def test_pieces_of_a_rollout_make_the_same_trace(decided, name):
-    """Decided worlds stay decided, and a lost object counts by the time of the whole grasp.
-
-    Quick by the structured engine: of two fingers that hold one another, test_friction_memory.
-    """
-    whole, pieces = decided[1](name, False), decided[1](name, False, 3)
-    for a, b in zip(*map(jax.tree.leaves, (whole, pieces)), strict=True):
-        # The order of MuJoCo's sums over bodies depends on the number of steps.
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-15 if name == "mujoco" else 0)
-
-
-# --- a whole optimisation as one program ---------------------------------------------------------
-
-
 # --- a cost of one's own -------------------------------------------------------------------------
 
 
@@ -181,26 +165,6 @@ def test_a_cost_of_ones_own_sees_the_end_of_the_trace():
         mujoco.mj_step(compiled, data)
     assert np.isfinite(result.lost_time).all()  # the hand does not close
     np.testing.assert_allclose(result.cost, 0.2 - data.qpos[-5], rtol=1e-5)
-
-
-def test_failed_trials_do_not_ask_ones_own_cost():
-    """They show the scene's maximum; a cost that is no number for each world is refused."""
-    scene, space, engine = toy_engine.tiny()
-    engine.failing = [1]
-    params = jax.tree.map(lambda v: jnp.stack([v] * 3), space.params(jnp.array([0.05, 0.0])))
-    trial = jax.tree.map(lambda v: v[None], rollout.nominal_trial(scene))
-    evaluate = jax.jit(
-        lambda p, t, c: rollout.evaluate(scene, engine, p, t, record_qpos=True, cost=c),
-        static_argnums=2,
-    )
-    result = evaluate(params, trial, lambda s, t, u: t.height[-1])
-    np.testing.assert_array_equal(result.cost[:, 0], [0.5, scene.cost.maximum, 0.5])
-    # Nor is a trial whose cost is no number one that counts.
-    result = evaluate(params, trial, lambda s, t, u: jnp.log(-t.height[-1]))
-    np.testing.assert_array_equal(result.status, [[Status.NONFINITE]] * 3)
-    np.testing.assert_array_equal(result.cost, [[scene.cost.maximum]] * 3)
-    with pytest.raises(ValueError, match="one number for each world"):
-        evaluate(params, trial, lambda s, t, u: t.height)
 
 
 def test_a_cost_does_not_read_what_was_not_simulated():

@@ -173,37 +173,28 @@ def test_later_noise_leaves_earlier_draws_alone():
     c = the_scene.constants()
     noise = c.objects.noise._replace(friction=0.3, stiffness=0.1, hand_mass=0.2)
     noisy = c._replace(objects=c.objects._replace(noise=noise))
-    drawn = jax.device_get(rollout.sample_trials(the_scene, key, 2000, constants=noisy))
-    np.testing.assert_array_equal(drawn.mass[:5], plain.mass)
-    factors = drawn.friction[:5], drawn.stiffness[:5], drawn.hand_mass[:5]
+    drawn = jax.device_get(rollout.sample_trials(the_scene, key, 5, constants=noisy))
+    np.testing.assert_array_equal(drawn.mass, plain.mass)
+    factors = drawn.friction, drawn.stiffness, drawn.hand_mass
     expected = np.exp(0.3 * later[:, 0]), np.exp(0.1 * later[:, 1]), np.exp(0.2 * last)
     np.testing.assert_allclose(factors, expected, rtol=1e-6)
-    # Standard deviations of 2000 draws scatter by 1.6 %.
-    friction, stiffness = np.asarray(drawn.friction), np.asarray(drawn.stiffness)
-    assert abs(np.log(friction).std() - 0.3) < 0.03
-    assert abs(np.log(stiffness).std() - 0.1) < 0.01
-    hand_mass = np.asarray(drawn.hand_mass)
-    assert abs(np.log(hand_mass).std() - 0.2) < 0.02
-    # Correlations of 2000 independent draws scatter by 0.022.
-    draws = [drawn.mass, drawn.size, *np.log([friction, stiffness, hand_mass])]
-    assert np.abs(np.corrcoef(draws) - np.eye(5)).max() < 0.1
     params, _ = jax.tree.map(jnp.asarray, hand_world(the_scene))
     fields_of = jax.jit(lambda p, t: model.model_fields(the_scene, p, t), compiler_options=QUICK)
     fields, one = (jax.device_get(fields_of(params, nth(t, 1))) for t in (drawn, plain))
     materials = fields.constants.hand.material.shear_modulus / 56e3
-    np.testing.assert_allclose(materials, stiffness[1], rtol=1e-6)
+    np.testing.assert_allclose(materials, drawn.stiffness[1], rtol=1e-6)
     ratio = fields.pair_friction[:, 0] / one.pair_friction[:, 0]
-    np.testing.assert_allclose(ratio, friction[1], rtol=1e-6)
+    np.testing.assert_allclose(ratio, drawn.friction[1], rtol=1e-6)
     lay = model.layout(the_scene)
     dofs, bodies = lay.dofs, np.r_[1, lay.stubs.ravel(), lay.bodies.ravel()]
     heavier = [
         getattr(fields, k)[bodies] / getattr(one, k)[bodies] for k in ("body_mass", "body_inertia")
     ]
     for ratio in heavier:
-        np.testing.assert_allclose(ratio, hand_mass[1], rtol=1e-5)
+        np.testing.assert_allclose(ratio, drawn.hand_mass[1], rtol=1e-5)
     np.testing.assert_array_equal(fields.body_mass[lay.object], one.body_mass[lay.object])
     stiffer = fields.jnt_stiffness[dofs] / one.jnt_stiffness[dofs]
-    np.testing.assert_allclose(stiffer, stiffness[1], rtol=1e-6)
+    np.testing.assert_allclose(stiffer, drawn.stiffness[1], rtol=1e-6)
 
 
 BAD = {

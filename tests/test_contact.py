@@ -1,7 +1,5 @@
 """The object on its table: rest, friction cone, creep, sliding and tipping, by closed forms."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -9,9 +7,8 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from codesign_jax import model
 from codesign_jax.engines.structured.laws import cones, contact
-from tests.helpers.grasps import SHAPES, hand_world, pinch
+from tests.helpers.grasps import SHAPES, pinch
 from tests.helpers.tables import GRAVITY, MASS, MU, Table
 
 CORNERS = {"box": 4, "cylinder": 3, "capsule": 2, "sphere": 1}  # contact points of a resting object
@@ -122,58 +119,3 @@ def test_incline_above_the_friction_angle_slides(shape):
         table = Table(shape, angle, flat=True, discretization__timestep=timestep)
         _, velocity = table.run(1.0)
         assert velocity[-1, 0] == pytest.approx(expected, rel=error)
-
-
-def test_a_sliding_sphere_comes_to_roll():
-    """Thrown with v_0 without spin: 5/7 v_0 once 2 v_0 / 7 mu g have passed."""
-    table = Table("sphere")
-    table.run(0.5)
-    table.data.qvel[-6] = v0 = 1.0
-    time = 2 * v0 / (7 * MU * GRAVITY)
-    _, velocity = table.run(1.0)
-    before, after = round(0.7 * time / 0.01), round(2 * time / 0.01)
-    # It hops as it slides (see above): Coulomb's law on average.
-    assert velocity[before - 1, 0] == pytest.approx(v0 - MU * GRAVITY * before * 0.01, rel=0.08)
-    assert velocity[after, 0] == pytest.approx(5 / 7 * v0, rel=1e-2)
-
-
-@pytest.mark.parametrize("ratio, falls", [(0.8, False), (1.25, True)])
-def test_box_tips_beyond_its_corner(ratio, falls):
-    """With friction enough, a box tips iff tan(angle) > half width / half height."""
-    table = Table("box")
-    half = np.array([0.02, 0.03, 0.04])
-    geom = model.layout(table.scene).object_geoms[0]
-    table.model.geom_size[geom] = half
-    table.model.pair_friction[:, :2] = 5.0
-    table.data.qpos[-5] = half[2]
-    angle = np.arctan(ratio * half[0] / half[2])
-    table.model.opt.gravity[:] = GRAVITY * np.array([np.sin(angle), 0, -np.cos(angle)])
-    table.run(1.0)
-    upright = 1 - 2 * (table.data.qpos[-3] ** 2 + table.data.qpos[-2] ** 2)
-    assert (upright < 0.7) == falls
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_finger_contact_has_the_declared_stiffness(shape):
-    """Pressed by a known force, a finger's sphere sinks into the object by F / k_n."""
-    scene = pinch(shape, links=1, solver__tolerance=1e-12)
-    params, trial = hand_world(dataclasses.replace(scene, gravity=0.0))
-    compiled = model.compile_model(dataclasses.replace(scene, gravity=0.0), params, trial)
-    lay = model.layout(scene)
-    # Everything is held but the object's position, and a force presses it up against one sphere.
-    data = mujoco.MjData(compiled)
-    data.qpos[2] = data.ctrl[2] = 0.5
-    compiled.dof_armature[: lay.dofs.max() + 1] = 1e6
-    compiled.body_inertia[lay.object] = compiled.dof_M0[-3:] = 1e6
-    mujoco.mj_kinematics(compiled, data)
-    sphere = lay.spheres[0, 0, 0]
-    radius, centre = compiled.geom_size[sphere, 0], data.geom_xpos[sphere]
-    reach = {"box": 0.03, "cylinder": 0.036, "capsule": 0.024, "sphere": 0.03}[shape]
-    data.qpos[-7:-4] = centre - [0, 0, radius + reach - 1e-4]
-    force = 0.5
-    for _ in range(300):
-        data.xfrc_applied[lay.object, 2] = force
-        mujoco.mj_step(compiled, data)
-    assert data.ncon == 1
-    depth = -data.contact.dist[0]
-    assert depth == pytest.approx(force / scene.contact.normal_stiffness, rel=1e-2)

@@ -189,17 +189,6 @@ def test_failed_worlds_are_saved_and_replayed(failing_run, capsys):
     assert (folder / "replay.html").exists()
 
 
-def test_what_is_no_failed_world_is_refused(failing_run, tmp_path, capsys):
-    folder, _ = failing_run
-    other = folder / "failures" / "no.npz"
-    for content in (b"nothing", b""):
-        other.write_bytes(content)
-        assert cli.main(["replay", str(other)]) == 2
-        assert "not a failed world" in capsys.readouterr().err
-    other.unlink()
-    assert cli.main(["replay", str(tmp_path / "missing.npz")]) == 2
-
-
 def test_all_failed_stops_with_a_diagnosis(tmp_path, capsys):
     from tests.helpers.toy_engine import TINY
 

@@ -107,15 +107,6 @@ def test_whether_an_object_rests_is_told_by_its_own_size():
         assert judge(held, trial).status == status, (name, size)
 
 
-def test_worlds_are_independent_under_vmap():
-    traces = [trace(400), trace(), trace(speed={300: np.nan}), trace(700)]
-    batch = jax.tree.map(lambda *v: jnp.stack(v), *traces)
-    together = grasps.outcomes(SCENE, batch)
-    for i, t in enumerate(traces):
-        for a, b in zip(evaluate(t), together, strict=True):
-            np.testing.assert_array_equal(a, b[i])
-
-
 # --- what engines tell of a step -----------------------------------------------------------------
 
 CAP, OVERFLOW = Status.SOLVER_CAP, Status.CONTACT_OVERFLOW
@@ -170,43 +161,6 @@ def test_a_trial_tells_how_its_solver_ended_and_warns_above_the_scene_s_threshol
     assert steps_only.status == CAP and np.isnan(steps_only.residual)
     nothing = evaluate(trace())  # as of MJX
     assert nothing.status == Status.OK and np.isnan([nothing.capped, nothing.residual]).all()
-
-
-# --- a trace at the end of a phase ---------------------------------------------------------------
-
-
-def counted(worlds=()):
-    """A trace whose entries are their indices, and five times that in qpos."""
-    step = jnp.broadcast_to(jnp.arange(float(STEPS)), (*worlds, STEPS))
-    qpos = 5 * step[..., None] + jnp.arange(3)
-    return Trace(step, step, step, qpos, step.astype(int), qpos[..., 0, :])
-
-
-ENDS = {"approach": 199, "inflate": 349, "lift": 449, "disturb": 799, "ungrasp": 899, None: 799}
-
-
-@pytest.mark.parametrize("worlds", [(), (2,)])
-def test_a_trace_at_the_end_of_a_phase_is_its_last_step(worlds):
-    for phase, last in ENDS.items():
-        found = counted(worlds).at(SCENE, phase)
-        np.testing.assert_array_equal(found.distance, np.full(worlds, last))
-        np.testing.assert_array_equal(found.qpos, np.full((*worlds, 3), 5 * last) + np.arange(3))
-        assert found.status.shape == worlds and found.last is None
-
-
-def test_a_trace_without_the_phase_says_so():
-    brief = scene.load("paper_spheres", overrides={"effects": {"disturb": False, "ungrasp": False}})
-    assert list(brief.phase_ends) == ["approach", "inflate", "lift"]
-    held = jax.tree.map(lambda v: v[: brief.num_steps], counted())
-    assert held.at(brief).distance == held.at(brief, "lift").distance == 449
-    for the_scene, phase, words in (
-        (SCENE, "distrub", "phase 'distrub' unknown; did you mean 'disturb'"),
-        (SCENE, "shaking", "unknown; valid: approach, disturb, inflate, lift, ungrasp"),
-        (brief, "disturb", "has no phase 'disturb', as effects.disturb = false; its grasp ends"),
-        (brief, "lift", "the trace has 900 time steps, but a grasp of the scene 450"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            counted().at(the_scene, phase)
 
 
 # --- particles -----------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
@@ -12,84 +11,13 @@ from hypothesis import strategies as st
 
 from codesign_jax import control, model
 from codesign_jax.engines import make_engine
-from codesign_jax.engines.mujoco import MujocoEngine
-from codesign_jax.engines.structured import StructuredEngine, coordinates
+from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.scene import effects, schema
-from codesign_jax.types import WARNINGS
-from tests.helpers import grasps, oracles
-from tests.helpers.effect_settings import setting
+from tests.helpers import grasps
 
-# Compiling takes longer than all that is done with a program here.
-QUICK = {"xla_backend_optimization_level": 0}
-CONTACTS = ("finger_object", "finger_table", "palm_object", "palm_table", "object_table")
 slow = pytest.mark.slow
-# The pinch with each object; away from it some effects together, for speed.
-SETTINGS = {
-    **{shape: {} for shape in grasps.SHAPES},
-    "new models": {
-        **{"friction": "full", "wrist": False, "neo_hookean": True},
-        # A box with an inertia of its own that falls from an edge.
-        "objects__object.0.orientation": (20.0, 0.0, 0.0),
-        "objects__object.0.inertia": (5e-5, 8e-5, 1.1e-4),
-    },
-    "little": {"friction": "none", "twist": False, "palm_table": False, "gravity": False},
-    "no contact": dict.fromkeys(CONTACTS, False),
-}
-TOGETHER = ("new models", "little")
-
-
-@pytest.mark.parametrize(
-    "name", [n if n in TOGETHER else pytest.param(n, marks=slow) for n in SETTINGS]
-)
-def test_steps_equal_mujocos(name):
-    """Accelerations of every step of the kernel's own path, contacts included."""
-    with jax.enable_x64(True):
-        shape = name if name in grasps.SHAPES else "box"
-        scene, _, fields, ctrl = setting(SETTINGS[name], shape)
-        engine = StructuredEngine(scene, iterations=100, evaluations=40, tolerance=1e-24)
-        fields, ctrl = jax.tree.map(lambda x: jnp.asarray(x)[None], fields), ctrl[None, :420]
-        found = oracles.path(engine, fields, ctrl)
-    errors, far, touching = oracles.against_mujoco(scene, fields, ctrl, found)
-    # A difference of velocities over 10 ms loses two of 16 digits, and MuJoCo's own Newton stops at
-    # rounding of its cost.  Its rigid arm gives way by the hand's forces over 1e9 kg, which stiff
-    # fingers multiply: 1.6e-8 with a wrist of 1e9, 2e-10 of 1e11.
-    assert errors.max() < (1e-8 if scene.effects.wrist else 1e-7) and far.max() < 1e-12
-    if scene.effects.finger_object and scene.effects.object_table:
-        # More than the object on the table.
-        assert touching.max() > (1 if shape == "sphere" else 4)
-
-
-@slow  # half a minute each to compile; quick: whole grasps by stock MJX (test_engines)
-@pytest.mark.parametrize("on", [{}, {"friction": "full", "neo_hookean": True}])
-def test_mjx_steps_equal_mujocos(on):
-    """Stock MJX with the models that it has, on a sphere (its other contacts differ a little)."""
-    with jax.enable_x64(True):
-        scene, oracle, fields, ctrl = setting(on, "sphere")
-        solver = dataclasses.replace(
-            scene.solver, tolerance=1e-14, iterations=100, ls_iterations=50
-        )
-        scene = dataclasses.replace(scene, solver=solver)
-        engine = make_engine("mjx", scene)
-        step = jax.jit(engine.step, compiler_options=QUICK)
-        data, ours = mujoco.MjData(oracle), engine.reset(fields)
-        data.qpos[:] = fields.start
-        for k in range(420):
-            data.ctrl[:] = ctrl[k]
-            oracles.soften(scene, fields, data)
-            if k % 70 == 20:
-                ours = ours.replace(qpos=data.qpos.copy(), qvel=data.qvel.copy())
-                found = step(fields, ours, ctrl[k])
-                mujoco.mj_forward(oracle, data)
-                scale = max(np.linalg.norm(data.qacc), 100.0)
-                # MJX keeps its warm start where it is good enough: 4e-9 at rest.
-                assert np.linalg.norm(found.qacc - data.qacc) / scale < 1e-7, k
-            mujoco.mj_step(oracle, data)
-
-
-# --- without a stimulus --------------------------------------------------------------------------
-
 
 # --- off is absent -------------------------------------------------------------------------------
 
@@ -189,19 +117,6 @@ def primitives(jaxpr, found):
     return found
 
 
-def test_without_contacts_the_kernel_has_no_cone():
-    """A beam simulation and a falling body: no contact is found, kept, or evaluated."""
-    scene = effects_scene(dict.fromkeys(CONTACTS, False))
-    assert not Program(scene, Limits(8, 8, 1e-6)).sets
-    free = primitives(step_jaxpr(scene), {})
-    touching = primitives(step_jaxpr(effects_scene({})), {})
-    # A contact is evaluated on condition that it touches, and a cone divides by its forces.  Of all
-    # primitives 61 % are left, the fingers' dynamics and the Newton solver's loop.
-    assert "cond" not in free and touching["cond"] > 0
-    assert free["div"] < touching["div"] / 4
-    assert sum(free.values()) < 0.7 * sum(touching.values())
-
-
 # --- support -------------------------------------------------------------------------------------
 
 
@@ -275,28 +190,3 @@ OPTIONS = {"deadline": None, "derandomize": True, "phases": [Phase.generate]}
 @given(values=COMBINATIONS, shape=st.sampled_from(grasps.SHAPES))
 def test_a_combination_builds_or_is_refused(values, shape):
     check_combination(values, shape)
-
-
-def test_mujoco_s_rigid_arm_moves_fingers_whatever_the_object_does():
-    """Fingers that touch nothing: the same motion with the object at rest and falling.
-
-    A solver that starts from the last step's accelerations left the tips 7 mm off, as the cost of
-    the palm's 1e9 kg hides what the fingers' accelerations lack.
-    """
-    off = ("wrist", "finger_object", "finger_table", "palm_object", "palm_table")
-    paths = []
-    for rests in (True, False):
-        effects = {f"effects__{name}": False for name in (*off, "disturb", "ungrasp")}
-        scene = grasps.pinch(
-            "sphere", links=2, effects__object_table=rests, limits__penetration=0.1, **effects
-        )
-        params, trials = grasps.random_worlds(scene, 0, 1)
-        fields, ctrl = grasps.batch_inputs(scene, params, trials)
-        pressed = ctrl[:, 210:222].at[:, :, 2].set(fields.start[0, 2])  # Pa, the arm at rest
-        trace = jax.jit(MujocoEngine(scene).rollout, static_argnames="trajectory")(
-            fields, pressed, trajectory=True
-        )
-        assert not (trace.status & ~int(WARNINGS)).any() and np.isfinite(trace.speed).all()
-        paths.append(np.asarray(trace.qpos[0, :, 6:-7]))
-    assert np.abs(paths[0]).max() > 0.05  # rad: they bend
-    np.testing.assert_allclose(paths[0], paths[1], atol=1e-6)

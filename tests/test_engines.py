@@ -1,4 +1,4 @@
-"""Stock MJX and MuJoCo C: whole short grasps, and failing worlds; single steps: test_effects."""
+"""Stock MJX and MuJoCo C: whole short grasps, and failing worlds; single steps: test_steps."""
 
 import jax
 import jax.numpy as jnp

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from codesign_jax import codesign, cost, rollout, runs, scene
+from codesign_jax import rollout, runs, scene
 from codesign_jax.commands import common
 from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
@@ -64,18 +64,6 @@ def test_a_design_is_opened_from_its_file(workplace, capsys):
     told = capsys.readouterr().err
     assert "wrong.toml 'lenght' is not a parameter; did you mean 'length'?" in told
     assert "wrong.toml 'arm_z[0]' is not a parameter" in told
-
-
-def test_evaluate_takes_the_best_of_a_run(finished, capsys):
-    rows = [line.split(",") for line in (finished / "tests.csv").read_text().splitlines()[1:]]
-    best = min(rows, key=lambda row: float(row[1]))
-    assert command("evaluate", "--run", finished, "--trials", "3") == 0
-    output = capsys.readouterr().out
-    assert command("evaluate", finished, "--trials", "3") == 0  # as report and replay take it
-    assert capsys.readouterr().out == output
-    assert command("evaluate", finished, "--run", finished) == 2
-    assert f"length={float(best[-2]):.4g} mm" in output
-    assert "of 3, " in output and " % of 3 fresh grasps (" in output
 
 
 def test_a_table_of_trials_has_noise_and_endings(finished, tmp_path, capsys):
@@ -187,38 +175,10 @@ def test_verdicts_count_all_trials_and_means_follow_the_rule(rule, mean, mean_in
     assert alone.endswith("no mean cost" if rule == "exclude" else "1 that failed")
 
 
-def test_a_design_that_loses_a_sixth_is_not_good():
-    """Late losses cost little: 4 of 24 lost in the last tenth of a second have a mean of 0.0049.
-
-    Nor is one that holds all that it releases, and releases half; many designs are judged at once.
-    """
-    tiny = scene.load(TINY)
-    late = trials_of([0.0] * 20 + [0.0294] * 4, [0] * 24, lost=range(20, 24))
-    hooks = trials_of([0.0] * 12 + [3.0] * 12, [0] * 12 + [Status.STUCK] * 12)
-    kept = trials_of([0.0] * 24, [0] * 24)
-    for found in (late, hooks, kept):
-        assert cost.particle_cost(tiny, found) < codesign.SUCCESS_COST
-    every = jax.tree.map(lambda *v: np.stack(v), late, hooks, kept)
-    np.testing.assert_array_equal(verdicts.good(every), [False, False, True])
-    assert verdicts.tally(every) == (56, 4, 12, 0)
-    assert "12 of 24 trials failed (STUCK 12)" in verdicts.warnings(Judged(tiny, hooks))[0]
-    # A sixth of the trials is no small share, but none of them failed.
-    assert not verdicts.warnings(Judged(tiny, late))
-
-
 def trials_of(cost, status, lost=()):
     """Outcomes of trials; the indices in `lost` lost their objects at 1 s."""
     times = np.where(np.isin(np.arange(len(cost)), list(lost)), 1.0, np.inf)
     return Outcome(np.array(cost), np.array(status, int), times, np.full(len(cost), -1))
-
-
-def test_evaluate_says_which_objects_it_leaves_out(capsys):
-    design = ["--scene", TINY, "--objects", "paper", "--dry-run"]
-    assert command("evaluate", *design, "--trials", "1") == 0
-    words = "--trials 1 tries 1 of 3 objects, and not cylinder, sphere; --trials 3 tries each once"
-    assert words in capsys.readouterr().out
-    assert command("evaluate", *design, "--trials", "3") == 0
-    assert "tries" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

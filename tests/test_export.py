@@ -12,11 +12,10 @@ from codesign_jax import cli, rollout, scene
 from codesign_jax.cost import outcome
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured.kernel import packing
-from codesign_jax.export import grasps, mjcf, plain, skin, tables
+from codesign_jax.export import grasps, plain, skin, tables
 from codesign_jax.export.play import play
 from codesign_jax.model import build_spec
 from codesign_jax.scene import parameters
-from codesign_jax.types import Status
 from tests.helpers.grasps import (
     batch_inputs,
     hand_world,
@@ -142,22 +141,6 @@ def test_contacts_have_the_declared_stiffness(friction):
     np.testing.assert_allclose(stiffness, 2 * the_scene.contact.normal_stiffness, rtol=1e-9)
 
 
-def test_what_plain_mujoco_does_not_simulate_is_named():
-    ours = ["lateral_threshold", "neo_hookean"]
-    found = plain.differences(pinch(**{f"effects__{name}": True for name in ours}))
-    assert sorted(text.split("effects.")[1].split(":")[0] for text in found) == ours
-    default, word = scene.load("paper"), "the model is without effects.friction_memory"
-    assert any(word in text for text in plain.differences(default))
-    contacts = dict.fromkeys(("effects.finger_finger", "effects.finger_itself"), False)
-    off = scene.load("paper", overrides=contacts)
-    assert not any("friction_memory" in text for text in plain.differences(off))
-    household = plain.differences(scene.load("paper", object_set="household"))
-    assert any("mesh 'mug' as its convex hull" in text for text in household)
-    assert any('effects.surface = "hull" as spheres' in text for text in household)
-    spheres = pinch(effects__friction_memory=True, effects__finger_finger=True)
-    assert not plain.differences(spheres), "spheres never have these effects"
-
-
 @pytest.fixture(scope="module")
 def skinned():
     """A scene with the hull, contact between fingers and one object, a hand, and its spec."""
@@ -209,26 +192,6 @@ def test_a_sphere_is_as_stiff_as_its_share_of_the_finger(skinned):
     assert touching > 2
 
 
-def test_a_grasp_that_mujoco_warns_of_has_failed(tmp_path, monkeypatch):
-    """Its key frames end where MuJoCo refused the numbers: of a pressure that is no number."""
-    monkeypatch.chdir(tmp_path)  # where MuJoCo logs its warnings
-    the_scene = pinch("box", **HURRIED)
-    params, trial = hand_world(the_scene, pressure=1e12)
-    found = grasps.grasp(the_scene, params, trial)
-    assert found.outcome.status & Status.NONFINITE and found.outcome.bad_step == 51
-    loaded = mujoco.MjModel.from_xml_string(found.xml)
-    assert [loaded.key(i).name for i in range(loaded.nkey)] == ["start", "after_approach"]
-
-
-def test_a_number_that_is_lost_is_noticed():
-    spec = mujoco.MjSpec()
-    spec.worldbody.add_geom(size=[1 / 3, 0, 0])  # without a name its numbers are not found
-    with pytest.raises(RuntimeError, match="geom_size"):
-        mjcf.text(spec)
-    spec.geoms[0].name = "found"
-    assert repr(1 / 3) in mjcf.text(spec)
-
-
 def test_commands_are_the_key_frames(tmp_path):
     the_scene = scene.load("paper_spheres")
     space = parameters.design_space(the_scene.hand, "2d")
@@ -263,17 +226,6 @@ def test_commands_are_the_key_frames(tmp_path):
 
 def export(*arguments):
     return cli.main(["export", *map(str, arguments)])
-
-
-def test_command_writes_models_and_commands(tmp_path, capsys):
-    out = tmp_path / "out"
-    assert export("--scene", TINY, "--out", out, "--trials", 1) == 0
-    names = {p.name for p in (out / "model").iterdir()}
-    assert {"sphere.xml", "sphere.mjb", "sphere_controls.csv", "play.py", "grasps.csv"} <= names
-    assert {"trial_000_sphere.xml"} <= names and (out / "commands.csv").exists()
-    assert "in plain MuJoCo: sphere: " in capsys.readouterr().out
-    assert export("--scene", TINY, "--out", out) == 2
-    assert "choose another folder, or give --overwrite" in capsys.readouterr().err
 
 
 def test_command_writes_models_of_the_default_scene_s_kind(tmp_path, capsys):

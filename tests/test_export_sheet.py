@@ -13,7 +13,6 @@ from codesign_jax.export import casting, drawing, process, sheet, tolerance
 from codesign_jax.export.process import Process
 from codesign_jax.optimize import answer
 from codesign_jax.runs import choice
-from codesign_jax.runs.progress import Meter
 from codesign_jax.scene import parameters
 from codesign_jax.types import Outcome
 from tests.helpers.toy_engine import TINY, ToyEngine, tiny
@@ -119,16 +118,6 @@ def test_sheet_has_dimensions_pressures_and_tolerances(page, tmp_path):
     assert "fewer than 90 %" in text
 
 
-def test_text_stands_apart_from_the_drawings(page):
-    """A long line about the design ran into them."""
-    the_scene, params, sizes, drift = page
-    lines = [f"Best final design of {'runs/a/' * 60}", "Scene x"]
-    shown = {"scene": the_scene, "params": params, "sizes": sizes, "drift": drift}
-    figure = drawing.page("Build sheet", lines, sheet.sheet_sections(*page), **shown)
-    boxes = apart(figure, 2)
-    assert any("runs/a/" in text for text in boxes) and len(boxes) > 10
-
-
 def apart(figure, drawings):
     """Boxes of a page's texts, which stand apart from each other and from the first drawings."""
     FigureCanvasAgg(figure).draw()
@@ -210,15 +199,6 @@ def test_command_writes_the_sheet(tmp_path, capsys, by_toy):
     assert {p.name for p in tmp_path.iterdir()} - {"cache"} == {"out", "plain"}
     assert cli.main([*TOY, "--tolerance-steps", "0", "--out", str(tmp_path / "no")]) == 2
     assert "--tolerance-steps" in capsys.readouterr().err and not (tmp_path / "no").exists()
-
-
-def test_an_interrupted_command_leaves_nothing(tmp_path, capsys, by_toy, monkeypatch):
-    def stopping(meter, grasps):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Meter, "advance", stopping)
-    assert cli.main([*TOY, *FREE, "--out", str(tmp_path / "out")]) == 130
-    assert "stopped" in capsys.readouterr().err and not any(tmp_path.iterdir())
 
 
 def test_a_folder_is_there_as_a_whole_or_not_at_all(tmp_path):

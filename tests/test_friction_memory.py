@@ -75,15 +75,6 @@ def test_bodies_that_part_hold_by_their_elastic_force():
     np.testing.assert_allclose(grip, [111 * 0.01 / 2.778, 0, 0], rtol=1e-12, atol=1e-15)
 
 
-def test_bodies_apart_hold_nothing():
-    with jax.enable_x64(True):
-        contacts = touching(np.array([[0, 0, 1.0]] * 3), np.array([-1e-3, -1e-6, 0.0]))
-        grip, force = next_grip(
-            contacts, jnp.diag(jnp.array([0, 0, 5.0])) @ jnp.ones((3, 3)), np.zeros(3) + 0.5
-        )
-    assert not grip.any() and not np.asarray(force).any()
-
-
 def test_spheres_keep_nothing():
     """Their contact is that of MuJoCo, which has no state, so that every engine simulates it."""
     for surface, held in ("hull", 4), ("spheres", 0):

@@ -19,7 +19,7 @@ from codesign_jax.engines.base import staged
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.world_model import world_constants
-from tests.helpers import gpu_cases, grasps, kernels
+from tests.helpers import gpu_cases, kernels
 
 pytestmark = pytest.mark.gpu
 
@@ -144,14 +144,6 @@ def test_staged_blocks_are_narrow_for_few_worlds(name):
     jax.tree.map(np.testing.assert_array_equal, *map(run, widths))
 
 
-def test_the_default_is_float32_and_the_kernel():
-    """What a user gets on a GPU without asking."""
-    scene = grasps.pinch("cylinder", links=2)
-    fields, ctrl = gpu_cases.inputs(scene, 3)
-    engine = StructuredEngine(scene)
-    assert engine.rollout(fields, ctrl[:, :20]).distance.dtype == np.float32
-
-
 # --- how kernels are launched ---------------------------------------------------------------------
 
 
@@ -183,21 +175,6 @@ def test_launch(blocks):
     np.testing.assert_allclose(got, kernels.expected(x, table), atol=TOLERANCE)
 
 
-def test_two_calls_of_one_program():
-    """One call's results are the next one's input, between operations of XLA's own."""
-    x, table = batch(64)
-
-    def twice(x, table):
-        first = run(x, table)
-        return run(x.at[:, :1].set(first / first.max()), table + 0.0), first
-
-    second, first = jax.jit(twice)(x, table)
-    np.testing.assert_array_equal(first, jax.jit(run)(x, table))
-    following = x.copy()
-    following[:, :1] = first / np.max(first)
-    np.testing.assert_allclose(second, kernels.expected(following, table), atol=TOLERANCE)
-
-
 def test_calls_in_a_loop_and_many_in_flight():
     """Programs that were started together, and launches inside of a scan, keep their order."""
     x, table = map(jnp.asarray, batch(256))
@@ -225,29 +202,6 @@ def test_every_device():
         assert got.devices() == {device}
     for got in started:
         np.testing.assert_array_equal(got, np.asarray(started[0]))
-
-
-def test_shares_of_a_mesh():
-    """The blocks dealt to the host's GPUs by `shard_map`, be it one."""
-    devices = jax.local_devices()
-    mesh, spec = jax.sharding.Mesh(np.array(devices), ("device",)), jax.sharding.PartitionSpec
-    x, table = batch(12 * len(devices))
-    share = jax.shard_map(
-        run, mesh=mesh, in_specs=(spec("device"), spec()), out_specs=spec("device")
-    )
-    np.testing.assert_array_equal(jax.jit(share)(x, table), jax.jit(run)(x, table))
-
-
-def test_what_the_driver_refuses(monkeypatch):
-    """PTX with an error: told before anything runs, with the assembler's words."""
-    text = gpu.device_code
-
-    def broken(jaxpr, layout):
-        return text(jaxpr, layout).replace("ret;", "return;")
-
-    monkeypatch.setattr(gpu, "device_code", broken)
-    with pytest.raises(launch.KernelUnavailable, match="CUDA_ERROR_INVALID_PTX"):
-        jax.jit(partial(run, rounds=3)).lower(*batch(2))
 
 
 def test_a_failing_launch_is_an_exception(monkeypatch):

@@ -3,13 +3,12 @@
 import ctypes
 from ctypes import POINTER, c_char_p, c_int, c_uint, c_void_p
 
-import jax
 import numpy as np
 import pytest
 
 from codesign_jax.compiler import ffi, gpu, launch
 from codesign_jax.compiler.values import OUTPUT, Array, Layout
-from tests.helpers import call_frames, kernels
+from tests.helpers import call_frames
 
 KERNEL, CONTEXT, PRIMARY = 0xCAFE, 0xC0, 0xC1
 NAMES = {1: b"CUDA_ERROR_INVALID_VALUE", 218: b"CUDA_ERROR_INVALID_PTX"}
@@ -170,14 +169,3 @@ def test_ptx_that_the_driver_refuses(function):
         gpu.load(gpu.Driver(driver), "nonsense", 0)
     names = [name for name, _ in driver.calls]
     assert names.count("cuCtxPushCurrent_v2") == names.count("cuCtxPopCurrent_v2")
-
-
-def test_device_code():
-    """The entry point has one pointer an array, scratch memory among the outputs."""
-    x, table = (jax.ShapeDtypeStruct(v.shape, v.dtype) for v in kernels.numbers(4, lanes=32))
-    function, outputs = kernels.call(x, table)
-    kind = launch.Kernel("", "gpu", 32, shared=(1,), scratch=(1,))
-    layout = launch.describe((x, table), outputs, kind)
-    assert [a.role for a in layout.arrays] == ["input", "input", "output", "output"]
-    text = gpu.device_code(launch.kernel_jaxpr(function, [x, table]), layout)
-    assert f".visible .entry {gpu.ENTRY}(" in text and text.count(".param .u64") == 4

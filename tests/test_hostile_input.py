@@ -1,4 +1,4 @@
-"""Input made to do harm is refused by the project's own error; the harness of `make faults`."""
+"""Input made to do harm is refused by the project's own error."""
 
 import base64
 import json
@@ -6,16 +6,13 @@ import os
 import zipfile
 
 import hypothesis
-import jax
-import numpy as np
 import pytest
 import trimesh
 
-from codesign_jax import engines, make_engine, rollout, scene
+from codesign_jax import scene
 from codesign_jax.runs import scene_files
-from codesign_jax.scene import InputError, constants, library, meshes
+from codesign_jax.scene import InputError, library, meshes
 from codesign_jax.scene.meshes import reading
-from codesign_jax.scene.parameters import design_space
 from scripts import faults
 from scripts.faults import shim  # noqa: F401  (a fixture)
 from tests.helpers.command_runs import command, own_workplace  # noqa: F401  (a fixture)
@@ -166,35 +163,6 @@ def test_a_run_has_the_bytes_that_were_read(tmp_path):
 # --- how far distances reach ---------------------------------------------------------------------
 
 
-def ball(tmp_path, **overrides):
-    """A scene of a ball as a mesh."""
-    mesh = trimesh.creation.icosphere(3, 0.02)
-    mesh.export(tmp_path / "ball.off", digits=17)
-    entry = 'name = "a"; type = "mesh"; file = "ball.off"; friction = 0.8; mass = 0.1'
-    path = object_file(tmp_path, entry + "; voxel_error = 0.002")
-    return scene.load("paper_spheres", object_set=path, overrides=overrides)
-
-
-def test_hands_that_reach_beyond_the_distances_are_refused(tmp_path):
-    usual = ball(tmp_path)
-    tall = scene.load("paper_spheres", overrides={"hand.parameter.height.high": 80})
-    mixed = usual.__class__(**{**vars(usual), "hand": tall.hand})
-    (problem,) = refusals(make_engine, "structured", mixed)
-    assert "distances reach 14 mm" in problem and "radius 40 mm need" in problem
-    wide = usual.constants()
-    palm = wide.hand.palm._replace(contact_radius=0.05)
-    (problem,) = refusals(constants.check, usual, wide._replace(hand=wide.hand._replace(palm=palm)))
-    assert "radius 50 mm" in problem
-    space = design_space(usual.hand, "full")
-    params = space.params(space.default())
-    params = params._replace(height=params.height * 0 + 0.09)
-    trial = rollout.nominal_trial(usual)
-    one = jax.tree.map(lambda v: np.asarray(v)[None], (params, trial))
-    engine = engines.make_engine("structured", usual)
-    (problem,) = refusals(rollout.simulate, usual, engine, *one)
-    assert "radius 45 mm" in problem
-
-
 # --- command lines -------------------------------------------------------------------------------
 
 
@@ -239,6 +207,3 @@ def test_some_mutated_input(strategy, count, trial, tmp_path):
 
     tried()
     assert any(refused)
-
-
-# --- the harness of make faults -------------------------------------------------------------------

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from jax.experimental import pallas as pl
 
-from codesign_jax import scene
 from codesign_jax.compiler.launch import Kernel, launch
 from codesign_jax.engines.structured.kernel.counts import Counts
 from codesign_jax.engines.structured.kernel.memory import MemoryLayout
-from codesign_jax.engines.structured.kernel.tables import Tables
 
 LANES, ROWS, BLOCKS, LENGTH = 8, 5, 3, 40
 
@@ -95,72 +93,6 @@ def test_gather(numbers, computed, stored):
     np.testing.assert_allclose(got, np.stack(want, 1), rtol=rtol, atol=rtol)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.int32])
-def test_scatter(numbers, dtype):
-    """Lanes append to columns of their own, as many entries as each of them has."""
-    source = numbers["x" if dtype == np.float32 else "codes"].astype(dtype)
-    floats = numbers["x"].astype(np.float32)
-
-    def kernel(floats, source, out, count):
-        zero = jnp.zeros((LANES,), dtype)
-        for k in range(ROWS + 1):
-            out[k, :] = zero
-
-        def append(k, used):
-            wanted = source[k, :] > 0
-            # What is not wanted goes to the row below the others.
-            out[jnp.where(wanted, used, ROWS), lane()] = source[k, :]
-            return used + wanted.astype(jnp.int32)
-
-        used = jax.lax.fori_loop(0, ROWS, append, jnp.zeros((LANES,), jnp.int32))
-        count[0, :] = used
-
-    shapes = [
-        jax.ShapeDtypeStruct((BLOCKS, ROWS + 1, LANES), dtype),
-        jax.ShapeDtypeStruct((BLOCKS, 1, LANES), np.int32),
-    ]
-    got, count = run("scatter", kernel, (floats, source), *shapes)
-    np.testing.assert_array_equal(count[:, 0], (source > 0).sum(1))
-    for block in range(BLOCKS):
-        for column in range(LANES):
-            kept = [v for v in source[block, :, column] if v > 0]
-            want = kept + [0] * (ROWS - len(kept))
-            np.testing.assert_array_equal(got[block, :ROWS, column], want)
-
-
-def test_lanes_of_one_world_store_in_one_place(numbers):
-    """As those of a hand whose fingers fill the block: all lanes have the same number."""
-    x = np.repeat(numbers["x"][..., :1], LANES, 2).astype(np.float32)
-
-    def kernel(x, out):
-        world = jax.lax.rem(lane(), jnp.int32(1))
-        out[0, world] = x[0, :]
-        out[1, world] = 2 * out[0, world] + x[1, :]
-
-    (got,) = run("one world", kernel, (x,), jax.ShapeDtypeStruct((BLOCKS, 2, 1), np.float32))
-    np.testing.assert_array_equal(got[:, 0, 0], x[:, 0, 0])
-    # A product and a sum in one instruction round once.
-    np.testing.assert_allclose(got[:, 1, 0], 2 * x[:, 0, 0] + x[:, 1, 0], rtol=1e-6)
-
-
-def test_what_memory_cannot_do_is_named(numbers):
-    """A vector for each lane, and elements that are neither floats nor int32."""
-    x, rows = numbers["x"].astype(np.float32), numbers["rows"]
-
-    def slices(x, rows, out):
-        out[0, :] = x[rows[0, :], :][0]
-
-    with pytest.raises(NotImplementedError, match="one number of each lane"):
-        run("slices", slices, (x, rows), jax.ShapeDtypeStruct(x.shape, np.float32))
-
-    def small(x, rows, out):
-        out[0, :] = x[0, :] + rows[0, :].astype(jnp.float32)
-
-    with pytest.raises(NotImplementedError, match="no dtype int8"):
-        inputs = (x, rows.astype(np.int8))
-        run("small", small, inputs, jax.ShapeDtypeStruct(x.shape, np.float32))
-
-
 # --- slots ----------------------------------------------------------------------------------------
 
 
@@ -190,15 +122,3 @@ def test_a_table_by_item_has_a_place_for_everything():
         for names in (("a", "d"), ("set.b", "set.e")):
             own = sorted(sum((rows[name, item] for name in names), []))
             assert own == list(range(own[0], own[0] + len(own)))
-
-
-def test_only_gpus_have_an_item_for_lanes_without_a_contact():
-    """Lanes of a CPU's vector read a slot's item together, whether they have filled it or not."""
-    here = {
-        name: {s.name: s for s in Tables(scene.load("paper"), backend=name, width=32).sets}
-        for name in ("cpu", "gpu")
-    }
-    cpu, gpu = (here[backend]["finger_finger"] for backend in ("cpu", "gpu"))
-    assert not cpu.gathers
-    assert gpu.gathers
-    assert gpu.count == cpu.count + 1 == cpu.rows * (cpu.slots + 1) + 1

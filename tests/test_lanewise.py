@@ -1,16 +1,13 @@
 """Evaluation of array functions component by component, and which of its programs are shared."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from codesign_jax.engines.structured import identity, lanewise
+from codesign_jax.engines.structured import lanewise
 from codesign_jax.engines.structured.lanewise import Lanes, lanes
 from codesign_jax.engines.structured.linear import elimination
-from tests.helpers import grasps
 
 FINGERS, WORLDS = 4, 8
 
@@ -104,32 +101,3 @@ def test_a_closure_over_an_array_is_traced_each_time():
         found = lanewise.lanewise(scaled(factor), x, x)
         np.testing.assert_allclose(as_array(found["product"]), (1.0 + k) * as_array(x) ** 2)
     assert len(counted) == 2
-
-
-def test_identities():
-    """Equal for equal values of one type; what has none says so."""
-    scene = grasps.pinch("box")
-    equal = [
-        (lambda: scaled(1.5)),
-        (lambda: functools.partial(scaled, 2, out=(1, None, "x"))),
-        (lambda: np.arange(3.0)),
-        (lambda: {"a": [1, (2.0, jnp.add)]}),
-        (lambda: scene),
-    ]
-    keys = [identity.of(make()) for make in equal]
-    assert keys == [identity.of(make()) for make in equal] and len({*map(hash, keys)}) == len(keys)
-    different = [0, 0.0, -0.0, False, None, "0", np.float32(0), np.float64(0), (0,), [0], jnp.add]
-    different += [scaled(1.0), scaled(2.0), scaled(1), lambda x: x, np.zeros(1), np.zeros((1, 1))]
-    assert len({identity.of(v) for v in different}) == len(different)
-
-    def endless():
-        return endless
-
-    def early():
-        return later
-
-    for value in (jnp.ones(2), object(), scaled(jnp.ones(2)), [object()], endless, early):
-        with pytest.raises(identity.NoIdentity):
-            identity.of(value)
-    later = None
-    assert later is early()

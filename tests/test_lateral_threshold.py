@@ -18,7 +18,7 @@ from tests.helpers.curled_hands import batched, curled
 from tests.helpers.planted_faults import Fault, planted, simulate
 
 BOUND = 1e-8
-"""As in test_effects.py."""
+"""As in test_steps.py."""
 SETTINGS = {"effects__lateral_threshold": True}
 
 

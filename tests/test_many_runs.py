@@ -109,30 +109,6 @@ def test_rows_of_runs_are_verdicts():
     assert "concurrent 1 of 1 60 1 of 1 21 to 100 %" in lines
 
 
-def test_strategies_are_compared(compared, tmp_path, capsys):
-    """Two strategies of two seeds in one batch, each run with the bits that it has alone."""
-    both = [*TWO, "--schedule", "single,concurrent", "--first", "alternate"]
-    assert command(*both, "--out", tmp_path / "both") == 0
-    output = capsys.readouterr().out
-    assert output.count("compiled in") == 1 and "single, seed 3: seed" in output
-    assert "strategy" in output and "not good: the interval" in output
-    with (tmp_path / "both" / "seeds.csv").open(newline="") as file:
-        rows = [tuple(r[n] for n in ("run", "schedule", "first")) for r in csv.DictReader(file)]
-    assert rows[1:3] == [
-        ("single/seed-3", "single", "control"),
-        ("concurrent/seed-2", "concurrent", "morphology"),
-    ]
-    alone = ["--seed", "3", "--episodes", "2", "--schedule", "single", "--first", "control"]
-    assert command(*BASE, *alone, "--out", tmp_path / "alone") == 0
-    assert stored(tmp_path / "both" / "single" / "seed-3") == stored(tmp_path / "alone")
-    for seed in ("seed-2", "seed-3"):
-        assert stored(tmp_path / "both" / "concurrent" / seed) == stored(compared[0] / seed)
-    assert command(*TWO, "--schedule", "single,singel", "--out", tmp_path / "no") == 2
-    assert "did you mean 'single'?" in capsys.readouterr().err
-    assert command(*TWO, "--schedule", "single,single", "--out", tmp_path / "no") == 2
-    assert "names a strategy more than once" in capsys.readouterr().err
-
-
 def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch, capsys):
     """A signal, a disk that is full for one of them, and runs that are at other episodes."""
     run = [*BASE, "--episodes", "3", "--seeds", "3-5", "--out", tmp_path / "runs"]

@@ -1,16 +1,13 @@
 """Meshes: mass and distance against closed forms, what is refused, what a repair says."""
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from codesign_jax.engines.structured.laws import shapes
 from codesign_jax.scene import meshes, objects, schema
-from codesign_jax.scene.meshes import grid, repair, surface
+from codesign_jax.scene.meshes import grid, surface
 from tests.helpers.solids import box, bracket, object_file
 
 
@@ -49,36 +46,7 @@ def test_mass_of_a_box_in_any_pose(tmp_path):
     assert -low == pytest.approx(pose[2, 3] - mesh.vertices[:, 2].min(), rel=1e-9)
 
 
-def test_mass_of_round_bodies(tmp_path):
-    """A prism of n sides and a geodesic ball, against cylinder and sphere."""
-    n, r, h = 96, 0.03, 0.036
-    found = solid(tmp_path, trimesh.creation.cylinder(r, 2 * h, sections=n))
-    area = np.sin(2 * np.pi / n) / (2 * np.pi / n)  # of a regular polygon over its circle
-    assert found.volume == pytest.approx(2 * np.pi * r**2 * h * area, rel=1e-9)
-    # The faceting takes (2 pi / n)^2 / 3 = 0.14 % off the second moment, the height takes nothing.
-    across = r**2 / 4 + h**2 / 3
-    np.testing.assert_allclose(found.inertia, [across, across, r**2 / 2], rtol=2e-3)
-    found = solid(tmp_path, trimesh.creation.icosphere(4, r))
-    # 5120 faces with edges of 0.07 r lie up to (0.07 r)^2 / (6 r) = 0.08 % r below the sphere.
-    assert found.volume == pytest.approx(4 / 3 * np.pi * r**3, rel=3e-3)
-    np.testing.assert_allclose(found.inertia, 0.4 * r**2, rtol=3e-3)
-
-
 # --- distance ------------------------------------------------------------------------------------
-
-
-def test_exact_distance_of_a_box_and_a_ball():
-    points = np.random.default_rng(0).uniform(-0.05, 0.05, (3000, 3))
-    mesh, half = box(), np.array([0.02, 0.025, 0.03])
-    found = surface.signed_distance(mesh.vertices, mesh.faces, points)
-    with jax.enable_x64(True):
-        expected = shapes._box(jnp.asarray(half)[:, None], jnp.asarray(points.T))[0]
-    np.testing.assert_allclose(found, expected, atol=1e-15)
-    ball = trimesh.creation.icosphere(3, 0.03)
-    found = surface.signed_distance(ball.vertices, ball.faces, points)
-    # 1280 faces with corners up to 0.1 r from their middles lie 0.1^2 / 2 r below the sphere.
-    error = found - (np.linalg.norm(points, axis=1) - 0.03)
-    assert -1e-12 < error.min() and error.max() < 0.005 * 0.03
 
 
 def test_exact_distance_is_the_least_over_all_faces():
@@ -241,17 +209,3 @@ def test_repair_mends_and_says_what(tmp_path):
         "closed a hole of 4 edges",
         "turned 1 of 14 faces, so that all point outwards",
     )
-
-
-def test_repair_keeps_and_makes_cavities(tmp_path):
-    """A ball in the cavity of a ball, beside another one: right and with every part turned."""
-    parts = [trimesh.creation.icosphere(2, r) for r in (0.03, 0.02, 0.01, 0.008)]
-    parts[1].invert()
-    parts[3].apply_translation([0.05, 0, 0])
-    right = trimesh.util.concatenate(parts)
-    faces, report = repair.repair(right.vertices, right.faces)[1:]
-    assert not report
-    np.testing.assert_array_equal(faces, right.faces)
-    turned = repair.repair(right.vertices, right.faces[:, ::-1])[1]
-    mended = trimesh.Trimesh(right.vertices, turned, process=False)
-    assert mended.volume == pytest.approx(right.volume, rel=1e-12)

@@ -1,6 +1,5 @@
 """Every optimiser by one protocol: what it finds, evosax, masks, resume, errors; schedules."""
 
-import sys
 from functools import partial
 
 import jax
@@ -178,23 +177,6 @@ def test_screened_searches_average_the_means_of_evosax(name):
         average = average + 4 / (t + 3) * (mean - average)
 
 
-def test_the_particles_of_the_default_are_what_was_simulated_as_particle_0():
-    """The newest average and those after one and two thirds: designs that the run can show."""
-    made = Screened(SPACE)
-    state, populations, infos = run(made, start(made), OPEN[:14])
-    for row in (1, 2):
-        np.testing.assert_array_equal(state.particles[row], populations[5 + 3 * row - 1, 0])
-    np.testing.assert_array_equal(state.particles[0], populations[-1, 0])
-    newest = np.tile(populations[-1, 0], (PARTICLES - 3, 1))
-    np.testing.assert_array_equal(state.particles[3:], newest)
-    np.testing.assert_array_equal(infos[-1].ancestors, [0, -1, -1, *[0] * (PARTICLES - 3)])
-    assert len(np.unique(state.particles, axis=0)) == made.finalists == 3
-    with_random, *_ = run(made, start(made), OPEN[:5])
-    random = populations[:3].reshape(-1, WIDTH)
-    order = np.argsort([info.cost for info in infos[:3]], axis=None)
-    np.testing.assert_array_equal(with_random.particles, random[order[:PARTICLES]])
-
-
 def test_with_few_parameters_the_final_test_takes_the_best_screened_designs_too():
     """They stay in rows 3 to 5, of any size of a run, while the strategy goes on."""
     few = Screened(optimize.Space(LOW[:2], HIGH[:2]))
@@ -292,15 +274,6 @@ def test_unknown_names_and_wrong_numbers_are_answered_in_words():
     with pytest.raises(ValueError, match="do not match"):
         made = make_optimizer("pso", SPACE)
         made.tell(start(made), jnp.zeros((PARTICLES, WIDTH)), np.zeros(3))
-
-
-def test_a_missing_extra_is_one_line_with_the_command(monkeypatch):
-    monkeypatch.setitem(sys.modules, "evosax", None)  # as if it were not installed
-    with pytest.raises(ModuleNotFoundError) as error:
-        make_optimizer("pso", SPACE)
-    assert str(error.value) == "pso needs evosax: pip install evosax"
-    assert optimize.problem("pso") == str(error.value)  # what the command says
-    assert make_optimizer("particle-filter", SPACE).space is SPACE
 
 
 # --- schedules ------------------------------------------------------------------------------------

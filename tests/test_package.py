@@ -2,10 +2,8 @@
 
 import json
 import os
-import re
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import pytest
@@ -83,25 +81,6 @@ print(json.dumps([cli.__file__, "optimize" in text.getvalue()]))
     assert path.startswith(str(installed)) and works
     [entry] = (installed).glob("codesign_jax-*.dist-info/entry_points.txt")
     assert "codesign = codesign_jax.cli:main" in entry.read_text()
-
-
-def test_extras_that_are_named_exist():
-    """In pages, notebooks and messages: pip only warns of one that does not."""
-    extras = {
-        *tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    }
-    places = ["README.md", "pyproject.toml", "Makefile", *ROOT.glob("docs/*.md")]
-    places += [
-        p for top in ("codesign_jax", "notebooks", "scripts") for p in (ROOT / top).rglob("*.py")
-    ]
-    texts = [(ROOT / place).read_text(encoding="utf-8") for place in places]
-    named = {
-        name
-        for text in texts
-        for names in re.findall(r"(?:codesign-jax|'\.|-e \.)\[([a-z,]+)\]", text)
-        for name in names.split(",")
-    }
-    assert {"report", "export", "parquet"} <= named <= extras
 
 
 HIDDEN = """

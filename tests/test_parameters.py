@@ -112,21 +112,6 @@ def test_designs_that_are_not_legal_are_simulated_with_a_warning():
     jax.eval_shape(lambda design: FULL.check(design), uniform)  # traced: the shape alone
 
 
-def test_pressures_that_may_be_kilopascals_are_hinted_at():
-    """141 Pa is in the range, which begins at 0, and moves nothing."""
-    design = FULL.default()
-    pressures = [i for i, name in enumerate(FULL.names) if name.startswith("pressure")]
-    design[pressures] = 141.0
-    hint = r"largest pressure is 141 Pa, next to none; did you mean 141000\? \(kPa given"
-    with pytest.warns(UserWarning, match=hint):
-        FULL.params(design)
-    with pytest.warns(UserWarning, match=hint):
-        unit_slips.refuse(parameters.unflatten(HAND, design))
-    for faint in (0.0, [141.0, 0.0, 0.0, 120e3]):  # no pressure; one finger left slack
-        design[pressures] = faint
-        FULL.params(design)
-
-
 def test_the_2d_preset_ties_lengths_and_fixes_the_rest():
     assert PLANAR.names == ("length", "arm_z") and PLANAR.is_morphology == (True, False)
     np.testing.assert_allclose(PLANAR.in_units(np.array(PLANAR.low)), [10, -60])

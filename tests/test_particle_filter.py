@@ -186,9 +186,6 @@ def test_bad_arguments_are_errors():
         told([1.0, 2.0, 3.0])
 
 
-# --- whole runs ----------------------------------------------------------------------------------
-
-
 # --- seeding -------------------------------------------------------------------------------------
 
 
@@ -308,15 +305,3 @@ def test_zero_weights_are_never_drawn_where_the_float32_sum_ends_off_one(n):
 def test_wrong_shapes_are_errors(shape):
     with pytest.raises(ValueError, match="shape"):
         stochastic_universal(0.5, jnp.ones(shape))
-
-
-@pytest.mark.parametrize("n", [7, 60])
-def test_agrees_with_blackjax(n):
-    reference = pytest.importorskip("blackjax.smc.resampling")
-    systematic = jax.jit(lambda key, w: reference.systematic(key, w, n))
-    rng = np.random.default_rng(n)
-    for key in jax.random.split(jax.random.key(n), 100):
-        weights = (1 / (0.2 + rng.uniform(0, 3, n))).astype(np.float32)
-        weights /= weights.sum()
-        ancestors = sample(jax.random.uniform(key, ()), weights)
-        np.testing.assert_array_equal(ancestors, systematic(key, weights))

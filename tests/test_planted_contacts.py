@@ -31,7 +31,7 @@ from tests.helpers.curled_hands import curled, kinds, on_palm
 from tests.helpers.planted_faults import Fault, chosen, cone_of, planted, simulate
 
 BOUND = 1e-8
-"""As in test_effects.py."""
+"""As in test_steps.py."""
 ITERATIONS = {"hull": 12, "spheres": 11}
 """Of Newton's method.  With many to spare a wrong matrix of the conjugate gradients would cost
 iterations and change no result."""

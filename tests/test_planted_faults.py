@@ -1,7 +1,7 @@
 """Faults planted in the kernel's own physics: the comparison with MuJoCo C notices each of them.
 
 One kernel simulates all faults, each in a world of its own beside a world that is sound, see
-`helpers/planted_faults.py`.  `test_effects.py` makes the same comparison of
+`helpers/planted_faults.py`.  `test_steps.py` makes the same comparison of
 sound kernels, with the same bounds; `test_planted_contacts.py` has the hull's stages and contacts
 between fingers.
 """
@@ -157,7 +157,7 @@ FAULTS = {
     "a softer contact": Fault(cones(lambda c: c._replace(spring=0.9 * c.spring))),
 }
 BOUNDS = {"acceleration": 1e-8, "position": 1e-12, "distance": 1e-12}
-"""As in test_effects.py."""
+"""As in test_steps.py."""
 
 
 @pytest.fixture(scope="module")

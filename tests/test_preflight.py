@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-import re
 
 import jax
 import mujoco
@@ -11,8 +10,8 @@ import pytest
 
 from codesign_jax import model, preflight, scene, start
 from codesign_jax.model.layout import first_on_palm
-from codesign_jax.scene import constants, hand, schema
-from tests.helpers.grasps import DATA, hand_world, pinch, random_worlds, still
+from codesign_jax.scene import hand, schema
+from tests.helpers.grasps import DATA, hand_world, random_worlds, still
 
 
 def hands(scene, count):
@@ -84,17 +83,6 @@ def test_fingers_inside_one_another_are_refused(surface):
     assert not preflight.refusals(alone, designs, ["together", "apart"])
 
 
-def test_a_tilt_in_radians_is_warned_of():
-    """It is a legal number of degrees."""
-    hand = scene.load("paper").hand
-    for tilt, warned in ((1.22, True), (-1.22, True), (0.0, False), (70.0, False)):
-        fingers = (dataclasses.replace(hand.finger[0], tilt=tilt), *hand.finger[1:])
-        tilted = dataclasses.replace(pinch(), hand=dataclasses.replace(hand, finger=fingers))
-        words = f"hand.finger.0.tilt = {tilt:g} deg .* did you mean {np.degrees(tilt):.3g}?"
-        found = [text for text in preflight._scene_warnings(tilted) if re.match(words, text)]
-        assert len(found) == warned
-
-
 # --- mounts of fingers ----------------------------------------------------------------------------
 
 
@@ -121,31 +109,6 @@ def test_base_points_stay_and_directions_turn(spread):
         level = np.cos(tilt) * np.array([np.cos(azimuth), np.sin(azimuth)])
         along = to_palm @ root.xmat.reshape(3, 3)[:, 0]
         np.testing.assert_allclose(along, [*level, -np.sin(tilt)], atol=1e-9)
-
-
-def test_base_points_are_constants():
-    """One traced program takes any base points; a circle through a base point gives its place."""
-    the_scene = coarse("paper")
-    start = the_scene.constants()
-    assert start.hand.finger[1].base == (0.036, -0.0175) and not hasattr(
-        start.hand.finger[1], "radius"
-    )
-    params, trial = hand_world(the_scene, spread=0.4)
-    params = jax.tree.map(np.float32, params)
-
-    @jax.jit
-    def places(values):
-        fields = model.model_fields(the_scene.with_constants(values), params, trial)
-        return fields.body_pos[model.layout(the_scene).stubs]
-
-    moved = tuple(f._replace(base=(f.base[0] + 0.01, f.base[1])) for f in start.hand.finger)
-    other = start._replace(hand=start.hand._replace(finger=moved))
-    constants.check(the_scene, other)
-    # Rounding of float32 of numbers of some 0.01 m.
-    np.testing.assert_allclose(places(other) - places(start), [[0.01, 0, 0]] * 4, atol=1e-8)
-    far = tuple(f._replace(base=(0.3, 0.0)) for f in start.hand.finger)
-    with pytest.raises(schema.InputError, match=r"finger\[0\].base\[0\] = 0.3 is outside"):
-        constants.check(the_scene, start._replace(hand=start.hand._replace(finger=far)))
 
 
 @pytest.mark.parametrize(

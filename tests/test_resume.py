@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 
-import jax
 import numpy as np
 import pytest
 
@@ -29,34 +28,6 @@ from tests.helpers.command_runs import (  # noqa: F401
     without,
 )
 from tests.helpers.tiny_run import RUN
-from tests.helpers.toy_engine import TINY
-
-
-def test_another_hand_compiles_nothing(finished, tmp_path):
-    """Neither a run nor an evaluation, once a hand of the same structure was simulated."""
-    text = (TINY.parent / "pinch.toml").read_text()
-    softer = text.replace("56e3", "53e3").replace("density = 1070.0", "density = 1100.0")
-    (tmp_path / "softer.toml").write_text(softer)
-    run = [*RUN, "--episodes", "2", "--out", tmp_path / "run"]
-    evaluate = ["evaluate", "--scene", TINY, "--engine", "mujoco", "--trials", "1"]
-    assert command(*run[:-1], tmp_path / "usual") == command(*evaluate) == 0
-    compiled = []
-
-    def listen(event, seconds, **details):
-        if event == "/jax/core/compile/backend_compile_duration":
-            compiled.append(details)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        for arguments in (run, evaluate):
-            assert command(*arguments, "--hand", tmp_path / "softer.toml") == 0
-        assert not compiled
-        # What the count would have seen of any other program.
-        jax.jit(lambda x: x + len(compiled))(np.ones(3))
-        assert compiled
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
-    assert stored(tmp_path / "run") != stored(finished)
 
 
 def test_same_command_again_changes_no_result(finished, tmp_path, capsys):

@@ -174,26 +174,6 @@ def test_a_kernel_is_refused_before_the_limit(monkeypatch):
     jax.jit(lambda *v: kernels.run(*v, rounds=3))(*kernels.numbers(2))
 
 
-def test_what_ctrl_c_left_in_jax_is_forgotten(monkeypatch):
-    """The next call works; another recursion is an error as ever."""
-    cleared, scene = [], grasps.pinch("sphere", 2)
-    words = ["Recursively calling <weakref> multiply"]
-
-    def stuck(*_):
-        if words and not cleared:
-            raise RecursionError(words[0])
-        return 3
-
-    monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(1))
-    program = reuse.Program(scene, stuck)
-    assert program(0, 0) == 3 and cleared == [1]
-    cleared.clear()
-    words[0] = "maximum recursion depth exceeded"
-    with pytest.raises(RecursionError, match="maximum"):
-        program(0, 0)
-    assert not cleared
-
-
 def test_a_forked_process_says_that_it_would_wait_for_ever(monkeypatch):
     """Only of a process that had simulated; its own first call is then an error at once."""
     program = reuse.Program(grasps.pinch("sphere", 2), lambda *_: 3)

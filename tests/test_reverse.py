@@ -528,16 +528,6 @@ def test_segments_have_the_bits_of_the_whole_path():
     assert (cut[1][:2, :20] != whole[1][:2, :20]).any()
 
 
-def test_segments_are_asked_for_in_words():
-    the_scene = grasps.pinch("sphere", links=2)
-    with pytest.raises(ValueError, match="at least"):
-        StructuredEngine(the_scene, segment=0)
-    with pytest.raises(ValueError, match="needs segment"):
-        StructuredEngine(the_scene, truncate=True)
-    engines = [StructuredEngine(the_scene, segment=n) for n in (5, 5, 6)]
-    assert engines[0] == engines[1] != engines[2]
-
-
 @pytest.mark.slow
 def test_gradients_of_random_worlds_are_finite():
     """2,000 worlds of the default scene in float32, a second each: through inflation and lift."""

@@ -175,14 +175,12 @@ def edge_across(place, depth):
     return straight(place), dense_skin.box(centre, turned([0, 1, 0], np.pi / 4), half)
 
 
-def edge_along(aside):
-    def case(place, depth):
-        half = np.array([0.02, 0.03, 0.03])
-        low = HEIGHT / 2 * (1 - (1 - (aside / (WIDTH / 2)) ** 4) ** 0.25)
-        centre = np.array([0, aside, low + depth - np.sqrt(2) * half[1]])
-        return straight(place), dense_skin.box(centre, turned([1, 0, 0], np.pi / 4), half)
-
-    return case
+def edge_along(place, depth):
+    """An edge along the finger, 5 mm beside its middle."""
+    half, aside = np.array([0.02, 0.03, 0.03]), 0.005
+    low = HEIGHT / 2 * (1 - (1 - (aside / (WIDTH / 2)) ** 4) ** 0.25)
+    centre = np.array([0, aside, low + depth - np.sqrt(2) * half[1]])
+    return straight(place), dense_skin.box(centre, turned([1, 0, 0], np.pi / 4), half)
 
 
 def corner(place, depth):
@@ -194,78 +192,44 @@ def corner(place, depth):
     )
 
 
-def half_over(place, depth):
-    half = np.array([0.02, 0.05, 0.03])
-    return straight(place), dense_skin.box(np.array([half[0], 0, depth - half[2]]), np.eye(3), half)
-
-
 def sphere(place, depth):
     return straight(place), dense_skin.ball(np.array([0, 0, depth - 0.03]), 0.03)
 
 
-def cylinder(place, depth):
-    centre = np.array([0, 0, depth - 0.03])
-    return straight(place), dense_skin.cylinder(centre, np.array([0, 1.0, 0]), 0.03)
+def crossed(place, depth):
+    other = straight((7 * place + 0.3) % 1, turn=turned([0, 0, 1], np.pi / 2))
+    return straight(place), other._replace(joints=other.joints + [0, 0, HEIGHT - depth])
 
 
-def crossed(angle):
-    def case(place, depth):
-        other = straight((7 * place + 0.3) % 1, turn=turned([0, 0, 1], np.radians(angle)))
-        move = np.array([0, 0, HEIGHT - depth])
-        return straight(place), other._replace(joints=other.joints + move)
-
-    return case
+def on_another(place, depth):
+    """All of a short finger on a long one."""
+    other = dense_skin.finger(0.16, base=np.array([-0.03 - 0.02 * place, 0, HEIGHT - depth]))
+    return dense_skin.finger(0.08), other
 
 
-def beside(away, side):
-    """All of a short finger on a long one, whose base is moved by `away` and towards `side`."""
-
-    def case(place, depth):
-        move = np.array(away) + depth * np.array(side)
-        other = dense_skin.finger(0.16, base=move - np.array([0.03 + 0.02 * place, 0, 0]))
-        return dense_skin.finger(0.08), other
-
-    return case
+def tip_on_side(place, depth):
+    """A tip on the upper side, from straight above."""
+    other = dense_skin.finger(LENGTH, turn=turned([0, 1, 0], np.pi / 2))
+    move = np.array([0, 0, HEIGHT + LENGTH - depth])
+    move[0] = -HEIGHT / 2
+    return straight(place), other._replace(joints=other.joints + move)
 
 
-def tip_on_side(angle):
-    """A tip on the upper side, from straight above (90 degrees) or inclined along it."""
-
-    def case(place, depth):
-        turn = turned([0, 1, 0], np.radians(angle))
-        other = dense_skin.finger(LENGTH, turn=turn)
-        lowest = ((np.abs(turn[2]) * other.half) ** (4 / 3)).sum() ** 0.75
-        middle = turn @ [LENGTH - other.half[0], 0, HEIGHT / 2]
-        move = np.array([0, 0, HEIGHT + lowest - depth]) - middle
-        return straight(place), other._replace(joints=other.joints + move)
-
-    return case
-
-
-WHOLE = ("flat", "rolled by 15 degrees", "rolled by 45 degrees", "wrapped")
+WHOLE = ("flat", "rolled by 45 degrees", "wrapped")
 """Cases in which all of a finger touches."""
 FIELDS = {
     "flat": flat(0.0),
-    "rolled by 15 degrees": flat(np.radians(15)),
     "rolled by 45 degrees": flat(np.radians(45)),
     "wrapped": wrapped,
     "sphere": sphere,
-    "cylinder across": cylinder,
     "edge across": edge_across,
-    "edge along": edge_along(0.0),
-    "edge along, 5 mm aside": edge_along(0.005),
+    "edge along, 5 mm aside": edge_along,
     "corner": corner,
-    "half over an edge": half_over,
 }
 FINGERS = {
-    "crossed at 90 degrees": crossed(90),
-    "crossed at 30 degrees": crossed(30),
-    "one on another": beside((0, 0, HEIGHT), (0, 0, -1)),
-    "one on another, 8 mm aside": beside((0, 0.008, HEIGHT), (0, 0, -1)),
-    "side by side": beside((0, WIDTH, 0), (0, -1, 0)),
-    "tip on a side": tip_on_side(90),
-    "tip on a side at 60 degrees": tip_on_side(60),
-    "tip on a side at 30 degrees": tip_on_side(30),
+    "crossed at 90 degrees": crossed,
+    "one on another": on_another,
+    "tip on a side": tip_on_side,
 }
 
 # Force over the reference's at each of `DEPTHS` from 0.5 mm on, least and most over the places; the
@@ -273,34 +237,22 @@ FINGERS = {
 # Within 20 % where a surface lies on a smooth one, within 30 % between fingers.  What is wider:
 # * Below 1 mm two fingers have the stiffness of 1 mm, `NOMINAL` of each, which lets them begin.
 # * A ring takes what it touches as a plane across its whole section.  On a ball and an edge, which
-#   touch a part of it, and beside a finger that ends 8 mm aside, it pushes too hard; less as it
-#   sinks in.  A skin on a sharp edge is no truth either: a solid of rubber pushes ten times as hard
-#   as its skin.
+#   touch a part of it, it pushes too hard; less as it sinks in.  A skin on a sharp edge is no truth
+#   either: a solid of rubber pushes ten times as hard as its skin.
 # * A tip's end is flat for the law, whose area is reached at once, and round for the skin.  The
-#   normal at a tip is not that of the least overlap: it acts up to 1 mm ahead of touch.  Where the
-#   tip's finger comes second, the side's rings see it, with half of that force.
-# * Of a finger half over an edge the last ring pushes beyond it.
+#   normal at a tip is not that of the least overlap: it acts up to 1 mm ahead of touch.
 SMOOTH, PAIRED = (0.8, 1.2), (0.7, 1.3)
 EXPECTED = {
     "flat": ([SMOOTH] * 5, 1, 1),
-    "rolled by 15 degrees": ([SMOOTH] * 5, 1, 1),
     "rolled by 45 degrees": ([SMOOTH] * 5, 1, 1),
     "wrapped": ([SMOOTH] * 5, 6, 3),
     "sphere": ([(2.3, 2.8), (1.9, 2.2), (1.6, 1.9), (1.5, 1.8), (1.4, 1.6)], 1, 0.5),
-    "cylinder across": ([(1.2, 1.4), (1.1, 1.3), *[SMOOTH] * 3], 1, 0.5),
     "edge across": ([(4, 30), (9, 14), (6, 8), (4, 6), (2, 3)], 13, 1.5),
-    "edge along": ([(50, 65), (30, 40), (20, 25), (14, 18), (9, 12)], 3, 1.5),
     "edge along, 5 mm aside": ([(25, 35), (20, 27), (14, 18), (11, 14), (6, 8)], 30, 5),
     "corner": ([(150, 1200), (200, 320), (80, 110), (40, 58), (14, 20)], 14, 1.5),
-    "half over an edge": ([(1.6, 1.9), (1.7, 2.0), (1.8, 2.1), (1.8, 2.2), (1.9, 2.4)], 11, 9),
     "crossed at 90 degrees": ([(1.2, 1.8), *[PAIRED] * 4], 1, 1),
-    "crossed at 30 degrees": ([(1.2, 1.8), *[PAIRED] * 4], 1, 1),
     "one on another": ([(1.0, 1.5), *[PAIRED] * 4], 1, 2.5),
-    "one on another, 8 mm aside": ([(1.9, 2.9), *[(1.2, 1.4)] * 4], 14, 5),
-    "side by side": ([(1.0, 1.5), *[PAIRED] * 4], 1, 2.5),
     "tip on a side": ([(2.8, 3.5), (1.7, 2.1), (1.3, 1.6), *[PAIRED] * 2], 3, 1.5),
-    "tip on a side at 60 degrees": ([(1, np.inf), (14, 17), (4, 6), (3, 4), (1.5, 2.5)], 13, 2),
-    "tip on a side at 30 degrees": ([(22, 27), (10, 13), (5, 7), (3, 5), (2, 3)], 10, 4),
 }
 
 

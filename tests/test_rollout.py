@@ -95,24 +95,6 @@ def test_commands_of_a_grasp():
     )
 
 
-def test_the_disturbance_grows_and_alternates():
-    u = commands()
-    roll, pitch = u[:, 3] - 0.1, u[:, 5] + 0.2
-    np.testing.assert_array_equal(u[:, 4], u[0, 4])  # yaw is never shaken
-    period = round(100 / 1.5)
-    assert np.abs(roll[450 : 450 + period]).max() > 0.01  # the first period rolls,
-    np.testing.assert_allclose(pitch[450 : 450 + period], 0.0, atol=1e-6)
-    second = slice(450 + period + 1, 450 + 2 * period)
-    assert (
-        np.abs(pitch[second]).max() > np.abs(roll[450 : 450 + period]).max()
-    )  # the second pitches
-    np.testing.assert_allclose(roll[second], 0.0, atol=1e-6)
-    largest = np.abs(np.stack([roll, pitch])).max()
-    assert 0.8 * np.deg2rad(40) < largest <= np.deg2rad(40) + 1e-6
-    np.testing.assert_allclose(u[850:, 3:6], u[850:, 3:6] * 0 + [0.1, 0.3, -0.2], atol=1e-6)
-    assert np.abs(np.diff(u[:, 3:6], axis=0)).max() < 0.08  # no jumps: 40 deg at 1.5 Hz in a step
-
-
 def test_the_arm_carries_the_trials_tilt():
     tilted = commands(arm_tilt=np.array([0.05, -0.07]))
     difference = tilted - commands()

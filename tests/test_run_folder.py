@@ -5,8 +5,8 @@ import shutil
 
 import pytest
 
-from codesign_jax import files, runs, scene
-from codesign_jax.runs import directory, manifest, scene_files
+from codesign_jax import runs, scene
+from codesign_jax.runs import directory, scene_files
 from codesign_jax.runs.directory import open_run
 from codesign_jax.scene.schema import InputError
 from tests.helpers.command_runs import command, own_workplace, snapshot, without  # noqa: F401
@@ -117,28 +117,6 @@ def test_fresh_deletes_no_file_that_is_not_the_runs(kind, run, tmp_path):
     words = {"file": "figures/my own.png in", "folder": "tests.csv in"}
     assert words.get(kind, "failures in") in str(refused.value)
     assert snapshot(run) == before and (other / "picture.png").exists()
-
-
-def test_fresh_that_was_cut_short_can_be_given_again(run, monkeypatch):
-    number = len(directory._all(run))
-    remove = files.remove
-    for moment in (0, 1, number // 2):
-        count = [0]
-
-        def killed(path, count=count, moment=moment):
-            if count[0] == moment:
-                raise KeyboardInterrupt
-            count[0] += 1
-            remove(path)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(files, "remove", killed)
-            with pytest.raises(KeyboardInterrupt):
-                start(run, fresh=True)
-        assert (run / "provenance.json").exists(), "the last file to go: it is still a run"
-    assert start(run, fresh=True) == []
-    assert manifest.read_provenance(run)["settings"]["particles"] == SETTINGS.particles
-    assert not (run / "checkpoints").exists() and not (run / "figures").exists()
 
 
 def test_a_run_has_no_files_but_its_own(run):

@@ -13,7 +13,7 @@ import pytest
 
 from codesign_jax import runs
 from codesign_jax.batch import Batch
-from codesign_jax.runs import checkpoint, choice, manifest, tables
+from codesign_jax.runs import choice, manifest, tables
 from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.scene.schema import InputError
 from scripts import faults
@@ -69,27 +69,6 @@ def test_a_resumption_mends_damage_and_says_so(name, how, run, whole, capsys):
     assert_same_run(run, whole)
 
 
-def test_every_command_says_which_checkpoint_it_takes(run, tmp_path, capsys):
-    """All but export, which refuses; what is simulated is not asked for."""
-    faults.damaged(run / "checkpoints" / str(NEWEST) / "default" / "manifest.ocdbt", "flipped")
-    before = snapshot(run)
-    words = f"Read instead is checkpoint {NEWEST - 1}"
-    page = tmp_path / "report.html"
-    for arguments in (
-        ["evaluate", run, "--dry-run"],
-        ["landscape", "--run", run, "--dry-run"],
-        ["report", run, "--no-replay", "--out", page],
-    ):
-        assert command(*arguments) == 0
-        error = capsys.readouterr().err
-        assert error.startswith("warning: ") and error.count(words) == 1, arguments
-    assert words in page.read_text(encoding="utf-8")
-    assert command("export", run, "--out", tmp_path / "models") == 2
-    error = capsys.readouterr().err
-    assert words in error and "Nothing is exported" in error and not (tmp_path / "models").exists()
-    assert snapshot(run) == before
-
-
 def relabelled(run, identity):
     """Saves the newest step of a run as one of a run with this identity, or with none."""
     own = manifest.read_provenance(run)["id"]
@@ -111,39 +90,11 @@ def test_checkpoints_of_another_run_are_refused(identity, run, capsys):
     assert snapshot(run / "checkpoints") == before
 
 
-@pytest.mark.parametrize("change", [{"particles": 5}, {"trials": 2}, {"episodes": 2}])
-def test_settings_that_are_not_those_of_the_checkpoints_are_refused(change, run):
-    """Such as those of an older copy of provenance.json."""
-    content = manifest.read_provenance(run)
-    content["settings"] |= change
-    manifest.write(run, content)
-    with pytest.raises(InputError, match="its checkpoints have 3 episodes of 4 particles and 3"):
-        runs.load_record(run)
-
-
 def test_a_run_of_a_newer_version_is_refused(run):
     content = manifest.read_provenance(run)
     manifest.write(run, content | {"schema": manifest.SCHEMA + 1})
     with pytest.raises(InputError, match="made by a newer version of codesign-jax"):
         runs.read_run(run)
-
-
-@pytest.mark.parametrize("number", [errno.EACCES, errno.EIO, errno.EMFILE])
-def test_a_step_that_cannot_be_read_now_is_kept(number, run, monkeypatch, capsys):
-    """It is not damaged: permissions come back, and so do network disks."""
-    before = snapshot(run / "checkpoints")
-
-    def refused(path):
-        raise OSError(number, os.strerror(number), str(path))
-
-    monkeypatch.setattr(checkpoint, "file_digest", refused)
-    assert command(*RUN, "--out", run) == 1
-    error = capsys.readouterr().err
-    assert f"checkpoint {NEWEST} in " in error and os.strerror(number) in error
-    assert "nothing was changed" in error and "go on from the one before" in error
-    with pytest.raises(InputError, match="cannot be read"):
-        runs.load_record(run)
-    assert snapshot(run / "checkpoints") == before
 
 
 def test_changed_scene_files_are_refused_by_all_that_read_the_run(run, capsys):

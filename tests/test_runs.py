@@ -1,31 +1,28 @@
 """Run folders: scene files, settings, tables and the signals that stop a run."""
 
 import csv
-import io
 import os
 import re
 import signal
 import time
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rich.console import Console
 
-from codesign_jax import cli, codesign, files, optimize, runs, scene, sizes
+from codesign_jax import codesign, files, optimize, runs, scene
 from codesign_jax.runs import columns, loop, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs import settings as settings_module
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.interrupts import Interrupts, Stopped
-from codesign_jax.runs.progress import Live, Progress, Report, Voice
+from codesign_jax.runs.progress import Progress, Report, Voice
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.scene_files import write_scene
-from codesign_jax.scene import effects, library, parameters
+from codesign_jax.scene import library, parameters
 from tests.helpers import episodes
 from tests.helpers.toy_engine import tiny
 
@@ -115,33 +112,6 @@ def test_the_planned_test_is_the_one_that_is_simulated(episodes):
     tested, _ = loop.finalists(plan, np.asarray(state.particles))
     assert len(tested) * own.trials * own.test_rounds == plan.test_grasps
     assert len(tested) == (8 if episodes <= 5 else 6)
-
-
-def test_sizes_are_told_as_they_are(capsys):
-    """The help and the pages have the numbers of `sizes`, and the engines that refuse a scene."""
-    with pytest.raises(SystemExit):
-        cli.main(["optimize", "--help"])
-    told = " ".join(re.sub(r"[│\n]", " ", capsys.readouterr().out).split())
-    for name in sizes.Sizes._fields:
-        assert f"default: {sizes.text(name)}." in told
-    assert "one with each object, and at least 3; the paper's are 6" in sizes.text("trials")
-    two, many = sizes.SCREENED["2d"], sizes.SCREENED[""]
-    assert f"{many.episodes} otherwise; the paper's are 64 and 128" in sizes.text("episodes")
-    pages = Path(__file__).parents[1] / "docs"
-    assert f"episodes ({sizes.text('episodes')})" in (pages / "concepts.md").read_text()
-    for words in (
-        f"{many.particles} particles ({two.particles} in 2D) in one trial with each object "
-        f"(three where there are fewer objects), {many.episodes} episodes ({two.episodes} in 2D), "
-        f"and {many.test_trials} more trials ({two.test_trials} in 2D)",
-        f"as in the paper: {' particles, '.join(map(str, sizes.PAPER['2d'][:2]))} trials, 64 epi",
-    ):
-        assert words in " ".join((pages / "command_line.md").read_text().split())
-    # What the help says of the engines is what they refuse.
-    assert "not of the default one, mujoco (C, float64) and mjx (stock)" in told
-    for engine in effects.ENGINES:
-        own = scene.load("paper"), scene.load("paper_spheres")
-        refused = [bool(effects.refusals(the_scene.effects, engine)) for the_scene in own]
-        assert refused == [engine != "structured", False]
 
 
 def test_settings_report_every_problem():
@@ -239,22 +209,3 @@ def test_time_left_includes_the_tests(capsys):
     assert lines[0].endswith("ETA 10:00") and lines[1].endswith("ETA 2:00")
     assert lines[2] == "final test 300/600 grasps  6.0 grasps/s  ETA 1:10"
     assert len(lines) == 3  # the second part came at once: a line now and then
-
-
-def test_silence_is_broken_where_there_is_no_terminal(monkeypatch, capsys):
-    """Every five seconds, counted from what was printed last."""
-    clock = SimpleNamespace(now=100.0)
-    monkeypatch.setattr(
-        "codesign_jax.runs.progress.time", SimpleNamespace(monotonic=lambda: clock.now)
-    )
-    live, said = Live(Console(file=io.StringIO())), {}
-    live.begin("simulating")
-    for second in range(1, 30):
-        clock.now = 100.0 + second
-        if second == 18:
-            live.message("said")
-        live.tick()
-        said[second] = capsys.readouterr().err
-    told = {second: text for second, text in said.items() if text}
-    assert list(told) == [5, 10, 15, 23, 28]
-    assert told[5] == "simulating: 0:05\n" and told[28] == "simulating: 0:28\n"

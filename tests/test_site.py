@@ -8,9 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from codesign_jax import model
-from scripts import reference_page, site_pages
-from tests.helpers import grasps
+from scripts import reference_page
 from tests.helpers.browsers import chromium, chromium_launcher  # noqa: F401
 
 ROOT = Path(__file__).parent.parent
@@ -61,44 +59,6 @@ def test_every_key_of_the_built_in_files_is_in_the_reference(heading):
     files = sorted(BUILT_IN[heading].glob("*.toml"))
     keys = {key for f in files for key in used(heading, "", tomllib.loads(f.read_text("utf-8")))}
     assert files and keys and not keys - on_page
-
-
-def test_the_layout_of_qpos_is_that_of_mujocos_model():
-    scene = grasps.pinch()
-    compiled = model.compile_template(scene)
-    sizes = {"F": scene.num_fingers, "N": scene.discretization.links}
-    sizes["A"] = (compiled.nv - 12) // (sizes["F"] * sizes["N"])
-    expected = {}
-    for joint, index, entries, _ in reference_page.qpos(scene):
-        many = joint.startswith("finger_f")
-        for f in range(sizes["F"] if many else 1):
-            for i in range(1, sizes["N"] + 1 if many else 2):
-                formula = re.sub(r"(?<=[a-zA-Z)]) (?=[A-Z])", " * ", index.replace("−", "-"))
-                name = joint.replace("_f_", f"_{f}_").replace("_i", f"_{i}") if many else joint
-                expected[name] = eval(formula, sizes | {"f": f, "i": i}), entries
-    ends = [*compiled.jnt_qposadr[1:], compiled.nq]
-    joints = [compiled.joint(j) for j in range(compiled.njnt)]
-    starts = compiled.jnt_qposadr
-    found = {j.name: (s, e - s) for j, s, e in zip(joints, starts, ends, strict=True)}
-    assert found == expected
-
-
-@pytest.mark.parametrize(
-    "link, page, expected",
-    [
-        ("[a](../CONTRIBUTING.md#rules)", "limits.md", "[a](contributing.md#rules)"),
-        ("[`CONTRIBUTING.md`](../CONTRIBUTING.md)", "limits.md", "[contributing](contributing.md)"),
-        ("[`a_b.md`](a_b.md)", "limits.md", "[a b](a_b.md)"),
-        ("[a](docs/effects.md)", "index.md", "[a](effects.md)"),
-        ("[a](../physics.md)", "notes/x.md", "[a](../physics.md)"),
-        ("[a](../hands/tripod3.toml)", "limits.md", "[a](repository/hands/tripod3.toml)"),
-        ("[a](https://b.c/d.md)", "limits.md", "[a](https://b.c/d.md)"),
-        ("[a](nowhere.md)", "limits.md", "[a](nowhere.md)"),  # MkDocs says that it is broken
-    ],
-)
-def test_links_of_the_repository_become_links_of_the_site(link, page, expected):
-    source = {"index.md": "README.md"}.get(page, f"docs/{page}")
-    assert site_pages._relinked(link, source, page) == expected
 
 
 def build(root, place):

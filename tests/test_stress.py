@@ -1,7 +1,6 @@
 """A design under other conditions, and what is amiss with the design itself."""
 
 import io
-import re
 
 import jax
 import numpy as np
@@ -15,7 +14,6 @@ from codesign_jax.model import overlap
 from codesign_jax.report import stress
 from codesign_jax.scene import beams, parameters
 from tests.helpers.command_runs import command, finished_run, own_workplace  # noqa: F401
-from tests.helpers.toy_engine import TINY
 
 PAPER = scene.load("paper")
 SPACE = parameters.design_space(PAPER.hand, "full")
@@ -165,17 +163,3 @@ def test_stress_is_told_kept_and_reported(finished, capsys):
     assert "Under other conditions, 12 grasps each" in page and "neo-Hookean bending law" in page
     other = settings.__class__(**{**vars(settings), "seed": settings.seed + 1})
     assert reference.stored_stress(finished, other) is None
-
-
-def test_evaluate_stresses_a_design(capsys):
-    """The row of another mass is what an evaluation with that mass finds, in the same trials."""
-    design = ["--scene", TINY, "--engine", "mujoco", "--design", "length=100", "--trials", "3"]
-    assert command("evaluate", *design, "--stress") == 0
-    tiny = scene.load(TINY)
-    name, numbers = next(stress.variants(tiny))
-    kept = re.search(rf"{name} +(\d+ %) of 3 ", capsys.readouterr().out)
-    assert kept and name.startswith("objects of ")
-    pairs = zip(tiny.objects.object, numbers.objects.object, strict=True)
-    masses = [f"objects.object.{o.name}.mass={n.mass}" for o, n in pairs]
-    assert command("evaluate", *design, "--set", *masses) == 0
-    assert f"keeps {kept[1]} of 3 fresh grasps" in capsys.readouterr().out

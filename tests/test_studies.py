@@ -1,6 +1,5 @@
 """Studies: sets of constants and waves, rates and their worlds, searches in lock step."""
 
-import json
 import re
 
 import jax
@@ -10,7 +9,7 @@ import scipy.stats
 
 from codesign_jax import scene
 from codesign_jax.scene import parameters, schema
-from scripts import benchmark, calibration, search
+from scripts import benchmark, calibration
 from scripts.calibration import OPEN
 from scripts.shared import statistics
 
@@ -109,54 +108,6 @@ def test_rank_correlation_equals_its_definition(ties):
     assert statistics.spearman(a, a + b) == pytest.approx(np.corrcoef(x, y)[0, 1], abs=1e-12)
 
 
-def test_winners_are_the_best_final_particle_of_each_concurrent_run():
-    """Each as often as any other, and in a second round with another object."""
-    chosen = scene.load("paper")
-    found, objects = benchmark.winners(chosen), len(chosen.objects.object)
-    with np.load(benchmark.WINNERS) as file:
-        particles, cost = file["final_particles"][2], file["test_worst"][2]
-        assert file["strategies"][2] == "concurrent" and len(found) == 30
-    for design, candidates, costs in zip(found, particles, cost, strict=True):
-        [best] = {costs[k] for k, c in enumerate(candidates) if np.array_equal(c, design)}
-        assert best == costs.min()
-    worlds = benchmark.make_worlds(chosen, "winners", 60)
-    np.testing.assert_array_equal(worlds.params.length[:30], worlds.params.length[30:])
-    assert not np.any(worlds.trials.shape[:30] == worlds.trials.shape[30:])
-    random = benchmark.make_worlds(chosen, "random", 60)
-    assert len(np.unique(random.params.length, axis=0)) == 60 // objects
-    assert np.bincount(random.trials.shape).tolist() == [60 // objects] * objects
-
-
-RUN = {"platform": "cpu", "cpus": 2, "commit": "0123456789", "jax": "0.1", "date": "2026-01-02T03"}
-
-
-def record(engine, rate, **more):
-    base = {"scene": "paper", "designs": "winners", "engine": engine, "worlds": 60, "run": 0}
-    return {**base, "grasps_per_s": rate, **more}
-
-
-def test_tables_are_those_of_the_records_and_a_second_measurement_replaces_the_first():
-    records = []
-    for new in (record("structured", 1.0), record("structured", 44.4, verdicts="0011")):
-        records = benchmark.replaced(records, new)
-    records = benchmark.replaced(records, record("MuJoCo C 4.0.0", 8.0, verdicts="0111"))
-    gpu = {**RUN, "platform": "gpu", "device": "NVIDIA H100 80GB HBM3"}
-    larger = {"runs": [gpu], "records": [record("structured", 1234.0, worlds=16384)]}
-    files = [{"runs": [RUN], "records": records}, larger]
-    assert benchmark.rates(files).splitlines() == [
-        "| grasps a second (time of a batch) | 2 CPU cores, winners | one H100, winners |",
-        "| --- | --- | --- |",
-        "| 60 grasps, an episode of the paper's 2D | 44 (1.4 s) | – |",
-        "| 16,384 grasps | – | 1,200 (13 s) |",
-    ]
-    assert benchmark.machines(files) == (
-        "Measured on 2 CPU cores, JAX 0.1, 2026-01-02; on one H100, JAX 0.1, 2026-01-02 "
-        "(`docs/data/rates_*.json`)."
-    )
-    row = "| paper | 2 CPU cores, 60 grasps | MuJoCo C 4.0.0 | 8.0 | 44 | 6 | 3 of 4 |"
-    assert benchmark.peers(files).splitlines()[2:] == [row]
-
-
 @pytest.mark.parametrize("page", benchmark.PAGES)
 def test_tables_of_the_pages_are_those_of_the_data(page):
     text, files = (benchmark.ROOT / page).read_text(encoding="utf-8"), benchmark.read()
@@ -166,26 +117,3 @@ def test_tables_of_the_pages_are_those_of_the_data(page):
 
 
 # --- searches -------------------------------------------------------------------------------------
-
-
-def test_the_page_gets_a_table_and_a_figure(tmp_path):
-    row = {"optimizer": "ours", "preset": "2d", "grasps": [10, 20, 40]}
-    row |= {"provenance": {"commit": "abc12345"}}
-    row["kept"] = [[0.5, 0.96, 0.2, 0.96], [0.96, 0.97, 1.0, 0.99], [0.96, 0.97, 1.0, 0.5]]
-    (tmp_path / "2d-ours.json").write_text(json.dumps(row))
-    whole = row | {"optimizer": "screened-es", "preset": "23d"}
-    part = whole | {"optimizer": "screened-es:tests=0"}
-    (tmp_path / "23d-screened-es.json").write_text(json.dumps(whole))
-    (tmp_path / "23d-tests0.json").write_text(json.dumps(part))
-    page = tmp_path / "page.md"
-    page.write_text("<!-- search:begin -->\n<!-- search:end -->\n")
-    figure = tmp_path / "search.png"
-    command = ["--report", str(tmp_path), "--page", str(page), "--figure", str(figure)]
-    assert search.main(command) == 0
-    lines = page.read_text().splitlines()
-    assert lines[4].startswith("| `screened-es` | 23d |"), "23 parameters first"
-    line = lines[5]
-    assert "| `ours` | 2d | three | 4 | 40 | 0.965 |" in line and "0.75 (0.30 to 0.95)" in line
-    assert not [text for text in lines if "tests=0" in text], "a part of it left out"
-    assert line.endswith("| not reached | abc1234 |") and figure.exists()
-    assert search.reached(row | {"kept": row["kept"][:2]}, 0.9) == "20"

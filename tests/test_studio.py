@@ -165,23 +165,6 @@ def test_a_tab_shows_judges_improves_and_saves(desk, capsys, monkeypatch):
     assert "design: length=100 mm arm_z=0 mm" in capsys.readouterr().out
 
 
-def test_a_tab_answers_nonsense_and_goes_on(desk):
-    tab = Tab(desk)
-    for text, part in (
-        ("{", "Expecting"),
-        ("[]", "'list' object"),
-        ('{"close": 1}', "'close'"),
-        (show([1.0]), "a design has 2 numbers"),
-        (show([1.0, float("nan")]), "a design has 2 numbers"),
-        (show([1.0, 2.0], object=3), "3 is not one of the choices"),
-        (show([1.0, 2.0], accuracy="../x"), "'../x' is not one of the choices"),
-    ):
-        tab.receive(text)
-        assert part in settled(tab)["error"]
-    tab.receive('{"save": true}')
-    assert settled(tab)["error"] == "there is no grasp of a design yet"
-
-
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory):
     """A studio that is served, and its address."""

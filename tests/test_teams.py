@@ -45,7 +45,8 @@ def test_a_step_reads_nothing_that_it_has_not_written(monkeypatch):
     """
     effects = gpu_cases.EFFECTS["hull and fingers"]
     effects = {name.removeprefix("effects__"): value for name, value in effects.items()}
-    scene = scenes.load("paper_spheres", overrides={"effects": effects})
+    small = {"effects": effects, "discretization": {"links": 3}}
+    scene = scenes.load("paper_spheres", overrides=small)
     fields, ctrl = work.inputs(scene, work.make_worlds(scene, 64))
     advance = Step.advance
 
@@ -63,9 +64,8 @@ def test_a_step_reads_nothing_that_it_has_not_written(monkeypatch):
 
     monkeypatch.setattr(Step, "advance", spoiled)
     # Kernels are kept by their scene and limits: nobody else has this tolerance.
-    program = Program(
-        scene, Limits(8, 8, 1.02e-6), backend="cpu", width=16 * teams.TEAM, team=teams.TEAM
-    )
+    how = {"backend": "cpu", "width": 4 * teams.TEAM, "team": teams.TEAM}
+    program = Program(scene, Limits(8, 8, 1.02e-6), **how)
     start = StructuredEngine(scene).reset(fields)
     run = jax.jit(lambda f, c: program.simulate(world_constants(scene, f), start, c))
     found, last = run(fields, ctrl[:, :5])

@@ -7,53 +7,17 @@ import numpy as np
 import scipy.optimize
 
 from codesign_jax import model
-from codesign_jax.engines.mujoco import world_model
 from codesign_jax.model import layout
-from tests.helpers import grasps
 
 FLOOR = 1e-6
 """Under the roots of the law, which have no slope at zero; see `laws.rings`."""
 
 
-def hull_scene(shape, links=3, **density):
-    settings = {f"discretization__{k}": v for k, v in density.items()}
-    return grasps.pinch(shape, links=links, effects__surface="hull", **settings)
-
-
-def world(scene, **params):
-    """Parameters, trial, model fields, oracle model and commands of one hand, in float64."""
-    hand, trial = grasps.hand_world(scene, **params)
-    trial = trial._replace(yaw=np.array(0.2), position=np.array([0.003, -0.002]))
-    fields, ctrl = grasps.world_inputs(scene, hand, trial)
-    return hand, trial, fields, world_model(scene, fields), np.asarray(ctrl)
-
-
 def distance(scene, data, points):
-    """Distance to the object and its gradient, world frame, by closed forms."""
-    shape, centre = scene.objects.object[0], data.body("object").xpos
-    half, turn = np.array(shape.half_sizes), data.body("object").xmat.reshape(3, 3)
-    local = (points - centre) @ turn
-    if shape.type == "sphere":
-        length = np.linalg.norm(local, axis=1)
-        return length - half[0], (local / length[:, None]) @ turn.T
-    if shape.type == "cylinder":
-        beside = np.hypot(local[:, 0], local[:, 1])
-        excess = np.stack([beside - half[0], np.abs(local[:, 2]) - half[1]], 1)
-        out = np.maximum(excess, 0)
-        outside = np.linalg.norm(out, axis=1)
-        face = np.eye(2)[excess.argmax(1)]
-        slope = np.where(outside[:, None] > 0, out / np.maximum(outside, 1e-300)[:, None], face)
-        axes = [local[:, 0] / beside, local[:, 1] / beside, np.sign(local[:, 2])]
-        gradient = np.stack(
-            [slope[:, 0] * axes[0], slope[:, 0] * axes[1], slope[:, 1] * axes[2]], 1
-        )
-        return np.where(outside > 0, outside, excess.max(1)), gradient @ turn.T
-    excess = np.abs(local) - half
-    out = np.maximum(excess, 0)
-    outside = np.linalg.norm(out, axis=1)
-    face = np.eye(3)[excess.argmax(1)]
-    gradient = np.where(outside[:, None] > 0, out / np.maximum(outside, 1e-300)[:, None], face)
-    return np.where(outside > 0, outside, excess.max(1)), (gradient * np.sign(local)) @ turn.T
+    """Distance to the object, a sphere, and its gradient, world frame."""
+    away = points - data.body("object").xpos
+    length = np.linalg.norm(away, axis=1)
+    return length - scene.objects.object[0].half_sizes[0], away / length[:, None]
 
 
 class Dense:
@@ -73,20 +37,12 @@ class Dense:
                 self._on_fields(ring)
 
     def _on_table(self):
-        """The object's lowest point, or the lower corners of a box, on the table."""
-        shape, body = self.scene.objects.object[0], self.data.body("object")
-        half, turn = np.array(shape.half_sizes), body.xmat.reshape(3, 3)
-        if shape.type == "sphere":
-            points = [[0, 0, -half[0]]]
-        else:
-            signs = np.array(list(np.ndindex(2, 2, 2))) * 2 - 1
-            points = [p for p in (signs * half) @ turn.T if p[2] < 0]
-        up = np.array([0, 0, 1.0])
-        for point in points:
-            gap = (body.xpos + point)[2]
-            ends = model.layout(self.scene).object, 0
-            friction = self.scene.objects.table.friction
-            self._add(body.xpos + point - gap / 2 * up, up, gap, 1.0, ends, friction, 1)
+        """The sphere's lowest point on the table."""
+        body, up = self.data.body("object"), np.array([0, 0, 1.0])
+        gap = body.xpos[2] - self.scene.objects.object[0].half_sizes[0]
+        ends = model.layout(self.scene).object, 0
+        point = body.xpos * [1, 1, 0] + gap / 2 * up
+        self._add(point, up, gap, 1.0, ends, self.scene.objects.table.friction, 1)
 
     def _on_fields(self, ring):
         scene, lay = self.scene, model.layout(self.scene)

@@ -1,11 +1,8 @@
 """Pinch grasps with effects, beside MuJoCo C."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import model
-from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import world_model
 from tests.helpers import grasps
 
@@ -25,13 +22,3 @@ def setting(effects, shape="box", **changes):
     oracle = world_model(scene, fields)
     oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
     return scene, oracle, fields, ctrl
-
-
-def inflated(scene, fields, ctrl, pressure, steps=400):
-    """Bend angles (finger, link) of fingers at rest under a pressure, by the engine `mujoco`."""
-    with jax.enable_x64(True):
-        held = np.broadcast_to(ctrl[:1], (1, steps, ctrl.shape[1])).copy()
-        held[..., 6:] = pressure
-        batch = jax.tree.map(lambda x: jnp.asarray(x)[None], fields)
-        trace = make_engine("mujoco", scene).rollout(batch, jnp.asarray(held), trajectory=True)
-    return np.asarray(trace.qpos)[0, -1][model.layout(scene).dofs[..., 0]]

@@ -1,4 +1,4 @@
-"""Hard cases 10, 14 and 15: the object on its table, thrown, spawned inside things."""
+"""Hard case 14: the object spawned inside things."""
 
 import dataclasses
 import functools
@@ -44,9 +44,6 @@ def middle_of_finger(compiled, data, qpos):
     return data.geom_xpos[spheres[len(spheres) // 2, 0]].copy()
 
 
-# --- 10: rest --------------------------------------------------------------------------------
-
-
 # --- 14: spawned inside ----------------------------------------------------------------------
 
 
@@ -80,40 +77,3 @@ def spawned(engine, step, precision):
     speed = np.linalg.norm(history.object_velocity, axis=-1).max(1)
     note = "table {:.2f}, finger {:.2f}, palm {:.2f} m/s".format(*speed)
     return Found(speed.max(), 1.0, note)
-
-
-# --- 15: no tunnelling -----------------------------------------------------------------------
-
-
-FAST = (15, "5 m/s at a finger with 2 mm walls")
-
-
-def thrown(the_bench):
-    """History of 0.1 s of a sphere thrown with 5 m/s at a finger of 2 mm walls."""
-    params, trial = grasps.hand_world(the_bench.scene, wall=0.002)
-    fields = the_bench.fields([params], [grasps.still(SPHERE)])
-    compiled = world_model(the_bench.scene, grasps.nth(fields, 0))
-    data, qpos = mujoco.MjData(compiled), fields.start.copy()
-    qpos[0, -7:-4] = middle_of_finger(compiled, data, qpos[0]) + [0, 0.137, 0]
-    qvel = np.zeros((1, compiled.nv))
-    qvel[0, -5] = -5.0
-    return the_bench.run(fields, held(the_bench, fields, 0.1), qpos, qvel)
-
-
-def received(the_bench):
-    """Impulse over mass that the finger gives the sphere [m/s]."""
-    return 5.0 + thrown(the_bench).object_velocity[0, -1, 1]
-
-
-@functools.cache
-def converged_throw():
-    return received(bench(weightless(), "mujoco", 1 / 64, "float64"))
-
-
-@case(*FAST, "impulse over the one at h/64 in C", lower=True, engines=BOTH, quick="mujoco")
-def tunnelling(engine, step, precision):
-    """It moves 50 mm in a step of 10 ms; the finger's contacts reach over 80 mm."""
-    found = received(bench(weightless(), engine, step, precision))
-    # Half of the converged impulse: the finger was met, not passed through.
-    note = f"converged impulse {converged_throw():.2f} m/s of 5"
-    return Found(found / converged_throw(), 0.5, note)

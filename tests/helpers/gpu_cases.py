@@ -30,7 +30,7 @@ EFFECTS = {
         "effects__pressure_dynamics": True,
     },
     "hull": {"effects__surface": "hull"},
-    "fingers": {"effects__finger_finger": True},
+    "fingers": {"effects__finger_finger": True, "effects__air_mass": True},
     "hull and fingers": {
         "effects__surface": "hull",
         "effects__finger_finger": True,

@@ -120,6 +120,8 @@ class Compare(Command, flags.TrialFlags):
     """Root of these trials' noise."""
     engine: Text = None
     """Engine that simulates them; default: the runs'."""
+    policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="STR ...", help_behavior_hint="")] = ()
+    """MODULE:CLASS of the runs that were made with a policy, to simulate their designs."""
     out: File = None
     """Write a table of the runs (.csv, docs/files.md)."""
 

@@ -4,6 +4,7 @@ The module is looked for in the working directory first, then among the installe
 imported for a command line that names it and for nothing else: no file can ask for it.
 """
 
+import functools
 import importlib
 import inspect
 import re
@@ -110,8 +111,13 @@ def make_policy(name: str, scene: Scene) -> tuple[Policy, Scene]:
     Raises:
       InputError: If it is none as `policy.Policy` describes them.
     """
-    flag, found = f"--policy {name}", _load(name, "--policy")
-    code = found
+    return _policy(f"--policy {name}", _load(name, "--policy"), scene)
+
+
+@functools.lru_cache(maxsize=16)
+def _policy(flag: str, code: Any, scene: Scene) -> tuple[Policy, Scene]:
+    """A policy that is made and tried once: engines of one policy share their programs."""
+    found = code
     if inspect.isclass(found):
         _refuse_signature(flag, found, ("scene",))
         found = _tried(flag, code, lambda: code(scene))

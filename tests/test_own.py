@@ -1,6 +1,7 @@
 """`--optimizer module:Class` and `--cost module:function`: what runs do with a user's own code."""
 
 import json
+import shutil
 import sys
 
 import jax
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from codesign_jax import cli, codesign, parameters, runs, scene
+from codesign_jax import cli, codesign, own, parameters, runs, scene
 from codesign_jax.engines import make_engine
 from tests.helpers.command_runs import assert_same_run, snapshot
 from tests.helpers.toy_engine import TINY
@@ -226,6 +227,15 @@ def test_a_policy_is_searched_and_said_wherever_it_acts(here, capsys):
         kept.append((here / f"{share}.csv").read_text())
     assert kept[0] != kept[1]
     assert cli.main(["evaluate", *trials, "--policy", "mine:Pull"]) in (0, 1)
+    pair = ["compare", "run", str(shutil.copytree(here / "run", here / "copy")), "--trials", "2"]
+    assert cli.main(pair) == 2
+    assert "the run was made with --policy mine:Pull" in capsys.readouterr().err
+    assert cli.main([*pair, "--policy", "mine:Pull", "mine:Narrow"]) == 2
+    assert "--policy mine:Narrow: neither run was made with it" in capsys.readouterr().err
+    assert cli.main([*pair, "--policy", "mine:Pull"]) == 0
+    assert "of the same 2 trials" in capsys.readouterr().out
+    one, other = (own.make_policy("mine:Pull", the_scene)[0] for _ in range(2))
+    assert one is other  # its programs are compiled once
 
 
 WRONG = {

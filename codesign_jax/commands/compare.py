@@ -108,8 +108,13 @@ def read_all(every: Mapping[Path, tuple[Scene, Settings]]) -> dict[Path, Compare
 
 def _pair(options: "Compare", folders: list[Path]) -> list[Case]:
     replaced = {n: getattr(options, n) for n in ("accuracy", "objects", "overrides", "robust")}
+    own = [runs.read_run(folder)[1].policy for folder in folders]
+    if unknown := [name for name in options.policy if name not in own]:
+        raise InputError([f"--policy {name}: neither run was made with it" for name in unknown])
     given = [
-        flags.Subject(run_folder=folder, engine=options.engine, **replaced) for folder in folders
+        flags.Subject(run_folder=folder, engine=options.engine, policy=policy, **replaced)
+        for folder, name in zip(folders, own, strict=True)
+        for policy in [name if name in options.policy else None]
     ]
     one, other = [find_case(subject) for subject in given]
     if one.scene.objects != other.scene.objects:

@@ -168,14 +168,18 @@ class ControlLoop(Equal):
             a command that is not finite: inside of `jax.jit` such a world has failed (NONFINITE).
         """
         plan: Plan = ctrl
-        hand = world_constants(self.scene, fields)
+        hand, pack = world_constants(self.scene, fields), getattr(self.engine, "tables", None)
+        # Worlds keep their constants, which a GPU would take a millisecond a period to lay out.
+        how = {} if pack is None else {"tables": pack(fields)}
         series = {"pose": plan.pose, "pressure": plan.pressure, "shake": plan.shake}
 
         def period(carry: tuple, now: dict[str, jax.Array]) -> tuple[tuple, Trace]:
             world, memory = carry
             ahead = plan._replace(**now)
             told, command = self._asked(hand, fields, world, memory, ahead)
-            world, trace = advance(self.engine, fields, world, ahead, command, trajectory)
+            world, trace = advance(
+                self.engine, fields, world, ahead, command, trajectory=trajectory, **how
+            )
             return (world, told), trace._replace(last=None)
 
         carry, found = (begin(self.scene, fields, plan), self._remembered(plan.params)), []
@@ -407,9 +411,9 @@ def advance(
     world: World,
     plan: Plan,
     command: Command,
-    trajectory: bool,
+    **how: Any,
 ) -> tuple[World, Trace]:
-    """Simulates a period under commands of shape (world, step, ...).
+    """Simulates a period under commands of shape (world, step, ...); how: of `engine.rollout`.
 
     Returns:
       The worlds after it, and the trace with the controls that the engine was given.
@@ -424,7 +428,7 @@ def advance(
 
     given = fields.constants, world.pressure, plan.shake, plan.tilt, command
     ctrl, pressure = jax.vmap(controls)(*given)
-    trace = engine.rollout(fields._replace(start=world.state), ctrl, trajectory=trajectory)
+    trace = engine.rollout(fields._replace(start=world.state), ctrl, **how)
     if trace.last is None:
         raise InputError([f"engine {engine.name} does not tell states to go on from"])
     return World(trace.last, pressure), trace._replace(ctrl=ctrl)

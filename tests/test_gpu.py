@@ -14,12 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from codesign_jax import policy, rollout
 from codesign_jax.compiler import gpu, launch, thread
 from codesign_jax.engines.base import staged
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.world_model import world_constants
-from tests.helpers import gpu_cases, kernels
+from tests.helpers import gpu_cases, grasps, kernels
 
 pytestmark = pytest.mark.gpu
 
@@ -69,6 +70,19 @@ def test_effects(on_cpu, name):
             # and 1e-9 at step 120, up to 1.3e-5, at which it stays; the other worlds by 2e-12.
             tolerance[0, 120:] = 1e-4
         np.testing.assert_array_less(np.abs(got[key] - value), tolerance, err_msg=key)
+
+
+def test_who_replays_the_key_frames_simulates_the_open_loop():
+    """To the bit, though the tables of worlds are laid out once and not in each period."""
+    scene = gpu_cases.short_scene("hull and fingers")
+    engine, worlds = StructuredEngine(scene), grasps.random_worlds(scene, 1, 4)
+    replay = policy.ControlLoop(engine, lambda carry, seen: (carry, seen.plan))
+    assert engine.tables(grasps.batch_inputs(scene, *worlds)[0])
+
+    def run(engine):
+        return jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t)[1])(*worlds)
+
+    jax.tree.map(np.testing.assert_array_equal, run(engine), run(replay)._replace(ctrl=None))
 
 
 @pytest.mark.parametrize("name", ["spheres", "fingers", "hull and fingers", "mesh"])

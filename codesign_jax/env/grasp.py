@@ -197,7 +197,7 @@ class GraspEnv:
         told = _batch(self.act(data.seen, action))
         command = policy.spread(self.scene, told, _batch(plan), of="act")
         fields, world, ahead = _batch((data.fields, data.world, plan))
-        advanced = policy.advance(self.engine, fields, world, ahead, command, False)
+        advanced = policy.advance(self.engine, fields, world, ahead, command)
         world, trace = _one(advanced)
         after = data._replace(world=world, period=data.period + 1)
         after = after._replace(seen=self._seen(after))

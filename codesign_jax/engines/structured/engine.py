@@ -151,18 +151,53 @@ class StructuredEngine(Equal):
         program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl))
         return self._run(program, hand, state, ctrl, trajectory=True, states=True)
 
-    def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
-        """See `Engine.rollout`; what JAX's transformations make of it stands in `transforms`."""
-        return transforms.rollout(self, fields, ctrl, trajectory=trajectory)
+    def rollout(
+        self,
+        fields: ModelFields,
+        ctrl: jax.Array,
+        *,
+        trajectory: bool = False,
+        tables: tuple[jax.Array, ...] = (),
+    ) -> Trace:
+        """See `Engine.rollout`; what JAX's transformations make of it stands in `transforms`.
 
-    def simulate(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
-        """The rollout itself, in one kernel; arguments as in `Engine.rollout`.
+        Args:
+          fields: As there.
+          ctrl: As there.
+          trajectory: As there.
+          tables: Those of the fields, see `tables`.
+        """
+        return transforms.rollout(self, fields, ctrl, tables, trajectory=trajectory)
+
+    def tables(self, fields: ModelFields) -> tuple[jax.Array, ...]:
+        """The kernel's tables of worlds, for rollouts that go on from one another.
+
+        Nothing where a block has several worlds, on CPUs: each rollout lays them out itself.
+        """
+        if Program.here(self.scene, self.limits, fields.start.dtype, len(fields.start)).team == 1:
+            return ()
+
+        def tables(fields: ModelFields) -> tuple[jax.Array, ...]:
+            count, dtype = len(fields.start), fields.start.dtype
+            return self._tables(Program.here(self.scene, self.limits, dtype, count), fields)
+
+        return transforms.folded(tables)(jax.lax.stop_gradient(fields))
+
+    def simulate(
+        self,
+        fields: ModelFields,
+        ctrl: jax.Array,
+        tables: tuple[jax.Array, ...] = (),
+        *,
+        trajectory: bool = False,
+    ) -> Trace:
+        """The rollout itself, in one kernel; arguments as in `rollout`.
 
         Raises:
           KernelUnavailable: If the kernel cannot be compiled for this device, or called there.
         """
         program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl))
-        inputs = self._inputs(program, fields, ctrl)
+        inputs = self._inputs(program, fields, ctrl, tables)
         try:
             out = program.execute(inputs, trajectory=trajectory)
         except KernelUnavailable as error:
@@ -190,30 +225,38 @@ class StructuredEngine(Equal):
         found, end = program.outputs(out, len(ctrl), **how)
         return self._trace(found, end, trajectory), found
 
-    def _inputs(self, program: Program, fields: ModelFields, ctrl: jax.Array) -> tuple:
-        """The kernel's arguments, see `Program.inputs`.
+    def _inputs(
+        self,
+        program: Program,
+        fields: ModelFields,
+        ctrl: jax.Array,
+        tables: tuple[jax.Array, ...] = (),
+    ) -> tuple:
+        """The kernel's arguments, see `Program.inputs`."""
+        hand, state = world_constants(self.scene, fields), self.reset(fields)
+        if program.team == 1:
+            return program.inputs(hand, state, ctrl)
+        tables = tables or self._tables(program, fields)
+        mesh = () if hand.mesh is None else (hand.mesh.values[None],)
+        return (*tables, *program.pack_state(state), *program.pack_controls(ctrl), *mesh)
+
+    def _tables(self, program: Program, fields: ModelFields) -> tuple[jax.Array, ...]:
+        """The hands' tables.
 
         XLA fuses a program of another number of worlds in another way and rounds in another way.
         Where a block is one world its numbers are therefore computed in pieces of one size.
         """
-        hand = world_constants(self.scene, fields)
-        if program.team == 1:
-            return program.inputs(hand, self.reset(fields), ctrl)
-
-        def tables(fields: ModelFields) -> tuple:
-            own = world_constants(self.scene, fields), self.reset(fields)
-            return (*program.pack_hand(own[0]), *program.pack_state(own[1]))
-
-        pieces = max(2, -(-len(ctrl) // PIECE))  # XLA would do without a loop of one round
+        pieces = max(2, -(-len(fields.start) // PIECE))  # XLA would do without a loop of one round
 
         def split(x: jax.Array) -> jax.Array:
             return lengthened(x, 0, pieces * PIECE).reshape(pieces, PIECE, *x.shape[1:])
 
-        found = jax.lax.map(tables, jax.tree.map(split, fields))
-        blocks = -(-len(ctrl) // program.block)
-        packed = [x.reshape(-1, *x.shape[2:])[:blocks] for x in found]
-        mesh = () if hand.mesh is None else (hand.mesh.values[None],)
-        return (*packed, *program.pack_controls(ctrl), *mesh)
+        def pack(fields: ModelFields) -> tuple[jax.Array, jax.Array]:
+            return program.pack_hand(world_constants(self.scene, fields))
+
+        found = jax.lax.map(pack, jax.tree.map(split, fields))
+        blocks = -(-len(fields.start) // program.block)
+        return tuple(x.reshape(-1, *x.shape[2:])[:blocks] for x in found)
 
     def record(
         self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False

@@ -36,7 +36,12 @@ if TYPE_CHECKING:
 
 
 def rollout(
-    engine: "StructuredEngine", fields: ModelFields, ctrl: jax.Array, *, trajectory: bool
+    engine: "StructuredEngine",
+    fields: ModelFields,
+    ctrl: jax.Array,
+    tables: tuple[jax.Array, ...] = (),
+    *,
+    trajectory: bool,
 ) -> Trace:
     """`StructuredEngine.simulate`'s trace, under any of JAX's transformations but forward mode.
 
@@ -48,18 +53,18 @@ def rollout(
     adjoint = _once(folded(partial(_adjoint, engine, trajectory)))
 
     @jax.custom_vjp
-    def run(fields: ModelFields, ctrl: jax.Array) -> Trace:
-        return plain(fields, ctrl)
+    def run(fields: ModelFields, ctrl: jax.Array, tables: tuple[jax.Array, ...]) -> Trace:
+        return plain(fields, ctrl, tables)
 
-    def forward(fields: ModelFields, ctrl: jax.Array):
+    def forward(fields: ModelFields, ctrl: jax.Array, _: tuple[jax.Array, ...]):
         trace, path = recorded(fields, ctrl)
         return trace, (fields, ctrl, path, trace.speed)
 
     def backward(saved: tuple, cotangent: Trace):
-        return adjoint(*saved, cotangent._replace(status=None, residual=None))
+        return *adjoint(*saved, cotangent._replace(status=None, residual=None)), None
 
     run.defvjp(forward, backward)
-    return run(fields, ctrl)
+    return run(fields, ctrl, tables)
 
 
 def folded(function: Callable) -> Callable:

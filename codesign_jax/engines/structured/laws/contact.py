@@ -19,7 +19,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.lanes import cross, dot
 
-MARGIN = 1e-3
+MARGIN = 2e-3
 """Gap below which a contact is a candidate, whatever its velocity [m]."""
 
 

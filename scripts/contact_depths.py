@@ -3,7 +3,8 @@
 python -m scripts.contact_depths docs/data/experiments/23d.npz --trials 2 --out runs/depths.json
 python -m scripts.contact_depths runs/ten --trials 18 --batch 1024 --out runs/depths.json
 
-A file is the 23d.npz of the experiments (the best particle of each run), a .json whose `designs`
+A file is the 23d.npz of the experiments (the best particle of each run), the .npz of a search of
+`scripts.search` (what it recommends at its last mark), a .json whose `designs`
 have a `vector` each, as --out has, or a folder of runs.  One program simulates all grasps, --batch
 at a time.  A finger's surface is the one that touches, whatever the law: |y/a|^4 + |z/b|^4 = 1
 along its blended links, with a cap over the last quarter of a segment.  The depth of a body in
@@ -278,6 +279,8 @@ def designs_of(path: Path) -> list[np.ndarray]:
     if path.suffix == ".json":
         return [np.array(d["vector"]) for d in json.loads(path.read_text())["designs"]]
     with np.load(path, allow_pickle=False) as stored:
+        if marks := [int(n.removeprefix("designs")) for n in stored if n.startswith("designs")]:
+            return list(stored[f"designs{max(marks)}"])
         particles, cost = stored["final_particles"][-1], stored["test_exclude"][-1]
     return list(particles[np.arange(len(cost)), np.nanargmin(cost, axis=1)])
 

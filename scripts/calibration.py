@@ -40,7 +40,7 @@ CUTOFF = 3.0
 distribution as long as it has one peak (Pukelsheim 1994)."""
 CLEARANCE = 0.002
 """Smallest gap between the sections of a pair of fingers at a spread of zero [m]."""
-DATA = Path("docs/data/calibration/palm_scores.npz")
+DATA = Path("docs/data/calibration/scores.npz")
 
 
 class Open(NamedTuple):

@@ -223,7 +223,7 @@ SPHERES = {
 }
 SURFACES = {"hull": HULL, "spheres": SPHERES}
 STATES = {
-    "hull": {"main": (5, 0.9, 0.06), "overflow": (1, 1.5, 0.045)},
+    "hull": {"main": (5, 0.95, 0.06), "overflow": (1, 1.5, 0.045)},
     "spheres": {"main": (3, 1.9, 0.045)},
 }
 """Arguments of `curled`: seed, bend and height [m]. Contacts of every kind, with rings more than

@@ -63,7 +63,7 @@ def test_numbers_of_a_set_are_those_of_the_files():
     third = jax.tree.map(lambda n: float(n[2] if np.ndim(n) else n), found)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), third, expected)
     paper = scene.load("paper")
-    own = calibration.values(calibration.own_set(paper, 35.0)[None])
+    own = calibration.values(calibration.own_set(paper, 40.0)[None])
     same = jax.tree.map(lambda n: float(np.max(n)), calibration.numbers(paper, own))
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9), same, paper.constants()

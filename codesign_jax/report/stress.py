@@ -169,9 +169,8 @@ def _recorded(scene: Scene, engine: Engine, space: DesignSpace, num_trials: int)
         design: jax.Array, key: jax.Array, constants: Constants
     ) -> tuple[Outcome, jax.Array, Trial]:
         trials = rollout.sample_trials(scene, key, num_trials, constants=constants)
-        hands, trials = rollout.crossed(
-            jax.tree.map(lambda v: v[None], space.params(design)), trials
-        )
+        one = jax.tree.map(lambda v: v[None], space.params(design))
+        hands, trials, _ = rollout.crossed(one, trials)
         found, trace = rollout.simulate(
             scene, engine, hands, trials, record_qpos=True, constants=constants
         )

@@ -89,7 +89,7 @@ class Dense:
         frame[0] = normal
         jac = frame @ (own - other)
         speed = jac @ self.data.qvel
-        if gap >= max(0.001, -h * speed[0]):
+        if gap >= max(0.002, -h * speed[0]):
             return
         stiffness = c.normal_stiffness * share * 2 / bodies
         mass = stiffness * h * (h + c.dissipation_time)

@@ -375,6 +375,12 @@ type = "box"
 position = [0.06, 0.0, 0.03]
 size = [0.03, 0.1, 0.03]
 orientation = [0, 10, 0]
+
+[[fixture]]
+name = "post"
+type = "cylinder"
+position = [-0.055, 0.02, 0.04]
+size = [0.015, 0.04]
 """
 
 

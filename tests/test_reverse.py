@@ -381,6 +381,7 @@ name = "post"
 type = "cylinder"
 position = [-0.055, 0.02, 0.04]
 size = [0.015, 0.04]
+friction = 0.3
 """
 
 

@@ -78,8 +78,8 @@ def add(scene: Scene, spec: mujoco.MjSpec, params: Params) -> dict[str, float]:
             shares[name] = ball.share
             if e.finger_object:
                 add_pair(scene, spec, name, "object_0", 0)
-            for other in surroundings(scene) if e.finger_table else []:
-                add_pair(scene, spec, other, name, pairs.HAND_TABLE)
+            for other, kind in surroundings(scene, pairs.HAND_TABLE) if e.finger_table else []:
+                add_pair(scene, spec, other, name, kind)
             if e.finger_palm and ball.link >= first_on_palm(scene.discretization.links):
                 add_pair(scene, spec, name, "palm_disc", pairs.PALM)
     if e.finger_finger or touches_itself(scene):

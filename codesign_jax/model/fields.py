@@ -227,17 +227,17 @@ def _section(scene: Scene, params: Params) -> jax.Array | None:
 def _pair_kinds(scene: Scene) -> np.ndarray:
     """Kind of each of the template's contact pairs, see `pairs`, counted from the first."""
     template, lay = compile_template(scene), layout(scene)
-    shapes = len(scene.objects.object)
     kinds = np.zeros(template.npair, np.int32)  # see layout: one width in every precision
     for i, pair in enumerate(zip(template.pair_geom1, template.pair_geom2, strict=True)):
         touched = np.isin(lay.object_geoms, pair)
         if min(pair) <= len(scene.fixture):  # the table or a fixture
-            kinds[i] = pairs.OBJECT_TABLE if touched.any() else pairs.HAND_TABLE
+            table = pairs.OBJECT_TABLE if touched.any() else pairs.HAND_TABLE
+            kinds[i] = pairs.around(scene, min(pair), table)
         elif np.isin(lay.disc, pair).any():
             kinds[i] = pairs.PALM
         else:
             kinds[i] = np.argmax(touched) if touched.any() else pairs.FINGERS
-    return np.where(kinds < 0, kinds + shapes + 4, kinds).astype(np.int32)
+    return np.where(kinds < 0, kinds + len(pairs.frictions(scene)), kinds).astype(np.int32)
 
 
 def _pairs(scene: Scene, dtype: Any) -> list[jax.Array]:

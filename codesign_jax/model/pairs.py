@@ -1,7 +1,8 @@
 """MuJoCo's numbers of the contact pairs, for single models and for fields.
 
-A pair has a kind: what touches the object with index i has kind i, and the others have the kinds
-below, which count from the last of `frictions`.
+A pair has a kind: what touches the object with index i has kind i, what touches a fixture that has
+a friction of its own one of the next, see `around`, and the others have the kinds below, which
+count from the last of `frictions`.
 """
 
 from typing import Any
@@ -18,12 +19,27 @@ def frictions(scene: Scene) -> list[Any]:
     """Coulomb coefficient of each kind of pair."""
     c = scene.contact
     others = [c.finger_table_friction, c.finger_finger_friction, c.finger_palm_friction]
-    return [*(s.friction for s in scene.objects.object), scene.objects.table.friction, *others]
+    own = [f.friction for f in scene.fixture if f.friction is not None]
+    on_object = [s.friction for s in scene.objects.object]
+    return [*on_object, *own, scene.objects.table.friction, *others]
+
+
+def around(scene: Scene, which: int, table: int) -> int:
+    """Kind of a pair with the table, number 0, or a fixture, from 1 on.
+
+    Args:
+      scene: The scene.
+      which: The number.
+      table: Kind of the other body's pair with the table, as which a fixture without a friction of
+        its own counts.
+    """
+    own = [i for i, f in enumerate(scene.fixture, 1) if f.friction is not None]
+    return len(scene.objects.object) + own.index(which) if which in own else table
 
 
 def impedances(scene: Scene) -> list[Any]:
     """Impedance of each kind of pair."""
-    return [IMPEDANCE] * (len(scene.objects.object) + 3) + [palm_impedance(scene)]
+    return [IMPEDANCE] * (len(frictions(scene)) - 1) + [palm_impedance(scene)]
 
 
 def numbers(scene: Scene, friction: Any, impedance: Any) -> tuple[list, list, list]:

@@ -334,9 +334,16 @@ def add_pair(scene: Scene, spec: mujoco.MjSpec, first: str, second: str, kind: i
     pair.friction, pair.solref, pair.solimp = pairs.numbers(scene, *own)
 
 
-def surroundings(scene: Scene) -> list[str]:
-    """Names of the geoms of table and fixtures that may be touched."""
-    return ["table"] * scene.effects.table + [f"fixture_{i}" for i in range(len(scene.fixture))]
+def surroundings(scene: Scene, table: int) -> list[tuple[str, int]]:
+    """Geoms of table and fixtures that may be touched, and the kinds of pairs with them.
+
+    Args:
+      scene: The scene.
+      table: Kind of the other body's pair with the table.
+    """
+    names = ["table", *(f"fixture_{i}" for i in range(len(scene.fixture)))]
+    found = [(name, pairs.around(scene, i, table)) for i, name in enumerate(names)]
+    return found if scene.effects.table else found[1:]
 
 
 def _add_pairs(scene: Scene, spec: mujoco.MjSpec) -> None:
@@ -346,13 +353,13 @@ def _add_pairs(scene: Scene, spec: mujoco.MjSpec) -> None:
     palm = [f"palm_{i}" for i in range(len(lay.palm))]
     add = functools.partial(add_pair, scene, spec)
     for i in range(len(scene.objects.object)):
-        for other in surroundings(scene) if e.object_table else []:
-            add(other, f"object_{i}", pairs.OBJECT_TABLE)
+        for other, kind in surroundings(scene, pairs.OBJECT_TABLE) if e.object_table else []:
+            add(other, f"object_{i}", kind)
         for name in (fingers if e.finger_object else []) + (palm if e.palm_object else []):
             add(name, f"object_{i}", i)
     for name in (fingers if e.finger_table else []) + (palm if e.palm_table else []):
-        for other in surroundings(scene):
-            add(other, name, pairs.HAND_TABLE)
+        for other, kind in surroundings(scene, pairs.HAND_TABLE):
+            add(other, name, kind)
     if e.finger_finger:
         for first, second in itertools.combinations(fingers, 2):
             if first.split("_")[1] != second.split("_")[1]:

@@ -130,7 +130,9 @@ def _with_friction(c: Constants, factor: Any) -> Constants:
     table = _scaled(c.objects.table, factor, "friction")
     names = "finger_table_friction", "finger_finger_friction", "finger_palm_friction"
     contact = _scaled(c.contact, factor, *names)
-    return c._replace(objects=c.objects._replace(object=shapes, table=table), contact=contact)
+    fixture = c.fixture and tuple(f and _scaled(f, factor, "friction") for f in c.fixture)
+    objects = c.objects._replace(object=shapes, table=table)
+    return c._replace(objects=objects, contact=contact, fixture=fixture)
 
 
 def _scaled(table: Any, factor: Any, *names: str) -> Any:

@@ -53,6 +53,7 @@ class Constants(NamedTuple):
     limits: Any
     pneumatics: Any
     control: Any
+    fixture: Any = None
 
 
 @dataclasses.dataclass(frozen=True)

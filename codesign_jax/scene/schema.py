@@ -216,6 +216,8 @@ def with_numbers(table: T, values: Any) -> T:
     changes = {}
     for name, new in values._asdict().items():
         old = getattr(table, name)
+        if new is None:
+            continue
         if dataclasses.is_dataclass(old):
             new = with_numbers(old, new)
         elif isinstance(old, tuple) and dataclasses.is_dataclass(old[0]):

@@ -45,9 +45,6 @@ class Effects:
 class Fixture:
     """A static body of the surroundings, which fingers, palm and object touch as the table.
 
-    Its friction is the table's: `contact.finger_table_friction` with the hand, `[table]` of the
-    object file with the object.
-
     Attributes:
       name: What it is, for messages.
       type: Its shape; a plane has its body below it.
@@ -55,6 +52,8 @@ class Fixture:
       size: Half lengths of a box, or radius and half height of a cylinder.
       orientation: Roll, pitch and yaw, which turn about x, y and z in this order, or a unit
         quaternion w, x, y, z. An unturned cylinder stands, the normal of a plane is z.
+      friction: Coulomb coefficient with hand and object. Not given: the table's, which are
+        `contact.finger_table_friction` with the hand and `[table]` of the object file.
     """
 
     name: str
@@ -64,6 +63,7 @@ class Fixture:
     orientation: tuple[float, ...] | None = quantity(
         "deg or quaternion", -360, 360, structure=True, default=None
     )
+    friction: float | None = quantity("", 0, 5, default=None)
 
     @property
     def quaternion(self) -> tuple[float, ...]:

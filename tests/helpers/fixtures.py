@@ -18,6 +18,7 @@ name = "post"
 type = "cylinder"
 position = [-0.055, 0.02, 0.04]
 size = [0.015, 0.04]
+friction = 0.2
 """
 SLOPES = """
 [[fixture]]
@@ -25,6 +26,7 @@ name = "slope"
 type = "plane"
 position = [0.0, 0.045, 0.0]
 orientation = [70, 0, 0]
+friction = 1.1
 
 [[fixture]]
 name = "other slope"

@@ -17,7 +17,7 @@ from codesign_jax.engines.structured.kernel.contact_sets import margin
 from codesign_jax.engines.structured.kernel.tables import rings_of_link
 from codesign_jax.engines.structured.lanes import dot, once
 from codesign_jax.engines.structured.laws import holding, rings, shapes, surroundings
-from codesign_jax.engines.structured.laws.cones import which_cone
+from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
 from codesign_jax.engines.structured.laws.contact import Cone, Contacts, candidates
 from codesign_jax.engines.structured.laws.inertia import bodies, joint_springs, smooth_forces
 from codesign_jax.engines.structured.laws.integration import rigid_arm
@@ -66,8 +66,12 @@ def contacts(
     """
     e, found = scene.effects, {}
 
-    def add(name: str, place: Place) -> None:
+    def add(name: str, place: Place, count: int = 1) -> None:
         cone = getattr(hand.cones, which_cone(name))
+        if own_friction(scene, name):
+            assert hand.friction is not None
+            own = hand.friction[np.array(surroundings.touched(scene, name, count))]
+            cone = once(Cone.of_friction, cone, own if name.startswith("finger") else own[:, 0])
 
         def act(place: Place, cone: Cone, velocity: Spatial | None) -> Contacts:
             moving = None if velocity is None else relative(name, velocity)
@@ -89,7 +93,8 @@ def contacts(
             for look in looks:
                 places.append(_on_field(scene, look, ring, frame, centre))
             if places:
-                add(name, _joined(places, int(name.startswith("finger"))))
+                finger = name.startswith("finger")
+                add(name, _joined(places, int(finger)), ring.half.shape[2 if finger else 1])
 
     if count := rings_of_link(scene):
         numbers = packing.ring_numbers(scene, hand, count)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.engines.structured.lanes import dot, total
-from codesign_jax.engines.structured.laws.cones import Cones, make_cones
+from codesign_jax.engines.structured.laws.cones import Cones, frictions, make_cones
 from codesign_jax.engines.structured.laws.meshes import MeshLanes, mesh_lanes
 from codesign_jax.model import Layout, ModelFields, layout
 from codesign_jax.model.morphology import at_joints
@@ -63,6 +63,7 @@ class WorldModel(NamedTuple):
         fingers (link, 3, finger, world); None without the effect `lateral_threshold`.
       air: Exponent of the air and the atmosphere's pressure, shape (2, 1, world); None without the
         effect `air_mass`.
+      friction: See `cones.frictions`, shape (n, 1, world); None where all is as the table.
     """
 
     mount: jax.Array
@@ -99,6 +100,7 @@ class WorldModel(NamedTuple):
     palm_disc: jax.Array | None = None
     threshold: jax.Array | None = None
     air: jax.Array | None = None
+    friction: jax.Array | None = None
 
 
 def sections(hand: WorldModel, places: np.ndarray) -> tuple[Any, Any, Any]:
@@ -228,6 +230,7 @@ def _world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
         object_id=shape[None],
         mesh=mesh_lanes(scene, shape[None], object_size),
         cones=make_cones(numbers, shape[None]),
+        friction=frictions(numbers),
         bounds=bounds(numbers),
         gravity=-fields.gravity[None, :, 2] if scene.effects.gravity else None,
         section=None if fields.section is None else fields.section.transpose(2, 1, 0),

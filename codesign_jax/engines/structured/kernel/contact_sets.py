@@ -15,7 +15,7 @@ from codesign_jax.engines.structured.kernel.solver import tree_add_scaled
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact
-from codesign_jax.engines.structured.laws.cones import which_cone
+from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
 from codesign_jax.engines.structured.laws.contact import Cone, Contacts, Line
 from codesign_jax.engines.structured.laws.rings import Place
 from codesign_jax.scene import Scene
@@ -64,12 +64,14 @@ class ContactSet:
         """
         self.scene, self.name, self.count, self.k, self.size = scene, name, count, k, size
         self.on_object = name.endswith("_object")
+        self.own_friction = own_friction(scene, name)
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         """The set's part of the scratch table."""
         rows, ray = ROWS[self.scene.effects.friction]
         fields = {name: 3 for name in ("point", "normal")} | {"gap": 1, "share": 1}
         fields |= {"jar": rows, "step": rows, "ray": ray}
+        fields |= {"friction": 1} if self.own_friction else {}
         return {f"{self.name}.{f}": (self.count, (n, self.k)) for f, n in fields.items()}
 
     def bind(self, table: MemoryLayout, ref: Any, read: Callable[[str], Lanes]) -> "BoundContacts":
@@ -130,9 +132,23 @@ class BoundContacts:
 
         return rebuild(jax.lax.cond(self.touching(item), some, lambda: none))
 
-    def create(self, item: Any, place: Place, motion: Lanes, velocity: Lanes) -> None:
-        """Stores contacts of a link's or a group's places, for relative motions (6, ...)."""
-        place, jar = self.begin(place, motion, velocity)
+    def cone_at(self, item: Any) -> Cone:
+        """The cone of the item's contacts."""
+        if not self.set.own_friction:
+            return self.cone
+        return lanewise(Cone.of_friction, self.cone, self.read("friction", item)[0])
+
+    def create(
+        self, item: Any, place: Place, motion: Lanes, velocity: Lanes, friction: Lanes | None = None
+    ) -> None:
+        """Stores contacts of a link's or a group's places, for relative motions (6, ...).
+
+        Args:
+          friction: Coulomb coefficients (1, k) of a set whose contacts have their own.
+        """
+        if friction is not None:
+            self.write("friction", friction, item)
+        place, jar = self.begin(item, place, motion, velocity)
         self.write("share", place.share, item)
 
         def store() -> None:
@@ -141,15 +157,17 @@ class BoundContacts:
 
         jax.lax.cond(self.touching(item), store, lambda: None)
 
-    def begin(self, place: Place, motion: Lanes, velocity: Lanes) -> tuple[Place, Lanes]:
+    def begin(self, item: Any, place: Place, motion: Lanes, velocity: Lanes) -> tuple[Place, Lanes]:
         """Places whose share is zero where no candidate is, and their jar.
 
         Args:
+          item: The item.
           place: Where they are, with an axis of their own.
           motion: Relative acceleration of their bodies.
           velocity: Relative velocity.
         """
-        return lanewise(partial(begun, margin(self.set.scene)), place, self.cone, motion, velocity)
+        run = partial(begun, margin(self.set.scene))
+        return lanewise(run, place, self.cone_at(item), motion, velocity)
 
     def place(self, item: Any) -> Place:
         """Where the contacts are."""
@@ -178,7 +196,7 @@ class BoundContacts:
         jar, step, place = self.read("jar", item), self.read("step", item), self.place(item)
         jar = lanewise(tree_add_scaled, alpha, jar, step)
         self.write("jar", jar, item)
-        matrix, wrench = lanewise(response, place, self.cone, jar)
+        matrix, wrench = lanewise(response, place, self.cone_at(item), jar)
         return [upper(matrix), wrench]
 
     def wrench(self, item: Any, alpha: Lanes) -> Lanes:
@@ -194,7 +212,7 @@ class BoundContacts:
             return sum_axis(contact.contact_wrench(c, force), 1)
 
         jar, step = self.read("jar", item), self.read("step", item)
-        return lanewise(response, self.place(item), self.cone, alpha, jar, step)
+        return lanewise(response, self.place(item), self.cone_at(item), alpha, jar, step)
 
     def changes(self, item: Any, alpha: Lanes) -> Lanes:
         """How many of the item's contacts the last step takes to another zone of the cone."""
@@ -208,8 +226,8 @@ class BoundContacts:
             line = Line(*(ray[i] if i < ray.shape[0] else None for i in range(5)))
             return sum_axis(jnp.where(contact.same_zone(c, line, alpha), 0.0, 1.0), 0)
 
-        share = self.read("share", item)
-        return lanewise(count, share, self.cone, self.read("ray", item), alpha)
+        share, cone = self.read("share", item), self.cone_at(item)
+        return lanewise(count, share, cone, self.read("ray", item), alpha)
 
     def prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:
         """Stores the contacts' cost along a relative motion (6, ...); returns its slope at 0."""
@@ -221,7 +239,7 @@ class BoundContacts:
         def relative(place, cone, step):
             return contacts(place, cone).relative(step[:, None])
 
-        return self.line(item, lanewise(relative, self.place(item), self.cone, step))
+        return self.line(item, lanewise(relative, self.place(item), self.cone_at(item), step))
 
     def line(self, item: Any, change: Lanes) -> Lanes:
         """Stores the contacts' cost along a change of jar; returns its slope at 0."""
@@ -233,7 +251,8 @@ class BoundContacts:
             first, _ = contact.slopes(c, line, 0.0)
             return jnp.stack([v for v in line if v is not None]), sum_axis(first, 0)
 
-        line, slope = lanewise(ray, self.place(item), self.cone, self.read("jar", item), change)
+        cone, jar = self.cone_at(item), self.read("jar", item)
+        line, slope = lanewise(ray, self.place(item), cone, jar, change)
         self.write("step", change, item)
         self.write("ray", line, item)
         return slope
@@ -251,8 +270,8 @@ class BoundContacts:
             first, second = contact.slopes(c, line, alpha)
             return [sum_axis(first, 0), sum_axis(second, 0)]
 
-        share = self.read("share", item)
-        return lanewise(both, share, self.cone, self.read("ray", item), alpha)
+        share, cone = self.read("share", item), self.cone_at(item)
+        return lanewise(both, share, cone, self.read("ray", item), alpha)
 
 
 def margin(scene: Scene) -> float:

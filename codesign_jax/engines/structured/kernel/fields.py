@@ -20,6 +20,7 @@ from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.lanes import cross, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact, rings, shapes, surroundings
+from codesign_jax.engines.structured.laws.cones import own_friction
 from codesign_jax.engines.structured.laws.rings import Place, Ring
 from codesign_jax.engines.structured.world_model import apply_columns
 
@@ -56,6 +57,20 @@ class FieldContacts:
         local = lanewise(shapes.in_object, columns, point)
         distance, gradient = objects.signed_distance(self.p.scene, self.thing, local)
         return distance, lanewise(apply_columns, columns, gradient)
+
+    def frictions(self, name: str, count: int = 1) -> Lanes | None:
+        """Coefficients (1, k) of contacts of an item, or of all slots of the object.
+
+        Args:
+          name: Pair of bodies.
+          count: Rings or spheres that look at each field.
+        """
+        if not own_friction(self.p.scene, name):
+            return None
+        which = surroundings.touched(self.p.scene, name, count)
+        return lanewise(
+            lambda v: jnp.stack([v[i] for i in which])[None], self.step.constant("friction")
+        )
 
     def moves(self, name: str, motion: Lanes | None, vel: Lanes | None) -> tuple[Lanes, Lanes]:
         """Relative acceleration and velocity of a pair of bodies."""
@@ -99,9 +114,10 @@ class FieldContacts:
         """Creates contacts of rings or balls of a body."""
         contacts, looks = self.m.contacts[name], self.looks(name)
         found = [look(centre) for look in looks]
+        friction = self.frictions(name, contacts.set.k // len(looks))
         if not self.hull:
             places = [lanewise(balls_on_field, numbers, centre, *first) for first in found]
-            return contacts.create(i, joined(places), *moves)
+            return contacts.create(i, joined(places), *moves, friction=friction)
         run = partial(may_touch, self.p.scene.discretization.timestep)
         near = [lanewise(run, numbers, centre, first[0], moves[1]).lane for first in found]
         like = jnp.zeros((self.p.size,), self.step.finger_state.dtype)
@@ -117,7 +133,7 @@ class FieldContacts:
                     offset = lanewise(aimed, numbers, frame, *first)
                     again = look(lanewise(jnp.add, centre, offset))
                 places.append(lanewise(rings_on_field, numbers, frame, centre, offset, *again))
-            contacts.create(i, joined(places), *moves)
+            contacts.create(i, joined(places), *moves, friction=friction)
 
         any_of(total(near) > 0, create)
 
@@ -133,10 +149,14 @@ class FieldContacts:
                 self.on_field(name, i, numbers, at["frame"], centre, moves)
         on_table = m.contacts.get("object_table")
         slots = self._table_points(state) if on_table else []
+        rubs = self.frictions("object_table")
         for i in range(on_table.set.count if on_table else 0):
-            part = [slots[k] for k in range(i * p.fingers, min((i + 1) * p.fingers, len(slots)))]
-            place = self._deal(part)
-            m.contacts["object_table"].create(i, place, *self.moves("object_table", None, None))
+            mine = range(i * p.fingers, min((i + 1) * p.fingers, len(slots)))
+            place, friction = Place(*self._deal([slots[k] for k in mine])), None
+            if rubs is not None:
+                (friction,) = self._deal([(rubs[:, k : k + 1],) for k in mine])
+            moves = self.moves("object_table", None, None)
+            m.contacts["object_table"].create(i, place, *moves, friction=friction)
 
     def _table_points(self, state: dict) -> list[Place]:
         """Each slot of the object on the table and the fixtures, lanes of a world."""
@@ -171,11 +191,11 @@ class FieldContacts:
             found += lanewise(back, point, distance, gradient, self.thing.shape)
         return found
 
-    def _deal(self, slots: list[Place]) -> Place:
-        """Deals the slots (component, 1, world) out to the finger lanes."""
+    def _deal(self, slots: list) -> list[Lanes]:
+        """Deals the slots, each of several (component, 1, world), out to the finger lanes."""
         none = jnp.zeros((self.p.size,), self.step.finger_state.dtype)
         dealt = []
-        for field in range(len(Place._fields)):
+        for field in range(len(slots[0])):
             values: list[Any] = [s[field] for s in slots]
             parts = []
             for c in range(values[0].parts.shape[0]):
@@ -184,7 +204,7 @@ class FieldContacts:
                     lane = jnp.where(self.step.block.finger == k, value.parts[c].item(), lane)
                 parts.append(lane)
             dealt.append(lanes(parts, (len(parts), 1), wide=True))
-        return Place(*dealt)
+        return dealt
 
 
 def ring_centres(origin, frame, numbers):

@@ -19,7 +19,7 @@ from codesign_jax.engines.structured.kernel.problem import make_body
 from codesign_jax.engines.structured.kernel.step import link_forces, palm_and_object
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.laws import contact, holding, shapes, surroundings
-from codesign_jax.engines.structured.laws.cones import which_cone
+from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
 from codesign_jax.engines.structured.laws.contact import Contacts
 from codesign_jax.engines.structured.linear.tree import next_motion, palm_motion
 from codesign_jax.engines.structured.world_model import apply_columns
@@ -106,7 +106,11 @@ def of_rings(scene: Scene, name: str, place: Place, numbers, at: dict, still: di
         places.append(fields.rings_on_field(numbers, place.frame, centre, offset, *again))
     found = fields.beside(places)
     found = found._replace(share=jnp.where(still["share"] > 0, found.share, 0.0))
-    contacts = ContactSet.contacts(found, _cone(scene, name, at))
+    cone = _cone(scene, name, at)
+    if own_friction(scene, name):
+        which = surroundings.touched(scene, name, numbers.shape[1])
+        cone = cone.of_friction(jnp.stack([at["friction"][i] for i in which]))
+    contacts = ContactSet.contacts(found, cone)
     moves = _from_object(name, place[2:], at, still)
     return of_contacts(contacts, *(m[:, None] for m in moves))
 
@@ -129,16 +133,22 @@ def of_table(scene: Scene, fingers: int, item: int, at: dict, finger, still: dic
       finger: Number of each lane's finger.
       still: As in `of_spheres`, with the motions of the object.
     """
-    places, dealt = _of_object(scene, at, still), []
     slots = surroundings.slots(scene)
-    for place in places:
+
+    def deal(place: jax.Array) -> jax.Array:
         lane = jnp.zeros_like(place[..., 0, None, :]) + 0 * finger
         for k in range(item * fingers, min((item + 1) * fingers, slots)):
             lane = jnp.where(finger == k - item * fingers, place[..., k, None, :], lane)
-        dealt.append(lane)
-    point, normal, gap = dealt
+        return lane
+
+    point, normal, gap = map(deal, _of_object(scene, at, still))
     used = (finger < slots - item * fingers) & (still["share"][0, 0] > 0)
-    cone = _cone(scene, TABLE, at).of_share(jnp.where(used, 1.0, 0.0)[None])
+    cone = _cone(scene, TABLE, at)
+    if own_friction(scene, TABLE):
+        which = surroundings.touched(scene, TABLE, 1)
+        rubs = jnp.stack([at["friction"][i, 0] for i in which])
+        cone = cone.of_friction(deal(rubs)[None])
+    cone = cone.of_share(jnp.where(used, 1.0, 0.0)[None])
     contacts = Contacts(point[:, None], normal[:, None], gap[None], cone)
     moves = at["object_vel"], still["object_motion"], still["object_along"]
     return of_contacts(contacts, *(m[:, None] for m in moves))

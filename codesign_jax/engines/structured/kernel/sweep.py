@@ -18,7 +18,7 @@ from codesign_jax.engines.structured.kernel.pull import plus, pull
 from codesign_jax.engines.structured.kernel.step import FINGER_CONSTANTS, LINK_CONSTANTS
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import shapes, surroundings
-from codesign_jax.engines.structured.laws.cones import which_cone
+from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
 from codesign_jax.engines.structured.laws.kinematics import mounted
 from codesign_jax.engines.structured.world_model import apply_columns
 
@@ -229,7 +229,8 @@ class Sweep:
         if name == powers.TABLE:
             names = set(self.object) - (set() if surrounded else {"grid_origin", "grid_cell"})
         chosen = {n: v for n, v in self.object.items() if n in names}
-        return chosen | {cone: self.step.constant(cone)}
+        names = [cone] + ["friction"] * own_friction(self.p.scene, name)
+        return chosen | {n: self.step.constant(n) for n in names}
 
     def _support(self, columns: Lanes, height: Lanes) -> Lanes:
         """Points that may touch a table of these axes, in the object's frame."""

@@ -10,6 +10,7 @@ from codesign_jax.engines.structured.kernel.pairs import PairSet, pair_slots
 from codesign_jax.engines.structured.kernel.slots import SlotSet
 from codesign_jax.engines.structured.kernel.team_slots import TeamFieldSet, TeamPairSet
 from codesign_jax.engines.structured.laws import shapes, surroundings
+from codesign_jax.engines.structured.laws.cones import own_friction
 from codesign_jax.model import layout
 from codesign_jax.model.layout import pairings_held, palm_touches, touches_itself
 from codesign_jax.scene import Scene
@@ -143,6 +144,8 @@ class Tables:
             some |= contacts.cone_rows()
         if self.scene.effects.gravity:
             some |= {"gravity": (1, one)}
+        if own_friction(self.scene, "object_table"):
+            some |= {"friction": (1, (2 * len(surroundings.fields(self.scene)),))}
         if self.scene.effects.wrist:
             some |= {"wrist_stiffness": (1, (6,))}
         if self.scene.effects.finger_palm:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.laws.contact import Cone
+from codesign_jax.engines.structured.laws.contact import LEAST, Cone
 from codesign_jax.model.layout import contact_mass, dissipation, friction_ratio
 from codesign_jax.scene import Scene
 
@@ -58,7 +58,7 @@ def make_cone(
     cone = Cone(normal, impratio * normal, friction, friction / jnp.sqrt(impratio), *reference)
     if scene.effects.friction != "full":
         return cone
-    least = jnp.maximum(friction, 1e-5)  # MuJoCo's mjMINMU
+    least = jnp.maximum(friction, LEAST)
     return cone._replace(spin=c.torsional_friction / least, roll=c.rolling_friction / least)
 
 
@@ -90,3 +90,24 @@ def make_cones(scene: Scene, shape: jax.Array) -> Cones:
             two(c.finger_palm_friction, ratio=between, stiffer=stiffer) if e.finger_palm else None
         ),
     )
+
+
+def own_friction(scene: Scene, pair: str) -> bool:
+    """Whether contacts of a pair of bodies have friction one by one, and not by the pair."""
+    rubs = any(fixture.friction is not None for fixture in scene.fixture)
+    return rubs and pair.endswith("_table") and scene.effects.friction != "none"
+
+
+def frictions(scene: Scene) -> jax.Array | None:
+    """Coulomb coefficients of the hand, then of the object, on table and fixtures, (n, 1, world).
+
+    They are in the order of `surroundings.fields`; None if all have the table's.
+    """
+    if not own_friction(scene, "object_table"):
+        return None
+    tables = scene.contact.finger_table_friction, scene.objects.table.friction
+    own = [fixture.friction for fixture in scene.fixture]
+    found = []
+    for table in tables:
+        found += [table] * scene.effects.table + [table if v is None else v for v in own]
+    return jnp.stack([jnp.asarray(v) for v in found])

@@ -21,6 +21,8 @@ from codesign_jax.engines.structured.lanes import cross, dot
 
 MARGIN = 2e-3
 """Gap below which a contact is a candidate, whatever its velocity [m]."""
+LEAST = 1e-5
+"""Coefficient to which torsional and rolling friction relate at the least, MuJoCo's mjMINMU."""
 
 
 class Cone(NamedTuple):
@@ -52,6 +54,17 @@ class Cone(NamedTuple):
         """That of contacts with a share of the scene's stiffness; 0 of what is none."""
         tangent = None if self.tangent is None else self.tangent * share
         return self._replace(normal=self.normal * share, tangent=tangent)
+
+    def of_friction(self, friction: jax.Array) -> "Cone":
+        """That of contacts with other Coulomb coefficients and the same stiffness."""
+        if self.friction is None:
+            return self
+        ratio = friction * jnp.sqrt(self.normal / self.tangent)
+        cone = self._replace(friction=friction, ratio=ratio)
+        if self.spin is None or self.roll is None:
+            return cone
+        change = jnp.maximum(self.friction, LEAST) / jnp.maximum(friction, LEAST)
+        return cone._replace(spin=self.spin * change, roll=self.roll * change)
 
 
 class Contacts(NamedTuple):

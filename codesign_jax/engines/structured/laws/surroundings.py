@@ -176,6 +176,25 @@ def edge_on(
 
 def slots(scene: Scene) -> int:
     """How many points of object, table and fixtures may touch."""
+    return sum(_points(scene))
+
+
+def _points(scene: Scene) -> list[int]:
+    """How many points of the object may touch each of `fields`."""
     flat = any(shape.type not in ROUND for shape in scene.objects.object)
     each = [4 + EDGES[fixture.type] * flat for fixture in scene.fixture]
-    return 4 * scene.effects.table + sum(each)
+    return [4] * scene.effects.table + each
+
+
+def touched(scene: Scene, pair: str, count: int) -> list[int]:
+    """Which of `cones.frictions` the contacts of a pair of bodies have.
+
+    Args:
+      scene: The scene.
+      pair: The bodies, as in `problem.relative`.
+      count: Rings or spheres that look at each field; of the object it is known.
+    """
+    each = _points(scene)
+    if pair == "object_table":
+        return [len(each) + i for i, points in enumerate(each) for _ in range(points)]
+    return [i for i in range(len(each)) for _ in range(count)]

@@ -109,7 +109,7 @@ def score(weights, start):
         return (after, felt, going * (1.0 - after.done)), earned
 
     first = start, 0.0 * start.obs, jnp.ones(len(start.reward))
-    return jax.lax.scan(step, first, length=task.length)[1].sum(0)
+    return jax.lax.scan(step, first, length=task.episode_length)[1].sum(0)
 
 
 reset, judge = jax.jit(jax.vmap(task.reset)), jax.jit(score)
@@ -118,25 +118,22 @@ trials, candidates, generations = (3, 4, 1) if FAST else (96, 24, 45)
 
 
 def train(weights, seed):
-    """The mean of the last generation, and the mean rewards of all of them."""
+    """The mean of the last generation."""
     search = CMA_ES(population_size=candidates, solution=weights)
-    how, mean = search.default_params.replace(std_init=0.2), []
+    how = search.default_params.replace(std_init=0.2)
     state = search.init(jax.random.key(seed), weights, how)
     for key in jax.random.split(jax.random.key(seed), generations):
         start = reset(jax.random.split(key, trials))  # new objects and noise
         population, state = search.ask(key, state, how)
         reward = evaluate(population, start)
         state, _ = search.tell(key, population, -reward, state, how)
-        mean.append(float(reward.mean()))
-    return state.mean, mean
+    return state.mean
 
 
-first, before = train(jnp.zeros(4 * fingers), 1)
-found, curves = {}, {}
+first, found = train(jnp.zeros(4 * fingers), 1), {}
 fresh = reset(jax.random.split(jax.random.key(99), 6 if FAST else 768))
 for name, more in (("by time", 0), ("by touch", features - 4)):
-    weights, curve = train(jnp.append(first, jnp.zeros(more)), 2)
-    curves[name] = before + curve
+    weights = train(jnp.append(first, jnp.zeros(more)), 2)
     found[name] = reward, held = np.asarray(judge(weights, fresh))
     print(f"{name}: reward {reward.mean():.3f}, held {100 * held.mean():.0f} % of the time")
 gain = found["by touch"][0] - found["by time"][0]
@@ -146,15 +143,13 @@ print(f"by touch {gain.mean():+.3f} +- {error:.3f} (95 %), {len(gain)} fresh tri
 # %%
 mass = grasping.objects.object[0].mass * np.asarray(fresh.data.trial.mass)  # kg, of all alike
 few = np.array_split(np.argsort(mass), 2 if FAST else 12)
-figure, (left, middle, right) = plt.subplots(1, 3, figsize=(12, 3.5), layout="constrained")
+figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3), layout="constrained")
 for name, (reward, held) in found.items():
-    left.plot(curves[name], label=name)
     pressure = 2 * (1 - reward.astype(float) / np.maximum(held, 1e-6))  # while it is held
     centre = [1000 * mass[k].mean() for k in few]
-    middle.plot(centre, [held[k].mean() for k in few], "o-", label=name)
+    left.plot(centre, [held[k].mean() for k in few], "o-", label=name)
     right.plot(centre, [pressure[k][held[k] > 0].mean() for k in few], "o-", label=name)
-left.set(xlabel="generation", ylabel="mean reward of the candidates")
-middle.set(xlabel="mass [g]", ylabel="share of the time held")
-right.set(xlabel="mass [g]", ylabel="pressure over the limit, while held")
+left.set(xlabel="mass [g]", ylabel="share of the time held")
+right.set(xlabel="mass [g]", ylabel="pressure over the limit")
 left.legend()
 plt.show()

@@ -30,7 +30,7 @@ def episode():
     grasp = Replay(SCENE, params, period=0.1)
     reset, step = (jax.jit(jax.vmap(f)) for f in (grasp.reset, grasp.step))
     states = [reset(jax.random.split(jax.random.key(0), 4))]
-    for _ in range(grasp.length):
+    for _ in range(grasp.episode_length):
         states.append(step(states[-1], jnp.zeros((4, 2))))
     return grasp, states
 
@@ -66,11 +66,11 @@ def test_brax_trains_on_it_as_on_its_own(episode):
     """Its wrappers begin a grasp anew where one ended."""
     training = pytest.importorskip("brax.envs.wrappers.training")
     grasp, _ = episode
-    wrapped = training.wrap(grasp, episode_length=grasp.length)
+    wrapped = training.wrap(grasp, episode_length=grasp.episode_length)
     state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 4))
     first = np.asarray(state.obs)
     step = jax.jit(wrapped.step)
-    for _ in range(grasp.length):
+    for _ in range(grasp.episode_length):
         state = step(state, jnp.zeros((4, 2)))
     assert (state.done == 1).all() and (state.info["truncation"] == 0).all()
     np.testing.assert_array_equal(state.obs, first)
@@ -87,9 +87,9 @@ def test_a_vector_environment_begins_ended_grasps_with_new_noise(episode):
     first, _ = worlds.reset(seed=2)
     assert worlds.observation_space.contains(first)
     before = np.asarray(worlds._state.data.trial.yaw)
-    for k in range(grasp.length):
+    for k in range(grasp.episode_length):
         obs, reward, ended, cut, info = worlds.step(np.zeros((4, 2), np.float32))
-        assert ended.all() == (k == grasp.length - 1) and not cut.any()
+        assert ended.all() == (k == grasp.episode_length - 1) and not cut.any()
     again, reward, ended, *_ = worlds.step(np.zeros((4, 2), np.float32))
     assert not ended.any() and (reward == 0).all() and obs.dtype == np.float32
     assert set(info) == {"held", "distance"}

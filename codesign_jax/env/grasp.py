@@ -79,7 +79,7 @@ class GraspEnv:
       scene: The scene.
       params: Parameters of the hand.
       dt: Seconds of an action.
-      length: Actions of a whole grasp.
+      episode_length: Actions of a whole grasp.
     """
 
     backend = "codesign"
@@ -111,7 +111,7 @@ class GraspEnv:
         self.scene, self.params = scene, params
         self.engine = make_engine(DEFAULT, scene) if engine is None else engine
         self._steps = policy.period_steps(scene, period)
-        self.dt, self.length = period, -(-scene.num_steps // self._steps)
+        self.dt, self.episode_length = period, -(-scene.num_steps // self._steps)
 
     def observe(self, seen: Observation) -> jax.Array:
         """What the agent observes: what a hand feels, and not where the object is.
@@ -203,7 +203,7 @@ class GraspEnv:
         after = after._replace(seen=self._seen(after))
         held, ended = self._held(data, trace, world)
         reward = self.reward(data.seen, _one(command), after.seen, held)
-        done = ended | (after.period >= self.length)
+        done = ended | (after.period >= self.episode_length)
         metrics = state.metrics | {"held": held, "distance": trace.distance[-1]}
         return state.replace(
             data=after,

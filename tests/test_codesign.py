@@ -1,6 +1,5 @@
 """Episodes, seeds and tests: what an optimisation does with an engine's outcomes."""
 
-import dataclasses
 from functools import partial
 
 import jax
@@ -28,25 +27,6 @@ def setup():
 def start(optimizer, seed=0, particles=PARTICLES, design=(0.05, 0.0)):
     """State before the first episode."""
     return optimizer.init(jax.random.key(seed), np.array(design), particles)
-
-
-def test_other_bounds_and_defaults_share_the_program(setup):
-    """A fixed value of the preset is a constant of it."""
-    the_scene, space, engine, optimizer, episode = setup
-    episode(start(optimizer), np.array([True, True]))
-    traced, free = engine.traced, space.source.index(0)
-    base = tuple(v * 1.1 if k == free else v for k, v in enumerate(space.base))
-    low, high = ([0.04, -0.001], [0.06, 0.001])
-    other = dataclasses.replace(space, bounds=(tuple(low), tuple(high)), base=base)
-    narrow = codesign.make_filter(other)
-    found = partial(codesign.Task(the_scene, other, TRIALS, engine).episode, narrow)
-    _, info = found(start(narrow), np.array([True, True]))
-    assert engine.traced == traced > 0
-    assert (np.float32(low) <= info.population).all() and (
-        info.population <= np.float32(high)
-    ).all()
-    fixed = dataclasses.replace(space, base=tuple(1.1 * v for v in space.base))
-    assert fixed.structure != space.structure == other.structure
 
 
 def test_episode_is_move_evaluate_weigh_and_resample(setup):

@@ -5,7 +5,6 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
@@ -21,7 +20,6 @@ from tests.helpers.grasps import (
     pinch,
     stack,
     still,
-    world_inputs,
 )
 
 HURRIED = {
@@ -118,21 +116,6 @@ def test_bad_starts_are_flagged(starting):
         changed(wall=0.02),  # walls thicker than the section
     )
     np.testing.assert_array_equal(found, [False, True, True, True, True, True])
-
-
-def test_the_depth_is_mujocos(starting):
-    """Deepest contact of the straight hand by MuJoCo C's own collision detection."""
-    the_scene, _ = starting
-    params = [hand_world(the_scene, length=x)[0] for x in (0.16, 0.17, 0.18)]
-    fields, _ = both(the_scene, stack(*params), stack(*[still()] * 3))
-    ours = np.asarray(jax.jit(partial(start.depth, the_scene))(fields))
-    for p, deep in zip(params, ours, strict=True):
-        compiled = model.compile_model(the_scene, p, still())
-        data = mujoco.MjData(compiled)
-        data.qpos[:] = world_inputs(the_scene, p, still())[0].start
-        mujoco.mj_fwdPosition(compiled, data)
-        # float32 positions of 0.2 m.
-        assert deep == pytest.approx(-data.contact.dist.min(), abs=1e-6)
 
 
 def test_an_invalid_start_is_in_the_outcome(starting):

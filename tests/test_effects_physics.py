@@ -2,7 +2,6 @@
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 from scipy import integrate
@@ -11,7 +10,6 @@ from codesign_jax import control
 from codesign_jax.engines.structured.laws import cones, contact
 from codesign_jax.model import morphology
 from tests.helpers import grasps
-from tests.helpers.effect_settings import setting
 
 WIDTH, G = 0.020, 70e3
 """Width of the section [m] and shear modulus [Pa] of the paper's fingers."""
@@ -82,34 +80,6 @@ def test_supply_against_an_integrator():
 
 
 # --- rigid arm, weight, torsion ------------------------------------------------------------------
-
-
-def test_the_palm_is_where_the_arm_frame_is():
-    """Also under the weight of hand and fingers, to what 100 N do to the heavy wrist in a step."""
-    scene, oracle, fields, ctrl = setting({"wrist": False})
-    data = mujoco.MjData(oracle)
-    data.qpos[:] = fields.start
-    for k in range(460):
-        data.ctrl[:] = ctrl[k]
-        mujoco.mj_step(oracle, data)
-        np.testing.assert_allclose(data.qpos[:6], ctrl[k, :6], rtol=0, atol=1e-10)
-    assert np.ptp(ctrl[:460, 2]) > 0.1
-
-
-@pytest.mark.parametrize("model_of_friction,expected", [("full", 1.0), ("coulomb", 0.0)])
-def test_a_spinning_ball_slows_by_torsion(model_of_friction, expected):
-    """d omega/dt = -torsional_friction g / (2/5 r^2) on the table; never by point friction."""
-    scene, oracle, fields, ctrl = setting({"friction": model_of_friction}, "sphere")
-    data = mujoco.MjData(oracle)
-    data.qpos[:], data.ctrl[:] = fields.start, ctrl[0]
-    mujoco.mj_step(oracle, data, nstep=50)  # settles
-    data.qvel[-1] = 20.0
-    mujoco.mj_step(oracle, data, nstep=10)
-    slowing = (20.0 - data.qvel[-1]) / (10 * scene.discretization.timestep)
-    radius = scene.objects.object[0].size[0]
-    limit = scene.contact.torsional_friction * scene.gravity / (0.4 * radius**2)
-    # A sliding contact's normal force differs from the weight as it hops: 15 % (docs/physics.md).
-    assert slowing == pytest.approx(expected * limit, rel=0.15, abs=1e-9)
 
 
 # --- contact by itself ---------------------------------------------------------------------------

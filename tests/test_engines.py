@@ -92,6 +92,11 @@ def mujoco_traces(hurried, tmp_path_factory):
         )
 
 
+# Stock MJX takes twelve seconds to compile; quick: test_compose has both other engines' traces.
+slow = pytest.mark.slow
+
+
+@slow
 def test_traces_of_both_engines_mean_the_same(hurried, mjx_traces, mujoco_traces):
     """Entry k describes the state before step k; up to first touch float32 follows float64."""
     the_scene, (fields, _), _ = hurried
@@ -135,7 +140,7 @@ EXPECTED = {
 }
 
 
-@pytest.mark.parametrize("engine", ["mjx", "mujoco"])
+@pytest.mark.parametrize("engine", [pytest.param("mjx", marks=slow), "mujoco"])
 def test_failing_worlds_are_flagged_alike(hurried, engine, request):
     the_scene, *_ = hurried
     trace = request.getfixturevalue(f"{engine}_traces")[1]
@@ -147,6 +152,7 @@ def test_failing_worlds_are_flagged_alike(hurried, engine, request):
     assert result.bad_step[PRESSURE] == 1
 
 
+@slow
 def test_a_failed_world_is_frozen_at_its_last_good_state(mjx_traces):
     (_, bad) = mjx_traces
     for index, step in ((CONTROL, NAN_FROM), (PRESSURE, 0), (BELOW, 0)):
@@ -156,6 +162,7 @@ def test_a_failed_world_is_frozen_at_its_last_good_state(mjx_traces):
     assert np.isnan(bad.speed[CONTROL, NAN_FROM + 1 :]).all()
 
 
+@slow
 def test_other_worlds_are_bitwise_unaffected(mjx_traces):
     """Good worlds do not notice failing ones in their batch."""
     good, bad = mjx_traces

@@ -62,6 +62,7 @@ def test_what_is_observed_is_what_a_hand_feels(episode):
     np.testing.assert_array_equal(jax.vmap(grasp.observe)(moved), felt)
 
 
+@pytest.mark.slow  # quick: the vector environment, which begins ended grasps anew as well
 def test_brax_trains_on_it_as_on_its_own(episode):
     """Its wrappers begin a grasp anew where one ended."""
     training = pytest.importorskip("brax.envs.wrappers.training")

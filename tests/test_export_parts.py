@@ -1,6 +1,5 @@
 """Exported parts: closed, in millimetres, with the design's walls, chamber and volumes."""
 
-import sys
 import zipfile
 
 import manifold3d
@@ -9,10 +8,8 @@ import pytest
 import trimesh
 from numpy.polynomial import Polynomial
 
-from codesign_jax import cli
 from codesign_jax.export import casting, meshes
 from codesign_jax.export.process import Process, Section, Size
-from tests.helpers.toy_engine import TINY
 
 
 def uniform(length, width, height, wall):
@@ -148,17 +145,3 @@ def test_moulds_of_a_tapered_finger_hold_it(tmp_path):
         at = sorted(hit.position[2] for hit in hits)
         wall = TAPERED.at(x).wall
         np.testing.assert_allclose(at, [0, wall, top - wall, top], atol=1e-3)
-
-
-def test_command_refuses_in_words(tmp_path, monkeypatch, capsys):
-    out = ["--scene", str(TINY), "--out", str(tmp_path / "out")]
-    assert cli.main(["export", *out, "--draft", "30", "--mould-wall", "0"]) == 2
-    text = capsys.readouterr().err
-    assert "--draft = 30.0 is outside [0, 10] deg" in text and "--mould-wall" in text
-    assert cli.main(["export", *out, "--design", "length=30", "--end-wall", "15"]) == 2
-    assert "finger 0 of 30 mm has no room" in capsys.readouterr().err
-    monkeypatch.setitem(sys.modules, "manifold3d", None)
-    assert cli.main(["export", *out]) == 2
-    [line] = capsys.readouterr().err.splitlines()
-    assert "the parts need manifold3d: pip install '.[export]' in the checkout" in line
-    assert not (tmp_path / "out").exists()

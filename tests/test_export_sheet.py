@@ -69,21 +69,6 @@ def test_known_thresholds_are_bracketed():
     assert (np.count_nonzero(moved, axis=1) <= 1).all() and x >= 0
 
 
-def test_the_design_space_widens_the_table():
-    """The paper's 2D space has -60 to 200 mm for arm_z, the table -50 to 150."""
-    the_scene = scene.load("paper")
-    space = parameters.design_space(the_scene.hand, "2d")
-    planned = tolerance.study(the_scene, space, space.default(), 2, free=False)
-    assert planned.space.num_parameters == 23 and len(planned.designs) == 1 + 23 * 2 * 2
-    row = planned.space.names.index("arm_z")
-    assert (planned.low[row], planned.high[row]) == pytest.approx((-0.060, 0.200))
-    # What the 2D space fixes, the whole design has: a pitch of 15 degrees.
-    pitch = planned.space.names.index("arm_pitch")
-    assert planned.designs[0, pitch] == pytest.approx(np.radians(15))
-    free = tolerance.study(the_scene, space, space.default(), 2, free=True)
-    assert free.space.names == ("length", "arm_z") and len(free.designs) == 1 + 2 * 2 * 2
-
-
 @pytest.fixture(scope="module")
 def toy():
     """An engine that two tests share, and with it their program."""

@@ -1,6 +1,7 @@
 """Recorded contact forces: momentum, MuJoCo's own, and that recording changes nothing."""
 
 import csv
+import functools
 import re
 
 import jax
@@ -23,6 +24,7 @@ from tests.helpers.toy_engine import TINY
 HELD = {"links": 3, "effects__disturb": False, "effects__ungrasp": False}
 
 
+@functools.cache
 def grasp_of(surface):
     """Scene, inputs, states and trace of one grasp that lifts its box and drops it, float64."""
     scene = grasps.pinch("box", effects__surface=surface, **HELD)
@@ -184,6 +186,7 @@ def test_what_cannot_be_pulled_is_said(capsys):
         assert f"--pull {text} must be down, x, y, z" in capsys.readouterr().err
 
 
+@pytest.mark.slow  # a kernel; quick: what is recorded, and that wrong pulls are refused
 def test_a_table_of_forces_has_each_step(tmp_path, capsys):
     path = tmp_path / "forces.csv"
     assert cli.main(["evaluate", "--scene", str(TINY), "--trials", "1", "--forces", str(path)]) == 0

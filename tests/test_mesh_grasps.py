@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial.transform import Rotation
 
 from codesign_jax import control, model, scene
 from codesign_jax.engines import make_engine
@@ -57,20 +56,6 @@ def test_household_distances_in_lanes(household):
         step = points[..., i].T + 1e-4 * np.asarray(gradient[..., i]).T
         slope = (1.03 * surface.signed_distance(*body, step / 1.03) - exact) / 1e-4
         assert np.median(slope[away]) > 0.99, s.name  # it is the way out
-
-
-def test_support_points_carry_the_lowest(household):
-    """Whatever the pose, the four points include the lowest of the mesh, up to the selection."""
-    the_scene = scene.load("paper_spheres", object_set="household")
-    poses = Rotation.from_rotvec(np.random.default_rng(5).normal(size=(40, 3))).as_matrix()
-    points = jax.jit(mesh_lanes.table_points)
-    for i, s in enumerate(household):
-        size = jnp.asarray(np.tile(np.array(s.half_sizes)[:, None, None], (1, 1, 40)))
-        lanes = mesh_lanes.mesh_lanes(the_scene, jnp.full((1, 40), i), size)
-        columns = jnp.asarray(poses.transpose(2, 1, 0))
-        found = np.asarray(points(lanes, columns))
-        lowest = (s.mesh.vertices @ poses.transpose(0, 2, 1))[..., 2].min(1)
-        assert (found[2].min(0) - lowest < 8e-4).all(), s.name
 
 
 # --- scenes --------------------------------------------------------------------------------------

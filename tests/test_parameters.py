@@ -182,20 +182,6 @@ def test_fingers_may_have_values_and_bounds_of_their_own():
     np.testing.assert_allclose(fixed.wall, 0.005, rtol=1e-6)
 
 
-def test_a_preset_narrows_single_fingers_and_tied_ones_share_the_bounds_of_all():
-    def of(*free):
-        return parameters.design_space(
-            dataclasses.replace(THUMB, preset=(hand.Preset("own", free),)), "own"
-        )
-
-    narrow = of(hand.Free("length", low=(70.0, 80.0, 90.0, 50.0), high=120.0))
-    np.testing.assert_allclose(narrow.in_units(narrow.low), [70, 80, 90, 50])
-    np.testing.assert_allclose(narrow.in_units(narrow.high), 120)
-    tied = of(hand.Free("length", tied=True))
-    assert tied.names == ("length",)
-    np.testing.assert_allclose(tied.in_units([tied.low, tied.high]), [[60], [110]])
-
-
 @pytest.mark.parametrize("the_hand", [HAND, THUMB], ids=lambda h: h.name)
 def test_sampled_designs_are_legal_and_uniform_where_no_limit_acts(the_hand):
     space = parameters.design_space(the_hand)

@@ -38,15 +38,11 @@ def loop(scene, step, **attributes):
     return policy.ControlLoop(make_engine("structured", scene), named)
 
 
-# Slow is what a supply leaves out; quick: the same with one.
-IDEAL = pytest.param(False, id="ideal", marks=pytest.mark.slow)
-
-
-@pytest.fixture(scope="module", params=[IDEAL, pytest.param(True, id="supply")])
-def worlds(request):
-    """A short scene, with an ideal air supply or a real one, and four random worlds."""
+@pytest.fixture(scope="module")
+def worlds():
+    """A short scene with a real air supply, and four random worlds."""
     effects = dataclasses.replace(
-        grasps.short_grasp().effects, pressure_dynamics=request.param, disturb=True
+        grasps.short_grasp().effects, pressure_dynamics=True, disturb=True
     )
     phases = dataclasses.replace(grasps.short_grasp().phases, disturb=0.6)
     scene = dataclasses.replace(grasps.short_grasp(), effects=effects, phases=phases)
@@ -116,6 +112,7 @@ def test_what_is_observed_is_where_mujoco_has_it(worlds):
     np.testing.assert_allclose(seen.phase_time, 0.4 - scene.phases.inflate, rtol=1e-5)
 
 
+@pytest.mark.slow  # quick: the open loop's (test_compose), and that both have the same bits
 def test_the_derivative_of_a_closed_loop_is_that_of_differences():
     """By a gain that its policy remembers, and acts on what it observes with."""
     scene = grasps.short_grasp()
@@ -183,6 +180,7 @@ def test_a_command_that_is_no_number_fails_its_world():
         rollout.simulate(scene, engine, params, trials)
 
 
+@pytest.mark.slow  # quick: test_docs takes the policy, test_env steps an environment
 def test_the_page_s_policy_and_environment_do_what_they_say(monkeypatch):
     """Pressures rise where the object slips in the hand, and nowhere else."""
     scene = grasps.short_grasp()

@@ -68,7 +68,7 @@ def test_fingers_and_palm_are_as_deep_in_one_another_as_mujocos_geoms():
     assert {line.split(":")[0] for line in found} == {str(i) for i in np.flatnonzero(deep)}
 
 
-@pytest.mark.parametrize("surface", ["spheres", "hull"])
+@pytest.mark.parametrize("surface", ["hull", pytest.param("spheres", marks=pytest.mark.slow)])
 def test_fingers_inside_one_another_are_refused(surface):
     """Without a spread two pairs of the paper's fingers stand in one place: 20 mm deep."""
     effects = {"surface": surface, "finger_finger": True}

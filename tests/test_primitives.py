@@ -74,7 +74,7 @@ def test_a_shape_without_record_or_distance_is_refused_at_import(names):
 # --- distances of finger spheres ------------------------------------------------------------------
 
 
-RADIUS, POSES = 0.010, 4000
+RADIUS, POSES = 0.010, 1500
 
 
 def world(kind):

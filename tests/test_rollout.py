@@ -66,35 +66,6 @@ def commands(**changes):
     return np.asarray(commanded(PAPER, params, trial))
 
 
-def test_commands_of_a_grasp():
-    """Key frames at the phases' ends, in the actuators' order: x y z, roll yaw pitch, pressures.
-
-    The hinge turns about +y; a positive pitch of the arm, about -y, points the fingers to +x.
-    """
-    u = commands()
-    assert u.shape == (900, 10)
-    start, low = 0.3, 0.06 + 0.05
-    for time, height, inflation in (
-        (0.0, start, 0.0),
-        (1.0, (start + low) / 2, 0.0),
-        (2.0, low, 0.0),
-        (2.75, low, 0.5),
-        (3.5, low, 1.0),
-        (4.0, (start + low) / 2, 1.0),
-        (4.5, start, 1.0),
-        (7.99, start, 1.0),
-        (8.25, start, 0.5),
-        (8.5, start, 0.0),
-        (8.99, start, 0.0),
-    ):
-        row = u[round(time * 100)]
-        np.testing.assert_allclose(row[2], height, atol=1e-6)
-        np.testing.assert_allclose(row[6:], 100e3 * inflation, rtol=1e-5, atol=1e-2)
-    np.testing.assert_allclose(
-        u[:450, [0, 1, 3, 4, 5]], [[0.01, 0.02, 0.1, 0.3, -0.2]] * 450, rtol=1e-6
-    )
-
-
 def test_the_arm_carries_the_trials_tilt():
     tilted = commands(arm_tilt=np.array([0.05, -0.07]))
     difference = tilted - commands()

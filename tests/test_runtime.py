@@ -3,7 +3,6 @@
 import ctypes
 import importlib.metadata
 import os
-import shutil
 import subprocess
 import sys
 import threading
@@ -208,72 +207,6 @@ def test_missing_memory_is_an_error(threads):
 
 
 # The interface's version and structures
-
-
-def test_structures_are_those_of_the_header(tmp_path):
-    """Places and sizes as a C compiler finds them in the installed header."""
-    compiler = shutil.which("cc")
-    if compiler is None:
-        pytest.skip("no C compiler")
-    names = {
-        "XLA_FFI_Metadata": ffi.Metadata,
-        "XLA_FFI_Metadata_Extension": ffi.MetadataExtension,
-        "XLA_FFI_Api_Version": ffi.Version,
-        "XLA_FFI_Buffer": ffi.Buffer,
-        "XLA_FFI_Args": ffi.Arguments,
-        "XLA_FFI_Rets": ffi.Arguments,
-        "XLA_FFI_Attrs": ffi.Attributes,
-        "XLA_FFI_CallFrame": ffi.CallFrame,
-        "XLA_FFI_Api": ffi.Api,
-        "XLA_FFI_Error_Create_Args": ffi.ErrorCreate,
-        "XLA_FFI_Error_Destroy_Args": ffi.ErrorDestroy,
-        "XLA_FFI_Stream_Get_Args": ffi.StreamGet,
-        "XLA_FFI_ThreadPool_Schedule_Args": ffi.Schedule,
-        "XLA_FFI_ThreadPool_NumThreads_Args": ffi.NumThreads,
-    }
-    functions = {
-        "error_create": "Error_Create",
-        "error_get_message": None,  # renamed since
-        "error_destroy": "Error_Destroy",
-        "handler_register": "Handler_Register",
-        "stream_get": "Stream_Get",
-        "type_register": "Type_Register",
-        "execution_context_get": None,
-        "state_set": "State_Set",
-        "state_get": "State_Get",
-        "device_memory_allocate": "DeviceMemory_Allocate",
-        "device_memory_free": "DeviceMemory_Free",
-        "thread_pool_schedule": "ThreadPool_Schedule",
-        "thread_pool_num_threads": "ThreadPool_NumThreads",
-    }
-    other = {("XLA_FFI_Args", "values"): "args", ("XLA_FFI_Rets", "values"): "rets"}
-    lines, want = [], []
-    for name, structure in names.items():
-        for field, _ in structure._fields_:
-            theirs = other.get((name, field), field)
-            if structure is ffi.Api and field in functions:
-                if functions[field] is None:
-                    continue
-                theirs = "XLA_FFI_" + functions[field]
-            at = f"offsetof({name}, {theirs}), sizeof((({name}*)0)->{theirs})"
-            lines.append(f'printf("{name}.{field} %zu %zu\\n", {at});')
-            place = getattr(structure, field)
-            want.append(f"{name}.{field} {place.offset} {place.size}")
-    codes = [f"XLA_FFI_Error_Code_{n}" for n in ("INVALID_ARGUMENT", "RESOURCE_EXHAUSTED")]
-    lines += [f'printf("%d\\n", {n});' for n in (*codes, "XLA_FFI_Extension_Metadata")]
-    want += [str(n) for n in (ffi.INVALID_ARGUMENT, ffi.RESOURCE_EXHAUSTED, ffi.METADATA)]
-    (tmp_path / "a.c").write_text(
-        f'#include <stdio.h>\n#include "{ffi.header()}"\nint main() {{ {" ".join(lines)} }}\n'
-    )
-    subprocess.run([compiler, "-w", "a.c", "-o", "a"], cwd=tmp_path, check=True)
-    done = subprocess.run([tmp_path / "a"], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines() == want
-    text = ffi.header().read_text()
-    for name, number in ffi.DTYPES.items():
-        letters = {"int": "S", "uint": "U", "float": "F", "bfloat": "BF"}
-        kind = name.rstrip("0123456789")
-        theirs = "PRED" if name == "bool" else letters[kind] + name[len(kind) :]
-        assert f"XLA_FFI_DataType_{theirs} = {number}," in text
 
 
 def test_a_newer_version_is_refused_by_xla(monkeypatch):

@@ -49,22 +49,15 @@ def scene_problems(**overrides):
 # --- messages ------------------------------------------------------------------------------------
 
 BY_PATH = {
-    "gravity=3.7": lambda s: s.gravity == 3.7,
     "discretization.links=5": lambda s: s.discretization.links == 5,
-    "pneumatics.lag=0.2": lambda s: s.pneumatics.lag == 0.2,
     "hand=tripod3": lambda s: s.hand.name == "tripod3",
     "hand.material.shear_modulus=60e3": lambda s: s.hand.material.shear_modulus == 60e3,
     "hand.finger[1].tilt=75": lambda s: [f.tilt for f in s.hand.finger[:2]] == [70.0, 75.0],
-    "hand.parameter.length.high=150": lambda s: s.hand.parameter[0].high == 150.0,
     "hand.preset.2d.fixed.pressure=110": lambda s: s.hand.preset[0].fixed["pressure"] == 110,
-    "hand.preset.2d.fixed.wall=[4, 5, 5, 6]": lambda s: (
-        s.hand.preset[0].fixed["wall"] == (4, 5, 5, 6)
-    ),
     "hand.parameter.length.default=[110, 110, 60, 90]": lambda s: (
         s.hand.parameter[0].default == (110.0, 110.0, 60.0, 90.0)
     ),
     "hand.preset.2d.free.arm_z.high=150": lambda s: s.hand.preset[0].free[1].high == 150.0,
-    "objects.noise.position=0.01": lambda s: s.objects.noise.position == 0.01,
     "objects.object.sphere.mass=0.2": lambda s: s.objects.object[2].mass == 0.2,
     "objects.object.0.size.2=0.02": lambda s: s.objects.object[0].size == (0.03, 0.03, 0.02),
 }
@@ -88,17 +81,13 @@ def test_key_paths_may_be_nested_or_dotted_and_the_last_of_a_key_holds():
 
 # Key paths, and what is said of each.
 WRONG_PATHS = {
-    "gravity.earth.x=1": "gravity = 9.81 is no table: it has no key 'earth'",
-    "solver.iteration=3": "solver.iteration is not a known key; did you mean 'solver.iterations'?",
     "objects.noise.size=2": "objects.noise.size = 2 is outside",
     "gravty=3": "gravty is not a known key; did you mean 'gravity'?",
-    "hand.material.densty=1": "did you mean 'hand.material.density'?",
     "hand.section.width=18": (
         "hand.section.width = 18 is outside [0.005, 0.1] m; did you mean 0.018? (mm given"
     ),
     "hand.finger[7].tilt=1": "hand.finger has no entry '7'; valid: 0, 1, 2, 3",
     "objects.object.spher.mass=1": "objects.object has no entry 'spher'; did you mean 'sphere'?",
-    "objects.object.sphere.mass=light": "objects.object.sphere.mass = 'light' must be",
     "discretization.links=10.0": "discretization.links = 10.0 must be a whole number in [1, 200]",
     # A number without a unit has no slip of units.
     "cost.maximum=2000": "cost.maximum = 2000 is outside [0.1, 100]",
@@ -184,21 +173,17 @@ LOW = "low = 10\nhigh = 180\ndefault"  # of the length
     ("old", "new", "expected"),
     [
         # The type of a value, and its unit
-        ("width = 0.024", 'width = "20 mm"', "'20 mm' must be a number in [0.005, 0.1] m"),
         (
             "width = 0.024",
             "width = 18",
             "hands.toml.section.width = 18 is outside [0.005, 0.1] m; did you mean 0.018? "
             "(mm given where m is expected)",
         ),
-        ('domain = "morphology"', 'domain = "shape"', "domain = 'shape' is not valid; "),
         ("density = 1", "densty = 1", "densty is not a known key; did you mean 'density'?"),
         # What does not fit together
-        ('unit = "mm"', 'unit = "kPa"', "unit"),  # a length is no pressure
         (LOW, "low = 200\nhigh = 180\ndefault", "must be below"),
         ("default = 80", "default = 190", "default = 190"),
         ('name = "wall"', 'name = "height"', "'wall' must be given once, not 0 times"),
-        ("high = 7", "high = 9", "no air chamber"),
         ("\nwall = 5", "\nwall = 2.5", "limit"),  # 120 kPa exceeds 40 kPa/mm * 2.5 mm
         ("[preset.fixed]", "[preset.fixed]\nlength = 100", "both free and fixed"),
         ('[[preset]]\nname = "2d"', '[[preset]]\nname = "full"', "full"),
@@ -211,22 +196,11 @@ LOW = "low = 10\nhigh = 180\ndefault"  # of the length
         ),
         (
             "\npressure = 120",
-            "\npressure = [120, 110, 0.11, 220]",
-            "preset 2d.fixed.pressure[3] = 220 is outside [0, 150] kPa",
-        ),
-        (
-            "\npressure = 120",
             '\npressure = [120, 110, "100", 110]',
             "fixed.pressure = [120, 110, '100', 110] must be a number [kPa], or one for each",
         ),
         ("\nwall = 5", "\nwall = [5, 5, 2.5, 5]", "120000 Pa is not below the limit of 100000 Pa"),
         ("\nspread = 45", "\nspread = [45]", "= [45] must be a number [deg]: the hand has one spr"),
-        (
-            "default = 80",
-            "default = [60, 110]",
-            "parameter length.default = [60.0, 110.0] must be a number [mm] for all fingers or 4, "
-            "one for each, not 2",
-        ),
         ("low = 2\n", "low = [2, 2, 8, 2]\n", "parameter wall[2]: low 8 must be below high 7 mm"),
         (
             "tied = true\nlow = 10",

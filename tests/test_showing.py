@@ -10,14 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from codesign_jax import batch, cli, codesign, runs, scene
-from codesign_jax.commands import landscape as command
+from codesign_jax import batch, cli, codesign, runs
 from codesign_jax.engines import make_engine
 from codesign_jax.report import animation, landscape
 from codesign_jax.runs import choice
-from codesign_jax.runs.choice import Case
 from codesign_jax.scene.parameters import design_space
-from codesign_jax.types import Outcome, Status, failed
+from codesign_jax.types import failed
 from tests.helpers.tiny_run import small_run  # noqa: F401
 from tests.helpers.toy_engine import TINY
 
@@ -183,30 +181,6 @@ def test_landscape_has_every_point(run, monkeypatch, capsys):
     pytest.importorskip("plotly")
     assert cli.main(["report", str(run), "--no-replay"]) == 0
     assert '"type":"heatmap"' in (run / "report.html").read_text(encoding="utf-8")
-
-
-def test_landscape_varies_two_of_many_and_counts_what_it_should():
-    """Other parameters stay; failed trials are left out of the mean, and warnings are none."""
-    the_scene = scene.load(TINY)
-    space = design_space(the_scene.hand)
-    start = np.asarray(space.default(), np.float32)
-    case = Case(the_scene, space, start, "mujoco")
-    columns = (space.names.index("pressure[0]"), space.names.index("wall[0]"))
-    made = command.make_plane(case, columns, 4)
-    others = np.delete(np.arange(space.num_parameters), columns)
-    np.testing.assert_array_equal(made.designs[:, others], np.tile(start[others], (16, 1)))
-    np.testing.assert_allclose(made.designs[:, columns[1]], np.tile(made.axes[1], 4), rtol=1e-6)
-    limit = the_scene.hand.pressure_limit.per_wall * made.designs[:, columns[1]]
-    assert (made.designs[:, columns[0]] <= limit).all()
-    status = np.zeros((16, 3), np.int32)
-    status[0] = [Status.SPEED, Status.SOLVER_CAP, 0]
-    cost = np.tile(np.float32([3.0, 0.0, 1.0]), (16, 1))
-    lost = np.where(cost > 0, 0.5, np.inf)
-    found = command.summarize(case, made, Outcome(cost, status, lost, status), 7)
-    assert found.cost[0, 0] == pytest.approx(0.5) and found.cost[1, 0] == pytest.approx(4 / 3)
-    assert found.kept[0, 0] == 1 and found.counted[0, 0] == 2 and found.counted[3, 3] == 3
-    assert [*found.units] == ["kPa", "mm"]
-    assert found.first[-1] == pytest.approx(made.axes[0][-1] / 1e3)
 
 
 def test_missing_extra_is_one_line(monkeypatch, capsys):

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 from scipy import integrate, optimize
 
-from codesign_jax import codesign, constants, model, runs, scene
+from codesign_jax import constants, model, runs, scene
 from codesign_jax.commands import reference
 from codesign_jax.model import overlap
 from codesign_jax.report import stress
@@ -110,8 +110,8 @@ def test_the_strain_s_pressure_is_that_of_the_wall_s_stress(neo_hookean):
 
 @pytest.mark.parametrize("law", ["false", "true"])
 def test_no_design_of_a_space_is_beyond_the_strain(law):
-    """Those that are drawn, projected and proposed; pressures alone change. Without the limit
-    Table I allows more."""
+    """Those that are drawn and projected; pressures alone change. Without the limit Table I allows
+    more."""
     limited = scene.load(
         "paper", overrides={"limits.strain": 1.0, "effects.neo_hookean": law == "true"}
     )
@@ -134,16 +134,6 @@ def test_no_design_of_a_space_is_beyond_the_strain(law):
     np.testing.assert_array_equal(drawn[space][:, same], drawn[SPACE][:, same])
     with pytest.warns(UserWarning, match="pressure above the limit"):
         space.check(drawn[SPACE])
-    optimizer = codesign.make_optimizer("cma-es", space)
-    state = optimizer.init(jax.random.key(0), space.default(), 8)
-    mask, ask = np.ones(space.num_parameters, bool), jax.jit(optimizer.ask)
-    tell = jax.jit(optimizer.tell)
-    for _ in range(4):  # the highest pressures cost least
-        population = ask(state, mask)
-        cost = -np.asarray(population)[:, -4:].sum(1) / 1e5
-        state, _ = tell(state, population, cost, mask)
-        assert highest(population).max() <= 1
-    assert highest(state.particles).max() <= 1
 
 
 def test_stress_is_told_kept_and_reported(finished, capsys):

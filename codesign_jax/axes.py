@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.scene import Constants, Scene
+from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Params, Tip, Trial
 
@@ -92,21 +92,17 @@ def _differences(one: Any, other: Any, path: str) -> list[str]:
     return [] if repr(one) == repr(other) else [path]
 
 
-def refuse_constants(constants: Constants, count: int, axis: str) -> None:
-    """Refuses constants of another number of values than there are worlds or trials.
-
-    Args:
-      constants: The constants, leaves of shape () or (n,).
-      count: Length of the axis.
+def refuse_numbers(scene: Scene, count: int, axis: str) -> None:
+    """Refuses a scene's numbers that are not one or as many as there are worlds or trials.
 
     Raises:
       InputError: With the first leaf of another length.
     """
-    for path, value in jax.tree_util.tree_leaves_with_path(constants):
+    for path, value in jax.tree_util.tree_leaves_with_path(scene):
         if np.ndim(value) == 1 and np.shape(value)[0] != count:
             key = jax.tree_util.keystr(path)
             raise InputError(
-                [f"constants{key} has {np.shape(value)[0]} values, one a {axis}: there are {count}"]
+                [f"scene{key} has {np.shape(value)[0]} values, one a {axis}: there are {count}"]
             )
 
 

@@ -22,7 +22,7 @@ from codesign_jax.engines import Engine
 from codesign_jax.engines.base import block_lanes, staged
 from codesign_jax.optimize import Optimizer, State
 from codesign_jax.reuse import Program, shared
-from codesign_jax.scene import Constants, Scene
+from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, Trial
 
@@ -170,9 +170,9 @@ class Batch:
         if self._parts is None:
             task, joined = self._task, min(runs, self._group(request))
             worlds = -(-joined * self._worlds(request) // len(self.devices))
-            scene, engine, space, trials, options = task.how
-            made = _stages(scene, engine, space, block_lanes(engine, worlds), trials, options)
-            ours = {n: Program(scene, getattr(made, n), self._optimizer) for n in _OURS}
+            engine, space, trials, options = task.how
+            made = _stages(engine, space, block_lanes(engine, worlds), trials, options)
+            ours = {n: Program(task.scene, getattr(made, n), self._optimizer) for n in _OURS}
             self._parts = made._replace(**ours)
         return self._parts
 
@@ -256,7 +256,6 @@ _OURS = "draw", "before", "after"
 
 @shared
 def _stages(
-    scene: Scene,
     engine: Engine,
     space: DesignSpace,
     lanes: int | None,
@@ -266,28 +265,28 @@ def _stages(
     """Draws an episode's trials; moves particles and prepares worlds; simulates them; judges."""
     stages = staged(engine, lanes, trajectory=options.to_end)
 
-    def draw(state: State, mask: Any, constants: Constants, optimizer: Optimizer) -> Trial:
-        return episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
+    def draw(state: State, mask: Any, scene: Scene, optimizer: Optimizer) -> Trial:
+        return episode_trials(scene, state.key, state.episode, num_trials)
 
-    def before(state: State, mask: Any, constants: Constants, optimizer: Optimizer) -> _Packed:
-        own = state, mask, constants, optimizer
-        population, (hands, trials, numbers) = asked(scene, space, num_trials, *own)
-        fields, ctrl, initial = rollout.prepare(scene, hands, trials, numbers, engine)
+    def before(state: State, mask: Any, scene: Scene, optimizer: Optimizer) -> _Packed:
+        population, worlds = asked(space, num_trials, state, mask, scene, optimizer)
+        fields, ctrl, initial = rollout.prepare(*worlds, engine)
+        trials = worlds[2]
         blocks = stages.pack(fields, ctrl)
         return _Packed(population, trials, initial, *blocks, None if options.cost is None else ctrl)
 
     def after(
         begun: tuple[State, _Packed],
         found: tuple[Any, tuple],
-        constants: Constants,
+        scene: Scene,
         optimizer: Optimizer,
     ) -> tuple[State, EpisodeInfo]:
         (state, packed), (mask, out) = begun, found
         trace = stages.unpack(out, len(packed.population) * num_trials)
-        judged = trace, packed.ctrl, packed.initial, packed.trials, constants
+        judged = trace, packed.ctrl, packed.initial, packed.trials
         outcome = rollout.judge(scene, *judged, options)
-        own = state, mask, constants, optimizer
-        return told(scene, num_trials, *own, packed.population, (outcome, trace.last))
+        own = state, mask, scene, optimizer
+        return told(num_trials, *own, packed.population, (outcome, trace.last))
 
     return _Stages(draw, before, stages.launch, after)
 

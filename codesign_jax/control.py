@@ -47,7 +47,7 @@ def commands(scene: Scene, params: Params, trial: Trial) -> jax.Array:
     to (k+1) h.  While the object settles the arm waits at the first key frame.
 
     Args:
-      scene: The scene; of `Scene.with_constants` if its numbers are traced.
+      scene: The scene; its numbers may be traced.
       params: Parameters of one hand.
       trial: Its trial; the arm frame carries the trial's roll and pitch noise.
     """

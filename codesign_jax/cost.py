@@ -37,7 +37,7 @@ def outcome(
     trial is neither kept nor lost and shows c_max; `particle_cost` decides what it counts.
 
     Args:
-      scene: The scene; of `Scene.with_constants` if its numbers are traced.
+      scene: The scene; its numbers may be traced.
       trace: Trace of one world, arrays of shape (time,).
       initial: Bits of `Status` that the world starts with, shape () int32.
       trial: The trial, by the size of whose object it is told whether a released one rests on the

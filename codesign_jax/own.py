@@ -81,15 +81,14 @@ def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
     forces = getattr(cost, "record_forces", False)
     if not isinstance(forces, bool):
         raise InputError([f"{flag}: its attribute record_forces must be True or False"])
-    constants = scene.constants()
 
     def judge(trace: Trace, params: Params, trials: Any) -> Outcome:
-        _, ctrl, initial = rollout.prepare(scene, params, trials, constants)
+        _, ctrl, initial = rollout.prepare(scene, params, trials)
         how = rollout.Options(record_qpos=not stops, stop_when_lost=stops, cost=cost)
-        return rollout.judge(scene, trace, ctrl, initial, trials, constants, how)
+        return rollout.judge(scene, trace, ctrl, initial, trials, how)
 
     one = jax.tree.map(lambda v: jnp.asarray(v)[None], (_hand(scene), rollout.nominal_trial(scene)))
-    fields, ctrl, _ = jax.eval_shape(lambda p, t: rollout.prepare(scene, p, t, constants), *one)
+    fields, ctrl, _ = jax.eval_shape(lambda p, t: rollout.prepare(scene, p, t), *one)
     dtype = jnp.result_type(float)
     series: Any = jax.ShapeDtypeStruct((1, scene.num_steps), dtype)
     size = (1, scene.num_steps, fields.start.shape[-1] if not stops else 0)

@@ -296,9 +296,7 @@ def begin(scene: Scene, fields: ModelFields, plan: Plan) -> World:
     state = jnp.concatenate(model.split(scene, fields.start), -1)
     first = plan.pressure[:, 0]
     if scene.effects.pressure_dynamics:
-        first = jax.vmap(lambda c, p: control.reachable(scene.with_constants(c), p))(
-            fields.constants, first
-        )
+        first = jax.vmap(control.reachable)(fields.constants, first)
     return World(state, first)
 
 
@@ -328,7 +326,7 @@ def observe(
     none = jnp.zeros_like(found.place)
     velocity = found.object_vel[:, 0].T
     step = model.split(scene, world.state).step[:, 0]
-    phase, since = jax.vmap(lambda c, k: _phase(scene.with_constants(c), k))(fields.constants, step)
+    phase, since = jax.vmap(_phase)(fields.constants, step)
     joint, rate = (jnp.moveaxis(v, (3, 2), (0, 1)) for v in (state.finger, state.finger_vel))
     palm, thing = (
         pose(found.place[:, 0], found.palm[:, :, 0]),
@@ -420,10 +418,10 @@ def advance(
     """
     scene: Scene = engine.scene  # type: ignore[attr-defined]
 
-    def controls(constants: Any, now: jax.Array, shake: jax.Array, tilt: jax.Array, told: Command):
+    def controls(own: Scene, now: jax.Array, shake: jax.Array, tilt: jax.Array, told: Command):
         pressure, end = told.pressure, told.pressure[-1]
         if scene.effects.pressure_dynamics:
-            pressure, end = control.supplied(scene.with_constants(constants), pressure, now)
+            pressure, end = control.supplied(own, pressure, now)
         return control.actuated(told.pose, pressure, shake, tilt), end
 
     given = fields.constants, world.pressure, plan.shake, plan.tilt, command

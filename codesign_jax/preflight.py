@@ -3,7 +3,6 @@
 The scene's own checks look at one number at a time; these look at what a design makes of them.
 """
 
-import functools
 import math
 import operator
 from collections.abc import Mapping
@@ -14,7 +13,7 @@ import numpy as np
 
 from codesign_jax import model, rollout, start
 from codesign_jax.model import morphology
-from codesign_jax.scene import Constants, Scene, key_frames
+from codesign_jax.scene import Scene, key_frames
 from codesign_jax.scene.parameters import DesignSpace, params_of
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Params
@@ -135,9 +134,9 @@ def _reach(scene: Scene, one: Params, name: str) -> list[str]:
 
 def _overlaps(scene: Scene, designs: Params, names: list[str]) -> list[str]:
     """Refuses designs that start deep inside the table, an object or themselves, without noise."""
-    numbers = jax.tree.map(np.float32, scene.constants())
+    numbers = jax.tree.map(np.float32, scene.bare)
     singles = jax.tree.map(np.float32, designs)
-    with_objects, fingers, palm = map(np.asarray, _depths(scene.structure, numbers, singles))
+    with_objects, fingers, palm = map(np.asarray, _depths(numbers, singles))
     fixtures = ", a fixture" if scene.fixture else ""
     limit = scene.limits.penetration
     found = []
@@ -170,15 +169,14 @@ def _overlaps(scene: Scene, designs: Params, names: list[str]) -> list[str]:
     return found
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _depths(scene: Scene, numbers: Constants, designs: Params) -> tuple[jax.Array, ...]:
+@jax.jit
+def _depths(scene: Scene, designs: Params) -> tuple[jax.Array, ...]:
     """What `start.invalid_start` judges by, each of shape (object, design); one program for all."""
-    own = scene.with_constants(numbers)
 
     def of_shape(index: jax.Array) -> tuple[jax.Array, ...]:
         trial = rollout.nominal_trial(scene)._replace(shape=index)
-        fields = jax.vmap(lambda p: model.model_fields(own, p, trial))(designs)
+        fields = jax.vmap(lambda p: model.model_fields(scene, p, trial))(designs)
         tests = start.depth, start.depth_between, start.depth_in_palm
-        return tuple(test(scene, fields) for test in tests)
+        return tuple(test(scene.structure, fields) for test in tests)
 
     return jax.lax.map(of_shape, jnp.arange(len(scene.objects.object)))

@@ -316,10 +316,10 @@ def _relieve() -> None:
 
 
 def shared(build: Callable[..., Any]) -> Callable[..., Any]:
-    """Jits the functions that build(scene, engine, space, *more) returns once for each structure.
+    """Jits the functions that build(engine, space, *more) returns once for all that are equal.
 
-    The program reads numbers from its constants alone, so that another scene of the same structure
-    compiles nothing; with a `cost` of the user's own, or code that is not known, nothing is shared.
+    They get their scene as an argument, so that another one of the same structure compiles nothing;
+    with a `cost` of the user's own, or code that is not known, nothing is shared.
     """
 
     def jitted(*arguments: Any) -> Any:
@@ -332,42 +332,42 @@ def shared(build: Callable[..., Any]) -> Callable[..., Any]:
     forgetters.append(found.cache_clear)
 
     @functools.wraps(build)
-    def find(scene: Any, engine: Any, space: Any, *arguments: Any) -> Any:
+    def find(engine: Any, space: Any, *arguments: Any) -> Any:
         if getattr(arguments[-1], "cost", None) is not None:
-            return jitted(scene, engine, space, *arguments)
+            return jitted(engine, space, *arguments)
         known = isinstance(engine, Hashable) and code_digest() is not None
-        return (found if known else jitted)(scene.structure, engine, space.structure, *arguments)
+        return (found if known else jitted)(engine, space.structure, *arguments)
 
     return find
 
 
 class Program:
-    """A jitted function of two arguments that gets a scene's numbers, or others, as its third.
+    """A jitted function of two arguments that gets a scene, or another one, as its third.
 
     `jax.jit`, `jax.vmap` and so on work on it as on a function.
     """
 
     def __init__(self, scene: Any, jitted: Any, *more: Any):
-        """Joins a program with what a scene passes to it, and further arguments of every call."""
+        """Joins a program with its scene, and further arguments of every call."""
         self._scene, self._jitted, self._more = scene, jitted, more
 
-    def __call__(self, first: Any, second: Any, constants: Any = None) -> Any:
-        """Calls the program; `constants` are checked and replace the scene's."""
-        numbers = self._numbers(constants)
-        return _run(lambda: self._jitted(first, second, numbers, *self._more))
+    def __call__(self, first: Any, second: Any, scene: Any = None) -> Any:
+        """Calls the program; the scene is checked and takes the place of its own."""
+        own = self._arrays(scene)
+        return _run(lambda: self._jitted(first, second, own, *self._more))
 
     def compile(self, first: Any, second: Any) -> Callable[..., Any]:
         """Compiles the program ahead for arguments like these; a function to call it by."""
-        numbers = self._numbers(None)
-        compiled = _run(lambda: self._jitted.lower(first, second, numbers, *self._more).compile())
-        return lambda first, second: compiled(first, second, numbers, *self._more)
+        own = self._arrays(None)
+        compiled = _run(lambda: self._jitted.lower(first, second, own, *self._more).compile())
+        return lambda first, second: compiled(first, second, own, *self._more)
 
-    def _numbers(self, constants: Any) -> Any:
+    def _arrays(self, scene: Any) -> Any:
         import jax
 
         # Python's floats would be traced apart from arrays.
-        numbers = self._scene.numbers(constants)
-        return jax.tree.map(lambda v: jax.numpy.asarray(v, float), numbers)
+        found = self._scene.checked(scene)
+        return jax.tree.map(lambda v: jax.numpy.asarray(v, float), found.bare)
 
 
 # Whether programs have run in this process, and whether it was forked from one in which they had.

@@ -27,7 +27,7 @@ from codesign_jax import axes, control, model, reuse
 from codesign_jax.cost import outcome, shown
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording
-from codesign_jax.scene import Constants, Scene, reach, schema, unit_slips
+from codesign_jax.scene import Scene, reach, schema, unit_slips
 from codesign_jax.scene.constants import batch_axes
 from codesign_jax.start import invalid_start
 from codesign_jax.types import Outcome, Params, Status, Trace, Trial, failed
@@ -79,31 +79,26 @@ class Options(NamedTuple):
 _LATER, _HAND_MASS = 1, 2
 
 
-def sample_trials(
-    scene: Scene, key: jax.Array, num_trials: int, *, constants: Constants | None = None
-) -> Trial:
+def sample_trials(scene: Scene, key: jax.Array, num_trials: int) -> Trial:
     """Draws objects and noise of trials (paper Sec. VI.2); shapes take turns in the set's order.
 
     Args:
-      scene: The scene.
+      scene: The scene; its numbers of shape () or (trial,).
       key: Typed key; trial t draws from fold_in(key, t), so that more trials do not change earlier
         ones.
       num_trials: Number of trials.
-      constants: Numbers instead of the scene's, of which the noise is read; leaves of shape () or
-        (trial,).
 
     Returns:
       Trials with leading axis (trial,).
 
     Raises:
       InputError: If `key` is not one typed key, `num_trials` is no whole number or below 1, or the
-        constants do not fit the scene or the trials.
+        scene's numbers are not in their ranges or as many as the trials.
     """
     reuse.begin()
     axes.refuse_draws(key, num_trials)
-    constants = scene.numbers(constants)
-    axes.refuse_constants(constants, num_trials, "trial")
-    return _draw(num_trials, len(scene.objects.object), key, constants.objects.noise)
+    axes.refuse_numbers(scene.checked(), num_trials, "trial")
+    return _draw(num_trials, len(scene.objects.object), key, scene.objects.noise)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -154,19 +149,15 @@ def simulate(
     engine: Engine,
     params: Params,
     trials: Trial,
-    *,
-    constants: Constants | None = None,
     **options: Any,
 ) -> tuple[Outcome, Trace]:
     """Simulates a batch of worlds; jit it, with scene and engine closed over.
 
     Args:
-      scene: The scene.
-      engine: The engine.
+      scene: The scene; its numbers of shape () or (world,).
+      engine: The engine, which may be that of any scene of the same structure.
       params: Parameters with leading axis (world,).
       trials: Trials with leading axis (world,).
-      constants: Numbers instead of the scene's, see `Scene.constants`; leaves of shape () or
-        (world,). The engine may be that of any scene of the same structure.
       **options: See `Options`.
 
     Returns:
@@ -174,15 +165,15 @@ def simulate(
 
     Raises:
       InputError: If the engine was made for a scene of another structure, if an array lacks an
-        axis, if the constants do not fit the scene or lie outside their ranges, or if a parameter
+        axis, if a number of the scene is outside of its range, or if a parameter
         is out of its range by a factor between units, such as millimetres given for metres, or a
         finger is so high that its contacts begin farther from a mesh than distances reach; of
         traced ones no values are known.
     """
     how = Options(**options)
-    constants = _checked(scene, engine, params, trials, constants)
-    trace, ctrl, initial = _traced(scene, engine, params, trials, constants, how)
-    return judge(scene, trace, ctrl, initial, trials, constants, how), trace
+    _check(scene, engine, params, trials)
+    trace, ctrl, initial = _traced(scene, engine, params, trials, how)
+    return judge(scene, trace, ctrl, initial, trials, how), trace
 
 
 def grasp(
@@ -192,7 +183,6 @@ def grasp(
     trial: Trial,
     *,
     steps: int | None = None,
-    constants: Constants | None = None,
     **options: Any,
 ) -> Trace:
     """Simulates one world, or the beginning of it; `jax.vmap` makes a batch of it.
@@ -203,7 +193,6 @@ def grasp(
       params: Parameters of one hand.
       trial: One trial.
       steps: How many time steps are simulated; None for the whole grasp.
-      constants: Numbers instead of the scene's, leaves of shape ().
       **options: See `Options`.
 
     Returns:
@@ -215,9 +204,8 @@ def grasp(
     if steps is not None and not 0 < steps <= scene.num_steps:
         raise schema.InputError([f"steps = {steps}: the grasp has 1 to {scene.num_steps}"])
     params, trial = jax.tree.map(lambda v: jnp.asarray(v)[None], (params, trial))
-    constants = _checked(scene, engine, params, trial, constants)
-    how = Options(**options)
-    trace, *_ = _traced(scene, engine, params, trial, constants, how, steps)
+    _check(scene, engine, params, trial)
+    trace, *_ = _traced(scene, engine, params, trial, Options(**options), steps)
     return jax.tree.map(lambda v: v[0], trace)
 
 
@@ -226,19 +214,16 @@ def evaluate(
     engine: Engine,
     params: Params,
     trials: Trial,
-    *,
-    constants: Constants | None = None,
     **options: Any,
 ) -> Outcome:
     """Evaluates all particles in all trials as one batch of particle * trial worlds.
 
     Args:
-      scene: The scene.
+      scene: The scene; its numbers of shape () or (trial,).
       engine: The engine.
       params: Parameters with leading axis (particle,).
       trials: Trials with leading axis (trial,): common random numbers, every particle meets the
         same ones.
-      constants: Numbers instead of the scene's; leaves of shape () or (trial,).
       **options: See `Options`.
 
     Returns:
@@ -248,24 +233,22 @@ def evaluate(
       InputError: See `simulate`.
     """
     axes.refuse(scene, params, trials, ("particle", "trial"))
-    if constants is not None:
-        axes.refuse_constants(constants, len(trials.yaw), "trial")
+    axes.refuse_numbers(scene, len(trials.yaw), "trial")
     shape = params.length.shape[0], trials.yaw.shape[0]
-    worlds = crossed(params, trials, constants)
-    result, _ = simulate(scene, engine, *worlds[:2], constants=worlds[2], **options)
-    return grid(result, shape)
+    scene, params, trials = crossed(scene, params, trials)
+    return grid(simulate(scene, engine, params, trials, **options)[0], shape)
 
 
-def crossed(params: Params, trials: Trial, constants: Any = None) -> tuple[Params, Trial, Any]:
+def crossed(scene: Scene, params: Params, trials: Trial) -> tuple[Scene, Params, Trial]:
     """Every particle in all trials, arrays with leading axis (particle * trial,), particles slow.
 
-    Of the constants those with an axis have the trials'.
+    Of the scene's numbers those with an axis have the trials'.
     """
     particles, count = params.length.shape[0], trials.yaw.shape[0]
     every_p = jax.tree.map(lambda v: jnp.repeat(v, count, axis=0), params)
     every_t = jax.tree.map(lambda v: jnp.tile(v, (particles,) + (1,) * (v.ndim - 1)), trials)
-    every_c = jax.tree.map(lambda v: jnp.tile(v, particles) if jnp.ndim(v) else v, constants)
-    return every_p, every_t, every_c
+    own = jax.tree.map(lambda v: jnp.tile(v, particles) if jnp.ndim(v) else v, scene)
+    return own, every_p, every_t
 
 
 def grid(tree: Any, shape: tuple[int, ...]) -> Any:
@@ -273,19 +256,14 @@ def grid(tree: Any, shape: tuple[int, ...]) -> Any:
     return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]), tree)
 
 
-def _checked(
-    scene: Scene, engine: Engine, params: Params, trials: Trial, constants: Constants | None
-) -> Constants:
-    """The numbers of a batch of worlds that is as `simulate` asks for."""
+def _check(scene: Scene, engine: Engine, params: Params, trials: Trial) -> None:
+    """Refuses a batch of worlds that is not as `simulate` asks for."""
     axes.refuse_other(scene, engine)
-    constants = scene.numbers(constants)
     axes.refuse(scene, params, trials, ("world", "world"))
-    axes.refuse_constants(constants, len(trials.yaw), "world")
+    axes.refuse_numbers(scene.checked(), len(trials.yaw), "world")
     unit_slips.refuse(params)
-    if not isinstance(params.height, jax.core.Tracer):
-        heights = [params.height] if params.tip is None else [params.height, params.tip.height]
-        reach.refuse(scene.objects, float(np.max(heights)) / 2)
-    return constants
+    for height in [params.height] if params.tip is None else [params.height, params.tip.height]:
+        reach.refuse(scene.objects, height / 2)
 
 
 def _traced(
@@ -293,7 +271,6 @@ def _traced(
     engine: Engine,
     params: Params,
     trials: Trial,
-    constants: Constants,
     how: Options,
     steps: int | None = None,
 ) -> tuple[Trace, Any, jax.Array]:
@@ -301,7 +278,7 @@ def _traced(
     forces = how.record_forces or getattr(how.cost, "record_forces", False)
     engine = recording(engine) if forces else engine
     ctrl: Any
-    fields, ctrl, initial = prepare(scene, params, trials, constants, engine)
+    fields, ctrl, initial = prepare(scene, params, trials, engine)
     if steps is not None and isinstance(ctrl, control.Plan):
         series = {k: getattr(ctrl, k)[:, :steps] for k in ("pose", "pressure", "shake")}
         ctrl = ctrl._replace(**series)
@@ -315,16 +292,14 @@ def prepare(
     scene: Scene,
     params: Params,
     trials: Trial,
-    constants: Constants,
     engine: Engine | None = None,
 ) -> tuple[model.ModelFields, Any, jax.Array]:
     """What a batch of worlds is, before an engine simulates it.
 
     Args:
-      scene: The scene.
+      scene: The scene; its numbers of shape () or (world,).
       params: Parameters with leading axis (world,).
       trials: Trials with leading axis (world,).
-      constants: Numbers of the worlds, leaves of shape () or (world,).
       engine: The engine, if it may be one that asks a policy, see `policy.ControlLoop`.
 
     Returns:
@@ -336,25 +311,18 @@ def prepare(
       RuntimeError: In a process that was forked from one that had simulated.
     """
     reuse.begin()
-    constants = jax.tree.map(lambda v: jnp.asarray(v, float), constants)
-    every = (0, 0, batch_axes(constants))
-    commands = getattr(engine, "commands", control.commands)
-    world = partial(_world, scene.structure, commands)
-    fields, ctrl = jax.vmap(world, in_axes=every)(params, trials, constants)
+    numbers = jax.tree.map(lambda v: jnp.asarray(v, float), scene.bare)
+    world = partial(_world, getattr(engine, "commands", control.commands))
+    fields, ctrl = jax.vmap(world, in_axes=(batch_axes(numbers), 0, 0))(numbers, params, trials)
     return fields, ctrl, invalid_start(scene, fields)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(jax.jit, static_argnums=0)
 def _world(
-    structure: Scene,
-    commands: Callable[..., Any],
-    params: Params,
-    trial: Trial,
-    constants: Constants,
+    commands: Callable[..., Any], scene: Scene, params: Params, trial: Trial
 ) -> tuple[model.ModelFields, Any]:
     """Model fields and controls of a world; a process traces them once for batches of any size."""
-    own = structure.with_constants(constants)
-    return model.model_fields(own, params, trial), commands(own, params, trial)
+    return model.model_fields(scene, params, trial), commands(scene, params, trial)
 
 
 def judge(
@@ -363,33 +331,30 @@ def judge(
     ctrl: jax.Array | None,
     initial: jax.Array,
     trials: Trial,
-    constants: Constants,
     how: Options,
 ) -> Outcome:
     """Outcomes of a batch of worlds, with leading axis (world,).
 
     Args:
-      scene: The scene.
+      scene: The scene; its numbers of shape () or (world,).
       trace: Their trace.
       ctrl: Their controls, for a cost of one's own; None without one.
       initial: Bits of `Status` that they started with, shape (world,).
       trials: Their trials, with leading axis (world,).
-      constants: Their numbers, leaves of shape () or (world,).
       how: How the trace was made.
     """
     if trace.ctrl is not None:
         ctrl = trace.ctrl
 
-    def world(t: Trace, u: jax.Array | None, i: jax.Array, trial: Trial, c: Constants) -> Outcome:
-        own = scene.with_constants(c)
+    def world(own: Scene, t: Trace, u: jax.Array | None, i: jax.Array, trial: Trial) -> Outcome:
         result = outcome(own, t, i, trial)
         if how.cost is None:
             return result
         seen = shown(t, how.record_qpos, how.stop_when_lost)
         return _by_own(own, how.cost, seen, u, result)
 
-    every = trace, ctrl, initial, trials, constants
-    return jax.vmap(world, in_axes=(0, 0, 0, 0, batch_axes(constants)))(*every)
+    every = jax.vmap(world, in_axes=(batch_axes(scene), 0, 0, 0, 0))
+    return every(scene, trace, ctrl, initial, trials)
 
 
 def _by_own(

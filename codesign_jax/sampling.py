@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from codesign_jax import axes, rollout
 from codesign_jax.engines import Engine
 from codesign_jax.reuse import Program, shared
-from codesign_jax.scene import Constants, Scene
+from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, Trial
 
@@ -66,27 +66,20 @@ def draw(
       InputError: If `key` is not one typed key, or a number is no whole number or below 1.
     """
     axes.refuse_draws(key, num_trials)
-    noise = scene.constants()
-    return _drawn(scene.structure, space, n, num_trials, key, first, noise)
+    return _drawn(space, n, num_trials, key, first, scene.bare)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+@partial(jax.jit, static_argnums=(0, 1, 2))
 def _drawn(
-    structure: Scene,
-    space: DesignSpace,
-    n: int,
-    num_trials: int,
-    key: jax.Array,
-    first: Any,
-    constants: Constants,
+    space: DesignSpace, n: int, num_trials: int, key: jax.Array, first: Any, scene: Scene
 ) -> Drawn:
     """`draw` for any scene of a structure; one program for a number of designs and trials."""
     designs = space.sample(jax.random.fold_in(key, _DESIGNS), n, first=first)
-    root, shapes = jax.random.fold_in(key, _TRIALS), len(structure.objects.object)
+    root, shapes = jax.random.fold_in(key, _TRIALS), len(scene.objects.object)
 
     def trials(i: jax.Array) -> Trial:
         own = jax.random.fold_in(root, i)
-        found = rollout.sample_trials(structure, own, num_trials, constants=constants)
+        found = rollout.sample_trials(scene, own, num_trials)
         # Remainders first: the product itself may be larger than an int32.
         turn = (i % shapes) * (num_trials % shapes) + jnp.arange(num_trials)
         return found._replace(shape=turn % shapes)
@@ -106,19 +99,18 @@ def make_simulate(
       engine: Engine that simulates.
       space: Space of the designs.
     """
-    return Program(scene, _simulation(scene, engine, space, rollout.Options()))
+    return Program(scene, _simulation(engine, space, rollout.Options()))
 
 
 @shared
 def _simulation(
-    scene: Scene, engine: Engine, space: DesignSpace, options: rollout.Options
-) -> Callable[[jax.Array, Trial, Constants], Outcome]:
-    def simulate(designs: jax.Array, trials: Trial, constants: Constants) -> Outcome:
+    engine: Engine, space: DesignSpace, options: rollout.Options
+) -> Callable[[jax.Array, Trial, Scene], Outcome]:
+    def simulate(designs: jax.Array, trials: Trial, scene: Scene) -> Outcome:
         shape = trials.yaw.shape
         hands = jax.vmap(space.params)(jnp.repeat(designs, shape[1], axis=0))
         flat = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), trials)
-        how = {"constants": constants} | options._asdict()
-        found, _ = rollout.simulate(scene, engine, hands, flat, **how)
+        found, _ = rollout.simulate(scene, engine, hands, flat, **options._asdict())
         return rollout.grid(found, shape)
 
     return simulate

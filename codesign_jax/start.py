@@ -32,6 +32,7 @@ def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
     drive them apart with energy that no actuator gave.
     """
     fields = jax.lax.stop_gradient(fields)  # a verdict has no derivative
+    scene = scene.structure
     deep = jnp.maximum(depth(scene, fields), depth_between(scene, fields))
     deep = jnp.maximum(deep, depth_in_palm(scene, fields))
     bad = ~(deep <= fields.constants.limits.penetration)
@@ -62,7 +63,7 @@ def depth(scene: Scene, fields: ModelFields) -> jax.Array:
       Shape (world,); 0 where nothing may touch.
     """
     alone = dataclasses.replace(scene.effects, finger_finger=False)
-    hand, kin, position = _straight(scene.structure, fields)
+    hand, kin, position = _straight(scene, fields)
     scene = dataclasses.replace(scene, effects=alone)
     every = contacts(scene, hand, kin, position)
     found = [(-c.distance).reshape(-1, c.distance.shape[-1]).max(0) for c in every.values()]
@@ -81,7 +82,7 @@ def depth_between(scene: Scene, fields: ModelFields) -> jax.Array:
     worlds, count = fields.start.shape[0], scene.num_fingers
     if not scene.effects.finger_finger or count == 1:
         return jnp.full((worlds,), -jnp.inf, fields.start.dtype)
-    hand, kin, _ = _straight(scene.structure, fields)
+    hand, kin, _ = _straight(scene, fields)
     up = hand.centre[2]
     middle = kin.origin + apply_columns(kin.link, hand.centre)
     deepest = []
@@ -101,7 +102,7 @@ def depth_in_palm(scene: Scene, fields: ModelFields) -> jax.Array:
     """
     if not scene.effects.finger_palm:
         return jnp.full((fields.start.shape[0],), -jnp.inf, fields.start.dtype)
-    hand, kin, _ = _straight(scene.structure, fields)
+    hand, kin, _ = _straight(scene, fields)
     first = first_on_palm(scene.discretization.links) - 1
     point, radius = hand.centre[:, None], hand.centre[2]
     if scene.effects.surface == "hull":

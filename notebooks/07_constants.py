@@ -20,6 +20,7 @@
 
 # %%
 import os
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -36,11 +37,10 @@ space = parameters.design_space(grasping.hand, "2d")
 # %% [markdown]
 # ## What there is
 #
-# `Scene.constants()` is a tree of named numbers in SI units.
+# A scene is a tree of named numbers in SI units.
 
 # %%
-numbers = grasping.constants()
-leaves = jax.tree_util.tree_leaves_with_path(numbers)
+leaves = jax.tree_util.tree_leaves_with_path(grasping)
 print(len(leaves), "constants, for example")
 for path, value in leaves[:: max(1, len(leaves) // 8)]:
     print(f"  {jax.tree_util.keystr(path)} = {value:g}")
@@ -58,27 +58,29 @@ evaluate = codesign.Task(grasping, space, trials).evaluate
 
 
 def scaled(friction=1.0, stiffness=1.0, contact=1.0, palm=1.0):
-    """The constants, four of them times factors: numbers, or arrays of shape (trial,)."""
+    """The scene, four of its numbers times factors: numbers, or arrays of shape (trial,)."""
 
     def times(table, **factors):
         new = {k: getattr(table, k) * np.broadcast_to(f, trials) for k, f in factors.items()}
-        return table._replace(**new)
+        return replace(table, **new)
 
-    shapes = tuple(times(s, friction=friction) for s in numbers.objects.object)
-    hand = numbers.hand._replace(
-        material=times(numbers.hand.material, shear_modulus=stiffness),
-        palm=times(numbers.hand.palm, mass=palm),
+    shapes = tuple(times(s, friction=friction) for s in grasping.objects.object)
+    hand = replace(
+        grasping.hand,
+        material=times(grasping.hand.material, shear_modulus=stiffness),
+        palm=times(grasping.hand.palm, mass=palm),
     )
-    return numbers._replace(
-        objects=numbers.objects._replace(object=shapes),
+    return replace(
+        grasping,
+        objects=replace(grasping.objects, object=shapes),
         hand=hand,
-        contact=times(numbers.contact, normal_stiffness=contact),
+        contact=times(grasping.contact, normal_stiffness=contact),
     )
 
 
-def kept(constants, seed=0):
+def kept(own, seed=0):
     """Whether each grasp keeps its object, shape (design, trial)."""
-    cost = evaluate(designs, jax.random.key(seed), constants).cost
+    cost = evaluate(designs, jax.random.key(seed), own).cost
     return np.asarray(cost) < codesign.SUCCESS_COST
 
 
@@ -90,7 +92,7 @@ def kept(constants, seed=0):
 
 # %%
 kinds, levels = len(grasping.objects.object), 2 if FAST else 12
-given = numbers.objects.object[0].friction
+given = grasping.objects.object[0].friction
 values = np.linspace(0.2, 1.4, levels)
 over = kept(scaled(friction=np.repeat(values, trials // levels) / given))
 share = over.reshape(len(designs), levels, -1).mean(-1)

@@ -21,6 +21,7 @@
 
 # %%
 import os
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -40,7 +41,7 @@ space = parameters.design_space(grasping.hand, "2d")  # finger length and arm he
 count = 6 if FAST else 24
 trials = rollout.sample_trials(grasping, jax.random.key(0), count)
 hands = jax.tree.map(lambda v: jnp.stack([v] * count), space.params(space.default()))
-fields, ctrl, _ = rollout.prepare(grasping, hands, trials, grasping.constants())
+fields, ctrl, _ = rollout.prepare(grasping, hands, trials)
 
 # %% [markdown]
 # ## Windows
@@ -64,12 +65,9 @@ def ends(logs):
         friction=friction * trials.friction,
         mass=mass * trials.mass,
     )
-    numbers = grasping.constants()
-    contact = numbers.contact._replace(
-        normal_stiffness=stiffness * numbers.contact.normal_stiffness
-    )
-    numbers = numbers._replace(contact=contact)
-    new, *_ = rollout.prepare(grasping, hands, own, numbers)
+    contact = grasping.contact
+    contact = replace(contact, normal_stiffness=stiffness * contact.normal_stiffness)
+    new, *_ = rollout.prepare(replace(grasping, contact=contact), hands, own)
     driven = window.at[:, :, 6:].multiply(gain[:, None, None])
     return engine.rollout(new._replace(start=state), driven).last[:, : fields.qpos.shape[1]]
 

@@ -13,6 +13,7 @@ import dataclasses
 import sys
 import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +28,7 @@ from codesign_jax.batch import LIMIT
 from codesign_jax.codesign import stream_key
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.optimize import ParticleFilter, State, candidates, schedule
-from codesign_jax.scene import Constants, InputError, Scene, parameters
+from codesign_jax.scene import InputError, Scene, parameters
 from codesign_jax.scene import constants as checks
 from codesign_jax.scene.beams import strain_pressure
 from codesign_jax.scene.hand import Hand
@@ -113,7 +114,7 @@ def own_set(the_scene: Scene, shear_modulus: float) -> np.ndarray:
         "width": width,
         "lateral": material.lateral_factor,
         "torsion": material.torsion_factor,
-        "half_size": 1e3 * shape.size[0],
+        "half_size": 1e3 * shape.half_sizes[0],
         "mass": 1e3 * shape.mass,
         "friction": shape.friction,
         "table_friction": the_scene.objects.table.friction,
@@ -132,56 +133,65 @@ def own_set(the_scene: Scene, shear_modulus: float) -> np.ndarray:
     return np.array([(scaled[k](own[k]) - a) / (b - a) for k, (a, b) in ends.items()])
 
 
-def numbers(the_scene: Scene, chosen: Mapping[str, np.ndarray]) -> Constants:
-    """The scene's numbers with those of sets in them: leaves of shape () or (set,)."""
+def numbers(the_scene: Scene, chosen: Mapping[str, np.ndarray]) -> Scene:
+    """The scene with the numbers of sets in it: leaves of shape () or (set,)."""
     if any(f.base is None for f in the_scene.hand.finger):
         raise InputError(["calibration moves base points; give each finger a base"])
-    c, v = the_scene.constants(), chosen
+    c, v = the_scene, chosen
     x, y = 1e-3 * v["base_x"], 0.5e-3 * v["pair_gap"]
     hand, wrist = c.hand, c.hand.wrist
     linear, angular = v["wrist_linear"], v["wrist_angular"]
-    hand = hand._replace(
+    hand = replace(
+        hand,
         finger=tuple(
-            f._replace(tilt=v["tilt"], base=(np.sign(f.base[0]) * x, np.sign(f.base[1]) * y))
+            replace(f, tilt=v["tilt"], base=(right * x, front * y))
             for f in hand.finger
+            for right, front in [np.sign(f.base or (0.0, 0.0))]
         ),
-        material=hand.material._replace(
+        material=replace(
+            hand.material,
             shear_modulus=1e3 * v["shear_modulus"],
             lateral_factor=v["lateral"],
             torsion_factor=v["torsion"],
         ),
-        section=hand.section._replace(width=1e-3 * v["width"]),
-        wrist=wrist._replace(
+        section=replace(hand.section, width=1e-3 * v["width"]),
+        wrist=replace(
+            wrist,
             linear_stiffness=linear,
             angular_stiffness=angular,
             linear_damping=wrist.linear_damping * np.sqrt(linear / wrist.linear_stiffness),
             angular_damping=wrist.angular_damping * np.sqrt(angular / wrist.angular_stiffness),
         ),
     )
-    factor = 1e-3 * v["half_size"] / c.objects.object[0].size[0]
+    factor = 1e-3 * v["half_size"] / c.objects.object[0].half_sizes[0]
     shapes = tuple(
-        shape._replace(
-            size=tuple(factor * s for s in shape.size),
+        replace(
+            shape,
+            size=tuple(factor * s for s in shape.size or ()),
             mass=1e-3 * v["mass"],
             friction=v["friction"],
         )
         for shape in c.objects.object
     )
-    table = c.objects.table._replace(friction=v["table_friction"])
-    c = c._replace(
+    table = replace(c.objects.table, friction=v["table_friction"])
+    c = replace(
+        c,
         hand=hand,
-        objects=c.objects._replace(object=shapes, table=table),
-        arm=c.arm._replace(
+        objects=replace(c.objects, object=shapes, table=table),
+        arm=replace(
+            c.arm,
             zero_height=1e-3 * v["zero_height"],
             shake_amplitude=v["shake_amplitude"],
             shake_frequency=v["shake_frequency"],
         ),
-        contact=c.contact._replace(
-            normal_stiffness=1e3 * v["normal_stiffness"], friction_ratio=v["friction_ratio"]
+        contact=replace(
+            c.contact,
+            normal_stiffness=1e3 * v["normal_stiffness"],
+            friction_ratio=v["friction_ratio"],
         ),
-        cost=c.cost._replace(maximum=v["cost_maximum"]),
+        cost=replace(c.cost, maximum=v["cost_maximum"]),
     )
-    checks.check(the_scene, c)
+    checks.check(c)
     return c
 
 
@@ -224,13 +234,13 @@ class Wave:
         root = jax.random.key(self.seed)
 
         @jax.jit
-        def simulate(constants: Constants, keys: jax.Array) -> Any:
+        def simulate(sets: Scene, keys: jax.Array) -> Any:
             draw = lambda key: rollout.sample_trials(self.scene, key, self.trials)  # noqa: E731
             set_, design, trial = jnp.indices((each, len(flat), self.trials)).reshape(3, -1)
             params = jax.tree.map(lambda v: v[design], jax.vmap(self.space.params)(flat))
             drawn = jax.tree.map(lambda v: v[set_, trial], jax.vmap(draw)(keys))
-            own = jax.tree.map(lambda v: v[set_] if jnp.ndim(v) else v, constants)
-            return rollout.simulate(self.scene, self.engine, params, drawn, constants=own)[0]
+            own = jax.tree.map(lambda v: v[set_] if jnp.ndim(v) else v, sets)
+            return rollout.simulate(own, self.engine, params, drawn)[0]
 
         for first in range(sum(len(d) for d in done), len(self.units), each):
             # Filled up with the last set, so that every call has the compiled size.

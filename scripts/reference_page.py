@@ -73,8 +73,8 @@ simulated.
 * A range includes its ends. A key whose default is *required* must be given, one whose default is
   *not given* may be left out.
 * Programs are compiled for a scene's *structure*: its effects, numbers of fingers and objects,
-  kinds of shapes, meshes, and the numbers marked ◆. All other numbers of a simulation are data
-  (`Scene.constants()`): changing them compiles nothing."""
+  kinds of shapes, meshes, and the numbers marked ◆. All other numbers of a simulation are
+  leaves of a `Scene`: changing them compiles nothing."""
 
 _STATE = """## State and controls
 

@@ -1,5 +1,7 @@
 """Missing axes, lengths that do not fit and numbers in other units are answered in words."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,9 +25,9 @@ def simulate(params, trials, **more):
     return rollout.simulate(SCENE, ENGINE, params, trials, **more)
 
 
-def evaluate(population, constants=None):
+def evaluate(population):
     made = codesign.Task(SCENE, SPACE, 2, ENGINE).evaluate
-    return made(jnp.asarray(population), jax.random.key(0), constants)
+    return made(jnp.asarray(population), jax.random.key(0))
 
 
 def draw(key, count):
@@ -39,7 +41,7 @@ def episode(mask):
 
 
 FINER = scene.load(TINY, overrides={"discretization.links": 4, "effects.twist": True})
-LONG = SCENE.constants()._replace(gravity=np.full(5, 9.81))
+LONG = dataclasses.replace(SCENE, gravity=np.full(5, 9.81))
 CASES = {
     "an engine of another scene": (
         lambda: rollout.simulate(FINER, ENGINE, batch(HAND, 1), batch(TRIAL, 1)),
@@ -74,9 +76,9 @@ CASES = {
         lambda: rollout.evaluate(SCENE, ENGINE, HAND, batch(TRIAL, 3)),
         r"no axis \(particle,\)",
     ),
-    "constants": (
-        lambda: simulate(batch(HAND, 2), batch(TRIAL, 2), constants=LONG),
-        "constants.gravity has 5 values, one a world: there are 2",
+    "numbers": (
+        lambda: rollout.simulate(LONG, ENGINE, batch(HAND, 2), batch(TRIAL, 2)),
+        "scene.gravity has 5 values, one a world: there are 2",
     ),
     "one design": (
         lambda: evaluate(SPACE.default()),

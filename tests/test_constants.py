@@ -12,7 +12,7 @@ from codesign_jax import model, rollout, scene
 from codesign_jax.compiler import launch
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured.world_model import world_constants
-from codesign_jax.scene import schema
+from codesign_jax.scene import constants, schema
 from tests.helpers.grasps import hand_world, nth, pinch, random_constants
 
 # Compiling takes longer than all that is done with a program here.
@@ -51,17 +51,15 @@ def in_float32(constants):
     return jax.tree.map(lambda v: jnp.asarray(v, jnp.float32), constants)
 
 
-def as_file(the_scene, constants):
-    """A scene whose files have these numbers; names and descriptions differ as well."""
-    changed = the_scene.with_constants(jax.tree.map(float, constants))
-    fields = {f.name: getattr(changed, f.name) for f in dataclasses.fields(scene.Scene)}
-    other = scene.Scene(**fields)
+def as_file(other):
+    """A scene as files with these numbers give it; names and descriptions differ as well."""
+    other = jax.tree.map(float, other)
     return dataclasses.replace(other, name="other", hand=dataclasses.replace(other.hand, name="x"))
 
 
 def test_every_number_is_a_leaf_with_the_name_of_its_key():
     """All numbers of the three files, but those that say how much is compiled."""
-    constants = scene.load("paper_spheres").constants()
+    constants = scene.load("paper_spheres")
     assert constants.hand.material.shear_modulus == 56e3
     assert constants.contact.friction_ratio == 3.0
     assert constants.objects.object[0].mass == 0.1
@@ -74,7 +72,7 @@ def test_every_number_is_a_leaf_with_the_name_of_its_key():
 
 def test_scenes_that_differ_in_numbers_share_their_structure():
     the_scene = short()
-    other = as_file(the_scene, random_constants(the_scene, 1))
+    other = as_file(random_constants(the_scene, 1))
     assert other != the_scene and other.structure == the_scene.structure
     assert model.compile_template(other) is model.compile_template(the_scene)
     assert model.layout(other) is model.layout(the_scene)
@@ -82,7 +80,7 @@ def test_scenes_that_differ_in_numbers_share_their_structure():
     for more in (short(discretization__timestep=0.005), pinch("box", links=2, **SHORT)):
         assert more.structure != the_scene.structure
     with pytest.raises(TypeError, match="unhashable"):
-        hash(the_scene.with_constants(the_scene.constants()))
+        hash(in_float32(the_scene))
 
 
 def test_changing_any_number_compiles_nothing(monkeypatch):
@@ -100,11 +98,11 @@ def test_changing_any_number_compiles_nothing(monkeypatch):
     trials = trials._replace(shape=jnp.zeros(2, jnp.int32))
 
     @partial(jax.jit, compiler_options=QUICK)
-    def height(constants):
-        outcome, trace = rollout.simulate(the_scene, engine, params, trials, constants=constants)
+    def height(other):
+        outcome, trace = rollout.simulate(other, engine, params, trials)
         return trace.height[:, -1], outcome.cost
 
-    constants = in_float32(the_scene.constants())
+    constants = in_float32(the_scene)
     first = height(constants)
     # One number of each table alone, then all of them.
     for key in sorted({key.rsplit(".", 1)[0]: key for key in named(constants)}.values()):
@@ -114,7 +112,7 @@ def test_changing_any_number_compiles_nothing(monkeypatch):
     assert height._cache_size() == 1 and len(compiled) == 1
     assert not np.allclose(first[0], changed[0], rtol=1e-2)
     # A scene read from other files asks for the same kernel.
-    again = as_file(the_scene, other)
+    again = as_file(other)
     other_engine = make_engine("structured", again)
     jax.eval_shape(lambda: rollout.simulate(again, other_engine, params, trials))
     assert len(compiled) == 2 and len(set(compiled)) == 1
@@ -131,7 +129,7 @@ def test_derivatives_equal_differences():
         way = jax.tree.map(lambda v: v * random.uniform(-1, 1), start)
 
         def numbers(c):
-            fields = model.model_fields(the_scene.with_constants(c), params, trial)
+            fields = model.model_fields(c, params, trial)
             hand = world_constants(the_scene, jax.tree.map(lambda v: v[None], fields))
             leaves = [x for x in jax.tree.leaves((fields, hand)) if x.dtype == float and x.size]
             return jnp.concatenate([x.ravel() for x in leaves])
@@ -170,10 +168,9 @@ def test_later_noise_leaves_earlier_draws_alone():
 
     z, later, last = jax.device_get(normals(np.arange(5)))
     np.testing.assert_allclose(plain.mass, 1 + 0.05 * z[:, 5], rtol=1e-6)
-    c = the_scene.constants()
-    noise = c.objects.noise._replace(friction=0.3, stiffness=0.1, hand_mass=0.2)
-    noisy = c._replace(objects=c.objects._replace(noise=noise))
-    drawn = jax.device_get(rollout.sample_trials(the_scene, key, 5, constants=noisy))
+    noise = {"friction": 0.3, "stiffness": 0.1, "hand_mass": 0.2}
+    noisy = scene.load("paper_spheres", overrides={"objects.noise": noise})
+    drawn = jax.device_get(rollout.sample_trials(noisy, key, 5))
     np.testing.assert_array_equal(drawn.mass, plain.mass)
     factors = drawn.friction, drawn.stiffness, drawn.hand_mass
     expected = np.exp(0.3 * later[:, 0]), np.exp(0.1 * later[:, 1]), np.exp(0.2 * last)
@@ -198,39 +195,25 @@ def test_later_noise_leaves_earlier_draws_alone():
 
 
 BAD = {
-    "constants.contact.friction_ratio = nan is outside [0.01, 1000]": {
+    "scene.contact.friction_ratio = nan is outside [0.01, 1000]": {
         "contact.friction_ratio": np.nan
     },
-    "constants.hand.palm.mass = 250.0 is outside [0.01, 10] kg; did you mean 0.25?": {
+    "scene.hand.palm.mass = 250.0 is outside [0.01, 10] kg; did you mean 0.25?": {
         "hand.palm.mass": 250.0
     },
-    "constants.objects.object[0].mass has shape (2, 2)": {
-        "objects.object[0].mass": np.ones((2, 2))
-    },
-    "constants.gravity = 'down' must be a number": {"gravity": "down"},
-    "constants.phases.inflate = 0.05 s must come after approach = 0.1 s": {"phases.inflate": 0.05},
-    "constants.contact.dissipation_time = 2.0 is outside [0, 1] s": {
-        "contact.dissipation_time": 2.0
-    },
+    "scene.objects.object[0].mass has shape (2, 2)": {"objects.object[0].mass": np.ones((2, 2))},
+    "scene.gravity = 'down' must be a number": {"gravity": "down"},
+    "scene.phases.inflate = 0.05 s must come after approach = 0.1 s": {"phases.inflate": 0.05},
+    "scene.contact.dissipation_time = 2.0 is outside [0, 1] s": {"contact.dissipation_time": 2.0},
 }
 
 
 @pytest.mark.parametrize("message", BAD)
 def test_bad_numbers_are_named_before_anything_runs(message):
     the_scene = short()
-    constants = the_scene.constants()
+    other = the_scene
     for key, value in BAD[message].items():
-        constants = with_leaf(constants, key, lambda _, value=value: value)
+        other = with_leaf(other, key, lambda _, value=value: value)
     with pytest.raises(schema.InputError) as error:
-        rollout.simulate(the_scene, None, None, None, constants=constants)  # type: ignore[arg-type]
+        constants.check(other)
     assert message in str(error.value)
-
-
-def test_constants_of_another_scene_are_refused():
-    """Other fingers, other shapes: the keys that are missing and those that are too many."""
-    the_scene, paper = short(), scene.load("paper_spheres")
-    with pytest.raises(schema.InputError) as error:
-        rollout.sample_trials(the_scene, jax.random.key(0), 1, constants=paper.constants())
-    assert "constants.hand.finger[2].azimuth is no number of this scene" in str(error.value)
-    with pytest.raises(schema.InputError, match=r"constants.hand.finger\[2\].azimuth is missing"):
-        rollout.sample_trials(paper, jax.random.key(0), 1, constants=the_scene.constants())

@@ -1,5 +1,7 @@
 """The rollout kernel: assembly, equality with MuJoCo C, and worlds that share a block."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -139,8 +141,8 @@ def test_in_float32_an_object_moves_as_in_float64_under_a_far_hand(grasp, steppe
     count, random = COUNT, np.random.default_rng(0)
     own = grasps.nth(fields, 0)
     ratio = np.float32(30)  # as in the scene `paper`
-    contact = own.constants.contact._replace(friction_ratio=ratio)
-    constants = own.constants._replace(contact=contact)
+    contact = dataclasses.replace(own.constants.contact, friction_ratio=ratio)
+    constants = dataclasses.replace(own.constants, contact=contact)
     impratio = friction_ratio(scene, ratio)
     own = own._replace(impratio=impratio, constants=constants)
     qpos, qvel = (np.zeros((count, n)) for n in (own.start.size, own.start.size - 1))

@@ -1,5 +1,6 @@
 """Key frames: files against NumPy's interpolation of what they say, and files that are refused."""
 
+import dataclasses
 import re
 import tomllib
 from pathlib import Path
@@ -107,18 +108,19 @@ def test_numbers_of_a_control_are_data():
     )
     assert one != other and one.structure == other.structure
     assert one.structure != load("slide").structure
-    numbers = one.constants()
-    assert numbers.control.frame[2].time.number == 0.4
+    assert one.control.frame[2].time.number == 0.4
     with pytest.raises(
-        scene.InputError, match=r"constants\.control\.frame\[3\]\.time .* 0\.8 s before"
+        scene.InputError, match=r"scene\.control\.frame\[3\]\.time .* 0\.8 s before"
     ):
-        scene.constants.check(one, _with_time(numbers, 1.6))
+        scene.constants.check(_with_time(one, 1.6))
 
 
-def _with_time(numbers, value):
-    frames = [*numbers.control.frame]
-    frames[2] = frames[2]._replace(time=frames[2].time._replace(number=value))
-    return numbers._replace(control=numbers.control._replace(frame=tuple(frames)))
+def _with_time(the_scene, value):
+    frames = [*the_scene.control.frame]
+    time = dataclasses.replace(frames[2].time, number=value)
+    frames[2] = dataclasses.replace(frames[2], time=time)
+    control = dataclasses.replace(the_scene.control, frame=tuple(frames))
+    return dataclasses.replace(the_scene, control=control)
 
 
 FRAME = {"time": "approach"}

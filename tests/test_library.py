@@ -103,7 +103,7 @@ def test_every_example_of_the_library(short, tmp_path, monkeypatch):
 def only_heights(monkeypatch):
     """Worlds are prepared without model fields, which would compile for seconds."""
 
-    def prepare(the_scene, params, trials, constants, engine):
+    def prepare(the_scene, params, trials, engine):
         ctrl = jnp.tile(params.arm[:, None, 2:3], (1, the_scene.num_steps, 3))
         return None, ctrl, jnp.zeros(len(ctrl), jnp.int32)
 

@@ -1,5 +1,6 @@
 """Model fields against fresh compiles, and implicit springs against MuJoCo's own integrator."""
 
+import dataclasses
 import operator
 
 import jax
@@ -67,29 +68,21 @@ def worlds(request):
     """
     the_scene = SCENES[request.param]()
 
-    def fields_of(p, t, c):
-        return model.model_fields(the_scene.with_constants(c), p, t)
-
     with jax.enable_x64(True):
         params, trials = random_worlds(the_scene, seed=1, count=6)
-        constants = random_constants(the_scene, seed=2, count=6)
-        constants = constants._replace(objects=noisy(constants.objects))
-        trials = rollout.sample_trials(the_scene, jax.random.key(1), 6, constants=constants)
-        fields = jax.jit(jax.vmap(fields_of))(params, trials, constants)
-        fresh = [
-            model.compile_model(
-                the_scene.with_constants(nth(constants, i)), nth(params, i), nth(trials, i)
-            )
-            for i in range(6)
-        ]
-    return the_scene, nth(fields, slice(None)), fresh, (params, trials, constants)
+        others = random_constants(the_scene, seed=2, count=6)
+        others = dataclasses.replace(others, objects=noisy(others.objects))
+        trials = rollout.sample_trials(others, jax.random.key(1), 6)
+        fields = jax.jit(jax.vmap(model.model_fields))(others, params, trials)
+        fresh = [model.compile_model(*nth((others, params, trials), i)) for i in range(6)]
+    return the_scene, nth(fields, slice(None)), fresh, (params, trials, others)
 
 
 def noisy(objects):
     """Numbers of an object set with noise of friction, stiffness and the hand's masses."""
     one = np.ones_like(objects.noise.position)
     noise = {"friction": 0.3 * one, "stiffness": 0.2 * one, "hand_mass": 0.2 * one}
-    return objects._replace(noise=objects.noise._replace(**noise))
+    return dataclasses.replace(objects, noise=dataclasses.replace(objects.noise, **noise))
 
 
 def test_fields_equal_a_fresh_compile(worlds):

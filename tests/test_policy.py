@@ -60,7 +60,7 @@ def test_who_replays_the_key_frames_simulates_the_open_loop(worlds):
     engine = loop(scene, replay, period=0.25)
     assert scene.num_steps % engine.steps
     again, found = simulate(scene, engine, params, trials)
-    ctrl = jax.jit(lambda p, t: rollout.prepare(scene, p, t, scene.constants())[1])(params, trials)
+    ctrl = jax.jit(lambda p, t: rollout.prepare(scene, p, t)[1])(params, trials)
     np.testing.assert_array_equal(found.ctrl, ctrl)
     both = (outcome, trace), (again, found._replace(ctrl=None))
     jax.tree.map(np.testing.assert_array_equal, *both)
@@ -71,11 +71,11 @@ def test_what_is_observed_is_where_mujoco_has_it(worlds):
     engine = make_engine("structured", scene)
 
     def look(params, trials):
-        prepared = rollout.prepare(scene, params, trials, scene.constants())
+        prepared = rollout.prepare(scene, params, trials)
         fields, ctrl, _ = prepared
         recorded = engine.recording().rollout(fields, ctrl[:, :40])
         last, pushed = recorded.last, jax.tree.map(lambda v: v[:, -1], recorded.forces)
-        plan = rollout.prepare(scene, params, trials, scene.constants(), loop(scene, replay))[1]
+        plan = rollout.prepare(scene, params, trials, loop(scene, replay))[1]
         world = policy.begin(scene, fields, plan)._replace(state=last)
         return (
             last,
@@ -191,7 +191,7 @@ def test_the_page_s_policy_and_environment_do_what_they_say(monkeypatch):
     scene = policy.searched(scene, firmer)
     engine = policy.ControlLoop(make_engine("structured", scene), firmer)
     params, trials = grasps.random_worlds(scene, 3, 4)
-    plan = rollout.prepare(scene, params, trials, scene.constants(), engine)[1]
+    plan = rollout.prepare(scene, params, trials, engine)[1]
     found, run = {}, jax.jit(partial(rollout.simulate, scene, engine))
     for gain in (0.0, 50.0):
         control = {"gain": jnp.full(4, gain)}

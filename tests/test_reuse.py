@@ -115,15 +115,15 @@ def test_a_replaced_name_is_seen_until_it_is_put_back(monkeypatch):
 
 def test_nothing_traced_is_found_once_the_code_is_not_known(monkeypatch):
     """A function's key does not have the functions that it calls."""
-    scene, built = types.SimpleNamespace(structure="s"), []
+    space, built = types.SimpleNamespace(structure="s"), []
     find = reuse.shared(lambda *how: built.append(how) or (lambda v: v))
-    first = find(scene, "engine", scene, None)
-    assert find(scene, "engine", scene, None) is first
+    first = find("engine", space, None)
+    assert find("engine", space, None) is first
     lanewise.of_code("a")
     lanewise._program.cache_clear()
     keep = lanewise._program.cache_info
     monkeypatch.setattr(reuse, "code_digest", lambda **_: None)
-    assert find(scene, "engine", scene, None) is not first and len(built) == 2
+    assert find("engine", space, None) is not first and len(built) == 2
 
     half = lanewise.lanes([np.float32(3)], (), wide=False)
     jax.make_jaxpr(lambda: lanewise.lanewise(lambda v: v * 2, half).lane)()
@@ -146,13 +146,13 @@ def full(monkeypatch, share):
 
 def test_programs_go_when_many_maps_are_taken(monkeypatch):
     """All that nobody holds; a program that is held works on."""
-    cleared, built, scene = [], [], types.SimpleNamespace(structure="s")
+    cleared, built = [], []
     monkeypatch.setattr(reuse, "forgetters", [])
     monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(1))
     find = reuse.shared(lambda *how: built.append(how) or (lambda v: v + 1))
 
     def get(number):
-        return find(scene, "engine", types.SimpleNamespace(structure=number), None)
+        return find("engine", types.SimpleNamespace(structure=number), None)
 
     full(monkeypatch, 0.29)
     first = get(0)
@@ -187,12 +187,12 @@ def test_a_forked_process_says_that_it_would_wait_for_ever(monkeypatch):
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 3
     scene = grasps.pinch("sphere", 2)
     worlds = jax.tree.map(lambda v: v[None], grasps.hand_world(scene))
-    key, numbers = jax.random.key(0), scene.constants()
+    key = jax.random.key(0)
     monkeypatch.setitem(reuse.process, "forked", True)
     for call in (
         lambda: program(0, 0),
         lambda: rollout.sample_trials(scene, key, 3),
-        lambda: rollout.prepare(scene, *worlds, numbers),
+        lambda: rollout.prepare(scene, *worlds),
     ):
         with pytest.raises(RuntimeError, match="forked from one that had simulated.*spawn"):
             call()

@@ -26,12 +26,11 @@ def test_conditions_are_numbers_within_the_files_ranges():
     names = [name for name, _ in found]
     assert names[:3] == ["objects of 200 g", "objects of 500 g", "friction 0.4 on the hand"]
     assert len(names) == 3 + stress.DRAWS and len({*names[3:]}) == 1
-    usual = PAPER.constants()
-    for _, numbers in found:
-        constants.check(PAPER, numbers)
-        assert numbers.phases == usual.phases and numbers.hand.palm == usual.hand.palm
+    for _, other in found:
+        constants.check(other)
+        assert other.phases == PAPER.phases and other.hand.palm == PAPER.hand.palm
     assert [o.mass for o in found[1][1].objects.object] == [0.5] * 3
-    ratio = [c.contact.normal_stiffness / usual.contact.normal_stiffness for _, c in found[3:]]
+    ratio = [c.contact.normal_stiffness / PAPER.contact.normal_stiffness for _, c in found[3:]]
     low, high = stress.FACTORS["contact", "normal_stiffness"]
     assert len({*ratio}) == len(ratio) and low <= min(ratio) and max(ratio) <= high
     masses = {f"objects.object.{o.name}.mass": 0.18 for o in PAPER.objects.object}

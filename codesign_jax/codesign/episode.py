@@ -17,7 +17,7 @@ from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording
 from codesign_jax.optimize import Info, Optimizer, ParticleFilter, State
 from codesign_jax.reuse import Program, shared
-from codesign_jax.scene import Constants, InputError, Scene
+from codesign_jax.scene import InputError, Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, Params, Trial
 
@@ -50,9 +50,9 @@ class EpisodeInfo(NamedTuple):
 class Task:
     """What is optimised: grasps of hands of a design space, and what they cost.
 
-    Its functions are programs that all scenes of one structure share (`programs`): neither other
-    `constants` nor another scene of the same structure compile anything.  `jax.jit`, `jax.vmap` and
-    so on work on them.
+    Its functions are programs that all scenes of one structure share (`programs`): another scene of
+    the same structure, as by `dataclasses.replace(scene, gravity=3.7)`, compiles nothing.
+    `jax.jit`, `jax.vmap` and so on work on them.
 
     Attributes:
       scene: The scene.
@@ -106,13 +106,13 @@ class Task:
     def how(self) -> tuple[Any, ...]:
         """What its programs are built from, see `reuse.shared`."""
         options = rollout.Options(self.record_qpos, self.stop_when_lost, cost=self.cost)
-        return self.scene, self.engine, self.space, self.trials, options
+        return self.engine, self.space, self.trials, options
 
     def evaluate(
         self,
         population: jax.typing.ArrayLike,
         key: jax.Array,
-        constants: Constants | None = None,
+        scene: Scene | None = None,
     ) -> Outcome:
         """Outcomes of particles in random trials, arrays of shape (particle, trial).
 
@@ -121,22 +121,22 @@ class Task:
         Args:
           population: Particles [SI units], shape (particle, parameter).
           key: Key of the trials.
-          constants: Numbers instead of the scene's, leaves of shape () or (trial,).
+          scene: A scene with other numbers, of shape () or (trial,).
 
         Raises:
-          InputError: If the population or the constants do not fit, and see `DesignSpace.check`,
+          InputError: If the population or the scene do not fit, and see `DesignSpace.check`,
             which warns of designs that are not legal.
         """
         self.space.refuse_population(population)
         self.space.check(population)
-        return Program(self.scene, self._programs.evaluate)(jnp.asarray(population), key, constants)
+        return Program(self.scene, self._programs.evaluate)(jnp.asarray(population), key, scene)
 
     def episode(
         self,
         optimizer: Optimizer,
         state: State,
         mask: jax.typing.ArrayLike | None = None,
-        constants: Constants | None = None,
+        scene: Scene | None = None,
     ) -> tuple[State, "EpisodeInfo"]:
         """Runs one episode: moves the particles, simulates, and tells the optimiser their costs.
 
@@ -148,36 +148,36 @@ class Task:
           state: Its state.
           mask: Parameters that may move, bool, shape (parameter,): data, so that every schedule
             shares one program. None for all.
-          constants: Numbers instead of the scene's, leaves of shape () or (trial,) but for
-            `cost.maximum`, which is one number.
+          scene: A scene with other numbers, of shape () or (trial,), but for `cost.maximum`, which
+            is one number.
         """
         mask = np.ones(self.space.num_parameters, bool) if mask is None else mask
-        return self._joined(self._programs.episode, optimizer)(state, mask, constants)
+        return self._joined(self._programs.episode, optimizer)(state, mask, scene)
 
     def run(
         self,
         optimizer: Optimizer,
         state: State,
         masks: jax.typing.ArrayLike,
-        constants: Constants | None = None,
+        scene: Scene | None = None,
     ) -> tuple[State, "EpisodeInfo"]:
         """Runs a whole optimisation as one program, a `jax.lax.scan` over the episodes.
 
         It is a loop in Python over `episode` without a way to stop in between.  XLA rounds the
         model fields of the two programs, and of batches of other sizes, differently in the last
         bit.  `jax.vmap` over the state runs many seeds in one batch, see `optimize.State`, and over
-        constants many worlds' physics.
+        a scene's numbers many worlds' physics.
 
         Args:
           optimizer: As of `episode`.
           state: Its state.
           masks: The mask of each episode, shape (episode, parameter).
-          constants: As of `episode`.
+          scene: As of `episode`.
 
         Returns:
           The state at the end, and reports with leading axis (episode,).
         """
-        return self._joined(self._programs.run, optimizer)(state, masks, constants)
+        return self._joined(self._programs.run, optimizer)(state, masks, scene)
 
     @functools.cached_property
     def _programs(self) -> "_Programs":
@@ -192,9 +192,9 @@ class Task:
 class _Weighing(Program):
     """A program whose costs of one's own a particle filter weighs: negative ones count as 0."""
 
-    def __call__(self, first: Any, second: Any, constants: Constants | None = None) -> Any:
+    def __call__(self, first: Any, second: Any, scene: Scene | None = None) -> Any:
         """As of `Program`; a warning if a particle's cost is negative, but for traced ones."""
-        found = super().__call__(first, second, constants)
+        found = super().__call__(first, second, scene)
         costs = found[1].selection.cost
         if not isinstance(costs, jax.core.Tracer) and (np.asarray(costs) < 0).any():
             warnings.warn(
@@ -207,33 +207,31 @@ class _Weighing(Program):
 
 
 def asked(
-    scene: Scene,
     space: DesignSpace,
     num_trials: int,
     state: State,
     mask: jax.typing.ArrayLike,
-    constants: Constants,
+    scene: Scene,
     optimizer: Optimizer,
-) -> tuple[jax.Array, tuple[Params, Trial, Constants]]:
+) -> tuple[jax.Array, tuple[Scene, Params, Trial]]:
     """The first part of an episode: the particles, and the worlds that they ask for."""
     population = optimizer.ask(state, mask)
-    noise = episode_trials(scene, state.key, state.episode, num_trials, constants=constants)
-    return population, rollout.crossed(jax.vmap(space.params)(population), noise, constants)
+    noise = episode_trials(scene, state.key, state.episode, num_trials)
+    return population, rollout.crossed(scene, jax.vmap(space.params)(population), noise)
 
 
 def told(
-    scene: Scene,
     num_trials: int,
     state: State,
     mask: jax.typing.ArrayLike,
-    constants: Constants,
+    scene: Scene,
     optimizer: Optimizer,
     population: jax.Array,
     found: tuple[Outcome, jax.Array | None],
 ) -> tuple[State, EpisodeInfo]:
     """The last part of an episode: costs of the worlds' outcomes and states at the end."""
     outcomes, last = rollout.grid(found, (len(population), num_trials))
-    costs = particle_cost(scene.with_constants(constants), outcomes)
+    costs = particle_cost(scene, outcomes)
     new, selection = optimizer.tell(state, population, costs, mask)
     return new, EpisodeInfo(population, outcomes, selection, last)
 
@@ -248,41 +246,30 @@ class _Programs(NamedTuple):
 
 @shared
 def _programs(
-    scene: Scene,
-    engine: Engine,
-    space: DesignSpace,
-    num_trials: int,
-    options: rollout.Options,
+    engine: Engine, space: DesignSpace, num_trials: int, options: rollout.Options
 ) -> _Programs:
     how = options._asdict()
 
-    def evaluate(population: jax.Array, key: jax.Array, constants: Constants) -> Outcome:
-        trials = rollout.sample_trials(scene, key, num_trials, constants=constants)
-        hands = jax.vmap(space.params)(population)
-        return rollout.evaluate(scene, engine, hands, trials, constants=constants, **how)
+    def evaluate(population: jax.Array, key: jax.Array, scene: Scene) -> Outcome:
+        trials = rollout.sample_trials(scene, key, num_trials)
+        return rollout.evaluate(scene, engine, jax.vmap(space.params)(population), trials, **how)
 
     @jax.jit  # is traced once for itself and for `run`
     def episode(
-        state: State,
-        mask: jax.typing.ArrayLike,
-        constants: Constants,
-        optimizer: Optimizer,
+        state: State, mask: jax.typing.ArrayLike, scene: Scene, optimizer: Optimizer
     ) -> tuple[State, EpisodeInfo]:
         _refuse_mask(space, mask)
         space.refuse_population(state.particles)
-        own = state, mask, constants, optimizer
-        population, (hands, trials, numbers) = asked(scene, space, num_trials, *own)
-        outcomes, trace = rollout.simulate(scene, engine, hands, trials, constants=numbers, **how)
-        return told(scene, num_trials, *own, population, (outcomes, trace.last))
+        own = state, mask, scene, optimizer
+        population, (worlds, hands, trials) = asked(space, num_trials, *own)
+        outcomes, trace = rollout.simulate(worlds, engine, hands, trials, **how)
+        return told(num_trials, *own, population, (outcomes, trace.last))
 
     def run(
-        state: State,
-        masks: jax.typing.ArrayLike,
-        constants: Constants,
-        optimizer: Optimizer,
+        state: State, masks: jax.typing.ArrayLike, scene: Scene, optimizer: Optimizer
     ) -> tuple[State, EpisodeInfo]:
         def one(state: State, mask: jax.Array) -> tuple[State, EpisodeInfo]:
-            return episode(state, mask, constants, optimizer)
+            return episode(state, mask, scene, optimizer)
 
         return jax.lax.scan(one, state, jnp.asarray(masks))
 
@@ -299,16 +286,10 @@ def _refuse_mask(space: DesignSpace, mask: jax.typing.ArrayLike) -> None:
 
 
 def episode_trials(
-    scene: Scene,
-    key: jax.Array,
-    episode: jax.typing.ArrayLike,
-    num_trials: int,
-    *,
-    constants: Constants | None = None,
+    scene: Scene, key: jax.Array, episode: jax.typing.ArrayLike, num_trials: int
 ) -> Trial:
     """Trials of an episode of the run with this root key, leading axis (trial,)."""
-    own = stream_key(key, STREAM_TRIAL, episode)
-    return rollout.sample_trials(scene, own, num_trials, constants=constants)
+    return rollout.sample_trials(scene, stream_key(key, STREAM_TRIAL, episode), num_trials)
 
 
 def closed(optimizer: Optimizer, population: jax.Array, key: jax.Array) -> tuple[State, np.ndarray]:

@@ -122,7 +122,7 @@ def pull(
 
     @jax.jit
     def run(hands: Params, trials: Trial) -> jax.Array:
-        fields, ctrl, _ = rollout.prepare(scene, hands, trials, scene.constants())
+        fields, ctrl, _ = rollout.prepare(scene, hands, trials)
         begun = engine.rollout(fields, ctrl[:, :held], trajectory=True)
         still = ctrl[:, held - 1 : held]
         assert begun.last is not None

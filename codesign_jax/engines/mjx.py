@@ -108,7 +108,7 @@ class MjxEngine(Equal):
     ) -> tuple[State, Trace]:
         """One time step of a world, and the trace's entry of the state before it."""
         lay = layout(self.scene)
-        bounds = verdict.bounds(self.scene.with_constants(fields.constants))
+        bounds = verdict.bounds(fields.constants)
         data = self.reset(fields).replace(
             qpos=carry.qpos, qvel=carry.qvel, qacc_warmstart=carry.acc
         )

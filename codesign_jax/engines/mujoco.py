@@ -11,7 +11,7 @@ import numpy as np
 from codesign_jax import verdict
 from codesign_jax.engines.base import Equal, refuse_meshes
 from codesign_jax.model import ModelFields, compile_template, layout, softening_moments, split
-from codesign_jax.scene import Constants, Scene, effects
+from codesign_jax.scene import Scene, effects
 from codesign_jax.types import Status, Trace
 
 # Steps between looking at the worlds: a lost object or a failed world stops being simulated at this
@@ -61,7 +61,7 @@ class MujocoEngine(Equal):
         # Of the constants C needs the bounds alone: each argument is an array for XLA to fill.
         inputs = (
             fields._replace(constants=()),
-            _bounds(self.scene.structure, fields.constants),
+            _bounds(fields.constants),
             ctrl,
         )
         run = partial(self._run, trajectory)
@@ -179,10 +179,7 @@ class MujocoEngine(Equal):
         return Trace(distance, middle[..., 2], speed, kept, status), taken, states
 
 
-@partial(jax.jit, static_argnums=0)
-def _bounds(structure: Scene, constants: Constants) -> verdict.Bounds:
-    """What decides each world, arrays of shape (world,)."""
-    return verdict.bounds(structure.with_constants(constants))
+_bounds = jax.jit(verdict.bounds)
 
 
 def _decisions(

@@ -232,7 +232,7 @@ class GraspEnv:
 
     def _held(self, data: Data, trace: Trace, world: World) -> tuple[jax.Array, jax.Array]:
         """Share of the window in which the object was held, and whether the grasp is decided."""
-        bounds = verdict.bounds(self.scene.with_constants(data.fields.constants))
+        bounds = verdict.bounds(data.fields.constants)
         steps = data.period * self._steps + jnp.arange(self._steps)
         counts = (steps >= bounds.start) & (steps < bounds.end) & (steps < self.scene.num_steps)
         away = jnp.cumsum(verdict.lost(bounds, trace.distance, steps)) > 0

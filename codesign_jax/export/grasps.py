@@ -1,6 +1,5 @@
 """Grasps as files: a model of each, its controls, and the player that needs MuJoCo alone."""
 
-import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +12,7 @@ from codesign_jax import control, model, verdict
 from codesign_jax.cost import outcome
 from codesign_jax.export import plain, skin
 from codesign_jax.export.play import play
-from codesign_jax.scene import Constants, Scene
+from codesign_jax.scene import Scene
 from codesign_jax.types import Outcome, Params, Trace, Trial
 
 PLAYER = Path(__file__).with_name("play.py")
@@ -96,17 +95,15 @@ def _wide(tree: Any) -> Any:
 def _float64(program: Callable, scene: Scene, params: Params, trial: Trial) -> np.ndarray:
     """Calls one of the programs below in float64, whatever the caller's mode."""
     with jax.enable_x64(True):
-        return np.asarray(program(scene.structure, _wide(scene.constants()), params, trial))
+        return np.asarray(program(_wide(scene.bare), params, trial))
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _start(structure: Scene, constants: Constants, params: Params, trial: Trial) -> jax.Array:
-    return model.model_fields(structure.with_constants(constants), params, trial).start
+@jax.jit
+def _start(scene: Scene, params: Params, trial: Trial) -> jax.Array:
+    return model.model_fields(scene, params, trial).start
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _commands(structure: Scene, constants: Constants, params: Params, trial: Trial) -> jax.Array:
-    return control.commands(structure.with_constants(constants), params, trial)
+_commands = jax.jit(control.commands)
 
 
 def _add_keys(scene: Scene, spec: mujoco.MjSpec, controls: np.ndarray, states: np.ndarray) -> None:

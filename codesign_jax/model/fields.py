@@ -22,7 +22,7 @@ from codesign_jax.model.layout import (
     wrist_springs,
 )
 from codesign_jax.model.spec import compile_template, palm_inertia
-from codesign_jax.scene import Constants, Scene, by_structure, key_frames
+from codesign_jax.scene import Scene, by_structure, key_frames
 from codesign_jax.scene.constants import with_trial
 from codesign_jax.types import Params, Trial
 
@@ -63,7 +63,7 @@ class ModelFields(NamedTuple):
     gravity: jax.Array
     impratio: jax.Array
     start: jax.Array
-    constants: Constants
+    constants: Scene
     section: jax.Array | None = None
     threshold: jax.Array | None = None
     tip: jax.Array | None = None
@@ -112,7 +112,7 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
     """Returns the batched model fields and the start state of one world; pure, vmap it for batches.
 
     Args:
-      scene: The scene; of `Scene.with_constants` if its numbers are traced.
+      scene: The scene; its numbers may be traced.
       params: Parameters of the hand; all physics in the float type of these.
       trial: The trial's object and noise.
     """
@@ -175,7 +175,7 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
         gravity=_filled(np.zeros(3), dtype, (2, -scene.gravity_on)),
         impratio=friction_ratio(scene, scene.contact.friction_ratio),
         start=_start(scene, params, trial),
-        constants=scene.constants(),
+        constants=scene.bare,
         section=_section(scene, params),
         threshold=(
             morphology.thresholds(scene.hand, params, beam, lay.links)
@@ -212,7 +212,7 @@ def _picked(array: jax.Array, places: np.ndarray) -> jax.Array:
 
 def _in_type(scene: Scene, dtype: Any) -> Scene:
     """The scene with its numbers as arrays of a float type."""
-    return scene.with_constants(jax.tree.map(lambda v: jnp.asarray(v, dtype), scene.constants()))
+    return jax.tree.map(lambda v: jnp.asarray(v, dtype), scene)
 
 
 def _section(scene: Scene, params: Params) -> jax.Array | None:

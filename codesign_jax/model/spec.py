@@ -27,7 +27,7 @@ from codesign_jax.model.layout import (
     wrist_springs,
 )
 from codesign_jax.model.morphology import Beam
-from codesign_jax.scene import Constants, Scene, by_structure, schema
+from codesign_jax.scene import Scene, by_structure
 from codesign_jax.scene.constants import with_trial
 from codesign_jax.scene.hand import Hand
 from codesign_jax.scene.objects import ObjectSet
@@ -83,21 +83,9 @@ def compile_model(
     return model
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2))
-def _numbers(
-    hand: Hand,
-    objects: ObjectSet,
-    links: int,
-    constants: Constants,
-    params: Params,
-    trial: Trial,
-) -> tuple:
-    """Beams, mounts, and the object's size and orientation; one program, not one an operation.
-
-    Hand and objects are of a scene's structure: scenes that differ in effects share the program.
-    """
-    hand = schema.with_numbers(hand, constants.hand)
-    objects = schema.with_numbers(objects, constants.objects)
+@functools.partial(jax.jit, static_argnums=0)
+def _numbers(links: int, hand: Hand, objects: ObjectSet, params: Params, trial: Trial) -> tuple:
+    """Beams, mounts, and the object's size and orientation; one program, not one an operation."""
     beams = morphology.finger_beams(hand, params, links)
     place = mounts(hand, params.spread)
     return beams, place, object_size(objects, trial), object_pose(objects, trial)
@@ -121,13 +109,11 @@ def build_spec(
     if not scene.effects.table:
         world.geoms[0].rgba = [0, 0, 0, 0]
     _add_palm(scene, spec, visual)
-    concrete = jax.tree.map(np.asarray, (scene.constants(), params, trial))
-    bodies = scene.structure
-    beams, place, solid, pose = jax.tree.map(
-        np.asarray, _numbers(bodies.hand, bodies.objects, layout(scene).links, *concrete)
-    )
+    bodies = scene.bare.hand, scene.bare.objects
+    *_, params, _ = every = jax.tree.map(np.asarray, (*bodies, params, trial))
+    beams, place, solid, pose = jax.tree.map(np.asarray, _numbers(layout(scene).links, *every))
     for f in range(scene.num_fingers):
-        _add_finger(scene, spec, concrete[1], f, beams, (place[0][f], place[1][f]), visual)
+        _add_finger(scene, spec, params, f, beams, (place[0][f], place[1][f]), visual)
     _add_object(scene, spec, trial, solid, pose, visual)
     _add_pairs(scene, spec)
     return spec

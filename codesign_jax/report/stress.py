@@ -21,7 +21,7 @@ from codesign_jax.report.statistics import wilson
 from codesign_jax.reuse import Program, shared
 from codesign_jax.runs.choice import Case
 from codesign_jax.runs.interrupts import interruptible
-from codesign_jax.scene import Constants, Scene
+from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome, Params, Trial
@@ -129,21 +129,21 @@ def sets(scene: Scene) -> int:
     return 2 + len([*variants(scene)])
 
 
-def variants(scene: Scene) -> Iterator[tuple[str, Constants]]:
-    """Conditions that are numbers of the scene, with their names; draws have one name."""
-    numbers, masses = scene.constants(), [shape.mass for shape in scene.objects.object]
+def variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
+    """Scenes with other numbers, and the names of these conditions; draws have one name."""
+    masses = [shape.mass for shape in scene.objects.object]
     sets = [tuple(max(min(n * m, HEAVIEST), m) for m in masses) for n in (4, 10)]
     for heavier in dict.fromkeys(sets):
         if heavier != (*masses,):
             grams = dict.fromkeys(f"{1e3 * m:.0f}" for m in (min(heavier), max(heavier)))
             path, place = ("objects", "object", "mass"), iter(heavier)
-            own = _changed(numbers, path, lambda _, place=place: next(place))
+            own = _changed(scene, path, lambda _, place=place: next(place))
             yield f"objects of {' to '.join(grams)} g", own
-    own = _changed(numbers, ("objects", "object", "friction"), lambda _: FRICTION)
+    own = _changed(scene, ("objects", "object", "friction"), lambda _: FRICTION)
     yield f"friction {FRICTION} on the hand", own
     random = np.random.default_rng(STREAM)
     for _ in range(DRAWS):
-        own = numbers
+        own = scene
         for path, ends in FACTORS.items():
             factor = float(np.exp(random.uniform(*np.log(ends))))
             own = _changed(own, path, lambda v, factor=factor: v * factor)
@@ -154,26 +154,25 @@ def _changed(table: Any, path: tuple[str, ...], change: Callable[[float], float]
     """Nested tables with changed numbers at a path, of all entries of arrays of tables."""
     if not path:
         return change(table)
-    if not hasattr(table, "_fields"):
+    if isinstance(table, tuple):
         return tuple(_changed(entry, path, change) for entry in table)
-    return table._replace(**{path[0]: _changed(getattr(table, path[0]), path[1:], change)})
+    new = _changed(getattr(table, path[0]), path[1:], change)
+    return dataclasses.replace(table, **{path[0]: new})
 
 
 def _program(scene: Scene, case: Case, trials: int) -> Program:
-    return Program(scene, _recorded(scene, case.make_engine(scene), case.space, trials))
+    return Program(scene, _recorded(case.make_engine(scene), case.space, trials))
 
 
 @shared
-def _recorded(scene: Scene, engine: Engine, space: DesignSpace, num_trials: int) -> Callable:
+def _recorded(engine: Engine, space: DesignSpace, num_trials: int) -> Callable:
     def simulated(
-        design: jax.Array, key: jax.Array, constants: Constants
+        design: jax.Array, key: jax.Array, scene: Scene
     ) -> tuple[Outcome, jax.Array, Trial]:
-        trials = rollout.sample_trials(scene, key, num_trials, constants=constants)
-        one = jax.tree.map(lambda v: v[None], space.params(design))
-        hands, trials, _ = rollout.crossed(one, trials)
-        found, trace = rollout.simulate(
-            scene, engine, hands, trials, record_qpos=True, constants=constants
-        )
+        trials = rollout.sample_trials(scene, key, num_trials)
+        hand = jax.tree.map(lambda v: v[None], space.params(design))
+        scene, hands, trials = rollout.crossed(scene, hand, trials)
+        found, trace = rollout.simulate(scene, engine, hands, trials, record_qpos=True)
         return found, trace.qpos[:, ::HELD], trials
 
     return simulated

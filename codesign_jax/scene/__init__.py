@@ -13,7 +13,7 @@ Traceback (most recent call last):
 codesign_jax.scene.schema.InputError: gravty is not a known key; did you mean 'gravity'?
 """
 
-from codesign_jax.scene.description import Constants, Scene, by_structure
+from codesign_jax.scene.description import Scene, by_structure
 from codesign_jax.scene.loading import check_together, load, load_accuracy, with_accuracy
 from codesign_jax.scene.schema import InputError
 from codesign_jax.scene.tables import (
@@ -33,7 +33,6 @@ from codesign_jax.scene.tables import (
 __all__ = [
     "Accuracy",
     "Arm",
-    "Constants",
     "Contact",
     "Cost",
     "Discretization",

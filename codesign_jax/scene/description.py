@@ -1,14 +1,16 @@
 """The scene: hand, objects, control, effects, phases, contact, time step; hashable.
 
 A scene has two parts.  Its `structure` (effects, counts, kinds of shapes, time step and number of
-steps) is what programs are compiled for; its `Constants` are all other numbers of the scene, hand
-and object files, and may be traced: changing them compiles nothing.
+steps) is what programs are compiled for; its leaves are all other numbers of the scene, hand and
+object files, and may be traced: changing them compiles nothing.
 """
 
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
+
+import jax
 
 from codesign_jax.scene import hand, key_frames, objects, schema
 from codesign_jax.scene.schema import quantity
@@ -27,33 +29,7 @@ from codesign_jax.scene.tables import (
 )
 
 T = TypeVar("T")
-
-
-class Constants(NamedTuple):
-    """The numbers of a scene, its hand and its objects that are not structure.
-
-    A pytree of nested named tuples whose names are the keys of the files, such as
-    `constants.hand.material.shear_modulus`, `constants.contact.friction_ratio` and
-    `constants.objects.object[0].mass`; arrays of tables are tuples.  Units and ranges are those of
-    the files.  Leaves are numbers, or arrays with a leading axis (world or trial) where a function
-    says so.  `codesign_jax.scene.constants` checks and changes them.
-
-    What is not here: names, effects, counts, kinds of shapes, meshes, the time step, the end of the
-    last phase, the solver's limits, and the parameter table with its bounds, presets and pressure
-    limit, which describe a search and not a simulation.
-    """
-
-    hand: Any
-    objects: Any
-    gravity: Any
-    phases: Any
-    arm: Any
-    cost: Any
-    contact: Any
-    limits: Any
-    pneumatics: Any
-    control: Any
-    fixture: Any = None
+PHASES = ("approach", "inflate", "lift", "disturb", "ungrasp")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,67 +67,71 @@ class SceneFile:
     gravity: float = quantity("m/s^2", 0, 100, kw_only=True)
 
 
+@schema.table
 @dataclasses.dataclass(frozen=True)
 class Scene(SceneFile):
-    """A simulation's description; built by `load`, changed by `dataclasses.replace`."""
+    """A simulation's description; built by `load`, changed by `dataclasses.replace`.
+
+    A pytree whose leaves are the numbers that are not structure, named by the keys of the files,
+    such as `hand.material.shear_modulus`, `contact.friction_ratio` and `objects.object[0].mass`;
+    arrays of tables are tuples.  Units and ranges are those of the files.  Leaves are numbers, or
+    arrays with a leading axis (world or trial) where a function says so; they may be traced:
+    changing them compiles nothing.  `codesign_jax.scene.constants` checks them.
+
+    Static are names, effects, counts, kinds of shapes, meshes, the time step, the end of the last
+    phase, the solver's limits, and the parameter table with its bounds, presets and pressure limit,
+    which describe a search and not a simulation.
+
+    Attributes:
+      num_steps: Time steps of one grasp, up to the end of the last phase that is on.
+    """
 
     hand: hand.Hand
     objects: objects.ObjectSet
     control: key_frames.Control  # type: ignore[assignment]
+    num_steps: int = dataclasses.field(
+        default=0, kw_only=True, repr=False, metadata={"in_file": False}
+    )
 
-    def constants(self) -> Constants:
-        """The numbers of the scene's files that are not structure."""
-        return Constants(**schema.numbers(self)._asdict())
+    def __post_init__(self) -> None:
+        """Counts the time steps, but where the phases' ends are arrays: they are structure."""
+        end = getattr(self.phases, self._phases[-1], None)
+        if isinstance(end, float):
+            count = round((end + self.phases.settle) / self.discretization.timestep)
+            object.__setattr__(self, "num_steps", count)
 
-    def numbers(self, constants: Constants | None) -> Constants:
-        """The given constants, checked, or else the scene's.
+    def checked(self, other: "Scene | None" = None) -> "Scene":
+        """The other scene if there is one, else this one, with numbers in their ranges.
 
         Raises:
-          InputError: If they do not fit the scene, see `scene.constants.check`.
+          InputError: See `scene.constants.check`.
         """
         from codesign_jax.scene.constants import check
 
-        if constants is None:
-            return self.constants()
-        check(self, constants)
-        return constants
+        check(found := other or self)
+        return found
 
-    def with_constants(self, constants: Constants) -> "Scene":
-        """The scene with other numbers, which may be arrays or traced, for functions to read.
-
-        Args:
-          constants: Numbers, of the structure of `constants()`; `scene.constants.check` says what
-            is wrong with others.
-
-        Returns:
-          A scene that reads as this one, has its `structure` and cannot be hashed.
-        """
-        values = schema.with_numbers(self, constants)
-        fields = {f.name: getattr(values, f.name) for f in dataclasses.fields(Scene)}
-        return _SceneWithConstants(**fields, described=self.structure)
+    @functools.cached_property
+    def bare(self) -> "Scene":
+        """The scene without what no program depends on: names, and what describes a search."""
+        return dataclasses.replace(
+            self,
+            name="",
+            description="",
+            limits=dataclasses.replace(self.limits, strain=None),
+            hand=hand.structure(self.hand),
+            objects=objects.structure(self.objects),
+            control=key_frames.structure(self.control),
+            fixture=tuple(dataclasses.replace(f, name="") for f in self.fixture),
+        )
 
     @functools.cached_property
     def structure(self) -> "Scene":
-        """The scene without what no program depends on: every number of `constants` is a fixed one.
+        """The bare scene with fixed numbers.
 
         Scenes of equal structure share model templates, traces and compiled programs.
         """
-        step = self.discretization.timestep
-        last = ("approach", "inflate", "lift", "disturb", "ungrasp").index([*self.phase_ends][-1])
-        time = self.num_steps * step - self.phases.settle
-        ends = (time * (i + 1) / (last + 1) for i in range(5))
-        fixed = schema.typical(self)
-        return dataclasses.replace(
-            fixed,
-            name="",
-            description="",
-            limits=dataclasses.replace(fixed.limits, strain=None),
-            phases=Phases(*ends, deflate_time=step, settle=self.phases.settle),
-            hand=hand.structure(fixed.hand),
-            objects=objects.structure(fixed.objects),
-            control=key_frames.structure(fixed.control),
-            fixture=tuple(dataclasses.replace(f, name="") for f in self.fixture),
-        )
+        return _structure(jax.tree.structure(self.bare))
 
     @property
     def gravity_on(self) -> float:
@@ -164,11 +144,6 @@ class Scene(SceneFile):
         return len(self.hand.finger)
 
     @property
-    def num_steps(self) -> int:
-        """Time steps of one grasp, up to the end of the last phase that is on."""
-        return round(self.end_time / self.discretization.timestep)
-
-    @property
     def end_time(self) -> float:
         """End of the last phase that is on [s]."""
         return [*self.phase_ends.values()][-1]
@@ -179,11 +154,15 @@ class Scene(SceneFile):
 
         Unlike those of the table `phases` they count from the start of the settling.
         """
-        on = {"disturb": self.effects.disturb, "ungrasp": self.effects.ungrasp}
-        names = ("approach", "inflate", "lift", "disturb", "ungrasp")
-        ends = {name: getattr(self.phases, name) for name in names if on.get(name, True)}
+        ends = {name: getattr(self.phases, name) for name in self._phases}
         settle = self.phases.settle
         return {name: end + settle for name, end in ends.items()} if settle else ends
+
+    @property
+    def _phases(self) -> list[str]:
+        """Names of the phases that are on, in order."""
+        on = {"disturb": self.effects.disturb, "ungrasp": self.effects.ungrasp}
+        return [name for name in PHASES if on.get(name, True)]
 
     @property
     def window(self) -> tuple[float, float]:
@@ -232,23 +211,15 @@ class Scene(SceneFile):
         return f"phase {phase!r} unknown; {schema.nearest(str(phase), self.phase_ends)}"
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _SceneWithConstants(Scene):
-    """A scene whose numbers may be arrays; see `Scene.with_constants`."""
-
-    described: Scene = dataclasses.field(kw_only=True, metadata={"in_file": False})
-
-    __hash__ = None  # type: ignore[assignment]
-
-    @property
-    def structure(self) -> Scene:  # type: ignore[override]
-        """That of the scene whose numbers were changed."""
-        return self.described
-
-    @property
-    def num_steps(self) -> int:
-        """That of the scene whose numbers were changed."""
-        return self.described.num_steps
+@functools.cache
+def _structure(tree: Any) -> Scene:
+    """`Scene.structure` of the tree of a bare scene."""
+    bare = jax.tree.unflatten(tree, [0] * tree.num_leaves)
+    step, last = bare.discretization.timestep, PHASES.index(bare._phases[-1])
+    time = bare.num_steps * step - bare.phases.settle
+    ends = (time * (i + 1) / (last + 1) for i in range(5))
+    phases = Phases(*ends, deflate_time=step, settle=bare.phases.settle)
+    return dataclasses.replace(schema.typical(bare), phases=phases)
 
 
 def by_structure(function: Callable[[Scene], T]) -> Callable[[Scene], T]:

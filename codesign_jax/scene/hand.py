@@ -38,7 +38,7 @@ from codesign_jax.scene.hand_tables import (
 
 
 def structure(hand: Hand) -> Hand:
-    """The hand without what no program depends on; its numbers are left to `schema.typical`."""
+    """The hand without what no program depends on."""
     return dataclasses.replace(
         hand,
         name="",

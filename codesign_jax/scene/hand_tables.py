@@ -9,7 +9,7 @@ import math
 from typing import Any, NamedTuple
 
 from codesign_jax.scene.beams import strain_pressure
-from codesign_jax.scene.schema import choice, quantity
+from codesign_jax.scene.schema import choice, quantity, table
 
 # Unit of a file -> (SI unit, factor).
 UNITS = {
@@ -67,6 +67,7 @@ def per_finger(value: Numbers, count: int) -> tuple[float, ...]:
     return value if isinstance(value, tuple) else (value,) * count
 
 
+@table
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Finger:
     """Mount of a finger, which leaves the palm at azimuth + spread * gamma, tilted downwards.
@@ -108,6 +109,7 @@ class Finger:
         return self.radius
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class Section:
     """Rectangular hollow cross-section; height and wall are parameters of the table.
@@ -122,6 +124,7 @@ class Section:
     tapered: bool = False
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class Material:
     """Silicone of the fingers.
@@ -145,6 +148,7 @@ class Material:
     torsion_factor: float = quantity("", 0.05, 20, default=1.0)
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class Palm:
     """Rigid palm; spheres of `contact_radius`, tangent to its underside, carry its contacts.
@@ -165,6 +169,7 @@ class Palm:
     contact_ring: float = quantity("m", 0, 0.2)
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class Wrist:
     """Passively compliant joint between arm frame X_D and wrist frame X_A.
@@ -314,6 +319,7 @@ class Preset:
         return hash((self.name, self.free, tuple(sorted(self.fixed.items()))))
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class Hand:
     """A hand file: fingers, palm, wrist and the table of what a search may change.

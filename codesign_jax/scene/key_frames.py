@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from codesign_jax.scene import hand as hands
 from codesign_jax.scene import keypaths, schema
 from codesign_jax.scene.hand_tables import PARAMETERS, UNITS, Hand, Parameter
-from codesign_jax.scene.schema import choice, quantity
+from codesign_jax.scene.schema import choice, quantity, table
 from codesign_jax.types import Params
 
 POSE = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -41,6 +41,7 @@ _TERM = re.compile(
 )
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class Term:
     """A named number times a factor.
@@ -54,6 +55,7 @@ class Term:
     factor: float | None = quantity("", -100, 100, default=None)
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class Sum:
     """A number and named terms.
@@ -74,6 +76,7 @@ def _sum(unit: str, **kwargs: Any) -> Any:
     return dataclasses.field(metadata={"unit": unit}, **kwargs)
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class Frame:
     """A key frame; what it leaves out is as in the frame before.
@@ -150,6 +153,7 @@ class ControlFile:
     group: dict = dataclasses.field(default_factory=dict)
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class Control:
     """A control file: key frames, and the parameters that they add to the hand's table.
@@ -175,7 +179,7 @@ class Control:
 
 
 def structure(control: Control) -> Control:
-    """The control without what no program depends on; numbers are left to `schema.typical`."""
+    """The control without what no program depends on."""
     rows = (dataclasses.replace(p, low=0.0, high=0.0, default=0.0) for p in control.parameter)
     return dataclasses.replace(control, name="", description="", parameter=tuple(rows))
 

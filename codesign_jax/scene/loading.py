@@ -80,7 +80,7 @@ def load(
     law = parsed.effects.neo_hookean
     parts["hand"] = hand.with_strain(parts["hand"], parsed.limits.strain, neo_hookean=law)
     parts["hand"] = key_frames.with_parameters(parts["hand"], parts["control"])
-    names = [f.name for f in dataclasses.fields(Scene) if f.name not in parts]
+    names = [f.name for f in dataclasses.fields(SceneFile) if f.name not in parts]
     scene = Scene(**parts, **{n: getattr(parsed, n) for n in names})
     if problems := key_frames.check(scene, "control"):
         raise schema.InputError(problems)

@@ -16,7 +16,7 @@ import numpy as np
 
 from codesign_jax.scene import keypaths, rigid, schema
 from codesign_jax.scene.primitives import PRIMITIVES, Primitive
-from codesign_jax.scene.schema import choice, quantity
+from codesign_jax.scene.schema import choice, quantity, table
 
 if TYPE_CHECKING:  # trimesh and SciPy take a while to import; sets of primitives need neither
     from codesign_jax.scene.meshes import Solid
@@ -27,6 +27,7 @@ _MESH_KEYS = ("file", "unit", "repair", "voxel_error", "centre_of_mass")
 _MASS, _SIZE = ("kg", 0.001, 10.0), ("m", 0.002, 0.25)
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class Noise:
     """Standard deviations of a trial's Gaussian noise; z is a draw of the standard normal.
@@ -76,6 +77,7 @@ materials differ by more, stiffness as between two castings of one silicone, and
 fingers and palm."""
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class Table:
     """The plane z = 0 and its friction with the object.
@@ -134,6 +136,7 @@ class _ShapeFile:
     voxel_error: float | None = quantity("m", 5e-5, 5e-3, structure=True, default=None)
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class Shape(_ShapeFile):
     """An object with its mass and, if it is a mesh, the mesh; see `load`."""
@@ -228,6 +231,7 @@ class _ObjectSetFile:
     object: tuple[_ShapeFile, ...]
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class ObjectSet(_ObjectSetFile):
     """Shapes that the trials cycle through, in the file's order; see `load`."""
@@ -236,10 +240,7 @@ class ObjectSet(_ObjectSetFile):
 
 
 def structure(objects: ObjectSet) -> ObjectSet:
-    """The set without what no program depends on; its numbers are left to `schema.typical`.
-
-    Meshes stay, and their names, by which they are refused.
-    """
+    """The set without what no program depends on.  Meshes stay, and the names of refused ones."""
     unused = dict.fromkeys(("file", "unit", "repair", "voxel_error", "inertia", "centre_of_mass"))
     shapes = tuple(
         dataclasses.replace(shape, **unused, **({} if shape.mesh else {"name": ""}))

@@ -6,6 +6,11 @@ late. A scene that is read has grids for its hand; one that was put together oth
 
 import dataclasses
 import math
+from typing import Any
+
+import jax
+import jax.core
+import numpy as np
 
 from codesign_jax.scene import schema
 from codesign_jax.scene.hand_tables import UNITS, Hand, Numbers, per_finger
@@ -64,21 +69,23 @@ def fit(objects: ObjectSet, hand: Hand) -> ObjectSet:
     return dataclasses.replace(objects, object=tuple(shapes))
 
 
-def refuse(objects: ObjectSet, radius: float, size_noise: float | None = None) -> None:
+def refuse(objects: ObjectSet, radius: Any) -> None:
     """Refuses contact spheres that are larger than the distances of the set's meshes reach.
 
     Args:
-      radius: Largest radius of a contact sphere [m].
-      size_noise: Standard deviation of the object's size instead of the set's.
+      radius: Radii of contact spheres [m], any shape; of traced ones nothing is known.
 
     Raises:
       InputError: With every mesh.
     """
-    needed = of(radius * (1 - 1e-6), objects.noise.size if size_noise is None else size_noise)
+    if any(isinstance(v, jax.core.Tracer) for v in (radius, objects.noise.size)):
+        return
+    largest, noise = float(np.max(radius)), float(np.max(objects.noise.size))
     problems = [
         f"object {shape.name!r}: distances reach {1e3 * shape.mesh.reach:g} mm from its surface, "
-        f"contact spheres of radius {1e3 * radius:g} mm need {1e3 * needed:g} mm: raise the "
+        f"contact spheres of radius {1e3 * largest:g} mm need {1e3 * needed:g} mm: raise the "
         "bounds of `height` or palm.contact_radius in the hand file, and read the scene again"
+        for needed in [of(largest * (1 - 1e-6), noise)]
         for shape in objects.object
         if shape.mesh and shape.mesh.reach < needed
     ]

@@ -5,7 +5,6 @@ ranges and names and reports the key path, the value, the unit, the range and, w
 unit slip that would explain it.
 """
 
-import collections
 import dataclasses
 import difflib
 import functools
@@ -14,6 +13,8 @@ import re
 import types
 import typing
 from typing import Any, TypeVar
+
+import jax
 
 from codesign_jax.scene import texts
 from codesign_jax.scene.texts import SHOWN, printable, shown
@@ -80,8 +81,7 @@ def quantity(
     """Declares a numeric dataclass field with its unit and closed range [low, high].
 
     Args:
-      structure: Whether compiled programs depend on the number; the others are traced values, see
-        `numbers`.
+      structure: Whether compiled programs depend on the number; the others are leaves, see `table`.
       typical: A usual value, see `typical`; by default one well inside the range.
       **kwargs: Further arguments of `dataclasses.field`.
     """
@@ -193,72 +193,55 @@ def parse(cls: type[T], table: Any, path: str, problems: list[str]) -> T | None:
     return cls(**values) if len(problems) == before else None
 
 
-def numbers(table: Any) -> Any:
-    """The numbers of a dataclass that are not structure, as nested named tuples.
+_tables: set[type] = set()
 
-    Field names are those of the file; arrays of tables and of numbers are tuples. A table without
-    such numbers is left out, and None in an array of tables.
+
+def table(cls: type[T]) -> type[T]:
+    """Registers a frozen dataclass as a pytree.
+
+    Its leaves are its numbers that are not structure, also those of tables in it, under the names
+    of the file; all else is static.
     """
-    return _collect(table, lambda field, value: value)
+    fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    data = [f.name for f in fields if _is_leaf(f) or _holds_tables(f.type)]
+    jax.tree_util.register_dataclass(cls, data, [f.name for f in fields if f.name not in data])
+    _tables.add(cls)
+    return cls
 
 
-def ranges(table: Any) -> Any:
-    """`Range` of every number, as nested as `numbers`."""
-    return _collect(table, lambda field, value: _range(field))
+def _is_leaf(field: dataclasses.Field) -> bool:
+    return "low" in field.metadata and not field.metadata["structure"]
 
 
-def with_numbers(table: T, values: Any) -> T:
-    """The dataclass with other numbers.
+def _holds_tables(hint: Any) -> bool:
+    return hint in _tables or any(map(_holds_tables, typing.get_args(hint)))
 
-    Args:
-      values: Its numbers, nested as `numbers(table)`; may be arrays or traced.
-    """
-    changes = {}
-    for name, new in values._asdict().items():
-        old = getattr(table, name)
-        if new is None:
+
+def each(table: T, leaf: typing.Callable[[dataclasses.Field], Any]) -> T:
+    """The table with leaf(field) in place of each of its leaves."""
+    changes: dict[str, Any] = {}
+    for field in dataclasses.fields(table):  # type: ignore[arg-type]
+        value = getattr(table, field.name)
+        several, entries = isinstance(value, tuple), value if isinstance(value, tuple) else (value,)
+        if value is None or not (_is_leaf(field) or type(entries[:1] and entries[0]) in _tables):
             continue
-        if dataclasses.is_dataclass(old):
-            new = with_numbers(old, new)
-        elif isinstance(old, tuple) and dataclasses.is_dataclass(old[0]):
-            pairs = zip(old, new, strict=True)
-            new = tuple(o if n is None else with_numbers(o, n) for o, n in pairs)
-        changes[name] = new
+        new = tuple(leaf(field) if _is_leaf(field) else each(v, leaf) for v in entries)
+        changes[field.name] = new if several else new[0]
     return dataclasses.replace(table, **changes)  # type: ignore[type-var]
 
 
+def ranges(table: T) -> T:
+    """The table with a `Range` in place of each of its leaves."""
+    return each(table, _range)
+
+
 def typical(table: T) -> T:
-    """The dataclass with a fixed value for every number that is not structure."""
-    return with_numbers(table, _collect(table, lambda field, value: field.metadata["typical"]))
+    """The table with a fixed value for each of its leaves."""
+    return each(table, lambda field: field.metadata["typical"])
 
 
 def _range(field: dataclasses.Field) -> Range:
     return Range(*(field.metadata[key] for key in ("unit", "low", "high")))
-
-
-def _collect(table: Any, leaf: typing.Callable[[dataclasses.Field, Any], Any]) -> Any:
-    """Named tuples of leaf(field, value) of a dataclass' numbers; None if it has none."""
-    found = {}
-    for field in dataclasses.fields(table):
-        value, kind = getattr(table, field.name), field.metadata
-        if value is None or not kind.get("in_file", True) or kind.get("structure"):
-            continue
-        if "low" in kind:
-            many = isinstance(value, tuple)
-            found[field.name] = tuple(leaf(field, v) for v in value) if many else leaf(field, value)
-        elif dataclasses.is_dataclass(value):
-            found[field.name] = _collect(value, leaf)
-        elif isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
-            rows = tuple(_collect(v, leaf) for v in value)
-            found[field.name] = rows if any(row is not None for row in rows) else None
-    found = {name: value for name, value in found.items() if value is not None}
-    return _named(type(table).__name__, tuple(found))(**found) if found else None
-
-
-@functools.cache
-def _named(name: str, fields: tuple[str, ...]) -> type:
-    """A named tuple type; equal tables share one, so that their trees have one structure."""
-    return collections.namedtuple(name, fields)
 
 
 def _required(field: dataclasses.Field) -> bool:

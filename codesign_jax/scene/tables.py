@@ -7,7 +7,7 @@ and ranges of the fields, see `scripts/reference_page.py`.
 import dataclasses
 
 from codesign_jax.scene import rigid
-from codesign_jax.scene.schema import choice, quantity
+from codesign_jax.scene.schema import choice, quantity, table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +41,7 @@ class Effects:
     gravity: bool = True
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class Fixture:
     """A static body of the surroundings, which fingers, palm and object touch as the table.
@@ -77,12 +78,13 @@ class Fixture:
         return (*(self.size or ()), 0.0, 0.0, 0.0)[:3]
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class Phases:
     """End times of the phases of one grasp (paper Fig. 3) [s], from the end of the settling.
 
     Each phase ends later than the one before it.  The number of time steps is structure: the end of
-    the last phase may not be changed by `Constants`.
+    the last phase is no leaf of a scene.
 
     Attributes:
       approach: End of the approach: the arm is at the grasp's height.
@@ -106,6 +108,7 @@ class Phases:
     settle: float = quantity("s", 0, 60, structure=True, default=0.0)
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class Arm:
     """Start pose, reference height and disturbance of the arm frame X_D.
@@ -124,6 +127,7 @@ class Arm:
     shake_amplitude: float = quantity("deg", 0, 90)
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class Cost:
     """Cost of a trial (paper Fig. 3).
@@ -142,6 +146,7 @@ class Cost:
     failure: str = choice("exclude", "worst")
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class Contact:
     """Contact of the rubber skin; see docs/hull.md.
@@ -182,6 +187,7 @@ class Contact:
     finger_palm_stiffness: float = quantity("N/m", 10, 1e6, default=20e3)
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class Pneumatics:
     """Air of the chambers: its supply, with `pressure_dynamics`, and its law, with `air_mass`.
@@ -280,6 +286,7 @@ class Accuracy:
     newton: dict = dataclasses.field(default_factory=dict)
 
 
+@table
 @dataclasses.dataclass(frozen=True)
 class Limits:
     """Bounds beyond which a world has failed although its numbers are finite.

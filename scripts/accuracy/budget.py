@@ -167,14 +167,14 @@ class Study:
         drawn = rollout.sample_trials(the_scene, jax.random.key(SEED), count)
         drawn = work.nudged(drawn) if variant.moved else drawn
         designs, trials = crossed(self.designs, drawn)
-        constants = calibrated(the_scene, count, len(self.designs)) if variant.drawn else None
+        if variant.drawn:
+            the_scene = calibrated(the_scene, count, len(self.designs))
 
         @jax.jit
-        def run(designs: jax.Array, trials: Trial, constants: Any) -> Any:
-            params = jax.vmap(space.params)(designs)
-            return rollout.simulate(the_scene, engine, params, trials, constants=constants)[0]
+        def run(designs: jax.Array, trials: Trial, own: Scene) -> Any:
+            return rollout.simulate(own, engine, jax.vmap(space.params)(designs), trials)[0]
 
-        arguments = jnp.asarray(designs, jnp.float32), trials, constants
+        arguments = jnp.asarray(designs, jnp.float32), trials, the_scene
         start = time.perf_counter()
         program = run.lower(*arguments).compile()
         return lambda: program(*arguments), time.perf_counter() - start
@@ -200,8 +200,8 @@ def crossed(designs: np.ndarray, drawn: Trial) -> tuple[np.ndarray, Trial]:
     return designs[index // count], jax.tree.map(lambda x: np.asarray(x)[index % count], drawn)
 
 
-def calibrated(the_scene: Scene, trials: int, designs: int) -> Any:
-    """Constants of each world: a set for each trial, of those that no target ruled out."""
+def calibrated(the_scene: Scene, trials: int, designs: int) -> Scene:
+    """A scene with numbers of each world: a set for each trial, of those that are not ruled out."""
     left = calibration.left()
     rows = np.random.default_rng(SEED).permutation(len(left))[np.arange(trials) % len(left)]
     numbers = calibration.numbers(the_scene, calibration.values(left[rows]))

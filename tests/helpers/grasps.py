@@ -1,5 +1,6 @@
 """Small scenes and states for the tests: two fingers, few links, one object a scene."""
 
+import dataclasses
 import functools
 from pathlib import Path
 
@@ -90,20 +91,19 @@ def lanes(the_scene, fields):
 
 
 def random_constants(the_scene, seed, count=None):
-    """A scene's numbers, each up to 20 % larger or smaller, leaves of shape () or (count,).
+    """The scene with numbers up to 20 % larger or smaller, leaves of shape () or (count,).
 
     They stay in their ranges, and the phases in order.
     """
     random = np.random.default_rng(seed)
     shape = () if count is None else (count,)
-    ranges = scene.Constants(**schema.ranges(the_scene)._asdict())
     found = jax.tree.map(
         lambda v, r: np.clip(v * random.uniform(0.8, 1.2, shape), r.low, r.high),
-        the_scene.constants(),
-        ranges,
+        the_scene,
+        schema.ranges(the_scene),
     )
-    slow = jax.tree.map(lambda v: v * random.uniform(0.97, 1.03, shape), the_scene.constants())
-    return found._replace(phases=slow.phases)
+    slow = jax.tree.map(lambda v: v * random.uniform(0.97, 1.03, shape), the_scene.phases)
+    return dataclasses.replace(found, phases=jax.tree.map(np.asarray, slow))
 
 
 def still(shape=0):

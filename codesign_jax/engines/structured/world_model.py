@@ -201,7 +201,7 @@ def _world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
     picked = jnp.take_along_axis(sizes, shape[:, None, None], axis=1)[:, 0]
     object_size = last(picked)[:, None]
     no_spheres = lay.spheres.size == 0
-    numbers = scene.with_constants(jax.tree.map(lambda v: v[None], fields.constants))
+    numbers = jax.tree.map(lambda v: v[None], fields.constants)
     return WorldModel(
         mount=mount,
         base=base,

@@ -36,14 +36,16 @@ def pytest_configure(config):
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 
-# Files of more than ten seconds, the longest first: what is left for the end is short, so that no
+# Files of more than five seconds, the longest first: what is left for the end is short, so that no
 # worker waits for the other.
 LONG = """
-test_resume test_reverse test_compose test_rollout test_docs test_steps test_effects
-test_mesh_grasps test_kernel test_export test_constants test_many_runs test_optimizers test_sample
-test_codesign test_containment test_stress test_run_reading test_evaluate test_report test_batch
-test_experiments test_engines test_own test_planted_contacts test_check test_friction_memory
-test_showing test_preflight test_library test_teams test_hard_cases
+test_policy test_forces test_docs test_own test_env test_steps test_reverse test_compose
+test_air test_resume test_batch test_library test_effects test_containment test_model test_rings
+test_optimizers test_particle_filter test_preflight test_kernel test_planted_contacts
+test_rollout test_constants test_run_reading test_sample test_friction_memory test_export_sheet
+test_many_runs test_codesign test_mesh_grasps test_fixtures test_export test_teams
+test_primitives test_showing test_report test_check test_stress test_lateral_threshold
+test_engines
 """.split()
 
 

@@ -136,14 +136,22 @@ def test_the_derivative_of_a_closed_loop_is_that_of_differences():
     np.testing.assert_allclose(slope, (one - two) / 100.0, rtol=1e-4)
 
 
-def test_pressures_stay_within_what_the_walls_stand():
+def test_pressures_stay_within_what_the_walls_stand_and_what_is_no_number_fails_its_world():
+    """And is told where it is, if nothing is traced."""
     scene = grasps.short_grasp()
-    params, trials = grasps.random_worlds(scene, 1, 4)
+    params, trials = grasps.random_worlds(scene, 1, 2)
 
     def wild(carry, seen):
-        return carry, seen.plan._replace(pressure=jnp.array([1e9, -1.0]))
+        pressure = jnp.where(seen.time > 0.2, jnp.nan, jnp.array([1e9, -1.0]))
+        return carry, seen.plan._replace(pressure=pressure)
 
-    ctrl = np.asarray(simulate(scene, loop(scene, wild), params, trials)[1].ctrl)
+    engine = loop(scene, wild, period=0.1)
+    outcome, trace = simulate(scene, engine, params, trials)
+    assert (np.asarray(outcome.status) & Status.NONFINITE).all()
+    assert (np.asarray(outcome.bad_step) == 31).all()
+    with pytest.raises(InputError, match=r"commands pressure\[0\] = nan at 0.3 s in world 0"):
+        rollout.simulate(scene, engine, params, trials)
+    ctrl = np.asarray(trace.ctrl)[:, :30]
     limit = jax.vmap(scene.hand.pressure_limit.of)(params.height, params.wall)
     top = np.maximum(limit, params.pressure)[:, None, 0]
     np.testing.assert_allclose(ctrl[..., 6], np.broadcast_to(top, ctrl.shape[:2]), rtol=1e-6)
@@ -160,24 +168,6 @@ def test_pressures_stay_within_what_the_walls_stand():
     found = policy.spread(tapered, policy.Command(*none), plan, of="policy").pressure
     want = morphology.pressure_limits(tapered.hand, thin)[:, None]
     np.testing.assert_allclose(found, np.broadcast_to(want, found.shape), rtol=1e-6)
-
-
-def no_number(carry, seen):
-    late = seen.time > 0.2
-    pressure = jnp.where(late, jnp.nan, seen.plan.pressure)
-    return carry, seen.plan._replace(pressure=pressure)
-
-
-def test_a_command_that_is_no_number_fails_its_world():
-    """And is told where it is, if nothing is traced."""
-    scene = grasps.short_grasp()
-    params, trials = grasps.random_worlds(scene, 1, 2)
-    engine = loop(scene, no_number, period=0.1)
-    outcome, _ = simulate(scene, engine, params, trials)
-    assert (np.asarray(outcome.status) & Status.NONFINITE).all()
-    assert (np.asarray(outcome.bad_step) == 31).all()
-    with pytest.raises(InputError, match=r"commands pressure\[0\] = nan at 0.3 s in world 0"):
-        rollout.simulate(scene, engine, params, trials)
 
 
 @pytest.mark.slow  # quick: test_docs takes the policy, test_env steps an environment

@@ -208,6 +208,29 @@ def test_a_mesh_has_the_mass_centre_and_inertia_of_its_file(tmp_path):
     assert len(shape.resting()) == 3 and len(only(tmp_path, MESH).resting()) == 2
 
 
+def test_a_primitive_may_have_its_centre_of_mass_elsewhere(tmp_path):
+    """The same as a primitive: MuJoCo's inertia, and the closed form of how high it stands."""
+    text = """<mujoco><worldbody><body><freejoint/>
+      <geom type="box" size="0.02 0.02 0.03" pos="0 0 -0.03" mass="0.3"/>
+      <geom type="box" size="0.02 0.02 0.03" pos="0 0 0.03" mass="0.05"/></body>
+    </worldbody></mujoco>"""
+    compiled = mujoco.MjModel.from_xml_string(text)
+    along, *_, across = np.sort(compiled.body_inertia[1])
+    low = float(compiled.body_ipos[1, 2])
+    entry = BOX.replace("mass = 0.1", "mass = 0.35") + f"; centre_of_mass = [0, 0, {low}]"
+    shape = only(tmp_path, f"{entry}; inertia = [{across}, {across}, {along}]")
+    expected = np.sort(compiled.body_inertia[1])
+    np.testing.assert_allclose(0.35 * np.sort(shape.unit_inertia), expected, rtol=1e-9)
+    # STL has float32: 4e-9 m of 60 mm.
+    assert shape.rest_height(rigid.up(shape.upright)) == pytest.approx(0.06 + low, abs=1e-8)
+    assert shape.radius == pytest.approx(np.linalg.norm([0.02, 0.02, 0.06 - low]), abs=1e-8)
+    assert len(shape.resting()) == 3  # its ends are two
+    kept = scene.load("paper_spheres", object_set=tmp_path / "objects.toml")
+    scene_files.write_scene(kept, tmp_path / "run")  # reads it back and compares
+    lying = only(tmp_path, SHAPES["capsule"] + "; centre_of_mass = [0, 0, 0.01]")
+    assert lying.rest_height(rigid.up(lying.upright)) == pytest.approx(0.02, rel=2e-3)  # facets
+
+
 def test_mass_of_primitives_by_density(tmp_path):
     for kind, entry in SHAPES.items():
         shape = only(tmp_path, entry.replace("mass = 0.1", "density = 800"))
@@ -228,7 +251,10 @@ def test_mass_of_primitives_by_density(tmp_path):
         (BOX + "; inertia = [1e-4, 1e-4, 1e-4, 1e-5, 0, 0]", "inertia of a box is xx, yy and zz"),
         (BOX + "; density = 100", "a box has either a mass or a density"),
         (BOX.replace("; mass = 0.1", ""), "a box has either a mass or a density"),
-        (BOX + "; centre_of_mass = [0, 0, 0]", "a box has no centre_of_mass"),
+        (
+            BOX + "; centre_of_mass = [0, 0, 0.07]",
+            "a: box.stl: centre_of_mass at 0, 0, 70 mm",
+        ),
         (MESH + "; centre_of_mass = [0, 0, 0.07]", "0, 0, 70 mm is outside its convex hull"),
         (MESH + "; centre_of_mass = [0, 0]", "centre_of_mass must have three coordinates"),
         (

@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # trimesh and SciPy take a while to import; sets of primitive
 
 MOST_BYTES = 1 << 25
 """Largest size of a set's mesh files together; those of the set household have 0.4 MB."""
-_MESH_KEYS = ("file", "unit", "repair", "voxel_error", "centre_of_mass")
+_MESH_KEYS = ("file", "unit", "repair", "voxel_error")
 _MASS, _SIZE = ("kg", 0.001, 10.0), ("m", 0.002, 0.25)
 
 
@@ -106,9 +106,10 @@ class _ShapeFile:
       mass: Mass; or give `density` instead.
       density: Density.
       inertia: Inertia about the centre of mass in the axes of its file: xx, yy and zz, of a mesh
-        also xy, xz and yz; goes with a mass. Not given: that of a homogeneous body.
-      centre_of_mass: Centre of mass of a mesh in the frame of its file. Not given: that of a
-        homogeneous body.
+        and with a centre of mass also xy, xz and yz; goes with a mass. Not given: that of a
+        homogeneous body about its centre.
+      centre_of_mass: Centre of mass in the frame of its file, of a primitive from its centre, which
+        is then simulated as the mesh of its surface. Not given: that of a homogeneous body.
       file: Mesh file, beside the object file if the path is relative.
       unit: Unit of the mesh file's numbers, metres if not given.
       repair: Whether to repair a mesh.
@@ -316,15 +317,20 @@ def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
                 f"{where}: size of a {kind} has {len(sizes)} values, not {len(given.size)}"
                 f" ({', '.join(sizes)})"
             )
-        if given.inertia is not None and len(given.inertia) == 6 and any(given.inertia[3:]):
+        moved = given.centre_of_mass is not None
+        if given.inertia is not None and any(given.inertia[3:]) and not moved:
             problems.append(f"{where}: inertia of a {kind} is xx, yy and zz in its own axes")
     problems += [f"{where}: {key} of a {kind} is missing" for key in missing]
     problems += [f"{where}: a {kind} has no {key}" for key in foreign]
     if len(problems) > before:
         return None
-    make = _mesh_shape if kind == "mesh" else _primitive
     values = {f.name: getattr(given, f.name) for f in dataclasses.fields(given)}
-    shape = make(values, path, where, problems)
+    if kind == "mesh":
+        shape = _mesh_shape(values, path, where, problems)
+    elif given.centre_of_mass is not None:
+        shape = _off_centre(values, path, where, problems)
+    else:
+        shape = _primitive(values)
     if shape is None:
         return None
     if why := schema.range_problem(f"{where}: mass", shape.mass, *_MASS):
@@ -343,7 +349,17 @@ def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
     return shape
 
 
-def _primitive(values: dict, path: Path, where: str, problems: list[str]) -> Shape:
+def _off_centre(values: dict, path: Path, where: str, problems: list[str]) -> Shape | None:
+    """A primitive as the mesh of its surface, which may have its centre of mass anywhere."""
+    primitive, size = PRIMITIVES[values["type"]], (*values["size"], 0.0, 0.0)[:3]
+    content = primitive.triangles(size).export(file_type="stl")
+    if values["orientation"] is None and values["pose"] is None:
+        values = values | {"orientation": primitive.upright}
+    mesh = {"type": "mesh", "file": f"{values['type']}.stl", "unit": "m", "size": None}
+    return _mesh_shape(values | mesh, path, where, problems, content)
+
+
+def _primitive(values: dict) -> Shape:
     primitive, size = PRIMITIVES[values["type"]], (*values["size"], 0.0, 0.0)[:3]
     mass, inertia = values["mass"], values["inertia"]
     if mass is None:
@@ -352,7 +368,9 @@ def _primitive(values: dict, path: Path, where: str, problems: list[str]) -> Sha
     return Shape(**values | {"mass": mass, "density": None, "own_inertia": own})
 
 
-def _mesh_shape(values: dict, path: Path, where: str, problems: list[str]) -> Shape | None:
+def _mesh_shape(
+    values: dict, path: Path, where: str, problems: list[str], content: bytes | None = None
+) -> Shape | None:
     from codesign_jax.scene import meshes
 
     mass, inertia, centre = (values[key] for key in ("mass", "inertia", "centre_of_mass"))
@@ -365,6 +383,7 @@ def _mesh_shape(values: dict, path: Path, where: str, problems: list[str]) -> Sh
             voxel_error=values["voxel_error"] or 5e-4,
             centre=None if centre is None else np.array(centre),
             tensor=None if own is None else rigid.tensor(own) / mass,
+            content=content,
         )
     except schema.InputError as error:
         problems += [f"{where}: {p}" for p in error.problems]

@@ -65,6 +65,16 @@ def read(path: Path) -> Read:
         raise InputError([f"{path.name}: {error.strerror}"]) from error
     if len(content) > MOST_BYTES:
         raise InputError([f"{path.name}: has more than {MOST_BYTES >> 20} MiB; use fewer faces"])
+    return parsed(path, content)
+
+
+def parsed(path: Path, content: bytes) -> Read:
+    """What a file of this name and content has.
+
+    Raises:
+      InputError: If it is no mesh.
+    """
+    kind = path.suffix.lower().removeprefix(".")
     if foreign := texts.foreign(content):
         raise InputError([f"{path.name}: {foreign}"])
     try:

@@ -121,20 +121,24 @@ def load(
     voxel_error: float,
     centre: np.ndarray | None = None,
     tensor: np.ndarray | None = None,
+    content: bytes | None = None,
 ) -> Solid:
     """Reads and checks a mesh file; `reading.FORMATS` are the formats.
 
     Args:
+      path: The file.
       unit: Unit of its numbers, one of `UNITS`.
       repaired: Whether to repair what can be.
       voxel_error: Bound on the error of the signed distance [m].
       centre: Centre of mass in the file's frame [m], shape (3,); None for a homogeneous body's.
       tensor: Inertia about it per mass [m^2], in the file's axes, shape (3, 3); likewise.
+      content: What the file would have, where there is none.
 
     Raises:
       InputError: with every problem of the mesh.
     """
-    vertices, faces, content, digest = reading.read(path)
+    found = reading.read(path) if content is None else reading.parsed(path, content)
+    vertices, faces, content, digest = found
     repairs: list[str] = []
     with np.errstate(over="ignore", invalid="ignore"):
         problems = _size_problems(np.ptp(vertices, axis=0).max(), unit)

@@ -24,10 +24,15 @@ def test_an_object_rests_on_a_shelf_or_tips_over_its_edge(tmp_path, overhang, st
     flat = jnp.array([0.0, 0.0, 0.03, 1.0, 0.0, 0.0, 0.0], fields.start.dtype)
     fields = fields._replace(start=fields.start.at[:, -7:].set(flat))
     held = jnp.asarray(np.repeat(ctrl[:, :1], 100, 1))
-    for name in ("structured", "mujoco"):
-        run = partial(make_engine(name, the_scene).rollout, trajectory=True)
-        height = float(jax.jit(run)(fields, held).height[0, -1])
-        assert abs(height - 0.03) < 1e-3 if stays else height < -0.1, (name, height)  # no failure
+    engines = make_engine("structured", the_scene).recording(), make_engine("mujoco", the_scene)
+    for engine in engines:
+        trace = jax.jit(partial(engine.rollout, trajectory=True))(fields, held)
+        height = float(trace.height[0, -1])
+        assert abs(height - 0.03) < 1e-3 if stays else height < -0.1, height  # no failure
+        if trace.forces is not None:
+            push = float(trace.forces.table[0, -2, 2])
+            weight = 9.81 * float(fields.body_mass[0, -1])
+            assert push == pytest.approx(weight if stays else 0.0, rel=1e-3)
 
 
 @pytest.mark.parametrize(

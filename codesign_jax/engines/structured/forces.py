@@ -79,7 +79,7 @@ def forces(scene: Scene, hand: WorldModel, state: State, acc: Acc) -> Forces:
     kin = kinematics(hand, layout(scene).axes, state)
     velocity = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
     motion = propagate(kin, acc)
-    found = assembly.contacts(scene, hand, kin, state.position[2], velocity)
+    found = assembly.contacts(scene, hand, kin, state.position, velocity)
     fingers, worlds = scene.num_fingers, state.wrist.shape[-1]
     none = jnp.zeros((3, fingers, worlds), state.wrist.dtype)
     net = {name: none[:, :1] for name in ("palm_object", "palm_table", "object_table")}

@@ -49,17 +49,6 @@ SECONDS = 10.0
 """Time after which no further call begins."""
 JUDGED = 360
 """Grasps whose verdicts are kept, to be compared between engines."""
-WINNERS = ROOT / "docs/data/experiments/23d.npz"
-
-
-def winners(chosen: Scene) -> np.ndarray:
-    """The final particle that tested best of each concurrent run with 23 parameters, (run, 23)."""
-    space = parameters.design_space(chosen.hand, "23d")
-    with np.load(WINNERS, allow_pickle=False) as file:
-        assert tuple(file["parameters"]) == space.names
-        place = list(file["strategies"]).index("concurrent")
-        tested, particles = file["test_worst"][place], file["final_particles"][place]
-    return particles[np.arange(len(particles)), tested.argmin(1)]
 
 
 def make_worlds(chosen: Scene, designs: str, count: int) -> work.Worlds:
@@ -77,7 +66,7 @@ def make_worlds(chosen: Scene, designs: str, count: int) -> work.Worlds:
     objects = len(chosen.objects.object)
     trials = rollout.sample_trials(chosen, key, count)
     if designs == "winners":
-        vectors, index = winners(chosen), np.arange(count)
+        vectors, index = work.winners(), np.arange(count)
         trials = trials._replace(shape=(index + index // len(vectors)) % objects)
         vectors = vectors[index % len(vectors)]
     else:

@@ -1,14 +1,14 @@
 """How deep fingers, object and palm stand in one another over grasps, from recorded poses alone.
 
-python -m scripts.contact_depths docs/data/experiments/23d.npz --trials 2 --out runs/depths.json
+python -m scripts.contact_depths docs/data/search/winners.npz --trials 3 --out runs/depths.json
 python -m scripts.contact_depths runs/ten --trials 18 --batch 1024 --out runs/depths.json
 
-A file is the 23d.npz of the experiments (the best particle of each run), the .npz of a search of
-`scripts.search` (what it recommends at its last mark), a .json whose `designs`
-have a `vector` each, as --out has, or a folder of runs.  One program simulates all grasps, --batch
-at a time.  A finger's surface is the one that touches, whatever the law: |y/a|^4 + |z/b|^4 = 1
-along its blended links, with a cap over the last quarter of a segment.  The depth of a body in
-another is that of its deepest point from the other's surface, in every step from the inflation on.
+A file is the .npz of a search of `scripts.search` (what it recommends in the end), a .json whose
+`designs` have a `vector` each, as --out has, or a folder of runs.  One program simulates all
+grasps, --batch at a time.  A finger's surface is the one that touches, whatever the law:
+|y/a|^4 + |z/b|^4 = 1 along its blended links, with a cap over the last quarter of a segment.  The
+depth of a body in another is that of its deepest point from the other's surface, in every step
+from the inflation on.
 """
 
 import argparse
@@ -32,6 +32,7 @@ from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import InputError, Scene, keypaths, parameters
 from codesign_jax.scene.primitives import PRIMITIVES
+from scripts.shared import work
 
 STATIONS, TIP = 4, 0.25  # sections a link; the cap's length in links, that of one section
 CAP = 0.5, 0.8, 0.95, 1.0  # places of its rings
@@ -278,11 +279,7 @@ def designs_of(path: Path) -> list[np.ndarray]:
         return [choice.choose(read_run(p)[0], choice.read_record(p)).design for p in folders]
     if path.suffix == ".json":
         return [np.array(d["vector"]) for d in json.loads(path.read_text())["designs"]]
-    with np.load(path, allow_pickle=False) as stored:
-        if marks := [int(n.removeprefix("designs")) for n in stored if n.startswith("designs")]:
-            return list(stored[f"designs{max(marks)}"])
-        particles, cost = stored["final_particles"][-1], stored["test_exclude"][-1]
-    return list(particles[np.arange(len(cost)), np.nanargmin(cost, axis=1)])
+    return list(work.winners(path))
 
 
 def main() -> None:

@@ -7,8 +7,8 @@ python -m scripts.accuracy --out runs/budget --tip              # errors of the 
 python -m scripts.accuracy --out runs/budget --merge docs/data/budget.json
 python -m scripts.accuracy --merge docs/data/budget.json --report     # page and figures
 
-All variants have the same designs, in which the concurrent 23D runs of --data ended, one of each,
-and the same trials.  The truth has the finer step, links and mesh; `finer` refines all three again.
+All variants have the same designs, what the default search recommended in its first seeds, and the
+same trials.  The truth has the finer step, links and rings; `finer` refines all three again.
 A variant has a file of its own, so that several processes share the work.
 """
 
@@ -23,7 +23,6 @@ from scripts.shared import output, provenance
 
 def main() -> int:
     parser = provenance.parser(__doc__)
-    parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
     parser.add_argument("--out", type=Path, default=Path("runs/budget"), help="folder of the files")
     parser.add_argument("--designs", type=int, default=budget.DESIGNS)
     parser.add_argument("--trials", type=int, default=budget.TRIALS)
@@ -51,7 +50,7 @@ def main() -> int:
     if args.tip:
         budget.measure_tips(args.out, args.commit)
         return 0
-    study = budget.Study(args.data, args.designs, args.trials)
+    study = budget.Study(args.designs, args.trials)
     first, count = (int(n) for n in args.share.split("/"))
     chosen = args.only.split(";") if args.only else budget.TIMED if args.time else budget.VARIANTS
     run = budget.measure if args.time else budget.simulate

@@ -31,7 +31,7 @@ DESIGNS, TRIALS, FEW = 30, 40, 16
 """Designs, trials of each, and trials of the dearest variants: the first ones."""
 BITS = {str(b.name): b.value for b in Status if b.value}
 SEED = 5
-"""Seed of the trials and of the choice of designs; no run of the experiments tested on it."""
+"""Seed of the trials; no search tested on it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,14 +59,14 @@ class Variant:
         return scene.load("paper", accuracy=self.accuracy, overrides=overrides)
 
 
-def discretized(step: float, links: int, rings: int, points: int) -> tuple[str, ...]:
-    """Changes to a time step [ms], links of a finger and mesh of a link, springs damped least."""
-    table = {"timestep": step * 1e-3, "links": links, "hull_rings": rings, "hull_points": points}
+def discretized(step: float, links: int, rings: int) -> tuple[str, ...]:
+    """Changes to a time step [ms], links of a finger and rings of a link, springs damped least."""
+    table = {"timestep": step * 1e-3, "links": links, "hull_rings": rings}
     found = [f"discretization.{key}={value:g}" for key, value in table.items()]
     return (*found, "discretization.spring_damping=least")
 
 
-TRUTH, FINER = discretized(2, 20, 4, 16), discretized(1, 30, 5, 20)
+TRUTH, FINER = discretized(2, 20, 4), discretized(1, 30, 5)
 LOOSE = ("newton.decrement=1e-3", "newton.iterations=24")
 """A looser tolerance of the contact solver, in place of fewer iterations."""
 LEAST = "discretization.spring_damping=least"
@@ -88,7 +88,10 @@ VARIANTS: dict[str, Variant] = {
     "2 ms": Variant(changes=("discretization.timestep=0.002",)),
     "5 ms": Variant(changes=("discretization.timestep=0.005",)),
     "20 links": Variant(changes=("discretization.links=20",)),
-    "4 x 16": Variant(changes=("discretization.hull_rings=4", "discretization.hull_points=16")),
+    "4 rings": Variant(changes=("discretization.hull_rings=4",)),
+    "twice the stiffness": Variant(changes=("contact.normal_stiffness=8000",)),
+    "half the dissipation": Variant(changes=("contact.dissipation_time=0.003",)),
+    "air mass": Variant(changes=("effects.air_mass=true",)),
     "neo-Hookean": Variant(changes=("effects.neo_hookean=true",)),
     "lateral threshold": Variant(changes=("effects.lateral_threshold=true",)),
     "spheres": Variant(changes=(SPHERES,)),
@@ -103,12 +106,12 @@ VARIANTS: dict[str, Variant] = {
     "least, 1e-3": Variant(changes=(LEAST, *LOOSE)),
     "5 ms, least, 1e-3": Variant("fine", changes=LOOSE),
     "least": Variant(changes=(LEAST,)),
-    "4 x 16, least, 1e-3": Variant(changes=(*discretized(10, 10, 4, 16), *LOOSE)),
-    "5 ms, 3 x 12, least, 1e-3": Variant(changes=(*discretized(5, 10, 3, 12), *LOOSE)),
+    "4 rings, least, 1e-3": Variant(changes=(*discretized(10, 10, 4), *LOOSE)),
+    "5 ms, 3 rings, least, 1e-3": Variant(changes=(*discretized(5, 10, 3), *LOOSE)),
 }
 TIMED = (
     *("fast", "standard", "fine", "reference", "least, 1e-3", "5 ms, least, 1e-3"),
-    *("4 x 16, least, 1e-3", "spheres", "spheres, MuJoCo C"),
+    *("4 rings, least, 1e-3", "spheres", "spheres, MuJoCo C"),
 )
 """Variants whose rate is measured, one after another."""
 DEAR = ("reference", "spheres, MuJoCo C")
@@ -118,9 +121,8 @@ DEAR = ("reference", "spheres, MuJoCo C")
 class Study:
     """Designs and trials, and what variants make of them."""
 
-    def __init__(self, data: Path, designs: int, trials: int):
-        """Reads the designs from 23d.npz of a folder."""
-        self.trials, self.designs = trials, late_designs(data, designs)
+    def __init__(self, designs: int, trials: int):
+        self.trials, self.designs = trials, work.winners()[:designs]
 
     def run(self, name: str, commit: str | None = None) -> dict[str, Any]:
         """Simulates a variant; what its file holds."""
@@ -178,19 +180,6 @@ class Study:
         start = time.perf_counter()
         program = run.lower(*arguments).compile()
         return lambda: program(*arguments), time.perf_counter() - start
-
-
-def late_designs(data: Path, count: int) -> np.ndarray:
-    """Distinct final particles of the concurrent 23D runs in turn, (design, 23) in SI units."""
-    with np.load(data / "23d.npz", allow_pickle=False) as file:
-        runs = file["final_particles"][-1]
-    rng = np.random.default_rng(SEED)
-    every = [rng.permutation(np.unique(run, axis=0)) for run in runs]
-    depth = max(len(run) for run in every)
-    chosen = [run[i] for i in range(depth) for run in every if i < len(run)][:count]
-    if len(chosen) < count:
-        raise ValueError(f"{count} designs asked for, the runs end with {len(chosen)} distinct")
-    return np.array(chosen)
 
 
 def crossed(designs: np.ndarray, drawn: Trial) -> tuple[np.ndarray, Trial]:

@@ -20,9 +20,9 @@ PRESETS = ("fast", "standard", "fine", "reference")
 CANDIDATES = {
     "least": "`standard` with least damping",
     "least, 1e-3": "`standard` with least damping, a tolerance of 1e-3",
-    "4 x 16, least, 1e-3": "the same and a skin of 4 × 16 points a link",
+    "4 rings, least, 1e-3": "the same and four rings a link",
     "5 ms, least, 1e-3": "`fine` with a tolerance of 1e-3 and 24 iterations",
-    "5 ms, 3 x 12, least, 1e-3": "the same and a skin of 3 × 12 points a link",
+    "5 ms, 3 rings, least, 1e-3": "the same and three rings a link",
 }
 RATED = {"gpu": "one H100", "cpu": "2 CPU cores"}
 """Machines whose rates the file has, in words."""
@@ -47,22 +47,28 @@ CHANGES = (
     Change("time step of 5 ms", "standard", "5 ms", NUMERICS),
     Change("time step of 2 ms", "standard", "2 ms", NUMERICS),
     Change("20 links", "standard", "20 links", NUMERICS),
-    Change("skin of 4 × 16 points a link", "standard", "4 x 16", NUMERICS),
+    Change("four rings a link", "standard", "4 rings", NUMERICS),
     Change("four Newton iterations", "standard", "4 iterations", NUMERICS),
     Change("tolerance of 1e-3", "standard", "1e-3", NUMERICS),
     Change("least damping alone", "standard", "least", NUMERICS),
-    Change("step, links and skin at once: the truth", "standard", "truth", NUMERICS),
+    Change("step, links and rings at once: the truth", "standard", "truth", NUMERICS),
     Change("the truth refined again", "truth", "finer", NUMERICS),
     Change(
         "MuJoCo C in place of this engine, with spheres", "spheres", "spheres, MuJoCo C", NUMERICS
     ),
-    Change("fingers creep on one another", CPUS, "fingers creep", MODELS),
-    Change("pressure resists sideways bending", CPUS, "lateral threshold", MODELS),
+    Change("twice the contacts' stiffness", "standard", "twice the stiffness", MODELS),
+    Change("half their dissipation time", "standard", "half the dissipation", MODELS),
+    Change("fingers creep on one another", "standard", "fingers creep", MODELS),
+    Change("pressure resists sideways bending", "standard", "lateral threshold", MODELS),
+    Change("a mass of air in each chamber", "standard", "air mass", MODELS),
     Change("neo-Hookean bending", "standard", "neo-Hookean", MODELS),
     Change("spheres in place of the skin", "standard", "spheres", MODELS),
     Change("fingers pass one another", "standard", "fingers pass each other", MODELS),
     Change("fingers pass the palm", "standard", "fingers pass the palm", MODELS),
-    Change("another of the calibrated sets of constants in each trial", CPUS, "constants", MODELS),
+    Change("fingers pass themselves", "standard", "fingers pass themselves", MODELS),
+    Change(
+        "another of the calibrated sets of constants in each trial", "standard", "constants", MODELS
+    ),
 )
 
 
@@ -208,7 +214,7 @@ WORDS = {
     "fine": "fine",
     "reference": "reference",
     "least, 1e-3": "10 ms, tolerance 1e-3",
-    "4 x 16, least, 1e-3": "10 ms, 1e-3, finer skin",
+    "4 rings, least, 1e-3": "10 ms, 1e-3, four rings",
     "5 ms, least, 1e-3": "5 ms, tolerance 1e-3",
     "spheres": "spheres, no skin",
     "spheres, MuJoCo C": "spheres, no skin",

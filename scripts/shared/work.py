@@ -1,6 +1,7 @@
 """What a benchmark simulates: designs in trials, and the fields and controls of these worlds."""
 
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -19,6 +20,17 @@ GOOD = {"length": (64.0, 8.0), "arm_z": (0.0, 8.0)}
 SEED = 2017
 NUDGE = 1e-6
 """Displacement of the objects that shows how much of a difference chaos alone makes [m]."""
+
+
+WINNERS = Path(__file__).parents[2] / "docs/data/search/winners.npz"
+"""What the default search of `scripts.search` recommended at the end of each of 100 seeds."""
+
+
+def winners(path: Path = WINNERS) -> np.ndarray:
+    """Designs of a search's .npz at its last mark, 23 parameters in SI units, (seed, 23)."""
+    with np.load(path, allow_pickle=False) as stored:
+        marks = [int(name.removeprefix("designs")) for name in stored if name.startswith("designs")]
+        return stored[f"designs{max(marks)}"]
 
 
 class Worlds(NamedTuple):

@@ -264,7 +264,8 @@ def merged(folder: Path) -> dict[str, Any]:
 # and the hand is shaken. Nothing touches, and no world ends early.
 IN_THE_AIR = {
     "effects": {
-        **dict.fromkeys(("finger_finger", "finger_palm", "finger_object", "finger_table"), False),
+        **dict.fromkeys(("finger_finger", "finger_itself", "finger_palm"), False),
+        **dict.fromkeys(("finger_object", "finger_table"), False),
         **dict.fromkeys(("palm_object", "palm_table", "ungrasp"), False),
     },
     "phases": {"approach": 0.3, "inflate": 0.6, "lift": 0.9, "disturb": 2.4, "ungrasp": 3.0},

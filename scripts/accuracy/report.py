@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib import ticker
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -286,8 +287,10 @@ def draw_against_time(found: Budget, path: Path) -> Path:
     _names(tip, right)
     for axis in (verdict, tip):
         axis.set_xlim(axis.get_xlim()[0] / 2)  # room for the name of a mark at the edge
-    if moved := found.compared("truth, moved", "truth"):
-        floor = 100 * moved["flipped"].value
+        axis.xaxis.set_major_formatter(ticker.ScalarFormatter())
+        axis.xaxis.set_minor_formatter(ticker.NullFormatter())
+    moved = found.compared("truth, moved", "truth")
+    if moved and (floor := 100 * moved["flipped"].value):
         verdict.axhline(floor, color="0.4", ls=":", lw=1)
         verdict.text(
             0.99, floor, "a micrometre flips this share of the truth's own", fontsize=8,

@@ -7,7 +7,6 @@ import pytest
 import scipy.stats
 
 from codesign_jax import scene
-from codesign_jax.scene import parameters
 from scripts import benchmark, calibration
 from scripts.calibration import OPEN
 from scripts.shared import statistics
@@ -45,10 +44,14 @@ def test_a_saddle_is_where_two_wells_part():
 
 def test_statements_rule_out_what_they_should():
     """Flat landscapes on which nothing, or everything, succeeds; two wells are two regions."""
-    space = parameters.design_space(scene.load("paper").hand, "2d")
+    paper = scene.load("paper")
     flat = [np.full((12, 12), c) for c in (0.0, 2.5)]
     costs = np.repeat(np.array([*flat, wells()])[..., None], 6, -1)
-    found = calibration.score(costs, np.full(3, 3.0), space)
+    own = calibration.values(np.stack([calibration.own_set(paper, g) for g in (35.0, 40.0, 70.0)]))
+    np.testing.assert_allclose(own["cost_maximum"], paper.cost.maximum, rtol=1e-9)
+    found = calibration.score(costs, own, paper)
+    # p M_p h / EI is 1.707 at 25 mm of height, 2 mm of wall, 80 kPa and 35 kPa, and goes by 1/G.
+    np.testing.assert_allclose(found["free strain"], [0.207 / 0.06, 0, 0], atol=0.01)
     good, bad, two = (({n: d[i] for n, d in found.items()}) for i in range(3))
     assert good["solutions"] == 0 and good["poor seeds"] > calibration.CUTOFF
     assert good["420 simulations"] > calibration.CUTOFF, "after the first episode"

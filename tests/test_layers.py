@@ -222,7 +222,7 @@ def test_no_kernel_depends_on_what_its_key_leaves_out():
 # As `find DIR -name '*.py' | xargs cat | wc -l` counts.  A larger number is a line of a review: say
 # there what users have of it, and what could go in its place.
 MOST_LINES = {
-    "codesign_jax": 40_850,
+    "codesign_jax": 40_900,
     "codesign_jax/codesign": 590,
     "codesign_jax/commands": 2_960,
     "codesign_jax/compiler": 2_980,
@@ -233,7 +233,7 @@ MOST_LINES = {
     "codesign_jax/optimize": 1_340,
     "codesign_jax/report": 2_120,
     "codesign_jax/runs": 3_280,
-    "codesign_jax/scene": 5_250,
+    "codesign_jax/scene": 5_300,
     "codesign_jax/studio": 770,
     "scripts": 5_500,
     "tests": 18_500,

@@ -28,8 +28,6 @@ def around(scene: Scene, which: int, table: int) -> int:
     """Kind of a pair with the table, number 0, or a fixture, from 1 on.
 
     Args:
-      scene: The scene.
-      which: The number.
       table: Kind of the other body's pair with the table, as which a fixture without a friction of
         its own counts.
     """

@@ -324,7 +324,6 @@ def surroundings(scene: Scene, table: int) -> list[tuple[str, int]]:
     """Geoms of table and fixtures that may be touched, and the kinds of pairs with them.
 
     Args:
-      scene: The scene.
       table: Kind of the other body's pair with the table.
     """
     names = ["table", *(f"fixture_{i}" for i in range(len(scene.fixture)))]

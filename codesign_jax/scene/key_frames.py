@@ -317,7 +317,6 @@ def read_sum(value: Any, unit: str) -> Sum | str:
 
     Args:
       value: A number, or text such as "zero_height + 0.5 * arm_z - 0.01".
-      unit: Its unit.
     """
     if isinstance(value, int | float) and not isinstance(value, bool):
         return Sum(unit, float(value))

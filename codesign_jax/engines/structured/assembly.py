@@ -199,10 +199,6 @@ def hand_contacts(
     """Contacts of fingers with one another, with themselves and with the palm, by these names.
 
     Args:
-      scene: The scene.
-      hand: Constants of the worlds.
-      kin: Kinematics.
-      velocity: Of the bodies.
       grip: As in `State`.
     """
     e, found, links = scene.effects, {}, scene.discretization.links

@@ -162,9 +162,6 @@ class StructuredEngine(Equal):
         """See `Engine.rollout`; what JAX's transformations make of it stands in `transforms`.
 
         Args:
-          fields: As there.
-          ctrl: As there.
-          trajectory: As there.
           tables: Those of the fields, see `tables`.
         """
         return transforms.rollout(self, fields, ctrl, tables, trajectory=trajectory)

@@ -126,7 +126,6 @@ def load(
     """Reads and checks a mesh file; `reading.FORMATS` are the formats.
 
     Args:
-      path: The file.
       unit: Unit of its numbers, one of `UNITS`.
       repaired: Whether to repair what can be.
       voxel_error: Bound on the error of the signed distance [m].

@@ -43,7 +43,6 @@ def make_cone(
 
     Args:
       scene: The scene; its numbers may be arrays.
-      friction: Coulomb coefficient.
       bodies: Bodies other than the world in the contact: against the world it is twice as stiff.
       ratio: How much harder friction is, by default `contact.friction_ratio`.
       stiffer: Stiffness over `contact.normal_stiffness`.

@@ -130,7 +130,6 @@ def candidates(
       share: Shares of the scene's stiffness, shape (...).
       gap: Their gaps [m].
       approach: Speed at which they close [m/s].
-      cone: Their parameters.
       margin: `MARGIN`; 0 of balls, which act from touch on, as MuJoCo's.
     """
     reach = jnp.maximum(margin, approach / cone.damper) if margin else 0.0

@@ -18,7 +18,6 @@ def held(contacts: Contacts, grip: jax.Array) -> jax.Array:
     tangential stiffness D_t b / h with a slider (Cundall and Strack 1979, Geotechnique 29, 47).
 
     Args:
-      contacts: The contacts.
       grip: g, world axes, shape (3, ...).
     """
     cone, n = contacts.cone, contacts.normal
@@ -40,8 +39,6 @@ def hold(contacts: Contacts, force: jax.Array, grip: jax.Array) -> jax.Array:
     touch with several normals would lose g as fast as those differ.
 
     Args:
-      contacts: The contacts.
-      force: Their forces.
       grip: As in `held`.
     """
     n, force = contacts.normal, force[:3]

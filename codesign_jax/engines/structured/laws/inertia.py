@@ -62,8 +62,6 @@ class Body(NamedTuple):
         """External minus inertial force at zero joint acceleration, shape (6, ...).
 
         Args:
-          vel: Spatial velocities.
-          bias: Spatial accelerations that velocities alone cause.
           gravity: Magnitude of gravity, along -z [m/s^2]; None without the effect.
         """
         omega, alpha = vel[:3], bias[:3]
@@ -109,7 +107,6 @@ class Centred(NamedTuple):
         The velocity of the centre causes no force: the body's coordinates are its own velocity.
 
         Args:
-          vel: Spatial velocity.
           gravity: Magnitude of gravity, along -z [m/s^2]; None without the effect.
         """
         omega, zero = vel[:3], jnp.zeros_like(vel[0])
@@ -209,10 +206,8 @@ def springs(
     `model.layout.implicit_damping`.
 
     Args:
-      scene: The scene.
       constants: Stiffness, damping and armature of the hinges, shape (axis, ...).
       threshold: See `WorldModel`, shape (3, ...); None without the effect.
-      pressure: Chamber pressure.
       q: Angles, shape (axis, ...); the second one is the lateral one.
     """
     stiffness, damping, armature = constants
@@ -255,12 +250,7 @@ def smooth_forces(
     """All forces that do not depend on the accelerations.
 
     Args:
-      hand: The hand.
-      kin: Kinematics of the state.
-      body: Inertia of the state.
-      state: The state.
       ctrl: Controls: arm pose and pressures, shape (nu, world).
-      scene: The scene.
     """
     g = hand.gravity
     arm, pressure = ctrl[:6, None], ctrl[6:]

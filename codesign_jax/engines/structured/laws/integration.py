@@ -12,9 +12,7 @@ def integrate(state: State, columns: jax.Array, acc: Acc, h: float) -> State:
     """Semi-implicit Euler: velocities first, then positions with the new velocities.
 
     Args:
-      state: Positions and velocities before the step.
       columns: Columns of the object's rotation matrix before the step, shape (3, 3, ...).
-      acc: Accelerations.
       h: Time step [s].
     """
     local = jnp.stack([total([columns[k, i] * acc.object[i] for i in range(3)]) for k in range(3)])
@@ -78,6 +76,5 @@ def rigid_arm(frame: jax.Array, wrist: jax.Array, velocity: jax.Array, h: float)
       frame: Pose of the arm frame, shape (6, ...).
       wrist: The palm's coordinates, same shape.
       velocity: Their velocities, same shape.
-      h: Time step.
     """
     return ((frame - wrist) / h - velocity) / h

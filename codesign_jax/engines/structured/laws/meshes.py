@@ -148,7 +148,6 @@ def mesh_lanes(scene: Scene, shape: jax.Array, size: jax.Array) -> MeshLanes | N
     """Looks up the meshes of a batch, once a rollout; None for a scene without meshes.
 
     Args:
-      scene: The scene.
       shape: Index of each world's object, shape (1, world).
       size: Half sizes, shape (3, 1, world).
     """
@@ -179,7 +178,6 @@ def signed_distance(lanes: MeshLanes, p: jax.Array) -> tuple[jax.Array, jax.Arra
     Beyond the grid, where no contact begins, the way back to it is added.
 
     Args:
-      lanes: The worlds' meshes.
       p: Points, shape (3, ..., world).
     """
     cell = locate(lanes.grid, p)
@@ -237,7 +235,6 @@ def table_points(lanes: MeshLanes, columns: jax.Array) -> jax.Array:
     Heights count against distances, so that higher points are taken only when no lower one is left.
 
     Args:
-      lanes: The worlds' meshes.
       columns: Columns of the object's orientation, shape (3, 3, world).
     """
     point = turned(columns, lanes.support)

@@ -123,11 +123,8 @@ def stiffness(ring: Ring, reach: jax.Array, unit: jax.Array, axial: jax.Array, g
     """Share of the scene's stiffness at a gap (...), see `Place`.
 
     Args:
-      ring: The ring.
       reach: Its support, and `unit` what else `support` returns.
-      unit: See there.
       axial: Component along the finger of the direction to the other side; the tip's end is flat.
-      gap: The gap.
     """
     depth = jnp.maximum(-gap, NOMINAL)
     u = jnp.minimum(depth / reach, 1.0)
@@ -169,9 +166,6 @@ def aim(ring: Ring, frame: jax.Array, distance: jax.Array, gradient: jax.Array) 
     flat faces would be pushed along the line to the nearest edge.
 
     Args:
-      ring: The ring.
-      frame: Its link's.
-      distance: Signed distance of its centre.
       gradient: Unit gradient there, world axes.
     """
     local = apply_rows(frame, -jnp.maximum(distance, 0.0) * gradient)
@@ -193,11 +187,7 @@ def on_field(
     """A ring's contact with what a distance field describes.
 
     Args:
-      ring: The ring.
-      frame: Its link's.
-      centre: Where its centre is.
       offset: See `aim`; any where the field is that of a plane.
-      distance: Signed distance at centre + offset.
       normal: Its unit gradient there, world axes.
     """
     toward = -apply_rows(frame, normal)
@@ -253,10 +243,6 @@ def between(
     along a finger, as at its ends, it is that line.
 
     Args:
-      ring: The ring.
-      frame: Its link's.
-      centre: Where its centre is.
-      segment: Segment of the other centre line.
       t: Where that is nearest to the ring's centre, see `nearest`.
     """
     other = section_frame(segment, t)

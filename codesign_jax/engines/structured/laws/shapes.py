@@ -36,7 +36,6 @@ def disc_distance(
     Args:
       point: The point, shape (3, ...).
       place: Place of the palm's frame, which is on the disc's underside.
-      frame: Columns of its orientation.
       size: Radius and half the thickness of the disc.
     """
     local = apply_rows(frame, point - place)
@@ -50,7 +49,6 @@ def signed_distance(
     """Signed distance and its unit gradient in the object's frame, for the shape of each world.
 
     Args:
-      scene: The scene.
       hand: Sizes and shape index of the objects.
       local: Points, shape (3, ...).
     """

@@ -150,7 +150,6 @@ def object_on(
     """Contacts of an object's points with a fixture: point, normal (3, point, world) and gap.
 
     Args:
-      fixture: The fixture.
       position: The object's centre, shape (3, 1, world).
       rows: See `towards`, shape (3, 3, 1, world).
       arms: Points that would touch a table in these axes, from the centre, shape (3, point, world).
@@ -168,7 +167,6 @@ def edge_on(
 
     Args:
       point: See `edges`.
-      gap: Their distances from the object.
       gradient: The gradients there, world axes.
     """
     return point - 0.5 * gap * gradient, -gradient, gap
@@ -190,7 +188,6 @@ def touched(scene: Scene, pair: str, count: int) -> list[int]:
     """Which of `cones.frictions` the contacts of a pair of bodies have.
 
     Args:
-      scene: The scene.
       pair: The bodies, as in `problem.relative`.
       count: Rings or spheres that look at each field; of the object it is known.
     """

@@ -173,11 +173,15 @@ def test_a_run_of_ones_own_code_goes_on_bit_for_bit(here, capsys):
     assert np.ptp(again.cost) > 0.01
 
 
-def test_a_cost_reads_forces_if_it_asks_for_them(here, capsys):
+def test_a_cost_of_forces_asks_for_them_of_an_engine_that_has_them(here, capsys):
     assert cli.main([*RUN, "--cost", "mine:gripped", "--out", "run"]) == 2
     assert "engine mujoco records no forces" in capsys.readouterr().err
     assert cli.main([*RUN, "--cost", "mine:unrecorded", "--out", "run"]) == 2
     assert "give it the attribute record_forces = True" in capsys.readouterr().err
+
+
+@pytest.mark.slow  # a kernel; quick: forces are recorded (test_forces), and the refusals above
+def test_a_cost_reads_forces_if_it_asks_for_them(here):
     sizes = ["--particles", "2", "--trials", "1", "--test-trials", "0", "--reference-trials", "0"]
     run = ["optimize", "--scene", str(TINY), *sizes, "--cost", "mine:gripped", "--out", "run"]
     assert cli.main([*run, "--optimizer", "random", "--episodes", "2", "--seed", "3"]) == 0

@@ -349,7 +349,11 @@ def observe(
 
 
 def _forces(scene: Scene, hand: WorldModel, state: State) -> Forces:
-    """Contact forces of the steps that led to states."""
+    """Contact forces of the steps that led to states.
+
+    What fingers hold on one another is that after the step, from which the force between two that
+    slide differs a little.
+    """
     found = forces(scene, hand, before(state, scene.discretization.timestep), state.acc)
     found = jax.lax.stop_gradient(found)  # accelerations of a rollout have no derivative
     moved = (state.step[0, 0] > 0) & (state.going[0, 0] > 0)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from codesign_jax.engines.base import Equal
 from codesign_jax.engines.structured import assembly, coordinates, transforms
 from codesign_jax.engines.structured.assembly import HandContacts
+from codesign_jax.engines.structured.kernel.memory import lengthened
 from codesign_jax.engines.structured.lanes import dot, once
 from codesign_jax.engines.structured.laws.contact import Contacts, constraint_update
 from codesign_jax.engines.structured.laws.kinematics import Acc, State, kinematics
@@ -24,6 +25,9 @@ from codesign_jax.types import Forces, Trace
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.engine import StructuredEngine
+
+LANES = 64
+"""Worlds, or steps of fewer ones, whose forces are computed at once."""
 
 
 class Recording(Equal):
@@ -55,7 +59,22 @@ class Recording(Equal):
 
     def _simulate(self, trajectory: bool, fields: ModelFields, ctrl: jax.Array) -> Trace:
         trace, found = self.engine.states(fields, ctrl, trajectory=trajectory)
-        hand = world_constants(self.scene, fields)
+        worlds, steps = found["moved"].shape[:2]
+        # Several steps of few worlds at once: an operation on few numbers costs its start.
+        chunk = min(max(1, LANES // worlds), steps)
+        rounds = -(-steps // chunk)
+        many = jax.tree.map(lambda v: jnp.repeat(v, chunk, 0), fields)
+        hand = world_constants(self.scene, many)
+
+        def split(series: jax.Array) -> jax.Array:  # to (round, world and step, n)
+            series = lengthened(series.reshape(worlds, steps, -1), 1, rounds * chunk)
+            series = series.reshape(worlds, rounds, chunk, series.shape[2])
+            return jnp.moveaxis(series, 1, 0).reshape(rounds, worlds * chunk, series.shape[3])
+
+        def joined(series: jax.Array) -> jax.Array:  # back
+            series = series.reshape(rounds, worlds, chunk, *series.shape[2:])
+            series = jnp.moveaxis(series, 0, 1)
+            return series.reshape(worlds, rounds * chunk, *series.shape[3:])[:, :steps]
 
         def step(now: tuple) -> Forces:
             qpos, qvel, acc, moved, *held = now
@@ -66,9 +85,8 @@ class Recording(Equal):
             )
 
         names = [k for k in ("qpos", "qvel", "acc", "moved", "held") if k in found]
-        series = tuple(jnp.moveaxis(found[k], 1, 0) for k in names)
-        every = jax.lax.map(step, series)
-        return trace._replace(forces=jax.tree.map(lambda v: jnp.moveaxis(v, 0, 1), every))
+        every = jax.lax.map(step, tuple(split(found[k]) for k in names))
+        return trace._replace(forces=jax.tree.map(joined, every))
 
 
 def forces(scene: Scene, hand: WorldModel, state: State, acc: Acc) -> Forces:

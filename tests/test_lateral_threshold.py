@@ -66,7 +66,7 @@ def test_moments_are_those_of_the_stored_energy(lateral):
     with jax.enable_x64(True):
         the_scene = scene.load("paper", overrides={"effects.lateral_threshold": True})
         params, beams, numbers = hand_and_numbers(the_scene)
-        links, pressure, bend, small_step = the_scene.discretization.links, 60e3, 15.0, 0.5
+        links, pressure, bend, small_step = the_scene.discretization.links, 69e3, 15.0, 0.5
         segment = float(params.length[0]) / links
         slopes = [
             (

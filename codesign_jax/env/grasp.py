@@ -27,7 +27,6 @@ class Data(NamedTuple):
       fields: Its model fields.
       plan: What the key frames command over the grasp.
       world: Its state and the pressures in its chambers.
-      seen: What is observed of it.
       period: Number of actions since the grasp began, shape () int32.
     """
 
@@ -35,7 +34,6 @@ class Data(NamedTuple):
     fields: ModelFields
     plan: Plan
     world: World
-    seen: Observation
     period: jax.Array
 
 
@@ -185,29 +183,29 @@ class GraspEnv:
         plan = control.plan(self.scene, self.params, trial)
         world = policy.begin(self.scene, *_batch((fields, plan)))
         zero = jnp.zeros((), plan.pose.dtype)
-        data = Data(trial, fields, plan, _one(world), None, jnp.int32(0))  # type: ignore[arg-type]
-        data = data._replace(seen=self._seen(data))
+        data = Data(trial, fields, plan, _one(world), jnp.int32(0))
         metrics = {"held": zero, "distance": zero}
-        return State(data, self.observe(data.seen), zero, zero, metrics)
+        return State(data, self.observe(self.seen(data)), zero, zero, metrics)
 
     def step(self, state: State, action: jax.Array) -> State:
         """The world after an action of shape (action,), each number of it in [-1, 1]."""
         data: Data = state.data
         plan = self._ahead(data)
-        told = _batch(self.act(data.seen, action))
+        before = self.seen(data)  # once more: a program leaves out what nothing reads
+        told = _batch(self.act(before, action))
         command = policy.spread(self.scene, told, _batch(plan), of="act")
         fields, world, ahead = _batch((data.fields, data.world, plan))
         advanced = policy.advance(self.engine, fields, world, ahead, command)
         world, trace = _one(advanced)
         after = data._replace(world=world, period=data.period + 1)
-        after = after._replace(seen=self._seen(after))
+        seen = self.seen(after)
         held, ended = self._held(data, trace, world)
-        reward = self.reward(data.seen, _one(command), after.seen, held)
+        reward = self.reward(before, _one(command), seen, held)
         done = ended | (after.period >= self.episode_length)
         metrics = state.metrics | {"held": held, "distance": trace.distance[-1]}
         return state.replace(
             data=after,
-            obs=self.observe(after.seen),
+            obs=self.observe(seen),
             reward=reward,
             done=done.astype(reward.dtype),
             metrics=metrics,
@@ -225,7 +223,8 @@ class GraspEnv:
             pose=cut(plan.pose), pressure=cut(plan.pressure), shake=cut(plan.shake)
         )
 
-    def _seen(self, data: Data) -> Observation:
+    def seen(self, data: Data) -> Observation:
+        """What is observed of a world."""
         fields, world, plan = _batch((data.fields, data.world, self._ahead(data)))
         hand = world_constants(self.scene, fields)
         return _one(policy.observe(self.engine, hand, fields, world, plan))

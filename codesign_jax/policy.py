@@ -89,7 +89,8 @@ class Observation(NamedTuple):
       object: Pose of the object, whose origin is its centre of mass.
       object_velocity: Its linear [m/s] and angular [rad/s] velocity, shape (6,).
       forces: Contact forces over the time step before, zero at the beginning; they have no
-        derivative. None with another engine than structured.
+        derivative. What is not read is not computed: those between fingers and on the palm take
+        longer than the simulation. None with another engine than structured.
     """
 
     time: jax.Array

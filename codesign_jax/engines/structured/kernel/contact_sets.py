@@ -251,8 +251,8 @@ class BoundContacts:
             first, _ = contact.slopes(c, line, 0.0)
             return jnp.stack([v for v in line if v is not None]), sum_axis(first, 0)
 
-        cone, jar = self.cone_at(item), self.read("jar", item)
-        line, slope = lanewise(ray, self.place(item), cone, jar, change)
+        given = self.place(item), self.cone_at(item), self.read("jar", item), change
+        line, slope = lanewise(ray, *given)
         self.write("step", change, item)
         self.write("ray", line, item)
         return slope

@@ -11,7 +11,7 @@ import pytest
 from codesign_jax import cli, rollout, scene
 from codesign_jax.cost import outcome
 from codesign_jax.engines.mujoco import MujocoEngine
-from codesign_jax.engines.structured.kernel import packing
+from codesign_jax.engines.structured.kernel import memory_tables
 from codesign_jax.export import grasps, plain, skin, tables
 from codesign_jax.export.play import play
 from codesign_jax.model import build_spec
@@ -158,7 +158,7 @@ def test_spheres_stand_where_the_engine_has_its_rings(skinned):
     alone, params, trial, _, shares = skinned
     fields, _ = world_inputs(alone, params, trial)
     hand = lanes(alone, repeat(fields, 1))
-    rings = np.asarray(packing.ring_numbers(alone, hand, 2))[:, :, 1, 0]
+    rings = np.asarray(memory_tables.ring_numbers(alone, hand, 2))[:, :, 1, 0]
     segment = params.length[1] / alone.discretization.links
     found = skin.balls(alone, 1, params)
     np.testing.assert_allclose([b.place for b in found], rings[:, :3], atol=1e-6)

@@ -7,8 +7,8 @@ import pytest
 from jax.experimental import pallas as pl
 
 from codesign_jax.compiler.launch import Kernel, launch
-from codesign_jax.engines.structured.kernel.counts import Counts
 from codesign_jax.engines.structured.kernel.memory import MemoryLayout
+from codesign_jax.engines.structured.kernel.slots import Counts
 
 LANES, ROWS, BLOCKS, LENGTH = 8, 5, 3, 40
 

@@ -18,10 +18,9 @@ import pytest
 
 from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.forces import forces
-from codesign_jax.engines.structured.kernel import tables
-from codesign_jax.engines.structured.kernel.counts import Counts
-from codesign_jax.engines.structured.kernel.pairs import BoundPairs
-from codesign_jax.engines.structured.kernel.slots import BoundSlots
+from codesign_jax.engines.structured.kernel import memory_tables
+from codesign_jax.engines.structured.kernel.finger_contacts import BoundPairs
+from codesign_jax.engines.structured.kernel.slots import BoundSlots, Counts
 from codesign_jax.engines.structured.lanewise import lanes, lanewise
 from codesign_jax.engines.structured.laws.rings import Place
 from codesign_jax.engines.structured.world_model import world_constants
@@ -272,9 +271,9 @@ def simulated(surface):
     """The worlds of a surface."""
     with jax.enable_x64(True), pytest.MonkeyPatch.context() as patch:
         scene, faults = scene_of(surface), SURFACES[surface]
-        patch.setattr(tables, "pair_slots", lambda _: SLOTS)
+        patch.setattr(memory_tables, "pair_slots", lambda _: SLOTS)
         if surface == "hull":  # as on a GPU; spheres, and the slow tests' hulls, as on this CPU
-            patch.setattr(tables, "GATHERING", ("cpu", "gpu"))
+            patch.setattr(memory_tables, "GATHERING", ("cpu", "gpu"))
         states = {name: curled(scene, *state) for name, state in STATES[surface].items()}
         checks = [f.check if f.check in states else "main" for f in faults.values()]
         each = [states[check] for check in [*checks, *states]]

@@ -20,17 +20,15 @@ from codesign_jax.compiler import gpu, launch
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import (
     adjoint,
-    grip_sweep,
-    pair_sweep,
-    pull,
-    reverse,
-    sweep,
-    virtual,
+    adjoint_step,
+    cotangents,
+    friction_memory,
+    residual_vjp,
 )
 from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, Path
-from codesign_jax.engines.structured.kernel.bars import Bars
+from codesign_jax.engines.structured.kernel.adjoint_step import AdjointSolve
+from codesign_jax.engines.structured.kernel.cotangents import Bars
 from codesign_jax.engines.structured.kernel.program import Limits, Program
-from codesign_jax.engines.structured.kernel.virtual import Virtual
 from codesign_jax.engines.structured.lanewise import lanewise
 from tests.helpers import grasps
 from tests.helpers.differences import Case, curled, weights_of
@@ -133,28 +131,33 @@ FAULTS = {
         results={"push.<locals>.of_held": without(0)}
     ),
     "both fingers own a contact": Fault(
-        methods={(pair_sweep, "only_on"): lambda right, mask, tree: tree}
+        methods={(residual_vjp, "only_on"): lambda right, mask, tree: tree}
     ),
     "contacts push on the right side": Fault(
         methods={
-            (Virtual, "push"): lambda right, self, contacts, item, alpha: contacts.push(item, alpha)
+            (AdjointSolve, "push"): lambda right, self, contacts, item, alpha: contacts.push(
+                item, alpha
+            )
         }
     ),
     "contacts of another stiffness": Fault(
         methods={
-            (Virtual, "push"): lambda right, *_: (lanewise(lambda m: 0.99 * m, right[0]), right[1])
+            (AdjointSolve, "push"): lambda right, *_: (
+                lanewise(lambda m: 0.99 * m, right[0]),
+                right[1],
+            )
         }
     ),
     "smooth forces on the right side": Fault(
         methods={
-            (Virtual, "smooth"): lambda right, self, i: [
+            (AdjointSolve, "smooth"): lambda right, self, i: [
                 *self.problem.read("smooth", item=i),
                 right[1],
             ]
         }
     ),
     "palm without conjugate gradients": Fault(
-        methods={(virtual.Coupling, "correct"): lambda right, self, step, idle: step}
+        methods={(adjoint_step.Coupling, "correct"): lambda right, self, step, idle: step}
     ),
 }
 
@@ -181,7 +184,7 @@ class Planted:
         stage = name_of(function)
         for change, mine in self.each("seeds", stage):
             bars = chosen(mine, change(bars), bars)
-        found = pull.pull(function, args, fixed, bars)
+        found = cotangents.pull(function, args, fixed, bars)
         for change, mine in self.each("results", stage):
             found = chosen(mine, change(found), found)
         return found
@@ -218,18 +221,18 @@ def planted(faults):
     """Kernels of derivatives that are made within have the faults."""
     fault = Planted(faults)
     with pytest.MonkeyPatch.context() as patch:
-        for module in (sweep, pair_sweep, grip_sweep, reverse):
+        for module in (residual_vjp, friction_memory, adjoint_step):
             patch.setattr(module, "pull", fault.pull)
         for owner, name in {key for f in faults.values() for key in f.methods}:
             patch.setattr(owner, name, fault.method(owner, name))
         patch.setattr(Bars, "add", fault.add(Bars.add))
-        start = reverse.ReverseStep.__init__
+        start = adjoint_step.ReverseStep.__init__
 
         def prepare(self, *args):
             start(self, *args)
             fault.step = self
 
-        patch.setattr(reverse.ReverseStep, "__init__", prepare)
+        patch.setattr(adjoint_step.ReverseStep, "__init__", prepare)
         # Sound kernels must neither be found in the place of this one nor find it.
         patch.setattr(reuse, "code_digest", lambda **_: f"planted: {sorted(faults)}")
         patch.setattr(adjoint, "of_code", lambda _: None)

@@ -10,7 +10,7 @@ import pytest
 
 from codesign_jax import rollout
 from codesign_jax.engines import make_engine
-from codesign_jax.engines.structured.kernel import packing
+from codesign_jax.engines.structured.kernel import memory_tables
 from codesign_jax.engines.structured.laws import rings
 from codesign_jax.scene import load, parameters
 from tests.helpers import dense_skin
@@ -34,7 +34,7 @@ def _numbers(height, segment, width):
     section = np.array([height, 0.0, segment, width])[:, None, None]
     with jax.enable_x64(True):
         hand = SimpleNamespace(section=jnp.asarray(section), tip=None)
-        found = packing.ring_numbers(scene, hand, scene.discretization.hull_rings)
+        found = memory_tables.ring_numbers(scene, hand, scene.discretization.hull_rings)
         return np.asarray(found)[..., 0, 0].T
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from codesign_jax import scene as scenes
 from codesign_jax.compiler import launch
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.kernel import Limits, Program, teams
+from codesign_jax.engines.structured.kernel import Limits, Program, shared_memory
 from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.world_model import world_constants
 from scripts.shared import work
@@ -24,7 +24,7 @@ def test_one_finger_is_one_team():
     eight = dataclasses.replace(spheres, hand=hand)
     limits = Limits(8, 8, 1e-6)
     for scene, backend, want in (
-        (paper, "gpu", teams.TEAM),
+        (paper, "gpu", shared_memory.TEAM),
         (paper, "cpu", 1),
         (spheres, "gpu", 1),
         (eight, "gpu", 1),
@@ -64,7 +64,7 @@ def test_a_step_reads_nothing_that_it_has_not_written(monkeypatch):
 
     monkeypatch.setattr(Step, "advance", spoiled)
     # Kernels are kept by their scene and limits: nobody else has this tolerance.
-    how = {"backend": "cpu", "width": 4 * teams.TEAM, "team": teams.TEAM}
+    how = {"backend": "cpu", "width": 4 * shared_memory.TEAM, "team": shared_memory.TEAM}
     program = Program(scene, Limits(8, 8, 1.02e-6), **how)
     start = StructuredEngine(scene).reset(fields)
     run = jax.jit(lambda f, c: program.simulate(world_constants(scene, f), start, c))

@@ -19,18 +19,17 @@ from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import (
     Limits,
     Program,
-    advance,
     chambers,
     contact_sets,
     coupling,
-    fields,
-    grip,
+    finger_collision,
+    finger_contacts,
+    friction_memory,
     linear_system,
     newton,
-    pair_search,
-    pairs,
     problem,
     program,
+    sdf_collision,
     slots,
     step,
 )
@@ -42,18 +41,19 @@ FAR = 1e30
 DEEP = 1e6
 """Depth of the object [m] that no world reaches; beyond it the bound tells a world's fault."""
 MODULES = (
+    chambers,
     contact_sets,
     coupling,
-    grip,
+    finger_collision,
+    finger_contacts,
+    friction_memory,
     linear_system,
-    pair_search,
-    fields,
-    advance,
     newton,
-    pairs,
     problem,
+    sdf_collision,
+    slots,
+    step,
 )
-MODULES += (slots, step, chambers)
 
 
 class Fault(NamedTuple):

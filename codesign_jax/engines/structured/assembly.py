@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured.kernel import packing, pair_search
+from codesign_jax.engines.structured.kernel import finger_collision, memory_tables
 from codesign_jax.engines.structured.kernel.contact_sets import margin
-from codesign_jax.engines.structured.kernel.tables import rings_of_link
+from codesign_jax.engines.structured.kernel.memory_tables import rings_of_link
 from codesign_jax.engines.structured.lanes import dot, once
 from codesign_jax.engines.structured.laws import holding, rings, shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
@@ -97,12 +97,12 @@ def contacts(
                 add(name, _joined(places, int(finger)), ring.half.shape[2 if finger else 1])
 
     if count := rings_of_link(scene):
-        numbers = packing.ring_numbers(scene, hand, count)
+        numbers = memory_tables.ring_numbers(scene, hand, count)
         numbers = jnp.moveaxis(numbers.reshape(-1, count, *numbers.shape[1:]), 2, 0)
         on = {"finger_object": e.finger_object, "finger_table": e.finger_table}
         of_body(on, Ring.of(numbers), kin.origin[:, :, None], kin.link[:, :, :, None])
     if palm_touches(scene):
-        numbers = jnp.moveaxis(packing.palm_numbers(scene, hand), 1, 0)
+        numbers = jnp.moveaxis(memory_tables.palm_numbers(scene, hand), 1, 0)
         on = {"palm_object": e.palm_object, "palm_table": e.palm_table}
         of_body(on, Ring.of(numbers), kin.place, kin.palm)
     if e.object_table and surroundings.slots(scene):
@@ -206,7 +206,7 @@ def hand_contacts(
     on_itself, hull = touches_itself(scene), e.surface == "hull"
     if not k or not (e.finger_finger or e.finger_palm or on_itself):
         return {}
-    numbers = jnp.moveaxis(packing.ring_numbers(scene, hand, k), 1, 0)
+    numbers = jnp.moveaxis(memory_tables.ring_numbers(scene, hand, k), 1, 0)
     numbers = jnp.broadcast_to(numbers, (*numbers.shape[:2], n, kin.place.shape[-1]))
     item = np.arange(links * k)
     link = item // k + 1
@@ -214,7 +214,7 @@ def hand_contacts(
     frames = jnp.concatenate([base_frame[:, :, None], kin.link], 2)
     joints = jnp.concatenate([base[:, None], kin.origin], 1)
     frame = frames[:, :, link]
-    centre = once(pair_search.ring_centre, joints[:, link], frame, numbers)
+    centre = once(finger_collision.ring_centre, joints[:, link], frame, numbers)
     lines = _centre_lines(scene, frames, joints, numbers, centre) if hull else None
     alone, two = np.stack([np.arange(n)] * 2), np.stack(np.triu_indices(n, 1))
 
@@ -233,14 +233,14 @@ def hand_contacts(
         assert lines is not None
         ring, mine, at = numbers[:, :, first], frame[:, :, :, first], centre[:, :, first]
         square, other, t = lines.nearest(at, second, lines.last(numbers) if own else None)
-        place = once(pair_search.between, ring, mine, at, lines.sections(other, second), t)
+        place = once(finger_collision.between, ring, mine, at, lines.sections(other, second), t)
         return place._replace(share=jnp.where(square < FAR, place.share, 0.0)), other
 
     if e.finger_palm:
         assert hand.palm_disc is not None
         disc = kin.place[:, None], kin.palm[:, :, None], hand.palm_disc[:, None]
         some = item >= (first_on_palm(links) - 1) * k
-        look = partial(pair_search.palm_distance, palm=disc)
+        look = partial(finger_collision.palm_distance, palm=disc)
         ring = Ring.of(numbers[:, some])
         place = _on_field(scene, look, ring, frame[:, :, some], centre[:, some])
         add("finger_palm", place, link[some], jnp.int32(0), alone)
@@ -257,13 +257,13 @@ def hand_contacts(
             for i, f in ((mine, two[0]), (theirs, two[1]))
             for v in (numbers, centre)
         ]
-        place = once(pair_search.balls, *sides)
+        place = once(finger_collision.balls, *sides)
         add("finger_finger", place, link[mine], jnp.asarray(link[theirs])[:, None, None], two)
     return found
 
 
 class _CentreLines(NamedTuple):
-    """Centre lines of fingers, and what `pair_search.between` takes of them.
+    """Centre lines of fingers, and what `finger_collision.between` takes of them.
 
     Attributes:
       scene: The scene.
@@ -280,11 +280,11 @@ class _CentreLines(NamedTuple):
     def last(self, numbers: jax.Array) -> jax.Array:
         """The last place on segments that rings of the same finger touch; see `last_of`."""
         links, k = self.scene.discretization.links, rings_of_link(self.scene)
-        along = (pair_search.ring_places(links, k) + np.arange(links)[:, None] + 0.5).ravel()
+        along = (finger_collision.ring_places(links, k) + np.arange(links)[:, None] + 0.5).ravel()
         largest = jnp.maximum(numbers[:, -1], numbers[:, 0])
-        end = along[:, None, None] - pair_search.arc(numbers[:, -1], largest)
+        end = along[:, None, None] - finger_collision.arc(numbers[:, -1], largest)
         row = np.arange(links + 1)[:, None, None, None]
-        length = np.where(row == links, pair_search.TIP, 1.0)
+        length = np.where(row == links, finger_collision.TIP, 1.0)
         last = jnp.minimum((end - (row - 0.5)) / length, 1.0)
         return jnp.where(row > 0, last, -1.0)  # a finger's half link at the palm is the palm's
 
@@ -303,7 +303,7 @@ class _CentreLines(NamedTuple):
             t = jnp.minimum(jnp.maximum(t, 0.0), last)
             away = centre - start[:, None] - t * along[:, None]
             square = jnp.where(last >= 0, dot(away, away), FAR)
-            better = square < pair_search.SURELY * best[0]
+            better = square < finger_collision.SURELY * best[0]
             new = square, number, t
             return tuple(jnp.where(better, a, b) for a, b in zip(new, best, strict=True)), None
 
@@ -317,7 +317,7 @@ class _CentreLines(NamedTuple):
         """Ends, frames and sizes of segments, and whether they are the last ones."""
         links = self.scene.discretization.links
         ends = tuple(_of_others(self.ends, r, second) for r in (row, row + 1))
-        near = pair_search.neighbours(row, links)
+        near = finger_collision.neighbours(row, links)
         frames = tuple(_of_others(self.frames, r, second) for r in near)
         return ends, frames, _of_others(self.sizes, row, second), 1.0 * (row == links)
 
@@ -331,7 +331,7 @@ def _centre_lines(
     if scene.hand.section.tapered:
         ring = np.maximum((row - 1) * rings_of_link(scene) - 1, 0)
     before = frames[:, :, np.maximum(row[:-1] - 1, 0)]
-    passed = once(pair_search.above, joints, before, frames, numbers[:, ring[:-1]])
+    passed = once(finger_collision.above, joints, before, frames, numbers[:, ring[:-1]])
     ends = jnp.concatenate([passed, centre[:, -1:]], 1)
     return _CentreLines(scene, ends, frames, numbers[:, ring[1:]])
 

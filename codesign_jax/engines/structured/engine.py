@@ -127,7 +127,7 @@ class StructuredEngine(Equal):
     def step(self, hand: WorldModel, state: State, ctrl: jax.Array) -> tuple[State, StepInfo]:
         """Advances a batch by one time step under controls of shape (nu, world).
 
-        No verdict ends a world here, see `advance`.
+        No verdict ends a world here, see `Step.advance`.
         """
         found, new = self.advance(hand, state, ctrl.T[:, None])
         overflow = found["overflow"].T > 0 if "overflow" in found else None

@@ -15,13 +15,13 @@ from jax.experimental import pallas as pl
 
 from codesign_jax import reuse
 from codesign_jax.compiler.launch import Kernel, launch
-from codesign_jax.engines.structured.kernel.bars import Bars, of_step
+from codesign_jax.engines.structured.kernel.adjoint_step import ReverseStep, Shown
+from codesign_jax.engines.structured.kernel.cotangents import Bars, of_step
+from codesign_jax.engines.structured.kernel.finger_contacts import PairSet
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
-from codesign_jax.engines.structured.kernel.pairs import PairSet
-from codesign_jax.engines.structured.kernel.powers import Place
 from codesign_jax.engines.structured.kernel.program import Program, block_spec
-from codesign_jax.engines.structured.kernel.reverse import ReverseStep, Shown
-from codesign_jax.engines.structured.kernel.sweep import SHAPES
+from codesign_jax.engines.structured.kernel.residual import Place
+from codesign_jax.engines.structured.kernel.residual_vjp import SHAPES
 from codesign_jax.engines.structured.lanewise import lanes, of_code
 
 

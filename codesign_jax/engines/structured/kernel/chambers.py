@@ -18,16 +18,16 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
+from codesign_jax.engines.structured.kernel.cotangents import pull
 from codesign_jax.engines.structured.kernel.memory import loop, upper
-from codesign_jax.engines.structured.kernel.pull import pull
 from codesign_jax.engines.structured.lanes import contract, dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 from codesign_jax.engines.structured.laws.air import end_pressure
 from codesign_jax.engines.structured.linear import elimination as el
 
 if TYPE_CHECKING:
+    from codesign_jax.engines.structured.kernel.adjoint_step import ReverseStep
     from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
-    from codesign_jax.engines.structured.kernel.reverse import ReverseStep
     from codesign_jax.engines.structured.kernel.step import Step
 
 JOINT = ("finger", "finger_vel", "acc")

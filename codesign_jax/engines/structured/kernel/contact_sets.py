@@ -10,8 +10,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel.memory import MemoryLayout, anywhere, full, solid, upper
-from codesign_jax.engines.structured.kernel.solver import tree_add_scaled
+from codesign_jax.engines.structured.kernel.memory import (
+    MemoryLayout,
+    anywhere,
+    full,
+    solid,
+    tree_add_scaled,
+    upper,
+)
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact
@@ -192,7 +198,7 @@ class BoundContacts:
             matrix = contact.contact_inertia(c, r.hessian)
             return sum_axis(matrix, 2), sum_axis(contact.contact_wrench(c, r.force), 1)
 
-        # All is read before anything is stored, see `pairs.OwnSide`.
+        # All is read before anything is stored, see `finger_contacts.OwnSide`.
         jar, step, place = self.read("jar", item), self.read("step", item), self.place(item)
         jar = lanewise(tree_add_scaled, alpha, jar, step)
         self.write("jar", jar, item)

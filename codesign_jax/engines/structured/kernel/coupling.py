@@ -20,9 +20,8 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
+from codesign_jax.engines.structured.kernel.finger_contacts import BoundPairs, Pairing
 from codesign_jax.engines.structured.kernel.memory import anywhere, loop
-from codesign_jax.engines.structured.kernel.pairing import Pairing
-from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
 from codesign_jax.engines.structured.lanes import contract, dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise

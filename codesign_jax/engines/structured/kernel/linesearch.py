@@ -5,7 +5,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import solver
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.memory import anywhere, loop, solid
 from codesign_jax.engines.structured.kernel.problem import (
@@ -20,6 +19,8 @@ from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.linear import elimination as el
 
+FAR = 3e38
+"""No upper end of a bracket yet; finite, as a GPU kernel has no test for infinity."""
 LINE_TOLERANCE = 0.01
 """Slope at which a line search ends, over the first one: MuJoCo's default `ls_tolerance`."""
 
@@ -152,7 +153,7 @@ class LineSearch:
             searching = lanes([left], (), wide=False)
             with only(self.problem.slotted, left):
                 one, two = evaluate(old[0])
-            new = (*lanewise(solver.refine, *old[:3], one, two), one)
+            new = (*lanewise(refine, *old[:3], one, two), one)
             new = [lanewise(jnp.where, searching, a, b) for a, b in zip(new, old, strict=True)]
             return [count + 1, *solid(tuple(new), self.block.size)[0]]
 
@@ -162,7 +163,7 @@ class LineSearch:
         goal = jnp.maximum(floor, LINE_TOLERANCE * jnp.abs(lanewise(jnp.add, slope, first).lane))
         one = lanewise(jnp.ones_like, slope)
         none = lanewise(jnp.zeros_like, slope)
-        far = lanewise(lambda x: jnp.full_like(x, solver.FAR), slope)
+        far = lanewise(lambda x: jnp.full_like(x, FAR), slope)
         start, rebuild = solid((one, none, far, far), self.block.size)
         return rebuild(jax.lax.while_loop(going, body, [jnp.int32(0), *start])[1:])[0]
 
@@ -177,3 +178,14 @@ def _rest(now: Iterate, step: Iterate, palm: Palm, slope, curvature):
     bent = dot(palm.palm.times(step.palm_motion), step.palm_motion)
     bent = bent + dot(palm.object.times(step.object_motion), step.object_motion)
     return slope, curvature + bent + dot(palm.armature * step.wrist, step.wrist)
+
+
+def refine(
+    alpha: jax.Array, low: jax.Array, high: jax.Array, first: jax.Array, second: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Next step length and bracket from the derivatives at alpha: Newton, else bisection."""
+    low, high = jnp.where(first <= 0, alpha, low), jnp.where(first > 0, alpha, high)
+    guess = alpha - first / jnp.maximum(second, 1e-30)
+    inside = (guess >= low) & (guess <= high)
+    middle = jnp.where(high > 1e30, 2.0 * low, 0.5 * (low + high))
+    return jnp.where(inside, guess, middle), low, high

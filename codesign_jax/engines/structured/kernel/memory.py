@@ -141,6 +141,11 @@ def lengthened(array: jax.Array, axis: int, length: int) -> jax.Array:
     return jnp.concatenate([array, jnp.broadcast_to(last, shape)], axis)
 
 
+def tree_add_scaled(alpha: jax.Array, value: Any, step: Any) -> Any:
+    """A tree of arrays moved by alpha times another one."""
+    return jax.tree.map(lambda v, s: v + alpha * s, value, step)
+
+
 def choose(which: jax.Array, compute: Callable, otherwise: Any, size: int) -> Any:
     """compute() where a scalar is true, else a tree of lanes of the same structure, as it is."""
     arrays, rebuild = solid(otherwise, size)
@@ -214,7 +219,7 @@ class Block:
     Attributes:
       fingers: Number of fingers, a power of two.
       worlds: Number of worlds.
-      team: Lanes that share the work of a finger, a power of two; see `teams`.
+      team: Lanes that share the work of a finger, a power of two; see `shared_memory`.
       size: Number of lanes.
       lane: The lanes, shape (lane,).
       world: World of each lane, shape (lane,).

@@ -1,4 +1,19 @@
-"""Newton's method of `solver`, inside a kernel: links in loops, numbers in registers."""
+"""Newton's method with exact line search, inside a kernel: links in loops, numbers in registers.
+
+A step minimises over the accelerations a
+  1/2 (a - a_s)' M (a - a_s) + sum_c s_c(J_c a - aref_c),
+MuJoCo's contact problem, M with armature and implicit terms.
+
+Most time steps end with an iteration whose decrement is already below the tolerance. Its matrix is
+all but that of the iteration before, if no contact has gone to another zone of its cone: the cost
+is quadratic in two of the three zones, and smooth in the third.  So the forces that the last step
+has left unbalanced are eliminated with the matrix that is there: the chord method (Ortega and
+Rheinboldt, Iterative Solution of Nonlinear Equations in Several Variables, 1970, ch. 7), at a sixth
+of an iteration's cost, and their decrement is what the iteration would have found.
+
+The matrix P lacks the contacts between fingers, whose cost is convex: with them the decrement is
+smaller than the one that P gives.  Such a world does not go along the step, as P may be too soft.
+"""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -6,20 +21,173 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import grip, solver
-from codesign_jax.engines.structured.kernel.chord import LARGEST, Chord
+from codesign_jax.engines.structured.kernel import friction_memory
+from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.coupling import Coupling, Eliminated
 from codesign_jax.engines.structured.kernel.linear_system import Elimination
-from codesign_jax.engines.structured.kernel.linesearch import LINE_TOLERANCE, LineSearch
-from codesign_jax.engines.structured.kernel.memory import anywhere, choose, loop, solid
-from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem
+from codesign_jax.engines.structured.kernel.linesearch import FAR, LINE_TOLERANCE, LineSearch
+from codesign_jax.engines.structured.kernel.memory import (
+    anywhere,
+    choose,
+    loop,
+    solid,
+    tree_add_scaled,
+)
+from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem, make_body
 from codesign_jax.engines.structured.kernel.slots import only
 from codesign_jax.engines.structured.kernel.team_solver import (
     TeamCoupling,
     TeamElimination,
     TeamLineSearch,
 )
+from codesign_jax.engines.structured.lanes import contract, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.linear import elimination as el
+
+LARGEST = 1e-3
+"""Decrement of an iteration behind which the next one is likely to be below the tolerance."""
+
+
+class Chord:
+    """The chord method's step behind a Newton step, of which the last matrix is left."""
+
+    def __init__(self, problem: Problem):
+        """Takes the step's problem."""
+        self.problem, self.block, self.links = problem, problem.block, problem.links
+        self.like = problem.like
+
+    def steady(self, alpha: Lanes) -> jax.Array:
+        """Whether no contact of a world goes to another zone along the last step, (lane,)."""
+        problem, count = self.problem, zeros((), self.like)
+        sets = [(self.links, c) for c in problem.fingers]
+        sets += [(c.set.count, c) for c in problem.slots]
+        for items, contacts in sets:
+
+            def add(i: Any, sums: Lanes, contacts: BoundContacts = contacts) -> Lanes:
+                return lanewise(jnp.add, sums, contacts.changes(i, alpha))
+
+            count = loop(items, add, count, self.block.size)
+        return self.block.sum(count).lane == 0
+
+    def step(self, now: Iterate, done: Eliminated, alpha: Lanes) -> tuple[Iterate, Lanes]:
+        """Leaves the fingers' part in "z_again".
+
+        Args:
+          now: The iterate behind the last step, of wrist, palm and object.
+          done: What is left of the palm's elimination.
+          alpha: Length of the last step, by which those of the links are still to be moved.
+
+        Returns:
+          The step of wrist, palm and object, and the forces' product with it and with that of the
+          fingers, which is the squared decrement.
+        """
+        problem = self.problem
+        if chambers := problem.chambers:
+            chambers.move(alpha)
+        if problem.pairs:
+            problem.pairs.update_wrenches(alpha)
+
+        def again(alpha, carry, body, moved, forces, factors, pushes, pair):
+            (r, ro, work), (axes, armature, *kept) = carry, factors
+            acc, motion = (a + alpha * b for a, b in moved)
+            smooth, tau = forces
+            push = total([smooth - make_body(*body).times(motion), *pushes.values()])
+            ro = total([ro, *(-w for name, w in pushes.items() if name == "finger_object")])
+            tau = tau - armature * acc
+            r = r + push if pair is None else r + push + pair
+            y = contract(axes, r[None], 1) + tau
+            kept = el.Kept(el.Factors(kept[0], kept[1], kept[0]), kept[2])
+            r, ro, new = el.eliminate_again(axes, kept, r, ro, tau)
+            return (r, ro, work + dot(y, new.z)), new.z
+
+        def one(i: Any, carry: tuple) -> tuple:
+            names = [("acc", "step_acc"), ("motion", "step_motion")]
+            moved = [problem.read(*pair, item=i) for pair in names]
+            pushes = {c.set.name: c.wrench(i, alpha) for c in problem.fingers}
+            pair = problem.pairs.pushed(i + 1) if problem.pairs else None
+            factors = problem.read("axes", "armature", "w", "g", "inverse", item=i)
+            forces = problem.read("smooth", "tau", item=i)
+            args = alpha, carry, problem.body_of(i), moved, forces, factors, pushes, pair
+            carry, z = lanewise(again, *args)
+            problem.write("z_again", z, i)
+            return carry
+
+        none = zeros((6,), self.like)
+        start = none, none, zeros((), self.like)
+        r, ro, work = loop(self.links, one, start, self.block.size, reverse=True)
+        if chambers:
+            r, ro, less = chambers.close_again("z_again", r, ro)
+            work = lanewise(jnp.subtract, work, less)
+        r = problem.add_first(r) if problem.pairs else r
+        r, ro, work = self.block.sum((r, ro, work))
+        given = now, problem.palm, done, r, ro, work, self._pushes(alpha)
+        step, work = lanewise(self._at_palm, *given)
+        if chambers:
+            chambers.settle("z_again", step)
+        return step, work
+
+    def _pushes(self, alpha: Lanes) -> dict[str, Lanes]:
+        """Wrenches of the contacts of palm and object, by name."""
+        pushes = {}
+        for c in self.problem.slots:
+
+            def add(i: Any, sums: Lanes, c: BoundContacts = c) -> Lanes:
+                return lanewise(jnp.add, sums, c.wrench(i, alpha))
+
+            found = loop(c.set.count, add, zeros((6,), self.like), self.block.size)
+            pushes[c.set.name] = self.block.sum(found)
+        return pushes
+
+    @staticmethod
+    def _at_palm(now: Iterate, palm, done: Eliminated, r, ro, work, pushes: dict) -> tuple:
+        r = r + palm.smooth_palm - palm.palm.times(now.palm_motion)
+        ro = ro + palm.smooth_object - palm.object.times(now.object_motion)
+        for name, wrench in pushes.items():
+            r = r + wrench if name.startswith("palm") else r
+            ro = ro - wrench if name == "palm_object" else ro
+            ro = ro + wrench if name == "object_table" else ro
+        if done.hinges is None or done.slides is None:
+            obj = el.solve_object(done.q, ro)
+            none = jnp.zeros_like(obj)
+            return Iterate(none, none, obj), work + dot(ro, obj)
+        twist = palm.smooth_wrist - palm.armature * now.wrist
+        slides, kept = el.wrist_slides(palm.armature), []
+        for axes, factors, tau in (
+            (palm.axes, done.hinges, twist[3:]),
+            (slides, done.slides, twist[:3]),
+        ):
+            y = contract(axes, r[None], 1) + tau
+            r, ro, new = el.eliminate_again(axes, factors, r, ro, tau)
+            kept.append(new)
+            work = work + dot(y, new.z)
+        obj = el.solve_object(done.q, ro)
+        first, motion = el.substitute(slides, kept[1], jnp.zeros_like(obj), obj)
+        second, motion = el.substitute(palm.axes, kept[0], motion, obj)
+        return Iterate(jnp.concatenate([first, second]), motion, obj), work + dot(ro, obj)
+
+    def take(self, step: Iterate, alpha: Lanes, taken: jax.Array) -> None:
+        """Makes "step_acc" what leads behind the chord's step with length 1, where it is taken.
+
+        Args:
+          step: Step of wrist, palm and object.
+          alpha: Length of the Newton step.
+          taken: Lanes of the worlds that take the chord's step behind it.
+        """
+        problem, mask = self.problem, lanes([taken], (), wide=True)
+
+        def move(parent, obj, axes, factors, before, alpha, taken):
+            a, motion = el.substitute(axes, el.Factors(*factors), parent, obj)
+            return motion, jnp.where(taken, tree_add_scaled(alpha, a, before), before)
+
+        def one(i: Any, parent: Lanes) -> Lanes:
+            axes, before = problem.read("axes", "step_acc", item=i)
+            factors = problem.read("w", "g", "z_again", item=i)
+            args = step.object_motion, axes, factors, before, alpha, mask
+            motion, acc = lanewise(move, parent, *args)
+            problem.write("step_acc", acc, i)
+            return motion
+
+        loop(self.links, one, problem.widened(step.palm_motion), self.block.size)
 
 
 class Quality(NamedTuple):
@@ -70,24 +238,24 @@ class Newton:
                 step, done = self.direction(now, last, ~busy)
                 slope, curvature, first = self.search.prepare(now, step)
                 residual, scale = lanewise(_residual, slope, first, problem.palm, now.object_motion)
-                floor = jnp.where(busy, LINE_TOLERANCE * tolerance * scale.lane, solver.FAR)
+                floor = jnp.where(busy, LINE_TOLERANCE * tolerance * scale.lane, FAR)
                 alpha = self.search.find(slope, curvature, first, floor, evaluations)
             alpha, residual = lanewise(hold, before, alpha, residual)
-            now = lanewise(solver.tree_add_scaled, alpha, now, step)
+            now = lanewise(tree_add_scaled, alpha, now, step)
             if self.chord:
                 likely = busy & (residual.lane > tolerance) & (residual.lane <= LARGEST)
                 found = now, alpha, residual
                 confirm = partial(self.confirm, *found, done, scale, likely, tolerance)
                 now, alpha, residual = choose(anywhere(likely), confirm, found, self.block.size)
-            if grip.kept(problem):
+            if friction_memory.kept(problem):
                 ends = busy & ((residual.lane <= tolerance) | (count + 1 >= iterations))
-                grip.settle(problem, alpha, ends)
+                friction_memory.settle(problem, alpha, ends)
             return [count + 1, *solid((now, residual, alpha), self.block.size)[0]]
 
         def going(carry: list) -> jax.Array:
             return (carry[0] < iterations) & anywhere(waiting & (carry[-2] > tolerance))
 
-        far = lanewise(lambda a: jnp.full_like(a[0], solver.FAR), now.wrist)
+        far = lanewise(lambda a: jnp.full_like(a[0], FAR), now.wrist)
         none = lanewise(lambda a: jnp.zeros_like(a[0]), now.wrist)
         start, rebuild = solid((now, far, none), self.block.size)
         count, *arrays = jax.lax.while_loop(going, body, [jnp.int32(0), *start])
@@ -170,5 +338,16 @@ class Newton:
 
 
 def _residual(slope, first, palm: Palm, motion):
-    scale = solver.scale(palm.object.mass, palm.palm.mass, motion)
+    scale = objective_scale(palm.object.mass, palm.palm.mass, motion)
     return jnp.maximum(-slope - first, 0.0) / scale, scale
+
+
+def objective_scale(mass: jax.Array, palm: jax.Array, motion: jax.Array) -> jax.Array:
+    """Typical size of the objective: object and palm at g, plus the object's present motion.
+
+    Args:
+      mass: Mass of the object.
+      palm: Mass of the palm.
+      motion: Spatial acceleration of the object, shape (6, ...).
+    """
+    return 100.0 * (mass + palm) + mass * dot(motion[3:], motion[3:])

@@ -74,7 +74,7 @@ def tables(scene: Scene, fingers: int) -> tuple[dict, dict]:
 
 
 def rows(found: MeshLanes, fingers: int, dtype: Any) -> dict[str, jax.Array]:
-    """Arrays for the groups of `tables`: support points are dealt to the lanes of the fingers."""
+    """Arrays for the rows of `tables`: support points are dealt to the lanes of the fingers."""
     support = found.support
     if support.shape[1] < fingers:
         support = jnp.tile(support, (1, fingers // support.shape[1], 1))

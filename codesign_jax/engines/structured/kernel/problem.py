@@ -5,11 +5,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import solver
 from codesign_jax.engines.structured.kernel.chambers import Chambers
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
-from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
-from codesign_jax.engines.structured.kernel.pairs import BoundPairs
+from codesign_jax.engines.structured.kernel.finger_contacts import BoundPairs
+from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout, tree_add_scaled
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 from codesign_jax.engines.structured.laws.inertia import Body, Centred
 
@@ -106,7 +105,7 @@ class Problem:
 
     def move(self, name: str, item: Any, alpha: Lanes) -> Lanes:
         """Adds the last step to a link's "acc" or "motion", and returns the sum."""
-        value = lanewise(solver.tree_add_scaled, alpha, *self.read(name, f"step_{name}", item=item))
+        value = lanewise(tree_add_scaled, alpha, *self.read(name, f"step_{name}", item=item))
         self.write(name, value, item)
         return value
 

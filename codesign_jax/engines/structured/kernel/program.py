@@ -17,9 +17,9 @@ from jax.experimental import pallas as pl
 from codesign_jax import reuse, verdict
 from codesign_jax.compiler.launch import Kernel, block_lanes, kernel_jaxpr, launch
 from codesign_jax.engines.structured import coordinates
-from codesign_jax.engines.structured.kernel import teams
+from codesign_jax.engines.structured.kernel import shared_memory
 from codesign_jax.engines.structured.kernel.memory import Block, anywhere
-from codesign_jax.engines.structured.kernel.packing import Packing
+from codesign_jax.engines.structured.kernel.memory_tables import Packing
 from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.lanewise import lanes, of_code
 from codesign_jax.engines.structured.laws import air
@@ -65,8 +65,8 @@ class Program(Packing):
           backend: "gpu", "cpu", or "interpreter", which is Pallas' own and slow.
           width: Lanes of a block, a power of two; more if a world has more fingers. By default
             those of a warp.
-          team: Lanes that share the work of a finger, 1 or `teams.TEAM`; by default what the scene
-            and the backend make faster. Sums depend on it, and so do last bits.
+          team: Lanes that share the work of a finger, 1 or `shared_memory.TEAM`; by default what
+            the scene and the backend make faster. Sums depend on it, and so do last bits.
         """
         super().__init__(scene, backend=backend, width=width, team=team)
         self.limits = limits
@@ -215,7 +215,7 @@ class Program(Packing):
         ) = rest
         block, onchip = Block(self.fingers, self.block, self.team), None
         if self.team > 1:
-            share = partial(teams.SharedColumns, block)
+            share = partial(shared_memory.SharedColumns, block)
             *path, onchip = path
             hand, finger_state0, pressure = map(share, (hand, finger_state0, pressure))
             finger_state, scratch, onchip = map(share, (finger_state, scratch, onchip))

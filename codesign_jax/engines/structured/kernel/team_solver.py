@@ -1,4 +1,4 @@
-"""Newton's linear system, conjugate gradients and line search by teams of lanes, see `teams`."""
+"""Newton's linear system, conjugate gradients and line search by teams, see `shared_memory`."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from codesign_jax.engines.structured.kernel.linear_system import Elimination, wi
 from codesign_jax.engines.structured.kernel.linesearch import LineSearch, _rest
 from codesign_jax.engines.structured.kernel.memory import loop
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem, make_body
-from codesign_jax.engines.structured.kernel.teams import (
+from codesign_jax.engines.structured.kernel.shared_memory import (
     AGAIN,
     FORCES,
     TEAM,
@@ -435,7 +435,7 @@ def rings_of_link(problem: Problem) -> int:
 
 
 def team_rows(stored: dict[str, Lanes], body: tuple) -> dict[str, Lanes]:
-    """What a link leaves for the solver, with rows of eight as columns, see `teams.fields`.
+    """What a link leaves for the solver, with rows of eight as columns, see `shared_memory.layout`.
 
     Args:
       stored: The same by name, see `step.link_forces`.

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import objects
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
+from codesign_jax.engines.structured.kernel.finger_collision import Search
 from codesign_jax.engines.structured.kernel.objects import WorldObject
-from codesign_jax.engines.structured.kernel.pair_search import Search
 from codesign_jax.engines.structured.kernel.problem import Memory, relative
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.lanes import cross, dot, total
@@ -26,6 +26,7 @@ from codesign_jax.engines.structured.world_model import apply_columns
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.step import Step
+
 
 OUTSIDE = 1.5
 """Farthest point of a ring over the largest of its half axes."""

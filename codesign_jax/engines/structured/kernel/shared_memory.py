@@ -1,8 +1,8 @@
-"""Teams: several lanes of a GPU share the work of a finger, and its numbers lie on the chip.
+"""Shared memory of a GPU: what lies there, and the teams of lanes that share a finger's work.
 
-A warp of one world has 37 kB of numbers where one of eight worlds, a lane a finger, has half a
-megabyte, far more than a multiprocessor's cache.  The lanes of a team share a column of each table.
-What is not shared out is computed by all of them, with the same bits.
+A team is several lanes.  A warp of one world has 37 kB of numbers where one of eight worlds, a lane
+a finger, has half a megabyte, far more than a multiprocessor's cache.  The lanes of a team share a
+column of each table.  What is not shared out is computed by all of them, with the same bits.
 
 * Matrices: lane k < 6 has column k of P, C and Q, and lane 6 has the forces r and r_o, see
   `elimination`.  One recursion P -= U'W, Q -= H'G then updates the forces as well, if G of lane 6
@@ -41,7 +41,7 @@ def lanes_of_a_finger(scene: Scene, backend: str, fingers: int) -> int:
     return TEAM if backend == "gpu" and coupled and fingers * TEAM <= WARP else 1
 
 
-def fields(links: int, axes: int) -> dict[str, tuple[int, tuple[int, ...]]]:
+def layout(links: int, axes: int) -> dict[str, tuple[int, tuple[int, ...]]]:
     """Rows on the chip: what the recursions over the links read, and what lanes hand to others.
 
     Rows of eight are columns of the team; two spare rows take what lanes without a component store.

@@ -1,9 +1,10 @@
-"""Powers of the forces of a step along virtual accelerations: what its derivative is taken of.
+"""The residual of a step along virtual accelerations: the scalar that its derivative is taken of.
 
 The accelerations a of a step solve F(a, theta) = 0, see `transforms`; with virtual accelerations
-lambda the derivative by theta is that of the scalar -lambda' F, a sum over links, contacts, palm
-and object.  Here is what each of them adds, as a function of one link or of the contacts of one
-item, over arrays as in `lanewise`, made of the functions that the forward pass calls.
+lambda the derivative by theta is that of the scalar -lambda' F, a virtual power and a sum over
+links, contacts, palm and object.  Here is what each of them adds, as a function of one link or of
+the contacts of one item, over arrays as in `lanewise`, made of the functions that the forward pass
+calls.
 """
 
 from collections.abc import Callable
@@ -13,8 +14,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import fields, objects, pair_search
+from codesign_jax.engines.structured.kernel import finger_collision, objects, sdf_collision
 from codesign_jax.engines.structured.kernel.contact_sets import ContactSet, cone_of
+from codesign_jax.engines.structured.kernel.friction_memory import held_work
 from codesign_jax.engines.structured.kernel.problem import make_body
 from codesign_jax.engines.structured.kernel.step import link_forces, palm_and_object
 from codesign_jax.engines.structured.lanes import dot, sum_axis
@@ -90,21 +92,21 @@ def of_rings(scene: Scene, name: str, place: Place, numbers, at: dict, still: di
       still: What has no derivative here: accelerations, indices and values of grids, and "share" of
         the contacts, which tells which are candidates.
     """
-    centre, places = fields.ring_centres(place.origin, place.frame, numbers), []
+    centre, places = sdf_collision.ring_centres(place.origin, place.frame, numbers), []
     on_object = name.endswith("_object")
     looks = around(scene, at) if not on_object else [partial(look, scene, at=at, still=still)]
     for n, one in enumerate(looks):
         values = [{"values": still.get(k)} if on_object else {} for k in ("values", "values_again")]
         first = one(centre, **values[0])
         if scene.effects.surface == "spheres":
-            places.append(fields.balls_on_field(numbers, centre, *first))
+            places.append(sdf_collision.balls_on_field(numbers, centre, *first))
             continue
         offset, again = jnp.zeros_like(centre), first
         if on_object or n >= scene.effects.table:  # the table is a plane
-            offset = fields.aimed(numbers, place.frame, *first)
+            offset = sdf_collision.aimed(numbers, place.frame, *first)
             again = one(centre + offset, **values[1])
-        places.append(fields.rings_on_field(numbers, place.frame, centre, offset, *again))
-    found = fields.beside(places)
+        places.append(sdf_collision.rings_on_field(numbers, place.frame, centre, offset, *again))
+    found = sdf_collision.beside(places)
     found = found._replace(share=jnp.where(still["share"] > 0, found.share, 0.0))
     cone = _cone(scene, name, at)
     if own_friction(scene, name):
@@ -117,9 +119,9 @@ def of_rings(scene: Scene, name: str, place: Place, numbers, at: dict, still: di
 
 def aim(scene: Scene, name: str, place: Place, numbers, at: dict, still: dict) -> jax.Array:
     """Where rings look at a field once more, shape (3, k, ...)."""
-    centre = fields.ring_centres(place.origin, place.frame, numbers)
+    centre = sdf_collision.ring_centres(place.origin, place.frame, numbers)
     first = look(scene, centre, at, still, still.get("values"))
-    return centre + fields.aimed(numbers, place.frame, *first)
+    return centre + sdf_collision.aimed(numbers, place.frame, *first)
 
 
 def of_table(scene: Scene, fingers: int, item: int, at: dict, finger, still: dict) -> jax.Array:
@@ -236,23 +238,24 @@ def on_palm(scene: Scene, mine: tuple[Place, Any], palm: Place, size, numbers) -
       numbers: Numbers of the cone.
     """
     place, ring = mine
-    centre, disc = pair_search.ring_centre(*place[:2], ring), (*palm[:2], size)
-    first = pair_search.palm_distance(centre, disc)
+    centre, disc = finger_collision.ring_centre(*place[:2], ring), (*palm[:2], size)
+    first = finger_collision.palm_distance(centre, disc)
     if scene.effects.surface == "spheres":
-        found = pair_search.ball_on_field(ring, centre, *first)
+        found = finger_collision.ball_on_field(ring, centre, *first)
     else:
-        offset = pair_search.aimed(ring, place.frame, *first)
-        again = pair_search.palm_distance(centre + offset, disc)
-        found = pair_search.on_field(ring, place.frame, centre, offset, *again)
+        offset = finger_collision.aimed(ring, place.frame, *first)
+        again = finger_collision.palm_distance(centre + offset, disc)
+        found = finger_collision.on_field(ring, place.frame, centre, offset, *again)
     return _between(scene, found, place[2:], palm[2:], numbers)
 
 
 def between_spheres(scene: Scene, mine: tuple, theirs: tuple, numbers: Any) -> jax.Array:
     """Power of two fingers' spheres on one another: links, and the spheres' numbers."""
     one, other = (
-        pair_search.ring_centre(place.origin, place.frame, ring) for place, ring in (mine, theirs)
+        finger_collision.ring_centre(place.origin, place.frame, ring)
+        for place, ring in (mine, theirs)
     )
-    found = pair_search.balls(mine[1], one, theirs[1], other)
+    found = finger_collision.balls(mine[1], one, theirs[1], other)
     return _between(scene, found, mine[0][2:], theirs[0][2:], numbers)
 
 
@@ -293,26 +296,21 @@ def between_rings(
     place, ring = mine
     link, before, after = theirs.place, *theirs.frames
     first = theirs.tip if theirs.first is None else theirs.first
-    start = pair_search.above(link.origin, before, link.frame, first)
-    behind = pair_search.above(theirs.origin, link.frame, after, theirs.tip)
-    tip = pair_search.ring_centre(link.origin, link.frame, theirs.tip)
+    start = finger_collision.above(link.origin, before, link.frame, first)
+    behind = finger_collision.above(theirs.origin, link.frame, after, theirs.tip)
+    tip = finger_collision.ring_centre(link.origin, link.frame, theirs.tip)
     ends = start, jnp.where(still["last"] > 0, tip, behind)
-    centre = pair_search.ring_centre(*place[:2], ring)
-    t = pair_search.where_on(ends, centre, still["end"])
+    centre = finger_collision.ring_centre(*place[:2], ring)
+    t = finger_collision.where_on(ends, centre, still["end"])
     other = ends, (before, link.frame, after), theirs.tip, still["last"]
-    found = pair_search.between(ring, place.frame, centre, other, t)
+    found = finger_collision.between(ring, place.frame, centre, other, t)
     return _between(scene, found, place[2:], link[2:], numbers, held)
-
-
-def held_work(contacts: Contacts, force: jax.Array, grip: jax.Array, bars: jax.Array) -> jax.Array:
-    """Cotangents of the sums of `holding.hold` times what contacts add to them."""
-    return sum_axis(dot(bars[:, None], holding.hold(contacts, force, grip[:, None])), 0)
 
 
 def _between(
     scene: Scene, found: Any, mine: Any, theirs: Any, numbers: Any, held: tuple = ()
 ) -> jax.Array:
-    one = ContactSet.contacts(pair_search.with_axis(found), cone_of(scene, numbers))
+    one = ContactSet.contacts(finger_collision.with_axis(found), cone_of(scene, numbers))
     vel, motion, along = (one.relative((a - b)[:, None]) for a, b in zip(mine, theirs, strict=True))
     jar = motion - one.reference(vel)
     if not held:

@@ -25,16 +25,54 @@ from codesign_jax.engines.structured.kernel.memory import (
     either,
     loop,
     solid,
+    tree_add_scaled,
 )
-from codesign_jax.engines.structured.kernel.pairing import Pairing
 from codesign_jax.engines.structured.kernel.slots import BoundSlots, SlotSet, any_of
-from codesign_jax.engines.structured.kernel.solver import tree_add_scaled
 from codesign_jax.engines.structured.lanes import dot, sum_axis, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact
 from codesign_jax.engines.structured.laws.rings import Place
 from codesign_jax.model.layout import touches_itself
 from codesign_jax.scene import Scene
+
+
+class Pairing:
+    """Fingers in pairs: those whose numbers differ by an exclusive or with the pairing's number.
+
+    Each finger is its own partner in the pairing 0, for contacts with itself and with the palm.
+
+    Attributes:
+      lane: Lane of the finger that each lane's finger is paired with, shape (lane,).
+      alone: Whether the number is 0, shape (lane,); None if it never is.
+      half: The share of a contact that a lane counts: two fingers' is on two lanes.
+    """
+
+    def __init__(self, block: Block, number: Any, dtype: Any, *, alone: bool):
+        """Takes the number, a scalar, and the type of shares; alone: whether it may be 0."""
+        self.block = block
+        self.number = (jnp.zeros_like(block.finger) + number).astype(jnp.int32)
+        same, one = self.number == 0, jnp.ones_like(block.finger, dtype)
+        self.alone = same if alone else None
+        self.half = lanes([jnp.where(same, one, 0.5 * one) if alone else 0.5 * one], (), wide=True)
+        other = jax.lax.bitwise_xor(block.finger, self.number)
+        self.lane = other * block.worlds + block.world
+
+    def swap(self, tree: Any) -> Any:
+        """What the lanes that the lanes are paired with have, of a tree of lanes.
+
+        Lanes exchange registers, once for each binary digit of the pairing's number: through memory
+        a lane would have to wait until its partner has written.
+        """
+        block = self.block
+        arrays, rebuild = solid(tree, block.size)
+        for digit in range(block.fingers.bit_length() - 1):
+            distance = block.worlds * block.team << digit
+            chosen = jax.lax.bitwise_and(self.number, jnp.int32(1 << digit)) > 0
+            arrays = [
+                jnp.where(chosen, jax.lax.rev(a.reshape(-1, 2, distance), (1,)).reshape(-1), a)
+                for a in arrays
+            ]
+        return rebuild(arrays)
 
 
 def pair_slots(scene: Scene) -> int:
@@ -158,7 +196,7 @@ class BoundPairs(BoundSlots):
         self.cone = before
 
     def holds(self, item: Any, pairing: Pairing) -> Lanes:
-        """One for contacts whose friction is kept, zero for those with the palm, see `grip`."""
+        """One for contacts whose friction is kept, zero for those with the palm."""
         kept = jnp.ones((self.set.size,), self.ref.dtype)
         if pairing.alone is not None:
             palm = pairing.alone & (self.read("other", item).lane < 0.5)

@@ -3,7 +3,7 @@
 A ring meets the nearest place of another finger's centre line, or of its own on the way back to the
 palm that is `arc` away along the finger.  Of two fingers the first one's rings look: with both
 fingers' there would be twice as many contacts, which is what a step's time goes to.  The lanes of a
-team, see `teams`, look with a ring each.
+team, see `shared_memory`, look with a ring each.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured.kernel import grip
+from codesign_jax.engines.structured.kernel import friction_memory
 from codesign_jax.engines.structured.kernel.contact_sets import (
     ContactSet,
     begun,
@@ -22,9 +22,8 @@ from codesign_jax.engines.structured.kernel.contact_sets import (
     margin,
     zeros,
 )
+from codesign_jax.engines.structured.kernel.finger_contacts import BoundPairs, Pairing
 from codesign_jax.engines.structured.kernel.memory import loop
-from codesign_jax.engines.structured.kernel.pairing import Pairing
-from codesign_jax.engines.structured.kernel.pairs import BoundPairs
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.lanes import cross, dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -35,6 +34,7 @@ from codesign_jax.model.layout import first_on_palm, touches_itself
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.step import Step
+
 
 SURELY = 1.0 - 1e-4
 """At a joint two segments have one nearest place, which is the first one's, whatever is rounded."""
@@ -105,7 +105,7 @@ class Search:
         """Empties the slots; stores what belongs to the palm."""
         for row in range(self.pairs.set.rows):
             self.pairs.clear(row)
-        grip.clear(self.step)
+        friction_memory.clear(self.step)
         self.write("fastest", zeros((), self.like))
         self._side(0, motion, vel, frame, base)
         self.write("end", lanewise(above, base, frame, frame, self.ring(self.ring_at(0))), 0)
@@ -258,7 +258,7 @@ class Search:
 
         def enter() -> None:
             place = self._between(numbers, frame, centre, other, t, None)
-            cone, held = self.pairs.of_row(1), grip.of_row(self.step, self.pairs, 0)
+            cone, held = self.pairs.of_row(1), friction_memory.of_row(self.step, self.pairs, 0)
             self._alone(place, cone, (row + jnp.zeros_like(other), other), held, item, near)
 
         any_of(near, enter)
@@ -296,7 +296,7 @@ class Search:
 
         def enter() -> None:
             place = self._between(numbers, frame, centre, other, t, pairing.lane)
-            held = grip.of_row(self.step, self.pairs, row)
+            held = friction_memory.of_row(self.step, self.pairs, row)
             cone, link_ = self.pairs.of_row(row), link + jnp.zeros_like(other)
             found = self._begun(place, cone, (link_, other), pairing.lane, held)
             self._enter(row, near, owner, found, other, item)

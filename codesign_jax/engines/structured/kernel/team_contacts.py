@@ -1,4 +1,4 @@
-"""Contacts whose slots are dealt to the lanes of a team, see `teams`."""
+"""Contacts whose slots are dealt to the lanes of a team, see `shared_memory`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,11 +7,16 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.contact_sets import ROWS, ContactSet
+from codesign_jax.engines.structured.kernel.finger_contacts import (
+    BoundPairs,
+    OwnSide,
+    Pairing,
+    PairSet,
+    _times,
+)
 from codesign_jax.engines.structured.kernel.memory import Block, choose, loop
-from codesign_jax.engines.structured.kernel.pairing import Pairing
-from codesign_jax.engines.structured.kernel.pairs import BoundPairs, OwnSide, PairSet, _times
+from codesign_jax.engines.structured.kernel.shared_memory import TEAM, Parts, ranks
 from codesign_jax.engines.structured.kernel.slots import BoundSlots, Slot
-from codesign_jax.engines.structured.kernel.teams import TEAM, Parts, ranks
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact
 from codesign_jax.scene import Scene

@@ -1,0 +1,332 @@
+"""One time step of a block of worlds in reverse: cotangents of its end to those of its start.
+
+Virtual accelerations lambda solve the one linear system of a step's derivative, H lambda = v, with
+v the cotangent of the step's accelerations and H the matrix of a Newton step at the solution,
+contacts as they are there: one elimination, however many iterations found it (`AdjointSolve`).
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured.kernel import chambers, friction_memory, residual
+from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
+from codesign_jax.engines.structured.kernel.cotangents import Bars, only_on, plus, pull
+from codesign_jax.engines.structured.kernel.coupling import Coupling
+from codesign_jax.engines.structured.kernel.finger_contacts import BoundPairs
+from codesign_jax.engines.structured.kernel.linear_system import Elimination
+from codesign_jax.engines.structured.kernel.memory import Block, choose, loop
+from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
+from codesign_jax.engines.structured.kernel.residual import Chain
+from codesign_jax.engines.structured.kernel.residual_vjp import PairSweep, Sweep
+from codesign_jax.engines.structured.kernel.slots import any_of
+from codesign_jax.engines.structured.kernel.step import Step, moved, turned
+from codesign_jax.engines.structured.lanes import dot
+from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.linear import elimination as el
+
+if TYPE_CHECKING:
+    from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram
+
+
+MOVED = ("wrist", "position", "quat", "wrist_vel", "linear_vel", "angular_vel")
+"""Positions and velocities of wrist and object."""
+JOINT = ("finger", "finger_vel", "acc")
+"""Angles, velocities and accelerations of the fingers' joints."""
+
+
+class Shown(NamedTuple):
+    """Cotangents of what the trace shows of the state before a step, numbers of a world."""
+
+    distance: jax.Array
+    height: jax.Array
+    speed: jax.Array
+
+
+class ReverseStep(Step):
+    """A step in reverse.
+
+    It goes from the step's start, with the accelerations that solve it as warm start, to the tips
+    as the forward pass does, solves for the virtual accelerations, and goes back to the palm.
+    """
+
+    def __init__(self, program: "AdjointProgram", block: Block, refs: tuple, bars: Bars):
+        """Takes the kernel's memory, see `Step`, and the cotangents."""
+        super().__init__(program, block, *refs)  # type: ignore[misc]
+        self.bars, self.like = bars, jnp.zeros((program.size,), bars.scratch.dtype)
+
+    def keep(self, i: Any, chain: tuple) -> None:
+        """See `Step`."""
+        for name, value in zip(Chain._fields, chain, strict=False):
+            self.p.scratch.write(self.scratch, f"chain.{name}", value, i)
+
+    def reverse(self, arm: Lanes, pressure: Lanes, moved: jax.Array, shown: Shown) -> Lanes:
+        """Makes the cotangents of the state after the step those of the state before it.
+
+        The cotangents of the pressures stay behind as the bars' "pressure".
+
+        Args:
+          arm: As in `Step.advance`.
+          pressure: As in `Step.advance`.
+          moved: Worlds that took the step; the state of the others is the same before and after.
+          shown: Cotangents of the trace's entries.
+
+        Returns:
+          Cotangents of the arm's commands.
+        """
+        p, block, bars = self.p, self.block, self.bars
+        bars.begin()
+        state, at, thing, m, now, centre = self.assemble(arm, pressure)
+        go = lanes([moved], (), wide=False)
+        before, acc_bar = self._integration(state, at, now, go)
+        if p.held:
+            friction_memory.reverse(self, m.contacts["finger_finger"], go)
+        forces = palm_problem(at["palm"], *acc_bar)
+        problem = Problem(p.links, block, m, forces, rigid=not p.scene.effects.wrist)
+        virtual = AdjointSolve(problem).solve()
+        sweep = Sweep(self, m, state, at, thing, virtual, bars)
+        if problem.pairs:
+            PairSweep(sweep, problem.pairs).run()
+        metered = p.scene.effects.air_mass
+        end = chambers.end_pressures(self, pressure) if metered else pressure
+        base = sweep.fingers(end, self._centre_bar(centre, shown.distance))
+        if metered:
+            chambers.reverse(self, pressure)
+        base = sweep.palm_and_table(base)
+        return self._palm_bars(state, arm, base, before, (now, virtual, acc_bar[0]), shown)
+
+    def _integration(self, state: dict, at: dict, now: Iterate, go: Lanes) -> tuple[dict, tuple]:
+        """Cotangents of the accelerations, and of the state that the integration starts at.
+
+        Those of the fingers' accelerations go to the scratch table, "acc_bar".
+
+        Returns:
+          Cotangents of positions and velocities of wrist and object, and those of the wrist's and
+          the object's accelerations.
+        """
+        p, h = self.p, self.p.scene.discretization.timestep
+        old = {n: state[n] for n in MOVED}
+        after = {
+            n: p.world_state.read(self.bars.world_state, n, 0, self.block.world) for n in MOVED
+        }
+        given = old, at["columns"], now.wrist, now.object_motion
+        run = partial(moved, h)
+        own, columns, wrist, obj = pull(run, given, (), only_on(go, after))
+        self.bars.add_once({"columns": columns})
+
+        def joint(i: Any, x: Any) -> Any:
+            given = tuple(p.finger_state.read(self.finger_state, n, i) for n in JOINT)
+            bars = [p.finger_state.read(self.bars.finger_state, n, i) for n in JOINT[:2]]
+            *new, acc = pull(partial(_turned, h), given, (), only_on(go, bars))
+            for name, one, other in zip(JOINT, new, bars, strict=False):
+                value = lanewise(jnp.where, go, one, other)
+                p.finger_state.write(self.bars.finger_state, name, value, i)
+            p.scratch.write(self.scratch, "acc_bar", acc, i)
+            return x
+
+        jax.lax.fori_loop(0, p.links, joint, jnp.int32(0))
+        before = {n: lanewise(jnp.where, go, own[n], after[n]) for n in MOVED}
+        return before, (wrist, obj)
+
+    def _centre_bar(self, centre: Lanes, bar: jax.Array) -> Lanes:
+        """Cotangent of the sum of the segments' weighted centres, of that of the distance."""
+        count = self.p.num_fingers * self.p.links
+
+        def slope(centre, bar):
+            square = dot(centre, centre)
+            apart = square > 0
+            length = jnp.sqrt(jnp.where(apart, square, 1.0))
+            return jnp.where(apart, bar / (count * length), 0.0) * centre
+
+        return lanewise(slope, centre, lanes([bar], (), wide=False))
+
+    def _palm_bars(
+        self, state: dict, arm: Lanes, base: Chain, before: dict, accelerations: tuple, shown: Shown
+    ) -> Lanes:
+        """Adds palm, wrist and object; stores their cotangents and returns those of the arm."""
+        p, (now, virtual, wrist_bar) = self.p, accelerations
+        still = {"acc_wrist": now.wrist, "acc_object": now.object_motion}
+        still |= {"virtual_wrist": virtual.wrist, "object_along": virtual.object_motion}
+        own = {n: self.bars.of_step(n) for n in self.bars.names if n != "pressure"}
+        base, own = self.block.sum((base, own))
+        one = lanes([self.like + 1.0], (), wide=False)
+        given = {n: state[n] for n in MOVED}, arm, self.palm_constants()
+        run = partial(residual.of_palm, p.scene.discretization.timestep)
+        acc = wrist_bar if not p.scene.effects.wrist else lanewise(jnp.zeros_like, wrist_bar)
+        height = plus(own["height"], lanes([shown.height], (), wide=False))
+        bars = base, own["columns"], own["object_vel"], height, acc, one
+        found, arm_bar, constant_bars = pull(run, given, (still,), bars)
+        self.bars.add_once(constant_bars)
+        if p.scene.fixture:
+            found["position"] = plus(found["position"], own["position"])
+        for name, value in plus(found, before).items():
+            p.world_state.write(self.bars.world_state, name, value, 0, self.block.world)
+        any_of(shown.speed != 0, lambda: add_speed_cotangent(self, state, shown.speed))
+        return arm_bar
+
+
+def _turned(h: float, q, rate, acc):
+    rate, q, _ = turned(h, q, rate, acc)
+    return q, rate
+
+
+ITERATIONS = 300
+"""Largest number of conjugate gradients: more than Newton's method needs, whose steps may err."""
+
+
+class AdjointSolve(Elimination):
+    """The elimination with a right side that acts on the joints alone.
+
+    The right side of the fingers' joints is read from the scratch table, "acc_bar"; that of wrist
+    and object stands in the place of their smooth forces, see `palm`.
+    """
+
+    def accelerations(self, i: Any, alpha: Lanes) -> list[Lanes]:
+        """See `Elimination`."""
+        return [_none(v) for v in self.problem.read("acc_bar", "motion", item=i)]
+
+    def smooth(self, i: Any) -> list[Lanes]:
+        """See `Elimination`."""
+        smooth, right = self.problem.read("smooth", "acc_bar", item=i)
+        return [_none(smooth), right]
+
+    def push(self, contacts: BoundContacts, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
+        """See `Elimination`."""
+        matrix, wrench = contacts.push(item, alpha)
+        return matrix, _none(wrench)
+
+    def between_fingers(self, pairs: BoundPairs, alpha: Lanes) -> None:
+        """See `Elimination`."""
+        pairs.update_constraints(alpha)
+        pairs.clear_wrenches()
+        if friction_memory.kept(self.problem):
+            friction_memory.push(self.problem, pairs)
+
+    def solve(self) -> Iterate:
+        """Solves the system; leaves the joints' part in the scratch table.
+
+        Returns:
+          Virtual accelerations of the wrist, and virtual motions of palm and object. Those of the
+          links stay behind as "virtual" of the joints and "chain.along" of the links.
+        """
+        problem, size = self.problem, self.block.size
+        still = zeros((), self.like)
+        node, work = self.backward(still)
+        palm = problem.palm
+        none = Iterate(*(_none(v) for v in (palm.smooth_wrist, *[palm.smooth_object] * 2)))
+        step, done = self.at_palm(none, node, self.slot_pushes(still))
+        if (pairs := problem.pairs) is not None:
+            done = done._replace(work=lanewise(jnp.add, done.work, work))
+            exact = float(jnp.finfo(self.like.dtype).eps) ** 1.5
+            coupling = Coupling(problem, pairs, done, tolerance=exact, iterations=ITERATIONS)
+            idle = jnp.zeros_like(self.like) > 0
+            touching = pairs.touching_now()
+            step = choose(touching, lambda: coupling.correct(step, idle), step, size)
+        self._substitute(step)
+        return step
+
+    def _substitute(self, step: Iterate) -> None:
+        problem = self.problem
+
+        def one(i: Any, parent: Lanes) -> Lanes:
+            axes, *factors = problem.read("axes", "w", "g", "z", item=i)
+
+            def move(axes, factors, parent, obj):
+                return el.substitute(axes, el.Factors(*factors), parent, obj)
+
+            virtual, along = lanewise(move, axes, factors, parent, step.object_motion)
+            problem.write("virtual", virtual, i)
+            problem.write("chain.along", along, i + 1)
+            return along
+
+        parent = problem.widened(step.palm_motion)
+        problem.write("chain.along", parent, 0)
+        loop(self.links, one, parent, self.block.size)
+
+
+def palm_problem(palm: Any, wrist: Lanes, obj: Lanes) -> Any:
+    """Palm, wrist and object with the right side of wrist and object as their only forces."""
+    return palm._replace(smooth_palm=_none(palm.smooth_palm), smooth_object=obj, smooth_wrist=wrist)
+
+
+def _none(value: Lanes) -> Lanes:
+    return lanewise(jnp.zeros_like, value)
+
+
+VELOCITIES = ("wrist_vel", "linear_vel", "angular_vel")
+
+
+def largest_velocity(step: "Step", state: dict[str, Lanes]) -> Lanes:
+    """Largest absolute velocity of each world's state; see `add`."""
+    return _folded(step, state, _largest, jnp.maximum)
+
+
+def add_speed_cotangent(step: "ReverseStep", state: dict[str, Lanes], bar: jax.Array) -> None:
+    """Adds the cotangent of the trace's speed; equal velocities share it.
+
+    Args:
+      step: The step, whose cotangents are those of the state before it.
+      state: Velocities of wrist and object, by name.
+      bar: The cotangent, numbers of a world.
+    """
+    p, block = step.p, step.block
+    top = largest_velocity(step, state)
+    number = _folded(step, state, _count, jnp.add, top)
+    share = lanewise(_share, lanes([bar], (), wide=False), number)
+
+    def link(i: Any, x: Any) -> Any:
+        step.bars.add_joint({"finger_vel": lanewise(_slope, _rates(step, i), top, share)}, i)
+        return x
+
+    jax.lax.fori_loop(0, p.links, link, jnp.int32(0))
+    table, ref = p.world_state, step.bars.world_state
+    for name in VELOCITIES:
+        old = table.read(ref, name, 0, block.world)
+        new = plus(old, lanewise(_slope, state[name], top, share))
+        table.write(ref, name, new, 0, block.world)
+
+
+def _rates(step: "Step", i: Any) -> Lanes:
+    return step.p.finger_state.read(step.finger_state, "finger_vel", i)
+
+
+def _folded(
+    step: "Step", state: dict[str, Lanes], function: Callable, combine: Callable, *more: Lanes
+) -> Lanes:
+    """function(x, velocities, *more) folded over all velocities of a world."""
+    p = step.p
+
+    def one(i: Any, x: Lanes) -> Lanes:
+        return lanewise(function, x, _rates(step, i), *more)
+
+    first = zeros((), jnp.zeros((p.size,), state[VELOCITIES[0]].dtype))
+    found = lanes(
+        [step.block.fold(loop(p.links, one, first, p.size).lane, combine)], (), wide=False
+    )
+    for name in VELOCITIES:
+        found = lanewise(function, found, state[name], *more)
+    return found
+
+
+def _largest(x, velocities):
+    for k in range(velocities.shape[0]):
+        x = jnp.maximum(x, jnp.abs(velocities[k]))
+    return x
+
+
+def _count(x, velocities, top):
+    for k in range(velocities.shape[0]):
+        x = x + jnp.where(jnp.abs(velocities[k]) == top, 1.0, 0.0)
+    return x
+
+
+def _share(bar, number):
+    return bar / jnp.maximum(number, 1.0)
+
+
+def _slope(velocities, top, share):
+    sign = jnp.where(velocities > 0, 1.0, jnp.where(velocities < 0, -1.0, 0.0))
+    return jnp.where(jnp.abs(velocities) == top, sign * share, 0.0)

@@ -126,7 +126,7 @@ def test_the_command_compares_and_fits(tmp_path, capsys):
     assert cli.main(line) == 0
     said = capsys.readouterr().out
     assert "--set hand.material.shear_modulus=5e+04" in said and "110 mm long" in said
-    assert "model: angle errs by" in said and "(42.9 %)" in said  # 50 / 35 - 1
+    assert "model: angle errs by" in said and "(25 %)" in said  # 50 / 40 - 1
     head, *rows = out.read_text().splitlines()
     assert head == "pressure_kPa,angle_deg,model_angle_deg,fitted_angle_deg" and len(rows) == 2
     for wrong in (["--fit"], ["--finger", "4"], ["--out", "table.txt"], ["no.csv"]):

@@ -21,8 +21,8 @@ RELIABLE = 0.95
 UNRELIABLE = 0.85
 """Share that the interval of a good design leaves out: 22 grasps without a loss do."""
 RULE = (
-    "good: at least 95 % kept, and the 95 % interval in brackets lies above 85 %; not good: it lies "
-    "below 95 %; otherwise not enough trials"
+    "good: at least 95 % kept, and the 95 % interval in brackets lies above 85 %; not good: it "
+    "lies below 95 %; otherwise not enough trials"
 )
 """The rule of `judge` in words."""
 _MOST = 10_000

@@ -95,9 +95,13 @@ def values(units: np.ndarray) -> dict[str, np.ndarray]:
     for (name, o), u in zip(OPEN.items(), np.asarray(units, float).T, strict=True):
         low, high = (np.log([o.low, o.high]) if o.log else np.array([o.low, o.high])) + 0.0
         found[name] = np.exp(low + u * (high - low)) if o.log else low + u * (high - low)
-    gap, u = OPEN["pair_gap"], np.asarray(units, float)[:, list(OPEN).index("pair_gap")]
-    least = np.maximum(gap.low, found["width"] + 1e3 * CLEARANCE)
-    return found | {"pair_gap": least + u * (gap.high - least)}
+    u, least = np.asarray(units, float)[:, list(OPEN).index("pair_gap")], least_gap(found["width"])
+    return found | {"pair_gap": least + u * (OPEN["pair_gap"].high - least)}
+
+
+def least_gap(width: Any) -> Any:
+    """Smallest gap of a pair of fingers of a width [mm]."""
+    return np.maximum(OPEN["pair_gap"].low, width + 1e3 * CLEARANCE)
 
 
 def own_set(the_scene: Scene, shear_modulus: float) -> np.ndarray:
@@ -126,8 +130,7 @@ def own_set(the_scene: Scene, shear_modulus: float) -> np.ndarray:
         "friction_ratio": c.friction_ratio,
         "cost_maximum": the_scene.cost.maximum,
     }
-    ranges = dict(OPEN)
-    ranges["pair_gap"] = Open("mm", max(OPEN["pair_gap"].low, width + 1e3 * CLEARANCE), 40)
+    ranges = OPEN | {"pair_gap": OPEN["pair_gap"]._replace(low=float(least_gap(width)))}
     scaled = {k: np.log if o.log else np.asarray for k, o in ranges.items()}
     ends = {k: (scaled[k](o.low), scaled[k](o.high)) for k, o in ranges.items()}
     return np.array([(scaled[k](own[k]) - a) / (b - a) for k, (a, b) in ends.items()])

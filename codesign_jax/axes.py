@@ -16,14 +16,7 @@ _TRIAL = Trial._make([(), (2,), (), (2,), (), (), (), (), (), (2,)])
 
 
 def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -> None:
-    """Refuses hands and trials without their leading axes.
-
-    Args:
-      axes: Names of the axes; where they are the same the arrays have to be as long.
-
-    Raises:
-      InputError: With every array of another shape.
-    """
+    """Refuses hands and trials without their leading axes."""
     fingers = (scene.num_fingers,)
     one = Params(*[fingers, fingers, fingers, (), (6,), fingers])  # type: ignore[list-item]
     problems = _problems("params", params._replace(control=None, tip=None), one, axes[0])
@@ -42,7 +35,6 @@ def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -
 
 
 def _control_problems(scene: Scene, params: Params) -> list[str]:
-    """What is wrong with the parameters of the scene's control."""
     one = {p.name: (scene.num_fingers,) * (p.per == "finger") for p in scene.control.parameter}
     given = {k: np.shape(v) for k, v in (params.control or {}).items()}
     if given.keys() != one.keys():
@@ -60,15 +52,7 @@ def _control_problems(scene: Scene, params: Params) -> list[str]:
 
 
 def refuse_other(scene: Any, engine: Any) -> None:
-    """Refuses a scene that is not one that the engine was made for.
-
-    Args:
-      engine: What should be an engine. Those of one's own without an attribute `scene` take all.
-
-    Raises:
-      InputError: If `scene` is none, or its structure is not that of the engine's scene: the engine
-        would simulate its own.
-    """
+    """Refuses a scene that is not one that the engine was made for."""
     if not isinstance(scene, Scene):
         raise InputError([f"scene is a {type(scene).__name__}, not a Scene; scene.load reads one"])
     own = getattr(engine, "scene", None)
@@ -93,11 +77,7 @@ def _differences(one: Any, other: Any, path: str) -> list[str]:
 
 
 def refuse_numbers(scene: Scene, count: int, axis: str) -> None:
-    """Refuses a scene's numbers that are not one or as many as there are worlds or trials.
-
-    Raises:
-      InputError: With the first leaf of another length.
-    """
+    """Refuses a scene's numbers that are not one or as many as there are worlds or trials."""
     for path, value in jax.tree_util.tree_leaves_with_path(scene):
         if np.ndim(value) == 1 and np.shape(value)[0] != count:
             key = jax.tree_util.keystr(path)
@@ -107,14 +87,7 @@ def refuse_numbers(scene: Scene, count: int, axis: str) -> None:
 
 
 def refuse_draws(key: Any, count: int) -> None:
-    """Refuses arguments of `rollout.sample_trials` from which no trials can be drawn.
-
-    Args:
-      key: What should be one typed key of JAX.
-
-    Raises:
-      InputError: If `key` is anything but one typed key, or `count` is no whole number or below 1.
-    """
+    """Refuses arguments of `rollout.sample_trials` from which no trials can be drawn."""
     if not isinstance(count, int | np.integer) or count < 1:
         raise InputError([f"num_trials = {count} must be a whole number, at least 1"])
     shape, kind = jnp.shape(key), jnp.result_type(key)
@@ -124,7 +97,6 @@ def refuse_draws(key: Any, count: int) -> None:
 
 
 def _problems(what: str, batch: Any, one: Any, axis: str) -> list[str]:
-    """What is wrong with the shapes of a batch, given those of one."""
     given = {k: np.shape(v) for k, v in batch._asdict().items() if v is not None}
     if all(shape == getattr(one, k) for k, shape in given.items()):
         return [

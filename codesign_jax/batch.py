@@ -34,49 +34,29 @@ LIMIT = 16_384
 
 
 class Request(NamedTuple):
-    """An episode that a run wants.
+    """An episode that a run wants."""
 
-    Attributes:
-      state: The optimiser's state before it.
-      mask: Parameters that may move, bool, shape (parameter,).
-    """
-
-    state: State
-    mask: Any
+    state: State  # the optimiser's state before it
+    mask: Any  # parameters that may move, bool, shape (parameter,)
 
 
 class _Packed(NamedTuple):
-    """A run's episode, ready to be simulated.
+    """A run's episode, ready to be simulated."""
 
-    Attributes:
-      population: Particles [SI units], shape (particle, parameter).
-      trials: Trials of the worlds, with leading axis (world,).
-      initial: Bits of `Status` that the worlds start with, shape (world,).
-      blocks: See `engines.base.Staged`.
-      common: See `engines.base.Staged`.
-      ctrl: Controls of the worlds, where a cost of one's own reads them.
-    """
-
-    population: jax.Array
-    trials: Trial
-    initial: jax.Array
-    blocks: tuple
-    common: tuple
-    ctrl: jax.Array | None = None
+    population: jax.Array  # particles [SI units], shape (particle, parameter)
+    trials: Trial  # trials of the worlds, with leading axis (world,)
+    initial: jax.Array  # bits of `Status` that the worlds start with, shape (world,)
+    blocks: tuple  # see `engines.base.Staged`
+    common: tuple  # see `engines.base.Staged`
+    ctrl: jax.Array | None = None  # controls of the worlds, where a cost of one's own reads them
 
 
 class _Launched(NamedTuple):
-    """What the devices have been told to simulate.
+    """What the devices have been told to simulate."""
 
-    Attributes:
-      packed: The runs' episodes without their blocks.
-      drawn: Their trials.
-      running: What the devices make of the blocks.
-    """
-
-    packed: list[_Packed]
+    packed: list[_Packed]  # the runs' episodes without their blocks
     drawn: list[Trial]
-    running: list[tuple]
+    running: list[tuple]  # what the devices make of the blocks
 
 
 class Batch:
@@ -88,11 +68,7 @@ class Batch:
     def __init__(
         self, task: Task, optimizer: Optimizer, *, devices: int | None = None, limit: int = LIMIT
     ):
-        """Compiles nothing yet.
-
-        Raises:
-          ValueError: If there are fewer devices.
-        """
+        """Compiles nothing yet."""
         self._task, self._optimizer, self._parts = task, optimizer, None
         self._joins, self._limit = staged(task.engine).joins, limit
         self.devices = take(devices)
@@ -119,13 +95,11 @@ class Batch:
         return self.begin(requests)()
 
     def begin(self, requests: Sequence[Request]) -> Callable[[], list[tuple[State, EpisodeInfo]]]:
-        """Lets the devices begin to simulate an episode for each request.
+        """Lets the devices begin an episode for each request; returns what goes on and answers.
 
-        Returns:
-          A function that goes on and returns states and reports in the requests' order. It takes
-          about as long as the simulation, although it only tells the devices what to do: JAX lets
-          a program wait its turn while 32 are under way on a GPU (`max_inflight_computations` of
-          XLA's GPU client), and each run is judged by a program of its own.
+        That takes about as long as the simulation, although it only tells the devices what to do:
+        JAX lets a program wait its turn while 32 are under way on a GPU
+        (`max_inflight_computations` of XLA's GPU client).
         """
         places = self._groups(requests)
         groups = [[requests[i] for i in group] for group in places]
@@ -143,7 +117,6 @@ class Batch:
         return finish
 
     def _groups(self, requests: Sequence[Request]) -> list[list[int]]:
-        """Indices of the requests of each call: of as many particles, as a test may have fewer."""
         by_size: dict[int, list[int]] = {}
         for i, request in enumerate(requests):
             by_size.setdefault(len(request.state.particles), []).append(i)
@@ -154,11 +127,9 @@ class Batch:
         return groups
 
     def _group(self, request: Request) -> int:
-        """Runs that are simulated in one call."""
         return max(1, self._limit * len(self.devices) // self._worlds(request))
 
     def _worlds(self, request: Request) -> int:
-        """Worlds of an episode."""
         return len(request.state.particles) * self._task.trials
 
     def _stages(self, request: Request, runs: int) -> "_Stages":
@@ -177,7 +148,6 @@ class Batch:
         return self._parts
 
     def _launched(self, requests: Sequence[Request]) -> _Launched:
-        """Tells the devices to simulate the runs' episodes."""
         parts = self._stages(requests[0], len(requests))
         draw = self._program("draw", parts.draw.compile, *requests[0])
         before = self._program("before", parts.before.compile, *requests[0])
@@ -191,7 +161,6 @@ class Batch:
     def _judged(
         self, requests: Sequence[Request], launched: _Launched
     ) -> list[tuple[State, EpisodeInfo]]:
-        """What becomes of the runs."""
         assert self._parts is not None
         packed, drawn, running = launched
         home = tuple(jax.device_put(out, self.devices[0]) for out in running)
@@ -204,7 +173,6 @@ class Batch:
         return results
 
     def _joined(self, packed: Sequence[_Packed]) -> list[tuple]:
-        """The blocks of all runs, dealt to the devices."""
         parts = _deal(tuple(p.blocks for p in packed), len(self.devices))
         return [
             self.call(blocks, packed[0].common, device)
@@ -212,7 +180,6 @@ class Batch:
         ]
 
     def _one_by_one(self, packed: Sequence[_Packed]) -> list[tuple]:
-        """Every run by itself, in turn on each device."""
         turns = zip(packed, itertools.cycle(self.devices), strict=False)
         return [self.call(p.blocks, p.common, device) for p, device in turns]
 
@@ -234,7 +201,6 @@ class Batch:
         return self._program(device, lower, blocks, common)
 
     def _program(self, name: Any, compile: Callable, first: Any, second: Any) -> Callable:
-        """A program for arguments of these shapes, compiled when it is first asked for."""
         shapes = tuple(jnp.shape(v) for v in jax.tree.leaves((first, second)))
         if (name, shapes) not in self._programs:
             self._programs[name, shapes] = compile(first, second)
@@ -355,11 +321,7 @@ def in_chunks(
 
 
 def take(count: int | None) -> list[Device]:
-    """The first devices of this process, by default all.
-
-    Raises:
-      ValueError: If there are not so many.
-    """
+    """The first devices of this process, by default all."""
     available = jax.local_devices()
     if count is not None and not 1 <= count <= len(available):
         raise ValueError(f"{count} devices asked for, {len(available)} available")
@@ -367,8 +329,7 @@ def take(count: int | None) -> list[Device]:
 
 
 def _light(packed: _Packed) -> _Packed:
-    """Without what only the simulation reads."""
-    return packed._replace(blocks=(), common=())
+    return packed._replace(blocks=(), common=())  # without what only the simulation reads
 
 
 def _length(blocks: tuple) -> int:
@@ -376,7 +337,7 @@ def _length(blocks: tuple) -> int:
 
 
 def _shares(total: int, parts: int) -> list[int]:
-    """How many blocks `_deal` gives to each device that gets any."""
+    # As many blocks as `_deal` gives to each device that gets any.
     return [len(range(part, total, parts)) for part in range(min(parts, total))]
 
 
@@ -393,7 +354,6 @@ def _deal(runs: tuple[tuple, ...], parts: int) -> Sequence[tuple]:
 
 
 def _collect(parts: tuple[tuple, ...], runs: int) -> Sequence[tuple]:
-    """What the dealt blocks have become, run by run."""
     return parts if len(parts) == runs == 1 else _gather(parts, runs)
 
 

@@ -10,14 +10,9 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def atomically(path: Path) -> Iterator[Path]:
-    """Replaces a file as a whole: whoever reads it, and whenever, finds the old one or the new one.
+    """Replaces a file as a whole: readers find the old one or the new one, at any time.
 
-    Yields:
-      The path to write to, beside the file. It takes the file's place, on disk, when the block ends
-      and is removed if the block raises; a killed process leaves it behind, with a name in .tmp.
-
-    Raises:
-      OSError: If the file cannot be written; the old one stays.
+    Yields a path beside it; a killed process leaves that behind, with a name in .tmp.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     # Of this call alone: threads may write the same file, and so may hosts that share a disk.
@@ -45,17 +40,9 @@ def naming(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """Fills a folder as a whole: what is written appears there when the block ends.
+    """Fills a folder as a whole: what is written to the yielded one appears there at the end.
 
-    Args:
-      path: The folder; new files replace those of the same names, others stay.
-
-    Yields:
-      The folder to write to, beside the other with a name in .part. If the block raises or the
-      process is killed, the other folder stays as it was.
-
-    Raises:
-      OSError: If the folder cannot be written.
+    New files replace those of the same names, others stay.
     """
     path = path.resolve()
     part = path.with_name(f".{path.name}.part")
@@ -74,11 +61,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
 
 
 def clear_place(path: Path) -> None:
-    """Deletes a folder that lies where a file of a cache belongs: nothing could be kept there.
-
-    Raises:
-      OSError: If it cannot be deleted.
-    """
+    """Deletes a folder that lies where a file of a cache belongs: nothing could be kept there."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
 

@@ -58,25 +58,16 @@ MEASURED = ("angle", "tip_force", "blocked_force", "deflection")
 
 
 class Finger(NamedTuple):
-    """A finger in the plane in which it bends.
+    """A finger in the plane in which it bends."""
 
-    Attributes:
-      segment: Length of a segment [m].
-      links: Number of segments and of joints N.
-      section: Its section at each joint, shape (N,), or one where they are the same.
-      shear_modulus: G [Pa].
-      stiffness: Of each joint at small angles [N m/rad], likewise.
-      gain: Moment per pressure of each joint [m^3], likewise.
-      neo_hookean: Whether a joint softens as the effect `neo_hookean` says.
-    """
-
-    segment: float
-    links: int
+    segment: float  # length of a segment [m]
+    links: int  # number of segments and of joints N
+    # Its section at each joint, shape (N,), or one where they are the same
     section: morphology.Section
-    shear_modulus: float
-    stiffness: np.ndarray
-    gain: np.ndarray
-    neo_hookean: bool
+    shear_modulus: float  # G [Pa]
+    stiffness: np.ndarray  # of each joint at small angles [N m/rad], likewise
+    gain: np.ndarray  # moment per pressure of each joint [m^3], likewise
+    neo_hookean: bool  # whether a joint softens as the effect `neo_hookean` says
 
     @property
     def length(self) -> float:
@@ -101,13 +92,7 @@ class Finger(NamedTuple):
 
 
 def of_design(scene: Scene, params: Params, index: int) -> Finger:
-    """A hand's finger.
-
-    Args:
-      scene: The scene, whose links and bending law count.
-      params: The hand's parameters.
-      index: Which finger.
-    """
+    """A hand's finger."""
     hand, links = scene.hand, scene.discretization.links
     params = jax.tree.map(lambda v: np.asarray(v, float), params)
     beams = morphology.finger_beams(hand, params, links)
@@ -125,17 +110,11 @@ def of_design(scene: Scene, params: Params, index: int) -> Finger:
 
 
 class Rest(NamedTuple):
-    """A finger at rest.
+    """A finger at rest."""
 
-    Attributes:
-      angles: Of the joints [rad], shape (N,).
-      force: On the tip, against the bending [N].
-      height: Of the tip, from the unbent finger towards its bending [m].
-    """
-
-    angles: np.ndarray
-    force: float
-    height: float
+    angles: np.ndarray  # of the joints [rad], shape (N,)
+    force: float  # on the tip, against the bending [N]
+    height: float  # of the tip, from the unbent finger towards its bending [m]
 
     @classmethod
     def of(
@@ -150,14 +129,8 @@ class Rest(NamedTuple):
         """Balances the joints.
 
         Args:
-          finger: The finger.
           pressure: Gauge pressure [Pa].
           load: Dead force on the tip, across the unbent finger and against its bending [N].
-          held: Whether the tip is held at height 0 instead, by a force that is found.
-          start: Where the search starts; by default the unbent finger.
-
-        Raises:
-          ValueError: If no rest is found.
         """
         n, moment, unit = finger.links, pressure * finger.gain, float(finger.stiffness[0])
         reach = finger.segment * np.append(np.ones(n - 1), 0.5)  # of the bodies behind the joints
@@ -204,7 +177,6 @@ def predict(finger: Finger, table: Mapping[str, np.ndarray]) -> dict[str, np.nda
     """What a finger does where something was measured.
 
     Args:
-      finger: The finger.
       table: Columns of `COLUMNS` [SI units], shape (row,); NaN where a row has none.
 
     Returns:
@@ -232,17 +204,12 @@ def predict(finger: Finger, table: Mapping[str, np.ndarray]) -> dict[str, np.nda
 
 
 class Fit(NamedTuple):
-    """What of a finger's material a measurement gives.
+    """What of a finger's material a measurement gives."""
 
-    Attributes:
-      shear_modulus: G [Pa].
-      gain: Factor on the moment per pressure.
-      spread: Standard errors of their logarithms if all rows of a column err alike; 0 for what
-        was not fitted.
-    """
-
-    shear_modulus: float
-    gain: float
+    shear_modulus: float  # G [Pa]
+    gain: float  # factor on the moment per pressure
+    # Standard errors of their logarithms if all rows of a column err alike; 0 for what was not
+    # fitted
     spread: tuple[float, float]
 
 
@@ -261,13 +228,6 @@ def fit(finger: Finger, table: Mapping[str, np.ndarray]) -> Fit:
     """Fits G, and where the measurement gives it the gain, by least squares.
 
     Every column counts by its errors relative to its root mean square, each row once.
-
-    Args:
-      finger: The finger, from whose material the fit starts.
-      table: See `predict`.
-
-    Raises:
-      ValueError: If a rest is not found, or the rows are fewer than the numbers to fit.
     """
     free = np.array(fitted(table))
     names = [n for n in MEASURED if n in table]
@@ -302,9 +262,6 @@ def read(path: Path) -> dict[str, np.ndarray]:
 
     Returns:
       Columns of `COLUMNS` that the file has [SI units], shape (row,); NaN for an empty cell.
-
-    Raises:
-      InputError: With everything that is wrong with the file.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:

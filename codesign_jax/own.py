@@ -50,9 +50,6 @@ def contents(names: Iterable[str]) -> dict[str, bytes]:
 
     They are the file that each name's module was read from, and the one that defines the object
     where that is another; what these import is not among them.
-
-    Raises:
-      InputError: If a module cannot be imported, or has no file of Python code.
     """
     found = {}
     for name in filter(is_own, names):
@@ -63,15 +60,7 @@ def contents(names: Iterable[str]) -> dict[str, bytes]:
 
 
 def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
-    """Imports a cost and tries it on arrays without values.
-
-    Returns:
-      The function and whether a grasp ends where the object is lost: the function's attribute
-      `stop_when_lost`, False if it has none.
-
-    Raises:
-      InputError: If it is no function of scene, trace and controls that returns one number.
-    """
+    """Imports a cost and tries it without values; also whether a grasp ends where it is lost."""
     flag, cost = f"--cost {name}", _load(name, "--cost")
     _refuse_signature(flag, cost, ("scene", "trace", "ctrl"))
     stops = getattr(cost, "stop_when_lost", False)
@@ -104,18 +93,13 @@ def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
 def make_policy(name: str, scene: Scene) -> tuple[Policy, Scene]:
     """Imports a policy, or a class that makes one of a scene, and tries it without values.
 
-    Returns:
-      The policy, and the scene with what it lets a search move, see `policy.searched`.
-
-    Raises:
-      InputError: If it is none as `policy.Policy` describes them.
+    With it the scene that has what the policy lets a search move, see `policy.searched`.
     """
     return _policy(f"--policy {name}", _load(name, "--policy"), scene)
 
 
 @functools.lru_cache(maxsize=16)
 def _policy(flag: str, code: Any, scene: Scene) -> tuple[Policy, Scene]:
-    """A policy that is made and tried once: engines of one policy share their programs."""
     found = code
     if inspect.isclass(found):
         _refuse_signature(flag, found, ("scene",))
@@ -129,14 +113,7 @@ def _policy(flag: str, code: Any, scene: Scene) -> tuple[Policy, Scene]:
 
 
 def make_optimizer(name: str, space: Space, num_particles: int | None = None) -> Optimizer:
-    """Imports an optimiser's class, or whatever makes one from a space.
-
-    Args:
-      num_particles: Particles of a run, with which its functions are tried on a cost of zero.
-
-    Raises:
-      InputError: If it is none as `optimize.Optimizer` describes them.
-    """
+    """Imports an optimiser's class, or whatever makes one from a space."""
     flag, make = f"--optimizer {name}", _load(name, "--optimizer")
     _refuse_signature(flag, make, ("space",))
     made = _tried(flag, make, lambda: make(space))
@@ -156,7 +133,6 @@ def make_optimizer(name: str, space: Space, num_particles: int | None = None) ->
 
 
 def _try(flag: str, make: Any, made: Optimizer, n: int) -> None:
-    """Refuses an optimiser that gives or takes other arrays than it should."""
     low, high = np.asarray(made.space.low), np.asarray(made.space.high)
     seed, mask = jnp.asarray((low + high) / 2, float), np.ones(low.shape, bool)
     state = _tried(flag, make, lambda: made.init(jax.random.key(0), seed, n))
@@ -191,13 +167,11 @@ def _same(before: Any, after: Any) -> bool:
 
 
 def _hand(scene: Scene) -> Params:
-    """Parameters of the hand, whatever their values: its whole table at its defaults."""
     space = design_space(scene.hand)
     return space.params(space.default())
 
 
 def _load(name: str, flag: str = "") -> Any:
-    """The object of a name."""
     begin = f"{flag} {name}".strip()
     if words := problem(name):
         raise InputError([f"{flag}: {words}".removeprefix(": ")])
@@ -224,7 +198,6 @@ def _load(name: str, flag: str = "") -> Any:
 
 
 def _source(name: str, module: str) -> Path:
-    """File of Python code that a module was read from."""
     try:
         return Path(inspect.getsourcefile(sys.modules[module]) or "").resolve(strict=True)
     except (TypeError, OSError) as error:
@@ -234,7 +207,6 @@ def _source(name: str, module: str) -> Path:
 
 
 def _refuse_signature(flag: str, function: Any, arguments: tuple[str, ...]) -> None:
-    """Refuses what cannot be called with so many arguments."""
     wanted = f"a function of ({', '.join(arguments)})"
     if not callable(function):
         raise InputError([f"{flag}: it is {type(function).__name__}, not {wanted}"])
@@ -247,7 +219,6 @@ def _refuse_signature(flag: str, function: Any, arguments: tuple[str, ...]) -> N
 
 
 def _tried(flag: str, code: Any, call: Callable[[], Any]) -> Any:
-    """Returns what the user's code returns."""
     try:
         return call()
     except Exception as error:

@@ -30,11 +30,7 @@ SINK = 1e-3
 
 
 def notes(scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray]) -> list[str]:
-    """Warnings of named designs [SI units], and how exact the scene's meshes are.
-
-    Raises:
-      InputError: If a design must not be simulated.
-    """
+    """Warnings of named designs [SI units], and how exact the scene's meshes are."""
     params = params_of(space, np.array([*designs.values()], np.float32))
     found = refusals(scene, params, [*designs])
     if found:
@@ -115,7 +111,6 @@ def _scene_warnings(scene: Scene) -> list[str]:
 
 
 def _reach(scene: Scene, one: Params, name: str) -> list[str]:
-    """Warns if no finger can come down to the object's top, even straight."""
     if not scene.effects.finger_object:
         return []
     palm = float(key_frames.poses(scene, one)[:, 2].min())
@@ -133,7 +128,6 @@ def _reach(scene: Scene, one: Params, name: str) -> list[str]:
 
 
 def _overlaps(scene: Scene, designs: Params, names: list[str]) -> list[str]:
-    """Refuses designs that start deep inside the table, an object or themselves, without noise."""
     numbers = jax.tree.map(np.float32, scene.bare)
     singles = jax.tree.map(np.float32, designs)
     with_objects, fingers, palm = map(np.asarray, _depths(numbers, singles))

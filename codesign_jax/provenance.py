@@ -35,11 +35,7 @@ def environment() -> dict[str, object]:
 
 
 def git_state(known: str | None = None) -> dict[str, object]:
-    """Returns commit and cleanliness of the checkout that the package runs from, if it is one.
-
-    Args:
-      known: The commit, for a copy of the code without its repository; taken as it is.
-    """
+    """Returns commit and cleanliness of the checkout that the package runs from, if it is one."""
     if known:
         return {"commit": known}
     folder = Path(__file__).parent

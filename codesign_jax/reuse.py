@@ -102,7 +102,6 @@ def replaced() -> list[str]:
 
 
 def _names(module: object) -> dict[str, object]:
-    """What a module and its own classes define, and the code of its own functions."""
     found, own = {}, getattr(module, "__name__", None)
     for name, value in getattr(module, "__dict__", {}).items():
         if name.startswith("__"):
@@ -263,7 +262,6 @@ def check_programs(place: Path) -> None:
 
 
 def _complete(content: bytes) -> bool:
-    """Whether a program can be unpacked to its end, by the library that JAX packed it with."""
     try:
         if content.startswith(b"\x28\xb5\x2f\xfd"):
             import zstandard  # type: ignore[import-not-found]

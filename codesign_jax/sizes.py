@@ -4,19 +4,12 @@ from typing import NamedTuple
 
 
 class Sizes(NamedTuple):
-    """Sizes of a run.
-
-    Attributes:
-      particles: Particles.
-      trials: Trials of a particle in an episode.
-      episodes: Episodes.
-      test_trials: Further trials of each particle of the final test.
-    """
+    """Sizes of a run."""
 
     particles: int
-    trials: int
+    trials: int  # trials of a particle in an episode
     episodes: int
-    test_trials: int
+    test_trials: int  # further trials of each particle of the final test
 
 
 PAPER = {"2d": Sizes(10, 6, 64, 36), "": Sizes(60, 6, 128, 72)}
@@ -28,11 +21,7 @@ meets every object."""
 
 
 def text(name: str) -> str:
-    """The defaults of a size in words, such as "13 in 2d, 25 otherwise; the paper's are 10 and 60".
-
-    Args:
-      name: A field of `Sizes`.
-    """
+    """The defaults of a size, as in "13 in 2d, 25 otherwise; the paper's are 10 and 60"."""
     two, many, paper_two, paper_many = (
         getattr(sizes[preset], name) for sizes in (SCREENED, PAPER) for preset in ("2d", "")
     )

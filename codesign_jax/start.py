@@ -58,9 +58,6 @@ def depth(scene: Scene, fields: ModelFields) -> jax.Array:
 
     The structured engine's contacts serve every engine: same spheres, shapes and pairs.  Fingers
     are straight; how deep they stand in one another says `depth_between`.
-
-    Returns:
-      Shape (world,); 0 where nothing may touch.
     """
     alone = dataclasses.replace(scene.effects, finger_finger=False)
     hand, kin, position = _straight(scene, fields)

@@ -31,22 +31,13 @@ class StoreError(ValueError):
 
 
 def save(path: Path, arrays: Arrays) -> None:
-    """Writes arrays by name, as a whole or not at all.
-
-    Raises:
-      OSError: If the file cannot be written.
-    """
+    """Writes arrays by name, as a whole or not at all."""
     with files.atomically(path) as part:
         part.write_bytes(packed(arrays))
 
 
 def load(path: Path) -> dict[str, np.ndarray]:
-    """Reads the arrays of a file.
-
-    Raises:
-      OSError: If the file cannot be opened.
-      StoreError: If it is not what `save` wrote.
-    """
+    """Reads the arrays of a file."""
     with path.open("rb") as file:
         return unpacked(file, path)
 
@@ -61,11 +52,7 @@ def packed(arrays: Arrays) -> bytes:
 
 
 def unpacked(file: BinaryIO, path: Path) -> dict[str, np.ndarray]:
-    """The arrays that `packed` had; `path` is for the error.
-
-    Raises:
-      StoreError: If it is something else.
-    """
+    """The arrays that `packed` had; `path` is for the error."""
     try:
         with zipfile.ZipFile(file) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
@@ -89,11 +76,7 @@ def _digest(arrays: Arrays) -> str:
 
 
 def head(about: Any) -> dict[str, np.ndarray]:
-    """Arrays that say of what results are, for `refusal`.
-
-    Args:
-      about: What determines the results, beside code, versions and device: of JSON's types.
-    """
+    """Arrays that say of what results are, for `refusal`."""
     # Results of code that is not known are nobody's: nothing is equal to this.
     code = reuse.code_digest() or f"unknown {uuid.uuid4()}"
     text = json.dumps(about, sort_keys=True)
@@ -115,12 +98,7 @@ def keep(path: Path, about: Any, results: Arrays) -> None:
 
 
 def found(path: Path, about: Any) -> tuple[dict[str, Any] | None, str]:
-    """Results of `about` that are in a file.
-
-    Returns:
-      The results, or None; and why there are none, with the file as subject: they are of something
-      else, of other code, or damaged. Empty if there is no such file.
-    """
+    """Results of `about` that are in a file."""
     try:
         arrays = load(path)
     except FileNotFoundError:

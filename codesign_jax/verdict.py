@@ -20,22 +20,15 @@ FAR = 3e38
 
 
 class Bounds(NamedTuple):
-    """What decides a world: numbers, or arrays that broadcast to those of the worlds.
+    """What decides a world: numbers, or arrays that broadcast to those of the worlds."""
 
-    Attributes:
-      lost_distance: Distance from object centre to hand centre from which on the object is lost
-        [m].
-      start: The first time step at which a lost object counts.
-      end: The first time step at which it no longer does.
-      speed: Largest velocity of a world that has not failed [rad/s or m/s].
-      penetration: How far below the table the object's centre may be [m]; `FAR` without a table,
-        where what falls is lost as soon as the window begins.
-    """
-
+    # Distance from object centre to hand centre from which on the object is lost [m]
     lost_distance: Any
-    start: Any
-    end: Any
-    speed: Any
+    start: Any  # the first time step at which a lost object counts
+    end: Any  # the first time step at which it no longer does
+    speed: Any  # largest velocity of a world that has not failed [rad/s or m/s]
+    # How far below the table the object's centre may be [m]; `FAR` without a table, where what
+    # falls is lost as soon as the window begins
     penetration: Any
 
 
@@ -52,7 +45,6 @@ def lost(bounds: Bounds, distance: Any, step: Any) -> Any:
 
     Args:
       distance: Object centre to hand centre [m].
-      step: Index of the time step, broadcast against the distance.
     """
     return (distance >= bounds.lost_distance) & (step >= bounds.start) & (step < bounds.end)
 
@@ -82,8 +74,6 @@ def goes_on(
     Args:
       distance: Object centre to hand centre [m].
       height: Object centre above the table [m].
-      step: Index of the time step.
-      to_end: Whether worlds that lost their object are simulated to the end all the same.
     """
     good = sound(bounds, distance, height) & slow(bounds, speed)
     return good if to_end else good & ~lost(bounds, distance, step)

@@ -226,19 +226,19 @@ def test_no_kernel_depends_on_what_its_key_leaves_out():
 # As `find DIR -name '*.py' | xargs cat | wc -l` counts.  A larger number is a line of a review: say
 # there what users have of it, and what could go in its place.
 MOST_LINES = {
-    "codesign_jax": 40_900,
+    "codesign_jax": 39_900,
     "codesign_jax/codesign": 590,
-    "codesign_jax/commands": 2_960,
+    "codesign_jax/commands": 2_910,
     "codesign_jax/compiler": 2_980,
     "codesign_jax/env": 350,
-    "codesign_jax/engines": 12_880,
-    "codesign_jax/export": 1_890,
-    "codesign_jax/model": 1_690,
+    "codesign_jax/engines": 12_830,
+    "codesign_jax/export": 1_720,
+    "codesign_jax/model": 1_630,
     "codesign_jax/optimize": 1_340,
-    "codesign_jax/report": 2_120,
-    "codesign_jax/runs": 3_280,
-    "codesign_jax/scene": 5_300,
-    "codesign_jax/studio": 770,
+    "codesign_jax/report": 2_020,
+    "codesign_jax/runs": 3_160,
+    "codesign_jax/scene": 5_050,
+    "codesign_jax/studio": 750,
     "scripts": 5_500,
     "tests": 18_500,
 }

@@ -33,19 +33,12 @@ _LEAST = 4
 
 
 class Measured(NamedTuple):
-    """A batch of grasps.
+    """A batch of grasps."""
 
-    Attributes:
-      scene: What was simulated.
-      outcomes: Arrays of shape (design, trial).
-      seconds: Wall time of the batch, compiled before.
-      compiling: Time to compile the program, or to load it [s].
-    """
-
-    scene: Scene
-    outcomes: Outcome
-    seconds: float
-    compiling: float
+    scene: Scene  # what was simulated
+    outcomes: Outcome  # arrays of shape (design, trial)
+    seconds: float  # wall time of the batch, compiled before
+    compiling: float  # time to compile the program, or to load it [s]
 
     @property
     def rate(self) -> float:
@@ -150,14 +143,12 @@ Run = Callable[[jax.Array, Trial], Outcome]
 
 
 def _compiled(scene: Scene, engine: Engine, case: Case, count: int) -> tuple[Run, float]:
-    """A program for so many designs, each with a trial of every object, and its compile time."""
     program, like = sampling.make_simulate(scene, engine, case.space), _draw(case, 0, 0, count)
     begin = time.perf_counter()
     return interruptible(program.compile, *like), time.perf_counter() - begin
 
 
 def _draw(case: Case, stream: int, first: int, count: int) -> sampling.Drawn:
-    """Random designs, each with a trial of every object."""
     key = jax.random.fold_in(jax.random.key(0), stream)
     sizes = {"first": first, "n": count, "num_trials": len(case.scene.objects.object)}
     return sampling.draw(case.scene, case.space, key, **sizes)
@@ -184,7 +175,6 @@ def _sample(options: "Check", case: Case, run: Run, count: int) -> tuple[jax.Arr
 
 
 def _mixed(options: "Check", case: Case, run: Run, count: int) -> tuple[np.ndarray, str]:
-    """In turn random designs and the best of several batches of them."""
     begin, designs, costs = time.perf_counter(), [], []
     while len(designs) < _ROUNDS and time.perf_counter() - begin < options.seconds / _ROUNDS:
         drawn = _draw(case, 0, count * len(designs), count)

@@ -88,15 +88,10 @@ def preset_of(options: Subject) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class DesignFile:
-    """A design as a .toml file, see `design_text`.
+    """A design as a .toml file, see `design_text`."""
 
-    Attributes:
-      preset: Design space that the names belong to.
-      design: Numbers by name in the hand file's units, or arrays with one for each finger.
-    """
-
-    preset: str
-    design: dict
+    preset: str  # design space that the names belong to
+    design: dict  # numbers by name in the hand file's units, or arrays with one for each finger
 
 
 def design_text(space: DesignSpace, preset: str, design: np.ndarray) -> str:
@@ -114,12 +109,7 @@ def design_text(space: DesignSpace, preset: str, design: np.ndarray) -> str:
 
 
 def open_designs(words: Sequence[str]) -> tuple[dict[str, list[str]], str | None]:
-    """Splits the words of --design into NAME=VALUE pairs, by the file that has them.
-
-    Returns:
-      Pairs by file in the order given, those of the command line last under "--design", and the
-      last file's preset; None without a file.
-    """
+    """Splits the words of --design into NAME=VALUE pairs, by the file that has them."""
     found: dict[str, list[str]] = {}
     preset, direct = None, []
     for word in words:
@@ -190,7 +180,6 @@ def parse_design(
 
 
 def _members(name: str, space: DesignSpace) -> list[str]:
-    """The parameters that a name stands for: itself, or those of all fingers."""
     each = [n for n in space.names if n.split("[")[0] == name]
     return each if name not in space.names and each else [name]
 

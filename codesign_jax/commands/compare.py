@@ -86,7 +86,6 @@ def main(options: "Compare") -> int:
 
 
 def _runs_in(folder: Path) -> list[Path]:
-    """The folder, or the runs in it."""
     found = manifest.runs_inside(folder, "**")
     if (folder / manifest.PROVENANCE).exists() or not found:
         runs.read_run(folder)  # which says what is wrong

@@ -54,7 +54,6 @@ def main(options: "Export") -> int:
 
 
 def _params(case: Case) -> Params:
-    """The design's parameters in float64."""
     with jax.enable_x64(True):
         exact = case.space.params(jnp.asarray(case.design, float))
     return jax.tree.map(np.asarray, exact)
@@ -167,7 +166,6 @@ def _models(case: Case, params: Params, folder: Path, options: "Export", console
 
 
 def _trials(case: Case, options: "Export") -> list[tuple[str, Trial]]:
-    """A trial without noise for each object, and as many with noise as asked for."""
     scene = case.scene
     names = tables.names_of([shape.name for shape in scene.objects.object])
     found = [(name, rollout.nominal_trial(scene, i)) for i, name in enumerate(names)]
@@ -180,7 +178,6 @@ def _trials(case: Case, options: "Export") -> list[tuple[str, Trial]]:
 
 
 def _tested(folder: Path) -> "sheet.Tested":
-    """What a run kept of its design's tests: the verdict, and grasps under other conditions."""
     scene, settings = runs.read_run(folder)
     fresh, _ = reference.stored(folder, settings)
     verdict = None if fresh is None else str(reference.judged(scene, fresh))

@@ -121,7 +121,6 @@ def _columns(
 
 
 def _errors(table: dict[str, np.ndarray], values: dict[str, np.ndarray]) -> str:
-    """Root mean squares of the errors, in units and relative to what was measured."""
     parts = []
     for name, model in values.items():
         unit, size = SHOWN[name]

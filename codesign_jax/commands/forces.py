@@ -79,11 +79,7 @@ def _object(scene: Scene, grasp: Replay) -> str:
 
 
 def direction(text: str) -> np.ndarray:
-    """Unit vector of what `--pull` was given: down, x, y, z, or three numbers such as 1,0,-1.
-
-    Raises:
-      InputError: If it is none of these.
-    """
+    """Unit vector of what `--pull` was given: down, x, y, z, or three numbers such as 1,0,-1."""
     axes = {"down": (0, 0, -1), "x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
     try:
         found = np.array(axes[text] if text in axes else text.split(","), float)
@@ -105,9 +101,6 @@ def pull(
 
     Args:
       along: Direction of the force on the object's centre of mass, world frame, shape (3,).
-
-    Raises:
-      InputError: If a policy commands the hand.
     """
     if isinstance(engine, ControlLoop):
         raise InputError(["--pull holds the hand as key frames do: leave out --policy"])

@@ -22,19 +22,12 @@ if TYPE_CHECKING:
 
 
 class Asked(NamedTuple):
-    """A grasp to simulate.
+    """A grasp to simulate."""
 
-    Attributes:
-      case: Scene, design and engine.
-      trial: Object and noise, no leading axis.
-      text: What grasp it is, in words.
-      recorded: How it ended in its run, in words; None if it is of no run.
-    """
-
-    case: Case
-    trial: Trial
-    text: str
-    recorded: str | None
+    case: Case  # scene, design and engine
+    trial: Trial  # object and noise, no leading axis
+    text: str  # what grasp it is, in words
+    recorded: str | None  # how it ended in its run, in words; None if it is of no run
 
 
 def find(options: "Shown") -> Asked:
@@ -54,7 +47,6 @@ def find(options: "Shown") -> Asked:
 
 
 def _of_run(case: Case, options: "Shown", folder: Path) -> Asked:
-    """A row of trials.csv, or its design with an object of the scene's, without noise."""
     if options.objects is not None and options.object is None:
         raise InputError(["--objects replaces the run's: --object must say which one to grasp"])
     place = {"episode": options.episode, "particle": options.particle, "trial": options.trial}

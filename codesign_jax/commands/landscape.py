@@ -25,16 +25,11 @@ if TYPE_CHECKING:
 
 
 class Plane(NamedTuple):
-    """Designs over a grid of two parameters.
+    """Designs over a grid of two parameters."""
 
-    Attributes:
-      columns: Indices of the two parameters, shape (2,).
-      axes: Their values [SI units], shapes (n,) and (m,).
-      designs: The designs [SI units], shape (n * m, parameter), the first parameter slowest.
-    """
-
-    columns: tuple[int, int]
-    axes: tuple[np.ndarray, np.ndarray]
+    columns: tuple[int, int]  # indices of the two parameters, shape (2,)
+    axes: tuple[np.ndarray, np.ndarray]  # their values [SI units], shapes (n,) and (m,)
+    # The designs [SI units], shape (n * m, parameter), the first parameter slowest
     designs: np.ndarray
 
 
@@ -63,7 +58,6 @@ def main(options: "Options") -> int:
 
 
 def _folder(options: "Options", case: Case) -> Path:
-    """Where the files go: to the run, if it is the run's scene that is simulated."""
     own = options.run_folder
     folder = Path("landscape")
     if own is not None and case.scene == runs.read_run(own)[0]:
@@ -96,7 +90,6 @@ def _columns(case: Case, names: tuple[str, ...]) -> tuple[int, int]:
 
 
 def _meant(name: str, known: tuple[str, ...]) -> str:
-    """The parameters that one may have meant."""
     fingers = [n for n in known if n.split("[")[0] == name]
     if fingers:
         return f"there is one for each finger: {fingers[0]} to {fingers[-1]}"

@@ -112,7 +112,6 @@ def _compare(options: "Optimize") -> int:
 
 
 def _tell(plan: Plan, result: RunResult, folder: Path, trials: int, console: Console) -> None:
-    """Says how a run ended, and tests its design at reference and under other conditions."""
     _summarize(plan, result, console)
     fresh = None
     if trials and result.test is not None:
@@ -134,7 +133,6 @@ def _tell(plan: Plan, result: RunResult, folder: Path, trials: int, console: Con
 
 
 def _ends(space: DesignSpace) -> dict[str, np.ndarray]:
-    """The ends of the design space: what a particle between them is, its status says later."""
     ends = {"default": space.default(), "lower ends": space.low, "upper ends": space.high}
     projected = jax.vmap(space.project)(np.array([*ends.values()], np.float32))
     names = [f"design of the space's {n}" for n in ends]
@@ -142,7 +140,6 @@ def _ends(space: DesignSpace) -> dict[str, np.ndarray]:
 
 
 def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
-    """Prints scene, settings, grasps and and disk of this many runs."""
     scene, settings = plan.scene, plan.settings
     for name, text in scene_texts(scene).items():
         print(f"# ---- {name}\n{text}")
@@ -190,7 +187,6 @@ def _summarize(plan: Plan, result: RunResult, console: Console) -> None:
 def _judge(
     plan: Plan, result: RunResult, fresh: Judged | None, folder: Path, console: Console
 ) -> None:
-    """Prints the verdict: on fresh trials, or on those of the final test if there are no others."""
     assert result.test is not None
     test = compare.of_test(plan.scene, result)
     assert result.record is not None
@@ -303,7 +299,6 @@ def runs_of(options: "Optimize", scene: Scene, settings: Settings) -> dict[Path,
 
 
 def _folder(options: "Optimize", scene: Scene, settings: Settings) -> Path:
-    """Folder of one run: --out, with a folder inside for each of several strategies and --seeds."""
     if options.out is not None:
         inside = [settings.schedule] if "," in options.schedule else []
         inside += [f"seed-{settings.seed}"] if several(options) else []

@@ -39,7 +39,6 @@ _LIMITS |= dict.fromkeys("xyz", ("m", 10))
 
 
 def _camera(words: Sequence[str]) -> "Camera":
-    """The camera that --camera names: a view, and numbers that replace its own."""
     from codesign_jax.report.animation import CAMERA, VIEWS
 
     camera, problems, numbers = CAMERA, [], {}

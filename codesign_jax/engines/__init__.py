@@ -65,9 +65,6 @@ def solver_problems(scene: Scene) -> list[str]:
     MuJoCo's [solver] table stands beside structured's [newton]. Values that no preset of accuracy
     has were written by somebody who wants them to act; with a [newton] table of its own as well the
     scene is one for all engines.
-
-    Args:
-      scene: The scene.
     """
     if scene.newton != Newton() or scene.solver in _usual_solvers():
         return []
@@ -79,12 +76,7 @@ def solver_problems(scene: Scene) -> list[str]:
 
 
 def solver_problem(given: str, key: str = "") -> str:
-    """Says that a value of the [solver] table has no effect in engine structured.
-
-    Args:
-      given: The value, as the user gave it.
-      key: Its key in the table; none names the table as a whole.
-    """
+    """Says that a value of the [solver] table has no effect in engine structured."""
     instead = f"newton.{_INSTEAD[key]}" if key in _INSTEAD else "the table [newton]"
     return (
         f"not supported by engine structured: {given} (MuJoCo's own solver); set {instead}, which "
@@ -94,7 +86,6 @@ def solver_problem(given: str, key: str = "") -> str:
 
 @functools.cache
 def _usual_solvers() -> tuple[Solver, ...]:
-    """The defaults, the one that older runs have, and what the presets of accuracy set."""
     presets = (load_accuracy(name).solver for name in library.available("accuracy"))
     return Solver(), Solver(ls_iterations=20), *(Solver(**values) for values in presets)
 

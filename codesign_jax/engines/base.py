@@ -61,24 +61,13 @@ class Staged(NamedTuple):
 
 
 def block_lanes(engine: Engine, worlds: int) -> int | None:
-    """Lanes of the blocks in which an engine packs worlds; None if it has no blocks.
-
-    Args:
-      engine: The engine.
-      worlds: Worlds of all batches that one device simulates in a call.
-    """
+    """Lanes of the blocks in which an engine packs worlds; None if it has no blocks."""
     own: Any = getattr(engine, "block_lanes", None)
     return None if own is None else own(worlds)
 
 
 def staged(engine: Engine, lanes: int | None = None, *, trajectory: bool = False) -> Staged:
-    """The engine's own parts, or the whole rollout as the middle one.
-
-    Args:
-      engine: The engine.
-      lanes: Lanes of its blocks, see `block_lanes`; None for the engine's default.
-      trajectory: As in `Engine.rollout`.
-    """
+    """The engine's own parts, or the whole rollout as the middle one."""
     own: Any = getattr(engine, "staged", None)
     if own is not None:
         return own(lanes, trajectory=trajectory)
@@ -96,11 +85,7 @@ def tells_forces(engine: Engine) -> bool:
 
 
 def recording(engine: Engine) -> Engine:
-    """The engine as one whose traces have the contact forces.
-
-    Raises:
-      InputError: If it does not tell them.
-    """
+    """The engine as one whose traces have the contact forces."""
     own: Any = getattr(engine, "recording", None)
     if own is None or not tells_forces(engine):
         raise InputError([f"engine {engine.name} records no forces; engine structured does"])
@@ -125,9 +110,6 @@ def refuse_meshes(scene: Scene, engine: str) -> None:
 
     MuJoCo takes a mesh for its convex hull, and its vertices, unlike a primitive's sizes, cannot
     differ between the worlds of a batch, as the size noise asks for.
-
-    Raises:
-      InputError: with a line for each mesh in the scene.
     """
     problems = [
         f"not supported by engine {engine}: object {shape.name!r} is a mesh; use engine structured"

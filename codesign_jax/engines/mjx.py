@@ -31,7 +31,6 @@ _STATIC = ("wrap_prm",)
 
 
 def _refuse_fixtures(scene: Scene) -> None:
-    """Refuses objects and fixtures that MJX does not collide: a box and a cylinder."""
     problems = [
         f"not supported by engine mjx: object {shape.name!r}, a {shape.type}, with fixture "
         f"{fixture.name!r}, a {fixture.type}; use engine structured or mujoco"
@@ -106,7 +105,6 @@ class MjxEngine(Equal):
     def _advance(
         self, trajectory: bool, fields: ModelFields, carry: State, u: jax.Array
     ) -> tuple[State, Trace]:
-        """One time step of a world, and the trace's entry of the state before it."""
         lay = layout(self.scene)
         bounds = verdict.bounds(fields.constants)
         data = self.reset(fields).replace(

@@ -30,11 +30,7 @@ class MujocoEngine(Equal):
     name = "mujoco"
 
     def __init__(self, scene: Scene, *, num_threads: int = 0):
-        """Prepares the engine.
-
-        Args:
-          num_threads: Threads to use; 0 for all cores.
-        """
+        """Prepares the engine."""
         refuse_meshes(scene, self.name)
         effects.refuse(scene.effects, self.name)
         self.scene = scene
@@ -151,10 +147,8 @@ class MujocoEngine(Equal):
     ) -> tuple[Trace, np.ndarray, np.ndarray]:
         """Steps the given worlds through a chunk.
 
-        Returns:
-          The chunk's trace, whose entry k describes the state before step k; the steps taken by
-          each world, fewer than asked for where MuJoCo stopped; and qpos and qvel of the states
-          that the entries describe.
+        Returns the chunk's trace, whose entry k describes the state before step k; the steps taken
+        by each world, fewer than asked for where MuJoCo stopped; and qpos and qvel of those states.
         """
         lay = layout(self.scene)
         before = batch.bind("qvel")[ids][:, None], batch.bind("qpos")[ids][:, None]
@@ -191,7 +185,6 @@ def _decisions(
       bounds: Bounds of the worlds, of shape (world, 1).
       new: The chunk's trace, arrays of shape (world, step).
       first: Index of each world's first step, shape (world, 1).
-      to_end: As in `verdict.goes_on`.
 
     Returns:
       Index of the entry that decides each world, or the number of entries, and of the entry whose
@@ -241,7 +234,6 @@ def _rollout(
 def _apply_softening(
     scene: Scene, batch: mujoco.batch.Batch, fields: ModelFields, ids: np.ndarray
 ) -> None:
-    """Applies the moments of the neo-Hookean law at the worlds' present angles."""
     bend = layout(scene).dofs[..., 0]
     angles = batch.bind("qpos")[ids][:, bend]
     mine = jax.tree.map(lambda v: v[ids], fields)

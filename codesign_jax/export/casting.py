@@ -30,19 +30,12 @@ SEGMENTS = 32
 
 
 class Parts(NamedTuple):
-    """Solids of a finger, each in its place in the finger's frame.
+    """Solids of a finger, each in its place in the finger's frame."""
 
-    Attributes:
-      finger: The finger, hollow.
-      tray: Mould of the shell; it opens downwards.
-      core: The core with its bars and the frame that sits on the tray.
-      base: Mould of the bottom wall.
-    """
-
-    finger: manifold3d.Manifold
-    tray: manifold3d.Manifold
-    core: manifold3d.Manifold
-    base: manifold3d.Manifold
+    finger: manifold3d.Manifold  # the finger, hollow
+    tray: manifold3d.Manifold  # mould of the shell; it opens downwards
+    core: manifold3d.Manifold  # the core with its bars and the frame that sits on the tray
+    base: manifold3d.Manifold  # mould of the bottom wall
 
 
 def parts(size: Size, process: Process) -> Parts:
@@ -54,11 +47,7 @@ def parts(size: Size, process: Process) -> Parts:
 def _solid(
     x: tuple[float, float], half: Line, low: Line, high: Line, grow: Callable | None = None
 ) -> manifold3d.Manifold:
-    """The body from x[0] to x[1], -half to half and low to high, whose faces are plane.
-
-    Args:
-      grow: How far its four upright faces are moved outwards, at a place along and a height.
-    """
+    """The body from x[0] to x[1], -half to half and low to high, whose faces are plane."""
     corners = []
     for end, side in zip(x, (-1, 1), strict=True):
         for level in (low, high):
@@ -70,7 +59,6 @@ def _solid(
 
 
 def _rim(size: Size) -> Line:
-    """Top of the bottom wall, where shell and bottom meet."""
     return lambda x: size.at(x).wall
 
 
@@ -83,7 +71,6 @@ def _half(size: Size) -> Line:
 
 
 def _chamber(size: Size) -> tuple[Line, Line, Line]:
-    """Half of the chamber's width, its underside and its top."""
     return (
         lambda x: size.at(x).chamber[0] / 2,
         _rim(size),
@@ -110,7 +97,6 @@ def slope(size: Size, process: Process, x: float, z: float) -> float:
 
 
 def _around(size: Size, grow: Line, low: Line, high: Line) -> manifold3d.Manifold:
-    """A body around the finger's outline, grown by as much on each side."""
     return _solid((0.0, size.length), _half(size), low, high, lambda x, z: grow(x))
 
 
@@ -123,22 +109,18 @@ def _tray(size: Size, process: Process) -> manifold3d.Manifold:
 
 
 def _at_rim(size: Size, process: Process) -> Line:
-    """How far the shell goes beyond the finger's outline at its rim, by the draft."""
     return lambda x: slope(size, process, x, size.at(x).wall)
 
 
 def _outside(size: Size, process: Process) -> Line:
-    """How far the tray goes beyond the finger's outline on each side."""
     return _shifted(_at_rim(size, process), process.mould_wall)
 
 
 def _overlap(size: Size) -> float:
-    """How deep parts sit in one another."""
     return min(OVERLAP, *((s.height - s.wall) / 2 for s in (size.base, size.tip)))
 
 
 def _core(size: Size, process: Process) -> manifold3d.Manifold:
-    """Core, spine and bars, and a frame that lies on the tray's rim and reaches around it."""
     wall, rim, ends = process.mould_wall, _rim(size), size.chamber_ends
     half, low, high = _chamber(size)
     drafted = lambda x, z: slope(size, process, x, z)  # noqa: E731
@@ -167,7 +149,6 @@ def bars_of(size: Size) -> list[tuple[float, float]]:
 
 
 def _base(size: Size, process: Process) -> manifold3d.Manifold:
-    """A tray as deep as the bottom wall, and above that wide enough to set the shell into it."""
     wall, rim, wide = process.mould_wall, _rim(size), _at_rim(size, process)
     top, room = _shifted(rim, _overlap(size)), _shifted(wide, process.clearance)
     outer = _around(size, _shifted(room, wall), lambda x: -wall, top)

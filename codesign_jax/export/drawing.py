@@ -24,11 +24,7 @@ _LINE = 0.0095  # height of a line of that size in the figure's
 
 
 def write(folder: Path, *content: Any, assembly: Sequence[SheetSection], **shown: Any) -> Path:
-    """Writes the sheet to a folder as two pages of PDF.
-
-    Args:
-      assembly: The second page's sections, see `sheet.assembly_sections`.
-    """
+    """Writes the sheet to a folder as two pages of PDF."""
     path = folder / f"{NAME}.pdf"
     with PdfPages(path) as pages:
         pages.savefig(page(*content, **shown))
@@ -46,11 +42,7 @@ def page(
     sizes: Sequence[Size],
     drift: Drift | None,
 ) -> matplotlib.figure.Figure:
-    """Draws the sheet on one page.
-
-    Args:
-      drift: Tolerances, or None.
-    """
+    """Draws the sheet on one page."""
     # A figure of its own instead of pyplot's: no state and no display is touched.
     figure = matplotlib.figure.Figure(figsize=_A4)
     figure.text(0.06, 0.965, title, fontsize=13, weight="bold")
@@ -93,7 +85,6 @@ def second_page(
 
 
 def _view(axes: Axes, scene: Scene, fingers: np.ndarray, title: str, across: int, up: int) -> None:
-    """The palm and the straight fingers [mm] in two of their coordinates, the nearest last."""
     radius, thick = 1e3 * scene.hand.palm.radius, 1e3 * scene.hand.palm.thickness
     depth = 3 - across - up
     near = -1 if depth == 1 else 1  # the front is seen from -y
@@ -123,7 +114,6 @@ def _lines(text: str) -> list[str]:
 
 
 def _table(figure: matplotlib.figure.Figure, top: float, section: SheetSection) -> float:
-    """Draws a section below `top` and returns where the next one begins, in figure's height."""
     figure.text(0.06, top, section.title, fontsize=8, weight="bold", va="top")
     top -= 0.015
     if section.rows:
@@ -154,7 +144,6 @@ def _notes(
 def _tolerance(
     figure: matplotlib.figure.Figure, top: float, section: SheetSection, drift: Drift
 ) -> float:
-    """A bar from the last good value on either side, a cross at the first bad one."""
     figure.text(0.06, top, section.title, fontsize=8, weight="bold", va="top")
     bottom = 0.02 + _LINE * sum(len(_lines(note)) for note in section.notes) + 0.015
     bottom = max(bottom, top - 0.03 - 0.03 * len(drift.rows))
@@ -195,7 +184,6 @@ def _rectangle(axes: Axes, low: tuple[float, float], size: Sequence[float], colo
 
 
 def _section(axes: Axes, size: Size) -> None:
-    """Cross-section of finger 0 with its measures, of a tapered one at the base."""
     (width, height, wall), chamber = size.base, size.base.chamber
     _rectangle(axes, (-width / 2, 0), (width, height), "0.8")
     _rectangle(axes, (-chamber[0] / 2, wall), chamber, "white")
@@ -209,7 +197,6 @@ def _section(axes: Axes, size: Size) -> None:
 
 
 def _side_view(axes: Axes, size: Size) -> None:
-    """Longitudinal section of finger 0."""
     start, end = size.chamber_ends
     first, last = size.at(start), size.at(end)
     outer = [(0, 0), (size.length, 0), (size.length, size.tip.height), (0, size.base.height)]
@@ -229,7 +216,6 @@ def _side_view(axes: Axes, size: Size) -> None:
 
 
 def _palm(axes: Axes, scene: Scene, params: Params) -> None:
-    """The palm from above: base points, directions and the fingers' horizontal reach."""
     radius, width = 1e3 * scene.hand.palm.radius, 1e3 * scene.hand.section.width
     axes.add_patch(matplotlib.patches.Circle((0, 0), radius, facecolor="0.93", edgecolor="0.4"))
     position, azimuth = places(scene, params)

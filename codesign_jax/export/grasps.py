@@ -19,23 +19,16 @@ PLAYER = Path(__file__).with_name("play.py")
 
 
 class Grasp(NamedTuple):
-    """A grasp as plain MuJoCo has it.
+    """A grasp as plain MuJoCo has it."""
 
-    Attributes:
-      xml: The model as MJCF, or None if MJCF cannot say it.
-      note: Why not, or nothing.
-      binary: The compiled model with the inverse weights of the engine `mujoco`.
-      controls: Time [s] and controls of each step, shape (time, 1 + nu); see `control_columns`.
-      states: Generalized positions and velocities before each step, shape (time, nq + nv).
-      outcome: What became of it, by the scene's rules.
-    """
-
-    xml: str | None
-    note: str
-    binary: mujoco.MjModel
+    xml: str | None  # the model as MJCF, or None if MJCF cannot say it
+    note: str  # why not, or nothing
+    binary: mujoco.MjModel  # the compiled model with the inverse weights of the engine `mujoco`
+    # Time [s] and controls of each step, shape (time, 1 + nu); see `control_columns`
     controls: np.ndarray
+    # Generalized positions and velocities before each step, shape (time, nq + nv)
     states: np.ndarray
-    outcome: Outcome
+    outcome: Outcome  # what became of it, by the scene's rules
 
 
 def grasp(scene: Scene, params: Params, trial: Trial) -> Grasp:
@@ -87,13 +80,11 @@ def timed_controls(scene: Scene, params: Params, trial: Trial) -> np.ndarray:
 
 
 def _wide(tree: Any) -> Any:
-    """A tree with its floating-point numbers in float64."""
     arrays = jax.tree.map(np.asarray, tree)
     return jax.tree.map(lambda v: v if v.dtype == np.int32 else v.astype(float), arrays)
 
 
 def _float64(program: Callable, scene: Scene, params: Params, trial: Trial) -> np.ndarray:
-    """Calls one of the programs below in float64, whatever the caller's mode."""
     with jax.enable_x64(True):
         return np.asarray(program(_wide(scene.bare), params, trial))
 
@@ -125,7 +116,6 @@ def _add_keys(scene: Scene, spec: mujoco.MjSpec, controls: np.ndarray, states: n
 def _judge(
     scene: Scene, distance: np.ndarray, states: np.ndarray, nq: int, trial: Trial
 ) -> Outcome:
-    """Outcome of one's own simulation by the scene's rule."""
     speed = np.abs(states[:, nq:]).max(1)
     trace = Trace(distance, states[:, nq - 5], speed, states[:, :0])
     with jax.enable_x64(True):

@@ -17,29 +17,17 @@ _VOLUME, _LENGTH = 1e-4, 1e-3
 
 
 class Part(NamedTuple):
-    """A part as it was written.
+    """A part as it was written."""
 
-    Attributes:
-      name: Name of its files without their ending.
-      fingers: Indices of the fingers that it is for.
-      size: Their dimensions.
-      volume: Volume of the solid, read back from its STL file [mm^3].
-      extents: Edges of its bounding box, likewise [mm].
-    """
-
-    name: str
-    fingers: tuple[int, ...]
-    size: Size
-    volume: float
-    extents: tuple[float, float, float]
+    name: str  # name of its files without their ending
+    fingers: tuple[int, ...]  # indices of the fingers that it is for
+    size: Size  # their dimensions
+    volume: float  # volume of the solid, read back from its STL file [mm^3]
+    extents: tuple[float, float, float]  # edges of its bounding box, likewise [mm]
 
 
 def write(folder: Path, sizes: list[Size], process: Process) -> list[Part]:
-    """Writes fingers and moulds, equal fingers once, as they stand on a printer's bed.
-
-    Raises:
-      RuntimeError: If a file does not hold a closed surface of the solid's volume.
-    """
+    """Writes fingers and moulds, equal fingers once, as they stand on a printer's bed."""
     found = []
     for size in dict.fromkeys(sizes):
         fingers = tuple(i for i, other in enumerate(sizes) if other == size)

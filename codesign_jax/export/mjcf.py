@@ -20,11 +20,7 @@ _NOT_PHYSICS = ("signature", "names")
 
 
 def text(spec: mujoco.MjSpec) -> str:
-    """Returns MJCF that plain MuJoCo compiles to the same model as the spec, to rounding.
-
-    Raises:
-      RuntimeError: If a number of the model is lost on the way.
-    """
+    """Returns MJCF that plain MuJoCo compiles to the same model as the spec, to rounding."""
     model = spec.compile()
     root = ElementTree.fromstring(spec.to_xml())
     for element, parent in _walk(root, None):
@@ -68,7 +64,6 @@ def _numbers(
     element: ElementTree.Element,
     parent: ElementTree.Element | None,
 ) -> dict[str, Any]:
-    """The numbers that an element's attributes abbreviate, by attribute."""
     if element.tag == "option":
         o = model.opt
         names = ("timestep", "gravity", "impratio", "tolerance")

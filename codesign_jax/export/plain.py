@@ -75,11 +75,7 @@ def single_object(scene: Scene, trial: Trial) -> tuple[Scene, Trial]:
 def engine_model(
     scene: Scene, spec: mujoco.MjSpec, shares: Mapping[str, float] = NONE
 ) -> mujoco.MjModel:
-    """Compiles a spec to the model of the engine `mujoco`: inverse weights are the declared ones.
-
-    Args:
-      shares: Stiffness of geoms that are not as stiff as declared, see `skin.add`.
-    """
+    """Compiles a spec to the model of the engine `mujoco`, with declared inverse weights."""
     if shares:
         spec = spec.copy()
         for pair in spec.pairs:
@@ -91,11 +87,7 @@ def engine_model(
 
 
 def text(scene: Scene, spec: mujoco.MjSpec, shares: Mapping[str, float] = NONE) -> str:
-    """MJCF which plain MuJoCo compiles to a model of the same dynamics as `engine_model`.
-
-    Raises:
-      Inexpressible: If a contact would need an impedance that MuJoCo does not take.
-    """
+    """MJCF which plain MuJoCo compiles to a model of the same dynamics as `engine_model`."""
     compiled, declared = spec.compile().body_invweight0[:, 0], contact_invweight(scene)
     body_of = {geom.name: geom.parent.id for geom in spec.geoms}
     for pair in spec.pairs:
@@ -112,7 +104,6 @@ def text(scene: Scene, spec: mujoco.MjSpec, shares: Mapping[str, float] = NONE) 
 
 
 def _share(pair: mujoco.MjsPair, shares: Mapping[str, float]) -> float:
-    """Stiffness of a pair as a share of the declared one."""
     return min(shares.get(name, 1.0) for name in (pair.geomname1, pair.geomname2))
 
 

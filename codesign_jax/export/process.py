@@ -12,38 +12,29 @@ from codesign_jax.types import Params
 
 @dataclasses.dataclass(frozen=True)
 class Process:
-    """What the design does not say about parts [ours].
+    """What the design does not say about parts [ours]."""
 
-    Attributes:
-      end_wall: Thickness of the walls that close the chamber at base and tip [mm]; 0: that of the
-        finger's other walls.
-      inlet: Diameter of the hole for the air tube through the base's end wall [mm]; 0: none,
-        pierced after casting.
-      mould_wall: Thickness of the moulds' walls, floors and bars [mm].
-      clearance: Gap between parts that are set into one another [mm].
-      draft: Slope of the tray's and the core's side faces [deg].  Both widen towards the opening,
-        by nothing at half of the shell's height, so that the finger's walls keep their thickness.
-    """
-
+    # Thickness of the walls that close the chamber at base and tip [mm]; 0: that of the finger's
+    # other walls
     end_wall: float = quantity("mm", 0, 100, default=0.0)
+    # Diameter of the hole for the air tube through the base's end wall [mm]; 0: none, pierced after
+    # casting
     inlet: float = quantity("mm", 0, 20, default=2.0)
+    # Thickness of the moulds' walls, floors and bars [mm]
     mould_wall: float = quantity("mm", 0.5, 50, default=4.0)
+    # Gap between parts that are set into one another [mm]
     clearance: float = quantity("mm", 0, 2, default=0.2)
+    # Slope of the tray's and the core's side faces [deg].  Both widen towards the opening, by
+    # nothing at half of the shell's height, so that the finger's walls keep their thickness
     draft: float = quantity("deg", 0, 10, default=0.0)
 
 
 class Section(NamedTuple):
-    """A finger's section [mm].
+    """A finger's section [mm]."""
 
-    Attributes:
-      width: Outer width.
-      height: Outer height.
-      wall: Thickness of bottom, top and sides.
-    """
-
-    width: float
-    height: float
-    wall: float
+    width: float  # outer width
+    height: float  # outer height
+    wall: float  # thickness of bottom, top and sides
 
     @property
     def chamber(self) -> tuple[float, float]:
@@ -52,19 +43,12 @@ class Section(NamedTuple):
 
 
 class Size(NamedTuple):
-    """Dimensions of a finger [mm].
-
-    Attributes:
-      length: Length.
-      base: Its section at the base.
-      tip: Its section at the tip, the same unless the finger is tapered.
-      end: Thickness of the walls at base and tip.
-    """
+    """Dimensions of a finger [mm]."""
 
     length: float
-    base: Section
-    tip: Section
-    end: float
+    base: Section  # its section at the base
+    tip: Section  # its section at the tip, the same unless the finger is tapered
+    end: float  # thickness of the walls at base and tip
 
     def at(self, place: float) -> Section:
         """The section at a place along the finger [mm]."""
@@ -90,17 +74,12 @@ class Size(NamedTuple):
 
 
 def _simpson(area: Callable[[float], float], start: float, end: float) -> float:
-    """Volume of a body between two places, exact for areas of the second degree."""
     middle = (start + end) / 2
     return (end - start) * (area(start) + 4 * area(middle) + area(end)) / 6
 
 
 def sizes(hand: Hand, params: Params, process: Process) -> list[Size]:
-    """Dimensions of a hand's fingers.
-
-    Raises:
-      InputError: With every finger that has no room for a chamber.
-    """
+    """Dimensions of a hand's fingers."""
     found, problems = [], []
     for i, length in enumerate(params.length):
         base = hand.section.width, params.height[i], params.wall[i]

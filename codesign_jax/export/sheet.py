@@ -33,23 +33,14 @@ Tested = tuple[str | None, Stress | None]
 
 
 class Drift(NamedTuple):
-    """What simulated grasps say about tolerances.
+    """What simulated grasps say about tolerances."""
 
-    Attributes:
-      nominal: Success of the design itself.
-      trials: Trials of each step.
-      steps: Steps on each side.
-      engine: Engine that simulated.
-      rows: Tolerances; empty if the design itself has too few successes.
-      fixed: Parameters of the hand's table that were not moved.
-    """
-
-    nominal: Interval
-    trials: int
-    steps: int
-    engine: str
-    rows: list[Tolerance]
-    fixed: int = 0
+    nominal: Interval  # success of the design itself
+    trials: int  # trials of each step
+    steps: int  # steps on each side
+    engine: str  # engine that simulated
+    rows: list[Tolerance]  # tolerances; empty if the design itself has too few successes
+    fixed: int = 0  # parameters of the hand's table that were not moved
 
 
 def sheet_sections(
@@ -59,12 +50,7 @@ def sheet_sections(
     drift: Drift | None,
     tested: Tested = (None, None),
 ) -> list[SheetSection]:
-    """The sheet's content.
-
-    Args:
-      drift: Tolerances, or None if they were not asked for.
-      tested: The verdict of the run that found the design, and its grasps under other conditions.
-    """
+    """The sheet's content."""
     found = [
         _tests(scene, params, *tested),
         _fingers(scene, params, sizes),
@@ -190,7 +176,6 @@ def corners(scene: Scene, params: Params, sizes: Sequence[Size]) -> np.ndarray:
 
 
 def _castable(thickness: float) -> str:
-    """A thickness [mm] to what a mould can be made to."""
     return f"{round(20 * thickness) / 20:.2f}"
 
 

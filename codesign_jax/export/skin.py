@@ -24,19 +24,12 @@ _PASSIVE = {"contype": 0, "conaffinity": 0, "group": 3}  # contacts come from ex
 
 
 class Ball(NamedTuple):
-    """A sphere of a finger on one of its links.
+    """A sphere of a finger on one of its links."""
 
-    Attributes:
-      name: Name of its geom.
-      link: The link, from 1 on.
-      place: Place in the link's frame [m], shape (3,).
-      share: Its stiffness as a share of the scene's.
-    """
-
-    name: str
-    link: int
-    place: np.ndarray
-    share: float
+    name: str  # name of its geom
+    link: int  # the link, from 1 on
+    place: np.ndarray  # place in the link's frame [m], shape (3,)
+    share: float  # its stiffness as a share of the scene's
 
 
 def balls(scene: Scene, finger: int, params: Params) -> list[Ball]:
@@ -62,11 +55,7 @@ def balls(scene: Scene, finger: int, params: Params) -> list[Ball]:
 
 
 def add(scene: Scene, spec: mujoco.MjSpec, params: Params) -> dict[str, float]:
-    """Adds spheres and capsules to a spec, with their pairs.
-
-    Returns:
-      Stiffness of a contact of each sphere, by the geom's name, as a share of the scene's.
-    """
+    """Adds spheres and capsules to a spec, with their pairs."""
     shares: dict[str, float] = {}
     e = scene.effects
     for f in range(scene.num_fingers):

@@ -57,11 +57,7 @@ def control_columns(scene: Scene) -> list[str]:
 
 
 def write_commands(folder: Path, scene: Scene, schedule: np.ndarray) -> Path:
-    """Writes commands.csv in mm, degrees and kPa.
-
-    Args:
-      schedule: Time and controls, see `grasps.timed_controls`.
-    """
+    """Writes commands.csv in mm, degrees and kPa."""
     factors = [1e3] * 3 + [180 / np.pi] * 3 + [1e-3] * scene.num_fingers
     names, ends = zip(*scene.phase_ends.items(), strict=True)
     rows = []
@@ -77,11 +73,7 @@ def write_commands(folder: Path, scene: Scene, schedule: np.ndarray) -> Path:
 def write_grasps(
     folder: Path, scene: Scene, trials: Sequence[tuple[str, Trial]], grasps: Iterable[Grasp]
 ) -> Iterator[str]:
-    """Writes notes, models, controls, player and grasps.csv, as far as its lines are asked for.
-
-    Yields:
-      What became of each grasp, a line each, as it is written.
-    """
+    """Writes notes, models, controls, player and grasps.csv, as far as its lines are asked for."""
     lines = ["Grasps of codesign-jax for plain MuJoCo: python play.py NAME.xml; docs/export.md"]
     lines += [f"Unlike the scene {scene.name}: {text}" for text in plain.differences(scene)]
     (folder / NOTES).write_text("\n".join(lines) + "\n", encoding="utf-8")

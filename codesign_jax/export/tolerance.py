@@ -38,53 +38,32 @@ class Step(NamedTuple):
 
 
 class Side(NamedTuple):
-    """What was found in one direction.
+    """What was found in one direction."""
 
-    Attributes:
-      good: The last step with enough successes, or None if the first one has too few.
-      bad: The first step with too few, or None if there is none up to the limit.
-      limit: The end of the range [hand file's unit].
-      room: Whether the range goes on in this direction at all.
-    """
-
-    good: Step | None
-    bad: Step | None
-    limit: float
-    room: bool
+    good: Step | None  # the last step with enough successes, or None if the first one has too few
+    bad: Step | None  # the first step with too few, or None if there is none up to the limit
+    limit: float  # the end of the range [hand file's unit]
+    room: bool  # whether the range goes on in this direction at all
 
 
 class Tolerance(NamedTuple):
-    """Tolerance of a parameter.
+    """Tolerance of a parameter."""
 
-    Attributes:
-      name: The parameter.
-      unit: The hand file's unit, of all values.
-      value: The design's value.
-      down: What was found below it.
-      up: What was found above it.
-    """
-
-    name: str
-    unit: str
-    value: float
-    down: Side
-    up: Side
+    name: str  # the parameter
+    unit: str  # the hand file's unit, of all values
+    value: float  # the design's value
+    down: Side  # what was found below it
+    up: Side  # what was found above it
 
 
 class Study(NamedTuple):
-    """Designs to simulate.
-
-    Attributes:
-      space: Space of the designs.
-      designs: The design, then its steps [SI units], shape (1 + parameter * 2 * step, parameter).
-      low: Ends of the ranges downwards [SI units], shape (parameter,).
-      high: Ends upwards.
-    """
+    """Designs to simulate."""
 
     space: DesignSpace
+    # The design, then its steps [SI units], shape (1 + parameter * 2 * step, parameter)
     designs: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    low: np.ndarray  # ends of the ranges downwards [SI units], shape (parameter,)
+    high: np.ndarray  # ends upwards
 
     @property
     def steps(self) -> int:
@@ -105,24 +84,14 @@ class Study(NamedTuple):
 
 
 class Round(NamedTuple):
-    """What `search` asks for.
+    """What `search` asks for."""
 
-    Attributes:
-      designs: Indices of designs of the study.
-      most: Designs that it may ask for after these, at most.
-    """
-
-    designs: list[int]
-    most: int
+    designs: list[int]  # indices of designs of the study
+    most: int  # designs that it may ask for after these, at most
 
 
 def study(scene: Scene, space: DesignSpace, design: np.ndarray, steps: int, *, free: bool) -> Study:
-    """Plans the steps.
-
-    Args:
-      space: The design space in which the design was found.
-      free: Whether to move the parameters of that space, or all of the hand's table.
-    """
+    """Plans the steps."""
     whole = space if free else design_space(scene.hand)
     centre, source = np.asarray(design, float), np.asarray(space.source)
     if not free:
@@ -174,18 +143,7 @@ def shares(outcomes: Outcome) -> list[Interval]:
 
 
 def search(planned: Study, size: int) -> Generator[Round, list[Interval], dict[int, Interval]]:
-    """Asks for the successes that the tolerances need: those of each side up to its end.
-
-    Args:
-      size: Most designs to ask for at a time.
-
-    Yields:
-      A round; to be sent the shares of its designs.
-
-    Returns:
-      Shares of successful grasps by index of the design; of a design with too few successes, what
-      was known by then.
-    """
+    """Asks for the successes that the tolerances need: those of each side up to its end."""
     steps, found = planned.steps, {}
     sides = [int(side) for side in np.flatnonzero(planned.room)]
     for step in range(steps):
@@ -201,11 +159,7 @@ def search(planned: Study, size: int) -> Generator[Round, list[Interval], dict[i
 
 
 def tolerances(planned: Study, found: Mapping[int, Interval]) -> list[Tolerance]:
-    """Reads the tolerances off the successes.
-
-    Args:
-      found: Shares of successful grasps by index of the design, see `search`.
-    """
+    """Reads the tolerances off the successes."""
     space, results, room = planned.space, [], planned.room
     factor = np.array([UNITS[unit][1] for unit in space.units])
     for i, name in enumerate(space.names):

@@ -191,9 +191,6 @@ def _filled(base: np.ndarray, dtype: Any, *parts: tuple[Any, Any]) -> jax.Array:
     """An array with other numbers in known places, where the last part wins.
 
     One gather of all numbers: a CPU's XLA makes a loop of every `.at[places].set(values)`.
-
-    Args:
-      *parts: Places, as NumPy's indices, and numbers that broadcast to what is there.
     """
     source = np.arange(base.size, dtype=np.int32).reshape(base.shape)
     numbers, count = [jnp.asarray(base, dtype).ravel()], base.size
@@ -206,12 +203,11 @@ def _filled(base: np.ndarray, dtype: Any, *parts: tuple[Any, Any]) -> jax.Array:
 
 
 def _picked(array: jax.Array, places: np.ndarray) -> jax.Array:
-    """array[places] for places that are known to exist, without operations that check them."""
+    # Without operations that check the places.
     return array.at[places].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def _in_type(scene: Scene, dtype: Any) -> Scene:
-    """The scene with its numbers as arrays of a float type."""
     return jax.tree.map(lambda v: jnp.asarray(v, dtype), scene)
 
 
@@ -225,7 +221,6 @@ def _section(scene: Scene, params: Params) -> jax.Array | None:
 
 @by_structure
 def _pair_kinds(scene: Scene) -> np.ndarray:
-    """Kind of each of the template's contact pairs, see `pairs`, counted from the first."""
     template, lay = compile_template(scene), layout(scene)
     kinds = np.zeros(template.npair, np.int32)  # see layout: one width in every precision
     for i, pair in enumerate(zip(template.pair_geom1, template.pair_geom2, strict=True)):
@@ -276,7 +271,6 @@ def softening_moments(scene: Scene, fields: ModelFields, angles: Any) -> Any:
 
 
 def _subtree_mass(lay: Layout, palm: Any, masses: jax.Array, object_mass: jax.Array) -> list[tuple]:
-    """Places and masses of what hangs on each body: fingers, world, palm and object."""
     tails = jnp.cumsum(masses[:, ::-1], 1)[:, ::-1]
     hand = palm.mass + tails[:, 0].sum()
     fingers = [(lay.stubs, tails[:, 0]), (lay.bodies, tails[:, 1:])]
@@ -284,7 +278,6 @@ def _subtree_mass(lay: Layout, palm: Any, masses: jax.Array, object_mass: jax.Ar
 
 
 def _sphere_positions(scene: Scene, params: Params, extents: jax.Array) -> list[tuple]:
-    """Spheres spread evenly over each moving link, tangent to the bottom layer, and the palm's."""
     lay = layout(scene)
     parts: list[tuple] = [(lay.palm, palm_points(scene))] if lay.palm.size else []
     if lay.disc.size:
@@ -300,7 +293,6 @@ def _sphere_positions(scene: Scene, params: Params, extents: jax.Array) -> list[
 def _geom_fields(
     scene: Scene, params: Params, size: jax.Array, filled: Callable
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Size, bounding radius and box of the geoms."""
     lay = layout(scene)
     sizes: list[tuple] = []
     radii: list[tuple] = []
@@ -331,7 +323,6 @@ def _geom_fields(
 
 
 def _start(scene: Scene, params: Params, trial: Trial) -> jax.Array:
-    """Start state: palm at the arm's first pose, straight fingers, object at rest."""
     tilt, dtype = trial.arm_tilt, params.arm.dtype
     x, y, z, roll, pitch, yaw = key_frames.poses(scene, params, 1)[0]
     wrist = jnp.stack([x, y, z, roll + tilt[0], yaw, tilt[1] - pitch])

@@ -21,28 +21,19 @@ from codesign_jax.types import Tip
 
 
 class Hull(NamedTuple):
-    """Mesh of a finger with places as fractions: of a segment, the width and the height.
+    """Mesh of a finger with places as fractions: of a segment, the width and the height."""
 
-    Attributes:
-      place: Along the finger in segments from its base, across in widths from the middle, up in
-        heights from the bottom layer, shape (vertex, 3).
-      link: The two links that a vertex follows, 0 the half segment at the palm, shape (vertex, 2).
-      weight: Their weights, shape (vertex, 2).
-      face: Vertices of the triangles, counter-clockwise from outside, shape (face, 3).
-    """
-
+    # Along the finger in segments from its base, across in widths from the middle, up in heights
+    # from the bottom layer, shape (vertex, 3)
     place: np.ndarray
+    # The two links that a vertex follows, 0 the half segment at the palm, shape (vertex, 2)
     link: np.ndarray
-    weight: np.ndarray
-    face: np.ndarray
+    weight: np.ndarray  # their weights, shape (vertex, 2)
+    face: np.ndarray  # vertices of the triangles, counter-clockwise from outside, shape (face, 3)
 
 
 def outline(points: int, *, square: bool = False) -> np.ndarray:
-    """Points on the section's outline (width, height), anticlockwise about x, shape (point, 2).
-
-    Args:
-      square: Whether the section is the paper's rectangle and not the superellipse that touches.
-    """
+    """Points on the section's outline (width, height), anticlockwise about x, shape (point, 2)."""
     m = points // 4
     t = np.arange(m) / m
     sides = [(t - 0.5, 0 * t), (0 * t + 0.5, t), (0.5 - t, 0 * t + 1), (0 * t - 0.5, 1 - t)]
@@ -86,7 +77,6 @@ def hull(scene: Scene, *, square: bool = False) -> Hull:
 
 
 def _faces(rings: int, points: int) -> np.ndarray:
-    """Triangles of a centre, `rings` rings of points and another centre, one after the other."""
     i = np.arange(points)
     after = (i + 1) % points
     first = 1 + points * np.arange(rings - 1)[:, None]
@@ -107,11 +97,7 @@ def _faces(rings: int, points: int) -> np.ndarray:
 def rest(
     scene: Scene, length: float, height: float, *, square: bool = False, tip: Tip | None = None
 ) -> np.ndarray:
-    """Vertices of the straight finger in the frame of its base [m], shape (vertex, 3).
-
-    Args:
-      tip: The section at the tip of a tapered one.
-    """
+    """Vertices of the straight finger in the frame of its base [m], shape (vertex, 3)."""
     links, place = scene.discretization.links, hull(scene, square=square).place
     size = np.array([length / links, scene.hand.section.width, height])
     if tip is not None:

@@ -125,9 +125,6 @@ def implicit_damping(scene: Scene, stiffness: Any, damping: Any) -> Any:
     Args:
       stiffness: Stiffness K [N/m, N m/rad].
       damping: The joint's own damping D [N s/m, N m s/rad], shaped as the stiffness.
-
-    Returns:
-      C by `discretization.spring_damping`, shaped as the stiffness.
     """
     added = scene.discretization.timestep * stiffness
     if scene.discretization.spring_damping == "added":
@@ -143,12 +140,11 @@ CREEP = 0.04
 
 
 def dissipation(scene: Scene, *, ahead: bool = False) -> Any:
-    """Dissipation time of contacts [s].
+    """Dissipation time of contacts [s]; `ahead`: of those that act ahead of touch.
 
-    Args:
-      ahead: Whether contacts act ahead of touch. MuJoCo's do not: one that is to end its step apart
-        is gone in the next one, and what should rest hops, unless its dissipation takes longer than
-        a step. A tall box on an incline hops with 6 ms at steps of 10 ms and rests with 15.
+    MuJoCo's do not: one that is to end its step apart is gone in the next one, and what should rest
+    hops, unless its dissipation takes longer than a step. A tall box on an incline hops with 6 ms
+    at steps of 10 ms and rests with 15.
     """
     tau, least = scene.contact.dissipation_time, 1.5 * scene.discretization.timestep
     return tau if ahead else tau + (least - tau) * (least > tau)
@@ -232,7 +228,6 @@ def mount_points(hand: Hand, spread: Any, numpy: Any = jnp) -> tuple[Any, Any, A
 
     Args:
       spread: Spread between the finger pairs [rad].
-      numpy: What computes, `jax.numpy` or NumPy.
     """
 
     def each(name: str) -> Any:
@@ -285,13 +280,11 @@ def object_pose(objects: ObjectSet, trial: Trial) -> tuple[jax.Array, jax.Array]
 
 
 def _turn(angle: jax.Array, axis: int) -> jax.Array:
-    """Quaternion (4,) of a turn about an axis: 1 for x, 2 for y, 3 for z."""
     half = jnp.asarray(angle) / 2  # of JAX's type, whatever NumPy's was
     return jnp.zeros(4, half.dtype).at[0].set(jnp.cos(half)).at[axis].set(jnp.sin(half))
 
 
 def _after(second: jax.Array, first: jax.Array) -> jax.Array:
-    """Quaternion (4,) of a turn after another one."""
     a, b, c, d = second
     w, x, y, z = first
     return jnp.stack(

@@ -100,22 +100,15 @@ def free_bends(hand: Hand, params: Params) -> np.ndarray:
 
 
 class Segments(NamedTuple):
-    """Numbers of the bodies of fingers: N equal segments, cut in their middles by the joints.
+    """Numbers of the bodies of fingers: N equal segments, cut in their middles by the joints."""
 
-    Attributes:
-      offset: Place of each link's joint along the body that carries it [m], shape (finger, N).
-      extent: Length of each body, half a segment at both ends [m], shape (finger, N + 1).
-      mass: Their masses [kg], shape (finger, N + 1).
-      inertia: Of solid blocks as large, principal [kg m^2], shape (finger, N + 1, 3).
-      along: Centres of mass from the start of the body [m], shape (finger, N + 1).
-      up: Their height over the bottom layer [m], shape (finger, N + 1), or (finger, 1) if alike.
-    """
-
+    # Place of each link's joint along the body that carries it [m], shape (finger, N)
     offset: jax.Array
-    extent: jax.Array
-    mass: jax.Array
-    inertia: jax.Array
-    along: jax.Array
+    extent: jax.Array  # length of each body, half a segment at both ends [m], shape (finger, N + 1)
+    mass: jax.Array  # their masses [kg], shape (finger, N + 1)
+    inertia: jax.Array  # of solid blocks as large, principal [kg m^2], shape (finger, N + 1, 3)
+    along: jax.Array  # centres of mass from the start of the body [m], shape (finger, N + 1)
+    # Their height over the bottom layer [m], shape (finger, N + 1), or (finger, 1) if alike
     up: jax.Array
 
 
@@ -172,9 +165,6 @@ def joint_springs(
 ) -> tuple[jax.Array, jax.Array]:
     """Stiffness k = EI / l or GJ / l of a segment's length l, and damping beta k (Kelvin-Voigt).
 
-    Args:
-      axes: Axes of a joint, as in `Layout`.
-
     Returns:
       Stiffness [N m/rad] and damping [N m s/rad] of each finger's joints, shape (finger, N, axis)
       with the beams' N.
@@ -225,7 +215,6 @@ def threshold_moments(numbers: tuple, pressure: Any, bend: Any, lateral: Any) ->
     bends the finger further.
 
     Args:
-      numbers: The three of `thresholds`.
       pressure: Of the chamber [Pa].
       bend: Bend angle [rad].
       lateral: Lateral angle [rad].

@@ -25,12 +25,7 @@ def frictions(scene: Scene) -> list[Any]:
 
 
 def around(scene: Scene, which: int, table: int) -> int:
-    """Kind of a pair with the table, number 0, or a fixture, from 1 on.
-
-    Args:
-      table: Kind of the other body's pair with the table, as which a fixture without a friction of
-        its own counts.
-    """
+    """Kind of a pair with the table, number 0, or a fixture, from 1 on."""
     own = [i for i, f in enumerate(scene.fixture, 1) if f.friction is not None]
     return len(scene.objects.object) + own.index(which) if which in own else table
 

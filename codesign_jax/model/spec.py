@@ -55,9 +55,9 @@ def template_world(scene: Scene) -> tuple[Params, Trial]:
     return params, Trial(np.int32(0), np.zeros(2), zero, np.zeros(2), *[unit] * 5)
 
 
+# Models are compiled in float64 whatever the caller's mode, also inside a traced function.
 @contextlib.contextmanager
 def _float64():
-    """Models are compiled in float64 whatever the caller's mode, also inside a traced function."""
     with jax.enable_x64(True), jax.ensure_compile_time_eval():
         yield
 
@@ -309,11 +309,7 @@ def _add_object(
 
 
 def add_pair(scene: Scene, spec: mujoco.MjSpec, first: str, second: str, kind: int) -> None:
-    """Adds a contact pair.
-
-    Args:
-      kind: What they are, see `pairs`.
-    """
+    """Adds a contact pair."""
     condim = {"none": 1, "coulomb": 3, "full": 6}[scene.effects.friction]
     pair = spec.add_pair(geomname1=first, geomname2=second, condim=condim)
     own = pairs.frictions(scene)[kind], pairs.impedances(scene)[kind]
@@ -321,18 +317,13 @@ def add_pair(scene: Scene, spec: mujoco.MjSpec, first: str, second: str, kind: i
 
 
 def surroundings(scene: Scene, table: int) -> list[tuple[str, int]]:
-    """Geoms of table and fixtures that may be touched, and the kinds of pairs with them.
-
-    Args:
-      table: Kind of the other body's pair with the table.
-    """
+    """Geoms of table and fixtures that may be touched, and the kinds of pairs with them."""
     names = ["table", *(f"fixture_{i}" for i in range(len(scene.fixture)))]
     found = [(name, pairs.around(scene, i, table)) for i, name in enumerate(names)]
     return found if scene.effects.table else found[1:]
 
 
 def _add_pairs(scene: Scene, spec: mujoco.MjSpec) -> None:
-    """Explicit contact pairs: the contact list is the scene's, not a filter's."""
     e, lay = scene.effects, layout(scene)
     fingers = [f"finger_{f}_sphere_{i + 1}_{j}" for f, i, j in np.ndindex(lay.spheres.shape)]
     palm = [f"palm_{i}" for i in range(len(lay.palm))]

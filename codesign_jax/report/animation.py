@@ -239,7 +239,6 @@ def _announce(notify: Callable[[str], None]) -> None:
 
 
 def _common_palette(images: list[Image.Image]) -> Image.Image:
-    """Palette of a few frames spread over the animation, glued together."""
     chosen = images[:: max(1, len(images) // 8)]
     width, height = chosen[0].size
     glued = Image.new("RGB", (width, height * len(chosen)))
@@ -249,7 +248,6 @@ def _common_palette(images: list[Image.Image]) -> Image.Image:
 
 
 def _visual_model(scene: Scene, grasp: Replay) -> mujoco.MjModel:
-    """Compiles the hand and object of a grasp with table, sky and light to look at."""
     spec = model.build_spec(scene, grasp.params, grasp.trial, visual=True)
     texture, kind = mujoco.mjtTexture, mujoco.mjtBuiltin
     spec.add_texture(

@@ -24,37 +24,24 @@ _MOST_FACES = 40_000
 
 
 class Part(NamedTuple):
-    """A skinned mesh.
+    """A skinned mesh."""
 
-    Attributes:
-      name: Name, such as "finger 0", "palm" or "object".
-      color: Red, green and blue, from 0 to 1.
-      first: Vertices in the frame of their first body [m], shape (vertex, 3).
-      second: The same in the frame of their second body, same shape.
-      body: Rows of `Motion.pose` that the vertices follow, shape (vertex, 2).
-      weight: Weight of the second body, shape (vertex,); that of the first is the rest to 1.
-      face: Vertices of the triangles, counter-clockwise from outside, shape (face, 3).
-    """
-
-    name: str
-    color: tuple[float, float, float]
-    first: np.ndarray
-    second: np.ndarray
-    body: np.ndarray
+    name: str  # name, such as "finger 0", "palm" or "object"
+    color: tuple[float, float, float]  # red, green and blue, from 0 to 1
+    first: np.ndarray  # vertices in the frame of their first body [m], shape (vertex, 3)
+    second: np.ndarray  # the same in the frame of their second body, same shape
+    body: np.ndarray  # rows of `Motion.pose` that the vertices follow, shape (vertex, 2)
+    # Weight of the second body, shape (vertex,); that of the first is the rest to 1
     weight: np.ndarray
-    face: np.ndarray
+    face: np.ndarray  # vertices of the triangles, counter-clockwise from outside, shape (face, 3)
 
 
 class Motion(NamedTuple):
-    """Poses of all bodies over time.
+    """Poses of all bodies over time."""
 
-    Attributes:
-      pose: Position [m] and unit quaternion (w, x, y, z) in the world, shape (time, body, 7).
-      rate: Frames of a second.
-    """
-
+    # Position [m] and unit quaternion (w, x, y, z) in the world, shape (time, body, 7)
     pose: np.ndarray
-    rate: float
+    rate: float  # frames of a second
 
 
 def parts(scene: Scene, grasp: Replay) -> list[Part]:
@@ -71,11 +58,7 @@ def parts(scene: Scene, grasp: Replay) -> list[Part]:
 
 
 def motion(scene: Scene, grasp: Replay, *, rate: float = 25.0) -> Motion:
-    """Poses of all bodies of a grasp by MuJoCo's kinematics.
-
-    Args:
-      rate: Wanted frames of a second; the nearest that whole time steps allow is taken.
-    """
+    """Poses of all bodies of a grasp by MuJoCo's kinematics."""
     h = scene.discretization.timestep
     every = max(1, round(1 / (rate * h)))
     compiled = model.compile_model(scene, grasp.params, grasp.trial)
@@ -149,7 +132,6 @@ def _rigid(name: str, color, vertices: np.ndarray, faces: np.ndarray, body: int)
 
 
 def _coarse(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Merges the vertices in each cell of a grid, as fine as the number of faces allows."""
     cells = 200
     while len(faces) > _MOST_FACES:
         cell = np.ptp(vertices, axis=0).max() / cells

@@ -137,7 +137,6 @@ def designs(
 
     Args:
       chosen: The chosen design [SI units], shape (2,).
-      landscape: The cost over the same two parameters, or None.
     """
     x, y = space.in_units(history.population.reshape(-1, 2)).T
     episode = np.repeat(np.arange(1, len(history.cost) + 1), history.cost.shape[1])
@@ -217,7 +216,6 @@ def failure_chart(status: np.ndarray) -> go.Figure:
 
 
 def _step(episodes: int) -> int:
-    """Episodes between two ticks of an axis: whole ones, and ten ticks at most or so."""
     rough = max(episodes / 10, 1)
     steps = (digit * 10**power for power in itertools.count() for digit in (1, 2, 5))
     return next(step for step in steps if step >= rough)

@@ -33,7 +33,6 @@ def design(run: Run) -> str:
 
 
 def _builder(run: Run) -> list[str]:
-    """What the design keeps under other conditions, and warnings of it."""
     warnings = stress.of_design(run.scene, run.space.params(run.chosen.design))
     parts = []
     if found := run.stress:
@@ -62,7 +61,6 @@ def _by_object(run: Run, judged: Judged) -> str:
 
 
 def _parameters(run: Run) -> str:
-    """The design's parameters: a row for each finger, and one for each of the hand's others."""
     space = run.space
     values, low, high = (
         space.in_units(np.asarray(v)) for v in (run.chosen.design, space.low, space.high)

@@ -63,7 +63,6 @@ def landscape(found: Landscape, path: Path) -> Path:
 
 
 def _save(figure: matplotlib.figure.Figure, path: Path) -> Path:
-    """Writes a figure as a whole or not at all."""
     with files.atomically(path) as part:  # whose name does not say the kind of picture
         figure.savefig(part, format=path.suffix.lstrip(".") or "png")
     return path

@@ -14,30 +14,18 @@ TABLE = columns.LANDSCAPE
 
 
 class Landscape(NamedTuple):
-    """The mean cost over a grid of two parameters.
+    """The mean cost over a grid of two parameters."""
 
-    Attributes:
-      names: Names of the two parameters, shape (2,).
-      units: Their units, shape (2,).
-      first: Values of the first one in its unit, shape (n,).
-      second: Values of the second one, shape (m,).
-      cost: Mean cost by the scene's rule for failed trials, shape (n, m).
-      kept: Trials that kept the object (cost below the limit of success), shape (n, m).
-      counted: Trials that did not fail, shape (n, m).
-      trials: Trials of a point, shape ().
-      seed: Root of their noise, shape ().
-      design: What the other parameters stay at: the whole design [SI units], shape (parameter,).
-    """
-
-    names: np.ndarray
-    units: np.ndarray
-    first: np.ndarray
-    second: np.ndarray
-    cost: np.ndarray
-    kept: np.ndarray
-    counted: np.ndarray
-    trials: np.ndarray
-    seed: np.ndarray
+    names: np.ndarray  # names of the two parameters, shape (2,)
+    units: np.ndarray  # their units, shape (2,)
+    first: np.ndarray  # values of the first one in its unit, shape (n,)
+    second: np.ndarray  # values of the second one, shape (m,)
+    cost: np.ndarray  # mean cost by the scene's rule for failed trials, shape (n, m)
+    kept: np.ndarray  # trials that kept the object (cost below the limit of success), shape (n, m)
+    counted: np.ndarray  # trials that did not fail, shape (n, m)
+    trials: np.ndarray  # trials of a point, shape ()
+    seed: np.ndarray  # root of their noise, shape ()
+    # What the other parameters stay at: the whole design [SI units], shape (parameter,)
     design: np.ndarray
 
 
@@ -62,11 +50,7 @@ def save(found: Landscape, folder: Path) -> list[Path]:
 
 
 def load(path: Path) -> Landscape:
-    """Reads the arrays of a landscape.
-
-    Raises:
-      InputError: If the file holds none.
-    """
+    """Reads the arrays of a landscape."""
     try:
         stored = store.load(path)
         return Landscape(**{name: stored[name] for name in Landscape._fields})

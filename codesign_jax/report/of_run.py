@@ -15,29 +15,18 @@ from codesign_jax.scene.parameters import DesignSpace, design_space
 
 
 class Run(NamedTuple):
-    """A run to report on.
-
-    Attributes:
-      folder: Its folder.
-      scene: Its scene.
-      settings: Its settings.
-      record: Its episodes, at least one.
-      chosen: The design it found.
-      provenance: Content of its provenance.json.
-      reference: The design's fresh trials at the end of the run; None without them.
-      notes: What is amiss with the run, in sentences.
-      stress: The design's grasps under other conditions; None without them.
-    """
+    """A run to report on."""
 
     folder: Path
     scene: Scene
     settings: Settings
-    record: Record
-    chosen: Chosen
-    provenance: dict[str, Any]
+    record: Record  # its episodes, at least one
+    chosen: Chosen  # the design it found
+    provenance: dict[str, Any]  # content of its provenance.json
+    # The design's fresh trials at the end of the run; None without them
     reference: Judged | None = None
-    notes: tuple[str, ...] = ()
-    stress: Stress | None = None
+    notes: tuple[str, ...] = ()  # what is amiss with the run, in sentences
+    stress: Stress | None = None  # the design's grasps under other conditions; None without them
 
     @property
     def judged(self) -> Judged:

@@ -19,11 +19,7 @@ from codesign_jax.types import MEANINGS, WARNINGS
 
 
 def write(run: Run, grasp: tuple[Grasp, Replay] | None, path: Path) -> Path:
-    """Writes the report of a run.
-
-    Args:
-      grasp: The grasp to show and what happened when it was simulated again, or None.
-    """
+    """Writes the report of a run."""
     sections = [
         *(markup.paragraph(f"Warning: {note}.", "warning") for note in run.notes),
         _summary(run),
@@ -138,7 +134,6 @@ def _parameters(run: Run) -> str:
 
 
 def _landscape(run: Run) -> str:
-    """The particles of a run with two parameters, and the landscape where there is one."""
     path, space = run.folder / landscape.FILE, run.space
     found = landscape.load(path) if path.exists() else None
     words, command = "A dot is a particle of any episode, coloured by its cost. ", []

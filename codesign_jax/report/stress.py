@@ -57,19 +57,12 @@ TURN = 2 * np.pi
 
 
 class Stress(NamedTuple):
-    """Grasps of one design under other conditions.
+    """Grasps of one design under other conditions."""
 
-    Attributes:
-      conditions: What was changed, once for each set of numbers that was simulated.
-      kept: Grasps that kept the object, shape (set,).
-      trials: Grasps of each set.
-      warnings: What the grasps as they are say of the design itself.
-    """
-
-    conditions: tuple[str, ...]
-    kept: np.ndarray
-    trials: int
-    warnings: tuple[str, ...]
+    conditions: tuple[str, ...]  # what was changed, once for each set of numbers that was simulated
+    kept: np.ndarray  # grasps that kept the object, shape (set,)
+    trials: int  # grasps of each set
+    warnings: tuple[str, ...]  # what the grasps as they are say of the design itself
 
     @property
     def head(self) -> tuple[str, str, str]:
@@ -151,7 +144,6 @@ def variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
 
 
 def _changed(table: Any, path: tuple[str, ...], change: Callable[[float], float]) -> Any:
-    """Nested tables with changed numbers at a path, of all entries of arrays of tables."""
     if not path:
         return change(table)
     if isinstance(table, tuple):
@@ -181,7 +173,6 @@ def _recorded(engine: Engine, space: DesignSpace, num_trials: int) -> Callable:
 def _in_grasps(
     scene: Scene, params: Params, found: Outcome, qpos: np.ndarray, trials: Trial
 ) -> list[str]:
-    """Warnings of what fingers do until the release, in kept grasps, one of each object."""
     kept = np.flatnonzero(codesign.verdicts(found) == codesign.VERDICTS.index("kept"))
     first = [kept[trials.shape[kept] == k][:1] for k in range(len(scene.objects.object))]
     times = np.arange(qpos.shape[1]) * HELD

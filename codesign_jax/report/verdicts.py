@@ -32,19 +32,12 @@ MANY = 0.1
 
 
 class Verdict(NamedTuple):
-    """Whether a design is good; as a string a sentence without its subject.
+    """Whether a design is good; as a string a sentence without its subject."""
 
-    Attributes:
-      share: Share of its grasps that it kept, with the 95 % interval.
-      total: Number of the grasps.
-      word: "good", "not good" or "not enough trials".
-      more: Further grasps after which the share, if it stays, is good or not good; 0 if it is.
-    """
-
-    share: Interval
-    total: int
-    word: str
-    more: int
+    share: Interval  # share of its grasps that it kept, with the 95 % interval
+    total: int  # number of the grasps
+    word: str  # "good", "not good" or "not enough trials"
+    more: int  # further grasps after which the share, if it stays, is good or not good; 0 if it is
 
     def sentence(self, grasps: str = "fresh grasps") -> str:
         """Such as "keeps 97 % of 150 fresh grasps (93 to 99 %): good"."""
@@ -80,26 +73,18 @@ def judge(kept: int, total: int) -> Verdict:
 
 
 def _percent(share: float) -> str:
-    """Percent, with a decimal where rounding would lift a share to 95 or 100."""
     text = f"{100 * share:.0f}"
     lifted = text in ("95", "100") and 100 * share < float(text)
     return f"{math.floor(1000 * share) / 10:.1f}" if lifted else text
 
 
 class Tally(NamedTuple):
-    """How trials ended, numbers of them; the four add up to all.
+    """How trials ended, numbers of them; the four add up to all."""
 
-    Attributes:
-      kept: Neither lost nor failed.
-      lost: The object left the hand within the window of the cost.
-      stuck: The hand did not let go of the object.
-      failed: Those that failed otherwise: faults of the simulation.
-    """
-
-    kept: int
-    lost: int
-    stuck: int
-    failed: int
+    kept: int  # neither lost nor failed
+    lost: int  # the object left the hand within the window of the cost
+    stuck: int  # the hand did not let go of the object
+    failed: int  # those that failed otherwise: faults of the simulation
 
     @property
     def total(self) -> int:
@@ -126,19 +111,12 @@ def good(outcomes: Outcome) -> np.ndarray:
 
 
 class Judged(NamedTuple):
-    """Trials by which a design is judged; as a string the verdict, in a sentence.
+    """Trials by which a design is judged; as a string the verdict, in a sentence."""
 
-    Attributes:
-      scene: The scene that was simulated, with its rule for failed trials.
-      outcomes: Outcomes of the trials, NumPy arrays of shape (trial,).
-      accuracy: Name of the accuracy's preset, if one was asked for.
-      grasps: What the trials are called.
-    """
-
-    scene: Scene
-    outcomes: Outcome
-    accuracy: str | None = None
-    grasps: str = "fresh grasps"
+    scene: Scene  # the scene that was simulated, with its rule for failed trials
+    outcomes: Outcome  # outcomes of the trials, NumPy arrays of shape (trial,)
+    accuracy: str | None = None  # name of the accuracy's preset, if one was asked for
+    grasps: str = "fresh grasps"  # what the trials are called
 
     @property
     def verdict(self) -> Verdict:

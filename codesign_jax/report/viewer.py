@@ -68,11 +68,7 @@ def element(name: str) -> str:
 
 
 def page(title: str, body: str, *scripts: str) -> str:
-    """A whole page.
-
-    Args:
-      scripts: JavaScript that the body calls, beside the viewer.
-    """
+    """A whole page."""
     script = "\n".join([*scripts, web("replay.js")])
     return _PAGE.format(title=html.escape(title), style=web("style.css"), script=script, body=body)
 
@@ -110,7 +106,6 @@ def data(scene: Scene, grasp: Replay) -> dict[str, Any]:
 
 
 def _strip(scene: Scene, grasp: Replay) -> list[tuple[str, str]]:
-    """Sketches at the start, at the ends of the phases and amid the longest: captions and PNGs."""
     ends = [("start", 0.0), *phases(scene)]
     spans = [
         (later - first, k) for k, ((_, first), (_, later)) in enumerate(itertools.pairwise(ends))
@@ -146,6 +141,5 @@ def _part(part: bodies.Part) -> dict[str, Any]:
 
 
 def _encode(array: np.ndarray, kind: type) -> str:
-    """Base64 of an array's bytes, little-endian as in every browser."""
     little = np.dtype(kind).newbyteorder("<")
     return base64.b64encode(np.ascontiguousarray(array, little).tobytes()).decode()

@@ -40,16 +40,11 @@ Arrays = dict[str, Any]
 
 
 class Restored(NamedTuple):
-    """What was found on disk.
+    """What was found on disk."""
 
-    Attributes:
-      step: Step restored, or None if there is none.
-      arrays: Its arrays, or an empty dictionary.
-      damaged: Newer steps that were passed over, newest first, with the reason of each.
-    """
-
-    step: int | None
-    arrays: Arrays
+    step: int | None  # step restored, or None if there is none
+    arrays: Arrays  # its arrays, or an empty dictionary
+    # Newer steps that were passed over, newest first, with the reason of each
     damaged: tuple[tuple[int, str], ...]
 
 
@@ -68,16 +63,7 @@ class Checkpoints:
         tell: Callable[[str], None] = warnings.warn,
         read_only: bool = False,
     ):
-        """Opens the folder, and makes it if it is missing.
-
-        Args:
-          run: Identity of the run, 32 hexadecimal digits, which every step carries; None for steps
-            of no run.
-          tell: Called when the folder is closed, with a message, if a step could not be deleted;
-            from then on orbax deletes none.
-          read_only: Opens a folder that exists and changes nothing in it, not even what a process
-            that was killed left of a step: another process may be saving that step now.
-        """
+        """Opens the folder, and makes it if it is missing."""
         import orbax.checkpoint as ocp
 
         self.folder = folder.resolve()  # orbax takes absolute paths only
@@ -107,11 +93,7 @@ class Checkpoints:
             self._tell(f"old checkpoints in {self.folder} could not be deleted: {error}")
 
     def save(self, step: int, arrays: Arrays) -> None:
-        """Writes a step; it becomes visible at once and as a whole, or not at all.
-
-        Raises:
-          OSError: If it cannot be written, for example on a full disk; older steps stay intact.
-        """
+        """Writes a step; it becomes visible at once and as a whole, or not at all."""
         labelled = arrays if self._run is None else arrays | {_LABEL: _label(self._run, step)}
         try:
             saved = self._manager.save(step, args=self._args.StandardSave(labelled))
@@ -133,12 +115,7 @@ class Checkpoints:
             part.write_text("\n".join(lines) + "\n")
 
     def restore(self) -> Restored:
-        """Reads the newest step whose digest matches; changes nothing on disk.
-
-        Raises:
-          RunError: If a step cannot be read though it may be whole, or the newest whole one is of
-            another run, or another step of this one.
-        """
+        """Reads the newest step whose digest matches; changes nothing on disk."""
         damaged: list[tuple[int, str]] = []
         for step in sorted(self._manager.all_steps(), reverse=True):
             arrays, reason = self._read(step)
@@ -165,7 +142,6 @@ class Checkpoints:
         self._manager.reload()
 
     def _read(self, step: int) -> tuple[Arrays, str]:
-        """Returns a step's arrays, or why they cannot be trusted."""
         try:
             expected, reason = self._compare(step)
             if reason:
@@ -268,7 +244,6 @@ def _label(run: str, step: int) -> Arrays:
 
 
 def _unsaved(place: Path, error: Exception) -> OSError:
-    """The error of a step that could not be saved: tensorstore's own has hundreds of characters."""
     text = str(error)
     for number in (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EACCES, errno.EFBIG):
         if getattr(error, "errno", None) == number or os.strerror(number) in text:

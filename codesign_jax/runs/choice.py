@@ -25,58 +25,35 @@ from codesign_jax.types import Outcome, Trial, failed
 
 
 class Grasp(NamedTuple):
-    """One trial of one particle of a run.
+    """One trial of one particle of a run."""
 
-    Attributes:
-      design: The particle as simulated [SI units], shape (parameter,).
-      trial: Object and noise, no leading axis.
-      outcome: How it ended in the run, numbers.
-      place: Number of the episode, from 1, and indices of particle and trial, as in trials.csv.
-    """
-
-    design: np.ndarray
-    trial: Trial
-    outcome: Outcome
+    design: np.ndarray  # the particle as simulated [SI units], shape (parameter,)
+    trial: Trial  # object and noise, no leading axis
+    outcome: Outcome  # how it ended in the run, numbers
+    # Number of the episode, from 1, and indices of particle and trial, as in trials.csv
     place: tuple[int, int, int]
 
 
 class Chosen(NamedTuple):
-    """The design that a run found.
+    """The design that a run found."""
 
-    Attributes:
-      design: The design [SI units], shape (parameter,).
-      particle: Its index among the final particles, or in its episode without a test.
-      cost: Its mean cost by the scene's rule for failed trials.
-      outcomes: Of its trials, arrays of shape (trial,).
-      tested: Whether they are those of the final test, or its episode's.
-      row: Its index in its episode's population.
-      episode: Index of an episode that simulated it: the last, where that did.
-    """
-
-    design: np.ndarray
-    particle: int
-    cost: float
-    outcomes: Outcome
-    tested: bool
-    row: int
-    episode: int
+    design: np.ndarray  # the design [SI units], shape (parameter,)
+    particle: int  # its index among the final particles, or in its episode without a test
+    cost: float  # its mean cost by the scene's rule for failed trials
+    outcomes: Outcome  # of its trials, arrays of shape (trial,)
+    tested: bool  # whether they are those of the final test, or its episode's
+    row: int  # its index in its episode's population
+    episode: int  # index of an episode that simulated it: the last, where that did
 
 
 class Case(NamedTuple):
-    """A design with what simulates it.
-
-    Attributes:
-      scene: The scene.
-      space: The design space.
-      design: The design [SI units], shape (parameter,).
-      engine: Name of the engine.
-      policy: Name of the user's own policy that commands the hand; empty for the key frames alone.
-    """
+    """A design with what simulates it."""
 
     scene: Scene
     space: DesignSpace
-    design: np.ndarray
-    engine: str
+    design: np.ndarray  # the design [SI units], shape (parameter,)
+    engine: str  # name of the engine
+    # Name of the user's own policy that commands the hand; empty for the key frames alone
     policy: str = ""
 
     @property
@@ -179,7 +156,6 @@ def doubt(chosen: Chosen) -> str:
 
 
 def _place(record: Record, particle: int) -> tuple[int, int]:
-    """Index of an episode that simulated a final particle, and its row in the population."""
     last = record.done - 1
     row = int(record.history.ancestors[last, particle])
     if row >= 0:
@@ -199,16 +175,7 @@ def find_grasp(
     particle: int | None = None,
     trial: int | None = None,
 ) -> Grasp:
-    """A grasp of a run, by the numbers of trials.csv.
-
-    Args:
-      record: The run, with a finished episode at least.
-      episode: Number of the episode, from 1; None for the chosen particle's, or the last if
-        `particle` is given.
-      particle: Index of the particle; None for the chosen one in its episode, otherwise for the
-        episode's best.
-      trial: Index of the trial; None for its best one.
-    """
+    """A grasp of a run, by the numbers of trials.csv."""
     history = record.history
     _, particles, trials = history.outcomes.cost.shape
     asked = (

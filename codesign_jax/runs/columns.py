@@ -4,14 +4,10 @@ from typing import NamedTuple
 
 
 class CsvTable(NamedTuple):
-    """Columns of a table, in the file's order.
+    """Columns of a table, in the file's order."""
 
-    Attributes:
-      columns: Names of its own columns.
-      designs: What precedes the names of the design's columns, which come last; None without them.
-    """
-
-    columns: tuple[str, ...]
+    columns: tuple[str, ...]  # names of its own columns
+    # What precedes the names of the design's columns, which come last; None without them
     designs: str | None = None
 
     def head(self, designs: list[str]) -> list[str]:

@@ -159,7 +159,6 @@ def _resume(path: Path, settings: Settings, command: list[str]) -> list[str]:
 
 
 def _contents(scene: Scene, settings: Settings) -> dict[str, bytes]:
-    """Files that a run is made from: the scene's, and the user's own code."""
     return scene_files.contents(scene) | own.contents(settings.own)
 
 
@@ -198,7 +197,6 @@ def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str
 
 
 def _is_cut_short(path: Path, scene: Scene, settings: Settings, stored: dict[str, Any]) -> bool:
-    """Whether the run's start was cut short, of this very scene: what is there is as it was."""
     noted = manifest.digests(_contents(scene, settings))
     changed = manifest.changed_files(path, stored)
     missing = not any((path / name).exists() for name in changed)
@@ -206,7 +204,6 @@ def _is_cut_short(path: Path, scene: Scene, settings: Settings, stored: dict[str
 
 
 def _other_code(path: Path, settings: Settings, stored: dict[str, Any]) -> list[str]:
-    """How the user's own optimiser and cost differ from those that the run was made with."""
     found = []
     for name, content in own.contents(settings.own).items():
         if manifest.digests({name: content})[name] != stored["files"].get(name):
@@ -224,7 +221,6 @@ def _own_command(stored: dict[str, Any]) -> list[str]:
 
 
 def _diff(path: Path, name: str, text: str) -> list[str]:
-    """The first differences of a run's file from another text."""
     old = (path / name).read_text("utf-8").splitlines()
     ends = f"run/{name}", f"asked/{name}"
     lines = [*difflib.unified_diff(old, text.splitlines(), *ends, n=0)]
@@ -233,7 +229,6 @@ def _diff(path: Path, name: str, text: str) -> list[str]:
 
 
 def _extension_problems(scene: Scene, settings: Settings, before: int) -> list[str]:
-    """Why a run cannot have another number of episodes than it had."""
     asked = settings.episodes
     both = f"the run has {before} episodes, asked for are {asked}"
     if asked < before:
@@ -260,7 +255,6 @@ def _differences(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
 
 
 def _refuse_foreign(path: Path) -> None:
-    """Refuses a place where no run can begin, and files that no run has made."""
     if path.is_symlink() and not path.exists():
         raise InputError([f"--out {path} is a symbolic link to nothing"])
     if path.exists() and not path.is_dir():
@@ -275,7 +269,6 @@ def _refuse_foreign(path: Path) -> None:
 
 
 def _refuse_to_delete(path: Path) -> None:
-    """Refuses `--fresh` where more than a run's own files would go."""
     others = [n for n in _all(path) if not _is_of_a_run(path, n) or (path / n).is_symlink()]
     if others:
         raise InputError(

@@ -17,23 +17,15 @@ MOST = 10
 
 
 class Failure(NamedTuple):
-    """One failed world.
+    """One failed world."""
 
-    Attributes:
-      design: Design as simulated [SI units], shape (parameter,).
-      trial: Its trial.
-      state: State in which it was frozen, see `model.State`; empty if the engine does not tell.
-      status: Bits of `Status`.
-      bad_step: First bad time step, or -1 (STUCK).
-      place: Number of the episode, from 1, and indices of particle and trial.
-    """
-
-    design: np.ndarray
+    design: np.ndarray  # design as simulated [SI units], shape (parameter,)
     trial: Trial
+    # State in which it was frozen, see `model.State`; empty if the engine does not tell
     state: np.ndarray
-    status: int
-    bad_step: int
-    place: tuple[int, int, int]
+    status: int  # bits of `Status`
+    bad_step: int  # first bad time step, or -1 (STUCK)
+    place: tuple[int, int, int]  # number of the episode, from 1, and indices of particle and trial
 
 
 def save(folder: Path, episode: int, info: EpisodeInfo) -> list[Path]:

@@ -54,7 +54,6 @@ def begin_fetch(tree: Any) -> None:
 
 
 def _numbers(array: Any) -> Any:
-    """The numbers of a typed key, and anything else as it is."""
     typed = isinstance(array, jax.Array) and jnp.issubdtype(array.dtype, jax.dtypes.prng_key)
     return jax.random.key_data(array) if typed else array
 
@@ -177,14 +176,7 @@ class Loop:
         self._unsaved: Callable[[], None] | None = None
 
     def run(self) -> Generator[Request, tuple[State, EpisodeInfo], RunResult]:
-        """Runs what is left of the run; to stop it, `Stopped` is thrown in.
-
-        Raises:
-          AllFailed: If every trial of an episode or of the final test failed, in an earlier process
-            or this one.
-          RunError: If the run's checkpoints are another's, cannot be read now, or are all lost.
-          OSError: If an episode cannot be saved; earlier ones stay intact.
-        """
+        """Runs what is left of the run; to stop it, `Stopped` is thrown in."""
         record, signum = self._restore(), 0
         try:
             if record is None:
@@ -300,7 +292,6 @@ class Loop:
             self._unsaved = partial(self._close, record, e, fetched)
 
     def _close(self, record: Record, e: int, info: EpisodeInfo) -> None:
-        """Saves an episode and reports it."""
         records.add_report(record.history, e, info)
         self._save_failures(e, info)
         last = e + 1 == self.plan.settings.episodes or record.failed_status() is not None

@@ -159,7 +159,6 @@ def runs_inside(path: Path, pattern: str = "*") -> list[Path]:
 
 
 def _hint(path: Path) -> str:
-    """A hint at the runs in a folder of several, such as that of --seeds."""
     inside = runs_inside(path)
     some = " or ".join(map(str, inside[:2]))
     several = f"{len(inside)} run{'s' * (len(inside) > 1)}"
@@ -184,7 +183,6 @@ def _problem(stored: Any) -> str:
 
 
 def _fits(value: Any, types: Any) -> bool:
-    """Whether a value of JSON has types, see `_TYPES`."""
     if isinstance(types, list):
         return isinstance(value, list) and all(_fits(v, types[0]) for v in value)
     if isinstance(types, dict):

@@ -15,36 +15,24 @@ from codesign_jax.types import Outcome, failed
 
 
 class History(NamedTuple):
-    """Reports of all episodes; those not run yet are zero.
+    """Reports of all episodes; those not run yet are zero."""
 
-    Attributes:
-      population: Particles as simulated [SI units], shape (episode, particle, parameter).
-      outcomes: Arrays of shape (episode, particle, trial).
-      cost: Mean cost of each particle, shape (episode, particle).
-      weight: Normalised weights, shape (episode, particle).
-      ancestors: Row of the population that each new particle copies, -1 if it is from an earlier
-        episode, shape (episode, particle).
-    """
-
+    # Particles as simulated [SI units], shape (episode, particle, parameter)
     population: np.ndarray
-    outcomes: Outcome
-    cost: np.ndarray
-    weight: np.ndarray
+    outcomes: Outcome  # arrays of shape (episode, particle, trial)
+    cost: np.ndarray  # mean cost of each particle, shape (episode, particle)
+    weight: np.ndarray  # normalised weights, shape (episode, particle)
+    # Row of the population that each new particle copies, -1 if it is from an earlier episode,
+    # shape (episode, particle)
     ancestors: np.ndarray
 
 
 class Start(NamedTuple):
-    """The particle that a run starts from, as `codesign.seed_search` found it.
+    """The particle that a run starts from, as `codesign.seed_search` found it."""
 
-    Attributes:
-      design: The particle [SI units], shape (parameter,).
-      cost: Its cost, shape ().
-      candidates: Candidates that were drawn until it was found, int, shape ().
-    """
-
-    design: np.ndarray
-    cost: np.ndarray
-    candidates: np.ndarray
+    design: np.ndarray  # the particle [SI units], shape (parameter,)
+    cost: np.ndarray  # its cost, shape ()
+    candidates: np.ndarray  # candidates that were drawn until it was found, int, shape ()
 
 
 def empty_history(settings: Settings, num_parameters: int) -> History:
@@ -87,18 +75,13 @@ def add_report(history: History, episode: int, info: EpisodeInfo) -> None:
 
 @dataclasses.dataclass
 class Record:
-    """What a run has so far; the content of a checkpoint.
+    """What a run has so far; the content of a checkpoint."""
 
-    Attributes:
-      state: State of the optimiser.
-      history: Reports of the episodes.
-      test: Outcomes of the final test, shape (particle, trial), or None before it.
-      start: What the run started from; None if its optimiser looks for its start by itself.
-    """
-
-    state: State
-    history: History
+    state: State  # state of the optimiser
+    history: History  # reports of the episodes
+    # Outcomes of the final test, shape (particle, trial), or None before it
     test: Outcome | None = None
+    # What the run started from; None if its optimiser looks for its start by itself
     start: Start | None = None
 
     @property
@@ -138,11 +121,7 @@ def to_arrays(record: Record) -> dict:
 
 
 def from_arrays(arrays: dict) -> Record:
-    """Inverse of `to_arrays`; the history is copied, so that `add_report` may write to it.
-
-    Raises:
-      RunError: If they are not the arrays of a record, such as those of another version.
-    """
+    """Inverse of `to_arrays`; the history is copied, so that `add_report` may write to it."""
     try:
         s, h = arrays["state"], jax.tree.map(np.array, arrays["history"])
         key = jax.random.wrap_key_data(jnp.asarray(s["key"]))

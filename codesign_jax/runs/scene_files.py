@@ -57,11 +57,7 @@ def digest(scene: Scene, engine: str, designs: np.ndarray, *numbers: int) -> str
 
 
 def write_scene(scene: Scene, folder: Path, written: Mapping[str, bytes] | None = None) -> None:
-    """Writes a resolved scene, meshes included; `scene.load` of it returns an equal one.
-
-    Raises:
-      RuntimeError: If what was written does not read back as the same scene.
-    """
+    """Writes a resolved scene, meshes included; `scene.load` of it returns an equal one."""
     for name, content in (contents(scene) if written is None else written).items():
         with files.atomically(folder / name) as part:
             part.write_bytes(content)
@@ -78,7 +74,6 @@ def _mesh_name(shape: Shape, index: int) -> str:
 
 
 def _document(table: dict[str, Any], units: dict[str, str]) -> str:
-    """TOML of a table, with the units of its values as comments."""
     lines, place = [], ""
     for line in tomli_w.dumps(table).split("\n")[:-1]:  # texts may hold other ends of lines
         if header := re.fullmatch(r"\[+(.*?)\]+", line):

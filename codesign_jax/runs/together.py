@@ -99,7 +99,6 @@ def _group(
     every: int,
     after: float,
 ) -> Results:
-    """`optimize` of as many runs as fit into one process."""
     plan = next(iter(plans.values()))
     called = run_names({folder: own.settings for folder, own in plans.items()})
     with contextlib.ExitStack() as stack:
@@ -162,7 +161,6 @@ class _Together:
         return Results(ended)
 
     def _go_on(self, folder: Path, asking: Generator, reply: Any) -> None:
-        """Lets a run go on until it wants another episode or ends."""
         try:
             self.waiting[folder] = asking, asking.send(reply)
         except StopIteration as stop:
@@ -187,7 +185,6 @@ class _Together:
             self.loops[folder].run_directory.log(message)
 
     def _test(self, request: Request) -> Request | None:
-        """What the final test will ask for, if that is another program than an episode's."""
         settings, optimizer = self.plan.settings, self.plan.optimizer
         few = self.plan.finalists
         if settings.test_trials == 0 or few == len(request.state.particles):
@@ -218,7 +215,6 @@ class _Together:
                 self._fail(folder, error)
 
     def _throw(self, error: Exception) -> None:
-        """Ends every run that still waits."""
         for folder, (asking, _) in self.waiting.items():
             try:
                 asking.throw(error)

@@ -56,7 +56,6 @@ _check_once = functools.lru_cache(maxsize=64)(_check)
 
 
 def _paths(tree: Any) -> Iterator[tuple[str, Any]]:
-    """Leaves by key, such as hand.finger[0].tilt."""
     for path, value in jax.tree_util.tree_leaves_with_path(tree):
         yield jax.tree_util.keystr(path).lstrip("."), value
 
@@ -84,7 +83,6 @@ def _range_problem(key: str, value: float, expected: schema.Range) -> str | None
 
 
 def _known(scene: Scene) -> bool:
-    """Whether every number is one number, and not traced."""
     leaves = jax.tree.leaves(scene)
     return all(np.ndim(v) == 0 and not isinstance(v, jax.core.Tracer) for v in leaves)
 
@@ -98,10 +96,6 @@ def with_trial(scene: Scene, trial: Trial) -> Scene:
     """The scene with a trial's factors on its numbers.
 
     Those are the friction of all contacts, the shear modulus and the masses of fingers and palm.
-
-    Args:
-      scene: The scene.
-      trial: One trial; its factors on the object's mass and size are applied by the model.
     """
     hand, objects, contact, fixtures = scene.hand, scene.objects, scene.contact, scene.fixture
     if trial.stiffness is not None:

@@ -15,17 +15,12 @@ ENGINES = ("structured", "mujoco", "mjx")
 
 
 class Effect(NamedTuple):
-    """An effect's description.
+    """An effect's description."""
 
-    Attributes:
-      meaning: What is simulated, in a line.
-      refused: Why an engine cannot do a value of the effect, by engine and value.
-      hull: Whether it acts with the surface "hull" alone.
-    """
-
-    meaning: str
+    meaning: str  # what is simulated, in a line
+    # Why an engine cannot do a value of the effect, by engine and value
     refused: Mapping[str, Mapping[Any, str]] = {}
-    hull: bool = False
+    hull: bool = False  # whether it acts with the surface "hull" alone
 
 
 _PRESCRIBED = (
@@ -89,11 +84,7 @@ def refusals(effects: Any, engine: str) -> dict[str, str]:
 
 
 def refuse(effects: Any, engine: str) -> None:
-    """Checks that an engine can do what a scene asks for.
-
-    Raises:
-      InputError: With a line for each effect that it cannot do.
-    """
+    """Checks that an engine can do what a scene asks for."""
     problems = []
     for name, reason in refusals(effects, engine).items():
         able = [e for e in ENGINES if name not in refusals(effects, e)]

@@ -132,7 +132,6 @@ def _check_table(hand: Hand, where: str, problems: list[str]) -> dict[str, Param
 
 
 def _fits(path: str, value: Numbers, row: Parameter, hand: Hand, problems: list[str]) -> bool:
-    """Whether a value is a number, or as many as there are fingers for what each has its own of."""
     if not isinstance(value, tuple) or (row.per == "finger" and len(value) == len(hand.finger)):
         return True
     if row.per != "finger":
@@ -227,7 +226,6 @@ def _check_free(free: Free, row: Parameter, path: str, hand: Hand, problems: lis
 
 
 def _check_sections(hand: Hand, where: str, problems: list[str]) -> None:
-    """Every section that the table or a preset allows needs an air chamber and a legal pressure."""
     places = [where, *(f"{where}.preset {preset.name}" for preset in hand.preset)]
     for path, bounds in zip(places, all_bounds(hand), strict=True):
         lowest = {name: low for name, (low, _) in bounds.items()}

@@ -44,35 +44,24 @@ _TERM = re.compile(
 @table
 @dataclasses.dataclass(frozen=True)
 class Term:
-    """A named number times a factor.
+    """A named number times a factor."""
 
-    Attributes:
-      name: A parameter of the design, or a number of the scene.
-      factor: What it is multiplied by; None for 1.
-    """
-
-    name: str
+    name: str  # a parameter of the design, or a number of the scene
+    # What it is multiplied by; None for 1
     factor: float | None = quantity("", -100, 100, default=None)
 
 
 @table
 @dataclasses.dataclass(frozen=True)
 class Sum:
-    """A number and named terms.
+    """A number and named terms."""
 
-    Attributes:
-      unit: Unit of the number, of `RANGES`; the names stand for SI units.
-      number: The number; None for none.
-      term: The terms.
-    """
-
-    unit: str
-    number: float | None = quantity("", -1e6, 1e6, default=None)
+    unit: str  # unit of the number, of `RANGES`; the names stand for SI units
+    number: float | None = quantity("", -1e6, 1e6, default=None)  # the number; None for none
     term: tuple[Term, ...] = ()
 
 
 def _sum(unit: str, **kwargs: Any) -> Any:
-    """A field of a frame that is a sum, or has one for each finger."""
     return dataclasses.field(metadata={"unit": unit}, **kwargs)
 
 
@@ -185,15 +174,7 @@ def structure(control: Control) -> Control:
 
 
 def load(name: str | Path, hand: Hand, *, overrides: Mapping[Any, Any] | None = None) -> Control:
-    """Reads a control and checks what does not depend on the scene's numbers; `check` does.
-
-    Args:
-      name: Name of a built-in control, or a path ending in .toml.
-      overrides: Values by key path that replace the file's; see `keypaths`.
-
-    Raises:
-      InputError: With every problem of the file.
-    """
+    """Reads a control and checks what does not depend on the scene's numbers; `check` does."""
     problems: list[str] = []
     table, path, places = keypaths.read("controls", name, overrides, problems)
     control = _Reader(table, path.name, len(hand.finger), problems).control()
@@ -203,11 +184,7 @@ def load(name: str | Path, hand: Hand, *, overrides: Mapping[Any, Any] | None = 
 
 
 def read_parameters(rows: Any, where: str) -> tuple[ControlParameter, ...]:
-    """Parameters from rows as those of a file, for what else than key frames has some.
-
-    Raises:
-      InputError: With every problem, by key path.
-    """
+    """Parameters from rows as those of a file, for what else than key frames has some."""
     problems: list[str] = []
     reader = _Reader({}, where, 0, problems)
     found = [schema.parse(ControlParameter, row, where, problems) for row in rows]
@@ -281,7 +258,6 @@ def pressures(scene: Any, params: Params) -> list[tuple[Any, jax.Array]]:
 
 
 def _names(scene: Any, params: Params) -> dict[str, Any]:
-    """What the names of a sum stand for, in SI units."""
     found = _scene_times(scene)
     found |= {key: getattr(scene.arm, key) for key in ("start_height", "zero_height")}
     found |= {f"arm_{axis}": params.arm[i] for i, axis in enumerate(POSE)}
@@ -313,11 +289,7 @@ def _factors(total: Sum) -> dict[str, Any]:
 
 
 def read_sum(value: Any, unit: str) -> Sum | str:
-    """A value of a file as a sum, or what is wrong with it.
-
-    Args:
-      value: A number, or text such as "zero_height + 0.5 * arm_z - 0.01".
-    """
+    """A value of a file as a sum, or what is wrong with it."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return Sum(unit, float(value))
     if not isinstance(value, str) or not value.strip():
@@ -342,7 +314,6 @@ def read_sum(value: Any, unit: str) -> Sum | str:
 
 
 def _text(total: Sum) -> str | float:
-    """What `read_sum` reads as this sum."""
     if not total.term:
         return float(total.number or 0.0)
     parts = [t.name if t.factor is None else f"{float(t.factor)!r} * {t.name}" for t in total.term]
@@ -479,11 +450,7 @@ class _Reader:
 
 
 def check(scene: Any, where: str) -> list[str]:
-    """What is wrong with key frames in some design of the hand's presets.
-
-    Args:
-      scene: The scene, its numbers not traced.
-    """
+    """What is wrong with key frames in some design of the hand's presets."""
     own = {row.name: _ends(row.row) for row in scene.control.parameter}
     fixed = {name: (value, value) for name, value in _scene_times(scene).items()}
     problems = [*_falling(scene.control.frame, fixed | own, where)]
@@ -498,7 +465,6 @@ def _ends(row: Parameter) -> tuple[float, float]:
 
 
 def _range(factors: Mapping[str, float], ends: Mapping[str, tuple[float, float]]) -> tuple:
-    """Smallest and largest value of a sum over a box."""
     both = [sorted((f * ends[n][0], f * ends[n][1])) for n, f in factors.items() if n]
     return tuple(factors.get("", 0.0) + sum(pair[side] for pair in both) for side in (0, 1))
 
@@ -523,7 +489,6 @@ def _falling(frames: tuple[Frame, ...], ends: Mapping, where: str) -> Iterator[s
 
 
 def _walls(hand: Hand) -> Iterator[tuple]:
-    """Lowest and highest pressures, and lowest and highest limits of the walls, by finger."""
     for bounds in hands.all_bounds(hand):
         both = zip(bounds["wall"], bounds.get("tip_wall", bounds["wall"]), strict=True)
         thinnest = [map(min, *ends) for ends in both]  # of a tapered finger
@@ -534,7 +499,6 @@ def _walls(hand: Hand) -> Iterator[tuple]:
 def _too_high(
     frames: tuple[Frame, ...], own: Mapping, low: Any, high: Any, limits: Any, where: str
 ) -> Iterator[str]:
-    """Pressures above the limit of the wall, or below zero, in some design."""
     for i, frame in enumerate(frames):
         for finger, value in enumerate(frame.pressure or ()):
             factors = _factors(value)

@@ -20,11 +20,7 @@ _INDEX = re.compile(r"\[(\d+)\]")
 def read(
     kind: str, name: str | pathlib.Path, overrides: Mapping[Any, Any] | None, problems: list[str]
 ) -> tuple[dict, pathlib.Path, Any]:
-    """Reads a file of hands, objects or controls, with other values in it.
-
-    Returns:
-      Its table, its path, and what `as_given` takes to name the values as they were given.
-    """
+    """Reads a file of hands, objects or controls, with other values in it."""
     path = library.find(kind, name)
     table, changes = library.read(path), flatten(overrides or {})
     root = kind.removesuffix("s") if kind != "objects" else kind
@@ -32,14 +28,7 @@ def read(
 
 
 def parse(pairs: Iterable[str]) -> dict[Path, Any]:
-    """Reads KEY=VALUE; the later of two values of one key holds.
-
-    Args:
-      pairs: The pairs; a value is TOML, and what is none, such as a bare word, is a string.
-
-    Raises:
-      InputError: With every pair that is not KEY=VALUE.
-    """
+    """Reads KEY=VALUE; the later of two values of one key holds."""
     found: dict[Path, Any] = {}
     problems = []
     for pair in pairs:
@@ -57,15 +46,7 @@ def parse(pairs: Iterable[str]) -> dict[Path, Any]:
 
 
 def flatten(values: Mapping[Any, Any]) -> dict[Path, Any]:
-    """Key paths of nested tables: {"solver": {"iterations": 5}} has ("solver", "iterations").
-
-    Args:
-      values: Values by key, dotted key path or tuple of keys; a value that is a mapping holds
-        further keys.
-
-    Raises:
-      InputError: If a key is neither, or tables or keys are nested too deep.
-    """
+    """Key paths of nested tables: {"solver": {"iterations": 5}} has ("solver", "iterations")."""
     if library.too_deep(values):
         deepest = library.DEEPEST
         raise schema.InputError([f"values are nested more than {deepest} tables deep"])
@@ -91,15 +72,10 @@ def below(changes: Mapping[Path, Any], key: str) -> dict[Path, Any]:
 def apply(
     table: dict, changes: Mapping[Path, Any], where: str, problems: list[str], *, root: str = ""
 ) -> dict[str, str]:
-    """Changes values of a file that was read; the file's schema checks keys and values afterwards.
+    """Changes values of a file that was read, before its schema checks keys and values.
 
-    Args:
-      changes: Values by path.
-      root: Key of the scene that leads into the file, such as "objects".
-
-    Returns:
-      Places of the changes as the schema names them, such as "paper.toml.noise", and as they were
-      given, such as "objects.noise"; for `as_given`.
+    Returns places of the changes as the schema names them, such as "paper.toml.noise", with what
+    was given, such as "objects.noise"; for `as_given`. `root` is the scene's key of the file.
     """
     places: dict[str, str] = {}
     for path, value in changes.items():
@@ -108,11 +84,7 @@ def apply(
 
 
 def as_given(problems: list[str], places: Mapping[str, str]) -> list[str]:
-    """Messages about changed values, with the keys as they were given instead of the file's.
-
-    Args:
-      problems: Messages that begin with a key path in a file.
-    """
+    """Messages about changed values, with the keys as they were given instead of the file's."""
     longest = sorted(places, key=len, reverse=True)
     return [_as_given(problem, longest, places) for problem in problems]
 
@@ -170,7 +142,6 @@ def _apply(
 
 
 def _names(entries: list) -> list[str]:
-    """What the entries of a list are called: their names, or their indices without names."""
     names = [str(e["name"]) for e in entries if isinstance(e, dict) and "name" in e]
     return names or [str(i) for i in range(len(entries))]
 
@@ -184,7 +155,6 @@ def _index(entries: list, key: str) -> int | None:
 
 
 def _path(key: str) -> Path:
-    """Splits "hand.finger[0].tilt" at its dots, indices in brackets as keys of their own."""
     return tuple(part.strip() for part in _INDEX.sub(r".\1", key).split("."))
 
 

@@ -36,11 +36,7 @@ def available(kind: str) -> dict[str, Path]:
 
 
 def find(kind: str, name: str | Path) -> Path:
-    """Resolves a built-in name or a path ending in .toml to a file.
-
-    Raises:
-      InputError: if neither a file nor a built-in of that name exists.
-    """
+    """Resolves a built-in name or a path ending in .toml to a file."""
     path = Path(name)
     if path.suffix == ".toml":
         if is_file(path):
@@ -60,7 +56,6 @@ def find(kind: str, name: str | Path) -> Path:
 
 
 def _no_file(kind: str, path: Path) -> str:
-    """Why a path that is no .toml file is none of a kind."""
     if os.path.isdir(path):
         inside = sorted(path.glob("*.toml"))[:1]
         return "is a folder" + (f"; did you mean {str(inside[0])!r}?" if inside else "")
@@ -73,11 +68,7 @@ def _no_file(kind: str, path: Path) -> str:
 
 
 def is_file(path: Path) -> bool:
-    """Whether a path is a file that can be asked for: not too long a name, no folder that is shut.
-
-    Raises:
-      InputError: If the system does not say, with its reason.
-    """
+    """Whether a path is a file; an InputError if the system does not say."""
     try:
         return path.is_file()
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name, of some versions
@@ -86,12 +77,7 @@ def is_file(path: Path) -> bool:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Reads a TOML file.
-
-    Raises:
-      InputError: if the file cannot be read or is too large, is not UTF-8 text or not valid TOML,
-        with the parser's position.
-    """
+    """Reads a TOML file."""
     try:
         with path.open("rb") as file:
             data = file.read(MOST_BYTES + 1)
@@ -109,12 +95,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def parse(text: str) -> dict[str, Any]:
-    """TOML text as a table.
-
-    Raises:
-      ValueError: If it is no TOML, or has a whole number of thousands of digits.
-      RecursionError: If tables and arrays are nested too deep.
-    """
+    """TOML text as a table."""
     if _LONG_KEY.search(text):
         raise RecursionError
     # Line ends as a text file's: tomllib refuses a lone carriage return.

@@ -88,7 +88,6 @@ def load(
 
 
 def _leave_out(table: dict, changes: dict[tuple, Any], where: str) -> None:
-    """Takes the keys of `GONE` out of a scene's table and its changes, with a warning."""
     found = []
     for key in (tuple(name.split(".")) for name in GONE):
         inside = table.get(key[0])
@@ -150,7 +149,7 @@ def _preset(name: str | Path | None, problems: list[str]) -> dict[str, dict[str,
 
 
 def _beside(path: Path, name: str) -> str | Path:
-    """Paths inside a scene file are relative to that file, whatever the working directory holds."""
+    # Relative to the scene's file, whatever the working directory holds.
     return path.parent / name if name.endswith(".toml") else name
 
 
@@ -185,12 +184,7 @@ def _fixture_problems(fixture: Fixture, where: str) -> list[str]:
 
 
 def check_together(scene: SceneFile, where: str) -> list[str]:
-    """Returns what is wrong with numbers that are each in range, but do not go together.
-
-    Args:
-      scene: The scene, its numbers not traced.
-      where: Key path shown before those of the scene.
-    """
+    """Returns what is wrong with numbers that are each in range, but do not go together."""
     problems = []
     p, h = scene.phases, scene.discretization.timestep
     times = [("approach", p.approach), ("inflate", p.inflate), ("lift", p.lift)]

@@ -173,7 +173,6 @@ class Shape(_ShapeFile):
 
     @property
     def _base(self) -> tuple[float, ...]:
-        """Orientation of the body in the frame of its file."""
         return self.mesh.upright if self.mesh else (1.0, 0.0, 0.0, 0.0)
 
     @property
@@ -281,7 +280,6 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Obj
 
 
 def _size_problems(given: _ObjectSetFile, path: Path) -> list[str]:
-    """Why the mesh files of a set are too large to be read, if they are."""
     total = 0
     for file in [path.parent / shape.file for shape in given.object if shape.file is not None]:
         with contextlib.suppress(OSError, ValueError):  # said where it is read

@@ -18,32 +18,25 @@ _CIRCLE = np.stack([np.cos(_TURN), np.sin(_TURN), 0 * _TURN], -1)
 
 
 class Primitive(NamedTuple):
-    """A shape of objects.
+    """A shape of objects."""
 
-    Attributes:
-      sizes: What each number of its `size` is.
-      geom: Name of MuJoCo's geom type.
-      upright: Orientation on the table before the trial's yaw, as a unit quaternion (w, x, y, z).
-      reach: How far it reaches from its centre in a direction [m], a function of its sizes and of a
-        unit vector in its own frame, shape (3,): on a table with this normal it rests so high.
-      volume: Volume [m^3], a function of its sizes.
-      radius: Distance of its farthest point from the centre [m], a function of its sizes.
-      half_extents: Of its bounding box in its own frame [m], three numbers, likewise.
-      inertia: Principal inertia of the solid per mass [m^2], three numbers, likewise.
-      outline: Lines of a sketch in its own frame [m], arrays (point, 3), likewise.
-      triangles: Its surface as a trimesh.Trimesh, likewise.
-    """
-
-    sizes: tuple[str, ...]
-    geom: str
+    sizes: tuple[str, ...]  # what each number of its `size` is
+    geom: str  # name of MuJoCo's geom type
+    # Orientation on the table before the trial's yaw, as a unit quaternion (w, x, y, z)
     upright: tuple[float, float, float, float]
+    # How far it reaches from its centre in a direction [m], a function of its sizes and of a unit
+    # vector in its own frame, shape (3,): on a table with this normal it rests so high
     reach: Callable[[Any, Any], Any]
-    volume: Callable[[Any], Any]
+    volume: Callable[[Any], Any]  # volume [m^3], a function of its sizes
+    # Distance of its farthest point from the centre [m], a function of its sizes
     radius: Callable[[Any], Any]
+    # Of its bounding box in its own frame [m], three numbers, likewise
     half_extents: Callable[[Any], tuple]
+    # Principal inertia of the solid per mass [m^2], three numbers, likewise
     inertia: Callable[[Any], tuple]
+    # Lines of a sketch in its own frame [m], arrays (point, 3), likewise
     outline: Callable[[Any], list[np.ndarray]]
-    triangles: Callable[[Any], Any]
+    triangles: Callable[[Any], Any]  # its surface as a trimesh.Trimesh, likewise
 
 
 def block_inertia(mass: Any, x: Any, y: Any, z: Any) -> tuple:
@@ -84,7 +77,6 @@ def _cylinder_outline(size: Any) -> list[np.ndarray]:
 
 
 def _capsule_outline(size: Any) -> list[np.ndarray]:
-    """Both rims of the cylinder, and the whole outline in two planes through the axis."""
     flat, top = _CIRCLE * size[0], np.array([0, 0, size[1]])
     half = flat[:13, [0, 2, 1]]  # from x over z to -x
     plane = np.concatenate([half + top, -half - top, half[:1] + top])

@@ -51,7 +51,6 @@ def contact_radius(hand: Hand) -> float:
 
 
 def _widened(hand: Hand) -> list[Numbers]:
-    """Upper bounds of the height that presets give instead of the table's, in its unit."""
     names = ("height", "tip_height")
     free = [f for preset in hand.preset for f in preset.free if f.name in names]
     return [f.high for f in free if f.high is not None]
@@ -74,9 +73,6 @@ def refuse(objects: ObjectSet, radius: Any) -> None:
 
     Args:
       radius: Radii of contact spheres [m], any shape; of traced ones nothing is known.
-
-    Raises:
-      InputError: With every mesh.
     """
     if any(isinstance(v, jax.core.Tracer) for v in (radius, objects.noise.size)):
         return

@@ -23,15 +23,10 @@ _NEUTRAL = 1e-6
 
 
 class Resting(NamedTuple):
-    """A pose in which an object rests on the table.
+    """A pose in which an object rests on the table."""
 
-    Attributes:
-      orientation: Of the frame of its file, a unit quaternion (w, x, y, z).
-      probability: How often it comes to rest so, dropped in any orientation.
-    """
-
-    orientation: tuple[float, ...]
-    probability: float
+    orientation: tuple[float, ...]  # of the frame of its file, a unit quaternion (w, x, y, z)
+    probability: float  # how often it comes to rest so, dropped in any orientation
 
 
 def turned(orientation: Sequence[float], base: Sequence[float]) -> tuple[float, ...]:
@@ -39,7 +34,6 @@ def turned(orientation: Sequence[float], base: Sequence[float]) -> tuple[float, 
 
     Args:
       orientation: Of the frame of its file, three angles [deg] or four numbers.
-      base: Of the body in that frame, a unit quaternion (w, x, y, z).
     """
     from scipy.spatial.transform import Rotation  # takes a while to import
 
@@ -80,7 +74,6 @@ def stable(points: np.ndarray, inertia: Sequence[float], base: Sequence[float]) 
     Args:
       points: Vertices of the convex hull from the centre of mass [m], shape (point, 3).
       inertia: Principal moments per mass [m^2].
-      base: Orientation of the body in the frame of its file, a unit quaternion (w, x, y, z).
     """
     import trimesh
     from scipy.spatial.transform import Rotation
@@ -116,17 +109,12 @@ def _levelled(turn: np.ndarray) -> np.ndarray:
 
 
 def _plainness(turn: np.ndarray) -> tuple[float, float]:
-    """The larger, the less a rotation turns, and the nearer its axes are to those of the world."""
+    # How little it turns, then how near its axes are to those of the world.
     return round(float(np.trace(turn)), 6), float(np.abs(turn).max(0).sum())
 
 
 def chosen(pose: str, found: Callable[[], list[Resting]]) -> Resting | str:
-    """The pose of this name, or what is wrong with it.
-
-    Args:
-      pose: "stable" for the most probable one, "stable:2" for the second.
-      found: Returns what `stable` does.
-    """
+    """The pose of this name, or what is wrong with it."""
     match = _STABLE.fullmatch(pose)
     if match is None:
         return 'must be "stable", or "stable:2" for the second most probable pose'
@@ -146,7 +134,6 @@ def fall(
 
     Args:
       height: Height of its centre on a table of these normals in its frame, shape (3, n), to (n,).
-      vertical: The vertical in its frame, a unit vector.
     """
     around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     now, tilt = np.asarray(vertical, float), np.deg2rad(1.0)

@@ -80,10 +80,7 @@ def quantity(
 ) -> Any:
     """Declares a numeric dataclass field with its unit and closed range [low, high].
 
-    Args:
-      structure: Whether compiled programs depend on the number; the others are leaves, see `table`.
-      typical: A usual value, see `typical`; by default one well inside the range.
-      **kwargs: Further arguments of `dataclasses.field`.
+    Programs are compiled for a number of the `structure`; others are leaves, see `table`.
     """
     if typical is None:
         typical = math.sqrt(low * high) if low > 0 else 0.01 * high
@@ -163,15 +160,7 @@ def _hints(cls: type) -> dict[str, Any]:
 
 
 def parse(cls: type[T], table: Any, path: str, problems: list[str]) -> T | None:
-    """Builds a frozen dataclass from a TOML table, appending every problem to `problems`.
-
-    Args:
-      cls: Dataclass to build; fields may be numbers, strings, booleans, dataclasses or tuples of
-        these.
-
-    Returns:
-      The dataclass, or None if this table has a problem.
-    """
+    """Builds a frozen dataclass from a TOML table, appending every problem to `problems`."""
     if not isinstance(table, dict):
         problems.append(f"{path} must be a table, not {type(table).__name__}")
         return None
@@ -250,7 +239,6 @@ def _required(field: dataclasses.Field) -> bool:
 
 
 def _value(hint: Any, value: Any, path: str, field: dataclasses.Field, problems: list[str]) -> Any:
-    """Checks one value against its type hint and its field's metadata."""
     if isinstance(hint, types.UnionType):
         # "X | None": TOML has no null, so a given value is an X. "X | tuple[X, ...]": one or many.
         kinds = [a for a in typing.get_args(hint) if a is not type(None)]
@@ -300,7 +288,6 @@ def _scalar(hint: Any, value: Any, path: str, field: dataclasses.Field, problems
 
 
 def _kind(hint: type, field: dataclasses.Field) -> str:
-    """What a value is to be, in words."""
     if hint is bool:
         return "true or false"
     if hint is str:

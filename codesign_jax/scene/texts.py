@@ -32,11 +32,7 @@ def printable(message: str) -> str:
 
 
 def problem(path: str, text: str, *, lines: bool = False) -> str | None:
-    """Returns why a text is none that a file, a table or a terminal could hold, or None.
-
-    Args:
-      lines: Whether it may have several lines.
-    """
+    """Returns why a text is none that a file, a table or a terminal could hold, or None."""
     if len(text) > MOST_LETTERS:
         return f"{path} has {len(text):,} characters, more than {MOST_LETTERS:,}"
     allowed = "\n\r\t" if lines else ""

@@ -18,9 +18,6 @@ def refuse(params: Params) -> None:
     """Refuses parameters that were given in other units than SI and radians.
 
     As `DesignSpace.refuse_unit_slips`, for parameters with any leading axes.
-
-    Raises:
-      InputError: With every such number and its suggested value.
     """
     if any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(params)):
         return
@@ -73,5 +70,4 @@ def slips(name: str, row: str, values: np.ndarray) -> list[str]:
 
 
 def _plain(value: float) -> float:
-    """A number as it was most likely written: a float32 as a float has nine more digits."""
-    return float(f"{value:.7g}")
+    return float(f"{value:.7g}")  # as it was written: a float32 as a float has nine more digits

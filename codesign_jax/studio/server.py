@@ -99,15 +99,7 @@ def _cookie(headers: Headers, name: str) -> str:
 
 
 def listen(guard: Guard, tab: Callable[[ServerConnection], None], host: str, port: int) -> Server:
-    """A server that listens, and serves once `serve_forever` is called.
-
-    Args:
-      tab: Takes the connection of one tab, and returns when that is over.
-      port: Port; 0 for one that is free.
-
-    Raises:
-      OSError: If it cannot listen there.
-    """
+    """A server that listens, and serves once `serve_forever` is called."""
     quiet = logging.getLogger(__name__)
     quiet.setLevel(logging.CRITICAL)  # what strangers send is no error of ours
     return serve(

@@ -80,11 +80,7 @@ class Studio:
         self._ended = False
 
     def listen(self, host: str, port: int) -> tuple[Server, str]:
-        """A server whose `serve_forever` serves the studio, and the page's address.
-
-        Raises:
-          InputError: If it cannot listen there.
-        """
+        """A server whose `serve_forever` serves the studio, and the page's address."""
         guard = server.Guard(_page(), everywhere=host not in LOCAL)
         try:
             listening = server.listen(guard, self.serve, host, port)
@@ -122,7 +118,6 @@ class Studio:
 
 
 def _deliver(tab: Tab, connection: ServerConnection) -> None:
-    """Sends a tab's messages until it is closed."""
     with contextlib.suppress(ConnectionClosed, OSError):
         while (messages := tab.messages()) is not None:
             for kind, content in messages.items():

@@ -50,24 +50,16 @@ LOOKED_AT = 15
 
 
 class View(NamedTuple):
-    """What a tab asks to be shown.
+    """What a tab asks to be shown."""
 
-    Attributes:
-      design: The design [SI units], shape (parameter,).
-      accuracy: Name of an accuracy; empty for the scene's own.
-      shape: Index of the object, where there is no noise.
-      noise: Which of the trials of the verdict it is, with its object; None without noise.
-      trials: Number of trials of the verdict.
-      resting: Whether the sliders rest, so that the verdict may follow.
-      number: The tab's own number of the request; None for a design that the studio puts there.
-    """
-
-    design: np.ndarray
-    accuracy: str
-    shape: int
+    design: np.ndarray  # the design [SI units], shape (parameter,)
+    accuracy: str  # name of an accuracy; empty for the scene's own
+    shape: int  # index of the object, where there is no noise
+    # Which of the trials of the verdict it is, with its object; None without noise
     noise: int | None
-    trials: int
-    resting: bool
+    trials: int  # number of trials of the verdict
+    resting: bool  # whether the sliders rest, so that the verdict may follow
+    # The tab's own number of the request; None for a design that the studio puts there
     number: int | None
 
 
@@ -299,7 +291,6 @@ class Tab:
         return sum(len(part.cost) for part in self._outcomes)
 
     def _show(self, view: View) -> None:
-        """Simulates a grasp and sends it."""
         if view.accuracy not in self._desk.benches:
             self.send("state", "compiling for this accuracy: up to a minute the first time ...")
         bench, before = self._desk.bench(view.accuracy), self._shown
@@ -329,7 +320,6 @@ class Tab:
     # ---- a search from here
 
     def _begin(self) -> None:
-        """Begins a search from the design that is shown, or ends the one that goes on."""
         shown = self._current()
         if self._search:
             self._end_search()
@@ -406,7 +396,6 @@ class Tab:
         self._command("report", str(self._desk.options.run_folder))
 
     def _command(self, *words: str) -> None:
-        """Runs another command beside the simulation, and shows what it says."""
         line = subprocess.list2cmdline(["codesign", *words])
         self.send("done", f"{line}\n...")
 
@@ -419,7 +408,6 @@ class Tab:
 
 
 def _told(shown: Shown) -> dict[str, Any]:
-    """A grasp as the page shows it."""
     view, bench, grasp = shown
     scene, space = bench.case.scene, bench.case.space
     replay = viewer.data(scene, grasp) | {"loop": True}
@@ -450,7 +438,6 @@ def _told(shown: Shown) -> dict[str, Any]:
 
 
 def _deepest(shown: Shown) -> str:
-    """The deepest overlap of a grasp between its approach and its end or loss, in words."""
     scene, grasp = shown.bench.case.scene, shown.grasp
     motion = bodies.motion(scene, grasp)
     end = min(scene.window[1], float(grasp.outcome.lost_time))

@@ -20,21 +20,13 @@ WORTH_KEEPING = 0.1  # time to build from which a grid is kept [s]; reading one 
 
 
 class Grid(NamedTuple):
-    """Signed distances at the nodes of a regular grid in the body's frame.
+    """Signed distances at the nodes of a regular grid in the body's frame."""
 
-    Attributes:
-      origin: Position of node (0, 0, 0) [m], shape (3,).
-      cell: Distance between neighbouring nodes [m].
-      values: Distances at the nodes [m], float32, shape (nx, ny, nz).
-      error: Error of interpolation that 99 % of points near the surface stay under [m].
-      worst: Largest error at any of these points [m]: sharp corners are rounded by so much.
-    """
-
-    origin: np.ndarray
-    cell: float
-    values: np.ndarray
-    error: float
-    worst: float
+    origin: np.ndarray  # position of node (0, 0, 0) [m], shape (3,)
+    cell: float  # distance between neighbouring nodes [m]
+    values: np.ndarray  # distances at the nodes [m], float32, shape (nx, ny, nz)
+    error: float  # error of interpolation that 99 % of points near the surface stay under [m]
+    worst: float  # largest error at any of these points [m]: sharp corners are rounded by so much
 
 
 def build(vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float) -> Grid:
@@ -49,9 +41,6 @@ def build(vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float) -
       faces: Vertex indices, shape (face, 3).
       bound: Largest error [m].
       reach: How far beyond the surface the grid goes [m]; see `codesign_jax.scene.reach`.
-
-    Raises:
-      ValueError: if the grid would have more than `MAX_NODES` nodes, or take more than `MAX_WORK`.
     """
     points = near_surface(vertices, faces, 3000)
     exact = signed_distance(vertices, faces, points)

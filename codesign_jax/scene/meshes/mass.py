@@ -13,19 +13,12 @@ _SYMMETRIC = 1e-6
 
 
 class MassProperties(NamedTuple):
-    """A body; its frame sits at the centre of mass along the principal axes.
+    """A body; its frame sits at the centre of mass along the principal axes."""
 
-    Attributes:
-      volume: Volume [m^3].
-      centre: Centre of mass in the file's frame [m], shape (3,).
-      axes: Principal axes as columns, in the file's frame, a rotation, shape (3, 3).
-      inertia: Principal moments per mass [m^2], shape (3,).
-    """
-
-    volume: float
-    centre: np.ndarray
-    axes: np.ndarray
-    inertia: np.ndarray
+    volume: float  # volume [m^3]
+    centre: np.ndarray  # centre of mass in the file's frame [m], shape (3,)
+    axes: np.ndarray  # principal axes as columns, in the file's frame, a rotation, shape (3, 3)
+    inertia: np.ndarray  # principal moments per mass [m^2], shape (3,)
 
 
 def body(

@@ -31,27 +31,16 @@ _MOST_PARTS = 1000
 
 
 class Read(NamedTuple):
-    """A mesh file.
+    """A mesh file."""
 
-    Attributes:
-      vertices: Positions in the file's unit, shape (vertex, 3).
-      faces: Vertex indices, shape (face, 3).
-      content: The file's bytes, all of which the mesh was read from.
-      digest: Their SHA-256.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    content: bytes
-    digest: str
+    vertices: np.ndarray  # positions in the file's unit, shape (vertex, 3)
+    faces: np.ndarray  # vertex indices, shape (face, 3)
+    content: bytes  # the file's bytes, all of which the mesh was read from
+    digest: str  # their SHA-256
 
 
 def read(path: Path) -> Read:
-    """Reads a mesh file of one of `FORMATS`.
-
-    Raises:
-      InputError: If there is no such file, it is too large, or it is no mesh.
-    """
+    """Reads a mesh file of one of `FORMATS`."""
     if not library.is_file(path):
         raise InputError([f"no file {shown(str(path))}"])
     kind = path.suffix.lower().removeprefix(".")
@@ -69,11 +58,7 @@ def read(path: Path) -> Read:
 
 
 def parsed(path: Path, content: bytes) -> Read:
-    """What a file of this name and content has.
-
-    Raises:
-      InputError: If it is no mesh.
-    """
+    """What a file of this name and content has."""
     kind = path.suffix.lower().removeprefix(".")
     if foreign := texts.foreign(content):
         raise InputError([f"{path.name}: {foreign}"])
@@ -88,7 +73,6 @@ def parsed(path: Path, content: bytes) -> Read:
 
 
 def _parse(content: bytes, kind: str) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of a file's bytes."""
     options: dict[str, Any] = {}
     if kind in ("glb", "gltf"):
         _check_gltf(content)
@@ -108,12 +92,10 @@ def _parse(content: bytes, kind: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _is_binary_stl(content: bytes) -> bool:
-    """Whether the length is the one that a binary STL's header says."""
     return len(content) >= 84 and len(content) == 84 + 50 * int.from_bytes(content[80:84], "little")
 
 
 def _check_gltf(content: bytes) -> None:
-    """Refuses glTF that needs other files, or grows when it is read."""
     text = content[20 : 20 + int.from_bytes(content[12:16], "little")]
     tree = json.loads(text if content[:4] == b"glTF" else content)
     parts = {key: tree.get(key, []) for key in ("buffers", "nodes", "meshes", "accessors")}
@@ -139,7 +121,6 @@ def _check_gltf(content: bytes) -> None:
 
 
 def _problem(vertices: np.ndarray, faces: np.ndarray) -> str | None:
-    """What is wrong with the numbers of a file, if anything."""
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         return "is no mesh of triangles"
     if not len(faces) or not np.isfinite(vertices).all():

@@ -14,11 +14,7 @@ _MERGE = 1e-5  # vertices closer than this fraction of the size are one
 
 
 def repair(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Merges vertices, drops degenerate and duplicate faces, turns faces alike and closes holes.
-
-    Returns:
-      Vertices, faces and what was changed, a line each; no line if nothing was.
-    """
+    """Merges vertices, drops degenerate and duplicate faces, turns faces alike and closes holes."""
     report: list[str] = []
     vertices, faces = _merge(vertices, faces, report)
     faces = _drop(faces, report)

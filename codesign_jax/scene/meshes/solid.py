@@ -23,32 +23,20 @@ class Solid:
 
     Two are equal if they come from the same bytes in the same way, wherever the file lies; the same
     holds for their representations, by which compiled kernels are kept.
-
-    Attributes:
-      path: The file.
-      content: Its bytes, as they were read.
-      digest: SHA-256 of the bytes and of how they were read.
-      vertices: Positions [m], shape (vertex, 3).
-      faces: Vertex indices, outwards, shape (face, 3).
-      volume: Volume [m^3].
-      inertia: Principal moments per mass [m^2].
-      upright: Orientation of the body in its file's frame, unit quaternion (w, x, y, z).
-      voxel_error: Bound on the error of the signed distance [m].
-      repairs: What a repair changed.
-      reach: How far beyond the surface distances are known [m].
     """
 
-    path: Path = dataclasses.field(repr=False)
-    content: bytes = dataclasses.field(repr=False)
-    digest: str
-    vertices: np.ndarray = dataclasses.field(repr=False)
-    faces: np.ndarray = dataclasses.field(repr=False)
-    volume: float
-    inertia: tuple[float, ...]
+    path: Path = dataclasses.field(repr=False)  # the file
+    content: bytes = dataclasses.field(repr=False)  # its bytes, as they were read
+    digest: str  # SHA-256 of the bytes and of how they were read
+    vertices: np.ndarray = dataclasses.field(repr=False)  # positions [m], shape (vertex, 3)
+    faces: np.ndarray = dataclasses.field(repr=False)  # vertex indices, outwards, shape (face, 3)
+    volume: float  # volume [m^3]
+    inertia: tuple[float, ...]  # principal moments per mass [m^2]
+    # Orientation of the body in its file's frame, unit quaternion (w, x, y, z)
     upright: tuple[float, ...]
-    voxel_error: float
-    repairs: tuple[str, ...]
-    reach: float = LEAST
+    voxel_error: float  # bound on the error of the signed distance [m]
+    repairs: tuple[str, ...]  # what a repair changed
+    reach: float = LEAST  # how far beyond the surface distances are known [m]
 
     def reaching(self, reach: float) -> "Solid":
         """The solid with distances up to another way from its surface [m]; see `scene.reach`."""
@@ -85,11 +73,7 @@ class Solid:
 
     @functools.cached_property
     def grid(self) -> grid.Grid:
-        """Signed distances; built when first asked for.
-
-        Raises:
-          InputError: if the bound asks for too fine a grid, or the surface cuts through itself.
-        """
+        """Signed distances; built when first asked for."""
         known = self.voxel_error, self.reach
         try:
             built = grid.cached(self.digest, self.vertices, self.faces, *known)
@@ -126,15 +110,9 @@ def load(
     """Reads and checks a mesh file; `reading.FORMATS` are the formats.
 
     Args:
-      unit: Unit of its numbers, one of `UNITS`.
-      repaired: Whether to repair what can be.
       voxel_error: Bound on the error of the signed distance [m].
       centre: Centre of mass in the file's frame [m], shape (3,); None for a homogeneous body's.
       tensor: Inertia about it per mass [m^2], in the file's axes, shape (3, 3); likewise.
-      content: What the file would have, where there is none.
-
-    Raises:
-      InputError: with every problem of the mesh.
     """
     found = reading.read(path) if content is None else reading.parsed(path, content)
     vertices, faces, content, digest = found
@@ -170,7 +148,6 @@ def load(
 
 
 def _inside(vertices: np.ndarray, point: np.ndarray) -> bool:
-    """Whether a point is in the convex hull."""
     planes = ConvexHull(vertices).equations
     return bool((planes[:, :3] @ point + planes[:, 3] < 0).all())
 

@@ -2,7 +2,8 @@
 
 python -m scripts.search --out runs/search                      # again to go on where it stopped
 timeout -s INT 500 python -m scripts.search --out runs/search   # stop after a time
-python -m scripts.search --report docs/data/search              # table and figure of the note
+python -m scripts.search --robust --masses 0.05 0.2 0.5         # what its winners keep at 500 g
+python -m scripts.search --report docs/data/search              # tables and figure of the note
 
 At every mark the optimiser's best particles meet fresh trials, and the one that costs least in
 these is what it recommends there: 25 particles in 12 trials each, or the final test of an optimiser
@@ -15,9 +16,11 @@ scene: 100 seeds of the default optimiser are 209,000 grasps and each mark 69,00
 import argparse
 import dataclasses
 import json
+import re
 import sys
 import time
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -30,16 +33,18 @@ from codesign_jax import codesign, optimize, rollout, runs, use_compilation_cach
 from codesign_jax import scene as scenes
 from codesign_jax.batch import in_chunks
 from codesign_jax.codesign import SUCCESS_COST
+from codesign_jax.commands.common import changes
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.optimize import NAMES, Optimizer, State
 from codesign_jax.report.statistics import wilson
 from codesign_jax.report.verdicts import RELIABLE
+from codesign_jax.reuse import Program
 from codesign_jax.runs.progress import duration
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.types import Outcome, Trial, failed
-from scripts.shared import output, provenance
+from scripts.shared import output, provenance, work
 
 CANDIDATES, ROUNDS = 25, 12
 """Most particles that are tested at a mark, and trials of each, but for whole turns of the objects;
@@ -123,7 +128,7 @@ class Study:
         objects = len(scene.objects.object)
         self.rounds = -(-case.tests // objects) * objects
         self.batch = min(chunk, seeds * case.worlds)
-        self.simulate = jax.jit(self._simulate)
+        self.simulate = Program(scene, jax.jit(self._simulate))
         self.ask = jax.jit(jax.vmap(lambda state: case.optimizer.ask(state, self.mask)))
         self.tell = jax.jit(
             jax.vmap(lambda state, x, c: case.optimizer.tell(state, x, c, self.mask)[0])
@@ -220,11 +225,16 @@ class Study:
             tested = self._costs(self._all(chosen, noise, self.rounds))
             best, grasps = tested.argmin(1), tested.size * self.rounds
         design = chosen[jnp.arange(len(chosen)), best][:, None]
-        outcome = self._all(design, self._noise(STREAM_JUDGE, 0), self.tests)
-        kept = ~failed(np.asarray(outcome.status)) & (np.asarray(outcome.cost) < SUCCESS_COST)
-        self.kept[mark] = kept[:, 0].mean(-1)
         self.designs[mark] = np.asarray(design[:, 0])
-        return grasps + kept.size
+        self.kept[mark] = self.judge(self.designs[mark], self.scene)
+        return grasps + len(chosen) * self.tests
+
+    def judge(self, designs: np.ndarray, scene: Scene) -> np.ndarray:
+        """Share of the judging trials that each seed's design keeps; the scene's numbers differ."""
+        noise = self._noise(STREAM_JUDGE, 0)
+        outcome = self._all(jnp.asarray(designs)[:, None], noise, self.tests, scene)
+        kept = ~failed(np.asarray(outcome.status)) & (np.asarray(outcome.cost) < SUCCESS_COST)
+        return kept[:, 0].mean(-1)
 
     def _noise(self, stream: int, index: int) -> jax.Array:
         return jax.vmap(lambda key: codesign.stream_key(key, stream, index))(self.keys)
@@ -232,9 +242,12 @@ class Study:
     def _costs(self, outcome: Outcome) -> jax.Array:
         return jax.jit(lambda found: particle_cost(self.scene, found))(outcome)
 
-    def _all(self, populations: jax.Array, keys: jax.Array, count: int) -> Outcome:
+    def _all(
+        self, populations: jax.Array, keys: jax.Array, count: int, scene: Scene | None = None
+    ) -> Outcome:
         """Outcomes of shape (seed, particle, trial) in the trials of these keys, by one program."""
-        draw = lambda key: rollout.sample_trials(self.scene, key, count)  # noqa: E731
+        scene = scene or self.scene
+        draw = lambda key: rollout.sample_trials(scene, key, count)  # noqa: E731
         trials = jax.tree.map(np.asarray, jax.vmap(draw)(keys))
         shape = (*populations.shape[:2], count)
         seed, particle, trial = np.indices(shape).reshape(3, -1)
@@ -242,15 +255,15 @@ class Study:
 
         def run(rows: np.ndarray, device: Any) -> Outcome:
             own = jax.tree.map(lambda v: v[seed[rows], trial[rows]], trials)
-            return self.simulate(designs[seed[rows], particle[rows]], own)
+            return self.simulate(designs[seed[rows], particle[rows]], own, scene)
 
         parts = in_chunks(run, len(seed), self.batch)
         found = jax.tree.map(lambda *v: np.concatenate(v), *parts)
         return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]), found)
 
-    def _simulate(self, designs: jax.Array, trials: Trial) -> Outcome:
+    def _simulate(self, designs: jax.Array, trials: Trial, scene: Scene) -> Outcome:
         hands = jax.vmap(self.space.params)(designs)
-        return rollout.simulate(self.scene, self.engine, hands, trials)[0]
+        return rollout.simulate(scene, self.engine, hands, trials)[0]
 
     def _leaves(self) -> list[jax.Array]:
         state = self.state._replace(key=jax.vmap(jax.random.key_data)(self.state.key))
@@ -312,7 +325,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             [
                 f"`{row['optimizer']}`",
                 row["preset"],
-                row.get("objects") or "three",
+                ", ".join([row.get("objects") or "three", *row.get("changes", ())]),
                 str(kept.size),
                 f"{row['grasps'][-1]:,}",
                 f"{np.median(kept):.3f}",
@@ -322,6 +335,19 @@ def table(rows: list[dict[str, Any]]) -> str:
                 str(row.get("provenance", {}).get("commit", ""))[:7],
             ]
         )
+    return output.markdown(found)
+
+
+def masses_table(rows: list[dict[str, Any]]) -> str:
+    """What recommended designs keep where every object has one of these masses."""
+    found = []
+    for row in sorted((r for r in rows if "masses" in r), key=order):
+        head, cells = ["searched with"], [" ".join(row["changes"]) or "objects as they are"]
+        for mass, kept in row["masses"].items():
+            head += [f"{1e3 * float(mass):g} g: kept on average", "seeds that keep 95 %"]
+            cells += [f"{np.mean(kept):.3f}", share_of(np.array(kept))]
+        found = found or [[*head, "commit"]]
+        found.append([*cells, row["provenance"]["commit"][:7]])
     return output.markdown(found)
 
 
@@ -348,7 +374,9 @@ def draw(rows: list[dict[str, Any]], path: Path) -> Path:
     rows = sorted((row for row in rows if not variant(row["optimizer"])), key=order)
     kinds: dict[tuple[str, str], list[dict[str, Any]]] = {}  # in the table's order
     for row in rows:
-        kinds.setdefault((row["preset"], row.get("objects") or "three objects"), []).append(row)
+        if not row.get("changes"):
+            kind = row["preset"], row.get("objects") or "three objects"
+            kinds.setdefault(kind, []).append(row)
     shown = {k: v for k, v in kinds.items() if len(v) > 1 and max(len(r["grasps"]) for r in v) > 1}
     shown = shown or kinds
     figure = output.new_figure(9.2, 3.8 * len(shown))
@@ -406,6 +434,13 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--preset", default="23d")
     parser.add_argument("--scene", default="paper")
     parser.add_argument("--objects", help="object set instead of the scene's")
+    parser.add_argument("--robust", action="store_true", help="as of codesign optimize")
+    own: dict[str, Any] = {"dest": "overrides", "nargs": "+", "action": "append", "default": []}
+    parser.add_argument("--set", **own, help="KEY=VALUE, as of codesign optimize")
+    text = "judge the last designs once more with all objects at each of these masses [kg]"
+    parser.add_argument("--masses", nargs="+", default=[], help=text)
+    text = "judge the designs of a study's .npz at --masses, and search nothing"
+    parser.add_argument("--designs", type=Path, help=text)
     parser.add_argument(
         "--optimizers",
         nargs="+",
@@ -427,26 +462,42 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 def search(args: argparse.Namespace, name: str) -> None:
     """Runs an optimiser's study to its end and writes what its designs keep."""
-    scene = scenes.load(args.scene, object_set=args.objects)
+    scene = scenes.load(args.scene, object_set=args.objects, overrides=changes(args))
     engine, space = make_engine("structured", scene), design_space(scene.hand, args.preset)
     case = make_case(name, space, args.preset, len(scene.objects.object))
-    stem = f"{args.preset}-{name.replace(':', '-').replace('=', '')}"
+    changed = ["--robust"] * args.robust + [*chain.from_iterable(args.overrides)]
+    words = [Path(args.objects).stem] if args.objects else []
+    words += [args.preset, name, *(re.sub(r"^--|^[a-z_.]+[.](?=.*=)", "", c) for c in changed)]
+    stem = "-".join(dict.fromkeys(words)).replace(":", "-").replace("=", "")
     how = {n: getattr(args, n) for n in ("seeds", "budget", "tests", "marks", "at", "first_seed")}
     how["chunk"] = args.chunk or (512 if jax.default_backend() == "cpu" else 16_384)
     study = Study(case, scene, engine, space, **how, path=args.out / f"{stem}.npz")
+    row = {"preset": args.preset, "scene": args.scene, "objects": args.objects, "changes": changed}
+    row |= {"first_seed": args.first_seed, "tests": args.tests, "optimizer": name}
     grasps, start = 0, time.monotonic()
-    while not study.finished:
+    while not study.finished and args.designs is None:
         grasps += study.step()
         study.save()  # the next command goes on here, whatever ends this one
         rate = grasps / (time.monotonic() - start)
         print(f"{name}: episode {study.done}/{study.marks[-1]}, {rate:.0f} grasps/s", flush=True)
-    row = study.row() | {"preset": args.preset, "scene": args.scene, "objects": args.objects}
-    row |= {"first_seed": args.first_seed, "tests": args.tests}
+    if args.designs is None:
+        row |= study.row()
+    if args.masses:
+        found = work.winners(args.designs or study.path)[: args.seeds]
+        row["masses"] = {m: study.judge(found, at_mass(args, m)).tolist() for m in args.masses}
     row["provenance"] = provenance.results(args.commit)
-    output.write_json(args.out / f"{stem}.json", row)
-    shares = [sum(k >= RELIABLE for k in kept) / len(kept) for kept in row["kept"]]
+    output.write_json(args.out / f"{stem}{'-masses' * bool(args.designs)}.json", row)
+    shares = [sum(k >= RELIABLE for k in kept) / len(kept) for kept in study.row()["kept"]]
     took = duration(time.monotonic() - start)
-    print(f"{name}: {dict(zip(row['grasps'], shares, strict=True))} in {took}", flush=True)
+    print(f"{name}: {dict(zip(study.row()['grasps'], shares, strict=True))} in {took}", flush=True)
+    print({m: float(np.mean(kept)) for m, kept in row.get("masses", {}).items()}, flush=True)
+
+
+def at_mass(args: argparse.Namespace, mass: str) -> Scene:
+    """The scene as its files have it, with every object at a mass [kg]."""
+    plain = scenes.load(args.scene, object_set=args.objects)
+    own = {("objects", "object", s.name, "mass"): float(mass) for s in plain.objects.object}
+    return scenes.load(args.scene, object_set=args.objects, overrides=own)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -455,8 +506,11 @@ def main(arguments: list[str] | None = None) -> int:
         rows = [json.loads(path.read_text()) for path in sorted(args.report.glob("*.json"))]
         if not rows:
             sys.exit(f"error: {args.report} has no results of scripts.search")
-        output.fill(args.page, table(rows), "search")
-        print(args.page, draw(rows, args.figure))
+        searched = [row for row in rows if "kept" in row]
+        output.fill(args.page, table(searched), "search")
+        if any("masses" in row for row in rows):
+            output.fill(args.page, masses_table(rows), "masses")
+        print(args.page, draw(searched, args.figure))
         return 0
     use_compilation_cache()
     try:

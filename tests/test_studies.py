@@ -1,15 +1,20 @@
 """Studies: sets of constants and waves, rates and their worlds, searches in lock step."""
 
+import json
 import re
 
+import jax
 import numpy as np
 import pytest
 import scipy.stats
 
-from codesign_jax import scene
-from scripts import benchmark, calibration
+from codesign_jax import codesign, rollout, scene
+from codesign_jax.engines import make_engine
+from codesign_jax.scene import parameters
+from scripts import benchmark, calibration, search
 from scripts.calibration import OPEN
-from scripts.shared import statistics
+from scripts.shared import statistics, work
+from tests.helpers import toy_engine
 
 
 def test_sets_fill_their_ranges_and_every_beginning_does():
@@ -81,3 +86,30 @@ def test_tables_of_the_pages_are_those_of_the_data(page):
 
 
 # --- searches -------------------------------------------------------------------------------------
+
+
+def test_winners_of_a_search_are_judged_at_other_masses(tmp_path):
+    """What they keep at a mass is what MuJoCo C says of them in the same trials."""
+    sizes = "--preset 2d --optimizers screened-es:particles=6,trials=2,tests=2 --seeds 3 --tests 5"
+    how = [*sizes.split(), "--marks", "1", "--budget", "50", "--scene", str(toy_engine.TINY)]
+    how += ["--out", str(tmp_path), "--commit", "abcdef0"]
+    assert search.main([*how, "--set", "objects.noise.mass_range=10", "--masses", "0.05", "2"]) == 0
+    [path] = tmp_path.glob("*.json")
+    row, designs = json.loads(path.read_text()), work.winners(path.with_suffix(".npz"))
+    assert row["changes"] == ["objects.noise.mass_range=10"] and len(row["kept"][-1]) == 3
+    own = scene.load(toy_engine.TINY, overrides={"objects.object.0.mass": 2.0})
+    space, engine = parameters.design_space(own.hand, "2d"), make_engine("mujoco", own)
+    for seed, design in enumerate(designs):
+        key = codesign.stream_key(jax.random.key(seed), search.STREAM_JUDGE, 0)
+        hand = jax.tree.map(lambda v: v[None], space.params(design))
+        found = rollout.evaluate(own, engine, hand, rollout.sample_trials(own, key, 5))
+        assert row["masses"]["2"][seed] == np.mean(found.cost < codesign.SUCCESS_COST)
+    light, heavy = (np.mean(row["masses"][m]) for m in ("0.05", "2"))
+    assert heavy < light
+    # The designs of a file are judged alike, without a search.
+    assert search.main([*how, "--designs", str(path.with_suffix(".npz")), "--masses", "2"]) == 0
+    [again] = tmp_path.glob("*-masses.json")
+    assert json.loads(again.read_text())["masses"]["2"] == row["masses"]["2"]
+    assert "2000 g: kept on average | seeds that keep 95 % | commit |\n" in (
+        search.masses_table([json.loads(again.read_text())])
+    )

@@ -307,18 +307,9 @@ def order(row: dict[str, Any]) -> tuple:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """A row for each optimiser: what its recommended designs keep at its last mark."""
-    head = [
-        "optimiser",
-        "preset",
-        "objects",
-        "seeds",
-        "grasps of a seed",
-        "median kept",
-        "5 % of the seeds below",
-    ]
-    head += ["share of seeds that keep 95 % (95 % interval)", "grasps until 90 % of the seeds do"]
-    head += ["commit"]
-    found = [head]
+    head = "optimiser|preset|objects|seeds|grasps of a seed|median kept|5 % of the seeds below|"
+    head += "share of seeds that keep 95 % (95 % interval)|grasps until 90 % of the seeds do|commit"
+    found = [head.split("|")]
     for row in sorted((r for r in rows if not variant(r["optimizer"])), key=order):
         kept = np.array(row["kept"][-1])
         found.append(
@@ -365,7 +356,7 @@ def variant(name: str) -> bool:
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> Path:
-    """What recommended designs keep, and how many seeds' designs keep `RELIABLE`, over grasps.
+    """What recommended designs lose, and how many seeds' designs keep `RELIABLE`, over grasps.
 
     Variants of an optimiser, but for its sizes, are in the table alone, as are questions that one
     optimiser was asked, or at one number of grasps.  Marks of optimisers at the same number of
@@ -381,48 +372,36 @@ def draw(rows: list[dict[str, Any]], path: Path) -> Path:
     shown = shown or kinds
     figure = output.new_figure(9.2, 3.8 * len(shown))
     for place, (kind, own) in enumerate(shown.items()):
-        kept, share = (figure.add_subplot(len(shown), 2, 2 * place + i) for i in (1, 2))
+        lost, share = (figure.add_subplot(len(shown), 2, 2 * place + i) for i in (1, 2))
         for number, row in enumerate(own):
             name, beside = row["optimizer"].split(":")[0], 1.02 ** (number - len(own) // 2)
             at, found = beside * np.array(row["grasps"]), [np.array(k) for k in row["kept"]]
             color = f"C{NAMES.index(name)}" if name in NAMES else None
             style: dict[str, Any] = {"fmt": "o-", "ms": 4, "lw": 1.4, "elinewidth": 1, "capsize": 3}
-            low, middle, high = np.array([np.quantile(k, [0.25, 0.5, 0.75]) for k in found]).T
+            low, middle, high = np.array([np.quantile(1 - k, [0.25, 0.5, 0.75]) for k in found]).T
             seeds = " to ".join(str(n) for n in sorted({k.size for k in found}))
             style |= {"color": color, "label": f"{name}, {seeds} seeds"}
-            kept.errorbar(at, middle, [middle - low, high - middle], **style)
+            lost.errorbar(at, middle, [middle - low, high - middle], **style)
             counts = [(int((k >= RELIABLE).sum()), k.size) for k in found]
             good, ends = np.array([g / n for g, n in counts]), [wilson(*c) for c in counts]
             away = [good - [e.low for e in ends], [e.high for e in ends] - good]
             share.errorbar(at, good, np.maximum(away, 0), **style)
-        kept.axhline(RELIABLE, color="0.6", lw=0.8)
-        # Shares near 1 are what differs: even steps are equal ratios of what is lost.
-        kept.set_yscale("function", functions=(_stretched, _unstretched))
-        kept.yaxis.set_major_locator(ticker.FixedLocator([0, 0.5, 0.8, 0.9, 0.95, 0.98, 1]))
-        kept.yaxis.set_minor_locator(ticker.NullLocator())
-        kept.yaxis.set_major_formatter(ticker.PercentFormatter(1))
-        share.yaxis.set_major_formatter(ticker.PercentFormatter(1))
+        lost.axhline(1 - RELIABLE, color="0.6", lw=0.8)
+        lost.set_yscale("symlog", linthresh=0.01)  # shares near 0 are what differs
         title = f"{kind[0].removesuffix('d')} parameters, {kind[1]}"
-        kept.set(title=f"{title}: fresh grasps kept,\nmedian and middle half of the seeds")
+        lost.set(title=f"{title}: fresh grasps lost,\nmedian and middle half of the seeds")
         share.set(title=f"seeds whose design keeps {100 * RELIABLE:.0f} %,\nwith 95 % intervals")
         ticks = sorted({g for row in own for g in row["grasps"]})
-        for axes in (kept, share):
+        for axes in (lost, share):
+            axes.yaxis.set_major_formatter(ticker.PercentFormatter(1))
             axes.set(xscale="log", xlabel="grasps of a seed, all counted", ylim=(0, 1.002))
             axes.set_xlim(0.8 * ticks[0], 1.25 * ticks[-1])
             axes.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
             axes.xaxis.set_major_formatter("{x:,.0f}")
             axes.xaxis.set_minor_formatter(ticker.NullFormatter())
             axes.grid(axis="y", lw=0.3)
-        kept.legend(fontsize=7, loc="lower right")
+        share.legend(fontsize=7, loc="lower right")
     return output.save_figure(figure, path)
-
-
-def _stretched(share: np.ndarray) -> np.ndarray:
-    return -np.log(1.01 - np.minimum(share, 1.005))
-
-
-def _unstretched(height: np.ndarray) -> np.ndarray:
-    return 1.01 - np.exp(-height)
 
 
 # --- the command ----------------------------------------------------------------------------------

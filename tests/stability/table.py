@@ -66,8 +66,8 @@ class Case:
         row = {"case": self.number, "precision": precision, "step": step, "note": found.note}
         names = ("name", "title", "invariant", "engine", "lower", "unit")
         row |= {name: getattr(self, name) for name in names}
-        row |= {"measured": float(found.measured), "bound": float(found.bound)}
-        row["margin"] = margin(self.lower, *found[:2])
+        measured, bound = float(found.measured), float(found.bound)  # of NumPy's, JSON has none
+        row |= {"measured": measured, "bound": bound, "margin": margin(self.lower, measured, bound)}
         row["passed"] = row["margin"] >= 1
         return row
 

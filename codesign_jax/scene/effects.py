@@ -47,9 +47,9 @@ EFFECTS: Mapping[str, Effect] = {
     "table": Effect("the plane z = 0; without it these touch the scene's fixtures alone"),
     "finger_finger": Effect("fingers touch one another"),
     "finger_palm": Effect("fingers touch the palm's disc"),
-    "finger_itself": Effect("skinned fingers touch themselves; spheres do not", hull=True),
+    "finger_itself": Effect("fingers touch themselves, with the hull", hull=True),
     "surface": Effect(
-        "the fingers' contact: spheres, or rings of the section, a skinned hull",
+        "what of a finger touches: spheres, or its whole surface, the hull",
         {"mjx": {"hull": _SKIN}, "mujoco": {"hull": _SKIN}},
     ),
     "friction": Effect(
@@ -57,7 +57,7 @@ EFFECTS: Mapping[str, Effect] = {
         {"mjx": {"none": "MJX has no frictionless contacts with elliptic cones"}},
     ),
     "friction_memory": Effect(
-        "skinned fingers hold one another without creep: their friction is kept from step to step",
+        "with the hull fingers hold one another without creep: friction is kept from step to step",
         hull=True,
     ),
     "disturb": Effect("the arm is shaken after the lift"),

@@ -69,7 +69,7 @@ class Bench:
     def __init__(self, found: Case) -> None:
         self.case = found
         self.engine = found.make_engine()
-        self.recorder = recording(self.engine) if tells_forces(self.engine) else self.engine
+        self.recorder = recording(self.engine) if tells_forces(self.engine) else None
         self.objects = len(found.scene.objects.object)
 
     @functools.cached_property
@@ -87,15 +87,14 @@ class Bench:
         """Parameters of a design as they are simulated."""
         return self.case.space.params(jnp.asarray(design, jnp.float32))
 
-    def grasp(self, view: View) -> animation.Replay:
-        """Simulates what is shown."""
+    def grasp(self, view: View, engine: Engine | None = None) -> animation.Replay:
+        """Simulates what is shown, with forces if the engine is the recorder."""
         trial = rollout.nominal_trial(self.case.scene, view.shape)
         if view.noise is not None:
             trial = jax.tree.map(lambda v: v[view.noise], self.trials)
         trials = jax.tree.map(lambda v: jnp.asarray(v)[None], trial)
-        # Forces take as long as the grasp: they wait until the sliders rest.
-        engine = self.recorder if view.resting else self.engine
-        return animation.replay(self.case.scene, engine, self.params(view.design), trials)[0]
+        params = self.params(view.design)
+        return animation.replay(self.case.scene, engine or self.engine, params, trials)[0]
 
     def outcomes(self, design: np.ndarray, first: int) -> Outcome:
         """Outcomes of the next `BATCH` trials, arrays of shape (trial,)."""
@@ -105,8 +104,8 @@ class Bench:
 
     def warm(self, design: np.ndarray) -> None:
         """Compiles the programs that a moved slider needs."""
-        for resting in (False, True):
-            self.grasp(View(design, "", 0, None, 0, resting, None))
+        for engine in (None, self.recorder):
+            self.grasp(View(design, "", 0, None, 0, False, None), engine)
         self.outcomes(design, 0)
 
 
@@ -166,6 +165,11 @@ class Shown(NamedTuple):
     view: View
     bench: Bench
     grasp: animation.Replay
+
+    @property
+    def forces(self) -> Any:
+        """Contact forces, where they were recorded."""
+        return self.grasp.trace and self.grasp.trace.forces
 
 
 class Tab:
@@ -274,6 +278,11 @@ class Tab:
                 self.send("error", str(error))
         elif shown and self._search:
             self._improve(shown, *self._search)
+        elif shown and shown.view.resting and shown.bench.recorder and not shown.forces:
+            # Forces take as long as the grasp: they come after it, once the sliders rest.
+            grasp = shown.bench.grasp(shown.view, shown.bench.recorder)
+            self._shown = shown._replace(grasp=grasp)
+            self.send("grasp", _told(self._shown))
         elif shown and shown.view.resting and self._total < shown.view.trials:
             left = shown.view.trials - self._total
             found = shown.bench.outcomes(shown.view.design, self._total)
@@ -294,10 +303,14 @@ class Tab:
         if view.accuracy not in self._desk.benches:
             self.send("state", "compiling for this accuracy: up to a minute the first time ...")
         bench, before = self._desk.bench(view.accuracy), self._shown
-        legal = np.asarray(bench.case.space.project(view.design), float)
-        shown = Shown(view._replace(design=legal), bench, bench.grasp(view._replace(design=legal)))
-        if not (before and before.bench is bench and np.array_equal(before.view.design, legal)):
-            self._outcomes = []
+        view = view._replace(design=np.asarray(bench.case.space.project(view.design), float))
+        same = before and before.bench is bench and np.array_equal(before.view.design, view.design)
+        if not (before and same):
+            self._outcomes, before = [], None
+        if before and (before.view.shape, before.view.noise) == (view.shape, view.noise):
+            shown = before._replace(view=view)  # a slider was let go where it has been seen
+        else:
+            shown = Shown(view, bench, bench.grasp(view))
         self._shown, self._looked = shown, False
         self.send("grasp", _told(shown))
         if view.resting:
@@ -416,8 +429,7 @@ def _told(shown: Shown) -> dict[str, Any]:
         name: np.round(1e3 * np.asarray(getattr(grasp.trace, name))[::step], 1).tolist()
         for name in ("distance", "height")
     }
-    forces = grasp.trace and grasp.trace.forces
-    if forces:
+    if forces := shown.forces:
         series["grip"] = np.round(np.asarray(forces.grip)[::step].T, 2).tolist()
     caps = np.asarray(morphology.pressure_limits(scene.hand, grasp.params))
     limits: list[float | None] = []

@@ -1,10 +1,9 @@
 """What each effect costs and decides: python -m scripts.effects [--quick] [--draw].
 
-Measures the scene `paper_spheres` with each effect turned over, writes docs/data/effects.json and
-fills in docs/effects.md and docs/notes/effects.md and draws their figure; --draw only draws.  An
-effect's decisions come from MuJoCo C, or from the structured engine what C refuses; its time is
-that of the structured engine, `STEPS` steps from the middle of the lift on.  About 15 minutes on
-two idle cores; a run that was broken off goes on.
+Measures the default scene with each effect turned over, on what the default search recommends,
+writes docs/data/effects.json, fills in docs/effects.md and docs/notes/effects.md and draws their
+figure; --draw only draws.  Times are of `STEPS` steps from the middle of the lift on.  About 15
+minutes on two idle cores; a run that was broken off goes on.
 """
 
 import argparse
@@ -28,12 +27,12 @@ from codesign_jax.scene import Scene, parameters
 from codesign_jax.scene.effects import EFFECTS, ENGINES, refusals
 from codesign_jax.types import failed
 from scripts.shared import output, provenance, work
-from scripts.shared.statistics import spearman
 
 DOCS = Path(__file__).parents[1] / "docs"
 AS_IT_IS = "as it is"
 CONTACTS = ("finger_object", "palm_object", "finger_table", "palm_table", "object_table")
-STEPS, ROUNDS = 20, 9
+STEPS, ROUNDS, TIMED = 20, 9, 6
+"""Time steps of a call, calls of each program, and designs whose grasps are timed."""
 
 
 def variants(base: Scene) -> dict[str, Scene]:
@@ -45,7 +44,8 @@ def variants(base: Scene) -> dict[str, Scene]:
             if value != now:
                 word = {True: "on", False: "off"}.get(value, value)
                 changes[f"{field.name} {word}"] = {field.name: value}
-    return {AS_IT_IS: base} | {name: changed(base, **change) for name, change in changes.items()}
+    found = {AS_IT_IS: base} | {name: changed(base, **change) for name, change in changes.items()}
+    return {n: v for n, v in found.items() if not refusals(v.effects, "structured")}
 
 
 def changed(base: Scene, **effects: Any) -> Scene:
@@ -53,84 +53,66 @@ def changed(base: Scene, **effects: Any) -> Scene:
 
 
 def grasps(base: Scene, designs: int, trials: int) -> work.Worlds:
-    """Designs of the 2D space around those that hold, each in the same trials.
-
-    In the box, lengths of 45 to 150 mm and arm heights of -60 to 60 mm, about half of the grasps
-    hold: leaving an effect out can change a verdict both ways.
-    """
-    space = parameters.design_space(base.hand, "2d")
-    low, high = np.array([0.045, -0.06]), np.array([0.150, 0.06])
-    chosen = low + (high - low) * np.random.default_rng(0).random((designs, 2))
-    design, trial = np.indices((designs, trials)).reshape(2, -1)
-    params = jax.vmap(space.params)(jnp.asarray(chosen, jnp.float32))
+    """What the default search recommends in its first seeds, each design in the same trials."""
+    space = parameters.design_space(base.hand, "23d")
+    params = jax.vmap(space.params)(jnp.asarray(work.winners()[:designs], jnp.float32))
     drawn = rollout.sample_trials(base, jax.random.key(0), trials)
-    of = lambda index: lambda v: v[index]  # noqa: E731
-    return work.Worlds(jax.tree.map(of(design), params), jax.tree.map(of(trial), drawn))
+    return work.Worlds(*rollout.crossed(base, params, drawn)[1:])
 
 
 def decide(variant: Scene, worlds: work.Worlds) -> tuple[np.ndarray, np.ndarray]:
-    engine = "structured" if refusals(variant.effects, "mujoco") else "mujoco"
-    outcome, _ = rollout.simulate(variant, make_engine(engine, variant), *worlds)
-    return np.asarray(outcome.cost), np.asarray(outcome.status)
+    """Which grasps are kept, and where they are in the middle of the lift, shape (world, nq)."""
+    engine, step = make_engine("structured", variant), middle(variant)
+
+    @jax.jit
+    def run(params: Any, trials: Any) -> tuple[Any, Any]:
+        outcome, trace = rollout.simulate(variant, engine, params, trials, record_qpos=True)
+        return outcome, trace.qpos[:, step - 1]
+
+    outcome, qpos = run(*worlds)
+    kept = (np.asarray(outcome.cost) < SUCCESS_COST) & ~failed(np.asarray(outcome.status))
+    return kept, np.asarray(qpos)
 
 
-def compare(found: tuple, reference: tuple, trials: int) -> dict[str, Any]:
-    """Success rate with its 95 % interval and agreement with the scene as it is."""
-    (cost, status), expected = found, reference[0]
-    success = (cost < SUCCESS_COST) & ~failed(status)
-    rate = wilson(int(success.sum()), success.size)
-    rank = float(spearman(*(c.reshape(-1, trials).mean(1) for c in (cost, expected))))
-    return {
-        "worlds": int(success.size),
-        "success": float(success.mean()),
-        "success_low": float(rate.low),
-        "success_high": float(rate.high),
-        "same_verdict": float(((cost < SUCCESS_COST) == (expected < SUCCESS_COST)).mean()),
-        "rank_correlation": None if np.isnan(rank) else rank,
-        "failed": int(failed(status).sum()),
-    }
+def middle(scene: Scene) -> int:
+    """The time step in the middle of the lift."""
+    ends = scene.phase_ends
+    return int(scene.steps_to((ends["inflate"] + ends["lift"]) / 2))
 
 
-def program(variant: Scene, worlds: work.Worlds) -> tuple[Any, tuple]:
-    """A compiled program of some steps, and its arguments.
-
-    The grasps are where MuJoCo C, with spheres, has them in the middle of the lift.
-    """
-    plain = changed(variant, surface="spheres")
-    step = round((plain.phases.inflate + plain.phases.lift) / 2 / plain.discretization.timestep)
-    fields, ctrl = work.inputs(plain, worlds)
-    begun = make_engine("mujoco", plain).rollout(fields, ctrl[:, :step], trajectory=True)
+def program(variant: Scene, worlds: work.Worlds, start: np.ndarray) -> tuple[Any, tuple]:
+    """A compiled program of some steps from the middle of the lift on, and its arguments."""
     fields, ctrl = work.inputs(variant, worlds)
-    fields = fields._replace(start=jnp.asarray(begun.qpos[:, -1], fields.start.dtype))
-    args, engine = (fields, ctrl[:, step : step + STEPS]), make_engine("structured", variant)
+    fields = fields._replace(start=jnp.asarray(start, fields.start.dtype))
+    step, engine = middle(variant), make_engine("structured", variant)
+    args = (fields, ctrl[:, step : step + STEPS])
     run = jax.jit(lambda f, c: engine.rollout(f, c).distance[:, -1])
     return run.lower(*args).compile(), args
 
 
 def measure(everything: dict[str, Scene], path: Path, *, quick: bool) -> dict[str, Any]:
-    """Measures what the file does not have; what it then holds."""
-    results: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"effects": {}}
+    """Measures all and writes the file; what it then holds."""
+    designs, trials = (6, 3) if quick else (30, 12)
+    results: dict[str, Any] = {"designs": designs, "trials": trials, "effects": {}}
     results["provenance"] = provenance.measurement()
-    designs, trials = (4, 3) if quick else (24, 6)
-    results["trials"], reference = trials, None
     worlds = grasps(everything[AS_IT_IS], designs, trials)
+    few = jax.tree.map(lambda v: np.asarray(v)[: TIMED * trials], worlds)
+    programs, expected = {}, None
     for name, variant in everything.items():
-        if reference is not None and "success" in results["effects"].get(name, {}):
-            continue  # done by an earlier run
-        found = decide(variant, worlds)
-        reference = reference or found
-        results["effects"].setdefault(name, {}).update(compare(found, reference, trials))
+        kept, start = decide(variant, worlds)
+        expected = kept if expected is None else expected
+        rate = wilson(int(kept.sum()), kept.size)
+        found = {"success": float(kept.mean()), "success_low": rate.low, "success_high": rate.high}
+        results["effects"][name] = found | {"same_verdict": float((kept == expected).mean())}
         print(name, results["effects"][name], flush=True)
-        output.write_json(path, results)
-    few = grasps(everything[AS_IT_IS], 6, trials)
-    programs = {name: program(variant, few) for name, variant in everything.items()}
+        programs[name] = program(variant, few, start[: TIMED * trials])
     times: dict[str, list[float]] = {name: [] for name in programs}
     results["load_before"] = os.getloadavg()
     for _ in range(ROUNDS + 1):  # in turn, so that a busy machine slows all alike
         for name, (run, args) in programs.items():
             begin = time.perf_counter()
             jax.block_until_ready(run(*args))
-            times[name].append((time.perf_counter() - begin) / STEPS / (6 * trials))
+            times[name].append((time.perf_counter() - begin) / STEPS / (TIMED * trials))
     results["load_after"] = os.getloadavg()
     for name, seconds in times.items():
         ratios = np.array(seconds[1:]) / np.array(times[AS_IT_IS][1:])  # the first round warms up
@@ -181,19 +163,13 @@ def support_table() -> list[list[str]]:
 
 
 def measured_table(results: dict[str, Any]) -> list[list[str]]:
-    """A row for each change of the scene; what was not measured is a dash."""
-    table = [["change", "µs a step", "time ×", "success (95 %)", "same verdict", "rank corr."]]
+    """A row for each change of the scene."""
+    table = [["change", "same verdicts", "success (95 %)", "time of a step (quartiles)"]]
     for name, r in results["effects"].items():
-        cells = ["–"] * 5
-        if "ratio" in r:
-            low, high = r["ratio_quartiles"]
-            cells[0] = f"{r['step_seconds'] * 1e6:.1f}"
-            cells[1] = f"{r['ratio']:.2f} ({low:.2f}–{high:.2f})"
-        if "success" in r:
-            rank = r["rank_correlation"]
-            cells[2] = f"{r['success']:.3f} ({r['success_low']:.3f}–{r['success_high']:.3f})"
-            cells[3:] = [f"{r['same_verdict']:.3f}", "–" if rank is None else f"{rank:.3f}"]
-        table.append([name, *cells])
+        low, high = r["ratio_quartiles"]
+        cells = [f"{100 * r['same_verdict']:.1f} %", f"{100 * r['success']:.1f} %"]
+        cells[1] += f" ({100 * r['success_low']:.1f} to {100 * r['success_high']:.1f})"
+        table.append([name, *cells, f"× {r['ratio']:.2f} ({low:.2f} to {high:.2f})"])
     return table
 
 
@@ -208,16 +184,17 @@ def main() -> None:
         results = json.loads(options.json.read_text())
     else:
         links = {"discretization": {"links": 3}} if options.quick else None
-        base = scenes.load("paper_spheres", overrides=links)
+        base = scenes.load("paper", overrides=links)
         results = measure(variants(base), options.json, quick=options.quick)
     if options.quick:
         return draw(results, options.json.with_suffix(".png"))
     draw(results, DOCS / "figures" / "effects.png")
     p, rows = results["provenance"], output.markdown(measured_table(results))
     load = [f"{results[k][0]:.1f}" for k in ("load_before", "load_after")]
-    made = f"{results['effects'][AS_IT_IS]['worlds']} grasps, {results['trials']} trials a design; "
-    made += f"{p['cpus']} cores of {p['cpu']}, jax {p['jax']}, MuJoCo {p['mujoco']}, commit "
-    made += f"{p['commit']}; load of the machine while timing: {' to '.join(load)}."
+    made = f"{results['designs']} designs in {results['trials']} trials; {p['cpus']} cores of "
+    made += f"{p['cpu']}, jax {p['jax']}, commit {p['commit'][:7]}; a step as the scene is takes "
+    made += f"{1e6 * results['effects'][AS_IT_IS]['step_seconds']:.0f} µs of a world; load of the "
+    made += f"machine while timing: {' to '.join(load)}."
     output.fill(DOCS / "notes" / "effects.md", f"{made}\n\n{rows}", "measured")
     output.fill(DOCS / "effects.md", output.markdown(support_table()), "support")
 

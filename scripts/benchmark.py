@@ -209,7 +209,8 @@ def peers(files: list[dict[str, Any]]) -> str:
             shown = [_rounded(n) for n in numbers]
             ratio = f"{numbers[1] / numbers[0]:.0f}"
             same = _same(ours.get("verdicts", ""), theirs.get("verdicts", ""))
-            rows.append([theirs["scene"], where, theirs["engine"], *shown, ratio, same])
+            peer = theirs["engine"] + provenance.before(found["runs"][theirs["run"]])
+            rows.append([theirs["scene"], where, peer, *shown, ratio, same])
     return output.markdown(rows)
 
 

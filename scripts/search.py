@@ -3,7 +3,7 @@
 python -m scripts.search --out runs/search                      # again to go on where it stopped
 timeout -s INT 500 python -m scripts.search --out runs/search   # stop after a time
 python -m scripts.search --robust --masses 0.05 0.2 0.5         # what its winners keep at 500 g
-python -m scripts.search --report docs/data/search              # tables and figure of the note
+python -m scripts.search --report docs/data/search              # tables of the note
 
 At every mark the optimiser's best particles meet fresh trials, and the one that costs least in
 these is what it recommends there: 25 particles in 12 trials each, or the final test of an optimiser
@@ -27,7 +27,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib import ticker
 
 from codesign_jax import codesign, optimize, rollout, runs, use_compilation_cache
 from codesign_jax import scene as scenes
@@ -51,7 +50,7 @@ CANDIDATES, ROUNDS = 25, 12
 an optimiser with `finalists` has its runs' final test."""
 STREAM_JUDGE = 0x6A756467
 """Stream of the trials that judge a recommended design ("judg")."""
-PAGE, FIGURE = Path("docs/notes/search.md"), Path("docs/figures/search.png")
+PAGE = Path("docs/notes/search.md")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -287,7 +286,7 @@ class Study:
         return state._replace(key=jax.vmap(jax.random.wrap_key_data)(state.key)), (*last,) or None
 
 
-# --- table and figure -----------------------------------------------------------------------------
+# --- tables --------------------------------------------------------------------------------------
 
 
 def reached(row: dict[str, Any], share: float) -> str:
@@ -323,7 +322,7 @@ def table(rows: list[dict[str, Any]]) -> str:
                 f"{np.quantile(kept, 0.05):.3f}",
                 share_of(kept),
                 reached(row, 0.9),
-                str(row.get("provenance", {}).get("commit", ""))[:7],
+                row["provenance"]["commit"][:7] + provenance.before(row["provenance"]),
             ]
         )
     return output.markdown(found)
@@ -355,55 +354,6 @@ def variant(name: str) -> bool:
     return not changes <= {"particles", "trials"}
 
 
-def draw(rows: list[dict[str, Any]], path: Path) -> Path:
-    """What recommended designs lose, and how many seeds' designs keep `RELIABLE`, over grasps.
-
-    Variants of an optimiser, but for its sizes, are in the table alone, as are questions that one
-    optimiser was asked, or at one number of grasps.  Marks of optimisers at the same number of
-    grasps stand a little beside one another.
-    """
-    rows = sorted((row for row in rows if not variant(row["optimizer"])), key=order)
-    kinds: dict[tuple[str, str], list[dict[str, Any]]] = {}  # in the table's order
-    for row in rows:
-        if not row.get("changes"):
-            kind = row["preset"], row.get("objects") or "three objects"
-            kinds.setdefault(kind, []).append(row)
-    shown = {k: v for k, v in kinds.items() if len(v) > 1 and max(len(r["grasps"]) for r in v) > 1}
-    shown = shown or kinds
-    figure = output.new_figure(9.2, 3.8 * len(shown))
-    for place, (kind, own) in enumerate(shown.items()):
-        lost, share = (figure.add_subplot(len(shown), 2, 2 * place + i) for i in (1, 2))
-        for number, row in enumerate(own):
-            name, beside = row["optimizer"].split(":")[0], 1.02 ** (number - len(own) // 2)
-            at, found = beside * np.array(row["grasps"]), [np.array(k) for k in row["kept"]]
-            color = f"C{NAMES.index(name)}" if name in NAMES else None
-            style: dict[str, Any] = {"fmt": "o-", "ms": 4, "lw": 1.4, "elinewidth": 1, "capsize": 3}
-            low, middle, high = np.array([np.quantile(1 - k, [0.25, 0.5, 0.75]) for k in found]).T
-            seeds = " to ".join(str(n) for n in sorted({k.size for k in found}))
-            style |= {"color": color, "label": f"{name}, {seeds} seeds"}
-            lost.errorbar(at, middle, [middle - low, high - middle], **style)
-            counts = [(int((k >= RELIABLE).sum()), k.size) for k in found]
-            good, ends = np.array([g / n for g, n in counts]), [wilson(*c) for c in counts]
-            away = [good - [e.low for e in ends], [e.high for e in ends] - good]
-            share.errorbar(at, good, np.maximum(away, 0), **style)
-        lost.axhline(1 - RELIABLE, color="0.6", lw=0.8)
-        lost.set_yscale("symlog", linthresh=0.01)  # shares near 0 are what differs
-        title = f"{kind[0].removesuffix('d')} parameters, {kind[1]}"
-        lost.set(title=f"{title}: fresh grasps lost,\nmedian and middle half of the seeds")
-        share.set(title=f"seeds whose design keeps {100 * RELIABLE:.0f} %,\nwith 95 % intervals")
-        ticks = sorted({g for row in own for g in row["grasps"]})
-        for axes in (lost, share):
-            axes.yaxis.set_major_formatter(ticker.PercentFormatter(1))
-            axes.set(xscale="log", xlabel="grasps of a seed, all counted", ylim=(0, 1.002))
-            axes.set_xlim(0.8 * ticks[0], 1.25 * ticks[-1])
-            axes.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
-            axes.xaxis.set_major_formatter("{x:,.0f}")
-            axes.xaxis.set_minor_formatter(ticker.NullFormatter())
-            axes.grid(axis="y", lw=0.3)
-        share.legend(fontsize=7, loc="lower right")
-    return output.save_figure(figure, path)
-
-
 # --- the command ----------------------------------------------------------------------------------
 
 
@@ -433,9 +383,8 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--at", type=int, nargs="+", default=[], help="grasps instead of --marks")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--chunk", type=int, help="most grasps of a call")
-    parser.add_argument("--report", type=Path, help="fill page and figure from a folder, and stop")
+    parser.add_argument("--report", type=Path, help="fill the page from a folder, and stop")
     parser.add_argument("--page", type=Path, default=PAGE)
-    parser.add_argument("--figure", type=Path, default=FIGURE)
     return parser.parse_args(arguments)
 
 
@@ -485,11 +434,9 @@ def main(arguments: list[str] | None = None) -> int:
         rows = [json.loads(path.read_text()) for path in sorted(args.report.glob("*.json"))]
         if not rows:
             sys.exit(f"error: {args.report} has no results of scripts.search")
-        searched = [row for row in rows if "kept" in row]
-        output.fill(args.page, table(searched), "search")
+        output.fill(args.page, table([row for row in rows if "kept" in row]), "search")
         if any("masses" in row for row in rows):
             output.fill(args.page, masses_table(rows), "masses")
-        print(args.page, draw(searched, args.figure))
         return 0
     use_compilation_cache()
     try:

@@ -1,5 +1,6 @@
 """The shell examples of README and docs: every command is one that the program takes."""
 
+import json
 import re
 import shlex
 import shutil
@@ -21,6 +22,7 @@ from codesign_jax.commands import (
     report,
 )
 from codesign_jax.studio import studio
+from scripts.shared import provenance
 from tests.helpers import tiny_run
 from tests.helpers.toy_engine import TINY
 
@@ -150,6 +152,44 @@ def test_the_user_s_pages_are_a_manual():
 def commits(text):
     """Hashes of commits: seven to forty hexadecimal digits, letters and figures among them."""
     return re.findall(r"\b(?=[0-9a-f]*[a-f])(?=[0-9a-f]*[0-9])[0-9a-f]{7,40}\b", text)
+
+
+BEFORE = {
+    "effects.json": ("docs/effects.md", "docs/notes/effects.md"),
+    "experiments/23d.json": ("README.md", "docs/results.md", "docs/notes/results.md"),
+    "experiments/fresh.json": ("docs/results.md", "docs/notes/results.md"),
+    "rates_h100.json": ("docs/performance.md",),
+    "search": ("docs/notes/search.md",),
+    "stability.json": ("docs/stability.md", "docs/notes/stability.md"),
+}
+"""Files or folders of docs/data with what was measured with another kernel; pages that show it."""
+
+
+def records(content):
+    """What made a file's results: the outermost tables that name a commit."""
+    if isinstance(content, dict) and "commit" in content:
+        return [content]
+    inner = content.values() if isinstance(content, dict) else content
+    return [r for v in inner if isinstance(v, dict | list) for r in records(v)]
+
+
+def test_all_figures_are_of_one_kernel_or_their_pages_say_that_they_are_not():
+    data, older = ROOT / "docs" / "data", {}
+    for path in data.rglob("*.json"):
+        made = records(json.loads(path.read_text()))
+        assert made, f"{path} does not say what made it"
+        for record in made:
+            if provenance.before(record):
+                place = path.relative_to(data)
+                key = place.parts[0] if place.parts[0] in BEFORE else str(place)
+                older.setdefault(key, set()).add(record["commit"][:7])
+    assert older.keys() == BEFORE.keys()
+    for key, pages in BEFORE.items():
+        for page in pages:
+            text = " ".join((ROOT / page).read_text().split())
+            assert re.search(r"contact\S* before", text), (page, key)
+            if page.startswith("docs/notes"):
+                assert all(commit in text for commit in older[key]), (page, key, older[key])
 
 
 def links(text):

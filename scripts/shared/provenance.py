@@ -10,6 +10,7 @@ import sys
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import jax
 import mujoco
@@ -18,6 +19,18 @@ import numpy as np
 from codesign_jax.provenance import environment, git_state
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene
+
+KERNEL = "702d952b"
+"""The commit that last changed what the kernel of the default scene computes: results name it.
+
+A commit that changes the kernels' text (scripts.same_kernels tells) and what grasps do comes in its
+place; what is not measured again is marked as of the contact before (tests/test_docs.py).
+"""
+
+
+def before(made: dict[str, Any]) -> str:
+    """The mark of what was measured with another kernel."""
+    return "" if made.get("kernel") == KERNEL else ", contact before"
 
 
 def command() -> str:
@@ -41,7 +54,7 @@ def parser(description: str | None) -> argparse.ArgumentParser:
 
 def results(commit: str | None = None) -> dict[str, object]:
     """What results depend on: command, commit, versions, platform and device."""
-    return {"command": command(), **git_state(commit), **environment()}
+    return {"command": command(), **git_state(commit), "kernel": KERNEL, **environment()}
 
 
 def scene_hash(scene: Scene) -> str:
@@ -56,6 +69,7 @@ def measurement(commit: str | None = None) -> dict:
     return {
         "command": command(),
         **git_state(commit),
+        "kernel": KERNEL,
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "python": platform.python_version(),
         "jax": jax.__version__,

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from codesign_jax import provenance
+from codesign_jax.provenance import environment, git_state
+from scripts.shared import provenance
 
 CASES: dict[str, "Case"] = {}
 STEPS = (1.0, 0.5, 0.25)
@@ -97,7 +98,7 @@ def margin(lower: bool, measured: float, bound: float) -> float:
 
 def write(docs: Path, new: list[dict[str, Any]]) -> None:
     """Puts rows in the place of the same ones of the stored table, and the table into its page."""
-    state = provenance.git_state()
+    state = git_state()
     made = str(state["commit"])[:7] + (" with changes" if state.get("modified") else "")
     path, page = docs / "data" / "stability.json", docs / "notes" / "stability.md"
     old = json.loads(path.read_text())["rows"] if path.exists() else []
@@ -105,9 +106,10 @@ def write(docs: Path, new: list[dict[str, Any]]) -> None:
     for row in new:
         # JSON has no infinite numbers.
         plain = {k: None if v in (math.inf, -math.inf) else v for k, v in row.items()}
-        rows[row["name"], row["step"], row["precision"]] = plain | {"commit": made}
+        plain |= {"commit": made, "kernel": provenance.KERNEL}
+        rows[row["name"], row["step"], row["precision"]] = plain
     kept = sorted(rows.values(), key=lambda r: (r["case"], r["name"], r["precision"], -r["step"]))
-    data = {"command": "make stability", **provenance.environment(), "rows": kept}
+    data = {"command": "make stability", **environment(), "rows": kept}
     path.write_text(json.dumps(data, indent=1) + "\n")
     head, tail = page.read_text().split("<!-- table:begin -->")
     tail = tail.split("<!-- table:end -->")[1]
@@ -132,12 +134,13 @@ def to_markdown(rows: list[dict[str, Any]]) -> str:
         causes = {r.get("failure") or "not explained" for r in part if not r["passed"]}
         said = ["**fails**: " + "; ".join(sorted(causes))] if causes else []
         said += ["; ".join(sorted({r["note"] for r in part if r["note"]}))]
+        made = ", ".join(sorted({r["commit"] + provenance.before(r) for r in part}))
         engine = "MuJoCo C" if first["engine"] == "mujoco" else first["engine"]
         lines.append(
             f"| {first['case']} {first['title']} | {first['invariant']} | "
             f"{engine}, {first['precision']} | {values} {first['unit']} | "
             f"{'>=' if first['lower'] else '<='} {bounds} | {number(least)} | "
-            f"{', '.join(sorted({r.get('commit', '') for r in part}))} | {' '.join(said).strip()} |"
+            f"{made} | {' '.join(said).strip()} |"
         )
     return "\n".join(lines) + "\n"
 

@@ -413,6 +413,7 @@ def search(args: argparse.Namespace, name: str) -> None:
     if args.masses:
         found = work.winners(args.designs or study.path)[: args.seeds]
         row["masses"] = {m: study.judge(found, at_mass(args, m)).tolist() for m in args.masses}
+    row["seconds"] = round(time.monotonic() - start)
     row["provenance"] = provenance.results(args.commit)
     output.write_json(args.out / f"{stem}{'-masses' * bool(args.designs)}.json", row)
     shares = [sum(k >= RELIABLE for k in kept) / len(kept) for kept in study.row()["kept"]]

@@ -29,7 +29,7 @@ help:
 	@echo "make faults      kills, full disks, damage, hostile input: FAULTS=100"
 	@echo "make notebooks   execute them         make lint types  ruff, pyright"
 	@echo "make benchmark   measure rates: BENCHMARK=docs/data/rates_cpu.json"
-	@echo "make effects     what each effect costs and decides: docs/notes/effects.md"
+	@echo "make effects     what each effect costs and decides: docs/effects.md"
 	@echo "make accuracy    what accuracy costs in time, and what moves a verdict"
 	@echo "make docs        the documentation as a site without a network: site/index.html"
 	@echo "make format      ruff format          make clean       remove what make built"

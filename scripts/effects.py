@@ -1,12 +1,10 @@
-"""What each effect costs and decides: python -m scripts.effects [--quick] [--draw].
+"""What each effect costs and decides: python -m scripts.effects [--quick] [--page].
 
 Measures the default scene with each effect turned over, on what the default search recommends,
-writes docs/data/effects.json, fills in docs/effects.md and docs/notes/effects.md and draws their
-figure; --draw only draws.  Times are of `STEPS` steps from the middle of the lift on.  About 15
-minutes on two idle cores; a run that was broken off goes on.
+writes docs/data/effects.json and fills in docs/effects.md; --page only fills in.  Times are of
+`STEPS` steps from the middle of the lift on.  About 15 minutes on two idle cores.
 """
 
-import argparse
 import dataclasses
 import json
 import os
@@ -29,15 +27,15 @@ from codesign_jax.types import failed
 from scripts.shared import output, provenance, work
 
 DOCS = Path(__file__).parents[1] / "docs"
+PAGE, DATA = DOCS / "effects.md", DOCS / "data" / "effects.json"
 AS_IT_IS = "as it is"
-CONTACTS = ("finger_object", "palm_object", "finger_table", "palm_table", "object_table")
 STEPS, ROUNDS, TIMED = 20, 9, 6
 """Time steps of a call, calls of each program, and designs whose grasps are timed."""
 
 
 def variants(base: Scene) -> dict[str, Scene]:
-    """The scene with each effect turned over, and without contacts, by what changed."""
-    changes: dict[str, dict[str, Any]] = {"all contacts off": dict.fromkeys(CONTACTS, False)}
+    """The scene with each effect turned over, by what changed."""
+    changes: dict[str, dict[str, Any]] = {}
     for field in dataclasses.fields(base.effects):
         now = getattr(base.effects, field.name)
         for value in field.metadata.get("options", (not now,)):
@@ -90,11 +88,11 @@ def program(variant: Scene, worlds: work.Worlds, start: np.ndarray) -> tuple[Any
     return run.lower(*args).compile(), args
 
 
-def measure(everything: dict[str, Scene], path: Path, *, quick: bool) -> dict[str, Any]:
-    """Measures all and writes the file; what it then holds."""
+def measure(everything: dict[str, Scene], path: Path, *, commit: str | None, quick: bool) -> None:
+    """Measures all and writes the file."""
     designs, trials = (6, 3) if quick else (30, 12)
     results: dict[str, Any] = {"designs": designs, "trials": trials, "effects": {}}
-    results["provenance"] = provenance.measurement()
+    results["provenance"] = provenance.measurement(commit)
     worlds = grasps(everything[AS_IT_IS], designs, trials)
     few = jax.tree.map(lambda v: np.asarray(v)[: TIMED * trials], worlds)
     programs, expected = {}, None
@@ -107,13 +105,13 @@ def measure(everything: dict[str, Scene], path: Path, *, quick: bool) -> dict[st
         print(name, results["effects"][name], flush=True)
         programs[name] = program(variant, few, start[: TIMED * trials])
     times: dict[str, list[float]] = {name: [] for name in programs}
-    results["load_before"] = os.getloadavg()
+    load = [os.getloadavg()[0]]
     for _ in range(ROUNDS + 1):  # in turn, so that a busy machine slows all alike
         for name, (run, args) in programs.items():
             begin = time.perf_counter()
             jax.block_until_ready(run(*args))
             times[name].append((time.perf_counter() - begin) / STEPS / (TIMED * trials))
-    results["load_after"] = os.getloadavg()
+    results["load"] = [*load, os.getloadavg()[0]]
     for name, seconds in times.items():
         ratios = np.array(seconds[1:]) / np.array(times[AS_IT_IS][1:])  # the first round warms up
         results["effects"][name] |= {
@@ -122,31 +120,6 @@ def measure(everything: dict[str, Scene], path: Path, *, quick: bool) -> dict[st
             "ratio_quartiles": [float(q) for q in np.quantile(ratios, [0.25, 0.75])],
         }
     output.write_json(path, results)
-    return results
-
-
-def draw(results: dict[str, Any], path: Path) -> None:
-    """Time of a step and success rate of the scene with each effect turned over."""
-    rows = results["effects"]
-    names = [*(n for n in rows if n != AS_IT_IS), AS_IT_IS][::-1]
-    figure = output.new_figure(9.6, 5.6)
-    left, right = figure.subplots(1, 2, sharey=True)
-    for axis, field, ends in (
-        (left, "ratio", lambda r: r["ratio_quartiles"]),
-        (right, "success", lambda r: (r["success_low"], r["success_high"])),
-    ):
-        place = [k for k, n in enumerate(names) if field in rows[n]]
-        value = np.array([rows[names[k]][field] for k in place])
-        low, high = np.array([ends(rows[names[k]]) for k in place]).T
-        # A share of 0 or 1 lies on its interval's end but for rounding.
-        error = np.maximum([value - low, high - value], 0.0)
-        axis.errorbar(value, place, xerr=error, fmt="o", ms=4, capsize=2)
-        axis.axvline(rows[AS_IT_IS][field], color="black", lw=0.8, ls="--")
-        axis.grid(axis="x", alpha=0.3)
-    left.set_yticks(range(len(names)), names)
-    left.set(xlabel="time of a step, relative to the scene as it is, quartiles", xlim=(0, None))
-    right.set(xlabel="success rate with 95 % interval")
-    output.save_figure(figure, path)
 
 
 def support_table() -> list[list[str]]:
@@ -162,41 +135,34 @@ def support_table() -> list[list[str]]:
     return table
 
 
-def measured_table(results: dict[str, Any]) -> list[list[str]]:
-    """A row for each change of the scene."""
+def measured(results: dict[str, Any]) -> str:
+    """What measured, and a row for each change of the scene."""
     table = [["change", "same verdicts", "success (95 %)", "time of a step (quartiles)"]]
     for name, r in results["effects"].items():
         low, high = r["ratio_quartiles"]
         cells = [f"{100 * r['same_verdict']:.1f} %", f"{100 * r['success']:.1f} %"]
         cells[1] += f" ({100 * r['success_low']:.1f} to {100 * r['success_high']:.1f})"
         table.append([name, *cells, f"× {r['ratio']:.2f} ({low:.2f} to {high:.2f})"])
-    return table
+    p, load = results["provenance"], results["load"]
+    made = f"{results['designs']} designs in {results['trials']} trials each; {p['cpus']} cores, "
+    made += f"jax {p['jax']}; load of the machine while timing {load[0]:.0f} to {load[1]:.0f}."
+    return f"{made}\n\n{output.markdown(table)}"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", type=Path, default=DOCS / "data" / "effects.json")
+    parser = provenance.parser(__doc__)
+    parser.add_argument("--json", type=Path, default=DATA)
     parser.add_argument("--quick", action="store_true", help="few grasps, few links; not for docs")
-    parser.add_argument("--draw", action="store_true", help="draw from the file; measure nothing")
+    parser.add_argument("--page", action="store_true", help="fill in the page and measure nothing")
     options = parser.parse_args()
     use_compilation_cache()
-    if options.draw:
-        results = json.loads(options.json.read_text())
-    else:
+    if not options.page:
         links = {"discretization": {"links": 3}} if options.quick else None
         base = scenes.load("paper", overrides=links)
-        results = measure(variants(base), options.json, quick=options.quick)
-    if options.quick:
-        return draw(results, options.json.with_suffix(".png"))
-    draw(results, DOCS / "figures" / "effects.png")
-    p, rows = results["provenance"], output.markdown(measured_table(results))
-    load = [f"{results[k][0]:.1f}" for k in ("load_before", "load_after")]
-    made = f"{results['designs']} designs in {results['trials']} trials; {p['cpus']} cores of "
-    made += f"{p['cpu']}, jax {p['jax']}, commit {p['commit'][:7]}; a step as the scene is takes "
-    made += f"{1e6 * results['effects'][AS_IT_IS]['step_seconds']:.0f} µs of a world; load of the "
-    made += f"machine while timing: {' to '.join(load)}."
-    output.fill(DOCS / "notes" / "effects.md", f"{made}\n\n{rows}", "measured")
-    output.fill(DOCS / "effects.md", output.markdown(support_table()), "support")
+        measure(variants(base), options.json, commit=options.commit, quick=options.quick)
+    if not options.quick:
+        output.fill(PAGE, measured(json.loads(options.json.read_text())), "measured")
+        output.fill(PAGE, output.markdown(support_table()), "support")
 
 
 if __name__ == "__main__":

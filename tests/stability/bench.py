@@ -58,13 +58,13 @@ def refined(base: Scene, step: float) -> Scene:
 
 
 @functools.cache
-def pinch(**settings) -> Scene:
+def pinch(name="paper_spheres", **settings) -> Scene:
     """Two opposed fingers of three links and the paper's three objects."""
     overrides: dict = {"discretization": {"links": 3}}
     for key, value in settings.items():
-        table, name = key.split("__")
-        overrides.setdefault(table, {})[name] = value
-    return scene.load("paper_spheres", hand_name=grasps.DATA / "pinch.toml", overrides=overrides)
+        table, entry = key.split("__")
+        overrides.setdefault(table, {})[entry] = value
+    return scene.load(name, hand_name=grasps.DATA / "pinch.toml", overrides=overrides)
 
 
 @functools.lru_cache(maxsize=8)

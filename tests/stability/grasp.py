@@ -15,16 +15,16 @@ from tests.helpers import grasps
 from tests.helpers.grasps import GOOD
 from tests.stability.bench import CREEP, FIRM, bench, floats
 from tests.stability.oracle import Reader
-from tests.stability.table import BOTH, Found, case
+from tests.stability.table import BOTH, Found, case, case_of_both_scenes
 
 
 @functools.cache
-def paper(**settings):
+def paper(name="paper_spheres", **settings):
     overrides: dict = {}
     for key, value in settings.items():
-        table, name = key.split("__")
-        overrides.setdefault(table, {})[name] = value
-    return scene.load("paper_spheres", overrides=overrides)
+        table, entry = key.split("__")
+        overrides.setdefault(table, {})[entry] = value
+    return scene.load(name, overrides=overrides)
 
 
 def design(the_scene, **changes) -> Params:
@@ -63,27 +63,25 @@ def good(b):
 
 
 @functools.cache
-def slow():
+def slow(name):
     """Every phase ten times as long, with the standard scene's contact; the arm holds still."""
-    base = paper(
-        contact__normal_stiffness=FIRM.normal_stiffness, contact__friction_ratio=FIRM.friction_ratio
-    )
+    firm = {n: getattr(FIRM, n) for n in ("normal_stiffness", "friction_ratio")}
+    base = paper(name, **{f"contact__{n}": value for n, value in firm.items()})
     phases = {f.name: 10 * getattr(base.phases, f.name) for f in dataclasses.fields(base.phases)}
     still = dataclasses.replace(base.arm, shake_amplitude=0.0)
     return dataclasses.replace(base, phases=type(base.phases)(**phases), arm=still)
 
 
-@case(
+@case_of_both_scenes(
     6,
     "stiffest corner of Table I, 9 s",
     "largest joint speed at rest on the object",
     unit="rad/s",
-    engines=BOTH,
     quick="mujoco",
 )
-def stiff_and_still(engine, step, precision):
+def stiff_and_still(name, engine, step, precision):
     """Joints of 500 rad/s that the palm presses onto the object do not rattle."""
-    b = bench(paper(), engine, step, precision)
+    b = bench(paper(name), engine, step, precision)
     return resting(b, *stiffest(b), 3.5, 0.3)
 
 
@@ -111,20 +109,19 @@ def zero_gap(engine, step, precision):
     return resting(b, fields, ctrl, 1.0, 0.3)
 
 
-@case(
+@case_of_both_scenes(
     20,
     "ten times the episode, 90 s",
     "creep of held objects in the palm",
     unit="m",
     steps=(1.0, 0.5),
-    engines=BOTH,
 )
-def long_hold(engine, step, precision):
+def long_hold(name, engine, step, precision):
     """How far objects creep in the palm's frame in 34.5 s from the end of the lift on."""
-    b = bench(slow(), engine, step, precision)
+    b = bench(slow(name), engine, step, precision)
     fields, ctrl = good(b)
     history = b.run(fields, ctrl)
-    times = [round(t / b.h) for t in (slow().phases.lift + 0.5, slow().phases.disturb)]
+    times = [round(t / b.h) for t in (b.scene.phases.lift + 0.5, b.scene.phases.disturb)]
     worst = 0.0
     for world in range(len(ctrl)):
         reader, places = Reader(b.scene, fields, world), []

@@ -7,7 +7,7 @@ from tests.helpers import grasps
 from tests.helpers.tables import GRAVITY
 from tests.stability.bench import CHUNK, CREEP, FIRM, bench, loaded, pinch
 from tests.stability.oracle import Reader
-from tests.stability.table import BOTH, Found, case
+from tests.stability.table import BOTH, Found, case, case_of_both_scenes
 from tests.stability.touch import at_height
 
 # --- 12: pinch -------------------------------------------------------------------------------
@@ -24,9 +24,11 @@ def lifted(the_bench, seconds):
     )
 
 
-def firm():
+def firm(name="paper_spheres"):
     return pinch(
-        contact__normal_stiffness=FIRM.normal_stiffness, contact__friction_ratio=FIRM.friction_ratio
+        name,
+        contact__normal_stiffness=FIRM.normal_stiffness,
+        contact__friction_ratio=FIRM.friction_ratio,
     )
 
 
@@ -35,10 +37,10 @@ def hanging(history):
     return history.qpos[0, :, 2] - history.qpos[0, :, -5]
 
 
-@case(12, "pinch held for 60 s", "slip of the object", unit="m", engines=BOTH)
-def pinch_holds(engine, step, precision):
+@case_of_both_scenes(12, "pinch held for 60 s", "slip of the object", unit="m")
+def pinch_holds(name, engine, step, precision):
     """For a minute, from a second after the lift on."""
-    b = bench(firm(), engine, step, precision)
+    b = bench(firm(name), engine, step, precision)
     slip = hanging(b.run(*lifted(b, 61.0)))[-round(60 / b.h) :]
     rate = (slip[-1] - slip[-round(30 / b.h)]) / 30
     return Found(slip[-1] - slip[0], 60 * CREEP, f"creeps at {1e3 * rate:.3f} mm/s in the end")
@@ -107,10 +109,10 @@ def pressed(b):
 HEAVY = (13, "mass ratio 2000 between object and link")
 
 
-@case(*HEAVY, "largest speed at rest", unit="rad/s", engines=BOTH, quick="mujoco")
-def heavy_rest(engine, step, precision):
+@case_of_both_scenes(*HEAVY, "largest speed at rest", unit="rad/s", quick="mujoco")
+def heavy_rest(name, engine, step, precision):
     """Speed after 1.2 s of rest, of joints and of the object."""
-    b = bench(pinch(discretization__links=10), engine, step, precision)
+    b = bench(pinch(name, discretization__links=10), engine, step, precision)
     history = b.run(*pressed(b))
     # Creep of 1 mm/s at 20 mm; a solver that loses digits to the mass ratio rattles.
     return Found(history.speed[0, -round(0.3 / b.h) :].max(), 0.05)

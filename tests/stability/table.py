@@ -1,6 +1,7 @@
 """The hard cases as data: what is measured, its bound, and the table of their margins."""
 
 import dataclasses
+import functools
 import itertools
 import json
 import math
@@ -82,6 +83,18 @@ def case(number: int, title: str, invariant: str, *, engines=BOTH[:1], name: str
             assert full not in CASES, f"two cases are called {full}"
             CASES[full] = Case(number, full, title, invariant, engine, measure, **how)
         return measure
+
+    return register
+
+
+def case_of_both_scenes(number, title, *what, quick="", **how):
+    """Registers a function (scene, engine, step, precision): the spheres', and the default one."""
+
+    def register(measure):
+        name = measure.__name__
+        spheres, default = (functools.partial(measure, n) for n in ("paper_spheres", "paper"))
+        case(number, title, *what, name=name, engines=BOTH, quick=quick, **how)(spheres)
+        case(number, f"{title}, default scene", *what, name=f"{name}_default", **how)(default)
 
     return register
 

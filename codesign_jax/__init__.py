@@ -19,7 +19,6 @@ if TYPE_CHECKING:
         engines,
         env,
         export,
-        fit,
         model,
         optimize,
         policy,
@@ -66,7 +65,6 @@ __all__ = [
     "engines",
     "env",
     "export",
-    "fit",
     "hand",
     "make_engine",
     "model",
@@ -85,10 +83,7 @@ __all__ = [
 
 
 def _import_mujoco() -> None:
-    """Imports MuJoCo, without OpenGL where MUJOCO_GL names a way that is not there.
-
-    Nothing but `report.renderer`, in a process of its own, draws with OpenGL.
-    """
+    """Imports MuJoCo, without OpenGL where MUJOCO_GL names a way that is not there."""
     way = os.environ["MUJOCO_GL"]
     try:
         importlib.import_module("mujoco")

@@ -29,7 +29,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import optax
 
-from codesign_jax import fit, make_engine, model, parameters, rollout, scene, use_compilation_cache
+from codesign_jax import make_engine, model, parameters, rollout, scene, use_compilation_cache
 
 use_compilation_cache()
 FAST = bool(os.environ.get("CODESIGN_FAST"))
@@ -55,9 +55,7 @@ finger = dataclasses.replace(whole.hand, finger=whole.hand.finger[:1])
 bench = dataclasses.replace(whole, hand=finger)
 
 space = parameters.design_space(bench.hand)
-fields = jax.jit(
-    lambda d: model.model_fields(bench, space.params(d), rollout.nominal_trial(bench))
-)(space.default())
+hand, trial = space.params(space.default()), rollout.nominal_trial(bench)
 time = np.arange(round(duration / step)) * step
 ctrl = np.zeros((len(time), 7), np.float32)  # six of the arm, one chamber
 ctrl[:, 2] = bench.arm.start_height  # m
@@ -70,11 +68,25 @@ ctrl = jnp.asarray(ctrl)
 # 70 kPa and 12 ms are what the fit has to find; the noise is 0.3 mm.
 
 # %%
-truth = fit.Material(jnp.asarray(70e3), jnp.asarray(0.012))
-oracle = make_engine("mujoco", bench)
-true_fields = jax.tree.map(lambda v: v[None], fit.with_material(bench, fields, truth))
-trace = jax.jit(lambda f, c: oracle.rollout(f, c, trajectory=True))(true_fields, ctrl[None])
-measured = jax.jit(lambda q: fit.tip_positions(bench, fields, q))(trace.qpos[0])
+truth = np.log([70e3, 0.012])  # logarithms of shear modulus [Pa] and damping time [s]
+bends = model.layout(bench).dofs[0, :, 0]  # places of the joints' angles among the positions
+
+
+def tips(engine, logs):
+    """Tip along and above the unbent finger [m], shape (time, 2), of logarithms of a material."""
+    numbers = {"shear_modulus": jnp.exp(logs[0]), "damping_time": jnp.exp(logs[1])}
+    material = dataclasses.replace(bench.hand.material, **numbers)
+    other = dataclasses.replace(bench, hand=dataclasses.replace(bench.hand, material=material))
+    fields = jax.tree.map(lambda v: jnp.asarray(v)[None], model.model_fields(other, hand, trial))
+    trace = engine.rollout(fields, ctrl[None], trajectory=True)
+    # Joints are in the middle of the segments: half a one before the first, half behind the last.
+    segment, angle = hand.length[0] / len(bends), jnp.cumsum(trace.qpos[0][:, bends], 1)
+    reach = segment * jnp.ones(len(bends)).at[-1].set(0.5)
+    along = segment / 2 + (reach * jnp.cos(angle)).sum(1)
+    return jnp.stack([along, -(reach * jnp.sin(angle)).sum(1)], 1)
+
+
+measured = jax.jit(lambda logs: tips(make_engine("mujoco", bench), logs))(truth)
 measured += 3e-4 * jax.random.normal(jax.random.key(0), measured.shape)
 
 # %% [markdown]
@@ -89,61 +101,53 @@ engine, variance = make_engine("structured", bench), jnp.var(measured, axis=0).m
 
 def misfit(logs):
     """Mean squared error of the tip over its variance, of logarithms of a material."""
-    tips = fit.simulate_tips(engine, fields, ctrl, jax.tree.map(jnp.exp, logs))
-    return jnp.mean((tips - measured) ** 2) / variance, tips
+    found = tips(engine, logs)
+    return jnp.mean((found - measured) ** 2) / variance, found
 
 
 gradient = jax.jit(jax.value_and_grad(misfit, has_aux=True))
 moduli = np.geomspace(40e3, 110e3, 3 if FAST else 9)
-
-
-def logarithms(shear_modulus, damping_time):
-    """A material's logarithms, as arrays of one type: another type would compile again."""
-    return fit.Material(jnp.float32(np.log(shear_modulus)), jnp.float32(np.log(damping_time)))
-
-
-tried = [logarithms(g, truth.damping_time) for g in moduli]
-along = [gradient(logs) for logs in tried]
+along = [gradient(jnp.array([np.log(modulus), truth[1]])) for modulus in moduli]
 values = np.array([float(value) for (value, _), _ in along])
-slopes = np.array([float(slope.shear_modulus) for _, slope in along])  # by the logarithm
+slopes = np.array([float(slope[0]) for _, slope in along])  # by the logarithm
 print("misfit:", np.round(values, 4), "\nslope: ", np.round(slopes, 3))
 
 # %% [markdown]
 # ## The fit
 #
-# Adam on the logarithms, whose signs and scales need no thought.  (`fit.fit_material` does this in
-# one program.)
+# Adam on the logarithms, whose signs and scales need no thought.
 
 # %%
 steps = 6 if FAST else 60
 adam = optax.adam(optax.cosine_decay_schedule(0.12, steps), b1=0.8, b2=0.95)
-logs = logarithms(50e3, 0.006)
+logs = jnp.log(jnp.array([50e3, 0.006]))
 memory, history, first = adam.init(logs), [], None
 for _ in range(steps):
-    (value, tips), slope = gradient(logs)
-    first = tips if first is None else first
-    history.append([*jax.tree.map(float, jax.tree.map(jnp.exp, logs)), float(value)])
+    (value, last), slope = gradient(logs)
+    first = last if first is None else first
+    history.append([*jnp.exp(logs).tolist(), float(value)])
     update, memory = adam.update(slope, memory)
     logs = optax.apply_updates(logs, update)
 history = np.array(history)
-for name, true, value in zip(fit.Material._fields, truth, history[-1], strict=False):
-    print(f"{name}: found {value:.4g}, true {float(true):.4g} ({100 * (value / true - 1):+.1f} %)")
+names, true = ("shear modulus", "damping time"), np.exp(truth)
+for name, wanted, value in zip(names, true, history[-1], strict=False):
+    print(f"{name}: found {value:.4g}, true {wanted:.4g} ({100 * (value / wanted - 1):+.1f} %)")
 
 # %%
 figure, axes = plt.subplots(1, 3, figsize=(12, 3.4), layout="constrained")
-axes[0].plot(time, 1e3 * np.asarray(measured)[:, 0, 2], ".", color="0.6", label="measured")
-axes[0].plot(time, 1e3 * np.asarray(first)[:, 0, 2], "--", color="C0", label="guess")
-axes[0].plot(time, 1e3 * np.asarray(tips)[:, 0, 2], color="C0", label="fitted")
+axes[0].plot(time, 1e3 * np.asarray(measured)[:, 1], ".", color="0.6", label="measured")
+axes[0].plot(time, 1e3 * np.asarray(first)[:, 1], "--", color="C0", label="guess")
+axes[0].plot(time, 1e3 * np.asarray(last)[:, 1], color="C0", label="fitted")
 axes[0].set(xlabel="time [s]", ylabel="tip height [mm]")
 axes[0].legend()
 axes[1].plot(1e-3 * moduli, values, "o", color="C1")
 for modulus, value, slope in zip(moduli, values, slopes, strict=True):
     ends = np.array([0.92, 1.08])
     axes[1].plot(1e-3 * modulus * ends, value + slope * np.log(ends), color="C1")
-axes[1].axvline(1e-3 * float(truth.shear_modulus), color="black", lw=1, ls="--")
+axes[1].axvline(1e-3 * true[0], color="black", lw=1, ls="--")
 axes[1].set(xlabel="shear modulus [kPa]", ylabel="misfit", title="values and their derivatives")
-axes[2].plot(history[:, 0] / float(truth.shear_modulus), label="shear modulus")
-axes[2].plot(history[:, 1] / float(truth.damping_time), label="damping time")
+axes[2].plot(history[:, 0] / true[0], label="shear modulus")
+axes[2].plot(history[:, 1] / true[1], label="damping time")
 axes[2].axhline(1, color="black", lw=1, ls="--")
 axes[2].set(xlabel="gradient step", ylabel="found / true")
 axes[2].legend()

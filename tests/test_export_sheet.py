@@ -103,37 +103,24 @@ def test_sheet_has_dimensions_pressures_and_tolerances(page, tmp_path):
     assert "fewer than 90 %" in text
 
 
-def apart(figure, drawings):
-    """Boxes of a page's texts, which stand apart from each other and from the first drawings."""
-    FigureCanvasAgg(figure).draw()
-    texts = [*figure.texts, *(axes.title for axes in figure.axes)]
-    boxes = {t.get_text(): t.get_window_extent() for t in texts if t.get_text()}
-    for (text, one), (other, two) in itertools.combinations(boxes.items(), 2):
-        assert not one.overlaps(two), (text, other)
-    for axes in figure.axes[:drawings]:
-        drawn = [patch.get_window_extent() for patch in axes.patches[:1]]
-        for text, box in boxes.items():
-            assert not any(box.overlaps(patch) for patch in drawn), text
-    assert min(box.y0 for box in boxes.values()) > 0, "all of it is on the page"
-    return boxes
-
-
-def test_drawing_is_two_pages(page, tmp_path):
-    the_scene, params, sizes, drift = page
-    content = sheet.sheet_sections(*page)
+def test_a_page_of_drawings_whose_texts_stand_apart(page, tmp_path):
+    the_scene, params, sizes, _ = page
+    data = drawing.write(tmp_path, "Build sheet", the_scene, params, sizes).read_bytes()
+    assert data.startswith(b"%PDF") and b"/Count 1" in data and len(data) > 10_000
     assembly = sheet.assembly_sections(the_scene, params, sizes, Process())
-    path = drawing.write(
-        *(tmp_path, "Build sheet", ["Design: x"], content),
-        **{"scene": the_scene, "params": params, "sizes": sizes, "drift": drift},
-        assembly=assembly,
-    )
-    data = path.read_bytes()
-    assert data.startswith(b"%PDF") and b"/Count 2" in data and len(data) > 10_000
     parts = {row[0]: row[1:] for row in assembly[0].rows}
     solids = [casting.parts(size, Process(inlet=0)).finger.volume() for size in sizes]
     assert parts["silicone"][1].startswith(f"{sum(solids) / 1e3:.0f} cm³")
-    second = drawing.second_page(assembly, the_scene, params, sizes)
-    apart(second, 3)
+    figure = drawing.page("Build sheet", the_scene, params, sizes)
+    FigureCanvasAgg(figure).draw()
+    texts = [*figure.texts, *(axes.title for axes in figure.axes)]
+    boxes = {t.get_text(): t.get_window_extent() for t in texts}
+    for (text, one), (other, two) in itertools.combinations(boxes.items(), 2):
+        assert not one.overlaps(two), (text, other)
+    for axes in figure.axes:
+        drawn = axes.patches[0].get_window_extent()
+        assert not any(box.overlaps(drawn) for box in boxes.values()), axes.title
+    assert min(box.y0 for box in boxes.values()) > 0, "all of it is on the page"
 
 
 def test_the_assembly_stands_as_mujoco_has_it(page):

@@ -24,7 +24,7 @@ engines cost
 start policy
 rollout
 own preflight
-codesign env finger fit sampling
+codesign env finger sampling
 batch
 runs
 report
@@ -112,7 +112,6 @@ GIVEN = {
     "engines.structured.forces": ["engines.structured.engine"],
     "engines.structured.segments": ["engines.structured.engine"],
     "engines.structured.transforms": ["engines.structured.engine"],
-    "report.sketch": ["report.animation"],
 }
 
 
@@ -226,18 +225,18 @@ def test_no_kernel_depends_on_what_its_key_leaves_out():
 # As `find DIR -name '*.py' | xargs cat | wc -l` counts.  A larger number is a line of a review: say
 # there what users have of it, and what could go in its place.
 MOST_LINES = {
-    "codesign_jax": 39_900,
+    "codesign_jax": 39_500,
     "codesign_jax/codesign": 590,
     "codesign_jax/commands": 2_910,
     "codesign_jax/compiler": 2_980,
     "codesign_jax/env": 350,
     "codesign_jax/engines": 12_830,
-    "codesign_jax/export": 1_720,
+    "codesign_jax/export": 1_620,
     "codesign_jax/model": 1_630,
     "codesign_jax/optimize": 1_340,
-    "codesign_jax/report": 2_020,
+    "codesign_jax/report": 1_880,
     "codesign_jax/runs": 3_160,
-    "codesign_jax/scene": 5_050,
+    "codesign_jax/scene": 5_020,
     "codesign_jax/studio": 750,
     "scripts": 5_500,
     "tests": 18_500,

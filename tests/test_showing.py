@@ -24,9 +24,8 @@ DESIGN = ["--scene", str(TINY), "--engine", "mujoco", "--design", "length=100", 
 
 @pytest.fixture(autouse=True)
 def workplace(tmp_path, monkeypatch):
-    """An empty working directory, a cache of its own, and no OpenGL, which is slow."""
+    """An empty working directory and a cache of its own."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(animation, "opengl_backend", lambda: None)
     (tmp_path / "work").mkdir()
     monkeypatch.chdir(tmp_path / "work")
     return tmp_path / "work"

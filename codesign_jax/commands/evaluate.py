@@ -133,5 +133,5 @@ def of_objects(case: Case, engine: Engine, options: "Evaluate", console: Console
             with Busy(console, "simulating what is drawn"):
                 grasps = animation.replay(scene, engine, params, trials)
         with Busy(console, "drawing"):
-            animation.write(scene, grasps, options.render, notify=console.print)
+            animation.write(scene, grasps, options.render)
         console.print(f"picture: {options.render}")

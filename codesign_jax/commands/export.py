@@ -127,7 +127,7 @@ def _tell(case: Case, options: "Export", console: Console) -> None:
     if not options.no_parts:
         console.print("  parts/: fingers and moulds, in millimetres")
     if not options.no_sheet:
-        console.print(f"  {sheet.NAME}.md, {sheet.NAME}.pdf: build sheet")
+        console.print(f"  {sheet.NAME}.md, {sheet.NAME}.pdf: build sheet and its drawings")
         if options.tolerance == "off":
             most = drift.study(case, options).most * options.tolerance_trials
             console.print(
@@ -209,5 +209,4 @@ def _sheet(
     ]
     assembly = sheet.assembly_sections(case.scene, params, sizes, _process(options))
     sheet.write(folder, title, lines, [*content, *assembly])
-    shown = {"scene": case.scene, "params": params, "sizes": sizes, "drift": found}
-    drawing.write(folder, title, lines, content, assembly=assembly, **shown)
+    drawing.write(folder, title, case.scene, params, sizes)

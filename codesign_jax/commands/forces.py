@@ -16,7 +16,7 @@ from codesign_jax import model, rollout
 from codesign_jax.engines import Engine
 from codesign_jax.policy import ControlLoop
 from codesign_jax.report import verdicts
-from codesign_jax.report.animation import Replay
+from codesign_jax.report.replay import Replay
 from codesign_jax.runs import tables
 from codesign_jax.scene import InputError, Scene
 from codesign_jax.types import Forces, Params, Trial

@@ -18,7 +18,7 @@ from codesign_jax.types import Trial
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Shown
-    from codesign_jax.report.animation import Replay
+    from codesign_jax.report.replay import Replay
 
 
 class Asked(NamedTuple):

@@ -11,7 +11,7 @@ from codesign_jax.scene import schema
 
 if TYPE_CHECKING:
     from codesign_jax.cli import Render
-    from codesign_jax.report.animation import Camera
+    from codesign_jax.report.replay import Camera
 
 
 def main(options: "Render") -> int:
@@ -73,7 +73,7 @@ def draw(asked: grasp.Asked, options: "Render", camera: "Camera", console: Conso
     console.print("\n".join(grasp.description(asked, shown)))
     scene, size = asked.case.scene, (options.size, options.size)
     with Busy(console, "drawing"):
-        how: Any = {"size": size, "camera": camera, "notify": console.print}
+        how: Any = {"size": size, "camera": camera}
         if options.times:
             how["times"] = options.times
         animation.write(scene, [shown], options.out, **how)

@@ -1,6 +1,5 @@
-"""The build sheet as two pages of PDF, drawn by matplotlib."""
+"""The drawings of the build sheet, a page of PDF: a finger, the palm, the hand from three sides."""
 
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,78 +8,43 @@ import matplotlib.figure
 import matplotlib.patches
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_pdf import PdfPages
 from scipy.spatial import ConvexHull
 
 from codesign_jax.export.process import Size
-from codesign_jax.export.sheet import NAME, Drift, SheetSection, corners, places
-from codesign_jax.export.tolerance import Side
+from codesign_jax.export.sheet import NAME, corners, places
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
 
 _A4 = (8.27, 11.69)
 _SMALL = 5.6
-_LINE = 0.0095  # height of a line of that size in the figure's
 
 
-def write(folder: Path, *content: Any, assembly: Sequence[SheetSection], **shown: Any) -> Path:
-    """Writes the sheet to a folder as two pages of PDF."""
+def write(folder: Path, title: str, scene: Scene, params: Params, sizes: Sequence[Size]) -> Path:
     path = folder / f"{NAME}.pdf"
-    with PdfPages(path) as pages:
-        pages.savefig(page(*content, **shown))
-        pages.savefig(second_page(assembly, shown["scene"], shown["params"], shown["sizes"]))
+    page(title, scene, params, sizes).savefig(path)
     return path
 
 
 def page(
-    title: str,
-    lines: Sequence[str],
-    content: Sequence[SheetSection],
-    *,
-    scene: Scene,
-    params: Params,
-    sizes: Sequence[Size],
-    drift: Drift | None,
+    title: str, scene: Scene, params: Params, sizes: Sequence[Size]
 ) -> matplotlib.figure.Figure:
-    """Draws the sheet on one page."""
     # A figure of its own instead of pyplot's: no state and no display is touched.
     figure = matplotlib.figure.Figure(figsize=_A4)
     figure.text(0.06, 0.965, title, fontsize=13, weight="bold")
-    about = "\n".join(textwrap.fill(line, 165) for line in lines)
-    figure.text(0.06, 0.957, about, fontsize=_SMALL, va="top")
-    top = 0.935 - _LINE * (about.count("\n") + 1)  # below what it is about, however long that is
-    _section(figure.add_axes((0.04, top - 0.14, 0.24, 0.13)), sizes[0])
-    _side_view(figure.add_axes((0.30, top - 0.14, 0.38, 0.13)), sizes[0])
-    _palm(figure.add_axes((0.70, top - 0.16, 0.26, 0.16)), scene, params)
-    top -= 0.175
-    for section in content:
-        if section.title.startswith("Tolerance") and drift and drift.rows:
-            top = _tolerance(figure, top, section, drift)
-        else:
-            top = _table(figure, top, section)
-    return figure
-
-
-def second_page(
-    content: Sequence[SheetSection], scene: Scene, params: Params, sizes: Sequence[Size]
-) -> matplotlib.figure.Figure:
-    """Draws the hand from three sides, and below it the sections; arguments as of `page`."""
-    figure = matplotlib.figure.Figure(figsize=_A4)
-    figure.text(0.06, 0.965, "Assembly", fontsize=13, weight="bold")
+    _section(figure.add_axes((0.06, 0.80, 0.34, 0.12)), sizes[0])
+    _side_view(figure.add_axes((0.44, 0.80, 0.50, 0.12)), sizes[0])
     found = corners(scene, params, sizes)
-    _view(figure.add_axes((0.08, 0.66, 0.40, 0.27)), scene, found, "front: x, z", 0, 2)
-    _view(figure.add_axes((0.54, 0.66, 0.40, 0.27)), scene, found, "side: y, z", 1, 2)
-    _view(figure.add_axes((0.08, 0.36, 0.40, 0.26)), scene, found, "from above: x, y", 0, 1)
+    _view(figure.add_axes((0.08, 0.46, 0.40, 0.27)), scene, found, "front: x, z", 0, 2)
+    _view(figure.add_axes((0.54, 0.46, 0.40, 0.27)), scene, found, "side: y, z", 1, 2)
+    _view(figure.add_axes((0.08, 0.12, 0.40, 0.27)), scene, found, "from above: x, y", 0, 1)
+    _palm(figure.add_axes((0.54, 0.12, 0.40, 0.27)), scene, params)
     extent = np.ptp(np.concatenate(found), axis=0)
     words = (
         f"Straight fingers, without pressure, span {extent[0]:.0f} x {extent[1]:.0f} x "
         f"{extent[2]:.0f} mm. Red: fabric, which faces inwards. z = 0: the palm's underside. "
-        "Numbers of fingers at their tips."
+        f"Numbers of fingers at their tips. Tables and the order of work: {NAME}.md."
     )
-    _notes(figure, 0.58, textwrap.wrap(words, 60), left=0.54)
-    top = 0.34
-    for section in content:
-        top = _table(figure, top, section)
+    figure.text(0.06, 0.06, words, fontsize=_SMALL)
     return figure
 
 
@@ -107,72 +71,6 @@ def _view(axes: Axes, scene: Scene, fingers: np.ndarray, title: str, across: int
     axes.tick_params(labelsize=_SMALL)
     axes.spines[["top", "right"]].set_visible(False)
     axes.margins(0.05)
-
-
-def _lines(text: str) -> list[str]:
-    return textwrap.wrap(text, 165)
-
-
-def _table(figure: matplotlib.figure.Figure, top: float, section: SheetSection) -> float:
-    figure.text(0.06, top, section.title, fontsize=8, weight="bold", va="top")
-    top -= 0.015
-    if section.rows:
-        height = 0.0125 * (len(section.rows) + 1)
-        axes = figure.add_axes((0.06, top - height, 0.88, height))
-        axes.axis("off")
-        table = axes.table(section.rows, colLabels=section.head, bbox=[0, 0, 1, 1], cellLoc="left")
-        table.auto_set_font_size(False)
-        table.set_fontsize(_SMALL)
-        table.auto_set_column_width([*range(len(section.head))])
-        for (row, _), cell in table.get_celld().items():
-            cell.set_linewidth(0.3)
-            cell.PAD = 0.03
-            if row == 0:
-                cell.set_facecolor("0.9")
-        top -= height + 0.003
-    return _notes(figure, top, section.notes)
-
-
-def _notes(
-    figure: matplotlib.figure.Figure, top: float, notes: Sequence[str], left: float = 0.06
-) -> float:
-    text = [line for note in notes for line in _lines(note)]
-    figure.text(left, top, "\n".join(text), fontsize=_SMALL, va="top", linespacing=1.3)
-    return top - _LINE * len(text) - 0.010
-
-
-def _tolerance(
-    figure: matplotlib.figure.Figure, top: float, section: SheetSection, drift: Drift
-) -> float:
-    figure.text(0.06, top, section.title, fontsize=8, weight="bold", va="top")
-    bottom = 0.02 + _LINE * sum(len(_lines(note)) for note in section.notes) + 0.015
-    bottom = max(bottom, top - 0.03 - 0.03 * len(drift.rows))
-    axes = figure.add_axes((0.14, bottom, 0.63, top - 0.018 - bottom))
-    for k, row in enumerate(drift.rows):
-        ends = [_end(side, row.value) for side in (row.down, row.up)]
-        span = row.up.limit - row.down.limit
-        at = [(end - row.down.limit) / span for end in (*ends, row.value)]
-        axes.plot([0, 1], [k, k], color="0.85", lw=0.6, zorder=0)
-        axes.plot(at[:2], [k, k], color="tab:blue", lw=3.5, solid_capstyle="butt")
-        axes.plot(at[2], k, "|", color="black", ms=7)
-        for side in (row.down, row.up):
-            if side.bad is not None:
-                x = (side.bad.value - row.down.limit) / span
-                axes.plot(x, k, "x", color="tab:red", ms=3.5, mew=0.9, clip_on=False)
-        left, right = f"{row.down.limit:.4g}  ", f"  {row.up.limit:.4g}"
-        axes.text(0, k, left, ha="right", va="center", fontsize=4.5, color="0.4")
-        label = f"{right}    {ends[0]:.3g} … {row.value:.3g} … {ends[1]:.3g} {row.unit}"
-        axes.text(1, k, label, ha="left", va="center", fontsize=4.8)
-    axes.set(xlim=(0, 1.0), ylim=(len(drift.rows) - 0.5, -0.5), xticks=[])
-    axes.set_yticks(range(len(drift.rows)), [row.name for row in drift.rows], fontsize=_SMALL)
-    axes.tick_params(length=0, pad=22)
-    axes.spines[:].set_visible(False)
-    key = "Bar: down to and up to; |: the design; x: fails at; grey: range. Shares: build_sheet.md."
-    return _notes(figure, bottom - 0.006, [key, *section.notes])
-
-
-def _end(side: Side, value: float) -> float:
-    return value if side.good is None else side.good.value
 
 
 def _rectangle(axes: Axes, low: tuple[float, float], size: Sequence[float], color: str) -> None:

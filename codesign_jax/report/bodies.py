@@ -11,7 +11,7 @@ import numpy as np
 
 from codesign_jax import model
 from codesign_jax.model import hull
-from codesign_jax.report.animation import Replay
+from codesign_jax.report.replay import Replay
 from codesign_jax.scene import Scene
 from codesign_jax.scene.primitives import PRIMITIVES
 from codesign_jax.scene.tables import Fixture
@@ -58,17 +58,21 @@ def parts(scene: Scene, grasp: Replay) -> list[Part]:
 
 
 def motion(scene: Scene, grasp: Replay, *, rate: float = 25.0) -> Motion:
-    """Poses of all bodies of a grasp by MuJoCo's kinematics."""
+    """Poses at about so many frames of a second: the nearest that whole time steps allow."""
     h = scene.discretization.timestep
     every = max(1, round(1 / (rate * h)))
+    return Motion(poses(scene, grasp, grasp.qpos[::every]), 1 / (every * h))
+
+
+def poses(scene: Scene, grasp: Replay, qpos: np.ndarray) -> np.ndarray:
+    """Poses of all bodies at these positions, by MuJoCo's kinematics; see `Motion`."""
     compiled = model.compile_model(scene, grasp.params, grasp.trial)
-    data = mujoco.MjData(compiled)
-    poses = []
-    for q in grasp.qpos[::every]:
+    data, found = mujoco.MjData(compiled), []
+    for q in qpos:
         data.qpos[:] = q
         mujoco.mj_kinematics(compiled, data)
-        poses.append(np.concatenate([data.xpos, data.xquat], 1))
-    return Motion(np.array(poses, np.float32), 1 / (every * h))
+        found.append(np.concatenate([data.xpos, data.xquat], 1))
+    return np.array(found, np.float32)
 
 
 def object_mesh(scene: Scene, index: int) -> tuple[np.ndarray, np.ndarray]:

@@ -10,8 +10,8 @@ import numpy as np
 
 from codesign_jax import codesign, files, types
 from codesign_jax.report import charts, chosen, landscape, markup, verdicts, viewer
-from codesign_jax.report.animation import Replay
 from codesign_jax.report.of_run import Run
+from codesign_jax.report.replay import Replay
 from codesign_jax.runs import SCENE_COST, choice, tables
 from codesign_jax.runs.choice import Grasp
 from codesign_jax.runs.scene_files import NAMES

@@ -17,7 +17,7 @@ from PIL import Image
 
 from codesign_jax import files
 from codesign_jax.report import animation, bodies
-from codesign_jax.report.animation import Replay
+from codesign_jax.report.replay import Replay
 from codesign_jax.scene import Scene
 
 _WEB = Path(__file__).parent / "web"
@@ -116,9 +116,8 @@ def _strip(scene: Scene, grasp: Replay) -> list[tuple[str, str]]:
     moments.insert(k + 1, amid)
     times = np.array([time for _, time in moments])
     found = []
-    for (caption, time), frame in zip(
-        moments, animation.sketches(scene, grasp, times), strict=True
-    ):
+    pictures = animation.frames(scene, grasp, times, size=(240, 240))
+    for (caption, time), frame in zip(moments, pictures, strict=True):
         file = io.BytesIO()
         Image.fromarray(frame).quantize(64).save(file, "png", optimize=True)
         picture = base64.b64encode(file.getvalue()).decode()

@@ -13,8 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 _SEGMENTS = 64  # of drawn circles
-_TURN = np.linspace(0, 2 * np.pi, 25)
-_CIRCLE = np.stack([np.cos(_TURN), np.sin(_TURN), 0 * _TURN], -1)
 
 
 class Primitive(NamedTuple):
@@ -34,8 +32,6 @@ class Primitive(NamedTuple):
     half_extents: Callable[[Any], tuple]
     # Principal inertia of the solid per mass [m^2], three numbers, likewise
     inertia: Callable[[Any], tuple]
-    # Lines of a sketch in its own frame [m], arrays (point, 3), likewise
-    outline: Callable[[Any], list[np.ndarray]]
     triangles: Callable[[Any], Any]  # its surface as a trimesh.Trimesh, likewise
 
 
@@ -62,29 +58,6 @@ def _capsule_inertia(size: Any) -> tuple:
     tips = 2 / 5 * radius**2 + half**2 + 3 / 4 * radius * half
     across = (1 - ball) * side + ball * tips
     return across, across, (1 - ball) * along + ball * 2 / 5 * radius**2
-
-
-def _box_outline(size: Any) -> list[np.ndarray]:
-    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
-    ring = np.column_stack([square, np.zeros(5)]) * size
-    top = np.array([0, 0, size[2]])
-    return [ring - top, ring + top, *(np.stack([p - top, p + top]) for p in ring[:4])]
-
-
-def _cylinder_outline(size: Any) -> list[np.ndarray]:
-    flat, top = _CIRCLE * size[0], np.array([0, 0, size[1]])
-    return [flat - top, flat + top, *(np.stack([p - top, p + top]) for p in flat[::6])]
-
-
-def _capsule_outline(size: Any) -> list[np.ndarray]:
-    flat, top = _CIRCLE * size[0], np.array([0, 0, size[1]])
-    half = flat[:13, [0, 2, 1]]  # from x over z to -x
-    plane = np.concatenate([half + top, -half - top, half[:1] + top])
-    return [flat - top, flat + top, plane, plane[:, [1, 0, 2]]]
-
-
-def _sphere_outline(size: Any) -> list[np.ndarray]:
-    return [size[0] * np.roll(_CIRCLE, k, axis=1) for k in range(3)]
 
 
 def _box_triangles(size: Any) -> Any:
@@ -123,7 +96,6 @@ PRIMITIVES = {
         radius=lambda size: (size[0] ** 2 + size[1] ** 2 + size[2] ** 2) ** 0.5,
         half_extents=lambda size: (size[0], size[1], size[2]),
         inertia=lambda size: block_inertia(1.0, *(2 * v for v in size)),
-        outline=_box_outline,
         triangles=_box_triangles,
     ),
     "cylinder": Primitive(
@@ -135,7 +107,6 @@ PRIMITIVES = {
         radius=lambda size: (size[0] ** 2 + size[1] ** 2) ** 0.5,
         half_extents=lambda size: (size[0], size[0], size[1]),
         inertia=_cylinder_inertia,
-        outline=_cylinder_outline,
         triangles=_cylinder_triangles,
     ),
     "capsule": Primitive(
@@ -148,7 +119,6 @@ PRIMITIVES = {
         radius=lambda size: size[0] + size[1],
         half_extents=lambda size: (size[0], size[0], size[0] + size[1]),
         inertia=_capsule_inertia,
-        outline=_capsule_outline,
         triangles=_capsule_triangles,
     ),
     "sphere": Primitive(
@@ -160,7 +130,6 @@ PRIMITIVES = {
         radius=lambda size: size[0],
         half_extents=lambda size: (size[0],) * 3,
         inertia=lambda size: (0.4 * size[0] ** 2,) * 3,
-        outline=_sphere_outline,
         triangles=_sphere_triangles,
     ),
 }

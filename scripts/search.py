@@ -396,7 +396,7 @@ def search(args: argparse.Namespace, name: str) -> None:
     changed = ["--robust"] * args.robust + [*chain.from_iterable(args.overrides)]
     words = [Path(args.objects).stem] if args.objects else []
     words += [args.preset, name, *(re.sub(r"^--|^[a-z_.]+[.](?=.*=)", "", c) for c in changed)]
-    stem = "-".join(dict.fromkeys(words)).replace(":", "-").replace("=", "")
+    stem = re.sub("[:,]", "-", "-".join(dict.fromkeys(words))).replace("=", "")
     how = {n: getattr(args, n) for n in ("seeds", "budget", "tests", "marks", "at", "first_seed")}
     how["chunk"] = args.chunk or (512 if jax.default_backend() == "cpu" else 16_384)
     study = Study(case, scene, engine, space, **how, path=args.out / f"{stem}.npz")

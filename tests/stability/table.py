@@ -42,6 +42,7 @@ class Case:
       precisions: Those of the structured engine; MuJoCo C is built for float64.
       quick: The engine whose first step and precision `make test` runs.
       lower: Whether the bound is a lower one.
+      failure: Why it fails, if it does.
     """
 
     number: int
@@ -55,6 +56,7 @@ class Case:
     precisions: tuple[str, ...] = WIDTHS["structured"]
     quick: str = ""
     lower: bool = False
+    failure: str = ""
 
     @property
     def variants(self) -> list[tuple[float, str]]:
@@ -66,7 +68,7 @@ class Case:
         """Measures a variant; returns its row of the table."""
         found = self.measure(self.engine, step, precision)
         row = {"case": self.number, "precision": precision, "step": step, "note": found.note}
-        names = ("name", "title", "invariant", "engine", "lower", "unit")
+        names = ("name", "title", "invariant", "engine", "lower", "unit", "failure")
         row |= {name: getattr(self, name) for name in names}
         measured, bound = float(found.measured), float(found.bound)  # of NumPy's, JSON has none
         row |= {"measured": measured, "bound": bound, "margin": margin(self.lower, measured, bound)}
@@ -87,14 +89,18 @@ def case(number: int, title: str, invariant: str, *, engines=BOTH[:1], name: str
     return register
 
 
-def case_of_both_scenes(number, title, *what, quick="", **how):
-    """Registers a function (scene, engine, step, precision): the spheres', and the default one."""
+def case_of_both_scenes(number, title, *what, quick="", failure="", **how):
+    """Registers a function (scene, engine, step, precision): the spheres', and the default one.
+
+    Of the default one alone `failure` says why it fails.
+    """
 
     def register(measure):
         name = measure.__name__
         spheres, default = (functools.partial(measure, n) for n in ("paper_spheres", "paper"))
         case(number, title, *what, name=name, engines=BOTH, quick=quick, **how)(spheres)
-        case(number, f"{title}, default scene", *what, name=f"{name}_default", **how)(default)
+        how.update(name=f"{name}_default", failure=failure)
+        case(number, f"{title}, default scene", *what, **how)(default)
 
     return register
 

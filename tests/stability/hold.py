@@ -24,11 +24,9 @@ def lifted(the_bench, seconds):
     )
 
 
-def firm(name="paper_spheres"):
+def firm():
     return pinch(
-        name,
-        contact__normal_stiffness=FIRM.normal_stiffness,
-        contact__friction_ratio=FIRM.friction_ratio,
+        contact__normal_stiffness=FIRM.normal_stiffness, contact__friction_ratio=FIRM.friction_ratio
     )
 
 
@@ -37,10 +35,10 @@ def hanging(history):
     return history.qpos[0, :, 2] - history.qpos[0, :, -5]
 
 
-@case_of_both_scenes(12, "pinch held for 60 s", "slip of the object", unit="m")
-def pinch_holds(name, engine, step, precision):
+@case(12, "pinch held for 60 s", "slip of the object", unit="m", engines=BOTH)
+def pinch_holds(engine, step, precision):
     """For a minute, from a second after the lift on."""
-    b = bench(firm(name), engine, step, precision)
+    b = bench(firm(), engine, step, precision)
     slip = hanging(b.run(*lifted(b, 61.0)))[-round(60 / b.h) :]
     rate = (slip[-1] - slip[-round(30 / b.h)]) / 30
     return Found(slip[-1] - slip[0], 60 * CREEP, f"creeps at {1e3 * rate:.3f} mm/s in the end")

@@ -55,20 +55,12 @@ class ArmEngine:
         return Trace(height, height, height, jnp.zeros((*height.shape, 0)))
 
 
-def front_page(last_line):
-    """Namespace of the front page's first example up to a line, and then of its second one."""
-    names, (first, second) = {}, blocks("README.md")
-    exec(first[: first.index(last_line)], names)
-    return names, second
-
-
-def test_the_derivative_on_the_front_page(monkeypatch, only_heights):
+def test_the_derivative_of_the_first_example_of_gradients(monkeypatch, only_heights):
     """Of an engine whose derivative is known."""
     monkeypatch.setattr(engines, "make_engine", lambda name, scene: ArmEngine())
-    names, second = front_page("optimizer =")
-    names["poor"] = names["space"].from_units(np.array([130.0, 150.0]))
-    exec(second, names)
-    np.testing.assert_allclose(names["value"], 0.15, rtol=1e-6)  # m, of the poor design
+    names = {}
+    exec(blocks("docs/gradients.md")[0], names)
+    np.testing.assert_allclose(names["value"], 0.03, rtol=1e-6)  # m, of the design there
     np.testing.assert_allclose(names["slope"], [0.0, 1.0], rtol=1e-6)
 
 
@@ -94,7 +86,6 @@ def test_every_example_of_the_library(short, tmp_path, monkeypatch):
     assert names["table"].shape == (2, 3)
     assert names["infos"].selection.mean_cost.shape == (5, 4)
     assert names["best"].shape == (2,) and np.isfinite(names["info"].selection.cost).all()
-    assert names["slope"].shape == (2,) and np.isfinite(names["slope"]).all()
     assert names["outcome"].cost.shape == (2,)
     assert pyarrow.parquet.read_metadata("grasps.parquet").num_rows == 600
 

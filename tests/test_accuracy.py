@@ -7,7 +7,6 @@ from pathlib import Path
 import jax
 import mujoco
 import numpy as np
-import pytest
 
 from codesign_jax import cli, scene
 from codesign_jax.commands import optimize
@@ -77,9 +76,6 @@ def test_mujoco_converges_with_the_scene_s_own_limits():
     assert max(errors[0]) < 1e-3 and max(errors[1]) > 1e-2
 
 
-# --- finger tips ---------------------------------------------------------------------------------
-
-
 # --- verdicts ------------------------------------------------------------------------------------
 
 
@@ -93,29 +89,6 @@ def test_every_variant_is_a_scene_and_every_row_has_its_variants(tmp_path):
     assert named <= set(budget.VARIANTS)
     assert len({budget.path_of(tmp_path, name) for name in budget.VARIANTS}) == len(scenes)
     json.dumps(budget.merged(tmp_path))
-
-
-WINDOW = scene.load("paper").window
-
-
-def record(kept):
-    lost = np.where(kept, np.inf, WINDOW[0])
-    text = budget.encode(lost, np.zeros(kept.shape, bool), WINDOW)
-    return {"particles": kept.shape[0], "trials": kept.shape[1], "lost": text, "status": {}}
-
-
-@pytest.fixture
-def found():
-    """20 designs in 12 trials: the truth loses 30 of 240, standard 18 of these alone."""
-    truth = np.ones((20, 12), bool)
-    truth[:15, :2] = False
-    standard = truth.copy()
-    standard[:6, :2] = True
-    moved = standard.copy()
-    moved[0, :6] = False
-    variants = {"truth": truth, "standard": standard, "standard, moved": moved}
-    every = {name: record(kept) for name, kept in variants.items()}
-    return {"variants": every | {"spheres": {"refused": "no"}}, "rates": {}}
 
 
 def test_the_page_has_the_tables_of_its_data(monkeypatch):

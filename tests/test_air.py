@@ -87,13 +87,18 @@ def test_a_free_finger_has_the_wanted_pressure(neo_hookean):
         the_scene = grasps.pinch("sphere", links=1, effects__air_mass=True, **how)
         params, trial = grasps.hand_world(the_scene, wall=0.003, length=0.1)
         fields, ctrl = grasps.world_inputs(the_scene, params, trial)
-        hand = grasps.lanes(the_scene, jax.tree.map(lambda v: v[None], fields))
-        wanted = jnp.asarray(ctrl)[None, :1].at[..., 6:].set(WANTED)
-        charge = air.charged(the_scene, hand, wanted)[0, 0, 6]
+        hand = grasps.lanes(the_scene, grasps.repeat(fields, 1))
+        wanted = np.array(ctrl)[None, :1]
+        wanted[..., 6:] = WANTED
         mine = Finger(the_scene, params, 1.4, neo_hookean)
-        grown = mine.gain * mine.free, 0.0, 0.0
-        given = air.volumes(hand, 1)[0, 0], hand.air[:, 0, 0], grown
-        pressure, fall = air.end_pressure(1.0, charge, *given)
+
+        @jax.jit
+        def reached(hand, wanted, grown):
+            charge = air.charged(the_scene, hand, wanted)[0, 0, 6]
+            given = air.volumes(hand, 1)[0, 0], hand.air[:, 0, 0], (grown, 0.0, 0.0)
+            return air.end_pressure(1.0, charge, *given)
+
+        pressure, fall = reached(hand, wanted, mine.gain * mine.free)
     assert pressure == pytest.approx(WANTED, rel=1e-9)
     ends = (mine.pressure(mine.free + a) for a in (1e-6, -1e-6))
     slope = np.subtract(*ends) / (2e-6 * mine.gain)
@@ -123,16 +128,18 @@ def swung():
             hand = dataclasses.replace(plain.hand, material=material)
             the_scene = dataclasses.replace(plain, hand=hand, gravity=gravity)
             fields, ctrl = grasps.world_inputs(the_scene, params, trial)
-            worlds.append(fields._replace(start=jnp.asarray(fields.start).at[6].set(start)))
-        fields = jax.tree.map(lambda *v: jnp.stack(v), *worlds)
-        held = jnp.repeat(jnp.asarray(ctrl)[None, :1].at[..., 6:].set(WANTED), 1000, 1)
+            begun = np.array(fields.start)
+            begun[6] = start
+            worlds.append(fields._replace(start=begun))
+        fields, held = grasps.stack(*worlds), np.repeat(np.array(ctrl)[None, :1], 1000, 1)
+        held[..., 6:] = WANTED
         engine = StructuredEngine(plain, tolerance=1e-24)
 
         @jax.jit
         def run(fields, ctrl):
             return engine.advance(world_constants(plain, fields), engine.reset(fields), ctrl)[0]
 
-        found = run(fields, jnp.repeat(held, 2, 0))
+        found = run(fields, np.repeat(held, 2, 0))
     return plain, params, fields, *(np.asarray(found[n])[..., 6] for n in ("qpos", "qvel"))
 
 

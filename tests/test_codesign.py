@@ -10,7 +10,7 @@ import pytest
 from codesign_jax import codesign
 from codesign_jax.optimize import schedule
 from tests.helpers import episodes
-from tests.helpers.toy_engine import ToyEngine, tiny
+from tests.helpers.toy_engine import tiny
 
 PARTICLES, TRIALS = 8, 3
 
@@ -52,24 +52,6 @@ def test_noise_differs_between_episodes_seeds_and_the_test(setup):
     rows = [i.outcomes.cost[0] for i in seen]
     rows += [test.outcomes.cost[0, :TRIALS], test.outcomes.cost[0, TRIALS:]]
     assert len(np.unique(np.asarray(rows), axis=0)) == 5
-
-
-@pytest.fixture(scope="module")
-def failing():
-    """An episode of three particles whose mask is closed, some of whose worlds fail."""
-    the_scene, space, _ = tiny()
-    # Worlds are particle-major: the first particle fails once, the second always.
-    engine = ToyEngine(the_scene, failing=[0, 3, 4, 5])
-    optimizer = codesign.make_filter(space)
-    episode = partial(codesign.Task(the_scene, space, TRIALS, engine).episode, optimizer)
-    return the_scene, episode(start(optimizer, particles=3), np.zeros(2, bool))[1]
-
-
-def test_failed_trials_are_left_out_of_the_mean(failing):
-    the_scene, info = failing
-    np.testing.assert_array_equal((info.outcomes.status != 0).sum(1), [1, 3, 0])
-    np.testing.assert_allclose(info.selection.cost[0], info.outcomes.cost[0, 1:].mean(), rtol=1e-6)
-    assert float(info.selection.cost[1]) == the_scene.cost.maximum
 
 
 def test_a_run_vmaps_over_seeds_and_is_the_loop_of_its_episodes(setup):

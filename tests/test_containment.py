@@ -4,13 +4,11 @@ import re
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from codesign_jax import cli, model, rollout, runs, start
 from codesign_jax.engines.mujoco import MujocoEngine
-from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.types import Status
 from tests.helpers.grasps import (
     batch_inputs,
@@ -38,16 +36,6 @@ def both(the_scene, params, trials):
 
 
 # --- structured engine -----------------------------------------------------------------------
-
-
-def test_the_cap_is_flagged_step_by_step():
-    """Bits of a step come from its residual; exactly the tolerance is solved."""
-    engine = StructuredEngine(pinch("box"), tolerance=1e-6)
-    found = {"residual": jnp.array([0.0, 1e-6, 2e-6, jnp.nan])}
-    np.testing.assert_array_equal(engine._status(found), [0, 0, Status.SOLVER_CAP, 0])
-    overflow, cap = Status.CONTACT_OVERFLOW, Status.SOLVER_CAP  # too few slots in the last two
-    found["overflow"] = jnp.array([0.0, 0.0, 1.0, 1.0])
-    np.testing.assert_array_equal(engine._status(found), [0, 0, overflow | cap, overflow])
 
 
 # --- MuJoCo C --------------------------------------------------------------------------------
@@ -167,9 +155,6 @@ def test_failed_worlds_are_saved_and_replayed(failing_run, capsys):
     assert recorded.split(": ")[1] == again.split(": ")[1]
     steps = re.findall(r"step \d+: speed (\S+), object", text)
     assert float(steps[-1]) > scene.limits.speed >= float(steps[-2])
-    assert cli.main(["replay", str(folder), "--engine", "mujoco"]) == 0
-    assert files[0].name in capsys.readouterr().out
-    assert (folder / "replay.html").exists()
 
 
 def test_all_failed_stops_with_a_diagnosis(tmp_path, capsys):

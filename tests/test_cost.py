@@ -184,11 +184,3 @@ def test_exclusion_and_worst():
     np.testing.assert_allclose(cost.particle_cost(SCENE, trials), [0.5, 0.5, 3.0])
     worst = scene.load("paper_spheres", overrides={"cost": {"failure": "worst"}})
     np.testing.assert_allclose(cost.particle_cost(worst, trials), [4 / 3, 6.5 / 3, 3.0])
-
-
-def test_costs_of_failed_trials_do_not_matter():
-    """Not even one that is not a number."""
-    trials = outcomes([[0.25, np.nan, 0.75]], [[0, 1, 0]])
-    np.testing.assert_allclose(cost.particle_cost(SCENE, trials), [0.5])
-    worst = scene.load("paper_spheres", overrides={"cost": {"failure": "worst"}})
-    np.testing.assert_allclose(cost.particle_cost(worst, trials), [4 / 3])

@@ -43,15 +43,8 @@ def test_neo_hookean_moment(height, wall):
 # --- air supply ----------------------------------------------------------------------------------
 
 
-def supply(**values):
-    return grasps.pinch(
-        effects__pressure_dynamics=True, **{f"pneumatics__{k}": v for k, v in values.items()}
-    )
-
-
 def test_supply_against_an_integrator():
     """Lag, rate and maximum at once, along a grasp, against scipy's adaptive integrator."""
-    scene = supply(lag=0.15, rate=120e3, maximum=90e3)
     h, count = 1e-3, 9000
     scene = grasps.pinch(
         effects__pressure_dynamics=True,
@@ -77,9 +70,6 @@ def test_supply_against_an_integrator():
     np.testing.assert_allclose(reached, exact, atol=130)
     assert reached.max() == pytest.approx(90e3, rel=1e-3)
     assert np.abs(np.diff(reached)).max() <= 120e3 * h * (1 + 1e-9)
-
-
-# --- rigid arm, weight, torsion ------------------------------------------------------------------
 
 
 # --- contact by itself ---------------------------------------------------------------------------

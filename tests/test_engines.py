@@ -152,25 +152,6 @@ def test_failing_worlds_are_flagged_alike(hurried, engine, request):
     assert result.bad_step[PRESSURE] == 1
 
 
-@slow
-def test_a_failed_world_is_frozen_at_its_last_good_state(mjx_traces):
-    (_, bad) = mjx_traces
-    for index, step in ((CONTROL, NAN_FROM), (PRESSURE, 0), (BELOW, 0)):
-        assert np.isfinite(bad.qpos[index]).all()
-        rest = bad.qpos[index, step:]
-        np.testing.assert_array_equal(rest, np.broadcast_to(rest[0], rest.shape))
-    assert np.isnan(bad.speed[CONTROL, NAN_FROM + 1 :]).all()
-
-
-@slow
-def test_other_worlds_are_bitwise_unaffected(mjx_traces):
-    """Good worlds do not notice failing ones in their batch."""
-    good, bad = mjx_traces
-    for index in (GOOD, OTHER):
-        for a, b in zip(*map(jax.tree.leaves, (good, bad)), strict=True):
-            np.testing.assert_array_equal(a[index], b[index])
-
-
 def test_decided_worlds_are_not_simulated_further(hurried, monkeypatch):
     """MuJoCo leaves worlds that are lost or failed; their traces repeat the last entry."""
     the_scene, (fields, ctrl), _ = hurried

@@ -12,6 +12,9 @@ from codesign_jax.engines import make_engine
 from codesign_jax.scene.schema import InputError
 from tests.helpers import grasps
 
+gymnasium = pytest.importorskip("gymnasium")
+vector = pytest.importorskip("codesign_jax.env.vector")
+
 SCENE = grasps.short_grasp()
 
 
@@ -26,18 +29,24 @@ class Replay(env.GraspEnv):
 def episode():
     """A batch of grasps that actions of zero let the key frames command, and all of its states."""
     params = grasps.hand_world(SCENE)[0]
-    params = jax.tree.map(lambda v: jnp.asarray(v, jnp.float32), params)
-    grasp = Replay(SCENE, params, period=0.1)
-    reset, step = (jax.jit(jax.vmap(f)) for f in (grasp.reset, grasp.step))
-    states = [reset(jax.random.split(jax.random.key(0), 4))]
-    for _ in range(grasp.episode_length):
-        states.append(step(states[-1], jnp.zeros((4, 2))))
-    return grasp, states
+    params = jax.tree.map(lambda v: np.asarray(v, np.float32), params)
+    worlds = vector.VectorEnv(grasp := Replay(SCENE, params, period=0.1), 4, seed=1)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        worlds.step(worlds.action_space.sample())
+    first, _ = worlds.reset(seed=2)
+    assert worlds.observation_space.contains(first)
+    states = [worlds._state]
+    for k in range(grasp.episode_length):
+        obs, _, ended, cut, info = worlds.step(np.zeros((4, 2), np.float32))
+        states.append(worlds._state)
+        assert ended.all() == (k == grasp.episode_length - 1) and not cut.any()
+    assert set(info) == {"held", "distance"} and obs.dtype == np.float32
+    return grasp, states, worlds
 
 
 def test_actions_that_change_nothing_make_the_grasp_of_the_key_frames(episode):
     """Its end and its cost; what is held adds up to what the cost leaves."""
-    grasp, states = episode
+    grasp, states, _ = episode
     trials = states[0].data.trial
     params = jax.tree.map(lambda v: jnp.repeat(v[None], 4, 0), grasp.params)
     simulate = jax.jit(partial(rollout.simulate, SCENE, make_engine("structured", SCENE)))
@@ -52,7 +61,7 @@ def test_actions_that_change_nothing_make_the_grasp_of_the_key_frames(episode):
 
 
 def test_what_is_observed_is_what_a_hand_feels(episode):
-    grasp, states = episode
+    grasp, states, _ = episode
     seen = jax.jit(jax.vmap(grasp.seen))(states[-1].data)
     felt = states[-1].obs
     np.testing.assert_allclose(felt[:, 0], SCENE.end_time, rtol=1e-6)
@@ -66,7 +75,7 @@ def test_what_is_observed_is_what_a_hand_feels(episode):
 def test_brax_trains_on_it_as_on_its_own(episode):
     """Its wrappers begin a grasp anew where one ended."""
     training = pytest.importorskip("brax.envs.wrappers.training")
-    grasp, _ = episode
+    grasp = episode[0]
     wrapped = training.wrap(grasp, episode_length=grasp.episode_length)
     state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 4))
     first = np.asarray(state.obs)
@@ -78,23 +87,11 @@ def test_brax_trains_on_it_as_on_its_own(episode):
 
 
 def test_a_vector_environment_begins_ended_grasps_with_new_noise(episode):
-    gymnasium = pytest.importorskip("gymnasium")
-    from codesign_jax.env.vector import VectorEnv
-
-    grasp, _ = episode
-    worlds = VectorEnv(grasp, 4, seed=1)
-    with pytest.raises(gymnasium.error.ResetNeeded):
-        worlds.step(worlds.action_space.sample())
-    first, _ = worlds.reset(seed=2)
-    assert worlds.observation_space.contains(first)
-    before = np.asarray(worlds._state.data.trial.yaw)
-    for k in range(grasp.episode_length):
-        obs, reward, ended, cut, info = worlds.step(np.zeros((4, 2), np.float32))
-        assert ended.all() == (k == grasp.episode_length - 1) and not cut.any()
-    again, reward, ended, *_ = worlds.step(np.zeros((4, 2), np.float32))
-    assert not ended.any() and (reward == 0).all() and obs.dtype == np.float32
-    assert set(info) == {"held", "distance"}
-    assert not (np.asarray(worlds._state.data.trial.yaw) == before).any()
+    _, states, worlds = episode
+    _, reward, ended, *_ = worlds.step(np.zeros((4, 2), np.float32))
+    assert not ended.any() and (reward == 0).all()
+    before, after = states[0].data.trial.yaw, worlds._state.data.trial.yaw
+    assert not (np.asarray(after) == np.asarray(before)).any()
 
 
 def test_a_period_that_no_steps_make_is_refused():

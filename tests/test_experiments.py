@@ -70,6 +70,3 @@ def test_the_page_has_the_tables_of_its_data():
     studies = {name: report.load_study(data, name) for name in ("2d", "23d")}
     text = report.tables(studies, report.load(data, "landscape"))
     assert text in (ROOT / "docs" / "notes" / "results.md").read_text(encoding="utf-8")
-
-
-# --- winners on fresh trials ----------------------------------------------------------------------

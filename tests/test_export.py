@@ -103,29 +103,15 @@ def test_plain_mujoco_plays_the_files_as_the_engine(grasped, tmp_path):
         assert found[i].outcome.status == judged.status[i] & ~8  # plain MuJoCo tells no warnings
 
 
-def test_the_test_would_notice_another_contact(grasped):
-    """MJCF as MuJoCo writes it, with inverse weights of the compiler's own: another grasp."""
-    the_scene, worlds, trace, _ = grasped
-    found = grasps.grasp(the_scene, *worlds[0])
-    alone, trial = plain.single_object(the_scene, worlds[0][1])
-    naive = build_spec(alone, worlds[0][0], trial)
-    for numeric in ("hand_centre", "lost"):
-        naive.add_numeric(name=numeric, data=found.binary.numeric(numeric).data)
-    naive.add_key(name="start", qpos=found.states[0, : found.binary.nq])
-    _, _, states = play(naive.compile(), found.controls)
-    assert errors(states, trace, 0).max() > 1e-3
+def assert_declared(alone, spec, shares):
+    """K I, B and R of every constraint row, in the file and in the model with declared weights.
 
-
-@pytest.mark.parametrize("friction", ["none", "coulomb", "full"])
-def test_contacts_have_the_declared_stiffness(friction):
-    """K I, B and R of every constraint row of MuJoCo, in a state with many contacts."""
-    the_scene = pinch("box", effects__friction=friction, effects__finger_finger=True)
-    params, trial = hand_world(the_scene)
-    alone, trial = plain.single_object(the_scene, trial)
-    spec = build_spec(alone, params, trial)
+    In a state with many contacts; the normal's stiffness k_n = K I / R is the declared one of two
+    bodies, twice as large at the table, times the share of a sphere on a finger.
+    """
     rows = []
-    declared = plain.engine_model(alone, spec)
-    for model in (declared, mujoco.MjModel.from_xml_string(plain.text(alone, spec))):
+    declared = plain.engine_model(alone, spec, shares)
+    for model in (declared, mujoco.MjModel.from_xml_string(plain.text(alone, spec.copy(), shares))):
         data = mujoco.MjData(model)
         # Palm, straight fingers, object and table are in one another.
         data.qpos[2], data.qpos[-7:-4] = 0.005, [0.03, 0, 0.02]
@@ -134,11 +120,22 @@ def test_contacts_have_the_declared_stiffness(friction):
         rows.append(np.stack([k * impedance, b, data.efc_R]))
     assert rows[0].shape[1] > 10
     np.testing.assert_allclose(rows[1], rows[0], rtol=1e-10)  # rounding
-    # One closed form: the normal of the object on the table, k_n = K I / R, is twice as stiff as
-    # that of two bodies.
-    table = np.nonzero((data.contact.geom == 0).any(1) & (data.contact.geom[:, 1] > 0))[0]
-    stiffness = (rows[0][0] / rows[0][2])[data.contact.efc_address[table]]
-    np.testing.assert_allclose(stiffness, 2 * the_scene.contact.normal_stiffness, rtol=1e-9)
+    stiffness, touching = rows[0][0] / rows[0][2], 0
+    for contact in data.contact:
+        names = [model.geom(g).name for g in contact.geom]
+        share = min(shares.get(name, 1.0) for name in names)
+        expected = share * alone.contact.normal_stiffness * 2 / (1 if "table" in names else 2)
+        assert stiffness[contact.efc_address] == pytest.approx(expected, rel=1e-9)
+        touching += share < 1
+    assert touching > 2 or not shares
+
+
+@pytest.mark.parametrize("friction", ["none", "coulomb", "full"])
+def test_contacts_have_the_declared_stiffness(friction):
+    the_scene = pinch("box", effects__friction=friction, effects__finger_finger=True)
+    params, trial = hand_world(the_scene)
+    alone, trial = plain.single_object(the_scene, trial)
+    assert_declared(alone, build_spec(alone, params, trial), {})
 
 
 @pytest.fixture(scope="module")
@@ -169,27 +166,8 @@ def test_spheres_stand_where_the_engine_has_its_rings(skinned):
 
 
 def test_a_sphere_is_as_stiff_as_its_share_of_the_finger(skinned):
-    """K I, B and R of every constraint row of the file and of the model with declared weights."""
     alone, _, _, spec, shares = skinned
-    rows = []
-    declared = plain.engine_model(alone, spec, shares)
-    for model in (declared, mujoco.MjModel.from_xml_string(plain.text(alone, spec.copy(), shares))):
-        data = mujoco.MjData(model)
-        data.qpos[2], data.qpos[-7:-4] = 0.005, [0.03, 0, 0.02]
-        mujoco.mj_forward(model, data)
-        k, b, impedance = data.efc_KBIP[:, :3].T
-        rows.append(np.stack([k * impedance, b, data.efc_R]))
-    np.testing.assert_allclose(rows[1], rows[0], rtol=1e-10)  # rounding
-    touching = 0
-    for contact in data.contact:
-        names = [model.geom(g).name for g in contact.geom]
-        share = min(shares.get(name, 1.0) for name in names)
-        stiffness = rows[0][0] / rows[0][2]  # k_n = K I / R
-        bodies = 1 if "table" in names else 2
-        expected = share * alone.contact.normal_stiffness * 2 / bodies
-        assert stiffness[contact.efc_address] == pytest.approx(expected, rel=1e-9)
-        touching += share < 1
-    assert touching > 2
+    assert_declared(alone, spec, shares)
 
 
 def test_commands_are_the_key_frames(tmp_path):
@@ -205,20 +183,13 @@ def test_commands_are_the_key_frames(tmp_path):
     at = {row["time_s"]: {k: v for k, v in row.items() if k != "phase"} for row in rows}
     values = {t: {k: float(v) for k, v in row.items()} for t, row in at.items()}
     top, grasp = 300, 60 + float(1e3 * design.arm[2])  # mm, as in the scene file
-    heights = {"0": top, "1": (top + grasp) / 2, "2": grasp, "3.5": grasp, "4.5": top}
+    heights = {"0": top, "1": (top + grasp) / 2, "2": grasp, "4.5": top}
     for time, height in heights.items():
         assert values[time]["arm_z_mm"] == pytest.approx(height, rel=1e-6)
-    pressures = {"2": 0, "2.75": 60, "3.5": 120, "8": 120, "8.25": 60, "8.5": 0}
-    for time, pressure in pressures.items():
-        assert values[time]["pressure_3_kPa"] == pytest.approx(pressure, abs=1e-4)
+    assert values["2.75"]["pressure_3_kPa"] == pytest.approx(60, abs=1e-4)
     assert values["0"]["arm_pitch_deg"] == pytest.approx(-15, rel=1e-6)
-    # Shaken by up to 40 degrees in 3.5 s, at 1.5 Hz: the second peak of roll, in the third period.
-    peak = 4.5 + (2 + 0.25) / 1.5
-    assert values[f"{peak:.9g}"]["arm_roll_deg"] == pytest.approx(40 * 1.5 / 3.5, rel=1e-4)
     phase = {row["time_s"]: row["phase"] for row in rows}
-    assert [phase[t] for t in ("1.99", "2", "4.49", "4.5", "7.99", "8")] == [
-        *("approach", "inflate", "lift", "disturb", "disturb", "ungrasp")
-    ]
+    assert [phase[t] for t in ("1.99", "2", "4.49")] == ["approach", "inflate", "lift"]
 
 
 # --- the command ---------------------------------------------------------------------------------

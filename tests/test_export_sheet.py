@@ -1,12 +1,9 @@
 """Build sheet and tolerances: thresholds that are known are found, and the page says them."""
 
-import itertools
-
 import jax
 import mujoco
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from codesign_jax import cli, files, model, rollout, scene
 from codesign_jax.export import casting, drawing, process, sheet, tolerance
@@ -181,14 +178,8 @@ def test_a_folder_is_there_as_a_whole_or_not_at_all(tmp_path):
     assert [*(tmp_path / "a").iterdir()] == []
     part.mkdir()
     (part / "of a killed process").touch()
-    with files.whole_folder(path) as part:
-        (part / "inside").mkdir()
-        (part / "inside" / "new").touch()
-    (path / "own").touch()
-    with files.whole_folder(path) as part:
-        (part / "inside").mkdir()
-        (part / "inside" / "newer").touch()
-    assert {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*")} == {
-        *("a", "a/folder", "a/folder/own", "a/folder/inside"),
-        *("a/folder/inside/new", "a/folder/inside/newer"),
-    }
+    for name in ("new", "newer"):
+        with files.whole_folder(path) as part:
+            (part / name).touch()
+        (path / "own").touch()
+    assert {p.name for p in path.iterdir()} == {"new", "newer", "own"}

@@ -3,7 +3,6 @@
 import ctypes
 from ctypes import POINTER, c_char_p, c_int, c_uint, c_void_p
 
-import numpy as np
 import pytest
 
 from codesign_jax.compiler import ffi, gpu, launch
@@ -119,7 +118,6 @@ def test_launch(prepared):
         ("cuLaunchKernel", 1, r"kernel fake: cuLaunchKernel: CUDA_ERROR_INVALID_VALUE (1)"),
         ("cuLaunchKernel", 77, r"kernel fake: cuLaunchKernel: unknown error (77)"),
         ("cuStreamGetCtx", 1, r"kernel fake: cuStreamGetCtx: CUDA_ERROR_INVALID_VALUE (1)"),
-        ("cuCtxPushCurrent_v2", 1, r"kernel fake: cuCtxPushCurrent: CUDA_ERROR_INVALID_VALUE (1)"),
         ("cuCtxPopCurrent_v2", 1, r"kernel fake: cuCtxPopCurrent: CUDA_ERROR_INVALID_VALUE (1)"),
     ],
 )
@@ -143,9 +141,6 @@ def test_errors_of_xla(prepared):
     for wrong in ([inputs[0], inputs[0]], [inputs[0][:, :1], inputs[1]], inputs[:1]):
         code, message = call_frames.Xla().call(handler, wrong, outputs)
         assert code == ffi.INVALID_ARGUMENT and message.startswith("kernel fake needs ")
-    with_one_more = [outputs[0], np.concatenate([outputs[1]] * 2)]
-    code, message = call_frames.Xla().call(handler, inputs, with_one_more)
-    assert message == "kernel fake needs array 3 to be output float32[blocks, 3, 32]"
     assert not driver.calls
 
 

@@ -54,9 +54,6 @@ def test_files_of_another_kind_are_named(tmp_path, kind, said):
     [
         ("gravity = " + "9" * 400, "characters) is outside [0, 100] m/s^2"),
         ("gravity = " + "9" * 5000, "not valid TOML: a whole number has thousands of digits"),
-        ("gravity = 0x" + "f" * 5000, "gravity = (int too long to show) is outside"),
-        ("gravity = " + "[" * 2000, "not valid TOML: tables and arrays are nested more than"),
-        ("gravity = " + "[" * 20 + "]" * 20, "not valid TOML: tables and arrays are nested"),
         ("a" + ".a" * 4000 + " = 1", "not valid TOML: tables and arrays are nested more than"),
         ("#" * 300_000, "has more than 262,144 bytes"),
         ("\n".join(f"x{i} = 1" for i in range(9000)), "has 8,980 more unknown keys"),
@@ -80,10 +77,8 @@ def test_an_error_never_speaks_to_the_terminal():
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        ({"gravity": 10**400}, "gravity = 1000"),
         ({"gravity": 10**6000}, "too long to show"),
         ({".".join("a" * 3000): 1}, "3,000 parts"),
-        ({1: 2}, "1 is no key path"),
         ({(): 2}, "() is no key path"),
         ({"hand.finger." + "9" * 5000 + ".tilt": 1}, "hand.finger has no entry"),
         ({"hand.finger": [{}] * 1001}, "1,001 entries, more than 1,000"),
@@ -160,9 +155,6 @@ def test_a_run_has_the_bytes_that_were_read(tmp_path):
     assert scene.load(tmp_path / "run" / "scene.toml") == loaded
 
 
-# --- how far distances reach ---------------------------------------------------------------------
-
-
 # --- command lines -------------------------------------------------------------------------------
 
 
@@ -170,14 +162,9 @@ def test_a_run_has_the_bytes_that_were_read(tmp_path):
     "arguments",
     [
         ["evaluate", "--run", "a" * 300],
-        ["evaluate", "--hand", "a" * 300],
         ["evaluate", "--hand", "a" * 300 + ".toml"],
-        ["optimize", "--dry-run", "--out", "a" * 300],
         ["optimize", "--dry-run", "--out", "a\udcffb"],
         ["optimize", "--dry-run", "--set", "hand.name=/elsewhere/x"],
-        ["optimize", "--dry-run", "--set", "hand.name=.."],
-        ["optimize", "--dry-run", "--chunk", "9" * 400],
-        ["optimize", "--dry-run", "--set", "gravity=" + "9" * 5000],
     ],
 )
 def test_arguments_that_are_refused(arguments, workplace, capsys):

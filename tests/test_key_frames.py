@@ -129,21 +129,12 @@ BAD = {
     "control.frame[2].time = 'approach - 0.5' must come after that of frame[1]": [
         {"time": 0}, FRAME, {"time": "approach - 0.5", "z": 0.1}
     ],
-    "frame[2].time = 'approach + 0.5' must come after that of frame[1], 'approach + wait'": [
-        {"time": 0}, {"time": "approach + wait"}, {"time": "approach + 0.5", "z": 0.1}
-    ],
-    "frame[1].pressure = '1.2 * pressure' of finger 0 may be": [
-        {"time": 0}, FRAME | {"pressure": "1.2 * pressure"}
-    ],
     "above the limit of 80000 Pa of its wall": [{"time": 0}, FRAME | {"pressure": 90e3}],
-    "may be -1000 Pa, below zero": [{"time": 0}, FRAME | {"pressure": "pressure - 1000"}],
     "frame[1].z names an unknown parameter 'arm_w'; did you mean 'arm_": [
         {"time": 0}, FRAME | {"z": "arm_w"}
     ],
     "frame[1].z: 'pressure' has the unit Pa, not m": [{"time": 0}, FRAME | {"z": "pressure"}],
     "frame[1].z = 'arm_z zero_height' is no sum": [{"time": 0}, FRAME | {"z": "arm_z zero_height"}],
-    "frame[1].z = 30.0 is outside [-2, 2] m; did you mean 0.03?": [{"time": 0}, FRAME | {"z": 30}],
-    "frame[1].time is missing": [{"time": 0}, {"z": 0.1}],
     "frame[1].pressure has 3 entries, the hand 4 fingers": [
         {"time": 0}, FRAME | {"pressure": [0, 0, 0]}
     ],
@@ -173,8 +164,6 @@ def test_bad_frames_are_refused_with_their_key(message, tmp_path):
             {"name": "pressure"},
             "parameter[0].name = 'pressure' must be a lower-case word not taken",
         ),
-        ({"low": 2}, "parameter[0]: low 2 must be below high 1"),
-        ({"default": 3}, "parameter[0].default = 3.0 is outside [0, 1] s"),
         ({"per": "finger"}, "parameter[0].per = 'finger' is for pressures, not for s"),
     ],
 )

@@ -1,13 +1,10 @@
 """Evaluation of array functions component by component, and which of its programs are shared."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from codesign_jax.engines.structured import lanewise
 from codesign_jax.engines.structured.lanewise import Lanes, lanes
-from codesign_jax.engines.structured.linear import elimination
 
 FINGERS, WORLDS = 4, 8
 
@@ -25,34 +22,6 @@ def as_array(value):
     shape = value.parts.shape[:-2]
     parts = [np.broadcast_to(p, (FINGERS * WORLDS,)) for p in value.parts.ravel()]
     return np.stack(parts).reshape(*shape, FINGERS, WORLDS)
-
-
-def test_components_equal_arrays():
-    """Eliminating a joint gives the same numbers either way."""
-    rng = np.random.default_rng(0)
-    node = [both(rng, s) for s in ((6, 6), (6, 6), (6, 6), (6,), (6,))]
-    axes, arm, tau = both(rng, (3, 6)), both(rng, (3,)), both(rng, (3,), wide=False)
-
-    def step(node, axes, arm, tau):
-        # A positive definite matrix, so that the joint's is invertible.
-        eye = 6.0 * jnp.eye(6)[:, :, None, None]
-        p = eye + 0.1 * (node[0] + jnp.swapaxes(node[0], 0, 1))
-        quadratic = elimination.Quadratic(p, *node[1:])
-        return elimination.eliminate(quadratic, axes, arm**2 + 1.0, tau)
-
-    want = jax.jit(step)([n[0] for n in node], axes[0], arm[0], tau[0])
-    got = lanewise.lanewise(step, [n[1] for n in node], axes[1], arm[1], tau[1])
-    got = jax.tree.leaves(got, is_leaf=lambda x: isinstance(x, Lanes))
-    for a, b in zip(jax.tree.leaves(want), got, strict=True):
-        # XLA may fuse a multiplication with an addition: a few units in the last place.
-        np.testing.assert_allclose(as_array(b), a, rtol=2e-5, atol=2e-5)
-
-
-def test_sums_over_lanes_are_refused():
-    """Lanes do not see each other."""
-    _, x = both(np.random.default_rng(0), (3,))
-    with pytest.raises(NotImplementedError, match="over the lanes"):
-        lanewise.lanewise(lambda v: v.sum(1), x)
 
 
 def scaled(factor, out=None):

@@ -10,19 +10,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from codesign_jax import control, model, scene
+from codesign_jax import scene
 from codesign_jax.engines import make_engine
 from codesign_jax.engines import mujoco as mujoco_engine
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.engines.structured.kernel import Program
 from codesign_jax.engines.structured.laws import meshes as mesh_lanes
-from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.runs import scene_files
 from codesign_jax.scene import objects, parameters, schema
 from codesign_jax.scene.meshes import surface
-from codesign_jax.types import Trace
 from tests.helpers import oracles
-from tests.helpers.grasps import DATA, nth, stack, still
+from tests.helpers.grasps import DATA, batch_inputs, nth, stack, still, world_inputs
 from tests.helpers.solids import box, object_file
 
 # --- the household set ---------------------------------------------------------------------------
@@ -103,59 +100,18 @@ class Grasps(NamedTuple):
     """Grasps of a batch, in float64 and solved to rounding.
 
     Attributes:
-      scene: The scene.
       params: Params of all worlds.
       trials: The trial of each world.
       names: Name of the object of each world.
-      kernel: Trace of the kernel.
-      reverse: Trace of the kernel for the same worlds in reverse.
+      path: What the kernel makes of them, and behind them of the same worlds in reverse.
       unbalanced: Forces that the kernel leaves unbalanced, see `oracles.unbalanced`.
-      compiled: How many programs the kernel's two traces took.
     """
 
-    scene: Any
     params: Any
     trials: list
     names: list[str]
-    kernel: Any
-    reverse: Any
+    path: oracles.Path
     unbalanced: np.ndarray
-    compiled: int
-
-
-EXACT = {"iterations": 100, "evaluations": 40, "tolerance": 1e-24}
-"""Limits at which the kernel solves a step to rounding in float64."""
-
-
-def runner(the_scene):
-    """Simulates worlds to rounding in float64; the trace with its path."""
-    engine = StructuredEngine(the_scene, **EXACT)
-
-    def world(p, t):
-        return model.model_fields(the_scene, p, t), control.commands(the_scene, p, t)
-
-    @jax.jit
-    def run(params, trials):
-        fields, ctrl = jax.vmap(world)(params, trials)
-        program = Program.here(the_scene, engine.limits, ctrl.dtype, len(ctrl))
-        hand, start = world_constants(the_scene, fields), engine.reset(fields)
-        found, _ = program.simulate(hand, start, ctrl, trajectory=True, states=True)
-        path = oracles.Path(*(found[name] for name in ("qpos", "qvel", "acc", "distance")))
-        trace = Trace(*(found[name] for name in ("distance", "height", "speed", "qpos")))
-        return trace, path, fields, ctrl
-
-    return run
-
-
-def unbalanced(the_scene, result, stride):
-    """Forces that the kernel leaves unbalanced at states of a grasp.
-
-    Without its start: there an object stands on the table with no gap, and rounding decides whether
-    it touches.
-    """
-    _, path, fields, ctrl = result
-    found = oracles.Path(*(v[:, 1:] for v in path))
-    return oracles.unbalanced(the_scene, fields, ctrl[:, 1:], found, stride)
 
 
 @pytest.fixture(scope="module")
@@ -188,21 +144,25 @@ def grasps(tmp_path_factory, household):
     yaws.append((names.index("mug"), 0.1 + np.pi / 2))
     trials = [still(i)._replace(size=np.array(1.04), yaw=np.array(yaw)) for i, yaw in yaws]
 
-    with jax.enable_x64(True):
-        worlds, run = stack(*[params] * len(trials)), runner(the_scene)
-        ways = [stack(*trials), stack(*trials[::-1])]
-        one, other = (nth(run(worlds, way), ...) for way in ways)
-        left = unbalanced(the_scene, one, 10)
     names.append("turned mug")
-    compiled = run._cache_size()
-    return Grasps(the_scene, params, trials, names, one[0], other[0], left, compiled)
+    count, both = len(trials), [*trials, *trials[::-1]]
+    engine = StructuredEngine(the_scene, iterations=100, evaluations=40, tolerance=1e-24)
+    with jax.enable_x64(True):
+        fields, ctrl = batch_inputs(the_scene, stack(*[params] * len(both)), stack(*both))
+        path = oracles.path(engine, fields, ctrl)
+        # Without the start: there an object stands on the table with no gap, and rounding decides
+        # whether it touches.
+        later = oracles.Path(*(v[:count, 1:] for v in path))
+        fields, ctrl = nth((fields, ctrl), slice(count))
+        left = oracles.unbalanced(the_scene, fields, ctrl[:, 1:], later, 10)
+    return Grasps(params, trials, names, path, left)
 
 
 def test_primitives_and_meshes_share_a_batch_and_a_program(grasps):
     """In the kernel's blocks of a few worlds, whose other worlds change no bit of a world."""
-    assert grasps.compiled == 1
-    for a, b in zip(*map(jax.tree.leaves, (grasps.kernel, grasps.reverse)), strict=True):
-        np.testing.assert_array_equal(a[::-1], b)
+    for value in grasps.path:
+        one, reverse = np.split(value, 2)
+        np.testing.assert_array_equal(one[::-1], reverse)
 
 
 def test_the_kernel_balances_all_forces_on_meshes(grasps):
@@ -210,7 +170,7 @@ def test_the_kernel_balances_all_forces_on_meshes(grasps):
 
     The forces are those of contacts that plain JAX finds on the same grids.
     """
-    qpos = grasps.kernel.qpos
+    qpos = grasps.path.qpos
     assert qpos.dtype == np.float64
     upright, turned = (grasps.names.index(name) for name in ("mug", "turned mug"))
     touched = np.abs(qpos[upright] - qpos[turned])[:, 6:-7].max()
@@ -233,12 +193,10 @@ def test_accelerations_of_a_meshed_box_equal_mujoco(grasps, tmp_path):
     world = grasps.names.index("mesh box")
     trial = grasps.trials[world]._replace(shape=np.int32(0))
     with jax.enable_x64(True):
-        params = jax.tree.map(jnp.asarray, grasps.params)
-        fields = jax.jit(lambda p, t: model.model_fields(twin, p, t))(params, trial)
-        ctrl = jax.jit(lambda p, t: control.commands(twin, p, t))(params, trial)
+        fields, ctrl = world_inputs(twin, grasps.params, trial)
         oracle = mujoco_engine.world_model(twin, fields)
     oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
-    data, h, qpos = mujoco.MjData(oracle), oracle.opt.timestep, grasps.kernel.qpos[world]
+    data, h, qpos = mujoco.MjData(oracle), oracle.opt.timestep, grasps.path.qpos[world]
     speed, contacts = np.zeros((len(qpos) - 1, oracle.nv)), set()
     for k in range(len(speed)):
         mujoco.mj_differentiatePos(oracle, speed[k], h, qpos[k], qpos[k + 1])

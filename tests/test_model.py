@@ -118,16 +118,6 @@ def test_every_array_that_depends_on_the_hand_is_covered(worlds):
     assert differing <= set(model.ModelFields._fields) | set(UNREAD)
 
 
-def test_other_options_are_the_template_s(worlds):
-    """Options that are no model fields depend on the structure only."""
-    the_scene, _, fresh, _ = worlds
-    template = model.compile_template(the_scene).opt
-    for compiled in fresh:
-        for name in (n for n in dir(template) if not n.startswith("_")):
-            if name not in ("gravity", "impratio") and not callable(getattr(template, name)):
-                np.testing.assert_array_equal(getattr(compiled.opt, name), getattr(template, name))
-
-
 def test_no_part_reads_the_unread_constants(worlds):
     """What UNREAD claims: no limits, joint friction, equalities, muscles or sleeping."""
     compiled = worlds[2][0]

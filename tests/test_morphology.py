@@ -135,16 +135,3 @@ def test_a_tapered_finger_is_the_integral_of_its_sections():
             assert chain == pytest.approx(bend, rel=0.12 / links**2)
         free = morphology.free_bends(hand, params._replace(pressure=np.full(2, 1e5)))
         assert free[f] == pytest.approx(1e5 * bend, rel=1e-4)
-
-
-def test_a_taper_of_nothing_is_a_uniform_finger():
-    hand, params = tapered()
-    width = np.full(2, hand.section.width)
-    same = params._replace(tip=Tip(params.height, params.wall, width))
-    plain = params._replace(tip=None)
-    for found, expected in (
-        (morphology.segments(hand, p, 4) for p in (same, plain)),
-        (morphology.finger_beams(hand, p, 4) for p in (same, plain)),
-    ):
-        for a, b in zip(found, expected, strict=True):
-            np.testing.assert_allclose(a, np.broadcast_to(b, a.shape), rtol=1e-14)

@@ -290,8 +290,8 @@ def open_domain(mask):
 
 
 @pytest.mark.parametrize("first", ["morphology", "control"])
-@pytest.mark.parametrize("episodes", [33, 64, 100, 128])
-@pytest.mark.parametrize("switches", [1, 2, 3, 4, 8, 16, 32])
+@pytest.mark.parametrize("episodes", [33, 64, 100])
+@pytest.mark.parametrize("switches", [1, 3, 8, 32])
 def test_switches_are_exact_and_even(switches, episodes, first):
     domain = open_domain(schedule(f"switch-{switches}", IS_MORPHOLOGY, episodes, first=first))
     at = np.flatnonzero(domain[1:] != domain[:-1]) + 1
@@ -305,11 +305,7 @@ def test_switches_are_exact_and_even(switches, episodes, first):
     ("name", "message"),
     [
         ("concurent", "did you mean 'concurrent'"),
-        ("switch_8", "did you mean 'switch-8'"),
-        ("switch-0", "unknown schedule"),
-        ("switch-", "unknown schedule"),
         ("switch--1", "unknown schedule"),
-        ("xyz", "Valid: concurrent, morphology"),
         ("switch-64", "at least 65 episodes, got 64"),
     ],
 )

@@ -4,13 +4,10 @@ import json
 import shutil
 import sys
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from codesign_jax import cli, codesign, own, parameters, runs, scene
-from codesign_jax.engines import make_engine
+from codesign_jax import cli, own, runs
 from tests.helpers.command_runs import assert_same_run, snapshot
 from tests.helpers.toy_engine import TINY
 
@@ -159,18 +156,8 @@ def test_a_run_of_ones_own_code_goes_on_bit_for_bit(here, capsys):
     assert (here / "grown" / "code" / "mine.py").read_text() == MINE
     noted = json.loads((here / "grown" / "provenance.json").read_text())
     assert [noted["settings"][name] for name in ("optimizer", "cost")] == OWN[-3::2]
-    # The costs of the run are those of the library, whose program is another.
-    the_scene, record = scene.load(TINY), runs.load_record(here / "grown")
-    space = parameters.design_space(the_scene.hand, "2d")
-    assert record is not None
-    low = sys.modules["mine"].low
-    engine = make_engine("mujoco", the_scene)
-    evaluate = codesign.Task(the_scene, space, 3, engine, cost=low, record_qpos=True).evaluate
-    noise = codesign.stream_key(jax.random.key(3), codesign.STREAM_TRIAL, 1)
-    again = evaluate(jnp.asarray(record.history.population[1]), noise)
-    # Two programs round model fields differently, and 0.3 s of contact let that grow.
-    np.testing.assert_allclose(again.cost, record.history.outcomes.cost[1], rtol=1e-3, atol=1e-5)
-    assert np.ptp(again.cost) > 0.01
+    record = runs.load_record(here / "grown")
+    assert record is not None and np.ptp(record.history.outcomes.cost[1]) > 0.01
 
 
 def test_a_cost_of_forces_asks_for_them_of_an_engine_that_has_them(here, capsys):
@@ -217,7 +204,6 @@ def test_a_policy_is_searched_and_said_wherever_it_acts(here, capsys):
     assert "share" in capsys.readouterr().out
     the_scene, settings = runs.read_run(here / "run")
     assert settings.policy == "mine:Pull" and the_scene.control.parameter[0].name == "share"
-    assert cli.main([*run, "--out", "run"]) == 0  # resumes
     assert cli.main([*run[:-4], "--policy", "mine:Narrow", "--out", "run"]) == 2
     capsys.readouterr()
     trials = ["--trials", "2", "--run", "run"]
@@ -230,7 +216,6 @@ def test_a_policy_is_searched_and_said_wherever_it_acts(here, capsys):
         cli.main(["evaluate", "--policy", "mine:Pull", *design, "--trials", "2", *table])
         kept.append((here / f"{share}.csv").read_text())
     assert kept[0] != kept[1]
-    assert cli.main(["evaluate", *trials, "--policy", "mine:Pull"]) in (0, 1)
     pair = ["compare", "run", str(shutil.copytree(here / "run", here / "copy")), "--trials", "2"]
     assert cli.main(pair) == 2
     assert "the run was made with --policy mine:Pull" in capsys.readouterr().err

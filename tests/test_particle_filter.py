@@ -103,15 +103,6 @@ def test_moves_have_the_stated_deviation():
     assert np.abs(correlation).max() < 0.08
 
 
-def test_draws_differ_between_episodes_and_particles_but_not_between_asks():
-    state = FILTER.init(jax.random.key(0), TARGET, 8)
-    population = ask(state, OPEN)
-    assert_same_bits(ask(state, OPEN), population)
-    assert len(np.unique(population[:, 0])) == 8
-    later = ask(state._replace(episode=state.episode + 1), OPEN)
-    assert not np.any(later == population)
-
-
 def pressure_under_wall(particle):
     """Two parameters: wall thickness [m] and pressure [Pa], limited as in Table I."""
     thickness, pressure = particle
@@ -173,32 +164,7 @@ def test_where_every_particle_failed_all_survive(bad):
     assert info.best_cost == np.inf and info.mean_cost == np.inf
 
 
-def test_bad_arguments_are_errors():
-    with pytest.raises(TypeError, match="typed key"):
-        FILTER.init(jnp.zeros(2, jnp.uint32), TARGET, 4)
-    with pytest.raises(ValueError, match="seed_particle"):
-        FILTER.init(jax.random.key(0), TARGET[:3], 4)
-    with pytest.raises(ValueError, match="num_particles"):
-        FILTER.init(jax.random.key(0), TARGET, 0)
-    with pytest.raises(ValueError, match="alpha"):
-        ParticleFilter(FILTER.space, alpha=0)
-    with pytest.raises(ValueError, match="match"):
-        told([1.0, 2.0, 3.0])
-
-
 # --- seeding -------------------------------------------------------------------------------------
-
-
-def test_candidates_fill_the_box_and_satisfy_the_constraint():
-    particles = np.asarray(draw(jax.random.key(0), FILTER.space, np.arange(2000)))
-    unit = (particles - LOW) / (HIGH - LOW)
-    assert unit.min() >= 0 and unit.max() <= 1
-    np.testing.assert_allclose(unit.mean(axis=0), 0.5, atol=0.03)
-    thickness, pressure = np.asarray(
-        draw(jax.random.key(0), PRESSURE.space, np.arange(500)), np.float64
-    ).T
-    # XLA may compute the thickness twice, once for its limit, and round it at other places.
-    assert np.all(pressure < thickness * 80e3 / 2e-3 * (1 + np.finfo(np.float32).eps))
 
 
 def test_seeds_do_not_depend_on_the_batch_size():
@@ -299,9 +265,3 @@ def test_zero_weights_are_never_drawn_where_the_float32_sum_ends_off_one():
     assert np.all(weights[np.asarray(ancestors)] > 0)
     for row in ancestors:
         assert_floor_or_ceiling(counts_of(row, n), expected_counts(weights))
-
-
-@pytest.mark.parametrize("shape", [(), (0,), (2, 3), (MAX_PARTICLES + 1,)])
-def test_wrong_shapes_are_errors(shape):
-    with pytest.raises(ValueError, match="shape"):
-        stochastic_universal(0.5, jnp.ones(shape))

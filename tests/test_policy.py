@@ -18,6 +18,7 @@ from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.model import morphology
 from codesign_jax.model.layout import layout
+from codesign_jax.report import charts
 from codesign_jax.scene import parameters
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Status
@@ -38,53 +39,71 @@ def loop(scene, step, **attributes):
     return policy.ControlLoop(make_engine("structured", scene), named)
 
 
+SCENE = grasps.short_grasp()
+
+
 @pytest.fixture(scope="module")
 def worlds():
-    """A short scene with a real air supply, and four random worlds."""
-    effects = dataclasses.replace(
-        grasps.short_grasp().effects, pressure_dynamics=True, disturb=True
-    )
-    phases = dataclasses.replace(grasps.short_grasp().phases, disturb=0.6)
-    scene = dataclasses.replace(grasps.short_grasp(), effects=effects, phases=phases)
-    return scene, *grasps.random_worlds(scene, 1, 4)
+    """Four random worlds, and how they end by the key frames, without and with recorded forces."""
+    inputs, engine = grasps.random_worlds(SCENE, 1, 4), make_engine("structured", SCENE)
+
+    @jax.jit
+    def run(params, trials):
+        ways = [{}, {"record_forces": True}]
+        return [rollout.simulate(SCENE, engine, params, trials, **how) for how in ways]
+
+    return inputs, *run(*inputs)
 
 
-def simulate(scene, engine, params, trials):
-    return jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t))(params, trials)
+def test_recording_changes_no_bit_and_a_lost_object_has_no_forces(worlds):
+    _, plain, (outcome, trace) = worlds
+    jax.tree.map(np.testing.assert_array_equal, plain, (outcome, trace._replace(forces=None)))
+    chart = charts.grip_chart(grasps.nth(trace.forces, 0), SCENE)
+    assert [line.name for line in chart.data] == ["finger 0", "finger 1", "palm"]
+    assert len(chart.data[0].y) == SCENE.num_steps
+    lost = np.asarray(outcome.lost_time)
+    assert np.isfinite(lost).any()
+    for world in np.flatnonzero(np.isfinite(lost)):
+        after = round(lost[world] / SCENE.discretization.timestep)
+        rest = jax.tree.map(lambda v, w=world, a=after: np.abs(v[w, a:]).max(), trace.forces)
+        assert max(jax.tree.leaves(rest)) == 0
 
 
 def test_who_replays_the_key_frames_simulates_the_open_loop(worlds):
     """To the bit: poses and pressures are the same numbers. The last period is a shorter one."""
-    scene, params, trials = worlds
-    outcome, trace = simulate(scene, make_engine("structured", scene), params, trials)
-    engine = loop(scene, replay, period=0.25)
-    assert scene.num_steps % engine.steps
-    again, found = simulate(scene, engine, params, trials)
-    ctrl = jax.jit(lambda p, t: rollout.prepare(scene, p, t)[1])(params, trials)
+    inputs, _, (outcome, trace) = worlds
+    engine = loop(SCENE, replay, period=0.25)
+    assert SCENE.num_steps % engine.steps
+
+    @jax.jit
+    def run(params, trials):
+        found = rollout.simulate(SCENE, engine, params, trials, record_forces=True)
+        return found, rollout.prepare(SCENE, params, trials)[1]
+
+    (again, found), ctrl = run(*inputs)
     np.testing.assert_array_equal(found.ctrl, ctrl)
-    both = (outcome, trace), (again, found._replace(ctrl=None))
+    both = (outcome, trace._replace(forces=None)), (again, found._replace(ctrl=None, forces=None))
     jax.tree.map(np.testing.assert_array_equal, *both)
+    # Two programs of plain JAX, of forces of 10 N in float32.
+    for a, b in zip(*map(jax.tree.leaves, (found.forces, trace.forces)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
 
 
 def test_what_is_observed_is_where_mujoco_has_it(worlds):
-    scene, params, trials = worlds
-    engine = make_engine("structured", scene)
+    """After as many steps as a period above has."""
+    scene, engine = SCENE, make_engine("structured", SCENE)
 
+    @jax.jit
     def look(params, trials):
-        prepared = rollout.prepare(scene, params, trials)
-        fields, ctrl, _ = prepared
-        recorded = engine.recording().rollout(fields, ctrl[:, :40])
-        last, pushed = recorded.last, jax.tree.map(lambda v: v[:, -1], recorded.forces)
+        fields, ctrl, _ = rollout.prepare(scene, params, trials)
         plan = rollout.prepare(scene, params, trials, loop(scene, replay))[1]
-        world = policy.begin(scene, fields, plan)._replace(state=last)
-        return (
-            last,
-            fields,
-            pushed,
-            policy.observe(engine, world_constants(scene, fields), fields, world, plan),
-        )
+        recorded = engine.recording().rollout(fields, ctrl[:, :25])
+        pushed = jax.tree.map(lambda v: v[:, -1], recorded.forces)
+        world = policy.begin(scene, fields, plan)._replace(state=recorded.last)
+        hand = world_constants(scene, fields)
+        return recorded.last, fields, pushed, policy.observe(engine, hand, fields, world, plan)
 
-    last, fields, pushed, seen = grasps.nth(jax.jit(look)(params, trials), ...)
+    last, fields, pushed, seen = grasps.nth(look(*worlds[0]), ...)
     state, lay = model.split(scene, last), layout(scene)
     bodies = {"palm": 1, "object": lay.object}
     for w in range(len(last)):
@@ -107,9 +126,9 @@ def test_what_is_observed_is_where_mujoco_has_it(worlds):
     for a, b in zip(jax.tree.leaves(seen.forces), jax.tree.leaves(pushed), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-3)
     assert pushed.table.max() > 0.1
-    np.testing.assert_allclose(seen.time, 0.4, rtol=1e-6)
-    assert ([*scene.phase_ends][int(seen.phase[0])], len({*seen.phase})) == ("lift", 1)
-    np.testing.assert_allclose(seen.phase_time, 0.4 - scene.phases.inflate, rtol=1e-5)
+    np.testing.assert_allclose(seen.time, 0.25, rtol=1e-6)
+    assert ([*scene.phase_ends][int(seen.phase[0])], len({*seen.phase})) == ("inflate", 1)
+    np.testing.assert_allclose(seen.phase_time, 0.25 - scene.phases.approach, rtol=1e-5)
 
 
 @pytest.mark.slow  # quick: the open loop's (test_compose), and that both have the same bits
@@ -136,30 +155,34 @@ def test_the_derivative_of_a_closed_loop_is_that_of_differences():
     np.testing.assert_allclose(slope, (one - two) / 100.0, rtol=1e-4)
 
 
-def test_pressures_stay_within_what_the_walls_stand_and_what_is_no_number_fails_its_world():
+def test_pressures_stay_within_what_the_walls_stand_and_what_is_no_number_fails_its_world(worlds):
     """And is told where it is, if nothing is traced."""
-    scene = grasps.short_grasp()
-    params, trials = grasps.random_worlds(scene, 1, 2)
+    params, trials = worlds[0]
+    at_once = dataclasses.replace(SCENE.pneumatics, lag=0.0, rate=1e9)
+    scene = dataclasses.replace(SCENE, pneumatics=at_once)
 
     def wild(carry, seen):
         pressure = jnp.where(seen.time > 0.2, jnp.nan, jnp.array([1e9, -1.0]))
         return carry, seen.plan._replace(pressure=pressure)
 
     engine = loop(scene, wild, period=0.1)
-    outcome, trace = simulate(scene, engine, params, trials)
+    simulate = partial(rollout.simulate, scene, engine)
+    # The other two worlds start with a finger in the table.
+    outcome, trace = grasps.nth(jax.jit(simulate)(params, trials), slice(2))
+    params = grasps.nth(params, slice(2))
     assert (np.asarray(outcome.status) & Status.NONFINITE).all()
-    assert (np.asarray(outcome.bad_step) == 31).all()
-    with pytest.raises(InputError, match=r"commands pressure\[0\] = nan at 0.3 s in world 0"):
-        rollout.simulate(scene, engine, params, trials)
+    assert (np.asarray(outcome.bad_step) == 32).all()  # the supply passes it on a step later
+    with pytest.raises(InputError, match=r"commands pressure\[0\] = nan at 0.31 s in world 0"):
+        simulate(params, grasps.nth(trials, slice(2)))
     ctrl = np.asarray(trace.ctrl)[:, :30]
     limit = jax.vmap(scene.hand.pressure_limit.of)(params.height, params.wall)
-    top = np.maximum(limit, params.pressure)[:, None, 0]
-    np.testing.assert_allclose(ctrl[..., 6], np.broadcast_to(top, ctrl.shape[:2]), rtol=1e-6)
+    top = np.maximum(limit, params.pressure)[:, :1]
+    np.testing.assert_allclose(ctrl[:, 1:, 6], np.broadcast_to(top, (2, 29)), rtol=1e-6)
     assert (ctrl[..., 7] == 0).all()
     # The tip of a tapered finger stands less than its base.
     tapered = scenes.load("paper", hand_name="tapered4")
     space = parameters.design_space(tapered.hand, "full")
-    one = jax.tree.map(lambda v: jnp.asarray(v)[None], space.params(space.default()))
+    one = jax.tree.map(lambda v: v[None], jax.jit(space.params)(space.default()))
     thin = one._replace(tip=one.tip._replace(wall=0.5 * one.wall), pressure=0.0 * one.pressure)
     none = jnp.zeros((1, 2, 6)), jnp.full((1, 2, tapered.num_fingers), 1e9)
     plan = control.Plan(*[None] * len(control.Plan._fields))._replace(

@@ -65,12 +65,6 @@ def test_triangles_lie_on_the_surface(kind):
     assert np.abs(distance).max() < 1e-9  # trimesh rounds corners that it merges to 1e-8
 
 
-@pytest.mark.parametrize("names", [KINDS[1:], [*KINDS, "cone"]])
-def test_a_shape_without_record_or_distance_is_refused_at_import(names):
-    with pytest.raises(TypeError, match=KINDS[0] if len(names) < len(KINDS) else "cone"):
-        primitives.check("distances", names)
-
-
 # --- distances of finger spheres ------------------------------------------------------------------
 
 

@@ -9,7 +9,7 @@ import signal
 import numpy as np
 import pytest
 
-from codesign_jax import reuse, runs
+from codesign_jax import runs
 from codesign_jax.commands import reference
 from codesign_jax.runs import choice
 from codesign_jax.runs.choice import Case
@@ -41,17 +41,17 @@ def test_same_command_again_changes_no_result(finished, tmp_path, capsys):
 
 def test_a_killed_run_resumes_bit_for_bit(tmp_path, capsys):
     """Signals within this process: test_runs_of_a_batch_stop_fail_and_go_on_by_themselves."""
-    # Enough episodes that a signal after the third finds the run on its way.
-    folder, run = tmp_path / "run", [*RUN, "--episodes", "14"]
+    # Enough episodes that a signal after the second finds the run on its way.
+    folder, run = tmp_path / "run", [*RUN, "--episodes", "10"]
     process = launch(*run, "--out", folder)
-    wait_for(folder / "events.log", "episode  3/", process)
+    wait_for(folder / "events.log", "episode  2/", process)
     process.kill()
     output, _ = process.communicate()
     assert process.returncode == -signal.SIGKILL, output
     done = runs.load_record(folder)
-    assert done is not None and 3 <= done.done < 14, "it was to stop on the way"
+    assert done is not None and 2 <= done.done < 10, "it was to stop on the way"
     assert command(*run, "--out", folder) == 0
-    assert f"resuming episode {done.done + 1}/14" in capsys.readouterr().out
+    assert f"resuming episode {done.done + 1}/10" in capsys.readouterr().out
     assert command(*run, "--out", tmp_path / "whole") == 0
     assert_same_run(folder, tmp_path / "whole")
 
@@ -116,14 +116,6 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
         patch.setattr(Case, "simulate", never)
         assert command(*RUN, "--reference-trials", "2", "--out", folder) == 0
         assert line in capsys.readouterr().out.splitlines()
-        with pytest.raises(AssertionError, match="simulated again"):
-            command(*RUN, "--reference-trials", "3", "--out", folder)
-        capsys.readouterr()
-        patch.setattr(reuse, "code_digest", lambda **_: "other code")
-        with pytest.raises(AssertionError, match="simulated again"):
-            command(*RUN, "--reference-trials", "2", "--out", folder)
-        said = capsys.readouterr().out
-        assert "reference.npz is of another version of the code: simulated again" in said
     settings = runs.read_run(folder)[1]
     assert reference.number_of_trials(None, settings) == 0  # MuJoCo C would take minutes
     quick = dataclasses.replace(settings, engine="structured")
@@ -142,13 +134,6 @@ def test_more_episodes_extend_a_run_bit_for_bit(finished, tmp_path, capsys):
     assert provenance["settings"]["episodes"] == 5
     ((step, command_line),) = [(e, e.pop("command")) for e in provenance["extended"]]
     assert (step["from"], step["to"]) == (3, 5) and command_line
-    # The design that was found, wherever in the run, and one grasp of it.
-    scene, record = runs.read_run(grown)[0], choice.read_record(grown)
-    chosen, grasp = choice.choose(scene, record), choice.find_grasp(scene, record)
-    np.testing.assert_array_equal(grasp.design, chosen.design)
-    assert grasp.place[:2] == (chosen.episode + 1, chosen.row)
-    # Four trials of the test in rounds of three, and the last episode's three.
-    assert chosen.outcomes.cost.shape == (9,)
     before = snapshot(grown)
     assert command(*run, "--episodes", "4", "--out", grown) == 2
     error = capsys.readouterr().err
@@ -171,13 +156,6 @@ def test_the_default_search_goes_on_and_a_run_keeps_its_optimiser(finished, tmp_
         assert command(*run, "--episodes", episodes, "--out", grown) == 0
     assert_same_run(grown, long)
     assert runs.read_run(grown)[1].optimizer == "screened-es"
-    # The final test simulates six particles, and those that are copies have their outcomes.
-    assert "final test: 36 grasps" in (long / "events.log").read_text()
-    particles, test = (lambda r: (r.state.particles, r.test))(choice.read_record(long))
-    _, same = np.unique(particles, axis=0, return_inverse=True)
-    assert len(np.unique(same)) <= 6 < len(same)
-    costs = {(s, *c) for s, c in zip(same.ravel(), test.cost.tolist(), strict=True)}
-    assert len(costs) == len(np.unique(same))
     # The design that was found was simulated in an episode, whose grasp can be shown.
     scene, record = runs.read_run(grown)[0], choice.read_record(grown)
     chosen, grasp = choice.choose(scene, record), choice.find_grasp(scene, record)

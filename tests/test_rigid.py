@@ -245,28 +245,21 @@ def test_mass_of_primitives_by_density(tmp_path):
     ("entry", "expected"),
     [
         (BOX + "; inertia = [1e-4, 1e-4, 3e-4]", "is of no body: its principal moments are 0.0001"),
-        (BOX + "; inertia = [1e-4, -1e-4, 1e-4]", "must be positive about every axis"),
         (BOX + "; inertia = [1e-2, 1e-2, 1e-2]", "reaches 66.3 mm .* more than 0.00044 kg m"),
-        (BOX + "; inertia = [1e-4]", "inertia must have three numbers"),
         (BOX + "; inertia = [1e-4, 1e-4, 1e-4, 1e-5, 0, 0]", "inertia of a box is xx, yy and zz"),
         (BOX + "; density = 100", "a box has either a mass or a density"),
-        (BOX.replace("; mass = 0.1", ""), "a box has either a mass or a density"),
         (
             BOX + "; centre_of_mass = [0, 0, 0.07]",
             "a: box.stl: centre_of_mass at 0, 0, 70 mm",
         ),
-        (MESH + "; centre_of_mass = [0, 0, 0.07]", "0, 0, 70 mm is outside its convex hull"),
         (MESH + "; centre_of_mass = [0, 0]", "centre_of_mass must have three coordinates"),
         (
             MESH + "; inertia = [1e-4, 1e-4, 1e-4, 9e-5, 9e-5, -9e-5]",
             "must be positive about every",
         ),
-        (BOX + '; pose = "stabel"', 'must be "stable", or "stable:2"'),
         (BOX + '; pose = "stable:3"', r"asks for pose 3: it has 2 stable poses, 1 \(\d+ %\), 2"),
         (BOX + '; pose = "stable"; orientation = [0, 0, 0]', "give either orientation or pose"),
-        (BOX + "; orientation = [0, 0]", "orientation must be roll, pitch and yaw in degrees, or"),
         (BOX + "; orientation = [1, 1, 0, 0]", "must be a unit quaternion w, x, y, z: its norm is"),
-        (BOX + "; orientation = [900, 0, 0]", r"= 900 is outside \[-360, 360\] deg"),
     ],
 )
 def test_impossible_bodies_are_refused(tmp_path, entry, expected):

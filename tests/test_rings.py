@@ -319,7 +319,8 @@ def _reference(name, body, field, place):
 
 def test_hands_grasp_whose_fingers_are_no_power_of_two():
     """Lanes that pad three fingers to four hold no finger: what they calculate is a number too."""
-    off = dict.fromkeys(("disturb", "ungrasp", "finger_finger", "finger_itself"), False)
+    names = "disturb ungrasp twist lateral_bending palm_object palm_table finger_table finger_palm"
+    off = dict.fromkeys((*names.split(), "finger_finger", "finger_itself"), False)
     ends = {"approach": 0.5, "inflate": 1.0, "lift": 1.2}
     how = {"discretization": {"links": 2}, "effects": off, "phases": ends}
     the_scene = load("paper", hand_name="tripod3", overrides=how)

@@ -26,10 +26,6 @@ def test_more_trials_do_not_change_the_first():
         np.testing.assert_array_equal(a, b[:4])
 
 
-def test_shapes_take_turns():
-    np.testing.assert_array_equal(draw(KEY, 7).shape, [0, 1, 2, 0, 1, 2, 0])
-
-
 def test_noise_has_the_declared_spread():
     """Means and standard deviations over 20,000 trials, to four standard errors."""
     count, noise = 20_000, PAPER.objects.noise
@@ -120,16 +116,6 @@ def test_order_of_particles_and_trials_does_not_matter(batch):
 # --- arm and start -------------------------------------------------------------------------------
 
 
-def test_a_grasp_starts_where_its_commands_do():
-    """The wrist starts in the arm's first pose, noise included: nothing jerks at the first step."""
-    params, trial = hand_world(PAPER)
-    arm = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.3])
-    trial = trial._replace(arm_tilt=np.array([0.05, -0.07]))
-    params, trial = jax.tree.map(jnp.asarray, (params._replace(arm=arm), trial))
-    fields = jax.jit(lambda p, t: model.model_fields(PAPER, p, t))(params, trial)
-    np.testing.assert_allclose(fields.start[:6], commanded(PAPER, params, trial)[0, :6], rtol=1e-6)
-
-
 @pytest.mark.parametrize("axis, sign, column", [(4, 1, 0), (3, 1, 1)])
 def test_pitch_points_the_fingers_to_x_and_roll_to_y(axis, sign, column):
     """Table I's x = -20 mm with a pitch of 15 degrees aims at the object."""
@@ -213,10 +199,3 @@ def test_bad_designs_drop_every_object(pneuflex, index):
     np.testing.assert_array_equal(outcome.status[index], Status.OK)
     assert (outcome.cost[index] > 2.0).all()
     assert (outcome.lost_time[index] < the_scene.phases.lift).all()
-
-
-def test_another_hand_grasps_with_no_line_of_code():
-    the_scene = scene.load("paper_spheres", hand_name="tripod3")
-    outcome, _ = grasp(the_scene, design(the_scene))
-    np.testing.assert_array_equal(outcome.status, Status.OK)
-    np.testing.assert_array_equal(outcome.cost, 0.0)

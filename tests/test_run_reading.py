@@ -117,34 +117,17 @@ def test_changed_scene_files_are_refused_by_all_that_read_the_run(run, capsys):
     runs.read_run(run)
 
 
-HOSTILE = {
-    "nested": "[" * 100_000,
-    "no JSON": "{",
-    "a number": "1" * 5_000,
-    "no text": b"\xff\xfe",
-}
-CHANGES = {
-    "no environment": {"environment": None},
-    "episodes as truth": {"settings": {"episodes": True}},
-    "too many episodes": {"settings": {"episodes": 10**12}},
-    "resumed at": {"resumed": [{"time": 3}]},
-    "id": {"id": "x"},
-    "files": {"files": {"../../etc/passwd": "0"}},
-}
+HOSTILE = ["[" * 100_000, "{", b"\xff\xfe", {"episodes": 10**12}, {"../../etc/passwd": "0"}]
 
 
-@pytest.mark.parametrize("case", [*HOSTILE, *CHANGES])
+@pytest.mark.parametrize("case", HOSTILE, ids=["nested", "no JSON", "no text", "settings", "files"])
 def test_a_hostile_provenance_is_refused_in_words(case, run):
     path = run / "provenance.json"
-    if case in HOSTILE:
-        content = HOSTILE[case]
-    else:
+    if isinstance(case, dict):
         content = json.loads(path.read_text())
-        for key, value in CHANGES[case].items():
-            own = content.get(key)
-            content[key] = own | value if key == "settings" else value
-        content = json.dumps(content)
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        content["settings" if "episodes" in case else "files"] |= case
+        case = json.dumps(content)
+    path.write_bytes(case if isinstance(case, bytes) else case.encode())
     with pytest.raises(
         InputError, match=r"provenance\.json is damaged: .* Put it back from a copy"
     ):

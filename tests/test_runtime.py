@@ -11,7 +11,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -75,24 +74,18 @@ def test_any_number_of_threads_gives_the_same_bits(handler, pool, threads, block
     np.testing.assert_array_equal(out, alone)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_calls_of_one_program_and_of_many_threads(dtype):
+def test_calls_of_one_program_and_of_many_threads():
     """Several calls at once, in one program and from several threads, find the pool busy."""
-    with jax.enable_x64(True):
-        lanes = launch.block_lanes("cpu", dtype)
-        batches = [kernels.numbers(n, dtype, lanes) for n in (1, 2, 7, 64)]
-        batches = jax.tree.map(jnp.asarray, batches)
-        program = jax.jit(lambda b: [kernels.run(x, t, 500) for x, t in b])
-        program = program.lower(batches).compile()
-        want = program(batches)
-        alone = [jax.jit(partial(kernels.run, rounds=500))(x, t) for x, t in batches]
-        found = []
-        call = [lambda: found.append(jax.block_until_ready(program(batches)))] * 4
-        threads = [threading.Thread(target=c) for c in call]
-        for t in threads:
-            t.start()
-        for t in threads:
-            t.join()
+    batches = [kernels.numbers(n) for n in (1, 2, 7, 64)]
+    program = jax.jit(lambda b: [kernels.run(x, t, 500) for x, t in b]).lower(batches).compile()
+    want, found = program(batches), []
+    alone = [jax.jit(partial(kernels.run, rounds=500))(x, t) for x, t in batches]
+    call = [lambda: found.append(jax.block_until_ready(program(batches)))] * 4
+    threads = [threading.Thread(target=c) for c in call]
+    for t in threads:
+        t.start()
+    for t in threads:
+        t.join()
     assert len(found) == 4
     for got in [alone, *found]:
         jax.tree.map(np.testing.assert_array_equal, want, got)
@@ -146,21 +139,6 @@ def test_kept_code_runs_in_another_process_on_several_devices(folder):
         timeout=120,
     )
     assert done.returncode == 0, done.stderr
-
-
-def test_code_that_is_not_optimized_is_other_code_with_the_same_result(folder, monkeypatch):
-    """For programs that run for milliseconds; a level that LLVM has not is refused."""
-    x, table = kernels.numbers(3)
-    found = []
-    for level in ("2", "0"):
-        monkeypatch.setenv(handlers.OPTIMIZATION, level)
-        found.append(jax.jit(partial(kernels.run, rounds=8))(x, table))
-        assert len(list(folder.rglob("*.kept"))) == len(found)
-    # The chaotic map multiplies a difference by up to 3.9 in each of eight rounds.
-    np.testing.assert_allclose(*found, atol=3.9**8 * 6e-8)
-    monkeypatch.setenv(handlers.OPTIMIZATION, "3")
-    with pytest.raises(ValueError, match="CODESIGN_KERNEL_OPTIMIZATION = '3' must be 0 or 2"):
-        jax.jit(kernels.run)(x, table)
 
 
 # What a handler refuses

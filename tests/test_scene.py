@@ -52,14 +52,12 @@ BY_PATH = {
     "discretization.links=5": lambda s: s.discretization.links == 5,
     "hand=tripod3": lambda s: s.hand.name == "tripod3",
     "hand.material.shear_modulus=60e3": lambda s: s.hand.material.shear_modulus == 60e3,
-    "hand.finger[1].tilt=75": lambda s: [f.tilt for f in s.hand.finger[:2]] == [70.0, 75.0],
     "hand.preset.2d.fixed.pressure=110": lambda s: s.hand.preset[0].fixed["pressure"] == 110,
     "hand.parameter.length.default=[110, 110, 60, 90]": lambda s: (
         s.hand.parameter[0].default == (110.0, 110.0, 60.0, 90.0)
     ),
     "hand.preset.2d.free.arm_z.high=150": lambda s: s.hand.preset[0].free[1].high == 150.0,
     "objects.object.sphere.mass=0.2": lambda s: s.objects.object[2].mass == 0.2,
-    "objects.object.0.size.2=0.02": lambda s: s.objects.object[0].size == (0.03, 0.03, 0.02),
 }
 
 
@@ -86,7 +84,6 @@ WRONG_PATHS = {
     "hand.section.width=18": (
         "hand.section.width = 18 is outside [0.005, 0.1] m; did you mean 0.018? (mm given"
     ),
-    "hand.finger[7].tilt=1": "hand.finger has no entry '7'; valid: 0, 1, 2, 3",
     "objects.object.spher.mass=1": "objects.object has no entry 'spher'; did you mean 'sphere'?",
     "discretization.links=10.0": "discretization.links = 10.0 must be a whole number in [1, 200]",
     # A number without a unit has no slip of units.
@@ -104,8 +101,6 @@ def test_a_wrong_key_path_is_told_in_words(pair):
     ("old", "new", "expected"),
     [
         ("size = [0.030]", "size = [30]", "did you mean 0.03?"),  # millimetres for metres
-        ("mass = 0.05\n", "mass = 50\n", "did you mean 0.05?"),  # grams for kilograms
-        ("position = 0.005", "position = 5", "did you mean 0.005?"),
         ("[table]\nfriction = 0.4", "", "objects.toml.table is missing"),
         ("size = [0.030, 0.036]", "size = [0.030]", "size of a cylinder has 2 values, not 1"),
         ('name = "sphere"', 'name = "cuboid"', "cuboid"),
@@ -120,12 +115,8 @@ def test_a_wrong_object_file(tmp_path, old, new, expected):
 def test_not_finite_values_are_refused(tmp_path, bad):
     (problem,) = hand_problems(tmp_path, ("density = 1070.0", f"density = {bad}"))
     assert "material.density" in problem and "did you mean" not in problem
-    for name, (old, new) in {
-        "high": ("high = 180\ndefault", f"high = {bad}\ndefault"),
-        "low": ("low = 10\nhigh = 180\n\n", f"low = {bad}\nhigh = 180\n\n"),
-    }.items():
-        problems = hand_problems(tmp_path, (old, new))
-        assert any(name in p and "length" in p for p in problems)
+    problems = hand_problems(tmp_path, ("high = 180\ndefault", f"high = {bad}\ndefault"))
+    assert any("high" in p and "length" in p for p in problems)
 
 
 def test_phases_out_of_order():
@@ -172,17 +163,9 @@ LOW = "low = 10\nhigh = 180\ndefault"  # of the length
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        # The type of a value, and its unit
-        (
-            "width = 0.024",
-            "width = 18",
-            "hands.toml.section.width = 18 is outside [0.005, 0.1] m; did you mean 0.018? "
-            "(mm given where m is expected)",
-        ),
         ("density = 1", "densty = 1", "densty is not a known key; did you mean 'density'?"),
         # What does not fit together
         (LOW, "low = 200\nhigh = 180\ndefault", "must be below"),
-        ("default = 80", "default = 190", "default = 190"),
         ('name = "wall"', 'name = "height"', "'wall' must be given once, not 0 times"),
         ("\nwall = 5", "\nwall = 2.5", "limit"),  # 120 kPa exceeds 40 kPa/mm * 2.5 mm
         ("[preset.fixed]", "[preset.fixed]\nlength = 100", "both free and fixed"),
@@ -194,14 +177,8 @@ LOW = "low = 10\nhigh = 180\ndefault"  # of the length
             "preset 2d.fixed.pressure = [120, 110] must be a number [kPa] for all fingers or 4, "
             "one for each, not 2",
         ),
-        (
-            "\npressure = 120",
-            '\npressure = [120, 110, "100", 110]',
-            "fixed.pressure = [120, 110, '100', 110] must be a number [kPa], or one for each",
-        ),
         ("\nwall = 5", "\nwall = [5, 5, 2.5, 5]", "120000 Pa is not below the limit of 100000 Pa"),
         ("\nspread = 45", "\nspread = [45]", "= [45] must be a number [deg]: the hand has one spr"),
-        ("low = 2\n", "low = [2, 2, 8, 2]\n", "parameter wall[2]: low 8 must be below high 7 mm"),
         (
             "tied = true\nlow = 10",
             "tied = true\nlow = [10, 10, 10, 20]",
@@ -237,8 +214,6 @@ def test_unknown_names_and_files(tmp_path):
     assert "did you mean the file" in problem and "myhand.toml'?" in problem
     (tmp_path / "broken.toml").write_text("a = = 1")
     assert "not valid TOML" in problems_of(hand.load, tmp_path / "broken.toml")[0]
-    (tmp_path / "latin.toml").write_bytes(b'name = "\xe9"')
-    assert "not valid TOML" in problems_of(hand.load, tmp_path / "latin.toml")[0]
 
 
 def test_paths_in_a_scene_file_are_relative_to_it(tmp_path):

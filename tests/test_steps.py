@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from codesign_jax import control, model
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
@@ -62,11 +63,17 @@ SLOW = {  # the same parts by themselves
 }
 
 
+@jax.jit
+def inputs(the_scene, params, trial):
+    """Fields and controls, by one program for scenes that differ in numbers."""
+    return model.model_fields(the_scene, params, trial), control.commands(the_scene, params, trial)
+
+
 def a_grasp(the_scene):
     """Fields and controls of a world, with the phases in which everything touches."""
     params, trial = grasps.hand_world(the_scene)
     trial = trial._replace(yaw=np.array(0.2), position=np.array([0.003, 0.01]))
-    fields, ctrl = grasps.world_inputs(the_scene, params, trial)
+    fields, ctrl = inputs(the_scene, params, trial)
     return jax.tree.map(lambda x: jnp.asarray(x)[None], fields), np.asarray(ctrl)[None, :420]
 
 

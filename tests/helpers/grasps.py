@@ -38,14 +38,16 @@ def pinch(shape="box", links=3, **settings):
     )
 
 
+@functools.cache
 def short_grasp():
-    """Half a second: the hand comes down beside the box, closes and begins to lift."""
+    """0.6 s: the hand comes down beside the box, closes by a real air supply, lifts and shakes."""
     return pinch(
         "box",
         phases__approach=0.2,
         phases__inflate=0.35,
         phases__lift=0.5,
-        effects__disturb=False,
+        phases__disturb=0.6,
+        effects__pressure_dynamics=True,
         effects__ungrasp=False,
         effects__palm_object=False,
         effects__palm_table=False,

@@ -1,20 +1,28 @@
-"""Forces and moments of rings against a dense skin, each case at ten places and several depths."""
+"""The hull in contact: rings against a dense skin, its mesh, depths, friction that is held."""
 
 import functools
+from functools import partial
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 
-from codesign_jax import rollout
+from codesign_jax import model, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured.kernel import memory_tables
-from codesign_jax.engines.structured.laws import rings
+from codesign_jax.engines.structured.laws import holding, rings
+from codesign_jax.engines.structured.laws.contact import Cone, Contacts, constraint_update
+from codesign_jax.model import hull
+from codesign_jax.model.layout import pairings_held
 from codesign_jax.scene import load, parameters
-from tests.helpers import dense_skin
+from codesign_jax.scene.schema import InputError
+from scripts import contact_depths
+from tests.helpers import dense_skin, grasps
 from tests.helpers.dense_skin import turned
+from tests.helpers.differences import curled
 
 STIFFNESS, LENGTH, WIDTH, HEIGHT, LINKS = 4000.0, 0.11, 0.024, 0.020, 10
 PER_AREA = STIFFNESS / WIDTH**2
@@ -331,3 +339,152 @@ def test_hands_grasp_whose_fingers_are_no_power_of_two():
     outcome, trace = jax.jit(lambda p, t: rollout.simulate(the_scene, engine, p, t))(*worlds)
     assert outcome.status[0] == 0 and outcome.cost[0] == 0
     assert float(trace.height[0, -1]) > 0.1, "lifted"
+
+
+# --- the hull's mesh: closed, as large as the finger, skinned as MuJoCo's renderer skins it -------
+
+
+def hull_scene(links=4, rings=2, points=8):
+    density = {"discretization__hull_rings": rings, "discretization__hull_points": points}
+    return grasps.pinch("box", links=links, effects__surface="hull", **density)
+
+
+@pytest.mark.parametrize(("links", "rings", "points"), [(1, 1, 4), (4, 2, 8), (3, 5, 20)])
+def test_mesh_is_the_closed_block_of_the_finger(links, rings, points):
+    """Watertight, faces outwards, with the block's volume; trimesh measures it."""
+    the_scene = hull_scene(links, rings, points)
+    mesh, width = hull.hull(the_scene, square=True), the_scene.hand.section.width
+    straight = hull.rest(the_scene, LENGTH, HEIGHT, square=True)
+    body = trimesh.Trimesh(straight, mesh.face, process=False)
+    assert body.is_watertight and body.is_winding_consistent
+    np.testing.assert_allclose(body.volume, LENGTH * width * HEIGHT, rtol=1e-12)
+    np.testing.assert_allclose(mesh.weight.sum(1), 1.0, atol=1e-12)
+    assert (mesh.weight >= -1e-12).all()
+
+
+def test_what_is_drawn_is_the_section_that_touches():
+    """|y/a|^4 + |z/b|^4 = 1 has the area 0.9270 of its square; the cap is a quarter of a link."""
+    the_scene = hull_scene(links=4, rings=8, points=80)
+    straight = hull.rest(the_scene, LENGTH, HEIGHT)
+    body = trimesh.Trimesh(straight, hull.hull(the_scene).face, process=False)
+    width, cap = the_scene.hand.section.width, LENGTH / 16
+    # Half of |x|^4 + |y|^4 + |z|^4 <= 1 has the volume 4 gamma(5/4)^3 / gamma(7/4).
+    volume = (LENGTH - cap + cap * 0.8106 / 0.9270) * 0.9270 * width * HEIGHT
+    assert body.is_watertight
+    np.testing.assert_allclose(body.volume, volume, rtol=0.01)
+
+
+def test_bad_settings_are_refused():
+    with pytest.raises(InputError, match="'hull' needs friction = 'coulomb' or 'none', not 'full'"):
+        grasps.pinch("box", effects__surface="hull", effects__friction="full")
+    with pytest.raises(InputError, match="hull_points = 6 must be a multiple of 4"):
+        hull_scene(points=6)
+    with pytest.raises(InputError, match="did you mean 'hull'"):
+        scene.load("paper_spheres", overrides={"effects": {"surface": "hul"}})
+
+
+# --- depths that `scripts.contact_depths` tells, of poses whose depth is known --------------------
+
+
+def tube(body, height=0.0):
+    """A finger of one state, moved up."""
+    joints = body.joints + [0, 0, height]
+    size = body.length, body.width, body.height
+    return contact_depths.tube(joints[None], body.frames[None], size)
+
+
+@pytest.mark.parametrize("depth", [-1e-3, 0.5e-3, 3e-3, 8e-3])
+@pytest.mark.parametrize("angle", [0, 30, 90])
+def test_a_finger_is_as_deep_in_another_one_as_it_was_moved(angle, depth):
+    """Across, along, and a tip that comes from above, whose end is nearer than its sides."""
+    turn = turned([0, 0, 1], np.radians(angle))
+    across = dense_skin.finger(LENGTH, base=[0.055, 0, 0] - turn[:, 0] * 0.055, turn=turn)
+    down = turned([0, 1, 0], np.pi / 2)
+    above = dense_skin.finger(LENGTH, base=[0.045, 0, LENGTH], turn=down)
+    one = tube(dense_skin.finger(LENGTH))
+    for other in (tube(across, HEIGHT - depth), tube(above, HEIGHT - depth)):
+        for a, b in ((one, other), (other, one)):
+            found = contact_depths.in_tube(a.rings, b)
+            np.testing.assert_allclose(found, [max(depth, 0)], atol=0.05e-3)
+
+
+@pytest.mark.parametrize("kind", ["box", "cylinder"])
+def test_an_edge_of_an_object_is_in_a_finger(kind):
+    """An object that stands with an edge in a finger; and a finger in its face."""
+    shape = type("Shape", (), {"type": kind})
+    size, depth = np.array([0.03, 0.03, 0.03]), 2e-3
+    edges, skin = contact_depths.surface(shape, size)
+    one = tube(dense_skin.finger(LENGTH))
+    inclined = turned([0, 1, 0], np.pi / 4)
+    low = (edges @ inclined.T)[:, 2].min()
+    at = np.array([0.0567, 0, HEIGHT - depth - low])
+    assert (skin @ inclined.T)[:, 2].min() > low - 1e-9
+    found = contact_depths.in_tube((edges @ inclined.T + at)[None, :, None], one)
+    np.testing.assert_allclose(found, depth, atol=0.1e-3)
+    away = one.rings.reshape(1, -1, 3) - [0.055, 0, HEIGHT - depth + size[2]]
+    np.testing.assert_allclose(contact_depths.in_object(kind, size, away), depth, atol=1e-6)
+
+
+# --- friction that fingers hold from step to step: its law on contacts alone, and who has it ------
+
+
+MU, STEPS = 0.8, 8
+
+
+def test_sliding_bodies_hold_coulomb_s_coefficient():
+    """Contacts of one normal that slide and close: |g| is mu, against the motion."""
+    with jax.enable_x64(True):
+        share = jnp.array([0.3, 1.0, 0.6])
+        cone = Cone(1.44 * share, 1.44 * share, MU, MU, 2778.0, 111.0)
+        normals = jnp.array([[0.0], [0.0], [1.0]]) * jnp.ones((1, 3))
+        contacts = Contacts(0 * normals, normals, -jnp.array([1e-3, 3e-3, 2e-4]), cone)
+        velocity = jnp.array([[2.0], [0.0], [-0.1]]) * jnp.ones((1, 3))
+        jar, none = -contacts.reference(velocity), jnp.zeros((3, 3))
+        force = constraint_update(contacts, jar + holding.held(contacts, none)).force
+        grip = np.asarray(holding.quotient(holding.hold(contacts, force, none).sum(1)))
+    assert grip[0] > 0 and np.hypot(*grip[:2]) == pytest.approx(MU, rel=1e-12)
+
+
+def test_spheres_keep_nothing():
+    """Their contact is that of MuJoCo, which has no state, so that every engine simulates it."""
+    for surface, held in ("hull", 4), ("spheres", 0):
+        chosen = scene.load("paper", overrides={"effects.surface": surface})
+        assert chosen.effects.friction_memory and pairings_held(chosen) == held
+    make_engine("mujoco", chosen)
+
+
+@pytest.fixture(scope="module")
+def held_hands():
+    """Two fingers that hold one another above the object: the state, and in pieces on from it.
+
+    A function of start, controls and steps of a piece: a sum of the end, the end, and the traces.
+    """
+    contacts = {"effects__finger_finger": True, "effects__friction_memory": True}
+    chosen = grasps.pinch("box", links=2, effects__surface="hull", **contacts)
+    engine = make_engine("structured", chosen)
+    with jax.enable_x64(True):
+        begin = curled(chosen, STEPS, bend=0.8, height=0.25)
+        fields, ctrl = jax.tree.map(lambda v: jnp.asarray(v)[None], (begin.fields, begin.ctrl))
+        ctrl = ctrl.at[..., 6:].set(180e3)  # Pa: they press on one another
+        start = jax.jit(engine.rollout)(fields, ctrl).last
+    assert np.abs(model.split(chosen, start).held).max() > 0.1
+
+    def one(start, ctrl):
+        trace = engine.rollout(fields._replace(start=start), ctrl)
+        return trace.last, (trace.distance, trace.height, trace.speed)
+
+    def pieces(start, ctrl, size):
+        parts = jnp.moveaxis(ctrl.reshape(1, -1, size, ctrl.shape[2]), 1, 0)
+        last, shown = jax.lax.scan(one, start, parts)
+        shown, end = jnp.stack(shown).reshape(3, -1), model.split(chosen, last)
+        return shown.sum() + end.qpos.sum() + end.held.sum(), (last, shown)
+
+    return start, ctrl, pieces
+
+
+def test_a_rollout_in_pieces_is_that_of_one_piece(held_hands):
+    """What fingers hold, the solver's warm start and the time of the grasp pass on: equal bits."""
+    start, ctrl, pieces = held_hands
+    with jax.enable_x64(True):
+        found = [jax.jit(partial(pieces, size=n))(start, ctrl)[1] for n in (STEPS, 1)]
+    jax.tree.map(np.testing.assert_array_equal, *found)

@@ -152,21 +152,6 @@ def test_its_counts_are_those_of_the_grasps_simulated_again(capsys):
     assert 60 * minutes + seconds >= 0.99 * grasps / rates[0][0] - 1
 
 
-@pytest.mark.parametrize(
-    "flags, expected",
-    [
-        (("--accuracy", FINER), "accuracy fine is what others are compared with"),
-        (("--grasps", 0), "--grasps = 0 is outside"),
-        (("--seconds", 0), "--seconds = 0.0 is outside"),
-        (("--engine", "mojoco"), "did you mean 'mujoco'?"),
-        (("--design", "lenght=44"), "did you mean 'length'?"),
-    ],
-)
-def test_bad_input_is_refused(flags, expected, capsys):
-    assert command(*SUBJECT, *flags) == 2
-    assert expected in capsys.readouterr().err
-
-
 def test_a_scene_in_which_every_grasp_fails_is_told_and_ends_with_an_error(capsys):
     assert command(*SUBJECT, "--design", "length=44", "--set", "limits.speed=1") == 1
     assert "failed: " in capsys.readouterr().out

@@ -174,21 +174,3 @@ def trials_of(cost, status, lost=()):
     """Outcomes of trials; the indices in `lost` lost their objects at 1 s."""
     times = np.where(np.isin(np.arange(len(cost)), list(lost)), 1.0, np.inf)
     return Outcome(np.array(cost), np.array(status, int), times, np.full(len(cost), -1))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "part"),
-    [
-        (["--design", "lenght=100"], "'lenght' is not a parameter; did you mean 'length'?"),
-        (["--design", "length=0.148"], "did you mean 148?"),
-        (["--design", "nowhere.toml"], "nowhere.toml: No such file or directory"),
-        (["--set", "solver.iterations=50"], "set newton.iterations, which limits the solver"),
-        (["--render", "grasp.avi"], "must end in .gif"),
-        (["--run", "nowhere"], "nowhere is not a run folder: there is no such folder"),
-        (["--run", "nowhere", "--hand", "tripod3", "--preset", "23d"], "out --hand and --preset"),
-    ],
-)
-def test_evaluate_refuses_wrong_input(arguments, part, workplace, capsys):
-    assert command("evaluate", *arguments) == 2
-    assert part in capsys.readouterr().err
-    assert list(workplace.iterdir()) == []

@@ -149,13 +149,9 @@ def pulled_by_mujoco(scene, hand, trials, along):
     return np.inf
 
 
-def test_what_cannot_be_pulled_is_said(capsys):
-    assert push.in_words(np.nan).startswith("not held") and "more than 50 N" in push.in_words(
-        np.inf
-    )
-    for text in ("up", "1,2", "0,0,0", "1,nan,0"):
-        assert cli.main(["evaluate", "--scene", str(TINY), "--pull", text]) == 2
-        assert f"--pull {text} must be down, x, y, z" in capsys.readouterr().err
+def test_what_cannot_be_pulled_is_said():
+    assert push.in_words(np.nan).startswith("not held")
+    assert "more than 50 N" in push.in_words(np.inf)
 
 
 @pytest.mark.slow  # a kernel; quick: what is recorded, and that wrong pulls are refused

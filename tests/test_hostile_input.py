@@ -2,7 +2,6 @@
 
 import base64
 import json
-import os
 import zipfile
 
 import hypothesis
@@ -153,23 +152,6 @@ def test_a_run_has_the_bytes_that_were_read(tmp_path):
     (tmp_path / "run").mkdir()
     scene_files.write_scene(loaded, tmp_path / "run")
     assert scene.load(tmp_path / "run" / "scene.toml") == loaded
-
-
-# --- command lines -------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["evaluate", "--run", "a" * 300],
-        ["evaluate", "--hand", "a" * 300 + ".toml"],
-        ["optimize", "--dry-run", "--out", "a\udcffb"],
-        ["optimize", "--dry-run", "--set", "hand.name=/elsewhere/x"],
-    ],
-)
-def test_arguments_that_are_refused(arguments, workplace, capsys):
-    assert command(*arguments) == 2
-    assert capsys.readouterr().err.startswith("error: ") and not os.listdir(workplace)
 
 
 # --- a few of what `make faults` tries in thousands ----------------------------------------------

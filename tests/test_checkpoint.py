@@ -3,7 +3,6 @@
 import re
 import shutil
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +10,6 @@ import pytest
 from codesign_jax import store
 from codesign_jax.runs.checkpoint import Checkpoints, digest
 from scripts import faults
-
-PACKAGE = Path(__file__).parent.parent / "codesign_jax"
 
 
 def arrays(step):

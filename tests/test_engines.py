@@ -96,26 +96,6 @@ def mujoco_traces(hurried, tmp_path_factory):
 slow = pytest.mark.slow
 
 
-@slow
-def test_traces_of_both_engines_mean_the_same(hurried, mjx_traces, mujoco_traces):
-    """Entry k describes the state before step k; up to first touch float32 follows float64."""
-    the_scene, (fields, _), _ = hurried
-    (ours, _), (theirs, _) = mjx_traces, mujoco_traces
-    steps = the_scene.num_steps
-    for trace in (ours, theirs):
-        assert trace.distance.shape == trace.height.shape == trace.speed.shape == (6, steps)
-        assert trace.qpos.shape == (6, steps, fields.start.shape[1])
-        np.testing.assert_allclose(trace.qpos[:, 0], fields.start, rtol=1e-6)
-        np.testing.assert_allclose(trace.height[:, 0], fields.start[:, -5], rtol=1e-6)
-        np.testing.assert_array_equal(trace.speed[:, 0], 0.0)
-        np.testing.assert_allclose(trace.height, trace.qpos[..., -5], atol=1e-6)
-    free = slice(0, 40)  # the hand is still above the object
-    # Positions of up to 0.3 m and speeds of up to 1 m/s in float32, over 40 steps.
-    np.testing.assert_allclose(ours.qpos[:, free], theirs.qpos[:, free], atol=1e-5)
-    np.testing.assert_allclose(ours.distance[:, free], theirs.distance[:, free], atol=1e-5)
-    np.testing.assert_allclose(ours.speed[:, free], theirs.speed[:, free], atol=1e-3)
-
-
 def test_distance_is_from_the_mean_of_the_links(hurried, mujoco_traces):
     """Hand centre by hand: the mean over segments of their centres, at the start pose."""
     the_scene, (fields, _), _ = hurried

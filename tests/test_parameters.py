@@ -123,15 +123,6 @@ def test_the_2d_preset_ties_lengths_and_fixes_the_rest():
     np.testing.assert_allclose(params.pressure, 120e3, rtol=1e-6)
 
 
-def test_the_subset_agrees_with_the_full_table():
-    """A 2D design expands to the full vector that gives the same hand in the whole table."""
-    design = jnp.asarray([0.1, 0.02])
-    one = PLANAR.params(design)
-    other = FULL.params(PLANAR.expand(design))
-    for a, b in zip(one, other, strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 designs = st.lists(st.floats(0, 1, width=32, allow_subnormal=False), min_size=23, max_size=23).map(
     lambda u: np.array(FULL.low) + np.array(u) * (np.array(FULL.high) - np.array(FULL.low))
 )

@@ -38,13 +38,6 @@ def quadratic(population):
     return 3 * jnp.mean(((population - TARGET) / (HIGH - LOW)) ** 2, axis=-1)
 
 
-def assert_same_bits(one, other):
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
-            a, b = jax.random.key_data(a), jax.random.key_data(b)
-        np.testing.assert_array_equal(a, b)
-
-
 # --- reflection and limits -----------------------------------------------------------------------
 
 # Processors may treat subnormal numbers as zero, so they are no test of a bound.

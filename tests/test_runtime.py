@@ -209,11 +209,6 @@ def old_llvmlite(monkeypatch):
     monkeypatch.setattr(importlib.metadata, "version", lambda name: "0.44.1")
 
 
-def no_header(monkeypatch):
-    ffi.installed_version.cache_clear()
-    monkeypatch.setattr(ffi, "header", lambda: Path("nowhere"))
-
-
 def old_gpu(monkeypatch):
     gpus(monkeypatch, "7.5")
 
@@ -232,7 +227,6 @@ def old_driver(monkeypatch):
     ("platform", "cause", "reason"),
     [
         ("cpu", old_llvmlite, "llvmlite 0.44.1 is older than 0.45"),
-        ("cpu", no_header, "the header of XLA's foreign function interface"),
         ("gpu", old_gpu, "NVIDIA T4 has compute capability 7.5, kernels need 8.0"),
         ("gpu", old_driver, "supports CUDA 11.8; kernels need 12.0"),
         ("tpu", lambda monkeypatch: None, "not for 'tpu'"),

@@ -39,12 +39,11 @@ def pytest_configure(config):
 # Files of more than five seconds, the longest first: what is left for the end is short, so that no
 # worker waits for the other.
 LONG = """
-test_policy test_forces test_docs test_own test_steps test_reverse test_compose test_air
+test_policy test_forces test_docs test_own test_engines test_steps test_reverse test_air
 test_resume test_batch test_library test_effects test_containment test_model test_rings
 test_optimizers test_particle_filter test_preflight test_kernel test_planted_contacts test_rollout
-test_constants test_run_reading test_sample test_many_runs test_codesign test_mesh_grasps
-test_export test_primitives test_showing test_report test_stress test_lateral_threshold
-test_engines
+test_constants test_run_reading test_sample test_codesign test_export test_primitives test_showing
+test_report test_stress
 """.split()
 
 

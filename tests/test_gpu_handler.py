@@ -23,12 +23,7 @@ LAYOUT = Layout(
 
 
 class FakeDriver:
-    """The driver's functions, which note their calls and return what they are told to.
-
-    Attributes:
-      calls: Name and arguments of every call.
-      results: Result of functions that fail, by name.
-    """
+    """The driver's functions, which note their calls and return `results` by their names."""
 
     def __init__(self, **results):
         """Starts."""

@@ -230,14 +230,9 @@ STATES = {
 
 
 class Worlds(NamedTuple):
-    """What the kernel made of the faults' worlds and of those that are sound.
+    """What the kernel made of the faults' worlds and, behind them, of sound ones of `STATES`.
 
-    Attributes:
-      faults: The faults by name; a sound world of each of `STATES` follows.
-      found: The kernel's trace with its states.
-      solve: Accelerations of the oracle, of qpos and qvel.
-      start: The same of the state in which the worlds start, see `solved`.
-      timestep: Of the scene [s].
+    `solve` is the oracle's of qpos and qvel, `start` what it has of the state in which all start.
     """
 
     faults: dict[str, Fault]

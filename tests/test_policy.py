@@ -131,7 +131,7 @@ def test_what_is_observed_is_where_mujoco_has_it(worlds):
     np.testing.assert_allclose(seen.phase_time, 0.25 - scene.phases.approach, rtol=1e-5)
 
 
-@pytest.mark.slow  # quick: the open loop's (test_compose), and that both have the same bits
+@pytest.mark.slow  # quick: the open loop's (test_engines), and that both have the same bits
 def test_the_derivative_of_a_closed_loop_is_that_of_differences():
     """By a gain that its policy remembers, and acts on what it observes with."""
     scene = grasps.short_grasp()
@@ -193,7 +193,7 @@ def test_pressures_stay_within_what_the_walls_stand_and_what_is_no_number_fails_
     np.testing.assert_allclose(found, np.broadcast_to(want, found.shape), rtol=1e-6)
 
 
-@pytest.mark.slow  # quick: test_docs takes the policy, test_env steps an environment
+@pytest.mark.slow  # quick: test_docs takes the policy, tests below step an environment
 def test_the_page_s_policy_and_environment_do_what_they_say(monkeypatch):
     """Pressures rise where the object slips in the hand, and nowhere else."""
     scene = grasps.short_grasp()

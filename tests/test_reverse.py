@@ -73,14 +73,10 @@ DEEP = 1e6
 
 
 class Fault(NamedTuple):
-    """What is wrong in the reverse pass of a world.
+    """What is wrong in the reverse pass of a world: functions of the right cotangents or results.
 
-    Attributes:
-      seeds: Wrong cotangents of a stage's results by its name, a function of the right ones.
-      results: Wrong cotangents of a stage's arguments, likewise.
-      methods: Wrong results of methods by class and name, functions of the right result and of
-        the method's arguments.
-      names: Of what no cotangent is kept.
+    By a stage's name of its results (`seeds`) and arguments (`results`), by class and name of
+    `methods`; and `names` of what no cotangent is kept.
     """
 
     seeds: dict = {}
@@ -242,15 +238,8 @@ def planted(faults):
 
 
 class Checked(NamedTuple):
-    """What the tests look at: derivatives along the groups' directions.
-
-    Attributes:
-      names: Of the groups.
-      difference: Central differences.
-      sound: Of a sound world for two weights, one plus twice the other, and zero, (4, group).
-      wrong: Of the faults' worlds, (fault, group).
-      alone: All cotangents of a sound world, and those of the same world in other company.
-    """
+    """Derivatives along the groups' directions: central differences; of a sound world for two
+    weights, one plus twice the other, and zero; of the faults' worlds; of a world in company."""
 
     names: list
     difference: np.ndarray

@@ -253,12 +253,7 @@ def test_a_ring_pushes_as_a_skin(name):
 
 
 def compared(name):
-    """The law over the reference.
-
-    Returns:
-      Forces over the reference's, shape (place, depth), the angle between both [rad] and how far
-      apart they act [m], and the force [N], all of shape (place, depth).
-    """
+    """Forces over the reference's, angles [rad], ways [m] between, forces [N]: (place, depth)."""
     case = FIELDS.get(name) or FINGERS[name]
     grid = [(p, d) for p in (np.arange(PLACES) + 0.5) / PLACES for d in DEPTHS]
     pairs = [case(p, d) for p, d in grid]

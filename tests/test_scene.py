@@ -242,7 +242,7 @@ def of_primitives(object_set):
     return not any(shape.mesh for shape in objects.load(object_set).object)
 
 
-# Sets with meshes are stepped in test_mesh_grasps.py: stock MuJoCo does not take them.
+# Sets with meshes are stepped in test_meshes.py: stock MuJoCo does not take them.
 STEPPED = [o for o in OBJECTS if of_primitives(o)]
 
 

@@ -50,13 +50,9 @@ def finger_scene(
 
 
 def elastica(load: float) -> tuple[float, float]:
-    """Tip of a cantilever under a dead transverse load (Bisshopp and Drucker 1945).
+    """How far a cantilever's tip moves down and back over L, by a dead load alpha = P L^2 / E I.
 
-    Args:
-      load: alpha = P L^2 / E I.
-
-    Returns:
-      Transverse deflection and axial shortening, both over L.
+    Bisshopp and Drucker (1945).
     """
 
     def phi(k: float) -> float:
@@ -72,17 +68,7 @@ def elastica(load: float) -> tuple[float, float]:
 
 
 class Finger:
-    """MuJoCo's chain of one finger; loads act at the tip's bottom layer.
-
-    Attributes:
-      scene: The scene.
-      layout: Where things are in the model.
-      model: MuJoCo's model.
-      data: Its state.
-      length: Length of the finger [m].
-      links: Number of segments.
-      beam: Its properties as a beam.
-    """
+    """MuJoCo's chain of one finger; loads act at the tip's bottom layer."""
 
     def __init__(
         self, links: int, length: float = 0.1, height: float = 0.02, wall: float = 0.005, **options
@@ -122,18 +108,7 @@ class Finger:
         steps: int = 3000,
         rest: float = 1e-10,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The tip, see `tip`, under a load of fixed direction, once even rounding has died away.
-
-        Args:
-          force: Force on the tip in the palm's frame [N], shape (3,).
-          torque: Moment on it [N m], shape (3,).
-          pressure: Pressure [Pa].
-          steps: Time steps after which it must be at rest.
-          rest: Largest speed at rest [rad/s or m/s].
-
-        Raises:
-          RuntimeError: If it is not at rest.
-        """
+        """The tip under a load of fixed direction in the palm's frame, at rest to rounding."""
         m, d, last = self.model, self.data, self.layout.bodies[0, -1]
         d.ctrl[6] = pressure
         mujoco.mj_kinematics(m, d)

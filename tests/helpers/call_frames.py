@@ -15,22 +15,11 @@ STREAM = 0x57EA
 class Xla:
     """Functions that handlers call, which note what they were asked for.
 
-    Attributes:
-      errors: Code and message of every error that was made; error k is the pointer k + 1.
-      destroyed: Pointers to errors that were given back.
-      tasks: Functions that run the tasks that have not been run yet.
-      scheduled: Number of tasks that were asked for.
+    Error k is the pointer k + 1; `tasks` have not been run yet, `scheduled` were asked for.
     """
 
     def __init__(self, threads=1, pool="late", stream_error=0):
-        """Starts.
-
-        Args:
-          threads: Threads of the pool; 0 for no pool.
-          pool: Tasks run "at once", in "threads", or "late", when `run_late` is called; or the
-            second one and all further ones are "refused".
-          stream_error: What asking for the stream returns.
-        """
+        """No pool with 0 threads; its tasks run "at once", "late", in "threads", or never."""
         self.errors, self.destroyed, self.tasks, self.scheduled = [], [], [], 0
         self.threads, self.pool, self.stream_error = threads, pool, stream_error
         self.running = []
@@ -47,14 +36,7 @@ class Xla:
             setattr(self.api, name, ctypes.cast(function, c_void_p))
 
     def call(self, address, inputs, outputs, **changes):
-        """Calls a handler; returns its error's code and message, or None.
-
-        Args:
-          address: The handler.
-          inputs: NumPy arrays.
-          outputs: NumPy arrays, written.
-          **changes: Fields of `ffi.CallFrame`.
-        """
+        """Calls a handler on NumPy arrays; its error's code and message, or None."""
         frame, _keep = self.frame(inputs, outputs, **changes)
         pointer = FUNCTION(address)(ctypes.addressof(frame))
         return self.errors[pointer - 1] if pointer else None

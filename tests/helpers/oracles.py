@@ -55,17 +55,9 @@ def path(engine, fields, ctrl):
 def against_mujoco(scene, fields, ctrl, found, stride=1):
     """Errors of a path's steps against MuJoCo C, which converges at each of its states.
 
-    Args:
-      scene: The scene.
-      fields: Model fields of the worlds.
-      ctrl: Controls, shape (world, time, nu).
-      found: The path.
-      stride: Steps between states that are compared.
-
-    Returns:
-      Relative errors of the accelerations and errors of the distance [m], shape (world, state),
-      and numbers of contacts, alike.  The start is left out: there the object is so exactly on the
-      table that rounding decides whether it touches.
+    Relative ones of accelerations, of distances [m], and numbers of contacts, (world, state). The
+    start is left out: there the object is so exactly on the table that rounding decides whether
+    it touches.
     """
     h, lay = scene.discretization.timestep, model.layout(scene)
     errors, far, touching = [], [], []
@@ -98,18 +90,8 @@ def unbalanced(scene, fields, ctrl, found, stride):
     """Forces that a path's accelerations leave unbalanced: the gradient of a step's objective.
 
     Plain JAX over whole arrays: no Newton iteration, no elimination and no memory of the kernel,
-    whose functions of geometry and friction cone alone are shared.
-
-    Args:
-      scene: The scene.
-      fields: Model fields of the worlds.
-      ctrl: Controls, shape (world, time, nu).
-      found: The path.
-      stride: Steps between states that are checked.
-
-    Returns:
-      Largest forces on wrist, joints and object, each relative to the largest of all states if
-      nothing were accelerated, shape (3, state).
+    whose functions of geometry and friction cone alone are shared. The largest on wrist, joints and
+    object, each over the largest of all states if nothing were accelerated, shape (3, state).
     """
     times = slice(None, None, stride)
     states = [v[:, times] for v in (found.qpos, found.qvel, found.acc, ctrl)]

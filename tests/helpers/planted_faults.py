@@ -57,16 +57,11 @@ MODULES = (
 
 
 class Fault(NamedTuple):
-    """What is wrong in a world.
+    """What is wrong in a world, and the comparison that must notice.
 
-    Attributes:
-      stages: Wrong result by the qualified name of the stage, a function of the right stage and of
-        its arguments.
-      check: The comparison that must notice, such as "acceleration".
-      methods: Wrong methods by class and name, functions of the right method, of whether a lane is
-        one of the world, of the object, and of its arguments.
-      finger: Number of the finger on whose lanes the stages are wrong; None for all.
-      later: Whether the first step is sound, in which there is no state of a step before.
+    Stages by qualified name: functions of the right stage and of its arguments. Methods by class
+    and name: of the right method, the lanes of the world, the object, and its arguments. On the
+    lanes of a `finger` alone, and `later`: in the second step, where there is a state before.
     """
 
     stages: dict[str, Callable]
@@ -100,11 +95,7 @@ def cone_of(name, other):
 
 
 class Planted:
-    """Evaluates stages of the kernel, wrong in the worlds of the faults.
-
-    Attributes:
-      used: Names of the faults with the stages that the kernel has evaluated wrong.
-    """
+    """Evaluates stages of the kernel, wrong in the worlds of the faults; `used`: what it met."""
 
     def __init__(self, faults: Mapping[str, Fault]):
         """Takes the faults; a fault's world has its number."""
@@ -198,16 +189,7 @@ def planted(faults: Mapping[str, Fault]) -> Iterator[Planted]:
 
 
 def simulate(scene, fields, state, ctrl, number, iterations=30):
-    """The kernel's trace with the states of all steps; solved to rounding.
-
-    Args:
-      scene: The scene.
-      fields: Model fields of the worlds.
-      state: Their qpos and qvel.
-      ctrl: Controls, shape (world, time, nu).
-      number: Number of the fault of each world; one that no fault has for sound worlds.
-      iterations: Largest number of Newton iterations of a step.
-    """
+    """The kernel's trace with all states, solved to rounding; `number`: of each world's fault."""
     hand, engine = world_constants(scene, fields), StructuredEngine(scene)
     number = jnp.asarray(number, ctrl.dtype)[None]
     far = FAR + 0 * number

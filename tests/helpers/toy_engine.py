@@ -15,8 +15,7 @@ TINY = Path(__file__).parents[1] / "data" / "tiny.toml"
 class ToyEngine:
     """Loses the object at a time that grows with the fingers' length and the grasp's height.
 
-    Attributes:
-      traced: How often `rollout` was traced, that is how often a caller compiled.
+    `traced`: how often a caller compiled its rollout.
     """
 
     name = "toy"

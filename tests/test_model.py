@@ -46,7 +46,6 @@ def arrays(compiled):
 
 
 SCENES = {
-    "pneuflex4": lambda: scene.load("paper_spheres"),
     "tripod3, two spheres": lambda: scene.load(
         "paper_spheres",
         hand_name="tripod3",

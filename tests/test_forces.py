@@ -3,6 +3,7 @@
 import csv
 import functools
 import re
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -97,14 +98,14 @@ def test_what_records_no_forces_is_refused():
     scene = grasps.short_grasp()
     world = grasps.hand_world(scene)
     with pytest.raises(InputError, match="engine mujoco records no forces"):
-        rollout.grasp(scene, make_engine("mujoco", scene), *world, record_forces=True)
+        simulate = partial(rollout.grasp, scene, make_engine("mujoco", scene), record_forces=True)
+        jax.eval_shape(simulate, *world)
     engine = make_engine("structured", scene)
 
     def end(height):
         params = world[0]._replace(arm=world[0].arm + height)
-        return rollout.grasp(scene, engine, params, world[1], steps=3, record_forces=True).height[
-            -1
-        ]
+        found = rollout.grasp(scene, engine, params, world[1], steps=3, record_forces=True)
+        return found.height[-1]
 
     with pytest.raises(NotImplementedError, match="has no derivative"):
         jax.eval_shape(jax.grad(end), jnp.zeros(()))

@@ -144,7 +144,7 @@ def examples(name):
     return [test for test in found if test.examples]
 
 
-# They compile kernels of the default scene, 20 s; quick: test_policy and test_env, the same calls.
+# They compile kernels of the default scene, 20 s; quick: test_policy, the same calls.
 LONG = {"env", "policy"}
 
 

@@ -102,10 +102,13 @@ class Case:
 
     @staticmethod
     def _lanes(scene, engine, start):
-        fields = jax.tree.map(lambda v: jnp.asarray(v)[None], start.fields)
-        state = engine.reset(fields)
-        state = engine.place(state, engine.qpos(state), jnp.asarray(start.qvel)[None])
-        return grasps.lanes(scene, fields), state
+        @jax.jit
+        def placed(fields, qvel):
+            state = engine.reset(fields)
+            return engine.place(state, engine.qpos(state), qvel)
+
+        fields = grasps.repeat(start.fields, 1)
+        return grasps.lanes(scene, fields), placed(fields, start.qvel[None])
 
     def world(self, table, k=0):
         """A world's numbers of a table, (block, ..., lane or world) to (..., finger or 1)."""
@@ -172,10 +175,15 @@ class Case:
                     more = np.zeros_like(self.world(tables[0]))
                     more[support] = sign * step * growth * self.world(self.tables[0])[support]
                     self._move(tables[0], side, more)
-        found, last = self.program.outputs(self.execute(tables), count, states=True)
-        found = {name: np.asarray(v) for name, v in found.items()}
+
+        @jax.jit
+        def results(out):
+            found, last = self.program.outputs(out, count, states=True)
+            return found, coordinates.flat(last)
+
+        found, last = jax.tree.map(np.asarray, results(self.execute(tables)))
         entries = np.stack([found[n] for n in ("distance", "height", "speed")], 2)
-        value = np.asarray(coordinates.flat(last)) @ weights.last
+        value = last @ weights.last
         value = value + np.einsum("wte,te->w", entries, weights.entries)
         value = value + np.einsum("wtq,tq->w", found["qpos"], weights.qpos)
         sides = value[:-1].reshape(-1, 2)

@@ -62,7 +62,7 @@ WRONG = {
     "optimize --hand pneuflex5 --engine mujco --seed -1 --set gravity=1000 cost.failur=worst": (
         "pneuflex4|mujoco|--seed = -1|gravity = 1000|did you mean 'cost.failure'?"
     ),
-    "optimize --dry-run --set hand.name=/elsewhere/x": "hand.name",
+    "optimize --dry-run --set hand.name=/elsewhere/x": "is no name of a folder",
     "optimize --dry-run --out a\udcffb": "error: ",
     "evaluate --design lenght=100": "'lenght' is not a parameter; did you mean 'length'?",
     "evaluate --design length=0.148": "did you mean 148?",

@@ -11,13 +11,11 @@ import shutil
 import signal
 import socket
 
-import numpy as np
 import pytest
 
 from codesign_jax import runs
 from codesign_jax.batch import Batch
 from codesign_jax.commands import reference
-from codesign_jax.runs import choice
 from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.runs.choice import Case
 from tests.helpers.command_runs import (  # noqa: F401
@@ -152,23 +150,9 @@ def test_more_episodes_extend_a_run_bit_for_bit(finished, tmp_path, capsys):
     assert_same_run(grown, long)
 
 
-@pytest.mark.slow  # quick: every optimiser by the library (test_optimizers), a filter by commands
-def test_the_default_search_goes_on_and_a_run_keeps_its_optimiser(finished, tmp_path, capsys):
-    usual = without([*RUN], "--optimizer")
-    run = [*usual, "--particles", "8"]
-    long, grown = tmp_path / "long", tmp_path / "grown"
-    assert command(*run, "--episodes", "7", "--out", long) == 0
-    assert "seed" not in capsys.readouterr().out, "it looks for its start by itself"
-    for episodes in ("2", "7"):  # within the random designs, and after them
-        assert command(*run, "--episodes", episodes, "--out", grown) == 0
-    assert_same_run(grown, long)
-    assert runs.read_run(grown)[1].optimizer == "screened-es"
-    # The design that was found was simulated in an episode, whose grasp can be shown.
-    scene, record = runs.read_run(grown)[0], choice.read_record(grown)
-    chosen, grasp = choice.choose(scene, record), choice.find_grasp(scene, record)
-    np.testing.assert_array_equal(grasp.design, chosen.design)
+def test_a_run_keeps_its_optimiser(finished, tmp_path, capsys):
     copy = shutil.copytree(finished, tmp_path / "filter")
-    assert command(*usual, "--out", copy) == 0
+    assert command(*without([*RUN], "--optimizer"), "--out", copy) == 0
     assert f"all {EPISODES} episodes are done" in capsys.readouterr().out
     assert runs.read_run(copy)[1].optimizer == "particle-filter"
 

@@ -39,11 +39,12 @@ def pytest_configure(config):
 # Files of more than five seconds, the longest first: what is left for the end is short, so that no
 # worker waits for the other.
 LONG = """
-test_policy test_forces test_docs test_own test_engines test_steps test_reverse test_air
-test_resume test_batch test_library test_effects test_containment test_model test_rings
-test_optimizers test_particle_filter test_preflight test_kernel test_planted_contacts test_rollout
-test_constants test_run_reading test_sample test_codesign test_export test_primitives test_showing
-test_report test_stress
+test_policy test_engines test_forces test_planted_contacts test_resume test_reverse test_rings
+test_docs test_own test_batch test_run_reading test_containment test_library test_steps
+test_kernel test_optimizers test_constants test_compare test_meshes test_air test_rollout
+test_report test_export_parts test_showing test_lanes test_preflight test_sample test_effects
+test_stress test_export test_package test_particle_filter test_codesign test_model test_rigid
+test_primitives test_planted_faults test_studio
 """.split()
 
 

@@ -88,8 +88,8 @@ def stepped(grasp):
     @jax.jit
     def run(fields, qpos, qvel, ctrl):
         start = engine.place(engine.reset(fields), qpos, qvel)
-        new, info = engine.step(world_constants(scene, fields), start, ctrl.T)
-        return engine.qvel(new), info.residual
+        found, new = engine.advance(world_constants(scene, fields), start, ctrl[:, None])
+        return engine.qvel(new), found["residual"].T
 
     return run
 

@@ -45,7 +45,7 @@ LOAD = "BoundPairs.load.<locals>.wrench"
 LINK, ADD = "Elimination.backward.<locals>.load", "_add"
 NEXT = "next acceleration"
 """A check of the second step, of a fault in what the first one leaves."""
-TIMES, AGAIN, PALM_AGAIN = "_times", "_again", "Coupling._palm.<locals>.solve"
+TIMES, AGAIN, PALM_AGAIN = "_times", "_again", "solve_palm_again"
 
 
 def place(stage, **wrong):

@@ -14,13 +14,12 @@ import numpy as np
 from codesign_jax import model
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import assembly, coordinates
-from codesign_jax.engines.structured.lanes import dot, once, sum_axis, sum_fingers
-from codesign_jax.engines.structured.laws.contact import Contacts, constraint_update
-from codesign_jax.engines.structured.laws.kinematics import Acc
-from codesign_jax.engines.structured.linear.tree import (
-    Forces,
-    Problem,
+from codesign_jax.engines.structured.lanes import dot
+from codesign_jax.engines.structured.laws.contact import constraint_update
+from codesign_jax.engines.structured.laws.kinematics import (
+    Acc,
     Spatial,
+    kinematics,
     propagate,
     relative,
 )
@@ -89,82 +88,58 @@ def soften(scene, fields, data):
 def unbalanced(scene, fields, ctrl, found, stride):
     """Forces that a path's accelerations leave unbalanced: the gradient of a step's objective.
 
-    Plain JAX over whole arrays: no Newton iteration, no elimination and no memory of the kernel,
-    whose functions of geometry and friction cone alone are shared. The largest on wrist, joints and
-    object, each over the largest of all states if nothing were accelerated, shape (3, state).
+    Mass matrix and smooth forces are MuJoCo C's.  Forces of contacts are found over whole arrays,
+    by the functions of geometry and friction cone that the kernel calls.  The largest on wrist,
+    which is compliant, joints and object, each over the largest of all states if nothing were
+    accelerated, shape (3, state).
     """
-    times = slice(None, None, stride)
-    states = [v[:, times] for v in (found.qpos, found.qvel, found.acc, ctrl)]
-    count = states[0].shape[1]
-    qpos, qvel, acc, u = (jnp.asarray(v.reshape(-1, v.shape[-1])) for v in states)
+    end, count = 6 + model.layout(scene).dofs.size, -(-ctrl.shape[1] // stride)
+    states = [v[:, ::stride] for v in (found.qpos, found.qvel, found.acc, ctrl)]
+    qpos, qvel, acc, u = (np.asarray(v).reshape(-1, v.shape[-1]) for v in states)
     many = jax.tree.map(lambda v: np.repeat(np.asarray(v), count, 0), fields)
 
     @jax.jit
-    def force(many, qpos, qvel, acc, u):
-        state = coordinates.make(scene, qpos, qvel, acc)
-        given = assembly.problem(scene, world_constants(scene, many), state, u.T)
+    def pushes(many, qpos, qvel, acc):
+        state, hand = coordinates.make(scene, qpos, qvel, acc), world_constants(scene, many)
+        kin = kinematics(hand, model.layout(scene).axes, state)
+        velocity = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
+        contacts = assembly.contacts(scene, hand, kin, state.position, velocity)
 
         def power(virtual: Acc, acc: Acc):
-            return residual_power(*given, acc, virtual).sum()
+            motion, along = propagate(kin, acc), propagate(kin, virtual)
+            each = [0.0 * along.object.sum()]
+            for name, c in contacts.items():
+                speed = c.relative(relative(name, velocity))
+                jar = c.relative(relative(name, motion)) - c.reference(speed)
+                force = constraint_update(c, jar).force
+                each.append(dot(force, c.relative(relative(name, along))).sum())
+            return sum(each)
 
         none = jax.tree.map(jnp.zeros_like, state.acc)
         # Power is linear in the virtual accelerations: its slope is the force itself.
-        return [jax.grad(power)(none, a) for a in (state.acc, none)]
+        return [coordinates.flat_acc(jax.grad(power)(none, a)) for a in (state.acc, none)]
 
-    left, all_of_it = force.lower(many, qpos, qvel, acc, u).compile(
-        {"xla_backend_optimization_level": 0}
-    )(many, qpos, qvel, acc, u)
-    worst = [[np.abs(v).reshape(-1, len(qpos)).max(0) for v in f] for f in (left, all_of_it)]
+    compiled = pushes.lower(many, qpos, qvel, acc).compile({"xla_backend_optimization_level": 0})
+    pushed, at_rest = (np.asarray(v) for v in compiled(many, qpos, qvel, acc))
+    left = np.empty((2, *pushed.shape))
+    for k in range(len(qpos)):
+        if k % count == 0:
+            own = grasps.nth(fields, k // count)
+            oracle = world_model(scene, own)
+            data, mass = mujoco.MjData(oracle), np.zeros((oracle.nv, oracle.nv))
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[k], qvel[k], u[k]
+        soften(scene, own, data)
+        mujoco.mj_forward(oracle, data)
+        mujoco.mj_fullM(oracle, data, mass)
+        # MuJoCo's object moves by (linear, angular in its own axes), ours by (angular, linear).
+        turn = np.eye(oracle.nv)
+        turn[end:, end:] = 0.0
+        turn[end : end + 3, end + 3 :] = np.eye(3)
+        turn[end + 3 :, end : end + 3] = data.body("object").xmat.reshape(3, 3).T
+        smooth = turn.T @ data.qfrc_smooth
+        left[0, k] = turn.T @ mass @ turn @ acc[k] - smooth - pushed[k]
+        left[1, k] = -smooth - at_rest[k]
+    parts = slice(0, 6), slice(6, end), slice(end, None)
+    worst = np.array([[np.abs(v[:, part]).max(1) for part in parts] for v in left])
     # At rest nothing is accelerated, and what is left is rounding of forces that cancel.
-    return np.array(worst[0]) / np.max(worst[1], axis=1, keepdims=True)
-
-
-def residual_power(problem: Problem, velocity: Spatial, acc: Acc, virtual: Acc) -> jax.Array:
-    """Power lambda' F of the unbalanced forces at acc along virtual, shape (1, world)."""
-    if problem.palm_acc is not None:  # data of the step, not a solution
-        acc = acc._replace(wrist=problem.palm_acc)
-    motion = propagate(problem.kin, acc)
-    along = propagate(problem.kin, virtual)
-    inertial = inertial_forces(problem, acc, motion)
-    force = Forces(*(m - s for m, s in zip(inertial, problem.smooth, strict=True)))
-    power = inner(force, virtual, along)
-    for name, c in problem.contacts.items():
-
-        def pushed(c: Contacts, motion: Spatial, velocity: Spatial, along: Spatial, name=name):
-            force = constraint_update(c, _jar(name, c, motion, velocity)).force
-            each = dot(force, c.relative(relative(name, along)))
-            return each.reshape(-1, each.shape[-1]).sum(0, keepdims=True)
-
-        power = power - once(pushed, c, motion, velocity, along)
-    return power
-
-
-def _jar(name: str, c: Contacts, motion: Spatial, velocity: Spatial) -> jax.Array:
-    """J a - aref of a set of contacts."""
-    speed = c.relative(relative(name, velocity))
-    return c.relative(relative(name, motion)) - c.reference(speed)
-
-
-def inertial_forces(problem: Problem, acc: Acc, motion: Spatial) -> Forces:
-    """M a in factored form: spatial forces of the bodies and armature forces of the joints."""
-    body, hand = problem.body, problem.hand
-    moves = problem.palm_acc is None
-    return Forces(
-        body.palm.times(motion.palm),
-        once(lambda b, m: b.times(m), body.link, motion.link),
-        body.object.times(motion.object),
-        hand.wrist_armature * acc.wrist if moves else jnp.zeros_like(acc.wrist),
-        hand.armature * acc.finger,
-    )
-
-
-def inner(force: Forces, acc: Acc, motion: Spatial) -> jax.Array:
-    """Product of forces and accelerations over all bodies and joints, shape (1, world)."""
-
-    def product(force: Forces, acc: Acc, motion: Spatial) -> jax.Array:
-        links = sum_axis(dot(force.link, motion.link), 0)
-        joints = sum_axis(sum_axis(force.finger * acc.finger, 0), 0)
-        rest = dot(force.palm, motion.palm) + dot(force.object, motion.object)
-        return sum_fingers(links + joints) + rest + dot(force.wrist, acc.wrist)
-
-    return once(product, force, acc, motion)
+    return worst[0] / worst[1].max(1, keepdims=True)

@@ -1,7 +1,6 @@
-"""A step's problem over arrays of all worlds: where bodies are, what pushes them, what touches.
+"""What touches in a state, over arrays of all worlds, for what simulates nothing.
 
-The kernel puts a step together link by link; here the same functions are called on whole arrays,
-for what looks at a state and simulates nothing.
+The kernel finds contacts link by link; here the same functions are called on whole arrays.
 """
 
 from collections.abc import Callable
@@ -19,36 +18,14 @@ from codesign_jax.engines.structured.lanes import dot, once
 from codesign_jax.engines.structured.laws import holding, rings, shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
 from codesign_jax.engines.structured.laws.contact import Cone, Contacts, candidates
-from codesign_jax.engines.structured.laws.inertia import bodies, joint_springs, smooth_forces
-from codesign_jax.engines.structured.laws.integration import rigid_arm
-from codesign_jax.engines.structured.laws.kinematics import Kinematics, State, kinematics, mounted
+from codesign_jax.engines.structured.laws.kinematics import Kinematics, Spatial, mounted, relative
 from codesign_jax.engines.structured.laws.rings import Place, Ring
-from codesign_jax.engines.structured.linear.tree import Matrices, Problem, Spatial, relative
 from codesign_jax.engines.structured.world_model import WorldModel, apply_columns
-from codesign_jax.model import layout
 from codesign_jax.model.layout import first_on_palm, palm_touches, touches_itself
 from codesign_jax.scene import Scene
 
 FAR = 1.0
 """Squared distance at which nothing touches [m^2]."""
-
-
-def problem(
-    scene: Scene, hand: WorldModel, state: State, ctrl: jax.Array
-) -> tuple[Problem, Spatial]:
-    """Assembles a step's problem and the bodies' velocities; ctrl has shape (nu, world)."""
-    kin = kinematics(hand, layout(scene).axes, state)
-    body = bodies(hand, kin)
-    smooth = smooth_forces(hand, kin, body, state, ctrl, scene)
-    matrix = Matrices(*(once(lambda b: b.matrix(), b) for b in body))
-    velocity = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
-    found = contacts(scene, hand, kin, state.position, velocity)
-    h, palm_acc = scene.discretization.timestep, None
-    if not scene.effects.wrist:
-        palm_acc = rigid_arm(ctrl[:6, None], state.wrist, state.wrist_vel, h)
-    springs = joint_springs(scene, hand, state, ctrl[6:])
-    hand = hand._replace(armature=springs.armature)
-    return Problem(hand, kin, body, matrix, smooth, found, palm_acc), velocity
 
 
 def contacts(

@@ -1,6 +1,6 @@
 """Step and rollout of the structured engine behind the common interface."""
 
-from typing import NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from codesign_jax.engines.structured.kernel import Limits, Program, lanes_here
 from codesign_jax.engines.structured.kernel.adjoint import Path, recorded
 from codesign_jax.engines.structured.kernel.memory import lengthened
 from codesign_jax.engines.structured.laws import meshes
-from codesign_jax.engines.structured.laws.kinematics import Acc, State
+from codesign_jax.engines.structured.laws.kinematics import State
 from codesign_jax.engines.structured.world_model import WorldModel, world_constants
 from codesign_jax.model import ModelFields
 from codesign_jax.scene import Scene, effects, reach
@@ -27,23 +27,6 @@ FAR = 1e30
 
 PIECE = 1024
 """Worlds of a piece in which `StructuredEngine` computes the tables of teams."""
-
-
-class StepInfo(NamedTuple):
-    """What a step reports but does not carry.
-
-    Attributes:
-      acc: Accelerations of the step.
-      residual: Relative Newton decrement of each world, shape (1, world).
-      iterations: Newton iterations of each world's block, shape (1, world).
-      overflow: Whether more contacts of the hull or between fingers touch than there are slots,
-        shape (1, world); None without such contacts.
-    """
-
-    acc: Acc
-    residual: jax.Array
-    iterations: jax.Array
-    overflow: jax.Array | None = None
 
 
 class StructuredEngine(Equal):
@@ -124,15 +107,6 @@ class StructuredEngine(Equal):
         """MuJoCo's qvel, shape (world, nv)."""
         return coordinates.qvel(state)
 
-    def step(self, hand: WorldModel, state: State, ctrl: jax.Array) -> tuple[State, StepInfo]:
-        """Advances a batch by one time step under controls of shape (nu, world).
-
-        No verdict ends a world here, see `Step.advance`.
-        """
-        found, new = self.advance(hand, state, ctrl.T[:, None])
-        overflow = found["overflow"].T > 0 if "overflow" in found else None
-        return new, StepInfo(new.acc, found["residual"].T, found["iterations"].T, overflow)
-
     def advance(
         self, hand: WorldModel, state: State, ctrl: jax.Array
     ) -> tuple[dict[str, jax.Array], State]:
@@ -149,7 +123,10 @@ class StructuredEngine(Equal):
         far = jnp.full_like(hand.bounds.speed, FAR)
         hand = hand._replace(bounds=hand.bounds._replace(speed=far, penetration=far))
         program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl))
-        return self._run(program, hand, state, ctrl, trajectory=True, states=True)
+        how = {"trajectory": True, "states": True}
+        return program.outputs(
+            _execute(program, program.inputs(hand, state, ctrl), **how), len(ctrl), **how
+        )
 
     def rollout(
         self,
@@ -195,10 +172,7 @@ class StructuredEngine(Equal):
         """
         program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl))
         inputs = self._inputs(program, fields, ctrl, tables)
-        try:
-            out = program.execute(inputs, trajectory=trajectory)
-        except KernelUnavailable as error:
-            raise _unavailable(str(error)) from error
+        out = _execute(program, inputs, trajectory=trajectory)
         return self._trace(*program.outputs(out, len(ctrl), trajectory=trajectory), trajectory)
 
     def recording(self) -> Recording:
@@ -215,10 +189,7 @@ class StructuredEngine(Equal):
         """
         program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl))
         how = {"trajectory": trajectory, "states": True}
-        try:
-            out = program.execute(self._inputs(program, fields, ctrl), **how)
-        except KernelUnavailable as error:
-            raise _unavailable(str(error)) from error
+        out = _execute(program, self._inputs(program, fields, ctrl), **how)
         found, end = program.outputs(out, len(ctrl), **how)
         return self._trace(found, end, trajectory), found
 
@@ -262,10 +233,7 @@ class StructuredEngine(Equal):
         # A lane a finger, as the reverse pass has it, which simulates segments again.
         program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl), team=1)
         inputs = program.inputs(world_constants(self.scene, fields), self.reset(fields), ctrl)
-        try:
-            out = program.execute(inputs, trajectory=trajectory, states=self.segment or 1)
-        except KernelUnavailable as error:
-            raise _unavailable(str(error)) from error
+        out = _execute(program, inputs, trajectory=trajectory, states=self.segment or 1)
         found, end = program.outputs(out, len(ctrl), trajectory=trajectory)
         taken = program.by_block(found["moved"].sum(1)[:, None, None, None])
         path = jax.tree.map(lambda x: program.by_world(x, len(ctrl)), recorded(out, taken))
@@ -296,11 +264,8 @@ class StructuredEngine(Equal):
 
         # The last axis of the first table, in and out, are the fingers of a block.
         def launch(blocks: tuple, common: tuple) -> tuple:
-            try:
-                here, inputs = program(blocks[0].shape[-1] * team), (*blocks, *common)
-                return tuple(here.execute(inputs, trajectory=trajectory))
-            except KernelUnavailable as error:
-                raise _unavailable(str(error)) from error
+            here = program(blocks[0].shape[-1] * team)
+            return tuple(_execute(here, (*blocks, *common), trajectory=trajectory))
 
         def unpack(out: tuple, worlds: int) -> Trace:
             here = program(out[0].shape[-1] * team)
@@ -321,13 +286,6 @@ class StructuredEngine(Equal):
             *series, qpos, self._status(found), coordinates.whole(end), residual=jnp.sqrt(left)
         )
 
-    @staticmethod
-    def _run(program: Program, *args, **record) -> tuple[dict[str, jax.Array], State]:
-        try:
-            return program.simulate(*args, **record)
-        except KernelUnavailable as error:
-            raise _unavailable(str(error)) from error
-
     def _status(self, found: dict[str, jax.Array]) -> jax.Array:
         """SOLVER_CAP above the tolerance, CONTACT_OVERFLOW; int32 of shape (world, time)."""
         above = found["residual"] > self.limits.tolerance
@@ -335,6 +293,14 @@ class StructuredEngine(Equal):
         if "overflow" not in found:
             return status
         return status | jnp.where(found["overflow"] > 0, int(Status.CONTACT_OVERFLOW), 0)
+
+
+def _execute(program: Program, inputs: tuple, **how: Any) -> list[jax.Array | None]:
+    """`Program.execute`, whose error names the engines that run on a device without kernels."""
+    try:
+        return program.execute(inputs, **how)
+    except KernelUnavailable as error:
+        raise _unavailable(str(error)) from error
 
 
 def _unavailable(reason: str) -> KernelUnavailable:

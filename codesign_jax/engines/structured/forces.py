@@ -16,8 +16,14 @@ from codesign_jax.engines.structured.assembly import HandContacts
 from codesign_jax.engines.structured.kernel.memory import lengthened
 from codesign_jax.engines.structured.lanes import dot, once
 from codesign_jax.engines.structured.laws.contact import Contacts, constraint_update
-from codesign_jax.engines.structured.laws.kinematics import Acc, State, kinematics
-from codesign_jax.engines.structured.linear.tree import Spatial, propagate, relative
+from codesign_jax.engines.structured.laws.kinematics import (
+    Acc,
+    Spatial,
+    State,
+    kinematics,
+    propagate,
+    relative,
+)
 from codesign_jax.engines.structured.world_model import WorldModel, world_constants
 from codesign_jax.model import ModelFields, layout
 from codesign_jax.scene import Scene

@@ -21,47 +21,34 @@ def once(function: Callable, *args: Any) -> Any:
     return jax.lax.optimization_barrier(function(*args))
 
 
-def scan_links(
-    step: Callable, first: Any, links: Any, inner: Any = (), *, reverse: bool = False
-) -> tuple[Any, Any]:
+def scan_links(step: Callable, first: Any, links: Any) -> tuple[Any, Any]:
     """`jax.lax.scan` over links whose slices are rows to the compiler.
 
     XLA's CPU loops that slice an array of five axes at a dynamic index are not vectorised, those
     that slice one of two or three axes are: a copy of 34 kB takes 2 instead of 8 microseconds.
 
     Args:
-      step: From carry and (links, inner) at one link to carry and output.
+      step: From carry and the arrays of one link to carry and output.
       first: First carry.
       links: Arrays with leading axis (link,).
-      inner: Arrays of shape (..., link, finger, world); to move the axis would cost a copy.
-      reverse: Whether to start at the tip.
 
     Returns:
       Last carry and outputs with leading axis (link,).
     """
     leading, treedef = jax.tree.flatten(links)
-    middle, inner_def = jax.tree.flatten(inner)
     count, out_shapes = leading[0].shape[0], []
     rows = [x.reshape(count, -1) for x in leading]
-    planes = [x.reshape(-1, count, x.shape[-2] * x.shape[-1]) for x in middle]
 
     def body(carry: Any, i: jax.Array) -> tuple[Any, Any]:
         own = [
             jax.lax.dynamic_index_in_dim(x, i, 0, keepdims=False).reshape(like.shape[1:])
             for x, like in zip(rows, leading, strict=True)
         ]
-        others = [
-            jax.lax.dynamic_index_in_dim(x, i, 1, keepdims=False).reshape(
-                *like.shape[:-3], *like.shape[-2:]
-            )
-            for x, like in zip(planes, middle, strict=True)
-        ]
-        link = jax.tree.unflatten(treedef, own), jax.tree.unflatten(inner_def, others)
-        carry, out = step(carry, link)
+        carry, out = step(carry, jax.tree.unflatten(treedef, own))
         out_shapes[:] = [x.shape for x in jax.tree.leaves(out)]
         return carry, jax.tree.map(lambda x: x.reshape(-1), out)
 
-    last, flat = jax.lax.scan(body, first, jnp.arange(count), reverse=reverse)
+    last, flat = jax.lax.scan(body, first, jnp.arange(count))
     leaves, out_def = jax.tree.flatten(flat)
     whole = [x.reshape(count, *s) for x, s in zip(leaves, out_shapes, strict=True)]
     return last, jax.tree.unflatten(out_def, whole)

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import chambers, friction_memory, residual
+from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.cotangents import Bars, only_on, plus, pull
 from codesign_jax.engines.structured.kernel.coupling import Coupling
@@ -26,7 +27,6 @@ from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step import Step, moved, turned
 from codesign_jax.engines.structured.lanes import dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.linear import elimination as el
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram

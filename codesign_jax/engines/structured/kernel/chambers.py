@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
+from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.cotangents import pull
 from codesign_jax.engines.structured.kernel.memory import loop, upper
 from codesign_jax.engines.structured.lanes import contract, dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 from codesign_jax.engines.structured.laws.air import end_pressure
-from codesign_jax.engines.structured.linear import elimination as el
 
 if TYPE_CHECKING:
     from codesign_jax.engines.structured.kernel.adjoint_step import ReverseStep

@@ -19,13 +19,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.finger_contacts import BoundPairs, Pairing
 from codesign_jax.engines.structured.kernel.memory import anywhere, loop
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
 from codesign_jax.engines.structured.lanes import contract, dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.linear import elimination as el
 
 ITERATIONS = 60
 """Largest number of conjugate gradient steps; a longer one would be of rounding."""
@@ -233,21 +233,8 @@ class Coupling:
         return found
 
     def _palm(self, r: Lanes, ro: Lanes) -> Iterate:
-        def solve(done: Eliminated, axes, armature, r, ro):
-            if done.hinges is None or done.slides is None:
-                obj = el.solve_object(done.q, ro)
-                none = jnp.zeros_like(obj)
-                return Iterate(none, none, obj)
-            r, ro, hinges = el.eliminate_again(axes, done.hinges, r, ro)
-            slide_axes = el.wrist_slides(armature)
-            _, ro, slides = el.eliminate_again(slide_axes, done.slides, r, ro)
-            obj = el.solve_object(done.q, ro)
-            first, motion = el.substitute(slide_axes, slides, jnp.zeros_like(obj), obj)
-            second, motion = el.substitute(axes, hinges, motion, obj)
-            return Iterate(jnp.concatenate([first, second]), motion, obj)
-
         palm = self.problem.palm
-        return lanewise(solve, self.done, palm.axes, palm.armature, r, ro)
+        return lanewise(solve_palm_again, self.done, palm.axes, palm.armature, r, ro)
 
     def substitute(self, z: str, step: Iterate) -> None:
         """Leaves the links' motion with the sides, see `LineSearch.prepare`."""
@@ -265,6 +252,37 @@ class Coupling:
         parent = self.problem.widened(step.palm_motion)
         self.pairs.put("motion", parent, 0)
         loop(self.links, one, parent, self.block.size)
+
+
+def solve_palm_again(done: Eliminated, axes, armature, r, ro, twist=None, work=None) -> Any:
+    """Wrist, palm and object of another right side, see `elimination.eliminate_again`.
+
+    Args:
+      twist: Forces on the wrist's joints; None for none.
+      work: Product of the fingers' forces with their step, to which that of these is added and
+        which is then returned too; None if nobody asks for it.
+    """
+    kept: list[el.Factors] = []
+    if done.hinges is None or done.slides is None:
+        obj = el.solve_object(done.q, ro)
+        none = jnp.zeros_like(obj)
+        step = Iterate(none, none, obj)
+        return step if work is None else (step, work + dot(ro, obj))
+    slides = el.wrist_slides(armature)
+    for subspace, factors, joints in (
+        (axes, done.hinges, slice(3, 6)),
+        (slides, done.slides, slice(3)),
+    ):
+        tau = None if twist is None else twist[joints]
+        y = None if work is None else contract(subspace, r[None], 1) + tau
+        r, ro, new = el.eliminate_again(subspace, factors, r, ro, tau)
+        kept.append(new)
+        work = None if work is None else work + dot(y, new.z)
+    obj = el.solve_object(done.q, ro)
+    first, motion = el.substitute(slides, kept[1], jnp.zeros_like(obj), obj)
+    second, motion = el.substitute(axes, kept[0], motion, obj)
+    step = Iterate(jnp.concatenate([first, second]), motion, obj)
+    return step if work is None else (step, work + dot(ro, obj))
 
 
 def _again(carry, factors, push):

@@ -7,15 +7,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.coupling import Eliminated
 from codesign_jax.engines.structured.kernel.finger_contacts import BoundPairs
 from codesign_jax.engines.structured.kernel.memory import choose, either, full, loop, upper
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem, make_body
-from codesign_jax.engines.structured.lanes import contract, dot, total
+from codesign_jax.engines.structured.lanes import contract, dot, sum_fingers, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
-from codesign_jax.engines.structured.linear import elimination as el
-from codesign_jax.engines.structured.linear.tree import Forces, Matrices
 
 
 class Elimination:
@@ -150,7 +149,7 @@ class Elimination:
         rigid = self.problem.rigid
 
         def solve(now: Iterate, palm: Palm, node: el.Quadratic, pushes: dict) -> tuple:
-            node, force = with_palm(now, palm, node, pushes)
+            node, wrist = with_palm(now, palm, node, pushes)
             if rigid:
                 obj = el.solve_object(node.q, node.r_object)
                 none = jnp.zeros_like(obj)
@@ -160,7 +159,7 @@ class Elimination:
             axes = (palm.axes, el.wrist_slides(armature))
             kept = []
             for subspace, inertia, twist in zip(
-                axes, (armature[3:], armature[:3]), (force.wrist[3:], force.wrist[:3]), strict=True
+                axes, (armature[3:], armature[:3]), (wrist[3:], wrist[:3]), strict=True
             ):
                 y = contract(subspace, node.r[None], 1) + twist
                 node, new = el.eliminate(node, subspace, inertia, twist)
@@ -181,17 +180,27 @@ class Elimination:
 
 def with_palm(
     now: Iterate, palm: Palm, node: el.Quadratic, pushes: dict
-) -> tuple[el.Quadratic, Forces]:
-    """Adds palm and object, with the forces that an iterate leaves unbalanced, to the fingers."""
-    force = Forces(
-        palm.smooth_palm - palm.palm.times(now.palm_motion),
-        None,  # type: ignore[arg-type]
-        palm.smooth_object - palm.object.times(now.object_motion),
-        palm.smooth_wrist - palm.armature * now.wrist,
-        None,  # type: ignore[arg-type]
-    )
-    matrices = Matrices(palm.palm.matrix(), None, palm.object.matrix())  # type: ignore[arg-type]
-    return el.add_palm(node, matrices, force, pushes), force
+) -> tuple[el.Quadratic, Any]:
+    """Adds palm and object, and what acts on them, to the fingers.
+
+    Returns:
+      The objective, and the forces that an iterate leaves unbalanced on the wrist's joints.
+    """
+    push, pull, twist = palm.unbalanced(now)
+    own, obj = palm.palm.matrix(), palm.object.matrix()
+    p, c, q, r, ro = (sum_fingers(v) for v in node)
+    p, r, q, ro = p + own, r + push, q + obj, ro + pull
+    if "object_table" in pushes:
+        inertia, wrench = pushes["object_table"]
+        q, ro = q + inertia, ro + wrench
+    if "palm_table" in pushes:
+        inertia, wrench = pushes["palm_table"]
+        p, r = p + inertia, r + wrench
+    if "palm_object" in pushes:
+        inertia, wrench = pushes["palm_object"]
+        p, c, q = p + inertia, c + inertia, q + inertia
+        r, ro = r + wrench, ro - wrench
+    return el.Quadratic(p, c, q, r, ro), twist
 
 
 def _add(node: el.Quadratic, matrix, wrench, held: bool) -> el.Quadratic:

@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.memory import anywhere, loop, solid
 from codesign_jax.engines.structured.kernel.problem import (
@@ -17,7 +18,6 @@ from codesign_jax.engines.structured.kernel.problem import (
 from codesign_jax.engines.structured.kernel.slots import only
 from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.linear import elimination as el
 
 FAR = 3e38
 """No upper end of a bracket yet; finite, as a GPU kernel has no test for infinity."""
@@ -170,9 +170,7 @@ class LineSearch:
 
 def _rest(now: Iterate, step: Iterate, palm: Palm, slope, curvature):
     """Adds wrist, palm and object to the smooth part's slope and curvature."""
-    push = palm.smooth_palm - palm.palm.times(now.palm_motion)
-    pull = palm.smooth_object - palm.object.times(now.object_motion)
-    twist = palm.smooth_wrist - palm.armature * now.wrist
+    push, pull, twist = palm.unbalanced(now)
     slope = slope - dot(push, step.palm_motion) - dot(pull, step.object_motion)
     slope = slope - dot(twist, step.wrist)
     bent = dot(palm.palm.times(step.palm_motion), step.palm_motion)

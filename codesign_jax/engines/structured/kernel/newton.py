@@ -21,9 +21,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel import friction_memory
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
-from codesign_jax.engines.structured.kernel.coupling import Coupling, Eliminated
+from codesign_jax.engines.structured.kernel.coupling import (
+    Coupling,
+    Eliminated,
+    solve_palm_again,
+)
 from codesign_jax.engines.structured.kernel.linear_system import Elimination
 from codesign_jax.engines.structured.kernel.linesearch import FAR, LINE_TOLERANCE, LineSearch
 from codesign_jax.engines.structured.kernel.memory import (
@@ -42,7 +47,6 @@ from codesign_jax.engines.structured.kernel.team_solver import (
 )
 from codesign_jax.engines.structured.lanes import contract, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.linear import elimination as el
 
 LARGEST = 1e-3
 """Decrement of an iteration behind which the next one is likely to be below the tolerance."""
@@ -146,24 +150,8 @@ class Chord:
             r = r + wrench if name.startswith("palm") else r
             ro = ro - wrench if name == "palm_object" else ro
             ro = ro + wrench if name == "object_table" else ro
-        if done.hinges is None or done.slides is None:
-            obj = el.solve_object(done.q, ro)
-            none = jnp.zeros_like(obj)
-            return Iterate(none, none, obj), work + dot(ro, obj)
         twist = palm.smooth_wrist - palm.armature * now.wrist
-        slides, kept = el.wrist_slides(palm.armature), []
-        for axes, factors, tau in (
-            (palm.axes, done.hinges, twist[3:]),
-            (slides, done.slides, twist[:3]),
-        ):
-            y = contract(axes, r[None], 1) + tau
-            r, ro, new = el.eliminate_again(axes, factors, r, ro, tau)
-            kept.append(new)
-            work = work + dot(y, new.z)
-        obj = el.solve_object(done.q, ro)
-        first, motion = el.substitute(slides, kept[1], jnp.zeros_like(obj), obj)
-        second, motion = el.substitute(palm.axes, kept[0], motion, obj)
-        return Iterate(jnp.concatenate([first, second]), motion, obj), work + dot(ro, obj)
+        return solve_palm_again(done, palm.axes, palm.armature, r, ro, twist, work)
 
     def take(self, step: Iterate, alpha: Lanes, taken: jax.Array) -> None:
         """Makes "step_acc" what leads behind the chord's step with length 1, where it is taken.

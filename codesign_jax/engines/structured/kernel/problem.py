@@ -24,6 +24,12 @@ class Palm(NamedTuple):
     armature: Any
     axes: Any
 
+    def unbalanced(self, now: "Iterate") -> tuple[Any, Any, Any]:
+        """Forces that an iterate leaves on the palm, the object and the wrist's joints."""
+        push = self.smooth_palm - self.palm.times(now.palm_motion)
+        pull = self.smooth_object - self.object.times(now.object_motion)
+        return push, pull, self.smooth_wrist - self.armature * now.wrist
+
 
 class Iterate(NamedTuple):
     """Accelerations of the wrist, and motion of palm and object; lanes of a world."""

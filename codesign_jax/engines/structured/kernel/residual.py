@@ -23,7 +23,7 @@ from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.laws import contact, holding, shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
 from codesign_jax.engines.structured.laws.contact import Contacts
-from codesign_jax.engines.structured.linear.tree import next_motion, palm_motion
+from codesign_jax.engines.structured.laws.kinematics import next_motion, palm_motion
 from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.scene import Scene
 

@@ -23,8 +23,7 @@ from codesign_jax.engines.structured.laws import inertia
 from codesign_jax.engines.structured.laws import kinematics as kin
 from codesign_jax.engines.structured.laws.inertia import Body, Centred
 from codesign_jax.engines.structured.laws.integration import integrate, rigid_arm
-from codesign_jax.engines.structured.laws.kinematics import State
-from codesign_jax.engines.structured.linear.tree import next_motion, palm_motion
+from codesign_jax.engines.structured.laws.kinematics import State, next_motion, palm_motion
 from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model.layout import joint_axes
 from codesign_jax.scene import Scene

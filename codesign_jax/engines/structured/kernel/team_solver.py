@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.coupling import Coupling, Eliminated
 from codesign_jax.engines.structured.kernel.linear_system import Elimination, with_palm
@@ -22,7 +23,6 @@ from codesign_jax.engines.structured.kernel.shared_memory import (
 )
 from codesign_jax.engines.structured.lanes import contract, dot, inverse_spd, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.linear import elimination as el
 
 
 class Team:
@@ -249,8 +249,7 @@ class TeamElimination(Elimination):
             none = jnp.zeros_like(palm.smooth_palm)
             square = jnp.zeros((6, *none.shape), none.dtype)
             empty = el.Quadratic(square, square, square, none, none)
-            node, force = with_palm(now, palm, empty, pushes)
-            return node, force.wrist
+            return with_palm(now, palm, empty, pushes)
 
         palm = self.problem.palm
         whole, twist = lanewise(own, now, palm, slots)

@@ -5,14 +5,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.lanes import cross, dot, once, spatial, total
-from codesign_jax.engines.structured.laws.kinematics import Kinematics, State
-from codesign_jax.engines.structured.world_model import (
-    WorldModel,
-    apply_columns,
-    joint_sections,
-    turn_columns,
-)
+from codesign_jax.engines.structured.lanes import cross, dot, spatial, total
+from codesign_jax.engines.structured.world_model import apply_columns, turn_columns
 from codesign_jax.model.morphology import softening, threshold_moments
 from codesign_jax.scene import Scene
 
@@ -115,32 +109,6 @@ class Centred(NamedTuple):
         return spatial(moment, jnp.stack([zero, zero, weight]))
 
 
-class Bodies(NamedTuple):
-    """The palm (1, world), the links (link, finger, world) and the object (1, world)."""
-
-    palm: Body
-    link: Body
-    object: Centred
-
-
-class Smooth(NamedTuple):
-    """Smooth forces on the bodies, (6, ...), and on the joints.
-
-    Attributes:
-      palm: Shape (6, 1, world).
-      link: Shape (6, link, finger, world).
-      object: Shape (6, 1, world).
-      wrist: Joint forces, shape (6, 1, world).
-      finger: Joint forces, shape (link, axis, finger, world).
-    """
-
-    palm: jax.Array
-    link: jax.Array
-    object: jax.Array
-    wrist: jax.Array
-    finger: jax.Array
-
-
 def principal_tensor(columns: jax.Array, principal: jax.Array) -> jax.Array:
     """World inertia tensor from body axes (3 columns, 3, ...) and principal moments (3, ...)."""
     pairs = zip(jnp.unstack(principal), jnp.unstack(columns), strict=True)
@@ -151,28 +119,6 @@ def turned_tensor(frame: jax.Array, tensor: jax.Array) -> jax.Array:
     """R T R' of a tensor T (3, 3, ...), R given by its columns."""
     # Rows of T first, then columns of T R'.
     return turn_columns(frame, jnp.moveaxis(turn_columns(frame, tensor), 0, 1))
-
-
-def bodies(hand: WorldModel, kin: Kinematics) -> Bodies:
-    """Inertia of all bodies at the present positions."""
-
-    def link(origin: jax.Array, frame: jax.Array):
-        return origin + apply_columns(frame, hand.centre), principal_tensor(frame, hand.inertia)
-
-    def rest(palm: jax.Array, obj: jax.Array):
-        tensor = turned_tensor(palm, hand.palm_inertia)
-        return (
-            kin.place + apply_columns(palm, hand.palm_centre),
-            tensor,
-            principal_tensor(obj, hand.object_inertia),
-        )
-
-    centre, tensor, object_tensor = once(rest, kin.palm, kin.object)
-    return Bodies(
-        palm=Body(hand.palm_mass, centre, tensor),
-        link=Body(hand.mass, *once(link, kin.origin, kin.link)),
-        object=Centred(hand.object_mass, object_tensor),
-    )
 
 
 def softening_moment(section: jax.Array, stiffness: jax.Array, angle: jax.Array) -> jax.Array:
@@ -225,55 +171,5 @@ def springs(
     return Springs(stiffness, damping, armature, moment[None])
 
 
-def joint_springs(scene: Scene, hand: WorldModel, state: State, pressure: jax.Array) -> Springs:
-    """`springs` of all joints, arrays of shape (link, axis, finger, world)."""
-    each = hand.stiffness, hand.damping, hand.armature
-    if hand.threshold is None:
-        return springs(scene, each, None, pressure, state.finger)
-    every = jnp.broadcast_to(hand.threshold, (len(state.finger), *hand.threshold.shape[1:]))
-    run = jax.vmap(lambda c, q, numbers: springs(scene, c, numbers, pressure, q))
-    return run(each, state.finger, every)
-
-
 def _with_lateral(axes: jax.Array, lateral: jax.Array) -> jax.Array:
     return jnp.concatenate([axes[:1], lateral[None], axes[2:]])
-
-
-def smooth_forces(
-    hand: WorldModel,
-    kin: Kinematics,
-    body: Bodies,
-    state: State,
-    ctrl: jax.Array,
-    scene,
-) -> Smooth:
-    """All forces that do not depend on the accelerations.
-
-    Args:
-      ctrl: Controls: arm pose and pressures, shape (nu, world).
-    """
-    g = hand.gravity
-    arm, pressure = ctrl[:6, None], ctrl[6:]
-    if not scene.effects.wrist:
-        wrist = jnp.zeros_like(state.wrist)
-    else:
-        wrist = hand.wrist_stiffness * (arm - state.wrist)
-        wrist = wrist - hand.wrist_damping * state.wrist_vel
-    joint = joint_springs(scene, hand, state, pressure)
-    finger = -joint.stiffness * state.finger - joint.damping * state.finger_vel
-    gain = hand.gain if hand.tip is None else hand.gain[:, None]
-    bend = finger[:, :1] + gain * pressure
-    if joint.moment is not None:
-        bend = bend + joint.moment
-    if scene.effects.neo_hookean:
-        section = jnp.moveaxis(joint_sections(hand, len(state.finger)), 1, 0)[:, :, None]
-        bend = bend + softening_moment(section, hand.stiffness[:, :1], state.finger[:, :1])
-    finger = jnp.concatenate([bend, finger[:, 1:]], 1)
-    links = once(lambda b, v, a: b.smooth_force(v, a, g), body.link, kin.vel, kin.bias)
-    return Smooth(
-        palm=body.palm.smooth_force(kin.palm_vel, kin.palm_bias, g),
-        link=links,
-        object=body.object.smooth_force(kin.object_vel, g),
-        wrist=wrist,
-        finger=finger,
-    )

@@ -20,6 +20,7 @@ from codesign_jax.engines.structured.lanes import (
     rotate,
     scan_links,
     spatial,
+    total,
 )
 from codesign_jax.engines.structured.world_model import (
     WorldModel,
@@ -82,6 +83,14 @@ class Acc(NamedTuple):
     object: jax.Array
 
 
+class Spatial(NamedTuple):
+    """Spatial motion: palm (6, 1, world), links (6, link, finger, world), object as palm."""
+
+    palm: jax.Array
+    link: jax.Array
+    object: jax.Array
+
+
 class Kinematics(NamedTuple):
     """Bodies in the frame at the object's centre; spatial vectors are (angular, linear).
 
@@ -123,7 +132,7 @@ def kinematics(hand: WorldModel, axis_names: tuple[str, ...], state: State) -> K
     trig = once(lambda q: (jnp.cos(q), jnp.sin(q)), state.finger)
 
     def next_link(carry, link):
-        (origin, frame, vel, bias), ((offset, cos, sin, rate), _) = carry, link
+        (origin, frame, vel, bias), (offset, cos, sin, rate) = carry, link
         turn = partial(_turn_link, axis_names)
         origin, frame, subspace = once(turn, origin, frame, offset, cos, sin)
         vel, bias = once(_link_velocity, vel, bias, subspace, rate)
@@ -218,3 +227,40 @@ def _link_velocity(vel: jax.Array, bias: jax.Array, subspace: jax.Array, rate: j
 def _object(state: State):
     columns = rotation_columns(state.quat)
     return columns, spatial(apply_columns(columns, state.angular_vel), state.linear_vel)
+
+
+def palm_motion(wrist: jax.Array, axes: jax.Array) -> jax.Array:
+    """The palm's spatial acceleration of the wrist's slides and hinges."""
+    moving = spatial(jnp.zeros_like(wrist[:3]), wrist[:3])
+    return moving + total([axes[k] * wrist[3 + k] for k in range(3)])
+
+
+def next_motion(parent: jax.Array, axes: jax.Array, a: jax.Array) -> jax.Array:
+    """A link's spatial acceleration from its parent's and its joint's."""
+    return parent + total([axes[k] * a[k] for k in range(axes.shape[0])])
+
+
+def propagate(kin: Kinematics, acc: Acc) -> Spatial:
+    """Spatial accelerations J a of all bodies, without velocity terms."""
+    palm = once(palm_motion, acc.wrist, kin.wrist_axes)
+
+    def step(parent: jax.Array, link: tuple):
+        motion = once(next_motion, parent, *link)
+        return motion, motion
+
+    first = palm + jnp.zeros_like(kin.vel[:, 0])
+    _, links = scan_links(step, first, (kin.axes, acc.finger))
+    return Spatial(palm, jnp.moveaxis(links, 0, 1), acc.object)
+
+
+def relative(name: str, motion: Spatial) -> jax.Array:
+    """Relative spatial motion of a pair of bodies, with axes for the contacts' items."""
+    obj = motion.object
+    if name == "finger_object":
+        return jnp.stack([motion.link[i] - obj[i] for i in range(6)])[:, :, None]
+    return {
+        "finger_table": motion.link[:, :, None],
+        "palm_object": motion.palm - obj,
+        "palm_table": motion.palm,
+        "object_table": obj,
+    }[name]

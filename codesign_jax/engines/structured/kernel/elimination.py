@@ -8,13 +8,12 @@ joint accelerations a gives the same form in v_parent: Featherstone's articulate
 (Rigid Body Dynamics Algorithms, 2008, ch. 7) extended by the object that every finger may touch.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.lanes import contract, inverse_spd, sum_fingers
-from codesign_jax.engines.structured.linear.tree import Forces, Matrices
+from codesign_jax.engines.structured.lanes import contract, inverse_spd
 
 
 class Quadratic(NamedTuple):
@@ -179,26 +178,6 @@ def solve_object(q: jax.Array, r: jax.Array) -> jax.Array:
     second = contract(inverse_spd(rest), (r[3:] - contract(low, r[None, :3], 1))[None], 1)
     left = r[:3] - contract(q[:3, 3:], second[None], 1)
     return jnp.concatenate([contract(top, left[None], 1), second])
-
-
-def add_palm(node: Quadratic, matrix: Matrices, force: Forces, pushes: dict) -> Quadratic:
-    """Sums the fingers and adds the palm, the object and their contacts."""
-    sums: Any = [None if v is None else sum_fingers(v) for v in node]
-    p, c, q, r, ro = sums
-    p, r = p + matrix.palm, r + force.palm
-    q = matrix.object if q is None else q + matrix.object
-    ro = force.object if ro is None else ro + force.object
-    if "object_table" in pushes:
-        inertia, wrench = pushes["object_table"]
-        q, ro = q + inertia, ro + wrench
-    if "palm_table" in pushes:
-        inertia, wrench = pushes["palm_table"]
-        p, r = p + inertia, r + wrench
-    if "palm_object" in pushes:
-        inertia, wrench = pushes["palm_object"]
-        p, c, q = p + inertia, c + inertia, q + inertia
-        r, ro = r + wrench, ro - wrench
-    return Quadratic(p, c, q, r, ro)
 
 
 def wrist_slides(like: jax.Array) -> jax.Array:

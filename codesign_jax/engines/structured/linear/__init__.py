@@ -1,1 +1,0 @@
-"""A step's linear system over the tree of bodies: its terms, elimination and substitution."""

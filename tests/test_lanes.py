@@ -120,8 +120,9 @@ def test_a_step_reads_nothing_that_it_has_not_written(monkeypatch):
     advance = Step.advance
 
     def spoiled(self, *args, **how):
-        for ref in (self.scratch, self.onchip):
-            if ref is not None:
+        for table in (self.scratch, self.onchip):
+            if table is not None:
+                ref = table.ref
                 none = jnp.full(ref.shape[-1:], np.nan, ref.dtype)
 
                 def spoil(row, x, ref=ref, none=none):

@@ -94,25 +94,7 @@ def for_types(name, other):
     if other in graph(types=False)[name]:
         return False
     mine, theirs = (n.removeprefix("codesign_jax.") for n in (name, other))
-    return theirs in GIVEN.get(mine, ()) or (
-        mine.startswith(("commands.", "studio.")) and theirs == "cli"
-    )
-
-
-KERNEL = "engines.structured.kernel."
-GIVEN = {
-    "compiler.rules": ["compiler.writer"],
-    f"{KERNEL}adjoint_step": [f"{KERNEL}adjoint"],
-    f"{KERNEL}chambers": [f"{KERNEL}{name}" for name in ("adjoint_step", "problem", "step")],
-    f"{KERNEL}cotangents": [f"{KERNEL}adjoint"],
-    f"{KERNEL}finger_collision": [f"{KERNEL}step"],
-    f"{KERNEL}friction_memory": [f"{KERNEL}adjoint_step", f"{KERNEL}step"],
-    f"{KERNEL}sdf_collision": [f"{KERNEL}step"],
-    f"{KERNEL}step": [f"{KERNEL}program"],
-    "engines.structured.forces": ["engines.structured.engine"],
-    "engines.structured.segments": ["engines.structured.engine"],
-    "engines.structured.transforms": ["engines.structured.engine"],
-}
+    return mine.startswith(("commands.", "studio.")) and theirs == "cli"
 
 
 # Within the engine `structured`: what stands in a folder may import those before it.

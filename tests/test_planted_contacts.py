@@ -19,8 +19,8 @@ import pytest
 from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.forces import forces
 from codesign_jax.engines.structured.kernel import memory_tables
-from codesign_jax.engines.structured.kernel.finger_contacts import BoundPairs
-from codesign_jax.engines.structured.kernel.slots import BoundSlots, Counts
+from codesign_jax.engines.structured.kernel.finger_contacts import BoundFingerContacts
+from codesign_jax.engines.structured.kernel.slots import BoundSlots, SlotCounts
 from codesign_jax.engines.structured.lanewise import lanes, lanewise
 from codesign_jax.engines.structured.laws.rings import Place
 from codesign_jax.engines.structured.world_model import world_constants
@@ -41,7 +41,7 @@ SLOTS = 14
 FIELD, AIM, BETWEEN, BALLS = "rings_on_field", "aimed", "between", "balls"
 BEGUN, HELD, HOLD, KEEP = "begun", "_with_held", "sums.<locals>.add", "quotient"
 RAY, SLOPES = "BoundContacts.line.<locals>.ray", "BoundContacts._slopes.<locals>.both"
-LOAD = "BoundPairs.load.<locals>.wrench"
+LOAD = "BoundFingerContacts.load.<locals>.wrench"
 LINK, ADD = "Elimination.backward.<locals>.load", "_add"
 NEXT = "next acceleration"
 """A check of the second step, of a fault in what the first one leaves."""
@@ -162,13 +162,17 @@ def without_last(right, *args):
 
 PAIRS = {
     # contacts between fingers, with spheres and with rings
-    "both fingers are pushed the same way": Fault({}, methods={(BoundPairs, "enter"): same_way}),
-    "contacts act on the link before": Fault({}, methods={(BoundPairs, "enter"): on_parent}),
+    "both fingers are pushed the same way": Fault(
+        {}, methods={(BoundFingerContacts, "enter"): same_way}
+    ),
+    "contacts act on the link before": Fault(
+        {}, methods={(BoundFingerContacts, "enter"): on_parent}
+    ),
     "the other finger does not feel the contact": Fault(
         {LOAD: lambda f, *a: jnp.zeros_like(f(*a))}, finger=1
     ),
     "links do not feel contacts between fingers": Fault({LINK: without_pairs}),
-    "relative motion of one side": Fault({}, methods={(BoundPairs, "relative"): own_half}),
+    "relative motion of one side": Fault({}, methods={(BoundFingerContacts, "relative"): own_half}),
     "half the Hessian between fingers": Fault({TIMES: lambda f, *a: 0.5 * f(*a)}),
     "conjugate gradients without forces on the object": Fault({PALM_AGAIN: without_last}),
     "conjugate gradients without forces on links": Fault({AGAIN: without_last}),
@@ -195,7 +199,9 @@ HULL = {
     "gaps close when they are half as wide": Fault({BEGUN: half_gap}),
     "a line search of one stiffness": Fault({RAY: one_stiffness, SLOPES: one_stiffness}),
     # one lane with both sides
-    "one side of a contact alone": Fault({}, methods={(BoundPairs, "_add_wrench"): one_side}),
+    "one side of a contact alone": Fault(
+        {}, methods={(BoundFingerContacts, "_add_wrench"): one_side}
+    ),
     "the palm rubs as fingers do": cone_of("finger_palm", "finger_finger"),
     # state
     "fingers hold nothing": Fault({HELD: lambda f, jar, *rest: jar}, later=True),
@@ -207,13 +213,17 @@ HULL = {
         {}, methods={(BoundSlots, "clear"): not_emptied}, later=True
     ),
     # where lanes gather; others pass through the slots of their block's other worlds as well
-    "a world that iterates is passed over": Fault({}, methods={(Counts, "masked"): passed_over}),
+    "a world that iterates is passed over": Fault(
+        {}, methods={(SlotCounts, "masked"): passed_over}
+    ),
     "no flag for too few slots": Fault({}, "overflow", methods={(BoundSlots, "overflow"): no_flag}),
     **PAIRS,
 }
 SPHERES = {
     "the palm pulls": Fault({"ball_on_field": pulled}),
-    "the palm does not feel fingers": Fault({}, methods={(BoundPairs, "_add_wrench"): one_side}),
+    "the palm does not feel fingers": Fault(
+        {}, methods={(BoundFingerContacts, "_add_wrench"): one_side}
+    ),
     "the palm rubs as fingers do": cone_of("finger_palm", "finger_finger"),
     "contacts between spheres in the centre": place(BALLS, point=lambda v: 0.9 * v),
     "spheres half as deep": place(BALLS, gap=lambda v: 0.5 * v),

@@ -25,9 +25,9 @@ from codesign_jax.engines.structured.kernel import (
     friction_memory,
     residual_vjp,
 )
-from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, Path
+from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, RecordedPath
 from codesign_jax.engines.structured.kernel.adjoint_step import AdjointSolve
-from codesign_jax.engines.structured.kernel.cotangents import Bars
+from codesign_jax.engines.structured.kernel.cotangents import CotangentTables
 from codesign_jax.engines.structured.kernel.program import Limits, Program
 from codesign_jax.engines.structured.lanewise import lanewise
 from tests.helpers import fixtures, grasps
@@ -198,7 +198,7 @@ class Planted:
         return call
 
     def add(self, right):
-        """Instead of `Bars.add`."""
+        """Instead of `CotangentTables.add`."""
 
         def call(this, values, *args):
             kept = {
@@ -221,7 +221,7 @@ def planted(faults):
             patch.setattr(module, "pull", fault.pull)
         for owner, name in {key for f in faults.values() for key in f.methods}:
             patch.setattr(owner, name, fault.method(owner, name))
-        patch.setattr(Bars, "add", fault.add(Bars.add))
+        patch.setattr(CotangentTables, "add", fault.add(CotangentTables.add))
         start = adjoint_step.ReverseStep.__init__
 
         def prepare(self, *args):
@@ -426,7 +426,7 @@ def ptx(the_scene):
     inputs = hand, world, *state, shape(steps, 6, block), shape(steps, size)
     ends = shape(1, rows[0], size), shape(1, rows[1], block)
     whole = shape(steps, rows[0], size), shape(steps, rows[1], block)
-    path = Path(*whole, *ends, shape(1, 1, block))
+    path = RecordedPath(*whole, *ends, shape(1, 1, block))
     given = program._arguments(inputs, path, Cotangents(*ends, shape(steps, 3, block)))
 
     def code(call, outputs, given, scratch):

@@ -13,14 +13,12 @@ the digits that the multiple takes.
 from collections.abc import Callable
 from fractions import Fraction
 from math import factorial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from codesign_jax.compiler.instructions import Instructions
 from codesign_jax.compiler.values import SIZES, Value, is_float, kind_of, numpy_type
-
-if TYPE_CHECKING:
-    from codesign_jax.compiler.writer import Writer
 
 _HALF_PI = Fraction("3.14159265358979323846264338327950288419716939937510") / 2
 # Terms of each polynomial and bits of the parts of pi / 2, by type.
@@ -39,7 +37,7 @@ def half_pi_parts(kind: str) -> list[float]:
     return parts
 
 
-def _polynomial(w: "Writer", x: Value, first: int, terms: int) -> Value:
+def _polynomial(w: Instructions, x: Value, first: int, terms: int) -> Value:
     """Sum of (-x)^k / (2 k + first)!, the last term first."""
     coefficients = [(-1) ** k / factorial(2 * k + first) for k in range(terms)]
     result, *rest = (w.like(x, c) for c in reversed(coefficients))
@@ -48,7 +46,7 @@ def _polynomial(w: "Writer", x: Value, first: int, terms: int) -> Value:
     return result
 
 
-def _of_angle(w: "Writer", x: Value, shift: int) -> Value:
+def _of_angle(w: Instructions, x: Value, shift: int) -> Value:
     """Sine of an angle to which `shift` quarter turns are added."""
     one = numpy_type(x.kind)
     turns = w.intrinsic("rint", w.compute("fmul", x, w.like(x, 2 / np.pi)), flags="")
@@ -68,12 +66,12 @@ def _of_angle(w: "Writer", x: Value, shift: int) -> Value:
     return w.select(bit(2), w.compute("fneg", value), value)
 
 
-def sine(w: "Writer", equation: Any, x: Value) -> Value:
+def sine(w: Instructions, equation: Any, x: Value) -> Value:
     """Rule of `sin`."""
     return _of_angle(w, x, 0)
 
 
-def cosine(w: "Writer", equation: Any, x: Value) -> Value:
+def cosine(w: Instructions, equation: Any, x: Value) -> Value:
     """Rule of `cos`."""
     return _of_angle(w, x, 1)
 
@@ -108,7 +106,7 @@ def _folded(name: str, kind: str, *args: Value) -> Value | None:
 
 
 def _arithmetic(name: str) -> Rule:
-    def rule(w: "Writer", equation: Any, a: Value, b: Value) -> Value:
+    def rule(w: Instructions, equation: Any, a: Value, b: Value) -> Value:
         if is_float(a.kind):
             # A product of one lane fused with another lane's rounded one would differ between the
             # two: what lanes add up after an exchange must have the same bits on all of them.
@@ -135,17 +133,17 @@ def _offset(name: str, a: Value, b: Value) -> Value | None:
     return a._replace(known=int(a.known) + (int(b.known) if name == "add" else -int(b.known)))
 
 
-def _divide(w: "Writer", equation: Any, a: Value, b: Value) -> Value:
+def _divide(w: Instructions, equation: Any, a: Value, b: Value) -> Value:
     if is_float(a.kind):
         return w.divide(a, b)
     return _whole_division(w, "sdiv", a, b)
 
 
-def _remainder(w: "Writer", equation: Any, a: Value, b: Value) -> Value:
+def _remainder(w: Instructions, equation: Any, a: Value, b: Value) -> Value:
     return w.compute("frem", a, b) if is_float(a.kind) else _whole_division(w, "srem", a, b)
 
 
-def _whole_division(w: "Writer", operation: str, a: Value, b: Value) -> Value:
+def _whole_division(w: Instructions, operation: str, a: Value, b: Value) -> Value:
     """Quotient or remainder of integers; those that processors trap at have XLA's results.
 
     x / 0 is -1, x rem 0 is x, and the smallest integer over -1 is itself, with remainder 0.
@@ -168,7 +166,7 @@ def _whole_division(w: "Writer", operation: str, a: Value, b: Value) -> Value:
 
 
 def _compare(name: str) -> Rule:
-    def rule(w: "Writer", equation: Any, a: Value, b: Value) -> Value:
+    def rule(w: Instructions, equation: Any, a: Value, b: Value) -> Value:
         known = _folded(name, "b", a, b)
         if known is not None:
             return known
@@ -184,7 +182,7 @@ def _compare(name: str) -> Rule:
 
 
 def _extreme(name: str) -> Rule:
-    def rule(w: "Writer", equation: Any, a: Value, b: Value) -> Value:
+    def rule(w: Instructions, equation: Any, a: Value, b: Value) -> Value:
         if a.kind == "b":
             return w.compute("or" if name == "max" else "and", a, b)
         if not is_float(a.kind):
@@ -195,7 +193,7 @@ def _extreme(name: str) -> Rule:
 
 
 def _logic(name: str) -> Rule:
-    def rule(w: "Writer", equation: Any, a: Value, b: Value) -> Value:
+    def rule(w: Instructions, equation: Any, a: Value, b: Value) -> Value:
         return _folded(name, a.kind, a, b) or w.compute(name, a, b)
 
     return rule
@@ -204,7 +202,7 @@ def _logic(name: str) -> Rule:
 def _shift(operation: str) -> Rule:
     """A shift of integers; by all bits or more XLA gives 0, and LLVM leaves it open."""
 
-    def rule(w: "Writer", equation: Any, a: Value, b: Value) -> Value:
+    def rule(w: Instructions, equation: Any, a: Value, b: Value) -> Value:
         bits = 8 * SIZES[a.kind]
         moved = w.compute(operation, a, b)
         if b.is_known and np.all((0 <= b.known) & (b.known < bits)):
@@ -216,29 +214,29 @@ def _shift(operation: str) -> Rule:
     return rule
 
 
-def _not(w: "Writer", equation: Any, a: Value) -> Value:
+def _not(w: Instructions, equation: Any, a: Value) -> Value:
     return w.compute("xor", a, Value(a.kind, a.wide, None, 1 if a.kind == "b" else -1))
 
 
-def _negate(w: "Writer", equation: Any, x: Value) -> Value:
+def _negate(w: Instructions, equation: Any, x: Value) -> Value:
     if is_float(x.kind):
         return w.compute("fneg", x)
     return RULES["sub"](w, None, w.like(x, 0), x)
 
 
-def _magnitude(w: "Writer", equation: Any, x: Value) -> Value:
+def _magnitude(w: Instructions, equation: Any, x: Value) -> Value:
     if is_float(x.kind):
         return w.intrinsic("fabs", x, flags="")
     return w.select(w.compute("icmp slt", x, w.like(x, 0), kind="b"), _negate(w, None, x), x)
 
 
-def _sign(w: "Writer", equation: Any, x: Value) -> Value:
+def _sign(w: Instructions, equation: Any, x: Value) -> Value:
     """-1, 0 or 1; zeros and what is not a number stay as they are."""
     below, above = (RULES[test](w, None, x, w.like(x, 0)) for test in ("lt", "gt"))
     return w.select(below, w.like(x, -1), w.select(above, w.like(x, 1), x))
 
 
-def _power(w: "Writer", equation: Any, x: Value) -> Value:
+def _power(w: Instructions, equation: Any, x: Value) -> Value:
     result, y = w.like(x, 1), equation.params["y"]
     square = x
     for bit in reversed(bin(abs(y))[2:]):
@@ -248,7 +246,7 @@ def _power(w: "Writer", equation: Any, x: Value) -> Value:
     return result if y >= 0 else w.divide(w.like(x, 1), result)
 
 
-def _select_n(w: "Writer", equation: Any, which: Value, *cases: Value) -> Value:
+def _select_n(w: Instructions, equation: Any, which: Value, *cases: Value) -> Value:
     if which.kind == "b":
         chosen = w.select(which, cases[1], cases[0])
         if {case.text for case in cases} & w.exchanged:
@@ -261,7 +259,7 @@ def _select_n(w: "Writer", equation: Any, which: Value, *cases: Value) -> Value:
     return result
 
 
-def _convert(w: "Writer", equation: Any, x: Value) -> Value:
+def _convert(w: Instructions, equation: Any, x: Value) -> Value:
     kind = kind_of(equation.outvars[0].aval.dtype)
     if kind == x.kind:
         return x
@@ -281,7 +279,7 @@ def _convert(w: "Writer", equation: Any, x: Value) -> Value:
     return w.convert("sext" if kind == "i64" else "trunc", x, kind)
 
 
-def _reverse(w: "Writer", equation: Any, x: Value) -> Value:
+def _reverse(w: Instructions, equation: Any, x: Value) -> Value:
     shape, dimensions = equation.invars[0].aval.shape, equation.params["dimensions"]
     source = np.flip(np.arange(np.prod(shape)).reshape(shape), dimensions).ravel()
     if x.is_known:
@@ -293,7 +291,7 @@ def _reverse(w: "Writer", equation: Any, x: Value) -> Value:
 
 
 def _over_lanes(name: str) -> Rule:
-    def rule(w: "Writer", equation: Any, x: Value) -> Value:
+    def rule(w: Instructions, equation: Any, x: Value) -> Value:
         if x.kind != "i32":
             raise NotImplementedError(
                 f"a kernel reduces int32 over its lanes, not {equation.invars[0].aval.dtype}"
@@ -303,12 +301,12 @@ def _over_lanes(name: str) -> Rule:
     return rule
 
 
-def _is_finite(w: "Writer", equation: Any, x: Value) -> Value:
+def _is_finite(w: Instructions, equation: Any, x: Value) -> Value:
     size = _magnitude(w, None, x)
     return w.compute("fcmp olt", size, w.like(x, np.inf), kind="b")
 
 
-def _clamp(w: "Writer", equation: Any, low: Value, x: Value, high: Value) -> Value:
+def _clamp(w: Instructions, equation: Any, low: Value, x: Value, high: Value) -> Value:
     return RULES["min"](w, None, RULES["max"](w, None, x, low), high)
 
 

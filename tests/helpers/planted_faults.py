@@ -132,8 +132,7 @@ class Planted:
         if fault.finger is not None:
             own = own & (step.block.finger == fault.finger)
         if fault.later:
-            state, world = step.p.world_state, step.block.world
-            own = own & (state.read(step.world_state, "acc_object", 0, world)[0].lane != 0)
+            own = own & (step.world_state.read("acc_object")[0].lane != 0)
         return own
 
     def method(self, owner: type, name: str) -> Callable:

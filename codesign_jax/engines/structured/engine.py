@@ -1,5 +1,6 @@
 """Step and rollout of the structured engine behind the common interface."""
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -9,17 +10,16 @@ from codesign_jax import reuse
 from codesign_jax.compiler import launch
 from codesign_jax.compiler.launch import KernelUnavailable
 from codesign_jax.engines.base import Equal, Staged
-from codesign_jax.engines.structured import coordinates, transforms
-from codesign_jax.engines.structured.forces import Recording
+from codesign_jax.engines.structured import coordinates, forces, transforms
 from codesign_jax.engines.structured.kernel import Limits, Program, lanes_here
-from codesign_jax.engines.structured.kernel.adjoint import Path, recorded
+from codesign_jax.engines.structured.kernel.adjoint import RecordedPath, recorded
 from codesign_jax.engines.structured.kernel.memory import lengthened
 from codesign_jax.engines.structured.laws import meshes
 from codesign_jax.engines.structured.laws.kinematics import State
 from codesign_jax.engines.structured.world_model import WorldModel, world_constants
 from codesign_jax.model import ModelFields
 from codesign_jax.scene import Scene, effects, reach
-from codesign_jax.types import Status, Trace
+from codesign_jax.types import Forces, Status, Trace
 
 FAR = 1e30
 """A bound that no number exceeds."""
@@ -27,6 +27,10 @@ FAR = 1e30
 
 PIECE = 1024
 """Worlds of a piece in which `StructuredEngine` computes the tables of teams."""
+
+
+LANES = 64
+"""Worlds, or steps of fewer ones, whose forces are computed at once."""
 
 
 class StructuredEngine(Equal):
@@ -141,7 +145,9 @@ class StructuredEngine(Equal):
         Args:
           tables: Those of the fields, see `tables`.
         """
-        return transforms.rollout(self, fields, ctrl, tables, trajectory=trajectory)
+        settings = transforms.Settings(self.scene, self.limits, self.segment, self.truncate)
+        run = partial(transforms.rollout, self.simulate, self.record, settings)
+        return run(fields, ctrl, tables, trajectory=trajectory)
 
     def tables(self, fields: ModelFields) -> tuple[jax.Array, ...]:
         """The kernel's tables of worlds, for rollouts that go on from one another.
@@ -175,7 +181,7 @@ class StructuredEngine(Equal):
         out = _execute(program, inputs, trajectory=trajectory)
         return self._trace(*program.outputs(out, len(ctrl), trajectory=trajectory), trajectory)
 
-    def recording(self) -> Recording:
+    def recording(self) -> "Recording":
         """As an engine whose traces have the contact forces."""
         return Recording(self)
 
@@ -228,7 +234,7 @@ class StructuredEngine(Equal):
 
     def record(
         self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False
-    ) -> tuple[Trace, Path]:
+    ) -> tuple[Trace, RecordedPath]:
         """`simulate`, and what a derivative reads of it."""
         # A lane a finger, as the reverse pass has it, which simulates segments again.
         program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl), team=1)
@@ -293,6 +299,65 @@ class StructuredEngine(Equal):
         if "overflow" not in found:
             return status
         return status | jnp.where(found["overflow"] > 0, int(Status.CONTACT_OVERFLOW), 0)
+
+
+class Recording(Equal):
+    """The engine `structured` as one whose traces have `Trace.forces`; without derivatives."""
+
+    def __init__(self, engine: StructuredEngine):
+        self.engine, self.scene, self.name = engine, engine.scene, engine.name
+
+    def _key(self) -> tuple:
+        return (self.engine,)
+
+    def recording(self) -> "Recording":
+        """Itself."""
+        return self
+
+    def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
+        """See `Engine.rollout`.
+
+        Raises:
+          NotImplementedError: If it is differentiated.
+        """
+        run = jax.custom_vjp(transforms.folded(partial(self._simulate, trajectory)))
+
+        def refuse(*_: Any) -> Any:
+            raise NotImplementedError("a rollout with record_forces=True has no derivative")
+
+        run.defvjp(refuse, refuse)
+        return run(fields, ctrl)
+
+    def _simulate(self, trajectory: bool, fields: ModelFields, ctrl: jax.Array) -> Trace:
+        trace, found = self.engine.states(fields, ctrl, trajectory=trajectory)
+        worlds, steps = found["moved"].shape[:2]
+        # Several steps of few worlds at once: an operation on few numbers costs its start.
+        chunk = min(max(1, LANES // worlds), steps)
+        rounds = -(-steps // chunk)
+        many = jax.tree.map(lambda v: jnp.repeat(v, chunk, 0), fields)
+        hand = world_constants(self.scene, many)
+
+        def split(series: jax.Array) -> jax.Array:  # to (round, world and step, n)
+            series = lengthened(series.reshape(worlds, steps, -1), 1, rounds * chunk)
+            series = series.reshape(worlds, rounds, chunk, series.shape[2])
+            return jnp.moveaxis(series, 1, 0).reshape(rounds, worlds * chunk, series.shape[3])
+
+        def joined(series: jax.Array) -> jax.Array:  # back
+            series = series.reshape(rounds, worlds, chunk, *series.shape[2:])
+            series = jnp.moveaxis(series, 0, 1)
+            return series.reshape(worlds, rounds * chunk, *series.shape[3:])[:, :steps]
+
+        def step(now: tuple) -> Forces:
+            qpos, qvel, acc, moved, *held = now
+            state = coordinates.make(self.scene, qpos, qvel, acc, *held)
+            every = forces.forces(self.scene, hand, state, state.acc)
+            return jax.tree.map(
+                lambda v: jnp.where(moved.reshape(-1, *[1] * (v.ndim - 1)) > 0, v, 0.0), every
+            )
+
+        names = [k for k in ("qpos", "qvel", "acc", "moved", "held") if k in found]
+        every = jax.lax.map(step, tuple(split(found[k]) for k in names))
+        return trace._replace(forces=jax.tree.map(joined, every))
 
 
 def _execute(program: Program, inputs: tuple, **how: Any) -> list[jax.Array | None]:

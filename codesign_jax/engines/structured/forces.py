@@ -5,15 +5,12 @@ at both.  They are functions of what a rollout records, and no part of the kerne
 """
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.base import Equal
-from codesign_jax.engines.structured import assembly, coordinates, transforms
+from codesign_jax.engines.structured import assembly
 from codesign_jax.engines.structured.assembly import HandContacts
-from codesign_jax.engines.structured.kernel.memory import lengthened
 from codesign_jax.engines.structured.lanes import dot, once
 from codesign_jax.engines.structured.laws.contact import Contacts, constraint_update
 from codesign_jax.engines.structured.laws.kinematics import (
@@ -24,75 +21,10 @@ from codesign_jax.engines.structured.laws.kinematics import (
     propagate,
     relative,
 )
-from codesign_jax.engines.structured.world_model import WorldModel, world_constants
-from codesign_jax.model import ModelFields, layout
+from codesign_jax.engines.structured.world_model import WorldModel
+from codesign_jax.model import layout
 from codesign_jax.scene import Scene
-from codesign_jax.types import Forces, Trace
-
-if TYPE_CHECKING:
-    from codesign_jax.engines.structured.engine import StructuredEngine
-
-LANES = 64
-"""Worlds, or steps of fewer ones, whose forces are computed at once."""
-
-
-class Recording(Equal):
-    """The engine `structured` as one whose traces have `Trace.forces`; without derivatives."""
-
-    def __init__(self, engine: "StructuredEngine"):
-        self.engine, self.scene, self.name = engine, engine.scene, engine.name
-
-    def _key(self) -> tuple:
-        return (self.engine,)
-
-    def recording(self) -> "Recording":
-        """Itself."""
-        return self
-
-    def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
-        """See `Engine.rollout`.
-
-        Raises:
-          NotImplementedError: If it is differentiated.
-        """
-        run = jax.custom_vjp(transforms.folded(partial(self._simulate, trajectory)))
-
-        def refuse(*_: Any) -> Any:
-            raise NotImplementedError("a rollout with record_forces=True has no derivative")
-
-        run.defvjp(refuse, refuse)
-        return run(fields, ctrl)
-
-    def _simulate(self, trajectory: bool, fields: ModelFields, ctrl: jax.Array) -> Trace:
-        trace, found = self.engine.states(fields, ctrl, trajectory=trajectory)
-        worlds, steps = found["moved"].shape[:2]
-        # Several steps of few worlds at once: an operation on few numbers costs its start.
-        chunk = min(max(1, LANES // worlds), steps)
-        rounds = -(-steps // chunk)
-        many = jax.tree.map(lambda v: jnp.repeat(v, chunk, 0), fields)
-        hand = world_constants(self.scene, many)
-
-        def split(series: jax.Array) -> jax.Array:  # to (round, world and step, n)
-            series = lengthened(series.reshape(worlds, steps, -1), 1, rounds * chunk)
-            series = series.reshape(worlds, rounds, chunk, series.shape[2])
-            return jnp.moveaxis(series, 1, 0).reshape(rounds, worlds * chunk, series.shape[3])
-
-        def joined(series: jax.Array) -> jax.Array:  # back
-            series = series.reshape(rounds, worlds, chunk, *series.shape[2:])
-            series = jnp.moveaxis(series, 0, 1)
-            return series.reshape(worlds, rounds * chunk, *series.shape[3:])[:, :steps]
-
-        def step(now: tuple) -> Forces:
-            qpos, qvel, acc, moved, *held = now
-            state = coordinates.make(self.scene, qpos, qvel, acc, *held)
-            every = forces(self.scene, hand, state, state.acc)
-            return jax.tree.map(
-                lambda v: jnp.where(moved.reshape(-1, *[1] * (v.ndim - 1)) > 0, v, 0.0), every
-            )
-
-        names = [k for k in ("qpos", "qvel", "acc", "moved", "held") if k in found]
-        every = jax.lax.map(step, tuple(split(found[k]) for k in names))
-        return trace._replace(forces=jax.tree.map(joined, every))
+from codesign_jax.types import Forces
 
 
 def forces(scene: Scene, hand: WorldModel, state: State, acc: Acc) -> Forces:

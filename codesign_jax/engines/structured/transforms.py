@@ -19,24 +19,46 @@ failed passes no cotangent back.
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from codesign_jax import verdict
-from codesign_jax.engines.structured import segments
-from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, Path
+from codesign_jax.engines.structured import coordinates
+from codesign_jax.engines.structured.kernel import Limits, Program
+from codesign_jax.engines.structured.kernel.adjoint import (
+    AdjointProgram,
+    Cotangents,
+    RecordedPath,
+    recorded,
+)
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.model import ModelFields
+from codesign_jax.scene import Scene
 from codesign_jax.types import Trace
 
-if TYPE_CHECKING:
-    from codesign_jax.engines.structured.engine import StructuredEngine
+
+class Settings(NamedTuple):
+    """What a rollout and its derivative depend on beside their arguments.
+
+    Attributes:
+      scene: The scene.
+      limits: How hard each step is solved.
+      segment: Steps of a segment, see `StructuredEngine`; None to store the states of all steps.
+      truncate: Whether no cotangent of a state passes from a segment to the one before it.
+    """
+
+    scene: Scene
+    limits: Limits
+    segment: int | None
+    truncate: bool
 
 
 def rollout(
-    engine: "StructuredEngine",
+    simulate: Callable,
+    record: Callable,
+    settings: Settings,
     fields: ModelFields,
     ctrl: jax.Array,
     tables: tuple[jax.Array, ...] = (),
@@ -45,19 +67,22 @@ def rollout(
 ) -> Trace:
     """`StructuredEngine.simulate`'s trace, under any of JAX's transformations but forward mode.
 
+    Args:
+      simulate: That method; `record`: `StructuredEngine.record`.
+
     Raises:
       NotImplementedError: If a derivative is differentiated again.
     """
-    plain = folded(partial(engine.simulate, trajectory=trajectory))
-    recorded = _once(folded(partial(engine.record, trajectory=trajectory)))
-    adjoint = _once(folded(partial(_adjoint, engine, trajectory)))
+    plain = folded(partial(simulate, trajectory=trajectory))
+    recording = _once(folded(partial(record, trajectory=trajectory)))
+    adjoint = _once(folded(partial(_adjoint, settings, trajectory)))
 
     @jax.custom_vjp
     def run(fields: ModelFields, ctrl: jax.Array, tables: tuple[jax.Array, ...]) -> Trace:
         return plain(fields, ctrl, tables)
 
     def forward(fields: ModelFields, ctrl: jax.Array, _: tuple[jax.Array, ...]):
-        trace, path = recorded(fields, ctrl)
+        trace, path = recording(fields, ctrl)
         return trace, (fields, ctrl, path, trace.speed)
 
     def backward(saved: tuple, cotangent: Trace):
@@ -104,11 +129,11 @@ def _once(function: Callable) -> Callable:
 
 
 def _adjoint(
-    engine: "StructuredEngine",
+    settings: Settings,
     trajectory: bool,
     fields: ModelFields,
     ctrl: jax.Array,
-    path: Path,
+    path: RecordedPath,
     speed: jax.Array,
     cotangent: Trace,
 ) -> tuple[ModelFields, jax.Array]:
@@ -118,11 +143,12 @@ def _adjoint(
       speed: Its largest velocities, as in `Trace`.
       cotangent: Cotangent of its trace, without status and residual.
     """
-    scene = engine.scene
-    program = AdjointProgram.here(scene, engine.limits, ctrl.dtype, len(ctrl))
+    scene = settings.scene
+    program = AdjointProgram.here(scene, settings.limits, ctrl.dtype, len(ctrl))
 
     def inputs(fields: ModelFields, ctrl: jax.Array) -> tuple:
-        return program.inputs(world_constants(scene, fields), engine.reset(fields), ctrl)
+        start = coordinates.reset(scene, fields)
+        return program.inputs(world_constants(scene, fields), start, ctrl)
 
     tables, pull_inputs = jax.vjp(inputs, fields, ctrl)
     taken = path.taken[:, 0, 0]
@@ -137,7 +163,7 @@ def _adjoint(
     if trajectory:
         bars = bars._replace(path=program.rows_of(_gathered(taken, cotangent.qpos)))
     path, bars = jax.tree.map(program.by_block, (path, bars))
-    found = segments.reverse(engine, program, tables, path, bars, trajectory=trajectory)
+    found = _reversed(settings, program, tables, path, bars, trajectory=trajectory)
     sound = program.sound  # pyright: ignore[reportAttributeAccessIssue]  # an AdjointProgram here
     fields_bar, ctrl_bar = pull_inputs(sound(found, path.taken))
     # A world of fields that are not numbers never moved, and has no derivative.
@@ -159,3 +185,67 @@ def _gathered(taken: jax.Array, x: jax.Array) -> jax.Array:
 def _of_worlds(keep: jax.Array, x: jax.Array) -> jax.Array:
     """Zeros for what is no number of worlds, on the leading axis, that are not kept."""
     return jnp.where(keep.reshape(-1, *[1] * (x.ndim - 1)) | jnp.isfinite(x), x, 0.0)
+
+
+def _reversed(
+    settings: Settings,
+    program: Any,
+    inputs: tuple,
+    path: RecordedPath,
+    bars: Cotangents,
+    *,
+    trajectory: bool,
+) -> tuple:
+    """Cotangents of a rollout's inputs, see `AdjointProgram.adjoint`.
+
+    Of segments only the first states were stored.  Their steps are simulated once more, by the
+    kernel that simulated them before: their bits are the same, as a block's step depends on nothing
+    but its state.  The cotangents of the constants are handed on from segment to segment, so that
+    the order of their sums is that of the whole path.
+
+    Args:
+      path: What was stored of it, as tables of blocks.
+      bars: Cotangents of its results, as tables of blocks.
+    """
+    if settings.segment is None:
+        hand_bar, world_bar, *rest = program.adjoint(inputs, path, bars)
+        return hand_bar, program.summed(world_bar), *rest
+    size, (hand, world, _, _, arm, pressure, *grid) = settings.segment, inputs
+    steps, count = arm.shape[1], path.finger.shape[1]
+    how = {"backend": program.backend, "width": program.size, "team": 1}
+    again = Program(settings.scene, settings.limits, **how)  # type: ignore[arg-type]
+
+    def split(x: jax.Array) -> jax.Array:
+        """(block, time, ...) to (segment, block, time of the segment, ...)."""
+        x = jnp.pad(x, [(0, 0), (0, count * size - steps)] + [(0, 0)] * (x.ndim - 2))
+        return jnp.moveaxis(x.reshape(x.shape[0], count, size, *x.shape[2:]), 1, 0)
+
+    def segment(ends: tuple, given: tuple) -> tuple[tuple, tuple]:
+        number, start, commands, shown = given
+        taken = jnp.clip(path.taken - number * size, 0, size)
+        own = (hand, world, *start, *commands, *grid)
+        out = again.execute(own, trajectory=trajectory, states=1)
+        here = recorded(out, taken)
+        finger_bar, state_bar, *sums = ends
+        cotangents = Cotangents(finger_bar, state_bar, shown[0], shown[1:])
+        found = program.adjoint(own, here, cotangents, tuple(sums))
+        hand_bar, world_bar, *state, arm_bar, pressure_bar = found[:6]
+        state = [(jnp.zeros_like(x) if settings.truncate else x)[:, None] for x in state]
+        return (*state, hand_bar, world_bar), (arm_bar, pressure_bar)
+
+    every = jnp.arange(count, dtype=arm.dtype)
+    starts = tuple(jnp.moveaxis(x, 1, 0) for x in path[:2])
+    shown = tuple(split(x) for x in (bars.trace, *bars.path))
+    given = every, starts, (split(arm), split(pressure)), shown
+    sums = program.no_sums(arm.shape[0], arm.dtype)
+    (*ends, hand_bar, world_bar), commands = jax.lax.scan(
+        segment, (bars.finger, bars.world, *sums), given, reverse=True
+    )
+
+    def join(x: jax.Array) -> jax.Array:
+        """Inverse of `split`."""
+        return jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])[:, :steps]
+
+    state = (x[:, 0] for x in ends)
+    none = [jnp.zeros_like(x) for x in grid]
+    return hand_bar, program.summed(world_bar), *state, *map(join, commands), *none

@@ -15,9 +15,9 @@ from jax.experimental import pallas as pl
 
 from codesign_jax import reuse
 from codesign_jax.compiler.launch import Kernel, launch
-from codesign_jax.engines.structured.kernel.adjoint_step import ReverseStep, Shown
-from codesign_jax.engines.structured.kernel.cotangents import Bars, of_step
-from codesign_jax.engines.structured.kernel.finger_contacts import PairSet
+from codesign_jax.engines.structured.kernel.adjoint_step import ReverseStep, TraceCotangents
+from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, of_step
+from codesign_jax.engines.structured.kernel.finger_contacts import FingerContactSet
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
 from codesign_jax.engines.structured.kernel.program import Program, block_spec
 from codesign_jax.engines.structured.kernel.residual import Place
@@ -25,7 +25,7 @@ from codesign_jax.engines.structured.kernel.residual_vjp import SHAPES
 from codesign_jax.engines.structured.lanewise import lanes, of_code
 
 
-class Path(NamedTuple):
+class RecordedPath(NamedTuple):
     """What the reverse pass reads of a rollout, with a leading world axis.
 
     In a kernel the rows are those of blocks, see `Packing.by_block`.
@@ -45,14 +45,14 @@ class Path(NamedTuple):
     taken: jax.Array
 
 
-def recorded(out: Any, taken: jax.Array) -> Path:
-    """What `Program.execute` has recorded in blocks; `taken` as in `Path`, of blocks."""
+def recorded(out: Any, taken: jax.Array) -> RecordedPath:
+    """What `Program.execute` has recorded in blocks; `taken` as in `RecordedPath`, of blocks."""
     finger_end, world_end = out[0][:, None], out[1][:, None]
-    return Path(out[-2], out[-1], finger_end, world_end, taken)
+    return RecordedPath(out[-2], out[-1], finger_end, world_end, taken)
 
 
 class Cotangents(NamedTuple):
-    """Cotangents of a rollout's results, laid out as `Path`.
+    """Cotangents of a rollout's results, laid out as `RecordedPath`.
 
     Attributes:
       finger: Of the fingers' state at the end, shape (world, 1, row, finger).
@@ -85,7 +85,7 @@ class AdjointProgram(Program):
         if self.held:
             more |= {"grip_bar": (self.held, (4,))}
         more |= {f"bar.{k}": (1, shape) for k, shape in of_step(self.scene).items()}
-        if any(isinstance(s, PairSet) for s in self.sets):
+        if any(isinstance(s, FingerContactSet) for s in self.sets):
             more |= {f"pairbar.{k}": (n + 1, getattr(SHAPES, k)) for k in Place._fields}
         if self.scene.effects.finger_palm:
             more |= {f"palmbar.{k}": (1, getattr(SHAPES, k)) for k in Place._fields}
@@ -93,7 +93,7 @@ class AdjointProgram(Program):
         self.world_bars = MemoryLayout(True, **self.world.groups)
 
     def adjoint(
-        self, inputs: tuple, path: Path, bars: Cotangents, sums: tuple | None = None
+        self, inputs: tuple, path: RecordedPath, bars: Cotangents, sums: tuple | None = None
     ) -> tuple:
         """Cotangents of `Program.inputs`; where a world took no step they need not be numbers.
 
@@ -134,7 +134,7 @@ class AdjointProgram(Program):
 
         Args:
           bars: The cotangents.
-          taken: As in `Path`, of blocks.
+          taken: As in `RecordedPath`, of blocks.
         """
         some = taken[:, 0] > 0
         lane = jnp.tile(some, (1, 1, self.fingers))
@@ -144,7 +144,7 @@ class AdjointProgram(Program):
         return (*found, *bars[6:])
 
     def _arguments(
-        self, inputs: tuple, path: Path, bars: Cotangents, sums: tuple | None = None
+        self, inputs: tuple, path: RecordedPath, bars: Cotangents, sums: tuple | None = None
     ) -> tuple:
         hand, world, _, _, arm, pressure, *grid = inputs
         if sums is None:
@@ -189,7 +189,7 @@ class AdjointProgram(Program):
         scratch, finger_state, world_state = rest
         block = Block(self.fingers, self.block)
         own, none = block.world, jnp.zeros((self.size,), scratch.dtype)
-        bars = Bars(self, block, (hand_bar, world_bar, finger_bar, state_bar), scratch)
+        bars = CotangentTables(self, block, (hand_bar, world_bar, finger_bar, state_bar), scratch)
         tables = hand, world, finger_state, world_state, scratch, grid
         step = ReverseStep(self, block, tables, bars)
         copy_rows((0, self.hand.rows), lambda k: hand_sum[(k,)], hand_bar)
@@ -211,7 +211,7 @@ class AdjointProgram(Program):
             self._load(t, steps, moved, states, (finger_state, world_state), own)
             commands = [jnp.where(moved, arm[t, k, own], 0.0) for k in range(6)]
             chamber = jnp.where(moved, pressure[(t,)], 0.0)
-            shown = Shown(*(trace[t, k, own] for k in range(3)))
+            shown = TraceCotangents(*(trace[t, k, own] for k in range(3)))
             arms = step.reverse(
                 lanes(commands, (6,), wide=False), lanes([chamber], (), wide=True), moved, shown
             )

@@ -7,7 +7,7 @@ contacts as they are there: one elimination, however many iterations found it (`
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,22 +15,19 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.kernel import chambers, friction_memory, residual
 from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
-from codesign_jax.engines.structured.kernel.cotangents import Bars, only_on, plus, pull
+from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, only_on, plus, pull
 from codesign_jax.engines.structured.kernel.coupling import Coupling
-from codesign_jax.engines.structured.kernel.finger_contacts import BoundPairs
+from codesign_jax.engines.structured.kernel.finger_contacts import BoundFingerContacts
 from codesign_jax.engines.structured.kernel.linear_system import Elimination
 from codesign_jax.engines.structured.kernel.memory import Block, choose, loop
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
 from codesign_jax.engines.structured.kernel.residual import Chain
-from codesign_jax.engines.structured.kernel.residual_vjp import PairSweep, Sweep
+from codesign_jax.engines.structured.kernel.residual_vjp import FingerContactsVjp, ResidualVjp
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step import Step, moved, turned
+from codesign_jax.engines.structured.kernel.step_memory import KernelLayout, StepMemory
 from codesign_jax.engines.structured.lanes import dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-
-if TYPE_CHECKING:
-    from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram
-
 
 MOVED = ("wrist", "position", "quat", "wrist_vel", "linear_vel", "angular_vel")
 """Positions and velocities of wrist and object."""
@@ -38,7 +35,7 @@ JOINT = ("finger", "finger_vel", "acc")
 """Angles, velocities and accelerations of the fingers' joints."""
 
 
-class Shown(NamedTuple):
+class TraceCotangents(NamedTuple):
     """Cotangents of what the trace shows of the state before a step, numbers of a world."""
 
     distance: jax.Array
@@ -53,17 +50,19 @@ class ReverseStep(Step):
     as the forward pass does, solves for the virtual accelerations, and goes back to the palm.
     """
 
-    def __init__(self, program: "AdjointProgram", block: Block, refs: tuple, bars: Bars):
-        """Takes the kernel's memory, see `Step`, and the cotangents."""
-        super().__init__(program, block, *refs)  # type: ignore[misc]
-        self.bars, self.like = bars, jnp.zeros((program.size,), bars.scratch.dtype)
+    def __init__(self, layout: KernelLayout, block: Block, refs: tuple, bars: CotangentTables):
+        """Takes the kernel's memory, see `StepMemory`, and the cotangents."""
+        super().__init__(layout, block, *refs)
+        self.bars = bars
 
     def keep(self, i: Any, chain: tuple) -> None:
         """See `Step`."""
         for name, value in zip(Chain._fields, chain, strict=False):
-            self.p.scratch.write(self.scratch, f"chain.{name}", value, i)
+            self.scratch.write(f"chain.{name}", value, i)
 
-    def reverse(self, arm: Lanes, pressure: Lanes, moved: jax.Array, shown: Shown) -> Lanes:
+    def reverse(
+        self, arm: Lanes, pressure: Lanes, moved: jax.Array, shown: TraceCotangents
+    ) -> Lanes:
         """Makes the cotangents of the state after the step those of the state before it.
 
         The cotangents of the pressures stay behind as the bars' "pressure".
@@ -77,24 +76,23 @@ class ReverseStep(Step):
         Returns:
           Cotangents of the arm's commands.
         """
-        p, block, bars = self.p, self.block, self.bars
+        p, bars = self.p, self.bars
         bars.begin()
-        state, at, thing, m, now, centre = self.assemble(arm, pressure)
+        state, at, thing, now, centre = self.assemble(arm, pressure)
         go = lanes([moved], (), wide=False)
         before, acc_bar = self._integration(state, at, now, go)
         if p.held:
-            friction_memory.reverse(self, m.contacts["finger_finger"], go)
-        forces = palm_problem(at["palm"], *acc_bar)
-        problem = Problem(p.links, block, m, forces, rigid=not p.scene.effects.wrist)
+            friction_memory.reverse(self, bars, self.contacts["finger_finger"], go)  # type: ignore[arg-type]
+        problem = Problem(self, palm_problem(at["palm"], *acc_bar))
         virtual = AdjointSolve(problem).solve()
-        sweep = Sweep(self, m, state, at, thing, virtual, bars)
+        sweep = ResidualVjp(self, state, at, thing, virtual, bars)
         if problem.pairs:
-            PairSweep(sweep, problem.pairs).run()
+            FingerContactsVjp(sweep, problem.pairs).run()
         metered = p.scene.effects.air_mass
         end = chambers.end_pressures(self, pressure) if metered else pressure
         base = sweep.fingers(end, self._centre_bar(centre, shown.distance))
         if metered:
-            chambers.reverse(self, pressure)
+            chambers.reverse(self, bars, pressure)
         base = sweep.palm_and_table(base)
         return self._palm_bars(state, arm, base, before, (now, virtual, acc_bar[0]), shown)
 
@@ -109,22 +107,20 @@ class ReverseStep(Step):
         """
         p, h = self.p, self.p.scene.discretization.timestep
         old = {n: state[n] for n in MOVED}
-        after = {
-            n: p.world_state.read(self.bars.world_state, n, 0, self.block.world) for n in MOVED
-        }
+        after = {n: self.bars.world_state.read(n) for n in MOVED}
         given = old, at["columns"], now.wrist, now.object_motion
         run = partial(moved, h)
         own, columns, wrist, obj = pull(run, given, (), only_on(go, after))
         self.bars.add_once({"columns": columns})
 
         def joint(i: Any, x: Any) -> Any:
-            given = tuple(p.finger_state.read(self.finger_state, n, i) for n in JOINT)
-            bars = [p.finger_state.read(self.bars.finger_state, n, i) for n in JOINT[:2]]
+            given = tuple(self.joint(i).values())
+            bars = [self.bars.finger_state.read(n, i) for n in JOINT[:2]]
             *new, acc = pull(partial(_turned, h), given, (), only_on(go, bars))
             for name, one, other in zip(JOINT, new, bars, strict=False):
                 value = lanewise(jnp.where, go, one, other)
-                p.finger_state.write(self.bars.finger_state, name, value, i)
-            p.scratch.write(self.scratch, "acc_bar", acc, i)
+                self.bars.finger_state.write(name, value, i)
+            self.scratch.write("acc_bar", acc, i)
             return x
 
         jax.lax.fori_loop(0, p.links, joint, jnp.int32(0))
@@ -144,7 +140,13 @@ class ReverseStep(Step):
         return lanewise(slope, centre, lanes([bar], (), wide=False))
 
     def _palm_bars(
-        self, state: dict, arm: Lanes, base: Chain, before: dict, accelerations: tuple, shown: Shown
+        self,
+        state: dict,
+        arm: Lanes,
+        base: Chain,
+        before: dict,
+        accelerations: tuple,
+        shown: TraceCotangents,
     ) -> Lanes:
         """Adds palm, wrist and object; stores their cotangents and returns those of the arm."""
         p, (now, virtual, wrist_bar) = self.p, accelerations
@@ -163,8 +165,8 @@ class ReverseStep(Step):
         if p.scene.fixture:
             found["position"] = plus(found["position"], own["position"])
         for name, value in plus(found, before).items():
-            p.world_state.write(self.bars.world_state, name, value, 0, self.block.world)
-        any_of(shown.speed != 0, lambda: add_speed_cotangent(self, state, shown.speed))
+            self.bars.world_state.write(name, value)
+        any_of(shown.speed != 0, lambda: add_speed_cotangent(self, self.bars, state, shown.speed))
         return arm_bar
 
 
@@ -198,7 +200,7 @@ class AdjointSolve(Elimination):
         matrix, wrench = contacts.push(item, alpha)
         return matrix, _none(wrench)
 
-    def between_fingers(self, pairs: BoundPairs, alpha: Lanes) -> None:
+    def between_fingers(self, pairs: BoundFingerContacts, alpha: Lanes) -> None:
         """See `Elimination`."""
         pairs.update_constraints(alpha)
         pairs.clear_wrenches()
@@ -259,42 +261,42 @@ def _none(value: Lanes) -> Lanes:
 VELOCITIES = ("wrist_vel", "linear_vel", "angular_vel")
 
 
-def largest_velocity(step: "Step", state: dict[str, Lanes]) -> Lanes:
+def largest_velocity(step: StepMemory, state: dict[str, Lanes]) -> Lanes:
     """Largest absolute velocity of each world's state; see `add`."""
     return _folded(step, state, _largest, jnp.maximum)
 
 
-def add_speed_cotangent(step: "ReverseStep", state: dict[str, Lanes], bar: jax.Array) -> None:
+def add_speed_cotangent(
+    step: StepMemory, bars: CotangentTables, state: dict[str, Lanes], bar: jax.Array
+) -> None:
     """Adds the cotangent of the trace's speed; equal velocities share it.
 
     Args:
-      step: The step, whose cotangents are those of the state before it.
+      bars: Cotangents of the state before the step.
       state: Velocities of wrist and object, by name.
       bar: The cotangent, numbers of a world.
     """
-    p, block = step.p, step.block
+    p = step.p
     top = largest_velocity(step, state)
     number = _folded(step, state, _count, jnp.add, top)
     share = lanewise(_share, lanes([bar], (), wide=False), number)
 
     def link(i: Any, x: Any) -> Any:
-        step.bars.add_joint({"finger_vel": lanewise(_slope, _rates(step, i), top, share)}, i)
+        bars.add_joint({"finger_vel": lanewise(_slope, _rates(step, i), top, share)}, i)
         return x
 
     jax.lax.fori_loop(0, p.links, link, jnp.int32(0))
-    table, ref = p.world_state, step.bars.world_state
     for name in VELOCITIES:
-        old = table.read(ref, name, 0, block.world)
-        new = plus(old, lanewise(_slope, state[name], top, share))
-        table.write(ref, name, new, 0, block.world)
+        old = bars.world_state.read(name)
+        bars.world_state.write(name, plus(old, lanewise(_slope, state[name], top, share)))
 
 
-def _rates(step: "Step", i: Any) -> Lanes:
-    return step.p.finger_state.read(step.finger_state, "finger_vel", i)
+def _rates(step: StepMemory, i: Any) -> Lanes:
+    return step.finger_state.read("finger_vel", i)
 
 
 def _folded(
-    step: "Step", state: dict[str, Lanes], function: Callable, combine: Callable, *more: Lanes
+    step: StepMemory, state: dict[str, Lanes], function: Callable, combine: Callable, *more: Lanes
 ) -> Lanes:
     """function(x, velocities, *more) folded over all velocities of a world."""
     p = step.p
@@ -302,7 +304,7 @@ def _folded(
     def one(i: Any, x: Lanes) -> Lanes:
         return lanewise(function, x, _rates(step, i), *more)
 
-    first = zeros((), jnp.zeros((p.size,), state[VELOCITIES[0]].dtype))
+    first = zeros((), step.like)
     found = lanes(
         [step.block.fold(loop(p.links, one, first, p.size).lane, combine)], (), wide=False
     )

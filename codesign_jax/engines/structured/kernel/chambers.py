@@ -12,23 +12,19 @@ once they are known the joints get z - l D^-1 y_1.
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
-from codesign_jax.engines.structured.kernel.cotangents import pull
+from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, pull
 from codesign_jax.engines.structured.kernel.memory import loop, upper
+from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import contract, dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 from codesign_jax.engines.structured.laws.air import end_pressure
-
-if TYPE_CHECKING:
-    from codesign_jax.engines.structured.kernel.adjoint_step import ReverseStep
-    from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
-    from codesign_jax.engines.structured.kernel.step import Step
 
 JOINT = ("finger", "finger_vel", "acc")
 """Angles of a joint and their derivatives by time, which move the volume and its derivatives."""
@@ -40,21 +36,21 @@ def fields(links: int, axes: int) -> dict[str, tuple[int, tuple[int, ...]]]:
     return {**found, "air_palm": (1, (6,)), "air_object": (1, (6,)), "air_joint": (links, (axes,))}
 
 
-def end_pressures(step: "Step", charge: Lanes) -> Lanes:
+def end_pressures(step: StepMemory, charge: Lanes) -> Lanes:
     """Pressures at a step's end by the accelerations of its warm start; leaves c behind."""
     pressure, stiffness = lanewise(_law(step), *_given(step, charge))
-    step.p.scratch.write(step.scratch, "air_stiffness", stiffness)
-    step.p.scratch.write(step.scratch, "air_step", lanewise(jnp.zeros_like, stiffness))
+    step.scratch.write("air_stiffness", stiffness)
+    step.scratch.write("air_step", lanewise(jnp.zeros_like, stiffness))
     return pressure
 
 
-def reverse(step: "ReverseStep", charge: Lanes) -> None:
+def reverse(step: StepMemory, bars: CotangentTables, charge: Lanes) -> None:
     """Makes the cotangents of the pressures at a step's end those of the charges."""
-    p, bars, law = step.p, step.bars, _law(step)
+    p, law = step.p, _law(step)
     given, bar = _given(step, charge), bars.of_step("pressure")
     charge, volume, air, grown = pull(lambda *v: law(*v)[0], given, (), bar)
     bars.add({"volume": volume, "air": air})
-    p.scratch.write(step.scratch, "bar.pressure", charge)
+    step.scratch.write("bar.pressure", charge)
 
     def moments(gain, joint, grown):
         turned = [jnp.stack([gain * v] + [0 * v] * (p.axes - 1)) for v in grown[:2]]
@@ -62,7 +58,7 @@ def reverse(step: "ReverseStep", charge: Lanes) -> None:
 
     def one(i: Any, x: jax.Array) -> jax.Array:
         row = i if p.tapered else 0
-        gain = p.hand.read(step.hand, "gain", row)
+        gain = step.hand.read("gain", row)
         turned, own = lanewise(moments, gain, step.joint(i), grown)
         bars.add_joint(dict(zip(JOINT[:2], turned, strict=True)), i)
         bars.add({"gain": own}, row)
@@ -71,32 +67,30 @@ def reverse(step: "ReverseStep", charge: Lanes) -> None:
     jax.lax.fori_loop(0, p.links, one, jnp.int32(0))
 
 
-def _law(step: "Step") -> Callable:
+def _law(step: StepMemory) -> Callable:
     return partial(end_pressure, step.p.scene.discretization.timestep)
 
 
-def _given(step: "Step", charge: Lanes) -> tuple:
+def _given(step: StepMemory, charge: Lanes) -> tuple:
     """Arguments of `end_pressure`."""
-    p, like = step.p, jnp.zeros((step.p.size,), step.finger_state.dtype)
+    p, like = step.p, step.like
 
     def add(sums, gain, joint):
         return [v + gain * joint[n][0] for v, n in zip(sums, JOINT, strict=True)]
 
     def one(i: Any, sums: list[Lanes]) -> list[Lanes]:
-        gain = p.hand.read(step.hand, "gain", i if p.tapered else 0)
+        gain = step.hand.read("gain", i if p.tapered else 0)
         return lanewise(add, sums, gain, step.joint(i))
 
     grown = loop(p.links, one, [zeros((), like)] * 3, p.size)
-    return charge, p.hand.read(step.hand, "volume"), step.constant("air"), grown
+    return charge, step.hand.read("volume"), step.constant("air"), grown
 
 
 class Chambers:
     """The chambers' part of a step's problem."""
 
-    def __init__(self, problem: "Problem"):
-        """Takes the problem."""
-        self.problem, self.links = problem, problem.links
-        self.tapered = problem.m.hand.groups["gain"][0] > 1
+    def __init__(self, step: StepMemory):
+        self.step, self.links, self.size = step, step.p.links, step.block.size
 
     def move(self, alpha: Lanes) -> None:
         """Moves the pressures, which are part of "tau", by the last step, and forgets that step."""
@@ -106,7 +100,7 @@ class Chambers:
             return jnp.concatenate([tau[:1] - gain * fall, tau[1:]])
 
         self._change("tau", push, "gain", fall)
-        self.problem.write("air_step", lanewise(jnp.zeros_like, fall), 0)
+        self.step.write("air_step", lanewise(jnp.zeros_like, fall))
 
     def close(self, node: el.Quadratic, work: Lanes) -> tuple[el.Quadratic, Lanes]:
         """Adds the chambers to eliminated fingers.
@@ -115,7 +109,7 @@ class Chambers:
           node: What is left of each finger, P and Q as their upper triangles.
           work: Product of the fingers' forces with the step so far.
         """
-        problem, none = self.problem, zeros((6,), self.problem.like)
+        none = zeros((6,), self.step.like)
 
         def again(carry, gain, axes, w, g, inverse):
             r, ro, give = carry
@@ -126,14 +120,14 @@ class Chambers:
 
         def one(i: Any, carry: tuple) -> tuple:
             carry, y = lanewise(again, carry, *self._read(i, "gain", "axes", "w", "g", "inverse"))
-            problem.write("air_joint", y, i)
+            self.step.write("air_joint", y, i)
             return carry
 
-        start = none, none, zeros((), problem.like)
-        palm, obj, give = loop(self.links, one, start, problem.block.size, reverse=True)
+        start = none, none, zeros((), self.step.like)
+        palm, obj, give = loop(self.links, one, start, self.size, reverse=True)
         share = lanewise(lambda c, e: c / (1 + c * e), *self._of_finger("stiffness"), give)
         for name, value in (("palm", palm), ("object", obj), ("share", share)):
-            problem.write(f"air_{name}", value, 0)
+            self.step.write(f"air_{name}", value)
 
         def square(share, a, b):
             return share * a[:, None] * b[None]
@@ -156,21 +150,21 @@ class Chambers:
           Both forces, and what the chambers take of the product of all forces with the step.
         """
         total = self._sum(dot, "air_joint", z)
-        self.problem.write("air_sum", total, 0)
+        self.step.write("air_sum", total)
 
         def less(r, ro, total, share, palm, obj):
             return r - share * total * palm, ro - share * total * obj, share * total * total
 
         return lanewise(less, r, ro, total, *self._of_finger("share", "palm", "object"))
 
-    def settle(self, z: str, step: "Iterate") -> None:
+    def settle(self, z: str, motion: Lanes, object_motion: Lanes) -> None:
         """Takes the chambers' part from the joints' factors, once palm and object are known."""
 
         def pressure(share, total, palm, obj, motion, object_motion):
             return share * (total + dot(palm, motion) + dot(obj, object_motion))
 
         known = self._of_finger("share", "sum", "palm", "object")
-        change = lanewise(pressure, *known, step.palm_motion, step.object_motion)
+        change = lanewise(pressure, *known, motion, object_motion)
 
         def take(z, y, inverse, change):
             return z - change * contract(inverse, y[None], 1)
@@ -180,23 +174,23 @@ class Chambers:
     def curvature(self) -> Lanes:
         """Curvature along the joints' step, on each finger's lanes; leaves g'a behind."""
         moved = self._sum(lambda gain, a: gain * a[0], "gain", "step_acc")
-        self.problem.write("air_step", moved, 0)
+        self.step.write("air_step", moved)
         return lanewise(lambda c, a: c * a * a, *self._of_finger("stiffness"), moved)
 
     def _of_finger(self, *names: str) -> list[Lanes]:
-        return self.problem.read(*(f"air_{n}" for n in names))
+        return [self.step.read(f"air_{n}") for n in names]
 
     def _read(self, i: Any, *names: Any) -> list[Lanes]:
         """What is kept of a joint by name, beside what is given."""
-        row = {"gain": i if self.tapered else 0}
-        read = self.problem.read
-        return [read(n, item=row.get(n, i))[0] if isinstance(n, str) else n for n in names]
+        row = {"gain": i if self.step.p.tapered else 0}
+        read = self.step.read
+        return [read(n, row.get(n, i)) if isinstance(n, str) else n for n in names]
 
     def _change(self, name: str, function: Callable, *names: Any) -> None:
         """Replaces what is kept of each joint by a function of it and of more."""
 
         def one(i: Any, x: jax.Array) -> jax.Array:
-            self.problem.write(name, lanewise(function, *self._read(i, name, *names)), i)
+            self.step.write(name, lanewise(function, *self._read(i, name, *names)), i)
             return x
 
         jax.lax.fori_loop(0, self.links, one, jnp.int32(0))
@@ -207,4 +201,4 @@ class Chambers:
         def one(i: Any, total: Lanes) -> Lanes:
             return lanewise(lambda t, *v: t + function(*v), total, *self._read(i, *names))
 
-        return loop(self.links, one, zeros((), self.problem.like), self.problem.block.size)
+        return loop(self.links, one, zeros((), self.step.like), self.size)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.memory import (
-    MemoryLayout,
+    BoundTable,
     anywhere,
     full,
     solid,
@@ -80,9 +80,9 @@ class ContactSet:
         fields |= {"friction": 1} if self.own_friction else {}
         return {f"{self.name}.{f}": (self.count, (n, self.k)) for f, n in fields.items()}
 
-    def bind(self, table: MemoryLayout, ref: Any, read: Callable[[str], Lanes]) -> "BoundContacts":
+    def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundContacts":
         """The set in a kernel's memory; `read` reads constants of the worlds by name."""
-        return BoundContacts(self, table, ref, self.cone(read))
+        return BoundContacts(self, table, self.cone(read))
 
     def cone_rows(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         """The set's part of the table of the worlds' constants."""
@@ -107,17 +107,18 @@ class ContactSet:
 class BoundContacts:
     """A contact set with its memory; every method works on one item."""
 
-    def __init__(self, of: ContactSet, table: MemoryLayout, ref: Any, cone: Cone):
+    def __init__(self, of: ContactSet, table: BoundTable, cone: Cone):
         """See `ContactSet.bind`."""
-        self.set, self.table, self.ref, self.cone = of, table, ref, cone
+        self.set, self.table, self.cone = of, table, cone
+        self.like = jnp.zeros((of.size,), table.dtype)
 
     def read(self, field: str, item: Any) -> Lanes:
         """A field of the item's contacts, shape (component, k, finger, world)."""
-        return self.table.read(self.ref, f"{self.set.name}.{field}", item)
+        return self.table.read(f"{self.set.name}.{field}", item)
 
     def write(self, field: str, value: Lanes, item: Any) -> None:
         """Stores a field."""
-        self.table.write(self.ref, f"{self.set.name}.{field}", value, item)
+        self.table.write(f"{self.set.name}.{field}", value, item)
 
     def touching(self, item: Any) -> jax.Array:
         """Whether any lane's contact is active, a scalar."""
@@ -129,8 +130,7 @@ class BoundContacts:
 
     def if_touching(self, item: Any, compute: Callable, parts: list[tuple]) -> list[Lanes]:
         """compute() where a lane touches, zeros of wide shapes elsewhere."""
-        like = jnp.zeros((self.set.size,), self.ref.dtype)
-        empty = [zeros(shape, like) for shape in parts]
+        empty = [zeros(shape, self.like) for shape in parts]
         none, rebuild = solid(empty, self.set.size)
 
         def some() -> list[jax.Array]:

@@ -6,7 +6,7 @@ belongs to a world gets one cotangent on each of its fingers' lanes, to be summe
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +14,10 @@ import numpy as np
 
 from codesign_jax.engines.structured.components import FINGER, is_number, splat
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
-from codesign_jax.engines.structured.kernel.memory import Block
+from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, MemoryLayout
+from codesign_jax.engines.structured.kernel.step_memory import KernelLayout
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.scene import Scene
-
-if TYPE_CHECKING:
-    from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram
 
 
 def pull(function: Callable, args: tuple, fixed: tuple, bars: Any) -> Any:
@@ -104,31 +102,36 @@ def of_step(scene: Scene) -> dict[str, tuple[int, ...]]:
     return STEP | ({"position": (3,)} if scene.fixture else {})
 
 
-class Bars:
+class CotangentTables:
     """Cotangents by the name of what they belong to.
 
     Attributes:
-      hand: Memory of the hand's constants, laid out as those.
-      world: That of the worlds' constants, with a value for each finger, to be summed.
+      hand: Of the hand's constants, laid out as those.
+      world: Of the worlds' constants, with a value for each finger, to be summed.
       finger_state: Of the fingers' state after the step, then before it.
       world_state: Likewise of wrist and object.
+      names: What several parts of a step add to beside these, see `STEP`; in scratch memory.
     """
 
-    def __init__(self, program: "AdjointProgram", block: Block, refs: tuple, scratch: Any):
+    def __init__(self, layout: KernelLayout, block: Block, refs: tuple, scratch: Any):
         """Takes the kernel's memory: refs in the order of the attributes, and scratch memory."""
-        self.p, self.block, self.scratch = program, block, scratch
-        self.hand, self.world, self.finger_state, self.world_state = refs
-        self.like = jnp.zeros((program.size,), scratch.dtype)
-        self.names = of_step(program.scene)
+        hand, world, finger_state, world_state = refs
+        self.block, self.scratch = block, BoundTable(layout.scratch, scratch)
+        self.hand = BoundTable(layout.hand, hand)
+        self.world = BoundTable(MemoryLayout(True, **layout.world.groups), world)
+        self.finger_state = BoundTable(layout.finger_state, finger_state)
+        self.world_state = BoundTable(layout.world_state, world_state, block.world)
+        self.like = jnp.zeros((layout.size,), scratch.dtype)
+        self.names = of_step(layout.scene)
 
     def begin(self) -> None:
         """Sets to zero what belongs to one step."""
         for name, shape in self.names.items():
-            self.p.scratch.write(self.scratch, f"bar.{name}", zeros(shape, self.like))
+            self.scratch.write(f"bar.{name}", zeros(shape, self.like))
 
     def of_step(self, name: str) -> Lanes:
         """What was added to a name of `STEP`, on each lane."""
-        return self.p.scratch.read(self.scratch, f"bar.{name}")
+        return self.scratch.read(f"bar.{name}")
 
     def add(self, values: dict[str, Lanes], item: Any = 0, lane: jax.Array | None = None) -> None:
         """Adds to the cotangents of constants and of what `STEP` names.
@@ -139,12 +142,13 @@ class Bars:
           lane: The lanes, if items differ from lane to lane.
         """
         for name, value in values.items():
-            table, ref, name = self._place(name)
+            table = self.hand if name in self.hand else self.world
+            if name in self.names:
+                table, name = self.scratch, f"bar.{name}"
             if lane is None:
-                table.write(ref, name, plus(table.read(ref, name, item), value), item)
+                table.write(name, plus(table.read(name, item), value), item)
             else:
-                old = table.gather(ref, name, item, lane)
-                table.scatter(ref, name, plus(old, value), item, lane)
+                table.scatter(name, plus(table.gather(name, item, lane), value), item, lane)
 
     def add_once(self, values: dict[str, Lanes]) -> None:
         """`add` of what all lanes of a world have alike."""
@@ -153,13 +157,5 @@ class Bars:
 
     def add_joint(self, values: dict[str, Lanes], i: Any) -> None:
         """Adds to the cotangents of a joint's angles or velocities."""
-        table, ref = self.p.finger_state, self.finger_state
         for name, value in values.items():
-            table.write(ref, name, plus(table.read(ref, name, i), value), i)
-
-    def _place(self, name: str) -> tuple:
-        if name in self.names:
-            return self.p.scratch, self.scratch, f"bar.{name}"
-        if name in self.p.hand.groups:
-            return self.p.hand, self.hand, name
-        return self.p.world_bars, self.world, name
+            self.finger_state.write(name, plus(self.finger_state.read(name, i), value), i)

@@ -21,7 +21,10 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
-from codesign_jax.engines.structured.kernel.finger_contacts import BoundPairs, Pairing
+from codesign_jax.engines.structured.kernel.finger_contacts import (
+    BoundFingerContacts,
+    FingerPairing,
+)
 from codesign_jax.engines.structured.kernel.memory import anywhere, loop
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
 from codesign_jax.engines.structured.lanes import contract, dot, sum_axis
@@ -59,7 +62,7 @@ class Coupling:
     def __init__(
         self,
         problem: Problem,
-        pairs: BoundPairs,
+        pairs: BoundFingerContacts,
         done: Eliminated,
         *,
         tolerance: float = TOLERANCE,
@@ -125,7 +128,7 @@ class Coupling:
         pairs = self.pairs
         pairs.clear_wrenches()
 
-        def store(item: Any, pairing: Pairing) -> None:
+        def store(item: Any, pairing: FingerPairing) -> None:
             own, hessian = pairs.own_side(item), pairs.read("hessian", item)
             change = pairs.relative(item, pairing)
             left = lanewise(lambda b, f: jnp.where(b, -f, 0.0), busy, pairs.stiff(hessian, change))
@@ -146,7 +149,7 @@ class Coupling:
         pairs = self.pairs
         self.substitute("z_again", self.again())
 
-        def add(item: Any, pairing: Pairing, sums: list[Lanes]) -> list[Lanes]:
+        def add(item: Any, pairing: FingerPairing, sums: list[Lanes]) -> list[Lanes]:
             left, hessian = pairs.read("left", item), pairs.read("hessian", item)
             answer = pairs.relative(item, pairing)
             pairs.write("answer", answer, item)
@@ -180,7 +183,7 @@ class Coupling:
             along, moved = left + beta * along, answer + beta * moved
             return along, moved, total_ + alpha * along, left - alpha * along
 
-        def store(item: Any, pairing: Pairing, gain: Lanes) -> Lanes:
+        def store(item: Any, pairing: FingerPairing, gain: Lanes) -> Lanes:
             own, hessian = pairs.own_side(item), pairs.read("hessian", item)
             old, first = [pairs.read(name, item) for name in names], pairs.read("first", item)
             along, moved, total_, left = lanewise(move, alpha, beta, *old)
@@ -203,7 +206,7 @@ class Coupling:
         pairs = self.pairs
         pairs.clear_wrenches()
 
-        def store(item: Any, pairing: Pairing) -> None:
+        def store(item: Any, pairing: FingerPairing) -> None:
             value = lanewise(lambda k, s: jnp.where(k, s, 0.0), kept, pairs.read("sum", item))
             pairs.load(item, pairs.own_side(item), value, pairing)
 
@@ -229,7 +232,7 @@ class Coupling:
         r = self.problem.add_first(r)
         found = self._palm(*self.block.sum((r, ro)))
         if chambers:
-            chambers.settle("z_again", found)
+            chambers.settle("z_again", found.palm_motion, found.object_motion)
         return found
 
     def _palm(self, r: Lanes, ro: Lanes) -> Iterate:
@@ -254,7 +257,9 @@ class Coupling:
         loop(self.links, one, parent, self.block.size)
 
 
-def solve_palm_again(done: Eliminated, axes, armature, r, ro, twist=None, work=None) -> Any:
+def solve_palm_again(
+    done: Eliminated, axes, armature, r, ro, twist: Any = None, work: Any = None
+) -> Any:
     """Wrist, palm and object of another right side, see `elimination.eliminate_again`.
 
     Args:
@@ -273,8 +278,8 @@ def solve_palm_again(done: Eliminated, axes, armature, r, ro, twist=None, work=N
         (axes, done.hinges, slice(3, 6)),
         (slides, done.slides, slice(3)),
     ):
-        tau = None if twist is None else twist[joints]
-        y = None if work is None else contract(subspace, r[None], 1) + tau
+        tau: Any = None if twist is None else twist[joints]
+        y: Any = None if work is None else contract(subspace, r[None], 1) + tau
         r, ro, new = el.eliminate_again(subspace, factors, r, ro, tau)
         kept.append(new)
         work = None if work is None else work + dot(y, new.z)

@@ -8,7 +8,7 @@ team, see `shared_memory`, look with a ring each.
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,19 +22,19 @@ from codesign_jax.engines.structured.kernel.contact_sets import (
     margin,
     zeros,
 )
-from codesign_jax.engines.structured.kernel.finger_contacts import BoundPairs, Pairing
-from codesign_jax.engines.structured.kernel.memory import loop
+from codesign_jax.engines.structured.kernel.finger_contacts import (
+    BoundFingerContacts,
+    FingerPairing,
+)
+from codesign_jax.engines.structured.kernel.memory import BoundTable, loop
 from codesign_jax.engines.structured.kernel.slots import any_of
+from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import cross, dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact, holding, rings, shapes
 from codesign_jax.engines.structured.laws.rings import Place, Ring, Segment
 from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model.layout import first_on_palm, touches_itself
-
-if TYPE_CHECKING:
-    from codesign_jax.engines.structured.kernel.step import Step
-
 
 SURELY = 1.0 - 1e-4
 """At a joint two segments have one nearest place, which is the first one's, whatever is rounded."""
@@ -50,14 +50,13 @@ def fields(links: int) -> dict[str, tuple[int, tuple[int, ...]]]:
     return {f"pair.{name}": group for name, group in found.items()}
 
 
-class Search:
+class FingerCollision:
     """Gives a slot to each contact of fingers with one another, with themselves and the palm."""
 
-    def __init__(self, step: "Step", pairs: BoundPairs, at: dict[str, Any]):
+    def __init__(self, step: StepMemory, pairs: BoundFingerContacts, at: dict[str, Any]):
         """Takes a step's memory and geometry, see `Step`."""
         self.step, self.pairs, self.p = step, pairs, step.p
-        self.scratch, self.ref, self.block = step.p.scratch, step.scratch, step.block
-        self.like = jnp.zeros((step.p.size,), step.finger_state.dtype)
+        self.scratch, self.block, self.like = step.scratch, step.block, step.like
         self.count, self.palm_vel = self.p.links * self.p.k, at["vel"]
         self.hull = step.p.scene.effects.surface == "hull"
         self.palm = None
@@ -68,23 +67,23 @@ class Search:
 
     def write(self, name: str, value: Lanes, item: Any = 0) -> None:
         """Stores where a finger is."""
-        self.scratch.write(self.ref, f"pair.{name}", value, item)
+        self.scratch.write(f"pair.{name}", value, item)
 
     def read(self, name: str, item: Any = 0, lane: jax.Array | None = None) -> Lanes:
         """Where the lanes' own fingers are, or those of other lanes; items may be of lanes."""
         if lane is None and not jnp.ndim(item):
-            return self.scratch.read(self.ref, f"pair.{name}", item)
-        return self._gathered(self.scratch, self.ref, f"pair.{name}", item, lane)
+            return self.scratch.read(f"pair.{name}", item)
+        return self._gathered(self.scratch, f"pair.{name}", item, lane)
 
-    def _gathered(self, table: Any, ref: Any, name: str, item: Any, lane: Any) -> Lanes:
+    def _gathered(self, table: BoundTable, name: str, item: Any, lane: Any) -> Lanes:
         item = jnp.zeros_like(self.block.own) + item
-        return table.gather(ref, name, item, self.block.own if lane is None else lane)
+        return table.gather(name, item, self.block.own if lane is None else lane)
 
     def ring(self, item: Any, lane: jax.Array | None = None) -> Lanes:
         """Numbers of a ring, see `rings.Ring`."""
         if lane is None and not jnp.ndim(item):
-            return self.p.hand.read(self.step.hand, "ring", item)
-        return self._gathered(self.p.hand, self.step.hand, "ring", item, lane)
+            return self.step.hand.read("ring", item)
+        return self._gathered(self.step.hand, "ring", item, lane)
 
     def ring_at(self, row: Any) -> Any:
         """The ring whose section a finger has where a segment of its centre line begins.
@@ -126,10 +125,10 @@ class Search:
         self.write("joint", joint, row)
 
     def side_of(self, name: str, row: Any, lane: jax.Array | None = None) -> Lanes:
-        """Motions of links, see `BoundPairs.put`; arguments as `read`."""
+        """Motions of links, see `BoundFingerContacts.put`; arguments as `read`."""
         if lane is None and not jnp.ndim(row):
-            return self.pairs.table.read(self.pairs.ref, f"side.{name}", row)
-        return self._gathered(self.pairs.table, self.pairs.ref, f"side.{name}", row, lane)
+            return self.pairs.table.read(f"side.{name}", row)
+        return self._gathered(self.pairs.table, f"side.{name}", row, lane)
 
     def _lines(self) -> None:
         """Ends the centre lines at the tips' rings; stores their segments."""
@@ -184,7 +183,7 @@ class Search:
 
         each(self.block.rounds(count), ring)
 
-    def _copy(self, pairing: Pairing) -> None:
+    def _copy(self, pairing: FingerPairing) -> None:
         """Stores the segments of the other finger's centre line."""
         each(self.p.links + 1, lambda i: self.write("other", pairing.swap(self.read("line", i)), i))
 
@@ -286,7 +285,7 @@ class Search:
         return link.astype(self.like.dtype) + (0.5 + own)
 
     def _on_finger(
-        self, row: Any, pairing: Pairing, owner: jax.Array, item: Any, mine: Any
+        self, row: Any, pairing: FingerPairing, owner: jax.Array, item: Any, mine: Any
     ) -> None:
         link, numbers, frame, centre = self.body(item)
         square, other, t = self._nearest("other", centre)
@@ -364,7 +363,7 @@ class Search:
     # Spheres
 
     def _on_spheres(
-        self, row: Any, pairing: Pairing, owner: jax.Array, item: Any, mine: Any
+        self, row: Any, pairing: FingerPairing, owner: jax.Array, item: Any, mine: Any
     ) -> None:
         """A sphere of the finger that comes first, with all of the other one's."""
         link, numbers, _, centre = self.body(item)

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.kernel.contact_sets import ROWS, zeros
 from codesign_jax.engines.structured.kernel.memory import (
     Block,
-    MemoryLayout,
+    BoundTable,
     anywhere,
     either,
     loop,
@@ -36,7 +36,7 @@ from codesign_jax.model.layout import touches_itself
 from codesign_jax.scene import Scene
 
 
-class Pairing:
+class FingerPairing:
     """Fingers in pairs: those whose numbers differ by an exclusive or with the pairing's number.
 
     Each finger is its own partner in the pairing 0, for contacts with itself and with the palm.
@@ -86,7 +86,7 @@ def pair_slots(scene: Scene) -> int:
     return min(4 * d.links * d.spheres_per_link, (d.links * d.spheres_per_link) ** 2)
 
 
-class PairSet(SlotSet):
+class FingerContactSet(SlotSet):
     """Contacts between fingers, with themselves and the palm; a row is a pairing of all fingers."""
 
     def __init__(
@@ -139,14 +139,14 @@ class PairSet(SlotSet):
         sides = {f"side.{name}": (self.links + 1, (6,)) for name in ("motion", "vel", "push")}
         return super().groups() | sides
 
-    def bind(self, table: MemoryLayout, ref: Any, read: Callable[[str], Lanes]) -> "BoundPairs":
+    def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundFingerContacts":
         """See `ContactSet`."""
         cones = {name: self.cone(read, name) for name in self._names()}
-        return BoundPairs(self, table, ref, cones)
+        return BoundFingerContacts(self, table, cones)
 
 
 class OwnSide(NamedTuple):
-    """What `BoundPairs.load` needs of a slot's own side, read before anything is stored.
+    """What `BoundFingerContacts.load` needs of a slot's own side, read before anything is stored.
 
     NVIDIA's assembler moves no load before a store that might be to the same place, so a thread
     waits a second time for what is read behind a store.
@@ -162,19 +162,21 @@ class OwnSide(NamedTuple):
     wrench: Lanes | None
 
 
-class BoundPairs(BoundSlots):
+class BoundFingerContacts(BoundSlots):
     """Contacts between fingers with their memory."""
 
-    set: PairSet  # type: ignore[assignment]
+    set: FingerContactSet  # type: ignore[assignment]
 
-    def __init__(self, of: PairSet, table: MemoryLayout, ref: Any, cones: dict[str, contact.Cone]):
+    def __init__(self, of: FingerContactSet, table: BoundTable, cones: dict[str, contact.Cone]):
         """See `ContactSet.bind`; the cones by name."""
-        super().__init__(of, table, ref, next(iter(cones.values())))
+        super().__init__(of, table, next(iter(cones.values())))
         self.block, self._cones = Block(*of.block), cones
 
-    def pairing(self, row: Any) -> Pairing:
+    def pairing(self, row: Any) -> FingerPairing:
         """A row's pairing of the fingers."""
-        return Pairing(self.block, row + self.set.first, self.ref.dtype, alone=self.set.alone)
+        return FingerPairing(
+            self.block, row + self.set.first, self.table.dtype, alone=self.set.alone
+        )
 
     def of_row(self, row: Any, other: Any = None) -> contact.Cone:
         """The cone of a row's contacts; other: second sides, of which 0 is the palm."""
@@ -195,9 +197,9 @@ class BoundPairs(BoundSlots):
         yield
         self.cone = before
 
-    def holds(self, item: Any, pairing: Pairing) -> Lanes:
+    def holds(self, item: Any, pairing: FingerPairing) -> Lanes:
         """One for contacts whose friction is kept, zero for those with the palm."""
-        kept = jnp.ones((self.set.size,), self.ref.dtype)
+        kept = jnp.ones_like(self.like)
         if pairing.alone is not None:
             palm = pairing.alone & (self.read("other", item).lane < 0.5)
             kept = jnp.where(palm, 0.0, kept)
@@ -205,11 +207,11 @@ class BoundPairs(BoundSlots):
 
     def put(self, name: str, value: Lanes, row: Any) -> None:
         """Stores a link's "motion", "vel" or "push"; row 0 is the palm's."""
-        self.table.write(self.ref, f"side.{name}", value, row)
+        self.table.write(f"side.{name}", value, row)
 
     def pushed(self, row: Any) -> Lanes:
         """Wrench of all contacts on a link, (6, ...)."""
-        return self.table.read(self.ref, "side.push", row)
+        return self.table.read("side.push", row)
 
     def rows(self) -> int:
         """Number of a finger's rows."""
@@ -256,7 +258,7 @@ class BoundPairs(BoundSlots):
     def do(self, body: Callable) -> None:
         """Runs body(item, pairing), which stores something, over all slots in use."""
 
-        def one(item: Any, pairing: Pairing, carry: list) -> list:
+        def one(item: Any, pairing: FingerPairing, carry: list) -> list:
             body(item, pairing)
             return carry
 
@@ -278,7 +280,7 @@ class BoundPairs(BoundSlots):
 
     # One side's part of a contact
 
-    def relative(self, item: Any, pairing: Pairing) -> Lanes:
+    def relative(self, item: Any, pairing: FingerPairing) -> Lanes:
         """How the links' motion moves a slot's sides to each other, on its own side's lanes."""
         contacts, place = self.set.contacts, self.place(item)
 
@@ -301,11 +303,11 @@ class BoundPairs(BoundSlots):
         """Motions of the links in a field of a slot's lanes; zeros where nothing touches."""
         if self.set.gathers:
             row = self.read(field, item).lane.astype(jnp.int32)
-            return self.table.gather(self.ref, "side.motion", row, self.block.own)
-        start = zeros((6,), jnp.zeros((self.set.size,), self.ref.dtype))
+            return self.table.gather("side.motion", row, self.block.own)
+        start = zeros((6,), self.like)
 
         def take(row: Any, chosen: jax.Array, found: Lanes) -> Lanes:
-            new = self.table.read(self.ref, "side.motion", row)
+            new = self.table.read("side.motion", row)
             return lanewise(jnp.where, lanes([chosen], (), wide=True), new, found)
 
         return self._each_row(item, field, take, start)
@@ -332,10 +334,9 @@ class BoundPairs(BoundSlots):
 
     def clear_wrenches(self) -> None:
         """Sets the wrenches of all sides to zero."""
-        like = jnp.zeros((self.set.size,), self.ref.dtype)
 
         def clear(row: Any, x: jax.Array) -> jax.Array:
-            self.put("push", zeros((6,), like), row)
+            self.put("push", zeros((6,), self.like), row)
             return x
 
         jax.lax.fori_loop(0, self.rows(), clear, jnp.int32(0))
@@ -345,10 +346,10 @@ class BoundPairs(BoundSlots):
         if not self.set.gathers:
             return OwnSide(self.place(item), None, None)
         row = self.read("row", item).lane.astype(jnp.int32)
-        wrench = self.table.gather(self.ref, "side.push", row, self.block.own)
+        wrench = self.table.gather("side.push", row, self.block.own)
         return OwnSide(self.place(item), row, wrench)
 
-    def load(self, item: Any, own: OwnSide, force: Lanes, pairing: Pairing) -> None:
+    def load(self, item: Any, own: OwnSide, force: Lanes, pairing: FingerPairing) -> None:
         """Adds a slot's force to its own side's wrench, and takes it from the other side's."""
         contacts = self.set.contacts
 
@@ -375,9 +376,9 @@ class BoundPairs(BoundSlots):
         if self.set.gathers:
             if row is None or sums is None:
                 row = self.read(field, item).lane.astype(jnp.int32)
-                sums = self.table.gather(self.ref, "side.push", row, self.block.own)
+                sums = self.table.gather("side.push", row, self.block.own)
             sums = lanewise(jnp.add, sums, more)
-            self.table.scatter(self.ref, "side.push", sums, row, self.block.own)
+            self.table.scatter("side.push", sums, row, self.block.own)
             return
 
         def add(row: Any, chosen: jax.Array, nothing: list) -> list:
@@ -393,7 +394,7 @@ class BoundPairs(BoundSlots):
         """Adds the last step of the line search to jar; stores Hessians and adds up wrenches."""
         self.clear_wrenches()
 
-        def store(item: Any, pairing: Pairing) -> None:
+        def store(item: Any, pairing: FingerPairing) -> None:
             own = self.own_side(item)
             self.load(item, own, self.update_constraint(item, own.place, alpha), pairing)
 
@@ -407,7 +408,7 @@ class BoundPairs(BoundSlots):
         def response(place, cone, alpha, jar, step):
             return contact.constraint_update(contacts(place, cone), jar + alpha * step).force
 
-        def load(item: Any, pairing: Pairing) -> None:
+        def load(item: Any, pairing: FingerPairing) -> None:
             own, jar, step = self.own_side(item), self.read("jar", item), self.read("step", item)
             self.load(
                 item, own, lanewise(response, own.place, self.cone, alpha, jar, step), pairing
@@ -423,7 +424,7 @@ class BoundPairs(BoundSlots):
     def prepare_all(self) -> Lanes:
         """Prepares the line search of all slots; returns the sum of the slopes at 0."""
 
-        def add(item: Any, pairing: Pairing, sums: Lanes) -> Lanes:
+        def add(item: Any, pairing: FingerPairing, sums: Lanes) -> Lanes:
             slope = self.line(item, self.relative(item, pairing))
             return lanewise(lambda s, h, f: s + h * f, sums, pairing.half, slope)
 
@@ -432,7 +433,7 @@ class BoundPairs(BoundSlots):
     def slopes_of_all(self, alpha: Lanes, sums: list[Lanes]) -> list[Lanes]:
         """Sums of the first and second derivative of the cost by the step length."""
 
-        def add(item: Any, pairing: Pairing, sums: list[Lanes]) -> list[Lanes]:
+        def add(item: Any, pairing: FingerPairing, sums: list[Lanes]) -> list[Lanes]:
             new = self._slopes(item, alpha)
             return lanewise(tree_add_scaled, pairing.half, sums, new)
 

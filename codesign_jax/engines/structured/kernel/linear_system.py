@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.coupling import Eliminated
-from codesign_jax.engines.structured.kernel.finger_contacts import BoundPairs
+from codesign_jax.engines.structured.kernel.finger_contacts import BoundFingerContacts
 from codesign_jax.engines.structured.kernel.memory import choose, either, full, loop, upper
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem, make_body
 from codesign_jax.engines.structured.lanes import contract, dot, sum_fingers, total
@@ -107,8 +107,8 @@ class Elimination:
         """Inertia and wrench of an item's contacts, see `BoundContacts.push`."""
         return contacts.push(item, alpha)
 
-    def between_fingers(self, pairs: BoundPairs, alpha: Lanes) -> None:
-        """Prepares contacts between fingers, see `BoundPairs.update_constraints`."""
+    def between_fingers(self, pairs: BoundFingerContacts, alpha: Lanes) -> None:
+        """Prepares contacts between fingers, see `BoundFingerContacts.update_constraints`."""
         pairs.update_constraints(alpha)
 
     def touch(self, node: el.Quadratic, contacts: BoundContacts, i: Any, alpha: Lanes) -> Any:
@@ -174,7 +174,7 @@ class Elimination:
 
         step, done = lanewise(solve, now, self.problem.palm, node, slots)
         if self.problem.chambers:
-            self.problem.chambers.settle("z", step)
+            self.problem.chambers.settle("z", step.palm_motion, step.object_motion)
         return step, done
 
 

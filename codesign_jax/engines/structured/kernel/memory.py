@@ -1,7 +1,7 @@
 """Named numbers in a kernel's memory, and loops that carry them."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -92,42 +92,58 @@ class MemoryLayout:
             arrays[name] = flat[first : first + size].reshape(*items, kept, worlds)
         return arrays
 
-    def _row(self, name: str, item: Any) -> tuple[Any, tuple[int, ...]]:
-        _, shape = self.groups[name]
-        return self.offset[name] + item * self.stride[name], shape
 
-    def read(self, ref: Any, name: str, item: Any = 0, world: Any = None) -> Lanes:
-        """Lanes of an item; `world` is the world of each lane, for a table of worlds."""
-        row, shape = self._row(name, item)
-        where = () if self.wide else (world,)
-        values = [ref[(row + k, *where)] for k in range(int(np.prod(shape)))]
-        return lanes(values, shape, wide=self.wide)
+class BoundTable:
+    """A table in a kernel: its layout, and the reference to its memory.
 
-    def gather(self, ref: Any, name: str, item: jax.Array, lane: jax.Array) -> Lanes:
-        """Lanes of items that differ from lane to lane, of a table of fingers.
+    Attributes:
+      layout: The rows.
+      ref: Pallas' reference.
+      world: World of each lane, shape (lane,), for a table of worlds.
+    """
+
+    def __init__(self, layout: MemoryLayout, ref: Any, world: jax.Array | None = None):
+        self.layout, self.ref, self.world = layout, ref, world
+        self.dtype = ref.dtype
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.layout.groups
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Shape of an item."""
+        return self.layout.groups[name][1]
+
+    def _rows(self, name: str, item: Any) -> Iterator[Any]:
+        first = self.layout.offset[name] + item * self.layout.stride[name]
+        return (first + k for k in range(math.prod(self.shape(name))))
+
+    def read(self, name: str, item: Any = 0) -> Lanes:
+        """Lanes of an item."""
+        where = () if self.layout.wide else (self.world,)
+        values = [self.ref[(row, *where)] for row in self._rows(name, item)]
+        return lanes(values, self.shape(name), wide=self.layout.wide)
+
+    def write(self, name: str, value: Lanes, item: Any = 0) -> None:
+        """Stores an item; the lanes of a world store the same number."""
+        where = () if self.layout.wide else (self.world,)
+        size = self.ref.shape[-1:] if self.layout.wide else self.world.shape  # type: ignore[union-attr]
+        for row, part in zip(self._rows(name, item), value.parts.ravel(), strict=True):
+            self.ref[(row, *where)] = splat(part, size, value.dtype)
+
+    def gather(self, name: str, item: jax.Array, lane: jax.Array) -> Lanes:
+        """Items that differ from lane to lane, of a table of fingers.
 
         Args:
-          ref: The memory.
-          name: Name of the rows.
           item: Item that each lane reads, int32, shape (lane,).
           lane: Lane whose item it reads, same shape.
         """
-        row, shape = self._row(name, item)
-        return lanes([ref[row + k, lane] for k in range(int(np.prod(shape)))], shape, wide=True)
+        values = [self.ref[row, lane] for row in self._rows(name, item)]
+        return lanes(values, self.shape(name), wide=True)
 
-    def scatter(self, ref: Any, name: str, value: Lanes, item: jax.Array, lane: jax.Array) -> None:
+    def scatter(self, name: str, value: Lanes, item: jax.Array, lane: jax.Array) -> None:
         """Stores items that differ from lane to lane; arguments as in `gather`."""
-        row, _ = self._row(name, item)
-        for k, part in enumerate(value.parts.ravel()):
-            ref[row + k, lane] = splat(part, lane.shape, value.dtype)
-
-    def write(self, ref: Any, name: str, value: Lanes, item: Any = 0, world: Any = None) -> None:
-        """Stores an item; the lanes of a world store the same number."""
-        row, _ = self._row(name, item)
-        where = () if self.wide else (world,)
-        size = ref.shape[-1:] if self.wide else world.shape
-        for k, part in enumerate(value.parts.ravel()):
-            ref[(row + k, *where)] = splat(part, size, value.dtype)
+        for row, part in zip(self._rows(name, item), value.parts.ravel(), strict=True):
+            self.ref[row, lane] = splat(part, lane.shape, value.dtype)
 
 
 def lengthened(array: jax.Array, axis: int, length: int) -> jax.Array:

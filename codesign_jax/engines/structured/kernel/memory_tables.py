@@ -19,10 +19,14 @@ from codesign_jax.engines.structured.kernel import (
 )
 from codesign_jax.engines.structured.kernel.contact_sets import ContactSet
 from codesign_jax.engines.structured.kernel.finger_collision import TIP, ring_places
-from codesign_jax.engines.structured.kernel.finger_contacts import PairSet, pair_slots
+from codesign_jax.engines.structured.kernel.finger_contacts import FingerContactSet, pair_slots
 from codesign_jax.engines.structured.kernel.memory import MemoryLayout, lengthened
 from codesign_jax.engines.structured.kernel.slots import SlotSet
-from codesign_jax.engines.structured.kernel.team_contacts import TeamFieldSet, TeamPairSet
+from codesign_jax.engines.structured.kernel.step_memory import KernelLayout
+from codesign_jax.engines.structured.kernel.team_contacts import (
+    TeamFingerContactSet,
+    TeamSdfContactSet,
+)
 from codesign_jax.engines.structured.laws import shapes, surroundings
 from codesign_jax.engines.structured.laws.air import volumes
 from codesign_jax.engines.structured.laws.cones import own_friction
@@ -47,19 +51,8 @@ def rings_of_link(scene: Scene) -> int:
     return scene.discretization.hull_rings * int(between or e.finger_object or e.finger_table)
 
 
-class Tables:
-    """Contacts and tables of a scene's kernel for one size of block.
-
-    Attributes:
-      links: Moving links of a finger; `axes`: axes of a joint.
-      fingers: Fingers of a block, a power of two; `num_fingers`: those of the scene.
-      block: Worlds of a block; `size`: its lanes.
-      team: Lanes of a finger; `columns`: columns of the tables of fingers, which they share.
-      k: Rings or contact spheres of a link; `palm_groups`: of the palm, for each finger's lanes.
-      sets: The contacts.
-      hand: Rows of the hand's table; likewise `world`, `finger_state`, `world_state`, `scratch`,
-        and with teams `onchip`.
-    """
+class Tables(KernelLayout):
+    """Contacts and tables of a scene's kernel for one size of block."""
 
     remembers: tuple[str, ...] = ()
     """Further numbers of the slots of contacts between fingers."""
@@ -95,26 +88,21 @@ class Tables:
         e, k, n = self.scene.effects, self.k, len(surroundings.fields(self.scene))
         make = partial(ContactSet, self.scene, size=self.size)
         on = {"finger_object": k * e.finger_object, "finger_table": n * k * e.finger_table}
-        fields = make if self.team == 1 else partial(TeamFieldSet, self.scene, self)
+        fields = make if self.team == 1 else partial(TeamSdfContactSet, self.scene, self)
         sets = [fields(name, self.links, on[name]) for name in on if on[name]]
         if self.between:
             block, slots = (self.fingers, self.block), pair_slots(self.scene)
             how = {"gathers": self.gathers, "remembers": self.remembers}
             if self.team == 1:
-                sets.append(PairSet(self.scene, block, self.links, slots, **how))
+                sets.append(FingerContactSet(self.scene, block, self.links, slots, **how))
             else:
                 block = (*block, self.team)
-                sets.append(TeamPairSet(self.scene, block, self.links, slots, **how))
+                sets.append(TeamFingerContactSet(self.scene, block, self.links, slots, **how))
         on = {"palm_object": int(e.palm_object), "palm_table": n * e.palm_table}
         sets += [make(name, self.palm_groups, on[name]) for name in on if on[name]]
         groups = -(-surroundings.slots(self.scene) // self.fingers)
         on_table = [make("object_table", groups, 1)] if e.object_table and groups else []
         return [*sets, *on_table]
-
-    @property
-    def tapered(self) -> bool:
-        """Whether the sections of fingers change along them."""
-        return self.scene.hand.section.tapered
 
     @property
     def rows(self) -> int:
@@ -217,7 +205,7 @@ class Tables:
             fields |= chambers.fields(n, a)
         if self.slotted or self.scene.effects.air_mass:
             fields |= {"inverse": (n, (a, a)), "z_again": (n, (a,))}
-        if any(isinstance(s, PairSet) for s in self.sets):
+        if any(isinstance(s, FingerContactSet) for s in self.sets):
             fields |= finger_collision.fields(n)
         if self.team > 1:
             onchip = shared_memory.layout(n, a)

@@ -52,7 +52,7 @@ LARGEST = 1e-3
 """Decrement of an iteration behind which the next one is likely to be below the tolerance."""
 
 
-class Chord:
+class ChordStep:
     """The chord method's step behind a Newton step, of which the last matrix is left."""
 
     def __init__(self, problem: Problem):
@@ -127,7 +127,7 @@ class Chord:
         given = now, problem.palm, done, r, ro, work, self._pushes(alpha)
         step, work = lanewise(self._at_palm, *given)
         if chambers:
-            chambers.settle("z_again", step)
+            chambers.settle("z_again", step.palm_motion, step.object_motion)
         return step, work
 
     def _pushes(self, alpha: Lanes) -> dict[str, Lanes]:
@@ -178,7 +178,7 @@ class Chord:
         loop(self.links, one, problem.widened(step.palm_motion), self.block.size)
 
 
-class Quality(NamedTuple):
+class Convergence(NamedTuple):
     """How the iteration stands: relative decrement, lanes of a world; count, a scalar."""
 
     residual: Any
@@ -197,11 +197,11 @@ class Newton:
         self.coupling = Coupling if one else TeamCoupling
         # A GPU's lanes wait for the one that needs most iterations, so that it gains nothing there.
         vectors = one and problem.slotted and not problem.slotted[0].set.gathers
-        self.chord = Chord(problem) if vectors else None
+        self.chord = ChordStep(problem) if vectors else None
 
     def solve(
         self, now: Iterate, waiting: jax.Array, iterations: int, evaluations: int, tolerance: float
-    ) -> tuple[Iterate, Quality]:
+    ) -> tuple[Iterate, Convergence]:
         """Iterates until every undecided world has converged.
 
         Args:
@@ -249,7 +249,7 @@ class Newton:
         count, *arrays = jax.lax.while_loop(going, body, [jnp.int32(0), *start])
         now, residual, last = rebuild(arrays)
         loop(problem.links, lambda i, _: (problem.move("acc", i, last), [])[1], [], self.block.size)
-        return now, Quality(residual, count)
+        return now, Convergence(residual, count)
 
     def confirm(
         self,
@@ -273,7 +273,7 @@ class Newton:
           tolerance: Relative Newton decrement.
 
         Returns:
-          Iterate, length and decrement, see `Chord`; the length belongs to "step_acc" of the links.
+          Iterate, length and decrement, see `ChordStep`; the length is that of "step_acc".
         """
         chord, pairs, size = self.chord, self.problem.pairs, self.block.size
         assert chord is not None

@@ -14,7 +14,7 @@ import numpy as np
 
 from codesign_jax.engines.structured.kernel.memory import (
     Block,
-    MemoryLayout,
+    BoundTable,
     anywhere,
     choose,
     loop,
@@ -87,36 +87,25 @@ def rows(found: MeshLanes, fingers: int, dtype: Any) -> dict[str, jax.Array]:
 
 
 def read(
-    scene: Scene,
-    block: Block,
-    world: tuple[MemoryLayout, Any],
-    hand: tuple[MemoryLayout, Any],
-    values: Any,
+    scene: Scene, block: Block, world: BoundTable, hand: BoundTable, values: Any
 ) -> WorldObject:
     """The objects of a block.
 
     Args:
-      scene: The scene.
-      block: The lanes.
-      world: Table of the worlds' constants and its reference.
-      hand: Table of the hand's constants and its reference.
+      world: The worlds' constants; `hand`: the hand's.
       values: Reference to the grid values of all meshes; None without meshes.
     """
-
-    def constant(name: str) -> Lanes:
-        return world[0].read(world[1], name, 0, block.world)
-
-    size, shape = constant("object_size"), constant("object_id")
+    size, shape = world.read("object_size"), world.read("object_id")
     if values is None:
         return WorldObject(size, shape, block, None)
     indices = np.array(shapes.mesh_indices(scene), np.int32)
     meshed = lanewise(lambda s: jnp.isin(s.astype(jnp.int32), indices), shape)
     found = MeshMemory(
         values,
-        partial(hand[0].read, hand[1], "support"),
-        hand[0].groups["support"][0],
-        GridLanes(*(constant(f"grid_{name}") for name in GridLanes._fields)),
-        constant("grid_reach"),
+        partial(hand.read, "support"),
+        hand.layout.groups["support"][0],
+        GridLanes(*(world.read(f"grid_{name}") for name in GridLanes._fields)),
+        world.read("grid_reach"),
         meshed,
     )
     return WorldObject(size, shape, block, found)

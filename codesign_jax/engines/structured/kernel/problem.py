@@ -1,4 +1,4 @@
-"""A step's problem for the solver: a kernel's memory, its contacts, and palm, wrist and object."""
+"""A step's problem for the solver: its memory and contacts, and palm, wrist and object."""
 
 from typing import Any, NamedTuple
 
@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.chambers import Chambers
-from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
-from codesign_jax.engines.structured.kernel.finger_contacts import BoundPairs
-from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout, tree_add_scaled
+from codesign_jax.engines.structured.kernel.contact_sets import zeros
+from codesign_jax.engines.structured.kernel.finger_contacts import BoundFingerContacts
+from codesign_jax.engines.structured.kernel.memory import tree_add_scaled
+from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 from codesign_jax.engines.structured.laws.inertia import Body, Centred
 
@@ -39,75 +40,38 @@ class Iterate(NamedTuple):
     object_motion: Any
 
 
-class Memory(NamedTuple):
-    """A kernel's memory: tables with their refs, and the bound contact sets by name."""
-
-    hand: MemoryLayout
-    hand_ref: Any
-    state: MemoryLayout
-    state_ref: Any
-    scratch: MemoryLayout
-    scratch_ref: Any
-    contacts: dict[str, BoundContacts]
-    onchip: MemoryLayout | None = None
-    onchip_ref: Any = None
-
-    @property
-    def tables(self) -> list[tuple[MemoryLayout, Any]]:
-        """The tables with their references."""
-        found = [(self.hand, self.hand_ref), (self.state, self.state_ref)]
-        more = (self.scratch, self.scratch_ref), (self.onchip, self.onchip_ref)
-        return [*found, *((t, r) for t, r in more if t is not None)]
-
-    def table(self, name: str) -> tuple[MemoryLayout, Any]:
-        """The table that has a name, with its reference."""
-        return next((t, r) for t, r in self.tables if name in t.groups)
-
-
 class Problem:
     """The solver's problem of one step.
 
     Attributes:
-      links: Moving links of a finger.
-      block: The lanes.
-      m: The memory.
+      m: The step's memory, in which the forward pass has left its results.
       palm: Palm, wrist and object.
-      rigid: Whether the wrist's accelerations are known, see `problem.Problem.palm_acc`.
-      pairs: Contacts between fingers, if there are any.
+      links: Moving links of a finger; `block`: the lanes; `like`: zeros of their shape and type.
+      rigid: Whether the wrist's accelerations are known and no unknowns.
+      pairs: Contacts between fingers, if there are any; `slotted`: the same as a list.
       fingers: Contacts of the fingers with the object and the table.
       slots: Contacts of the palm, and of the object with the table.
-      slotted: Those of `pairs`, in slots.
       chambers: Chambers with a mass of air; None without the effect.
-      like: Zeros of the lanes' shape and type.
     """
 
-    def __init__(self, links: int, block: Block, m: Memory, palm: Palm, *, rigid: bool = False):
-        """Takes the step's memory, in which the forward pass has left its results."""
-        self.links, self.block, self.m, self.palm, self.rigid = links, block, m, palm, rigid
-        self.pairs: BoundPairs | None = m.contacts.get("finger_finger")  # type: ignore[assignment]
-        self.fingers = [m.contacts[n] for n in ("finger_object", "finger_table") if n in m.contacts]
-        self.slots = [c for n, c in m.contacts.items() if not n.startswith("finger")]
+    def __init__(self, m: StepMemory, palm: Palm):
+        self.m, self.palm, self.links, self.block = m, palm, m.p.links, m.block
+        self.rigid, found = not m.p.scene.effects.wrist, m.contacts
+        self.pairs: BoundFingerContacts | None = found.get("finger_finger")  # type: ignore[assignment]
+        self.fingers = [found[n] for n in ("finger_object", "finger_table") if n in found]
+        self.slots = [c for n, c in found.items() if not n.startswith("finger")]
         self.slotted = [self.pairs] if self.pairs else []
-        self.like = jnp.zeros((block.size,), palm.armature.dtype)
-        self.chambers = Chambers(self) if "air_step" in m.scratch.groups else None
+        self.like = jnp.zeros((self.block.size,), palm.armature.dtype)
+        self.chambers = Chambers(m) if "air_step" in m.scratch else None
 
     def read(self, *names: str, item: Any = 0) -> list[Lanes]:
-        """Reads names from the table that has them.
-
-        Of the joints' armature that of this step, if it changes.
-        """
-        if "armature_now" in self.m.scratch.groups:
+        """Reads names; of the joints' armature that of this step, if it changes."""
+        if "armature_now" in self.m.scratch:
             names = tuple("armature_now" if n == "armature" else n for n in names)
-        found = []
-        for name in names:
-            table, ref = self.m.table(name)
-            found.append(table.read(ref, name, item))
-        return found
+        return [self.m.read(name, item) for name in names]
 
     def write(self, name: str, value: Lanes, item: Any) -> None:
-        """Writes to the table that has the name."""
-        table, ref = self.m.table(name)
-        table.write(ref, name, value, item)
+        self.m.write(name, value, item)
 
     def move(self, name: str, item: Any, alpha: Lanes) -> Lanes:
         """Adds the last step to a link's "acc" or "motion", and returns the sum."""

@@ -224,17 +224,14 @@ class Program(Packing):
         own = block.world
         _copy(finger_state0, finger_state, self.finger_state.rows)
         _copy(world_state0, world_state, self.world_state.rows, own)
-        bounds = verdict.Bounds(
-            *(self.world.read(world, n, 0, own).lane for n in verdict.Bounds._fields)
-        )
+        bounds = verdict.Bounds(*(step.constant(n).lane for n in verdict.Bounds._fields))
 
         def number(name: str) -> jax.Array:
-            return self.world_state.read(world_state, name, 0, own).lane
+            return step.world_state.read(name).lane
 
         def keep(**numbers: jax.Array) -> None:
             for name, value in numbers.items():
-                value = lanes([value], (), wide=False)
-                self.world_state.write(world_state, name, value, 0, own)
+                step.world_state.write(name, lanes([value], (), wide=False))
 
         def store(place: jax.Array, whole: bool, fingers: Any, worlds: Any) -> None:
             angles, places = self.path_rows(whole)
@@ -261,7 +258,9 @@ class Program(Packing):
             record(t)
             commands = lanes([arm[t, k, own] for k in range(6)], (6,), wide=False)
             chamber = lanes([pressure[t]], (), wide=True)
-            entry, new_speed, moved = step.advance(commands, chamber, undecided, going > 0, fastest)
+            entry, new_speed, moved = step.advance(
+                commands, chamber, undecided, going > 0, fastest, self.limits
+            )
             going = jnp.where(moved, going, 0.0)
             for k, value in enumerate((*entry[:2], fastest, *entry[2:4], going, *entry[4:])):
                 trace[t, k, own] = value

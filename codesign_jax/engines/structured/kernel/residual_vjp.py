@@ -20,14 +20,18 @@ from codesign_jax.engines.structured.kernel import (
     sdf_collision,
 )
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
-from codesign_jax.engines.structured.kernel.cotangents import Bars, only_on, plus, pull
-from codesign_jax.engines.structured.kernel.finger_contacts import BoundPairs, Pairing
+from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, only_on, plus, pull
+from codesign_jax.engines.structured.kernel.finger_contacts import (
+    BoundFingerContacts,
+    FingerPairing,
+)
 from codesign_jax.engines.structured.kernel.memory import choose, loop
 from codesign_jax.engines.structured.kernel.objects import WorldObject
-from codesign_jax.engines.structured.kernel.problem import Iterate, Memory
+from codesign_jax.engines.structured.kernel.problem import Iterate
 from codesign_jax.engines.structured.kernel.residual import Chain, Line, Place
 from codesign_jax.engines.structured.kernel.slots import any_of
-from codesign_jax.engines.structured.kernel.step import FINGER_CONSTANTS, LINK_CONSTANTS, Step
+from codesign_jax.engines.structured.kernel.step import Step
+from codesign_jax.engines.structured.kernel.step_memory import FINGER_CONSTANTS, LINK_CONSTANTS
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
@@ -38,40 +42,38 @@ from codesign_jax.model.layout import touches_itself
 SHAPES = Chain((3,), (3, 3), (6,), (6,), (6,), (6,))
 
 
-class Sweep:
+class ResidualVjp:
     """Adds a step's part of the cotangents, given its virtual accelerations."""
 
     def __init__(
         self,
         step: Step,
-        m: Memory,
         state: dict[str, Lanes],
         at: dict[str, Any],
         thing: WorldObject,
         virtual: Iterate,
-        bars: Bars,
+        bars: CotangentTables,
     ):
         """Takes a step's memory and geometry as the forward pass has left them, see `Step`.
 
         Args:
-          step: The step.
-          m: Its memory.
           state: Positions and velocities of wrist and object.
           at: What `Step` calculates of palm and object.
           thing: The objects.
           virtual: Virtual accelerations, see `AdjointSolve.solve`.
           bars: The cotangents so far.
         """
-        self.step, self.p, self.m, self.at, self.thing = step, step.p, m, at, thing
+        self.step, self.p, self.at, self.thing = step, step.p, at, thing
+        self.contacts, self.scratch = step.contacts, step.scratch
         self.virtual, self.bars, self.block = virtual, bars, step.block
-        self.like = jnp.zeros((step.p.size,), step.finger_state.dtype)
+        self.like = step.like
         self.one = lanes([self.like + 1.0], (), wide=True)
         self.object = {"columns": at["columns"], "object_vel": at["object_vel"]}
         self.object |= {"height": state["position"][2]}
         if self.p.scene.fixture:
             self.object |= {"position": state["position"]}
         names = ("object_size", "grid_origin", "grid_cell", "grid_factor")
-        self.object |= {n: step.constant(n) for n in names if n in step.p.world.groups}
+        self.object |= {n: step.constant(n) for n in names if n in step.world}
         self.still: dict[str, Any] = {"object_id": step.constant("object_id")}
         self.still |= {"object_motion": at["now"].object_motion}
         self.still |= {"object_along": virtual.object_motion}
@@ -82,7 +84,7 @@ class Sweep:
     def chain(self, i: Any) -> Chain:
         """What the link before joint i hands on."""
         names = (f"chain.{n}" for n in Chain._fields)
-        return Chain(*(self.m.scratch.read(self.m.scratch_ref, n, i) for n in names))
+        return Chain(*(self.scratch.read(n, i) for n in names))
 
     def fingers(self, pressure: Lanes, centre_bar: Lanes) -> Chain:
         """Goes through the fingers from their tips, and through the contacts of their links.
@@ -95,7 +97,7 @@ class Sweep:
           Cotangents of what the palm hands on, on each finger's lanes.
         """
         p, tips = self.p, self.p.links
-        touching = [n for n in ("finger_object", "finger_table") if n in self.m.contacts]
+        touching = [n for n in ("finger_object", "finger_table") if n in self.contacts]
 
         def link(i: Any, after: Chain) -> Chain:
             if touching:
@@ -117,16 +119,15 @@ class Sweep:
 
     def more(self, bars: Chain, i: Any) -> Chain:
         """Adds what contacts between fingers have left for a link."""
-        if "pairbar.origin" not in self.p.scratch.groups:
+        if "pairbar.origin" not in self.scratch:
             return bars
-        read = partial(self.p.scratch.read, self.step.scratch)
-        return _add(bars, **{n: read(f"pairbar.{n}", i) for n in Place._fields})
+        return _add(bars, **{n: self.scratch.read(f"pairbar.{n}", i) for n in Place._fields})
 
     def _link(self, i: Any, after: Chain, pressure: Lanes, centre_bar: Lanes) -> Chain:
         numbers, joint = self.step.link_constants(i), self.step.joint(i)
         still = {"acc": joint.pop("acc")}
-        still["virtual"] = self.m.scratch.read(self.m.scratch_ref, "virtual", i)
-        share = self.p.hand.read(self.step.hand, "share", i + 1)
+        still["virtual"] = self.scratch.read("virtual", i)
+        share = self.step.hand.read("share", i + 1)
         still["centre_bar"] = lanewise(jnp.multiply, centre_bar, share)
         run, joint = partial(residual.of_link, self.p.scene), joint | {"pressure": pressure}
         before, own, moved = pull(run, (self.chain(i), numbers, joint), (still,), (after, self.one))
@@ -138,7 +139,7 @@ class Sweep:
         return before
 
     def _mount(self, base: Chain, centre_bar: Lanes) -> Chain:
-        read = partial(self.p.hand.read, self.step.hand)
+        read = self.step.hand.read
         names = ("mount", "base", "stub_centre")
         palm = self.at["place"], self.at["frame"]
 
@@ -157,26 +158,26 @@ class Sweep:
 
     def palm_and_table(self, base: Chain) -> Chain:
         """Adds the contacts of the palm's rings or spheres, and of the object with the table."""
-        names = [n for n in ("palm_object", "palm_table") if n in self.m.contacts]
+        names = [n for n in ("palm_object", "palm_table") if n in self.contacts]
         at, now = self.at, self.at["now"]
         place = Place(
             at["place"], at["frame"], at["vel"], now.palm_motion, self.virtual.palm_motion
         )
-        if "palmbar.origin" in self.p.scratch.groups:
-            read = partial(self.p.scratch.read, self.step.scratch)
-            base = _add(base, **{n: read(f"palmbar.{n}") for n in Place._fields})
+        if "palmbar.origin" in self.scratch:
+            more = {n: self.scratch.read(f"palmbar.{n}") for n in Place._fields}
+            base = _add(base, **more)
         for i in range(self.p.palm_groups if names else 0):
             for name in names:
                 new = self.rings(name, i, place, "palm_ring")
                 base = _add(base, **new._asdict())
-        if residual.TABLE in self.m.contacts:
+        if residual.TABLE in self.contacts:
             self._table()
         return base
 
     def rings(self, name: str, i: Any, place: Place, table: str = "ring") -> Place:
         """Cotangents of a body, of an item of the contacts of its rings."""
         k = self.p.k if table == "ring" else 1
-        rows = [self.p.hand.read(self.step.hand, table, i * k + j) for j in range(k)]
+        rows = [self.step.hand.read(table, i * k + j) for j in range(k)]
         numbers = lanewise(lambda rows: jnp.stack(rows, 1), rows)
 
         def compute(at: dict, still: dict) -> Place:
@@ -199,12 +200,12 @@ class Sweep:
     def _touching(self, name: str, i: Any, compute: Callable[[dict, dict], Place]) -> Place:
         """What is computed of an item's contacts if there are any."""
         at, empty = self._object(name), Place(*(self.none(n) for n in Place._fields))
-        contacts = self.m.contacts[name]
+        contacts = self.contacts[name]
         still = self.still | {"share": contacts.read("share", i)}
         return choose(contacts.touching(i), lambda: compute(at, still), empty, self.p.size)
 
     def _table(self) -> None:
-        contacts, p = self.m.contacts[residual.TABLE], self.p
+        contacts, p = self.contacts[residual.TABLE], self.p
         finger = lanes([self.block.finger.astype(self.like.dtype)], (), wide=True)
         at, still = self._object(residual.TABLE), self.still
         if "meshed" in still:
@@ -274,22 +275,22 @@ def _add(bars: Chain, **more: Lanes) -> Chain:
 CONE, ON_PALM = "cone.finger_finger", "cone.finger_palm"
 
 
-class PairSweep:
+class FingerContactsVjp:
     """Leaves the cotangents of the links with contacts between fingers as "pairbar"."""
 
-    def __init__(self, sweep: "Sweep", pairs: BoundPairs):
+    def __init__(self, sweep: ResidualVjp, pairs: BoundFingerContacts):
         """Takes a step's sweep and its contacts between fingers."""
         self.sweep, self.pairs, self.p, self.bars = sweep, pairs, sweep.p, sweep.bars
         self.like, self.lane = sweep.like, sweep.block.lane
-        self.scratch, self.ref = sweep.p.scratch, sweep.step.scratch
+        self.scratch, self.hand = sweep.scratch, sweep.step.hand
 
     def run(self) -> None:
         """Goes through all contacts."""
 
         def clear(i: jax.Array, x: jax.Array) -> jax.Array:
             for name in Place._fields:
-                shape = self.scratch.groups[f"pairbar.{name}"][1]
-                self.scratch.write(self.ref, f"pairbar.{name}", zeros(shape, self.like), i)
+                name = f"pairbar.{name}"
+                self.scratch.write(name, zeros(self.scratch.shape(name), self.like), i)
             return x
 
         jax.lax.fori_loop(0, self.p.links + 1, clear, jnp.int32(0))
@@ -297,7 +298,7 @@ class PairSweep:
         if effects.finger_palm:
             self._leave_palm(Place(*(self.sweep.none(n) for n in Place._fields)), first=True)
 
-        def slot(item: Any, pairing: Pairing) -> None:
+        def slot(item: Any, pairing: FingerPairing) -> None:
             read = self.pairs.read
             owner = read("owner", item).lane > 0.5
             live = owner & (read("share", item).lane > 0)
@@ -336,12 +337,12 @@ class PairSweep:
         for name, value in bars._asdict().items():
             name = f"palmbar.{name}"
             if not first:
-                value = plus(self.scratch.read(self.ref, name), value)
-            self.scratch.write(self.ref, name, value)
+                value = plus(self.scratch.read(name), value)
+            self.scratch.write(name, value)
 
     # Fingers
 
-    def _spheres(self, item: Any, pairing: Pairing, live: jax.Array) -> None:
+    def _spheres(self, item: Any, pairing: FingerPairing, live: jax.Array) -> None:
         """Adds the cotangents of two spheres."""
         number, row, ring = self._ring(item)
         other = jax.lax.div(self.pairs.read("ring", item).lane.astype(jnp.int32), self._count)
@@ -357,7 +358,7 @@ class PairSweep:
         self.bars.add({"ring": own}, other, self.lane)
         self._leave(place._asdict(), row_of(other, self.p.k))
 
-    def _on_finger(self, item: Any, pairing: Pairing, live: jax.Array) -> None:
+    def _on_finger(self, item: Any, pairing: FingerPairing, live: jax.Array) -> None:
         """Adds the cotangents of a ring and of another finger's segment."""
         row = self.pairs.read("row", item)
         other = pairing.swap(row).lane.astype(jnp.int32)
@@ -366,7 +367,7 @@ class PairSweep:
         line, where = pairing.swap((theirs, self._float(other)))
         self._leave_line(line, where.lane.astype(jnp.int32))
 
-    def _on_itself(self, item: Any, pairing: Pairing, live: jax.Array) -> None:
+    def _on_itself(self, item: Any, pairing: FingerPairing, live: jax.Array) -> None:
         """Adds the cotangents of a ring and of its own finger's segment."""
         other = self.pairs.read("other", item).lane.astype(jnp.int32)
         search = self.sweep.step.search
@@ -377,7 +378,7 @@ class PairSweep:
         self._leave_line(line, other)
 
     def _rings(
-        self, item: Any, pairing: Pairing, live: jax.Array, other: Any, lane: Any, still: dict
+        self, item: Any, pairing: FingerPairing, live: jax.Array, other: Any, lane: Any, still: dict
     ) -> Line:
         """Adds the cotangents of a ring; returns those of the segment that it touches."""
         number, row, ring = self._ring(item)
@@ -390,7 +391,7 @@ class PairSweep:
         args = (self._body(row), ring), line, self.sweep.step.constant(CONE), held
         found = pull(partial(residual.between_rings, self.p.scene), args, (still,), self._one)
         (place, own_ring), line, cone, kept = only_on(self._side(live), found)
-        friction_memory.leave(self.sweep.step, pairing, kept)
+        friction_memory.leave(self.bars, pairing, kept)
         self.bars.add({CONE: cone})
         self.bars.add({"ring": own_ring}, number, self.lane)
         self._leave(place._asdict(), row)
@@ -432,12 +433,12 @@ class PairSweep:
         """Number of a slot's ring, its link and its numbers."""
         number = self.pairs.read("ring", item).lane.astype(jnp.int32)
         number = jax.lax.rem(number, self._count)
-        ring = self.p.hand.gather(self.sweep.step.hand, "ring", number, self.lane)
+        ring = self.hand.gather("ring", number, self.lane)
         return number, row_of(number, self.p.k), ring
 
-    def _numbers(self, number: jax.Array, pairing: Pairing, lane: Any = None) -> Lanes:
+    def _numbers(self, number: jax.Array, pairing: FingerPairing, lane: Any = None) -> Lanes:
         lane = pairing.lane if lane is None else lane
-        return self.p.hand.gather(self.sweep.step.hand, "ring", number, lane)
+        return self.hand.gather("ring", number, lane)
 
     def _body(self, row: jax.Array, lane: Any = None) -> Place:
         """A link."""
@@ -445,13 +446,13 @@ class PairSweep:
 
     def _chain(self, name: str, row: jax.Array, lane: Any = None) -> Lanes:
         lane = self.lane if lane is None else lane
-        return self.scratch.gather(self.ref, f"chain.{name}", row, lane)
+        return self.scratch.gather(f"chain.{name}", row, lane)
 
     def _leave(self, values: dict[str, Lanes], row: jax.Array) -> None:
         for name, value in values.items():
             name = f"pairbar.{name}"
-            old = self.scratch.gather(self.ref, name, row, self.lane)
-            self.scratch.scatter(self.ref, name, plus(old, value), row, self.lane)
+            old = self.scratch.gather(name, row, self.lane)
+            self.scratch.scatter(name, plus(old, value), row, self.lane)
 
 
 def row_of(number: jax.Array, k: int) -> jax.Array:

@@ -6,17 +6,18 @@ looked at further.
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import objects
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
-from codesign_jax.engines.structured.kernel.finger_collision import Search
+from codesign_jax.engines.structured.kernel.finger_collision import FingerCollision
 from codesign_jax.engines.structured.kernel.objects import WorldObject
-from codesign_jax.engines.structured.kernel.problem import Memory, relative
+from codesign_jax.engines.structured.kernel.problem import relative
 from codesign_jax.engines.structured.kernel.slots import any_of
+from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import cross, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact, rings, shapes, surroundings
@@ -24,21 +25,18 @@ from codesign_jax.engines.structured.laws.cones import own_friction
 from codesign_jax.engines.structured.laws.rings import Place, Ring
 from codesign_jax.engines.structured.world_model import apply_columns
 
-if TYPE_CHECKING:
-    from codesign_jax.engines.structured.kernel.step import Step
-
-
 OUTSIDE = 1.5
 """Farthest point of a ring over the largest of its half axes."""
 
 
-class FieldContacts:
+class SdfCollision:
     """Enters the contacts of fingers, palm and object with object and table."""
 
-    def __init__(self, step: "Step", at: dict[str, Any], m: Memory, thing: WorldObject):
+    def __init__(self, step: StepMemory, at: dict[str, Any], thing: WorldObject):
         """Takes a step's memory and geometry, see `Step`."""
-        self.step, self.p, self.at, self.m, self.thing = step, step.p, at, m, thing
-        self.names = [n for n in ("finger_object", "finger_table") if n in m.contacts]
+        self.step, self.p, self.at, self.thing = step, step.p, at, thing
+        self.contacts = step.contacts
+        self.names = [n for n in ("finger_object", "finger_table") if n in self.contacts]
         self.hull = step.p.scene.effects.surface == "hull"
 
     def looks(self, name: str) -> list[Callable[[Lanes], tuple[Lanes, Lanes]]]:
@@ -48,9 +46,7 @@ class FieldContacts:
         """
         if name.endswith("_object"):
             return [self._object]
-        position = self.p.world_state.read(
-            self.step.world_state, "position", 0, self.step.block.world
-        )
+        position = self.step.world_state.read("position")
         return [partial(lanewise, field, position) for field in surroundings.fields(self.p.scene)]
 
     def _object(self, point: Lanes) -> tuple[Lanes, Lanes]:
@@ -91,10 +87,10 @@ class FieldContacts:
             centre = lanewise(ring_centres, origin, frame, numbers)
             self.on_field(name, i, numbers, frame, centre, self.moves(name, motion, vel))
 
-    def of_rings(self, search: Search) -> None:
+    def of_rings(self, search: FingerCollision) -> None:
         """Contacts of the fingers' rings, dealt to the lanes of a team."""
         for name in self.names:
-            contacts = self.m.contacts[name]
+            contacts = self.contacts[name]
             contacts.begin_step()  # type: ignore[attr-defined]
 
             def one(slot: Any, item: jax.Array, nothing: list, name: str = name) -> list:
@@ -108,12 +104,12 @@ class FieldContacts:
 
     def numbers(self, i: Any) -> Lanes:
         """Numbers of a link's rings, shape (8, k)."""
-        k, read = self.p.k, partial(self.p.hand.read, self.step.hand, "ring")
+        k, read = self.p.k, partial(self.step.hand.read, "ring")
         return lanewise(lambda rows: jnp.stack(rows, 1), [read(i * k + j) for j in range(k)])
 
     def on_field(self, name: str, i: Any, numbers: Lanes, frame: Lanes, centre: Lanes, moves: Any):
         """Creates contacts of rings or balls of a body."""
-        contacts, looks = self.m.contacts[name], self.looks(name)
+        contacts, looks = self.contacts[name], self.looks(name)
         found = [look(centre) for look in looks]
         friction = self.frictions(name, contacts.set.k // len(looks))
         if not self.hull:
@@ -121,8 +117,7 @@ class FieldContacts:
             return contacts.create(i, joined(places), *moves, friction=friction)
         run = partial(may_touch, self.p.scene.discretization.timestep)
         near = [lanewise(run, numbers, centre, first[0], moves[1]).lane for first in found]
-        like = jnp.zeros((self.p.size,), self.step.finger_state.dtype)
-        contacts.write("share", zeros((1, contacts.set.k), like), i)
+        contacts.write("share", zeros((1, contacts.set.k), self.step.like), i)
         flat = not name.endswith("_object") and self.p.scene.effects.table
 
         def create() -> None:
@@ -140,24 +135,25 @@ class FieldContacts:
 
     def of_palm_and_object(self, state: dict) -> None:
         """Contacts of the palm's rings or spheres, and of the object with the table."""
-        p, m, at = self.p, self.m, self.at
-        palm = [name for name in ("palm_object", "palm_table") if name in m.contacts]
+        p, at = self.p, self.at
+        palm = [name for name in ("palm_object", "palm_table") if name in self.contacts]
         for i in range(p.palm_groups if palm else 0):
-            numbers = lanewise(one_of, p.hand.read(self.step.hand, "palm_ring", i))
+            numbers = lanewise(one_of, self.step.hand.read("palm_ring", i))
             centre = lanewise(ring_centres, at["place"], at["frame"], numbers)
             for name in palm:
                 moves = self.moves(name, None, None)
                 self.on_field(name, i, numbers, at["frame"], centre, moves)
-        on_table = m.contacts.get("object_table")
+        on_table = self.contacts.get("object_table")
         slots = self._table_points(state) if on_table else []
         rubs = self.frictions("object_table")
         for i in range(on_table.set.count if on_table else 0):
+            assert on_table is not None
             mine = range(i * p.fingers, min((i + 1) * p.fingers, len(slots)))
             place, friction = Place(*self._deal([slots[k] for k in mine])), None
             if rubs is not None:
                 (friction,) = self._deal([(rubs[:, k : k + 1],) for k in mine])
             moves = self.moves("object_table", None, None)
-            m.contacts["object_table"].create(i, place, *moves, friction=friction)
+            on_table.create(i, place, *moves, friction=friction)
 
     def _table_points(self, state: dict) -> list[Place]:
         """Each slot of the object on the table and the fixtures, lanes of a world."""
@@ -194,13 +190,12 @@ class FieldContacts:
 
     def _deal(self, slots: list) -> list[Lanes]:
         """Deals the slots, each of several (component, 1, world), out to the finger lanes."""
-        none = jnp.zeros((self.p.size,), self.step.finger_state.dtype)
         dealt = []
         for field in range(len(slots[0])):
             values: list[Any] = [s[field] for s in slots]
             parts = []
             for c in range(values[0].parts.shape[0]):
-                lane = none
+                lane = self.step.like
                 for k, value in enumerate(values):
                     lane = jnp.where(self.step.block.finger == k, value.parts[c].item(), lane)
                 parts.append(lane)

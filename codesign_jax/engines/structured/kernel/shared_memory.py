@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.components import splat
-from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
+from codesign_jax.engines.structured.kernel.memory import Block, BoundTable
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.scene import Scene
 
@@ -78,16 +78,16 @@ class SharedColumns:
         self.ref[self._at(index)] = value
 
 
-class Parts:
+class TeamRows:
     """Reads and writes a table's rows by the lanes of a team, each its own row."""
 
-    def __init__(self, block: Block, table: MemoryLayout, ref: Any):
+    def __init__(self, block: Block, table: BoundTable):
         """Takes the lanes and a table of fingers."""
-        self.block, self.table, self.ref = block, table, ref
+        self.block, self.layout, self.ref = block, table.layout, table.ref
 
     def _at(self, name: str, item: Any, first: int, step: int) -> tuple:
-        row = item * self.table.stride[name] + self.block.mate * step
-        return row + (self.table.offset[name] + first), self.block.own
+        row = item * self.layout.stride[name] + self.block.mate * step
+        return row + (self.layout.offset[name] + first), self.block.own
 
     def get(self, name: str, item: Any = 0, first: int = 0, step: int = 1) -> jax.Array:
         """Row `first` + lane * `step` of an item, shape (lane,)."""
@@ -99,7 +99,7 @@ class Parts:
 
     def rows(self, name: str, item: Any = 0) -> Lanes:
         """The lane's column of a matrix, shape (row,)."""
-        count = self.table.groups[name][1][0]
+        count = self.layout.groups[name][1][0]
         found = [self.get(name, item, TEAM * k) for k in range(count)]
         return lanes(found, (count,), wide=True)
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, ContactSet, zeros
 from codesign_jax.engines.structured.kernel.memory import (
-    MemoryLayout,
+    BoundTable,
     anywhere,
     solid,
     tree_add_scaled,
@@ -27,7 +27,7 @@ from codesign_jax.engines.structured.laws.rings import Place
 from codesign_jax.scene import Scene
 
 
-class Counts:
+class SlotCounts:
     """Numbers of the slots that lanes have filled: those of all rows in a few integers a lane.
 
     Every pass through the contacts asks for them. Read from memory, a GPU's thread would wait for
@@ -43,16 +43,16 @@ class Counts:
         self._bits, self._each = _sizes(most)
 
     @classmethod
-    def of_rows(cls, counts: list[jax.Array], most: int) -> "Counts":
+    def of_rows(cls, counts: list[jax.Array], most: int) -> "SlotCounts":
         """Packs the rows' numbers, from 0 to `most`, int32 of shape (lane,) each."""
         bits, each = _sizes(most)
         parts = [counts[start : start + each] for start in range(0, len(counts), each)]
         words = [total([n * (1 << bits * k) for k, n in enumerate(part)]) for part in parts]
         return cls(words, most)
 
-    def masked(self, chosen: jax.Array) -> "Counts":
+    def masked(self, chosen: jax.Array) -> "SlotCounts":
         """The numbers of some lanes, and zero for all others."""
-        return Counts([jnp.where(chosen, word, 0) for word in self.words], self._most)
+        return SlotCounts([jnp.where(chosen, word, 0) for word in self.words], self._most)
 
     def of(self, row: jax.typing.ArrayLike) -> jax.Array:
         """A row's numbers, shape (lane,); `row` is a scalar."""
@@ -113,9 +113,9 @@ class SlotSet(ContactSet):
     more: dict[str, int] = {}
     """Components of further fields of a slot."""
 
-    def bind(self, table: MemoryLayout, ref: Any, read: Callable[[str], Lanes]) -> "BoundSlots":
+    def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundSlots":
         """See `ContactSet`."""
-        return BoundSlots(self, table, ref, self.cone(read))
+        return BoundSlots(self, table, self.cone(read))
 
 
 class Slot(NamedTuple):
@@ -138,25 +138,24 @@ class BoundSlots(BoundContacts):
     """Slots with their memory; methods work on a row."""
 
     set: SlotSet  # type: ignore[assignment]
-    _counts: Counts | None = None
+    _counts: SlotCounts | None = None
 
     def clear(self, row: Any) -> None:
         """Empties a row."""
-        none = jnp.zeros((self.set.size,), self.ref.dtype)
-        self.write("count", lanes([none], (), wide=True), row)
+        self.write("count", zeros((), self.like), row)
 
     def read(self, field: str, item: Any) -> Lanes:
         """See `BoundContacts`; an item may be a `Slot`."""
         if not isinstance(item, Slot):
             return super().read(field, item)
-        return self.table.gather(self.ref, f"{self.set.name}.{field}", item.source, self._lane())
+        return self.table.gather(f"{self.set.name}.{field}", item.source, self._lane())
 
     def write(self, field: str, value: Lanes, item: Any) -> None:
         """See `BoundContacts`; an item may be a `Slot`."""
         if not isinstance(item, Slot):
-            return super().write(field, value, item)
-        name = f"{self.set.name}.{field}"
-        return self.table.scatter(self.ref, name, value, item.sink, self._lane())
+            super().write(field, value, item)
+            return
+        self.table.scatter(f"{self.set.name}.{field}", value, item.sink, self._lane())
 
     def _lane(self) -> jax.Array:
         return jax.lax.broadcasted_iota(jnp.int32, (self.set.size,), 0)
@@ -165,7 +164,7 @@ class BoundSlots(BoundContacts):
         """Keeps in registers how many slots lanes have filled, when all contacts are found."""
         rows, most = range(self.set.rows), self.set.slots
         found = [self.read("count", row).lane.astype(jnp.int32) for row in rows]
-        self._counts = Counts.of_rows([jnp.minimum(n, most) for n in found], most)
+        self._counts = SlotCounts.of_rows([jnp.minimum(n, most) for n in found], most)
         if self.set.gathers:
             self.write_empty(self.set.fields(), self.set.count - 1)
 
@@ -174,12 +173,12 @@ class BoundSlots(BoundContacts):
 
         All fields of it, as a number that is none, times no share, is none.
         """
-        none = jnp.zeros((self.set.size,), self.ref.dtype)
+        none = self.like
         one, prefix = jnp.ones_like(none), f"{self.set.name}."
         sound = {"gap": [one], "normal": [none, none, one]}
         for name, (_, shape) in fields.items():
             values = sound.get(name.removeprefix(prefix), [none] * math.prod(shape))
-            self.table.write(self.ref, name, lanes(values, shape, wide=True), item)
+            self.table.write(name, lanes(values, shape, wide=True), item)
 
     def used(self, row: Any) -> jax.Array:
         """Number of slots that any lane has filled, a scalar; within `only` any of its lanes."""
@@ -202,7 +201,7 @@ class BoundSlots(BoundContacts):
 
     def remembered(self, numbers: dict[str, Any]) -> dict[str, Lanes]:
         """Fields of the numbers, the same or different on the lanes, that the set remembers."""
-        none = jnp.zeros((self.set.size,), self.ref.dtype)
+        none = self.like
         return {
             name: lanes([none + jnp.asarray(number).astype(none.dtype)], (1, 1), wide=True)
             for name, number in numbers.items()
@@ -215,9 +214,8 @@ class BoundSlots(BoundContacts):
         def worst(row: jax.Array, most: jax.Array) -> jax.Array:
             return jnp.maximum(most, self.read("count", row).lane)
 
-        none = jnp.zeros((self.set.size,), self.ref.dtype)
-        most = jax.lax.fori_loop(0, self.set.rows, worst, none)
-        return jnp.where(most > self.set.slots, 1.0, 0.0).astype(none.dtype)
+        most = jax.lax.fori_loop(0, self.set.rows, worst, self.like)
+        return jnp.where(most > self.set.slots, 1.0, 0.0).astype(self.like.dtype)
 
     def add(self, row: Any, which: jax.Array, fields: dict[str, Lanes], lane: jax.Array) -> None:
         """Gives contacts a slot each, on the lanes that have one.
@@ -238,7 +236,7 @@ class BoundSlots(BoundContacts):
                 self.write(field, away, fresh)
         mine = jnp.where(which, jnp.minimum(filled, self.set.slots), self.set.slots)
         for field, value in fields.items():
-            self.table.scatter(self.ref, f"{self.set.name}.{field}", value, first + mine, lane)
+            self.table.scatter(f"{self.set.name}.{field}", value, first + mine, lane)
         more = jnp.where(which, count + 1.0, count)
         self.write("count", lanes([more], (), wide=True), row)
 
@@ -277,8 +275,7 @@ class BoundSlots(BoundContacts):
         return force
 
     def _zeros(self, *shapes: tuple[int, ...]) -> list[Lanes]:
-        like = jnp.zeros((self.set.size,), self.ref.dtype)
-        return [zeros(shape, like) for shape in shapes]
+        return [zeros(shape, self.like) for shape in shapes]
 
 
 @contextlib.contextmanager

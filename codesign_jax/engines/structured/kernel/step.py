@@ -2,20 +2,21 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import chambers, friction_memory, objects
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
-from codesign_jax.engines.structured.kernel.finger_collision import Search
-from codesign_jax.engines.structured.kernel.finger_contacts import BoundPairs
-from codesign_jax.engines.structured.kernel.memory import Block, loop
+from codesign_jax.engines.structured.kernel.finger_collision import FingerCollision
+from codesign_jax.engines.structured.kernel.finger_contacts import BoundFingerContacts
+from codesign_jax.engines.structured.kernel.memory import loop
 from codesign_jax.engines.structured.kernel.newton import Newton
 from codesign_jax.engines.structured.kernel.objects import WorldObject
-from codesign_jax.engines.structured.kernel.problem import Iterate, Memory, Palm, Problem, triangle
-from codesign_jax.engines.structured.kernel.sdf_collision import FieldContacts
+from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem, triangle
+from codesign_jax.engines.structured.kernel.sdf_collision import SdfCollision
+from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.kernel.team_solver import team_rows
 from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -28,81 +29,21 @@ from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model.layout import joint_axes
 from codesign_jax.scene import Scene
 
-if TYPE_CHECKING:
-    from codesign_jax.engines.structured.kernel.program import Program
 
-
-PALM_CONSTANTS = (
-    "palm_mass",
-    "palm_centre",
-    "palm_inertia",
-    "wrist_damping",
-    "wrist_armature",
-    "object_mass",
-    "object_inertia",
-    "wrist_stiffness",
-    "gravity",
-)
-"""Constants of the worlds that `palm_and_object` takes; some scenes lack the last ones."""
-LINK_CONSTANTS = ("offset", "mass", "centre", "inertia", "stiffness", "damping", "armature")
-"""Constants of each link that `link_forces` takes."""
-FINGER_CONSTANTS = ("gain", "section", "threshold")
-"""Constants of each finger, of each link of tapered ones, that it takes; some scenes lack all but
-the first."""
-
-
-class Step:
+class Step(StepMemory):
     """One time step of a block."""
 
-    def __init__(
+    search: FingerCollision | None = None
+
+    def advance(
         self,
-        program: "Program",
-        block: Block,
-        hand: Any,
-        world: Any,
-        finger_state: Any,
-        world_state: Any,
-        scratch: Any,
-        grid: Any = None,
-        onchip: Any = None,
-    ):
-        """Takes the kernel's lanes and memory.
-
-        The last two, of scenes with meshes and of teams: distances of all meshes, and the table of
-        shared memory.
-        """
-        self.p, self.block, self.hand, self.world = program, block, hand, world
-        self.finger_state, self.world_state, self.scratch = finger_state, world_state, scratch
-        self.grid, self.onchip = grid, onchip
-
-    def constant(self, name: str) -> Lanes:
-        """A constant of the worlds."""
-        return self.p.world.read(self.world, name, 0, self.block.world)
-
-    def constants(self, *names: str) -> list[Lanes]:
-        """Constants of the worlds."""
-        return [self.constant(n) for n in names]
-
-    def palm_constants(self) -> dict[str, Lanes]:
-        """Constants that `palm_and_object` takes, by name, of those that the scene has."""
-        return {n: self.constant(n) for n in PALM_CONSTANTS if n in self.p.world.groups}
-
-    def link_constants(self, i: Any) -> dict[str, Lanes]:
-        """Constants that `link_forces` takes, by name, of those that the scene has."""
-        read = partial(self.p.hand.read, self.hand)
-        found = {n: read(n, i) for n in LINK_CONSTANTS}
-        row = i if self.p.tapered else 0
-        found |= {n: read(n, row) for n in FINGER_CONSTANTS if n in self.p.hand.groups}
-        if "gravity" in self.p.world.groups:
-            found["gravity"] = self.constant("gravity")
-        return found
-
-    def joint(self, i: Any) -> dict[str, Lanes]:
-        """Angles, velocities and accelerations of a joint, by name."""
-        read = partial(self.p.finger_state.read, self.finger_state)
-        return {n: read(n, i) for n in ("finger", "finger_vel", "acc")}
-
-    def advance(self, arm: Lanes, pressure: Lanes, undecided: Callable, waiting: Any, speed: Any):
+        arm: Lanes,
+        pressure: Lanes,
+        undecided: Callable,
+        waiting: Any,
+        speed: Any,
+        limits: tuple[int, int, float],
+    ) -> tuple:
         """Advances the block.
 
         Args:
@@ -111,21 +52,20 @@ class Step:
           undecided: Whether a world takes this step, from distance and height before it.
           waiting: Undecided worlds, which must converge.
           speed: Largest velocity before the step.
+          limits: See `program.Limits`.
 
         Returns:
           Trace entries distance, height, residual, iterations and, with slots, overflow; speed
           after the step; worlds that have moved, and so go on.
         """
         p = self.p
-        state, geometry, _, memory, now, centre = self.assemble(arm, pressure)
-        rigid = not p.scene.effects.wrist
-        problem = Problem(p.links, self.block, memory, geometry["palm"], rigid=rigid)
-        now, quality = Newton(problem).solve(now, waiting, *p.limits)
+        state, geometry, _, now, centre = self.assemble(arm, pressure)
+        now, quality = Newton(Problem(self, geometry["palm"])).solve(now, waiting, *limits)
         distance = lanewise(lambda c: jnp.sqrt(dot(c, c)), centre).lane
         height = state["position"][2].lane
         goes_on, slots = waiting & undecided(distance, height), []
         if p.slotted:
-            slots = [self._overflow(memory.contacts, waiting)]
+            slots = [self._overflow(waiting)]
             goes_on &= slots[0] == 0
         new_speed, good = semi_implicit_euler(self, state, geometry, now, goes_on, speed)
         count = jnp.full_like(height, quality.count)
@@ -141,25 +81,20 @@ class Step:
           pressure: As in `Step.advance`.
 
         Returns:
-          The state of wrist and object by name, what `palm_and_object` finds, the objects, the
-          memory, the warm start, and the hand's centre from the object's.
+          The state of wrist and object by name, what `palm_and_object` finds, the objects, the warm
+          start, and the hand's centre from the object's.
         """
-        p, hand, world = self.p, (self.p.hand, self.hand), (self.p.world, self.world)
-        read = partial(p.world_state.read, self.world_state, item=0, world=self.block.world)
-        state = {name: read(name) for name in p.world_state.groups}
+        p = self.p
+        state = {name: self.world_state.read(name) for name in p.world_state.groups}
         run = partial(palm_and_object, p.scene.discretization.timestep)
         at = lanewise(run, state, arm, self.palm_constants())
-        thing = objects.read(p.scene, self.block, world, hand, self.grid)
-        bound = {c.name: c.bind(p.scratch, self.scratch, self.constant) for c in p.sets}
-        state_table, scratch = (p.finger_state, self.finger_state), (p.scratch, self.scratch)
-        memory = Memory(*hand, *state_table, *scratch, bound)
-        if p.team > 1:
-            memory = memory._replace(onchip=p.onchip, onchip_ref=self.onchip)
-        return state, at, thing, memory, *self._forward(state, at, pressure, memory, thing)
+        thing = objects.read(p.scene, self.block, self.world, self.hand, self.grid)
+        self.contacts = {c.name: c.bind(self.scratch, self.constant) for c in p.sets}
+        return state, at, thing, *self._forward(state, at, pressure, thing)
 
-    def _overflow(self, bound: dict[str, Any], waiting: jax.Array) -> jax.Array:
+    def _overflow(self, waiting: jax.Array) -> jax.Array:
         """One for worlds that had too few slots for their contacts in this step, else zero."""
-        lists = [c.overflow() for c in bound.values() if isinstance(c, BoundPairs)]
+        lists = [c.overflow() for c in self.contacts.values() if isinstance(c, BoundFingerContacts)]
         most = self.block.fold(total(lists), jnp.maximum)
         return jnp.where(waiting & (most > 0), 1.0, 0.0).astype(most.dtype)
 
@@ -171,17 +106,15 @@ class Step:
           chain: What the forward pass carries from link to link.
         """
 
-    def _forward(self, state: dict, at: dict, pressure: Lanes, m: Memory, thing: WorldObject):
+    def _forward(self, state: dict, at: dict, pressure: Lanes, thing: WorldObject):
         """Bodies, forces and contacts from the palm to the tips, left in the scratch table.
 
         Returns:
           The warm start and the hand's centre from the object's.
         """
-        p, now = self.p, at["now"]
-        like = jnp.zeros((p.size,), self.finger_state.dtype)
-        mount, base, share, stub = (
-            p.hand.read(self.hand, n) for n in ("mount", "base", "share", "stub_centre")
-        )
+        p, now, like = self.p, at["now"], self.like
+        names = ("mount", "base", "share", "stub_centre")
+        mount, base, share, stub = (self.hand.read(n) for n in names)
         frame, origin = lanewise(kin.mounted, at["place"], at["frame"], mount, base)
         weight = lanewise(
             lambda x, f, s, share: share * (x + apply_columns(f, s)),
@@ -194,12 +127,14 @@ class Step:
 
         if p.scene.effects.air_mass:
             pressure = chambers.end_pressures(self, pressure)
-        pairs = m.contacts.get("finger_finger")
-        search = Search(self, pairs, at) if isinstance(pairs, BoundPairs) else None
+        pairs = self.contacts.get("finger_finger")
+        search = (
+            FingerCollision(self, pairs, at) if isinstance(pairs, BoundFingerContacts) else None
+        )
         self.search = search
         if search:
             search.start(motion, vel, frame, origin)
-        fields = FieldContacts(self, at, m, thing)
+        fields = SdfCollision(self, at, thing)
 
         def link(i: Any, carry: tuple) -> tuple:
             origin, frame, vel, bias, motion, middle = carry
@@ -213,9 +148,8 @@ class Step:
             if p.team > 1:
                 stored = team_rows(stored, (constants["mass"], centre, stored["tensor"]))
             for name, value in stored.items():
-                table, ref = m.table(name)
-                table.write(ref, name, value, i)
-            share = p.hand.read(self.hand, "share", i + 1)
+                self.write(name, value, i)
+            share = self.hand.read("share", i + 1)
             middle = lanewise(lambda m, c, s: m + s * c, middle, centre, share)
             fields.of_link(i, carry)
             if search:
@@ -229,8 +163,8 @@ class Step:
             search.find()
         if search and p.team > 1:
             fields.of_rings(search)
-        for contacts in m.contacts.values():
-            if isinstance(contacts, BoundPairs):
+        for contacts in self.contacts.values():
+            if isinstance(contacts, BoundFingerContacts):
                 contacts.keep_counts()
         fields.of_palm_and_object(state)
         count = p.num_fingers * p.links
@@ -327,7 +261,7 @@ def link_forces(scene: Scene, parent: tuple, constants: dict, joint: dict):
 
 
 def semi_implicit_euler(
-    step: "Step", state: dict, at: dict, now: Iterate, goes_on: Any, speed: Any
+    step: StepMemory, state: dict, at: dict, now: Iterate, goes_on: Any, speed: Any
 ):
     """Semi-implicit Euler; worlds that are decided or whose step fails stay as they were.
 
@@ -339,30 +273,26 @@ def semi_implicit_euler(
     size = lanewise(_largest, new)
 
     def link(i: Any, largest: Lanes) -> Lanes:
-        q, rate, acc = (
-            p.finger_state.read(step.finger_state, n, i) for n in ("finger", "finger_vel", "acc")
-        )
-        rate, q, top = lanewise(partial(turned, h), q, rate, acc)
-        p.scratch.write(step.scratch, "new_finger", q, i)
-        p.scratch.write(step.scratch, "new_finger_vel", rate, i)
+        rate, q, top = lanewise(partial(turned, h), *step.joint(i).values())
+        step.scratch.write("new_finger", q, i)
+        step.scratch.write("new_finger_vel", rate, i)
         return lanewise(_worse, largest, top)
 
-    like = jnp.zeros((p.size,), step.finger_state.dtype)
-    fingers = loop(p.links, link, zeros((), like), p.size).lane
+    fingers = loop(p.links, link, zeros((), step.like), p.size).lane
     largest = _worse(size.lane, step.block.fold(fingers, _worse))
     limit = step.constant("speed").lane
     good = goes_on & (largest <= limit)
     acc = {"acc_wrist": now.wrist, "acc_object": now.object_motion}
     for name, value in {**new, **acc}.items():
         kept = lanewise(jnp.where, lanes([good], (), wide=False), value, state[name])
-        p.world_state.write(step.world_state, name, kept, 0, step.block.world)
+        step.world_state.write(name, kept)
 
     def store(i: Any, x: Any) -> Any:
         for name in ("finger", "finger_vel"):
-            value = p.scratch.read(step.scratch, f"new_{name}", i)
-            old = p.finger_state.read(step.finger_state, name, i)
+            value = step.scratch.read(f"new_{name}", i)
+            old = step.finger_state.read(name, i)
             kept = lanewise(jnp.where, lanes([good], (), wide=False), value, old)
-            p.finger_state.write(step.finger_state, name, kept, i)
+            step.finger_state.write(name, kept, i)
         return x
 
     jax.lax.fori_loop(0, p.links, store, jnp.int32(0))

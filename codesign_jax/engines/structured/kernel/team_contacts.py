@@ -8,21 +8,21 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.contact_sets import ROWS, ContactSet
 from codesign_jax.engines.structured.kernel.finger_contacts import (
-    BoundPairs,
+    BoundFingerContacts,
+    FingerContactSet,
+    FingerPairing,
     OwnSide,
-    Pairing,
-    PairSet,
     _times,
 )
-from codesign_jax.engines.structured.kernel.memory import Block, choose, loop
-from codesign_jax.engines.structured.kernel.shared_memory import TEAM, Parts, ranks
+from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, choose, loop
+from codesign_jax.engines.structured.kernel.shared_memory import TEAM, TeamRows, ranks
 from codesign_jax.engines.structured.kernel.slots import BoundSlots, Slot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact
 from codesign_jax.scene import Scene
 
 
-class TeamFieldSet(ContactSet):
+class TeamSdfContactSet(ContactSet):
     """Contacts of a finger's rings with object or table, dealt to the lanes of its team."""
 
     def __init__(self, scene: Scene, tables: Any, name: str, links: int, k: int):
@@ -37,15 +37,15 @@ class TeamFieldSet(ContactSet):
         more = {f"{self.name}.{f}": (self.count, (size, 1)) for f, size in fields.items()}
         return super().groups() | more
 
-    def bind(self, table: Any, ref: Any, read: Callable[[str], Lanes]) -> "TeamFields":
+    def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundTeamSdfContacts":
         """See `ContactSet`."""
-        return TeamFields(self, table, ref, self.cone(read))
+        return BoundTeamSdfContacts(self, table, self.cone(read))
 
 
-class TeamFields(BoundSlots):
+class BoundTeamSdfContacts(BoundSlots):
     """The contacts with their memory."""
 
-    set: TeamFieldSet  # type: ignore[assignment]
+    set: TeamSdfContactSet  # type: ignore[assignment]
 
     def __init__(self, *bound: Any):
         """See `BoundContacts`."""
@@ -109,7 +109,7 @@ class TeamFields(BoundSlots):
             found = choose(self.touching(item), add, found, self.set.size)
         return found
 
-    def prepare_all(self, pairs: BoundPairs, k: int, obj: Lanes) -> Lanes:
+    def prepare_all(self, pairs: BoundFingerContacts, k: int, obj: Lanes) -> Lanes:
         """`prepare_linesearch` of all items; slopes at 0, each on its lane.
 
         Args:
@@ -120,7 +120,7 @@ class TeamFields(BoundSlots):
 
         def add(item: Slot, ring: jax.Array, sums: Lanes) -> Lanes:
             row = jax.lax.div(ring, jnp.full_like(ring, k)) + 1
-            motion = pairs.table.gather(pairs.ref, "side.motion", row, self.block.own)
+            motion = pairs.table.gather("side.motion", row, self.block.own)
             if self.set.on_object:
                 motion = lanewise(jnp.subtract, motion, obj)
             return lanewise(jnp.add, sums, self.prepare_linesearch(item, motion))
@@ -128,17 +128,17 @@ class TeamFields(BoundSlots):
         return self.every(add, self._zeros(())[0])
 
 
-class TeamPairSet(PairSet):
+class TeamFingerContactSet(FingerContactSet):
     """Contacts between fingers, a pairing's slots dealt to the lanes."""
 
     def __init__(self, scene: Scene, block: tuple[int, int, int], *rest: Any, **how: Any):
-        """As `PairSet`; block: fingers, worlds and lanes of a team."""
+        """As `FingerContactSet`; block: fingers, worlds and lanes of a team."""
         super().__init__(scene, block[:2], *rest, **how)
         self.block, self.size = block, block[0] * block[1] * block[2]  # type: ignore[assignment]
         self.more |= {"wrench": 6, "wrench_spare": TEAM - 6}
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
-        """See `PairSet`; spare rows take what lanes without a component store."""
+        """See `FingerContactSet`; spare rows take what lanes without a component store."""
         found: dict[str, tuple[int, tuple[int, ...]]] = {}
         for name, (count, shape) in super().groups().items():
             found[name] = count, shape
@@ -146,19 +146,19 @@ class TeamPairSet(PairSet):
                 found[f"{name}_spare"] = count, (TEAM - 6,)
         return found
 
-    def bind(self, table: Any, ref: Any, read: Callable[[str], Lanes]) -> "TeamPairs":
+    def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundTeamFingerContacts":
         """See `ContactSet`."""
         cones = {name: self.cone(read, name) for name in self._names()}
-        return TeamPairs(self, table, ref, cones)
+        return BoundTeamFingerContacts(self, table, cones)
 
 
-class TeamPairs(BoundPairs):
+class BoundTeamFingerContacts(BoundFingerContacts):
     """The contacts with their memory."""
 
     def __init__(self, *bound: Any):
-        """See `BoundPairs`."""
+        """See `BoundFingerContacts`."""
         super().__init__(*bound)
-        self.parts, self._loaded = Parts(self.block, self.table, self.ref), False
+        self.parts, self._loaded = TeamRows(self.block, self.table), False
 
     def _lane(self) -> jax.Array:
         return self.block.own
@@ -183,14 +183,14 @@ class TeamPairs(BoundPairs):
         mine = jnp.where(which, jnp.minimum(count.astype(jnp.int32) + rank, slots), slots)
         for field, value in fields.items():
             name, first = f"{self.set.name}.{field}", row * (slots + 1)
-            self.table.scatter(self.ref, name, value, first + mine, lane)
+            self.table.scatter(name, value, first + mine, lane)
         self.write("count", lanes([count + number.astype(count.dtype)], (), wide=True), row)
 
     def own_side(self, item: Any) -> OwnSide:
-        """See `BoundPairs`; wrenches are added up later."""
+        """See `BoundFingerContacts`; wrenches are added up later."""
         return OwnSide(self.place(item), None, None)
 
-    def load(self, item: Any, own: OwnSide, force: Lanes, pairing: Pairing) -> None:
+    def load(self, item: Any, own: OwnSide, force: Lanes, pairing: FingerPairing) -> None:
         """Keeps a slot's wrench, which is added to its side's when the pass has ended."""
         contacts = self.set.contacts
 
@@ -201,7 +201,7 @@ class TeamPairs(BoundPairs):
         self._loaded = True
 
     def each(self, body: Callable, start: Any) -> Any:
-        """See `BoundPairs`; adds up the wrenches of the pass."""
+        """See `BoundFingerContacts`; adds up the wrenches of the pass."""
         found = super().each(body, start)
         if self._loaded:
             self._loaded = False
@@ -209,11 +209,10 @@ class TeamPairs(BoundPairs):
         return found
 
     def clear_wrenches(self) -> None:
-        """See `BoundPairs`."""
-        none = jnp.zeros((self.set.size,), self.ref.dtype)
+        """See `BoundFingerContacts`."""
 
         def clear(row: Any, x: jax.Array) -> jax.Array:
-            self.parts.put("side.push", none, row)
+            self.parts.put("side.push", self.like, row)
             return x
 
         jax.lax.fori_loop(0, self.rows(), clear, jnp.int32(0))

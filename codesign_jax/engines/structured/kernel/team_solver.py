@@ -17,7 +17,7 @@ from codesign_jax.engines.structured.kernel.shared_memory import (
     FORCES,
     TEAM,
     UNUSED,
-    Parts,
+    TeamRows,
     chosen,
     team_sum,
 )
@@ -25,15 +25,15 @@ from codesign_jax.engines.structured.lanes import contract, dot, inverse_spd, to
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 
 
-class Team:
+class TeamLanes:
     """A problem's numbers as the lanes of a team share them."""
 
     def __init__(self, problem: Problem):
         """Takes the problem."""
         m, block = problem.m, problem.block
         self.problem, self.block, self.like = problem, block, problem.like
-        self.chip = Parts(block, m.onchip, m.onchip_ref)
-        self.scratch = Parts(block, m.scratch, m.scratch_ref)
+        assert m.onchip is not None
+        self.chip, self.scratch = TeamRows(block, m.onchip), TeamRows(block, m.scratch)
         self.forces = self.mask(block.mate == FORCES)
 
     def mask(self, which: jax.Array, *, wide: bool = True) -> Lanes:
@@ -183,7 +183,7 @@ class TeamElimination(Elimination):
     def __init__(self, problem: Problem):
         """Takes the problem."""
         super().__init__(problem)
-        self.team, self.rings = Team(problem), rings_of_link(problem)
+        self.team, self.rings = TeamLanes(problem), problem.m.p.k
         one = jnp.ones_like(self.like)
         unit = [jnp.where(self.block.mate == k, one, 0.0) for k in range(6)]
         self.unit = lanes(unit, (6,), wide=True)
@@ -286,7 +286,7 @@ class TeamCoupling(Coupling):
     def __init__(self, problem: Problem, *rest: Any):
         """See `Coupling`."""
         super().__init__(problem, *rest)
-        self.team = Team(problem)
+        self.team = TeamLanes(problem)
 
     def again(self) -> Iterate:
         """See `Coupling`."""
@@ -309,11 +309,11 @@ class TeamCoupling(Coupling):
 
     @property
     def _axes(self) -> int:
-        return self.team.chip.table.groups["axes"][1][0]
+        return self.team.chip.layout.groups["axes"][1][0]
 
     def _row(self, i: Any, k: int, lane: int, value: jax.Array | None = None) -> jax.Array:
         """A lane's number in row k of w, on all lanes; or stores it."""
-        table, ref = self.team.chip.table, self.team.chip.ref
+        table, ref = self.team.chip.layout, self.team.chip.ref
         place = i * table.stride["w"] + (table.offset["w"] + TEAM * k + lane)
         if value is not None:
             ref[place] = value
@@ -364,7 +364,7 @@ class TeamLineSearch(LineSearch):
     def __init__(self, problem: Problem):
         """Takes the problem."""
         super().__init__(problem)
-        self.team, self.rings = Team(problem), rings_of_link(problem)
+        self.team, self.rings = TeamLanes(problem), problem.m.p.k
 
     def prepare(self, now: Iterate, step: Iterate) -> tuple[Lanes, Lanes, Lanes]:
         """See `LineSearch`."""
@@ -426,11 +426,6 @@ class TeamLineSearch(LineSearch):
             sums = c.every(lambda item, _, s, c=c: plus(s, c.slopes(item, alpha)), sums)  # type: ignore[attr-defined]
         assert problem.pairs is not None
         return problem.pairs.slopes_of_all(alpha, sums)
-
-
-def rings_of_link(problem: Problem) -> int:
-    """Rings of a link."""
-    return problem.m.hand.groups["ring"][0] // problem.links
 
 
 def team_rows(stored: dict[str, Lanes], body: tuple) -> dict[str, Lanes]:

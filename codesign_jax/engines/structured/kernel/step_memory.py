@@ -1,0 +1,142 @@
+"""A block's memory in a step: its tables with their references, and what is read of them."""
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, ContactSet
+from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, MemoryLayout
+from codesign_jax.engines.structured.lanewise import Lanes
+from codesign_jax.model import Layout
+from codesign_jax.scene import Scene
+
+PALM_CONSTANTS = (
+    "palm_mass",
+    "palm_centre",
+    "palm_inertia",
+    "wrist_damping",
+    "wrist_armature",
+    "object_mass",
+    "object_inertia",
+    "wrist_stiffness",
+    "gravity",
+)
+"""Constants of the worlds that `palm_and_object` takes; some scenes lack the last ones."""
+LINK_CONSTANTS = ("offset", "mass", "centre", "inertia", "stiffness", "damping", "armature")
+"""Constants of each link that `link_forces` takes."""
+FINGER_CONSTANTS = ("gain", "section", "threshold")
+"""Constants of each finger, of each link of tapered ones, that it takes; some scenes lack all but
+the first."""
+
+
+class KernelLayout:
+    """What the parts of a kernel know of its tables, which `memory_tables.Tables` lays out.
+
+    Attributes:
+      scene: The scene; `lay`: where its joints and bodies are in MuJoCo's model.
+      links: Moving links of a finger; `axes`: axes of a joint.
+      fingers: Fingers of a block, a power of two; `num_fingers`: those of the scene.
+      block: Worlds of a block; `size`: its lanes.
+      team: Lanes of a finger; `columns`: columns of the tables of fingers, which they share.
+      k: Rings or contact spheres of a link; `palm_groups`: of the palm, for each finger's lanes.
+      hull: Whether fingers have rings; `tapered`: whether their sections change along them.
+      sets: The contacts; `slotted`: whether any are in slots; `held`: rows of friction memory.
+      hand: Rows of the hand's table; likewise `world`, `finger_state`, `world_state`, `scratch`,
+        and with teams `onchip`.
+    """
+
+    scene: Scene
+    lay: Layout
+    links: int
+    axes: int
+    fingers: int
+    num_fingers: int
+    block: int
+    size: int
+    team: int
+    columns: int
+    k: int
+    palm_groups: int
+    hull: bool
+    meshes: bool
+    sets: list[ContactSet]
+    slotted: bool
+    held: int
+    hand: MemoryLayout
+    world: MemoryLayout
+    finger_state: MemoryLayout
+    world_state: MemoryLayout
+    scratch: MemoryLayout
+    onchip: MemoryLayout
+
+    @property
+    def tapered(self) -> bool:
+        return self.scene.hand.section.tapered
+
+
+class StepMemory:
+    """A block's tables with their references.
+
+    Attributes:
+      p: Their layout.
+      block: The lanes.
+      grid: Distances of all meshes, a reference; None without meshes.
+      like: Zeros of the lanes' shape and type.
+      contacts: The contact sets with their memory, by name.
+    """
+
+    def __init__(
+        self,
+        layout: KernelLayout,
+        block: Block,
+        hand: Any,
+        world: Any,
+        finger_state: Any,
+        world_state: Any,
+        scratch: Any,
+        grid: Any = None,
+        onchip: Any = None,
+    ):
+        """Takes the references; `onchip`: the table of shared memory, of teams."""
+        self.p, self.block, self.grid = layout, block, grid
+        self.hand = BoundTable(layout.hand, hand)
+        self.world = BoundTable(layout.world, world, block.world)
+        self.finger_state = BoundTable(layout.finger_state, finger_state)
+        self.world_state = BoundTable(layout.world_state, world_state, block.world)
+        self.scratch = BoundTable(layout.scratch, scratch)
+        self.onchip = None if onchip is None else BoundTable(layout.onchip, onchip)
+        self.like = jnp.zeros((layout.size,), finger_state.dtype)
+        self.contacts: dict[str, BoundContacts] = {}
+
+    def _table(self, name: str) -> BoundTable:
+        tables = self.hand, self.finger_state, self.scratch, self.onchip
+        return next(t for t in tables if t is not None and name in t)
+
+    def read(self, name: str, item: Any = 0) -> Lanes:
+        """Reads from the table of fingers that has the name."""
+        return self._table(name).read(name, item)
+
+    def write(self, name: str, value: Lanes, item: Any = 0) -> None:
+        """Writes to it."""
+        self._table(name).write(name, value, item)
+
+    def constant(self, name: str) -> Lanes:
+        """A constant of the worlds."""
+        return self.world.read(name)
+
+    def palm_constants(self) -> dict[str, Lanes]:
+        """Constants that `palm_and_object` takes, by name, of those that the scene has."""
+        return {n: self.constant(n) for n in PALM_CONSTANTS if n in self.world}
+
+    def link_constants(self, i: Any) -> dict[str, Lanes]:
+        """Constants that `link_forces` takes, by name, of those that the scene has."""
+        found = {n: self.hand.read(n, i) for n in LINK_CONSTANTS}
+        row = i if self.p.tapered else 0
+        found |= {n: self.hand.read(n, row) for n in FINGER_CONSTANTS if n in self.hand}
+        if "gravity" in self.world:
+            found["gravity"] = self.constant("gravity")
+        return found
+
+    def joint(self, i: Any) -> dict[str, Lanes]:
+        """Angles, velocities and accelerations of a joint, by name."""
+        return {n: self.finger_state.read(n, i) for n in ("finger", "finger_vel", "acc")}

@@ -14,7 +14,7 @@ from typing import Any
 
 from codesign_jax import reuse
 from codesign_jax.compiler import ffi, handlers, vector
-from codesign_jax.compiler.handlers import Code, Handler
+from codesign_jax.compiler.handlers import Handler, LlvmFunction
 from codesign_jax.compiler.values import SCRATCH, Layout
 
 _ALIGNMENT = 64  # bytes: a line of the cache
@@ -43,12 +43,10 @@ declare i32 @nanosleep(ptr, ptr)
 
 
 def block_code(jaxpr: Any, layout: Layout) -> str:
-    """The function `block` of LLVM's language, of one address an array, that runs one block."""
     return vector.write(jaxpr, layout.blocks, layout.lanes)
 
 
 def handler_code(name: str, layout: Layout) -> str:
-    """The handler of a kernel whose function `block` is in the same module."""
     return _DECLARATIONS + _work(layout) + _task() + _drop() + _handler(name, layout)
 
 
@@ -57,17 +55,8 @@ def register(
 ) -> str:
     """Compiles a kernel and makes it known to XLA; returns the name to call it by.
 
-    Args:
-      origin: What determines the kernel besides the compiler's code and the layout; one that was
-        compiled before is not traced again.
-      trace: Returns the kernel's jaxpr; its arguments are references to a block of each array.
-      layout: Its arrays.
-      keep: Whether its machine code may be kept on disk and be found there.
-      level: LLVM's level of optimisation, see `handlers.compile`.
-
-    Raises:
-      KernelUnavailable: If XLA does not take the handler.
-      NotImplementedError: If the kernel does something that has no instruction.
+    One of the same origin and layout that was compiled before is not traced again; `keep`: whether
+    its machine code may be kept on disk and be found there.
     """
     name = "kernel_" + reuse.digest("cpu", origin, layout, level, *handlers.identity())
 
@@ -96,7 +85,7 @@ def _declared_once(text: str) -> str:
 
 def _work(layout: Layout) -> str:
     """Takes blocks until none is left; true if there was no memory to run them in."""
-    c = Code("define internal i1 @work(ptr %job) noinline nounwind")
+    c = LlvmFunction("define internal i1 @work(ptr %job) noinline nounwind")
     blocks = c.get("%job", Job, "blocks")
     following = c.at("%job", Job, "next")
     waiting = c.let(f"load atomic i64, ptr {following} monotonic, align 8")
@@ -136,7 +125,7 @@ def _work(layout: Layout) -> str:
 
 def _task() -> str:
     """What XLA's threads run; without memory it leaves the blocks to others."""
-    c = Code("define internal void @task(ptr %job) nounwind")
+    c = LlvmFunction("define internal void @task(ptr %job) nounwind")
     c.let("call i1 @work(ptr %job)")
     c.do("call void @drop(ptr %job)")
     c.end("ret void")
@@ -145,7 +134,7 @@ def _task() -> str:
 
 def _drop() -> str:
     """Takes leave of a record; the last user frees it."""
-    c = Code("define internal void @drop(ptr %job) nounwind")
+    c = LlvmFunction("define internal void @drop(ptr %job) nounwind")
     users = c.let(f"atomicrmw sub ptr {c.at('%job', Job, 'users')}, i64 1 acq_rel")
     with c.when(c.let(f"icmp eq i64 {users}, 1")):
         c.do("call void @free(ptr %job)")
@@ -179,8 +168,7 @@ def _handler(name: str, layout: Layout) -> str:
     return h.text()
 
 
-def _smaller(c: Code, a: str, b: str) -> str:
-    """The smaller one of two 64-bit numbers."""
+def _smaller(c: LlvmFunction, a: str, b: str) -> str:
     return c.let(f"select i1 {c.let(f'icmp slt i64 {a}, {b}')}, i64 {a}, i64 {b}")
 
 
@@ -200,14 +188,12 @@ def _threads(h: Handler) -> str:
 
 
 def _destroy(h: Handler, error: str) -> None:
-    """Gives an error of XLA's back to it."""
     record = h.code.record(ffi.ErrorDestroy, error=error)
     destroy = h.code.get(h.api, ffi.Api, "error_destroy")
     h.code.do(f"call void {destroy}(ptr {record})")
 
 
 def _job(h: Handler, users: str) -> str:
-    """A new record of the call."""
     c, arrays = h.code, h.layout.arrays
     size = Job.arrays.offset + 8 * len(arrays)
     job = c.let(f"call ptr @malloc(i64 {size})")
@@ -239,7 +225,7 @@ def _schedule(h: Handler, job: str, workers: str) -> None:
         c.end("br label %schedule")
 
 
-def _wait(c: Code, job: str, begun: str) -> None:
+def _wait(c: LlvmFunction, job: str, begun: str) -> None:
     """Waits until as many blocks are done as were begun."""
     looks, pause = c.local("i64"), c.local("[2 x i64]")
     c.do(f"store i64 0, ptr {looks}")

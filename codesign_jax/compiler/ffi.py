@@ -11,6 +11,7 @@ import functools
 import re
 from ctypes import c_int32, c_int64, c_uint32, c_uint64, c_void_p
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -22,162 +23,41 @@ class KernelUnavailable(RuntimeError):
     """Kernels cannot run here; the message says why."""
 
 
-class Extension(ctypes.Structure):
-    """XLA_FFI_Extension_Base."""
-
-    _fields_ = [("struct_size", c_uint64), ("type", c_int32), ("next", c_void_p)]
-
-
-class Version(ctypes.Structure):
-    """XLA_FFI_Api_Version."""
-
-    _fields_ = [
-        ("struct_size", c_uint64),
-        ("extension_start", c_void_p),
-        ("major_version", c_int32),
-        ("minor_version", c_int32),
-    ]
+def _structure(name: str, *head: tuple[str, Any], **fields: Any) -> type[ctypes.Structure]:
+    """A structure of XLA's; most begin with their size and a list of extensions."""
+    head = head or (("struct_size", c_uint64), ("extension_start", c_void_p))
+    return type(name, (ctypes.Structure,), {"_fields_": [*head, *fields.items()]})
 
 
-class Metadata(ctypes.Structure):
-    """XLA_FFI_Metadata, as far as it is written."""
-
-    _fields_ = [("struct_size", c_uint64), ("api_version", Version), ("traits", c_uint32)]
-
-
-class MetadataExtension(ctypes.Structure):
-    """XLA_FFI_Metadata_Extension."""
-
-    _fields_ = [("extension_base", Extension), ("metadata", c_void_p)]
-
-
-class Buffer(ctypes.Structure):
-    """XLA_FFI_Buffer."""
-
-    _fields_ = [
-        ("struct_size", c_uint64),
-        ("extension_start", c_void_p),
-        ("dtype", c_int32),
-        ("data", c_void_p),
-        ("rank", c_int64),
-        ("dims", c_void_p),
-    ]
-
-
-class Arguments(ctypes.Structure):
-    """XLA_FFI_Args and XLA_FFI_Rets."""
-
-    _fields_ = [
-        ("struct_size", c_uint64),
-        ("extension_start", c_void_p),
-        ("size", c_int64),
-        ("types", c_void_p),
-        ("values", c_void_p),
-    ]
-
-
-class Attributes(ctypes.Structure):
-    """XLA_FFI_Attrs."""
-
-    _fields_ = [
-        ("struct_size", c_uint64),
-        ("extension_start", c_void_p),
-        ("size", c_int64),
-        ("types", c_void_p),
-        ("names", c_void_p),
-        ("attrs", c_void_p),
-    ]
-
-
-class CallFrame(ctypes.Structure):
-    """XLA_FFI_CallFrame, without the future that a handler may set."""
-
-    _fields_ = [
-        ("struct_size", c_uint64),
-        ("extension_start", c_void_p),
-        ("api", c_void_p),
-        ("ctx", c_void_p),
-        ("stage", c_int32),
-        ("args", Arguments),
-        ("rets", Arguments),
-        ("attrs", Attributes),
-    ]
-
-
-class Api(ctypes.Structure):
-    """XLA_FFI_Api up to the last function that handlers call."""
-
-    _fields_ = [
-        ("struct_size", c_uint64),
-        ("extension_start", c_void_p),
-        ("api_version", Version),
-        ("internal_api", c_void_p),
-        ("error_create", c_void_p),
-        ("error_get_message", c_void_p),
-        ("error_destroy", c_void_p),
-        ("handler_register", c_void_p),
-        ("stream_get", c_void_p),
-        ("type_register", c_void_p),
-        ("execution_context_get", c_void_p),
-        ("state_set", c_void_p),
-        ("state_get", c_void_p),
-        ("device_memory_allocate", c_void_p),
-        ("device_memory_free", c_void_p),
-        ("thread_pool_schedule", c_void_p),
-        ("thread_pool_num_threads", c_void_p),
-    ]
-
-
-class ErrorCreate(ctypes.Structure):
-    """XLA_FFI_Error_Create_Args."""
-
-    _fields_ = [
-        ("struct_size", c_uint64),
-        ("extension_start", c_void_p),
-        ("message", c_void_p),
-        ("errc", c_int32),
-    ]
-
-
-class ErrorDestroy(ctypes.Structure):
-    """XLA_FFI_Error_Destroy_Args."""
-
-    _fields_ = [("struct_size", c_uint64), ("extension_start", c_void_p), ("error", c_void_p)]
-
-
-class StreamGet(ctypes.Structure):
-    """XLA_FFI_Stream_Get_Args."""
-
-    _fields_ = [
-        ("struct_size", c_uint64),
-        ("extension_start", c_void_p),
-        ("ctx", c_void_p),
-        ("stream", c_void_p),
-    ]
-
-
-class Schedule(ctypes.Structure):
-    """XLA_FFI_ThreadPool_Schedule_Args."""
-
-    _fields_ = [
-        ("struct_size", c_uint64),
-        ("extension_start", c_void_p),
-        ("ctx", c_void_p),
-        ("task", c_void_p),
-        ("data", c_void_p),
-    ]
-
-
-class NumThreads(ctypes.Structure):
-    """XLA_FFI_ThreadPool_NumThreads_Args; the number goes to an address."""
-
-    _fields_ = [
-        ("struct_size", c_uint64),
-        ("extension_start", c_void_p),
-        ("ctx", c_void_p),
-        ("num_threads", c_void_p),
-    ]
-
+_SIZE = ("struct_size", c_uint64)
+Extension = _structure("XLA_FFI_Extension_Base", _SIZE, type=c_int32, next=c_void_p)
+Version = _structure("XLA_FFI_Api_Version", major_version=c_int32, minor_version=c_int32)
+# As far as it is written.
+Metadata = _structure("XLA_FFI_Metadata", _SIZE, api_version=Version, traits=c_uint32)
+MetadataExtension = _structure(
+    "XLA_FFI_Metadata_Extension", ("extension_base", Extension), metadata=c_void_p
+)
+Buffer = _structure("XLA_FFI_Buffer", dtype=c_int32, data=c_void_p, rank=c_int64, dims=c_void_p)
+Arguments = _structure("XLA_FFI_Args", size=c_int64, types=c_void_p, values=c_void_p)  # and _Rets
+_ATTRIBUTES = dict(size=c_int64, types=c_void_p, names=c_void_p, attrs=c_void_p)
+Attributes = _structure("XLA_FFI_Attrs", **_ATTRIBUTES)
+_CALL = dict(api=c_void_p, ctx=c_void_p, stage=c_int32, args=Arguments, rets=Arguments)
+# Without the future that a handler may set.
+CallFrame = _structure("XLA_FFI_CallFrame", **_CALL, attrs=Attributes)
+_FUNCTIONS = """internal_api error_create error_get_message error_destroy handler_register
+stream_get type_register execution_context_get state_set state_get device_memory_allocate
+device_memory_free thread_pool_schedule thread_pool_num_threads"""
+# Up to the last function that handlers call.
+Api = _structure("XLA_FFI_Api", api_version=Version, **dict.fromkeys(_FUNCTIONS.split(), c_void_p))
+ErrorCreate = _structure("XLA_FFI_Error_Create_Args", message=c_void_p, errc=c_int32)
+ErrorDestroy = _structure("XLA_FFI_Error_Destroy_Args", error=c_void_p)
+StreamGet = _structure("XLA_FFI_Stream_Get_Args", ctx=c_void_p, stream=c_void_p)
+Schedule = _structure(
+    "XLA_FFI_ThreadPool_Schedule_Args", ctx=c_void_p, task=c_void_p, data=c_void_p
+)
+NumThreads = _structure(  # the number goes to an address
+    "XLA_FFI_ThreadPool_NumThreads_Args", ctx=c_void_p, num_threads=c_void_p
+)
 
 METADATA = 1
 """XLA_FFI_Extension_Metadata: XLA asks a handler for the version that it was written for."""
@@ -210,17 +90,12 @@ def size(structure: type[ctypes.Structure]) -> int:
 
 
 def header() -> Path:
-    """The interface's header of the installed jaxlib."""
     return Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
 
 
 @functools.cache
 def installed_version() -> tuple[int, int]:
-    """Major and minor version of the installed jaxlib's interface.
-
-    Raises:
-      KernelUnavailable: If its header is missing or states none.
-    """
+    """Major and minor version of the installed jaxlib's interface."""
     try:
         text = header().read_text()
     except OSError as error:
@@ -251,16 +126,7 @@ def unsupported() -> str | None:
 
 
 def register(name: str, address: int, platform: str) -> None:
-    """Makes a handler known to XLA.
-
-    Args:
-      name: Name of the handler.
-      address: Its machine code.
-      platform: XLA's name of the platform, "cpu" or "CUDA".
-
-    Raises:
-      KernelUnavailable: If XLA refuses it: another version, or other structures.
-    """
+    """Makes a handler's machine code known to XLA, whose platforms are "cpu" and "CUDA"."""
     # A refusal after the backend has been initialised concerns this handler, before it the backend.
     jax.local_devices(backend=platform.lower())
     try:

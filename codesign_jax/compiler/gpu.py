@@ -43,11 +43,7 @@ _lent: list[Any] = []  # memory that the driver may write to whenever it transla
 
 
 def device_code(jaxpr: Any, layout: Layout) -> str:
-    """PTX of a kernel with the entry point `ENTRY`.
-
-    Raises:
-      NotImplementedError: If the kernel does something that has no instruction.
-    """
+    """PTX of a kernel with the entry point `ENTRY`."""
     return thread.assembly(thread.write(jaxpr, layout, ENTRY))
 
 
@@ -55,15 +51,9 @@ class Driver:
     """NVIDIA's driver, whose errors become exceptions."""
 
     def __init__(self, library: Any):
-        """Takes the driver's library, or anything that has its functions."""
         self.library = library
 
     def __call__(self, function: str, *args: Any) -> None:
-        """Calls a function.
-
-        Raises:
-          KernelUnavailable: If it returns an error.
-        """
         result = getattr(self.library, function)(*args)
         if result:
             text = ctypes.c_char_p()
@@ -71,7 +61,6 @@ class Driver:
             raise KernelUnavailable(f"{function}: {(text.value or b'').decode()} ({result})")
 
     def address(self, function: str) -> int:
-        """Address of a function."""
         pointer = ctypes.cast(getattr(self.library, function), ctypes.c_void_p).value
         assert pointer
         return pointer
@@ -79,11 +68,7 @@ class Driver:
 
 @functools.cache
 def driver() -> Driver:
-    """The driver of this computer, initialised.
-
-    Raises:
-      KernelUnavailable: If there is none, or an old one.
-    """
+    """The driver of this computer, initialised."""
     try:
         found = Driver(ctypes.CDLL("libcuda.so.1"))
     except OSError as error:
@@ -102,14 +87,8 @@ def driver() -> Driver:
 def load(driver: Driver, text: str, device: int) -> int:
     """Hands PTX to the driver for the rest of the process; returns the kernel's handle.
 
-    Args:
-      driver: The driver.
-      text: The PTX, with entry point `ENTRY`.
-      device: A GPU that it is translated for now, where an error can be told, and not at the first
-        launch; for others that happens then.
-
-    Raises:
-      KernelUnavailable: If the driver does not take it, with its assembler's message.
+    The driver translates it for one GPU now, where an error can be told, with its assembler's
+    message, and for others at their first launch.
     """
     library, kernel = ctypes.c_void_p(), ctypes.c_void_p()
     log = ctypes.create_string_buffer(_LOG_BYTES)
@@ -156,12 +135,7 @@ def prepare(name: str, layout: Layout, kernel: int, driver: Driver) -> handlers.
 
 
 def register(origin: str, trace: Callable[[], Any], layout: Layout, *, keep: bool = True) -> str:
-    """Compiles a kernel and makes it known to XLA; arguments as of `cpu.register`.
-
-    Raises:
-      KernelUnavailable: If the driver does not take the kernel, or XLA the handler.
-      NotImplementedError: If the kernel does something that has no instruction.
-    """
+    """As `cpu.register`."""
     name = "kernel_" + reuse.digest("cuda", origin, layout, *handlers.identity()[:2])
 
     def build() -> bytes:
@@ -216,7 +190,6 @@ def handler_code(name: str, layout: Layout) -> str:
 
 
 def _stream(h: Handler) -> str:
-    """The stream that XLA runs the call on."""
     c = h.code
     record = c.record(ffi.StreamGet, ctx=h.ctx)
     error = h.call("stream_get", record)
@@ -226,7 +199,6 @@ def _stream(h: Handler) -> str:
 
 
 def _call(h: Handler, function: str, arguments: str) -> str:
-    """The result of one of the driver's functions."""
     place = h.code.byte(f"@{h.name}_table", 8 * (1 + CALLS.index(function)))
     pointer = h.code.let(f"load ptr, ptr {place}")
     return h.code.let(f"call i32 {pointer}({arguments})")

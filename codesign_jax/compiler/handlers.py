@@ -1,7 +1,7 @@
 """XLA's handlers in this computer's machine code, made and loaded by LLVM.  Needs llvmlite.
 
 A handler is the same for every device in its version, checks and errors.  It is written in LLVM's
-language, with instructions of its own (`Code`): it is no kernel.
+language, with instructions of its own (`LlvmFunction`): it is no kernel.
 
 The environment variable CODESIGN_KERNEL_OPTIMIZATION says how much LLVM optimises: 2, the default,
 or 0, which takes half of LLVM's time, for programs that run for milliseconds.  A kernel may ask for
@@ -28,28 +28,24 @@ _TYPES = {1: "i8", 4: "i32", 8: "i64"}
 
 
 def type_of(structure: type[ctypes.Structure], field: str) -> str:
-    """LLVM's type of a field."""
     kind = dict(structure._fields_)[field]  # type: ignore[arg-type]
     return "ptr" if kind is ctypes.c_void_p else _TYPES[ctypes.sizeof(kind)]
 
 
 def constant(name: str, text: str) -> str:
-    """A constant string that ends in a zero byte."""
     raw = text.encode() + b"\0"
     quoted = "".join(f"\\{byte:02X}" for byte in raw)
     return f'@{name} = private constant [{len(raw)} x i8] c"{quoted}"\n'
 
 
-class Code:
+class LlvmFunction:
     """A function that is being written."""
 
     def __init__(self, head: str):
-        """Starts with a function's head, such as "define void @f(ptr %x)"."""
         self.head, self.lines, self.first = head, [], []
         self.count, self.ended = 0, False
 
     def name(self, prefix: str = "t") -> str:
-        """A new name."""
         self.count += 1
         return f"{prefix}{self.count}"
 
@@ -64,7 +60,6 @@ class Code:
         self.lines.append(text)
 
     def end(self, text: str) -> None:
-        """Ends a basic block."""
         self.lines.append(text)
         self.ended = True
 
@@ -91,19 +86,15 @@ class Code:
         return name
 
     def byte(self, base: str, offset: int | str) -> str:
-        """The address some bytes on."""
         return self.let(f"getelementptr i8, ptr {base}, i64 {offset}")
 
     def at(self, base: str, structure: type[ctypes.Structure], field: str) -> str:
-        """Address of a structure's field."""
         return self.byte(base, getattr(structure, field).offset)
 
     def get(self, base: str, structure: type[ctypes.Structure], field: str) -> str:
-        """Reads a structure's field."""
         return self.let(f"load {type_of(structure, field)}, ptr {self.at(base, structure, field)}")
 
     def put(self, base: str, structure: type[ctypes.Structure], field: str, value: object) -> None:
-        """Writes a structure's field."""
         kind = type_of(structure, field)
         self.do(f"store {kind} {value}, ptr {self.at(base, structure, field)}")
 
@@ -116,7 +107,6 @@ class Code:
         return place
 
     def text(self) -> str:
-        """The function."""
         return "\n".join([self.head + " {", "entry:", *self.first, *self.lines, "}", ""])
 
 
@@ -142,7 +132,7 @@ class Handler:
     def __init__(self, name: str, layout: Layout):
         """Writes the answer to XLA's question for the version, and the checks of the arrays."""
         self.name, self.layout = name, layout
-        self.code = Code(f"define ptr @{name}(ptr %frame) nounwind")
+        self.code = LlvmFunction(f"define ptr @{name}(ptr %frame) nounwind")
         self.globals = [f"@{seen(name)} = global [{len(SEEN)} x i64] zeroinitializer\n"]
         self.messages = 0
         self.api = self.code.get("%frame", ffi.CallFrame, "api")
@@ -152,19 +142,13 @@ class Handler:
         self.blocks = self._arrays()
 
     def message(self, text: str) -> str:
-        """A constant string."""
         self.messages += 1
         name = f"{self.name}_message{self.messages}"
         self.globals.append(constant(name, text))
         return f"@{name}"
 
     def fail(self, code: int, message: str) -> None:
-        """Returns an error to XLA.
-
-        Args:
-          code: Kind of error.
-          message: Address of its text, which XLA copies.
-        """
+        """Returns an error to XLA; message: address of its text, which XLA copies."""
         c = self.code
         record = c.record(ffi.ErrorCreate, message=message, errc=code)
         create = c.get(self.api, ffi.Api, "error_create")
@@ -177,7 +161,6 @@ class Handler:
         return self.code.let(f"call ptr {pointer}(ptr {record})")
 
     def text(self) -> str:
-        """The handler with its constants."""
         return "".join(self.globals) + self.code.text()
 
     def _answer(self) -> None:
@@ -225,7 +208,6 @@ class Handler:
         return blocks
 
     def _array(self, place: int, buffer: str, blocks: str) -> str:
-        """Checks one array; returns the number of blocks, once it is known."""
         c, array = self.code, self.layout.arrays[place]
         rank, what = 1 + len(array.shape), f"array {place} to be {array}"
         self._demand(
@@ -261,7 +243,6 @@ _loaded: dict[str, "Loaded"] = {}
 
 @functools.cache
 def vector_bytes() -> int:
-    """Size of this processor's vector registers."""
     features = binding.get_host_cpu_features()
     return 64 if features.get("avx512f") else 32 if features.get("avx") else 16
 
@@ -281,11 +262,6 @@ def identity() -> tuple[object, ...]:
 
 
 def _level() -> int:
-    """LLVM's level of optimisation.
-
-    Raises:
-      ValueError: If the environment states one that is neither 0 nor 2.
-    """
     text = os.environ.get(OPTIMIZATION, "2")
     if text not in ("0", "2"):
         raise ValueError(f"{OPTIMIZATION} = {text!r} must be 0 or 2")
@@ -307,8 +283,7 @@ def compile(text: str, level: int = 2) -> bytes:
     """Object file of a program in LLVM's language.
 
     Args:
-      text: The program.
-      level: Level at which machine code is chosen, 1 or 2, and the highest of other passes.
+      level: At which machine code is chosen, 1 or 2, and the highest of other passes.
     """
     # Where the environment says 0, machine code is still chosen at this level. At 0 that would take
     # a fourth of the time, but multiplications and additions are fused here and not there, and the
@@ -337,7 +312,6 @@ class Loaded:
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(engine))
 
     def function(self, name: str) -> int:
-        """Address of a function."""
         return self.engine.get_function_address(name)
 
     def numbers(self, name: str, count: int) -> Any:
@@ -346,16 +320,10 @@ class Loaded:
 
 
 def known(name: str) -> bool:
-    """Whether a handler of this name has been registered."""
     return name in _loaded
 
 
 def register(name: str, loaded: Loaded, platform: str) -> None:
-    """Makes a loaded handler known to XLA.
-
-    Raises:
-      KernelUnavailable: If XLA has another version, or its structures are smaller.
-    """
     try:
         ffi.register(name, loaded.function(name), platform)
     except ffi.KernelUnavailable as error:

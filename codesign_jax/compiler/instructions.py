@@ -24,7 +24,6 @@ class Instructions:
     """
 
     def __init__(self, lanes: int):
-        """Starts empty."""
         self.lanes = lanes
         self.lines: list[str] = []
         self.declared: set[str] = set()
@@ -35,11 +34,9 @@ class Instructions:
     # What vectors and threads do differently
 
     def type(self, kind: str, wide: bool) -> str:
-        """Name of the LLVM type of a value."""
         raise NotImplementedError
 
     def lane_index(self) -> Value:
-        """The index of each lane."""
         raise NotImplementedError
 
     def splat(self, value: Value) -> Value:
@@ -66,15 +63,12 @@ class Instructions:
         raise NotImplementedError
 
     def divide(self, a: Value, b: Value) -> Value:
-        """Quotient of floats."""
         return self.compute("fdiv contract", a, b)
 
     def square_root(self, x: Value) -> Value:
-        """Square root of floats."""
         return self.intrinsic("sqrt", x)
 
     def inverse_square_root(self, x: Value) -> Value:
-        """1 / sqrt(x) of floats."""
         return self.divide(self.constant(numpy_type(x.kind)(1)), self.square_root(x))
 
     def grown(self, name: str, a: Value, b: Value, result: Value) -> Value:
@@ -84,7 +78,6 @@ class Instructions:
     # Text
 
     def name(self, prefix: str = "v") -> str:
-        """A new name."""
         self.count += 1
         return f"{prefix}{self.count}"
 
@@ -95,12 +88,10 @@ class Instructions:
         return name
 
     def start(self, label: str) -> None:
-        """Begins a basic block."""
         self.lines.append(f"{label}:")
         self.here = label
 
     def number(self, kind: str, value: Any) -> str:
-        """A number as an operand."""
         if is_float(kind):  # the bits of a double, also for a float
             return "0x" + struct.pack(">d", float(numpy_type(kind)(value))).hex().upper()
         return str(int(value))
@@ -122,11 +113,9 @@ class Instructions:
         return Value(value.kind, value.wide, text)
 
     def _known(self, kind: str, wide: bool, number: Any) -> str:
-        """A number as an operand of an instruction on wide or scalar values."""
         return self.operand(Value(kind, wide, None, number))
 
     def typed(self, value: Value) -> str:
-        """A value as an operand with its type."""
         operand = self.operand(value)  # may add an instruction
         return f"{self.type(value.kind, value.wide)} {operand}"
 
@@ -140,7 +129,6 @@ class Instructions:
         return value
 
     def alike(self, *values: Value) -> list[Value]:
-        """The values, all wide if one is."""
         if any(v.wide for v in values):
             return [self.splat(v) for v in values]
         return list(values)
@@ -153,11 +141,9 @@ class Instructions:
         return Value(kind_of(array.dtype), bool(array.shape), None, array[()])
 
     def like(self, value: Value, number: float) -> Value:
-        """A number of a value's kind."""
         return Value(value.kind, False, None, numpy_type(value.kind)(number))
 
     def compute(self, operation: str, *args: Value, kind: str | None = None) -> Value:
-        """The result of an instruction whose operands have one type."""
         args = tuple(self.alike(*args))
         first, wide = args[0], args[0].wide
         operands = ", ".join([self.operand(a) for a in args])
@@ -179,17 +165,15 @@ class Instructions:
         return Value(kind, wide, self.emit(f"call {flags}{one} @{full}({operands})"))
 
     def suffix(self, kind: str, wide: bool) -> str:
-        """How LLVM names a type in its functions' names."""
         scalar = {"b": "i1"}.get(kind, kind)
         vector = self.type(kind, wide).startswith("<")
         return f"v{self.lanes}{scalar}" if vector else scalar
 
     def fma(self, a: Value, b: Value, c: Value) -> Value:
-        """The product of a and b plus c, rounded once."""
+        """The product plus c, rounded once."""
         return self.intrinsic("fma", a, b, c)
 
     def convert(self, operation: str, value: Value, kind: str) -> Value:
-        """The result of one of LLVM's conversions."""
         text = self.emit(f"{operation} {self.typed(value)} to {self.type(kind, value.wide)}")
         return Value(kind, value.wide, text)
 

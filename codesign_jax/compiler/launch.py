@@ -22,31 +22,24 @@ OLDEST_GPU = (8, 0)
 
 
 class Kernel(NamedTuple):
-    """What a kernel is.
+    """What a kernel is."""
 
-    Attributes:
-      origin: Cache key, beyond the source of the compiler and the types and shapes of the blocks.
-        Kernels of one origin and layout, written by one state of this package's code (`reuse`),
-        are taken to be the same.
-      backend: "gpu" or "cpu".
-      lanes: Lanes of a block, see `block_lanes`.
-      shared: Places of inputs of one block that all blocks read; their leading axis is 1.
-      scratch: Places among the outputs of scratch memory. Scratch does not outlive a block, so one
-        buffer a thread suffices on a CPU; on a GPU every block has its own.
-      onchip: Places of further scratch memory that a GPU has in shared memory, if it is small
-        enough.
-      exchanged: Places of outputs where lanes read what other lanes write, see `Array`.
-      level: LLVM's level of optimisation on a CPU, 1 or 2.
-    """
-
+    # Cache key, beyond the source of the compiler and the types and shapes of the blocks. Kernels
+    # of one origin and layout, written by one state of this package's code (`reuse`), are taken to
+    # be the same.
     origin: str
-    backend: str
-    lanes: int
+    backend: str  # "gpu" or "cpu"
+    lanes: int  # Lanes of a block, see `block_lanes`
+    # Places of inputs of one block that all blocks read; their leading axis is 1
     shared: tuple[int, ...] = ()
+    # Places among the outputs of scratch memory. Scratch does not outlive a block, so one buffer a
+    # thread suffices on a CPU; on a GPU every block has its own.
     scratch: tuple[int, ...] = ()
+    # Places of further scratch memory that a GPU has in shared memory, if it is small enough
     onchip: tuple[int, ...] = ()
+    # Places of outputs where lanes read what other lanes write, see `Array`
     exchanged: tuple[int, ...] = ()
-    level: int = 2
+    level: int = 2  # LLVM's level of optimisation on a CPU, 1 or 2
 
 
 SHARED_BYTES = 27_648
@@ -55,11 +48,7 @@ SHARED_BYTES = 27_648
 
 @functools.cache
 def available(platform: str) -> str | None:
-    """Why kernels cannot run on a platform, or None if they can.
-
-    Args:
-      platform: As `jax.default_backend` names it; "gpu" is only NVIDIA's.
-    """
+    """Why kernels cannot run on a platform of JAX's, or None; "gpu" is only NVIDIA's."""
     if platform not in ("cpu", "gpu"):
         return f"kernels are compiled for CPUs and NVIDIA GPUs, not for {platform!r}"
     return _llvmlite() or ffi.unsupported() or (_gpu() if platform == "gpu" else None)
@@ -171,11 +160,7 @@ def _no_collection() -> Iterator[None]:
 
 
 def describe(inputs: Any, outputs: Any, kernel: Kernel) -> Layout:
-    """The layout of a kernel's arrays; scratch memory on a GPU is an output that nobody reads.
-
-    Raises:
-      ValueError: If an array's leading axis is neither the number of blocks nor, shared, 1.
-    """
+    """The layout of a kernel's arrays; scratch memory on a GPU is an output that nobody reads."""
     arrays = []
     scratch = SCRATCH if kernel.backend == "cpu" else OUTPUT
     blocks = outputs[0].shape[0]
@@ -218,7 +203,6 @@ def _varying(inputs: tuple) -> dict[str, Any]:
 
 
 def _llvmlite() -> str | None:
-    """What is wrong with llvmlite."""
     try:
         version = importlib.metadata.version("llvmlite")
         import llvmlite.binding  # noqa: F401  # its own library may not load
@@ -230,7 +214,6 @@ def _llvmlite() -> str | None:
 
 
 def _gpu() -> str | None:
-    """What is wrong with the GPUs or their driver."""
     from codesign_jax.compiler import gpu
 
     try:
@@ -255,7 +238,6 @@ def _gpu() -> str | None:
 
 
 def _pallas_call(jaxpr: Any) -> Any:
-    """The kernel's equation, wherever it is nested."""
     for equation in jaxpr.eqns:
         if equation.primitive.name == "pallas_call":
             return equation

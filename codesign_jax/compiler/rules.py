@@ -67,12 +67,10 @@ def _of_angle(w: Instructions, x: Value, shift: int) -> Value:
 
 
 def sine(w: Instructions, equation: Any, x: Value) -> Value:
-    """Rule of `sin`."""
     return _of_angle(w, x, 0)
 
 
 def cosine(w: Instructions, equation: Any, x: Value) -> Value:
-    """Rule of `cos`."""
     return _of_angle(w, x, 1)
 
 

@@ -19,27 +19,18 @@ AHEAD = 300
 """Lines of a loop between asking for a row and reading it, about the time that memory takes."""
 
 
-class Ahead(NamedTuple):
-    """Rows that a loop reads at an address, and reads again further on in the next round.
+class PrefetchedRows(NamedTuple):
+    """Rows that a loop reads at an address, and reads again further on in the next round."""
 
-    Attributes:
-      line: Line behind which the address is known.
-      offsets: Offsets of the rows from the address [bytes].
-    """
-
-    line: int
-    offsets: list[int]
+    line: int  # Line behind which the address is known
+    offsets: list[int]  # Offsets of the rows from the address [bytes]
 
 
 def rounds_ahead(lines: int, length: int) -> int:
-    """How many rounds ahead of its use a loop prefetches a row.
+    """How many rounds ahead of its use a loop of so many lines prefetches a row.
 
     As many as memory takes, but few against the loop's length: what is asked for in the last rounds
     lies behind the rows that the loop reads.
-
-    Args:
-      lines: Lines of the loop's body.
-      length: Its number of rounds.
     """
     return min(-(-AHEAD // max(1, lines)), max(1, length // 5))
 
@@ -72,28 +63,26 @@ class ThreadWriter(Writer):
         self.born: dict[str, int] = {}  # line behind an address
         self.found: list[dict[tuple, Any]] = [{}]  # computed already, one scope a region
         # The loops around: line at which a body begins, rounds, and its reads by address.
-        self.ahead: list[tuple[int, int, dict[str, Ahead]]] = []
+        self.ahead: list[tuple[int, int, dict[str, PrefetchedRows]]] = []
         self.meeting = False  # between the loads of a group, before which the threads have met
         # Where lanes exchange through memory, whether they have since they last met.
         self.stored = self.loaded = False
         self.spans: set[int] = set()  # numbers of rows that are asked for at once
 
     def type(self, kind: str, wide: bool) -> str:
-        """See `Writer`."""
         return LLVM_TYPES[kind]
 
     def lane_index(self) -> Value:
-        """See `Writer`."""
         return self.lane
 
     def splat(self, value: Value) -> Value:
-        """See `Writer`; the register stays."""
+        """The register stays."""
         if not value.wide and value.text is not None:
             self.scalar_of[value.text] = value._replace(known=0)
         return value._replace(wide=True)
 
     def swap_lanes(self, value: Value, source: np.ndarray) -> Value:
-        """See `Writer`; lanes swap in pairs."""
+        """Lanes swap in pairs."""
         mask = int(source[0])
         if len(source) != self.lanes or (source != np.arange(self.lanes) ^ mask).any():
             raise NotImplementedError("a kernel's lanes swap in pairs whose indices differ by bits")
@@ -121,13 +110,12 @@ class ThreadWriter(Writer):
         return Value(value.kind, True, self.emit(call))
 
     def over_lanes(self, name: str, value: Value) -> Value:
-        """See `Writer`."""
         full = f"llvm.nvvm.redux.sync.{name}"
         self.declared.add(f"declare i32 @{full}(i32, i32)")
         return Value("i32", False, self.emit(f"call i32 @{full}({self.typed(value)}, {self.all})"))
 
     def compute(self, operation: str, *args: Value, kind: str | None = None) -> Value:
-        """See `Writer`; no integer is computed twice, so that addresses are known again."""
+        """No integer is computed twice, so that addresses are known again."""
         if args[0].kind != "i32":
             return super().compute(operation, *args, kind=kind)
         key = (operation, *args)
@@ -146,7 +134,6 @@ class ThreadWriter(Writer):
     # Arithmetic: in float32 what the kernel's tolerance is far above, two units in the last place
 
     def divide(self, a: Value, b: Value) -> Value:
-        """See `Writer`."""
         if a.kind == "f64":
             return super().divide(a, b)
         self.declared.add("declare float @llvm.nvvm.div.full(float, float)")
@@ -154,11 +141,9 @@ class ThreadWriter(Writer):
         return Value("f32", a.wide or b.wide, self.emit(f"call float @llvm.nvvm.div.full({parts})"))
 
     def square_root(self, x: Value) -> Value:
-        """See `Writer`."""
         return super().square_root(x) if x.kind == "f64" else self._approximate("sqrt", x)
 
     def inverse_square_root(self, x: Value) -> Value:
-        """See `Writer`."""
         if x.kind == "f64":
             return super().inverse_square_root(x)
         return self._approximate("rsqrt", x)
@@ -171,7 +156,6 @@ class ThreadWriter(Writer):
     # Memory
 
     def load(self, ref: Ref, indices: list[Value]) -> Value:
-        """See `Writer`."""
         base, offset, place = self._address(ref, indices)
         wide, kind = any(i.wide for i in indices), LLVM_TYPES[ref.kind]
         foreign = self._is_foreign(ref, indices)
@@ -192,7 +176,6 @@ class ThreadWriter(Writer):
         return Value(ref.kind, wide, text)
 
     def store(self, ref: Ref, indices: list[Value], value: Value) -> None:
-        """See `Writer`."""
         _, _, place = self._address(ref, indices)
         if ref.exchanged:
             if self.loaded:
@@ -216,7 +199,6 @@ class ThreadWriter(Writer):
         return base, offset, place
 
     def _step(self, base: str, index: Value, stride: int, space: int) -> str:
-        """Address `index` times `stride` bytes behind another one."""
         key = (base, index.text, stride)
         return self._once(key, lambda: self._behind(base, index, stride, space))
 
@@ -233,15 +215,15 @@ class ThreadWriter(Writer):
         return place
 
     def branch(self, equation: Any, args: list) -> list:
-        """See `Writer`; addresses computed in a branch are unknown after it."""
+        """Addresses computed in a branch are unknown after it."""
         return self._scoped(super().branch, equation, args)
 
     def while_loop(self, equation: Any, args: list) -> list:
-        """See `Writer`; addresses computed in a loop are unknown after it."""
+        """Addresses computed in a loop are unknown after it."""
         return self._scoped(super().while_loop, equation, args)
 
     def loop(self, equation: Any, args: list) -> list:
-        """See `Writer`; addresses computed in a loop are unknown after it."""
+        """Addresses computed in a loop are unknown after it."""
         return self._scoped(super().loop, equation, args)
 
     def _scoped(self, write: Any, equation: Any, args: list) -> list:
@@ -251,7 +233,7 @@ class ThreadWriter(Writer):
         return results
 
     def start(self, label: str) -> None:
-        """See `Writer`; the two branches of a conditional know nothing of each other."""
+        """The two branches of a conditional know nothing of each other."""
         super().start(label)
         self.stored = self.loaded = True
         if len(self.found) > 1:
@@ -260,7 +242,7 @@ class ThreadWriter(Writer):
     # Asking for memory ahead
 
     def grown(self, name: str, a: Value, b: Value, result: Value) -> Value:
-        """See `Writer`; notes how integers grow from round to round."""
+        """Notes how integers grow from round to round."""
         if result.text is None:
             return result
         grow = [0 if v.text is None else self.growth.get(v.text, 0) for v in (a, b)]
@@ -289,11 +271,10 @@ class ThreadWriter(Writer):
         line = self.born[base]
         for first, _, reads in reversed(self.ahead):
             if first <= line:
-                reads.setdefault(base, Ahead(line, [])).offsets.append(offset)
+                reads.setdefault(base, PrefetchedRows(line, [])).offsets.append(offset)
                 return
 
     def begin_loop(self, counters: list[str], length: int) -> None:
-        """See `Writer`."""
         self.ahead.append((len(self.lines), length, {}))
         self.growth |= {name: 1 for name in counters}
 
@@ -326,16 +307,7 @@ class ThreadWriter(Writer):
 
 
 def write(jaxpr: Any, layout: Layout, name: str) -> str:
-    """A kernel of LLVM's language whose block b works on entry b of every array.
-
-    Args:
-      jaxpr: The kernel's jaxpr; its arguments are references to a block of each array.
-      layout: The arrays, and the number of lanes: at most those of a warp.
-      name: Name of the kernel.
-
-    Raises:
-      NotImplementedError: If the kernel does something that has no rule here.
-    """
+    """A kernel of LLVM's language whose block b works on entry b of every array."""
     lanes, blocks = layout.lanes, layout.blocks
     if not 1 <= lanes <= LANES:
         raise NotImplementedError(f"a block of {lanes} lanes: a warp has {LANES}")
@@ -394,13 +366,10 @@ _CONDITIONAL = re.compile(r"^(\s*@!?%p\d+ )bra(\s)", re.MULTILINE)
 
 
 def assembly(text: str) -> str:
-    """PTX of a kernel.
+    """PTX of a kernel in LLVM's language.
 
     Passes are few on purpose: the kernel's own text has loops and little that is computed twice,
     and passes that move loads out of loops make values live longer than there are registers.
-
-    Args:
-      text: The kernel in LLVM's language, see `thread.write`.
     """
     binding.initialize_all_targets()
     binding.initialize_all_asmprinters()

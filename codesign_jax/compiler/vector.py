@@ -15,11 +15,9 @@ class VectorWriter(Writer):
     """Writes vector instructions."""
 
     def type(self, kind: str, wide: bool) -> str:
-        """See `Writer`."""
         return f"<{self.lanes} x {LLVM_TYPES[kind]}>" if wide else LLVM_TYPES[kind]
 
     def lane_index(self) -> Value:
-        """See `Writer`."""
         return Value("i32", True, None, np.arange(self.lanes, dtype=np.int32))
 
     def _known(self, kind: str, wide: bool, number: Any) -> str:
@@ -29,13 +27,11 @@ class VectorWriter(Writer):
         return "<" + ", ".join(f"{LLVM_TYPES[kind]} {self.number(kind, v)}" for v in each) + ">"
 
     def operand(self, value: Value) -> str:
-        """See `Writer`."""
         if value.is_known and value.wide:
             return self._known(value.kind, True, value.known)
         return super().operand(value)
 
     def splat(self, value: Value) -> Value:
-        """See `Writer`."""
         if value.wide:
             return value
         if value.is_known:
@@ -47,19 +43,16 @@ class VectorWriter(Writer):
         return Value(value.kind, True, text)
 
     def swap_lanes(self, value: Value, source: np.ndarray) -> Value:
-        """See `Writer`."""
         text = self._shuffle(self.type(value.kind, True), self.operand(value), source)
         return Value(value.kind, True, text)
 
     def _shuffle(self, kind: str, value: str, pattern: np.ndarray) -> str:
-        """A vector whose lane i is the value's lane pattern[i]."""
         mask = ", ".join(f"i32 {int(p)}" for p in pattern)
         return self.emit(
             f"shufflevector {kind} {value}, {kind} poison, <{len(pattern)} x i32> <{mask}>"
         )
 
     def over_lanes(self, name: str, value: Value) -> Value:
-        """See `Writer`."""
         full = f"llvm.vector.reduce.s{name}.v{self.lanes}i32"
         self.declared.add(f"declare i32 @{full}({self.type('i32', True)})")
         return Value("i32", False, self.emit(f"call i32 @{full}({self.typed(value)})"))
@@ -67,7 +60,7 @@ class VectorWriter(Writer):
     # Memory
 
     def load(self, ref: Ref, indices: list[Value]) -> Value:
-        """See `Writer`; lanes that read one row read it once."""
+        """Lanes that read one row read it once."""
         *rows, lane = indices
         if any(i.wide for i in rows) or (lane.wide and not lane.is_known):
             return self._gather(ref, indices)
@@ -84,7 +77,6 @@ class VectorWriter(Writer):
         return Value(ref.kind, True, value)
 
     def store(self, ref: Ref, indices: list[Value], value: Value) -> None:
-        """See `Writer`."""
         *rows, lane = indices
         if any(i.wide for i in rows) or (lane.wide and not lane.is_known):
             self._scatter(ref, indices, self.splat(value))
@@ -124,7 +116,6 @@ class VectorWriter(Writer):
         return address
 
     def _addresses(self, ref: Ref, indices: list[Value]) -> str:
-        """Addresses of an element of each lane."""
         strides = np.cumprod([1, *ref.shape[:0:-1]])[::-1]
         total = "zeroinitializer"
         rows = f"<{self.lanes} x i64>"
@@ -138,7 +129,6 @@ class VectorWriter(Writer):
         return self.emit(f"getelementptr inbounds {scalar}, ptr {ref.address}, {rows} {total}")
 
     def _masked(self, name: str, ref: Ref, operands: list[str], result: str) -> str:
-        """A call of LLVM's gather or scatter with all lanes on."""
         full = f"llvm.masked.{name}.{self.suffix(ref.kind, True)}.v{self.lanes}p0"
         align, mask = f"i32 {SIZES[ref.kind]}", self._known("b", True, 1)
         operands = [*operands, align, f"{self.type('b', True)} {mask}"]
@@ -160,16 +150,7 @@ class VectorWriter(Writer):
 
 
 def write(jaxpr: Any, blocks: list[tuple[tuple[int, ...], Any]], lanes: int) -> str:
-    """A function `block` of LLVM's language that runs a kernel on one block.
-
-    Args:
-      jaxpr: The kernel's jaxpr; its arguments are references to a block of each array.
-      blocks: Shape and dtype of a block of each array.
-      lanes: Lanes of a block.
-
-    Raises:
-      NotImplementedError: If the kernel does something that has no rule here.
-    """
+    """A function `block` of LLVM's language that runs a kernel on one block."""
     writer = VectorWriter(lanes)
     refs = [Ref(f"%a{k}", shape, kind_of(dtype)) for k, (shape, dtype) in enumerate(blocks)]
     writer.run(jaxpr, [], refs)

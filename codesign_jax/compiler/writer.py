@@ -34,7 +34,6 @@ class Writer(Instructions):
     """
 
     def __init__(self, lanes: int):
-        """Starts empty."""
         super().__init__(lanes)
         self.following: list[Any] = []  # operations behind the present one
         self.last_of_group = True
@@ -193,11 +192,7 @@ class Writer(Instructions):
     # The walk through the jaxpr
 
     def run(self, jaxpr: Any, consts: Any, args: list) -> list:
-        """Writes the instructions of a jaxpr; returns its results.
-
-        Raises:
-          NotImplementedError: If an operation has no rule, or its operands' dtype none.
-        """
+        """Writes the instructions of a jaxpr; returns its results."""
         values: dict[Any, Any] = {}
 
         def read(atom: Any) -> Any:
@@ -218,7 +213,6 @@ class Writer(Instructions):
         return [read(v) for v in jaxpr.outvars]
 
     def equation(self, equation: Any, args: list) -> list:
-        """Writes one operation; returns its results."""
         name, params = equation.primitive.name, equation.params
         if name in _INLINE:
             inner = params.get("jaxpr", params.get("call_jaxpr"))

@@ -186,7 +186,7 @@ def palm_touches(scene: Scene) -> bool:
 
 
 def pairings_held(scene: Scene) -> int:
-    """Pairings of fingers whose friction is kept from step to step; see the kernel's `Pairing`.
+    """Pairings of fingers whose friction is kept from step to step; see `FingerPairing`.
 
     Number 0 is each finger with itself. Spheres keep none: their contact is MuJoCo's, which has no
     state.

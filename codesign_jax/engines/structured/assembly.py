@@ -140,20 +140,14 @@ def _of_object(
 
 
 class HandContacts(NamedTuple):
-    """Contacts of rings or spheres with other fingers, their own or the palm.
+    """Contacts of rings or spheres with other fingers, their own or the palm."""
 
-    Attributes:
-      contacts: The contacts, shape (item, pair, world); a pair is two fingers, or one.
-      links: Their links on the first finger, 1 for the first one that moves, shape (item,).
-      others: Links of the other side, 0 for the palm, shape (item, pair, world).
-      fingers: First and second finger of the pairs, shape (2, pair).
-      grip: What the pairs hold of friction, see `holding.held`, shape (3, 1, pair, world), or None.
-    """
-
-    contacts: Contacts
+    contacts: Contacts  # The contacts, shape (item, pair, world); a pair is two fingers, or one
+    # Their links on the first finger, 1 for the first one that moves, shape (item,)
     links: jax.Array
-    others: jax.Array
-    fingers: jax.Array
+    others: jax.Array  # Links of the other side, 0 for the palm, shape (item, pair, world)
+    fingers: jax.Array  # First and second finger of the pairs, shape (2, pair)
+    # What the pairs hold of friction, see `holding.held`, shape (3, 1, pair, world), or None
     grip: jax.Array | None = None
 
     def relative(self, motion: Spatial) -> jax.Array:
@@ -240,18 +234,14 @@ def hand_contacts(
 
 
 class _CentreLines(NamedTuple):
-    """Centre lines of fingers, and what `finger_collision.between` takes of them.
+    """Centre lines of fingers, and what `finger_collision.between` takes of them."""
 
-    Attributes:
-      scene: The scene.
-      ends: Where segments begin and the last one ends [m], shape (3, link + 2, finger, world).
-      frames: Of the links, the palm's half one first, shape (3, 3, link + 1, finger, world).
-      sizes: Numbers of the ring whose section a segment has, shape (8, link + 1, finger, world).
-    """
-
-    scene: Scene
+    scene: Scene  # The scene
+    # Where segments begin and the last one ends [m], shape (3, link + 2, finger, world)
     ends: jax.Array
+    # Of the links, the palm's half one first, shape (3, 3, link + 1, finger, world)
     frames: jax.Array
+    # Numbers of the ring whose section a segment has, shape (8, link + 1, finger, world)
     sizes: jax.Array
 
     def last(self, numbers: jax.Array) -> jax.Array:
@@ -268,7 +258,7 @@ class _CentreLines(NamedTuple):
     def nearest(
         self, centre: jax.Array, second: np.ndarray, last: jax.Array | None
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Squared distances of places, their nearest segments and where on them; see `Search`."""
+        """Squared distances of places, their nearest segments and where on them."""
         start = self.ends[:, :-1, second]
         along = self.ends[:, 1:, second] - start
         if last is None:

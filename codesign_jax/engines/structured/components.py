@@ -18,12 +18,10 @@ FINGER, WORLD = 1009, 1013
 
 
 def _small(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Shape of the components: lane axes have length one."""
     return tuple(1 if n in (FINGER, WORLD) else n for n in shape)
 
 
 def _constant(value: Any) -> np.ndarray:
-    """Components of a literal or captured array."""
     array = np.asarray(value)
     parts = np.empty(_small(array.shape), object)
     for index in np.ndindex(parts.shape):
@@ -103,7 +101,6 @@ def is_number(x: Any) -> bool:
 
 
 def _fold(equation: Any, parts: tuple) -> Any:
-    """Result of an operation on numbers, at trace time."""
     types = [v.aval.dtype for v in equation.invars]
     with jax.ensure_compile_time_eval():
         arrays = [np.asarray(p, t) for p, t in zip(parts, types, strict=True)]
@@ -113,7 +110,6 @@ def _fold(equation: Any, parts: tuple) -> Any:
 
 
 def _bind(equation: Any, parts: tuple) -> Any:
-    """The operation on lanes, to which numbers are spread."""
     shape = next(p.shape for p in parts if not is_number(p))
     arrays = [splat(p, shape, v.aval.dtype) for p, v in zip(parts, equation.invars, strict=True)]
     return equation.primitive.bind(*arrays, **equation.params)

@@ -10,16 +10,11 @@ from codesign_jax.scene import Scene
 
 
 def reset(scene: Scene, fields: ModelFields) -> State:
-    """Start states of a batch, fields with leading axis (world,)."""
     return _in_lanes(scene, model.split(scene, fields.start))
 
 
 def make(
-    scene: Scene,
-    qpos: jax.Array,
-    qvel: jax.Array,
-    acc: jax.Array,
-    held: jax.Array | None = None,
+    scene: Scene, qpos: jax.Array, qvel: jax.Array, acc: jax.Array, held: jax.Array | None = None
 ) -> State:
     """The state at MuJoCo's coordinates, at the beginning of a grasp.
 
@@ -81,7 +76,6 @@ def flat_acc(acc: Acc) -> jax.Array:
 
 
 def flat(state: State) -> jax.Array:
-    """Generalized positions and velocities, shape (world, nq + nv)."""
     return jnp.concatenate([qpos(state), qvel(state)], 1)
 
 

@@ -90,7 +90,6 @@ class StructuredEngine(Equal):
         return self.scene.structure, self.limits, self.segment, self.truncate
 
     def reset(self, fields: ModelFields) -> State:
-        """Start states of a batch, fields with leading axis (world,)."""
         return coordinates.reset(self.scene, fields)
 
     def place(
@@ -104,11 +103,9 @@ class StructuredEngine(Equal):
         return coordinates.make(self.scene, qpos, qvel, warm)
 
     def qpos(self, state: State) -> jax.Array:
-        """MuJoCo's qpos, shape (world, nq)."""
         return coordinates.qpos(state)
 
     def qvel(self, state: State) -> jax.Array:
-        """MuJoCo's qvel, shape (world, nv)."""
         return coordinates.qvel(state)
 
     def advance(
@@ -188,11 +185,7 @@ class StructuredEngine(Equal):
     def states(
         self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False
     ) -> tuple[Trace, dict[str, jax.Array]]:
-        """`simulate`, and qpos, qvel and the accelerations of every step, see `Program.simulate`.
-
-        Raises:
-          KernelUnavailable: As `simulate`.
-        """
+        """`simulate`, and qpos, qvel and accelerations of every step, see `Program.simulate`."""
         program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl))
         how = {"trajectory": trajectory, "states": True}
         out = _execute(program, self._inputs(program, fields, ctrl), **how)
@@ -311,15 +304,9 @@ class Recording(Equal):
         return (self.engine,)
 
     def recording(self) -> "Recording":
-        """Itself."""
         return self
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
-        """See `Engine.rollout`.
-
-        Raises:
-          NotImplementedError: If it is differentiated.
-        """
         run = jax.custom_vjp(transforms.folded(partial(self._simulate, trajectory)))
 
         def refuse(*_: Any) -> Any:
@@ -361,7 +348,6 @@ class Recording(Equal):
 
 
 def _execute(program: Program, inputs: tuple, **how: Any) -> list[jax.Array | None]:
-    """`Program.execute`, whose error names the engines that run on a device without kernels."""
     try:
         return program.execute(inputs, **how)
     except KernelUnavailable as error:

@@ -100,7 +100,6 @@ def _pressing(met: HandContacts, motion: Spatial, velocity: Spatial) -> jax.Arra
 
 
 def _force(contacts: Contacts, jar: jax.Array) -> jax.Array:
-    """Forces on the first body, shape (3, ...)."""
     return jnp.where(contacts.active, constraint_update(contacts, jar).force[:3], 0.0)
 
 

@@ -22,7 +22,7 @@ def once(function: Callable, *args: Any) -> Any:
 
 
 def scan_links(step: Callable, first: Any, links: Any) -> tuple[Any, Any]:
-    """`jax.lax.scan` over links whose slices are rows to the compiler.
+    """`jax.lax.scan` over links, whose slices are rows to the compiler.
 
     XLA's CPU loops that slice an array of five axes at a dynamic index are not vectorised, those
     that slice one of two or three axes are: a copy of 34 kB takes 2 instead of 8 microseconds.
@@ -31,9 +31,6 @@ def scan_links(step: Callable, first: Any, links: Any) -> tuple[Any, Any]:
       step: From carry and the arrays of one link to carry and output.
       first: First carry.
       links: Arrays with leading axis (link,).
-
-    Returns:
-      Last carry and outputs with leading axis (link,).
     """
     leading, treedef = jax.tree.flatten(links)
     count, out_shapes = leading[0].shape[0], []
@@ -55,7 +52,6 @@ def scan_links(step: Callable, first: Any, links: Any) -> tuple[Any, Any]:
 
 
 def total(terms: Sequence[jax.Array]) -> jax.Array:
-    """Sum of a short list."""
     result = terms[0]
     for term in terms[1:]:
         result = result + term
@@ -87,7 +83,6 @@ def cross(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def spatial(angular: jax.Array, linear: jax.Array) -> jax.Array:
-    """Spatial vector (angular, linear) of six components."""
     return jnp.concatenate([angular, linear])
 
 
@@ -106,12 +101,10 @@ def rotate(columns: list[jax.Array], axis: int, angle_cos: jax.Array, angle_sin:
 
 
 def sum_axis(x: jax.Array, axis: int) -> jax.Array:
-    """Sum over a short axis, written out."""
     return total([jax.lax.index_in_dim(x, i, axis, keepdims=False) for i in range(x.shape[axis])])
 
 
 def sum_fingers(x: jax.Array) -> jax.Array:
-    """Sum over the finger axis, kept with length one."""
     return sum_axis(x, x.ndim - 2)[..., None, :]
 
 

@@ -39,7 +39,6 @@ class Lanes:
 
     @property
     def lane(self) -> Any:
-        """The only component."""
         return self.parts.item()
 
 
@@ -74,7 +73,6 @@ def lanewise(function: Callable, *args: Any) -> Any:
 
 
 def _components(function: Callable, tree: Any, leaves: list) -> Any:
-    """`lanewise`, traced anew."""
     mine = [i for i, leaf in enumerate(leaves) if isinstance(leaf, Lanes)]
 
     def flat(*arrays: jax.Array) -> Any:
@@ -134,7 +132,7 @@ def _program(call: _Call) -> Callable[[list], Any]:
     Tracing is most of the time that a kernel takes to compile, and its functions come again: for
     each pair of bodies, and in the kernel of the next scene.
     """
-    found: list = []  # as the function is traced: its result, with places instead of values
+    found: list = []  # As the function is traced: its result, with places instead of values
 
     def run(*values: Any) -> list:
         filled = [

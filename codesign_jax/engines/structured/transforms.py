@@ -40,19 +40,13 @@ from codesign_jax.types import Trace
 
 
 class Settings(NamedTuple):
-    """What a rollout and its derivative depend on beside their arguments.
+    """What a rollout and its derivative depend on beside their arguments."""
 
-    Attributes:
-      scene: The scene.
-      limits: How hard each step is solved.
-      segment: Steps of a segment, see `StructuredEngine`; None to store the states of all steps.
-      truncate: Whether no cotangent of a state passes from a segment to the one before it.
-    """
-
-    scene: Scene
-    limits: Limits
+    scene: Scene  # The scene
+    limits: Limits  # How hard each step is solved
+    # Steps of a segment, see `StructuredEngine`; None to store the states of all steps
     segment: int | None
-    truncate: bool
+    truncate: bool  # Whether no cotangent of a state passes from a segment to the one before it
 
 
 def rollout(
@@ -243,7 +237,6 @@ def _reversed(
     )
 
     def join(x: jax.Array) -> jax.Array:
-        """Inverse of `split`."""
         return jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])[:, :steps]
 
     state = (x[:, 0] for x in ends)

@@ -18,88 +18,58 @@ from codesign_jax.verdict import Bounds, bounds
 
 
 class WorldModel(NamedTuple):
-    """Hand and object of every world; lanes are (finger, world) or (1, world), all lengths SI.
+    """Hand and object of every world; lanes are (finger, world) or (1, world), all lengths SI."""
 
-    Attributes:
-      mount: Columns of the finger bases' orientations in the palm frame, shape (3, 3, finger,
-        world).
-      base: Base positions in the palm frame, shape (3, finger, world).
-      offset: Joint positions along the previous link, shape (link, finger, world).
-      mass: Link masses, shape (link, finger, world).
-      centre: Link centres of mass in the link frame, shape (3, link, finger, world).
-      inertia: Principal inertia of the links, shape (3, link, finger, world).
-      stiffness: Joint stiffness, shape (link, axis, finger, world).
-      damping: Joint damping with the implicit term, same shape.
-      armature: Joint armature with the implicit terms, same shape.
-      gain: Bending moment per pressure, shape (finger, world); of tapered fingers (link, finger,
-        world).
-      sphere: Sphere centres in the link frame, shape (3, link, k, finger, world).
-      radius: Sphere radii, shape (link, k, finger, world).
-      stub_centre: Centre of the half segments at the palm in the palm frame, shape (3, finger,
-        world).
-      palm_mass: Mass of the palm with the half segments, shape (1, world).
-      palm_centre: Its centre of mass in the palm frame, shape (3, 1, world).
-      palm_inertia: Its inertia tensor about that centre, shape (3, 3, 1, world).
-      palm_point: Centres of the palm's contact spheres in the palm frame, shape (3, sphere, world);
-        empty without palm contacts.
-      palm_radius: Their radii, shape (sphere, world).
-      palm_disc: Radius and half the thickness of the palm's disc, shape (2, 1, world); None where
-        nothing touches it.
-      wrist_stiffness: Stiffness of the wrist's springs, shape (6, 1, world).
-      wrist_damping: Damping with the implicit term, shape (6, 1, world).
-      wrist_armature: Armature with the implicit terms, shape (6, 1, world).
-      object_mass: Shape (1, world).
-      object_inertia: Principal inertia, shape (3, 1, world).
-      object_size: Sizes of the object's shape, shape (3, 1, world).
-      object_id: Index of the object's shape, shape (1, world).
-      mesh: Meshes of the worlds; None if the scene has none.
-      cones: Parameters of the contacts.
-      bounds: When a world is decided, of shape (1, world) each.
-      gravity: Magnitude of gravity [m/s^2], shape (1, world); None without the effect.
-      section: Height, wall, segment length and width of the fingers at their bases, shape (4,
-        finger, world); None where no effect needs them, see `ModelFields`.
-      tip: Height, wall and width at the tips, shape (3, finger, world); None without taper.
-      threshold: Numbers of `model.morphology.thresholds`, shape (1, 3, finger, world), of tapered
-        fingers (link, 3, finger, world); None without the effect `lateral_threshold`.
-      air: Exponent of the air and the atmosphere's pressure, shape (2, 1, world); None without the
-        effect `air_mass`.
-      friction: See `cones.frictions`, shape (n, 1, world); None where all is as the table.
-    """
-
+    # Columns of the finger bases' orientations in the palm frame, shape (3, 3, finger, world)
     mount: jax.Array
-    base: jax.Array
-    offset: jax.Array
-    mass: jax.Array
-    centre: jax.Array
-    inertia: jax.Array
-    stiffness: jax.Array
-    damping: jax.Array
-    armature: jax.Array
+    base: jax.Array  # Base positions in the palm frame, shape (3, finger, world)
+    offset: jax.Array  # Joint positions along the previous link, shape (link, finger, world)
+    mass: jax.Array  # Link masses, shape (link, finger, world)
+    centre: jax.Array  # Link centres of mass in the link frame, shape (3, link, finger, world)
+    inertia: jax.Array  # Principal inertia of the links, shape (3, link, finger, world)
+    stiffness: jax.Array  # Joint stiffness, shape (link, axis, finger, world)
+    damping: jax.Array  # Joint damping with the implicit term, same shape
+    armature: jax.Array  # Joint armature with the implicit terms, same shape
+    # Bending moment per pressure, shape (finger, world); of tapered fingers (link, finger, world)
     gain: jax.Array
-    sphere: jax.Array
-    radius: jax.Array
+    sphere: jax.Array  # Sphere centres in the link frame, shape (3, link, k, finger, world)
+    radius: jax.Array  # Sphere radii, shape (link, k, finger, world)
+    # Centre of the half segments at the palm in the palm frame, shape (3, finger, world)
     stub_centre: jax.Array
-    palm_mass: jax.Array
-    palm_centre: jax.Array
-    palm_inertia: jax.Array
+    palm_mass: jax.Array  # Mass of the palm with the half segments, shape (1, world)
+    palm_centre: jax.Array  # Its centre of mass in the palm frame, shape (3, 1, world)
+    palm_inertia: jax.Array  # Its inertia tensor about that centre, shape (3, 3, 1, world)
+    # Centres of the palm's contact spheres in the palm frame, shape (3, sphere, world); empty
+    # without palm contacts
     palm_point: jax.Array
-    palm_radius: jax.Array
-    wrist_stiffness: jax.Array
-    wrist_damping: jax.Array
-    wrist_armature: jax.Array
-    object_mass: jax.Array
-    object_inertia: jax.Array
-    object_size: jax.Array
-    object_id: jax.Array
-    mesh: MeshLanes | None
-    cones: Cones
-    bounds: Bounds
+    palm_radius: jax.Array  # Their radii, shape (sphere, world)
+    wrist_stiffness: jax.Array  # Stiffness of the wrist's springs, shape (6, 1, world)
+    wrist_damping: jax.Array  # Damping with the implicit term, shape (6, 1, world)
+    wrist_armature: jax.Array  # Armature with the implicit terms, shape (6, 1, world)
+    object_mass: jax.Array  # Shape (1, world)
+    object_inertia: jax.Array  # Principal inertia, shape (3, 1, world)
+    object_size: jax.Array  # Sizes of the object's shape, shape (3, 1, world)
+    object_id: jax.Array  # Index of the object's shape, shape (1, world)
+    mesh: MeshLanes | None  # Meshes of the worlds; None if the scene has none
+    cones: Cones  # Parameters of the contacts
+    bounds: Bounds  # When a world is decided, of shape (1, world) each
+    # Magnitude of gravity [m/s^2], shape (1, world); None without the effect
     gravity: jax.Array | None = None
+    # Height, wall, segment length and width of the fingers at their bases, shape (4, finger,
+    # world); None where no effect needs them, see `ModelFields`
     section: jax.Array | None = None
+    # Height, wall and width at the tips, shape (3, finger, world); None without taper
     tip: jax.Array | None = None
+    # Radius and half the thickness of the palm's disc, shape (2, 1, world); None where nothing
+    # touches it
     palm_disc: jax.Array | None = None
+    # Numbers of `model.morphology.thresholds`, shape (1, 3, finger, world), of tapered fingers
+    # (link, 3, finger, world); None without the effect `lateral_threshold`
     threshold: jax.Array | None = None
+    # Exponent of the air and the atmosphere's pressure, shape (2, 1, world); None without the
+    # effect `air_mass`
     air: jax.Array | None = None
+    # See `cones.frictions`, shape (n, 1, world); None where all is as the table
     friction: jax.Array | None = None
 
 
@@ -252,7 +222,6 @@ def _air(scene: Scene) -> jax.Array:
 
 
 def _gain(fields: ModelFields, lay: Layout, last: Callable) -> jax.Array:
-    """Bending moment per pressure, see `WorldModel`."""
     of_finger = last(fields.actuator_gainprm[:, 6 : 6 + len(lay.stubs), 0])
     if fields.wrap_prm is None:
         return of_finger

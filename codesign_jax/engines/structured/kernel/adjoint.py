@@ -11,7 +11,6 @@ from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
-from jax.experimental import pallas as pl
 
 from codesign_jax import reuse
 from codesign_jax.compiler.launch import Kernel, launch
@@ -19,8 +18,8 @@ from codesign_jax.engines.structured.kernel.adjoint_step import ReverseStep, Tra
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, of_step
 from codesign_jax.engines.structured.kernel.finger_contacts import FingerContactSet
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
-from codesign_jax.engines.structured.kernel.program import Program, block_spec
-from codesign_jax.engines.structured.kernel.residual import Place
+from codesign_jax.engines.structured.kernel.program import Program, copy_rows
+from codesign_jax.engines.structured.kernel.residual import BodyMotion
 from codesign_jax.engines.structured.kernel.residual_vjp import SHAPES
 from codesign_jax.engines.structured.lanewise import lanes, of_code
 
@@ -29,20 +28,14 @@ class RecordedPath(NamedTuple):
     """What the reverse pass reads of a rollout, with a leading world axis.
 
     In a kernel the rows are those of blocks, see `Packing.by_block`.
-
-    Attributes:
-      finger: Fingers' state before the steps that are recorded, shape (world, time, row, finger).
-      world: Wrist and object alike, shape (world, time, row, 1).
-      finger_end: The same after the last step, shape (world, 1, row, finger).
-      world_end: Likewise.
-      taken: Number of steps that each world took, shape (world, 1, 1, 1).
     """
 
+    # Fingers' state before the steps that are recorded, shape (world, time, row, finger)
     finger: jax.Array
-    world: jax.Array
-    finger_end: jax.Array
-    world_end: jax.Array
-    taken: jax.Array
+    world: jax.Array  # Wrist and object alike, shape (world, time, row, 1)
+    finger_end: jax.Array  # The same after the last step, shape (world, 1, row, finger)
+    world_end: jax.Array  # Likewise
+    taken: jax.Array  # Number of steps that each world took, shape (world, 1, 1, 1)
 
 
 def recorded(out: Any, taken: jax.Array) -> RecordedPath:
@@ -52,19 +45,13 @@ def recorded(out: Any, taken: jax.Array) -> RecordedPath:
 
 
 class Cotangents(NamedTuple):
-    """Cotangents of a rollout's results, laid out as `RecordedPath`.
+    """Cotangents of a rollout's results, laid out as `RecordedPath`."""
 
-    Attributes:
-      finger: Of the fingers' state at the end, shape (world, 1, row, finger).
-      world: Of wrist and object at the end, shape (world, 1, row, 1).
-      trace: Of distance, height and speed, shape (world, time, 3, 1).
-      path: Of the positions at every step, (world, time, row, finger) and (world, time, row, 1);
-        none without a trajectory.
-    """
-
-    finger: jax.Array
-    world: jax.Array
-    trace: jax.Array
+    finger: jax.Array  # Of the fingers' state at the end, shape (world, 1, row, finger)
+    world: jax.Array  # Of wrist and object at the end, shape (world, 1, row, 1)
+    trace: jax.Array  # Of distance, height and speed, shape (world, time, 3, 1)
+    # Of the positions at every step, (world, time, row, finger) and (world, time, row, 1); none
+    # without a trajectory
     path: tuple[jax.Array, ...] = ()
 
 
@@ -72,7 +59,6 @@ class AdjointProgram(Program):
     """Tables and kernel of a rollout's derivative."""
 
     def __init__(self, *args: Any, **how: Any):
-        """As `Program`, a lane a finger."""
         super().__init__(*args, **{**how, "team": 1})
 
     remembers = ("owner", "ring")
@@ -86,9 +72,9 @@ class AdjointProgram(Program):
             more |= {"grip_bar": (self.held, (4,))}
         more |= {f"bar.{k}": (1, shape) for k, shape in of_step(self.scene).items()}
         if any(isinstance(s, FingerContactSet) for s in self.sets):
-            more |= {f"pairbar.{k}": (n + 1, getattr(SHAPES, k)) for k in Place._fields}
+            more |= {f"pairbar.{k}": (n + 1, getattr(SHAPES, k)) for k in BodyMotion._fields}
         if self.scene.effects.finger_palm:
-            more |= {f"palmbar.{k}": (1, getattr(SHAPES, k)) for k in Place._fields}
+            more |= {f"palmbar.{k}": (1, getattr(SHAPES, k)) for k in BodyMotion._fields}
         self.scratch = MemoryLayout.by_item(True, **(self.scratch.groups | more))
         self.world_bars = MemoryLayout(True, **self.world.groups)
 
@@ -97,14 +83,8 @@ class AdjointProgram(Program):
     ) -> tuple:
         """Cotangents of `Program.inputs`; where a world took no step they need not be numbers.
 
-        Args:
-          inputs: As in `Program.execute`.
-          path: The steps, as tables of blocks.
-          bars: Cotangents of the results, as tables of blocks.
-          sums: What is added to the cotangents of the constants, see `no_sums`; None for nothing.
-
-        Returns:
-          The cotangents, those of the worlds' constants for each of their fingers, see `summed`.
+        Those of the worlds' constants are for each of their fingers, see `summed`; `sums` is what
+        is added to those of the constants, see `no_sums`.
         """
         given = self._arguments(inputs, path, bars, sums)
         call, outputs = self._adjoint_call(given)
@@ -130,12 +110,7 @@ class AdjointProgram(Program):
         return world.reshape(*world.shape[:2], self.fingers, self.block).sum(2)
 
     def sound(self, bars: tuple, taken: jax.Array) -> tuple:
-        """Cotangents of the inputs, zero where a world took no step and they are no numbers.
-
-        Args:
-          bars: The cotangents.
-          taken: As in `RecordedPath`, of blocks.
-        """
+        """Cotangents of the inputs, zero where a world took no step and they are no numbers."""
         some = taken[:, 0] > 0
         lane = jnp.tile(some, (1, 1, self.fingers))
         masks = lane, some, lane, some, some[:, None], lane
@@ -167,17 +142,8 @@ class AdjointProgram(Program):
             (blocks, self.world_state.rows, self.block),
         ]
         trajectory = len(given) - int(self.meshes) > 14
-        outputs = [jax.ShapeDtypeStruct(s, dtype) for s in shapes]
-        call = pl.pallas_call(
-            partial(self._adjoint_kernel, steps, trajectory),
-            grid=(blocks,),
-            in_specs=[block_spec(x.shape, blocks) for x in given],
-            out_specs=[block_spec(s, blocks) for s in shapes],
-            out_shape=outputs,
-            interpret=self.backend == "interpreter",
-            name="grasp_adjoint",
-        )
-        return call, outputs
+        kernel = partial(self._adjoint_kernel, steps, trajectory)
+        return self.call(kernel, "grasp_adjoint", given, shapes, dtype)
 
     def _adjoint_kernel(self, steps: int, trajectory: bool, *refs: Any) -> None:
         hand, world, arm, pressure, *rest = refs
@@ -251,13 +217,3 @@ class AdjointProgram(Program):
         copy_rows((0, first[1]), lambda k: worlds[t, k, own], target[1], own)
         copy_rows((first[0], ends[0]), of_finger, target[0])
         copy_rows((first[1], ends[1]), of_world, target[1], own)
-
-
-def copy_rows(rows: tuple[int, int], read: Callable, target: Any, *where: jax.Array) -> None:
-    """Stores read(row) in the rows of a table; where: the world of each lane, if it has."""
-
-    def one(k: jax.Array, x: jax.Array) -> jax.Array:
-        target[(k, *where)] = read(k)
-        return x
-
-    jax.lax.fori_loop(*rows, one, jnp.int32(0))

@@ -21,7 +21,7 @@ from codesign_jax.engines.structured.kernel.finger_contacts import BoundFingerCo
 from codesign_jax.engines.structured.kernel.linear_system import Elimination
 from codesign_jax.engines.structured.kernel.memory import Block, choose, loop
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
-from codesign_jax.engines.structured.kernel.residual import Chain
+from codesign_jax.engines.structured.kernel.residual import LinkMotion
 from codesign_jax.engines.structured.kernel.residual_vjp import FingerContactsVjp, ResidualVjp
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step import Step, moved, turned
@@ -51,13 +51,11 @@ class ReverseStep(Step):
     """
 
     def __init__(self, layout: KernelLayout, block: Block, refs: tuple, bars: CotangentTables):
-        """Takes the kernel's memory, see `StepMemory`, and the cotangents."""
         super().__init__(layout, block, *refs)
         self.bars = bars
 
     def keep(self, i: Any, chain: tuple) -> None:
-        """See `Step`."""
-        for name, value in zip(Chain._fields, chain, strict=False):
+        for name, value in zip(LinkMotion._fields, chain, strict=False):
             self.scratch.write(f"chain.{name}", value, i)
 
     def reverse(
@@ -65,11 +63,9 @@ class ReverseStep(Step):
     ) -> Lanes:
         """Makes the cotangents of the state after the step those of the state before it.
 
-        The cotangents of the pressures stay behind as the bars' "pressure".
-
         Args:
-          arm: As in `Step.advance`.
-          pressure: As in `Step.advance`.
+          arm: Commands of the arm; `pressure`: of the chambers, whose cotangents stay behind as
+            "pressure".
           moved: Worlds that took the step; the state of the others is the same before and after.
           shown: Cotangents of the trace's entries.
 
@@ -83,7 +79,10 @@ class ReverseStep(Step):
         before, acc_bar = self._integration(state, at, now, go)
         if p.held:
             friction_memory.reverse(self, bars, self.contacts["finger_finger"], go)  # type: ignore[arg-type]
-        problem = Problem(self, palm_problem(at["palm"], *acc_bar))
+        # The right side of wrist and object stands in the place of their only forces.
+        right = {"smooth_wrist": acc_bar[0], "smooth_object": acc_bar[1]}
+        right["smooth_palm"] = _none(at["palm"].smooth_palm)
+        problem = Problem(self, at["palm"]._replace(**right))
         virtual = AdjointSolve(problem).solve()
         sweep = ResidualVjp(self, state, at, thing, virtual, bars)
         if problem.pairs:
@@ -97,13 +96,9 @@ class ReverseStep(Step):
         return self._palm_bars(state, arm, base, before, (now, virtual, acc_bar[0]), shown)
 
     def _integration(self, state: dict, at: dict, now: Iterate, go: Lanes) -> tuple[dict, tuple]:
-        """Cotangents of the accelerations, and of the state that the integration starts at.
+        """Cotangents of the state that the integration starts at, and of the accelerations.
 
-        Those of the fingers' accelerations go to the scratch table, "acc_bar".
-
-        Returns:
-          Cotangents of positions and velocities of wrist and object, and those of the wrist's and
-          the object's accelerations.
+        Of wrist and object; those of the fingers' accelerations go to the scratch table, "acc_bar".
         """
         p, h = self.p, self.p.scene.discretization.timestep
         old = {n: state[n] for n in MOVED}
@@ -143,7 +138,7 @@ class ReverseStep(Step):
         self,
         state: dict,
         arm: Lanes,
-        base: Chain,
+        base: LinkMotion,
         before: dict,
         accelerations: tuple,
         shown: TraceCotangents,
@@ -183,36 +178,30 @@ class AdjointSolve(Elimination):
     """The elimination with a right side that acts on the joints alone.
 
     The right side of the fingers' joints is read from the scratch table, "acc_bar"; that of wrist
-    and object stands in the place of their smooth forces, see `palm`.
+    and object stands in the place of their smooth forces.
     """
 
     def accelerations(self, i: Any, alpha: Lanes) -> list[Lanes]:
-        """See `Elimination`."""
         return [_none(v) for v in self.problem.read("acc_bar", "motion", item=i)]
 
     def smooth(self, i: Any) -> list[Lanes]:
-        """See `Elimination`."""
         smooth, right = self.problem.read("smooth", "acc_bar", item=i)
         return [_none(smooth), right]
 
     def push(self, contacts: BoundContacts, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
-        """See `Elimination`."""
         matrix, wrench = contacts.push(item, alpha)
         return matrix, _none(wrench)
 
     def between_fingers(self, pairs: BoundFingerContacts, alpha: Lanes) -> None:
-        """See `Elimination`."""
         pairs.update_constraints(alpha)
         pairs.clear_wrenches()
         if friction_memory.kept(self.problem):
             friction_memory.push(self.problem, pairs)
 
     def solve(self) -> Iterate:
-        """Solves the system; leaves the joints' part in the scratch table.
+        """Virtual accelerations of the wrist, and virtual motions of palm and object.
 
-        Returns:
-          Virtual accelerations of the wrist, and virtual motions of palm and object. Those of the
-          links stay behind as "virtual" of the joints and "chain.along" of the links.
+        Those of the fingers stay behind as "virtual" of the joints and "chain.along" of the links.
         """
         problem, size = self.problem, self.block.size
         still = zeros((), self.like)
@@ -249,11 +238,6 @@ class AdjointSolve(Elimination):
         loop(self.links, one, parent, self.block.size)
 
 
-def palm_problem(palm: Any, wrist: Lanes, obj: Lanes) -> Any:
-    """Palm, wrist and object with the right side of wrist and object as their only forces."""
-    return palm._replace(smooth_palm=_none(palm.smooth_palm), smooth_object=obj, smooth_wrist=wrist)
-
-
 def _none(value: Lanes) -> Lanes:
     return lanewise(jnp.zeros_like, value)
 
@@ -261,23 +245,12 @@ def _none(value: Lanes) -> Lanes:
 VELOCITIES = ("wrist_vel", "linear_vel", "angular_vel")
 
 
-def largest_velocity(step: StepMemory, state: dict[str, Lanes]) -> Lanes:
-    """Largest absolute velocity of each world's state; see `add`."""
-    return _folded(step, state, _largest, jnp.maximum)
-
-
 def add_speed_cotangent(
     step: StepMemory, bars: CotangentTables, state: dict[str, Lanes], bar: jax.Array
 ) -> None:
-    """Adds the cotangent of the trace's speed; equal velocities share it.
-
-    Args:
-      bars: Cotangents of the state before the step.
-      state: Velocities of wrist and object, by name.
-      bar: The cotangent, numbers of a world.
-    """
+    """Adds the cotangent of the trace's speed; equal velocities share it."""
     p = step.p
-    top = largest_velocity(step, state)
+    top = _folded(step, state, _largest, jnp.maximum)
     number = _folded(step, state, _count, jnp.add, top)
     share = lanewise(_share, lanes([bar], (), wide=False), number)
 

@@ -72,7 +72,6 @@ def _law(step: StepMemory) -> Callable:
 
 
 def _given(step: StepMemory, charge: Lanes) -> tuple:
-    """Arguments of `end_pressure`."""
     p, like = step.p, step.like
 
     def add(sums, gain, joint):
@@ -139,15 +138,11 @@ class Chambers:
         return el.Quadratic(p, c, q, r, ro), work
 
     def close_again(self, z: str, r: Lanes, ro: Lanes) -> tuple[Lanes, Lanes, Lanes]:
-        """Adds the chambers to another right side of the same matrix.
-
-        Args:
-          z: Name of the joints' factors.
-          r: Forces that the fingers leave to the palm.
-          ro: Forces that they leave to the object.
+        """Adds the chambers to another right side; z: name of the joints' factors.
 
         Returns:
-          Both forces, and what the chambers take of the product of all forces with the step.
+          The forces that the fingers leave to palm and object, and what the chambers take of the
+          product of all forces with the step.
         """
         total = self._sum(dot, "air_joint", z)
         self.step.write("air_sum", total)
@@ -181,7 +176,6 @@ class Chambers:
         return [self.step.read(f"air_{n}") for n in names]
 
     def _read(self, i: Any, *names: Any) -> list[Lanes]:
-        """What is kept of a joint by name, beside what is given."""
         row = {"gain": i if self.step.p.tapered else 0}
         read = self.step.read
         return [read(n, row.get(n, i)) if isinstance(n, str) else n for n in names]

@@ -22,7 +22,7 @@ from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact
 from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
-from codesign_jax.engines.structured.laws.contact import Cone, Contacts, Line
+from codesign_jax.engines.structured.laws.contact import Cone, Contacts, LineCost
 from codesign_jax.engines.structured.laws.rings import Place
 from codesign_jax.scene import Scene
 
@@ -37,7 +37,6 @@ NEEDLESS = {
 
 
 def cone_fields(scene: Scene) -> list[str]:
-    """Fields of the cones of a scene's contacts."""
     return [name for name in Cone._fields if name not in NEEDLESS[scene.effects.friction]]
 
 
@@ -59,21 +58,11 @@ class ContactSet:
     """The contacts of one pair of bodies: items are links or groups of slots, k contacts each."""
 
     def __init__(self, scene: Scene, name: str, count: int, k: int, size: int):
-        """Prepares the set.
-
-        Args:
-          scene: The scene.
-          name: Pair of bodies, as in `problem.relative`.
-          count: Number of items.
-          k: Contacts of an item, on each lane.
-          size: Lanes of a block.
-        """
         self.scene, self.name, self.count, self.k, self.size = scene, name, count, k, size
         self.on_object = name.endswith("_object")
         self.own_friction = own_friction(scene, name)
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
-        """The set's part of the scratch table."""
         rows, ray = ROWS[self.scene.effects.friction]
         fields = {name: 3 for name in ("point", "normal")} | {"gap": 1, "share": 1}
         fields |= {"jar": rows, "step": rows, "ray": ray}
@@ -85,17 +74,14 @@ class ContactSet:
         return BoundContacts(self, table, self.cone(read))
 
     def cone_rows(self) -> dict[str, tuple[int, tuple[int, ...]]]:
-        """The set's part of the table of the worlds' constants."""
         return {f"cone.{which_cone(self.name)}": (1, (len(cone_fields(self.scene)),))}
 
     def cone(self, read: Callable[[str], Lanes], pair: str = "") -> Cone:
-        """Contact parameters of the set's pair of bodies or another, lanes of a world each."""
         numbers = read(f"cone.{which_cone(pair or self.name)}")
         return cone_of(self.scene, numbers)
 
     @staticmethod
     def contacts(place: Place, cone: Cone) -> Contacts:
-        """Contacts of places."""
         return Contacts(place.point, place.normal, place.gap[0], cone.of_share(place.share[0]))
 
     @staticmethod
@@ -108,7 +94,6 @@ class BoundContacts:
     """A contact set with its memory; every method works on one item."""
 
     def __init__(self, of: ContactSet, table: BoundTable, cone: Cone):
-        """See `ContactSet.bind`."""
         self.set, self.table, self.cone = of, table, cone
         self.like = jnp.zeros((of.size,), table.dtype)
 
@@ -117,7 +102,6 @@ class BoundContacts:
         return self.table.read(f"{self.set.name}.{field}", item)
 
     def write(self, field: str, value: Lanes, item: Any) -> None:
-        """Stores a field."""
         self.table.write(f"{self.set.name}.{field}", value, item)
 
     def touching(self, item: Any) -> jax.Array:
@@ -139,7 +123,6 @@ class BoundContacts:
         return rebuild(jax.lax.cond(self.touching(item), some, lambda: none))
 
     def cone_at(self, item: Any) -> Cone:
-        """The cone of the item's contacts."""
         if not self.set.own_friction:
             return self.cone
         return lanewise(Cone.of_friction, self.cone, self.read("friction", item)[0])
@@ -147,11 +130,7 @@ class BoundContacts:
     def create(
         self, item: Any, place: Place, motion: Lanes, velocity: Lanes, friction: Lanes | None = None
     ) -> None:
-        """Stores contacts of a link's or a group's places, for relative motions (6, ...).
-
-        Args:
-          friction: Coulomb coefficients (1, k) of a set whose contacts have their own.
-        """
+        """Stores contacts of a link's or a group's places, for relative motions (6, ...)."""
         if friction is not None:
             self.write("friction", friction, item)
         place, jar = self.begin(item, place, motion, velocity)
@@ -164,27 +143,15 @@ class BoundContacts:
         jax.lax.cond(self.touching(item), store, lambda: None)
 
     def begin(self, item: Any, place: Place, motion: Lanes, velocity: Lanes) -> tuple[Place, Lanes]:
-        """Places whose share is zero where no candidate is, and their jar.
-
-        Args:
-          item: The item.
-          place: Where they are, with an axis of their own.
-          motion: Relative acceleration of their bodies.
-          velocity: Relative velocity.
-        """
+        """Places whose share is zero where no candidate is, and their jar."""
         run = partial(begun, margin(self.set.scene))
         return lanewise(run, place, self.cone_at(item), motion, velocity)
 
     def place(self, item: Any) -> Place:
-        """Where the contacts are."""
         return Place(*(self.read(field, item) for field in Place._fields))
 
     def push(self, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
-        """Adds the last step of the line search to jar.
-
-        Returns:
-          Contact inertia (6, 6) and wrench (6,) at the new jar, summed over the item's contacts.
-        """
+        """Adds the last step to jar; returns the contacts' inertia (6, 6) and wrench (6,) there."""
         parts: list[tuple] = [(21,), (6,)]
         triangle, wrench = self.if_touching(item, lambda: self._push(item, alpha), parts)
         return full(triangle), wrench
@@ -229,7 +196,7 @@ class BoundContacts:
 
         def count(share, cone, ray, alpha):
             c = of_line(share, cone)
-            line = Line(*(ray[i] if i < ray.shape[0] else None for i in range(5)))
+            line = LineCost(*(ray[i] if i < ray.shape[0] else None for i in range(5)))
             return sum_axis(jnp.where(contact.same_zone(c, line, alpha), 0.0, 1.0), 0)
 
         share, cone = self.read("share", item), self.cone_at(item)
@@ -272,7 +239,7 @@ class BoundContacts:
 
         def both(share, cone, ray, alpha):
             c = of_line(share, cone)
-            line = Line(*(ray[i] if i < ray.shape[0] else None for i in range(5)))
+            line = LineCost(*(ray[i] if i < ray.shape[0] else None for i in range(5)))
             first, second = contact.slopes(c, line, alpha)
             return [sum_axis(first, 0), sum_axis(second, 0)]
 
@@ -281,7 +248,6 @@ class BoundContacts:
 
 
 def margin(scene: Scene) -> float:
-    """See `contact.candidates`."""
     return contact.MARGIN if scene.effects.surface == "hull" else 0.0
 
 
@@ -293,7 +259,6 @@ def kept(place: Place, jar: Lanes) -> dict[str, Lanes]:
 def begun(
     margin: float, place: Place, cone: Cone, motion: jax.Array, velocity: jax.Array
 ) -> tuple[Place, jax.Array]:
-    """See `BoundContacts.begin`."""
     c = ContactSet.contacts(place, cone)
     speed = c.relative(velocity[:, None])
     approach = -dot(place.normal, speed)

@@ -25,9 +25,8 @@ def pull(function: Callable, args: tuple, fixed: tuple, bars: Any) -> Any:
 
     Args:
       function: As in `lanewise`.
-      args: Trees of lanes by which to differentiate.
-      fixed: Further arguments.
-      bars: Cotangents of the function's results, a tree of lanes of the same structure.
+      args: Trees of lanes by which to differentiate; `fixed`: further arguments.
+      bars: Cotangents of the function's results.
 
     Returns:
       A tree as `args`, all of it lanes of a finger each.
@@ -65,7 +64,6 @@ def pull(function: Callable, args: tuple, fixed: tuple, bars: Any) -> Any:
 
 
 def plus(one: Any, other: Any) -> Any:
-    """Sum of two trees of lanes."""
     return lanewise(_sum, one, other)
 
 
@@ -87,7 +85,6 @@ def _is_lanes(x: Any) -> bool:
 
 
 def _nothing(leaf: Lanes) -> Lanes:
-    """Zeros in the shape of lanes, of a finger each."""
     parts = np.empty(leaf.parts.shape, object)
     parts.fill(np.zeros((), leaf.dtype)[()])
     return Lanes(parts, (*leaf.shape[:-2], FINGER, leaf.shape[-1]), leaf.dtype)
@@ -114,7 +111,6 @@ class CotangentTables:
     """
 
     def __init__(self, layout: KernelLayout, block: Block, refs: tuple, scratch: Any):
-        """Takes the kernel's memory: refs in the order of the attributes, and scratch memory."""
         hand, world, finger_state, world_state = refs
         self.block, self.scratch = block, BoundTable(layout.scratch, scratch)
         self.hand = BoundTable(layout.hand, hand)
@@ -125,7 +121,6 @@ class CotangentTables:
         self.names = of_step(layout.scene)
 
     def begin(self) -> None:
-        """Sets to zero what belongs to one step."""
         for name, shape in self.names.items():
             self.scratch.write(f"bar.{name}", zeros(shape, self.like))
 
@@ -134,13 +129,7 @@ class CotangentTables:
         return self.scratch.read(f"bar.{name}")
 
     def add(self, values: dict[str, Lanes], item: Any = 0, lane: jax.Array | None = None) -> None:
-        """Adds to the cotangents of constants and of what `STEP` names.
-
-        Args:
-          values: What to add, by name.
-          item: Item of each name, such as the number of a link.
-          lane: The lanes, if items differ from lane to lane.
-        """
+        """Adds to cotangents of constants and of `STEP`; lane: if items differ by lane."""
         for name, value in values.items():
             table = self.hand if name in self.hand else self.world
             if name in self.names:
@@ -156,6 +145,5 @@ class CotangentTables:
         self.add({name: only_on(first, value) for name, value in values.items()})
 
     def add_joint(self, values: dict[str, Lanes], i: Any) -> None:
-        """Adds to the cotangents of a joint's angles or velocities."""
         for name, value in values.items():
             self.finger_state.write(name, plus(self.finger_state.read(name, i), value), i)

@@ -41,19 +41,12 @@ conjugate gradients 40 % fewer (fingers that touch in 120 grasps of scene `paper
 
 
 class Eliminated(NamedTuple):
-    """What the palm's elimination leaves for another right side; lanes of a world.
+    """What the palm's elimination leaves for another right side; lanes of a world."""
 
-    Attributes:
-      hinges: Of the wrist's hinges; None with a rigid arm.
-      slides: Of its slides; None with a rigid arm.
-      q: Matrix that is left of the object, shape (6, 6, 1, world).
-      work: g'P^-1 g of the present right side, shape (1, world).
-    """
-
-    hinges: el.Kept | None
-    slides: el.Kept | None
-    q: Any
-    work: Any
+    hinges: el.Kept | None  # Of the wrist's hinges; None with a rigid arm
+    slides: el.Kept | None  # Of its slides; None with a rigid arm
+    q: Any  # Matrix that is left of the object, shape (6, 6, 1, world)
+    work: Any  # g'P^-1 g of the present right side, shape (1, world)
 
 
 class Coupling:
@@ -68,18 +61,12 @@ class Coupling:
         tolerance: float = TOLERANCE,
         iterations: int = ITERATIONS,
     ):
-        """Takes an elimination, the squared error at which to end, and most iterations."""
         self.problem, self.pairs, self.done = problem, pairs, done
         self.tolerance, self.iterations = tolerance, iterations
         self.block, self.links = problem.block, problem.links
 
     def correct(self, step: Iterate, idle: jax.Array) -> Iterate:
-        """Adds the correction to the fingers' factors z and returns the step of palm and object.
-
-        Args:
-          step: Step without the Hessians of these contacts.
-          idle: Lanes of worlds whose step is of no use.
-        """
+        """Adds the correction to the fingers' factors z and returns the step of palm and object."""
         work = self.done.work.lane
         self.substitute("z", step)
         self._begin(lanes([~idle], (), wide=False))
@@ -114,8 +101,6 @@ class Coupling:
         return lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), step, more)
 
     def _settle(self) -> None:
-        """Adds the last right side's factors to the first one's."""
-
         def add(i: Any, x: jax.Array) -> jax.Array:
             z = lanewise(jnp.add, *self.problem.read("z", "z_again", item=i))
             self.problem.write("z", z, i)
@@ -143,8 +128,7 @@ class Coupling:
     def _products(self) -> tuple[jax.Array, jax.Array]:
         """Applies P^-1 J' to the residual; "answer" is the contacts' relative motion by that.
 
-        Returns:
-          The product of the residual with it, and its curvature, shape (lane,) each.
+        Returns the product of the residual with it, and its curvature, shape (lane,) each.
         """
         pairs = self.pairs
         self.substitute("z_again", self.again())
@@ -165,14 +149,9 @@ class Coupling:
         return size, bent
 
     def _advance(self, length: jax.Array, turn: jax.Array) -> jax.Array:
-        """Turns the direction and goes along it; lays what is left of the residual on the sides.
+        """Turns the direction and goes along it; returns what that gains of the work.
 
-        Args:
-          length: Length of the step, lanes of a world.
-          turn: Part of the last direction in the new one.
-
-        Returns:
-          What the direction gains of the right side's work, shape (lane,).
+        What is left of the residual is laid on the sides.
         """
         pairs = self.pairs
         pairs.clear_wrenches()

@@ -20,65 +20,42 @@ class Quadratic(NamedTuple):
     """Coefficients of a subtree's objective.
 
     Where nothing of the hand may touch the object c, q and r_object are None.
-
-    Attributes:
-      p: P, shape (6, 6, finger, world).
-      c: C, same shape.
-      q: Q, same shape.
-      r: r, shape (6, finger, world).
-      r_object: r_o, same shape.
     """
 
-    p: jax.Array
-    c: jax.Array
-    q: jax.Array
-    r: jax.Array
-    r_object: jax.Array
+    p: jax.Array  # P, shape (6, 6, finger, world)
+    c: jax.Array  # C, same shape
+    q: jax.Array  # Q, same shape
+    r: jax.Array  # r, shape (6, finger, world)
+    r_object: jax.Array  # r_o, same shape
 
 
 class Factors(NamedTuple):
-    """What back substitution needs: a = z - w v_parent + g v_o.
+    """What back substitution needs: a = z - w v_parent + g v_o."""
 
-    Attributes:
-      w: D^-1 U', shape (axis, 6, finger, world).
-      g: D^-1 S'C, same shape.
-      z: D^-1 (S'r + tau), shape (axis, finger, world).
-    """
-
-    w: jax.Array
-    g: jax.Array
-    z: jax.Array
+    w: jax.Array  # D^-1 U', shape (axis, 6, finger, world)
+    g: jax.Array  # D^-1 S'C, same shape
+    z: jax.Array  # D^-1 (S'r + tau), shape (axis, finger, world)
 
 
 class Kept(NamedTuple):
-    """What another right side needs: see `eliminate_again`.
+    """What another right side needs: see `eliminate_again`."""
 
-    Attributes:
-      factors: The factors.
-      inverse: D^-1, shape (axis, axis, finger, world).
-    """
-
-    factors: Factors
-    inverse: jax.Array
+    factors: Factors  # The factors
+    inverse: jax.Array  # D^-1, shape (axis, axis, finger, world)
 
 
 def eliminate(
-    node: Quadratic,
-    axes: jax.Array,
-    armature: jax.Array,
-    tau: jax.Array,
+    node: Quadratic, axes: jax.Array, armature: jax.Array, tau: jax.Array
 ) -> tuple[Quadratic, Kept]:
     """Minimises over the accelerations of a joint.
 
     Args:
-      node: The subtree's objective in its base link's acceleration.
       axes: Motion subspace S, shape (axis, 6, finger, world).
       armature: Diagonal joint inertia (armature with implicit terms), shape (axis, finger, world).
       tau: Joint force, same shape.
 
     Returns:
-      The objective in the parent's acceleration, the factors for `substitute`, and what else
-      `eliminate_again` needs.
+      The objective in the parent's acceleration, and what other right sides need.
     """
     u, h, y = _project(node.p, node.c, node.r, axes, tau)
     inverse = _joint_inverse(axes, u, armature)
@@ -87,24 +64,15 @@ def eliminate(
 
 
 def eliminate_again(
-    axes: jax.Array,
-    kept: Kept,
-    r: jax.Array,
-    r_object: jax.Array,
-    tau: jax.Array | None = None,
+    axes: jax.Array, kept: Kept, r: jax.Array, r_object: jax.Array, tau: jax.Array | None = None
 ) -> tuple[jax.Array, jax.Array, Factors]:
-    """`eliminate` of the same matrix with other forces.
+    """`eliminate` of the same matrix with other forces, by a sixth of the operations.
 
-    Since r - U z = r - (D^-1 U')'y it takes a sixth of the operations.
+    Since r - U z = r - (D^-1 U')'y.
 
     Args:
-      axes: Motion subspace S, shape (axis, 6, finger, world).
-      r: Force on the subtree's base link, shape (6, finger, world).
-      r_object: Force on the object, same shape.
+      r: Force on the subtree's base link, shape (6, finger, world); `r_object`: on the object.
       tau: Force on the joint, shape (axis, finger, world); None for none.
-
-    Returns:
-      The forces in the parent's acceleration, and the factors for `substitute`.
     """
     w, g, _ = kept.factors
     y = contract(axes, r[None], 1)
@@ -154,15 +122,10 @@ def _reduce(node: Quadratic, u: jax.Array, h: jax.Array | None, f: Factors):
 def substitute(
     axes: jax.Array, factors: Factors, parent: jax.Array, object_acc: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Back substitution of one joint.
+    """Back substitution of one joint: its accelerations, and its link's spatial acceleration.
 
     Args:
-      axes: Motion subspace, shape (axis, 6, finger, world).
-      parent: Spatial acceleration of the parent, shape (6, finger or 1, world).
-      object_acc: Spatial acceleration of the object, shape (6, 1, world).
-
-    Returns:
-      Joint accelerations, shape (axis, finger, world), and the link's spatial acceleration.
+      parent: Spatial acceleration of the parent, shape (6, finger or 1, world); `object_acc` alike.
     """
     a = factors.z - contract(factors.w, parent[None], 1)
     if factors.g is not None:

@@ -54,7 +54,6 @@ class FingerCollision:
     """Gives a slot to each contact of fingers with one another, with themselves and the palm."""
 
     def __init__(self, step: StepMemory, pairs: BoundFingerContacts, at: dict[str, Any]):
-        """Takes a step's memory and geometry, see `Step`."""
         self.step, self.pairs, self.p = step, pairs, step.p
         self.scratch, self.block, self.like = step.scratch, step.block, step.like
         self.count, self.palm_vel = self.p.links * self.p.k, at["vel"]
@@ -66,7 +65,6 @@ class FingerCollision:
     # Where fingers are
 
     def write(self, name: str, value: Lanes, item: Any = 0) -> None:
-        """Stores where a finger is."""
         self.scratch.write(f"pair.{name}", value, item)
 
     def read(self, name: str, item: Any = 0, lane: jax.Array | None = None) -> Lanes:
@@ -80,7 +78,6 @@ class FingerCollision:
         return table.gather(name, item, self.block.own if lane is None else lane)
 
     def ring(self, item: Any, lane: jax.Array | None = None) -> Lanes:
-        """Numbers of a ring, see `rings.Ring`."""
         if lane is None and not jnp.ndim(item):
             return self.step.hand.read("ring", item)
         return self._gathered(self.step.hand, "ring", item, lane)
@@ -110,7 +107,6 @@ class FingerCollision:
         self.write("end", lanewise(above, base, frame, frame, self.ring(self.ring_at(0))), 0)
 
     def link(self, i: Any, motion: Lanes, vel: Lanes, frame: Lanes, origin: Lanes) -> None:
-        """Stores where a link is and how it moves."""
         before = self.read("frame", i)
         self._side(i + 1, motion, vel, frame, origin)
         numbers = self.ring(self.ring_at(i + 1))
@@ -149,7 +145,6 @@ class FingerCollision:
         return row, numbers, frame, lanewise(ring_centre, self.read("joint", row), frame, numbers)
 
     def find(self) -> None:
-        """Looks at all pairs of fingers, at each finger and at the palm."""
         scene = self.p.scene
         if self.hull:
             self._lines()
@@ -165,7 +160,9 @@ class FingerCollision:
             other = jax.lax.div(pairing.lane, jnp.int32(self.p.block))
             owner = (self.block.finger < other) & (other < self.p.num_fingers)
             if self.hull:
-                self._copy(pairing)
+                # The segments of the other finger's centre line.
+                copy = lambda i: self.write("other", pairing.swap(self.read("line", i)), i)  # noqa: E731, B023
+                each(self.p.links + 1, copy)
             one = self._on_finger if self.hull else self._on_spheres
             self._each_ring(0, lambda *ring: one(row, pairing, owner, *ring))
             return x
@@ -183,14 +180,9 @@ class FingerCollision:
 
         each(self.block.rounds(count), ring)
 
-    def _copy(self, pairing: FingerPairing) -> None:
-        """Stores the segments of the other finger's centre line."""
-        each(self.p.links + 1, lambda i: self.write("other", pairing.swap(self.read("line", i)), i))
-
     # Contacts
 
     def _near(self, square: jax.Array, mine: Lanes, theirs: Lanes, speed: Lanes) -> jax.Array:
-        """Lanes whose ring may be near enough to a place at a squared distance."""
         h = self.p.scene.discretization.timestep
 
         def reach(mine, theirs, speed):
@@ -319,9 +311,7 @@ class FingerCollision:
         """The nearest place of a centre line: squared distance, segment, and where along it.
 
         Args:
-          name: "line" or "other".
-          centre: Places, lanes.
-          itself: Of the finger's own line: the ring whose place it is.
+          name: "line", the finger's own, or "other"; `itself`: the ring on the finger's own line.
         """
         last = self.p.links
 
@@ -405,17 +395,14 @@ def neighbours(row: jax.Array, links: int) -> tuple[jax.Array, jax.Array, jax.Ar
 
 
 def ring_centre(origin, frame, numbers):
-    """Centre of a ring, shape (3, ...)."""
     return origin + apply_columns(frame, numbers[:3])
 
 
 def aimed(numbers, frame, distance, gradient):
-    """See `rings.aim`."""
     return rings.aim(Ring.of(numbers), frame, distance, gradient)
 
 
 def on_field(numbers, frame, centre, offset, distance, normal):
-    """See `rings.on_field`."""
     return rings.on_field(Ring.of(numbers), frame, centre, offset, distance, normal)
 
 
@@ -425,7 +412,6 @@ def ball_on_field(numbers, centre, distance, normal):
 
 
 def palm_distance(point, palm):
-    """Signed distance of a point from the palm's disc, and its gradient."""
     return shapes.disc_distance(point, *palm)
 
 
@@ -442,18 +428,12 @@ def between(numbers, frame, centre, other, t):
 
 
 def balls(numbers, centre, theirs, their_centre):
-    """Contact of two spheres."""
     return rings.ball_on_ball(numbers[3] * numbers[6], centre, theirs[3] * theirs[6], their_centre)
 
 
 def above(origin, before, frame, numbers):
     """Where the centre line passes a joint."""
     return origin + 0.5 * numbers[5] * (before[2] + frame[2])
-
-
-def where_on(ends, point, last):
-    """Where between its ends a segment is nearest to a point, see `rings.nearest`."""
-    return rings.nearest(point, Segment(ends, None, None), last)  # type: ignore[arg-type]
 
 
 def _line(start, end):
@@ -470,7 +450,6 @@ def _faster(most, vel, palm, origin, numbers):
 
 
 def with_axis(place: Place) -> Place:
-    """A place with an axis of one contact, as sets keep them."""
     return Place(*(v[:, None] for v in place[:2]), *(v[None, None] for v in place[2:]))
 
 

@@ -48,7 +48,6 @@ class FingerPairing:
     """
 
     def __init__(self, block: Block, number: Any, dtype: Any, *, alone: bool):
-        """Takes the number, a scalar, and the type of shares; alone: whether it may be 0."""
         self.block = block
         self.number = (jnp.zeros_like(block.finger) + number).astype(jnp.int32)
         same, one = self.number == 0, jnp.ones_like(block.finger, dtype)
@@ -99,16 +98,6 @@ class FingerContactSet(SlotSet):
         gathers: bool,
         remembers: tuple[str, ...] = (),
     ):
-        """Prepares the set.
-
-        Args:
-          scene: The scene.
-          block: Fingers, a power of two, and worlds of a block.
-          links: Moving links of a finger.
-          slots: Slots of a pairing, on each lane.
-          gathers: Whether lanes read rows of their own as fast as a common one: on GPUs.
-          remembers: As in `SlotSet`.
-        """
         fingers, worlds = block
         e = scene.effects
         self.alone = e.finger_palm or touches_itself(scene)
@@ -140,7 +129,6 @@ class FingerContactSet(SlotSet):
         return super().groups() | sides
 
     def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundFingerContacts":
-        """See `ContactSet`."""
         cones = {name: self.cone(read, name) for name in self._names()}
         return BoundFingerContacts(self, table, cones)
 
@@ -150,16 +138,12 @@ class OwnSide(NamedTuple):
 
     NVIDIA's assembler moves no load before a store that might be to the same place, so a thread
     waits a second time for what is read behind a store.
-
-    Attributes:
-      place: Where the contact is.
-      row: Row of each lane's side, int32, shape (lane,); None where lanes do not gather.
-      wrench: Wrench of all contacts so far on that row, (6, ...); None likewise.
     """
 
-    place: Place
+    place: Place  # Where the contact is
+    # Row of each lane's side, int32, shape (lane,); None where lanes do not gather
     row: jax.Array | None
-    wrench: Lanes | None
+    wrench: Lanes | None  # Wrench of all contacts so far on that row, (6, ...); None likewise
 
 
 class BoundFingerContacts(BoundSlots):
@@ -168,12 +152,10 @@ class BoundFingerContacts(BoundSlots):
     set: FingerContactSet  # type: ignore[assignment]
 
     def __init__(self, of: FingerContactSet, table: BoundTable, cones: dict[str, contact.Cone]):
-        """See `ContactSet.bind`; the cones by name."""
         super().__init__(of, table, next(iter(cones.values())))
         self.block, self._cones = Block(*of.block), cones
 
     def pairing(self, row: Any) -> FingerPairing:
-        """A row's pairing of the fingers."""
         return FingerPairing(
             self.block, row + self.set.first, self.table.dtype, alone=self.set.alone
         )
@@ -214,7 +196,6 @@ class BoundFingerContacts(BoundSlots):
         return self.table.read("side.push", row)
 
     def rows(self) -> int:
-        """Number of a finger's rows."""
         return self.set.links + 1
 
     # Slots
@@ -225,14 +206,12 @@ class BoundFingerContacts(BoundSlots):
         """Gives contacts a slot on both of their lanes.
 
         Args:
-          row: The pairing.
-          which: Lanes that have found a contact, a part of `owner`.
-          owner: Lanes that look for contacts, one of each pair of lanes.
-          mine: What the finder keeps, by field.
-          other: What its partner keeps.
-          alike: What every lane knows of its own side.
+          which: Lanes that have found a contact, a part of `owner`, of which each pair of lanes has
+            one.
+          mine: What the finder keeps, by field; `other`: its partner; `alike`: each of its own
+            side.
         """
-        share = only_where(which, other["share"])
+        share = lanewise(_only_where, lanes([which], (), wide=True), other["share"])
         theirs = self.pairing(row).swap(other | {"share": share})
         side = lanes([owner], (), wide=True)
         fields = {
@@ -265,8 +244,6 @@ class BoundFingerContacts(BoundSlots):
         self.each(one, [])
 
     def touching_now(self) -> jax.Array:
-        """Whether any slot is in use, a scalar."""
-
         def most(row: Any, found: jax.Array) -> jax.Array:
             return jnp.maximum(found, self.used(row))
 
@@ -333,8 +310,6 @@ class BoundFingerContacts(BoundSlots):
         return rebuild(jax.lax.while_loop(lambda c: c[0] >= 0, step, first)[2:])
 
     def clear_wrenches(self) -> None:
-        """Sets the wrenches of all sides to zero."""
-
         def clear(row: Any, x: jax.Array) -> jax.Array:
             self.put("push", zeros((6,), self.like), row)
             return x
@@ -418,12 +393,9 @@ class BoundFingerContacts(BoundSlots):
 
     @staticmethod
     def stiff(hessian: Lanes, change: Lanes) -> Lanes:
-        """A slot's Hessian times a relative motion."""
         return lanewise(_times, hessian, change)
 
     def prepare_all(self) -> Lanes:
-        """Prepares the line search of all slots; returns the sum of the slopes at 0."""
-
         def add(item: Any, pairing: FingerPairing, sums: Lanes) -> Lanes:
             slope = self.line(item, self.relative(item, pairing))
             return lanewise(lambda s, h, f: s + h * f, sums, pairing.half, slope)
@@ -440,9 +412,8 @@ class BoundFingerContacts(BoundSlots):
         return self.each(add, sums)
 
 
-def only_where(which: jax.Array, value: Lanes) -> Lanes:
-    """A number of lanes, zero on others."""
-    return lanewise(lambda w, v: jnp.where(w, v, 0.0), lanes([which], (), wide=True), value)
+def _only_where(mask, value):
+    return jnp.where(mask, value, 0.0)
 
 
 def _where(mask, one, other):

@@ -32,7 +32,6 @@ from codesign_jax.engines.structured.laws import contact, holding
 
 
 def kept(problem: Problem) -> bool:
-    """Whether the scene has it."""
     return "new_grip" in problem.m.scratch
 
 
@@ -99,14 +98,10 @@ def settle(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
 
 
 def reverse(step: StepMemory, bars: CotangentTables, pairs: BoundFingerContacts, go: Lanes) -> None:
-    """Cotangents of the sums of `holding.hold`, of those of the state after the step.
+    """Makes the cotangents of the state after the step those of the sums of `holding.hold`.
 
-    Leaves them as "grip_bar", and the state's as those before a step of which contacts add their
+    Leaves these as "grip_bar", and the state's as those before a step of which contacts add their
     part (`leave`).  What a finger holds is the opposite of what its partner holds.
-
-    Args:
-      pairs: The step's contacts, at its accelerations.
-      go: Worlds that took it.
     """
     state, still = bars.finger_state, zeros((), step.like)
 

@@ -21,16 +21,14 @@ class Elimination:
     """The elimination of one step's problem."""
 
     def __init__(self, problem: Problem):
-        """Takes the problem."""
         self.problem = problem
         self.block, self.links, self.like = problem.block, problem.links, problem.like
 
     def backward(self, alpha: Lanes) -> tuple[el.Quadratic, Lanes]:
         """Eliminates the fingers from their tips.
 
-        Args:
-          alpha: Length of the last step, by which accelerations, motions and jar move first: so
-            they are read once an iteration.
+        Accelerations, motions and jar move by `alpha`, the length of the last step, first: so they
+        are read once an iteration.
 
         Returns:
           The sum over the fingers, and the product of their forces with the step so far.
@@ -104,16 +102,12 @@ class Elimination:
         return self.problem.read("smooth", "tau", item=i)
 
     def push(self, contacts: BoundContacts, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
-        """Inertia and wrench of an item's contacts, see `BoundContacts.push`."""
         return contacts.push(item, alpha)
 
     def between_fingers(self, pairs: BoundFingerContacts, alpha: Lanes) -> None:
-        """Prepares contacts between fingers, see `BoundFingerContacts.update_constraints`."""
         pairs.update_constraints(alpha)
 
     def touch(self, node: el.Quadratic, contacts: BoundContacts, i: Any, alpha: Lanes) -> Any:
-        """Adds a link's contacts with object or table, if there are any."""
-
         def add() -> el.Quadratic:
             return lanewise(_add, node, *self.push(contacts, i, alpha), contacts.set.on_object)
 

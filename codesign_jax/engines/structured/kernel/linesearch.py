@@ -29,7 +29,6 @@ class LineSearch:
     """The line search of one step's problem."""
 
     def __init__(self, problem: Problem):
-        """Takes the problem."""
         self.problem = problem
         self.block, self.links, self.like = problem.block, problem.links, problem.like
 
@@ -100,7 +99,6 @@ class LineSearch:
         return touch
 
     def total(self, sums: list[Lanes]) -> list[Lanes]:
-        """What the lanes of a world have found, summed."""
         return self.block.sum(sums)
 
     def contact_slopes(self, alpha: Lanes) -> list[Lanes]:
@@ -123,20 +121,14 @@ class LineSearch:
         return sums
 
     def find(
-        self,
-        slope: Lanes,
-        curvature: Lanes,
-        first: Lanes,
-        floor: jax.Array,
-        evaluations: int,
+        self, slope: Lanes, curvature: Lanes, first: Lanes, floor: jax.Array, evaluations: int
     ) -> Lanes:
         """Step length, lanes of a world.
 
         Args:
-          slope: Slope of the smooth part at 0.
-          curvature: Its curvature.
-          first: Slope of the contacts at 0.
-          floor: Slope that is small enough, lanes of a world.
+          slope: Slope of the smooth part at 0; `curvature`: its curvature; `first`: slope of the
+            contacts.
+          floor: Slope that is small enough.
           evaluations: Largest number of evaluations.
         """
 

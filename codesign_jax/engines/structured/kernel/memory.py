@@ -74,13 +74,8 @@ class MemoryLayout:
     ) -> dict[str, jax.Array]:
         """Inverse of `pack`: arrays (item, component, ..., finger or 1, world) by name.
 
-        An item's axis is left out where there is one item only.
-
-        Args:
-          packed: The table.
-          fingers: Fingers it was packed for, 1 for a table of worlds.
-          kept: The first of them, without those that fill up.
-          worlds: Worlds without those that fill the last block.
+        Kept are the first `kept` of the fingers and `worlds`, without what fills up.  An item's
+        axis is left out where there is one item only.
         """
         blocks = packed.reshape(packed.shape[0], self.rows, fingers, -1)
         flat = jnp.moveaxis(blocks, 0, 2).reshape(self.rows, fingers, -1)[:, :kept, :worlds]
@@ -110,7 +105,6 @@ class BoundTable:
         return name in self.layout.groups
 
     def shape(self, name: str) -> tuple[int, ...]:
-        """Shape of an item."""
         return self.layout.groups[name][1]
 
     def _rows(self, name: str, item: Any) -> Iterator[Any]:
@@ -118,7 +112,6 @@ class BoundTable:
         return (first + k for k in range(math.prod(self.shape(name))))
 
     def read(self, name: str, item: Any = 0) -> Lanes:
-        """Lanes of an item."""
         where = () if self.layout.wide else (self.world,)
         values = [self.ref[(row, *where)] for row in self._rows(name, item)]
         return lanes(values, self.shape(name), wide=self.layout.wide)
@@ -131,17 +124,11 @@ class BoundTable:
             self.ref[(row, *where)] = splat(part, size, value.dtype)
 
     def gather(self, name: str, item: jax.Array, lane: jax.Array) -> Lanes:
-        """Items that differ from lane to lane, of a table of fingers.
-
-        Args:
-          item: Item that each lane reads, int32, shape (lane,).
-          lane: Lane whose item it reads, same shape.
-        """
+        """Each lane's item of a lane, of a table of fingers; both are int32 of shape (lane,)."""
         values = [self.ref[row, lane] for row in self._rows(name, item)]
         return lanes(values, self.shape(name), wide=True)
 
     def scatter(self, name: str, value: Lanes, item: jax.Array, lane: jax.Array) -> None:
-        """Stores items that differ from lane to lane; arguments as in `gather`."""
         for row, part in zip(self._rows(name, item), value.parts.ravel(), strict=True):
             self.ref[row, lane] = splat(part, lane.shape, value.dtype)
 
@@ -158,7 +145,6 @@ def lengthened(array: jax.Array, axis: int, length: int) -> jax.Array:
 
 
 def tree_add_scaled(alpha: jax.Array, value: Any, step: Any) -> Any:
-    """A tree of arrays moved by alpha times another one."""
     return jax.tree.map(lambda v, s: v + alpha * s, value, step)
 
 
@@ -244,7 +230,6 @@ class Block:
     """
 
     def __init__(self, fingers: int, worlds: int, team: int = 1):
-        """Makes the indices, inside a kernel."""
         self.fingers, self.worlds, self.team = fingers, worlds, team
         self.size = fingers * worlds * team
         self.lane = lane = jax.lax.broadcasted_iota(jnp.int32, (self.size,), 0)
@@ -261,7 +246,6 @@ class Block:
         return self._swapped(array, combine, self.worlds, self.worlds * self.team)
 
     def total(self, array: jax.Array) -> jax.Array:
-        """The sum over all lanes of each world."""
         return self.fold(self.over_team(array, jnp.add), jnp.add)
 
     def dealt(self, count: int, k: jax.Array) -> tuple[jax.Array, jax.Array | None]:
@@ -276,7 +260,6 @@ class Block:
         return which if self.team == 1 else which & (self.mate == 0)
 
     def rounds(self, count: int) -> int:
-        """Number of those rounds."""
         return -(-count // self.team)
 
     def fold(self, array: jax.Array, combine: Callable) -> jax.Array:
@@ -284,10 +267,6 @@ class Block:
 
         Lanes swap their values in pairs of fingers, then in pairs of pairs: combine(a, b) has to
         equal combine(b, a), so that all lanes of a world get the same bits.
-
-        Args:
-          array: Numbers of every lane, shape (lane,).
-          combine: Function of two such arrays.
         """
         return self._swapped(array, combine, self.worlds * self.team, self.size)
 
@@ -311,5 +290,4 @@ class Block:
 
 
 def anywhere(mask: jax.Array) -> jax.Array:
-    """Whether any lane is true, a scalar."""
     return jnp.max(mask.astype(jnp.int32)) > 0

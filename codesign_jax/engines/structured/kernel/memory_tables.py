@@ -43,7 +43,6 @@ GATHERING = ("gpu",)
 
 
 def rings_of_link(scene: Scene) -> int:
-    """Rings or contact spheres of a link."""
     e, spheres = scene.effects, layout(scene).spheres
     if e.surface == "spheres":
         return spheres.shape[-1] if spheres.size else 0
@@ -58,7 +57,6 @@ class Tables(KernelLayout):
     """Further numbers of the slots of contacts between fingers."""
 
     def __init__(self, scene: Scene, *, backend: str, width: int, team: int | None = None):
-        """Lays out the memory, see `Program`."""
         self.backend = backend
         self.scene, self.lay = scene, layout(scene)
         self.hull = scene.effects.surface == "hull"
@@ -271,7 +269,6 @@ class Packing(Tables):
         )
 
     def _widen(self, array: jax.Array) -> jax.Array:
-        """Fingers up to a power of two."""
         return lengthened(array, array.ndim - 2, self.fingers)
 
     def _palm_slots(self, hand: WorldModel) -> jax.Array:
@@ -344,9 +341,7 @@ class Packing(Tables):
     def rows_of(self, qpos: jax.Array, qvel: jax.Array | None = None) -> tuple:
         """Rows (world, time, row, finger or 1) of coordinates, or of their cotangents; see `path`.
 
-        Args:
-          qpos: Generalized positions, shape (world, time, nq).
-          qvel: Generalized velocities, shape (world, time, nv); without them positions' rows only.
+        Of positions alone if there are no velocities.
         """
         joints, others, end = [], [], 6 + self.lay.dofs.size
         for x in (qpos,) if qvel is None else (qpos, qvel):

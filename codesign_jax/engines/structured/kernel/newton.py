@@ -3,16 +3,6 @@
 A step minimises over the accelerations a
   1/2 (a - a_s)' M (a - a_s) + sum_c s_c(J_c a - aref_c),
 MuJoCo's contact problem, M with armature and implicit terms.
-
-Most time steps end with an iteration whose decrement is already below the tolerance. Its matrix is
-all but that of the iteration before, if no contact has gone to another zone of its cone: the cost
-is quadratic in two of the three zones, and smooth in the third.  So the forces that the last step
-has left unbalanced are eliminated with the matrix that is there: the chord method (Ortega and
-Rheinboldt, Iterative Solution of Nonlinear Equations in Several Variables, 1970, ch. 7), at a sixth
-of an iteration's cost, and their decrement is what the iteration would have found.
-
-The matrix P lacks the contacts between fingers, whose cost is convex: with them the decrement is
-smaller than the one that P gives.  Such a world does not go along the step, as P may be too soft.
 """
 
 from functools import partial
@@ -24,11 +14,7 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel import friction_memory
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
-from codesign_jax.engines.structured.kernel.coupling import (
-    Coupling,
-    Eliminated,
-    solve_palm_again,
-)
+from codesign_jax.engines.structured.kernel.coupling import Coupling, Eliminated, solve_palm_again
 from codesign_jax.engines.structured.kernel.linear_system import Elimination
 from codesign_jax.engines.structured.kernel.linesearch import FAR, LINE_TOLERANCE, LineSearch
 from codesign_jax.engines.structured.kernel.memory import (
@@ -53,10 +39,22 @@ LARGEST = 1e-3
 
 
 class ChordStep:
-    """The chord method's step behind a Newton step, of which the last matrix is left."""
+    """The chord method's step behind a Newton step, of which the last matrix is left.
+
+    Most time steps end with an iteration whose decrement is already below the tolerance. Its matrix
+    is all but that of the iteration before, if no contact has gone to another zone of its cone: the
+    cost is quadratic in two of the three zones, and smooth in the third. So the forces that the
+    last step has left unbalanced are eliminated with the matrix that is there: the chord method
+    (Ortega and Rheinboldt, Iterative Solution of Nonlinear Equations in Several Variables, 1970,
+    ch. 7), at a sixth of an iteration's cost, and their decrement is what the iteration would have
+    found.
+
+    The matrix P lacks the contacts between fingers, whose cost is convex: with them the decrement
+    is smaller than the one that P gives. Such a world does not go along the step, as P may be too
+    soft.
+    """
 
     def __init__(self, problem: Problem):
-        """Takes the step's problem."""
         self.problem, self.block, self.links = problem, problem.block, problem.links
         self.like = problem.like
 
@@ -74,7 +72,7 @@ class ChordStep:
         return self.block.sum(count).lane == 0
 
     def step(self, now: Iterate, done: Eliminated, alpha: Lanes) -> tuple[Iterate, Lanes]:
-        """Leaves the fingers' part in "z_again".
+        """The step of wrist, palm and object; leaves the fingers' part in "z_again".
 
         Args:
           now: The iterate behind the last step, of wrist, palm and object.
@@ -82,8 +80,7 @@ class ChordStep:
           alpha: Length of the last step, by which those of the links are still to be moved.
 
         Returns:
-          The step of wrist, palm and object, and the forces' product with it and with that of the
-          fingers, which is the squared decrement.
+          The step, and the forces' product with it and that of the fingers: the squared decrement.
         """
         problem = self.problem
         if chambers := problem.chambers:
@@ -156,10 +153,7 @@ class ChordStep:
     def take(self, step: Iterate, alpha: Lanes, taken: jax.Array) -> None:
         """Makes "step_acc" what leads behind the chord's step with length 1, where it is taken.
 
-        Args:
-          step: Step of wrist, palm and object.
-          alpha: Length of the Newton step.
-          taken: Lanes of the worlds that take the chord's step behind it.
+        Alpha is the length of the Newton step before it.
         """
         problem, mask = self.problem, lanes([taken], (), wide=True)
 
@@ -189,7 +183,6 @@ class Newton:
     """The solver of one step in a kernel."""
 
     def __init__(self, problem: Problem):
-        """Takes the step's problem."""
         self.problem, self.block = problem, problem.block
         one = problem.block.team == 1
         self.elimination = (Elimination if one else TeamElimination)(problem)
@@ -202,14 +195,12 @@ class Newton:
     def solve(
         self, now: Iterate, waiting: jax.Array, iterations: int, evaluations: int, tolerance: float
     ) -> tuple[Iterate, Convergence]:
-        """Iterates until every undecided world has converged.
+        """Iterates until the relative decrement of every undecided world is small.
 
         Args:
           now: Warm start.
-          waiting: Lanes of the undecided worlds, which must converge.
-          iterations: Largest number of iterations.
-          evaluations: Largest number of line-search evaluations.
-          tolerance: Relative Newton decrement.
+          waiting: Lanes of the undecided worlds.
+          iterations: Largest number of Newton iterations; `evaluations`: of the line search.
         """
         problem = self.problem
 
@@ -264,13 +255,11 @@ class Newton:
         """Ends the iteration of worlds whose next decrement would be below the tolerance.
 
         Args:
-          now: The iterate behind the step.
-          alpha: Length of the step.
-          residual: Relative decrement before it.
+          now: The iterate behind the step; `alpha`: its length; `residual`: relative decrement
+            before.
           done: What `direction` left of the palm's elimination.
           scale: Scale of the decrement.
           likely: Lanes of worlds whose decrement is to be looked at.
-          tolerance: Relative Newton decrement.
 
         Returns:
           Iterate, length and decrement, see `ChordStep`; the length is that of "step_acc".
@@ -307,10 +296,7 @@ class Newton:
     def direction(self, now: Iterate, last: Lanes, idle: jax.Array) -> tuple[Iterate, Eliminated]:
         """Newton's step: the fingers' factors, and the step of wrist and object.
 
-        Args:
-          now: The iterate.
-          last: Length of the last step, see `Elimination.backward`.
-          idle: Lanes of worlds whose step is of no use.
+        Last is the length of the last step; the step of idle lanes is of no use.
         """
         pairs = self.problem.pairs
         node, work = self.elimination.backward(last)
@@ -326,16 +312,7 @@ class Newton:
 
 
 def _residual(slope, first, palm: Palm, motion):
-    scale = objective_scale(palm.object.mass, palm.palm.mass, motion)
+    # Typical size of the objective: object and palm at g, plus the object's present motion.
+    mass = palm.object.mass
+    scale = 100.0 * (mass + palm.palm.mass) + mass * dot(motion[3:], motion[3:])
     return jnp.maximum(-slope - first, 0.0) / scale, scale
-
-
-def objective_scale(mass: jax.Array, palm: jax.Array, motion: jax.Array) -> jax.Array:
-    """Typical size of the objective: object and palm at g, plus the object's present motion.
-
-    Args:
-      mass: Mass of the object.
-      palm: Mass of the palm.
-      motion: Spatial acceleration of the object, shape (6, ...).
-    """
-    return 100.0 * (mass + palm) + mass * dot(motion[3:], motion[3:])

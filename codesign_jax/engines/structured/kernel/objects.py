@@ -12,13 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured.kernel.memory import (
-    Block,
-    BoundTable,
-    anywhere,
-    choose,
-    loop,
-)
+from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, anywhere, choose, loop
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import meshes, shapes
 from codesign_jax.engines.structured.laws.meshes import GridLanes, MeshLanes
@@ -28,39 +22,24 @@ _LAST = 1e9  # beyond any index of a support point
 
 
 class MeshMemory(NamedTuple):
-    """A block's memory of meshes.
+    """A block's memory of meshes."""
 
-    Attributes:
-      values: Grid values of all meshes of the scene, a reference to a flat array.
-      support: Reads the support points of a row, one for each finger's lane, shape (3,).
-      rows: Number of these rows.
-      grid: The grid of each world's mesh.
-      reach: Distance of the farthest support point from the centre [m], lanes of a world.
-      meshed: Which worlds have a mesh, lanes of a world.
-    """
-
-    values: Any
+    values: Any  # Grid values of all meshes of the scene, a reference to a flat array
+    # Reads the support points of a row, one for each finger's lane, shape (3,)
     support: Callable[[Any], Lanes]
-    rows: int
-    grid: GridLanes
-    reach: Lanes
-    meshed: Lanes
+    rows: int  # Number of these rows
+    grid: GridLanes  # The grid of each world's mesh
+    reach: Lanes  # Distance of the farthest support point from the centre [m], lanes of a world
+    meshed: Lanes  # Which worlds have a mesh, lanes of a world
 
 
 class WorldObject(NamedTuple):
-    """Objects of a block's worlds.
+    """Objects of a block's worlds."""
 
-    Attributes:
-      size: Sizes of the primitives, shape (3,), lanes of a world.
-      shape: Index of each world's object in the scene, a float, lanes of a world.
-      block: The lanes.
-      mesh: Meshes; None if the scene has none.
-    """
-
-    size: Lanes
-    shape: Lanes
-    block: Block
-    mesh: MeshMemory | None
+    size: Lanes  # Sizes of the primitives, shape (3,), lanes of a world
+    shape: Lanes  # Index of each world's object in the scene, a float, lanes of a world
+    block: Block  # The lanes
+    mesh: MeshMemory | None  # Meshes; None if the scene has none
 
 
 def tables(scene: Scene, fingers: int) -> tuple[dict, dict]:
@@ -89,12 +68,6 @@ def rows(found: MeshLanes, fingers: int, dtype: Any) -> dict[str, jax.Array]:
 def read(
     scene: Scene, block: Block, world: BoundTable, hand: BoundTable, values: Any
 ) -> WorldObject:
-    """The objects of a block.
-
-    Args:
-      world: The worlds' constants; `hand`: the hand's.
-      values: Reference to the grid values of all meshes; None without meshes.
-    """
     size, shape = world.read("object_size"), world.read("object_id")
     if values is None:
         return WorldObject(size, shape, block, None)
@@ -121,13 +94,7 @@ def _for_both(
 ) -> Any:
     """Results of primitive() and meshed() on the lanes that have such an object.
 
-    Args:
-      scene: The scene.
-      thing: The objects.
-      primitive: Computes a tree of lanes for primitives.
-      meshed: Computes one of the same structure for meshes.
-      like: Lanes of the same structure.
-      near: Lanes whose mesh is asked for; the others may get zeros.  By default all with a mesh.
+    Lanes that are not `near`, by default none, may get zeros for a mesh.
     """
     if thing.mesh is None:
         return primitive()
@@ -214,7 +181,6 @@ def _pick(mine: jax.Array, one: Any, other: Any) -> Any:
 
 
 def _gather(ref: Any, index: Lanes, dtype: Any) -> Lanes:
-    """Elements of a flat array at the indices of each lane."""
     parts = np.empty(index.parts.shape, object)
     for at, where in np.ndenumerate(index.parts):
         parts[at] = ref[(where,)].astype(dtype)
@@ -224,11 +190,7 @@ def _gather(ref: Any, index: Lanes, dtype: Any) -> Lanes:
 def table_points(scene: Scene, thing: WorldObject, columns: Lanes, height: Lanes) -> Lanes:
     """Four points that may touch the table, from the centre, shape (3, 4, world).
 
-    Args:
-      scene: The scene.
-      thing: The objects.
-      columns: Columns of their orientation, shape (3, 3).
-      height: Height of their centres above the table.
+    Height is that of the objects' centres above the table.
     """
 
     def primitive() -> Lanes:
@@ -259,13 +221,7 @@ def _search(thing: WorldObject, columns: Lanes, scores: Callable, *known: Lanes)
     """The support points with the largest scores, from the centre, shape (3,), lanes of a world.
 
     Each finger's lane goes through its part of the points; then the lanes of a world compare.
-
-    Args:
-      thing: The objects.
-      columns: Columns of their orientation, shape (3, 3).
-      scores: Function of points (3, finger, world), their indices and the known points to a tuple
-        of scores, see `mesh.lowest`.
-      *known: Points that were found before.
+    Scores takes points (3, finger, world), their indices and known points, see `meshes.lowest`.
     """
     assert thing.mesh is not None
     block, support = thing.block, thing.mesh.support

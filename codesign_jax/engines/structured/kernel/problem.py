@@ -80,7 +80,6 @@ class Problem:
         return value
 
     def body_of(self, item: Any) -> list[Lanes]:
-        """Arguments of `make_body` for a link."""
         return self.read("mass", "body_centre", "tensor", item=item)
 
     def add_first(self, r: Lanes) -> Lanes:
@@ -89,12 +88,10 @@ class Problem:
         return lanewise(jnp.add, r, self.pairs.pushed(0))
 
     def widened(self, motion: Lanes) -> Lanes:
-        """What belongs to a world, on all fingers."""
         return lanewise(jnp.add, motion, zeros(motion.shape[:-2], self.like))
 
 
 def relative(name: str, link: Any, palm: Lanes, obj: Lanes) -> Lanes:
-    """Relative motion of a pair of bodies."""
     difference = jnp.subtract
     if name == "finger_object":
         return lanewise(difference, link, obj)
@@ -112,5 +109,4 @@ def make_body(mass: jax.Array, centre: jax.Array, tensor: jax.Array) -> Body:
 
 
 def triangle(tensor: jax.Array) -> jax.Array:
-    """Upper triangle of a symmetric tensor (3, 3, ...)."""
     return jnp.stack([tensor[i, j] for i in range(3) for j in range(i, 3)])

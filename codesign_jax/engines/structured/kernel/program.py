@@ -32,17 +32,11 @@ TRACE = ("distance", "height", "speed", "residual", "iterations", "moved")
 
 
 class Limits(NamedTuple):
-    """How hard each step is solved.
+    """How hard each step is solved."""
 
-    Attributes:
-      iterations: Largest number of Newton iterations.
-      evaluations: Largest number of line-search evaluations of an iteration.
-      tolerance: Relative Newton decrement at which a world has converged.
-    """
-
-    iterations: int
-    evaluations: int
-    tolerance: float
+    iterations: int  # Largest number of Newton iterations
+    evaluations: int  # Largest number of line-search evaluations of an iteration
+    tolerance: float  # Relative Newton decrement at which a world has converged
 
 
 class Program(Packing):
@@ -117,10 +111,7 @@ class Program(Packing):
     ) -> list[jax.Array | None]:
         """Runs the blocks, which do not depend on each other; None in the place of scratch memory.
 
-        Args:
-          inputs: See `inputs`.
-          trajectory: As in `simulate`.
-          states: Steps from one recorded state to the next, beginning with the first; 0 for none.
+        States are steps from one recorded state to the next, beginning with the first; 0 for none.
         """
         call, outputs = self._call(inputs, trajectory, states)
         if self.backend == "interpreter":
@@ -183,36 +174,30 @@ class Program(Packing):
         if self.team > 1:
             shapes += [(blocks, self.onchip.rows, self.columns)]
 
+        kernel = partial(self._kernel, steps, trajectory, states)
+        return self.call(kernel, "grasp", inputs, shapes, dtype)
+
+    def call(
+        self, kernel: Callable, name: str, inputs: tuple, shapes: list, dtype: Any
+    ) -> tuple[Callable, list[jax.ShapeDtypeStruct]]:
+        """A kernel as a function of its inputs, and its outputs, whose shapes are given."""
+        blocks = inputs[0].shape[0]
         outputs = [jax.ShapeDtypeStruct(s, dtype) for s in shapes]
         call = pl.pallas_call(
-            partial(self._kernel, steps, trajectory, states),
+            kernel,
             grid=(blocks,),
             in_specs=[block_spec(x.shape, blocks) for x in inputs],
             out_specs=[block_spec(s, blocks) for s in shapes],
             out_shape=outputs,
             interpret=self.backend == "interpreter",
-            name="grasp",
+            name=name,
         )
         return call, outputs
 
     def _kernel(self, steps: int, to_end: bool, states: int, *refs: Any) -> None:
-        (
-            hand,
-            world,
-            finger_state0,
-            world_state0,
-            arm,
-            pressure,
-            *rest,
-        ) = refs
+        (hand, world, finger_state0, world_state0, arm, pressure, *rest) = refs
         grid = rest.pop(0) if self.meshes else None
-        (
-            finger_state,
-            world_state,
-            scratch,
-            trace,
-            *path,
-        ) = rest
+        (finger_state, world_state, scratch, trace, *path) = rest
         block, onchip = Block(self.fingers, self.block, self.team), None
         if self.team > 1:
             share = partial(shared_memory.SharedColumns, block)
@@ -222,8 +207,9 @@ class Program(Packing):
             path[::2] = map(share, path[::2])
         step = Step(self, block, hand, world, finger_state, world_state, scratch, grid, onchip)
         own = block.world
-        _copy(finger_state0, finger_state, self.finger_state.rows)
-        _copy(world_state0, world_state, self.world_state.rows, own)
+        rows = self.finger_state.rows, self.world_state.rows
+        copy_rows((0, rows[0]), lambda k: finger_state0[(k,)], finger_state)
+        copy_rows((0, rows[1]), lambda k: world_state0[k, own], world_state, own)
         bounds = verdict.Bounds(*(step.constant(n).lane for n in verdict.Bounds._fields))
 
         def number(name: str) -> jax.Array:
@@ -235,8 +221,8 @@ class Program(Packing):
 
         def store(place: jax.Array, whole: bool, fingers: Any, worlds: Any) -> None:
             angles, places = self.path_rows(whole)
-            _copy(finger_state, fingers, angles, at=(place,))
-            _copy(world_state, worlds, places, own, at=(place,))
+            copy_rows((0, angles), lambda k: finger_state[(k,)], fingers, at=(place,))
+            copy_rows((0, places), lambda k: world_state[k, own], worlds, own, at=(place,))
 
         def record(t: jax.Array) -> None:
             for k, (stride, whole) in enumerate(_records(to_end, states)):
@@ -301,23 +287,17 @@ def block_spec(shape: tuple[int, ...], blocks: int) -> pl.BlockSpec:
 
 
 def lanes_here(scene: Scene, dtype: Any, worlds: int | None = None) -> int:
-    """Lanes of a block on this device, see `launch.block_lanes`.
-
-    Args:
-      scene: The scene.
-      dtype: Type of the numbers.
-      worlds: Worlds that the device simulates at once; None if they are not known.
-    """
+    """Lanes of a block on this device for so many worlds, if it is known; `launch.block_lanes`."""
     fingers = layout(scene).dofs.shape[0]
     total = None if worlds is None else worlds << (fingers - 1).bit_length()
     return block_lanes(jax.default_backend(), dtype, total)
 
 
-def _copy(source: Any, target: Any, rows: int, *where: jax.Array, at: tuple = ()) -> None:
-    """Copies the first rows; `at`: what comes before the row in the target."""
+def copy_rows(rows: tuple[Any, Any], read: Callable, target: Any, *where: Any, at: tuple = ()):
+    """Stores read(row) in rows of a table; what is before and behind the row in the index."""
 
     def one(k: jax.Array, x: jax.Array) -> jax.Array:
-        target[(*at, k, *where)] = source[(k, *where)]
+        target[(*at, k, *where)] = read(k)
         return x
 
-    jax.lax.fori_loop(0, rows, one, jnp.int32(0))
+    jax.lax.fori_loop(*rows, one, jnp.int32(0))

@@ -20,36 +20,28 @@ from codesign_jax.engines.structured.kernel.friction_memory import held_work
 from codesign_jax.engines.structured.kernel.problem import make_body
 from codesign_jax.engines.structured.kernel.step import link_forces, palm_and_object
 from codesign_jax.engines.structured.lanes import dot, sum_axis
-from codesign_jax.engines.structured.laws import contact, holding, shapes, surroundings
+from codesign_jax.engines.structured.laws import contact, holding, rings, shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
 from codesign_jax.engines.structured.laws.contact import Contacts
 from codesign_jax.engines.structured.laws.kinematics import next_motion, palm_motion
+from codesign_jax.engines.structured.laws.rings import Segment
 from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.scene import Scene
 
 
-class Chain(NamedTuple):
-    """What the links of a finger inherit from one another.
+class LinkMotion(NamedTuple):
+    """What the links of a finger inherit from one another."""
 
-    Attributes:
-      origin: Place of the link's frame, shape (3, ...).
-      frame: Columns of its orientation, shape (3, 3, ...).
-      vel: Spatial velocity, shape (6, ...).
-      bias: Spatial acceleration at zero joint acceleration, same shape.
-      motion: Spatial acceleration without velocity terms, same shape.
-      along: Virtual spatial acceleration, same shape.
-    """
-
-    origin: Any
-    frame: Any
-    vel: Any
-    bias: Any
-    motion: Any
-    along: Any
+    origin: Any  # Place of the link's frame, shape (3, ...)
+    frame: Any  # Columns of its orientation, shape (3, 3, ...)
+    vel: Any  # Spatial velocity, shape (6, ...)
+    bias: Any  # Spatial acceleration at zero joint acceleration, same shape
+    motion: Any  # Spatial acceleration without velocity terms, same shape
+    along: Any  # Virtual spatial acceleration, same shape
 
 
-class Place(NamedTuple):
-    """A body with contacts: as `Chain`."""
+class BodyMotion(NamedTuple):
+    """A body with contacts: as `LinkMotion`."""
 
     origin: Any
     frame: Any
@@ -80,13 +72,12 @@ def around(scene: Scene, at: dict) -> list[Callable]:
     return [partial(field, at["position"]) for field in surroundings.fields(scene)]
 
 
-def of_rings(scene: Scene, name: str, place: Place, numbers, at: dict, still: dict) -> jax.Array:
+def of_rings(
+    scene: Scene, name: str, place: BodyMotion, numbers, at: dict, still: dict
+) -> jax.Array:
     """Power of the contacts of the rings, or spheres, of a link or the palm.
 
     Args:
-      scene: The scene.
-      name: Pair of bodies, as in `problem.relative`.
-      place: The body.
       numbers: Numbers of its rings, see `rings.Ring`, shape (8, k, ...).
       at: The object and the constants of the contacts, by name.
       still: What has no derivative here: accelerations, indices and values of grids, and "share" of
@@ -103,7 +94,7 @@ def of_rings(scene: Scene, name: str, place: Place, numbers, at: dict, still: di
             continue
         offset, again = jnp.zeros_like(centre), first
         if on_object or n >= scene.effects.table:  # the table is a plane
-            offset = sdf_collision.aimed(numbers, place.frame, *first)
+            offset = finger_collision.aimed(numbers, place.frame, *first)
             again = one(centre + offset, **values[1])
         places.append(sdf_collision.rings_on_field(numbers, place.frame, centre, offset, *again))
     found = sdf_collision.beside(places)
@@ -117,23 +108,17 @@ def of_rings(scene: Scene, name: str, place: Place, numbers, at: dict, still: di
     return of_contacts(contacts, *(m[:, None] for m in moves))
 
 
-def aim(scene: Scene, name: str, place: Place, numbers, at: dict, still: dict) -> jax.Array:
+def aim(scene: Scene, name: str, place: BodyMotion, numbers, at: dict, still: dict) -> jax.Array:
     """Where rings look at a field once more, shape (3, k, ...)."""
     centre = sdf_collision.ring_centres(place.origin, place.frame, numbers)
     first = look(scene, centre, at, still, still.get("values"))
-    return centre + sdf_collision.aimed(numbers, place.frame, *first)
+    return centre + finger_collision.aimed(numbers, place.frame, *first)
 
 
 def of_table(scene: Scene, fingers: int, item: int, at: dict, finger, still: dict) -> jax.Array:
     """Power of the object's points on the table that an item deals to the fingers' lanes.
 
-    Args:
-      scene: The scene.
-      fingers: Fingers of a block.
-      item: The item.
-      at: As in `of_spheres`.
-      finger: Number of each lane's finger.
-      still: As in `of_spheres`, with the motions of the object.
+    Finger is the number of each lane's finger; the rest is as in `of_rings`.
     """
     slots = surroundings.slots(scene)
 
@@ -182,16 +167,11 @@ def _of_object(scene: Scene, at: dict, still: dict) -> tuple:
 TABLE = "object_table"
 
 
-def of_link(scene: Scene, chain: Chain, numbers: dict, joint: dict, still: dict):
+def of_link(scene: Scene, chain: LinkMotion, numbers: dict, joint: dict, still: dict):
     """What a link hands on, and its power.
 
-    Args:
-      scene: The scene.
-      chain: What it inherits.
-      numbers: See `Step.link_constants`.
-      joint: Angles and velocities of the joint before it, and the chamber's pressure, by name.
-      still: Accelerations and virtual accelerations of the joint, and the cotangent of the centre
-        of mass.
+    Chain is what it inherits, `numbers` its constants; `still` has the accelerations and virtual
+    accelerations of the joint, and the cotangent of the centre of mass.
     """
     after, found = link_forces(scene, chain[:5], numbers, joint | {"acc": still["acc"]})
     along = next_motion(chain.along, found["axes"], still["virtual"])
@@ -199,19 +179,11 @@ def of_link(scene: Scene, chain: Chain, numbers: dict, joint: dict, still: dict)
     armature = found.get("armature_now", numbers["armature"])
     inertial = armature * still["acc"] - found["tau"]
     power = dot(body.times(after[4]) - found["smooth"], along) + dot(inertial, still["virtual"])
-    return Chain(*after, along), dot(still["centre_bar"], found["body_centre"]) - power
+    return LinkMotion(*after, along), dot(still["centre_bar"], found["body_centre"]) - power
 
 
 def of_palm(timestep: float, state: dict, arm, constants: dict, still: dict) -> tuple:
-    """Geometry and motions of palm and object, and the power of palm, wrist and object.
-
-    Args:
-      timestep: Time step [s].
-      state: Positions and velocities of wrist and object, by name.
-      arm: Commands of the arm frame.
-      constants: See `Step.palm_constants`.
-      still: Accelerations of wrist and object, and their virtual ones.
-    """
+    """Geometry and motions of palm and object, and the power of palm, wrist and object."""
     given = {name: still[name] for name in ("acc_wrist", "acc_object")}
     found = palm_and_object(timestep, state | given, arm, constants)
     palm, now, virtual = found["palm"], found["now"], still["virtual_wrist"]
@@ -220,23 +192,17 @@ def of_palm(timestep: float, state: dict, arm, constants: dict, still: dict) -> 
     object_force = palm.object.times(now.object_motion) - palm.smooth_object
     power = power + dot(object_force, still["object_along"])
     power = power + dot(palm.armature * now.wrist - palm.smooth_wrist, virtual)
-    place = Chain(
+    place = LinkMotion(
         found["place"], found["frame"], found["vel"], found["bias"], now.palm_motion, along
     )
     height = state["position"][2]
     return place, found["columns"], found["object_vel"], height, now.wrist, -power
 
 
-def on_palm(scene: Scene, mine: tuple[Place, Any], palm: Place, size, numbers) -> jax.Array:
-    """Power of a finger's ring or sphere on the palm.
-
-    Args:
-      scene: The scene.
-      mine: Link, and the ring's numbers.
-      palm: The palm.
-      size: Radius and half the thickness of its disc.
-      numbers: Numbers of the cone.
-    """
+def on_palm(
+    scene: Scene, mine: tuple[BodyMotion, Any], palm: BodyMotion, size, numbers
+) -> jax.Array:
+    """Power of a finger's ring or sphere, on a link, on the palm's disc of a size."""
     place, ring = mine
     centre, disc = finger_collision.ring_centre(*place[:2], ring), (*palm[:2], size)
     first = finger_collision.palm_distance(centre, disc)
@@ -259,35 +225,30 @@ def between_spheres(scene: Scene, mine: tuple, theirs: tuple, numbers: Any) -> j
     return _between(scene, found, mine[0][2:], theirs[0][2:], numbers)
 
 
-class Line(NamedTuple):
-    """A segment of a finger's centre line.
+class CentreLineSegment(NamedTuple):
+    """A segment of a finger's centre line."""
 
-    Attributes:
-      places: Its link, as `Place`.
-      origins: Places of the joints at its ends.
-      frames: Of the links before it and behind it.
-      tip: Numbers of the ring whose section it has, see `Search.ring_at`; on the last segment of
-        the finger's last one.
-      first: Of that which the segment before it has, of a tapered finger; else None.
-    """
-
-    place: Place
-    origin: Any
-    frames: tuple[Any, Any]
+    place: BodyMotion  # Its link
+    origin: Any  # Place of the joint behind it
+    frames: tuple[Any, Any]  # Of the links before it and behind it
+    # Numbers of the ring whose section it has, see `FingerCollision.ring_at`; on the last segment
+    # of the finger's last one.
     tip: Any
-    first: Any = None
+    first: Any = None  # Of that which the segment before it has, of a tapered finger
 
 
 def between_rings(
-    scene: Scene, mine: tuple[Place, Any], theirs: Line, numbers, held: tuple, still: dict
+    scene: Scene,
+    mine: tuple[BodyMotion, Any],
+    theirs: CentreLineSegment,
+    numbers,
+    held: tuple,
+    still: dict,
 ) -> jax.Array:
     """Power of a ring on another finger, or its own.
 
     Args:
-      scene: The scene.
-      mine: Link, and the ring's numbers.
-      theirs: Segment that it touches.
-      numbers: Numbers of the cone.
+      mine: Link, and the ring's numbers; `theirs`: segment that it touches.
       held: What the fingers hold, see `holding.held`, and cotangents of the sums of
         `holding.hold`; nothing where they have no such state.
       still: Whether the segment is the last one, "last", and where it may be touched at the most,
@@ -301,7 +262,7 @@ def between_rings(
     tip = finger_collision.ring_centre(link.origin, link.frame, theirs.tip)
     ends = start, jnp.where(still["last"] > 0, tip, behind)
     centre = finger_collision.ring_centre(*place[:2], ring)
-    t = finger_collision.where_on(ends, centre, still["end"])
+    t = rings.nearest(centre, Segment(ends, None, None), still["end"])  # type: ignore[arg-type]
     other = ends, (before, link.frame, after), theirs.tip, still["last"]
     found = finger_collision.between(ring, place.frame, centre, other, t)
     return _between(scene, found, place[2:], link[2:], numbers, held)

@@ -28,7 +28,11 @@ from codesign_jax.engines.structured.kernel.finger_contacts import (
 from codesign_jax.engines.structured.kernel.memory import choose, loop
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.problem import Iterate
-from codesign_jax.engines.structured.kernel.residual import Chain, Line, Place
+from codesign_jax.engines.structured.kernel.residual import (
+    BodyMotion,
+    CentreLineSegment,
+    LinkMotion,
+)
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.kernel.step_memory import FINGER_CONSTANTS, LINK_CONSTANTS
@@ -39,7 +43,7 @@ from codesign_jax.engines.structured.laws.kinematics import mounted
 from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model.layout import touches_itself
 
-SHAPES = Chain((3,), (3, 3), (6,), (6,), (6,), (6,))
+SHAPES = LinkMotion((3,), (3, 3), (6,), (6,), (6,), (6,))
 
 
 class ResidualVjp:
@@ -54,15 +58,6 @@ class ResidualVjp:
         virtual: Iterate,
         bars: CotangentTables,
     ):
-        """Takes a step's memory and geometry as the forward pass has left them, see `Step`.
-
-        Args:
-          state: Positions and velocities of wrist and object.
-          at: What `Step` calculates of palm and object.
-          thing: The objects.
-          virtual: Virtual accelerations, see `AdjointSolve.solve`.
-          bars: The cotangents so far.
-        """
         self.step, self.p, self.at, self.thing = step, step.p, at, thing
         self.contacts, self.scratch = step.contacts, step.scratch
         self.virtual, self.bars, self.block = virtual, bars, step.block
@@ -81,25 +76,17 @@ class ResidualVjp:
             self.still |= {n: step.constant(n) for n in ("grid_first", "grid_nodes")}
             self.still |= {"meshed": thing.mesh.meshed}
 
-    def chain(self, i: Any) -> Chain:
+    def chain(self, i: Any) -> LinkMotion:
         """What the link before joint i hands on."""
-        names = (f"chain.{n}" for n in Chain._fields)
-        return Chain(*(self.scratch.read(n, i) for n in names))
+        names = (f"chain.{n}" for n in LinkMotion._fields)
+        return LinkMotion(*(self.scratch.read(n, i) for n in names))
 
-    def fingers(self, pressure: Lanes, centre_bar: Lanes) -> Chain:
-        """Goes through the fingers from their tips, and through the contacts of their links.
-
-        Args:
-          pressure: Chamber pressures.
-          centre_bar: Cotangent of the sum of the segments' centres.
-
-        Returns:
-          Cotangents of what the palm hands on, on each finger's lanes.
-        """
+    def fingers(self, pressure: Lanes, centre_bar: Lanes) -> LinkMotion:
+        """From the tips inwards; cotangents of what the palm hands on, on each lane."""
         p, tips = self.p, self.p.links
         touching = [n for n in ("finger_object", "finger_table") if n in self.contacts]
 
-        def link(i: Any, after: Chain) -> Chain:
+        def link(i: Any, after: LinkMotion) -> LinkMotion:
             if touching:
                 place = _place(self.chain(i + 1))
                 for name in touching:
@@ -108,22 +95,21 @@ class ResidualVjp:
             before = self._link(i, after, pressure, centre_bar)
             return self.more(before, i)
 
-        after = Chain(*(zeros(shape, self.like) for shape in SHAPES))
+        after = LinkMotion(*(zeros(shape, self.like) for shape in SHAPES))
         after = self.more(after, tips)
         base = loop(tips, link, after, p.size, reverse=True)
         return self._mount(base, centre_bar)
 
     def none(self, name: str) -> Lanes:
-        """No cotangent of what a link hands on, by name."""
         return zeros(getattr(SHAPES, name), self.like)
 
-    def more(self, bars: Chain, i: Any) -> Chain:
+    def more(self, bars: LinkMotion, i: Any) -> LinkMotion:
         """Adds what contacts between fingers have left for a link."""
         if "pairbar.origin" not in self.scratch:
             return bars
-        return _add(bars, **{n: self.scratch.read(f"pairbar.{n}", i) for n in Place._fields})
+        return _add(bars, **{n: self.scratch.read(f"pairbar.{n}", i) for n in BodyMotion._fields})
 
-    def _link(self, i: Any, after: Chain, pressure: Lanes, centre_bar: Lanes) -> Chain:
+    def _link(self, i: Any, after: LinkMotion, pressure: Lanes, centre_bar: Lanes) -> LinkMotion:
         numbers, joint = self.step.link_constants(i), self.step.joint(i)
         still = {"acc": joint.pop("acc")}
         still["virtual"] = self.scratch.read("virtual", i)
@@ -138,7 +124,7 @@ class ResidualVjp:
         self.bars.add_joint(moved, i)
         return before
 
-    def _mount(self, base: Chain, centre_bar: Lanes) -> Chain:
+    def _mount(self, base: LinkMotion, centre_bar: Lanes) -> LinkMotion:
         read = self.step.hand.read
         names = ("mount", "base", "stub_centre")
         palm = self.at["place"], self.at["frame"]
@@ -146,7 +132,8 @@ class ResidualVjp:
         def run(palm, mount, base, stub, weight):
             place, frame = palm
             turned, origin = mounted(place, frame, mount, base)
-            return turned, origin, dot_of(weight, place + apply_columns(frame, stub))
+            middle = place + apply_columns(frame, stub)
+            return turned, origin, sum(weight[k] * middle[k] for k in range(3))
 
         weight = lanewise(jnp.multiply, centre_bar, read("share"))
         given = (palm, *(read(n) for n in names))
@@ -156,15 +143,15 @@ class ResidualVjp:
 
     # Contacts
 
-    def palm_and_table(self, base: Chain) -> Chain:
+    def palm_and_table(self, base: LinkMotion) -> LinkMotion:
         """Adds the contacts of the palm's rings or spheres, and of the object with the table."""
         names = [n for n in ("palm_object", "palm_table") if n in self.contacts]
         at, now = self.at, self.at["now"]
-        place = Place(
+        place = BodyMotion(
             at["place"], at["frame"], at["vel"], now.palm_motion, self.virtual.palm_motion
         )
         if "palmbar.origin" in self.scratch:
-            more = {n: self.scratch.read(f"palmbar.{n}") for n in Place._fields}
+            more = {n: self.scratch.read(f"palmbar.{n}") for n in BodyMotion._fields}
             base = _add(base, **more)
         for i in range(self.p.palm_groups if names else 0):
             for name in names:
@@ -174,13 +161,13 @@ class ResidualVjp:
             self._table()
         return base
 
-    def rings(self, name: str, i: Any, place: Place, table: str = "ring") -> Place:
+    def rings(self, name: str, i: Any, place: BodyMotion, table: str = "ring") -> BodyMotion:
         """Cotangents of a body, of an item of the contacts of its rings."""
         k = self.p.k if table == "ring" else 1
         rows = [self.step.hand.read(table, i * k + j) for j in range(k)]
         numbers = lanewise(lambda rows: jnp.stack(rows, 1), rows)
 
-        def compute(at: dict, still: dict) -> Place:
+        def compute(at: dict, still: dict) -> BodyMotion:
             if "meshed" in still and name.endswith("_object"):
                 centre = lanewise(sdf_collision.ring_centres, place.origin, place.frame, numbers)
                 still = still | {"values": self._values(centre)}
@@ -197,9 +184,10 @@ class ResidualVjp:
 
         return self._touching(name, i, compute)
 
-    def _touching(self, name: str, i: Any, compute: Callable[[dict, dict], Place]) -> Place:
-        """What is computed of an item's contacts if there are any."""
-        at, empty = self._object(name), Place(*(self.none(n) for n in Place._fields))
+    def _touching(
+        self, name: str, i: Any, compute: Callable[[dict, dict], BodyMotion]
+    ) -> BodyMotion:
+        at, empty = self._object(name), BodyMotion(*(self.none(n) for n in BodyMotion._fields))
         contacts = self.contacts[name]
         still = self.still | {"share": contacts.read("share", i)}
         return choose(contacts.touching(i), lambda: compute(at, still), empty, self.p.size)
@@ -253,21 +241,16 @@ class ResidualVjp:
         return objects.cell_values(self.thing, local)
 
 
-def dot_of(weight: jax.Array, vector: jax.Array) -> jax.Array:
-    """Product of two vectors (3, ...)."""
-    return sum(weight[k] * vector[k] for k in range(3))  # type: ignore[return-value]
-
-
 def _turned_back(columns: jax.Array, points: jax.Array) -> jax.Array:
     """Points (3, point, world) along the world's axes in the object's frame."""
     return shapes.in_object(columns[:, :, 0], points)
 
 
-def _place(chain: Chain) -> Place:
-    return Place(*(getattr(chain, n) for n in Place._fields))
+def _place(chain: LinkMotion) -> BodyMotion:
+    return BodyMotion(*(getattr(chain, n) for n in BodyMotion._fields))
 
 
-def _add(bars: Chain, **more: Lanes) -> Chain:
+def _add(bars: LinkMotion, **more: Lanes) -> LinkMotion:
     old = {n: getattr(bars, n) for n in more}
     return bars._replace(**plus(old, more))
 
@@ -279,16 +262,13 @@ class FingerContactsVjp:
     """Leaves the cotangents of the links with contacts between fingers as "pairbar"."""
 
     def __init__(self, sweep: ResidualVjp, pairs: BoundFingerContacts):
-        """Takes a step's sweep and its contacts between fingers."""
         self.sweep, self.pairs, self.p, self.bars = sweep, pairs, sweep.p, sweep.bars
         self.like, self.lane = sweep.like, sweep.block.lane
         self.scratch, self.hand = sweep.scratch, sweep.step.hand
 
     def run(self) -> None:
-        """Goes through all contacts."""
-
         def clear(i: jax.Array, x: jax.Array) -> jax.Array:
-            for name in Place._fields:
+            for name in BodyMotion._fields:
                 name = f"pairbar.{name}"
                 self.scratch.write(name, zeros(self.scratch.shape(name), self.like), i)
             return x
@@ -296,7 +276,9 @@ class FingerContactsVjp:
         jax.lax.fori_loop(0, self.p.links + 1, clear, jnp.int32(0))
         effects, hull = self.p.scene.effects, self.p.scene.effects.surface == "hull"
         if effects.finger_palm:
-            self._leave_palm(Place(*(self.sweep.none(n) for n in Place._fields)), first=True)
+            self._leave_palm(
+                BodyMotion(*(self.sweep.none(n) for n in BodyMotion._fields)), first=True
+            )
 
         def slot(item: Any, pairing: FingerPairing) -> None:
             read = self.pairs.read
@@ -332,8 +314,7 @@ class FingerContactsVjp:
         self._leave_palm(palm)
         self._leave(place._asdict(), row)
 
-    def _leave_palm(self, bars: Place, *, first: bool = False) -> None:
-        """Adds to what the palm's place and motion get."""
+    def _leave_palm(self, bars: BodyMotion, *, first: bool = False) -> None:
         for name, value in bars._asdict().items():
             name = f"palmbar.{name}"
             if not first:
@@ -343,7 +324,6 @@ class FingerContactsVjp:
     # Fingers
 
     def _spheres(self, item: Any, pairing: FingerPairing, live: jax.Array) -> None:
-        """Adds the cotangents of two spheres."""
         number, row, ring = self._ring(item)
         other = jax.lax.div(self.pairs.read("ring", item).lane.astype(jnp.int32), self._count)
         theirs = self._body(row_of(other, self.p.k), pairing.lane), self._numbers(other, pairing)
@@ -379,13 +359,15 @@ class FingerContactsVjp:
 
     def _rings(
         self, item: Any, pairing: FingerPairing, live: jax.Array, other: Any, lane: Any, still: dict
-    ) -> Line:
+    ) -> CentreLineSegment:
         """Adds the cotangents of a ring; returns those of the segment that it touches."""
         number, row, ring = self._ring(item)
         before, own, after = finger_collision.neighbours(other, self.p.links)
         frames = tuple(self._chain("frame", r, lane) for r in (before, after))
         sections = [self._numbers(n, pairing, lane) for n in self._sections(other)]
-        line = Line(self._body(own, lane), self._chain("origin", after, lane), frames, *sections)
+        line = CentreLineSegment(
+            self._body(own, lane), self._chain("origin", after, lane), frames, *sections
+        )
         still |= {"last": self._float(jnp.where(other == self.p.links, self.like + 1.0, self.like))}
         held = friction_memory.at(self.sweep.step, pairing)
         args = (self._body(row), ring), line, self.sweep.step.constant(CONE), held
@@ -397,7 +379,7 @@ class FingerContactsVjp:
         self._leave(place._asdict(), row)
         return line
 
-    def _leave_line(self, line: Line, row: jax.Array) -> None:
+    def _leave_line(self, line: CentreLineSegment, row: jax.Array) -> None:
         before, own, after = finger_collision.neighbours(row, self.p.links)
         self._leave(line.place._asdict(), own)
         self._leave({"frame": line.frames[0]}, before)
@@ -407,7 +389,7 @@ class FingerContactsVjp:
             self.bars.add({"ring": bar}, ring, self.lane)
 
     def _sections(self, row: jax.Array) -> list[jax.Array]:
-        """Rings whose sections segments have, and the one before has; see `Search.ring_at`."""
+        """Rings whose sections segments have, and the one before has; see `ring_at`."""
         search = self.sweep.step.search
         assert search is not None
         places = (1, 0) if self.p.tapered else (1,)
@@ -440,9 +422,8 @@ class FingerContactsVjp:
         lane = pairing.lane if lane is None else lane
         return self.hand.gather("ring", number, lane)
 
-    def _body(self, row: jax.Array, lane: Any = None) -> Place:
-        """A link."""
-        return Place(*(self._chain(n, row, lane) for n in Place._fields))
+    def _body(self, row: jax.Array, lane: Any = None) -> BodyMotion:
+        return BodyMotion(*(self._chain(n, row, lane) for n in BodyMotion._fields))
 
     def _chain(self, name: str, row: jax.Array, lane: Any = None) -> Lanes:
         lane = self.lane if lane is None else lane
@@ -456,5 +437,4 @@ class FingerContactsVjp:
 
 
 def row_of(number: jax.Array, k: int) -> jax.Array:
-    """Link of a ring."""
     return jax.lax.div(number, jnp.full_like(number, k)) + 1

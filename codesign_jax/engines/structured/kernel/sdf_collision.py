@@ -13,16 +13,21 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import objects
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
-from codesign_jax.engines.structured.kernel.finger_collision import FingerCollision
+from codesign_jax.engines.structured.kernel.finger_collision import (
+    FingerCollision,
+    aimed,
+    ball_on_field,
+    on_field,
+)
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.problem import relative
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import cross, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.laws import contact, rings, shapes, surroundings
+from codesign_jax.engines.structured.laws import contact, shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import own_friction
-from codesign_jax.engines.structured.laws.rings import Place, Ring
+from codesign_jax.engines.structured.laws.rings import Place
 from codesign_jax.engines.structured.world_model import apply_columns
 
 OUTSIDE = 1.5
@@ -33,17 +38,13 @@ class SdfCollision:
     """Enters the contacts of fingers, palm and object with object and table."""
 
     def __init__(self, step: StepMemory, at: dict[str, Any], thing: WorldObject):
-        """Takes a step's memory and geometry, see `Step`."""
         self.step, self.p, self.at, self.thing = step, step.p, at, thing
         self.contacts = step.contacts
         self.names = [n for n in ("finger_object", "finger_table") if n in self.contacts]
         self.hull = step.p.scene.effects.surface == "hull"
 
     def looks(self, name: str) -> list[Callable[[Lanes], tuple[Lanes, Lanes]]]:
-        """What bodies of a pair touch: from points (3, k) to distances (k,) and gradients.
-
-        It is the object, or the table and the fixtures.
-        """
+        """The object, or table and fixtures: from points (3, k) to distances (k,) and gradients."""
         if name.endswith("_object"):
             return [self._object]
         position = self.step.world_state.read("position")
@@ -56,12 +57,7 @@ class SdfCollision:
         return distance, lanewise(apply_columns, columns, gradient)
 
     def frictions(self, name: str, count: int = 1) -> Lanes | None:
-        """Coefficients (1, k) of contacts of an item, or of all slots of the object.
-
-        Args:
-          name: Pair of bodies.
-          count: Rings or spheres that look at each field.
-        """
+        """Coefficients (1, k) of an item of `count` rings a field; None where all are alike."""
         if not own_friction(self.p.scene, name):
             return None
         which = surroundings.touched(self.p.scene, name, count)
@@ -70,7 +66,6 @@ class SdfCollision:
         )
 
     def moves(self, name: str, motion: Lanes | None, vel: Lanes | None) -> tuple[Lanes, Lanes]:
-        """Relative acceleration and velocity of a pair of bodies."""
         at, now = self.at, self.at["now"]
         return (
             relative(name, motion, now.palm_motion, now.object_motion),
@@ -103,7 +98,6 @@ class SdfCollision:
             contacts.every(one, [])  # type: ignore[attr-defined]
 
     def numbers(self, i: Any) -> Lanes:
-        """Numbers of a link's rings, shape (8, k)."""
         k, read = self.p.k, partial(self.step.hand.read, "ring")
         return lanewise(lambda rows: jnp.stack(rows, 1), [read(i * k + j) for j in range(k)])
 
@@ -204,7 +198,6 @@ class SdfCollision:
 
 
 def ring_centres(origin, frame, numbers):
-    """Centres of a body's rings, shape (3, k, ...)."""
     return origin[:, None] + apply_columns(frame[:, :, None], numbers[:3])
 
 
@@ -239,11 +232,6 @@ def may_touch(timestep, numbers, centre, distance, vel):
     return sum(found[k] for k in range(found.shape[0]))
 
 
-def aimed(numbers, frame, distance, gradient):
-    """See `rings.aim`; of a link's rings."""
-    return rings.aim(Ring.of(numbers), frame[:, :, None], distance, gradient)
-
-
 def as_kept(place: Place) -> Place:
     """Gaps and shares with an axis of one component, as sets keep them."""
     return place._replace(gap=place.gap[None], share=place.share[None])
@@ -251,15 +239,13 @@ def as_kept(place: Place) -> Place:
 
 def rings_on_field(numbers, frame, centre, offset, distance, normal):
     """See `rings.on_field`; of a link's rings."""
-    frame = frame[:, :, None]
-    return as_kept(rings.on_field(Ring.of(numbers), frame, centre, offset, distance, normal))
+    return as_kept(on_field(numbers, frame, centre, offset, distance, normal))
 
 
 def balls_on_field(numbers, centre, distance, normal):
     """Contacts of a body's spheres, whose half axes are the radius."""
-    return as_kept(rings.ball_on_field(numbers[3] * numbers[6], centre, distance, normal))
+    return as_kept(ball_on_field(numbers, centre, distance, normal))
 
 
 def one_of(numbers):
-    """Numbers of one ring, with an axis of their own."""
     return numbers[:, None]

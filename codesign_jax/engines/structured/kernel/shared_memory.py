@@ -61,7 +61,6 @@ class SharedColumns:
     """Reference to a table of fingers, of which the lanes of a team share a column."""
 
     def __init__(self, block: Block, ref: Any):
-        """Takes the lanes and Pallas' reference."""
         self.ref, self.own, self.dtype = ref, block.own, ref.dtype
         self.shape = (*ref.shape[:-1], block.size)
 
@@ -82,7 +81,6 @@ class TeamRows:
     """Reads and writes a table's rows by the lanes of a team, each its own row."""
 
     def __init__(self, block: Block, table: BoundTable):
-        """Takes the lanes and a table of fingers."""
         self.block, self.layout, self.ref = block, table.layout, table.ref
 
     def _at(self, name: str, item: Any, first: int, step: int) -> tuple:
@@ -104,7 +102,6 @@ class TeamRows:
         return lanes(found, (count,), wide=True)
 
     def put_rows(self, name: str, value: Lanes, item: Any = 0) -> None:
-        """Stores the lane's column of a matrix."""
         for k, part in enumerate(value.parts.ravel()):
             self.put(name, splat(part, (self.block.size,), value.dtype), item, TEAM * k)
 
@@ -116,7 +113,6 @@ def team_sum(block: Block, value: Lanes) -> Lanes:
 
 
 def where(mask: jax.Array, one: Any, other: Any) -> Any:
-    """One of two trees of lanes, by a condition of the lanes."""
     which = lanes([mask], (), wide=True)
     return lanewise(lambda w, a, b: jax.tree.map(partial(jnp.where, w), a, b), which, one, other)
 

@@ -38,7 +38,6 @@ class SlotCounts:
     """
 
     def __init__(self, words: list[jax.Array], most: int):
-        """Takes the integers and the largest number that a row may have."""
         self.words, self._most = words, most
         self._bits, self._each = _sizes(most)
 
@@ -51,7 +50,6 @@ class SlotCounts:
         return cls(words, most)
 
     def masked(self, chosen: jax.Array) -> "SlotCounts":
-        """The numbers of some lanes, and zero for all others."""
         return SlotCounts([jnp.where(chosen, word, 0) for word in self.words], self._most)
 
     def of(self, row: jax.typing.ArrayLike) -> jax.Array:
@@ -88,12 +86,8 @@ class SlotSet(ContactSet):
         """Prepares the set.
 
         Args:
-          scene: The scene.
-          name: Pair of bodies, as in `problem.relative`.
-          rows: Number of rows.
           slots: Slots of a row, on each lane; one more takes what finds no room. Where lanes
             gather, one more item of the set is what they read in slots that are not theirs.
-          size: Lanes of a block.
           gathers: Whether lanes read items of their own as fast as a common one: on GPUs.
           remembers: Numbers that are kept of each slot beside its contact, see `remembered`.
         """
@@ -101,11 +95,9 @@ class SlotSet(ContactSet):
         self.rows, self.slots, self.gathers, self.remembers = rows, slots, gathers, remembers
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
-        """The set's part of the scratch table."""
         return self.fields() | {f"{self.name}.count": (self.rows, ())}
 
     def fields(self) -> dict[str, tuple[int, tuple[int, ...]]]:
-        """What is kept of each slot."""
         fields = self.more | dict.fromkeys(self.remembers, 1)
         more = {f"{self.name}.{field}": (self.count, (n, 1)) for field, n in fields.items()}
         return super().groups() | more
@@ -114,7 +106,6 @@ class SlotSet(ContactSet):
     """Components of further fields of a slot."""
 
     def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundSlots":
-        """See `ContactSet`."""
         return BoundSlots(self, table, self.cone(read))
 
 
@@ -124,14 +115,10 @@ class Slot(NamedTuple):
     Lanes that have filled it, and whose worlds the pass is for, use it. All others read an item
     where nothing touches, the same in every slot, and write to one that nobody reads. So a GPU's
     memory, which is what its threads wait for, is asked for little that no lane uses.
-
-    Attributes:
-      source: Item that each lane reads, int32, shape (lane,).
-      sink: Item that each lane writes, int32, shape (lane,).
     """
 
-    source: jax.Array
-    sink: jax.Array
+    source: jax.Array  # Item that each lane reads, int32, shape (lane,)
+    sink: jax.Array  # Item that each lane writes, int32, shape (lane,)
 
 
 class BoundSlots(BoundContacts):
@@ -141,7 +128,6 @@ class BoundSlots(BoundContacts):
     _counts: SlotCounts | None = None
 
     def clear(self, row: Any) -> None:
-        """Empties a row."""
         self.write("count", zeros((), self.like), row)
 
     def read(self, field: str, item: Any) -> Lanes:
@@ -187,11 +173,9 @@ class BoundSlots(BoundContacts):
 
     @contextlib.contextmanager
     def only(self, busy: jax.Array) -> Iterator[None]:
-        """Within this context a pass goes through the slots that some lanes have filled.
+        """Within this context a pass goes through the slots that the lanes `busy` have filled.
 
-        Args:
-          busy: Those lanes, bool, shape (lane,): of the worlds that the pass is made for. What it
-            makes of other worlds is of no use.
+        What it makes of other worlds is of no use.
         """
         before = self._counts
         assert before is not None
@@ -218,14 +202,7 @@ class BoundSlots(BoundContacts):
         return jnp.where(most > self.set.slots, 1.0, 0.0).astype(self.like.dtype)
 
     def add(self, row: Any, which: jax.Array, fields: dict[str, Lanes], lane: jax.Array) -> None:
-        """Gives contacts a slot each, on the lanes that have one.
-
-        Args:
-          row: The row.
-          which: Lanes that have a contact.
-          fields: What is kept of it, see `begin`.
-          lane: The lanes.
-        """
+        """Gives contacts, with what is kept of them, a slot of a row on the lanes `which`."""
         count, first = self.read("count", row).lane, row * (self.set.slots + 1)
         filled = count.astype(jnp.int32)
         if not self.set.gathers:
@@ -280,7 +257,6 @@ class BoundSlots(BoundContacts):
 
 @contextlib.contextmanager
 def only(sets: Sequence[BoundSlots], busy: jax.Array) -> Iterator[None]:
-    """`BoundSlots.only` of several sets."""
     with contextlib.ExitStack() as stack:
         for slots in sets:
             stack.enter_context(slots.only(busy))

@@ -99,18 +99,12 @@ class Step(StepMemory):
         return jnp.where(waiting & (most > 0), 1.0, 0.0).astype(most.dtype)
 
     def keep(self, i: Any, chain: tuple) -> None:
-        """Called with origin, frame, velocity, bias and motion of the link before each joint.
-
-        Args:
-          i: The joint; the number of links for the last link.
-          chain: What the forward pass carries from link to link.
-        """
+        """Called with what the forward pass carries before joint i, and behind the last one."""
 
     def _forward(self, state: dict, at: dict, pressure: Lanes, thing: WorldObject):
         """Bodies, forces and contacts from the palm to the tips, left in the scratch table.
 
-        Returns:
-          The warm start and the hand's centre from the object's.
+        Returns the warm start and the hand's centre from the object's.
         """
         p, now, like = self.p, at["now"], self.like
         names = ("mount", "base", "share", "stub_centre")
@@ -118,7 +112,7 @@ class Step(StepMemory):
         frame, origin = lanewise(kin.mounted, at["place"], at["frame"], mount, base)
         weight = lanewise(
             lambda x, f, s, share: share * (x + apply_columns(f, s)),
-            at["place"], at["frame"], stub, share,
+            at["place"], at["frame"], stub, share
         )  # fmt: skip
         wide = zeros((6,), like)
         vel, bias, motion = (
@@ -175,12 +169,8 @@ class Step(StepMemory):
 def palm_and_object(timestep: float, state: dict, arm, constants: dict) -> dict[str, Any]:
     """Geometry, motion, inertia and smooth forces of palm, wrist and object.
 
-    Args:
-      timestep: Time step [s].
-      state: The state by name.
-      arm: Commands of the arm frame, shape (6, ...).
-      constants: Those of `PALM_CONSTANTS` that the scene has, by name. Without a stiffness of the
-        wrist its accelerations follow from the commands.
+    Arm are the commands of the arm frame, `constants` those of `PALM_CONSTANTS` that the scene has.
+    Without a stiffness of the wrist its accelerations follow from the commands.
     """
     k, g = constants.get("wrist_stiffness"), constants.get("gravity")
     s = State(**{k: state.get(k) for k in State._fields})
@@ -216,14 +206,11 @@ def link_forces(scene: Scene, parent: tuple, constants: dict, joint: dict):
     """A link's kinematics, inertia and forces.
 
     Args:
-      scene: The scene.
       parent: Origin, frame, velocity, bias and motion of the link before it.
-      constants: See `Step.link_constants`.
-      joint: Angles, velocities and accelerations of the joint before it, and the chamber's
-        pressure, by name.
+      joint: Angles, velocities and accelerations of the joint, and the chamber's pressure, by name.
 
     Returns:
-      Origin, frame, velocity, bias and motion of the link, and what the solver needs, by name.
+      What `parent` is for the next link, and what the solver needs, by name.
     """
     origin, frame, vel, bias, motion = parent
     q, rate, pressure = joint["finger"], joint["finger_vel"], joint["pressure"]
@@ -265,8 +252,7 @@ def semi_implicit_euler(
 ):
     """Semi-implicit Euler; worlds that are decided or whose step fails stay as they were.
 
-    Returns:
-      Largest velocity after the step, and whether the world has moved, shapes (1, world).
+    Returns the largest velocity after the step, and whether the world has moved.
     """
     p, h = step.p, step.p.scene.discretization.timestep
     new = lanewise(partial(moved, h), state, at["columns"], now.wrist, now.object_motion)
@@ -301,7 +287,6 @@ def semi_implicit_euler(
 
 
 def moved(h: float, state: dict, columns, wrist, obj) -> dict:
-    """Wrist and object after the step."""
     names = ("wrist", "position", "quat", "wrist_vel", "linear_vel", "angular_vel")
     # The fingers' joints are moved link by link, see `turned`.
     old = State(finger=0.0, finger_vel=0.0, acc=None, **{n: state[n] for n in names})  # type: ignore[arg-type]

@@ -30,38 +30,26 @@ the first."""
 
 
 class KernelLayout:
-    """What the parts of a kernel know of its tables, which `memory_tables.Tables` lays out.
-
-    Attributes:
-      scene: The scene; `lay`: where its joints and bodies are in MuJoCo's model.
-      links: Moving links of a finger; `axes`: axes of a joint.
-      fingers: Fingers of a block, a power of two; `num_fingers`: those of the scene.
-      block: Worlds of a block; `size`: its lanes.
-      team: Lanes of a finger; `columns`: columns of the tables of fingers, which they share.
-      k: Rings or contact spheres of a link; `palm_groups`: of the palm, for each finger's lanes.
-      hull: Whether fingers have rings; `tapered`: whether their sections change along them.
-      sets: The contacts; `slotted`: whether any are in slots; `held`: rows of friction memory.
-      hand: Rows of the hand's table; likewise `world`, `finger_state`, `world_state`, `scratch`,
-        and with teams `onchip`.
-    """
+    """What the parts of a kernel know of its tables, which `memory_tables.Tables` lays out."""
 
     scene: Scene
-    lay: Layout
-    links: int
-    axes: int
-    fingers: int
-    num_fingers: int
-    block: int
-    size: int
-    team: int
-    columns: int
-    k: int
-    palm_groups: int
-    hull: bool
-    meshes: bool
-    sets: list[ContactSet]
-    slotted: bool
-    held: int
+    lay: Layout  # Where the scene's joints and bodies are in MuJoCo's model
+    links: int  # Moving links of a finger
+    axes: int  # Axes of a joint
+    fingers: int  # Fingers of a block, a power of two
+    num_fingers: int  # Those of the scene
+    block: int  # Worlds of a block
+    size: int  # Its lanes
+    team: int  # Lanes of a finger
+    columns: int  # Columns of the tables of fingers, which the lanes of a team share
+    k: int  # Rings or contact spheres of a link
+    palm_groups: int  # Those of the palm, for each finger's lanes
+    hull: bool  # Whether fingers have rings
+    meshes: bool  # Whether there are objects with meshes
+    sets: list[ContactSet]  # The contacts
+    slotted: bool  # Whether any of them are in slots
+    held: int  # Rows of friction memory
+    # Rows of the tables; `onchip` with teams only.
     hand: MemoryLayout
     world: MemoryLayout
     finger_state: MemoryLayout

@@ -38,7 +38,6 @@ class TeamSdfContactSet(ContactSet):
         return super().groups() | more
 
     def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundTeamSdfContacts":
-        """See `ContactSet`."""
         return BoundTeamSdfContacts(self, table, self.cone(read))
 
 
@@ -48,7 +47,6 @@ class BoundTeamSdfContacts(BoundSlots):
     set: TeamSdfContactSet  # type: ignore[assignment]
 
     def __init__(self, *bound: Any):
-        """See `BoundContacts`."""
         super().__init__(*bound)
         self.block = Block(*self.set.block)
 
@@ -83,13 +81,10 @@ class BoundTeamSdfContacts(BoundSlots):
         self.every(store, [])
 
     def columns(self, i: Any, k: int, unit: Lanes, forces: Lanes) -> Lanes:
-        """The lanes' columns, (6,), of the sum of X'KX over a link's contacts.
+        """The lanes' columns, (6,), of the sum of X'KX over the k contacts of link i.
 
-        Args:
-          i: The link.
-          k: Rings of a link.
-          unit: Motion that the lane's column belongs to, shape (6,).
-          forces: The lanes whose column are the forces.
+        Unit is the motion that a lane's column belongs to, `forces` the lanes whose column are the
+        forces.
         """
         contacts = self.set.contacts
 
@@ -110,13 +105,7 @@ class BoundTeamSdfContacts(BoundSlots):
         return found
 
     def prepare_all(self, pairs: BoundFingerContacts, k: int, obj: Lanes) -> Lanes:
-        """`prepare_linesearch` of all items; slopes at 0, each on its lane.
-
-        Args:
-          pairs: Has the links' motion along the step.
-          k: Rings of a link.
-          obj: The object's motion.
-        """
+        """`prepare_linesearch` of all items, k a link; slopes at 0, each on its lane."""
 
         def add(item: Slot, ring: jax.Array, sums: Lanes) -> Lanes:
             row = jax.lax.div(ring, jnp.full_like(ring, k)) + 1
@@ -147,7 +136,6 @@ class TeamFingerContactSet(FingerContactSet):
         return found
 
     def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundTeamFingerContacts":
-        """See `ContactSet`."""
         cones = {name: self.cone(read, name) for name in self._names()}
         return BoundTeamFingerContacts(self, table, cones)
 
@@ -156,7 +144,6 @@ class BoundTeamFingerContacts(BoundFingerContacts):
     """The contacts with their memory."""
 
     def __init__(self, *bound: Any):
-        """See `BoundFingerContacts`."""
         super().__init__(*bound)
         self.parts, self._loaded = TeamRows(self.block, self.table), False
 
@@ -209,8 +196,6 @@ class BoundTeamFingerContacts(BoundFingerContacts):
         return found
 
     def clear_wrenches(self) -> None:
-        """See `BoundFingerContacts`."""
-
         def clear(row: Any, x: jax.Array) -> jax.Array:
             self.parts.put("side.push", self.like, row)
             return x

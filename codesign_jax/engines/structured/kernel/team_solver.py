@@ -29,7 +29,6 @@ class TeamLanes:
     """A problem's numbers as the lanes of a team share them."""
 
     def __init__(self, problem: Problem):
-        """Takes the problem."""
         m, block = problem.m, problem.block
         self.problem, self.block, self.like = problem, block, problem.like
         assert m.onchip is not None
@@ -37,11 +36,9 @@ class TeamLanes:
         self.forces = self.mask(block.mate == FORCES)
 
     def mask(self, which: jax.Array, *, wide: bool = True) -> Lanes:
-        """A condition of the lanes."""
         return lanes([which], (), wide=wide)
 
     def one(self, value: jax.Array) -> Lanes:
-        """A number of each lane."""
         return lanes([value], (), wide=True)
 
     def axes(self, i: Any) -> Lanes:
@@ -74,12 +71,10 @@ class TeamLanes:
     def eliminate(
         self, node: list[Lanes], axes: Lanes, armature: Lanes, more: Lanes
     ) -> tuple[list[Lanes], el.Kept, Lanes]:
-        """`elimination.eliminate_and_keep` by columns.
+        """`elimination.eliminate` by columns.
 
         Args:
           node: The lanes' columns of P with r, of C, and of Q with r_o, shape (6,) each.
-          axes: Motion subspace, on all lanes.
-          armature: Diagonal joint inertia.
           more: What joint forces add to the columns of U with y.
 
         Returns:
@@ -114,12 +109,8 @@ class TeamLanes:
     ) -> Lanes:
         """Joint accelerations of the lanes' components of the parent's and the object's motion.
 
-        Args:
-          kept: Columns of w and g.
-          parent: Component of the parent's motion, zero on lanes without one.
-          obj: Component of the object's motion.
-          z: Joint accelerations at rest; None if a lane has them in its column of w.
-          at: That lane.
+        Lanes without a component have zero.  Without z a lane, `at`, has the joint accelerations at
+        rest in its column of w.
         """
         own = self.mask(self.block.mate == at)
 
@@ -134,11 +125,7 @@ class TeamLanes:
     def again(self, axes: list, kept: el.Kept, r: jax.Array, ro: jax.Array) -> tuple:
         """`elimination.eliminate_again` of the lanes' components; also the joint accelerations.
 
-        Args:
-          axes: The lanes' components of the axes; zero on lanes without one.
-          kept: Columns of w and g, and D^-1.
-          r: Component of the force.
-          ro: Component of the force on the object.
+        Axes are the lanes' components; zero on lanes without one.
         """
         y = [self.block.over_team(s * r, jnp.add) for s in axes]
 
@@ -151,7 +138,6 @@ class TeamLanes:
         return r.lane, ro.lane, z  # pyright: ignore[reportAttributeAccessIssue]  # lanewise gives Lanes
 
     def link(self, i: Any) -> el.Kept:
-        """What a link's elimination has left, by columns."""
         factors = el.Factors(self.chip.rows("w", i), self.chip.rows("g", i), None)  # type: ignore[arg-type]
         return el.Kept(factors, self.problem.read("inverse", item=i)[0])
 
@@ -181,7 +167,6 @@ class TeamElimination(Elimination):
     """The elimination by columns."""
 
     def __init__(self, problem: Problem):
-        """Takes the problem."""
         super().__init__(problem)
         self.team, self.rings = TeamLanes(problem), problem.m.p.k
         one = jnp.ones_like(self.like)
@@ -229,8 +214,6 @@ class TeamElimination(Elimination):
         return self.block.sum((p, c, q)), lanes([whole], (), wide=False)
 
     def touched(self, node: list[Lanes], i: Any) -> list[Lanes]:
-        """Adds a link's contacts with object and table."""
-
         def add(node, own, held, forces):
             p, c, q = node
             return [p + own, c + held, q + jnp.where(forces, -held, held)]
@@ -242,7 +225,6 @@ class TeamElimination(Elimination):
         return node
 
     def at_palm(self, now: Iterate, node: Any, slots: dict) -> tuple[Iterate, Eliminated]:
-        """See `Elimination`."""
         team, rigid = self.team, self.problem.rigid
 
         def own(now, palm, pushes):
@@ -284,12 +266,10 @@ class TeamCoupling(Coupling):
     """Conjugate gradients whose sweeps are by components."""
 
     def __init__(self, problem: Problem, *rest: Any):
-        """See `Coupling`."""
         super().__init__(problem, *rest)
         self.team = TeamLanes(problem)
 
     def again(self) -> Iterate:
-        """See `Coupling`."""
         team, none = self.team, jnp.zeros_like(self.problem.like)
 
         def step(i: Any, carry: tuple) -> tuple:
@@ -345,7 +325,6 @@ class TeamCoupling(Coupling):
         return team.wrist(kept, axes, obj, z)  # type: ignore[arg-type]
 
     def substitute(self, z: str, step: Iterate) -> None:
-        """See `Coupling`."""
         team, at = self.team, FORCES if z == "z" else AGAIN
         palm, obj = (chosen(self.block, v) for v in (step.palm_motion, step.object_motion))
 
@@ -362,12 +341,10 @@ class TeamLineSearch(LineSearch):
     """The line search of which each lane has a part."""
 
     def __init__(self, problem: Problem):
-        """Takes the problem."""
         super().__init__(problem)
         self.team, self.rings = TeamLanes(problem), problem.m.p.k
 
     def prepare(self, now: Iterate, step: Iterate) -> tuple[Lanes, Lanes, Lanes]:
-        """See `LineSearch`."""
         problem, team, pairs = self.problem, self.team, self.problem.pairs
         assert pairs is not None
         palm, obj = (chosen(self.block, v) for v in (step.palm_motion, step.object_motion))
@@ -407,11 +384,9 @@ class TeamLineSearch(LineSearch):
         return slope, curvature, touch
 
     def total(self, sums: list[Lanes]) -> list[Lanes]:
-        """See `LineSearch`."""
         return self.block.sum([team_sum(self.block, v) for v in sums])
 
     def contact_slopes(self, alpha: Lanes) -> list[Lanes]:
-        """See `LineSearch`."""
         problem, sums = self.problem, [zeros((), self.like)] * 2
         first = self.team.one(jnp.where(self.block.mate == 0, jnp.ones_like(self.like), 0.0))
 
@@ -429,12 +404,7 @@ class TeamLineSearch(LineSearch):
 
 
 def team_rows(stored: dict[str, Lanes], body: tuple) -> dict[str, Lanes]:
-    """What a link leaves for the solver, with rows of eight as columns, see `shared_memory.layout`.
-
-    Args:
-      stored: The same by name, see `step.link_forces`.
-      body: Arguments of `make_body`.
-    """
+    """What a link leaves for the solver, with columns in rows of eight; `shared_memory.layout`."""
 
     def wide(axes, *body):
         matrix = make_body(*body).matrix()

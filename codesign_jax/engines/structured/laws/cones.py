@@ -12,21 +12,13 @@ from codesign_jax.scene import Scene
 
 
 class Cones(NamedTuple):
-    """Cones by what touches; their numbers have shape (1, world).  None where nothing of it does.
+    """Cones by what touches, numbers of shape (1, world); None where nothing of it does."""
 
-    Attributes:
-      hand_object: Fingers or palm on the object.
-      hand_table: Fingers or palm on the table.
-      object_table: The object on the table.
-      finger_finger: Fingers on one another and on themselves.
-      finger_palm: Fingers on the palm's disc.
-    """
-
-    hand_object: Cone | None
-    hand_table: Cone | None
-    object_table: Cone | None
-    finger_finger: Cone | None
-    finger_palm: Cone | None
+    hand_object: Cone | None  # Fingers or palm on the object
+    hand_table: Cone | None  # Fingers or palm on the table
+    object_table: Cone | None  # The object on the table
+    finger_finger: Cone | None  # Fingers on one another and on themselves
+    finger_palm: Cone | None  # Fingers on the palm's disc
 
 
 def which_cone(pair: str) -> str:
@@ -62,12 +54,7 @@ def make_cone(
 
 
 def make_cones(scene: Scene, shape: jax.Array) -> Cones:
-    """The cones of a batch.
-
-    Args:
-      scene: The scene, its numbers of shape (1, world).
-      shape: Index of each world's object, shape (1, world).
-    """
+    """The cones of a batch; the scene's numbers and the objects' indices are (1, world)."""
     on_object = scene.objects.object[0].friction
     for i, other in enumerate(scene.objects.object[1:], 1):
         on_object = jnp.where(shape == i, other.friction, on_object)

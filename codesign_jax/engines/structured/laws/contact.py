@@ -29,26 +29,16 @@ class Cone(NamedTuple):
     """A contact's parameters, as numbers or arrays that broadcast to the contacts.
 
     What a friction model does not need is None: it has no place in the program.
-
-    Attributes:
-      normal: D of the normal row at the scene's stiffness [kg].
-      tangent: D of the tangential rows [kg].
-      friction: Coulomb coefficient mu.
-      ratio: mu sqrt(D / D_t), MuJoCo's regularized cone.
-      spring: K, coefficient of the penetration in aref [1/s^2].
-      damper: Coefficient of the velocity in aref, 1/h [1/s].
-      spin: Torsional friction over Coulomb friction [m].
-      roll: Rolling friction over Coulomb friction [m].
     """
 
-    normal: jax.Array | float
-    tangent: jax.Array | float
-    friction: jax.Array | float
-    ratio: jax.Array | float
-    spring: jax.Array | float
-    damper: jax.Array | float
-    spin: jax.Array | float | None = None
-    roll: jax.Array | float | None = None
+    normal: jax.Array | float  # D of the normal row at the scene's stiffness [kg]
+    tangent: jax.Array | float  # D of the tangential rows [kg]
+    friction: jax.Array | float  # Coulomb coefficient mu
+    ratio: jax.Array | float  # mu sqrt(D / D_t), MuJoCo's regularized cone
+    spring: jax.Array | float  # K, coefficient of the penetration in aref [1/s^2]
+    damper: jax.Array | float  # Coefficient of the velocity in aref, 1/h [1/s]
+    spin: jax.Array | float | None = None  # Torsional friction over Coulomb friction [m]
+    roll: jax.Array | float | None = None  # Rolling friction over Coulomb friction [m]
 
     def of_share(self, share: jax.Array) -> "Cone":
         """That of contacts with a share of the scene's stiffness; 0 of what is none."""
@@ -68,23 +58,15 @@ class Cone(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """A set of contacts between the same two bodies or kinds of bodies.
+    """A set of contacts between the same two bodies or kinds of bodies."""
 
-    Attributes:
-      point: Contact points, shape (3, ...).
-      normal: Unit normals, shape (3, ...).
-      distance: Signed distance [m], negative in contact, shape (...).
-      cone: Their parameters, see `Cone.of_share`.
-    """
-
-    point: jax.Array
-    normal: jax.Array
-    distance: jax.Array
-    cone: Cone
+    point: jax.Array  # Contact points, shape (3, ...)
+    normal: jax.Array  # Unit normals, shape (3, ...)
+    distance: jax.Array  # Signed distance [m], negative in contact, shape (...)
+    cone: Cone  # Their parameters, see `Cone.of_share`
 
     @property
     def active(self) -> jax.Array:
-        """Which contacts exist, shape (...)."""
         return jnp.asarray(self.cone.normal > 0)
 
     @property
@@ -136,22 +118,17 @@ def candidates(
     return jnp.where(gap < reach, share, 0.0)
 
 
-class Response(NamedTuple):
-    """Cone force and Hessian at jar.
+class ConeResponse(NamedTuple):
+    """Cone force and Hessian at jar."""
 
-    Attributes:
-      force: -ds/d(jar), shape (3, ...); with full friction (6, ...).
-      hessian: Upper triangle xx, xy, xz, yy, yz, zz, shape (6, ...); with full friction of the
-        6 x 6 matrix, row by row, shape (21, ...).
-      cost: s(jar), shape (...).
-    """
-
-    force: jax.Array
+    force: jax.Array  # -ds/d(jar), shape (3, ...); with full friction (6, ...)
+    # Upper triangle xx, xy, xz, yy, yz, zz, shape (6, ...); with full friction of the 6 x 6 matrix,
+    # row by row, shape (21, ...)
     hessian: jax.Array
-    cost: jax.Array
+    cost: jax.Array  # s(jar), shape (...)
 
 
-def constraint_update(contacts: Contacts, jar: jax.Array) -> Response:
+def constraint_update(contacts: Contacts, jar: jax.Array) -> ConeResponse:
     """Evaluates MuJoCo's elliptic cone (engine_core_constraint.c, mj_constraintUpdate) at jar.
 
     With w_n and w_t the normal and tangential parts of jar: the bottom zone is quadratic in both,
@@ -187,17 +164,17 @@ def constraint_update(contacts: Contacts, jar: jax.Array) -> Response:
     )
     quadratic = cone.normal * normal**2 + cone.tangent * length**2
     cost = 0.5 * jnp.where(bottom, quadratic, stiff * slip**2)
-    return Response(force, hessian, cost)
+    return ConeResponse(force, hessian, cost)
 
 
-def _update_frictionless(contacts: Contacts, jar: jax.Array) -> Response:
+def _update_frictionless(contacts: Contacts, jar: jax.Array) -> ConeResponse:
     """One row a contact: quadratic in the normal part where that is negative."""
     n = contacts.normal
     normal = dot(n, jar)
     stiff = jnp.where(contacts.active & (normal < 0), contacts.cone.normal, 0.0)
     pairs = [(i, j) for i in range(3) for j in range(i, 3)]
     hessian = jnp.stack([stiff * n[i] * n[j] for i, j in pairs])
-    return Response(-stiff * normal * n, hessian, 0.5 * stiff * normal**2)
+    return ConeResponse(-stiff * normal * n, hessian, 0.5 * stiff * normal**2)
 
 
 def _zones(contacts: Contacts, normal: jax.Array, length: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -208,36 +185,29 @@ def _zones(contacts: Contacts, normal: jax.Array, length: jax.Array) -> tuple[ja
     return bottom, middle
 
 
-class Line(NamedTuple):
+class LineCost(NamedTuple):
     """A contact's cost along jar + alpha * step: all that the line search needs.
 
     Without friction the tangential parts are None.
-
-    Attributes:
-      n0: Normal part of jar.
-      n1: Normal part of the step.
-      uu: Squared tangential part of jar.
-      uv: Product of the tangential parts.
-      vv: Squared tangential part of the step.
     """
 
-    n0: jax.Array
-    n1: jax.Array
-    uu: jax.Array
-    uv: jax.Array
-    vv: jax.Array
+    n0: jax.Array  # Normal part of jar
+    n1: jax.Array  # Normal part of the step
+    uu: jax.Array  # Squared tangential part of jar
+    uv: jax.Array  # Product of the tangential parts
+    vv: jax.Array  # Squared tangential part of the step
 
 
-def line(contacts: Contacts, jar: jax.Array, step: jax.Array) -> Line:
+def line(contacts: Contacts, jar: jax.Array, step: jax.Array) -> LineCost:
     """Prepares the line search along a step of jar."""
     n0, n1 = dot(contacts.normal, jar), dot(contacts.normal, step)
     if contacts.cone.friction is None:
-        return Line(n0, n1, None, None, None)
+        return LineCost(n0, n1, None, None, None)
     u, v = jar - n0 * contacts.direction, step - n1 * contacts.direction
-    return Line(n0, n1, dot(u, u), dot(u, v), dot(v, v))
+    return LineCost(n0, n1, dot(u, u), dot(u, v), dot(v, v))
 
 
-def same_zone(contacts: Contacts, ray: Line, alpha: jax.Array) -> jax.Array:
+def same_zone(contacts: Contacts, ray: LineCost, alpha: jax.Array) -> jax.Array:
     """Whether the contacts are in one zone of the cone, see `constraint_update`, at 0 and alpha."""
     normals = ray.n0, ray.n0 + alpha * ray.n1
     if contacts.cone.friction is None:
@@ -249,7 +219,7 @@ def same_zone(contacts: Contacts, ray: Line, alpha: jax.Array) -> jax.Array:
     return (one[0] == two[0]) & (one[1] == two[1])
 
 
-def slopes(contacts: Contacts, ray: Line, alpha: jax.Array) -> tuple[jax.Array, jax.Array]:
+def slopes(contacts: Contacts, ray: LineCost, alpha: jax.Array) -> tuple[jax.Array, jax.Array]:
     """First and second derivative of the cost along the line, shape (...)."""
     cone = contacts.cone
     normal = ray.n0 + alpha * ray.n1
@@ -290,7 +260,6 @@ def contact_inertia(contacts: Contacts, hessian: jax.Array) -> jax.Array:
 
 
 def _crossed(r: jax.Array, k: list[jax.Array]) -> list[jax.Array]:
-    """Rows of [r]K from those of K."""
     return [r[1] * k[2] - r[2] * k[1], r[2] * k[0] - r[0] * k[2], r[0] * k[1] - r[1] * k[0]]
 
 

@@ -12,17 +12,11 @@ from codesign_jax.scene import Scene
 
 
 class Body(NamedTuple):
-    """Inertia of bodies; the item axes (link, finger or 1) precede the world's.
+    """Inertia of bodies; the item axes (link, finger or 1) precede the world's."""
 
-    Attributes:
-      mass: Shape (..., world).
-      centre: Centres of mass, shape (3, ..., world).
-      tensor: Rotational inertia about the centre, world axes, shape (3, 3, ..., world).
-    """
-
-    mass: jax.Array
-    centre: jax.Array
-    tensor: jax.Array
+    mass: jax.Array  # Shape (..., world)
+    centre: jax.Array  # Centres of mass, shape (3, ..., world)
+    tensor: jax.Array  # Rotational inertia about the centre, world axes, shape (3, 3, ..., world)
 
     def times(self, acc: jax.Array) -> jax.Array:
         """Spatial force (moment about the origin, force) of a spatial acceleration, (6, ...)."""
@@ -70,22 +64,15 @@ class Body(NamedTuple):
 
 
 class Centred(NamedTuple):
-    """As `Body`, its centre the origin.
+    """As `Body`, its centre the origin."""
 
-    Attributes:
-      mass: Shape (..., world).
-      tensor: Rotational inertia, world axes, shape (3, 3, ..., world).
-    """
-
-    mass: jax.Array
-    tensor: jax.Array
+    mass: jax.Array  # Shape (..., world)
+    tensor: jax.Array  # Rotational inertia, world axes, shape (3, 3, ..., world)
 
     def times(self, acc: jax.Array) -> jax.Array:
-        """See `Body.times`."""
         return spatial(apply_columns(self.tensor, acc[:3]), self.mass * acc[3:])
 
     def matrix(self) -> jax.Array:
-        """See `Body.matrix`."""
         zero = jnp.zeros_like(self.mass + self.tensor[0, 0])
         none = jnp.stack([zero] * 3)
         mass = self.mass + zero
@@ -128,18 +115,12 @@ def softening_moment(section: jax.Array, stiffness: jax.Array, angle: jax.Array)
 
 
 class Springs(NamedTuple):
-    """A joint's springs, and what the threshold of sideways bending adds; (axis, ...).
+    """A joint's springs, and what the threshold of sideways bending adds; (axis, ...)."""
 
-    Attributes:
-      stiffness: Of the hinges.
-      damping: With the implicit term.
-      armature: With the implicit terms.
-      moment: Further moment on the bend hinge, shape (1, ...); None without the effect.
-    """
-
-    stiffness: jax.Array
-    damping: jax.Array
-    armature: jax.Array
+    stiffness: jax.Array  # Of the hinges
+    damping: jax.Array  # With the implicit term
+    armature: jax.Array  # With the implicit terms
+    # Further moment on the bend hinge, shape (1, ...); None without the effect
     moment: jax.Array | None
 
 

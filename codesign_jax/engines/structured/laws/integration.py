@@ -70,11 +70,5 @@ def _turn(quat: jax.Array, omega: jax.Array, h: float) -> jax.Array:
 
 
 def rigid_arm(frame: jax.Array, wrist: jax.Array, velocity: jax.Array, h: float) -> jax.Array:
-    """Acceleration of the palm's coordinates that ends the step at the arm frame.
-
-    Args:
-      frame: Pose of the arm frame, shape (6, ...).
-      wrist: The palm's coordinates, same shape.
-      velocity: Their velocities, same shape.
-    """
+    """Acceleration of the palm's coordinates, (6, ...), that ends the step at the frame."""
     return ((frame - wrist) / h - velocity) / h

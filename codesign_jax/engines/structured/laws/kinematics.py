@@ -35,52 +35,32 @@ _WRIST = (0, 2, 1)  # roll (x), yaw (z), pitch (y)
 
 
 class State(NamedTuple):
-    """State of every world in lane layout.
+    """State of every world in lane layout."""
 
-    Attributes:
-      wrist: Wrist coordinates x, y, z [m], roll, yaw, pitch [rad], shape (6, 1, world).
-      finger: Joint angles [rad], shape (link, axis, finger, world).
-      position: Object centre [m], shape (3, 1, world).
-      quat: Object orientation, unit quaternion, shape (4, 1, world).
-      wrist_vel: Wrist velocities, shape (6, 1, world).
-      finger_vel: Joint velocities, as `finger`.
-      linear_vel: Object velocity, world frame, shape (3, 1, world).
-      angular_vel: Object angular velocity, body frame as in MuJoCo, shape (3, 1, world).
-      acc: Accelerations of the last step, the solver's warm start.
-      step: Number of steps since the beginning of the grasp, shape (1, 1, world).
-      going: Zero for a world that is decided, else one, likewise.
-      speed: Largest absolute velocity, for a failed world that of the failed step, likewise.
-      grip: Friction that fingers hold on one another, see `holding.held`, of each pairing of the
-        kernel, shape (pairing, 3, finger, world); None without `effects.friction_memory`.
-    """
-
-    wrist: jax.Array
-    finger: jax.Array
-    position: jax.Array
-    quat: jax.Array
-    wrist_vel: jax.Array
-    finger_vel: jax.Array
-    linear_vel: jax.Array
-    angular_vel: jax.Array
-    acc: "Acc"
-    step: Any = None
-    going: Any = None
+    wrist: jax.Array  # Wrist coordinates x, y, z [m], roll, yaw, pitch [rad], shape (6, 1, world)
+    finger: jax.Array  # Joint angles [rad], shape (link, axis, finger, world)
+    position: jax.Array  # Object centre [m], shape (3, 1, world)
+    quat: jax.Array  # Object orientation, unit quaternion, shape (4, 1, world)
+    wrist_vel: jax.Array  # Wrist velocities, shape (6, 1, world)
+    finger_vel: jax.Array  # Joint velocities, as `finger`
+    linear_vel: jax.Array  # Object velocity, world frame, shape (3, 1, world)
+    angular_vel: jax.Array  # Object angular velocity, body frame as in MuJoCo, shape (3, 1, world)
+    acc: "Acc"  # Accelerations of the last step, the solver's warm start
+    step: Any = None  # Number of steps since the beginning of the grasp, shape (1, 1, world)
+    going: Any = None  # Zero for a world that is decided, else one, likewise
+    # Largest absolute velocity, for a failed world that of the failed step, likewise
     speed: Any = None
+    # Friction that fingers hold on one another, see `holding.held`, of each pairing of the kernel,
+    # shape (pairing, 3, finger, world); None without `effects.friction_memory`
     grip: jax.Array | None = None
 
 
 class Acc(NamedTuple):
-    """Accelerations; the object's as (angular, linear at its centre) in world axes.
+    """Accelerations; the object's as (angular, linear at its centre) in world axes."""
 
-    Attributes:
-      wrist: Shape (6, 1, world).
-      finger: Shape (link, axis, finger, world).
-      object: Shape (6, 1, world).
-    """
-
-    wrist: jax.Array
-    finger: jax.Array
-    object: jax.Array
+    wrist: jax.Array  # Shape (6, 1, world)
+    finger: jax.Array  # Shape (link, axis, finger, world)
+    object: jax.Array  # Shape (6, 1, world)
 
 
 class Spatial(NamedTuple):
@@ -92,39 +72,23 @@ class Spatial(NamedTuple):
 
 
 class Kinematics(NamedTuple):
-    """Bodies in the frame at the object's centre; spatial vectors are (angular, linear).
+    """Bodies in the frame at the object's centre; spatial vectors are (angular, linear)."""
 
-    Attributes:
-      place: Palm position, shape (3, 1, world).
-      palm: Columns of the palm's orientation, shape (3, 3, 1, world).
-      wrist_axes: Subspace of the three wrist hinges, shape (3, 6, 1, world).
-      palm_vel: Palm velocity, shape (6, 1, world).
-      palm_bias: Palm acceleration at zero joint acceleration, same shape.
-      link: Columns of the links' orientations, shape (3, 3, link, finger, world).
-      origin: Link frame positions, shape (3, link, finger, world).
-      axes: Joint subspaces, shape (link, axis, 6, finger, world).
-      vel: Link velocities, shape (6, link, finger, world).
-      bias: Link accelerations at zero joint acceleration, same shape.
-      object: Columns of the object's orientation, shape (3, 3, 1, world).
-      object_vel: Object velocity, shape (6, 1, world).
-    """
-
-    place: jax.Array
-    palm: jax.Array
-    wrist_axes: jax.Array
-    palm_vel: jax.Array
-    palm_bias: jax.Array
-    link: jax.Array
-    origin: jax.Array
-    axes: jax.Array
-    vel: jax.Array
-    bias: jax.Array
-    object: jax.Array
-    object_vel: jax.Array
+    place: jax.Array  # Palm position, shape (3, 1, world)
+    palm: jax.Array  # Columns of the palm's orientation, shape (3, 3, 1, world)
+    wrist_axes: jax.Array  # Subspace of the three wrist hinges, shape (3, 6, 1, world)
+    palm_vel: jax.Array  # Palm velocity, shape (6, 1, world)
+    palm_bias: jax.Array  # Palm acceleration at zero joint acceleration, same shape
+    link: jax.Array  # Columns of the links' orientations, shape (3, 3, link, finger, world)
+    origin: jax.Array  # Link frame positions, shape (3, link, finger, world)
+    axes: jax.Array  # Joint subspaces, shape (link, axis, 6, finger, world)
+    vel: jax.Array  # Link velocities, shape (6, link, finger, world)
+    bias: jax.Array  # Link accelerations at zero joint acceleration, same shape
+    object: jax.Array  # Columns of the object's orientation, shape (3, 3, 1, world)
+    object_vel: jax.Array  # Object velocity, shape (6, 1, world)
 
 
 def kinematics(hand: WorldModel, axis_names: tuple[str, ...], state: State) -> Kinematics:
-    """Computes the kinematics of all bodies."""
     place = _place(state)
     palm, wrist_axes, palm_vel, palm_bias = once(_wrist, place, state.wrist, state.wrist_vel)
     frame, origin = once(mounted, place, palm, hand.mount, hand.base)
@@ -201,7 +165,6 @@ def _palm_columns(wrist: jax.Array) -> jax.Array:
 
 
 def mounted(place: jax.Array, palm: jax.Array, mount: jax.Array, base: jax.Array):
-    """Columns and origin of a finger's base from the palm's."""
     frame = turn_columns(palm, mount)
     return frame, place + apply_columns(palm, base)
 

@@ -30,30 +30,22 @@ _STEEPEST = 20.0
 _ORDER = 2e-7  # m of score for each point
 
 
-class Tables(NamedTuple):
-    """Constants of a scene's meshes, a row for each shape of the set; those of primitives are void.
+class MeshTables(NamedTuple):
+    """Constants of a scene's meshes, a row a shape of the set; a primitive's is void."""
 
-    Attributes:
-      values: Grid values of all meshes [m], flat, z fastest, float32.
-      first: Index of each grid's first value, shape (shape,).
-      nodes: Nodes along each axis, shape (shape, 3).
-      origin: Position of the first node [m], shape (shape, 3).
-      cell: Distance of the nodes [m], shape (shape,).
-      half: First half size, by which the size of a world's object is known, shape (shape,).
-      support: Support points [m], shape (shape, point, 3); their number is a power of two.
-    """
-
-    values: np.ndarray
-    first: np.ndarray
-    nodes: np.ndarray
-    origin: np.ndarray
-    cell: np.ndarray
+    values: np.ndarray  # Grid values of all meshes [m], flat, z fastest, float32
+    first: np.ndarray  # Index of each grid's first value, shape (shape,)
+    nodes: np.ndarray  # Nodes along each axis, shape (shape, 3)
+    origin: np.ndarray  # Position of the first node [m], shape (shape, 3)
+    cell: np.ndarray  # Distance of the nodes [m], shape (shape,)
+    # First half size, by which the size of a world's object is known, shape (shape,)
     half: np.ndarray
+    # Support points [m], shape (shape, point, 3); their number is a power of two
     support: np.ndarray
 
 
 @by_structure
-def tables(scene: Scene) -> Tables | None:
+def tables(scene: Scene) -> MeshTables | None:
     """Builds the grids of a scene's meshes; None without any.
 
     Raises:
@@ -78,7 +70,7 @@ def tables(scene: Scene) -> Tables | None:
     total = sum(v.size for v in flat)
     # Sizes in powers of two: scenes of other meshes find the programs of this one.
     filled = np.zeros((1 << (total - 1).bit_length()) - total, np.float32)
-    result = Tables(
+    result = MeshTables(
         np.concatenate([*flat, filled]),
         np.zeros(count, np.int32),
         np.full((count, 3), 2, np.int32),
@@ -97,60 +89,38 @@ def tables(scene: Scene) -> Tables | None:
 
 
 class GridLanes(NamedTuple):
-    """The grid of each world's mesh.
+    """The grid of each world's mesh."""
 
-    Attributes:
-      first: Index of its first value, shape (1, world), int32 or a float that holds it exactly.
-      nodes: Nodes along each axis, shape (3, 1, world), like `first`.
-      origin: Position of the first node [m], shape (3, 1, world).
-      cell: Distance of the nodes [m], shape (1, world).
-      factor: Factor on the mesh's size, shape (1, world).
-    """
-
+    # Index of its first value, shape (1, world), int32 or a float that holds it exactly
     first: jax.Array
-    nodes: jax.Array
-    origin: jax.Array
-    cell: jax.Array
-    factor: jax.Array
+    nodes: jax.Array  # Nodes along each axis, shape (3, 1, world), like `first`
+    origin: jax.Array  # Position of the first node [m], shape (3, 1, world)
+    cell: jax.Array  # Distance of the nodes [m], shape (1, world)
+    factor: jax.Array  # Factor on the mesh's size, shape (1, world)
 
 
 class MeshLanes(NamedTuple):
-    """The tables on the device, and each world's rows of them.
+    """The tables on the device, and each world's rows of them."""
 
-    Attributes:
-      values: Grid values of all meshes [m], flat, float32: of the scene, not of a world.
-      grid: Where and how large the grid of each world's mesh is.
-      support: Support points of the mesh as large as it is [m], shape (3, point, world); their
-        number is a power of two.
-    """
-
-    values: jax.Array
-    grid: GridLanes
+    values: jax.Array  # Grid values of all meshes [m], flat, float32: of the scene, not of a world
+    grid: GridLanes  # Where and how large the grid of each world's mesh is
+    # Support points of the mesh as large as it is [m], shape (3, point, world); their number is a
+    # power of two
     support: jax.Array
 
 
-class Cell(NamedTuple):
-    """The cells of a grid in which points lie.
+class GridCell(NamedTuple):
+    """The cells of a grid in which points lie."""
 
-    Attributes:
-      corner: Index of the cell's first corner in the values, int32, shape (...).
-      part: Position in the cell, 0 to 1 on each axis, shape (3, ...).
-      beyond: Way from the nearest point of the grid to the point, in the mesh's size as it is in
-        its file [m], shape (3, ...).
-    """
-
-    corner: jax.Array
-    part: jax.Array
+    corner: jax.Array  # Index of the cell's first corner in the values, int32, shape (...)
+    part: jax.Array  # Position in the cell, 0 to 1 on each axis, shape (3, ...)
+    # Way from the nearest point of the grid to the point, in the mesh's size as it is in its file
+    # [m], shape (3, ...)
     beyond: jax.Array
 
 
 def mesh_lanes(scene: Scene, shape: jax.Array, size: jax.Array) -> MeshLanes | None:
-    """Looks up the meshes of a batch, once a rollout; None for a scene without meshes.
-
-    Args:
-      shape: Index of each world's object, shape (1, world).
-      size: Half sizes, shape (3, 1, world).
-    """
+    """Looks up the meshes of a batch, once a rollout; None for a scene without meshes."""
     t = tables(scene)
     if t is None:
         return None
@@ -176,16 +146,13 @@ def signed_distance(lanes: MeshLanes, p: jax.Array) -> tuple[jax.Array, jax.Arra
     """Signed distance and its unit gradient in the object's frame by trilinear interpolation.
 
     Beyond the grid, where no contact begins, the way back to it is added.
-
-    Args:
-      p: Points, shape (3, ..., world).
     """
     cell = locate(lanes.grid, p)
     values = lanes.values[corners(lanes.grid, cell)].astype(p.dtype)
     return interpolate(lanes.grid, cell, values)
 
 
-def locate(grid: GridLanes, p: jax.Array) -> Cell:
+def locate(grid: GridLanes, p: jax.Array) -> GridCell:
     """Finds the cells of points (3, ..., world) in the object's frame."""
     axes, nodes = range(3), grid.nodes.astype(jnp.int32)
     scaled = [(p[k] / grid.factor - grid.origin[k]) / grid.cell for k in axes]
@@ -198,17 +165,17 @@ def locate(grid: GridLanes, p: jax.Array) -> Cell:
     beyond = [jnp.where(scaled[k] == inside[k], 0.0, scaled[k] - inside[k]) for k in axes]
     beyond = jnp.stack(beyond) * grid.cell
     first = grid.first.astype(jnp.int32)
-    return Cell(first + (index[0] * nodes[1] + index[1]) * nodes[2] + index[2], part, beyond)
+    return GridCell(first + (index[0] * nodes[1] + index[1]) * nodes[2] + index[2], part, beyond)
 
 
-def corners(grid: GridLanes, cell: Cell) -> jax.Array:
+def corners(grid: GridLanes, cell: GridCell) -> jax.Array:
     """Indices of the values at a cell's corners, z fastest, int32 of shape (8, ...)."""
     nodes = grid.nodes.astype(jnp.int32)
     offsets = [i * nodes[1] * nodes[2] + j * nodes[2] + k for i, j, k in np.ndindex(2, 2, 2)]
     return jnp.stack([cell.corner + offset for offset in offsets])
 
 
-def interpolate(grid: GridLanes, cell: Cell, values: jax.Array) -> tuple[jax.Array, jax.Array]:
+def interpolate(grid: GridLanes, cell: GridCell, values: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Signed distance (...) and its unit gradient (3, ...) from the values at `corners`."""
     x, y, z = (cell.part[k] for k in range(3))
 
@@ -233,9 +200,6 @@ def table_points(lanes: MeshLanes, columns: jax.Array) -> jax.Array:
 
     The lowest; the one farthest from it; then the farthest on either side of the line through both.
     Heights count against distances, so that higher points are taken only when no lower one is left.
-
-    Args:
-      columns: Columns of the object's orientation, shape (3, 3, world).
     """
     point = turned(columns, lanes.support)
     index = jnp.arange(point.shape[1], dtype=point.dtype)[:, None]

@@ -30,54 +30,35 @@ FLOOR = 1e-6
 
 
 class Ring(NamedTuple):
-    """Rings on a link.
+    """Rings on a link."""
 
-    Attributes:
-      centre: In the link's frame [m], shape (3, ...).
-      half: Half axes e, a and b [m], shape (3, ...).
-      length: Length of the finger that it stands for, in widths; 0 where there is no ring.
-      tip: 1 of the last ring of a finger, else 0.
-    """
-
-    centre: jax.Array
-    half: jax.Array
+    centre: jax.Array  # In the link's frame [m], shape (3, ...)
+    half: jax.Array  # Half axes e, a and b [m], shape (3, ...)
+    # Length of the finger that it stands for, in widths; 0 where there is no ring
     length: jax.Array
-    tip: jax.Array
+    tip: jax.Array  # 1 of the last ring of a finger, else 0
 
     @classmethod
     def of(cls, numbers: jax.Array) -> "Ring":
-        """From numbers in this order, shape (8, ...)."""
         return cls(numbers[:3], numbers[3:6], numbers[6], numbers[7])
 
 
 class Segment(NamedTuple):
-    """A stretch of a finger's centre line on one link.
+    """A stretch of a finger's centre line on one link."""
 
-    Attributes:
-      ends: Where it begins and ends [m], shape (3, ...) each.
-      frames: Of the link before it, of its own and of the next one.
-      half: Half axes of its sections; the first is that of the tip, 0 before it.
-    """
-
-    ends: tuple[jax.Array, jax.Array]
+    ends: tuple[jax.Array, jax.Array]  # Where it begins and ends [m], shape (3, ...) each
+    # Of the link before it, of its own and of the next one
     frames: tuple[jax.Array, jax.Array, jax.Array]
-    half: jax.Array
+    half: jax.Array  # Half axes of its sections; the first is that of the tip, 0 before it
 
 
 class Place(NamedTuple):
-    """A contact.
+    """A contact."""
 
-    Attributes:
-      point: Where it acts [m], shape (3, ...).
-      normal: From the other side to the ring, shape (3, ...).
-      gap: Negative in contact [m], shape (...).
-      share: Its stiffness over `contact.normal_stiffness`, same shape.
-    """
-
-    point: jax.Array
-    normal: jax.Array
-    gap: jax.Array
-    share: jax.Array
+    point: jax.Array  # Where it acts [m], shape (3, ...)
+    normal: jax.Array  # From the other side to the ring, shape (3, ...)
+    gap: jax.Array  # Negative in contact [m], shape (...)
+    share: jax.Array  # Its stiffness over `contact.normal_stiffness`, same shape
 
 
 def cube_root(x: jax.Array) -> jax.Array:
@@ -217,7 +198,6 @@ def nearest(point: jax.Array, segment: Segment, last: jax.Array | float = 1.0) -
 
 
 def on_line(segment: Segment, t: jax.Array) -> jax.Array:
-    """The place of a parameter of `nearest`, shape (3, ...)."""
     start, end = segment.ends
     return start + t * (end - start)
 

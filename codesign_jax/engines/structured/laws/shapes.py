@@ -34,7 +34,6 @@ def disc_distance(
     """Signed distance of a point from the palm's disc, and its gradient.
 
     Args:
-      point: The point, shape (3, ...).
       place: Place of the palm's frame, which is on the disc's underside.
       size: Radius and half the thickness of the disc.
     """
@@ -46,12 +45,7 @@ def disc_distance(
 def signed_distance(
     scene: Scene, hand: WorldModel, local: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Signed distance and its unit gradient in the object's frame, for the shape of each world.
-
-    Args:
-      hand: Sizes and shape index of the objects.
-      local: Points, shape (3, ...).
-    """
+    """Signed distance and unit gradient in the object's frame, for the shape of each world."""
     indices = mesh_indices(scene)
     if len(indices) == len(scene.objects.object):
         return meshes.signed_distance(hand.mesh, local)  # type: ignore[arg-type]
@@ -64,21 +58,13 @@ def signed_distance(
 
 
 def mesh_indices(scene: Scene) -> list[int]:
-    """Indices of the scene's objects that are meshes."""
     return [i for i, s in enumerate(scene.objects.object) if s.type == "mesh"]
 
 
 def primitive_distance(
     scene: Scene, size: jax.Array, shape: jax.Array, local: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """As `signed_distance`, for a scene's primitives; worlds with a mesh get any primitive's.
-
-    Args:
-      scene: The scene, with a primitive at least.
-      size: Sizes of the objects, shape (3, 1, world).
-      shape: Index of each world's object, shape (1, world).
-      local: Points, shape (3, ...).
-    """
+    """As `signed_distance`, for a scene's primitives; worlds with a mesh get any primitive's."""
     return _by_kind(scene, shape, {k: partial(s.distance, size, local) for k, s in SHAPES.items()})
 
 
@@ -140,7 +126,6 @@ def _capsule(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
 def object_on_table(
     scene: Scene, hand: WorldModel, columns: jax.Array, height: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Point, normal and gap of the object on the table, see `lowest_points` and `on_table`."""
     return once(on_table, lowest_points(scene, hand, columns), height)
 
 
@@ -170,24 +155,12 @@ def lowest_points(scene: Scene, hand: WorldModel, columns: jax.Array) -> jax.Arr
 def primitive_points(
     scene: Scene, size: jax.Array, shape: jax.Array, columns: jax.Array
 ) -> jax.Array:
-    """Points of a scene's primitives that may touch the table, from the centre, (3, 4, world).
-
-    Args:
-      scene: The scene, with a primitive at least.
-      size: Sizes of the objects, shape (3, world).
-      shape: Index of each world's object, shape (1, world).
-      columns: Columns of the object's orientation, shape (3, 3, world).
-    """
+    """Points of a scene's primitives that may touch the table, from the centre, (3, 4, world)."""
     return _by_kind(scene, shape, {k: partial(s.points, size, columns) for k, s in SHAPES.items()})
 
 
 def on_table(arms: jax.Array, height: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Contacts of an object's points with the table: point, normal (3, slot, world) and gap.
-
-    Args:
-      arms: Points from the centre, shape (3, slot, world).
-      height: Height of the object's centre above the table, shape (1, world).
-    """
+    """Contacts of an object's points (3, slot, world) with the table: point, normal and gap."""
     gap = arms[2] + height
     zero = jnp.zeros_like(gap)
     normal = jnp.stack([zero, zero, zero + 1.0])
@@ -238,16 +211,13 @@ def _cap_points(size: jax.Array, columns: jax.Array) -> jax.Array:
 
 
 class ShapeFunctions(NamedTuple):
-    """Functions of a primitive's sizes, for lanes: see `primitive_distance`, `primitive_points`.
+    """Functions of a primitive's sizes, for lanes: see `primitive_distance`, `primitive_points`."""
 
-    Attributes:
-      distance: Sizes (3, 1, world) and points (3, ...) of the object's frame to the signed
-        distance (...) and its unit gradient (3, ...).
-      points: Sizes (3, world) and columns of the orientation (3, 3, world) to the up to four points
-        that can touch the table, from the centre (3, 4, world); unused ones are `_AWAY`.
-    """
-
+    # Sizes (3, 1, world) and points (3, ...) of the object's frame to the signed distance (...) and
+    # its unit gradient (3, ...)
     distance: Callable
+    # Sizes (3, world) and columns of the orientation (3, 3, world) to the up to four points that
+    # can touch the table, from the centre (3, 4, world); unused ones are `_AWAY`
     points: Callable
 
 

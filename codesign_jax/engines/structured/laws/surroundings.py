@@ -49,13 +49,11 @@ def turn_of(fixture: Fixture) -> np.ndarray:
 
 
 def _turned(matrix: np.ndarray, vector: jax.Array) -> jax.Array:
-    """A known matrix times vectors (3, ...)."""
     rows = [sum(float(m) * vector[k] for k, m in enumerate(row)) for row in matrix]
     return jnp.stack(rows)  # type: ignore[arg-type]
 
 
 def _from_centre(fixture: Fixture, point: jax.Array) -> jax.Array:
-    """Points of the world in a fixture's frame."""
     away = jnp.stack([point[k] - float(fixture.position[k]) for k in range(3)])
     return _turned(turn_of(fixture).T, away)
 
@@ -163,12 +161,7 @@ def object_on(
 def edge_on(
     point: jax.Array, gap: jax.Array, gradient: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Contacts of the edges' points with the object: point, normal (3, ...) and gap.
-
-    Args:
-      point: See `edges`.
-      gradient: The gradients there, world axes.
-    """
+    """Contacts of the `edges` with the object, by its distance and gradient: point, normal, gap."""
     return point - 0.5 * gap * gradient, -gradient, gap
 
 
@@ -187,9 +180,7 @@ def _points(scene: Scene) -> list[int]:
 def touched(scene: Scene, pair: str, count: int) -> list[int]:
     """Which of `cones.frictions` the contacts of a pair of bodies have.
 
-    Args:
-      pair: The bodies, as in `problem.relative`.
-      count: Rings or spheres that look at each field; of the object it is known.
+    Rings or spheres look at each field `count` times; of the object it is known.
     """
     each = _points(scene)
     if pair == "object_table":

@@ -114,7 +114,9 @@ def test_what_records_no_forces_is_refused():
 @pytest.mark.parametrize("text", ["down", "1,1,0"])
 def test_a_pull_takes_the_object_as_mujocos_external_force_does(text):
     """Stepped by MuJoCo alone, with `xfrc_applied`; by engines that share no step; and too much."""
-    scene, along = load(TINY), push.direction(text)
+    off = ("finger_table", "palm_table", "palm_object")
+    scene = load(TINY, overrides={f"effects.{name}": False for name in off})
+    along = push.direction(text)
     space = parameters.design_space(scene.hand, "2d")
     hand = space.params(space.default())
     one = jax.tree.map(lambda v: np.asarray(v)[None], rollout.nominal_trial(scene))

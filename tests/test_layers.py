@@ -215,7 +215,7 @@ MOST_LINES = {
     "codesign_jax/runs": 3_160,
     "codesign_jax/scene": 5_020,
     "codesign_jax/studio": 750,
-    "scripts": 5_500,
+    "scripts": 5_560,
     "tests": 17_150,
 }
 

@@ -1,0 +1,150 @@
+"""Hands that searches found, as a page of moving pictures: docs/gallery.md.
+
+    python -m scripts.gallery [NAME ...]
+
+The hands are those of docs/gallery/hands.toml, the design of each is docs/gallery/NAME.toml; where
+that is not there, its search is run, in runs/gallery/NAME, where an interrupted one goes on.  A
+design is judged in 100 fresh trials at the accuracy of the search, and its grasp without noise is
+drawn; look.png in runs/gallery/NAME shows it from two sides, to be looked at.
+"""
+
+import dataclasses
+import shlex
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from PIL import Image
+
+from codesign_jax import cli, codesign, rollout, runs
+from codesign_jax.commands import common
+from codesign_jax.report import animation
+from codesign_jax.report.replay import Camera
+from codesign_jax.report.verdicts import Judged
+from codesign_jax.runs import choice
+
+RUNS, DOCS = Path("runs") / "gallery", Path("docs")
+FOLDER = DOCS / "gallery"
+RATE, SIZE, QUALITY = 10.0, (280, 280), 45
+"""Frames of a second, pixels, and WebP's quality: ten films of 9 s have less than 2 MB."""
+TRIALS, SEED = 100, 1000
+
+
+@dataclasses.dataclass(frozen=True)
+class Hand:
+    """A hand of docs/gallery/hands.toml.
+
+    Attributes:
+      scene: Flags of the scene.
+      search: Those that `codesign optimize` has beside them.
+      sentence: What the hand does.
+      shown: Objects that it is seen with.
+      camera: What its camera has of its own.
+    """
+
+    name: str
+    search: str
+    sentence: str
+    shown: list[str]
+    scene: str = ""
+    camera: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def command(self) -> str:
+        """The search."""
+        return " ".join(f"codesign optimize {self.scene} {self.search}".split())
+
+    @property
+    def design(self) -> Path:
+        """The file of the design."""
+        return FOLDER / f"{self.name}.toml"
+
+
+def hands() -> list[Hand]:
+    """Those of the page."""
+    named = tomllib.loads((FOLDER / "hands.toml").read_text(encoding="utf-8"))
+    return [Hand(name, **given) for name, given in named.items()]
+
+
+def find(hand: Hand) -> None:
+    """Runs the search, or what is left of it, and writes the design that it found."""
+    folder = RUNS / hand.name
+    words = [*shlex.split(hand.command)[1:], "--reference-trials", "0"]
+    cli.main([*words, "--out", str(folder)])
+    case, preset = choice.case_of_run(folder), runs.read_run(folder)[1].preset
+    text = common.design_text(case.space, preset, case.design)
+    hand.design.write_text(text, encoding="utf-8")
+
+
+def judge(hand: Hand, case: choice.Case) -> None:
+    """Writes the verdict as the first line of the design's file, if it is not there."""
+    text = hand.design.read_text(encoding="utf-8")
+    if not text.startswith("# keeps"):
+        judged = Judged(case.scene, case.simulate(TRIALS, jax.random.key(SEED)))
+        hand.design.write_text(f"# {judged}\n{text}", encoding="utf-8")
+
+
+def draw(hand: Hand, case: choice.Case) -> None:
+    """Simulates a grasp of each object without noise, and writes them as a film."""
+    scene, params = case.scene, case.space.params(jnp.asarray(case.design, jnp.float32))
+    named = [rollout.nominal_trial(scene, name) for name in hand.shown]
+    trials = jax.tree.map(lambda *v: jnp.stack(v), *named)
+    shown = animation.replay(scene, case.make_engine(), params, trials)
+    ends = [codesign.VERDICTS[int(codesign.verdicts(one.outcome))] for one in shown]
+    print(hand.name, *zip(hand.shown, ends, strict=True))
+    seen = animation.CAMERA._replace(**({"distance": 0.55} | hand.camera))
+
+    def row(times: np.ndarray, camera: Camera) -> list[np.ndarray]:
+        parts = [animation.frames(scene, one, times, size=SIZE, camera=camera) for one in shown]
+        return [*np.concatenate(parts, axis=2)]
+
+    frames = row(np.arange(0.0, scene.end_time, 1 / RATE), seen)
+    first, *others = (Image.fromarray(frame) for frame in frames)
+    how = {"duration": round(1e3 / RATE), "loop": 0, "quality": QUALITY, "method": 6}
+    first.save(FOLDER / f"{hand.name}.webp", save_all=True, append_images=others, **how)
+    times = np.array([2.0, 2.7, 3.5, 4.5, 6.0, 7.9, 8.9])
+    turns = (seen.azimuth, seen.azimuth + 90)
+    sides = [seen._replace(azimuth=turn, elevation=-8.0) for turn in turns]
+    looks = [np.hstack(row(times, camera)) for camera in sides]
+    (RUNS / hand.name).mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.vstack(looks)).save(RUNS / hand.name / "look.png")
+
+
+def row(hand: Hand) -> str:
+    """What the page says of a hand."""
+    verdict = hand.design.read_text(encoding="utf-8").splitlines()[0].removeprefix("# ")
+    words = f"**[{hand.name}](gallery/{hand.name}.toml)**: {hand.sentence} It {verdict}."
+    return f"| ![{hand.name}](gallery/{hand.name}.webp) | {words}<br><br>`{hand.command}` |"
+
+
+def main(names: list[str]) -> None:
+    """Finds and draws the hands of these names, all without any, and writes the page."""
+    for hand in hands():
+        if not names or hand.name in names:
+            if not hand.design.exists():
+                find(hand)
+            words = [*shlex.split(hand.scene), "--design", str(hand.design)]
+            case = common.find_case(tyro.cli(cli.Evaluate, args=words))
+            judge(hand, case)
+            draw(hand, case)
+    rows = [row(hand) for hand in hands() if hand.design.exists()]
+    (DOCS / "gallery.md").write_text("\n".join([HEAD, *rows, ""]), encoding="utf-8")
+
+
+HEAD = """# Hands that were found
+
+Each hand is the answer of one search, by the command beside it, and was judged in 100 fresh trials
+at the accuracy of the search. A name is the design as `--design` takes it: try `codesign studio
+--design FILE`. On another machine a search may find another hand. `python -m scripts.gallery`
+makes this page.
+
+| | |
+| --- | --- |"""
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

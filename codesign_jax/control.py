@@ -108,7 +108,6 @@ def supplied(
     volume does not enter, so pressures are known beforehand and cost a step nothing.
 
     Args:
-      scene: The scene; its `pneumatics` have the constants.
       wanted: Wanted pressures [Pa].
       start: Pressures at the beginning, shape (finger,), instead of the first wanted ones.
 

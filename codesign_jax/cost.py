@@ -69,7 +69,6 @@ def particle_cost(scene: Scene, outcomes: Outcome) -> jax.Array:
     scores each failed trial with the maximum.
 
     Args:
-      scene: The scene.
       outcomes: Arrays with the trial as the last axis.
 
     Returns:
@@ -88,15 +87,6 @@ def shown(trace: Trace, record_qpos: bool, stop_when_lost: bool | None) -> Trace
 
     A world that stopped repeats the step at which it lost its object, which a cost of one's own
     would take for what happened.
-
-    Args:
-      trace: Trace of one world.
-      record_qpos: Whether it has qpos, of a whole grasp.
-      stop_when_lost: Whether it ends where the object is lost; None if the caller did not say what
-        the cost needs.
-
-    Returns:
-      The trace, whose fields raise ValueError when they are read if they are not to be.
     """
     if trace.forces is None:
         trace = trace._replace(forces=_NO_FORCES)
@@ -158,17 +148,12 @@ _UNASKED = _refusing(
 
 
 def _first(condition: jax.Array) -> jax.Array:
-    """Index of the first true entry along time, or the number of entries, as int32."""
     steps = condition.shape[0]
     return jnp.where(condition.any(), jnp.argmax(condition), steps).astype(jnp.int32)
 
 
 def _solved(trace: Trace, decided: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """How the solver ended in the steps before the one at which the trial was decided.
-
-    Returns:
-      `Outcome.capped` and `Outcome.residual`.
-    """
+    """How the solver ended in the steps before the one at which the trial was decided."""
     dtype = trace.distance.dtype
     untold = jnp.full((), jnp.nan, dtype)
     if trace.status is None:
@@ -184,7 +169,6 @@ def _solved(trace: Trace, decided: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _stuck(scene: Scene, trace: Trace, trial: Trial | None) -> jax.Array:
-    """Whether the released object neither left the hand nor rests on the table."""
     if not scene.effects.ungrasp:
         return jnp.zeros((), bool)
     # A resting object's centre is at most its bounding radius above the table, whatever side it

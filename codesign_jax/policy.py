@@ -214,7 +214,6 @@ class ControlLoop(Equal):
     def _asked(
         self, hand: WorldModel, fields: ModelFields, world: World, memory: Any, plan: Plan
     ) -> tuple[Any, Command]:
-        """What the policies remember, and command over the period of the plan."""
         answer = jax.vmap(self.policy)(memory, observe(self.engine, hand, fields, world, plan))
         if not (isinstance(answer, tuple) and [*map(type, answer[1:])] == [Command]):
             raise InputError([f"{self._called} must return (carry, policy.Command)"])
@@ -226,7 +225,6 @@ class ControlLoop(Equal):
         return f"policy {getattr(self.policy, '__name__', type(self.policy).__name__)}"
 
     def _remembered(self, params: Params) -> Any:
-        """What the policy remembers at first, with a leading axis (world,)."""
         init = getattr(self.policy, "init", None)
         if init is None:
             return ()
@@ -237,7 +235,6 @@ class ControlLoop(Equal):
         return jax.vmap(one)(params)
 
     def _refuse_memory(self, before: Any, after: Any) -> None:
-        """Refuses what could not be given to the next call."""
         trees = [jax.tree.flatten(tree) for tree in (before, after)]
         kinds = [[(v.shape[1:], v.dtype.name) for v in map(jnp.asarray, t[0])] for t in trees]
         if trees[0][1] != trees[1][1] or kinds[0] != kinds[1]:
@@ -261,11 +258,7 @@ class ControlLoop(Equal):
 
 
 def searched(scene: Scene, policy: Policy) -> Scene:
-    """The scene with the policy's parameters beside those of its key frames.
-
-    Raises:
-      InputError: If they are not rows as those of a control file, or have a name that is taken.
-    """
+    """The scene with the policy's parameters beside those of its key frames."""
     rows = key_frames.read_parameters(getattr(policy, "parameters", ()), "policy.parameters")
     there = {row.name: row for row in scene.control.parameter}
     new = tuple(row for row in rows if there.get(row.name) != row)
@@ -278,11 +271,7 @@ def searched(scene: Scene, policy: Policy) -> Scene:
 
 
 def period_steps(scene: Scene, period: float | None) -> int:
-    """Time steps of a period [s]; None for about `PERIOD`.
-
-    Raises:
-      InputError: If they are not a whole number.
-    """
+    """Time steps of a period [s]; None for about `PERIOD`."""
     h = scene.discretization.timestep
     if period is None:
         return max(1, round(PERIOD / h))
@@ -304,15 +293,7 @@ def begin(scene: Scene, fields: ModelFields, plan: Plan) -> World:
 def observe(
     engine: Engine, hand: WorldModel, fields: ModelFields, world: World, plan: Plan
 ) -> Observation:
-    """What policies observe, every array with a leading axis (world,).
-
-    Args:
-      engine: The engine that simulates them.
-      hand: Constants of the worlds, `world_constants` of their fields.
-      fields: Model fields of the worlds.
-      world: The worlds.
-      plan: Their plan over the period that begins.
-    """
+    """What policies observe, every array with a leading axis (world,)."""
     scene: Scene = engine.scene  # type: ignore[attr-defined]
     state = coordinates.reset(scene, fields._replace(start=world.state))
     found = kinematics(hand, layout(scene).axes, state)
@@ -366,7 +347,6 @@ def _forces(scene: Scene, hand: WorldModel, state: State) -> Forces:
 
 
 def _phase(scene: Scene, step: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Index of the phase that a time step belongs to, and the time since it began [s]."""
     ends = jnp.stack(
         [jnp.asarray(scene.steps_to(t), step.dtype) for t in scene.phase_ends.values()]
     )
@@ -379,13 +359,7 @@ def spread(scene: Scene, command: Command, plan: Plan, *, of: str) -> Command:
     """Commands over the time steps of a period, with pressures that the fingers stand.
 
     Args:
-      scene: The scene.
       command: Commands with a leading axis (world,).
-      plan: The plan of the worlds over the period.
-      of: Who commands, for the error.
-
-    Raises:
-      InputError: If their shapes are not those of `Command`.
     """
     problems, found = [], []
     for name, like in (("pose", plan.pose), ("pressure", plan.pressure)):
@@ -416,11 +390,7 @@ def advance(
     command: Command,
     **how: Any,
 ) -> tuple[World, Trace]:
-    """Simulates a period under commands of shape (world, step, ...); how: of `engine.rollout`.
-
-    Returns:
-      The worlds after it, and the trace with the controls that the engine was given.
-    """
+    """Simulates a period under commands of shape (world, step, ...); how: of `engine.rollout`."""
     scene: Scene = engine.scene  # type: ignore[attr-defined]
 
     def controls(own: Scene, now: jax.Array, shake: jax.Array, tilt: jax.Array, told: Command):

@@ -188,8 +188,6 @@ def grasp(
     """Simulates one world, or the beginning of it; `jax.vmap` makes a batch of it.
 
     Args:
-      scene: The scene.
-      engine: The engine.
       params: Parameters of one hand.
       trial: One trial.
       steps: How many time steps are simulated; None for the whole grasp.
@@ -220,7 +218,6 @@ def evaluate(
 
     Args:
       scene: The scene; its numbers of shape () or (trial,).
-      engine: The engine.
       params: Parameters with leading axis (particle,).
       trials: Trials with leading axis (trial,): common random numbers, every particle meets the
         same ones.
@@ -257,7 +254,6 @@ def grid(tree: Any, shape: tuple[int, ...]) -> Any:
 
 
 def _check(scene: Scene, engine: Engine, params: Params, trials: Trial) -> None:
-    """Refuses a batch of worlds that is not as `simulate` asks for."""
     axes.refuse_other(scene, engine)
     axes.refuse(scene, params, trials, ("world", "world"))
     axes.refuse_numbers(scene.checked(), len(trials.yaw), "world")
@@ -274,7 +270,6 @@ def _traced(
     how: Options,
     steps: int | None = None,
 ) -> tuple[Trace, Any, jax.Array]:
-    """The trace of the first steps, and the controls and bits of `Status` that it began with."""
     forces = how.record_forces or getattr(how.cost, "record_forces", False)
     engine = recording(engine) if forces else engine
     ctrl: Any
@@ -300,15 +295,11 @@ def prepare(
       scene: The scene; its numbers of shape () or (world,).
       params: Parameters with leading axis (world,).
       trials: Trials with leading axis (world,).
-      engine: The engine, if it may be one that asks a policy, see `policy.ControlLoop`.
 
     Returns:
       Model fields, controls of shape (world, time, nu), or a `control.Plan` for such an engine,
       and bits of `Status` that the worlds start
       with, shape (world,).
-
-    Raises:
-      RuntimeError: In a process that was forked from one that had simulated.
     """
     reuse.begin()
     numbers = jax.tree.map(lambda v: jnp.asarray(v, float), scene.bare)
@@ -337,11 +328,8 @@ def judge(
 
     Args:
       scene: The scene; its numbers of shape () or (world,).
-      trace: Their trace.
-      ctrl: Their controls, for a cost of one's own; None without one.
       initial: Bits of `Status` that they started with, shape (world,).
       trials: Their trials, with leading axis (world,).
-      how: How the trace was made.
     """
     if trace.ctrl is not None:
         ctrl = trace.ctrl
@@ -360,7 +348,6 @@ def judge(
 def _by_own(
     scene: Scene, own: CostFunction, trace: Trace, ctrl: jax.Array | None, result: Outcome
 ) -> Outcome:
-    """Outcome of one world with a cost of one's own."""
     if ctrl is None:
         raise ValueError("a cost of one's own needs the controls")
     returned = own(scene, trace, ctrl)

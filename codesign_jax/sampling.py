@@ -52,7 +52,6 @@ def draw(
     objects are equally frequent, and has noise of its own: that of trial t of the key of i.
 
     Args:
-      scene: The scene.
       space: Space of the designs.
       key: Typed key.
       first: Index of the first design; may be traced.
@@ -95,7 +94,6 @@ def make_simulate(
     Its arguments are those of `Drawn`; another number of designs or trials compiles again.
 
     Args:
-      scene: The scene.
       engine: Engine that simulates.
       space: Space of the designs.
     """

@@ -15,7 +15,6 @@ from numpy.polynomial import Polynomial
 from codesign_jax import cli, files, model, rollout, scene
 from codesign_jax.export import casting, drawing, meshes, process, sheet, tolerance
 from codesign_jax.export.process import Process, Section, Size
-from codesign_jax.optimize import answer
 from codesign_jax.runs import choice
 from codesign_jax.scene import parameters
 from codesign_jax.types import Outcome
@@ -186,7 +185,7 @@ def test_known_thresholds_are_bracketed():
     good &= (moved[:, z] < 0.03) | (moved[:, z] > 0.1)  # and good again behind: not counted
     good &= np.abs(moved[:, wall]) == 0  # nothing off at all
     shares = tolerance.shares(outcomes(0.925 * good))
-    found = answer(tolerance.search(planned, 14), lambda asked: [shares[i] for i in asked.designs])
+    found = tolerance.search(planned, lambda asked: [shares[i] for i in asked])
     # What lies behind a failure is not simulated, and with it the tolerances are the same.
     bad = ~good[1:].reshape(-1, STEPS)
     asked = np.cumsum(bad, 1) - bad == 0

@@ -18,7 +18,7 @@ from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.model import morphology
 from codesign_jax.model.layout import layout
-from codesign_jax.report import charts
+from codesign_jax.report import figures
 from codesign_jax.scene import parameters
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Status
@@ -58,9 +58,9 @@ def worlds():
 def test_recording_changes_no_bit_and_a_lost_object_has_no_forces(worlds):
     _, plain, (outcome, trace) = worlds
     jax.tree.map(np.testing.assert_array_equal, plain, (outcome, trace._replace(forces=None)))
-    chart = charts.grip_chart(grasps.nth(trace.forces, 0), SCENE)
-    assert [line.name for line in chart.data] == ["finger 0", "finger 1", "palm"]
-    assert len(chart.data[0].y) == SCENE.num_steps
+    drawn = figures.grip(grasps.nth(trace.forces, 0), SCENE).axes[0].lines[:3]
+    assert [line.get_label() for line in drawn] == ["finger 0", "finger 1", "palm"]
+    assert len(drawn[0].get_ydata()) == SCENE.num_steps
     lost = np.asarray(outcome.lost_time)
     assert np.isfinite(lost).any()
     for world in np.flatnonzero(np.isfinite(lost)):

@@ -1,11 +1,9 @@
 """Figures, animations and what a viewer draws show what they should."""
 
 import csv
-import importlib
 import json
 import re
 import shutil
-import sys
 
 import av
 import jax
@@ -126,9 +124,6 @@ def test_objects_have_their_size(name):
 # --- the report of a run: the numbers of its tables, in one file, and errors in words -------------
 
 
-pytest.importorskip("plotly", reason="the extra 'report' is not installed")
-
-
 @pytest.fixture(scope="module")
 def text(run):
     return (run / "report.html").read_text(encoding="utf-8")
@@ -153,12 +148,13 @@ def test_report_shows_the_best_tested_particle_with_its_interval(run, text):
 
 
 def test_report_is_one_small_file_that_names_its_origin(run, text):
-    assert (run / "report.html").stat().st_size < 10e6
+    assert (run / "report.html").stat().st_size < 2e6
     provenance = json.loads((run / "provenance.json").read_text())
     assert provenance["environment"]["versions"]["mujoco"] in text
     assert "&lt;run&gt; &amp; 1" in text and "<run>" not in text, "names are text, not HTML"
     page = re.sub(r"<script.*?</script>", "", text, flags=re.S)
-    assert not re.search(r"(src|href)\s*=", page), "nothing is loaded from elsewhere"
+    outside = re.search(r"(src|href)\s*=\s*['\"](?!data:)", page)
+    assert not outside, "nothing is loaded from elsewhere"
 
 
 def test_grasp_is_the_one_of_the_table(run):
@@ -223,7 +219,7 @@ def test_fresh_trials_at_reference_are_in_the_report(run, tmp_path, capsys):
         assert ("1 of 5 trials failed (STUCK 1)" in text) == words
 
 
-def test_errors_are_words(run, tmp_path, capsys, monkeypatch):
+def test_errors_are_words(run, tmp_path, capsys):
     assert cli.main(["report", str(tmp_path)]) == 2
     assert "is not a run folder" in capsys.readouterr().err
     for seed in (0, 1):
@@ -233,12 +229,3 @@ def test_errors_are_words(run, tmp_path, capsys, monkeypatch):
     assert cli.main(["report", str(tmp_path / "seeds")]) == 2
     hint = f"it holds 2 runs: give one, such as {tmp_path / 'seeds' / 'seed-0'}"
     assert hint in capsys.readouterr().err
-    for name in ("codesign_jax.report.page", "codesign_jax.report.charts"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
-        monkeypatch.delattr(
-            importlib.import_module("codesign_jax.report"), name[20:], raising=False
-        )
-    monkeypatch.setitem(sys.modules, "plotly", None)
-    assert cli.main(["report", str(run)]) == 2
-    [line] = capsys.readouterr().err.splitlines()
-    assert "plotly" in line and "pip install '.[report]' in the checkout" in line

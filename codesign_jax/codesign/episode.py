@@ -55,7 +55,6 @@ class Task:
     `jax.jit`, `jax.vmap` and so on work on them.
 
     Attributes:
-      scene: The scene.
       space: Design space of the particles.
       trials: Trials of each particle in an evaluation or an episode.
       engine: Engine that simulates; by default the engine `structured` of the scene.
@@ -145,7 +144,6 @@ class Task:
 
         Args:
           optimizer: Optimiser over the same space, see `optimize.Optimizer`.
-          state: Its state.
           mask: Parameters that may move, bool, shape (parameter,): data, so that every schedule
             shares one program. None for all.
           scene: A scene with other numbers, of shape () or (trial,), but for `cost.maximum`, which
@@ -170,7 +168,6 @@ class Task:
 
         Args:
           optimizer: As of `episode`.
-          state: Its state.
           masks: The mask of each episode, shape (episode, parameter).
           scene: As of `episode`.
 
@@ -277,7 +274,6 @@ def _programs(
 
 
 def _refuse_mask(space: DesignSpace, mask: jax.typing.ArrayLike) -> None:
-    """Refuses a mask that is not one of the space's parameters."""
     if np.shape(mask) != (space.num_parameters,):
         names = ", ".join(space.names)
         raise InputError(
@@ -296,9 +292,7 @@ def closed(optimizer: Optimizer, population: jax.Array, key: jax.Array) -> tuple
     """State and mask of an episode that moves nothing: it simulates a population as it is.
 
     Args:
-      optimizer: The episode's optimiser.
       population: Particles [SI units], shape (particle, parameter).
-      key: Key from which the noise of the trials derives.
     """
     state = optimizer.init(key, population[0], len(population))
     mask = np.zeros(np.shape(optimizer.space.low), bool)

@@ -57,7 +57,6 @@ def seed_search(
     A generator: it yields (population, key), and is sent their outcomes; see `optimize.answer`.
 
     Args:
-      scene: The scene.
       optimizer: Optimiser whose space is sampled.
       key: Root key of the run.
       batch: Candidates of one request.
@@ -92,7 +91,6 @@ def testing(
     in 23D, which makes 78.  A generator: it yields (population, key), and is sent their outcomes.
 
     Args:
-      scene: The scene.
       particles: Particles [SI units], shape (particle, parameter).
       key: Root key of the run.
       num_trials: Further trials of each particle; requests go on until there are as many, so that a
@@ -111,7 +109,6 @@ def summarize_test(scene: Scene, outcomes: Outcome) -> FinalTest:
     """Returns cost and the paper's success of particles from the outcomes of their test.
 
     Args:
-      scene: The scene.
       outcomes: Arrays of shape (particle, trial).
     """
     cost = particle_cost(scene, outcomes)

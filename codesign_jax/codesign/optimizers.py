@@ -41,7 +41,6 @@ def make_optimizer(name: str, space: DesignSpace, *, num_particles: int | None =
 
     Raises:
       ValueError: If there is no such optimiser, or your own is not as `optimize.Optimizer` says.
-      ModuleNotFoundError: If it needs evosax, which is not installed.
     """
     if own.is_own(name):
         return own.make_optimizer(name, _box(space), num_particles)

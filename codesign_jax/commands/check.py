@@ -4,7 +4,7 @@ import importlib.metadata
 import os
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from rich.console import Console
 from codesign_jax import codesign, optimize, preflight, runs, sampling
 from codesign_jax.commands import common, reference
 from codesign_jax.commands.common import find_case
+from codesign_jax.commands.flags import Check
 from codesign_jax.engines import Engine
 from codesign_jax.report.statistics import wilson
 from codesign_jax.runs import Settings, choice
@@ -22,9 +23,6 @@ from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.progress import Busy, duration
 from codesign_jax.scene import Scene, with_accuracy
 from codesign_jax.types import Outcome, Trial, failed
-
-if TYPE_CHECKING:
-    from codesign_jax.cli import Check
 
 _ROUNDS = 4
 """Batches of random designs of which a mixed sample takes the best."""
@@ -59,7 +57,7 @@ class Measured(NamedTuple):
         )
 
 
-def main(options: "Check") -> int:
+def main(options: Check) -> int:
     common.use_compilation_cache()
     load = os.getloadavg()[0]
     case = find_case(options)
@@ -73,7 +71,7 @@ def main(options: "Check") -> int:
 
 
 def simulate(
-    case: Case, settings: Settings, finer: Scene, options: "Check", console: Console
+    case: Case, settings: Settings, finer: Scene, options: Check, console: Console
 ) -> tuple[str, Measured, Measured]:
     """What the designs are, and their grasps in the scene and in the finer one.
 
@@ -99,7 +97,7 @@ def simulate(
     return words, usual, fine
 
 
-def _refuse(options: "Check", case: Case, finer: Scene) -> None:
+def _refuse(options: Check, case: Case, finer: Scene) -> None:
     problems = common.number_problems(
         ("--grasps", options.grasps, 1, 1_000_000), ("--seconds", options.seconds, 1, 86_400)
     )
@@ -130,7 +128,7 @@ def _head(case: Case, load: float) -> list[str]:
     return lines + preflight.notes(case.scene, case.space, {"the design": case.design})
 
 
-def _settings(options: "Check", case: Case) -> Settings:
+def _settings(options: Check, case: Case) -> Settings:
     if options.run_folder:
         return runs.read_run(options.run_folder)[1]
     objects = len(case.scene.objects.object)
@@ -160,7 +158,7 @@ def _timed(run: Run, designs: jax.Array, trials: Trial) -> tuple[Outcome, float]
     return found, time.perf_counter() - begin
 
 
-def _sample(options: "Check", case: Case, run: Run, count: int) -> tuple[jax.Array, str]:
+def _sample(options: Check, case: Case, run: Run, count: int) -> tuple[jax.Array, str]:
     """Designs of shape (count, parameter), repeated where there are fewer, and what they are."""
     if options.run_folder:
         particles = choice.read_record(options.run_folder).state.particles
@@ -174,7 +172,7 @@ def _sample(options: "Check", case: Case, run: Run, count: int) -> tuple[jax.Arr
     return jnp.asarray(np.resize(found, (count, found.shape[1])), jnp.float32), words
 
 
-def _mixed(options: "Check", case: Case, run: Run, count: int) -> tuple[np.ndarray, str]:
+def _mixed(options: Check, case: Case, run: Run, count: int) -> tuple[np.ndarray, str]:
     begin, designs, costs = time.perf_counter(), [], []
     while len(designs) < _ROUNDS and time.perf_counter() - begin < options.seconds / _ROUNDS:
         drawn = _draw(case, 0, count * len(designs), count)

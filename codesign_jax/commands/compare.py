@@ -6,7 +6,7 @@
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -17,6 +17,7 @@ from rich.table import Table
 from codesign_jax import codesign, cost, runs
 from codesign_jax.commands import common, flags, reference
 from codesign_jax.commands.common import find_case
+from codesign_jax.commands.flags import Compare
 from codesign_jax.report import statistics, verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import RunResult, Settings, columns, manifest, tables
@@ -24,9 +25,6 @@ from codesign_jax.runs.choice import Case
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import InputError
-
-if TYPE_CHECKING:
-    from codesign_jax.cli import Compare
 
 _OF_SETTINGS = ("schedule", "optimizer", "preset", "engine", "cost")
 _WORDS = {"schedule": "strategy"}
@@ -63,7 +61,7 @@ class Compared(NamedTuple):
         return own | {_WORDS.get(n, n): str(getattr(self.settings, n)) for n in _OF_SETTINGS}
 
 
-def main(options: "Compare") -> int:
+def main(options: Compare) -> int:
     folders = [run for folder in options.folders for run in _runs_in(folder)]
     problems = common.number_problems(
         ("--trials", options.trials, 1, 100_000), ("--seed", options.seed, 0, 2**31 - 1)
@@ -105,7 +103,7 @@ def read_all(every: Mapping[Path, tuple[Scene, Settings]]) -> dict[Path, Compare
     return found
 
 
-def _pair(options: "Compare", folders: list[Path]) -> list[Case]:
+def _pair(options: Compare, folders: list[Path]) -> list[Case]:
     replaced = {n: getattr(options, n) for n in ("accuracy", "objects", "overrides", "robust")}
     own = [runs.read_run(folder)[1].policy for folder in folders]
     if unknown := [name for name in options.policy if name not in own]:
@@ -121,7 +119,7 @@ def _pair(options: "Compare", folders: list[Path]) -> list[Case]:
     return [one, other]
 
 
-def _compare_pair(pair: list[Case], names: list[str], options: "Compare", console: Console) -> None:
+def _compare_pair(pair: list[Case], names: list[str], options: Compare, console: Console) -> None:
     kept, count = [], options.trials or 0
     for case, name in zip(pair, names, strict=True):
         with Busy(console, f"simulating {common.counted(count, 'grasp')}"):

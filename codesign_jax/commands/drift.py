@@ -7,19 +7,18 @@ from rich.console import Console
 
 from codesign_jax import batch
 from codesign_jax.codesign import Task
+from codesign_jax.commands.flags import Export
 from codesign_jax.engines import Engine
-from codesign_jax.optimize import answer
 from codesign_jax.report.statistics import Interval
 from codesign_jax.runs.choice import Case
 from codesign_jax.runs.progress import Meter
 
 if TYPE_CHECKING:
-    from codesign_jax.cli import Export
     from codesign_jax.export import sheet
     from codesign_jax.export.tolerance import Study
 
 
-def simulate(case: Case, engine: Engine, options: "Export", console: Console) -> "sheet.Drift":
+def simulate(case: Case, engine: Engine, options: Export, console: Console) -> "sheet.Drift":
     """Tolerances of the design: says how many grasps they take at most, and simulates."""
     from codesign_jax.export import sheet, tolerance  # with the extra
 
@@ -30,19 +29,18 @@ def simulate(case: Case, engine: Engine, options: "Export", console: Console) ->
     _announce(planned, options, console)
     with Meter("tolerance", planned.most * count, console) as meter:
 
-        def reply(asked: tolerance.Round) -> list[Interval]:
-            meter.total = meter.done + count * (len(asked.designs) + asked.most)
-            designs = planned.designs[asked.designs]
+        def shares_of(asked: list[int]) -> list[Interval]:
+            designs = planned.designs[asked]
             return tolerance.shares(batch.evaluate(task, key, designs, size, meter.advance))
 
-        found = answer(tolerance.search(planned, size), reply)
+        found = tolerance.search(planned, shares_of)
     known = found[0].value >= tolerance.WANTED
     rows = tolerance.tolerances(planned, found) if known else []
     fixed = sum(source < 0 for source in planned.space.source)
     return sheet.Drift(found[0], count, steps, case.engine, rows, fixed)
 
 
-def study(case: Case, options: "Export") -> "Study":
+def study(case: Case, options: Export) -> "Study":
     """The designs of the tolerances; of the free parameters if none are asked for."""
     from codesign_jax.export import tolerance  # with the extra
 
@@ -51,7 +49,7 @@ def study(case: Case, options: "Export") -> "Study":
     return tolerance.study(case.scene, case.space, case.design, steps, free=free)
 
 
-def _announce(planned: "Study", options: "Export", console: Console) -> None:
+def _announce(planned: "Study", options: Export, console: Console) -> None:
     names, most = planned.space.names, planned.most * options.tolerance_trials
     moved = ", ".join(names) if len(names) <= 4 else f"{len(names)} parameters"
     others = {"free": "all moves the hand's whole table", "all": "free moves fewer"}

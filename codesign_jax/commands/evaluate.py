@@ -1,7 +1,6 @@
 """`codesign evaluate`."""
 
 from itertools import chain
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +10,7 @@ from rich.console import Console
 from codesign_jax import preflight, rollout, runs, types
 from codesign_jax.commands import common, forces, reference
 from codesign_jax.commands.common import find_case
+from codesign_jax.commands.flags import Evaluate
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording
 from codesign_jax.report import stress, verdicts
@@ -19,11 +19,8 @@ from codesign_jax.runs.choice import Case
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.schema import InputError
 
-if TYPE_CHECKING:
-    from codesign_jax.cli import Evaluate
 
-
-def main(options: "Evaluate") -> int:
+def main(options: Evaluate) -> int:
     common.use_compilation_cache()
     case = _of_particle(find_case(options), options)
     _check(options, case.engine)
@@ -54,7 +51,7 @@ def main(options: "Evaluate") -> int:
     return int(types.failed(one.status).all())  # no trial says anything of the design
 
 
-def _of_particle(case: Case, options: "Evaluate") -> Case:
+def _of_particle(case: Case, options: Evaluate) -> Case:
     if options.particle is None:
         return case
     if options.run_folder is None:
@@ -65,7 +62,7 @@ def _of_particle(case: Case, options: "Evaluate") -> Case:
     return case._replace(design=particles[options.particle])
 
 
-def _check(options: "Evaluate", engine: str) -> None:
+def _check(options: Evaluate, engine: str) -> None:
     problems = common.number_problems(
         ("--trials", options.trials, 1, 100_000), ("--seed", options.seed, 0, 2**31 - 1)
     )
@@ -77,7 +74,7 @@ def _check(options: "Evaluate", engine: str) -> None:
     common.refuse(problems + common.engine_problems(engine, options.overrides))
 
 
-def simulate(case: Case, options: "Evaluate", console: Console) -> types.Outcome:
+def simulate(case: Case, options: Evaluate, console: Console) -> types.Outcome:
     """Simulates the trials and prints how they ended, by object and in all; outcomes (trial,)."""
     with Busy(console, f"simulating {common.counted(options.trials, 'grasp')}"):
         one = case.simulate(options.trials, jax.random.key(options.seed))
@@ -96,7 +93,7 @@ def simulate(case: Case, options: "Evaluate", console: Console) -> types.Outcome
     return one
 
 
-def _untried(case: Case, options: "Evaluate") -> list[str]:
+def _untried(case: Case, options: Evaluate) -> list[str]:
     names = [shape.name for shape in case.scene.objects.object]
     left = names[options.trials :]
     if not left:
@@ -107,7 +104,7 @@ def _untried(case: Case, options: "Evaluate") -> list[str]:
     ]
 
 
-def of_objects(case: Case, engine: Engine, options: "Evaluate", console: Console) -> None:
+def of_objects(case: Case, engine: Engine, options: Evaluate, console: Console) -> None:
     """Of the first trial of each object: its forces, the pull that ends it, and a drawing."""
     from codesign_jax.report import animation
 

@@ -13,6 +13,7 @@ from rich.console import Console
 from codesign_jax import engines, files, preflight, provenance, rollout, runs
 from codesign_jax.commands import common, drift, reference
 from codesign_jax.commands.common import find_case
+from codesign_jax.commands.flags import Export
 from codesign_jax.export import grasps, plain, process, tables
 from codesign_jax.export.process import Process, Size
 from codesign_jax.runs.choice import Case
@@ -21,11 +22,10 @@ from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Params, Trial
 
 if TYPE_CHECKING:
-    from codesign_jax.cli import Export
     from codesign_jax.export import sheet
 
 
-def main(options: "Export") -> int:
+def main(options: Export) -> int:
     common.use_compilation_cache()
     doubts: list[str] = []
     case = find_case(options, tell=doubts.append)
@@ -59,15 +59,15 @@ def _params(case: Case) -> Params:
     return jax.tree.map(np.asarray, exact)
 
 
-def _process(options: "Export") -> Process:
+def _process(options: Export) -> Process:
     return Process(**{f.name: getattr(options, f.name) for f in dataclasses.fields(Process)})
 
 
-def _sizes(case: Case, params: Params, options: "Export") -> list[Size]:
+def _sizes(case: Case, params: Params, options: Export) -> list[Size]:
     return process.sizes(case.scene.hand, params, _process(options))
 
 
-def _check(options: "Export", case: Case) -> None:
+def _check(options: Export, case: Case) -> None:
     problems = common.number_problems(
         ("--trials", options.trials, 0, 10_000),
         ("--seed", options.seed, 0, 2**31 - 1),
@@ -83,7 +83,7 @@ def _check(options: "Export", case: Case) -> None:
     common.refuse(problems + common.engine_problems(case.engine, options.overrides))
 
 
-def _missing(options: "Export") -> list[str]:
+def _missing(options: Export) -> list[str]:
     names = () if options.no_parts else ("manifold3d", "lxml")
     absent = [name for name in names if importlib.util.find_spec(name) is None]
     if not absent:
@@ -100,7 +100,7 @@ def write_files(
     sizes: list[Size],
     engine: engines.Engine | None,
     folder: Path,
-    options: "Export",
+    options: Export,
     console: Console,
 ) -> None:
     """Writes all that is asked for; tolerances if there is an engine to simulate them."""
@@ -115,7 +115,7 @@ def write_files(
             _sheet(case, params, sizes, found, folder, options)
 
 
-def _tell(case: Case, options: "Export", console: Console) -> None:
+def _tell(case: Case, options: Export, console: Console) -> None:
     from codesign_jax.export import sheet
 
     console.print(f"exported: {options.out}")
@@ -136,7 +136,7 @@ def _tell(case: Case, options: "Export", console: Console) -> None:
             )
 
 
-def _parts(sizes: list[Size], folder: Path, options: "Export", console: Console) -> None:
+def _parts(sizes: list[Size], folder: Path, options: Export, console: Console) -> None:
     from codesign_jax.export import meshes  # needs the extra
 
     folder, how = folder / meshes.FOLDER, _process(options)
@@ -153,7 +153,7 @@ def _parts(sizes: list[Size], folder: Path, options: "Export", console: Console)
             )
 
 
-def _models(case: Case, params: Params, folder: Path, options: "Export", console: Console) -> None:
+def _models(case: Case, params: Params, folder: Path, options: Export, console: Console) -> None:
     for difference in plain.differences(case.scene):
         console.print(f"note: {difference} (docs/export.md)")
     folder = folder / tables.MODELS
@@ -165,7 +165,7 @@ def _models(case: Case, params: Params, folder: Path, options: "Export", console
             console.print(f"in plain MuJoCo: {line}")
 
 
-def _trials(case: Case, options: "Export") -> list[tuple[str, Trial]]:
+def _trials(case: Case, options: Export) -> list[tuple[str, Trial]]:
     scene = case.scene
     names = tables.names_of([shape.name for shape in scene.objects.object])
     found = [(name, rollout.nominal_trial(scene, i)) for i, name in enumerate(names)]
@@ -190,7 +190,7 @@ def _sheet(
     sizes: list[Size],
     found: "sheet.Drift | None",
     folder: Path,
-    options: "Export",
+    options: Export,
 ) -> None:
     from codesign_jax.export import drawing, sheet  # needs the extra
 

@@ -2,7 +2,6 @@
 
 import math
 from itertools import chain
-from typing import TYPE_CHECKING
 
 import numpy as np
 from rich import box
@@ -12,12 +11,10 @@ from rich.table import Table
 from codesign_jax import finger as fingers
 from codesign_jax.commands import common
 from codesign_jax.commands.common import find_case
+from codesign_jax.commands.flags import Finger as Options
 from codesign_jax.finger import Finger, Fit
 from codesign_jax.runs import tables
 from codesign_jax.scene.schema import InputError
-
-if TYPE_CHECKING:
-    from codesign_jax.cli import Finger as Options
 
 SHOWN = {
     "pressure": ("kPa", 1e3),
@@ -33,7 +30,7 @@ POINTS = 11
 """Pressures of a curve without measurements."""
 
 
-def main(options: "Options") -> int:
+def main(options: Options) -> int:
     case = find_case(options)
     params = case.space.params(np.asarray(case.design))
     problems = common.number_problems(("--finger", options.finger, 0, case.scene.num_fingers - 1))
@@ -73,9 +70,7 @@ def _about(mine: Finger, number: int, hand: str) -> str:
     )
 
 
-def compare(
-    mine: Finger, table: dict[str, np.ndarray], options: "Options", console: Console
-) -> None:
+def compare(mine: Finger, table: dict[str, np.ndarray], options: Options, console: Console) -> None:
     """Prints and writes what was measured, predicted and fitted."""
     models = {"model": mine}
     fit: Fit | None = None

@@ -10,6 +10,7 @@ import numpy as np
 from codesign_jax import rollout, runs
 from codesign_jax.commands import common
 from codesign_jax.commands.common import find_case
+from codesign_jax.commands.flags import Shown
 from codesign_jax.engines.base import recording, tells_forces
 from codesign_jax.runs import choice
 from codesign_jax.runs.choice import Case
@@ -17,7 +18,6 @@ from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Trial
 
 if TYPE_CHECKING:
-    from codesign_jax.cli import Shown
     from codesign_jax.report.replay import Replay
 
 
@@ -30,7 +30,7 @@ class Asked(NamedTuple):
     recorded: str | None  # how it ended in its run, in words; None if it is of no run
 
 
-def find(options: "Shown") -> Asked:
+def find(options: Shown) -> Asked:
     """The grasp that the flags name; simulates nothing."""
     places = {"--episode": options.episode, "--particle": options.particle}
     places |= {"--trial": options.trial}
@@ -46,7 +46,7 @@ def find(options: "Shown") -> Asked:
     return _of_run(case, options, options.run_folder)
 
 
-def _of_run(case: Case, options: "Shown", folder: Path) -> Asked:
+def _of_run(case: Case, options: Shown, folder: Path) -> Asked:
     if options.objects is not None and options.object is None:
         raise InputError(["--objects replaces the run's: --object must say which one to grasp"])
     place = {"episode": options.episode, "particle": options.particle, "trial": options.trial}

@@ -12,15 +12,12 @@ import re
 import signal
 import sys
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import jax
 
 from codesign_jax.commands import common, status
+from codesign_jax.commands.flags import Optimize
 from codesign_jax.scene.schema import InputError
-
-if TYPE_CHECKING:
-    from codesign_jax.cli import Optimize
 
 WAIT = 7 * 24 * 3600
 """Longest time that a process waits for the others' runs [s]."""
@@ -53,7 +50,7 @@ def join(text: str) -> tuple[int, int]:
     return jax.process_index(), jax.process_count()
 
 
-def run(options: "Optimize") -> tuple[int, int]:
+def run(options: Optimize) -> tuple[int, int]:
     """Runs this host's seeds and waits for all hosts'; the exit status and this host's index."""
     chosen = common.parse_seeds(options.seeds or "")
     index, count = join(options.distributed or "")

@@ -1,7 +1,7 @@
 """`codesign landscape`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -11,6 +11,7 @@ from codesign_jax import batch, codesign, files, preflight, runs
 from codesign_jax.codesign import Task
 from codesign_jax.commands import common
 from codesign_jax.commands.common import find_case
+from codesign_jax.commands.flags import Landscape as Options
 from codesign_jax.cost import particle_cost
 from codesign_jax.report import landscape
 from codesign_jax.report.landscape import Landscape
@@ -19,9 +20,6 @@ from codesign_jax.runs.progress import Meter
 from codesign_jax.scene import schema
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome, failed
-
-if TYPE_CHECKING:
-    from codesign_jax.cli import Landscape as Options
 
 
 class Plane(NamedTuple):
@@ -33,7 +31,7 @@ class Plane(NamedTuple):
     designs: np.ndarray
 
 
-def main(options: "Options") -> int:
+def main(options: Options) -> int:
     common.use_compilation_cache()
     case = find_case(options)
     _check(options, case)
@@ -57,7 +55,7 @@ def main(options: "Options") -> int:
     return 0
 
 
-def _folder(options: "Options", case: Case) -> Path:
+def _folder(options: Options, case: Case) -> Path:
     own = options.run_folder
     folder = Path("landscape")
     if own is not None and case.scene == runs.read_run(own)[0]:
@@ -68,7 +66,7 @@ def _folder(options: "Options", case: Case) -> Path:
     return folder
 
 
-def _check(options: "Options", case: Case) -> None:
+def _check(options: Options, case: Case) -> None:
     problems = common.number_problems(
         ("--points", options.points, 2, 1000),
         ("--trials", options.trials, 1, 100_000),
@@ -111,7 +109,7 @@ def make_plane(case: Case, columns: tuple[int, int], points: int) -> Plane:
 
 
 def simulated_designs(
-    case: Case, designs: np.ndarray, size: int, options: "Options", console: Console
+    case: Case, designs: np.ndarray, size: int, options: Options, console: Console
 ) -> Outcome:
     task = Task(case.scene, case.space, options.trials, case.make_engine())
     with Meter("landscape", len(designs) * options.trials, console) as meter:
@@ -165,5 +163,5 @@ def write_files(found: Landscape, folder: Path, console: Console) -> None:
 
     path = folder / "figures" / "landscape.png"
     with files.naming(path):
-        figures.landscape(found, path)
+        figures.save(figures.landscape(found), path)
     console.print(f"figure: {path}")

@@ -7,7 +7,7 @@ import shlex
 import sys
 import traceback
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -15,6 +15,7 @@ from rich.console import Console
 
 from codesign_jax import codesign, engines, files, optimize, preflight, runs
 from codesign_jax.commands import common, compare, hosts, reference, status
+from codesign_jax.commands.flags import Optimize
 from codesign_jax.own import is_own, make_policy
 from codesign_jax.report import stress, verdicts
 from codesign_jax.report.verdicts import Judged
@@ -25,17 +26,13 @@ from codesign_jax.scene import Scene, schema
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.scene.schema import InputError
 
-if TYPE_CHECKING:
-    from codesign_jax.cli import Optimize
-
-
 ALTERNATE, DOMAINS = "alternate", ("morphology", "control")
 """Value of --first by which even seeds begin in the first domain and odd ones in the other."""
 _LONGEST = 200
 """Most bytes of a folder's name; file systems take 255, temporary files add to it."""
 
 
-def main(options: "Optimize") -> int:
+def main(options: Optimize) -> int:
     common.use_compilation_cache()
     if options.distributed is not None:
         return _distributed(options)
@@ -84,7 +81,7 @@ def _tell_error(name: str, error: Exception) -> None:
     print(f"error: {name}{status.words(error)}", file=sys.stderr)
 
 
-def _distributed(options: "Optimize") -> int:
+def _distributed(options: Optimize) -> int:
     """Runs this host's share of the seeds; the first host compares all of them."""
     hosts.check(options.distributed or "")
     problems = []
@@ -99,7 +96,7 @@ def _distributed(options: "Optimize") -> int:
     return hosts.in_a_process(functools.partial(_compare, options)) or code
 
 
-def _compare(options: "Optimize") -> int:
+def _compare(options: Optimize) -> int:
     """Compares the command's runs as their folders have them; whether one of them failed."""
     scene, settings = resolve(dataclasses.replace(options, fresh=False))
     every = runs_of(options, scene, settings)
@@ -126,7 +123,7 @@ def _tell(plan: Plan, result: RunResult, folder: Path, trials: int, console: Con
     with Busy(console, "drawing"), files.naming(path):
         from codesign_jax.report import figures
 
-        figures.cost_evolution(result.record.history.cost, path)
+        figures.save(figures.cost_evolution(result.record.history.cost), path)
     console.print(f"figure: {path}")
     console.print(f"results: {folder}")
     console.print(f"to look at: {shlex.join(['codesign', 'report', str(folder)])}")
@@ -139,7 +136,7 @@ def _ends(space: DesignSpace) -> dict[str, np.ndarray]:
     return dict(zip(names, np.asarray(projected), strict=True))
 
 
-def _dry_run(plan: Plan, count: int, options: "Optimize") -> None:
+def _dry_run(plan: Plan, count: int, options: Optimize) -> None:
     scene, settings = plan.scene, plan.settings
     for name, text in scene_texts(scene).items():
         print(f"# ---- {name}\n{text}")
@@ -207,7 +204,7 @@ def _judge(
         console.print(line)
 
 
-def resolve(options: "Optimize") -> tuple[Scene, Settings]:
+def resolve(options: Optimize) -> tuple[Scene, Settings]:
     """Reads the scene and fills the settings."""
     problems, scene = [], None
     try:
@@ -249,7 +246,7 @@ def resolve(options: "Optimize") -> tuple[Scene, Settings]:
     return scene, settings
 
 
-def _flag_problems(options: "Optimize") -> list[str]:
+def _flag_problems(options: Optimize) -> list[str]:
     problems = []
     if options.seeds is not None and options.seed != 0:
         problems.append("--seed and --seeds exclude each other")
@@ -265,7 +262,7 @@ def _flag_problems(options: "Optimize") -> list[str]:
     )
 
 
-def _of_the_runs(options: "Optimize", scene: Scene) -> tuple[str | None, int | None]:
+def _of_the_runs(options: Optimize, scene: Scene) -> tuple[str | None, int | None]:
     """Optimiser and episodes: where none are given, those of the runs that are there.
 
     An optimiser of somebody's own is not among them: only a command line has code imported.
@@ -282,12 +279,12 @@ def _of_the_runs(options: "Optimize", scene: Scene) -> tuple[str | None, int | N
     return optimizer, runs.setting_of(folders, "episodes") if episodes is None else episodes
 
 
-def several(options: "Optimize") -> bool:
+def several(options: Optimize) -> bool:
     """Whether the command compares runs, even if it happens to have one alone."""
     return options.seeds is not None or "," in options.schedule
 
 
-def runs_of(options: "Optimize", scene: Scene, settings: Settings) -> dict[Path, Settings]:
+def runs_of(options: Optimize, scene: Scene, settings: Settings) -> dict[Path, Settings]:
     """Settings of each run by its folder: of every strategy those of every seed."""
     found = {}
     for name in options.schedule.split(","):
@@ -298,7 +295,7 @@ def runs_of(options: "Optimize", scene: Scene, settings: Settings) -> dict[Path,
     return found
 
 
-def _folder(options: "Optimize", scene: Scene, settings: Settings) -> Path:
+def _folder(options: Optimize, scene: Scene, settings: Settings) -> Path:
     if options.out is not None:
         inside = [settings.schedule] if "," in options.schedule else []
         inside += [f"seed-{settings.seed}"] if several(options) else []

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from codesign_jax.commands import common, grasp
+from codesign_jax.commands.flags import Render
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import schema
 
 if TYPE_CHECKING:
-    from codesign_jax.cli import Render
     from codesign_jax.report.replay import Camera
 
 
-def main(options: "Render") -> int:
+def main(options: Render) -> int:
     common.use_compilation_cache()
     _check(options)
     camera = _camera(options.camera)
@@ -26,7 +26,7 @@ def main(options: "Render") -> int:
     return 0
 
 
-def _check(options: "Render") -> None:
+def _check(options: Render) -> None:
     problems = common.picture_problems("--out", options.out)
     if options.times and options.out.suffix != ".png":
         problems.append("--times are those of a strip (.png); a film shows the whole grasp")
@@ -65,7 +65,7 @@ def _camera(words: Sequence[str]) -> "Camera":
     return camera._replace(lookat=at, **numbers)
 
 
-def draw(asked: grasp.Asked, options: "Render", camera: "Camera", console: Console) -> None:
+def draw(asked: grasp.Asked, options: Render, camera: "Camera", console: Console) -> None:
     with Busy(console, "simulating the grasp"):
         shown = grasp.simulate(asked)
     from codesign_jax.report import animation

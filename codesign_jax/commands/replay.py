@@ -2,7 +2,6 @@
 
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -11,20 +10,18 @@ from rich.console import Console
 
 from codesign_jax import rollout, runs
 from codesign_jax.commands import common, grasp
+from codesign_jax.commands.flags import Replay
 from codesign_jax.runs import failures
 from codesign_jax.runs.choice import Case, refuse_other_policy
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import MEANINGS, Status, Trace
 
-if TYPE_CHECKING:
-    from codesign_jax.cli import Replay
-
 MOST = 10
 """Failed worlds that a list shows."""
 
 
-def main(options: "Replay") -> int:
+def main(options: Replay) -> int:
     common.use_compilation_cache()
     if options.first is not None and not options.first.is_dir():
         return explain(options.first, options.engine, options.policy)

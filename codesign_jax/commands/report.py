@@ -6,6 +6,9 @@ from rich.console import Console
 
 from codesign_jax import runs
 from codesign_jax.commands import common, grasp, reference
+from codesign_jax.commands.flags import Report
+from codesign_jax.report import page
+from codesign_jax.report.of_run import Run
 from codesign_jax.runs import Settings, choice
 from codesign_jax.runs.choice import Case
 from codesign_jax.runs.manifest import read_provenance
@@ -13,26 +16,18 @@ from codesign_jax.runs.progress import Busy
 from codesign_jax.runs.record import Record
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
-from codesign_jax.scene.schema import InputError
 
 if TYPE_CHECKING:
-    from codesign_jax.cli import Report
     from codesign_jax.report import animation
 
 
-def main(options: "Report") -> int:
+def main(options: Report) -> int:
     common.use_compilation_cache()
     scene, settings = runs.read_run(options.folder)
     if not options.no_replay:
         choice.refuse_other_policy(settings.policy, options.policy)
     name = options.engine or settings.engine
     common.refuse(common.engine_problems(name))
-    try:
-        from codesign_jax.report import page
-        from codesign_jax.report.of_run import Run
-    except ImportError as error:
-        message = f"a report needs {error.name}: pip install '.[report]' in the checkout"
-        raise InputError([message]) from error
     path = options.out or options.folder / "report.html"
     common.refuse(common.place_problems("--out", path))
     notes: list[str] = []

@@ -1,7 +1,6 @@
 """`codesign sample`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
@@ -10,6 +9,7 @@ from rich.console import Console
 from codesign_jax import batch, files, preflight, sampling
 from codesign_jax.codesign import VERDICTS, verdicts
 from codesign_jax.commands import common
+from codesign_jax.commands.flags import Sample
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.runs import dataset
 from codesign_jax.runs.dataset import Question, Shards
@@ -20,14 +20,11 @@ from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import Outcome
 
-if TYPE_CHECKING:
-    from codesign_jax.cli import Sample
-
 MOST = 1_000_000_000
 """Most designs of a file: their indices are int32."""
 
 
-def main(options: "Sample") -> int:
+def main(options: Sample) -> int:
     common.use_compilation_cache()
     _check(options)
     scene = common.load_scene(options)
@@ -59,7 +56,7 @@ def main(options: "Sample") -> int:
     return 0
 
 
-def _check(options: "Sample") -> None:
+def _check(options: Sample) -> None:
     problems = common.number_problems(
         ("--designs", options.designs, 1, MOST),
         ("--trials", options.trials, 1, 100_000),
@@ -73,7 +70,7 @@ def _check(options: "Sample") -> None:
     dataset.pyarrow_module("codesign sample")
 
 
-def _question(options: "Sample", scene: Scene) -> Question:
+def _question(options: Sample, scene: Scene) -> Question:
     """What is asked; without --chunk calls are as large as those that made what is there."""
     design_space(scene.hand, options.preset)
     before = Shards(options.out).question
@@ -84,7 +81,7 @@ def _question(options: "Sample", scene: Scene) -> Question:
     return Question(scene, options.engine, options.preset, options.trials, options.seed, chunk)
 
 
-def _amount(options: "Sample") -> str:
+def _amount(options: Sample) -> str:
     sizes = (options.designs, "design"), (options.trials, "trial")
     each = " x ".join(common.counted(*size) for size in sizes)
     return f"{each}: {common.counted(options.designs * options.trials, 'grasp')}"

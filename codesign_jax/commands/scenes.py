@@ -1,20 +1,16 @@
 """`codesign scenes`."""
 
-from typing import TYPE_CHECKING
-
 from rich import box
 from rich.console import Console
 from rich.table import Column, Table
 
 from codesign_jax import scene as scenes
+from codesign_jax.commands.flags import Scenes
 from codesign_jax.scene import effects, library, schema
 from codesign_jax.scene.schema import InputError
 
-if TYPE_CHECKING:
-    from codesign_jax.cli import Scenes
 
-
-def main(options: "Scenes") -> int:
+def main(options: Scenes) -> int:
     if options.engine is not None and options.engine not in effects.ENGINES:
         hint = schema.nearest(options.engine, effects.ENGINES)
         raise InputError([f"--engine {options.engine!r} is not valid; {hint}"])

@@ -20,7 +20,6 @@ def make_engine(name: str, scene: Scene) -> Engine:
 
     Args:
       name: One of `NAMES`.
-      scene: The scene.
 
     Raises:
       InputError: If there is no such engine, if `scene` is not a `Scene`, or if the engine does not

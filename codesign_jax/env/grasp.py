@@ -74,7 +74,6 @@ class GraspEnv:
     """Grasps of one hand, each of an object of the set with noise of its own.
 
     Attributes:
-      scene: The scene.
       params: Parameters of the hand.
       dt: Seconds of an action.
       episode_length: Actions of a whole grasp.

@@ -7,7 +7,7 @@ steps further out are not simulated.
 """
 
 import dataclasses
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -83,13 +83,6 @@ class Study(NamedTuple):
         return 1 + int(self.room.sum()) * self.steps
 
 
-class Round(NamedTuple):
-    """What `search` asks for."""
-
-    designs: list[int]  # indices of designs of the study
-    most: int  # designs that it may ask for after these, at most
-
-
 def study(scene: Scene, space: DesignSpace, design: np.ndarray, steps: int, *, free: bool) -> Study:
     """Plans the steps."""
     whole = space if free else design_space(scene.hand)
@@ -142,49 +135,37 @@ def shares(outcomes: Outcome) -> list[Interval]:
     return [statistics.wilson(int(n), kept.shape[1]) for n in kept.sum(1)]
 
 
-def search(planned: Study, size: int) -> Generator[Round, list[Interval], dict[int, Interval]]:
-    """Asks for the successes that the tolerances need: those of each side up to its end."""
+def search(planned: Study, shares_of: Callable[[list[int]], list[Interval]]) -> dict[int, Interval]:
+    """Shares of successful grasps by index of the design, of each side up to its end.
+
+    Of a design with too few successes itself, those of the first steps alone.
+    """
     steps, found = planned.steps, {}
     sides = [int(side) for side in np.flatnonzero(planned.room)]
     for step in range(steps):
         asked = [0] * (step == 0) + [1 + side * steps + step for side in sides]
-        for start in range(0, len(asked), size):
-            some = asked[start : start + size]
-            later = len(asked) - start - len(some) + len(sides) * (steps - step - 1)
-            found |= zip(some, (yield Round(some, later)), strict=True)
-            if found[0].value < WANTED:
-                return found
+        found |= zip(asked, shares_of(asked), strict=True)
         sides = [side for side in sides if found[1 + side * steps + step].value >= WANTED]
+        if found[0].value < WANTED or not sides:
+            break
     return found
 
 
 def tolerances(planned: Study, found: Mapping[int, Interval]) -> list[Tolerance]:
-    """Reads the tolerances off the successes."""
-    space, results, room = planned.space, [], planned.room
-    factor = np.array([UNITS[unit][1] for unit in space.units])
-    for i, name in enumerate(space.names):
-        sides = []
+    """Reads the tolerances off what `search` found."""
+    space, results, steps = planned.space, [], planned.steps
+    for i, (name, unit) in enumerate(zip(space.names, space.units, strict=True)):
+        factor, sides = UNITS[unit][1], []
         for s, end in enumerate((planned.low[i], planned.high[i])):
-            moved = _known(planned, found, i, s, factor[i])
-            sides.append(_side([*moved], float(end / factor[i]), bool(room[i, s])))
-        value = float(planned.designs[0, i] / factor[i])
-        results.append(Tolerance(name, space.units[i], value, *sides))
+            first = 1 + (2 * i + s) * steps
+            known = [k for k in range(first, first + steps) if k in found]
+            moved = [Step(float(planned.designs[k, i] / factor), found[k]) for k in known]
+            sides.append(_side(moved, float(end / factor), bool(planned.room[i, s])))
+        results.append(Tolerance(name, unit, float(planned.designs[0, i] / factor), *sides))
     return results
 
 
-def _known(
-    planned: Study, found: Mapping[int, Interval], parameter: int, side: int, factor: float
-) -> Iterator[Step]:
-    """The steps of a side whose successes are known, from the design outwards."""
-    first = 1 + (2 * parameter + side) * planned.steps
-    for k in range(first, first + planned.steps):
-        if k in found:
-            yield Step(float(planned.designs[k, parameter] / factor), found[k])
-
-
 def _side(moved: list[Step], limit: float, room: bool) -> Side:
-    if not room:
-        return Side(None, None, limit, False)
     count = next((k for k, step in enumerate(moved) if step.share.value < WANTED), len(moved))
-    good = moved[count - 1] if count else None
-    return Side(good, moved[count] if count < len(moved) else None, limit, True)
+    good, bad = moved[:count][-1:], moved[count : count + 1]
+    return Side(good[0] if good else None, bad[0] if bad else None, limit, room)

@@ -253,7 +253,6 @@ def softening_moments(scene: Scene, fields: ModelFields, angles: Any) -> Any:
     start.
 
     Args:
-      scene: The scene.
       fields: Fields with `section`; leading axes as `angles`.
       angles: Bend angles [rad], shape (..., finger, link); NumPy or JAX arrays.
 

@@ -68,7 +68,6 @@ def compile_model(
     """Compiles a fresh MuJoCo model of one hand and one trial from concrete values.
 
     Args:
-      scene: The scene.
       params: Parameters as concrete arrays.
       trial: The trial as concrete arrays.
       visual: Adds geoms that only a renderer needs (finger blocks, palm disc).

@@ -40,7 +40,6 @@ def split(scene: Scene, start: Any) -> State:
     """The state that `ModelFields.start` has; what it lacks is that of a grasp's beginning.
 
     Args:
-      scene: The scene.
       start: Array of JAX or NumPy, shape (..., n).
 
     Raises:

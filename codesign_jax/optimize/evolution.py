@@ -75,27 +75,10 @@ class Evolution:
     sigma: float = dataclasses.field(default=0.25, metadata={"static": True})
 
     def __post_init__(self) -> None:
-        """Check the static fields.
-
-        Raises:
-          ValueError: If there is no such strategy or `sigma` is not positive.
-          ModuleNotFoundError: If evosax is not installed.
-        """
         if self.name not in LEAST or not self.sigma > 0:
             raise ValueError(f"need a name of {', '.join(LEAST)} and sigma > 0: {self}")
-        try:
-            import evosax  # noqa: F401
-        except ModuleNotFoundError as error:
-            message = f"{self.name} needs evosax: pip install evosax"
-            raise ModuleNotFoundError(message, name=error.name) from error
 
     def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
-        """The state before episode 0; see `Optimizer.init`.
-
-        Raises:
-          TypeError: If `key` is not a typed key.
-          ValueError: If the shape of the seed particle or the number of particles is wrong.
-        """
         seed = check_start(self.space, key, seed_particle, num_particles, MAX_PARTICLES)
         if num_particles < LEAST[self.name]:
             raise ValueError(f"{num_particles=}: {self.name} needs at least {LEAST[self.name]}")
@@ -111,10 +94,7 @@ class Evolution:
         return state._replace(memory=memory)
 
     def ask(self, state: State, mask: ArrayLike) -> jax.Array:
-        """Particles to evaluate; see `Optimizer.ask`.
-
-        The constraint of the space may change a closed parameter, as with the particle filter.
-        """
+        # The space's constraint may change a closed parameter, as with the particle filter.
         low, high = jnp.asarray(self.space.low), jnp.asarray(self.space.high)
         unit, _ = self._asked(state, mask)
         moved = reflect(low + unit * (high - low), low, high)
@@ -124,11 +104,6 @@ class Evolution:
     def tell(
         self, state: State, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
     ) -> tuple[State, Info]:
-        """The next state and the episode's report; see `Optimizer.tell`.
-
-        Raises:
-          ValueError: If shapes do not match.
-        """
         assert state.memory is not None
         cost = check_told(state, population, cost)
         ranked = jnp.where(jnp.isfinite(cost), cost, jnp.inf)

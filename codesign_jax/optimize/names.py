@@ -1,7 +1,6 @@
 """Optimisers by name."""
 
 import difflib
-import importlib.util
 from collections.abc import Callable, Mapping
 from functools import partial
 
@@ -40,7 +39,6 @@ def make_optimizer(name: str, space: Space) -> Optimizer:
 
     Raises:
       ValueError: If there is no such optimiser.
-      ModuleNotFoundError: If it needs evosax, which is not installed.
     """
     if name not in NAMES:
         raise ValueError(problem(name))
@@ -60,8 +58,6 @@ def problem(name: str, num_particles: int | None = None) -> str | None:
         near = difflib.get_close_matches(name, NAMES, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
         return f"unknown optimizer {name!r}; {hint}Valid: {', '.join(NAMES)}"
-    if name in (*SCREENED, *EVOSAX) and importlib.util.find_spec("evosax") is None:
-        return f"{name} needs evosax: pip install evosax"
     least = screened.LEAST if name in SCREENED else LEAST.get(name, 1)
     if num_particles is not None and num_particles < least:
         return f"{name} ranks its particles: it needs at least {least}, got {num_particles}"

@@ -56,29 +56,11 @@ class ParticleFilter:
     alpha: float = dataclasses.field(default=0.2, metadata={"static": True})
 
     def __post_init__(self) -> None:
-        """Check the static fields.
-
-        Raises:
-          ValueError: If `sigma` is negative or `alpha` not positive.
-        """
         if not self.sigma >= 0 or not self.alpha > 0:
             raise ValueError(f"need sigma >= 0 and alpha > 0: {self.sigma=}, {self.alpha=}")
 
     def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
-        """Place all particles at the seed particle.
-
-        Args:
-          key: Typed key from `jax.random.key`; the root of all draws of this run.
-          seed_particle: Parameters to start from, shape (parameter,).
-          num_particles: Number of particles, 1 to `MAX_PARTICLES`.
-
-        Returns:
-          The state before episode 0.
-
-        Raises:
-          TypeError: If `key` is not a typed key.
-          ValueError: If the shape of the seed particle or the number of particles is wrong.
-        """
+        """All particles at the seed particle."""
         seed_particle = check_start(self.space, key, seed_particle, num_particles, MAX_PARTICLES)
         particles = jnp.tile(seed_particle, (num_particles, 1))
         return State(particles, jnp.zeros((), jnp.int32), key)
@@ -91,13 +73,6 @@ class ParticleFilter:
         feasibility wins: it may change a closed parameter, for example lower a closed pressure
         under a limit that sank with an open wall thickness. A particle that satisfies the
         constraint is not changed by it.
-
-        Args:
-          state: Current state; not changed, so asking again gives the same population.
-          mask: True where a parameter is open, bool, shape (parameter,).
-
-        Returns:
-          Particles to evaluate, shape (particle, parameter).
         """
         low, high = jnp.asarray(self.space.low), jnp.asarray(self.space.high)
         n, width = state.particles.shape
@@ -115,18 +90,6 @@ class ParticleFilter:
         `weight = 1 / (alpha + cost)` (section VI.1), then stochastic universal sampling with one
         uniform number. A cost that is not finite gets weight zero; where none is finite, every
         particle survives once. The weight needs costs of at least zero; lower ones count as zero.
-
-        Args:
-          state: State that `population` was asked from.
-          population: Evaluated particles, shape (particle, parameter).
-          cost: Mean cost over the trials of each particle, shape (particle,); lower is better.
-          mask: Not used: resampling copies whole particles.
-
-        Returns:
-          The state of the next episode and what happened in this one.
-
-        Raises:
-          ValueError: If shapes do not match.
         """
         cost = check_told(state, population, cost)
         finite = jnp.isfinite(cost)

@@ -98,6 +98,11 @@ class Optimizer(Protocol):
           key: Typed key from `jax.random.key`; the root of all draws of this run.
           seed_particle: Parameters to start from, shape (parameter,).
           num_particles: Particles that every episode evaluates.
+
+        Raises:
+          TypeError: If `key` is not a typed key.
+          ValueError: If the shape of the seed particle or the number of particles is wrong, or the
+            seed particle lies far outside the box.
         """
         ...
 
@@ -130,13 +135,7 @@ class Optimizer(Protocol):
 def check_start(
     space: Space, key: jax.Array, seed_particle: ArrayLike, num_particles: int, most: int
 ) -> jax.Array:
-    """Checks the arguments of `init`; returns the seed particle as an array of floats.
-
-    Raises:
-      TypeError: If `key` is not a typed key.
-      ValueError: If the shape of the seed particle or the number of particles is wrong, or the
-        seed particle lies far outside the box.
-    """
+    """Checks the arguments of `init`; returns the seed particle as an array of floats."""
     if not jnp.issubdtype(kind := jnp.result_type(key), jax.dtypes.prng_key):
         raise TypeError(f"key must be a typed key from jax.random.key, got {kind}")
     seed_particle = jnp.asarray(seed_particle, float)
@@ -149,7 +148,6 @@ def check_start(
 
 
 def _refuse_far(space: Space, particle: jax.Array) -> None:
-    """Refuses a particle as far from the box as another unit puts it, if it is not traced."""
     values = particle, space.low, space.high
     if any(isinstance(v, jax.core.Tracer) or np.ndim(v) != 1 for v in values):
         return
@@ -162,11 +160,7 @@ def _refuse_far(space: Space, particle: jax.Array) -> None:
 
 
 def check_told(state: State, population: jax.Array, cost: ArrayLike) -> jax.Array:
-    """Checks the arguments of `tell`; returns the costs as an array of the population's type.
-
-    Raises:
-      ValueError: If shapes do not match.
-    """
+    """Checks the arguments of `tell`; returns the costs as an array of the population's type."""
     cost = jnp.asarray(cost, population.dtype)
     if population.shape != state.particles.shape or cost.shape != population.shape[:1]:
         raise ValueError(

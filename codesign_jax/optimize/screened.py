@@ -98,11 +98,6 @@ class Screened:
     recency: float = dataclasses.field(default=4.0, metadata={"static": True})
 
     def __post_init__(self) -> None:
-        """Check the static fields.
-
-        Raises:
-          ValueError: If one of them is out of its range.
-        """
         if self.strategy not in STRATEGIES:
             raise ValueError(f"need a strategy of {', '.join(STRATEGIES)}: {self}")
         if not (min(self.screening, self.retests, self.sigma) >= 0 and self.recency >= 1):
@@ -119,14 +114,7 @@ class Screened:
         return self.screening + self.retests
 
     def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
-        """The state before episode 0; see `Optimizer.init`.
-
-        The seed particle gives the parameters that a schedule closes from the start.
-
-        Raises:
-          TypeError: If `key` is not a typed key.
-          ValueError: If the shape of the seed particle or the number of particles is wrong.
-        """
+        # The seed particle gives the parameters that a schedule closes from the start.
         seed = check_start(self.space, key, seed_particle, num_particles, MAX_PARTICLES)
         if num_particles < LEAST:
             raise ValueError(f"{num_particles=}: a screened search needs at least {LEAST}")
@@ -139,10 +127,7 @@ class Screened:
         return state._replace(memory=memory | self._start(state))
 
     def ask(self, state: State, mask: ArrayLike) -> jax.Array:
-        """Particles to evaluate; see `Optimizer.ask`.
-
-        The constraint of the space may change a closed parameter, as with the particle filter.
-        """
+        # The space's constraint may change a closed parameter, as with the particle filter.
         key, shape = episode_key(state, STREAM_SCREEN), state.particles.shape
         drawn = jax.random.uniform(key, shape, state.particles.dtype)
         unit = jnp.where(self._screens(state), drawn, self._asked(state, mask)[0])
@@ -154,11 +139,6 @@ class Screened:
     def tell(
         self, state: State, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
     ) -> tuple[State, Info]:
-        """The next state and the episode's report; see `Optimizer.tell`.
-
-        Raises:
-          ValueError: If shapes do not match.
-        """
         assert state.memory is not None
         cost = check_told(state, population, cost)
         ranked, screens = jnp.where(jnp.isfinite(cost), cost, jnp.inf), self._screens(state)

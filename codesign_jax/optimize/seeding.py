@@ -110,16 +110,7 @@ def answer(asking: Generator[Any, Any, T], reply: Callable[[Any], Any]) -> T:
 def translated(
     asking: Generator[Any, Any, T], request: Callable[[Any], Any], reply: Callable[[Any], Any]
 ) -> Generator[Any, Any, T]:
-    """A generator that asks for what another one asks for, in other terms.
-
-    Args:
-      asking: The other one.
-      request: What to yield for what it asks for.
-      reply: What to send it for what is sent here.
-
-    Returns:
-      What it returns.
-    """
+    """A generator that asks for request(x) where another asks for x, and is told reply(answer)."""
     try:
         wanted = next(asking)
         while True:

@@ -1,20 +1,58 @@
-"""Figures of a run (matplotlib)."""
+"""Figures of a run (matplotlib), as files and as pictures of its report."""
 
+import base64
+import io
 from pathlib import Path
 
+import matplotlib
 import matplotlib.figure
 import numpy as np
+from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
 from codesign_jax import files
 from codesign_jax.codesign import CONVERGED_COST, SUCCESS_COST
 from codesign_jax.report.landscape import Landscape
+from codesign_jax.report.markup import text
+from codesign_jax.runs.record import History
+from codesign_jax.scene import Scene
+from codesign_jax.scene.parameters import DesignSpace
+from codesign_jax.types import WARNINGS, Forces, Status
+
+_BLUE, _ORANGE = "tab:blue", "tab:orange"
+_COLUMNS = 3  # of the grid of parameters
+
+
+def save(figure: matplotlib.figure.Figure, path: Path) -> Path:
+    """Writes a figure as a whole or not at all."""
+    with files.atomically(path) as part:  # whose name does not say the kind of picture
+        figure.savefig(part, format=path.suffix.lstrip(".") or "png")
+    return path
+
+
+def html(figure: matplotlib.figure.Figure, name: str) -> str:
+    """A figure as a piece of a page that needs no other file."""
+    buffer = io.BytesIO()
+    with matplotlib.rc_context({"svg.fonttype": "none"}):  # the browser's letters
+        figure.savefig(buffer, format="svg")
+    data = base64.b64encode(buffer.getvalue()).decode()
+    source = f"data:image/svg+xml;base64,{data}"
+    return f"<img class='figure' id='{name}' alt='{text(name)}' src='{source}'>"
+
+
+def _figure(width: float, height: float) -> matplotlib.figure.Figure:
+    # A figure of its own instead of pyplot's: no state and no display is touched.
+    return matplotlib.figure.Figure(figsize=(width, height), dpi=120, layout="constrained")
+
+
+def _above(axes: Axes, columns: int = 3) -> None:
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=columns, frameon=False)
 
 
 def cost_evolution(
-    cost: ArrayLike, path: Path, *, threshold: float = CONVERGED_COST, title: str = ""
-) -> Path:
-    """Draws the evolution of the cost as Fig. 6 of the paper.
+    cost: ArrayLike, *, threshold: float = CONVERGED_COST, title: str = ""
+) -> matplotlib.figure.Figure:
+    """The evolution of the cost as Fig. 6 of the paper.
 
     Dots are the costs of the particles, the line is their mean, and the dashed line is the
     threshold that defines convergence.
@@ -24,33 +62,30 @@ def cost_evolution(
     """
     cost = np.asarray(cost)
     episode = np.arange(1, len(cost) + 1)
-    # A figure of its own instead of pyplot's: no state and no display is touched.
-    figure = matplotlib.figure.Figure(figsize=(6.4, 3.6), dpi=120, layout="constrained")
+    figure = _figure(6.4, 3.6)
     axes = figure.add_subplot()
-    axes.plot(
-        np.repeat(episode, cost.shape[1]), cost.ravel(), ".", color="tab:blue", alpha=0.4, ms=5
-    )
-    axes.plot([], [], ".", color="tab:blue", label="particle")
-    axes.plot(episode, cost.mean(1), color="tab:orange", lw=2, label="mean of the particles")
+    dots = {"color": _BLUE, "alpha": 0.4, "ms": 5, "rasterized": True}  # of thousands
+    axes.plot(np.repeat(episode, cost.shape[1]), cost.ravel(), ".", **dots)
+    axes.plot([], [], ".", color=_BLUE, label="particle")
+    axes.plot(episode, cost.mean(1), color=_ORANGE, lw=2, label="mean of the particles")
     axes.axhline(threshold, color="black", lw=1, ls="--", label="convergence threshold")
     axes.set(xlabel="episode", ylabel="cost", title=title, xlim=(0, len(cost) + 1))
     axes.set_ylim(bottom=-0.05)
     axes.locator_params(axis="x", integer=True)
-    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False)
-    return _save(figure, path)
+    _above(axes)
+    return figure
 
 
-def landscape(found: Landscape, path: Path) -> Path:
-    """Draws the mean cost over a grid of two parameters as Fig. 8 of the paper: white where low.
+def landscape(found: Landscape) -> matplotlib.figure.Figure:
+    """The mean cost over a grid of two parameters as Fig. 8 of the paper: white where low.
 
     Lines enclose where the mean cost is below the thresholds of convergence and of success.
     """
-    figure = matplotlib.figure.Figure(figsize=(5.6, 4.4), dpi=120, layout="constrained")
+    figure = _figure(5.6, 4.4)
     axes = figure.add_subplot()
+    _landscape(axes, found)
+    lines = ((CONVERGED_COST, _ORANGE, "--"), (SUCCESS_COST, "tab:red", "-"))
     x, y, cost = found.first, found.second, found.cost.T
-    image = axes.pcolormesh(x, y, cost, cmap="gray_r", shading="nearest", vmin=0)
-    figure.colorbar(image, label=f"mean cost of {int(found.trials)} trials")
-    lines = ((CONVERGED_COST, "tab:orange", "--"), (SUCCESS_COST, "tab:red", "-"))
     for level, color, style in lines:
         if cost.min() < level <= cost.max():
             axes.contour(x, y, cost, [level], colors=color, linestyles=style, linewidths=1.2)
@@ -59,10 +94,108 @@ def landscape(found: Landscape, path: Path) -> Path:
         axes.legend(loc="upper left", fontsize=8)
     labels = [f"{n} [{u}]" for n, u in zip(found.names, found.units, strict=True)]
     axes.set(xlabel=labels[0], ylabel=labels[1])
-    return _save(figure, path)
+    return figure
 
 
-def _save(figure: matplotlib.figure.Figure, path: Path) -> Path:
-    with files.atomically(path) as part:  # whose name does not say the kind of picture
-        figure.savefig(part, format=path.suffix.lstrip(".") or "png")
-    return path
+def _landscape(axes: Axes, found: Landscape) -> None:
+    grid = found.first, found.second, found.cost.T
+    image = axes.pcolormesh(*grid, cmap="gray_r", shading="nearest", vmin=0, rasterized=True)
+    label = f"mean cost of {int(found.trials)} trials"
+    axes.figure.colorbar(image, ax=axes, label=label)
+
+
+def designs(
+    history: History, space: DesignSpace, chosen: np.ndarray, found: Landscape | None
+) -> matplotlib.figure.Figure:
+    """All particles of a run with two parameters, over the landscape where there is one.
+
+    Args:
+      chosen: The chosen design [SI units], shape (2,).
+    """
+    figure = _figure(6.4, 4.4)
+    axes = figure.add_subplot()
+    if found is not None:
+        _landscape(axes, found)
+    x, y = space.in_units(history.population.reshape(-1, 2)).T
+    dots = {"s": 14, "edgecolors": "white", "linewidths": 0.4, "vmin": 0, "rasterized": True}
+    scatter = axes.scatter(x, y, c=history.cost.ravel(), label="particle", **dots)
+    figure.colorbar(scatter, ax=axes, label="cost")
+    star = {"marker": "*", "s": 200, "color": _ORANGE, "edgecolors": "black", "linewidths": 0.8}
+    axes.scatter(*space.in_units(chosen)[:, None], label="chosen design", **star)
+    labels = [f"{n} [{u}]" for n, u in zip(space.names, space.units, strict=True)]
+    axes.set(xlabel=labels[0], ylabel=labels[1])
+    _above(axes)
+    return figure
+
+
+def parameters(
+    history: History, space: DesignSpace, chosen: np.ndarray
+) -> matplotlib.figure.Figure:
+    """Distribution of every parameter over the episodes: range, quartiles and median.
+
+    Args:
+      chosen: The chosen design [SI units], shape (parameter,), drawn as a line.
+    """
+    columns = min(_COLUMNS, space.num_parameters)
+    rows = -(-space.num_parameters // columns)
+    figure = _figure(9.6, 0.6 + 1.9 * rows)
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    values, low, high, shown = (
+        space.in_units(np.array(v)) for v in (history.population, space.low, space.high, chosen)
+    )
+    episode = np.arange(1, len(values) + 1)
+    for k, axes in enumerate(grid[: space.num_parameters]):
+        for ends, shade, name in (((0, 100), 0.15, "range"), ((25, 75), 0.3, "quartiles")):
+            between = np.percentile(values[..., k], ends, axis=1)
+            axes.fill_between(episode, *between, color=_BLUE, alpha=shade, lw=0, label=name)
+        axes.plot(episode, np.median(values[..., k], 1), color=_BLUE, label="median")
+        axes.axhline(shown[k], color=_ORANGE, lw=1.2, ls=":", label="chosen design")
+        axes.set(ylim=(low[k], high[k]), title=f"{space.names[k]} [{space.units[k]}]")
+        axes.locator_params(axis="x", integer=True)
+    for axes in grid[space.num_parameters :]:
+        axes.set_visible(False)
+    handles, names = grid[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside upper center", ncols=4, frameon=False)
+    return figure
+
+
+def grip(forces: Forces, scene: Scene) -> matplotlib.figure.Figure:
+    """Normal force of each finger on the object, and the palm's force, over time.
+
+    Args:
+      forces: Forces of a grasp, arrays of shape (time, ...).
+    """
+    figure = _figure(7.6, 3.0)
+    axes = figure.add_subplot()
+    time = scene.discretization.timestep * np.arange(len(forces.grip))
+    series = {f"finger {i}": forces.grip[:, i] for i in range(forces.grip.shape[1])}
+    series["palm"] = np.linalg.norm(forces.palm, axis=1)
+    for name, force in series.items():
+        axes.plot(time, force, lw=1.2, label=name)
+    for name, end in scene.phase_ends.items():
+        axes.axvline(end, color="0.5", lw=0.8, ls=":")
+        how = {"rotation": 90, "ha": "right", "va": "top", "fontsize": 7, "color": "0.4"}
+        axes.text(end, 1.0, f"{name} ", transform=axes.get_xaxis_transform(), **how)
+    axes.set(xlabel="time [s]", ylabel="force [N]")
+    _above(axes, len(series))
+    return figure
+
+
+def failures(status: np.ndarray) -> matplotlib.figure.Figure:
+    """How often each cause of failure occurs in each episode.
+
+    Args:
+      status: Bits of `Status`, shape (episode, particle, trial).
+    """
+    figure = _figure(6.4, 2.8)
+    axes = figure.add_subplot()
+    episode, below = np.arange(1, len(status) + 1), np.zeros(len(status))
+    for bit in (b for b in Status if b and b not in WARNINGS):
+        count = ((status & bit) != 0).sum((1, 2))
+        if count.any():
+            axes.bar(episode, count, bottom=below, label=bit.name)
+            below = below + count
+    axes.set(xlabel="episode", ylabel="trials")
+    axes.locator_params(axis="x", integer=True)
+    _above(axes)
+    return figure

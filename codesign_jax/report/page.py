@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from codesign_jax import codesign, files, types
-from codesign_jax.report import charts, chosen, landscape, markup, verdicts, viewer
+from codesign_jax.report import chosen, figures, landscape, markup, verdicts, viewer
 from codesign_jax.report.of_run import Run
 from codesign_jax.report.replay import Replay
 from codesign_jax.runs import SCENE_COST, choice, tables
@@ -28,7 +28,7 @@ def write(run: Run, grasp: tuple[Grasp, Replay] | None, path: Path) -> Path:
         markup.section(
             "Cost",
             markup.paragraph(_cost_note(run)),
-            charts.html(charts.cost_evolution(run.history), "cost"),
+            figures.html(figures.cost_evolution(run.history.cost), "cost"),
         ),
         _parameters(run),
         _landscape(run),
@@ -40,7 +40,7 @@ def write(run: Run, grasp: tuple[Grasp, Replay] | None, path: Path) -> Path:
     head = f"<h1>{markup.text(title)}</h1>\n<p class='note'>codesign-jax, report of {now}</p>\n"
     with files.atomically(path) as part:
         body = head + "\n".join(sections)
-        part.write_text(viewer.page(title, body, charts.plotly_source()), encoding="utf-8")
+        part.write_text(viewer.page(title, body), encoding="utf-8")
     return path
 
 
@@ -111,7 +111,7 @@ def _grasp(run: Run, grasp: tuple[Grasp, Replay] | None) -> str:
             "Below: the fingers' normal forces on the object, and the palm's force. Largest depths "
             f"in one another over this grasp: {verdicts.depths(forces)}."
         )
-        chart = charts.html(charts.grip_chart(forces, run.scene), "grip")
+        chart = figures.html(figures.grip(forces, run.scene), "grip")
         parts += [markup.paragraph(text), chart]
     return markup.section("Best grasp", markup.paragraph(note), *parts)
 
@@ -129,8 +129,8 @@ def _parameters(run: Run) -> str:
         "Distribution of the particles over the episodes; an axis spans the parameter's range. "
         "A band that stays wide says that selection did not narrow the parameter."
     )
-    figure = charts.parameter_chart(run.history, run.space, run.chosen.design)
-    return markup.section("Parameters", markup.paragraph(note), charts.html(figure, "parameters"))
+    figure = figures.parameters(run.history, run.space, run.chosen.design)
+    return markup.section("Parameters", markup.paragraph(note), figures.html(figure, "parameters"))
 
 
 def _landscape(run: Run) -> str:
@@ -141,18 +141,18 @@ def _landscape(run: Run) -> str:
         if space.num_parameters != 2:
             return ""
         words, command = words + "The whole landscape: ", ["landscape", "--run", str(run.folder)]
-        figure = charts.designs(run.history, space, run.chosen.design, None)
+        figure = figures.designs(run.history, space, run.chosen.design, None)
     else:
         grey = f"the mean cost over {int(found.trials)} trials a point, white where all are kept."
         if tuple(found.names) == space.names:
             words += f"In grey {grey}"
-            figure = charts.designs(run.history, space, run.chosen.design, found)
+            figure = figures.designs(run.history, space, run.chosen.design, found)
         else:
             own = np.allclose(found.design, run.chosen.design)
             around = "the chosen design" if own else "another design, which landscape.npz has"
             words = f"In grey {grey} The other parameters are those of {around}."
-            figure = charts.landscape_figure(found)
-    section = markup.paragraph(words, "", command), charts.html(figure, "landscape")
+            figure = figures.landscape(found)
+    section = markup.paragraph(words, "", command), figures.html(figure, "landscape")
     return markup.section("Landscape", *section)
 
 
@@ -175,7 +175,7 @@ def _failures(run: Run) -> str:
     if not rows:
         return markup.section("Failures by cause", markup.paragraph(note))
     table = markup.table(("status", "trials", "share", "meaning"), rows, (1, 2))
-    figure = charts.html(charts.failure_chart(status), "failures")
+    figure = figures.html(figures.failures(status), "failures")
     return markup.section("Failures by cause", markup.paragraph(note), table, figure)
 
 

@@ -5,6 +5,7 @@ No OpenGL is needed, so that a picture always exists and is the same everywhere.
 
 import itertools
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -54,7 +55,7 @@ def paint(
     table = scene.effects.table and view.eye[2] > 0
     if table:
         _paint_table(ImageDraw.Draw(empty), view)
-    picture, before = None, None
+    picture, before = None, np.zeros(0)
     for pose in bodies.poses(scene, grasp, qpos):
         if picture is not None and np.array_equal(pose, before):  # one that was lost stands still
             yield picture
@@ -71,7 +72,8 @@ def _fine(part: Part) -> Part:
     """A rigid part with small triangles."""
     if part.weight.any():
         return part
-    vertices, face = trimesh.remesh.subdivide_to_size(part.first, part.face, _EDGE)
+    fine: Any = trimesh.remesh.subdivide_to_size(part.first, part.face, _EDGE)
+    vertices, face = fine[:2]
     body = np.full((len(vertices), 2), part.body[0, 0])
     weight = np.zeros(len(vertices))
     return part._replace(first=vertices, second=vertices, body=body, weight=weight, face=face)

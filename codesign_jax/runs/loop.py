@@ -112,7 +112,6 @@ def prepare(scene: Scene, settings: Settings) -> Plan:
     """Builds everything that a run needs in memory, so that errors come before any file.
 
     Args:
-      scene: The scene.
       settings: Settings without `settings.check`'s problems.
 
     Raises:

@@ -33,7 +33,6 @@ def read_run(
     """Reads scene and settings of a run folder.
 
     Args:
-      path: The folder.
       object_set: Object set instead of the run's.
       accuracy: Preset of discretization and solver instead of the run's.
       overrides: Values by key path that replace the run's; see `scene.load`.
@@ -53,7 +52,6 @@ def load_record(folder: Path, *, tell: Tell | None = None) -> Record | None:
     """Reads the newest whole checkpoint of a run folder; None if it has none.
 
     Args:
-      folder: The folder.
       tell: Called with what is amiss, such as newer checkpoints that are damaged; None to warn.
 
     Raises:

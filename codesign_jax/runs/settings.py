@@ -106,7 +106,6 @@ def check(settings: Settings, hand: Hand | None) -> list[str]:
     """Returns everything that is wrong with the settings.
 
     Args:
-      settings: The settings.
       hand: The hand, or None if it could not be read; then its presets are not checked.
     """
     found = []

@@ -160,7 +160,6 @@ class Scene(SceneFile):
 
     @property
     def _phases(self) -> list[str]:
-        """Names of the phases that are on, in order."""
         on = {"disturb": self.effects.disturb, "ungrasp": self.effects.ungrasp}
         return [name for name in PHASES if on.get(name, True)]
 
@@ -213,7 +212,6 @@ class Scene(SceneFile):
 
 @functools.cache
 def _structure(tree: Any) -> Scene:
-    """`Scene.structure` of the tree of a bare scene."""
     bare = jax.tree.unflatten(tree, [0] * tree.num_leaves)
     step, last = bare.discretization.timestep, PHASES.index(bare._phases[-1])
     time = bare.num_steps * step - bare.phases.settle

@@ -217,7 +217,6 @@ class DesignSpace:
     def _outside(
         self, units: Sequence[str], low: np.ndarray, high: np.ndarray, rows: np.ndarray
     ) -> list[str]:
-        """Which parameters are outside of the bounds, all in these units, of rows as above."""
         ends = zip(self.names, units, low, high, rows.T, strict=True)
         return [problem for end in ends if (problem := unit_slips.outside(*end))]
 
@@ -307,7 +306,6 @@ def _projected(space: DesignSpace, design: jax.Array) -> jax.Array:
 
 
 def _caps(hand: Hand, value: Callable[[str], Any]) -> Any:
-    """Highest pressures of fingers, from the values of their parameters by name."""
     tip = [value(name) for name in TIP] if hand.section.tapered else None
     return highest_pressure(hand, value("height"), value("wall"), tip)
 
@@ -325,7 +323,6 @@ def _sampled(space: DesignSpace, n: int, key: jax.Array, first: Any) -> jax.Arra
 
 
 def _representable(space: DesignSpace) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds as JAX's floats, none beyond the space's own by rounding."""
     kind = np.dtype(jnp.result_type(float))
     low, high = space.low.astype(kind), space.high.astype(kind)
     low = np.where(low < space.low, np.nextafter(low, kind.type(np.inf)), low)
@@ -333,7 +330,6 @@ def _representable(space: DesignSpace) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _refuse_draws(key: Any, n: Any) -> None:
-    """Refuses what no designs can be drawn from."""
     if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
         raise schema.InputError([f"n = {n!r} designs must be a whole number, at least 1"])
     shape, kind = jnp.shape(key), jnp.result_type(key)
@@ -373,7 +369,6 @@ def design_space(hand: Hand, preset: str = "full") -> DesignSpace:
     """Builds the design space of a preset; parameters of the scene's control are free as well.
 
     Args:
-      hand: The hand.
       preset: Name of a preset of the hand, or "full" for the whole table (the paper's 23D; "23d"
         for a table of 23 parameters).
 
@@ -393,7 +388,6 @@ def design_space(hand: Hand, preset: str = "full") -> DesignSpace:
 
 
 def _hint(preset: str, names: list[str]) -> str:
-    """The preset that an unknown name comes closest to, of numbers of parameters the next one."""
     sizes = {int(name[:-1]): name for name in names if re.fullmatch(r"\d+d", name)}
     if sizes and re.fullmatch(r"\d+[dD]", preset):
         return f"did you mean {sizes[min(sizes, key=lambda n: abs(n - int(preset[:-1])))]!r}?"

@@ -11,7 +11,7 @@ import json
 import socket
 import threading
 import webbrowser
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Console
 from websockets.exceptions import ConnectionClosed
@@ -20,6 +20,7 @@ from websockets.sync.server import Server, ServerConnection
 from codesign_jax import preflight
 from codesign_jax.codesign import VERDICTS
 from codesign_jax.commands import common
+from codesign_jax.commands.flags import Studio as Options
 from codesign_jax.report import viewer
 from codesign_jax.runs import choice, tables
 from codesign_jax.runs.interrupts import interruptible
@@ -28,11 +29,8 @@ from codesign_jax.scene.schema import InputError
 from codesign_jax.studio import server
 from codesign_jax.studio.tab import COUNTS, Desk, Tab
 
-if TYPE_CHECKING:
-    from codesign_jax.cli import Studio as Options
 
-
-def main(options: "Options") -> int:
+def main(options: Options) -> int:
     common.use_compilation_cache()
     problems = common.number_problems(("--port", options.port, 0, 65535))
     common.refuse(problems + common.place_problems("--out", options.out, folder=True))

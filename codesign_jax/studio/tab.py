@@ -14,7 +14,7 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from codesign_jax import Task, codesign, files, rollout, runs
 from codesign_jax.codesign import VERDICTS
 from codesign_jax.commands import common
+from codesign_jax.commands.flags import Studio as Options
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording, tells_forces
 from codesign_jax.model import morphology, overlap
@@ -34,9 +35,6 @@ from codesign_jax.scene import Scene, library
 from codesign_jax.scene.loading import with_accuracy
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome, Params, Trial, failed
-
-if TYPE_CHECKING:
-    from codesign_jax.cli import Studio as Options
 
 COUNTS = (24, 48, 96, 240)
 """Numbers of trials that a verdict may have."""
@@ -118,7 +116,7 @@ def _outcomes(scene: Scene, engine: Engine, params: Params, trials: Trial) -> Ou
 class Desk:
     """What all tabs share: a case with its programs, its run, and where files go."""
 
-    def __init__(self, options: "Options") -> None:
+    def __init__(self, options: Options) -> None:
         self.options = options
         self.case = common.find_case(options)
         common.refuse(common.engine_problems(self.case.engine))

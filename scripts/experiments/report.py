@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from codesign_jax.codesign import CONVERGED_COST, SUCCESS_COST, convergence_episode
-from codesign_jax.report.figures import cost_evolution
+from codesign_jax.report import figures
 from codesign_jax.report.statistics import Interval, wilson
 from codesign_jax.types import WARNINGS
 from scripts.experiments.simulate import BITS, PAPER_GRASPS, TOTAL_GRASPS
@@ -158,7 +158,8 @@ def draw_evolution(study: Study, path: Path) -> Path:
     """Draws Fig. 6: the particle costs of the run that converges at the median speed."""
     run = typical_run(study)
     title = f"{study.strategies[-1]}, run {run} of {study.plan['runs']}"
-    return cost_evolution(study.data["particle_cost"][run].astype(float), path, title=title)
+    costs = study.data["particle_cost"][run].astype(float)
+    return figures.save(figures.cost_evolution(costs, title=title), path)
 
 
 def draw_success(study: Study, path: Path) -> Path:

@@ -130,7 +130,9 @@ def support_table() -> list[list[str]]:
         for engine in ENGINES:
             refused = effect.refused.get(engine, {})
             words = [f"not {str(v).lower() if isinstance(v, bool) else v}" for v in refused]
-            cells.append(", ".join(words) or "yes")
+            hull = "hull" in EFFECTS["surface"].refused.get(engine, {})
+            idle = hull and "with the hull" in effect.meaning
+            cells.append(", ".join(words) or ("no hull" if idle else "yes"))
         table.append([f"`{name}`", effect.meaning, *cells])
     return table
 
@@ -139,6 +141,8 @@ def measured(results: dict[str, Any]) -> str:
     """What measured, and a row for each change of the scene."""
     table = [["change", "same verdicts", "success (95 %)", "time of a step (quartiles)"]]
     for name, r in results["effects"].items():
+        if r["success_high"] < 0.02:  # nothing is held: there is no grasp to time
+            continue
         low, high = r["ratio_quartiles"]
         cells = [f"{100 * r['same_verdict']:.1f} %", f"{100 * r['success']:.1f} %"]
         cells[1] += f" ({100 * r['success_low']:.1f} to {100 * r['success_high']:.1f})"

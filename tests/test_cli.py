@@ -106,8 +106,11 @@ def test_version(capsys):
     assert capsys.readouterr().out == f"codesign-jax {project['project']['version']}\n"
 
 
-def test_ctrl_c_is_one_line_and_ends_the_process(monkeypatch, capsys):
+def test_ctrl_c_is_one_line_and_ends_the_process(monkeypatch, capsys, request):
     """A simulation may hold the process for minutes: what waits for it must not."""
+    # A shell that starts the suite in its background has Ctrl-C ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
     going, left = threading.Event(), []
 
     def simulate(*arguments):

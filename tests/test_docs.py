@@ -176,7 +176,6 @@ def commits(text):
 
 
 BEFORE = {
-    "effects.json": ("docs/effects.md",),
     "experiments/23d.json": ("README.md", "docs/results.md", "docs/notes/results.md"),
     "experiments/fresh.json": ("docs/results.md", "docs/notes/results.md"),
     "rates_h100.json": ("docs/performance.md",),

@@ -139,9 +139,8 @@ def main(names: list[str]) -> None:
 HEAD = """# Hands that were found
 
 Each hand is the answer of one search, by the command beside it, and was judged in 100 fresh trials
-at the accuracy of the search. A name is the design as `--design` takes it: try `codesign studio
---design FILE`. On another machine a search may find another hand. `python -m scripts.gallery`
-makes this page.
+at the accuracy of the search. `--design` takes its file, as in `codesign studio --design FILE`. On
+another machine a search may find another hand. `python -m scripts.gallery` makes this page.
 
 | | |
 | --- | --- |"""

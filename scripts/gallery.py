@@ -138,9 +138,9 @@ def main(names: list[str]) -> None:
 
 HEAD = """# Hands that were found
 
-Each hand is the answer of one search, by the command beside it, and was judged in 100 fresh trials
-at the accuracy of the search. `--design` takes its file, as in `codesign studio --design FILE`. On
-another machine a search may find another hand. `python -m scripts.gallery` makes this page.
+Each hand is the answer of one search, by the command beside it ([bin and shelf](scenes.md): of one
+of twelve seeds), judged in 100 fresh trials at the accuracy of the search. `--design` takes its
+file. On another machine a search may find another hand. `python -m scripts.gallery` makes the page.
 
 | | |
 | --- | --- |"""

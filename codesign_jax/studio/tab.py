@@ -102,8 +102,10 @@ class Bench:
 
     def warm(self, design: np.ndarray) -> None:
         """Compiles the programs that a moved slider needs."""
-        for engine in (None, self.recorder):
-            self.grasp(View(design, "", 0, None, 0, False, None), engine)
+        view = View(design, "", 0, None, 0, False, None)
+        self.grasp(view)
+        if self.recorder:
+            self.grasp(view, self.recorder)
         self.outcomes(design, 0)
 
 

@@ -45,8 +45,8 @@ CORE := layers scene parameters optimizers compiler planted_faults codesign run_
 quick: $(QUICK)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(CORE:%=tests/test_%.py)
 
-# What needs a browser: the report, its 3D replay and the studio in a headless Chromium.
-test-browser: $(STAMP)
+# What needs a browser: the report, its 3D replay, the studio and the documentation's site.
+test-browser: docs
 	$(BIN)/python -m pytest -q -m browser -rs $$(grep -l mark.browser tests/test_*.py)
 
 # Kernels for GPUs by NVIDIA's assembler, without a GPU: a minute of one core.

@@ -76,6 +76,13 @@ WRONG = {
     "evaluate --pull 1,nan,0": "--pull 1,nan,0 must be down, x, y, z",
     "check --accuracy reference": "accuracy reference is what others are compared with",
     "check --seconds 0": "--seconds = 0.0 is outside",
+    "export --design lenght=95 arm_z=900 --trials 1 --out out": (
+        "--design 'lenght' is not a parameter; did you mean 'length'|arm_z"
+    ),
+    f"export --scene {TINY} --set effects.surface=hull --engine mujoco --tolerance all --out out": (
+        "not supported by engine mujoco: effects.surface"
+    ),
+    "export --trials -1 --out out": "--trials",
     "sample --designs 0 --out a.parquet": "--designs = 0 is outside [1, 1e+09]",
     "sample --out a.csv": "--out a.csv must end in .parquet",
     "sample --out /proc/a.parquet": "--out /proc/a.parquet cannot be written",

@@ -54,8 +54,7 @@ def test_runs_of_folders_are_rows(place, tmp_path, monkeypatch, capsys):
     # Neither a test nor fresh trials: the search was stopped after five episodes.
     [stopped] = [line for line in lines if line.startswith("screened")]
     assert stopped.endswith("screened-es 23d structured 0 episode 6")
-    with table.open(newline="") as file:
-        rows = [*csv.DictReader(file)]
+    rows = [*csv.DictReader(table.read_text().splitlines())]
     assert [row["seed"] for row in rows] == ["3", "0", "0", "1"]
     there = [(tmp_path / row["run"]).resolve() for row in rows]
     assert there[-1] == (place / "seeds" / "seed-1").resolve()
@@ -223,8 +222,7 @@ def test_a_table_of_trials_has_noise_and_endings(finished, tmp_path, capsys):
     assert command(*asked, "--out", table) == 0
     output = capsys.readouterr().out
     assert f"particle 1 of {finished}" in output and f"length={float(rows[1][-2]):.4g} mm" in output
-    with table.open(newline="") as file:
-        found = [*csv.DictReader(file)]
+    found = [*csv.DictReader(table.read_text().splitlines())]
     assert [*found[0]] == [*columns.MORE[columns.REFERENCE].columns]
     drawn = rollout.sample_trials(runs.read_run(finished)[0], jax.random.key(seed), 3)
     for row, x, mass in zip(found, drawn.position[:, 0], drawn.mass, strict=True):

@@ -13,21 +13,13 @@ from codesign_jax.compiler import launch
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.scene import constants, schema
-from tests.helpers.grasps import hand_world, pinch, random_constants
+from tests.helpers.grasps import hand_world, hurried, off, pinch, random_constants
 
 # Compiling takes longer than all that is done with a program here.
 QUICK = {"xla_backend_optimization_level": 0}
-SHORT = dict(  # 30 steps, with every phase
-    phases__approach=0.1,
-    phases__inflate=0.15,
-    phases__lift=0.2,
-    phases__disturb=0.25,
-    phases__ungrasp=0.3,
-    phases__deflate_time=0.02,
-)
-
-
-BARE = {f"effects__{n}": False for n in ("palm_object", "palm_table", "finger_table", "twist")}
+# 30 steps, with every phase
+SHORT = hurried(0.1, 0.15, 0.2, 0.25, 0.3) | {"phases__deflate_time": 0.02}
+BARE = off("palm_object palm_table finger_table twist")
 
 
 def short(**settings):
@@ -156,28 +148,19 @@ def test_derivatives_equal_differences():
 
 def test_later_noise_leaves_earlier_draws_alone():
     """Friction, stiffness and the hand's masses have keys of their own; their factors are 1."""
-    the_scene, key = scene.load("paper_spheres"), jax.random.key(3)
-    plain = jax.device_get(rollout.sample_trials(the_scene, key, 5))
-    np.testing.assert_array_equal(plain.friction, 1.0)
-    np.testing.assert_array_equal(plain.stiffness, 1.0)
-    np.testing.assert_array_equal(plain.hand_mass, 1.0)
-
-    @jax.jit
-    @jax.vmap
-    def normals(t):
-        own = jax.random.fold_in(key, t)
-        one, two = jax.random.fold_in(own, 1), jax.random.fold_in(own, 2)
-        return jax.random.normal(own, (7,)), jax.random.normal(one, (2,)), jax.random.normal(two)
-
-    z, later, last = jax.device_get(normals(np.arange(5)))
-    np.testing.assert_allclose(plain.mass, 1 + 0.05 * z[:, 5], rtol=1e-6)
-    noise = {"friction": 0.3, "stiffness": 0.1, "hand_mass": 0.2}
-    noisy = scene.load("paper_spheres", overrides={"objects.noise": noise})
-    drawn = jax.device_get(rollout.sample_trials(noisy, key, 5))
-    np.testing.assert_array_equal(drawn.mass, plain.mass)
-    factors = drawn.friction, drawn.stiffness, drawn.hand_mass
-    expected = np.exp(0.3 * later[:, 0]), np.exp(0.1 * later[:, 1]), np.exp(0.2 * last)
-    np.testing.assert_allclose(factors, expected, rtol=1e-6)
+    key, names = jax.random.key(3), ("friction", "stiffness", "hand_mass")
+    noise = {"objects.noise": dict(zip(names, (0.3, 0.1, 0.2), strict=True))}
+    plain, noisy = (
+        jax.device_get(rollout.sample_trials(scene.load("paper_spheres", overrides=o), key, 5))
+        for o in ({}, noise)
+    )
+    drawn = np.array([np.log(getattr(noisy, name)) for name in names])
+    assert np.unique(np.abs(drawn)).size == 15
+    for name, value in noisy._asdict().items():
+        if name in names:
+            assert (getattr(plain, name) == 1).all(), name
+        else:
+            np.testing.assert_array_equal(value, getattr(plain, name), err_msg=name)
 
 
 BAD = {

@@ -13,37 +13,21 @@ from codesign_jax.types import Status
 from tests.helpers.grasps import (
     batch_inputs,
     hand_world,
+    hurried,
     nth,
     outcome,
     pinch,
     stack,
     still,
 )
+from tests.helpers.toy_engine import TINY
 
-HURRIED = {
-    "links": 2,
-    "phases__approach": 0.3,
-    "phases__inflate": 0.5,
-    "phases__lift": 0.7,
-    "phases__disturb": 0.9,
-    "phases__ungrasp": 1.5,
-}
-
-
-def both(the_scene, params, trials):
-    """Fields and controls of a batch."""
-    return batch_inputs(the_scene, params, trials)
-
-
-# --- structured engine -----------------------------------------------------------------------
-
-
-# --- MuJoCo C --------------------------------------------------------------------------------
+HURRIED = {"links": 2} | hurried(0.3, 0.5, 0.7, 0.9, 1.5)
 
 
 def one_world(the_scene):
-    params, trial = hand_world(the_scene)
-    return both(the_scene, *(stack(v) for v in (params, trial)))
+    """Fields and controls of one world."""
+    return batch_inputs(the_scene, *(stack(v) for v in hand_world(the_scene)))
 
 
 def test_mujoco_tells_when_its_solver_stops_at_the_cap():
@@ -62,8 +46,7 @@ def test_mujoco_tells_when_its_contacts_do_not_fit(monkeypatch, tmp_path, capfd)
     monkeypatch.chdir(tmp_path)  # MuJoCo logs its warning there
     the_scene = pinch("box", **HURRIED)
     engine = MujocoEngine(the_scene)
-    params, trial = hand_world(the_scene)
-    spec = model.build_spec(the_scene, params, trial)
+    spec = model.build_spec(the_scene, *hand_world(the_scene))
     spec.memory = 20_000
     engine.template = spec.compile()
     trace = engine.rollout(*one_world(the_scene))
@@ -73,56 +56,39 @@ def test_mujoco_tells_when_its_contacts_do_not_fit(monkeypatch, tmp_path, capfd)
     capfd.readouterr()
 
 
-# --- start -----------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def starting():
-    """INVALID_START of worlds that start with the palm at 150 mm."""
+def test_bad_starts_are_flagged_and_in_the_outcome():
+    """Of worlds that start with the palm at 150 mm."""
     the_scene = pinch("box", arm__start_height=0.15)
-
-    def invalid(*params):
-        fields, _ = both(the_scene, stack(*params), stack(*[still()] * len(params)))
-        return np.asarray(jax.jit(partial(start.invalid_start, the_scene))(fields)) != 0
-
-    return the_scene, invalid
-
-
-def test_bad_starts_are_flagged(starting):
-    the_scene, invalid = starting
     base, _ = hand_world(the_scene, length=0.08)
-
-    def changed(**values):
-        return base._replace(**{k: 0 * getattr(base, k) + v for k, v in values.items()})
-
-    found = invalid(
-        base,
-        changed(length=0.18),  # straight fingers, 75 degrees down: 24 mm into the table
-        changed(length=np.nan),
-        changed(wall=0.0),  # neither mass nor stiffness
-        changed(length=-0.05),
-        changed(wall=0.02),  # walls thicker than the section
+    changes = (
+        {},
+        {"length": 0.18},  # straight fingers, 75 degrees down: 24 mm into the table
+        {"length": np.nan},
+        {"wall": 0.0},  # neither mass nor stiffness
+        {"length": -0.05},
+        {"wall": 0.02},  # walls thicker than the section
     )
-    np.testing.assert_array_equal(found, [False, True, True, True, True, True])
-
-
-def test_an_invalid_start_is_in_the_outcome(starting):
-    the_scene, _ = starting
-    params = stack(*(hand_world(the_scene, length=x)[0] for x in (0.08, 0.18)))
-    engine = MujocoEngine(the_scene)
+    worlds = [base._replace(**{k: 0 * base.length + v for k, v in c.items()}) for c in changes]
+    trials = stack(*[still()] * len(worlds))
+    fields, _ = batch_inputs(the_scene, stack(*worlds), trials)
+    found = jax.jit(partial(start.invalid_start, the_scene))(fields)
+    bad = [False, True, True, True, True, True]
+    np.testing.assert_array_equal(np.asarray(found) != 0, bad)
+    engine, few = MujocoEngine(the_scene), slice(2)
     run = jax.jit(lambda p, t: rollout.simulate(the_scene, engine, p, t)[0])
-    result = run(params, stack(still(), still()))
-    assert [bool(s & Status.INVALID_START) for s in result.status] == [False, True]
+    result = run(stack(*worlds[few]), nth(trials, few))
+    assert [bool(s & Status.INVALID_START) for s in result.status] == bad[few]
 
 
 # --- runs ------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def failing_run(tmp_path_factory):
-    """A tiny optimisation in MuJoCo C in which some trials are too fast."""
-    from tests.helpers.toy_engine import TINY
-
+# The kernel's own last good state: test_kernel.
+@pytest.fixture(
+    scope="module", params=["mujoco", pytest.param("structured", marks=pytest.mark.slow)]
+)
+def failing_run(request, tmp_path_factory):
+    """A tiny optimisation in which some trials are too fast."""
     save = runs.loop.Loop.save
 
     def without_devices(loop):
@@ -132,16 +98,25 @@ def failing_run(tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("failing") / "run"
     sizes = ["--particles", "3", "--trials", "2", "--episodes", "1", "--test-trials", "0"]
-    run = ["optimize", "--scene", str(TINY), "--out", str(folder), *sizes]
+    run = [
+        "optimize",
+        "--scene",
+        str(TINY),
+        "--engine",
+        request.param,
+        "--out",
+        str(folder),
+        *sizes,
+    ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runs.loop.Loop, "save", without_devices)
-        code = cli.main([*run, "--set", "limits.speed=12"])
-    return folder, code
+        cli.main([*run, "--set", "limits.speed=12"])
+    return folder
 
 
 def test_failed_worlds_are_saved_and_replayed(failing_run, capsys):
     """The saved state is the last good one, and the replay fails alike, at the same step."""
-    folder, _ = failing_run
+    folder = failing_run
     scene, _ = runs.read_run(folder)
     files = sorted((folder / "failures").glob("*.npz"))
     assert files
@@ -158,11 +133,10 @@ def test_failed_worlds_are_saved_and_replayed(failing_run, capsys):
 
 
 def test_all_failed_stops_with_a_diagnosis(tmp_path, capsys):
-    from tests.helpers.toy_engine import TINY
-
     folder = tmp_path / "run"
     sizes = ["--particles", "3", "--trials", "2", "--episodes", "2", "--test-trials", "0"]
-    arguments = ["optimize", "--scene", str(TINY), "--out", str(folder), *sizes]
+    own = ["--scene", str(TINY), "--engine", "mujoco", "--out", str(folder)]
+    arguments = ["optimize", *own, *sizes]
     assert cli.main([*arguments, "--set", "limits.speed=1"]) == 1
     message = capsys.readouterr().err
     assert "every one of 6 trials failed (SPEED 6)" in message

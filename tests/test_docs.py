@@ -4,8 +4,6 @@ import json
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
@@ -82,40 +80,37 @@ def here_alone(example):
     return [word.replace("/shared/", "shared/") for word in shlex.split(example)]
 
 
+# Where a command simulates, or writes what it has simulated: owners and names.
+SIMULATES = {
+    "check": [(check, "tell")],
+    "evaluate": [(evaluate, "simulate"), (evaluate, "of_objects"), (evaluate.stress, "simulate")],
+    "export": [(export, "write_files")],
+    "finger": [(finger, "compare")],
+    "landscape": [
+        (landscape, name)
+        for name in ("simulated_designs", "summarize", "print_summary", "write_files")
+    ],
+    "render": [(render, "draw")],
+    "replay": [(replay, "explain"), (replay, "write_page")],
+    "report": [(report, "best_grasp")],
+    "studio": [(studio, "serve")],
+}
+
+
 @pytest.mark.parametrize("example", CODESIGN)
 def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch):
     """Scene, design and files are the example's own; nothing is compiled that places or steps."""
-    arguments = here_alone(example)
-    reached = []
+    arguments, reached = here_alone(example), []
     monkeypatch.setattr(preflight, "refusals", lambda *rest: [])  # the slow test below has it
+    monkeypatch.setattr(check, "simulate", lambda *rest: ())
+    monkeypatch.setattr(evaluate.reference, "tell_stress", lambda *rest: None)
+    # The exit code is what is handed on, or made of a status.
+    kept = SimpleNamespace(status=np.zeros(1, int))
+    code = {"check": 0, "replay": 0, "evaluate": kept}.get(arguments[0])
+    for owner, name in SIMULATES.get(arguments[0], ()):
+        monkeypatch.setattr(owner, name, lambda *rest: reached.append(rest) or code)
     if arguments[0] in ("optimize", "sample"):
         arguments.append("--dry-run")
-    elif arguments[0] == "evaluate":
-        kept = SimpleNamespace(status=np.zeros(1, int))  # of which the exit code is made
-        for name in ("simulate", "of_objects"):
-            monkeypatch.setattr(evaluate, name, lambda *rest: reached.append(rest) or kept)
-        monkeypatch.setattr(evaluate.stress, "simulate", lambda *rest: reached.append(rest))
-        monkeypatch.setattr(evaluate.reference, "tell_stress", lambda *rest: None)
-    elif arguments[0] == "check":
-        monkeypatch.setattr(check, "simulate", lambda *rest: ())
-        monkeypatch.setattr(check, "tell", lambda *rest: reached.append(rest) or 0)
-    elif arguments[0] == "export":
-        monkeypatch.setattr(export, "write_files", lambda *rest: reached.append(rest))
-    elif arguments[0] == "finger":
-        monkeypatch.setattr(finger, "compare", lambda *rest: reached.append(rest))
-    elif arguments[0] == "report":
-        monkeypatch.setattr(report, "best_grasp", lambda *rest: reached.append(rest))
-    elif arguments[0] == "landscape":
-        for name in ("simulated_designs", "summarize", "print_summary", "write_files"):
-            monkeypatch.setattr(landscape, name, lambda *rest: reached.append(rest))
-    elif arguments[0] == "studio":
-        monkeypatch.setattr(studio, "serve", lambda *rest: reached.append(rest))
-    elif arguments[0] == "render":
-        monkeypatch.setattr(render, "draw", lambda *rest: reached.append(rest))
-    elif arguments[0] == "replay" and "failures" in example:
-        monkeypatch.setattr(replay, "explain", lambda *rest: reached.append(rest) or 0)
-    elif arguments[0] == "replay":
-        monkeypatch.setattr(replay, "write_page", lambda *rest: reached.append(rest))
     assert cli.main(arguments) == 0
     simulates = arguments[0] not in ("scenes", "compare") and "--dry-run" not in arguments
     assert bool(reached) == simulates
@@ -227,7 +222,6 @@ def test_what_a_page_links_to_is_there(page):
 # --- the site of the documentation: the reference is up to date, links, search without a network --
 
 
-ROOT = Path(__file__).parent.parent
 BUILT_IN = {
     "Scene files": ROOT / "codesign_jax" / "scenes",
     "Hand files": ROOT / "hands",
@@ -277,27 +271,13 @@ def test_every_key_of_the_built_in_files_is_in_the_reference(heading):
     assert files and keys and not keys - on_page
 
 
-def build(root, place):
-    """Runs the recipe of `make docs` on a checkout."""
-    flags = re.search(r"\$\(BIN\)/mkdocs (.*)", (ROOT / "Makefile").read_text())[1].split()
-    command = [sys.executable, "-m", "mkdocs", *flags, "--site-dir", place]
-    return subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=300)
-
-
-@pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    place = tmp_path_factory.mktemp("site")
-    done = build(ROOT, place)
-    assert not done.returncode, done.stderr
-    return place
-
-
 @pytest.mark.browser
-def test_the_site_is_read_and_searched_without_a_network(site, browser):
+def test_the_site_is_read_and_searched_without_a_network(browser):
+    """The one of `make docs`, which `make test-browser` makes first."""
     page, complaints = browser.new_page(viewport={"width": 1300, "height": 900}), []
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on("request", lambda r: None if r.url.startswith("file:") else complaints.append(r.url))
-    page.goto((site / "index.html").as_uri())
+    page.goto((ROOT / "site" / "index.html").as_uri())
     shown = "e => e.complete && e.naturalWidth > 0"
     assert all(picture.evaluate(shown) for picture in page.locator("article img").all())
     assert page.locator("article img").count() >= 1

@@ -1,4 +1,4 @@
-"""Stock MJX and MuJoCo C: whole short grasps, and failing worlds; single steps: test_steps."""
+"""Engines: lost and failing worlds, JAX's transformations, costs; single steps: test_steps."""
 
 import functools
 from functools import partial
@@ -13,149 +13,13 @@ from codesign_jax import control, model, rollout, scene
 from codesign_jax.engines import make_engine, solver_problems
 from codesign_jax.engines.mujoco import MujocoEngine, world_model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.scene import parameters, schema
+from codesign_jax.scene import schema
 from codesign_jax.types import Status
 from tests.helpers import grasps, toy_engine
-from tests.helpers.grasps import batch_inputs, nth, pinch, stack, still
+from tests.helpers.grasps import pinch
 
-# A design (length, arm_z) [m] at which two fingers hold the sphere.
-HOLDING = (0.11, 0.025)
-# Compiling stock MJX takes longer than all that is done with it here.
+# Compiling takes longer than all that is done with a program here.
 QUICK = {"xla_backend_optimization_level": 0}
-
-
-def world(the_scene, design, **changes):
-    """Params and trial of a design, slightly off centre so that no symmetry hides a mistake."""
-    space = parameters.design_space(the_scene.hand, "2d")
-    params = space.params(jnp.asarray(design))
-    params = params._replace(**{k: getattr(params, k) * 0 + v for k, v in changes.items()})
-    dtype = params.length.dtype
-    offset = {"position": jnp.array([0.004, 0.003], dtype), "arm_tilt": jnp.full(2, 0.05, dtype)}
-    return params, jax.tree.map(jnp.asarray, still()._replace(**offset))
-
-
-# --- whole rollouts ------------------------------------------------------------------------------
-
-# A grasp in 1.3 s: the same phases, hurried, with fewer links, joints and contacts.
-HURRIED = {
-    "links": 2,
-    "effects__lateral_bending": False,
-    "effects__twist": False,
-    "effects__palm_object": False,
-    "effects__palm_table": False,
-    "effects__finger_table": False,
-    "phases__approach": 0.5,
-    "phases__inflate": 0.7,
-    "phases__lift": 0.9,
-    "phases__disturb": 1.1,
-    "phases__ungrasp": 1.3,
-    "phases__deflate_time": 0.1,
-    # Worlds that are not numbers never converge: their solver takes all iterations in every step.
-    "solver__iterations": 10,
-    "solver__ls_iterations": 10,
-}
-GOOD, LENGTH, CONTROL, PRESSURE, BELOW, OTHER = range(6)
-NAN_FROM = 24  # time step of the first control that is not a number
-
-
-@pytest.fixture(scope="module")
-def hurried():
-    """Fields and controls of six worlds, of which four fail in their own way, and of good ones."""
-    the_scene = pinch("sphere", **HURRIED)
-    worlds = [world(the_scene, HOLDING) for _ in range(6)]
-    worlds[OTHER] = world(the_scene, (0.11, 0.02))
-    good = batch_inputs(the_scene, *stack(*worlds))
-    worlds[LENGTH] = world(the_scene, HOLDING, length=jnp.nan)
-    worlds[PRESSURE] = world(the_scene, HOLDING, pressure=1e12)
-    fields, ctrl = batch_inputs(the_scene, *stack(*worlds))
-    ctrl = ctrl.at[CONTROL, NAN_FROM:, 6].set(jnp.nan)
-    # Inflated from the first step on, so that the failure is sudden.
-    ctrl = ctrl.at[PRESSURE, :, 6:].set(1e12)
-    fields = fields._replace(start=fields.start.at[BELOW, -5].set(-0.05))
-    return the_scene, good, (fields, ctrl)
-
-
-@pytest.fixture(scope="module")
-def mjx_traces(hurried):
-    """Traces by stock MJX in float32, of the good and of the failing batch, by one program."""
-    the_scene, good, bad = hurried
-    engine = make_engine("mjx", the_scene)
-    run = jax.jit(lambda f, c: engine.rollout(f, c, trajectory=True), compiler_options=QUICK)
-    return tuple(jax.tree.map(np.asarray, run(*batch)) for batch in (good, bad))
-
-
-@pytest.fixture(scope="module")
-def mujoco_traces(hurried, tmp_path_factory):
-    the_scene, good, bad = hurried
-    engine = make_engine("mujoco", the_scene)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(tmp_path_factory.mktemp("log"))  # where MuJoCo logs that a world went bad
-        return tuple(
-            jax.tree.map(np.asarray, engine.rollout(*batch, trajectory=True))
-            for batch in (good, bad)
-        )
-
-
-# Stock MJX takes twelve seconds to compile; quick: traces of both other engines are below
-slow = pytest.mark.slow
-
-
-def test_distance_is_from_the_mean_of_the_links(hurried, mujoco_traces):
-    """Hand centre by hand: the mean over segments of their centres, at the start pose."""
-    the_scene, (fields, _), _ = hurried
-    data = mujoco.MjData(compiled := world_model(the_scene, nth(fields, 0)))
-    data.qpos[:] = nth(fields, 0).start
-    mujoco.mj_kinematics(compiled, data)
-    lay, length = model.layout(the_scene), HOLDING[0]
-    along = (np.arange(2) + 0.5) * length / 2
-    height = 0.010  # of the section's middle above the bottom layer
-    centres = [
-        data.xpos[s] + data.xmat[s].reshape(3, 3) @ [x, 0, height] for s in lay.stubs for x in along
-    ]
-    expected = np.linalg.norm(data.xpos[lay.object] - np.mean(centres, 0))
-    np.testing.assert_allclose(mujoco_traces[0].distance[0, 0], expected, rtol=1e-5)
-
-
-EXPECTED = {
-    GOOD: (Status.OK, -1),
-    LENGTH: (Status.NONFINITE, 0),  # positions are not numbers before the first step
-    CONTROL: (Status.NONFINITE, NAN_FROM + 1),  # the state after the step that had it
-    BELOW: (Status.PENETRATION, 0),
-}
-
-
-@pytest.mark.parametrize("engine", [pytest.param("mjx", marks=slow), "mujoco"])
-def test_failing_worlds_are_flagged_alike(hurried, engine, request):
-    the_scene, *_ = hurried
-    trace = request.getfixturevalue(f"{engine}_traces")[1]
-    result = grasps.outcomes(the_scene, trace)
-    for index, (status, step) in EXPECTED.items():
-        assert result.status[index] == status and result.bad_step[index] == step
-    # A finger under 1e12 Pa is fast in the first step, or beyond float32's numbers.
-    assert result.status[PRESSURE] & (Status.SPEED | Status.NONFINITE)
-    assert result.bad_step[PRESSURE] == 1
-
-
-def test_decided_worlds_are_not_simulated_further(hurried, monkeypatch):
-    """MuJoCo leaves worlds that are lost or failed; their traces repeat the last entry."""
-    the_scene, (fields, ctrl), _ = hurried
-    engine = MujocoEngine(the_scene)
-    asked, advance = [], MujocoEngine.advance
-
-    def spy(self, batch, ids, *rest):
-        asked.append(ids.tolist())
-        return advance(self, batch, ids, *rest)
-
-    monkeypatch.setattr(MujocoEngine, "advance", spy)
-    # World 0 keeps the object at the start; world 1 holds its hand up in the air: lost at once.
-    away = ctrl.at[1, :, 2].set(0.3)
-    trace = jax.tree.map(np.asarray, engine.rollout(nth(fields, slice(0, 2)), away[:2]))
-    window = round(the_scene.window[0] / the_scene.discretization.timestep)
-    last = (window // 25 + 1) * 25  # the end of the chunk in which the window opens
-    assert asked[window // 25] == [0, 1] and asked[window // 25 + 1] == [0]
-    np.testing.assert_array_equal(trace.distance[1, last:], trace.distance[1, last - 1])
-    result = grasps.outcome(the_scene, nth(trace, 1))
-    np.testing.assert_allclose(result.cost, the_scene.cost.maximum, rtol=1e-6)
 
 
 def test_unknown_engine_names_the_nearest():
@@ -180,29 +44,14 @@ def test_mujocos_solver_table_is_refused_where_it_has_no_effect():
 
 
 # A grasp in 1.2 s with few contacts: what is tested here does not depend on them.
-SHORT = {
-    "links": 2,
-    "effects__palm_object": False,
-    "effects__palm_table": False,
-    "effects__finger_table": False,
-    "effects__disturb": False,
-    "effects__ungrasp": False,
-    "phases__approach": 0.3,
-    "phases__inflate": 0.5,
-    "phases__lift": 1.2,
-}
+OFF = "palm_object palm_table finger_table disturb ungrasp"
+SHORT = {"links": 2} | grasps.hurried(0.3, 0.5, 1.2, without=OFF)
 
 
-@pytest.fixture(scope="module")
-def batch():
-    """A short grasp, fields and controls of four random worlds."""
-    scene = grasps.pinch("sphere", **SHORT)
-    return scene, *grasps.batch_inputs(scene, *grasps.random_worlds(scene, 3, 4))
-
-
-def test_vmap_is_a_larger_batch(batch):
+def test_vmap_is_a_larger_batch():
     """Nested, over axes in any place, and with controls that all share: the same bits."""
-    scene, fields, ctrl = batch
+    scene = grasps.pinch("sphere", **SHORT)
+    fields, ctrl = grasps.batch_inputs(scene, *grasps.random_worlds(scene, 3, 4))
     engine = StructuredEngine(scene)
     want = jax.jit(engine.rollout)(fields, ctrl)
     fields, ctrl = jax.tree.map(np.asarray, (fields, ctrl))  # whose axes NumPy moves
@@ -220,72 +69,89 @@ def test_vmap_is_a_larger_batch(batch):
     np.testing.assert_array_equal(shared.distance[:, 0], alone.distance)
 
 
-# Compiling takes longer than all that is done with a program here.
-QUICK = {"xla_backend_optimization_level": 0}
-
-
-def engines(scene):
-    """Every engine but stock MJX, whose compile takes longer than all of these tests."""
-    return {
-        "structured": StructuredEngine(scene, tolerance=1e-16),
-        "mujoco": MujocoEngine(scene, num_threads=1),
-    }
-
-
 @pytest.fixture(scope="module")
 def decided():
-    """Traces, without and with a trajectory, of a lost and of failing worlds, and their outcomes.
+    """Scene, hands and fields of a lost and of failing worlds; traces of them, and outcomes.
 
-    A function of engine, trajectory and number of pieces, one rollout after the other, which
-    simulates what nobody has asked for yet.
+    The latter are a function of engine and trajectory, which simulates what nobody has asked for.
 
     The hand of world 0 stays above the object, which is lost as the window opens, and rises on;
-    world 1 starts below the table; a pressure of world 2 is not a number from step 10 on.
+    world 1 starts below the table; a pressure of world 2 is not a number from step 10 on, and the
+    length of world 3; the fingers of world 4 are inflated at once, by 1e12 Pa.
     """
     scene = grasps.pinch("sphere", **SHORT, effects__finger_object=False, effects__twist=False)
     with jax.enable_x64(True):
-        params, trials = grasps.random_worlds(scene, 3, 3)
+        params, trials = grasps.random_worlds(scene, 3, 5)
+        params = params._replace(length=params.length.at[3].set(jnp.nan))
         fields, ctrl = grasps.batch_inputs(scene, params, trials)
         ctrl = ctrl.at[0, :, 2].set(jnp.linspace(0.3, 0.4, ctrl.shape[1]))
-        ctrl = ctrl.at[2, 10:, 6].set(jnp.nan)
+        ctrl = ctrl.at[2, 10:, 6].set(jnp.nan).at[4, :, 6:].set(1e12)
         # A micrometre above the table: exactly on it, rounding decides whether an object touches.
         start = fields.start.at[:, -5].add(1e-6)
         fields = fields._replace(start=start.at[1, -5].set(-0.05))
+        params, fields = jax.tree.map(np.asarray, (params, fields))
+    engines = {
+        "structured": lambda: StructuredEngine(scene, tolerance=1e-16),
+        "mujoco": lambda: MujocoEngine(scene, num_threads=1),
+        "mjx": lambda: make_engine("mjx", scene),
+    }
 
     @functools.cache
-    def simulated(name, trajectory, pieces=1):
+    def simulated(name, trajectory):
         with jax.enable_x64(True):
-            run = partial(engines(scene)[name].rollout, trajectory=trajectory)
-            run, last, parts = jax.jit(run, compiler_options=QUICK), fields.start, []
-            for commands in jnp.split(ctrl, pieces, axis=1):
-                trace = run(fields._replace(start=last), commands)
-                parts, last = [*parts, trace._replace(last=None)], trace.last
-            trace = jax.tree.map(lambda *v: jnp.concatenate(v, 1), *parts)._replace(last=last)
+            run = partial(engines[name]().rollout, trajectory=trajectory)
+            trace = jax.jit(run, compiler_options=QUICK)(fields, ctrl)
             return jax.tree.map(np.asarray, (trace, grasps.outcomes(scene, trace)))
 
-    return scene, simulated
+    return scene, params, fields, simulated
+
+
+def test_distance_is_from_the_mean_of_the_links(decided):
+    """Hand centre by hand: the mean over segments of their centres, at the start pose."""
+    scene, params, fields, simulated = decided
+    data = mujoco.MjData(compiled := world_model(scene, grasps.nth(fields, 0)))
+    data.qpos[:] = fields.start[0]
+    mujoco.mj_kinematics(compiled, data)
+    lay, sizes = model.layout(scene), zip(params.length[0], params.height[0], strict=True)
+    centres = [
+        data.xpos[stub] + data.xmat[stub].reshape(3, 3) @ [share * length, 0, height / 2]
+        for stub, (length, height) in zip(lay.stubs, sizes, strict=True)
+        for share in (0.25, 0.75)  # of two links
+    ]
+    expected = np.linalg.norm(data.xpos[lay.object] - np.mean(centres, 0))
+    np.testing.assert_allclose(simulated("mujoco", False)[0].distance[0, 0], expected, rtol=1e-12)
 
 
 # By the kernel a trajectory is another program: quick tests compare its path with MuJoCo C step by
-# step (test_kernel, test_steps).
-TRAJECTORY = [False, pytest.param(True, marks=pytest.mark.slow)]
-
-
-@pytest.mark.parametrize("trajectory", TRAJECTORY)
-def test_a_trace_means_the_same_on_every_engine(decided, trajectory):
+# step (test_kernel, test_steps). Stock MJX takes twelve seconds to compile.
+@pytest.mark.parametrize(
+    ("name", "trajectory"),
+    [
+        ("structured", False),
+        pytest.param("structured", True, marks=pytest.mark.slow),
+        pytest.param("mjx", False, marks=pytest.mark.slow),
+    ],
+)
+def test_a_trace_means_the_same_on_every_engine(decided, name, trajectory):
     """Where worlds are decided, what later entries show, and the state in which they stay."""
-    scene, simulated = decided
+    scene, *_, simulated = decided
     first, end = round(scene.window[0] / 0.01), scene.num_steps
-    (got, ours), (want, outcome) = (simulated(n, trajectory) for n in ("structured", "mujoco"))
+    (got, ours), (want, outcome) = (simulated(n, trajectory) for n in (name, "mujoco"))
     lost_at = 0.01 * first
     assert outcome.lost_time[0] == pytest.approx(lost_at)
-    assert outcome.bad_step.tolist() == [-1, 0, 11]
-    told = ours._replace(residual=None), outcome._replace(residual=None)  # MuJoCo C has none
+    # Below the table; the state after the step that had no number; before the first step; fast in
+    # the first step, or beyond all numbers.
+    assert outcome.bad_step.tolist() == [-1, 0, 11, 0, 1]
+    assert outcome.status[:4].tolist() == [Status.OK, Status.PENETRATION, *[Status.NONFINITE] * 2]
+    assert all(found.status[4] & (Status.SPEED | Status.NONFINITE) for found in (ours, outcome))
+    untold = {"residual": None} | ({"capped": None} if name == "mjx" else {})  # how a solver ended
+    told = (found._replace(**untold) for found in (ours, outcome))
     for a, b in zip(*map(jax.tree.leaves, told), strict=True):
-        np.testing.assert_allclose(a, b)
+        np.testing.assert_allclose(a[:4], b[:4])
+    np.testing.assert_array_equal(ours.bad_step, outcome.bad_step)
     shown = [
-        {f: getattr(trace, f) for f in ("distance", "height", "speed", "qpos")}
-        | model.split(scene, trace.last)._replace(acc=0)._asdict()
+        {f: getattr(trace, f)[:3] for f in ("distance", "height", "speed", "qpos")}
+        | model.split(scene, trace.last[:3])._replace(acc=0)._asdict()
         for trace in (got, want)
     ]
     for field, value in shown[0].items():
@@ -295,13 +161,12 @@ def test_a_trace_means_the_same_on_every_engine(decided, trajectory):
         rest = trace.distance[0, first:]
         if trajectory:
             assert rest[-1] - rest[0] > 0.03 and trace.qpos.shape[1] == end
-            np.testing.assert_array_equal(
-                trace.qpos[2, 10:], trace.qpos[2, 10:11].repeat(end - 10, 0)
-            )
+            stays = trace.qpos[2, 10:11].repeat(end - 10, 0)
+            np.testing.assert_array_equal(trace.qpos[2, 10:], stays)
         else:
             np.testing.assert_array_equal(rest, rest[0])
         np.testing.assert_array_equal(trace.height[1], trace.height[1, 0])
-        assert np.isnan(trace.speed[2, 11:]).all() and np.isnan(trace.last).sum() == 1
+        assert np.isnan(trace.speed[2, 11:]).all() and np.isnan(trace.last[:3]).sum() == 1
 
 
 # --- a cost of one's own -------------------------------------------------------------------------
@@ -370,14 +235,7 @@ def test_a_cost_does_not_read_what_was_not_simulated():
 # --- gradients -----------------------------------------------------------------------------------
 
 # Nothing touches and nothing falls: a derivative compiles in half a minute, with contacts in two.
-FREE = SHORT | {
-    "effects__finger_object": False,
-    "effects__object_table": False,
-    "effects__gravity": False,
-    "effects__wrist": False,
-    "effects__twist": False,
-    "effects__lateral_bending": False,
-}
+FREE = SHORT | grasps.off("finger_object object_table gravity wrist twist lateral_bending")
 
 
 def bent(scene, engine, world, x, broken):

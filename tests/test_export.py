@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import cli, rollout, scene
+from codesign_jax import rollout, scene
 from codesign_jax.cost import outcome
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured.kernel import memory_tables
@@ -16,9 +16,11 @@ from codesign_jax.export import grasps, plain, skin, tables
 from codesign_jax.export.play import play
 from codesign_jax.model import build_spec
 from codesign_jax.scene import parameters
+from tests.helpers.command_runs import command
 from tests.helpers.grasps import (
     batch_inputs,
     hand_world,
+    hurried,
     lanes,
     nth,
     pinch,
@@ -32,13 +34,7 @@ from tests.helpers.toy_engine import TINY
 ROOT = Path(__file__).parent.parent
 
 # A grasp in 2.2 s, with all joints and contacts.
-HURRIED = {
-    "phases__approach": 0.5,
-    "phases__inflate": 0.8,
-    "phases__lift": 1.2,
-    "phases__disturb": 1.6,
-    "phases__ungrasp": 2.2,
-}
+HURRIED = hurried(0.5, 0.8, 1.2, 1.6, 2.2)
 
 
 def by_engine(the_scene, params, trials):
@@ -76,8 +72,7 @@ def grasped():
 
 def read(path):
     """Rows of a table."""
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+    return list(csv.DictReader(path.read_text().splitlines()))
 
 
 def errors(states, trace, index):
@@ -195,10 +190,6 @@ def test_commands_are_the_key_frames(tmp_path):
 # --- the command ---------------------------------------------------------------------------------
 
 
-def export(*arguments):
-    return cli.main(["export", *map(str, arguments)])
-
-
 def test_command_writes_models_of_the_default_scene_s_kind(tmp_path, capsys):
     """Hull, effects that plain MuJoCo does not have, and a mesh: models without them, and notes."""
     out = tmp_path / "out"
@@ -206,7 +197,8 @@ def test_command_writes_models_of_the_default_scene_s_kind(tmp_path, capsys):
     mug = 'name = "mug"; type = "mesh"; unit = "mm"; mass = 0.1; friction = 0.8; '
     mesh = object_file(tmp_path, f'{mug}file = "{ROOT / "objects" / "household" / "mug.stl"}"')
     own += ["effects.neo_hookean=true", "--objects", mesh]
-    assert export("--scene", TINY, "--out", out, "--no-parts", "--no-sheet", "--set", *own) == 0
+    arguments = ["--scene", TINY, "--out", out, "--no-parts", "--no-sheet", "--set", *own]
+    assert command("export", *arguments) == 0
     said = capsys.readouterr().out
     notes = (out / "model" / "README.txt").read_text()
     for words in ("without effects.neo_hookean", "without effects.friction_memory", "mesh 'mug'"):
@@ -222,19 +214,3 @@ def test_command_writes_models_of_the_default_scene_s_kind(tmp_path, capsys):
     geom = data.geom("object_0")
     vertices = loaded.mesh_vert @ geom.xmat.reshape(3, 3).T + geom.xpos
     np.testing.assert_allclose(vertices, mug.mesh.vertices @ turn.T + place, atol=1e-7)  # float32
-
-
-def test_command_refuses_in_words_and_writes_nothing(tmp_path, capsys):
-    out = tmp_path / "out"
-    assert export("--design", "lenght=95", "arm_z=900", "--out", out, "--trials", 1) == 2
-    text = capsys.readouterr().err
-    assert "--design 'lenght' is not a parameter; did you mean 'length'" in text
-    assert "arm_z" in text and not out.exists()
-    (tmp_path / "file").touch()
-    assert export("--scene", TINY, "--out", tmp_path / "file" / "out") == 2
-    assert "Not a directory" in capsys.readouterr().err
-    hull = ("--set", "effects.surface=hull", "--engine", "mujoco", "--tolerance", "all")
-    assert export("--scene", TINY, "--out", out, *hull) == 2
-    assert "not supported by engine mujoco: effects.surface" in capsys.readouterr().err
-    assert export("--trials", "-1", "--out", out) == 2
-    assert "--trials" in capsys.readouterr().err and not out.exists()

@@ -18,11 +18,10 @@ from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.scene import load, parameters
 from codesign_jax.scene.schema import InputError
-from tests.helpers import grasps
+from tests.helpers import grasps, oracles
 from tests.helpers.toy_engine import TINY
 
-HELD = {"links": 3, "effects__disturb": False, "effects__ungrasp": False}
-HELD |= {"phases__approach": 0.8, "phases__inflate": 1.3, "phases__lift": 2.0}
+HELD = {"links": 3} | grasps.hurried(0.8, 1.3, 2.0, without="disturb ungrasp")
 
 
 @functools.cache
@@ -65,18 +64,14 @@ def test_forces_on_the_object_are_what_its_momentum_gains(grasp):
 def test_forces_are_mujocos():
     """Of every contact, by its own solver, at the states and velocities of the path."""
     scene, (fields, ctrl), found, trace = grasp_of("spheres")
-    own = world_model(scene, grasps.nth(fields, 0))
-    own.opt.tolerance, own.opt.iterations, own.opt.ls_iterations = 0.0, 200, 50
+    own = oracles.exact(scene, grasps.nth(fields, 0))
     data, lay, touched = mujoco.MjData(own), model.layout(scene), 0
     weight = fields.body_mass[0, lay.object] * scene.gravity
     kinds = {body: ("finger", f) for f, row in enumerate(lay.bodies) for body in row}
     kinds |= {1: ("palm",), 0: ("table",)}
     for k in range(5, ctrl.shape[1], 7):
-        data.qpos[:], data.qvel[:], data.ctrl[:] = (
-            found["qpos"][0, k],
-            found["qvel"][0, k],
-            ctrl[0, k],
-        )
+        data.qpos[:], data.qvel[:] = found["qpos"][0, k], found["qvel"][0, k]
+        data.ctrl[:] = ctrl[0, k]
         mujoco.mj_forward(own, data)
         forces = jax.tree.map(lambda v, k=k: v[0, k], trace.forces)
         sums = {"finger": np.zeros((2, 3)), "palm": np.zeros(3), "table": np.zeros(3)}
@@ -165,8 +160,7 @@ def test_a_table_of_forces_has_each_step(tmp_path, capsys):
     said = capsys.readouterr().out
     assert re.search(r"sphere: grip [\d.e-]+ \+ [\d.e-]+ N by finger", said) and " mm" in said
     scene = load(TINY)
-    with path.open() as file:
-        rows = [*csv.DictReader(file)]
+    rows = [*csv.DictReader(path.read_text().splitlines())]
     assert len(rows) == scene.num_steps and rows[-1]["object"] == "sphere"
     held = rows[int(scene.last_step("lift"))]
     push_up = sum(float(held[f"finger_{i}_z_N"]) for i in (0, 1)) + float(held["palm_z_N"])

@@ -1,7 +1,6 @@
 """Meshes: mass and distance against closed forms, what is refused, what a repair says."""
 
 import dataclasses
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,14 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from codesign_jax import scene
 from codesign_jax.engines import make_engine
-from codesign_jax.engines import mujoco as mujoco_engine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.laws import meshes as mesh_lanes
 from codesign_jax.runs import scene_files
 from codesign_jax.scene import meshes, objects, parameters, schema
 from codesign_jax.scene.meshes import grid, surface
 from tests.helpers import oracles
-from tests.helpers.grasps import DATA, batch_inputs, nth, stack, still, world_inputs
+from tests.helpers.grasps import batch_inputs, hurried, nth, pinch, stack, still
 from tests.helpers.solids import box, bracket, object_file
 
 
@@ -224,10 +222,7 @@ def test_repair_mends_and_says_what(tmp_path):
     )
 
 
-# --- the household set and other meshes in scenes: distances in lanes, pictures, grasps -----------
-
-
-# --- the household set ---------------------------------------------------------------------------
+# --- the household set and other meshes in scenes: distances in lanes, grasps ---------------------
 
 
 @pytest.fixture(scope="module")
@@ -260,9 +255,6 @@ def test_household_distances_in_lanes(household):
         assert np.median(slope[away]) > 0.99, s.name  # it is the way out
 
 
-# --- scenes --------------------------------------------------------------------------------------
-
-
 def test_engines_that_cannot_say_so():
     the_scene = scene.load("paper_spheres", object_set="household")
     for name in ("mujoco", "mjx"):
@@ -287,33 +279,19 @@ def test_a_scene_carries_its_meshes(tmp_path):
 # --- rollouts ------------------------------------------------------------------------------------
 
 # A grasp in 1.3 s with few links and contacts: what is compared is the object's side of them.
-HURRIED = {
-    "discretization": {"links": 2},
-    "effects": {
-        "twist": False,
-        "palm_object": False,
-        "palm_table": False,
-        "finger_table": False,
-        "disturb": False,
-    }
-    | {"ungrasp": False},
-    "phases": {"approach": 0.5, "inflate": 0.8, "lift": 1.3},
-}
-
-
-class Grasps(NamedTuple):
-    """Grasps of a batch, in float64 and solved to rounding; `path` has them again in reverse."""
-
-    params: Any
-    trials: list
-    names: list[str]
-    path: oracles.Path
-    unbalanced: np.ndarray
+HURRIED = hurried(
+    0.5, 0.8, 1.3, without="twist palm_object palm_table finger_table disturb ungrasp"
+)
+BOX = 'name = "box"; type = "box"; size = [0.03, 0.03, 0.03]; mass = 0.1; friction = 0.8'
 
 
 @pytest.fixture(scope="module")
 def grasps(tmp_path_factory, household):
-    """Two fingers grasp primitives, their meshed twins and a mug, in one batch."""
+    """Two fingers grasp primitives, their meshed twins and a mug, in one batch.
+
+    In float64 and solved to rounding: the hand, trials and names by grasp; the path, which has the
+    grasps again in reverse; and what forces are unbalanced.
+    """
     folder = tmp_path_factory.mktemp("objects")
     box(60, 60, 60).export(folder / "box.stl")
     trimesh.creation.icosphere(4, 30).export(folder / "ball.stl")
@@ -322,26 +300,21 @@ def grasps(tmp_path_factory, household):
     common = "mass = 0.1; friction = 0.8"
     path = object_file(
         folder,
-        f'name = "box"; type = "box"; size = [0.03, 0.03, 0.03]; {common}',
+        BOX,
         f'name = "ball"; type = "sphere"; size = [0.03]; {common}',
         *(f'name = "{n}"; type = "mesh"; file = "{f}"; unit = "mm"; {common}'
           for n, f in files.items()),
     )  # fmt: skip
-    the_scene = scene.load(
-        "paper_spheres", hand_name=DATA / "pinch.toml", object_set=path, overrides=HURRIED
-    )
+    the_scene = pinch(links=2, objects=path, **HURRIED)
     names = [shape.name for shape in the_scene.objects.object]
+    hand = parameters.design_space(the_scene.hand, "2d")
     with jax.enable_x64(True):
-        params = nth(
-            parameters.design_space(the_scene.hand, "2d").params(jnp.array((0.09, 0.05))), ...
-        )
+        params = nth(hand.params(jnp.array((0.09, 0.05))), ...)
     params = params._replace(pressure=params.pressure * 0 + 190e3)
     yaws = [(i, 0.1) for i in range(len(names))]
     # Once more with the mug's handle between the fingers.
     yaws.append((names.index("mug"), 0.1 + np.pi / 2))
     trials = [still(i)._replace(size=np.array(1.04), yaw=np.array(yaw)) for i, yaw in yaws]
-
-    names.append("turned mug")
     count, both = len(trials), [*trials, *trials[::-1]]
     engine = StructuredEngine(the_scene, iterations=100, evaluations=40, tolerance=1e-24)
     with jax.enable_x64(True):
@@ -352,12 +325,13 @@ def grasps(tmp_path_factory, household):
         later = oracles.Path(*(v[:count, 1:] for v in path))
         fields, ctrl = nth((fields, ctrl), slice(count))
         left = oracles.unbalanced(the_scene, fields, ctrl[:, 1:], later, 10)
-    return Grasps(params, trials, names, path, left)
+    return params, dict(zip([*names, "turned mug"], trials, strict=True)), path, left
 
 
 def test_primitives_and_meshes_share_a_batch_and_a_program(grasps):
     """In the kernel's blocks of a few worlds, whose other worlds change no bit of a world."""
-    for value in grasps.path:
+    *_, path, _ = grasps
+    for value in path:
         one, reverse = np.split(value, 2)
         np.testing.assert_array_equal(one[::-1], reverse)
 
@@ -367,42 +341,30 @@ def test_the_kernel_balances_all_forces_on_meshes(grasps):
 
     The forces are those of contacts that plain JAX finds on the same grids.
     """
-    qpos = grasps.path.qpos
-    assert qpos.dtype == np.float64
-    upright, turned = (grasps.names.index(name) for name in ("mug", "turned mug"))
-    touched = np.abs(qpos[upright] - qpos[turned])[:, 6:-7].max()
-    assert touched > 0.05  # the handle made a difference to the fingers, radians
+    _, trials, path, left = grasps
+    assert path.qpos.dtype == np.float64
+    upright, turned = (path.qpos[[*trials].index(name)] for name in ("mug", "turned mug"))
+    # The handle made a difference to the fingers, radians.
+    assert np.abs(upright - turned)[:, 6:-7].max() > 0.05
     # A decrement of 1e-24 is an error of 1e-12 as the whole problem measures it; what is lost are
     # digits of the largest forces on a body that nearly cancel.
-    assert grasps.unbalanced.max() < 1e-8
+    assert left.max() < 1e-8
 
 
 def test_accelerations_of_a_meshed_box_equal_mujoco(grasps, tmp_path):
     """MuJoCo C has no meshes that are not convex: it gets the box as a primitive of the same size.
 
-    At the states that the kernel went through; its accelerations are differences of them.
+    At the states that the kernel went through.
     """
-    common = "mass = 0.1; friction = 0.8"
-    path = object_file(tmp_path, f'name = "box"; type = "box"; size = [0.03, 0.03, 0.03]; {common}')
-    twin = scene.load(
-        "paper_spheres", hand_name=DATA / "pinch.toml", object_set=path, overrides=HURRIED
-    )
-    world = grasps.names.index("mesh box")
-    trial = grasps.trials[world]._replace(shape=np.int32(0))
+    params, trials, path, _ = grasps
+    twin = pinch(links=2, objects=object_file(tmp_path, BOX), **HURRIED)
+    world = slice(place := [*trials].index("mesh box"), place + 1)
     with jax.enable_x64(True):
-        fields, ctrl = world_inputs(twin, grasps.params, trial)
-        oracle = mujoco_engine.world_model(twin, fields)
-    oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
-    data, h, qpos = mujoco.MjData(oracle), oracle.opt.timestep, grasps.path.qpos[world]
-    speed, contacts = np.zeros((len(qpos) - 1, oracle.nv)), set()
-    for k in range(len(speed)):
-        mujoco.mj_differentiatePos(oracle, speed[k], h, qpos[k], qpos[k + 1])
-    for k in range(1, len(speed)):
-        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[k], speed[k - 1], ctrl[k]
-        mujoco.mj_forward(oracle, data)
-        error = np.linalg.norm((speed[k] - speed[k - 1]) / h - data.qacc)
-        # The grid's distances are float32: 2e-9 m at 30 mm, of the 1e-3 m that the fingers press
-        # in; 1e-7 measured.
-        assert error < 1e-6 * max(np.linalg.norm(data.qacc), 100.0), k
-        contacts.add(data.ncon)
-    assert contacts >= {4, 6}  # on the table, and there between two fingers
+        trial = stack(trials["mesh box"]._replace(shape=np.int32(0)))
+        fields, ctrl = batch_inputs(twin, stack(params), trial)
+        own = oracles.Path(*(v[world] for v in path))
+        errors, _, touching = oracles.against_mujoco(twin, fields, np.asarray(ctrl), own)
+    # The grid's distances are float32: 2e-9 m at 30 mm, of the 1e-3 m that the fingers press in;
+    # 1e-7 measured.
+    assert errors.max() < 1e-6
+    assert {4, 6} <= {*touching.ravel()}  # on the table, and there between two fingers

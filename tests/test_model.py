@@ -13,6 +13,7 @@ from tests.helpers.grasps import (
     DATA,
     hand_world,
     nth,
+    off,
     pinch,
     random_constants,
     random_worlds,
@@ -146,26 +147,12 @@ def discrete_twin(the_scene, params, trial):
     return m, stiffness
 
 
-def free_scene(**discretization):
-    """A hand above nothing: no contacts at all, gravity on."""
-    settings = {f"discretization__{k}": v for k, v in discretization.items()}
-    return pinch(
-        "sphere",
-        links=5,
-        effects__finger_object=False,
-        effects__finger_table=False,
-        effects__palm_object=False,
-        effects__palm_table=False,
-        **settings,
-    )
-
-
 def test_implicit_springs_equal_mujocos_discrete_integrator():
     """Without contact, every step of a second of inflation under gravity and a moving arm.
 
     The twin's wrist springs are passive too: position actuators are not implicit in MuJoCo.
     """
-    the_scene = free_scene()
+    the_scene = pinch("sphere", 5, **off("finger_object finger_table palm_object palm_table"))
     params, trial = hand_world(the_scene)
     ours = model.compile_model(the_scene, params, trial)
     twin, stiffness = discrete_twin(the_scene, params, trial)

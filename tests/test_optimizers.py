@@ -41,9 +41,13 @@ SWITCH = np.repeat([IS_FIRST, ~IS_FIRST], 4, axis=0)
 LIMITED = 10
 
 
+def highest(first):
+    """Limit of one of the later parameters, which the first one sets."""
+    return 23 * first + 68.5
+
+
 def limit(particle):
-    """Keeps one of the later parameters below a limit that the first one sets."""
-    return particle.at[LIMITED].set(strictly_below(particle[LIMITED], 10 * particle[0] + 60))
+    return particle.at[LIMITED].set(strictly_below(particle[LIMITED], highest(particle[0])))
 
 
 SPACE = Space(LOW, HIGH, limit)
@@ -88,37 +92,39 @@ def test_each_finds_the_minimum_better_than_random_search():
     assert found["random"] < 2 and found["cma-es"] < 0.02, found
 
 
-@pytest.mark.parametrize("name", EVOSAX)
-def test_populations_are_those_of_evosax_called_directly(name):
+def by_evosax(name, count, std):
+    """A strategy of evosax and its parameters, with our deviation and step."""
     from evosax import algorithms
 
+    zeros = jnp.zeros(WIDTH)
+    if name == "cma-es":
+        own = algorithms.CMA_ES(count, zeros)
+        return own, own.default_params.replace(std_init=jnp.float32(std))
+    if name == "open-es":
+        descent = optax.sgd(np.sqrt(2 * np.pi * WIDTH) * 2 / 3 * std**2)
+        schedule = optax.constant_schedule(std)
+        own = algorithms.Open_ES(count, zeros, optimizer=descent, std_schedule=schedule)
+    elif name == "pso":
+        own = algorithms.PSO(count, zeros)
+    else:
+        own = algorithms.RandomSearch(count, zeros, partial(jax.random.uniform, shape=(WIDTH,)))
+    return own, own.default_params
+
+
+@pytest.mark.parametrize("name", EVOSAX)
+def test_populations_are_those_of_evosax_called_directly(name):
     made, count = make_optimizer(name, SPACE), 4
     _, ours, infos = run(made, start(made), OPEN[:count])
 
     def key(stream, episode):
         return jax.random.fold_in(jax.random.fold_in(jax.random.key(0), stream), episode)
 
-    unit, zeros = (SEED - LOW) / (HIGH - LOW), jnp.zeros(WIDTH)
-    if name == "cma-es":
-        own = algorithms.CMA_ES(PARTICLES, zeros)
-        params = own.default_params.replace(std_init=jnp.float32(0.25))
-        state = own.init(key(0, 0), unit, params)
-    elif name == "open-es":
-        descent = optax.sgd(np.sqrt(2 * np.pi * WIDTH) * 2 / 3 * 0.15**2)
-        std = {"std_schedule": optax.constant_schedule(0.15)}
-        own = algorithms.Open_ES(PARTICLES, zeros, optimizer=descent, **std)
-        params = own.default_params
-        state = own.init(key(0, 0), unit, params)
-    elif name == "pso":
-        own = algorithms.PSO(PARTICLES, zeros)
-        params = own.default_params
+    own, params = by_evosax(name, PARTICLES, 0.25 if name == "cma-es" else 0.15)
+    begun = ((SEED - LOW) / (HIGH - LOW),)
+    if name == "pso":
         swarm = jax.random.uniform(key(evolution.STREAM_START, 0), (PARTICLES, WIDTH))
-        state = own.init(key(0, 0), swarm.at[0].set(unit), jnp.full(PARTICLES, jnp.inf), params)
-    else:
-        uniform = partial(jax.random.uniform, shape=(WIDTH,))
-        own = algorithms.RandomSearch(PARTICLES, zeros, uniform)
-        params = own.default_params
-        state = own.init(key(0, 0), unit, params)
+        begun = swarm.at[0].set(begun[0]), jnp.full(PARTICLES, jnp.inf)
+    state = own.init(key(0, 0), *begun, params)
     free = np.arange(WIDTH) != LIMITED
     for episode in range(count):
         asked, state = own.ask(key(evolution.STREAM_ASK, episode), state, params)
@@ -135,8 +141,6 @@ def test_populations_are_those_of_evosax_called_directly(name):
 @pytest.mark.parametrize("name", optimize.SCREENED)
 def test_screened_searches_average_the_means_of_evosax(name):
     """Random designs, the best of them again, a strategy from there; particle 0 averages."""
-    from evosax import algorithms
-
     made = make_optimizer(name, SPACE)
     assert isinstance(made, Screened)
     state, populations, infos = run(made, start(made), OPEN[:5])
@@ -146,15 +150,8 @@ def test_screened_searches_average_the_means_of_evosax(name):
     costs = np.array([info.cost for info in infos])
     best, kept = drawn[costs[:3].argmin()], np.sort(costs[:3], axis=None)[:PARTICLES]
     np.testing.assert_allclose(costs[3:], [kept, kept], rtol=1e-6)  # sorted: no noise here
-    count = PARTICLES - 1 if made.strategy == "cma-es" else PARTICLES - 2
-    if made.strategy == "cma-es":
-        own = algorithms.CMA_ES(count, jnp.zeros(WIDTH))
-        params = own.default_params.replace(std_init=jnp.float32(0.2))
-    else:
-        descent = optax.sgd(evolution.learning_rate(0.15, WIDTH))
-        std = {"std_schedule": optax.constant_schedule(0.15)}
-        own = algorithms.Open_ES(count, jnp.zeros(WIDTH), optimizer=descent, **std)
-        params = own.default_params
+    count, std = {"cma-es": (PARTICLES - 1, 0.2), "open-es": (PARTICLES - 2, 0.15)}[made.strategy]
+    own, params = by_evosax(made.strategy, count, std)
     keys = [
         jax.random.fold_in(jax.random.fold_in(jax.random.key(0), stream), 5)
         for stream in (screened.STREAM_MOVE, screened.STREAM_TELL)
@@ -198,16 +195,23 @@ def test_with_few_parameters_the_final_test_takes_the_best_screened_designs_too(
 def test_bounds_and_constraint_hold(optimizer):
     _, populations, _ = run(optimizer, start(optimizer), OPEN[:8])
     assert (populations >= LOW).all() and (populations <= HIGH).all()
-    limits = 10 * populations[..., 0].astype(np.float64) + 60
+    limits = highest(populations[..., 0].astype(np.float64))
     # The limit is a sum of rounded float32.
     assert (populations[..., LIMITED] < limits + 1e-5).all()
     assert populations[..., LIMITED].std() > 1
 
 
 def test_closed_parameters_keep_their_bits(optimizer):
-    """One domain and then the other: what closes keeps a value that was found before."""
+    """One domain and then the other: what closes keeps a value that was found before.
+
+    But one that must sink with its limit, which wins.
+    """
     _, populations, _ = run(optimizer, start(optimizer), SWITCH)
-    free = np.arange(WIDTH) != LIMITED  # which may sink with its limit
+    free = np.arange(WIDTH) != LIMITED
+    sank = populations[:4, :, LIMITED] < SEED[LIMITED]
+    np.testing.assert_array_equal(sank[0], highest(populations[0, :, 0]) <= SEED[LIMITED])
+    assert sank.any() and not sank.all()
+    assert (populations[:4][~sank][:, LIMITED] == SEED[LIMITED]).all()
     kept = populations[:4, :, ~IS_FIRST & free]
     np.testing.assert_array_equal(kept, np.broadcast_to(SEED[~IS_FIRST & free], kept.shape))
     first, second = populations[:4][..., IS_FIRST], populations[4:][..., IS_FIRST]

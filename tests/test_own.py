@@ -197,7 +197,7 @@ def test_a_policy_is_searched_and_said_wherever_it_acts(here, capsys):
     assert "the run was made with --policy mine:Pull" in capsys.readouterr().err
     kept = []
     for share in ("0", "1"):
-        design = ["--scene", str(TINY), "--design", f"share={share}"]
+        design = ["--scene", str(TINY), "--engine", "mujoco", "--design", f"share={share}"]
         table = ["--out", f"{share}.csv"]
         cli.main(["evaluate", "--policy", "mine:Pull", *design, "--trials", "2", *table])
         kept.append((here / f"{share}.csv").read_text())

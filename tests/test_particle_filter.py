@@ -17,7 +17,6 @@ from codesign_jax.optimize import (
     reflect,
     rejection,
     stochastic_universal,
-    strictly_below,
 )
 
 repeatable = settings(max_examples=30, deadline=None, derandomize=True)
@@ -94,29 +93,6 @@ def test_moves_have_the_stated_deviation():
     np.testing.assert_allclose(step.mean(axis=0), 0, atol=4 * 0.05 / 64)
     correlation = np.corrcoef(np.asarray(step).T) - np.eye(5)
     assert np.abs(correlation).max() < 0.08
-
-
-def pressure_under_wall(particle):
-    """Two parameters: wall thickness [m] and pressure [Pa], limited as in Table I."""
-    thickness, pressure = particle
-    return jnp.stack([thickness, strictly_below(pressure, thickness * 4e7)])
-
-
-PRESSURE = ParticleFilter(
-    Space(np.array([2e-3, 0.0]), np.array([7e-3, 150e3]), project=pressure_under_wall)
-)
-
-
-def test_constraint_wins_over_a_closed_parameter_and_touches_nothing_feasible():
-    seed = np.array([3e-3, 119e3], np.float32)  # the limit is 120 kPa
-    population = jax.jit(PRESSURE.ask)(
-        PRESSURE.init(jax.random.key(0), seed, 200), np.array([True, False])
-    )
-    thickness, pressure = np.asarray(population, np.float64).T
-    assert np.all(pressure < thickness * 80e3 / 2e-3)
-    sank = thickness * 4e7 <= seed[1]
-    assert 50 < sank.sum() < 150
-    assert np.all(pressure[~sank] == seed[1])
 
 
 # --- tell ----------------------------------------------------------------------------------------

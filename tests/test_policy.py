@@ -244,6 +244,9 @@ def test_what_is_no_policy_is_refused(step, attributes, problem):
         )
     with pytest.raises(InputError, match="not a function"):
         policy.ControlLoop(make_engine("structured", scene), "react")
+    with pytest.raises(InputError, match="not a whole number of time steps"):
+        env.GraspEnv(SCENE, period=0.033)
+    assert policy.period_steps(SCENE, 0.03) == 3
 
 
 # --- environments: a grasp's actions make the trace of its controls, and trainers' wrappers run ---
@@ -327,9 +330,3 @@ def test_a_vector_environment_begins_ended_grasps_with_new_noise(episode):
     assert not ended.any() and (reward == 0).all()
     before, after = states[0].data.trial.yaw, worlds._state.data.trial.yaw
     assert not (np.asarray(after) == np.asarray(before)).any()
-
-
-def test_a_period_that_no_steps_make_is_refused():
-    with pytest.raises(InputError, match="not a whole number of time steps"):
-        env.GraspEnv(SCENE, period=0.033)
-    assert policy.period_steps(SCENE, 0.03) == 3

@@ -4,7 +4,6 @@ import contextlib
 import functools
 import importlib.util
 import os
-import pathlib
 import shutil
 import subprocess
 from functools import partial
@@ -51,21 +50,6 @@ EVERYTHING = {
 }
 
 
-def compared(case, steps=(STEP,)):
-    """Errors of the groups' derivatives over the largest, the least of several difference steps."""
-    weights = weights_of(case.start)
-    tables = case.many(1)
-    slope = case.along(case.bars(tables, case.execute(tables), [weights]))
-    errors = []
-    for step in steps:
-        difference, found = case.differences(weights, step)
-        assert (found["moved"] == 1).all()
-        errors.append(np.abs(slope - difference) / np.abs(slope).max())
-    for group, *row in zip(case.groups, slope, *errors, strict=True):
-        print(group[1], *(f"{v:.2e}" for v in row))
-    return np.min(errors, 0), dict(zip((name for _, name in case.groups), slope, strict=True))
-
-
 # --- planted faults ------------------------------------------------------------------------------
 
 DEEP = 1e6
@@ -104,6 +88,7 @@ def without(place, *fields):
     return change
 
 
+PUSH, SMOOTH = (AdjointSolve, "push"), (AdjointSolve, "smooth")
 FAULTS = {
     "links do not hand on what velocities cause": Fault(results={"of_link": without(0, "bias")}),
     "links do not hand on virtual motions": Fault(seeds={"of_link": without(0, "along")}),
@@ -130,27 +115,13 @@ FAULTS = {
         methods={(residual_vjp, "only_on"): lambda right, mask, tree: tree}
     ),
     "contacts push on the right side": Fault(
-        methods={
-            (AdjointSolve, "push"): lambda right, self, contacts, item, alpha: contacts.push(
-                item, alpha
-            )
-        }
+        methods={PUSH: lambda right, self, contacts, *rest: contacts.push(*rest)}
     ),
     "contacts of another stiffness": Fault(
-        methods={
-            (AdjointSolve, "push"): lambda right, *_: (
-                lanewise(lambda m: 0.99 * m, right[0]),
-                right[1],
-            )
-        }
+        methods={PUSH: lambda right, *_: (lanewise(lambda m: 0.99 * m, right[0]), right[1])}
     ),
     "smooth forces on the right side": Fault(
-        methods={
-            (AdjointSolve, "smooth"): lambda right, self, i: [
-                *self.problem.read("smooth", item=i),
-                right[1],
-            ]
-        }
+        methods={SMOOTH: lambda right, self, i: [*self.problem.read("smooth", item=i), right[1]]}
     ),
     "palm without conjugate gradients": Fault(
         methods={(adjoint_step.Coupling, "correct"): lambda right, self, step, idle: step}
@@ -290,12 +261,8 @@ def test_derivatives_by_every_group_equal_central_differences():
     slope, largest = c.sound[0], np.abs(c.sound[0]).max()
     for name, *row in zip(c.names, slope, c.difference, strict=True):
         print(name, *(f"{v:.6e}" for v in row))
-    cones = [abs(s) for n, s in zip(c.names, slope, strict=True) if n.startswith("cone.")]
-    cones += [
-        abs(s)
-        for n, s in zip(c.names, slope, strict=True)
-        if n.startswith("palm_") and n != "palm_disc"
-    ]
+    named = dict(zip(c.names, np.abs(slope), strict=True))
+    cones = [s for n, s in named.items() if n.startswith(("cone.", "palm_")) and n != "palm_disc"]
     assert len(cones) == 9 and min(cones) > 1e-6 * largest  # all bodies touch
     assert np.abs(slope - c.difference).max() < BOUND * largest
 
@@ -328,85 +295,60 @@ def test_derivatives_do_not_depend_on_company():
 
 # --- other scenes: what the quick tests' scene has not ------------------------------------------
 
+HELD = {"effects__finger_finger": True, "effects__friction_memory": True}
+HULL = {"effects__surface": "hull"}
+MIXED = DATA / "mixed.toml"  # a mesh, which still trials take, and a primitive
 SCENES = {
     "spheres": {"discretization__spheres_per_link": 2, "effects__finger_finger": True},
-    "full friction": {
-        "effects__friction": "full",
-        "effects__finger_finger": True,
-        "effects__friction_memory": True,
-    },
-    "no friction": {"effects__friction": "none", "effects__surface": "hull"},
+    "full friction": {"effects__friction": "full", **HELD},
+    "no friction": {"effects__friction": "none", **HULL},
     "rigid wrist": {"effects__wrist": False},
     "bending alone": {"effects__twist": False, "effects__lateral_bending": False},
     "no gravity, no table": {"effects__gravity": False, "effects__object_table": False},
-    "mesh": {},
-    "mesh and hull": {"effects__surface": "hull"},
-    "three fingers": {"effects__finger_finger": True, "effects__friction_memory": True},
-    "capsule": {},
+    "mesh": {"objects": MIXED},
+    "mesh and hull": {"objects": MIXED, **HULL},
+    "three fingers": {"hand": "tripod3", **HELD},
+    "capsule": {"shape": "capsule"},
     "fixtures": {},
     "tapered": {
-        "effects__surface": "hull",
+        "hand": DATA / "tapered.toml",
         "effects__finger_finger": True,
         "effects__finger_itself": True,
         "effects__neo_hookean": True,
         "effects__air_mass": True,
+        **HULL,
     },
 }
-
-
 # One of each kind, near enough that the curled hand touches them.
 FIXTURES = fixtures.WALL.replace("0.06, 0.0, 0.05", "0.06, 0.0, 0.03") + fixtures.POST
 FIXTURES += fixtures.SLOPES.replace("0.0, 0.045, 0.0", "0.0, 0.03, 0.0")
-
-
-def mixed(folder):
-    """A set of a mesh, which still trials take, and a primitive."""
-    text = (DATA / "sphere.toml").read_text()
-    mesh = f'''[[object]]
-name = "capsule"
-type = "mesh"
-file = "{pathlib.Path(__file__).parents[1] / "objects/household/capsule.stl"}"
-unit = "mm"
-mass = 0.1
-friction = 0.8
-
-[[object]]'''
-    (path := folder / "mixed.toml").write_text(text.replace("[[object]]", mesh))
-    return path
-
-
-def loaded(hand, objects, settings):
-    overrides = {"discretization": {"links": 2}}
-    for key, value in settings.items():
-        table, name = key.split("__")
-        overrides.setdefault(table, {})[name] = value
-    return scene.load("paper_spheres", hand_name=hand, object_set=objects, overrides=overrides)
 
 
 @pytest.mark.slow  # quick: the scene with everything
 @pytest.mark.parametrize("name", SCENES)
 def test_derivatives_of_scenes(name, tmp_path):
     """Each group as above; of two difference steps the one with the smaller error counts."""
-    settings = dict(SCENES[name])
     with jax.enable_x64(True):
-        if name.startswith("mesh"):
-            the_scene = loaded(DATA / "pinch.toml", mixed(tmp_path), settings)
-        elif name == "fixtures":
+        if name == "fixtures":
             overrides = {"discretization.links": 2, "effects.surface": "hull"}
             the_scene = fixtures.loaded(tmp_path, FIXTURES, "box", **overrides)
-        elif name in ("three fingers", "tapered"):
-            hand = "tripod3" if name == "three fingers" else DATA / "tapered.toml"
-            the_scene = loaded(hand, DATA / "sphere.toml", settings)
         else:
-            shape = "capsule" if name == "capsule" else "sphere"
-            the_scene = grasps.pinch(shape, links=2, **settings)
+            the_scene = grasps.pinch(**{"shape": "sphere", "links": 2} | SCENES[name])
         case = Case(the_scene, curled(the_scene, 8))
+        weights, tables, errors = weights_of(case.start), case.many(1), []
+        slope = case.along(case.bars(tables, case.execute(tables), [weights]))
         # With the capsule the differences by the wrist's start err by 2e-6 at a step of 1e-6, by a
         # hundredth at a tenth of it, and by 7e-10 at 2e-8; below that rounding grows.
-        errors, slopes = compared(case, (1e-7, 2e-8) if name == "capsule" else (1e-6, 1e-7))
+        for step in (1e-7, 2e-8) if name == "capsule" else (1e-6, 1e-7):
+            difference, found = case.differences(weights, step)
+            assert (found["moved"] == 1).all()
+            errors.append(np.abs(slope - difference) / np.abs(slope).max())
+        for (_, group), *row in zip(case.groups, slope, *errors, strict=True):
+            print(group, *(f"{v:.2e}" for v in row))
+        slopes = dict(zip((group for _, group in case.groups), slope, strict=True))
         size = "grid_factor" if name.startswith("mesh") else "object_size"
         assert slopes["cone.hand_object"] and slopes[size]
-        assert errors.max() < BOUND
+        assert np.min(errors, 0).max() < BOUND
 
 
 # --- on a GPU, in segments, of many worlds -------------------------------------------------------

@@ -429,8 +429,8 @@ def held_hands():
     A function of start, controls and steps of a piece: a sum of the end, the end, and the traces.
     """
     off = "finger_object finger_table palm_object palm_table finger_palm finger_itself twist"
-    how = {f"effects__{name}": False for name in off.split()} | {"effects__surface": "hull"}
-    how |= {"effects__finger_finger": True, "effects__friction_memory": True}
+    how = {"effects__finger_finger": True, "effects__friction_memory": True}
+    how |= grasps.off(off) | {"effects__surface": "hull"}
     chosen = grasps.pinch("box", links=2, **how)
     engine = make_engine("structured", chosen)
     with jax.enable_x64(True):

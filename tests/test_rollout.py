@@ -1,5 +1,7 @@
 """Trials, commands and batches: the same numbers in any order and company; whole grasps."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -10,7 +12,7 @@ from codesign_jax import control, model, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import parameters
 from codesign_jax.types import Status
-from tests.helpers.grasps import GOOD, hand_world, nth, pinch, random_designs, stack
+from tests.helpers.grasps import GOOD, hand_world, hurried, nth, pinch, random_designs, stack
 
 PAPER = scene.load("paper_spheres")
 KEY = jax.random.key(5)
@@ -47,70 +49,27 @@ def test_noise_has_the_declared_spread():
     assert np.abs(correlation).max() < 4.5 / np.sqrt(count)
 
 
-# --- commands ------------------------------------------------------------------------------------
-
-
-# One program for each scene; operation by operation they are eighty.
-commanded = jax.jit(control.commands, static_argnums=0)
-
-
-def commands(**changes):
-    params, trial = hand_world(PAPER, pressure=100e3)
-    arm = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.3])  # x y z roll pitch yaw
-    trial = trial._replace(**changes)
-    params, trial = jax.tree.map(jnp.asarray, (params._replace(arm=arm), trial))
-    return np.asarray(commanded(PAPER, params, trial))
-
-
-def test_the_arm_carries_the_trials_tilt():
-    tilted = commands(arm_tilt=np.array([0.05, -0.07]))
-    difference = tilted - commands()
-    np.testing.assert_allclose(difference[:, 3], 0.05, atol=1e-6)
-    np.testing.assert_allclose(difference[:, 5], -0.07, atol=1e-6)
-    np.testing.assert_array_equal(difference[:, [0, 1, 2, 4, 6, 7, 8, 9]], 0.0)
-
-
 # --- batches -------------------------------------------------------------------------------------
 
-SHORT = {
-    "phases__approach": 0.4,
-    "phases__inflate": 0.6,
-    "phases__lift": 0.8,
-    "phases__disturb": 1.0,
-    "phases__ungrasp": 1.6,
-}
 
+def test_order_of_particles_and_trials_does_not_matter():
+    """Also: every particle meets the same trials, whatever its place (common random numbers)."""
+    the_scene = pinch("box", links=2, **hurried(0.4, 0.6, 0.8, 1.0, 1.6))
+    engine, space = make_engine("mujoco", the_scene), parameters.design_space(the_scene.hand)
 
-@pytest.fixture(scope="module")
-def batch():
-    """A short scene, its engine, and a jitted evaluation that counts its compiles."""
-    the_scene = pinch("box", links=2, **SHORT)
-    engine, compiles = make_engine("mujoco", the_scene), []
-    space = parameters.design_space(the_scene.hand)
-
+    @jax.jit
     def evaluate(designs, trials):
-        compiles.append(designs.shape)
         return rollout.evaluate(the_scene, engine, jax.vmap(space.params)(designs), trials)
 
     designs = random_designs(space, seed=4, count=5)
     trials = rollout.sample_trials(the_scene, KEY, 4)
-    return jax.jit(evaluate), compiles, designs, trials, (the_scene, engine, space)
-
-
-def assert_same(one, other):
-    for a, b in zip(one, other, strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
-def test_order_of_particles_and_trials_does_not_matter(batch):
-    """Also: every particle meets the same trials, whatever its place (common random numbers)."""
-    evaluate, _, designs, trials, _ = batch
     whole = evaluate(designs, trials)
     particles, order = np.array([3, 0, 4, 1, 2]), np.array([2, 3, 0, 1])
     shuffled = evaluate(designs[particles], nth(trials, order))
-    assert_same(shuffled, (v[particles][:, order] for v in whole))
     twins = evaluate(jnp.stack([designs[0]] * 5), trials)
-    assert_same(twins, (jnp.stack([v[0]] * 5) for v in whole))
+    for one, mixed, same in zip(whole, shuffled, twins, strict=True):
+        np.testing.assert_array_equal(mixed, one[particles][:, order])
+        np.testing.assert_array_equal(same, jnp.stack([one[0]] * 5))
 
 
 # --- arm and start -------------------------------------------------------------------------------
@@ -125,7 +84,7 @@ def test_pitch_points_the_fingers_to_x_and_roll_to_y(axis, sign, column):
     params = params._replace(arm=arm)
     compiled = model.compile_model(PAPER, params, trial)
     data = mujoco.MjData(compiled)
-    u = commanded(PAPER, *jax.tree.map(jnp.asarray, (params, trial)))
+    u = jax.jit(partial(control.commands, PAPER))(params, trial)
     data.qpos[:6] = u[0, :6]
     mujoco.mj_kinematics(compiled, data)
     centre = model.layout(PAPER).centre_weights @ data.xipos - data.xpos[1]
@@ -133,9 +92,6 @@ def test_pitch_points_the_fingers_to_x_and_roll_to_y(axis, sign, column):
 
 
 # --- whole grasps in MuJoCo C ---------------------------------------------------------------------
-
-
-SHAPES = range(3)
 
 
 def design(the_scene, **changes):
@@ -146,28 +102,19 @@ def design(the_scene, **changes):
     return space.params(jnp.asarray(space.from_units(np.array(values)), jnp.float32))
 
 
-def grasp(the_scene, *designs, trials=None):
-    """Outcomes and traces, with leading axes (design, shape), of nominal trials."""
-    engine = make_engine("mujoco", the_scene)
-    trials = trials or [rollout.nominal_trial(the_scene, s) for s in SHAPES]
-    params = stack(*(p for p in designs for _ in trials))
-    worlds = stack(*(t for _ in designs for t in trials))
-    result = jax.jit(lambda p, t: rollout.simulate(the_scene, engine, p, t, record_qpos=True))(
-        params, worlds
-    )
-    return jax.tree.map(
-        lambda v: np.asarray(v).reshape(len(designs), len(trials), *v.shape[1:]), result
-    )
-
-
 @pytest.fixture(scope="module")
 def pneuflex():
-    """The paper's hand with a good design and four bad ones, on all three objects."""
+    """The paper's hand with a good design and four bad ones, on all three objects.
+
+    Outcomes and traces have leading axes (design, shape).
+    """
     the_scene = scene.load("paper_spheres")
-    short, limp = design(the_scene, length=25), design(the_scene, pressure=0)
-    high, beside = design(the_scene, arm_z=150), design(the_scene, arm_y=60)
-    outcome, trace = grasp(the_scene, design(the_scene), short, limp, high, beside)
-    return the_scene, outcome, trace
+    changes = {}, {"length": 25}, {"pressure": 0}, {"arm_z": 150}, {"arm_y": 60}
+    params = stack(*(p for c in changes for p in [design(the_scene, **c)] * 3))
+    trials = stack(*[rollout.nominal_trial(the_scene, s) for s in range(3)] * 5)
+    simulate = partial(rollout.simulate, the_scene, make_engine("mujoco", the_scene))
+    found = jax.jit(simulate)(params, trials)
+    return the_scene, *jax.tree.map(lambda v: np.reshape(v, (5, 3, *v.shape[1:])), found)
 
 
 def test_a_good_design_grasps_every_object(pneuflex):

@@ -25,17 +25,9 @@ ROOT = Path(__file__).parent.parent
 
 def settings(**changes):
     """The paper's 2D settings, changed."""
-    sizes = {"particles": 4, "trials": 2, "episodes": 3, "test_trials": 3}
-    named = {k: v for k, v in changes.items() if k not in sizes}
-    sizes |= {k: v for k, v in changes.items() if k in sizes}
-    base = {
-        "preset": "2d",
-        "schedule": "concurrent",
-        "first": "control",
-        "engine": "mujoco",
-        "seed": 0,
-    }
-    return settings_module.make_settings(**(base | named), **sizes)
+    base = {"preset": "2d", "schedule": "concurrent", "first": "control", "engine": "mujoco"}
+    base |= {"seed": 0, "particles": 4, "trials": 2, "episodes": 3, "test_trials": 3}
+    return settings_module.make_settings(**(base | changes))
 
 
 @pytest.fixture(scope="module")
@@ -114,8 +106,7 @@ def test_settings_report_every_problem():
 
 
 def read(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+    return list(csv.DictReader(path.read_text().splitlines()))
 
 
 def test_tables_hold_the_history_with_units(run, tmp_path):

@@ -61,8 +61,7 @@ def test_render_draws_a_row_of_the_table(run, workplace, simulated, capsys):
         assert image.size == (32, 32) and image.n_frames > 2
     assert simulated == [1]
     said = capsys.readouterr().out
-    with (run / "trials.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = list(csv.DictReader((run / "trials.csv").read_text().splitlines()))
     [row] = [r for r in rows if [r["episode"], r["particle"], r["trial"]] == ["1", "2", "1"]]
     lost = float(row["lost_time_s"])
     verdict = "object kept" if np.isinf(lost) else f"object lost at {lost:.2f} s"
@@ -121,11 +120,12 @@ def test_places_that_cannot_be_written_are_said_before_a_simulation(
         ("replay", *DESIGN, "--out"): "file/folder/a.html",
         ("report", str(run), "--out"): "file/a.html",
         ("optimize", *DESIGN[:2], "--out"): "file/folder",
+        ("export", *DESIGN[:2], "--out"): "file/out",
     }
     for arguments, place in cases.items():
         assert cli.main([*arguments, place]) == 2, arguments
-        words = f"error: {arguments[-1]} {place} cannot be written: Not a directory"
-        assert words in capsys.readouterr().err
+        words = f"error: {arguments[-1]} {place}( cannot be written)?: Not a directory"
+        assert re.search(words, capsys.readouterr().err)
     assert cli.main(["report", str(run), "--out", str(workplace)]) == 2
     assert "cannot be written: it is a folder" in capsys.readouterr().err
     assert simulated == [] and [p.name for p in workplace.iterdir()] == ["file"]
@@ -155,8 +155,7 @@ def test_landscape_has_every_point(run, monkeypatch, capsys):
     np.testing.assert_allclose(found.cost.ravel(), cost, rtol=1e-6)
     assert len(np.unique(cost.round(3))) > 3, "points differ"
     np.testing.assert_array_equal(found.counted.ravel(), (~failed(joined.status)).sum(1))
-    with (run / landscape.TABLE).open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = list(csv.DictReader((run / landscape.TABLE).read_text().splitlines()))
     assert len(rows) == 9
     assert float(rows[5]["length_mm"]) == pytest.approx(found.first[1])
     assert float(rows[5]["arm_z_mm"]) == pytest.approx(found.second[2])

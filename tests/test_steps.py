@@ -11,7 +11,6 @@ import pytest
 
 from codesign_jax import control, model, preflight
 from codesign_jax.engines import make_engine
-from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.runs import scene_files
 from codesign_jax.scene import schema
@@ -135,8 +134,7 @@ def test_steps_of_mjx_equal_mujocos(tmp_path, effects, fixtures):
         scene = dataclasses.replace(scene, solver=solver)
         fields, ctrl = a_grasp(scene)
         fields = jax.tree.map(lambda v: v[0], fields)
-        engine, oracle = make_engine("mjx", scene), world_model(scene, fields)
-        oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
+        engine, oracle = make_engine("mjx", scene), oracles.exact(scene, fields)
         step = jax.jit(engine.step, compiler_options={"xla_backend_optimization_level": 0})
         data, ours = mujoco.MjData(oracle), engine.reset(fields)
         data.qpos[:] = fields.start

@@ -12,7 +12,7 @@ from codesign_jax import model
 from codesign_jax.model import morphology
 from codesign_jax.scene import hand
 from codesign_jax.types import Params, Trial
-from tests.helpers.grasps import pinch
+from tests.helpers.grasps import off, pinch
 
 
 @functools.cache
@@ -26,17 +26,13 @@ def finger_scene(
     beta=6e-3,
     damping="added",
 ):
+    without = "finger_object finger_table palm_object palm_table"
     the_scene = pinch(
         "sphere",
-        links=links,
+        links,
         discretization__timestep=timestep,
         discretization__spring_damping=damping,
-        effects__lateral_bending=not bending_only,
-        effects__twist=not bending_only,
-        effects__finger_object=False,
-        effects__finger_table=False,
-        effects__palm_object=False,
-        effects__palm_table=False,
+        **off(without + " lateral_bending twist" * bending_only),
     )
     one = dataclasses.replace(
         the_scene.hand,

@@ -53,12 +53,7 @@ def inputs(scene, count):
 def short_scene(name):
     """A small scene: two fingers of two links, and a cylinder or household objects from meshes."""
     if name == "mesh":
-        return scenes.load(
-            "paper_spheres",
-            hand_name=grasps.DATA / "pinch.toml",
-            object_set="household",
-            overrides={"discretization": {"links": 2}},
-        )
+        return grasps.pinch(links=2, objects="household")
     return grasps.pinch("cylinder", links=2, **EFFECTS[name])
 
 

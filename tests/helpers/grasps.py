@@ -24,35 +24,32 @@ GOOD = {"length": 86, "height": 24.5, "wall": 5, "spread": 55, "arm_z": 58, "pre
 
 
 @functools.cache
-def pinch(shape="box", links=3, **settings):
-    """Two opposed fingers and one object; settings as table__key=value."""
+def pinch(shape="box", links=3, *, hand=DATA / "pinch.toml", objects=None, **settings):
+    """Two opposed fingers and one object, or other files; settings as table__key=value."""
     overrides = {"discretization": {"links": links}}
     for key, value in settings.items():
         table, name = key.split("__")
         overrides.setdefault(table, {})[name] = list(value) if type(value) is tuple else value
-    return scene.load(
-        "paper_spheres",
-        hand_name=DATA / "pinch.toml",
-        object_set=DATA / f"{shape}.toml",
-        overrides=overrides,
-    )
+    files = {"hand_name": hand, "object_set": objects or DATA / f"{shape}.toml"}
+    return scene.load("paper_spheres", **files, overrides=overrides)
+
+
+def off(effects):
+    """Settings of `pinch` without these effects, named in one text."""
+    return {f"effects__{name}": False for name in effects.split()}
+
+
+def hurried(*ends, without=""):
+    """Settings of `pinch`: ends of the first phases [s], and without these effects."""
+    names = ("approach", "inflate", "lift", "disturb", "ungrasp")
+    return {f"phases__{n}": end for n, end in zip(names, ends, strict=False)} | off(without)
 
 
 @functools.cache
 def short_grasp():
     """0.6 s: the hand comes down beside the box, closes by a real air supply, lifts and shakes."""
-    return pinch(
-        "box",
-        phases__approach=0.2,
-        phases__inflate=0.35,
-        phases__lift=0.5,
-        phases__disturb=0.6,
-        effects__pressure_dynamics=True,
-        effects__ungrasp=False,
-        effects__palm_object=False,
-        effects__palm_table=False,
-        arm__start_height=0.15,
-    )
+    settings = hurried(0.2, 0.35, 0.5, 0.6, without="ungrasp palm_object palm_table")
+    return pinch("box", effects__pressure_dynamics=True, arm__start_height=0.15, **settings)
 
 
 def random_designs(space, seed, count):

@@ -51,6 +51,13 @@ def path(engine, fields, ctrl):
     return Path(*(np.asarray(found[name]) for name in Path._fields))
 
 
+def exact(scene, fields):
+    """MuJoCo C's model of a world, solved to rounding."""
+    compiled = world_model(scene, fields)
+    compiled.opt.tolerance, compiled.opt.iterations, compiled.opt.ls_iterations = 0.0, 200, 50
+    return compiled
+
+
 def against_mujoco(scene, fields, ctrl, found, stride=1):
     """Errors of a path's steps against MuJoCo C, which converges at each of its states.
 
@@ -62,9 +69,7 @@ def against_mujoco(scene, fields, ctrl, found, stride=1):
     errors, far, touching = [], [], []
     for world in range(len(ctrl)):
         own = grasps.nth(fields, world)
-        compiled = world_model(scene, own)
-        compiled.opt.tolerance, compiled.opt.iterations, compiled.opt.ls_iterations = 0.0, 200, 50
-        data = mujoco.MjData(compiled)
+        data = mujoco.MjData(compiled := exact(scene, own))
         for k in range(1, ctrl.shape[1] - 1, stride):
             qpos, (qvel, after) = found.qpos[world, k], found.qvel[world, k : k + 2]
             data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, ctrl[world, k]

@@ -15,7 +15,7 @@ class Sizes(NamedTuple):
 PAPER = {"2d": Sizes(10, 6, 64, 36), "": Sizes(60, 6, 128, 72)}
 """The paper's (sections VI.2 and VI.4), by preset or for all others, which the optimisers that are
 compared with the paper's share."""
-SCREENED = {"2d": Sizes(13, 3, 19, 36), "": Sizes(25, 3, 30, 48)}
+SCREENED = {"2d": Sizes(12, 3, 22, 48), "": Sizes(25, 3, 30, 48)}
 """Those of the screened searches, by docs/notes/search.md; `trials` is the least, as each particle
 meets every object."""
 

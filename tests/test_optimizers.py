@@ -138,10 +138,9 @@ def test_populations_are_those_of_evosax_called_directly(name):
         state, _ = own.tell(*told, state, params)
 
 
-@pytest.mark.parametrize("name", optimize.SCREENED)
-def test_screened_searches_average_the_means_of_evosax(name):
+def test_the_default_averages_the_means_of_evosax():
     """Random designs, the best of them again, a strategy from there; particle 0 averages."""
-    made = make_optimizer(name, SPACE)
+    made = make_optimizer(optimize.DEFAULT, SPACE)
     assert isinstance(made, Screened)
     state, populations, infos = run(made, start(made), OPEN[:5])
     free = np.arange(WIDTH) != LIMITED
@@ -150,8 +149,8 @@ def test_screened_searches_average_the_means_of_evosax(name):
     costs = np.array([info.cost for info in infos])
     best, kept = drawn[costs[:3].argmin()], np.sort(costs[:3], axis=None)[:PARTICLES]
     np.testing.assert_allclose(costs[3:], [kept, kept], rtol=1e-6)  # sorted: no noise here
-    count, std = {"cma-es": (PARTICLES - 1, 0.2), "open-es": (PARTICLES - 2, 0.15)}[made.strategy]
-    own, params = by_evosax(made.strategy, count, std)
+    count = PARTICLES - 2
+    own, params = by_evosax("open-es", count, 0.15)
     keys = [
         jax.random.fold_in(jax.random.fold_in(jax.random.key(0), stream), 5)
         for stream in (screened.STREAM_MOVE, screened.STREAM_TELL)
@@ -174,22 +173,36 @@ def test_screened_searches_average_the_means_of_evosax(name):
         average = average + 4 / (t + 3) * (mean - average)
 
 
-def test_with_few_parameters_the_final_test_takes_the_best_screened_designs_too():
-    """They stay in rows 3 to 5, of any size of a run, while the strategy goes on."""
-    few = Screened(optimize.Space(LOW[:2], HIGH[:2]))
-    assert (few.finalists, Screened(SPACE).finalists) == (6, 3)
+def test_with_few_parameters_the_best_random_designs_are_simulated_again():
+    """A design's cost is the mean of all its episodes, and a lucky one does not stand first."""
+    space, noise = optimize.Space(LOW[:3], HIGH[:3]), np.random.default_rng(0)
+    made = make_optimizer(optimize.DEFAULT, space)
+    assert not isinstance(make_optimizer(optimize.DEFAULT, SPACE), type(made))
+    told = {}
 
-    def tops(population):
-        return ((population - LOW[:2]) ** 2).sum(-1)
+    def cost(population):
+        """Noisy grasps: of the best design two thirds cost nothing, of others fewer."""
+        unit = (population - LOW[:3]) / (HIGH[:3] - LOW[:3])
+        lost = noise.random(len(unit)) < 1 / 3 + 2 / 3 * np.abs(unit - TARGET[:3]).max(-1)
+        for row, value in zip(population, lost, strict=True):
+            told.setdefault(row.tobytes(), []).append(float(value))
+        return lost.astype(np.float32)
 
-    for particles in (13, 5):
-        state = few.init(jax.random.key(0), SEED[:2], particles)
-        screened_state, *_ = run(few, state, OPEN[:5, :2], tops)
-        for count in (1, 6):
-            later, _, infos = run(few, screened_state, OPEN[:count, :2], tops)
-            best = np.asarray(screened_state.particles)[: particles - 3][:3]
-            np.testing.assert_array_equal(later.particles[3:6], best)
-            assert (np.asarray(infos[-1].ancestors)[3:6] == -1).all()
+    state = made.init(jax.random.key(0), SEED[:3], 12)
+    state, populations, infos = run(made, state, OPEN[:40, :3], cost)
+    drawn = ((populations[::2] - LOW[:3]) / (HIGH[:3] - LOW[:3])).ravel()
+    assert stats.kstest(drawn, "uniform").pvalue > 0.01
+    assert (np.unique(populations[1::2].reshape(-1, 3), axis=0).shape[0]) < 20 * 12 / 2
+    # By the mean with one episode of cost 1 besides, of all that was ever simulated.
+    ranked = sorted(told, key=lambda row: (sum(told[row]) + 1) / (len(told[row]) + 1))
+    means = [np.mean(told[row]) for row in ranked[:3]]
+    designs = [row.tobytes() for row in np.asarray(state.memory["designs"])]
+    np.testing.assert_allclose(state.memory["cost"][:3], means, rtol=1e-5)
+    assert designs[:3] == ranked[:3] and len(told[ranked[0]]) > 5
+    rows = [row.tobytes() for row in np.asarray(state.particles)]
+    assert rows == designs[:3] + designs[:1] * 9
+    copied = np.asarray(infos[-1].ancestors)
+    np.testing.assert_array_equal(populations[-1][copied], state.particles)
 
 
 def test_bounds_and_constraint_hold(optimizer):

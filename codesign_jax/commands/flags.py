@@ -151,7 +151,7 @@ class Optimize(Command, SceneFlags):
     control for odd ones, as in the paper's experiments."""
     optimizer: Text = None
     """Optimiser: screened-es, the default of a new run, particle-filter (the paper's),
-    screened-cma-es, cma-es, open-es, pso or random (docs/command_line.md); or MODULE:CLASS, one of
+    cma-es, open-es, pso or random (docs/command_line.md); or MODULE:CLASS, one of
     your own. A run goes on with its own."""
     cost: Text = None
     """MODULE:FUNCTION, a cost of your own instead of the scene's: a number from scene, trace and

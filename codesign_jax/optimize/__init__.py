@@ -20,10 +20,11 @@ array([[ True, False],
 
 from codesign_jax.optimize.bounds import Space, reflect, strictly_below
 from codesign_jax.optimize.evolution import EVOSAX, Evolution
-from codesign_jax.optimize.names import DEFAULT, NAMES, PAPER, SCREENED, make_optimizer, problem
+from codesign_jax.optimize.names import DEFAULT, NAMES, PAPER, make_optimizer, problem
 from codesign_jax.optimize.particle_filter import ParticleFilter
 from codesign_jax.optimize.protocol import Info, Optimizer, State
 from codesign_jax.optimize.resampling import MAX_PARTICLES, stochastic_universal
+from codesign_jax.optimize.retested import Retested
 from codesign_jax.optimize.schedule import schedule
 from codesign_jax.optimize.screened import Screened
 from codesign_jax.optimize.seeding import (
@@ -40,12 +41,12 @@ __all__ = [
     "MAX_PARTICLES",
     "NAMES",
     "PAPER",
-    "SCREENED",
     "Evolution",
     "Info",
     "NoSeed",
     "Optimizer",
     "ParticleFilter",
+    "Retested",
     "Screened",
     "Space",
     "State",

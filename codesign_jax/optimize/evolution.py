@@ -107,7 +107,9 @@ class Evolution:
         assert state.memory is not None
         cost = check_told(state, population, cost)
         ranked = jnp.where(jnp.isfinite(cost), cost, jnp.inf)
-        told = fitness(self.name, ranked)
+        # CMA-ES knows ranks only.  evosax gives equal costs a common weight below their share,
+        # which shrinks steps on a plateau such as "every grasp is lost"; rows are a fair draw.
+        told = jnp.argsort(jnp.argsort(ranked)) if self.name == "cma-es" else ranked
         strategy, (unit, asked) = self._strategy(state), self._asked(state, mask)
         key = episode_key(state, STREAM_TELL)
         new, _ = strategy.algorithm.tell(key, unit, told.astype(unit.dtype), asked, strategy.params)
@@ -179,15 +181,6 @@ def build(name: str, particles: int, width: int, sigma: float, dtype: str) -> St
         if name == "cma-es":
             params = params.replace(std_init=jnp.asarray(sigma, dtype))
         return Strategy(algorithm, params)
-
-
-def fitness(name: str, cost: jax.Array) -> jax.Array:
-    """What a strategy is told of costs, shape (particle,).
-
-    CMA-ES knows ranks only.  evosax gives equal costs a common weight below their share, which
-    shrinks the steps on a plateau such as "every grasp is lost"; rows are a fair draw.
-    """
-    return jnp.argsort(jnp.argsort(cost)) if name == "cma-es" else cost
 
 
 def learning_rate(sigma: float, width: int) -> float:

@@ -4,17 +4,14 @@ Grasps are noisy: a design that loses none of three objects may lose one in ten.
 particle is believed.  The mean of an evolution strategy moves where particles keep their objects on
 the whole; the average of these means over the episodes, recent ones weighing more, has less noise
 still, and no trial chose it.  Each average is simulated as particle 0 of the next episode, and the
-final test takes the newest one and two earlier ones.  Where parameters are few, random designs come
-close to the best, and a strategy's mean can stay at a poor one: there the final test takes the best
-random designs as well.
+final test takes the newest one and two earlier ones.
 
 The strategy is OpenAI's.  Its draws come in mirrored pairs and designs of equal cost have equal
 weight, so that its mean stays where it is while all particles keep all of their objects; that of
 CMA-ES wanders then, as it follows whichever of them stand first.
 
 Sources: Salimans et al. (2017), "Evolution strategies as a scalable alternative to reinforcement
-learning", arXiv:1703.03864, and Hansen (2016), "The CMA evolution strategy: a tutorial",
-arXiv:1604.00772, both by evosax; Shamir and Zhang (2013), "Stochastic gradient descent for
+learning", arXiv:1703.03864, by evosax; Shamir and Zhang (2013), "Stochastic gradient descent for
 non-smooth optimization", arXiv:1212.1824, section 4 (polynomial-decay averaging).
 docs/notes/search.md has what each part is worth.
 """
@@ -28,7 +25,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from codesign_jax.optimize.bounds import Space, reflect
-from codesign_jax.optimize.evolution import OPEN_SIGMA, Strategy, arrays, build, fitness
+from codesign_jax.optimize.evolution import OPEN_SIGMA, Strategy, arrays, build
 from codesign_jax.optimize.protocol import (
     Info,
     State,
@@ -48,14 +45,6 @@ STREAM_TELL = 0x636D6174
 """Stream of its draws in `tell` ("cmat")."""
 LEAST = 3
 """Fewest particles: the average, and two for the strategy to rank."""
-AVERAGES = 3
-"""Averages that the final test takes."""
-STARTS = 3
-"""Best screened designs that it takes as well, where a design has at most `FEW` parameters."""
-FEW = 4
-"""Most parameters with which random designs count as close to the best."""
-STRATEGIES = {"open-es": OPEN_SIGMA, "cma-es": 0.2}
-"""The strategies, and the first standard deviation of each as a fraction of the parameter range."""
 
 
 @jax.tree_util.register_dataclass
@@ -68,45 +57,35 @@ class Screened:
     more than they do.  Later ones simulate the average so far, as particle 0, and draws of the
     strategy.  Particles 1 and 2 of the state are the averages after a third and two thirds of
     these, at most as many ago as there are particles: a guard against a mean that has left a good
-    place.  With up to `FEW` parameters particles 3 to 5 are the best screened designs.  All others
-    are the newest average, and the final test takes these first three or six alone: so few are
-    compared in many trials.  When a schedule opens other parameters, strategy and average start
-    anew at particle 0.
+    place.  All others are the newest average, and the final test takes these first three alone: so
+    few are compared in many trials.  When a schedule opens other parameters, strategy and average
+    start anew at particle 0.
 
     Attributes:
       keeps_best: True: the final test counts new trials only; see `Optimizer.keeps_best`.
       screens: True: it looks for its start by itself, so that a run needs no poor seed particle.
+      finalists: Averages that the final test takes.
       space: Bounds and constraint of the parameters.
-      strategy: One of `STRATEGIES`. With "open-es", whose draws come in pairs, the last one of
-        an even number of particles is the strategy's mean.
       screening: Episodes of random designs; without any it starts at the seed particle.
       retests: Episodes that simulate the best of them again.
-      sigma: First standard deviation of the strategy as a fraction of the parameter range; 0 for
-        that of `STRATEGIES`.
+      sigma: Standard deviation of the strategy's draws as a fraction of the parameter range.
       recency: After `t` episodes of the strategy its mean has weight `recency / (t + recency
         - 1)` in the average: 1 is the plain average, more forgets the first means sooner.
     """
 
     keeps_best = True
     screens = True
+    finalists = 3
 
     space: Space
-    strategy: str = dataclasses.field(default="open-es", metadata={"static": True})
     screening: int = dataclasses.field(default=3, metadata={"static": True})
     retests: int = dataclasses.field(default=2, metadata={"static": True})
-    sigma: float = dataclasses.field(default=0.0, metadata={"static": True})
+    sigma: float = dataclasses.field(default=OPEN_SIGMA, metadata={"static": True})
     recency: float = dataclasses.field(default=4.0, metadata={"static": True})
 
     def __post_init__(self) -> None:
-        if self.strategy not in STRATEGIES:
-            raise ValueError(f"need a strategy of {', '.join(STRATEGIES)}: {self}")
-        if not (min(self.screening, self.retests, self.sigma) >= 0 and self.recency >= 1):
-            raise ValueError(f"need recency >= 1, screening, retests and sigma >= 0: {self}")
-
-    @property
-    def finalists(self) -> int:
-        """Particles of the state that the final test takes: averages, and screened designs."""
-        return AVERAGES + (STARTS if jnp.size(self.space.low) <= FEW else 0)
+        if not (min(self.screening, self.retests) >= 0 < self.sigma and self.recency >= 1):
+            raise ValueError(f"need recency >= 1, screening and retests >= 0, sigma > 0: {self}")
 
     @property
     def begins(self) -> int:
@@ -153,7 +132,7 @@ class Screened:
         unit, asked, memory = self._asked(state, mask)
         algorithm, params = self._strategy(state)
         points = slice(1, 1 + algorithm.population_size)
-        told = fitness(self.strategy, ranked[points]).astype(unit.dtype)
+        told = ranked[points].astype(unit.dtype)
         key = episode_key(state, STREAM_TELL)
         new, _ = algorithm.tell(key, unit[points], told, asked, params)
         weight = self.recency / (memory["averaged"] + self.recency)
@@ -162,20 +141,15 @@ class Screened:
         # The averages that were simulated, newest first, and which of them the final test takes.
         way = jnp.concatenate([population[:1], state.memory["way"][:-1]])
         rows, third = jnp.arange(len(cost)), now["averaged"] // 3
-        ago = jnp.where(rows < AVERAGES, jnp.array([0, 2, 1])[rows % AVERAGES] * third, 0)
+        ago = jnp.where(rows < 3, jnp.array([0, 2, 1])[rows % 3] * third, 0)
         finalists = way[jnp.minimum(ago, len(cost) - 1)]
-        # Screened designs stand best first until the strategy begins.
-        starts = (rows >= AVERAGES) & (rows < self.finalists)
-        begins = state.episode == self.begins
-        screened_rows = jnp.where(begins, jnp.maximum(rows - AVERAGES, 0), rows)
-        finalists = jnp.where(starts[:, None], state.particles[screened_rows], finalists)
         following = jax.tree.map(partial(jnp.where, screens), memory, now) | {
             "way": jnp.where(screens, state.memory["way"], way),
             "mask": jnp.broadcast_to(mask, state.memory["mask"].shape),
             "cost": jnp.where(screens, costs[best], state.memory["cost"]),
         }
         copied = jnp.where(
-            screens, jnp.where(best < len(cost), best, -1), jnp.where(starts | (ago > 0), -1, 0)
+            screens, jnp.where(best < len(cost), best, -1), jnp.where(ago > 0, -1, 0)
         )
         particles = jnp.where(screens, screened, finalists)
         next_state = State(particles, state.episode + 1, state.key, following)
@@ -216,6 +190,5 @@ class Screened:
 
     def _strategy(self, state: State) -> Strategy:
         (n, width), dtype = state.particles.shape, str(state.particles.dtype)
-        count = n - 1 if self.strategy == "cma-es" else 2 * ((n - 1) // 2)
-        sigma = self.sigma or STRATEGIES[self.strategy]
-        return build(self.strategy, count, width, sigma, dtype)
+        # Its draws come in pairs; the last one of an even number of particles is its mean.
+        return build("open-es", 2 * ((n - 1) // 2), width, self.sigma, dtype)

@@ -85,7 +85,7 @@ def make_settings(
     objects: int = 3,
 ) -> Settings:
     """Fills sizes that are not given: those of `sizes`, in a scene with so many `objects`."""
-    screens = optimizer in optimize.SCREENED
+    screens = optimizer == optimize.DEFAULT
     by_preset = sizes.SCREENED if screens else sizes.PAPER
     usual = by_preset.get(preset, by_preset[""])
     if screens:

@@ -11,6 +11,7 @@ STAMP := $(VENV)/.installed
 DEMO := $(VENV)/.demo
 QUICK := $(VENV)/.quick
 EXTRAS := notebooks,report,test,docs,dev
+SHOWN := report,export
 CHECKED := codesign_jax scripts tests notebooks
 
 # What is imported is compiled once: without its bytecode every process compiles it again, for 7 s.
@@ -19,7 +20,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: demo docs test quick test-browser test-ptx test-gpu test-slow stability faults notebooks benchmark effects accuracy lint format types clean help
 
 help:
-	@echo "make demo        co-design a gripper in 2D on the CPU, with figure and animation"
+	@echo "make demo        co-design a gripper, 23 parameters, on the CPU, with figures and a film"
 	@echo "make test        quick tests          make test-slow   whole optimisations"
 	@echo "make quick       a minute of them, for another Python: PYTHON=python3.13 VENV=.venv-other MUJOCO='mujoco<4'"
 	@echo "make test-gpu    the tests that need an NVIDIA GPU, GPU=file.json"
@@ -118,9 +119,9 @@ $(STAMP): pyproject.toml
 	$(call install,$(EXTRAS))
 	@touch $@ $(DEMO) $(QUICK)
 
-# A third of the packages: who asks for the demo does not wait for the others.
+# What README and quickstart then use: who asks for the demo does not wait for the others.
 $(DEMO): pyproject.toml
-	$(call install,report)
+	$(call install,$(SHOWN))
 	@touch $@
 
 $(QUICK): pyproject.toml

@@ -1,6 +1,6 @@
 """A co-design of all 23 parameters, from random designs to one that grasps, with pictures.
 
-`make demo` runs it: a minute or two on two cores.  It is `codesign optimize` and `codesign
+`make demo` runs it: two minutes on two cores.  It is `codesign optimize` and `codesign
 evaluate` with the arguments below; further arguments go to the former, such as --fresh or --seed 1.
 The scene has its skinned hull and contact between fingers.
 """
@@ -16,7 +16,7 @@ FOLDER = Path("runs") / "demo"
 
 
 def main() -> int:
-    """Runs the demo and returns the exit status: 0 only if the design is good."""
+    """Runs the demo and returns the exit status: 0 if it ran to its end."""
     run = ["optimize", "--scene", "paper", "--preset", "23d", "--seed", "3"]
     run += ["--reference-trials", "0", "--out", str(FOLDER)]
     status = cli.main([*run, *sys.argv[1:]])
@@ -36,7 +36,7 @@ def main() -> int:
     print("the cost's evolution:   ", FOLDER / "figures" / "cost_evolution.png")
     print("the best grasp, moving: ", pictures[1])
     print("all of it, for a browser:", FOLDER / "report.html")
-    return 0 if judged.verdict.word == "good" else 1
+    return 0
 
 
 if __name__ == "__main__":

@@ -18,11 +18,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from PIL import Image
 
 from codesign_jax import cli, codesign, rollout, runs
 from codesign_jax.commands import common
+from codesign_jax.commands.flags import Evaluate
 from codesign_jax.report import animation
 from codesign_jax.report.replay import Camera
 from codesign_jax.report.verdicts import Judged
@@ -40,8 +40,8 @@ class Hand:
     """A hand of docs/gallery/hands.toml.
 
     Attributes:
-      scene: Flags of the scene.
-      search: Those that `codesign optimize` has beside them.
+      names: Scene, hand, objects or control, where they are not the default ones.
+      search: Flags that `codesign optimize` has beside these.
       sentence: What the hand does.
       shown: Objects that it is seen with.
       camera: What its camera has of its own.
@@ -51,13 +51,15 @@ class Hand:
     search: str
     sentence: str
     shown: list[str]
-    scene: str = ""
+    names: dict[str, str] = dataclasses.field(default_factory=dict)
     camera: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     @property
     def command(self) -> str:
         """The search."""
-        return " ".join(f"codesign optimize {self.scene} {self.search}".split())
+        flags = {"control": "--set control="}
+        named = [flags.get(key, f"--{key} ") + name for key, name in self.names.items()]
+        return " ".join(["codesign optimize", *named, self.search])
 
     @property
     def design(self) -> Path:
@@ -77,7 +79,7 @@ def find(hand: Hand) -> None:
     words = [*shlex.split(hand.command)[1:], "--reference-trials", "0"]
     cli.main([*words, "--out", str(folder)])
     case, preset = choice.case_of_run(folder), runs.read_run(folder)[1].preset
-    text = common.design_text(case.space, preset, case.design)
+    text = common.design_text(case.space, common.DesignFile(preset, {}, **hand.names), case.design)
     hand.design.write_text(text, encoding="utf-8")
 
 
@@ -128,8 +130,7 @@ def main(names: list[str]) -> None:
         if not names or hand.name in names:
             if not hand.design.exists():
                 find(hand)
-            words = [*shlex.split(hand.scene), "--design", str(hand.design)]
-            case = common.find_case(tyro.cli(cli.Evaluate, args=words))
+            case = common.find_case(Evaluate(design=((str(hand.design),),)))
             judge(hand, case)
             draw(hand, case)
     rows = [row(hand) for hand in hands() if hand.design.exists()]
@@ -138,9 +139,10 @@ def main(names: list[str]) -> None:
 
 HEAD = """# Hands that were found
 
-Each hand is the answer of one search, by the command beside it ([bin and shelf](scenes.md): of one
-of twelve seeds), judged in 100 fresh trials at the accuracy of the search. `--design` takes its
-file. On another machine a search may find another hand. `python -m scripts.gallery` makes the page.
+Each hand is the answer of one search, by the command beside it; `bin` and `shelf` show the best of
+12 seeds, `edge` of three ([how](scenes.md)). `codesign evaluate --design docs/gallery/bin.toml
+--trials 100 --seed 1000` repeats the verdict of `bin`: the file names the scene, the hand and what
+else is not the default. On another machine a search may find another hand.
 
 | | |
 | --- | --- |"""

@@ -192,14 +192,19 @@ def test_what_is_not_given_is_said_to_be_a_default(capsys):
 
 
 def test_a_design_is_opened_from_its_file(workplace, capsys):
-    """As it was written, in its own design space, and with what the command line changes."""
-    space = parameters.design_space(scene.load("paper").hand, "23d")
+    """As it was written, in what it names, and with what the command line changes."""
+    sliding = scene.load("paper", overrides={"control": "slide"})
+    space = parameters.design_space(sliding.hand, "23d")
     design = np.asarray(space.sample(jax.random.key(3), 1)[0])
-    text = common.design_text(space, "23d", design)
+    file = common.DesignFile("23d", {}, objects="plate", control="slide")
+    text = common.design_text(space, file, design)
     (workplace / "mine.toml").write_text(text)
     assert tomllib.loads(text)["preset"] == "23d"
     opened = common.find_design(space, ["mine.toml"])
     np.testing.assert_allclose(opened, design, rtol=1e-8)  # nine digits
+    flags = common.Subject(objects="paper", design=(("mine.toml",),))
+    named = common.load_scene(flags)
+    assert (named.control.name, named.objects.name) == ("slide", "paper"), "a flag holds"
     assert command("evaluate", "--dry-run", "--design", "mine.toml", "length[1]=90") == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     lengths = [f"{v:.4g}" for v in 1e3 * design[:4]]

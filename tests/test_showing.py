@@ -170,4 +170,4 @@ def test_missing_extra_is_one_line(monkeypatch, capsys):
     for arguments in (["render", *DESIGN, "--out"], ["evaluate", *DESIGN, "--render"]):
         assert cli.main([*arguments, "a.mp4"]) == 2
         [line] = capsys.readouterr().err.splitlines()
-        assert ".mp4 needs PyAV: pip install '.[report]' in the checkout" in line
+        assert ".mp4 needs PyAV: pip install -e '.[report]' in the checkout" in line

@@ -133,7 +133,7 @@ def _settings(options: Check, case: Case) -> Settings:
         return runs.read_run(options.run_folder)[1]
     objects = len(case.scene.objects.object)
     how = {"optimizer": optimize.DEFAULT, "objects": objects}
-    preset = common.preset_of(options)
+    preset = common.design_file(options).preset
     return runs.make_settings(preset, "concurrent", "morphology", case.engine, 0, **how)
 
 

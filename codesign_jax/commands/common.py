@@ -42,14 +42,38 @@ def changes(options: TrialFlags) -> dict[keypaths.Path, Any]:
     return {("objects", "noise", name): value for name, value in noise.items()} | given
 
 
+@dataclasses.dataclass(frozen=True)
+class DesignFile:
+    """A design as a .toml file, see `design_text`; what it is simulated in, unless flags say it."""
+
+    preset: str  # design space that the names belong to
+    design: dict  # numbers by name in the hand file's units, or arrays with one for each finger
+    scene: str = SCENE
+    hand: str = ""
+    objects: str = ""
+    control: str = ""
+
+
+NO_FILE = DesignFile(PRESET, {})
+
+
+def design_file(options: SceneFlags) -> DesignFile:
+    """What the file of --design names, if there is one; flags that name the same hold."""
+    words = [*chain.from_iterable(getattr(options, "design", ()))]
+    names = ("preset", "scene", "hand", "objects")
+    flags = {name: given for name in names if (given := getattr(options, name, None))}
+    return dataclasses.replace(open_designs(words)[1], **flags)
+
+
 def load_scene(options: SceneFlags) -> Scene:
-    """Reads the scene that a command's flags name."""
+    """Reads the scene that a command's flags name, or the file of its design."""
+    file = design_file(options)
     return scenes.load(
-        options.scene or SCENE,
-        hand_name=options.hand,
-        object_set=options.objects,
+        file.scene,
+        hand_name=file.hand or None,
+        object_set=file.objects or None,
         accuracy=options.accuracy,
-        overrides=changes(options),
+        overrides=({("control",): file.control} if file.control else {}) | changes(options),
     )
 
 
@@ -64,7 +88,7 @@ def find_case(options: Subject, *, tell: Tell = warn) -> Case:
         scene, words = load_scene(options), [*chain.from_iterable(options.design)]
         if options.policy:
             scene = make_policy(options.policy, scene)[1]
-        space = design_space(scene.hand, preset_of(options))
+        space = design_space(scene.hand, design_file(options).preset)
         design = find_design(space, words)
         how = options.engine or engines.DEFAULT, options.policy or ""
         return Case(scene, space, design, *how)
@@ -80,27 +104,14 @@ def find_case(options: Subject, *, tell: Tell = warn) -> Case:
     return case
 
 
-def preset_of(options: Subject) -> str:
-    """The design space of a design that is given by its parameters."""
-    words = [*chain.from_iterable(options.design)]
-    return options.preset or open_designs(words)[1] or PRESET
-
-
-@dataclasses.dataclass(frozen=True)
-class DesignFile:
-    """A design as a .toml file, see `design_text`."""
-
-    preset: str  # design space that the names belong to
-    design: dict  # numbers by name in the hand file's units, or arrays with one for each finger
-
-
-def design_text(space: DesignSpace, preset: str, design: np.ndarray) -> str:
-    """A design [SI units] as the .toml text that --design opens again."""
+def design_text(space: DesignSpace, file: DesignFile, design: np.ndarray) -> str:
+    """A design [SI units] as the .toml text that --design opens again, in what the file names."""
     own, others = tables.by_finger(space)
     places = {space.names[k]: k for k in others} | own
     values = [f"{value:.9g}" for value in space.in_units(design)]
     lines = ["# A design in the hand file's units, for --design."]
-    lines += [tomli_w.dumps({"preset": preset}), "[design]"]
+    names = {name: v for name, v in dataclasses.asdict(file).items() if v and name != "design"}
+    lines += [tomli_w.dumps(names), "[design]"]
     for name, k in places.items():
         several = isinstance(k, list)
         text = f"[{', '.join(values[i] for i in k)}]" if several else values[k]
@@ -108,10 +119,10 @@ def design_text(space: DesignSpace, preset: str, design: np.ndarray) -> str:
     return "\n".join([*lines, ""])
 
 
-def open_designs(words: Sequence[str]) -> tuple[dict[str, list[str]], str | None]:
-    """Splits the words of --design into NAME=VALUE pairs, by the file that has them."""
+def open_designs(words: Sequence[str]) -> tuple[dict[str, list[str]], DesignFile]:
+    """Splits the words of --design into NAME=VALUE pairs, by the file that has them; the file."""
     found: dict[str, list[str]] = {}
-    preset, direct = None, []
+    file, direct = NO_FILE, []
     for word in words:
         if "=" in word or not word.endswith(".toml"):
             direct.append(word)
@@ -121,13 +132,13 @@ def open_designs(words: Sequence[str]) -> tuple[dict[str, list[str]], str | None
         file = schema.parse(DesignFile, library.read(path), path.name, problems)
         if file is None:
             raise InputError(problems)
-        preset, pairs = file.preset, found.setdefault(path.name, [])
+        pairs = found.setdefault(path.name, [])
         for name, value in file.design.items():
             if isinstance(value, list):
                 pairs += [f"{name}[{k}]={v}" for k, v in enumerate(value)]
             else:
                 pairs.append(f"{name}={value}")
-    return found | {"--design": direct}, preset
+    return found | {"--design": direct}, file
 
 
 def find_design(space: DesignSpace, words: Sequence[str]) -> np.ndarray:
@@ -245,7 +256,7 @@ def picture_problems(flag: str, path: Path | None) -> list[str]:
     """What is wrong with the path of a picture."""
     problems = place_problems(flag, path, ".gif", ".mp4", ".png")
     if path and path.suffix == ".mp4" and importlib.util.find_spec("av") is None:
-        problems.append(f"{flag} {path}: .mp4 needs PyAV: pip install '.[report]' in the checkout")
+        problems.append(f"{flag} {path} needs PyAV: pip install -e '.[report]' in the checkout")
     return problems
 
 

@@ -89,8 +89,8 @@ def _missing(options: Export) -> list[str]:
     if not absent:
         return []
     return [
-        f"the parts need {' and '.join(absent)}: pip install '.[export]' in the checkout, or give "
-        "--no-parts"
+        f"the parts need {' and '.join(absent)}: pip install -e '.[export]' in the checkout, "
+        "or give --no-parts"
     ]
 
 

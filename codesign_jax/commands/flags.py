@@ -72,8 +72,8 @@ class Subject(SceneFlags):
         tyro.conf.UseAppendAction,
         tyro.conf.arg(metavar="FILE NAME=VALUE ...", help_behavior_hint=""),
     ] = ()
-    """The design: a .toml file that `codesign studio` saved, or numbers in the hand file's units,
-    e.g. length=148 arm_z=-59, which replace the file's; the rest is the default."""
+    """The design: a .toml file that `codesign studio` saved, with the names of scene and hand, or
+    numbers in the hand file's units, e.g. length=148 arm_z=-59, which replace the file's."""
     run_folder: Annotated[
         Path | None, tyro.conf.arg(name="run", metavar="PATH", help_behavior_hint="")
     ] = None

@@ -128,7 +128,7 @@ def pyarrow_module(what: str) -> ModuleType:
         import pyarrow
         import pyarrow.parquet
     except ModuleNotFoundError as error:
-        message = f"{what} needs {error.name}: pip install '.[parquet]' in the checkout"
+        message = f"{what} needs {error.name}: pip install -e '.[parquet]' in the checkout"
         raise InputError([message]) from error
     return pyarrow
 

@@ -156,7 +156,7 @@ def about(desk: Desk) -> dict[str, Any]:
         run["chosen"] = [chosen.episode + 1, chosen.row]
     source = f"run {desk.options.run_folder}" if run else f"hand {scene.hand.name}"
     return {
-        "title": f"{source}, objects {scene.objects.name}, design space {desk.preset}",
+        "title": f"{source}, objects {scene.objects.name}, design space {desk.file.preset}",
         "parameters": parameters,
         "groups": [{"title": t, "members": [*members]} for t, members in groups.items() if members],
         "design": design.tolist(),

@@ -122,9 +122,10 @@ class Desk:
         self.options = options
         self.case = common.find_case(options)
         common.refuse(common.engine_problems(self.case.engine))
-        self.preset, self.record = common.preset_of(options), None
+        self.file, self.record = common.design_file(options), None
         if folder := options.run_folder:
-            self.preset = runs.read_run(folder)[1].preset
+            own = {"preset": runs.read_run(folder)[1].preset, "scene": str(folder / "scene.toml")}
+            self.file = dataclasses.replace(self.file, **own)
             self.record = choice.read_record(folder, tell=lambda text: None)  # `find_case` said it
         self.accuracies = ("", *library.available("accuracy"))
         self.benches: dict[str, Bench] = {}
@@ -139,13 +140,9 @@ class Desk:
         return self.benches[accuracy]
 
     def flags(self, accuracy: str) -> list[str]:
-        """Flags that name the same scene and engine to another command."""
-        given, scene = self.options, self.options.scene
-        if given.run_folder:
-            scene = str(given.run_folder / "scene.toml")
-        named = {"scene": scene, "hand": given.hand, "objects": given.objects}
-        named |= {"accuracy": accuracy or given.accuracy, "engine": self.case.engine}
-        named["policy"] = given.policy
+        """Flags that name to another command what a design's file does not."""
+        given, named = self.options, {"accuracy": accuracy or self.options.accuracy}
+        named |= {"engine": self.case.engine, "policy": given.policy}
         found = [word for k, v in named.items() if v is not None for word in (f"--{k}", v)]
         for words in given.overrides:
             found += ["--set", *words]
@@ -391,7 +388,7 @@ class Tab:
         """Saves the design that is shown; flags that name it to another command."""
         view, space = self._current().view, self._desk.case.space
         with files.atomically(path := self._desk.place("design", ".toml")) as part:
-            text = common.design_text(space, self._desk.preset, view.design)
+            text = common.design_text(space, self._desk.file, view.design)
             part.write_text(text, encoding="utf-8")
         return ["--design", str(path), *self._desk.flags(view.accuracy)]
 

@@ -13,6 +13,7 @@ import pytest
 
 from codesign_jax import cli, codesign
 from codesign_jax.commands import status
+from codesign_jax.scene import library
 from tests.helpers.command_runs import EPISODES, command, finished_run, own_workplace  # noqa: F401
 from tests.helpers.tiny_run import RUN
 from tests.helpers.toy_engine import TINY
@@ -137,3 +138,11 @@ def test_ctrl_c_is_one_line_and_ends_the_process(monkeypatch, capsys, request):
     assert cli.main() == 130 and left == [130]
     assert time.monotonic() - start < 20  # of the 30 that the simulation goes on
     assert capsys.readouterr().err == "stopped\n"
+
+
+def test_scenes_names_what_is_built_in(capsys):
+    assert cli.main(["scenes"]) == 0
+    said, kinds = capsys.readouterr().out, ("scenes", "hands", "objects", "controls")
+    assert all(name in said for kind in kinds for name in library.available(kind))
+    assert "lateral_bending" not in said
+    assert cli.main(["scenes", "edge"]) == 0 and "lateral_bending" in capsys.readouterr().out

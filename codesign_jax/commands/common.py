@@ -54,9 +54,6 @@ class DesignFile:
     control: str = ""
 
 
-NO_FILE = DesignFile(PRESET, {})
-
-
 def design_file(options: SceneFlags) -> DesignFile:
     """What the file of --design names, if there is one; flags that name the same hold."""
     words = [*chain.from_iterable(getattr(options, "design", ()))]
@@ -122,7 +119,7 @@ def design_text(space: DesignSpace, file: DesignFile, design: np.ndarray) -> str
 def open_designs(words: Sequence[str]) -> tuple[dict[str, list[str]], DesignFile]:
     """Splits the words of --design into NAME=VALUE pairs, by the file that has them; the file."""
     found: dict[str, list[str]] = {}
-    file, direct = NO_FILE, []
+    file, direct = DesignFile(PRESET, {}), []
     for word in words:
         if "=" in word or not word.endswith(".toml"):
             direct.append(word)
@@ -152,14 +149,7 @@ def find_design(space: DesignSpace, words: Sequence[str]) -> np.ndarray:
 def parse_design(
     space: DesignSpace, pairs: Sequence[str], base: np.ndarray, where: str = "--design"
 ) -> np.ndarray:
-    """Reads changes of a design given as NAME=VALUE in the hand file's units.
-
-    Args:
-      base: What is changed [SI units], shape (parameter,).
-
-    Returns:
-      The design [SI units], shape (parameter,).
-    """
+    """A design after NAME=VALUE in the hand file's units; base and result in SI, (parameter,)."""
     values = dict(zip(space.names, space.in_units(base), strict=True))
     lows = dict(zip(space.names, space.in_units(np.array(space.low)), strict=True))
     highs = dict(zip(space.names, space.in_units(np.array(space.high)), strict=True))

@@ -392,14 +392,14 @@ class Sample(Command, SceneFlags):
 
 @dataclasses.dataclass
 class Scenes(Command):
-    """List scenes and their effects: on, off, or unsupported by an engine."""
+    """List what is built in; of a scene its effects: on, off, or unsupported by an engine."""
 
     name: Annotated[
         str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[NAME]", help_behavior_hint="")
     ] = None
-    """Scene: a built-in name or a .toml file; default: all built-in ones."""
+    """Scene: a built-in name or a .toml file; default: names of all that is built in."""
     engine: Text = None
-    """Show this engine only."""
+    """Show the effects in this engine only."""
 
 
 @dataclasses.dataclass

@@ -19,7 +19,10 @@ def main(options: Scenes) -> int:
     console = Console(highlight=False)
     for scene in [scenes.load(name) for name in names]:
         console.print(f"{scene.name}: {scene.description}")
-        console.print(_table(scene, engines))
+        if options.name or options.engine:
+            console.print(_table(scene, engines))
+    for kind in () if options.name else ("hands", "objects", "controls", "accuracy"):
+        console.print(f"{kind}: {', '.join(library.available(kind))}")
     return 0
 
 

@@ -64,7 +64,7 @@ test-gpu: $(STAMP)
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -q -m slow -n 2 --dist loadfile --durations=10
 
-# All hard cases; their margins go to docs/notes/stability.md. About ten minutes on two cores.
+# All hard cases; their margins go to docs/notes/stability.md. About four minutes on two cores.
 stability: $(STAMP)
 	$(BIN)/python -m pytest -q tests/stability -m stability --stability-table docs $(ARGS)
 

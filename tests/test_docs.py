@@ -175,7 +175,6 @@ BEFORE = {
     "experiments/fresh.json": ("docs/results.md", "docs/notes/results.md"),
     "rates_h100.json": ("docs/performance.md",),
     "search": ("docs/notes/search.md",),
-    "stability.json": ("docs/stability.md", "docs/notes/stability.md"),
 }
 """Files or folders of docs/data with what was measured with another kernel; pages that show it."""
 

@@ -1,16 +1,13 @@
 """Which optimiser finds a good hand in the fewest grasps: many seeds of each, in lock step.
 
 python -m scripts.search --out runs/search                      # again to go on where it stopped
-timeout -s INT 500 python -m scripts.search --out runs/search   # stop after a time
 python -m scripts.search --robust --masses 0.05 0.2 0.5         # what its winners keep at 500 g
 python -m scripts.search --report docs/data/search              # tables of the note
 
 At every mark the optimiser's best particles meet fresh trials, and the one that costs least in
 these is what it recommends there: 25 particles in 12 trials each, or the final test of an optimiser
 that says how many finalists it has.  These trials count as the search's; those by which the
-recommended design is judged do not.  An H200 simulates about 1,900 grasps a second of the default
-scene: 100 seeds of the default optimiser are 209,000 grasps and each mark 69,000, so that
-`--marks 3` takes four minutes there.  evosax is needed for all but the particle filter.
+recommended design is judged do not.  100 seeds with two marks take five minutes of an H200.
 """
 
 import argparse
@@ -116,13 +113,12 @@ class Study:
         tests: int,
         marks: int = 9,
         at: Sequence[int] = (),
-        first_seed: int = 0,
         chunk: int,
         path: Path,
     ):
         self.case, self.scene, self.engine, self.space = case, scene, engine, space
         self.tests, self.chunk, self.path = tests, chunk, path
-        self.keys = jax.vmap(jax.random.key)(first_seed + jnp.arange(seeds))
+        self.keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
         self.mask = jnp.ones(space.num_parameters, bool)
         objects = len(scene.objects.object)
         self.rounds = -(-case.tests // objects) * objects
@@ -289,14 +285,6 @@ class Study:
 # --- tables --------------------------------------------------------------------------------------
 
 
-def reached(row: dict[str, Any], share: float) -> str:
-    """Grasps after which this share of the seeds keeps `RELIABLE`, and stays there."""
-    good = np.array([np.mean(np.array(kept) >= RELIABLE) for kept in row["kept"]])
-    below = np.flatnonzero(good < share)
-    first = 0 if below.size == 0 else int(below[-1]) + 1
-    return f"{row['grasps'][first]:,}" if first < len(good) else "not reached"
-
-
 def order(row: dict[str, Any]) -> tuple:
     """Where a row stands: 23D first, the paper's objects first, the default's order of names."""
     name = row["optimizer"].split(":")[0]
@@ -307,7 +295,7 @@ def order(row: dict[str, Any]) -> tuple:
 def table(rows: list[dict[str, Any]]) -> str:
     """A row for each optimiser: what its recommended designs keep at its last mark."""
     head = "optimiser|preset|objects|seeds|grasps of a seed|median kept|5 % of the seeds below|"
-    head += "share of seeds that keep 95 % (95 % interval)|grasps until 90 % of the seeds do|commit"
+    head += "share of seeds that keep 95 % (95 % interval)|commit"
     found = [head.split("|")]
     for row in sorted((r for r in rows if not variant(r["optimizer"])), key=order):
         kept = np.array(row["kept"][-1])
@@ -315,16 +303,28 @@ def table(rows: list[dict[str, Any]]) -> str:
             [
                 f"`{row['optimizer']}`",
                 row["preset"],
-                ", ".join([row.get("objects") or "three", *row.get("changes", ())]),
+                row.get("objects") or "three",
                 str(kept.size),
                 f"{row['grasps'][-1]:,}",
                 f"{np.median(kept):.3f}",
                 f"{np.quantile(kept, 0.05):.3f}",
                 share_of(kept),
-                reached(row, 0.9),
                 row["provenance"]["commit"][:7] + provenance.before(row["provenance"]),
             ]
         )
+    return output.markdown(found)
+
+
+def variants_table(rows: list[dict[str, Any]]) -> str:
+    """What one other constant of the default search is worth on the same seeds, at each mark."""
+    found = []
+    for row in sorted(rows, key=lambda row: (row["optimizer"] != optimize.DEFAULT, order(row))):
+        head, cells = ["search"], [f"`{row['optimizer']}`"]
+        for grasps, kept in zip(row["grasps"], np.array(row["kept"]), strict=True):
+            head += [f"after {grasps:,} grasps: seeds that keep 95 %", "5 % below", "mean kept"]
+            cells += [share_of(kept), f"{np.quantile(kept, 0.05):.3f}", f"{kept.mean():.3f}"]
+        found = found or [[*head, "commit"]]
+        found.append([*cells, row["provenance"]["commit"][:7]])
     return output.markdown(found)
 
 
@@ -368,8 +368,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--set", **own, help="KEY=VALUE, as of codesign optimize")
     text = "judge the last designs once more with all objects at each of these masses [kg]"
     parser.add_argument("--masses", nargs="+", default=[], help=text)
-    text = "judge the designs of a study's .npz at --masses, and search nothing"
-    parser.add_argument("--designs", type=Path, help=text)
+    parser.add_argument("--designs", type=Path, help="judge those of an .npz at --masses alone")
     parser.add_argument(
         "--optimizers",
         nargs="+",
@@ -381,8 +380,6 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--tests", type=int, default=400, help="trials of a recommended design")
     parser.add_argument("--marks", type=int, default=9, help="times at which one is recommended")
     parser.add_argument("--at", type=int, nargs="+", default=[], help="grasps instead of --marks")
-    parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--chunk", type=int, help="most grasps of a call")
     parser.add_argument("--report", type=Path, help="fill the page from a folder, and stop")
     parser.add_argument("--page", type=Path, default=PAGE)
     return parser.parse_args(arguments)
@@ -397,11 +394,11 @@ def search(args: argparse.Namespace, name: str) -> None:
     words = [Path(args.objects).stem] if args.objects else []
     words += [args.preset, name, *(re.sub(r"^--|^[a-z_.]+[.](?=.*=)", "", c) for c in changed)]
     stem = re.sub("[:,]", "-", "-".join(dict.fromkeys(words))).replace("=", "")
-    how = {n: getattr(args, n) for n in ("seeds", "budget", "tests", "marks", "at", "first_seed")}
-    how["chunk"] = args.chunk or (512 if jax.default_backend() == "cpu" else 16_384)
+    how = {n: getattr(args, n) for n in ("seeds", "budget", "tests", "marks", "at")}
+    how["chunk"] = 512 if jax.default_backend() == "cpu" else 16_384
     study = Study(case, scene, engine, space, **how, path=args.out / f"{stem}.npz")
     row = {"preset": args.preset, "scene": args.scene, "objects": args.objects, "changes": changed}
-    row |= {"first_seed": args.first_seed, "tests": args.tests, "optimizer": name}
+    row |= {"tests": args.tests, "optimizer": name}
     grasps, start = 0, time.monotonic()
     while not study.finished and args.designs is None:
         grasps += study.step()
@@ -417,8 +414,7 @@ def search(args: argparse.Namespace, name: str) -> None:
     row["provenance"] = provenance.results(args.commit)
     output.write_json(args.out / f"{stem}{'-masses' * bool(args.designs)}.json", row)
     shares = [sum(k >= RELIABLE for k in kept) / len(kept) for kept in study.row()["kept"]]
-    took = duration(time.monotonic() - start)
-    print(f"{name}: {dict(zip(study.row()['grasps'], shares, strict=True))} in {took}", flush=True)
+    print(name, study.row()["grasps"], shares, duration(row["seconds"]), flush=True)
     print({m: float(np.mean(kept)) for m, kept in row.get("masses", {}).items()}, flush=True)
 
 
@@ -435,7 +431,11 @@ def main(arguments: list[str] | None = None) -> int:
         rows = [json.loads(path.read_text()) for path in sorted(args.report.glob("*.json"))]
         if not rows:
             sys.exit(f"error: {args.report} has no results of scripts.search")
-        output.fill(args.page, table([row for row in rows if "kept" in row]), "search")
+        plain = [row for row in rows if "kept" in row and not row.get("changes")]
+        output.fill(args.page, table(plain), "search")
+        same = [r for r in plain if (r["preset"], r.get("objects")) == ("23d", None)]
+        same = [row for row in same if row["optimizer"].startswith(optimize.DEFAULT)]
+        output.fill(args.page, variants_table(same), "variants")
         if any("masses" in row for row in rows):
             output.fill(args.page, masses_table(rows), "masses")
         return 0

@@ -171,8 +171,6 @@ def commits(text):
 
 
 BEFORE = {
-    "experiments/23d.json": ("README.md", "docs/results.md", "docs/notes/results.md"),
-    "experiments/fresh.json": ("docs/results.md", "docs/notes/results.md"),
     "rates_h100.json": ("docs/performance.md",),
     "search": ("docs/notes/search.md",),
 }

@@ -139,5 +139,5 @@ axes.set(xlabel="episode", ylabel="cost")
 plt.show()
 
 # %% [markdown]
-# From here: `codesign optimize --help` runs the same with checkpoints and a run folder,
-# `codesign evaluate --render grasp.gif` draws any design, and another hand is another file.
+# From here: `codesign optimize --optimizer particle-filter` does this with checkpoints and a run
+# folder, `codesign evaluate --render grasp.gif` draws any design, another hand is another file.

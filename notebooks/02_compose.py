@@ -76,7 +76,7 @@ print("distance [mm], a row for each design:\n", np.round(1e3 * np.asarray(table
 # %% [markdown]
 # ## grad and value_and_grad
 #
-# The first gradient compiles for about a minute, and is kept for the next start.
+# The first gradient compiles for some 30 s, and is kept for the next start.
 # With `jax.vmap` around it each design gets its own.  `jax.checkpoint` forgets the stored states
 # and simulates again when the gradient needs them: less memory for twice the kernel's time.
 

@@ -106,5 +106,5 @@ right.set(xlabel="episode", ylabel="mean cost of the particles", xlim=(1, episod
 plt.show()
 
 # %% [markdown]
-# `codesign optimize --preset 2d --schedule morphology --seeds 0-9` is the same from the command
-# line, with checkpoints, final tests and run folders.
+# On the command line, with checkpoints, final tests and run folders: `codesign optimize
+# --optimizer particle-filter --schedule concurrent,morphology,control --seeds 0-9`.

@@ -66,8 +66,8 @@ rest = template[template.index("[section]") :]
 # %% [markdown]
 # ## An object
 #
-# A spindle: thick ends, a thin middle.  Any watertight mesh of 5 to 500 mm will do, in any format
-# that trimesh reads; its mass properties follow from its volume.
+# A spindle: thick ends, a thin middle.  Any watertight mesh of 5 to 500 mm will do, as
+# .stl, .obj, .ply, .off, .glb or .gltf; its mass properties follow from its volume.
 
 # %%
 height = np.linspace(-0.04, 0.04, 17)  # m
@@ -153,8 +153,8 @@ for s, g in zip(grasping.objects.object, grasps, strict=True):
 # %% [markdown]
 # ## Optimise it
 #
-# From here everything is as for the built-in hand.  On the command line: `codesign optimize --hand
-# rows.toml --objects mine.toml --set discretization.links=5`.
+# From here everything is as for the built-in hand.  On the command line, in the folder of the two
+# files: `codesign optimize --scene paper_spheres --hand rows.toml --objects mine.toml`.
 
 # %%
 particles, num_trials, episodes = (4, 2, 1) if FAST else (10, 4, 12)

@@ -149,7 +149,7 @@ def measured(results: dict[str, Any]) -> str:
         table.append([name, *cells, f"× {r['ratio']:.2f} ({low:.2f} to {high:.2f})"])
     p, load = results["provenance"], results["load"]
     made = f"{results['designs']} designs in {results['trials']} trials each; {p['cpus']} cores, "
-    made += f"jax {p['jax']}; load of the machine while timing {load[0]:.0f} to {load[1]:.0f}."
+    made += f"jax {p['jax']}; timed at a load of {max(load):.0f}."
     return f"{made}\n\n{output.markdown(table)}"
 
 

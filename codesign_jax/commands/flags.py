@@ -142,7 +142,7 @@ class Optimize(Command, SceneFlags):
     """
 
     preset: str = "2d"
-    """Design space: 2d, 23d (the whole table; also full) or another preset of the hand file."""
+    """Design space: 2d, full (the whole table, 23d of the default hand) or another preset."""
     schedule: str = "concurrent"
     """Strategy: concurrent, single, switch-K (K switches), morphology or control. Several, such as
     single,switch-4,concurrent: runs of each, simulated in one batch, and a comparison."""
@@ -379,7 +379,7 @@ class Sample(Command, SceneFlags):
     trials: int = 3
     """Trials of each design, each with noise of its own; objects take turns."""
     preset: str = "2d"
-    """Design space: 2d, 23d (the whole table; also full) or another preset of the hand file."""
+    """Design space: 2d, full (the whole table, 23d of the default hand) or another preset."""
     engine: Annotated[str, ENGINE] = "structured"
     seed: int = 0
     """Root of designs and noise."""

@@ -159,8 +159,8 @@ class Contact:
         morphology and time step, and of a contact sphere; a contact with the table is twice as
         stiff.
       dissipation_time: Time constant of the skin's dissipation: its damping over its stiffness.
-      friction_ratio: How little friction creeps: D_t / D at a step and dissipation of 40 ms
-        together; MuJoCo's `impratio` follows from it.
+      friction_ratio: A contact creeps by its friction force / (normal_stiffness * ratio * 40 ms): a
+        larger ratio creeps less. MuJoCo's `impratio` follows from it.
       finger_table_friction: Coulomb coefficient of fingers and palm on the table.
       torsional_friction: Length by which a contact's normal force resists spin, only with
         `effects.friction = "full"`.
@@ -295,8 +295,8 @@ class Limits:
       speed: Largest velocity of any joint.
       penetration: How far the object's centre may be below the table, if there is one, and any body
         in another at the start.
-      strain: Largest strain of the walls of a free finger at its pressure; pressures of a search
-        are lowered to it, as to the hand's pressure limit. Not given: no such limit.
+      strain: Largest strain of the walls of a free finger at its pressure; a search lowers
+        pressures until the walls stay below it. Not given: no such limit.
     """
 
     speed: float = quantity("rad/s or m/s", 1, 1e9)

@@ -309,7 +309,7 @@ def table(rows: list[dict[str, Any]]) -> str:
                 f"{np.median(kept):.3f}",
                 f"{np.quantile(kept, 0.05):.3f}",
                 share_of(kept),
-                row["provenance"]["commit"][:7] + provenance.before(row["provenance"]),
+                row["provenance"]["commit"][:7],
             ]
         )
     return output.markdown(found)

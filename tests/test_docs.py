@@ -171,7 +171,6 @@ def commits(text):
 
 BEFORE = {
     "rates_h100.json": ("docs/performance.md",),
-    "search": ("docs/notes/search.md",),
 }
 """Files or folders of docs/data with what was measured with another kernel; pages that show it."""
 

@@ -17,7 +17,7 @@ CHECKED := codesign_jax scripts tests notebooks
 # What is imported is compiled once: without its bytecode every process compiles it again, for 7 s.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo docs test quick test-browser test-ptx test-gpu test-slow stability faults notebooks benchmark effects accuracy lint format types clean help
+.PHONY: demo docs interpreter test quick test-browser test-ptx test-gpu test-slow stability faults notebooks benchmark effects accuracy lint format types clean help
 
 help:
 	@echo "make demo        co-design a gripper, 23 parameters, on the CPU, with figures and a film"
@@ -35,6 +35,9 @@ help:
 	@echo "make docs        the documentation as a site without a network: site/index.html"
 	@echo "make format      ruff format          make clean       remove what make built"
 
+interpreter:
+	@echo $(PYTHON)
+
 demo: $(DEMO)
 	$(BIN)/python -m scripts.demo
 
@@ -42,7 +45,7 @@ test: $(STAMP)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=10
 
 # The quick core: a minute for another Python and MuJoCo, in an environment of its own.
-CORE := layers scene parameters optimizers compiler planted_faults codesign run_folder
+CORE := scene parameters optimizers compiler planted_faults codesign runs
 quick: $(QUICK)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(CORE:%=tests/test_%.py)
 

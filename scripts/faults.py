@@ -6,7 +6,7 @@ they were; hostile input is refused with the project's own error.  FAULTS=N asks
 of each kind.  It needs Linux, and a C compiler for failing disks: faults_shim.c is a library that
 is loaded before all others, counts operations on files below a folder, and lets one of them fail.
 
-Hypothesis makes the input; tests/test_hostile_input.py tries a little of it.
+Hypothesis makes the input; tests/test_meshes.py tries a little of it.
 """
 
 import contextlib

@@ -28,7 +28,7 @@ def pytest_configure(config):
         compile_flags.use()
     folder = tempfile.mkdtemp(prefix="codesign-tests-")
     config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
-    os.environ["CODESIGN_TESTS_FOLDER"] = folder  # see tiny_run.py
+    os.environ["CODESIGN_TESTS_FOLDER"] = folder  # see command_runs.py
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", folder)
     # Grids of meshes and rates of runs: shared as well, and never those of the user.
     os.environ["XDG_CACHE_HOME"] = os.path.join(folder, "xdg")
@@ -39,12 +39,11 @@ def pytest_configure(config):
 # Files of more than five seconds, the longest first: what is left for the end is short, so that no
 # worker waits for the other.
 LONG = """
-test_policy test_engines test_forces test_planted_contacts test_resume test_reverse test_rings
-test_docs test_own test_batch test_run_reading test_containment test_library test_steps
-test_kernel test_optimizers test_constants test_compare test_meshes test_air test_rollout
-test_report test_export_parts test_showing test_lanes test_preflight test_sample test_effects
-test_stress test_export test_package test_particle_filter test_codesign test_model test_rigid
-test_primitives test_planted_faults test_studio
+test_resume test_policy test_own test_planted_contacts test_engines test_steps test_forces
+test_rings test_reverse test_studies test_compare test_containment test_run_reading test_library
+test_optimizers test_kernel test_docs test_sample test_rigid test_constants test_lanes test_air
+test_meshes test_codesign test_rollout test_showing test_runs test_scene
+test_studio test_export test_report test_runtime test_particle_filter test_planted_faults
 """.split()
 
 

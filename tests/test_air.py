@@ -38,9 +38,6 @@ def test_power_is_numpy_s():
     np.testing.assert_allclose(found, base**exponent, rtol=1e-13)
 
 
-# --- one finger of one joint, by its section ------------------------------------------------------
-
-
 def root(function):
     """An angle [rad]."""
     return float(optimize.brentq(function, -2, 9, xtol=1e-14))  # pyright: ignore[reportArgumentType]
@@ -183,18 +180,6 @@ def test_a_free_swing_keeps_its_energy():
     assert np.ptp(gas) > 0.5 * np.ptp(wall) and np.count_nonzero(np.diff(np.sign(v))) > 8
 
 
-# --- pressure against sideways bending ------------------------------------------------------------
-
-
-def hand_and_numbers(the_scene):
-    """Parameters of the hand, and the numbers of its first finger's joints."""
-    params, _ = grasps.hand_world(the_scene, length=0.1)
-    links = the_scene.discretization.links
-    beams = morphology.finger_beams(the_scene.hand, params, links)
-    numbers = morphology.thresholds(the_scene.hand, params, beams, links)[0, 0]
-    return params, jax.tree.map(lambda v: v[:, 0], beams), numbers
-
-
 def stored(the_scene, params, pressure, bend, lateral):
     """Energy of a length of the first finger [J/m] by quadrature over its section.
 
@@ -226,8 +211,11 @@ def test_moments_are_those_of_the_stored_energy(lateral):
     """
     with jax.enable_x64(True):
         the_scene = scene.load("paper", overrides={"effects.lateral_threshold": True})
-        params, beams, numbers = hand_and_numbers(the_scene)
+        params, _ = grasps.hand_world(the_scene, length=0.1)
         links, pressure, bend, small_step = the_scene.discretization.links, 69e3, 15.0, 0.5
+        beams = morphology.finger_beams(the_scene.hand, params, links)
+        numbers = morphology.thresholds(the_scene.hand, params, beams, links)[0, 0]
+        beams = jax.tree.map(lambda v: v[:, 0], beams)
         segment = float(params.length[0]) / links
         slopes = [
             (
@@ -253,9 +241,6 @@ def test_moments_are_those_of_the_stored_energy(lateral):
         mine = float(mine[0] - numbers[1] * numbers[2]), float(mine[1])
         assert float(stiffness) * abs(lateral) * segment > 0.01 and float(moment) > 1e-3
     np.testing.assert_allclose(mine, slopes, rtol=1e-3)
-
-
-# --- the kernel, in which faults are planted, against MuJoCo C ------------------------------------
 
 
 def numbers_of(*factors):
@@ -372,9 +357,6 @@ def test_accelerations_equal_mujoco_with_the_chambers_of_the_state(name):
 def test_a_planted_fault_is_noticed(name, fault):
     """By a hundred times the bound."""
     assert not simulated(name)[[*FAULTS[name]].index(fault)] < 100 * BOUND
-
-
-# --- what it is refused with ----------------------------------------------------------------------
 
 
 def test_it_is_refused_where_it_is_not_simulated():

@@ -95,9 +95,6 @@ def test_arrays_that_differ_from_what_was_saved_are_refused(folder):
     assert found.step == 3 and found.damaged == ((4, "its arrays' digest differs"),)
 
 
-# --- results to go on from ------------------------------------------------------------------------
-
-
 def flipped(content, place=30):
     return content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :]
 

@@ -14,8 +14,7 @@ import pytest
 from codesign_jax import cli, codesign
 from codesign_jax.commands import status
 from codesign_jax.scene import library
-from tests.helpers.command_runs import EPISODES, command, finished_run, own_workplace  # noqa: F401
-from tests.helpers.tiny_run import RUN
+from tests.helpers.command_runs import EPISODES, RUN, command, finished_run, own_workplace  # noqa: F401
 from tests.helpers.toy_engine import TINY
 
 

@@ -317,32 +317,6 @@ def test_what_has_no_instruction_is_named(function, kind, message):
         list(write(function, kind))
 
 
-def test_lanes_meet_where_they_read_what_others_wrote():
-    """A GPU's threads see each other's stores only behind a barrier; own columns need none."""
-
-    def kernel(x, out):
-        lane = jax.lax.broadcasted_iota(jnp.int32, (32,), 0)
-        out[0, :] = x[0, :] + 1
-        other = jax.lax.bitwise_xor(lane, jnp.int32(8))
-        out[1, :] = out[0, other] + out[1, other] + out[0, lane]
-
-    spec = pl.BlockSpec((None, 2, 32), lambda i: (i, 0, 0))
-    shape = jax.ShapeDtypeStruct((1, 2, 32), jnp.float32)
-    call = pl.pallas_call(kernel, grid=(1,), in_specs=[spec], out_specs=spec, out_shape=shape)
-    (equation,) = jax.make_jaxpr(call)(shape).eqns
-    layout = Layout((Array((2, 32), "float32"),) * 2, 32)
-    text = thread.write(equation.params["jaxpr"], layout, "test")
-    lines = [line for line in text.splitlines() if " load " in line or "bar.warp" in line]
-    assert ["bar.warp" in line for line in lines if "declare" not in line] == [
-        False,
-        True,
-        False,
-        False,  # one group
-        True,
-        False,
-    ]
-
-
 def exchange(lanes, backend):
     """A kernel of two tables that lanes share columns of, the second one on a GPU's chip.
 

@@ -86,23 +86,19 @@ def test_a_contact_is_the_least_of_a_convex_problem(gap, speed):
     assert speed + h * found == pytest.approx(after, abs=1e-9)
 
 
-def creep(table, shape, angle):
-    """Steady speed below the cone: F / (n k r 40 ms) for a friction ratio r, whatever the step.
-
-    The table's contacts are twice as stiff; n of them share m g sin(angle).
-    """
-    contact, n = table.scene.contact, CORNERS[shape]
-    damper = 2 * contact.normal_stiffness * contact.friction_ratio * 0.04
-    return MASS * GRAVITY * np.sin(angle) / (n * damper)
-
-
 @pytest.mark.parametrize("shape", ["box", "cylinder"])
 def test_incline_below_the_friction_angle_holds(shape):
-    """At 0.9 of the friction angle the object only creeps, at the soft contact's own speed."""
+    """At 0.9 of the friction angle the object only creeps, at the soft contact's own speed.
+
+    F / (n k r 40 ms) for a friction ratio r, whatever the step: the table's contacts are twice as
+    stiff; n of them share m g sin(angle).
+    """
     angle = 0.9 * np.arctan(MU)
     flat, full = Table(shape, angle, flat=True), Table(shape, angle)
     (_, slow), (_, velocity) = flat.run(3.0), full.run(3.0)
-    expected = creep(flat, shape, angle)
+    contact = flat.scene.contact
+    damper = 2 * contact.normal_stiffness * contact.friction_ratio * 0.04
+    expected = MASS * GRAVITY * np.sin(angle) / (CORNERS[shape] * damper)
     assert slow[-1, 0] == pytest.approx(expected, rel=1e-6)
     assert np.abs(slow[-1, 1:]).max() < 1e-9
     # Uphill contacts of a tall object carry less, slip, and leave the rest to the others.
@@ -157,9 +153,6 @@ def test_neo_hookean_moment(height, wall):
     assert backwards == 0
 
 
-# --- air supply ----------------------------------------------------------------------------------
-
-
 def test_supply_against_an_integrator():
     """Lag, rate and maximum at once, along a grasp, against scipy's adaptive integrator."""
     h, count = 1e-3, 9000
@@ -187,9 +180,6 @@ def test_supply_against_an_integrator():
     np.testing.assert_allclose(reached, exact, atol=130)
     assert reached.max() == pytest.approx(90e3, rel=1e-3)
     assert np.abs(np.diff(reached)).max() <= 120e3 * h * (1 + 1e-9)
-
-
-# --- contact by itself ---------------------------------------------------------------------------
 
 
 @jax.enable_x64(True)

@@ -107,8 +107,6 @@ def test_whether_an_object_rests_is_told_by_its_own_size():
         assert judge(held, trial).status == status, (name, size)
 
 
-# --- what engines tell of a step -----------------------------------------------------------------
-
 CAP, OVERFLOW = Status.SOLVER_CAP, Status.CONTACT_OVERFLOW
 
 
@@ -161,9 +159,6 @@ def test_a_trial_tells_how_its_solver_ended_and_warns_above_the_scene_s_threshol
     assert steps_only.status == CAP and np.isnan(steps_only.residual)
     nothing = evaluate(trace())  # as of MJX
     assert nothing.status == Status.OK and np.isnan([nothing.capped, nothing.residual]).all()
-
-
-# --- particles -----------------------------------------------------------------------------------
 
 
 def outcomes(costs, statuses):

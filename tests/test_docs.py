@@ -12,20 +12,11 @@ import numpy as np
 import pytest
 
 from codesign_jax import cli, preflight
-from codesign_jax.commands import (
-    check,
-    evaluate,
-    export,
-    finger,
-    landscape,
-    render,
-    replay,
-    report,
-)
+from codesign_jax.commands import check, evaluate, export, finger, landscape, render, replay, report
 from codesign_jax.studio import studio
 from scripts import reference_page
 from scripts.shared import provenance
-from tests.helpers import tiny_run
+from tests.helpers import command_runs
 from tests.helpers.browsers import chromium, chromium_launcher  # noqa: F401
 from tests.helpers.toy_engine import TINY
 
@@ -65,7 +56,7 @@ def folder(tmp_path_factory):
     policy = re.search(r"^```python\n(.*?)^```", CONTROL.read_text(), re.S | re.M)
     (place / "mine.py").write_text(policy[1])
     for name in ("demo", "ten"):
-        tiny_run.copied(place / "runs" / name)
+        command_runs.copied(place / "runs" / name)
     return place
 
 
@@ -169,9 +160,7 @@ def commits(text):
     return re.findall(r"\b(?=[0-9a-f]*[a-f])(?=[0-9a-f]*[0-9])[0-9a-f]{7,40}\b", text)
 
 
-BEFORE = {
-    "rates_h100.json": ("docs/performance.md",),
-}
+BEFORE = {"rates_h100.json": ("docs/performance.md",)}
 """Files or folders of docs/data with what was measured with another kernel; pages that show it."""
 
 

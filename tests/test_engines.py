@@ -70,7 +70,7 @@ def test_vmap_is_a_larger_batch():
 
 
 @pytest.fixture(scope="module")
-def decided():
+def decided(tmp_path_factory):
     """Scene, hands and fields of a lost and of failing worlds; traces of them, and outcomes.
 
     The latter are a function of engine and trajectory, which simulates what nobody has asked for.
@@ -90,6 +90,7 @@ def decided():
         start = fields.start.at[:, -5].add(1e-6)
         fields = fields._replace(start=start.at[1, -5].set(-0.05))
         params, fields = jax.tree.map(np.asarray, (params, fields))
+    logs = tmp_path_factory.mktemp("log")  # where MuJoCo tells that a world went bad
     engines = {
         "structured": lambda: StructuredEngine(scene, tolerance=1e-16),
         "mujoco": lambda: MujocoEngine(scene, num_threads=1),
@@ -98,7 +99,8 @@ def decided():
 
     @functools.cache
     def simulated(name, trajectory):
-        with jax.enable_x64(True):
+        with jax.enable_x64(True), pytest.MonkeyPatch.context() as patch:
+            patch.chdir(logs)
             run = partial(engines[name]().rollout, trajectory=trajectory)
             trace = jax.jit(run, compiler_options=QUICK)(fields, ctrl)
             return jax.tree.map(np.asarray, (trace, grasps.outcomes(scene, trace)))
@@ -169,9 +171,6 @@ def test_a_trace_means_the_same_on_every_engine(decided, name, trajectory):
         assert np.isnan(trace.speed[2, 11:]).all() and np.isnan(trace.last[:3]).sum() == 1
 
 
-# --- a cost of one's own -------------------------------------------------------------------------
-
-
 def final_height(scene, trace, ctrl):
     """How far below 0.2 m the object is at the end; what the arm does is no part of it."""
     assert trace.qpos.shape[-1] > 0 and ctrl.shape[0] == trace.height.shape[0]
@@ -231,8 +230,6 @@ def test_a_cost_does_not_read_what_was_not_simulated():
 
     assert [float(v) for v in allowed(params, trial)] == [0.5, 0.5, 1.5]
 
-
-# --- gradients -----------------------------------------------------------------------------------
 
 # Nothing touches and nothing falls: a derivative compiles in half a minute, with contacts in two.
 FREE = SHORT | grasps.off("finger_object object_table gravity wrist twist lateral_bending")

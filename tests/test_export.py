@@ -1,21 +1,41 @@
-"""Exported grasps: plain MuJoCo simulates the files as the engine `mujoco` does."""
+"""Exports: parts and moulds, build sheet and tolerances, and grasps in plain MuJoCo."""
 
 import csv
+import itertools
+import zipfile
 from pathlib import Path
 
 import jax
+import manifold3d
 import mujoco
 import numpy as np
 import pytest
+import trimesh
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from numpy.polynomial import Polynomial
 
-from codesign_jax import rollout, scene
+from codesign_jax import cli, files, model, rollout, scene
 from codesign_jax.cost import outcome
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured.kernel import memory_tables
-from codesign_jax.export import grasps, plain, skin, tables
+from codesign_jax.export import (
+    casting,
+    drawing,
+    grasps,
+    meshes,
+    plain,
+    process,
+    sheet,
+    skin,
+    tables,
+    tolerance,
+)
 from codesign_jax.export.play import play
+from codesign_jax.export.process import Process, Section, Size
 from codesign_jax.model import build_spec
+from codesign_jax.runs import choice
 from codesign_jax.scene import parameters
+from codesign_jax.types import Outcome
 from tests.helpers.command_runs import command
 from tests.helpers.grasps import (
     batch_inputs,
@@ -29,7 +49,320 @@ from tests.helpers.grasps import (
     world_inputs,
 )
 from tests.helpers.solids import object_file
-from tests.helpers.toy_engine import TINY
+from tests.helpers.toy_engine import TINY, ToyEngine, tiny
+
+
+def uniform(length, width, height, wall):
+    section = Section(width, height, wall)
+    return Size(length, section, section, wall)
+
+
+USUAL, FLAT, SHORT = uniform(95, 20, 20, 5), uniform(170, 20, 15, 7), uniform(12, 20, 25, 2)
+TAPERED = Size(120, Section(24, 22, 5), Section(16, 14, 3), 4.0)
+# STL holds float32: seven digits of lengths of up to 200 mm.
+EXACT = 1e-4
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Folder of the parts of three fingers, and what was said of them."""
+    folder = tmp_path_factory.mktemp("parts")
+    found = meshes.write(folder, [USUAL, FLAT, USUAL, SHORT], Process())
+    return folder, {part.name: part for part in found}
+
+
+def test_equal_fingers_are_written_once_in_both_formats(written):
+    folder, parts = written
+    labels = ["0_2", "1", "3"]
+    kinds = ["", "_tray", "_core", "_base"]
+    names = {f"finger_{label}{kind}" for label in labels for kind in kinds}
+    assert set(parts) == names
+    assert {p.name for p in folder.iterdir()} == {f"{n}.{e}" for n in names for e in meshes.FORMATS}
+    assert parts["finger_0_2"].fingers == (0, 2)
+
+
+def test_files_hold_closed_bodies_in_millimetres(written):
+    folder, parts = written
+    for path in folder.iterdir():
+        surface, part = trimesh.load_mesh(path), parts[path.stem]
+        assert surface.is_watertight and surface.is_winding_consistent
+        assert surface.volume == pytest.approx(part.volume, rel=EXACT) and surface.volume > 0
+        np.testing.assert_allclose(surface.bounds[0, 2], 0, atol=EXACT)  # on the printer's bed
+        if path.suffix == ".3mf":
+            text = zipfile.ZipFile(path).read("3D/3dmodel.model").decode()
+            assert 'unit="millimeter"' in text
+    assert np.allclose(parts["finger_1"].extents, (170, 20, 15), atol=EXACT)
+
+
+@pytest.mark.parametrize(("name", "size"), [("0_2", USUAL), ("1", FLAT), ("3", SHORT)])
+def test_walls_and_chamber_are_the_design_s(written, name, size):
+    """Rays through the finger meet its surfaces at the thickness of the walls."""
+    part = solid(written[0] / f"finger_{name}.stl")
+    wall, (across, up) = size.base.wall, size.base.chamber
+    low, high = np.reshape(part.bounding_box(), (2, 3))
+    inside = np.array([size.length / 2, 0.3 * across / 2, wall + 0.3 * up])
+    for axis, thick in enumerate((size.end, wall, wall)):
+        step = 10 * np.eye(3)[axis]
+        ends = (
+            np.where(step > 0, place + way * step, inside) for way, place in ((-1, low), (1, high))
+        )
+        hits = part.ray_cast(*ends)
+        places = sorted(hit.position[axis] for hit in hits)
+        expected = [low[axis], low[axis] + thick, high[axis] - thick, high[axis]]
+        np.testing.assert_allclose(places, expected, atol=EXACT)
+
+
+def solid(path):
+    """A part's file as a solid, for booleans."""
+    surface = trimesh.load_mesh(path)
+    return manifold3d.Manifold(
+        manifold3d.Mesh64(np.asarray(surface.vertices, float), np.asarray(surface.faces, "uint64"))
+    )
+
+
+def box(low, high):
+    return manifold3d.Manifold.cube(np.subtract(high, low)).translate(low)
+
+
+@pytest.mark.parametrize("draft", [0.0, 3.0])
+def test_what_the_moulds_hold_is_the_finger(tmp_path, draft):
+    """The closed mould's cavity, from the files: the shell; the base's pocket: the bottom wall."""
+    size, how = USUAL, Process(draft=draft, inlet=0.0)
+    meshes.write(tmp_path, [size], how)
+    length, (width, height, wall) = size.length, size.base
+    # Back into the frame of the finger: the tray was turned over, the core's bars stood below it.
+    tray = solid(tmp_path / "finger_0_tray.stl").translate([0, 0, -height - how.mould_wall])
+    tray = tray.rotate([180, 0, 0])
+    core = solid(tmp_path / "finger_0_core.stl").translate([0, 0, wall - how.mould_wall])
+    assert (tray ^ core).volume() == pytest.approx(0, abs=1e-2)  # they fit: rounding of float32
+    room = box([-2, -width / 2 - 2, wall], [length + 2, width / 2 + 2, height])
+    cast = room - tray - core
+    z = Polynomial([0, 1])
+    side = np.tan(np.radians(draft)) * ((wall + height) / 2 - z)
+
+    def prism(a, b, low, high):
+        integral = ((a + 2 * side) * (b + 2 * side)).integ()
+        return integral(high) - integral(low)
+
+    chamber = length - 2 * wall, size.base.chamber[0]
+    shell = prism(length, width, wall, height) - prism(*chamber, wall, height - wall)
+    assert cast.volume() == pytest.approx(shell, rel=EXACT)
+    base = solid(tmp_path / "finger_0_base.stl").translate([0, 0, -how.mould_wall])
+    pocket = box([-2, -width / 2 - 2, 0], [length + 2, width / 2 + 2, wall]) - base
+    bottom = (length + 2 * side(wall)) * (width + 2 * side(wall)) * wall
+    assert pocket.volume() == pytest.approx(bottom, rel=EXACT)
+    if not draft:
+        assert cast.volume() + pocket.volume() == pytest.approx(size.volume, rel=EXACT)
+    # The walls keep their thickness: what is between core and tray at any height.
+    for height_at in (wall + 1, height - wall - 1):
+        [ray] = cast.ray_cast([50.0, -50, height_at], [50.0, -chamber[1] / 2, height_at])[:1]
+        inner = cast.ray_cast([50.0, -50, height_at], [50.0, 0, height_at])[1]
+        assert inner.position[1] - ray.position[1] == pytest.approx(wall, abs=1e-3)
+
+
+def test_moulds_of_a_tapered_finger_hold_it(tmp_path):
+    """Shell and bottom wall are the finger, by Simpson's rule over its sections; walls have the
+    thickness of the place."""
+    how = Process(inlet=0.0)
+    meshes.write(tmp_path, [TAPERED], how)
+    finger, tray, core, base = (
+        solid(tmp_path / f"finger_0{kind}.stl") for kind in ("", "_tray", "_core", "_base")
+    )
+    assert finger.volume() == pytest.approx(TAPERED.volume, rel=EXACT)
+    made = casting.parts(TAPERED, how)
+    for part, file in zip(made, (finger, tray, core, base), strict=True):
+        assert part.volume() == pytest.approx(file.volume(), rel=EXACT)
+    assert (made.tray ^ made.core).volume() == pytest.approx(0, abs=1e-6)
+    assert core.genus() == 2 * len(casting.bars_of(TAPERED))
+    x, half = (-2.0, 122.0), casting._shifted(casting._half(TAPERED), 2.0)
+    rim, top = casting._rim(TAPERED), lambda x: TAPERED.at(x).height
+    shell = casting._solid(x, half, rim, top) - made.tray - made.core
+    pocket = casting._solid(x, half, lambda x: 0.0, rim) - made.base
+    assert shell.volume() + pocket.volume() == pytest.approx(TAPERED.volume, rel=1e-6)
+    for x in (10.0, 110.0):
+        top = TAPERED.at(x).height
+        hits = finger.ray_cast([x, 0.3, top + 5], [x, 0.3, -5])
+        at = sorted(hit.position[2] for hit in hits)
+        wall = TAPERED.at(x).wall
+        np.testing.assert_allclose(at, [0, wall, top - wall, top], atol=1e-3)
+
+
+# --- build sheet and tolerances: thresholds that are known are found, and the page says them ------
+
+
+STEPS = 5
+FACTOR = tolerance.NEAREST ** (-1 / (STEPS - 1))  # between a step and the next
+
+
+def outcomes(success, trials=40):
+    """Outcomes of designs of which a given share of trials succeeds."""
+    kept = np.arange(trials)[None] < np.round(np.asarray(success)[:, None] * trials)
+    zero = np.zeros(kept.shape, np.int32)
+    return Outcome(np.where(kept, 0.0, 3.0), zero, np.where(kept, np.inf, 1.0), zero - 1)
+
+
+def test_known_thresholds_are_bracketed():
+    """A rule for each parameter: the tolerance ends at the step before the rule's end."""
+    the_scene = scene.load("paper")
+    space = parameters.design_space(the_scene.hand, "full")
+    names, design = list(space.names), space.default()
+    for name, value in {"length[0]": 0.110, "arm_z": 0.020, "arm_x": 0.0}.items():
+        design[names.index(name)] = value
+    planned = tolerance.study(the_scene, space, design, STEPS, free=False)
+    moved = planned.designs - design
+    length, z, x, wall = (names.index(n) for n in ("length[0]", "arm_z", "arm_x", "wall[2]"))
+    good = np.ones(len(moved), bool)
+    good &= moved[:, length] > -0.020  # 20 mm shorter at most
+    good &= (moved[:, z] < 0.03) | (moved[:, z] > 0.1)  # and good again behind: not counted
+    good &= np.abs(moved[:, wall]) == 0  # nothing off at all
+    shares = tolerance.shares(outcomes(0.925 * good))
+    found = tolerance.search(planned, lambda asked: [shares[i] for i in asked])
+    # What lies behind a failure is not simulated, and with it the tolerances are the same.
+    bad = ~good[1:].reshape(-1, STEPS)
+    asked = np.cumsum(bad, 1) - bad == 0
+    assert sorted(found) == [0, *(1 + np.flatnonzero(asked))] and not asked.all()
+    every = tolerance.tolerances(planned, dict(enumerate(shares)))
+    assert tolerance.tolerances(planned, found) == every
+    rows = {row.name: row for row in every}
+    assert list(rows) == names
+    short = rows["length[0]"].down
+    assert short.bad.value < 110 - 20 < short.good.value
+    assert (110 - short.bad.value) / (110 - short.good.value) == pytest.approx(FACTOR)
+    assert rows["length[0]"].up.bad is None  # up to the table's limit
+    assert rows["length[0]"].up.good.value == pytest.approx(180) == rows["length[0]"].up.limit
+    up = rows["arm_z"].up
+    assert up.good.value < 20 + 30 < up.bad.value < 20 + 100
+    assert rows["wall[2]"].up.good is None and rows["wall[2]"].up.bad.value > 5
+    assert rows["arm_x"].down.bad is None and rows["arm_x"].down.good.value == pytest.approx(-60)
+    share = rows["arm_x"].down.good.share  # 37 of 40: Wilson's interval by its formula
+    n, p, q = 40, 0.925, 1.959964
+    centre, half = (p + q**2 / 2 / n), q * np.sqrt(p * (1 - p) / n + q**2 / 4 / n**2)
+    np.testing.assert_allclose(share[1:], (centre + half * np.array([-1, 1])) / (1 + q**2 / n))
+    # Every design differs from the middle in one parameter.
+    assert (np.count_nonzero(moved, axis=1) <= 1).all() and x >= 0
+
+
+@pytest.fixture(scope="module")
+def toy():
+    """An engine that two tests share, and with it their program."""
+    return ToyEngine(tiny()[0])
+
+
+@pytest.fixture(scope="module")
+def page():
+    """Scene, parameters, sizes and tolerances of a design."""
+    the_scene = scene.load("paper_spheres")
+    space = parameters.design_space(the_scene.hand, "full")
+    params = jax.tree.map(np.asarray, space.params(space.default()))
+    sizes = process.sizes(the_scene.hand, params, Process())
+    planned = tolerance.study(the_scene, space, space.default(), STEPS, free=False)
+    good = np.abs(planned.designs - space.default())[:, 0] < 0.02
+    shares = tolerance.shares(outcomes(np.where(good, 1.0, 0.4)))
+    drift = sheet.Drift(
+        shares[0], 40, STEPS, "structured", tolerance.tolerances(planned, dict(enumerate(shares)))
+    )
+    return the_scene, params, sizes, drift
+
+
+def test_sheet_has_dimensions_pressures_and_tolerances(page, tmp_path):
+    content = sheet.sheet_sections(*page)
+    text = sheet.write(tmp_path, "Build sheet", ["Design: x"], content).read_text()
+    fingers = "| 0 | 110.0 | 20.0 | 20.0 | 5.00 | 100.0 x 10.0 x 10.0 | 34.0 | 36.4 | 120.0 (200) |"
+    assert fingers in text  # 110 x 20 x 20 - 100 x 10 x 10 = 34 cm^3 of 1.07 g
+    row = next(line for line in text.splitlines() if line.startswith("| length[0] | mm | 110 |"))
+    cells = [c.strip() for c in row.strip("|").split("|")]
+    assert cells[3].endswith(": 100 % [91, 100]") and cells[4].endswith(": 40 % [26, 55]")
+    assert "not within the limits" in text and "Resolution: 5 values a side" in text
+    assert "fewer than 90 %" in text
+
+
+def test_a_page_of_drawings_whose_texts_stand_apart(page, tmp_path):
+    the_scene, params, sizes, _ = page
+    data = drawing.write(tmp_path, "Build sheet", the_scene, params, sizes).read_bytes()
+    assert data.startswith(b"%PDF") and b"/Count 1" in data and len(data) > 10_000
+    assembly = sheet.assembly_sections(the_scene, params, sizes, Process())
+    parts = {row[0]: row[1:] for row in assembly[0].rows}
+    solids = [casting.parts(size, Process(inlet=0)).finger.volume() for size in sizes]
+    assert parts["silicone"][1].startswith(f"{sum(solids) / 1e3:.0f} cm³")
+    figure = drawing.page("Build sheet", the_scene, params, sizes)
+    FigureCanvasAgg(figure).draw()
+    texts = [*figure.texts, *(axes.title for axes in figure.axes)]
+    boxes = {t.get_text(): t.get_window_extent() for t in texts}
+    for (text, one), (other, two) in itertools.combinations(boxes.items(), 2):
+        assert not one.overlaps(two), (text, other)
+    for axes in figure.axes:
+        drawn = axes.patches[0].get_window_extent()
+        assert not any(box.overlaps(drawn) for box in boxes.values()), axes.title
+    assert min(box.y0 for box in boxes.values()) > 0, "all of it is on the page"
+
+
+def test_the_assembly_stands_as_mujoco_has_it(page):
+    """By its kinematics: frames of the fingers' first bodies, lengths along x, up from z = 0."""
+    the_scene, params, sizes, _ = page
+    nominal = jax.tree.map(np.asarray, rollout.nominal_trial(the_scene))
+    data = mujoco.MjData(compiled := model.compile_model(the_scene, params, nominal))
+    mujoco.mj_kinematics(compiled, data)
+    palm = data.xmat[1].reshape(3, 3)
+    drawn = sheet.corners(the_scene, params, sizes)
+    for stub, size, found in zip(model.layout(the_scene).stubs, sizes, drawn, strict=True):
+        place = 1e3 * (data.xpos[stub] - data.xpos[1]) @ palm
+        turn = palm.T @ data.xmat[stub].reshape(3, 3)
+        half, high = size.base.width / 2, size.tip.height
+        np.testing.assert_allclose(found[0], place + turn @ [0, -half, 0], atol=1e-3)
+        np.testing.assert_allclose(found[6], place + turn @ [size.length, half, high], atol=1e-3)
+
+
+TOY = ["export", "--scene", str(TINY), "--no-parts", "--design", "length=100", "arm_z=40"]
+TOY += ["--set", "objects.noise.position=0", "--tolerance-trials", "4"]
+FREE = ["--tolerance", "free"]
+
+
+@pytest.fixture
+def by_toy(toy, tmp_path, monkeypatch):
+    """The toy engine simulates; rates are those that were measured elsewhere."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(choice, "make_engine", lambda name, the_scene: toy)
+
+
+def test_command_writes_the_sheet(tmp_path, capsys, by_toy):
+    grasps = (1 + 2 * 2 * STEPS) * 4
+    assert cli.main([*TOY, "--out", str(tmp_path / "plain")]) == 0
+    output = capsys.readouterr().out
+    assert f"--tolerance free --overwrite simulates them, at most {grasps} grasps" in output
+    assert "simulating at most" not in output, "minutes are asked for"
+    assert "Not simulated" in (tmp_path / "plain" / "build_sheet.md").read_text()
+    assert cli.main([*TOY, *FREE, "--out", str(tmp_path / "out")]) == 0
+    output = capsys.readouterr().out
+    assert f"tolerance of length, arm_z: simulating at most {grasps} grasps" in output
+    assert "build_sheet.pdf: build sheet" in output and "no tolerances" not in output
+    text = (tmp_path / "out" / "build_sheet.md").read_text()
+    assert "Of 4 grasps of the design itself 100 % [51, 100] succeed." in text
+    assert "| length | mm | 100 |" in text and "Design; scene tiny" in text
+    # The toy scene's hand has two fingers: lengths and height of the arm of 15 parameters.
+    assert "12 further parameters of the hand's table were not moved" in text
+    assert (tmp_path / "out" / "build_sheet.pdf").exists()
+    assert {p.name for p in tmp_path.iterdir()} - {"cache"} == {"out", "plain"}
+    assert cli.main([*TOY, "--tolerance-steps", "0", "--out", str(tmp_path / "no")]) == 2
+    assert "--tolerance-steps" in capsys.readouterr().err and not (tmp_path / "no").exists()
+
+
+def test_a_folder_is_there_as_a_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "a" / "folder"
+    with pytest.raises(ValueError), files.whole_folder(path) as part:
+        (part / "half").touch()
+        raise ValueError
+    assert [*(tmp_path / "a").iterdir()] == []
+    part.mkdir()
+    (part / "of a killed process").touch()
+    for name in ("new", "newer"):
+        with files.whole_folder(path) as part:
+            (part / name).touch()
+        (path / "own").touch()
+    assert {p.name for p in path.iterdir()} == {"new", "newer", "own"}
+
+
+# --- exported grasps: plain MuJoCo simulates the files as the engine mujoco does ------------------
+
 
 ROOT = Path(__file__).parent.parent
 
@@ -104,20 +437,20 @@ def assert_declared(alone, spec, shares):
     In a state with many contacts; the normal's stiffness k_n = K I / R is the declared one of two
     bodies, twice as large at the table, times the share of a sphere on a finger.
     """
-    rows = []
+    rows, written = [], plain.text(alone, spec.copy(), shares)
     declared = plain.engine_model(alone, spec, shares)
-    for model in (declared, mujoco.MjModel.from_xml_string(plain.text(alone, spec.copy(), shares))):
-        data = mujoco.MjData(model)
+    for played in (declared, mujoco.MjModel.from_xml_string(written)):
+        data = mujoco.MjData(played)
         # Palm, straight fingers, object and table are in one another.
         data.qpos[2], data.qpos[-7:-4] = 0.005, [0.03, 0, 0.02]
-        mujoco.mj_forward(model, data)
+        mujoco.mj_forward(played, data)
         k, b, impedance = data.efc_KBIP[:, :3].T
         rows.append(np.stack([k * impedance, b, data.efc_R]))
     assert rows[0].shape[1] > 10
     np.testing.assert_allclose(rows[1], rows[0], rtol=1e-10)  # rounding
     stiffness, touching = rows[0][0] / rows[0][2], 0
     for contact in data.contact:
-        names = [model.geom(g).name for g in contact.geom]
+        names = [played.geom(g).name for g in contact.geom]
         share = min(shares.get(name, 1.0) for name in names)
         expected = share * alone.contact.normal_stiffness * 2 / (1 if "table" in names else 2)
         assert stiffness[contact.efc_address] == pytest.approx(expected, rel=1e-9)
@@ -185,9 +518,6 @@ def test_commands_are_the_key_frames(tmp_path):
     assert values["0"]["arm_pitch_deg"] == pytest.approx(-15, rel=1e-6)
     phase = {row["time_s"]: row["phase"] for row in rows}
     assert [phase[t] for t in ("1.99", "2", "4.49")] == ["approach", "inflate", "lift"]
-
-
-# --- the command ---------------------------------------------------------------------------------
 
 
 def test_command_writes_models_of_the_default_scene_s_kind(tmp_path, capsys):

@@ -158,9 +158,6 @@ def test_staged_blocks_are_narrow_for_few_worlds(name):
     jax.tree.map(np.testing.assert_array_equal, *map(run, widths))
 
 
-# --- how kernels are launched ---------------------------------------------------------------------
-
-
 # Ten rounds of a map that doubles differences; a few roundings of 6e-8 in each.
 TOLERANCE = 2**10 * 4 * 6e-8
 

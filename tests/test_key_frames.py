@@ -109,18 +109,13 @@ def test_numbers_of_a_control_are_data():
     assert one != other and one.structure == other.structure
     assert one.structure != load("slide").structure
     assert one.control.frame[2].time.number == 0.4
-    with pytest.raises(
-        scene.InputError, match=r"scene\.control\.frame\[3\]\.time .* 0\.8 s before"
-    ):
-        scene.constants.check(_with_time(one, 1.6))
-
-
-def _with_time(the_scene, value):
-    frames = [*the_scene.control.frame]
-    time = dataclasses.replace(frames[2].time, number=value)
+    frames = [*one.control.frame]
+    time = dataclasses.replace(frames[2].time, number=1.6)
     frames[2] = dataclasses.replace(frames[2], time=time)
-    control = dataclasses.replace(the_scene.control, frame=tuple(frames))
-    return dataclasses.replace(the_scene, control=control)
+    control = dataclasses.replace(one.control, frame=tuple(frames))
+    words = r"scene\.control\.frame\[3\]\.time .* 0\.8 s before"
+    with pytest.raises(scene.InputError, match=words):
+        scene.constants.check(dataclasses.replace(one, control=control))
 
 
 FRAME = {"time": "approach"}

@@ -208,7 +208,7 @@ MOST_LINES = {
     "codesign_jax/scene": 5_010,
     "codesign_jax/studio": 750,
     "scripts": 5_560,
-    "tests": 16_600,
+    "tests": 16_000,
 }
 
 

@@ -9,15 +9,7 @@ import numpy as np
 import pytest
 
 from codesign_jax import model, rollout, scene
-from tests.helpers.grasps import (
-    DATA,
-    hand_world,
-    nth,
-    off,
-    pinch,
-    random_constants,
-    random_worlds,
-)
+from tests.helpers.grasps import DATA, hand_world, nth, off, pinch, random_constants, random_worlds
 
 # Arrays of mjModel that differ between hands although no ModelFields entry carries them, and why
 # nothing in these scenes reads them.
@@ -131,9 +123,6 @@ def test_no_part_reads_the_unread_constants(worlds):
     assert not compiled.jnt_stiffness[free].any()
     assert not compiled.tendon_stiffness.any() and not compiled.tendon_damping.any()
     np.testing.assert_array_equal(np.flatnonzero(compiled.body_simple), [0, compiled.nbody - 1])
-
-
-# --- implicit springs ----------------------------------------------------------------------------
 
 
 def discrete_twin(the_scene, params, trial):

@@ -293,9 +293,6 @@ def test_unknown_names_and_wrong_numbers_are_answered_in_words():
         made.tell(start(made), jnp.zeros((PARTICLES, WIDTH)), np.zeros(3))
 
 
-# --- schedules ------------------------------------------------------------------------------------
-
-
 IS_MORPHOLOGY = np.array([True] * 13 + [False] * 10)
 
 

@@ -37,17 +37,12 @@ def quadratic(population):
     return 3 * jnp.mean(((population - TARGET) / (HIGH - LOW)) ** 2, axis=-1)
 
 
-# --- reflection and limits -----------------------------------------------------------------------
-
 # Processors may treat subnormal numbers as zero, so they are no test of a bound.
 floats = st.floats(-1000, 1000, width=32, allow_subnormal=False)
 far = st.floats(-1e6, 1e6, width=32, allow_subnormal=False)
 
 
-@st.composite
-def boxes(draw):
-    low, high = sorted([draw(floats), draw(floats)])
-    return low, high
+boxes = st.tuples(floats, floats).map(sorted)
 
 
 def rounding(*values):
@@ -55,7 +50,7 @@ def rounding(*values):
 
 
 @repeatable
-@given(x=far, box=boxes())
+@given(x=far, box=boxes)
 def test_reflection_stays_inside_and_keeps_what_is_inside(x, box):
     low, high = box
     y = float(mirror(x, low, high))
@@ -65,15 +60,12 @@ def test_reflection_stays_inside_and_keeps_what_is_inside(x, box):
 
 
 @repeatable
-@given(box=boxes(), folds=st.integers(-20, 20), fraction=st.floats(0, 1, width=32))
+@given(box=boxes, folds=st.integers(-20, 20), fraction=st.floats(0, 1, width=32))
 def test_reflection_is_a_triangle_wave(box, folds, fraction):
     low, high = box
     inside, width = low + fraction * (high - low), high - low
     image = low + (folds + (fraction if folds % 2 == 0 else 1 - fraction)) * width
     np.testing.assert_allclose(mirror(image, low, high), inside, atol=rounding(image, low, high))
-
-
-# --- ask -----------------------------------------------------------------------------------------
 
 
 def test_closed_parameters_keep_their_bits_and_open_ones_move_inside_the_box():
@@ -93,9 +85,6 @@ def test_moves_have_the_stated_deviation():
     np.testing.assert_allclose(step.mean(axis=0), 0, atol=4 * 0.05 / 64)
     correlation = np.corrcoef(np.asarray(step).T) - np.eye(5)
     assert np.abs(correlation).max() < 0.08
-
-
-# --- tell ----------------------------------------------------------------------------------------
 
 
 def told(cost):
@@ -133,9 +122,6 @@ def test_where_every_particle_failed_all_survive(bad):
     assert info.best_cost == np.inf and info.mean_cost == np.inf
 
 
-# --- seeding -------------------------------------------------------------------------------------
-
-
 def test_seeds_do_not_depend_on_the_batch_size():
     key, space = jax.random.key(9), FILTER.space
     results = [
@@ -166,9 +152,6 @@ def test_too_few_seeds_are_an_error_with_the_counts():
         answer(rejection(key, space, 2), lambda x: x)
     with pytest.raises(ValueError, match="at least 1"):
         answer(rejection(key, space, 0), quadratic)
-
-
-# --- resampling -----------------------------------------------------------------------------------
 
 
 ALMOST_ONE = float(np.nextafter(np.float32(1), np.float32(0)))

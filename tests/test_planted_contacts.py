@@ -322,10 +322,8 @@ def pressing(scene, model, data):
     sides = {body: f for f, row in enumerate(lay.bodies) for body in (*row, lay.stubs[f])}
     sides[model.body("palm").id] = -1
     for i in range(data.ncon):
-        force, ends = (
-            np.zeros(6),
-            [sides.get(int(b)) for b in model.geom_bodyid[data.contact[i].geom]],
-        )
+        geoms, force = data.contact[i].geom, np.zeros(6)
+        ends = [sides.get(int(body)) for body in model.geom_bodyid[geoms]]
         mujoco.mj_contactForce(model, data, i, force)
         if None not in ends:
             found[*ends] += force[0]

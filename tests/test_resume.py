@@ -1,4 +1,4 @@
-"""A run and its folder: it resumes and extends bit for bit, whatever ended it."""
+"""Runs and their folders: they resume and extend bit for bit, alone and many in one batch."""
 
 import contextlib
 import csv
@@ -11,16 +11,21 @@ import shutil
 import signal
 import socket
 
+import jax
+import numpy as np
 import pytest
 
-from codesign_jax import runs
-from codesign_jax.batch import Batch
+from codesign_jax import codesign, runs, scene
+from codesign_jax.batch import Batch, Request, take
 from codesign_jax.commands import reference
-from codesign_jax.runs.checkpoint import Checkpoints
+from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.runs.checkpoint import Checkpoints, digest
 from codesign_jax.runs.choice import Case
+from codesign_jax.scene import parameters
 from tests.helpers.command_runs import (  # noqa: F401
     EPISODES,
     RESULTS,
+    RUN,
     assert_same_run,
     command,
     finished_run,
@@ -31,7 +36,7 @@ from tests.helpers.command_runs import (  # noqa: F401
     wait_for,
     without,
 )
-from tests.helpers.tiny_run import RUN
+from tests.helpers.toy_engine import TINY, tiny
 
 
 def test_same_command_again_changes_no_result(finished, tmp_path, capsys):
@@ -105,11 +110,24 @@ def test_second_process_on_a_folder_is_refused(finished, capsys):
 
 
 def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, monkeypatch, capsys):
-    """At five times the steps and three times the links: with 20 times MuJoCo C takes long."""
+    """And grasps of other conditions, which are told, kept and reported.
+
+    At five times the steps and three times the links: with 20 times MuJoCo C takes long.
+    """
     monkeypatch.setattr(reference, "ACCURACY", "fine")
     folder = shutil.copytree(finished, tmp_path / "run")
     assert command(*RUN, "--reference-trials", "2", "--out", folder) == 0
-    said = capsys.readouterr().out.splitlines()
+    settings, text = runs.read_run(folder)[1], capsys.readouterr().out
+    stress = reference.stored_stress(folder, settings)
+    assert [*dict.fromkeys(stress.conditions)][-1] == "neo-Hookean bending law"
+    for words in ("under other conditions, 12 grasps each", *stress.lines()):
+        assert " ".join(words.split()) in " ".join(text.split())
+    other = dataclasses.replace(settings, seed=settings.seed + 1)
+    assert reference.stored_stress(folder, other) is None
+    assert command("report", folder, "--no-replay") == 0
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert "Under other conditions, 12 grasps each" in page and "neo-Hookean bending law" in page
+    said = text.splitlines()
     line = next(x for x in said if x.startswith("verdict: "))
     assert "of 2 fresh grasps" in line
     assert any("accuracy fine, steps of 5 ms, 10 links a finger" in x for x in said)
@@ -121,7 +139,6 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
         patch.setattr(Case, "simulate", never)
         assert command(*RUN, "--reference-trials", "2", "--out", folder) == 0
         assert line in capsys.readouterr().out.splitlines()
-    settings = runs.read_run(folder)[1]
     assert reference.number_of_trials(None, settings) == 0  # MuJoCo C would take minutes
     quick = dataclasses.replace(settings, engine="structured")
     assert reference.number_of_trials(None, quick) == 24
@@ -251,3 +268,70 @@ def test_hosts_share_the_seeds(tmp_path, capsys):
     assert tables[0] == tables[1]
     assert "of 3 runs found a good design" in outputs[0]
     assert "seed 4: final test" not in outputs[0] and "of 3 runs" not in outputs[1]
+
+
+# --- runs in one batch on several devices: the bits of each alone on one --------------------------
+
+
+def numbers(tree):
+    """All arrays of a tree by their places."""
+    leaves = jax.tree.leaves(tree)
+    keys = (jax.dtypes.issubdtype(v.dtype, jax.dtypes.prng_key) for v in leaves)
+    arrays = (jax.random.key_data(v) if k else v for v, k in zip(leaves, keys, strict=True))
+    return {str(place): np.asarray(v) for place, v in enumerate(arrays)}
+
+
+def test_shares_of_joined_runs_are_those_of_one_run(monkeypatch):
+    """By the kernel, on one device that stands for two: the middle run of three is cut.
+
+    Beside them calls of one run each: the limit has room for 39 grasps, and a run has 20.
+    """
+    contacts = ("finger_table", "palm_table", "palm_object")
+    the_scene = scene.load(TINY, overrides={f"effects.{pair}": False for pair in contacts})
+    space = parameters.design_space(the_scene.hand, "2d")
+    optimizer = codesign.make_filter(space)
+    task = codesign.Task(the_scene, space, 2, StructuredEngine(the_scene))
+    shares, call = [], Batch.call
+
+    def spy(self, blocks, *rest):
+        shares.append(jax.tree.leaves(blocks)[0].shape[0])
+        return call(self, blocks, *rest)
+
+    def episodes(batch):
+        """States and reports of two episodes of three runs."""
+        keys, found = map(jax.random.key, range(3)), []
+        states = [optimizer.init(key, space.default(), 10) for key in keys]
+        for _ in range(2):
+            found.append(batch([Request(state, np.ones(2, bool)) for state in states]))
+            states = [state for state, _ in found[-1]]
+        return found
+
+    monkeypatch.setattr(Batch, "call", spy)
+    with monkeypatch.context() as patch:
+        patch.setattr("codesign_jax.batch.take", lambda count: 2 * take(1))
+        joined = episodes(Batch(task, optimizer))
+    first, second = shares[:2]
+    assert first == second + 1 and (first + second) % 3 == 0
+    shares.clear()
+    alone = episodes(Batch(task, optimizer, limit=39))
+    assert {3 * share for share in shares} == {first + second}
+    assert digest(numbers(joined)) == digest(numbers(alone))
+    assert np.ptp([float(info.selection.mean_cost) for _, info in joined[-1]]) > 0
+
+
+def test_a_test_of_few_particles_runs_beside_episodes():
+    """Requests of two sizes in one call: each has the answer that it has alone, in its place."""
+    the_scene, space, engine = tiny()
+    optimizer = codesign.make_optimizer("screened-es", space)
+    task = codesign.Task(the_scene, space, 2, engine)
+    keys = jax.random.split(jax.random.key(5), 3)
+    requests = [
+        Request(*codesign.closed(optimizer, space.sample(key, count), key))
+        for key, count in zip(keys, (3, 6, 3), strict=True)
+    ]
+    together = Batch(task, optimizer)
+    together.compile(requests[0], 3)
+    for request, (_, info) in zip(requests, together(requests), strict=True):
+        [(_, alone)] = together([request])
+        np.testing.assert_array_equal(info.population, request.state.particles)
+        np.testing.assert_array_equal(info.outcomes.cost, alone.outcomes.cost)

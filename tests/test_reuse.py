@@ -19,8 +19,6 @@ from codesign_jax.engines.structured import lanewise
 from codesign_jax.scene.meshes import grid
 from tests.helpers import grasps, kernels
 
-# The code
-
 
 @pytest.fixture
 def code(tmp_path, monkeypatch):
@@ -136,9 +134,6 @@ def test_nothing_traced_is_found_once_the_code_is_not_known(monkeypatch):
         assert keep().currsize == 0
 
 
-# Memory maps and processes
-
-
 def full(monkeypatch, share):
     """The process has this share of the maps that it may have."""
     monkeypatch.setattr(reuse, "memory_maps", lambda: (int(share * 65_530), 65_530))
@@ -190,9 +185,6 @@ def test_a_forked_process_says_that_it_would_wait_for_ever(monkeypatch):
     for call in (lambda: program(0, 0), lambda: rollout.sample_trials(scene, key, 3)):
         with pytest.raises(RuntimeError, match="forked from one that had simulated.*spawn"):
             call()
-
-
-# On disk
 
 
 @pytest.fixture
@@ -301,9 +293,6 @@ def test_what_is_not_used_goes(folder, monkeypatch):
             abandoned.write_bytes(b"part")
             os.utime(abandoned, (0, 0))
     assert {p.name for p in (folder / "kernels").iterdir()} == {f"k{k}.kept" for k in (0, 7, 8, 9)}
-
-
-# JAX's programs
 
 
 @pytest.mark.parametrize("damage", [b"", b"nothing", zlib.compress(b"program" * 99)[:-9]])

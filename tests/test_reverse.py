@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 from functools import partial
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import jax
@@ -49,8 +50,6 @@ EVERYTHING = {
     "contact__finger_finger_friction": 0.6,  # not the object's
 }
 
-
-# --- planted faults ------------------------------------------------------------------------------
 
 DEEP = 1e6
 """Depth of the object [m] that no world reaches; beyond it the bound tells a world's fault."""
@@ -208,20 +207,13 @@ def planted(faults):
     assert fault.used == set(faults), set(faults) - fault.used
 
 
-class Checked(NamedTuple):
-    """Derivatives along the groups' directions: central differences; of a sound world for two
-    weights, one plus twice the other, and zero; of the faults' worlds; of a world in company."""
-
-    names: list
-    difference: np.ndarray
-    sound: np.ndarray
-    wrong: np.ndarray
-    alone: tuple
-
-
 @functools.cache
 def checked(wrong=False):
-    """One kernel of sound worlds; or `wrong`: one with all faults, whose other worlds are sound."""
+    """One kernel of sound worlds; or `wrong`: one with all faults, whose other worlds are sound.
+
+    Derivatives along the groups' directions, by central differences; of a sound world for two
+    weights, one plus twice the other, and zero; of the faults' worlds; of a world in company.
+    """
     faults = FAULTS if wrong else {}
     with jax.enable_x64(True):
         case = Case(
@@ -252,7 +244,8 @@ def checked(wrong=False):
         for bars, order in zip(found, orders, strict=True)
     )
     names = [name for _, name in case.groups]
-    return Checked(names, difference, slopes[count:], slopes[:count], alone)
+    found = {"sound": slopes[count:], "wrong": slopes[:count], "alone": alone}
+    return SimpleNamespace(names=names, difference=difference, **found)
 
 
 def test_derivatives_by_every_group_equal_central_differences():
@@ -292,8 +285,6 @@ def test_derivatives_do_not_depend_on_company():
         for a, b in zip(mine, other, strict=True):
             np.testing.assert_array_equal(a, b)
 
-
-# --- other scenes: what the quick tests' scene has not ------------------------------------------
 
 HELD = {"effects__finger_finger": True, "effects__friction_memory": True}
 HULL = {"effects__surface": "hull"}
@@ -349,9 +340,6 @@ def test_derivatives_of_scenes(name, tmp_path):
         size = "grid_factor" if name.startswith("mesh") else "object_size"
         assert slopes["cone.hand_object"] and slopes[size]
         assert np.min(errors, 0).max() < BOUND
-
-
-# --- on a GPU, in segments, of many worlds -------------------------------------------------------
 
 
 def ptx(the_scene):

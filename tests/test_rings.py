@@ -212,10 +212,7 @@ FIELDS = {
     "edge across": edge_across,
     "corner": corner,
 }
-FINGERS = {
-    "crossed at 90 degrees": crossed,
-    "tip on a side": tip_on_side,
-}
+FINGERS = {"crossed at 90 degrees": crossed, "tip on a side": tip_on_side}
 
 # Force over the reference's at each of `DEPTHS` from 0.5 mm on, least and most over the places; the
 # largest angle between both [degrees] and distance of their lines of action [mm] from 1 mm on.

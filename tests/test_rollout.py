@@ -19,9 +19,6 @@ KEY = jax.random.key(5)
 draw = jax.jit(lambda key, n: rollout.sample_trials(PAPER, key, n), static_argnums=1)
 
 
-# --- trials --------------------------------------------------------------------------------------
-
-
 def test_more_trials_do_not_change_the_first():
     few, many = draw(KEY, 4), draw(KEY, 40)
     for a, b in zip(few, many, strict=True):
@@ -49,9 +46,6 @@ def test_noise_has_the_declared_spread():
     assert np.abs(correlation).max() < 4.5 / np.sqrt(count)
 
 
-# --- batches -------------------------------------------------------------------------------------
-
-
 def test_order_of_particles_and_trials_does_not_matter():
     """Also: every particle meets the same trials, whatever its place (common random numbers)."""
     the_scene = pinch("box", links=2, **hurried(0.4, 0.6, 0.8, 1.0, 1.6))
@@ -72,9 +66,6 @@ def test_order_of_particles_and_trials_does_not_matter():
         np.testing.assert_array_equal(same, jnp.stack([one[0]] * 5))
 
 
-# --- arm and start -------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("axis, sign, column", [(4, 1, 0), (3, 1, 1)])
 def test_pitch_points_the_fingers_to_x_and_roll_to_y(axis, sign, column):
     """Table I's x = -20 mm with a pitch of 15 degrees aims at the object."""
@@ -89,9 +80,6 @@ def test_pitch_points_the_fingers_to_x_and_roll_to_y(axis, sign, column):
     mujoco.mj_kinematics(compiled, data)
     centre = model.layout(PAPER).centre_weights @ data.xipos - data.xpos[1]
     assert centre[column] > 0.01 and abs(centre[1 - column]) < 1e-6 and centre[2] < 0
-
-
-# --- whole grasps in MuJoCo C ---------------------------------------------------------------------
 
 
 def design(the_scene, **changes):

@@ -18,13 +18,14 @@ from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.scene.schema import InputError
 from scripts import faults
 from tests.helpers.command_runs import (  # noqa: F401
+    RUN,
     assert_same_run,
     command,
+    copied,
     own_workplace,
     snapshot,
     stored,
 )
-from tests.helpers.tiny_run import RUN, copied
 
 NEWEST = 4  # the final test, after three episodes
 

@@ -1,7 +1,9 @@
-"""Run folders: scene files, settings, tables and the signals that stop a run."""
+"""Run folders: scene files, settings, tables, signals, and what is deleted of them."""
 
 import csv
+import os
 import re
+import shutil
 from functools import partial
 from pathlib import Path
 
@@ -11,13 +13,16 @@ import numpy as np
 import pytest
 
 from codesign_jax import codesign, files, optimize, runs, scene
-from codesign_jax.runs import columns, loop, tables
+from codesign_jax.runs import columns, directory, loop, scene_files, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs import settings as settings_module
+from codesign_jax.runs.directory import open_run
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import library, parameters
+from codesign_jax.scene.schema import InputError
 from tests.helpers import episodes
+from tests.helpers.command_runs import RUN, command, copied, own_workplace, snapshot, without  # noqa: F401
 from tests.helpers.toy_engine import tiny
 
 ROOT = Path(__file__).parent.parent
@@ -31,7 +36,7 @@ def settings(**changes):
 
 
 @pytest.fixture(scope="module")
-def run():
+def toy_run():
     """A toy run of three episodes: scene, space, record and final test."""
     the_scene, space, engine = tiny()
     s, optimizer = settings(), codesign.make_filter(space)
@@ -72,27 +77,29 @@ def test_sizes_default_to_the_papers():
     assert of("23d", optimize.DEFAULT) == (25, 3, 30, 48)
     assert of("full", optimize.DEFAULT, objects=8) == (25, 8, 30, 48)
     assert of("full", optimize.DEFAULT, objects=1) == (25, 3, 30, 48)
-    # Its final test simulates three averages, and no copies of them; in 2D three designs more.
-    for preset, grasps in (("23d", 30 * 75 + 3 * 48), ("2d", 19 * 39 + 6 * 36)):
+    # Its final test simulates three averages, or designs of 2D, and no copies of them.
+    for preset, grasps in (("23d", 30 * 75 + 3 * 48), ("2d", 22 * 36 + 3 * 48)):
         made = settings_module.make_settings(
             preset, "concurrent", "control", "structured", 0, optimizer=optimize.DEFAULT
         )
         assert runs.prepare(scene.load(), made).grasps == grasps
 
 
-@pytest.mark.parametrize("episodes", [1, 5, 6])
-def test_the_planned_test_is_the_one_that_is_simulated(episodes):
-    """A search that ends among its random designs tests all of them: "39/36 grasps"."""
-    the_scene, space, _ = tiny()
-    own = settings(particles=8, episodes=episodes, optimizer=optimize.DEFAULT)
-    plan = runs.prepare(the_scene, own)
-    state = plan.optimizer.init(jax.random.key(0), space.default(), own.particles)
+@pytest.mark.parametrize(
+    ("preset", "episodes", "finalists"),
+    [("2d", 1, 3), ("2d", 6, 3), ("full", 1, 8), ("full", 6, 3)],
+)
+def test_the_planned_test_is_the_one_that_is_simulated(preset, episodes, finalists):
+    """A search for many parameters that ends among its random designs tests all of them."""
+    own = settings(preset=preset, particles=8, episodes=episodes, optimizer=optimize.DEFAULT)
+    plan = runs.prepare(tiny()[0], own)
+    state = plan.optimizer.init(jax.random.key(0), plan.space.default(), own.particles)
     for mask in plan.mask:
         asked = plan.optimizer.ask(state, mask)
         state, _ = plan.optimizer.tell(state, asked, jnp.arange(8.0), mask)
     tested, _ = loop.finalists(plan, np.asarray(state.particles))
     assert len(tested) * own.trials * own.test_rounds == plan.test_grasps
-    assert len(tested) == (8 if episodes <= 5 else 6)
+    assert len(tested) == finalists
 
 
 def test_settings_report_every_problem():
@@ -109,8 +116,8 @@ def read(path):
     return list(csv.DictReader(path.read_text().splitlines()))
 
 
-def test_tables_hold_the_history_with_units(run, tmp_path):
-    the_scene, space, record, test = run
+def test_tables_hold_the_history_with_units(toy_run, tmp_path):
+    the_scene, space, record, test = toy_run
     tables.write_episodes(tmp_path, the_scene, space, record.history, 0, 3)
     tables.write_tests(tmp_path, space, np.asarray(record.state.particles), test)
     history, trials = record.history, read(tmp_path / "trials.csv")
@@ -128,11 +135,11 @@ def test_tables_hold_the_history_with_units(run, tmp_path):
     assert [np.float32(r["test_cost"]) for r in rows] == np.asarray(test.cost).tolist()
 
 
-def test_every_file_and_column_is_described_on_the_page(run, tmp_path):
-    the_scene, space, record, test = run
+def test_every_file_and_column_is_described_on_the_page(toy_run, tmp_path):
+    the_scene, space, record, test = toy_run
     tables.write_episodes(tmp_path, the_scene, space, record.history, 0, 3)
     tables.write_tests(tmp_path, space, np.asarray(record.state.particles), test)
-    assert {p.name for p in tmp_path.iterdir()} == {*columns.TABLES}
+    assert {p.name for p in tmp_path.glob("*.csv")} == {*columns.TABLES}
     head, *sections = (ROOT / "docs" / "files.md").read_text(encoding="utf-8").split("\n## ")
     assert {*re.findall(r"^\| `(\S+)` \|", head, re.M)} == columns.FILES | {*columns.TABLES}
     named = {s.split("\n")[0]: re.findall(r"^\| `(\w+)` \|", s, re.M) for s in sections}
@@ -150,3 +157,120 @@ def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path):
         part.write_text("half")
         raise RuntimeError
     assert path.read_text() == "old" and list(path.parent.iterdir()) == [path]
+
+
+# --- run folders: nothing is deleted that is not a run's ------------------------------------------
+
+
+SETTINGS = runs.make_settings("2d", "concurrent", "control", "mujoco", 0, particles=4, episodes=2)
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A finished run of its own."""
+    return copied(tmp_path / "run")
+
+
+def start(folder, **how):
+    """Opens a run folder and closes it again; returns its notes."""
+    with open_run(folder, tiny()[0], SETTINGS, ["codesign", "optimize"], **how) as (_, notes):
+        return notes
+
+
+@pytest.fixture
+def mine(tmp_path):
+    """A folder with a user's own scene, as a run would name its files."""
+    folder = tmp_path / "mine"
+    (folder / "meshes").mkdir(parents=True)
+    scene_files.write_scene(tiny()[0], folder)
+    (folder / "hand.toml").write_text("# years of work\n" + (folder / "hand.toml").read_text())
+    (folder / "meshes" / "capsule.stl").write_text("solid")
+    return folder
+
+
+@pytest.mark.parametrize("more", [(), ("--fresh",)])
+def test_a_users_own_scene_stays_where_it_is(more, mine, capsys):
+    before = snapshot(mine)
+    own = ["optimize", "--scene", mine / "scene.toml", "--engine", "mujoco", "--out", mine]
+    assert command(*own, *more) == 2
+    error = capsys.readouterr().err
+    assert f"{mine} holds control.toml, hand.toml, meshes/capsule.stl and 2 more" in error
+    assert "choose another folder" in error
+    assert snapshot(mine) == before and not (mine / ".lock").exists()
+
+
+@pytest.mark.parametrize("fresh", [False, True])
+@pytest.mark.parametrize("left", [None, ["landscape.npz", "report.html"], ["scene.toml"]])
+def test_what_is_no_run_is_not_cleared(left, fresh, run, capsys):
+    """A run that lost provenance.json, results alone, and a scene."""
+    for path in run.iterdir():
+        if path.name == "provenance.json" or (left and path.name not in left):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    for name in left or ():
+        (run / name).touch()
+    before = snapshot(run)
+    assert command(*RUN, "--out", run, *(["--fresh"] if fresh else [])) == 2
+    error = capsys.readouterr().err
+    assert "and no provenance.json" in error and "Nothing was changed" in error
+    assert ("put that back from a copy" in error) == (left is None)
+    assert snapshot(run) == before
+
+
+@pytest.mark.parametrize("moment", range(5))
+def test_a_start_that_was_cut_short_goes_on(moment, tmp_path, monkeypatch):
+    """At any file that it writes: provenance.json and four of the scene."""
+    folder, replace, count = tmp_path / "run", os.replace, [0]
+
+    def killed(source, target):
+        if count[0] == moment:
+            shutil.copy(source, f"{target}.4711.tmp")  # which a kill leaves
+            raise KeyboardInterrupt
+        count[0] += 1
+        replace(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", killed)
+        with pytest.raises(KeyboardInterrupt):
+            start(folder)
+    assert (folder / "provenance.json").exists() == (moment > 0)
+    if moment == 3:  # and what somebody has changed since then stays
+        text = (folder / "hand.toml").read_text()
+        (folder / "hand.toml").write_text("# my own\n")
+        before = snapshot(folder)
+        with pytest.raises(InputError, match=r"hand.toml.* since the run was made"):
+            start(folder)
+        assert snapshot(folder) == before
+        (folder / "hand.toml").write_text(text)
+    start(folder)
+    names = [".lock", "control.toml", "events.log", "hand.toml", "objects.toml"]
+    names += ["provenance.json", "scene.toml"]
+    assert sorted(os.listdir(folder)) == names
+    assert scene.load(folder / "scene.toml") == tiny()[0]
+
+
+@pytest.mark.parametrize("kind", ["file", "folder", "link", "dangling"])
+def test_fresh_deletes_no_file_that_is_not_the_runs(kind, run, tmp_path):
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "picture.png").touch()
+    if kind == "file":
+        (run / "figures" / "my own.png").touch()
+    elif kind == "folder":
+        (run / "tests.csv").unlink()
+        (run / "tests.csv").mkdir()
+    else:
+        (run / "failures").symlink_to(other if kind == "link" else tmp_path / "nowhere")
+    before = snapshot(run)
+    with pytest.raises(InputError) as refused:
+        start(run, fresh=True)
+    words = {"file": "figures/my own.png in", "folder": "tests.csv in"}
+    assert words.get(kind, "failures in") in str(refused.value)
+    assert snapshot(run) == before and (other / "picture.png").exists()
+
+
+def test_a_run_has_no_files_but_its_own(run):
+    """What `--fresh` deletes is all that a run makes."""
+    assert command("report", run, "--no-replay") == 0
+    directory._refuse_to_delete(run)
+    directory._delete_run(run)
+    assert os.listdir(run) == [".lock"]

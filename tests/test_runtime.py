@@ -1,4 +1,4 @@
-"""How kernels reach XLA on a CPU: threads, checks, versions, fallback, and kept machine code."""
+"""How kernels reach XLA, on CPUs and NVIDIA GPUs: threads, checks, versions, kept machine code."""
 
 import ctypes
 import importlib.metadata
@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import threading
+from ctypes import POINTER, c_char_p, c_int, c_int64, c_uint, c_void_p
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,9 +17,121 @@ import pytest
 
 from codesign_jax.compiler import cpu, ffi, gpu, handlers, launch
 from codesign_jax.compiler.values import OUTPUT, SCRATCH, Array, Layout
-from tests.helpers import call_frames, kernels
+from tests.helpers import kernels
 
 pytestmark = pytest.mark.usefixtures("optimized_kernels")
+
+FUNCTION = ctypes.CFUNCTYPE(c_void_p, c_void_p)
+STREAM = 0x57EA
+
+
+class Xla:
+    """Functions that handlers call, which note what they were asked for.
+
+    Error k is the pointer k + 1; `tasks` have not been run yet, `scheduled` were asked for.
+    """
+
+    def __init__(self, threads=1, pool="late", stream_error=0):
+        """No pool with 0 threads; its tasks run "at once", "late", in "threads", or never."""
+        self.errors, self.destroyed, self.tasks, self.scheduled = [], [], [], 0
+        self.threads, self.pool, self.stream_error = threads, pool, stream_error
+        self.running = []
+        named = {
+            "error_create": self._create,
+            "error_destroy": self._destroy,
+            "stream_get": self._stream,
+            "thread_pool_schedule": self._schedule,
+            "thread_pool_num_threads": self._num_threads,
+        }
+        self.functions = {name: FUNCTION(function) for name, function in named.items()}
+        self.api = ffi.Api(struct_size=ffi.size(ffi.Api))
+        for name, function in self.functions.items():
+            setattr(self.api, name, ctypes.cast(function, c_void_p))
+
+    def call(self, address, inputs, outputs):
+        """Calls a handler on NumPy arrays; its error's code and message, or None."""
+        keep = []
+
+        def arguments(arrays):
+            buffers = [self._buffer(a, keep) for a in arrays]
+            pointers = (c_void_p * len(arrays))(*(ctypes.addressof(b) for b in buffers))
+            keep.extend([*buffers, pointers])
+            size, values = ffi.size(ffi.Arguments), ctypes.addressof(pointers)
+            return ffi.Arguments(struct_size=size, size=len(arrays), values=values)
+
+        given = {"args": arguments(inputs), "rets": arguments(outputs)}
+        api, size = ctypes.addressof(self.api), ffi.size(ffi.CallFrame)
+        frame = ffi.CallFrame(struct_size=size, api=api, stage=3, **given)
+        pointer = FUNCTION(address)(ctypes.addressof(frame))
+        return self.errors[pointer - 1] if pointer else None
+
+    def _buffer(self, array, keep):
+        dims = (c_int64 * array.ndim)(*array.shape)
+        keep.extend([dims, array])
+        return ffi.Buffer(
+            struct_size=ffi.size(ffi.Buffer),
+            dtype=ffi.DTYPES[array.dtype.name],
+            data=array.ctypes.data,
+            rank=array.ndim,
+            dims=ctypes.addressof(dims),
+        )
+
+    def run_late(self):
+        """Runs the tasks that wait, and waits for those that run."""
+        while self.tasks:
+            self.tasks.pop()()
+        for thread in self.running:
+            thread.join()
+
+    def _create(self, record):
+        given = ffi.ErrorCreate.from_address(record)
+        self.errors.append((given.errc, ctypes.string_at(given.message).decode()))
+        return len(self.errors)
+
+    def _destroy(self, record):
+        self.destroyed.append(ffi.ErrorDestroy.from_address(record).error)
+        return None
+
+    def _stream(self, record):
+        ffi.StreamGet.from_address(record).stream = STREAM
+        return self.stream_error or None
+
+    def _num_threads(self, record):
+        if not self.threads:
+            self.errors.append((12, "no pool"))
+            return len(self.errors)
+        given = ffi.NumThreads.from_address(record)
+        c_int64.from_address(given.num_threads).value = self.threads
+        return None
+
+    def _schedule(self, record):
+        given = ffi.Schedule.from_address(record)
+        function, data = ctypes.CFUNCTYPE(None, c_void_p)(given.task), given.data
+        self.scheduled += 1
+        if self.pool == "refused" and self.scheduled > 1:
+            self.errors.append((8, "the pool is full"))
+            return len(self.errors)
+        if self.pool == "at once":
+            function(data)
+        elif self.pool == "threads":
+            self.running.append(threading.Thread(target=function, args=(data,)))
+            self.running[-1].start()
+        else:
+            self.tasks.append(lambda: function(data))
+        return None
+
+
+def arrays(layout, blocks, seed=0):
+    """Random inputs and empty outputs of a layout, as NumPy arrays."""
+    rng = np.random.default_rng(seed)
+    found = {"input": [], "output": []}
+    for array in layout.arrays:
+        if array.role in found:
+            shape = (1 if array.shared else blocks, *array.shape)
+            values = rng.standard_normal(shape) if array.role == "input" else np.zeros(shape)
+            found[array.role].append(values.astype(array.dtype))
+    return found["input"], found["output"]
+
 
 LAYOUT = Layout(
     (
@@ -49,9 +162,6 @@ def folder(tmp_path):
     jax.config.update("jax_compilation_cache_dir", previous)
 
 
-# Threads
-
-
 @pytest.mark.parametrize("pool", ["late", "at once", "threads", "refused"])
 @pytest.mark.parametrize(("threads", "blocks"), [(0, 3), (1, 3), (4, 1), (4, 2), (4, 100), (3, 0)])
 def test_any_number_of_threads_gives_the_same_bits(handler, pool, threads, blocks):
@@ -60,10 +170,10 @@ def test_any_number_of_threads_gives_the_same_bits(handler, pool, threads, block
     Tasks that run late look at the call's record after the handler has returned.
     """
     x, table = kernels.numbers(blocks)
-    xla, out = call_frames.Xla(threads, pool), np.full((blocks, 1, 8), np.nan, np.float32)
+    xla, out = Xla(threads, pool), np.full((blocks, 1, 8), np.nan, np.float32)
     assert xla.call(handler, [x, table], [out]) is None
     alone = np.empty_like(out)
-    assert call_frames.Xla(1).call(handler, [x, table], [alone]) is None
+    assert Xla(1).call(handler, [x, table], [alone]) is None
     np.testing.assert_array_equal(out, alone)
     # Ten rounds of a map that doubles differences; a few roundings of 6e-8 in each.
     np.testing.assert_allclose(out, kernels.expected(x, table), atol=2**10 * 4 * 6e-8)
@@ -141,9 +251,6 @@ def test_kept_code_runs_in_another_process_on_several_devices(folder):
     assert done.returncode == 0, done.stderr
 
 
-# What a handler refuses
-
-
 def test_arrays_of_another_kind_are_refused():
     """By XLA's own call: an exception that names the array, and nothing is written."""
     x, table = kernels.numbers(3)
@@ -178,13 +285,10 @@ def test_missing_memory_is_an_error(threads):
     block = "define internal void @block(ptr %a, ptr %b, ptr %c, ptr %d) {\nret void\n}\n"
     loaded = handlers.Loaded(handlers.compile(block + cpu.handler_code("large", large)))
     (x, table), out = kernels.numbers(8), np.zeros((8, 1, 8), np.float32)
-    xla = call_frames.Xla(threads, "threads")
+    xla = Xla(threads, "threads")
     code, message = xla.call(loaded.function("large"), [x, table], [out])
     xla.run_late()
     assert code == ffi.RESOURCE_EXHAUSTED and "scratch" in message
-
-
-# The interface's version and structures
 
 
 def test_a_newer_version_is_refused_by_xla(monkeypatch):
@@ -195,9 +299,6 @@ def test_a_newer_version_is_refused_by_xla(monkeypatch):
         jax.jit(partial(kernels.run, rounds=3)).lower(x, table)
     monkeypatch.undo()
     jax.jit(partial(kernels.run, rounds=4))(x, table)
-
-
-# Where kernels cannot run
 
 
 def gpus(monkeypatch, capability):
@@ -248,3 +349,156 @@ def test_why_kernels_cannot_run(monkeypatch, platform, cause, reason):
         gpu.driver.cache_clear()
         ffi.installed_version.cache_clear()
     assert launch.available("cpu") is None
+
+
+# --- launching on NVIDIA GPUs, with a driver and an XLA of our own --------------------------------
+
+
+KERNEL, CONTEXT, PRIMARY = 0xCAFE, 0xC0, 0xC1
+NAMES = {1: b"CUDA_ERROR_INVALID_VALUE", 218: b"CUDA_ERROR_INVALID_PTX"}
+GPU_LAYOUT = Layout(
+    (
+        Array((2, 32), "float32"),
+        Array((5,), "int32", shared=True),
+        Array((1, 32), "float64", OUTPUT),
+        Array((3, 32), "float32", OUTPUT),
+    ),
+    32,
+)
+
+
+class FakeDriver:
+    """The driver's functions, which note their calls and return `results` by their names."""
+
+    def __init__(self, **results):
+        """Starts."""
+        self.calls, self.results = [], results
+        kinds = {
+            "cuStreamGetCtx": [c_void_p, POINTER(c_void_p)],
+            "cuCtxPushCurrent_v2": [c_void_p],
+            "cuCtxPopCurrent_v2": [POINTER(c_void_p)],
+            "cuLaunchKernel": [c_void_p, *[c_uint] * 7, c_void_p, POINTER(c_void_p), c_void_p],
+            "cuGetErrorName": [c_int, POINTER(c_char_p)],
+            "cuLibraryLoadData": [
+                *(POINTER(c_void_p), c_char_p, POINTER(c_int), POINTER(c_void_p), c_uint),
+                *(c_void_p, c_void_p, c_uint),
+            ],
+            "cuLibraryGetKernel": [POINTER(c_void_p), c_void_p, c_char_p],
+            "cuDevicePrimaryCtxRetain": [POINTER(c_void_p), c_int],
+            "cuDevicePrimaryCtxRelease_v2": [c_int],
+            "cuKernelGetFunction": [POINTER(c_void_p), c_void_p],
+        }
+        for name, arguments in kinds.items():
+            function = ctypes.CFUNCTYPE(c_int, *arguments)(self._answer(name))
+            setattr(self, name, function)
+
+    def _answer(self, name):
+        def answer(*args):
+            if name == "cuGetErrorName":
+                if args[0] not in NAMES:
+                    return 1
+                args[1][0] = NAMES[args[0]]
+                return 0
+            known = {"cuStreamGetCtx": CONTEXT, "cuDevicePrimaryCtxRetain": PRIMARY}
+            if name in known:
+                args[-1 if name == "cuStreamGetCtx" else 0][0] = known[name]
+            if name in ("cuLibraryLoadData", "cuLibraryGetKernel", "cuKernelGetFunction"):
+                args[0][0] = KERNEL
+            noted = args
+            if name == "cuLaunchKernel":
+                addresses = [c_void_p.from_address(args[9][k]).value for k in range(4)]
+                noted = (*args[:9], addresses, args[10])
+            if name == "cuLibraryLoadData" and self.results:
+                ctypes.memmove(args[3][0], b"line 3: syntax error\0", 21)
+            self.calls.append((name, noted))
+            return self.results.get(name, 0)
+
+        return answer
+
+
+@pytest.fixture(scope="module")
+def prepared():
+    """A handler and what sets the driver that it calls."""
+    fake = FakeDriver()
+    loaded = gpu.prepare("fake", GPU_LAYOUT, KERNEL, gpu.Driver(fake))
+
+    def use(driver):
+        table = loaded.numbers("fake_table", 1 + len(gpu.CALLS))
+        for k, name in enumerate(gpu.CALLS):
+            table[1 + k] = gpu.Driver(driver).address(name)
+        return driver
+
+    return loaded.function("fake"), use, fake
+
+
+def test_launch(prepared):
+    """Grid, block, stream and the address of every array's first block, in the stream's context."""
+    handler, use, _ = prepared
+    driver, xla = use(FakeDriver()), Xla()
+    for blocks in (1, 7):
+        inputs, outputs = arrays(GPU_LAYOUT, blocks)
+        assert xla.call(handler, inputs, outputs) is None
+        addresses = [a.ctypes.data for a in (*inputs, *outputs)]
+        names, arguments = zip(*driver.calls, strict=True)
+        assert names == ("cuStreamGetCtx", "cuCtxPushCurrent_v2", "cuLaunchKernel") + (
+            "cuCtxPopCurrent_v2",
+        )
+        assert arguments[0][0] == STREAM and arguments[1] == (CONTEXT,)
+        assert arguments[2] == (*(KERNEL, blocks, 1, 1, 32, 1, 1, 0, STREAM, addresses, None),)
+        driver.calls.clear()
+    inputs, outputs = arrays(GPU_LAYOUT, 0)
+    assert xla.call(handler, inputs, outputs) is None and not driver.calls
+
+
+@pytest.mark.parametrize(
+    ("function", "result", "message"),
+    [
+        ("cuLaunchKernel", 1, r"kernel fake: cuLaunchKernel: CUDA_ERROR_INVALID_VALUE (1)"),
+        ("cuLaunchKernel", 77, r"kernel fake: cuLaunchKernel: unknown error (77)"),
+        ("cuStreamGetCtx", 1, r"kernel fake: cuStreamGetCtx: CUDA_ERROR_INVALID_VALUE (1)"),
+        ("cuCtxPopCurrent_v2", 1, r"kernel fake: cuCtxPopCurrent: CUDA_ERROR_INVALID_VALUE (1)"),
+    ],
+)
+def test_errors_of_the_driver(prepared, function, result, message):
+    """They name the call and the result; the context is restored after a launch that failed."""
+    handler, use, _ = prepared
+    driver, xla = use(FakeDriver(**{function: result})), Xla()
+    assert xla.call(handler, *arrays(GPU_LAYOUT, 2)) == (ffi.INTERNAL, message)
+    names = [name for name, _ in driver.calls]
+    assert ("cuLaunchKernel" in names) == ("cuCtxPopCurrent_v2" in names)
+    assert "cuLaunchKernel" not in names or function in ("cuLaunchKernel", "cuCtxPopCurrent_v2")
+
+
+def test_errors_of_xla(prepared):
+    """No stream: XLA's own error is handed back.  Arrays of another kind are not launched on."""
+    handler, use, _ = prepared
+    driver, xla = use(FakeDriver()), Xla(stream_error=1)
+    xla.errors.append((9, "no stream"))
+    inputs, outputs = arrays(GPU_LAYOUT, 2)
+    assert xla.call(handler, inputs, outputs) == (9, "no stream")
+    for wrong in ([inputs[0], inputs[0]], [inputs[0][:, :1], inputs[1]], inputs[:1]):
+        code, message = Xla().call(handler, wrong, outputs)
+        assert code == ffi.INVALID_ARGUMENT and message.startswith("kernel fake needs ")
+    assert not driver.calls
+
+
+def test_loading():
+    """PTX becomes a kernel of a library, which is translated in a GPU's primary context."""
+    driver = FakeDriver()
+    assert gpu.load(gpu.Driver(driver), "the text", 3) == KERNEL
+    calls = dict(driver.calls)
+    assert calls["cuLibraryLoadData"][1] == b"the text"
+    assert calls["cuLibraryGetKernel"][2] == gpu.ENTRY.encode()
+    assert calls["cuDevicePrimaryCtxRetain"][1] == 3 and calls["cuCtxPushCurrent_v2"] == (PRIMARY,)
+    names = [name for name, _ in driver.calls]
+    assert names[-2:] == ["cuCtxPopCurrent_v2", "cuDevicePrimaryCtxRelease_v2"]
+
+
+@pytest.mark.parametrize("function", ["cuLibraryLoadData", "cuKernelGetFunction"])
+def test_ptx_that_the_driver_refuses(function):
+    """Its assembler's message is in the error, and the context is given back."""
+    driver = FakeDriver(**{function: 218})
+    with pytest.raises(launch.KernelUnavailable, match="INVALID_PTX .218. line 3: syntax error"):
+        gpu.load(gpu.Driver(driver), "nonsense", 0)
+    names = [name for name, _ in driver.calls]
+    assert names.count("cuCtxPushCurrent_v2") == names.count("cuCtxPopCurrent_v2")

@@ -73,9 +73,6 @@ def killed_after(saves, monkeypatch, **sizes):
     return done
 
 
-# --- draws ---------------------------------------------------------------------------------------
-
-
 def test_outcomes_are_those_of_each_grasp_by_itself():
     drawn = sampling.draw(THREE, SPACE, KEY, first=4, n=4, num_trials=2)
     engine = ToyEngine(THREE)
@@ -86,9 +83,6 @@ def test_outcomes_are_those_of_each_grasp_by_itself():
     for i in (1, 3):  # all designs in the trials of one
         cost = every(hands, nth(drawn.trials, i)).cost
         np.testing.assert_allclose(found.cost[i], cost[i], atol=1e-5)
-
-
-# --- the file ------------------------------------------------------------------------------------
 
 
 def test_a_row_has_design_noise_and_outcome(place, capsys):
@@ -124,9 +118,6 @@ def test_a_row_has_design_noise_and_outcome(place, capsys):
     assert f"of 20 grasps: {said}" in capsys.readouterr().out and counts["lost"] > 0
 
 
-# --- kills ---------------------------------------------------------------------------------------
-
-
 def test_a_killed_command_goes_on_to_the_same_bytes(place, monkeypatch, capsys):
     assert run(out="whole.parquet") == 0
     assert killed_after(1, monkeypatch) == [0]
@@ -138,9 +129,6 @@ def test_a_killed_command_goes_on_to_the_same_bytes(place, monkeypatch, capsys):
     assert "going on after 2 of 3 calls, from a.parquet.part" in capsys.readouterr().out
     assert (place / "a.parquet").read_bytes() == (place / "whole.parquet").read_bytes()
     assert sorted(p.name for p in place.iterdir()) == ["a.parquet", "whole.parquet"]
-
-
-# --- what is refused -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

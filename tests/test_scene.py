@@ -38,16 +38,6 @@ def hand_problems(tmp_path, *edits):
     return problems_of(hand.load, edited(tmp_path, "hands", "pneuflex4", *edits))
 
 
-def object_problems(tmp_path, *edits):
-    return problems_of(objects.load, edited(tmp_path, "objects", "paper", *edits))
-
-
-def scene_problems(**overrides):
-    return problems_of(lambda name: scene.load(name, overrides=overrides), "paper")
-
-
-# --- messages ------------------------------------------------------------------------------------
-
 BY_PATH = {
     "discretization.links=5": lambda s: s.discretization.links == 5,
     "hand=tripod3": lambda s: s.hand.name == "tripod3",
@@ -107,7 +97,7 @@ def test_a_wrong_key_path_is_told_in_words(pair):
     ],
 )
 def test_a_wrong_object_file(tmp_path, old, new, expected):
-    problems = object_problems(tmp_path, (old, new))
+    problems = problems_of(objects.load, edited(tmp_path, "objects", "paper", (old, new)))
     assert len([p for p in problems if expected in p]) == 1, problems
 
 
@@ -120,7 +110,8 @@ def test_not_finite_values_are_refused(tmp_path, bad):
 
 
 def test_phases_out_of_order():
-    problems = scene_problems(phases={"inflate": 5.0, "lift": 4.5, "disturb": 8.6})
+    phases = {"phases": {"inflate": 5.0, "lift": 4.5, "disturb": 8.6}}
+    problems = problems_of(lambda name: scene.load(name, overrides=phases), "paper")
     assert problems == [
         "phases.lift = 4.5 s must come after inflate = 5 s",
         "paper.toml.phases.deflate_time = 0.5 s does not fit between disturb = 8.6 s "
@@ -157,6 +148,7 @@ def test_all_problems_of_all_files_at_once(tmp_path):
     assert len(caught.value.problems) == 5
 
 
+BASE = "base = [0.036, 0.0175]\n"
 LOW = "low = 10\nhigh = 180\ndefault"  # of the length
 
 
@@ -170,6 +162,10 @@ LOW = "low = 10\nhigh = 180\ndefault"  # of the length
         ("\nwall = 5", "\nwall = 2.5", "limit"),  # 120 kPa exceeds 40 kPa/mm * 2.5 mm
         ("[preset.fixed]", "[preset.fixed]\nlength = 100", "both free and fixed"),
         ('[[preset]]\nname = "2d"', '[[preset]]\nname = "full"', "full"),
+        # Mounts of fingers
+        (BASE, "", "finger[0] has no base point: give base = [x, y]"),
+        (BASE, f"{BASE}radius = 0.035\n", f"leave out {BASE.strip()} or radius = 0.035"),
+        ("base = [0.036", "base = [36", "base[0] = 36 is outside [-0.2, 0.2] m"),
         # Numbers of fingers that do not fit the hand: with key, what was given, how many there are
         (
             "\npressure = 120",
@@ -224,9 +220,6 @@ def test_paths_in_a_scene_file_are_relative_to_it(tmp_path):
     assert scene.load(tmp_path / "scene.toml").hand.name == "mine"
 
 
-# --- scenes as values ----------------------------------------------------------------------------
-
-
 def test_the_grasp_is_the_papers():
     the_scene = scene.load("paper")
     assert the_scene.num_steps == 900 and the_scene.end_time == 9.0
@@ -235,16 +228,12 @@ def test_the_grasp_is_the_papers():
     assert short.end_time == 4.5 and short.window == (3.5, 4.5)
 
 
-# --- contract: every hand with every object set --------------------------------------------------
-
-
 # Sets with meshes are stepped in test_meshes.py: stock MuJoCo does not take them.
 STEPPED = [o for o in OBJECTS if 'type = "mesh"' not in text_of("objects", o)]
 
 
 @pytest.mark.parametrize(
-    "hand_name, object_set",
-    [(hand, STEPPED[i % len(STEPPED)]) for i, hand in enumerate(HANDS)],
+    "hand_name, object_set", [(hand, STEPPED[i % len(STEPPED)]) for i, hand in enumerate(HANDS)]
 )
 def test_every_hand_and_object_set_steps_finitely(hand_name, object_set):
     spheres = {"effects": {"surface": "spheres"}}  # MuJoCo C has no contact with the skinned hull

@@ -16,7 +16,7 @@ from codesign_jax.report import animation, landscape
 from codesign_jax.runs import choice
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import failed
-from tests.helpers.tiny_run import small_run  # noqa: F401
+from tests.helpers.command_runs import small_run  # noqa: F401
 from tests.helpers.toy_engine import TINY
 
 DESIGN = ["--scene", str(TINY), "--engine", "mujoco", "--design", "length=100", "arm_z=0"]

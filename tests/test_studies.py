@@ -1,20 +1,32 @@
-"""Studies: sets of constants and waves, rates and their worlds, searches in lock step."""
+"""Studies: constants, rates, searches, accuracy, and the paper's experiments, by known answers."""
 
+import dataclasses
 import json
 import re
+from pathlib import Path
 
 import jax
+import mujoco
 import numpy as np
 import pytest
 import scipy.stats
 
-from codesign_jax import codesign, rollout, scene
+from codesign_jax import cli, codesign, rollout, scene
+from codesign_jax.commands import optimize
 from codesign_jax.engines import make_engine
+from codesign_jax.engines.mujoco import world_model
+from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.scene import parameters
+from codesign_jax.types import Outcome
 from scripts import benchmark, calibration, search
+from scripts.accuracy import budget, report
 from scripts.calibration import OPEN
+from scripts.experiments import report as results
+from scripts.experiments import simulate
+from scripts.experiments.simulate import PAPER, TOTAL_GRASPS
 from scripts.shared import statistics, work
 from tests.helpers import toy_engine
+from tests.helpers.toy_engine import tiny
 
 
 def test_sets_fill_their_ranges_and_every_beginning_does():
@@ -65,9 +77,6 @@ def test_statements_rule_out_what_they_should():
     assert good["two regions"] == bad["two regions"] == pytest.approx(1 / 0.3)
 
 
-# --- rates ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("ties", (False, True))
 def test_rank_correlation_equals_its_definition(ties):
     rng = np.random.default_rng(1)
@@ -85,16 +94,16 @@ def test_tables_of_the_pages_are_those_of_the_data(page):
         assert shown == benchmark.TABLES[mark](files)
 
 
-# --- searches -------------------------------------------------------------------------------------
-
-
 def test_winners_of_a_search_are_judged_at_other_masses(tmp_path):
     """What they keep at a mass is what MuJoCo C says of them in the same trials."""
     sizes = "--preset 2d --optimizers screened-es:particles=6,trials=2,tests=2 --seeds 3 --tests 5"
     how = [*sizes.split(), "--marks", "1", "--budget", "50", "--scene", str(toy_engine.TINY)]
     how += ["--out", str(tmp_path), "--commit", "abcdef0"]
-    assert search.main([*how, "--set", "objects.noise.mass_range=10", "--masses", "0.05", "2"]) == 0
+    assert search.main([*how, "--set", "objects.noise.mass_range=10"]) == 0
     [path] = tmp_path.glob("*.json")
+    masses = ["--masses", "0.05", "2"]
+    assert search.main([*how, "--designs", str(path.with_suffix(".npz")), *masses]) == 0
+    [judged] = (json.loads(p.read_text()) for p in tmp_path.glob("*-masses.json"))
     row, designs = json.loads(path.read_text()), work.winners(path.with_suffix(".npz"))
     assert row["changes"] == ["objects.noise.mass_range=10"] and len(row["kept"][-1]) == 3
     own = scene.load(toy_engine.TINY, overrides={"objects.object.0.mass": 2.0})
@@ -103,13 +112,157 @@ def test_winners_of_a_search_are_judged_at_other_masses(tmp_path):
         key = codesign.stream_key(jax.random.key(seed), search.STREAM_JUDGE, 0)
         hand = jax.tree.map(lambda v: v[None], space.params(design))
         found = rollout.evaluate(own, engine, hand, rollout.sample_trials(own, key, 5))
-        assert row["masses"]["2"][seed] == np.mean(found.cost < codesign.SUCCESS_COST)
-    light, heavy = (np.mean(row["masses"][m]) for m in ("0.05", "2"))
+        assert judged["masses"]["2"][seed] == np.mean(found.cost < codesign.SUCCESS_COST)
+    light, heavy = (np.mean(judged["masses"][m]) for m in ("0.05", "2"))
     assert heavy != light
-    # The designs of a file are judged alike, without a search.
-    assert search.main([*how, "--designs", str(path.with_suffix(".npz")), "--masses", "2"]) == 0
-    [again] = tmp_path.glob("*-masses.json")
-    assert json.loads(again.read_text())["masses"]["2"] == row["masses"]["2"]
-    assert "2000 g: kept on average | seeds that keep 95 % | commit |\n" in (
-        search.masses_table([json.loads(again.read_text())])
+    table = search.masses_table([judged])
+    assert "2000 g: kept on average | seeds that keep 95 % | commit |\n" in table
+
+
+# --- accuracy: presets, the study's variants and tips, its tables of verdicts ---------------------
+
+
+EXPERIMENTS = Path(__file__).parents[1] / "docs" / "data" / "experiments"
+
+
+def test_presets_replace_the_scene_s_values_and_overrides_replace_theirs():
+    assert scene.load("paper", accuracy="standard") == scene.load("paper")
+    fine = scene.load("paper_spheres", accuracy="reference")
+    assert fine.discretization == scene.Discretization(0.001, 20, 1, spring_damping="least")
+    fast = scene.load("paper_spheres", accuracy="fast", overrides={"discretization": {"links": 7}})
+    assert (fast.discretization.links, fast.newton.iterations) == (7, 4)
+    for name, iterations in {"fast": 4, "fine": 6}.items():
+        found = scene.load("paper", accuracy=name)
+        assert StructuredEngine(found).limits.iterations == iterations
+
+
+def test_the_command_line_takes_a_preset(capsys):
+    found, _ = optimize.resolve(
+        cli.Optimize(accuracy="fast", engine="mujoco", overrides=(("solver.iterations=7",),))
     )
+    assert found.discretization == scene.Discretization(0.01, 10, 1, spring_damping="least")
+    assert found.solver.iterations == 7
+    assert cli.main(["evaluate", "--accuracy", "fastest"]) == 2
+    assert "'fastest' unknown; did you mean 'fast'" in capsys.readouterr().err
+
+
+def test_mujoco_converges_with_the_scene_s_own_limits():
+    """A line search that ends early looks like convergence: 20 iterations were too few.
+
+    Of 480 states in contact the largest error is 1.6e-4 with the scene's limits; with 20
+    iterations of the line search a tenth of them errs by 0.04 and more.
+    """
+    plain = {"links": 4, "spheres_per_link": 1}, {"surface": "spheres", "finger_finger": False}
+    overrides = dict(zip(("discretization", "effects"), plain, strict=True))
+    base = scene.load("paper", overrides=overrides)
+    exact = dataclasses.replace(base, solver=scene.Solver(300, 100, 1e-15))
+    few = dataclasses.replace(base, solver=dataclasses.replace(base.solver, ls_iterations=20))
+    with jax.enable_x64(True):
+        worlds = jax.tree.map(np.asarray, work.make_worlds(exact, 2))
+        fields, ctrl = jax.tree.map(np.asarray, work.inputs(exact, worlds))
+    errors = ([], [])
+    first, last = (round(t / 0.01) for t in (exact.phases.approach, exact.phases.disturb))
+    for w in range(2):
+        of_world = jax.tree.map(lambda x, w=w: x[w], fields)
+        truth, *others = (world_model(s, of_world) for s in (exact, base, few))
+        d, datas = mujoco.MjData(truth), [mujoco.MjData(m) for m in others]
+        d.qpos[:] = of_world.start
+        for k in range(last):
+            d.ctrl[:] = ctrl[w, k]
+            if k >= first and k % 30 == 0:
+                mujoco.mj_forward(truth, d)
+                for m, data, found in zip(others, datas, errors, strict=True):
+                    data.qpos[:], data.qvel[:], data.ctrl[:] = d.qpos, d.qvel, d.ctrl
+                    mujoco.mj_forward(m, data)
+                    away = np.linalg.norm(data.qacc - d.qacc)
+                    found.append(away / max(np.linalg.norm(d.qacc), 100.0))
+            mujoco.mj_step(truth, d)
+    assert max(errors[0]) < 1e-3 and max(errors[1]) > 1e-2
+
+
+def test_every_variant_is_a_scene_and_every_row_has_its_variants(tmp_path):
+    scenes = {name: variant.scene() for name, variant in budget.VARIANTS.items()}
+    fine = scenes["truth"].discretization
+    assert (fine.timestep, fine.links, fine.hull_rings) == (0.002, 20, 4)
+    assert scenes["1e-3"].newton.decrement == 1e-3 and scenes["4 iterations"].newton.iterations == 4
+    named = {n for c in report.CHANGES for n in (c.of, c.to)}
+    named |= {*report.PRESETS, *report.CANDIDATES, *budget.TIMED, *report.WORDS}
+    assert named <= set(budget.VARIANTS)
+    assert len({budget.path_of(tmp_path, name) for name in budget.VARIANTS}) == len(scenes)
+    json.dumps(budget.merged(tmp_path))
+
+
+def test_the_page_has_the_tables_of_its_data(monkeypatch):
+    monkeypatch.setattr(report, "RESAMPLES", 2)  # intervals are left out of the comparison
+    made = report.Budget(json.loads((EXPERIMENTS.parent / "budget.json").read_text()))
+    page = (EXPERIMENTS.parents[1] / "accuracy.md").read_text()
+    for mark, text in made.tables().items():
+        shown = page.split(f"<!-- {mark}:begin -->")[1].split(f"<!-- {mark}:end -->")[0]
+        assert _without_intervals(shown.strip()) == _without_intervals(text), mark
+
+
+def _without_intervals(text):
+    return [part.split("]")[-1] for part in text.split("[")]
+
+
+# --- the paper's experiments: counts, statistics, pages -------------------------------------------
+
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_counts_are_the_papers():
+    assert {name: p.grasps for name, p in PAPER.items()} == simulate.PAPER_GRASPS
+    assert simulate.PAPER_GRASPS == {"2d": 1_008_000, "23d": 4_536_000, "landscape": 129_600}
+    assert TOTAL_GRASPS == 5_673_600
+    assert (PAPER["2d"].worlds, PAPER["23d"].worlds) == (14_400, 32_400)
+
+
+def test_means_by_either_rule():
+    scene, *_ = tiny()
+    cost = np.array([[0.0, 1.0, 3.0], [3.0, 3.0, 3.0]], np.float32)
+    status = np.array([[0, 0, 1], [1, 2, 64]], np.uint8)
+    means = simulate.both_means(scene, cost, status)
+    np.testing.assert_allclose(means["exclude"], [0.5, 3.0])
+    np.testing.assert_allclose(means["worst"], [4 / 3, 3.0], rtol=1e-6)
+    trials = Outcome(cost, status.astype(np.int32), cost, status)
+    np.testing.assert_allclose(means["exclude"], codesign.particle_cost(scene, trials))
+    bits = dict(zip(simulate.BITS, simulate.failures(status, (0, 1)), strict=True))
+    assert [bits[b] for b in (1, 2, 64)] == [2, 1, 1] and sum(bits.values()) == 4
+
+
+def test_quantiles_and_medians_with_runs_that_never_converged():
+    values = np.array([1.0, np.inf, 3.0, 2.0, np.inf, np.inf])
+    assert statistics.quantile(values, 0.25) == 2.0
+    assert statistics.quantile(values, 0.5) == np.inf
+    finite = np.random.default_rng(0).normal(size=(3, 31))
+    for q in (0.025, 0.25, 0.5, 0.75):
+        expected = np.quantile(finite, q, axis=-1, method="averaged_inverted_cdf")
+        np.testing.assert_allclose(statistics.quantile(finite, q), expected)
+    interval = statistics.median(finite[0])
+    assert interval.low < interval.value == np.median(finite[0]) < interval.high
+
+
+def test_paired_tests():
+    a, b = np.arange(30) < 20, np.arange(30) < 10
+    assert statistics.mcnemar(a, b) == pytest.approx(2 * 0.5**10)
+    assert statistics.mcnemar(a, a) == 1.0
+    slow, fast = np.full(30, np.inf), np.arange(30.0)
+    assert statistics.wilcoxon(slow, fast, 64) < 1e-3 < statistics.wilcoxon(fast, fast, 64)
+    assert statistics.trend(np.arange(4.0)[:, None] + np.zeros((4, 30))) < 1e-3
+    assert statistics.trend(np.zeros((4, 30))) == 1.0
+
+
+def test_both_readings_of_converged():
+    """Below 1 in the second episode, above in the third, and below from the fourth on."""
+    means = np.array([[[2.0, 0.5, 1.5, 0.9, 0.2], [2.0] * 5]])
+    one = results.Study({}, {}, {"mean_exclude": means})
+    np.testing.assert_array_equal(one.first_below(), [[2.0, np.inf]])
+    np.testing.assert_array_equal(one.convergence(), [[4.0, np.inf]])
+
+
+def test_the_results_page_has_the_tables_of_its_data():
+    data = ROOT / "docs" / "data" / "experiments"
+    studies = {name: results.load_study(data, name) for name in ("2d", "23d")}
+    text = results.tables(studies, results.load(data, "landscape"))
+    assert text in (ROOT / "docs" / "notes" / "results.md").read_text(encoding="utf-8")

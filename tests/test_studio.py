@@ -15,7 +15,7 @@ from codesign_jax.studio import server
 from codesign_jax.studio import tab as tabs
 from codesign_jax.studio.studio import Studio, about
 from codesign_jax.studio.tab import COUNTS, Desk, Tab
-from tests.helpers import tiny_run
+from tests.helpers import command_runs
 from tests.helpers.browsers import chromium, chromium_launcher  # noqa: F401
 from tests.helpers.command_runs import command, own_workplace  # noqa: F401
 from tests.helpers.toy_engine import TINY
@@ -113,7 +113,7 @@ def show(design, number=1, **changes):
 def desk(tmp_path_factory):
     """That of a small run."""
     folder = tmp_path_factory.mktemp("studio")
-    run = tiny_run.copied(folder / "run")
+    run = command_runs.copied(folder / "run")
     return Desk(cli.Studio(first=run, out=folder / "saved"))
 
 

@@ -1,17 +1,25 @@
 """Runs by the command line for tests: the command, its run, and comparisons of run folders."""
 
+import fcntl
 import os
+import shutil
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
 from codesign_jax import cli, runs
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.record import to_arrays
-from tests.helpers.tiny_run import copied
+from tests.helpers.toy_engine import TINY
 
+RUN = [
+    *("optimize", "--scene", str(TINY), "--seed", "3", "--engine", "mujoco"),
+    *("--optimizer", "particle-filter"),
+    *("--particles", "4", "--trials", "3", "--episodes", "3", "--test-trials", "4"),
+]
 EPISODES = 3  # of RUN
 RESULTS = ("episodes.csv", "particles.csv", "trials.csv", "tests.csv")
 
@@ -80,3 +88,26 @@ def without(arguments, flag):
     """The arguments without a flag and its values."""
     given = [k for k, argument in enumerate(arguments) if argument == flag]
     return [a for k, a in enumerate(arguments) if k not in given and k - 1 not in given]
+
+
+def copied(folder: Path) -> Path:
+    """Copies the run to a folder; it is made once for all processes of the session."""
+    kept = Path(os.environ["CODESIGN_TESTS_FOLDER"]) / "tiny-run"
+    with kept.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (kept / "done").exists():
+            shutil.rmtree(kept, ignore_errors=True)
+            assert cli.main([*RUN, "--out", str(kept / "run")]) == 0
+            (kept / "done").touch()
+    return Path(shutil.copytree(kept / "run", folder))
+
+
+@pytest.fixture(scope="module", name="run")
+def small_run(tmp_path_factory):
+    """A small run with its report."""
+    folder = tmp_path_factory.mktemp("report") / "<run> & 1"
+    copied(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(folder.parent / "cache"))
+        assert cli.main(["report", str(folder)]) == 0
+    return folder

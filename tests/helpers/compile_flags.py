@@ -12,10 +12,7 @@ _NO_EMITTERS = ("--xla_cpu_use_fusion_emitters=false",)
 _KNOWN = ("0.10.",)
 """Releases of jaxlib that know this flag: others end the process that has an unknown one."""
 
-OPTIMIZED = (
-    *_ONE_THREAD,
-    *(_NO_EMITTERS if metadata.version("jaxlib").startswith(_KNOWN) else ()),
-)
+OPTIMIZED = (*_ONE_THREAD, *(_NO_EMITTERS if metadata.version("jaxlib").startswith(_KNOWN) else ()))
 
 FLAGS = (
     *OPTIMIZED,

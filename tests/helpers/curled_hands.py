@@ -8,21 +8,24 @@ from codesign_jax import model
 from tests.helpers import grasps
 
 
-def curled(the_scene, seed, bend, height):
-    """Model, data and lanes of a hand with random joint angles about a bend, object between."""
-    hand, trial = grasps.hand_world(the_scene, length=0.1)
-    fields, _ = grasps.world_inputs(the_scene, hand, trial)
-    oracle = model.compile_model(the_scene, hand, trial)
-    oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
-    data, random = mujoco.MjData(oracle), np.random.default_rng(seed)
-    lay, qpos = model.layout(the_scene), np.array(fields.start)
-    qpos[2] = height
+def state(the_scene, seed, bend, height):
+    """Fields, qpos, qvel and ctrl of a hand with random joint angles about a bend; all moves."""
+    fields, _ = grasps.world_inputs(the_scene, *grasps.hand_world(the_scene, length=0.1))
+    random, lay, qpos = np.random.default_rng(seed), model.layout(the_scene), np.array(fields.start)
     angles = 0.1 * random.normal(size=lay.dofs.shape)
     angles[..., 0] += bend
+    qpos[2] = height
     qpos[6 : 6 + lay.dofs.size] = angles.ravel()
-    data.qpos[:], data.qvel[:] = qpos, 0.3 * random.normal(size=oracle.nv)
-    data.ctrl[:6] = qpos[:6]
-    data.ctrl[6:] = 60e3
+    qvel = 0.3 * random.normal(size=len(qpos) - 1)
+    return fields, qpos, qvel, np.append(qpos[:6], [60e3] * the_scene.num_fingers)
+
+
+def curled(the_scene, seed, bend, height):
+    """Model, data and lanes of a `state`, with the object between the fingers."""
+    oracle = model.compile_model(the_scene, *grasps.hand_world(the_scene, length=0.1))
+    oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
+    data = mujoco.MjData(oracle)
+    fields, data.qpos[:], data.qvel[:], data.ctrl[:] = state(the_scene, seed, bend, height)
     return oracle, data, jax.tree.map(lambda x: x[None], fields)
 
 

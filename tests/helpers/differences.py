@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import model
 from codesign_jax.engines.structured import StructuredEngine, coordinates
 from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, recorded
 from tests.helpers import grasps
+from tests.helpers.curled_hands import state
 
 EXACT = {"iterations": 100, "evaluations": 40, "tolerance": 1e-26}
 """Solved to rounding: differences divide the solver's error by twice the step."""
@@ -55,19 +55,10 @@ class Weights(NamedTuple):
 
 def curled(scene, steps, *, bend=0.9, height=0.07, seed=1):
     """A hand with bent fingers around the object, all of it moving."""
-    params, trial = grasps.hand_world(scene, length=0.1)
-    fields, ctrl = grasps.world_inputs(scene, params, trial)
-    random, lay, qpos = np.random.default_rng(seed), model.layout(scene), np.array(fields.start)
-    angles = 0.1 * random.normal(size=lay.dofs.shape)
-    angles[..., 0] += bend
-    qpos[2] = height
-    qpos[6 : 6 + lay.dofs.size] = angles.ravel()
+    fields, qpos, qvel, ctrl = state(scene, seed, bend, height)
     qpos[-7:-4] += [0.001, 0.002, -0.002]
-    ctrl = np.repeat(np.asarray(ctrl)[:1], steps, 0)
-    ctrl[:, :6], ctrl[:, 6:] = qpos[:6], 60e3
-    qvel = 0.3 * random.normal(size=len(qpos) - 1)
     qvel[-4] = -6.0  # the object is thrown at the table
-    return Start(fields._replace(start=jnp.asarray(qpos)), qvel, ctrl)
+    return Start(fields._replace(start=jnp.asarray(qpos)), qvel, np.repeat(ctrl[None], steps, 0))
 
 
 def weights_of(start, seed=0):

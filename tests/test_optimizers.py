@@ -203,6 +203,10 @@ def test_with_few_parameters_the_best_random_designs_are_simulated_again():
     assert rows == designs[:3] + designs[:1] * 9
     copied = np.asarray(infos[-1].ancestors)
     np.testing.assert_array_equal(populations[-1][copied], state.particles)
+    # A closed parameter has the best design's value in what is drawn; all closed, nothing is drawn.
+    drawn = np.asarray(made.ask(state, np.array([True, False, True])))
+    assert (drawn[:, 1] == state.particles[0, 1]).all() and len(np.unique(drawn[:, 0])) == 12
+    np.testing.assert_array_equal(made.ask(state, np.zeros(3, bool)), state.particles)
 
 
 def test_bounds_and_constraint_hold(optimizer):

@@ -1,6 +1,6 @@
 """A co-design of all 23 parameters, from random designs to one that grasps, with pictures.
 
-`make demo` runs it: two minutes on two cores.  It is `codesign optimize` and `codesign
+`make demo` runs it: two to three minutes on two cores.  It is `codesign optimize` and `codesign
 evaluate` with the arguments below; further arguments go to the former, such as --fresh or --seed 1.
 The scene has its skinned hull and contact between fingers.
 """

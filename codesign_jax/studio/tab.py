@@ -28,6 +28,7 @@ from codesign_jax.commands.flags import Studio as Options
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording, tells_forces
 from codesign_jax.model import morphology, overlap
+from codesign_jax.optimize import Screened
 from codesign_jax.report import animation, bodies, stress, verdicts, viewer
 from codesign_jax.runs import choice
 from codesign_jax.runs.choice import Case
@@ -335,8 +336,8 @@ class Tab:
             self._end_search()
             self._asked.append(shown.view._replace(resting=True, number=None))
             return
-        optimizer: Any = codesign.make_optimizer("screened-es", shown.bench.case.space)
-        optimizer = dataclasses.replace(optimizer, screening=0, retests=0, sigma=SIGMA)
+        space = codesign.make_filter(shown.bench.case.space).space
+        optimizer = Screened(space, screening=0, retests=0, sigma=SIGMA)
         state = optimizer.init(jax.random.key(0), shown.view.design, PARTICLES)
         self._search = optimizer, state, 0
         self.send("improving", True)

@@ -3,6 +3,8 @@
 import difflib
 from collections.abc import Callable, Mapping
 
+import numpy as np
+
 from codesign_jax.optimize import screened
 from codesign_jax.optimize.bounds import Space
 from codesign_jax.optimize.evolution import EVOSAX, LEAST, OPEN_SIGMA, Evolution
@@ -22,7 +24,7 @@ there, and a strategy's mean does not."""
 
 
 OWN: Mapping[str, Callable[[Space], Optimizer]] = {
-    DEFAULT: lambda space: (Retested if len(space.low) <= FEW else Screened)(space),
+    DEFAULT: lambda space: (Retested if np.size(space.low) <= FEW else Screened)(space),
     PAPER: ParticleFilter,
 }
 """The optimisers that this package implements itself, by name: what makes each over a space."""

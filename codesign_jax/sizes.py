@@ -21,7 +21,7 @@ meets every object."""
 
 
 def text(name: str) -> str:
-    """The defaults of a size, as in "13 in 2d, 25 otherwise; the paper's are 10 and 60"."""
+    """The defaults of a size, as in "12 in 2d, 25 otherwise; the paper's are 10 and 60"."""
     two, many, paper_two, paper_many = (
         getattr(sizes[preset], name) for sizes in (SCREENED, PAPER) for preset in ("2d", "")
     )

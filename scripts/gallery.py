@@ -139,10 +139,10 @@ def main(names: list[str]) -> None:
 
 HEAD = """# Hands that were found
 
-Each hand is the answer of one search, by the command beside it; `bin` and `shelf` show the best of
-12 seeds, `edge` of three ([how](scenes.md)). `codesign evaluate --design docs/gallery/bin.toml
---trials 100 --seed 1000` repeats the verdict of `bin`: the file names the scene, the hand and what
-else is not the default. On another machine a search may find another hand.
+Each hand is of one search, by the command beside it; `bin` and `shelf` are the best of 12 seeds,
+chosen by 42 more trials, `edge` is the best of three ([how](scenes.md)). `codesign evaluate
+--design docs/gallery/bin.toml --trials 100 --seed 1000` repeats the verdict of `bin`: the file
+names scene, hand and what else is not the default. Another machine may find another hand.
 
 | | |
 | --- | --- |"""

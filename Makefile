@@ -65,7 +65,7 @@ test-gpu: $(STAMP)
 
 # About 22 minutes on two idle cores.
 test-slow: $(STAMP)
-	$(BIN)/python -m pytest -q -m slow -n 2 --dist loadfile --durations=10
+	$(BIN)/python -m pytest -q -m "slow and not gpu" -n 2 --dist loadfile --durations=10
 
 # All hard cases; their margins go to docs/notes/stability.md. About four minutes on two cores.
 stability: $(STAMP)

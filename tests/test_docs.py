@@ -24,7 +24,7 @@ ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / n for n in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "scripts/README.md")]
 PAGES += sorted((ROOT / "docs").rglob("*.md"))
 CONTROL = ROOT / "docs" / "control.md"
-SMALL = ["--particles", "2", "--trials", "3", "--episodes", "1", "--test-trials", "0"]
+SMALL = ["--particles", "3", "--trials", "3", "--episodes", "1", "--test-trials", "0"]
 
 
 def examples(program):

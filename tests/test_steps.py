@@ -136,7 +136,7 @@ def test_steps_of_mjx_equal_mujocos(tmp_path, effects, fixtures):
         fields = jax.tree.map(lambda v: v[0], fields)
         engine, oracle = make_engine("mjx", scene), oracles.exact(scene, fields)
         step = jax.jit(engine.step, compiler_options={"xla_backend_optimization_level": 0})
-        data, ours = mujoco.MjData(oracle), engine.reset(fields)
+        data, ours, most = mujoco.MjData(oracle), engine.reset(fields), 0
         data.qpos[:] = fields.start
         for k in range(420):
             data.ctrl[:] = ctrl[0, k]
@@ -149,7 +149,8 @@ def test_steps_of_mjx_equal_mujocos(tmp_path, effects, fixtures):
                 # MJX keeps its warm start where it is good enough: 4e-9 at rest.
                 assert np.linalg.norm(found.qacc - data.qacc) / scale < 1e-7, k
             mujoco.mj_step(oracle, data)
-        assert data.ncon > 1 or not fixtures
+            most = max(most, data.ncon)
+        assert most > 1 or not fixtures
 
 
 @SLOWLY  # quick: momentum of a box in rings (test_forces), and fixtures that spheres touch

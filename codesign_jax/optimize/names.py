@@ -22,7 +22,6 @@ FEW = 3
 """Most parameters with which the default is `Retested`: random designs come close to the best
 there, and a strategy's mean does not."""
 
-
 OWN: Mapping[str, Callable[[Space], Optimizer]] = {
     DEFAULT: lambda space: (Retested if np.size(space.low) <= FEW else Screened)(space),
     PAPER: ParticleFilter,

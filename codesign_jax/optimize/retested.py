@@ -57,7 +57,7 @@ class Retested:
         particles = jnp.tile(seed, (num_particles, 1))
         memory = {
             "designs": particles,
-            "cost": jnp.full(num_particles, jnp.inf, seed.dtype),  # mean of so many episodes
+            "cost": jnp.full(num_particles, jnp.inf, seed.dtype),  # mean over its episodes
             "episodes": jnp.ones(num_particles, jnp.int32),
         }
         return State(particles, jnp.zeros((), jnp.int32), key, memory)

@@ -141,7 +141,7 @@ class Screened:
         # The averages that were simulated, newest first, and which of them the final test takes.
         way = jnp.concatenate([population[:1], state.memory["way"][:-1]])
         rows, third = jnp.arange(len(cost)), now["averaged"] // 3
-        ago = jnp.where(rows < 3, jnp.array([0, 2, 1])[rows % 3] * third, 0)
+        ago = jnp.where(rows < self.finalists, jnp.array([0, 2, 1])[rows % 3] * third, 0)
         finalists = way[jnp.minimum(ago, len(cost) - 1)]
         following = jax.tree.map(partial(jnp.where, screens), memory, now) | {
             "way": jnp.where(screens, state.memory["way"], way),

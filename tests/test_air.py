@@ -18,6 +18,7 @@ from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.laws import air
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.model import morphology
+from codesign_jax.model.layout import NEWMARK
 from codesign_jax.scene import schema
 from tests.helpers import grasps
 from tests.helpers.curled_hands import batched, curled
@@ -284,10 +285,10 @@ FAULTS = {
 }
 SETTINGS = {
     "air": {"effects__air_mass": True, "pneumatics__exponent": 1.4},
-    "sideways": {"effects__lateral_threshold": True, "discretization__spring_damping": "added"},
-    "sideways, least damping": {
+    "sideways": {"effects__lateral_threshold": True, "discretization__integrator": "euler"},
+    "sideways, by Newmark": {
         "effects__lateral_threshold": True,
-        "discretization__spring_damping": "least",
+        "discretization__integrator": "newmark",
     },
 }
 
@@ -318,11 +319,11 @@ def stiffen(the_scene, model_, data, fields):
         length = np.hypot(s, numbers[2])
         added = moment / length
         model_.jnt_stiffness[lateral] += added
-        if the_scene.discretization.spring_damping == "added":
-            damping = model_.dof_damping[lateral] + h * added
+        if the_scene.discretization.integrator == "euler":
+            model_.dof_damping[lateral] += h * added
+            model_.dof_armature[lateral] += h * h * added
         else:
-            damping = max(model_.dof_damping[lateral], h * model_.jnt_stiffness[lateral])
-        model_.dof_damping[lateral], model_.dof_armature[lateral] = damping, h * damping
+            model_.dof_armature[lateral] += NEWMARK * h * h * added
         if moment > 0:
             data.qfrc_applied[bend] += numbers[1] * (length - numbers[2])
 
@@ -347,7 +348,7 @@ def simulated(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["air", "sideways", pytest.param("sideways, least damping", marks=pytest.mark.slow)]
+    "name", ["air", "sideways", pytest.param("sideways, by Newmark", marks=pytest.mark.slow)]
 )
 def test_accelerations_equal_mujoco_with_the_chambers_of_the_state(name):
     assert simulated(name)[-1] < BOUND

@@ -128,7 +128,7 @@ EXPERIMENTS = Path(__file__).parents[1] / "docs" / "data" / "experiments"
 def test_presets_replace_the_scene_s_values_and_overrides_replace_theirs():
     assert scene.load("paper", accuracy="standard") == scene.load("paper")
     fine = scene.load("paper_spheres", accuracy="reference")
-    assert fine.discretization == scene.Discretization(0.001, 20, 1, spring_damping="least")
+    assert fine.discretization == scene.Discretization(0.001, 20, 1, integrator="newmark")
     fast = scene.load("paper_spheres", accuracy="fast", overrides={"discretization": {"links": 7}})
     assert (fast.discretization.links, fast.newton.iterations) == (7, 4)
     for name, iterations in {"fast": 4, "fine": 6}.items():
@@ -140,7 +140,7 @@ def test_the_command_line_takes_a_preset(capsys):
     found, _ = optimize.resolve(
         cli.Optimize(accuracy="fast", engine="mujoco", overrides=(("solver.iterations=7",),))
     )
-    assert found.discretization == scene.Discretization(0.01, 10, 1, spring_damping="least")
+    assert found.discretization == scene.Discretization(0.01, 10, 1, integrator="newmark")
     assert found.solver.iterations == 7
     assert cli.main(["evaluate", "--accuracy", "fastest"]) == 2
     assert "'fastest' unknown; did you mean 'fast'" in capsys.readouterr().err

@@ -8,9 +8,9 @@ y across (the bend axis) and z up from the inextensible bottom layer; positive b
 towards that layer.
 
 Springs are integrated linearly implicitly in every engine by the same substitution for diagonal
-stiffness K and damping D and time step h: dof_damping = D + h K and dof_armature = h (D + h K),
-integrator Euler with eulerdamp disabled.  MuJoCo then solves (M + h D + h^2 K) a = tau - K q - (D +
-h K) v.
+stiffness K and damping D: a dof_damping C and a dof_armature A in MuJoCo's integrator Euler with
+eulerdamp disabled, which then solves (M + A) a = tau - K q - C v.  `layout.implicit_spring` has the
+two integrators, implicit Euler and Newmark's.
 
 >>> from codesign_jax import model, scene
 >>> grasping = scene.load("paper")

@@ -13,7 +13,7 @@ from codesign_jax.model.layout import (
     contact_invweight,
     friction_ratio,
     geom_bounds,
-    implicit_damping,
+    implicit_spring,
     layout,
     mounts,
     object_pose,
@@ -129,9 +129,11 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
     bodies = np.concatenate([lay.stubs[:, None], lay.bodies], 1)
     mount_pos, mount_quat = mounts(scene.hand, params.spread)
     palm = scene.hand.palm
-    h = scene.discretization.timestep
     stiffness, damping = joint_springs(scene, params)
-    implicit = implicit_damping(scene, stiffness, damping)
+    rigid = not scene.effects.wrist
+    wrist = implicit_spring(scene, stiffness[:6], damping[:6], rigid=rigid)
+    others = implicit_spring(scene, stiffness[6:], damping[6:])
+    damping, armature = (jnp.concatenate(parts) for parts in zip(wrist, others, strict=True))
     geom_size, rbound, aabb = _geom_fields(scene, params, size, filled)
     friction, solref, solimp = _pairs(scene, dtype)
     return ModelFields(
@@ -157,8 +159,8 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
         geom_aabb=aabb,
         # The wrist's springs are its position actuators; only the fingers have passive ones.
         jnt_stiffness=filled("jnt_stiffness", (lay.dofs, _picked(stiffness, lay.dofs))),
-        dof_damping=implicit,
-        dof_armature=h * implicit,
+        dof_damping=damping,
+        dof_armature=armature,
         # MuJoCo takes the inertia of a free body from this constant; of other bodies it does not.
         dof_M0=filled("dof_M0", (slice(-6, -3), object_mass), (slice(-3, None), object_inertia)),
         actuator_gainprm=filled(

@@ -107,30 +107,45 @@ def wrist_springs(scene: Scene) -> tuple[list[Any], list[Any]]:
     """
     w, h = scene.hand.wrist, scene.discretization.timestep
     if not scene.effects.wrist:
-        # What implicit_damping does not add.
-        damping = 0.0 if scene.discretization.spring_damping == "added" else RIGID / h
-        return [RIGID / h**2] * 6, [damping] * 6
+        return [RIGID / h**2] * 6, [0.0] * 6
     stiffness = [w.linear_stiffness] * 3 + [w.angular_stiffness] * 3
     return stiffness, [w.linear_damping] * 3 + [w.angular_damping] * 3
 
 
-def implicit_damping(scene: Scene, stiffness: Any, damping: Any) -> Any:
-    """Damping C of a joint whose spring acts implicitly, (M + h C) a = tau - K q - C v.
+NEWMARK = 1.0
+"""Newmark's beta [ours]. From 1/4 on the step is stable for springs alone. Contact forces turn with
+the hand, which is a stiffness that no step takes implicitly: 4 beta - 1 times the springs' own is
+what they may add. Of 180 grasps of winners 34 are kept at 10 ms with 0.3, and 178 with 0.5, where
+joints still reach 330 rad/s; with 1 they are as fast as with "euler"."""
 
-    With the new velocity v + h a that is the spring's force at the step's start and all of the
-    damping at its end.  C = D + h K is the implicit Euler step of both.  A joint without inertia
-    moves by -h K / C q in a step: C = max(D, h K) never overshoots, and where D >= h K the joint
-    keeps its own damping.
+
+def implicit_spring(
+    scene: Scene, stiffness: Any, damping: Any, *, rigid: bool = False
+) -> tuple[Any, Any]:
+    """Damping C and armature A of a joint whose spring acts implicitly.
+
+    The step solves (M + A) a = tau - K q - C v for the acceleration a, then v + h a is the new
+    velocity, and q + h (v + h a) the new angle.
+
+    * "euler": C = D + h K and A = h C, which is the implicit Euler step of spring and damper: their
+      forces are those of the step's end.
+    * "newmark": C = D and A = h D / 2 + beta h^2 K, which is Newmark's method with gamma = 1/2
+      (Newmark 1959, J. Eng. Mech. Div. 85, 67) in its leapfrog form: forces are those of the time
+      of q, and v is the velocity half a step before it.
+
+    Both are stable at any stiffness, as 4 (M + A) - h^2 K - 2 h C is positive.
 
     Args:
+      scene: The scene, for its integrator and time step h.
       stiffness: Stiffness K [N/m, N m/rad].
-      damping: The joint's own damping D [N s/m, N m s/rad], shaped as the stiffness.
+      damping: The joint's damping D [N s/m, N m s/rad], shaped as the stiffness.
+      rigid: Whether the joint shall end each step at its rest: "euler", whatever the scene has.
     """
-    added = scene.discretization.timestep * stiffness
-    if scene.discretization.spring_damping == "added":
-        return damping + added
-    # Not jnp.maximum: NumPy's numbers, as a MuJoCo spec takes them, stay NumPy's.
-    return damping + (added - damping) * (added > damping)
+    h = scene.discretization.timestep
+    if rigid or scene.discretization.integrator == "euler":
+        implicit = damping + h * stiffness
+        return implicit, h * implicit
+    return damping, h * (0.5 * damping + NEWMARK * h * stiffness)
 
 
 IMPEDANCE = 0.9

@@ -17,7 +17,7 @@ from codesign_jax.model.layout import (
     contact_invweight,
     first_on_palm,
     friction_ratio,
-    implicit_damping,
+    implicit_spring,
     layout,
     mounts,
     object_pose,
@@ -161,7 +161,7 @@ def palm_inertia(scene: Scene) -> list[Any]:
 
 
 def _add_palm(scene: Scene, spec: mujoco.MjSpec, visual: bool) -> None:
-    p, h = scene.hand.palm, scene.discretization.timestep
+    p = scene.hand.palm
     body = spec.worldbody.add_body(name="palm")
     body.explicitinertial, body.mass, body.ipos = True, p.mass, [0, 0, p.thickness / 2]
     body.inertia = palm_inertia(scene)
@@ -170,8 +170,9 @@ def _add_palm(scene: Scene, spec: mujoco.MjSpec, visual: bool) -> None:
     for name, stiffness, damping in zip(WRIST, *wrist_springs(scene), strict=True):
         linear = len(name) == 1
         kind = mujoco.mjtJoint.mjJNT_SLIDE if linear else mujoco.mjtJoint.mjJNT_HINGE
-        implicit = implicit_damping(scene, stiffness, damping)
-        _hinge(body, f"wrist_{name}", axes[name], kind, damping=implicit, armature=h * implicit)
+        rigid = not scene.effects.wrist
+        damping, armature = implicit_spring(scene, stiffness, damping, rigid=rigid)
+        _hinge(body, f"wrist_{name}", axes[name], kind, damping=damping, armature=armature)
         actuator = spec.add_actuator(
             name=f"arm_{name}", target=f"wrist_{name}", trntype=mujoco.mjtTrn.mjTRN_JOINT
         )
@@ -202,7 +203,8 @@ def _add_finger(
     mount: tuple[np.ndarray, np.ndarray],
     visual: bool,
 ) -> None:
-    lay, hand, h = layout(scene), scene.hand, scene.discretization.timestep
+    lay = layout(scene)
+    hand = scene.hand
     count, many = lay.spheres.shape[2], (lay.links, lay.spheres.shape[2])
     links = morphology.segments(hand, params, lay.links)
     springs = [
@@ -237,15 +239,15 @@ def _add_finger(
         if i == 0:
             continue
         for name, stiffness, own in zip(lay.axes, *(v[i - 1] for v in springs), strict=True):
-            implicit = implicit_damping(scene, stiffness, own)
+            damping, armature = implicit_spring(scene, stiffness, own)
             joint = f"finger_{f}_{name}_{i}"
             _hinge(
                 body,
                 joint,
                 AXES[name],
                 stiffness=stiffness,
-                damping=implicit,
-                armature=h * implicit,
+                damping=damping,
+                armature=armature,
             )
         tendon.wrap_joint(f"finger_{f}_bend_{i}", gains[i - 1] / gains[0])
         for j, (x, radius) in enumerate(zip(spheres[i - 1], radii[i - 1], strict=True)):

@@ -217,8 +217,8 @@ class Discretization:
       spheres_per_link: Contact spheres of a link, only with `effects.surface = "spheres"`.
       hull_rings: Rings of a link, only with `effects.surface = "hull"`.
       hull_points: Vertices of a ring of the mesh that is drawn, a multiple of four.
-      spring_damping: How much of the time step h the implicit springs add to a joint's damping time
-        beta: "added" acts as beta + h, "least" as max(beta, h); see docs/physics.md.
+      integrator: How springs and dampers are integrated: "newmark" is of second order and damps as
+        the material does, "euler" adds the time step to the damping time; see docs/physics.md.
     """
 
     timestep: float = quantity("s", 1e-5, 0.05, structure=True)
@@ -226,7 +226,7 @@ class Discretization:
     spheres_per_link: int = quantity("", 1, 20, structure=True)
     hull_rings: int = quantity("", 1, 20, structure=True, default=2)
     hull_points: int = quantity("", 4, 80, structure=True, default=8)
-    spring_damping: str = choice("added", "least", default="added")
+    integrator: str = choice("euler", "newmark", default="euler")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.lanes import cross, dot, spatial, total
 from codesign_jax.engines.structured.world_model import apply_columns, turn_columns
+from codesign_jax.model.layout import implicit_spring
 from codesign_jax.model.morphology import softening, threshold_moments
 from codesign_jax.scene import Scene
 
@@ -130,7 +131,7 @@ def springs(
     """A joint's springs at its angles.
 
     The threshold is a spring that is implicit in the lateral hinge as its own one, see
-    `model.layout.implicit_damping`.
+    `model.layout.implicit_spring`.
 
     Args:
       constants: Stiffness, damping and armature of the hinges, shape (axis, ...).
@@ -140,15 +141,11 @@ def springs(
     stiffness, damping, armature = constants
     if threshold is None:
         return Springs(stiffness, damping, armature, None)
-    h = scene.discretization.timestep
     more, moment = threshold_moments(tuple(threshold), pressure, q[0], q[1])
     stiffness = _with_lateral(stiffness, stiffness[1] + more)
-    if scene.discretization.spring_damping == "added":
-        lateral = damping[1] + h * more, armature[1] + h * h * more
-    else:
-        least = h * stiffness[1]
-        lateral = jnp.maximum(damping[1], least), jnp.maximum(armature[1], h * least)
-    damping, armature = map(_with_lateral, (damping, armature), lateral)
+    added = implicit_spring(scene, more, jnp.zeros_like(more))
+    damping = _with_lateral(damping, damping[1] + added[0])
+    armature = _with_lateral(armature, armature[1] + added[1])
     return Springs(stiffness, damping, armature, moment[None])
 
 

@@ -115,8 +115,6 @@ def zero_gap(engine, step, precision):
     "creep of held objects in the palm",
     unit="m",
     steps=(1.0, 0.5),
-    failure="friction of a ring creeps by 0.2 mm/s per newton, and few rings carry an object: "
-    "0.07 to 0.1 mm/s",
 )
 def long_hold(name, engine, step, precision):
     """How far objects creep in the palm's frame in 34.5 s from the end of the lift on."""

@@ -39,9 +39,6 @@ def hanging(history):
     "pinch held for 60 s",
     "slip of the object",
     unit="m",
-    failure="a held contact of 4 kN/m creeps by 0.2 mm/s per newton, and the ten rings that hold "
-    "the box of 0.49 N have 4.4 kN/m together: 0.1 mm/s at any step, a quarter of it with four "
-    "times the friction_ratio",
 )
 def pinch_holds(name, engine, step, precision):
     """For a minute, from a second after the lift on."""

@@ -73,7 +73,7 @@ def test_a_contact_is_the_least_of_a_convex_problem(gap, speed):
     h = scene.discretization.timestep
     tau = max(scene.contact.dissipation_time, 1.5 * h)
     with jax.enable_x64(True):
-        cone = cones.make_cone(scene, MU, bodies=2)
+        cone = cones.make_cone(scene, MU, bodies=2, ratio=1.0)
         up = jnp.array([0.0, 0.0, 1.0])
         one = contact.Contacts(0.0 * up, up, jnp.float64(gap), cone)
         wanted = one.reference(speed * up)
@@ -191,7 +191,7 @@ def some_contacts(friction, rng, count):
         point=jnp.asarray(0.05 * rng.normal(size=(3, 1, count))),
         normal=jnp.asarray(normal / np.linalg.norm(normal, axis=0)),
         distance=jnp.asarray(np.full((1, count), -1e-3)),
-        cone=jax.jit(lambda: cones.make_cone(scene, 0.8, bodies=2))(),
+        cone=jax.jit(lambda: cones.make_cone(scene, 0.8, bodies=2, ratio=30.0))(),
     )
 
 

@@ -13,6 +13,7 @@ from codesign_jax.engines.structured.kernel import Limits, Program, shared_memor
 from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.lanewise import Lanes, lanes
 from codesign_jax.engines.structured.world_model import world_constants
+from codesign_jax.model import held
 from scripts.shared import work
 from tests.helpers import gpu_cases
 
@@ -116,4 +117,5 @@ def test_a_step_reads_nothing_that_it_has_not_written(monkeypatch):
     moved = np.asarray(found["distance"])
     assert np.isfinite(moved).all() and (np.diff(moved, axis=1) != 0).all()
     assert np.isfinite(found["residual"]).all() and np.isfinite(last.finger).all()
-    assert np.abs(np.asarray(last.grip)).max() > 0  # some start with their fingers in one another
+    rows = held.rows(scene)["finger_finger"]
+    assert np.abs(np.asarray(last.held[rows])).max() > 0  # some start with fingers in one another

@@ -40,6 +40,7 @@ SLOTS = 14
 # Stages of the kernel: functions that it evaluates lane by lane.
 FIELD, AIM, BETWEEN, BALLS = "rings_on_field", "aimed", "between", "balls"
 BEGUN, HELD, HOLD, KEEP = "begun", "_with_held", "sums.<locals>.add", "quotient"
+RINGS_HELD, RINGS_HOLD, TURN = "with_held", "_settle.<locals>.after", "in_world"
 RAY, SLOPES = "BoundContacts.line.<locals>.ray", "BoundContacts._slopes.<locals>.both"
 LOAD = "BoundFingerContacts.load.<locals>.wrench"
 LINK, ADD = "Elimination.backward.<locals>.load", "_add"
@@ -207,6 +208,9 @@ HULL = {
     "fingers hold nothing": Fault({HELD: lambda f, jar, *rest: jar}, later=True),
     "fingers hold the other way": Fault({KEEP: lambda f, sums: -f(sums)}, NEXT),
     "fingers hold by one contact": Fault({HOLD: lambda f, sums, *rest: f(0 * sums, *rest)}, NEXT),
+    "rings hold nothing": Fault({RINGS_HELD: lambda f, jar, *rest: jar}, later=True),
+    "rings hold the other way": Fault({RINGS_HOLD: lambda f, *a: -f(*a)}, NEXT),
+    "what rings hold does not turn": Fault({TURN: lambda f, columns, own: own}, later=True),
     # slots
     "a pairing has one slot": Fault({}, methods={(BoundSlots, "add"): first_only}),
     "a slot of the step before": Fault(
@@ -289,7 +293,7 @@ def simulated(surface):
             found = run(fields, (qpos, qvel), ctrl, np.arange(len(each)))
     solve = partial(solved, scene, *states["main"][:2])
     found, start = jax.tree.map(np.asarray, found), len(faults)
-    held = np.zeros(3), np.zeros((scene.num_fingers, 3))
+    held = np.zeros(3), np.zeros((scene.num_fingers, 3)), {}
     start = solve(found["qpos"][start, 0], found["qvel"][start, 0], held)
     assert surface == "hull" or min(kinds(*states["main"][:2])) > 0
     assert surface == "hull" or on_palm(*states["main"][:2]) > 0
@@ -313,7 +317,11 @@ def solved(scene, model, data, qpos, qvel, held):
     assert not first or min(dense.pairs, dense.on_palm, dense.itself, 4 * dense.ahead) > 3
     found = dense.solve()
     own = np.array([dense.next_grip(f) for f in range(scene.num_fingers)])
-    return found, (dense.next_grip(), own), dense.normal_forces(scene.num_fingers + 1)
+    holds = dense.next_holds()
+    # Some contact of each kind holds something that the second step begins with.
+    kinds = {name if isinstance(name, str) else name[2] for name, g in holds.items() if g.any()}
+    assert not first or kinds >= {True, "lowest"}
+    return found, (dense.next_grip(), own, holds), dense.normal_forces(scene.num_fingers + 1)
 
 
 def pressing(scene, model, data):

@@ -107,6 +107,11 @@ FAULTS = {
     "a segment's neighbours stand still": Fault(results={"between_rings": without(1, "frames")}),
     "fingers held nothing in the step before": Fault(results={"between_rings": without(3)}),
     "the palm's disc stands still": Fault(results={"on_palm": without(1)}),
+    "rings held nothing in the step before": Fault(results={"of_rings": without(3)}),
+    "points held nothing in the step before": Fault(results={"of_table": without(1)}),
+    "what rings hold asks nothing of accelerations": Fault(
+        results={"asks.<locals>.of_jar": without(0)}
+    ),
     "what fingers hold asks nothing of accelerations": Fault(
         results={"push.<locals>.of_held": without(0)}
     ),

@@ -22,7 +22,7 @@ import numpy as np
 
 from codesign_jax.export import mjcf
 from codesign_jax.model import contact_invweight
-from codesign_jax.model.layout import pairings_held
+from codesign_jax.model.held import keeps
 from codesign_jax.model.pairs import SOLIMP
 from codesign_jax.scene import Scene
 from codesign_jax.types import Trial
@@ -35,7 +35,7 @@ _LEFT_OUT = {
     "neo_hookean": "joints have the linear law of bending, which is stiffer at large strain",
     "lateral_threshold": "pressure does not resist sideways bending",
     "air_mass": "pressures are what the valves ask for, whatever the chambers' volumes do",
-    "friction_memory": "fingers that hold one another creep",
+    "friction_memory": "what is held creeps",
 }
 """What a model is like without an effect that plain MuJoCo does not have."""
 
@@ -49,7 +49,7 @@ class Inexpressible(ValueError):
 def differences(scene: Scene) -> list[str]:
     """What of a scene the model lacks or has in another form, a sentence each."""
     acts = {name: getattr(scene.effects, name) for name in _LEFT_OUT}
-    acts |= {"friction_memory": pairings_held(scene) > 0}
+    acts |= {"friction_memory": keeps(scene)}
     found = [
         f"the model is without effects.{name}: {how}"
         for name, how in _LEFT_OUT.items()

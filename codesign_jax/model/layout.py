@@ -227,19 +227,6 @@ def palm_touches(scene: Scene) -> bool:
     return scene.effects.palm_object or scene.effects.palm_table
 
 
-def pairings_held(scene: Scene) -> int:
-    """Pairings of fingers whose friction is kept from step to step; see `FingerPairing`.
-
-    Number 0 is each finger with itself. Spheres keep none: their contact is MuJoCo's, which has no
-    state.
-    """
-    e, fingers = scene.effects, len(layout(scene).dofs)
-    kept = e.friction_memory and e.surface == "hull" and (e.finger_finger or e.finger_itself)
-    if not kept or e.friction == "none":
-        return 0
-    return 1 << (fingers - 1).bit_length()
-
-
 def touches_itself(scene: Scene) -> bool:
     """Whether fingers touch themselves; spheres do not."""
     return scene.effects.finger_itself and scene.effects.surface == "hull"

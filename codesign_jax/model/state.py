@@ -4,7 +4,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from codesign_jax.model.layout import layout, pairings_held
+from codesign_jax.model import held
+from codesign_jax.model.layout import layout
 from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import InputError
 
@@ -23,8 +24,8 @@ class State(NamedTuple):
         counts, shape (..., 1).
       going: One for a world that goes on, zero for a decided one, see `Trace`, shape (..., 1).
       speed: Largest absolute velocity, for a failed world that of the failed step, shape (..., 1).
-      held: Friction that fingers hold on one another with `effects.friction_memory`, shape
-        (..., 3 * pairing * finger); empty without.
+      held: Friction that contacts hold with `effects.friction_memory`, shape (..., row * lane), the
+        rows as in `model.held`; empty without.
     """
 
     qpos: Any
@@ -52,11 +53,11 @@ def split(scene: Scene, start: Any) -> State:
     >>> hand = space.params(space.default())
     >>> fields = model.model_fields(grasping, hand, rollout.nominal_trial(grasping))
     >>> state = model.split(grasping, fields.start)
-    >>> float(state.going[0]), state.held.shape  # 3 numbers for 4 pairings of 4 fingers
-    (1.0, (48,))
+    >>> float(state.going[0]), state.held.shape  # 3 numbers of 47 contacts on 4 lanes
+    (1.0, (564,))
     """
-    fingers, nv = len(layout(scene).dofs), 12 + layout(scene).dofs.size
-    sizes = State(nv + 1, nv, nv, 1, 1, 1, 3 * pairings_held(scene) * fingers)
+    nv, rows = 12 + layout(scene).dofs.size, 3 * sum(held.held(scene).values())
+    sizes = State(nv + 1, nv, nv, 1, 1, 1, rows * held.lanes(scene))
     ends, n = np.cumsum(sizes), start.shape[-1]
     if n not in {*ends[[0, 1, 6]]}:
         problem = f"start has {n} numbers; a state of the scene has {ends[-1]}, its beginning"

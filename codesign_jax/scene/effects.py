@@ -57,7 +57,7 @@ EFFECTS: Mapping[str, Effect] = {
         {"mjx": {"none": "MJX has no frictionless contacts with elliptic cones"}},
     ),
     "friction_memory": Effect(
-        "with the hull fingers hold one another without creep: friction is kept from step to step",
+        "with the hull nothing that is held creeps: friction is kept from step to step",
         hull=True,
     ),
     "disturb": Effect("the arm is shaken after the lift"),

@@ -159,8 +159,10 @@ class Contact:
         morphology and time step, and of a contact sphere; a contact with the table is twice as
         stiff.
       dissipation_time: Time constant of the skin's dissipation: its damping over its stiffness.
-      friction_ratio: A contact creeps by its friction force / (normal_stiffness * ratio * 40 ms): a
-        larger ratio creeps less. MuJoCo's `impratio` follows from it.
+      friction_ratio: A contact without memory creeps by its friction force / (normal_stiffness *
+        ratio * 40 ms): a larger ratio creeps less. MuJoCo's `impratio` follows from it.
+      held_friction_ratio: `friction_ratio` of contacts with object, table and fixtures that hold
+        friction by `effects.friction_memory`: they do not creep.
       finger_table_friction: Coulomb coefficient of fingers and palm on the table.
       torsional_friction: Length by which a contact's normal force resists spin, only with
         `effects.friction = "full"`.
@@ -179,6 +181,7 @@ class Contact:
     friction_ratio: float = quantity("", 0.01, 1000)
     finger_table_friction: float = quantity("", 0, 5)
     dissipation_time: float = quantity("s", 0, 1, default=0.006)
+    held_friction_ratio: float = quantity("", 0.01, 1000, default=5.0)
     torsional_friction: float = quantity("m", 1e-5, 0.1, default=0.003)
     rolling_friction: float = quantity("m", 1e-5, 0.1, default=0.0005)
     finger_finger_friction: float = quantity("", 0, 5, default=0.8)

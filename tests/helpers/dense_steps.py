@@ -8,6 +8,7 @@ import scipy.optimize
 
 from codesign_jax import model
 from codesign_jax.model import layout
+from codesign_jax.model.held import keeps
 
 FLOOR = 1e-6
 """Under the roots of the law, which have no slope at zero; see `laws.rings`."""
@@ -23,7 +24,12 @@ def distance(scene, data, points):
 class Dense:
     """A step's problem with all Jacobians written out, from MuJoCo's mass matrix and mj_jac."""
 
-    def __init__(self, scene, oracle, data, hand):
+    def __init__(self, scene, oracle, data, hand, holds=None):
+        """Holds: friction coefficients that contacts with object and table use, by their names.
+
+        They are along the object's axes where it is touched, and along the world's on the table.
+        """
+        self.holds, self.turn = holds or {}, data.body("object").xmat.reshape(3, 3)
         self.mass = np.zeros((oracle.nv, oracle.nv))
         mujoco.mj_fullM(oracle, data, self.mass)
         self.smooth = data.qfrc_smooth.copy()
@@ -32,9 +38,9 @@ class Dense:
         self.rows = []  # (Jacobian (3, nv), reference (3,), R of normal and tangent, friction)
         self.num_hull, self.held = 0, []
         self._on_table()
-        for finger in self.fingers:
-            for ring in finger.rings:
-                self._on_fields(ring)
+        for f, finger in enumerate(self.fingers):
+            for number, ring in enumerate(finger.rings):
+                self._on_fields(ring, (f, number))
 
     def _on_table(self):
         """The sphere's lowest point on the table."""
@@ -42,9 +48,18 @@ class Dense:
         gap = body.xpos[2] - self.scene.objects.object[0].half_sizes[0]
         ends = model.layout(self.scene).object, 0
         point = body.xpos * [1, 1, 0] + gap / 2 * up
-        self._add(point, up, gap, 1.0, ends, self.scene.objects.table.friction, 1)
+        friction = self.scene.objects.table.friction
+        self._add(point, up, gap, 1.0, ends, friction, 1, **self._held("lowest", False))
 
-    def _on_fields(self, ring):
+    def _held(self, name, on_object):
+        """What a contact of object or table holds, and how hard its friction is."""
+        if not keeps(self.scene):
+            return {}
+        grip = self.holds.get(name, np.zeros(3))
+        grip = self.turn @ grip if on_object else grip
+        return {"ratio": self.scene.contact.held_friction_ratio, "grip": grip, "name": name}
+
+    def _on_fields(self, ring, number):
         scene, lay = self.scene, model.layout(self.scene)
 
         def from_object(point):
@@ -59,8 +74,9 @@ class Dense:
             on,
             (from_table, scene.contact.finger_table_friction, 0, 1),
         ):
-            place = on_field(ring, field)
-            self._add(*place, (ring.body, other), friction, bodies)
+            place, on_object = on_field(ring, field), field is from_object
+            held = self._held((*number, on_object), on_object)
+            self._add(*place, (ring.body, other), friction, bodies, **held)
 
     def jac(self, point, body):
         """Jacobian of a body's point, (3, nv)."""
@@ -165,13 +181,13 @@ def project(z, slope):
 class DensePairs(Dense):
     """A step's problem with the contacts of fingers with each other, themselves and the palm."""
 
-    def __init__(self, scene, oracle, data, hand, grip=None, own=None):
+    def __init__(self, scene, oracle, data, hand, grip=None, own=None, holds=None):
         """As `Dense`.
 
         grip: Friction coefficient that the first of two fingers uses on the second one, (3,).
         own: That each finger's outer part uses on its inner one, (finger, 3).
         """
-        super().__init__(scene, oracle, data, hand)
+        super().__init__(scene, oracle, data, hand, holds)
         self.grip, self.own = grip, own
         self.pairs = self.on_palm = self.itself = self.ahead = 0
         self.sides = {}
@@ -228,6 +244,13 @@ class DensePairs(Dense):
         rest = c.finger_finger_friction, 2, c.finger_finger_friction_ratio, self.grip, 1.0, "two"
         self._add(point, normal, gap, share, (ring.body, body), *rest)
         self._count("pairs", before, f, g)
+
+    def next_holds(self):
+        """What contacts with object and table use in the solution, by name."""
+        names = {name for *_, name in self.held if isinstance(name, tuple) or name == "lowest"}
+        found = {name: self.next_grip(name) for name in names}
+        on_object = {name: isinstance(name, tuple) and name[2] for name in names}
+        return {n: self.turn.T @ g if on_object[n] else g for n, g in found.items()}
 
     def next_grip(self, name="two"):
         """What the first finger uses in the solution: tangential over normal forces, or elastic."""

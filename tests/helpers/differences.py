@@ -31,6 +31,7 @@ FIXED = (
 )
 FIXED += ("support", "grid_first", "grid_nodes", "grid_reach")
 """Rows of the tables that no derivative is asked for: indices, bounds, and what only saves time."""
+FINGERS = "finger_finger"
 TABLES = ("hand", "world", "finger_state", "world_state", "arm", "pressure")
 
 
@@ -80,9 +81,12 @@ class Case:
         self.start, (hand, state) = start, self._lanes(scene, engine, start)
         ctrl = jnp.asarray(start.ctrl)[None]
         self.tables = [np.array(x) for x in jax.jit(self.program.inputs)(hand, state, ctrl)]
-        if self.program.held:  # fingers hold on one another from the start
-            grip = 0.3 * np.random.default_rng(1).normal(size=self.world(self.tables[2]).shape)
-            self._move(self.tables[2], 0, self._opposite(grip))
+        random = np.random.default_rng(1)
+        for name in self.program.held:  # contacts hold friction from the start
+            hold = np.zeros(self.world(self.tables[2]).shape)
+            rows = self.rows(2, f"held.{name}")
+            hold[rows] = 0.3 * random.normal(size=hold[rows].shape)
+            self._move(self.tables[2], 0, self._opposite(hold) if name == FINGERS else hold)
         layouts = [getattr(self.program, name) for name in TABLES[:4]]
         self.groups = [
             (k, name)
@@ -131,9 +135,10 @@ class Case:
         return slice(first, first + count)
 
     def _opposite(self, values):
-        """The rows of "grip" of values (row, finger), equal and opposite for two fingers."""
+        """Rows of what fingers hold on one another, of values (row, finger): equal and opposite."""
         found, fingers = np.zeros_like(values), np.arange(values.shape[1])
-        for item, row in enumerate(np.arange(values.shape[0])[self.rows(2, "grip")][::3]):
+        rows = self.rows(2, f"held.{FINGERS}")
+        for item, row in enumerate(np.arange(values.shape[0])[rows][::3]):
             other = fingers ^ item
             mine = values[row : row + 3] * ((fingers < other) | (item == 0))
             found[row : row + 3] = mine - mine[:, other] * (item > 0)
@@ -147,7 +152,7 @@ class Case:
             along, noise = np.zeros_like(here), random.normal(size=here.shape)
             size = {2: 0.1, 3: 0.1, 4: 0.01, 5: np.abs(here).max()}.get(k)
             along[rows] = noise[rows] * (np.abs(here[rows]) if size is None else size)
-            if name == "grip":
+            if name == f"held.{FINGERS}":
                 along = self._opposite(along)
             if name == "quat":  # it stays one
                 along[rows] -= here[rows] * (here[rows] * along[rows]).sum()

@@ -1,8 +1,13 @@
-"""Hard cases 12 and 13: an object between two fingers that press on it."""
+"""Hard cases 12, 13, 38: an object between two fingers, or two pads, that press on it."""
+
+import dataclasses
+import functools
 
 import numpy as np
 
 from codesign_jax import model
+from codesign_jax.scene.objects import Shape
+from codesign_jax.scene.tables import Fixture
 from tests.helpers import grasps
 from tests.helpers.tables import GRAVITY
 from tests.stability.bench import CHUNK, CREEP, FIRM, bench, loaded, pinch
@@ -118,3 +123,68 @@ def heavy_rest(name, engine, step, precision):
     history = b.run(*pressed(b))
     # Creep of 1 mm/s at 20 mm; a solver that loses digits to the mass ratio rattles.
     return Found(history.speed[0, -round(0.3 / b.h) :].max(), 0.05)
+
+
+# --- 38: two pads ----------------------------------------------------------------------------
+
+
+RADIUS, WEIGHT = 0.024, 0.045
+"""Radius [m] and mass [kg] of a capsule, which stands between two pads; google-deepmind/mujoco
+issue 3328 has one of that mass, which slips down by 155 um/s at pads of 12 to 60 N."""
+HANDS = "finger_object finger_table finger_finger finger_palm finger_itself palm_object palm_table"
+PADS = 2.0, 3.9
+"""Half the height of the pads, and where on them the capsule begins [m]."""
+
+
+@functools.cache
+def padded(press, share):
+    """A scene of two pads that press on a capsule [N], with a share of the critical friction."""
+    base = pinch("paper", **grasps.off(HANDS))
+    # Two points of the capsule touch each pad, with twice the stiffness of two bodies.
+    depth = press / (2 * 2 * base.contact.normal_stiffness)
+    place = RADIUS - depth + 0.1
+    wall = {"type": "box", "size": (0.1, 1.0, PADS[0])}
+    pads = [Fixture(f"pad {s}", position=(s * place, 0.0, PADS[0]), **wall) for s in (-1, 1)]
+    shape = Shape(name="capsule", type="capsule", size=(RADIUS, 0.020), mass=WEIGHT, friction=0.8)
+    friction = share * WEIGHT * GRAVITY / (2 * press)
+    table = dataclasses.replace(base.objects.table, friction=friction)
+    objects = dataclasses.replace(base.objects, object=(shape,), table=table)
+    return dataclasses.replace(base, fixture=tuple(pads), objects=objects)
+
+
+def slipped(engine, step, precision, press, share, seconds):
+    """How far the capsule goes in a time, and in its last half [m]."""
+    b = bench(padded(press, share), engine, step, precision)
+    fields, ctrl = lifted(b, 0.0)
+    qpos = np.array(fields.start)
+    qpos[:, -7:] = 0.0, 0.0, PADS[1], 1.0, 0.0, 0.0, 0.0
+    height = b.run(fields, b.hold(seconds, ctrl[0, 0]), qpos).object[0, :, 2]
+    return PADS[1] - height[-1], height[len(height) // 2] - height[-1]
+
+
+PADDED = 38, "capsule of 45 g between two pads"
+
+
+@case(*PADDED, "way in 5 s, at 12 and 60 N", unit="m", quick="structured")
+def pads_hold(engine, step, precision):
+    """With the paper's friction: it slips by the tangential springs' way alone."""
+    found = []
+    for press in 12.0, 60.0:
+        share = 0.8 * 2 * press / (WEIGHT * GRAVITY)
+        found.append(slipped(engine, step, precision, press, share, 5.0)[0])
+    return Found(max(np.abs(found)), 1e-5)
+
+
+@case(*PADDED, "way in 5 s, at 1.02 and 1.10 of the critical friction", unit="m")
+def pads_hold_at_the_limit(engine, step, precision):
+    """Nothing moves any more in the last half."""
+    found = [slipped(engine, step, precision, 12.0, share, 5.0) for share in (1.02, 1.10)]
+    late = max(abs(last) for _, last in found)
+    return Found(max(abs(way) for way, _ in found), 1e-4, f"{late:.2g} m in the last half")
+
+
+@case(*PADDED, "way in 0.5 s, at 0.90 and 0.98 of it", unit="m", lower=True)
+def pads_let_go(engine, step, precision):
+    """It slips: the cone of what is pressed by bodies that do not give way is oily."""
+    found = [slipped(engine, step, precision, 12.0, share, 0.5)[0] for share in (0.90, 0.98)]
+    return Found(min(found), 5e-3)

@@ -31,7 +31,7 @@ class Case:
     """One invariant of a hard case, over time steps and precisions.
 
     Attributes:
-      number: Number of the case in the protocol, 1 to 37.
+      number: Number of the case in the protocol, 1 to 38.
       name: Names of function and engine.
       title: The case.
       invariant: What must hold.

@@ -13,7 +13,6 @@ import numpy as np
 
 from codesign_jax.engines.structured.kernel import finger_collision, memory_tables
 from codesign_jax.engines.structured.kernel.contact_sets import margin
-from codesign_jax.engines.structured.kernel.memory_tables import rings_of_link
 from codesign_jax.engines.structured.lanes import dot, once
 from codesign_jax.engines.structured.laws import holding, rings, shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
@@ -21,6 +20,8 @@ from codesign_jax.engines.structured.laws.contact import Cone, Contacts, candida
 from codesign_jax.engines.structured.laws.kinematics import Kinematics, Spatial, mounted, relative
 from codesign_jax.engines.structured.laws.rings import Place, Ring
 from codesign_jax.engines.structured.world_model import WorldModel, apply_columns
+from codesign_jax.model import held
+from codesign_jax.model.held import rings_of_link
 from codesign_jax.model.layout import first_on_palm, palm_touches, touches_itself
 from codesign_jax.scene import Scene
 
@@ -88,6 +89,39 @@ def contacts(
     return found
 
 
+def grips(scene: Scene, hold: jax.Array, kin: Kinematics) -> dict[str, jax.Array]:
+    """What the contacts of `contacts` hold, see `holding.held`, by pair of bodies.
+
+    Args:
+      hold: As in `State`.
+
+    Returns:
+      Friction along the world's axes, shape (3, ...), items as those of the contacts.
+    """
+    found, rows = {}, held.rows(scene)
+    lanes, links = held.lanes(scene), scene.discretization.links
+    for name in (n for n in rows if n != "finger_finger"):
+        own = hold[rows[name]].reshape(-1, 3, lanes, hold.shape[-1])  # (item, 3, lane, world)
+        if name.startswith("finger"):
+            own = own.reshape(links, -1, *own.shape[1:])[:, :, :, : scene.num_fingers]
+            own = jnp.moveaxis(own, 2, 0)
+        else:
+            own = _dealt_back(scene, name, own)
+        found[name] = apply_columns(kin.object, own) if name.endswith("_object") else own
+    return found
+
+
+def _dealt_back(scene: Scene, name: str, own: jax.Array) -> jax.Array:
+    """Numbers (item, 3, lane, world) of what is dealt to lanes, one behind the other."""
+    fields = held.surfaces(scene) if name == "palm_table" else 1
+    count = sum(held.object_points(scene)) if name == "object_table" else held.PALM_RINGS
+    # (field, group and lane, 3, world): a group's fields are beside one another.
+    own = own.reshape(-1, fields, *own.shape[1:])
+    own = jnp.moveaxis(own, (1, 0, 3), (0, 1, 2)).reshape(fields, -1, 3, own.shape[-1])
+    own = own[:, :count].reshape(-1, 3, own.shape[-1])
+    return jnp.moveaxis(own, 1, 0)
+
+
 def _candidates(scene: Scene, place: Place, cone: Cone, moving: jax.Array | None) -> Contacts:
     """Contacts at places, for relative velocities of their bodies or bodies at rest."""
     c, approach = Contacts(*place[:3], cone.of_share(place.share)), 0.0 * place.gap
@@ -125,13 +159,13 @@ def _of_object(
     if scene.effects.table:
         place = shapes.object_on_table(scene, hand, kin.object, position[2])
         places.append(Place(*place, one(place[2])))
-    flat = [i for i, s in enumerate(scene.objects.object) if s.type not in surroundings.ROUND]
+    flat = [i for i, s in enumerate(scene.objects.object) if s.type not in held.ROUND]
     for fixture in scene.fixture:
         _, rows = surroundings.towards(fixture, position)
         arms = shapes.lowest_points(scene, hand, surroundings.faced(rows, kin.object))
         place = surroundings.object_on(fixture, position, rows[:, :, 0], arms)
         places.append(Place(*place, one(place[2])))
-        if flat and surroundings.EDGES[fixture.type]:
+        if flat and held.EDGES[fixture.type]:
             point = surroundings.edges(fixture, position)
             on, normal, gap = (v[..., 0, :] for v in surroundings.edge_on(point, *of_object(point)))
             mine = jnp.isin(hand.object_id, jnp.array(flat))
@@ -165,12 +199,12 @@ class HandContacts(NamedTuple):
 
 
 def hand_contacts(
-    scene: Scene, hand: WorldModel, kin: Kinematics, velocity: Spatial, grip: jax.Array | None
+    scene: Scene, hand: WorldModel, kin: Kinematics, velocity: Spatial, hold: jax.Array
 ) -> dict[str, HandContacts]:
     """Contacts of fingers with one another, with themselves and with the palm, by these names.
 
     Args:
-      grip: As in `State`.
+      hold: What contacts hold, as in `State`.
     """
     e, found, links = scene.effects, {}, scene.discretization.links
     k, n = rings_of_link(scene), scene.num_fingers
@@ -188,15 +222,18 @@ def hand_contacts(
     centre = once(finger_collision.ring_centre, joints[:, link], frame, numbers)
     lines = _centre_lines(scene, frames, joints, numbers, centre) if hull else None
     alone, two = np.stack([np.arange(n)] * 2), np.stack(np.triu_indices(n, 1))
+    grip, rows = None, held.rows(scene).get("finger_finger")
+    if rows is not None:
+        grip = hold[rows].reshape(-1, 3, *hold.shape[1:])
 
     def add(name: str, place: Place, link: np.ndarray, others: jax.Array, fingers: np.ndarray):
         shape = place.gap.shape
         cone = getattr(hand.cones, "finger_palm" if name == "finger_palm" else "finger_finger")
-        held = None
+        own = None
         if grip is not None and name != "finger_palm":
-            held = jnp.moveaxis(grip[fingers[0] ^ fingers[1], :, fingers[0]], 1, 0)[:, None]
+            own = jnp.moveaxis(grip[fingers[0] ^ fingers[1], :, fingers[0]], 1, 0)[:, None]
         others = jnp.broadcast_to(others, shape)
-        met = HandContacts(None, jnp.asarray(link), others, jnp.asarray(fingers), held)  # type: ignore[arg-type]
+        met = HandContacts(None, jnp.asarray(link), others, jnp.asarray(fingers), own)  # type: ignore[arg-type]
         run = partial(_candidates, scene)
         found[name] = met._replace(contacts=once(run, place, cone, met.relative(velocity)))
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from codesign_jax import model
 from codesign_jax.engines.structured.laws.kinematics import Acc, State
-from codesign_jax.model import ModelFields, layout
+from codesign_jax.model import ModelFields, held, layout
 from codesign_jax.model.layout import hinge_sign
 from codesign_jax.scene import Scene
 
@@ -16,7 +16,7 @@ def reset(scene: Scene, fields: ModelFields) -> State:
 
 
 def make(
-    scene: Scene, qpos: jax.Array, qvel: jax.Array, acc: jax.Array, held: jax.Array | None = None
+    scene: Scene, qpos: jax.Array, qvel: jax.Array, acc: jax.Array, hold: jax.Array | None = None
 ) -> State:
     """The state at MuJoCo's coordinates, at the beginning of a grasp.
 
@@ -25,10 +25,10 @@ def make(
       qvel: Generalized velocities, shape (world, nv).
       acc: Accelerations, the solver's warm start, in the order of qvel, the object's as in
         `kinematics.Acc`, shape (world, nv).
-      held: What fingers hold on one another, as in `model.State`; None for nothing.
+      hold: What contacts hold of friction, `held` in `model.State`; None for nothing.
     """
     start = model.split(scene, jnp.concatenate([qpos, qvel], 1))
-    start = start if held is None else start._replace(held=held)
+    start = start if hold is None else start._replace(held=hold)
     return _in_lanes(scene, start._replace(acc=acc))
 
 
@@ -53,7 +53,7 @@ def _in_lanes(scene: Scene, start: model.State) -> State:
         step=step,
         going=going,
         speed=speed,
-        grip=start.held.T.reshape(-1, 3, len(lay.dofs), q.shape[-1]) if start.held.size else None,
+        held=jnp.asarray(start.held).T.reshape(-1, held.lanes(scene), q.shape[-1]),
     )
 
 
@@ -88,5 +88,5 @@ def whole(state: State) -> jax.Array:
     # A step of a decided world leaves accelerations that nothing reads and that may be no numbers.
     acc = jnp.where(state.going[0, 0, :, None] > 0, flat_acc(state.acc), 0.0)
     numbers = (x[0].T for x in (state.step, state.going, state.speed))
-    held = [] if state.grip is None else [state.grip.reshape(-1, state.grip.shape[-1]).T]
-    return jnp.concatenate([flat(state), acc, *numbers, *held], 1)
+    hold = state.held.reshape(-1, state.held.shape[-1]).T
+    return jnp.concatenate([flat(state), acc, *numbers, hold], 1)

@@ -97,7 +97,7 @@ class StructuredEngine(Equal):
     ) -> State:
         """The state at MuJoCo's qpos (world, nq) and qvel (world, nv); see `coordinates.make`.
 
-        The warm start is the given one or the state's own; fingers hold nothing on one another yet.
+        The warm start is the given one or the state's own; contacts hold no friction yet.
         """
         warm = coordinates.flat_acc(state.acc) if acc is None else acc
         return coordinates.make(self.scene, qpos, qvel, warm)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured import assembly
 from codesign_jax.engines.structured.assembly import HandContacts
 from codesign_jax.engines.structured.lanes import dot, once
+from codesign_jax.engines.structured.laws import holding
 from codesign_jax.engines.structured.laws.contact import Contacts, constraint_update
 from codesign_jax.engines.structured.laws.kinematics import (
     Acc,
@@ -30,7 +31,7 @@ from codesign_jax.types import Forces
 def forces(scene: Scene, hand: WorldModel, state: State, acc: Acc) -> Forces:
     """Forces of a step of a batch, every array with a leading axis (world,).
 
-    The states are those before the step, with what fingers held on one another then.
+    The states are those before the step, with the friction that contacts held then.
     """
     kin = kinematics(hand, layout(scene).axes, state)
     velocity = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
@@ -40,16 +41,17 @@ def forces(scene: Scene, hand: WorldModel, state: State, acc: Acc) -> Forces:
     none = jnp.zeros((3, fingers, worlds), state.wrist.dtype)
     net = {name: none[:, :1] for name in ("palm_object", "palm_table", "object_table")}
     net |= {name: none for name in ("finger_object", "finger_table")}
-    grip, depth = none[0], {}
+    grip, depth, hold = none[0], {}, assembly.grips(scene, state.held, kin)
     for name, contacts in found.items():
-        force, normal = once(partial(_acting, name), contacts, motion, velocity)
+        own = hold.get(name)
+        force, normal = once(partial(_acting, name), contacts, motion, velocity, own)
         net[name] = force
         if name == "finger_object":
             grip = normal
         depth[name] = _deepest(contacts)
     between = jnp.zeros((fingers, fingers, worlds), state.wrist.dtype)
     on_palm = none[0]
-    met = assembly.hand_contacts(scene, hand, kin, velocity, state.grip)
+    met = assembly.hand_contacts(scene, hand, kin, velocity, state.held)
     for name, these in met.items():
         normal, depth[name] = once(_pressing, these, motion, velocity), _deepest(these.contacts)
         one, two = these.fingers
@@ -78,14 +80,16 @@ def forces(scene: Scene, hand: WorldModel, state: State, acc: Acc) -> Forces:
 
 
 def _acting(
-    name: str, contacts: Contacts, motion: Spatial, velocity: Spatial
+    name: str, contacts: Contacts, motion: Spatial, velocity: Spatial, hold: jax.Array | None
 ) -> tuple[jax.Array, jax.Array]:
     """Sums over a set's contacts: forces on the first body, (3, finger or 1, world), and normal.
 
-    The first body is the finger, the palm, or the object on the table.
+    The first body is the finger, the palm, or the object on the table; hold is the friction that
+    they hold, if they do.
     """
     speed = contacts.relative(relative(name, velocity))
     jar = contacts.relative(relative(name, motion)) - contacts.reference(speed)
+    jar = jar if hold is None else jar + holding.held(contacts, hold)
     force = _force(contacts, jar)
     normal, lanes = dot(contacts.normal, force), force.shape[-2:]
     if not name.startswith("finger"):

@@ -68,8 +68,9 @@ class AdjointProgram(Program):
         n, a = self.links, self.axes
         more = {f"chain.{k}": (n + 1, shape) for k, shape in SHAPES._asdict().items()}
         more |= {"acc_bar": (n, (a,)), "virtual": (n, (a,))}
-        if self.held:
-            more |= {"grip_bar": (self.held, (4,))}
+        if pairings := self.held.get("finger_finger"):
+            more |= {"grip_bar": (pairings, (4,))}
+        more |= {f"{s.name}.held_bar": (s.count, (3, s.k)) for s in self.sets if s.holds}
         more |= {f"bar.{k}": (1, shape) for k, shape in of_step(self.scene).items()}
         if any(isinstance(s, FingerContactSet) for s in self.sets):
             more |= {f"pairbar.{k}": (n + 1, getattr(SHAPES, k)) for k in BodyMotion._fields}

@@ -78,7 +78,7 @@ class ReverseStep(Step):
         go = lanes([moved], (), wide=False)
         before, acc_bar = self._integration(state, at, now, go)
         if p.held:
-            friction_memory.reverse(self, bars, self.contacts["finger_finger"], go)  # type: ignore[arg-type]
+            friction_memory.reverse(self, bars, go)
         # The right side of wrist and object stands in the place of their only forces.
         right = {"smooth_wrist": acc_bar[0], "smooth_object": acc_bar[1]}
         right["smooth_palm"] = _none(at["palm"].smooth_palm)
@@ -190,12 +190,14 @@ class AdjointSolve(Elimination):
 
     def push(self, contacts: BoundContacts, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
         matrix, wrench = contacts.push(item, alpha)
+        if contacts.set.holds:
+            return matrix, friction_memory.asks(self.problem, contacts, item)
         return matrix, _none(wrench)
 
     def between_fingers(self, pairs: BoundFingerContacts, alpha: Lanes) -> None:
         pairs.update_constraints(alpha)
         pairs.clear_wrenches()
-        if friction_memory.kept(self.problem):
+        if friction_memory.pairings(self.problem.m):
             friction_memory.push(self.problem, pairs)
 
     def solve(self) -> Iterate:

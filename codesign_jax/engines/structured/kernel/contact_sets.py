@@ -20,10 +20,11 @@ from codesign_jax.engines.structured.kernel.memory import (
 )
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.laws import contact
+from codesign_jax.engines.structured.laws import contact, holding
 from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
 from codesign_jax.engines.structured.laws.contact import Cone, Contacts, LineCost
 from codesign_jax.engines.structured.laws.rings import Place
+from codesign_jax.model.held import held
 from codesign_jax.scene import Scene
 
 # Rows of a contact's jar and numbers of its line, by friction model.
@@ -61,12 +62,15 @@ class ContactSet:
         self.scene, self.name, self.count, self.k, self.size = scene, name, count, k, size
         self.on_object = name.endswith("_object")
         self.own_friction = own_friction(scene, name)
+        # Contacts between fingers share what they hold, see `friction_memory`.
+        self.holds = name in held(scene) and name != "finger_finger"
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         rows, ray = ROWS[self.scene.effects.friction]
         fields = {name: 3 for name in ("point", "normal")} | {"gap": 1, "share": 1}
         fields |= {"jar": rows, "step": rows, "ray": ray}
         fields |= {"friction": 1} if self.own_friction else {}
+        fields |= {"held": 3} if self.holds else {}
         return {f"{self.name}.{f}": (self.count, (n, self.k)) for f, n in fields.items()}
 
     def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundContacts":
@@ -128,16 +132,32 @@ class BoundContacts:
         return lanewise(Cone.of_friction, self.cone, self.read("friction", item)[0])
 
     def create(
-        self, item: Any, place: Place, motion: Lanes, velocity: Lanes, friction: Lanes | None = None
+        self,
+        item: Any,
+        place: Place,
+        motion: Lanes,
+        velocity: Lanes,
+        friction: Lanes | None = None,
+        hold: tuple[Lanes, Lanes] | None = None,
     ) -> None:
-        """Stores contacts of a link's or a group's places, for relative motions (6, ...)."""
+        """Stores contacts of a link's or a group's places.
+
+        Args:
+          motion: Relative motion of the bodies, (6, ...); `velocity`: their relative velocity.
+          friction: Coulomb coefficients (1, k) of contacts that have their own.
+          hold: What they hold of friction, (3, k), along the world's axes and as it is kept.
+        """
         if friction is not None:
             self.write("friction", friction, item)
         place, jar = self.begin(item, place, motion, velocity)
+        more = {}
+        if hold is not None:
+            jar = lanewise(with_held, jar, place, self.cone_at(item), hold[0])
+            more = {"held": hold[1]}
         self.write("share", place.share, item)
 
         def store() -> None:
-            for field, value in kept(place, jar).items():
+            for field, value in (kept(place, jar) | more).items():
                 self.write(field, value, item)
 
         jax.lax.cond(self.touching(item), store, lambda: None)
@@ -146,6 +166,15 @@ class BoundContacts:
         """Places whose share is zero where no candidate is, and their jar."""
         run = partial(begun, margin(self.set.scene))
         return lanewise(run, place, self.cone_at(item), motion, velocity)
+
+    def each_item(self, body: Callable[[Any], None]) -> None:
+        """Runs body(item), which stores something, for all items."""
+
+        def one(item: jax.Array, x: jax.Array) -> jax.Array:
+            body(item)
+            return x
+
+        jax.lax.fori_loop(0, self.set.count, one, jnp.int32(0))
 
     def place(self, item: Any) -> Place:
         return Place(*(self.read(field, item) for field in Place._fields))
@@ -249,6 +278,11 @@ class BoundContacts:
 
 def margin(scene: Scene) -> float:
     return contact.MARGIN if scene.effects.surface == "hull" else 0.0
+
+
+def with_held(jar: jax.Array, place: Place, cone: Cone, grip: jax.Array) -> jax.Array:
+    """The jar of contacts with the friction that they hold, see `holding.held`."""
+    return jar + holding.held(ContactSet.contacts(place, cone), grip)
 
 
 def kept(place: Place, jar: Lanes) -> dict[str, Lanes]:

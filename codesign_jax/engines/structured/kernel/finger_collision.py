@@ -16,10 +16,10 @@ import numpy as np
 
 from codesign_jax.engines.structured.kernel import friction_memory
 from codesign_jax.engines.structured.kernel.contact_sets import (
-    ContactSet,
     begun,
     kept,
     margin,
+    with_held,
     zeros,
 )
 from codesign_jax.engines.structured.kernel.finger_contacts import (
@@ -31,7 +31,7 @@ from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import cross, dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.laws import contact, holding, rings, shapes
+from codesign_jax.engines.structured.laws import contact, rings, shapes
 from codesign_jax.engines.structured.laws.rings import Place, Ring, Segment
 from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model.layout import first_on_palm, touches_itself
@@ -454,7 +454,7 @@ def with_axis(place: Place) -> Place:
 
 
 def _with_held(jar, place, cone, grip):
-    return jar + holding.held(ContactSet.contacts(place, cone), grip[:, None])
+    return with_held(jar, place, cone, grip[:, None])
 
 
 def each(count: int, body: Callable[[Any], None]) -> None:

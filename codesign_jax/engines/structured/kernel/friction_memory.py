@@ -1,8 +1,14 @@
-"""Friction that fingers hold on one another from step to step, in the kernel and in its adjoint.
+"""Friction that contacts hold from step to step, in the kernel and in its adjoint.
 
-Its law is `holding.held`.  The state has three numbers for each pairing of the fingers, "grip" of
-both fingers' lanes, equal and opposite: all contacts of two fingers share it.  A step leaves what
-it ends with in "new_grip".
+Its law is `holding.held`.  What is held is state, `model.held`:
+
+* A contact of a distance field, of fingers, palm and object with object, table and fixtures, holds
+  three numbers of its own, along the object's axes if it is on the object, which it turns with, and
+  else along the world's.  Within a step they are "held" of the contact, first those before the
+  step, then those behind it.
+* Fingers that touch one another hold three numbers for each of their pairings, on both fingers'
+  lanes, equal and opposite: all contacts of two fingers share them, as none of them stays at one
+  ring.  A step leaves what it ends with in "new_grip".
 
 The state after a step is a quotient of sums over contacts, of their forces f(jar(a, theta)).  With
 b the cotangents of the sums it adds to the step's derivative two things: -J' K r, with r = b times
@@ -15,8 +21,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel.contact_sets import zeros
-from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, only_on, pull
+from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
+from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, only_on, plus, pull
 from codesign_jax.engines.structured.kernel.finger_contacts import (
     BoundFingerContacts,
     FingerPairing,
@@ -29,32 +35,91 @@ from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact, holding
+from codesign_jax.engines.structured.world_model import apply_columns, apply_rows
+
+GRIP = "held.finger_finger"
+"""What fingers hold on one another, a row a pairing."""
 
 
 def kept(problem: Problem) -> bool:
-    return "new_grip" in problem.m.scratch
+    return bool(problem.m.p.held)
+
+
+def pairings(step: StepMemory) -> int:
+    """Pairings of fingers that hold on one another."""
+    return step.p.held.get("finger_finger", 0)
 
 
 def of_row(step: StepMemory, pairs: BoundFingerContacts, row: Any) -> list[Lanes]:
     """What the fingers of a pairing's row hold, (3,) or nothing if the scene has no such state."""
-    if not step.p.held:
+    if not pairings(step):
         return []
-    return [step.finger_state.read("grip", row + pairs.set.first)]
+    return [step.finger_state.read(GRIP, row + pairs.set.first)]
+
+
+def of_item(step: StepMemory, contacts: BoundContacts, item: Any) -> tuple[Lanes, Lanes] | None:
+    """What an item's contacts hold, (3, k): along the world's axes, and as the state has it."""
+    if not contacts.set.holds:
+        return None
+    name, k = f"held.{contacts.set.name}", contacts.set.k
+    rows = [step.finger_state.read(name, item * k + j) for j in range(k)]
+    return _both(step, contacts, lanewise(lambda rows: jnp.stack(rows, 1), rows))
+
+
+def of_ring(
+    step: StepMemory, contacts: BoundContacts, ring: jax.Array
+) -> tuple[Lanes, Lanes] | None:
+    """`of_item` of rings, one on each of a team's lanes, shape (lane,)."""
+    if not contacts.set.holds:
+        return None
+    own = step.finger_state.gather(f"held.{contacts.set.name}", ring, step.block.own)
+    return _both(step, contacts, lanewise(lambda v: v[:, None], own))
+
+
+def _both(step: StepMemory, contacts: BoundContacts, own: Lanes) -> tuple[Lanes, Lanes]:
+    if not contacts.set.on_object:
+        return own, own
+    return lanewise(in_world, step.columns, own), own
+
+
+def in_world(columns: jax.Array, own: jax.Array) -> jax.Array:
+    """What contacts on the object hold, along the world's axes."""
+    return apply_columns(columns, own)
 
 
 def clear(step: StepMemory) -> None:
     """Begins a step: fingers that do not touch hold nothing."""
-    for item in range(step.p.held):
+    for item in range(pairings(step)):
         step.scratch.write("new_grip", zeros((3,), step.like), item)
 
 
 def store(step: StepMemory, good: jax.Array) -> None:
     """Ends a step of the worlds that have moved."""
     state, mask = step.finger_state, lanes([good], (), wide=False)
-    for item in range(step.p.held):
+    for item in range(pairings(step)):
         new = step.scratch.read("new_grip", item)
-        old = state.read("grip", item)
-        state.write("grip", lanewise(jnp.where, mask, new, old), item)
+        old = state.read(GRIP, item)
+        state.write(GRIP, lanewise(jnp.where, mask, new, old), item)
+    for contacts in step.contacts.values():
+        if contacts.set.holds:
+            _store(step, contacts, mask)
+
+
+def _store(step: StepMemory, contacts: BoundContacts, mask: Lanes) -> None:
+    """Ends a step of a set's contacts; what does not touch holds nothing."""
+    name, state, k = f"held.{contacts.set.name}", step.finger_state, contacts.set.k
+
+    def after(mask: jax.Array, share: jax.Array, new: jax.Array, old: jax.Array) -> jax.Array:
+        return jnp.where(mask, jnp.where(share > 0, new, 0.0), old)
+
+    def one(item: jax.Array, x: jax.Array) -> jax.Array:
+        share, new = contacts.read("share", item), contacts.read("held", item)
+        for j in range(k):
+            old = state.read(name, item * k + j)
+            state.write(name, lanewise(after, mask, share[0, j], new[:, j], old), item * k + j)
+        return x
+
+    jax.lax.fori_loop(0, step.p.held[contacts.set.name] // k, one, jnp.int32(0))
 
 
 def sums(pairs: BoundFingerContacts, row: Any, alpha: Lanes, grip: Lanes) -> Lanes:
@@ -78,7 +143,60 @@ def sums(pairs: BoundFingerContacts, row: Any, alpha: Lanes, grip: Lanes) -> Lan
 
 
 def settle(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
-    """Keeps what the fingers of worlds hold whose iteration ends with a step of this length."""
+    """Keeps what contacts of worlds hold whose iteration ends with a step of this length."""
+    some = [c for c in (*problem.fingers, *problem.slots) if c.set.holds]
+
+    def keep() -> None:
+        for contacts in some:
+            _settle(problem, contacts, alpha, lanes([which], (), wide=True))
+
+    if some:
+        any_of(which, keep)
+    if pairings(problem.m):
+        _settle_fingers(problem, alpha, which)
+
+
+def _settle(problem: Problem, contacts: BoundContacts, alpha: Lanes, mask: Lanes) -> None:
+    """Keeps what a set's contacts hold behind the step, in the worlds of the mask."""
+    build, axes = contacts.set.contacts, turning(problem.m, contacts)
+
+    def after(mask, place, cone, alpha, jar, step, old, axes):
+        new = behind(build(place, cone), jar + alpha * step, old, axes)
+        return jnp.where(mask, new, old)
+
+    def one(item: Any) -> None:
+        def store() -> None:
+            place, cone = contacts.place(item), contacts.cone_at(item)
+            jar, step, old = (contacts.read(n, item) for n in ("jar", "step", "held"))
+            found = lanewise(after, mask, place, cone, alpha, jar, step, old, axes)
+            contacts.write("held", found, item)
+
+        jax.lax.cond(contacts.touching(item), store, lambda: None)
+
+    contacts.each_item(one)
+
+
+def turning(step: StepMemory, contacts: BoundContacts) -> Lanes | None:
+    """Columns of the axes along which contacts hold, None for the world's."""
+    return step.columns if contacts.set.on_object else None
+
+
+def behind(
+    contacts: contact.Contacts, jar: jax.Array, before: jax.Array, axes: jax.Array | None
+) -> jax.Array:
+    """What contacts hold behind a step, of what they hold before it, (3, ...) along their axes.
+
+    Args:
+      jar: Theirs at the step's accelerations.
+      axes: Columns of their axes; None for the world's.
+    """
+    grip = before if axes is None else apply_columns(axes, before)
+    force = contact.constraint_update(contacts, jar).force
+    found = holding.quotient(holding.hold(contacts, force, grip))
+    return found if axes is None else apply_rows(axes, found)
+
+
+def _settle_fingers(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
     pairs = problem.pairs
     assert pairs is not None
 
@@ -86,7 +204,7 @@ def settle(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
         mask, first = lanes([which], (), wide=True), pairs.set.first
 
         def one(row: jax.Array, x: jax.Array) -> jax.Array:
-            before, old = problem.read("grip", "new_grip", item=row + first)
+            before, old = problem.read(GRIP, "new_grip", item=row + first)
             new = lanewise(holding.quotient, sums(pairs, row, alpha, before))
             problem.write("new_grip", lanewise(jnp.where, mask, new, old), row + first)
             return x
@@ -97,33 +215,102 @@ def settle(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
         any_of(which & pairs.touching_worlds(), keep)
 
 
-def reverse(step: StepMemory, bars: CotangentTables, pairs: BoundFingerContacts, go: Lanes) -> None:
+def reverse(step: StepMemory, bars: CotangentTables, go: Lanes) -> None:
+    """Leaves the cotangents of what contacts hold after the step to the contacts.
+
+    As "held_bar" of each, and as "grip_bar" of fingers on one another.  The state's become those
+    before a step of which contacts add their part.
+    """
+    for contacts in step.contacts.values():
+        if contacts.set.holds:
+            _reverse(step, bars, contacts, go)
+    if pairings(step):
+        _reverse_fingers(step, bars, step.contacts["finger_finger"], go)  # type: ignore[arg-type]
+
+
+def _reverse(step: StepMemory, bars: CotangentTables, contacts: BoundContacts, go: Lanes) -> None:
+    """Leaves the cotangents of a set's contacts as "held_bar"."""
+    rest = lanewise(jnp.logical_not, go)
+
+    def one(item: Any) -> None:
+        found = held_bars(bars, contacts, item)
+        contacts.write("held_bar", only_on(go, found), item)
+        _write_bars(bars, contacts, item, only_on(rest, found))
+
+    contacts.each_item(one)
+
+
+def held_bars(bars: CotangentTables, contacts: BoundContacts, item: Any) -> Lanes:
+    """Cotangents of what an item's contacts hold, (3, k)."""
+    name, k = f"held.{contacts.set.name}", contacts.set.k
+    rows = [bars.finger_state.read(name, item * k + j) for j in range(k)]
+    return lanewise(lambda rows: jnp.stack(rows, 1), rows)
+
+
+def _write_bars(bars: CotangentTables, contacts: BoundContacts, item: Any, value: Lanes) -> None:
+    name, k = f"held.{contacts.set.name}", contacts.set.k
+    for j in range(k):
+        bars.finger_state.write(name, value[:, j], item * k + j)
+
+
+def add_held(bars: CotangentTables, contacts: BoundContacts, item: Any, held: dict) -> None:
+    """Adds an item's cotangents of what its contacts hold, "held", to those of the state."""
+    if contacts.set.holds:
+        old = held_bars(bars, contacts, item)
+        _write_bars(bars, contacts, item, plus(old, held["held"]))
+
+
+def asks(problem: Problem, contacts: BoundContacts, item: Any) -> Lanes:
+    """Wrench (6,) of what "held_bar" of an item's contacts asks of the step's accelerations.
+
+    It is the cotangent of jar, through the force, of what they hold behind the step.
+    """
+    build, axes = contacts.set.contacts, turning(problem.m, contacts)
+
+    def of_jar(jar, place, cone, held, bars, axes):
+        return sum_axis(dot(bars, behind(build(place, cone), jar, held, axes)), 0)
+
+    def wrench(place, cone, change):
+        return sum_axis(contact.contact_wrench(build(place, cone), change), 1)
+
+    def found() -> list[Lanes]:
+        place, cone = contacts.place(item), contacts.cone_at(item)
+        jar, held, bars = (contacts.read(n, item) for n in ("jar", "held", "held_bar"))
+        one = lanes([problem.like + 1.0], (), wide=True)
+        (change,) = pull(of_jar, (jar,), (place, cone, held, bars, axes), one)
+        return [lanewise(wrench, place, cone, change)]
+
+    return contacts.if_touching(item, found, [(6,)])[0]
+
+
+def _reverse_fingers(
+    step: StepMemory, bars: CotangentTables, pairs: BoundFingerContacts, go: Lanes
+) -> None:
     """Makes the cotangents of the state after the step those of the sums of `holding.hold`.
 
-    Leaves these as "grip_bar", and the state's as those before a step of which contacts add their
-    part (`leave`).  What a finger holds is the opposite of what its partner holds.
+    What a finger holds is the opposite of what its partner holds.
     """
     state, still = bars.finger_state, zeros((), step.like)
 
-    for item in range(step.p.held):
-        row, mine = item - pairs.set.first, state.read("grip", item)
+    for item in range(pairings(step)):
+        row, mine = item - pairs.set.first, state.read(GRIP, item)
         found = zeros((4,), step.like)
         if 0 <= row < pairs.set.rows:
-            ended = sums(pairs, row, still, step.finger_state.read("grip", item))
+            ended = sums(pairs, row, still, step.finger_state.read(GRIP, item))
             theirs = pairs.pairing(row).swap(mine)
             both = lanewise(jnp.subtract, mine, theirs) if item else mine
             (found,) = pull(holding.quotient, (ended,), (), only_on(go, both))
         step.scratch.write("grip_bar", found, item)
         rest = only_on(lanewise(jnp.logical_not, go), mine)
-        state.write("grip", rest, item)
+        state.write(GRIP, rest, item)
 
 
 def at(step: StepMemory, pairing: FingerPairing) -> tuple[Lanes, ...]:
     """What the lanes' fingers hold, and "grip_bar"; nothing if the scene has no such state."""
-    if not step.p.held:
+    if not pairings(step):
         return ()
     item, lane = pairing.number, step.block.lane
-    held = step.finger_state.gather("grip", item, lane)
+    held = step.finger_state.gather(GRIP, item, lane)
     return held, step.scratch.gather("grip_bar", item, lane)
 
 
@@ -132,8 +319,8 @@ def leave(bars: CotangentTables, pairing: FingerPairing, found: tuple) -> None:
     if not found:
         return
     item, lane, state = pairing.number, bars.block.lane, bars.finger_state
-    new = lanewise(jnp.add, state.gather("grip", item, lane), found[0])
-    state.scatter("grip", new, item, lane)
+    new = lanewise(jnp.add, state.gather(GRIP, item, lane), found[0])
+    state.scatter(GRIP, new, item, lane)
 
 
 def push(problem: Problem, pairs: BoundFingerContacts) -> None:
@@ -154,7 +341,7 @@ def push(problem: Problem, pairs: BoundFingerContacts) -> None:
             return contact.constraint_update(contacts(place, cone), jar).force
 
         force = lanewise(response, side.place, pairs.cone, jar)
-        held = problem.m.finger_state.gather("grip", which, lane)
+        held = problem.m.finger_state.gather(GRIP, which, lane)
         bars = problem.m.scratch.gather("grip_bar", which, lane)
         one = lanes([problem.like + 1.0], (), wide=True)
         (r,) = pull(of_held, (force,), (side.place, pairs.cone, held, bars), one)

@@ -32,22 +32,15 @@ from codesign_jax.engines.structured.laws.air import volumes
 from codesign_jax.engines.structured.laws.cones import own_friction
 from codesign_jax.engines.structured.laws.kinematics import Acc, State
 from codesign_jax.engines.structured.world_model import WorldModel, joint_sections, sections
-from codesign_jax.model import layout
-from codesign_jax.model.layout import pairings_held, palm_touches, touches_itself
+from codesign_jax.model import held, layout
+from codesign_jax.model.held import palm_groups, rings_of_link
+from codesign_jax.model.layout import palm_touches, touches_itself
 from codesign_jax.scene import Scene
 
 PALM = ((1, 0), (0, 1), (-1, 0), (0, -1))
 """Places of the rings that the palm's disc is made of, and their half axes, in half radii."""
 GATHERING = ("gpu",)
 """Backends whose lanes read rows of their own as fast as a common one."""
-
-
-def rings_of_link(scene: Scene) -> int:
-    e, spheres = scene.effects, layout(scene).spheres
-    if e.surface == "spheres":
-        return spheres.shape[-1] if spheres.size else 0
-    between = e.finger_finger or e.finger_palm or e.finger_itself
-    return scene.discretization.hull_rings * int(between or e.finger_object or e.finger_table)
 
 
 class Tables(KernelLayout):
@@ -61,7 +54,7 @@ class Tables(KernelLayout):
         self.scene, self.lay = scene, layout(scene)
         self.hull = scene.effects.surface == "hull"
         n, self.links, self.axes = self.lay.dofs.shape
-        self.fingers = 1 << (n - 1).bit_length()
+        self.fingers = held.lanes(scene)
         self.team = team or shared_memory.lanes_of_a_finger(scene, backend, self.fingers)
         # A slot of a team is one contact, a ring's are as many as the fields.
         if scene.fixture or scene.effects.air_mass:
@@ -75,10 +68,10 @@ class Tables(KernelLayout):
         e = scene.effects
         self.between = (e.finger_finger and n > 1) or e.finger_palm or touches_itself(scene)
         self.k = rings_of_link(scene)
-        self.palm_groups = -(-(len(PALM) if self.hull else self.lay.palm.size) // self.fingers)
+        self.palm_groups = palm_groups(scene)
         self.meshes = bool(shapes.mesh_indices(scene))
         self.sets = self._sets()
-        self.held = pairings_held(scene)
+        self.held = held.held(scene)
         self.slotted = any(isinstance(s, SlotSet) for s in self.sets)
         self._tables()
 
@@ -170,9 +163,8 @@ class Tables(KernelLayout):
             **dict.fromkeys(verdict.Bounds._fields, (1, one)),
             **some,
         )
-        held = {"grip": (self.held, (3,))} if self.held else {}
-        joint = n, (a,)
-        self.finger_state = MemoryLayout(True, finger=joint, finger_vel=joint, **held, acc=joint)
+        joint, hold = (n, (a,)), {f"held.{name}": (n, (3,)) for name, n in self.held.items()}
+        self.finger_state = MemoryLayout(True, finger=joint, finger_vel=joint, **hold, acc=joint)
         world_state = dict(wrist=6, position=3, quat=4, wrist_vel=6, linear_vel=3, angular_vel=3)
         world_state |= dict(step=1, going=1, speed=1, acc_wrist=6, acc_object=6)
         self.world_state = MemoryLayout(
@@ -195,8 +187,8 @@ class Tables(KernelLayout):
         }
         if self.scene.effects.lateral_threshold:
             fields |= {"armature_now": (n, (a,))}
-        if self.held:
-            fields |= {"new_grip": (self.held, (3,))}
+        if pairings := self.held.get("finger_finger"):
+            fields |= {"new_grip": (pairings, (3,))}
         for contacts in self.sets:
             fields |= contacts.groups()
         if self.scene.effects.air_mass:
@@ -287,8 +279,9 @@ class Packing(Tables):
             "finger_vel": state.finger_vel,
             "acc": state.acc.finger,
         }
-        if self.held:
-            finger_state["grip"] = state.grip
+        for name, rows in held.rows(self.scene).items():
+            own = state.held[rows]
+            finger_state[f"held.{name}"] = own.reshape(-1, 3, *own.shape[1:])
         wide = {k: self._widen(v) for k, v in finger_state.items()}
         narrow = {k: arrays[k] for k in self.world_state.groups}
         packed = self.world_state.pack(1, self.block, **narrow)
@@ -331,11 +324,11 @@ class Packing(Tables):
             rest = jnp.moveaxis(worlds[:, :, rows], 3, 1).reshape(-1, steps, rows.size)
             found[name] = jnp.concatenate([rest[..., :6], joints, rest[..., 6:]], -1)
         if states and self.held:
-            count = 3 * self.held
-            rows = self.finger_state.offset["grip"] + np.arange(count)
-            held = fingers[:, :, rows].reshape(-1, steps, count, self.fingers, self.block)
-            held = jnp.moveaxis(held[..., : self.num_fingers, :], 4, 1)
-            found["held"] = held.reshape(-1, steps, count * self.num_fingers)
+            count = 3 * sum(self.held.values())
+            first = self.finger_state.offset[f"held.{next(iter(self.held))}"]
+            hold = fingers[:, :, first : first + count]
+            hold = hold.reshape(-1, steps, count, self.fingers, self.block)
+            found["held"] = jnp.moveaxis(hold, 4, 1).reshape(-1, steps, count * self.fingers)
         return found
 
     def rows_of(self, qpos: jax.Array, qvel: jax.Array | None = None) -> tuple:
@@ -358,9 +351,8 @@ class Packing(Tables):
         """
         nq, nv = 13 + self.lay.dofs.size, 12 + self.lay.dofs.size
         fingers, worlds = self.rows_of(last[:, None, :nq], last[:, None, nq : nq + nv])
-        held = last[:, nq + 2 * nv + 3 :].reshape(len(last), 1, -1, self.num_fingers)
-        fill = [(0, 0)] * 3 + [(0, self.fingers - self.num_fingers)]
-        found = jnp.concatenate([fingers, jnp.pad(held, fill)], 2), worlds
+        hold = last[:, nq + 2 * nv + 3 :].reshape(len(last), 1, -1, self.fingers)
+        found = jnp.concatenate([fingers, hold], 2), worlds
         rows = self.path_rows(states=True)
         return tuple(
             jnp.pad(x, [(0, 0), (0, 0), (0, n - x.shape[2]), (0, 0)])
@@ -381,10 +373,14 @@ class Packing(Tables):
 
     def unpack_state(self, finger_state: jax.Array, world_state: jax.Array, worlds: int) -> State:
         """Inverse of `pack_state`."""
-        wide = self.finger_state.unpack(finger_state, self.fingers, self.num_fingers, worlds)
+        wide = self.finger_state.unpack(finger_state, self.fingers, self.fingers, worlds)
+        lanes = self.fingers, worlds
+        hold = [wide.pop(f"held.{name}").reshape(-1, *lanes) for name in self.held]
+        hold = hold or [jnp.zeros((0, *lanes), finger_state.dtype)]
+        wide = {name: v[..., : self.num_fingers, :] for name, v in wide.items()}
         narrow = self.world_state.unpack(world_state, 1, 1, worlds)
         acc = Acc(narrow.pop("acc_wrist"), wide.pop("acc"), narrow.pop("acc_object"))
-        return State(**wide, **narrow, acc=acc)
+        return State(**wide, **narrow, acc=acc, held=jnp.concatenate(hold))
 
 
 def ring_numbers(scene: Scene, hand: WorldModel, k: int) -> jax.Array:

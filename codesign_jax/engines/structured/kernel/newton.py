@@ -220,6 +220,7 @@ class Newton:
                 floor = jnp.where(busy, LINE_TOLERANCE * tolerance * scale.lane, FAR)
                 alpha = self.search.find(slope, curvature, first, floor, evaluations)
             alpha, residual = lanewise(hold, before, alpha, residual)
+            newton = alpha  # of the contacts, which the chord's step does not move
             now = lanewise(tree_add_scaled, alpha, now, step)
             if self.chord:
                 likely = busy & (residual.lane > tolerance) & (residual.lane <= LARGEST)
@@ -228,7 +229,7 @@ class Newton:
                 now, alpha, residual = choose(anywhere(likely), confirm, found, self.block.size)
             if friction_memory.kept(problem):
                 ends = busy & ((residual.lane <= tolerance) | (count + 1 >= iterations))
-                friction_memory.settle(problem, alpha, ends)
+                friction_memory.settle(problem, newton, ends)
             return [count + 1, *solid((now, residual, alpha), self.block.size)[0]]
 
         def going(carry: list) -> jax.Array:

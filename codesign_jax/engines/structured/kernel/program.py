@@ -95,8 +95,8 @@ class Program(Packing):
           ctrl: Controls, shape (world, time, nu).
           trajectory: Whether to record qpos, and to simulate worlds that lost their object to the
             end.
-          states: Whether to record qpos, qvel, the accelerations of every step, and what fingers
-            hold on one another before it.
+          states: Whether to record qpos, qvel, the accelerations of every step, and the friction
+            that contacts hold before it.
 
         Returns:
           `trace` by name, shape (world, time), with "qpos", "qvel" and "acc", shape (world, time,

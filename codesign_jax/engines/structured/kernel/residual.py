@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import finger_collision, objects, sdf_collision
 from codesign_jax.engines.structured.kernel.contact_sets import ContactSet, cone_of
-from codesign_jax.engines.structured.kernel.friction_memory import held_work
+from codesign_jax.engines.structured.kernel.friction_memory import behind, held_work
 from codesign_jax.engines.structured.kernel.problem import make_body
 from codesign_jax.engines.structured.kernel.step import link_forces, palm_and_object
 from codesign_jax.engines.structured.lanes import dot, sum_axis
@@ -26,6 +26,7 @@ from codesign_jax.engines.structured.laws.contact import Contacts
 from codesign_jax.engines.structured.laws.kinematics import next_motion, palm_motion
 from codesign_jax.engines.structured.laws.rings import Segment
 from codesign_jax.engines.structured.world_model import apply_columns
+from codesign_jax.model.held import EDGES, ROUND
 from codesign_jax.scene import Scene
 
 
@@ -50,11 +51,35 @@ class BodyMotion(NamedTuple):
     along: Any
 
 
-def of_contacts(contacts: Contacts, vel: jax.Array, motion: jax.Array, along: jax.Array):
-    """Power of contacts for relative motions, (6, ...), with an axis for the items."""
+def of_contacts(
+    contacts: Contacts,
+    vel: jax.Array,
+    motion: jax.Array,
+    along: jax.Array,
+    hold: tuple = (),
+) -> jax.Array:
+    """Power of contacts for relative motions, (6, ...), with an axis for the items.
+
+    Hold is what they hold of friction, the cotangents of what they hold behind the step, and the
+    columns of the axes of both or None; nothing where they hold none.
+    """
     jar = contacts.relative(motion) - contacts.reference(contacts.relative(vel))
+    work = 0.0
+    if hold:
+        grip, bars, axes = hold
+        own = grip if axes is None else apply_columns(axes, grip)
+        jar = jar + holding.held(contacts, own)
+        work = sum_axis(dot(bars, behind(contacts, jar, grip, axes)), 0)
     force = contact.constraint_update(contacts, jar).force
-    return sum_axis(dot(force, contacts.relative(along)), 0)
+    return sum_axis(dot(force, contacts.relative(along)), 0) + work
+
+
+def _held(name: str, held: dict, at: dict, still: dict) -> tuple:
+    """What `of_contacts` needs of the friction that a pair of bodies holds."""
+    if not held:
+        return ()
+    axes = at["columns"] if name.endswith("_object") else None
+    return held["held"], still["held_bar"], axes
 
 
 def look(scene: Scene, point, at: dict, still: dict, values: Any = None):
@@ -73,15 +98,17 @@ def around(scene: Scene, at: dict) -> list[Callable]:
 
 
 def of_rings(
-    scene: Scene, name: str, place: BodyMotion, numbers, at: dict, still: dict
+    scene: Scene, name: str, place: BodyMotion, numbers, at: dict, held: dict, still: dict
 ) -> jax.Array:
     """Power of the contacts of the rings, or spheres, of a link or the palm.
 
     Args:
       numbers: Numbers of its rings, see `rings.Ring`, shape (8, k, ...).
       at: The object and the constants of the contacts, by name.
-      still: What has no derivative here: accelerations, indices and values of grids, and "share" of
-        the contacts, which tells which are candidates.
+      held: What they hold of friction, "held"; nothing where they hold none.
+      still: What has no derivative here: accelerations, indices and values of grids, cotangents of
+        what they hold behind the step, and "share" of the contacts, which tells which are
+        candidates.
     """
     centre, places = sdf_collision.ring_centres(place.origin, place.frame, numbers), []
     on_object = name.endswith("_object")
@@ -105,7 +132,8 @@ def of_rings(
         cone = cone.of_friction(jnp.stack([at["friction"][i] for i in which]))
     contacts = ContactSet.contacts(found, cone)
     moves = _from_object(name, place[2:], at, still)
-    return of_contacts(contacts, *(m[:, None] for m in moves))
+    hold = _held(name, held, at, still)
+    return of_contacts(contacts, *(m[:, None] for m in moves), hold=hold)
 
 
 def aim(scene: Scene, name: str, place: BodyMotion, numbers, at: dict, still: dict) -> jax.Array:
@@ -115,7 +143,9 @@ def aim(scene: Scene, name: str, place: BodyMotion, numbers, at: dict, still: di
     return centre + finger_collision.aimed(numbers, place.frame, *first)
 
 
-def of_table(scene: Scene, fingers: int, item: int, at: dict, finger, still: dict) -> jax.Array:
+def of_table(
+    scene: Scene, fingers: int, item: int, at: dict, held: dict, finger: Any, still: dict
+) -> jax.Array:
     """Power of the object's points on the table that an item deals to the fingers' lanes.
 
     Finger is the number of each lane's finger; the rest is as in `of_rings`.
@@ -138,7 +168,8 @@ def of_table(scene: Scene, fingers: int, item: int, at: dict, finger, still: dic
     cone = cone.of_share(jnp.where(used, 1.0, 0.0)[None])
     contacts = Contacts(point[:, None], normal[:, None], gap[None], cone)
     moves = at["object_vel"], still["object_motion"], still["object_along"]
-    return of_contacts(contacts, *(m[:, None] for m in moves))
+    hold = _held(TABLE, held, at, still)
+    return of_contacts(contacts, *(m[:, None] for m in moves), hold=hold)
 
 
 def _of_object(scene: Scene, at: dict, still: dict) -> tuple:
@@ -146,7 +177,7 @@ def _of_object(scene: Scene, at: dict, still: dict) -> tuple:
     found = []
     if scene.effects.table:
         found.append(shapes.on_table(objects.points_of(scene, at, still), at["height"]))
-    flat = any(shape.type not in surroundings.ROUND for shape in scene.objects.object)
+    flat = any(shape.type not in ROUND for shape in scene.objects.object)
     for j, fixture in enumerate(scene.fixture):
         position = at["position"]
         _, rows = surroundings.towards(fixture, position)
@@ -154,7 +185,7 @@ def _of_object(scene: Scene, at: dict, still: dict) -> tuple:
         own = still | {"support": still[f"support_{j}"]} if "meshed" in still else still
         arms = objects.points_of(scene, turned, own)
         found.append(surroundings.object_on(fixture, position, rows[:, :, 0], arms))
-        if flat and surroundings.EDGES[fixture.type]:
+        if flat and EDGES[fixture.type]:
             point = surroundings.edges(fixture, position)
             seen = look(scene, point, at, still, still.get(f"values_{j}"))
             edge = surroundings.edge_on(point, *seen)

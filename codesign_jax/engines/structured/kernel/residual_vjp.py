@@ -41,6 +41,7 @@ from codesign_jax.engines.structured.laws import shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
 from codesign_jax.engines.structured.laws.kinematics import mounted
 from codesign_jax.engines.structured.world_model import apply_columns
+from codesign_jax.model import held
 from codesign_jax.model.layout import touches_itself
 
 SHAPES = LinkMotion((3,), (3, 3), (6,), (6,), (6,), (6,))
@@ -176,7 +177,9 @@ class ResidualVjp:
                     again = lanewise(run, place, numbers, at, still)
                     still = still | {"values_again": self._values(again)}
             run = partial(residual.of_rings, self.p.scene, name)
-            found, own, shared = pull(run, (place, numbers, at), (still,), self.one)
+            args = place, numbers, at, self.held(name, i)
+            found, own, shared, held = pull(run, args, (still,), self.one)
+            friction_memory.add_held(self.bars, self.contacts[name], i, held)
             for j in range(k):
                 self.bars.add({table: own[:, j]}, i * k + j)
             self.bars.add(shared)
@@ -189,7 +192,7 @@ class ResidualVjp:
     ) -> BodyMotion:
         at, empty = self._object(name), BodyMotion(*(self.none(n) for n in BodyMotion._fields))
         contacts = self.contacts[name]
-        still = self.still | {"share": contacts.read("share", i)}
+        still = self.still | self.of_contacts(name, i)
         return choose(contacts.touching(i), lambda: compute(at, still), empty, self.p.size)
 
     def _table(self) -> None:
@@ -205,18 +208,30 @@ class ResidualVjp:
                 gap, rows = lanewise(partial(surroundings.towards, fixture), position)
                 turned = lanewise(surroundings.faced, rows, columns)
                 still |= {f"support_{j}": self._support(turned, gap)}
-                if surroundings.EDGES[fixture.type]:
+                if held.EDGES[fixture.type]:
                     point = lanewise(partial(surroundings.edges, fixture), position)
                     still |= {f"values_{j}": self._values(point)}
         for i in range(contacts.set.count):
 
             def compute(i: int = i) -> None:
                 run = partial(residual.of_table, p.scene, p.fingers, i)
-                shares = {"share": contacts.read("share", i)}
-                (found,) = pull(run, (at,), (finger, still | shares), self.one)
+                own = still | self.of_contacts(residual.TABLE, i)
+                args = at, self.held(residual.TABLE, i)
+                found, held = pull(run, args, (finger, own), self.one)
+                friction_memory.add_held(self.bars, contacts, i, held)
                 self.bars.add(found)
 
             jax.lax.cond(contacts.touching(i), compute, lambda: None)
+
+    def held(self, name: str, i: Any) -> dict[str, Lanes]:
+        """What an item's contacts hold of friction; nothing where they hold none."""
+        contacts = self.contacts[name]
+        return {"held": contacts.read("held", i)} if contacts.set.holds else {}
+
+    def of_contacts(self, name: str, i: Any) -> dict[str, Lanes]:
+        """What an item's contacts have that has no derivative, by name."""
+        names = ["share", *["held_bar"] * self.contacts[name].set.holds]
+        return {n: self.contacts[name].read(n, i) for n in names}
 
     def _object(self, name: str) -> dict[str, Lanes]:
         """What contacts of a pair of bodies depend on beside the hand, by name."""

@@ -11,8 +11,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import objects
-from codesign_jax.engines.structured.kernel.contact_sets import zeros
+from codesign_jax.engines.structured.kernel import friction_memory, objects
+from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.finger_collision import (
     FingerCollision,
     aimed,
@@ -29,6 +29,7 @@ from codesign_jax.engines.structured.laws import contact, shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import own_friction
 from codesign_jax.engines.structured.laws.rings import Place
 from codesign_jax.engines.structured.world_model import apply_columns
+from codesign_jax.model import held
 
 OUTSIDE = 1.5
 """Farthest point of a ring over the largest of its half axes."""
@@ -80,7 +81,8 @@ class SdfCollision:
         for name in self.names:
             numbers = self.numbers(i)
             centre = lanewise(ring_centres, origin, frame, numbers)
-            self.on_field(name, i, numbers, frame, centre, self.moves(name, motion, vel))
+            hold = friction_memory.of_item(self.step, self.contacts[name], i)
+            self.on_field(name, i, numbers, frame, centre, self.moves(name, motion, vel), hold)
 
     def of_rings(self, search: FingerCollision) -> None:
         """Contacts of the fingers' rings, dealt to the lanes of a team."""
@@ -88,11 +90,18 @@ class SdfCollision:
             contacts = self.contacts[name]
             contacts.begin_step()  # type: ignore[attr-defined]
 
-            def one(slot: Any, item: jax.Array, nothing: list, name: str = name) -> list:
+            def one(
+                slot: Any,
+                item: jax.Array,
+                nothing: list,
+                name: str = name,
+                contacts: BoundContacts = contacts,
+            ) -> list:
                 row, numbers, frame, centre = search.body(item)
                 numbers, centre = (lanewise(one_of, v) for v in (numbers, centre))
                 moves = self.moves(name, *(search.side_of(n, row) for n in ("motion", "vel")))
-                self.on_field(name, slot, numbers, frame, centre, moves)
+                hold = friction_memory.of_ring(self.step, contacts, item)
+                self.on_field(name, slot, numbers, frame, centre, moves, hold)
                 return nothing
 
             contacts.every(one, [])  # type: ignore[attr-defined]
@@ -101,7 +110,16 @@ class SdfCollision:
         k, read = self.p.k, partial(self.step.hand.read, "ring")
         return lanewise(lambda rows: jnp.stack(rows, 1), [read(i * k + j) for j in range(k)])
 
-    def on_field(self, name: str, i: Any, numbers: Lanes, frame: Lanes, centre: Lanes, moves: Any):
+    def on_field(
+        self,
+        name: str,
+        i: Any,
+        numbers: Lanes,
+        frame: Lanes,
+        centre: Lanes,
+        moves: tuple[Lanes, Lanes],
+        hold: tuple[Lanes, Lanes] | None,
+    ) -> None:
         """Creates contacts of rings or balls of a body."""
         contacts, looks = self.contacts[name], self.looks(name)
         found = [look(centre) for look in looks]
@@ -123,7 +141,7 @@ class SdfCollision:
                     offset = lanewise(aimed, numbers, frame, *first)
                     again = look(lanewise(jnp.add, centre, offset))
                 places.append(lanewise(rings_on_field, numbers, frame, centre, offset, *again))
-            contacts.create(i, joined(places), *moves, friction=friction)
+            contacts.create(i, joined(places), *moves, friction=friction, hold=hold)
 
         any_of(total(near) > 0, create)
 
@@ -136,7 +154,8 @@ class SdfCollision:
             centre = lanewise(ring_centres, at["place"], at["frame"], numbers)
             for name in palm:
                 moves = self.moves(name, None, None)
-                self.on_field(name, i, numbers, at["frame"], centre, moves)
+                hold = friction_memory.of_item(self.step, self.contacts[name], i)
+                self.on_field(name, i, numbers, at["frame"], centre, moves, hold)
         on_table = self.contacts.get("object_table")
         slots = self._table_points(state) if on_table else []
         rubs = self.frictions("object_table")
@@ -147,7 +166,8 @@ class SdfCollision:
             if rubs is not None:
                 (friction,) = self._deal([(rubs[:, k : k + 1],) for k in mine])
             moves = self.moves("object_table", None, None)
-            on_table.create(i, place, *moves, friction=friction)
+            hold = friction_memory.of_item(self.step, on_table, i)
+            on_table.create(i, place, *moves, friction=friction, hold=hold)
 
     def _table_points(self, state: dict) -> list[Place]:
         """Each slot of the object on the table and the fixtures, lanes of a world."""
@@ -156,7 +176,7 @@ class SdfCollision:
         if scene.effects.table:
             arms = objects.table_points(scene, self.thing, columns, position[2])
             found += lanewise(lambda a, h: slots_of(*shapes.on_table(a, h)), arms, position[2])
-        kinds = [shape.type in surroundings.ROUND for shape in scene.objects.object]
+        kinds = [shape.type in held.ROUND for shape in scene.objects.object]
         for fixture in scene.fixture:
             gap, rows = lanewise(partial(surroundings.towards, fixture), position)
             turned = lanewise(surroundings.faced, rows, columns)

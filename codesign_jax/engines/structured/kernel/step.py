@@ -89,6 +89,7 @@ class Step(StepMemory):
         run = partial(palm_and_object, p.scene.discretization.timestep)
         at = lanewise(run, state, arm, self.palm_constants())
         thing = objects.read(p.scene, self.block, self.world, self.hand, self.grid)
+        self.columns = at["columns"]
         self.contacts = {c.name: c.bind(self.scratch, self.constant) for c in p.sets}
         return state, at, thing, *self._forward(state, at, pressure, thing)
 

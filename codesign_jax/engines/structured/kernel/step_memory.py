@@ -49,7 +49,7 @@ class KernelLayout:
     meshes: bool  # Whether there are objects with meshes
     sets: list[ContactSet]  # The contacts
     slotted: bool  # Whether any of them are in slots
-    held: int  # Rows of friction memory
+    held: dict[str, int]  # What contacts hold of friction, see `model.held`
     # Rows of the tables; `onchip` with teams only.
     hand: MemoryLayout
     world: MemoryLayout
@@ -72,6 +72,7 @@ class StepMemory:
       grid: Distances of all meshes, a reference; None without meshes.
       like: Zeros of the lanes' shape and type.
       contacts: The contact sets with their memory, by name.
+      columns: Columns of the object's orientation, once they are known.
     """
 
     def __init__(
@@ -96,6 +97,7 @@ class StepMemory:
         self.onchip = None if onchip is None else BoundTable(layout.onchip, onchip)
         self.like = jnp.zeros((layout.size,), finger_state.dtype)
         self.contacts: dict[str, BoundContacts] = {}
+        self.columns: Lanes | None = None
 
     def _table(self, name: str) -> BoundTable:
         tables = self.hand, self.finger_state, self.scratch, self.onchip

@@ -68,6 +68,15 @@ class BoundTeamSdfContacts(BoundSlots):
         rounds = self.block.rounds(self.set.rings)
         return loop(rounds, lambda k, carry: body(*self.slot(k), carry), start, self.set.size)
 
+    def each_item(self, body: Callable[[Any], None]) -> None:
+        """See `BoundContacts`; a lane each."""
+
+        def one(item: Slot, _: Any, nothing: list) -> list:
+            body(item)
+            return nothing
+
+        self.every(one, [])
+
     def update_constraints(self, alpha: Lanes) -> None:
         """Adds the last step of the line search to jar; stores Hessians and forces."""
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.laws.contact import LEAST, Cone
+from codesign_jax.model.held import keeps
 from codesign_jax.model.layout import contact_mass, dissipation, friction_ratio
 from codesign_jax.scene import Scene
 
@@ -28,15 +29,13 @@ def which_cone(pair: str) -> str:
     return "hand_object" if pair.endswith("_object") else "hand_table"
 
 
-def make_cone(
-    scene: Scene, friction: Any, *, bodies: int, ratio: Any = None, stiffer: Any = 1.0
-) -> Cone:
+def make_cone(scene: Scene, friction: Any, *, bodies: int, ratio: Any, stiffer: Any = 1.0) -> Cone:
     """A contact's parameters, see `contact`.
 
     Args:
       scene: The scene; its numbers may be arrays.
       bodies: Bodies other than the world in the contact: against the world it is twice as stiff.
-      ratio: How much harder friction is, by default `contact.friction_ratio`.
+      ratio: How much harder friction is.
       stiffer: Stiffness over `contact.normal_stiffness`.
     """
     c, h = scene.contact, scene.discretization.timestep
@@ -45,7 +44,7 @@ def make_cone(
     reference = 1.0 / (h * (h + dissipation(scene, **how))), 1.0 / h + 0.0 * normal
     if scene.effects.friction == "none":
         return Cone(normal, None, None, None, *reference)  # type: ignore[arg-type]
-    impratio = friction_ratio(scene, c.friction_ratio if ratio is None else ratio, **how)
+    impratio = friction_ratio(scene, ratio, **how)
     cone = Cone(normal, impratio * normal, friction, friction / jnp.sqrt(impratio), *reference)
     if scene.effects.friction != "full":
         return cone
@@ -59,7 +58,8 @@ def make_cones(scene: Scene, shape: jax.Array) -> Cones:
     for i, other in enumerate(scene.objects.object[1:], 1):
         on_object = jnp.where(shape == i, other.friction, on_object)
     e, c = scene.effects, scene.contact
-    two, one = partial(make_cone, scene, bodies=2), partial(make_cone, scene, bodies=1)
+    ratio = c.held_friction_ratio if keeps(scene) else c.friction_ratio
+    two, one = (partial(make_cone, scene, bodies=n, ratio=ratio) for n in (2, 1))
     # MuJoCo has one impratio for all contacts, so that spheres, which it simulates too, do here.
     between = c.finger_finger_friction_ratio if e.surface == "hull" else c.friction_ratio
     stiffer = c.finger_palm_stiffness / c.normal_stiffness

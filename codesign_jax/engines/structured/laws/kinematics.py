@@ -49,9 +49,9 @@ class State(NamedTuple):
     going: Any = None  # Zero for a world that is decided, else one, likewise
     # Largest absolute velocity, for a failed world that of the failed step, likewise
     speed: Any = None
-    # Friction that fingers hold on one another, see `holding.held`, of each pairing of the kernel,
-    # shape (pairing, 3, finger, world); None without `effects.friction_memory`
-    grip: jax.Array | None = None
+    # Friction that contacts hold, see `holding.held`, rows as in `model.held`, shape
+    # (row, lane, world), lanes of fingers; no rows without `effects.friction_memory`
+    held: Any = None
 
 
 class Acc(NamedTuple):

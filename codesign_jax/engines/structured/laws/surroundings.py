@@ -15,15 +15,12 @@ import numpy as np
 
 from codesign_jax.engines.structured.lanes import cross, dot
 from codesign_jax.engines.structured.laws import shapes
+from codesign_jax.model.held import object_points
 from codesign_jax.scene import Scene
 from codesign_jax.scene.tables import Fixture
 
 Field = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 """From position and points to distances and their gradients."""
-EDGES = {"box": 4, "cylinder": 1, "plane": 0}
-"""Points of a fixture that may touch an object's faces, by its type."""
-ROUND = ("sphere",)
-"""Objects that touch a fixture in the one point that their own side finds."""
 
 
 def fields(scene: Scene) -> list[Field]:
@@ -167,14 +164,7 @@ def edge_on(
 
 def slots(scene: Scene) -> int:
     """How many points of object, table and fixtures may touch."""
-    return sum(_points(scene))
-
-
-def _points(scene: Scene) -> list[int]:
-    """How many points of the object may touch each of `fields`."""
-    flat = any(shape.type not in ROUND for shape in scene.objects.object)
-    each = [4 + EDGES[fixture.type] * flat for fixture in scene.fixture]
-    return [4] * scene.effects.table + each
+    return sum(object_points(scene))
 
 
 def touched(scene: Scene, pair: str, count: int) -> list[int]:
@@ -182,7 +172,7 @@ def touched(scene: Scene, pair: str, count: int) -> list[int]:
 
     Rings or spheres look at each field `count` times; of the object it is known.
     """
-    each = _points(scene)
+    each = object_points(scene)
     if pair == "object_table":
         return [len(each) + i for i, points in enumerate(each) for _ in range(points)]
     return [i for i in range(len(each)) for _ in range(count)]

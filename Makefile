@@ -17,7 +17,7 @@ CHECKED := codesign_jax scripts tests notebooks
 # What is imported is compiled once: without its bytecode every process compiles it again, for 7 s.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo docs interpreter test quick test-browser test-ptx test-gpu test-slow stability faults notebooks benchmark effects accuracy lint format types clean help
+.PHONY: demo docs interpreter test quick test-browser test-ptx test-gpu test-slow stability faults notebooks benchmark effects accuracy reality lint format types clean help
 
 help:
 	@echo "make demo        co-design a gripper, 23 parameters, on the CPU, with figures and a film"
@@ -31,6 +31,7 @@ help:
 	@echo "make notebooks   execute them         make lint types  ruff, pyright"
 	@echo "make benchmark   measure rates: BENCHMARK=docs/data/rates_cpu.json"
 	@echo "make effects     what each effect costs and decides: docs/effects.md"
+	@echo "make reality     the simulation beside published measurements: docs/reality.md"
 	@echo "make accuracy    what accuracy costs in time, and what moves a verdict"
 	@echo "make docs        the documentation as a site without a network: site/index.html"
 	@echo "make format      ruff format          make clean       remove what make built"
@@ -87,6 +88,10 @@ benchmark: $(STAMP)
 # About 15 minutes on two idle cores.
 effects: $(STAMP)
 	$(BIN)/python -m scripts.effects $(ARGS)
+
+# Tables and figures of docs/reality.md, and the silicones of docs/measurements.md.
+reality: $(STAMP)
+	$(BIN)/python -m scripts.reality --pages $(ARGS)
 
 # Hours of a GPU and its host; goes on where it stopped. Then ARGS="--merge FILE", "--merge FILE --report".
 accuracy: $(STAMP)

@@ -17,7 +17,7 @@ from codesign_jax import objects
 
 FOLDER = Path(__file__).parent.parent / "objects"
 HEAD = """\
-# Eight shapes beyond the primitives, made by scripts/make_objects.py; all numbers are [ours].
+# Eight shapes beyond the primitives, made by scripts/make_objects.py; all numbers are [chosen].
 # Meshes need the structured engine.  SI units except for the files', which are in millimetres.
 name = "{name}"
 description = "Capsule, cone, torus, ring segment, mug, bottle, superquadric and L-bracket{how}"

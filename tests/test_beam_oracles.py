@@ -593,7 +593,10 @@ def test_the_command_compares_and_fits(tmp_path, capsys):
     line = ["finger", str(path), "--fit", "--design", "length=110", "--out", str(out)]
     assert cli.main(line) == 0
     said = capsys.readouterr().out
-    assert "--set hand.material.shear_modulus=5e+04" in said and "110 mm long" in said
+    assert (
+        "--set hand.material.law=linear hand.material.shear_modulus=5e+04" in said
+        and "110 mm long" in said
+    )
     assert "model: angle errs by" in said and "(25 %)" in said  # 50 / 40 - 1
     head, *rows = out.read_text().splitlines()
     assert head == "pressure_kPa,angle_deg,model_angle_deg,fitted_angle_deg" and len(rows) == 2

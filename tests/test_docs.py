@@ -131,7 +131,7 @@ def lines_of(page):
 def test_the_user_s_pages_are_a_manual():
     """What was tried, and by which commit, is in docs/notes and docs/data."""
     assert len(lines_of(ROOT / "README.md")) <= 110
-    assert sum(len(lines_of(page)) for page in USERS) <= 2400
+    assert sum(len(lines_of(page)) for page in USERS) <= 2700
     for name in STUDIES:
         assert len(lines_of(ROOT / "docs" / f"{name}.md")) <= 120, name
         assert (ROOT / "docs" / "notes" / f"{name}.md").is_file()
@@ -270,3 +270,34 @@ def test_the_site_is_read_and_searched_without_a_network(browser):
     page.wait_for_selector(".md-search-result__item a[href*='reference.html']", timeout=20_000)
     page.close()
     assert not complaints
+
+
+# --- constants by evidence ------------------------------------------------------------------------
+
+KINDS = "measured", "chosen", "fitted"
+CONSTANT = "section", "material", "palm", "wrist", "contact", "arm"
+"""Tables of hand and scene files whose numbers name their kind."""
+
+
+def kinds(path):
+    """Kind by key of a file's constants: that of the comment in its line, or of its table."""
+    found, table, of_table = {}, "", ""
+    for line in path.read_text(encoding="utf-8").splitlines():
+        code, _, comment = line.partition("#")
+        named = [k for k in KINDS if f"[{k}]" in comment]
+        assert len(named) < 2 or not code, line
+        if header := re.match(r"\[+([a-z_.]+)\]+", code):
+            table, of_table = header[1], "".join(named)
+        elif (key := re.match(r"([a-z_]+) = (?!true|false)", code)) and table in CONSTANT:
+            found[f"{table}.{key[1]}"] = "".join(named) or of_table
+    return found
+
+
+def test_every_constant_is_measured_chosen_or_fitted():
+    paths = [*(ROOT / "hands").glob("*.toml"), BUILT_IN["Scene files"] / "paper.toml"]
+    of_files = {path.stem: kinds(path) for path in paths}
+    assert all(of_files.values())
+    assert not {(n, k) for n, keys in of_files.items() for k, v in keys.items() if v not in KINDS}
+    page = (ROOT / "docs" / "calibration.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `([a-z_.]+)` \| [^|]+ \| (\w+) \|", page, re.M)
+    assert dict(rows) == of_files["pneuflex4"] | of_files["paper"] and len(rows) == len(dict(rows))

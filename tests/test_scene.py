@@ -1,14 +1,26 @@
 """Scene, hand and object files: every problem is found, said once, and said helpfully."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from codesign_jax import model, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.runs.scene_files import write_scene
-from codesign_jax.scene import hand, keypaths, library, objects, parameters, schema
+from codesign_jax.scene import (
+    constants,
+    hand,
+    keypaths,
+    library,
+    objects,
+    parameters,
+    schema,
+    silicones,
+)
 from tests.helpers.grasps import batch_inputs, nth, repeat, stack, still
 
+NAMES = silicones.SILICONES
 HANDS, OBJECTS = sorted(library.available("hands")), sorted(library.available("objects"))
 
 
@@ -42,6 +54,12 @@ BY_PATH = {
     "discretization.links=5": lambda s: s.discretization.links == 5,
     "hand=tripod3": lambda s: s.hand.name == "tripod3",
     "hand.material.shear_modulus=60e3": lambda s: s.hand.material.shear_modulus == 60e3,
+    "hand.material=ecoflex_00_30": lambda s: (
+        s.effects.neo_hookean and s.hand.material.shear_modulus == 27.6e3
+    ),
+    "hand.material={silicone='dragon_skin_30', density=1100.0}": lambda s: (
+        s.hand.material.silicone == "dragon_skin_30" and s.hand.material.density == 1100.0
+    ),
     "hand.preset.2d.fixed.pressure=110": lambda s: s.hand.preset[0].fixed["pressure"] == 110,
     "hand.parameter.length.default=[110, 110, 60, 90]": lambda s: (
         s.hand.parameter[0].default == (110.0, 110.0, 60.0, 90.0)
@@ -78,7 +96,94 @@ WRONG_PATHS = {
     "discretization.links=10.0": "discretization.links = 10.0 must be a whole number in [1, 200]",
     # A number without a unit has no slip of units.
     "cost.maximum=2000": "cost.maximum = 2000 is outside [0.1, 100]",
+    "hand.material=dragonskin": f"silicone = 'dragonskin' unknown; valid: {', '.join(NAMES)}",
+    "hand.material=5": "hand.material must be a table, not int",
+    "hand.material.silicone=[1]": "hand.material.silicone = [1] unknown; valid: dragon_skin_10,",
+    "hand.material.law=mooney_rivlin": "valid: linear, neo_hookean",
 }
+
+
+# Changes of material and effects, and what law and modulus [kPa] they give, or what is said.
+GIVEN = "hand.material=dragon_skin_10"
+LAWS = {
+    (GIVEN,): (True, 88.0),
+    (GIVEN, "effects.neo_hookean=true"): (True, 88.0),
+    (GIVEN, "hand.material.damping_time=0.005"): (True, 88.0),
+    (GIVEN, "hand.material.law=linear", "hand.material.shear_modulus=50e3"): (False, 50.0),
+    ("hand.material.law=neo_hookean", "hand.material.shear_modulus=70e3"): (True, 70.0),
+    (GIVEN, "effects.neo_hookean=false"): (
+        "effects.neo_hookean = false stands against hand.material.law = 'neo_hookean' "
+        "(silicone 'dragon_skin_10')"
+    ),
+    (GIVEN, "hand.material.shear_modulus=60e3"): (
+        "hand.material.shear_modulus = 60000.0 stands beside silicone = 'dragon_skin_10'"
+    ),
+    (GIVEN, "hand.material.law=linear"): (
+        "hand.material.law = 'linear' stands beside silicone = 'dragon_skin_10'"
+    ),
+    (
+        "hand.material.law=linear",
+        "hand.material.shear_modulus=50e3",
+        "effects.neo_hookean=true",
+    ): "effects.neo_hookean = true stands against hand.material.law = 'linear': a modulus",
+}
+
+
+@pytest.mark.parametrize("pairs", LAWS)
+def test_a_modulus_comes_with_its_law(pairs):
+    def load(name):
+        return scene.load(name, overrides=keypaths.parse(pairs))
+
+    if isinstance(LAWS[pairs], str):
+        (problem,) = problems_of(load, "paper")
+        assert LAWS[pairs] in problem
+        return
+    found = load("paper")
+    material = found.hand.material
+    assert (found.effects.neo_hookean, material.shear_modulus) == (
+        LAWS[pairs][0],
+        1e3 * LAWS[pairs][1],
+    )
+    assert material.lateral_factor == scene.load("paper").hand.material.lateral_factor
+    # In Python the law of another hand is not that of the scene's effects.
+    law = silicones.LAWS[not found.effects.neo_hookean]
+    other = dataclasses.replace(material, law=law)
+    changed = dataclasses.replace(found, hand=dataclasses.replace(found.hand, material=other))
+    with pytest.raises(schema.InputError, match="stands against hand.material.law"):
+        constants.check(changed)
+    # Names of silicones and laws are no part of what is compiled: numbers are data.
+    plain = dataclasses.replace(material, law=None, silicone=None, shear_modulus=1e5)
+    changed = dataclasses.replace(found, hand=dataclasses.replace(found.hand, material=plain))
+    assert changed.structure == found.structure
+
+
+def test_a_hand_file_names_its_silicone_in_a_line(tmp_path):
+    text = text_of("hands", "tripod3")
+    start, end = text.index("[material]"), text.index("[palm]")
+    (tmp_path / "mine.toml").write_text('material = "ecoflex_00_50"\n' + text[:start] + text[end:])
+    mine = hand.load(tmp_path / "mine.toml").material
+    assert mine.law == "neo_hookean" and mine.shear_modulus == silicones.get(mine.silicone)[2]
+    assert scene.load("paper", hand_name=tmp_path / "mine.toml").effects.neo_hookean
+    one = hand.load(tmp_path / "mine.toml", overrides={"material": "dragon_skin_20"}).material
+    assert one.shear_modulus == silicones.get("dragon_skin_20").shear_modulus
+    with pytest.raises(schema.InputError, match="'ecoflex' unknown; valid: dragon_skin_10, "):
+        silicones.get("ecoflex")
+
+
+def test_silicones_lie_within_their_measurements():
+    for name, s in silicones.SILICONES.items():
+        low, high = s.interval
+        assert low <= s.shear_modulus <= high, name
+        span = s.damping_interval or (s.damping_time, s.damping_time)
+        assert span[0] <= s.damping_time <= span[1]
+        # Crosshead strain is too large, so that its modulus is the lowest of all.
+        assert s.crosshead_modulus < min(s.shear_modulus, s.sheet_modulus)
+        if "geometric" in s.source:
+            wanted = np.sqrt(s.crosshead_modulus * s.sheet_modulus)
+            assert s.shear_modulus == pytest.approx(wanted, rel=0.005)  # three digits
+            np.testing.assert_allclose(
+                s.interval, [s.crosshead_modulus, s.sheet_modulus], rtol=3e-3
+            )
 
 
 @pytest.mark.parametrize("pair", WRONG_PATHS)

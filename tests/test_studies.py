@@ -16,15 +16,15 @@ from codesign_jax.commands import optimize
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.scene import parameters
+from codesign_jax.scene import parameters, silicones
 from codesign_jax.types import Outcome
-from scripts import benchmark, calibration, search
+from scripts import benchmark, calibration, reality, search
 from scripts.accuracy import budget, report
 from scripts.calibration import OPEN
 from scripts.experiments import report as results
 from scripts.experiments import simulate
 from scripts.experiments.simulate import PAPER, TOTAL_GRASPS
-from scripts.shared import statistics, work
+from scripts.shared import output, statistics, work
 from tests.helpers import toy_engine
 from tests.helpers.toy_engine import tiny
 
@@ -92,6 +92,39 @@ def test_tables_of_the_pages_are_those_of_the_data(page):
     for mark in benchmark.PAGES[page]:
         [shown] = re.findall(f"<!-- {mark}:begin -->\n\n(.*?)\n\n<!-- {mark}:end -->", text, re.S)
         assert shown == benchmark.TABLES[mark](files)
+
+
+def test_measured_silicones_are_those_of_the_page():
+    text = (reality.DOCS / "measurements.md").read_text(encoding="utf-8")
+    for mark, rows in (("laws", reality.law_rows()), ("silicones", reality.silicone_rows())):
+        assert f"<!-- {mark}:begin -->\n\n{output.markdown(rows)}\n\n<!-- {mark}:end -->" in text
+    # Of a material that is neo-Hookean the law is exact, and the other one has the fixed ratio.
+    modulus, errors = reality.fitted_law(lambda e: 30 * reality.neo_hookean(e), *NEO)
+    assert modulus == pytest.approx(30) and np.abs(errors).max() < 1e-4  # of the grid of strains
+    other, _ = reality.fitted_law(lambda e: 30 * reality.neo_hookean(e), *LINEAR)
+    assert modulus / other == pytest.approx(silicones.EQUAL_BEND, rel=1e-3)
+    modulus, _ = reality.fitted_law(reality.plane_strain(), NEO[0], NEO[1][:-1])
+    assert 1e3 * modulus == pytest.approx(silicones.get("ecoflex_00_30").shear_modulus, rel=2e-3)
+    names = [
+        name.removesuffix(" Medium") for name in (s.name for s in silicones.SILICONES.values())
+    ]
+    tension = reality.tension()
+    for name, s in zip(names, silicones.SILICONES.values(), strict=True):
+        modulus, _ = reality.fitted_law(tension[name], *NEO)
+        assert 1e3 * modulus == pytest.approx(s.crosshead_modulus, rel=5e-3)  # three digits
+
+
+NEO, LINEAR = ((law, reality.STRAINS) for law in (reality.neo_hookean, reality.linear))
+
+
+def test_a_ring_down_is_read_from_its_peaks():
+    """Of a decaying cosine, in steps of a twentieth of its period."""
+    time = np.arange(1, 261) * 0.01
+    drop = 5.0 * (1 - np.exp(-1.5 * time) * np.cos(2 * np.pi * time / 0.2))
+    ring = reality.Ring.of(time, drop)
+    # Parabolas through a cosine's three points, and what still swings at the end.
+    np.testing.assert_allclose(ring, [5.0, 0.2, 0.3], rtol=2e-3)
+    assert np.isnan(reality.Ring.of(time, 1 - np.exp(-time / 0.1)).decrement)
 
 
 def test_winners_of_a_search_are_judged_at_other_masses(tmp_path):

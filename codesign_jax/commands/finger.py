@@ -15,6 +15,7 @@ from codesign_jax.commands.flags import Finger as Options
 from codesign_jax.finger import Finger, Fit
 from codesign_jax.runs import tables
 from codesign_jax.scene.schema import InputError
+from codesign_jax.scene.silicones import LAWS
 
 SHOWN = {
     "pressure": ("kPa", 1e3),
@@ -89,7 +90,7 @@ def compare(mine: Finger, table: dict[str, np.ndarray], options: Options, consol
         for which, values in found.items():
             console.print(f"{which}: {_errors(table, values)}")
     if fit:
-        for line in _of_fit(fit, table):
+        for line in _of_fit(fit, table, mine.neo_hookean):
             console.print(line)
     if options.out:
         texts = {n: ["" if math.isnan(v) else f"{v:.9g}" for v in c] for n, c in columns.items()}
@@ -125,13 +126,13 @@ def _errors(table: dict[str, np.ndarray], values: dict[str, np.ndarray]) -> str:
     return ", ".join(parts) + ", root mean square"
 
 
-def _of_fit(fit: Fit, table: dict[str, np.ndarray]) -> list[str]:
+def _of_fit(fit: Fit, table: dict[str, np.ndarray], neo_hookean: bool) -> list[str]:
     modulus, gain = fingers.fitted(table)
     lines = []
     if modulus:
         lines.append(
             f"fitted: G = {1e-3 * fit.shear_modulus:.4g} kPa, standard error "
-            f"{100 * fit.spread[0]:.2g} %: --set "
+            f"{100 * fit.spread[0]:.2g} %: --set hand.material.law={LAWS[neo_hookean]} "
             f"hand.material.shear_modulus={fit.shear_modulus:.4g}"
         )
     if gain:

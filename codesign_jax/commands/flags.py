@@ -17,7 +17,7 @@ Overrides = Annotated[
         name="set",
         metavar="KEY=VALUE ...",
         help="Values that replace those of the scene, hand and objects files, by key path: "
-        "gravity=3.7 discretization.links=5 hand.material.shear_modulus=60e3 "
+        "gravity=3.7 discretization.links=5 hand.material=dragon_skin_10 "
         "objects.object.sphere.mass=0.2",
         help_behavior_hint="",
     ),

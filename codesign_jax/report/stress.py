@@ -21,7 +21,7 @@ from codesign_jax.report.statistics import wilson
 from codesign_jax.reuse import Program, shared
 from codesign_jax.runs.choice import Case
 from codesign_jax.runs.interrupts import interruptible
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, silicones
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome, Params, Trial
@@ -102,9 +102,8 @@ def simulate(case: Case, trials: int, key: jax.Array) -> Stress:
     warnings = _in_grasps(scene, params, *jax.tree.map(np.asarray, (found, qpos, drawn)))
     every = [("as it is", found)]
     every += [(name, interruptible(run, design, key, c)[0]) for name, c in variants(scene)]
-    law = not scene.effects.neo_hookean
-    other = dataclasses.replace(scene, effects=dataclasses.replace(scene.effects, neo_hookean=law))
-    name = f"{'neo-Hookean' if law else 'linear'} bending law"
+    other = _other_law(scene)
+    name = f"{'neo-Hookean' if other.effects.neo_hookean else 'linear'} bending law"
     try:
         run = _program(other, case, trials)
     except InputError:  # an engine that has one law only
@@ -115,6 +114,20 @@ def simulate(case: Case, trials: int, key: jax.Array) -> Stress:
         conditions.append(name)
         kept.append((codesign.verdicts(outcome) == codesign.VERDICTS.index("kept")).sum())
     return Stress(tuple(conditions), np.array(kept), trials, tuple(warnings))
+
+
+def _other_law(scene: Scene) -> Scene:
+    """The scene under the other bending law, with the modulus of walls that bend alike."""
+    law, factor = not scene.effects.neo_hookean, silicones.EQUAL_BEND
+    modulus = scene.hand.material.shear_modulus * (factor if law else 1 / factor)
+    material = dataclasses.replace(
+        scene.hand.material, shear_modulus=modulus, law=silicones.LAWS[law], silicone=None
+    )
+    return dataclasses.replace(
+        scene,
+        hand=dataclasses.replace(scene.hand, material=material),
+        effects=dataclasses.replace(scene.effects, neo_hookean=law),
+    )
 
 
 def sets(scene: Scene) -> int:

@@ -62,7 +62,9 @@ EFFECTS: Mapping[str, Effect] = {
     ),
     "disturb": Effect("the arm is shaken after the lift"),
     "ungrasp": Effect("the fingers let go at the end"),
-    "neo_hookean": Effect("rubber at large strain: fingers soften as they bend"),
+    "neo_hookean": Effect(
+        "rubber at large strain: fingers soften as they bend; not given: as the hand's material"
+    ),
     "lateral_threshold": Effect(
         "pressure resists sideways bending up to a moment",
         {"mujoco": {True: _SPRINGS}, "mjx": {True: _SPRINGS}},

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from codesign_jax.scene import keypaths, schema
+from codesign_jax.scene import keypaths, schema, silicones
 from codesign_jax.scene.hand_tables import (
     PARAMETERS,
     TIP,
@@ -46,6 +46,7 @@ def structure(hand: Hand) -> Hand:
         parameter=(),
         preset=(),
         pressure_limit=PressureLimit(0.0),
+        material=dataclasses.replace(hand.material, silicone=None, law=None),
     )
 
 
@@ -60,7 +61,8 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Han
       InputError: with every problem in the file.
     """
     problems: list[str] = []
-    table, path, places = keypaths.read("hands", name, overrides, problems)
+    table, path, places = keypaths.read("hands", name, overrides, problems, silicones.prepare)
+    silicones.complete(table, path.name, problems)
     hand = schema.parse(Hand, table, path.name, problems)
     if hand is not None and not hand.finger:
         problems.append(f"{path.name}.finger must name at least one finger")

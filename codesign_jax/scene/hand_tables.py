@@ -8,6 +8,7 @@ import dataclasses
 import math
 from typing import Any, NamedTuple
 
+from codesign_jax.scene import silicones
 from codesign_jax.scene.beams import strain_pressure
 from codesign_jax.scene.schema import choice, quantity, table
 
@@ -127,14 +128,19 @@ class Section:
 @table
 @dataclasses.dataclass(frozen=True)
 class Material:
-    """Silicone of the fingers.
+    """Silicone of the fingers: `material = NAME`, or a table of its name or of own numbers.
 
+    A shear modulus belongs to a bending law. A silicone's name gives both, its density and its
+    damping; without a name, or for a batch that was measured, law and modulus are given together.
     The two factors scale the stiffness that `morphology` derives for bending sideways and for
     torsion: for the former the fabric's side is the neutral line, which is an upper bound; for the
     latter walls are thin, which is a lower one.
 
     Attributes:
-      shear_modulus: Shear modulus G.
+      silicone: Name of the silicone, see docs/measurements.md. Not given: own numbers.
+      law: Bending law of the walls that the modulus belongs to. Not given, without a silicone:
+        `effects.neo_hookean` of the scene says it.
+      shear_modulus: Shear modulus G; required without a silicone, as the next two.
       density: Density.
       damping_time: Kelvin-Voigt damping time beta: a joint's damping is beta times its stiffness.
       lateral_factor: Factor on the stiffness of bending sideways.
@@ -144,6 +150,8 @@ class Material:
     shear_modulus: float = quantity("Pa", 1e3, 1e7)
     density: float = quantity("kg/m^3", 100, 10000)
     damping_time: float = quantity("s", 0, 1)
+    silicone: str | None = choice(*silicones.SILICONES, default=None)
+    law: str | None = choice(*silicones.LAWS, default=None)
     lateral_factor: float = quantity("", 0.05, 20, default=1.0)
     torsion_factor: float = quantity("", 0.05, 20, default=1.0)
 

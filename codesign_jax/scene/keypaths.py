@@ -7,7 +7,7 @@ entry of a list is named by its `name` or by its index: `objects.object.sphere.m
 
 import pathlib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from codesign_jax.scene import library, schema
@@ -18,11 +18,20 @@ _INDEX = re.compile(r"\[(\d+)\]")
 
 
 def read(
-    kind: str, name: str | pathlib.Path, overrides: Mapping[Any, Any] | None, problems: list[str]
+    kind: str,
+    name: str | pathlib.Path,
+    overrides: Mapping[Any, Any] | None,
+    problems: list[str],
+    prepare: Callable[[dict, dict[Path, Any]], None] = lambda table, changes: None,
 ) -> tuple[dict, pathlib.Path, Any]:
-    """Reads a file of hands, objects or controls, with other values in it."""
+    """Reads a file of hands, objects or controls, with other values in it.
+
+    Args:
+      prepare: Is told the file's table and the values by key path, both of which it may change.
+    """
     path = library.find(kind, name)
     table, changes = library.read(path), flatten(overrides or {})
+    prepare(table, changes)
     root = kind.removesuffix("s") if kind != "objects" else kind
     return table, path, apply(table, changes, path.name, problems, root=root)
 

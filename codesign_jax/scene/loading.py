@@ -6,7 +6,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from codesign_jax.scene import hand, key_frames, keypaths, library, objects, reach, rigid, schema
+from codesign_jax.scene import (
+    hand,
+    key_frames,
+    keypaths,
+    library,
+    objects,
+    reach,
+    rigid,
+    schema,
+    silicones,
+)
 from codesign_jax.scene.description import Scene, SceneFile
 from codesign_jax.scene.primitives import PRIMITIVES
 from codesign_jax.scene.tables import Accuracy, Fixture
@@ -67,6 +77,8 @@ def load(
         except schema.InputError as error:
             problems += error.problems
     if parsed is not None and "hand" in parts:
+        parsed = _with_law(parsed, parts["hand"].material, path.name, problems)
+        problems = keypaths.as_given(problems, places)
         # A path that the caller gives is not beside the scene's file.
         given = ("control",) in own
         source = parsed.control if given else _beside(path, parsed.control)
@@ -77,7 +89,7 @@ def load(
     if problems or parsed is None:
         raise schema.InputError(problems)
     parts["objects"] = reach.fit(parts["objects"], parts["hand"])
-    law = parsed.effects.neo_hookean
+    law = bool(parsed.effects.neo_hookean)
     parts["hand"] = hand.with_strain(parts["hand"], parsed.limits.strain, neo_hookean=law)
     parts["hand"] = key_frames.with_parameters(parts["hand"], parts["control"])
     names = [f.name for f in dataclasses.fields(SceneFile) if f.name not in parts]
@@ -85,6 +97,15 @@ def load(
     if problems := key_frames.check(scene, "control"):
         raise schema.InputError(problems)
     return scene
+
+
+def _with_law(scene: SceneFile, material: hand.Material, where: str, problems: list[str]) -> Any:
+    """The scene with the bending law that its hand's modulus belongs to, if it says none itself."""
+    law = scene.effects.neo_hookean
+    if problem := silicones.law_problem(law, material, where):
+        problems.append(problem)
+    law = silicones.of_law(material.law) if law is None else law
+    return dataclasses.replace(scene, effects=dataclasses.replace(scene.effects, neo_hookean=law))
 
 
 def _leave_out(table: dict, changes: dict[tuple, Any], where: str) -> None:
@@ -209,6 +230,8 @@ def check_together(scene: SceneFile, where: str) -> list[str]:
         )
     if isinstance(scene, Scene):
         problems += key_frames.check(scene, f"{where}.control")
+        law = silicones.law_problem(scene.effects.neo_hookean, scene.hand.material, where)
+        problems += [law] if law else []
     if isinstance(scene, Scene) and round(scene.end_time / h) != scene.num_steps:
         problems.append(
             f"{where}.phases ends after {scene.end_time:g} s: the number of steps is structure, "

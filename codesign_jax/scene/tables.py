@@ -14,7 +14,8 @@ from codesign_jax.scene.schema import choice, quantity, table
 class Effects:
     """What is simulated; an effect that is off has no joint, contact or branch in the program.
 
-    `codesign_jax.scene.effects` says what each means and which engines have it.
+    `codesign_jax.scene.effects` says what each means and which engines have it.  The bending law,
+    `neo_hookean`, is None in a file that leaves it to the hand's material, in a `Scene` never.
     """
 
     lateral_bending: bool = True
@@ -34,7 +35,7 @@ class Effects:
     friction_memory: bool = False
     disturb: bool = True
     ungrasp: bool = True
-    neo_hookean: bool = False
+    neo_hookean: bool | None = None
     lateral_threshold: bool = False
     pressure_dynamics: bool = False
     air_mass: bool = False

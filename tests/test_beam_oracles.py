@@ -475,15 +475,22 @@ def test_a_tapered_finger_is_the_integral_of_its_sections():
             springs, _ = morphology.joint_springs(hand, params, beams, links, ("bend",))
             chain = (beams.moment_per_pressure[f] / springs[f, :, 0]).sum()
             assert chain == pytest.approx(bend, rel=0.12 / links**2)
-        free = morphology.free_bends(hand, params._replace(pressure=np.full(2, 1e5)))
+        free = morphology.free_bends(
+            hand, params._replace(pressure=np.full(2, 1e5)), neo_hookean=False
+        )
         assert free[f] == pytest.approx(1e5 * bend, rel=1e-4)
 
 
 # --- one finger at rest, its fits and files -------------------------------------------------------
 
 
-def made(links=10, **effects):
-    loaded = scene.load("paper", overrides={"effects": effects, "discretization": {"links": links}})
+def material(law="linear"):
+    """Overrides of law and modulus."""
+    return {"hand.material.law": law, "hand.material.shear_modulus": 40e3}
+
+
+def made(links=10, law="linear"):
+    loaded = scene.load("paper", overrides=material(law) | {"discretization.links": links})
     space = parameters.design_space(loaded.hand, "2d")
     design = space.from_units([110.0, 0.0])
     return finger.of_design(loaded, space.params(design), 0)
@@ -547,8 +554,21 @@ def test_a_fit_finds_the_material_within_its_own_error(columns):
     assert (ratio > 0.4).all() and (ratio < 1.8).all()
 
 
+@pytest.mark.parametrize("pressure", [0.0, 20e3, 80e3])
+def test_a_free_neo_hookean_finger_is_the_chain_s(pressure):
+    mine = made(1, "neo_hookean")
+    loaded = scene.load("paper", overrides=material("neo_hookean"))
+    space = parameters.design_space(loaded.hand, "2d")
+    params = space.params(space.from_units([110.0, 0.0]))
+    params = params._replace(pressure=np.full(4, pressure))
+    bends = morphology.free_bends(loaded.hand, params, neo_hookean=True)
+    np.testing.assert_allclose(bends, finger.Rest.of(mine, pressure).angles.sum(), rtol=1e-6)
+    if pressure:
+        assert bends[0] > morphology.free_bends(loaded.hand, params, neo_hookean=False)[0]
+
+
 def test_a_fit_under_the_neo_hookean_law_is_exact_without_noise():
-    mine, truth = made(3, neo_hookean=True), (52e3, 0.8)
+    mine, truth = made(3, "neo_hookean"), (52e3, 0.8)
     found = finger.fit(mine, synthetic(mine.of_material(*truth), 0.0))
     np.testing.assert_allclose(found[:2], truth, rtol=1e-6)
 
@@ -591,6 +611,7 @@ def test_the_command_compares_and_fits(tmp_path, capsys):
     angles = np.rad2deg([finger.Rest.of(truth, p).angles.sum() for p in (20e3, 40e3)])
     path.write_text(f"pressure_kPa,angle_deg\n20,{angles[0]}\n40,{angles[1]}\n")
     line = ["finger", str(path), "--fit", "--design", "length=110", "--out", str(out)]
+    line += ["--set", *(f"{k}={v}" for k, v in material().items())]
     assert cli.main(line) == 0
     said = capsys.readouterr().out
     assert (

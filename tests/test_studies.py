@@ -59,16 +59,62 @@ def test_a_saddle_is_where_two_wells_part():
     assert calibration.saddle(corner) == 0.0
 
 
+def linear_hand(modulus):
+    """The default hand with a modulus [kPa] under the linear law."""
+    law = {"hand.material.law": "linear", "hand.material.shear_modulus": 1e3 * modulus}
+    return scene.load("paper", overrides=law).hand
+
+
+def test_a_second_wave_is_near_the_best_of_the_first(tmp_path):
+    units = calibration.space_filling(40, seed=1)
+    distances = np.abs(units[:, :3] - 0.5)  # the best are in the middle of three ranges
+    near = calibration.near_best(units, distances, 30, seed=2)
+    np.testing.assert_array_equal(near[:8], calibration.near_best(units, distances, 8, seed=2))
+    best = units[np.argsort(distances.max(-1))[: calibration.BEST]]
+    assert 0 <= near.min() and near.max() <= 1
+    for k, mine in enumerate(near):
+        # Reflected at the ends of a range a set is no farther away.
+        assert np.abs(mine - best[k % len(best)]).max() <= calibration.NEAR
+    # A file of scores is read by its constants' names; one of fewer is refused.
+    path, names = tmp_path / "scores.npz", [*OPEN]
+    more = np.insert(units, 4, 0.5, axis=1)
+    own = dict(units=more, distances=distances, names=[*names[:4], "shear_modulus", *names[4:]])
+    output.write_arrays(path, own)
+    np.testing.assert_array_equal(calibration.scored(path)[0], units)
+    output.write_arrays(path, dict(units=units[:, 1:], distances=distances, names=names[1:]))
+    with pytest.raises(scene.InputError, match="has no constant tilt"):
+        calibration.scored(path)
+    # So are costs of other sets.
+    wave = tmp_path / "wave.npz"
+    output.write_arrays(wave, dict(units=units, costs=np.zeros((7, 2, 2, 3))))
+    assert len(calibration.simulated(wave, units)) == 7
+    assert len(calibration.simulated(wave, np.concatenate([units[:9], near]))) == 7
+    with pytest.raises(scene.InputError, match="has other sets"):
+        calibration.simulated(wave, near)
+    lines = calibration.told(units, {"middle": 9 * distances[:, 0], "first": distances[:, 1]})
+    assert lines[0] == f"{(9 * distances[:, 0] <= 3).sum()} of 40 sets are not ruled out"
+    assert [line.split()[0] for line in lines[4:-1]] == names
+
+
 def test_statements_rule_out_what_they_should():
     """Flat landscapes on which nothing, or everything, succeeds; two wells are two regions."""
     paper = scene.load("paper")
     flat = [np.full((12, 12), c) for c in (0.0, 2.5)]
     costs = np.repeat(np.array([*flat, wells()])[..., None], 6, -1)
-    own = calibration.values(np.stack([calibration.own_set(paper, g) for g in (35.0, 40.0, 70.0)]))
+    own = calibration.values(np.stack([calibration.own_set(paper)] * 3))
     np.testing.assert_allclose(own["cost_maximum"], paper.cost.maximum, rtol=1e-9)
     found = calibration.score(costs, own, paper)
     # p M_p h / EI is 1.707 at 25 mm of height, 2 mm of wall, 80 kPa and 35 kPa, and goes by 1/G.
-    np.testing.assert_allclose(found["free strain"], [0.207 / 0.06, 0, 0], atol=0.01)
+    soft = linear_hand(35.0)
+    [strain, *same] = calibration.free_strain(own, soft, neo_hookean=False)
+    assert strain == pytest.approx(1.707, abs=1e-3) and same == [strain] * 2
+    # A neo-Hookean wall of the same modulus is up to four times softer at large strain.
+    softer = calibration.free_strain(own, soft, neo_hookean=True)
+    assert softer[0] > 1.5 * strain
+    own_strain = calibration.free_strain(
+        own, paper.hand, neo_hookean=bool(paper.effects.neo_hookean)
+    )
+    np.testing.assert_allclose(found["free strain"], np.maximum(own_strain - 1.5, 0) / 0.06)
     good, bad, two = (({n: d[i] for n, d in found.items()}) for i in range(3))
     assert good["solutions"] == 0 and good["poor seeds"] > calibration.CUTOFF
     assert good["420 simulations"] > calibration.CUTOFF, "after the first episode"

@@ -73,9 +73,9 @@ def _tests(scene: Scene, params: Params, verdict: str | None, found: Stress | No
 def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSection:
     density = scene.hand.material.density
     rows, limits = [], morphology.pressure_limits(scene.hand, params)
-    for i, (size, angle) in enumerate(
-        zip(sizes, morphology.free_bends(scene.hand, params), strict=True)
-    ):
+    law = bool(scene.effects.neo_hookean)
+    bends = morphology.free_bends(scene.hand, params, neo_hookean=law)
+    for i, (size, angle) in enumerate(zip(sizes, bends, strict=True)):
         pressure = float(params.pressure[i])
         limit = limits[i]
         ends = list(dict.fromkeys((size.base, size.tip)))  # one, unless it is tapered

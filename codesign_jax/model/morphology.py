@@ -91,12 +91,31 @@ def _beam(hand: Hand, own: Section) -> Beam:
     return beam(own.height, own.wall, width=own.width, shear_modulus=modulus, density=density)
 
 
-def free_bends(hand: Hand, params: Params) -> np.ndarray:
-    """Angles by which free fingers bend at their pressures [rad], by the linear law, (finger,)."""
-    exact = jax.tree.map(lambda v: np.asarray(v, float), params)
-    beams = finger_beams(hand, exact, 1 if params.tip is None else 100)
+def free_bends(hand: Hand, params: Params, *, neo_hookean: bool) -> np.ndarray:
+    """Angles by which free fingers bend at their pressures [rad], by a bending law, (finger,)."""
+    exact, links = jax.tree.map(lambda v: np.asarray(v, float), params), 1
+    if params.tip is not None:
+        links = 100
+    beams = finger_beams(hand, exact, links)
     curvature = np.asarray(exact.pressure)[:, None] * beams.moment_per_pressure / beams.bending
+    if neo_hookean:
+        curvature = _softened(curvature, sections(hand, exact, at_joints(links)))
     return np.asarray(curvature.mean(1) * exact.length)
+
+
+def _softened(linear: np.ndarray, own: Section) -> np.ndarray:
+    """Curvature of neo-Hookean walls that have a curvature by the linear law, of any shape.
+
+    At large strain they carry a quarter of the linear moment, so that it is at most four times as
+    large; halved 50 times the interval is as short as rounding.
+    """
+    low, high = linear, 4 * linear
+    for _ in range(50):
+        middle = (low + high) / 2
+        lacking = softening(middle, own.height, own.wall, width=own.width)
+        enough = middle * (1 - lacking) >= linear
+        low, high = np.where(enough, low, middle), np.where(enough, middle, high)
+    return (low + high) / 2
 
 
 class Segments(NamedTuple):

@@ -220,7 +220,8 @@ def of_design(scene: Scene, params: Params) -> list[str]:
     """Warnings of a design itself, of which nothing is simulated."""
     found: list[str] = []
     limits = morphology.pressure_limits(scene.hand, params)
-    for f, bend in enumerate(morphology.free_bends(scene.hand, params)):
+    law = bool(scene.effects.neo_hookean)
+    for f, bend in enumerate(morphology.free_bends(scene.hand, params, neo_hookean=law)):
         limit = limits[f]
         if float(params.pressure[f]) > 0.99 * limit:
             found.append(f"finger {f}: its pressure is at its limit, {limit / 1e3:.0f} kPa")

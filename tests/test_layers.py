@@ -201,7 +201,7 @@ MOST_LINES = {
     "codesign_jax/env": 350,
     "codesign_jax/engines": 12_300,
     "codesign_jax/export": 1_600,
-    "codesign_jax/model": 1_720,
+    "codesign_jax/model": 1_800,
     "codesign_jax/optimize": 1_300,
     "codesign_jax/report": 1_830,
     "codesign_jax/runs": 3_160,

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from codesign_jax.scene import silicones
 from codesign_jax.scene.beams import Beam, beam, softening
 from codesign_jax.scene.hand import Hand, highest_pressure
 from codesign_jax.scene.primitives import block_inertia
@@ -91,14 +92,19 @@ def _beam(hand: Hand, own: Section) -> Beam:
     return beam(own.height, own.wall, width=own.width, shear_modulus=modulus, density=density)
 
 
-def free_bends(hand: Hand, params: Params, *, neo_hookean: bool) -> np.ndarray:
-    """Angles by which free fingers bend at their pressures [rad], by a bending law, (finger,)."""
+def free_bends(hand: Hand, params: Params, *, neo_hookean: bool | None = None) -> np.ndarray:
+    """Angles by which free fingers bend at their pressures [rad], shape (finger,).
+
+    Args:
+      neo_hookean: The bending law; None for that of the hand's material.
+    """
+    law = silicones.of_law(hand.material.law) if neo_hookean is None else neo_hookean
     exact, links = jax.tree.map(lambda v: np.asarray(v, float), params), 1
     if params.tip is not None:
         links = 100
     beams = finger_beams(hand, exact, links)
     curvature = np.asarray(exact.pressure)[:, None] * beams.moment_per_pressure / beams.bending
-    if neo_hookean:
+    if law:
         curvature = _softened(curvature, sections(hand, exact, at_joints(links)))
     return np.asarray(curvature.mean(1) * exact.length)
 

@@ -102,7 +102,7 @@ def simulate(case: Case, trials: int, key: jax.Array) -> Stress:
     warnings = _in_grasps(scene, params, *jax.tree.map(np.asarray, (found, qpos, drawn)))
     every = [("as it is", found)]
     every += [(name, interruptible(run, design, key, c)[0]) for name, c in variants(scene)]
-    other = _other_law(scene)
+    other = silicones.under(scene, neo_hookean=not scene.effects.neo_hookean)
     name = f"{'neo-Hookean' if other.effects.neo_hookean else 'linear'} bending law"
     try:
         run = _program(other, case, trials)
@@ -114,20 +114,6 @@ def simulate(case: Case, trials: int, key: jax.Array) -> Stress:
         conditions.append(name)
         kept.append((codesign.verdicts(outcome) == codesign.VERDICTS.index("kept")).sum())
     return Stress(tuple(conditions), np.array(kept), trials, tuple(warnings))
-
-
-def _other_law(scene: Scene) -> Scene:
-    """The scene under the other bending law, with the modulus of walls that bend alike."""
-    law, factor = not scene.effects.neo_hookean, silicones.EQUAL_BEND
-    modulus = scene.hand.material.shear_modulus * (factor if law else 1 / factor)
-    material = dataclasses.replace(
-        scene.hand.material, shear_modulus=modulus, law=silicones.LAWS[law], silicone=None
-    )
-    return dataclasses.replace(
-        scene,
-        hand=dataclasses.replace(scene.hand, material=material),
-        effects=dataclasses.replace(scene.effects, neo_hookean=law),
-    )
 
 
 def sets(scene: Scene) -> int:

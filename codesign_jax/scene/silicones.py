@@ -12,6 +12,7 @@ Traceback (most recent call last):
 codesign_jax.scene.schema.InputError: silicone 'dragonskin' unknown; valid: ...
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 from codesign_jax.scene import schema
@@ -245,6 +246,24 @@ def law_problem(neo_hookean: bool | None, material: Any, where: str) -> str | No
         f"{where}.effects.neo_hookean = {str(neo_hookean).lower()} stands against "
         f"hand.material.law = {material.law!r}{source}: a modulus belongs to its law; leave out "
         "effects.neo_hookean, or give hand.material.law and hand.material.shear_modulus"
+    )
+
+
+def under(scene: Any, *, neo_hookean: bool) -> Any:
+    """A scene under a bending law, with the modulus of walls that bend alike if it is another one.
+
+    Args:
+      scene: A `Scene`; its numbers may be traced.
+    """
+    if scene.effects.neo_hookean == neo_hookean:
+        return scene
+    material, factor = scene.hand.material, EQUAL_BEND if neo_hookean else 1 / EQUAL_BEND
+    modulus, law = material.shear_modulus * factor, LAWS[neo_hookean]
+    material = dataclasses.replace(material, shear_modulus=modulus, law=law, silicone=None)
+    return dataclasses.replace(
+        scene,
+        hand=dataclasses.replace(scene.hand, material=material),
+        effects=dataclasses.replace(scene.effects, neo_hookean=neo_hookean),
     )
 
 

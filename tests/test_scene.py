@@ -127,7 +127,7 @@ LAWS = {
         "hand.material.law=linear",
         "hand.material.shear_modulus=50e3",
         "effects.neo_hookean=true",
-    ): "effects.neo_hookean = true stands against hand.material.law = 'linear': a modulus",
+    ): "effects.neo_hookean = true stands against hand.material.law = 'linear'",
 }
 
 

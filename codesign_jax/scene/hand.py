@@ -3,7 +3,7 @@
 >>> from codesign_jax import hand
 >>> tripod = hand.load("tripod3")
 >>> len(tripod.finger), tripod.material.shear_modulus  # Pa
-(3, 56000.0)
+(3, 88000.0)
 >>> hand.load("tripod")
 Traceback (most recent call last):
 codesign_jax.scene.schema.InputError: hands: 'tripod' unknown; did you mean 'tripod3'?

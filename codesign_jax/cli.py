@@ -6,7 +6,7 @@ import warnings
 
 import tyro
 
-from codesign_jax import reuse
+from codesign_jax import reuse, terminal
 from codesign_jax.commands import status
 from codesign_jax.commands.flags import (
     Check,
@@ -55,7 +55,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     def run() -> int:
         if arguments is None:
-            warnings.showwarning = lambda text, *_: print(f"warning: {text}", file=sys.stderr)
+            warnings.showwarning = lambda text, *_: terminal.say(f"warning: {text}", error=True)
         if given == ["--version"]:
             return _version()
         bad = [a for a in given if a.encode(errors="replace").decode() != a]
@@ -80,9 +80,9 @@ def main(arguments: list[str] | None = None) -> int:
 def _version() -> int:
     """Prints the version of the installed package."""
     try:
-        print(f"codesign-jax {importlib.metadata.version('codesign-jax')}")
+        terminal.say(f"codesign-jax {importlib.metadata.version('codesign-jax')}")
     except importlib.metadata.PackageNotFoundError:
-        print("codesign-jax, not installed: run from its sources")
+        terminal.say("codesign-jax, not installed: run from its sources")
     return 0
 
 

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 
 # What stands in a line may import lines before it, and its own folder.
 LAYERS = """
-files sizes
+files sizes terminal
 reuse
 store
 types provenance compiler optimize

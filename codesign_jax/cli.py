@@ -1,6 +1,7 @@
 """The `codesign` command.  Nothing heavy is imported before its flags are parsed."""
 
 import importlib.metadata
+import os
 import sys
 import warnings
 
@@ -54,7 +55,10 @@ def main(arguments: list[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
 
     def run() -> int:
+        terminal.tolerate(sys.stdout)  # the parser of flags prints too
         if arguments is None:
+            # XLA's alarm of a compilation of two minutes reads like a crash; what fails is raised.
+            os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
             warnings.showwarning = lambda text, *_: terminal.say(f"warning: {text}", error=True)
         if given == ["--version"]:
             return _version()

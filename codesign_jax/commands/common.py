@@ -256,9 +256,9 @@ def engine_problems(name: str, overrides: Sequence[Sequence[str]] = ()) -> list[
     ]
 
 
-def counted(number: int, noun: str) -> str:
+def counted(number: int, noun: str, plural: str = "s") -> str:
     """A number of things in words, such as "1 call" and "2 calls"."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
+    return f"{number} {noun}{'' if number == 1 else plural}"
 
 
 def number(text: str) -> float | None:

@@ -43,7 +43,7 @@ def of(run: Callable[[], int]) -> int:
         for problem in error.problems:
             say(f"error: {problem}", error=True)
         return 2
-    except RuntimeError as error:
+    except (RuntimeError, AssertionError) as error:
         problem = _known(error)
         if problem is None:
             raise
@@ -65,7 +65,7 @@ def of(run: Callable[[], int]) -> int:
         return INTERRUPTED
 
 
-def _known(error: RuntimeError) -> str | None:
+def _known(error: Exception) -> str | None:
     """What an error says to a user who can do something about it; None of any other."""
     from codesign_jax.compiler.ffi import KernelUnavailable
     from codesign_jax.runs.errors import RunError
@@ -84,10 +84,11 @@ def _lacking_platform() -> str | None:
         return None
     try:
         jax.devices()
-    except RuntimeError as error:
+    except Exception as error:  # each of JAX's plugins has its own
+        why = f" ({error})" if str(error) else ""
         return (
-            f"JAX_PLATFORMS={asked} asks for a device that JAX has not got here ({error}): leave "
-            "it out, or give cpu"
+            f"JAX_PLATFORMS={asked} asks for a device that JAX has not got here{why}: leave it "
+            "out, or give cpu"
         )
     return None
 

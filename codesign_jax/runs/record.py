@@ -149,20 +149,24 @@ def _shapes(record: Any, settings: Settings) -> Iterator[tuple[str, Any, tuple]]
     yield "episode", state.episode, ()
     yield "key", state.key, ()
     for name, value in history.outcomes._asdict().items():
-        yield f"trials/{name}", value, (e, n, t)
+        if value is not None or name not in _NOT_EVERYWHERE:
+            yield f"trials/{name}", value, (e, n, t)
     yield "population", history.population, (e, n, p)
     for name in ("cost", "weight", "ancestors"):
         yield name, getattr(history, name), (e, n)
     if record.test is not None:
         tested = n, settings.test_rounds * settings.trials
         for name, value in record.test._asdict().items():
-            yield f"test/{name}", value, tested
+            if value is not None or name not in _NOT_EVERYWHERE:
+                yield f"test/{name}", value, tested
     if record.start is not None:
         yield "start/design", record.start.design, (p,)
         yield "start/cost", record.start.cost, ()
         yield "start/candidates", record.start.candidates, ()
 
 
+_NOT_EVERYWHERE = {"capped", "residual"}
+"""Arrays that not every engine tells."""
 _WHOLE = {"episode", "ancestors", "status", "bad_step", "candidates"}
 """Arrays of whole numbers; the others have real ones."""
 
@@ -175,8 +179,6 @@ def _problem(record: Record, settings: Settings) -> str:
     try:
         for name, value, shape in _shapes(record, settings):
             last = name.rpartition("/")[2]
-            if value is None and last in ("capped", "residual"):  # not every engine tells
-                continue
             kinds = "iu" if last in _WHOLE else "f"
             if value.shape != shape or (name != "key" and value.dtype.kind not in kinds):
                 return name

@@ -6,6 +6,7 @@ import os
 import shlex
 import sys
 import traceback
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ def main(options: Optimize) -> int:
     plans = {folder: runs.variant(plan, own) for folder, own in every.items()}
     place = options.out or next(iter(every))
     common.refuse(common.place_problems("--out", place, folder=True))
+    _refuse_links(options, every)
     for folder, own in every.items():
         runs.check_folder(folder, scene, own, fresh=options.fresh)
     for note in preflight.notes(scene, plan.space, _ends(plan.space)):
@@ -127,6 +129,19 @@ def _tell(plan: Plan, result: RunResult, folder: Path, trials: int, console: Con
     console.print(f"figure: {path}")
     console.print(f"results: {folder}")
     console.print(f"to look at: {shlex.join(['codesign', 'report', str(folder)])}")
+
+
+def _refuse_links(options: Optimize, folders: Iterable[Path]) -> None:
+    """Refuses links below --out, where a command of several runs chooses the folders."""
+    if options.out is None:
+        return
+    places = {
+        p for folder in folders for p in (folder, *folder.parents) if options.out in p.parents
+    }
+    links = sorted(str(place) for place in places if place.is_symlink())
+    common.refuse(
+        [f"{link} is a symbolic link: put the folder itself in its place" for link in links]
+    )
 
 
 def _ends(space: DesignSpace) -> dict[str, np.ndarray]:

@@ -304,7 +304,7 @@ class Loop:
         """Ends a run whose last episode or final test has not one trial that did not fail."""
         outcomes = record.failed_outcomes()
         if outcomes is not None:
-            _all_failed(outcomes, self.run_directory.path, self.plan.settings.cost)
+            refuse_all_failed(outcomes, self.run_directory.path, self.plan.settings.cost)
 
     def _save_failures(self, e: int, info: EpisodeInfo) -> None:
         if not types.failed(np.asarray(info.outcomes.status)).any():
@@ -381,7 +381,7 @@ def _final_test(plan: Plan, record: Record) -> FinalTest | None:
     return None if record.test is None else codesign.summarize_test(plan.scene, record.test)
 
 
-def _all_failed(outcomes: Outcome, folder: Path, cost: str) -> None:
+def refuse_all_failed(outcomes: Outcome, folder: Path, cost: str) -> None:
     status = np.asarray(outcomes.status)
     # A state that is no number has a first bad step; a cost of the user's that is none has none.
     of_cost = ((status & Status.NONFINITE) != 0) & (np.asarray(outcomes.bad_step) < 0)

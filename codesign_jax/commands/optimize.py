@@ -135,13 +135,10 @@ def _refuse_links(options: Optimize, folders: Iterable[Path]) -> None:
     """Refuses links below --out, where a command of several runs chooses the folders."""
     if options.out is None:
         return
-    places = {
-        p for folder in folders for p in (folder, *folder.parents) if options.out in p.parents
-    }
-    links = sorted(str(place) for place in places if place.is_symlink())
-    common.refuse(
-        [f"{link} is a symbolic link: put the folder itself in its place" for link in links]
-    )
+    places = {place for folder in folders for place in (folder, *folder.parents)}
+    links = sorted(p for p in places if options.out in p.parents and p.is_symlink())
+    hint = "is a symbolic link: put the folder itself in its place"
+    common.refuse([f"{link} {hint}" for link in links])
 
 
 def _ends(space: DesignSpace) -> dict[str, np.ndarray]:

@@ -27,7 +27,7 @@ FORMATS = ("glb", "gltf", "obj", "off", "ply", "stl")
 MOST_BYTES = 1 << 24
 """Largest file; a binary STL of 200,000 faces has 10 MB."""
 MOST_FACES = 200_000
-_MOST_PARTS = 1000
+MOST_PARTS = 1000
 """Most bodies of a file: each costs trimesh a millisecond, however small it is."""
 _STL_HEAD, _STL_FACE = 84, 50
 """Bytes of a binary STL before its faces, the last four of them their number, and of a face."""
@@ -118,11 +118,11 @@ def _text(content: bytes, kind: str) -> str:
     """A mesh file of text, in which the parser finds nothing that takes it long."""
     # What is no UTF-8 trimesh would give to a detector of encodings, which takes minutes.
     text = content.decode("utf-8", "replace")
-    if kind == "stl" and text.lower().count("endsolid") > _MOST_PARTS:
-        raise ValueError(f"more than {_MOST_PARTS:,} solids")
+    if kind == "stl" and text.lower().count("endsolid") > MOST_PARTS:
+        raise ValueError(f"more than {MOST_PARTS:,} solids")
     if _COMMA.search(text):
         raise ValueError("its numbers have decimal commas; save it with decimal points")
-    if kind == "obj" and sum(1 for _ in _GROUP.finditer(text)) > _MOST_PARTS:
+    if kind == "obj" and sum(1 for _ in _GROUP.finditer(text)) > MOST_PARTS:
         text = _GROUP.sub("", text)
     return text
 
@@ -136,8 +136,8 @@ def _check_gltf(content: bytes) -> None:
             uri = shown(buffer["uri"])
             raise ValueError(f"its numbers are in another file, {uri}; save it as .glb")
     for key in ("nodes", "meshes"):
-        if len(parts[key]) > _MOST_PARTS:
-            raise ValueError(f"{len(parts[key]):,} {key}, more than {_MOST_PARTS:,}")
+        if len(parts[key]) > MOST_PARTS:
+            raise ValueError(f"{len(parts[key]):,} {key}, more than {MOST_PARTS:,}")
     children = [child for node in parts["nodes"] for child in node.get("children", [])]
     if len(children) != len({*children}):
         raise ValueError("a node has two parents")

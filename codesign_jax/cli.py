@@ -1,12 +1,13 @@
 """The `codesign` command.  Nothing heavy is imported before its flags are parsed."""
 
 import importlib.metadata
+import os
 import sys
 import warnings
 
 import tyro
 
-from codesign_jax import reuse
+from codesign_jax import reuse, terminal
 from codesign_jax.commands import status
 from codesign_jax.commands.flags import (
     Check,
@@ -54,8 +55,11 @@ def main(arguments: list[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
 
     def run() -> int:
+        terminal.tolerate(sys.stdout)  # the parser of flags prints too
         if arguments is None:
-            warnings.showwarning = lambda text, *_: print(f"warning: {text}", file=sys.stderr)
+            # XLA's alarm of a compilation of two minutes reads like a crash; what fails is raised.
+            os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+            warnings.showwarning = lambda text, *_: terminal.say(f"warning: {text}", error=True)
         if given == ["--version"]:
             return _version()
         bad = [a for a in given if a.encode(errors="replace").decode() != a]
@@ -80,9 +84,9 @@ def main(arguments: list[str] | None = None) -> int:
 def _version() -> int:
     """Prints the version of the installed package."""
     try:
-        print(f"codesign-jax {importlib.metadata.version('codesign-jax')}")
+        terminal.say(f"codesign-jax {importlib.metadata.version('codesign-jax')}")
     except importlib.metadata.PackageNotFoundError:
-        print("codesign-jax, not installed: run from its sources")
+        terminal.say("codesign-jax, not installed: run from its sources")
     return 0
 
 

@@ -1,10 +1,11 @@
-"""Writes files as a whole or not at all."""
+"""Writes files as a whole or not at all, and says which files of a folder are to be opened."""
 
 import contextlib
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+import stat
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 
@@ -25,6 +26,45 @@ def atomically(path: Path) -> Iterator[Path]:
             os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def append(path: Path, text: str) -> None:
+    """Adds text to a file of this name alone; makes the file if there is none.
+
+    A link is not followed (OSError), and a FIFO is not waited for. Of a file that has other names
+    too, such as of a copy by `cp -al`, the others stay as they are.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    how = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
+    with naming(path), os.fdopen(os.open(path, how, 0o666), "ab") as file:
+        if os.fstat(file.fileno()).st_nlink == 1:
+            file.write(text.encode())
+            return
+    with atomically(path) as part:
+        part.write_bytes(path.read_bytes() + text.encode())
+
+
+def special(folder: Path, names: Iterable[str]) -> list[str]:
+    """What lies under these names in a folder and is neither a file nor a folder.
+
+    A link leads out of the folder, a FIFO has its reader wait for ever; archives may hold both.
+    Folders are looked into. A name that is not there is none of them.
+
+    Returns:
+      Paths relative to the folder, sorted.
+    """
+    found, left = [], [*names]
+    while left:
+        name = left.pop()
+        try:
+            mode = os.lstat(folder / name).st_mode
+            inside = os.listdir(folder / name) if stat.S_ISDIR(mode) else []
+        except OSError:  # it is not there, or no longer; or it cannot be read, as its reader says
+            continue
+        left += [f"{name}/{other}" for other in inside]
+        if not stat.S_ISDIR(mode) and not stat.S_ISREG(mode):
+            found.append(name)
+    return sorted(found)
 
 
 @contextlib.contextmanager

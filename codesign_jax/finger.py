@@ -14,6 +14,7 @@ True
 """
 
 import csv
+import io
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -53,6 +54,8 @@ COLUMNS = {
 }
 """Columns of a file of measurements: what their unit measures, and what they are."""
 
+_MOST_LETTERS = 1_000_000
+"""Most characters of a measured table."""
 MEASURED = ("angle", "tip_force", "blocked_force", "deflection")
 """Columns that are compared with the model."""
 
@@ -265,16 +268,19 @@ def read(path: Path) -> dict[str, np.ndarray]:
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = [(n, line) for n, line in enumerate(file, 1) if line.strip()]
+            text = file.read(_MOST_LETTERS + 1)
+            lines = [(n, line) for n, line in enumerate(io.StringIO(text, newline=""), 1)]
     except (OSError, UnicodeDecodeError) as error:
         why = getattr(error, "strerror", None) or "no UTF-8 text"
         raise InputError([f"{path}: {why}"]) from error
-    lines = [(n, line) for n, line in lines if not line.lstrip().startswith("#")]
+    if len(text) > _MOST_LETTERS:
+        raise InputError([f"{path} has more than {_MOST_LETTERS:,} characters"])
+    lines = [(n, v) for n, v in lines if v.strip() and not v.lstrip().startswith("#")]
     if not lines:
         raise InputError(
             [f"{path} is empty; its head names columns, such as pressure_kPa,angle_deg"]
         )
-    head, *rows = csv.reader([line for _, line in lines])
+    head, *rows = (_row(path, number, line) for number, line in lines)
     names, factors, problems = _columns([c.strip() for c in head])
     values = []
     for (number, _), row in zip(lines[1:], rows, strict=True):
@@ -299,6 +305,15 @@ def read(path: Path) -> dict[str, np.ndarray]:
     if problems:
         raise InputError([f"{path}: {p}" for p in problems])
     return table
+
+
+def _row(path: Path, number: int, line: str) -> list[str]:
+    """The cells of a line; quotes that leave it are refused."""
+    try:
+        [cells] = csv.reader([line], strict=True)
+    except (csv.Error, ValueError) as error:
+        raise InputError([f"{path}: line {number} is no row of cells: {error}"]) from error
+    return cells
 
 
 def _columns(head: list[str]) -> tuple[list[str], list[float], list[str]]:

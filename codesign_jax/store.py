@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from codesign_jax import files, reuse
+from codesign_jax import files, reuse, terminal
 
 MOST = 2**30
 """Most bytes of arrays that a file may unpack to."""
@@ -37,7 +37,9 @@ def save(path: Path, arrays: Arrays) -> None:
 
 
 def load(path: Path) -> dict[str, np.ndarray]:
-    """Reads the arrays of a file."""
+    """Reads the arrays of a file; texts in them are one line each."""
+    if path.exists() and not path.is_file():  # a FIFO would be waited for
+        raise StoreError(f"{path} is no file")
     with path.open("rb") as file:
         return unpacked(file, path)
 
@@ -60,10 +62,17 @@ def unpacked(file: BinaryIO, path: Path) -> dict[str, np.ndarray]:
             with np.load(file, allow_pickle=False) as stored:
                 arrays = {name: np.asarray(stored[name]) for name in stored.files}
             if str(arrays.pop(_DIGEST)) == _digest(arrays):
-                return arrays
+                return {name: _lines(value) for name, value in arrays.items()}
     except Exception as error:  # zip, zlib and NumPy have a dozen kinds for what damage they find
         raise StoreError(f"{path} is damaged, or another version wrote it: {error!r}") from error
     raise StoreError(f"{path} is damaged: it does not hold what was written")
+
+
+def _lines(value: np.ndarray) -> np.ndarray:
+    """An array, of texts the lines that `terminal.line` makes of them."""
+    if value.dtype.kind != "U" or all(map(str.isprintable, value.flat)):
+        return value
+    return np.array([terminal.line(text) for text in value.flat]).reshape(value.shape)
 
 
 def _digest(arrays: Arrays) -> str:

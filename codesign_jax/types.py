@@ -24,7 +24,7 @@ class Status(enum.IntFlag):
     grip, which does not let go.
 
     Attributes:
-      NONFINITE: A number of the state was not finite.
+      NONFINITE: A number of the state, or a cost of the user's own, was not finite.
       SPEED: A velocity beyond the scene's limit.
       PENETRATION: The object fell through the table.
       SOLVER_CAP: The solver stopped at its limit of iterations in a step before the verdict, with
@@ -55,7 +55,7 @@ WARNINGS = Status.SOLVER_CAP
 """Bits that do not make a trial a failed one."""
 
 MEANINGS = {
-    Status.NONFINITE: "a number of the state was not finite",
+    Status.NONFINITE: "a number of the state, or a cost of the user's own, was not finite",
     Status.SPEED: "a velocity beyond the scene's limit",
     Status.PENETRATION: "the object fell through the table",
     Status.SOLVER_CAP: "a warning only: the contact solver stopped at its limit of iterations, "

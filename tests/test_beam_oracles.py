@@ -593,6 +593,12 @@ WRONG = {
     "pressure_kPa,load_N\n1,2": "no measured value; columns of them: angle, tip_force",
     "pressure_kPa,deflection_mm\n1,2": "a deflection has no load beside it",
     "# nothing": "is empty",
+    'pressure_kPa,angle_deg\n"1,2\n3,4\n': "line 2 is no row of cells",
+    'pressure_kPa,angle_deg\n"1\n",2\n': "line 2 is no row of cells",
+    '"\n1,2\n': "line 1 is no row of cells",
+    'pressure_kPa,angle_deg\n"1"2,3\n': "line 2 is no row of cells",
+    "pressure_kPa,angle_deg\n" + "1" * 200_000 + ",2\n": "line 2 is no row of cells",
+    "# " + "a" * 1_000_000: "more than 1,000,000 characters",
 }
 
 

@@ -130,6 +130,8 @@ BAD = {
     ],
     "frame[1].z: 'pressure' has the unit Pa, not m": [{"time": 0}, FRAME | {"z": "pressure"}],
     "frame[1].z = 'arm_z zero_height' is no sum": [{"time": 0}, FRAME | {"z": "arm_z zero_height"}],
+    "frame[0].time = 1000": [{"time": 10**400}],
+    "is too large": [{"time": 0}, FRAME | {"pressure": [10**310, 0, 0, 0]}],
     "frame[1].pressure has 3 entries, the hand 4 fingers": [
         {"time": 0}, FRAME | {"pressure": [0, 0, 0]}
     ],

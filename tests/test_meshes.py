@@ -161,6 +161,90 @@ def test_a_surface_that_cuts_through_itself(tmp_path):
         _ = found.grid
 
 
+def test_parts_that_overlap_are_named_where_they_have_no_grid(tmp_path, monkeypatch):
+    """Walls between them want a grid too fine to be built."""
+    monkeypatch.setattr(grid, "MAX_NODES", 1000)
+    other = box()
+    other.apply_translation([0.02, 0.01, 0])
+    with pytest.raises(schema.InputError, match="parts that overlap"):
+        _ = solid(tmp_path, trimesh.util.concatenate([box(), other]), voxel_error=1e-3).grid
+
+
+TETRAHEDRON = ((0, 0, 0), (0.04, 0, 0), (0, 0.04, 0), (0, 0, 0.04))
+CORNERS = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2))
+
+
+def as_text(kind, write="{:g}"):
+    """A tetrahedron as a mesh file of text, with numbers as `write` has them."""
+    rows = [" ".join(write.format(v) for v in p) for p in TETRAHEDRON]
+    if kind == "obj":
+        lines = [f"v {row}" for row in rows] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in CORNERS]
+    elif kind == "stl":
+        lines = ["solid a"]
+        for face in CORNERS:
+            lines += ["facet normal 0 0 0", "outer loop"]
+            lines += [*(f"vertex {rows[k]}" for k in face), "endloop", "endfacet"]
+        lines.append("endsolid a")
+    else:
+        lines = ["OFF", "4 4 0", *rows, *(f"3 {a} {b} {c}" for a, b, c in CORNERS)]
+    if kind == "ply":
+        head = ["ply", "format ascii 1.0", "element vertex 4"]
+        head += [f"property float {axis}" for axis in "xyz"]
+        head += ["element face 4", "property list uchar int vertex_indices", "end_header"]
+        lines = head + lines[2:]
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize("kind", ["obj", "stl", "off", "ply"])
+def test_decimal_commas_are_named(kind, tmp_path):
+    path = tmp_path / f"a.{kind}"
+    path.write_text(as_text(kind))
+    assert len(reading.read(path).faces) == 4
+    for write in ("{:.3f}", "\t-{:.1f}", "{:.2e}"):
+        text = as_text(kind, write).replace(".", ",")
+        path.write_text(text.replace("ascii 1,0", "ascii 1.0"))
+        [problem] = refusals(reading.read, path)
+        assert "decimal commas" in problem
+
+
+@pytest.mark.parametrize("more", [b"\r\n", b"\0" * 50, b"colours of a program" * 9])
+def test_bytes_behind_the_last_face_of_a_binary_stl_are_left(more, tmp_path):
+    path = tmp_path / "a.stl"
+    box().export(path)
+    whole = path.read_bytes()
+    before = reading.read(path)
+    path.write_bytes(whole + more)
+    after = reading.read(path)
+    np.testing.assert_array_equal(after.vertices, before.vertices)
+    np.testing.assert_array_equal(after.faces, before.faces)
+    assert after.content == whole + more
+    path.write_bytes(whole[:-20])
+    [problem] = refusals(reading.read, path)
+    assert "cut short: its head has 12 faces, the file 11" in problem
+
+
+@pytest.mark.parametrize("group", ["g a{0}", "o a{0}", "usemtl a{0}", "\tusemtl a{0}", "s {0}"])
+def test_an_obj_of_many_groups_is_read_as_one_without(group, tmp_path, monkeypatch):
+    """Each of trimesh's splits takes as long as the file has lines: it has none to split at."""
+    monkeypatch.setattr(reading, "MOST_PARTS", 3)
+    path = tmp_path / "a.obj"
+    path.write_text(as_text("obj"))
+    before = reading.read(path)
+    lines = as_text("obj").splitlines()
+    text = [part for k, line in enumerate(lines) for part in (group.format(k), line)]
+    path.write_text("\n".join(text))
+    load = trimesh.load_mesh
+
+    def loaded(file, **how):
+        assert not any(word in file.getvalue() for word in (b"usemtl", b"g a", b"o a", b"s "))
+        return load(file, **how)
+
+    monkeypatch.setattr(trimesh, "load_mesh", loaded)
+    after = reading.read(path)
+    np.testing.assert_array_equal(after.vertices, before.vertices)
+    np.testing.assert_array_equal(after.faces, before.faces)
+
+
 def disc(radius, height, bore=0.0):
     """A plate with or without a hole, turned out of the axes of its grid's cells."""
     make = trimesh.creation

@@ -1,5 +1,6 @@
 """`codesign check`: how fast and how exact a scene is on this machine, by simulating it."""
 
+import dataclasses
 import importlib.metadata
 import os
 import time
@@ -9,9 +10,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
 
-from codesign_jax import codesign, optimize, preflight, runs, sampling
+from codesign_jax import codesign, optimize, own, preflight, runs, sampling
 from codesign_jax.commands import common, reference
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Check
@@ -22,6 +22,7 @@ from codesign_jax.runs.choice import Case
 from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.progress import Busy, duration
 from codesign_jax.scene import Scene, with_accuracy
+from codesign_jax.terminal import Console
 from codesign_jax.types import Outcome, Trial, failed
 
 _ROUNDS = 4
@@ -63,7 +64,7 @@ def main(options: Check) -> int:
     case = find_case(options)
     finer = with_accuracy(case.scene, reference.ACCURACY)
     _refuse(options, case, finer)
-    console = common.console()
+    console = Console()
     for line in _head(case, load):
         console.print(line)
     settings = _settings(options, case)
@@ -137,6 +138,13 @@ def _settings(options: Check, case: Case) -> Settings:
     return runs.make_settings(preset, "concurrent", "morphology", case.engine, 0, **how)
 
 
+def _without_own_code(settings: Settings) -> Settings:
+    """Settings of as many grasps that import nothing: a run's are a stranger's, maybe."""
+    optimizer = optimize.PAPER if own.is_own(settings.optimizer) else settings.optimizer
+    replaced = {"optimizer": optimizer, "cost": runs.SCENE_COST, "policy": ""}
+    return dataclasses.replace(settings, **replaced)
+
+
 Run = Callable[[jax.Array, Trial], Outcome]
 
 
@@ -197,12 +205,12 @@ def tell(
     ours, theirs = usual.kept[: len(fine.kept)], fine.kept
     differ = int((ours != theirs).sum())
     share = wilson(differ, theirs.size)
-    grasps = runs.prepare(case.scene, settings).grasps
+    grasps = runs.prepare(case.scene, _without_own_code(settings)).grasps
     tested = reference.number_of_trials(None, settings)
     test = f", and {duration(tested / fine.rate)} for its test at accuracy {reference.ACCURACY}"
     causes = runs.failure_counts(usual.outcomes.status)
     lines = [
-        f"designs: {words}",
+        *f"designs: {words}".split("\n"),
         str(usual),
         f"accuracy {reference.ACCURACY}, {fine}",
         *([f"failed: {causes}"] if causes else []),

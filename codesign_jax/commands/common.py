@@ -4,7 +4,6 @@ import dataclasses
 import importlib.util
 import math
 import re
-import sys
 import tempfile
 from collections import Counter
 from collections.abc import Sequence
@@ -14,10 +13,9 @@ from typing import Any
 
 import numpy as np
 import tomli_w
-from rich.console import Console
 from rich.table import Table
 
-from codesign_jax import engines
+from codesign_jax import engines, terminal
 from codesign_jax import scene as scenes
 from codesign_jax.commands.flags import SceneFlags, Subject, TrialFlags
 from codesign_jax.own import make_policy
@@ -28,6 +26,7 @@ from codesign_jax.runs.reading import Tell
 from codesign_jax.scene import Scene, keypaths, library, objects, schema
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.scene.schema import InputError
+from codesign_jax.terminal import Console
 
 MOST = 1000
 """Most runs of one command: a guard against a slip such as 0-99999."""
@@ -76,7 +75,7 @@ def load_scene(options: SceneFlags) -> Scene:
 
 def warn(text: str) -> None:
     """Prints a warning that concerns the result, apart from the result."""
-    print(f"warning: {text}", file=sys.stderr)
+    terminal.say(f"warning: {text}", error=True)
 
 
 def find_case(options: Subject, *, tell: Tell = warn) -> Case:
@@ -198,11 +197,6 @@ def by_default(space: DesignSpace, words: Sequence[str]) -> str:
     return f"not given, so the hand file's defaults: {', '.join(groups)}"
 
 
-def console() -> Console:
-    """Prints texts as they are, in lines as long as they are."""
-    return Console(highlight=False, soft_wrap=True, markup=False)
-
-
 def refuse(problems: list[str]) -> None:
     """Ends the command if anything is wrong with its input."""
     if problems:
@@ -239,7 +233,7 @@ def number_problems(*numbers: tuple[str, float | None, float, float]) -> list[st
 
 def print_table(console: Console, table: Table) -> None:
     """Prints a table as wide as it is: a log takes long lines, and a terminal folds them."""
-    Console(file=console.file, width=1000, markup=False).print(table)
+    Console(file=console.file, width=1000, highlight=True, soft_wrap=False).print(table)
 
 
 def picture_problems(flag: str, path: Path | None) -> list[str]:
@@ -262,9 +256,9 @@ def engine_problems(name: str, overrides: Sequence[Sequence[str]] = ()) -> list[
     ]
 
 
-def counted(number: int, noun: str) -> str:
+def counted(number: int, noun: str, plural: str = "s") -> str:
     """A number of things in words, such as "1 call" and "2 calls"."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
+    return f"{number} {noun}{'' if number == 1 else plural}"
 
 
 def number(text: str) -> float | None:

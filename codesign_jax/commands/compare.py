@@ -11,7 +11,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from codesign_jax import codesign, cost, runs
@@ -25,6 +24,7 @@ from codesign_jax.runs.choice import Case
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import InputError
+from codesign_jax.terminal import Console
 
 _OF_SETTINGS = ("schedule", "optimizer", "preset", "engine", "cost")
 _WORDS = {"schedule": "strategy"}
@@ -73,7 +73,7 @@ def main(options: Compare) -> int:
     common.refuse(problems + common.place_problems("--out", options.out, ".csv"))
     pair = [] if options.trials is None else _pair(options, folders)
     every = read_all({folder: runs.read_run(folder) for folder in folders})
-    console = common.console()
+    console = Console()
     compare(every, console, named=True)
     if options.out is not None:
         write_table(every, options.out)
@@ -97,8 +97,11 @@ def read_all(every: Mapping[Path, tuple[Scene, Settings]]) -> dict[Path, Compare
     for folder, (scene, settings) in every.items():
         result, fresh = read(scene, folder), None
         if result is not None and result.test is not None and (folder / reference.FILE).exists():
-            kept, _ = reference.stored(folder, settings)
+            kept, why = reference.stored(folder, settings)
             fresh = None if kept is None else reference.judged(scene, kept)
+            if why:
+                judge = "the final test, which flatters the design, judges it"
+                common.warn(f"{folder / reference.FILE} {why}: {judge}")
         found[folder] = Compared(scene, settings, result, fresh)
     return found
 
@@ -260,7 +263,7 @@ def read(scene: Scene, folder: Path) -> RunResult | None:
     except InputError as error:
         common.warn(str(error))
         return None
-    if record is None or record.failed_status() is not None:
+    if record is None or record.failed_outcomes() is not None:
         return None
     test = None if record.test is None else codesign.summarize_test(scene, record.test)
     return RunResult(record, test, 0)

@@ -3,7 +3,6 @@
 from typing import TYPE_CHECKING
 
 import jax
-from rich.console import Console
 
 from codesign_jax import batch
 from codesign_jax.codesign import Task
@@ -12,6 +11,7 @@ from codesign_jax.engines import Engine
 from codesign_jax.report.statistics import Interval
 from codesign_jax.runs.choice import Case
 from codesign_jax.runs.progress import Meter
+from codesign_jax.terminal import Console
 
 if TYPE_CHECKING:
     from codesign_jax.export import sheet

@@ -5,7 +5,6 @@ from itertools import chain
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
 
 from codesign_jax import preflight, rollout, runs, types
 from codesign_jax.commands import common, forces, reference
@@ -16,8 +15,9 @@ from codesign_jax.engines.base import recording
 from codesign_jax.report import stress, verdicts
 from codesign_jax.runs import choice, tables
 from codesign_jax.runs.choice import Case
-from codesign_jax.runs.progress import Busy
+from codesign_jax.runs.progress import Busy, Meter
 from codesign_jax.scene.schema import InputError
+from codesign_jax.terminal import Console
 
 
 def main(options: Evaluate) -> int:
@@ -26,11 +26,11 @@ def main(options: Evaluate) -> int:
     _check(options, case.engine)
     engine = case.make_engine()
     notes = preflight.notes(case.scene, case.space, {"the design": case.design})
-    console = common.console()
+    console = Console()
     if options.run_folder:
         which = "best final design" if options.particle is None else f"particle {options.particle}"
         console.print(f"{which} of {options.run_folder}")
-    console.print(runs.describe(case.space, case.design))
+    console.print(*runs.describe(case.space, case.design).split("\n"), sep="\n")
     if not options.run_folder:
         words = [*chain.from_iterable(options.design)]
         if note := common.by_default(case.space, words):
@@ -43,8 +43,10 @@ def main(options: Evaluate) -> int:
         return 0
     one = simulate(case, options, console)
     if options.stress:
-        with Busy(console, "simulating other conditions"):
-            found = stress.simulate(case, options.trials, jax.random.key(options.seed))
+        total = options.trials * stress.sets(case.scene)
+        with Meter("other conditions", total, console) as meter:
+            noise = jax.random.key(options.seed)
+            found = stress.simulate(case, options.trials, noise, done=meter.advance)
         reference.tell_stress(case, found, console)
     if options.render or options.forces or options.pull:
         of_objects(case, engine, options, console)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
 
 from codesign_jax import engines, files, preflight, provenance, rollout, runs
 from codesign_jax.commands import common, drift, reference
@@ -19,6 +18,7 @@ from codesign_jax.export.process import Process, Size
 from codesign_jax.runs.choice import Case
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.schema import InputError
+from codesign_jax.terminal import Console
 from codesign_jax.types import Params, Trial
 
 if TYPE_CHECKING:
@@ -38,10 +38,10 @@ def main(options: Export) -> int:
         notes.append(f"commands are those of the key frames: policy {case.policy} is left out")
     simulating = options.tolerance != "off" and not options.no_sheet
     engine = case.make_engine() if simulating else None
-    console = common.console()
+    console = Console()
     if options.run_folder:
         console.print(f"best final design of {options.run_folder}")
-    console.print(runs.describe(case.space, case.design))
+    console.print(*runs.describe(case.space, case.design).split("\n"), sep="\n")
     for note in notes:
         console.print(note)
     try:
@@ -177,13 +177,6 @@ def _trials(case: Case, options: Export) -> list[tuple[str, Trial]]:
     return [(name, jax.tree.map(np.asarray, trial)) for name, trial in found]
 
 
-def _tested(folder: Path) -> "sheet.Tested":
-    scene, settings = runs.read_run(folder)
-    fresh, _ = reference.stored(folder, settings)
-    verdict = None if fresh is None else str(reference.judged(scene, fresh))
-    return verdict, reference.stored_stress(folder, settings)
-
-
 def _sheet(
     case: Case,
     params: Params,
@@ -194,7 +187,12 @@ def _sheet(
 ) -> None:
     from codesign_jax.export import drawing, sheet  # needs the extra
 
-    tested = _tested(options.run_folder) if options.run_folder else (None, None)
+    kept = reference.Kept(None, None, [])
+    if options.run_folder:
+        kept = reference.kept(options.run_folder, *runs.read_run(options.run_folder))
+    for note in kept.notes:
+        common.warn(note)
+    tested = None if kept.fresh is None else str(kept.fresh), kept.stress
     content = sheet.sheet_sections(case.scene, params, sizes, found, tested)
     title = f"Build sheet: {case.scene.hand.name}"
     source = f"Best final design of {options.run_folder}" if options.run_folder else "Design"
@@ -206,6 +204,7 @@ def _sheet(
         f"codesign-jax {version}, commit {code['commit'] or 'unknown'}"
         f"{' with changes' if code.get('modified') else ''}. Predictions of a simulation, not "
         "measurements.",
+        *(f"Warning: {note}." for note in kept.notes),
     ]
     assembly = sheet.assembly_sections(case.scene, params, sizes, _process(options))
     sheet.write(folder, title, lines, [*content, *assembly])

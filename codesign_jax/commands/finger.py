@@ -5,7 +5,6 @@ from itertools import chain
 
 import numpy as np
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from codesign_jax import finger as fingers
@@ -16,6 +15,7 @@ from codesign_jax.finger import Finger, Fit
 from codesign_jax.runs import tables
 from codesign_jax.scene.schema import InputError
 from codesign_jax.scene.silicones import LAWS
+from codesign_jax.terminal import Console
 
 SHOWN = {
     "pressure": ("kPa", 1e3),
@@ -40,7 +40,7 @@ def main(options: Options) -> int:
     common.refuse(problems + common.place_problems("--out", options.out, ".csv"))
     measured = options.measured and fingers.read(options.measured)
     mine = fingers.of_design(case.scene, params, options.finger)
-    console = common.console()
+    console = Console()
     console.print(_about(mine, options.finger, case.scene.hand.name))
     if not options.run_folder:
         given = [*chain.from_iterable(options.design)]

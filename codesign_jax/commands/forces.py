@@ -10,7 +10,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
 
 from codesign_jax import model, rollout
 from codesign_jax.engines import Engine
@@ -19,6 +18,7 @@ from codesign_jax.report import verdicts
 from codesign_jax.report.replay import Replay
 from codesign_jax.runs import tables
 from codesign_jax.scene import InputError, Scene
+from codesign_jax.terminal import Console
 from codesign_jax.types import Forces, Params, Trial
 
 RATE = 5.0

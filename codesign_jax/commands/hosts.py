@@ -17,7 +17,9 @@ import jax
 
 from codesign_jax.commands import common, status
 from codesign_jax.commands.flags import Optimize
+from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.schema import InputError
+from codesign_jax.terminal import Console
 
 WAIT = 7 * 24 * 3600
 """Longest time that a process waits for the others' runs [s]."""
@@ -43,8 +45,12 @@ def join(text: str) -> tuple[int, int]:
     given = check(text)
     address, count, index = given or (None, None, None)
     jax.config.update("jax_platforms", "cpu")  # this process leaves the GPUs to the one that runs
+    others = "the other processes"
+    if count is not None:
+        others = f"{common.counted(count - 1, 'other process', 'es')} at {address}"
     try:
-        jax.distributed.initialize(address, count, index, shutdown_timeout_seconds=WAIT)
+        with Busy(Console(), f"waiting for {others} of --distributed {text}"):
+            jax.distributed.initialize(address, count, index, shutdown_timeout_seconds=WAIT)
     except (RuntimeError, ValueError) as error:
         raise InputError([f"--distributed {text}: {error}"]) from error
     return jax.process_index(), jax.process_count()
@@ -60,7 +66,8 @@ def run(options: Optimize) -> tuple[int, int]:
         own = dataclasses.replace(options, distributed=None, seeds=mine)
         code = in_a_process(own.run)
     if code < 128:  # not stopped by a signal
-        jax.distributed.shutdown()
+        with Busy(Console(), f"waiting for the runs of {count} processes"):
+            jax.distributed.shutdown()
     return code, index
 
 

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from rich.console import Console
 
 from codesign_jax import batch, codesign, files, preflight, runs
 from codesign_jax.codesign import Task
@@ -19,6 +18,7 @@ from codesign_jax.runs.choice import Case
 from codesign_jax.runs.progress import Meter
 from codesign_jax.scene import schema
 from codesign_jax.scene.schema import InputError
+from codesign_jax.terminal import Console
 from codesign_jax.types import Outcome, failed
 
 
@@ -37,10 +37,10 @@ def main(options: Options) -> int:
     _check(options, case)
     folder = _folder(options, case)
     made = make_plane(case, _columns(case, options.parameters), options.points)
-    console = common.console()
+    console = Console()
     others = [k for k in range(case.space.num_parameters) if k not in made.columns]
     if others:
-        console.print(runs.describe(case.space, case.design, "around"))
+        console.print(*runs.describe(case.space, case.design, "around").split("\n"), sep="\n")
     for note in preflight.notes(case.scene, case.space, {"the design": case.design}):
         console.print(note)
     size = batch.size(len(made.designs), options.trials)

@@ -6,12 +6,12 @@ import os
 import shlex
 import sys
 import traceback
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from rich.console import Console
 
 from codesign_jax import codesign, engines, files, optimize, preflight, runs
 from codesign_jax.commands import common, compare, hosts, reference, status
@@ -25,6 +25,7 @@ from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene, schema
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.scene.schema import InputError
+from codesign_jax.terminal import Console, say
 
 ALTERNATE, DOMAINS = "alternate", ("morphology", "control")
 """Value of --first by which even seeds begin in the first domain and odd ones in the other."""
@@ -43,10 +44,11 @@ def main(options: Optimize) -> int:
     plans = {folder: runs.variant(plan, own) for folder, own in every.items()}
     place = options.out or next(iter(every))
     common.refuse(common.place_problems("--out", place, folder=True))
+    _refuse_links(options, every)
     for folder, own in every.items():
         runs.check_folder(folder, scene, own, fresh=options.fresh)
     for note in preflight.notes(scene, plan.space, _ends(plan.space)):
-        print(note)
+        say(note)
     if options.dry_run:
         _dry_run(plan, len(every), options)
         return 0
@@ -64,7 +66,7 @@ def main(options: Optimize) -> int:
             _tell_error(f"{called[folder]}: " if called else "", result)
     if found.signum:
         return 128 + found.signum
-    console = common.console()
+    console = Console()
     for folder, result in results.items():
         if result is not None and result.record is not None:
             if called:
@@ -76,9 +78,9 @@ def main(options: Optimize) -> int:
 
 def _tell_error(name: str, error: Exception) -> None:
     if not isinstance(error, runs.FAILURES):
-        traceback.print_exception(error)
+        say(*"".join(traceback.format_exception(error)).splitlines(), error=True)
         name += f"{type(error).__name__}: "
-    print(f"error: {name}{status.words(error)}", file=sys.stderr)
+    say(f"error: {name}{status.words(error)}", error=True)
 
 
 def _distributed(options: Optimize) -> int:
@@ -101,7 +103,7 @@ def _compare(options: Optimize) -> int:
     scene, settings = resolve(dataclasses.replace(options, fresh=False))
     every = runs_of(options, scene, settings)
     found = compare.read_all({folder: (scene, own) for folder, own in every.items()})
-    console, table = common.console(), (options.out or Path("runs")) / columns.SEEDS
+    console, table = Console(), (options.out or Path("runs")) / columns.SEEDS
     compare.compare(found, console)
     compare.write_table(found, table)
     console.print(f"table: {table}")
@@ -129,6 +131,16 @@ def _tell(plan: Plan, result: RunResult, folder: Path, trials: int, console: Con
     console.print(f"to look at: {shlex.join(['codesign', 'report', str(folder)])}")
 
 
+def _refuse_links(options: Optimize, folders: Iterable[Path]) -> None:
+    """Refuses links below --out, where a command of several runs chooses the folders."""
+    if options.out is None:
+        return
+    places = {place for folder in folders for place in (folder, *folder.parents)}
+    links = sorted(p for p in places if options.out in p.parents and p.is_symlink())
+    hint = "is a symbolic link: put the folder itself in its place"
+    common.refuse([f"{link} {hint}" for link in links])
+
+
 def _ends(space: DesignSpace) -> dict[str, np.ndarray]:
     ends = {"default": space.default(), "lower ends": space.low, "upper ends": space.high}
     projected = jax.vmap(space.project)(np.array([*ends.values()], np.float32))
@@ -139,25 +151,25 @@ def _ends(space: DesignSpace) -> dict[str, np.ndarray]:
 def _dry_run(plan: Plan, count: int, options: Optimize) -> None:
     scene, settings = plan.scene, plan.settings
     for name, text in scene_texts(scene).items():
-        print(f"# ---- {name}\n{text}")
+        say(f"# ---- {name}", *text.split("\n"))
     values = dataclasses.asdict(settings).items()
-    print("# ---- settings", *(f"{name}: {value}" for name, value in values), "", sep="\n")
+    say("# ---- settings", *(f"{name}: {value}" for name, value in values), "")
     batch = settings.particles * settings.trials
     seed = batch if runs.needs_poor_seed(plan) else 0
-    print(f"grasps: {plan.grasps}" + (f" and at least {seed} to find the seed" if seed else ""))
+    say(f"grasps: {plan.grasps}" + (f" and at least {seed} to find the seed" if seed else ""))
     if tested := settings.test_rounds * settings.trials:
         whole = f", in whole rounds of {settings.trials}" if tested != settings.test_trials else ""
         many, few = plan.test_grasps, plan.finalists
-        print(f"final test: {many} of these grasps, {tested} trials of {few} particles{whole}")
+        say(f"final test: {many} of these grasps, {tested} trials of {few} particles{whole}")
     if count > 1:
-        print(f"runs: {count}, in one batch; grasps and disk are those of each")
+        say(f"runs: {count}, in one batch; grasps and disk are those of each")
     row = 40 + 12 * plan.space.num_parameters
     rows = settings.episodes * settings.particles * (settings.trials + 1)
-    print(f"disk: about {3 * rows * row / 1e6:.1f} MB")
+    say(f"disk: about {3 * rows * row / 1e6:.1f} MB")
     if trials := reference.number_of_trials(options.reference_trials, settings):
-        print(f"reference test: {trials} grasps at accuracy {reference.ACCURACY}")
-        print(f"other conditions: {reference.STRESS_TRIALS * stress.sets(scene)} grasps")
-    print("time: `codesign check` measures it on this machine")
+        say(f"reference test: {trials} grasps at accuracy {reference.ACCURACY}")
+        say(f"other conditions: {reference.STRESS_TRIALS * stress.sets(scene)} grasps")
+    say("time: `codesign check` measures it on this machine")
 
 
 def _summarize(plan: Plan, result: RunResult, console: Console) -> None:
@@ -178,7 +190,7 @@ def _summarize(plan: Plan, result: RunResult, console: Console) -> None:
         console.print(f"converged from episode {converged + 1} on, after {grasps} grasps")
     if result.test is not None:
         best = particles[int(np.asarray(result.test.cost).argmin())]
-        console.print(runs.describe(plan.space, best, "best final particle"))
+        console.print(*runs.describe(plan.space, best, "best final particle").split("\n"), sep="\n")
 
 
 def _judge(

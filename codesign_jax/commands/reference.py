@@ -7,11 +7,11 @@ much that changes), and at the run's accuracy under other conditions (`report.st
 """
 
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
 
 from codesign_jax import codesign, engines, rollout, store
 from codesign_jax.commands.common import counted
@@ -20,8 +20,9 @@ from codesign_jax.report.stress import Stress
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import Settings, columns, tables
 from codesign_jax.runs.choice import Case, case_of_run
-from codesign_jax.runs.progress import Busy
+from codesign_jax.runs.progress import Busy, Meter
 from codesign_jax.scene import Scene, with_accuracy
+from codesign_jax.terminal import Console
 from codesign_jax.types import Outcome
 
 ACCURACY = "reference"
@@ -30,6 +31,13 @@ TRIALS = 24
 """Fresh trials by default: without a loss in them, 86 to 100 % of grasps hold (95 % interval)."""
 STRESS_TRIALS = 12
 """Grasps of each condition."""
+_OUTCOME = ("cost", "status", "lost_time", "bad_step")
+"""Arrays that every outcome has."""
+_NO_RESULT = "does not hold what such a file has"
+_LEFT_OUT = {
+    FILE: "the design's fresh trials and their verdict are",
+    STRESS_FILE: "its grasps under other conditions and their warnings are",
+}
 STREAM_REFERENCE = 0x72656665
 """Stream of the fresh trials' noise ("refe")."""
 
@@ -72,7 +80,12 @@ def steps_and_links(scene: Scene) -> float:
 def stored(folder: Path, settings: Settings) -> tuple[Outcome | None, str]:
     """Outcomes that `test` kept of the run's design; or None and why, see `store.found`."""
     arrays, why = store.found(folder / FILE, _finer(folder, settings).digest(settings.seed))
-    return None if arrays is None else Outcome(**arrays), why
+    if arrays is None:
+        return None, why
+    shapes = {v.shape if v.dtype.kind in "biuf" else () for v in arrays.values()}
+    if not {*_OUTCOME} <= {*arrays} <= {*Outcome._fields} or {len(s) for s in shapes} != {1}:
+        return None, _NO_RESULT
+    return (Outcome(**arrays), "") if len(shapes) == 1 else (None, _NO_RESULT)
 
 
 def tell_stress(case: Case, found: Stress, console: Console) -> None:
@@ -89,21 +102,57 @@ def tell_stress(case: Case, found: Stress, console: Console) -> None:
 
 def stress_run(folder: Path, settings: Settings, console: Console) -> None:
     """Tells what the run's design keeps under other conditions, simulated if not yet."""
-    (case, about), found = _stress_case(folder, settings), stored_stress(folder, settings)
+    case, about = _stress_case(folder, settings)
+    found, why = stored_stress(folder, settings)
+    if why:
+        console.print(f"{folder / STRESS_FILE} {why}: simulated again")
     if found is None:
-        with Busy(console, f"stress, {counted(STRESS_TRIALS, 'grasp')} of each condition"):
-            found = stress.simulate(case, STRESS_TRIALS, _noise(settings, stress.STREAM))
+        total = STRESS_TRIALS * stress.sets(case.scene)
+        with Meter("stress", total, console) as meter:
+            noise = _noise(settings, stress.STREAM)
+            found = stress.simulate(case, STRESS_TRIALS, noise, done=meter.advance)
         store.keep(folder / STRESS_FILE, about, found._asdict())
     tell_stress(case, found, console)
 
 
-def stored_stress(folder: Path, settings: Settings) -> Stress | None:
-    """What `stress_run` kept in a run folder, if it is of its design today."""
-    arrays, _ = store.found(folder / STRESS_FILE, _stress_case(folder, settings)[1])
+def stored_stress(folder: Path, settings: Settings) -> tuple[Stress | None, str]:
+    """What `stress_run` kept of the run's design; or None and why, see `store.found`."""
+    arrays, why = store.found(folder / STRESS_FILE, _stress_case(folder, settings)[1])
     if arrays is None:
-        return None
-    texts = {k: tuple(arrays[k].tolist()) for k in ("conditions", "warnings")}
-    return Stress(kept=arrays["kept"], trials=int(arrays["trials"]), **texts)
+        return None, why
+    try:
+        texts = {k: tuple(map(str, arrays[k].tolist())) for k in ("conditions", "warnings")}
+        found = Stress(kept=arrays["kept"].astype(int), trials=int(arrays["trials"]), **texts)
+    except (KeyError, TypeError, ValueError):
+        return None, _NO_RESULT
+    whole = found.kept.shape == (len(found.conditions),) and found.trials > 0
+    if not whole or not ((0 <= found.kept) & (found.kept <= found.trials)).all():
+        return None, _NO_RESULT
+    return found, ""
+
+
+class Kept(NamedTuple):
+    """What is kept of a run's design from the grasps after its search."""
+
+    fresh: Judged | None
+    stress: Stress | None
+    notes: list[str]  # what is left out, and why
+
+
+def kept(folder: Path, scene: Scene, settings: Settings) -> Kept:
+    """Both results of a run's design, and notes where one cannot be shown or is gone."""
+    outcome, why = stored(folder, settings)
+    conditions, cause = stored_stress(folder, settings)
+    gone = (outcome is None) != (conditions is None)  # a run that ended has both, or neither
+    reasons = {FILE: why, STRESS_FILE: cause}
+    lacking = {FILE: outcome is None, STRESS_FILE: conditions is None}
+    notes = [
+        f"{folder / name} {reasons[name] or 'is missing'}: {_LEFT_OUT[name]} left out. The "
+        "command of codesign optimize that made the run simulates them again"
+        for name in reasons
+        if lacking[name] and (reasons[name] or gone)
+    ]
+    return Kept(None if outcome is None else judged(scene, outcome), conditions, notes)
 
 
 def _stress_case(folder: Path, settings: Settings) -> tuple[Case, str]:

@@ -3,12 +3,11 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
 from codesign_jax.commands import common, grasp
 from codesign_jax.commands.flags import Render
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import schema
+from codesign_jax.terminal import Console
 
 if TYPE_CHECKING:
     from codesign_jax.report.replay import Camera
@@ -22,7 +21,7 @@ def main(options: Render) -> int:
     end = asked.case.scene.end_time
     late = [t for t in options.times if not 0 <= t <= end]
     common.refuse([f"--times {t:g} is outside [0, {end:g}] s, a grasp" for t in late])
-    draw(asked, options, camera, common.console())
+    draw(asked, options, camera, Console())
     return 0
 
 
@@ -70,7 +69,8 @@ def draw(asked: grasp.Asked, options: Render, camera: "Camera", console: Console
         shown = grasp.simulate(asked)
     from codesign_jax.report import animation
 
-    console.print("\n".join(grasp.description(asked, shown)))
+    lines = "\n".join(grasp.description(asked, shown)).split("\n")
+    console.print(*lines, sep="\n")
     scene, size = asked.case.scene, (options.size, options.size)
     with Busy(console, "drawing"):
         how: Any = {"size": size, "camera": camera}

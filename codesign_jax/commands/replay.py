@@ -6,15 +6,15 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
 
 from codesign_jax import rollout, runs
 from codesign_jax.commands import common, grasp
 from codesign_jax.commands.flags import Replay
-from codesign_jax.runs import failures
+from codesign_jax.runs import failures, manifest
 from codesign_jax.runs.choice import Case, refuse_other_policy
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.parameters import design_space
+from codesign_jax.terminal import Console, say
 from codesign_jax.types import MEANINGS, Status, Trace
 
 MOST = 10
@@ -28,7 +28,7 @@ def main(options: Replay) -> int:
     path = options.out or (options.run_folder or Path()) / "replay.html"
     common.refuse(common.place_problems("--out", path, ".html"))
     asked = grasp.find(options)
-    console = common.console()
+    console = Console()
     places = options.episode, options.particle, options.trial, options.object
     if options.run_folder is not None and places == (None,) * 4:
         show_failures(options.run_folder)
@@ -45,7 +45,7 @@ def write_page(asked: grasp.Asked, path: Path, console: Console) -> Path:
     from codesign_jax.report import viewer
 
     lines = grasp.description(asked, shown)
-    console.print("\n".join(lines))
+    console.print(*"\n".join(lines).split("\n"), sep="\n")
     return viewer.write(asked.case.scene, shown, path, title="A grasp in 3D", text=lines)
 
 
@@ -56,37 +56,39 @@ def show_failures(folder: Path) -> None:
     for path in found[:MOST]:
         failure = failures.load(path)
         verdict = _verdict(failure.status, failure.bad_step, scene.discretization.timestep)
-        print(f"failed world {path}: {verdict}")
+        say(f"failed world {path}: {verdict}")
     if found[MOST:]:
-        print(f"and {len(found) - MOST} more in {folder / failures.FOLDER}")
+        say(f"and {len(found) - MOST} more in {folder / failures.FOLDER}")
 
 
 def explain(path: Path, engine: str | None, policy: str | None) -> int:
     """Says how a failed world failed, and what happens when it is simulated again."""
+    folder = path.parent.resolve().parent
+    manifest.refuse_links(folder)
     failure = failures.load(path)
-    scene, settings = runs.read_run(path.resolve().parent.parent)
+    scene, settings = runs.read_run(folder)
     refuse_other_policy(settings.policy, policy)
     name = engine or settings.engine
     common.refuse(common.engine_problems(name))
     space, h = design_space(scene.hand, settings.preset), scene.discretization.timestep
-    print(runs.describe(space, failure.design))
-    print(f"recorded by {settings.engine}: {_verdict(failure.status, failure.bad_step, h)}")
+    say(*runs.describe(space, failure.design).split("\n"))
+    say(f"recorded by {settings.engine}: {_verdict(failure.status, failure.bad_step, h)}")
     for bit in Status(failure.status):
-        print(f"  {bit.name}: {MEANINGS[bit]}")
+        say(f"  {bit.name}: {MEANINGS[bit]}")
     numbers = zip(("--episode", "--particle", "--trial"), failure.place, strict=True)
     place = " ".join(f"{flag} {number}" for flag, number in numbers)
-    print(f"in 3D: codesign replay {path.parent.parent} {place}")
+    say(f"in 3D: codesign replay {path.parent.parent} {place}")
     world = space.params(jnp.asarray(failure.design)), failure.trial
     simulator = Case(scene, space, failure.design, name, settings.policy).make_engine()
     run = jax.jit(lambda p, t: rollout.simulate(scene, simulator, p, t))
     found = run(*jax.tree.map(lambda v: jnp.asarray(v)[None], world))
     outcome, trace = jax.tree.map(lambda v: np.asarray(v)[0], found)
     bad = int(outcome.bad_step)
-    print(f"again in {name}: {_verdict(int(outcome.status), bad, h)}")
+    say(f"again in {name}: {_verdict(int(outcome.status), bad, h)}")
     if bad < 0:
-        print(f"  cost {outcome.cost:.3f}; at the end: {_where(trace, -1)}")
+        say(f"  cost {outcome.cost:.3f}; at the end: {_where(trace, -1)}")
     for k in range(max(bad - 3, 0), bad + 1):
-        print(f"  step {k}: {_where(trace, k)}")
+        say(f"  step {k}: {_where(trace, k)}")
     return 0
 
 

@@ -2,8 +2,6 @@
 
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-
 from codesign_jax import runs
 from codesign_jax.commands import common, grasp, reference
 from codesign_jax.commands.flags import Report
@@ -16,6 +14,7 @@ from codesign_jax.runs.progress import Busy
 from codesign_jax.runs.record import Record
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
+from codesign_jax.terminal import Console
 
 if TYPE_CHECKING:
     from codesign_jax.report import animation
@@ -34,11 +33,11 @@ def main(options: Report) -> int:
     record = choice.read_record(options.folder, tell=notes.append)
     chosen = choice.choose(scene, record)
     notes += [text for text in [choice.doubt(chosen)] if text]
+    kept = reference.kept(options.folder, scene, settings)
+    notes += kept.notes
     for note in notes:
         common.warn(note)
     provenance = read_provenance(options.folder)
-    found, why = reference.stored(options.folder, settings)
-    fresh = None if found is None else reference.judged(scene, found)
     run = Run(
         options.folder,
         scene,
@@ -46,13 +45,11 @@ def main(options: Report) -> int:
         record,
         chosen,
         provenance,
-        fresh,
+        kept.fresh,
         tuple(notes),
-        reference.stored_stress(options.folder, settings),
+        kept.stress,
     )
-    console = common.console()
-    if why:
-        console.print(f"{options.folder / reference.FILE} {why}: left out")
+    console = Console()
     shown = None if options.no_replay else best_grasp(scene, settings, record, name, console)
     with Busy(console, "writing the report"):
         page.write(run, shown, path)

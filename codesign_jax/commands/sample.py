@@ -4,7 +4,6 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from rich.console import Console
 
 from codesign_jax import batch, files, preflight, sampling
 from codesign_jax.codesign import VERDICTS, verdicts
@@ -18,6 +17,7 @@ from codesign_jax.runs.interrupts import Interrupts, Stopped
 from codesign_jax.runs.progress import Meter
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
+from codesign_jax.terminal import Console
 from codesign_jax.types import Outcome
 
 MOST = 1_000_000_000
@@ -29,7 +29,7 @@ def main(options: Sample) -> int:
     _check(options)
     scene = common.load_scene(options)
     question, engine = _question(options, scene), make_engine(options.engine, scene)
-    console = common.console()
+    console = Console()
     outcomes = Shards(options.out)
     outcomes.refuse_other(question)
     designs = {"the default design": question.space.default()}

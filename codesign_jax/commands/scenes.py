@@ -1,13 +1,13 @@
 """`codesign scenes`."""
 
 from rich import box
-from rich.console import Console
 from rich.table import Column, Table
 
 from codesign_jax import scene as scenes
 from codesign_jax.commands.flags import Scenes
 from codesign_jax.scene import effects, library, schema
 from codesign_jax.scene.schema import InputError
+from codesign_jax.terminal import Console
 
 
 def main(options: Scenes) -> int:
@@ -16,9 +16,9 @@ def main(options: Scenes) -> int:
         raise InputError([f"--engine {options.engine!r} is not valid; {hint}"])
     engines = effects.ENGINES if options.engine is None else (options.engine,)
     names = library.available("scenes") if options.name is None else [options.name]
-    console = Console(highlight=False)
+    console = Console(soft_wrap=False)
     for scene in [scenes.load(name) for name in names]:
-        console.print(f"{scene.name}: {scene.description}")
+        console.print(f"{scene.name}: {' '.join(scene.description.split())}")
         if options.name or options.engine:
             console.print(_table(scene, engines))
     for kind in () if options.name else ("hands", "objects", "controls", "accuracy"):

@@ -7,6 +7,8 @@ import sys
 from collections.abc import Callable
 from typing import NoReturn
 
+from codesign_jax.terminal import say
+
 INTERRUPTED = 128 + signal.SIGINT
 """Exit status of a command that Ctrl-C ended."""
 
@@ -39,14 +41,13 @@ def of(run: Callable[[], int]) -> int:
         if not isinstance(error, InputError):
             raise
         for problem in error.problems:
-            print(f"error: {problem}", file=sys.stderr)
+            say(f"error: {problem}", error=True)
         return 2
-    except RuntimeError as error:
-        from codesign_jax.runs.errors import RunError
-
-        if not isinstance(error, RunError):
+    except (RuntimeError, AssertionError) as error:
+        problem = _known(error)
+        if problem is None:
             raise
-        print(f"error: {error}", file=sys.stderr)
+        say(f"error: {problem}", error=True)
         return 1
     except BrokenPipeError:
         # Who read the output, such as `head`, has enough. The interpreter would complain when it
@@ -56,12 +57,40 @@ def of(run: Callable[[], int]) -> int:
     except OSError as error:
         if error.errno is None:
             raise
-        print(f"error: {words(error)}", file=sys.stderr)
+        say(f"error: {words(error)}", error=True)
         return 2 if error.errno == errno.ENAMETOOLONG else 1
     except KeyboardInterrupt:
         # Commands with something to save have saved it, and said so, before this.
-        print("stopped", file=sys.stderr)
+        say("stopped", error=True)
         return INTERRUPTED
+
+
+def _known(error: Exception) -> str | None:
+    """What an error says to a user who can do something about it; None of any other."""
+    from codesign_jax.compiler.ffi import KernelUnavailable
+    from codesign_jax.runs.errors import RunError
+
+    if isinstance(error, RunError | KernelUnavailable):
+        return str(error)
+    return _lacking_platform()
+
+
+def _lacking_platform() -> str | None:
+    """Why JAX has no device where one was asked for; None if it has one."""
+    import jax
+
+    asked = jax.config.jax_platforms  # type: ignore[attr-defined]
+    if not asked:
+        return None
+    try:
+        jax.devices()
+    except Exception as error:  # each of JAX's plugins has its own
+        why = f" ({error})" if str(error) else ""
+        return (
+            f"JAX_PLATFORMS={asked} asks for a device that JAX has not got here{why}: leave it "
+            "out, or give cpu"
+        )
+    return None
 
 
 def leave(code: int) -> NoReturn:

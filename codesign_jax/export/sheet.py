@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from codesign_jax import terminal
 from codesign_jax.export.process import Process, Size, inlet
 from codesign_jax.export.tolerance import NEAREST, WANTED, Side, Tolerance
 from codesign_jax.model import morphology
@@ -298,11 +299,16 @@ def markdown(title: str, lines: Sequence[str], content: Sequence[SheetSection]) 
             text += [_row(row) for row in section.rows]
         for note in section.notes:
             text += ["", note]
-    return "\n".join(text) + "\n"
+    return "\n".join(map(_plain, text)) + "\n"
+
+
+def _plain(text: str) -> str:
+    """A line without HTML, links and pictures: texts of a run or a scene may be a stranger's."""
+    return terminal.line(text).replace("<", "&lt;").replace("](", "]\\(")
 
 
 def _row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
 def write(folder: Path, title: str, lines: Sequence[str], content: Sequence[SheetSection]) -> Path:

@@ -92,16 +92,24 @@ class Stress(NamedTuple):
         return ["  " + "  ".join(row).rstrip() for row in cells]
 
 
-def simulate(case: Case, trials: int, key: jax.Array) -> Stress:
-    """Simulates the design under every condition, in the same trials."""
+def simulate(
+    case: Case, trials: int, key: jax.Array, done: Callable[[int], None] = lambda grasps: None
+) -> Stress:
+    """Simulates the design under every condition, in the same trials; `done` counts the grasps."""
     scene, conditions, kept = case.scene, [], []
-    run = _program(scene, case, trials)
     design = jnp.asarray(case.design, jnp.float32)
-    found, qpos, drawn = interruptible(run, design, key)
+
+    def simulated(run: Program, *constants: Scene) -> tuple[Outcome, jax.Array, Trial]:
+        result = interruptible(run, design, key, *constants)
+        done(trials)
+        return result
+
+    run = _program(scene, case, trials)
+    found, qpos, drawn = simulated(run)
     params = jax.tree.map(np.asarray, jax.jit(case.space.params)(design))
     warnings = _in_grasps(scene, params, *jax.tree.map(np.asarray, (found, qpos, drawn)))
     every = [("as it is", found)]
-    every += [(name, interruptible(run, design, key, c)[0]) for name, c in variants(scene)]
+    every += [(name, simulated(run, c)[0]) for name, c in variants(scene)]
     other = silicones.under(scene, neo_hookean=not scene.effects.neo_hookean)
     name = f"{'neo-Hookean' if other.effects.neo_hookean else 'linear'} bending law"
     try:
@@ -109,7 +117,7 @@ def simulate(case: Case, trials: int, key: jax.Array) -> Stress:
     except InputError:  # an engine that has one law only
         pass
     else:
-        every.append((name, interruptible(run, design, key)[0]))
+        every.append((name, simulated(run)[0]))
     for name, outcome in every:
         conditions.append(name)
         kept.append((codesign.verdicts(outcome) == codesign.VERDICTS.index("kept")).sum())

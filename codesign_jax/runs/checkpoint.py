@@ -7,13 +7,15 @@ So every step has a file of SHA-256 digests beside it: of its files, as `sha256s
 and of its arrays (names, types, shapes, bytes).  That file is written last: a step without it was
 cut short.  The newest step whose digests match is used.  A step that is whole, but of another run
 or another step of this one, is refused, and so is one that cannot be read for a reason that may
-pass: neither is damaged, and only what is damaged may be deleted.
+pass: neither is damaged, and only what is damaged may be deleted.  Orbax opens no step whose
+digests were not compared.
 """
 
 import errno
 import hashlib
 import logging
 import os
+import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -21,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from codesign_jax import files
+from codesign_jax import files, terminal
 from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.manifest import SCHEMA
 
@@ -32,8 +34,19 @@ _LABEL = "run"
 _TEMPORARY = ".orbax-checkpoint-tmp"
 """Mark in the name of a step that orbax is writing."""
 
-# Orbax's threads log the traceback of an error that `Checkpoints.save` raises.
-logging.getLogger("absl").addFilter(lambda record: "_SignalingThread" not in record.getMessage())
+_MOST_LOGGED = 300
+"""Most characters of a message that Orbax logs: it quotes files as a whole."""
+
+
+def _logged(record: logging.LogRecord) -> bool:
+    """Has a message of Orbax's in one line; whether it is to be logged."""
+    text = record.getMessage()
+    record.msg, record.args = terminal.line(text)[:_MOST_LOGGED], None
+    # Its threads log the traceback of an error that `Checkpoints.save` raises.
+    return "_SignalingThread" not in text
+
+
+logging.getLogger("absl").addFilter(_logged)
 
 Arrays = dict[str, Any]
 """Nested dictionaries of NumPy arrays; orbax stores none of size zero."""
@@ -64,39 +77,55 @@ class Checkpoints:
         read_only: bool = False,
     ):
         """Opens the folder, and makes it if it is missing."""
-        import orbax.checkpoint as ocp
-
         self.folder = folder.resolve()  # orbax takes absolute paths only
         # Synchronous: an episode counts as saved when the command says so.
         # A thread of orbax's deletes old steps: on a slow file system a step may take a tenth of a
         # second, and a batch of thirty runs, which are saved in turn, would wait for thirty.
         writing = {"max_to_keep": keep, "enable_background_delete": True}
         reading = {"create": False}  # orbax's own read_only warns that the folder is read-only
-        options = ocp.CheckpointManagerOptions(
-            enable_async_checkpointing=False, **(reading if read_only else writing)
-        )
+        self._options: dict[str, Any] = reading if read_only else writing
         if not read_only:
+            self.folder.mkdir(parents=True, exist_ok=True)
             # Not by orbax, which begins a thread for it and does not wait for that when it closes.
             for left in self.folder.glob(f"*{_TEMPORARY}*"):
                 files.remove(left)
-        self._args, self._tell, self._run = ocp.args, tell, run
-        self._manager = ocp.CheckpointManager(self.folder, options=options)
+        self._tell, self._run = tell, run
+        self._opened: Any = None
+
+    @property
+    def _manager(self) -> Any:
+        """Orbax's manager, made when it is first needed: it looks at all steps that are there."""
+        import orbax.checkpoint as ocp
+
+        if self._opened is None:
+            options = ocp.CheckpointManagerOptions(
+                enable_async_checkpointing=False, lightweight_initialize=True, **self._options
+            )
+            self._opened = ocp.CheckpointManager(self.folder, options=options)
+        return self._opened
 
     def __enter__(self) -> "Checkpoints":
         return self
 
     def __exit__(self, *exception: object) -> None:
         """Closes orbax's manager, which waits until old steps are deleted."""
+        self._close()
+
+    def _close(self) -> None:
+        opened, self._opened = self._opened, None
         try:
-            self._manager.close()
+            if opened is not None:
+                opened.close()
         except OSError as error:  # the newest steps are saved all the same
             self._tell(f"old checkpoints in {self.folder} could not be deleted: {error}")
 
     def save(self, step: int, arrays: Arrays) -> None:
         """Writes a step; it becomes visible at once and as a whole, or not at all."""
+        import orbax.checkpoint as ocp
+
         labelled = arrays if self._run is None else arrays | {_LABEL: _label(self._run, step)}
         try:
-            saved = self._manager.save(step, args=self._args.StandardSave(labelled))
+            saved = self._manager.save(step, args=ocp.args.StandardSave(labelled))
             if saved:
                 self._write_digests(step, labelled)
         except (OSError, ValueError) as error:  # the latter is how tensorstore says it
@@ -117,13 +146,19 @@ class Checkpoints:
     def restore(self) -> Restored:
         """Reads the newest step whose digest matches; changes nothing on disk."""
         damaged: list[tuple[int, str]] = []
-        for step in sorted(self._manager.all_steps(), reverse=True):
+        for step in sorted(self._steps(), reverse=True):
             arrays, reason = self._read(step)
             if not reason:
                 self._check_label(step, arrays.pop(_LABEL, None))
                 return Restored(step, arrays, tuple(damaged))
             damaged.append((step, reason))
         return Restored(None, {}, tuple(damaged))
+
+    def _steps(self) -> list[int]:
+        """Numbers of the steps that are there, whole or not."""
+        places = self.folder.iterdir() if self.folder.exists() else ()
+        names = [path.name for path in places if path.is_dir()]
+        return [int(name) for name in names if re.fullmatch("0|[1-9][0-9]{0,8}", name)]
 
     def discard(self, steps: Iterable[int]) -> None:
         """Deletes damaged steps, so that their numbers can be saved again."""
@@ -139,14 +174,16 @@ class Checkpoints:
                     f"delete {places[0]} and {places[1]} by hand. The same command then goes on "
                     "from the checkpoint before"
                 ) from error
-        self._manager.reload()
+        self._close()  # orbax remembers the steps that it met
 
     def _read(self, step: int) -> tuple[Arrays, str]:
         try:
             expected, reason = self._compare(step)
             if reason:
                 return {}, reason
-            arrays: Any = self._manager.restore(step, args=self._args.StandardRestore())
+            import orbax.checkpoint as ocp
+
+            arrays: Any = self._manager.restore(step, args=ocp.args.StandardRestore())
         except RunError:
             raise
         except OSError as error:
@@ -232,7 +269,8 @@ def digest(arrays: Arrays) -> str:
 
 
 def file_digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _label(run: str, step: int) -> Arrays:

@@ -17,13 +17,13 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from codesign_jax import files, own
+from codesign_jax import files, own, terminal
 from codesign_jax import scene as scenes
 from codesign_jax.provenance import environment
 from codesign_jax.runs import manifest, reading, scene_files
 from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.runs.columns import FILES, TABLES
-from codesign_jax.runs.manifest import PROVENANCE
+from codesign_jax.runs.manifest import LOCK, PROVENANCE
 from codesign_jax.runs.settings import Settings, masks_of
 from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import InputError
@@ -34,7 +34,6 @@ _MOST_LINES = 16
 """Lines of a file's differences that an error shows."""
 
 
-LOCK = ".lock"
 _INSIDE = {
     own.FOLDER: re.compile(r"[A-Za-z_][\w.]*\.py"),
     "checkpoints": re.compile(r"[0-9]+(\.sha256|\.orbax-checkpoint-tmp.*)?"),
@@ -58,9 +57,7 @@ class RunDirectory:
     def log(self, message: str) -> None:
         """Appends a line with the time to events.log."""
         now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-        path = self.path / EVENTS
-        with files.naming(path), path.open("a", encoding="utf-8") as file:
-            file.write(f"{now} {message}\n")
+        files.append(self.path / EVENTS, f"{now} {terminal.line(message)}\n")
 
 
 @contextlib.contextmanager
@@ -99,6 +96,7 @@ def open_run(
 
 def check_folder(path: Path, scene: Scene, settings: Settings, *, fresh: bool = False) -> None:
     """Checks that a run could start or go on in a folder; changes nothing."""
+    manifest.refuse_links(path)
     _refuse_foreign(path)
     if not (path / PROVENANCE).exists():
         return
@@ -269,7 +267,7 @@ def _refuse_foreign(path: Path) -> None:
 
 
 def _refuse_to_delete(path: Path) -> None:
-    others = [n for n in _all(path) if not _is_of_a_run(path, n) or (path / n).is_symlink()]
+    others = [name for name in _all(path) if not _is_of_a_run(path, name)]
     if others:
         raise InputError(
             [

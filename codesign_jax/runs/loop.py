@@ -293,7 +293,7 @@ class Loop:
     def _close(self, record: Record, e: int, info: EpisodeInfo) -> None:
         records.add_report(record.history, e, info)
         self._save_failures(e, info)
-        last = e + 1 == self.plan.settings.episodes or record.failed_status() is not None
+        last = e + 1 == self.plan.settings.episodes or record.failed_outcomes() is not None
         if last or (e + 1) % self._every == 0:
             self._save(e + 1, record)
         self._write_tables(record, e)
@@ -302,9 +302,9 @@ class Loop:
 
     def _refuse_all_failed(self, record: Record) -> None:
         """Ends a run whose last episode or final test has not one trial that did not fail."""
-        status = record.failed_status()
-        if status is not None:
-            _all_failed(status, self.run_directory.path)
+        outcomes = record.failed_outcomes()
+        if outcomes is not None:
+            refuse_all_failed(outcomes, self.run_directory.path, self.plan.settings.cost)
 
     def _save_failures(self, e: int, info: EpisodeInfo) -> None:
         if not types.failed(np.asarray(info.outcomes.status)).any():
@@ -381,8 +381,19 @@ def _final_test(plan: Plan, record: Record) -> FinalTest | None:
     return None if record.test is None else codesign.summarize_test(plan.scene, record.test)
 
 
-def _all_failed(status: np.ndarray, folder: Path) -> None:
-    advice = [text for bit, text in _ADVICE.items() if (status & bit).any()]
+def refuse_all_failed(outcomes: Outcome, folder: Path, cost: str) -> None:
+    status = np.asarray(outcomes.status)
+    # A state that is no number has a first bad step; a cost of the user's that is none has none.
+    of_cost = ((status & Status.NONFINITE) != 0) & (np.asarray(outcomes.bad_step) < 0)
+    of_cost &= cost != SCENE_COST
+    rest = np.where(of_cost, status & ~Status.NONFINITE, status)
+    advice = [text for bit, text in _ADVICE.items() if (rest & bit).any()]
+    if of_cost.any():
+        advice.insert(
+            0,
+            f"--cost {cost} returned NaN or an infinite number in {of_cost.sum()} of them: it must "
+            "be finite whatever a grasp does.",
+        )
     raise AllFailed(
         f"every one of {status.size} trials failed ({tables.failure_counts(status)}); see "
         f"trials.csv and codesign replay {folder}. " + " ".join(advice)

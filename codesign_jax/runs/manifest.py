@@ -1,6 +1,7 @@
 """provenance.json of a run folder: whose folder it is, how it was made, and whether it is intact.
 
-It may be a stranger's, or damaged: all that others read from it is checked here.
+It may be a stranger's, or damaged: all that others read from it is checked here, and that the
+folder has its files itself.
 """
 
 import dataclasses
@@ -8,23 +9,28 @@ import datetime
 import json
 import re
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from codesign_jax import files, own
+from codesign_jax import files, own, terminal
 from codesign_jax import scene as scenes
 from codesign_jax.provenance import environment, git_state
 from codesign_jax.runs import scene_files
+from codesign_jax.runs.columns import FILES, TABLES
 from codesign_jax.runs.settings import Settings, check
 from codesign_jax.scene.schema import InputError
 
 PROVENANCE = "provenance.json"
 """File that makes a folder a run."""
+LOCK = ".lock"
+"""File that a process holds while it writes to a run."""
 SCHEMA = 1
 """Version of what a run folder holds: it grows when the code before can no longer read a folder."""
 _MOST_BYTES = 20_000_000
+_MOST_PROBLEMS = 3
+"""Links of a folder that an error names."""
 _START = {"time": str, "command": [str]}
 _TYPES = {
     "schema": int,
@@ -68,7 +74,26 @@ def write(path: Path, content: dict[str, Any]) -> None:
         part.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
+def refuse_links(path: Path, names: Iterable[str] = (*FILES, *TABLES, LOCK)) -> None:
+    """Refuses a run folder one of whose files is a link, or nothing that can be read to its end.
+
+    Whoever made the folder would choose which of its user's files are read, shown and written to.
+
+    Args:
+      names: Files and folders at its top that are about to be opened.
+    """
+    problems = [
+        f"{path / name} is a symbolic link, or no file: a run is read and written in its folder "
+        "alone. Put the file or folder itself in its place"
+        for name in files.special(path, names)
+    ]
+    if problems:
+        raise InputError(problems[:_MOST_PROBLEMS])
+
+
 def read_provenance(path: Path) -> dict[str, Any]:
+    """What is noted of a run; texts in it are one line each."""
+    refuse_links(path, [PROVENANCE, *scene_files.NAMES, scene_files.MESHES, own.FOLDER])
     file = path / PROVENANCE
     try:
         size = file.stat().st_size
@@ -101,7 +126,16 @@ def read_provenance(path: Path) -> dict[str, Any]:
     settings = Settings(**stored["settings"])
     if problems := check(settings, None):
         raise _damaged(file, f"its settings are not valid: {problems[0]}")
-    return stored
+    return _lines(stored)
+
+
+def _lines(value: Any) -> Any:
+    """JSON with texts that are one line each."""
+    if isinstance(value, dict):
+        return {terminal.line(name): _lines(entry) for name, entry in value.items()}
+    if isinstance(value, list):
+        return [_lines(entry) for entry in value]
+    return terminal.line(value) if isinstance(value, str) else value
 
 
 def changed_files(path: Path, stored: Mapping[str, Any]) -> list[str]:

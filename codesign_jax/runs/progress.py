@@ -1,17 +1,16 @@
 """Progress on the terminal: a live bar where there is one, plain lines where not."""
 
-import sys
 import threading
 import time
 from typing import NamedTuple, Self
 
-import rich.console
 import rich.progress
 
+from codesign_jax.terminal import Console, line, say
+
 SILENCE = 5.0
-"""Time without a line after which one is printed, where there is no terminal [s]."""
-SECONDS = 10.0
-"""Time between lines of a `Meter` there [s]."""
+"""Time without a line after which one is printed, where there is no terminal [s]; each further one
+of the same phase comes after twice the time of the one before."""
 
 
 def duration(seconds: float) -> str:
@@ -21,20 +20,30 @@ def duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
+def _description() -> rich.progress.ProgressColumn:
+    """What goes on, as it is: names may hold what rich takes for markup."""
+    return rich.progress.TextColumn("{task.description}", markup=False)
+
+
 class Live:
     """A bar where there is a terminal; a context manager.
 
-    Elsewhere a line on the standard error says what goes on and for how long, whenever nothing else
-    was printed for a few seconds.
+    Elsewhere, as in the log of a job, a line says what goes on and for how long if nothing else was
+    printed for a few seconds: a few lines for each phase, however long it is.
     """
 
-    def __init__(self, console: rich.console.Console, *columns: rich.progress.ProgressColumn):
+    def __init__(self, console: Console, *columns: rich.progress.ProgressColumn):
         self.console = console
         self._bar = rich.progress.Progress(
             *columns, console=console, transient=True, disable=not console.is_terminal
         )
         self._task = self._bar.add_task("", total=None)
-        self._stop, self.text, self._since, self._spoken = threading.Event(), "", 0.0, 0.0
+        self._stop = threading.Event()
+        self.text = ""
+        self._since = 0.0  # when the phase began
+        self._spoken = 0.0  # when the last line was printed
+        self._silence = SILENCE  # until the next one
+        self._phase = ""
 
     def __enter__(self) -> Self:
         self._bar.start()
@@ -47,13 +56,16 @@ class Live:
         self._bar.stop()
 
     def begin(self, text: str) -> None:
+        if text != self._phase:  # episodes, of which a run has hundreds, are one phase
+            self._silence = SILENCE
+        self._phase = text
         self._since = self._spoken = time.monotonic()
         self.say(text)
 
     def say(self, text: str) -> None:
         """Says more precisely what goes on; its time goes on as well."""
-        self.text = text
-        self._bar.update(self._task, description=text)
+        self.text = line(text)
+        self._bar.update(self._task, description=self.text)
 
     def message(self, text: str) -> None:
         self.console.print(text)
@@ -62,10 +74,10 @@ class Live:
     def tick(self) -> None:
         """Says what goes on if nothing has been said for so long."""
         now = time.monotonic()
-        if self.text and now - self._spoken >= SILENCE:
+        if self.text and now - self._spoken >= self._silence:
             self._spoken = now
-            words = f"{self.text}: {duration(now - self._since)}"
-            print(words, file=sys.stderr, flush=True)
+            self._silence *= 2
+            say(f"{self.text} ({duration(now - self._since)} so far)", error=True)
 
     def _run(self) -> None:
         while not self._stop.wait(0.2):
@@ -75,8 +87,11 @@ class Live:
 class Busy(Live):
     """Shows that something of unknown progress goes on, and for how long."""
 
-    def __init__(self, console: rich.console.Console, text: str):
-        columns = rich.progress.SpinnerColumn(), rich.progress.TextColumn("{task.description}")
+    def __init__(self, console: Console, text: str):
+        columns = (
+            rich.progress.SpinnerColumn(),
+            _description(),
+        )
         super().__init__(console, *columns, rich.progress.TimeElapsedColumn())
         self.begin(text)
 
@@ -89,11 +104,10 @@ class Meter(Live):
       done: Grasps that were simulated.
     """
 
-    def __init__(self, text: str, total: int, console: rich.console.Console):
-        columns = rich.progress.Progress.get_default_columns()[:-1]
-        super().__init__(console, *columns, rich.progress.TimeRemainingColumn())
+    def __init__(self, text: str, total: int, console: Console):
+        columns = rich.progress.Progress.get_default_columns()[1:-1]
+        super().__init__(console, _description(), *columns, rich.progress.TimeRemainingColumn())
         self.total, self.done, self._name, self._compiled = total, 0, text, None
-        self._told = time.monotonic()
         self.begin(f"{text}: compiling, then {total} grasps")
 
     def found(self, grasps: int) -> None:
@@ -105,12 +119,12 @@ class Meter(Live):
         """Counts grasps that were just simulated; the first call compiled, and has no rate."""
         self.found(grasps)
         now, text = time.monotonic(), f"{self._name}: {self.done} of {self.total} grasps"
-        self.say(text)
         start, before = self._compiled = self._compiled or (now, self.done)
-        if now > start and not self.console.is_terminal and now - self._told >= SECONDS:
-            self._told, rate = now, (self.done - before) / max(now - start, 1e-9)
+        if now > start and not self.console.is_terminal:  # the bar says as much
+            rate = (self.done - before) / (now - start)
             left = duration(max(self.total - self.done, 0) / rate)
-            self.message(f"{text}, {rate:.1f} grasps/s, about {left} left")
+            text += f", {rate:.1f} grasps/s, about {left} left"
+        self.say(text)
 
 
 class Progress(Live):
@@ -120,12 +134,14 @@ class Progress(Live):
     """
 
     def __init__(self, total: int, runs: int = 1, *, test: int = 0, after: float = 0.0):
-        console = rich.console.Console(highlight=False, soft_wrap=True, markup=False)
-        columns = rich.progress.BarColumn(), rich.progress.TextColumn("{task.description}")
-        super().__init__(console, *columns, rich.progress.TimeElapsedColumn())
+        columns = (
+            rich.progress.BarColumn(),
+            _description(),
+        )
+        super().__init__(Console(), *columns, rich.progress.TimeElapsedColumn())
         self.total, self._test, self._after = total, runs * test, runs * after
         self._reports: list[Report] = []
-        self._seconds, self._grasps, self._told = 0.0, 0.0, 0.0
+        self._seconds, self._grasps = 0.0, 0.0
         self._part, self._tested, self._done = 0, 0, 0
 
     def add(self, report: "Report") -> None:
@@ -149,11 +165,8 @@ class Progress(Live):
             self._bar.update(self._task, description=pace)
         elif tested:
             pace = self._pace(tested, seconds, left)
-            line = f"final test {self._tested}/{self._test} grasps  {pace}"
-            self._bar.update(self._task, description=line)
-            if not self.console.is_terminal and time.monotonic() - self._told >= SILENCE:
-                self._told = time.monotonic()
-                self.message(line)
+            words = f"final test {self._tested}/{self._test} grasps  {pace}"
+            self.say(words)
 
     def _line(self, reports: "list[Report]", first: int, grasps: int) -> str:
         if len(reports) == 1:

@@ -58,11 +58,12 @@ def load_record(folder: Path, *, tell: Tell | None = None) -> Record | None:
       InputError: If the folder is no run, no checkpoint of it can be read, or they are another's.
     """
     tell = tell or (lambda text: warnings.warn(text, stacklevel=3))
+    manifest.refuse_links(folder)
+    stored = manifest.read_provenance(folder)
     if problem := lost(folder):
         raise InputError([problem])
     if not (folder / "checkpoints").is_dir():
         return None
-    stored = manifest.read_provenance(folder)
     settings = Settings(**stored["settings"])
     try:
         with Checkpoints(folder / "checkpoints", run=stored["id"], read_only=True) as store:

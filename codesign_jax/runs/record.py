@@ -1,7 +1,8 @@
 """What a run has so far: the optimiser's state and its episodes' reports, and both as arrays."""
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -88,11 +89,12 @@ class Record:
     def done(self) -> int:
         return int(self.state.episode)
 
-    def failed_status(self) -> np.ndarray | None:
-        """Status of the final test's or the last episode's trials where every one failed."""
-        told = [] if self.test is None else [np.asarray(self.test.status)]
-        told += [np.asarray(self.history.outcomes.status[self.done - 1])] if self.done else []
-        return next((status for status in told if failed(status).all()), None)
+    def failed_outcomes(self) -> Outcome | None:
+        """The final test or the last episode, where every trial of it failed."""
+        told = [] if self.test is None else [self.test]
+        if self.done:
+            told.append(jax.tree.map(lambda v: v[self.done - 1], self.history.outcomes))
+        return next((every for every in told if failed(np.asarray(every.status)).all()), None)
 
     def last_outcomes(self) -> Outcome:
         """Outcomes in the last episode of the particle filter's final particles.
@@ -138,14 +140,72 @@ def from_arrays(arrays: dict) -> Record:
         ) from error
 
 
+def _shapes(record: Any, settings: Settings) -> Iterator[tuple[str, Any, tuple]]:
+    """Arrays of a record by name, and the shapes that they have in a run of these settings."""
+    history, state = record.history, record.state
+    e, n, t = np.shape(history.outcomes.cost)
+    p = np.shape(state.particles)[-1]
+    yield "particles", state.particles, (settings.particles, p)
+    yield "episode", state.episode, ()
+    yield "key", state.key, ()
+    for name, value in history.outcomes._asdict().items():
+        if value is not None or name not in _NOT_EVERYWHERE:
+            yield f"trials/{name}", value, (e, n, t)
+    yield "population", history.population, (e, n, p)
+    for name in ("cost", "weight", "ancestors"):
+        yield name, getattr(history, name), (e, n)
+    if record.test is not None:
+        tested = n, settings.test_rounds * settings.trials
+        for name, value in record.test._asdict().items():
+            if value is not None or name not in _NOT_EVERYWHERE:
+                yield f"test/{name}", value, tested
+    if record.start is not None:
+        yield "start/design", record.start.design, (p,)
+        yield "start/cost", record.start.cost, ()
+        yield "start/candidates", record.start.candidates, ()
+
+
+_NOT_EVERYWHERE = {"capped", "residual"}
+"""Arrays that not every engine tells."""
+_WHOLE = {"episode", "ancestors", "status", "bad_step", "candidates"}
+"""Arrays of whole numbers; the others have real ones."""
+
+
+def _problem(record: Record, settings: Settings) -> str:
+    """Which array is none of a run of these settings; nothing if each is.
+
+    Digests say that arrays are those that were saved, not who saved them.
+    """
+    try:
+        for name, value, shape in _shapes(record, settings):
+            last = name.rpartition("/")[2]
+            kinds = "iu" if last in _WHOLE else "f"
+            if value.shape != shape or (name != "key" and value.dtype.kind not in kinds):
+                return name
+    except (AttributeError, IndexError, TypeError, ValueError):
+        return "cost"
+    ancestors, rooms = record.history.ancestors, len(record.history.cost)
+    if not 0 <= record.done <= rooms:
+        return "episode"
+    if ancestors.size and not (-1 <= ancestors.min() and ancestors.max() < settings.particles):
+        return "ancestors"
+    return ""
+
+
 def refuse_other(record: Record, settings: Settings) -> None:
     """Refuses a record that is not of a run of these settings."""
-    (_, n, t), done = record.history.outcomes.cost.shape, record.done
+    sizes = np.shape(record.history.outcomes.cost)[1:]
     asked = settings.particles, settings.trials, settings.episodes
-    if asked[:2] != (n, t) or done > asked[2]:
-        raise RunError(
-            f"its checkpoints have {done} episodes of {n} particles and {t} trials, and "
-            "provenance.json {2} of {0} and {1}: put back the one that belongs to them".format(
-                *asked
+    if len(sizes) == 2 and np.shape(record.state.episode) == ():
+        done = record.done
+        if asked[:2] != sizes or done > asked[2]:
+            raise RunError(
+                f"its checkpoints have {done} episodes of {sizes[0]} particles and {sizes[1]} "
+                f"trials, and provenance.json {asked[2]} of {asked[0]} and {asked[1]}: put back "
+                "the one that belongs to them"
             )
+    if problem := _problem(record, settings):
+        raise RunError(
+            f"its checkpoints hold an array {problem!r} that no run of these settings has: put "
+            "checkpoints/ back from a copy"
         )

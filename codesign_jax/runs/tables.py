@@ -42,8 +42,7 @@ def write_episodes(
         if start == 0:
             _replace(path, text)
         else:
-            with files.naming(path), path.open("a", newline="", encoding="utf-8") as file:
-                file.write(text)
+            files.append(path, text)
 
 
 def write_tests(folder: Path, space: DesignSpace, particles: np.ndarray, test: FinalTest) -> None:

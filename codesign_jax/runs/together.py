@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 from codesign_jax import codesign
 from codesign_jax.batch import LIMIT, Batch, Request
+from codesign_jax.compiler.ffi import KernelUnavailable
 from codesign_jax.runs.directory import open_run
 from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.interrupts import Interrupts, Stopped
@@ -23,8 +24,9 @@ from codesign_jax.runs.settings import Settings
 MOST = 100
 """Most runs at once: each holds open files.  More go on when these have ended."""
 
-FAILURES = (OSError, RunError)
-"""How a run may fail: what it has cannot be saved, no seed is found, or every trial failed.
+FAILURES = (OSError, RunError, KernelUnavailable)
+"""How a run may fail: what it has cannot be saved, no seed is found, every trial failed, or the
+engine cannot run here.
 
 Any other error is unexpected: its traceback is kept.
 """
@@ -229,4 +231,5 @@ class _Together:
         self.found[folder] = error
         how = str(error) if isinstance(error, FAILURES) else "".join(format_exception(error))
         with contextlib.suppress(OSError):  # a full disk may be why it failed
-            self.loops[folder].run_directory.log(f"failed: {how.rstrip()}")
+            for line in f"failed: {how.rstrip()}".splitlines():
+                self.loops[folder].run_directory.log(line)

@@ -291,7 +291,10 @@ def _factors(total: Sum) -> dict[str, Any]:
 def read_sum(value: Any, unit: str) -> Sum | str:
     """A value of a file as a sum, or what is wrong with it."""
     if isinstance(value, int | float) and not isinstance(value, bool):
-        return Sum(unit, float(value))
+        try:
+            return Sum(unit, float(value))
+        except OverflowError:
+            return "is too large"
     if not isinstance(value, str) or not value.strip():
         return 'must be a number, or a sum of numbers and names such as "zero_height + arm_z"'
     number, terms, place = None, {}, 0

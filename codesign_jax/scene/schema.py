@@ -16,8 +16,9 @@ from typing import Any, TypeVar
 
 import jax
 
+from codesign_jax import terminal
 from codesign_jax.scene import texts
-from codesign_jax.scene.texts import SHOWN, printable, shown
+from codesign_jax.scene.texts import SHOWN, shown
 
 T = TypeVar("T")
 
@@ -56,7 +57,7 @@ class InputError(ValueError):
 
     def __init__(self, problems: list[str]):
         """Joins the problems into one message, a line each."""
-        self.problems = [printable(problem) for problem in problems]
+        self.problems = [terminal.line(problem) for problem in problems]
         super().__init__("\n".join(self.problems))
 
 

@@ -4,8 +4,8 @@ import codecs
 import unicodedata
 from typing import Any
 
-_CONTROL = {"Cc", "Cs", "Zl", "Zp"}
-"""Unicode categories of what is no text: control characters, halves of a pair, ends of lines."""
+from codesign_jax.terminal import CONTROL
+
 MOST_LETTERS = 1000
 """Most characters of a text."""
 SHOWN = 120
@@ -21,23 +21,13 @@ def shown(value: Any) -> str:
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}... ({len(text):,} characters)"
 
 
-def printable(message: str) -> str:
-    """A message without what a terminal would take for a command, or could not show."""
-    if message.isprintable():
-        return message
-    return "".join(
-        c if c in "\n\t" or unicodedata.category(c) not in _CONTROL else ascii(c)[1:-1]
-        for c in message
-    )
-
-
 def problem(path: str, text: str, *, lines: bool = False) -> str | None:
     """Returns why a text is none that a file, a table or a terminal could hold, or None."""
     if len(text) > MOST_LETTERS:
         return f"{path} has {len(text):,} characters, more than {MOST_LETTERS:,}"
     allowed = "\n\r\t" if lines else ""
     for c in text:
-        if unicodedata.category(c) in _CONTROL and c not in allowed:
+        if unicodedata.category(c) in CONTROL and c not in allowed:
             return f"{path} = {shown(text)} has a character that is no text, U+{ord(c):04X}"
     return None
 

@@ -13,7 +13,6 @@ import threading
 import webbrowser
 from typing import Any
 
-from rich.console import Console
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import Server, ServerConnection
 
@@ -28,13 +27,14 @@ from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.schema import InputError
 from codesign_jax.studio import server
 from codesign_jax.studio.tab import COUNTS, Desk, Tab
+from codesign_jax.terminal import Console
 
 
 def main(options: Options) -> int:
     common.use_compilation_cache()
     problems = common.number_problems(("--port", options.port, 0, 65535))
     common.refuse(problems + common.place_problems("--out", options.out, folder=True))
-    console = common.console()
+    console = Console()
     desk = Desk(options)
     scene, space = desk.case.scene, desk.case.space
     for note in preflight.notes(scene, space, {"the design": desk.case.design}):
@@ -54,7 +54,8 @@ def serve(desk: Desk, console: Console) -> None:
             f"--host {options.host}: other machines can reach this page. Its token guards it, but "
             "crosses the network unencrypted, as all else; an ssh tunnel to loopback is safer"
         )
-    console.print(f"the studio: {address}\nfor this user's browser; Ctrl-C ends it")
+    console.print(f"the studio: {address}")
+    console.print("for this user's browser; Ctrl-C ends it")
     if options.open:
         webbrowser.open(address)
     with listening:

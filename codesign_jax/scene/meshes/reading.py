@@ -9,6 +9,7 @@ import hashlib
 import io
 import json
 import logging
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,8 +27,16 @@ FORMATS = ("glb", "gltf", "obj", "off", "ply", "stl")
 MOST_BYTES = 1 << 24
 """Largest file; a binary STL of 200,000 faces has 10 MB."""
 MOST_FACES = 200_000
-_MOST_PARTS = 1000
+MOST_PARTS = 1000
 """Most bodies of a file: each costs trimesh a millisecond, however small it is."""
+_STL_HEAD, _STL_FACE = 84, 50
+"""Bytes of a binary STL before its faces, the last four of them their number, and of a face."""
+_GROUP = re.compile(r"^[ \t]*+(?:usemtl|g|o|s|mtllib)\b.*$", re.MULTILINE)
+"""Lines of an OBJ that name parts and materials: trimesh takes quadratic time for them."""
+_COMMA = re.compile(
+    r"^[ \t]*+(?:v|vertex|facet[ \t]++normal)?[ \t]*+[-+]?[0-9]++,[0-9]", re.MULTILINE
+)
+"""A line of positions or normals that begins with a number with a decimal comma."""
 
 
 class Read(NamedTuple):
@@ -76,12 +85,10 @@ def _parse(content: bytes, kind: str) -> tuple[np.ndarray, np.ndarray]:
     options: dict[str, Any] = {}
     if kind in ("glb", "gltf"):
         _check_gltf(content)
-    elif kind in ("obj", "off") or (kind == "stl" and not _is_binary_stl(content)):
-        # What is no UTF-8 trimesh would give to a detector of encodings, which takes minutes.
-        text = content.decode("utf-8", "replace")
-        if text.lower().count("endsolid") > _MOST_PARTS:
-            raise ValueError(f"more than {_MOST_PARTS:,} solids")
-        content = text.encode()
+    elif kind == "stl" and (end := _end_of_binary_stl(content)):
+        content = content[:end]
+    elif kind != "ply" or b"format ascii" in content[:_STL_HEAD]:
+        content = _text(content, kind).encode()
     if kind in ("glb", "gltf", "obj", "ply"):
         options["skip_materials"] = True
     with np.errstate(all="ignore"):  # numbers out of range are looked at below
@@ -91,8 +98,33 @@ def _parse(content: bytes, kind: str) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
 
 
-def _is_binary_stl(content: bytes) -> bool:
-    return len(content) >= 84 and len(content) == 84 + 50 * int.from_bytes(content[80:84], "little")
+def _end_of_binary_stl(content: bytes) -> int:
+    """Where the last face of a binary STL ends; 0 for a text.
+
+    Some programs write more behind it. A text has letters for the number of faces: so many faces
+    no file has room for.
+    """
+    count = int.from_bytes(content[_STL_HEAD - 4 : _STL_HEAD], "little")
+    end = _STL_HEAD + _STL_FACE * count
+    if len(content) >= max(end, _STL_HEAD):
+        return end
+    if b"\0" in content[:_STL_HEAD]:
+        whole = max(len(content) - _STL_HEAD, 0) // _STL_FACE
+        raise ValueError(f"it is cut short: its head has {count:,} faces, the file {whole:,}")
+    return 0
+
+
+def _text(content: bytes, kind: str) -> str:
+    """A mesh file of text, in which the parser finds nothing that takes it long."""
+    # What is no UTF-8 trimesh would give to a detector of encodings, which takes minutes.
+    text = content.decode("utf-8", "replace")
+    if kind == "stl" and text.lower().count("endsolid") > MOST_PARTS:
+        raise ValueError(f"more than {MOST_PARTS:,} solids")
+    if _COMMA.search(text):
+        raise ValueError("its numbers have decimal commas; save it with decimal points")
+    if kind == "obj" and sum(1 for _ in _GROUP.finditer(text)) > MOST_PARTS:
+        text = _GROUP.sub("", text)
+    return text
 
 
 def _check_gltf(content: bytes) -> None:
@@ -104,8 +136,8 @@ def _check_gltf(content: bytes) -> None:
             uri = shown(buffer["uri"])
             raise ValueError(f"its numbers are in another file, {uri}; save it as .glb")
     for key in ("nodes", "meshes"):
-        if len(parts[key]) > _MOST_PARTS:
-            raise ValueError(f"{len(parts[key]):,} {key}, more than {_MOST_PARTS:,}")
+        if len(parts[key]) > MOST_PARTS:
+            raise ValueError(f"{len(parts[key]):,} {key}, more than {MOST_PARTS:,}")
     children = [child for node in parts["nodes"] for child in node.get("children", [])]
     if len(children) != len({*children}):
         raise ValueError("a node has two parents")

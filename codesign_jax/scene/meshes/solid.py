@@ -78,23 +78,28 @@ class Solid:
         try:
             built = grid.cached(self.digest, self.vertices, self.faces, *known)
         except ValueError as error:
+            # Of parts that overlap their walls are too close together, not the body too large.
+            self._refuse_overlap()
             raise InputError([f"{self.path.name}: {error}"]) from error
         # Where parts overlap, the mesh counts a volume twice and the distance has inner walls.
         filled = np.clip(0.5 - built.values / built.cell, 0.0, 1.0).sum() * built.cell**3
         # A body that is thin for the cells fills another volume too.
-        if abs(filled - self.volume) > 0.1 * self.volume and self._inner_share() > 0.02:
-            raise InputError(
-                [
-                    f"{self.path.name}: the surface cuts through itself: "
-                    f"{100 * self._inner_share():.0f} % of it lie inside the body"
-                ]
-            )
+        if abs(filled - self.volume) > 0.1 * self.volume:
+            self._refuse_overlap()
         return built
 
-    def _inner_share(self) -> float:
-        """Share of the surface whose outer side lies inside the body, by random points of it."""
+    def _refuse_overlap(self) -> None:
+        """Refuses a surface with inner walls: much of its outer side lies inside the body."""
         points = grid.near_surface(self.vertices, self.faces, 400, 1e-5 * self.radius)
-        return float((surface.winding(self.vertices, self.faces, points) > 0.5).mean())
+        inside = float((surface.winding(self.vertices, self.faces, points) > 0.5).mean())
+        if inside > 0.02:
+            raise InputError(
+                [
+                    f"{self.path.name}: the surface cuts through itself, as of parts that overlap: "
+                    f"{100 * inside:.0f} % of it lie inside the body. Unite the parts in the "
+                    "program that made them"
+                ]
+            )
 
 
 def load(

@@ -1,0 +1,364 @@
+"""A stranger's run folder: nothing is opened through a link, run, or printed as it stands.
+
+SECURITY.md names these tests beside its promises.
+"""
+
+import copy
+import io
+import json
+import os
+import sys
+import types
+import unicodedata
+import zipfile
+from pathlib import Path
+
+import hypothesis
+import jax
+import numpy as np
+import pytest
+import rich.table
+
+from codesign_jax import files, runs, store, terminal
+from codesign_jax.commands import check, hosts, reference, status
+from codesign_jax.compiler.ffi import KernelUnavailable
+from codesign_jax.export import sheet
+from codesign_jax.report.stress import Stress
+from codesign_jax.runs import directory, loop, manifest, progress
+from codesign_jax.runs import record as records
+from codesign_jax.runs.columns import FILES, TABLES
+from codesign_jax.scene import InputError
+from codesign_jax.types import Outcome, Status
+from tests.helpers.command_runs import command, own_workplace  # noqa: F401
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*contacts of today have no such numbers")
+ARCHIVE = Path(__file__).parent / "data" / "run_screened.zip"
+HOSTILE = "\x1b]0;owned\x07\nsecond\r\u202e\u2028line"
+SHOWN = r"\x1b]0;owned\x07\nsecond\r\u202e\u2028line"
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run of a stranger's."""
+    zipfile.ZipFile(ARCHIVE).extractall(tmp_path)
+    return tmp_path / "screened"
+
+
+def noted(run, change):
+    """Changes what the run's provenance notes."""
+    path = run / "provenance.json"
+    stored = json.loads(path.read_text())
+    change(stored)
+    path.write_text(json.dumps(stored))
+
+
+# --- links and what is no file -------------------------------------------------------------------
+
+
+NAMES = {*FILES, *TABLES, manifest.LOCK, "checkpoints/5", "checkpoints/5.sha256"}
+NAMES |= {"checkpoints/5/_CHECKPOINT_METADATA", "failures/x.npz", "figures/cost_evolution.png"}
+
+
+@pytest.mark.parametrize("kind", ["link", "link to nothing", "FIFO"])
+def test_no_file_of_a_run_is_opened_through_a_link_or_waited_for(kind, run, tmp_path):
+    """Each of its names is refused by all that open it, and what lies outside stays."""
+    scene, settings = runs.read_run(run)
+    outside = tmp_path / "outside"
+    for name in sorted(NAMES):
+        place, before = run / name, tmp_path / "before"
+        place.parent.mkdir(exist_ok=True)
+        if place.exists():
+            place.rename(before)
+        if kind == "FIFO":
+            os.mkfifo(place)
+        else:
+            if kind == "link":
+                outside.write_text("mine")
+            place.symlink_to(outside)
+        for fresh in (False, True):
+            with (
+                pytest.raises(InputError, match="is a symbolic link, or no file"),
+                directory.open_run(run, scene, settings, ["codesign"], fresh=fresh),
+            ):
+                pass
+        with pytest.raises(InputError, match="is a symbolic link, or no file"):
+            runs.load_record(run)
+        assert kind != "link" or outside.read_text() == "mine"
+        assert kind != "link to nothing" or not outside.exists()
+        place.unlink()
+        outside.unlink(missing_ok=True)
+        if before.exists():
+            before.rename(place)
+    assert runs.load_record(run) is not None  # the same folder without them
+
+
+def test_a_scene_file_of_a_run_that_is_a_link_is_not_read(run, tmp_path):
+    for name in ("provenance.json", "scene.toml", "objects.toml"):
+        (run / name).rename(tmp_path / name)
+        (run / name).symlink_to(tmp_path / name)
+        with pytest.raises(InputError, match=f"{name} is a symbolic link"):
+            runs.read_run(run)
+        (run / name).unlink()
+        (tmp_path / name).rename(run / name)
+
+
+def test_text_is_appended_to_a_file_of_this_name_alone(tmp_path):
+    path, other, link = (tmp_path / name for name in ("log", "copy", "link"))
+    files.append(path, "one\n")
+    os.link(path, other)
+    files.append(path, "two\n")
+    assert (path.read_text(), other.read_text()) == ("one\ntwo\n", "one\n")
+    link.symlink_to(other)
+    with pytest.raises(OSError):
+        files.append(link, "three\n")
+    assert other.read_text() == "one\n"
+
+
+def test_a_batch_does_not_run_in_a_folder_that_is_a_link(tmp_path, workplace, capsys):
+    (tmp_path / "elsewhere").mkdir()
+    (workplace / "many").mkdir()
+    (workplace / "many" / "seed-1").symlink_to(tmp_path / "elsewhere")
+    line = ["optimize", "--scene", "paper_spheres", "--seeds", "0-1", "--out", "many", "--dry-run"]
+    assert command(*line) == 2
+    assert "many/seed-1 is a symbolic link" in capsys.readouterr().err
+
+
+# --- texts ---------------------------------------------------------------------------------------
+
+
+@hypothesis.settings(max_examples=50, deadline=None)
+@hypothesis.given(hypothesis.strategies.text(max_size=20))
+def test_a_printed_text_is_one_line_without_commands(text):
+    shown = terminal.line(text)
+    assert not any(unicodedata.category(c) in terminal.CONTROL for c in shown)
+    assert shown == text or not text.isprintable()
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii", "latin-1"])
+def test_every_way_to_print_shows_what_a_terminal_would_obey(encoding, monkeypatch):
+    """Also in encodings that lack a letter."""
+    stream = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+    monkeypatch.setattr(sys, "stdout", stream)
+    table = rich.table.Table("Größe")
+    table.add_row(HOSTILE)
+    for console in (terminal.Console(), terminal.Console(file=stream, width=100)):
+        console.print(HOSTILE, "[red]日:smile:")
+        console.print(table)
+    terminal.say(HOSTILE, "日")
+    stream.seek(0)
+    said = stream.read()
+    assert not {*said} & {"\x1b", "\x07", "\r", "\u2028"} and "\nsecond" not in said
+    assert said.count(SHOWN) == 5
+    assert ("日" if encoding == "utf-8" else r"\u65e5") in said
+
+
+def test_texts_of_a_run_are_one_line_each_where_it_goes_on(run):
+    noted(run, lambda stored: stored["environment"].update(python=HOSTILE))
+    scene, settings = runs.read_run(run)
+    before = (run / "events.log").read_text().count("\n")
+    with directory.open_run(run, scene, settings, ["codesign"]) as (opened, notes):
+        opened.log(HOSTILE)
+    log = (run / "events.log").read_text()
+    assert log.count("\n") == before + len(notes) + 2 and "\x1b" not in log
+    assert any(SHOWN in note for note in notes) and not any("\n" in note for note in notes)
+
+
+def test_texts_of_results_are_one_line_each_and_no_html_on_a_sheet(tmp_path):
+    kept = {"warnings": np.array([HOSTILE, "<script>"]), "empty": np.array([], str)}
+    store.save(tmp_path / "x.npz", kept)
+    found = store.load(tmp_path / "x.npz")
+    assert found["warnings"].tolist() == [SHOWN, "<script>"] and found["empty"].shape == (0,)
+    rows = [(HOSTILE, "<img src=x>", "![a](http://b)")]
+    section = sheet.SheetSection("t", ("a", "b", "c"), rows, [HOSTILE])
+    text = sheet.markdown(HOSTILE, ["<b>"], [section])
+    assert not {*text} & {"\x1b", "\r"} and "<" not in text and "](" not in text
+    assert text.count("\n") == sheet.markdown("", [""], [section]).count("\n")
+
+
+def test_a_log_without_a_terminal_gets_few_lines_with_counts_and_the_time_left(monkeypatch, capsys):
+    """In an hour of simulated time; the clock is a stand-in, as is the thread that ticks."""
+    now = [0.0]
+    monkeypatch.setattr(progress, "time", types.SimpleNamespace(monotonic=lambda: now[0]))
+    meter = progress.Meter("stress", 720, terminal.Console())
+    for _ in range(720):
+        now[0] += 5.0
+        meter.advance(1)
+        meter.tick()
+    lines = capsys.readouterr().err.splitlines()
+    assert 5 <= len(lines) <= 12
+    assert "of 720 grasps, 0.2 grasps/s, about" in lines[-1] and lines[-1].endswith("so far)")
+
+
+# --- code, results and checkpoints ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("key", ["optimizer", "cost"])
+def test_check_imports_nothing_that_a_run_names(key, run, workplace, monkeypatch, capsys):
+    """Its simulations are stand-ins: what follows them counts the grasps of a search."""
+    (workplace / "stranger.py").write_text("open('executed', 'w')\ndef X(*a): pass\n")
+    noted(run, lambda stored: stored["settings"].update({key: "stranger:X"}))
+
+    def simulate(case, settings, finer, options, console):
+        size = (2, 3)
+        outcomes = Outcome(*(np.zeros(size, int) for _ in range(4)))  # type: ignore[arg-type]
+        measured = check.Measured(case.scene, outcomes, 1.0, 0.0)
+        return "designs", measured, measured
+
+    monkeypatch.setattr(check, "simulate", simulate)
+    assert command("check", "--run", run) == 0
+    assert not (workplace / "executed").exists() and "stranger" not in sys.modules
+    assert "a search (" in capsys.readouterr().out
+
+
+def stress(**changed):
+    found = {"conditions": np.array(["as it is"]), "kept": np.array([3]), "trials": np.array(12)}
+    return found | {"warnings": np.array(["a warning"])} | changed
+
+
+def outcomes(**changed):
+    numbers = np.zeros(4, np.float32)
+    return dict.fromkeys(("cost", "status", "lost_time", "bad_step"), numbers) | changed
+
+
+def test_results_that_are_not_shown_are_told(run, monkeypatch):
+    """Damaged, gone, or with arrays that no run has under a right digest: each is a note."""
+    monkeypatch.setattr(reference, "ACCURACY", "fast")
+    scene, settings = runs.read_run(run)
+    places = run / reference.FILE, run / reference.STRESS_FILE
+    abouts = [
+        reference.case_of_run(run, accuracy="fast", engine=settings.engine).digest(settings.seed),
+        reference.case_of_run(run, engine=settings.engine).digest(
+            reference.STRESS_TRIALS, settings.seed
+        ),
+    ]
+
+    def write(fresh, conditions):
+        for place, about, arrays in zip(places, abouts, (fresh, conditions), strict=True):
+            store.keep(place, about, arrays)
+
+    write(outcomes(), stress())
+    found = reference.kept(run, scene, settings)
+    assert found.fresh is not None and isinstance(found.stress, Stress) and not found.notes
+    wrong = [
+        (outcomes(more=np.zeros(4)), stress()),
+        (outcomes(cost=np.zeros((4, 2))), stress()),
+        (outcomes(cost=np.array(["a"] * 4)), stress()),
+        (outcomes(), stress(kept=np.array([13]))),
+        (outcomes(), stress(kept=np.zeros((1, 2)))),
+        (outcomes(), stress(trials=np.zeros(2))),
+    ]
+    for fresh, conditions in wrong:
+        write(fresh, conditions)
+        [note] = reference.kept(run, scene, settings).notes
+        assert "does not hold what such a file has" in note
+    for place in places:
+        write(outcomes(), stress())
+        place.write_bytes(place.read_bytes()[:-100])
+        [note] = reference.kept(run, scene, settings).notes
+        assert note.startswith(f"{place} is damaged") and "left out" in note
+        place.unlink()
+        [note] = reference.kept(run, scene, settings).notes
+        assert note.startswith(f"{place} is missing")
+
+
+def test_digests_are_compared_before_orbax_opens_a_step(run, caplog):
+    """What Orbax cannot parse it logs as a whole."""
+    for path in run.glob("checkpoints/*/_CHECKPOINT_METADATA"):
+        path.write_text("\x1b[2J{" + "A" * 20_000)
+    with pytest.raises(InputError, match="no checkpoint that is whole"):
+        runs.load_record(run)
+    assert not caplog.records
+
+
+def leaves(arrays, place=()):
+    for name, value in arrays.items():
+        if isinstance(value, dict):
+            yield from leaves(value, (*place, name))
+        else:
+            yield (*place, name), value
+
+
+def replaced(arrays, place, value):
+    changed = copy.deepcopy(arrays)
+    inside = changed
+    for name in place[:-1]:
+        inside = inside[name]
+    inside[place[-1]] = value
+    return changed
+
+
+def test_arrays_that_no_run_has_are_refused_in_words(run):
+    """Each array of a checkpoint with another shape, of another kind, or a table in its place."""
+    record, settings = runs.load_record(run), runs.read_run(run)[1]
+    assert record is not None
+    arrays = records.to_arrays(record)
+    records.refuse_other(records.from_arrays(arrays), settings)
+    cases = []
+    for place, value in leaves(arrays):
+        if "memory" not in place:
+            wrong = (value[..., None], value.astype(bool), {"a": value}, np.zeros((0, 0, 0)))
+            cases += [(place, other) for other in wrong]
+    size = arrays["history"]["ancestors"].shape
+    cases += [(("history", "ancestors"), np.full(size, n, np.int32)) for n in (-2, 10**6)]
+    cases += [(("state", "episode"), np.array(n, np.int32)) for n in (-1, 10**6)]
+    for place, value in cases:
+        with pytest.raises(runs.RunError, match="checkpoints (hold|have)"):
+            records.refuse_other(records.from_arrays(replaced(arrays, place, value)), settings)
+
+
+# --- what is not there ---------------------------------------------------------------------------
+
+
+def failing(error):
+    def fail():
+        raise error
+
+    return fail
+
+
+def test_what_this_machine_lacks_is_one_line(monkeypatch, capsys):
+    assert status.of(failing(KernelUnavailable("no kernels: why"))) == 1
+    assert capsys.readouterr().err == "error: no kernels: why\n"
+    before = jax.config.jax_platforms
+    jax.config.update("jax_platforms", "cuda")
+    try:
+        for error in (RuntimeError("no cuda"), AssertionError()):
+            with monkeypatch.context() as patch:
+                patch.setattr(jax, "devices", failing(error))
+                assert status.of(failing(error)) == 1
+            assert capsys.readouterr().err.startswith("error: JAX_PLATFORMS=cuda asks for a device")
+    finally:
+        jax.config.update("jax_platforms", before)
+    with pytest.raises(RuntimeError, match="a bug"):
+        status.of(failing(RuntimeError("a bug")))
+
+
+@pytest.mark.parametrize(("bad_step", "blamed"), [(-1, True), (7, False)])
+def test_a_cost_that_is_no_number_is_blamed_itself(bad_step, blamed):
+    status, step = np.full(4, int(Status.NONFINITE)), np.full(4, bad_step)
+    found = Outcome(np.zeros(4), status, np.zeros(4), step)  # type: ignore[arg-type]
+    with pytest.raises(runs.AllFailed) as error:
+        loop.refuse_all_failed(found, Path("r"), "mine:c")
+    assert ("--cost mine:c returned NaN" in str(error.value)) == blamed
+    assert ("timestep" in str(error.value)) != blamed
+
+
+def test_a_process_says_for_whom_it_waits(monkeypatch, capsys):
+    """JAX's own wait is a stand-in that ticks for the thread."""
+    now = [0.0]
+    monkeypatch.setattr(progress, "time", types.SimpleNamespace(monotonic=lambda: now[0]))
+    shown = []
+    begin = progress.Busy.begin
+    monkeypatch.setattr(progress.Busy, "begin", lambda s, t: (shown.append(s), begin(s, t))[1])
+
+    def wait(*where, **how):
+        now[0] = 6.0
+        shown[-1].tick()
+
+    monkeypatch.setattr(jax.distributed, "initialize", wait)
+    before = jax.config.jax_platforms
+    try:
+        hosts.join("node0:1234,3,1")
+    finally:
+        jax.config.update("jax_platforms", before)
+    assert "waiting for 2 other processes at node0:1234" in capsys.readouterr().err

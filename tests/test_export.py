@@ -1,7 +1,9 @@
 """Exports: parts and moulds, build sheet and tolerances, and grasps in plain MuJoCo."""
 
 import csv
+import hashlib
 import itertools
+import json
 import zipfile
 from pathlib import Path
 
@@ -346,6 +348,18 @@ def test_command_writes_the_sheet(tmp_path, capsys, by_toy):
     assert "--tolerance-steps" in capsys.readouterr().err and not (tmp_path / "no").exists()
 
 
+def fill(path, *names, **kwargs):
+    """Fills a folder with files that hold their names."""
+    with files.whole_folder(path, **kwargs) as part:
+        for name in names:
+            (part / name).parent.mkdir(parents=True, exist_ok=True)
+            (part / name).write_text(name)
+
+
+def below(path):
+    return {p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file()}
+
+
 def test_a_folder_is_there_as_a_whole_or_not_at_all(tmp_path):
     path = tmp_path / "a" / "folder"
     with pytest.raises(ValueError), files.whole_folder(path) as part:
@@ -354,11 +368,52 @@ def test_a_folder_is_there_as_a_whole_or_not_at_all(tmp_path):
     assert [*(tmp_path / "a").iterdir()] == []
     part.mkdir()
     (part / "of a killed process").touch()
-    for name in ("new", "newer"):
-        with files.whole_folder(path) as part:
-            (part / name).touch()
-        (path / "own").touch()
-    assert {p.name for p in path.iterdir()} == {"new", "newer", "own"}
+    (part.parent / ".folder.other.part").mkdir()  # of a folder whose name begins alike
+    fill(path, "new")
+    assert below(tmp_path / "a") == {"folder/new", "folder/manifest.json"}
+    assert {p.name for p in path.parent.iterdir()} == {"folder", ".folder.other.part"}
+
+
+def test_what_belongs_to_a_folder_is_replaced_whole(tmp_path):
+    """Of what an earlier call wrote nothing stays, of others' files all, whatever their place."""
+    path, outside = tmp_path / "folder", tmp_path / "outside"
+    fill(path, "kept", "changed", "parts/old", "deep/er/old", "edited")
+    (path / "foreign").touch()
+    (path / "parts" / "mine").touch()
+    (path / "edited").write_text("by its reader")
+    fill(path, "kept", "changed", "parts/new")
+    others = ["edited", "foreign", "parts/mine"]
+    assert files.foreign(path) == others
+    assert below(path) == {*others, "kept", "changed", "parts/new", "manifest.json"}
+    assert not (path / "deep").exists()
+    # A list is data: it deletes nothing outside of its folder, and a damaged one nothing at all.
+    outside.write_text("outside")
+    digest = hashlib.sha256(b"outside").hexdigest()
+    for name in ("../outside", str(outside), "link/outside"):
+        (path / files.MANIFEST).write_text(json.dumps({"files": {name: digest}}))
+        (path / "link").is_symlink() or (path / "link").symlink_to(tmp_path)
+        fill(path, "kept")
+        assert outside.exists(), name
+    for text in ("", "[]", "{}", '{"files": 3}'):
+        (path / files.MANIFEST).write_text(text)
+        fill(path, "kept")
+        assert files.foreign(path) == ["changed", *others[:2], *sorted(["parts/mine", "parts/new"])]
+
+
+def test_one_call_fills_a_folder_at_a_time(tmp_path):
+    path = tmp_path / "folder"
+    with files.whole_folder(path) as part:
+        (part / "first").touch()
+        with pytest.raises(BlockingIOError, match="another export is writing"):
+            fill(path, "second")
+        fill(tmp_path / "beside", "other")
+    assert below(path) == {"first", "manifest.json"}
+    with pytest.raises(FileExistsError, match="were not there"):
+        fill(path, "second", replace=False)
+    (path / "second").mkdir()
+    with pytest.raises(IsADirectoryError, match="second is a folder"):
+        fill(path, "second")
+    assert "first" in below(path) and {p.name for p in tmp_path.iterdir()} == {"folder", "beside"}
 
 
 # --- exported grasps: plain MuJoCo simulates the files as the engine mujoco does ------------------

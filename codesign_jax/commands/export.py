@@ -45,12 +45,20 @@ def main(options: Export) -> int:
     for note in notes:
         console.print(note)
     try:
-        with files.whole_folder(options.out) as folder:
+        with files.whole_folder(options.out, replace=options.overwrite) as folder:
             write_files(case, params, sizes, engine, folder, options, console)
     except OSError as error:
         raise InputError([f"--out {options.out}: {error.strerror}"]) from error
     _tell(case, options, console)
+    if others := files.foreign(options.out):
+        console.print(f"  left there, no part of this export: {_some(others)}")
     return 0
+
+
+def _some(names: list[str], most: int = 8) -> str:
+    """Names in a line, the first ones if there are many."""
+    rest = len(names) - most
+    return ", ".join(names[:most]) + (f", and {rest} more" if rest > 0 else "")
 
 
 def _params(case: Case) -> Params:

@@ -176,10 +176,10 @@ def test_moulds_of_a_tapered_finger_hold_it(tmp_path):
         assert part.volume() == pytest.approx(file.volume(), rel=EXACT)
     assert (made.tray ^ made.core).volume() == pytest.approx(0, abs=1e-6)
     assert core.genus() == 2 * len(casting.bars_of(TAPERED))
-    x, half = (-2.0, 122.0), casting._shifted(casting._half(TAPERED), 2.0)
+    x, half = (-2.0, 122.0), casting.shifted(casting.half_width(TAPERED), 2.0)
     rim, top = casting._rim(TAPERED), lambda x: TAPERED.at(x).height
-    shell = casting._solid(x, half, rim, top) - made.tray - made.core
-    pocket = casting._solid(x, half, lambda x: 0.0, rim) - made.base
+    shell = casting.prism(x, half, rim, top) - made.tray - made.core
+    pocket = casting.prism(x, half, lambda x: 0.0, rim) - made.base
     assert shell.volume() + pocket.volume() == pytest.approx(TAPERED.volume, rel=1e-6)
     for x in (10.0, 110.0):
         top = TAPERED.at(x).height

@@ -14,7 +14,7 @@ from codesign_jax import engines, files, preflight, provenance, rollout, runs
 from codesign_jax.commands import common, drift, reference
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Export
-from codesign_jax.export import grasps, plain, process, tables, valves
+from codesign_jax.export import grasps, plain, process, sheet, tables, valves
 from codesign_jax.export.process import Process, Size
 from codesign_jax.runs.choice import Case
 from codesign_jax.runs.progress import Busy
@@ -22,7 +22,7 @@ from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Params, Trial
 
 if TYPE_CHECKING:
-    from codesign_jax.export import sheet, workshop
+    from codesign_jax.export import workshop
 
 
 def main(options: Export) -> int:
@@ -34,6 +34,8 @@ def main(options: Export) -> int:
     params = _params(case)
     sizes = [] if options.no_parts and options.no_sheet else _sizes(case, params, options)
     notes = preflight.notes(case.scene, case.space, {"the design": case.design})
+    if sizes:
+        notes += sheet.idle_fingers(case.scene, params, sizes)
     if case.policy:
         notes.append(f"commands are those of the key frames: policy {case.policy} is left out")
     simulating = options.tolerance != "off" and not options.no_sheet
@@ -129,8 +131,6 @@ def write_files(
 
 
 def _tell(case: Case, options: Export, console: Console) -> None:
-    from codesign_jax.export import sheet
-
     console.print(f"exported: {options.out}")
     models = sorted((options.out / tables.MODELS).glob("*.mjb"))
     if models:
@@ -167,7 +167,7 @@ def _parts(
     folder.mkdir(exist_ok=True)
     with Busy(console, "making fingers, moulds and the palm"):
         made = palm.palm(case.scene, params, sizes, how)
-        parts = [*meshes.write(folder, sizes, how), *meshes.write_palm(folder, made, sizes)]
+        parts = [*meshes.write(folder, sizes, how), *meshes.write_palm(folder, made)]
     for part in parts:
         edges = " x ".join(f"{v:.1f}" for v in part.extents)
         console.print(f"part {part.name}: {edges} mm, {part.volume / 1e3:.1f} cm^3")
@@ -213,7 +213,7 @@ def _trials(case: Case, options: Export) -> list[tuple[str, Trial]]:
     return [(name, jax.tree.map(np.asarray, trial)) for name, trial in found]
 
 
-def _tested(folder: Path) -> "sheet.Tested":
+def _tested(folder: Path) -> sheet.Tested:
     scene, settings = runs.read_run(folder)
     fresh, _ = reference.stored(folder, settings)
     verdict = None if fresh is None else str(reference.judged(scene, fresh))
@@ -229,7 +229,7 @@ def _sheet(
     options: Export,
 ) -> list[str]:
     """Writes the sheet; returns letters that its drawings lack."""
-    from codesign_jax.export import drawing, sheet, workshop  # needs the extra
+    from codesign_jax.export import drawing, workshop  # needs the extra
 
     found, printed = added
     tested = _tested(options.run_folder) if options.run_folder else (None, None)

@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 
 from codesign_jax.export import fonts, posture, valves
 from codesign_jax.export.process import BACK, BAR, FABRIC, FLOOR, Section, Size
-from codesign_jax.export.sheet import NAME, corners, places
+from codesign_jax.export.sheet import NAME, castable, corners, places
 from codesign_jax.export.workshop import Printed
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
@@ -56,10 +56,13 @@ def pages(
     found = [_hand_page(title, scene, params, sizes)]
     for first in range(0, len(rows), _ROWS):
         found.append(_fingers_page(title, rows[first : first + _ROWS]))
-    return [*found, _mounting_page(title, scene, params, sizes, printed)]
+    found.append(_mounting_page(title, scene, params, sizes, printed))
+    for k, page in enumerate(found, 1):
+        page.text(0.94, 0.025, f"{k} of {len(found)}", fontsize=7, ha="right")
+    return found
 
 
-def _page(title: str, what: str) -> matplotlib.figure.Figure:
+def _page(title: str) -> matplotlib.figure.Figure:
     # A figure of its own instead of pyplot's: no state and no display is touched.
     figure = matplotlib.figure.Figure(figsize=_A4)
     font = fonts.of_text(title)
@@ -71,19 +74,18 @@ def _page(title: str, what: str) -> matplotlib.figure.Figure:
         0.975,
         text,
         fontsize=12,
-        weight="bold",
+        weight="bold" if font.family == [fonts.DEFAULT] else "normal",
         va="top",
         family=font.family,
         parse_math=False,
     )
-    figure.text(0.94, 0.025, what, fontsize=7, ha="right")
     return figure
 
 
 def _hand_page(
     title: str, scene: Scene, params: Params, sizes: Sequence[Size]
 ) -> matplotlib.figure.Figure:
-    figure = _page(title, "1: the hand")
+    figure = _page(title)
     found = corners(scene, params, sizes)
     _view(figure.add_axes((0.08, 0.56, 0.40, 0.32)), scene, found, "front: x, z", 0, 2)
     _view(figure.add_axes((0.54, 0.56, 0.40, 0.32)), scene, found, "side: y, z", 1, 2)
@@ -100,7 +102,7 @@ def _hand_page(
 
 
 def _fingers_page(title: str, rows: list[tuple[Size, list[int]]]) -> matplotlib.figure.Figure:
-    figure = _page(title, "2: the fingers")
+    figure = _page(title)
     high = 0.88 / _ROWS
     for k, (size, fingers) in enumerate(rows):
         label = f"finger {', '.join(map(str, fingers))}"
@@ -120,7 +122,7 @@ def _fingers_page(title: str, rows: list[tuple[Size, list[int]]]) -> matplotlib.
 def _mounting_page(
     title: str, scene: Scene, params: Params, sizes: Sequence[Size], printed: Printed | None
 ) -> matplotlib.figure.Figure:
-    figure = _page(title, "3: turns, seat, wrist")
+    figure = _page(title)
     hand = corners(scene, params, sizes)
     palm = 1e3 * scene.hand.palm.radius, 1e3 * scene.hand.palm.thickness
     for k, (words, angles) in enumerate(posture.TURNS.items()):
@@ -178,7 +180,7 @@ def _section(axes: Axes, section: Section, label: str) -> None:
     axes.plot([-width / 2, width / 2], [0, 0], color="tab:red", lw=2)
     axes.text(0, -0.06 * height, f"{width:.1f}", ha="center", va="top", fontsize=6)
     axes.text(-0.53 * width, height / 2, f"{height:.1f}", ha="right", va="center", fontsize=6)
-    axes.text(0, wall / 2, f"{wall:.2f}", ha="center", va="center", fontsize=6)
+    axes.text(0, wall / 2, castable(wall), ha="center", va="center", fontsize=6)
     _finish(axes, label)
     axes.set(xlim=(-0.85 * width, 0.85 * width), ylim=(-5, height + 2))
 

@@ -36,7 +36,7 @@ def of_text(text: str) -> Drawable:
 def _lacking(font: str, letters: dict[str, None]) -> dict[str, None]:
     """Letters that a font has not; all of them if it cannot be read."""
     try:
-        path = manager.findfont(manager.FontProperties(family=font, weight="bold"))
+        path = manager.findfont(manager.FontProperties(family=font))
         known = manager.get_font(path).get_charmap()
     except (OSError, RuntimeError, ValueError):
         return letters

@@ -42,16 +42,18 @@ def write(folder: Path, sizes: list[Size], process: Process) -> list[Part]:
     return found
 
 
-def write_palm(folder: Path, made: Palm, sizes: list[Size]) -> list[Part]:
+def write_palm(folder: Path, made: Palm) -> list[Part]:
     """Writes the palm and its clamp bars, equal bars once, as they stand on a printer's bed.
 
     Seats that stand in one another may leave a surface that no file can say as a closed one; such
     a palm is left out.
     """
-    solids = {("palm", tuple(range(len(sizes)))): made.body}
+    solids = {("palm", tuple(range(len(made.bars)))): made.body}
     alike: dict[tuple, list[int]] = {}
-    for i, size in enumerate(sizes):
-        alike.setdefault((size.base, size.at(-size.root), size.root), []).append(i)
+    for i, bar in enumerate(made.bars):
+        low, high = np.reshape(bar.bounding_box(), (2, 3))
+        key = *np.round(high - low, 3).tolist(), round(bar.volume(), 2)
+        alike.setdefault(key, []).append(i)
     solids |= {("bar", tuple(fingers)): made.bars[fingers[0]] for fingers in alike.values()}
     found = []
     for (kind, fingers), solid in solids.items():
@@ -66,7 +68,7 @@ def write_palm(folder: Path, made: Palm, sizes: list[Size]) -> list[Part]:
 
 
 def _in_float32(solid: manifold3d.Manifold) -> manifold3d.Manifold | None:
-    """The solid without edges so short that STL's float32 makes one point of their ends, or None."""
+    """The solid without edges of which STL's float32 makes a point; None if that opens it."""
     for shortest in _SHORTEST:
         found = solid.simplify(shortest)
         surface = mesh(found)

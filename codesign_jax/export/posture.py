@@ -19,7 +19,7 @@ TURNS: Mapping[str, Mapping[str, float]] = {
 """Turns about one axis each, by what is said below their drawings."""
 
 _FACES = ((0, 1, 2, 3), (4, 5, 6, 7), (0, 1, 5, 4), (2, 3, 7, 6), (0, 3, 7, 4), (1, 2, 6, 5))
-_AZIMUTH, _ELEVATION = np.radians(-60), np.radians(22)  # of the eye
+_AZIMUTH, _ELEVATION = np.radians(35), np.radians(25)  # of the eye: x and y come towards it
 _AROUND = np.linspace(0, 2 * np.pi, 49)
 
 
@@ -45,12 +45,14 @@ def draw(
     turned = [(turn.apply(points), color, label) for points, color, label in solids]
     for points, color, label in sorted(turned, key=lambda solid: _depth(solid[0]).mean()):
         _solid(axes, points, color, label)
-    reach = 1.15 * max(np.linalg.norm(fingers, axis=-1).max(), 1.3 * radius)
-    _arrows(axes, 0.62 * reach)
-    axes.set(xlim=(-reach, reach), ylim=(-reach, 0.75 * reach))
+    length = 1.8 * radius
+    _arrows(axes, length)
+    drawn = [_flat(points) for points, _, _ in turned] + [_flat(1.2 * length * np.eye(3))]
+    low, high = (f(np.concatenate(drawn), axis=0) for f in (np.min, np.max))
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.set_aspect("equal")
     axes.axis("off")
-    axes.set_title(words, fontsize=6, y=-0.04)
+    axes.set_title(words, fontsize=6)
 
 
 def _flat(points: Any) -> np.ndarray:

@@ -117,7 +117,7 @@ def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSectio
                 str(i),
                 f"{size.length:.1f}",
                 *(" to ".join(f"{s[k]:.1f}" for s in ends) for k in range(2)),
-                " to ".join(_castable(s.wall) for s in ends),
+                " to ".join(castable(s.wall) for s in ends),
                 f"{end - start:.1f} x {' to '.join(dict.fromkeys(chambers))}",
                 f"{size.volume / 1e3:.1f}",
                 f"{1e-6 * size.volume * density:.1f}",
@@ -129,11 +129,11 @@ def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSectio
     head += ("silicone cm³", "mass g", "pressure kPa (limit)", "free bend °")
     ends = "as thick as the others"
     if any(size.end != size.base.wall for size in sizes):
-        ends = f"{', '.join(dict.fromkeys(_castable(size.end) for size in sizes))} mm"
+        ends = f"{', '.join(dict.fromkeys(castable(size.end) for size in sizes))} mm"
     notes = [
-        f"Walls to 0.05 mm; at base and tip: {ends}. Silicone and mass with the root behind the "
-        "base, which the palm holds. Free bend: predicted by beam theory for a straight finger "
-        "at its pressure, without load; measure it first."
+        f"Walls to 0.05 mm; at base and tip: {ends}. Lengths are those in front of the palm; "
+        "silicone and mass include the root behind it, which the palm holds. Free bend: predicted "
+        "by beam theory for a straight finger at its pressure, without load; measure it first."
     ]
     return SheetSection("Fingers", head, rows, notes)
 
@@ -156,7 +156,8 @@ def corners(scene: Scene, params: Params, sizes: Sequence[Size]) -> np.ndarray:
     return np.array(found)
 
 
-def _castable(thickness: float) -> str:
+def castable(thickness: float) -> str:
+    """A thickness [mm] to the twentieth of a millimetre that a mould gives."""
     return f"{round(20 * thickness) / 20:.2f}"
 
 

@@ -313,9 +313,10 @@ def _order(
         "through the fabric until the bar sits on the seat's rim. Cut the flap.",
         "Palm: ballast as in 'What to print'; screws from below into the wrist; groove towards "
         "the arm frame's x.",
-        "Arm: its frame is the middle of the palm's underside. z = 0 is where that lies on the "
-        "table with the wrist undeflected; x = y = 0 is the object's place. Turn by +20° of roll, "
-        "yaw and pitch, each alone, and compare with the drawing before anything else moves.",
+        "Arm: set its tool centre point to the middle of the palm's underside. z = 0 is where that "
+        "lies on the table with the wrist undeflected; x = y = 0 is the object's place. Turn by "
+        "+20° of roll, yaw and pitch, each alone, and compare with the drawing before anything "
+        "else moves.",
         "Valves: finger 0 on channel 0 and so on. Play valves.csv with the hand in the air "
         "(play_valves.py), then commands.csv with neither object nor pressure, then with both, "
         "then with the object. Keep hands away: the arm ends where the file says.",

@@ -41,6 +41,8 @@ FLANGES = ((31.5, "M5", 5.5, 10.0, 5.5), (20.0, "M4", 4.5, 8.0, 4.5), (14.0, "M3
 The first is that of a robot's flange 31.5-4-M5 by ISO 9409-1."""
 APART = 0.01
 """Difference of one seat and the next [mm]: equal ones meet in lines, which no file can say."""
+INSIDE = 0.05
+"""How far a web stays within what it joins [mm]."""
 LOST = 0.2
 """Share of a seat's walls from which on they are missed."""
 OVERLAP = 1.0
@@ -86,7 +88,8 @@ def palm(scene: Scene, params: Params, sizes: list[Size], process: Process) -> P
     disc = Solid.cylinder(thickness, radius, radius, 4 * SEGMENTS)
     body = _sum([disc, *seats])
     if len(body.decompose()) > 1:
-        body = _sum([body, *(_web(seat, radius, thickness) for seat in seats)])
+        webs = (_web(z, place, radius, thickness) for z, place in zip(sizes, places, strict=True))
+        body = _sum([body, *webs])
     taken = _sum([*pockets, *holes])
     body -= taken
     # Slivers of the disc that the fingers' room cuts off hold nothing.
@@ -140,8 +143,9 @@ def _edge(size: Size) -> float:
 
 def _block(size: Size, more: float = 0.0) -> Solid:
     edge, back = _edge(size) + more, size.root + BACK + more
-    # Beyond the base plane, where `_pocket` cuts it: two faces in one plane would leave slivers.
-    return _box((-back, -edge, -FLOOR - more), (0.75, edge, size.pressed))
+    # Beyond base plane and rim, where `_pocket` cuts it: two faces in one plane leave slivers.
+    shrunk = max(0.0, -more)
+    return _box((-back, -edge, -FLOOR - more), (0.75, edge, size.pressed + 0.5 - shrunk))
 
 
 def _seat(size: Size, frame: np.ndarray, more: float) -> Solid:
@@ -152,7 +156,7 @@ def _seat(size: Size, frame: np.ndarray, more: float) -> Solid:
 
 
 def _pocket(size: Size, process: Process, more: float) -> Solid:
-    """What a finger needs for itself: its root with the way in, and the room around its base."""
+    """What a finger needs for itself: root and way in, the room around its base, the bar's."""
     clear, edge = process.clearance + more, _edge(size)
     ends = (-size.root - FABRIC - more, 1.0)
     top = lambda x: size.at(x).height  # noqa: E731
@@ -165,7 +169,10 @@ def _pocket(size: Size, process: Process, more: float) -> Solid:
         reach, shifted(half_width(size), 1.0 + more), shifted(floor, 0.015), shifted(top, BAR + 1.0)
     )
     front = _box((0.0, -edge - 1.0, -FLOOR - 1.0), (1.5, edge + 1.0, size.pressed + 1.0))
-    return _sum([root, free, front])
+    # The bar and the heads of its screws; the bar's neighbour may have walls there.
+    back, high = size.root + BACK + 0.3 + more, size.pressed + BAR + 4.0
+    bar = _box((-back, -edge - 0.3 - more, size.pressed), (1.0, edge + 0.3 + more, high))
+    return _sum([root, free, front, bar])
 
 
 def screws(size: Size, process: Process) -> list[tuple[float, float]]:
@@ -183,7 +190,9 @@ def _holes(size: Size, process: Process, frame: np.ndarray) -> list[Solid]:
     way = _placed(way.rotate([0, -90, 0]).translate([start, 0, middle]), frame)
     # Behind the seat the tube turns up, out of the palm's upper side.
     at = frame @ [start - BACK - 2.0, 0, middle, 1]
-    up = Solid.cylinder(100.0, 1.5 * tube, 1.5 * tube, SEGMENTS).translate([*at])
+    # Turned by an odd angle: its corners would lie on those of the level hole of a level finger.
+    up = Solid.cylinder(100.0, 1.5 * tube, 1.5 * tube, SEGMENTS).rotate([0, 0, 3.3])
+    up = up.translate([*at])
     pilots = [
         Solid.cylinder(DEEP + 1.0, PILOT / 2, PILOT / 2, SEGMENTS).translate([x, y, rim - DEEP])
         for x, y in screws(size, process)
@@ -201,11 +210,13 @@ def _bar(size: Size, process: Process) -> Solid:
     return bar
 
 
-def _web(seat: Solid, radius: float, thickness: float) -> Solid:
+def _web(size: Size, frame: np.ndarray, radius: float, thickness: float) -> Solid:
     """What joins a seat outside of the disc to its middle, within the disc's height if it can."""
-    core = Solid.cylinder(thickness, radius / 2, radius / 2, SEGMENTS)
-    level = seat.trim_by_plane((0, 0, 1), 0.0).trim_by_plane((0, 0, -1), -thickness)
-    return Solid.batch_hull([core, seat if level.is_empty() else level])
+    core = Solid.cylinder(thickness - 2 * INSIDE, radius / 2, radius / 2, SEGMENTS)
+    # A little within the seat and the disc, so that no two faces coincide.
+    seat = _placed(_block(size, -INSIDE), frame)
+    level = seat.trim_by_plane((0, 0, 1), INSIDE).trim_by_plane((0, 0, -1), INSIDE - thickness)
+    return Solid.batch_hull([core.translate([0, 0, INSIDE]), seat if level.is_empty() else level])
 
 
 def _flange(radius: float, thickness: float, taken: Solid) -> tuple[Flange | None, list[Solid]]:

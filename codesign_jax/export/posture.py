@@ -83,11 +83,13 @@ def _solid(axes: Axes, points: np.ndarray, color: str, label: str | None) -> Non
         red = set(face) == {0, 1, 4, 5}
         style = {"facecolor": "#e9a8a0" if red else color, "edgecolor": "0.2", "lw": 0.4}
         axes.add_patch(Polygon(flat[[*face]], **style))
-    axes.text(*flat[4:].mean(0), label, fontsize=6, ha="center", va="center")
+    x, y = flat[4:].mean(0)
+    axes.text(x, y, label, fontsize=6, ha="center", va="center")
 
 
 def _arrows(axes: Axes, length: float) -> None:
     for name, end in zip("xyz", length * np.eye(3), strict=True):
         tip, style = _flat(end), {"arrowstyle": "->", "lw": 0.9, "color": "tab:green"}
         axes.annotate("", tip, _flat(np.zeros(3)), arrowprops=style)
-        axes.text(*(1.12 * tip), name, fontsize=7, color="tab:green", ha="center", va="center")
+        x, y = 1.12 * tip
+        axes.text(x, y, name, fontsize=7, color="tab:green", ha="center", va="center")

@@ -1,7 +1,12 @@
 """Writes files as a whole or not at all, and says which files of a folder are to be opened."""
 
 import contextlib
+import errno
+import fcntl
+import hashlib
+import json
 import os
+import re
 import secrets
 import shutil
 import stat
@@ -78,26 +83,156 @@ def naming(path: Path) -> Iterator[None]:
         raise
 
 
+MANIFEST = "manifest.json"
+"""File of a folder from `whole_folder` that lists its files."""
+_ABOUT = "Files of this folder with their SHA-256. Writing it again replaces these and no others."
+
+
 @contextlib.contextmanager
-def whole_folder(path: Path) -> Iterator[Path]:
+def whole_folder(path: Path, *, replace: bool = True) -> Iterator[Path]:
     """Fills a folder as a whole: what is written to the yielded one appears there at the end.
 
-    New files replace those of the same names, others stay.
+    `MANIFEST` lists what was written.  Where the folder has one already, the files that it lists
+    are replaced whole: those that were not written again go, unless somebody changed them.  Files
+    that it does not list stay; `foreign` has them.
+
+    Args:
+      path: The folder.
+      replace: Whether it may have files by the time that the new ones are complete.
+
+    Raises:
+      OSError: Also if another call is filling the same folder, and if it has files that are not to
+        be replaced.
     """
     path = path.resolve()
-    part = path.with_name(f".{path.name}.part")
-    remove(part)
-    part.mkdir(parents=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part, lock = _begin(path)
     try:
         yield part
-    except BaseException:
-        shutil.rmtree(part)
-        raise
+        _write_manifest(part, _digests(part))
+        _move(part, path, replace=replace)
+    finally:
+        os.close(lock)
+        remove(part)
+
+
+def foreign(path: Path) -> list[str]:
+    """Files below a folder that its `MANIFEST` does not list, by their paths in it."""
+    listed = {MANIFEST, *_listed(path)}
+    return [name for name in _names(path) if name not in listed]
+
+
+def _begin(path: Path) -> tuple[Path, int]:
+    """Makes the folder in which `path` is prepared, of this call alone, and locks it."""
+    with _mutex(path.parent) as exclusive:
+        pattern = re.compile(rf"\.{re.escape(path.name)}\.([0-9a-f]{{16}}\.)?part")
+        for other in path.parent.iterdir():
+            if not pattern.fullmatch(other.name):
+                continue
+            if _in_use(other):
+                why = "another export is writing to it; wait for that one, or choose another folder"
+                raise BlockingIOError(errno.EAGAIN, why)
+            if exclusive:  # otherwise nobody can say that it is a killed process's
+                remove(other)
+        part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
+        part.mkdir()
+        lock = os.open(part, os.O_RDONLY)
+        with contextlib.suppress(OSError):
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return part, lock
+
+
+@contextlib.contextmanager
+def _mutex(folder: Path) -> Iterator[bool]:
+    """Lets one process at a time in; yields whether the file system can do that."""
+    place = os.open(folder, os.O_RDONLY)
     try:
-        os.replace(part, path)  # where there is no folder, or an empty one
+        fcntl.flock(place, fcntl.LOCK_EX)
+        exclusive = True
     except OSError:
-        shutil.copytree(part, path, dirs_exist_ok=True)
-        shutil.rmtree(part)
+        exclusive = False
+    try:
+        yield exclusive
+    finally:
+        os.close(place)
+
+
+def _in_use(folder: Path) -> bool:
+    place = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(place, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(place)
+    return False
+
+
+def _move(part: Path, path: Path, *, replace: bool) -> None:
+    if not path.is_dir() or not any(path.iterdir()):
+        with contextlib.suppress(OSError):  # an empty mount point cannot be replaced, but filled
+            os.replace(part, path)
+            return
+    if not replace and any(path.iterdir()):
+        raise FileExistsError(errno.EEXIST, "has files that were not there when this call began")
+    before, after = _listed(path), _listed(part)
+    # A process that is killed in between leaves a list of both, so that the next call finds all.
+    path.mkdir(exist_ok=True)
+    with atomically(path / MANIFEST) as temporary:
+        _write_manifest(temporary.parent, before | after, temporary.name)
+    for name in after:
+        place = path / name
+        if place.is_dir() and not place.is_symlink():
+            raise IsADirectoryError(errno.EISDIR, f"{name} is a folder where a file belongs")
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.move(part / name, place)
+    for name in before.keys() - after.keys():
+        _remove_listed(path, name, before[name])
+    shutil.move(part / MANIFEST, path / MANIFEST)
+
+
+def _remove_listed(path: Path, name: str, digest: str) -> None:
+    """Deletes a file of an earlier manifest if it is within the folder and as it was written."""
+    place = path / name
+    inside = place.parent.resolve().is_relative_to(path)
+    if not inside or place.is_symlink() or not place.is_file() or _digest(place) != digest:
+        return
+    place.unlink()
+    for parent in place.parents:
+        if parent == path or any(parent.iterdir()):
+            break
+        parent.rmdir()
+
+
+def _names(path: Path) -> list[str]:
+    """Paths of the files below a folder, relative to it."""
+    found = (Path(folder, name) for folder, _, names in os.walk(path) for name in names)
+    return sorted(place.relative_to(path).as_posix() for place in found)
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _digests(path: Path) -> dict[str, str]:
+    return {name: _digest(path / name) for name in _names(path)}
+
+
+def _write_manifest(folder: Path, digests: dict[str, str], name: str = MANIFEST) -> None:
+    text = json.dumps({"about": _ABOUT, "files": digests}, indent=1, ensure_ascii=False)
+    (folder / name).write_text(text + "\n", encoding="utf-8")
+
+
+def _listed(path: Path) -> dict[str, str]:
+    """Files that a folder's manifest lists; none if it has no manifest, or one that is damaged."""
+    try:
+        listed = json.loads((path / MANIFEST).read_text(encoding="utf-8"))["files"]
+        return {str(name): str(digest) for name, digest in listed.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
 
 
 def clear_place(path: Path) -> None:

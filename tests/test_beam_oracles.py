@@ -627,6 +627,29 @@ def test_the_command_compares_and_fits(tmp_path, capsys):
     assert "model: angle errs by" in said and "(25 %)" in said  # 50 / 40 - 1
     head, *rows = out.read_text().splitlines()
     assert head == "pressure_kPa,angle_deg,model_angle_deg,fitted_angle_deg" and len(rows) == 2
+    # A finger of 0.8 times the model's moment bends as the model does if its pressure is divided
+    # by that, and the model as the finger if the simulated one is multiplied.
+    weaker = truth.of_material(50e3, 0.8)
+    rows = [
+        f"20,{np.rad2deg(finger.Rest.of(weaker, 20e3).angles.sum())},{16e3 * g / made().length}"
+        for g in made().gain[:1]
+    ]
+    path.write_text("pressure_kPa,angle_deg,blocked_force_N\n" + "\n".join(rows))
+    assert cli.main(line[:-2]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "moment 0.8 of the model's" in said
+    assert "on the real hand divide a simulated design's pressures by 0.8 " in said
+    assert "multiply the simulated pressures by 0.8 instead" in said
+    bends = [
+        finger.Rest.of(who, pressure).angles.sum()
+        for who, pressure in (
+            (truth, 20e3),
+            (weaker, 20e3 / 0.8),
+            (truth, 0.8 * 20e3),
+            (weaker, 20e3),
+        )
+    ]
+    np.testing.assert_allclose(bends[0::2], bends[1::2], rtol=1e-9)  # the solver's tolerance
     for wrong in (["--fit"], ["--finger", "4"], ["--out", "table.txt"], ["no.csv"]):
         assert cli.main(["finger", *wrong]) == 2
     said = capsys.readouterr().err

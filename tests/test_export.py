@@ -1,7 +1,11 @@
 """Exports: parts and moulds, build sheet and tolerances, and grasps in plain MuJoCo."""
 
 import csv
+import dataclasses
+import hashlib
 import itertools
+import json
+import os
 import zipfile
 from pathlib import Path
 
@@ -14,21 +18,28 @@ import trimesh
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numpy.polynomial import Polynomial
 
-from codesign_jax import cli, files, model, rollout, scene
+from codesign_jax import cli, control, files, model, rollout, scene
 from codesign_jax.cost import outcome
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.engines.structured.kernel import memory_tables
 from codesign_jax.export import (
     casting,
     drawing,
+    fonts,
     grasps,
     meshes,
+    palm,
     plain,
+    play_valves,
+    pose,
     process,
     sheet,
+    silicone,
     skin,
     tables,
     tolerance,
+    valves,
+    workshop,
 )
 from codesign_jax.export.play import play
 from codesign_jax.export.process import Process, Section, Size
@@ -160,31 +171,48 @@ def test_what_the_moulds_hold_is_the_finger(tmp_path, draft):
         assert inner.position[1] - ray.position[1] == pytest.approx(wall, abs=1e-3)
 
 
-def test_moulds_of_a_tapered_finger_hold_it(tmp_path):
+@pytest.mark.parametrize("root", [0.0, 12.0])
+def test_moulds_of_a_tapered_finger_hold_it(tmp_path, root):
     """Shell and bottom wall are the finger, by Simpson's rule over its sections; walls have the
     thickness of the place."""
-    how = Process(inlet=0.0)
-    meshes.write(tmp_path, [TAPERED], how)
+    how, size = Process(inlet=0.0), TAPERED._replace(root=root)
+    meshes.write(tmp_path, [size], how)
     finger, tray, core, base = (
         solid(tmp_path / f"finger_0{kind}.stl") for kind in ("", "_tray", "_core", "_base")
     )
-    assert finger.volume() == pytest.approx(TAPERED.volume, rel=EXACT)
-    made = casting.parts(TAPERED, how)
+    assert finger.volume() == pytest.approx(size.volume, rel=EXACT)
+    made = casting.parts(size, how)
     for part, file in zip(made, (finger, tray, core, base), strict=True):
         assert part.volume() == pytest.approx(file.volume(), rel=EXACT)
     assert (made.tray ^ made.core).volume() == pytest.approx(0, abs=1e-6)
-    assert core.genus() == 2 * len(casting.bars_of(TAPERED))
-    x, half = (-2.0, 122.0), casting._shifted(casting._half(TAPERED), 2.0)
-    rim, top = casting._rim(TAPERED), lambda x: TAPERED.at(x).height
-    shell = casting._solid(x, half, rim, top) - made.tray - made.core
-    pocket = casting._solid(x, half, lambda x: 0.0, rim) - made.base
-    assert shell.volume() + pocket.volume() == pytest.approx(TAPERED.volume, rel=1e-6)
+    assert core.genus() == 2 * len(casting.bars_of(size))
+    x, half = (-2.0 - root, 122.0), casting.shifted(casting.half_width(size), 2.0)
+    rim, top = casting._rim(size), lambda x: size.at(x).height
+    shell = casting.prism(x, half, rim, top) - made.tray - made.core
+    pocket = casting.prism(x, half, lambda x: 0.0, rim) - made.base
+    assert shell.volume() + pocket.volume() == pytest.approx(size.volume, rel=1e-6)
     for x in (10.0, 110.0):
-        top = TAPERED.at(x).height
+        top = size.at(x).height
         hits = finger.ray_cast([x, 0.3, top + 5], [x, 0.3, -5])
         at = sorted(hit.position[2] for hit in hits)
-        wall = TAPERED.at(x).wall
+        wall = size.at(x).wall
         np.testing.assert_allclose(at, [0, wall, top - wall, top], atol=1e-3)
+
+
+@pytest.mark.parametrize("size", [USUAL._replace(root=10.0), TAPERED._replace(root=5.0), SHORT])
+def test_a_pin_keeps_the_inlet_free(size):
+    """From outside of the tray into the core, through nothing but their holes."""
+    how = Process(inlet=2.0)
+    made = casting.parts(size, how)
+    start, end = size.chamber_ends
+    depth = min(casting.PIN, (end - start) / 2)
+    pin = manifold3d.Manifold.cylinder(60, 0.99, 0.99, 32).rotate([0, 90, 0])
+    pin = pin.translate([start + depth - 60.01, 0, size.base.height / 2])
+    assert (pin ^ made.tray).volume() == 0 and (pin ^ made.core).volume() == 0
+    deeper = pin.translate([1, 0, 0])
+    assert (deeper ^ made.core).volume() > 0.9 * np.pi  # a millimetre into the core
+    # The pin stands where the finger has its inlet, all the way into the chamber.
+    assert (pin ^ made.finger).volume() == 0
 
 
 # --- build sheet and tolerances: thresholds that are known are found, and the page says them ------
@@ -267,8 +295,8 @@ def page():
 def test_sheet_has_dimensions_pressures_and_tolerances(page, tmp_path):
     content = sheet.sheet_sections(*page)
     text = sheet.write(tmp_path, "Build sheet", ["Design: x"], content).read_text()
-    fingers = "| 0 | 110.0 | 20.0 | 20.0 | 5.00 | 100.0 x 10.0 x 10.0 | 34.0 | 36.4 | 120.0 (200) |"
-    assert fingers in text  # 110 x 20 x 20 - 100 x 10 x 10 = 34 cm^3 of 1.07 g
+    fingers = "| 0 | 110.0 | 20.0 | 20.0 | 5.00 | 100.0 x 10.0 x 10.0 | 38.0 | 40.7 | 120.0 (200) |"
+    assert fingers in text  # 120 x 20 x 20 with the root - 100 x 10 x 10 = 38 cm^3 of 1.07 g
     row = next(line for line in text.splitlines() if line.startswith("| length[0] | mm | 110 |"))
     cells = [c.strip() for c in row.strip("|").split("|")]
     assert cells[3].endswith(": 100 % [91, 100]") and cells[4].endswith(": 40 % [26, 55]")
@@ -276,24 +304,161 @@ def test_sheet_has_dimensions_pressures_and_tolerances(page, tmp_path):
     assert "fewer than 90 %" in text
 
 
-def test_a_page_of_drawings_whose_texts_stand_apart(page, tmp_path):
+@pytest.mark.parametrize(
+    "title", ["Build sheet", "Build sheet: " + "a_name_as_data_sets_have " * 20, "日本の手" * 30]
+)
+def test_drawings_stand_apart_and_within_their_pages(page, title):
     the_scene, params, sizes, _ = page
-    data = drawing.write(tmp_path, "Build sheet", the_scene, params, sizes).read_bytes()
-    assert data.startswith(b"%PDF") and b"/Count 1" in data and len(data) > 10_000
-    assembly = sheet.assembly_sections(the_scene, params, sizes, Process())
-    parts = {row[0]: row[1:] for row in assembly[0].rows}
+    sizes = [*sizes[:2], TAPERED, *sizes[3:]]
+    hand, fingers, mounting = drawing.pages(title, the_scene, params, sizes)
+    for figure in (hand, fingers, mounting):
+        FigureCanvasAgg(figure).draw()
+        edge = figure.bbox
+        texts = [*figure.texts, *(axes.title for axes in figure.axes)]
+        # Letters of a font that has no bold variant end up to a point further.
+        boxes = {t.get_text(): t.get_window_extent() for t in texts if t.get_text()}
+        for (text, one), (other, two) in itertools.combinations(boxes.items(), 2):
+            assert not one.overlaps(two), (text, other)
+        for text, box in boxes.items():
+            assert edge.x0 < box.x0 and box.x1 < edge.x1, text
+            assert edge.y0 < box.y0 and box.y1 < edge.y1, text
+    titles = [axes.get_title() for axes in fingers.axes]
+    assert "finger 0, 1, 3" in titles and {"finger 2, base", "finger 2, tip"} < {*titles}
+
+
+def test_letters_of_a_title(tmp_path, page):
+    """Mathematics is text, what no font has is a question mark and is named."""
+    found = fonts.of_text("a\nhand $x_{2 of 日本 \U0010fffd\U0010fffd")
+    assert found.text.startswith("a hand $x_{2 of ") and found.text.endswith("??")
+    assert "\U0010fffd" in found.lacking and "a" not in found.lacking
+    the_scene, params, sizes, _ = page
+    assert drawing.write(tmp_path, "\U0010fffd $\\frac", the_scene, params, sizes) == ["\U0010fffd"]
+    data = (tmp_path / "build_sheet.pdf").read_bytes()
+    assert data.startswith(b"%PDF") and b"/Count 3" in data
+    text = sheet.markdown("a\n# b", [], [sheet.SheetSection("t", ("h",), [("a|b\nc",)], [])])
+    assert text.startswith("# a # b\n") and "| a\\|b c |" in text
+
+
+def test_the_sheet_s_lists_add_up(page):
+    """Silicone of the solids, all fingers' castings, and what every step of the work takes."""
+    the_scene, params, sizes, _ = page
+    how = Process()
+    made = palm.palm(the_scene, params, sizes, how)
+    printed = workshop.Printed(["palm", "bar_0_1"], 1e5, made.flange, made.below)
+    sections = {
+        x.title: x for x in workshop.assembly_sections(the_scene, params, sizes, how, printed)
+    }
+    bought = {row[0]: row[1:] for row in sections["What to buy"].rows}
     solids = [casting.parts(size, Process(inlet=0)).finger.volume() for size in sizes]
-    assert parts["silicone"][1].startswith(f"{sum(solids) / 1e3:.0f} cm³")
-    figure = drawing.page("Build sheet", the_scene, params, sizes)
-    FigureCanvasAgg(figure).draw()
-    texts = [*figure.texts, *(axes.title for axes in figure.axes)]
-    boxes = {t.get_text(): t.get_window_extent() for t in texts}
-    for (text, one), (other, two) in itertools.combinations(boxes.items(), 2):
-        assert not one.overlaps(two), (text, other)
-    for axes in figure.axes:
-        drawn = axes.patches[0].get_window_extent()
-        assert not any(box.overlaps(drawn) for box in boxes.values()), axes.title
-    assert min(box.y0 for box in boxes.values()) > 0, "all of it is on the page"
+    assert bought["silicone"][1].startswith(f"{sum(solids) / 1e3:.0f} cm³ cast + 15 % loss")
+    grams = float(bought["silicone"][0].removesuffix(" g"))
+    cast = [
+        float(cell.split()[0]) for row in sections["Silicone by casting"].rows for cell in row[1:]
+    ]
+    assert sum(cast) == pytest.approx(grams, abs=len(cast))  # whole grams
+    bottoms = [workshop.bottom(size) for size in sizes]
+    pockets = [(s.length + s.root) * s.base.width * s.base.wall for s in sizes]
+    np.testing.assert_allclose(bottoms, pockets)
+    assert (
+        bought["screws of the bars"][0] == "8" and "31.5-4-M5" in bought["screws to the wrist"][1]
+    )
+    # Of a hanging hand by hand: 0.25 kg and four fingers of 34 cm^3 of 1.07 g, on 180 N/m.
+    weight = 9.81 * (0.25 + 4 * 34e-6 * 1070)
+    [hangs] = [note for note in sections["Wrist"].notes if "lowers it by" in note]
+    assert f"lowers it by {1e3 * weight / the_scene.hand.wrist.linear_stiffness:.0f} mm" in hangs
+    text = sheet.markdown("x", [], [*sections.values()])
+    for words in (
+        "Leak test",
+        "Bend test",
+        "pours for ",
+        "at 23 °C",
+        "finger 0 has one",
+    ):
+        assert words in text, words
+    named = dataclasses.make_dataclass("Material", ["silicone", "shear_modulus"])
+    assert silicone.of_material(named("ecoflex_00_30", 1e4)).name == "Ecoflex 00-30"
+    assert silicone.of_material(the_scene.hand.material) is None
+
+
+@pytest.mark.parametrize(
+    ("length", "pressure", "idle"), [(0.017, 4e4, True), (0.11, 0.0, True), (0.11, 1.2e5, False)]
+)
+def test_a_finger_that_does_nothing_is_named(page, length, pressure, idle):
+    the_scene, params, _, _ = page
+    one, rest = np.array([True, False, False, False]), params
+    params = rest._replace(
+        length=np.where(one, length, rest.length), pressure=np.where(one, pressure, rest.pressure)
+    )
+    found = sheet.idle_fingers(the_scene, params, process.sizes(the_scene.hand, params, Process()))
+    assert [words.startswith("finger 0 does next to nothing") for words in found] == [True] * idle
+
+
+# --- the palm: fingers fit into its seats, in any hand -------------------------------------------
+
+
+HANDS = {
+    "pneuflex4": {},
+    "tripod3": {},
+    "thumb4": {},
+    "tapered4": {},
+    "level": {f"hand.finger.{i}.tilt": 0.0 for i in range(4)},
+    "upright": {f"hand.finger.{i}.tilt": 90.0 for i in range(4)},
+    "small": {"hand.palm.radius": 0.02, "hand.palm.thickness": 0.005},
+    "far": {
+        f"hand.finger.{i}.base": base
+        for i, base in enumerate([[0.09, 0.02], [0.09, -0.02], [-0.09, -0.02], [-0.09, 0.02]])
+    },
+}
+FINE = 1e-2  # mm^3: seats are rounded to hundredths of a millimetre along their edges
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_fingers_fit_into_the_palm(name, tmp_path):
+    hand = name if not HANDS[name] else "pneuflex4"
+    the_scene = scene.load("paper_spheres", hand_name=hand, overrides=HANDS[name])
+    space = parameters.design_space(the_scene.hand, "full")
+    params, how = jax.tree.map(np.asarray, space.params(space.default())), Process()
+    sizes = process.sizes(the_scene.hand, params, how)
+    made = palm.palm(the_scene, params, sizes, how)
+    meshes.write_palm(tmp_path, made)
+    body, low = solid(tmp_path / "palm.stl"), made.body.bounding_box()[2]
+    body = body.translate([0, 0, low])
+    assert trimesh.load_mesh(tmp_path / "palm.stl").is_watertight and len(body.decompose()) == 1
+    assert low == pytest.approx(-made.below, abs=1e-6)
+    assert made.below == 0 or name == "level"
+    for i, (size, frame) in enumerate(zip(sizes, palm.frames(the_scene, params), strict=True)):
+        finger = casting.parts(size, how).finger.transform(frame)
+        bar = made.bars[i].transform(frame)
+        assert (body ^ finger).volume() < FINE and (body ^ bar).volume() < FINE
+        # The bar presses the root by its share of the height, over the root's length and width.
+        ends = [size.at(x) for x in (-size.root, -size.root / 2, 0.0)]
+        areas = [z.width * (z.height - size.pressed) for z in ends]
+        expected = size.root * (areas[0] + 4 * areas[1] + areas[2]) / 6
+        assert (bar ^ finger).volume() == pytest.approx(expected, rel=1e-3)  # the screws' holes
+        assert size.pressed == pytest.approx(0.95 * size.base.height)
+        # The root cannot turn or sink: a hair to either side, in or backwards it meets the palm.
+        for x, y, z in ((-1, 0, 0), (0, 0.5, 0), (0, -0.5, 0), (0, 0, -0.5)):
+            moved = finger.translate(frame[:, :3] @ [x, y, z])
+            assert (body ^ moved).volume() > 1, (i, x, y, z)
+        # Each screw cuts its thread in the palm and passes the bar; the tube comes out on top.
+        for x, y in palm.screws(size, how):
+            for radius, cuts in ((1.2, False), (1.5, True)):
+                screw = manifold3d.Manifold.cylinder(16, radius, radius, 32)
+                screw = screw.translate([x, y, size.pressed + process.BAR - 16]).transform(frame)
+                assert (screw ^ bar).volume() < FINE
+                assert ((screw ^ body).volume() > 10) == cuts
+    assert made.flange is not None and (made.flange.diameter < 31.5) == (name in ("small", "level"))
+    assert not made.problems or name == "level" and "clamp bars" in made.problems[0]
+
+
+def test_what_cannot_be_built_is_named():
+    """Fingers whose bases stand in one another, as in the hand of one circle at little spread."""
+    the_scene = scene.load("paper_spheres", hand_name="pneuflex4_circle")
+    space = parameters.design_space(the_scene.hand, "full")
+    params = space.params(space.default())._replace(spread=np.float32(0.0))
+    sizes = process.sizes(the_scene.hand, params, Process())
+    made = palm.palm(the_scene, params, sizes, Process())
+    assert made.problems[0] == "the bases of fingers 0 and 1 stand in one another"
 
 
 def test_the_assembly_stands_as_mujoco_has_it(page):
@@ -342,8 +507,31 @@ def test_command_writes_the_sheet(tmp_path, capsys, by_toy):
     assert "12 further parameters of the hand's table were not moved" in text
     assert (tmp_path / "out" / "build_sheet.pdf").exists()
     assert {p.name for p in tmp_path.iterdir()} - {"cache"} == {"out", "plain"}
+    lines = (tmp_path / "out" / "valves.csv").read_text().splitlines()
+    assert (
+        lines[1].startswith("time_s,pressure_0_kPa") and (tmp_path / "out/play_valves.py").exists()
+    )
+    (tmp_path / "out" / "mine.txt").touch()
+    assert cli.main([*TOY, "--no-sheet", "--overwrite", "--out", str(tmp_path / "out")]) == 0
+    assert "left there, no part of this export: mine.txt" in capsys.readouterr().out
+    assert not (tmp_path / "out" / "build_sheet.pdf").exists()
+    with files.whole_folder(tmp_path / "busy"):
+        assert cli.main([*TOY, "--no-sheet", "--out", str(tmp_path / "busy")]) == 2
+    assert "busy: another export is writing to it" in capsys.readouterr().err
     assert cli.main([*TOY, "--tolerance-steps", "0", "--out", str(tmp_path / "no")]) == 2
     assert "--tolerance-steps" in capsys.readouterr().err and not (tmp_path / "no").exists()
+
+
+def fill(path, *names, **kwargs):
+    """Fills a folder with files that hold their names."""
+    with files.whole_folder(path, **kwargs) as part:
+        for name in names:
+            (part / name).parent.mkdir(parents=True, exist_ok=True)
+            (part / name).write_text(name)
+
+
+def below(path):
+    return {p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file()}
 
 
 def test_a_folder_is_there_as_a_whole_or_not_at_all(tmp_path):
@@ -354,11 +542,52 @@ def test_a_folder_is_there_as_a_whole_or_not_at_all(tmp_path):
     assert [*(tmp_path / "a").iterdir()] == []
     part.mkdir()
     (part / "of a killed process").touch()
-    for name in ("new", "newer"):
-        with files.whole_folder(path) as part:
-            (part / name).touch()
-        (path / "own").touch()
-    assert {p.name for p in path.iterdir()} == {"new", "newer", "own"}
+    (part.parent / ".folder.other.part").mkdir()  # of a folder whose name begins alike
+    fill(path, "new")
+    assert below(tmp_path / "a") == {"folder/new", "folder/manifest.json"}
+    assert {p.name for p in path.parent.iterdir()} == {"folder", ".folder.other.part"}
+
+
+def test_what_belongs_to_a_folder_is_replaced_whole(tmp_path):
+    """Of what an earlier call wrote nothing stays, of others' files all, whatever their place."""
+    path, outside = tmp_path / "folder", tmp_path / "outside"
+    fill(path, "kept", "changed", "parts/old", "deep/er/old", "edited")
+    (path / "foreign").touch()
+    (path / "parts" / "mine").touch()
+    (path / "edited").write_text("by its reader")
+    fill(path, "kept", "changed", "parts/new")
+    others = ["edited", "foreign", "parts/mine"]
+    assert files.foreign(path) == others
+    assert below(path) == {*others, "kept", "changed", "parts/new", "manifest.json"}
+    assert not (path / "deep").exists()
+    # A list is data: it deletes nothing outside of its folder, and a damaged one nothing at all.
+    outside.write_text("outside")
+    digest = hashlib.sha256(b"outside").hexdigest()
+    for name in ("../outside", str(outside), "link/outside"):
+        (path / files.MANIFEST).write_text(json.dumps({"files": {name: digest}}))
+        (path / "link").is_symlink() or (path / "link").symlink_to(tmp_path)
+        fill(path, "kept")
+        assert outside.exists(), name
+    for text in ("", "[]", "{}", '{"files": 3}'):
+        (path / files.MANIFEST).write_text(text)
+        fill(path, "kept")
+        assert files.foreign(path) == ["changed", *others[:2], *sorted(["parts/mine", "parts/new"])]
+
+
+def test_one_call_fills_a_folder_at_a_time(tmp_path):
+    path = tmp_path / "folder"
+    with files.whole_folder(path) as part:
+        (part / "first").touch()
+        with pytest.raises(BlockingIOError, match="another export is writing"):
+            fill(path, "second")
+        fill(tmp_path / "beside", "other")
+    assert below(path) == {"first", "manifest.json"}
+    with pytest.raises(FileExistsError, match="were not there"):
+        fill(path, "second", replace=False)
+    (path / "second").mkdir()
+    with pytest.raises(IsADirectoryError, match="second is a folder"):
+        fill(path, "second")
+    assert "first" in below(path) and {p.name for p in tmp_path.iterdir()} == {"folder", "beside"}
 
 
 # --- exported grasps: plain MuJoCo simulates the files as the engine mujoco does ------------------
@@ -424,6 +653,7 @@ def test_plain_mujoco_plays_the_files_as_the_engine(grasped, tmp_path):
         xml = mujoco.MjModel.from_xml_path(str(tmp_path / f"{name}.xml"))
         binary = mujoco.MjModel.from_binary_path(str(tmp_path / f"{name}.mjb"))
         for loaded in (xml, binary):
+            assert loaded.nlight and loaded.vis.headlight.diffuse.min() > 0.3 and loaded.ntex
             when, _, states = play(loaded, controls)
             assert when == judged.lost_time[i]
             # Rounding of 1e-16 grows while fingers slide on the sphere, here to 1e-11.
@@ -515,9 +745,165 @@ def test_commands_are_the_key_frames(tmp_path):
     for time, height in heights.items():
         assert values[time]["arm_z_mm"] == pytest.approx(height, rel=1e-6)
     assert values["2.75"]["pressure_3_kPa"] == pytest.approx(60, abs=1e-4)
-    assert values["0"]["arm_pitch_deg"] == pytest.approx(-15, rel=1e-6)
+    assert values["0"]["arm_pitch_deg"] == pytest.approx(15, rel=1e-6)
     phase = {row["time_s"]: row["phase"] for row in rows}
     assert [phase[t] for t in ("1.99", "2", "4.49")] == ["approach", "inflate", "lift"]
+
+
+def table_of(section):
+    """Numbers of a section's table, by its head."""
+    columns = zip(*section.rows, strict=True)
+    return dict(zip(section.head, ([*map(str, c)] for c in columns), strict=True))
+
+
+@pytest.mark.parametrize("settle", [0.0, 0.25])
+def test_commands_played_back_are_the_sheet_s_poses(tmp_path, settle):
+    """One sign and one order of the angles: the commands, the sheet and MuJoCo's hinges agree."""
+    the_scene = scene.load("paper_spheres", overrides={"phases.settle": settle})
+    space = parameters.design_space(the_scene.hand, "full")
+    params = jax.tree.map(lambda v: np.asarray(v, float), space.params(space.default()))
+    angles = {"roll": 35.0, "yaw": -20.0, "pitch": 50.0}
+    arm = np.array([0.02, -0.03, 0.04, *np.radians([35.0, 50.0, -20.0])])
+    params = params._replace(arm=arm)
+    nominal = jax.tree.map(np.asarray, rollout.nominal_trial(the_scene))
+    controls = grasps.timed_controls(the_scene, params, nominal)
+    tables.write_commands(tmp_path, the_scene, controls)
+    rows = {round(float(row["time_s"]), 6): row for row in read(tmp_path / tables.COMMANDS)}
+    sizes = process.sizes(the_scene.hand, params, Process())
+    sections = sheet.sheet_sections(the_scene, params, sizes, None)
+    arms, pressures = (table_of(s) for s in sections if s.title in ("Arm", "Valves"))
+    ends, compared = the_scene.phase_ends, 0
+    for k, time in enumerate(map(float, arms["time s"])):
+        if ends["lift"] < time <= ends["disturb"] or time not in rows:
+            continue  # shaken there
+        row, compared = rows[time], compared + 1
+        for name in ("x mm", "y mm", "z mm", "roll °", "yaw °", "pitch °"):
+            word, unit = name.split()
+            column = f"arm_{word}_{'deg' if unit == '°' else unit}"
+            assert float(row[column]) == pytest.approx(float(arms[name][k]), abs=0.051), name
+        turn = [float(row[f"arm_q{c}"]) for c in "wxyz"]
+        written = [float(v) for v in arms["quaternion w x y z"][k].split()]
+        np.testing.assert_allclose(written, turn, atol=5.1e-5)  # four digits behind the point
+        for f in range(the_scene.num_fingers):
+            told = float(pressures[f"finger {f} kPa"][k])
+            assert float(row[f"pressure_{f}_kPa"]) == pytest.approx(told, abs=0.051)
+    assert compared >= 4
+    # MuJoCo turns the palm by the controls as the commands say, and the words are true.
+    compiled = model.compile_model(the_scene, params, nominal)
+    data, k = mujoco.MjData(compiled), round((settle + 2) / 0.01)
+    data.qpos[:6] = controls[k, 1:7]
+    mujoco.mj_kinematics(compiled, data)
+    palm_turn = data.xmat[1].reshape(3, 3)
+    np.testing.assert_allclose(pose.rotation(**angles).as_matrix(), palm_turn, atol=1e-6)  # float32
+    for name, way in {"roll": (0, 1), "pitch": (1, 0)}.items():
+        alone = {a: 30.0 * (a == name) for a in pose.ANGLES}
+        down = pose.rotation(**alone).apply([0, 0, -1])
+        np.testing.assert_allclose(down[:2], 0.5 * np.array(way), atol=1e-12)
+    turned = pose.rotation(roll=0.0, yaw=30.0, pitch=0.0).apply([1, 0, 0])
+    assert turned[1] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["box", "a/b: c"], ["box", "a_b_c"]),
+        (["scan_of_a_ball_" * 20] * 2, [("scan_of_a_ball_" * 20)[:79] + f"_{i}" for i in (0, 1)]),
+        (["日本語の" * 30], [("日本語の" * 30)[:26]]),
+        (["Ball", "ball"], ["Ball_0", "ball_1"]),
+        (["", "***"], ["object_0", "object_1"]),
+        (["trial_000_box"], ["object_trial_000_box"]),
+        (["u\u0308", "ü"], ["ü_0", "ü_1"]),
+    ],
+)
+def test_files_have_names_that_a_disk_takes(names, expected):
+    assert tables.names_of(names) == expected
+
+
+# --- pressures for regulators --------------------------------------------------------------------
+
+
+JUMP = (
+    "# limit kPa,100,50\ntime_s,pressure_0_kPa,pressure_1_kPa\n"
+    "0,0,0\n0.2,80,40\n0.2,10,0\n0.4,10,0\n"
+)
+
+
+def test_pressures_reach_standard_output_and_a_serial_line(tmp_path, capsys):
+    (tmp_path / "valves.csv").write_text(JUMP)
+    words = [str(tmp_path / "valves.csv"), "--period", "0.1", "--no-wait", "--divide", "0.8"]
+    assert play_valves.main(words) == 0
+    lines = capsys.readouterr().out
+    assert lines == (
+        "0.000,0.000,0.000\n0.100,50.000,25.000\n0.200,12.500,0.000\n0.300,12.500,0.000\n"
+        "0.400,12.500,0.000\n0.500,0.000,0.000\n"
+    )
+    ours, theirs = os.openpty()
+    assert play_valves.main([*words, "--port", os.ttyname(theirs), "--baud", "9600"]) == 0
+    received = b""
+    while len(received) < len(lines):
+        received += os.read(ours, 1000)
+    assert received.decode() == lines
+    os.close(ours)
+    os.close(theirs)
+    assert play_valves.main([*words, "--port", str(tmp_path / "none")]) == 2
+    assert "error: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("table", "divide", "words"),
+    [
+        (JUMP, ["0.7"], "finger 0 would get 114.3 kPa, and its wall stands 100.0 kPa"),
+        (JUMP, ["1", "0.7"], "finger 1 would get 57.1 kPa"),
+        (JUMP, ["1", "1", "1"], "1 number or 2, not 3"),
+        (JUMP, ["0"], "above 0"),
+        ("time_s,pressure_0_kPa\n0,1\n1,-2\n", ["1"], "line 3: a number is below 0"),
+        ("time_s,pressure_0_kPa\n1,1\n0,2\n", ["1"], "line 3: times must not fall"),
+        ("time_s,pressure_0_kPa\n0,1\n1,x\n", ["1"], "line 3: a cell is no number"),
+        ("time_s,pressure_0_kPa\n0,1\n1\n", ["1"], "line 3: 1 cells"),
+        ("time_s,pressure_0_kPa\n", ["1"], "has no rows"),
+    ],
+)
+def test_wrong_pressures_are_not_sent(tmp_path, capsys, table, divide, words):
+    (tmp_path / "valves.csv").write_text(table)
+    assert play_valves.main([str(tmp_path / "valves.csv"), "--divide", *divide]) == 2
+    output = capsys.readouterr()
+    assert words in output.err and not output.out
+
+
+def test_an_interrupted_player_empties_the_chambers():
+    rows, sent = [[0.0, 10.0], [1.0, 20.0]], []
+
+    def wait(seconds):
+        if len(sent) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        play_valves.play(rows, sent.append, 0.1, wait)
+    assert sent[-2:] == ["0.200,12.000\n", "0.200,0.000\n"]
+
+
+def test_the_table_of_valves_is_what_the_control_commands(tmp_path):
+    """Held values jump; between the rows the player's line is the plan's pressure."""
+    (tmp_path / "held.toml").write_text(
+        'name = "held"\ndescription = "steps"\nframe = [\n{ time = 0, pressure = "0.2 * pressure", '
+        'interpolation = "held" },\n{ time = "approach", pressure = "pressure" },\n'
+        '{ time = "lift", pressure = 0 },\n]\n'
+    )
+    own = {"control": str(tmp_path / "held.toml"), "phases.settle": 0.5}
+    the_scene = scene.load("paper_spheres", overrides=own)
+    space = parameters.design_space(the_scene.hand, "2d")
+    params = jax.tree.map(np.asarray, space.params(space.default()))
+    valves.write(tmp_path, the_scene, params)
+    rows, limits = play_valves.read(tmp_path / valves.VALVES)
+    assert [row[0] for row in rows] == [0.5, 2.5, 2.5, 5.0] and len(limits) == 4
+    nominal = jax.tree.map(np.asarray, rollout.nominal_trial(the_scene))
+    commanded = 1e-3 * np.asarray(control.plan(the_scene, params, nominal).pressure)
+    times = np.arange(len(commanded)) * the_scene.discretization.timestep
+    sent = np.array([play_valves.at(rows, time) for time in times])
+    # The time of a jump is a step's beginning, whose rounding belongs to either side.
+    steady = np.abs(times - 2.5) > 1e-6
+    np.testing.assert_allclose(sent[steady], commanded[steady], atol=1e-3)
+    assert play_valves.scaled(rows, limits, [1.0]) == rows
 
 
 def test_command_writes_models_of_the_default_scene_s_kind(tmp_path, capsys):

@@ -13,7 +13,7 @@ from codesign_jax import engines, files, preflight, provenance, rollout, runs
 from codesign_jax.commands import common, drift, reference
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Export
-from codesign_jax.export import grasps, plain, process, tables
+from codesign_jax.export import grasps, plain, process, sheet, tables, valves
 from codesign_jax.export.process import Process, Size
 from codesign_jax.runs.choice import Case
 from codesign_jax.runs.progress import Busy
@@ -22,7 +22,7 @@ from codesign_jax.terminal import Console
 from codesign_jax.types import Params, Trial
 
 if TYPE_CHECKING:
-    from codesign_jax.export import sheet
+    from codesign_jax.export import workshop
 
 
 def main(options: Export) -> int:
@@ -34,6 +34,8 @@ def main(options: Export) -> int:
     params = _params(case)
     sizes = [] if options.no_parts and options.no_sheet else _sizes(case, params, options)
     notes = preflight.notes(case.scene, case.space, {"the design": case.design})
+    if sizes:
+        notes += sheet.idle_fingers(case.scene, params, sizes)
     if case.policy:
         notes.append(f"commands are those of the key frames: policy {case.policy} is left out")
     simulating = options.tolerance != "off" and not options.no_sheet
@@ -45,12 +47,20 @@ def main(options: Export) -> int:
     for note in notes:
         console.print(note)
     try:
-        with files.whole_folder(options.out) as folder:
+        with files.whole_folder(options.out, replace=options.overwrite) as folder:
             write_files(case, params, sizes, engine, folder, options, console)
     except OSError as error:
         raise InputError([f"--out {options.out}: {error.strerror}"]) from error
     _tell(case, options, console)
+    if others := files.foreign(options.out):
+        console.print(f"  left there, no part of this export: {_some(others)}")
     return 0
+
+
+def _some(names: list[str], most: int = 8) -> str:
+    """Names in a line, the first ones if there are many."""
+    rest = len(names) - most
+    return ", ".join(names[:most]) + (f", and {rest} more" if rest > 0 else "")
 
 
 def _params(case: Case) -> Params:
@@ -107,25 +117,32 @@ def write_files(
     _models(case, params, folder, options, console)
     nominal = jax.tree.map(np.asarray, rollout.nominal_trial(case.scene))
     tables.write_commands(folder, case.scene, grasps.timed_controls(case.scene, params, nominal))
-    if not options.no_parts:
-        _parts(sizes, folder, options, console)
+    valves.write(folder, case.scene, params)
+    printed = None if options.no_parts else _parts(case, params, sizes, folder, options, console)
     if not options.no_sheet:
         found = drift.simulate(case, engine, options, console) if engine else None
         with Busy(console, "writing the build sheet"):
-            _sheet(case, params, sizes, found, folder, options)
+            lacking = _sheet(case, params, sizes, (found, printed), folder, options)
+        if lacking:
+            console.print(
+                f"the PDF writes ? for letters that no font here has: {' '.join(lacking)} "
+                "(the text has them)"
+            )
 
 
 def _tell(case: Case, options: Export, console: Console) -> None:
-    from codesign_jax.export import sheet
-
     console.print(f"exported: {options.out}")
     models = sorted((options.out / tables.MODELS).glob("*.mjb"))
     if models:
         player = f"python {grasps.PLAYER.name} {models[0].name}"
         console.print(f"  {tables.MODELS}/: models for plain MuJoCo; there: {player}")
-    console.print(f"  {tables.COMMANDS}: commands of arm and valves")
+    console.print(
+        f"  {tables.COMMANDS}: commands of arm and valves; turns: roll about x, then yaw, then "
+        "pitch, positive towards +x, as above"
+    )
+    console.print(f"  {valves.VALVES}, {valves.PLAYER.name}: pressures for regulators")
     if not options.no_parts:
-        console.print("  parts/: fingers and moulds, in millimetres")
+        console.print("  parts/: fingers, moulds, palm and clamp bars, in millimetres")
     if not options.no_sheet:
         console.print(f"  {sheet.NAME}.md, {sheet.NAME}.pdf: build sheet and its drawings")
         if options.tolerance == "off":
@@ -136,21 +153,40 @@ def _tell(case: Case, options: Export, console: Console) -> None:
             )
 
 
-def _parts(sizes: list[Size], folder: Path, options: Export, console: Console) -> None:
-    from codesign_jax.export import meshes  # needs the extra
+def _parts(
+    case: Case,
+    params: Params,
+    sizes: list[Size],
+    folder: Path,
+    options: Export,
+    console: Console,
+) -> "workshop.Printed":
+    from codesign_jax.export import meshes, palm, workshop  # needs the extra
 
     folder, how = folder / meshes.FOLDER, _process(options)
     folder.mkdir(exist_ok=True)
-    with Busy(console, "making fingers and moulds"):
-        for part in meshes.write(folder, sizes, how):
-            edges = " x ".join(f"{v:.1f}" for v in part.extents)
-            console.print(f"part {part.name}: {edges} mm, {part.volume / 1e3:.1f} cm^3")
+    with Busy(console, "making fingers, moulds and the palm"):
+        made = palm.palm(case.scene, params, sizes, how)
+        parts = [*meshes.write(folder, sizes, how), *meshes.write_palm(folder, made)]
+    for part in parts:
+        edges = " x ".join(f"{v:.1f}" for v in part.extents)
+        console.print(f"part {part.name}: {edges} mm, {part.volume / 1e3:.1f} cm^3")
+    problems = list(made.problems)
+    if not any(part.name == "palm" for part in parts):
+        problems.append("its surface does not close, so that no file of it was written")
+    for problem in problems:
+        console.print(f"note: the palm cannot be built as it is: {problem}")
+    if made.flange is None:
+        console.print("note: the palm has no room for screws to the wrist")
     for i, size in enumerate(sizes):
         if how.inlet and not process.inlet(size, how):
             low = min(size.base.chamber)
             console.print(
                 f"finger {i} has no inlet: its chamber of {low:g} mm is narrower than the tube"
             )
+    volume = made.body.volume() + sum(bar.volume() for bar in made.bars)
+    names = [part.name for part in parts]
+    return workshop.Printed(names, volume, made.flange, made.below, problems)
 
 
 def _models(case: Case, params: Params, folder: Path, options: Export, console: Console) -> None:
@@ -181,11 +217,12 @@ def _sheet(
     case: Case,
     params: Params,
     sizes: list[Size],
-    found: "sheet.Drift | None",
+    added: "tuple[sheet.Drift | None, workshop.Printed | None]",
     folder: Path,
     options: Export,
-) -> None:
-    from codesign_jax.export import drawing, sheet  # needs the extra
+) -> list[str]:
+    """Writes the sheet; returns letters that its drawings lack."""
+    from codesign_jax.export import drawing, workshop  # needs the extra
 
     kept = reference.Kept(None, None, [])
     if options.run_folder:
@@ -193,6 +230,7 @@ def _sheet(
     for note in kept.notes:
         common.warn(note)
     tested = None if kept.fresh is None else str(kept.fresh), kept.stress
+    found, printed = added
     content = sheet.sheet_sections(case.scene, params, sizes, found, tested)
     title = f"Build sheet: {case.scene.hand.name}"
     source = f"Best final design of {options.run_folder}" if options.run_folder else "Design"
@@ -206,6 +244,8 @@ def _sheet(
         "measurements.",
         *(f"Warning: {note}." for note in kept.notes),
     ]
-    assembly = sheet.assembly_sections(case.scene, params, sizes, _process(options))
+    if printed:
+        content[0].notes.extend(f"Warning: the palm: {words}." for words in printed.problems)
+    assembly = workshop.assembly_sections(case.scene, params, sizes, _process(options), printed)
     sheet.write(folder, title, lines, [*content, *assembly])
-    drawing.write(folder, title, case.scene, params, sizes)
+    return drawing.write(folder, title, case.scene, params, sizes, printed)

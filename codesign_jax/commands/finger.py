@@ -138,7 +138,13 @@ def _of_fit(fit: Fit, table: dict[str, np.ndarray], neo_hookean: bool) -> list[s
     if gain:
         lines.append(
             f"fitted: moment {fit.gain:.4g} of the model's at the same pressure, standard error "
-            f"{100 * fit.spread[1]:.2g} %: multiply the pressures that you command by it"
+            f"{100 * fit.spread[1]:.2g} %"
+        )
+        given = ", with the fitted G in it," if modulus else ""
+        lines.append(
+            f"on the real hand divide a simulated design's pressures by {fit.gain:.4g} "
+            f"(play_valves.py --divide {fit.gain:.4g}); to simulate the real finger{given} "
+            f"multiply the simulated pressures by {fit.gain:.4g} instead"
         )
     elif modulus:
         lines.append(

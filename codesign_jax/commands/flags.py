@@ -279,6 +279,8 @@ class Export(Command, RunOrDesign):
     """Leave out the fingers and their moulds."""
     end_wall: float = 0.0
     """Walls that close the chamber at base and tip [mm]; 0: as thick as the finger's others."""
+    root: float = 10.0
+    """Solid end of a finger behind its base, which the palm's seat holds [mm]."""
     inlet: float = 2.0
     """Diameter of the air tube's hole through the base [mm]; 0: none."""
     mould_wall: float = 4.0

@@ -3,11 +3,13 @@
 Frame: that of the finger's base, x along the finger, y across, z up from the inextensible bottom
 layer.  The finger is the design's: a block of length x width x height around a chamber with walls
 of one thickness on all sides, each of which may change linearly from base to tip.  The design is a
-beam and says nothing of ends, inlet and moulds; how they are made is ours.
+beam and says nothing of ends, inlet and moulds; how they are made is ours.  Behind the base, at
+x < 0, the block goes on as a solid root, which `palm` holds.
 
 A finger is cast in two steps.  First the shell, all but the bottom wall, back downwards in a tray
 around a core that hangs from bars over the tray's rim; the mould is open between the bars, where
-silicone is poured in and air leaves.  Then the bottom wall, on the inextensible fabric that lies on
+silicone is poured in and air leaves.  A pin through the tray's end into the core keeps the inlet
+free.  Then the bottom wall, on the inextensible fabric that lies on
 the floor of a second tray; the cured shell is set into it and bonds.
 """
 
@@ -27,6 +29,8 @@ BAR, SPACING, OVERLAP = 6.0, 40.0, 5.0
 """Width of the core's bars, largest distance between two, and how deep parts sit in a mould."""
 SEGMENTS = 32
 """Corners of the inlet's section."""
+PIN = 3.0
+"""How deep the inlet's pin stands in the core [mm]."""
 
 
 class Parts(NamedTuple):
@@ -44,7 +48,7 @@ def parts(size: Size, process: Process) -> Parts:
                  _base(size, process))  # fmt: skip
 
 
-def _solid(
+def prism(
     x: tuple[float, float], half: Line, low: Line, high: Line, grow: Callable | None = None
 ) -> manifold3d.Manifold:
     """The body from x[0] to x[1], -half to half and low to high, whose faces are plane."""
@@ -62,11 +66,11 @@ def _rim(size: Size) -> Line:
     return lambda x: size.at(x).wall
 
 
-def _shifted(line: Line, by: float) -> Line:
+def shifted(line: Line, by: float) -> Line:
     return lambda x: line(x) + by
 
 
-def _half(size: Size) -> Line:
+def half_width(size: Size) -> Line:
     return lambda x: size.at(x).width / 2
 
 
@@ -79,15 +83,30 @@ def _chamber(size: Size) -> tuple[Line, Line, Line]:
 
 
 def _finger(size: Size, process: Process) -> manifold3d.Manifold:
-    block = _solid((0.0, size.length), _half(size), lambda x: 0.0, lambda x: size.at(x).height)
-    found = block - _solid(size.chamber_ends, *_chamber(size))
+    block = prism(size.ends, half_width(size), lambda x: 0.0, lambda x: size.at(x).height)
+    found = block - prism(size.chamber_ends, *_chamber(size))
     radius = inlet(size, process) / 2
     if radius:
         start, end = size.chamber_ends
-        reach = start + min(1.0, (end - start) / 2) + 1.0
-        tube = manifold3d.Manifold.cylinder(reach, radius, radius, SEGMENTS)
-        found -= tube.rotate([0, 90, 0]).translate([-1.0, 0, size.base.height / 2])
+        reach = min(1.0, (end - start) / 2)
+        found -= _tube(size, radius, -size.root - 1.0, start + reach)
     return found
+
+
+def _tube(size: Size, radius: float, start: float, end: float) -> manifold3d.Manifold:
+    """A cylinder along the finger in the middle of its base."""
+    tube = manifold3d.Manifold.cylinder(end - start, radius, radius, SEGMENTS)
+    return tube.rotate([0, 90, 0]).translate([start, 0, size.base.height / 2])
+
+
+def _pinned(part: manifold3d.Manifold, size: Size, process: Process) -> manifold3d.Manifold:
+    """A mould with the hole of the pin that keeps the inlet free, from outside into the core."""
+    radius = inlet(size, process) / 2
+    if not radius:
+        return part
+    start, end = size.chamber_ends
+    outside = -size.root - 4 * process.mould_wall - process.clearance
+    return part - _tube(size, radius, outside, start + min(PIN, (end - start) / 2))
 
 
 def slope(size: Size, process: Process, x: float, z: float) -> float:
@@ -97,15 +116,15 @@ def slope(size: Size, process: Process, x: float, z: float) -> float:
 
 
 def _around(size: Size, grow: Line, low: Line, high: Line) -> manifold3d.Manifold:
-    return _solid((0.0, size.length), _half(size), low, high, lambda x, z: grow(x))
+    return prism(size.ends, half_width(size), low, high, lambda x, z: grow(x))
 
 
 def _tray(size: Size, process: Process) -> manifold3d.Manifold:
     rim, top = _rim(size), lambda x: size.at(x).height
-    outer = _around(size, _outside(size, process), rim, _shifted(top, process.mould_wall))
+    outer = _around(size, _outside(size, process), rim, shifted(top, process.mould_wall))
     # The cavity goes on below its opening, so that no two faces coincide there.
-    cavity = (0.0, size.length), _half(size), _shifted(rim, -1.0), top
-    return outer - _solid(*cavity, lambda x, z: slope(size, process, x, z))
+    cavity = size.ends, half_width(size), shifted(rim, -1.0), top
+    return _pinned(outer - prism(*cavity, lambda x, z: slope(size, process, x, z)), size, process)
 
 
 def _at_rim(size: Size, process: Process) -> Line:
@@ -113,7 +132,7 @@ def _at_rim(size: Size, process: Process) -> Line:
 
 
 def _outside(size: Size, process: Process) -> Line:
-    return _shifted(_at_rim(size, process), process.mould_wall)
+    return shifted(_at_rim(size, process), process.mould_wall)
 
 
 def _overlap(size: Size) -> float:
@@ -124,17 +143,18 @@ def _core(size: Size, process: Process) -> manifold3d.Manifold:
     wall, rim, ends = process.mould_wall, _rim(size), size.chamber_ends
     half, low, high = _chamber(size)
     drafted = lambda x, z: slope(size, process, x, z)  # noqa: E731
-    core = _solid(ends, half, _shifted(low, -wall / 2), high, drafted)
-    inside = _shifted(_outside(size, process), process.clearance)
-    below, depth = _shifted(rim, -wall), _overlap(size)
-    frame = _around(size, _shifted(inside, wall), below, _shifted(rim, depth))
-    frame -= _around(size, inside, rim, _shifted(rim, depth + 1.0))
+    core = prism(ends, half, shifted(low, -wall / 2), high, drafted)
+    inside = shifted(_outside(size, process), process.clearance)
+    below, depth = shifted(rim, -wall), _overlap(size)
+    frame = _around(size, shifted(inside, wall), below, shifted(rim, depth))
+    frame -= _around(size, inside, rim, shifted(rim, depth + 1.0))
     opening = _at_rim(size, process)
-    frame -= _around(size, opening, _shifted(below, -1.0), _shifted(rim, 1.0))
-    spine = _solid(ends, half, below, rim)
+    frame -= _around(size, opening, shifted(below, -1.0), shifted(rim, 1.0))
+    spine = prism(ends, half, below, rim)
     across = lambda x: size.at(x).width / 2 + inside(x)  # noqa: E731
-    bars = [_solid((x - w / 2, x + w / 2), across, below, rim) for x, w in bars_of(size)]
-    return manifold3d.Manifold.batch_boolean([core, frame, spine, *bars], manifold3d.OpType.Add)
+    bars = [prism((x - w / 2, x + w / 2), across, below, rim) for x, w in bars_of(size)]
+    found = manifold3d.Manifold.batch_boolean([core, frame, spine, *bars], manifold3d.OpType.Add)
+    return _pinned(found, size, process)
 
 
 def bars_of(size: Size) -> list[tuple[float, float]]:
@@ -150,7 +170,7 @@ def bars_of(size: Size) -> list[tuple[float, float]]:
 
 def _base(size: Size, process: Process) -> manifold3d.Manifold:
     wall, rim, wide = process.mould_wall, _rim(size), _at_rim(size, process)
-    top, room = _shifted(rim, _overlap(size)), _shifted(wide, process.clearance)
-    outer = _around(size, _shifted(room, wall), lambda x: -wall, top)
-    outer -= _around(size, wide, lambda x: 0.0, _shifted(top, 1.0))
-    return outer - _around(size, room, rim, _shifted(top, 1.0))
+    top, room = shifted(rim, _overlap(size)), shifted(wide, process.clearance)
+    outer = _around(size, shifted(room, wall), lambda x: -wall, top)
+    outer -= _around(size, wide, lambda x: 0.0, shifted(top, 1.0))
+    return outer - _around(size, room, rim, shifted(top, 1.0))

@@ -1,50 +1,142 @@
-"""The drawings of the build sheet, a page of PDF: a finger, the palm, the hand from three sides."""
+"""The drawings of the build sheet as pages of PDF: hand, fingers, seat, wrist, turns of the arm."""
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib.backends.backend_pdf
 import matplotlib.figure
 import matplotlib.patches
 import numpy as np
 from matplotlib.axes import Axes
 from scipy.spatial import ConvexHull
 
-from codesign_jax.export.process import Size
-from codesign_jax.export.sheet import NAME, corners, places
+from codesign_jax.export import fonts, posture, valves
+from codesign_jax.export.process import BACK, BAR, FABRIC, FLOOR, Section, Size
+from codesign_jax.export.sheet import NAME, castable, corners, places
+from codesign_jax.export.workshop import Printed
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
 
 _A4 = (8.27, 11.69)
 _SMALL = 5.6
+_ROWS = 6  # fingers on a page
+_WIDE, _LINES = 64, 2  # letters in a line of the title, and its lines
 
 
-def write(folder: Path, title: str, scene: Scene, params: Params, sizes: Sequence[Size]) -> Path:
+def write(
+    folder: Path,
+    title: str,
+    scene: Scene,
+    params: Params,
+    sizes: Sequence[Size],
+    printed: Printed | None = None,
+) -> list[str]:
+    """Writes the PDF; returns letters of the title that no font of this system has."""
     path = folder / f"{NAME}.pdf"
-    page(title, scene, params, sizes).savefig(path)
-    return path
+    with matplotlib.backends.backend_pdf.PdfPages(path) as file:
+        for page in pages(title, scene, params, sizes, printed):
+            file.savefig(page)
+    return fonts.of_text(title).lacking
 
 
-def page(
-    title: str, scene: Scene, params: Params, sizes: Sequence[Size]
-) -> matplotlib.figure.Figure:
+def pages(
+    title: str,
+    scene: Scene,
+    params: Params,
+    sizes: Sequence[Size],
+    printed: Printed | None = None,
+) -> list[matplotlib.figure.Figure]:
+    """The pages: the hand, its fingers, and how it is held and turned."""
+    alike = {}
+    for i, size in enumerate(sizes):
+        alike.setdefault(size, []).append(i)
+    rows = [*alike.items()]
+    found = [_hand_page(title, scene, params, sizes)]
+    for first in range(0, len(rows), _ROWS):
+        found.append(_fingers_page(title, rows[first : first + _ROWS]))
+    found.append(_mounting_page(title, scene, params, sizes, printed))
+    for k, page in enumerate(found, 1):
+        page.text(0.94, 0.025, f"{k} of {len(found)}", fontsize=7, ha="right")
+    return found
+
+
+def _page(title: str) -> matplotlib.figure.Figure:
     # A figure of its own instead of pyplot's: no state and no display is touched.
     figure = matplotlib.figure.Figure(figsize=_A4)
-    figure.text(0.06, 0.965, title, fontsize=13, weight="bold")
-    _section(figure.add_axes((0.06, 0.80, 0.34, 0.12)), sizes[0])
-    _side_view(figure.add_axes((0.44, 0.80, 0.50, 0.12)), sizes[0])
+    font = fonts.of_text(title)
+    # Letters of other scripts are up to twice as wide.
+    width = _WIDE if font.text.isascii() else _WIDE // 2
+    text = textwrap.fill(font.text, width, max_lines=_LINES, placeholder=" …")
+    figure.text(
+        0.06,
+        0.975,
+        text,
+        fontsize=12,
+        weight="bold" if font.family == [fonts.DEFAULT] else "normal",
+        va="top",
+        family=font.family,
+        parse_math=False,
+    )
+    return figure
+
+
+def _hand_page(
+    title: str, scene: Scene, params: Params, sizes: Sequence[Size]
+) -> matplotlib.figure.Figure:
+    figure = _page(title)
     found = corners(scene, params, sizes)
-    _view(figure.add_axes((0.08, 0.46, 0.40, 0.27)), scene, found, "front: x, z", 0, 2)
-    _view(figure.add_axes((0.54, 0.46, 0.40, 0.27)), scene, found, "side: y, z", 1, 2)
-    _view(figure.add_axes((0.08, 0.12, 0.40, 0.27)), scene, found, "from above: x, y", 0, 1)
-    _palm(figure.add_axes((0.54, 0.12, 0.40, 0.27)), scene, params)
+    _view(figure.add_axes((0.08, 0.56, 0.40, 0.32)), scene, found, "front: x, z", 0, 2)
+    _view(figure.add_axes((0.54, 0.56, 0.40, 0.32)), scene, found, "side: y, z", 1, 2)
+    _view(figure.add_axes((0.08, 0.16, 0.40, 0.32)), scene, found, "from above: x, y", 0, 1)
+    _palm(figure.add_axes((0.54, 0.16, 0.40, 0.32)), scene, params)
     extent = np.ptp(np.concatenate(found), axis=0)
     words = (
         f"Straight fingers, without pressure, span {extent[0]:.0f} x {extent[1]:.0f} x "
         f"{extent[2]:.0f} mm. Red: fabric, which faces inwards. z = 0: the palm's underside. "
         f"Numbers of fingers at their tips. Tables and the order of work: {NAME}.md."
     )
-    figure.text(0.06, 0.06, words, fontsize=_SMALL)
+    figure.text(0.06, 0.08, textwrap.fill(words, 120), fontsize=7, va="top")
+    return figure
+
+
+def _fingers_page(title: str, rows: list[tuple[Size, list[int]]]) -> matplotlib.figure.Figure:
+    figure = _page(title)
+    high = 0.88 / _ROWS
+    for k, (size, fingers) in enumerate(rows):
+        label = f"finger {', '.join(map(str, fingers))}"
+        bottom, tapered = 0.92 - (k + 1) * high + 0.02, size.base != size.tip
+        tall = high - 0.045
+        first = figure.add_axes((0.06, bottom, 0.14 if tapered else 0.30, tall))
+        _section(first, size.base, f"{label}{', base' if tapered else ''}")
+        if tapered:
+            _section(figure.add_axes((0.22, bottom, 0.14, tall)), size.tip, f"{label}, tip")
+        _side_view(figure.add_axes((0.40, bottom, 0.54, tall)), size, f"{label}, along")
+    figure.text(
+        0.06, 0.05, "All in mm. Red: fabric. Left of the dashed line: the root.", fontsize=7
+    )
+    return figure
+
+
+def _mounting_page(
+    title: str, scene: Scene, params: Params, sizes: Sequence[Size], printed: Printed | None
+) -> matplotlib.figure.Figure:
+    figure = _page(title)
+    hand = corners(scene, params, sizes)
+    palm = 1e3 * scene.hand.palm.radius, 1e3 * scene.hand.palm.thickness
+    for k, (words, angles) in enumerate(posture.TURNS.items()):
+        axes = figure.add_axes((0.05 + 0.225 * k, 0.68, 0.21, 0.22))
+        posture.draw(axes, hand, palm, angles, words)
+    keys = valves.key_poses(scene, params)
+    lowest = keys[np.argmin(keys[:, 3])]
+    angles = dict(zip(("roll", "pitch", "yaw"), lowest[4:], strict=True))
+    words = ", ".join(f"{name} {angles[name]:.1f}°" for name in ("roll", "yaw", "pitch"))
+    axes = figure.add_axes((0.05, 0.36, 0.36, 0.27))
+    posture.draw(axes, hand, palm, angles, f"this hand at its lowest key frame: {words}")
+    _seat(figure.add_axes((0.50, 0.36, 0.44, 0.27)), sizes[0], scene.hand.finger[0].tilt)
+    if scene.effects.wrist:
+        _wrist(figure.add_axes((0.08, 0.07, 0.84, 0.24)), scene, printed)
     return figure
 
 
@@ -81,36 +173,117 @@ def _rectangle(axes: Axes, low: tuple[float, float], size: Sequence[float], colo
     axes.add_patch(patch)
 
 
-def _section(axes: Axes, size: Size) -> None:
-    (width, height, wall), chamber = size.base, size.base.chamber
+def _section(axes: Axes, section: Section, label: str) -> None:
+    (width, height, wall), chamber = section, section.chamber
     _rectangle(axes, (-width / 2, 0), (width, height), "0.8")
     _rectangle(axes, (-chamber[0] / 2, wall), chamber, "white")
     axes.plot([-width / 2, width / 2], [0, 0], color="tab:red", lw=2)
     axes.text(0, -0.06 * height, f"{width:.1f}", ha="center", va="top", fontsize=6)
-    axes.text(-0.53 * width, height / 2, f"{height:.1f}", ha="right", fontsize=6)
-    axes.text(0, wall / 2, f"{wall:.1f}", ha="center", va="center", fontsize=6)
-    where = "" if size.base == size.tip else " at its base"
-    _finish(axes, f"section of finger 0{where} [mm]; red: fabric")
+    axes.text(-0.53 * width, height / 2, f"{height:.1f}", ha="right", va="center", fontsize=6)
+    axes.text(0, wall / 2, castable(wall), ha="center", va="center", fontsize=6)
+    _finish(axes, label)
     axes.set(xlim=(-0.85 * width, 0.85 * width), ylim=(-5, height + 2))
 
 
-def _side_view(axes: Axes, size: Size) -> None:
+def _side_view(axes: Axes, size: Size, label: str) -> None:
     start, end = size.chamber_ends
     first, last = size.at(start), size.at(end)
-    outer = [(0, 0), (size.length, 0), (size.length, size.tip.height), (0, size.base.height)]
+    root = size.at(-size.root).height
+    outer = [(-size.root, 0), (size.length, 0), (size.length, size.tip.height), (-size.root, root)]
     inner = [(start, first.wall), (end, last.wall)]
     inner += [(end, last.height - last.wall), (start, first.height - first.wall)]
     for outline, color in ((outer, "0.8"), (inner, "white")):
         axes.add_patch(
             matplotlib.patches.Polygon(outline, facecolor=color, edgecolor="0.3", lw=0.8)
         )
-    axes.plot([0, size.length], [0, 0], color="tab:red", lw=2)
+    axes.plot([-size.root, size.length], [0, 0], color="tab:red", lw=2)
+    axes.plot([0, 0], [0, size.base.height], color="black", lw=0.8, ls="--")
     axes.text(size.length / 2, -1.5, f"{size.length:.1f}", ha="center", va="top", fontsize=6)
+    if size.root:
+        axes.text(-size.root / 2, -1.5, f"{size.root:g}", ha="center", va="top", fontsize=6)
     chambers = dict.fromkeys("{:.1f} x {:.1f}".format(*s.chamber) for s in (first, last))
     text = f"chamber {end - start:.1f} x {' to '.join(chambers)}"
-    axes.text(size.length / 2, size.tip.height / 2, text, ha="center", va="center", fontsize=6)
-    _finish(axes, "along finger 0 [mm], base on the left")
-    axes.set(xlim=(-3, size.length + 3), ylim=(-8, size.base.height + 3))
+    above = max(size.base.height, size.tip.height) + 1.5
+    axes.text(size.length / 2, above, text, ha="center", va="bottom", fontsize=6)
+    _finish(axes, label)
+    axes.set(xlim=(-size.root - 3, max(size.length, 60) + 3), ylim=(-8, above + 8))
+
+
+def _seat(axes: Axes, size: Size, tilt: float) -> None:
+    """A cut through the middle of a seat, in the plane of the finger."""
+    cosine, sine = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
+
+    def put(points: Sequence[tuple[float, float]], **style: Any) -> None:
+        flat = [(x * cosine + z * sine, -x * sine + z * cosine) for x, z in points]
+        axes.add_patch(matplotlib.patches.Polygon(flat, **{"edgecolor": "0.2", "lw": 0.8} | style))
+
+    def box(x: tuple[float, float], z: tuple[float, float], **style: Any) -> None:
+        put([(x[0], z[0]), (x[1], z[0]), (x[1], z[1]), (x[0], z[1])], **style)
+
+    def note(x: float, z: float, text: str, to: tuple[float, float]) -> None:
+        at = (x * cosine + z * sine, -x * sine + z * cosine)
+        arrow = {"arrowstyle": "-", "lw": 0.5}
+        axes.annotate(text, at, to, fontsize=6, arrowprops=arrow, va="center")
+
+    root, height, rim = size.root, size.base.height, size.pressed
+    back = (-root - BACK, -root - FABRIC)
+    box((-root - BACK, 0), (-FLOOR - 6, 0), facecolor="0.85")
+    box(back, (0, rim), facecolor="0.85")
+    box((-root, 45), (0, height), facecolor="#cfdcec")
+    box((size.end, 46), (size.base.wall, height - size.base.wall), facecolor="white")
+    box((-root - BACK, 0), (rim, rim + BAR), facecolor="#e8c48c")
+    middle = sum(back) / 2
+    box((middle - 1.5, middle + 1.5), (rim - 11, rim + BAR), facecolor="0.5")
+    box((middle - 2.8, middle + 2.8), (rim + BAR, rim + BAR + 3), facecolor="0.5")
+    tube = (height / 2 - 1, height / 2 + 1)
+    box((-root - BACK - 12, size.end + 10), tube, facecolor="white", edgecolor="tab:blue")
+    flap = [(45, 0), (-root - 0.25, 0), (-root - 0.25, rim), (-root - BACK, rim)]
+    path = [(x * cosine + z * sine, -x * sine + z * cosine) for x, z in flap]
+    axes.plot(*np.transpose(path), color="tab:red", lw=1.6)
+    axes.axhline(0, color="0.4", lw=0.6, ls=":")
+    right = (height + BAR) * sine + 40 * cosine + 12
+    note(middle, rim + BAR + 3, "screw M3", (right, 32))
+    note(-3, rim + BAR, "clamp bar", (right, 22))
+    note(-root / 2, height * 0.75, "root", (right, 12))
+    note(5, height, "finger", (right, 2))
+    note(-root - 0.25, rim * 0.25, "flap of fabric", (-42, 30))
+    note(-root - BACK - 10, height / 2, "tube", (-42, 20))
+    note(-root - 4, -FLOOR - 3, "palm", (-42, 10))
+    axes.text(-42, 0, "underside, z = 0", fontsize=6, va="bottom")
+    _finish(axes, f"a seat, cut along finger 0 (tilt {tilt:g}°)")
+    axes.set(xlim=(-45, right + 22), ylim=(-50, 48))
+
+
+def _wrist(axes: Axes, scene: Scene, printed: Printed | None) -> None:
+    """The compliant wrist as stages above one another, seen from the side."""
+    wrist = scene.hand.wrist
+    k, turn, damping = wrist.linear_stiffness, wrist.angular_stiffness, wrist.linear_damping
+    stages = [f"guide along {axis}" for axis in "zyx"]
+    each = f"two springs {k / 2e3:.3g} N/mm against each other, dashpot {damping:g} N s/m"
+    _rectangle(axes, (20, 70), (60, 10), "0.7")
+    axes.text(50, 75, "flange of the arm", ha="center", va="center", fontsize=6)
+    for i, stage in enumerate(stages):
+        low = 54 - 16 * i
+        _rectangle(axes, (28, low), (44, 9), "0.88")
+        axes.text(50, low + 4.5, stage, ha="center", va="center", fontsize=6)
+        for side in (-1, 1):
+            x = 50 + side * np.linspace(22, 34, 40)
+            axes.plot(x, low + 4.5 + 2 * np.sin(np.linspace(0, 10 * np.pi, 40)), "0.3", lw=0.7)
+            axes.plot([50 + side * 34] * 2, [low, low + 9], color="black", lw=1.2)
+        axes.plot([50, 50], [low + 9, low + 16], color="0.5", lw=3)
+        axes.text(88, low + 4.5, each, va="center", fontsize=6)
+    words = f"four rubber buffers, together {turn:g} N m/rad about each axis"
+    if printed and printed.flange:
+        words += f", on the circle of {printed.flange[0]:g} mm"
+    for x in (36, 58):
+        _rectangle(axes, (x, 12), (6, 10), "0.4")
+    axes.text(88, 17, words, va="center", fontsize=6)
+    _rectangle(axes, (15, 2), (70, 10), "0.93")
+    axes.text(50, 7, "palm", ha="center", va="center", fontsize=6)
+    _finish(
+        axes, "the wrist of the simulation, built (not to scale; or an arm with impedance control)"
+    )
+    axes.set(xlim=(0, 175), ylim=(0, 84))
 
 
 def _palm(axes: Axes, scene: Scene, params: Params) -> None:
@@ -140,4 +313,4 @@ def _palm(axes: Axes, scene: Scene, params: Params) -> None:
 def _finish(axes: Axes, title: str) -> None:
     axes.set_aspect("equal")
     axes.axis("off")
-    axes.set_title(title, fontsize=6)
+    axes.set_title(title, fontsize=7, parse_math=False)

@@ -37,6 +37,7 @@ def grasp(scene: Scene, params: Params, trial: Trial) -> Grasp:
     wide = _wide(params), _wide(trial)
     start, controls = _float64(_start, scene, *wide), timed_controls(scene, params, trial)
     spec, shares = _spec(scene, *wide)
+    _light(spec)
     limits = verdict.bounds(scene)
     spec.add_numeric(name="hand_centre", data=model.layout(scene).centre_weights)
     spec.add_numeric(name="lost", data=[limits.lost_distance, limits.start, limits.end])
@@ -71,6 +72,29 @@ def _spec(scene: Scene, params: Params, trial: Trial) -> tuple[mujoco.MjSpec, Ma
     spec = model.build_spec(scene, params, trial, visual=True)
     skinned = scene.effects.surface == "hull"
     return spec, skin.add(scene, spec, params) if skinned else plain.NONE
+
+
+def _light(spec: mujoco.MjSpec) -> None:
+    """Light, sky and colours: any renderer shows the hand, none of it is physics."""
+    head = spec.visual.headlight
+    head.ambient, head.diffuse, head.specular = [0.3] * 3, [0.5] * 3, [0.1] * 3
+    sun = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    spec.worldbody.add_light(
+        name="sun", type=sun, pos=[0, -0.9, 1.2], dir=[0, 0.6, -0.8], diffuse=[0.5] * 3
+    )
+    sky, gradient = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
+    spec.add_texture(
+        name="sky",
+        type=sky,
+        builtin=gradient,
+        rgb1=[0.75, 0.85, 0.95],
+        rgb2=[0.95, 0.97, 1.0],
+        width=64,
+        height=384,
+    )
+    for geom in spec.worldbody.geoms:
+        if geom.name == "table":
+            geom.rgba = [0.8, 0.78, 0.75, 1]
 
 
 def timed_controls(scene: Scene, params: Params, trial: Trial) -> np.ndarray:

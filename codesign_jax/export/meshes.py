@@ -8,12 +8,15 @@ import numpy as np
 import trimesh
 
 from codesign_jax.export.casting import Parts, parts
+from codesign_jax.export.palm import Palm
 from codesign_jax.export.process import Process, Size
 
 FOLDER = "parts"
 FORMATS = ("stl", "3mf")
 # STL holds float32: seven digits of lengths up to a metre, of which a volume has three.
 _VOLUME, _LENGTH = 1e-4, 1e-3
+# Edges that may be shortened to nothing [mm], tried from the finest on; none is printed.
+_SHORTEST = (1e-4, 1e-3, 3e-3, 1e-2, 3e-2)
 
 
 class Part(NamedTuple):
@@ -21,7 +24,6 @@ class Part(NamedTuple):
 
     name: str  # name of its files without their ending
     fingers: tuple[int, ...]  # indices of the fingers that it is for
-    size: Size  # their dimensions
     volume: float  # volume of the solid, read back from its STL file [mm^3]
     extents: tuple[float, float, float]  # edges of its bounding box, likewise [mm]
 
@@ -36,14 +38,54 @@ def write(folder: Path, sizes: list[Size], process: Process) -> list[Part]:
             name = f"finger_{label}" + ("" if kind == "finger" else f"_{kind}")
             meshes = [_save(folder / f"{name}.{ending}", solid) for ending in FORMATS]
             extents = tuple(float(v) for v in meshes[0].extents)
-            found.append(Part(name, fingers, size, float(meshes[0].volume), extents))
+            found.append(Part(name, fingers, float(meshes[0].volume), extents))
     return found
+
+
+def write_palm(folder: Path, made: Palm) -> list[Part]:
+    """Writes the palm and its clamp bars, equal bars once, as they stand on a printer's bed.
+
+    Seats that stand in one another may leave a surface that no file can say as a closed one; such
+    a palm is left out.
+    """
+    solids = {("palm", tuple(range(len(made.bars)))): made.body}
+    alike: dict[tuple, list[int]] = {}
+    for i, bar in enumerate(made.bars):
+        low, high = np.reshape(bar.bounding_box(), (2, 3))
+        key = *np.round(high - low, 3).tolist(), round(bar.volume(), 2)
+        alike.setdefault(key, []).append(i)
+    solids |= {("bar", tuple(fingers)): made.bars[fingers[0]] for fingers in alike.values()}
+    found = []
+    for (kind, fingers), solid in solids.items():
+        name = kind if kind == "palm" else f"{kind}_{'_'.join(map(str, fingers))}"
+        stands = _in_float32(_stands(solid))
+        if stands is None:
+            continue
+        meshes = [_save(folder / f"{name}.{ending}", stands) for ending in FORMATS]
+        extents = tuple(float(v) for v in meshes[0].extents)
+        found.append(Part(name, fingers, float(meshes[0].volume), extents))
+    return found
+
+
+def _in_float32(solid: manifold3d.Manifold) -> manifold3d.Manifold | None:
+    """The solid without edges of which STL's float32 makes a point; None if that opens it."""
+    for shortest in _SHORTEST:
+        found = solid.simplify(shortest)
+        surface = mesh(found)
+        vertices = surface.vertices.astype(np.float32)
+        if trimesh.Trimesh(vertices, surface.faces, process=True).is_watertight:
+            return found
+    return None
+
+
+def _stands(solid: manifold3d.Manifold) -> manifold3d.Manifold:
+    return solid.translate([0, 0, -solid.bounding_box()[2]])
 
 
 def standing(found: Parts) -> Parts:
     """Parts as they stand on z = 0 with their openings up."""
     turned = found._replace(tray=found.tray.rotate([180, 0, 0]))
-    return Parts(*(s.translate([0, 0, -s.bounding_box()[2]]) for s in turned))
+    return Parts(*map(_stands, turned))
 
 
 def mesh(solid: manifold3d.Manifold) -> trimesh.Trimesh:

@@ -17,6 +17,9 @@ class Process:
     # Thickness of the walls that close the chamber at base and tip [mm]; 0: that of the finger's
     # other walls
     end_wall: float = quantity("mm", 0, 100, default=0.0)
+    # Solid end behind the base, which the palm's seat holds [mm]; all of the finger's length is
+    # in front of the seat
+    root: float = quantity("mm", 5, 50, default=10.0)
     # Diameter of the hole for the air tube through the base's end wall [mm]; 0: none, pierced after
     # casting
     inlet: float = quantity("mm", 0, 20, default=2.0)
@@ -27,6 +30,14 @@ class Process:
     # Slope of the tray's and the core's side faces [deg].  Both widen towards the opening, by
     # nothing at half of the shell's height, so that the finger's walls keep their thickness
     draft: float = quantity("deg", 0, 10, default=0.0)
+
+
+CHEEK, BACK, FLOOR, BAR = 3.0, 9.0, 4.0, 5.0
+"""Walls of a seat beside, behind and below a root, and thickness of its clamp bar [mm] [ours]."""
+SQUEEZE = 0.05
+"""Share of its height by which the bar presses a root [ours]."""
+FABRIC = 0.5
+"""Room for the fabric behind a root [mm] [ours]."""
 
 
 class Section(NamedTuple):
@@ -49,6 +60,7 @@ class Size(NamedTuple):
     base: Section  # its section at the base
     tip: Section  # its section at the tip, the same unless the finger is tapered
     end: float  # thickness of the walls at base and tip
+    root: float = 0.0  # solid end behind the base, in the palm
 
     def at(self, place: float) -> Section:
         """The section at a place along the finger [mm]."""
@@ -56,9 +68,19 @@ class Size(NamedTuple):
         return Section(*(a + (b - a) * share for a, b in zip(self.base, self.tip, strict=True)))
 
     @property
+    def ends(self) -> tuple[float, float]:
+        """Where the finger begins and ends with its root [mm]."""
+        return -self.root, self.length
+
+    @property
     def chamber_ends(self) -> tuple[float, float]:
         """Where the chamber begins and ends [mm]."""
         return self.end, self.length - self.end
+
+    @property
+    def pressed(self) -> float:
+        """Height of the seat's rim above the fabric, to which the bar presses the root [mm]."""
+        return (1 - SQUEEZE) * min(self.base.height, self.at(-self.root).height)
 
     @property
     def chamber_volume(self) -> float:
@@ -68,8 +90,8 @@ class Size(NamedTuple):
 
     @property
     def volume(self) -> float:
-        """Volume of the silicone, with no inlet [mm^3]."""
-        whole = _simpson(lambda x: self.at(x).width * self.at(x).height, 0.0, self.length)
+        """Volume of the silicone with the root, with no inlet [mm^3]."""
+        whole = _simpson(lambda x: self.at(x).width * self.at(x).height, -self.root, self.length)
         return whole - self.chamber_volume
 
 
@@ -87,7 +109,7 @@ def sizes(hand: Hand, params: Params, process: Process) -> list[Size]:
         # A design is in float32, which knows no more than a tenth of a micrometre.
         length, *both = (round(1e3 * float(v), 4) for v in (length, *base, *tip))
         ends = Section(*both[:3]), Section(*both[3:])
-        size = Size(length, *ends, process.end_wall or ends[0].wall)
+        size = Size(length, *ends, process.end_wall or ends[0].wall, process.root)
         found.append(size)
         if size.length - 2 * size.end < 1.0:
             problems.append(

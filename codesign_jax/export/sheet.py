@@ -8,14 +8,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from codesign_jax import terminal
-from codesign_jax.export.process import Process, Size, inlet
+from codesign_jax.export import pose, valves
+from codesign_jax.export.process import Size
 from codesign_jax.export.tolerance import NEAREST, WANTED, Side, Tolerance
 from codesign_jax.model import morphology
 from codesign_jax.model.layout import mounts
 from codesign_jax.report import stress
 from codesign_jax.report.statistics import Interval
 from codesign_jax.report.stress import Stress
-from codesign_jax.scene import Scene, key_frames
+from codesign_jax.scene import Scene
 from codesign_jax.types import Params
 
 NAME = "build_sheet"
@@ -52,23 +53,53 @@ def sheet_sections(
     tested: Tested = (None, None),
 ) -> list[SheetSection]:
     """The sheet's content."""
-    found = [
-        _tests(scene, params, *tested),
+    return [
+        _tests(scene, params, sizes, *tested),
         _fingers(scene, params, sizes),
         _mounts(scene, params),
-        _material(scene),
+        _arm(scene, params),
+        _valves(scene, params),
+        tolerance_section(drift),
     ]
-    found.append(_control(scene, params))
-    return [*found, tolerance_section(drift)]
 
 
-def _tests(scene: Scene, params: Params, verdict: str | None, found: Stress | None) -> SheetSection:
+def _tests(
+    scene: Scene,
+    params: Params,
+    sizes: Sequence[Size],
+    verdict: str | None,
+    found: Stress | None,
+) -> SheetSection:
     title = f"Verdict: {verdict or 'not judged at accuracy reference'}"
     warnings = stress.of_design(scene, params) + [*(found.warnings if found else ())]
+    warnings += idle_fingers(scene, params, sizes)
     notes = [f"Warning: {words}." for words in warnings]
     if not found:
         return SheetSection(title, (), [], notes)
     return SheetSection(title, found.head, found.rows, notes)
+
+
+IDLE = 10.0
+"""Travel of a tip under the design's pressure below which a finger does next to nothing [mm]."""
+_FURTHEST = 2.331
+"""Bend at which the tip of a finger of constant curvature is furthest to the side [rad]."""
+
+
+def idle_fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> list[str]:
+    """Fingers that do next to nothing, a sentence each."""
+    found = []
+    bends = morphology.free_bends(scene.hand, params)
+    for i, (size, bend) in enumerate(zip(sizes, bends, strict=True)):
+        angle = float(bend)
+        reached = min(abs(angle), _FURTHEST)
+        travel = size.length * (1 - np.cos(reached)) / reached if reached else 0.0
+        if travel < IDLE:
+            found.append(
+                f"finger {i} does next to nothing: {size.length:.0f} mm long, it bends by "
+                f"{np.degrees(angle):.0f}° and moves its tip by {travel:.1f} mm; its moulds and "
+                "its valve may not be worth making"
+            )
+    return found
 
 
 def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSection:
@@ -87,7 +118,7 @@ def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSectio
                 str(i),
                 f"{size.length:.1f}",
                 *(" to ".join(f"{s[k]:.1f}" for s in ends) for k in range(2)),
-                " to ".join(_castable(s.wall) for s in ends),
+                " to ".join(castable(s.wall) for s in ends),
                 f"{end - start:.1f} x {' to '.join(dict.fromkeys(chambers))}",
                 f"{size.volume / 1e3:.1f}",
                 f"{1e-6 * size.volume * density:.1f}",
@@ -99,63 +130,13 @@ def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSectio
     head += ("silicone cm³", "mass g", "pressure kPa (limit)", "free bend °")
     ends = "as thick as the others"
     if any(size.end != size.base.wall for size in sizes):
-        ends = f"{', '.join(dict.fromkeys(_castable(size.end) for size in sizes))} mm"
+        ends = f"{', '.join(dict.fromkeys(castable(size.end) for size in sizes))} mm"
     notes = [
-        f"Walls to 0.05 mm; at base and tip: {ends}. Free bend: predicted by beam theory for a "
-        "straight finger at its pressure, without load; measure it first."
+        f"Walls to 0.05 mm; at base and tip: {ends}. Lengths are those in front of the palm; "
+        "silicone and mass include the root behind it, which the palm holds. Free bend: predicted "
+        "by beam theory for a straight finger at its pressure, without load; measure it first."
     ]
     return SheetSection("Fingers", head, rows, notes)
-
-
-FLAP, PITCH = 15.0, 2.0
-"""Fabric that reaches over the base to hold the finger, and a turn of thread, in mm [ours]."""
-
-
-def assembly_sections(
-    scene: Scene, params: Params, sizes: Sequence[Size], process: Process
-) -> list[SheetSection]:
-    """What the hand is made of, and in what order; arguments as of `sheet_sections`."""
-    palm, material, count = scene.hand.palm, scene.hand.material, len(sizes)
-    volume = sum(size.volume for size in sizes) / 1e3
-    strips = (f"{z.length + FLAP:.0f} x {max(z.base.width, z.tip.width):.0f}" for z in sizes)
-    middle = [(size, size.at(size.length / 2)) for size in sizes]
-    thread = sum(z.length / PITCH * 2 * (m.width + m.height) for z, m in middle) / 1e3
-    tubes = [d for size in sizes if (d := inlet(size, process))]
-    highest = float(np.max(np.asarray(params.pressure))) / 1e3
-    tilts = dict.fromkeys(f"{90 - finger.tilt:g}°" for finger in scene.hand.finger)
-    disc = f"disc of radius {1e3 * palm.radius:.0f} mm, {1e3 * palm.thickness:.0f} mm thick"
-    shear = f"shear modulus {material.shear_modulus / 1e3:g} kPa"
-    rows = [
-        ("palm", "1", f"{disc}; {1e3 * palm.mass:.0f} g with all that it bears but the fingers"),
-        ("seats", str(count), f"cut back into the palm's underside by {', '.join(tilts)}, see 6"),
-        ("silicone", f"{1e-3 * volume * material.density:.0f} g", f"{volume:.0f} cm³, {shear}"),
-        ("fabric", str(count), f"inextensible, {', '.join(strips)} mm"),
-        ("thread", f"{thread:.1f} m", f"around the fingers, a turn every {PITCH:g} mm [ours]"),
-        ("tubes", str(len(tubes)), ", ".join(dict.fromkeys(f"{d:g} mm" for d in tubes)) or "–"),
-        ("valves", str(count), f"a channel for each finger, up to {highest:.0f} kPa"),
-        ("moulds", str(3 * len(set(sizes))), "tray, core and base of each finger: parts/"),
-    ]
-    steps = (
-        "Print the moulds.",
-        "Cast each shell: core on the tray, pour between the bars up to the rim, cure.",
-        "Close it: fabric on the floor of the base mould, its flap out over the base end, pour to "
-        "the step, set the shell in before it cures.",
-        "Wind the thread around the finger and hold its ends with a drop of silicone.",
-        "Set the tube into the base and seal it. Raise the pressure slowly to the design's, and "
-        "compare the bend with the table of fingers: a stiffer silicone bends less.",
-        "Fix each finger: its base is square to its axis and would stand in the palm. So cut the "
-        "palm's underside back, from the line at the base point outwards, until the base lies "
-        "flat in this seat; glue it there, and clamp the flap of fabric, which runs inwards on "
-        "the underside, under a bar. The simulation has rigid bases and no seats [ours].",
-        "Fix the palm to the wrist's springs and these to the arm; find z = 0, where the palm's "
-        "underside lies on the table.",
-        "Play commands.csv, first without an object and without pressure.",
-    )
-    notes = [f"{k}. {step}" for k, step in enumerate(steps, 1)]
-    return [
-        SheetSection("Parts", ("part", "number", "what"), rows, []),
-        SheetSection("Order of work", (), [], notes),
-    ]
 
 
 def corners(scene: Scene, params: Params, sizes: Sequence[Size]) -> np.ndarray:
@@ -176,7 +157,8 @@ def corners(scene: Scene, params: Params, sizes: Sequence[Size]) -> np.ndarray:
     return np.array(found)
 
 
-def _castable(thickness: float) -> str:
+def castable(thickness: float) -> str:
+    """A thickness [mm] to the twentieth of a millimetre that a mould gives."""
     return f"{round(20 * thickness) / 20:.2f}"
 
 
@@ -201,45 +183,48 @@ def _mounts(scene: Scene, params: Params) -> SheetSection:
         "palm's centre. A finger leaves in the direction of the azimuth (anticlockwise from x, "
         "seen from above), tilted below the horizontal; its inextensible layer faces inwards.",
         f"Palm: radius {1e3 * palm.radius:.0f} mm, thickness {1e3 * palm.thickness:.0f} mm, mass "
-        f"{palm.mass:g} kg. Spread {np.degrees(float(params.spread)):.1f}°.",
+        f"{palm.mass:g} kg. Spread {np.degrees(float(params.spread)):.1f}°; the palm to print has "
+        "these seats.",
     ]
     head = ("finger", "base x mm", "base y mm", "azimuth °", "tilt °")
     return SheetSection("Mounts", head, rows, notes)
 
 
-def _material(scene: Scene) -> SheetSection:
-    material, wrist = scene.hand.material, scene.hand.wrist
-    notes = [
-        f"Silicone: shear modulus {material.shear_modulus / 1e3:g} kPa, density "
-        f"{material.density:g} kg/m³, damping time {1e3 * material.damping_time:g} ms. Bottom "
-        "layer: inextensible fabric. Around the finger: thread hoops, which keep the section.",
-    ]
-    if scene.effects.wrist:
-        notes.append(
-            f"Wrist: {wrist.linear_stiffness:g} N/m and {wrist.angular_stiffness:g} N m/rad, "
-            f"damping {wrist.linear_damping:g} N s/m and {wrist.angular_damping:g} N m s/rad."
-        )
-    return SheetSection("Material and wrist", (), [], notes)
-
-
-def _control(scene: Scene, params: Params) -> SheetSection:
-    times, poses = (np.asarray(f(scene, params)) for f in (key_frames.times, key_frames.poses))
-    terms = key_frames.pressures(scene, params)
-    pressures = sum(np.asarray(v) * np.asarray(f) for v, f in terms) + np.zeros((len(times), 1))
+def _arm(scene: Scene, params: Params) -> SheetSection:
     rows = []
-    for time, pose, row in zip(times, poses, 1e-3 * pressures, strict=True):
-        same = [f"{row[0]:.1f}"] if np.ptp(row) == 0 else [f"{p:.1f}" for p in row]
-        place = [f"{v:.1f}" for v in (*(1e3 * pose[:3]), *np.degrees(pose[3:]))]
-        rows.append((f"{time:g}", *place, " ".join(same)))
-    head = ("time s", "x mm", "y mm", "z mm", "roll °", "pitch °", "yaw °", "pressure kPa")
+    for time, x, y, z, roll, pitch, yaw in valves.key_poses(scene, params):
+        angles = {"roll": roll, "yaw": yaw, "pitch": pitch}
+        turn = pose.quaternion(**angles)
+        cells = [f"{v + 0.0:.1f}" for v in (x, y, z, *(angles[a] for a in pose.ANGLES))]
+        rows.append((f"{time:g}", *cells, " ".join(f"{v + 0.0:.4f}" for v in turn)))
+    head = ("time s", "x mm", "y mm", "z mm", *(f"{name} °" for name in pose.ANGLES))
     held = [i for i, f in enumerate(scene.control.frame) if f.interpolation == "held"]
     notes = [
-        f"Key frames of the control {scene.control.name!r}: arm frame, z above the table, and "
-        "pressures of the fingers; between them linear"
+        f"Key frames of the control {scene.control.name!r}: pose of the arm frame, which is the "
+        "middle of the palm's underside while the wrist is not deflected; between them linear"
         + (f", but held after row {', '.join(str(i + 1) for i in held)}" if held else "")
-        + ". Every time step, with the shaking: commands.csv."
+        + ". Every time step, with the shaking that tests the grasp: commands.csv, of the same "
+        "angles, signs and quaternion.",
+        f"{pose.CONVENTION} The drawing on the last page of {NAME}.pdf shows each angle.",
     ]
-    return SheetSection("Grasp", head, rows, notes)
+    return SheetSection("Arm", (*head, "quaternion w x y z"), rows, notes)
+
+
+def _valves(scene: Scene, params: Params) -> SheetSection:
+    rows = [
+        (f"{time:g}", *(f"{p:.1f}" for p in pressures))
+        for time, *pressures in valves.key_pressures(scene, params)
+    ]
+    head = ("time s", *(f"finger {i} kPa" for i in range(scene.num_fingers)))
+    notes = [
+        f"Gauge pressures, linear between rows; the same table: {valves.VALVES}. "
+        f"`python {valves.PLAYER.name} --port PORT` sends it to regulators over a serial line, a "
+        "line for each 50 ms: the time in s and a pressure in kPa for each finger, with commas "
+        "between. Without --port it writes to standard output; --help has the rest. Where "
+        "`codesign finger MEASURED.csv --fit` gave a moment of less than the model's, add "
+        "`--divide` with that number: the real finger needs more pressure.",
+    ]
+    return SheetSection("Valves", head, rows, notes)
 
 
 def tolerance_section(drift: Drift | None) -> SheetSection:
@@ -291,7 +276,7 @@ def _percent(share: Interval) -> str:
 
 def markdown(title: str, lines: Sequence[str], content: Sequence[SheetSection]) -> str:
     """The sheet as Markdown."""
-    text = [f"# {title}", "", *(f"{line}  " for line in lines)]
+    text = [f"# {' '.join(title.split())}", "", *(f"{line}  " for line in lines)]
     for section in content:
         text += ["", f"## {section.title}"]
         if section.rows:
@@ -308,7 +293,9 @@ def _plain(text: str) -> str:
 
 
 def _row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+    # Names are free text: a bar would begin a cell, a line feed a row.
+    plain = [" ".join(cell.split()).replace("|", "\\|") for cell in cells]
+    return "| " + " | ".join(plain) + " |"
 
 
 def write(folder: Path, title: str, lines: Sequence[str], content: Sequence[SheetSection]) -> Path:

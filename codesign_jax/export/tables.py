@@ -2,13 +2,14 @@
 
 import csv
 import re
+import unicodedata
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from codesign_jax.export import plain
+from codesign_jax.export import plain, pose
 from codesign_jax.export.grasps import PLAYER, Grasp
 from codesign_jax.model.layout import WRIST
 from codesign_jax.scene import Scene
@@ -23,8 +24,13 @@ COMMAND_COLUMNS = {
     "arm_y_mm": "likewise",
     "arm_z_mm": "height of the palm's underside above the table, if the wrist is not deflected",
     "arm_roll_deg": "orientation of X_D: turned about x by this angle, ...",
-    "arm_yaw_deg": "... then about the turned z, ...",
-    "arm_pitch_deg": "... then about the turned y; Table I's arm_pitch has the other sign",
+    "arm_yaw_deg": "... then about its own z, ...",
+    "arm_pitch_deg": "... then about its own y; positive points the fingers towards +x, as in "
+    "designs, control files and the build sheet, which is a left-handed turn",
+    "arm_qw": "the same orientation as a unit quaternion w, x, y, z, for arms that take one",
+    "arm_qx": "likewise",
+    "arm_qy": "likewise",
+    "arm_qz": "likewise",
     "pressure_0_kPa": "gauge pressure in the chamber of finger 0; a column for each finger",
 }
 """Meaning of the columns of commands.csv, a row for each time step."""
@@ -38,7 +44,7 @@ GRASP_COLUMNS = {
     "object_roll_deg": "its turn about x, before the others",
     "object_pitch_deg": "its turn about y, before that about the vertical",
     "arm_roll_tilt_deg": "noise of the arm's roll, part of the controls",
-    "arm_pitch_tilt_deg": "noise of the arm's pitch",
+    "arm_pitch_tilt_deg": "noise of the arm's pitch, of its sign in commands.csv",
     "object_mass_factor": "factor on the object's mass",
     "object_size_factor": "factor on its size",
     "friction_factor": "factor on the friction of all contacts",
@@ -51,23 +57,29 @@ GRASP_COLUMNS = {
 
 
 def control_columns(scene: Scene) -> list[str]:
-    """Names of the columns of a grasp's controls, in SI units and the order of the actuators."""
-    arm = [f"arm_{name}_{'m' if len(name) == 1 else 'rad'}" for name in WRIST]
+    """Names of the columns of a grasp's controls, in SI units and the order of the actuators.
+
+    The hinge of the pitch turns against `arm_pitch`, which its name says.
+    """
+    signs = {"pitch": "minus_"}
+    arm = [f"{signs.get(name, '')}arm_{name}_{'m' if len(name) == 1 else 'rad'}" for name in WRIST]
     return ["time_s", *arm, *(f"pressure_{i}_Pa" for i in range(scene.num_fingers))]
 
 
 def write_commands(folder: Path, scene: Scene, schedule: np.ndarray) -> Path:
-    """Writes commands.csv in mm, degrees and kPa."""
-    factors = [1e3] * 3 + [180 / np.pi] * 3 + [1e-3] * scene.num_fingers
+    """Writes commands.csv in mm, degrees and kPa; `schedule` as of `grasps.timed_controls`."""
+    arm = pose.of_controls(schedule[:, 1:])
+    pressures = 1e-3 * schedule[:, 1 + len(WRIST) :]
+    values = np.column_stack([arm, pose.quaternion(*arm[:, 3:].T), pressures])
     names, ends = zip(*scene.phase_ends.items(), strict=True)
     rows = []
-    for time, *controls in schedule:
+    for time, row in zip(schedule[:, 0], values, strict=True):
         # A step belongs to the phase in which it begins; 1e-9 s is rounding of k h.
         phase = names[min(int(np.searchsorted(ends, time + 1e-9, "right")), len(names) - 1)]
-        values = np.multiply(controls, factors)
-        rows.append([f"{time:.9g}", phase, *(f"{v:.7g}" for v in values)])  # float32 has 7
+        # float32 has 7 digits; + 0.0 writes -0 as 0.
+        rows.append([f"{time:.9g}", phase, *(f"{v + 0.0:.7g}" for v in row)])
     head = [*COMMAND_COLUMNS][:-1] + [f"pressure_{i}_kPa" for i in range(scene.num_fingers)]
-    return _write(folder / COMMANDS, head, rows)
+    return write_table(folder / COMMANDS, head, rows)
 
 
 def write_grasps(
@@ -84,12 +96,12 @@ def write_grasps(
         mujoco.mj_saveModel(grasp.binary, str(folder / f"{name}.mjb"))
         # repr names a float64 exactly: the player's controls are these.
         exact = ([repr(float(v)) for v in row] for row in grasp.controls)
-        _write(folder / f"{name}_controls.csv", control_columns(scene), exact)
+        write_table(folder / f"{name}_controls.csv", control_columns(scene), exact)
         rows.append(_row(name, scene, trial, grasp))
         yield f"{name}: {_verdict(grasp)}"
         if grasp.note:
             yield f"{name}: no MJCF: {grasp.note}"
-    _write(folder / GRASPS, [*GRASP_COLUMNS], rows)
+    write_table(folder / GRASPS, [*GRASP_COLUMNS], rows)
     (folder / PLAYER.name).write_text(PLAYER.read_text(encoding="utf-8"), encoding="utf-8")
 
 
@@ -97,7 +109,8 @@ def _row(name: str, scene: Scene, trial: Trial, grasp: Grasp) -> list[str]:
     factors = [trial.mass, trial.size, trial.friction, trial.stiffness, trial.hand_mass]
     numbers = [*np.multiply(1e3, trial.position)]
     tilt = np.zeros(2) if trial.tilt is None else trial.tilt
-    numbers += [*np.degrees([trial.yaw, *tilt, *trial.arm_tilt])]
+    roll, hinge = trial.arm_tilt  # the model's hinge of the pitch turns against the design's
+    numbers += [*np.degrees([trial.yaw, *tilt, roll, -hinge])]
     numbers += [1.0 if v is None else v for v in factors] + [grasp.outcome.lost_time]
     status = str(Status(int(grasp.outcome.status)).name)
     shape = scene.objects.object[int(trial.shape)].name
@@ -112,14 +125,27 @@ def _verdict(grasp: Grasp) -> str:
     return "kept" if np.isinf(lost) else f"lost at {lost:.2f} s"
 
 
+LONGEST = 80
+"""Most bytes of an object's name in the names of files, of which systems take 255."""
+
+
 def names_of(objects: Sequence[str]) -> list[str]:
-    """Names of files for names of objects, which are free text."""
-    plain = [re.sub(r"\W+", "_", name).strip("_") or "object" for name in objects]
-    unique = len(set(plain)) == len(plain)
+    """Names of files for names of objects, which are free text: no two that a disk takes for one.
+
+    Long names are cut.  Where names meet, also on a disk that ignores case, all get their number.
+    """
+    plain = [_cut(re.sub(r"\W+", "_", unicodedata.normalize("NFKC", name))) for name in objects]
+    # A name such as trial_007 belongs to the grasps with noise.
+    plain = [re.sub(r"^(trial_\d)", r"object_\1", name) for name in plain]
+    unique = len({name.casefold() for name in plain}) == len(plain)
     return plain if unique else [f"{name}_{i}" for i, name in enumerate(plain)]
 
 
-def _write(path: Path, head: Sequence[str], rows: Iterable[Sequence[str]]) -> Path:
+def _cut(name: str) -> str:
+    return name.encode()[:LONGEST].decode(errors="ignore").strip("_") or "object"
+
+
+def write_table(path: Path, head: Sequence[str], rows: Iterable[Sequence[str]]) -> Path:
     with path.open("w", encoding="utf-8", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([head, *rows])
     return path

@@ -1,0 +1,327 @@
+"""What a workshop needs beside the dimensions: what to buy, to print and to do, and the wrist."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from codesign_jax.export import silicone
+from codesign_jax.export.process import BACK, Process, Size, inlet
+from codesign_jax.export.sheet import NAME, SheetSection
+from codesign_jax.scene import Scene
+from codesign_jax.types import Params
+
+PITCH = 2.0
+"""A turn of the thread along a finger [mm] [ours]."""
+LOSS = 0.15
+"""Silicone that stays in cups and on moulds, as a share of what is cast [ours]."""
+TUBE = 1.0
+"""Tube for each finger [m] [ours]."""
+BARS = "M3 x 16"
+"""Screws of the clamp bars, which cut their thread into the palm."""
+PLASTIC = 1.24e-3
+"""Density of printed PLA [g/mm^3]."""
+
+
+class Printed(NamedTuple):
+    """What was made of the parts; see `meshes` and `palm`."""
+
+    names: Sequence[str]  # names of the parts' files without their ending
+    palm_volume: float  # volume of the palm with its bars [mm^3]
+    flange: tuple[float, str, float, bool] | None  # screws to the wrist, as `palm.Flange`
+    below: float  # how far seats stand below the palm's underside [mm]
+    problems: Sequence[str] = ()  # what of the palm cannot be built, a sentence each
+
+
+def assembly_sections(
+    scene: Scene,
+    params: Params,
+    sizes: Sequence[Size],
+    process: Process,
+    printed: Printed | None = None,
+) -> list[SheetSection]:
+    """What the hand is made of, and in what order; arguments as of `sheet.sheet_sections`.
+
+    Args:
+      printed: The parts; None where they were left out.
+    """
+    return [
+        _shopping(scene, params, sizes, process, printed),
+        _castings(scene, sizes),
+        _prints(scene, sizes, printed),
+        _wrist(scene, sizes, printed),
+        _order(scene, params, sizes, process, printed),
+    ]
+
+
+def bottom(size: Size) -> float:
+    """Volume of a finger's bottom wall, which is cast by itself [mm^3]."""
+    start, end = size.ends
+    middle = (start + end) / 2
+    areas = [s.width * s.wall for s in map(size.at, (start, middle, end))]
+    return (end - start) * (areas[0] + 4 * areas[1] + areas[2]) / 6
+
+
+def fabric(size: Size) -> tuple[float, float]:
+    """Length and width of a finger's strip of fabric with the flap under the clamp bar [mm]."""
+    behind = size.at(-size.root).height + BACK
+    return size.length + size.root + behind, max(size.base.width, size.tip.width)
+
+
+def hand_mass(scene: Scene, sizes: Sequence[Size]) -> float:
+    """Mass of the palm with what it bears, and of the fingers in front of it [kg]."""
+    inside = sum(size.root * size.base.width * size.base.height for size in sizes)
+    cast = sum(size.volume for size in sizes) - inside
+    return scene.hand.palm.mass + 1e-9 * cast * scene.hand.material.density
+
+
+def _shopping(
+    scene: Scene,
+    params: Params,
+    sizes: Sequence[Size],
+    process: Process,
+    printed: Printed | None,
+) -> SheetSection:
+    count, material = len(sizes), scene.hand.material
+    volume = sum(size.volume for size in sizes) / 1e3
+    middle = [(size, size.at(size.length / 2)) for size in sizes]
+    thread = sum(z.length / PITCH * 2 * (m.width + m.height) for z, m in middle) / 1e3
+    tubes = [inlet(size, process) for size in sizes]
+    widths = ", ".join(f"{d:g} mm" for d in dict.fromkeys(d or 2.0 for d in tubes))
+    strips = ", ".join("{:.0f} x {:.0f}".format(*fabric(size)) for size in sizes)
+    highest = float(np.max(np.asarray(params.pressure))) / 1e3
+    pins = sum(d > 0 for d in tubes)
+    with_loss = (1 + LOSS) * volume
+    grams = f"{1e-3 * with_loss * material.density:.0f} g"
+    rows = [
+        ("silicone", grams, f"{volume:.0f} cm³ cast + {100 * LOSS:.0f} % loss; {_silicone(scene)}"),
+        (
+            "fabric",
+            str(count),
+            f"{strips} mm; does not stretch, open weave (polyester mesh, glass)",
+        ),
+        ("thread", f"{thread:.1f} m", f"polyester sewing thread; a turn every {PITCH:g} mm [ours]"),
+        ("tube", f"{TUBE * count:g} m", f"polyurethane, outer diameter {widths} (--inlet)"),
+        ("push-in fittings", str(count), f"for tube of {widths}, with the regulators' thread"),
+        ("pressure regulators", str(count), _regulator(highest)),
+        ("compressed air", "1", f"dry, oil-free, at least {highest + 100:.0f} kPa gauge [ours]"),
+        (
+            "silicone adhesive",
+            "1 tube",
+            "seals tubes and closes leaks; the silicone itself does too",
+        ),
+        (
+            "screws of the bars",
+            str(2 * count),
+            f"{BARS}, socket head; cut their thread in the palm",
+        ),
+        *_flange_screws(scene, printed),
+        ("steel pins", str(pins), f"of {widths}, 60 mm long (drill shanks): keep the inlets free"),
+        (
+            "filament",
+            "–",
+            "PLA or PETG. No resin print: its residues stop platinum silicones curing",
+        ),
+    ]
+    return SheetSection("What to buy", ("what", "how much", "which"), rows, [])
+
+
+def _silicone(scene: Scene) -> str:
+    material = scene.hand.material
+    law = "neo-Hookean" if scene.effects.neo_hookean else "linear"
+    needed = f"G = {material.shear_modulus / 1e3:g} kPa under the {law} law of bending"
+    named = silicone.of_material(material)
+    if named:
+        return f"{named}; {needed}"
+    return (
+        f"platinum-cured, {needed}. The hand's file names none; nearest by docs/measurements.md "
+        f"is {silicone.nearest(material)}. Measure the first finger (codesign finger FILE --fit)"
+    )
+
+
+def _regulator(highest: float) -> str:
+    top = next((v for v in (100, 500, 900) if v >= highest), None)
+    model = {100: "SMC ITV0010", 500: "SMC ITV0030", 900: "SMC ITV0050"}.get(top or 0)
+    text = f"proportional, electronic, a channel for each finger, up to {highest:.0f} kPa"
+    return f"{text}, which vents as well; such as {model} (0 to {top} kPa)" if model else text
+
+
+def _flange_screws(scene: Scene, printed: Printed | None) -> list[tuple[str, str, str]]:
+    if not printed or not printed.flange:
+        return []
+    diameter, thread, angle, sunk = printed.flange
+    length = 5 * math.ceil((1e3 * scene.hand.palm.thickness * (0.7 if sunk else 1) + 10) / 5)
+    circle = f"circle of {diameter:g} mm, the first {angle:g}° from x"
+    if diameter == 31.5:
+        circle += ": the flange 31.5-4-M5 of ISO 9409-1"
+    return [("screws to the wrist", "4", f"{thread} x {length}, socket head, from below; {circle}")]
+
+
+def _castings(scene: Scene, sizes: Sequence[Size]) -> SheetSection:
+    grams = 1e-6 * scene.hand.material.density * (1 + LOSS)
+    named = silicone.of_material(scene.hand.material) or silicone.nearest(scene.hand.material)
+    a, b = named.mix
+    rows = []
+    for i, size in enumerate(sizes):
+        shell, base = grams * (size.volume - bottom(size)), grams * bottom(size)
+        cells = [f"{v:.0f} ({v * a / (a + b):.1f} + {v * b / (a + b):.1f})" for v in (shell, base)]
+        rows.append((str(i), *cells))
+    head = ("finger", "shell g (A + B)", "bottom wall g (A + B)")
+    notes = [
+        f"With {100 * LOSS:.0f} % loss, for {named.name}: mix only what is poured within "
+        f"{named.pot_life:g} min. Mix, pot life and cure: {silicone.SOURCE}.",
+    ]
+    return SheetSection("Silicone by casting", head, rows, notes)
+
+
+def _prints(scene: Scene, sizes: Sequence[Size], printed: Printed | None) -> SheetSection:
+    if printed is None:
+        note = "Left out (--no-parts): neither moulds nor palm."
+        return SheetSection("What to print", (), [], [note])
+    rows = []
+    uses = {"tray": "mould of the shell", "core": "its core", "base": "mould of the bottom wall"}
+    for name in printed.names:
+        kind, _, label = name.partition("_")
+        fingers = [part for part in label.split("_") if part.isdigit()]
+        which = ", ".join(fingers)
+        if kind == "palm":
+            rows.append((name, "1", "the palm; underside down, no supports inside the seats"))
+        elif kind == "bar":
+            rows.append((name, str(len(fingers)), f"clamp bar of finger {which}; lies flat"))
+        elif (what := label.rpartition("_")[2]) in uses:
+            rows.append((name, "1", f"{uses[what]}, finger {which}: cast {len(fingers)}"))
+        else:
+            rows.append((name, "0", f"finger {which} as it is to be: to compare, not to print"))
+    mass, wanted = PLASTIC * printed.palm_volume, 1e3 * scene.hand.palm.mass
+    notes = [
+        "Files in parts/, STL and 3MF, in mm, as they stand on the printer's bed: layers of 0.15 "
+        "mm, 4 perimeters; palm and bars with 50 % infill or more, moulds with 15 %. Sand the "
+        "trays' inside: layers show on the finger.",
+        f"Palm and bars weigh {mass:.0f} g if printed solid; the simulated palm weighs "
+        f"{wanted:.0f} g with all that it bears but the fingers (screws, tubes, the wrist's upper "
+        "plate). Add what is missing in the middle of its upper side.",
+        "The groove in the palm's upper side points to x. Dimples in its underside count each "
+        "finger from 1: finger 0 has one.",
+    ]
+    if printed.below > 0.05:
+        notes.append(
+            f"The seats stand {printed.below:.1f} mm below the palm's underside, which the "
+            "simulation does not have."
+        )
+    return SheetSection("What to print", ("file", "number", "what"), rows, notes)
+
+
+def _wrist(scene: Scene, sizes: Sequence[Size], printed: Printed | None) -> SheetSection:
+    if not scene.effects.wrist:
+        note = "The simulated wrist is rigid: screw the palm to the arm's flange."
+        return SheetSection("Wrist", (), [], [note])
+    wrist, mass = scene.hand.wrist, hand_mass(scene, sizes)
+    k, turn = wrist.linear_stiffness, wrist.angular_stiffness
+    sag = 1e3 * mass * scene.gravity_on / k
+    rows = [
+        (
+            "along x, y and z, each",
+            f"{k:g} N/m ({k / 1e3:.3g} N/mm)",
+            f"100 g moves it by {1e3 * 0.1 * 9.81 / k:.1f} mm",
+            f"{wrist.linear_damping:g} N s/m",
+        ),
+        (
+            "about x, y and z, each",
+            f"{turn:g} N m/rad ({turn * math.pi / 180:.3g} N m/°)",
+            f"1 N at a lever of 100 mm turns it by {math.degrees(0.1 / turn):.2f}°",
+            f"{wrist.angular_damping:g} N m s/rad",
+        ),
+    ]
+    ratio = wrist.linear_damping / (2 * math.sqrt(k * mass))
+    notes = [
+        f"The simulated hand hangs on springs in six directions, palm and fingers of "
+        f"{1e3 * mass:.0f} g. Its weight lowers it by {sag:.0f} mm: the arm's z is that of the "
+        "undeflected wrist, so leave commands.csv as it is.",
+        "**A stock part:** an arm with Cartesian impedance control (Franka Research 3, KUKA LBR "
+        f"iiwa) is such a wrist. Screw the palm to its flange, set {k:g} N/m in translation, "
+        f"{turn:g} N m/rad in rotation and a damping ratio of {ratio:.2g}, and give the controller "
+        "no weight of the hand to compensate.",
+        _mechanical(scene, sag, printed),
+        "**A rigid mount:** another hand. See first what it keeps: codesign evaluate with --set "
+        "effects.wrist=false.",
+    ]
+    return SheetSection("Wrist", ("direction", "stiffness", "to test", "damping"), rows, notes)
+
+
+def _mechanical(scene: Scene, sag: float, printed: Printed | None) -> str:
+    wrist = scene.hand.wrist
+    k, turn = wrist.linear_stiffness, wrist.angular_stiffness
+    text = (
+        f"**To build** (drawing: last page of {NAME}.pdf): three miniature linear guides, crossed, "
+        f"one above the other, each with {math.ceil((sag + 30) / 10) * 10:.0f} mm of travel to "
+        f"either side, a pair of tension springs of {k / 2e3:.3g} N/mm against each other, and a "
+        f"dashpot of {wrist.linear_damping:g} N s/m. Below them the palm on four rubber buffers"
+    )
+    if not printed or not printed.flange:
+        return f"{text}, that give {turn:g} N m/rad about each axis."
+    radius = 5e-4 * printed.flange[0]
+    axial, shear = turn / (2 * radius**2) / 1e3, turn / (4 * radius**2) / 1e3
+    return (
+        f"{text} with {printed.flange[1]} studs in the screw holes of the palm, each with "
+        f"{axial:.0f} N/mm along and {shear:.0f} N/mm across (K/2r² and K/4r² of the circle's "
+        "radius r). Stock buffers are softer across: take those that are right along, and test "
+        "the angles as in the table."
+    )
+
+
+def _order(
+    scene: Scene,
+    params: Params,
+    sizes: Sequence[Size],
+    process: Process,
+    printed: Printed | None,
+) -> SheetSection:
+    named = silicone.of_material(scene.hand.material) or silicone.nearest(scene.hand.material)
+    test = 0.5 * float(np.max(np.asarray(params.pressure))) / 1e3
+    pinned = any(inlet(size, process) for size in sizes)
+    pin = (
+        " Grease the pin and push it through the tray's end wall into the core."
+        if pinned
+        else " There is no pin for the inlet: pierce the root after casting."
+    )
+    steps = (
+        "Print the parts; fit each core on its tray dry, it must sit without force. Wipe the "
+        "moulds with release agent for silicone (optional on PLA) and let it dry.",
+        "Mix as in 'Silicone by casting', stir for 3 min, scraping the sides, draw air out for 3 "
+        f"min at -90 kPa or more, and pour within {named.pot_life:g} min.",
+        f"Shell: core on the tray.{pin} Pour in a thin stream between the bars until the tray is "
+        f"full to the rim, tap out bubbles, cure {named.cure_time:g} h at 23 °C. Pull the pin, "
+        "lift the core out with the shell, peel the shell from the core.",
+        "Bottom wall: lay the strip of fabric on the floor of the base mould, tip flush, the rest "
+        "hanging out over the root's end as the flap. Pour up to the step, set the shell in at "
+        f"once, its back upwards, press it down lightly, cure {named.cure_time:g} h.",
+        "Thread: wind it around the finger from the base to the tip, a turn every "
+        f"{PITCH:g} mm, snug and not pressing in; not around the root. Fix both ends with a drop "
+        "of silicone and rub a film over all of it.",
+        "Tube: push 10 mm of it through the root into the chamber, seal with silicone adhesive "
+        "around it, cure.",
+        f"Leak test: under water at {test:.0f} kPa for a minute, no bubbles; then close the tube: "
+        "the pressure must fall by less than 5 % in a minute [ours]. Paint leaks with silicone and "
+        "test again.",
+        "Bend test: lay the finger on its side, raise the pressure slowly to the design's, and "
+        "compare the angle of the tip with 'free bend'. Write pressures and angles into a file and "
+        "fit the silicone: codesign finger FILE.csv --fit (docs/measurements.md).",
+        "Seats: thread the tube through the seat's hole and out at the top. Lay the root in the "
+        "pocket, fabric towards the palm's middle, its base flush with the lower edge. Fold the "
+        "flap up behind the root and over the back wall, lay the bar on it, and drive both screws "
+        "through the fabric until the bar sits on the seat's rim. Cut the flap.",
+        "Palm: ballast as in 'What to print'; screws from below into the wrist; groove towards "
+        "the arm frame's x.",
+        "Arm: set its tool centre point to the middle of the palm's underside. z = 0 is where that "
+        "lies on the table with the wrist undeflected; x = y = 0 is the object's place. Turn by "
+        "+20° of roll, yaw and pitch, each alone, and compare with the drawing before anything "
+        "else moves.",
+        "Valves: finger 0 on channel 0 and so on. Play valves.csv with the hand in the air "
+        "(play_valves.py), then commands.csv with neither object nor pressure, then with both, "
+        "then with the object. Keep hands away: the arm ends where the file says.",
+    )
+    if printed is None:
+        steps = steps[:8] + ("Fix each finger to a palm of your own (--no-parts).", *steps[9:])
+    notes = [f"{k}. {step}" for k, step in enumerate(steps, 1)]
+    return SheetSection("Order of work", (), [], notes)

@@ -20,9 +20,14 @@ _under_way = threading.Lock()
 """Held while a command runs, whichever tab started it: a command takes all processors."""
 
 
+def under_way() -> bool:
+    """Whether a command runs."""
+    return _under_way.locked()
+
+
 def check() -> None:
     """Refuses a command, as an InputError, while another one runs."""
-    if _under_way.locked():
+    if under_way():
         raise InputError([_BUSY])
 
 

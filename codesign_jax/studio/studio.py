@@ -82,7 +82,7 @@ class Studio:
 
     def listen(self, host: str, port: int) -> tuple[Server, str]:
         """A server whose `serve_forever` serves the studio, and the page's address."""
-        guard = server.Guard(_page(), everywhere=host not in LOCAL)
+        guard = self.guard = server.Guard(_page(), everywhere=host not in LOCAL)
         try:
             listening = server.listen(guard, self.serve, host, port)
         except OSError as error:

@@ -191,7 +191,7 @@ class Tab:
     """What one tab of a browser shows and asks for."""
 
     def __init__(self, desk: Desk, tell: Callable[[str, Any], None] | None = None) -> None:
-        """Takes what all tabs share, and the sender of a command's messages, which outlives a tab."""
+        """Takes what all tabs share, and who sends what a command tells, which outlives a tab."""
         self._desk, self._tell = desk, tell or self.send
         self._asked: collections.deque[View] = collections.deque(maxlen=1)  # the newest
         self._actions: collections.deque[Callable[[], None]] = collections.deque()

@@ -230,6 +230,7 @@ function startStudio(root) {
       if (startReplay(stage, { ...grasp.replay, strip: [] })) stage.replay.play();
       else show();  // with pictures
     }
+    if (stage.replay) find("message").textContent = "";
     if (grasp.number === null || grasp.number === asked) {  // else a slider has moved on
       grasp.design.forEach((value, k) => set(rows[k], value));
       if (grasp.number === null) keep();

@@ -80,7 +80,10 @@ def web(name: str) -> str:
 
 def write(scene: Scene, grasp: Replay, path: Path, *, title: str, text: list[str]) -> Path:
     """Writes a grasp alone as an HTML file."""
-    lines = "".join(f"<p>{html.escape(line)}</p>\n" for line in text)
+    tags = ["pre" if "\n" in line else "p" for line in text]  # lines of a table stay lines
+    lines = "".join(
+        f"<{tag}>{html.escape(line)}</{tag}>\n" for tag, line in zip(tags, text, strict=True)
+    )
     body = f"<h1>{html.escape(title)}</h1>\n{lines}{fragment(scene, grasp)}"
     with files.atomically(path) as part:
         part.write_text(page(title, body), encoding="utf-8")

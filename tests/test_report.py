@@ -354,11 +354,14 @@ def test_browser_skins_as_python_does(browser, tmp_path):
     """Vertices on the page at its frames against those of `bodies`, and between them continuous."""
     the_scene = grasps.pinch("box", links=4, effects__surface="hull")
     grasp = bent_grasp(the_scene)
-    path = viewer.write(the_scene, grasp, tmp_path / "r.html", title="<b>", text=["a & b"])
+    path = viewer.write(
+        the_scene, grasp, tmp_path / "r.html", title="<b>", text=["a & b", "x  y\n1  2"]
+    )
     page = browser.new_page()
     page.goto(path.as_uri())
     view = "document.getElementById('replay').replay"
     assert page.locator("h1").inner_text() == "<b>"
+    assert page.locator("pre").inner_text() == "x  y\n1  2", "a table's lines"
     motion = bodies.motion(the_scene, grasp)
     for k, pose in enumerate(motion.pose):
         page.evaluate(f"{view}.seek({k / motion.rate})")

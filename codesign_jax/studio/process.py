@@ -44,12 +44,14 @@ def _run(words: Sequence[str], tell: Callable[[str], None]) -> None:
     line = [sys.executable, "-P", "-m", "codesign_jax.cli", *words]
     pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True}
     try:
-        ended = subprocess.run(line, check=False, errors="replace", **pipes)
-        printed = ended.stdout[-MOST:] + ended.stderr[-MOST:]
-    except OSError as error:
-        printed = f"error: {error}"
-    if "--out" in words:  # a folder that was made to keep its name, if nothing came into it
-        with contextlib.suppress(OSError):
-            Path(words[words.index("--out") + 1]).rmdir()
-    tell(f"{shlex.join(['codesign', *words])}\n{printed.rstrip()}\n")
-    _under_way.release()
+        try:
+            ended = subprocess.run(line, check=False, errors="replace", **pipes)
+            printed = ended.stdout[-MOST:] + ended.stderr[-MOST:]
+        except OSError as error:
+            printed = f"error: {error}"
+        if "--out" in words:  # a folder that was made to keep its name, if nothing came into it
+            with contextlib.suppress(OSError):
+                Path(words[words.index("--out") + 1]).rmdir()
+        tell(f"{shlex.join(['codesign', *words])}\n{printed.rstrip()}\n")
+    finally:
+        _under_way.release()

@@ -27,7 +27,8 @@ from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.schema import InputError
 from codesign_jax.studio import server
-from codesign_jax.studio.tab import COUNTS, Desk, Tab
+from codesign_jax.studio.desk import COUNTS, Desk
+from codesign_jax.studio.tab import Tab
 
 
 def main(options: Options) -> int:
@@ -78,19 +79,19 @@ class Studio:
         self.tabs: list[Tab] = []
         self._wake = threading.Event()
         self._begun = self._ended = False
+        self.guard = server.Guard(_page(), everywhere=desk.options.host not in LOCAL)
         self._told: dict[str, Any] = {}  # of the newest command, for tabs that connect again
 
     def listen(self, host: str, port: int) -> tuple[Server, str]:
         """A server whose `serve_forever` serves the studio, and the page's address."""
-        guard = self.guard = server.Guard(_page(), everywhere=host not in LOCAL)
         try:
-            listening = server.listen(guard, self.serve, host, port)
+            listening = server.listen(self.guard, self.serve, host, port)
         except OSError as error:
             raise InputError([f"--host {host} --port {port}: {error.strerror}"]) from error
         named = socket.gethostname() if host in ("0.0.0.0", "::") else host
         named = f"[{named}]" if ":" in named else named
         port = listening.socket.getsockname()[1]
-        return listening, f"http://{named}:{port}/?token={guard.token}"
+        return listening, f"http://{named}:{port}/?token={self.guard.token}"
 
     def begin(self) -> None:
         """Compiles what a moved slider needs; from then on tabs get what they ask for."""

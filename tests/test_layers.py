@@ -194,9 +194,9 @@ def test_no_kernel_depends_on_what_its_key_leaves_out():
 # As `find DIR -name '*.py' | xargs cat | wc -l` counts.  A larger number is a line of a review: say
 # there what users have of it, and what could go in its place.
 MOST_LINES = {
-    "codesign_jax": 38_400,
+    "codesign_jax": 38_700,
     "codesign_jax/codesign": 580,
-    "codesign_jax/commands": 3_210,
+    "codesign_jax/commands": 3_260,
     "codesign_jax/compiler": 2_640,
     "codesign_jax/env": 350,
     "codesign_jax/engines": 12_300,
@@ -208,7 +208,7 @@ MOST_LINES = {
     "codesign_jax/scene": 5_010,
     "codesign_jax/studio": 950,
     "scripts": 5_560,
-    "tests": 16_400,
+    "tests": 17_000,
 }
 
 

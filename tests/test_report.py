@@ -285,6 +285,42 @@ def test_replay_plays_in_a_browser(opened, tmp_path):
 
 
 @pytest.mark.browser
+def test_a_view_that_the_browser_took_away_comes_back(opened, tmp_path):
+    """As after a sleep, or a driver that starts again; meanwhile words say what is the matter."""
+    page, complaints = opened
+    message = page.locator("#replay .message")
+    assert_hand_and_object(picture(page, tmp_path))
+    page.evaluate(
+        """() => {
+          const canvas = document.querySelector("#replay .view");
+          window.taken = canvas.getContext("webgl2").getExtension("WEBGL_lose_context");
+          window.taken.loseContext();
+        }"""
+    )
+    page.wait_for_function("document.querySelector('#replay .message').innerText")
+    assert "load the page again" in message.inner_text()
+    page.evaluate("document.getElementById('replay').replay.seek(0.4)")
+    page.wait_for_timeout(200)
+    page.evaluate("window.taken.restoreContext()")
+    page.wait_for_function("!document.querySelector('#replay .message').innerText")
+    page.wait_for_timeout(200)
+    assert_hand_and_object(picture(page, tmp_path))
+    assert [text for text in complaints if "CONTEXT_LOST" not in text] == []
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("width", [390, 1000])
+def test_a_report_is_as_wide_as_its_window(run, browser, width):
+    """Tables that are wider scroll by themselves."""
+    page = browser.new_page(viewport={"width": width, "height": 800})
+    page.goto((run / "report.html").as_uri())
+    assert page.evaluate("document.documentElement.scrollWidth") == width
+    for table in page.locator(".table").all():
+        assert table.bounding_box()["width"] <= width
+    page.close()
+
+
+@pytest.mark.browser
 def test_a_browser_without_webgl_shows_a_film_strip(run, flat_browser, tmp_path):
     """Pictures at the ends of the phases, and no controls of what is not there."""
     page = flat_browser.new_page(viewport={"width": 1000, "height": 900})
@@ -292,7 +328,7 @@ def test_a_browser_without_webgl_shows_a_film_strip(run, flat_browser, tmp_path)
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.goto((run / "report.html").as_uri())
     assert page.evaluate("document.createElement('canvas').getContext('webgl2')") is None
-    assert "this browser offers no WebGL 2" in page.locator("#replay .message").inner_text()
+    assert "This browser offers no WebGL 2" in page.locator("#replay .message").inner_text()
     pictures = page.locator("#replay .strip img")
     captions = [pictures.nth(k).get_attribute("alt") for k in range(pictures.count())]
     assert len(captions) == 7 and captions[1] == "end of approach, 0.3 s"
@@ -318,11 +354,14 @@ def test_browser_skins_as_python_does(browser, tmp_path):
     """Vertices on the page at its frames against those of `bodies`, and between them continuous."""
     the_scene = grasps.pinch("box", links=4, effects__surface="hull")
     grasp = bent_grasp(the_scene)
-    path = viewer.write(the_scene, grasp, tmp_path / "r.html", title="<b>", text=["a & b"])
+    path = viewer.write(
+        the_scene, grasp, tmp_path / "r.html", title="<b>", text=["a & b", "x  y\n1  2"]
+    )
     page = browser.new_page()
     page.goto(path.as_uri())
     view = "document.getElementById('replay').replay"
     assert page.locator("h1").inner_text() == "<b>"
+    assert page.locator("pre").inner_text() == "x  y\n1  2", "a table's lines"
     motion = bodies.motion(the_scene, grasp)
     for k, pose in enumerate(motion.pose):
         page.evaluate(f"{view}.seek({k / motion.rate})")

@@ -81,6 +81,7 @@ def test_replay_writes_the_best_grasp_of_a_run(run, simulated, tmp_path, capsys)
     parts = json.loads(data)["parts"]
     assert [p["name"] for p in parts] == ["finger 0", "finger 1", "palm", "object"]
     assert not re.search(r"(src|href)\s*=\s*[\"']", page), "nothing is loaded from elsewhere"
+    assert re.search(r"<p>design: length=\S+ mm arm_z=\S+ mm</p>", page)
 
 
 def test_wrong_grasps_are_refused_in_words(run, workplace, capsys):

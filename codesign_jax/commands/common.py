@@ -100,11 +100,25 @@ def find_case(options: Subject, *, tell: Tell = warn) -> Case:
     return case
 
 
+def shortest(space: DesignSpace, design: np.ndarray) -> list[float]:
+    """A design [SI units] in the hand file's units, by the fewest digits that mean the same.
+
+    Simulations take a design as float32: 114.125 mm and 114.124998 mm are one number there.
+    """
+    exact, single = space.in_units(design), np.asarray(design, np.float32)
+    values = exact.copy()
+    for digits in range(9, 0, -1):  # nine tell any two numbers of float32 apart
+        fewer = np.array([float(f"{value:.{digits}g}") for value in exact])
+        same = (fewer * np.asarray(space.scale)).astype(np.float32) == single
+        values = np.where(same, fewer, values)
+    return values.tolist()
+
+
 def design_text(space: DesignSpace, file: DesignFile, design: np.ndarray) -> str:
     """A design [SI units] as the .toml text that --design opens again, in what the file names."""
     own, others = tables.by_finger(space)
     places = {space.names[k]: k for k in others} | own
-    values = [f"{value:.9g}" for value in space.in_units(design)]
+    values = [f"{value:.9g}" for value in shortest(space, design)]
     lines = ["# A design in the hand file's units, for --design."]
     names = {name: v for name, v in dataclasses.asdict(file).items() if v and name != "design"}
     lines += [tomli_w.dumps(names), "[design]"]

@@ -39,4 +39,5 @@ def table(
         return "<tr>" + "".join(cell(tag, k, v) for k, v in enumerate(values)) + "</tr>"
 
     top = line("th", head) if head else ""
-    return "<table>" + top + "".join(line("td", row) for row in rows) + "</table>"
+    inside = top + "".join(line("td", row) for row in rows)
+    return f"<div class='table'><table>{inside}</table></div>"  # which scrolls on a phone

@@ -56,7 +56,7 @@ _PAGE = """<!DOCTYPE html>
 
 def fragment(scene: Scene, grasp: Replay, name: str = "replay") -> str:
     """HTML of a grasp, for a page that `page` makes."""
-    shown = data(scene, grasp) | {"strip": _strip(scene, grasp)}
+    shown = data(scene, grasp) | {"strip": strip(scene, grasp)}
     # "<" appears in no JSON but inside strings, where its escape means the same.
     text = json.dumps(shown).replace("<", "\\u003c")
     return element(name) + _START.format(name=html.escape(name), data=text)
@@ -80,7 +80,10 @@ def web(name: str) -> str:
 
 def write(scene: Scene, grasp: Replay, path: Path, *, title: str, text: list[str]) -> Path:
     """Writes a grasp alone as an HTML file."""
-    lines = "".join(f"<p>{html.escape(line)}</p>\n" for line in text)
+    tags = ["pre" if "\n" in line else "p" for line in text]  # lines of a table stay lines
+    lines = "".join(
+        f"<{tag}>{html.escape(line)}</{tag}>\n" for tag, line in zip(tags, text, strict=True)
+    )
     body = f"<h1>{html.escape(title)}</h1>\n{lines}{fragment(scene, grasp)}"
     with files.atomically(path) as part:
         part.write_text(page(title, body), encoding="utf-8")
@@ -105,7 +108,8 @@ def data(scene: Scene, grasp: Replay) -> dict[str, Any]:
     }
 
 
-def _strip(scene: Scene, grasp: Replay) -> list[tuple[str, str]]:
+def strip(scene: Scene, grasp: Replay) -> list[tuple[str, str]]:
+    """Pictures of a grasp at the ends of its phases: captions, and PNG files in base64."""
     ends = [("start", 0.0), *phases(scene)]
     spans = [
         (later - first, k) for k, ((_, first), (_, later)) in enumerate(itertools.pairwise(ends))

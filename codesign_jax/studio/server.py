@@ -4,7 +4,7 @@ As Jupyter does it: the address that is printed has a random token; the page the
 cookie, which no other site's page makes the browser send (`SameSite=Strict`). A WebSocket is
 opened with that cookie, and by a page of this server only: browsers say in `Origin` whose page
 asks. On loopback the `Host` must be a loopback name as well, so that no name of a stranger's that
-points here is served.
+points here is served. Its port may be any, as a tunnel's other end may have another one.
 """
 
 import base64
@@ -16,7 +16,7 @@ import secrets
 from collections.abc import Callable
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
@@ -26,8 +26,13 @@ LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 SOCKET = "/socket"
 MOST_BYTES = 1 << 16
 """Largest message that a page may send."""
+_LOCAL = re.compile(rf"({'|'.join(map(re.escape, LOOPBACK))})(:[0-9]{{1,5}})?", re.IGNORECASE)
 _MISSING = (
     "This page is its user's: open the address that `codesign studio` printed, with its token.\n"
+)
+_TUNNEL = (
+    "From another machine take a tunnel, `ssh -L {port}:localhost:{port} HOST`, and open the "
+    "address that `codesign studio` printed there.\n"
 )
 
 
@@ -55,21 +60,30 @@ class Guard:
 
     def answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """The page, a refusal, or None: a WebSocket may be opened."""
-        headers, url = request.headers, urlsplit(request.path)
+        headers = request.headers
+        path, _, query = request.path.partition("?")
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
-        port = connection.local_address[1]
-        if len(hosts) != 1 or not (
-            self._everywhere or hosts[0].lower() in [f"{name}:{port}" for name in LOOPBACK]
-        ):
-            return connection.respond(HTTPStatus.FORBIDDEN, "Not a name of this server.\n")
-        cookie = f"codesign-studio-{port}"  # cookies of one host are shared by its ports
-        if url.path == SOCKET:
-            if origins != [f"http://{hosts[0]}"] or not self._known(_cookie(headers, cookie)):
+        tunnel = _TUNNEL.format(port=connection.local_address[1])
+        if getattr(request, "method", "GET") != "GET":  # websockets < 17 refuses these itself
+            refusal = connection.respond(HTTPStatus.METHOD_NOT_ALLOWED, "")
+            refusal.headers["Allow"] = "GET"
+            return refusal
+        if len(hosts) != 1 or not (self._everywhere or _LOCAL.fullmatch(hosts[0])):
+            words = "The page is served to names of this machine alone, such as localhost. "
+            return connection.respond(HTTPStatus.FORBIDDEN, words + tunnel)
+        # Cookies of a host are shared by its ports: each port has one. The port is the one that
+        # the browser knows, as tunnels to two machines may lead to one port there.
+        port = re.search(r":([0-9]{1,5})$", hosts[0])
+        cookie = f"codesign-studio-{port[1] if port else 80}"
+        if path == SOCKET:
+            own = [[f"{scheme}://{hosts[0]}"] for scheme in ("http", "https")]
+            if origins not in own or not self._known(_cookie(headers, cookie)):
                 return connection.respond(HTTPStatus.FORBIDDEN, _MISSING)
             return None
-        if url.path != "/":
-            return connection.respond(HTTPStatus.NOT_FOUND, "There is the page / alone.\n")
-        given = parse_qs(url.query).get("token", [""])[0]
+        if path != "/":
+            words = "There is the page / alone. A proxy has to take its own path away. "
+            return connection.respond(HTTPStatus.NOT_FOUND, words + tunnel)
+        given = parse_qs(query).get("token", [""])[0]
         if not (self._known(given) or self._known(_cookie(headers, cookie))):
             return connection.respond(HTTPStatus.FORBIDDEN, _MISSING)
         more = Headers()
@@ -80,11 +94,12 @@ class Guard:
         more["Cache-Control"] = "no-store"
         more["Referrer-Policy"] = "no-referrer"
         more["X-Content-Type-Options"] = "nosniff"
-        more["Set-Cookie"] = f"{cookie}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+        # Without a path: the browser takes the page's, so that a proxy's other pages do not get it.
+        more["Set-Cookie"] = f"{cookie}={self.token}; HttpOnly; SameSite=Strict"
         return Response(HTTPStatus.OK, "OK", more, self._body)
 
     def _known(self, token: str) -> bool:
-        return hmac.compare_digest(token.encode(), self.token.encode())
+        return hmac.compare_digest(token.encode("utf-8", "replace"), self.token.encode())
 
 
 def _cookie(headers: Headers, name: str) -> str:

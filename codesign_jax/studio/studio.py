@@ -26,7 +26,8 @@ from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.schema import InputError
 from codesign_jax.studio import server
-from codesign_jax.studio.tab import COUNTS, Desk, Tab
+from codesign_jax.studio.desk import COUNTS, Desk
+from codesign_jax.studio.tab import Tab
 from codesign_jax.terminal import Console
 
 
@@ -44,9 +45,7 @@ def main(options: Options) -> int:
 
 
 def serve(desk: Desk, console: Console) -> None:
-    """Compiles what a moved slider needs, and serves the studio until Ctrl-C."""
-    with Busy(console, "compiling the simulation"):
-        interruptible(desk.bench("").warm, desk.case.design)
+    """Serves the studio until Ctrl-C; its page waits for the simulation, which is compiled."""
     options, studio = desk.options, Studio(desk)
     listening, address = studio.listen(options.host, options.port)
     if options.host not in LOCAL:
@@ -56,11 +55,15 @@ def serve(desk: Desk, console: Console) -> None:
         )
     console.print(f"the studio: {address}")
     console.print("for this user's browser; Ctrl-C ends it")
-    if options.open:
-        webbrowser.open(address)
     with listening:
+        serving = threading.Thread(target=listening.serve_forever, daemon=True)
+        serving.start()
+        if options.open:
+            webbrowser.open(address)
         try:
-            listening.serve_forever()
+            with Busy(console, "compiling the simulation"):
+                studio.begin()
+            serving.join()
         finally:
             studio.close()
 
@@ -76,33 +79,52 @@ class Studio:
         self.desk = desk
         self.tabs: list[Tab] = []
         self._wake = threading.Event()
-        self._ended = False
+        self._begun = self._ended = False
+        self.guard = server.Guard(_page(), everywhere=desk.options.host not in LOCAL)
+        self._told: dict[str, Any] = {}  # of the newest command, for tabs that connect again
 
     def listen(self, host: str, port: int) -> tuple[Server, str]:
         """A server whose `serve_forever` serves the studio, and the page's address."""
-        guard = server.Guard(_page(), everywhere=host not in LOCAL)
         try:
-            listening = server.listen(guard, self.serve, host, port)
+            listening = server.listen(self.guard, self.serve, host, port)
         except OSError as error:
             raise InputError([f"--host {host} --port {port}: {error.strerror}"]) from error
         named = socket.gethostname() if host in ("0.0.0.0", "::") else host
         named = f"[{named}]" if ":" in named else named
         port = listening.socket.getsockname()[1]
+        return listening, f"http://{named}:{port}/?token={self.guard.token}"
+
+    def begin(self) -> None:
+        """Compiles what a moved slider needs; from then on tabs get what they ask for."""
+        interruptible(self.desk.bench("").warm, self.desk.case.design)
+        self._begun = True
         threading.Thread(target=self._work, daemon=True).start()
-        return listening, f"http://{named}:{port}/?token={guard.token}"
+
+    def tell(self, kind: str, content: Any) -> None:
+        """Sends a message of a command to all tabs, also to those that are opened later."""
+        self._told[kind] = content
+        for tab in list(self.tabs):
+            tab.send(kind, content)
 
     def serve(self, connection: ServerConnection) -> None:
         """Serves one tab until it is closed."""
-        tab = Tab(self.desk)
+        tab = Tab(self.desk, self.tell)
         self.tabs.append(tab)
         threading.Thread(target=_deliver, args=(tab, connection), daemon=True).start()
-        tab.send("about", about(self.desk))
-        with contextlib.suppress(ConnectionClosed):
+        try:
+            tab.send("about", about(self.desk))
+            if not self._begun:
+                tab.send("state", "compiling the simulation: a minute or two the first time ...")
+            for kind, content in self._told.items():
+                tab.send(kind, content)
             for text in connection:
                 tab.receive(text)
                 self._wake.set()
-        self.tabs.remove(tab)
-        tab.close()
+        except ConnectionClosed:
+            pass
+        finally:
+            self.tabs.remove(tab)
+            tab.close()
 
     def close(self) -> None:
         """Ends the work after its step."""
@@ -137,7 +159,7 @@ def about(desk: Desk) -> dict[str, Any]:
     groups = {f"Finger {f}": {k[f]: name for name, k in own.items()} for f in fingers}
     for title, morphology in (("Hand", True), ("Control", False)):
         groups[title] = {k: space.names[k] for k in others if space.is_morphology[k] == morphology}
-    low, high, design = (space.in_units(v) for v in (space.low, space.high, desk.case.design))
+    low, high = (space.in_units(v) for v in (space.low, space.high))
     parameters = [
         {
             "name": space.names[k],
@@ -160,7 +182,7 @@ def about(desk: Desk) -> dict[str, Any]:
         "title": f"{source}, objects {scene.objects.name}, design space {desk.file.preset}",
         "parameters": parameters,
         "groups": [{"title": t, "members": [*members]} for t, members in groups.items() if members],
-        "design": design.tolist(),
+        "design": common.shortest(space, desk.case.design),
         "objects": [shape.name for shape in scene.objects.object],
         "accuracies": desk.accuracies,
         "counts": COUNTS,

@@ -6,155 +6,35 @@ trial by trial, what the verdict needs. What was asked for in between is dropped
 """
 
 import collections
-import dataclasses
 import functools
 import json
-import subprocess
-import sys
+import os
+import shlex
 import threading
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from codesign_jax import Task, codesign, files, rollout, runs
+from codesign_jax import codesign, files, runs
 from codesign_jax.codesign import VERDICTS
 from codesign_jax.commands import common
-from codesign_jax.commands.flags import Studio as Options
-from codesign_jax.engines import Engine
-from codesign_jax.engines.base import recording, tells_forces
 from codesign_jax.model import morphology, overlap
 from codesign_jax.optimize import Screened
 from codesign_jax.report import animation, bodies, stress, verdicts, viewer
 from codesign_jax.runs import choice
-from codesign_jax.runs.choice import Case
-from codesign_jax.scene import Scene, library
-from codesign_jax.scene.loading import with_accuracy
 from codesign_jax.scene.schema import InputError
-from codesign_jax.types import Outcome, Params, Trial, failed
+from codesign_jax.studio import process
+from codesign_jax.studio.desk import COUNTS, Bench, Desk, View
+from codesign_jax.types import Outcome, failed
 
-COUNTS = (24, 48, 96, 240)
-"""Numbers of trials that a verdict may have."""
-BATCH = 3
-"""Trials of one step: more would keep the next grasp waiting."""
 PARTICLES, EPISODES, SIGMA = 20, 15, 0.12
 """Of `improve`: designs of an episode, episodes, and how far the first ones lie from the design, as
 a standard deviation in shares of the parameters' ranges."""
 LOOKED_AT = 15
 """States of a grasp in which overlaps are sought: a tenth of a second."""
-
-
-class View(NamedTuple):
-    """What a tab asks to be shown."""
-
-    design: np.ndarray  # the design [SI units], shape (parameter,)
-    accuracy: str  # name of an accuracy; empty for the scene's own
-    shape: int  # index of the object, where there is no noise
-    # Which of the trials of the verdict it is, with its object; None without noise
-    noise: int | None
-    trials: int  # number of trials of the verdict
-    resting: bool  # whether the sliders rest, so that the verdict may follow
-    # The tab's own number of the request; None for a design that the studio puts there
-    number: int | None
-
-
-class Bench:
-    """A scene at one accuracy, with the programs that simulate it."""
-
-    def __init__(self, found: Case) -> None:
-        self.case = found
-        self.engine = found.make_engine()
-        self.recorder = recording(self.engine) if tells_forces(self.engine) else None
-        self.objects = len(found.scene.objects.object)
-
-    @functools.cached_property
-    def trials(self) -> Trial:
-        """The first trials of `codesign evaluate --seed 0`."""
-        drawn = rollout.sample_trials(self.case.scene, jax.random.key(0), max(COUNTS) + BATCH)
-        return jax.tree.map(np.asarray, drawn)
-
-    @functools.cached_property
-    def task(self) -> Task:
-        """What `improve` searches by."""
-        return Task(self.case.scene, self.case.space, max(self.objects, BATCH), self.engine)
-
-    def params(self, design: np.ndarray) -> Params:
-        """Parameters of a design as they are simulated."""
-        return self.case.space.params(jnp.asarray(design, jnp.float32))
-
-    def grasp(self, view: View, engine: Engine | None = None) -> animation.Replay:
-        """Simulates what is shown, with forces if the engine is the recorder."""
-        trial = rollout.nominal_trial(self.case.scene, view.shape)
-        if view.noise is not None:
-            trial = jax.tree.map(lambda v: v[view.noise], self.trials)
-        trials = jax.tree.map(lambda v: jnp.asarray(v)[None], trial)
-        params = self.params(view.design)
-        return animation.replay(self.case.scene, engine or self.engine, params, trials)[0]
-
-    def outcomes(self, design: np.ndarray, first: int) -> Outcome:
-        """Outcomes of the next `BATCH` trials, arrays of shape (trial,)."""
-        trials = jax.tree.map(lambda v: v[first : first + BATCH], self.trials)
-        found = _outcomes(self.case.scene, self.engine, self.params(design), trials)
-        return jax.tree.map(np.asarray, found)
-
-    def warm(self, design: np.ndarray) -> None:
-        """Compiles the programs that a moved slider needs."""
-        view = View(design, "", 0, None, 0, False, None)
-        self.grasp(view)
-        if self.recorder:
-            self.grasp(view, self.recorder)
-        self.outcomes(design, 0)
-
-
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _outcomes(scene: Scene, engine: Engine, params: Params, trials: Trial) -> Outcome:
-    hands = jax.tree.map(lambda v: v[None], params)
-    return jax.tree.map(lambda v: v[0], rollout.evaluate(scene, engine, hands, trials))
-
-
-class Desk:
-    """What all tabs share: a case with its programs, its run, and where files go."""
-
-    def __init__(self, options: Options) -> None:
-        self.options = options
-        self.case = common.find_case(options)
-        common.refuse(common.engine_problems(self.case.engine))
-        self.file, self.record = common.design_file(options), None
-        if folder := options.run_folder:
-            own = {"preset": runs.read_run(folder)[1].preset, "scene": str(folder / "scene.toml")}
-            self.file = dataclasses.replace(self.file, **own)
-            self.record = choice.read_record(folder, tell=lambda text: None)  # `find_case` said it
-        self.accuracies = ("", *library.available("accuracy"))
-        self.benches: dict[str, Bench] = {}
-
-    def bench(self, accuracy: str) -> Bench:
-        """The programs of an accuracy."""
-        if accuracy not in self.benches:
-            found = self.case
-            if accuracy:
-                found = found._replace(scene=with_accuracy(found.scene, accuracy))
-            self.benches[accuracy] = Bench(found)
-        return self.benches[accuracy]
-
-    def flags(self, accuracy: str) -> list[str]:
-        """Flags that name to another command what a design's file does not."""
-        given, named = self.options, {"accuracy": accuracy or self.options.accuracy}
-        named |= {"engine": self.case.engine, "policy": given.policy}
-        found = [word for k, v in named.items() if v is not None for word in (f"--{k}", v)]
-        for words in given.overrides:
-            found += ["--set", *words]
-        return found + ["--robust"] * given.robust
-
-    def place(self, stem: str, ending: str = "") -> Path:
-        """A path in the folder of what is saved that is not there yet."""
-        k = 1
-        while (path := self.options.out / f"{stem}-{k}{ending}").exists():
-            k += 1
-        return path
 
 
 class Shown(NamedTuple):
@@ -173,12 +53,13 @@ class Shown(NamedTuple):
 class Tab:
     """What one tab of a browser shows and asks for."""
 
-    def __init__(self, desk: Desk) -> None:
-        self._desk = desk
+    def __init__(self, desk: Desk, tell: Callable[[str, Any], None] | None = None) -> None:
+        """Takes what all tabs share, and who sends what a command tells, which outlives a tab."""
+        self._desk, self._tell = desk, tell or self.send
         self._asked: collections.deque[View] = collections.deque(maxlen=1)  # the newest
         self._actions: collections.deque[Callable[[], None]] = collections.deque()
         self._shown: Shown | None = None
-        self._looked = False
+        self._looked = self._pictured = False
         self._outcomes: list[Outcome] = []  # of trials of the design that is shown
         self._search: tuple[Any, Any, int] | None = None  # optimiser, state, episodes done
         self._outbox: dict[str, Any] = {}
@@ -220,7 +101,7 @@ class Tab:
                 self._actions.append(lambda: self._of_run(place))
             else:
                 self._actions.append(actions[kind])
-        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        except Exception as error:  # whatever is sent, the tab goes on
             self.send("error", f"not a message of this page: {error}"[:300])
 
     def _view(
@@ -232,66 +113,96 @@ class Tab:
         noise: int | None,
         accuracy: str,
         trials: int,
+        pictures: bool = False,
     ) -> View:
-        """What a message asks for; ValueError if there is no such thing."""
+        """What a message asks for; an error if there is no such thing."""
         space, values = self._desk.case.space, np.array(design, float)
         if values.shape != space.low.shape or not np.isfinite(values).all():
             raise ValueError(f"a design has {space.num_parameters} numbers")
         shapes = range(len(self._desk.case.scene.objects.object))
-        for value, known in (
-            (object, shapes),
-            (noise, [None, *range(max(COUNTS))]),
-            (accuracy, self._desk.accuracies),
-            (trials, COUNTS),
-        ):
-            if value not in known:
-                raise ValueError(f"{value!r} is not one of the choices")
         legal = np.clip(values * np.array(space.scale), space.low, space.high)
-        return View(legal, accuracy, object, noise, trials, bool(resting), int(number))
+        return View(
+            legal,
+            _choice(accuracy, self._desk.accuracies),
+            _choice(object, shapes),
+            _choice(noise, (None, *range(max(COUNTS)))),
+            _choice(trials, COUNTS),
+            bool(resting),
+            int(number),
+            bool(pictures),
+        )
 
     # ---- the worker's part
 
     def step(self) -> bool:
         """Does the next thing, if there is one; an error is shown and ends what it was about."""
-        try:
-            return self._next()
-        except Exception as error:  # the studio goes on with another design
-            self._shown = None
-            self._end_search()
-            name = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
-            self.send("error", f"{name}{error}"[:1000])
-            return True
-
-    def _next(self) -> bool:
-        shown = self._shown
-        if self._asked:
-            view = self._asked.popleft()
-            if view.number is not None:  # the page's: a slider was moved
-                self._end_search()
-            self._show(view)
-        elif self._actions:
-            try:
-                self._actions.popleft()()
-            except InputError as error:  # what is shown stays
-                self.send("error", str(error))
-        elif shown and self._search:
-            self._improve(shown, *self._search)
-        elif shown and shown.view.resting and shown.bench.recorder and not shown.forces:
-            # Forces take as long as the grasp: they come after it, once the sliders rest.
-            grasp = shown.bench.grasp(shown.view, shown.bench.recorder)
-            self._shown = shown._replace(grasp=grasp)
-            self.send("grasp", _told(self._shown))
-        elif shown and shown.view.resting and self._total < shown.view.trials:
-            left = shown.view.trials - self._total
-            found = shown.bench.outcomes(shown.view.design, self._total)
-            self._outcomes.append(jax.tree.map(lambda v: v[:left], found))
-            self._tell_verdict(shown)
-        elif shown and shown.view.resting and not self._looked:
-            self._looked = True
-            self.send("overlap", _deepest(shown))
-        else:
+        work, end = self._next()
+        if work is None:
             return False
+        try:
+            work()
+        except Exception as error:  # the studio goes on
+            end()
+            self.send("error", _words(error))
         return True
+
+    def _next(self) -> tuple[Callable[[], None] | None, Callable[[], None]]:
+        """What is to be done next, if anything is, and what ends if that fails."""
+        if self._asked:
+            return self._take, self._forget
+        if self._actions:
+            return self._actions.popleft(), lambda: None  # what is shown stays
+        if (shown := self._shown) is None:
+            return None, self._forget
+        if self._search:
+            return functools.partial(self._improve, shown, *self._search), self._end_search
+        work = self._following(shown) if shown.view.resting else None
+        return functools.partial(work, shown) if work else None, self._rest
+
+    def _following(self, shown: Shown) -> Callable[[Shown], None] | None:
+        """What is still to be told of a design whose sliders rest."""
+        if shown.view.pictures and not self._pictured:
+            return self._tell_pictures
+        # Forces take as long as the grasp: they come after it, once the sliders rest.
+        if shown.bench.recorder and not shown.forces:
+            return self._tell_forces
+        if self._total < shown.view.trials:
+            return self._tell_trials
+        return None if self._looked else self._tell_overlap
+
+    def _take(self) -> None:
+        view = self._asked.popleft()
+        if view.number is not None:  # the page's: a slider was moved
+            self._end_search()
+        self._show(view)
+
+    def _forget(self) -> None:
+        """There is no grasp of the design that was asked for."""
+        self._shown = None
+        self._end_search()
+
+    def _rest(self) -> None:
+        """What is shown stays; nothing else is told of it."""
+        if shown := self._shown:
+            self._shown = shown._replace(view=shown.view._replace(resting=False))
+
+    def _tell_pictures(self, shown: Shown) -> None:
+        self._pictured = True
+        self.send("pictures", viewer.strip(shown.bench.case.scene, shown.grasp))
+
+    def _tell_forces(self, shown: Shown) -> None:
+        self._shown = shown._replace(grasp=shown.bench.grasp(shown.view, shown.bench.recorder))
+        self.send("grasp", _told(self._shown))
+
+    def _tell_trials(self, shown: Shown) -> None:
+        left = shown.view.trials - self._total
+        found = shown.bench.outcomes(shown.view.design, self._total)
+        self._outcomes.append(jax.tree.map(lambda v: v[:left], found))
+        self._tell_verdict(shown)
+
+    def _tell_overlap(self, shown: Shown) -> None:
+        self._looked = True
+        self.send("overlap", _deepest(shown))
 
     @property
     def _total(self) -> int:
@@ -309,7 +220,7 @@ class Tab:
             shown = before._replace(view=view)  # a slider was let go where it has been seen
         else:
             shown = Shown(view, bench, bench.grasp(view))
-        self._shown, self._looked = shown, False
+        self._shown, self._looked, self._pictured = shown, False, False
         self.send("grasp", _told(shown))
         if view.resting:
             self._tell_verdict(shown)
@@ -324,7 +235,7 @@ class Tab:
             sentence = str(verdicts.Judged(scene, found, grasps="grasps"))
             if not failed(found.status).all():
                 cost = float(codesign.particle_cost(scene, found))
-        design = shown.bench.case.space.in_units(view.design).tolist()
+        design = common.shortest(shown.bench.case.space, view.design)
         told = {"number": view.number, "total": view.trials, "design": design}
         self.send("verdict", told | {"ends": ends, "sentence": sentence, "cost": cost})
 
@@ -369,7 +280,7 @@ class Tab:
 
     def _current(self) -> Shown:
         if self._shown is None:
-            raise InputError(["there is no grasp of a design yet"])
+            raise InputError(["there is no grasp of this design; move a slider"])
         return self._shown
 
     def _of_run(self, place: list[int] | None) -> None:
@@ -383,39 +294,52 @@ class Tab:
 
     def _save(self) -> None:
         words = ["codesign", "evaluate", *self._saved()]
-        self.send("done", f"saved; to open it again:\n{subprocess.list2cmdline(words)}")
+        self.send("done", f"saved; to open it again:\n{shlex.join(words)}")
 
     def _saved(self) -> list[str]:
         """Saves the design that is shown; flags that name it to another command."""
         view, space = self._current().view, self._desk.case.space
-        with files.atomically(path := self._desk.place("design", ".toml")) as part:
-            text = common.design_text(space, self._desk.file, view.design)
+        text = common.design_text(space, self._desk.file, view.design)
+        with self._desk.reserved("design", ".toml") as path, files.atomically(path) as part:
             part.write_text(text, encoding="utf-8")
         return ["--design", str(path), *self._desk.flags(view.accuracy)]
 
     def _page(self) -> None:
         view, bench, grasp = self._current()
-        path, space = self._desk.place("grasp", ".html"), bench.case.space
+        space = bench.case.space
         lines = [runs.describe(space, view.design), choice.ending(grasp.outcome)]
-        viewer.write(bench.case.scene, grasp, path, title="A grasp in 3D", text=lines)
+        with self._desk.reserved("grasp", ".html") as path:
+            viewer.write(bench.case.scene, grasp, path, title="A grasp in 3D", text=lines)
         self.send("done", f"written: {path}, for any browser, offline")
 
     def _export(self) -> None:
-        self._command("export", *self._saved(), "--out", str(self._desk.place("export")))
+        process.check()  # before anything is written for it
+        with self._desk.reserved("export") as folder:
+            self._command("export", *self._saved(), "--out", str(folder))
 
     def _report(self) -> None:
+        if self._desk.options.run_folder is None:
+            raise InputError(["there is no run to report"])
         self._command("report", str(self._desk.options.run_folder))
 
     def _command(self, *words: str) -> None:
-        line = subprocess.list2cmdline(["codesign", *words])
-        self.send("done", f"{line}\n...")
+        process.start(words, lambda text: self._tell("done", text))
 
-        def wait() -> None:
-            whole = [sys.executable, "-m", "codesign_jax.cli", *words]
-            ended = subprocess.run(whole, capture_output=True, text=True, check=False)
-            self.send("done", f"{line}\n{ended.stdout[-3000:]}{ended.stderr[-3000:]}")
 
-        threading.Thread(target=wait, daemon=True).start()
+def _choice(value: Any, known: Sequence[Any]) -> Any:
+    """That one of the known values which equals a value of a message; ValueError without one."""
+    if value not in known:
+        raise ValueError(f"{value!r} is not one of the choices")
+    return known[known.index(value)]  # of its own type: True and 1.0 equal 1
+
+
+def _words(error: Exception) -> str:
+    """What an error says on the page."""
+    if isinstance(error, InputError):
+        return str(error)
+    if isinstance(error, OSError) and error.strerror:
+        return f"{os.fsdecode(error.filename or 'a file')}: {error.strerror}"
+    return f"{type(error).__name__}: {error}"[:1000]
 
 
 def _told(shown: Shown) -> dict[str, Any]:
@@ -438,7 +362,7 @@ def _told(shown: Shown) -> dict[str, Any]:
     return {
         "number": view.number,
         "replay": replay,
-        "design": space.in_units(view.design).tolist(),
+        "design": common.shortest(space, view.design),
         "limits": limits,
         "ending": choice.ending(grasp.outcome),
         "cost": float(grasp.outcome.cost),

@@ -17,16 +17,17 @@
 // Pictures in place of the 3D view and its controls.
 function showStrip(root, strip) {
   const find = (name) => root.querySelector(`.${name}`);
-  find("message").textContent = "Pictures instead of 3D: this browser offers no WebGL 2. " +
-    "Its settings may have hardware acceleration switched off.";
-  for (const [caption, png] of strip) {
+  const offer = "This browser offers no WebGL 2; its settings may have hardware acceleration switched off. ";
+  find("message").textContent = offer + (strip.length ? "Pictures stand in place of the 3D view." : "Pictures follow.");
+  const figures = strip.map(([caption, png]) => {
     const figure = document.createElement("figure"), picture = document.createElement("img");
     const words = document.createElement("figcaption");
     picture.src = `data:image/png;base64,${png}`;
     picture.alt = words.textContent = caption;
     figure.append(picture, words);
-    find("strip").append(figure);
-  }
+    return figure;
+  });
+  find("strip").replaceChildren(...figures);
   root.classList.add("still");
 }
 
@@ -131,22 +132,40 @@ function startReplay(root, data) {
       float light = 0.60 + 0.10 * n.z + 0.42 * max(dot(n, normalize(sun)), 0.0);
       result = vec4(color.rgb * light, 1.0);
     }`;
-  const program = gl.createProgram();
-  for (const [kind, text] of [[gl.VERTEX_SHADER, vertexShader], [gl.FRAGMENT_SHADER, fragmentShader]]) {
-    const shader = gl.createShader(kind);
-    gl.shaderSource(shader, text);
-    gl.compileShader(shader);
-    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
-    gl.attachShader(program, shader);
+  // What the context holds beside the meshes' buffers.
+  let program, uniform, table;
+  function prepare() {
+    program = gl.createProgram();
+    for (const [kind, text] of [[gl.VERTEX_SHADER, vertexShader], [gl.FRAGMENT_SHADER, fragmentShader]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, text);
+      gl.compileShader(shader);
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost())
+        throw new Error(gl.getShaderInfoLog(shader));
+      gl.attachShader(program, shader);
+    }
+    gl.bindAttribLocation(program, 0, "position");
+    gl.linkProgram(program);
+    uniform = Object.fromEntries(["camera", "sun", "eye", "color", "kind", "flatten"].map(
+      (name) => [name, gl.getUniformLocation(program, name)]));
+    table = gl.createBuffer();
+    const s = data.table;
+    gl.bindBuffer(gl.ARRAY_BUFFER, table);
+    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-s, -s, 0, s, -s, 0, s, s, 0, -s, -s, 0, s, s, 0, -s, s, 0]),
+      gl.STATIC_DRAW);
   }
-  gl.bindAttribLocation(program, 0, "position");
-  gl.linkProgram(program);
-  const uniform = Object.fromEntries(["camera", "sun", "eye", "color", "kind", "flatten"].map(
-    (name) => [name, gl.getUniformLocation(program, name)]));
-  const table = gl.createBuffer(), s = data.table;
-  gl.bindBuffer(gl.ARRAY_BUFFER, table);
-  gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-s, -s, 0, s, -s, 0, s, s, 0, -s, -s, 0, s, s, 0, -s, s, 0]),
-    gl.STATIC_DRAW);
+  prepare();
+  // The browser takes contexts away when a computer sleeps, a driver starts again, or pages have too many.
+  canvas.addEventListener("webglcontextlost", (event) => {
+    event.preventDefault();  // which asks for it back
+    find("message").textContent = "The browser has taken the 3D view away. If it does not come back, load the page again.";
+  });
+  canvas.addEventListener("webglcontextrestored", () => {  // as a new one, which holds nothing
+    prepare();
+    for (const p of parts) p.buffer = gl.createBuffer();
+    find("message").textContent = "";
+    request();
+  });
 
   // ---- camera: orbits about a point; column-major matrices as WebGL has them
   const home = () => ({ ...data.camera, target: [...data.camera.target] });
@@ -264,7 +283,7 @@ function startReplay(root, data) {
   let start = 0;
   for (const [name, until] of data.phases) {
     const mark = document.createElement("button"), from = start;
-    mark.textContent = name;
+    mark.textContent = mark.title = name;
     mark.style.flex = `${until - from} 0 0`;
     mark.addEventListener("click", () => { pause(); seek(from); });
     find("phases").append(mark);

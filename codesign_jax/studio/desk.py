@@ -1,0 +1,153 @@
+"""What all tabs of `codesign studio` share: a scene with its programs, a run, and a folder."""
+
+import contextlib
+import dataclasses
+import functools
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax import Task, files, rollout, runs
+from codesign_jax.commands import common
+from codesign_jax.commands.flags import Studio as Options
+from codesign_jax.engines import Engine
+from codesign_jax.engines.base import recording, tells_forces
+from codesign_jax.report import animation
+from codesign_jax.runs import choice
+from codesign_jax.runs.choice import Case
+from codesign_jax.scene import Scene, library
+from codesign_jax.scene.loading import with_accuracy
+from codesign_jax.types import Outcome, Params, Trial
+
+COUNTS = (24, 48, 96, 240)
+"""Numbers of trials that a verdict may have."""
+BATCH = 3
+"""Trials of one step: more would keep the next grasp waiting."""
+
+
+class View(NamedTuple):
+    """What a tab asks to be shown."""
+
+    design: np.ndarray  # the design [SI units], shape (parameter,)
+    accuracy: str  # name of an accuracy; empty for the scene's own
+    shape: int  # index of the object, where there is no noise
+    # Which of the trials of the verdict it is, with its object; None without noise
+    noise: int | None
+    trials: int  # number of trials of the verdict
+    resting: bool  # whether the sliders rest, so that the verdict may follow
+    # The tab's own number of the request; None for a design that the studio puts there
+    number: int | None
+    pictures: bool = False  # whether the page draws nothing itself, and shows pictures
+
+
+class Bench:
+    """A scene at one accuracy, with the programs that simulate it."""
+
+    def __init__(self, found: Case) -> None:
+        self.case = found
+        self.engine = found.make_engine()
+        self.recorder = recording(self.engine) if tells_forces(self.engine) else None
+        self.objects = len(found.scene.objects.object)
+
+    @functools.cached_property
+    def trials(self) -> Trial:
+        """The first trials of `codesign evaluate --seed 0`."""
+        drawn = rollout.sample_trials(self.case.scene, jax.random.key(0), max(COUNTS) + BATCH)
+        return jax.tree.map(np.asarray, drawn)
+
+    @functools.cached_property
+    def task(self) -> Task:
+        """What `improve` searches by."""
+        return Task(self.case.scene, self.case.space, max(self.objects, BATCH), self.engine)
+
+    def params(self, design: np.ndarray) -> Params:
+        """Parameters of a design as they are simulated."""
+        return self.case.space.params(jnp.asarray(design, jnp.float32))
+
+    def grasp(self, view: View, engine: Engine | None = None) -> animation.Replay:
+        """Simulates what is shown, with forces if the engine is the recorder."""
+        trial = rollout.nominal_trial(self.case.scene, view.shape)
+        if view.noise is not None:
+            trial = jax.tree.map(lambda v: v[view.noise], self.trials)
+        trials = jax.tree.map(lambda v: jnp.asarray(v)[None], trial)
+        params = self.params(view.design)
+        return animation.replay(self.case.scene, engine or self.engine, params, trials)[0]
+
+    def outcomes(self, design: np.ndarray, first: int) -> Outcome:
+        """Outcomes of the next `BATCH` trials, arrays of shape (trial,)."""
+        trials = jax.tree.map(lambda v: v[first : first + BATCH], self.trials)
+        found = _outcomes(self.case.scene, self.engine, self.params(design), trials)
+        return jax.tree.map(np.asarray, found)
+
+    def warm(self, design: np.ndarray) -> None:
+        """Compiles the programs that a moved slider needs."""
+        view = View(design, "", 0, None, 0, False, None)
+        self.grasp(view)
+        if self.recorder:
+            self.grasp(view, self.recorder)
+        self.outcomes(design, 0)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _outcomes(scene: Scene, engine: Engine, params: Params, trials: Trial) -> Outcome:
+    hands = jax.tree.map(lambda v: v[None], params)
+    return jax.tree.map(lambda v: v[0], rollout.evaluate(scene, engine, hands, trials))
+
+
+class Desk:
+    """What all tabs share: a case with its programs, its run, and where files go."""
+
+    def __init__(self, options: Options) -> None:
+        self.options = options
+        self.case = common.find_case(options)
+        common.refuse(common.engine_problems(self.case.engine))
+        self.file, self.record = common.design_file(options), None
+        if folder := options.run_folder:
+            own = {"preset": runs.read_run(folder)[1].preset, "scene": str(folder / "scene.toml")}
+            self.file = dataclasses.replace(self.file, **own)
+            self.record = choice.read_record(folder, tell=lambda text: None)  # `find_case` said it
+        self.accuracies = ("", *library.available("accuracy"))
+        self.benches: dict[str, Bench] = {}
+
+    def bench(self, accuracy: str) -> Bench:
+        """The programs of an accuracy."""
+        if accuracy not in self.benches:
+            found = self.case
+            if accuracy:
+                found = found._replace(scene=with_accuracy(found.scene, accuracy))
+            self.benches[accuracy] = Bench(found)
+        return self.benches[accuracy]
+
+    def flags(self, accuracy: str) -> list[str]:
+        """Flags that name to another command what a design's file does not."""
+        given, named = self.options, {"accuracy": accuracy or self.options.accuracy}
+        named |= {"engine": self.case.engine, "policy": given.policy}
+        found = [word for k, v in named.items() if v is not None for word in (f"--{k}", v)]
+        for words in given.overrides:
+            found += ["--set", *words]
+        return found + ["--robust"] * given.robust
+
+    @contextlib.contextmanager
+    def reserved(self, stem: str, ending: str = "") -> Iterator[Path]:
+        """A new file in the folder of what is saved, or without an ending a new folder.
+
+        It is made at once, so that nobody else gets its name, and removed after an error.
+        """
+        self.options.out.mkdir(parents=True, exist_ok=True)
+        for number in itertools.count(1):
+            path = self.options.out / f"{stem}-{number}{ending}"
+            try:
+                path.touch(exist_ok=False) if ending else path.mkdir()
+            except FileExistsError:
+                continue
+            break
+        try:
+            yield path
+        except BaseException:
+            files.remove(path)
+            raise

@@ -146,9 +146,15 @@ def _slips(unit: str) -> typing.Iterator[tuple[float, str]]:
 
 def range_problem(path: str, value: float, unit: str, low: float, high: float) -> str | None:
     """Returns why a value lies outside its range, or None."""
+    words = range_words(value, unit, low, high)
+    return f"{path} = {shown(value)} {words}" if words else None
+
+
+def range_words(value: float, unit: str, low: float, high: float) -> str | None:
+    """That a value "is outside" its range, with the unit that would explain it; None if it is."""
     if low <= value <= high:
         return None
-    message = f"{path} = {shown(value)} is outside [{low:g}, {high:g}] {unit}".rstrip()
+    message = f"is outside [{low:g}, {high:g}] {unit}".rstrip()
     slip = unit_slip(value, unit, low, high)
     return f"{message}; did you mean {value * slip[0]:g}? ({slip[1]})" if slip else message
 

@@ -159,6 +159,14 @@ def range_words(value: float, unit: str, low: float, high: float) -> str | None:
     return f"{message}; did you mean {value * slip[0]:g}? ({slip[1]})" if slip else message
 
 
+def field_problem(path: str, value: float, cls: type, name: str) -> str | None:
+    """Why a value lies outside the range of a field of a table, without a guess, or None."""
+    limits = next(_range(field) for field in dataclasses.fields(cls) if field.name == name)
+    if limits.low <= value <= limits.high:
+        return None
+    return f"{path} = {value:g} is outside [{limits.low:g}, {limits.high:g}] {limits.unit}".rstrip()
+
+
 @functools.cache
 def _hints(cls: type) -> dict[str, Any]:
     """Types of a dataclass's fields, which take a seventh of the time to read a file."""

@@ -16,20 +16,13 @@ import re
 import unicodedata
 from typing import Any
 
-from codesign_jax.scene import schema
+from codesign_jax.scene import schema, texts
 from codesign_jax.scene.schema import quantity, table
 
 RANGES = {"s": (-60, 60), "m": (-2, 2), "deg": (-360, 360), "Pa": (-1e6, 1e6)}
 """Smallest and largest number of a sum, by its unit."""
 _FACTOR = 100.0
 """Largest factor of a name."""
-_TYPESET = str.maketrans(
-    dict.fromkeys("\u2010\u2011\u2012\u2013\u2014\u2212\ufe63\uff0d", "-")
-    | dict.fromkeys("\u00b7\u00d7\u2217\u22c5", "*")
-    | dict.fromkeys("\u00a0\u2007\u2009\u202f", " ")
-    | {"\u00f7": "/", "\u2215": "/", "\uff0b": "+"}
-)
-"""Characters that editors and web pages have for those of a keyboard: minus, dot, narrow blank."""
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)"
     r"|(?P<name>[A-Za-z]\w*)|(?P<operator>[-+*/]))",
@@ -123,7 +116,7 @@ class _Reader:
     """Reads the text of one sum; a ValueError says what is wrong with it."""
 
     def __init__(self, given: str):
-        self.tokens = self._tokens(given.translate(_TYPESET))
+        self.tokens = self._tokens(texts.typed(given))
         self.place = 0
 
     @staticmethod

@@ -25,7 +25,7 @@ from codesign_jax.reuse import use_compilation_cache as use_compilation_cache
 from codesign_jax.runs import choice, tables
 from codesign_jax.runs.choice import Case
 from codesign_jax.runs.reading import Tell
-from codesign_jax.scene import Scene, keypaths, library, objects, schema
+from codesign_jax.scene import Scene, keypaths, library, objects, schema, texts
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.scene.schema import InputError
 
@@ -120,7 +120,7 @@ def open_designs(words: Sequence[str]) -> tuple[dict[str, list[str]], DesignFile
     """Splits the words of --design into NAME=VALUE pairs, by the file that has them; the file."""
     found: dict[str, list[str]] = {}
     file, direct = DesignFile(PRESET, {}), []
-    for word in words:
+    for word in keypaths.joined(words):
         if "=" in word or not word.endswith(".toml"):
             direct.append(word)
             continue
@@ -269,7 +269,7 @@ def counted(number: int, noun: str) -> str:
 
 def number(text: str) -> float | None:
     try:
-        value = float(text)
+        value = float(texts.typed(text))
     except ValueError:
         return None
     return value if math.isfinite(value) else None

@@ -159,7 +159,8 @@ def read_parameters(rows: Any, where: str) -> tuple[ControlParameter, ...]:
     """Parameters from rows as those of a file, for what else than key frames has some."""
     problems: list[str] = []
     reader = _Reader({}, where, 0, problems)
-    found = [schema.parse(ControlParameter, row, where, problems) for row in rows]
+    given = [keypaths.plain(row, where) for row in rows]
+    found = [schema.parse(ControlParameter, row, where, problems) for row in given]
     for i, row in enumerate(found):
         if row is not None:
             reader.parameter(row, f"{where}[{i}]")

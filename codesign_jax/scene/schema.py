@@ -28,8 +28,12 @@ _ANGLES = {
 _PREFIXES = {-6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 _SLIPS = (-3, 3, -6, 6)
 """Powers of ten between units that people mix up, tried in this order."""
-_SMALLER = (1e-3, 1e-6)
+_SMALLER = (1e-3, 1e-6, 1e-2)
 """Factors from a smaller unit to the right one."""
+_CENTI = -2
+"""Power of ten of the centimetre, which people use besides; of nothing else."""
+_FAR = 1.5
+"""How many times a value lies outside its range before centimetres explain it."""
 _UNIT = re.compile(r"(µ|m|k|M)?(m|s|g|N|Pa|Hz)(?![A-Za-z])(.*)")
 _COMMON = {"Mg/m^3": "g/cm^3"}
 """What a unit is usually called."""
@@ -111,6 +115,8 @@ def unit_slip(value: float, unit: str, low: float, high: float) -> tuple[float, 
     (0.001, 'mm given where m is expected')
     >>> unit_slip(141.0, "Pa", 1e3, 1e6)
     (1000.0, 'kPa given where Pa is expected')
+    >>> unit_slip(9.5, "mm", 20, 200)
+    (10.0, 'cm given where mm is expected')
     """
     if low <= value <= high or not 0 < abs(value) < 1e300:
         return None
@@ -123,6 +129,8 @@ def unit_slip(value: float, unit: str, low: float, high: float) -> tuple[float, 
             and (abs(value) >= 1 or f not in _SMALLER)
             # Where a range begins at zero, next to nothing is in it and not what is meant.
             and (low > 0 or abs(value * f) >= 0.01 * high)
+            # What lies just outside its range is no slip by a factor of 10 or 100.
+            and (f not in (10.0, 1e-2) or not low / _FAR < value < high * _FAR)
         ),
         None,
     )
@@ -142,6 +150,8 @@ def _slips(unit: str) -> typing.Iterator[tuple[float, str]]:
         if other is not None and other != "µ":
             name = f"{other}{base}{rest}"
             yield 10.0**power, f"{_COMMON.get(name, name)} given where {unit} is expected"
+    if base == "m" and not rest.startswith("^"):
+        yield 10.0 ** (_CENTI - own), f"cm{rest} given where {unit} is expected"
 
 
 def range_problem(path: str, value: float, unit: str, low: float, high: float) -> str | None:

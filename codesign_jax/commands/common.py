@@ -17,9 +17,10 @@ import tomli_w
 from rich.console import Console
 from rich.table import Table
 
-from codesign_jax import engines
+from codesign_jax import engines, policy, rollout
 from codesign_jax import scene as scenes
 from codesign_jax.commands.flags import SceneFlags, Subject, TrialFlags
+from codesign_jax.engines import Engine
 from codesign_jax.own import make_policy
 from codesign_jax.reuse import use_compilation_cache as use_compilation_cache
 from codesign_jax.runs import choice, tables
@@ -28,6 +29,7 @@ from codesign_jax.runs.reading import Tell
 from codesign_jax.scene import Scene, keypaths, library, objects, schema, texts
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.scene.schema import InputError
+from codesign_jax.types import Params
 
 MOST = 1000
 """Most runs of one command: a guard against a slip such as 0-99999."""
@@ -273,6 +275,14 @@ def number(text: str) -> float | None:
     except ValueError:
         return None
     return value if math.isfinite(value) else None
+
+
+def policy_notes(engine: Engine, params: Params) -> list[str]:
+    """Warnings of what a policy commands, if the engine asks one; nothing is simulated."""
+    if not isinstance(engine, policy.ControlLoop):
+        return []
+    found = policy.doubts(engine, params, rollout.nominal_trial(engine.scene))
+    return [f"warning: {text}" for text in found]
 
 
 def parse_seeds(text: str) -> list[int]:

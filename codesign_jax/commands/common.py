@@ -165,6 +165,10 @@ def parse_design(
         if count > 1
     ]
     for name, text in given:
+        if name in dict(space.idle):
+            words = f"{where} {name!r} has no effect: {dict(space.idle)[name]}; leave it out"
+            problems.append(words)
+            continue
         if name not in values:
             problems.append(f"{where} {name!r} is not a parameter; {schema.nearest(name, values)}")
             continue

@@ -404,7 +404,7 @@ def check(scene: Any, where: str) -> list[str]:
 
 def doubts(scene: Any, where: str) -> list[str]:
     """What is no error in key frames, and hardly meant: kPa for Pa, frames after the grasp."""
-    return [*_faint(scene.control, where), *_late(scene, where)]
+    return [*_faint(scene.control, where), *_late(scene, where), *_unused(scene.control, where)]
 
 
 def _faint(control: Control, where: str) -> Iterator[str]:
@@ -442,6 +442,20 @@ def _late(scene: Any, where: str) -> Iterator[str]:
             f"{where}.frame[{i}].time = {schema.shown(sums.text(frame.time))} is {which}: the "
             f"grasp ends after {last:g} s"
         )
+
+
+def _unused(control: Control, where: str) -> Iterator[str]:
+    """Parameters of pose and pressure that no frame reads, so that a search of them is idle."""
+    first = control.frame[0]
+    used = {f"arm_{axis}" for axis in POSE if axis != "z" and getattr(first, axis) is None}
+    for frame in control.frame:
+        for name in _UNITS:
+            values = getattr(frame, name) or ()
+            for total in values if isinstance(values, tuple) else (values,):
+                used |= {term.name for term in total.term}
+    left = [n for n in (*(f"arm_{axis}" for axis in POSE), "pressure") if n not in used]
+    if left:
+        yield f"{where}: no key frame reads {', '.join(left)}: without a policy it has no effect"
 
 
 def _ends(row: Parameter) -> tuple[float, float]:

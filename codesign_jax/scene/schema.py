@@ -9,12 +9,15 @@ import dataclasses
 import difflib
 import functools
 import math
+import operator
 import re
 import types
 import typing
 from typing import Any, TypeVar
 
 import jax
+import jax.core
+import numpy as np
 
 from codesign_jax.scene import texts
 from codesign_jax.scene.texts import SHOWN, printable, shown
@@ -210,16 +213,90 @@ _tables: set[type] = set()
 
 
 def table(cls: type[T]) -> type[T]:
-    """Registers a frozen dataclass as a pytree.
+    """Registers a frozen dataclass as a pytree whose numbers a program may trace.
 
     Its leaves are its numbers that are not structure, also those of tables in it, under the names
-    of the file; all else is static.
+    of the file; all else is static.  Whoever makes one, or another one by `dataclasses.replace`, is
+    refused what a file is refused, as far as a number is known: a tracer's is not.  JAX, which
+    makes trees of anything, is refused nothing.
     """
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
-    data = [f.name for f in fields if _is_leaf(f) or _holds_tables(f.type)]
-    jax.tree_util.register_dataclass(cls, data, [f.name for f in fields if f.name not in data])
+    data = tuple(f.name for f in fields if _is_leaf(f) or _holds_tables(f.type))
+    static = tuple(f.name for f in fields if f.name not in data)
+
+    leaves_of, rest_of = _getter(data), _getter(static)
+    keys = tuple(map(jax.tree_util.GetAttrKey, data))
+
+    def parts(value: T) -> tuple[tuple, tuple]:
+        return leaves_of(value), rest_of(value)
+
+    def named_parts(value: T) -> tuple[tuple, tuple]:
+        return tuple(zip(keys, leaves_of(value), strict=True)), rest_of(value)
+
+    def whole(rest: tuple, leaves: typing.Iterable) -> T:
+        made = object.__new__(cls)
+        made.__dict__.update(zip(static, rest, strict=True))
+        made.__dict__.update(zip(data, leaves, strict=True))
+        return made
+
+    jax.tree_util.register_pytree_with_keys(cls, named_parts, whole, parts)
     _tables.add(cls)
+    _check_when_made(cls)
     return cls
+
+
+def _getter(names: tuple[str, ...]) -> typing.Callable[[Any], tuple]:
+    """A function to the attributes of these names, as a tuple."""
+    if len(names) > 1:
+        return operator.attrgetter(*names)
+    return lambda value: tuple(getattr(value, name) for name in names)
+
+
+def _check_when_made(cls: type) -> None:
+    make = cls.__init__
+    name = cls.__name__.lower()
+    numbers = [field for field in dataclasses.fields(cls) if _is_leaf(field)]
+
+    @functools.wraps(make)
+    def checked(self: Any, *given: Any, **named: Any) -> None:
+        make(self, *given, **named)
+        found = (_known_problem(f"{name}.{f.name}", getattr(self, f.name), f) for f in numbers)
+        if problems := [problem for problem in found if problem]:
+            raise InputError(problems)
+
+    cls.__init__ = checked
+
+
+def _known_problem(path: str, value: Any, field: dataclasses.Field) -> str | None:
+    """What is wrong with the numbers of a field of a table, as far as they are known."""
+    if isinstance(value, tuple):
+        found = (_known_problem(f"{path}[{i}]", v, field) for i, v in enumerate(value))
+        return next(filter(None, found), None)
+    if isinstance(value, bool | str):
+        return f"{path} = {shown(value)} must be {_kind(float, field)}"
+    known = isinstance(value, int | float | np.number | np.ndarray)
+    if isinstance(value, jax.Array) and not isinstance(value, jax.core.Tracer):
+        known = value.is_fully_addressable
+    if not known or np.asarray(value).dtype.kind not in "fiuV":  # V: bfloat16
+        return None
+    every = np.unique(np.asarray(value, float))
+    return next(filter(None, (near_problem(path, float(v), _range(field)) for v in every)), None)
+
+
+def near_problem(path: str, value: float, expected: Range) -> str | None:
+    """As `range_problem`, for numbers that were a float32: the one nearest to a bound is inside."""
+    low, high = (b + side * 1e-6 * abs(b) for b, side in ((expected.low, -1), (expected.high, 1)))
+    if low <= value <= high:
+        return None
+    return range_problem(path, value, expected.unit, expected.low, expected.high)
+
+
+def replaced(table: T, **changes: Any) -> T:
+    """As `dataclasses.replace`, for numbers of the program's own, which may leave their ranges."""
+    made = object.__new__(type(table))
+    made.__dict__.update({f.name: getattr(table, f.name) for f in dataclasses.fields(table)})  # type: ignore[arg-type]
+    made.__dict__.update(changes)
+    return made
 
 
 def _is_leaf(field: dataclasses.Field) -> bool:

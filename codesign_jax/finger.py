@@ -13,51 +13,20 @@ so that a measurement is compared, and the material fitted, in a second.
 True
 """
 
-import csv
-import io
+import contextlib
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
 from scipy import optimize
 
+from codesign_jax.measurements import MEASURED
+from codesign_jax.measurements import read as read
 from codesign_jax.model import morphology
 from codesign_jax.scene import Scene
-from codesign_jax.scene.schema import InputError, nearest
 from codesign_jax.types import Params
-
-UNITS = {
-    "Pa": ("pressure", 1.0),
-    "kPa": ("pressure", 1e3),
-    "bar": ("pressure", 1e5),
-    "psi": ("pressure", 6894.757293168),
-    "deg": ("angle", math.pi / 180),
-    "rad": ("angle", 1.0),
-    "mN": ("force", 1e-3),
-    "N": ("force", 1.0),
-    "mm": ("length", 1e-3),
-    "cm": ("length", 1e-2),
-    "m": ("length", 1.0),
-}
-"""Units of a column: what they measure, and how many SI units they are."""
-
-COLUMNS = {
-    "pressure": ("pressure", "gauge pressure of the chamber"),
-    "angle": ("angle", "angle between the finger's base and its free tip"),
-    "tip_force": ("force", "force on a tip that is held where it was, the rest free to bow"),
-    "blocked_force": ("force", "force on the tip of a finger that is kept straight"),
-    "load": ("force", "force on the tip, across the unbent finger, against its bending"),
-    "deflection": ("length", "how far the load moves the tip, in the load's direction"),
-}
-"""Columns of a file of measurements: what their unit measures, and what they are."""
-
-_MOST_LETTERS = 1_000_000
-"""Most characters of a measured table."""
-MEASURED = ("angle", "tip_force", "blocked_force", "deflection")
-"""Columns that are compared with the model."""
 
 
 class Finger(NamedTuple):
@@ -112,6 +81,14 @@ def of_design(scene: Scene, params: Params, index: int) -> Finger:
     )
 
 
+TOO_FAR = "the finger bends too far for its law"
+"""Why a finger has no rest."""
+
+
+class NoRest(ValueError):
+    """A finger does not come to rest under a pressure and a load."""
+
+
 class Rest(NamedTuple):
     """A finger at rest."""
 
@@ -134,6 +111,9 @@ class Rest(NamedTuple):
         Args:
           pressure: Gauge pressure [Pa].
           load: Dead force on the tip, across the unbent finger and against its bending [N].
+
+        Raises:
+          NoRest: If the joints cannot be balanced.
         """
         n, moment, unit = finger.links, pressure * finger.gain, float(finger.stiffness[0])
         reach = finger.segment * np.append(np.ones(n - 1), 0.5)  # of the bodies behind the joints
@@ -170,9 +150,7 @@ class Rest(NamedTuple):
             first[n:] = start.force * finger.length / unit
         found = optimize.root(residual, first, jac=slopes, tol=1e-12)
         if np.abs(residual(found.x)).max() > 1e-8:
-            raise ValueError(
-                f"no rest found at {pressure / 1e3:g} kPa: the finger bends too far for its law"
-            )
+            raise NoRest(f"no rest found at {pressure / 1e3:g} kPa: {TOO_FAR}")
         return cls(found.x[:n], force(found.x), tip(found.x[:n])[0])
 
 
@@ -180,10 +158,11 @@ def predict(finger: Finger, table: Mapping[str, np.ndarray]) -> dict[str, np.nda
     """What a finger does where something was measured.
 
     Args:
-      table: Columns of `COLUMNS` [SI units], shape (row,); NaN where a row has none.
+      table: Columns of `measurements.COLUMNS` [SI units], shape (row,); NaN where a row has none.
 
     Returns:
-      Columns of `MEASURED` that the table has, shape (row,); NaN where the row has none.
+      Columns of `MEASURED` that the table has, shape (row,); NaN where the row has none, or the
+      finger no rest.
     """
     rows = len(table["pressure"])
     found = {name: np.full(rows, np.nan) for name in MEASURED if name in table}
@@ -191,19 +170,38 @@ def predict(finger: Finger, table: Mapping[str, np.ndarray]) -> dict[str, np.nda
     for row in np.argsort(table["pressure"], kind="stable"):  # each begins where the last one ended
         pressure = float(table["pressure"][row])
         asked = {n for n in found if np.isfinite(table[n][row])}
-        if asked & {"angle", "deflection"}:
-            free = Rest.of(finger, pressure, start=free)
-        if "angle" in asked:
-            found["angle"][row] = free.angles.sum()
-        if "deflection" in asked:
-            bent = Rest.of(finger, pressure, float(table["load"][row]), start=free)
-            found["deflection"][row] = free.height - bent.height
-        if "tip_force" in asked:
-            held = Rest.of(finger, pressure, held=True, start=held)
-            found["tip_force"][row] = held.force
         if "blocked_force" in asked:
             found["blocked_force"][row] = pressure * finger.gain[0] / finger.length
+        if "tip_force" in asked:
+            with contextlib.suppress(NoRest):
+                held = Rest.of(finger, pressure, held=True, start=held)
+                found["tip_force"][row] = held.force
+        if asked & {"angle", "deflection"}:
+            with contextlib.suppress(NoRest):
+                free = Rest.of(finger, pressure, start=free)
+                if "angle" in asked:
+                    found["angle"][row] = free.angles.sum()
+                if "deflection" in asked:
+                    bent = Rest.of(finger, pressure, float(table["load"][row]), start=free)
+                    found["deflection"][row] = free.height - bent.height
     return found
+
+
+def without_rest(
+    table: Mapping[str, np.ndarray], found: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Pressures [Pa] at which a finger has no rest, in rising order, by the column that lacks it.
+
+    Args:
+      found: What `predict` makes of the table.
+    """
+    lacking = {n: np.isfinite(table[n]) & np.isnan(v) for n, v in found.items()}
+    return {n: np.unique(table["pressure"][rows]) for n, rows in lacking.items() if rows.any()}
+
+
+def opposed(table: Mapping[str, np.ndarray], found: Mapping[str, np.ndarray]) -> list[str]:
+    """Columns that were measured with the other sign than that of `predict`, most of their rows."""
+    return [n for n, v in found.items() if np.nansum(v * table[n]) < 0]
 
 
 class Fit(NamedTuple):
@@ -212,7 +210,7 @@ class Fit(NamedTuple):
     shear_modulus: float  # G [Pa]
     gain: float  # factor on the moment per pressure
     # Standard errors of their logarithms if all rows of a column err alike; 0 for what was not
-    # fitted
+    # fitted, NaN where there are no more different values than numbers
     spread: tuple[float, float]
 
 
@@ -231,9 +229,14 @@ def fit(finger: Finger, table: Mapping[str, np.ndarray]) -> Fit:
     """Fits G, and where the measurement gives it the gain, by least squares.
 
     Every column counts by its errors relative to its root mean square, each row once.
+
+    Raises:
+      ValueError: If the measurement does not give them, its signs are not the model's, or the
+        finger has no rest where something was measured.
     """
     free = np.array(fitted(table))
-    names = [n for n in MEASURED if n in table]
+    names = [n for n in MEASURED if n in table and np.isfinite(table[n]).any()]
+    _refuse_values(finger, table, names)
     sizes = {n: math.sqrt(np.nanmean(table[n] ** 2)) for n in names}
 
     def material(logs: np.ndarray) -> tuple[float, float]:
@@ -242,130 +245,52 @@ def fit(finger: Finger, table: Mapping[str, np.ndarray]) -> Fit:
         return finger.shear_modulus * math.exp(full[0]), math.exp(full[1])
 
     def residual(logs: np.ndarray) -> np.ndarray:
-        model = predict(finger.of_material(*material(logs)), table)
+        modulus, gain = material(logs)
+        model = predict(finger.of_material(modulus, gain), table)
+        if lacking := without_rest(table, model):
+            lowest = min(v.min() for v in lacking.values())
+            words = f"a finger of G = {modulus / 1e3:.4g} kPa has no rest at {lowest / 1e3:g} kPa"
+            raise NoRest(f"{words}: {TOO_FAR}")
         errors = np.concatenate([(model[n] - table[n]) / sizes[n] for n in names])
         return errors[np.isfinite(errors)]
 
-    start = np.zeros(free.sum())
-    count = len(residual(start))
-    if count < len(start):
-        raise ValueError(f"{count} measured value does not give {len(start)} numbers")
-    found = optimize.least_squares(residual, start, x_scale=0.3, diff_step=1e-4)
-    variance = 2 * found.cost / max(count - len(start), 1)
+    numbers, count = int(free.sum()), _different_values(table, names)
+    if count < numbers:
+        raise ValueError(f"{count} measured value does not give {numbers} numbers")
+    found = optimize.least_squares(residual, np.zeros(numbers), x_scale=0.3, diff_step=1e-4)
+    if np.linalg.matrix_rank(found.jac) < numbers:
+        raise ValueError("the measured values do not depend on what is fitted to them")
     spread = np.zeros(2)
-    spread[free] = np.sqrt(variance * np.diag(np.linalg.inv(found.jac.T @ found.jac)))
+    spread[free] = math.nan
+    if count > numbers:
+        variance = 2 * found.cost / (len(found.fun) - numbers)
+        spread[free] = np.sqrt(variance * np.diag(np.linalg.inv(found.jac.T @ found.jac)))
     return Fit(*material(found.x), (float(spread[0]), float(spread[1])))
 
 
-def read(path: Path) -> dict[str, np.ndarray]:
-    """Reads measurements: a CSV whose head names columns with their units, as in angle_deg.
-
-    Lines that begin with # are comments. A cell without a value leaves that quantity out of its
-    row.
-
-    Returns:
-      Columns of `COLUMNS` that the file has [SI units], shape (row,); NaN for an empty cell.
-    """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            text = file.read(_MOST_LETTERS + 1)
-            lines = [(n, line) for n, line in enumerate(io.StringIO(text, newline=""), 1)]
-    except (OSError, UnicodeDecodeError) as error:
-        why = getattr(error, "strerror", None) or "no UTF-8 text"
-        raise InputError([f"{path}: {why}"]) from error
-    if len(text) > _MOST_LETTERS:
-        raise InputError([f"{path} has more than {_MOST_LETTERS:,} characters"])
-    lines = [(n, v) for n, v in lines if v.strip() and not v.lstrip().startswith("#")]
-    if not lines:
-        raise InputError(
-            [f"{path} is empty; its head names columns, such as pressure_kPa,angle_deg"]
+def _refuse_values(finger: Finger, table: Mapping[str, np.ndarray], names: list[str]) -> None:
+    """Refuses columns that no material explains: of zeros, and of the other sign."""
+    for name in names:
+        if not np.nan_to_num(table[name]).any():
+            raise ValueError(f"every measured {_words(name)} is 0: there is nothing to fit")
+    if not table["pressure"].any() and "deflection" not in names:
+        raise ValueError("every pressure is 0: there is nothing to fit")
+    if wrong := opposed(table, predict(finger, table)):
+        raise ValueError(
+            f"{' and '.join(map(_words, wrong))} of the other sign than the model's: bending "
+            "under pressure, and what resists it, count as positive; change the signs in the file"
         )
-    head, *rows = (_row(path, number, line) for number, line in lines)
-    names, factors, problems = _columns([c.strip() for c in head])
-    values = []
-    for (number, _), row in zip(lines[1:], rows, strict=True):
-        if len(row) != len(head):
-            problems.append(f"line {number} has {len(row)} cells, the head {len(head)}")
-            continue
-        values.append(
-            [
-                _cell(cell, f"line {number}, {h}", problems)
-                for cell, h in zip(row, head, strict=True)
-            ]
-        )
-    if not problems:
-        table = dict(
-            zip(
-                names,
-                np.array(values).reshape(-1, len(names)).T * np.array(factors)[:, None],
-                strict=True,
-            )
-        )
-        problems = _missing(table)
-    if problems:
-        raise InputError([f"{path}: {p}" for p in problems])
-    return table
 
 
-def _row(path: Path, number: int, line: str) -> list[str]:
-    """The cells of a line; quotes that leave it are refused."""
-    try:
-        [cells] = csv.reader([line], strict=True)
-    except (csv.Error, ValueError) as error:
-        raise InputError([f"{path}: line {number} is no row of cells: {error}"]) from error
-    return cells
+def _different_values(table: Mapping[str, np.ndarray], names: list[str]) -> int:
+    """Number of measured values; a row that is repeated to the last digit counts once."""
+    loads = table.get("load", np.zeros_like(table["pressure"]))
+    count = 0
+    for name in names:
+        rows = np.stack([table["pressure"], np.nan_to_num(loads), table[name]], 1)
+        count += len(np.unique(rows[np.isfinite(table[name])], axis=0))
+    return count
 
 
-def _columns(head: list[str]) -> tuple[list[str], list[float], list[str]]:
-    names, factors, problems = [], [], []
-    for column in head:
-        name, _, unit = column.rpartition("_")
-        if name not in COLUMNS:
-            known = [
-                f"{n}_{u}"
-                for n, (kind, _) in COLUMNS.items()
-                for u, (k, _) in UNITS.items()
-                if k == kind
-            ]
-            problems.append(f"column {column!r} is not valid; {nearest(column, known)}")
-            continue
-        kind = COLUMNS[name][0]
-        units = [u for u, (k, _) in UNITS.items() if k == kind]
-        if unit not in units:
-            problems.append(f"column {column!r}: unit {unit!r} is not one of {', '.join(units)}")
-            continue
-        if name in names:
-            problems.append(f"column {name!r} is given more than once")
-        names.append(name)
-        factors.append(UNITS[unit][1])
-    return names, factors, problems
-
-
-def _cell(text: str, where: str, problems: list[str]) -> float:
-    if not text.strip():
-        return math.nan
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        problems.append(f"{where} = {text.strip()!r} must be a number")
-    return value
-
-
-def _missing(table: dict[str, np.ndarray]) -> list[str]:
-    if "pressure" not in table:
-        return ["no column of the pressure, such as pressure_kPa"]
-    names = [n for n in MEASURED if n in table and np.isfinite(table[n]).any()]
-    problems = []
-    if not names:
-        problems.append(f"no measured value; columns of them: {', '.join(MEASURED)}")
-    if np.isnan(table["pressure"]).any():
-        problems.append("a row has no pressure")
-    elif (table["pressure"] < 0).any():
-        problems.append("a pressure is below 0; gauge pressures are meant")
-    if "deflection" in table:
-        loads = table.get("load", np.full(len(table["pressure"]), np.nan))
-        if np.isnan(loads[np.isfinite(table["deflection"])]).any():
-            problems.append("a deflection has no load beside it, in a column such as load_N")
-    return problems
+def _words(name: str) -> str:
+    return name.replace("_", " ")

@@ -40,6 +40,11 @@ def is_own(name: str) -> bool:
 
 def problem(name: str) -> str | None:
     """What is wrong with the name itself, in words; nothing is imported."""
+    module, colon, attribute = name.rpartition(":")
+    if colon and module.endswith(".py"):
+        dotted = ".".join(Path(module.removesuffix(".py")).parts)
+        if _NAME.fullmatch(better := f"{dotted}:{attribute}"):
+            return f"{name!r} names a file in place of a module; did you mean {better}?"
     if _NAME.fullmatch(name):
         return None
     return f"{name!r} must be MODULE:NAME, such as mine:Search for the class Search of mine.py"

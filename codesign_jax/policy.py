@@ -36,7 +36,7 @@ from codesign_jax.engines.structured.laws.kinematics import State, kinematics
 from codesign_jax.engines.structured.world_model import WorldModel, world_constants
 from codesign_jax.model import ModelFields
 from codesign_jax.model.layout import WRIST, layout
-from codesign_jax.scene import Scene, key_frames
+from codesign_jax.scene import Scene, key_frames, unit_slips
 from codesign_jax.scene.hand import highest_pressure
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Forces, Params, Trace, Trial
@@ -202,26 +202,54 @@ class ControlLoop(Equal):
         Raises:
           InputError: As `rollout`.
         """
+        return self._rehearsed(params, trial, 1)
+
+    def rehearsed(self, params: Params, trial: Trial) -> Command:
+        """What the policy commands over a grasp in which nothing moves, shape (step, ...).
+
+        It is asked in every whole period and observes hand and object where they begin, while time
+        and key frames go on: nothing is simulated.
+
+        Raises:
+          InputError: As `rollout`.
+        """
+        return self._rehearsed(params, trial, max(1, self.scene.num_steps // self.steps))
+
+    def _rehearsed(self, params: Params, trial: Trial, periods: int) -> Command:
         params, trial = jax.tree.map(lambda v: jnp.asarray(v)[None], (params, trial))
         fields = jax.vmap(partial(model.model_fields, self.scene))(params, trial)
         plan = jax.vmap(partial(control.plan, self.scene))(params, trial)
-        series = {k: getattr(plan, k)[:, : self.steps] for k in ("pose", "pressure", "shake")}
+        steps = min(self.steps, self.scene.num_steps)
+        series = {k: getattr(plan, k)[:, : periods * steps] for k in ("pose", "pressure", "shake")}
         hand, world = world_constants(self.scene, fields), begin(self.scene, fields, plan)
+        state = model.split(self.scene, world.state)
+
+        def period(memory: Any, now: tuple) -> tuple[Any, Command]:
+            taken, ahead = now
+            at = jnp.full_like(state.step, taken)
+            there = world._replace(state=jnp.concatenate(state._replace(step=at), -1))
+            return self._asked(hand, fields, there, memory, plan._replace(**ahead))
+
+        cut = {k: _split(v, periods) for k, v in series.items()}
         memory = self._remembered(params)
-        command = self._asked(hand, fields, world, memory, plan._replace(**series))[1]
-        return jax.tree.map(lambda v: v[0], command)
+        if periods == 1:
+            command = period(memory, (0, {k: v[0] for k, v in cut.items()}))[1]
+            return jax.tree.map(lambda v: v[0], command)
+        _, command = jax.lax.scan(period, memory, (steps * jnp.arange(periods), cut))
+        return jax.tree.map(lambda v: _joined(v)[0], command)
 
     def _asked(
         self, hand: WorldModel, fields: ModelFields, world: World, memory: Any, plan: Plan
     ) -> tuple[Any, Command]:
         answer = jax.vmap(self.policy)(memory, observe(self.engine, hand, fields, world, plan))
         if not (isinstance(answer, tuple) and [*map(type, answer[1:])] == [Command]):
-            raise InputError([f"{self._called} must return (carry, policy.Command)"])
+            raise InputError([f"{self.called} must return (carry, policy.Command)"])
         self._refuse_memory(memory, answer[0])
-        return answer[0], spread(self.scene, answer[1], plan, of=self._called)
+        return answer[0], spread(self.scene, answer[1], plan, of=self.called)
 
     @property
-    def _called(self) -> str:
+    def called(self) -> str:
+        """The policy's name for messages."""
         return f"policy {getattr(self.policy, '__name__', type(self.policy).__name__)}"
 
     def _remembered(self, params: Params) -> Any:
@@ -241,7 +269,7 @@ class ControlLoop(Equal):
             words = [f"{k}, in the tree {t[1]}" for k, t in zip(kinds, trees, strict=True)]
             raise InputError(
                 [
-                    f"{self._called} must remember arrays like those of its init: {words[0]}; "
+                    f"{self.called} must remember arrays like those of its init: {words[0]}; "
                     f"it returned {words[1]}"
                 ]
             )
@@ -254,7 +282,7 @@ class ControlLoop(Equal):
         names = [*WRIST, *(f"pressure[{i}]" for i in range(ctrl.shape[2] - 6))]
         time = f"{step * self.scene.discretization.timestep:.4g} s"
         value = f"{names[column]} = {float(ctrl[world, step, column])}"
-        raise InputError([f"{self._called} commands {value} at {time} in world {world}"])
+        raise InputError([f"{self.called} commands {value} at {time} in world {world}"])
 
 
 def searched(scene: Scene, policy: Policy) -> Scene:
@@ -268,6 +296,15 @@ def searched(scene: Scene, policy: Policy) -> Scene:
     more = dataclasses.replace(scene.control, parameter=(*scene.control.parameter, *new))
     hand = key_frames.with_parameters(scene.hand, dataclasses.replace(more, parameter=new))
     return dataclasses.replace(scene, control=more, hand=hand)
+
+
+def doubts(loop: ControlLoop, params: Params, trial: Trial) -> list[str]:
+    """What is no error in a policy's commands, and hardly meant: kPa for Pa."""
+    command = jax.jit(loop.rehearsed)(params, trial)
+    words = unit_slips.kilopascals(np.asarray(command.pressure))
+    if not words:
+        return []
+    return [f"{loop.called}: the highest pressure that it commands while nothing moves {words}"]
 
 
 def period_steps(scene: Scene, period: float | None) -> int:

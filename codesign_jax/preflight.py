@@ -35,7 +35,9 @@ def notes(scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray]) -
     found = refusals(scene, params, [*designs])
     if found:
         raise InputError(found)
-    return [f"warning: {text}" for text in warnings(scene, params, [*designs])] + mesh_notes(scene)
+    told = [f"warning: {text}" for text in warnings(scene, params, [*designs])]
+    idle = [f"not searched: {name}, which has no effect: {why}" for name, why in space.idle]
+    return told + idle + mesh_notes(scene)
 
 
 def warnings(scene: Scene, designs: Params, names: list[str]) -> list[str]:
@@ -73,7 +75,7 @@ def mesh_notes(scene: Scene) -> list[str]:
 
 
 def _scene_warnings(scene: Scene) -> list[str]:
-    h, found = scene.discretization.timestep, []
+    h, found = scene.discretization.timestep, key_frames.doubts(scene, "control")
     rate = scene.arm.shake_frequency
     if scene.effects.disturb and rate * h * SHAKE_STEPS > 1:
         found.append(

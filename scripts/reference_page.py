@@ -28,6 +28,7 @@ from codesign_jax.scene import (
     key_frames,
     objects,
     primitives,
+    sums,
 )
 from codesign_jax.scene import load as load_scene
 
@@ -114,7 +115,7 @@ def _inner(schema: type, field: dataclasses.Field) -> type | None:
     """The dataclass of a table or of an array of tables, None of a value."""
     hint = field.metadata.get("table", typing.get_type_hints(schema)[field.name])
     for kind in (hint, *typing.get_args(hint)):
-        if dataclasses.is_dataclass(kind) and kind is not key_frames.Sum:
+        if dataclasses.is_dataclass(kind) and kind is not sums.Sum:
             return typing.cast(type, kind)
     return None
 
@@ -159,7 +160,7 @@ def _limits(schema: type, field: dataclasses.Field) -> tuple[str, str, str]:
     """Unit, range and default of a field."""
     hint, limits = typing.get_type_hints(schema)[field.name], field.metadata
     if "unit" in limits and "low" not in limits:  # a sum of a control file
-        low, high = key_frames.RANGES[limits["unit"]]
+        low, high = sums.RANGES[limits["unit"]]
         limits = {**limits, "low": low, "high": high, "structure": False}
     if "low" in limits:
         mark = f"{_SPACE}◆" if limits["structure"] else ""

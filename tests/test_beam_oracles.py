@@ -7,6 +7,7 @@ positions are taken in the palm's frame, so that the wrist's remaining complianc
 
 import dataclasses
 import functools
+import re
 
 import mujoco
 import numpy as np
@@ -15,7 +16,7 @@ from scipy import integrate, linalg, optimize, special
 
 from codesign_jax import cli, finger, model, scene
 from codesign_jax.model import morphology
-from codesign_jax.scene import hand, parameters
+from codesign_jax.scene import hand, keypaths, parameters
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Params, Tip, Trial
 from tests.helpers.grasps import off, pinch
@@ -585,7 +586,32 @@ def test_a_file_is_read_in_its_units(tmp_path):
     np.testing.assert_allclose(table["deflection"], [np.nan, 0.015])
 
 
+SPELLINGS = {
+    "commas": "pressure_kPa,angle_deg\n20,18.9\n40,-37.2\n",
+    "semicolons and decimal commas": "pressure_kPa;angle_deg\n20;18,9\n40;-37,2\n",
+    "semicolons and points": "pressure_kPa;angle_deg\r\n20;18.9\r\n40;-37.2\r\n",
+    "tabs": "pressure_kPa\tangle_deg\n20\t18,9\n40\t-37.2\n",
+    "a line for Excel": "\ufeffsep=;\npressure_kPa;angle_deg\n20;18,9\n40;-37,2\n",
+    "empty columns": "pressure_kPa;angle_deg;;\n20;18,9;;\n40;-37,2;;\n",
+    "a typographic minus": "pressure_kPa,angle_deg\n20,18.9\n40,\N{MINUS SIGN}37.2\n",
+    "quotes": 'pressure_kPa,angle_deg\n"20","18.9"\n"40","-37.2"\n',
+}
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+def test_a_table_is_read_as_spreadsheets_write_it(spelling, tmp_path):
+    path = tmp_path / "finger.csv"
+    path.write_bytes(SPELLINGS[spelling].encode())
+    table = finger.read(path)
+    np.testing.assert_allclose(table["pressure"], [20e3, 40e3])
+    np.testing.assert_allclose(np.rad2deg(table["angle"]), [18.9, -37.2])
+
+
 WRONG = {
+    "pressure_kPa,angle_deg\n20,18,9": "line 2 has 3 cells, the head 2; beside a decimal comma",
+    "pressure_kPa;angle_deg\n20;1.018,9": "line 2, angle_deg = '1.018,9' must be a number",
+    "pressure_kPa angle_deg\n20 18.9": "columns are separated by commas, semicolons or tabs",
+    'pressure_kPa,angle_deg\n"1,2\n3,4': "line 2 is no row of cells: unexpected end of data",
     "presure_kPa,angle_deg\n1,2": "did you mean 'pressure_kPa'?",
     "pressure_kPa,pressure_Pa,angle_deg\n1,1,2": "column 'pressure' is given more than once",
     "# a\npressure_kPa,angle_deg\n\n1,x": "line 4, angle_deg = 'x' must be a number",
@@ -609,6 +635,73 @@ def test_a_wrong_file_is_refused(text, tmp_path):
     with pytest.raises(InputError, match="finger.csv") as error:
         finger.read(path)
     assert WRONG[text] in str(error.value)
+
+
+UNFIT = {
+    "angle_deg\n20,0\n40,0": "every measured angle is 0: there is nothing to fit",
+    "blocked_force_N\n20,0\n40,": "every measured blocked force is 0",
+    "angle_deg\n0,1\n0,2": "every pressure is 0",
+    "angle_deg\n20,-18.9\n40,-37.2": "angle of the other sign than the model's",
+    "angle_deg,tip_force_N\n20,19,-0.5\n40,37,-1": "tip force of the other sign than the model's",
+    "angle_deg\n10,400": "fitted: G = 821.3 is outside [1000, 1e+07] Pa",
+    "angle_deg\n40,1e-3": "is outside [1000, 1e+07] Pa",
+    "angle_deg,tip_force_N\n20,19,\n20,19,": "does not give 2 numbers",
+}
+"""Measurements without `pressure_kPa,` before them that no material explains."""
+
+
+@pytest.mark.parametrize("text", UNFIT)
+def test_what_no_material_explains_is_refused(text, tmp_path, capsys):
+    path = tmp_path / "finger.csv"
+    path.write_text(f"pressure_kPa,{text}\n")
+    assert cli.main(["finger", str(path), "--fit", "--set", "discretization.links=3"]) == 2
+    said = capsys.readouterr()
+    assert UNFIT[text] in said.err and "--set" not in said.out
+
+
+FITTED = {
+    "angle_deg\n40,37.2": None,
+    "angle_deg\n40,37.2\n40,37.2": None,
+    "angle_deg,tip_force_N\n40,37.2,0.6": None,
+    "angle_deg\n40,37.2\n40,38": (0.4, 2.0),
+    "angle_rad\n20,0.33\n40,0.65\n60,0.99": (0.2, 2.0),
+    "load_N,deflection_mm\n0,0.1,2\n0,0.2,4.1": (0.2, 4.0),
+}
+"""Likewise, with the range of the standard error [%] or None for none."""
+
+
+@pytest.mark.parametrize("text", FITTED)
+def test_a_standard_error_needs_more_values_than_numbers(text, tmp_path, capsys):
+    """And what the command proposes is a value that a scene takes."""
+    path = tmp_path / "finger.csv"
+    path.write_text(f"pressure_kPa,{text}\n")
+    assert cli.main(["finger", str(path), "--fit", "--set", "discretization.links=3"]) == 0
+    said = capsys.readouterr().out
+    errors = [float(e) for e in re.findall(r"standard error ([0-9.e+-]+) %", said)]
+    if FITTED[text] is None:
+        assert not errors and "no standard error (as many numbers as values)" in said
+    else:
+        low, high = FITTED[text]
+        assert all(low < error < high for error in errors) and errors
+    [proposed] = re.findall(r"--set (\S+)", said)
+    value = scene.load("paper", overrides=keypaths.parse([proposed])).hand.material.shear_modulus
+    assert value == pytest.approx(float(proposed.partition("=")[2]))
+
+
+def test_rows_that_have_a_rest_are_printed_and_the_others_named(tmp_path, capsys):
+    """Also with measurements, whose signs are compared with the model's without a fit."""
+    soft = ["--set", "hand.material.shear_modulus=8.9e3", "discretization.links=3"]
+    assert cli.main(["finger", *soft]) == 0
+    said = capsys.readouterr().out
+    rows = [line.split() for line in said.splitlines() if re.match(r" +\d", line)]
+    assert len(rows) == 11 and len(rows[3]) == 4 and len(rows[-1]) == 3
+    assert re.search(r"warning: model: no rest found for the tip force at [\d, ]*120 kPa", said)
+    path = tmp_path / "finger.csv"
+    path.write_text("pressure_kPa,angle_deg,tip_force_N\n30,-20,\n120,,3\n")
+    assert cli.main(["finger", str(path), *soft]) == 0
+    said = capsys.readouterr().out
+    assert "no rest found for the tip force at 120 kPa" in said
+    assert "warning: measured and predicted angle differ in sign" in said
 
 
 def test_the_command_compares_and_fits(tmp_path, capsys):

@@ -1,6 +1,9 @@
 """Numbers of a scene are data, its effects are structure: what compiles, and what is refused."""
 
+import copy
 import dataclasses
+import pickle
+import re
 from functools import partial
 
 import jax
@@ -188,6 +191,48 @@ def test_bad_numbers_are_named_before_anything_runs(message):
     with pytest.raises(schema.InputError) as error:
         constants.check(other)
     assert message in str(error.value)
+
+
+NOT_OF_A_FILE = {
+    "scene.gravity = -9.81 is outside [0, 100] m/s^2": lambda s: ("gravity", -9.81),
+    "scene.gravity = '3.7' must be a number in [0, 100]": lambda s: ("gravity", "3.7"),
+    "scene.gravity = nan is outside": lambda s: ("gravity", np.float32("nan")),
+    "scene.gravity = -1.0 is outside": lambda s: ("gravity", np.array([1.0, -1.0])),
+    "scene.gravity = 200.0 is outside": lambda s: ("gravity", jnp.float32(200)),
+    "material.shear_modulus = 60.0 is outside [1000, 1e+07] Pa; did you mean 60000?": lambda s: (
+        "hand", dataclasses.replace(s.hand.material, shear_modulus=60)
+    ),
+    "finger.base[1] = 36.0 is outside [-0.2, 0.2] m": lambda s: (
+        "hand", dataclasses.replace(s.hand.finger[0], base=(0.0, 36.0), radius=None)
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("message", NOT_OF_A_FILE)
+def test_what_a_file_is_refused_no_scene_is_made_of(message):
+    the_scene = short()
+    with pytest.raises(schema.InputError, match=re.escape(message)):
+        name, value = NOT_OF_A_FILE[message](the_scene)
+        dataclasses.replace(the_scene, **{name: value})
+
+
+def test_what_is_not_known_and_what_jax_makes_is_let_pass():
+    """Tracers, trees of anything, a float32 of a bound; and a tree has all of its scene."""
+    the_scene = short()
+    for value in (np.float32(100.0), jnp.zeros(3), 3):
+        assert dataclasses.replace(the_scene, gravity=value).gravity is value
+    way = jax.tree.map(lambda v: -1e9, the_scene)
+    assert way.hand.material.shear_modulus == -1e9 and way.num_steps == the_scene.num_steps
+
+    def weigh(gravity):
+        return dataclasses.replace(the_scene, gravity=gravity).gravity
+
+    assert float(jax.jit(jax.grad(weigh))(-1.0)) == 1.0
+    again = jax.tree.unflatten(*reversed(jax.tree.flatten(the_scene)))
+    assert again == the_scene and hash(again) == hash(the_scene)
+    paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(the_scene)]
+    assert ".hand.material.shear_modulus" in map(jax.tree_util.keystr, paths)
+    assert copy.deepcopy(the_scene) == pickle.loads(pickle.dumps(the_scene)) == the_scene
 
 
 # --- effects: inert without a stimulus, not in the program if off, refused in words ---------------

@@ -13,7 +13,7 @@ import tomli_w
 
 from codesign_jax import control, parameters, rollout, scene
 from codesign_jax.runs.scene_files import write_scene
-from codesign_jax.scene import library
+from codesign_jax.scene import key_frames, library, sums
 
 CONTROLS = library.available("controls")
 PAGE = Path(__file__).parent.parent / "docs" / "control.md"
@@ -130,8 +130,34 @@ BAD = {
     ],
     "frame[1].z: 'pressure' has the unit Pa, not m": [{"time": 0}, FRAME | {"z": "pressure"}],
     "frame[1].z = 'arm_z zero_height' is no sum": [{"time": 0}, FRAME | {"z": "arm_z zero_height"}],
-    "frame[0].time = 1000": [{"time": 10**400}],
     "is too large": [{"time": 0}, FRAME | {"pressure": [10**310, 0, 0, 0]}],
+    "frame[1].z = 'arm_z * arm_x' multiplies 'arm_z' by 'arm_x'": [
+        {"time": 0}, FRAME | {"z": "arm_z * arm_x"}
+    ],
+    "frame[1].z = '1 / arm_z' divides by 'arm_z', but only numbers divide": [
+        {"time": 0}, FRAME | {"z": "1 / arm_z"}
+    ],
+    "frame[1].z = '2 * (arm_z)' is no sum of numbers and names, each with a factor if need be: it "
+    "has brackets": [{"time": 0}, FRAME | {"z": "2 * (arm_z)"}],
+    "at its end": [{"time": 0}, FRAME | {"z": "arm_z -"}],
+    "has the character '\N{DEGREE SIGN}' (U+00B0 DEGREE SIGN)": [
+        {"time": 0}, FRAME | {"pitch": "30\N{DEGREE SIGN}"}
+    ],
+    "the decimal sign is a point": [{"time": 0}, FRAME | {"z": "arm_z - 0,01"}],
+    "numbers there are in Pa and have no unit; did you mean 150000 for 150 kPa?": [
+        {"time": 0}, FRAME | {"pressure": "150 kPa"}
+    ],
+    "did you mean 10 for 10 deg?": [{"time": 0}, FRAME | {"pitch": "arm_pitch + 10deg"}],
+    "has the unit 'psi', but numbers there are in m and have no unit": [
+        {"time": 0}, FRAME | {"z": "zero_height + 3 psi"}
+    ],
+    "has the number 95, which is outside [-2, 2] m; did you mean 0.095?": [
+        {"time": 0}, FRAME | {"z": "zero_height + 95"}
+    ],
+    "has the factor 1000 of 'arm_z', which is outside [-100, 100]": [
+        {"time": 0}, FRAME | {"z": "1e3 * arm_z"}
+    ],
+    "is outside [-60, 60] s": [{"time": 0}, {"time": 10**400}],
     "frame[1].pressure has 3 entries, the hand 4 fingers": [
         {"time": 0}, FRAME | {"pressure": [0, 0, 0]}
     ],
@@ -152,6 +178,76 @@ def test_bad_frames_are_refused_with_their_key(message, tmp_path):
     with pytest.raises(scene.InputError) as error:
         load(write(tmp_path, frame=BAD[message]))
     assert message in str(error.value) and len(error.value.problems) <= 4  # one a finger
+
+
+DOUBTS = {
+    "control.frame[1].pressure: its number is 80 Pa, next to none; did you mean 80000? (kPa": [
+        {"time": 0}, FRAME | {"pressure": 80}
+    ],
+    "control.frame[1].pressure: its number is 20 Pa, next to none; did you mean 20000? (kPa": [
+        {"time": 0}, FRAME | {"pressure": {"few": "0.5 * pressure + 20"}}
+    ],
+    "control.frame[1].pressure: its number is 0.8 Pa, next to none: pressures are in Pa": [
+        {"time": 0}, FRAME | {"pressure": 0.8}
+    ],
+    "control.frame[1].time = 20.0 is never reached: the grasp ends after 4.5 s": [
+        {"time": 0}, {"time": 20, "pressure": 0}
+    ],
+    "control.frame[1].time = 'release + 60.0' is never reached: the grasp ends after 9 s": [
+        {"time": 0}, {"time": "release + 60", "pressure": 0}
+    ],
+    "control.frame[1].time = '8.0 * wait + 2.0' is not reached in some designs": [
+        {"time": 0}, {"time": "8 * wait + 2", "pressure": 0}
+    ],
+    "control: no key frame reads arm_x, arm_z, pressure: without a policy it has no effect": [
+        {"time": 0, "x": 0.1, "z": 0.2}, FRAME | {"x": 0.2, "pressure": 50e3}
+    ],
+    "": [
+        {"time": 0}, FRAME | {"z": "arm_z", "pressure": "0.5 * pressure + 2e3"},
+        {"time": 4.5, "pressure": 0},
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("message", DOUBTS)
+def test_what_is_hardly_meant_is_told_and_simulated(message, tmp_path):
+    path = write(tmp_path, frame=DOUBTS[message], group={"few": [0]})
+    found = key_frames.doubts(load(path, **{"effects.ungrasp": False}), "control")
+    found = [text for text in found if message in text or "no key frame reads" not in text]
+    assert [text[: len(message)] for text in found] == ([message] if message else [])
+
+
+def test_a_parameter_of_the_control_in_the_wrong_unit_is_told(tmp_path):
+    squeeze = {"name": "squeeze", "unit": "Pa", "low": 0, "high": 80, "default": 40}
+    frames = [{"time": 0}, FRAME | {"pressure": "squeeze"}]
+    found, _ = key_frames.doubts(
+        load(write(tmp_path, parameter=[squeeze], frame=frames)), "control"
+    )
+    assert "parameter squeeze: the largest pressure is 80 Pa, next to none" in found
+
+
+@pytest.mark.parametrize("name", CONTROLS)
+def test_nothing_is_told_of_what_ships(name):
+    """With and without the phases that its frames name."""
+    for off in ({}, {"effects.ungrasp": False}, {"effects.disturb": True}):
+        assert not key_frames.doubts(load(name, **off), "control")
+
+
+SPELLINGS = [
+    "pressure * 0.5", "0.5*pressure", "0.5 pressure", "pressure / 2", "1 / 2 * pressure",
+    "2 * pressure / 4", "+ .5 \N{MULTIPLICATION SIGN} pressure", "5e-1\N{MIDDLE DOT}pressure",
+    "0.5\N{NO-BREAK SPACE}* pressure",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+def test_a_factor_may_stand_before_and_behind_a_name(spelling):
+    half = sums.Sum("Pa", None, (sums.Term("pressure", 0.5),))
+    assert sums.read(spelling, "Pa") == half
+    for minus in ("-", "\N{MINUS SIGN}", "\N{EN DASH}", "\N{HYPHEN}"):
+        found = sums.read(f"{spelling} {minus} 3e3 {minus} 2*push", "Pa")
+        assert found == sums.Sum("Pa", -3e3, (*half.term, sums.Term("push", -2.0)))
+        assert sums.read(sums.text(found), "Pa") == found
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ axes model control verdict
 engines cost
 start policy
 rollout
-own preflight
+own preflight measurements
 codesign env finger sampling
 batch
 runs

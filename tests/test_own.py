@@ -68,6 +68,10 @@ def low(scene, trace, ctrl):
     return jnp.abs(0.2 - trace.at(scene, "disturb").height) + lift
 
 
+def late(carry, seen):
+    return carry, seen.plan._replace(pressure=jnp.where(seen.phase > 0, 80.0, 0.0) + jnp.zeros(2))
+
+
 class Pull:
     """Moves the hand aside by a searched share of a metre, once fingers move."""
 
@@ -210,11 +214,27 @@ def test_a_policy_is_searched_and_said_wherever_it_acts(here, capsys):
     assert one is other  # its programs are compiled once
 
 
+def test_a_dry_run_tells_of_a_policy_that_commands_kilopascals(here, capsys):
+    """It is asked over the whole grasp, most of which begins with empty chambers."""
+    dry = ["evaluate", "--scene", str(TINY), "--engine", "mujoco", "--dry-run", "--policy"]
+    assert cli.main([*dry, "mine:Pull"]) == 0
+    assert "while nothing moves" not in capsys.readouterr().out
+    assert cli.main([*dry, "mine:late"]) == 0
+    said = capsys.readouterr().out
+    assert "policy late: the highest pressure that it commands while nothing moves is 80 Pa" in said
+    assert "did you mean 80000?" in said
+    assert cli.main([*RUN, "--policy", "mine:late", "--out", "run", "--dry-run"]) == 0
+    assert "did you mean 80000?" in capsys.readouterr().out
+
+
 WRONG = {
     "--cost nobodys:low": "there is no module 'nobodys' in ",
     "--cost mine:no_function": "it is int, not a function of (scene, trace, ctrl)",
     "--cost mine:series": "ValueError: a cost is one number for each world, not an array",
     "--cost broken:low": "importing it fails: ZeroDivisionError: division by zero (",
+    "--policy mine.py:Pull": "names a file in place of a module; did you mean mine:Pull?",
+    "--cost ./mine.py:low": "names a file in place of a module; did you mean mine:low?",
+    "--optimizer ideas/mine.py:Climber": "did you mean ideas.mine:Climber?",
     "--policy mine:Narrow": "returned pressure of shape (7,), not (2,) or (5, 2)",
     "--optimizer mine:Forgetful": "tell must return a state, with the arrays of init's",
     "--optimizer mine:low": "it must be a function of (space): ",

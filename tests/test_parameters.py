@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from codesign_jax import codesign, make_engine, rollout, scene
+from codesign_jax import cli, codesign, make_engine, rollout, scene
+from codesign_jax.commands import common
 from codesign_jax.scene import InputError, hand, parameters, schema, unit_slips
 from tests.helpers.toy_engine import TINY, tiny
 
@@ -273,3 +274,27 @@ def test_what_is_wrong_is_said(case):
 def test_it_is_said_while_tracing():
     with pytest.raises(InputError, match="params have no axis"):
         jax.jit(lambda p, t: simulate(p, t))(PARAMS, batch(TRIAL, 3))
+
+
+def test_a_spread_that_turns_no_finger_is_named_and_not_searched(capsys):
+    """It stays at its default, and the number of parameters says what is searched."""
+    flat = {f"hand.finger.{i}.spread": 0.0 for i in range(3)}
+    bare = scene.load("paper", hand_name="tripod3", overrides=flat).hand
+    space = parameters.design_space(bare)
+    assert "spread" not in space.names and space == parameters.design_space(bare, "18d")
+    assert space.idle == (("spread", "every finger has spread = 0"),)
+    assert not parameters.design_space(bare, "2d").idle
+    whole = parameters.design_space(scene.load("paper", hand_name="tripod3").hand)
+    assert float(space.params(space.default()).spread) == float(
+        whole.params(whole.default()).spread
+    )
+    with pytest.raises(InputError, match="--design 'spread' has no effect: every finger has"):
+        common.parse_design(space, ["spread=20"], space.default())
+    spread = hand.Preset("one", (hand.Free("spread"),))
+    alone = dataclasses.replace(bare, preset=(spread,))
+    with pytest.raises(InputError, match="leaves nothing to search: spread has no effect"):
+        parameters.design_space(alone, "one")
+    words = ["effects.finger_finger=false", *(f"{key}={value}" for key, value in flat.items())]
+    line = ["evaluate", "--hand", "tripod3", "--preset", "full", "--dry-run", "--set", *words]
+    assert cli.main(line) == 0
+    assert "not searched: spread, which has no effect" in capsys.readouterr().out

@@ -2,8 +2,11 @@
 
 import dataclasses
 import re
+import warnings
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -245,7 +248,7 @@ def test_what_is_no_policy_is_refused(step, attributes, problem):
     with pytest.raises(InputError, match="not a function"):
         policy.ControlLoop(make_engine("structured", scene), "react")
     with pytest.raises(InputError, match="not a whole number of time steps"):
-        env.GraspEnv(SCENE, period=0.033)
+        policy.period_steps(SCENE, 0.033)
     assert policy.period_steps(SCENE, 0.03) == 3
 
 
@@ -330,3 +333,142 @@ def test_a_vector_environment_begins_ended_grasps_with_new_noise(episode):
     assert not ended.any() and (reward == 0).all()
     before, after = states[0].data.trial.yaw, worlds._state.data.trial.yaw
     assert not (np.asarray(after) == np.asarray(before)).any()
+
+
+def test_an_action_that_is_no_number_ends_its_grasp_alone(episode):
+    """What is observed stays a number, so that a mean over observations does."""
+    _, _, worlds = episode
+    first, _ = worlds.reset(seed=5)
+    actions = np.zeros((4, 2), np.float32)
+    actions[0, 1] = np.nan
+    obs, reward, ended, _, info = worlds.step(actions)
+    assert list(ended) == [True, False, False, False] and reward[0] == 0
+    np.testing.assert_array_equal(obs[0], first[0])
+    assert np.isfinite(obs).all() and np.isfinite(info["distance"]).all()
+    obs, _, ended, _, _ = worlds.step(np.zeros((4, 2)))
+    assert np.isfinite(obs).all() and not ended.any()
+
+
+NO_ENVIRONMENT = {
+    "period = 10 s is longer than a grasp, of 0.6 s": lambda: env.GraspEnv(SCENE, period=10.0),
+    "period = 0.61 s is longer than a grasp": lambda: env.GraspEnv(SCENE, period=0.61),
+    "period = 0.033 s is not a whole number of": lambda: env.GraspEnv(SCENE, period=0.033),
+    "engine mujoco tells no contact forces": lambda: env.GraspEnv(
+        SCENE, engine=cast(Any, SimpleNamespace(name="mujoco"))
+    ).observe(UNFELT),
+    "an action has shape (1,), not (2,)": lambda: acted(env.GraspEnv(SCENE), 1),
+    "an action has shape (), not (2,)": lambda: acted(env.GraspEnv(SCENE)),
+    "has shape (3, 2), not (2,); jax.vmap maps": lambda: acted(env.GraspEnv(SCENE), 3, 2),
+    "reset takes a key, as of jax.random.key(0), not 0": lambda: Counted(SCENE).reset(0),
+    "reset takes a key, as of jax.random.key(0), not Array([0., 0.]": lambda: Counted(SCENE).reset(
+        jnp.zeros(2)
+    ),
+    "reset takes one key, not (3,)": lambda: Counted(SCENE).reset(
+        jax.random.split(jax.random.key(0), 3)
+    ),
+    "reset takes one key, not (2,)": lambda: Counted(SCENE).reset(
+        jax.random.split(jax.random.PRNGKey(0), 2)
+    ),
+    "3 environments take actions of shape (3, 2), not (2, 2)": lambda: begun().step(
+        np.zeros((2, 2))
+    ),
+    "3 environments take actions of shape (3, 2), not (3, 1)": lambda: begun().step(
+        np.zeros((3, 1))
+    ),
+    "seed has 2 entries for 3 environments": lambda: begun().reset(seed=[1, 2]),
+    "a seed is a whole number, not 1.5": lambda: begun().reset(seed=[1, 2, 1.5]),
+}
+
+
+class Counted(env.GraspEnv):
+    """Observes its trial and counts actions: what wrappers need, without a simulation."""
+
+    def begin(self, trial):
+        zero = jnp.zeros(())
+        metrics = {"held": zero, "distance": zero}
+        return env.State(jnp.int32(0), jnp.stack([trial.yaw, zero]), zero, zero, metrics)
+
+    def step(self, state, action):
+        done = state.data >= 2
+        obs = state.obs.at[1].add(action.mean())
+        return state.replace(
+            data=state.data + 1, obs=obs, reward=obs[1], done=done.astype(obs.dtype)
+        )
+
+
+UNFELT: Any = SimpleNamespace(forces=None)
+"""What is observed with an engine that tells no forces."""
+
+
+def acted(grasp, *shape):
+    """What a step makes of an action, without values."""
+    state = jax.eval_shape(grasp.reset, jax.random.key(0))
+    return jax.eval_shape(grasp.step, state, jax.ShapeDtypeStruct(shape, jnp.float32))
+
+
+def begun():
+    worlds = vector.VectorEnv(Counted(SCENE), 3)
+    worlds.reset()
+    return worlds
+
+
+@pytest.mark.parametrize("problem", NO_ENVIRONMENT)
+def test_what_is_no_environment_key_or_action_is_refused_in_words(problem):
+    with pytest.raises(InputError, match=re.escape(problem)):
+        NO_ENVIRONMENT[problem]()
+
+
+def test_each_environment_draws_from_its_own_seed():
+    """As Gymnasium's: a number is the first one's, and None draws on."""
+    worlds = begun()
+    first, _ = worlds.reset(seed=[7, 8, 9])
+    assert len(np.unique(first[:, 0])) == 3
+    for seed in (7, np.int64(7), 7 + 2**32, np.array([7, 8, 9]), (7, 8, 9)):
+        np.testing.assert_array_equal(worlds.reset(seed=seed)[0], first)
+    mixed, _ = worlds.reset(seed=[8, None, 8])
+    assert mixed[0, 0] == mixed[2, 0] == first[1, 0] != mixed[1, 0]
+    np.testing.assert_array_equal(vector.VectorEnv(Counted(SCENE), 3, seed=7).reset()[0], first)
+    again, _ = worlds.reset(seed=-1)
+    assert worlds.observation_space.contains(again)
+
+
+@pytest.mark.parametrize("x64", [False, True])
+def test_single_environments_pass_gymnasium_s_check(x64):
+    """And what is observed lies in its space whatever precision JAX has."""
+    from gymnasium.utils import env_checker
+
+    with jax.enable_x64(x64), warnings.catch_warnings():
+        # Of spaces without ends, of an environment that is no registered one, and, of versions
+        # before 1.2, of a check that is left out.
+        warnings.filterwarnings("ignore", category=UserWarning, module="gymnasium")
+        single = vector.SingleEnv(Counted(SCENE))
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            single.step(np.zeros(2))
+        env_checker.check_env(single, skip_render_check=True)
+        assert single.observation_space.contains(single.reset(seed=3)[0])
+        steps = [single.step(np.full(2, 0.5, np.float32)) for _ in range(3)]
+        assert [(s[1], s[2]) for s in steps] == [(0.5, False), (1.0, False), (1.5, True)]
+        worlds = vector.VectorEnv(Counted(SCENE), 2)
+        obs, _ = worlds.reset(seed=0)
+        assert worlds.observation_space.contains(obs)
+        obs, reward, *_ = worlds.step(np.ones((2, 2), np.float32))
+        assert worlds.observation_space.contains(obs) and reward.dtype == np.float64
+
+
+@pytest.mark.slow  # a program and PyTorch; quick: Gymnasium's check above
+def test_stable_baselines3_trains_on_a_single_environment():
+    """Its own check of environments, and PPO for two updates."""
+    baselines = pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common.env_checker import check_env
+
+    single = vector.SingleEnv(env.GraspEnv(SCENE, period=0.1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of PyTorch, and of networks on a GPU that are small
+        check_env(single)
+        model = baselines.PPO("MlpPolicy", single, n_steps=12, batch_size=12, seed=0, device="cpu")
+        before = [p.clone() for p in model.policy.parameters()]
+        model.learn(24)
+    after = list(model.policy.parameters())
+    assert model.num_timesteps == 24 and len(model.ep_info_buffer) == 4  # of 6 actions each
+    assert all(p.isfinite().all() for p in after)
+    assert any((p != q).any() for p, q in zip(before, after, strict=True))

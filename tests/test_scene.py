@@ -1,16 +1,21 @@
 """Scene, hand and object files: every problem is found, said once, and said helpfully."""
 
 import dataclasses
+import re
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from codesign_jax import model, scene
+from codesign_jax.commands import common
 from codesign_jax.engines import make_engine
 from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import (
     constants,
     hand,
+    key_frames,
     keypaths,
     library,
     objects,
@@ -69,6 +74,57 @@ BY_PATH = {
     "hand.preset.2d.free.arm_z.high=150": lambda s: s.hand.preset[0].free[1].high == 150.0,
     "objects.object.sphere.mass=0.2": lambda s: s.objects.object[2].mass == 0.2,
 }
+
+
+OF_LIBRARIES = [
+    ("gravity", np.float32(3.75), 3.75),
+    ("gravity", jnp.bfloat16(3.5), 3.5),
+    ("gravity", np.array(4), 4.0),
+    ("discretization.links", np.int64(5), 5),
+    ("discretization.links", jnp.int32(5), 5),
+    ("effects.wrist", np.bool_(False), False),
+    ("hand.finger.0.base", np.array([0.03, 0.02]), (0.03, 0.02)),
+    ("hand.finger.0.base", (np.float16(0.25 / 8), 0), (0.03125, 0.0)),
+    ("control", library.available("controls")["slide"], "slide"),
+    ("control.frame.2.pressure", jnp.array([1e4, 0, 0, 0]), (1e4, 0.0, 0.0, 0.0)),
+]
+"""A key, a value as Python programs have it, and what it is in a scene."""
+
+
+@pytest.mark.parametrize("key, value, expected", OF_LIBRARIES)
+def test_numbers_arrays_and_paths_of_libraries_are_taken(key, value, expected):
+    found = scene.load("paper", overrides={key: value})
+    for part in keypaths.flatten({key: 0}).popitem()[0]:
+        found = found[int(part)] if part.isdecimal() else getattr(found, part)
+    if isinstance(found, key_frames.Control):
+        found = found.name
+    if isinstance(found, tuple):
+        found = tuple(getattr(v, "number", v) for v in found)
+    assert found == expected
+    assert [type(v) for v in np.atleast_1d(expected)] == [type(v) for v in np.atleast_1d(found)]
+
+
+OF_NO_FILE = {
+    "gravity = [3.7, 1.0] must be a number": {"gravity": np.array([3.7, 1])},
+    "gravity = '3' must be a number": {"gravity": np.str_("3")},
+    "gravity = nan is outside": {"gravity": np.float32("nan")},
+    "links = 5.0 must be a whole number": {"discretization": {"links": np.float64(5)}},
+    "gravity = (1+0j) must be a number": {"gravity": np.complex64(1)},
+}
+
+
+@pytest.mark.parametrize("problem", OF_NO_FILE)
+def test_what_a_file_could_not_have_is_refused_by_its_value(problem):
+    with pytest.raises(schema.InputError, match=re.escape(problem)):
+        scene.load("paper", overrides=OF_NO_FILE[problem])
+
+
+def test_a_traced_override_is_refused_with_what_takes_it():
+    def weigh(gravity):
+        return scene.load("paper", overrides={"gravity": gravity}).gravity
+
+    with pytest.raises(schema.InputError, match="gravity is traced; dataclasses.replace puts"):
+        jax.eval_shape(weigh, 1.0)
 
 
 @pytest.mark.parametrize("pair", BY_PATH)
@@ -186,6 +242,44 @@ def test_silicones_lie_within_their_measurements():
             np.testing.assert_allclose(
                 s.interval, [s.crosshead_modulus, s.sheet_modulus], rtol=3e-3
             )
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["gravity", "=", "3.7"], ["gravity=", "3.7"], ["gravity", "=3.7"], ["gravity=3.7"]],
+)
+def test_blanks_around_the_sign_of_a_value_are_let_pass(words):
+    links = ("discretization", "links")
+    found = keypaths.parse([*words, "discretization.links=5"])
+    assert found == {("gravity",): 3.7, links: 5}
+    assert keypaths.parse(["discretization.links=5", *words]) == found
+    design = [w.replace("gravity", "length") for w in words]
+    assert common.open_designs(design)[0]["--design"] == ["length=3.7"]
+
+
+def test_signs_of_an_editor_are_read_in_numbers_and_kept_in_names():
+    minus, dash = "\N{MINUS SIGN}", "\N{EN DASH}"
+    found = keypaths.parse([f"gravity={minus}3.7", f'hand.name="a{dash}b"', f"scene=c{dash}d"])
+    assert [*found.values()] == [-3.7, f"a{dash}b", f"c{dash}d"]
+
+
+@pytest.mark.parametrize(
+    "value, unit, low, high, guess",
+    [
+        (9.5, "mm", 20, 200, "95? (cm given where mm is expected)"),
+        (3.5, "m", 0.005, 0.1, "0.035? (cm given where m is expected)"),
+        (981, "m/s^2", 0, 100, "9.81? (cm/s^2 given where m/s^2 is expected)"),
+        (18.0, "m", 0.005, 0.1, "0.018? (mm given where m is expected)"),
+        (18, "mm", 20, 200, None),  # just below the bound, and not 180
+        (9.5, "m^2", 20, 200, None),
+        (9.5, "kPa", 20, 200, None),
+    ],
+)
+def test_centimetres_are_guessed_where_nothing_nearer_explains_a_length(
+    value, unit, low, high, guess
+):
+    told = schema.range_problem("size", value, unit, low, high)
+    assert told and (told.endswith(f"did you mean {guess}") if guess else "mean" not in told)
 
 
 @pytest.mark.parametrize("pair", WRONG_PATHS)

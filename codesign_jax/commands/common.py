@@ -15,18 +15,20 @@ import numpy as np
 import tomli_w
 from rich.table import Table
 
-from codesign_jax import engines, terminal
+from codesign_jax import engines, policy, rollout, terminal
 from codesign_jax import scene as scenes
 from codesign_jax.commands.flags import SceneFlags, Subject, TrialFlags
+from codesign_jax.engines import Engine
 from codesign_jax.own import make_policy
 from codesign_jax.reuse import use_compilation_cache as use_compilation_cache
 from codesign_jax.runs import choice, tables
 from codesign_jax.runs.choice import Case
 from codesign_jax.runs.reading import Tell
-from codesign_jax.scene import Scene, keypaths, library, objects, schema
+from codesign_jax.scene import Scene, keypaths, library, objects, schema, texts
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.scene.schema import InputError
 from codesign_jax.terminal import Console
+from codesign_jax.types import Params
 
 MOST = 1000
 """Most runs of one command: a guard against a slip such as 0-99999."""
@@ -133,7 +135,7 @@ def open_designs(words: Sequence[str]) -> tuple[dict[str, list[str]], DesignFile
     """Splits the words of --design into NAME=VALUE pairs, by the file that has them; the file."""
     found: dict[str, list[str]] = {}
     file, direct = DesignFile(PRESET, {}), []
-    for word in words:
+    for word in keypaths.joined(words):
         if "=" in word or not word.endswith(".toml"):
             direct.append(word)
             continue
@@ -176,6 +178,10 @@ def parse_design(
         if count > 1
     ]
     for name, text in given:
+        if name in dict(space.idle):
+            words = f"{where} {name!r} has no effect: {dict(space.idle)[name]}; leave it out"
+            problems.append(words)
+            continue
         if name not in values:
             problems.append(f"{where} {name!r} is not a parameter; {schema.nearest(name, values)}")
             continue
@@ -277,10 +283,18 @@ def counted(number: int, noun: str, plural: str = "s") -> str:
 
 def number(text: str) -> float | None:
     try:
-        value = float(text)
+        value = float(texts.typed(text))
     except ValueError:
         return None
     return value if math.isfinite(value) else None
+
+
+def policy_notes(engine: Engine, params: Params) -> list[str]:
+    """Warnings of what a policy commands, if the engine asks one; nothing is simulated."""
+    if not isinstance(engine, policy.ControlLoop):
+        return []
+    found = policy.doubts(engine, params, rollout.nominal_trial(engine.scene))
+    return [f"warning: {text}" for text in found]
 
 
 def parse_seeds(text: str) -> list[int]:

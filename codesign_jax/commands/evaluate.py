@@ -38,6 +38,8 @@ def main(options: Evaluate) -> int:
     for note in [*_untried(case, options), *notes]:
         console.print(note)
     if options.dry_run:
+        for note in common.policy_notes(engine, case.space.params(case.design)):
+            console.print(note)
         more = f", {stress.sets(case.scene) * options.trials} more" if options.stress else ""
         console.print(f"grasps: {options.trials}{more}")
         return 0

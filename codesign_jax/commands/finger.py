@@ -1,6 +1,7 @@
 """`codesign finger`."""
 
 import math
+from collections.abc import Iterator
 from itertools import chain
 
 import numpy as np
@@ -13,6 +14,8 @@ from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Finger as Options
 from codesign_jax.finger import Finger, Fit
 from codesign_jax.runs import tables
+from codesign_jax.scene import schema
+from codesign_jax.scene.hand import Material
 from codesign_jax.scene.schema import InputError
 from codesign_jax.scene.silicones import LAWS
 from codesign_jax.terminal import Console
@@ -86,9 +89,13 @@ def compare(mine: Finger, table: dict[str, np.ndarray], options: Options, consol
     for row in zip(*columns.values(), strict=True):
         shown.add_row(*("" if math.isnan(v) else f"{v:.4g}" for v in row))
     common.print_table(console, shown)
+    for line in chain.from_iterable(_without_rest(table, *item) for item in found.items()):
+        console.print(line)
     if options.measured:
         for which, values in found.items():
             console.print(f"{which}: {_errors(table, values)}")
+        for name in fingers.opposed(table, found["model"]):
+            console.print(f"warning: measured and predicted {_words(name)} differ in sign")
     if fit:
         for line in _of_fit(fit, table, mine.neo_hookean):
             console.print(line)
@@ -97,6 +104,18 @@ def compare(mine: Finger, table: dict[str, np.ndarray], options: Options, consol
         rows = (dict(zip(texts, row, strict=True)) for row in zip(*texts.values(), strict=True))
         tables.write(options.out, [*texts], rows)
         console.print(f"table: {options.out}")
+
+
+def _without_rest(
+    table: dict[str, np.ndarray], which: str, found: dict[str, np.ndarray]
+) -> Iterator[str]:
+    """Says where a finger has no rest, after what it has."""
+    for name, pressures in fingers.without_rest(table, found).items():
+        places = ", ".join(f"{pressure / 1e3:.4g}" for pressure in pressures)
+        yield (
+            f"warning: {which}: no rest found for the {_words(name)} at {places} kPa: "
+            f"{fingers.TOO_FAR}"
+        )
 
 
 def _columns(
@@ -119,26 +138,31 @@ def _columns(
 def _errors(table: dict[str, np.ndarray], values: dict[str, np.ndarray]) -> str:
     parts = []
     for name, model in values.items():
+        if not np.isfinite(model).any():
+            continue
         unit, size = SHOWN[name]
         error, whole = (math.sqrt(np.nanmean(v**2)) for v in (model - table[name], table[name]))
         share = f" ({100 * error / whole:.3g} %)" if whole else ""
         parts.append(f"{name} errs by {error / size:.3g} {unit}{share}")
-    return ", ".join(parts) + ", root mean square"
+    return ", ".join(parts) + ", root mean square" if parts else "no rest where it was measured"
 
 
 def _of_fit(fit: Fit, table: dict[str, np.ndarray], neo_hookean: bool) -> list[str]:
     modulus, gain = fingers.fitted(table)
     lines = []
     if modulus:
+        value = f"{fit.shear_modulus:.4g}"
+        if wrong := schema.field_problem("G", float(value), Material, "shear_modulus"):
+            words = "the table's units, signs and the design's section do not fit one another"
+            raise ValueError(f"fitted: {wrong}: {words}")
         lines.append(
-            f"fitted: G = {1e-3 * fit.shear_modulus:.4g} kPa, standard error "
-            f"{100 * fit.spread[0]:.2g} %: --set hand.material.law={LAWS[neo_hookean]} "
-            f"hand.material.shear_modulus={fit.shear_modulus:.4g}"
+            f"fitted: G = {1e-3 * fit.shear_modulus:.4g} kPa, {_error(fit.spread[0])}: "
+            f"--set hand.material.law={LAWS[neo_hookean]} hand.material.shear_modulus={value}"
         )
     if gain:
         lines.append(
-            f"fitted: moment {fit.gain:.4g} of the model's at the same pressure, standard error "
-            f"{100 * fit.spread[1]:.2g} %"
+            f"fitted: moment {fit.gain:.4g} of the model's at the same pressure, "
+            f"{_error(fit.spread[1])}"
         )
         given = ", with the fitted G in it," if modulus else ""
         lines.append(
@@ -152,3 +176,13 @@ def _of_fit(fit: Fit, table: dict[str, np.ndarray], neo_hookean: bool) -> list[s
             "blocked_force tells them apart"
         )
     return lines
+
+
+def _error(spread: float) -> str:
+    if math.isnan(spread):
+        return "no standard error (as many numbers as values)"
+    return f"standard error {100 * spread:.2g} %"
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")

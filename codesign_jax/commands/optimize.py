@@ -50,6 +50,8 @@ def main(options: Optimize) -> int:
     for note in preflight.notes(scene, plan.space, _ends(plan.space)):
         say(note)
     if options.dry_run:
+        for note in common.policy_notes(plan.task.engine, plan.space.params(plan.space.default())):
+            say(note)
         _dry_run(plan, len(every), options)
         return 0
     devices, chunk = options.devices, options.chunk

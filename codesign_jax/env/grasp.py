@@ -1,7 +1,9 @@
 """One grasp as an environment, whose observation, action and reward are methods."""
 
+import contextlib
 import dataclasses
 import functools
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +18,7 @@ from codesign_jax.policy import Command, Observation, World
 from codesign_jax.scene import Scene
 from codesign_jax.scene.hand import highest_pressure
 from codesign_jax.scene.parameters import design_space
+from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Params, Trace, Trial
 
 
@@ -96,11 +99,12 @@ class GraspEnv:
             counts.
           params: Parameters of the hand, as `DesignSpace.params` makes them; default: the hand
             file's.
-          engine: Engine of the scene; default: structured, which alone tells forces.
-          period: Seconds of an action, a whole number of time steps.
+          engine: Engine of the scene; default: structured, which alone tells forces, so that with
+            another one `observe` has to be replaced.
+          period: Seconds of an action, a whole number of time steps, at most those of a grasp.
 
         Raises:
-          InputError: If the period is not a whole number of time steps.
+          InputError: If the period is not a whole number of time steps, or longer than a grasp.
         """
         if params is None:
             space = design_space(scene.hand)
@@ -108,6 +112,9 @@ class GraspEnv:
         self.scene, self.params = scene, params
         self.engine = make_engine(DEFAULT, scene) if engine is None else engine
         self._steps = policy.period_steps(scene, period)
+        if self._steps > scene.num_steps:
+            end = scene.num_steps * scene.discretization.timestep
+            raise InputError([f"period = {period:g} s is longer than a grasp, of {end:g} s"])
         self.dt, self.episode_length = period, -(-scene.num_steps // self._steps)
 
     def observe(self, seen: Observation) -> jax.Array:
@@ -117,7 +124,13 @@ class GraspEnv:
         its wall, how far it is bent [rad], how fast that changes [rad/s], how hard it presses on
         the object [N], and how much of the object it carries [N].
         """
-        assert seen.forces is not None
+        if seen.forces is None:
+            raise InputError(
+                [
+                    f"engine {self.engine.name} tells no contact forces, which `observe` of "
+                    "GraspEnv shows: take engine structured, or replace the method"
+                ]
+            )
         bend, rate = seen.joint[..., 0].sum(-1), seen.joint_velocity[..., 0].sum(-1)
         times = jnp.stack([seen.time, seen.phase_time])
         touch = [seen.forces.grip, seen.forces.finger[:, 2]]
@@ -168,10 +181,11 @@ class GraspEnv:
 
         Args:
           rng: A key, or the data of one, as Brax has keys.
+
+        Raises:
+          InputError: If it is no key, or several.
         """
-        if not jnp.issubdtype(rng.dtype, jax.dtypes.prng_key):
-            rng = jax.random.wrap_key_data(rng)
-        noise, choice = jax.random.split(rng)
+        noise, choice = jax.random.split(_one_key(rng))
         trial = jax.tree.map(lambda v: v[0], rollout.sample_trials(self.scene, noise, 1))
         shape = jax.random.randint(choice, (), 0, len(self.scene.objects.object))
         return self.begin(trial._replace(shape=shape))
@@ -187,7 +201,15 @@ class GraspEnv:
         return State(data, self.observe(self.seen(data)), zero, zero, metrics)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """The world after an action of shape (action,), each number of it in [-1, 1]."""
+        """The world after an action of shape (action,), each number of it in [-1, 1].
+
+        A grasp that fails, as by an action that is no number, ends without a reward: it is done,
+        and the agent observes what it observed before.
+
+        Raises:
+          InputError: If the action has another shape.
+        """
+        self._refuse_shape(action)
         data: Data = state.data
         plan = self._ahead(data)
         before = self.seen(data)  # once more: a program leaves out what nothing reads
@@ -200,15 +222,24 @@ class GraspEnv:
         seen = self.seen(after)
         held, ended = self._held(data, trace, world)
         reward = self.reward(before, _one(command), seen, held)
-        done = ended | (after.period >= self.episode_length)
+        obs = self.observe(seen)
+        good = jnp.isfinite(obs).all() & jnp.isfinite(reward)
+        done = ended | ~good | (after.period >= self.episode_length)
         metrics = state.metrics | {"held": held, "distance": trace.distance[-1]}
+        earlier = {name: state.metrics[name] for name in metrics}
         return state.replace(
             data=after,
-            obs=self.observe(seen),
-            reward=reward,
+            obs=jnp.where(good, obs, state.obs),
+            reward=jnp.where(good, reward, 0.0),
             done=done.astype(reward.dtype),
-            metrics=metrics,
+            metrics=jax.tree.map(partial(jnp.where, good), metrics, earlier),
         )
+
+    def _refuse_shape(self, action: jax.typing.ArrayLike) -> None:
+        shape, size = jnp.shape(action), self.action_size
+        if shape != (size,):
+            hint = "; jax.vmap maps over environments" if shape[1:] == (size,) else ""
+            raise InputError([f"an action has shape {shape}, not ({size},){hint}"])
 
     def _ahead(self, data: Data) -> Plan:
         """The plan over the period that begins; a last one that is shorter overlaps."""
@@ -238,6 +269,20 @@ class GraspEnv:
         ended = model.split(self.scene, world.state).going[0] == 0
         held = (counts & ~away & good).sum() / (bounds.end - bounds.start)
         return held.astype(trace.distance.dtype), ended
+
+
+def _one_key(rng: Any) -> jax.Array:
+    """A key, which may be given as its data."""
+    dtype = getattr(rng, "dtype", None)
+    if dtype == jnp.uint32:
+        with contextlib.suppress(TypeError, ValueError):  # of another shape than a key's data
+            rng = jax.random.wrap_key_data(rng)
+    if dtype is None or not jnp.issubdtype(rng.dtype, jax.dtypes.prng_key):
+        raise InputError([f"reset takes a key, as of jax.random.key(0), not {rng!r:.60}"])
+    if rng.shape:
+        words = f"reset takes one key, not {rng.shape}: jax.vmap(env.reset)(keys) begins several"
+        raise InputError([words])
+    return rng
 
 
 def _batch(tree: Any) -> Any:

@@ -215,9 +215,10 @@ def _structure(tree: Any) -> Scene:
     bare = jax.tree.unflatten(tree, [0] * tree.num_leaves)
     step, last = bare.discretization.timestep, PHASES.index(bare._phases[-1])
     time = bare.num_steps * step - bare.phases.settle
-    ends = (time * (i + 1) / (last + 1) for i in range(5))
-    phases = Phases(*ends, deflate_time=step, settle=bare.phases.settle)
-    return dataclasses.replace(schema.typical(bare), phases=phases)
+    typical = schema.typical(bare)
+    ends = {name: time * (i + 1) / (last + 1) for i, name in enumerate(PHASES)}
+    phases = schema.replaced(typical.phases, **ends, deflate_time=step)
+    return schema.replaced(typical, phases=phases)
 
 
 def by_structure(function: Callable[[Scene], T]) -> Callable[[Scene], T]:

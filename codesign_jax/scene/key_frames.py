@@ -1,12 +1,8 @@
 """Key frames: pose of the arm frame and pressures over time, as a file that a scene names.
 
 A value is a number, the name of a number that the design or the scene has, or a sum of such terms,
-each with a factor if need be: `"zero_height + arm_z - 0.01"`, `"0.5 * pressure"`. docs/control.md
-has the names. A sum stays a sum: its numbers are data, as those of the other files.
-
->>> from codesign_jax.scene import key_frames
->>> key_frames.read_sum("zero_height + 0.5 * arm_z", "m").term
-(Term(name='zero_height', factor=None), Term(name='arm_z', factor=0.5))
+each with a factor if need be: `"zero_height + arm_z - 0.01"`, `"0.5 * pressure"`; `sums` reads it.
+docs/control.md has the names.
 """
 
 import dataclasses
@@ -19,9 +15,10 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.scene import hand as hands
-from codesign_jax.scene import keypaths, schema
+from codesign_jax.scene import keypaths, schema, sums, unit_slips
 from codesign_jax.scene.hand_tables import PARAMETERS, UNITS, Hand, Parameter
-from codesign_jax.scene.schema import choice, quantity, table
+from codesign_jax.scene.schema import choice, table
+from codesign_jax.scene.sums import Sum
 from codesign_jax.types import Params
 
 POSE = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -33,32 +30,7 @@ _OF_SCENE = {
     "Pa": ("pressure",),
 }
 """Names that every scene has, by the SI unit of what may use them."""
-RANGES = {"s": (-60, 60), "m": (-2, 2), "deg": (-360, 360), "Pa": (-1e6, 1e6)}
-"""Smallest and largest number of a sum, by its unit."""
 _NAME = re.compile(r"[a-z]\w*", re.ASCII)
-_TERM = re.compile(
-    r"\s*([+-]?)\s*(?:(\d+\.?\d*(?:[eE][+-]?\d+)?|\.\d+)\s*(\*)?)?\s*([A-Za-z]\w*)?\s*", re.ASCII
-)
-
-
-@table
-@dataclasses.dataclass(frozen=True)
-class Term:
-    """A named number times a factor."""
-
-    name: str  # a parameter of the design, or a number of the scene
-    # What it is multiplied by; None for 1
-    factor: float | None = quantity("", -100, 100, default=None)
-
-
-@table
-@dataclasses.dataclass(frozen=True)
-class Sum:
-    """A number and named terms."""
-
-    unit: str  # unit of the number, of `RANGES`; the names stand for SI units
-    number: float | None = quantity("", -1e6, 1e6, default=None)  # the number; None for none
-    term: tuple[Term, ...] = ()
 
 
 def _sum(unit: str, **kwargs: Any) -> Any:
@@ -187,7 +159,8 @@ def read_parameters(rows: Any, where: str) -> tuple[ControlParameter, ...]:
     """Parameters from rows as those of a file, for what else than key frames has some."""
     problems: list[str] = []
     reader = _Reader({}, where, 0, problems)
-    found = [schema.parse(ControlParameter, row, where, problems) for row in rows]
+    given = [keypaths.plain(row, where) for row in rows]
+    found = [schema.parse(ControlParameter, row, where, problems) for row in given]
     for i, row in enumerate(found):
         if row is not None:
             reader.parameter(row, f"{where}[{i}]")
@@ -288,47 +261,13 @@ def _factors(total: Sum) -> dict[str, Any]:
 # --- reading -------------------------------------------------------------------------------------
 
 
-def read_sum(value: Any, unit: str) -> Sum | str:
-    """A value of a file as a sum, or what is wrong with it."""
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        try:
-            return Sum(unit, float(value))
-        except OverflowError:
-            return "is too large"
-    if not isinstance(value, str) or not value.strip():
-        return 'must be a number, or a sum of numbers and names such as "zero_height + arm_z"'
-    number, terms, place = None, {}, 0
-    while place < len(value):
-        found = _TERM.match(value, place)
-        if found is None or found.end() == place or not (found[2] or found[4]):
-            return "is no sum of numbers and names, each with a factor if need be"
-        sign, digits, times, name = found.groups()
-        if (place and not sign) or (times and not name):
-            return "is no sum of numbers and names, each with a factor if need be"
-        factor = (-1.0 if sign == "-" else 1.0) * float(digits or 1.0)
-        if name in terms:
-            return f"has {name!r} twice"
-        if name:
-            terms[name] = factor
-        else:
-            number = factor + (number or 0.0)
-        place = found.end()
-    return Sum(unit, number, tuple(Term(n, None if f == 1.0 else f) for n, f in terms.items()))
-
-
-def _text(total: Sum) -> str | float:
-    if not total.term:
-        return float(total.number or 0.0)
-    parts = [t.name if t.factor is None else f"{float(t.factor)!r} * {t.name}" for t in total.term]
-    parts += [] if total.number is None else [repr(float(total.number))]
-    return " + ".join(parts).replace("+ -", "- ")
-
-
 def _frame_table(frame: Frame) -> dict[str, Any]:
     given = {f.name: getattr(frame, f.name) for f in dataclasses.fields(frame)}
-    found = {k: _text(v) if isinstance(v, Sum) else v for k, v in given.items() if v is not None}
+    found = {
+        k: sums.text(v) if isinstance(v, Sum) else v for k, v in given.items() if v is not None
+    }
     if frame.pressure is not None:
-        values = [_text(v) for v in frame.pressure]
+        values = [sums.text(v) for v in frame.pressure]
         found["pressure"] = values if len(set(frame.pressure)) > 1 else values[0]
     return found
 
@@ -428,17 +367,18 @@ class _Reader:
         return tuple(found)
 
     def _sum(self, value: Any, path: str, unit: str) -> Sum:
-        total = read_sum(value, unit)
+        total = sums.read(value, unit)
         if isinstance(total, str):
             self.problems.append(f"{path} = {schema.shown(value)} {total}")
             return Sum(unit, 0.0)
-        if total.number is not None:
-            why = schema.range_problem(path, total.number, unit, *RANGES[unit])
-            self.problems += [why] if why else []
         wanted = UNITS[unit][0]
         fitting = [name for name, u in self.units.items() if u == wanted]
         for term in total.term:
-            if term.name not in self.units:
+            if term.name not in self.units and (
+                why := sums.unit_words(term.name, term.factor, unit)
+            ):
+                self.problems.append(f"{path} = {schema.shown(value)} {why}")
+            elif term.name not in self.units:
                 why = schema.nearest(term.name, fitting)
                 self.problems.append(f"{path} names an unknown parameter {term.name!r}; {why}")
             elif self.units[term.name] != wanted:
@@ -460,6 +400,62 @@ def check(scene: Any, where: str) -> list[str]:
     for low, high, limits in _walls(scene.hand):
         problems += _too_high(scene.control.frame, own, low, high, limits, where)
     return list(dict.fromkeys(problems))
+
+
+def doubts(scene: Any, where: str) -> list[str]:
+    """What is no error in key frames, and hardly meant: kPa for Pa, frames after the grasp."""
+    return [*_faint(scene.control, where), *_late(scene, where), *_unused(scene.control, where)]
+
+
+def _faint(control: Control, where: str) -> Iterator[str]:
+    """Numbers that are pressures of nearly zero."""
+    for i, frame in enumerate(control.frame):
+        given = dict.fromkeys(v.number for v in frame.pressure or () if v.number is not None)
+        for number in given:
+            if words := unit_slips.kilopascals(number):
+                yield f"{where}.frame[{i}].pressure: its number {words}"
+    for row in control.parameter:
+        if UNITS[row.unit][0] != "Pa":
+            continue
+        if words := unit_slips.kilopascals(_ends(row.row)):
+            yield f"{where}.parameter {row.name}: the largest pressure {words}"
+
+
+def _late(scene: Any, where: str) -> Iterator[str]:
+    """Frames whose time lies after the end of the grasp, in every design or in some.
+
+    A frame whose time names a phase is no slip where that phase is off, as in a scene without
+    release: it may lie after the grasp's end, but not after that of all phases.
+    """
+    settle = scene.phases.settle
+    ends = {name: (value, value) for name, value in _scene_times(scene).items()}
+    known = {*ends}
+    ends |= {row.name: _ends(row.row) for row in scene.control.parameter}
+    for i, frame in enumerate(scene.control.frame):
+        factors = _factors(frame.time)
+        last = scene.phases.ungrasp if known & {*factors} else scene.end_time - settle
+        least, most = _range(factors, ends)
+        if most <= last + 1e-9:
+            continue
+        which = "never reached" if least > last + 1e-9 else "not reached in some designs"
+        yield (
+            f"{where}.frame[{i}].time = {schema.shown(sums.text(frame.time))} is {which}: the "
+            f"grasp ends after {last:g} s"
+        )
+
+
+def _unused(control: Control, where: str) -> Iterator[str]:
+    """Parameters of pose and pressure that no frame reads, so that a search of them is idle."""
+    first = control.frame[0]
+    used = {f"arm_{axis}" for axis in POSE if axis != "z" and getattr(first, axis) is None}
+    for frame in control.frame:
+        for name in _UNITS:
+            values = getattr(frame, name) or ()
+            for total in values if isinstance(values, tuple) else (values,):
+                used |= {term.name for term in total.term}
+    left = [n for n in (*(f"arm_{axis}" for axis in POSE), "pressure") if n not in used]
+    if left:
+        yield f"{where}: no key frame reads {', '.join(left)}: without a policy it has no effect"
 
 
 def _ends(row: Parameter) -> tuple[float, float]:
@@ -485,9 +481,10 @@ def _falling(frames: tuple[Frame, ...], ends: Mapping, where: str) -> Iterator[s
         )
         if least < -1e-9 or (changes and least < 1e-9):
             earlier = f"{-least:g} s before it" if least < -1e-9 else "at that time"
+            before, after = (schema.shown(sums.text(frame.time)) for frame in (a, b))
             yield (
-                f"{where}.frame[{i}].time = {schema.shown(_text(b.time))} must come after that of "
-                f"frame[{i - 1}], {schema.shown(_text(a.time))}, and is {earlier} in some design"
+                f"{where}.frame[{i}].time = {after} must come after that of frame[{i - 1}], "
+                f"{before}, and is {earlier} in some design"
             )
 
 
@@ -514,7 +511,7 @@ def _too_high(
                 ends = {**own, "pressure": (min(low[finger], limit), min(high[finger], limit))}
                 least, most = _range(factors, ends)
                 key = f"{where}.frame[{i}].pressure"
-                text = schema.shown(_text(value))
+                text = schema.shown(sums.text(value))
                 if most > limit * (1 + 1e-9):
                     yield (
                         f"{key} = {text} of finger {finger} may be {most:.6g} Pa, above the limit "

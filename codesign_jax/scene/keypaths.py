@@ -10,7 +10,10 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from codesign_jax.scene import library, schema
+import jax
+import jax.core
+
+from codesign_jax.scene import library, schema, texts
 
 Path = tuple[str, ...]
 
@@ -40,7 +43,7 @@ def parse(pairs: Iterable[str]) -> dict[Path, Any]:
     """Reads KEY=VALUE; the later of two values of one key holds."""
     found: dict[Path, Any] = {}
     problems = []
-    for pair in pairs:
+    for pair in joined(pairs):
         key, equals, text = pair.partition("=")
         path = _path(key.strip())
         if not equals or not all(path):
@@ -51,6 +54,23 @@ def parse(pairs: Iterable[str]) -> dict[Path, Any]:
             found[path] = _toml_value(text)
     if problems:
         raise schema.InputError(problems)
+    return found
+
+
+def joined(words: Iterable[str]) -> list[str]:
+    """Words of a command line, of which those that a blank beside a = parted are one again.
+
+    >>> joined(["gravity", "=", "3.7", "arm_z=", "10", "length", "=95"])
+    ['gravity=3.7', 'arm_z=10', 'length=95']
+    """
+    found: list[str] = []
+    for word in words:
+        before = found[-1] if found else ""
+        open_end = before.endswith("=") and "=" not in word
+        if open_end or (word.startswith("=") and before and "=" not in before):
+            found[-1] = before + word
+        else:
+            found.append(word)
     return found
 
 
@@ -69,8 +89,27 @@ def flatten(values: Mapping[Any, Any]) -> dict[Path, Any]:
         if isinstance(value, Mapping):
             found |= {path + rest: v for rest, v in flatten(value).items()}
         else:
-            found[path] = value
+            found[path] = plain(value, ".".join(path))
     return found
+
+
+def plain(value: Any, key: str) -> Any:
+    """A value as a file would have it: of arrays and numbers of any library those of Python.
+
+    Raises:
+      InputError: If it is being traced: a file's values are known when it is read.
+    """
+    if isinstance(value, jax.core.Tracer):
+        words = "is traced; dataclasses.replace puts traced numbers into a scene that was read"
+        raise schema.InputError([f"{key} {words}"])
+    if isinstance(value, pathlib.PurePath):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {k: plain(v, f"{key}.{k}") for k, v in value.items()}
+    if isinstance(value, list | tuple | range):
+        return [plain(v, f"{key}[{i}]") for i, v in enumerate(value)]
+    listed = getattr(value, "tolist", None)  # of NumPy, JAX and whatever has their interface
+    return listed() if callable(listed) else value
 
 
 def below(changes: Mapping[Path, Any], key: str) -> dict[Path, Any]:
@@ -168,8 +207,11 @@ def _path(key: str) -> Path:
 
 
 def _toml_value(text: str) -> Any:
+    plain_signs = texts.typed(text)
     try:
-        table = library.parse(f"value = {text}")
+        table = library.parse(f"value = {plain_signs}")
     except (ValueError, RecursionError):
         return text
+    if isinstance(table["value"], str):  # signs of a name stay what they are
+        table = library.parse(f"value = {text}")
     return table["value"] if len(table) == 1 else text  # more keys on further lines

@@ -52,6 +52,8 @@ class DesignSpace:
       is_morphology: True for morphology, False for control, shape (parameter,).
       base: Full vector with the fixed values and defaults [SI], shape (full,).
       source: For each full entry the design entry that fills it, or -1, shape (full,).
+      idle: Parameters that the preset leaves free, but which have no effect and are fixed at their
+        default: name and why.
     """
 
     hand: Hand
@@ -62,6 +64,7 @@ class DesignSpace:
     is_morphology: tuple[bool, ...]
     base: tuple[float, ...]
     source: tuple[int, ...]
+    idle: tuple[tuple[str, str], ...] = ()
 
     @property
     def low(self) -> np.ndarray:
@@ -91,6 +94,7 @@ class DesignSpace:
             hand=dataclasses.replace(self.hand, parameter=tuple(rows)),
             scale=zeros,
             bounds=(zeros, zeros),
+            idle=(),
             base=tuple(0.0 if source >= 0 else value for value, source in place),
         )
 
@@ -375,7 +379,10 @@ def design_space(hand: Hand, preset: str = "full") -> DesignSpace:
     Raises:
       InputError: if the hand has no such preset.
     """
-    total = sum(hand.width(p) for p in hand.parameter if p.name in PARAMETERS)
+    rows = [
+        p for p in hand.parameter if p.name in PARAMETERS and p.name not in without_effect(hand)
+    ]
+    total = sum(hand.width(p) for p in rows)
     if preset in ("full", f"{total}d"):
         chosen = Preset(preset, ())
     else:
@@ -385,6 +392,14 @@ def design_space(hand: Hand, preset: str = "full") -> DesignSpace:
             raise schema.InputError([f"preset {preset!r} unknown for hand {hand.name}; {hint}"])
         chosen = known[preset]
     return _build(hand, chosen, everything=not chosen.free)
+
+
+def without_effect(hand: Hand) -> dict[str, str]:
+    """Parameters that change nothing in a hand, with the reason; no preset searches them."""
+    shares = [finger.spread for finger in hand.finger]
+    if all(isinstance(share, int | float) and share == 0 for share in shares):
+        return {"spread": "every finger has spread = 0"}
+    return {}
 
 
 def _hint(preset: str, names: list[str]) -> str:
@@ -402,10 +417,13 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
         width, factor = hand.width(row), UNITS[row.unit][1]
         base[offsets[name] : offsets[name] + width] = np.array(per_finger(value, width)) * factor
     free = {f.name: f for f in preset.free}
+    idle = {n: why for n, why in without_effect(hand).items() if everything or n in free}
     columns: list[tuple[str, str, float, float, float, bool]] = []
     for row in hand.parameter:
         if not everything and row.name not in free and row.name in PARAMETERS:
             continue  # those of the control are free in every preset
+        if row.name in idle:
+            continue
         spec = free.get(row.name, Free(row.name))
         factor, width = UNITS[row.unit][1], hand.width(row)
         low, high = spec.bounds(row, width)
@@ -416,6 +434,10 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
             name = f"{row.name}[{k}]" if count > 1 else row.name
             morphology = row.domain == "morphology"
             columns.append((name, row.unit, factor, low[k] * factor, high[k] * factor, morphology))
+    if not columns:
+        left = "; ".join(f"{name} has no effect: {why}" for name, why in idle.items())
+        words = f"preset {preset.name!r} of hand {hand.name} leaves nothing to search"
+        raise schema.InputError([f"{words}: {left}"])
     names, units, scale, low, high, domain = zip(*columns, strict=True)
     return DesignSpace(
         _table_alone(hand),
@@ -426,6 +448,7 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
         domain,
         tuple(base),
         tuple(source.tolist()),
+        tuple(idle.items()),
     )
 
 

@@ -9,12 +9,15 @@ import dataclasses
 import difflib
 import functools
 import math
+import operator
 import re
 import types
 import typing
 from typing import Any, TypeVar
 
 import jax
+import jax.core
+import numpy as np
 
 from codesign_jax import terminal
 from codesign_jax.scene import texts
@@ -29,8 +32,12 @@ _ANGLES = {
 _PREFIXES = {-6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 _SLIPS = (-3, 3, -6, 6)
 """Powers of ten between units that people mix up, tried in this order."""
-_SMALLER = (1e-3, 1e-6)
+_SMALLER = (1e-3, 1e-6, 1e-2)
 """Factors from a smaller unit to the right one."""
+_CENTI = -2
+"""Power of ten of the centimetre, which people use besides; of nothing else."""
+_FAR = 1.5
+"""How many times a value lies outside its range before centimetres explain it."""
 _UNIT = re.compile(r"(µ|m|k|M)?(m|s|g|N|Pa|Hz)(?![A-Za-z])(.*)")
 _COMMON = {"Mg/m^3": "g/cm^3"}
 """What a unit is usually called."""
@@ -112,6 +119,8 @@ def unit_slip(value: float, unit: str, low: float, high: float) -> tuple[float, 
     (0.001, 'mm given where m is expected')
     >>> unit_slip(141.0, "Pa", 1e3, 1e6)
     (1000.0, 'kPa given where Pa is expected')
+    >>> unit_slip(9.5, "mm", 20, 200)
+    (10.0, 'cm given where mm is expected')
     """
     if low <= value <= high or not 0 < abs(value) < 1e300:
         return None
@@ -124,6 +133,8 @@ def unit_slip(value: float, unit: str, low: float, high: float) -> tuple[float, 
             and (abs(value) >= 1 or f not in _SMALLER)
             # Where a range begins at zero, next to nothing is in it and not what is meant.
             and (low > 0 or abs(value * f) >= 0.01 * high)
+            # What lies just outside its range is no slip by a factor of 10 or 100.
+            and (f not in (10.0, 1e-2) or not low / _FAR < value < high * _FAR)
         ),
         None,
     )
@@ -143,15 +154,31 @@ def _slips(unit: str) -> typing.Iterator[tuple[float, str]]:
         if other is not None and other != "µ":
             name = f"{other}{base}{rest}"
             yield 10.0**power, f"{_COMMON.get(name, name)} given where {unit} is expected"
+    if base == "m" and not rest.startswith("^"):
+        yield 10.0 ** (_CENTI - own), f"cm{rest} given where {unit} is expected"
 
 
 def range_problem(path: str, value: float, unit: str, low: float, high: float) -> str | None:
     """Returns why a value lies outside its range, or None."""
+    words = range_words(value, unit, low, high)
+    return f"{path} = {shown(value)} {words}" if words else None
+
+
+def range_words(value: float, unit: str, low: float, high: float) -> str | None:
+    """That a value "is outside" its range, with the unit that would explain it; None if it is."""
     if low <= value <= high:
         return None
-    message = f"{path} = {shown(value)} is outside [{low:g}, {high:g}] {unit}".rstrip()
+    message = f"is outside [{low:g}, {high:g}] {unit}".rstrip()
     slip = unit_slip(value, unit, low, high)
     return f"{message}; did you mean {value * slip[0]:g}? ({slip[1]})" if slip else message
+
+
+def field_problem(path: str, value: float, cls: type, name: str) -> str | None:
+    """Why a value lies outside the range of a field of a table, without a guess, or None."""
+    limits = next(_range(field) for field in dataclasses.fields(cls) if field.name == name)
+    if limits.low <= value <= limits.high:
+        return None
+    return f"{path} = {value:g} is outside [{limits.low:g}, {limits.high:g}] {limits.unit}".rstrip()
 
 
 @functools.cache
@@ -187,16 +214,90 @@ _tables: set[type] = set()
 
 
 def table(cls: type[T]) -> type[T]:
-    """Registers a frozen dataclass as a pytree.
+    """Registers a frozen dataclass as a pytree whose numbers a program may trace.
 
     Its leaves are its numbers that are not structure, also those of tables in it, under the names
-    of the file; all else is static.
+    of the file; all else is static.  Whoever makes one, or another one by `dataclasses.replace`, is
+    refused what a file is refused, as far as a number is known: a tracer's is not.  JAX, which
+    makes trees of anything, is refused nothing.
     """
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
-    data = [f.name for f in fields if _is_leaf(f) or _holds_tables(f.type)]
-    jax.tree_util.register_dataclass(cls, data, [f.name for f in fields if f.name not in data])
+    data = tuple(f.name for f in fields if _is_leaf(f) or _holds_tables(f.type))
+    static = tuple(f.name for f in fields if f.name not in data)
+
+    leaves_of, rest_of = _getter(data), _getter(static)
+    keys = tuple(map(jax.tree_util.GetAttrKey, data))
+
+    def parts(value: T) -> tuple[tuple, tuple]:
+        return leaves_of(value), rest_of(value)
+
+    def named_parts(value: T) -> tuple[tuple, tuple]:
+        return tuple(zip(keys, leaves_of(value), strict=True)), rest_of(value)
+
+    def whole(rest: tuple, leaves: typing.Iterable) -> T:
+        made = object.__new__(cls)
+        made.__dict__.update(zip(static, rest, strict=True))
+        made.__dict__.update(zip(data, leaves, strict=True))
+        return made
+
+    jax.tree_util.register_pytree_with_keys(cls, named_parts, whole, parts)
     _tables.add(cls)
+    _check_when_made(cls)
     return cls
+
+
+def _getter(names: tuple[str, ...]) -> typing.Callable[[Any], tuple]:
+    """A function to the attributes of these names, as a tuple."""
+    if len(names) > 1:
+        return operator.attrgetter(*names)
+    return lambda value: tuple(getattr(value, name) for name in names)
+
+
+def _check_when_made(cls: type) -> None:
+    make = cls.__init__
+    name = cls.__name__.lower()
+    numbers = [field for field in dataclasses.fields(cls) if _is_leaf(field)]
+
+    @functools.wraps(make)
+    def checked(self: Any, *given: Any, **named: Any) -> None:
+        make(self, *given, **named)
+        found = (_known_problem(f"{name}.{f.name}", getattr(self, f.name), f) for f in numbers)
+        if problems := [problem for problem in found if problem]:
+            raise InputError(problems)
+
+    cls.__init__ = checked
+
+
+def _known_problem(path: str, value: Any, field: dataclasses.Field) -> str | None:
+    """What is wrong with the numbers of a field of a table, as far as they are known."""
+    if isinstance(value, tuple):
+        found = (_known_problem(f"{path}[{i}]", v, field) for i, v in enumerate(value))
+        return next(filter(None, found), None)
+    if isinstance(value, bool | str):
+        return f"{path} = {shown(value)} must be {_kind(float, field)}"
+    known = isinstance(value, int | float | np.number | np.ndarray)
+    if isinstance(value, jax.Array) and not isinstance(value, jax.core.Tracer):
+        known = value.is_fully_addressable
+    if not known or np.asarray(value).dtype.kind not in "fiuV":  # V: bfloat16
+        return None
+    every = np.unique(np.asarray(value, float))
+    return next(filter(None, (near_problem(path, float(v), _range(field)) for v in every)), None)
+
+
+def near_problem(path: str, value: float, expected: Range) -> str | None:
+    """As `range_problem`, for numbers that were a float32: the one nearest to a bound is inside."""
+    low, high = (b + side * 1e-6 * abs(b) for b, side in ((expected.low, -1), (expected.high, 1)))
+    if low <= value <= high:
+        return None
+    return range_problem(path, value, expected.unit, expected.low, expected.high)
+
+
+def replaced(table: T, **changes: Any) -> T:
+    """As `dataclasses.replace`, for numbers of the program's own, which may leave their ranges."""
+    made = object.__new__(type(table))
+    made.__dict__.update({f.name: getattr(table, f.name) for f in dataclasses.fields(table)})  # type: ignore[arg-type]
+    made.__dict__.update(changes)
+    return made
 
 
 def _is_leaf(field: dataclasses.Field) -> bool:

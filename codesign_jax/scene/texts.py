@@ -10,6 +10,18 @@ MOST_LETTERS = 1000
 """Most characters of a text."""
 SHOWN = 120
 """Most characters of a value in a message."""
+_TYPESET = str.maketrans(
+    dict.fromkeys("\u2010\u2011\u2012\u2013\u2014\u2212\ufe63\uff0d", "-")
+    | dict.fromkeys("\u00b7\u00d7\u2217\u22c5", "*")
+    | dict.fromkeys("\u00a0\u2007\u2009\u202f", " ")
+    | {"\u00f7": "/", "\u2215": "/", "\uff0b": "+"}
+)
+"""Signs that editors and web pages make of those of a keyboard: minus, times, narrow blanks."""
+
+
+def typed(text: str) -> str:
+    """A formula with the signs of a keyboard in place of typographic ones."""
+    return text.translate(_TYPESET)
 
 
 def shown(value: Any) -> str:

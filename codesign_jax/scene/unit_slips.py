@@ -10,8 +10,10 @@ from codesign_jax.scene import schema
 from codesign_jax.scene.hand_tables import PARAMETERS
 from codesign_jax.types import Params
 
-_FAINT = 1000.0
+FAINT = 1000.0
 """Pressure below which no finger moves visibly [Pa]: 1 kPa bends one of 100 mm by half a degree."""
+_LEAST = 1.0
+"""What a thousand times as much is no faint pressure; smaller numbers may be bar or MPa."""
 
 
 def refuse(params: Params) -> None:
@@ -35,13 +37,19 @@ def refuse(params: Params) -> None:
 
 def hint_at_kilopascals(pressures: np.ndarray) -> None:
     """Warns of pressures that are all nearly zero, which their range has: kPa, most likely."""
-    largest = float(np.abs(pressures).max(initial=0.0))
-    if 0 < largest < _FAINT:
-        warnings.warn(
-            f"the largest pressure is {largest:g} Pa, next to none; did you mean "
-            f"{1e3 * largest:g}? (kPa given where Pa is expected; Python takes SI units)",
-            stacklevel=3,
-        )
+    if words := kilopascals(pressures):
+        warnings.warn(f"the largest pressure {words}; Python takes SI units", stacklevel=3)
+
+
+def kilopascals(pressures: np.typing.ArrayLike) -> str | None:
+    """That the largest of some pressures [Pa] "is" nearly zero and most likely kPa, or None."""
+    largest = float(np.abs(np.asarray(pressures, float)).max(initial=0.0))
+    if not 0 < largest < FAINT:
+        return None
+    words = f"is {largest:g} Pa, next to none"
+    if largest < _LEAST:
+        return f"{words}: pressures are in Pa"
+    return f"{words}; did you mean {1e3 * largest:g}? (kPa given where Pa is expected)"
 
 
 def outside(name: str, unit: str, low: float, high: float, values: np.ndarray) -> str | None:

@@ -1,0 +1,210 @@
+r"""Tables of what was measured on a finger: a CSV whose head names columns with their units.
+
+>>> import pathlib, tempfile
+>>> from codesign_jax import measurements
+>>> folder = tempfile.TemporaryDirectory()
+>>> path = pathlib.Path(folder.name, "finger.csv")
+>>> _ = path.write_text("pressure_kPa;angle_deg\n20;18,9\n40;37,2\n")  # of a spreadsheet
+>>> measurements.read(path)["pressure"]  # Pa
+array([20000., 40000.])
+>>> folder.cleanup()
+"""
+
+import csv
+import io
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+
+from codesign_jax.scene import texts
+from codesign_jax.scene.schema import InputError, nearest
+
+UNITS = {
+    "Pa": ("pressure", 1.0),
+    "kPa": ("pressure", 1e3),
+    "bar": ("pressure", 1e5),
+    "psi": ("pressure", 6894.757293168),
+    "deg": ("angle", math.pi / 180),
+    "rad": ("angle", 1.0),
+    "mN": ("force", 1e-3),
+    "N": ("force", 1.0),
+    "mm": ("length", 1e-3),
+    "cm": ("length", 1e-2),
+    "m": ("length", 1.0),
+}
+"""Units of a column: what they measure, and how many SI units they are."""
+
+COLUMNS = {
+    "pressure": ("pressure", "gauge pressure of the chamber"),
+    "angle": ("angle", "angle between the finger's base and its free tip"),
+    "tip_force": ("force", "force on a tip that is held where it was, the rest free to bow"),
+    "blocked_force": ("force", "force on the tip of a finger that is kept straight"),
+    "load": ("force", "force on the tip, across the unbent finger, against its bending"),
+    "deflection": ("length", "how far the load moves the tip, in the load's direction"),
+}
+"""Columns of a file of measurements: what their unit measures, and what they are."""
+
+MEASURED = ("angle", "tip_force", "blocked_force", "deflection")
+"""Columns that are compared with the model."""
+MOST_CHARACTERS = 1_000_000
+"""Largest size of a file."""
+_SEPARATORS = (";", "\t", ",")
+"""What stands between cells; the first of them that the head has."""
+_EXCEL = re.compile(r"sep=(.)\s*")
+"""A first line that names the separator."""
+
+
+def read(path: Path) -> dict[str, np.ndarray]:
+    """Reads measurements.
+
+    Cells are separated by commas, or by semicolons or tabs as spreadsheets write them, beside which
+    a decimal sign may be a comma.  Lines that begin with # are comments.  A cell without a value
+    leaves that quantity out of its row.
+
+    Returns:
+      Columns of `COLUMNS` that the file has [SI units], shape (row,); NaN for an empty cell.
+
+    Raises:
+      InputError: With everything that is wrong with the file.
+    """
+    lines = _lines(path)
+    separator, lines = _separator(lines)
+    if not lines:
+        raise InputError(
+            [f"{path} is empty; its head names columns, such as pressure_kPa,angle_deg"]
+        )
+    problems: list[str] = []
+    head, rows = _rows(lines, separator, problems)
+    names, factors = _columns(head, problems)
+    values = [
+        [_cell(c, separator, f"line {n}, {h}", problems) for c, h in zip(row, head, strict=True)]
+        for n, row in rows
+    ]
+    table: dict[str, np.ndarray] = {}
+    if not problems:
+        columns = np.array(values).reshape(-1, len(names)).T * np.array(factors)[:, None]
+        table = dict(zip(names, columns, strict=True))
+        problems = _missing(table)
+    if problems:
+        raise InputError([f"{path}: {p}" for p in problems])
+    return table
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    """Lines of a file that have something to read, with their numbers."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            text = file.read(MOST_CHARACTERS + 1)
+    except (OSError, UnicodeDecodeError) as error:
+        why = getattr(error, "strerror", None) or "no UTF-8 text"
+        raise InputError([f"{path}: {why}"]) from error
+    if len(text) > MOST_CHARACTERS:
+        raise InputError([f"{path} has more than {MOST_CHARACTERS:,} characters"])
+    lines = [(n, v) for n, v in enumerate(io.StringIO(text, newline=""), 1) if v.strip()]
+    return [(n, line) for n, line in lines if not line.lstrip().startswith("#")]
+
+
+def _separator(lines: list[tuple[int, str]]) -> tuple[str, list[tuple[int, str]]]:
+    """What stands between the cells, and the lines that have some."""
+    first = lines[0][1] if lines else ""
+    if named := _EXCEL.fullmatch(first):
+        return named[1], lines[1:]
+    return next((s for s in _SEPARATORS if s in first), ","), lines
+
+
+def _rows(
+    lines: list[tuple[int, str]], separator: str, problems: list[str]
+) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """The head, and the rows with the numbers of their lines."""
+    rows = []
+    for number, line in lines:
+        try:
+            [cells] = csv.reader([line.rstrip("\r\n")], delimiter=separator, strict=True)
+        except (csv.Error, ValueError) as error:
+            problems.append(f"line {number} is no row of cells: {error}")
+            continue
+        rows.append((number, [cell.strip() for cell in cells]))
+    if problems:
+        return [], []
+    (_, head), *rows = rows
+    # A spreadsheet writes its empty columns as well.
+    while len(head) > 1 and not head[-1] and all(len(r) < len(head) or not r[-1] for _, r in rows):
+        rows = [(n, row[: len(head) - 1]) for n, row in rows]
+        head = head[:-1]
+    hint = "; beside a decimal comma cells are separated by semicolons" if separator == "," else ""
+    fitting = []
+    for number, row in rows:
+        if len(row) == len(head):
+            fitting.append((number, row))
+            continue
+        words = f"line {number} has {len(row)} cells, the head {len(head)}"
+        problems.append(words + hint * (len(row) > len(head)))
+    return head, fitting
+
+
+def _columns(head: list[str], problems: list[str]) -> tuple[list[str], list[float]]:
+    """Names of the columns, and how many SI units theirs are."""
+    names, factors = [], []
+    for column in head:
+        name, _, unit = column.rpartition("_")
+        if name not in COLUMNS:
+            problems.append(f"column {column!r} is not valid; {_valid(column)}")
+            continue
+        kind = COLUMNS[name][0]
+        units = [u for u, (k, _) in UNITS.items() if k == kind]
+        if unit not in units:
+            problems.append(f"column {column!r}: unit {unit!r} is not one of {', '.join(units)}")
+            continue
+        if name in names:
+            problems.append(f"column {name!r} is given more than once")
+        names.append(name)
+        factors.append(UNITS[unit][1])
+    return names, factors
+
+
+def _valid(column: str) -> str:
+    """What a column could be instead."""
+    known = [
+        f"{name}_{unit}"
+        for name, (kind, _) in COLUMNS.items()
+        for unit, (measures, _) in UNITS.items()
+        if measures == kind
+    ]
+    if any(name in column for name in known):
+        return "columns are separated by commas, semicolons or tabs"
+    return nearest(column, known)
+
+
+def _cell(text: str, separator: str, where: str, problems: list[str]) -> float:
+    if not text:
+        return math.nan
+    plain = texts.typed(text)
+    if separator != "," and plain.count(",") == 1 and "." not in plain:
+        plain = plain.replace(",", ".")
+    try:
+        value = float(plain)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        problems.append(f"{where} = {texts.shown(text)} must be a number")
+    return value
+
+
+def _missing(table: dict[str, np.ndarray]) -> list[str]:
+    if "pressure" not in table:
+        return ["no column of the pressure, such as pressure_kPa"]
+    names = [n for n in MEASURED if n in table and np.isfinite(table[n]).any()]
+    problems = []
+    if not names:
+        problems.append(f"no measured value; columns of them: {', '.join(MEASURED)}")
+    if np.isnan(table["pressure"]).any():
+        problems.append("a row has no pressure")
+    elif (table["pressure"] < 0).any():
+        problems.append("a pressure is below 0; gauge pressures are meant")
+    if "deflection" in table:
+        loads = table.get("load", np.full(len(table["pressure"]), np.nan))
+        if np.isnan(loads[np.isfinite(table["deflection"])]).any():
+            problems.append("a deflection has no load beside it, in a column such as load_N")
+    return problems

@@ -31,7 +31,7 @@ from codesign_jax.scene import InputError
 from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import command, own_workplace  # noqa: F401
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*contacts of today have no such numbers")
+pytestmark = pytest.mark.filterwarnings("ignore:.*they have no effect any more")
 ARCHIVE = Path(__file__).parent / "data" / "run_screened.zip"
 HOSTILE = "\x1b]0;owned\x07\nsecond\r\u202e\u2028line"
 SHOWN = r"\x1b]0;owned\x07\nsecond\r\u202e\u2028line"

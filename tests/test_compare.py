@@ -25,7 +25,7 @@ from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import command, copied, finished_run, own_workplace  # noqa: F401
 from tests.helpers.toy_engine import TINY
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*contacts of today have no such numbers")
+pytestmark = pytest.mark.filterwarnings("ignore:.*they have no effect any more")
 DATA = Path(__file__).parent / "data"
 
 

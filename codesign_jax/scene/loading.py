@@ -22,8 +22,9 @@ from codesign_jax.scene.primitives import PRIMITIVES
 from codesign_jax.scene.tables import Accuracy, Fixture
 
 GONE = ("effects.soft_touch", "effects.speculative_palm", "contact.touch_depth")
-GONE += ("contact.time_constant", "contact.impedance")
-"""Keys of earlier scene files, which have no effect any more; see docs/hull.md."""
+GONE += ("contact.time_constant", "contact.impedance", "discretization.spring_damping")
+"""Keys of earlier scene files, which have no effect any more; see docs/hull.md and, for the last,
+`discretization.integrator` in docs/physics.md, whose default is the former "added"."""
 _OF_ACCURACY = ("discretization", "solver", "newton")
 """Tables of a scene that a preset of accuracy replaces values of."""
 
@@ -118,7 +119,7 @@ def _leave_out(table: dict, changes: dict[tuple, Any], where: str) -> None:
             found.append(".".join(key))
     if found:
         names = ", ".join(found)
-        text = f"{where} is read without {names}: contacts of today have no such numbers"
+        text = f"{where} is read without {names}: they have no effect any more"
         warnings.warn(text, stacklevel=3)
 
 

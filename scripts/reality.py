@@ -3,7 +3,7 @@
 Releases the Dragon Skin 10 beam of docs/data/measured.toml in engine structured at three time
 steps, bends walls by both laws beside measured silicones, and presses on the default finger's tip;
 prints the tables of docs/reality.md and docs/measurements.md and draws docs/figures/reality_*.png.
---set changes values of the beam's scene, such as discretization.spring_damping=least; --pages
+--set changes values of the beam's scene, such as discretization.integrator=euler; --pages
 fills the tables into the pages.  A minute of one core.
 """
 

@@ -45,7 +45,7 @@ from codesign_jax.export.play import play
 from codesign_jax.export.process import Process, Section, Size
 from codesign_jax.model import build_spec
 from codesign_jax.runs import choice
-from codesign_jax.scene import parameters
+from codesign_jax.scene import hand, parameters
 from codesign_jax.types import Outcome
 from tests.helpers.command_runs import command
 from tests.helpers.grasps import (
@@ -375,9 +375,22 @@ def test_the_sheet_s_lists_add_up(page):
         "finger 0 has one",
     ):
         assert words in text, words
-    named = dataclasses.make_dataclass("Material", ["silicone", "shear_modulus"])
-    assert silicone.of_material(named("ecoflex_00_30", 1e4)).name == "Ecoflex 00-30"
-    assert silicone.of_material(the_scene.hand.material) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "named", "nearest"),
+    [
+        ({"silicone": "ecoflex_00_30", "law": "neo_hookean"}, "Ecoflex 00-30", "Ecoflex 00-30"),
+        ({"shear_modulus": 90e3, "law": "neo_hookean"}, None, "Dragon Skin 10 Medium"),
+        # 1.78 times as much under the neo-Hookean law.
+        ({"shear_modulus": 90e3, "law": "linear"}, None, "Dragon Skin 20"),
+    ],
+)
+def test_a_hand_s_silicone_is_named_or_the_nearest_is(change, named, nearest):
+    plain = hand.Material(27.6e3, 1070.0, 3e-3)
+    material = dataclasses.replace(plain, **change)
+    own = silicone.of_material(material)
+    assert (own and own.name) == named and silicone.nearest(material).name == nearest
 
 
 @pytest.mark.parametrize(

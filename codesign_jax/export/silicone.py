@@ -1,48 +1,34 @@
-"""What a workshop must know of a silicone: how it is sold, mixed, poured and cured."""
+"""What a workshop must know of a hand's silicone; `scene.silicones` has the silicones."""
 
-from typing import NamedTuple
-
+from codesign_jax.scene import silicones
 from codesign_jax.scene.hand import Material
-
-
-class Silicone(NamedTuple):
-    """A silicone as it is worked."""
-
-    name: str  # what it is sold as
-    mix: tuple[float, float]  # parts A and B by weight
-    pot_life: float  # time after mixing in which it pours [min], at 23 degrees
-    cure_time: float  # time until it leaves the mould [h], at 23 degrees
-    shear_modulus: float  # G under the linear law [Pa], docs/measurements.md
-
-    def __str__(self) -> str:
-        a, b = self.mix
-        return (
-            f"{self.name} (mix {a:g} A : {b:g} B by weight, pours for {self.pot_life:g} min, "
-            f"leaves the mould after {self.cure_time:g} h at 23 °C)"
-        )
-
+from codesign_jax.scene.silicones import Silicone
 
 SOURCE = "the maker's technical bulletins (Smooth-On, Dragon Skin and Ecoflex series)"
 """Where mix, pot life and time of cure come from."""
-SILICONES = {
-    "dragon_skin_10": Silicone("Dragon Skin 10 Medium", (1, 1), 20, 5, 31.9e3),
-    "dragon_skin_20": Silicone("Dragon Skin 20", (1, 1), 25, 4, 88.8e3),
-    "dragon_skin_30": Silicone("Dragon Skin 30", (1, 1), 45, 16, 126e3),
-    "ecoflex_00_30": Silicone("Ecoflex 00-30", (1, 1), 45, 4, 8.9e3),
-    "ecoflex_00_50": Silicone("Ecoflex 00-50", (1, 1), 18, 3, 12.6e3),
-}
+
+
+def words(silicone: Silicone) -> str:
+    """How a silicone is sold, mixed, poured and cured."""
+    a, b = silicone.mix
+    return (
+        f"{silicone.name} (mix {a:g} A : {b:g} B by weight, pours for {silicone.pot_life:g} min, "
+        f"leaves the mould after {silicone.cure_time:g} h at 23 °C)"
+    )
 
 
 def of_material(material: Material) -> Silicone | None:
     """The silicone that a hand names, or None where its material is numbers alone."""
-    return SILICONES.get(getattr(material, "silicone", None) or "")
+    return silicones.get(material.silicone) if material.silicone else None
 
 
 def nearest(material: Material) -> Silicone:
-    """The silicone whose modulus is nearest to the hand's, by their ratio."""
+    """The silicone whose walls bend most like the hand's, by the ratio of their moduli."""
     mine = material.shear_modulus
+    if not silicones.of_law(material.law):
+        mine *= silicones.EQUAL_BEND  # the silicones' law is the neo-Hookean one
 
     def distance(other: Silicone) -> float:
         return max(mine / other.shear_modulus, other.shear_modulus / mine)
 
-    return min(SILICONES.values(), key=distance)
+    return min(silicones.SILICONES.values(), key=distance)

@@ -133,10 +133,11 @@ def _silicone(scene: Scene) -> str:
     needed = f"G = {material.shear_modulus / 1e3:g} kPa under the {law} law of bending"
     named = silicone.of_material(material)
     if named:
-        return f"{named}; {needed}"
+        return f"{silicone.words(named)}; {needed}"
     return (
         f"platinum-cured, {needed}. The hand's file names none; nearest by docs/measurements.md "
-        f"is {silicone.nearest(material)}. Measure the first finger (codesign finger FILE --fit)"
+        f"is {silicone.words(silicone.nearest(material))}. Measure the first finger (codesign "
+        "finger FILE --fit)"
     )
 
 

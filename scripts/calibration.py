@@ -72,7 +72,8 @@ OPEN = {
     "torsion": Open("", 1, 3),
     "half_size": Open("mm", 20, 40),
     "mass": Open("g", 20, 300, log=True),
-    "friction": Open("", 0.5, 1.2),
+    # The interval of a pneumatic gripper's friction ratio, docs/reality.md.
+    "friction": Open("", 0.77, 1.09),
     "table_friction": Open("", 0.2, 0.6),
     "wrist_linear": Open("N/m", 100, 2000, log=True),
     "wrist_angular": Open("N m/rad", 1, 20, log=True),
@@ -494,7 +495,10 @@ def sets_of(args: Any, the_scene: Scene) -> np.ndarray:
         units = near_best(*scored(args.near), args.sets, args.seed)
     else:
         units = space_filling(args.sets, args.seed)
-    return np.concatenate([units, *[own_set(the_scene)[None]] * args.own])
+    own = own_set(the_scene)
+    fixed = [list(OPEN).index(name) for name in args.fix]
+    units[:, fixed] = own[fixed]
+    return np.concatenate([units, *[own[None]] * args.own])
 
 
 def main() -> int:
@@ -506,6 +510,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     near = "scores of a wave around whose best sets these are drawn"
     parser.add_argument("--near", type=Path, metavar="SCORES", help=near)
+    fix = "constants that every set has of the scene"
+    parser.add_argument("--fix", nargs="+", default=[], choices=OPEN, metavar="NAME", help=fix)
     own = "how often the scene's own set comes behind them, each time in other trials"
     parser.add_argument("--own", type=int, default=0, metavar="TIMES", help=own)
     parser.add_argument("--chunk", type=int, default=LIMIT, help="most worlds of a call")

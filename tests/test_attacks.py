@@ -32,7 +32,7 @@ from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import command, own_workplace  # noqa: F401
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*they have no effect any more")
-ARCHIVE = Path(__file__).parent / "data" / "run_screened.zip"
+DATA = Path(__file__).parent / "data"
 HOSTILE = "\x1b]0;owned\x07\nsecond\r\u202e\u2028line"
 SHOWN = r"\x1b]0;owned\x07\nsecond\r\u202e\u2028line"
 
@@ -40,7 +40,7 @@ SHOWN = r"\x1b]0;owned\x07\nsecond\r\u202e\u2028line"
 @pytest.fixture
 def run(tmp_path):
     """A run of a stranger's."""
-    zipfile.ZipFile(ARCHIVE).extractall(tmp_path)
+    zipfile.ZipFile(DATA / "run_screened.zip").extractall(tmp_path)
     return tmp_path / "screened"
 
 
@@ -287,10 +287,16 @@ def replaced(arrays, place, value):
     return changed
 
 
-def test_arrays_that_no_run_has_are_refused_in_words(run):
-    """Each array of a checkpoint with another shape, of another kind, or a table in its place."""
+@pytest.mark.parametrize("archive", ["run_screened", "run_particle_filter"])
+def test_arrays_that_no_run_has_are_refused_in_words(archive, tmp_path):
+    """Each array of a checkpoint with another shape, of another kind, or a table in its place.
+
+    One of the runs has ended with a test.
+    """
+    zipfile.ZipFile(DATA / f"{archive}.zip").extractall(tmp_path)
+    [run] = manifest.runs_inside(tmp_path)
     record, settings = runs.load_record(run), runs.read_run(run)[1]
-    assert record is not None
+    assert record is not None and (record.test is not None) == (archive != "run_screened")
     arrays = records.to_arrays(record)
     records.refuse_other(records.from_arrays(arrays), settings)
     cases = []

@@ -99,7 +99,7 @@ def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch)
     kept = SimpleNamespace(status=np.zeros(1, int))
     code = {"check": 0, "replay": 0, "evaluate": kept}.get(arguments[0])
     for owner, name in SIMULATES.get(arguments[0], ()):
-        monkeypatch.setattr(owner, name, lambda *rest: reached.append(rest) or code)
+        monkeypatch.setattr(owner, name, lambda *rest, **more: reached.append(rest) or code)
     if arguments[0] in ("optimize", "sample"):
         arguments.append("--dry-run")
     assert cli.main(arguments) == 0

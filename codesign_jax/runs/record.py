@@ -155,7 +155,8 @@ def _shapes(record: Any, settings: Settings) -> Iterator[tuple[str, Any, tuple]]
     for name in ("cost", "weight", "ancestors"):
         yield name, getattr(history, name), (e, n)
     if record.test is not None:
-        tested = n, settings.test_rounds * settings.trials
+        # The last episode's trials may be among them, see `codesign.testing`.
+        tested = n, max(np.shape(record.test.cost)[-1], settings.test_rounds * settings.trials)
         for name, value in record.test._asdict().items():
             if value is not None or name not in _NOT_EVERYWHERE:
                 yield f"test/{name}", value, tested

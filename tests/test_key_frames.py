@@ -130,7 +130,7 @@ BAD = {
     ],
     "frame[1].z: 'pressure' has the unit Pa, not m": [{"time": 0}, FRAME | {"z": "pressure"}],
     "frame[1].z = 'arm_z zero_height' is no sum": [{"time": 0}, FRAME | {"z": "arm_z zero_height"}],
-    "is too large": [{"time": 0}, FRAME | {"pressure": [10**310, 0, 0, 0]}],
+    "is outside [-1e+06, 1e+06] Pa": [{"time": 0}, FRAME | {"pressure": [10**310, 0, 0, 0]}],
     "frame[1].z = 'arm_z * arm_x' multiplies 'arm_z' by 'arm_x'": [
         {"time": 0}, FRAME | {"z": "arm_z * arm_x"}
     ],

@@ -194,21 +194,21 @@ def test_no_kernel_depends_on_what_its_key_leaves_out():
 # As `find DIR -name '*.py' | xargs cat | wc -l` counts.  A larger number is a line of a review: say
 # there what users have of it, and what could go in its place.
 MOST_LINES = {
-    "codesign_jax": 37_800,
+    "codesign_jax": 39_300,
     "codesign_jax/codesign": 580,
-    "codesign_jax/commands": 3_210,
+    "codesign_jax/commands": 3_300,
     "codesign_jax/compiler": 2_640,
     "codesign_jax/env": 350,
     "codesign_jax/engines": 11_770,
-    "codesign_jax/export": 1_600,
+    "codesign_jax/export": 3_000,
     "codesign_jax/model": 1_620,
     "codesign_jax/optimize": 1_300,
     "codesign_jax/report": 1_790,
     "codesign_jax/runs": 3_160,
     "codesign_jax/scene": 5_010,
     "codesign_jax/studio": 750,
-    "scripts": 5_560,
-    "tests": 16_000,
+    "scripts": 5_600,
+    "tests": 16_500,
 }
 
 

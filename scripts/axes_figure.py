@@ -1,6 +1,6 @@
 """The figure of docs/control.md that shows how roll, yaw and pitch turn the hand.
 
-    python -m scripts.axes_figure
+python -m scripts.axes_figure
 """
 
 from pathlib import Path

@@ -46,12 +46,15 @@ def main(options: Export) -> int:
     console.print(*runs.describe(case.space, case.design).split("\n"), sep="\n")
     for note in notes:
         console.print(note)
+    earlier = (options.out / files.MANIFEST).is_file()
     try:
         with files.whole_folder(options.out, replace=options.overwrite) as folder:
             write_files(case, params, sizes, engine, folder, options, console)
     except OSError as error:
         raise InputError([f"--out {options.out}: {error.strerror}"]) from error
     _tell(case, options, console)
+    if earlier:
+        console.print("  the files of the earlier export there are gone or replaced")
     if others := files.foreign(options.out):
         console.print(f"  left there, no part of this export: {_some(others)}")
     return 0

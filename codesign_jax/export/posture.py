@@ -49,7 +49,8 @@ def draw(
     _arrows(axes, length)
     drawn = [_flat(points) for points, _, _ in turned] + [_flat(1.2 * length * np.eye(3))]
     low, high = (f(np.concatenate(drawn), axis=0) for f in (np.min, np.max))
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    edge = 0.04 * (high - low).max()
+    axes.set(xlim=(low[0] - edge, high[0] + edge), ylim=(low[1] - edge, high[1] + edge))
     axes.set_aspect("equal")
     axes.axis("off")
     axes.set_title(words, fontsize=6)

@@ -199,7 +199,7 @@ def measured(scene: Scene, params: Any, trial: Any, qpos: np.ndarray) -> dict[st
     first, begin, end = (int(scene.last_step(p)) for p in ("approach", "inflate", "disturb"))
     hold = slice(begin - first, end - first)
     in_palm = in_disc(palm, place[:, 1], turn[:, 1], skin[:, :, None])
-    hinges = 6 + np.arange(lay.dofs.size).reshape(lay.dofs.shape)[..., 0]
+    hinges = lay.dofs[..., 0]  # hinges that bend
     bend = np.median(qpos[hold][:, hinges], 0)
     curved = np.abs(bend).max(1) * np.asarray(params.height) / np.array([t.segment for t in tubes])
     depths = {name: series[name].max() for name in ("self", "finger", "palm", "object")}

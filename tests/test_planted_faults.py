@@ -182,9 +182,10 @@ def touching(scene):
     fields, ctrl = grasps.world_inputs(scene, hand, trial)
     qpos = np.array(fields.start)
     qpos[2], qpos[3:6] = 0.1, 0.1 * random.normal(size=3)
-    bend = np.zeros(model.layout(scene).dofs.shape)
+    dofs = model.layout(scene).dofs
+    bend = np.zeros(dofs.shape)
     bend[..., 0], qpos[-5] = 0.35, qpos[-5] - 5e-4
-    qpos[6:-7] = (bend + 0.05 * random.normal(size=bend.shape)).ravel()
+    qpos[dofs] = bend + 0.05 * random.normal(size=bend.shape)
     qvel = 0.3 * random.normal(size=len(qpos) - 1)
     qvel[-4] = -0.2  # onto the table
     ctrl = np.repeat(np.asarray(ctrl[:1]), STEPS, 0)

@@ -100,7 +100,7 @@ def joint_springs(scene: Scene, params: Params) -> tuple[jax.Array, jax.Array]:
     lay, hand = layout(scene), scene.hand
     beams = morphology.finger_beams(hand, params, lay.links)
     each = morphology.joint_springs(hand, params, beams, lay.links, lay.axes)
-    finger, own = (jnp.broadcast_to(v, lay.dofs.shape).reshape(-1) for v in each)
+    finger, own = (_picked(jnp.broadcast_to(v, lay.dofs.shape).ravel(), lay.hinges) for v in each)
     springs = wrist_springs(scene)
     wrist, wrist_damping = (jnp.stack([jnp.asarray(x, finger.dtype) for x in v]) for v in springs)
     free = jnp.zeros(6, finger.dtype)

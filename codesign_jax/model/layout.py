@@ -25,6 +25,7 @@ INACTIVE = 1e-3
 # to yaw.
 WRIST = ("x", "y", "z", "roll", "yaw", "pitch")
 AXES = {"bend": (0, 1, 0), "lateral": (0, 0, 1), "twist": (1, 0, 0)}
+"""Axes of a finger's joints in the link's frame, in the order in which arrays have them."""
 
 
 class Layout(NamedTuple):
@@ -32,11 +33,12 @@ class Layout(NamedTuple):
 
     Attributes:
       links: Number of segments N of a finger.
-      axes: Names of the joint axes that are on, in hinge order.
+      axes: Names of the joint axes that are on, in the order of `AXES`.
       stubs: Body ids of the half segments at the palm, shape (finger,).
       bodies: Body ids of the moving links, shape (finger, N).
       object: Body id of the object.
-      dofs: Dof (and joint) ids of the finger hinges, shape (finger, N, axis).
+      dofs: Dof (and joint) ids of the finger hinges, shape (finger, N, axis), the axes in the order
+        of `axes`: on every other joint the ids descend, see `hinge_sign`.
       spheres: Geom ids of the finger spheres, shape (finger, N, k); empty without finger contacts.
       object_geoms: Geom ids of the object's shapes, shape (shape,).
       palm: Geom ids of the palm's contact spheres, shape (sphere,); empty without palm contacts.
@@ -57,11 +59,34 @@ class Layout(NamedTuple):
     disc: np.ndarray
     centre_weights: np.ndarray
 
+    @property
+    def hinges(self) -> np.ndarray:
+        """Places of the finger hinges, in MuJoCo's order, in a flat array (finger, N, axis)."""
+        return np.argsort(self.dofs, axis=None).astype(np.int32)
+
 
 def joint_axes(scene: Scene) -> tuple[str, ...]:
-    """Names of the finger joints' axes that the scene's effects call for, in hinge order."""
+    """Names of the finger joints' axes that the scene's effects call for, as `AXES` has them."""
     on = {"bend": True, "lateral": scene.effects.lateral_bending, "twist": scene.effects.twist}
     return tuple(name for name in AXES if on[name])
+
+
+def hinge_sign(joint: Any) -> Any:
+    """1 for joints whose hinges follow one another in the order of `AXES`, else -1.
+
+    Those of every other joint follow in the opposite order.  One order in all of them couples
+    bending and twist with an error of first order in 1/N: ten links of a finger that is bent by 120
+    degrees give way to a sideways force by 8 % less than a fine chain; alternating, by 1 % less.
+
+    Args:
+      joint: Number of the joint along its finger, from 0; an integer or an array of them.
+    """
+    return 1 - 2 * (joint & 1)
+
+
+def hinge_order(scene: Scene, joint: int) -> tuple[str, ...]:
+    """Names of a joint's axes in the order in which its hinges follow one another."""
+    return joint_axes(scene)[:: hinge_sign(joint)]
 
 
 @by_structure
@@ -71,6 +96,8 @@ def layout(scene: Scene) -> Layout:
     stubs = 2 + np.arange(n) * (links + 1)
     bodies = stubs[:, None] + 1 + np.arange(links)
     dofs = 6 + np.arange(n * links * len(axes)).reshape(n, links, len(axes))
+    forward = hinge_sign(np.arange(links)) > 0
+    dofs = np.where(forward[:, None], dofs, dofs[:, :, ::-1])
     e = scene.effects
     own = e.finger_object or e.finger_table or e.finger_finger or e.finger_palm
     touching = e.surface == "spheres" and own

@@ -17,6 +17,7 @@ from codesign_jax.model.layout import (
     contact_invweight,
     first_on_palm,
     friction_ratio,
+    hinge_order,
     implicit_damping,
     layout,
     mounts,
@@ -236,12 +237,12 @@ def _add_finger(
             )
         if i == 0:
             continue
-        for name, stiffness, own in zip(lay.axes, *(v[i - 1] for v in springs), strict=True):
+        for name in hinge_order(scene, i - 1):
+            stiffness, own = (v[i - 1, lay.axes.index(name)] for v in springs)
             implicit = implicit_damping(scene, stiffness, own)
-            joint = f"finger_{f}_{name}_{i}"
             _hinge(
                 body,
-                joint,
+                f"finger_{f}_{name}_{i}",
                 AXES[name],
                 stiffness=stiffness,
                 damping=implicit,

@@ -15,7 +15,7 @@ def state(the_scene, seed, bend, height):
     angles = 0.1 * random.normal(size=lay.dofs.shape)
     angles[..., 0] += bend
     qpos[2] = height
-    qpos[6 : 6 + lay.dofs.size] = angles.ravel()
+    qpos[lay.dofs] = angles
     qvel = 0.3 * random.normal(size=len(qpos) - 1)
     return fields, qpos, qvel, np.append(qpos[:6], [60e3] * the_scene.num_fingers)
 

@@ -2,10 +2,12 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from codesign_jax import model
 from codesign_jax.engines.structured.laws.kinematics import Acc, State
 from codesign_jax.model import ModelFields, layout
+from codesign_jax.model.layout import hinge_sign
 from codesign_jax.scene import Scene
 
 
@@ -36,7 +38,7 @@ def _in_lanes(scene: Scene, start: model.State) -> State:
     q, v, a, step, going, speed = (jnp.asarray(x).T[:, None] for x in start[:6])
 
     def finger(x: jax.Array) -> jax.Array:
-        return jnp.moveaxis(x[6:end, 0].reshape(*lay.dofs.shape, -1), 0, 2)
+        return jnp.moveaxis(x[:, 0][lay.dofs], 0, 2)
 
     return State(
         wrist=q[:6],
@@ -56,7 +58,9 @@ def _in_lanes(scene: Scene, start: model.State) -> State:
 
 
 def _flat(wrist: jax.Array, finger: jax.Array, *rest: jax.Array) -> jax.Array:
-    joints = jnp.moveaxis(finger, 2, 0).reshape(-1, finger.shape[-1])
+    forward = hinge_sign(np.arange(len(finger))) > 0
+    hinges = jnp.where(forward[:, None, None, None], finger, finger[:, ::-1])
+    joints = jnp.moveaxis(hinges, 2, 0).reshape(-1, finger.shape[-1])
     return jnp.concatenate([wrist[:, 0], joints, *(x[:, 0] for x in rest)]).T
 
 

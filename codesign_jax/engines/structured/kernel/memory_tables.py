@@ -321,10 +321,10 @@ class Packing(Tables):
             names += [("acc", "acc", ("acc_wrist", "acc_object"))]
         found = {}
         for name, joint, others in names:
-            rows = self.finger_state.offset[joint] + np.arange(size)
+            rows = self.finger_state.offset[joint] + self.lay.hinges[:size]
             split = (-1, steps, size, self.fingers, self.block)
             joints = fingers[:, :, rows].reshape(split)[..., : self.num_fingers, :]
-            joints = joints.transpose(0, 4, 1, 3, 2)  # (block, world, time, finger, link and axis)
+            joints = joints.transpose(0, 4, 1, 3, 2)  # (block, world, time, finger, hinge)
             joints = joints.reshape(-1, steps, self.num_fingers * size)
             where = [(self.world_state.offset[o], self.world_state.groups[o][1][0]) for o in others]
             rows = np.concatenate([np.arange(first, first + count) for first, count in where])
@@ -345,7 +345,7 @@ class Packing(Tables):
         """
         joints, others, end = [], [], 6 + self.lay.dofs.size
         for x in (qpos,) if qvel is None else (qpos, qvel):
-            finger = x[:, :, 6:end].reshape(*x.shape[:2], self.num_fingers, -1)
+            finger = x[:, :, self.lay.dofs].reshape(*x.shape[:2], self.num_fingers, -1)
             joints.append(jnp.swapaxes(finger, 2, 3))
             others.append(jnp.concatenate([x[:, :, :6], x[:, :, end:]], 2))
         fill = [(0, 0)] * 3 + [(0, self.fingers - self.num_fingers)]

@@ -171,9 +171,10 @@ def of_link(scene: Scene, chain: LinkMotion, numbers: dict, joint: dict, still: 
     """What a link hands on, and its power.
 
     Chain is what it inherits, `numbers` its constants; `still` has the accelerations and virtual
-    accelerations of the joint, and the cotangent of the centre of mass.
+    accelerations of the joint, the order of its hinges, and the cotangent of the centre of mass.
     """
-    after, found = link_forces(scene, chain[:5], numbers, joint | {"acc": still["acc"]})
+    joint = joint | {"acc": still["acc"], "order": still["order"]}
+    after, found = link_forces(scene, chain[:5], numbers, joint)
     along = next_motion(chain.along, found["axes"], still["virtual"])
     body = make_body(numbers["mass"], found["body_centre"], found["tensor"])
     armature = found.get("armature_now", numbers["armature"])

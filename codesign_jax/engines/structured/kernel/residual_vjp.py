@@ -111,7 +111,7 @@ class ResidualVjp:
 
     def _link(self, i: Any, after: LinkMotion, pressure: Lanes, centre_bar: Lanes) -> LinkMotion:
         numbers, joint = self.step.link_constants(i), self.step.joint(i)
-        still = {"acc": joint.pop("acc")}
+        still = {"acc": joint.pop("acc"), "order": self.step.order(i)}
         still["virtual"] = self.scratch.read("virtual", i)
         share = self.step.hand.read("share", i + 1)
         still["centre_bar"] = lanewise(jnp.multiply, centre_bar, share)

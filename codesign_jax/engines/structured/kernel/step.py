@@ -133,7 +133,7 @@ class Step(StepMemory):
         def link(i: Any, carry: tuple) -> tuple:
             origin, frame, vel, bias, motion, middle = carry
             self.keep(i, carry[:5])
-            joint = self.joint(i) | {"pressure": pressure}
+            joint = self.joint(i) | {"pressure": pressure, "order": self.order(i)}
             run = partial(link_forces, p.scene)
             constants = self.link_constants(i)
             carry, stored = lanewise(run, carry[:5], constants, joint)
@@ -207,7 +207,8 @@ def link_forces(scene: Scene, parent: tuple, constants: dict, joint: dict):
 
     Args:
       parent: Origin, frame, velocity, bias and motion of the link before it.
-      joint: Angles, velocities and accelerations of the joint, and the chamber's pressure, by name.
+      joint: Angles, velocities and accelerations of the joint, the chamber's pressure, and the
+        order of the hinges, see `hinge_sign`, by name.
 
     Returns:
       What `parent` is for the next link, and what the solver needs, by name.
@@ -217,9 +218,9 @@ def link_forces(scene: Scene, parent: tuple, constants: dict, joint: dict):
     hinges = [constants[n] for n in ("stiffness", "damping", "armature")]
     cos, sin = jnp.cos(q), jnp.sin(q)
     origin, frame, axes = kin._turn_link(
-        joint_axes(scene), origin, frame, constants["offset"], cos, sin
+        joint_axes(scene), origin, frame, constants["offset"], cos, sin, joint["order"]
     )
-    vel, bias = kin._link_velocity(vel, bias, axes, rate)
+    vel, bias = kin._link_velocity(vel, bias, axes, rate, joint["order"])
     motion = next_motion(motion, axes, joint["acc"])
     body = Body(
         constants["mass"],

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, ContactSet
 from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, MemoryLayout
-from codesign_jax.engines.structured.lanewise import Lanes
+from codesign_jax.engines.structured.lanewise import Lanes, lanes
 from codesign_jax.model import Layout
+from codesign_jax.model.layout import hinge_sign
 from codesign_jax.scene import Scene
 
 PALM_CONSTANTS = (
@@ -128,3 +129,8 @@ class StepMemory:
     def joint(self, i: Any) -> dict[str, Lanes]:
         """Angles, velocities and accelerations of a joint, by name."""
         return {n: self.finger_state.read(n, i) for n in ("finger", "finger_vel", "acc")}
+
+    def order(self, i: Any) -> Lanes:
+        """In which order a joint's hinges follow one another, see `hinge_sign`."""
+        sign = hinge_sign(jnp.asarray(i)).astype(self.like.dtype)
+        return lanes([self.like + sign], (), wide=True)

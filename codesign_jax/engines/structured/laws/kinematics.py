@@ -28,9 +28,8 @@ from codesign_jax.engines.structured.world_model import (
     rotation_columns,
     turn_columns,
 )
+from codesign_jax.model.layout import hinge_sign
 
-# Axis of the frame about which each hinge turns, in the order bend (y), lateral (z), twist (x).
-_HINGE = {"bend": 1, "lateral": 2, "twist": 0}
 _WRIST = (0, 2, 1)  # roll (x), yaw (z), pitch (y)
 
 
@@ -89,6 +88,7 @@ class Kinematics(NamedTuple):
 
 
 def kinematics(hand: WorldModel, axis_names: tuple[str, ...], state: State) -> Kinematics:
+    """Kinematics of a state; the axes' names are those of `model.joint_axes`."""
     place = _place(state)
     palm, wrist_axes, palm_vel, palm_bias = once(_wrist, place, state.wrist, state.wrist_vel)
     frame, origin = once(mounted, place, palm, hand.mount, hand.base)
@@ -96,13 +96,14 @@ def kinematics(hand: WorldModel, axis_names: tuple[str, ...], state: State) -> K
     trig = once(lambda q: (jnp.cos(q), jnp.sin(q)), state.finger)
 
     def next_link(carry, link):
-        (origin, frame, vel, bias), (offset, cos, sin, rate) = carry, link
+        (origin, frame, vel, bias), (offset, cos, sin, rate, order) = carry, link
         turn = partial(_turn_link, axis_names)
-        origin, frame, subspace = once(turn, origin, frame, offset, cos, sin)
-        vel, bias = once(_link_velocity, vel, bias, subspace, rate)
+        origin, frame, subspace = once(turn, origin, frame, offset, cos, sin, order)
+        vel, bias = once(_link_velocity, vel, bias, subspace, rate, order)
         return (origin, frame, vel, bias), (origin, frame, vel, bias, subspace)
 
-    over = (hand.offset, *trig, state.finger_vel)
+    order = hinge_sign(jnp.arange(len(hand.offset)))[:, None, None]
+    over = (hand.offset, *trig, state.finger_vel, order.astype(hand.offset.dtype))
     lanes = jnp.zeros_like(hand.offset[0])
     first = (origin, frame, vel + lanes, bias + lanes)
     _, (origins, frames, vels, biases, axes) = scan_links(next_link, first, over)
@@ -169,22 +170,59 @@ def mounted(place: jax.Array, palm: jax.Array, mount: jax.Array, base: jax.Array
     return frame, place + apply_columns(palm, base)
 
 
-def _turn_link(names: tuple[str, ...], origin, frame, offset, cos, sin):
-    """Position, orientation and motion subspace of a link from its parent's."""
+def _turn_link(names: tuple[str, ...], origin, frame, offset, cos, sin, order):
+    """Position, orientation and motion subspace of a link from its parent's.
+
+    Seen in a mirror that swaps the axes x and y, the hinges of the opposite order twist, lateral,
+    bend are bend, lateral, twist, and their angles have the other sign.  So both orders are the
+    same arithmetic on columns that trade places.
+
+    Args:
+      names: Names of the axes that are on, in the order of `model.layout.AXES`.
+      order: See `model.layout.hinge_sign`, shape (...).
+    """
     origin = origin + frame[0] * offset
-    columns, subspace = list(frame), []
-    for a, name in enumerate(names):
-        axis = columns[_HINGE[name]]
-        subspace.append(spatial(axis, cross(origin, axis)))
-        columns = rotate(columns, _HINGE[name], cos[a], sin[a])
+    if names == ("bend",):
+        axis = frame[1]
+        columns = rotate(list(frame), 1, cos[0], sin[0])
+        return origin, jnp.stack(columns), spatial(axis, cross(origin, axis))[None]
+    still = jnp.ones_like(cos[0]), jnp.zeros_like(sin[0])
+    turns = {name: (cos[a], sin[a]) for a, name in enumerate(names)}
+    bend, lateral, twist = (turns.get(name, still) for name in ("bend", "lateral", "twist"))
+    forward = order > 0
+
+    def swapped(a, b):
+        """The two values, in the other order where the hinges are."""
+        return jnp.where(forward, a, b), jnp.where(forward, b, a)
+
+    columns = [*swapped(frame[0], frame[1]), frame[2]]
+    both = [swapped(b, t) for b, t in zip(bend, twist, strict=True)]
+    turned = []
+    for axis, c, s in ((1, both[0][0], both[1][0]), (2, *lateral), (0, both[0][1], both[1][1])):
+        turned.append(columns[axis])
+        columns = rotate(columns, axis, c, order * s)
+    first, middle, last = turned
+    bend_axis, twist_axis = swapped(first, last)
+    axes = {"bend": bend_axis, "lateral": middle, "twist": twist_axis}
+    subspace = [spatial(axes[name], cross(origin, axes[name])) for name in names]
+    columns = [*swapped(columns[0], columns[1]), columns[2]]
     return origin, jnp.stack(columns), jnp.stack(subspace)
 
 
-def _link_velocity(vel: jax.Array, bias: jax.Array, subspace: jax.Array, rate: jax.Array):
-    for a in range(subspace.shape[0]):
-        bias = bias + motion_cross(vel, subspace[a]) * rate[a]
-        vel = vel + subspace[a] * rate[a]
-    return vel, bias
+def _link_velocity(
+    vel: jax.Array, bias: jax.Array, subspace: jax.Array, rate: jax.Array, order: jax.Array
+):
+    """Velocity and bias of a link from its parent's; each hinge is carried by those before it."""
+    motion = subspace[0] * rate[0]
+    carried = None
+    for a in range(1, subspace.shape[0]):
+        more = motion_cross(motion, subspace[a]) * rate[a]
+        carried = more if carried is None else carried + more
+        motion = motion + subspace[a] * rate[a]
+    bias = bias + motion_cross(vel, motion)
+    if carried is not None:
+        bias = bias + order * carried
+    return vel + motion, bias
 
 
 def _object(state: State):

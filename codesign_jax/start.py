@@ -7,18 +7,15 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.assembly import contacts
+from codesign_jax.engines.structured import assembly
 from codesign_jax.engines.structured.coordinates import reset
-from codesign_jax.engines.structured.laws import shapes
 from codesign_jax.engines.structured.laws.kinematics import Kinematics, straight
 from codesign_jax.engines.structured.world_model import (
     WorldModel,
     apply_columns,
-    apply_rows,
     world_constants,
 )
 from codesign_jax.model import ModelFields, layout
-from codesign_jax.model.layout import first_on_palm
 from codesign_jax.scene import Scene
 from codesign_jax.types import Status
 
@@ -62,7 +59,7 @@ def depth(scene: Scene, fields: ModelFields) -> jax.Array:
     alone = dataclasses.replace(scene.effects, finger_finger=False)
     hand, kin, position = _straight(scene, fields)
     scene = dataclasses.replace(scene, effects=alone)
-    every = contacts(scene, hand, kin, position)
+    every = assembly.contacts(scene, hand, kin, position)
     found = [(-c.distance).reshape(-1, c.distance.shape[-1]).max(0) for c in every.values()]
     if not found:
         return jnp.zeros(fields.body_mass.shape[0], fields.body_mass.dtype)
@@ -94,27 +91,12 @@ def depth_between(scene: Scene, fields: ModelFields) -> jax.Array:
 def depth_in_palm(scene: Scene, fields: ModelFields) -> jax.Array:
     """Deepest overlap of a straight finger with the palm's disc [m], shape (world,).
 
-    By the edges of the hull, or by spheres around the links' middles, see `depth_between`; of the
-    links that may touch the palm.
+    By the rings or spheres that touch it in a simulation, of those that may.
     """
     if not scene.effects.finger_palm:
         return jnp.full((fields.start.shape[0],), -jnp.inf, fields.start.dtype)
     hand, kin, _ = _straight(scene, fields)
-    first = first_on_palm(scene.discretization.links) - 1
-    point, radius = hand.centre[:, None], hand.centre[2]
-    if scene.effects.surface == "hull":
-        assert hand.section is not None
-        across = jnp.array([-0.5, 0.5, -0.5, 0.5])[:, None, None, None] * hand.section[3]
-        up = jnp.array([0.0, 0.0, 2.0, 2.0])[:, None, None, None] * hand.centre[2]
-        point = jnp.stack([0.0 * up, across + 0.0 * up, up])
-        radius = jnp.zeros_like(radius)
-    point = kin.origin[:, None] + apply_columns(kin.link[:, :, None], point)
-    local = apply_rows(kin.palm[:, :, None, None], point - kin.place[:, None, None])
-    assert hand.palm_disc is not None
-    above = jnp.stack([local[0], local[1], local[2] - hand.palm_disc[1]])
-    distance, _ = shapes.cylinder(hand.palm_disc[:, None, None], above)
-    deepest = (radius - distance)[:, first:]
-    return deepest.reshape(-1, deepest.shape[-1]).max(0)
+    return assembly.depth_in_palm(scene, hand, kin)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -1,14 +1,14 @@
-"""How deep fingers, object and palm stand in one another over grasps, from recorded poses alone.
+"""How deep fingers, object and palm stand in one another over grasps.
 
 python -m scripts.contact_depths docs/data/search/winners.npz --trials 3 --out runs/depths.json
 python -m scripts.contact_depths runs/ten --trials 18 --batch 1024 --out runs/depths.json
 
 A file is the .npz of a search of `scripts.search` (what it recommends in the end), a .json whose
 `designs` have a `vector` each, as --out has, or a folder of runs.  One program simulates all
-grasps, --batch at a time.  A finger's surface is the one that touches, whatever the law:
-|y/a|^4 + |z/b|^4 = 1 along its blended links, with a cap over the last quarter of a segment.  The
-depth of a body in another is that of its deepest point from the other's surface, in every step
-from the inflation on.
+grasps, --batch at a time.  Depths are those of the rings that the engine presses with, in every
+step from the inflation on.  Beside them stand, as *_surface_mm, depths from recorded poses alone:
+of a body's deepest point from the other's surface, with |y/a|^4 + |z/b|^4 = 1 along a finger's
+blended links and a cap over the last quarter of a segment.
 """
 
 import argparse
@@ -30,6 +30,7 @@ from codesign_jax import files, model, provenance, rollout, types
 from codesign_jax import scene as scenes
 from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.engines import make_engine
+from codesign_jax.model.layout import PALM_FROM, beyond_base
 from codesign_jax.scene import InputError, Scene, keypaths, parameters
 from codesign_jax.scene.primitives import PRIMITIVES
 from scripts.shared import work
@@ -37,7 +38,9 @@ from scripts.shared import work
 STATIONS, TIP = 4, 0.25  # sections a link; the cap's length in links, that of one section
 CAP = 0.5, 0.8, 0.95, 1.0  # places of its rings
 ARC = 3.0, 1.8  # links and heights along a finger from which on its parts touch one another
-ON_PALM = 0.25  # share of a finger at its base that is fixed to the palm and may stand in it
+# Kinds of contact whose depths the engine records, by the names that they have here.
+RINGS = {"self": "finger_itself", "finger": "finger_finger", "palm": "finger_palm"}
+RINGS |= {"object": "finger_object", "object_palm": "palm_object"}
 LIMITS = dict(self_mm=3.0, finger_share=1 / 3, finger_deep_s=0.5, palm_mm=2.0)
 LIMITS |= dict(object_held_mm=4.0, object_palm_mm=2.0)  # beyond which kept grasps are counted
 
@@ -160,8 +163,14 @@ def surface(shape: Any, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return edges.reshape(-1, 3), np.asarray(mesh.subdivide_to_size(0.005).vertices)
 
 
-def measured(scene: Scene, params: Any, trial: Any, qpos: np.ndarray) -> dict[str, float]:
-    """Depths [mm], durations [s], and bending while held, of a grasp in states (state, nq)."""
+def measured(
+    scene: Scene, params: Any, trial: Any, qpos: np.ndarray, recorded: dict[str, np.ndarray]
+) -> dict[str, float]:
+    """Depths [mm], durations [s], and bending while held, of a grasp in states (state, nq).
+
+    Args:
+      recorded: Depths of `types.Forces` in these states [m], by kind of contact, (state,) each.
+    """
     h, lay, palm = scene.discretization.timestep, model.layout(scene), scene.hand.palm
     compiled = model.compile_model(scene, params, trial)
     data, place, turn = mujoco.MjData(compiled), [], []
@@ -179,10 +188,10 @@ def measured(scene: Scene, params: Any, trial: Any, qpos: np.ndarray) -> dict[st
     for f, bodies in enumerate(lay.bodies):
         sizes = float(params.length[f]), scene.hand.section.width, float(params.height[f])
         tubes.append(tube(place[:, bodies], turn[:, [lay.stubs[f], *bodies]], sizes))
-    series = {name: np.zeros(len(qpos)) for name in ("self", "finger", "share", "palm", "object")}
+    surface_series = {n: np.zeros(len(qpos)) for n in ("self", "finger", "share", "palm", "object")}
 
     def deeper(name: str, depth: np.ndarray) -> None:
-        series[name] = np.maximum(series[name], depth)
+        surface_series[name] = np.maximum(surface_series[name], depth)
 
     for f, one in enumerate(tubes):
         least = max(ARC[0] * one.segment, ARC[1] * 2 * one.half[2])
@@ -191,29 +200,39 @@ def measured(scene: Scene, params: Any, trial: Any, qpos: np.ndarray) -> dict[st
             depth = in_tube(one.rings, other)
             deeper("finger", depth)
             deeper("share", depth / (2 * other.half[1:].min()))
-        free = one.rings[:, one.place > ON_PALM * lay.links * one.segment]
-        deeper("palm", in_disc(palm, place[:, 1], turn[:, 1], free))
+        free = one.place > PALM_FROM * lay.links * one.segment
+        free &= beyond_base(one.place, 2 * one.half[2])
+        if free.any():
+            deeper("palm", in_disc(palm, place[:, 1], turn[:, 1], one.rings[:, free]))
         points = one.rings.reshape(len(qpos), -1, 3) - centre[:, None]
         deeper("object", in_object(shape.type, size, points @ frame))
         deeper("object", in_tube(edges[:, :, None], one))
     first, begin, end = (int(scene.last_step(p)) for p in ("approach", "inflate", "disturb"))
     hold = slice(begin - first, end - first)
-    in_palm = in_disc(palm, place[:, 1], turn[:, 1], skin[:, :, None])
+    surface_series["object_palm"] = in_disc(palm, place[:, 1], turn[:, 1], skin[:, :, None])
+    none = np.zeros(len(qpos))
+    series = {name: recorded.get(kind, none) for name, kind in RINGS.items()}
     hinges = lay.dofs[..., 0]  # hinges that bend
     bend = np.median(qpos[hold][:, hinges], 0)
     curved = np.abs(bend).max(1) * np.asarray(params.height) / np.array([t.segment for t in tubes])
-    depths = {name: series[name].max() for name in ("self", "finger", "palm", "object")}
-    depths |= {"object_held": series["object"][hold].max(), "object_palm": in_palm[hold].max()}
-    depths["object_held_median"] = np.median(series["object"][hold])
 
-    def lasting(name: str, limit: float) -> float:
-        return round(h * int((series[name] > limit).sum()), 3)
+    def deepest(series: dict[str, np.ndarray], end: str = "") -> dict[str, float]:
+        depths = {name: series[name].max() for name in ("self", "finger", "palm", "object")}
+        depths |= {"object_held": series["object"][hold].max()}
+        depths |= {"object_palm": series["object_palm"][hold].max()}
+        depths |= {"object_held_median": np.median(series["object"][hold])}
+        return {f"{name}{end}": depth for name, depth in depths.items()}
+
+    depths = deepest(series) | deepest(surface_series, "_surface")
+
+    def lasting(depth: np.ndarray, limit: float) -> float:
+        return round(h * int((depth > limit).sum()), 3)
 
     return {f"{k}_mm": round(1e3 * float(v), 2) for k, v in depths.items()} | {
-        "self_deep_s": lasting("self", 1e-3 * LIMITS["self_mm"]),
-        "finger_share": round(float(series["share"].max()), 3),
-        "finger_deep_s": lasting("share", LIMITS["finger_share"]),
-        "palm_deep_s": lasting("palm", 1e-3 * LIMITS["palm_mm"]),
+        "self_deep_s": lasting(series["self"], 1e-3 * LIMITS["self_mm"]),
+        "finger_share": round(float(surface_series["share"].max()), 3),
+        "finger_deep_s": lasting(surface_series["share"], LIMITS["finger_share"]),
+        "palm_deep_s": lasting(series["palm"], 1e-3 * LIMITS["palm_mm"]),
         "angle": round(float(np.degrees(bend.sum(1).max())), 0),
         "strain": round(float(curved.max()), 2),
     }
@@ -242,7 +261,8 @@ def grasps(scene: Scene, designs: np.ndarray, args: argparse.Namespace) -> list[
     hands = jax.jit(jax.vmap(space.params))(jnp.asarray(designs, jnp.float32))
     hands, total = jax.tree.map(np.asarray, hands), len(designs) * args.trials
     size, start = min(args.batch, total), int(scene.last_step("approach"))
-    run = jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t, record_qpos=True))
+    shown = {"record_qpos": True, "record_forces": True}
+    run = jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t, **shown))
     rows: list[dict[str, Any]] = []
     os.environ["JAX_PLATFORMS"] = "cpu"  # of the processes that measure
     with ProcessPoolExecutor(args.workers, multiprocessing.get_context("spawn")) as pool:
@@ -263,7 +283,8 @@ def grasps(scene: Scene, designs: np.ndarray, args: argparse.Namespace) -> list[
                 rows.append(row)
                 if kept[i]:
                     states = trace.qpos[i, start:]
-                    found.append((row, pool.submit(measured, scene, own, trial, states)))
+                    depth = {k: v[i, start:] for k, v in trace.forces.depth.items()}
+                    found.append((row, pool.submit(measured, scene, own, trial, states, depth)))
             for row, depths in found:
                 row |= depths.result()
             print(f"{len(rows):,} of {total:,}", flush=True)

@@ -83,10 +83,11 @@ Generalized positions `qpos` of a world with F fingers of N links and A axes a j
 and in an exported MuJoCo model; `f` counts the fingers from 0, `i` the links of a finger from 1."""
 
 _STATE_END = """
-A finger's axes are those of the effects, in the order {axes} about the link's {vectors}. Velocities
-`qvel` have the same order; the object's are three linear ones in the world's frame [m/s] and three
-angular ones in its own [rad/s], as everywhere in MuJoCo, so that nv = nq − 1. Scene `{name}`:
-F = {fingers}, N = {links}, A = {num_axes}, nq = {nq}, nv = {nv}.
+A finger's axes are those of the effects: {axes} about the link's {vectors}. Its first
+joint, i = 1, turns about them in this order, the second one in the opposite order, and so on.
+Velocities `qvel` have the same order as `qpos`; the object's are three linear ones in the world's
+frame [m/s] and three angular ones in its own [rad/s], as everywhere in MuJoCo, so that nv = nq − 1.
+Scene `{name}`: F = {fingers}, N = {links}, A = {num_axes}, nq = {nq}, nv = {nv}.
 
 Controls `ctrl`, a row for each time step, held over it:
 """
@@ -236,7 +237,8 @@ def qpos(scene: Scene) -> list[tuple[str, str, int, str]]:
         kind = "slide of the wrist [m]" if len(name) == 1 else "hinge of the wrist [rad]"
         rows.append((f"wrist_{name}", str(k), 1, kind))
     for a, name in enumerate(axes):
-        index = f"6 + (f N + i − 1) A + {a}"
+        last = len(axes) - 1 - a  # see `layout.hinge_sign`
+        index = f"6 + (f N + i − 1) A + {a}" + (f"; + {last} where i is even" if last != a else "")
         rows.append((f"finger_f_{name}_i", index, 1, f"{name} of link i of finger f [rad]"))
     rows.append(("object", "6 + F N A", 7, "centre x, y, z [m] and quaternion w, x, y, z"))
     return rows

@@ -383,8 +383,11 @@ def test_overlaps_are_depths_of_sections():
     assert found.fingers[0, 2, 2] == pytest.approx(depth, rel=0.02)
     assert found.palm[0] == pytest.approx([0, 0, 0, depth])
     words = stress.of_overlaps(PAPER, HAND, [found])
-    assert words[0].startswith("finger 2 stands 4 mm deep in itself")
+    assert words[0] == "finger 2 stands 4 mm deep in itself"
     assert words[1] == "finger 3 stands 4 mm deep in the palm" and len(words) == 2
+    without = scene.load("paper", overrides={"effects.finger_itself": False})
+    words = stress.of_overlaps(without, HAND, [found])
+    assert words[0].endswith("deep in itself: the simulation has no such contact")
 
 
 def test_strain_is_curvature_times_height():

@@ -12,7 +12,6 @@ import pytest
 
 from codesign_jax import cli, model, preflight, rollout, runs, scene, start
 from codesign_jax.engines.mujoco import MujocoEngine
-from codesign_jax.model.layout import first_on_palm
 from codesign_jax.types import Status
 from tests.helpers.grasps import (
     batch_inputs,
@@ -201,15 +200,47 @@ def test_fingers_and_palm_are_as_deep_in_one_another_as_mujocos_geoms():
         # MuJoCo's own iteration for a sphere and a cylinder ends at 1e-6.
         found = max(deepest(compiled, data, a, b) for a, b in pairs)
         assert between[i] == pytest.approx(found, abs=1e-6)
-        first = first_on_palm(3) - 1
         disc = [compiled.geom("palm_disc").id]
-        found = max(deepest(compiled, data, links[first:], disc) for links in fingers)
+        # Joints are at 1/6, 1/2 and 5/6 of the length, spheres in the middles behind them.
+        along = np.outer(one.length, [1 / 3, 2 / 3, 11 / 12])
+        beyond = (along >= one.height[:, None]) & (along >= one.length[:, None] / 4)
+        free = [np.array(geoms)[far] for geoms, far in zip(fingers, beyond, strict=True)]
+        found = max(deepest(compiled, data, geoms, disc) for geoms in free if len(geoms))
         assert palm[i] == pytest.approx(found, abs=1e-6)
     deep = np.maximum(between, palm) > 0.002
     assert 0 < deep.sum() and palm.max() > 0.002
     np.testing.assert_array_equal(invalid != 0, deep)
     found = preflight.refusals(the_scene, designs, [*map(str, range(len(deep)))])
     assert {line.split(":")[0] for line in found} == {str(i) for i in np.flatnonzero(deep)}
+
+
+def test_straight_fingers_rest_beside_the_palm():
+    """Of any length, by the rings that press; a finger that is mounted into the palm is refused.
+
+    Where a quarter of the length alone was kept off the palm, a third of such hands pressed on it
+    at rest, by up to 6.3 mm.
+    """
+    the_scene = scene.load("paper")
+    designs = hands(the_scene, 100)
+    short = np.random.default_rng(5).uniform(0.010, 0.030, designs.length.shape)
+    designs = designs._replace(length=np.where(np.arange(100)[:, None] < 50, short, designs.length))
+    inwards = dataclasses.replace(the_scene.hand.finger[0], azimuth=180.0, tilt=-20.0)
+    mounted = dataclasses.replace(the_scene.hand, finger=(inwards, *the_scene.hand.finger[1:]))
+    mounted = dataclasses.replace(the_scene, hand=mounted)
+
+    @jax.jit
+    def depths(numbers, designs):
+        fields = jax.vmap(lambda p: model.model_fields(numbers, p, still()))(designs)
+        scenes = the_scene.structure, fields
+        return start.depth_in_palm(*scenes), start.invalid_start(*scenes)
+
+    with jax.enable_x64(True):
+        rest, into = (jax.tree.map(np.asarray, depths(s, designs)) for s in (the_scene, mounted))
+    assert rest[0].max() < -5e-3  # farther than a step's candidates
+    # Not where the finger is shorter than it is high: it touches no palm.
+    assert into[0][designs.length[:, 0] > designs.height[:, 0] + 0.02].min() > 4e-3
+    deep = into[0] > the_scene.limits.penetration
+    assert deep.sum() > 10 and into[1][deep].all()
 
 
 @pytest.mark.parametrize("surface", ["hull", pytest.param("spheres", marks=pytest.mark.slow)])

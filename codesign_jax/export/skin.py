@@ -14,7 +14,7 @@ import numpy as np
 
 from codesign_jax.engines.structured.kernel.finger_collision import ring_places
 from codesign_jax.model import pairs
-from codesign_jax.model.layout import first_on_palm, touches_itself
+from codesign_jax.model.layout import beyond_base, first_on_palm, touches_itself
 from codesign_jax.model.morphology import at_joints, sections
 from codesign_jax.model.spec import add_pair, surroundings
 from codesign_jax.scene import Scene
@@ -69,11 +69,19 @@ def add(scene: Scene, spec: mujoco.MjSpec, params: Params) -> dict[str, float]:
                 add_pair(scene, spec, name, "object_0", 0)
             for other, kind in surroundings(scene, pairs.HAND_TABLE) if e.finger_table else []:
                 add_pair(scene, spec, other, name, kind)
-            if e.finger_palm and ball.link >= first_on_palm(scene.discretization.links):
+            if e.finger_palm and _on_palm(scene, params, f, ball):
                 add_pair(scene, spec, name, "palm_disc", pairs.PALM)
     if e.finger_finger or touches_itself(scene):
         _capsules(scene, spec, params)
     return shares
+
+
+def _on_palm(scene: Scene, params: Params, finger: int, ball: Ball) -> bool:
+    """Whether a sphere may touch the palm."""
+    links = scene.discretization.links
+    along = (ball.link - 0.5) * float(params.length[finger]) / links + ball.place[0]
+    free = beyond_base(along, float(params.height[finger]))
+    return bool(free) and ball.link >= first_on_palm(links)
 
 
 def _capsules(scene: Scene, spec: mujoco.MjSpec, params: Params) -> None:

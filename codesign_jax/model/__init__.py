@@ -2,10 +2,11 @@
 
 One MjSpec template a scene fixes the topology.  Each finger is a chain of `links` equal segments
 with its joints at the segments' midpoints, so the first half segment is welded to the palm.  A ball
-joint is three hinges on one body in the order bend (y), lateral (z), twist (x): the middle angle
-stays far from 90 degrees and each axis has its own stiffness.  Link frames have x along the finger,
-y across (the bend axis) and z up from the inextensible bottom layer; positive bending curls the tip
-towards that layer.
+joint is three hinges on one body, bend (y), lateral (z) and twist (x) in this order or, in every
+other joint, in the opposite one: the middle angle stays far from 90 degrees, each axis has its own
+stiffness, and the chain is of second order also where it bends both ways.  Link frames have x along
+the finger, y across (the bend axis) and z up from the inextensible bottom layer; positive bending
+curls the tip towards that layer.
 
 Springs are integrated linearly implicitly in every engine by the same substitution for diagonal
 stiffness K and damping D: a dof_damping C and a dof_armature A in MuJoCo's integrator Euler with

@@ -68,6 +68,8 @@ class ModelFields(NamedTuple):
     threshold: jax.Array | None = None
     tip: jax.Array | None = None
     wrap_prm: jax.Array | None = None
+    # Of fingers of spheres that touch the palm: a short one's first spheres do not
+    pair_margin: jax.Array | None = None
 
     @property
     def qpos(self) -> jax.Array:
@@ -186,6 +188,7 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
         ),
         wrap_prm=None if params.tip is None else (gains / gains[:, :1]).reshape(-1),
         tip=None if params.tip is None else jnp.stack(params.tip, -1),
+        pair_margin=_margins(scene, params) if lay.disc.size and lay.spheres.size else None,
     )
 
 
@@ -245,6 +248,17 @@ def _pairs(scene: Scene, dtype: Any) -> list[jax.Array]:
         jnp.stack([jnp.broadcast_to(jnp.asarray(v, dtype), len(kinds)) for v in row], -1)
         for row in pairs.numbers(scene, *own)
     ]
+
+
+def _margins(scene: Scene, params: Params) -> jax.Array:
+    """MuJoCo's margin of the contact pairs [m], shape (pair,)."""
+    lay, template = layout(scene), compile_template(scene)
+    geoms = np.stack([template.pair_geom1, template.pair_geom2], 1)
+    on_palm = (geoms == lay.disc).any(1)
+    sphere = np.where(on_palm, geoms.max(1) - lay.spheres.min(), 0)  # behind the disc
+    free = morphology.spheres_on_palm(scene.hand, params, *lay.spheres.shape[1:])
+    margins = pairs.margin(_picked(jnp.ravel(free), sphere))
+    return jnp.where(on_palm, margins, 0.0).astype(params.length.dtype)
 
 
 def softening_moments(scene: Scene, fields: ModelFields, angles: Any) -> Any:

@@ -235,11 +235,27 @@ def touches_itself(scene: Scene) -> bool:
 PALM_FROM = 0.25
 """Share of a finger's length from its base that is not tested against the palm, to which it is
 fixed."""
+PALM_HEIGHTS = 1.0
+"""Heights of its section from its base that are not tested either: sections across a finger that
+leaves the palm aslant reach into the disc as far along it as they are high."""
 
 
 def first_on_palm(links: int) -> int:
-    """The first of a finger's links that may touch the palm; link 0 is the half one at its base."""
+    """The first link of a finger of any length that may touch the palm, see `beyond_base`.
+
+    Link 0 is the half one at its base.
+    """
     return math.ceil(PALM_FROM * links)
+
+
+def beyond_base(along: Any, height: Any) -> Any:
+    """Whether a part of a finger is so far from its base that it may touch the palm.
+
+    Args:
+      along: Distance from the base along the finger [m], any shape.
+      height: Height of the finger's section at its base [m], of a shape that broadcasts to it.
+    """
+    return along >= PALM_HEIGHTS * height
 
 
 _PALM_RING = ((0, 0), (1, 0), (0, 1), (-1, 0), (0, -1))

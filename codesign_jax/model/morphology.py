@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from codesign_jax.scene import silicones
+from codesign_jax.model.layout import beyond_base
 from codesign_jax.scene.beams import Beam, beam, softening
 from codesign_jax.scene.hand import Hand, highest_pressure
 from codesign_jax.scene.primitives import block_inertia
@@ -183,6 +184,14 @@ def sphere_radii(hand: Hand, params: Params, links: int, count: int) -> Any:
     heights = sections(hand, params, places.ravel()).height
     shape = (1, 1) if params.tip is None else places.shape
     return heights.reshape(len(heights), *shape) / 2
+
+
+def spheres_on_palm(hand: Hand, params: Params, links: int, count: int) -> Any:
+    """Whether spheres may touch the palm, shape (finger, N, count), see `layout.beyond_base`."""
+    extent = segments(hand, params, links).extent
+    joints = at_joints(links) * params.length[:, None]
+    along = joints[..., None] + sphere_places(extent, count)
+    return beyond_base(along, 2.0 * sphere_radii(hand, params, links, count)[:, :1, :1])
 
 
 def joint_springs(

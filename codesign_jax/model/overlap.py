@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from codesign_jax.model.layout import first_on_palm, layout
+from codesign_jax.model.layout import beyond_base, first_on_palm, layout
 from codesign_jax.model.morphology import at_joints, sections
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
@@ -28,8 +28,8 @@ class Overlaps(NamedTuple):
     Attributes:
       fingers: Of finger i in finger j, shape (state, i, j); on the diagonal that of a finger in
         itself.
-      palm: Of each finger in the palm's disc, shape (state, finger), without its first quarter,
-        which is fixed to the palm.
+      palm: Of each finger in the palm's disc, shape (state, finger), without the part at its base
+        that touches no palm, see `layout.beyond_base`.
     """
 
     fingers: np.ndarray
@@ -49,7 +49,7 @@ def overlaps(scene: Scene, params: Params, place: np.ndarray, turn: np.ndarray) 
     angle = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
     unit = np.stack([np.cos(angle), np.sin(angle)], 1)
     unit /= ((unit**4).sum(1) ** 0.25)[:, None]
-    points, owners, sizes = [], [], []
+    points, owners, sizes, beyond = [], [], [], []
     middles = (np.arange(links) + 0.5 + whole / 2) / links
     size = sections(scene.hand, jax.tree.map(lambda v: np.asarray(v, float), params), middles)
     halves = np.stack(
@@ -66,18 +66,21 @@ def overlaps(scene: Scene, params: Params, place: np.ndarray, turn: np.ndarray) 
         local.append(np.c_[np.full(len(face), span[-1]), face])
         own = np.repeat(np.arange(links), _AROUND * len(_ALONG))
         own = np.append(own, np.full(len(face), links - 1))
-        at = np.array(bodies)[own]
-        moved = np.einsum("spij,pj->spi", turn[:, at], np.concatenate(local))
+        at, local = np.array(bodies)[own], np.concatenate(local)
+        along = (own + 0.5) * float(params.length[f]) / links + local[:, 0]
+        free = beyond_base(along, float(params.height[f]))
+        beyond.append(free & (own >= first_on_palm(links) - 1))
+        moved = np.einsum("spij,pj->spi", turn[:, at], local)
         points.append(place[:, at] + moved)
         owners.append(own)
         sizes.append((span, *half.T))
     found = np.zeros((len(place), count, count))
     palm = np.zeros((len(place), count))
     for i, own in enumerate(owners):
-        free = points[i][:, own >= first_on_palm(links) - 1]
+        free = points[i][:, beyond[i]]
         x, y, z = np.moveaxis((free - place[:, None, 1]) @ turn[:, 1], -1, 0)
         inside = np.minimum(disc.radius - np.hypot(x, y), np.minimum(z, disc.thickness - z))
-        palm[:, i] = np.maximum(inside.max(1), 0)
+        palm[:, i] = inside.max(1, initial=0)
         for j, bodies in enumerate(lay.bodies):
             away = points[i][:, None] - place[:, bodies, None]
             depth = _depths(away @ turn[:, bodies], *sizes[j])

@@ -35,6 +35,11 @@ def impedances(scene: Scene) -> list[Any]:
     return [IMPEDANCE] * (len(frictions(scene)) - 1) + [palm_impedance(scene)]
 
 
+def margin(touching: Any) -> Any:
+    """MuJoCo's margin of a pair [m]; one that may not touch would have to be a metre deep."""
+    return touching - 1.0
+
+
 def numbers(scene: Scene, friction: Any, impedance: Any) -> tuple[list, list, list]:
     """MuJoCo's friction (5), solref (2) and solimp (5) of a pair."""
     c = scene.contact

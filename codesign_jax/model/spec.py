@@ -115,7 +115,7 @@ def build_spec(
     for f in range(scene.num_fingers):
         _add_finger(scene, spec, params, f, beams, (place[0][f], place[1][f]), visual)
     _add_object(scene, spec, trial, solid, pose, visual)
-    _add_pairs(scene, spec)
+    _add_pairs(scene, spec, params)
     return spec
 
 
@@ -310,12 +310,15 @@ def _add_object(
             )
 
 
-def add_pair(scene: Scene, spec: mujoco.MjSpec, first: str, second: str, kind: int) -> None:
+def add_pair(
+    scene: Scene, spec: mujoco.MjSpec, first: str, second: str, kind: int
+) -> mujoco.MjsPair:
     """Adds a contact pair."""
     condim = {"none": 1, "coulomb": 3, "full": 6}[scene.effects.friction]
     pair = spec.add_pair(geomname1=first, geomname2=second, condim=condim)
     own = pairs.frictions(scene)[kind], pairs.impedances(scene)[kind]
     pair.friction, pair.solref, pair.solimp = pairs.numbers(scene, *own)
+    return pair
 
 
 def surroundings(scene: Scene, table: int) -> list[tuple[str, int]]:
@@ -325,7 +328,7 @@ def surroundings(scene: Scene, table: int) -> list[tuple[str, int]]:
     return found if scene.effects.table else found[1:]
 
 
-def _add_pairs(scene: Scene, spec: mujoco.MjSpec) -> None:
+def _add_pairs(scene: Scene, spec: mujoco.MjSpec, params: Params) -> None:
     e, lay = scene.effects, layout(scene)
     fingers = [f"finger_{f}_sphere_{i + 1}_{j}" for f, i, j in np.ndindex(lay.spheres.shape)]
     palm = [f"palm_{i}" for i in range(len(lay.palm))]
@@ -342,7 +345,8 @@ def _add_pairs(scene: Scene, spec: mujoco.MjSpec) -> None:
         for first, second in itertools.combinations(fingers, 2):
             if first.split("_")[1] != second.split("_")[1]:
                 add(first, second, pairs.FINGERS)
-    if e.finger_palm:
-        for name in fingers:
+    if e.finger_palm and fingers:
+        free = morphology.spheres_on_palm(scene.hand, params, *lay.spheres.shape[1:])
+        for name, may in zip(fingers, np.ravel(free), strict=True):
             if int(name.split("_")[3]) >= first_on_palm(lay.links):
-                add(name, "palm_disc", pairs.PALM)
+                add(name, "palm_disc", pairs.PALM).margin = pairs.margin(may)

@@ -16,6 +16,7 @@ from codesign_jax import codesign, model, rollout
 from codesign_jax.engines import Engine
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.model import morphology, overlap
+from codesign_jax.model.layout import touches_itself
 from codesign_jax.model.overlap import Overlaps
 from codesign_jax.report.statistics import wilson
 from codesign_jax.reuse import Program, shared
@@ -268,9 +269,8 @@ def of_overlaps(scene: Scene, params: Params, depths: list[Overlaps]) -> list[st
     for i, j in np.argwhere(fingers > DEEP):
         deep = f"{1e3 * fingers[i, j]:.0f} mm"
         if i == j:
-            found.append(
-                f"finger {i} stands {deep} deep in itself: the simulation has no such contact"
-            )
+            more = "" if touches_itself(scene) else ": the simulation has no such contact"
+            found.append(f"finger {i} stands {deep} deep in itself{more}")
         elif fingers[i, j] > thin[j] / 3 and (fingers[i, j] >= fingers[j, i] or i < j):
             found.append(f"finger {i} stands {deep} deep in finger {j}, more than a third of it")
     for f in np.flatnonzero(palm > DEEP):

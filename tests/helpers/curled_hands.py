@@ -8,9 +8,9 @@ from codesign_jax import model
 from tests.helpers import grasps
 
 
-def state(the_scene, seed, bend, height):
+def state(the_scene, seed, bend, height, length=0.1):
     """Fields, qpos, qvel and ctrl of a hand with random joint angles about a bend; all moves."""
-    fields, _ = grasps.world_inputs(the_scene, *grasps.hand_world(the_scene, length=0.1))
+    fields, _ = grasps.world_inputs(the_scene, *grasps.hand_world(the_scene, length=length))
     random, lay, qpos = np.random.default_rng(seed), model.layout(the_scene), np.array(fields.start)
     angles = 0.1 * random.normal(size=lay.dofs.shape)
     angles[..., 0] += bend
@@ -20,12 +20,13 @@ def state(the_scene, seed, bend, height):
     return fields, qpos, qvel, np.append(qpos[:6], [60e3] * the_scene.num_fingers)
 
 
-def curled(the_scene, seed, bend, height):
+def curled(the_scene, seed, bend, height, length=0.1):
     """Model, data and lanes of a `state`, with the object between the fingers."""
-    oracle = model.compile_model(the_scene, *grasps.hand_world(the_scene, length=0.1))
+    oracle = model.compile_model(the_scene, *grasps.hand_world(the_scene, length=length))
     oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
     data = mujoco.MjData(oracle)
-    fields, data.qpos[:], data.qvel[:], data.ctrl[:] = state(the_scene, seed, bend, height)
+    found = state(the_scene, seed, bend, height, length)
+    fields, data.qpos[:], data.qvel[:], data.ctrl[:] = found
     return oracle, data, jax.tree.map(lambda x: x[None], fields)
 
 

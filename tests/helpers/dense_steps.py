@@ -193,7 +193,10 @@ class DensePairs(Dense):
         self.sides = {}
         for f, finger in enumerate(self.fingers):
             for ring in finger.rings:
-                if scene.effects.finger_palm and ring.link >= np.ceil(finger.links / 4):
+                # Not within a quarter of the length from the base, nor within a section's height.
+                free = ring.link >= np.ceil(finger.links / 4)
+                free &= ring.along * finger.segment >= finger.height
+                if scene.effects.finger_palm and free:
                     self._on_palm(f, ring)
                 if scene.effects.finger_itself:
                     self._on_itself(f, ring)

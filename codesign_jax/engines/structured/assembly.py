@@ -245,13 +245,10 @@ def hand_contacts(
         return place._replace(share=jnp.where(square < FAR, place.share, 0.0)), other
 
     if e.finger_palm:
-        assert hand.palm_disc is not None
-        disc = kin.place[:, None], kin.palm[:, :, None], hand.palm_disc[:, None]
-        some = item >= (first_on_palm(links) - 1) * k
-        look = partial(finger_collision.palm_distance, palm=disc)
-        ring = Ring.of(numbers[:, some])
-        place = _on_field(scene, look, ring, frame[:, :, some], centre[:, some])
-        add("finger_palm", place, link[some], jnp.int32(0), alone)
+        first = (first_on_palm(links) - 1) * k
+        own = link[first:], numbers[:, first:], numbers[:, 0]
+        place = _on_palm(scene, hand, kin, own, (frame[:, :, first:], centre[:, first:]))
+        add("finger_palm", place, link[first:], jnp.int32(0), alone)
     if on_itself:
         place, other = with_lines(*alone, own=True)
         add("finger_itself", place, link, other, alone)
@@ -268,6 +265,39 @@ def hand_contacts(
         place = once(finger_collision.balls, *sides)
         add("finger_finger", place, link[mine], jnp.asarray(link[theirs])[:, None, None], two)
     return found
+
+
+def _on_palm(
+    scene: Scene, hand: WorldModel, kin: Kinematics, own: tuple, pose: tuple[jax.Array, jax.Array]
+) -> Place:
+    """Contacts of rings or spheres with the palm's disc, items first.
+
+    Args:
+      own: Their links, their numbers, and the numbers of their fingers' first ones.
+      pose: Frames of their links, shape (3, 3, item, finger, world), and their centres.
+    """
+    assert hand.palm_disc is not None
+    (row, numbers, first), (frame, centre) = own, pose
+    disc = kin.place[:, None], kin.palm[:, :, None], hand.palm_disc[:, None]
+    look = partial(finger_collision.palm_distance, palm=disc)
+    place = _on_field(scene, look, Ring.of(numbers), frame, centre)
+    sizes = row[:, None, None], numbers, hand.offset[0], first
+    return place._replace(share=place.share * finger_collision.free_of_palm(*sizes))
+
+
+def depth_in_palm(scene: Scene, hand: WorldModel, kin: Kinematics) -> jax.Array:
+    """Deepest overlap with the palm's disc of rings or spheres that may touch it [m], (world,)."""
+    k = rings_of_link(scene)
+    first = first_on_palm(scene.discretization.links) - 1
+    numbers = jnp.moveaxis(memory_tables.ring_numbers(scene, hand, k), 1, 0)
+    numbers = jnp.broadcast_to(numbers, (*numbers.shape[:2], *kin.origin.shape[2:]))
+    own = numbers[:, first * k :]
+    link = np.arange(first * k, numbers.shape[1]) // k
+    frame = kin.link[:, :, link]
+    centre = once(finger_collision.ring_centre, kin.origin[:, link], frame, own)
+    place = _on_palm(scene, hand, kin, (link + 1, own, numbers[:, 0]), (frame, centre))
+    depth = jnp.where(place.share > 0, -place.gap, -jnp.inf)
+    return depth.reshape(-1, depth.shape[-1]).max(0)
 
 
 class _CentreLines(NamedTuple):

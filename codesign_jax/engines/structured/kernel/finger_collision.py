@@ -34,7 +34,7 @@ from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact, rings, shapes
 from codesign_jax.engines.structured.laws.rings import Place, Ring, Segment
 from codesign_jax.engines.structured.world_model import apply_columns
-from codesign_jax.model.layout import first_on_palm, touches_itself
+from codesign_jax.model.layout import beyond_base, first_on_palm, touches_itself
 
 SURELY = 1.0 - 1e-4
 """At a joint two segments have one nearest place, which is the first one's, whatever is rounded."""
@@ -221,6 +221,9 @@ class FingerCollision:
     def _on_palm(self, item: Any, mine: jax.Array) -> None:
         row, numbers, frame, centre = self.body(item)
         field = lanewise(palm_distance, centre, self.palm)
+        place = lanes([self.like + jnp.asarray(row, self.like.dtype)], (), wide=True)
+        sizes = self.step.hand.read("offset", 0), self.ring(0)
+        mine = mine & (lanewise(free_of_palm, place, numbers, *sizes).lane > 0)
         near = self._near_palm(field[0], numbers)
 
         def enter() -> None:
@@ -409,6 +412,18 @@ def on_field(numbers, frame, centre, offset, distance, normal):
 def ball_on_field(numbers, centre, distance, normal):
     """See `rings.ball_on_field`; of a sphere all half axes are the radius."""
     return rings.ball_on_field(numbers[3] * numbers[6], centre, distance, normal)
+
+
+def free_of_palm(row, numbers, offset, first):
+    """1 for rings that may touch the palm, else 0, see `beyond_base`.
+
+    Args:
+      row: The ring's link, 1 for the first one that moves.
+      offset: From the finger's base to its first joint [m], half a segment.
+      first: Numbers of the finger's first ring, at its base.
+    """
+    along = (row - 0.5) * 2.0 * offset + numbers[0]
+    return jnp.where(beyond_base(along, 2.0 * first[5]), 1.0, 0.0)
 
 
 def palm_distance(point, palm):

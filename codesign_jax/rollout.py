@@ -79,7 +79,9 @@ class Options(NamedTuple):
 _LATER, _HAND_MASS = 1, 2
 
 
-def sample_trials(scene: Scene, key: jax.Array, num_trials: int) -> Trial:
+def sample_trials(
+    scene: Scene, key: jax.Array, num_trials: int, first: jax.typing.ArrayLike = 0
+) -> Trial:
     """Draws objects and noise of trials (paper Sec. VI.2); shapes take turns in the set's order.
 
     Args:
@@ -87,6 +89,7 @@ def sample_trials(scene: Scene, key: jax.Array, num_trials: int) -> Trial:
       key: Typed key; trial t draws from fold_in(key, t), so that more trials do not change earlier
         ones.
       num_trials: Number of trials.
+      first: Index of the first of them, which may be traced: more of what was drawn before.
 
     Returns:
       Trials with leading axis (trial,).
@@ -98,11 +101,13 @@ def sample_trials(scene: Scene, key: jax.Array, num_trials: int) -> Trial:
     reuse.begin()
     axes.refuse_draws(key, num_trials)
     axes.refuse_numbers(scene.checked(), num_trials, "trial")
-    return _draw(num_trials, len(scene.objects.object), key, scene.objects.noise)
+    return _draw(num_trials, len(scene.objects.object), key, scene.objects.noise, first)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _draw(num_trials: int, shapes: int, key: jax.Array, noises: Any) -> Trial:
+def _draw(
+    num_trials: int, shapes: int, key: jax.Array, noises: Any, first: jax.typing.ArrayLike
+) -> Trial:
     """Trials of a set of so many shapes; one program where nothing else is compiled with it."""
 
     def draw(t: jax.Array, noise: Any) -> Trial:
@@ -126,7 +131,7 @@ def _draw(num_trials: int, shapes: int, key: jax.Array, noises: Any) -> Trial:
             tilt=jnp.deg2rad(noise.tilt) * later[2:4],
         )
 
-    return jax.vmap(draw, in_axes=(0, batch_axes(noises)))(jnp.arange(num_trials), noises)
+    return jax.vmap(draw, in_axes=(0, batch_axes(noises)))(first + jnp.arange(num_trials), noises)
 
 
 def nominal_trial(scene: Scene, shape: int | str = 0) -> Trial:

@@ -106,8 +106,15 @@ def keep(path: Path, about: Any, results: Arrays) -> None:
     save(path, {**head(about), **results})
 
 
-def found(path: Path, about: Any) -> tuple[dict[str, Any] | None, str]:
-    """Results of `about` that are in a file."""
+def found(path: Path, about: Any, *, any_code: bool = False) -> tuple[dict[str, Any] | None, str]:
+    """Results of `about` that are in a file, or None; and what is amiss with them, if anything is.
+
+    Args:
+      path: The file; without it there is nothing amiss.
+      about: As of `keep`.
+      any_code: Whether results of another version of the code are returned, to be shown as such
+        and not to go on from.
+    """
     try:
         arrays = load(path)
     except FileNotFoundError:
@@ -116,6 +123,8 @@ def found(path: Path, about: Any) -> tuple[dict[str, Any] | None, str]:
         return None, f"cannot be read ({error.strerror})"
     except StoreError:
         return None, "is damaged, or of another version of the code"
-    if why := refusal(arrays, about):
+    why = refusal(arrays, about)
+    same_case = str(arrays.get("about")) == str(head(about)["about"])
+    if why and not (any_code and same_case):
         return None, why
-    return {name: value for name, value in arrays.items() if name not in _HEADS}, ""
+    return {name: value for name, value in arrays.items() if name not in _HEADS}, why

@@ -19,9 +19,9 @@ import jax.numpy as jnp
 class Status(enum.IntFlag):
     """What went wrong in a world, as bits; OK is zero.
 
-    Every bit but those of `WARNINGS` makes the trial a failed one, which counts neither as kept nor
-    as lost; see `failed`. All of these but STUCK are faults of the simulation; STUCK is the hand's
-    grip, which does not let go.
+    Every bit but those of `WARNINGS` makes the trial a failed one, see `failed`: a verdict counts
+    it as lost, and a mean cost leaves it out or takes the maximum for it (`cost.failure`). All of
+    these but STUCK are faults of the simulation; STUCK is the hand's grip, which does not let go.
 
     Attributes:
       NONFINITE: A number of the state, or a cost of the user's own, was not finite.

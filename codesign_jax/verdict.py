@@ -1,11 +1,21 @@
-"""When a world is decided: the one rule that every engine and the cost apply.
+"""Verdicts: when a world is decided, how a trial ended, and whether a design is good.
 
 A world is decided when its object is lost within the cost's window (paper Fig. 3) or when it
-failed.  The functions consist of comparisons only, so that they take NumPy arrays, JAX arrays and
-the lanes of a kernel alike.  None of them asks whether a number is finite, because a GPU kernel
-cannot: comparisons with a number that is not one are false.
+failed.  The functions of that rule, which every engine and the cost apply, consist of comparisons
+only, so that they take NumPy arrays, JAX arrays and the lanes of a kernel alike.  None of them asks
+whether a number is finite, because a GPU kernel cannot: comparisons with a number that is not one
+are false.
+
+A design is judged by the outcomes of its trials (`judge`), by Wald's sequential probability ratio
+test of the share of its grasps that it keeps.
+
+>>> from codesign_jax import verdict
+>>> verdict.judge(60, 60).word, verdict.judge(24, 24).word
+('good', 'not enough trials')
 """
 
+import math
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.scene import Scene
-from codesign_jax.types import Status, Trace, failed
+from codesign_jax.statistics import Interval, wilson
+from codesign_jax.types import Outcome, Status, Trace, failed
 
 FAR = 3e38
 """Larger than any distance, and still a number in float32."""
@@ -101,3 +112,222 @@ def failures(scene: Scene, trace: Trace) -> jax.Array:
 def as_bit(condition: jax.Array, bit: Status) -> jax.Array:
     """The bit where the condition holds, int32 in every mode of JAX."""
     return condition.astype(jnp.int32) * np.int32(bit)
+
+
+# ---- how a trial ended
+
+VERDICTS = ("kept", "lost", "not_released", "failed")
+"""How a trial ends, see `verdicts`."""
+
+
+def verdicts(outcomes: Outcome) -> np.ndarray:
+    """How trials ended, as indices of `VERDICTS`: the one rule of tables, reports and commands.
+
+    Lost is what did not fail and lost its object within the window of the scene's cost, whatever
+    a cost of one's own says.  Of the trials that failed, not released are those in which the hand
+    kept the object and did not let go of it at the end (STUCK); the others are faults of the
+    simulation.
+
+    Args:
+      outcomes: Outcomes, arrays of any shape.
+
+    Returns:
+      Indices, of the same shape.
+    """
+    status = np.asarray(outcomes.status)
+    lost = np.isfinite(outcomes.lost_time)
+    held, broken = VERDICTS.index("not_released"), VERDICTS.index("failed")
+    bad = np.where(status & Status.STUCK, held, broken)
+    return np.where(failed(status), bad, lost.astype(int))
+
+
+def kept(outcomes: Outcome) -> np.ndarray:
+    """Which trials kept their object and let go of it at the end, bool, shaped as the outcomes."""
+    return verdicts(outcomes) == VERDICTS.index("kept")
+
+
+class Tally(NamedTuple):
+    """How trials ended, numbers of them; the four add up to all."""
+
+    kept: int  # neither lost nor failed
+    lost: int  # the object left the hand within the window of the cost
+    not_released: int  # the hand did not let go of the object
+    failed: int  # those that failed otherwise: faults of the simulation
+
+    @property
+    def total(self) -> int:
+        """All trials."""
+        return sum(self)
+
+    def __str__(self) -> str:
+        """In words, such as "kept 20 of 24, 3 lost, 1 not released"."""
+        words = f"kept {self.kept} of {self.total}, {self.lost} lost"
+        words += f", {self.not_released} not released"
+        return words + (f", {self.failed} failed" if self.failed else "")
+
+
+def tally(outcomes: Outcome) -> Tally:
+    """Counts trials, given as arrays of any shape."""
+    return Tally(*np.bincount(verdicts(outcomes).ravel(), minlength=len(VERDICTS)).tolist())
+
+
+# ---- whether a design is good
+
+WANTED = 0.95
+"""Share of its grasps from which on a design ought to be called good."""
+POOR = 0.90
+"""Share of its grasps up to which a design ought to be called not good."""
+ERROR = 0.05
+"""Largest probability that a design of at most `POOR` is ever called good, and that one of at least
+`WANTED` is ever called not good."""
+BATCH = 20
+"""Grasps between two looks of `sequential`: three batches without a loss decide."""
+MOST = 600
+"""Most grasps of `sequential` by default."""
+USUAL = 73
+"""Expected number of grasps of `sequential` for a design that keeps 99 % of them."""
+RULE = (
+    f"good, not good: Wald's sequential test between shares of {100 * POOR:.0f} and "
+    f"{100 * WANTED:.0f} % kept, with errors of at most {100 * ERROR:.0f} %; trials that failed or "
+    "did not let go count as lost"
+)
+"""The rule of `judge` in words."""
+
+OPEN = "not enough trials"
+"""What is said of a design until its trials decide."""
+_OF_KEPT, _OF_LOST = math.log(WANTED / POOR), math.log((1 - POOR) / (1 - WANTED))
+# By Ville's inequality a likelihood ratio exceeds 1 / ERROR at any time with at most that
+# probability, however often it is looked at; Wald's own bound, (1 - ERROR) / ERROR, is less strict.
+_DECISIVE = math.log(1 / ERROR)
+_MANY = 10_000
+
+
+class Verdict(NamedTuple):
+    """Whether a design is good."""
+
+    share: Interval  # share of its grasps that it kept, with Wilson's 95 % interval
+    total: int  # number of the grasps
+    word: str  # "good", "not good" or "not enough trials"
+    more: int  # further grasps after which the share, if it stays, is good or not good; 0 if it is
+
+    def sentence(self, grasps: str = "fresh grasps") -> str:
+        """Such as "keeps 97 % of 150 fresh grasps (93 to 99 %): good"."""
+        share, low, high = (_percent(v) for v in self.share)
+        text = f"keeps {share} % of {self.total} {grasps} ({low} to {high} %): {self.word}"
+        if not self.more:
+            return text
+        some = f"{self.more:,}" if self.more <= _MANY else f"more than {_MANY:,}"
+        return f"{text}, {some} more at this share would decide"
+
+
+def evidence(kept: int, total: int) -> float:
+    """Logarithm of the likelihood ratio of a share of `WANTED` to one of `POOR`.
+
+    A design is good from log(1 / `ERROR`) on, and not good from its negative on.
+    """
+    return kept * _OF_KEPT - (total - kept) * _OF_LOST
+
+
+def word(kept: int, total: int) -> str:
+    """What a design is, good, not good or `OPEN`: the only place that decides.
+
+    A kept grasp more never makes a verdict worse, a lost one never better.  It may be asked for
+    after every grasp, and trials may be added: `ERROR` bounds the probability of ever being wrong.
+    """
+    ratio = evidence(kept, total)
+    if abs(ratio) < _DECISIVE - 1e-9:
+        return OPEN
+    return "good" if ratio > 0 else "not good"
+
+
+def judge(kept: int, total: int) -> Verdict:
+    """The verdict on a design, by `word`, with the share that it keeps and its interval."""
+    decision = word(kept, total)
+    more = _more(evidence(kept, total), total) if decision == OPEN else 0
+    return Verdict(wilson(kept, total), total, decision, more)
+
+
+def _more(ratio: float, total: int) -> int:
+    """Grasps after which a ratio that grows as until now decides; `_MANY` + 1 for more."""
+    needed = total * _DECISIVE / max(abs(ratio), 1e-9)
+    return math.ceil(min(needed - total, _MANY + 1) - 1e-9)
+
+
+def good(outcomes: Outcome) -> np.ndarray:
+    """Which designs are good, bool; of outcomes with the trial as the last axis."""
+    every = kept(outcomes)
+    found = [word(int(n), every.shape[-1]) == "good" for n in every.sum(-1).ravel()]
+    return np.array(found).reshape(every.shape[:-1])
+
+
+def sequential(
+    simulate: Callable[[int, int], Outcome], most: int = MOST, previous: Outcome | None = None
+) -> Iterator[Outcome]:
+    """Simulates trials in batches until they decide whether a design is good.
+
+    Args:
+      simulate: Outcomes of trials, shape (trial,), from the index of the first and their number,
+        which is the same in every call.
+      most: Most trials; at least 1.
+      previous: Outcomes of the first trials, which are known.
+
+    Yields:
+      Outcomes of all trials so far, shape (trial,), after each batch.
+    """
+    count = min(BATCH, most)
+    so_far = previous
+    while so_far is None or _goes_on(so_far, most):
+        first = 0 if so_far is None else so_far.cost.size
+        batch = simulate(first, count)
+        parts = [batch] if so_far is None else [so_far, batch]
+        # A last batch of fewer trials would be another program.
+        so_far = jax.tree.map(lambda *v: np.concatenate(v)[:most], *parts)
+        yield so_far
+
+
+def _goes_on(outcomes: Outcome, most: int) -> bool:
+    counts = tally(outcomes)
+    return counts.total < most and word(counts.kept, counts.total) == OPEN
+
+
+class Characteristic(NamedTuple):
+    """What `sequential` does with a design that keeps a certain share of its grasps."""
+
+    good: float  # probabilities of the three ends
+    not_good: float
+    undecided: float
+    grasps: float  # expected number of grasps
+
+
+def characteristic(share: float, batch: int = BATCH, most: int = MOST) -> Characteristic:
+    """Operating characteristic and average sample number of the test, exactly.
+
+    The distribution of the number of losses is followed from batch to batch.
+
+    Args:
+      share: Share of its grasps that the design keeps.
+      batch: Grasps between two looks.
+      most: Most grasps.
+    """
+    from scipy import stats  # takes half a second to import: commands do so once they are done
+
+    undecided, ends, expected, total = np.ones(1), np.zeros(2), 0.0, 0
+    while total < most:
+        count = min(batch, most - total)
+        total += count
+        losses = stats.binom.pmf(np.arange(count + 1), count, 1 - share)
+        undecided = np.convolve(undecided, losses)
+        ratio = evidence(total - np.arange(undecided.size), total)  # type: ignore[arg-type]
+        decided = ratio >= _DECISIVE - 1e-9, ratio <= -_DECISIVE + 1e-9
+        now = np.array([undecided[which].sum() for which in decided])
+        ends += now
+        expected += total * now.sum()
+        undecided = np.where(decided[0] | decided[1], 0.0, undecided)
+    left = float(undecided.sum())
+    return Characteristic(float(ends[0]), float(ends[1]), left, float(expected + total * left))
+
+
+def _percent(share: float) -> str:
+    text = f"{100 * share:.0f}"
+    lifted = text in ("95", "100") and 100 * share < float(text)
+    return f"{math.floor(1000 * share) / 10:.1f}" if lifted else text

@@ -8,9 +8,7 @@ The scene has its skinned hull and contact between fingers.
 import sys
 from pathlib import Path
 
-from codesign_jax import cli, runs
-from codesign_jax.report.verdicts import Judged
-from codesign_jax.runs import choice
+from codesign_jax import cli
 
 FOLDER = Path("runs") / "demo"
 
@@ -25,14 +23,10 @@ def main() -> int:
     pictures = [FOLDER / "figures" / name for name in ("best_grasp.png", "best_grasp.gif")]
     for path in pictures:
         print()
-        cli.main(["evaluate", "--run", str(FOLDER), "--trials", "3", "--render", str(path)])
+        cli.main(["evaluate", "--run", str(FOLDER), "--render", str(path)])
     print()
     cli.main(["report", str(FOLDER)])
-    scene, _ = runs.read_run(FOLDER)
-    trials = choice.choose(scene, choice.read_record(FOLDER)).outcomes
-    judged = Judged(scene, trials, grasps="grasps of its final test")
-    print(f"\nthe design {judged}")
-    print("the run, cost by cost:  ", FOLDER / "episodes.csv")
+    print("\nthe run, cost by cost:  ", FOLDER / "episodes.csv")
     print("the cost's evolution:   ", FOLDER / "figures" / "cost_evolution.png")
     print("the best grasp, moving: ", pictures[1])
     print("all of it, for a browser:", FOLDER / "report.html")

@@ -20,9 +20,9 @@ from codesign_jax import rollout, use_compilation_cache
 from codesign_jax import scene as scenes
 from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.engines import make_engine
-from codesign_jax.report.statistics import wilson
 from codesign_jax.scene import Scene, parameters
 from codesign_jax.scene.effects import EFFECTS, ENGINES, refusals
+from codesign_jax.statistics import wilson
 from codesign_jax.types import failed
 from scripts.shared import output, provenance, work
 

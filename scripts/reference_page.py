@@ -170,8 +170,10 @@ def _limits(schema: type, field: dataclasses.Field) -> tuple[str, str, str]:
         span = ", ".join(f"`{option}`" for option in limits["options"])
     else:
         span = {bool: "`true`, `false`", str: "text", dict: "a table"}.get(_base(hint), "a number")
-        if any(typing.get_origin(kind) is tuple for kind in typing.get_args(hint)):
-            span += ", or one for each finger"
+        several = [kind for kind in typing.get_args(hint) if typing.get_origin(kind) is tuple]
+        if several:
+            groups = typing.get_origin(typing.get_args(several[0])[0]) is tuple
+            span += ", or groups of fingers" if groups else ", or one for each finger"
     return limits.get("unit", ""), span, _default(field)
 
 

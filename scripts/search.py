@@ -33,13 +33,13 @@ from codesign_jax.commands.common import changes
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.optimize import NAMES, Optimizer, State
-from codesign_jax.report.statistics import wilson
-from codesign_jax.report.verdicts import RELIABLE
 from codesign_jax.reuse import Program
 from codesign_jax.runs.progress import duration
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
+from codesign_jax.statistics import wilson
 from codesign_jax.types import Outcome, Trial, failed
+from codesign_jax.verdict import WANTED
 from scripts.shared import output, provenance, work
 
 CANDIDATES, ROUNDS = 25, 12
@@ -342,8 +342,8 @@ def masses_table(rows: list[dict[str, Any]]) -> str:
 
 
 def share_of(kept: np.ndarray) -> str:
-    """Share of the seeds that keep `RELIABLE`, with its interval."""
-    good = int((kept >= RELIABLE).sum())
+    """Share of the seeds that keep `WANTED`, with its interval."""
+    good = int((kept >= WANTED).sum())
     share = wilson(good, kept.size)
     return f"{good / kept.size:.2f} ({share.low:.2f} to {share.high:.2f})"
 
@@ -413,7 +413,7 @@ def search(args: argparse.Namespace, name: str) -> None:
     row["seconds"] = round(time.monotonic() - start)
     row["provenance"] = provenance.results(args.commit)
     output.write_json(args.out / f"{stem}{'-masses' * bool(args.designs)}.json", row)
-    shares = [sum(k >= RELIABLE for k in kept) / len(kept) for kept in study.row()["kept"]]
+    shares = [sum(k >= WANTED for k in kept) / len(kept) for kept in study.row()["kept"]]
     print(name, study.row()["grasps"], shares, duration(row["seconds"]), flush=True)
     print({m: float(np.mean(kept)) for m, kept in row.get("masses", {}).items()}, flush=True)
 

@@ -23,11 +23,11 @@ from codesign_jax import files, runs, store, terminal
 from codesign_jax.commands import check, hosts, reference, status
 from codesign_jax.compiler.ffi import KernelUnavailable
 from codesign_jax.export import sheet
-from codesign_jax.report.stress import Stress
 from codesign_jax.runs import directory, loop, manifest, progress
 from codesign_jax.runs import record as records
 from codesign_jax.runs.columns import FILES, TABLES
 from codesign_jax.scene import InputError
+from codesign_jax.stress import Stress
 from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import command, own_workplace  # noqa: F401
 

@@ -1,6 +1,7 @@
 """Designs beside one another, at finer steps and under other conditions; verdicts on them."""
 
 import csv
+import itertools
 import re
 import shutil
 import tomllib
@@ -13,13 +14,24 @@ import numpy as np
 import pytest
 from scipy import integrate, optimize, stats
 
-from codesign_jax import constants, model, preflight, rollout, runs, sampling, scene
-from codesign_jax.commands import common, reference
+from codesign_jax import (
+    constants,
+    model,
+    preflight,
+    rollout,
+    runs,
+    sampling,
+    scene,
+    statistics,
+    stress,
+    verdict,
+)
+from codesign_jax.commands import common, compare, reference
 from codesign_jax.engines import make_engine
 from codesign_jax.model import overlap
-from codesign_jax.report import statistics, stress, verdicts
+from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
-from codesign_jax.runs import columns
+from codesign_jax.runs import choice, columns
 from codesign_jax.scene import beams, parameters, silicones
 from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import command, copied, finished_run, own_workplace  # noqa: F401
@@ -78,6 +90,11 @@ def test_two_designs_meet_the_same_trials(place, capsys):
         (["today", "screened"], ["--trials", "3"], "other objects or noise: --objects says which"),
         (["today"], ["--out", "a.txt"], "--out a.txt must end in .csv"),
         (["today", "screened"], ["--trials", "0"], "--trials = 0 is outside"),
+        (["a.toml"], [], "compare takes two design files, or one with --policy against none"),
+        (["a.toml"] * 3, [], "compare takes two design files, or one with --policy"),
+        (["a.toml", "today"], [], "compare takes design files (.toml) or run folders, not both"),
+        (["a.toml"] * 2, ["--out", "a.csv"], "--out is a table of runs"),
+        (["a.toml"] * 2, ["--policy", "a:B", "c:D"], "--policy takes one policy beside design"),
     ],
 )
 def test_what_cannot_be_compared_is_refused(names, flags, expected, place, capsys):
@@ -102,6 +119,53 @@ def test_the_interval_of_a_difference_covers_as_often_as_it_says():
         covered.append(weights[inside].sum())
     # Newcombe's own evaluation has a mean of 0.95 and no less than 0.92 at such sizes.
     assert min(covered) > 0.92 and np.mean(covered) < 0.995
+
+
+def test_where_a_policy_leaves_the_key_frames():
+    """Until a grasp is decided: what is commanded later is nobody's."""
+    tiny = scene.load(TINY)
+    steps, h = 8, tiny.discretization.timestep
+    planned = np.zeros((5, steps, 8))
+    ctrl = planned.copy()
+    ctrl[1, 3:, 6] = -2e4  # a pressure, from the fourth step on
+    ctrl[2, 5, 0] = 0.003  # the arm
+    ctrl[2, 6, 4] = 0.1
+    ctrl[3, 6:, 7] = 5e4  # after the object was lost
+    ctrl[4, 2, 7] = 1e-3  # rounding
+    found = trials_of(np.zeros(5), np.zeros(5))
+    found.lost_time[3] = 6 * h
+    left = choice.departure(tiny, found, ctrl, planned)
+    np.testing.assert_allclose(left.time, [np.inf, 3 * h, 5 * h, np.inf, np.inf])
+    np.testing.assert_allclose(left.lower, [0, -2e4, 0, 0, 0])
+    np.testing.assert_allclose(left.place, [0, 0, 0.003, 0, 0])
+    np.testing.assert_allclose(left.turn, [0, 0, 0.1, 0, 0])
+    said = str(jax.tree.map(np.asarray, left))
+    assert said.startswith("left the key frames in 2 of 5 grasps, first after 0.08 s (median); ")
+    assert said.endswith("pressures by -20 to +1e-06 kPa, the arm by up to 3 mm and 5.73°")
+    none = choice.departure(tiny, found, planned, planned)
+    assert str(none) == "commanded nothing but the key frames in 5 grasps"
+
+
+@pytest.mark.parametrize(("first", "second", "total"), [(30, 12, 400), (5, 2, 24), (0, 3, 60)])
+def test_how_many_trials_would_show_a_difference(first, second, total):
+    """With so many at the same shares the interval is about to leave out 0."""
+    said = " ".join(compare.difference(*outcomes_of(first, second, total), names=["a", "b"]))
+    if "no difference" not in said:
+        return
+    needed = int(re.search(r"about ([\d,]+) trials", said)[1].replace(",", ""))
+    scale = needed / total
+    pair = [round(scale * n) for n in (first, second)]
+    found = statistics.paired(round(scale * total) - sum(pair), *pair, round(scale * total))
+    # Newcombe's interval is wider than the normal one at few trials, by less than its half.
+    assert abs(found.value) > 0.5 * (found.high - found.low) / 2
+
+
+def outcomes_of(first, second, total):
+    """Which trials two designs kept, of which so many one alone did."""
+    one, other = np.ones((2, total), bool)
+    other[:first] = False
+    one[first : first + second] = False
+    return one, other
 
 
 # --- `codesign check`: its counts are those of the grasps simulated again, and refusals -----------
@@ -245,57 +309,176 @@ def test_a_table_of_trials_has_noise_and_endings(finished, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("kept", "total", "word", "more"),
     [
-        (24, 24, "good", 0),
-        (143, 150, "good", 0),
+        (24, 24, "not enough trials", 32),
+        (56, 56, "good", 0),
+        (97, 100, "good", 0),
+        (96, 100, "not enough trials", 24),
+        (143, 150, "not enough trials", 7),
+        (0, 4, "not enough trials", 1),
+        (0, 5, "not good", 0),
         (18, 24, "not good", 0),
-        (137, 150, "not good", 0),
-        (6, 6, "not enough trials", 16),
-        (29, 30, "not enough trials", 6),
-        (27, 30, "not enough trials", 43),
-        (142, 150, "not enough trials", 16_273),
+        (6, 6, "not enough trials", 50),
+        (142, 150, "not enough trials", 61),
+        # Close to the share at which the two likelihoods are equal.
+        (128, 138, "not enough trials", 10_001),
     ],
 )
 def test_one_rule_judges_designs(kept, total, word, more):
-    found = verdicts.judge(kept, total)
+    """By binomial likelihoods of SciPy; the interval is SciPy's."""
+    found = verdict.judge(kept, total)
     assert (found.word, found.more) == (word, more)
     low, high = stats.binomtest(kept, total).proportion_ci(0.95, method="wilson")
     assert (found.share.low, found.share.high) == pytest.approx((low, high))
+    ratio = np.subtract(*stats.binom.logpmf(kept, total, [verdict.WANTED, verdict.POOR]))
+    assert verdict.evidence(kept, total) == pytest.approx(ratio)
+    decided = {"good": ratio, "not good": -ratio}.get(word, -abs(ratio))
+    assert (decided >= np.log(1 / verdict.ERROR)) == (not more)
 
 
-def test_verdicts_are_those_of_intervals_and_monotone():
-    """By SciPy's interval; one more grasp that is kept never makes a verdict worse, a lost one
-    never better, so that it may be looked at as trials go on."""
+def test_verdicts_are_monotone_and_what_decides_decides():
+    """One more grasp that is kept never makes a verdict worse, a lost one never better."""
     rank = {"not good": 0, "not enough trials": 1, "good": 2}
 
     def of(kept, total):
-        return rank[verdicts.judge(kept, total).word]
+        return rank[verdict.word(kept, total)]
 
     for total in (1, 5, 20, 22, 24, 49, 150, 300):
         for kept in range(total + 1):
-            low, high = stats.binomtest(kept, total).proportion_ci(0.95, method="wilson")
-            good, bad = kept >= 0.95 * total and low > 0.85, kept < 0.95 * total and high < 0.95
-            assert of(kept, total) == 1 + good - bad
             assert of(kept, total + 1) <= of(kept, total) <= of(kept + 1, total + 1)
+            more = verdict.judge(kept, total).more if total < 25 else 0
+            if 0 < more <= 10_000:
+                share = kept / total
+                ratios = [verdict.evidence(share * n, n) for n in (total + more - 1, total + more)]
+                assert abs(ratios[0]) < np.log(20) + 1e-6 and abs(ratios[1]) > np.log(20) - 1e-6
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.9, 0.925, 0.95, 0.97, 0.99, 1.0])
+def test_the_characteristic_of_the_test_is_exact(share):
+    """By the closed form of a design that loses nothing, and by all sequences of a short test."""
+    for batch, most in ((1, 600), (20, 600), (20, 90)):
+        found = verdict.characteristic(share, batch, most)
+        assert sum(found[:3]) == pytest.approx(1)
+        # The errors that are promised, at any number of looks.
+        assert share > verdict.POOR or found.good <= verdict.ERROR
+        assert share < verdict.WANTED or found.not_good <= verdict.ERROR
+        assert found.grasps <= most
+    if share == 1.0:
+        alone = np.log(1 / verdict.ERROR) / np.log(verdict.WANTED / verdict.POOR)
+        assert verdict.characteristic(share, 1).grasps == np.ceil(alone) == 56
+        assert verdict.characteristic(share).grasps == 60
+    batch, most = 2, 12
+    looks = range(batch, most + 1, batch)
+    words = {(kept, n): verdict.judge(kept, n).word for n in looks for kept in range(n + 1)}
+    ends, grasps = dict.fromkeys(("good", "not good", "not enough trials"), 0.0), 0.0
+    for sequence in itertools.product((1, 0), repeat=most):
+        chance = share ** sum(sequence) * (1 - share) ** (most - sum(sequence))
+        for total in looks:
+            word = words[sum(sequence[:total]), total]
+            if word != "not enough trials" or total == most:
+                ends[word] += chance
+                grasps += chance * total
+                break
+    found = verdict.characteristic(share, batch, most)
+    assert [*found] == pytest.approx([*ends.values(), grasps], abs=1e-12)
+
+
+def test_the_page_has_the_numbers_of_the_test():
+    """Expected grasps and chances, of a row for each share."""
+    page = (ROOT / "docs" / "command_line.md").read_text(encoding="utf-8")
+    table = page.split("| true share |")[1].split("\n\n")[0].splitlines()[2:]
+    shares = []
+    for row in table:
+        share, *numbers = [float(cell.strip(" %<")) for cell in row.strip("|").split("|")]
+        good, bad, undecided, grasps = verdict.characteristic(share / 100)
+        expected = [grasps, 100 * good, 100 * bad, 100 * undecided]
+        np.testing.assert_allclose(numbers, expected, atol=0.051)  # a digit behind the point
+        shares.append(share)
+    assert {90, 95, 97, 99, 100} <= {*shares}
+    assert verdict.USUAL == round(verdict.characteristic(0.99).grasps)
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "most", "known", "expected"),
+    [
+        ([0] * 60, 600, 0, 60),  # none lost
+        ([3] * 60, 600, 0, 20),  # all lost
+        ([0] * 60, 600, 24, 64),  # those of a stored test count; batches keep their size
+        ([0] * 60, 50, 0, 50),  # the last batch is cut
+        ([0] * 60, 600, 60, 60),  # nothing to simulate
+        ([0] * 60, 24, 30, 30),  # fewer are asked for than there are
+        ([3] + [0] * 99, 600, 0, 80),
+    ],
+)
+def test_trials_go_on_until_they_decide(outcomes, most, known, expected):
+    """Batches follow one another, of one size; what is known is not simulated again."""
+    cost = np.array(outcomes + [0] * 20, float)
+    every = trials_of(cost, np.zeros(len(cost)), lost=np.flatnonzero(cost))
+    calls = []
+
+    def simulate(first, count):
+        calls.append((first, count))
+        return jax.tree.map(lambda v: v[first : first + count], every)
+
+    previous = jax.tree.map(lambda v: v[:known], every) if known else None
+    found = [*verdict.sequential(simulate, most, previous)]
+    assert [first for first, _ in calls] == [*range(known, expected, min(20, most))]
+    assert len({count for _, count in calls}) <= 1
+    end = found[-1] if found else previous
+    np.testing.assert_array_equal(end.cost, every.cost[:expected])
 
 
 def test_a_verdict_is_a_sentence():
-    """A share below a limit is not rounded to it. The page has examples of the rule."""
-    page = " ".join((ROOT / "docs" / "command_line.md").read_text().split())
-    assert "lies above 85 %: 24 of 24 are enough, and 143 of 150" in page
-    said = verdicts.judge(143, 150).sentence()
-    assert said == "keeps 95 % of 150 fresh grasps (91 to 98 %): good"
-    said = verdicts.judge(142, 150).sentence()
-    assert said.startswith("keeps 94.6 % of 150") and "more than 10,000 more at" in said
-    assert "keeps 99.6 % of 250 grasps of its" in verdicts.judge(249, 250).sentence("grasps of its")
+    """A share below a limit is not rounded to it."""
+    said = verdict.judge(97, 100).sentence()
+    assert said == "keeps 97 % of 100 fresh grasps (92 to 99 %): good"
+    said = verdict.judge(128, 138).sentence()
+    assert said.startswith("keeps 93 % of 138") and "more than 10,000 more at" in said
+    assert "keeps 99.6 % of 250 grasps of its" in verdict.judge(249, 250).sentence("grasps of its")
     tiny = scene.load(TINY)
     kept = Judged(tiny, trials_of([0.0] * 3, [0] * 3), "fine")
     assert str(kept).endswith(
-        "(44 to 100 %): not enough trials, 19 more at this share would decide"
+        "(44 to 100 %): not enough trials, 53 more at this share would decide"
     )
-    how = "kept 3 of 3, 0 lost, 0 stuck; mean cost 0.0000; accuracy fine, steps of 20 ms, 3 links"
+    how = "kept 3 of 3, 0 lost, 0 not released; mean cost 0.0000; accuracy fine, steps of 20 ms, "
     assert kept.details.startswith(how)
     broken = str(Judged(tiny, trials_of([3.0] * 3, [Status.NONFINITE] * 3)))
     assert broken == "no verdict: every trial failed (NONFINITE 3)"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ({}, "objects of 50 g, friction 0.86"),
+        ({"objects.object.sphere.mass": 0.3}, "objects of 50 to 300 g, friction 0.86"),
+        ({"objects.noise.mass_range": 10.0}, "objects of 50 to 500 g, friction 0.86"),
+        ({"objects.object.sphere.friction": 0.4}, "objects of 50 g, friction 0.4 to 0.86"),
+        ({"effects.friction": "none"}, "objects of 50 g, no friction"),
+    ],
+)
+def test_a_verdict_names_what_it_holds_for(overrides, words):
+    judged = Judged(scene.load("paper", overrides=overrides), trials_of([0.0] * 60, [0] * 60))
+    text = f"keeps 100 % of 60 fresh grasps of {words} (94 to 100 %): good; "
+    assert str(judged) == f"{text}other conditions not tried"
+
+
+@pytest.mark.parametrize(
+    ("kept", "words"),
+    [
+        ((12, 12, 11, 12, 11), "holds under all 3 other conditions"),
+        ((0, 12, 12, 12, 12), "holds under all 3 other conditions"),  # the design as it is
+        ((12, 5, 12, 12, 12), "not with objects of 500 g (42 %)"),
+        ((12, 12, 7, 12, 12), "not with friction 0.4 on the hand (58 %)"),
+        ((12, 12, 12, 12, 1), "not with draws (54 %)"),
+        ((12, 10, 10, 0, 0), "not with objects of 500 g (83 %), friction 0.4 on the hand (83 %), "),
+    ],
+)
+def test_a_second_word_names_conditions_under_which_it_does_not_hold(kept, words):
+    """Draws of other constants are one condition."""
+    names = (stress.AS_IT_IS, "objects of 500 g", "friction 0.4 on the hand", "draws", "draws")
+    found = stress.Stress(names, np.array(kept), 12, ())
+    assert found.limits.startswith(words)
+    judged = Judged(PAPER, trials_of([0.0] * 60, [0] * 60), stress=found)
+    assert str(judged).endswith(f": good; {found.limits}")
 
 
 @pytest.mark.parametrize(
@@ -311,7 +494,7 @@ def test_verdicts_count_all_trials_and_means_follow_the_rule(rule, mean, mean_in
     found = trials_of([0.0, 1.0, 3.0], [0, Status.SOLVER_CAP, Status.STUCK], lost=[1])
     judged = Judged(tiny, found)
     row = verdicts.of_trials(tiny, found)
-    assert row == f"kept 1 of 3, 1 lost, 1 stuck; {mean_in_words}; warnings: SOLVER_CAP 1"
+    assert row == f"kept 1 of 3, 1 lost, 1 not released; {mean_in_words}; warnings: SOLVER_CAP 1"
     assert str(judged).startswith("keeps 33 % of 3 fresh") and row in judged.details
     [warning] = verdicts.warnings(judged)
     assert warning.startswith("warning: 1 of 3 trials failed (STUCK 1); STUCK: the hand did not")

@@ -74,7 +74,9 @@ def here_alone(example):
 # Where a command simulates, or writes what it has simulated: owners and names.
 SIMULATES = {
     "check": [(check, "tell")],
-    "evaluate": [(evaluate, "simulate"), (evaluate, "of_objects"), (evaluate.stress, "simulate")],
+    "evaluate": [
+        (evaluate, name) for name in ("simulate", "other_conditions", "tell_verdict", "of_objects")
+    ],
     "export": [(export, "write_files")],
     "finger": [(finger, "compare")],
     "landscape": [
@@ -94,7 +96,6 @@ def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch)
     arguments, reached = here_alone(example), []
     monkeypatch.setattr(preflight, "refusals", lambda *rest: [])  # the slow test below has it
     monkeypatch.setattr(check, "simulate", lambda *rest: ())
-    monkeypatch.setattr(evaluate.reference, "tell_stress", lambda *rest: None)
     # The exit code is what is handed on, or made of a status.
     kept = SimpleNamespace(status=np.zeros(1, int))
     code = {"check": 0, "replay": 0, "evaluate": kept}.get(arguments[0])

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 
 # What stands in a line may import lines before it, and its own folder.
 LAYERS = """
-files sizes terminal
+files sizes statistics terminal
 reuse
 store
 types provenance compiler optimize
@@ -27,6 +27,7 @@ own preflight measurements
 codesign env finger sampling
 batch
 runs
+stress
 report
 export
 commands

@@ -210,6 +210,18 @@ def test_a_policy_is_searched_and_said_wherever_it_acts(here, capsys):
     assert "the run was made with --policy mine:Pull" in capsys.readouterr().err
     assert cli.main([*pair, "--policy", "mine:Pull", "mine:Narrow"]) == 2
     assert "--policy mine:Narrow: neither run was made with it" in capsys.readouterr().err
+    capsys.readouterr()
+    assert cli.main(["compare", "run", "--policy", "mine:Pull", "--trials", "2"]) == 0
+    said = capsys.readouterr().out
+    assert "run with mine:Pull keeps " in said and "without keeps " in said
+    assert "policy mine:Pull left the key frames in 2 of 2 grasps" in said
+    assert "of the same 2 trials" in said
+    (here / "a.toml").write_text(f'preset = "2d"\nscene = "{TINY}"\n[design]\nlength = 44\n')
+    (here / "b.toml").write_text(f'preset = "2d"\nscene = "{TINY}"\n[design]\nlength = 100\n')
+    files = ["compare", "a.toml", "b.toml", "--engine", "mujoco", "--trials", "2"]
+    assert cli.main(files) == 0
+    said = capsys.readouterr().out
+    assert "a.toml keeps " in said and "b.toml keeps " in said and "difference: " in said
     one, other = (own.make_policy("mine:Pull", the_scene)[0] for _ in range(2))
     assert one is other  # its programs are compiled once
 

@@ -157,6 +157,42 @@ def test_a_tied_pressure_obeys_the_thinnest_wall():
     assert space.project(design)[-1] < 80e3
 
 
+@pytest.mark.parametrize(
+    ("tied", "names", "fingers"),
+    [
+        (((0, 3), (1, 2)), ["length[0+3]", "length[1+2]"], [0, 1, 1, 0]),
+        (((1, 3),), ["length[0]", "length[1+3]", "length[2]"], [0, 1, 2, 1]),
+        (((3, 1, 2),), ["length[0]", "length[3+1+2]"], [0, 1, 1, 1]),
+        (((0, 1, 2, 3),), ["length"], [0, 0, 0, 0]),
+        (True, ["length"], [0, 0, 0, 0]),
+        (False, [f"length[{k}]" for k in range(4)], [0, 1, 2, 3]),
+    ],
+)
+def test_groups_of_fingers_share_a_value(tied, names, fingers):
+    """Of bounds the narrowest; a pressure that they share obeys the thinnest wall."""
+    low, high = (60.0, 70.0, 80.0, 90.0), (100.0, 110.0, 120.0, 130.0)
+    free = (hand.Free("length", tied, low, high), hand.Free("pressure", tied), hand.Free("wall"))
+    own = dataclasses.replace(HAND, preset=(hand.Preset("own", free),))
+    space = parameters.design_space(own, "own")
+    lengths = [n for n in space.names if n.startswith("length")]
+    assert lengths == names
+    values = np.asarray(space.default(), np.float32)
+    values[: len(names)] = 0.08 + np.arange(len(names)) / 1e3
+    np.testing.assert_array_equal(space.params(jnp.asarray(values)).length, values[fingers])
+    for k in range(len(names)):
+        group = [i for i, own_index in enumerate(fingers) if own_index == k]
+        ends = space.in_units(space.low)[k], space.in_units(space.high)[k]
+        assert ends == pytest.approx((max(low[i] for i in group), min(high[i] for i in group)))
+        assert parameters.fingers_of(names[k]) in (group, [], [3, 1, 2])
+    walls = np.array([0.007, 0.005, 0.002, 0.006])
+    design = space.default()
+    pressures = [n.startswith("pressure") for n in space.names]
+    design[pressures], design[[n.startswith("wall") for n in space.names]] = 150e3, walls
+    found = np.asarray(space.project(design))[pressures]
+    limits = [min(walls[i] for i in range(4) if fingers[i] == k) * 40e6 for k in range(len(names))]
+    np.testing.assert_allclose(found, np.minimum(limits, 150e3), rtol=1e-5)
+
+
 THUMB = hand.load("thumb4")
 
 

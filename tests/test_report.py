@@ -17,7 +17,7 @@ from scipy import stats
 from codesign_jax import cli, model, rollout, runs, scene, store
 from codesign_jax.commands import reference
 from codesign_jax.engines import make_engine
-from codesign_jax.report import animation, bodies, viewer
+from codesign_jax.report import animation, bodies, verdicts, viewer
 from codesign_jax.runs import choice
 from codesign_jax.scene import parameters
 from codesign_jax.scene.schema import InputError
@@ -124,7 +124,7 @@ def test_report_shows_the_best_tested_particle_with_its_interval(run, text):
     chosen = choice.choose(the_scene, choice.read_record(run))
     kept = int(((chosen.outcomes.cost < 0.01) & ~failed(chosen.outcomes.status)).sum())
     low, high = stats.binomtest(kept, int(best["trials"])).proportion_ci(0.95, method="wilson")
-    share = f"grasps of its final test ({100 * low:.0f} to {100 * high:.0f} %): not good"
+    share = f"({100 * low:.0f} to {100 * high:.0f} %): not good"
     assert f"kept {kept} of {best['trials']}, " in text and share in text
     assert f"Particle {best['particle']}, chosen as the best by the final test" in text
     assert f"; mean cost {float(best['test_cost']):.4f}" in text
@@ -197,7 +197,10 @@ def test_fresh_trials_at_reference_are_in_the_report(run, tmp_path, capsys):
         assert cli.main(["report", str(copy), "--no-replay", "--out", str(page)]) == 0
         low, high = stats.binomtest(3, 5).proportion_ci(0.95, method="wilson")
         text = page.read_text(encoding="utf-8")
-        share = f"keeps 60 % of 5 fresh grasps ({100 * low:.0f} to {100 * high:.0f} %): not good"
+        grasps = f"fresh grasps of {verdicts.objects(case.scene)}"
+        share = (
+            f"keeps 60 % of 5 {grasps} ({100 * low:.0f} to {100 * high:.0f} %): not enough trials"
+        )
         assert (share in text) == words
         assert ("; accuracy reference, steps of " in text) == words
         assert ("1 of 5 trials failed (STUCK 1)" in text) == words

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 import pytest
 
-from codesign_jax import codesign, runs, scene
+from codesign_jax import codesign, runs, scene, store
 from codesign_jax.batch import Batch, Request, take
 from codesign_jax.commands import reference
 from codesign_jax.engines.structured import StructuredEngine
@@ -122,6 +122,7 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
     assert (
         stress is not None and [*dict.fromkeys(stress.conditions)][-1] == "neo-Hookean bending law"
     )
+    assert f"; {stress.limits}" in text
     for words in ("under other conditions, 12 grasps each", *stress.lines()):
         assert " ".join(words.split()) in " ".join(text.split())
     other = dataclasses.replace(settings, seed=settings.seed + 1)
@@ -141,10 +142,38 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
         patch.setattr(Case, "simulate", never)
         assert command(*RUN, "--reference-trials", "2", "--out", folder) == 0
         assert line in capsys.readouterr().out.splitlines()
-    assert reference.number_of_trials(None, settings) == 0  # MuJoCo C would take minutes
+    # A longer test goes on from what is there, and a shorter one takes it.
+    two, more = reference.stored(folder, settings)[0], []
+
+    def simulate(case, trials, key, first=0):
+        more.append((first, trials))
+        return jax.tree.map(lambda v: np.repeat(v[:1], trials), two)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Case, "simulate", simulate)
+        assert command(*RUN, "--reference-trials", "5", "--out", folder) == 0
+        assert command(*RUN, "--reference-trials", "3", "--out", folder) == 0
+    assert more == [(2, 5)]
+    five = reference.stored(folder, settings)[0]
+    np.testing.assert_array_equal(five.cost, [*two.cost, *[two.cost[0]] * 3])
+    rows = (folder / "reference.csv").read_text().splitlines()
+    assert len(rows) == 6
+    # Of another version of the code they are shown as such, and not gone on from.
+    with monkeypatch.context() as patch:
+        patch.setattr(store.reuse, "code_digest", lambda: "another")
+        found, why = reference.stored(folder, settings)
+        assert found.cost.size == 5 and why == "is of another version of the code"
+        capsys.readouterr()
+        assert command("report", folder, "--no-replay") == 0
+        assert command("compare", folder) == 0
+        told = capsys.readouterr()
+        assert "reference.npz is of another version of the code" in told.out
+        assert "reference.npz is of another version of the code" in told.err
+        assert "fine" in told.out
+    assert reference.most_trials(None, settings) == 0  # MuJoCo C would take minutes
     quick = dataclasses.replace(settings, engine="structured")
-    assert reference.number_of_trials(None, quick) == 24
-    assert reference.number_of_trials(None, dataclasses.replace(quick, test_trials=0)) == 0
+    assert reference.most_trials(None, quick) == 600
+    assert reference.most_trials(None, dataclasses.replace(quick, test_trials=0)) == 0
 
 
 def test_more_episodes_extend_a_run_bit_for_bit(finished, tmp_path, capsys):
@@ -201,7 +230,8 @@ def test_seeds_are_compared(compared):
     table = output[output.rindex("judged by") :]
     rows = [line for line in table.splitlines() if "final test" in line]
     assert [row.split()[0] for row in rows] == ["2", "3"]
-    assert "of 2 runs found a good design" in table and "good: at least 95 % kept" in table
+    assert "of 2 runs found a good design" in table and "Wald's sequential test" in table
+    assert "; for objects of " in table
     assert "% of such runs (95 % interval)" in table
     rows = [*csv.DictReader((both / "seeds.csv").read_text().splitlines())]
     names = ("seed", "schedule", "first", "finished", "run")

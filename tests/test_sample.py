@@ -7,6 +7,7 @@ import pytest
 
 from codesign_jax import cli, codesign, objects, rollout, sampling, scene
 from codesign_jax.commands import sample
+from codesign_jax.export import process
 from codesign_jax.runs import dataset, directory
 from codesign_jax.scene import parameters
 from tests.helpers.grasps import nth
@@ -85,6 +86,17 @@ def test_outcomes_are_those_of_each_grasp_by_itself():
         np.testing.assert_allclose(found.cost[i], cost[i], atol=1e-5)
 
 
+def air_of(designs):
+    """Air in the chambers of designs [cm^3], as the moulds' volumes have it but for end walls."""
+    hands = parameters.params_of(SPACE, designs)
+    found = []
+    for k in range(len(designs)):
+        own = nth(hands, k)
+        sizes = process.sizes(THREE.hand, jax.tree.map(np.asarray, own), process.Process())
+        found.append(sum(s._replace(end=0.0).chamber_volume for s in sizes) / 1e3)
+    return np.array(found)
+
+
 def test_a_row_has_design_noise_and_outcome(place, capsys):
     assert run() == 0
     assert [p.name for p in place.iterdir()] == ["a.parquet"]
@@ -102,6 +114,7 @@ def test_a_row_has_design_noise_and_outcome(place, capsys):
         "noise_mass_factor": drawn.trials.mass,
         "length_mm": 1e3 * np.repeat(drawn.designs[:, :1], 2, axis=1),
         "arm_z_mm": 1e3 * np.repeat(drawn.designs[:, 1:], 2, axis=1),
+        "chamber_volume_cm3": np.repeat(air_of(drawn.designs), 2),
     }.items():
         np.testing.assert_allclose(rows[name], np.ravel(values)[:20], rtol=1e-6)
     bad = np.isin(np.arange(20) % 8, [1, 4])

@@ -376,6 +376,11 @@ LOW = "low = 10\nhigh = 180\ndefault"  # of the length
         ),
         ("\nwall = 5", "\nwall = [5, 5, 2.5, 5]", "120000 Pa is not below the limit of 100000 Pa"),
         ("\nspread = 45", "\nspread = [45]", "= [45] must be a number [deg]: the hand has one spr"),
+        ("tied = true\nlow = 10", "tied = [[0, 4]]\nlow = 10", "fingers are numbered from 0 to 3"),
+        ("tied = true\nlow = 10", "tied = [[0], [1, 2]]\nlow = 10", "a group has two or more"),
+        ("tied = true\nlow = 10", "tied = [[0, 1], [1, 2]]\nlow = 10", "is in one group only"),
+        ("tied = true\nlow = 10", "tied = [0, 1]\nlow = 10", "tied[0] must be an array"),
+        ("tied = true\nlow = 10", "tied = 'all'\nlow = 10", "must be true or false"),
         (
             "tied = true\nlow = 10",
             "tied = true\nlow = [10, 10, 10, 20]",

@@ -1,6 +1,7 @@
 """`codesign render`, `replay` and `landscape`: one grasp is simulated, a grid is complete."""
 
 import csv
+import dataclasses
 import json
 import re
 import sys
@@ -11,6 +12,9 @@ import pytest
 from PIL import Image
 
 from codesign_jax import batch, cli, codesign, runs
+from codesign_jax import scene as scenes
+from codesign_jax.commands import common, flags, grid
+from codesign_jax.commands import landscape as landscapes
 from codesign_jax.engines import make_engine
 from codesign_jax.report import animation, landscape
 from codesign_jax.runs import choice
@@ -19,6 +23,7 @@ from codesign_jax.types import failed
 from tests.helpers.command_runs import small_run  # noqa: F401
 from tests.helpers.toy_engine import TINY
 
+GRID = ("landscape", "--scene", str(TINY), "--engine", "mujoco", "--parameters")
 DESIGN = ["--scene", str(TINY), "--engine", "mujoco", "--design", "length=100", "arm_z=0"]
 
 
@@ -102,6 +107,17 @@ def test_wrong_grasps_are_refused_in_words(run, workplace, capsys):
         ("replay", *own, "--out", "a.gif"): "must end in .html",
         ("landscape", *DESIGN, "--parameters", "length", "arm_q"): "did you mean 'arm_z'",
         ("landscape", *DESIGN[:4], "--preset", "full"): "must name two of length[0]",
+        (*GRID, "gravity", "length"): "'gravity' is not a parameter",
+        (*GRID, "contact.friction_ratio", "length"): "needs its range: contact.friction_ratio=LOW",
+        (*GRID, "gravity=3", "length"): "'gravity=3' must be NAME=LOW:HIGH",
+        (*GRID, "gravity=9:3", "length"): "must be NAME=LOW:HIGH, two numbers, the lower one",
+        (*GRID, "gravity=3:9"): "must name two of",
+        (*GRID, "gravity=3:9", "gravity=1:2"): "must name two of",
+        (*GRID, "gravty=3:9", "length"): "did you mean 'gravity'?",
+        (*GRID, "gravity=3:900", "length"): "gravity = 900.0 is outside [0, 100] m/s^2",
+        (*GRID, "length=1:2000", "arm_z"): "--parameters length = 1.0 is outside",
+        (*GRID, "discretization.links=2:4", "length"): "must be a whole number",
+        (*GRID, "objects.object.cube.mass=0.1:1", "length"): "'cube'",
     }
     for arguments, words in cases.items():
         assert cli.main([*arguments]) == 2, arguments
@@ -164,6 +180,51 @@ def test_landscape_has_every_point(run, monkeypatch, capsys):
     assert (run / "figures" / "landscape.png").exists()
     assert cli.main(["report", str(run), "--no-replay"]) == 0
     assert "mean cost over 2 trials a point" in (run / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("words", "names", "varied"),
+    [
+        (["gravity=3:9", "length"], ["gravity", "length"], {"gravity"}),
+        (
+            ["objects.object.mass=0.1:0.3", "objects.noise.mass=0:0.1"],
+            ["objects.object.mass", "objects.noise.mass"],
+            {"objects.object.mass", "objects.noise.mass"},
+        ),
+        (["hand.material.shear_modulus=3e4:6e4", "arm_z=10:40"], ["hand.material.shear_modulus",
+         "arm_z"], {"hand.material.shear_modulus"}),
+        (["length", "arm_z"], ["length", "arm_z"], set()),
+    ],
+)  # fmt: skip
+def test_a_landscape_is_over_any_numbers(words, names, varied):
+    """Each point has the scene that --set makes of both values; of a list all entries change."""
+    options = flags.Landscape(
+        scene=str(TINY), engine="mujoco", design=(("length=44", "arm_z=20"),), points=2
+    )
+    options = dataclasses.replace(options, parameters=tuple(words))
+    case = common.find_case(options)
+    pair = grid.axes(case, options)
+    assert [axis.name for axis in pair] == names
+    made = landscapes.make_plane(case, pair)
+    assert (made.numbers is None) == (not varied)
+    tree = jax.tree.structure(case.scene)
+    for i, j in np.ndindex(2, 2):
+        values = {n: axis.values[k] for n, axis, k in zip(names, pair, (i, j), strict=True)}
+        for k, name in enumerate(case.space.names):
+            wanted = values.get(name, case.space.in_units(case.design)[k])
+            assert case.space.in_units(made.designs[2 * i + j])[k] == pytest.approx(wanted)
+        if made.numbers is None:
+            continue
+        own = {n: float(values[n]) for n in varied}
+        count = len(case.scene.objects.object)
+        own = {
+            n.replace("object.mass", f"object.{k}.mass"): v
+            for n, v in own.items()
+            for k in range(count)
+        }
+        wanted = scenes.load(TINY, overrides=own)
+        found = jax.tree.unflatten(tree, made.numbers[2 * i + j].tolist())
+        np.testing.assert_allclose(jax.tree.leaves(found), jax.tree.leaves(wanted), rtol=1e-12)
 
 
 def test_missing_extra_is_one_line(monkeypatch, capsys):

@@ -508,7 +508,7 @@ def page(browser, opened):
         yield page
 
 
-COMPLETE = f"#studio .trials button:nth-child({COUNTS[0]}):is(.kept, .lost, .stuck, .failed)"
+COMPLETE = f"#studio .trials button:nth-child({COUNTS[0]}):is(.kept, .lost, .not_released, .failed)"
 LENGTH = "#studio input[type=range][aria-label=length]"
 
 

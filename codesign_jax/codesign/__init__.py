@@ -29,16 +29,15 @@ from codesign_jax.codesign.experiment import (
     STREAM_SCREEN,
     STREAM_TEST,
     SUCCESS_COST,
-    VERDICTS,
     FinalTest,
     convergence_episode,
     seed_search,
     summarize_test,
     testing,
-    verdicts,
 )
 from codesign_jax.codesign.optimizers import make_filter, make_optimizer
 from codesign_jax.cost import particle_cost
+from codesign_jax.verdict import VERDICTS, verdicts
 
 __all__ = [
     "CONVERGED_COST",

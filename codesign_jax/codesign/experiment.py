@@ -11,7 +11,7 @@ from codesign_jax.codesign.episode import stream_key
 from codesign_jax.cost import particle_cost
 from codesign_jax.optimize import Optimizer, rejection, translated
 from codesign_jax.scene import Scene
-from codesign_jax.types import Outcome, Status, failed
+from codesign_jax.types import Outcome
 
 # Four ASCII letters each, see `episode.STREAM_TRIAL`.
 STREAM_SCREEN = 0x7363726E
@@ -21,13 +21,11 @@ STREAM_TEST = 0x74657374
 
 SUCCESS_COST = 0.01
 """Mean test cost below which a particle has solved the task by the paper's rule (section VI.4); the
-verdict of a run is `report.verdicts.judge`."""
+verdict of a run is `verdict.judge`."""
 CONVERGED_COST = 1.0
 """Mean particle cost of an episode below which a run counts as converged (section VI.4)."""
 SEED_COST = 2.0
 """Cost that a seed particle must exceed, so that no run starts with a solution (section VI.4)."""
-VERDICTS = ("kept", "lost", "stuck", "failed")
-"""How a trial ends, see `verdicts`."""
 
 
 class FinalTest(NamedTuple):
@@ -113,25 +111,6 @@ def summarize_test(scene: Scene, outcomes: Outcome) -> FinalTest:
     """
     cost = particle_cost(scene, outcomes)
     return FinalTest(outcomes, cost, cost < SUCCESS_COST)
-
-
-def verdicts(outcomes: Outcome) -> np.ndarray:
-    """How trials ended, as indices of `VERDICTS`: the one rule of tables, reports and commands.
-
-    Lost is what did not fail and lost its object within the window of the scene's cost, whatever
-    a cost of one's own says.  Of the trials that failed, stuck are those in which the hand did not
-    let go; the others are faults of the simulation.
-
-    Args:
-      outcomes: Outcomes, arrays of any shape.
-
-    Returns:
-      Indices, of the same shape.
-    """
-    status = np.asarray(outcomes.status)
-    lost = np.isfinite(outcomes.lost_time)
-    bad = np.where(status & Status.STUCK, VERDICTS.index("stuck"), VERDICTS.index("failed"))
-    return np.where(failed(status), bad, lost.astype(int))
 
 
 def convergence_episode(

@@ -11,17 +11,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import codesign, optimize, own, preflight, runs, sampling
+from codesign_jax import optimize, own, preflight, runs, sampling, verdict
 from codesign_jax.commands import common, reference
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Check
 from codesign_jax.engines import Engine
-from codesign_jax.report.statistics import wilson
 from codesign_jax.runs import Settings, choice
 from codesign_jax.runs.choice import Case
 from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.progress import Busy, duration
 from codesign_jax.scene import Scene, with_accuracy
+from codesign_jax.statistics import wilson
 from codesign_jax.terminal import Console
 from codesign_jax.types import Outcome, Trial, failed
 
@@ -46,7 +46,7 @@ class Measured(NamedTuple):
     @property
     def kept(self) -> np.ndarray:
         """Whether each grasp kept its object, shape (design, trial)."""
-        return codesign.verdicts(self.outcomes) == codesign.VERDICTS.index("kept")
+        return verdict.kept(self.outcomes)
 
     def __str__(self) -> str:
         """Rate and sizes in a line."""
@@ -193,7 +193,7 @@ def _mixed(options: Check, case: Case, run: Run, count: int) -> tuple[np.ndarray
     mixed = np.stack([best, every[-half:]], 1).reshape(-1, best.shape[1])[:count]
     words = (
         f"half of them random, half the best of {len(every)} random ones; those that a search "
-        "ends with take longer (--run FOLDER measures them)"
+        "ends with take longer, and fewer of their verdicts differ (--run FOLDER measures them)"
     )
     return mixed, words
 
@@ -206,7 +206,7 @@ def tell(
     differ = int((ours != theirs).sum())
     share = wilson(differ, theirs.size)
     grasps = runs.prepare(case.scene, _without_own_code(settings)).grasps
-    tested = reference.number_of_trials(None, settings)
+    tested = min(reference.most_trials(None, settings), verdict.USUAL)
     test = f", and {duration(tested / fine.rate)} for its test at accuracy {reference.ACCURACY}"
     causes = runs.failure_counts(usual.outcomes.status)
     lines = [

@@ -127,7 +127,8 @@ def design_text(space: DesignSpace, file: DesignFile, design: np.ndarray) -> str
     for name, k in places.items():
         several = isinstance(k, list)
         text = f"[{', '.join(values[i] for i in k)}]" if several else values[k]
-        lines.append(f"{name} = {text}  # {space.units[k[0] if several else k]}")
+        key = f'"{name}"' if "[" in name else name
+        lines.append(f"{key} = {text}  # {space.units[k[0] if several else k]}")
     return "\n".join([*lines, ""])
 
 

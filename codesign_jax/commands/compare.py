@@ -3,6 +3,7 @@
 `codesign optimize` ends with it where there are several seeds or strategies.
 """
 
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,11 +14,11 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from codesign_jax import codesign, cost, runs
+from codesign_jax import codesign, cost, runs, statistics, verdict
 from codesign_jax.commands import common, flags, reference
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Compare
-from codesign_jax.report import statistics, verdicts
+from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import RunResult, Settings, columns, manifest, tables
 from codesign_jax.runs.choice import Case
@@ -27,6 +28,8 @@ from codesign_jax.scene.schema import InputError
 from codesign_jax.terminal import Console
 
 _OF_SETTINGS = ("schedule", "optimizer", "preset", "engine", "cost")
+TRIALS = 150
+"""Trials in which designs are compared by default."""
 _WORDS = {"schedule": "strategy"}
 
 
@@ -62,24 +65,35 @@ class Compared(NamedTuple):
 
 
 def main(options: Compare) -> int:
-    folders = [run for folder in options.folders for run in _runs_in(folder)]
+    designs = [place for place in options.folders if place.suffix == ".toml"]
+    folders = [] if designs else [run for folder in options.folders for run in _runs_in(folder)]
     problems = common.number_problems(
         ("--trials", options.trials, 1, 100_000), ("--seed", options.seed, 0, 2**31 - 1)
     )
-    if not folders:
+    if not options.folders:
         problems.append("compare needs at least one run folder")
-    if options.trials is not None and len(folders) != 2:
+    if designs and len(designs) < len(options.folders):
+        problems.append("compare takes design files (.toml) or run folders, not both")
+    if designs and options.out is not None:
+        problems.append("--out is a table of runs; leave it out beside design files")
+    places = designs or folders
+    alone = len(places) == 1 and len(options.policy) == 1
+    if designs and len(designs) != 2 and not alone:
+        problems.append("compare takes two design files, or one with --policy against none")
+    if options.trials is not None and len(places) != 2 and not alone:
         problems.append(f"--trials compares two designs; the folders have {len(folders)} runs")
     common.refuse(problems + common.place_problems("--out", options.out, ".csv"))
-    pair = [] if options.trials is None else _pair(options, folders)
-    every = read_all({folder: runs.read_run(folder) for folder in folders})
+    simulates = bool(designs) or options.trials is not None
+    pair = _pair(options, places, runs=not designs) if simulates else {}
     console = Console()
-    compare(every, console, named=True)
-    if options.out is not None:
-        write_table(every, options.out)
-        console.print(f"table: {options.out}")
+    if folders:
+        every = read_all({folder: runs.read_run(folder) for folder in folders})
+        compare(every, console, named=True)
+        if options.out is not None:
+            write_table(every, options.out)
+            console.print(f"table: {options.out}")
     if pair:
-        _compare_pair(pair, [str(folder) for folder in folders], options, console)
+        _compare_pair(pair, options, console)
     return 0
 
 
@@ -98,38 +112,58 @@ def read_all(every: Mapping[Path, tuple[Scene, Settings]]) -> dict[Path, Compare
         result, fresh = read(scene, folder), None
         if result is not None and result.test is not None and (folder / reference.FILE).exists():
             kept, why = reference.stored(folder, settings)
-            fresh = None if kept is None else reference.judged(scene, kept)
             if why:
-                judge = "the final test, which flatters the design, judges it"
-                common.warn(f"{folder / reference.FILE} {why}: {judge}")
+                judge = "" if kept else ": the final test, which flatters the design, judges it"
+                common.warn(f"{folder / reference.FILE} {why}{judge}")
+            if kept is not None:
+                other, _ = reference.stored_stress(folder, settings)
+                fresh = reference.judged(scene, kept, other)
         found[folder] = Compared(scene, settings, result, fresh)
     return found
 
 
-def _pair(options: Compare, folders: list[Path]) -> list[Case]:
-    replaced = {n: getattr(options, n) for n in ("accuracy", "objects", "overrides", "robust")}
-    own = [runs.read_run(folder)[1].policy for folder in folders]
-    if unknown := [name for name in options.policy if name not in own]:
+def _pair(options: Compare, places: list[Path], *, runs: bool) -> dict[str, Case]:
+    """The two designs by what they are called; one alone is with its policy and without it."""
+    given = [_subject(options, place, of_run=runs) for place in places]
+    if runs and (unknown := {*options.policy} - {subject.policy for subject in given}):
         raise InputError([f"--policy {name}: neither run was made with it" for name in unknown])
-    given = [
-        flags.Subject(run_folder=folder, engine=options.engine, policy=policy, **replaced)
-        for folder, name in zip(folders, own, strict=True)
-        for policy in [name if name in options.policy else None]
-    ]
-    one, other = [find_case(subject) for subject in given]
+    cases = [find_case(subject) for subject in given]
+    names = [str(place) for place in places]
+    if len(cases) == 1:
+        [case] = cases
+        return {f"{names[0]} with {case.policy}": case, "without": case._replace(policy="")}
+    one, other = cases
     if one.scene.objects != other.scene.objects:
-        raise InputError(["the two runs have other objects or noise: --objects says which to take"])
-    return [one, other]
+        what = "runs" if runs else "designs"
+        raise InputError(
+            [f"the two {what} have other objects or noise: --objects says which to take"]
+        )
+    if names[0] == names[1]:
+        names[1] += " again"
+    return dict(zip(names, cases, strict=True))
 
 
-def _compare_pair(pair: list[Case], names: list[str], options: Compare, console: Console) -> None:
-    kept, count = [], options.trials or 0
-    for case, name in zip(pair, names, strict=True):
+def _subject(options: Compare, place: Path, *, of_run: bool) -> flags.Subject:
+    how = {n: getattr(options, n) for n in ("accuracy", "objects", "overrides", "robust", "engine")}
+    if of_run:
+        own = runs.read_run(place)[1].policy
+        policy = own if own in options.policy else None
+        return flags.Subject(run_folder=place, policy=policy, **how)
+    if len(options.policy) > 1:
+        raise InputError(["--policy takes one policy beside design files"])
+    return flags.Subject(design=((str(place),),), policy=next(iter(options.policy), None), **how)
+
+
+def _compare_pair(pair: dict[str, Case], options: Compare, console: Console) -> None:
+    kept, count = [], TRIALS if options.trials is None else options.trials
+    for name, case in pair.items():
         with Busy(console, f"simulating {common.counted(count, 'grasp')}"):
-            outcome = case.simulate(count, jax.random.key(options.seed))
+            outcome, left = case.observe(count, jax.random.key(options.seed))
         console.print(f"{name} {Judged(case.scene, outcome, options.accuracy)}")
-        kept.append(codesign.verdicts(outcome) == codesign.VERDICTS.index("kept"))
-    for line in difference(*kept, names=names):
+        if left is not None:
+            console.print(f"policy {case.policy} {left}")
+        kept.append(verdict.kept(outcome))
+    for line in difference(*kept, names=[*pair]):
         console.print(line)
 
 
@@ -143,13 +177,27 @@ def difference(first: np.ndarray, second: np.ndarray, names: list[str]) -> list[
     both, total = int((first & second).sum()), len(first)
     found = statistics.paired(both, *only, total)
     value, low, high = (100 * v for v in found)
-    word = "no difference is shown" if low <= 0 <= high else f"{names[value < 0]} keeps more"
+    word = f"{names[value < 0]} keeps more"
+    if low <= 0 <= high:
+        word = "no difference is shown"
+        if value:
+            word += f"; about {_needed(*only, total):,} trials at these shares would show one"
     return [
         f"of the same {total} trials {both} were kept by both, {only[0]} by {names[0]} alone, "
         f"{only[1]} by {names[1]} alone, and {total - both - sum(only)} by neither",
         f"difference: {value:+.1f} percentage points ({low:+.1f} to {high:+.1f}, 95 % interval by "
         f"Newcombe; McNemar's exact test: p = {statistics.mcnemar(*only):.2g}): {word}",
     ]
+
+
+def _needed(first: int, second: int, total: int) -> int:
+    """Paired trials whose 95 % interval of the difference would leave out 0 at the same shares.
+
+    By the normal distribution's variance of a difference of paired shares.
+    """
+    one, other = first / total, second / total
+    variance = one + other - (one - other) ** 2
+    return math.ceil(1.96**2 * variance / (one - other) ** 2)
 
 
 def of_test(scene: Scene, result: RunResult) -> Judged:
@@ -171,7 +219,8 @@ def compare(every: Mapping[Path, Compared], console: Console, *, named: bool = F
         groups.setdefault(own, []).append(run)
         name = [folder.as_posix()] if named else []
         rows.append((*name, *own, str(run.settings.seed), *_row(run)))
-    head = ("seed", "converged", "judged by", "kept", "lost", "stuck", "failed", "verdict")
+    head = ("seed", "converged", "judged by", "kept", "lost", "not released", "failed", "verdict")
+    head += ("other conditions",)
     common.print_table(console, _table((*["run"] * named, *differ, *head), rows))
     rows = [(*kind, *_summary(own)) for kind, own in groups.items()]
     if len(groups) > 1:
@@ -181,7 +230,8 @@ def compare(every: Mapping[Path, Compared], console: Console, *, named: bool = F
     if good and len(groups) == 1:
         console.print(f"{good} runs found a good design: {interval} of such runs (95 % interval)")
     if good:
-        console.print(verdicts.RULE)
+        things = {verdicts.objects(run.judged.scene) for run in every.values() if run.judged}
+        console.print(f"{verdict.RULE}; for {', or '.join(sorted(things))}")
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Table:
@@ -229,14 +279,15 @@ def _values(place: Path, run: Compared, path: Path) -> dict[str, object]:
     first = np.unique(np.asarray(run.result.record.state.particles), axis=0, return_index=True)[1]
     found |= {
         "best_test_cost": f"{np.asarray(test.cost).min():.9g}",
-        "kept_trials": verdicts.tally(chosen.outcomes).kept,
+        "kept_trials": verdict.tally(chosen.outcomes).kept,
         "trials": chosen.outcomes.cost.size,
         "paper_successes": int(np.asarray(test.paper_success)[first].sum()),
         "particles": first.size,
         "verdict": (run.fresh or chosen).verdict.word,
+        "other_conditions": (run.fresh or chosen).limits,
     }
     if run.fresh is not None:
-        counts = verdicts.tally(run.fresh.outcomes)._asdict()
+        counts = verdict.tally(run.fresh.outcomes)._asdict()
         found |= {f"fresh_{name}_trials": number for name, number in counts.items()}
         mean = float(cost.particle_cost(run.fresh.scene, run.fresh.outcomes))
         found["fresh_cost"] = f"{mean:.9g}"
@@ -245,15 +296,15 @@ def _values(place: Path, run: Compared, path: Path) -> dict[str, object]:
 
 def _row(run: Compared) -> tuple[str, ...]:
     if run.result is None or run.result.record is None:
-        return ("failed", *[""] * 6)
+        return ("failed", *[""] * 7)
     converged = f"episode {run.converged}" if run.converged else "no"
     judged = run.judged
     if judged is None:
-        return (converged, *[""] * 6)
+        return (converged, *[""] * 7)
     where = "final test" if run.fresh is None else f"{judged.accuracy}"
-    found = verdicts.tally(judged.outcomes)
+    found = verdict.tally(judged.outcomes)
     numbers = f"{found.kept} of {found.total}", *map(str, found[1:])
-    return (converged, where, *numbers, judged.verdict.word)
+    return (converged, where, *numbers, judged.verdict.word, judged.limits)
 
 
 def read(scene: Scene, folder: Path) -> RunResult | None:

@@ -6,17 +6,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import preflight, rollout, runs, types
+from codesign_jax import preflight, rollout, runs, stress, types, verdict
 from codesign_jax.commands import common, forces, reference
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Evaluate
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording
-from codesign_jax.report import stress, verdicts
+from codesign_jax.report import verdicts
 from codesign_jax.runs import choice, tables
 from codesign_jax.runs.choice import Case
 from codesign_jax.runs.progress import Busy, Meter
 from codesign_jax.scene.schema import InputError
+from codesign_jax.stress import Stress
 from codesign_jax.terminal import Console
 
 
@@ -40,19 +41,30 @@ def main(options: Evaluate) -> int:
     if options.dry_run:
         for note in common.policy_notes(engine, case.space.params(case.design)):
             console.print(note)
-        more = f", {stress.sets(case.scene) * options.trials} more" if options.stress else ""
-        console.print(f"grasps: {options.trials}{more}")
+        console.print(_size(case, options))
         return 0
     one = simulate(case, options, console)
-    if options.stress:
-        total = options.trials * stress.sets(case.scene)
-        with Meter("other conditions", total, console) as meter:
-            noise = jax.random.key(options.seed)
-            found = stress.simulate(case, options.trials, noise, done=meter.advance)
-        reference.tell_stress(case, found, console)
+    other = other_conditions(case, options, console) if options.stress else None
+    tell_verdict(case, one, other, options, console)
     if options.render or options.forces or options.pull:
         of_objects(case, engine, options, console)
     return int(types.failed(one.status).all())  # no trial says anything of the design
+
+
+def _size(case: Case, options: Evaluate) -> str:
+    """The number of grasps, in words."""
+    if options.trials is None:
+        text = f"grasps: until the verdict is decided, at most {verdict.MOST}"
+    else:
+        text = f"grasps: {options.trials}"
+    if not options.stress:
+        return text
+    return f"{text}, {_of_each(options) * stress.sets(case.scene)} more"
+
+
+def _of_each(options: Evaluate) -> int:
+    """Grasps under each of the other conditions."""
+    return reference.STRESS_TRIALS if options.trials is None else options.trials
 
 
 def _of_particle(case: Case, options: Evaluate) -> Case:
@@ -80,26 +92,58 @@ def _check(options: Evaluate, engine: str) -> None:
 
 def simulate(case: Case, options: Evaluate, console: Console) -> types.Outcome:
     """Simulates the trials and prints how they ended, by object and in all; outcomes (trial,)."""
-    with Busy(console, f"simulating {common.counted(options.trials, 'grasp')}"):
-        one = case.simulate(options.trials, jax.random.key(options.seed))
+    key, asked = jax.random.key(options.seed), options.trials
+    if asked is None:
+        later = _of_each(options) * stress.sets(case.scene) if options.stress else 0
+        with Meter("trials", verdict.USUAL, console, later=later) as meter:
+            one = reference.decided(case, key, verdict.MOST, meter)
+    else:
+        with Busy(console, f"simulating {common.counted(asked, 'grasp')}"):
+            one = case.simulate(asked, key)
     names = [shape.name for shape in case.scene.objects.object]
-    for k, name in enumerate(names[: options.trials]):
+    for k, name in enumerate(names[: one.cost.size]):
         own = jax.tree.map(lambda v, k=k: v[k :: len(names)], one)
         console.print(f"{name:>12}: {verdicts.of_trials(case.scene, own)}")
     judged = verdicts.Judged(case.scene, one, options.accuracy)
-    lines = [f"{'all':>12}: {judged.details}", *verdicts.solver(one), *verdicts.warnings(judged)]
-    for line in [*lines, f"verdict: {judged}"]:
+    for line in [f"{'all':>12}: {judged.details}", *verdicts.solver(one)]:
         console.print(line)
+    if case.policy:
+        with Busy(console, "asking what the policy commanded"):
+            told = case.observe(verdict.BATCH if asked is None else asked, key)[1]
+        console.print(f"policy {case.policy} {told}")
     if options.out:
-        drawn = rollout.sample_trials(case.scene, jax.random.key(options.seed), options.trials)
+        drawn = rollout.sample_trials(case.scene, key, one.cost.size)
         tables.write_grasps(options.out, case.scene, jax.tree.map(np.asarray, drawn), one)
         console.print(f"table: {options.out}")
     return one
 
 
+def other_conditions(case: Case, options: Evaluate, console: Console) -> Stress:
+    """Simulates the design under other conditions and prints what it keeps."""
+    count = _of_each(options)
+    with Meter("other conditions", count * stress.sets(case.scene), console) as meter:
+        key = jax.random.key(options.seed)
+        found = stress.simulate(case, count, key, meter.advance)
+    reference.tell_stress(case, found, console)
+    return found
+
+
+def tell_verdict(
+    case: Case,
+    one: types.Outcome,
+    other: Stress | None,
+    options: Evaluate,
+    console: Console,
+) -> None:
+    """Prints the verdict of the trials, and what speaks against it."""
+    judged = verdicts.Judged(case.scene, one, options.accuracy, stress=other)
+    for line in [*verdicts.warnings(judged), f"verdict: {judged}"]:
+        console.print(line)
+
+
 def _untried(case: Case, options: Evaluate) -> list[str]:
     names = [shape.name for shape in case.scene.objects.object]
-    left = names[options.trials :]
+    left = [] if options.trials is None else names[options.trials :]
     if not left:
         return []
     return [
@@ -112,7 +156,9 @@ def of_objects(case: Case, engine: Engine, options: Evaluate, console: Console) 
     """Of the first trial of each object: its forces, the pull that ends it, and a drawing."""
     from codesign_jax.report import animation
 
-    scene, count = case.scene, min(options.trials, len(case.scene.objects.object))
+    scene, count = case.scene, len(case.scene.objects.object)
+    if options.trials is not None:
+        count = min(options.trials, count)
     trials = rollout.sample_trials(scene, jax.random.key(options.seed), count)
     params = case.space.params(jnp.asarray(case.design, jnp.float32))
     grasps = []

@@ -171,8 +171,8 @@ class Optimize(Command, SceneFlags):
         _size("test_trials", "Further trials of each particle of the final test; 0: none"),
     ] = None
     reference_trials: Count = None
-    """Fresh trials at accuracy reference of the particle that tested best; default: 24 with engine
-    structured; 0: none."""
+    """Most fresh trials at accuracy reference of the particle that tested best, which go on until
+    they decide its verdict; default: 600 with engine structured; 0: none."""
     seed: int = 0
     """Root of all random numbers."""
     seeds: Text = None
@@ -202,19 +202,21 @@ class Compare(Command, TrialFlags):
     """Compare runs: a row for each, and how many of each kind found a good design.
 
     With --trials the designs of two runs are simulated in the same trials, and their difference
-    comes with its 95 % interval.
+    comes with its 95 % interval; so are two design files, and one design with a policy and without.
     """
 
     folders: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER ...")]
-    """Run folders, or folders of run folders."""
+    """Run folders, or folders of run folders; or one or two design files (.toml)."""
     trials: Count = None
-    """Trials in which the two designs are compared; default: none, only what the runs found."""
+    """Trials in which the two designs are compared; default: none of runs, only what they found,
+    and 150 of design files."""
     seed: int = 0
     """Root of these trials' noise."""
     engine: Text = None
     """Engine that simulates them; default: the runs'."""
     policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="STR ...", help_behavior_hint="")] = ()
-    """MODULE:CLASS of the runs that were made with a policy, to simulate their designs."""
+    """MODULE:CLASS of the runs that were made with a policy, to simulate their designs; with one
+    design alone, the policy that is compared with none."""
     out: File = None
     """Write a table of the runs (.csv, docs/files.md)."""
 
@@ -223,8 +225,9 @@ class Compare(Command, TrialFlags):
 class Evaluate(Command, RunOrDesign):
     """Evaluate one design: costs of each object, how sure they are, an animation if asked for."""
 
-    trials: int = 6
-    """Trials, taking turns between the objects."""
+    trials: Count = None
+    """Trials, taking turns between the objects; default: as many as decide the verdict, at most 600
+    (docs/command_line.md)."""
     seed: int = 0
     """Root of the trials' noise."""
     particle: Count = None
@@ -232,8 +235,8 @@ class Evaluate(Command, RunOrDesign):
     out: File = None
     """Write a table of the trials, with their noise and how they ended (.csv)."""
     stress: Flag = False
-    """Then the same trials with heavier objects, less friction, the other bending law and other
-    constants, and warnings of the design itself (docs/command_line.md); best with --trials 24."""
+    """Then grasps with heavier objects, less friction, the other bending law and other constants,
+    12 of each or --trials, and warnings of the design itself (docs/command_line.md)."""
     forces: File = None
     """Write contact forces and depths of the first trial of each object, a row for each time step
     (.csv, docs/files.md), and say how hard the fingers grip."""
@@ -305,16 +308,19 @@ class Export(Command, RunOrDesign):
 
 @dataclasses.dataclass
 class Landscape(Command, RunOrDesign):
-    """Draw the mean cost over a grid of two parameters: a figure, a table and arrays.
+    """Draw the mean cost over a grid of two numbers: a figure, a table and arrays.
 
-    With --run the files go to the run folder, and its report shows them.
+    The numbers are parameters of the design, or any of the scene by their key paths. With --run and
+    two parameters the files go to the run folder, and its report shows them.
     """
 
     parameters: Annotated[
-        tuple[str, ...], tyro.conf.arg(metavar="NAME NAME", help_behavior_hint="")
+        tuple[str, ...], tyro.conf.arg(metavar="NAME KEY=LOW:HIGH", help_behavior_hint="")
     ] = ()
-    """The two parameters; default: those of a design space of two. The others stay as they are in
-    the design."""
+    """The two parameters, such as length arm_z=20:60 (in the hand file's units), or keys with their
+    ranges, such as objects.object.friction=0.2:1 objects.object.mass=0.05:0.5, which without an
+    entry's name mean all of a list; default: those of a design space of two. The rest stays as it
+    is."""
     points: int = 20
     """Points along each parameter's range, its ends included."""
     trials: int = 6

@@ -1,45 +1,51 @@
 """`codesign landscape`."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import batch, codesign, files, preflight, runs
+from codesign_jax import batch, codesign, files, preflight, rollout, runs, verdict
 from codesign_jax.codesign import Task
-from codesign_jax.commands import common
+from codesign_jax.commands import common, grid
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Landscape as Options
+from codesign_jax.commands.grid import Axis
 from codesign_jax.cost import particle_cost
+from codesign_jax.engines import Engine
 from codesign_jax.report import landscape
 from codesign_jax.report.landscape import Landscape
+from codesign_jax.reuse import Program, shared
 from codesign_jax.runs.choice import Case
 from codesign_jax.runs.progress import Meter
-from codesign_jax.scene import schema
-from codesign_jax.scene.schema import InputError
+from codesign_jax.scene import Scene
+from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.terminal import Console
-from codesign_jax.types import Outcome, failed
+from codesign_jax.types import Outcome, Trial, failed
 
 
 class Plane(NamedTuple):
-    """Designs over a grid of two parameters."""
+    """Designs and scenes over a grid."""
 
-    columns: tuple[int, int]  # indices of the two parameters, shape (2,)
-    axes: tuple[np.ndarray, np.ndarray]  # their values [SI units], shapes (n,) and (m,)
-    # The designs [SI units], shape (n * m, parameter), the first parameter slowest
+    axes: tuple[Axis, Axis]
+    # The designs [SI units], shape (n * m, parameter), the first axis slowest
     designs: np.ndarray
+    # Numbers of each one's scene, shape (n * m, leaf); None if all have the same
+    numbers: np.ndarray | None
 
 
 def main(options: Options) -> int:
     common.use_compilation_cache()
     case = find_case(options)
     _check(options, case)
-    folder = _folder(options, case)
-    made = make_plane(case, _columns(case, options.parameters), options.points)
+    pair = grid.axes(case, options)
+    folder = _folder(options, case, pair)
+    made = make_plane(case, pair)
     console = Console()
-    others = [k for k in range(case.space.num_parameters) if k not in made.columns]
-    if others:
+    if case.space.num_parameters > sum(axis.column is not None for axis in pair):
         console.print(*runs.describe(case.space, case.design, "around").split("\n"), sep="\n")
     for note in preflight.notes(case.scene, case.space, {"the design": case.design}):
         console.print(note)
@@ -48,17 +54,18 @@ def main(options: Options) -> int:
     console.print(f"grasps: {len(made.designs) * options.trials} in {count}")
     if options.dry_run:
         return 0
-    simulated = simulated_designs(case, made.designs, size, options, console)
+    simulated = simulated_designs(case, made, size, options, console)
     found = summarize(case, made, simulated, options.seed)
     print_summary(case, found, console)
     write_files(found, folder, console)
     return 0
 
 
-def _folder(options: Options, case: Case) -> Path:
+def _folder(options: Options, case: Case, pair: tuple[Axis, Axis]) -> Path:
     own = options.run_folder
     folder = Path("landscape")
-    if own is not None and case.scene == runs.read_run(own)[0]:
+    of_designs = all(axis.column is not None for axis in pair)
+    if own is not None and of_designs and case.scene == runs.read_run(own)[0]:
         folder = own
     if options.out is not None:
         folder = options.out
@@ -75,58 +82,84 @@ def _check(options: Options, case: Case) -> None:
     common.refuse(problems + common.engine_problems(case.engine, options.overrides))
 
 
-def _columns(case: Case, names: tuple[str, ...]) -> tuple[int, int]:
-    known = case.space.names
-    chosen = names or (known if len(known) == 2 else ())
-    unknown = [name for name in chosen if name not in known]
-    common.refuse(
-        [f"--parameters {name!r} is not a parameter; {_meant(name, known)}" for name in unknown]
-    )
-    if len(set(chosen)) != 2 or len(chosen) != 2:
-        raise InputError([f"--parameters must name two of {', '.join(known)}"])
-    return known.index(chosen[0]), known.index(chosen[1])
-
-
-def _meant(name: str, known: tuple[str, ...]) -> str:
-    fingers = [n for n in known if n.split("[")[0] == name]
-    if fingers:
-        return f"there is one for each finger: {fingers[0]} to {fingers[-1]}"
-    return schema.nearest(name, known)
-
-
-def make_plane(case: Case, columns: tuple[int, int], points: int) -> Plane:
-    """A regular grid over the ranges of two parameters, ends included.
+def make_plane(case: Case, pair: tuple[Axis, Axis]) -> Plane:
+    """A regular grid over two axes, ends included.
 
     Pressures are lowered under the limit that the walls set, as of every particle.
     """
     space = case.space
-    axes = [np.linspace(space.low[k], space.high[k], points) for k in columns]
-    first, second = np.meshgrid(*axes, indexing="ij")
-    designs = np.tile(np.asarray(case.design, np.float32), (first.size, 1))
-    designs[:, columns[0]], designs[:, columns[1]] = first.ravel(), second.ravel()
+    values = np.meshgrid(*(axis.values for axis in pair), indexing="ij")
+    designs = np.tile(np.asarray(case.design, np.float32), (values[0].size, 1))
+    for axis, own in zip(pair, values, strict=True):
+        if axis.column is not None:
+            designs[:, axis.column] = own.ravel() * space.scale[axis.column]
     projected = jax.jit(jax.vmap(space.project))(designs)
-    return Plane(columns, (axes[0], axes[1]), np.asarray(projected))
+    return Plane(pair, np.asarray(projected), grid.numbers(case.scene, pair))
 
 
 def simulated_designs(
-    case: Case, designs: np.ndarray, size: int, options: Options, console: Console
+    case: Case, made: Plane, size: int, options: Options, console: Console
 ) -> Outcome:
-    task = Task(case.scene, case.space, options.trials, case.make_engine())
-    with Meter("landscape", len(designs) * options.trials, console) as meter:
-        return batch.evaluate(task, jax.random.key(options.seed), designs, size, meter.advance)
+    """Outcomes, arrays of shape (point, trial); all points meet trials of the same key."""
+    key, count = jax.random.key(options.seed), options.trials
+    with Meter("landscape", len(made.designs) * count, console) as meter:
+        if made.numbers is None:
+            task = Task(case.scene, case.space, count, case.make_engine())
+            return batch.evaluate(task, key, made.designs, size, meter.advance)
+        return _in_scenes(case, made.designs, made.numbers, (key, count), size, meter.advance)
+
+
+def _in_scenes(
+    case: Case,
+    designs: np.ndarray,
+    numbers: np.ndarray,
+    noise: tuple[jax.Array, int],
+    size: int,
+    advance: Callable[[int], None],
+) -> Outcome:
+    """As `simulated_designs`, each point in its own scene; one program for all of them."""
+    key, count = noise
+    base, tree = jax.tree.flatten(case.scene)
+    varied = (numbers != numbers[0]).any(0)
+    run = Program(case.scene, _worlds(case.make_engine(), case.space, count))
+
+    def scene_of(rows: np.ndarray | int) -> Scene:
+        own = [numbers[rows, k] if varied[k] else value for k, value in enumerate(base)]
+        return jax.tree.unflatten(tree, own)
+
+    def call(rows: np.ndarray, device: Any) -> Outcome:
+        drawn = [rollout.sample_trials(scene_of(row), key, count) for row in rows]
+        trials = jax.tree.map(lambda *v: jnp.concatenate(v), *drawn)
+        every = np.repeat(rows, count)
+        own = jnp.asarray(designs[every], jnp.float32)
+        return rollout.grid(run(own, trials, scene_of(every)), (len(rows), count))
+
+    found = []
+    for outcome in batch.in_chunks(call, len(designs), size):
+        found.append(outcome)
+        advance(outcome.cost.size)
+    return jax.tree.map(lambda *v: np.concatenate(v), *found)
+
+
+@shared
+def _worlds(engine: Engine, space: DesignSpace, num_trials: int) -> Callable:
+    def simulated(designs: jax.Array, trials: Trial, scene: Scene) -> Outcome:
+        assert designs.shape[0] % num_trials == 0
+        return rollout.simulate(scene, engine, jax.vmap(space.params)(designs), trials)[0]
+
+    return simulated
 
 
 def summarize(case: Case, made: Plane, found: Outcome, seed: int) -> Landscape:
     """The landscape of a grid's outcomes, arrays of shape (design, trial), in trials of a seed."""
-    space, shape = case.space, tuple(len(axis) for axis in made.axes)
+    shape = tuple(len(axis.values) for axis in made.axes)
     counted = ~failed(found.status)
-    kept = codesign.verdicts(found) == codesign.VERDICTS.index("kept")
-    scale = np.asarray(space.scale)[[*made.columns]]
+    kept = verdict.kept(found)
     return Landscape(
-        names=np.array([space.names[k] for k in made.columns]),
-        units=np.array([space.units[k] for k in made.columns]),
-        first=made.axes[0] / scale[0],
-        second=made.axes[1] / scale[1],
+        names=np.array([axis.name for axis in made.axes]),
+        units=np.array([axis.unit for axis in made.axes]),
+        first=made.axes[0].values,
+        second=made.axes[1].values,
         cost=np.asarray(particle_cost(case.scene, found)).reshape(shape),
         kept=kept.sum(1).reshape(shape),
         counted=counted.sum(1).reshape(shape),
@@ -141,7 +174,7 @@ def print_summary(case: Case, found: Landscape, console: Console) -> None:
     i, j = np.unravel_index(int(found.cost.argmin()), found.cost.shape)
     good = int((found.cost < codesign.SUCCESS_COST).sum())
     place = " ".join(
-        f"{name}={value:.4g} {unit}"
+        f"{name}={value:.4g} {unit}".rstrip()
         for name, value, unit in zip(
             found.names, (found.first[i], found.second[j]), found.units, strict=True
         )
@@ -149,6 +182,11 @@ def print_summary(case: Case, found: Landscape, console: Console) -> None:
     console.print(
         f"{good} of {found.cost.size} points have a mean cost below {codesign.SUCCESS_COST}; "
         f"lowest: {found.cost[i, j]:.4f} at {place}"
+    )
+    best = float((found.kept / found.trials).max())
+    console.print(
+        f"kept: {found.kept.sum()} of {found.kept.size * int(found.trials)}; most of a "
+        f"point: {100 * best:.0f} %"
     )
     bad = int((int(found.trials) - found.counted).sum())
     if bad:

@@ -13,11 +13,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from codesign_jax import codesign, engines, files, optimize, preflight, runs
+from codesign_jax import codesign, engines, files, optimize, preflight, runs, stress, verdict
 from codesign_jax.commands import common, compare, hosts, reference, status
 from codesign_jax.commands.flags import Optimize
 from codesign_jax.own import is_own, make_policy
-from codesign_jax.report import stress, verdicts
+from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import Plan, RunResult, Settings, columns
 from codesign_jax.runs.progress import Busy
@@ -55,9 +55,8 @@ def main(options: Optimize) -> int:
         _dry_run(plan, len(every), options)
         return 0
     devices, chunk = options.devices, options.chunk
-    trials = reference.number_of_trials(options.reference_trials, settings)
-    after = trials * reference.steps_and_links(scene)
-    after += reference.STRESS_TRIALS * stress.sets(scene) if trials else 0
+    most = reference.most_trials(options.reference_trials, settings)
+    after = _after(scene, most)
     how = {"fresh": options.fresh, "after": after, "devices": devices, "chunk": chunk}
     found = runs.optimize(plans, sys.argv, **how)
     results: dict[Path, RunResult | None] = {}
@@ -69,11 +68,12 @@ def main(options: Optimize) -> int:
     if found.signum:
         return 128 + found.signum
     console = Console()
-    for folder, result in results.items():
-        if result is not None and result.record is not None:
-            if called:
-                console.print(f"{called[folder]}:")
-            _tell(plans[folder], result, folder, trials, console)
+    left = [f for f, result in results.items() if result is not None and result.record is not None]
+    while left:
+        folder = left.pop(0)
+        if called:
+            console.print(f"{called[folder]}:")
+        _tell(plans[folder], results[folder], folder, (most, len(left) * after), console)
     failed = int(None in results.values())
     return (_compare(options) if called else 0) or failed
 
@@ -112,17 +112,32 @@ def _compare(options: Optimize) -> int:
     return int(any(run.result is None for run in found.values()))
 
 
-def _tell(plan: Plan, result: RunResult, folder: Path, trials: int, console: Console) -> None:
+def _after(scene: Scene, most: int) -> float:
+    """What a run simulates once it has ended, in grasps of its accuracy."""
+    if not most:
+        return 0.0
+    fresh = min(most, verdict.USUAL) * reference.steps_and_links(scene)
+    return fresh + reference.STRESS_TRIALS * stress.sets(scene)
+
+
+def _tell(
+    plan: Plan, result: RunResult | None, folder: Path, work: tuple[int, float], console: Console
+) -> None:
+    """Tells how a run ended, with its verdict; `work`: most fresh grasps, and grasps after it."""
+    assert result is not None and result.record is not None
     _summarize(plan, result, console)
-    fresh = None
-    if trials and result.test is not None:
-        found = reference.test(folder, plan.settings, trials, console)
-        fresh = reference.judged(plan.scene, found)
-    if result.test is not None:
-        _judge(plan, result, fresh, folder, console)
-    if fresh is not None:
-        reference.stress_run(folder, plan.settings, console)
-    assert result.record is not None
+    most, later = work
+    if result.test is None:
+        pass
+    elif not most:
+        _judge(plan, result, None, folder, console)
+    else:
+        slower, others = reference.steps_and_links(plan.scene), stress.sets(plan.scene)
+        coming = (later + reference.STRESS_TRIALS * others) / slower
+        found = reference.test(folder, plan.settings, most, console, coming)
+        case, other = reference.stress_run(folder, plan.settings, console, later)
+        reference.tell_stress(case, other, console)
+        _judge(plan, result, reference.judged(plan.scene, found, other), folder, console)
     path = folder / "figures" / "cost_evolution.png"
     with Busy(console, "drawing"), files.naming(path):
         from codesign_jax.report import figures
@@ -168,8 +183,9 @@ def _dry_run(plan: Plan, count: int, options: Optimize) -> None:
     row = 40 + 12 * plan.space.num_parameters
     rows = settings.episodes * settings.particles * (settings.trials + 1)
     say(f"disk: about {3 * rows * row / 1e6:.1f} MB")
-    if trials := reference.number_of_trials(options.reference_trials, settings):
-        say(f"reference test: {trials} grasps at accuracy {reference.ACCURACY}")
+    if most := reference.most_trials(options.reference_trials, settings):
+        usual = f"until the verdict is decided, about {verdict.USUAL} for a good design"
+        say(f"reference test: at most {most} grasps at accuracy {reference.ACCURACY}, {usual}")
         say(f"other conditions: {reference.STRESS_TRIALS * stress.sets(scene)} grasps")
     say("time: `codesign check` measures it on this machine")
 
@@ -207,10 +223,10 @@ def _judge(
         lines = [f"{chosen} by these very trials, which flatters it: {test.details}"]
     else:
         lines = [
-            f"{chosen}, by a test that flatters it: {verdicts.tally(test.outcomes)}",
+            f"{chosen}, by a test that flatters it: {verdict.tally(test.outcomes)}",
             f"its fresh grasps: {fresh.details}",
         ]
-    flags = ["--run", str(folder), "--trials", "150", "--accuracy", reference.ACCURACY]
+    flags = ["--run", str(folder), "--accuracy", reference.ACCURACY]
     again = shlex.join(["codesign", "evaluate", *flags])
     judged = test if fresh is None else fresh
     last = [f"verdict: {judged}", f"more fresh trials: {again}"]

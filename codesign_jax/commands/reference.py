@@ -3,9 +3,11 @@
 An optimiser picks what the errors of its simulation favour (the winner's curse), and the best of
 several final particles was chosen by the very trials that tested it.  So it is simulated again, in
 trials that the run has not met and with finer steps (accuracy `reference`; docs/results.md has how
-much that changes), and at the run's accuracy under other conditions (`report.stress`).
+much that changes), until its verdict is decided, and at the run's accuracy under other conditions
+(`stress`).
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,22 +15,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import codesign, engines, rollout, store
-from codesign_jax.commands.common import counted
-from codesign_jax.report import stress
-from codesign_jax.report.stress import Stress
+from codesign_jax import codesign, engines, rollout, store, stress, verdict
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import Settings, columns, tables
 from codesign_jax.runs.choice import Case, case_of_run
-from codesign_jax.runs.progress import Busy, Meter
+from codesign_jax.runs.progress import Meter
 from codesign_jax.scene import Scene, with_accuracy
+from codesign_jax.stress import Stress
 from codesign_jax.terminal import Console
 from codesign_jax.types import Outcome
 
 ACCURACY = "reference"
 FILE, STRESS_FILE = "reference.npz", "stress.npz"
-TRIALS = 24
-"""Fresh trials by default: without a loss in them, 86 to 100 % of grasps hold (95 % interval)."""
 STRESS_TRIALS = 12
 """Grasps of each condition."""
 _OUTCOME = ("cost", "status", "lost_time", "bad_step")
@@ -42,32 +40,88 @@ STREAM_REFERENCE = 0x72656665
 """Stream of the fresh trials' noise ("refe")."""
 
 
-def number_of_trials(asked: int | None, settings: Settings) -> int:
-    """Fresh trials of a run: those asked for, or `TRIALS` with the engine that is fast."""
+def most_trials(asked: int | None, settings: Settings) -> int:
+    """Most fresh trials of a run: as asked for, or `MOST` with the engine that is fast."""
     if asked is not None:
         return asked
-    return TRIALS if settings.engine == engines.DEFAULT and settings.test_trials else 0
+    return verdict.MOST if settings.engine == engines.DEFAULT and settings.test_trials else 0
 
 
-def test(folder: Path, settings: Settings, trials: int, console: Console) -> Outcome:
-    """Outcomes of the run's design in fresh trials at `reference`, simulated if not yet."""
-    found, why = stored(folder, settings)
-    if found is not None and found.cost.size == trials:
-        return found
+def test(
+    folder: Path, settings: Settings, most: int, console: Console, later: float = 0.0
+) -> Outcome:
+    """Outcomes of the run's design in fresh trials at `reference`, as many as decide its verdict.
+
+    Every batch is kept, so that the test goes on where it was stopped, or with a larger `most`.
+
+    Args:
+      most: Most trials; at least 1.
+      later: What is simulated after it, for the time left, in grasps of this accuracy.
+    """
+    case, key = _finer(folder, settings), _noise(settings, STREAM_REFERENCE)
+    about = case.digest(settings.seed)
+    kept, why = _outcomes(folder, about)
     if why:
         console.print(f"{folder / FILE} {why}: simulated again")
-    case, key = _finer(folder, settings), _noise(settings, STREAM_REFERENCE)
-    with Busy(console, f"reference test, {counted(trials, 'grasp')}"):
-        found = case.simulate(trials, key)
-        store.keep(folder / FILE, case.digest(settings.seed), found._asdict())
-        drawn = rollout.sample_trials(case.scene, key, trials)
+    with Meter("reference test", min(verdict.USUAL, most), console, later=later) as meter:
+
+        def keep(found: Outcome) -> None:
+            store.keep(folder / FILE, about, found._asdict())
+
+        found = decided(case, key, most, meter, kept, keep)
+    if kept is None or found.cost.size > kept.cost.size:
+        drawn = rollout.sample_trials(case.scene, key, found.cost.size)
         tables.write_grasps(folder / columns.REFERENCE, case.scene, drawn, found)
     return found
 
 
-def judged(scene: Scene, found: Outcome) -> Judged:
-    """Outcomes of the test with the scene that was simulated."""
-    return Judged(with_accuracy(scene, ACCURACY), found, ACCURACY)
+def decided(
+    case: Case,
+    key: jax.Array,
+    most: int,
+    meter: Meter,
+    previous: Outcome | None = None,
+    keep: Callable[[Outcome], None] = lambda found: None,
+) -> Outcome:
+    """Outcomes of as many trials as decide whether a design is good, see `verdict.sequential`.
+
+    Args:
+      case: The design.
+      key: Key of the trials.
+      most: Most trials; at least 1.
+      meter: Counts the grasps, and estimates how many there are to come.
+      previous: Outcomes of the first trials, which are known.
+      keep: Is called with all outcomes so far after each batch.
+    """
+
+    def simulate(first: int, count: int) -> Outcome:
+        return case.simulate(count, key, first)
+
+    found = previous
+    if previous is not None:
+        meter.found(previous.cost.size)
+    for found in verdict.sequential(simulate, most, previous):
+        keep(found)
+        ends = verdict.tally(found)
+        meter.total = min(most, ends.total + verdict.judge(ends.kept, ends.total).more)
+        meter.advance(ends.total - meter.done)
+    assert found is not None
+    return found
+
+
+def _outcomes(folder: Path, about: str, *, any_code: bool = False) -> tuple[Outcome | None, str]:
+    arrays, why = store.found(folder / FILE, about, any_code=any_code)
+    if arrays is None:
+        return None, why
+    shapes = {v.shape if v.dtype.kind in "biuf" else () for v in arrays.values()}
+    if not {*_OUTCOME} <= {*arrays} <= {*Outcome._fields} or {len(s) for s in shapes} != {1}:
+        return None, _NO_RESULT
+    return (Outcome(**arrays), why) if len(shapes) == 1 else (None, _NO_RESULT)
+
+
+def judged(scene: Scene, found: Outcome, other: Stress | None = None) -> Judged:
+    """Outcomes of the test with the scene that was simulated, and those of other conditions."""
+    return Judged(with_accuracy(scene, ACCURACY), found, ACCURACY, stress=other)
 
 
 def steps_and_links(scene: Scene) -> float:
@@ -78,14 +132,11 @@ def steps_and_links(scene: Scene) -> float:
 
 
 def stored(folder: Path, settings: Settings) -> tuple[Outcome | None, str]:
-    """Outcomes that `test` kept of the run's design; or None and why, see `store.found`."""
-    arrays, why = store.found(folder / FILE, _finer(folder, settings).digest(settings.seed))
-    if arrays is None:
-        return None, why
-    shapes = {v.shape if v.dtype.kind in "biuf" else () for v in arrays.values()}
-    if not {*_OUTCOME} <= {*arrays} <= {*Outcome._fields} or {len(s) for s in shapes} != {1}:
-        return None, _NO_RESULT
-    return (Outcome(**arrays), "") if len(shapes) == 1 else (None, _NO_RESULT)
+    """Outcomes that `test` kept of the run's design, or None; and what is amiss with them.
+
+    To be shown: those of another version of the code are among them.
+    """
+    return _outcomes(folder, _finer(folder, settings).digest(settings.seed), any_code=True)
 
 
 def tell_stress(case: Case, found: Stress, console: Console) -> None:
@@ -100,24 +151,34 @@ def tell_stress(case: Case, found: Stress, console: Console) -> None:
         console.print(line)
 
 
-def stress_run(folder: Path, settings: Settings, console: Console) -> None:
-    """Tells what the run's design keeps under other conditions, simulated if not yet."""
+def stress_run(
+    folder: Path, settings: Settings, console: Console, later: float = 0.0
+) -> tuple[Case, Stress]:
+    """The run's design, and what it keeps under other conditions, simulated if not yet.
+
+    Args:
+      later: What is simulated after it, for the time left, in grasps of the run's accuracy.
+    """
     case, about = _stress_case(folder, settings)
-    found, why = stored_stress(folder, settings)
+    found, why = _stress(folder, about)
     if why:
         console.print(f"{folder / STRESS_FILE} {why}: simulated again")
     if found is None:
         total = STRESS_TRIALS * stress.sets(case.scene)
-        with Meter("stress", total, console) as meter:
+        with Meter("other conditions", total, console, later=later) as meter:
             noise = _noise(settings, stress.STREAM)
             found = stress.simulate(case, STRESS_TRIALS, noise, done=meter.advance)
         store.keep(folder / STRESS_FILE, about, found._asdict())
-    tell_stress(case, found, console)
+    return case, found
 
 
 def stored_stress(folder: Path, settings: Settings) -> tuple[Stress | None, str]:
-    """What `stress_run` kept of the run's design; or None and why, see `store.found`."""
-    arrays, why = store.found(folder / STRESS_FILE, _stress_case(folder, settings)[1])
+    """What `stress_run` kept of the run's design, or None; and what is amiss, as of `stored`."""
+    return _stress(folder, _stress_case(folder, settings)[1], any_code=True)
+
+
+def _stress(folder: Path, about: str, *, any_code: bool = False) -> tuple[Stress | None, str]:
+    arrays, why = store.found(folder / STRESS_FILE, about, any_code=any_code)
     if arrays is None:
         return None, why
     try:
@@ -128,7 +189,7 @@ def stored_stress(folder: Path, settings: Settings) -> tuple[Stress | None, str]
     whole = found.kept.shape == (len(found.conditions),) and found.trials > 0
     if not whole or not ((0 <= found.kept) & (found.kept <= found.trials)).all():
         return None, _NO_RESULT
-    return found, ""
+    return found, why
 
 
 class Kept(NamedTuple):
@@ -136,7 +197,7 @@ class Kept(NamedTuple):
 
     fresh: Judged | None
     stress: Stress | None
-    notes: list[str]  # what is left out, and why
+    notes: list[str]  # what is left out or of another version of the code, and why
 
 
 def kept(folder: Path, scene: Scene, settings: Settings) -> Kept:
@@ -146,13 +207,16 @@ def kept(folder: Path, scene: Scene, settings: Settings) -> Kept:
     gone = (outcome is None) != (conditions is None)  # a run that ended has both, or neither
     reasons = {FILE: why, STRESS_FILE: cause}
     lacking = {FILE: outcome is None, STRESS_FILE: conditions is None}
-    notes = [
-        f"{folder / name} {reasons[name] or 'is missing'}: {_LEFT_OUT[name]} left out. The "
-        "command of codesign optimize that made the run simulates them again"
-        for name in reasons
-        if lacking[name] and (reasons[name] or gone)
-    ]
-    return Kept(None if outcome is None else judged(scene, outcome), conditions, notes)
+    again = "The command of codesign optimize that made the run simulates them again"
+    notes = []
+    for name, reason in reasons.items():
+        if lacking[name] and (reason or gone):
+            text = f"{folder / name} {reason or 'is missing'}: {_LEFT_OUT[name]} left out"
+            notes.append(f"{text}. {again}")
+        elif reason:
+            notes.append(f"{folder / name} {reason}. {again}")
+    fresh = None if outcome is None else judged(scene, outcome, conditions)
+    return Kept(fresh, conditions, notes)
 
 
 def _stress_case(folder: Path, settings: Settings) -> tuple[Case, str]:

@@ -7,16 +7,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from codesign_jax import terminal
+from codesign_jax import stress, terminal
 from codesign_jax.export import pose, valves
 from codesign_jax.export.process import Size
 from codesign_jax.export.tolerance import NEAREST, WANTED, Side, Tolerance
 from codesign_jax.model import morphology
 from codesign_jax.model.layout import mounts
-from codesign_jax.report import stress
-from codesign_jax.report.statistics import Interval
-from codesign_jax.report.stress import Stress
 from codesign_jax.scene import Scene
+from codesign_jax.statistics import Interval
+from codesign_jax.stress import Stress
 from codesign_jax.types import Params
 
 NAME = "build_sheet"

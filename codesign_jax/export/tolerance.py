@@ -12,13 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codesign_jax.codesign import VERDICTS, verdicts
+from codesign_jax import statistics, verdict
 from codesign_jax.model import morphology
-from codesign_jax.report import statistics
-from codesign_jax.report.statistics import Interval
 from codesign_jax.scene import Scene
 from codesign_jax.scene.hand import UNITS
-from codesign_jax.scene.parameters import DesignSpace, design_space
+from codesign_jax.scene.parameters import DesignSpace, design_space, fingers_of
+from codesign_jax.statistics import Interval
 from codesign_jax.types import Outcome
 
 WANTED = 0.9
@@ -117,8 +116,8 @@ def _limits(
     caps = morphology.pressure_limits(whole.hand, params)
     floors = np.asarray(params.pressure) / limit.per_wall
     for i, name in enumerate(whole.names):
-        row, _, index = name.partition("[")
-        fingers = slice(int(index[:-1]), int(index[:-1]) + 1) if index else slice(None)
+        row = name.partition("[")[0]
+        fingers = fingers_of(name) or slice(None)
         if row == "pressure":
             high[i] = min(high[i], caps[fingers].min())
         if row in ("wall", "tip_wall"):
@@ -131,7 +130,7 @@ def shares(outcomes: Outcome) -> list[Interval]:
 
     A success keeps the object and lets go of it; a trial that failed, for whatever reason, is none.
     """
-    kept = verdicts(outcomes) == VERDICTS.index("kept")
+    kept = verdict.kept(outcomes)
     return [statistics.wilson(int(n), kept.shape[1]) for n in kept.sum(1)]
 
 

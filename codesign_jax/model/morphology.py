@@ -24,6 +24,7 @@ __all__ = [
     "Section",
     "Segments",
     "at_joints",
+    "chamber_volumes",
     "beam",
     "finger_beams",
     "free_bends",
@@ -37,6 +38,24 @@ __all__ = [
     "threshold_moments",
     "thresholds",
 ]
+
+
+def chamber_volumes(hand: Hand, params: Params) -> Any:
+    """Air in the unloaded chambers, from base to tip [m^3], shape (..., finger).
+
+    Args:
+      hand: The hand.
+      params: Parameters, arrays of shape (..., finger).
+    """
+    base = params.height, params.wall, hand.section.width
+    tip = base if params.tip is None else params.tip
+    middle = tuple((a + b) / 2 for a, b in zip(base, tip, strict=True))
+
+    def area(height: Any, wall: Any, width: Any) -> Any:
+        return (height - 2 * wall) * (width - 2 * wall)
+
+    # Simpson's rule is exact: along a tapered finger the area is quadratic in the place.
+    return params.length * (area(*base) + 4 * area(*middle) + area(*tip)) / 6
 
 
 def pressure_limits(hand: Hand, params: Params) -> np.ndarray:

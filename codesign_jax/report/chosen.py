@@ -3,11 +3,12 @@
 import jax
 import numpy as np
 
-from codesign_jax.report import markup, stress, verdicts
+from codesign_jax import stress, verdict
+from codesign_jax.report import markup, verdicts
 from codesign_jax.report.of_run import Run
-from codesign_jax.report.statistics import wilson
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import tables
+from codesign_jax.statistics import wilson
 
 
 def design(run: Run) -> str:
@@ -18,10 +19,10 @@ def design(run: Run) -> str:
         f"Particle {chosen.particle}, chosen as the best by {source}, which flatters it: "
         f"{verdicts.of_trials(run.scene, chosen.outcomes)}. "
     )
-    again = ["evaluate", "--run", str(run.folder), "--trials", "150", "--accuracy", "reference"]
+    again = ["evaluate", "--run", str(run.folder), "--accuracy", "reference"]
     parts = [
         markup.paragraph(f"Verdict: {judged}", "key"),
-        markup.paragraph(f"{judged.details}. Rule: {verdicts.RULE}."),
+        markup.paragraph(f"{judged.details}. Rule: {verdict.RULE}."),
         *(markup.paragraph(words, "warning") for words in verdicts.warnings(judged)),
         *(markup.paragraph(words, "note") for words in verdicts.solver(judged.outcomes)),
         markup.paragraph(note + "More fresh trials: ", "note", again),
@@ -52,11 +53,11 @@ def _by_object(run: Run, judged: Judged) -> str:
         own = turns % len(names) == k
         if own.any():
             mine = jax.tree.map(lambda v, own=own: np.asarray(v)[own], judged.outcomes)
-            found = verdicts.tally(mine)
+            found = verdict.tally(mine)
             share = wilson(found.kept, found.total)
             span = f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
             rows.append((name, f"{found.kept} of {found.total}", span, *found[1:]))
-    head = ("object", "kept", "95 % interval of all", "lost", "stuck", "failed otherwise")
+    head = ("object", "kept", "95 % interval of all", "lost", "not released", "failed otherwise")
     return markup.table(head, rows, (1, 2, 3, 4, 5))
 
 

@@ -34,7 +34,7 @@ def save(found: Landscape, folder: Path) -> list[Path]:
     npz, table = folder / FILE, folder / TABLE
     store.save(npz, found._asdict())
     axes = [
-        f"{n}_{u}".replace("[", "_").replace("]", "")
+        f"{n}_{u}".rstrip("_").replace("[", "_").replace("]", "")
         for n, u in zip(found.names, found.units, strict=True)
     ]
 

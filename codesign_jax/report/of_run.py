@@ -5,13 +5,13 @@ from typing import Any, NamedTuple
 
 import jax
 
-from codesign_jax.report.stress import Stress
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import Settings
 from codesign_jax.runs.choice import Chosen
 from codesign_jax.runs.record import History, Record
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
+from codesign_jax.stress import Stress
 
 
 class Run(NamedTuple):
@@ -32,7 +32,7 @@ class Run(NamedTuple):
     def judged(self) -> Judged:
         """The trials that judge the design: the fresh ones, or else those that chose it."""
         own = "grasps of " + ("its final test" if self.chosen.tested else "its last episode")
-        return self.reference or Judged(self.scene, self.chosen.outcomes, grasps=own)
+        return self.reference or Judged(self.scene, self.chosen.outcomes, None, own, self.stress)
 
     @property
     def space(self) -> DesignSpace:

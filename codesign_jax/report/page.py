@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from codesign_jax import codesign, files, types
+from codesign_jax import codesign, files, types, verdict
 from codesign_jax.report import chosen, figures, landscape, markup, verdicts, viewer
 from codesign_jax.report.of_run import Run
 from codesign_jax.report.replay import Replay
@@ -83,7 +83,7 @@ def _solved(run: Run) -> str:
         return "not tested"
     test = run.record.test
     first = np.unique(np.asarray(run.record.state.particles), axis=0, return_index=True)[1]
-    good = verdicts.good(jax.tree.map(lambda v: np.asarray(v)[first], test))
+    good = verdict.good(jax.tree.map(lambda v: np.asarray(v)[first], test))
     trials = f"{test.cost.shape[1]} trials of the final test"
     return f"{good.sum()} of {good.size} are good in {trials}; copies count once"
 

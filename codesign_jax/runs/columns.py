@@ -45,7 +45,7 @@ GRASPS = {
     "noise_friction_factor": ("float32", "", "factor on the friction of all contacts"),
     "noise_stiffness_factor": ("float32", "", "factor on the fingers' shear modulus"),
     "noise_hand_mass_factor": ("float32", "", "factor on the masses of fingers and palm"),
-    "verdict": ("name", "", "kept, lost, stuck (the hand did not let go), or failed otherwise"),
+    "verdict": ("name", "", "kept, lost, not_released (the hand did not let go), or failed"),
     "cost": ("float32", "", "0 if kept, cost.maximum if lost as the lift begins or failed"),
     "lost_time_s": ("float32", "s", "when the object was lost; inf if it was kept"),
     "status": ("name", "", "OK, or the bits of codesign_jax.types.Status joined by +"),
@@ -55,6 +55,8 @@ GRASPS = {
 }
 """Columns of the Parquet file of `codesign sample`: type, unit and meaning, by name; those of the
 design follow."""
+OF_DESIGNS = {"chamber_volume_cm3": ("float32", "cm^3", "air in all unloaded chambers")}
+"""Columns of that file that follow the design's."""
 MAY_BE_EMPTY = ("first_bad_step", "steps_at_limit", "residual")
 """Those of `GRASPS` whose values may be missing."""
 
@@ -64,7 +66,8 @@ MORE = {
         (
             *("seed", "schedule", "first", "finished", "converged_episode", "best_test_cost"),
             *("kept_trials", "trials", "paper_successes", "particles", "verdict"),
-            *("fresh_kept_trials", "fresh_lost_trials", "fresh_stuck_trials"),
+            "other_conditions",
+            *("fresh_kept_trials", "fresh_lost_trials", "fresh_not_released_trials"),
             *("fresh_failed_trials", "fresh_cost", "run"),
         )
     ),

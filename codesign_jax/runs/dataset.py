@@ -19,14 +19,15 @@ import numpy as np
 
 from codesign_jax import files, reuse, sampling, store
 from codesign_jax.codesign import VERDICTS, verdicts
+from codesign_jax.model import morphology
 from codesign_jax.provenance import environment
-from codesign_jax.runs.columns import GRASPS, MAY_BE_EMPTY
+from codesign_jax.runs.columns import GRASPS, MAY_BE_EMPTY, OF_DESIGNS
 from codesign_jax.runs.directory import LOCK
 from codesign_jax.runs.scene_files import contents, scene_texts
 from codesign_jax.runs.tables import design_columns, noise_values, status_names
 from codesign_jax.sampling import Drawn
 from codesign_jax.scene import Scene
-from codesign_jax.scene.parameters import DesignSpace, design_space
+from codesign_jax.scene.parameters import DesignSpace, design_space, params_of
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome, Status
 
@@ -143,6 +144,9 @@ def _schema(pa: ModuleType, space: DesignSpace, notes: dict[str, Any]) -> Any:
     for column, name, unit in zip(design_columns(space), space.names, space.units, strict=True):
         about = {"description": "the design", "unit": unit, "parameter": name}
         fields.append(pa.field(column, pa.float32(), nullable=False, metadata=about))
+    for name, (kind, unit, text) in OF_DESIGNS.items():
+        about = {"description": text, "unit": unit}
+        fields.append(pa.field(name, getattr(pa, kind)(), nullable=False, metadata=about))
     return pa.schema(fields, {name: json.dumps(note) for name, note in notes.items()})
 
 
@@ -180,6 +184,9 @@ def rows(question: Question, shard: int, drawn: Drawn, found: Outcome) -> dict[s
     }
     designs = question.space.in_units(drawn.designs)
     own = design_columns(question.space)
+    hands = params_of(question.space, drawn.designs)
+    air = 1e6 * np.asarray(morphology.chamber_volumes(question.scene.hand, hands)).sum(-1)
+    values["chamber_volume_cm3"] = air[:, None]
     return values | {name: designs[:, k, None] for k, name in enumerate(own)}
 
 

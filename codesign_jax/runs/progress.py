@@ -100,14 +100,16 @@ class Meter(Live):
     """Grasps that were simulated: a live bar on a terminal, elsewhere a line now and then.
 
     Attributes:
-      total: Grasps to simulate, which may become fewer.
+      total: Grasps to simulate, which may become fewer or more.
       done: Grasps that were simulated.
+      later: What is simulated after these, in as many of them as take that time.
     """
 
-    def __init__(self, text: str, total: int, console: Console):
+    def __init__(self, text: str, total: int, console: Console, *, later: float = 0.0):
         columns = rich.progress.Progress.get_default_columns()[1:-1]
         super().__init__(console, _description(), *columns, rich.progress.TimeRemainingColumn())
         self.total, self.done, self._name, self._compiled = total, 0, text, None
+        self.later = later
         self.begin(f"{text}: compiling, then {total} grasps")
 
     def found(self, grasps: int) -> None:
@@ -122,7 +124,7 @@ class Meter(Live):
         start, before = self._compiled = self._compiled or (now, self.done)
         if now > start and not self.console.is_terminal:  # the bar says as much
             rate = (self.done - before) / (now - start)
-            left = duration(max(self.total - self.done, 0) / rate)
+            left = duration((max(self.total - self.done, 0) + self.later) / rate)
             text += f", {rate:.1f} grasps/s, about {left} left"
         self.say(text)
 

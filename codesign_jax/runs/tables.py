@@ -6,6 +6,7 @@ events.log.
 
 import csv
 import io
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from codesign_jax.codesign import VERDICTS, FinalTest, verdicts
 from codesign_jax.runs.columns import MORE, REFERENCE, TABLES
 from codesign_jax.runs.record import History, Record
 from codesign_jax.scene import Scene
-from codesign_jax.scene.parameters import DesignSpace
+from codesign_jax.scene.parameters import DesignSpace, fingers_of
 from codesign_jax.types import WARNINGS, Outcome, Status, Trial
 
 TESTS = "tests.csv"
@@ -29,7 +30,7 @@ Row = dict[str, Any]
 
 def design_columns(space: DesignSpace) -> list[str]:
     """Names of the parameters with their units, e.g. length_mm and pressure_0_kPa."""
-    names = (name.replace("[", "_").replace("]", "") for name in space.names)
+    names = (re.sub(r"[\[+]", "_", name).replace("]", "") for name in space.names)
     return [f"{name}_{unit}" for name, unit in zip(names, space.units, strict=True)]
 
 
@@ -114,8 +115,9 @@ def by_finger(space: DesignSpace) -> tuple[dict[str, list[int]], list[int]]:
     """Indices of the parameters that each finger has of its own, by name, and of the others."""
     own: dict[str, list[int]] = {}
     for k, name in enumerate(space.names):
-        if name.endswith("]"):
+        if len(fingers_of(name)) == 1:
             own.setdefault(name.partition("[")[0], []).append(k)
+    own = {name: places for name, places in own.items() if len(places) == len(space.hand.finger)}
     fingers = {k for places in own.values() for k in places}
     return own, [k for k in range(space.num_parameters) if k not in fingers]
 

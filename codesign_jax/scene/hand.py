@@ -217,14 +217,33 @@ def _check_free(free: Free, row: Parameter, path: str, hand: Hand, problems: lis
         if not _fits(f"{path}.{name}", value, row, hand, problems):
             return
         _check_range(f"{path}.{name}", value, row.unit, kind, factor, problems)
-        if free.tied and isinstance(value, tuple):
+        if free.tied is True and isinstance(value, tuple):
             problems.append(
                 f"{path}.{name} = {list(value)} must be a number [{row.unit}]: "
                 "tied = true gives all fingers one value"
             )
+    if found := _group_problem(free, hand.width(row)):
+        problems.append(f"{path}.tied: {found}")
+        return
     for low, high in dict.fromkeys(zip(*free.bounds(row, hand.width(row)), strict=True)):
         if low >= high:
             problems.append(f"{path}: low {low:g} must be below high {high:g}")
+
+
+def _group_problem(free: Free, count: int) -> str:
+    """Why the groups of fingers that share a value are none, or nothing."""
+    if isinstance(free.tied, bool):
+        return ""
+    members = [k for group in free.tied for k in group]
+    if count == 1:
+        return f"{free.name} is one value, which no groups of fingers share"
+    if any(len(group) < 2 for group in free.tied):
+        return "a group has two or more fingers"
+    if any(not 0 <= k < count for k in members):
+        return f"fingers are numbered from 0 to {count - 1}"
+    if len({*members}) < len(members):
+        return "a finger is in one group only"
+    return ""
 
 
 def _check_sections(hand: Hand, where: str, problems: list[str]) -> None:

@@ -280,7 +280,8 @@ class Free:
 
     Attributes:
       name: Which parameter.
-      tied: Whether all fingers share one value, within the bounds of each.
+      tied: Whether all fingers share one value, within the bounds of each; or groups of fingers
+        that share one, such as [[0, 3], [1, 2]], where a finger of no group has its own.
       low: Lower bound in the table's unit, for all fingers or for each; that of the table if not
         given.
       high: Upper bound in the table's unit, for all fingers or for each; that of the table if not
@@ -288,7 +289,7 @@ class Free:
     """
 
     name: str = choice(*PARAMETERS)
-    tied: bool = False
+    tied: bool | tuple[tuple[int, ...], ...] = False
     low: Numbers | None = None
     high: Numbers | None = None
 
@@ -299,7 +300,20 @@ class Free:
         """
         low = per_finger(row.low if self.low is None else self.low, count)
         high = per_finger(row.high if self.high is None else self.high, count)
-        return ((max(low),) * count, (min(high),) * count) if self.tied else (low, high)
+        lows, highs = [*low], [*high]
+        for group in self.groups(count):
+            for k in group:
+                lows[k] = max(low[i] for i in group)
+                highs[k] = min(high[i] for i in group)
+        return tuple(lows), tuple(highs)
+
+    def groups(self, count: int) -> list[tuple[int, ...]]:
+        """Which of `count` values are one and the same, in the order of each group's first."""
+        if self.tied is True:
+            return [tuple(range(count))]
+        given = () if self.tied is False else self.tied
+        others = {*range(count)} - {k for group in given for k in group}
+        return sorted([*given, *((k,) for k in others)], key=min)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -44,7 +44,7 @@ class DesignSpace:
     Attributes:
       hand: The hand's parameter table and pressure limit, without its other numbers: hands that
         differ in those have equal spaces.
-      names: Names of the free parameters, e.g. "length[2]" or "length" where tied.
+      names: Names of the free parameters, e.g. "length[2]", "length[0+3]" or "length" where tied.
       units: Units in which the hand file states them.
       scale: Factor from that unit to SI, shape (parameter,).
       bounds: Lower and upper bounds [SI], as tuples, which can be hashed; `low` and `high` are
@@ -343,6 +343,12 @@ def _refuse_draws(key: Any, n: Any) -> None:
 
 
 @functools.partial(jax.jit, static_argnums=0)
+def fingers_of(name: str) -> list[int]:
+    """The fingers of a parameter's name, such as [0, 3] of "length[0+3]"; none for all of them."""
+    _, _, inside = name.partition("[")
+    return [int(k) for k in inside.removesuffix("]").split("+") if k]
+
+
 def params_of(space: DesignSpace, designs: jax.typing.ArrayLike) -> Params:
     """Named parameters of designs [SI], shape (design, parameter); one program a space."""
     return jax.vmap(space.params)(designs)
@@ -427,13 +433,12 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
         spec = free.get(row.name, Free(row.name))
         factor, width = UNITS[row.unit][1], hand.width(row)
         low, high = spec.bounds(row, width)
-        count = 1 if spec.tied else width
-        for k in range(width):
-            source[offsets[row.name] + k] = len(columns) + (k if count > 1 else 0)
-        for k in range(count):
-            name = f"{row.name}[{k}]" if count > 1 else row.name
+        for group in spec.groups(width):
+            source[[offsets[row.name] + k for k in group]] = len(columns)
+            fingers = "" if len(group) == width else f"[{'+'.join(map(str, group))}]"
             morphology = row.domain == "morphology"
-            columns.append((name, row.unit, factor, low[k] * factor, high[k] * factor, morphology))
+            ends = low[group[0]] * factor, high[group[0]] * factor
+            columns.append((f"{row.name}{fingers}", row.unit, factor, *ends, morphology))
     if not columns:
         left = "; ".join(f"{name} has no effect: {why}" for name, why in idle.items())
         words = f"preset {preset.name!r} of hand {hand.name} leaves nothing to search"

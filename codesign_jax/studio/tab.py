@@ -18,13 +18,14 @@ import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from codesign_jax import codesign, files, runs
+from codesign_jax import codesign, files, runs, stress
 from codesign_jax.codesign import VERDICTS
 from codesign_jax.commands import common
 from codesign_jax.model import morphology, overlap
 from codesign_jax.optimize import Screened
-from codesign_jax.report import animation, bodies, stress, verdicts, viewer
+from codesign_jax.report import animation, bodies, verdicts, viewer
 from codesign_jax.runs import choice
+from codesign_jax.scene.parameters import fingers_of
 from codesign_jax.scene.schema import InputError
 from codesign_jax.studio import process
 from codesign_jax.studio.desk import COUNTS, Bench, Desk, View
@@ -356,8 +357,8 @@ def _told(shown: Shown) -> dict[str, Any]:
     caps = np.asarray(morphology.pressure_limits(scene.hand, grasp.params))
     limits: list[float | None] = []
     for name, scale in zip(space.names, space.scale, strict=True):
-        row, _, finger = name.partition("[")
-        cap = caps[int(finger[:-1])] if finger else caps.min()
+        row = name.partition("[")[0]
+        cap = caps[fingers_of(name) or slice(None)].min()
         limits.append(float(cap / scale) if row == "pressure" else None)
     return {
         "number": view.number,

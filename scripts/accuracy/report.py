@@ -10,8 +10,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from codesign_jax.codesign import SUCCESS_COST
-from codesign_jax.report.statistics import Interval
 from codesign_jax.scene import load
+from codesign_jax.statistics import Interval
 from scripts.accuracy import budget
 from scripts.shared import output
 from scripts.shared.statistics import spearman, two_way

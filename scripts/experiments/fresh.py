@@ -24,8 +24,8 @@ import numpy as np
 from codesign_jax import rollout, scene, use_compilation_cache
 from codesign_jax.codesign import stream_key
 from codesign_jax.engines import NAMES, make_engine
-from codesign_jax.report.statistics import wilson
 from codesign_jax.scene import keypaths, parameters
+from codesign_jax.statistics import wilson
 from codesign_jax.types import failed
 from scripts.experiments import report
 from scripts.experiments.simulate import write

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from codesign_jax.codesign import CONVERGED_COST, SUCCESS_COST, convergence_episode
 from codesign_jax.report import figures
-from codesign_jax.report.statistics import Interval, wilson
+from codesign_jax.statistics import Interval, wilson
 from codesign_jax.types import WARNINGS
 from scripts.experiments.simulate import BITS, PAPER_GRASPS, TOTAL_GRASPS
 from scripts.shared import output, statistics

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.stats
 from numpy.typing import ArrayLike
 
-from codesign_jax.report.statistics import Interval
+from codesign_jax.statistics import Interval
 
 RESAMPLES = 10_000
 _CONFIDENCE = 0.95

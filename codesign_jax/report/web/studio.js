@@ -251,7 +251,7 @@ function startStudio(root) {
     find("verdict").textContent = sentence;
     find("trials").replaceChildren(...Array.from({ length: total }, (_, k) => {
       const object = k % about.objects.length, end = about.ends[ends[k]] || "";
-      const dot = make("button", { type: "button", className: end, title: `trial ${k}, ${about.objects[object]}: ${end || "to come"}` });
+      const dot = make("button", { type: "button", className: end, title: `trial ${k}, ${about.objects[object]}: ${(end || "to come").replace("_", " ")}` });
       dot.classList.toggle("chosen", find("noise").value === String(k));
       dot.addEventListener("click", () => {
         find("object").value = object;

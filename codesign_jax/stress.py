@@ -12,21 +12,23 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from codesign_jax import codesign, model, rollout
+from codesign_jax import model, rollout, verdict
 from codesign_jax.engines import Engine
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.model import morphology, overlap
 from codesign_jax.model.layout import touches_itself
 from codesign_jax.model.overlap import Overlaps
-from codesign_jax.report.statistics import wilson
 from codesign_jax.reuse import Program, shared
 from codesign_jax.runs.choice import Case
 from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.scene import Scene, silicones
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.scene.schema import InputError
+from codesign_jax.statistics import wilson
 from codesign_jax.types import Outcome, Params, Trial
 
+AS_IT_IS = "as it is"
+"""Name of the condition in which nothing is changed, the first one."""
 DRAWS = 6
 """Draws of other constants."""
 HEAVIEST = 0.5
@@ -71,11 +73,16 @@ class Stress(NamedTuple):
         return "condition", "kept", "95 % interval"
 
     @property
+    def by_condition(self) -> dict[str, np.ndarray]:
+        """Grasps that kept the object of each set of numbers, shape (set,), by condition."""
+        names = np.array(self.conditions)
+        return {name: self.kept[names == name] for name in dict.fromkeys(self.conditions)}
+
+    @property
     def rows(self) -> list[tuple[str, str, str]]:
         """A row for each condition; of several sets what the worst and the best one keep."""
         found = []
-        for name in dict.fromkeys(self.conditions):
-            kept = self.kept[[condition == name for condition in self.conditions]]
+        for name, kept in self.by_condition.items():
             total = self.trials * kept.size
             share, low, high = wilson(int(kept.sum()), total)
             what = ""
@@ -84,6 +91,19 @@ class Stress(NamedTuple):
             span = f"{100 * low:.0f} to {100 * high:.0f} %{what}"
             found.append((name, f"{100 * share:.0f} % of {total}", span))
         return found
+
+    @property
+    def limits(self) -> str:
+        """The second word of a verdict: under which of the other conditions it does not hold.
+
+        Those under which the design kept less than the share that a verdict takes for poor.
+        """
+        shares = {name: kept.mean() / self.trials for name, kept in self.by_condition.items()}
+        del shares[AS_IT_IS]
+        weak = [f"{n} ({100 * share:.0f} %)" for n, share in shares.items() if share < verdict.POOR]
+        if weak:
+            return f"not with {', '.join(weak)}"
+        return f"holds under all {len(shares)} other conditions"
 
     def lines(self) -> list[str]:
         """The rows as aligned text."""
@@ -97,8 +117,7 @@ def simulate(
     case: Case, trials: int, key: jax.Array, done: Callable[[int], None] = lambda grasps: None
 ) -> Stress:
     """Simulates the design under every condition, in the same trials; `done` counts the grasps."""
-    scene, conditions, kept = case.scene, [], []
-    design = jnp.asarray(case.design, jnp.float32)
+    scene, design = case.scene, jnp.asarray(case.design, jnp.float32)
 
     def simulated(run: Program, *constants: Scene) -> tuple[Outcome, jax.Array, Trial]:
         result = interruptible(run, design, key, *constants)
@@ -109,7 +128,7 @@ def simulate(
     found, qpos, drawn = simulated(run)
     params = jax.tree.map(np.asarray, jax.jit(case.space.params)(design))
     warnings = _in_grasps(scene, params, *jax.tree.map(np.asarray, (found, qpos, drawn)))
-    every = [("as it is", found)]
+    every = [(AS_IT_IS, found)]
     every += [(name, simulated(run, c)[0]) for name, c in variants(scene)]
     other = silicones.under(scene, neo_hookean=not scene.effects.neo_hookean)
     name = f"{'neo-Hookean' if other.effects.neo_hookean else 'linear'} bending law"
@@ -119,10 +138,8 @@ def simulate(
         pass
     else:
         every.append((name, simulated(run)[0]))
-    for name, outcome in every:
-        conditions.append(name)
-        kept.append((codesign.verdicts(outcome) == codesign.VERDICTS.index("kept")).sum())
-    return Stress(tuple(conditions), np.array(kept), trials, tuple(warnings))
+    kept = [verdict.kept(outcome).sum() for _, outcome in every]
+    return Stress(tuple(name for name, _ in every), np.array(kept), trials, tuple(warnings))
 
 
 def sets(scene: Scene) -> int:
@@ -181,7 +198,7 @@ def _recorded(engine: Engine, space: DesignSpace, num_trials: int) -> Callable:
 def _in_grasps(
     scene: Scene, params: Params, found: Outcome, qpos: np.ndarray, trials: Trial
 ) -> list[str]:
-    kept = np.flatnonzero(codesign.verdicts(found) == codesign.VERDICTS.index("kept"))
+    kept = np.flatnonzero(verdict.kept(found))
     first = [kept[trials.shape[kept] == k][:1] for k in range(len(scene.objects.object))]
     times = np.arange(qpos.shape[1]) * HELD
     closed, held, end = (scene.steps_to(t) for t in (scene.phase_ends["approach"], *scene.window))

@@ -1,4 +1,10 @@
-"""Statistics that commands and studies share, by SciPy."""
+"""Statistics that verdicts, commands and studies share, by SciPy.
+
+>>> from codesign_jax import statistics
+>>> share = statistics.wilson(3, 3)  # three of three trials kept: how sure is that?
+>>> round(share.low, 2), share.high
+(0.44, 1.0)
+"""
 
 import math
 from typing import NamedTuple

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from codesign_jax.scene import silicones
 from codesign_jax.model.layout import beyond_base
+from codesign_jax.scene import silicones
 from codesign_jax.scene.beams import Beam, beam, softening
 from codesign_jax.scene.hand import Hand, highest_pressure
 from codesign_jax.scene.primitives import block_inertia

@@ -291,18 +291,18 @@ def test_derivatives_do_not_depend_on_company():
             np.testing.assert_array_equal(a, b)
 
 
-HELD = {"effects__finger_finger": True, "effects__friction_memory": True}
 HULL = {"effects__surface": "hull"}
+HELD = {"effects__finger_finger": True, "effects__friction_memory": True, **HULL}
 MIXED = DATA / "mixed.toml"  # a mesh, which still trials take, and a primitive
 SCENES = {
     "spheres": {"discretization__spheres_per_link": 2, "effects__finger_finger": True},
-    "full friction": {"effects__friction": "full", **HELD},
+    "full friction": {"effects__friction": "full", "effects__finger_finger": True},
     "no friction": {"effects__friction": "none", **HULL},
     "rigid wrist": {"effects__wrist": False},
     "bending alone": {"effects__twist": False, "effects__lateral_bending": False},
     "no gravity, no table": {"effects__gravity": False, "effects__object_table": False},
     "mesh": {"objects": MIXED},
-    "mesh and hull": {"objects": MIXED, **HULL},
+    "mesh and hull": {"objects": MIXED, "effects__friction_memory": True, **HULL},
     "three fingers": {"hand": "tripod3", **HELD},
     "capsule": {"shape": "capsule"},
     "fixtures": {},
@@ -327,6 +327,7 @@ def test_derivatives_of_scenes(name, tmp_path):
     with jax.enable_x64(True):
         if name == "fixtures":
             overrides = {"discretization.links": 2, "effects.surface": "hull"}
+            overrides |= {"effects.friction_memory": True}
             the_scene = fixtures.loaded(tmp_path, FIXTURES, "box", **overrides)
         else:
             the_scene = grasps.pinch(**{"shape": "sphere", "links": 2} | SCENES[name])

@@ -491,21 +491,24 @@ def test_spheres_keep_nothing():
 
 @pytest.fixture(scope="module")
 def held_hands():
-    """Two fingers that hold one another above the object: the state, and in pieces on from it.
+    """Two fingers that hold one another and the object: the state, and in pieces on from it.
 
     A function of start, controls and steps of a piece: a sum of the end, the end, and the traces.
     """
-    off = "finger_object finger_table palm_object palm_table finger_palm finger_itself twist"
+    off = "finger_table palm_object palm_table finger_palm finger_itself twist"
     how = {"effects__finger_finger": True, "effects__friction_memory": True}
     how |= grasps.off(off) | {"effects__surface": "hull"}
     chosen = grasps.pinch("box", links=2, **how)
     engine = make_engine("structured", chosen)
     with jax.enable_x64(True):
-        begin = curled(chosen, STEPS, bend=0.8, height=0.25)
+        begin = curled(chosen, STEPS, bend=0.8, height=0.12)
         fields, ctrl = jax.tree.map(lambda v: jnp.asarray(v)[None], (begin.fields, begin.ctrl))
         ctrl = ctrl.at[..., 6:].set(180e3)  # Pa: they press on one another
         start = jax.jit(engine.rollout)(fields, ctrl).last
-    assert np.abs(model.split(chosen, start).held).max() > 0.1
+    hold = np.asarray(model.split(chosen, start).held).reshape(-1, 2)
+    rows = friction_held.rows(chosen)
+    assert set(rows) == {"finger_finger", "finger_object", "object_table"}
+    assert min(np.abs(hold[own]).max() for own in rows.values()) > 0.05
 
     def one(start, ctrl):
         trace = engine.rollout(fields._replace(start=start), ctrl)

@@ -50,7 +50,7 @@ def pinch_holds(name, engine, step, precision):
     b = bench(firm(name), engine, step, precision)
     slip = hanging(b.run(*lifted(b, 61.0)))[-round(60 / b.h) :]
     rate = (slip[-1] - slip[-round(30 / b.h)]) / 30
-    return Found(slip[-1] - slip[0], 60 * CREEP, f"creeps at {1e3 * rate:.3f} mm/s in the end")
+    return Found(abs(slip[-1] - slip[0]), 60 * CREEP, f"creeps at {1e3 * rate:.3f} mm/s in the end")
 
 
 def grip(reader):

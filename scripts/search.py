@@ -16,6 +16,7 @@ import json
 import re
 import sys
 import time
+import zlib
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
@@ -47,6 +48,8 @@ CANDIDATES, ROUNDS = 25, 12
 an optimiser with `finalists` has its runs' final test."""
 STREAM_JUDGE = 0x6A756467
 """Stream of the trials that judge a recommended design ("judg")."""
+LONGEST_STEM = 100
+"""Longest name of a study's files that says all of its changes."""
 PAGE = Path("docs/notes/search.md")
 
 
@@ -394,6 +397,8 @@ def search(args: argparse.Namespace, name: str) -> None:
     words = [Path(args.objects).stem] if args.objects else []
     words += [args.preset, name, *(re.sub(r"^--|^[a-z_.]+[.](?=.*=)", "", c) for c in changed)]
     stem = re.sub("[:,]", "-", "-".join(dict.fromkeys(words))).replace("=", "")
+    if len(stem) > LONGEST_STEM:
+        stem = f"{stem[:LONGEST_STEM]}-{zlib.crc32(stem.encode()):08x}"
     how = {n: getattr(args, n) for n in ("seeds", "budget", "tests", "marks", "at")}
     how["chunk"] = 512 if jax.default_backend() == "cpu" else 16_384
     study = Study(case, scene, engine, space, **how, path=args.out / f"{stem}.npz")

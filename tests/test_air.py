@@ -213,7 +213,8 @@ def test_moments_are_those_of_the_stored_energy(lateral):
     with jax.enable_x64(True):
         the_scene = scene.load("paper", overrides={"effects.lateral_threshold": True})
         params, _ = grasps.hand_world(the_scene, length=0.1)
-        links, pressure, bend, small_step = the_scene.discretization.links, 69e3, 15.0, 0.5
+        links, bend, small_step = the_scene.discretization.links, 15.0, 0.5
+        pressure = 1.7 * the_scene.hand.material.shear_modulus
         beams = morphology.finger_beams(the_scene.hand, params, links)
         numbers = morphology.thresholds(the_scene.hand, params, beams, links)[0, 0]
         beams = jax.tree.map(lambda v: v[:, 0], beams)

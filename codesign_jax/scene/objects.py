@@ -323,16 +323,17 @@ def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
     if len(problems) > before:
         return None
     values = {f.name: getattr(given, f.name) for f in dataclasses.fields(given)}
-    if kind == "mesh":
-        shape = _mesh_shape(values, path, where, problems)
-    elif given.centre_of_mass is not None:
-        shape = _off_centre(values, path, where, problems)
-    else:
-        shape = _primitive(values)
-    if shape is None:
+    try:
+        if kind == "mesh":
+            shape = _mesh_shape(values, path, where, problems)
+        elif given.centre_of_mass is not None:
+            shape = _off_centre(values, path, where, problems)
+        else:
+            shape = _primitive(values)
+    except schema.InputError as error:  # a density that makes no mass within its range
+        problems += [f"{where}: {problem.removeprefix('shape.')}" for problem in error.problems]
         return None
-    if why := schema.range_problem(f"{where}: mass", shape.mass, *_MASS):
-        problems.append(why)
+    if shape is None:
         return None
     if given.inertia is not None:
         why = rigid.inertia_problem(given.inertia, shape.mass, shape.radius)

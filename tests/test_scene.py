@@ -292,7 +292,7 @@ def test_a_wrong_key_path_is_told_in_words(pair):
     ("old", "new", "expected"),
     [
         ("size = [0.030]", "size = [30]", "did you mean 0.03?"),  # millimetres for metres
-        ("[table]\nfriction = 0.4", "", "objects.toml.table is missing"),
+        ("[table]\nfriction = 0.37", "", "objects.toml.table is missing"),
         ("size = [0.030, 0.036]", "size = [0.030]", "size of a cylinder has 2 values, not 1"),
         ('name = "sphere"', 'name = "cuboid"', "cuboid"),
     ],
@@ -349,7 +349,7 @@ def test_all_problems_of_all_files_at_once(tmp_path):
     assert len(caught.value.problems) == 5
 
 
-BASE = "base = [0.036, 0.0175]\n"
+BASE = "base = [0.037, 0.015]\n"
 LOW = "low = 10\nhigh = 180\ndefault"  # of the length
 
 
@@ -366,7 +366,7 @@ LOW = "low = 10\nhigh = 180\ndefault"  # of the length
         # Mounts of fingers
         (BASE, "", "finger[0] has no base point: give base = [x, y]"),
         (BASE, f"{BASE}radius = 0.035\n", f"leave out {BASE.strip()} or radius = 0.035"),
-        ("base = [0.036", "base = [36", "base[0] = 36 is outside [-0.2, 0.2] m"),
+        ("base = [0.037", "base = [37", "base[0] = 37 is outside [-0.2, 0.2] m"),
         # Numbers of fingers that do not fit the hand: with key, what was given, how many there are
         (
             "\npressure = 120",

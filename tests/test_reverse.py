@@ -292,7 +292,6 @@ def test_derivatives_do_not_depend_on_company():
 
 
 HULL = {"effects__surface": "hull"}
-HELD = {"effects__finger_finger": True, "effects__friction_memory": True, **HULL}
 MIXED = DATA / "mixed.toml"  # a mesh, which still trials take, and a primitive
 SCENES = {
     "spheres": {"discretization__spheres_per_link": 2, "effects__finger_finger": True},
@@ -302,8 +301,8 @@ SCENES = {
     "bending alone": {"effects__twist": False, "effects__lateral_bending": False},
     "no gravity, no table": {"effects__gravity": False, "effects__object_table": False},
     "mesh": {"objects": MIXED},
-    "mesh and hull": {"objects": MIXED, "effects__friction_memory": True, **HULL},
-    "three fingers": {"hand": "tripod3", **HELD},
+    "mesh and hull": {"objects": MIXED, **HULL},
+    "three fingers": {"hand": "tripod3", "effects__finger_finger": True},
     "capsule": {"shape": "capsule"},
     "fixtures": {},
     "tapered": {

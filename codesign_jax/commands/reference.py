@@ -6,8 +6,9 @@ trials that the run has not met and with finer steps (accuracy `reference`; docs
 much that changes), and at the run's accuracy under other conditions (`report.stress`).
 """
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -103,9 +104,10 @@ def tell_stress(case: Case, found: Stress, console: Console) -> None:
 def stress_run(folder: Path, settings: Settings, console: Console) -> None:
     """Tells what the run's design keeps under other conditions, simulated if not yet."""
     case, about = _stress_case(folder, settings)
-    found, why = stored_stress(folder, settings)
-    if why:
-        console.print(f"{folder / STRESS_FILE} {why}: simulated again")
+    place = folder / STRESS_FILE
+    found = stored_stress(
+        folder, settings, lambda why: console.print(f"{place} {why}: simulated again")
+    )
     if found is None:
         total = STRESS_TRIALS * stress.sets(case.scene)
         with Meter("stress", total, console) as meter:
@@ -115,20 +117,27 @@ def stress_run(folder: Path, settings: Settings, console: Console) -> None:
     tell_stress(case, found, console)
 
 
-def stored_stress(folder: Path, settings: Settings) -> tuple[Stress | None, str]:
-    """What `stress_run` kept of the run's design; or None and why, see `store.found`."""
+def stored_stress(
+    folder: Path, settings: Settings, tell: Callable[[str], None] = lambda why: None
+) -> Stress | None:
+    """What `stress_run` kept of the run's design; else None, and `tell` takes why if it is there."""
     arrays, why = store.found(folder / STRESS_FILE, _stress_case(folder, settings)[1])
-    if arrays is None:
-        return None, why
+    found = None if arrays is None else _stress(arrays)
+    if why or (arrays is not None and found is None):
+        tell(why or _NO_RESULT)
+    return found
+
+
+def _stress(arrays: dict[str, Any]) -> Stress | None:
+    """Arrays of a file as a result; None if they are none."""
     try:
         texts = {k: tuple(map(str, arrays[k].tolist())) for k in ("conditions", "warnings")}
         found = Stress(kept=arrays["kept"].astype(int), trials=int(arrays["trials"]), **texts)
     except (KeyError, TypeError, ValueError):
-        return None, _NO_RESULT
-    whole = found.kept.shape == (len(found.conditions),) and found.trials > 0
-    if not whole or not ((0 <= found.kept) & (found.kept <= found.trials)).all():
-        return None, _NO_RESULT
-    return found, ""
+        return None
+    if found.kept.shape != (len(found.conditions),) or found.trials < 1:
+        return None
+    return found if ((0 <= found.kept) & (found.kept <= found.trials)).all() else None
 
 
 class Kept(NamedTuple):
@@ -142,9 +151,10 @@ class Kept(NamedTuple):
 def kept(folder: Path, scene: Scene, settings: Settings) -> Kept:
     """Both results of a run's design, and notes where one cannot be shown or is gone."""
     outcome, why = stored(folder, settings)
-    conditions, cause = stored_stress(folder, settings)
+    causes: list[str] = []
+    conditions = stored_stress(folder, settings, causes.append)
     gone = (outcome is None) != (conditions is None)  # a run that ended has both, or neither
-    reasons = {FILE: why, STRESS_FILE: cause}
+    reasons = {FILE: why, STRESS_FILE: "".join(causes)}
     lacking = {FILE: outcome is None, STRESS_FILE: conditions is None}
     notes = [
         f"{folder / name} {reasons[name] or 'is missing'}: {_LEFT_OUT[name]} left out. The "

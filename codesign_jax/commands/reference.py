@@ -120,7 +120,7 @@ def stress_run(folder: Path, settings: Settings, console: Console) -> None:
 def stored_stress(
     folder: Path, settings: Settings, tell: Callable[[str], None] = lambda why: None
 ) -> Stress | None:
-    """What `stress_run` kept of the run's design; else None, and `tell` takes why if it is there."""
+    """What `stress_run` kept of the run's design; else None, and `tell` takes why."""
     arrays, why = store.found(folder / STRESS_FILE, _stress_case(folder, settings)[1])
     found = None if arrays is None else _stress(arrays)
     if why or (arrays is not None and found is None):

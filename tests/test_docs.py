@@ -12,7 +12,17 @@ import numpy as np
 import pytest
 
 from codesign_jax import cli, preflight
-from codesign_jax.commands import check, evaluate, export, finger, landscape, render, replay, report
+from codesign_jax.commands import (
+    check,
+    compare,
+    evaluate,
+    export,
+    finger,
+    landscape,
+    render,
+    replay,
+    report,
+)
 from codesign_jax.studio import studio
 from scripts import reference_page
 from scripts.shared import provenance
@@ -55,6 +65,7 @@ def folder(tmp_path_factory):
     (place / "measured.csv").write_text("pressure_kPa,angle_deg\n20,18.9\n40,37.2\n")
     policy = re.search(r"^```python\n(.*?)^```", CONTROL.read_text(), re.S | re.M)
     (place / "mine.py").write_text(policy[1])
+    shutil.copytree(ROOT / "docs" / "gallery", place / "docs" / "gallery")
     for name in ("demo", "ten"):
         command_runs.copied(place / "runs" / name)
     return place
@@ -74,6 +85,7 @@ def here_alone(example):
 # Where a command simulates, or writes what it has simulated: owners and names.
 SIMULATES = {
     "check": [(check, "tell")],
+    "compare": [(compare, "compare_pair")],
     "evaluate": [
         (evaluate, name) for name in ("simulate", "other_conditions", "tell_verdict", "of_objects")
     ],
@@ -104,7 +116,9 @@ def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch)
     if arguments[0] in ("optimize", "sample"):
         arguments.append("--dry-run")
     assert cli.main(arguments) == 0
-    simulates = arguments[0] not in ("scenes", "compare") and "--dry-run" not in arguments
+    simulates = arguments[0] != "scenes" and "--dry-run" not in arguments
+    if arguments[0] == "compare":
+        simulates = "--trials" in arguments
     assert bool(reached) == simulates
 
 

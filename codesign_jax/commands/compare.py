@@ -93,7 +93,7 @@ def main(options: Compare) -> int:
             write_table(every, options.out)
             console.print(f"table: {options.out}")
     if pair:
-        _compare_pair(pair, options, console)
+        compare_pair(pair, options, console)
     return 0
 
 
@@ -154,7 +154,8 @@ def _subject(options: Compare, place: Path, *, of_run: bool) -> flags.Subject:
     return flags.Subject(design=((str(place),),), policy=next(iter(options.policy), None), **how)
 
 
-def _compare_pair(pair: dict[str, Case], options: Compare, console: Console) -> None:
+def compare_pair(pair: dict[str, Case], options: Compare, console: Console) -> None:
+    """Simulates designs by their names in the same trials, and prints how they differ."""
     kept, count = [], TRIALS if options.trials is None else options.trials
     for name, case in pair.items():
         with Busy(console, f"simulating {common.counted(count, 'grasp')}"):

@@ -120,6 +120,9 @@ def _entries(value: Any, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
         entry = value[names.index(part)] if part in names else chosen
         yield from ((part, *more) for more in _entries(entry, rest))
         return
+    if not any(hasattr(entry, part) for entry in value):
+        yield path  # of which whoever reads it says what there is
+        return
     for k, entry in enumerate(value):
         yield from ((str(k), *more) for more in _entries(entry, path))
 

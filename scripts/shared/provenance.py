@@ -20,7 +20,7 @@ from codesign_jax.provenance import environment, git_state
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene
 
-KERNEL = "702d952b"
+KERNEL = "a7ad6c4c"
 """The commit that last changed what the kernel of the default scene computes: results name it.
 
 A commit that changes the kernels' text (scripts.same_kernels tells) and what grasps do comes in its

@@ -8,15 +8,13 @@ import numpy as np
 import trimesh
 
 from codesign_jax.export.casting import Parts, parts
-from codesign_jax.export.palm import Palm
+from codesign_jax.export.palm import Palm, closed
 from codesign_jax.export.process import Process, Size
 
 FOLDER = "parts"
 FORMATS = ("stl", "3mf")
 # STL holds float32: seven digits of lengths up to a metre, of which a volume has three.
 _VOLUME, _LENGTH = 1e-4, 1e-3
-# Edges that may be shortened to nothing [mm], tried from the finest on; none is printed.
-_SHORTEST = (1e-4, 1e-3, 3e-3, 1e-2, 3e-2)
 
 
 class Part(NamedTuple):
@@ -58,24 +56,13 @@ def write_palm(folder: Path, made: Palm) -> list[Part]:
     found = []
     for (kind, fingers), solid in solids.items():
         name = kind if kind == "palm" else f"{kind}_{'_'.join(map(str, fingers))}"
-        stands = _in_float32(_stands(solid))
+        stands = closed(_stands(solid))
         if stands is None:
             continue
         meshes = [_save(folder / f"{name}.{ending}", stands) for ending in FORMATS]
         extents = tuple(float(v) for v in meshes[0].extents)
         found.append(Part(name, fingers, float(meshes[0].volume), extents))
     return found
-
-
-def _in_float32(solid: manifold3d.Manifold) -> manifold3d.Manifold | None:
-    """The solid without edges of which STL's float32 makes a point; None if that opens it."""
-    for shortest in _SHORTEST:
-        found = solid.simplify(shortest)
-        surface = mesh(found)
-        vertices = surface.vertices.astype(np.float32)
-        if trimesh.Trimesh(vertices, surface.faces, process=True).is_watertight:
-            return found
-    return None
 
 
 def _stands(solid: manifold3d.Manifold) -> manifold3d.Manifold:

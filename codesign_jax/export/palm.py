@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import manifold3d
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from codesign_jax.export.casting import SEGMENTS, half_width, prism, shifted
@@ -39,8 +40,10 @@ FLANGES = ((31.5, "M5", 5.5, 10.0, 5.5), (20.0, "M4", 4.5, 8.0, 4.5), (14.0, "M3
 """Circles of four screws to the wrist: diameter, thread, hole, head, height of the head [mm].
 
 The first is that of a robot's flange 31.5-4-M5 by ISO 9409-1."""
-APART = 0.01
-"""Difference of one seat and the next [mm]: equal ones meet in lines, which no file can say."""
+APART = (0.01, 0.017, 0.023, 0.031)
+"""Differences of one seat and the next [mm]: equal ones meet in lines, which no file can say."""
+SHORTEST = (1e-4, 1e-3, 3e-3, 1e-2, 3e-2)
+"""Edges that may be shortened to nothing [mm], tried from the finest on; none is printed."""
 INSIDE = 0.05
 """How far a web stays within what it joins [mm]."""
 LOST = 0.2
@@ -69,9 +72,34 @@ class Palm(NamedTuple):
 
 
 def palm(scene: Scene, params: Params, sizes: list[Size], process: Process) -> Palm:
-    """Builds the palm of a hand, whose fingers need a root."""
+    """Builds the palm of a hand, whose fingers need a root.
+
+    Seats differ by hundredths of a millimetre; where some of their faces still meet in a line,
+    other differences are tried.  The last one stays, closed or not.
+    """
+    for step in APART:
+        found = _palm(scene, params, sizes, process, [step * i for i in range(len(sizes))])
+        if (body := closed(found.body)) is not None:
+            return found._replace(body=body)
+    return found
+
+
+def closed(solid: Solid) -> Solid | None:
+    """The solid without edges of which STL's float32 makes a point; None if that opens it."""
+    for shortest in SHORTEST:
+        found = solid.simplify(shortest)
+        surface = found.to_mesh64()
+        vertices = np.asarray(surface.vert_properties)[:, :3].astype(np.float32)
+        faces = np.asarray(surface.tri_verts)
+        if trimesh.Trimesh(vertices, faces, process=True).is_watertight:
+            return found
+    return None
+
+
+def _palm(
+    scene: Scene, params: Params, sizes: list[Size], process: Process, apart: list[float]
+) -> Palm:
     places = frames(scene, params)
-    apart = [APART * i for i in range(len(sizes))]
     seats = [
         _seat(size, place, more) for size, place, more in zip(sizes, places, apart, strict=True)
     ]
@@ -85,10 +113,14 @@ def palm(scene: Scene, params: Params, sizes: list[Size], process: Process) -> P
         for hole in _holes(size, process, place)
     ]
     radius, thickness = 1e3 * scene.hand.palm.radius, 1e3 * scene.hand.palm.thickness
-    disc = Solid.cylinder(thickness, radius, radius, 4 * SEGMENTS)
+    # Turned by an odd angle, so that no corner of it lies in a plane of symmetry.
+    disc = Solid.cylinder(thickness, radius, radius, 4 * SEGMENTS).rotate([0, 0, 0.9])
     body = _sum([disc, *seats])
     if len(body.decompose()) > 1:
-        webs = (_web(z, place, radius, thickness) for z, place in zip(sizes, places, strict=True))
+        webs = (
+            _web(size, place, (radius, thickness), more)
+            for size, place, more in zip(sizes, places, apart, strict=True)
+        )
         body = _sum([body, *webs])
     taken = _sum([*pockets, *holes])
     body -= taken
@@ -210,13 +242,15 @@ def _bar(size: Size, process: Process) -> Solid:
     return bar
 
 
-def _web(size: Size, frame: np.ndarray, radius: float, thickness: float) -> Solid:
+def _web(size: Size, frame: np.ndarray, disc: tuple[float, float], more: float) -> Solid:
     """What joins a seat outside of the disc to its middle, within the disc's height if it can."""
-    core = Solid.cylinder(thickness - 2 * INSIDE, radius / 2, radius / 2, SEGMENTS)
+    radius, thickness = disc
+    inside = INSIDE + more
+    core = Solid.cylinder(thickness - 2 * inside, radius / 2 + more, radius / 2 + more, SEGMENTS)
     # A little within the seat and the disc, so that no two faces coincide.
-    seat = _placed(_block(size, -INSIDE), frame)
-    level = seat.trim_by_plane((0, 0, 1), INSIDE).trim_by_plane((0, 0, -1), INSIDE - thickness)
-    return Solid.batch_hull([core.translate([0, 0, INSIDE]), seat if level.is_empty() else level])
+    seat = _placed(_block(size, -inside), frame)
+    level = seat.trim_by_plane((0, 0, 1), inside).trim_by_plane((0, 0, -1), inside - thickness)
+    return Solid.batch_hull([core.translate([0, 0, inside]), seat if level.is_empty() else level])
 
 
 def _flange(radius: float, thickness: float, taken: Solid) -> tuple[Flange | None, list[Solid]]:

@@ -12,7 +12,7 @@ from codesign_jax.types import Params
 
 @dataclasses.dataclass(frozen=True)
 class Process:
-    """What the design does not say about parts [ours]."""
+    """What the design does not say about parts [chosen]."""
 
     # Thickness of the walls that close the chamber at base and tip [mm]; 0: that of the finger's
     # other walls
@@ -33,11 +33,11 @@ class Process:
 
 
 CHEEK, BACK, FLOOR, BAR = 3.0, 9.0, 4.0, 5.0
-"""Walls of a seat beside, behind and below a root, and thickness of its clamp bar [mm] [ours]."""
+"""Walls of a seat beside, behind and below a root, and thickness of its clamp bar [mm] [chosen]."""
 SQUEEZE = 0.05
-"""Share of its height by which the bar presses a root [ours]."""
+"""Share of its height by which the bar presses a root [chosen]."""
 FABRIC = 0.5
-"""Room for the fabric behind a root [mm] [ours]."""
+"""Room for the fabric behind a root [mm] [chosen]."""
 
 
 class Section(NamedTuple):

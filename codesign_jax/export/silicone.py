@@ -22,10 +22,14 @@ def of_material(material: Material) -> Silicone | None:
     return silicones.get(material.silicone) if material.silicone else None
 
 
-def nearest(material: Material) -> Silicone:
-    """The silicone whose walls bend most like the hand's, by the ratio of their moduli."""
+def nearest(material: Material, *, neo_hookean: bool) -> Silicone:
+    """The silicone whose walls bend most like the hand's, by the ratio of their moduli.
+
+    Args:
+      neo_hookean: Whether the hand's modulus belongs to the neo-Hookean law, as in its scene.
+    """
     mine = material.shear_modulus
-    if not silicones.of_law(material.law):
+    if not neo_hookean:
         mine *= silicones.EQUAL_BEND  # the silicones' law is the neo-Hookean one
 
     def distance(other: Silicone) -> float:

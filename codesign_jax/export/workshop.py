@@ -10,14 +10,15 @@ from codesign_jax.export import silicone
 from codesign_jax.export.process import BACK, Process, Size, inlet
 from codesign_jax.export.sheet import NAME, SheetSection
 from codesign_jax.scene import Scene
+from codesign_jax.scene.silicones import Silicone
 from codesign_jax.types import Params
 
 PITCH = 2.0
-"""A turn of the thread along a finger [mm] [ours]."""
+"""A turn of the thread along a finger [mm] [chosen]."""
 LOSS = 0.15
-"""Silicone that stays in cups and on moulds, as a share of what is cast [ours]."""
+"""Silicone that stays in cups and on moulds, as a share of what is cast [chosen]."""
 TUBE = 1.0
-"""Tube for each finger [m] [ours]."""
+"""Tube for each finger [m] [chosen]."""
 BARS = "M3 x 16"
 """Screws of the clamp bars, which cut their thread into the palm."""
 PLASTIC = 1.24e-3
@@ -101,11 +102,15 @@ def _shopping(
             str(count),
             f"{strips} mm; does not stretch, open weave (polyester mesh, glass)",
         ),
-        ("thread", f"{thread:.1f} m", f"polyester sewing thread; a turn every {PITCH:g} mm [ours]"),
+        (
+            "thread",
+            f"{thread:.1f} m",
+            f"polyester sewing thread; a turn every {PITCH:g} mm [chosen]",
+        ),
         ("tube", f"{TUBE * count:g} m", f"polyurethane, outer diameter {widths} (--inlet)"),
         ("push-in fittings", str(count), f"for tube of {widths}, with the regulators' thread"),
         ("pressure regulators", str(count), _regulator(highest)),
-        ("compressed air", "1", f"dry, oil-free, at least {highest + 100:.0f} kPa gauge [ours]"),
+        ("compressed air", "1", f"dry, oil-free, at least {highest + 100:.0f} kPa gauge [chosen]"),
         (
             "silicone adhesive",
             "1 tube",
@@ -136,9 +141,15 @@ def _silicone(scene: Scene) -> str:
         return f"{silicone.words(named)}; {needed}"
     return (
         f"platinum-cured, {needed}. The hand's file names none; nearest by docs/measurements.md "
-        f"is {silicone.words(silicone.nearest(material))}. Measure the first finger (codesign "
+        f"is {silicone.words(_worked(scene))}. Measure the first finger (codesign "
         "finger FILE --fit)"
     )
+
+
+def _worked(scene: Scene) -> Silicone:
+    """The silicone whose mix and times the sheet gives."""
+    material, law = scene.hand.material, scene.effects.neo_hookean
+    return silicone.of_material(material) or silicone.nearest(material, neo_hookean=bool(law))
 
 
 def _regulator(highest: float) -> str:
@@ -161,7 +172,7 @@ def _flange_screws(scene: Scene, printed: Printed | None) -> list[tuple[str, str
 
 def _castings(scene: Scene, sizes: Sequence[Size]) -> SheetSection:
     grams = 1e-6 * scene.hand.material.density * (1 + LOSS)
-    named = silicone.of_material(scene.hand.material) or silicone.nearest(scene.hand.material)
+    named = _worked(scene)
     a, b = named.mix
     rows = []
     for i, size in enumerate(sizes):
@@ -278,7 +289,7 @@ def _order(
     process: Process,
     printed: Printed | None,
 ) -> SheetSection:
-    named = silicone.of_material(scene.hand.material) or silicone.nearest(scene.hand.material)
+    named = _worked(scene)
     test = 0.5 * float(np.max(np.asarray(params.pressure))) / 1e3
     pinned = any(inlet(size, process) for size in sizes)
     pin = (
@@ -303,8 +314,8 @@ def _order(
         "Tube: push 10 mm of it through the root into the chamber, seal with silicone adhesive "
         "around it, cure.",
         f"Leak test: under water at {test:.0f} kPa for a minute, no bubbles; then close the tube: "
-        "the pressure must fall by less than 5 % in a minute [ours]. Paint leaks with silicone and "
-        "test again.",
+        "the pressure must fall by less than 5 % in a minute [chosen]. Paint leaks with silicone "
+        "and test again.",
         "Bend test: lay the finger on its side, raise the pressure slowly to the design's, and "
         "compare the angle of the tip with 'free bend'. Write pressures and angles into a file and "
         "fit the silicone: codesign finger FILE.csv --fit (docs/measurements.md).",

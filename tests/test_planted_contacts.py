@@ -241,7 +241,7 @@ SPHERES = {
 }
 SURFACES = {"hull": HULL, "spheres": SPHERES}
 STATES = {
-    "hull": {"main": (6, 0.95, 0.06), SHORT: (2, 0.6, 0.3, 0.012), "overflow": (1, 1.5, 0.045)},
+    "hull": {"main": (16, 0.95, 0.06), SHORT: (2, 0.6, 0.3, 0.012), "overflow": (1, 1.5, 0.045)},
     "spheres": {"main": (3, 1.9, 0.045), SHORT: (2, -1.2, 0.3, 0.012)},
 }
 """Arguments of `curled`: seed, bend, height and length [m]. Contacts of every kind, none, and with

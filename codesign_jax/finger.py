@@ -77,7 +77,7 @@ def of_design(scene: Scene, params: Params, index: int) -> Finger:
         float(hand.material.shear_modulus),
         np.asarray(springs[index, :, 0]),
         np.asarray(beams.moment_per_pressure[index]),
-        scene.effects.neo_hookean,
+        bool(scene.effects.neo_hookean),
     )
 
 

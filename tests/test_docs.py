@@ -168,7 +168,16 @@ def commits(text):
     return re.findall(r"\b(?=[0-9a-f]*[a-f])(?=[0-9a-f]*[0-9])[0-9a-f]{7,40}\b", text)
 
 
-BEFORE = {"rates_h100.json": ("docs/performance.md",)}
+BEFORE = {
+    "budget.json": ("docs/accuracy.md", "docs/notes/accuracy.md"),
+    "contact_depths.json": ("docs/hull.md",),
+    "effects.json": ("docs/effects.md",),
+    "experiments": ("docs/results.md", "docs/notes/results.md"),
+    "rates_cpu.json": ("docs/performance.md", "README.md"),
+    "rates_h100.json": ("docs/performance.md", "README.md"),
+    "search": ("docs/notes/search.md",),
+    "stability.json": ("docs/notes/stability.md",),
+}
 """Files or folders of docs/data with what was measured with another kernel; pages that show it."""
 
 

@@ -131,7 +131,8 @@ def _draw(
             tilt=jnp.deg2rad(noise.tilt) * later[2:4],
         )
 
-    return jax.vmap(draw, in_axes=(0, batch_axes(noises)))(first + jnp.arange(num_trials), noises)
+    numbers = jnp.asarray(first) + jnp.arange(num_trials)
+    return jax.vmap(draw, in_axes=(0, batch_axes(noises)))(numbers, noises)
 
 
 def nominal_trial(scene: Scene, shape: int | str = 0) -> Trial:

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from codesign_jax import cli, codesign
+from codesign_jax import cli
 from codesign_jax.commands import status
+from codesign_jax.runs import choice
 from codesign_jax.scene import library
 from tests.helpers.command_runs import EPISODES, RUN, command, finished_run, own_workplace  # noqa: F401
 from tests.helpers.toy_engine import TINY
@@ -128,7 +129,7 @@ def test_ctrl_c_is_one_line_and_ends_the_process(monkeypatch, capsys, request):
         going.wait(30)
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(codesign.Task, "evaluate", simulate)
+    monkeypatch.setattr(choice.Case, "simulate", simulate)
     monkeypatch.setattr(status, "leave", left.append)
     arguments = ["evaluate", "--scene", str(TINY), "--engine", "mujoco", "--trials", "1"]
     monkeypatch.setattr(sys, "argv", ["codesign", *arguments])

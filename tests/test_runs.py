@@ -143,7 +143,8 @@ def test_every_file_and_column_is_described_on_the_page(toy_run, tmp_path):
     head, *sections = (ROOT / "docs" / "files.md").read_text(encoding="utf-8").split("\n## ")
     assert {*re.findall(r"^\| `(\S+)` \|", head, re.M)} == columns.FILES | {*columns.TABLES}
     named = {s.split("\n")[0]: re.findall(r"^\| `(\w+)` \|", s, re.M) for s in sections}
-    assert named.pop("The Parquet file of `codesign sample`") == ["design"]
+    sampled = named.pop("The Parquet file of `codesign sample`")
+    assert sampled == ["design", *columns.OF_DESIGNS]
     assert named.pop("A table of forces") == []  # its columns are of the hand's fingers
     assert named == {n: [*t.columns] for n, t in (columns.TABLES | columns.MORE).items()}
 

@@ -92,6 +92,8 @@ def _check(options: Export, case: Case) -> None:
         problems.append(f"--out {out} exists; choose another folder, or give --overwrite")
     elif out.exists() and not out.is_dir():
         problems.append(f"--out {out} is a file")
+    else:
+        problems += common.place_problems("--out", out, folder=True)
     problems += process.problems(_process(options)) + _missing(options)
     common.refuse(problems + common.engine_problems(case.engine, options.overrides))
 

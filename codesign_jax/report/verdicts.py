@@ -68,7 +68,7 @@ class Judged(NamedTuple):
 
 
 def objects(scene: Scene) -> str:
-    """What a verdict holds for, such as "objects of 50 g, friction 0.86"."""
+    """What a verdict holds for, such as "objects of 50 g, friction 0.85"."""
     shapes, noise = scene.objects.object, scene.objects.noise
     masses = [1e3 * float(shape.mass) for shape in shapes]
     masses += [mass * float(noise.mass_range) for mass in masses]

@@ -20,7 +20,7 @@ from codesign_jax import rollout, use_compilation_cache
 from codesign_jax import scene as scenes
 from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.engines import make_engine
-from codesign_jax.scene import Scene, parameters
+from codesign_jax.scene import Scene, parameters, silicones
 from codesign_jax.scene.effects import EFFECTS, ENGINES, refusals
 from codesign_jax.statistics import wilson
 from codesign_jax.types import failed
@@ -47,6 +47,8 @@ def variants(base: Scene) -> dict[str, Scene]:
 
 
 def changed(base: Scene, **effects: Any) -> Scene:
+    if "neo_hookean" in effects:  # a modulus belongs to its law
+        base = silicones.under(base, neo_hookean=effects["neo_hookean"])
     return dataclasses.replace(base, effects=dataclasses.replace(base.effects, **effects))
 
 

@@ -90,7 +90,9 @@ VARIANTS: dict[str, Variant] = {
     "twice the stiffness": Variant(changes=("contact.normal_stiffness=8000",)),
     "half the dissipation": Variant(changes=("contact.dissipation_time=0.003",)),
     "air mass": Variant(changes=("effects.air_mass=true",)),
-    "neo-Hookean": Variant(changes=("effects.neo_hookean=true",)),
+    "linear law": Variant(
+        changes=("hand.material.law=linear", "hand.material.shear_modulus=49.5e3")
+    ),
     "lateral threshold": Variant(changes=("effects.lateral_threshold=true",)),
     "spheres": Variant(changes=(SPHERES,)),
     "spheres, MuJoCo C": Variant(changes=(SPHERES,), few=True, engine="mujoco"),

@@ -62,7 +62,7 @@ CHANGES = (
     Change("fingers creep on one another", "standard", "fingers creep", MODELS),
     Change("pressure resists sideways bending", "standard", "lateral threshold", MODELS),
     Change("a mass of air in each chamber", "standard", "air mass", MODELS),
-    Change("neo-Hookean bending", "standard", "neo-Hookean", MODELS),
+    Change("the other bending law", "standard", "linear law", MODELS),
     Change("spheres in place of the hull", "standard", "spheres", MODELS),
     Change("fingers pass one another", "standard", "fingers pass each other", MODELS),
     Change("fingers pass the palm", "standard", "fingers pass the palm", MODELS),

@@ -17,6 +17,7 @@ from codesign_jax.export import grasps, plain, process, sheet, tables, valves
 from codesign_jax.export.process import Process, Size
 from codesign_jax.runs.choice import Case
 from codesign_jax.runs.progress import Busy
+from codesign_jax.scene.objects import Shape
 from codesign_jax.scene.schema import InputError
 from codesign_jax.terminal import Console
 from codesign_jax.types import Params, Trial
@@ -218,6 +219,12 @@ def _trials(case: Case, options: Export) -> list[tuple[str, Trial]]:
     return [(name, jax.tree.map(np.asarray, trial)) for name, trial in found]
 
 
+def _described(shape: Shape) -> str:
+    """An object with its full sizes, mass and friction."""
+    sizes = " x ".join(f"{2e3 * half:.0f}" for half in shape.half_sizes if half)
+    return f"{shape.name} ({sizes} mm, {1e3 * shape.mass:.0f} g, friction {shape.friction:g})"
+
+
 def _sheet(
     case: Case,
     params: Params,
@@ -241,7 +248,7 @@ def _sheet(
     source = f"Best final design of {options.run_folder}" if options.run_folder else "Design"
     code = provenance.git_state()
     version = provenance.environment()["versions"]["codesign-jax"]  # type: ignore[index]
-    objects = ", ".join(s.name for s in case.scene.objects.object)
+    objects = ", ".join(map(_described, case.scene.objects.object))
     lines = [
         f"{source}; scene {case.scene.name}, objects {objects}; "
         f"codesign-jax {version}, commit {code['commit'] or 'unknown'}"

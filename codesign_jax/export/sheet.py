@@ -95,8 +95,9 @@ def idle_fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> list[st
         if travel < IDLE:
             found.append(
                 f"finger {i} does next to nothing: {size.length:.0f} mm long, it bends by "
-                f"{np.degrees(angle):.0f}° and moves its tip by {travel:.1f} mm; its moulds and "
-                "its valve may not be worth making"
+                f"{np.degrees(angle):.0f}° and moves its tip by {travel:.1f} mm. It may be left "
+                "out, with its seat empty and its column of valves.csv unused; the simulation "
+                "has it"
             )
     return found
 
@@ -202,11 +203,30 @@ def _arm(scene: Scene, params: Params) -> SheetSection:
         f"Key frames of the control {scene.control.name!r}: pose of the arm frame, which is the "
         "middle of the palm's underside while the wrist is not deflected; between them linear"
         + (f", but held after row {', '.join(str(i + 1) for i in held)}" if held else "")
-        + ". Every time step, with the shaking that tests the grasp: commands.csv, of the same "
-        "angles, signs and quaternion.",
+        + ". commands.csv has every time step, in the same angles, signs and quaternion, and in "
+        "addition the shaking that tests the grasp, from the lift until the chambers are empty.",
+        _clearance(scene, rows),
         f"{pose.CONVENTION} The drawing on the last page of {NAME}.pdf shows each angle.",
     ]
     return SheetSection("Arm", (*head, "quaternion w x y z"), rows, notes)
+
+
+def _clearance(scene: Scene, rows: Sequence[Sequence[str]]) -> str:
+    """How near the table the palm's rim is commanded, of rows of `_arm`."""
+    radius = 1e3 * scene.hand.palm.radius
+    lowest, time = np.inf, ""
+    for row in rows:
+        w, x, y, z = map(float, row[-1].split())
+        upright = Rotation.from_quat([x, y, z, w]).as_matrix()[2, 2]
+        height = float(row[3]) - radius * np.sqrt(max(0.0, 1.0 - upright**2))
+        if height < lowest:
+            lowest, time = height, row[0]
+    return (
+        f"The palm's rim, {radius:.0f} mm from its middle, is commanded to {lowest:.0f} mm above "
+        f"the table at the lowest ({time} s), before the wrist gives way. The printed palm, its "
+        "bars and whatever is behind it reach further than the simulated disc: move the empty "
+        "hand there slowly first."
+    )
 
 
 def _valves(scene: Scene, params: Params) -> SheetSection:

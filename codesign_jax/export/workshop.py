@@ -247,9 +247,10 @@ def _wrist(scene: Scene, sizes: Sequence[Size], printed: Printed | None) -> Shee
     ]
     ratio = wrist.linear_damping / (2 * math.sqrt(k * mass))
     notes = [
-        f"The simulated hand hangs on springs in six directions, palm and fingers of "
-        f"{1e3 * mass:.0f} g. Its weight lowers it by {sag:.0f} mm: the arm's z is that of the "
-        "undeflected wrist, so leave commands.csv as it is.",
+        "The simulated hand hangs on springs in six directions, palm and fingers of "
+        f"{1e3 * mass:.0f} g (without the fingers' roots, which the palm's mass has). Its weight "
+        f"lowers it by {sag:.0f} mm: the arm's z is that of the undeflected wrist, so leave "
+        "commands.csv as it is.",
         "**A stock part:** an arm with Cartesian impedance control (Franka Research 3, KUKA LBR "
         f"iiwa) is such a wrist. Screw the palm to its flange, set {k:g} N/m in translation, "
         f"{turn:g} N m/rad in rotation and a damping ratio of {ratio:.2g}, and give the controller "
@@ -267,8 +268,9 @@ def _mechanical(scene: Scene, sag: float, printed: Printed | None) -> str:
     text = (
         f"**To build** (drawing: last page of {NAME}.pdf): three miniature linear guides, crossed, "
         f"one above the other, each with {math.ceil((sag + 30) / 10) * 10:.0f} mm of travel to "
-        f"either side, a pair of tension springs of {k / 2e3:.3g} N/mm against each other, and a "
-        f"dashpot of {wrist.linear_damping:g} N s/m. Below them the palm on four rubber buffers"
+        "either side, two tension springs that pull against each other, of "
+        f"{k / 2e3:.3g} N/mm each, and a dashpot of {wrist.linear_damping:g} N s/m. Below them the "
+        "palm on four rubber buffers"
     )
     if not printed or not printed.flange:
         return f"{text}, that give {turn:g} N m/rad about each axis."
@@ -276,9 +278,9 @@ def _mechanical(scene: Scene, sag: float, printed: Printed | None) -> str:
     axial, shear = turn / (2 * radius**2) / 1e3, turn / (4 * radius**2) / 1e3
     return (
         f"{text} with {printed.flange[1]} studs in the screw holes of the palm, each with "
-        f"{axial:.0f} N/mm along and {shear:.0f} N/mm across (K/2r² and K/4r² of the circle's "
-        "radius r). Stock buffers are softer across: take those that are right along, and test "
-        "the angles as in the table."
+        f"{axial:.0f} N/mm along and {shear:.0f} N/mm across (K/2r² and K/4r² at a distance r of "
+        f"{1e3 * radius:.1f} mm from the middle). Most buffers are softer across than that: choose "
+        "them by their stiffness along, and test the angles as in the table."
     )
 
 
@@ -311,8 +313,8 @@ def _order(
         "Thread: wind it around the finger from the base to the tip, a turn every "
         f"{PITCH:g} mm, snug and not pressing in; not around the root. Fix both ends with a drop "
         "of silicone and rub a film over all of it.",
-        "Tube: push 10 mm of it through the root into the chamber, seal with silicone adhesive "
-        "around it, cure.",
+        "Tube: push it through the root until 10 mm of it, or half of a shorter chamber, are "
+        "inside, seal with silicone adhesive around it, cure.",
         f"Leak test: under water at {test:.0f} kPa for a minute, no bubbles; then close the tube: "
         "the pressure must fall by less than 5 % in a minute [chosen]. Paint leaks with silicone "
         "and test again.",
@@ -329,9 +331,10 @@ def _order(
         "lies on the table with the wrist undeflected; x = y = 0 is the object's place. Turn by "
         "+20° of roll, yaw and pitch, each alone, and compare with the drawing before anything "
         "else moves.",
-        "Valves: finger 0 on channel 0 and so on. Play valves.csv with the hand in the air "
-        "(play_valves.py), then commands.csv with neither object nor pressure, then with both, "
-        "then with the object. Keep hands away: the arm ends where the file says.",
+        "Valves: finger 0 on channel 0 and so on. First play the pressures alone, with the hand in "
+        "the air (play_valves.py). Then play the arm alone, without pressure and without an object "
+        "(commands.csv). Then play both without an object, and at last with one. Start both from "
+        "one clock: the times of valves.csv and commands.csv are the same. Keep hands away.",
     )
     if printed is None:
         steps = steps[:8] + ("Fix each finger to a palm of your own (--no-parts).", *steps[9:])

@@ -90,7 +90,8 @@ def refuse_draws(key: Any, count: int) -> None:
     """Refuses arguments of `rollout.sample_trials` from which no trials can be drawn."""
     if not isinstance(count, int | np.integer) or count < 1:
         raise InputError([f"num_trials = {count} must be a whole number, at least 1"])
-    shape, kind = jnp.shape(key), jnp.result_type(key)
+    shape = jnp.shape(key)
+    kind = jnp.result_type(key)
     if shape or not jnp.issubdtype(kind, jax.dtypes.prng_key):
         words = f"key must be one typed key from jax.random.key, got shape {shape} of {kind}"
         raise InputError([words])

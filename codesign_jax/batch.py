@@ -69,8 +69,11 @@ class Batch:
         self, task: Task, optimizer: Optimizer, *, devices: int | None = None, limit: int = LIMIT
     ):
         """Compiles nothing yet."""
-        self._task, self._optimizer, self._parts = task, optimizer, None
-        self._joins, self._limit = staged(task.engine).joins, limit
+        self._task = task
+        self._optimizer = optimizer
+        self._parts = None
+        self._joins = staged(task.engine).joins
+        self._limit = limit
         self.devices = take(devices)
         self._programs: dict[Any, Callable] = {}
 
@@ -80,7 +83,8 @@ class Batch:
         self._program("draw", parts.draw.compile, *request)
         self._program("before", parts.before.compile, *request)
         packed = jax.eval_shape(parts.before, *request)
-        total, count = min(runs, self._group(request)), len(self.devices)
+        total = min(runs, self._group(request))
+        count = len(self.devices)
         shares = _shares(total * _length(packed.blocks), count) if self._joins else [0] * total
         for device, share in zip(self.devices, shares, strict=False):
             blocks = _resized(packed.blocks, share) if self._joins else packed.blocks
@@ -139,7 +143,8 @@ class Batch:
         all programs would be compiled again in the middle.
         """
         if self._parts is None:
-            task, joined = self._task, min(runs, self._group(request))
+            task = self._task
+            joined = min(runs, self._group(request))
             worlds = -(-joined * self._worlds(request) // len(self.devices))
             engine, space, trials, options = task.how
             made = _stages(engine, space, block_lanes(engine, worlds), trials, options)
@@ -189,7 +194,8 @@ class Batch:
         return self._launcher(blocks, common, device)(blocks, common)
 
     def _launcher(self, blocks: tuple, common: tuple, device: Device) -> Callable:
-        place, parts = jax.sharding.SingleDeviceSharding(device), self._parts
+        place = jax.sharding.SingleDeviceSharding(device)
+        parts = self._parts
         assert parts is not None
 
         def lower(blocks: tuple, common: tuple) -> Callable:
@@ -247,7 +253,8 @@ def _stages(
         scene: Scene,
         optimizer: Optimizer,
     ) -> tuple[State, EpisodeInfo]:
-        (state, packed), (mask, out) = begun, found
+        state, packed = begun
+        mask, out = found
         trace = stages.unpack(out, len(packed.population) * num_trials)
         judged = trace, packed.ctrl, packed.initial, packed.trials
         outcome = rollout.judge(scene, *judged, options)
@@ -365,7 +372,8 @@ def _split_now(runs: tuple[tuple, ...], parts: int) -> list[tuple]:
 
 def _gather_now(parts: tuple[tuple, ...], runs: int) -> list[tuple]:
     def in_place(*dealt: jax.Array) -> jax.Array:
-        total, first = sum(len(v) for v in dealt), dealt[0]
+        total = sum(len(v) for v in dealt)
+        first = dealt[0]
         whole = jnp.zeros((total, *first.shape[1:]), first.dtype)
         for part, values in enumerate(dealt):
             whole = whole.at[part :: len(dealt)].set(values)

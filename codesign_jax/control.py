@@ -85,7 +85,8 @@ def _place(scene: Scene, params: Params, time: np.ndarray) -> tuple[jax.Array, .
     at = key_frames.times(scene, params)
     now = jnp.asarray(time, at.dtype)
     reached = (at <= now[:, None]).sum(1)
-    before, after = jnp.maximum(reached - 1, 0), jnp.minimum(reached, len(at) - 1)
+    before = jnp.maximum(reached - 1, 0)
+    after = jnp.minimum(reached, len(at) - 1)
     span = at[after] - at[before]
     share = (now - at[before]) / jnp.where(span > 0, span, 1.0)
     held = np.array([frame.interpolation == "held" for frame in scene.control.frame])
@@ -114,7 +115,8 @@ def supplied(
     Returns:
       The pressures, and those at the end of the last step, shape (finger,).
     """
-    p, h = scene.pneumatics, scene.discretization.timestep
+    p = scene.pneumatics
+    h = scene.discretization.timestep
     lagging = p.lag > 0
     gain = jnp.where(lagging, -jnp.expm1(-h / jnp.where(lagging, p.lag, 1.0)), 1.0)
     target = reachable(scene, wanted)
@@ -139,7 +141,8 @@ def _shake(scene: Scene, time: np.ndarray) -> tuple[jax.Array, jax.Array]:
     """
     if not scene.effects.disturb:
         return jnp.zeros(len(time)), jnp.zeros(len(time))
-    p, arm = scene.phases, scene.arm
+    p = scene.phases
+    arm = scene.arm
     inside = jnp.clip(time, p.lift, p.disturb) - p.lift
     growth = jnp.deg2rad(arm.shake_amplitude) * inside / (p.disturb - p.lift)
     period = arm.shake_frequency * inside

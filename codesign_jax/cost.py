@@ -43,7 +43,9 @@ def outcome(
       trial: The trial, by the size of whose object it is told whether a released one rests on the
         table; without it by the largest object of the set.
     """
-    steps, (start, end), dtype = trace.distance.shape[0], scene.window, trace.distance.dtype
+    steps = trace.distance.shape[0]
+    start, end = scene.window
+    dtype = trace.distance.dtype
     lost_step = _first(verdict.lost(verdict.bounds(scene), trace.distance, np.arange(steps)))
     bits = verdict.failures(scene, trace)
     bits = bits.at[0].set(bits[0] | jnp.asarray(initial, jnp.int32))

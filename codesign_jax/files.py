@@ -58,7 +58,8 @@ def special(folder: Path, names: Iterable[str]) -> list[str]:
     Returns:
       Paths relative to the folder, sorted.
     """
-    found, left = [], [*names]
+    found = []
+    left = [*names]
     while left:
         name = left.pop()
         try:
@@ -177,7 +178,8 @@ def _move(part: Path, path: Path, *, replace: bool) -> None:
             return
     if not replace and any(path.iterdir()):
         raise FileExistsError(errno.EEXIST, "has files that were not there when this call began")
-    before, after = _listed(path), _listed(part)
+    before = _listed(path)
+    after = _listed(part)
     # A process that is killed in between leaves a list of both, so that the next call finds all.
     path.mkdir(exist_ok=True)
     with atomically(path / MANIFEST) as temporary:

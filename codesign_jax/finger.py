@@ -65,7 +65,8 @@ class Finger(NamedTuple):
 
 def of_design(scene: Scene, params: Params, index: int) -> Finger:
     """A hand's finger."""
-    hand, links = scene.hand, scene.discretization.links
+    hand = scene.hand
+    links = scene.discretization.links
     params = jax.tree.map(lambda v: np.asarray(v, float), params)
     beams = morphology.finger_beams(hand, params, links)
     springs, _ = morphology.joint_springs(hand, params, beams, links, ("bend",))
@@ -115,7 +116,9 @@ class Rest(NamedTuple):
         Raises:
           NoRest: If the joints cannot be balanced.
         """
-        n, moment, unit = finger.links, pressure * finger.gain, float(finger.stiffness[0])
+        n = finger.links
+        moment = pressure * finger.gain
+        unit = float(finger.stiffness[0])
         reach = finger.segment * np.append(np.ones(n - 1), 0.5)  # of the bodies behind the joints
 
         def tip(angles: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -254,7 +257,8 @@ def fit(finger: Finger, table: Mapping[str, np.ndarray]) -> Fit:
         errors = np.concatenate([(model[n] - table[n]) / sizes[n] for n in names])
         return errors[np.isfinite(errors)]
 
-    numbers, count = int(free.sum()), _different_values(table, names)
+    numbers = int(free.sum())
+    count = _different_values(table, names)
     if count < numbers:
         raise ValueError(f"{count} measured value does not give {numbers} numbers")
     found = optimize.least_squares(residual, np.zeros(numbers), x_scale=0.3, diff_step=1e-4)

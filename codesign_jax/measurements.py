@@ -146,7 +146,8 @@ def _rows(
 
 def _columns(head: list[str], problems: list[str]) -> tuple[list[str], list[float]]:
     """Names of the columns, and how many SI units theirs are."""
-    names, factors = [], []
+    names = []
+    factors = []
     for column in head:
         name, _, unit = column.rpartition("_")
         if name not in COLUMNS:

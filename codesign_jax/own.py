@@ -66,7 +66,8 @@ def contents(names: Iterable[str]) -> dict[str, bytes]:
 
 def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
     """Imports a cost and tries it without values; also whether a grasp ends where it is lost."""
-    flag, cost = f"--cost {name}", _load(name, "--cost")
+    flag = f"--cost {name}"
+    cost = _load(name, "--cost")
     _refuse_signature(flag, cost, ("scene", "trace", "ctrl"))
     stops = getattr(cost, "stop_when_lost", False)
     if not isinstance(stops, bool):
@@ -119,7 +120,8 @@ def _policy(flag: str, code: Any, scene: Scene) -> tuple[Policy, Scene]:
 
 def make_optimizer(name: str, space: Space, num_particles: int | None = None) -> Optimizer:
     """Imports an optimiser's class, or whatever makes one from a space."""
-    flag, make = f"--optimizer {name}", _load(name, "--optimizer")
+    flag = f"--optimizer {name}"
+    make = _load(name, "--optimizer")
     _refuse_signature(flag, make, ("space",))
     made = _tried(flag, make, lambda: make(space))
     missing = [n for n in ("space", "keeps_best", "init", "ask", "tell") if not hasattr(made, n)]
@@ -138,8 +140,10 @@ def make_optimizer(name: str, space: Space, num_particles: int | None = None) ->
 
 
 def _try(flag: str, make: Any, made: Optimizer, n: int) -> None:
-    low, high = np.asarray(made.space.low), np.asarray(made.space.high)
-    seed, mask = jnp.asarray((low + high) / 2, float), np.ones(low.shape, bool)
+    low = np.asarray(made.space.low)
+    high = np.asarray(made.space.high)
+    seed = jnp.asarray((low + high) / 2, float)
+    mask = np.ones(low.shape, bool)
     state = _tried(flag, make, lambda: made.init(jax.random.key(0), seed, n))
     if not isinstance(state, State) or np.shape(state.particles) != (n, low.size):
         raise InputError(

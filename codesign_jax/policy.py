@@ -147,7 +147,9 @@ class ControlLoop(Equal):
         if not callable(policy):
             words = f"policy is {policy!r:.60}, not a function of (carry, observation)"
             raise InputError([words])
-        self.engine, self.policy, self.name = engine, policy, engine.name
+        self.engine = engine
+        self.policy = policy
+        self.name = engine.name
         self.scene: Scene = engine.scene  # type: ignore[attr-defined]
         self.steps = period_steps(self.scene, getattr(policy, "period", None))
 
@@ -169,7 +171,8 @@ class ControlLoop(Equal):
             a command that is not finite: inside of `jax.jit` such a world has failed (NONFINITE).
         """
         plan: Plan = ctrl
-        hand, pack = world_constants(self.scene, fields), getattr(self.engine, "tables", None)
+        hand = world_constants(self.scene, fields)
+        pack = getattr(self.engine, "tables", None)
         # Worlds keep their constants, which a GPU would take a millisecond a period to lay out.
         how = {} if pack is None else {"tables": pack(fields)}
         series = {"pose": plan.pose, "pressure": plan.pressure, "shake": plan.shake}
@@ -183,7 +186,8 @@ class ControlLoop(Equal):
             )
             return (world, told), trace._replace(last=None)
 
-        carry, found = (begin(self.scene, fields, plan), self._remembered(plan.params)), []
+        carry = (begin(self.scene, fields, plan), self._remembered(plan.params))
+        found = []
         periods, rest = divmod(plan.pose.shape[1], self.steps)
         if periods:
             now = {k: _split(v[:, : periods * self.steps], periods) for k, v in series.items()}
@@ -221,7 +225,8 @@ class ControlLoop(Equal):
         plan = jax.vmap(partial(control.plan, self.scene))(params, trial)
         steps = min(self.steps, self.scene.num_steps)
         series = {k: getattr(plan, k)[:, : periods * steps] for k in ("pose", "pressure", "shake")}
-        hand, world = world_constants(self.scene, fields), begin(self.scene, fields, plan)
+        hand = world_constants(self.scene, fields)
+        world = begin(self.scene, fields, plan)
         state = model.split(self.scene, world.state)
 
         def period(memory: Any, now: tuple) -> tuple[Any, Command]:
@@ -347,10 +352,8 @@ def observe(
     step = model.split(scene, world.state).step[:, 0]
     phase, since = jax.vmap(_phase)(fields.constants, step)
     joint, rate = (jnp.moveaxis(v, (3, 2), (0, 1)) for v in (state.finger, state.finger_vel))
-    palm, thing = (
-        pose(found.place[:, 0], found.palm[:, :, 0]),
-        pose(none[:, 0], found.object[:, :, 0]),
-    )
+    palm = pose(found.place[:, 0], found.palm[:, :, 0])
+    thing = pose(none[:, 0], found.object[:, :, 0])
     return Observation(
         time=step * scene.discretization.timestep,
         phase=phase,
@@ -398,7 +401,8 @@ def spread(scene: Scene, command: Command, plan: Plan, *, of: str) -> Command:
     Args:
       command: Commands with a leading axis (world,).
     """
-    problems, found = [], []
+    problems = []
+    found = []
     for name, like in (("pose", plan.pose), ("pressure", plan.pressure)):
         given = jnp.asarray(getattr(command, name), like.dtype)
         if given.shape == (len(like), like.shape[2]):
@@ -431,7 +435,8 @@ def advance(
     scene: Scene = engine.scene  # type: ignore[attr-defined]
 
     def controls(own: Scene, now: jax.Array, shake: jax.Array, tilt: jax.Array, told: Command):
-        pressure, end = told.pressure, told.pressure[-1]
+        pressure = told.pressure
+        end = told.pressure[-1]
         if scene.effects.pressure_dynamics:
             pressure, end = control.supplied(own, pressure, now)
         return control.actuated(told.pose, pressure, shake, tilt), end

@@ -75,7 +75,8 @@ def mesh_notes(scene: Scene) -> list[str]:
 
 
 def _scene_warnings(scene: Scene) -> list[str]:
-    h, found = scene.discretization.timestep, key_frames.doubts(scene, "control")
+    h = scene.discretization.timestep
+    found = key_frames.doubts(scene, "control")
     rate = scene.arm.shake_frequency
     if scene.effects.disturb and rate * h * SHAKE_STEPS > 1:
         found.append(

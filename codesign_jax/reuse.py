@@ -41,7 +41,8 @@ _UNTRACED = ("compiler", "files", "reuse", "store")
 
 def _state() -> dict[str, tuple[int, ...]]:
     """Each file of code, with the time of its inode's last change, which no program sets back."""
-    found, folders = {}, [""]
+    found = {}
+    folders = [""]
     with contextlib.suppress(OSError):  # a file goes away while its state is read
         while folders:
             folder = folders.pop()
@@ -102,7 +103,8 @@ def replaced() -> list[str]:
 
 
 def _names(module: object) -> dict[str, object]:
-    found, own = {}, getattr(module, "__name__", None)
+    found = {}
+    own = getattr(module, "__name__", None)
     for name, value in getattr(module, "__dict__", {}).items():
         if name.startswith("__"):
             continue
@@ -246,13 +248,15 @@ def check_programs(place: Path) -> None:
     JAX (`lru_cache.py`) writes no program as a whole and writes over nothing: what a full disk or a
     power cut left would stay, with a warning in each process.
     """
-    checked, now = place / "checked", time.time_ns()
+    checked = place / "checked"
+    now = time.time_ns()
     with contextlib.suppress(OSError):  # no folder, a read-only one, or a full disk: no matter
         last = checked.stat().st_mtime_ns - 10**9 if checked.exists() else 0
         for path in place.glob("*-cache"):
             with contextlib.suppress(OSError):  # another process deletes as well
                 files.clear_place(path)
-                used, written = path.with_name(f"{path.name[:-6]}-atime"), path.stat().st_mtime_ns
+                used = path.with_name(f"{path.name[:-6]}-atime")
+                written = path.stat().st_mtime_ns
                 if written > last and not _complete(path.read_bytes()):
                     path.unlink()
                 elif not used.exists():  # JAX's limit of size needs it of every program
@@ -347,7 +351,9 @@ class Program:
 
     def __init__(self, scene: Any, jitted: Any, *more: Any):
         """Joins a program with its scene, and further arguments of every call."""
-        self._scene, self._jitted, self._more = scene, jitted, more
+        self._scene = scene
+        self._jitted = jitted
+        self._more = more
 
     def __call__(self, first: Any, second: Any, scene: Any = None) -> Any:
         """Calls the program; the scene is checked and takes the place of its own."""

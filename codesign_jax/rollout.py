@@ -76,7 +76,8 @@ class Options(NamedTuple):
 
 
 # Folded into a trial's key for draws that came later, so that earlier ones stay as they are.
-_LATER, _HAND_MASS = 1, 2
+_LATER = 1
+_HAND_MASS = 2
 
 
 def sample_trials(
@@ -116,7 +117,9 @@ def _draw(
         # The first numbers of a key are the same however many are drawn, so that one draw of all
         # is three draws, with two thirds of the operations.
         every = jax.vmap(lambda k: jax.random.normal(k, (7,)))(jnp.append(own, others))
-        z, later, hand_mass = every[0], every[1], every[2, 0]
+        z = every[0]
+        later = every[1]
+        hand_mass = every[2, 0]
         angles = jnp.deg2rad(noise.orientation) * z[2:5]
         return Trial(
             shape=t % shapes,
@@ -146,7 +149,9 @@ def nominal_trial(scene: Scene, shape: int | str = 0) -> Trial:
         hint = schema.nearest(str(shape), names)
         raise schema.InputError([f"object {shape!r} unknown in {scene.objects.name}; {hint}"])
     index = names.index(shape) if isinstance(shape, str) else shape
-    zero, none, one = jnp.zeros(()), jnp.zeros(2), jnp.ones(())
+    zero = jnp.zeros(())
+    none = jnp.zeros(2)
+    one = jnp.ones(())
     return Trial(jnp.int32(index), none, zero, none, one, one, one, one, one, none)
 
 
@@ -247,7 +252,8 @@ def crossed(scene: Scene, params: Params, trials: Trial) -> tuple[Scene, Params,
 
     Of the scene's numbers those with an axis have the trials'.
     """
-    particles, count = params.length.shape[0], trials.yaw.shape[0]
+    particles = params.length.shape[0]
+    count = trials.yaw.shape[0]
     every_p = jax.tree.map(lambda v: jnp.repeat(v, count, axis=0), params)
     every_t = jax.tree.map(lambda v: jnp.tile(v, (particles,) + (1,) * (v.ndim - 1)), trials)
     own = jax.tree.map(lambda v: jnp.tile(v, particles) if jnp.ndim(v) else v, scene)

@@ -27,7 +27,8 @@ from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, Trial
 
-_DESIGNS, _TRIALS = 0, 1
+_DESIGNS = 0
+_TRIALS = 1
 """Folded into the key for designs and for trials."""
 
 
@@ -74,7 +75,8 @@ def _drawn(
 ) -> Drawn:
     """`draw` for any scene of a structure; one program for a number of designs and trials."""
     designs = space.sample(jax.random.fold_in(key, _DESIGNS), n, first=first)
-    root, shapes = jax.random.fold_in(key, _TRIALS), len(scene.objects.object)
+    root = jax.random.fold_in(key, _TRIALS)
+    shapes = len(scene.objects.object)
 
     def trials(i: jax.Array) -> Trial:
         own = jax.random.fold_in(root, i)

@@ -73,7 +73,8 @@ def depth_between(scene: Scene, fields: ModelFields) -> jax.Array:
     As spheres around the links' middles, as high as the section: the vertices of two hulls in one
     and the same place would not stand inside one another.
     """
-    worlds, count = fields.start.shape[0], scene.num_fingers
+    worlds = fields.start.shape[0]
+    count = scene.num_fingers
     if not scene.effects.finger_finger or count == 1:
         return jnp.full((worlds,), -jnp.inf, fields.start.dtype)
     hand, kin, _ = _straight(scene, fields)
@@ -102,5 +103,6 @@ def depth_in_palm(scene: Scene, fields: ModelFields) -> jax.Array:
 @partial(jax.jit, static_argnums=0)
 def _straight(scene: Scene, fields: ModelFields) -> tuple[WorldModel, Kinematics, jax.Array]:
     """Worlds with straight fingers, and the place of the object's centre, (3, 1, world)."""
-    state, hand = reset(scene, fields), world_constants(scene, fields)
+    state = reset(scene, fields)
+    hand = world_constants(scene, fields)
     return hand, straight(hand, state), state.position

@@ -32,7 +32,8 @@ def paired(both: int, first: int, second: int, total: int) -> Interval:
     It joins Wilson's intervals of the two shares by their correlation: with no trial in which the
     two differ it has a width, unlike Wald's and the bootstrap's.
     """
-    one, other = wilson(both + first, total), wilson(both + second, total)
+    one = wilson(both + first, total)
+    other = wilson(both + second, total)
     neither = total - both - first - second
     product = (both + first) * (second + neither) * (both + second) * (first + neither)
     together = both * neither - first * second

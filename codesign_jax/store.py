@@ -21,7 +21,8 @@ MOST = 2**30
 """Most bytes of arrays that a file may unpack to."""
 SCHEMA = 2
 """Layout of results, in which their arrays have names and shapes."""
-_DIGEST, _HEADS = "digest", ("about", "code", "schema")
+_DIGEST = "digest"
+_HEADS = ("about", "code", "schema")
 
 Arrays = Mapping[str, Any]
 

@@ -87,7 +87,9 @@ class Stress(NamedTuple):
             share, low, high = wilson(int(kept.sum()), total)
             what = ""
             if kept.size > 1:
-                low, high, what = kept.min() / self.trials, kept.max() / self.trials, ", by draw"
+                low = kept.min() / self.trials
+                high = kept.max() / self.trials
+                what = ", by draw"
             span = f"{100 * low:.0f} to {100 * high:.0f} %{what}"
             found.append((name, f"{100 * share:.0f} % of {total}", span))
         return found
@@ -117,7 +119,8 @@ def simulate(
     case: Case, trials: int, key: jax.Array, done: Callable[[int], None] = lambda grasps: None
 ) -> Stress:
     """Simulates the design under every condition, in the same trials; `done` counts the grasps."""
-    scene, design = case.scene, jnp.asarray(case.design, jnp.float32)
+    scene = case.scene
+    design = jnp.asarray(case.design, jnp.float32)
 
     def simulated(run: Program, *constants: Scene) -> tuple[Outcome, jax.Array, Trial]:
         result = interruptible(run, design, key, *constants)
@@ -154,7 +157,8 @@ def variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
     for heavier in dict.fromkeys(sets):
         if heavier != (*masses,):
             grams = dict.fromkeys(f"{1e3 * m:.0f}" for m in (min(heavier), max(heavier)))
-            path, place = ("objects", "object", "mass"), iter(heavier)
+            path = ("objects", "object", "mass")
+            place = iter(heavier)
             own = _changed(scene, path, lambda _, place=place: next(place))
             yield f"objects of {' to '.join(grams)} g", own
     own = _changed(scene, ("objects", "object", "friction"), lambda _: FRICTION)
@@ -202,7 +206,8 @@ def _in_grasps(
     first = [kept[trials.shape[kept] == k][:1] for k in range(len(scene.objects.object))]
     times = np.arange(qpos.shape[1]) * HELD
     closed, held, end = (scene.steps_to(t) for t in (scene.phase_ends["approach"], *scene.window))
-    whole, hold = (times >= closed) & (times < end), (times >= held) & (times < end)
+    whole = (times >= closed) & (times < end)
+    hold = (times >= held) & (times < end)
     bends = overlap.bend_angles(scene, qpos[kept])
     lines = of_bends(overlap.wall_strain(scene, params, bends[:, whole]), bends[:, hold])
     depths = []
@@ -219,7 +224,8 @@ def _poses(
     """Places (state, body, 3) and orientations (state, body, 3, 3) of bodies, by MuJoCo C."""
     fields = jax.jit(model.model_fields, static_argnums=0)(scene, params, trial)
     compiled = world_model(scene, jax.tree.map(np.asarray, fields))
-    data, found = mujoco.MjData(compiled), []
+    data = mujoco.MjData(compiled)
+    found = []
     for state in qpos:
         data.qpos[:] = state
         mujoco.mj_kinematics(compiled, data)
@@ -259,7 +265,8 @@ def of_bends(strain: np.ndarray, held: np.ndarray) -> list[str]:
     """
     if not strain.size:
         return []
-    found, most = [], strain.max((0, 1, 3))
+    found = []
+    most = strain.max((0, 1, 3))
     for f in np.flatnonzero(most > STRAIN):
         found.append(
             f"finger {f}: its walls stretch by {100 * most[f]:.0f} % in grasps, more than the "

@@ -278,7 +278,8 @@ class Trace(NamedTuple):
         >>> round(float(held.distance), 3), round(float(trace.distance[-1]), 3)
         (0.02, 0.5)
         """
-        index, steps = scene.last_step(phase), jnp.shape(self.distance)[-1]
+        index = scene.last_step(phase)
+        steps = jnp.shape(self.distance)[-1]
         if jnp.ndim(index):
             raise ValueError("the scene's phases differ between worlds: map over them by jax.vmap")
         if steps != scene.num_steps:

@@ -136,7 +136,8 @@ def verdicts(outcomes: Outcome) -> np.ndarray:
     """
     status = np.asarray(outcomes.status)
     lost = np.isfinite(outcomes.lost_time)
-    held, broken = VERDICTS.index("not_released"), VERDICTS.index("failed")
+    held = VERDICTS.index("not_released")
+    broken = VERDICTS.index("failed")
     bad = np.where(status & Status.STUCK, held, broken)
     return np.where(failed(status), bad, lost.astype(int))
 
@@ -195,7 +196,8 @@ RULE = (
 
 OPEN = "not enough trials"
 """What is said of a design until its trials decide."""
-_OF_KEPT, _OF_LOST = math.log(WANTED / POOR), math.log((1 - POOR) / (1 - WANTED))
+_OF_KEPT = math.log(WANTED / POOR)
+_OF_LOST = math.log((1 - POOR) / (1 - WANTED))
 # By Ville's inequality a likelihood ratio exceeds 1 / ERROR at any time with at most that
 # probability, however often it is looked at; Wald's own bound, (1 - ERROR) / ERROR, is less strict.
 _DECISIVE = math.log(1 / ERROR)
@@ -311,7 +313,10 @@ def characteristic(share: float, batch: int = BATCH, most: int = MOST) -> Charac
     """
     from scipy import stats  # takes half a second to import: commands do so once they are done
 
-    undecided, ends, expected, total = np.ones(1), np.zeros(2), 0.0, 0
+    undecided = np.ones(1)
+    ends = np.zeros(2)
+    expected = 0.0
+    total = 0
     while total < most:
         count = min(batch, most - total)
         total += count

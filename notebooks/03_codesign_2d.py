@@ -74,7 +74,8 @@ def by_strategy(values):
     return np.asarray(values).reshape(len(strategies), seeds, *values.shape[1:])
 
 
-means, paths = by_strategy(infos.selection.mean_cost), by_strategy(infos.population.mean(2))
+means = by_strategy(infos.selection.mean_cost)
+paths = by_strategy(infos.population.mean(2))
 for name, mean in zip(strategies, means, strict=True):
     found = [codesign.convergence_episode(m) for m in mean]
     print(f"{name:>10}: converged from episode {[None if e is None else e + 1 for e in found]}")

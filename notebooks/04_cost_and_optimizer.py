@@ -48,7 +48,8 @@ space = parameters.design_space(grasping.hand, "2d")  # finger length and arm he
 # `stop_when_lost=True` it stops there, which is faster, and its last entry repeats.
 
 # %%
-closed, shaken = grasping.last_step("inflate") + 1, grasping.last_step() + 1
+closed = grasping.last_step("inflate") + 1
+shaken = grasping.last_step() + 1
 
 
 def looseness(scene, trace, ctrl):

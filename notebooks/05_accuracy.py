@@ -69,7 +69,8 @@ def costs(engine, step, links, calls=2):
 # %%
 settings = [("structured", 10, 2), ("mujoco", 10, 2)]
 if not FAST:
-    steps, links = (10, 5, 2.5), (5, 10)
+    steps = (10, 5, 2.5)
+    links = (5, 10)
     settings = [("structured", h, n) for h in steps for n in links] + [("mujoco", 10, 10)]
 reference, _ = costs(*(("mujoco", 5, 2) if FAST else ("structured", 1, 20)), calls=1)
 results = []
@@ -86,7 +87,8 @@ for engine, step, links in settings:
 # %%
 figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
 for engine, step, links, cost_ms, flips, bias in results:
-    marker, color = ("s" if engine == "mujoco" else "o"), f"C{[2, 5, 10, 20].index(links)}"
+    marker = "s" if engine == "mujoco" else "o"
+    color = f"C{[2, 5, 10, 20].index(links)}"
     for axis, value in zip(axes, (flips, bias), strict=True):
         axis.plot(cost_ms, value, marker, color=color)
         axis.annotate(f"{step:g} ms, {links}", (cost_ms, value), (4, 4), textcoords="offset points")

@@ -55,7 +55,8 @@ finger = dataclasses.replace(whole.hand, finger=whole.hand.finger[:1])
 bench = dataclasses.replace(whole, hand=finger)
 
 space = parameters.design_space(bench.hand)
-hand, trial = space.params(space.default()), rollout.nominal_trial(bench)
+hand = space.params(space.default())
+trial = rollout.nominal_trial(bench)
 time = np.arange(round(duration / step)) * step
 ctrl = np.zeros((len(time), 7), np.float32)  # six of the arm, one chamber
 ctrl[:, 2] = bench.arm.start_height  # m
@@ -80,7 +81,8 @@ def tips(engine, logs):
     fields = jax.tree.map(lambda v: jnp.asarray(v)[None], model.model_fields(other, hand, trial))
     trace = engine.rollout(fields, ctrl[None], trajectory=True)
     # Joints are in the middle of the segments: half a one before the first, half behind the last.
-    segment, angle = hand.length[0] / len(bends), jnp.cumsum(trace.qpos[0][:, bends], 1)
+    segment = hand.length[0] / len(bends)
+    angle = jnp.cumsum(trace.qpos[0][:, bends], 1)
     reach = segment * jnp.ones(len(bends)).at[-1].set(0.5)
     along = segment / 2 + (reach * jnp.cos(angle)).sum(1)
     return jnp.stack([along, -(reach * jnp.sin(angle)).sum(1)], 1)
@@ -96,7 +98,8 @@ measured += 3e-4 * jax.random.normal(jax.random.key(0), measured.shape)
 # gives the derivative by both numbers, whatever their count.
 
 # %%
-engine, variance = make_engine("structured", bench), jnp.var(measured, axis=0).mean()
+engine = make_engine("structured", bench)
+variance = jnp.var(measured, axis=0).mean()
 
 
 def misfit(logs):
@@ -121,7 +124,9 @@ print("misfit:", np.round(values, 4), "\nslope: ", np.round(slopes, 3))
 steps = 6 if FAST else 60
 adam = optax.adam(optax.cosine_decay_schedule(0.12, steps), b1=0.8, b2=0.95)
 logs = jnp.log(jnp.array([50e3, 0.006]))
-memory, history, first = adam.init(logs), [], None
+memory = adam.init(logs)
+history = []
+first = None
 for _ in range(steps):
     (value, last), slope = gradient(logs)
     first = last if first is None else first
@@ -129,7 +134,8 @@ for _ in range(steps):
     update, memory = adam.update(slope, memory)
     logs = optax.apply_updates(logs, update)
 history = np.array(history)
-names, true = ("shear modulus", "damping time"), np.exp(truth)
+names = ("shear modulus", "damping time")
+true = np.exp(truth)
 for name, wanted, value in zip(names, true, history[-1], strict=False):
     print(f"{name}: found {value:.4g}, true {wanted:.4g} ({100 * (value / wanted - 1):+.1f} %)")
 

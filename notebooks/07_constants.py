@@ -91,7 +91,8 @@ def kept(own, seed=0):
 # between the objects, so that neighbours, one of each, get one value.
 
 # %%
-kinds, levels = len(grasping.objects.object), 2 if FAST else 12
+kinds = len(grasping.objects.object)
+levels = 2 if FAST else 12
 given = grasping.objects.object[0].friction
 values = np.linspace(0.2, 1.4, levels)
 over = kept(scaled(friction=np.repeat(values, trials // levels) / given))
@@ -108,7 +109,8 @@ share = over.reshape(len(designs), levels, -1).mean(-1)
 random = np.random.default_rng(1)
 spreads = {"friction": 0.2, "stiffness": 0.15, "contact": 0.3, "palm": 0.2}
 factors = {k: np.exp(s * random.standard_normal(trials)) for k, s in spreads.items()}
-fixed, drawn = kept(scaled()).mean(1), kept(scaled(**factors)).mean(1)
+fixed = kept(scaled()).mean(1)
+drawn = kept(scaled(**factors)).mean(1)
 for design, a, b in zip(space.in_units(np.asarray(designs)), fixed, drawn, strict=True):
     print(
         f"{design[0]:.0f} mm, {design[1]:.0f} mm: keeps {a:.0%} as in the files, {b:.0%} at random"
@@ -122,7 +124,8 @@ for design, a, b in zip(space.in_units(np.asarray(designs)), fixed, drawn, stric
 # follows from the shares above: kept grasps are binomial.
 
 # %%
-hidden, seen = 0.55, trials // 2
+hidden = 0.55
+seen = trials // 2
 successes = kept(scaled(friction=hidden / given), seed=99)[:, :seen].sum(1)[:, None]
 count = trials // levels
 chance = (share * count + 1) / (count + 2)  # Laplace's rule: a few grasps never make 0 or 1

@@ -50,7 +50,8 @@ fields, ctrl, _ = rollout.prepare(grasping, hands, trials)
 # shaken for 0.3 s; then 0.2 s are measured, with a step of the pressures of 10 %, up or down.
 
 # %%
-begin, steps = 480, 20
+begin = 480
+steps = 20
 state = jax.jit(engine.rollout)(fields, ctrl[:, :begin]).last
 sign = np.where(np.arange(count) % 2, -1.0, 1.0)[:, None, None]
 window = ctrl[:, begin : begin + steps].at[:, :, 6:].multiply(1 + 0.1 * sign)

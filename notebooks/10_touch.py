@@ -60,8 +60,10 @@ class Touch(env.GraspEnv):
     """Its observation is (finger, feature), flat: four of time, then what each finger feels."""
 
     def observe(self, seen):
-        one, forces = jnp.ones(self.scene.num_fingers), seen.forces
-        lifted, shaken = seen.phase == 2, seen.phase > 2
+        one = jnp.ones(self.scene.num_fingers)
+        forces = seen.forces
+        lifted = seen.phase == 2
+        shaken = seen.phase > 2
         times = one, one * lifted, one * shaken, one * shaken * seen.phase_time  # ever stronger
         carried = (forces.finger.sum(0) + forces.palm)[2]  # by the hand [N]
         bend = 0.5 * seen.joint[..., 0].sum(-1)
@@ -82,7 +84,8 @@ features = task.observation_size // fingers
 
 def policy(weights, obs, felt):
     """Each finger's own pressure for closing, lifting and shaking, and what all do by touch."""
-    times, touch = weights[: 4 * fingers].reshape(fingers, 4), weights[4 * fingers :]
+    times = weights[: 4 * fingers].reshape(fingers, 4)
+    touch = weights[4 * fingers :]
     now, before = (v.reshape(fingers, features) for v in (obs, felt))
     return jnp.tanh((now[:, :4] * times).sum(1) + before[:, 4 : 4 + len(touch)] @ touch)
 
@@ -112,7 +115,8 @@ def score(weights, start):
     return jax.lax.scan(step, first, length=task.episode_length)[1].sum(0)
 
 
-reset, judge = jax.jit(jax.vmap(task.reset)), jax.jit(score)
+reset = jax.jit(jax.vmap(task.reset))
+judge = jax.jit(score)
 evaluate = jax.jit(lambda every, start: jax.vmap(score, (0, None))(every, start)[:, 0].mean(1))
 trials, candidates, generations = (3, 4, 1) if FAST else (96, 24, 45)
 
@@ -130,7 +134,8 @@ def train(weights, seed):
     return state.mean
 
 
-first, found = train(jnp.zeros(4 * fingers), 1), {}
+first = train(jnp.zeros(4 * fingers), 1)
+found = {}
 fresh = reset(jax.random.split(jax.random.key(99), 6 if FAST else 768))
 for name, more in (("by time", 0), ("by touch", features - 4)):
     weights = train(jnp.append(first, jnp.zeros(more)), 2)

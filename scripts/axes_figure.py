@@ -21,7 +21,8 @@ def main() -> None:
     space = parameters.design_space(grasping.hand, "full")
     params = jax.tree.map(np.asarray, space.params(space.default()))
     sizes = process.sizes(grasping.hand, params, process.Process())
-    fingers, palm = sheet.corners(grasping, params, sizes), grasping.hand.palm
+    fingers = sheet.corners(grasping, params, sizes)
+    palm = grasping.hand.palm
     turns = {**posture.TURNS, "pitch +90°: fingers along +x": {"roll": 0, "yaw": 0, "pitch": 90}}
     figure = matplotlib.figure.Figure(figsize=(11, 2.6))
     for k, (words, angles) in enumerate(turns.items()):

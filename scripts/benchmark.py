@@ -62,11 +62,13 @@ def make_worlds(chosen: Scene, designs: str, count: int) -> work.Worlds:
     """
     if designs == "mixed":
         return work.make_worlds(chosen, count)
-    space, key = parameters.design_space(chosen.hand, "23d"), jax.random.key(work.SEED)
+    space = parameters.design_space(chosen.hand, "23d")
+    key = jax.random.key(work.SEED)
     objects = len(chosen.objects.object)
     trials = rollout.sample_trials(chosen, key, count)
     if designs == "winners":
-        vectors, index = work.winners(), np.arange(count)
+        vectors = work.winners()
+        index = np.arange(count)
         trials = trials._replace(shape=(index + index // len(vectors)) % objects)
         vectors = vectors[index % len(vectors)]
     else:
@@ -81,7 +83,8 @@ class JaxProgram:
 
     def __init__(self, function: Callable, *args: Any):
         begin = time.perf_counter()
-        self.args, self.compiled = args, jax.jit(function).lower(*args).compile()
+        self.args = args
+        self.compiled = jax.jit(function).lower(*args).compile()
         self.compile_s = time.perf_counter() - begin
 
     def run(self) -> tuple[Any, float]:
@@ -166,7 +169,8 @@ def rates(files: list[dict[str, Any]]) -> str:
         for record in found["records"]:
             if record["scene"] == "paper" and record["engine"] == "structured":
                 column = machine(found["runs"][record["run"]]), DESIGNS[record["designs"]]
-                rate, worlds = record["grasps_per_s"], record["worlds"]
+                rate = record["grasps_per_s"]
+                worlds = record["worlds"]
                 text = f"{_rounded(rate)} ({_rounded(worlds / rate)} s)"
                 cells.setdefault(column, {})[worlds] = text
     columns = sorted(cells, key=lambda c: list(DESIGNS.values()).index(c[1]))

@@ -25,7 +25,8 @@ except ImportError:
 
 # Contacts and constraint rows that Warp allocates for each world.  Its documentation asks for as
 # few as are never exceeded; Warp prints a warning if they are.
-CONTACTS, ROWS = 64, 192
+CONTACTS = 64
+ROWS = 192
 # Not in Warp's model: it derives the inertia of free bodies. Options are the template's there.
 _ABSENT = ("dof_M0", "opt.gravity", "opt.impratio")
 
@@ -85,7 +86,8 @@ class WarpProgram:
           ctrl: Controls, shape (world, time, nu).
         """
         self.worlds, self.steps = ctrl.shape[:2]
-        template, lay = copy.deepcopy(compile_template(scene)), layout(scene)
+        template = copy.deepcopy(compile_template(scene))
+        lay = layout(scene)
         # Warp never resets a world and refuses the flag that asks for that.
         template.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         begin = time.perf_counter()
@@ -121,7 +123,8 @@ class WarpProgram:
         wp.copy(self.data.qpos, self.start)
 
     def _step(self) -> None:
-        data, at = self.data, self.index
+        data = self.data
+        at = self.index
         wp.launch(_command, data.ctrl.shape, [self.table, at], [data.ctrl])
         wp.launch(_velocity, self.worlds, [data.qvel, at], [self.out])
         mjw.step(self.model, data)

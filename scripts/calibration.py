@@ -46,7 +46,8 @@ distribution as long as it has one peak (Pukelsheim 1994)."""
 CLEARANCE = 0.002
 """Smallest gap between the sections of a pair of fingers at a spread of zero [m]."""
 DATA = Path("docs/data/calibration/scores.npz")
-BEST, NEAR = 10, 0.15
+BEST = 10
+NEAR = 0.15
 """Sets of a first wave around which a second one draws, and how far, as a share of each range."""
 
 
@@ -115,7 +116,8 @@ def values(units: np.ndarray) -> dict[str, np.ndarray]:
     for (name, o), u in zip(OPEN.items(), np.asarray(units, float).T, strict=True):
         low, high = (np.log([o.low, o.high]) if o.log else np.array([o.low, o.high])) + 0.0
         found[name] = np.exp(low + u * (high - low)) if o.log else low + u * (high - low)
-    u, least = np.asarray(units, float)[:, list(OPEN).index("pair_gap")], least_gap(found["width"])
+    u = np.asarray(units, float)[:, list(OPEN).index("pair_gap")]
+    least = least_gap(found["width"])
     return found | {"pair_gap": least + u * (OPEN["pair_gap"].high - least)}
 
 
@@ -126,9 +128,14 @@ def least_gap(width: Any) -> Any:
 
 def own_set(the_scene: Scene) -> np.ndarray:
     """The scene's own constants as a point of the unit cube, outside of it if beyond a range."""
-    hand, shape, c = the_scene.hand, the_scene.objects.object[0], the_scene.contact
-    (x, y), width = np.abs(hand.finger[0].base or (0.0, 0.0)), 1e3 * hand.section.width
-    material, wrist, arm = hand.material, hand.wrist, the_scene.arm
+    hand = the_scene.hand
+    shape = the_scene.objects.object[0]
+    c = the_scene.contact
+    x, y = np.abs(hand.finger[0].base or (0.0, 0.0))
+    width = 1e3 * hand.section.width
+    material = hand.material
+    wrist = hand.wrist
+    arm = the_scene.arm
     own = {
         "tilt": hand.finger[0].tilt,
         "base_x": 1e3 * x,
@@ -159,10 +166,14 @@ def numbers(the_scene: Scene, chosen: Mapping[str, np.ndarray]) -> Scene:
     """The scene with the numbers of sets in it: leaves of shape () or (set,)."""
     if any(f.base is None for f in the_scene.hand.finger):
         raise InputError(["calibration moves base points; give each finger a base"])
-    c, v = the_scene, chosen
-    x, y = 1e-3 * v["base_x"], 0.5e-3 * v["pair_gap"]
-    hand, wrist = c.hand, c.hand.wrist
-    linear, angular = v["wrist_linear"], v["wrist_angular"]
+    c = the_scene
+    v = chosen
+    x = 1e-3 * v["base_x"]
+    y = 0.5e-3 * v["pair_gap"]
+    hand = c.hand
+    wrist = c.hand.wrist
+    linear = v["wrist_linear"]
+    angular = v["wrist_angular"]
     hand = replace(
         hand,
         finger=tuple(
@@ -225,7 +236,9 @@ def scored(path: Path) -> tuple[np.ndarray, np.ndarray]:
       InputError: If the file has not all constants of `OPEN`.
     """
     with np.load(path, allow_pickle=False) as file:
-        units, distances, names = file["units"], file["distances"], [*file["names"]]
+        units = file["units"]
+        distances = file["distances"]
+        names = [*file["names"]]
     if missing := [name for name in OPEN if name not in names]:
         raise InputError([f"{path} has no constant {', '.join(missing)}"])
     return units[:, [names.index(name) for name in OPEN]], distances
@@ -255,7 +268,8 @@ class Wave:
 
     def designs(self) -> np.ndarray:
         """The grid, shape (points, points, 2), first parameter first."""
-        low, high = self.space.low, self.space.high
+        low = self.space.low
+        high = self.space.high
         axes = [np.linspace(a, b, self.points) for a, b in zip(low, high, strict=True)]
         return np.stack(np.meshgrid(*axes, indexing="ij"), -1).astype(np.float32)
 
@@ -298,8 +312,14 @@ STREAM_WAVE = 0x67726964
 # --- the particle filter on a landscape -----------------------------------------------------------
 
 STRATEGIES = ("single", "switch-4", "concurrent")
-RUNS, PARTICLES, EPISODES, TRIALS, TEST = 30, 10, 64, 6, 42
-CANDIDATES, SCREEN, FINAL = 64, 1_000_000, 1_000_001
+RUNS = 30
+PARTICLES = 10
+EPISODES = 64
+TRIALS = 6
+TEST = 42
+CANDIDATES = 64
+SCREEN = 1_000_000
+FINAL = 1_000_001
 """Seed candidates of a run; numbers of the draws that belong to no episode."""
 
 
@@ -321,7 +341,8 @@ def on_landscapes(space: DesignSpace, shapes: int = 3) -> Callable[..., Any]:
         points = jnp.array(landscape.shape[:2])
         place = (design - low) / (high - low) * (points - 1)
         i, j = corner = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, points - 2)
-        (a, b), at = place - corner, (i, j, trial)
+        a, b = place - corner
+        at = (i, j, trial)
         square = jax.lax.dynamic_slice(landscape, at, (2, 2, 1))[..., 0]
         return jnp.array([1 - a, a]) @ square @ jnp.array([1 - b, b])
 
@@ -407,12 +428,14 @@ def score(
 
     Costs are those of `Wave.costs`, `chosen` the sets' values.
     """
-    maximum, space = chosen["cost_maximum"], parameters.design_space(the_scene.hand, "2d")
+    maximum = chosen["cost_maximum"]
+    space = parameters.design_space(the_scene.hand, "2d")
     good = np.isfinite(costs)
     mean = np.where(good, costs, 0).sum(-1) / np.maximum(good.sum(-1), 1)
     mean = np.where(good.any(-1), mean, maximum[:, None, None])
     filled = np.where(good, costs, mean[..., None]).astype(np.float32)
-    run, found = on_landscapes(space), {}
+    run = on_landscapes(space)
+    found = {}
     success: dict[str, np.ndarray] = {}
     for noise in ("shared", "own"):
         parts = [run(filled[i : i + 32], noise == "shared") for i in range(0, len(filled), 32)]
@@ -459,7 +482,8 @@ def score(
 def told(units: np.ndarray, distances: Mapping[str, np.ndarray], count: int = 5) -> list[str]:
     """Lines about a score: what each statement rules out, what is left, and the best sets."""
     every = np.stack([*distances.values()], -1)
-    kept, found = (every <= CUTOFF).all(-1), values(units)
+    kept = (every <= CUTOFF).all(-1)
+    found = values(units)
     lines = [f"{kept.sum()} of {len(units)} sets are not ruled out"]
     lines += [f"  {name}: rules out {(d > CUTOFF).sum()}" for name, d in distances.items()]
     best = np.argsort(every.max(-1), kind="stable")[:count]
@@ -479,7 +503,8 @@ def told(units: np.ndarray, distances: Mapping[str, np.ndarray], count: int = 5)
 def score_file(path: Path, the_scene: Scene) -> int:
     """Scores what a wave has simulated so far, beside its file."""
     with np.load(path, allow_pickle=False) as file:
-        units, costs = file["units"], file["costs"]
+        units = file["units"]
+        costs = file["costs"]
     units = units[: len(costs)]
     found = score(costs, values(units), the_scene)
     out = path.with_name(f"{path.stem}_scores.npz")
@@ -522,7 +547,8 @@ def main() -> int:
         the_scene = scene.load("paper", overrides=keypaths.parse(args.set))
         if args.command == "score":
             return score_file(args.file or args.out, the_scene)
-        units, done = sets_of(args, the_scene), []
+        units = sets_of(args, the_scene)
+        done = []
         if args.out.exists():
             done = [simulated(args.out, units)]
     except InputError as error:
@@ -548,7 +574,8 @@ def simulated(path: Path, units: np.ndarray) -> np.ndarray:
       InputError: If they are costs of other sets.
     """
     with np.load(path, allow_pickle=False) as file:
-        costs, own = file["costs"], file["units"]
+        costs = file["costs"]
+        own = file["units"]
     count = len(costs)
     if own.shape[1:] != units.shape[1:] or not np.array_equal(own[:count], units[:count]):
         raise InputError([f"{path} has other sets; choose another --out or remove it"])

@@ -35,7 +35,9 @@ from codesign_jax.scene import InputError, Scene, keypaths, parameters
 from codesign_jax.scene.primitives import PRIMITIVES
 from scripts.shared import work
 
-STATIONS, TIP = 4, 0.25  # sections a link; the cap's length in links, that of one section
+# sections a link; the cap's length in links, that of one section
+STATIONS = 4
+TIP = 0.25
 CAP = 0.5, 0.8, 0.95, 1.0  # places of its rings
 ARC = 3.0, 1.8  # links and heights along a finger from which on its parts touch one another
 # Kinds of contact whose depths the engine records, by the names that they have here.
@@ -73,7 +75,8 @@ class Tube(NamedTuple):
 def tube(joints: np.ndarray, turn: np.ndarray, size: tuple[float, float, float]) -> Tube:
     """A finger from joints, frames with that of the half link at the palm first, and its sizes."""
     links = joints.shape[1]
-    segment, half = size[0] / links, np.array([2 * TIP * size[0] / links, *size[1:]]) / 2
+    segment = size[0] / links
+    half = np.array([2 * TIP * size[0] / links, *size[1:]]) / 2
     along = segment * np.arange(STATIONS * links) / STATIONS
     row = np.clip(np.ceil(along / segment - 1e-9).astype(int) - 1, 0, links - 1)
     blend = np.minimum(along / segment - row, 1)[:, None, None]
@@ -99,7 +102,8 @@ def in_tube(rings: np.ndarray, solid: Tube, own: tuple[np.ndarray, float] | None
       solid: The finger.
       own: Of the finger's own rings their places along it, and from which distance on they count.
     """
-    found, last = np.zeros(len(rings)), len(solid.along) - 1
+    found = np.zeros(len(rings))
+    last = len(solid.along) - 1
     if not rings.size:
         return found  # a ball has no edges
     reach = np.linalg.norm(solid.half[1:]) + solid.along[1]
@@ -115,11 +119,13 @@ def in_tube(rings: np.ndarray, solid: Tube, own: tuple[np.ndarray, float] | None
         if not len(pair):
             continue
         k = k[pair]
-        p, after = rings[s, ring[pair], point], np.minimum(k + 1, last)
+        p = rings[s, ring[pair], point]
+        after = np.minimum(k + 1, last)
         local, beyond = (
             np.einsum("nij,ni->nj", solid.frame[s, i], p - solid.centre[s, i]) for i in (k, after)
         )
-        tip, whole = k == last, local[:, 0] - beyond[:, 0]
+        tip = k == last
+        whole = local[:, 0] - beyond[:, 0]
         inside = (local[:, 0] >= 0) & (tip | (beyond[:, 0] < 0) & (whole > 0))
         share = np.where(inside & ~tip, local[:, 0] / np.where(whole > 0, whole, 1), 0)
         to_tip = solid.along[-1] + solid.half[0] - solid.along[k] - share * solid.along[1]
@@ -171,18 +177,24 @@ def measured(
     Args:
       recorded: Depths of `types.Forces` in these states [m], by kind of contact, (state,) each.
     """
-    h, lay, palm = scene.discretization.timestep, model.layout(scene), scene.hand.palm
+    h = scene.discretization.timestep
+    lay = model.layout(scene)
+    palm = scene.hand.palm
     compiled = model.compile_model(scene, params, trial)
-    data, place, turn = mujoco.MjData(compiled), [], []
+    data = mujoco.MjData(compiled)
+    place = []
+    turn = []
     for state in qpos:
         data.qpos[:] = state
         mujoco.mj_kinematics(compiled, data)
         place.append(data.xpos.copy())
         turn.append(data.xmat.reshape(-1, 3, 3).copy())
-    place, turn = np.stack(place), np.stack(turn)
+    place = np.stack(place)
+    turn = np.stack(turn)
     shape = scene.objects.object[int(trial.shape)]
     size = float(trial.size) * np.array(shape.half_sizes)
-    centre, frame = place[:, lay.object], turn[:, lay.object]
+    centre = place[:, lay.object]
+    frame = turn[:, lay.object]
     edges, skin = (centre[:, None] + v @ frame.swapaxes(-1, -2) for v in surface(shape, size))
     tubes = []
     for f, bodies in enumerate(lay.bodies):
@@ -259,8 +271,10 @@ def grasps(scene: Scene, designs: np.ndarray, args: argparse.Namespace) -> list[
     key = jax.random.fold_in(jax.random.key(args.seed), 0x64657074)  # no search has met them
     trials = jax.tree.map(np.asarray, rollout.sample_trials(scene, key, args.trials))
     hands = jax.jit(jax.vmap(space.params))(jnp.asarray(designs, jnp.float32))
-    hands, total = jax.tree.map(np.asarray, hands), len(designs) * args.trials
-    size, start = min(args.batch, total), int(scene.last_step("approach"))
+    hands = jax.tree.map(np.asarray, hands)
+    total = len(designs) * args.trials
+    size = min(args.batch, total)
+    start = int(scene.last_step("approach"))
     shown = {"record_qpos": True, "record_forces": True}
     run = jax.jit(lambda p, t: rollout.simulate(scene, engine, p, t, **shown))
     rows: list[dict[str, Any]] = []
@@ -271,7 +285,8 @@ def grasps(scene: Scene, designs: np.ndarray, args: argparse.Namespace) -> list[
             p = jax.tree.map(lambda v, w=world: v[w // args.trials], hands)
             t = jax.tree.map(lambda v, w=world: v[w % args.trials], trials)
             outcome, trace = jax.tree.map(np.asarray, run(p, t))
-            bad, found = types.failed(outcome.status), []
+            bad = types.failed(outcome.status)
+            found = []
             kept = ~bad & (outcome.cost < SUCCESS_COST)
             for i in range(min(size, total - first)):
                 own, trial = jax.tree.map(lambda v, i=i: v[i], (p, t))

@@ -27,9 +27,12 @@ from codesign_jax.types import failed
 from scripts.shared import output, provenance, work
 
 DOCS = Path(__file__).parents[1] / "docs"
-PAGE, DATA = DOCS / "effects.md", DOCS / "data" / "effects.json"
+PAGE = DOCS / "effects.md"
+DATA = DOCS / "data" / "effects.json"
 AS_IT_IS = "as it is"
-STEPS, ROUNDS, TIMED = 20, 9, 6
+STEPS = 20
+ROUNDS = 9
+TIMED = 6
 """Time steps of a call, calls of each program, and designs whose grasps are timed."""
 
 
@@ -62,7 +65,8 @@ def grasps(base: Scene, designs: int, trials: int) -> work.Worlds:
 
 def decide(variant: Scene, worlds: work.Worlds) -> tuple[np.ndarray, np.ndarray]:
     """Which grasps are kept, and where they are in the middle of the lift, shape (world, nq)."""
-    engine, step = make_engine("structured", variant), middle(variant)
+    engine = make_engine("structured", variant)
+    step = middle(variant)
 
     @jax.jit
     def run(params: Any, trials: Any) -> tuple[Any, Any]:
@@ -84,7 +88,8 @@ def program(variant: Scene, worlds: work.Worlds, start: np.ndarray) -> tuple[Any
     """A compiled program of some steps from the middle of the lift on, and its arguments."""
     fields, ctrl = work.inputs(variant, worlds)
     fields = fields._replace(start=jnp.asarray(start, fields.start.dtype))
-    step, engine = middle(variant), make_engine("structured", variant)
+    step = middle(variant)
+    engine = make_engine("structured", variant)
     args = (fields, ctrl[:, step : step + STEPS])
     run = jax.jit(lambda f, c: engine.rollout(f, c).distance[:, -1])
     return run.lower(*args).compile(), args
@@ -97,7 +102,8 @@ def measure(everything: dict[str, Scene], path: Path, *, commit: str | None, qui
     results["provenance"] = provenance.measurement(commit)
     worlds = grasps(everything[AS_IT_IS], designs, trials)
     few = jax.tree.map(lambda v: np.asarray(v)[: TIMED * trials], worlds)
-    programs, expected = {}, None
+    programs = {}
+    expected = None
     for name, variant in everything.items():
         kept, start = decide(variant, worlds)
         expected = kept if expected is None else expected
@@ -149,7 +155,8 @@ def measured(results: dict[str, Any]) -> str:
         cells = [f"{100 * r['same_verdict']:.1f} %", f"{100 * r['success']:.1f} %"]
         cells[1] += f" ({100 * r['success_low']:.1f} to {100 * r['success_high']:.1f})"
         table.append([name, *cells, f"× {r['ratio']:.2f} ({low:.2f} to {high:.2f})"])
-    p, load = results["provenance"], results["load"]
+    p = results["provenance"]
+    load = results["load"]
     made = f"{results['designs']} designs in {results['trials']} trials each; {p['cpus']} cores, "
     made += f"jax {p['jax']}; timed at a load of {max(load):.0f}."
     return f"{made}\n\n{output.markdown(table)}"

@@ -60,7 +60,9 @@ def run(*arguments: str | Path) -> tuple[int, str]:
 
 def process(*arguments: str | Path, more: dict[str, str] | None = None) -> subprocess.Popen:
     command = [sys.executable, "-m", "codesign_jax.cli", *map(str, arguments)]
-    environment, pipe, both = os.environ | (more or {}), subprocess.PIPE, subprocess.STDOUT
+    environment = os.environ | (more or {})
+    pipe = subprocess.PIPE
+    both = subprocess.STDOUT
     return subprocess.Popen(command, env=environment, text=True, stdout=pipe, stderr=both)
 
 
@@ -302,7 +304,8 @@ def mesh_files(draw: Any) -> tuple[str, bytes]:
     """A format and the bytes of a mesh in it, damaged or of an odd size."""
     kind = draw(st.sampled_from(("stl", "obj", "ply", "off", "glb")))
     thin = tuple(draw(st.sampled_from((1e-6, 1e-4, 0.01, 0.05))) for _ in range(2))
-    ball, ring = trimesh.creation.icosphere(2, 0.03), trimesh.creation.torus(0.03, 0.01, 12, 8)
+    ball = trimesh.creation.icosphere(2, 0.03)
+    ring = trimesh.creation.torus(0.03, 0.01, 12, 8)
     mesh = draw(st.sampled_from((trimesh.creation.box((0.3, *thin)), ball, ring))).copy()
     mesh.apply_scale(draw(st.sampled_from((1e-3, 1.0, 1.0, 1e3))))
     exported: Any = mesh.export(file_type=kind)

@@ -28,11 +28,15 @@ from codesign_jax.report.replay import Camera
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import choice
 
-RUNS, DOCS = Path("runs") / "gallery", Path("docs")
+RUNS = Path("runs") / "gallery"
+DOCS = Path("docs")
 FOLDER = DOCS / "gallery"
-RATE, SIZE, QUALITY = 10.0, (280, 280), 45
+RATE = 10.0
+SIZE = (280, 280)
+QUALITY = 45
 """Frames of a second, pixels, and WebP's quality: ten films of 9 s have less than 2 MB."""
-TRIALS, SEED = 100, 1000
+TRIALS = 100
+SEED = 1000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +82,8 @@ def find(hand: Hand) -> None:
     folder = RUNS / hand.name
     words = [*shlex.split(hand.command)[1:], "--reference-trials", "0"]
     cli.main([*words, "--out", str(folder)])
-    case, preset = choice.case_of_run(folder), runs.read_run(folder)[1].preset
+    case = choice.case_of_run(folder)
+    preset = runs.read_run(folder)[1].preset
     text = common.design_text(case.space, common.DesignFile(preset, {}, **hand.names), case.design)
     hand.design.write_text(text, encoding="utf-8")
 
@@ -93,7 +98,8 @@ def judge(hand: Hand, case: choice.Case) -> None:
 
 def draw(hand: Hand, case: choice.Case) -> None:
     """Simulates a grasp of each object without noise, and writes them as a film."""
-    scene, params = case.scene, case.space.params(jnp.asarray(case.design, jnp.float32))
+    scene = case.scene
+    params = case.space.params(jnp.asarray(case.design, jnp.float32))
     named = [rollout.nominal_trial(scene, name) for name in hand.shown]
     trials = jax.tree.map(lambda *v: jnp.stack(v), *named)
     shown = animation.replay(scene, case.make_engine(), params, trials)

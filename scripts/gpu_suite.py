@@ -54,7 +54,8 @@ def main() -> int:
     arguments = parser.parse_args()
     # Many processes share the GPU's memory.
     os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
-    begin, made = time.monotonic(), provenance.measurement(arguments.commit)
+    begin = time.monotonic()
+    made = provenance.measurement(arguments.commit)
 
     def write() -> None:
         seconds = round(time.monotonic() - begin, 1)

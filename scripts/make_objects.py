@@ -56,7 +56,8 @@ def tube(loops: np.ndarray, *, closed: bool = False, capped: bool = False) -> Pa
     index = np.arange(rows * n).reshape(rows, n)
     a = index if closed else index[:-1]
     b = np.roll(index, -1, 0) if closed else index[1:]
-    a_next, b_next = np.roll(a, -1, 1), np.roll(b, -1, 1)
+    a_next = np.roll(a, -1, 1)
+    b_next = np.roll(b, -1, 1)
     # The two faces of quadrilateral (row, point) are 2 (row n + point) and the next.
     faces = np.stack([np.stack([a, a_next, b_next], -1), np.stack([a, b_next, b], -1)], 2)
     parts = [faces.reshape(-1, 3)]
@@ -105,13 +106,16 @@ def ring_segment() -> Part:
 
 def mug() -> Part:
     """58 mm across with walls of 6 mm; the handle joins two holes of 2 x 2 quadrilaterals."""
-    sectors, heights = 32, np.linspace(0, 66, 13)
+    sectors = 32
+    heights = np.linspace(0, 66, 13)
     outside = np.stack([np.full(13, 29.0), heights], -1)
     inside = np.stack([np.full(7, 23.0), np.linspace(66, 8, 7)], -1)
     loops = rings(np.vstack([[[0, 0]], outside, inside, [[0, 8]]]), sectors)
     vertices, faces = tube(loops)
     keep = np.ones(len(faces), bool)
-    low, high, ring = 3, 11, ((-1, -1), (-1, 0), (-1, 1), (0, 1), (1, 1), (1, 0), (1, -1), (0, -1))
+    low = 3
+    high = 11
+    ring = ((-1, -1), (-1, 0), (-1, 1), (0, 1), (1, 1), (1, 0), (1, -1), (0, -1))
     for row in (low, high):
         for r in (row - 1, row):
             for s in (sectors - 1, 0):
@@ -123,13 +127,17 @@ def mug() -> Part:
 
 def _handle(upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
     """Loops along a half ellipse outwards, from one hole's rim to the mirrored other's."""
-    start, end = upper.mean(0), lower.mean(0)
-    middle, reach = (start + end) / 2, (start - end)[2] / 2
-    side, tall = upper[:, 1], upper[:, 2] - start[2]
+    start = upper.mean(0)
+    end = lower.mean(0)
+    middle = (start + end) / 2
+    reach = (start - end)[2] / 2
+    side = upper[:, 1]
+    tall = upper[:, 2] - start[2]
     inset = upper[:, 0] - start[0]  # the rims lie on the round wall
     loops = []
     for angle in np.linspace(np.pi / 2, -np.pi / 2, 17):
-        c, s = np.cos(angle), np.sin(angle)
+        c = np.cos(angle)
+        s = np.sin(angle)
         centre = middle + [0.85 * reach * c, 0, reach * s]
         loop = centre + np.outer(tall, [c, 0, s]) + np.outer(side, [0, 1, 0])
         loop[:, 0] += inset * abs(s) ** 8
@@ -139,7 +147,8 @@ def _handle(upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
 
 def bottle() -> Part:
     """86 mm high, 56 mm across, with a neck of 26 mm; solid."""
-    foot, shoulder = arc(5, (23, 5), -90, 0, 5), arc(15, (13, 44), 0, 80, 8)
+    foot = arc(5, (23, 5), -90, 0, 5)
+    shoulder = arc(15, (13, 44), 0, 80, 8)
     neck = np.array([[13, 63], [13, 80], [12, 86], [0, 86.0]])
     return tube(rings(np.vstack([[[0, 0]], foot, [[28, 25]], shoulder, neck]), 40))
 
@@ -150,9 +159,11 @@ def superquadric() -> Part:
     def power(x: np.ndarray) -> np.ndarray:
         return np.sign(x) * np.sqrt(np.abs(np.round(x, 12)))
 
-    up, around = np.deg2rad(np.linspace(-90, 90, 21))[:, None], turn(40)
+    up = np.deg2rad(np.linspace(-90, 90, 21))[:, None]
+    around = turn(40)
     flat = power(np.cos(up))
-    x, y = 28 * flat * power(np.cos(around)), 32 * flat * power(np.sin(around))
+    x = 28 * flat * power(np.cos(around))
+    y = 32 * flat * power(np.sin(around))
     return tube(np.stack([x, y, np.broadcast_to(30 * power(np.sin(up)), x.shape)], -1))
 
 
@@ -193,7 +204,8 @@ def main() -> None:
     folder = parser.parse_args().out
     (folder / "household").mkdir(parents=True, exist_ok=True)
     for name, make in SHAPES.items():
-        mesh, path = finish(make()), folder / "household" / f"{name}.stl"
+        mesh = finish(make())
+        path = folder / "household" / f"{name}.stl"
         path.write_bytes(export_stl(mesh))
         size = " x ".join(f"{v:.0f}" for v in mesh.extents)
         print(f"{name}: {size} mm, {mesh.volume / 1e3:.0f} cm^3, {len(mesh.faces)} faces")

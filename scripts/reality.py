@@ -28,7 +28,8 @@ from codesign_jax.types import Params
 from scripts.shared import output, provenance
 
 DOCS = Path(__file__).parents[1] / "docs"
-MEASURED, TENSION = DOCS / "data" / "measured.toml", DOCS / "data" / "silicones.csv"
+MEASURED = DOCS / "data" / "measured.toml"
+TENSION = DOCS / "data" / "silicones.csv"
 STEPS = (0.010, 0.005, 0.001)
 """Time steps at which the beam is released [s]."""
 DURATION = 2.6
@@ -58,7 +59,8 @@ def beam_scene(beam: Mapping[str, Any], timestep: float, changes: Mapping[Any, A
     own |= {f"effects.{name}": False for name in BARE.split()}
     own |= {"phases.approach": 0.1, "phases.inflate": 0.2, "phases.lift": DURATION}
     base = scene.load("paper", overrides={**own, "hand.material": "dragon_skin_10", **changes})
-    rubber, height = base.hand.material, beam["height"]
+    rubber = base.hand.material
+    height = beam["height"]
     slender = beam["height"] / beam["length"]
     bending = 3 * rubber.shear_modulus * beam["width"] * height**3 / 12 / (1 + 0.9 * slender**2)
     solid = beams.beam(height, wall(beam), width=beam["width"], shear_modulus=1.0, density=1.0)
@@ -120,10 +122,12 @@ def _finger_joints(start: np.ndarray, lay: Any) -> np.ndarray:
 
 def _weighted(fields: Any, lay: Any, extent: float, loads: np.ndarray) -> Any:
     """Fields with point masses [kg] at the end of the last body, `extent` [m] from its joint."""
-    last, bodies = lay.bodies[0, -1], np.append(lay.stubs, lay.bodies[0])
+    last = lay.bodies[0, -1]
+    bodies = np.append(lay.stubs, lay.bodies[0])
     place = np.array(fields.body_ipos)
     place[:, bodies, 2] = 0.0
-    mass, inertia = np.array(fields.body_mass), np.array(fields.body_inertia)
+    mass = np.array(fields.body_mass)
+    inertia = np.array(fields.body_inertia)
     own = mass[:, last].copy()
     centre = (own * place[:, last, 0] + loads * extent) / (own + loads)
     more = own * (centre - place[:, last, 0]) ** 2 + loads * (extent - centre) ** 2
@@ -147,7 +151,8 @@ class Ring(NamedTuple):
         With fewer peaks by those that there are; period and decrement are NaN with one or none.
         """
         rest = drop[time > time[-1] - 0.5].mean()
-        x, h = drop - rest, time[1] - time[0]
+        x = drop - rest
+        h = time[1] - time[0]
         inner = np.flatnonzero((x[1:-1] > x[:-2]) & (x[1:-1] >= x[2:]) & (x[1:-1] > 0)) + 1
         inner = inner[x[inner] > 1e-3 * x.max()][:4]
         if len(inner) < 2:
@@ -155,7 +160,8 @@ class Ring(NamedTuple):
         second = (x[inner - 1] - 2 * x[inner] + x[inner + 1]) / 2
         slope = (x[inner + 1] - x[inner - 1]) / 2
         at = time[inner] - slope / (2 * second) * h
-        peak, count = x[inner] - slope**2 / (4 * second), len(inner) - 1
+        peak = x[inner] - slope**2 / (4 * second)
+        count = len(inner) - 1
         return cls(float(rest), (at[-1] - at[0]) / count, float(np.log(peak[0] / peak[-1])) / count)
 
 
@@ -180,7 +186,9 @@ def beam_rows(rings: Mapping[str, Sequence[Ring]], beam: Mapping[str, Any]) -> l
 
 # --- bending laws and silicones -------------------------------------------------------------------
 
-HEIGHT, WIDTH, WALL = 20.0, 24.0, 5.0
+HEIGHT = 20.0
+WIDTH = 24.0
+WALL = 5.0
 """Section of the default finger [mm]."""
 STRAINS = np.array([0.25, 0.5, 0.75, 1.0, 1.25, 1.5])
 
@@ -213,7 +221,8 @@ def fitted_law(stress: Any, law: Any, strains: np.ndarray) -> tuple[float, np.nd
     for every material: `silicones.EQUAL_BEND` over all of `STRAINS`.  The errors are those of the
     curvature under the same moment, at the outermost fibre's strains.
     """
-    wanted, grid = np.array([moment(stress, e) for e in strains]), np.linspace(0.01, 4, 600)
+    wanted = np.array([moment(stress, e) for e in strains])
+    grid = np.linspace(0.01, 4, 600)
     own = np.array([moment(law, e) for e in strains])
     modulus = float(np.exp(np.log(wanted / own).mean()))
     bent = np.interp(wanted, modulus * np.array([moment(law, e) for e in grid]), grid)
@@ -227,7 +236,8 @@ def tension() -> dict[str, Any]:
     has the I1 of a fibre of the wall, whose stress is 2 w' (s - s^-3) at its own stretch s.
     """
     text = [line for line in TENSION.read_text().splitlines() if not line.startswith("#")]
-    names, table = text[0].split(",")[1:], np.array([r.split(",") for r in text[1:]], float)
+    names = text[0].split(",")[1:]
+    table = np.array([r.split(",") for r in text[1:]], float)
     stretch = np.linspace(1.0, 3.0, 2001)[1:]
     first = stretch**2 + 2 / stretch
     found = {}
@@ -331,8 +341,10 @@ def draw_laws(folder: Path) -> Path:
     """Measured plane strain beside both laws, each with the modulus that bends walls best."""
     figure = output.new_figure(8.4, 3.0)
     left, right = figure.subplots(1, 2)
-    table, stress = measured()["plane_strain"], plane_strain()
-    strains, strain = STRAINS[:-1], np.linspace(0, 1.25, 100)
+    table = measured()["plane_strain"]
+    stress = plane_strain()
+    strains = STRAINS[:-1]
+    strain = np.linspace(0, 1.25, 100)
     left.plot(100 * np.array(table["strain"]), table["stress"], "ko", ms=4, label="measured")
     for law, of in LAWS.items():
         modulus, errors = fitted_law(stress, of, strains)
@@ -352,14 +364,17 @@ def main() -> int:
     parser.add_argument("--figures", type=Path, default=DOCS / "figures", metavar="FOLDER")
     parser.add_argument("--pages", action="store_true", help="fill the tables into the pages")
     args = parser.parse_args()
-    beam, rings, curves = measured()["beam"], {}, {}
+    beam = measured()["beam"]
+    rings = {}
+    curves = {}
     try:
         changes = keypaths.parse(args.changes)
         for step in STEPS:
             own = beam_scene(beam, step, changes)
             time, drops = curve = released(beam, own)
             name = f"{1e3 * own.discretization.timestep:g} ms"
-            curves[name], rings[name] = curve, [Ring.of(time, d) for d in drops]
+            curves[name] = curve
+            rings[name] = [Ring.of(time, d) for d in drops]
     except InputError as error:
         parser.error(str(error))
     tables = {

@@ -159,7 +159,8 @@ def _text(described: Any) -> str:
 
 def _limits(schema: type, field: dataclasses.Field) -> tuple[str, str, str]:
     """Unit, range and default of a field."""
-    hint, limits = typing.get_type_hints(schema)[field.name], field.metadata
+    hint = typing.get_type_hints(schema)[field.name]
+    limits = field.metadata
     if "unit" in limits and "low" not in limits:  # a sum of a control file
         low, high = sums.RANGES[limits["unit"]]
         limits = {**limits, "low": low, "high": high, "structure": False}
@@ -248,7 +249,8 @@ def qpos(scene: Scene) -> list[tuple[str, str, int, str]]:
 
 def _state(scene: Scene) -> str:
     names = [(f"`{joint}`", index, str(n), text) for joint, index, n, text in qpos(scene)]
-    axes, lay = joint_axes(scene), layout(scene)
+    axes = joint_axes(scene)
+    lay = layout(scene)
     joints = lay.dofs.size
     vectors = ", ".join("xyz"[AXES[name].index(1)] for name in axes)
     facts = {"fingers": scene.num_fingers, "links": lay.links, "num_axes": len(axes)}

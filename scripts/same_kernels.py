@@ -29,7 +29,8 @@ SCENES: dict[str, dict[str, Any]] = {
     },
     "derivative of paper": {"derivative": True},
 }
-WORLDS, STEPS = 64, 20
+WORLDS = 64
+STEPS = 20
 
 
 def texts(values: dict[str, Any], backend: str) -> list[str]:
@@ -114,7 +115,8 @@ def main() -> int:
         return 0
     if args.other is None:
         parser.error("name the folder of the other checkout")
-    mine, theirs = of(ROOT), of(args.other.resolve())
+    mine = of(ROOT)
+    theirs = of(args.other.resolve())
     for name in mine:
         same = mine[name] == theirs.get(name) and len(mine[name]) > 0
         print(f"{'same' if same else 'DIFFERENT':9}  {name}")

@@ -43,7 +43,8 @@ from codesign_jax.types import Outcome, Trial, failed
 from codesign_jax.verdict import WANTED
 from scripts.shared import output, provenance, work
 
-CANDIDATES, ROUNDS = 25, 12
+CANDIDATES = 25
+ROUNDS = 12
 """Most particles that are tested at a mark, and trials of each, but for whole turns of the objects;
 an optimiser with `finalists` has its runs' final test."""
 STREAM_JUDGE = 0x6A756467
@@ -119,8 +120,13 @@ class Study:
         chunk: int,
         path: Path,
     ):
-        self.case, self.scene, self.engine, self.space = case, scene, engine, space
-        self.tests, self.chunk, self.path = tests, chunk, path
+        self.case = case
+        self.scene = scene
+        self.engine = engine
+        self.space = space
+        self.tests = tests
+        self.chunk = chunk
+        self.path = path
         self.keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
         self.mask = jnp.ones(space.num_parameters, bool)
         objects = len(scene.objects.object)
@@ -197,7 +203,8 @@ class Study:
         }
 
     def _start(self) -> State:
-        space, first = self.case.optimizer.space, np.arange(self.case.particles)
+        space = self.case.optimizer.space
+        first = np.arange(self.case.particles)
         drawn = jax.jit(jax.vmap(lambda key: optimize.candidates(key, space, first)))(self.keys)
         rows = jnp.zeros(len(self.keys), int)
         if self.before:
@@ -212,16 +219,19 @@ class Study:
     def _mark(self) -> int:
         """Chooses from particles by fresh trials, and judges the chosen one by others."""
         assert self.last is not None
-        particles, mark = self.state.particles, self.done
+        particles = self.state.particles
+        mark = self.done
         if not self.case.optimizer.keeps_best:
             order = jnp.argsort(jnp.asarray(self.last[1]), axis=1)[..., None]
             particles = jnp.take_along_axis(jnp.asarray(self.last[0]), order, 1)
         chosen = particles[:, : self.case.finalists]
-        best, grasps = jnp.zeros(len(chosen), int), 0
+        best = jnp.zeros(len(chosen), int)
+        grasps = 0
         if self.rounds:
             noise = self._noise(codesign.STREAM_TEST, mark)
             tested = self._costs(self._all(chosen, noise, self.rounds))
-            best, grasps = tested.argmin(1), tested.size * self.rounds
+            best = tested.argmin(1)
+            grasps = tested.size * self.rounds
         design = chosen[jnp.arange(len(chosen)), best][:, None]
         self.designs[mark] = np.asarray(design[:, 0])
         self.kept[mark] = self.judge(self.designs[mark], self.scene)
@@ -269,7 +279,8 @@ class Study:
 
     def _restore(self) -> tuple[State, Any]:
         """What a file holds of the study; the arrays' order is that of a state."""
-        n, zeros = self.case.particles, jnp.zeros(self.mask.shape)
+        n = self.case.particles
+        zeros = jnp.zeros(self.mask.shape)
         like = jax.eval_shape(jax.vmap(lambda k: self.case.optimizer.init(k, zeros, n)), self.keys)
         with np.load(self.path) as stored:
             shapes = jax.tree.leaves(like._replace(key=np.zeros(0)))
@@ -322,7 +333,8 @@ def variants_table(rows: list[dict[str, Any]]) -> str:
     """What one other constant of the default search is worth on the same seeds, at each mark."""
     found = []
     for row in sorted(rows, key=lambda row: (row["optimizer"] != optimize.DEFAULT, order(row))):
-        head, cells = ["search"], [f"`{row['optimizer']}`"]
+        head = ["search"]
+        cells = [f"`{row['optimizer']}`"]
         for grasps, kept in zip(row["grasps"], np.array(row["kept"]), strict=True):
             head += [f"after {grasps:,} grasps: seeds that keep 95 %", "5 % below", "mean kept"]
             cells += [share_of(kept), f"{np.quantile(kept, 0.05):.3f}", f"{kept.mean():.3f}"]
@@ -335,7 +347,8 @@ def masses_table(rows: list[dict[str, Any]]) -> str:
     """What recommended designs keep where every object has one of these masses."""
     found = []
     for row in sorted((r for r in rows if "masses" in r), key=order):
-        head, cells = ["searched with"], [" ".join(row["changes"]) or "objects as they are"]
+        head = ["searched with"]
+        cells = [" ".join(row["changes"]) or "objects as they are"]
         for mass, kept in row["masses"].items():
             head += [f"{1e3 * float(mass):g} g: kept on average", "seeds that keep 95 %"]
             cells += [f"{np.mean(kept):.3f}", share_of(np.array(kept))]
@@ -391,7 +404,8 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 def search(args: argparse.Namespace, name: str) -> None:
     """Runs an optimiser's study to its end and writes what its designs keep."""
     scene = scenes.load(args.scene, object_set=args.objects, overrides=changes(args))
-    engine, space = make_engine("structured", scene), design_space(scene.hand, args.preset)
+    engine = make_engine("structured", scene)
+    space = design_space(scene.hand, args.preset)
     case = make_case(name, space, args.preset, len(scene.objects.object))
     changed = ["--robust"] * args.robust + [*chain.from_iterable(args.overrides)]
     words = [Path(args.objects).stem] if args.objects else []
@@ -404,7 +418,8 @@ def search(args: argparse.Namespace, name: str) -> None:
     study = Study(case, scene, engine, space, **how, path=args.out / f"{stem}.npz")
     row = {"preset": args.preset, "scene": args.scene, "objects": args.objects, "changes": changed}
     row |= {"tests": args.tests, "optimizer": name}
-    grasps, start = 0, time.monotonic()
+    grasps = 0
+    start = time.monotonic()
     while not study.finished and args.designs is None:
         grasps += study.step()
         study.save()  # the next command goes on here, whatever ends this one

@@ -76,7 +76,8 @@ def _links_out(path: Path) -> list[str]:
 
 
 def _relinked(text: str, source: str, page: str) -> str:
-    folder, here = posixpath.dirname(source), posixpath.dirname(page)
+    folder = posixpath.dirname(source)
+    here = posixpath.dirname(page)
 
     def replace(match: re.Match) -> str:
         target = _target(folder, match[2])

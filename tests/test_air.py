@@ -26,12 +26,14 @@ from tests.helpers.planted_faults import Fault, planted, simulate
 
 BOUND = 1e-8
 """As in test_steps.py."""
-WANTED, ATMOSPHERE = 60e3, 101325.0
+WANTED = 60e3
+ATMOSPHERE = 101325.0
 
 
 def test_power_is_numpy_s():
     """To sixteen times rounding, by which the last four squarings multiply it."""
-    base, exponent = np.geomspace(0.05, 20, 500), np.linspace(1, 1.7, 8)[:, None]
+    base = np.geomspace(0.05, 20, 500)
+    exponent = np.linspace(1, 1.7, 8)[:, None]
     found = air.power(jnp.float32(base), jnp.float32(exponent))
     np.testing.assert_allclose(found, base**exponent, rtol=4e-6)
     with jax.enable_x64(True):
@@ -50,9 +52,12 @@ class Finger:
     def __init__(self, the_scene, params, exponent, neo_hookean=False):
         """Takes its dimensions; SI units."""
         length, height, wall = (float(v[0]) for v in (params.length, params.height, params.wall))
-        width, shear = the_scene.hand.section.width, the_scene.hand.material.shear_modulus
+        width = the_scene.hand.section.width
+        shear = the_scene.hand.material.shear_modulus
         area = (width - 2 * wall) * (height - 2 * wall)
-        self.gain, self.straight, self.exponent = area * height / 2, area * length, exponent
+        self.gain = area * height / 2
+        self.straight = area * length
+        self.exponent = exponent
         second = width * height**3 - (width - 2 * wall) * ((height - wall) ** 3 - wall**3)
         self.stiffness = 4 * shear * second / 3 / length
 
@@ -128,7 +133,8 @@ def swung():
             begun = np.array(fields.start)
             begun[6] = start
             worlds.append(fields._replace(start=begun))
-        fields, held = grasps.stack(*worlds), np.repeat(np.array(ctrl)[None, :1], 1000, 1)
+        fields = grasps.stack(*worlds)
+        held = np.repeat(np.array(ctrl)[None, :1], 1000, 1)
         held[..., 6:] = WANTED
         engine = StructuredEngine(plain, tolerance=1e-24)
 
@@ -143,7 +149,8 @@ def swung():
 def test_a_loaded_finger_rests_where_the_closed_form_does():
     """The torque of its weight, by MuJoCo C, against wall and air: a root of one variable."""
     the_scene, params, fields, angles, speeds = swung()
-    mine, oracle = Finger(the_scene, params, 1.0), world_model(the_scene, grasps.nth(fields, 0))
+    mine = Finger(the_scene, params, 1.0)
+    oracle = world_model(the_scene, grasps.nth(fields, 0))
     data = mujoco.MjData(oracle)
 
     def unbalanced(angle, pressure):
@@ -163,16 +170,20 @@ def test_a_loaded_finger_rests_where_the_closed_form_does():
 def test_a_free_swing_keeps_its_energy():
     """Of wall, air, atmosphere and motion, less what implicit Euler takes, to the third order."""
     the_scene, params, fields, angles, speeds = swung()
-    mine, oracle = Finger(the_scene, params, 1.0), world_model(the_scene, grasps.nth(fields, 1))
-    data, mass = mujoco.MjData(oracle), np.zeros((oracle.nv, oracle.nv))
+    mine = Finger(the_scene, params, 1.0)
+    oracle = world_model(the_scene, grasps.nth(fields, 1))
+    data = mujoco.MjData(oracle)
+    mass = np.zeros((oracle.nv, oracle.nv))
     data.qpos[:] = fields.start[1]
     mujoco.mj_forward(oracle, data)
     mujoco.mj_fullM(oracle, data, mass)
     inertia = mass[6, 6] - oracle.dof_armature[6]
-    q, v = angles[1], speeds[1]
+    q = angles[1]
+    v = speeds[1]
     wall, gas = mine.energy(q)
     fall = (mine.pressure(q) + ATMOSPHERE) / mine.volume(q)
-    turned, faster = np.diff(q), np.diff(v)
+    turned = np.diff(q)
+    faster = np.diff(v)
     lost = inertia * faster**2 + (mine.stiffness + fall[:-1] * mine.gain**2) * turned**2
     total = wall + gas + inertia * v**2 / 2
     left = total[1:] + np.cumsum(lost) / 2 - total[0]
@@ -188,8 +199,10 @@ def stored(the_scene, params, pressure, bend, lateral):
     at height y and z has the strain that leaves the one bottom edge as long as it is: the left one
     or the right one, by the sign of the lateral curvature.
     """
-    width, shear = the_scene.hand.section.width, the_scene.hand.material.shear_modulus
-    height, wall = float(params.height[0]), float(params.wall[0])
+    width = the_scene.hand.section.width
+    shear = the_scene.hand.material.shear_modulus
+    height = float(params.height[0])
+    wall = float(params.wall[0])
 
     def strain(y, z):
         return bend * y - abs(lateral) * width / 2 + lateral * z
@@ -213,7 +226,9 @@ def test_moments_are_those_of_the_stored_energy(lateral):
     with jax.enable_x64(True):
         the_scene = scene.load("paper", overrides={"effects.lateral_threshold": True})
         params, _ = grasps.hand_world(the_scene, length=0.1)
-        links, bend, small_step = the_scene.discretization.links, 15.0, 0.5
+        links = the_scene.discretization.links
+        bend = 15.0
+        small_step = 0.5
         pressure = 1.7 * the_scene.hand.material.shear_modulus
         beams = morphology.finger_beams(the_scene.hand, params, links)
         numbers = morphology.thresholds(the_scene.hand, params, beams, links)[0, 0]
@@ -296,12 +311,16 @@ SETTINGS = {
 
 def fill(the_scene, model_, data, fields):
     """Gives MuJoCo's tendons, which have the joints' angles as lengths, the air of this state."""
-    h, lay, n = the_scene.discretization.timestep, model.layout(the_scene), 1.4
+    h = the_scene.discretization.timestep
+    lay = model.layout(the_scene)
+    n = 1.4
     for f, joints in enumerate(lay.dofs[..., 0]):
         gain = float(fields.actuator_gainprm[0, 6 + f, 0])
         height, _, segment, _ = np.asarray(fields.section)[0, f]
-        stiffness, straight = model_.jnt_stiffness[joints[0]], 4 * gain / height * segment
-        wanted, volume = data.ctrl[6 + f], straight + gain * data.qpos[joints].sum()
+        stiffness = model_.jnt_stiffness[joints[0]]
+        straight = 4 * gain / height * segment
+        wanted = data.ctrl[6 + f]
+        volume = straight + gain * data.qpos[joints].sum()
         free = straight + gain * len(joints) * gain * wanted / stiffness
         absolute = (wanted + ATMOSPHERE) * (free / volume) ** n
         fall = n * absolute / volume
@@ -311,11 +330,13 @@ def fill(the_scene, model_, data, fields):
 
 def stiffen(the_scene, model_, data, fields):
     """Gives MuJoCo's joints the springs of this state, and the moments on its bend hinges."""
-    lay, h = model.layout(the_scene), the_scene.discretization.timestep
+    lay = model.layout(the_scene)
+    h = the_scene.discretization.timestep
     angles = data.qpos[lay.dofs]
     for f, j in np.ndindex(*lay.dofs.shape[:2]):
         bend, lateral = lay.dofs[f, j, :2]
-        numbers, (q, s) = np.asarray(fields.threshold)[0, f, 0], angles[f, j, :2]
+        numbers = np.asarray(fields.threshold)[0, f, 0]
+        q, s = angles[f, j, :2]
         moment = max(numbers[0] * data.ctrl[6 + f] - numbers[1] * q, 0.0)
         length = np.hypot(s, numbers[2])
         added = moment / length

@@ -65,7 +65,8 @@ def test_no_file_of_a_run_is_opened_through_a_link_or_waited_for(kind, run, tmp_
     scene, settings = runs.read_run(run)
     outside = tmp_path / "outside"
     for name in sorted(NAMES):
-        place, before = run / name, tmp_path / "before"
+        place = run / name
+        before = tmp_path / "before"
         place.parent.mkdir(exist_ok=True)
         if place.exists():
             place.rename(before)
@@ -295,7 +296,8 @@ def test_arrays_that_no_run_has_are_refused_in_words(archive, tmp_path):
     """
     zipfile.ZipFile(DATA / f"{archive}.zip").extractall(tmp_path)
     [run] = manifest.runs_inside(tmp_path)
-    record, settings = runs.load_record(run), runs.read_run(run)[1]
+    record = runs.load_record(run)
+    settings = runs.read_run(run)[1]
     assert record is not None and (record.test is not None) == (archive != "run_screened")
     arrays = records.to_arrays(record)
     records.refuse_other(records.from_arrays(arrays), settings)
@@ -341,7 +343,8 @@ def test_what_this_machine_lacks_is_one_line(monkeypatch, capsys):
 
 @pytest.mark.parametrize(("bad_step", "blamed"), [(-1, True), (7, False)])
 def test_a_cost_that_is_no_number_is_blamed_itself(bad_step, blamed):
-    status, step = np.full(4, int(Status.NONFINITE)), np.full(4, bad_step)
+    status = np.full(4, int(Status.NONFINITE))
+    step = np.full(4, bad_step)
     found = Outcome(np.zeros(4), status, np.zeros(4), step)  # type: ignore[arg-type]
     with pytest.raises(runs.AllFailed) as error:
         loop.refuse_all_failed(found, Path("r"), "mine:c")

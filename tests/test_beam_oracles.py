@@ -76,14 +76,18 @@ class Finger:
     def __init__(self, links, length=0.1, height=0.02, wall=0.005, **options):
         """Compiles the finger of `finger_scene`, 0.3 m above the table; dimensions in m."""
         self.scene = scene = finger_scene(links, **options)
-        self.layout, self.length, self.links = model.layout(scene), length, links
-        one, zero = np.ones(1), np.zeros(())
+        self.layout = model.layout(scene)
+        self.length = length
+        self.links = links
+        one = np.ones(1)
+        zero = np.zeros(())
         params = Params(length * one, height * one, wall * one, zero, np.zeros(6), 0 * one)
         trial = Trial(np.int32(0), np.zeros(2), zero, np.zeros(2), np.ones(()), np.ones(()))
         self.model = model.compile_model(scene, params, trial)
         self.data = mujoco.MjData(self.model)
         self.data.qpos[2] = self.data.ctrl[2] = 0.3
-        width, material = scene.hand.section.width, scene.hand.material
+        width = scene.hand.section.width
+        material = scene.hand.material
         how = {"shear_modulus": material.shear_modulus, "density": material.density}
         self.beam = morphology.beam(height, wall, width=width, **how)
 
@@ -93,17 +97,21 @@ class Finger:
         return palm.T @ (self._end() - self.data.xpos[1]), palm.T @ frame
 
     def _end(self):
-        d, last = self.data, self.layout.bodies[0, -1]
+        d = self.data
+        last = self.layout.bodies[0, -1]
         return d.xpos[last] + d.xmat[last].reshape(3, 3) @ [self.length / self.links / 2, 0, 0]
 
     def settle(self, force=(0, 0, 0), torque=(0, 0, 0), pressure=0.0, steps=3000, rest=1e-10):
         """The tip under a load of fixed direction in the palm's frame, at rest to rounding."""
-        m, d, last = self.model, self.data, self.layout.bodies[0, -1]
+        m = self.model
+        d = self.data
+        last = self.layout.bodies[0, -1]
         d.ctrl[6] = pressure
         mujoco.mj_kinematics(m, d)
         mujoco.mj_comPos(m, d)
         for _ in range(steps):
-            palm, d.qfrc_applied[:] = d.xmat[1].reshape(3, 3), 0.0
+            palm = d.xmat[1].reshape(3, 3)
+            d.qfrc_applied[:] = 0.0
             load = palm @ force, palm @ torque
             mujoco.mj_applyFT(m, d, *load, self._end(), last, d.qfrc_applied)
             mujoco.mj_step(m, d)
@@ -216,8 +224,12 @@ PRINCETON = (
 
 def princeton_rigidity():
     """Weak and strong E I and G J [N m^2]; EXUDYN's torsion factor is 0.198 on both moments."""
-    height, width, young, poisson = 12.3777e-3, 3.2024e-3, 71.7e9, 0.31
-    weak, strong = height * width**3 / 12, width * height**3 / 12
+    height = 12.3777e-3
+    width = 3.2024e-3
+    young = 71.7e9
+    poisson = 0.31
+    weak = height * width**3 / 12
+    strong = width * height**3 / 12
     shear = young / 2 / (1 + poisson)
     return np.array([young * weak, young * strong, shear * 0.198 * (weak + strong)])
 
@@ -229,11 +241,15 @@ def balanced(finger, rigidity, force, bend=0.0):
       rigidity: Of bending, sideways bending and twist [N m^2], shape (3,).
       bend: Angle by which a moment on all its joints bends the unloaded finger [rad].
     """
-    m, d, last = finger.model, finger.data, finger.layout.bodies[0, -1]
-    dofs, length = finger.layout.dofs[0].ravel(), finger.length
+    m = finger.model
+    d = finger.data
+    last = finger.layout.bodies[0, -1]
+    dofs = finger.layout.dofs[0].ravel()
+    length = finger.length
     springs = np.tile(rigidity * finger.links / length, finger.links)
     moment = np.tile([rigidity[0] * bend / length, 0.0, 0.0], finger.links)
-    unit, jacobian = np.sqrt(springs), np.zeros((3, m.nv))
+    unit = np.sqrt(springs)
+    jacobian = np.zeros((3, m.nv))
 
     def residual(y, share):
         d.qpos[dofs] = y / unit
@@ -275,7 +291,8 @@ def test_a_bent_finger_gives_way_sideways(bend, load):
     With hinges in the same order in all joints ten links lack 4 to 8 %.
     """
     rigidity = np.array([6.8e-3, 5.1e-3, 1.75e-3])
-    force, turn = np.array([0.0, load, 0.0]), np.deg2rad(bend)
+    force = np.array([0.0, load, 0.0])
+    turn = np.deg2rad(bend)
     ten, fine = (
         balanced(Finger(n, bending_only=False), rigidity, force, turn)[1] for n in (10, 40)
     )
@@ -284,7 +301,8 @@ def test_a_bent_finger_gives_way_sideways(bend, load):
 
 def eigenfrequencies(finger):
     """Angular frequencies of the finger on a fixed palm, from MuJoCo's mass matrix, ascending."""
-    m, dofs = finger.model, finger.layout.dofs.ravel()
+    m = finger.model
+    dofs = finger.layout.dofs.ravel()
     finger.data.qpos[6 + np.arange(dofs.size)] = 0.0
     mujoco.mj_forward(m, finger.data)
     mass = np.zeros((m.nv, m.nv))
@@ -306,7 +324,8 @@ def test_ring_down(integrator, beta, acts):
     """
     finger = Finger(5, timestep=1e-3, length=0.3, integrator=integrator, beta=beta)
     omega, shape = eigenfrequencies(finger)
-    m, d = finger.model, finger.data
+    m = finger.model
+    d = finger.data
     d.qpos[6:11] = 1e-3 * shape[:, 0] / np.abs(shape[:, 0]).max()
     d.qvel[:] = 0.0
     d.ctrl[2] = d.qpos[2]
@@ -316,7 +335,8 @@ def test_ring_down(integrator, beta, acts):
         mujoco.mj_step(m, d)
     angle = np.array(angle)
     peaks = np.flatnonzero((angle[1:-1] > angle[:-2]) & (angle[1:-1] >= angle[2:])) + 1
-    h, zeta = 1e-3, acts * omega[0] / 2
+    h = 1e-3
+    zeta = acts * omega[0] / 2
     period = 2 * np.pi / (omega[0] * np.sqrt(1 - zeta**2))
     assert len(peaks) >= 4
     # Four periods of 0.85 s, peaks at whole steps.
@@ -333,7 +353,8 @@ def test_order_in_time(integrator, order):
     for h in (16e-3, 8e-3):
         finger = Finger(5, timestep=h, length=0.3, integrator=integrator)
         omega, shape = eigenfrequencies(finger)
-        m, d = finger.model, finger.data
+        m = finger.model
+        d = finger.data
         decay = 6e-3 * omega[0] ** 2 / 2
         turning = np.sqrt(omega[0] ** 2 - decay**2)
 
@@ -361,7 +382,8 @@ def test_order_in_time(integrator, order):
 def test_free_fall():
     """Semi-implicit Euler falls g h^2 n (n + 1) / 2 in n steps, exactly."""
     finger = Finger(1, gravity=9.81)
-    m, d = finger.model, finger.data
+    m = finger.model
+    d = finger.data
     d.qpos[-5] = 2.0
     for _ in range(50):
         mujoco.mj_step(m, d)
@@ -401,7 +423,8 @@ def test_section_integrals(height, wall, width):
     assert beam.bending == pytest.approx(young * bending, rel=1e-6)
     assert beam.lateral == pytest.approx(young * lateral, rel=1e-6)
     assert beam.line_density == pytest.approx(1070 * area, rel=1e-6)
-    wide, high = width - wall, height - wall
+    wide = width - wall
+    high = height - wall
     assert beam.torsion == pytest.approx(70e3 * 2 * (wide * high) ** 2 * wall / (wide + high))
     chamber = (width - 2 * wall) * (height - 2 * wall)
     assert beam.moment_per_pressure == pytest.approx(chamber * height / 2)
@@ -414,7 +437,9 @@ def test_segments_are_a_finger_cut_in_pieces(links):
     params = Params(*np.array([[0.09, 0.13], [0.018, 0.021], [0.004, 0.005]]), 0.0, None, None)
     beams = morphology.finger_beams(hand, params, links)
     found = morphology.segments(hand, params, links)
-    length, height, mass = params.length, params.height, beams.line_density[:, 0] * params.length
+    length = params.length
+    height = params.height
+    mass = beams.line_density[:, 0] * params.length
     joint = np.cumsum(found.offset, 1)
     # A joint stands in the middle of each segment.
     np.testing.assert_allclose(joint, np.outer(length, (np.arange(links) + 0.5) / links))
@@ -500,9 +525,12 @@ def made(links=10, law="linear"):
 @pytest.mark.parametrize("links", [3, 10])
 def test_closed_forms_of_beams(links):
     """M L / EI; M / L; 3 M / 2 L and P L^3 / 3 EI, both up to the chain's 1 - 1 / (4 N^2)."""
-    mine, chain = made(links), 1 - 1 / (4 * links**2)
+    mine = made(links)
+    chain = 1 - 1 / (4 * links**2)
     [stiffness], [gain] = mine.stiffness, mine.gain
-    moment, rigidity = 1e-3 * stiffness, stiffness * mine.segment  # 1e-3 rad a joint
+    # 1e-3 rad a joint
+    moment = 1e-3 * stiffness
+    rigidity = stiffness * mine.segment
     pressure = moment / gain
     load = 0.1 * moment / mine.length
     table = {n: np.array([pressure]) for n in ("pressure", *finger.MEASURED)}
@@ -544,8 +572,10 @@ def synthetic(truth, noise, seed=0, columns=("angle", "tip_force")):
 @pytest.mark.parametrize("columns", [("angle", "tip_force"), ("angle", "deflection")])
 def test_a_fit_finds_the_material_within_its_own_error(columns):
     """Over ten draws of noise the errors are as large as it says; such a ratio varies by 22 %."""
-    mine, truth = made(3), (52e3, 0.8)
-    errors, spreads = [], []
+    mine = made(3)
+    truth = (52e3, 0.8)
+    errors = []
+    spreads = []
     for seed in range(10):
         table = synthetic(mine.of_material(*truth), 0.02, seed, columns)
         found = finger.fit(mine, table)
@@ -569,7 +599,8 @@ def test_a_free_neo_hookean_finger_is_the_chain_s(pressure):
 
 
 def test_a_fit_under_the_neo_hookean_law_is_exact_without_noise():
-    mine, truth = made(3, "neo_hookean"), (52e3, 0.8)
+    mine = made(3, "neo_hookean")
+    truth = (52e3, 0.8)
     found = finger.fit(mine, synthetic(mine.of_material(*truth), 0.0))
     np.testing.assert_allclose(found[:2], truth, rtol=1e-6)
 
@@ -712,7 +743,8 @@ def test_rows_that_have_a_rest_are_printed_and_the_others_named(tmp_path, capsys
 
 
 def test_the_command_compares_and_fits(tmp_path, capsys):
-    path, out = tmp_path / "finger.csv", tmp_path / "out.csv"
+    path = tmp_path / "finger.csv"
+    out = tmp_path / "out.csv"
     truth = made().of_material(50e3)
     angles = np.rad2deg([finger.Rest.of(truth, p).angles.sum() for p in (20e3, 40e3)])
     path.write_text(f"pressure_kPa,angle_deg\n20,{angles[0]}\n40,{angles[1]}\n")

@@ -54,7 +54,8 @@ def test_round_trip_is_bitwise(folder):
 
 def test_no_save_waits_for_the_deletion_of_old_steps_or_fails_with_it(tmp_path, monkeypatch):
     """Deletions begin when all saves are done, and are refused then."""
-    saved, said = threading.Event(), []
+    saved = threading.Event()
+    said = []
 
     def refuse(path, *rest, **more):
         assert saved.wait(60), "a save waits for this"
@@ -112,9 +113,11 @@ def damaged(content, count):
 
 
 def test_any_damage_of_arrays_is_one_error(tmp_path):
-    path, arrays = tmp_path / "x.npz", {"a": np.arange(50.0), "name": np.array("text")}
+    path = tmp_path / "x.npz"
+    arrays = {"a": np.arange(50.0), "name": np.array("text")}
     store.save(path, arrays)
-    content, refused = path.read_bytes(), 0
+    content = path.read_bytes()
+    refused = 0
     for place, other in damaged(content, 150):
         path.write_bytes(other)
         try:

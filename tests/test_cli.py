@@ -119,7 +119,8 @@ def test_ctrl_c_is_one_line_and_ends_the_process(monkeypatch, capsys, request):
     # A shell that starts the suite in its background has Ctrl-C ignored.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
-    going, left = threading.Event(), []
+    going = threading.Event()
+    left = []
 
     def simulate(*arguments):
         going.set()
@@ -142,7 +143,8 @@ def test_ctrl_c_is_one_line_and_ends_the_process(monkeypatch, capsys, request):
 
 def test_scenes_names_what_is_built_in(capsys):
     assert cli.main(["scenes"]) == 0
-    said, kinds = capsys.readouterr().out, ("scenes", "hands", "objects", "controls")
+    said = capsys.readouterr().out
+    kinds = ("scenes", "hands", "objects", "controls")
     assert all(name in said for kind in kinds for name in library.available(kind))
     assert "lateral_bending" not in said
     assert cli.main(["scenes", "edge"]) == 0 and "lateral_bending" in capsys.readouterr().out

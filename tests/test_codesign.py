@@ -12,7 +12,8 @@ from codesign_jax.optimize import schedule
 from tests.helpers import episodes
 from tests.helpers.toy_engine import tiny
 
-PARTICLES, TRIALS = 8, 3
+PARTICLES = 8
+TRIALS = 3
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,8 @@ def start(optimizer, seed=0, particles=PARTICLES, design=(0.05, 0.0)):
 
 def test_episode_is_move_evaluate_weigh_and_resample(setup):
     the_scene, space, engine, optimizer, episode = setup
-    state, mask = start(optimizer), np.array([True, True])
+    state = start(optimizer)
+    mask = np.array([True, True])
     new, info = episode(state, mask)
     # The same arithmetic in another program, where the compiler fuses it: the last bit may differ.
     np.testing.assert_allclose(info.population, optimizer.ask(state, mask), rtol=1e-6, atol=1e-8)
@@ -82,7 +84,9 @@ def test_seed_is_poor_and_reproducible(setup):
         search = codesign.seed_search(the_scene, optimizer, key, batch=PARTICLES)
         return episodes.answered(search, evaluate)
 
-    (a, cost, drawn), (b, *_), (c, *_) = find(0), find(0), find(1)
+    a, cost, drawn = find(0)
+    b, *_ = find(0)
+    c, *_ = find(1)
     assert cost > codesign.SEED_COST and drawn >= 1
     np.testing.assert_array_equal(a, b)
     assert (np.asarray(a) != np.asarray(c)).any()

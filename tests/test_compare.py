@@ -54,7 +54,8 @@ def place(tmp_path_factory):
 def test_runs_of_folders_are_rows(place, tmp_path, monkeypatch, capsys):
     """One a run, with what the runs differ in; folders of runs are those in them."""
     monkeypatch.chdir(place)
-    table, folders = tmp_path / "runs.csv", ["particle-filter", "screened", "seeds"]
+    table = tmp_path / "runs.csv"
+    folders = ["particle-filter", "screened", "seeds"]
     assert command("compare", *folders, "--out", table) == 0
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     assert "run scene hand objects optimizer preset engine seed converged judged by" in lines[1]
@@ -104,7 +105,8 @@ def test_what_cannot_be_compared_is_refused(names, flags, expected, place, capsy
 
 def test_the_interval_of_a_difference_covers_as_often_as_it_says():
     """By the exact probabilities of all tables of 20 trials, for shares of good and bad designs."""
-    total, covered = 20, []
+    total = 20
+    covered = []
     tables = [
         (a, b, c)
         for a in range(total + 1)
@@ -124,7 +126,8 @@ def test_the_interval_of_a_difference_covers_as_often_as_it_says():
 def test_where_a_policy_leaves_the_key_frames():
     """Until a grasp is decided: what is commanded later is nobody's."""
     tiny = scene.load(TINY)
-    steps, h = 8, tiny.discretization.timestep
+    steps = 8
+    h = tiny.discretization.timestep
     planned = np.zeros((5, steps, 8))
     ctrl = planned.copy()
     ctrl[1, 3:, 6] = -2e4  # a pressure, from the fourth step on
@@ -285,7 +288,8 @@ def test_a_design_is_opened_from_its_file(workplace, capsys, monkeypatch):
 def test_a_table_of_trials_has_noise_and_endings(finished, tmp_path, capsys):
     """Of any final particle: the noise is that of the seed, and endings add up to the verdict."""
     rows = [line.split(",") for line in (finished / "tests.csv").read_text().splitlines()[1:]]
-    table, seed = tmp_path / "new" / "trials.csv", 4
+    table = tmp_path / "new" / "trials.csv"
+    seed = 4
     asked = ["evaluate", finished, "--particle", "1", "--trials", "3", "--seed", seed]
     assert command(*asked, "--out", table) == 0
     output = capsys.readouterr().out
@@ -367,10 +371,12 @@ def test_the_characteristic_of_the_test_is_exact(share):
         alone = np.log(1 / verdict.ERROR) / np.log(verdict.WANTED / verdict.POOR)
         assert verdict.characteristic(share, 1).grasps == np.ceil(alone) == 56
         assert verdict.characteristic(share).grasps == 60
-    batch, most = 2, 12
+    batch = 2
+    most = 12
     looks = range(batch, most + 1, batch)
     words = {(kept, n): verdict.judge(kept, n).word for n in looks for kept in range(n + 1)}
-    ends, grasps = dict.fromkeys(("good", "not good", "not enough trials"), 0.0), 0.0
+    ends = dict.fromkeys(("good", "not good", "not enough trials"), 0.0)
+    grasps = 0.0
     for sequence in itertools.product((1, 0), repeat=most):
         chance = share ** sum(sequence) * (1 - share) ** (most - sum(sequence))
         for total in looks:
@@ -555,7 +561,8 @@ def test_overlaps_are_depths_of_sections():
     lay, place, turn = placed()
     alone = overlap.overlaps(PAPER, HAND, place, turn)
     assert not alone.fingers.any() and not alone.palm.any()
-    depth, height = 0.004, float(HAND.height[0])
+    depth = 0.004
+    height = float(HAND.height[0])
     place[0, lay.bodies[1]] = place[0, lay.bodies[0]] + [0, 0, height - depth]
     found = overlap.overlaps(PAPER, HAND, place, turn).fingers[0]
     # To first order: the rounded outline is 1 % nearer beside the middle.
@@ -592,7 +599,11 @@ def test_strain_is_curvature_times_height():
 def test_the_strain_s_pressure_is_that_of_the_wall_s_stress(neo_hookean):
     """By SciPy: the curvature at which the integral of the stress over the section balances
     the pressure's moment; 4 G e of the linear law, G (l - l^-3) of the neo-Hookean one."""
-    height, wall, width, modulus, strain = 0.02, 0.004, 0.024, 35e3, 1.3
+    height = 0.02
+    wall = 0.004
+    width = 0.024
+    modulus = 35e3
+    strain = 1.3
     how = {"width": width, "shear_modulus": modulus, "neo_hookean": neo_hookean}
     pressure = beams.strain_pressure(strain, np.array(height), np.array(wall), **how)
 
@@ -637,7 +648,8 @@ def test_no_design_of_a_space_is_beyond_the_strain(law):
         )
         return np.asarray(own.pressure / caps).max(1)
 
-    before, after = highest(drawn[SPACE]), highest(drawn[space])
+    before = highest(drawn[SPACE])
+    after = highest(drawn[space])
     assert before.max() > 1.2 and after.max() <= 1 and (after[before > 1] > 0.999).all()
     same = [k for k, name in enumerate(space.names) if not name.startswith("pressure")]
     np.testing.assert_array_equal(drawn[space][:, same], drawn[SPACE][:, same])

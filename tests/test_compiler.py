@@ -183,7 +183,8 @@ def test_operations_on_floats(backend, dtype):
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_angles_and_control(backend, dtype):
     """Sine and cosine to some units in the last place, and every kind of control flow."""
-    eps, size = np.finfo(dtype).eps, BLOCKS * lanes_of(backend)
+    eps = np.finfo(dtype).eps
+    size = BLOCKS * lanes_of(backend)
     rng = np.random.default_rng(1)
     x, y = 3 * rng.standard_normal((2, size)).astype(dtype)
     x[:6] = [0, np.pi / 4, -np.pi / 2, 1e3, -20, 1]
@@ -200,7 +201,8 @@ def test_angles_and_control(backend, dtype):
 
 def sum_of_pairs(x, y):
     """Products of all lanes, summed as a block sums over its fingers."""
-    product, distance = x * y, 1
+    product = x * y
+    distance = 1
     while distance < x.size:
         product = product + jax.lax.rev(product.reshape(-1, 2, distance), (1,)).reshape(x.shape)
         distance *= 2
@@ -238,7 +240,8 @@ def test_what_lanes_sum_after_an_exchange_has_the_same_bits_on_all(backend):
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_operations_on_integers(backend, dtype):
     """Of all kinds of numbers, also those at which processors trap; sums wrap around."""
-    info, size = np.iinfo(dtype), BLOCKS * lanes_of(backend)
+    info = np.iinfo(dtype)
+    size = BLOCKS * lanes_of(backend)
     numbers = [0, 1, -1, 2, -7, 9, info.min, info.max]
     pairs = [(a, b) for a in numbers for b in numbers]
     pairs += [(3, 2)] * (size - len(pairs))
@@ -326,7 +329,8 @@ def exchange(lanes, backend):
 
     def kernel(x, out, table, onchip):
         lane = jax.lax.broadcasted_iota(jnp.int32, (lanes,), 0)
-        own, mate = jax.lax.rem(lane, columns), jax.lax.div(lane, columns)
+        own = jax.lax.rem(lane, columns)
+        mate = jax.lax.div(lane, columns)
 
         def body(k, total):
             for ref in (table, onchip):

@@ -88,8 +88,10 @@ def test_scenes_that_differ_in_numbers_share_their_structure():
 
 def test_changing_any_number_compiles_nothing(monkeypatch):
     """Neither XLA's program nor the kernel, for a number of each table and for all at once."""
-    the_scene, compiled = short(**BARE), []
-    engine, original = make_engine("structured", the_scene), launch.launch
+    the_scene = short(**BARE)
+    compiled = []
+    engine = make_engine("structured", the_scene)
+    original = launch.launch
 
     def counting(call, inputs, outputs, kernel):
         compiled.append(kernel.origin)
@@ -156,7 +158,8 @@ def test_derivatives_equal_differences():
 
 def test_later_noise_leaves_earlier_draws_alone():
     """Friction, stiffness and the hand's masses have keys of their own; their factors are 1."""
-    key, names = jax.random.key(3), ("friction", "stiffness", "hand_mass")
+    key = jax.random.key(3)
+    names = ("friction", "stiffness", "hand_mass")
     noise = {"objects.noise": dict(zip(names, (0.3, 0.1, 0.2), strict=True))}
     plain, noisy = (
         jax.device_get(rollout.sample_trials(scene.load("paper_spheres", overrides=o), key, 5))

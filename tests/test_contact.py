@@ -54,7 +54,9 @@ def test_a_step_ends_with_the_force_at_its_end(dissipation, timestep):
     touch = table.data.qpos[-5]
     table.data.qpos[-5] += 0.02
     position, velocity = table.run(0.3)
-    k, h, ends = 2 * table.scene.contact.normal_stiffness, timestep, velocity[:, 2]
+    k = 2 * table.scene.contact.normal_stiffness
+    h = timestep
+    ends = velocity[:, 2]
     gaps = position[:, 2] - h * ends - touch  # at the beginning of each step
     force = np.where(gaps < 0, np.maximum(-k * (gaps + (h + tau) * ends), 0), 0)
     before = np.append(0, ends[:-1])
@@ -94,8 +96,10 @@ def test_incline_below_the_friction_angle_holds(shape):
     stiff; n of them share m g sin(angle).
     """
     angle = 0.9 * np.arctan(MU)
-    flat, full = Table(shape, angle, flat=True), Table(shape, angle)
-    (_, slow), (_, velocity) = flat.run(3.0), full.run(3.0)
+    flat = Table(shape, angle, flat=True)
+    full = Table(shape, angle)
+    _, slow = flat.run(3.0)
+    _, velocity = full.run(3.0)
     contact = flat.scene.contact
     damper = 2 * contact.normal_stiffness * contact.friction_ratio * 0.04
     expected = MASS * GRAVITY * np.sin(angle) / (CORNERS[shape] * damper)
@@ -124,7 +128,8 @@ def test_incline_above_the_friction_angle_slides(shape):
 # --- physics of the effects against closed forms, quadrature and scipy's integrators --------------
 
 
-WIDTH, G = 0.020, 70e3
+WIDTH = 0.020
+G = 70e3
 """Width of the section [m] and shear modulus [Pa] of the paper's fingers."""
 
 
@@ -155,7 +160,8 @@ def test_neo_hookean_moment(height, wall):
 
 def test_supply_against_an_integrator():
     """Lag, rate and maximum at once, along a grasp, against scipy's adaptive integrator."""
-    h, count = 1e-3, 9000
+    h = 1e-3
+    count = 9000
     scene = grasps.pinch(
         effects__pressure_dynamics=True,
         pneumatics__lag=0.15,
@@ -164,7 +170,8 @@ def test_supply_against_an_integrator():
         discretization__timestep=h,
     )
     time = np.arange(count) * h
-    p, end = scene.phases, scene.window[1]
+    p = scene.phases
+    end = scene.window[1]
     keys = [p.approach, p.inflate, end, end + p.deflate_time]
     wanted = 130e3 * np.interp(time, keys, [0.0, 1.0, 1.0, 0.0])[None]
     with jax.enable_x64(True):
@@ -208,7 +215,8 @@ def pushes(c, relative):
 )
 def test_force_and_inertia_are_derivatives_of_the_cost(friction):
     """In spatial accelerations, by automatic differentiation of the cost, in every zone."""
-    rng, count = np.random.default_rng(3), 60
+    rng = np.random.default_rng(3)
+    count = 60
     c = some_contacts(friction, rng, count)
     with jax.enable_x64(True):
         # Towards the surface, along it, and turning, in all proportions.

@@ -78,7 +78,8 @@ def test_bad_starts_are_flagged_and_in_the_outcome():
     found = jax.jit(partial(start.invalid_start, the_scene))(fields)
     bad = [False, True, True, True, True, True]
     np.testing.assert_array_equal(np.asarray(found) != 0, bad)
-    engine, few = MujocoEngine(the_scene), slice(2)
+    engine = MujocoEngine(the_scene)
+    few = slice(2)
     run = jax.jit(lambda p, t: rollout.simulate(the_scene, engine, p, t)[0])
     result = run(stack(*worlds[few]), nth(trials, few))
     assert [bool(s & Status.INVALID_START) for s in result.status] == bad[few]
@@ -272,7 +273,8 @@ def test_base_points_stay_and_directions_turn(spread):
         place = to_palm @ (root.xpos - data.body("palm").xpos)
         assert finger.base is not None
         np.testing.assert_allclose(place, [*finger.base, 0.0], atol=1e-9)
-        azimuth, tilt = np.deg2rad(finger.azimuth) + finger.spread * spread, np.deg2rad(finger.tilt)
+        azimuth = np.deg2rad(finger.azimuth) + finger.spread * spread
+        tilt = np.deg2rad(finger.tilt)
         level = np.cos(tilt) * np.array([np.cos(azimuth), np.sin(azimuth)])
         along = to_palm @ root.xmat.reshape(3, 3)[:, 0]
         np.testing.assert_allclose(along, [*level, -np.sin(tilt)], atol=1e-9)

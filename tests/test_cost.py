@@ -10,15 +10,19 @@ from codesign_jax.types import Outcome, Status, Trace, failed
 from tests.helpers import grasps
 
 SCENE = scene.load("paper_spheres")
-STEPS, LOST = SCENE.num_steps, SCENE.cost.lost_distance
+STEPS = SCENE.num_steps
+LOST = SCENE.cost.lost_distance
 evaluate = jax.jit(lambda trace: cost.outcome(SCENE, trace))
 judge = jax.jit(lambda trace, trial: cost.outcome(SCENE, trace, 0, trial))
 
 
 def trace(lost_from=None, until=STEPS, **changes):
     """A grasp that keeps the object until a step, releases it, and leaves it on the table."""
-    distance, height = np.full(STEPS, 0.03), np.full(STEPS, 0.25)
-    distance[850:], height[850:] = 0.25, 0.03  # un-grasped at 8.5 s
+    distance = np.full(STEPS, 0.03)
+    height = np.full(STEPS, 0.25)
+    # un-grasped at 8.5 s
+    distance[850:] = 0.25
+    height[850:] = 0.03
     if lost_from is not None:
         distance[lost_from:until] = 0.2
     speed = np.full(STEPS, 0.5)
@@ -107,12 +111,14 @@ def test_whether_an_object_rests_is_told_by_its_own_size():
         assert judge(held, trial).status == status, (name, size)
 
 
-CAP, OVERFLOW = Status.SOLVER_CAP, Status.CONTACT_OVERFLOW
+CAP = Status.SOLVER_CAP
+OVERFLOW = Status.CONTACT_OVERFLOW
 
 
 def with_status(bits, lost_from=None, residuals=None):
     """A grasp with bits, and residuals of its solver, at steps."""
-    status, residual = np.zeros(STEPS, np.int32), np.zeros(STEPS, np.float32)
+    status = np.zeros(STEPS, np.int32)
+    residual = np.zeros(STEPS, np.float32)
     for array, values in ((status, bits), (residual, residuals or {})):
         array[[*values]] = [*values.values()]
     told = None if residuals is None else jnp.asarray(residual)

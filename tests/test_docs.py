@@ -105,7 +105,8 @@ SIMULATES = {
 @pytest.mark.parametrize("example", CODESIGN)
 def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch):
     """Scene, design and files are the example's own; nothing is compiled that places or steps."""
-    arguments, reached = here_alone(example), []
+    arguments = here_alone(example)
+    reached = []
     monkeypatch.setattr(preflight, "refusals", lambda *rest: [])  # the slow test below has it
     monkeypatch.setattr(check, "simulate", lambda *rest: ())
     # The exit code is what is handed on, or made of a status.
@@ -190,7 +191,8 @@ def records(content):
 
 
 def test_all_figures_are_of_one_kernel_or_their_pages_say_that_they_are_not():
-    data, older = ROOT / "docs" / "data", {}
+    data = ROOT / "docs" / "data"
+    older = {}
     for path in data.rglob("*.json"):
         made = records(json.loads(path.read_text()))
         assert made, f"{path} does not say what made it"
@@ -242,10 +244,13 @@ FREE = "fixed", "group", "pressure"  # tables whose keys are names
 
 def documented(page):
     """Keys of each kind of file on the page: (heading, table, key), with "" for the top level."""
-    found, heading, table = set(), "", ""
+    found = set()
+    heading = ""
+    table = ""
     for line in page.splitlines():
         if line.startswith("## "):
-            heading, table = line[3:], ""
+            heading = line[3:]
+            table = ""
         elif name := re.match(r"### `\[+([a-z_.]+)\]+`", line):
             table = name[1]
         elif key := re.match(r"\| `([a-z_]+)` \|", line):
@@ -275,7 +280,8 @@ def test_every_key_of_the_built_in_files_is_in_the_reference(heading):
 @pytest.mark.browser
 def test_the_site_is_read_and_searched_without_a_network(browser):
     """The one of `make docs`, which `make test-browser` makes first."""
-    page, complaints = browser.new_page(viewport={"width": 1300, "height": 900}), []
+    page = browser.new_page(viewport={"width": 1300, "height": 900})
+    complaints = []
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on("request", lambda r: None if r.url.startswith("file:") else complaints.append(r.url))
     page.goto((ROOT / "site" / "index.html").as_uri())
@@ -298,13 +304,16 @@ CONSTANT = "section", "material", "palm", "wrist", "contact", "arm"
 
 def kinds(path):
     """Kind by key of a file's constants: that of the comment in its line, or of its table."""
-    found, table, of_table = {}, "", ""
+    found = {}
+    table = ""
+    of_table = ""
     for line in path.read_text(encoding="utf-8").splitlines():
         code, _, comment = line.partition("#")
         named = [k for k in KINDS if f"[{k}]" in comment]
         assert len(named) < 2 or not code, line
         if header := re.match(r"\[+([a-z_.]+)\]+", code):
-            table, of_table = header[1], "".join(named)
+            table = header[1]
+            of_table = "".join(named)
         elif (key := re.match(r"([a-z_]+) = (?!true|false)", code)) and table in CONSTANT:
             found[f"{table}.{key[1]}"] = "".join(named) or of_table
     return found

@@ -114,7 +114,8 @@ def test_distance_is_from_the_mean_of_the_links(decided):
     data = mujoco.MjData(compiled := world_model(scene, grasps.nth(fields, 0)))
     data.qpos[:] = fields.start[0]
     mujoco.mj_kinematics(compiled, data)
-    lay, sizes = model.layout(scene), zip(params.length[0], params.height[0], strict=True)
+    lay = model.layout(scene)
+    sizes = zip(params.length[0], params.height[0], strict=True)
     centres = [
         data.xpos[stub] + data.xmat[stub].reshape(3, 3) @ [share * length, 0, height / 2]
         for stub, (length, height) in zip(lay.stubs, sizes, strict=True)
@@ -137,7 +138,8 @@ def test_distance_is_from_the_mean_of_the_links(decided):
 def test_a_trace_means_the_same_on_every_engine(decided, name, trajectory):
     """Where worlds are decided, what later entries show, and the state in which they stay."""
     scene, *_, simulated = decided
-    first, end = round(scene.window[0] / 0.01), scene.num_steps
+    first = round(scene.window[0] / 0.01)
+    end = scene.num_steps
     (got, ours), (want, outcome) = (simulated(n, trajectory) for n in (name, "mujoco"))
     lost_at = 0.01 * first
     assert outcome.lost_time[0] == pytest.approx(lost_at)
@@ -285,7 +287,8 @@ def test_gradients_by_the_kernel_equal_central_differences(slopes):
     engine = StructuredEngine(scene, iterations=60, tolerance=1e-22)
     with jax.enable_x64(True):
         value = partial(bent, scene, engine, grasps.hand_world(scene, pressure=50e3))
-        x, broken = jnp.array([[1.0, 1.0, 1.0], [0.9, 1.1, 1.2]]), jnp.array([False, True])
+        x = jnp.array([[1.0, 1.0, 1.0], [0.9, 1.1, 1.2]])
+        broken = jnp.array([False, True])
         slope = jax.jit(partial(slopes, value), compiler_options=QUICK)(x, broken)
         step = 1e-5 * jnp.eye(3)
         sides = jnp.stack([x[:, None] + step, x[:, None] - step])
@@ -300,7 +303,9 @@ def test_gradients_by_the_kernel_equal_central_differences(slopes):
 def test_what_has_no_derivative_says_so():
     """Forward mode and second derivatives, before anything is compiled."""
     scene = grasps.pinch("sphere", **FREE)
-    engine, world, x = StructuredEngine(scene), grasps.hand_world(scene), jnp.ones(3)
+    engine = StructuredEngine(scene)
+    world = grasps.hand_world(scene)
+    x = jnp.ones(3)
 
     def value(x):
         return bent(scene, engine, world, x[None], jnp.zeros(1, bool))[0]

@@ -68,7 +68,9 @@ def uniform(length, width, height, wall):
     return Size(length, section, section, wall)
 
 
-USUAL, FLAT, SHORT = uniform(95, 20, 20, 5), uniform(170, 20, 15, 7), uniform(12, 20, 25, 2)
+USUAL = uniform(95, 20, 20, 5)
+FLAT = uniform(170, 20, 15, 7)
+SHORT = uniform(12, 20, 25, 2)
 TAPERED = Size(120, Section(24, 22, 5), Section(16, 14, 3), 4.0)
 # STL holds float32: seven digits of lengths of up to 200 mm.
 EXACT = 1e-4
@@ -95,7 +97,8 @@ def test_equal_fingers_are_written_once_in_both_formats(written):
 def test_files_hold_closed_bodies_in_millimetres(written):
     folder, parts = written
     for path in folder.iterdir():
-        surface, part = trimesh.load_mesh(path), parts[path.stem]
+        surface = trimesh.load_mesh(path)
+        part = parts[path.stem]
         assert surface.is_watertight and surface.is_winding_consistent
         assert surface.volume == pytest.approx(part.volume, rel=EXACT) and surface.volume > 0
         np.testing.assert_allclose(surface.bounds[0, 2], 0, atol=EXACT)  # on the printer's bed
@@ -109,7 +112,8 @@ def test_files_hold_closed_bodies_in_millimetres(written):
 def test_walls_and_chamber_are_the_design_s(written, name, size):
     """Rays through the finger meet its surfaces at the thickness of the walls."""
     part = solid(written[0] / f"finger_{name}.stl")
-    wall, (across, up) = size.base.wall, size.base.chamber
+    wall = size.base.wall
+    across, up = size.base.chamber
     low, high = np.reshape(part.bounding_box(), (2, 3))
     inside = np.array([size.length / 2, 0.3 * across / 2, wall + 0.3 * up])
     for axis, thick in enumerate((size.end, wall, wall)):
@@ -138,9 +142,11 @@ def box(low, high):
 @pytest.mark.parametrize("draft", [0.0, 3.0])
 def test_what_the_moulds_hold_is_the_finger(tmp_path, draft):
     """The closed mould's cavity, from the files: the shell; the base's pocket: the bottom wall."""
-    size, how = USUAL, Process(draft=draft, inlet=0.0)
+    size = USUAL
+    how = Process(draft=draft, inlet=0.0)
     meshes.write(tmp_path, [size], how)
-    length, (width, height, wall) = size.length, size.base
+    length = size.length
+    width, height, wall = size.base
     # Back into the frame of the finger: the tray was turned over, the core's bars stood below it.
     tray = solid(tmp_path / "finger_0_tray.stl").translate([0, 0, -height - how.mould_wall])
     tray = tray.rotate([180, 0, 0])
@@ -175,7 +181,8 @@ def test_what_the_moulds_hold_is_the_finger(tmp_path, draft):
 def test_moulds_of_a_tapered_finger_hold_it(tmp_path, root):
     """Shell and bottom wall are the finger, by Simpson's rule over its sections; walls have the
     thickness of the place."""
-    how, size = Process(inlet=0.0), TAPERED._replace(root=root)
+    how = Process(inlet=0.0)
+    size = TAPERED._replace(root=root)
     meshes.write(tmp_path, [size], how)
     finger, tray, core, base = (
         solid(tmp_path / f"finger_0{kind}.stl") for kind in ("", "_tray", "_core", "_base")
@@ -186,8 +193,13 @@ def test_moulds_of_a_tapered_finger_hold_it(tmp_path, root):
         assert part.volume() == pytest.approx(file.volume(), rel=EXACT)
     assert (made.tray ^ made.core).volume() == pytest.approx(0, abs=1e-6)
     assert core.genus() == 2 * len(casting.bars_of(size))
-    x, half = (-2.0 - root, 122.0), casting.shifted(casting.half_width(size), 2.0)
-    rim, top = casting._rim(size), lambda x: size.at(x).height
+    x = (-2.0 - root, 122.0)
+    half = casting.shifted(casting.half_width(size), 2.0)
+    rim = casting._rim(size)
+
+    def top(x):
+        return size.at(x).height
+
     shell = casting.prism(x, half, rim, top) - made.tray - made.core
     pocket = casting.prism(x, half, lambda x: 0.0, rim) - made.base
     assert shell.volume() + pocket.volume() == pytest.approx(size.volume, rel=1e-6)
@@ -233,7 +245,8 @@ def test_known_thresholds_are_bracketed():
     """A rule for each parameter: the tolerance ends at the step before the rule's end."""
     the_scene = scene.load("paper")
     space = parameters.design_space(the_scene.hand, "full")
-    names, design = list(space.names), space.default()
+    names = list(space.names)
+    design = space.default()
     for name, value in {"length[0]": 0.110, "arm_z": 0.020, "arm_x": 0.0}.items():
         design[names.index(name)] = value
     planned = tolerance.study(the_scene, space, design, STEPS, free=False)
@@ -263,8 +276,11 @@ def test_known_thresholds_are_bracketed():
     assert rows["wall[2]"].up.good is None and rows["wall[2]"].up.bad.value > 5
     assert rows["arm_x"].down.bad is None and rows["arm_x"].down.good.value == pytest.approx(-60)
     share = rows["arm_x"].down.good.share  # 37 of 40: Wilson's interval by its formula
-    n, p, q = 40, 0.925, 1.959964
-    centre, half = (p + q**2 / 2 / n), q * np.sqrt(p * (1 - p) / n + q**2 / 4 / n**2)
+    n = 40
+    p = 0.925
+    q = 1.959964
+    centre = p + q**2 / 2 / n
+    half = q * np.sqrt(p * (1 - p) / n + q**2 / 4 / n**2)
     np.testing.assert_allclose(share[1:], (centre + half * np.array([-1, 1])) / (1 + q**2 / n))
     # Every design differs from the middle in one parameter.
     assert (np.count_nonzero(moved, axis=1) <= 1).all() and x >= 0
@@ -400,7 +416,8 @@ def test_a_hand_s_silicone_is_named_or_the_nearest_is(change, named, nearest):
 )
 def test_a_finger_that_does_nothing_is_named(page, length, pressure, idle):
     the_scene, params, _, _ = page
-    one, rest = np.array([True, False, False, False]), params
+    one = np.array([True, False, False, False])
+    rest = params
     params = rest._replace(
         length=np.where(one, length, rest.length), pressure=np.where(one, pressure, rest.pressure)
     )
@@ -432,11 +449,13 @@ def test_fingers_fit_into_the_palm(name, tmp_path):
     hand = name if not HANDS[name] else "pneuflex4"
     the_scene = scene.load("paper_spheres", hand_name=hand, overrides=HANDS[name])
     space = parameters.design_space(the_scene.hand, "full")
-    params, how = jax.tree.map(np.asarray, space.params(space.default())), Process()
+    params = jax.tree.map(np.asarray, space.params(space.default()))
+    how = Process()
     sizes = process.sizes(the_scene.hand, params, how)
     made = palm.palm(the_scene, params, sizes, how)
     meshes.write_palm(tmp_path, made)
-    body, low = solid(tmp_path / "palm.stl"), made.body.bounding_box()[2]
+    body = solid(tmp_path / "palm.stl")
+    low = made.body.bounding_box()[2]
     body = body.translate([0, 0, low])
     assert trimesh.load_mesh(tmp_path / "palm.stl").is_watertight and len(body.decompose()) == 1
     assert low == pytest.approx(-made.below, abs=1e-6)
@@ -487,7 +506,8 @@ def test_the_assembly_stands_as_mujoco_has_it(page):
     for stub, size, found in zip(model.layout(the_scene).stubs, sizes, drawn, strict=True):
         place = 1e3 * (data.xpos[stub] - data.xpos[1]) @ palm
         turn = palm.T @ data.xmat[stub].reshape(3, 3)
-        half, high = size.base.width / 2, size.tip.height
+        half = size.base.width / 2
+        high = size.tip.height
         np.testing.assert_allclose(found[0], place + turn @ [0, -half, 0], atol=1e-3)
         np.testing.assert_allclose(found[6], place + turn @ [size.length, half, high], atol=1e-3)
 
@@ -565,7 +585,8 @@ def test_a_folder_is_there_as_a_whole_or_not_at_all(tmp_path):
 
 def test_what_belongs_to_a_folder_is_replaced_whole(tmp_path):
     """Of what an earlier call wrote nothing stays, of others' files all, whatever their place."""
-    path, outside = tmp_path / "folder", tmp_path / "outside"
+    path = tmp_path / "folder"
+    outside = tmp_path / "outside"
     fill(path, "kept", "changed", "parts/old", "deep/er/old", "edited")
     (path / "foreign").touch()
     (path / "parts" / "mine").touch()
@@ -682,18 +703,21 @@ def assert_declared(alone, spec, shares):
     In a state with many contacts; the normal's stiffness k_n = K I / R is the declared one of two
     bodies, twice as large at the table, times the share of a sphere on a finger.
     """
-    rows, written = [], plain.text(alone, spec.copy(), shares)
+    rows = []
+    written = plain.text(alone, spec.copy(), shares)
     declared = plain.engine_model(alone, spec, shares)
     for played in (declared, mujoco.MjModel.from_xml_string(written)):
         data = mujoco.MjData(played)
         # Palm, straight fingers, object and table are in one another.
-        data.qpos[2], data.qpos[-7:-4] = 0.005, [0.03, 0, 0.02]
+        data.qpos[2] = 0.005
+        data.qpos[-7:-4] = [0.03, 0, 0.02]
         mujoco.mj_forward(played, data)
         k, b, impedance = data.efc_KBIP[:, :3].T
         rows.append(np.stack([k * impedance, b, data.efc_R]))
     assert rows[0].shape[1] > 10
     np.testing.assert_allclose(rows[1], rows[0], rtol=1e-10)  # rounding
-    stiffness, touching = rows[0][0] / rows[0][2], 0
+    stiffness = rows[0][0] / rows[0][2]
+    touching = 0
     for contact in data.contact:
         names = [played.geom(g).name for g in contact.geom]
         share = min(shares.get(name, 1.0) for name in names)
@@ -755,7 +779,9 @@ def test_commands_are_the_key_frames(tmp_path):
     assert [*rows[0]] == head and len(rows) == 900
     at = {row["time_s"]: {k: v for k, v in row.items() if k != "phase"} for row in rows}
     values = {t: {k: float(v) for k, v in row.items()} for t, row in at.items()}
-    top, grasp = 300, 60 + float(1e3 * design.arm[2])  # mm, as in the scene file
+    # mm, as in the scene file
+    top = 300
+    grasp = 60 + float(1e3 * design.arm[2])
     heights = {"0": top, "1": (top + grasp) / 2, "2": grasp, "4.5": top}
     for time, height in heights.items():
         assert values[time]["arm_z_mm"] == pytest.approx(height, rel=1e-6)
@@ -787,11 +813,13 @@ def test_commands_played_back_are_the_sheet_s_poses(tmp_path, settle):
     sizes = process.sizes(the_scene.hand, params, Process())
     sections = sheet.sheet_sections(the_scene, params, sizes, None)
     arms, pressures = (table_of(s) for s in sections if s.title in ("Arm", "Valves"))
-    ends, compared = the_scene.phase_ends, 0
+    ends = the_scene.phase_ends
+    compared = 0
     for k, time in enumerate(map(float, arms["time s"])):
         if ends["lift"] < time <= ends["disturb"] or time not in rows:
             continue  # shaken there
-        row, compared = rows[time], compared + 1
+        row = rows[time]
+        compared = compared + 1
         for name in ("x mm", "y mm", "z mm", "roll °", "yaw °", "pitch °"):
             word, unit = name.split()
             column = f"arm_{word}_{'deg' if unit == '°' else unit}"
@@ -805,7 +833,8 @@ def test_commands_played_back_are_the_sheet_s_poses(tmp_path, settle):
     assert compared >= 4
     # MuJoCo turns the palm by the controls as the commands say, and the words are true.
     compiled = model.compile_model(the_scene, params, nominal)
-    data, k = mujoco.MjData(compiled), round((settle + 2) / 0.01)
+    data = mujoco.MjData(compiled)
+    k = round((settle + 2) / 0.01)
     data.qpos[:6] = controls[k, 1:7]
     mujoco.mj_kinematics(compiled, data)
     palm_turn = data.xmat[1].reshape(3, 3)
@@ -886,7 +915,8 @@ def test_wrong_pressures_are_not_sent(tmp_path, capsys, table, divide, words):
 
 
 def test_an_interrupted_player_empties_the_chambers():
-    rows, sent = [[0.0, 10.0], [1.0, 20.0]], []
+    rows = [[0.0, 10.0], [1.0, 20.0]]
+    sent = []
 
     def wait(seconds):
         if len(sent) == 3:
@@ -941,7 +971,8 @@ def test_command_writes_models_of_the_default_scene_s_kind(tmp_path, capsys):
     mujoco.mj_resetDataKeyframe(loaded, data, 0)
     mujoco.mj_kinematics(loaded, data)
     # The file's vertices stand in the world where the mesh's do, in the orientation of the start.
-    turn, place = data.body("object").xmat.reshape(3, 3), data.body("object").xpos
+    turn = data.body("object").xmat.reshape(3, 3)
+    place = data.body("object").xpos
     geom = data.geom("object_0")
     vertices = loaded.mesh_vert @ geom.xmat.reshape(3, 3).T + geom.xpos
     np.testing.assert_allclose(vertices, mug.mesh.vertices @ turn.T + place, atol=1e-7)  # float32

@@ -50,7 +50,8 @@ def grasp(request):
 
 def test_forces_on_the_object_are_what_its_momentum_gains(grasp):
     scene, (fields, _), found, trace = grasp
-    h, forces = scene.discretization.timestep, trace.forces
+    h = scene.discretization.timestep
+    forces = trace.forces
     mass = fields.body_mass[0, model.layout(scene).object]
     gained = np.diff(found["qvel"][0, :, -6:-3], axis=0) / h + [0, 0, scene.gravity]
     total = (forces.finger.sum(2) + forces.palm + forces.table)[0, :-1]
@@ -65,18 +66,22 @@ def test_forces_are_mujocos():
     """Of every contact, by its own solver, at the states and velocities of the path."""
     scene, (fields, ctrl), found, trace = grasp_of("spheres")
     own = oracles.exact(scene, grasps.nth(fields, 0))
-    data, lay, touched = mujoco.MjData(own), model.layout(scene), 0
+    data = mujoco.MjData(own)
+    lay = model.layout(scene)
+    touched = 0
     weight = fields.body_mass[0, lay.object] * scene.gravity
     kinds = {body: ("finger", f) for f, row in enumerate(lay.bodies) for body in row}
     kinds |= {1: ("palm",), 0: ("table",)}
     for k in range(5, ctrl.shape[1], 7):
-        data.qpos[:], data.qvel[:] = found["qpos"][0, k], found["qvel"][0, k]
+        data.qpos[:] = found["qpos"][0, k]
+        data.qvel[:] = found["qvel"][0, k]
         data.ctrl[:] = ctrl[0, k]
         mujoco.mj_forward(own, data)
         forces = jax.tree.map(lambda v, k=k: v[0, k], trace.forces)
         sums = {"finger": np.zeros((2, 3)), "palm": np.zeros(3), "table": np.zeros(3)}
         for i in range(data.ncon):
-            contact, force = data.contact[i], np.zeros(6)
+            contact = data.contact[i]
+            force = np.zeros(6)
             mujoco.mj_contactForce(own, data, i, force)
             bodies = own.geom_bodyid[contact.geom]
             if lay.object in bodies:
@@ -129,8 +134,11 @@ def test_a_pull_takes_the_object_as_mujocos_external_force_does(text):
 def pulled_by_mujoco(scene, hand, trials, along):
     """The force [N] at which the object has left its place."""
     fields, ctrl = grasps.world_inputs(scene, hand, grasps.nth(trials, 0))
-    own, lay, h = world_model(scene, fields), model.layout(scene), scene.discretization.timestep
-    data, count = mujoco.MjData(own), int(scene.last_step("lift")) + 1
+    own = world_model(scene, fields)
+    lay = model.layout(scene)
+    h = scene.discretization.timestep
+    data = mujoco.MjData(own)
+    count = int(scene.last_step("lift")) + 1
     data.qpos[:] = fields.start[: own.nq]
 
     def place():
@@ -143,7 +151,8 @@ def pulled_by_mujoco(scene, hand, trials, along):
         if k > count and np.linalg.norm(place() - first) > push.OUT:
             return force
         force = push.RATE * h * max(0, k - count + 1)
-        data.ctrl[:], data.xfrc_applied[lay.object, :3] = ctrl[min(k, count - 1)], force * along
+        data.ctrl[:] = ctrl[min(k, count - 1)]
+        data.xfrc_applied[lay.object, :3] = force * along
         mujoco.mj_step(own, data)
     return np.inf
 

@@ -34,7 +34,8 @@ def on_cpu(tmp_path):
     started = []
 
     def start(case):
-        path, environment = tmp_path / "result.npz", {**os.environ, "JAX_PLATFORMS": "cpu"}
+        path = tmp_path / "result.npz"
+        environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
         command = [sys.executable, "-m", "tests.helpers.gpu_cases", case, str(path)]
         process = subprocess.Popen(command, env=environment, cwd=Path(__file__).parents[1])
         started.append(process)
@@ -59,7 +60,8 @@ def test_effects(on_cpu, name):
     """Every effect in float64: GPU and CPU follow the same path through the first contacts."""
     read = on_cpu(f"short/{name}")
     assert jax.default_backend() == "gpu"
-    got, want = gpu_cases.short(name), read()
+    got = gpu_cases.short(name)
+    want = read()
     assert np.abs(want["qpos"][:, -1] - want["qpos"][:, 0]).max() > 0.05  # it moves
     for key, value in want.items():
         # Steps round differently by 1e-16; contact multiplies it by up to seven in a step.
@@ -75,7 +77,8 @@ def test_effects(on_cpu, name):
 def test_who_replays_the_key_frames_simulates_the_open_loop():
     """To the bit, though the tables of worlds are laid out once and not in each period."""
     scene = gpu_cases.short_scene("hull and fingers")
-    engine, worlds = StructuredEngine(scene), grasps.random_worlds(scene, 1, 4)
+    engine = StructuredEngine(scene)
+    worlds = grasps.random_worlds(scene, 1, 4)
     replay = policy.ControlLoop(engine, lambda carry, seen: (carry, seen.plan))
     assert engine.tables(grasps.batch_inputs(scene, *worlds)[0])
 
@@ -89,7 +92,8 @@ def test_who_replays_the_key_frames_simulates_the_open_loop():
 def test_derivatives(on_cpu, name):
     """The reverse pass in float64, by every group of numbers of the kernel's tables."""
     read = on_cpu(f"slopes/{name}")
-    got, want = gpu_cases.slopes(name)["slopes"], read()["slopes"]
+    got = gpu_cases.slopes(name)["slopes"]
+    want = read()["slopes"]
     # Steps round differently by 1e-16, stiff contacts multiply it by up to seven in a step, and
     # derivatives divide it by the depth of contacts, of 1e-4 m and more.
     assert np.abs(got - want).max() < 1e-7 * np.abs(want).max()
@@ -103,7 +107,8 @@ def test_verdicts(on_cpu, name):
     (docs/performance.md): three of 384 differ by chaos alone, ten with a probability below 1e-3.
     """
     read = on_cpu(f"whole/{name}")
-    got, want = gpu_cases.whole(name), read()
+    got = gpu_cases.whole(name)
+    want = read()
     kept = [np.where(r["failed"], -1, r["cost"] < 0.01) for r in (got, want)]
     assert 0.1 < (kept[1] == 1).mean() < 0.9
     assert (kept[0] != kept[1]).sum() <= 10
@@ -112,7 +117,8 @@ def test_verdicts(on_cpu, name):
 @pytest.mark.parametrize("name", ["spheres", "hull and fingers", "mesh"])
 def test_neighbours_in_a_block_change_no_bit(name):
     """A world's numbers are the same whatever worlds share its block, however wide that is."""
-    scene, many = gpu_cases.short_scene(name), 5000
+    scene = gpu_cases.short_scene(name)
+    many = 5000
     fields, ctrl = gpu_cases.inputs(scene, 40)
     widths = [launch.block_lanes("gpu", np.float32, 4 * worlds) for worlds in (40, many)]
     assert widths[0] < widths[1] == 32
@@ -144,7 +150,8 @@ def test_staged_blocks_are_narrow_for_few_worlds(name):
     """
     scene = gpu_cases.short_scene(name)
     fields, ctrl = gpu_cases.inputs(scene, 40)
-    engine, ctrl = StructuredEngine(scene), ctrl[:, :200]
+    engine = StructuredEngine(scene)
+    ctrl = ctrl[:, :200]
     widths = [engine.block_lanes(worlds) for worlds in (40, 16_384)]
     assert widths[0] < widths[1] == 32
 

@@ -95,7 +95,8 @@ def stepped(grasp):
 
 def by_mujoco(scene, fields, *states):
     """Accelerations of a world in states of qpos, qvel and ctrl, and numbers of contacts."""
-    data, found = mujoco.MjData(compiled := oracles.exact(scene, fields)), []
+    data = mujoco.MjData(compiled := oracles.exact(scene, fields))
+    found = []
     for state in zip(*states, strict=True):
         data.qpos[:], data.qvel[:], data.ctrl[:] = state
         mujoco.mj_forward(compiled, data)
@@ -131,7 +132,8 @@ def test_in_float32_an_object_moves_as_in_float64_under_a_far_hand(grasp, steppe
     away, but many contacts of light fingers have the same effect.
     """
     scene, fields, ctrl = grasp
-    count, random = COUNT, np.random.default_rng(0)
+    count = COUNT
+    random = np.random.default_rng(0)
     own = grasps.nth(fields, 0)
     ratio = np.float32(30)  # as in the scene `paper`
     contact = dataclasses.replace(own.constants.contact, friction_ratio=ratio)
@@ -139,7 +141,8 @@ def test_in_float32_an_object_moves_as_in_float64_under_a_far_hand(grasp, steppe
     impratio = friction_ratio(scene, ratio)
     own = own._replace(impratio=impratio, constants=constants)
     qpos, qvel = (np.zeros((count, n)) for n in (own.start.size, own.start.size - 1))
-    qpos, u = qpos + own.start, np.repeat(np.asarray(ctrl[:1, 0]), count, 0)
+    qpos = qpos + own.start
+    u = np.repeat(np.asarray(ctrl[:1, 0]), count, 0)
     qpos[:, 2], qpos[:, -5] = 2.0, qpos[:, -5] - random.uniform(1e-5, 5e-4, count)
     qvel[:, -6:] = random.normal(size=(count, 6)) * [0.1, 0.1, 0.05, 2, 2, 2]
     u[:, :6] = qpos[:, :6]
@@ -170,7 +173,8 @@ def test_neighbours_of_a_failing_world_are_bitwise_unaffected(grasp):
     """A finger of the world in the middle is blown up; it keeps its last good state."""
     scene, fields, ctrl = grasp
     run = jax.jit(StructuredEngine(scene).rollout)
-    good, bad = run(fields, ctrl), run(fields, ctrl.at[1, 20:, 6].set(1e12))
+    good = run(fields, ctrl)
+    bad = run(fields, ctrl.at[1, 20:, 6].set(1e12))
     for index in (0, 2):
         for a, b in zip(*map(jax.tree.leaves, (good, bad)), strict=True):
             np.testing.assert_array_equal(a[index], b[index])

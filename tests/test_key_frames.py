@@ -46,7 +46,9 @@ def by_numpy(the_scene, table, params):
     groups = table.get("group", {})
     now = {axis: names[f"arm_{axis}"] for axis in POSE}
     now |= {"z": the_scene.arm.start_height, "pressure": np.zeros(the_scene.num_fingers)}
-    times, rows, held = [], [], []
+    times = []
+    rows = []
+    held = []
     for frame in table["frame"]:
         now = dict(now)
         for key, value in frame.items():

@@ -62,7 +62,8 @@ def test_one_program_for_closures_of_one_code_over_equal_numbers():
 
 def test_one_finger_is_one_team():
     """Teams depend on the scene's structure and the backend, and nothing on the batch."""
-    paper, spheres = scenes.load("paper"), scenes.load("paper_spheres")
+    paper = scenes.load("paper")
+    spheres = scenes.load("paper_spheres")
     fingers = tuple(dataclasses.replace(f, azimuth=f.azimuth + 20) for f in spheres.hand.finger)
     hand = dataclasses.replace(spheres.hand, finger=spheres.hand.finger + fingers)
     eight = dataclasses.replace(spheres, hand=hand)

@@ -103,7 +103,8 @@ def within(mine, theirs):
 
 def wrong(name, other):
     """What forbids an import, or None."""
-    mine, theirs = name.split("."), other.split(".")
+    mine = name.split(".")
+    theirs = other.split(".")
     if problem := within(mine, theirs):
         return problem
     if theirs[0] == "scripts" and mine[0] != "scripts":
@@ -181,7 +182,8 @@ def test_no_kernel_depends_on_what_its_key_leaves_out():
     """Kept kernels are known by the digest of the code that writes them."""
     folders = {path.name for path in (ROOT / "codesign_jax").iterdir() if path.is_dir()}
     assert set(reuse.UNRELATED) <= folders
-    links, found = graph(types=False), set()
+    links = graph(types=False)
+    found = set()
     left = ["codesign_jax.engines.structured.kernel.program"]
     while left:
         name = left.pop()
@@ -190,3 +192,19 @@ def test_no_kernel_depends_on_what_its_key_leaves_out():
             left += links.get(name, ())
     assert "codesign_jax.engines.structured.kernel.newton" in found
     assert not {n for n in found if n.split(".")[1:2] and n.split(".")[1] in reuse.UNRELATED}
+
+
+def parallel(tree):
+    """Lines that assign three names or more from as many expressions: `a, b, c = x, y, z`."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Tuple):
+            target = node.targets[0]
+            if isinstance(target, ast.Tuple) and len(target.elts) >= 3:
+                yield node.lineno
+
+
+def test_assignments_stand_one_a_line():
+    folders = [ROOT / name for name in ("codesign_jax", "scripts", "tests")]
+    paths = [path for folder in folders for path in sorted(folder.rglob("*.py"))]
+    assert [f"{path}:{line}" for path in paths for line in parallel(parse(path))] == []
+    assert list(parallel(ast.parse("a, b, c = 1, 2, 3\na, b = b, a"))) == [1]

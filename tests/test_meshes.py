@@ -42,7 +42,8 @@ def problems(tmp_path, mesh, **options):
 
 def test_mass_of_a_box_in_any_pose(tmp_path):
     """Exact up to the rounding of moments over lengths, whatever the pose in the file."""
-    mesh, half = box(), np.array([0.02, 0.025, 0.03])
+    mesh = box()
+    half = np.array([0.02, 0.025, 0.03])
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_rotvec([0.3, 0.9, -0.5]).as_matrix()
     pose[:3, 3] = [0.1, -0.2, 0.05]
@@ -391,7 +392,8 @@ def grasps(tmp_path_factory, household):
     # Once more with the mug's handle between the fingers.
     yaws.append((names.index("mug"), 0.1 + np.pi / 2))
     trials = [still(i)._replace(size=np.array(1.04), yaw=np.array(yaw)) for i, yaw in yaws]
-    count, both = len(trials), [*trials, *trials[::-1]]
+    count = len(trials)
+    both = [*trials, *trials[::-1]]
     engine = StructuredEngine(the_scene, iterations=100, evaluations=40, tolerance=1e-24)
     with jax.enable_x64(True):
         fields, ctrl = batch_inputs(the_scene, stack(*[params] * len(both)), stack(*both))
@@ -584,7 +586,8 @@ def test_a_run_has_the_bytes_that_were_read(tmp_path):
     ids=["toml", "mesh"],
 )
 def test_some_mutated_input(strategy, count, trial, tmp_path):
-    refused, place = [], tmp_path / "place"
+    refused = []
+    place = tmp_path / "place"
     place.mkdir()
 
     @faults.often(count)

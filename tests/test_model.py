@@ -132,7 +132,8 @@ def discrete_twin(the_scene, params, trial):
         stiffness, damping = nth(model.joint_springs(the_scene, params), slice(None))
     m.opt.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     m.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
-    m.dof_damping[:], m.dof_armature[:] = damping, 0.0
+    m.dof_damping[:] = damping
+    m.dof_armature[:] = 0.0
     return m, stiffness
 
 
@@ -147,11 +148,13 @@ def test_implicit_springs_equal_mujocos_discrete_integrator():
     twin, stiffness = discrete_twin(the_scene, params, trial)
     twin.jnt_stiffness[:6] = stiffness[:6]
     twin.actuator_gainprm[:6, 0] = twin.actuator_biasprm[:6, 1] = 0.0
-    one, other = mujoco.MjData(ours), mujoco.MjData(twin)
+    one = mujoco.MjData(ours)
+    other = mujoco.MjData(twin)
     worst = 0.0
     for step in range(100):
         target = np.array([0.0, 0.01, 0.02, 0.1, 0.0, 0.3]) * step / 100
-        one.ctrl[:6], one.ctrl[6:] = target, 1200.0 * step
+        one.ctrl[:6] = target
+        one.ctrl[6:] = 1200.0 * step
         other.ctrl[:] = one.ctrl
         other.qfrc_applied[:6] = stiffness[:6] * target
         for name in ("qpos", "qvel"):
@@ -187,14 +190,16 @@ def test_every_kind_of_pair_has_its_own_numbers():
         ("finger", "finger"): 0.41,
         ("finger", "palm"): 0.51,
     }
-    c, found = the_scene.contact, set()
+    c = the_scene.contact
+    found = set()
     for i in range(compiled.npair):
         pair = compiled.pair_geom1[i], compiled.pair_geom2[i]
         kind = tuple(sorted(compiled.geom(g).name.split("_")[0] for g in pair))
         friction = [want[kind]] * 2 + [0.003, 0.0004, 0.0004]
         np.testing.assert_allclose(compiled.pair_friction[i], friction, rtol=1e-12)
         stiffness = 5000.0 if kind == ("finger", "palm") else c.normal_stiffness
-        d, h = compiled.pair_solimp[i, 0], the_scene.discretization.timestep
+        d = compiled.pair_solimp[i, 0]
+        h = the_scene.discretization.timestep
         mass = d / (1 - d) / (2 * model.contact_invweight(the_scene))
         wanted = stiffness * h * (h + max(c.dissipation_time, 1.5 * h))
         np.testing.assert_allclose(mass, wanted, rtol=1e-9)

@@ -29,7 +29,8 @@ from codesign_jax.runs.settings import make_settings
 
 # As many parameters as in the paper, of different ranges.  Each optimiser has two programs for all
 # tests: its `ask` and `tell` at this size.
-WIDTH, PARTICLES = 23, 30
+WIDTH = 23
+PARTICLES = 30
 LOW = np.linspace(-3, 1, WIDTH).astype(np.float32)
 HIGH = np.linspace(2, 100, WIDTH).astype(np.float32)
 SEED = LOW + np.float32(0.1) * (HIGH - LOW)
@@ -64,7 +65,8 @@ def sphere(population):
 
 def run(optimizer, state, masks, cost=sphere):
     """State after episodes with these masks, and the populations and reports of each."""
-    populations, infos = [], []
+    populations = []
+    infos = []
     for mask in masks:
         population = ask(optimizer, state, mask)
         populations.append(np.asarray(population))
@@ -113,7 +115,8 @@ def by_evosax(name, count, std):
 
 @pytest.mark.parametrize("name", EVOSAX)
 def test_populations_are_those_of_evosax_called_directly(name):
-    made, count = make_optimizer(name, SPACE), 4
+    made = make_optimizer(name, SPACE)
+    count = 4
     _, ours, infos = run(made, start(made), OPEN[:count])
 
     def key(stream, episode):
@@ -147,7 +150,8 @@ def test_the_default_averages_the_means_of_evosax():
     drawn = ((populations[:3] - LOW) / (HIGH - LOW)).reshape(-1, WIDTH)
     assert stats.kstest(drawn[:, free].ravel(), "uniform").pvalue > 0.01
     costs = np.array([info.cost for info in infos])
-    best, kept = drawn[costs[:3].argmin()], np.sort(costs[:3], axis=None)[:PARTICLES]
+    best = drawn[costs[:3].argmin()]
+    kept = np.sort(costs[:3], axis=None)[:PARTICLES]
     np.testing.assert_allclose(costs[3:], [kept, kept], rtol=1e-6)  # sorted: no noise here
     count = PARTICLES - 2
     own, params = by_evosax("open-es", count, 0.15)
@@ -165,7 +169,8 @@ def test_the_default_averages_the_means_of_evosax():
         near(unit[0, free], 1 - np.abs(1 - average[free] % 2))  # mirrors at 0 and 1
         mean = np.asarray(state.memory["strategy"]["mean"])
         if t == 1:  # later ones draw along eigenvectors, whose sign hangs on the last bit
-            drawn, costs = unit[1 : count + 1], info.cost[1 : count + 1]
+            drawn = unit[1 : count + 1]
+            costs = info.cost[1 : count + 1]
             near(drawn[:, free], 1 - np.abs(1 - np.asarray(asked)[:, free] % 2))
             near(mean, own.tell(keys[1], asked, costs, strategy, params)[0].mean)
             rest = np.broadcast_to(best, (PARTICLES - 1 - count, WIDTH))
@@ -175,7 +180,8 @@ def test_the_default_averages_the_means_of_evosax():
 
 def test_with_few_parameters_the_best_random_designs_are_simulated_again():
     """A design's cost is the mean of all its episodes, and a lucky one does not stand first."""
-    space, noise = optimize.Space(LOW[:3], HIGH[:3]), np.random.default_rng(0)
+    space = optimize.Space(LOW[:3], HIGH[:3])
+    noise = np.random.default_rng(0)
     made = make_optimizer(optimize.DEFAULT, space)
     assert not isinstance(make_optimizer(optimize.DEFAULT, SPACE), type(made))
     told = {}
@@ -231,7 +237,8 @@ def test_closed_parameters_keep_their_bits(optimizer):
     assert (populations[:4][~sank][:, LIMITED] == SEED[LIMITED]).all()
     kept = populations[:4, :, ~IS_FIRST & free]
     np.testing.assert_array_equal(kept, np.broadcast_to(SEED[~IS_FIRST & free], kept.shape))
-    first, second = populations[:4][..., IS_FIRST], populations[4:][..., IS_FIRST]
+    first = populations[:4][..., IS_FIRST]
+    second = populations[4:][..., IS_FIRST]
     rows = {row.tobytes() for row in first.reshape(-1, 9)}
     assert len(rows) > 4 and {row.tobytes() for row in second.reshape(-1, 9)} <= rows
     assert len(np.unique(populations[4:, :, -1])) > 4
@@ -259,13 +266,15 @@ def test_a_resumed_run_equals_the_uninterrupted_one_bitwise(optimizer):
 
 @pytest.mark.parametrize("name", EVOSAX)
 def test_the_particles_are_the_best_so_far_and_failed_ones_never(name):
-    made, good = make_optimizer(name, SPACE), np.arange(PARTICLES) % 2 == 1
+    made = make_optimizer(name, SPACE)
+    good = np.arange(PARTICLES) % 2 == 1
 
     def half_fail(population):
         return np.where(good, sphere(population), np.float32("nan"))
 
     state, populations, infos = run(made, start(made), OPEN[:5], half_fail)
-    tried, particles = populations[:, good].reshape(-1, WIDTH), np.asarray(state.particles)
+    tried = populations[:, good].reshape(-1, WIDTH)
+    particles = np.asarray(state.particles)
     np.testing.assert_array_equal(particles, tried[np.argsort(sphere(tried))[:PARTICLES]])
     assert np.isfinite([info.mean_cost for info in infos]).all()
     # What is from this episode names its row.

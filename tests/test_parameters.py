@@ -17,7 +17,8 @@ from codesign_jax.scene import InputError, hand, parameters, schema, unit_slips
 from tests.helpers.toy_engine import TINY, tiny
 
 HAND = hand.load("pneuflex4")
-FULL, PLANAR = parameters.design_space(HAND), parameters.design_space(HAND, "2d")
+FULL = parameters.design_space(HAND)
+PLANAR = parameters.design_space(HAND, "2d")
 repeatable = settings(max_examples=30, deadline=None, derandomize=True)
 
 
@@ -30,7 +31,8 @@ def test_the_full_table_is_the_papers():
     expected += [f"pressure[{i}]" for i in range(4)]
     assert FULL.names == tuple(expected)
     assert parameters.design_space(HAND, "23d") == FULL
-    low, high = FULL.in_units(np.array(FULL.low)), FULL.in_units(np.array(FULL.high))
+    low = FULL.in_units(np.array(FULL.low))
+    high = FULL.in_units(np.array(FULL.high))
     per_row = [(10, 180)] * 4 + [(15, 25)] * 4 + [(2, 7)] * 4 + [(0, 110)] + [(-60, 60)] * 3
     per_row += [(-50, 150), (-60, 60), (-60, 60)] + [(0, 150)] * 4
     np.testing.assert_allclose(np.stack([low, high], 1), per_row, rtol=1e-14)
@@ -170,7 +172,8 @@ def test_a_tied_pressure_obeys_the_thinnest_wall():
 )
 def test_groups_of_fingers_share_a_value(tied, names, fingers):
     """Of bounds the narrowest; a pressure that they share obeys the thinnest wall."""
-    low, high = (60.0, 70.0, 80.0, 90.0), (100.0, 110.0, 120.0, 130.0)
+    low = (60.0, 70.0, 80.0, 90.0)
+    high = (100.0, 110.0, 120.0, 130.0)
     free = (hand.Free("length", tied, low, high), hand.Free("pressure", tied), hand.Free("wall"))
     own = dataclasses.replace(HAND, preset=(hand.Preset("own", free),))
     space = parameters.design_space(own, "own")
@@ -187,7 +190,8 @@ def test_groups_of_fingers_share_a_value(tied, names, fingers):
     walls = np.array([0.007, 0.005, 0.002, 0.006])
     design = space.default()
     pressures = [n.startswith("pressure") for n in space.names]
-    design[pressures], design[[n.startswith("wall") for n in space.names]] = 150e3, walls
+    design[pressures] = 150e3
+    design[[n.startswith("wall") for n in space.names]] = walls
     found = np.asarray(space.project(design))[pressures]
     limits = [min(walls[i] for i in range(4) if fingers[i] == k) * 40e6 for k in range(len(names))]
     np.testing.assert_allclose(found, np.minimum(limits, 150e3), rtol=1e-5)
@@ -199,7 +203,8 @@ THUMB = hand.load("thumb4")
 def test_fingers_may_have_values_and_bounds_of_their_own():
     """The file has [60, 60, 60, 40] to [180, 180, 180, 110] mm, default [100, 100, 100, 75]."""
     space = parameters.design_space(THUMB)
-    low, high = space.in_units(np.array(space.low)), space.in_units(np.array(space.high))
+    low = space.in_units(np.array(space.low))
+    high = space.in_units(np.array(space.high))
     np.testing.assert_allclose(low[:4], [60, 60, 60, 40])
     np.testing.assert_allclose(high[:4], [180, 180, 180, 110])
     np.testing.assert_allclose(space.in_units(space.default())[:4], [100, 100, 100, 75])

@@ -28,7 +28,9 @@ IS_MORPHOLOGY = np.array([True, True, False, True, False])
 OPEN = np.ones(5, bool)
 
 FILTER = ParticleFilter(Space(LOW, HIGH))
-ask, tell, draw = jax.jit(FILTER.ask), jax.jit(FILTER.tell), jax.jit(candidates)
+ask = jax.jit(FILTER.ask)
+tell = jax.jit(FILTER.tell)
+draw = jax.jit(candidates)
 mirror = jax.jit(reflect)
 
 
@@ -63,7 +65,8 @@ def test_reflection_stays_inside_and_keeps_what_is_inside(x, box):
 @given(box=boxes, folds=st.integers(-20, 20), fraction=st.floats(0, 1, width=32))
 def test_reflection_is_a_triangle_wave(box, folds, fraction):
     low, high = box
-    inside, width = low + fraction * (high - low), high - low
+    inside = low + fraction * (high - low)
+    width = high - low
     image = low + (folds + (fraction if folds % 2 == 0 else 1 - fraction)) * width
     np.testing.assert_allclose(mirror(image, low, high), inside, atol=rounding(image, low, high))
 
@@ -123,7 +126,8 @@ def test_where_every_particle_failed_all_survive(bad):
 
 
 def test_seeds_do_not_depend_on_the_batch_size():
-    key, space = jax.random.key(9), FILTER.space
+    key = jax.random.key(9)
+    space = FILTER.space
     results = [
         answer(rejection(key, space, 5, threshold=0.6, batch=batch, max_batches=500), quadratic)
         for batch in (8, 64)
@@ -143,7 +147,8 @@ def test_too_few_seeds_are_an_error_with_the_counts():
     def costs(population):
         return jnp.where(jnp.arange(len(population)) == 0, jnp.nan, 1.5)
 
-    key, space = jax.random.key(0), FILTER.space
+    key = jax.random.key(0)
+    space = FILTER.space
     with pytest.raises(RuntimeError, match=r"accepted 0 of 2 .* from 12 candidates; .* was 1\.5"):
         answer(rejection(key, space, 2, batch=4, max_batches=3), costs)
     with pytest.raises(RuntimeError, match="was -inf"):

@@ -38,15 +38,27 @@ SLOTS = 14
 """Between two fingers, and of a finger with itself and the palm."""
 
 # Stages of the kernel: functions that it evaluates lane by lane.
-FIELD, AIM, BETWEEN, BALLS = "rings_on_field", "aimed", "between", "balls"
-BEGUN, HELD, HOLD, KEEP = "begun", "_with_held", "sums.<locals>.add", "quotient"
-RINGS_HELD, RINGS_HOLD, TURN = "with_held", "_settle.<locals>.after", "in_world"
-RAY, SLOPES = "BoundContacts.line.<locals>.ray", "BoundContacts._slopes.<locals>.both"
+FIELD = "rings_on_field"
+AIM = "aimed"
+BETWEEN = "between"
+BALLS = "balls"
+BEGUN = "begun"
+HELD = "_with_held"
+HOLD = "sums.<locals>.add"
+KEEP = "quotient"
+RINGS_HELD = "with_held"
+RINGS_HOLD = "_settle.<locals>.after"
+TURN = "in_world"
+RAY = "BoundContacts.line.<locals>.ray"
+SLOPES = "BoundContacts._slopes.<locals>.both"
 LOAD = "BoundFingerContacts.load.<locals>.wrench"
-LINK, ADD = "Elimination.backward.<locals>.load", "_add"
+LINK = "Elimination.backward.<locals>.load"
+ADD = "_add"
 NEXT = "next acceleration"
 """A check of the second step, of a fault in what the first one leaves."""
-TIMES, AGAIN, PALM_AGAIN = "_times", "_again", "solve_palm_again"
+TIMES = "_times"
+AGAIN = "_again"
+PALM_AGAIN = "solve_palm_again"
 
 
 def place(stage, **wrong):
@@ -287,7 +299,8 @@ def scene_of(surface):
 def simulated(surface):
     """The worlds of a surface."""
     with jax.enable_x64(True), pytest.MonkeyPatch.context() as patch:
-        scene, faults = scene_of(surface), SURFACES[surface]
+        scene = scene_of(surface)
+        faults = SURFACES[surface]
         patch.setattr(memory_tables, "pair_slots", lambda _: SLOTS)
         if surface == "hull":  # as on a GPU; spheres, and the slow tests' hulls, as on this CPU
             patch.setattr(memory_tables, "GATHERING", ("cpu", "gpu"))
@@ -300,7 +313,8 @@ def simulated(surface):
             ctrl = jnp.asarray(np.repeat(ctrl[:, None], 3, 1))
             found = run(fields, (qpos, qvel), ctrl, np.arange(len(each)))
     solve = partial(solved, scene, *states["main"][:2])
-    found, start = jax.tree.map(np.asarray, found), len(faults)
+    found = jax.tree.map(np.asarray, found)
+    start = len(faults)
     held = np.zeros(3), np.zeros((scene.num_fingers, 3)), {}
     start = solve(found["qpos"][start, 0], found["qvel"][start, 0], held)
     assert surface == "hull" or min(kinds(*states["main"][:2])) > 0
@@ -315,7 +329,8 @@ def solved(scene, model, data, qpos, qvel, held, length=0.1):
 
     The last is a matrix of normal forces, of each finger and, in the last row, of the palm.
     """
-    data.qpos[:], data.qvel[:] = qpos, qvel
+    data.qpos[:] = qpos
+    data.qvel[:] = qvel
     mujoco.mj_forward(model, data)
     if scene.effects.surface != "hull":
         return data.qacc.copy(), None, pressing(scene, model, data)
@@ -336,11 +351,13 @@ def solved(scene, model, data, qpos, qvel, held, length=0.1):
 
 def pressing(scene, model, data):
     """MuJoCo's normal forces between fingers and, last, on the palm."""
-    lay, found = layout(scene), np.zeros([scene.num_fingers + 1] * 2)
+    lay = layout(scene)
+    found = np.zeros([scene.num_fingers + 1] * 2)
     sides = {body: f for f, row in enumerate(lay.bodies) for body in (*row, lay.stubs[f])}
     sides[model.body("palm").id] = -1
     for i in range(data.ncon):
-        geoms, force = data.contact[i].geom, np.zeros(6)
+        geoms = data.contact[i].geom
+        force = np.zeros(6)
         ends = [sides.get(int(body)) for body in model.geom_bodyid[geoms]]
         mujoco.mj_contactForce(model, data, i, force)
         if None not in ends:
@@ -352,8 +369,10 @@ def pressing(scene, model, data):
 @pytest.mark.parametrize("surface", SURFACES)
 def test_recorded_forces_are_the_oracle_s(surface):
     """How fingers press on one another, on themselves and on the palm, in the two steps."""
-    worlds, scene = simulated(surface), scene_of(surface)
-    sound, fingers = len(worlds.faults), scene.num_fingers
+    worlds = simulated(surface)
+    scene = scene_of(surface)
+    sound = len(worlds.faults)
+    fingers = scene.num_fingers
     names = [n for n in ("qpos", "qvel", "acc", "held") if n in worlds.found]
     state = [worlds.found[n][sound, :2] for n in names]
     with jax.enable_x64(True):
@@ -395,7 +414,8 @@ def test_sound_worlds_equal_the_oracle(surface):
 def test_a_planted_fault_is_noticed(surface, name):
     """By a hundred times the bound, because nothing is left but NaN, or by a flag that lacks."""
     worlds = simulated(surface)
-    fault, world = worlds.faults[name], [*worlds.faults].index(name)
+    fault = worlds.faults[name]
+    world = [*worlds.faults].index(name)
     if fault.check in ("acceleration", NEXT):
         step = int(fault.later or fault.check == NEXT)
         assert not worlds.error(world, step) < 100 * BOUND

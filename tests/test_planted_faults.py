@@ -23,11 +23,14 @@ from tests.helpers.planted_faults import Fault, planted, simulate
 STEPS = 8
 
 # Stages of the kernel: functions that it evaluates lane by lane.
-PALM, LINK = "palm_and_object", "link_forces"
+PALM = "palm_and_object"
+LINK = "link_forces"
 JAR = "begun"
 RESPONSE = "BoundContacts._push.<locals>.response"
-RAY, SLOPES = "BoundContacts.line.<locals>.ray", "BoundContacts._slopes.<locals>.both"
-SOLVE, ELIMINATE = "Elimination.at_palm.<locals>.solve", "Elimination.backward.<locals>.eliminate"
+RAY = "BoundContacts.line.<locals>.ray"
+SLOPES = "BoundContacts._slopes.<locals>.both"
+SOLVE = "Elimination.at_palm.<locals>.solve"
+ELIMINATE = "Elimination.backward.<locals>.eliminate"
 CENTRE = "Step._forward.<locals>.link.<locals>.<lambda>"
 
 
@@ -177,20 +180,24 @@ def touching(scene):
 
     Both fingers press on the box and on the table and slide at decimetres a second.
     """
-    count, random = len(FAULTS) + 1, np.random.default_rng(2)
+    count = len(FAULTS) + 1
+    random = np.random.default_rng(2)
     hand, trial = grasps.hand_world(scene, length=0.1)
     trial = trial._replace(mass=np.array(10.0))  # so that the fingers do not fling it away
     fields, ctrl = grasps.world_inputs(scene, hand, trial)
     qpos = np.array(fields.start)
-    qpos[2], qpos[3:6] = 0.1, 0.1 * random.normal(size=3)
+    qpos[2] = 0.1
+    qpos[3:6] = 0.1 * random.normal(size=3)
     dofs = model.layout(scene).dofs
     bend = np.zeros(dofs.shape)
-    bend[..., 0], qpos[-5] = 0.35, qpos[-5] - 5e-4
+    bend[..., 0] = 0.35
+    qpos[-5] = qpos[-5] - 5e-4
     qpos[dofs] = bend + 0.05 * random.normal(size=bend.shape)
     qvel = 0.3 * random.normal(size=len(qpos) - 1)
     qvel[-4] = -0.2  # onto the table
     ctrl = np.repeat(np.asarray(ctrl[:1]), STEPS, 0)
-    ctrl[:, :6], ctrl[:, 6:] = qpos[:6] + 0.01, 90e3
+    ctrl[:, :6] = qpos[:6] + 0.01
+    ctrl[:, 6:] = 90e3
     many = grasps.repeat((fields, ctrl), count)
     return many[0], (np.repeat(qpos[None], count, 0), np.repeat(qvel[None], count, 0)), many[1]
 
@@ -202,7 +209,8 @@ def errors(wrong, world):
     own = oracles.Path(*(v[one] for v in path))
     batch = jax.tree.map(lambda v: v[one], fields)
     acceleration, far, touching = oracles.against_mujoco(scene, batch, ctrl[one], own)
-    compiled, moved = world_model(scene, grasps.nth(fields, world)), []
+    compiled = world_model(scene, grasps.nth(fields, world))
+    moved = []
     for qpos, qvel, after in zip(own.qpos[0], own.qvel[0, 1:], own.qpos[0, 1:], strict=False):
         expected = qpos.copy()
         mujoco.mj_integratePos(compiled, expected, qvel, scene.discretization.timestep)

@@ -48,7 +48,8 @@ SCENE = grasps.short_grasp()
 @pytest.fixture(scope="module")
 def worlds():
     """Four random worlds, and how they end by the key frames, without and with recorded forces."""
-    inputs, engine = grasps.random_worlds(SCENE, 1, 4), make_engine("structured", SCENE)
+    inputs = grasps.random_worlds(SCENE, 1, 4)
+    engine = make_engine("structured", SCENE)
 
     @jax.jit
     def run(params, trials):
@@ -94,7 +95,8 @@ def test_who_replays_the_key_frames_simulates_the_open_loop(worlds):
 
 def test_what_is_observed_is_where_mujoco_has_it(worlds):
     """After as many steps as a period above has."""
-    scene, engine = SCENE, make_engine("structured", SCENE)
+    scene = SCENE
+    engine = make_engine("structured", SCENE)
 
     @jax.jit
     def look(params, trials):
@@ -107,12 +109,14 @@ def test_what_is_observed_is_where_mujoco_has_it(worlds):
         return recorded.last, fields, pushed, policy.observe(engine, hand, fields, world, plan)
 
     last, fields, pushed, seen = grasps.nth(look(*worlds[0]), ...)
-    state, lay = model.split(scene, last), layout(scene)
+    state = model.split(scene, last)
+    lay = layout(scene)
     bodies = {"palm": 1, "object": lay.object}
     for w in range(len(last)):
         own = world_model(scene, grasps.nth(fields, w))
         data = mujoco.MjData(own)
-        data.qpos, data.qvel = state.qpos[w], state.qvel[w]
+        data.qpos = state.qpos[w]
+        data.qvel = state.qvel[w]
         mujoco.mj_kinematics(own, data)
         mujoco.mj_comPos(own, data)
         mujoco.mj_comVel(own, data)
@@ -211,7 +215,8 @@ def test_the_page_s_policy_and_environment_do_what_they_say(monkeypatch):
     engine = policy.ControlLoop(make_engine("structured", scene), firmer)
     params, trials = grasps.random_worlds(scene, 3, 4)
     plan = rollout.prepare(scene, params, trials, engine)[1]
-    found, run = {}, jax.jit(partial(rollout.simulate, scene, engine))
+    found = {}
+    run = jax.jit(partial(rollout.simulate, scene, engine))
     for gain in (0.0, 50.0):
         control = {"gain": jnp.full(4, gain)}
         trace = run(params._replace(control=control), trials)[1]
@@ -331,7 +336,8 @@ def test_a_vector_environment_begins_ended_grasps_with_new_noise(episode):
     _, states, worlds = episode
     _, reward, ended, *_ = worlds.step(np.zeros((4, 2), np.float32))
     assert not ended.any() and (reward == 0).all()
-    before, after = states[0].data.trial.yaw, worlds._state.data.trial.yaw
+    before = states[0].data.trial.yaw
+    after = worlds._state.data.trial.yaw
     assert not (np.asarray(after) == np.asarray(before)).any()
 
 

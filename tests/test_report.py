@@ -51,7 +51,9 @@ def grasp():
 
 def test_a_picture_shows_the_object_where_a_pinhole_camera_does(grasp):
     the_scene, replay = grasp
-    side, away, place = 200, 0.6, np.array(replay.qpos[0, -7:-4])
+    side = 200
+    away = 0.6
+    place = np.array(replay.qpos[0, -7:-4])
     camera = animation.Camera(azimuth=90.0, elevation=0.0, distance=away, lookat=(0.0, 0.0, 0.1))
     [picture] = animation.frames(the_scene, replay, np.zeros(1), size=(side, side), camera=camera)
     focal = side / 2 / np.tan(np.radians(45.0) / 2)  # MuJoCo's field of view
@@ -92,11 +94,14 @@ def test_fingers_move_as_in_mujoco():
     """Skins of MuJoCo's own linear blend skinning, and the palm where its disc is."""
     the_scene = grasps.pinch("box", links=4, effects__surface="hull")
     grasp = bent_grasp(the_scene)
-    shown, motion = bodies.parts(the_scene, grasp), bodies.motion(the_scene, grasp, rate=1000.0)
+    shown = bodies.parts(the_scene, grasp)
+    motion = bodies.motion(the_scene, grasp, rate=1000.0)
     assert motion.rate == pytest.approx(1 / the_scene.discretization.timestep)
     compiled = model.compile_model(the_scene, grasp.params, grasp.trial, visual=True)
-    data, view = mujoco.MjData(compiled), mujoco.MjvScene(compiled, maxgeom=100)
-    every, camera = int(mujoco.mjtCatBit.mjCAT_ALL), mujoco.MjvCamera()
+    data = mujoco.MjData(compiled)
+    view = mujoco.MjvScene(compiled, maxgeom=100)
+    every = int(mujoco.mjtCatBit.mjCAT_ALL)
+    camera = mujoco.MjvCamera()
     for q, pose in zip(grasp.qpos, motion.pose, strict=True):
         data.qpos[:] = q
         mujoco.mj_forward(compiled, data)
@@ -158,7 +163,8 @@ def test_grasp_is_the_one_of_the_table(run):
         assert found.place == place
         assert float(rows[place]["cost"]) == pytest.approx(float(found.outcome.cost), rel=1e-6)
     # The best one is the chosen particle's ancestor.
-    best, chosen = choice.find_grasp(the_scene, record), choice.choose(the_scene, record)
+    best = choice.find_grasp(the_scene, record)
+    chosen = choice.choose(the_scene, record)
     np.testing.assert_array_equal(best.design, chosen.design)
     with pytest.raises(InputError) as error:
         choice.find_grasp(the_scene, record, episode=4, trial=3)
@@ -185,8 +191,10 @@ def test_unfinished_run_reports_its_finished_episodes(run, tmp_path, capsys):
 def test_fresh_trials_at_reference_are_in_the_report(run, tmp_path, capsys):
     """Those of the run's design; not those of the design before the run was extended."""
     copy = shutil.copytree(run, tmp_path / "run")
-    settings, trials = runs.read_run(copy)[1], 5
-    cost, status = np.array([0.0, 0.0, 0.0, 2.0, 3.0]), np.array([0, 0, 0, 0, int(Status.STUCK)])
+    settings = runs.read_run(copy)[1]
+    trials = 5
+    cost = np.array([0.0, 0.0, 0.0, 2.0, 3.0])
+    status = np.array([0, 0, 0, 0, int(Status.STUCK)])
     lost = np.where(cost == 2.0, 5.0, np.inf)
     found = Outcome(cost, status, lost, np.full(trials, -1))
     for design, words in (("own", True), ("other", False)):

@@ -52,7 +52,8 @@ def test_same_command_again_changes_no_result(finished, tmp_path, capsys):
 def test_a_killed_run_resumes_bit_for_bit(tmp_path, capsys):
     """Signals within this process: test_runs_of_a_batch_stop_fail_and_go_on_by_themselves."""
     # Enough episodes that a signal after the second finds the run on its way.
-    folder, run = tmp_path / "run", [*RUN, "--episodes", "10"]
+    folder = tmp_path / "run"
+    run = [*RUN, "--episodes", "10"]
     process = launch(*run, "--out", folder)
     wait_for(folder / "events.log", "episode  2/", process)
     process.kill()
@@ -117,7 +118,8 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
     monkeypatch.setattr(reference, "ACCURACY", "fine")
     folder = shutil.copytree(finished, tmp_path / "run")
     assert command(*RUN, "--reference-trials", "2", "--out", folder) == 0
-    settings, text = runs.read_run(folder)[1], capsys.readouterr().out
+    settings = runs.read_run(folder)[1]
+    text = capsys.readouterr().out
     stress, _ = reference.stored_stress(folder, settings)
     assert (
         stress is not None and [*dict.fromkeys(stress.conditions)][-1] == "neo-Hookean bending law"
@@ -143,7 +145,8 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
         assert command(*RUN, "--reference-trials", "2", "--out", folder) == 0
         assert line in capsys.readouterr().out.splitlines()
     # A longer test goes on from what is there, and a shorter one takes it.
-    two, more = reference.stored(folder, settings)[0], []
+    two = reference.stored(folder, settings)[0]
+    more = []
 
     def simulate(case, trials, key, first=0):
         more.append((first, trials))
@@ -176,7 +179,9 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
 
 
 def test_more_episodes_extend_a_run_bit_for_bit(finished, tmp_path, capsys):
-    run, long, grown = RUN, tmp_path / "long", tmp_path / "grown"
+    run = RUN
+    long = tmp_path / "long"
+    grown = tmp_path / "grown"
     assert command(*run, "--episodes", "5", "--out", long) == 0
     shutil.copytree(finished, grown)
     assert command(*run, "--episodes", "5", "--out", grown) == 0
@@ -216,7 +221,8 @@ TWO = [*BASE, "--episodes", "2", "--seeds", "2-3"]
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory):
     """Folder of two seeds in one batch, and what was printed."""
-    folder, text = tmp_path_factory.mktemp("compared") / "both", io.StringIO()
+    folder = tmp_path_factory.mktemp("compared") / "both"
+    text = io.StringIO()
     with contextlib.redirect_stdout(text):
         assert command(*TWO, "--out", folder) == 0
     return folder, text.getvalue()
@@ -249,7 +255,8 @@ def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch
     """A signal, a disk that is full for one of them, and runs that are at other episodes."""
     run = [*BASE, "--episodes", "3", "--seeds", "3-5", "--out", tmp_path / "runs"]
     assert command(*RUN, "--episodes", "1", "--out", tmp_path / "runs" / "seed-3") == 0
-    save, simulate = Checkpoints.save, Batch.begin
+    save = Checkpoints.save
+    simulate = Batch.begin
 
     def interrupted(batch, requests):
         os.kill(os.getpid(), signal.SIGTERM)
@@ -322,7 +329,8 @@ def test_shares_of_joined_runs_are_those_of_one_run(monkeypatch):
     space = parameters.design_space(the_scene.hand, "2d")
     optimizer = codesign.make_filter(space)
     task = codesign.Task(the_scene, space, 2, StructuredEngine(the_scene))
-    shares, call = [], Batch.call
+    shares = []
+    call = Batch.call
 
     def spy(self, blocks, *rest):
         shares.append(jax.tree.leaves(blocks)[0].shape[0])
@@ -330,7 +338,8 @@ def test_shares_of_joined_runs_are_those_of_one_run(monkeypatch):
 
     def episodes(batch):
         """States and reports of two episodes of three runs."""
-        keys, found = map(jax.random.key, range(3)), []
+        keys = map(jax.random.key, range(3))
+        found = []
         states = [optimizer.init(key, space.default(), 10) for key in keys]
         for _ in range(2):
             found.append(batch([Request(state, np.ones(2, bool)) for state in states]))

@@ -113,7 +113,8 @@ def test_a_replaced_name_is_seen_until_it_is_put_back(monkeypatch):
 
 def test_nothing_traced_is_found_once_the_code_is_not_known(monkeypatch):
     """A function's key does not have the functions that it calls."""
-    space, built = types.SimpleNamespace(structure="s"), []
+    space = types.SimpleNamespace(structure="s")
+    built = []
     find = reuse.shared(lambda *how: built.append(how) or (lambda v: v))
     first = find("engine", space, None)
     assert find("engine", space, None) is first
@@ -141,7 +142,8 @@ def full(monkeypatch, share):
 
 def test_programs_go_when_many_maps_are_taken(monkeypatch):
     """All that nobody holds; a program that is held works on."""
-    cleared, built = [], []
+    cleared = []
+    built = []
     monkeypatch.setattr(reuse, "forgetters", [])
     monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(1))
     find = reuse.shared(lambda *how: built.append(how) or (lambda v: v + 1))
@@ -180,7 +182,8 @@ def test_a_forked_process_says_that_it_would_wait_for_ever(monkeypatch):
     if not child:
         os._exit(3 if reuse.process["forked"] else 4)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 3
-    scene, key = grasps.pinch("sphere", 2), jax.random.key(0)
+    scene = grasps.pinch("sphere", 2)
+    key = jax.random.key(0)
     monkeypatch.setitem(reuse.process, "forked", True)
     for call in (lambda: program(0, 0), lambda: rollout.sample_trials(scene, key, 3)):
         with pytest.raises(RuntimeError, match="forked from one that had simulated.*spawn"):

@@ -34,7 +34,8 @@ from tests.helpers import fixtures, grasps
 from tests.helpers.differences import Case, curled, weights_of
 from tests.helpers.planted_faults import chosen, name_of
 
-DATA, STEP = grasps.DATA, 3e-7
+DATA = grasps.DATA
+STEP = 3e-7
 BOUND = 1e-8
 """Of the largest derivative of any group.  Differences lose rounding of 1e-15 over the step, and
 the step times the kinks within it; with ten times the step they err by 5e-8."""
@@ -87,7 +88,8 @@ def without(place, *fields):
     return change
 
 
-PUSH, SMOOTH = (AdjointSolve, "push"), (AdjointSolve, "smooth")
+PUSH = (AdjointSolve, "push")
+SMOOTH = (AdjointSolve, "smooth")
 FAULTS = {
     "links do not hand on what velocities cause": Fault(results={"of_link": without(0, "bias")}),
     "links do not hand on virtual motions": Fault(seeds={"of_link": without(0, "along")}),
@@ -137,7 +139,9 @@ class Planted:
     """Stages of the reverse pass, wrong in the worlds of the faults; `used`: what was planted."""
 
     def __init__(self, faults):
-        self.faults, self.used, self.step = faults, set(), None
+        self.faults = faults
+        self.used = set()
+        self.step = None
 
     def mine(self, number):
         """Lanes of a fault's world."""
@@ -233,7 +237,8 @@ def checked(wrong=False):
         # Sound worlds stand between those of the faults in the other order.
         orders = np.arange(len(each)), np.random.default_rng(2).permutation(len(each))
         assert (orders[1] != orders[0]).all() or wrong
-        out, found = case.execute(tables), []
+        out = case.execute(tables)
+        found = []
         with planted(faults) if wrong else contextlib.nullcontext():
             for order in orders:
                 number = np.full(tables[1].shape[0] * case.program.block, 1e3)
@@ -256,7 +261,8 @@ def checked(wrong=False):
 def test_derivatives_by_every_group_equal_central_differences():
     """Hull, contact between fingers, palm, wrist, softening: everything that a scene may have."""
     c = checked()
-    slope, largest = c.sound[0], np.abs(c.sound[0]).max()
+    slope = c.sound[0]
+    largest = np.abs(c.sound[0]).max()
     for name, *row in zip(c.names, slope, c.difference, strict=True):
         print(name, *(f"{v:.6e}" for v in row))
     named = dict(zip(c.names, np.abs(slope), strict=True))
@@ -331,7 +337,9 @@ def test_derivatives_of_scenes(name, tmp_path):
         else:
             the_scene = grasps.pinch(**{"shape": "sphere", "links": 2} | SCENES[name])
         case = Case(the_scene, curled(the_scene, 8))
-        weights, tables, errors = weights_of(case.start), case.many(1), []
+        weights = weights_of(case.start)
+        tables = case.many(1)
+        errors = []
         slope = case.along(case.bars(tables, case.execute(tables), [weights]))
         # With the capsule the differences by the wrist's start err by 2e-6 at a step of 1e-6, by a
         # hundredth at a tenth of it, and by 7e-10 at 2e-8; below that rounding grows.
@@ -350,13 +358,17 @@ def test_derivatives_of_scenes(name, tmp_path):
 def ptx(the_scene):
     """PTX of the reverse pass, and then of the forward pass that records its states."""
     program = AdjointProgram(the_scene, Limits(9, 9, 1e-6), backend="gpu", width=32)
-    blocks, steps = 1, 2
+    blocks = 1
+    steps = 2
 
     def shape(*sizes):
         return jax.ShapeDtypeStruct((blocks, *sizes), np.float32)
 
-    rows, size, block = program.path_rows(states=True), program.size, program.block
-    hand, world = shape(program.hand.rows, size), shape(program.world.rows, block)
+    rows = program.path_rows(states=True)
+    size = program.size
+    block = program.block
+    hand = shape(program.hand.rows, size)
+    world = shape(program.world.rows, block)
     state = shape(rows[0], size), shape(rows[1], block)
     inputs = hand, world, *state, shape(steps, 6, block), shape(steps, size)
     ends = shape(1, rows[0], size), shape(1, rows[1], block)
@@ -425,7 +437,8 @@ def test_segments_have_the_bits_of_the_whole_path():
     fields, ctrl = grasps.batch_inputs(the_scene, *grasps.random_worlds(the_scene, 3, 3))
     fields, ctrl = jax.tree.map(np.array, (fields, ctrl[:, 300:325]))
     fields.start[:, 2] = 0.09
-    ctrl[:, :, 2], ctrl[2, 17:, 6] = 0.09, np.nan
+    ctrl[:, :, 2] = 0.09
+    ctrl[2, 17:, 6] = np.nan
     whole = rollout_slopes(StructuredEngine(the_scene), fields, ctrl)
     parts = rollout_slopes(StructuredEngine(the_scene, segment=10), fields, ctrl)
     cut = rollout_slopes(StructuredEngine(the_scene, segment=10, truncate=True), fields, ctrl)
@@ -439,7 +452,8 @@ def test_segments_have_the_bits_of_the_whole_path():
 @pytest.mark.slow
 def test_gradients_of_random_worlds_are_finite():
     """2,000 worlds of the default scene in float32, a second each: through inflation and lift."""
-    the_scene, count = scene.load("paper"), 2000
+    the_scene = scene.load("paper")
+    count = 2000
     fields, ctrl = grasps.batch_inputs(the_scene, *grasps.random_worlds(the_scene, 0, count))
     engine = StructuredEngine(the_scene)
     found = jax.jit(jax.grad(lambda c: engine.rollout(fields, c).distance.sum()))(ctrl[:, :420])

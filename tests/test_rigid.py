@@ -277,7 +277,8 @@ KINDS = list(primitives.PRIMITIVES)
 
 def on_table(kind):
     """MuJoCo's own model of a shape of 1 kg on a plane, in the record's start orientation."""
-    shape, size = primitives.PRIMITIVES[kind], SIZES[kind]
+    shape = primitives.PRIMITIVES[kind]
+    size = SIZES[kind]
     quat = " ".join(map(str, shape.upright))
     text = f"""<mujoco><worldbody><geom type="plane" size="1 1 1"/>
       <body pos="0 0 {shape.reach(size, rigid.up(shape.upright))}" quat="{quat}"><freejoint/>
@@ -288,7 +289,9 @@ def on_table(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_inertia_and_bounds_are_those_of_mujocos_compiler(kind):
-    compiled, shape, size = on_table(kind), primitives.PRIMITIVES[kind], SIZES[kind]
+    compiled = on_table(kind)
+    shape = primitives.PRIMITIVES[kind]
+    size = SIZES[kind]
     # MuJoCo sorts principal moments by turning the frame; the set of them stays.
     np.testing.assert_allclose(
         np.sort(shape.inertia(size)), np.sort(compiled.body_inertia[1]), rtol=1e-12
@@ -300,7 +303,8 @@ def test_inertia_and_bounds_are_those_of_mujocos_compiler(kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_triangles_lie_on_the_surface_and_have_its_inertia(kind):
     """In the shape's own axes, with its volume; polyhedra in round shapes lack up to 0.5 %."""
-    shape, size = primitives.PRIMITIVES[kind], SIZES[kind]
+    shape = primitives.PRIMITIVES[kind]
+    size = SIZES[kind]
     mesh = shape.triangles(size)
     own = np.diag(mesh.moment_inertia) / mesh.volume
     np.testing.assert_allclose(shape.inertia(size), own, rtol=5e-3)
@@ -308,12 +312,14 @@ def test_triangles_lie_on_the_surface_and_have_its_inertia(kind):
     way = np.array([0.48, -0.6, 0.64])
     assert shape.reach(size, way) == pytest.approx((mesh.vertices @ way).max(), rel=2e-3)
     with jax.enable_x64(True):
-        sizes, points = jnp.asarray(size)[:, None, None], jnp.asarray(mesh.vertices.T[:, None])
+        sizes = jnp.asarray(size)[:, None, None]
+        points = jnp.asarray(mesh.vertices.T[:, None])
         distance, _ = shapes.SHAPES[kind].distance(sizes, points)
     assert np.abs(distance).max() < 1e-9  # trimesh rounds corners that it merges to 1e-8
 
 
-RADIUS, POSES = 0.010, 1500
+RADIUS = 0.010
+POSES = 1500
 
 
 def poses():
@@ -335,7 +341,9 @@ def reference(kind, position, quat, centre):
       <body mocap="true"><geom type="sphere" size="{RADIUS}"/></body>
     </worldbody></mujoco>"""
     data = mujoco.MjData(compiled := mujoco.MjModel.from_xml_string(xml))
-    distance, normal, points = np.zeros(POSES), np.zeros((POSES, 3)), np.zeros(6)
+    distance = np.zeros(POSES)
+    normal = np.zeros((POSES, 3))
+    points = np.zeros(6)
     for i in range(POSES):
         data.mocap_pos[:] = position[i], centre[i]
         data.mocap_quat[0] = quat[i]
@@ -356,7 +364,8 @@ def engine_contacts(kind, position, quat, centre):
         size = np.broadcast_to(np.array(SIZES[kind])[:, None, None], (3, 1, POSES))
         frames = jnp.asarray(columns.reshape(POSES, 3, 3).transpose(2, 1, 0)[:, :, None])
         at = jnp.asarray((centre - position).T[:, None])  # frames: column, row, 1, world
-        local, shape = shapes.in_object(frames, at), jnp.zeros((1, POSES), jnp.int32)
+        local = shapes.in_object(frames, at)
+        shape = jnp.zeros((1, POSES), jnp.int32)
         distance, gradient = shapes.primitive_distance(alone, jnp.asarray(size), shape, local)
         return rings.ball_on_field(RADIUS, at, distance, apply_columns(frames, gradient))
 
@@ -368,7 +377,8 @@ def test_distances_equal_mujoco(kind):
     want, normal = reference(kind, position, quat, centre)
     got = engine_contacts(kind, position, quat, centre)
     gap = np.asarray(got.gap)[0]
-    outside, inside = gap > 1e-6, gap < -1e-6
+    outside = gap > 1e-6
+    inside = gap < -1e-6
     assert 0.2 < outside.mean() < 0.99 and inside.sum() > 100  # both kinds of poses are tried
     # Both are closed forms in float64; they differ by rounding of lengths below a metre.
     both = outside | inside

@@ -24,7 +24,11 @@ from tests.helpers import dense_skin, grasps
 from tests.helpers.dense_skin import turned
 from tests.helpers.differences import curled
 
-STIFFNESS, LENGTH, WIDTH, HEIGHT, LINKS = 4000.0, 0.11, 0.024, 0.020, 10
+STIFFNESS = 4000.0
+LENGTH = 0.11
+WIDTH = 0.024
+HEIGHT = 0.020
+LINKS = 10
 PER_AREA = STIFFNESS / WIDTH**2
 DEPTHS = np.array([-0.5, 0.5, 1, 2, 3, 6]) * 1e-3
 PLACES = 10
@@ -48,7 +52,9 @@ def _numbers(height, segment, width):
 
 def ringed(bodies):
     """Rings and their frames and centres, with axes (ring, body) behind."""
-    numbers, frames, centres = [], [], []
+    numbers = []
+    frames = []
+    centres = []
     for body in bodies:
         own, link = ring_numbers(body)
         frame = body.frames[link + 1]
@@ -120,7 +126,8 @@ def segments(bodies):
     found = []
     for body in bodies:
         numbers, _ = ring_numbers(body)
-        turn, (tip, a, b) = body.frames, body.half
+        turn = body.frames
+        tip, a, b = body.half
         up = b * np.concatenate([turn[:1, :, 2], (turn[:-1, :, 2] + turn[1:, :, 2]) / 2])
         end = body.joints[-1] + turn[-1] @ numbers[:3, -1]
         line = np.concatenate([np.concatenate([[body.base], body.joints]) + up, [end]])
@@ -161,7 +168,8 @@ def flat(place, depth):
 
 def arc(place, links=LINKS):
     """A finger wound about a cylinder with a radius of 32.5 mm, of another size at each place."""
-    length, height = 0.08 + 0.08 * place, 0.015 + 0.01 * ((place * 7) % 1)
+    length = 0.08 + 0.08 * place
+    height = 0.015 + 0.01 * ((place * 7) % 1)
     bend = 2 * np.arctan(length / links / 2 / 0.0325)
     return dense_skin.finger(length, height=height, bend=bend, links=links)
 
@@ -223,7 +231,8 @@ FINGERS = {"crossed at 90 degrees": crossed, "tip on a side": tip_on_side}
 #   either: a solid of rubber pushes ten times as hard as its skin.
 # * A tip's end is flat for the law, whose area is reached at once, and round for the skin.  The
 #   normal at a tip is not that of the least overlap: it acts up to 1 mm ahead of touch.
-SMOOTH, PAIRED = (0.8, 1.2), (0.7, 1.3)
+SMOOTH = (0.8, 1.2)
+PAIRED = (0.7, 1.3)
 EXPECTED = {
     "flat": ([SMOOTH] * 5, 1, 1),
     "wrapped": ([SMOOTH] * 5, 6, 3),
@@ -302,7 +311,8 @@ def test_hands_grasp_whose_fingers_are_no_power_of_two():
     how |= {"hand.material.shear_modulus": 40e3}
     the_scene = load("paper", hand_name="tripod3", overrides=how)
     space = parameters.design_space(the_scene.hand)
-    params, trial = space.params(space.default()), rollout.nominal_trial(the_scene, "sphere")
+    params = space.params(space.default())
+    trial = rollout.nominal_trial(the_scene, "sphere")
     worlds = jax.tree.map(lambda v: jnp.asarray(v)[None], (params, trial))
     engine = make_engine("structured", the_scene)
     outcome, trace = jax.jit(lambda p, t: rollout.simulate(the_scene, engine, p, t))(*worlds)
@@ -322,7 +332,8 @@ def hull_scene(links=4, rings=2, points=8):
 def test_mesh_is_the_closed_block_of_the_finger(links, rings, points):
     """Watertight, faces outwards, with the block's volume; trimesh measures it."""
     the_scene = hull_scene(links, rings, points)
-    mesh, width = hull.hull(the_scene, square=True), the_scene.hand.section.width
+    mesh = hull.hull(the_scene, square=True)
+    width = the_scene.hand.section.width
     straight = hull.rest(the_scene, LENGTH, HEIGHT, square=True)
     body = trimesh.Trimesh(straight, mesh.face, process=False)
     assert body.is_watertight and body.is_winding_consistent
@@ -336,7 +347,8 @@ def test_what_is_drawn_is_the_section_that_touches():
     the_scene = hull_scene(links=4, rings=8, points=80)
     straight = hull.rest(the_scene, LENGTH, HEIGHT)
     body = trimesh.Trimesh(straight, hull.hull(the_scene).face, process=False)
-    width, cap = the_scene.hand.section.width, LENGTH / 16
+    width = the_scene.hand.section.width
+    cap = LENGTH / 16
     # Half of |x|^4 + |y|^4 + |z|^4 <= 1 has the volume 4 gamma(5/4)^3 / gamma(7/4).
     volume = (LENGTH - cap + cap * 0.8106 / 0.9270) * 0.9270 * width * HEIGHT
     assert body.is_watertight
@@ -381,7 +393,8 @@ def test_a_finger_is_as_deep_in_another_one_as_it_was_moved(angle, depth):
 def test_an_edge_of_an_object_is_in_a_finger(kind):
     """An object that stands with an edge in a finger; and a finger in its face."""
     shape = type("Shape", (), {"type": kind})
-    size, depth = np.array([0.03, 0.03, 0.03]), 2e-3
+    size = np.array([0.03, 0.03, 0.03])
+    depth = 2e-3
     edges, skin = contact_depths.surface(shape, size)
     one = tube(dense_skin.finger(LENGTH))
     inclined = turned([0, 1, 0], np.pi / 4)
@@ -397,7 +410,8 @@ def test_an_edge_of_an_object_is_in_a_finger(kind):
 # --- friction that fingers hold from step to step: its law on contacts alone, and who has it ------
 
 
-MU, STEPS = 0.8, 8
+MU = 0.8
+STEPS = 8
 
 
 def test_sliding_bodies_hold_coulomb_s_coefficient():
@@ -408,7 +422,8 @@ def test_sliding_bodies_hold_coulomb_s_coefficient():
         normals = jnp.array([[0.0], [0.0], [1.0]]) * jnp.ones((1, 3))
         contacts = Contacts(0 * normals, normals, -jnp.array([1e-3, 3e-3, 2e-4]), cone)
         velocity = jnp.array([[2.0], [0.0], [-0.1]]) * jnp.ones((1, 3))
-        jar, none = -contacts.reference(velocity), jnp.zeros((3, 3))
+        jar = -contacts.reference(velocity)
+        none = jnp.zeros((3, 3))
         force = constraint_update(contacts, jar + holding.held(contacts, none)).force
         grip = np.asarray(holding.quotient(holding.hold(contacts, force, none).sum(1)))
     assert grip[0] > 0 and np.hypot(*grip[:2]) == pytest.approx(MU, rel=1e-12)
@@ -416,7 +431,9 @@ def test_sliding_bodies_hold_coulomb_s_coefficient():
 
 SHARES = 0.90, 0.98, 1.00, 1.02, 1.10
 """Friction coefficients over the one at which a load just slips."""
-LOAD, PRESS, WEIGHT = 0.44, 12.0, 0.045
+LOAD = 0.44
+PRESS = 12.0
+WEIGHT = 0.045
 """Load along a pad and force on it [N], and the mass that hangs there [kg]."""
 
 
@@ -425,10 +442,14 @@ def hanging(pads):
 
     It is pressed on each pad, and its motion across them is given: the law of one contact alone.
     """
-    h, tau, stiffness = 0.01, 0.006, 4000.0
-    ratio, none = 5.0, jnp.zeros((3, pads, len(SHARES)))
+    h = 0.01
+    tau = 0.006
+    stiffness = 4000.0
+    ratio = 5.0
+    none = jnp.zeros((3, pads, len(SHARES)))
     friction = jnp.array(SHARES) * LOAD / (PRESS * pads)
-    normal, tangent = stiffness * h * (h + tau), stiffness * h * ratio * 0.04
+    normal = stiffness * h * (h + tau)
+    tangent = stiffness * h * ratio * 0.04
     damper = 1 / h + none[0]
     cone = Cone(
         normal + none[0],
@@ -520,7 +541,8 @@ def held_hands():
     def pieces(start, ctrl, size):
         parts = jnp.moveaxis(ctrl.reshape(1, -1, size, ctrl.shape[2]), 1, 0)
         last, shown = jax.lax.scan(one, start, parts)
-        shown, end = jnp.stack(shown).reshape(3, -1), model.split(chosen, last)
+        shown = jnp.stack(shown).reshape(3, -1)
+        end = model.split(chosen, last)
         return shown.sum() + end.qpos.sum() + end.held.sum(), (last, shown)
 
     return start, ctrl, pieces

@@ -20,14 +20,16 @@ draw = jax.jit(lambda key, n: rollout.sample_trials(PAPER, key, n), static_argnu
 
 
 def test_more_trials_do_not_change_the_first():
-    few, many = draw(KEY, 4), draw(KEY, 40)
+    few = draw(KEY, 4)
+    many = draw(KEY, 40)
     for a, b in zip(few, many, strict=True):
         np.testing.assert_array_equal(a, b[:4])
 
 
 def test_noise_has_the_declared_spread():
     """Means and standard deviations over 20,000 trials, to four standard errors."""
-    count, noise = 20_000, PAPER.objects.noise
+    count = 20_000
+    noise = PAPER.objects.noise
     trials = draw(jax.random.key(0), count)
     angle = np.deg2rad(noise.orientation)
     for values, mean, sigma in (
@@ -49,7 +51,8 @@ def test_noise_has_the_declared_spread():
 def test_order_of_particles_and_trials_does_not_matter():
     """Also: every particle meets the same trials, whatever its place (common random numbers)."""
     the_scene = pinch("box", links=2, **hurried(0.4, 0.6, 0.8, 1.0, 1.6))
-    engine, space = make_engine("mujoco", the_scene), parameters.design_space(the_scene.hand)
+    engine = make_engine("mujoco", the_scene)
+    space = parameters.design_space(the_scene.hand)
 
     @jax.jit
     def evaluate(designs, trials):
@@ -58,7 +61,8 @@ def test_order_of_particles_and_trials_does_not_matter():
     designs = random_designs(space, seed=4, count=5)
     trials = rollout.sample_trials(the_scene, KEY, 4)
     whole = evaluate(designs, trials)
-    particles, order = np.array([3, 0, 4, 1, 2]), np.array([2, 3, 0, 1])
+    particles = np.array([3, 0, 4, 1, 2])
+    order = np.array([2, 3, 0, 1])
     shuffled = evaluate(designs[particles], nth(trials, order))
     twins = evaluate(jnp.stack([designs[0]] * 5), trials)
     for one, mixed, same in zip(whole, shuffled, twins, strict=True):
@@ -114,8 +118,10 @@ def test_a_good_design_grasps_every_object(pneuflex):
 def test_it_lifts_shakes_and_releases(pneuflex):
     """For the right reason: carried up with the hand, kept through the shaking, then dropped."""
     the_scene, _, trace = pneuflex
-    start, phases = the_scene.arm.start_height, the_scene.phases
-    height, distance = trace.height[0], trace.distance[0]
+    start = the_scene.arm.start_height
+    phases = the_scene.phases
+    height = trace.height[0]
+    distance = trace.distance[0]
 
     def at(time):
         return height[:, round(time / the_scene.discretization.timestep) - 1]

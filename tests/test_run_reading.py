@@ -48,7 +48,8 @@ def test_damage_of_the_newest_checkpoint_is_said_and_nothing_is_changed(how, run
     step = run / "checkpoints" / str(NEWEST)
     paths = [p for p in sorted(step.rglob("*")) if p.stat().st_size and p.is_file()]
     faults.damaged(paths[faults.WAYS.index(how) % len(paths)], how)
-    before, said = sorted(os.walk(run)), []
+    before = sorted(os.walk(run))
+    said = []
     record = runs.load_record(run, tell=said.append)
     assert record is not None and record.test is None and record.done == 3
     (words,) = said
@@ -176,7 +177,8 @@ def test_an_unexpected_error_keeps_its_traceback(run, monkeypatch, capsys):
 
     monkeypatch.setattr(Batch, "begin", broken)
     assert command(*RUN, "--out", run, "--episodes", "4") == 1
-    error, log = capsys.readouterr().err, (run / "events.log").read_text()
+    error = capsys.readouterr().err
+    log = (run / "events.log").read_text()
     for text in (error, log):
         assert "Traceback (most recent call last)" in text and "in broken" in text
     assert "error: RuntimeError: a bug of somebody's" in error

@@ -39,14 +39,16 @@ def settings(**changes):
 def toy_run():
     """A toy run of three episodes: scene, space, record and final test."""
     the_scene, space, engine = tiny()
-    s, optimizer = settings(), codesign.make_filter(space)
+    s = settings()
+    optimizer = codesign.make_filter(space)
     episode = partial(codesign.Task(the_scene, space, s.trials, engine).episode, optimizer)
     state = optimizer.init(jax.random.key(0), np.array([0.05, 0.0]), s.particles)
     record = Record(state, records.empty_history(s, space.num_parameters))
     for e in range(s.episodes):
         record.state, info = episode(record.state, np.ones(2, bool))
         records.add_report(record.history, e, info)
-    particles, key = record.state.particles, record.state.key
+    particles = record.state.particles
+    key = record.state.key
     how = {"num_trials": s.test_trials, "previous": record.last_outcomes()}
     testing = codesign.testing(the_scene, particles, key, **how)
     test = episodes.answered(testing, episodes.evaluate_by(episode, optimizer))
@@ -120,7 +122,8 @@ def test_tables_hold_the_history_with_units(toy_run, tmp_path):
     the_scene, space, record, test = toy_run
     tables.write_episodes(tmp_path, the_scene, space, record.history, 0, 3)
     tables.write_tests(tmp_path, space, np.asarray(record.state.particles), test)
-    history, trials = record.history, read(tmp_path / "trials.csv")
+    history = record.history
+    trials = read(tmp_path / "trials.csv")
     assert [np.float32(r["cost"]) for r in trials] == history.outcomes.cost.ravel().tolist()
     assert {r["object"] for r in trials} == {"sphere"}
     assert {r["status"] for r in trials} == {"OK"}
@@ -220,7 +223,9 @@ def test_what_is_no_run_is_not_cleared(left, fresh, run, capsys):
 @pytest.mark.parametrize("moment", range(5))
 def test_a_start_that_was_cut_short_goes_on(moment, tmp_path, monkeypatch):
     """At any file that it writes: provenance.json and four of the scene."""
-    folder, replace, count = tmp_path / "run", os.replace, [0]
+    folder = tmp_path / "run"
+    replace = os.replace
+    count = [0]
 
     def killed(source, target):
         if count[0] == moment:

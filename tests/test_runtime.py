@@ -33,8 +33,13 @@ class Xla:
 
     def __init__(self, threads=1, pool="late", stream_error=0):
         """No pool with 0 threads; its tasks run "at once", "late", in "threads", or never."""
-        self.errors, self.destroyed, self.tasks, self.scheduled = [], [], [], 0
-        self.threads, self.pool, self.stream_error = threads, pool, stream_error
+        self.errors = []
+        self.destroyed = []
+        self.tasks = []
+        self.scheduled = 0
+        self.threads = threads
+        self.pool = pool
+        self.stream_error = stream_error
         self.running = []
         named = {
             "error_create": self._create,
@@ -56,11 +61,13 @@ class Xla:
             buffers = [self._buffer(a, keep) for a in arrays]
             pointers = (c_void_p * len(arrays))(*(ctypes.addressof(b) for b in buffers))
             keep.extend([*buffers, pointers])
-            size, values = ffi.size(ffi.Arguments), ctypes.addressof(pointers)
+            size = ffi.size(ffi.Arguments)
+            values = ctypes.addressof(pointers)
             return ffi.Arguments(struct_size=size, size=len(arrays), values=values)
 
         given = {"args": arguments(inputs), "rets": arguments(outputs)}
-        api, size = ctypes.addressof(self.api), ffi.size(ffi.CallFrame)
+        api = ctypes.addressof(self.api)
+        size = ffi.size(ffi.CallFrame)
         frame = ffi.CallFrame(struct_size=size, api=api, stage=3, **given)
         pointer = FUNCTION(address)(ctypes.addressof(frame))
         return self.errors[pointer - 1] if pointer else None
@@ -106,7 +113,8 @@ class Xla:
 
     def _schedule(self, record):
         given = ffi.Schedule.from_address(record)
-        function, data = ctypes.CFUNCTYPE(None, c_void_p)(given.task), given.data
+        function = ctypes.CFUNCTYPE(None, c_void_p)(given.task)
+        data = given.data
         self.scheduled += 1
         if self.pool == "refused" and self.scheduled > 1:
             self.errors.append((8, "the pool is full"))
@@ -170,7 +178,8 @@ def test_any_number_of_threads_gives_the_same_bits(handler, pool, threads, block
     Tasks that run late look at the call's record after the handler has returned.
     """
     x, table = kernels.numbers(blocks)
-    xla, out = Xla(threads, pool), np.full((blocks, 1, 8), np.nan, np.float32)
+    xla = Xla(threads, pool)
+    out = np.full((blocks, 1, 8), np.nan, np.float32)
     assert xla.call(handler, [x, table], [out]) is None
     alone = np.empty_like(out)
     assert Xla(1).call(handler, [x, table], [alone]) is None
@@ -188,7 +197,8 @@ def test_calls_of_one_program_and_of_many_threads():
     """Several calls at once, in one program and from several threads, find the pool busy."""
     batches = [kernels.numbers(n) for n in (1, 2, 7, 64)]
     program = jax.jit(lambda b: [kernels.run(x, t, 500) for x, t in b]).lower(batches).compile()
-    want, found = program(batches), []
+    want = program(batches)
+    found = []
     alone = [jax.jit(partial(kernels.run, rounds=500))(x, t) for x, t in batches]
     call = [lambda: found.append(jax.block_until_ready(program(batches)))] * 4
     threads = [threading.Thread(target=c) for c in call]
@@ -284,7 +294,8 @@ def test_missing_memory_is_an_error(threads):
     large = Layout((*LAYOUT.arrays[:3], Array((2**40, 256), "float32", SCRATCH)), 8)
     block = "define internal void @block(ptr %a, ptr %b, ptr %c, ptr %d) {\nret void\n}\n"
     loaded = handlers.Loaded(handlers.compile(block + cpu.handler_code("large", large)))
-    (x, table), out = kernels.numbers(8), np.zeros((8, 1, 8), np.float32)
+    x, table = kernels.numbers(8)
+    out = np.zeros((8, 1, 8), np.float32)
     xla = Xla(threads, "threads")
     code, message = xla.call(loaded.function("large"), [x, table], [out])
     xla.run_late()
@@ -354,7 +365,9 @@ def test_why_kernels_cannot_run(monkeypatch, platform, cause, reason):
 # --- launching on NVIDIA GPUs, with a driver and an XLA of our own --------------------------------
 
 
-KERNEL, CONTEXT, PRIMARY = 0xCAFE, 0xC0, 0xC1
+KERNEL = 0xCAFE
+CONTEXT = 0xC0
+PRIMARY = 0xC1
 NAMES = {1: b"CUDA_ERROR_INVALID_VALUE", 218: b"CUDA_ERROR_INVALID_PTX"}
 GPU_LAYOUT = Layout(
     (
@@ -372,7 +385,8 @@ class FakeDriver:
 
     def __init__(self, **results):
         """Starts."""
-        self.calls, self.results = [], results
+        self.calls = []
+        self.results = results
         kinds = {
             "cuStreamGetCtx": [c_void_p, POINTER(c_void_p)],
             "cuCtxPushCurrent_v2": [c_void_p],
@@ -434,7 +448,8 @@ def prepared():
 def test_launch(prepared):
     """Grid, block, stream and the address of every array's first block, in the stream's context."""
     handler, use, _ = prepared
-    driver, xla = use(FakeDriver()), Xla()
+    driver = use(FakeDriver())
+    xla = Xla()
     for blocks in (1, 7):
         inputs, outputs = arrays(GPU_LAYOUT, blocks)
         assert xla.call(handler, inputs, outputs) is None
@@ -462,7 +477,8 @@ def test_launch(prepared):
 def test_errors_of_the_driver(prepared, function, result, message):
     """They name the call and the result; the context is restored after a launch that failed."""
     handler, use, _ = prepared
-    driver, xla = use(FakeDriver(**{function: result})), Xla()
+    driver = use(FakeDriver(**{function: result}))
+    xla = Xla()
     assert xla.call(handler, *arrays(GPU_LAYOUT, 2)) == (ffi.INTERNAL, message)
     names = [name for name, _ in driver.calls]
     assert ("cuLaunchKernel" in names) == ("cuCtxPopCurrent_v2" in names)
@@ -472,7 +488,8 @@ def test_errors_of_the_driver(prepared, function, result, message):
 def test_errors_of_xla(prepared):
     """No stream: XLA's own error is handed back.  Arrays of another kind are not launched on."""
     handler, use, _ = prepared
-    driver, xla = use(FakeDriver()), Xla(stream_error=1)
+    driver = use(FakeDriver())
+    xla = Xla(stream_error=1)
     xla.errors.append((9, "no stream"))
     inputs, outputs = arrays(GPU_LAYOUT, 2)
     assert xla.call(handler, inputs, outputs) == (9, "no stream")

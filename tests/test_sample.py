@@ -50,7 +50,8 @@ def test_robust_draws_what_the_paper_keeps():
     tables = (pq.read_table(f"{n}.parquet").to_pydict() for n in "ab")
     wide, usual = ({n: np.array(v) for n, v in t.items() if n[:5] == "noise"} for t in tables)
     for name in ("friction", "stiffness", "hand_mass"):
-        column, sigma = f"noise_{name}_factor", getattr(objects.ROBUST, name)
+        column = f"noise_{name}_factor"
+        sigma = getattr(objects.ROBUST, name)
         assert (usual[column] == 1).all()
         # The standard deviation of 400 normal draws is within 11 % of theirs in 998 of 1000 cases.
         np.testing.assert_allclose(np.log(wide[column]).std(), sigma, rtol=0.11)
@@ -60,7 +61,8 @@ def test_robust_draws_what_the_paper_keeps():
 
 def killed_after(saves, monkeypatch, **sizes):
     """Runs the command until so many shards have been saved."""
-    save, done = dataset.Shards.save, []
+    save = dataset.Shards.save
+    done = []
 
     def counted(self, shard, found):
         if len(done) == saves:

@@ -26,7 +26,8 @@ from codesign_jax.scene import (
 from tests.helpers.grasps import batch_inputs, nth, repeat, stack, still
 
 NAMES = silicones.SILICONES
-HANDS, OBJECTS = sorted(library.available("hands")), sorted(library.available("objects"))
+HANDS = sorted(library.available("hands"))
+OBJECTS = sorted(library.available("objects"))
 
 
 def text_of(kind, name):
@@ -217,7 +218,8 @@ def test_a_modulus_comes_with_its_law(pairs):
 
 def test_a_hand_file_names_its_silicone_in_a_line(tmp_path):
     text = text_of("hands", "tripod3")
-    start, end = text.index("[material]"), text.index("[palm]")
+    start = text.index("[material]")
+    end = text.index("[palm]")
     (tmp_path / "mine.toml").write_text('material = "ecoflex_00_50"\n' + text[:start] + text[end:])
     mine = hand.load(tmp_path / "mine.toml").material
     assert mine.law == "neo_hookean" and mine.shear_modulus == silicones.get(mine.silicone)[2]
@@ -258,7 +260,8 @@ def test_blanks_around_the_sign_of_a_value_are_let_pass(words):
 
 
 def test_signs_of_an_editor_are_read_in_numbers_and_kept_in_names():
-    minus, dash = "\N{MINUS SIGN}", "\N{EN DASH}"
+    minus = "\N{MINUS SIGN}"
+    dash = "\N{EN DASH}"
     found = keypaths.parse([f"gravity={minus}3.7", f'hand.name="a{dash}b"', f"scene=c{dash}d"])
     assert [*found.values()] == [-3.7, f"a{dash}b", f"c{dash}d"]
 

@@ -39,7 +39,8 @@ def workplace(tmp_path, monkeypatch):
 @pytest.fixture
 def simulated(monkeypatch):
     """Worlds that were simulated for pictures."""
-    counts, own = [], animation.replay
+    counts = []
+    own = animation.replay
 
     def replay(the_scene, engine, params, trials):
         counts.append(trials.yaw.shape[0])

@@ -134,9 +134,12 @@ def test_steps_of_mjx_equal_mujocos(tmp_path, effects, fixtures):
         scene = dataclasses.replace(scene, solver=solver)
         fields, ctrl = a_grasp(scene)
         fields = jax.tree.map(lambda v: v[0], fields)
-        engine, oracle = make_engine("mjx", scene), oracles.exact(scene, fields)
+        engine = make_engine("mjx", scene)
+        oracle = oracles.exact(scene, fields)
         step = jax.jit(engine.step, compiler_options={"xla_backend_optimization_level": 0})
-        data, ours, most = mujoco.MjData(oracle), engine.reset(fields), 0
+        data = mujoco.MjData(oracle)
+        ours = engine.reset(fields)
+        most = 0
         data.qpos[:] = fields.start
         for k in range(420):
             data.ctrl[:] = ctrl[0, k]
@@ -177,7 +180,8 @@ def test_an_object_rests_on_a_shelf_or_tips_over_its_edge(tmp_path):
     start = np.array(fields.start)
     start[:, -7:] = [0.0, 0.0, 0.03, 1.0, 0.0, 0.0, 0.0]
     start[:, -7] = [0.0, 0.015]
-    fields, held = fields._replace(start=start), np.repeat(np.asarray(ctrl[:, :1]), 100, 1)
+    fields = fields._replace(start=start)
+    held = np.repeat(np.asarray(ctrl[:, :1]), 100, 1)
     engines = make_engine("structured", the_scene).recording(), make_engine("mujoco", the_scene)
     for engine in engines:
         trace = jax.jit(partial(engine.rollout, trajectory=True))(fields, held)

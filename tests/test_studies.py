@@ -46,7 +46,9 @@ def test_sets_fill_their_ranges_and_every_beginning_does():
 def wells(ridge=2.6, floor=2.6):
     """Two wells of 12 and 6 cells on a plain; the row between them has the ridge's cost."""
     cost = np.full((12, 12), floor)
-    cost[1:4, 2:6], cost[7:9, 3:6], cost[4:7, 3] = 0.0, 0.2, ridge
+    cost[1:4, 2:6] = 0.0
+    cost[7:9, 3:6] = 0.2
+    cost[4:7, 3] = ridge
     return cost
 
 
@@ -76,7 +78,8 @@ def test_a_second_wave_is_near_the_best_of_the_first(tmp_path):
         # Reflected at the ends of a range a set is no farther away.
         assert np.abs(mine - best[k % len(best)]).max() <= calibration.NEAR
     # A file of scores is read by its constants' names; one of fewer is refused.
-    path, names = tmp_path / "scores.npz", [*OPEN]
+    path = tmp_path / "scores.npz"
+    names = [*OPEN]
     more = np.insert(units, 4, 0.5, axis=1)
     own = dict(units=more, distances=distances, names=[*names[:4], "shear_modulus", *names[4:]])
     output.write_arrays(path, own)
@@ -126,7 +129,8 @@ def test_statements_rule_out_what_they_should():
 @pytest.mark.parametrize("ties", (False, True))
 def test_rank_correlation_equals_its_definition(ties):
     rng = np.random.default_rng(1)
-    a, b = rng.normal(size=300), rng.normal(0.3, 1.0, size=300)
+    a = rng.normal(size=300)
+    b = rng.normal(0.3, 1.0, size=300)
     a, b = (np.round(a), np.round(b)) if ties else (a, b)
     x, y = (scipy.stats.rankdata(v) for v in (a, a + b))
     assert statistics.spearman(a, a + b) == pytest.approx(np.corrcoef(x, y)[0, 1], abs=1e-12)
@@ -134,7 +138,8 @@ def test_rank_correlation_equals_its_definition(ties):
 
 @pytest.mark.parametrize("page", benchmark.PAGES)
 def test_tables_of_the_pages_are_those_of_the_data(page):
-    text, files = (benchmark.ROOT / page).read_text(encoding="utf-8"), benchmark.read()
+    text = (benchmark.ROOT / page).read_text(encoding="utf-8")
+    files = benchmark.read()
     for mark in benchmark.PAGES[page]:
         [shown] = re.findall(f"<!-- {mark}:begin -->\n\n(.*?)\n\n<!-- {mark}:end -->", text, re.S)
         assert shown == benchmark.TABLES[mark](files)
@@ -183,10 +188,12 @@ def test_winners_of_a_search_are_judged_at_other_masses(tmp_path):
     masses = ["--masses", "0.05", "2"]
     assert search.main([*how, "--designs", str(path.with_suffix(".npz")), *masses]) == 0
     [judged] = (json.loads(p.read_text()) for p in tmp_path.glob("*-masses.json"))
-    row, designs = json.loads(path.read_text()), work.winners(path.with_suffix(".npz"))
+    row = json.loads(path.read_text())
+    designs = work.winners(path.with_suffix(".npz"))
     assert row["changes"] == ["objects.noise.mass_range=10"] and len(row["kept"][-1]) == 3
     own = scene.load(toy_engine.TINY, overrides={"objects.object.0.mass": 2.0})
-    space, engine = parameters.design_space(own.hand, "2d"), make_engine("mujoco", own)
+    space = parameters.design_space(own.hand, "2d")
+    engine = make_engine("mujoco", own)
     for seed, design in enumerate(designs):
         key = codesign.stream_key(jax.random.key(seed), search.STREAM_JUDGE, 0)
         hand = jax.tree.map(lambda v: v[None], space.params(design))
@@ -244,14 +251,17 @@ def test_mujoco_converges_with_the_scene_s_own_limits():
     for w in range(2):
         of_world = jax.tree.map(lambda x, w=w: x[w], fields)
         truth, *others = (world_model(s, of_world) for s in (exact, base, few))
-        d, datas = mujoco.MjData(truth), [mujoco.MjData(m) for m in others]
+        d = mujoco.MjData(truth)
+        datas = [mujoco.MjData(m) for m in others]
         d.qpos[:] = of_world.start
         for k in range(last):
             d.ctrl[:] = ctrl[w, k]
             if k >= first and k % 30 == 0:
                 mujoco.mj_forward(truth, d)
                 for m, data, found in zip(others, datas, errors, strict=True):
-                    data.qpos[:], data.qvel[:], data.ctrl[:] = d.qpos, d.qvel, d.ctrl
+                    data.qpos[:] = d.qpos
+                    data.qvel[:] = d.qvel
+                    data.ctrl[:] = d.ctrl
                     mujoco.mj_forward(m, data)
                     away = np.linalg.norm(data.qacc - d.qacc)
                     found.append(away / max(np.linalg.norm(d.qacc), 100.0))
@@ -323,10 +333,12 @@ def test_quantiles_and_medians_with_runs_that_never_converged():
 
 
 def test_paired_tests():
-    a, b = np.arange(30) < 20, np.arange(30) < 10
+    a = np.arange(30) < 20
+    b = np.arange(30) < 10
     assert statistics.mcnemar(a, b) == pytest.approx(2 * 0.5**10)
     assert statistics.mcnemar(a, a) == 1.0
-    slow, fast = np.full(30, np.inf), np.arange(30.0)
+    slow = np.full(30, np.inf)
+    fast = np.arange(30.0)
     assert statistics.wilcoxon(slow, fast, 64) < 1e-3 < statistics.wilcoxon(fast, fast, 64)
     assert statistics.trend(np.arange(4.0)[:, None] + np.zeros((4, 30))) < 1e-3
     assert statistics.trend(np.zeros((4, 30))) == 1.0

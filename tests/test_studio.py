@@ -146,7 +146,8 @@ def test_odd_requests_are_refused_and_do_not_fail(guarded):
 def test_a_stranger_s_page_opens_no_socket(guarded):
     """A stranger's page has another origin; cookies alone, which ports share, are not enough."""
     token, port = guarded
-    url, own = f"ws://127.0.0.1:{port}/socket", f"http://127.0.0.1:{port}"
+    url = f"ws://127.0.0.1:{port}/socket"
+    own = f"http://127.0.0.1:{port}"
     cookie = {"Cookie": f"a=b; codesign-studio-{port}={token}"}
     with connect(url, origin=own, additional_headers=cookie) as socket:
         socket.send("hello")
@@ -201,7 +202,8 @@ def desk(tmp_path_factory):
 
 def test_a_tab_shows_judges_improves_and_saves(desk, capsys, monkeypatch):
     """The verdict is that of `codesign evaluate`; a design of the run is the one in its record."""
-    tab, told = Tab(desk), about(desk)
+    tab = Tab(desk)
+    told = about(desk)
     assert told["groups"] == [
         {"title": "Hand", "members": [0]},
         {"title": "Control", "members": [1]},
@@ -339,7 +341,8 @@ class Children:
     """Stands in for the processes of commands: each ends when it is told to."""
 
     def __init__(self, monkeypatch):
-        self.lines, self.ends = [], threading.Semaphore(0)
+        self.lines = []
+        self.ends = threading.Semaphore(0)
         monkeypatch.setattr(subprocess, "run", self.run)
 
     def run(self, line, **_):
@@ -361,9 +364,11 @@ def ended(tab):
 
 def test_one_command_runs_at_a_time(desk, monkeypatch, tmp_path):
     """A double click is answered, every export has a folder, and what is shown can be pasted."""
-    children, place = Children(monkeypatch), tmp_path / "a; $(b) 'c'"
+    children = Children(monkeypatch)
+    place = tmp_path / "a; $(b) 'c'"
     monkeypatch.setattr(desk.options, "out", place)
-    tab, other = Tab(desk), Tab(desk)
+    tab = Tab(desk)
+    other = Tab(desk)
     for one in (tab, other):
         one.receive(show([100.0, 0.0]))
         settled(one)
@@ -375,7 +380,8 @@ def test_one_command_runs_at_a_time(desk, monkeypatch, tmp_path):
     children.ends.release()
     line, printed = ended(tab).splitlines()
     assert printed == "exported: it"
-    design, folder = place / "design-1.toml", place / "export-1"
+    design = place / "design-1.toml"
+    folder = place / "export-1"
     wanted = ["codesign", "export", "--design", design, "--engine", "mujoco", "--out", folder]
     assert shlex.split(line) == [str(word) for word in wanted]
     python = [sys.executable, "-P", "-m", "codesign_jax.cli"]
@@ -436,7 +442,8 @@ def test_the_page_is_served_while_the_simulation_is_compiled(desk, monkeypatch, 
 
 
 def test_a_design_has_the_fewest_digits_that_mean_the_same(desk):
-    space, random = desk.case.space, np.random.default_rng(0)
+    space = desk.case.space
+    random = np.random.default_rng(0)
     drawn = random.uniform(space.low, space.high, (200, 2)).astype(np.float32)
     dusty = space.from_units([[114.125, 0.1], [100.0, 30.0], [33.3, 1e-3]]).astype(np.float32)
     for design in (*drawn, *dusty):
@@ -454,7 +461,8 @@ class Dropping(Studio):
 
     def __init__(self, desk):
         super().__init__(desk)
-        self.connections, self.lost = [], False
+        self.connections = []
+        self.lost = False
 
     def serve(self, connection):
         if not self.lost:
@@ -462,7 +470,8 @@ class Dropping(Studio):
             super().serve(connection)
 
     def drop(self):
-        connections, self.connections = self.connections, []
+        connections = self.connections
+        self.connections = []
         for connection in connections:
             connection.close()
 
@@ -539,7 +548,8 @@ def test_two_tabs_work_and_a_closed_one_costs_nothing(page, opened, monkeypatch)
     other.locator(LENGTH).press("Home")
     until(lambda: "keeps 0 %" in other.locator(".verdict").inner_text(), other)
     assert "keeps 0 %" not in page.locator(".verdict").inner_text()
-    bench, simulated = studio.desk.bench(""), []
+    bench = studio.desk.bench("")
+    simulated = []
     simulate = bench.outcomes
     monkeypatch.setattr(bench, "outcomes", lambda *a: simulated.append(a) or simulate(*a))
     other.locator("#studio .count").select_option("240")
@@ -557,7 +567,8 @@ def test_two_tabs_work_and_a_closed_one_costs_nothing(page, opened, monkeypatch)
 @pytest.mark.browser
 def test_a_page_waits_for_the_compiler(browser, opened):
     with served(opened[0].desk) as (studio, address), visited(browser, address) as page:
-        state, view = page.locator("#studio .state"), page.locator("#studio .message")
+        state = page.locator("#studio .state")
+        view = page.locator("#studio .message")
         until(lambda: "compiling the simulation" in state.inner_text(), page)
         assert "compiling the simulation" in view.inner_text()
         assert page.locator(LENGTH).is_visible(), "sliders are there"
@@ -570,7 +581,8 @@ def test_a_page_waits_for_the_compiler(browser, opened):
 def test_a_lost_connection_comes_back_with_its_design(page, opened):
     """And so does a page that is loaded again, also by somebody who was sent its address."""
     studio, address = opened
-    verdict, error = page.locator("#studio .verdict"), page.locator("#studio .error")
+    verdict = page.locator("#studio .verdict")
+    error = page.locator("#studio .error")
     page.locator(LENGTH).press("Home")
     until(lambda: "keeps 0 % of 24" in verdict.inner_text(), page)
     page.locator("#studio .count").select_option("48")
@@ -613,7 +625,8 @@ def test_a_studio_that_was_started_again_is_told_apart(page, opened):
 @pytest.mark.browser
 def test_a_double_click_exports_once(page, monkeypatch):
     children = Children(monkeypatch)
-    button, done = page.locator("#studio .export"), page.locator("#studio .done")
+    button = page.locator("#studio .export")
+    done = page.locator("#studio .done")
     button.dblclick()
     until(lambda: children.lines, page)
     assert button.is_disabled() and not page.locator("#studio .error").is_visible()

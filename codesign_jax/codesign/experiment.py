@@ -96,10 +96,12 @@ def testing(
       previous: Outcomes that count as well, shape (particle, trial), such as the last episode's.
     """
     parts = [] if previous is None else [previous]
-    done, chunk = 0, 0
+    done = 0
+    chunk = 0
     while done < num_trials:
         parts.append((yield particles, stream_key(key, STREAM_TEST, chunk)))
-        done, chunk = done + parts[-1].cost.shape[1], chunk + 1
+        done = done + parts[-1].cost.shape[1]
+        chunk = chunk + 1
     return summarize_test(scene, jax.tree.map(lambda *v: jnp.concatenate(v, axis=1), *parts))
 
 

@@ -50,7 +50,8 @@ class Measured(NamedTuple):
 
     def __str__(self) -> str:
         """Rate and sizes in a line."""
-        size, count = self.scene.discretization, self.outcomes.cost.size
+        size = self.scene.discretization
+        count = self.outcomes.cost.size
         return (
             f"steps of {1e3 * size.timestep:g} ms, {size.links} links a finger: {self.rate:.3g} "
             f"grasps/s ({count} grasps in {self.seconds:.3g} s; compiled or loaded in "
@@ -149,7 +150,8 @@ Run = Callable[[jax.Array, Trial], Outcome]
 
 
 def _compiled(scene: Scene, engine: Engine, case: Case, count: int) -> tuple[Run, float]:
-    program, like = sampling.make_simulate(scene, engine, case.space), _draw(case, 0, 0, count)
+    program = sampling.make_simulate(scene, engine, case.space)
+    like = _draw(case, 0, 0, count)
     begin = time.perf_counter()
     return interruptible(program.compile, *like), time.perf_counter() - begin
 
@@ -174,14 +176,17 @@ def _sample(options: Check, case: Case, run: Run, count: int) -> tuple[jax.Array
         words = f"the {common.counted(len(found), 'final particle')} of {options.run_folder} "
         words += "that differ"
     elif options.design:
-        found, words = np.asarray(case.design)[None], runs.describe(case.space, case.design)
+        found = np.asarray(case.design)[None]
+        words = runs.describe(case.space, case.design)
     else:
         found, words = _mixed(options, case, run, count)
     return jnp.asarray(np.resize(found, (count, found.shape[1])), jnp.float32), words
 
 
 def _mixed(options: Check, case: Case, run: Run, count: int) -> tuple[np.ndarray, str]:
-    begin, designs, costs = time.perf_counter(), [], []
+    begin = time.perf_counter()
+    designs = []
+    costs = []
     while len(designs) < _ROUNDS and time.perf_counter() - begin < options.seconds / _ROUNDS:
         drawn = _draw(case, 0, count * len(designs), count)
         outcomes, _ = _timed(run, *drawn)
@@ -202,7 +207,8 @@ def tell(
     case: Case, settings: Settings, words: str, usual: Measured, fine: Measured, console: Console
 ) -> int:
     """Prints what `simulate` found; the exit status."""
-    ours, theirs = usual.kept[: len(fine.kept)], fine.kept
+    ours = usual.kept[: len(fine.kept)]
+    theirs = fine.kept
     differ = int((ours != theirs).sum())
     share = wilson(differ, theirs.size)
     grasps = runs.prepare(case.scene, _without_own_code(settings)).grasps

@@ -32,7 +32,8 @@ from codesign_jax.types import Params
 
 MOST = 1000
 """Most runs of one command: a guard against a slip such as 0-99999."""
-SCENE, PRESET = "paper", "2d"
+SCENE = "paper"
+PRESET = "2d"
 """Scene and design space where none is named."""
 
 
@@ -83,7 +84,8 @@ def warn(text: str) -> None:
 def find_case(options: Subject, *, tell: Tell = warn) -> Case:
     """The design that the flags name: the best of a run, or one given by its parameters."""
     if options.run_folder is None:
-        scene, words = load_scene(options), [*chain.from_iterable(options.design)]
+        scene = load_scene(options)
+        words = [*chain.from_iterable(options.design)]
         if options.policy:
             scene = make_policy(options.policy, scene)[1]
         space = design_space(scene.hand, design_file(options).preset)
@@ -107,7 +109,8 @@ def shortest(space: DesignSpace, design: np.ndarray) -> list[float]:
 
     Simulations take a design as float32: 114.125 mm and 114.124998 mm are one number there.
     """
-    exact, single = space.in_units(design), np.asarray(design, np.float32)
+    exact = space.in_units(design)
+    single = np.asarray(design, np.float32)
     values = exact.copy()
     for digits in range(9, 0, -1):  # nine tell any two numbers of float32 apart
         fewer = np.array([float(f"{value:.{digits}g}") for value in exact])
@@ -135,7 +138,8 @@ def design_text(space: DesignSpace, file: DesignFile, design: np.ndarray) -> str
 def open_designs(words: Sequence[str]) -> tuple[dict[str, list[str]], DesignFile]:
     """Splits the words of --design into NAME=VALUE pairs, by the file that has them; the file."""
     found: dict[str, list[str]] = {}
-    file, direct = DesignFile(PRESET, {}), []
+    file = DesignFile(PRESET, {})
+    direct = []
     for word in keypaths.joined(words):
         if "=" in word or not word.endswith(".toml"):
             direct.append(word)

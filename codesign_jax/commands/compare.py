@@ -109,7 +109,8 @@ def read_all(every: Mapping[Path, tuple[Scene, Settings]]) -> dict[Path, Compare
     """The runs in folders as they are, with the fresh trials that these have, by folder."""
     found = {}
     for folder, (scene, settings) in every.items():
-        result, fresh = read(scene, folder), None
+        result = read(scene, folder)
+        fresh = None
         if result is not None and result.test is not None and (folder / reference.FILE).exists():
             kept, why = reference.stored(folder, settings)
             if why:
@@ -156,7 +157,8 @@ def _subject(options: Compare, place: Path, *, of_run: bool) -> flags.Subject:
 
 def compare_pair(pair: dict[str, Case], options: Compare, console: Console) -> None:
     """Simulates designs by their names in the same trials, and prints how they differ."""
-    kept, count = [], TRIALS if options.trials is None else options.trials
+    kept = []
+    count = TRIALS if options.trials is None else options.trials
     for name, case in pair.items():
         with Busy(console, f"simulating {common.counted(count, 'grasp')}"):
             outcome, left = case.observe(count, jax.random.key(options.seed))
@@ -175,7 +177,8 @@ def difference(first: np.ndarray, second: np.ndarray, names: list[str]) -> list[
       first: Which trials the first design kept, shape (trial,) bool.
     """
     only = int((first & ~second).sum()), int((~first & second).sum())
-    both, total = int((first & second).sum()), len(first)
+    both = int((first & second).sum())
+    total = len(first)
     found = statistics.paired(both, *only, total)
     value, low, high = (100 * v for v in found)
     word = f"{names[value < 0]} keeps more"
@@ -196,7 +199,8 @@ def _needed(first: int, second: int, total: int) -> int:
 
     By the normal distribution's variance of a difference of paired shares.
     """
-    one, other = first / total, second / total
+    one = first / total
+    other = second / total
     variance = one + other - (one - other) ** 2
     return math.ceil(1.96**2 * variance / (one - other) ** 2)
 
@@ -276,7 +280,8 @@ def _values(place: Path, run: Compared, path: Path) -> dict[str, object]:
     found["converged_episode"] = run.converged or ""
     if run.result is None or run.result.record is None or run.result.test is None:
         return found
-    test, chosen = run.result.test, of_test(run.scene, run.result)
+    test = run.result.test
+    chosen = of_test(run.scene, run.result)
     first = np.unique(np.asarray(run.result.record.state.particles), axis=0, return_index=True)[1]
     found |= {
         "best_test_cost": f"{np.asarray(test.cost).min():.9g}",

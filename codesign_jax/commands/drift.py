@@ -22,10 +22,12 @@ def simulate(case: Case, engine: Engine, options: Export, console: Console) -> "
     """Tolerances of the design: says how many grasps they take at most, and simulates."""
     from codesign_jax.export import sheet, tolerance  # with the extra
 
-    steps, count = options.tolerance_steps, options.tolerance_trials
+    steps = options.tolerance_steps
+    count = options.tolerance_trials
     planned = study(case, options)
     task = Task(case.scene, planned.space, count, engine)
-    size, key = batch.size(1 + int(planned.room.sum()), count), jax.random.key(options.seed)
+    size = batch.size(1 + int(planned.room.sum()), count)
+    key = jax.random.key(options.seed)
     _announce(planned, options, console)
     with Meter("tolerance", planned.most * count, console) as meter:
 
@@ -50,7 +52,8 @@ def study(case: Case, options: Export) -> "Study":
 
 
 def _announce(planned: "Study", options: Export, console: Console) -> None:
-    names, most = planned.space.names, planned.most * options.tolerance_trials
+    names = planned.space.names
+    most = planned.most * options.tolerance_trials
     moved = ", ".join(names) if len(names) <= 4 else f"{len(names)} parameters"
     others = {"free": "all moves the hand's whole table", "all": "free moves fewer"}
     console.print(

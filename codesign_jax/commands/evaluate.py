@@ -92,7 +92,8 @@ def _check(options: Evaluate, engine: str) -> None:
 
 def simulate(case: Case, options: Evaluate, console: Console) -> types.Outcome:
     """Simulates the trials and prints how they ended, by object and in all; outcomes (trial,)."""
-    key, asked = jax.random.key(options.seed), options.trials
+    key = jax.random.key(options.seed)
+    asked = options.trials
     if asked is None:
         later = _of_each(options) * stress.sets(case.scene) if options.stress else 0
         with Meter("trials", verdict.USUAL, console, later=later) as meter:
@@ -156,7 +157,8 @@ def of_objects(case: Case, engine: Engine, options: Evaluate, console: Console) 
     """Of the first trial of each object: its forces, the pull that ends it, and a drawing."""
     from codesign_jax.report import animation
 
-    scene, count = case.scene, len(case.scene.objects.object)
+    scene = case.scene
+    count = len(case.scene.objects.object)
     if options.trials is not None:
         count = min(options.trials, count)
     trials = rollout.sample_trials(scene, jax.random.key(options.seed), count)

@@ -169,7 +169,8 @@ def _parts(
 ) -> "workshop.Printed":
     from codesign_jax.export import meshes, palm, workshop  # needs the extra
 
-    folder, how = folder / meshes.FOLDER, _process(options)
+    folder = folder / meshes.FOLDER
+    how = _process(options)
     folder.mkdir(exist_ok=True)
     with Busy(console, "making fingers, moulds and the palm"):
         made = palm.palm(case.scene, params, sizes, how)

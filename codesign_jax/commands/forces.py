@@ -48,7 +48,8 @@ def columns(forces: Forces) -> dict[str, Any]:
 
 def write(path: Path, scene: Scene, grasps: list[Replay]) -> None:
     """Writes a row for each time step of each grasp."""
-    rows, step = [], scene.discretization.timestep
+    rows = []
+    step = scene.discretization.timestep
     for trial, grasp in enumerate(grasps):
         named = columns(_forces(grasp))
         for k in range(len(grasp.qpos)):
@@ -104,10 +105,12 @@ def pull(
     """
     if isinstance(engine, ControlLoop):
         raise InputError(["--pull holds the hand as key frames do: leave out --policy"])
-    held, step = int(scene.last_step("lift")) + 1, scene.discretization.timestep
+    held = int(scene.last_step("lift")) + 1
+    step = scene.discretization.timestep
     hands = jax.tree.map(lambda v: jnp.repeat(v[None], len(trials.yaw), 0), params)
     lay = model.layout(scene)
-    joints, three = lay.dofs.size, np.arange(3)
+    joints = lay.dofs.size
+    three = np.arange(3)
     linear = 19 + 2 * joints + three  # the object's velocity in a state, see `model.State`
 
     def place(state: jax.Array) -> jax.Array:  # of the object, from the palm's

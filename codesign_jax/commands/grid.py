@@ -64,7 +64,8 @@ def _problem(word: str, case: Case) -> str:
 def _range(text: str) -> list[float]:
     """The two numbers of LOW:HIGH, or nothing."""
     low, _, high = text.partition(":")
-    first, last = common.number(low), common.number(high)
+    first = common.number(low)
+    last = common.number(high)
     return [first, last] if first is not None and last is not None and first < last else []
 
 
@@ -81,7 +82,8 @@ def _axis(word: str, case: Case, options: Options) -> Axis:
     name, _, text = word.partition("=")
     ends = _range(text)
     if name in case.space.names:
-        k, space = case.space.names.index(name), case.space
+        k = case.space.names.index(name)
+        space = case.space
         low, high = ends or (space.in_units(np.array(v))[k] for v in (space.low, space.high))
         return Axis(name, space.units[k], np.linspace(low, high, options.points), k)
     values = np.linspace(ends[0], ends[1], options.points)
@@ -109,7 +111,8 @@ def _entries(value: Any, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
     if not path:
         yield ()
         return
-    part, rest = path[0], path[1:]
+    part = path[0]
+    rest = path[1:]
     if not isinstance(value, tuple):
         inside = getattr(value, part, None)
         yield from ((part, *more) for more in _entries(inside, rest))

@@ -101,7 +101,8 @@ def simulated_designs(
     case: Case, made: Plane, size: int, options: Options, console: Console
 ) -> Outcome:
     """Outcomes, arrays of shape (point, trial); all points meet trials of the same key."""
-    key, count = jax.random.key(options.seed), options.trials
+    key = jax.random.key(options.seed)
+    count = options.trials
     with Meter("landscape", len(made.designs) * count, console) as meter:
         if made.numbers is None:
             task = Task(case.scene, case.space, count, case.make_engine())

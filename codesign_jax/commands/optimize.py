@@ -27,7 +27,8 @@ from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.scene.schema import InputError
 from codesign_jax.terminal import Console, say
 
-ALTERNATE, DOMAINS = "alternate", ("morphology", "control")
+ALTERNATE = "alternate"
+DOMAINS = ("morphology", "control")
 """Value of --first by which even seeds begin in the first domain and odd ones in the other."""
 _LONGEST = 200
 """Most bytes of a folder's name; file systems take 255, temporary files add to it."""
@@ -54,7 +55,8 @@ def main(options: Optimize) -> int:
             say(note)
         _dry_run(plan, len(every), options)
         return 0
-    devices, chunk = options.devices, options.chunk
+    devices = options.devices
+    chunk = options.chunk
     most = reference.most_trials(options.reference_trials, settings)
     after = _after(scene, most)
     how = {"fresh": options.fresh, "after": after, "devices": devices, "chunk": chunk}
@@ -105,7 +107,8 @@ def _compare(options: Optimize) -> int:
     scene, settings = resolve(dataclasses.replace(options, fresh=False))
     every = runs_of(options, scene, settings)
     found = compare.read_all({folder: (scene, own) for folder, own in every.items()})
-    console, table = Console(), (options.out or Path("runs")) / columns.SEEDS
+    console = Console()
+    table = (options.out or Path("runs")) / columns.SEEDS
     compare.compare(found, console)
     compare.write_table(found, table)
     console.print(f"table: {table}")
@@ -132,7 +135,8 @@ def _tell(
     elif not most:
         _judge(plan, result, None, folder, console)
     else:
-        slower, others = reference.steps_and_links(plan.scene), stress.sets(plan.scene)
+        slower = reference.steps_and_links(plan.scene)
+        others = stress.sets(plan.scene)
         coming = (later + reference.STRESS_TRIALS * others) / slower
         found = reference.test(folder, plan.settings, most, console, coming)
         case, other = reference.stress_run(folder, plan.settings, console, later)
@@ -166,7 +170,8 @@ def _ends(space: DesignSpace) -> dict[str, np.ndarray]:
 
 
 def _dry_run(plan: Plan, count: int, options: Optimize) -> None:
-    scene, settings = plan.scene, plan.settings
+    scene = plan.scene
+    settings = plan.settings
     for name, text in scene_texts(scene).items():
         say(f"# ---- {name}", *text.split("\n"))
     values = dataclasses.asdict(settings).items()
@@ -176,7 +181,8 @@ def _dry_run(plan: Plan, count: int, options: Optimize) -> None:
     say(f"grasps: {plan.grasps}" + (f" and at least {seed} to find the seed" if seed else ""))
     if tested := settings.test_rounds * settings.trials:
         whole = f", in whole rounds of {settings.trials}" if tested != settings.test_trials else ""
-        many, few = plan.test_grasps, plan.finalists
+        many = plan.test_grasps
+        few = plan.finalists
         say(f"final test: {many} of these grasps, {tested} trials of {few} particles{whole}")
     if count > 1:
         say(f"runs: {count}, in one batch; grasps and disk are those of each")
@@ -192,7 +198,8 @@ def _dry_run(plan: Plan, count: int, options: Optimize) -> None:
 
 def _summarize(plan: Plan, result: RunResult, console: Console) -> None:
     assert result.record is not None
-    history, particles = result.record.history, np.asarray(result.record.state.particles)
+    history = result.record.history
+    particles = np.asarray(result.record.state.particles)
     converged = codesign.convergence_episode(history.cost.mean(1))
     if plan.task.cost is not None:
         console.print(
@@ -236,7 +243,8 @@ def _judge(
 
 def resolve(options: Optimize) -> tuple[Scene, Settings]:
     """Reads the scene and fills the settings."""
-    problems, scene = [], None
+    problems = []
+    scene = None
     try:
         problems += common.engine_problems(options.engine or engines.DEFAULT, options.overrides)
         scene = common.load_scene(options)
@@ -245,7 +253,8 @@ def resolve(options: Optimize) -> tuple[Scene, Settings]:
     except InputError as error:
         problems += error.problems
     schedules = options.schedule.split(",")
-    optimizer, episodes = options.optimizer, options.episodes
+    optimizer = options.optimizer
+    episodes = options.episodes
     if scene is not None and not options.fresh:
         try:
             optimizer, episodes = _of_the_runs(options, scene)
@@ -297,7 +306,8 @@ def _of_the_runs(options: Optimize, scene: Scene) -> tuple[str | None, int | Non
 
     An optimiser of somebody's own is not among them: only a command line has code imported.
     """
-    optimizer, cost = options.optimizer, options.cost or runs.SCENE_COST
+    optimizer = options.optimizer
+    cost = options.cost or runs.SCENE_COST
     own: dict[str, Any] = {"optimizer": optimizer or optimize.DEFAULT, "cost": cost}
     own["policy"] = options.policy or ""
     usual = runs.make_settings(options.preset, "", "", "", 0, **own)

@@ -26,7 +26,8 @@ from codesign_jax.terminal import Console
 from codesign_jax.types import Outcome
 
 ACCURACY = "reference"
-FILE, STRESS_FILE = "reference.npz", "stress.npz"
+FILE = "reference.npz"
+STRESS_FILE = "stress.npz"
 STRESS_TRIALS = 12
 """Grasps of each condition."""
 _OUTCOME = ("cost", "status", "lost_time", "bad_step")
@@ -58,7 +59,8 @@ def test(
       most: Most trials; at least 1.
       later: What is simulated after it, for the time left, in grasps of this accuracy.
     """
-    case, key = _finer(folder, settings), _noise(settings, STREAM_REFERENCE)
+    case = _finer(folder, settings)
+    key = _noise(settings, STREAM_REFERENCE)
     about = case.digest(settings.seed)
     kept, why = _outcomes(folder, about)
     if why:

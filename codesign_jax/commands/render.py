@@ -40,7 +40,9 @@ _LIMITS |= dict.fromkeys("xyz", ("m", 10))
 def _camera(words: Sequence[str]) -> "Camera":
     from codesign_jax.report.animation import CAMERA, VIEWS
 
-    camera, problems, numbers = CAMERA, [], {}
+    camera = CAMERA
+    problems = []
+    numbers = {}
     for word in words:
         name, given, text = word.partition("=")
         if not given and name in VIEWS:
@@ -50,7 +52,8 @@ def _camera(words: Sequence[str]) -> "Camera":
             hint = schema.nearest(name, [*VIEWS, *_LIMITS])
             problems.append(f"--camera {name!r} is no view and no number of a camera; {hint}")
             continue
-        (unit, most), value = _LIMITS[name], common.number(text)
+        unit, most = _LIMITS[name]
+        value = common.number(text)
         least = 0.05 if name == "distance" else -most  # MuJoCo cuts what is nearer than 1 cm
         if value is None:
             problems.append(f"--camera {name}={text} must be a number [{unit}]")
@@ -71,7 +74,8 @@ def draw(asked: grasp.Asked, options: Render, camera: "Camera", console: Console
 
     lines = "\n".join(grasp.description(asked, shown)).split("\n")
     console.print(*lines, sep="\n")
-    scene, size = asked.case.scene, (options.size, options.size)
+    scene = asked.case.scene
+    size = (options.size, options.size)
     with Busy(console, "drawing"):
         how: Any = {"size": size, "camera": camera}
         if options.times:

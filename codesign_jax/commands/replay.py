@@ -70,7 +70,8 @@ def explain(path: Path, engine: str | None, policy: str | None) -> int:
     refuse_other_policy(settings.policy, policy)
     name = engine or settings.engine
     common.refuse(common.engine_problems(name))
-    space, h = design_space(scene.hand, settings.preset), scene.discretization.timestep
+    space = design_space(scene.hand, settings.preset)
+    h = scene.discretization.timestep
     say(*runs.describe(space, failure.design).split("\n"))
     say(f"recorded by {settings.engine}: {_verdict(failure.status, failure.bad_step, h)}")
     for bit in Status(failure.status):
@@ -98,6 +99,7 @@ def _verdict(status: int, bad_step: int, h: float) -> str:
 
 
 def _where(trace: Trace, k: int) -> str:
-    height, distance = trace.height[k], trace.distance[k]
+    height = trace.height[k]
+    distance = trace.distance[k]
     words = f"object {height:.4f} m above the table, {distance:.4f} m from the hand"
     return f"speed {trace.speed[k]:.4g}, {words}"

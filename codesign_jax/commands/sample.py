@@ -28,7 +28,8 @@ def main(options: Sample) -> int:
     common.use_compilation_cache()
     _check(options)
     scene = common.load_scene(options)
-    question, engine = _question(options, scene), make_engine(options.engine, scene)
+    question = _question(options, scene)
+    engine = make_engine(options.engine, scene)
     console = Console()
     outcomes = Shards(options.out)
     outcomes.refuse_other(question)
@@ -97,7 +98,8 @@ def _simulate(
 ) -> np.ndarray:
     """Simulates the shards that are missing; numbers of grasps by `codesign.VERDICTS`."""
     simulate = sampling.make_simulate(question.scene, engine, question.space)
-    counts, total = np.zeros(len(VERDICTS), int), question.shards(designs)
+    counts = np.zeros(len(VERDICTS), int)
+    total = question.shards(designs)
 
     def count(shard: int, found: Outcome) -> int:
         wanted = min(question.chunk, designs - shard * question.chunk)

@@ -18,7 +18,9 @@ from codesign_jax.compiler.handlers import Handler, LlvmFunction
 from codesign_jax.compiler.values import SCRATCH, Layout
 
 _ALIGNMENT = 64  # bytes: a line of the cache
-_YIELDS, _SLEEP = 100, 50_000  # times that a handler looks again at once, then pauses [ns]
+# times that a handler looks again at once, then pauses [ns]
+_YIELDS = 100
+_SLEEP = 50_000
 
 
 class Job(ctypes.Structure):
@@ -74,7 +76,8 @@ def register(
 def _declared_once(text: str) -> str:
     """A program without repeated declarations: block and handler may use the same function."""
     lines = text.splitlines()
-    repeated, seen = set(), set()
+    repeated = set()
+    seen = set()
     for number, line in enumerate(lines):
         if line.startswith("declare"):
             if line in seen:
@@ -91,7 +94,8 @@ def _work(layout: Layout) -> str:
     waiting = c.let(f"load atomic i64, ptr {following} monotonic, align 8")
     with c.when(c.let(f"icmp sge i64 {waiting}, {blocks}")):
         c.end("ret i1 false")
-    offsets, total = {}, 0
+    offsets = {}
+    total = 0
     for k in layout.of(SCRATCH):
         offsets[k] = total
         total += -(-layout.arrays[k].bytes // _ALIGNMENT) * _ALIGNMENT
@@ -145,7 +149,8 @@ def _drop() -> str:
 def _handler(name: str, layout: Layout) -> str:
     """Shares the blocks with XLA's threads, and waits for all that were begun."""
     h = Handler(name, layout)
-    c, blocks = h.code, h.blocks
+    c = h.code
+    blocks = h.blocks
     with c.when(c.let(f"icmp eq i64 {blocks}, 0")):
         c.end("ret ptr null")
     workers = _smaller(c, _threads(h), blocks)
@@ -174,7 +179,8 @@ def _smaller(c: LlvmFunction, a: str, b: str) -> str:
 
 def _threads(h: Handler) -> str:
     """Threads of XLA's pool; one, the caller's, if there is no pool."""
-    c, number = h.code, h.code.local("i64")
+    c = h.code
+    number = h.code.local("i64")
     c.do(f"store i64 1, ptr {number}")
     record = c.record(ffi.NumThreads, ctx=h.ctx, num_threads=number)
     error = h.call("thread_pool_num_threads", record)
@@ -194,7 +200,8 @@ def _destroy(h: Handler, error: str) -> None:
 
 
 def _job(h: Handler, users: str) -> str:
-    c, arrays = h.code, h.layout.arrays
+    c = h.code
+    arrays = h.layout.arrays
     size = Job.arrays.offset + 8 * len(arrays)
     job = c.let(f"call ptr @malloc(i64 {size})")
     with c.when(c.let(f"icmp eq ptr {job}, null")):
@@ -209,7 +216,8 @@ def _job(h: Handler, users: str) -> str:
 
 def _schedule(h: Handler, job: str, workers: str) -> None:
     """Gives XLA's threads one task less than there are workers: the caller is one of them."""
-    c, count = h.code, h.code.local("i64")
+    c = h.code
+    count = h.code.local("i64")
     record = c.record(ffi.Schedule, ctx=h.ctx, task="@task", data=job)
     c.do(f"store i64 1, ptr {count}")
     c.start("schedule")
@@ -227,7 +235,8 @@ def _schedule(h: Handler, job: str, workers: str) -> None:
 
 def _wait(c: LlvmFunction, job: str, begun: str) -> None:
     """Waits until as many blocks are done as were begun."""
-    looks, pause = c.local("i64"), c.local("[2 x i64]")
+    looks = c.local("i64")
+    pause = c.local("[2 x i64]")
     c.do(f"store i64 0, ptr {looks}")
     c.do(f"store [2 x i64] [i64 0, i64 {_SLEEP}], ptr {pause}")
     done = c.at(job, Job, "done")

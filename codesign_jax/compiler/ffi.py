@@ -15,7 +15,8 @@ from typing import Any
 
 import jax
 
-MAJOR, MINOR = 0, 3
+MAJOR = 0
+MINOR = 3
 """The version whose layout this module describes."""
 
 
@@ -62,7 +63,9 @@ NumThreads = _structure(  # the number goes to an address
 METADATA = 1
 """XLA_FFI_Extension_Metadata: XLA asks a handler for the version that it was written for."""
 
-INVALID_ARGUMENT, RESOURCE_EXHAUSTED, INTERNAL = 3, 8, 13
+INVALID_ARGUMENT = 3
+RESOURCE_EXHAUSTED = 8
+INTERNAL = 13
 """Codes of errors (XLA_FFI_Error_Code)."""
 
 DTYPES = {

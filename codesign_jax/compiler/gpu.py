@@ -36,8 +36,11 @@ CALLS = (
 """Functions of the driver that a handler calls, in the order of its table of addresses."""
 
 _OLDEST_DRIVER = 12_000  # cuLibraryLoadData and launches by CUkernel
-_LOG_BUFFER, _LOG_SIZE = 5, 6  # CU_JIT_ERROR_LOG_BUFFER and its size [bytes]
-_LOG_BYTES, _MESSAGE_BYTES = 4096, 512
+# CU_JIT_ERROR_LOG_BUFFER and its size [bytes]
+_LOG_BUFFER = 5
+_LOG_SIZE = 6
+_LOG_BYTES = 4096
+_MESSAGE_BYTES = 512
 
 _lent: list[Any] = []  # memory that the driver may write to whenever it translates for another GPU
 
@@ -90,7 +93,8 @@ def load(driver: Driver, text: str, device: int) -> int:
     The driver translates it for one GPU now, where an error can be told, with its assembler's
     message, and for others at their first launch.
     """
-    library, kernel = ctypes.c_void_p(), ctypes.c_void_p()
+    library = ctypes.c_void_p()
+    kernel = ctypes.c_void_p()
     log = ctypes.create_string_buffer(_LOG_BYTES)
     options = (ctypes.c_int * 2)(_LOG_BUFFER, _LOG_SIZE)
     values = (ctypes.c_void_p * 2)(ctypes.addressof(log), _LOG_BYTES)
@@ -112,7 +116,8 @@ def load(driver: Driver, text: str, device: int) -> int:
 
 
 def _translate(driver: Driver, kernel: ctypes.c_void_p, device: int) -> None:
-    context, function = ctypes.c_void_p(), ctypes.c_void_p()
+    context = ctypes.c_void_p()
+    function = ctypes.c_void_p()
     driver("cuDevicePrimaryCtxRetain", ctypes.byref(context), device)
     try:
         driver("cuCtxPushCurrent_v2", context)
@@ -157,14 +162,16 @@ def handler_code(name: str, layout: Layout) -> str:
     """The handler of a kernel, with a table of the kernel's handle and the driver's functions."""
     h = Handler(name, layout)
     h.globals.append(f"@{name}_table = global [{1 + len(CALLS)} x ptr] zeroinitializer\n")
-    c, blocks = h.code, h.blocks
+    c = h.code
+    blocks = h.blocks
     places = [k for k, array in enumerate(layout.arrays) if array.role != ONCHIP]
     with c.when(c.let(f"icmp eq i64 {blocks}, 0")):
         c.end("ret ptr null")
     with c.when(c.let(f"icmp sgt i64 {blocks}, {2**31 - 1}")):
         h.fail(ffi.INVALID_ARGUMENT, h.message(f"kernel {name}: more blocks than a grid has"))
     stream = _stream(h)
-    addresses, params = c.local("ptr", len(places)), c.local("ptr", len(places))
+    addresses = c.local("ptr", len(places))
+    params = c.local("ptr", len(places))
     for k, array in enumerate(places):
         place = c.byte(addresses, 8 * k)
         c.do(f"store ptr {h.data[array]}, ptr {place}")
@@ -208,7 +215,8 @@ def _check(h: Handler, function: str, result: str) -> None:
     """Returns an error that names function and result, unless the result is CUDA_SUCCESS."""
     c = h.code
     with c.when(c.let(f"icmp ne i32 {result}, 0")):
-        known, text = c.local("ptr"), c.local("i8", _MESSAGE_BYTES)
+        known = c.local("ptr")
+        text = c.local("i8", _MESSAGE_BYTES)
         c.do(f"store ptr {h.message('unknown error')}, ptr {known}")
         _call(h, "cuGetErrorName", f"i32 {result}, ptr {known}")
         form = h.message(f"kernel {h.name}: {function}: %s (%d)")

@@ -42,8 +42,11 @@ class LlvmFunction:
     """A function that is being written."""
 
     def __init__(self, head: str):
-        self.head, self.lines, self.first = head, [], []
-        self.count, self.ended = 0, False
+        self.head = head
+        self.lines = []
+        self.first = []
+        self.count = 0
+        self.ended = False
 
     def name(self, prefix: str = "t") -> str:
         self.count += 1
@@ -73,7 +76,8 @@ class LlvmFunction:
     @contextlib.contextmanager
     def when(self, condition: str) -> Iterator[None]:
         """What is added in this context runs if a condition holds."""
-        yes, after = self.name("yes"), self.name("after")
+        yes = self.name("yes")
+        after = self.name("after")
         self.end(f"br i1 {condition}, label %{yes}, label %{after}")
         self.start(yes)
         yield
@@ -131,7 +135,8 @@ class Handler:
 
     def __init__(self, name: str, layout: Layout):
         """Writes the answer to XLA's question for the version, and the checks of the arrays."""
-        self.name, self.layout = name, layout
+        self.name = name
+        self.layout = layout
         self.code = LlvmFunction(f"define ptr @{name}(ptr %frame) nounwind")
         self.globals = [f"@{seen(name)} = global [{len(SEEN)} x i64] zeroinitializer\n"]
         self.messages = 0
@@ -189,7 +194,8 @@ class Handler:
 
     def _arrays(self) -> str:
         """Checks the arrays that XLA passes; returns the number of blocks."""
-        c, blocks = self.code, ""
+        c = self.code
+        blocks = ""
         for which, role in (("args", INPUT), ("rets", OUTPUT)):
             places = self.layout.of(role)
             given = c.at("%frame", ffi.CallFrame, which)
@@ -208,8 +214,10 @@ class Handler:
         return blocks
 
     def _array(self, place: int, buffer: str, blocks: str) -> str:
-        c, array = self.code, self.layout.arrays[place]
-        rank, what = 1 + len(array.shape), f"array {place} to be {array}"
+        c = self.code
+        array = self.layout.arrays[place]
+        rank = 1 + len(array.shape)
+        what = f"array {place} to be {array}"
         self._demand(
             [
                 f"uge i64 {c.get(buffer, ffi.Buffer, 'struct_size')}, {ffi.size(ffi.Buffer)}",
@@ -227,7 +235,8 @@ class Handler:
 
     def _demand(self, tests: list[str], what: str) -> None:
         """Returns an error unless all comparisons hold."""
-        c, holds = self.code, "true"
+        c = self.code
+        holds = "true"
         for test in tests:
             holds = c.let(f"and i1 {holds}, {c.let('icmp ' + test)}")
         with c.when(c.let(f"xor i1 {holds}, true")):

@@ -27,7 +27,8 @@ class Instructions:
         self.lanes = lanes
         self.lines: list[str] = []
         self.declared: set[str] = set()
-        self.count, self.here = 0, "entry"
+        self.count = 0
+        self.here = "entry"
         self.scalar_of: dict[str, Value] = {}  # splatted scalars, by vector
         self.exchanged: set[str | None] = set()
 
@@ -145,7 +146,8 @@ class Instructions:
 
     def compute(self, operation: str, *args: Value, kind: str | None = None) -> Value:
         args = tuple(self.alike(*args))
-        first, wide = args[0], args[0].wide
+        first = args[0]
+        wide = args[0].wide
         operands = ", ".join([self.operand(a) for a in args])
         text = self.emit(f"{operation} {self.type(first.kind, wide)} {operands}")
         return Value(kind or first.kind, wide, text)
@@ -155,7 +157,8 @@ class Instructions:
     ) -> Value:
         """The result of one of LLVM's overloaded functions on floats or integers."""
         args = tuple(self.alike(*args))
-        kind, wide = args[0].kind, args[0].wide
+        kind = args[0].kind
+        wide = args[0].wide
         full = f"llvm.{name}.{self.suffix(kind, wide)}"
         one = self.type(kind, wide)
         more = [part.rsplit(" ", 1)[0] for part in extra.split(", ") if part]
@@ -179,8 +182,10 @@ class Instructions:
 
     def whole(self, x: Value, kind: str = "i32") -> Value:
         """A float without its fraction; 0 for what is not a number, the nearest integer beyond."""
-        source, target = self.suffix(x.kind, x.wide), self.suffix(kind, x.wide)
-        full, result = f"llvm.fptosi.sat.{target}.{source}", self.type(kind, x.wide)
+        source = self.suffix(x.kind, x.wide)
+        target = self.suffix(kind, x.wide)
+        full = f"llvm.fptosi.sat.{target}.{source}"
+        result = self.type(kind, x.wide)
         self.declared.add(f"declare {result} @{full}({self.type(x.kind, x.wide)})")
         return Value(kind, x.wide, self.emit(f"call {result} @{full}({self.typed(x)})"))
 
@@ -190,6 +195,7 @@ class Instructions:
             return yes if which.known else no
         yes, no = self.alike(yes, no)
         if which.wide:
-            yes, no = self.splat(yes), self.splat(no)
+            yes = self.splat(yes)
+            no = self.splat(no)
         parts = [self.typed(v) for v in (which, yes, no)]
         return Value(yes.kind, yes.wide, self.emit(f"select {', '.join(parts)}"))

@@ -177,7 +177,8 @@ def describe(inputs: Any, outputs: Any, kernel: Kernel) -> Layout:
             raise ValueError(f"array {k} of shape {x.shape} {what}")
         if shared and role != INPUT:
             raise ValueError(f"array {k} is an output; only inputs can be shared")
-        name, exchanged = np.dtype(x.dtype).name, place in kernel.exchanged
+        name = np.dtype(x.dtype).name
+        exchanged = place in kernel.exchanged
         arrays.append(Array(tuple(x.shape[1:]), name, role, shared, exchanged))
     return Layout(tuple(arrays), kernel.lanes)
 
@@ -195,7 +196,8 @@ def _varying(inputs: tuple) -> dict[str, Any]:
     every = frozenset().union(*(jax.typeof(x).manual_axis_type.varying for x in inputs))
     if not every:
         return {}
-    mesh, whole = jax.sharding.get_abstract_mesh(), jax.sharding.PartitionSpec()
+    mesh = jax.sharding.get_abstract_mesh()
+    whole = jax.sharding.PartitionSpec()
     return {
         "sharding": jax.sharding.NamedSharding(mesh, whole),
         "manual_axis_type": jax.sharding.ManualAxisType(varying=every),

@@ -28,7 +28,8 @@ _BITS = {"f32": (12, 12, 24), "f64": (33, 33, 53)}
 
 def half_pi_parts(kind: str) -> list[float]:
     """Numbers that add up to pi / 2; all but the last times a small whole number are exact."""
-    parts, left = [], _HALF_PI
+    parts = []
+    left = _HALF_PI
     for bits in _BITS[kind]:
         scale = Fraction(2) ** (bits - 1 - int(np.floor(np.log2(float(left)))))
         part = Fraction(int(left * scale), 1) / scale
@@ -148,12 +149,14 @@ def _whole_division(w: Instructions, operation: str, a: Value, b: Value) -> Valu
     """
     quotient = operation == "sdiv"
     if a.is_known and b.is_known and np.all(np.asarray(b.known) > 0):
-        x, y = np.asarray(a.known), np.asarray(b.known)
+        x = np.asarray(a.known)
+        y = np.asarray(b.known)
         exact = np.asarray(np.sign(x) * (np.abs(x) // y) if quotient else np.fmod(x, y))
         return Value(a.kind, a.wide or b.wide, None, exact.astype(numpy_type(a.kind))[()])
     if b.is_known and np.all(np.asarray(b.known) > 0):
         return w.compute(operation, a, b)
-    zero, minus = w.like(b, 0), w.like(b, -1)
+    zero = w.like(b, 0)
+    minus = w.like(b, -1)
     nothing = w.compute("icmp eq", b, zero, kind="b")
     negated = w.compute("icmp eq", b, minus, kind="b")
     trap = w.compute("or", nothing, negated)
@@ -235,7 +238,8 @@ def _sign(w: Instructions, equation: Any, x: Value) -> Value:
 
 
 def _power(w: Instructions, equation: Any, x: Value) -> Value:
-    result, y = w.like(x, 1), equation.params["y"]
+    result = w.like(x, 1)
+    y = equation.params["y"]
     square = x
     for bit in reversed(bin(abs(y))[2:]):
         if bit == "1":
@@ -278,7 +282,8 @@ def _convert(w: Instructions, equation: Any, x: Value) -> Value:
 
 
 def _reverse(w: Instructions, equation: Any, x: Value) -> Value:
-    shape, dimensions = equation.invars[0].aval.shape, equation.params["dimensions"]
+    shape = equation.invars[0].aval.shape
+    dimensions = equation.params["dimensions"]
     source = np.flip(np.arange(np.prod(shape)).reshape(shape), dimensions).ravel()
     if x.is_known:
         known = np.broadcast_to(np.asarray(x.known), (w.lanes,))[source]

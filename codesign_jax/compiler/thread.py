@@ -157,7 +157,8 @@ class ThreadWriter(Writer):
 
     def load(self, ref: Ref, indices: list[Value]) -> Value:
         base, offset, place = self._address(ref, indices)
-        wide, kind = any(i.wide for i in indices), LLVM_TYPES[ref.kind]
+        wide = any(i.wide for i in indices)
+        kind = LLVM_TYPES[ref.kind]
         foreign = self._is_foreign(ref, indices)
         if foreign and not self.meeting:
             self._meet()
@@ -187,7 +188,8 @@ class ThreadWriter(Writer):
     def _address(self, ref: Ref, indices: list[Value]) -> tuple[str, int, str]:
         """An element's address: a base, the offset from it in bytes, and both together."""
         strides = np.cumprod([1, *ref.shape[:0:-1]])[::-1] * SIZES[ref.kind]
-        offset, base = 0, ref.address
+        offset = 0
+        base = ref.address
         for index, stride in zip(indices, strides, strict=True):
             offset += int(stride) * int(index.known)
             if not index.is_known:
@@ -289,7 +291,8 @@ class ThreadWriter(Writer):
         if not rounds:
             return
         for address, (line, offsets) in sorted(reads.items(), key=lambda r: -r[1].line):
-            behind, self.lines = self.lines[line:], self.lines[:line]
+            behind = self.lines[line:]
+            self.lines = self.lines[:line]
             for offset, rows in adjacent(sorted(set(offsets)), 4 * self.lanes, self.lanes):
                 self._prefetch(address, offset + rounds * self.growth[address], rows)
             self.lines += behind
@@ -308,11 +311,15 @@ class ThreadWriter(Writer):
 
 def write(jaxpr: Any, layout: Layout, name: str) -> str:
     """A kernel of LLVM's language whose block b works on entry b of every array."""
-    lanes, blocks = layout.lanes, layout.blocks
+    lanes = layout.lanes
+    blocks = layout.blocks
     if not 1 <= lanes <= LANES:
         raise NotImplementedError(f"a block of {lanes} lanes: a warp has {LANES}")
     writer = ThreadWriter(lanes)
-    refs, start, params, onchip = [], [], [], []
+    refs = []
+    start = []
+    params = []
+    onchip = []
     for k, ((shape, dtype), array) in enumerate(zip(blocks, layout.arrays, strict=True)):
         kind = kind_of(dtype)
         if array.role == ONCHIP:
@@ -359,7 +366,8 @@ def write(jaxpr: Any, layout: Layout, name: str) -> str:
     )
 
 
-TARGET, FEATURES = "sm_80", "+ptx78"
+TARGET = "sm_80"
+FEATURES = "+ptx78"
 """The oldest GPU and the version of PTX that the code is written for; newer ones run it too."""
 
 _CONDITIONAL = re.compile(r"^(\s*@!?%p\d+ )bra(\s)", re.MULTILINE)

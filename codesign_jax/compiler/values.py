@@ -4,7 +4,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-INPUT, OUTPUT, SCRATCH, ONCHIP = "input", "output", "scratch", "onchip"
+INPUT = "input"
+OUTPUT = "output"
+SCRATCH = "scratch"
+ONCHIP = "onchip"
 
 
 class Array(NamedTuple):

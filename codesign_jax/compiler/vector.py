@@ -36,7 +36,8 @@ class VectorWriter(Writer):
             return value
         if value.is_known:
             return value._replace(wide=True)
-        kind, zeros = self.type(value.kind, True), f"<{self.lanes} x i32> zeroinitializer"
+        kind = self.type(value.kind, True)
+        zeros = f"<{self.lanes} x i32> zeroinitializer"
         first = self.emit(f"insertelement {kind} poison, {self.typed(value)}, i32 0")
         text = self.emit(f"shufflevector {kind} {first}, {kind} poison, {zeros}")
         self.scalar_of[text] = value
@@ -64,7 +65,8 @@ class VectorWriter(Writer):
         *rows, lane = indices
         if any(i.wide for i in rows) or (lane.wide and not lane.is_known):
             return self._gather(ref, indices)
-        address, align = self._address(ref, indices), SIZES[ref.kind]
+        address = self._address(ref, indices)
+        align = SIZES[ref.kind]
         scalar = LLVM_TYPES[ref.kind]
         if not lane.wide:
             text = self.emit(f"load {scalar}, ptr {address}, align {align}")
@@ -81,7 +83,8 @@ class VectorWriter(Writer):
         if any(i.wide for i in rows) or (lane.wide and not lane.is_known):
             self._scatter(ref, indices, self.splat(value))
             return
-        address, align = self._address(ref, indices), SIZES[ref.kind]
+        address = self._address(ref, indices)
+        align = SIZES[ref.kind]
         if not lane.wide:
             if value.wide:  # as below, the first of the lanes that share a place
                 text = self.emit(f"extractelement {self.typed(value)}, i32 0")
@@ -102,7 +105,9 @@ class VectorWriter(Writer):
     def _address(self, ref: Ref, indices: list[Value]) -> str:
         """Address of an element, of the first lane where an index has one for each."""
         strides = np.cumprod([1, *ref.shape[:0:-1]])[::-1]
-        offset, address, scalar = 0, ref.address, LLVM_TYPES[ref.kind]
+        offset = 0
+        address = ref.address
+        scalar = LLVM_TYPES[ref.kind]
         for index, stride in zip(indices, strides, strict=True):
             offset += int(stride) * int(np.min(index.known))
             if not index.is_known:
@@ -130,7 +135,8 @@ class VectorWriter(Writer):
 
     def _masked(self, name: str, ref: Ref, operands: list[str], result: str) -> str:
         full = f"llvm.masked.{name}.{self.suffix(ref.kind, True)}.v{self.lanes}p0"
-        align, mask = f"i32 {SIZES[ref.kind]}", self._known("b", True, 1)
+        align = f"i32 {SIZES[ref.kind]}"
+        mask = self._known("b", True, 1)
         operands = [*operands, align, f"{self.type('b', True)} {mask}"]
         if name == "gather":
             operands.append(f"{self.type(ref.kind, True)} poison")
@@ -155,7 +161,8 @@ def write(jaxpr: Any, blocks: list[tuple[tuple[int, ...], Any]], lanes: int) -> 
     refs = [Ref(f"%a{k}", shape, kind_of(dtype)) for k, (shape, dtype) in enumerate(blocks)]
     writer.run(jaxpr, [], refs)
     params = ", ".join(f"ptr noalias %a{k}" for k in range(len(blocks)))
-    body, declarations = "\n".join(writer.lines), "\n".join(sorted(writer.declared))
+    body = "\n".join(writer.lines)
+    declarations = "\n".join(sorted(writer.declared))
     return (
         f"define internal void @block({params}) nounwind {{\nentry:\n{body}\nret void\n}}\n"
         f"{declarations}\n"

@@ -49,7 +49,8 @@ class Writer(Instructions):
 
     def _phis(self, values: list[Value], source: str) -> tuple[list[Value], list[int]]:
         """Values that depend on where control comes from, and their lines, which `_close` ends."""
-        found, lines = [], []
+        found = []
+        lines = []
         for value in values:
             name = "%" + self.name()
             lines.append(len(self.lines))
@@ -86,10 +87,13 @@ class Writer(Instructions):
                 "a kernel's scan has no inputs or outputs of each round: use memory instead"
             )
         variables = p["jaxpr"].jaxpr.invars[split:]
-        consts, start = args[:split], self._carried(variables, args[split:])
+        consts = args[:split]
+        start = self._carried(variables, args[split:])
         if not p["length"]:
             return start
-        label, end, source = self.name("L"), self.name("L"), self.here
+        label = self.name("L")
+        end = self.name("L")
+        source = self.here
         self.lines.append(f"br label %{label}")
         self.start(label)
         values, lines = self._phis([Value("i32", False, None, 0), *start], source)
@@ -109,14 +113,20 @@ class Writer(Instructions):
     def while_loop(self, equation: Any, args: list) -> list:
         """A while loop; its condition is the same on all lanes."""
         p = equation.params
-        a, b = p["cond_nconsts"], p["body_nconsts"]
-        cond_consts, body_consts = args[:a], args[a : a + b]
+        a = p["cond_nconsts"]
+        b = p["body_nconsts"]
+        cond_consts = args[:a]
+        body_consts = args[a : a + b]
         start = self._carried(equation.outvars, args[a + b :])
-        top, inside, end, source = self.name("L"), self.name("L"), self.name("L"), self.here
+        top = self.name("L")
+        inside = self.name("L")
+        end = self.name("L")
+        source = self.here
         self.lines.append(f"br label %{top}")
         self.start(top)
         values, lines = self._phis(start, source)
-        cond, body = p["cond_jaxpr"], p["body_jaxpr"]
+        cond = p["cond_jaxpr"]
+        body = p["body_jaxpr"]
         (going,) = self.run(cond.jaxpr, cond.consts, [*cond_consts, *values])
         going = self._condition(going)
         self.lines.append(f"br {going}, label %{inside}, label %{end}")
@@ -130,16 +140,19 @@ class Writer(Instructions):
 
     def branch(self, equation: Any, args: list) -> list:
         """A conditional of two branches; its predicate is the same on all lanes."""
-        which, operands = args[0], args[1:]
+        which = args[0]
+        operands = args[1:]
         if len(equation.params["branches"]) != 2:
             raise NotImplementedError("a kernel's conditional has two branches: nest them")
         no, yes = equation.params["branches"]
         if which.kind != "b":
             which = self.compute("icmp ne", which, self.like(which, 0), kind="b")
-        labels, end = (self.name("L"), self.name("L")), self.name("L")
+        labels = (self.name("L"), self.name("L"))
+        end = self.name("L")
         which = self._condition(which)
         self.lines.append(f"br {which}, label %{labels[0]}, label %{labels[1]}")
-        found, sources = [], []
+        found = []
+        sources = []
         for branch, label in zip((yes, no), labels, strict=True):
             self.start(label)
             values = self.run(branch.jaxpr, branch.consts, operands)
@@ -213,7 +226,8 @@ class Writer(Instructions):
         return [read(v) for v in jaxpr.outvars]
 
     def equation(self, equation: Any, args: list) -> list:
-        name, params = equation.primitive.name, equation.params
+        name = equation.primitive.name
+        params = equation.params
         if name in _INLINE:
             inner = params.get("jaxpr", params.get("call_jaxpr"))
             return self.run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), args)
@@ -249,7 +263,8 @@ def scan_parts(params: dict[str, Any]) -> tuple[int, int, int]:
     JAX up to 0.10 has numbers for it, later versions a tree of the operands.
     """
     if "num_consts" in params:
-        consts, carried = params["num_consts"], params["num_carry"]
+        consts = params["num_consts"]
+        carried = params["num_carry"]
         return consts, carried, len(params["jaxpr"].jaxpr.invars) - consts - carried
     consts, carried, each_round = (len(part) for part in params["ft_in"].unpack())
     return consts, carried, each_round

@@ -75,7 +75,8 @@ class MjxEngine(Equal):
 
     def step(self, fields: ModelFields, data: mjx.Data, ctrl: jax.Array) -> mjx.Data:
         """Advances one world by one time step under controls of shape (nu,)."""
-        bend, moments = layout(self.scene).dofs[..., 0], None
+        bend = layout(self.scene).dofs[..., 0]
+        moments = None
         if self.scene.effects.neo_hookean:
             moments = softening_moments(self.scene, fields, data.qpos[bend])
         if fields.wrap_prm is not None:
@@ -113,10 +114,14 @@ class MjxEngine(Equal):
         new = self.step(fields, data, u)
         # Positions computed by a step belong to the state before it.
         weights = jnp.asarray(lay.centre_weights, u.dtype)
-        centre, middle = weights @ new.xipos, new.xipos[lay.object]
-        distance, height = jnp.linalg.norm(middle - centre), middle[2]
+        centre = weights @ new.xipos
+        middle = new.xipos[lay.object]
+        distance = jnp.linalg.norm(middle - centre)
+        height = middle[2]
         qpos = carry.qpos if trajectory else carry.qpos[:0]
-        step, going, before = carry.step[0], carry.going[0] > 0, carry.speed[0]
+        step = carry.step[0]
+        going = carry.going[0] > 0
+        before = carry.speed[0]
         entry = Trace(distance, height, before, qpos)
         # The sum makes the speed not finite if any position is not.
         speed = jnp.abs(new.qvel).max() + 0.0 * new.qpos.sum()

@@ -44,7 +44,8 @@ class MujocoEngine(Equal):
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
         """See `Engine.rollout`."""
-        (worlds, steps), (nq, nv) = ctrl.shape[:2], (self.template.nq, self.template.nv)
+        worlds, steps = ctrl.shape[:2]
+        nq, nv = (self.template.nq, self.template.nv)
         like = jax.ShapeDtypeStruct((worlds, steps), ctrl.dtype)
         shapes = Trace(
             like,
@@ -66,7 +67,8 @@ class MujocoEngine(Equal):
     def _run(
         self, trajectory: bool, fields: ModelFields, bounds: verdict.Bounds, ctrl: jax.Array
     ) -> Trace:
-        dtype, inputs = np.asarray(ctrl).dtype, (fields, bounds, ctrl)
+        dtype = np.asarray(ctrl).dtype
+        inputs = (fields, bounds, ctrl)
         fields, bounds, wide = jax.tree.map(lambda v: np.asarray(v, np.float64), inputs)
         with self._lock:
             trace = self._simulate(fields, bounds, wide, trajectory)
@@ -82,7 +84,9 @@ class MujocoEngine(Equal):
     def _simulate(
         self, fields: ModelFields, bounds: verdict.Bounds, ctrl: np.ndarray, trajectory: bool
     ) -> Trace:
-        (worlds, steps), scene, nq = ctrl.shape[:2], self.scene, self.template.nq
+        worlds, steps = ctrl.shape[:2]
+        scene = self.scene
+        nq = self.template.nq
         batch = self._batch(worlds)
         write_fields(batch, fields)
         start = split(scene, fields.start)
@@ -90,10 +94,8 @@ class MujocoEngine(Equal):
         end = split(scene, last)  # views
         batch.bind("qacc_warmstart")[:] = start.acc
         distance, height, speed = np.zeros((3, worlds, steps))
-        status, qpos = (
-            np.zeros((worlds, steps), np.int32),
-            np.zeros((worlds, steps, nq * trajectory)),
-        )
+        status = np.zeros((worlds, steps), np.int32)
+        qpos = np.zeros((worlds, steps, nq * trajectory))
         series = (distance, height, speed, qpos, status)
         bounds = verdict.Bounds(*(v[:, None] for v in bounds))
         going = np.arange(worlds)
@@ -115,8 +117,10 @@ class MujocoEngine(Equal):
             entry, kept = _decisions(mine, new, start.step[going] + first, to_end=trajectory)
             if not first:  # worlds that were decided before
                 stay = start.going[:, 0] == 0
-                entry[stay], kept[stay] = 0, 0
-                speed[stay, 0], status[stay, 0] = start.speed[stay, 0], 0
+                entry[stay] = 0
+                kept[stay] = 0
+                speed[stay, 0] = start.speed[stay, 0]
+                status[stay, 0] = 0
             done = (entry < count) | stopped
             here = kept >= 0
             last[going[here], : states.shape[-1]] = states[here, kept[here]]
@@ -129,7 +133,8 @@ class MujocoEngine(Equal):
                 speed[world, rest] = end.speed[world] = (
                     speed[world, first + at] if at < count else np.nan
                 )
-                end.acc[world], end.going[world] = 0, 0
+                end.acc[world] = 0
+                end.going[world] = 0
             going = going[~done]
             if not going.size:
                 break
@@ -139,7 +144,8 @@ class MujocoEngine(Equal):
         mine = verdict.Bounds(*(v[going] for v in bounds))
         good = np.isfinite(state).all(1) & verdict.slow(mine, end.speed[going])[:, 0]
         last[going[good], : state.shape[1]] = state[good]
-        end.going[going], end.step[:] = good[:, None], start.step + steps
+        end.going[going] = good[:, None]
+        end.step[:] = start.step + steps
         return Trace(*series, last)
 
     def advance(
@@ -208,7 +214,8 @@ def _rollout(
     Contacts, constraints and solver share one arena.  Where it is full MuJoCo leaves out contacts
     and warns, or raises; records of the latter worlds are not numbers.
     """
-    m, shape = batch.model, (len(ids), ctrl.shape[1])
+    m = batch.model
+    shape = (len(ids), ctrl.shape[1])
     names = {"xipos": (m.nbody, 3), "qvel": (m.nv,), "qpos": (m.nq,), _TIME: (1,)}
     record = {name: np.full((*shape, *size), np.nan) for name, size in names.items()}
     record["solver_niter"] = np.zeros((*shape, mujoco.mjNISLAND), np.int32)
@@ -243,7 +250,8 @@ def _apply_softening(
 def write_fields(batch: mujoco.batch.Batch, fields: ModelFields) -> None:
     """Gives every simulation of a batch its model fields and start state."""
     batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
-    batch.bind("qpos")[:], batch.bind("qvel")[:] = fields.qpos, fields.qvel
+    batch.bind("qpos")[:] = fields.qpos
+    batch.bind("qvel")[:] = fields.qvel
     for name, value in fields.of_model.items():
         batch.expand(name)[:] = value
     batch.bind("qacc_warmstart")[:] = 0.0

@@ -109,13 +109,15 @@ class GraspEnv:
         if params is None:
             space = design_space(scene.hand)
             params = space.params(space.default())
-        self.scene, self.params = scene, params
+        self.scene = scene
+        self.params = params
         self.engine = make_engine(DEFAULT, scene) if engine is None else engine
         self._steps = policy.period_steps(scene, period)
         if self._steps > scene.num_steps:
             end = scene.num_steps * scene.discretization.timestep
             raise InputError([f"period = {period:g} s is longer than a grasp, of {end:g} s"])
-        self.dt, self.episode_length = period, -(-scene.num_steps // self._steps)
+        self.dt = period
+        self.episode_length = -(-scene.num_steps // self._steps)
 
     def observe(self, seen: Observation) -> jax.Array:
         """What the agent observes: what a hand feels, and not where the object is.
@@ -131,7 +133,8 @@ class GraspEnv:
                     "GraspEnv shows: take engine structured, or replace the method"
                 ]
             )
-        bend, rate = seen.joint[..., 0].sum(-1), seen.joint_velocity[..., 0].sum(-1)
+        bend = seen.joint[..., 0].sum(-1)
+        rate = seen.joint_velocity[..., 0].sum(-1)
         times = jnp.stack([seen.time, seen.phase_time])
         touch = [seen.forces.grip, seen.forces.finger[:, 2]]
         return jnp.concatenate([times, seen.pressure / self.limit, bend, 0.1 * rate, *touch])
@@ -236,7 +239,8 @@ class GraspEnv:
         )
 
     def _refuse_shape(self, action: jax.typing.ArrayLike) -> None:
-        shape, size = jnp.shape(action), self.action_size
+        shape = jnp.shape(action)
+        size = self.action_size
         if shape != (size,):
             hint = "; jax.vmap maps over environments" if shape[1:] == (size,) else ""
             raise InputError([f"an action has shape {shape}, not ({size},){hint}"])

@@ -34,7 +34,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         Args:
           seed: Seed of the first environment until `reset` has one; the others count on from it.
         """
-        self.env, self.num_envs = env, num_envs
+        self.env = env
+        self.num_envs = num_envs
         self.single_observation_space, self.single_action_space = _spaces(env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -55,7 +56,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
             return keys, jax.tree.map(either, fresh, after)
 
-        self._reset, self._step = jax.jit(reset), jax.jit(step)
+        self._reset = jax.jit(reset)
+        self._step = jax.jit(step)
 
     def reset(
         self,
@@ -89,13 +91,15 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         """
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
-        shape, wanted = np.shape(actions), self.action_space.shape
+        shape = np.shape(actions)
+        wanted = self.action_space.shape
         if shape != wanted:
             words = f"{self.num_envs} environments take actions of shape {wanted}, not {shape}"
             raise InputError([words])
         self._keys, state = self._step(self._keys, self._state, jnp.asarray(actions))
         self._state = state
-        reward, over = np.asarray(state.reward, np.float64), np.asarray(state.done) > 0
+        reward = np.asarray(state.reward, np.float64)
+        over = np.asarray(state.done) > 0
         return _observed(state), reward, over, np.zeros(self.num_envs, bool), _info(state)
 
     def _seed(self, seed: Any) -> None:
@@ -118,7 +122,8 @@ class SingleEnv(gymnasium.Env):
         self.env = env
         self.observation_space, self.action_space = _spaces(env)
         self._state: State | None = None
-        self._reset, self._step = jax.jit(env.reset), jax.jit(env.step)
+        self._reset = jax.jit(env.reset)
+        self._step = jax.jit(env.step)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

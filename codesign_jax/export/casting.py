@@ -25,7 +25,9 @@ from codesign_jax.export.process import Process, Size, inlet
 Line = Callable[[float], float]
 """A number that changes linearly along a finger."""
 
-BAR, SPACING, OVERLAP = 6.0, 40.0, 5.0
+BAR = 6.0
+SPACING = 40.0
+OVERLAP = 5.0
 """Width of the core's bars, largest distance between two, and how deep parts sit in a mould."""
 SEGMENTS = 32
 """Corners of the inlet's section."""
@@ -120,7 +122,11 @@ def _around(size: Size, grow: Line, low: Line, high: Line) -> manifold3d.Manifol
 
 
 def _tray(size: Size, process: Process) -> manifold3d.Manifold:
-    rim, top = _rim(size), lambda x: size.at(x).height
+    rim = _rim(size)
+
+    def top(x):
+        return size.at(x).height
+
     outer = _around(size, _outside(size, process), rim, shifted(top, process.mould_wall))
     # The cavity goes on below its opening, so that no two faces coincide there.
     cavity = size.ends, half_width(size), shifted(rim, -1.0), top
@@ -140,12 +146,15 @@ def _overlap(size: Size) -> float:
 
 
 def _core(size: Size, process: Process) -> manifold3d.Manifold:
-    wall, rim, ends = process.mould_wall, _rim(size), size.chamber_ends
+    wall = process.mould_wall
+    rim = _rim(size)
+    ends = size.chamber_ends
     half, low, high = _chamber(size)
     drafted = lambda x, z: slope(size, process, x, z)  # noqa: E731
     core = prism(ends, half, shifted(low, -wall / 2), high, drafted)
     inside = shifted(_outside(size, process), process.clearance)
-    below, depth = shifted(rim, -wall), _overlap(size)
+    below = shifted(rim, -wall)
+    depth = _overlap(size)
     frame = _around(size, shifted(inside, wall), below, shifted(rim, depth))
     frame -= _around(size, inside, rim, shifted(rim, depth + 1.0))
     opening = _at_rim(size, process)
@@ -169,8 +178,11 @@ def bars_of(size: Size) -> list[tuple[float, float]]:
 
 
 def _base(size: Size, process: Process) -> manifold3d.Manifold:
-    wall, rim, wide = process.mould_wall, _rim(size), _at_rim(size, process)
-    top, room = shifted(rim, _overlap(size)), shifted(wide, process.clearance)
+    wall = process.mould_wall
+    rim = _rim(size)
+    wide = _at_rim(size, process)
+    top = shifted(rim, _overlap(size))
+    room = shifted(wide, process.clearance)
     outer = _around(size, shifted(room, wall), lambda x: -wall, top)
     outer -= _around(size, wide, lambda x: 0.0, shifted(top, 1.0))
     return outer - _around(size, room, rim, shifted(top, 1.0))

@@ -22,7 +22,9 @@ from codesign_jax.types import Params
 _A4 = (8.27, 11.69)
 _SMALL = 5.6
 _ROWS = 6  # fingers on a page
-_WIDE, _LINES = 64, 2  # letters in a line of the title, and its lines
+# letters in a line of the title, and its lines
+_WIDE = 64
+_LINES = 2
 
 
 def write(
@@ -106,7 +108,8 @@ def _fingers_page(title: str, rows: list[tuple[Size, list[int]]]) -> matplotlib.
     high = 0.88 / _ROWS
     for k, (size, fingers) in enumerate(rows):
         label = f"finger {', '.join(map(str, fingers))}"
-        bottom, tapered = 0.92 - (k + 1) * high + 0.02, size.base != size.tip
+        bottom = 0.92 - (k + 1) * high + 0.02
+        tapered = size.base != size.tip
         tall = high - 0.045
         first = figure.add_axes((0.06, bottom, 0.14 if tapered else 0.30, tall))
         _section(first, size.base, f"{label}{', base' if tapered else ''}")
@@ -141,7 +144,8 @@ def _mounting_page(
 
 
 def _view(axes: Axes, scene: Scene, fingers: np.ndarray, title: str, across: int, up: int) -> None:
-    radius, thick = 1e3 * scene.hand.palm.radius, 1e3 * scene.hand.palm.thickness
+    radius = 1e3 * scene.hand.palm.radius
+    thick = 1e3 * scene.hand.palm.thickness
     depth = 3 - across - up
     near = -1 if depth == 1 else 1  # the front is seen from -y
     order = np.argsort(near * fingers[..., depth].mean(1))
@@ -174,7 +178,8 @@ def _rectangle(axes: Axes, low: tuple[float, float], size: Sequence[float], colo
 
 
 def _section(axes: Axes, section: Section, label: str) -> None:
-    (width, height, wall), chamber = section, section.chamber
+    width, height, wall = section
+    chamber = section.chamber
     _rectangle(axes, (-width / 2, 0), (width, height), "0.8")
     _rectangle(axes, (-chamber[0] / 2, wall), chamber, "white")
     axes.plot([-width / 2, width / 2], [0, 0], color="tab:red", lw=2)
@@ -187,7 +192,8 @@ def _section(axes: Axes, section: Section, label: str) -> None:
 
 def _side_view(axes: Axes, size: Size, label: str) -> None:
     start, end = size.chamber_ends
-    first, last = size.at(start), size.at(end)
+    first = size.at(start)
+    last = size.at(end)
     root = size.at(-size.root).height
     outer = [(-size.root, 0), (size.length, 0), (size.length, size.tip.height), (-size.root, root)]
     inner = [(start, first.wall), (end, last.wall)]
@@ -211,7 +217,8 @@ def _side_view(axes: Axes, size: Size, label: str) -> None:
 
 def _seat(axes: Axes, size: Size, tilt: float) -> None:
     """A cut through the middle of a seat, in the plane of the finger."""
-    cosine, sine = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
+    cosine = np.cos(np.radians(tilt))
+    sine = np.sin(np.radians(tilt))
 
     def put(points: Sequence[tuple[float, float]], **style: Any) -> None:
         flat = [(x * cosine + z * sine, -x * sine + z * cosine) for x, z in points]
@@ -225,7 +232,9 @@ def _seat(axes: Axes, size: Size, tilt: float) -> None:
         arrow = {"arrowstyle": "-", "lw": 0.5}
         axes.annotate(text, at, to, fontsize=6, arrowprops=arrow, va="center")
 
-    root, height, rim = size.root, size.base.height, size.pressed
+    root = size.root
+    height = size.base.height
+    rim = size.pressed
     back = (-root - BACK, -root - FABRIC)
     box((-root - BACK, 0), (-FLOOR - 6, 0), facecolor="0.85")
     box(back, (0, rim), facecolor="0.85")
@@ -257,7 +266,9 @@ def _seat(axes: Axes, size: Size, tilt: float) -> None:
 def _wrist(axes: Axes, scene: Scene, printed: Printed | None) -> None:
     """The compliant wrist as stages above one another, seen from the side."""
     wrist = scene.hand.wrist
-    k, turn, damping = wrist.linear_stiffness, wrist.angular_stiffness, wrist.linear_damping
+    k = wrist.linear_stiffness
+    turn = wrist.angular_stiffness
+    damping = wrist.linear_damping
     stages = [f"guide along {axis}" for axis in "zyx"]
     each = f"two springs {k / 2e3:.3g} N/mm against each other, dashpot {damping:g} N s/m"
     _rectangle(axes, (20, 70), (60, 10), "0.7")
@@ -287,7 +298,8 @@ def _wrist(axes: Axes, scene: Scene, printed: Printed | None) -> None:
 
 
 def _palm(axes: Axes, scene: Scene, params: Params) -> None:
-    radius, width = 1e3 * scene.hand.palm.radius, 1e3 * scene.hand.section.width
+    radius = 1e3 * scene.hand.palm.radius
+    width = 1e3 * scene.hand.section.width
     axes.add_patch(matplotlib.patches.Circle((0, 0), radius, facecolor="0.93", edgecolor="0.4"))
     position, azimuth = places(scene, params)
     for i, ((x, y), angle) in enumerate(zip(1e3 * position, azimuth, strict=True)):

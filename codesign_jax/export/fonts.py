@@ -19,7 +19,8 @@ class Drawable(NamedTuple):
 def of_text(text: str) -> Drawable:
     """Chooses fonts for a text, the default one first."""
     text = " ".join(text.split())
-    family, missing = [DEFAULT], _lacking(DEFAULT, dict.fromkeys(text))
+    family = [DEFAULT]
+    missing = _lacking(DEFAULT, dict.fromkeys(text))
     if missing:
         for font in sorted({entry.name for entry in manager.fontManager.ttflist}):
             if not missing:

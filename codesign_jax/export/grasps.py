@@ -35,7 +35,8 @@ def grasp(scene: Scene, params: Params, trial: Trial) -> Grasp:
     """Builds a grasp and plays it in plain MuJoCo, for its key frames and its outcome."""
     scene, trial = plain.single_object(scene, trial)
     wide = _wide(params), _wide(trial)
-    start, controls = _float64(_start, scene, *wide), timed_controls(scene, params, trial)
+    start = _float64(_start, scene, *wide)
+    controls = timed_controls(scene, params, trial)
     spec, shares = _spec(scene, *wide)
     _light(spec)
     limits = verdict.bounds(scene)
@@ -48,9 +49,11 @@ def grasp(scene: Scene, params: Params, trial: Trial) -> Grasp:
     _, distance, states = play(compiled, controls)
     _add_keys(scene, spec, controls, states)
     try:
-        xml, note = plain.text(scene, spec.copy(), shares), ""
+        xml = plain.text(scene, spec.copy(), shares)
+        note = ""
     except plain.Inexpressible as error:
-        xml, note = None, str(error)
+        xml = None
+        note = str(error)
     return Grasp(
         xml,
         note,
@@ -77,12 +80,15 @@ def _spec(scene: Scene, params: Params, trial: Trial) -> tuple[mujoco.MjSpec, Ma
 def _light(spec: mujoco.MjSpec) -> None:
     """Light, sky and colours: any renderer shows the hand, none of it is physics."""
     head = spec.visual.headlight
-    head.ambient, head.diffuse, head.specular = [0.3] * 3, [0.5] * 3, [0.1] * 3
+    head.ambient = [0.3] * 3
+    head.diffuse = [0.5] * 3
+    head.specular = [0.1] * 3
     sun = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
     spec.worldbody.add_light(
         name="sun", type=sun, pos=[0, -0.9, 1.2], dir=[0, 0.6, -0.8], diffuse=[0.5] * 3
     )
-    sky, gradient = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
+    sky = mujoco.mjtTexture.mjTEXTURE_SKYBOX
+    gradient = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
     spec.add_texture(
         name="sky",
         type=sky,

@@ -14,7 +14,8 @@ from codesign_jax.export.process import Process, Size
 FOLDER = "parts"
 FORMATS = ("stl", "3mf")
 # STL holds float32: seven digits of lengths up to a metre, of which a volume has three.
-_VOLUME, _LENGTH = 1e-4, 1e-3
+_VOLUME = 1e-4
+_LENGTH = 1e-3
 
 
 class Part(NamedTuple):
@@ -91,7 +92,8 @@ def _save(path: Path, solid: manifold3d.Manifold) -> trimesh.Trimesh:
     surface = mesh(solid)
     surface.units = "mm"
     surface.export(path)
-    again, bounds = read(path), np.reshape(solid.bounding_box(), (2, 3))
+    again = read(path)
+    bounds = np.reshape(solid.bounding_box(), (2, 3))
     same = abs(again.volume - solid.volume()) <= _VOLUME * solid.volume()
     if not (again.is_watertight and same and np.allclose(again.bounds, bounds, atol=_LENGTH)):
         raise RuntimeError(f"{path} does not hold the part that was written")

@@ -45,7 +45,8 @@ def differences(first: mujoco.MjModel, second: mujoco.MjModel) -> list[str]:
 def _same(a: Any, b: Any) -> bool:
     if not isinstance(a, (int, float, np.ndarray)):
         return True  # methods, and structures without numbers of their own
-    a, b = np.asarray(a), np.asarray(b)
+    a = np.asarray(a)
+    b = np.asarray(b)
     if a.shape != b.shape:
         return False
     scale = np.abs(a).max(initial=0.0)

@@ -32,7 +32,9 @@ from codesign_jax.types import Params
 
 Solid = manifold3d.Manifold
 
-PILOT, PASS, DEEP = 2.5, 3.4, 13.0
+PILOT = 2.5
+PASS = 3.4
+DEEP = 13.0
 """Holes of the bars' M3 screws in the palm and in the bar, and depth of the first [mm]."""
 REACH = 60.0
 """How far from its base a finger has the room beside its seat to itself [mm]."""
@@ -112,7 +114,8 @@ def _palm(
         for size, place in zip(sizes, places, strict=True)
         for hole in _holes(size, process, place)
     ]
-    radius, thickness = 1e3 * scene.hand.palm.radius, 1e3 * scene.hand.palm.thickness
+    radius = 1e3 * scene.hand.palm.radius
+    thickness = 1e3 * scene.hand.palm.thickness
     # Turned by an odd angle, so that no corner of it lies in a plane of symmetry.
     disc = Solid.cylinder(thickness, radius, radius, 4 * SEGMENTS).rotate([0, 0, 0.9])
     body = _sum([disc, *seats])
@@ -174,7 +177,8 @@ def _edge(size: Size) -> float:
 
 
 def _block(size: Size, more: float = 0.0) -> Solid:
-    edge, back = _edge(size) + more, size.root + BACK + more
+    edge = _edge(size) + more
+    back = size.root + BACK + more
     # Beyond base plane and rim, where `_pocket` cuts it: two faces in one plane leave slivers.
     shrunk = max(0.0, -more)
     return _box((-back, -edge, -FLOOR - more), (0.75, edge, size.pressed + 0.5 - shrunk))
@@ -189,7 +193,8 @@ def _seat(size: Size, frame: np.ndarray, more: float) -> Solid:
 
 def _pocket(size: Size, process: Process, more: float) -> Solid:
     """What a finger needs for itself: root and way in, the room around its base, the bar's."""
-    clear, edge = process.clearance + more, _edge(size)
+    clear = process.clearance + more
+    edge = _edge(size)
     ends = (-size.root - FABRIC - more, 1.0)
     top = lambda x: size.at(x).height  # noqa: E731
     # The floors are apart by hundredths of a millimetre, and the base's line lies in neither: all
@@ -202,7 +207,8 @@ def _pocket(size: Size, process: Process, more: float) -> Solid:
     )
     front = _box((0.0, -edge - 1.0, -FLOOR - 1.0), (1.5, edge + 1.0, size.pressed + 1.0))
     # The bar and the heads of its screws; the bar's neighbour may have walls there.
-    back, high = size.root + BACK + 0.3 + more, size.pressed + BAR + 4.0
+    back = size.root + BACK + 0.3 + more
+    high = size.pressed + BAR + 4.0
     bar = _box((-back, -edge - 0.3 - more, size.pressed), (1.0, edge + 0.3 + more, high))
     return _sum([root, free, front, bar])
 
@@ -215,7 +221,8 @@ def screws(size: Size, process: Process) -> list[tuple[float, float]]:
 
 
 def _holes(size: Size, process: Process, frame: np.ndarray) -> list[Solid]:
-    rim, start = size.pressed, -size.root + 1.0
+    rim = size.pressed
+    start = -size.root + 1.0
     tube = (inlet(size, process) or 3.0) / 2 + 0.3
     way = Solid.cylinder(BACK + 3.0, tube, tube, SEGMENTS)
     middle = size.base.height / 2
@@ -234,7 +241,8 @@ def _holes(size: Size, process: Process, frame: np.ndarray) -> list[Solid]:
 
 def _bar(size: Size, process: Process) -> Solid:
     """A clamp bar in the frame of its finger's base, on the rim of the seat."""
-    edge, rim = _edge(size), size.pressed
+    edge = _edge(size)
+    rim = size.pressed
     bar = _box((-size.root - BACK, -edge, rim), (0.0, edge, rim + BAR))
     for x, y in screws(size, process):
         hole = Solid.cylinder(BAR + 2.0, PASS / 2, PASS / 2, SEGMENTS)
@@ -261,7 +269,8 @@ def _flange(radius: float, thickness: float, taken: Solid) -> tuple[Flange | Non
         sunk = thickness >= high + 4.0
         for angle in range(45, 135, 5):
             middles = [np.radians(angle + 90 * k) for k in range(4)]
-            room, found = [], []
+            room = []
+            found = []
             for at in middles:
                 place = [diameter / 2 * np.cos(at), diameter / 2 * np.sin(at), -1.0]
                 # The head's way in is clear over all of the thickness, and a wall around it.

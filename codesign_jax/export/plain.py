@@ -89,7 +89,8 @@ def engine_model(
 
 def text(scene: Scene, spec: mujoco.MjSpec, shares: Mapping[str, float] = NONE) -> str:
     """MJCF which plain MuJoCo compiles to a model of the same dynamics as `engine_model`."""
-    compiled, declared = spec.compile().body_invweight0[:, 0], contact_invweight(scene)
+    compiled = spec.compile().body_invweight0[:, 0]
+    declared = contact_invweight(scene)
     body_of = {geom.name: geom.parent.id for geom in spec.geoms}
     for pair in spec.pairs:
         names = pair.geomname1, pair.geomname2

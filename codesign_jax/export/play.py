@@ -9,7 +9,9 @@ import numpy as np
 
 def play(model, controls):
     """Simulates a grasp; returns when the object was lost [s], and distances and states."""
-    data, times, record = mujoco.MjData(model), controls[:, 0], []
+    data = mujoco.MjData(model)
+    times = controls[:, 0]
+    record = []
     weights = model.numeric("hand_centre").data  # of the bodies, in the centre of the hand
     lost, begin, end = model.numeric("lost").data  # from this distance [m] and in these time steps
     mujoco.mj_resetDataKeyframe(model, data, 0)  # the key frame "start"
@@ -20,7 +22,8 @@ def play(model, controls):
         away = np.linalg.norm(data.body("object").xipos - weights @ data.xipos)
         sound = np.nan if any(data.warning.number) else 1.0  # MuJoCo warns of bad numbers
         record.append(sound * np.array([away, *before]))
-    distance, states = np.array(record)[:, 0], np.array(record)[:, 1:]
+    distance = np.array(record)[:, 0]
+    states = np.array(record)[:, 1:]
     steps = np.arange(len(times))
     away = (distance >= lost) & (steps >= begin) & (steps < end)
     return times[away][0] if away.any() else np.inf, distance, states

@@ -35,7 +35,8 @@ class TableError(ValueError):
 
 def read(path):
     """Rows (time, pressures...) of a table of pressures, and the limits of its comment, or none."""
-    rows, limits = [], []
+    rows = []
+    limits = []
     with open(path, newline="", encoding="utf-8") as file:
         for number, cells in enumerate(csv.reader(file), 1):
             if not cells or cells[0] == "time_s":
@@ -63,7 +64,8 @@ def at(rows, moment):
     after = next((k for k, row in enumerate(rows) if row[0] > moment), len(rows))
     if after in (0, len(rows)):
         return rows[min(after, len(rows) - 1)][1:]
-    (start, *low), (end, *high) = rows[after - 1], rows[after]
+    start, *low = rows[after - 1]
+    end, *high = rows[after]
     share = (moment - start) / (end - start)
     return [a + share * (b - a) for a, b in zip(low, high, strict=True)]
 
@@ -93,7 +95,9 @@ def line(moment, pressures):
 
 def play(rows, send, period, wait=time.sleep, clock=time.monotonic):
     """Sends a line for each period, and zeros at the end, whatever ends it."""
-    begin, now, k = clock(), 0.0, 0
+    begin = clock()
+    now = 0.0
+    k = 0
     try:
         while (now := k * period) < rows[-1][0] + period:
             send(line(now, at(rows, now)))

@@ -19,7 +19,9 @@ TURNS: Mapping[str, Mapping[str, float]] = {
 """Turns about one axis each, by what is said below their drawings."""
 
 _FACES = ((0, 1, 2, 3), (4, 5, 6, 7), (0, 1, 5, 4), (2, 3, 7, 6), (0, 3, 7, 4), (1, 2, 6, 5))
-_AZIMUTH, _ELEVATION = np.radians(35), np.radians(25)  # of the eye: x and y come towards it
+# of the eye: x and y come towards it
+_AZIMUTH = np.radians(35)
+_ELEVATION = np.radians(25)
 _AROUND = np.linspace(0, 2 * np.pi, 49)
 
 
@@ -38,7 +40,8 @@ def draw(
       angles: Roll, yaw and pitch [deg].
       words: What stands below the drawing.
     """
-    turn, (radius, thickness) = pose.rotation(**angles), palm
+    turn = pose.rotation(**angles)
+    radius, thickness = palm
     ring = np.stack([radius * np.cos(_AROUND), radius * np.sin(_AROUND), 0 * _AROUND], 1)
     solids = [(np.concatenate([ring, ring + [0, 0, thickness]]), "0.85", None)]
     solids += [(box, "#cfdcec", str(i)) for i, box in enumerate(fingers)]
@@ -90,7 +93,8 @@ def _solid(axes: Axes, points: np.ndarray, color: str, label: str | None) -> Non
 
 def _arrows(axes: Axes, length: float) -> None:
     for name, end in zip("xyz", length * np.eye(3), strict=True):
-        tip, style = _flat(end), {"arrowstyle": "->", "lw": 0.9, "color": "tab:green"}
+        tip = _flat(end)
+        style = {"arrowstyle": "->", "lw": 0.9, "color": "tab:green"}
         axes.annotate("", tip, _flat(np.zeros(3)), arrowprops=style)
         x, y = 1.12 * tip
         axes.text(x, y, name, fontsize=7, color="tab:green", ha="center", va="center")

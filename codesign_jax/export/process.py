@@ -32,7 +32,10 @@ class Process:
     draft: float = quantity("deg", 0, 10, default=0.0)
 
 
-CHEEK, BACK, FLOOR, BAR = 3.0, 9.0, 4.0, 5.0
+CHEEK = 3.0
+BACK = 9.0
+FLOOR = 4.0
+BAR = 5.0
 """Walls of a seat beside, behind and below a root, and thickness of its clamp bar [mm] [chosen]."""
 SQUEEZE = 0.05
 """Share of its height by which the bar presses a root [chosen]."""
@@ -102,7 +105,8 @@ def _simpson(area: Callable[[float], float], start: float, end: float) -> float:
 
 def sizes(hand: Hand, params: Params, process: Process) -> list[Size]:
     """Dimensions of a hand's fingers."""
-    found, problems = [], []
+    found = []
+    problems = []
     for i, length in enumerate(params.length):
         base = hand.section.width, params.height[i], params.wall[i]
         tip = base if params.tip is None else [params.tip[k][i] for k in (2, 0, 1)]
@@ -130,7 +134,8 @@ def problems(process: Process) -> list[str]:
     """What is out of range in a process, by the names of the flags."""
     found = []
     for field in dataclasses.fields(process):
-        name, value = f"--{field.name.replace('_', '-')}", getattr(process, field.name)
+        name = f"--{field.name.replace('_', '-')}"
+        value = getattr(process, field.name)
         limits = (field.metadata[key] for key in ("unit", "low", "high"))
         problem = range_problem(name, value, *limits)
         found += [problem] if problem else []

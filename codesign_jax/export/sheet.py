@@ -104,7 +104,8 @@ def idle_fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> list[st
 
 def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSection:
     density = scene.hand.material.density
-    rows, limits = [], morphology.pressure_limits(scene.hand, params)
+    rows = []
+    limits = morphology.pressure_limits(scene.hand, params)
     law = bool(scene.effects.neo_hookean)
     bends = morphology.free_bends(scene.hand, params, neo_hookean=law)
     for i, (size, angle) in enumerate(zip(sizes, bends, strict=True)):
@@ -214,13 +215,15 @@ def _arm(scene: Scene, params: Params) -> SheetSection:
 def _clearance(scene: Scene, rows: Sequence[Sequence[str]]) -> str:
     """How near the table the palm's rim is commanded, of rows of `_arm`."""
     radius = 1e3 * scene.hand.palm.radius
-    lowest, time = np.inf, ""
+    lowest = np.inf
+    time = ""
     for row in rows:
         w, x, y, z = map(float, row[-1].split())
         upright = Rotation.from_quat([x, y, z, w]).as_matrix()[2, 2]
         height = float(row[3]) - radius * np.sqrt(max(0.0, 1.0 - upright**2))
         if height < lowest:
-            lowest, time = height, row[0]
+            lowest = height
+            time = row[0]
     return (
         f"The palm's rim, {radius:.0f} mm from its middle, is commanded to {lowest:.0f} mm above "
         f"the table at the lowest ({time} s), before the wrist gives way. The printed palm, its "

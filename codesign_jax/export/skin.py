@@ -34,12 +34,11 @@ class Ball(NamedTuple):
 
 def balls(scene: Scene, finger: int, params: Params) -> list[Ball]:
     """The spheres of a finger, as high as the section on the inside of its bottom layer."""
-    links, k, width = (
-        scene.discretization.links,
-        scene.discretization.hull_rings,
-        scene.hand.section.width,
-    )
-    along, found = ring_places(links, k), []
+    links = scene.discretization.links
+    k = scene.discretization.hull_rings
+    width = scene.hand.section.width
+    along = ring_places(links, k)
+    found = []
     segment = float(params.length[finger]) / links
     places = (along + at_joints(links)[:, None] * links) / links
     size = sections(scene.hand, params, places.ravel())
@@ -47,7 +46,8 @@ def balls(scene: Scene, finger: int, params: Params) -> list[Ball]:
         np.broadcast_to(v, (scene.num_fingers, along.size)) for v in (size.height, size.width)
     )
     for (i, j), at in np.ndenumerate(along):
-        height, across = heights[finger, i * k + j], widths[finger, i * k + j]
+        height = heights[finger, i * k + j]
+        across = widths[finger, i * k + j]
         share = segment / k * (0.5 if i == links - 1 else 1.0) * across / width**2
         place = np.array([at * segment, 0.0, height / 2])
         found.append(Ball(f"finger_{finger}_ring_{i + 1}_{j}", i + 1, place, float(share)))
@@ -60,7 +60,8 @@ def add(scene: Scene, spec: mujoco.MjSpec, params: Params) -> dict[str, float]:
     e = scene.effects
     for f in range(scene.num_fingers):
         for ball in balls(scene, f, params):
-            name, size = ball.name, [ball.place[2], 0, 0]
+            name = ball.name
+            size = [ball.place[2], 0, 0]
             spec.body(f"finger_{f}_link_{ball.link}").add_geom(
                 name=name, pos=ball.place, size=size, **_PASSIVE
             )
@@ -86,10 +87,12 @@ def _on_palm(scene: Scene, params: Params, finger: int, ball: Ball) -> bool:
 
 def _capsules(scene: Scene, spec: mujoco.MjSpec, params: Params) -> None:
     """Capsules around the links, with which fingers touch each other and themselves."""
-    links, names = scene.discretization.links, []
+    links = scene.discretization.links
+    names = []
     heights = sections(scene.hand, params, (np.arange(links) + 1.0) / links).height
     for f, i in itertools.product(range(scene.num_fingers), range(1, links + 1)):
-        length, up = float(params.length[f]), float(heights[f, min(i, heights.shape[1]) - 1]) / 2
+        length = float(params.length[f])
+        up = float(heights[f, min(i, heights.shape[1]) - 1]) / 2
         extent = length / links * (0.25 if i == links else 1.0)
         spec.body(f"finger_{f}_link_{i}").add_geom(
             name=f"finger_{f}_capsule_{i}",

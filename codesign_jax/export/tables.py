@@ -15,7 +15,10 @@ from codesign_jax.model.layout import WRIST
 from codesign_jax.scene import Scene
 from codesign_jax.types import Status, Trial, failed
 
-COMMANDS, MODELS, GRASPS, NOTES = "commands.csv", "model", "grasps.csv", "README.txt"
+COMMANDS = "commands.csv"
+MODELS = "model"
+GRASPS = "grasps.csv"
+NOTES = "README.txt"
 
 COMMAND_COLUMNS = {
     "time_s": "time from the start of the grasp",

@@ -85,7 +85,8 @@ class Study(NamedTuple):
 def study(scene: Scene, space: DesignSpace, design: np.ndarray, steps: int, *, free: bool) -> Study:
     """Plans the steps."""
     whole = space if free else design_space(scene.hand)
-    centre, source = np.asarray(design, float), np.asarray(space.source)
+    centre = np.asarray(design, float)
+    source = np.asarray(space.source)
     if not free:
         centre = np.where(source >= 0, centre[np.maximum(source, 0)], space.base)
     low, high = _limits(whole, space, centre)
@@ -107,12 +108,15 @@ def _limits(
 
     A wall ends where its pressure meets the pressure limit, and a pressure likewise.
     """
-    low, high = np.array(whole.low), np.array(whole.high)
+    low = np.array(whole.low)
+    high = np.array(whole.high)
     if space is not whole:
         for j, name in enumerate(space.names):
             for i in np.nonzero([n.split("[")[0] == name.split("[")[0] for n in whole.names])[0]:
-                low[i], high[i] = min(low[i], space.low[j]), max(high[i], space.high[j])
-    limit, params = whole.hand.pressure_limit, whole.params(centre)
+                low[i] = min(low[i], space.low[j])
+                high[i] = max(high[i], space.high[j])
+    limit = whole.hand.pressure_limit
+    params = whole.params(centre)
     caps = morphology.pressure_limits(whole.hand, params)
     floors = np.asarray(params.pressure) / limit.per_wall
     for i, name in enumerate(whole.names):
@@ -139,7 +143,8 @@ def search(planned: Study, shares_of: Callable[[list[int]], list[Interval]]) -> 
 
     Of a design with too few successes itself, those of the first steps alone.
     """
-    steps, found = planned.steps, {}
+    steps = planned.steps
+    found = {}
     sides = [int(side) for side in np.flatnonzero(planned.room)]
     for step in range(steps):
         asked = [0] * (step == 0) + [1 + side * steps + step for side in sides]
@@ -152,9 +157,12 @@ def search(planned: Study, shares_of: Callable[[list[int]], list[Interval]]) -> 
 
 def tolerances(planned: Study, found: Mapping[int, Interval]) -> list[Tolerance]:
     """Reads the tolerances off what `search` found."""
-    space, results, steps = planned.space, [], planned.steps
+    space = planned.space
+    results = []
+    steps = planned.steps
     for i, (name, unit) in enumerate(zip(space.names, space.units, strict=True)):
-        factor, sides = UNITS[unit][1], []
+        factor = UNITS[unit][1]
+        sides = []
         for s, end in enumerate((planned.low[i], planned.high[i])):
             first = 1 + (2 * i + s) * steps
             known = [k for k in range(first, first + steps) if k in found]
@@ -166,5 +174,6 @@ def tolerances(planned: Study, found: Mapping[int, Interval]) -> list[Tolerance]
 
 def _side(moved: list[Step], limit: float, room: bool) -> Side:
     count = next((k for k, step in enumerate(moved) if step.share.value < WANTED), len(moved))
-    good, bad = moved[:count][-1:], moved[count : count + 1]
+    good = moved[:count][-1:]
+    bad = moved[count : count + 1]
     return Side(good[0] if good else None, bad[0] if bad else None, limit, room)

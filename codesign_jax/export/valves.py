@@ -28,7 +28,8 @@ def key_pressures(scene: Scene, params: Params) -> np.ndarray:
     Pressures are linear between rows.  A key frame whose values are held has a row more, at the
     time of the next frame, so that two rows of one time are a jump.
     """
-    times, terms = _times(scene, params), key_frames.pressures(scene, params)
+    times = _times(scene, params)
+    terms = key_frames.pressures(scene, params)
     zero = np.zeros((len(times), scene.num_fingers))
     pressures = 1e-3 * sum((np.asarray(v) * np.asarray(f) for v, f in terms), start=zero)
     rows: list[np.ndarray] = []

@@ -84,7 +84,8 @@ def _shopping(
     process: Process,
     printed: Printed | None,
 ) -> SheetSection:
-    count, material = len(sizes), scene.hand.material
+    count = len(sizes)
+    material = scene.hand.material
     volume = sum(size.volume for size in sizes) / 1e3
     middle = [(size, size.at(size.length / 2)) for size in sizes]
     thread = sum(z.length / PITCH * 2 * (m.width + m.height) for z, m in middle) / 1e3
@@ -148,7 +149,8 @@ def _silicone(scene: Scene) -> str:
 
 def _worked(scene: Scene) -> Silicone:
     """The silicone whose mix and times the sheet gives."""
-    material, law = scene.hand.material, scene.effects.neo_hookean
+    material = scene.hand.material
+    law = scene.effects.neo_hookean
     return silicone.of_material(material) or silicone.nearest(material, neo_hookean=bool(law))
 
 
@@ -176,7 +178,8 @@ def _castings(scene: Scene, sizes: Sequence[Size]) -> SheetSection:
     a, b = named.mix
     rows = []
     for i, size in enumerate(sizes):
-        shell, base = grams * (size.volume - bottom(size)), grams * bottom(size)
+        shell = grams * (size.volume - bottom(size))
+        base = grams * bottom(size)
         cells = [f"{v:.0f} ({v * a / (a + b):.1f} + {v * b / (a + b):.1f})" for v in (shell, base)]
         rows.append((str(i), *cells))
     head = ("finger", "shell g (A + B)", "bottom wall g (A + B)")
@@ -205,7 +208,8 @@ def _prints(scene: Scene, sizes: Sequence[Size], printed: Printed | None) -> She
             rows.append((name, "1", f"{uses[what]}, finger {which}: cast {len(fingers)}"))
         else:
             rows.append((name, "0", f"finger {which} as it is to be: to compare, not to print"))
-    mass, wanted = PLASTIC * printed.palm_volume, 1e3 * scene.hand.palm.mass
+    mass = PLASTIC * printed.palm_volume
+    wanted = 1e3 * scene.hand.palm.mass
     notes = [
         "Files in parts/, STL and 3MF, in mm, as they stand on the printer's bed: layers of 0.15 "
         "mm, 4 perimeters; palm and bars with 50 % infill or more, moulds with 15 %. Sand the "
@@ -228,8 +232,10 @@ def _wrist(scene: Scene, sizes: Sequence[Size], printed: Printed | None) -> Shee
     if not scene.effects.wrist:
         note = "The simulated wrist is rigid: screw the palm to the arm's flange."
         return SheetSection("Wrist", (), [], [note])
-    wrist, mass = scene.hand.wrist, hand_mass(scene, sizes)
-    k, turn = wrist.linear_stiffness, wrist.angular_stiffness
+    wrist = scene.hand.wrist
+    mass = hand_mass(scene, sizes)
+    k = wrist.linear_stiffness
+    turn = wrist.angular_stiffness
     sag = 1e3 * mass * scene.gravity_on / k
     rows = [
         (
@@ -264,7 +270,8 @@ def _wrist(scene: Scene, sizes: Sequence[Size], printed: Printed | None) -> Shee
 
 def _mechanical(scene: Scene, sag: float, printed: Printed | None) -> str:
     wrist = scene.hand.wrist
-    k, turn = wrist.linear_stiffness, wrist.angular_stiffness
+    k = wrist.linear_stiffness
+    turn = wrist.angular_stiffness
     text = (
         f"**To build** (drawing: last page of {NAME}.pdf): three miniature linear guides, crossed, "
         f"one above the other, each with {math.ceil((sag + 30) / 10) * 10:.0f} mm of travel to "
@@ -275,7 +282,8 @@ def _mechanical(scene: Scene, sag: float, printed: Printed | None) -> str:
     if not printed or not printed.flange:
         return f"{text}, that give {turn:g} N m/rad about each axis."
     radius = 5e-4 * printed.flange[0]
-    axial, shear = turn / (2 * radius**2) / 1e3, turn / (4 * radius**2) / 1e3
+    axial = turn / (2 * radius**2) / 1e3
+    shear = turn / (4 * radius**2) / 1e3
     return (
         f"{text} with {printed.flange[1]} studs in the screw holes of the palm, each with "
         f"{axial:.0f} N/mm along and {shear:.0f} N/mm across (K/2r² and K/4r² at a distance r of "

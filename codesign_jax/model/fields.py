@@ -99,7 +99,8 @@ def joint_springs(scene: Scene, params: Params) -> tuple[jax.Array, jax.Array]:
     Finger joints have those of `morphology.joint_springs`, the six wrist dofs those of the hand
     file; the object's are free.
     """
-    lay, hand = layout(scene), scene.hand
+    lay = layout(scene)
+    hand = scene.hand
     beams = morphology.finger_beams(hand, params, lay.links)
     each = morphology.joint_springs(hand, params, beams, lay.links, lay.axes)
     finger, own = (_picked(jnp.broadcast_to(v, lay.dofs.shape).ravel(), lay.hinges) for v in each)
@@ -118,15 +119,19 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
       params: Parameters of the hand; all physics in the float type of these.
       trial: The trial's object and noise.
     """
-    template, lay, dtype = compile_template(scene), layout(scene), params.length.dtype
+    template = compile_template(scene)
+    lay = layout(scene)
+    dtype = params.length.dtype
     scene = _in_type(with_trial(scene, trial), dtype)
     beam = morphology.finger_beams(scene.hand, params, lay.links)
 
     def filled(name: str, *parts: tuple[Any, Any]) -> jax.Array:
         return _filled(getattr(template, name), dtype, *parts)
 
-    links, gains = morphology.segments(scene.hand, params, lay.links), beam.moment_per_pressure
-    extents, masses = links.extent, links.mass
+    links = morphology.segments(scene.hand, params, lay.links)
+    gains = beam.moment_per_pressure
+    extents = links.extent
+    masses = links.mass
     size, object_mass, object_inertia = object_size(scene.objects, trial)
     bodies = np.concatenate([lay.stubs[:, None], lay.bodies], 1)
     mount_pos, mount_quat = mounts(scene.hand, params.spread)
@@ -198,7 +203,8 @@ def _filled(base: np.ndarray, dtype: Any, *parts: tuple[Any, Any]) -> jax.Array:
     One gather of all numbers: a CPU's XLA makes a loop of every `.at[places].set(values)`.
     """
     source = np.arange(base.size, dtype=np.int32).reshape(base.shape)
-    numbers, count = [jnp.asarray(base, dtype).ravel()], base.size
+    numbers = [jnp.asarray(base, dtype).ravel()]
+    count = base.size
     for places, given in parts:
         values = jnp.asarray(given, dtype)
         source[places] = np.arange(count, count + values.size).reshape(values.shape)
@@ -226,7 +232,8 @@ def _section(scene: Scene, params: Params) -> jax.Array | None:
 
 @by_structure
 def _pair_kinds(scene: Scene) -> np.ndarray:
-    template, lay = compile_template(scene), layout(scene)
+    template = compile_template(scene)
+    lay = layout(scene)
     kinds = np.zeros(template.npair, np.int32)  # see layout: one width in every precision
     for i, pair in enumerate(zip(template.pair_geom1, template.pair_geom2, strict=True)):
         touched = np.isin(lay.object_geoms, pair)
@@ -242,7 +249,8 @@ def _pair_kinds(scene: Scene) -> np.ndarray:
 
 def _pairs(scene: Scene, dtype: Any) -> list[jax.Array]:
     """MuJoCo's friction (pair, 5), solref (pair, 2) and solimp (pair, 5) of the contact pairs."""
-    kinds, found = _pair_kinds(scene), (pairs.frictions(scene), pairs.impedances(scene))
+    kinds = _pair_kinds(scene)
+    found = (pairs.frictions(scene), pairs.impedances(scene))
     own = (jnp.stack([jnp.asarray(v, dtype) for v in values])[kinds] for values in found)
     return [
         jnp.stack([jnp.broadcast_to(jnp.asarray(v, dtype), len(kinds)) for v in row], -1)
@@ -252,7 +260,8 @@ def _pairs(scene: Scene, dtype: Any) -> list[jax.Array]:
 
 def _margins(scene: Scene, params: Params) -> jax.Array:
     """MuJoCo's margin of the contact pairs [m], shape (pair,)."""
-    lay, template = layout(scene), compile_template(scene)
+    lay = layout(scene)
+    template = compile_template(scene)
     geoms = np.stack([template.pair_geom1, template.pair_geom2], 1)
     on_palm = (geoms == lay.disc).any(1)
     sphere = np.where(on_palm, geoms.max(1) - lay.spheres.min(), 0)  # behind the disc
@@ -338,7 +347,8 @@ def _geom_fields(
 
 
 def _start(scene: Scene, params: Params, trial: Trial) -> jax.Array:
-    tilt, dtype = trial.arm_tilt, params.arm.dtype
+    tilt = trial.arm_tilt
+    dtype = params.arm.dtype
     x, y, z, roll, pitch, yaw = key_frames.poses(scene, params, 1)[0]
     wrist = jnp.stack([x, y, z, roll + tilt[0], yaw, tilt[1] - pitch])
     fingers = jnp.zeros(layout(scene).dofs.size, dtype)

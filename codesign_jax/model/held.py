@@ -23,7 +23,8 @@ def lanes(scene: Scene) -> int:
 
 def rings_of_link(scene: Scene) -> int:
     """Rings of a link of a finger, or its contact spheres."""
-    e, spheres = scene.effects, layout(scene).spheres
+    e = scene.effects
+    spheres = layout(scene).spheres
     if e.surface == "spheres":
         return spheres.shape[-1] if spheres.size else 0
     between = e.finger_finger or e.finger_palm or e.finger_itself
@@ -65,7 +66,9 @@ def held(scene: Scene) -> dict[str, int]:
     """
     if not keeps(scene):
         return {}
-    e, count, many = scene.effects, lanes(scene), surfaces(scene)
+    e = scene.effects
+    count = lanes(scene)
+    many = surfaces(scene)
     rings = scene.discretization.links * rings_of_link(scene)
     palm = palm_groups(scene) if palm_touches(scene) else 0
     found = {
@@ -81,7 +84,8 @@ def held(scene: Scene) -> dict[str, int]:
 
 def rows(scene: Scene) -> dict[str, slice]:
     """Rows of `State.held`, three for each of `held`, by the pair of bodies."""
-    found, first = {}, 0
+    found = {}
+    first = 0
     for name, items in held(scene).items():
         found[name] = slice(first, first + 3 * items)
         first += 3 * items

@@ -80,8 +80,10 @@ def _faces(rings: int, points: int) -> np.ndarray:
     i = np.arange(points)
     after = (i + 1) % points
     first = 1 + points * np.arange(rings - 1)[:, None]
-    a, a_next = first + i, first + after
-    b, b_next = a + points, a_next + points
+    a = first + i
+    a_next = first + after
+    b = a + points
+    b_next = a_next + points
     sides = np.concatenate(
         [
             np.stack([a, b_next, b], -1).reshape(-1, 3),
@@ -98,7 +100,8 @@ def rest(
     scene: Scene, length: float, height: float, *, square: bool = False, tip: Tip | None = None
 ) -> np.ndarray:
     """Vertices of the straight finger in the frame of its base [m], shape (vertex, 3)."""
-    links, place = scene.discretization.links, hull(scene, square=square).place
+    links = scene.discretization.links
+    place = hull(scene, square=square).place
     size = np.array([length / links, scene.hand.section.width, height])
     if tip is not None:
         end = np.array([length / links, tip.width, tip.height])

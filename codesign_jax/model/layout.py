@@ -92,7 +92,9 @@ def hinge_order(scene: Scene, joint: int) -> tuple[str, ...]:
 @by_structure
 def layout(scene: Scene) -> Layout:
     """Returns the index layout of a scene's model."""
-    n, links, axes = scene.num_fingers, scene.discretization.links, joint_axes(scene)
+    n = scene.num_fingers
+    links = scene.discretization.links
+    axes = joint_axes(scene)
     stubs = 2 + np.arange(n) * (links + 1)
     bodies = stubs[:, None] + 1 + np.arange(links)
     dofs = 6 + np.arange(n * links * len(axes)).reshape(n, links, len(axes))
@@ -132,7 +134,8 @@ def wrist_springs(scene: Scene) -> tuple[list[Any], list[Any]]:
     Without the effect `wrist` they are the limit in which the implicit spring ends every step where
     the arm frame is: (M + h^2 K) a = K (u - q - h v) gives q + h (v + h a) = u as K grows.
     """
-    w, h = scene.hand.wrist, scene.discretization.timestep
+    w = scene.hand.wrist
+    h = scene.discretization.timestep
     if not scene.effects.wrist:
         return [RIGID / h**2] * 6, [0.0] * 6
     stiffness = [w.linear_stiffness] * 3 + [w.angular_stiffness] * 3
@@ -188,7 +191,8 @@ def dissipation(scene: Scene, *, ahead: bool = False) -> Any:
     hops, unless its dissipation takes longer than a step. A tall box on an incline hops with 6 ms
     at steps of 10 ms and rests with 15.
     """
-    tau, least = scene.contact.dissipation_time, 1.5 * scene.discretization.timestep
+    tau = scene.contact.dissipation_time
+    least = 1.5 * scene.discretization.timestep
     return tau if ahead else tau + (least - tau) * (least > tau)
 
 
@@ -264,7 +268,8 @@ _PALM_RING = ((0, 0), (1, 0), (0, 1), (-1, 0), (0, -1))
 def palm_points(scene: Scene) -> jax.Array:
     """Centres of the palm's contact spheres in the palm frame, whose origin is on the underside."""
     p = scene.hand.palm
-    ring, up = jnp.asarray(p.contact_ring), jnp.asarray(p.contact_radius)
+    ring = jnp.asarray(p.contact_ring)
+    up = jnp.asarray(p.contact_radius)
     return jnp.stack([jnp.stack([x * ring, y * ring, up]) for x, y in _PALM_RING])
 
 

@@ -99,7 +99,8 @@ def finger_beams(hand: Hand, params: Params, links: int) -> Beam:
 
     N is 1 where they are the same all along.
     """
-    material, own = hand.material, sections(hand, params, at_joints(links))
+    material = hand.material
+    own = sections(hand, params, at_joints(links))
     found = _beam(hand, own)
     return found._replace(
         lateral=material.lateral_factor * found.lateral,
@@ -108,7 +109,8 @@ def finger_beams(hand: Hand, params: Params, links: int) -> Beam:
 
 
 def _beam(hand: Hand, own: Section) -> Beam:
-    modulus, density = hand.material.shear_modulus, hand.material.density
+    modulus = hand.material.shear_modulus
+    density = hand.material.density
     return beam(own.height, own.wall, width=own.width, shear_modulus=modulus, density=density)
 
 
@@ -119,7 +121,8 @@ def free_bends(hand: Hand, params: Params, *, neo_hookean: bool | None = None) -
       neo_hookean: The bending law; None for that of the hand's material.
     """
     law = silicones.of_law(hand.material.law) if neo_hookean is None else neo_hookean
-    exact, links = jax.tree.map(lambda v: np.asarray(v, float), params), 1
+    exact = jax.tree.map(lambda v: np.asarray(v, float), params)
+    links = 1
     if params.tip is not None:
         links = 100
     beams = finger_beams(hand, exact, links)
@@ -135,12 +138,14 @@ def _softened(linear: np.ndarray, own: Section) -> np.ndarray:
     At large strain they carry a quarter of the linear moment, so that it is at most four times as
     large; halved 50 times the interval is as short as rounding.
     """
-    low, high = linear, 4 * linear
+    low = linear
+    high = 4 * linear
     for _ in range(50):
         middle = (low + high) / 2
         lacking = softening(middle, own.height, own.wall, width=own.width)
         enough = middle * (1 - lacking) >= linear
-        low, high = np.where(enough, low, middle), np.where(enough, middle, high)
+        low = np.where(enough, low, middle)
+        high = np.where(enough, middle, high)
     return (low + high) / 2
 
 
@@ -166,10 +171,12 @@ def segments(hand: Hand, params: Params, links: int) -> Segments:
     factor = np.ones(links + 1)
     factor[[0, -1]] = 0.5
     segment = params.length[:, None] / links
-    extent, offset = segment * factor, segment * factor[:-1]
+    extent = segment * factor
+    offset = segment * factor[:-1]
     start = np.concatenate([[0.0], at_joints(links)])
     density, along, up = _contents(hand, params, start, factor / links)
-    mass, middle = density * extent, sections(hand, params, start + factor / links / 2)
+    mass = density * extent
+    middle = sections(hand, params, start + factor / links / 2)
     numpy = mass.__array_namespace__()  # traced if any number is
     inertia = numpy.stack(block_inertia(mass, extent, middle.width, middle.height), -1)
     return Segments(offset, extent, mass, inertia, along * extent, up)

@@ -15,7 +15,9 @@ from codesign_jax.model.morphology import at_joints, sections
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
 
-_AROUND, _ALONG, _INNER = 16, (0.0, 0.25, 0.5, 0.75, 1.0), (0.9, 0.5, 0.0)
+_AROUND = 16
+_ALONG = (0.0, 0.25, 0.5, 0.75, 1.0)
+_INNER = (0.9, 0.5, 0.0)
 """Points of an outline, its places on a link as shares of the link, and outlines of the tip's face
 as shares of the section."""
 _APART = 3
@@ -43,20 +45,26 @@ def overlaps(scene: Scene, params: Params, place: np.ndarray, turn: np.ndarray) 
       place: Origins of the bodies' frames [m], shape (state, body, 3).
       turn: Their orientations, shape (state, body, 3, 3).
     """
-    lay, disc = layout(scene), scene.hand.palm
-    links, count = lay.links, scene.num_fingers
+    lay = layout(scene)
+    disc = scene.hand.palm
+    links = lay.links
+    count = scene.num_fingers
     whole = np.where(np.arange(links) < links - 1, 1, 0.5)
     angle = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
     unit = np.stack([np.cos(angle), np.sin(angle)], 1)
     unit /= ((unit**4).sum(1) ** 0.25)[:, None]
-    points, owners, sizes, beyond = [], [], [], []
+    points = []
+    owners = []
+    sizes = []
+    beyond = []
     middles = (np.arange(links) + 0.5 + whole / 2) / links
     size = sections(scene.hand, jax.tree.map(lambda v: np.asarray(v, float), params), middles)
     halves = np.stack(
         [np.broadcast_to(v, (count, links)) / 2 for v in (size.width, size.height)], -1
     )
     for f, bodies in enumerate(lay.bodies):
-        half, span = halves[f], float(params.length[f]) / links * whole
+        half = halves[f]
+        span = float(params.length[f]) / links * whole
         local = [
             np.c_[np.full(_AROUND, part * s), unit * own + [0, own[1]]]
             for s, own in zip(span, half, strict=True)
@@ -66,7 +74,8 @@ def overlaps(scene: Scene, params: Params, place: np.ndarray, turn: np.ndarray) 
         local.append(np.c_[np.full(len(face), span[-1]), face])
         own = np.repeat(np.arange(links), _AROUND * len(_ALONG))
         own = np.append(own, np.full(len(face), links - 1))
-        at, local = np.array(bodies)[own], np.concatenate(local)
+        at = np.array(bodies)[own]
+        local = np.concatenate(local)
         along = (own + 0.5) * float(params.length[f]) / links + local[:, 0]
         free = beyond_base(along, float(params.height[f]))
         beyond.append(free & (own >= first_on_palm(links) - 1))
@@ -99,7 +108,8 @@ def _depths(local: np.ndarray, span: np.ndarray, a: np.ndarray, b: np.ndarray) -
       a: Half of their widths in the middle, same shape.
     """
     x, y, z = np.moveaxis(local, -1, 0)
-    a, b = a[:, None], b[:, None]
+    a = a[:, None]
+    b = b[:, None]
     units = np.abs([y / a, (z - b) / b])
     phi = np.maximum((units**4).sum(0) ** 0.25, 1e-9)
     slope = np.sqrt((units[0] / phi) ** 6 / a**2 + (units[1] / phi) ** 6 / b**2)

@@ -10,7 +10,10 @@ from typing import Any
 from codesign_jax.model.layout import IMPEDANCE, dissipation, palm_impedance
 from codesign_jax.scene import Scene
 
-OBJECT_TABLE, HAND_TABLE, FINGERS, PALM = -4, -3, -2, -1
+OBJECT_TABLE = -4
+HAND_TABLE = -3
+FINGERS = -2
+PALM = -1
 SOLIMP = (0.001, 0.5, 2.0)
 """Width, midpoint and power of MuJoCo's impedance, which is constant here: they do not matter."""
 
@@ -45,6 +48,7 @@ def numbers(scene: Scene, friction: Any, impedance: Any) -> tuple[list, list, li
     c = scene.contact
     turning = [c.torsional_friction, c.rolling_friction, c.rolling_friction]
     h = scene.discretization.timestep
-    spring, damper = 1.0 / (h * (h + dissipation(scene))), 1.0 / h
+    spring = 1.0 / (h * (h + dissipation(scene)))
+    damper = 1.0 / h
     reference = [-impedance * spring, -impedance * damper]
     return [friction, friction, *turning], reference, [impedance] * 2 + [*SOLIMP]

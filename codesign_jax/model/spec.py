@@ -52,7 +52,8 @@ def template_world(scene: Scene) -> tuple[Params, Trial]:
     params = Params(0.1 * one, 0.02 * one, 0.004 * one, np.zeros(()), np.zeros(6), 0.0 * one)
     if scene.hand.section.tapered:
         params = params._replace(tip=Tip(0.015 * one, 0.003 * one, 0.02 * one))
-    zero, unit = np.zeros(()), np.ones(())
+    zero = np.zeros(())
+    unit = np.ones(())
     return params, Trial(np.int32(0), np.zeros(2), zero, np.zeros(2), *[unit] * 5)
 
 
@@ -96,7 +97,8 @@ def build_spec(
     scene: Scene, params: Params, trial: Trial, *, visual: bool = False
 ) -> mujoco.MjSpec:
     """Builds the MjSpec of one hand and one trial; arguments as `compile_model`."""
-    spec, scene = mujoco.MjSpec(), with_trial(scene, jax.tree.map(np.asarray, trial))
+    spec = mujoco.MjSpec()
+    scene = with_trial(scene, jax.tree.map(np.asarray, trial))
     _options(scene, spec)
     world = spec.worldbody
     world.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 0.05], **_PASSIVE)
@@ -130,10 +132,13 @@ _COLORS = {
 
 def _options(scene: Scene, spec: mujoco.MjSpec) -> None:
     o = spec.option
-    o.timestep, o.gravity = scene.discretization.timestep, [0, 0, -scene.gravity_on]
-    o.integrator, o.cone = mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtCone.mjCONE_ELLIPTIC
+    o.timestep = scene.discretization.timestep
+    o.gravity = [0, 0, -scene.gravity_on]
+    o.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    o.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     o.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    o.iterations, o.ls_iterations = scene.solver.iterations, scene.solver.ls_iterations
+    o.iterations = scene.solver.iterations
+    o.ls_iterations = scene.solver.ls_iterations
     o.tolerance = scene.solver.tolerance
     o.impratio = friction_ratio(scene, scene.contact.friction_ratio)
     bits = mujoco.mjtDisableBit
@@ -164,7 +169,9 @@ def palm_inertia(scene: Scene) -> list[Any]:
 def _add_palm(scene: Scene, spec: mujoco.MjSpec, visual: bool) -> None:
     p = scene.hand.palm
     body = spec.worldbody.add_body(name="palm")
-    body.explicitinertial, body.mass, body.ipos = True, p.mass, [0, 0, p.thickness / 2]
+    body.explicitinertial = True
+    body.mass = p.mass
+    body.ipos = [0, 0, p.thickness / 2]
     body.inertia = palm_inertia(scene)
     axes = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
     axes |= {"roll": axes["x"], "yaw": axes["z"], "pitch": axes["y"]}
@@ -178,12 +185,14 @@ def _add_palm(scene: Scene, spec: mujoco.MjSpec, visual: bool) -> None:
             name=f"arm_{name}", target=f"wrist_{name}", trntype=mujoco.mjtTrn.mjTRN_JOINT
         )
         actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
-        actuator.gainprm[0], actuator.biasprm[1] = stiffness, -stiffness
+        actuator.gainprm[0] = stiffness
+        actuator.biasprm[1] = -stiffness
     if palm_touches(scene):
         for i, point in enumerate(np.asarray(palm_points(scene))):
             _sphere(body, f"palm_{i}", point, p.contact_radius)
     if visual or scene.effects.finger_palm:
-        kind, size = mujoco.mjtGeom.mjGEOM_CYLINDER, [p.radius, p.thickness / 2, 0]
+        kind = mujoco.mjtGeom.mjGEOM_CYLINDER
+        size = [p.radius, p.thickness / 2, 0]
         pos = [0, 0, p.thickness / 2]
         body.add_geom(
             name="palm_disc", type=kind, size=size, pos=pos, rgba=_COLORS["palm"], **_PASSIVE
@@ -206,7 +215,8 @@ def _add_finger(
 ) -> None:
     lay = layout(scene)
     hand = scene.hand
-    count, many = lay.spheres.shape[2], (lay.links, lay.spheres.shape[2])
+    count = lay.spheres.shape[2]
+    many = (lay.links, lay.spheres.shape[2])
     links = morphology.segments(hand, params, lay.links)
     springs = [
         np.broadcast_to(v[f], (lay.links, len(lay.axes)))
@@ -228,11 +238,13 @@ def _add_finger(
         else:
             body.pos = [links.offset[f, i - 1], 0, 0]
         extent = links.extent[f, i]
-        body.explicitinertial, body.mass = True, links.mass[f, i]
+        body.explicitinertial = True
+        body.mass = links.mass[f, i]
         body.ipos = [links.along[f, i], 0, up[i]]
         body.inertia = links.inertia[f, i]
         if visual and scene.effects.surface == "spheres":
-            kind, half = mujoco.mjtGeom.mjGEOM_BOX, [extent / 2, width[i] / 2, up[i]]
+            kind = mujoco.mjtGeom.mjGEOM_BOX
+            half = [extent / 2, width[i] / 2, up[i]]
             name = f"finger_{f}_block_{i}"
             body.add_geom(
                 name=name, type=kind, size=half, pos=body.ipos, rgba=_COLORS["finger"], **_PASSIVE
@@ -265,9 +277,11 @@ def _add_finger(
 
 def _add_skin(scene: Scene, spec: mujoco.MjSpec, params: Params, f: int) -> None:
     """The finger's hull as MuJoCo's skin, which is for looking at only."""
-    length, height = float(params.length[f]), float(params.height[f])
+    length = float(params.length[f])
+    height = float(params.height[f])
     tip = None if params.tip is None else Tip(*(float(v[f]) for v in params.tip))
-    mesh, origins = hull.hull(scene), hull.link_origins(scene, length)
+    mesh = hull.hull(scene)
+    origins = hull.link_origins(scene, length)
     skin = spec.add_skin(name=f"finger_{f}_hull", rgba=_COLORS["finger"])
     skin.vert = hull.rest(scene, length, height, tip=tip).ravel()
     skin.face = mesh.face.ravel()
@@ -291,8 +305,11 @@ def _add_object(
     rest, quat = pose
     body = spec.worldbody.add_body(name="object", pos=[*np.asarray(trial.position), float(rest)])
     body.quat = quat
-    body.explicitinertial, body.mass, body.inertia = True, float(mass), inertia
-    body.ipos, body.iquat = [0, 0, 0], [1, 0, 0, 0]
+    body.explicitinertial = True
+    body.mass = float(mass)
+    body.inertia = inertia
+    body.ipos = [0, 0, 0]
+    body.iquat = [1, 0, 0, 0]
     body.add_freejoint(name="object")
     for i, shape in enumerate(scene.objects.object):
         active = i == int(trial.shape)
@@ -303,7 +320,8 @@ def _add_object(
         geom = body.add_geom(name=f"object_{i}", type=kind, rgba=color, **_PASSIVE)
         geom.size = np.asarray(sizes[i])
         if shape.mesh and active and visual:
-            geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, f"object_{i}"
+            geom.type = mujoco.mjtGeom.mjGEOM_MESH
+            geom.meshname = f"object_{i}"
             vertices = shape.mesh.vertices * float(trial.size)
             spec.add_mesh(
                 name=f"object_{i}", uservert=vertices.ravel(), userface=shape.mesh.faces.ravel()
@@ -329,7 +347,8 @@ def surroundings(scene: Scene, table: int) -> list[tuple[str, int]]:
 
 
 def _add_pairs(scene: Scene, spec: mujoco.MjSpec, params: Params) -> None:
-    e, lay = scene.effects, layout(scene)
+    e = scene.effects
+    lay = layout(scene)
     fingers = [f"finger_{f}_sphere_{i + 1}_{j}" for f, i, j in np.ndindex(lay.spheres.shape)]
     palm = [f"palm_{i}" for i in range(len(lay.palm))]
     add = functools.partial(add_pair, scene, spec)

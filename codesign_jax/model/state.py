@@ -56,9 +56,11 @@ def split(scene: Scene, start: Any) -> State:
     >>> float(state.going[0]), state.held.shape  # 3 numbers of 47 contacts on 4 lanes
     (1.0, (564,))
     """
-    nv, rows = 12 + layout(scene).dofs.size, 3 * sum(held.held(scene).values())
+    nv = 12 + layout(scene).dofs.size
+    rows = 3 * sum(held.held(scene).values())
     sizes = State(nv + 1, nv, nv, 1, 1, 1, rows * held.lanes(scene))
-    ends, n = np.cumsum(sizes), start.shape[-1]
+    ends = np.cumsum(sizes)
+    n = start.shape[-1]
     if n not in {*ends[[0, 1, 6]]}:
         problem = f"start has {n} numbers; a state of the scene has {ends[-1]}, its beginning"
         raise InputError([f"{problem} {ends[0]} (qpos) or {ends[1]} (qpos, qvel)"])

@@ -24,7 +24,9 @@ def reflect(x: ArrayLike, low: ArrayLike, high: ArrayLike) -> jax.Array:
     Returns:
       Values in [low, high], shape of `x`.
     """
-    x, low, high = jnp.asarray(x), jnp.asarray(low), jnp.asarray(high)
+    x = jnp.asarray(x)
+    low = jnp.asarray(low)
+    high = jnp.asarray(high)
     width = high - low
     # The wave is symmetric about low, so the distance from low is all that matters.
     phase = jnp.abs(x - low) % jnp.where(width > 0, 2 * width, 1)
@@ -79,7 +81,8 @@ class Space:
         """
         if not all(_is_value(bound) for bound in (self.low, self.high)):
             return
-        low, high = np.asarray(self.low), np.asarray(self.high)
+        low = np.asarray(self.low)
+        high = np.asarray(self.high)
         if low.shape != high.shape or low.ndim < 1:
             raise ValueError(f"low {low.shape} and high {high.shape} must both be (parameter,)")
         wrong = np.argwhere(~(np.isfinite(low) & np.isfinite(high) & (low <= high)))

@@ -95,7 +95,8 @@ class Evolution:
 
     def ask(self, state: State, mask: ArrayLike) -> jax.Array:
         # The space's constraint may change a closed parameter, as with the particle filter.
-        low, high = jnp.asarray(self.space.low), jnp.asarray(self.space.high)
+        low = jnp.asarray(self.space.low)
+        high = jnp.asarray(self.space.high)
         unit, _ = self._asked(state, mask)
         moved = reflect(low + unit * (high - low), low, high)
         kept = jnp.where(jnp.any(mask), state.particles[:1], state.particles)
@@ -110,7 +111,8 @@ class Evolution:
         # CMA-ES knows ranks only.  evosax gives equal costs a common weight below their share,
         # which shrinks steps on a plateau such as "every grasp is lost"; rows are a fair draw.
         told = jnp.argsort(jnp.argsort(ranked)) if self.name == "cma-es" else ranked
-        strategy, (unit, asked) = self._strategy(state), self._asked(state, mask)
+        strategy = self._strategy(state)
+        unit, asked = self._asked(state, mask)
         key = episode_key(state, STREAM_TELL)
         new, _ = strategy.algorithm.tell(key, unit, told.astype(unit.dtype), asked, strategy.params)
         # Newer particles come first, so that they win among equal costs.
@@ -129,7 +131,8 @@ class Evolution:
     def _asked(self, state: State, mask: ArrayLike) -> tuple[jax.Array, Any]:
         """Points of the strategy in unit coordinates, and the strategy's state with them."""
         assert state.memory is not None
-        strategy, start = self._strategy(state), self._start(state)
+        strategy = self._strategy(state)
+        start = self._start(state)
         same = jnp.all(mask == state.memory["mask"])
         kept = jax.tree.map(
             lambda old, new: jnp.where(same, old, new), state.memory["strategy"], arrays(start)
@@ -140,7 +143,8 @@ class Evolution:
     def _start(self, state: State) -> Any:
         """The strategy's state as it starts around the best particle."""
         algorithm, params = self._strategy(state)
-        low, high = jnp.asarray(self.space.low), jnp.asarray(self.space.high)
+        low = jnp.asarray(self.space.low)
+        high = jnp.asarray(self.space.high)
         best = (state.particles[0] - low) / jnp.where(high > low, high - low, 1)
         key = episode_key(state, STREAM_START)
         if self.name != "pso":
@@ -173,7 +177,8 @@ def build(name: str, particles: int, width: int, sigma: float, dtype: str) -> St
             uniform = functools.partial(jax.random.uniform, shape=(width,), dtype=dtype)
             algorithm = RandomSearch(particles, point, uniform)
         elif name == "open-es":
-            std, descent = jnp.asarray(sigma, dtype), optax.sgd(learning_rate(sigma, width))
+            std = jnp.asarray(sigma, dtype)
+            descent = optax.sgd(learning_rate(sigma, width))
             algorithm = Open_ES(particles, point, optimizer=descent, std_schedule=lambda _: std)
         else:
             algorithm = (CMA_ES if name == "cma-es" else PSO)(particles, point)

@@ -74,7 +74,8 @@ class ParticleFilter:
         under a limit that sank with an open wall thickness. A particle that satisfies the
         constraint is not changed by it.
         """
-        low, high = jnp.asarray(self.space.low), jnp.asarray(self.space.high)
+        low = jnp.asarray(self.space.low)
+        high = jnp.asarray(self.space.high)
         n, width = state.particles.shape
         key = episode_key(state, STREAM_MOVE)
         keys = jax.vmap(lambda particle: jax.random.fold_in(key, particle))(jnp.arange(n))

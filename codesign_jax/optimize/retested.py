@@ -64,8 +64,10 @@ class Retested:
 
     def ask(self, state: State, mask: ArrayLike) -> jax.Array:
         assert state.memory is not None
-        low, high = jnp.asarray(self.space.low), jnp.asarray(self.space.high)
-        shape, dtype = state.particles.shape, state.particles.dtype
+        low = jnp.asarray(self.space.low)
+        high = jnp.asarray(self.space.high)
+        shape = state.particles.shape
+        dtype = state.particles.dtype
         unit = jax.random.uniform(episode_key(state, STREAM_DRAW), shape, dtype)
         drawn = jnp.where(mask, low + unit * (high - low), state.particles[:1]).astype(dtype)
         asked = jnp.where(self._again(state), state.memory["designs"], drawn)
@@ -76,7 +78,9 @@ class Retested:
     ) -> tuple[State, Info]:
         assert state.memory is not None
         cost = check_told(state, population, cost)
-        again, known, count = self._again(state), state.memory["cost"], state.memory["episodes"]
+        again = self._again(state)
+        known = state.memory["cost"]
+        count = state.memory["episodes"]
         found = jnp.where(jnp.isfinite(cost), cost, jnp.inf)
         found = jnp.where(again, known + (found - known) / (count + 1), found)
         costs = jnp.concatenate([found, jnp.where(again, jnp.inf, known)])

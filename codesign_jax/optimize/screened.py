@@ -107,7 +107,8 @@ class Screened:
 
     def ask(self, state: State, mask: ArrayLike) -> jax.Array:
         # The space's constraint may change a closed parameter, as with the particle filter.
-        key, shape = episode_key(state, STREAM_SCREEN), state.particles.shape
+        key = episode_key(state, STREAM_SCREEN)
+        shape = state.particles.shape
         drawn = jax.random.uniform(key, shape, state.particles.dtype)
         unit = jnp.where(self._screens(state), drawn, self._asked(state, mask)[0])
         kept = jnp.where(jnp.any(mask), state.particles[:1], state.particles)
@@ -120,7 +121,8 @@ class Screened:
     ) -> tuple[State, Info]:
         assert state.memory is not None
         cost = check_told(state, population, cost)
-        ranked, screens = jnp.where(jnp.isfinite(cost), cost, jnp.inf), self._screens(state)
+        ranked = jnp.where(jnp.isfinite(cost), cost, jnp.inf)
+        screens = self._screens(state)
         # Screening keeps the best so far, best first; newer ones win among equal costs.  Simulated
         # again, a design has the mean of its costs, and what it was before does not count.
         tests = jnp.maximum(state.episode - self.screening + 1, 0)
@@ -140,7 +142,8 @@ class Screened:
         now = {"average": average, "averaged": memory["averaged"] + 1, "strategy": arrays(new)}
         # The averages that were simulated, newest first, and which of them the final test takes.
         way = jnp.concatenate([population[:1], state.memory["way"][:-1]])
-        rows, third = jnp.arange(len(cost)), now["averaged"] // 3
+        rows = jnp.arange(len(cost))
+        third = now["averaged"] // 3
         ago = jnp.where(rows < self.finalists, jnp.array([0, 2, 1])[rows % 3] * third, 0)
         finalists = way[jnp.minimum(ago, len(cost) - 1)]
         following = jax.tree.map(partial(jnp.where, screens), memory, now) | {
@@ -178,17 +181,20 @@ class Screened:
     def _start(self, state: State) -> dict[str, Any]:
         """Average and strategy as they start, at particle 0."""
         algorithm, params = self._strategy(state)
-        low, high = jnp.asarray(self.space.low), jnp.asarray(self.space.high)
+        low = jnp.asarray(self.space.low)
+        high = jnp.asarray(self.space.high)
         unit = (state.particles[0] - low) / jnp.where(high > low, high - low, 1)
         strategy = arrays(algorithm.init(state.key, unit, params))
         return {"average": unit, "averaged": jnp.zeros((), jnp.int32), "strategy": strategy}
 
     def _design(self, unit: jax.Array) -> jax.Array:
         """Designs at unit coordinates, mirrored at the bounds."""
-        low, high = jnp.asarray(self.space.low), jnp.asarray(self.space.high)
+        low = jnp.asarray(self.space.low)
+        high = jnp.asarray(self.space.high)
         return reflect(low + unit * (high - low), low, high)
 
     def _strategy(self, state: State) -> Strategy:
-        (n, width), dtype = state.particles.shape, str(state.particles.dtype)
+        n, width = state.particles.shape
+        dtype = str(state.particles.dtype)
         # Its draws come in pairs; the last one of an even number of particles is its mean.
         return build("open-es", 2 * ((n - 1) // 2), width, self.sigma, dtype)

@@ -31,7 +31,8 @@ def candidates(key: jax.Array, space: Space, indices: ArrayLike) -> jax.Array:
     Returns:
       Particles, shape (particle, parameter).
     """
-    low, high = jnp.asarray(space.low, float), jnp.asarray(space.high, float)
+    low = jnp.asarray(space.low, float)
+    high = jnp.asarray(space.high, float)
     key = jax.random.fold_in(key, STREAM_SEED)
 
     def draw(index: jax.Array) -> jax.Array:
@@ -78,7 +79,8 @@ def rejection(
     """
     if min(num_seeds, batch, max_batches) < 1:
         raise ValueError(f"counts must be at least 1: {num_seeds=}, {batch=}, {max_batches=}")
-    drawn, costs = [], np.empty(0)
+    drawn = []
+    costs = np.empty(0)
     accepted = np.empty(0, int)
     for start in range(0, batch * max_batches, batch):
         drawn.append(candidates(key, space, np.arange(start, start + batch)))

@@ -17,7 +17,9 @@ from codesign_jax.scene.primitives import PRIMITIVES
 from codesign_jax.scene.tables import Fixture
 from codesign_jax.types import Tip
 
-FINGER, OBJECT, PALM = (0.36, 0.57, 0.80), (0.95, 0.58, 0.20), (0.36, 0.38, 0.43)
+FINGER = (0.36, 0.57, 0.80)
+OBJECT = (0.95, 0.58, 0.20)
+PALM = (0.36, 0.38, 0.43)
 FIXTURE = (0.62, 0.60, 0.55)
 _MOST_FACES = 40_000
 """Faces of an object's mesh above which a coarser one is drawn: pages are to stay small."""
@@ -46,7 +48,8 @@ class Motion(NamedTuple):
 
 def parts(scene: Scene, grasp: Replay) -> list[Part]:
     """Meshes of fingers, palm and object; bodies are numbered as in MuJoCo's model."""
-    lay, palm = model.layout(scene), scene.hand.palm
+    lay = model.layout(scene)
+    palm = scene.hand.palm
     found = [_finger(scene, grasp, f, lay) for f in range(scene.num_fingers)]
     disc = PRIMITIVES["cylinder"].triangles((palm.radius, palm.thickness / 2))
     disc.apply_translation([0, 0, palm.thickness / 2])
@@ -67,7 +70,8 @@ def motion(scene: Scene, grasp: Replay, *, rate: float = 25.0) -> Motion:
 def poses(scene: Scene, grasp: Replay, qpos: np.ndarray) -> np.ndarray:
     """Poses of all bodies at these positions, by MuJoCo's kinematics; see `Motion`."""
     compiled = model.compile_model(scene, grasp.params, grasp.trial)
-    data, found = mujoco.MjData(compiled), []
+    data = mujoco.MjData(compiled)
+    found = []
     for q in qpos:
         data.qpos[:] = q
         mujoco.mj_kinematics(compiled, data)
@@ -97,7 +101,8 @@ def vertices(part: Part, pose: np.ndarray) -> np.ndarray:
     turn = np.zeros((len(pose), 9))
     for body, quat in enumerate(pose[:, 3:]):
         mujoco.mju_quat2Mat(turn[body], quat.astype(float))
-    turn, place = turn.reshape(-1, 3, 3), pose[:, :3]
+    turn = turn.reshape(-1, 3, 3)
+    place = pose[:, :3]
     moved = [
         place[b] + np.einsum("vij,vj->vi", turn[b], local)
         for b, local in zip(part.body.T, (part.first, part.second), strict=True)
@@ -106,10 +111,12 @@ def vertices(part: Part, pose: np.ndarray) -> np.ndarray:
 
 
 def _finger(scene: Scene, grasp: Replay, f: int, lay: model.Layout) -> Part:
-    length, height = float(grasp.params.length[f]), float(grasp.params.height[f])
+    length = float(grasp.params.length[f])
+    height = float(grasp.params.height[f])
     tip = grasp.params.tip
     tip = None if tip is None else Tip(*(float(v[f]) for v in tip))
-    mesh, straight = hull.hull(scene), hull.rest(scene, length, height, tip=tip)
+    mesh = hull.hull(scene)
+    straight = hull.rest(scene, length, height, tip=tip)
     along = np.zeros((2, *straight.shape))
     along[..., 0] = hull.link_origins(scene, length)[mesh.link.T]
     bodies = np.array([lay.stubs[f], *lay.bodies[f]])
@@ -144,6 +151,7 @@ def _coarse(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
         )
         faces = merged.ravel()[faces]
         sides = np.roll(faces, 1, axis=1)
-        vertices, faces = vertices[index], faces[(faces != sides).all(1)]
+        vertices = vertices[index]
+        faces = faces[(faces != sides).all(1)]
         cells = cells * 3 // 4
     return vertices, faces

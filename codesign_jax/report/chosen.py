@@ -13,7 +13,8 @@ from codesign_jax.statistics import wilson
 
 def design(run: Run) -> str:
     """The verdict on the design, its parameters within their ranges, and its trials by object."""
-    chosen, judged = run.chosen, run.judged
+    chosen = run.chosen
+    judged = run.judged
     source = "the final test" if chosen.tested else "its last episode (there was no final test)"
     note = (
         f"Particle {chosen.particle}, chosen as the best by {source}, which flatters it: "

@@ -19,7 +19,8 @@ from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import WARNINGS, Forces, Status
 
-_BLUE, _ORANGE = "tab:blue", "tab:orange"
+_BLUE = "tab:blue"
+_ORANGE = "tab:orange"
 _COLUMNS = 3  # of the grid of parameters
 
 
@@ -85,7 +86,9 @@ def landscape(found: Landscape) -> matplotlib.figure.Figure:
     axes = figure.add_subplot()
     _landscape(axes, found)
     lines = ((CONVERGED_COST, _ORANGE, "--"), (SUCCESS_COST, "tab:red", "-"))
-    x, y, cost = found.first, found.second, found.cost.T
+    x = found.first
+    y = found.second
+    cost = found.cost.T
     for level, color, style in lines:
         if cost.min() < level <= cost.max():
             axes.contour(x, y, cost, [level], colors=color, linestyles=style, linewidths=1.2)
@@ -189,7 +192,8 @@ def failures(status: np.ndarray) -> matplotlib.figure.Figure:
     """
     figure = _figure(6.4, 2.8)
     axes = figure.add_subplot()
-    episode, below = np.arange(1, len(status) + 1), np.zeros(len(status))
+    episode = np.arange(1, len(status) + 1)
+    below = np.zeros(len(status))
     for bit in (b for b in Status if b and b not in WARNINGS):
         count = ((status & bit) != 0).sum((1, 2))
         if count.any():

@@ -31,7 +31,8 @@ class Landscape(NamedTuple):
 
 def save(found: Landscape, folder: Path) -> list[Path]:
     """Writes a landscape as arrays and as a table of its points; returns the files."""
-    npz, table = folder / FILE, folder / TABLE
+    npz = folder / FILE
+    table = folder / TABLE
     store.save(npz, found._asdict())
     axes = [
         f"{n}_{u}".rstrip("_").replace("[", "_").replace("]", "")

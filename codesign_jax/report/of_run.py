@@ -41,6 +41,7 @@ class Run(NamedTuple):
     @property
     def history(self) -> History:
         """Reports of the finished episodes."""
-        h, done = self.record.history, self.record.done
+        h = self.record.history
+        done = self.record.done
         trials = jax.tree.map(lambda v: v[:done], h.outcomes)
         return History(h.population[:done], trials, *(v[:done] for v in h[2:]))

@@ -45,7 +45,9 @@ def write(run: Run, grasp: tuple[Grasp, Replay] | None, path: Path) -> Path:
 
 
 def _summary(run: Run) -> str:
-    scene, s, record = run.scene, run.settings, run.record
+    scene = run.scene
+    s = run.settings
+    record = run.record
     objects = ", ".join(f"{o.name} ({o.type}, {1000 * o.mass:.0f} g)" for o in scene.objects.object)
     fingers = f"{scene.num_fingers} fingers of {scene.discretization.links} links"
     done = f"{record.done} of {s.episodes} episodes"
@@ -134,13 +136,16 @@ def _parameters(run: Run) -> str:
 
 
 def _landscape(run: Run) -> str:
-    path, space = run.folder / landscape.FILE, run.space
+    path = run.folder / landscape.FILE
+    space = run.space
     found = landscape.load(path) if path.exists() else None
-    words, command = "A dot is a particle of any episode, coloured by its cost. ", []
+    words = "A dot is a particle of any episode, coloured by its cost. "
+    command = []
     if found is None:
         if space.num_parameters != 2:
             return ""
-        words, command = words + "The whole landscape: ", ["landscape", "--run", str(run.folder)]
+        words = words + "The whole landscape: "
+        command = ["landscape", "--run", str(run.folder)]
         figure = figures.designs(run.history, space, run.chosen.design, None)
     else:
         grey = f"the mean cost over {int(found.trials)} trials a point, white where all are kept."
@@ -158,7 +163,8 @@ def _landscape(run: Run) -> str:
 
 def _failures(run: Run) -> str:
     status = np.asarray(run.history.outcomes.status)
-    failed, total = int(types.failed(status).sum()), status.size
+    failed = int(types.failed(status).sum())
+    total = status.size
     rule = (
         "are left out of a particle's mean"
         if run.scene.cost.failure == "exclude"
@@ -180,7 +186,8 @@ def _failures(run: Run) -> str:
 
 
 def _provenance(run: Run) -> str:
-    p, e = run.provenance, run.provenance["environment"]
+    p = run.provenance
+    e = run.provenance["environment"]
     git = p.get("git", {})
     commit = git.get("commit") or "not a checkout"
     rows = [("commit", commit + (" with changes" if git.get("modified") else ""))]

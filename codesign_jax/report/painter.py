@@ -19,8 +19,12 @@ from codesign_jax.scene import Scene
 _FIELD = 45.0  # MuJoCo's vertical field of view [deg]
 _SMOOTH = 2  # pixels of a side that become one
 _EDGE = 0.02  # longest edge of a triangle [m]: larger ones would stand before others as a whole
-_SKY, _TABLE, _SHADOW = (232, 238, 246), ((219, 214, 204), (204, 199, 189)), (150, 146, 139)
-_REACH, _SQUARE = 0.6, 0.05  # half side of the table, and the side of its squares [m]
+_SKY = (232, 238, 246)
+_TABLE = ((219, 214, 204), (204, 199, 189))
+_SHADOW = (150, 146, 139)
+# half side of the table, and the side of its squares [m]
+_REACH = 0.6
+_SQUARE = 0.05
 _LIGHT = np.array([0.15, -0.25, -1.0])  # the direction in which light falls
 
 
@@ -55,12 +59,14 @@ def paint(
     table = scene.effects.table and view.eye[2] > 0
     if table:
         _paint_table(ImageDraw.Draw(empty), view)
-    picture, before = None, np.zeros(0)
+    picture = None
+    before = np.zeros(0)
     for pose in bodies.poses(scene, grasp, qpos):
         if picture is not None and np.array_equal(pose, before):  # one that was lost stands still
             yield picture
             continue
-        image, before = empty.copy(), pose
+        image = empty.copy()
+        before = pose
         corners = [bodies.vertices(part, pose)[part.face] for part in parts]
         colors = np.repeat([part.color for part in parts], [*map(len, corners)], 0)
         _paint(ImageDraw.Draw(image), view, np.concatenate(corners), colors, shadows=table)

@@ -69,7 +69,8 @@ class Judged(NamedTuple):
 
 def objects(scene: Scene) -> str:
     """What a verdict holds for, such as "objects of 50 g, friction 0.85"."""
-    shapes, noise = scene.objects.object, scene.objects.noise
+    shapes = scene.objects.object
+    noise = scene.objects.noise
     masses = [1e3 * float(shape.mass) for shape in shapes]
     masses += [mass * float(noise.mass_range) for mass in masses]
     text = f"objects of {_span(masses)} g"
@@ -113,7 +114,8 @@ def solver(outcomes: Outcome) -> list[str]:
         return []
     text = f"solver: {100 * shares.mean():.2g} % of the steps ended at the limit of iterations"
     if residuals.size:
-        middle, most = np.median(residuals), residuals.max()
+        middle = np.median(residuals)
+        most = residuals.max()
         text += f"; largest residual of a trial: median {middle:.2g}, most {most:.2g} weights"
     return [text]
 
@@ -126,7 +128,8 @@ def _told(values: Any) -> np.ndarray:
 
 def warnings(judged: Judged) -> list[str]:
     """Says in a line that many trials failed, and what may be done about it; no line if few did."""
-    scene, found = judged.scene, tally(judged.outcomes)
+    scene = judged.scene
+    found = tally(judged.outcomes)
     count = found.not_released + found.failed
     if count <= MANY * found.total or found.failed == found.total:
         return []

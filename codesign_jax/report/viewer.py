@@ -92,7 +92,8 @@ def write(scene: Scene, grasp: Replay, path: Path, *, title: str, text: list[str
 
 def data(scene: Scene, grasp: Replay) -> dict[str, Any]:
     """What web/replay.js reads of a grasp, of JSON's types."""
-    motion, parts = bodies.motion(scene, grasp), bodies.parts(scene, grasp)
+    motion = bodies.motion(scene, grasp)
+    parts = bodies.parts(scene, grasp)
     frames, count = motion.pose.shape[:2]
     return {
         "parts": [_part(part) for part in parts],

@@ -41,7 +41,8 @@ _MOST_LOGGED = 300
 def _logged(record: logging.LogRecord) -> bool:
     """Has a message of Orbax's in one line; whether it is to be logged."""
     text = record.getMessage()
-    record.msg, record.args = terminal.line(text)[:_MOST_LOGGED], None
+    record.msg = terminal.line(text)[:_MOST_LOGGED]
+    record.args = None
     # Its threads log the traceback of an error that `Checkpoints.save` raises.
     return "_SignalingThread" not in text
 
@@ -89,7 +90,8 @@ class Checkpoints:
             # Not by orbax, which begins a thread for it and does not wait for that when it closes.
             for left in self.folder.glob(f"*{_TEMPORARY}*"):
                 files.remove(left)
-        self._tell, self._run = tell, run
+        self._tell = tell
+        self._run = run
         self._opened: Any = None
 
     @property
@@ -112,7 +114,8 @@ class Checkpoints:
         self._close()
 
     def _close(self) -> None:
-        opened, self._opened = self._opened, None
+        opened = self._opened
+        self._opened = None
         try:
             if opened is not None:
                 opened.close()
@@ -227,9 +230,12 @@ class Checkpoints:
         if label is None and self._run is None:
             return
         try:
-            run, own = bytes(label["id"]).hex(), int(label["step"])  # type: ignore[index]
+            # type: ignore[index]
+            run = bytes(label["id"]).hex()
+            own = int(label["step"])
         except (KeyError, TypeError, ValueError):
-            run, own = None, step
+            run = None
+            own = step
         if run != self._run:
             raise self._foreign(step, "of another run")
         if own != step:

@@ -150,7 +150,8 @@ def departure(scene: Scene, found: Outcome, ctrl: jax.Array, planned: jax.Array)
         pressures [Pa].
       planned: Those of the key frames, of the same shape.
     """
-    steps, h = ctrl.shape[1], scene.discretization.timestep
+    steps = ctrl.shape[1]
+    h = scene.discretization.timestep
     end = jnp.where(found.bad_step < 0, steps, found.bad_step)
     end = jnp.minimum(end, jnp.where(jnp.isfinite(found.lost_time), found.lost_time / h, steps))
     counts = np.arange(steps) < end[:, None]
@@ -161,7 +162,8 @@ def departure(scene: Scene, found: Outcome, ctrl: jax.Array, planned: jax.Array)
     size = jnp.maximum(jnp.maximum(place, turn), 1e-5 * jnp.abs(pressure).max(-1))
     moved = size > LEAST
     first = jnp.where(moved.any(1), moved.argmax(1) * h, jnp.inf)
-    lower, higher = (jnp.minimum(pressure, 0).min((1, 2)), jnp.maximum(pressure, 0).max((1, 2)))
+    lower = jnp.minimum(pressure, 0).min((1, 2))
+    higher = jnp.maximum(pressure, 0).max((1, 2))
     return Departure(first, lower, higher, place.max(1), turn.max(1))
 
 
@@ -214,7 +216,8 @@ def choose(scene: Scene, record: Record) -> Chosen:
     """
     history = record.history
     if record.test is None:
-        episode, row = record.done - 1, int(history.cost[record.done - 1].argmin())
+        episode = record.done - 1
+        row = int(history.cost[record.done - 1].argmin())
         if (history.ancestors[: record.done] < 0).any():
             episode, row = _place(record, 0)
         trials = jax.tree.map(lambda v: v[episode, row], history.outcomes)

@@ -60,7 +60,9 @@ OF_DESIGNS = {"chamber_volume_cm3": ("float32", "cm^3", "air in all unloaded cha
 MAY_BE_EMPTY = ("first_bad_step", "steps_at_limit", "residual")
 """Those of `GRASPS` whose values may be missing."""
 
-SEEDS, LANDSCAPE, REFERENCE = "seeds.csv", "landscape.csv", "reference.csv"
+SEEDS = "seeds.csv"
+LANDSCAPE = "landscape.csv"
+REFERENCE = "reference.csv"
 MORE = {
     SEEDS: CsvTable(
         (

@@ -54,7 +54,8 @@ class Question:
     @functools.cached_property
     def described(self) -> dict[str, Any]:
         """What determines the outcomes, beside versions and machine; of JSON's types."""
-        texts, every = scene_texts(self.scene), contents(self.scene)
+        texts = scene_texts(self.scene)
+        every = contents(self.scene)
         meshes = [hashlib.sha256(every[name]).hexdigest() for name in sorted({*every} - {*texts})]
         # What code that is not known has simulated is no part of anything else.
         code = reuse.code_digest() or f"unknown {uuid.uuid4()}"
@@ -63,7 +64,8 @@ class Question:
 
     def drawn(self, shard: int) -> Drawn:
         """Designs and trials of a shard, NumPy arrays."""
-        first, key = shard * self.chunk, jax.random.key(self.seed)
+        first = shard * self.chunk
+        key = jax.random.key(self.seed)
         sizes = {"n": self.chunk, "num_trials": self.trials}
         found = sampling.draw(self.scene, self.space, key, first=np.int32(first), **sizes)
         return jax.tree.map(np.asarray, found)
@@ -91,7 +93,8 @@ class Shards:
 
     def refuse_other(self, question: Question) -> None:
         """Refuses what is there if it is of another question, or no part of a data set."""
-        part, before = self.folder, self.question
+        part = self.folder
+        before = self.question
         if part.exists() and before is None and not (part.is_dir() and {*self.names} <= {LOCK}):
             raise InputError([f"{part} is no part of a data set; choose another --out"])
         others = [n for n, v in question.described.items() if before and before.get(n) != v]
@@ -139,7 +142,8 @@ def _schema(pa: ModuleType, space: DesignSpace, notes: dict[str, Any]) -> Any:
     for name, (kind, unit, text) in GRASPS.items():
         named = pa.dictionary(pa.int16(), pa.string())
         about = {"description": text} | ({"unit": unit} if unit else {})
-        own, empty = named if kind == "name" else getattr(pa, kind)(), name in MAY_BE_EMPTY
+        own = named if kind == "name" else getattr(pa, kind)()
+        empty = name in MAY_BE_EMPTY
         fields.append(pa.field(name, own, nullable=empty, metadata=about))
     for column, name, unit in zip(design_columns(space), space.names, space.units, strict=True):
         about = {"description": "the design", "unit": unit, "parameter": name}
@@ -166,7 +170,8 @@ def _table(pa: ModuleType, schema: Any, columns: dict[str, Any], shape: tuple[in
 
 def rows(question: Question, shard: int, drawn: Drawn, found: Outcome) -> dict[str, Any]:
     """Values of the columns for a shard, arrays that broadcast to (design, trial)."""
-    trials, status = drawn.trials, np.asarray(found.status)
+    trials = drawn.trials
+    status = np.asarray(found.status)
     texts, index = np.unique(status, return_inverse=True)
     bad_step = np.asarray(found.bad_step)
     values = {
@@ -196,7 +201,9 @@ def write(path: Path, question: Question, designs: int, outcomes: Shards) -> Non
     notes = {"question": question.described, "designs": designs, "environment": environment()}
     notes |= {"status_bits": {str(int(bit)): bit.name for bit in Status if bit}}
     schema = _schema(pa, question.space, notes)
-    shape, left, group = (question.chunk, question.trials), designs * question.trials, []
+    shape = (question.chunk, question.trials)
+    left = designs * question.trials
+    group = []
     with (
         files.atomically(path) as temporary,
         pa.parquet.ParquetWriter(temporary, schema, compression="zstd") as writer,

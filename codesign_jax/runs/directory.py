@@ -75,7 +75,9 @@ def open_run(
     with locked(path):
         # Again: another process may have been here.
         check_folder(path, scene, settings, fresh=fresh)
-        contents, run, notes = _contents(scene, settings), RunDirectory(path), []
+        contents = _contents(scene, settings)
+        run = RunDirectory(path)
+        notes = []
         if fresh:
             _delete_run(path)
         created = not (path / PROVENANCE).exists()
@@ -161,7 +163,8 @@ def _contents(scene: Scene, settings: Settings) -> dict[str, bytes]:
 
 
 def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str, Any]) -> None:
-    problems, extension = [], []
+    problems = []
+    extension = []
     for name, value in dataclasses.asdict(settings).items():
         stood = stored["settings"].get(name, "")
         if name == "episodes":

@@ -32,7 +32,9 @@ def save(folder: Path, episode: int, info: EpisodeInfo) -> list[Path]:
     """Saves an episode's first failed worlds, a file each; returns the files."""
     # From the device as a whole: to index there would be a program for each number.
     info = jax.tree.map(np.asarray, info)
-    status, trials, files = info.outcomes.status, info.drawn, []
+    status = info.outcomes.status
+    trials = info.drawn
+    files = []
     for p, t in np.argwhere(types.failed(status))[:MOST]:
         trial = jax.tree.map(lambda v, t=t: v[t], trials)
         state = np.zeros(0) if info.last is None else info.last[p, t]
@@ -58,7 +60,8 @@ def load(path: Path) -> Failure:
         drawn = [n for n in Trial._fields if n != "tilt" or "trial_tilt" in values]
         trial = Trial(**{name: values[f"trial_{name}"] for name in drawn})
         place = tuple(int(v) for v in values["place"])
-        status, bad_step = int(values["status"]), int(values["bad_step"])
+        status = int(values["status"])
+        bad_step = int(values["bad_step"])
         return Failure(values["design"], trial, values["state"], status, bad_step, place)  # type: ignore[arg-type]
     except (OSError, ValueError, KeyError, TypeError) as error:
         problem = f"{path} is not a failed world of a run, which are .npz files in its {FOLDER}/"

@@ -117,13 +117,15 @@ def prepare(scene: Scene, settings: Settings) -> Plan:
     Raises:
       InputError: If an optimiser, a cost or a policy of the user's own is none; see `own`.
     """
-    space, mask = design_space(scene.hand, settings.preset), masks_of(scene, settings)
+    space = design_space(scene.hand, settings.preset)
+    mask = masks_of(scene, settings)
     engine = make_engine(settings.engine, scene)
     if settings.policy:
         engine = ControlLoop(engine, own.make_policy(settings.policy, scene)[0])
     n = settings.particles
     optimizer = codesign.make_optimizer(settings.optimizer, space, num_particles=n)
-    task, key = Task(scene, space, settings.trials, engine), jax.random.key(settings.seed)
+    task = Task(scene, space, settings.trials, engine)
+    key = jax.random.key(settings.seed)
     if settings.cost != SCENE_COST:
         cost, stops = own.make_cost(settings.cost, scene)
         how = {"record_qpos": not stops, "stop_when_lost": stops}
@@ -144,7 +146,8 @@ def variant(plan: Plan, settings: Settings) -> Plan:
     free = {name: getattr(settings, name) for name in ("seed", "schedule", "first")}
     if dataclasses.replace(plan.settings, **free) != settings:
         raise ValueError(f"{settings} differs from {plan.settings} in more than {[*free]}")
-    mask, key = masks_of(plan.scene, settings), jax.random.key(settings.seed)
+    mask = masks_of(plan.scene, settings)
+    key = jax.random.key(settings.seed)
     return plan._replace(settings=settings, mask=mask, key=key)
 
 
@@ -170,13 +173,18 @@ class Loop:
         every: int = 1,
     ):
         """Takes the run, its open folder and checkpoints, what to tell, and episodes per save."""
-        self.plan, self.run_directory, self.store = plan, run, store
-        self.progress, self._every, self._saved = progress, every, 0
+        self.plan = plan
+        self.run_directory = run
+        self.store = store
+        self.progress = progress
+        self._every = every
+        self._saved = 0
         self._unsaved: Callable[[], None] | None = None
 
     def run(self) -> Generator[Request, tuple[State, EpisodeInfo], RunResult]:
         """Runs what is left of the run; to stop it, `Stopped` is thrown in."""
-        record, signum = self._restore(), 0
+        record = self._restore()
+        signum = 0
         try:
             if record is None:
                 record = yield from self._seed()
@@ -202,7 +210,8 @@ class Loop:
         whoever drives it may ask for it while that episode is simulated. It asks nothing of the
         devices, which are busy then.
         """
-        unsaved, self._unsaved = self._unsaved, None
+        unsaved = self._unsaved
+        self._unsaved = None
         if unsaved is not None:
             unsaved()
 
@@ -218,13 +227,15 @@ class Loop:
                 self._say(f"checkpoint {step} is lost: {reason}; the run begins anew")
             self.store.discard([step for step, _ in found.damaged])
             return None
-        record, self._saved = records.from_arrays(found.arrays), found.step
+        record = records.from_arrays(found.arrays)
+        self._saved = found.step
         plan = self.plan
         records.refuse_other(record, plan.settings)
         for step, reason in found.damaged:
             self._say(f"checkpoint {step} is lost: {reason}; using an older one")
         self.store.discard([step for step, _ in found.damaged])
-        done, total = record.done, plan.settings.episodes
+        done = record.done
+        total = plan.settings.episodes
         if done < total and record.test is not None:
             # The run was extended: its test was of particles that are no longer final, and the next
             # episode takes the step of that test.
@@ -239,12 +250,14 @@ class Loop:
         return record
 
     def _seed(self) -> Generator[Request, tuple[State, EpisodeInfo], Record]:
-        plan, settings = self.plan, self.plan.settings
+        plan = self.plan
+        settings = self.plan.settings
         if needs_poor_seed(plan):
             start = yield from self._poor_seed()
             seed = start.design
         else:
-            start, seed = None, optimize.candidates(plan.key, plan.optimizer.space, [0])[0]
+            start = None
+            seed = optimize.candidates(plan.key, plan.optimizer.space, [0])[0]
         state = plan.optimizer.init(plan.key, seed, settings.particles)
         history = records.empty_history(settings, plan.space.num_parameters)
         record = Record(state, history, start=start)
@@ -252,7 +265,8 @@ class Loop:
         return record
 
     def _poor_seed(self) -> Generator[Request, tuple[State, EpisodeInfo], Start]:
-        plan, batch = self.plan, self.plan.settings.particles
+        plan = self.plan
+        batch = self.plan.settings.particles
         search = codesign.seed_search(plan.scene, plan.optimizer, plan.key, batch=batch)
         self.progress.begin("looking for a poor seed")
         try:
@@ -313,7 +327,8 @@ class Loop:
             self.run_directory.log(f"failed world: codesign replay {path}")
 
     def _test(self, record: Record) -> Asking:
-        plan, settings = self.plan, self.plan.settings
+        plan = self.plan
+        settings = self.plan.settings
         if self._tested(record):
             return
         # Outcomes by which the best particles so far were chosen are too good to count.
@@ -336,7 +351,8 @@ class Loop:
         self._say(f"final test: {batch * settings.test_rounds} grasps")
 
     def _report(self, history: History, e: int) -> None:
-        status, cost = history.outcomes.status[e], history.cost[e]
+        status = history.outcomes.status[e]
+        cost = history.cost[e]
         ends = tables.failure_counts(status), tables.warning_counts(status)
         failed = int(types.failed(status).sum())
         report = Report(e + 1, float(cost.mean()), float(cost.min()), failed, status.size, *ends)
@@ -347,14 +363,16 @@ class Loop:
         self._saved = step
 
     def _write_tables(self, record: Record, start: int) -> None:
-        plan, folder = self.plan, self.run_directory.path
+        plan = self.plan
+        folder = self.run_directory.path
         tables.write_episodes(folder, plan.scene, plan.space, record.history, start, record.done)
         test = _final_test(plan, record)
         if test is not None:
             tables.write_tests(folder, plan.space, np.asarray(record.state.particles), test)
 
     def _mend_tables(self, record: Record) -> None:
-        plan, folder = self.plan, self.run_directory.path
+        plan = self.plan
+        folder = self.run_directory.path
         mended = tables.mend(folder, plan.scene, plan.space, record, _final_test(plan, record))
         if mended and record.done:
             names = ", ".join(mended)
@@ -370,7 +388,8 @@ def finalists(plan: Plan, particles: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
     They are all of them, unless the optimiser says that few differ, and so few do.
     """
-    every, most = len(particles), plan.finalists
+    every = len(particles)
+    most = plan.finalists
     _, first, same = np.unique(particles, axis=0, return_index=True, return_inverse=True)
     if most >= every or len(first) > most:
         return particles, np.arange(every)

@@ -108,7 +108,10 @@ class Meter(Live):
     def __init__(self, text: str, total: int, console: Console, *, later: float = 0.0):
         columns = rich.progress.Progress.get_default_columns()[1:-1]
         super().__init__(console, _description(), *columns, rich.progress.TimeRemainingColumn())
-        self.total, self.done, self._name, self._compiled = total, 0, text, None
+        self.total = total
+        self.done = 0
+        self._name = text
+        self._compiled = None
         self.later = later
         self.begin(f"{text}: compiling, then {total} grasps")
 
@@ -120,7 +123,8 @@ class Meter(Live):
     def advance(self, grasps: int) -> None:
         """Counts grasps that were just simulated; the first call compiled, and has no rate."""
         self.found(grasps)
-        now, text = time.monotonic(), f"{self._name}: {self.done} of {self.total} grasps"
+        now = time.monotonic()
+        text = f"{self._name}: {self.done} of {self.total} grasps"
         start, before = self._compiled = self._compiled or (now, self.done)
         if now > start and not self.console.is_terminal:  # the bar says as much
             rate = (self.done - before) / (now - start)
@@ -141,10 +145,15 @@ class Progress(Live):
             _description(),
         )
         super().__init__(Console(), *columns, rich.progress.TimeElapsedColumn())
-        self.total, self._test, self._after = total, runs * test, runs * after
+        self.total = total
+        self._test = runs * test
+        self._after = runs * after
         self._reports: list[Report] = []
-        self._seconds, self._grasps = 0.0, 0.0
-        self._part, self._tested, self._done = 0, 0, 0
+        self._seconds = 0.0
+        self._grasps = 0.0
+        self._part = 0
+        self._tested = 0
+        self._done = 0
 
     def add(self, report: "Report") -> None:
         """Takes a run's report of an episode for the line of this round."""
@@ -156,12 +165,15 @@ class Progress(Live):
 
     def round(self, seconds: float) -> None:
         """Tells of a round that took so long: its episodes in a line, or its part of the test."""
-        reports, self._reports = self._reports, []
-        tested, self._part = self._part, 0
+        reports = self._reports
+        self._reports = []
+        tested = self._part
+        self._part = 0
         self._tested += tested
         left = max(self._test - self._tested, 0) + self._after
         if reports:
-            grasps, first = sum(r.grasps for r in reports), min(r.done for r in reports)
+            grasps = sum(r.grasps for r in reports)
+            first = min(r.done for r in reports)
             pace = self._pace(grasps + tested, seconds, left + (self.total - first) * grasps)
             self.message(f"{self._line(reports, first, grasps)}  {pace}")
             self._bar.update(self._task, description=pace)
@@ -173,7 +185,8 @@ class Progress(Live):
     def _line(self, reports: "list[Report]", first: int, grasps: int) -> str:
         if len(reports) == 1:
             return reports[0].line(self.total)
-        last, failed = max(r.done for r in reports), sum(r.failed for r in reports)
+        last = max(r.done for r in reports)
+        failed = sum(r.failed for r in reports)
         means, bests = ([getattr(r, k) for r in reports] for k in ("mean", "best"))
         count = f"{first:>{len(str(self.total))}}" + (f" to {last}" if last > first else "")
         return (
@@ -187,7 +200,8 @@ class Progress(Live):
         self._done += grasps
         self._bar.update(self._task, completed=self._done, total=self._done + left)
         # A search begins with hands that lose their objects, which ends a grasp early.
-        self._seconds, self._grasps = 0.8 * self._seconds + seconds, 0.8 * self._grasps + grasps
+        self._seconds = 0.8 * self._seconds + seconds
+        self._grasps = 0.8 * self._grasps + grasps
         rate = self._grasps / max(self._seconds, 1e-9)
         return f"{rate:.1f} grasps/s  ETA {duration(left / rate)}"
 
@@ -214,8 +228,10 @@ class Voice:
     """What one of the runs says; its name precedes its messages where there are several."""
 
     def __init__(self, progress: Progress, name: str = ""):
-        self._progress, self._name = progress, f"{name}: " if name else ""
-        self.begin, self.tested = progress.begin, progress.tested
+        self._progress = progress
+        self._name = f"{name}: " if name else ""
+        self.begin = progress.begin
+        self.tested = progress.tested
 
     def message(self, text: str) -> None:
         self._progress.message(f"{self._name}{text}")

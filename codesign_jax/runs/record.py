@@ -38,12 +38,15 @@ class Start(NamedTuple):
 
 def empty_history(settings: Settings, num_parameters: int) -> History:
     """Returns a history with room for all episodes of a run."""
-    e, n, t = settings.episodes, settings.particles, settings.trials
+    e = settings.episodes
+    n = settings.particles
+    t = settings.trials
 
     def trials(dtype: type) -> np.ndarray:
         return np.zeros((e, n, t), dtype)
 
-    real, whole = np.float32, np.int32
+    real = np.float32
+    whole = np.int32
     return History(
         population=np.zeros((e, n, num_parameters), real),
         outcomes=Outcome(
@@ -107,7 +110,8 @@ class Record:
 
 def to_arrays(record: Record) -> dict:
     """Returns a record as nested dictionaries of NumPy arrays."""
-    s, h = record.state, record.history
+    s = record.state
+    h = record.history
     state = {"particles": s.particles, "episode": s.episode, "key": jax.random.key_data(s.key)}
     if s.memory is not None:
         state["memory"] = s.memory
@@ -125,7 +129,8 @@ def to_arrays(record: Record) -> dict:
 def from_arrays(arrays: dict) -> Record:
     """Inverse of `to_arrays`; the history is copied, so that `add_report` may write to it."""
     try:
-        s, h = arrays["state"], jax.tree.map(np.array, arrays["history"])
+        s = arrays["state"]
+        h = jax.tree.map(np.array, arrays["history"])
         key = jax.random.wrap_key_data(jnp.asarray(s["key"]))
         memory = jax.tree.map(jnp.asarray, s.get("memory"))
         state = State(jnp.asarray(s["particles"]), jnp.asarray(s["episode"]), key, memory)
@@ -142,7 +147,8 @@ def from_arrays(arrays: dict) -> Record:
 
 def _shapes(record: Any, settings: Settings) -> Iterator[tuple[str, Any, tuple]]:
     """Arrays of a record by name, and the shapes that they have in a run of these settings."""
-    history, state = record.history, record.state
+    history = record.history
+    state = record.state
     e, n, t = np.shape(history.outcomes.cost)
     p = np.shape(state.particles)[-1]
     yield "particles", state.particles, (settings.particles, p)
@@ -185,7 +191,8 @@ def _problem(record: Record, settings: Settings) -> str:
                 return name
     except (AttributeError, IndexError, TypeError, ValueError):
         return "cost"
-    ancestors, rooms = record.history.ancestors, len(record.history.cost)
+    ancestors = record.history.ancestors
+    rooms = len(record.history.cost)
     if not 0 <= record.done <= rooms:
         return "episode"
     if ancestors.size and not (-1 <= ancestors.min() and ancestors.max() < settings.particles):

@@ -52,7 +52,8 @@ def contents(scene: Scene) -> dict[str, bytes]:
 
 def digest(scene: Scene, engine: str, designs: np.ndarray, *numbers: int) -> str:
     """Digest of what determines outcomes, beside code, versions and device."""
-    shape, content = designs.shape, np.ascontiguousarray(designs).tobytes()
+    shape = designs.shape
+    content = np.ascontiguousarray(designs).tobytes()
     return reuse.digest(scene_texts(scene), engine, shape, content, numbers)
 
 
@@ -74,7 +75,8 @@ def _mesh_name(shape: Shape, index: int) -> str:
 
 
 def _document(table: dict[str, Any], units: dict[str, str]) -> str:
-    lines, place = [], ""
+    lines = []
+    place = ""
     for line in tomli_w.dumps(table).split("\n")[:-1]:  # texts may hold other ends of lines
         if header := re.fullmatch(r"\[+(.*?)\]+", line):
             place = header[1] + "."

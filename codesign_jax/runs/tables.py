@@ -39,7 +39,8 @@ def write_episodes(
 ) -> None:
     """Writes the rows of episodes start to stop: replaces the files if start is 0, else appends."""
     for name, rows in _of_episodes(scene, space, history, range(start, stop)).items():
-        path, text = folder / name, _text(name, space, rows, named=start == 0)
+        path = folder / name
+        text = _text(name, space, rows, named=start == 0)
         if start == 0:
             _replace(path, text)
         else:
@@ -100,7 +101,8 @@ def noise_values(trials: Trial) -> dict[str, Any]:
 
 def write_grasps(path: Path, scene: Scene, trials: Trial, outcomes: Outcome) -> None:
     """Writes a design's trials with their noise and how they ended, a row each."""
-    names, noise = [s.name for s in scene.objects.object], noise_values(trials)
+    names = [s.name for s in scene.objects.object]
+    noise = noise_values(trials)
 
     def row(t: int) -> Row:
         one = jax.tree.map(lambda v: np.asarray(v)[t], outcomes)
@@ -197,7 +199,8 @@ def _particles(history: History, space: DesignSpace, span: range) -> Iterator[Ro
 
 
 def _trials(history: History, scene: Scene, span: range) -> Iterator[Row]:
-    names, trials = [s.name for s in scene.objects.object], history.outcomes
+    names = [s.name for s in scene.objects.object]
+    trials = history.outcomes
     for e in span:
         for i, t in np.ndindex(*trials.cost.shape[1:]):
             own = {"episode": e + 1, "particle": i, "trial": t, "object": names[t % len(names)]}

@@ -133,8 +133,11 @@ class _Together:
         interrupts: Interrupts,
         batch: Batch,
     ):
-        self.plan, self.loops, self.progress = plan, loops, progress
-        self.interrupts, self.seconds = interrupts, 0.0
+        self.plan = plan
+        self.loops = loops
+        self.progress = progress
+        self.interrupts = interrupts
+        self.seconds = 0.0
         self.batch = batch
         self.waiting: dict[Path, tuple[Generator, Request]] = {}
         self.found: dict[Path, RunResult | Exception] = {}
@@ -173,12 +176,14 @@ class _Together:
     def _compile(self) -> None:
         """Compiles apart from the first round, so that its time is not an episode's."""
         request = next(iter(self.waiting.values()))[1]
-        wanted, start = self.progress.text, time.perf_counter()
+        wanted = self.progress.text
+        start = time.perf_counter()
         self.progress.begin("compiling")
         self.interrupts.call(self.batch.compile, request, len(self.waiting))
         if test := self._test(request):
             self.interrupts.call(self.batch.compile, test, len(self.waiting))
-        count, engine = len(self.batch.devices), self.plan.task.engine.name
+        count = len(self.batch.devices)
+        engine = self.plan.task.engine.name
         where = f", {count} devices" if count > 1 else ""
         message = f"compiled in {time.perf_counter() - start:.1f} s (engine {engine}{where})"
         self.progress.message(message)
@@ -187,7 +192,8 @@ class _Together:
             self.loops[folder].run_directory.log(message)
 
     def _test(self, request: Request) -> Request | None:
-        settings, optimizer = self.plan.settings, self.plan.optimizer
+        settings = self.plan.settings
+        optimizer = self.plan.optimizer
         few = self.plan.finalists
         if settings.test_trials == 0 or few == len(request.state.particles):
             return None

@@ -46,14 +46,18 @@ def beam(
         side, G J with J = 4 A_m^2 d / U (Bredt, thin wall; thick walls are up to 25 % stiffer),
         M_p / p = A_c h/2 by virtual work, independent of curvature and load.
     """
-    h, d, w = height, wall, width
-    chamber_width, chamber_height = w - 2 * d, h - 2 * d
+    h = height
+    d = wall
+    w = width
+    chamber_width = w - 2 * d
+    chamber_height = h - 2 * d
     chamber_area = chamber_width * chamber_height
     area = w * h - chamber_area
     second_moment = (w * h**3 - chamber_width * ((h - d) ** 3 - d**3)) / 3
     lateral_centroid = (h * w**3 - chamber_height * chamber_width**3) / 12
     lateral_moment = lateral_centroid + area * (w / 2) ** 2
-    middle_area, perimeter = (w - d) * (h - d), 2 * (w + h - 2 * d)
+    middle_area = (w - d) * (h - d)
+    perimeter = 2 * (w + h - 2 * d)
     torsion_constant = 4 * middle_area**2 * d / perimeter
     return Beam(
         bending=4 * shear_modulus * second_moment,
@@ -82,7 +86,8 @@ def softening(curvature: Any, height: Any, wall: Any, *, width: Any) -> Any:
       wall: Wall thickness d [m], likewise.
       width: Outer width w [m].
     """
-    kappa, inner = curvature * (curvature > 0), height - wall
+    kappa = curvature * (curvature > 0)
+    inner = height - wall
     chamber = width - 2 * wall
 
     def missing(y: Any) -> Any:

@@ -41,7 +41,9 @@ def check(scene: Scene) -> None:
 
 
 def _check(scene: Scene) -> None:
-    ranges, leaves, problems = dict(_paths(schema.ranges(scene))), dict(_paths(scene)), []
+    ranges = dict(_paths(schema.ranges(scene)))
+    leaves = dict(_paths(scene))
+    problems = []
     lengths = {np.shape(v) for v in leaves.values()} - {()}
     for path, value in leaves.items():
         problems += _leaf_problems(path, value, ranges[path], len(lengths) > 1)
@@ -61,7 +63,8 @@ def _paths(tree: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _leaf_problems(path: str, value: Any, expected: schema.Range, mixed: bool) -> list[str]:
-    key, shape = f"scene.{path}", np.shape(value)
+    key = f"scene.{path}"
+    shape = np.shape(value)
     if len(shape) > 1 or (shape and mixed):
         return [f"{key} has shape {shape}: numbers have shape (), or all of them the same (n,)"]
     if isinstance(value, jax.core.Tracer):
@@ -89,7 +92,10 @@ def with_trial(scene: Scene, trial: Trial) -> Scene:
 
     Those are the friction of all contacts, the shear modulus and the masses of fingers and palm.
     """
-    hand, objects, contact, fixtures = scene.hand, scene.objects, scene.contact, scene.fixture
+    hand = scene.hand
+    objects = scene.objects
+    contact = scene.contact
+    fixtures = scene.fixture
     if trial.stiffness is not None:
         material = _scaled(hand.material, trial.stiffness, "shear_modulus")
         hand = dataclasses.replace(hand, material=material)

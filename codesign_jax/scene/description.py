@@ -213,7 +213,8 @@ class Scene(SceneFile):
 @functools.cache
 def _structure(tree: Any) -> Scene:
     bare = jax.tree.unflatten(tree, [0] * tree.num_leaves)
-    step, last = bare.discretization.timestep, PHASES.index(bare._phases[-1])
+    step = bare.discretization.timestep
+    last = PHASES.index(bare._phases[-1])
     time = bare.num_steps * step - bare.phases.settle
     typical = schema.typical(bare)
     ends = {name: time * (i + 1) / (last + 1) for i, name in enumerate(PHASES)}

@@ -99,7 +99,8 @@ def _check_mounts(hand: Hand, where: str, problems: list[str]) -> None:
 
 def _check_table(hand: Hand, where: str, problems: list[str]) -> dict[str, Parameter]:
     """Checks the parameter table; returns by name the rows whose values may be looked at."""
-    names, rows = [p.name for p in hand.parameter], {}
+    names = [p.name for p in hand.parameter]
+    rows = {}
     for name in PARAMETERS:
         if name in TIP and not hand.section.tapered:
             if name in names:
@@ -109,7 +110,8 @@ def _check_table(hand: Hand, where: str, problems: list[str]) -> dict[str, Param
                 f"{where}.parameter {name!r} must be given once, not {names.count(name)} times"
             )
     for p in hand.parameter:
-        path, kind = f"{where}.parameter {p.name}", PARAMETERS[p.name]
+        path = f"{where}.parameter {p.name}"
+        kind = PARAMETERS[p.name]
         unit, factor = UNITS[p.unit]
         if p.per != kind.per:
             problems.append(f"{path}.per must be {kind.per!r}")
@@ -157,7 +159,8 @@ def _by_finger(*values: Numbers) -> Iterator[tuple[str, tuple[float, ...]]]:
 def _check_range(
     path: str, value: Numbers, unit: str, kind: Kind, factor: float, problems: list[str]
 ) -> None:
-    low, high = kind.low / factor, kind.high / factor
+    low = kind.low / factor
+    high = kind.high / factor
     for finger, (number,) in _by_finger(value):
         if problem := schema.range_problem(path + finger, number, unit, low, high):
             problems.append(problem)
@@ -210,7 +213,8 @@ def _check_fixed(path: str, value: Any, row: Parameter, hand: Hand, problems: li
 
 def _check_free(free: Free, row: Parameter, path: str, hand: Hand, problems: list[str]) -> None:
     """A preset may go beyond the table's bounds (the paper's 2D one does) but must make sense."""
-    kind, factor = PARAMETERS[free.name], UNITS[row.unit][1]
+    kind = PARAMETERS[free.name]
+    factor = UNITS[row.unit][1]
     for name, value in (("low", free.low), ("high", free.high)):
         if value is None:
             continue
@@ -293,7 +297,8 @@ def _bounds(
     row: Parameter, preset: Preset, hand: Hand
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Lowest and highest values [SI] that a preset gives a parameter, for each finger."""
-    factor, width = UNITS[row.unit][1], hand.width(row)
+    factor = UNITS[row.unit][1]
+    width = hand.width(row)
     free = next((f for f in preset.free if f.name == row.name), None)
     if free is None:
         low = high = per_finger(preset.fixed.get(row.name, row.default), width)

@@ -300,7 +300,8 @@ class Free:
         """
         low = per_finger(row.low if self.low is None else self.low, count)
         high = per_finger(row.high if self.high is None else self.high, count)
-        lows, highs = [*low], [*high]
+        lows = [*low]
+        highs = [*high]
         for group in self.groups(count):
             for k in group:
                 lows[k] = max(low[i] for i in group)

@@ -194,9 +194,11 @@ def times(scene: Any, params: Params) -> jax.Array:
 
 def poses(scene: Any, params: Params, count: int | None = None) -> jax.Array:
     """Poses of the arm frame at the first `count` key frames [m, rad], shape (frame, 6)."""
-    names, dtype = _names(scene, params), jnp.result_type(params.arm)
+    names = _names(scene, params)
+    dtype = jnp.result_type(params.arm)
     pose: dict[str, Any] = {axis: params.arm[i] for i, axis in enumerate(POSE)}
-    pose["z"], rows = scene.arm.start_height, []
+    pose["z"] = scene.arm.start_height
+    rows = []
     for frame in scene.control.frame[:count]:
         given = {axis: getattr(frame, axis) for axis in POSE}
         pose |= {axis: _value(v, names) for axis, v in given.items() if v is not None}
@@ -214,8 +216,10 @@ def pressures(scene: Any, params: Params) -> list[tuple[Any, jax.Array]]:
       Named numbers [Pa], of shape (finger,) or (), and their factors, shape (frame, finger); the
       number is 1 where the factors are the numbers of the file.
     """
-    names, dtype = _names(scene, params), jnp.result_type(params.pressure)
-    rows, now = [], [{}] * scene.num_fingers
+    names = _names(scene, params)
+    dtype = jnp.result_type(params.pressure)
+    rows = []
+    now = [{}] * scene.num_fingers
     for frame in scene.control.frame:
         if frame.pressure is not None:
             now = [_factors(v) for v in frame.pressure]
@@ -279,7 +283,10 @@ class _Reader:
     """Reads one file; problems are collected."""
 
     def __init__(self, table: Any, where: str, fingers: int, problems: list[str]):
-        self.table, self.where, self.fingers, self.problems = table, where, fingers, problems
+        self.table = table
+        self.where = where
+        self.fingers = fingers
+        self.problems = problems
         self.groups: dict[str, list[int]] = {}
         self.units = {name: unit for unit, names in _OF_SCENE.items() for name in names}
 
@@ -292,7 +299,8 @@ class _Reader:
             self.parameter(row, f"{self.where}.parameter[{i}]")
         for name, fingers in file.group.items():
             self._group(name, fingers)
-        frames, now = [], (Sum("Pa", 0.0),) * self.fingers
+        frames = []
+        now = (Sum("Pa", 0.0),) * self.fingers
         for i, entry in enumerate(file.frame):
             frame = self._frame(entry, f"{self.where}.frame[{i}]", now)
             frames.append(frame)
@@ -471,7 +479,8 @@ def _range(factors: Mapping[str, float], ends: Mapping[str, tuple[float, float]]
 def _falling(frames: tuple[Frame, ...], ends: Mapping, where: str) -> Iterator[str]:
     """Times that do not grow; a frame that repeats the one before may have its time."""
     for i, (a, b) in enumerate(zip(frames, frames[1:], strict=False), 1):
-        first, second = _factors(a.time), _factors(b.time)
+        first = _factors(a.time)
+        second = _factors(b.time)
         step = {n: second.get(n, 0.0) - first.get(n, 0.0) for n in {**first, **second}}
         least = _range(step, ends)[0]
         changes = any(

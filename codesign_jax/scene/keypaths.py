@@ -33,7 +33,8 @@ def read(
       prepare: Is told the file's table and the values by key path, both of which it may change.
     """
     path = library.find(kind, name)
-    table, changes = library.read(path), flatten(overrides or {})
+    table = library.read(path)
+    changes = flatten(overrides or {})
     prepare(table, changes)
     root = kind.removesuffix("s") if kind != "objects" else kind
     return table, path, apply(table, changes, path.name, problems, root=root)
@@ -158,7 +159,8 @@ def _apply(
     places: dict[str, str],
 ) -> None:
     """Changes one value; `where` has the names of the place in messages, and as it is given."""
-    (names, given), rest = where, path[1:]
+    names, given = where
+    rest = path[1:]
     key: Any = path[0]
     if len(rest) >= library.DEEPEST:
         problems.append(f"{schema.shown('.'.join(path))} is no key: it has {len(path):,} parts")
@@ -170,7 +172,8 @@ def _apply(
             problems.append(f"{given} has no entry {schema.shown(key)}; {hint}")
             return
         # The schema names an entry by its index, other checks by its name.
-        names, key = tuple(n + form for n in names for form in (f"[{index}]", f" {key}")), index
+        names = tuple(n + form for n in names for form in (f"[{index}]", f" {key}"))
+        key = index
     elif isinstance(place, dict):
         names = tuple(f"{name}.{key}" for name in names)
     else:

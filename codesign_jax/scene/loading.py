@@ -208,7 +208,8 @@ def _fixture_problems(fixture: Fixture, where: str) -> list[str]:
 def check_together(scene: SceneFile, where: str) -> list[str]:
     """Returns what is wrong with numbers that are each in range, but do not go together."""
     problems = []
-    p, h = scene.phases, scene.discretization.timestep
+    p = scene.phases
+    h = scene.discretization.timestep
     times = [("approach", p.approach), ("inflate", p.inflate), ("lift", p.lift)]
     times += [("disturb", p.disturb), ("ungrasp", p.ungrasp)]
     for (first, a), (second, b) in zip(times, times[1:], strict=False):

@@ -24,7 +24,8 @@ if TYPE_CHECKING:  # trimesh and SciPy take a while to import; sets of primitive
 MOST_BYTES = 1 << 25
 """Largest size of a set's mesh files together; those of the set household have 0.4 MB."""
 _MESH_KEYS = ("file", "unit", "repair", "voxel_error")
-_MASS, _SIZE = ("kg", 0.001, 10.0), ("m", 0.002, 0.25)
+_MASS = ("kg", 0.001, 10.0)
+_SIZE = ("m", 0.002, 0.25)
 
 
 @table
@@ -291,8 +292,11 @@ def _size_problems(given: _ObjectSetFile, path: Path) -> list[str]:
 
 def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
     """Checks which keys go together, and reads the mesh."""
-    before, where = len(problems), f"{path.name}.object {given.name}"
-    kind, missing, foreign = given.type, [], []
+    before = len(problems)
+    where = f"{path.name}.object {given.name}"
+    kind = given.type
+    missing = []
+    foreign = []
     if (given.mass is None) == (given.density is None):
         problems.append(f"{where}: a {kind} has either a mass or a density")
     if given.inertia is not None and given.mass is None:
@@ -350,7 +354,8 @@ def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
 
 def _off_centre(values: dict, path: Path, where: str, problems: list[str]) -> Shape | None:
     """A primitive as the mesh of its surface, which may have its centre of mass anywhere."""
-    primitive, size = PRIMITIVES[values["type"]], (*values["size"], 0.0, 0.0)[:3]
+    primitive = PRIMITIVES[values["type"]]
+    size = (*values["size"], 0.0, 0.0)[:3]
     content = primitive.triangles(size).export(file_type="stl")
     if values["orientation"] is None and values["pose"] is None:
         values = values | {"orientation": primitive.upright}
@@ -359,8 +364,10 @@ def _off_centre(values: dict, path: Path, where: str, problems: list[str]) -> Sh
 
 
 def _primitive(values: dict) -> Shape:
-    primitive, size = PRIMITIVES[values["type"]], (*values["size"], 0.0, 0.0)[:3]
-    mass, inertia = values["mass"], values["inertia"]
+    primitive = PRIMITIVES[values["type"]]
+    size = (*values["size"], 0.0, 0.0)[:3]
+    mass = values["mass"]
+    inertia = values["inertia"]
     if mass is None:
         mass = values["density"] * primitive.volume(size)
     own = inertia and tuple(v / mass for v in inertia[:3])

@@ -87,7 +87,8 @@ class DesignSpace:
 
         Values of fixed parameters and the pressure limit stay: programs have them as constants.
         """
-        zeros, place = (0.0,) * self.num_parameters, zip(self.base, self.source, strict=True)
+        zeros = (0.0,) * self.num_parameters
+        place = zip(self.base, self.source, strict=True)
         rows = (dataclasses.replace(p, low=0.0, high=0.0, default=0.0) for p in self.hand.parameter)
         return dataclasses.replace(
             self,
@@ -106,7 +107,8 @@ class DesignSpace:
         """
         self._refuse_shape(design, "")
         self.refuse_unit_slips(design)
-        values, source = jnp.asarray(design), np.asarray(self.source)
+        values = jnp.asarray(design)
+        source = np.asarray(self.source)
         filled = values[np.maximum(source, 0)]
         return jnp.where(source >= 0, filled, jnp.asarray(self.base, values.dtype))
 
@@ -226,7 +228,8 @@ class DesignSpace:
 
     def _above_the_limit(self, rows: np.ndarray) -> int:
         """How many designs [SI], shape (design, parameter), have a pressure above its limit."""
-        source, start = np.asarray(self.source), _offsets(self.hand)
+        source = np.asarray(self.source)
+        start = _offsets(self.hand)
         full = np.where(source >= 0, rows[:, np.maximum(source, 0)], np.asarray(self.base))
         fingers = np.arange(len(self.hand.finger))
         caps = _caps(self.hand, lambda name: full[:, start[name] + fingers])
@@ -249,7 +252,8 @@ class DesignSpace:
         self._refuse_shape(population, "particle, ")
 
     def _refuse_shape(self, designs: np.typing.ArrayLike, leading: str) -> None:
-        shape, count = np.shape(designs), self.num_parameters
+        shape = np.shape(designs)
+        count = self.num_parameters
         if shape[-1:] != (count,) or (not leading and len(shape) > 1):
             names = ", ".join(self.names)
             hint = "; jax.vmap maps over designs" if not leading and len(shape) > 1 else ""
@@ -285,7 +289,8 @@ class DesignSpace:
           InputError: If the last axis is not that of the parameters, or a number is not finite.
         """
         self._refuse_shape(design, "..., ")
-        given, scale = np.asarray(design, float), np.asarray(self.scale)
+        given = np.asarray(design, float)
+        scale = np.asarray(self.scale)
         rows = given.reshape(-1, self.num_parameters)
         self._refuse_infinite(rows)
         problems = self._outside(self.units, self.low / scale, self.high / scale, rows)
@@ -298,7 +303,8 @@ class DesignSpace:
 @functools.partial(jax.jit, static_argnums=0)
 def _projected(space: DesignSpace, design: jax.Array) -> jax.Array:
     """`DesignSpace.project` of a design whose units are known to be right; one program a space."""
-    full, offsets = space.expand(design), _offsets(space.hand)
+    full = space.expand(design)
+    offsets = _offsets(space.hand)
     fingers = len(space.hand.finger)
     caps = _caps(space.hand, lambda name: full[offsets[name] :][:fingers]) * _STRICT
     start = offsets["pressure"]
@@ -328,7 +334,8 @@ def _sampled(space: DesignSpace, n: int, key: jax.Array, first: Any) -> jax.Arra
 
 def _representable(space: DesignSpace) -> tuple[np.ndarray, np.ndarray]:
     kind = np.dtype(jnp.result_type(float))
-    low, high = space.low.astype(kind), space.high.astype(kind)
+    low = space.low.astype(kind)
+    high = space.high.astype(kind)
     low = np.where(low < space.low, np.nextafter(low, kind.type(np.inf)), low)
     return low, np.where(high > space.high, np.nextafter(high, kind.type(-np.inf)), high)
 
@@ -336,7 +343,8 @@ def _representable(space: DesignSpace) -> tuple[np.ndarray, np.ndarray]:
 def _refuse_draws(key: Any, n: Any) -> None:
     if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
         raise schema.InputError([f"n = {n!r} designs must be a whole number, at least 1"])
-    shape, kind = jnp.shape(key), jnp.result_type(key)
+    shape = jnp.shape(key)
+    kind = jnp.result_type(key)
     if shape or not jnp.issubdtype(kind, jax.dtypes.prng_key):
         words = f"key must be one typed key from jax.random.key, got shape {shape} of {kind}"
         raise schema.InputError([words])
@@ -356,7 +364,8 @@ def params_of(space: DesignSpace, designs: jax.typing.ArrayLike) -> Params:
 
 def unflatten(hand: Hand, full: jax.Array) -> Params:
     """Splits a full vector [SI], shape (full,), into named parameters."""
-    n, offsets = len(hand.finger), _offsets(hand)
+    n = len(hand.finger)
+    offsets = _offsets(hand)
 
     def take(name: str) -> jax.Array:
         start = offsets[name]
@@ -416,11 +425,13 @@ def _hint(preset: str, names: list[str]) -> str:
 
 
 def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
-    base, offsets = _defaults(hand), _offsets(hand)
+    base = _defaults(hand)
+    offsets = _offsets(hand)
     source = np.full(base.shape, -1)
     for name, value in preset.fixed.items():
         row = _row(hand, name)
-        width, factor = hand.width(row), UNITS[row.unit][1]
+        width = hand.width(row)
+        factor = UNITS[row.unit][1]
         base[offsets[name] : offsets[name] + width] = np.array(per_finger(value, width)) * factor
     free = {f.name: f for f in preset.free}
     idle = {n: why for n, why in without_effect(hand).items() if everything or n in free}
@@ -431,7 +442,8 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
         if row.name in idle:
             continue
         spec = free.get(row.name, Free(row.name))
-        factor, width = UNITS[row.unit][1], hand.width(row)
+        factor = UNITS[row.unit][1]
+        width = hand.width(row)
         low, high = spec.bounds(row, width)
         for group in spec.groups(width):
             source[[offsets[row.name] + k for k in group]] = len(columns)

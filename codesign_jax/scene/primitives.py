@@ -52,7 +52,8 @@ def _cylinder_inertia(size: Any) -> tuple:
 
 def _capsule_inertia(size: Any) -> tuple:
     """Cylinder and two half balls, whose centres of mass lie 3/8 r beyond the cylinder's ends."""
-    radius, half = size[0], size[1]
+    radius = size[0]
+    half = size[1]
     ball = 4 * radius / (6 * half + 4 * radius)  # share of the mass
     side, _, along = _cylinder_inertia(size)
     tips = 2 / 5 * radius**2 + half**2 + 3 / 4 * radius * half

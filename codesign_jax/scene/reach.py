@@ -76,7 +76,8 @@ def refuse(objects: ObjectSet, radius: Any) -> None:
     """
     if any(isinstance(v, jax.core.Tracer) for v in (radius, objects.noise.size)):
         return
-    largest, noise = float(np.max(radius)), float(np.max(objects.noise.size))
+    largest = float(np.max(radius))
+    noise = float(np.max(objects.noise.size))
     problems = [
         f"object {shape.name!r}: distances reach {1e3 * shape.mesh.reach:g} mm from its surface, "
         f"contact spheres of radius {1e3 * largest:g} mm need {1e3 * needed:g} mm: raise the "

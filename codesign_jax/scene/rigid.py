@@ -81,10 +81,12 @@ def stable(points: np.ndarray, inertia: Sequence[float], base: Sequence[float]) 
     size = np.abs(points).max()  # trimesh merges faces by lengths in units of the file
     hull = trimesh.PointCloud(points / size).convex_hull
     poses, chances = trimesh.poses.compute_stable_poses(hull, center_mass=np.zeros(3), seed=0)
-    own, groups = Rotation.from_quat(np.roll(base, -1)).as_matrix().T, []
+    own = Rotation.from_quat(np.roll(base, -1)).as_matrix().T
+    groups = []
     total = sum(inertia)
     for turn, chance in zip(poses[:, :3, :3], chances, strict=True):
-        height, moment = -(points @ turn[2]).min(), np.dot(turn[2] ** 2, inertia)
+        height = -(points @ turn[2]).min()
+        moment = np.dot(turn[2] ** 2, inertia)
         for group in groups:
             near = abs(height - group[0]) < _ALIKE * height
             if near and abs(moment - group[1]) < _ALIKE * total:
@@ -104,7 +106,8 @@ def stable(points: np.ndarray, inertia: Sequence[float], base: Sequence[float]) 
 def _levelled(turn: np.ndarray) -> np.ndarray:
     """The rotation with the yaw that brings it nearest to none."""
     yaw = np.arctan2(turn[0, 1] - turn[1, 0], turn[0, 0] + turn[1, 1])
-    c, s = np.cos(yaw), np.sin(yaw)
+    c = np.cos(yaw)
+    s = np.sin(yaw)
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ turn
 
 
@@ -118,7 +121,8 @@ def chosen(pose: str, found: Callable[[], list[Resting]]) -> Resting | str:
     match = _STABLE.fullmatch(pose)
     if match is None:
         return 'must be "stable", or "stable:2" for the second most probable pose'
-    index, poses = int(match[1] or 1), found()
+    index = int(match[1] or 1)
+    poses = found()
     if index <= len(poses):
         return poses[index - 1]
     some = ", ".join(f"{i} ({100 * p.probability:.0f} %)" for i, p in enumerate(poses[:9], 1))
@@ -136,7 +140,8 @@ def fall(
       height: Height of its centre on a table of these normals in its frame, shape (3, n), to (n,).
     """
     around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    now, tilt = np.asarray(vertical, float), np.deg2rad(1.0)
+    now = np.asarray(vertical, float)
+    tilt = np.deg2rad(1.0)
     start = low = float(height(now[:, None])[0])
     for degrees in range(180):
         side = np.cross(now, np.eye(3)[np.abs(now).argmin()])
@@ -146,7 +151,8 @@ def fall(
         heights = height(ring)
         if not heights.min() < low * (1 - _NEUTRAL):
             return degrees, start - low
-        now, low = ring[:, heights.argmin()], float(heights.min())
+        now = ring[:, heights.argmin()]
+        low = float(heights.min())
     return 180, start - low
 
 

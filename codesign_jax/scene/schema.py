@@ -225,7 +225,8 @@ def table(cls: type[T]) -> type[T]:
     data = tuple(f.name for f in fields if _is_leaf(f) or _holds_tables(f.type))
     static = tuple(f.name for f in fields if f.name not in data)
 
-    leaves_of, rest_of = _getter(data), _getter(static)
+    leaves_of = _getter(data)
+    rest_of = _getter(static)
     keys = tuple(map(jax.tree_util.GetAttrKey, data))
 
     def parts(value: T) -> tuple[tuple, tuple]:
@@ -313,7 +314,8 @@ def each(table: T, leaf: typing.Callable[[dataclasses.Field], Any]) -> T:
     changes: dict[str, Any] = {}
     for field in dataclasses.fields(table):  # type: ignore[arg-type]
         value = getattr(table, field.name)
-        several, entries = isinstance(value, tuple), value if isinstance(value, tuple) else (value,)
+        several = isinstance(value, tuple)
+        entries = value if isinstance(value, tuple) else (value,)
         if value is None or not (_is_leaf(field) or type(entries[:1] and entries[0]) in _tables):
             continue
         new = tuple(leaf(field) if _is_leaf(field) else each(v, leaf) for v in entries)

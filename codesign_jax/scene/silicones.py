@@ -212,7 +212,8 @@ def complete(table: dict[str, Any], where: str, problems: list[str]) -> None:
     material = table.get("material")
     if not isinstance(material, dict) or "silicone" not in material:
         return
-    name, path = material["silicone"], f"{where}.material"
+    name = material["silicone"]
+    path = f"{where}.material"
     known = isinstance(name, str) and name in SILICONES
     if not known:
         problems.append(f"{path}.silicone = {schema.shown(name)} {_unknown()}")
@@ -257,8 +258,10 @@ def under(scene: Any, *, neo_hookean: bool) -> Any:
     """
     if scene.effects.neo_hookean == neo_hookean:
         return scene
-    material, factor = scene.hand.material, EQUAL_BEND if neo_hookean else 1 / EQUAL_BEND
-    modulus, law = material.shear_modulus * factor, LAWS[neo_hookean]
+    material = scene.hand.material
+    factor = EQUAL_BEND if neo_hookean else 1 / EQUAL_BEND
+    modulus = material.shear_modulus * factor
+    law = LAWS[neo_hookean]
     material = dataclasses.replace(material, shear_modulus=modulus, law=law, silicone=None)
     return dataclasses.replace(
         scene,

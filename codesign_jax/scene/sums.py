@@ -121,7 +121,8 @@ class _Reader:
 
     @staticmethod
     def _tokens(given: str) -> list[tuple[str, str]]:
-        tokens, place = [], 0
+        tokens = []
+        place = 0
         given = given.rstrip()
         while place < len(given):
             match = _TOKEN.match(given, place)
@@ -134,7 +135,8 @@ class _Reader:
 
     def total(self) -> tuple[float | None, dict[str, float]]:
         """The number, None for none, and the factors of the names."""
-        number, factors = None, {}
+        number = None
+        factors = {}
         first = True
         while first or self.place < len(self.tokens):
             sign = self._sign(first)

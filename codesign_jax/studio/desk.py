@@ -106,7 +106,8 @@ class Desk:
         self.options = options
         self.case = common.find_case(options)
         common.refuse(common.engine_problems(self.case.engine))
-        self.file, self.record = common.design_file(options), None
+        self.file = common.design_file(options)
+        self.record = None
         if folder := options.run_folder:
             own = {"preset": runs.read_run(folder)[1].preset, "scene": str(folder / "scene.toml")}
             self.file = dataclasses.replace(self.file, **own)
@@ -125,7 +126,8 @@ class Desk:
 
     def flags(self, accuracy: str) -> list[str]:
         """Flags that name to another command what a design's file does not."""
-        given, named = self.options, {"accuracy": accuracy or self.options.accuracy}
+        given = self.options
+        named = {"accuracy": accuracy or self.options.accuracy}
         named |= {"engine": self.case.engine, "policy": given.policy}
         found = [word for k, v in named.items() if v is not None for word in (f"--{k}", v)]
         for words in given.overrides:

@@ -62,7 +62,8 @@ class Guard:
         """The page, a refusal, or None: a WebSocket may be opened."""
         headers = request.headers
         path, _, query = request.path.partition("?")
-        hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+        hosts = headers.get_all("Host")
+        origins = headers.get_all("Origin")
         tunnel = _TUNNEL.format(port=connection.local_address[1])
         if getattr(request, "method", "GET") != "GET":  # websockets < 17 refuses these itself
             refusal = connection.respond(HTTPStatus.METHOD_NOT_ALLOWED, "")

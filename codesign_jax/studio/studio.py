@@ -37,7 +37,8 @@ def main(options: Options) -> int:
     common.refuse(problems + common.place_problems("--out", options.out, folder=True))
     console = Console()
     desk = Desk(options)
-    scene, space = desk.case.scene, desk.case.space
+    scene = desk.case.scene
+    space = desk.case.space
     for note in preflight.notes(scene, space, {"the design": desk.case.design}):
         console.print(note)
     serve(desk, console)
@@ -46,7 +47,8 @@ def main(options: Options) -> int:
 
 def serve(desk: Desk, console: Console) -> None:
     """Serves the studio until Ctrl-C; its page waits for the simulation, which is compiled."""
-    options, studio = desk.options, Studio(desk)
+    options = desk.options
+    studio = Studio(desk)
     listening, address = studio.listen(options.host, options.port)
     if options.host not in LOCAL:
         common.warn(
@@ -153,7 +155,8 @@ def _page() -> str:
 
 def about(desk: Desk) -> dict[str, Any]:
     """What a page is told first: the design's parameters, and what there is to choose from."""
-    scene, space = desk.case.scene, desk.case.space
+    scene = desk.case.scene
+    space = desk.case.space
     own, others = tables.by_finger(space)
     fingers = range(scene.num_fingers if own else 0)
     groups = {f"Finger {f}": {k[f]: name for name, k in own.items()} for f in fingers}

@@ -31,7 +31,9 @@ from codesign_jax.studio import process
 from codesign_jax.studio.desk import COUNTS, Bench, Desk, View
 from codesign_jax.types import Outcome, failed
 
-PARTICLES, EPISODES, SIGMA = 20, 15, 0.12
+PARTICLES = 20
+EPISODES = 15
+SIGMA = 0.12
 """Of `improve`: designs of an episode, episodes, and how far the first ones lie from the design, as
 a standard deviation in shares of the parameters' ranges."""
 LOOKED_AT = 15
@@ -56,7 +58,8 @@ class Tab:
 
     def __init__(self, desk: Desk, tell: Callable[[str, Any], None] | None = None) -> None:
         """Takes what all tabs share, and who sends what a command tells, which outlives a tab."""
-        self._desk, self._tell = desk, tell or self.send
+        self._desk = desk
+        self._tell = tell or self.send
         self._asked: collections.deque[View] = collections.deque(maxlen=1)  # the newest
         self._actions: collections.deque[Callable[[], None]] = collections.deque()
         self._shown: Shown | None = None
@@ -80,7 +83,8 @@ class Tab:
         """Waits for messages, by kind; None once the tab is closed."""
         with self._filled:
             self._filled.wait_for(lambda: self._outbox or self._closed)
-            found, self._outbox = self._outbox, {}
+            found = self._outbox
+            self._outbox = {}
             return None if self._closed else found
 
     def close(self) -> None:
@@ -117,7 +121,8 @@ class Tab:
         pictures: bool = False,
     ) -> View:
         """What a message asks for; an error if there is no such thing."""
-        space, values = self._desk.case.space, np.array(design, float)
+        space = self._desk.case.space
+        values = np.array(design, float)
         if values.shape != space.low.shape or not np.isfinite(values).all():
             raise ValueError(f"a design has {space.num_parameters} numbers")
         shapes = range(len(self._desk.case.scene.objects.object))
@@ -212,24 +217,30 @@ class Tab:
     def _show(self, view: View) -> None:
         if view.accuracy not in self._desk.benches:
             self.send("state", "compiling for this accuracy: up to a minute the first time ...")
-        bench, before = self._desk.bench(view.accuracy), self._shown
+        bench = self._desk.bench(view.accuracy)
+        before = self._shown
         view = view._replace(design=np.asarray(bench.case.space.project(view.design), float))
         same = before and before.bench is bench and np.array_equal(before.view.design, view.design)
         if not (before and same):
-            self._outcomes, before = [], None
+            self._outcomes = []
+            before = None
         if before and (before.view.shape, before.view.noise) == (view.shape, view.noise):
             shown = before._replace(view=view)  # a slider was let go where it has been seen
         else:
             shown = Shown(view, bench, bench.grasp(view))
-        self._shown, self._looked, self._pictured = shown, False, False
+        self._shown = shown
+        self._looked = False
+        self._pictured = False
         self.send("grasp", _told(shown))
         if view.resting:
             self._tell_verdict(shown)
 
     def _tell_verdict(self, shown: Shown) -> None:
-        view, scene = shown.view, shown.bench.case.scene
+        view = shown.view
+        scene = shown.bench.case.scene
         ends: list[int] = []
-        sentence, cost = "the verdict comes ...", None
+        sentence = "the verdict comes ..."
+        cost = None
         if self._outcomes:
             found = jax.tree.map(lambda *v: np.concatenate(v)[: view.trials], *self._outcomes)
             ends = codesign.verdicts(found).tolist()
@@ -286,7 +297,8 @@ class Tab:
 
     def _of_run(self, place: list[int] | None) -> None:
         """Shows a particle of an episode, counted from 1; the chosen design without a place."""
-        found, desk = self._desk.case.design, self._desk
+        found = self._desk.case.design
+        desk = self._desk
         if place is not None and desk.record is not None:
             e, p = place
             found = choice.find_grasp(desk.case.scene, desk.record, episode=e, particle=p).design
@@ -299,7 +311,8 @@ class Tab:
 
     def _saved(self) -> list[str]:
         """Saves the design that is shown; flags that name it to another command."""
-        view, space = self._current().view, self._desk.case.space
+        view = self._current().view
+        space = self._desk.case.space
         text = common.design_text(space, self._desk.file, view.design)
         with self._desk.reserved("design", ".toml") as path, files.atomically(path) as part:
             part.write_text(text, encoding="utf-8")
@@ -345,7 +358,8 @@ def _words(error: Exception) -> str:
 
 def _told(shown: Shown) -> dict[str, Any]:
     view, bench, grasp = shown
-    scene, space = bench.case.scene, bench.case.space
+    scene = bench.case.scene
+    space = bench.case.space
     replay = viewer.data(scene, grasp) | {"loop": True}
     step = max(1, round(1 / (replay["rate"] * scene.discretization.timestep)))
     series: dict[str, Any] = {
@@ -373,7 +387,8 @@ def _told(shown: Shown) -> dict[str, Any]:
 
 
 def _deepest(shown: Shown) -> str:
-    scene, grasp = shown.bench.case.scene, shown.grasp
+    scene = shown.bench.case.scene
+    grasp = shown.grasp
     motion = bodies.motion(scene, grasp)
     end = min(scene.window[1], float(grasp.outcome.lost_time))
     times = np.linspace(min(scene.phases.approach, end), end, LOOKED_AT)

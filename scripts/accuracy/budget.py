@@ -27,7 +27,9 @@ from codesign_jax.types import Status, Trial, failed
 from scripts import calibration
 from scripts.shared import output, provenance, work
 
-DESIGNS, TRIALS, FEW = 30, 40, 16
+DESIGNS = 30
+TRIALS = 40
+FEW = 16
 """Designs, trials of each, and trials of the dearest variants: the first ones."""
 BITS = {str(b.name): b.value for b in Status if b.value}
 SEED = 5
@@ -65,7 +67,8 @@ def discretized(step: float, links: int, rings: int) -> tuple[str, ...]:
     return tuple(f"discretization.{key}={value:g}" for key, value in table.items())
 
 
-TRUTH, FINER = discretized(2, 20, 4), discretized(1, 30, 5)
+TRUTH = discretized(2, 20, 4)
+FINER = discretized(1, 30, 5)
 LOOSE = ("newton.decrement=1e-3", "newton.iterations=24")
 """A looser tolerance of the contact solver, in place of fewer iterations."""
 SPHERES = "effects.surface=spheres"
@@ -121,7 +124,8 @@ class Study:
     """Designs and trials, and what variants make of them."""
 
     def __init__(self, designs: int, trials: int):
-        self.trials, self.designs = trials, work.winners()[:designs]
+        self.trials = trials
+        self.designs = work.winners()[:designs]
 
     def run(self, name: str, commit: str | None = None) -> dict[str, Any]:
         """Simulates a variant; what its file holds."""
@@ -132,7 +136,8 @@ class Study:
         outcome = jax.tree.map(np.asarray, call())
         seconds = time.perf_counter() - start
         shape = len(self.designs), self._trials(variant)
-        lost, status = outcome.lost_time.reshape(shape), outcome.status.reshape(shape)
+        lost = outcome.lost_time.reshape(shape)
+        status = outcome.status.reshape(shape)
         bits = {n: int((status & b != 0).sum()) for n, b in BITS.items()}
         return {
             "variant": dataclasses.asdict(variant),
@@ -164,7 +169,8 @@ class Study:
     def _call(self, variant: Variant, the_scene: Scene) -> tuple[Callable[[], Any], float]:
         """A function that simulates, compiled, and the time that this took [s]."""
         space = parameters.design_space(the_scene.hand)
-        engine, count = make_engine(variant.engine, the_scene), self._trials(variant)
+        engine = make_engine(variant.engine, the_scene)
+        count = self._trials(variant)
         drawn = rollout.sample_trials(the_scene, jax.random.key(SEED), count)
         drawn = work.nudged(drawn) if variant.moved else drawn
         designs, trials = crossed(self.designs, drawn)
@@ -197,7 +203,9 @@ def calibrated(the_scene: Scene, trials: int, designs: int) -> Scene:
     return jax.tree.map(lambda v: jnp.asarray(v[index] if np.ndim(v) else v, jnp.float32), numbers)
 
 
-KEPT, FAILED, _PARTS = 255, 254, 250
+KEPT = 255
+FAILED = 254
+_PARTS = 250
 """Marks in place of the time of loss: kept to the end, and failed; parts of the time."""
 
 
@@ -272,7 +280,8 @@ IN_THE_AIR = {
 }
 EVERY = 0.02
 """Time between compared states [s]: a multiple of every time step."""
-HANDS, SECONDS = 12, 2.4
+HANDS = 12
+SECONDS = 2.4
 REFERENCE = (1e-4, 40, "newmark")
 """Time step [s], links and integrator of the motion that stands for the truth, by MuJoCo C."""
 
@@ -285,7 +294,8 @@ def motion(
     step, links, integrator = setting
     sizes = {"timestep": step, "links": links, "integrator": integrator}
     the_scene = scene.load("paper", overrides={**IN_THE_AIR, "discretization": sizes})
-    stride, count = round(EVERY / step), round(seconds / step)
+    stride = round(EVERY / step)
+    count = round(seconds / step)
     vectors = np.asarray(work.designs(the_scene, hands))
     drawn = rollout.sample_trials(the_scene, jax.random.key(work.SEED), work.TRIALS)
     with jax.enable_x64(engine == "mujoco"):
@@ -308,7 +318,8 @@ def motion(
             return np.array([tips(the_scene, compiled, state) for state in qpos[world]])
         # The object on the table is the only contact: without it there is nothing to solve.
         compiled.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-        data, found = mujoco.MjData(compiled), []
+        data = mujoco.MjData(compiled)
+        found = []
         data.qpos[:] = fields.start[world]
         for k in range(ctrl.shape[1]):
             if k % stride == 0:
@@ -328,7 +339,8 @@ def _each(function: Callable[[int], Any], count: int) -> list[Any]:
 
 def tips(the_scene: Scene, compiled: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
     """Finger tips of a state [m], shape (finger, 3), on the bottom layer."""
-    data, last = mujoco.MjData(compiled), model.layout(the_scene).bodies[:, -1]
+    data = mujoco.MjData(compiled)
+    last = model.layout(the_scene).bodies[:, -1]
     data.qpos[:] = qpos
     mujoco.mj_kinematics(compiled, data)
     # A half segment follows the last joint; its centre of mass lies halfway along it.

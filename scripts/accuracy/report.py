@@ -38,7 +38,9 @@ class Change(NamedTuple):
     kind: str
 
 
-CHANCE, NUMERICS, MODELS = "chance", "numerics", "models"
+CHANCE = "chance"
+NUMERICS = "numerics"
+MODELS = "models"
 COLORS = {CHANCE: "tab:gray", NUMERICS: "tab:blue", MODELS: "tab:orange"}
 CPUS = "standard, on CPUs"
 CHANGES = (
@@ -90,7 +92,8 @@ def compare(a: np.ndarray, b: np.ndarray) -> dict[str, Interval]:
     trials = min(a.shape[1], b.shape[1])
 
     def values(a: np.ndarray, b: np.ndarray) -> list[float]:
-        kept, expected = a < SUCCESS_COST, b < SUCCESS_COST
+        kept = a < SUCCESS_COST
+        expected = b < SUCCESS_COST
         rank = float(spearman(mean_costs(a), mean_costs(b)))
         return [kept.mean() - expected.mean(), (kept != expected).mean(), rank]
 
@@ -119,12 +122,14 @@ class Budget:
         return self._compared[of, to]
 
     def row(self, name: str, words: str) -> list[str]:
-        beside, moved = self.compared(name, "truth"), self.compared(name, f"{name}, moved")
+        beside = self.compared(name, "truth")
+        moved = self.compared(name, f"{name}, moved")
         rates = [self.rates.get(machine, {}).get(name) for machine in RATED]
         cells = [words, *["–"] * 5]
         if beside:
             cells[1] = points(beside["success_difference"])
-            cells[2], cells[3] = interval(beside["flipped"]), interval(beside["rank"], ".2f")
+            cells[2] = interval(beside["flipped"])
+            cells[3] = interval(beside["rank"], ".2f")
         if moved:
             cells[4] = f"{moved['flipped'].value:.1%}"
         if name in self.tips:
@@ -343,6 +348,7 @@ def _apart(axis: Axes, points: list[tuple[float, float]], least: float = 0.04) -
     steps = least * np.arange(len(order))
     wanted = height[order] - steps
     # Between the lowest heights of which none is too low and the highest of which none too high.
-    up, down = np.maximum.accumulate(wanted), np.minimum.accumulate(wanted[::-1])[::-1]
+    up = np.maximum.accumulate(wanted)
+    down = np.minimum.accumulate(wanted[::-1])[::-1]
     height[order] = (up + down) / 2 + steps
     return [float(y) for _, y in scale.inverted().transform([(0.0, h) for h in height])]

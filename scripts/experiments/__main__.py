@@ -46,7 +46,8 @@ def run(args: argparse.Namespace) -> int:
     """Runs or resumes an experiment, and writes what it has; returns the exit status."""
     common.use_compilation_cache()
     plans, changes = simulate.SIZES[args.size]
-    the_plan, overrides = plans[args.experiment], keypaths.parse([*changes, *args.set])
+    the_plan = plans[args.experiment]
+    overrides = keypaths.parse([*changes, *args.set])
     the_scene = scene.load(args.scene, overrides=overrides)
     path = args.out / f"{args.experiment}.json"
     settings = simulate.settings_of(the_plan, the_scene, args.engine, args.seed)

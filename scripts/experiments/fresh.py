@@ -68,9 +68,11 @@ def simulate(
     drawn = rollout.sample_trials(the_scene, stream_key(jax.random.key(0), STREAM_FRESH, 0), trials)
     made = make_engine(engine, the_scene)
     outcome = jax.jit(lambda p, t: rollout.evaluate(the_scene, made, p, t))(joined, drawn)
-    found, start = {}, 0
+    found = {}
+    start = 0
     for name, particles in every.items():
-        shape, count = particles.shape[:2], int(np.prod(particles.shape[:2]))
+        shape = particles.shape[:2]
+        count = int(np.prod(particles.shape[:2]))
         part = slice(start, start + count)
         found[f"{name}|cost"] = np.asarray(outcome.cost[part], np.float16).reshape(*shape, trials)
         found[f"{name}|status"] = np.asarray(outcome.status[part], np.uint8).reshape(*shape, trials)
@@ -110,7 +112,8 @@ def summary(data: Path) -> str:
     found = report.load(data, "fresh")
     if found is None:
         raise FileNotFoundError(f"{data} holds no fresh.npz")
-    arrays, text = found[0], []
+    arrays = found[0]
+    text = []
     for name in EXPERIMENTS:
         labels = [k.split("|")[1] for k in arrays if k.startswith(f"{name}|") and "cost" in k]
         if labels:

@@ -185,7 +185,8 @@ def draw_convergence(study: Study, path: Path) -> Path:
     stands under the strategy.
     """
     figure, axes = _axes()
-    episodes, limit = study.convergence(), study.plan["episodes"]
+    episodes = study.convergence()
+    limit = study.plan["episodes"]
     never = 1.08 * limit
     low, middle, high = (
         np.minimum(statistics.quantile(episodes, q), never) for q in (0.25, 0.5, 0.75)
@@ -208,7 +209,8 @@ def draw_convergence(study: Study, path: Path) -> Path:
 def draw_landscape(data: dict[str, np.ndarray], path: Path) -> Path:
     """Draws Fig. 8: the mean cost, white where low, with the regions below the threshold."""
     figure, axes = _axes(5.4, 4.4)
-    x, y = data["first_axis"], data["second_axis"]
+    x = data["first_axis"]
+    y = data["second_axis"]
     image = axes.pcolormesh(x, y, data["exclude"].T, cmap="gray_r", shading="nearest", vmin=0)
     figure.colorbar(image, label="mean cost")
     for letter, region in zip("abcdefgh", regions(data, LANDSCAPE_THRESHOLD), strict=False):
@@ -220,7 +222,8 @@ def draw_landscape(data: dict[str, np.ndarray], path: Path) -> Path:
         scale = np.array([np.ptp(x), np.ptp(y)])
         nearest = axis[np.argmin((((axis - region.centre) / scale) ** 2).sum(1))]
         axes.text(nearest[0], nearest[1], f"({letter})", color="tab:red", ha="center", va="center")
-    names, units = data["parameters"], data["units"]
+    names = data["parameters"]
+    units = data["units"]
     axes.set(xlabel=f"{names[0]} [{units[0]}]", ylabel=f"{names[1]} [{units[1]}]")
     return output.save_figure(figure, path)
 
@@ -250,10 +253,8 @@ def make(data: Path, pictures: Path, page: Path | None = None) -> str:
     Returns:
       The table in Markdown.
     """
-    studies, grid = (
-        {name: load_study(data, name) for name in ("2d", "23d")},
-        load(data, "landscape"),
-    )
+    studies = {name: load_study(data, name) for name in ("2d", "23d")}
+    grid = load(data, "landscape")
     text = tables(studies, grid)
     for study in studies.values():
         if study and len(study.strategies) > 1:
@@ -303,11 +304,14 @@ def details(study: Study) -> str:
         "| trials in which the solver met its limit |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    episodes, first = study.convergence(), study.first_below()
-    good, strict = study.success(), study.success("worst")
+    episodes = study.convergence()
+    first = study.first_below()
+    good = study.success()
+    strict = study.success("worst")
     status = study.data["failed"].sum((1, 2))
     warning = np.array([bit in WARNINGS for bit in BITS])
-    failed, capped = status[:, ~warning].sum(1), status[:, warning].sum(1)
+    failed = status[:, ~warning].sum(1)
+    capped = status[:, warning].sum(1)
     trials = study.per_episode * study.plan["runs"] * study.episodes
     for s, strategy in enumerate(study.strategies):
         cells = [
@@ -327,8 +331,10 @@ def details(study: Study) -> str:
 
 def _against_last(study: Study) -> list[str]:
     """Every strategy against the last one; runs of one number share seed and noise: pairs."""
-    episodes, good = study.convergence(), study.success()
-    limit, others = study.episodes, range(len(study.strategies) - 1)
+    episodes = study.convergence()
+    good = study.success()
+    limit = study.episodes
+    others = range(len(study.strategies) - 1)
     columns = [
         statistics.holm([statistics.mcnemar(good[s], good[-1]) for s in others]),
         statistics.holm([statistics.wilcoxon(episodes[s], episodes[-1], limit) for s in others]),
@@ -355,7 +361,8 @@ def _quartiles(values: np.ndarray) -> str:
 
 def _rows(name: str, study: Study) -> list[tuple[str, str]]:
     paper = {"2d": 420, "23d": 6120}[name]
-    success, episodes = study.success(), study.convergence()
+    success = study.success()
+    episodes = study.convergence()
     ratios = ", ".join(
         f"{label(s)} {100 * r.mean():.0f} %" for s, r in zip(study.strategies, success, strict=True)
     )
@@ -432,7 +439,8 @@ def _regions(grid) -> str:
         found = regions(grid[0], threshold)
         shares = ", ".join(f"{100 * r.share:.1f} %" for r in found)
         parts.append(f"cost < {threshold:g}: {len(found)}" + (f" ({shares})" if found else ""))
-    units, names = grid[0]["units"], grid[0]["parameters"]
+    units = grid[0]["units"]
+    names = grid[0]["parameters"]
     found = regions(grid[0], LANDSCAPE_THRESHOLD)
     for letter, region in zip("abcdefgh", found, strict=False):
         ends = ", ".join(

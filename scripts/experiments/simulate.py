@@ -165,7 +165,8 @@ def gather(plan: Strategies, folder: Path, seed: int) -> Arrays | None:
         return None
     done = min(record.done for record in records)
     tested = all(record.test is not None for record in records)
-    rows, shape = [_one(record, done, tested) for record in records], (len(every), plan.runs)
+    rows = [_one(record, done, tested) for record in records]
+    shape = (len(every), plan.runs)
     found = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     found = {name: values.reshape(*shape, *values.shape[1:]) for name, values in found.items()}
     starts = [record.start for record in records[: plan.runs] if record.start is not None]
@@ -174,7 +175,8 @@ def gather(plan: Strategies, folder: Path, seed: int) -> Arrays | None:
 
 
 def _one(record: Record, done: int, tested: bool) -> Arrays:
-    history, trials = record.history, record.history.outcomes
+    history = record.history
+    trials = record.history.outcomes
     found = {
         "particles": np.asarray(record.state.particles),
         "cost": history.cost[:done],
@@ -259,7 +261,8 @@ def failures(status: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
 
 def of_strategies(plan: Strategies, scene: Scene, space: DesignSpace, found: Arrays) -> Arrays:
     """What is kept of `gather`; docs/notes/results.md says what each array is."""
-    cost, status = found["cost"], found["status"]
+    cost = found["cost"]
+    status = found["status"]
     quartiles = np.quantile(cost, [0.25, 0.5, 0.75], axis=-1).astype(np.float32)
     means = both_means(scene, found["trial_cost"], status)
     if "test_cost" in found:
@@ -292,7 +295,8 @@ def of_strategies(plan: Strategies, scene: Scene, space: DesignSpace, found: Arr
 
 def of_landscape(scene: Scene, space: DesignSpace, found: Arrays) -> Arrays:
     """What is kept of `landscape`."""
-    cost, status = found["trial_cost"], found["status"]
+    cost = found["trial_cost"]
+    status = found["status"]
     means = both_means(scene, cost, status)
     designs = space.in_units(found["designs"])
     return {

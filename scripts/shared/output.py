@@ -38,11 +38,13 @@ def markdown(rows: list[list[str]]) -> str:
 
 def fill(page: Path, text: str, mark: str) -> None:
     """Replaces what stands between the marks of a page, NAME:begin and NAME:end in comments."""
-    begin, end = f"<!-- {mark}:begin -->", f"<!-- {mark}:end -->"
+    begin = f"<!-- {mark}:begin -->"
+    end = f"<!-- {mark}:end -->"
     old = page.read_text(encoding="utf-8")
     if begin not in old or end not in old:
         raise ValueError(f"{page} holds no {begin} and {end}")
-    head, tail = old.split(begin)[0], old.split(end)[1]
+    head = old.split(begin)[0]
+    tail = old.split(end)[1]
     with files.atomically(page) as part:
         part.write_text(f"{head}{begin}\n\n{text}\n\n{end}{tail}", encoding="utf-8")
 

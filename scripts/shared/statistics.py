@@ -34,7 +34,8 @@ def quantile(values: np.ndarray, q: float) -> np.ndarray:
     "averaged_inverted_cdf", whose interpolation turns two infinite neighbours into nan.
     """
     rank = values.shape[-1] * q
-    first, second = (max(int(np.ceil(rank)) - 1, 0), min(int(rank), values.shape[-1] - 1))
+    first = max(int(np.ceil(rank)) - 1, 0)
+    second = min(int(rank), values.shape[-1] - 1)
     ordered = np.sort(values, axis=-1)
     return (ordered[..., first] + ordered[..., second]) / 2
 
@@ -73,12 +74,14 @@ def two_way(
       An interval for each value; resamples in which it is NaN are left out, and its ends are NaN if
       it is in all of them.
     """
-    rng, (rows, columns) = np.random.default_rng(seed), tables[0].shape
+    rng = np.random.default_rng(seed)
+    rows, columns = tables[0].shape
     drawn = []
     for _ in range(resamples):
         index = np.ix_(rng.integers(0, rows, rows), rng.integers(0, columns, columns))
         drawn.append(statistics(*(t[index] for t in tables)))
-    tail, found = (1 - _CONFIDENCE) / 2, np.array(drawn, float)
+    tail = (1 - _CONFIDENCE) / 2
+    found = np.array(drawn, float)
     low, high = np.full((2, found.shape[1]), np.nan)
     some = ~np.isnan(found).all(0)
     low[some], high[some] = np.nanquantile(found[:, some], [tail, 1 - tail], axis=0)
@@ -103,7 +106,8 @@ def ratio_of_medians(a: np.ndarray, b: np.ndarray) -> Interval:
 
 def mcnemar(a: np.ndarray, b: np.ndarray) -> float:
     """Exact two-sided McNemar test of paired successes, shape (run,): the p-value."""
-    only_a, only_b = int((a & ~b).sum()), int((b & ~a).sum())
+    only_a = int((a & ~b).sum())
+    only_b = int((b & ~a).sum())
     if only_a + only_b == 0:
         return 1.0
     return float(scipy.stats.binomtest(only_a, only_a + only_b).pvalue)

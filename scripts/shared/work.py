@@ -50,7 +50,8 @@ def designs(chosen: Scene, count: int) -> jax.Array:
     """
     rng = np.random.default_rng(SEED)
     table, plane = (parameters.design_space(chosen.hand, p) for p in ("full", "2d"))
-    low, high = np.array(table.low), np.array(table.high)
+    low = np.array(table.low)
+    high = np.array(table.high)
     unit = rng.random((count, len(low) + len(GOOD)))
     random = jax.vmap(table.project)(jnp.asarray(low + (high - low) * unit[:, : len(low)]))
     middle = np.array([GOOD[n][0] for n in plane.names])

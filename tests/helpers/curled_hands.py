@@ -11,7 +11,9 @@ from tests.helpers import grasps
 def state(the_scene, seed, bend, height, length=0.1):
     """Fields, qpos, qvel and ctrl of a hand with random joint angles about a bend; all moves."""
     fields, _ = grasps.world_inputs(the_scene, *grasps.hand_world(the_scene, length=length))
-    random, lay, qpos = np.random.default_rng(seed), model.layout(the_scene), np.array(fields.start)
+    random = np.random.default_rng(seed)
+    lay = model.layout(the_scene)
+    qpos = np.array(fields.start)
     angles = 0.1 * random.normal(size=lay.dofs.shape)
     angles[..., 0] += bend
     qpos[2] = height
@@ -23,7 +25,9 @@ def state(the_scene, seed, bend, height, length=0.1):
 def curled(the_scene, seed, bend, height, length=0.1):
     """Model, data and lanes of a `state`, with the object between the fingers."""
     oracle = model.compile_model(the_scene, *grasps.hand_world(the_scene, length=length))
-    oracle.opt.tolerance, oracle.opt.iterations, oracle.opt.ls_iterations = 0.0, 200, 50
+    oracle.opt.tolerance = 0.0
+    oracle.opt.iterations = 200
+    oracle.opt.ls_iterations = 50
     data = mujoco.MjData(oracle)
     found = state(the_scene, seed, bend, height, length)
     fields, data.qpos[:], data.qvel[:], data.ctrl[:] = found

@@ -48,8 +48,10 @@ def turned(axis, angle):
 
 def finger(length, width=0.024, height=0.020, base=(0, 0, 0), turn=UPRIGHT, bend=0.0, links=10):
     """A finger from its base, all of whose joints bend by the same angle towards z = 0."""
-    segment, each = length / links, turned([0, 1, 0], bend)
-    frames, joints = [np.asarray(turn, float)], [np.asarray(base) + turn[:, 0] * segment / 2]
+    segment = length / links
+    each = turned([0, 1, 0], bend)
+    frames = [np.asarray(turn, float)]
+    joints = [np.asarray(base) + turn[:, 0] * segment / 2]
     for _ in range(links):
         frames.append(frames[-1] @ each)
         joints.append(joints[-1] + segment * frames[-1][:, 0])
@@ -86,7 +88,8 @@ def skin(body, low=0.0, high=None, along=160, around=160):
       along: Pieces along it, without the cap.
       around: Pieces around it.
     """
-    ring, (tip, a, b) = outline(around), body.half
+    ring = outline(around)
+    tip, a, b = body.half
     angle = np.linspace(0, np.pi / 2, 1 if high else 33)
     end = high or body.length - tip
     x = np.append(np.linspace(low, end, along + 1)[:-1], end + tip * np.sqrt(np.sin(angle)))
@@ -95,7 +98,8 @@ def skin(body, low=0.0, high=None, along=160, around=160):
         x[:, None], a * scale[:, None] * ring[:, 0], b * (1 + scale[:, None] * ring[:, 1])
     )
     p = place(body, *grid)
-    first, second = p[1:, 1:] - p[:-1, :-1], p[1:, :-1] - p[:-1, 1:]
+    first = p[1:, 1:] - p[:-1, :-1]
+    second = p[1:, :-1] - p[:-1, 1:]
     area = np.linalg.norm(np.cross(first, second), axis=-1) / 2
     middle = (p[1:, 1:] + p[:-1, :-1] + p[1:, :-1] + p[:-1, 1:]) / 4
     return middle.reshape(-1, 3), area.ravel()
@@ -119,7 +123,8 @@ def on_field(body, field, per_area, **pieces):
 
 def inside(body, point):
     """Whether points are in a straight finger, and the unit gradient of its level."""
-    turn, tip = body.frames[0], body.half
+    turn = body.frames[0]
+    tip = body.half
     local = (point - body.base) @ turn - [body.length - tip[0], 0, tip[2]]
     unit = np.maximum(local, [0, -np.inf, -np.inf]) / tip
     square = unit * unit
@@ -148,7 +153,8 @@ def on_finger(body, other, per_area, cells=40):
         both = own & theirs
         if not both.any():
             return Push(np.zeros(3), np.zeros(3), 0.0)
-        low, high = grid[both].min(0) - step, grid[both].max(0) + step
+        low = grid[both].min(0) - step
+        high = grid[both].max(0) + step
     point = point[both]
     normal = (away - outward)[both].sum(0)
     normal /= np.linalg.norm(normal)

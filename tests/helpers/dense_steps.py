@@ -29,14 +29,18 @@ class Dense:
 
         They are along the object's axes where it is touched, and along the world's on the table.
         """
-        self.holds, self.turn = holds or {}, data.body("object").xmat.reshape(3, 3)
+        self.holds = holds or {}
+        self.turn = data.body("object").xmat.reshape(3, 3)
         self.mass = np.zeros((oracle.nv, oracle.nv))
         mujoco.mj_fullM(oracle, data, self.mass)
         self.smooth = data.qfrc_smooth.copy()
-        self.scene, self.oracle, self.data = scene, oracle, data
+        self.scene = scene
+        self.oracle = oracle
+        self.data = data
         self.fingers = [Rings(scene, data, hand, f) for f in range(scene.num_fingers)]
         self.rows = []  # (Jacobian (3, nv), reference (3,), R of normal and tangent, friction)
-        self.num_hull, self.held = 0, []
+        self.num_hull = 0
+        self.held = []
         self._on_table()
         for f, finger in enumerate(self.fingers):
             for number, ring in enumerate(finger.rings):
@@ -44,7 +48,8 @@ class Dense:
 
     def _on_table(self):
         """The sphere's lowest point on the table."""
-        body, up = self.data.body("object"), np.array([0, 0, 1.0])
+        body = self.data.body("object")
+        up = np.array([0, 0, 1.0])
         gap = body.xpos[2] - self.scene.objects.object[0].half_sizes[0]
         ends = model.layout(self.scene).object, 0
         point = body.xpos * [1, 1, 0] + gap / 2 * up
@@ -60,7 +65,8 @@ class Dense:
         return {"ratio": self.scene.contact.held_friction_ratio, "grip": grip, "name": name}
 
     def _on_fields(self, ring, number):
-        scene, lay = self.scene, model.layout(self.scene)
+        scene = self.scene
+        lay = model.layout(self.scene)
 
         def from_object(point):
             gap, normal = distance(scene, self.data, point[None])
@@ -74,7 +80,8 @@ class Dense:
             on,
             (from_table, scene.contact.finger_table_friction, 0, 1),
         ):
-            place, on_object = on_field(ring, field), field is from_object
+            place = on_field(ring, field)
+            on_object = field is from_object
             held = self._held((*number, on_object), on_object)
             self._add(*place, (ring.body, other), friction, bodies, **held)
 
@@ -99,7 +106,8 @@ class Dense:
         name=None,
     ):
         """Adds a contact, if it may act within the step."""
-        c, h = self.scene.contact, self.scene.discretization.timestep
+        c = self.scene.contact
+        h = self.scene.discretization.timestep
         own, other = (self.jac(point, body) for body in ends)
         frame = np.linalg.svd(normal[None])[2]
         frame[0] = normal
@@ -126,7 +134,9 @@ class Dense:
         back = np.linalg.inv(factor).T
 
         def parts(y):
-            value, grad, hess = 0.5 * y @ y, y.copy(), np.eye(len(y))
+            value = 0.5 * y @ y
+            grad = y.copy()
+            hess = np.eye(len(y))
             for jac, reference, r, friction in self.rows:
                 whitened = jac @ back / np.sqrt([r[0], r[1], r[1]])[:, None]
                 jar = (jac @ start - reference) / np.sqrt([r[0], r[1], r[1]]) + whitened @ y
@@ -164,7 +174,8 @@ class Dense:
 
 def project(z, slope):
     """Euclidean projection onto |z_t| <= slope z_n, and its derivative."""
-    n, t = z[0], z[1:]
+    n = z[0]
+    t = z[1:]
     length = np.linalg.norm(t)
     if length <= slope * n:
         return z, np.eye(3)
@@ -188,7 +199,8 @@ class DensePairs(Dense):
         own: That each finger's outer part uses on its inner one, (finger, 3).
         """
         super().__init__(scene, oracle, data, hand, holds)
-        self.grip, self.own = grip, own
+        self.grip = grip
+        self.own = own
         self.pairs = self.on_palm = self.itself = self.ahead = 0
         self.sides = {}
         for f, finger in enumerate(self.fingers):
@@ -217,7 +229,9 @@ class DensePairs(Dense):
         return found
 
     def _on_palm(self, f, ring):
-        c, palm, before = self.scene.contact, self.data.body("palm"), len(self.rows)
+        c = self.scene.contact
+        palm = self.data.body("palm")
+        before = len(self.rows)
         frame = palm.xmat.reshape(3, 3)
 
         def field(point):
@@ -232,7 +246,9 @@ class DensePairs(Dense):
         self.ahead += len(self.rows) > before and gap > 0
 
     def _on_itself(self, f, ring):
-        c, finger, before = self.scene.contact, self.fingers[f], len(self.rows)
+        c = self.scene.contact
+        finger = self.fingers[f]
+        before = len(self.rows)
         end = ring.along - max(3.0, 1.8 * finger.height / finger.segment)
         if end >= 0.5:
             point, normal, gap, share, body = between(ring, finger, 0.5, end)
@@ -242,7 +258,8 @@ class DensePairs(Dense):
         self._count("itself", before, f, f)
 
     def _on_finger(self, f, g, ring):
-        c, before = self.scene.contact, len(self.rows)
+        c = self.scene.contact
+        before = len(self.rows)
         point, normal, gap, share, body = between(ring, self.fingers[g], 0.0, self.fingers[g].links)
         rest = c.finger_finger_friction, 2, c.finger_finger_friction_ratio, self.grip, 1.0, "two"
         self._add(point, normal, gap, share, (ring.body, body), *rest)
@@ -264,7 +281,8 @@ class DensePairs(Dense):
             force = self.force(row)
             weight = max(force[0], elastic)
             held = weight * frame[0] * (frame[0] @ grip) - frame[1:].T @ force[1:]
-            above, below = above + sign * held, below + weight
+            above = above + sign * held
+            below = below + weight
         return above / below if below else np.zeros(3)
 
 
@@ -285,19 +303,25 @@ class Rings:
     """A finger's rings and its centre line, from MuJoCo's poses of its links."""
 
     def __init__(self, scene, data, hand, f):
-        lay, width, k = layout(scene), scene.hand.section.width, scene.discretization.hull_rings
-        self.bodies, self.links = [lay.stubs[f], *lay.bodies[f]], lay.links
-        self.height, self.segment = float(hand.height[f]), float(hand.length[f]) / lay.links
+        lay = layout(scene)
+        width = scene.hand.section.width
+        k = scene.discretization.hull_rings
+        self.bodies = [lay.stubs[f], *lay.bodies[f]]
+        self.links = lay.links
+        self.height = float(hand.height[f])
+        self.segment = float(hand.length[f]) / lay.links
         self.frames = [data.xmat[b].reshape(3, 3) for b in self.bodies]
         self.rings = []
         for link in range(1, lay.links + 1):
             last = link == lay.links
             for j in range(k):
-                tip, size = last and j == k - 1, (0.5 if last else 1.0) / k
+                tip = last and j == k - 1
+                size = (0.5 if last else 1.0) / k
                 at = 0.25 if tip else (j + 0.5) * size
                 half = np.array([0.25 if tip else 0.6 * size, 0, 0]) * self.segment
                 half[1:] = width / 2, self.height / 2
-                body, frame = self.bodies[link], self.frames[link]
+                body = self.bodies[link]
+                frame = self.frames[link]
                 centre = data.xpos[body] + frame @ [at * self.segment, 0, self.height / 2]
                 ring = body, link, link - 0.5 + at, centre, frame, half, size * self.segment / width
                 self.rings.append(Ring(*ring, tip))
@@ -348,14 +372,16 @@ def cap(unit, u):
     """Area of the cap of |y|^4 + |z|^4 = 1 at the relative depth u; see docs/hull.md."""
     y, z = np.sqrt(unit[1:] ** 2 + FLOOR)
     t = min(y, z) / max(y, z)
-    face, edge = 2.26 * u**1.25 * (1 - 0.11 * u), 1.56 * u**1.5 * (1 + 0.1 * u)
+    face = 2.26 * u**1.25 * (1 - 0.11 * u)
+    edge = 1.56 * u**1.5 * (1 + 0.1 * u)
     return edge + (face - edge) / (1 + (t / (0.5 * u ** (2 / 3))) ** 2)
 
 
 def secant(ring, size, unit, axial, gap):
     """Share of the scene's stiffness of a ring at a gap."""
     depth = max(-gap, 0.5e-3)
-    u, (_, a, b) = min(depth / size, 1), ring.half
+    u = min(depth / size, 1)
+    _, a, b = ring.half
     side = ring.length * b / 2 * cap(unit, u) / depth
     end = 2.6 * a * b * np.sqrt(u) / (2 * a) ** 2
     ahead = max(axial, 0) ** 2 if ring.tip else 0.0
@@ -394,9 +420,11 @@ def between(ring, other, low, high):
     """Point, normal, gap and share of a ring on a finger's centre line; and its body there."""
     i, t = other.nearest(ring.centre, low, high)
     a, b = other.points[i : i + 2]
-    away, section = ring.centre - a - t * (b - a), other.section(i, t)
+    away = ring.centre - a - t * (b - a)
+    section = other.section(i, t)
     apart = np.linalg.norm(away)
-    line, normal = away / apart, 0.0
+    line = away / apart
+    normal = 0.0
     half = np.array([other.rings[-1].half[0] if i == other.links else 0.0, *ring.half[1:]])
     half[1:] = other.rings[-1].half[1:]
     for frame, size, sign in ((ring.frame, ring.half, -1), (section, half, 1)):
@@ -404,7 +432,8 @@ def between(ring, other, low, high):
         along = (line @ frame[:, 0]) ** 2
         normal = normal + (1 - along) * own + along * line
     normal = normal / np.linalg.norm(normal)
-    back, toward = section.T @ normal, -ring.frame.T @ normal
+    back = section.T @ normal
+    toward = -ring.frame.T @ normal
     if t < 1 or back[0] <= 0:
         half[0] = 0.0
     size, unit = reach(ring.half, toward)

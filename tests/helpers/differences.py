@@ -64,7 +64,9 @@ def curled(scene, steps, *, bend=0.9, height=0.07, seed=1):
 
 def weights_of(start, seed=0):
     """Random ones."""
-    random, nq, steps = np.random.default_rng(seed), len(start.fields.start), len(start.ctrl)
+    random = np.random.default_rng(seed)
+    nq = len(start.fields.start)
+    steps = len(start.ctrl)
     shapes = (2 * nq - 1,), (steps, 3), (steps, nq)
     weights = Weights(*(random.normal(size=shape) for shape in shapes))
     weights.entries[0, 2] = 0.0  # the first speed is a number of the state, as it is given
@@ -131,12 +133,14 @@ class Case:
         if k > 3:
             return Ellipsis
         layout = getattr(self.program, TABLES[k])
-        count, first = layout.groups[name][0] * layout.stride[name], layout.offset[name]
+        count = layout.groups[name][0] * layout.stride[name]
+        first = layout.offset[name]
         return slice(first, first + count)
 
     def _opposite(self, values):
         """Rows of what fingers hold on one another, of values (row, finger): equal and opposite."""
-        found, fingers = np.zeros_like(values), np.arange(values.shape[1])
+        found = np.zeros_like(values)
+        fingers = np.arange(values.shape[1])
         rows = self.rows(2, f"held.{FINGERS}")
         for item, row in enumerate(np.arange(values.shape[0])[rows][::3]):
             other = fingers ^ item
@@ -146,10 +150,13 @@ class Case:
 
     def directions(self):
         """A random direction for each group, as large as its numbers."""
-        random, found = np.random.default_rng(0), []
+        random = np.random.default_rng(0)
+        found = []
         for k, name in self.groups:
-            here, rows = self.world(self.tables[k]), self.rows(k, name)
-            along, noise = np.zeros_like(here), random.normal(size=here.shape)
+            here = self.world(self.tables[k])
+            rows = self.rows(k, name)
+            along = np.zeros_like(here)
+            noise = random.normal(size=here.shape)
             size = {2: 0.1, 3: 0.1, 4: 0.01, 5: np.abs(here).max()}.get(k)
             along[rows] = noise[rows] * (np.abs(here[rows]) if size is None else size)
             if name == f"held.{FINGERS}":
@@ -161,12 +168,14 @@ class Case:
 
     def differences(self, weights, step):
         """Central differences of the weighted results along the groups' directions; the trace."""
-        tables, count = self.many(2 * len(self.groups) + 1), 2 * len(self.groups) + 1
+        tables = self.many(2 * len(self.groups) + 1)
+        count = 2 * len(self.groups) + 1
         for g, ((k, name), along) in enumerate(zip(self.groups, self.directions(), strict=True)):
             for side, sign in ((2 * g, 1), (2 * g + 1, -1)):
                 self._move(tables[k], side, sign * step * along)
                 if name == "grid_factor":  # a mesh's support points are as large as its grid
-                    rows, support = self.rows(1, name), self.rows(0, "support")
+                    rows = self.rows(1, name)
+                    support = self.rows(0, "support")
                     growth = along[rows] / self.world(self.tables[1])[rows]
                     more = np.zeros_like(self.world(tables[0]))
                     more[support] = sign * step * growth * self.world(self.tables[0])[support]
@@ -192,7 +201,8 @@ class Case:
 
     def bars(self, tables, out, weights):
         """Cotangents of tables for weights of each world, by what `execute` made of them."""
-        program, count = self.program, tables[0].shape[0] * self.program.block
+        program = self.program
+        count = tables[0].shape[0] * self.program.block
         missing = [weights[0].times(0.0)] * (count - len(weights))
         last, entries, qpos = (np.stack(x) for x in zip(*weights, *missing, strict=True))
 

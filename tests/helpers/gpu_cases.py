@@ -72,7 +72,8 @@ def short(name):
 def slopes(name):
     """Derivatives of eight steps of a curled hand by every group of numbers, in float64."""
     with jax.enable_x64(True):
-        scene, backend = short_scene(name), jax.default_backend()
+        scene = short_scene(name)
+        backend = jax.default_backend()
         case = differences.Case(scene, differences.curled(scene, 8), backend=backend)
         tables = case.many(1)
         bars = case.bars(tables, case.execute(tables), [differences.weights_of(case.start)])

@@ -54,7 +54,8 @@ def short_grasp():
 
 def random_designs(space, seed, count):
     """Uniform designs inside the bounds and under the pressure limit, (count, parameter)."""
-    low, high = np.array(space.low), np.array(space.high)
+    low = np.array(space.low)
+    high = np.array(space.high)
     designs = low + (high - low) * np.random.default_rng(seed).random((count, len(low)))
     return jax.jit(jax.vmap(space.project))(jnp.asarray(designs))
 
@@ -107,7 +108,8 @@ def random_constants(the_scene, seed, count=None):
 
 def still(shape=0):
     """A trial without noise, as NumPy arrays."""
-    zero, one = np.zeros(()), np.ones(())
+    zero = np.zeros(())
+    one = np.ones(())
     return Trial(np.int32(shape), np.zeros(2), zero, np.zeros(2), one, one, one, one, one)
 
 

@@ -27,7 +27,9 @@ def body(rounds, x, table, out, scratch):
 
 def call(x, table, rounds=10):
     """The kernel as a `pallas_call`, with its outputs."""
-    blocks, dtype, lanes = x.shape[0], x.dtype, x.shape[2]
+    blocks = x.shape[0]
+    dtype = x.dtype
+    lanes = x.shape[2]
 
     def spec(rows, own=True):
         return pl.BlockSpec((None, rows, lanes), lambda i: (i if own else 0, 0, 0))

@@ -54,7 +54,9 @@ def path(engine, fields, ctrl):
 def exact(scene, fields):
     """MuJoCo C's model of a world, solved to rounding."""
     compiled = world_model(scene, fields)
-    compiled.opt.tolerance, compiled.opt.iterations, compiled.opt.ls_iterations = 0.0, 200, 50
+    compiled.opt.tolerance = 0.0
+    compiled.opt.iterations = 200
+    compiled.opt.ls_iterations = 50
     return compiled
 
 
@@ -65,14 +67,20 @@ def against_mujoco(scene, fields, ctrl, found, stride=1):
     start is left out: there the object is so exactly on the table that rounding decides whether
     it touches.
     """
-    h, lay = scene.discretization.timestep, model.layout(scene)
-    errors, far, touching = [], [], []
+    h = scene.discretization.timestep
+    lay = model.layout(scene)
+    errors = []
+    far = []
+    touching = []
     for world in range(len(ctrl)):
         own = grasps.nth(fields, world)
         data = mujoco.MjData(compiled := exact(scene, own))
         for k in range(1, ctrl.shape[1] - 1, stride):
-            qpos, (qvel, after) = found.qpos[world, k], found.qvel[world, k : k + 2]
-            data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, ctrl[world, k]
+            qpos = found.qpos[world, k]
+            qvel, after = found.qvel[world, k : k + 2]
+            data.qpos[:] = qpos
+            data.qvel[:] = qvel
+            data.ctrl[:] = ctrl[world, k]
             soften(scene, own, data)
             mujoco.mj_forward(compiled, data)
             scale = max(np.linalg.norm(data.qacc), FLOOR)
@@ -98,20 +106,23 @@ def unbalanced(scene, fields, ctrl, found, stride):
     which is compliant, joints and object, each over the largest of all states if nothing were
     accelerated, shape (3, state).
     """
-    end, count = 6 + model.layout(scene).dofs.size, -(-ctrl.shape[1] // stride)
+    end = 6 + model.layout(scene).dofs.size
+    count = -(-ctrl.shape[1] // stride)
     states = [v[:, ::stride] for v in (found.qpos, found.qvel, found.acc, ctrl)]
     qpos, qvel, acc, u = (np.asarray(v).reshape(-1, v.shape[-1]) for v in states)
     many = jax.tree.map(lambda v: np.repeat(np.asarray(v), count, 0), fields)
 
     @jax.jit
     def pushes(many, qpos, qvel, acc):
-        state, hand = coordinates.make(scene, qpos, qvel, acc), world_constants(scene, many)
+        state = coordinates.make(scene, qpos, qvel, acc)
+        hand = world_constants(scene, many)
         kin = kinematics(hand, model.layout(scene).axes, state)
         velocity = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
         contacts = assembly.contacts(scene, hand, kin, state.position, velocity)
 
         def power(virtual: Acc, acc: Acc):
-            motion, along = propagate(kin, acc), propagate(kin, virtual)
+            motion = propagate(kin, acc)
+            along = propagate(kin, virtual)
             each = [0.0 * along.object.sum()]
             for name, c in contacts.items():
                 speed = c.relative(relative(name, velocity))
@@ -131,8 +142,11 @@ def unbalanced(scene, fields, ctrl, found, stride):
         if k % count == 0:
             own = grasps.nth(fields, k // count)
             oracle = world_model(scene, own)
-            data, mass = mujoco.MjData(oracle), np.zeros((oracle.nv, oracle.nv))
-        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[k], qvel[k], u[k]
+            data = mujoco.MjData(oracle)
+            mass = np.zeros((oracle.nv, oracle.nv))
+        data.qpos[:] = qpos[k]
+        data.qvel[:] = qvel[k]
+        data.ctrl[:] = u[k]
         soften(scene, own, data)
         mujoco.mj_forward(oracle, data)
         mujoco.mj_fullM(oracle, data, mass)

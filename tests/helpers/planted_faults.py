@@ -73,7 +73,8 @@ class Planted:
 
     def __init__(self, faults: Mapping[str, Fault]):
         """Takes the faults; a fault's world has its number."""
-        self.faults, self.used = faults, set()
+        self.faults = faults
+        self.used = set()
         self.step: Any = None
 
     def __call__(self, function: Callable, *args: Any) -> Any:
@@ -101,7 +102,8 @@ class Planted:
 
     def lanes(self, number: int) -> jax.Array:
         """Lanes on which a fault is now."""
-        fault, step = [*self.faults.values()][number], self.step
+        fault = [*self.faults.values()][number]
+        step = self.step
         own = step.constant("penetration").lane - DEEP == number
         if fault.finger is not None:
             own = own & (step.block.finger == fault.finger)
@@ -162,7 +164,8 @@ def planted(faults: Mapping[str, Fault]) -> Iterator[Planted]:
 
 def simulate(scene, fields, state, ctrl, number, iterations=30):
     """The kernel's trace with all states, solved to rounding; `number`: of each world's fault."""
-    hand, engine = world_constants(scene, fields), StructuredEngine(scene)
+    hand = world_constants(scene, fields)
+    engine = StructuredEngine(scene)
     number = jnp.asarray(number, ctrl.dtype)[None]
     far = FAR + 0 * number
     hand = hand._replace(bounds=hand.bounds._replace(speed=far, penetration=DEEP + number))

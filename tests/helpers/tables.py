@@ -6,7 +6,9 @@ import numpy as np
 from codesign_jax import model
 from tests.helpers.grasps import hand_world, pinch
 
-MASS, GRAVITY, MU = 0.1, 9.81, 0.5
+MASS = 0.1
+GRAVITY = 9.81
+MU = 0.5
 
 
 class Table:

@@ -22,7 +22,9 @@ class ToyEngine:
 
     def __init__(self, the_scene, *, failing=()):
         """Takes the worlds of a batch that come out as not finite."""
-        self.scene, self.failing, self.traced = the_scene, list(failing), 0
+        self.scene = the_scene
+        self.failing = list(failing)
+        self.traced = 0
         self.first_link = int(model.layout(the_scene).bodies[0, 0])
 
     def rollout(self, fields, ctrl, *, trajectory=False):

@@ -94,7 +94,9 @@ class Bench:
     """A scene in one engine and precision."""
 
     def __init__(self, the_scene: Scene, engine: str, precision: str):
-        self.scene, self.engine, self.wide = the_scene, engine, precision == "float64"
+        self.scene = the_scene
+        self.engine = engine
+        self.wide = precision == "float64"
         assert self.wide or engine == "structured"  # MuJoCo C is built for float64
         self.h = the_scene.discretization.timestep
 
@@ -140,8 +142,10 @@ class Bench:
         out = []
         for w in range(len(ctrl)):
             compiled = world_model(self.scene, grasps.nth(fields, w))
-            data, rows = mujoco.MjData(compiled), []
-            data.qpos[:], data.qvel[:] = qpos[w], qvel[w]
+            data = mujoco.MjData(compiled)
+            rows = []
+            data.qpos[:] = qpos[w]
+            data.qvel[:] = qvel[w]
             thing = compiled.body_mass[-1], compiled.body_inertia[-1].copy()
             for k, u in enumerate(ctrl[w]):
                 if masses is not None and k % CHUNK == 0:
@@ -160,7 +164,8 @@ class Bench:
         dtype = jnp.float64 if self.wide else jnp.float32
         with floats(self.wide):
             fields = jax.tree.map(lambda v: np.asarray(v, dtype), fields._replace(start=qpos))
-            count, (start, advance) = ctrl.shape[1], self._program
+            count = ctrl.shape[1]
+            start, advance = self._program
             hand, state = start(fields, jnp.asarray(qvel, dtype))
             ctrl = np.concatenate([ctrl, np.repeat(ctrl[:, -1:], -count % CHUNK, 1)], 1)
             rows = []

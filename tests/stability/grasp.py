@@ -101,7 +101,8 @@ def zero_gap(engine, step, precision):
     params = design(b.scene, length=180, arm_z=60)
     fields = b.fields([params], [grasps.still()])
     reader = Reader(b.scene, fields)
-    data, spheres = reader.at(fields.start[0]), reader.lay.spheres.ravel()
+    data = reader.at(fields.start[0])
+    spheres = reader.lay.spheres.ravel()
     gap = (data.geom_xpos[spheres, 2] - reader.model.geom_size[spheres, 0]).min()
     fields.start[0, 2] -= gap
     ctrl = np.repeat(b.commands([params], [grasps.still()])[:, :1], round(1 / b.h), 1)
@@ -124,7 +125,8 @@ def long_hold(name, engine, step, precision):
     times = [round(t / b.h) for t in (b.scene.phases.lift + 0.5, b.scene.phases.disturb)]
     worst = 0.0
     for world in range(len(ctrl)):
-        reader, places = Reader(b.scene, fields, world), []
+        reader = Reader(b.scene, fields, world)
+        places = []
         for k in times:
             data = reader.at(history.qpos[world, k])
             away = history.object[world, k] - data.xpos[1]

@@ -22,7 +22,8 @@ def lifted(the_bench, seconds):
     """Fields and controls of the box lifted by two fingers and held for a time."""
     params, trial = grasps.hand_world(the_bench.scene, length=0.09, pressure=190e3)
     params = at_height(params, 0.05)
-    fields, ctrl = the_bench.fields([params], [trial]), the_bench.commands([params], [trial])
+    fields = the_bench.fields([params], [trial])
+    ctrl = the_bench.commands([params], [trial])
     ctrl = ctrl[:, : round(4.5 / the_bench.h)]
     return fields, np.concatenate(
         [ctrl, np.repeat(ctrl[:, -1:], round(seconds / the_bench.h), 1)], 1
@@ -30,7 +31,8 @@ def lifted(the_bench, seconds):
 
 
 def firm(name="paper_spheres"):
-    stiff, slow = FIRM.normal_stiffness, FIRM.friction_ratio
+    stiff = FIRM.normal_stiffness
+    slow = FIRM.friction_ratio
     return pinch(name, contact__normal_stiffness=stiff, contact__friction_ratio=slow)
 
 
@@ -62,7 +64,8 @@ def grip(reader):
     loads = []
     for names, force, c in reader.pushes():
         if any("finger" in n for n in names):
-            down, mu = c.frame[2], c.friction[0]
+            down = c.frame[2]
+            mu = c.friction[0]
             loads.append(force * (mu * np.sqrt(1 - down**2) + down))
     return sum(loads)
 
@@ -89,7 +92,8 @@ def pinch_drops(engine, step, precision):
     when = start + int(np.argmax(fast))
     load = mass * masses[when // CHUNK] * GRAVITY
     factor = masses[when // CHUNK]
-    reader, grips = Reader(b.scene, loaded(fields, factor)), []
+    reader = Reader(b.scene, loaded(fields, factor))
+    grips = []
     # A sliding contact hops, so the grip is the mean over the last tenth of a second.
     for k in range(when - round(0.1 / b.h), when):
         reader.at(history.qpos[0, k], history.qvel[0, k], ctrl[0, k + 1])
@@ -128,7 +132,8 @@ def heavy_rest(name, engine, step, precision):
 # --- 38: two pads ----------------------------------------------------------------------------
 
 
-RADIUS, WEIGHT = 0.024, 0.045
+RADIUS = 0.024
+WEIGHT = 0.045
 """Radius [m] and mass [kg] of a capsule, which stands between two pads; google-deepmind/mujoco
 issue 3328 has one of that mass, which slips down by 155 um/s at pads of 12 to 60 N."""
 HANDS = "finger_object finger_table finger_finger finger_palm finger_itself palm_object palm_table"

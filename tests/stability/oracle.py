@@ -12,10 +12,12 @@ class Reader:
     """MuJoCo C's model of a world, which reads states and never steps."""
 
     def __init__(self, the_scene, fields, world=0):
-        self.scene, self.lay = the_scene, model.layout(the_scene)
+        self.scene = the_scene
+        self.lay = model.layout(the_scene)
         self.fields = grasps.nth(fields, world)
         self.model = world_model(the_scene, self.fields)
-        self.model.opt.tolerance, self.model.opt.iterations = 0.0, 200
+        self.model.opt.tolerance = 0.0
+        self.model.opt.iterations = 200
         self.data = mujoco.MjData(self.model)
 
     def at(self, qpos, qvel=None, ctrl=None):
@@ -30,7 +32,8 @@ class Reader:
 
     def pushes(self):
         """Contacts of the present state: names of both geoms, normal force [N] and MuJoCo's row."""
-        found, force = [], np.zeros(6)
+        found = []
+        force = np.zeros(6)
         for i, c in enumerate(self.data.contact):
             mujoco.mj_contactForce(self.model, self.data, i, force)
             names = [

@@ -70,7 +70,9 @@ class Case:
         row = {"case": self.number, "precision": precision, "step": step, "note": found.note}
         names = ("name", "title", "invariant", "engine", "lower", "unit", "failure")
         row |= {name: getattr(self, name) for name in names}
-        measured, bound = float(found.measured), float(found.bound)  # of NumPy's, JSON has none
+        # of NumPy's, JSON has none
+        measured = float(found.measured)
+        bound = float(found.bound)
         row |= {"measured": measured, "bound": bound, "margin": margin(self.lower, measured, bound)}
         row["passed"] = row["margin"] >= 1
         return row
@@ -119,7 +121,8 @@ def write(docs: Path, new: list[dict[str, Any]]) -> None:
     """Puts rows in the place of the same ones of the stored table, and the table into its page."""
     state = git_state()
     made = str(state["commit"])[:7] + (" with changes" if state.get("modified") else "")
-    path, page = docs / "data" / "stability.json", docs / "notes" / "stability.md"
+    path = docs / "data" / "stability.json"
+    page = docs / "notes" / "stability.md"
     old = json.loads(path.read_text())["rows"] if path.exists() else []
     rows = {(r["name"], r["step"], r["precision"]): r for r in old}
     for row in new:
@@ -143,7 +146,8 @@ def to_markdown(rows: list[dict[str, Any]]) -> str:
     ]
     for _, group in itertools.groupby(rows, lambda r: (r["name"], r["precision"])):
         part = list(group)
-        first, steps = part[0], [r["step"] for r in part]
+        first = part[0]
+        steps = [r["step"] for r in part]
         values = "; ".join(number(r["measured"]) for r in part)
         if tuple(steps) != STEPS:
             values += f" ({'; '.join('h' if s == 1 else f'h/{1 / s:g}' for s in steps)})"

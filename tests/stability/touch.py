@@ -65,8 +65,10 @@ def spawned(engine, step, precision):
     b = bench(weightless(), engine, step, precision)
     fields = worlds(b, SPHERE, SPHERE, SPHERE)
     compiled = world_model(b.scene, grasps.nth(fields, 0))
-    data, qpos = mujoco.MjData(compiled), fields.start.copy()
-    radius, deep = compiled.geom_size[-1, 0], 0.010
+    data = mujoco.MjData(compiled)
+    qpos = fields.start.copy()
+    radius = compiled.geom_size[-1, 0]
+    deep = 0.010
     qpos[0, -5] -= deep
     lay = model.layout(b.scene)
     finger = middle_of_finger(compiled, data, qpos[1])

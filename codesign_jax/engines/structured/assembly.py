@@ -42,7 +42,8 @@ def contacts(
       position: The object's centre, shape (3, 1, world).
       velocity: Of the bodies; none where they are at rest.
     """
-    e, found = scene.effects, {}
+    e = scene.effects
+    found = {}
 
     def add(name: str, place: Place, count: int = 1) -> None:
         cone = getattr(hand.cones, which_cone(name))
@@ -98,8 +99,10 @@ def grips(scene: Scene, hold: jax.Array, kin: Kinematics) -> dict[str, jax.Array
     Returns:
       Friction along the world's axes, shape (3, ...), items as those of the contacts.
     """
-    found, rows = {}, held.rows(scene)
-    lanes, links = held.lanes(scene), scene.discretization.links
+    found = {}
+    rows = held.rows(scene)
+    lanes = held.lanes(scene)
+    links = scene.discretization.links
     for name in (n for n in rows if n != "finger_finger"):
         own = hold[rows[name]].reshape(-1, 3, lanes, hold.shape[-1])  # (item, 3, lane, world)
         if name.startswith("finger"):
@@ -124,7 +127,8 @@ def _dealt_back(scene: Scene, name: str, own: jax.Array) -> jax.Array:
 
 def _candidates(scene: Scene, place: Place, cone: Cone, moving: jax.Array | None) -> Contacts:
     """Contacts at places, for relative velocities of their bodies or bodies at rest."""
-    c, approach = Contacts(*place[:3], cone.of_share(place.share)), 0.0 * place.gap
+    c = Contacts(*place[:3], cone.of_share(place.share))
+    approach = 0.0 * place.gap
     if moving is not None:
         approach = -dot(c.normal, c.relative(moving))
     share = candidates(place.share, place.gap, approach, cone, margin(scene))
@@ -155,7 +159,8 @@ def _of_object(
     scene: Scene, hand: WorldModel, kin: Kinematics, position: jax.Array, of_object: Callable
 ) -> list[Place]:
     """Contacts of the object with table and fixtures, items first."""
-    places, one = [], jnp.ones_like
+    places = []
+    one = jnp.ones_like
     if scene.effects.table:
         place = shapes.object_on_table(scene, hand, kin.object, position[2])
         places.append(Place(*place, one(place[2])))
@@ -206,9 +211,13 @@ def hand_contacts(
     Args:
       hold: What contacts hold, as in `State`.
     """
-    e, found, links = scene.effects, {}, scene.discretization.links
-    k, n = rings_of_link(scene), scene.num_fingers
-    on_itself, hull = touches_itself(scene), e.surface == "hull"
+    e = scene.effects
+    found = {}
+    links = scene.discretization.links
+    k = rings_of_link(scene)
+    n = scene.num_fingers
+    on_itself = touches_itself(scene)
+    hull = e.surface == "hull"
     if not k or not (e.finger_finger or e.finger_palm or on_itself):
         return {}
     numbers = jnp.moveaxis(memory_tables.ring_numbers(scene, hand, k), 1, 0)
@@ -221,8 +230,10 @@ def hand_contacts(
     frame = frames[:, :, link]
     centre = once(finger_collision.ring_centre, joints[:, link], frame, numbers)
     lines = _centre_lines(scene, frames, joints, numbers, centre) if hull else None
-    alone, two = np.stack([np.arange(n)] * 2), np.stack(np.triu_indices(n, 1))
-    grip, rows = None, held.rows(scene).get("finger_finger")
+    alone = np.stack([np.arange(n)] * 2)
+    two = np.stack(np.triu_indices(n, 1))
+    grip = None
+    rows = held.rows(scene).get("finger_finger")
     if rows is not None:
         grip = hold[rows].reshape(-1, 3, *hold.shape[1:])
 
@@ -239,7 +250,9 @@ def hand_contacts(
 
     def with_lines(first: np.ndarray, second: np.ndarray, own: bool) -> tuple[Place, jax.Array]:
         assert lines is not None
-        ring, mine, at = numbers[:, :, first], frame[:, :, :, first], centre[:, :, first]
+        ring = numbers[:, :, first]
+        mine = frame[:, :, :, first]
+        at = centre[:, :, first]
         square, other, t = lines.nearest(at, second, lines.last(numbers) if own else None)
         place = once(finger_collision.between, ring, mine, at, lines.sections(other, second), t)
         return place._replace(share=jnp.where(square < FAR, place.share, 0.0)), other
@@ -277,7 +290,8 @@ def _on_palm(
       pose: Frames of their links, shape (3, 3, item, finger, world), and their centres.
     """
     assert hand.palm_disc is not None
-    (row, numbers, first), (frame, centre) = own, pose
+    row, numbers, first = own
+    frame, centre = pose
     disc = kin.place[:, None], kin.palm[:, :, None], hand.palm_disc[:, None]
     look = partial(finger_collision.palm_distance, palm=disc)
     place = _on_field(scene, look, Ring.of(numbers), frame, centre)
@@ -313,7 +327,8 @@ class _CentreLines(NamedTuple):
 
     def last(self, numbers: jax.Array) -> jax.Array:
         """The last place on segments that rings of the same finger touch; see `last_of`."""
-        links, k = self.scene.discretization.links, rings_of_link(self.scene)
+        links = self.scene.discretization.links
+        k = rings_of_link(self.scene)
         along = (finger_collision.ring_places(links, k) + np.arange(links)[:, None] + 0.5).ravel()
         largest = jnp.maximum(numbers[:, -1], numbers[:, 0])
         end = along[:, None, None] - finger_collision.arc(numbers[:, -1], largest)

@@ -14,7 +14,8 @@ import numpy as np
 from jax.extend import core
 
 # Stand for the lane axes while a function is traced: sizes that no other axis has.
-FINGER, WORLD = 1009, 1013
+FINGER = 1009
+WORLD = 1013
 
 
 def _small(shape: tuple[int, ...]) -> tuple[int, ...]:
@@ -55,7 +56,8 @@ def evaluate(jaxpr: Any, consts: Any, args: list[np.ndarray]) -> list[np.ndarray
 
 
 def _apply(equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    name, params = equation.primitive.name, equation.params
+    name = equation.primitive.name
+    params = equation.params
     for key in ("jaxpr", "call_jaxpr"):
         if name in ("jit", "pjit", "closed_call", "custom_jvp_call", "remat2", "checkpoint"):
             if key in params:

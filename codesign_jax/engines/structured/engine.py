@@ -78,7 +78,9 @@ class StructuredEngine(Equal):
         if truncate and segment is None:
             raise ValueError("truncate = True needs segment, the number of steps of a segment")
         meshes.tables(scene)
-        self.scene, self.segment, self.truncate = scene, segment, truncate
+        self.scene = scene
+        self.segment = segment
+        self.truncate = truncate
         newton = scene.newton
         self.limits = Limits(
             newton.iterations if iterations is None else iterations,
@@ -155,7 +157,8 @@ class StructuredEngine(Equal):
             return ()
 
         def tables(fields: ModelFields) -> tuple[jax.Array, ...]:
-            count, dtype = len(fields.start), fields.start.dtype
+            count = len(fields.start)
+            dtype = fields.start.dtype
             return self._tables(Program.here(self.scene, self.limits, dtype, count), fields)
 
         return transforms.folded(tables)(jax.lax.stop_gradient(fields))
@@ -200,7 +203,8 @@ class StructuredEngine(Equal):
         tables: tuple[jax.Array, ...] = (),
     ) -> tuple:
         """The kernel's arguments, see `Program.inputs`."""
-        hand, state = world_constants(self.scene, fields), self.reset(fields)
+        hand = world_constants(self.scene, fields)
+        state = self.reset(fields)
         if program.team == 1:
             return program.inputs(hand, state, ctrl)
         tables = tables or self._tables(program, fields)
@@ -255,7 +259,8 @@ class StructuredEngine(Equal):
             if team > 1:
                 inputs = self._inputs(here, fields, ctrl)
                 return (inputs[:-1], inputs[-1:]) if here.meshes else (inputs, ())
-            hand, state = world_constants(self.scene, fields), self.reset(fields)
+            hand = world_constants(self.scene, fields)
+            state = self.reset(fields)
             # What is calculated is apart from how it is laid out, so that XLA rounds alike
             # whatever the width.
             inputs = here.inputs(*jax.lax.optimization_barrier((hand, state, ctrl)))
@@ -298,7 +303,9 @@ class Recording(Equal):
     """The engine `structured` as one whose traces have `Trace.forces`; without derivatives."""
 
     def __init__(self, engine: StructuredEngine):
-        self.engine, self.scene, self.name = engine, engine.scene, engine.name
+        self.engine = engine
+        self.scene = engine.scene
+        self.name = engine.name
 
     def _key(self) -> tuple:
         return (self.engine,)

@@ -37,11 +37,14 @@ def forces(scene: Scene, hand: WorldModel, state: State, acc: Acc) -> Forces:
     velocity = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
     motion = propagate(kin, acc)
     found = assembly.contacts(scene, hand, kin, state.position, velocity)
-    fingers, worlds = scene.num_fingers, state.wrist.shape[-1]
+    fingers = scene.num_fingers
+    worlds = state.wrist.shape[-1]
     none = jnp.zeros((3, fingers, worlds), state.wrist.dtype)
     net = {name: none[:, :1] for name in ("palm_object", "palm_table", "object_table")}
     net |= {name: none for name in ("finger_object", "finger_table")}
-    grip, depth, hold = none[0], {}, assembly.grips(scene, state.held, kin)
+    grip = none[0]
+    depth = {}
+    hold = assembly.grips(scene, state.held, kin)
     for name, contacts in found.items():
         own = hold.get(name)
         force, normal = once(partial(_acting, name), contacts, motion, velocity, own)
@@ -53,7 +56,8 @@ def forces(scene: Scene, hand: WorldModel, state: State, acc: Acc) -> Forces:
     on_palm = none[0]
     met = assembly.hand_contacts(scene, hand, kin, velocity, state.held)
     for name, these in met.items():
-        normal, depth[name] = once(_pressing, these, motion, velocity), _deepest(these.contacts)
+        normal = once(_pressing, these, motion, velocity)
+        depth[name] = _deepest(these.contacts)
         one, two = these.fingers
         if name == "finger_palm":
             on_palm = normal
@@ -91,7 +95,8 @@ def _acting(
     jar = contacts.relative(relative(name, motion)) - contacts.reference(speed)
     jar = jar if hold is None else jar + holding.held(contacts, hold)
     force = _force(contacts, jar)
-    normal, lanes = dot(contacts.normal, force), force.shape[-2:]
+    normal = dot(contacts.normal, force)
+    lanes = force.shape[-2:]
     if not name.startswith("finger"):
         lanes = 1, lanes[1]
     return force.reshape(3, -1, *lanes).sum(1), normal.reshape(-1, *lanes).sum(0)

@@ -33,7 +33,8 @@ def scan_links(step: Callable, first: Any, links: Any) -> tuple[Any, Any]:
       links: Arrays with leading axis (link,).
     """
     leading, treedef = jax.tree.flatten(links)
-    count, out_shapes = leading[0].shape[0], []
+    count = leading[0].shape[0]
+    out_shapes = []
     rows = [x.reshape(count, -1) for x in leading]
 
     def body(carry: Any, i: jax.Array) -> tuple[Any, Any]:
@@ -78,7 +79,8 @@ def dot(a: jax.Array, b: jax.Array) -> jax.Array:
 def cross(a: jax.Array, b: jax.Array) -> jax.Array:
     """Cross product of vectors with the components in front; trailing axes broadcast."""
     # Indexing by numbers would be an operation for each use of a component.
-    (x, y, z), (u, v, w) = jnp.unstack(a), jnp.unstack(b)
+    x, y, z = jnp.unstack(a)
+    u, v, w = jnp.unstack(b)
     return jnp.stack([y * w - z * v, z * u - x * w, x * v - y * u])
 
 
@@ -93,7 +95,8 @@ def motion_cross(v: jax.Array, s: jax.Array) -> jax.Array:
 
 def rotate(columns: list[jax.Array], axis: int, angle_cos: jax.Array, angle_sin: jax.Array) -> list:
     """Turns a frame, given by its columns, about its own axis 0, 1 or 2."""
-    i, j = (axis + 1) % 3, (axis + 2) % 3
+    i = (axis + 1) % 3
+    j = (axis + 2) % 3
     turned = list(columns)
     turned[i] = angle_cos * columns[i] + angle_sin * columns[j]
     turned[j] = angle_cos * columns[j] - angle_sin * columns[i]
@@ -117,10 +120,19 @@ def inverse_spd(m: jax.Array) -> jax.Array:
         scale = 1.0 / (m[0, 0] * m[1, 1] - m[0, 1] * m[0, 1])
         off = -m[0, 1] * scale
         return jnp.stack([jnp.stack([m[1, 1] * scale, off]), jnp.stack([off, m[0, 0] * scale])])
-    a, b, c, d, e, f = m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], m[2, 2]
-    aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
+    a = m[0, 0]
+    b = m[0, 1]
+    c = m[0, 2]
+    d = m[1, 1]
+    e = m[1, 2]
+    f = m[2, 2]
+    aa = d * f - e * e
+    bb = c * e - b * f
+    cc = b * e - c * d
     scale = 1.0 / (a * aa + b * bb + c * cc)
-    ab, ac, bc = bb * scale, cc * scale, (b * c - a * e) * scale
+    ab = bb * scale
+    ac = cc * scale
+    bc = (b * c - a * e) * scale
     rows = [
         [aa * scale, ab, ac],
         [ab, (a * f - c * c) * scale, bc],

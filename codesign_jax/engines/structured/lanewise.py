@@ -30,7 +30,9 @@ class Lanes:
     """
 
     def __init__(self, parts: np.ndarray, shape: tuple[int, ...], dtype: Any):
-        self.parts, self.shape, self.dtype = parts, shape, np.dtype(dtype)
+        self.parts = parts
+        self.shape = shape
+        self.dtype = np.dtype(dtype)
 
     def __getitem__(self, index: Any) -> "Lanes":
         """Components along the leading axes that are not lanes."""

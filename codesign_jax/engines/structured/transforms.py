@@ -171,7 +171,8 @@ def _gathered(taken: jax.Array, x: jax.Array) -> jax.Array:
       taken: Number of steps that each world took, shape (world, 1): later entries show the state
         at its end.
     """
-    step, end = jnp.arange(x.shape[1])[:, None], taken[:, None]
+    step = jnp.arange(x.shape[1])[:, None]
+    end = taken[:, None]
     rest = jnp.where(step >= end, x, 0.0).sum(1, keepdims=True)
     return jnp.where(step < end, x, jnp.where(step == end, rest, 0.0))
 
@@ -204,8 +205,10 @@ def _reversed(
     if settings.segment is None:
         hand_bar, world_bar, *rest = program.adjoint(inputs, path, bars)
         return hand_bar, program.summed(world_bar), *rest
-    size, (hand, world, _, _, arm, pressure, *grid) = settings.segment, inputs
-    steps, count = arm.shape[1], path.finger.shape[1]
+    size = settings.segment
+    hand, world, _, _, arm, pressure, *grid = inputs
+    steps = arm.shape[1]
+    count = path.finger.shape[1]
     how = {"backend": program.backend, "width": program.size, "team": 1}
     again = Program(settings.scene, settings.limits, **how)  # type: ignore[arg-type]
 

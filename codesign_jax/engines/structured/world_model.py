@@ -166,7 +166,8 @@ def _world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
     base = vectors(fields.body_pos, lay.stubs)
     stub_centre = base + apply_columns(mount, vectors(fields.body_ipos, lay.stubs))
     palm = _palm(fields, lay.stubs, mount, stub_centre, last)
-    sizes, rbound = fields.geom_size[:, lay.object_geoms], fields.geom_rbound[:, lay.object_geoms]
+    sizes = fields.geom_size[:, lay.object_geoms]
+    rbound = fields.geom_rbound[:, lay.object_geoms]
     shape = jnp.argmax(rbound, axis=1)  # the one not shrunk to INACTIVE
     picked = jnp.take_along_axis(sizes, shape[:, None, None], axis=1)[:, 0]
     object_size = last(picked)[:, None]

@@ -44,7 +44,8 @@ def build(vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float) -
     """
     points = near_surface(vertices, faces, 3000)
     exact = signed_distance(vertices, faces, points)
-    low, extent = vertices.min(0) - reach, np.ptp(vertices, axis=0) + 2 * reach
+    low = vertices.min(0) - reach
+    extent = np.ptp(vertices, axis=0) + 2 * reach
     cell = _cell(vertices, faces, points[::4], exact[::4], low, bound)
     while True:
         shape = np.ceil(extent / cell).astype(int) + 1
@@ -108,7 +109,8 @@ def _cell(
     bound: float,
 ) -> float:
     """Cell that meets the bound at points, without building the grid; it begins at `low`."""
-    cell, offsets = COARSEST, np.array(list(np.ndindex(2, 2, 2)))
+    cell = COARSEST
+    offsets = np.array(list(np.ndindex(2, 2, 2)))
     while True:
         base = low + np.floor((points - low) / cell) * cell
         corners = (base[:, None] + offsets * cell).reshape(-1, 3)

@@ -34,7 +34,8 @@ def body(
       tensor: Inertia about the centre of mass per mass [m^2], in the file's axes, shape (3, 3).
     """
     # Near the origin and of order one: products of five lengths in metres drown in rounding.
-    middle, scale = vertices.mean(0), np.ptp(vertices, axis=0).max()
+    middle = vertices.mean(0)
+    scale = np.ptp(vertices, axis=0).max()
     unit = trimesh.Trimesh((vertices - middle) / scale, faces, process=False).mass_properties
     if tensor is None:
         tensor = np.asarray(unit["inertia"]) / unit["volume"] * scale**2

@@ -29,7 +29,8 @@ MOST_BYTES = 1 << 24
 MOST_FACES = 200_000
 MOST_PARTS = 1000
 """Most bodies of a file: each costs trimesh a millisecond, however small it is."""
-_STL_HEAD, _STL_FACE = 84, 50
+_STL_HEAD = 84
+_STL_FACE = 50
 """Bytes of a binary STL before its faces, the last four of them their number, and of a face."""
 _GROUP = re.compile(r"^[ \t]*+(?:usemtl|g|o|s|mtllib)\b.*$", re.MULTILINE)
 """Lines of an OBJ that name parts and materials: trimesh takes quadratic time for them."""

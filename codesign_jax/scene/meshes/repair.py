@@ -35,7 +35,8 @@ def _merge(vertices: np.ndarray, faces: np.ndarray, report: list[str]):
     pairs = KDTree(vertices).query_pairs(near, output_type="ndarray")
     if not len(pairs):
         return vertices, faces
-    ones, n = np.ones(len(pairs), bool), len(vertices)
+    ones = np.ones(len(pairs), bool)
+    n = len(vertices)
     count, group = connected_components(coo_array((ones, tuple(pairs.T)), shape=(n, n)))
     report.append(f"merged {n - count} vertices into their neighbours")
     first = np.unique(group, return_index=True)[1]
@@ -75,7 +76,8 @@ def _close(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, report: li
             vertices = np.vstack([vertices, vertices[loop].mean(0)])
             middle = len(vertices) - 1
             new = [[a, b, middle] for a, b in zip(loop, loop[1:] + loop[:1], strict=True)]
-        faces, part = np.vstack([faces, new]), np.concatenate([part, [owner] * len(new)])
+        faces = np.vstack([faces, new])
+        part = np.concatenate([part, [owner] * len(new)])
         report.append(f"closed a hole of {len(loop)} edges")
     return vertices, faces, part
 
@@ -83,7 +85,9 @@ def _close(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, report: li
 def _turn_outwards(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray):
     """Turns parts inside out but cavities, parts in an odd number of others; also which faces."""
     corner = vertices[faces] - vertices.mean(0)
-    a, b, c = corner[:, 0], corner[:, 1], corner[:, 2]
+    a = corner[:, 0]
+    b = corner[:, 1]
+    c = corner[:, 2]
     names, own = np.unique(part, return_inverse=True)
     volume = np.bincount(own, weights=np.einsum("fi,fi->f", a, np.cross(b, c)))
     each = [faces[own == k] for k in range(len(names))]

@@ -14,7 +14,9 @@ from codesign_jax.scene.schema import InputError
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 _NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
-SMALLEST, LARGEST = 0.005, 0.5  # longest side of the bounding box [m]
+# longest side of the bounding box [m]
+SMALLEST = 0.005
+LARGEST = 0.5
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -40,7 +40,8 @@ class RecordedPath(NamedTuple):
 
 def recorded(out: Any, taken: jax.Array) -> RecordedPath:
     """What `Program.execute` has recorded in blocks; `taken` as in `RecordedPath`, of blocks."""
-    finger_end, world_end = out[0][:, None], out[1][:, None]
+    finger_end = out[0][:, None]
+    world_end = out[1][:, None]
     return RecordedPath(out[-2], out[-1], finger_end, world_end, taken)
 
 
@@ -65,7 +66,8 @@ class AdjointProgram(Program):
 
     def _tables(self) -> None:
         super()._tables()
-        n, a = self.links, self.axes
+        n = self.links
+        a = self.axes
         more = {f"chain.{k}": (n + 1, shape) for k, shape in SHAPES._asdict().items()}
         more |= {"acc_bar": (n, (a,)), "virtual": (n, (a,))}
         if pairings := self.held.get("finger_finger"):
@@ -129,7 +131,9 @@ class AdjointProgram(Program):
         return (hand, world, arm, pressure, *path, *ends, *grid)
 
     def _adjoint_call(self, given: tuple) -> tuple[Callable, list[jax.ShapeDtypeStruct]]:
-        blocks, steps, dtype = given[0].shape[0], given[2].shape[1], given[2].dtype
+        blocks = given[0].shape[0]
+        steps = given[2].shape[1]
+        dtype = given[2].dtype
         shapes = [
             (blocks, self.hand.rows, self.size),
             (blocks, self.world_bars.rows, self.size),
@@ -155,7 +159,8 @@ class AdjointProgram(Program):
         hand_bar, world_bar, finger_bar, state_bar, arm_bar, pressure_bar, *rest = rest
         scratch, finger_state, world_state = rest
         block = Block(self.fingers, self.block)
-        own, none = block.world, jnp.zeros((self.size,), scratch.dtype)
+        own = block.world
+        none = jnp.zeros((self.size,), scratch.dtype)
         bars = CotangentTables(self, block, (hand_bar, world_bar, finger_bar, state_bar), scratch)
         tables = hand, world, finger_state, world_state, scratch, grid
         step = ReverseStep(self, block, tables, bars)
@@ -202,7 +207,8 @@ class AdjointProgram(Program):
         world stands still they are of no use, nor need they be numbers.
         """
         fingers, worlds, finger_end, world_end = states
-        after, more = jnp.minimum(t + 1, steps - 1), t + 1 < steps
+        after = jnp.minimum(t + 1, steps - 1)
+        more = t + 1 < steps
         first = self.finger_state.offset["acc"], self.world_state.offset["acc_wrist"]
         ends = self.finger_state.rows, self.world_state.rows
 

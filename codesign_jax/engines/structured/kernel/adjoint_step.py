@@ -72,7 +72,8 @@ class ReverseStep(Step):
         Returns:
           Cotangents of the arm's commands.
         """
-        p, bars = self.p, self.bars
+        p = self.p
+        bars = self.bars
         bars.begin()
         state, at, thing, now, centre = self.assemble(arm, pressure)
         go = lanes([moved], (), wide=False)
@@ -100,7 +101,8 @@ class ReverseStep(Step):
 
         Of wrist and object; those of the fingers' accelerations go to the scratch table, "acc_bar".
         """
-        p, h = self.p, self.p.scene.discretization.timestep
+        p = self.p
+        h = self.p.scene.discretization.timestep
         old = {n: state[n] for n in MOVED}
         after = {n: self.bars.world_state.read(n) for n in MOVED}
         given = old, at["columns"], now.wrist, now.object_motion
@@ -144,7 +146,8 @@ class ReverseStep(Step):
         shown: TraceCotangents,
     ) -> Lanes:
         """Adds palm, wrist and object; stores their cotangents and returns those of the arm."""
-        p, (now, virtual, wrist_bar) = self.p, accelerations
+        p = self.p
+        now, virtual, wrist_bar = accelerations
         still = {"acc_wrist": now.wrist, "acc_object": now.object_motion}
         still |= {"virtual_wrist": virtual.wrist, "object_along": virtual.object_motion}
         own = {n: self.bars.of_step(n) for n in self.bars.names if n != "pressure"}
@@ -205,7 +208,8 @@ class AdjointSolve(Elimination):
 
         Those of the fingers stay behind as "virtual" of the joints and "chain.along" of the links.
         """
-        problem, size = self.problem, self.block.size
+        problem = self.problem
+        size = self.block.size
         still = zeros((), self.like)
         node, work = self.backward(still)
         palm = problem.palm

@@ -46,8 +46,10 @@ def end_pressures(step: StepMemory, charge: Lanes) -> Lanes:
 
 def reverse(step: StepMemory, bars: CotangentTables, charge: Lanes) -> None:
     """Makes the cotangents of the pressures at a step's end those of the charges."""
-    p, law = step.p, _law(step)
-    given, bar = _given(step, charge), bars.of_step("pressure")
+    p = step.p
+    law = _law(step)
+    given = _given(step, charge)
+    bar = bars.of_step("pressure")
     charge, volume, air, grown = pull(lambda *v: law(*v)[0], given, (), bar)
     bars.add({"volume": volume, "air": air})
     step.scratch.write("bar.pressure", charge)
@@ -72,7 +74,8 @@ def _law(step: StepMemory) -> Callable:
 
 
 def _given(step: StepMemory, charge: Lanes) -> tuple:
-    p, like = step.p, step.like
+    p = step.p
+    like = step.like
 
     def add(sums, gain, joint):
         return [v + gain * joint[n][0] for v, n in zip(sums, JOINT, strict=True)]
@@ -89,7 +92,9 @@ class Chambers:
     """The chambers' part of a step's problem."""
 
     def __init__(self, step: StepMemory):
-        self.step, self.links, self.size = step, step.p.links, step.block.size
+        self.step = step
+        self.links = step.p.links
+        self.size = step.block.size
 
     def move(self, alpha: Lanes) -> None:
         """Moves the pressures, which are part of "tau", by the last step, and forgets that step."""
@@ -133,8 +138,10 @@ class Chambers:
 
         pp, po, oo = (lanewise(square, share, *v) for v in ((palm, palm), (palm, obj), (obj, obj)))
         r, ro, less = self.close_again("z", node.r, node.r_object)
-        p, q = lanewise(jnp.add, node.p, upper(pp)), lanewise(jnp.add, node.q, upper(oo))
-        c, work = lanewise(jnp.subtract, node.c, po), lanewise(jnp.subtract, work, less)
+        p = lanewise(jnp.add, node.p, upper(pp))
+        q = lanewise(jnp.add, node.q, upper(oo))
+        c = lanewise(jnp.subtract, node.c, po)
+        work = lanewise(jnp.subtract, work, less)
         return el.Quadratic(p, c, q, r, ro), work
 
     def close_again(self, z: str, r: Lanes, ro: Lanes) -> tuple[Lanes, Lanes, Lanes]:

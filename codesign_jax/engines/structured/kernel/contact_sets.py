@@ -59,7 +59,11 @@ class ContactSet:
     """The contacts of one pair of bodies: items are links or groups of slots, k contacts each."""
 
     def __init__(self, scene: Scene, name: str, count: int, k: int, size: int):
-        self.scene, self.name, self.count, self.k, self.size = scene, name, count, k, size
+        self.scene = scene
+        self.name = name
+        self.count = count
+        self.k = k
+        self.size = size
         self.on_object = name.endswith("_object")
         self.own_friction = own_friction(scene, name)
         # Contacts between fingers share what they hold, see `friction_memory`.
@@ -98,7 +102,9 @@ class BoundContacts:
     """A contact set with its memory; every method works on one item."""
 
     def __init__(self, of: ContactSet, table: BoundTable, cone: Cone):
-        self.set, self.table, self.cone = of, table, cone
+        self.set = of
+        self.table = table
+        self.cone = cone
         self.like = jnp.zeros((of.size,), table.dtype)
 
     def read(self, field: str, item: Any) -> Lanes:
@@ -195,7 +201,9 @@ class BoundContacts:
             return sum_axis(matrix, 2), sum_axis(contact.contact_wrench(c, r.force), 1)
 
         # All is read before anything is stored, see `finger_contacts.OwnSide`.
-        jar, step, place = self.read("jar", item), self.read("step", item), self.place(item)
+        jar = self.read("jar", item)
+        step = self.read("step", item)
+        place = self.place(item)
         jar = lanewise(tree_add_scaled, alpha, jar, step)
         self.write("jar", jar, item)
         matrix, wrench = lanewise(response, place, self.cone_at(item), jar)
@@ -213,7 +221,8 @@ class BoundContacts:
             force = contact.constraint_update(c, jar + alpha * step).force
             return sum_axis(contact.contact_wrench(c, force), 1)
 
-        jar, step = self.read("jar", item), self.read("step", item)
+        jar = self.read("jar", item)
+        step = self.read("step", item)
         return lanewise(response, self.place(item), self.cone_at(item), alpha, jar, step)
 
     def changes(self, item: Any, alpha: Lanes) -> Lanes:
@@ -228,7 +237,8 @@ class BoundContacts:
             line = LineCost(*(ray[i] if i < ray.shape[0] else None for i in range(5)))
             return sum_axis(jnp.where(contact.same_zone(c, line, alpha), 0.0, 1.0), 0)
 
-        share, cone = self.read("share", item), self.cone_at(item)
+        share = self.read("share", item)
+        cone = self.cone_at(item)
         return lanewise(count, share, cone, self.read("ray", item), alpha)
 
     def prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:
@@ -272,7 +282,8 @@ class BoundContacts:
             first, second = contact.slopes(c, line, alpha)
             return [sum_axis(first, 0), sum_axis(second, 0)]
 
-        share, cone = self.read("share", item), self.cone_at(item)
+        share = self.read("share", item)
+        cone = self.cone_at(item)
         return lanewise(both, share, cone, self.read("ray", item), alpha)
 
 

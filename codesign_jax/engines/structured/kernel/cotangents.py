@@ -112,7 +112,8 @@ class CotangentTables:
 
     def __init__(self, layout: KernelLayout, block: Block, refs: tuple, scratch: Any):
         hand, world, finger_state, world_state = refs
-        self.block, self.scratch = block, BoundTable(layout.scratch, scratch)
+        self.block = block
+        self.scratch = BoundTable(layout.scratch, scratch)
         self.hand = BoundTable(layout.hand, hand)
         self.world = BoundTable(MemoryLayout(True, **layout.world.groups), world)
         self.finger_state = BoundTable(layout.finger_state, finger_state)
@@ -133,7 +134,8 @@ class CotangentTables:
         for name, value in values.items():
             table = self.hand if name in self.hand else self.world
             if name in self.names:
-                table, name = self.scratch, f"bar.{name}"
+                table = self.scratch
+                name = f"bar.{name}"
             if lane is None:
                 table.write(name, plus(table.read(name, item), value), item)
             else:

@@ -61,16 +61,21 @@ class Coupling:
         tolerance: float = TOLERANCE,
         iterations: int = ITERATIONS,
     ):
-        self.problem, self.pairs, self.done = problem, pairs, done
-        self.tolerance, self.iterations = tolerance, iterations
-        self.block, self.links = problem.block, problem.links
+        self.problem = problem
+        self.pairs = pairs
+        self.done = done
+        self.tolerance = tolerance
+        self.iterations = iterations
+        self.block = problem.block
+        self.links = problem.links
 
     def correct(self, step: Iterate, idle: jax.Array) -> Iterate:
         """Adds the correction to the fingers' factors z and returns the step of palm and object."""
         work = self.done.work.lane
         self.substitute("z", step)
         self._begin(lanes([~idle], (), wide=False))
-        none, one = jnp.zeros_like(work), jnp.ones_like(work)
+        none = jnp.zeros_like(work)
+        one = jnp.ones_like(work)
         # Squared error and curvature; squared error and length of the step before; work.
         start = (jnp.int32(0), *self._products(), one, none, work)
 
@@ -114,7 +119,8 @@ class Coupling:
         pairs.clear_wrenches()
 
         def store(item: Any, pairing: FingerPairing) -> None:
-            own, hessian = pairs.own_side(item), pairs.read("hessian", item)
+            own = pairs.own_side(item)
+            hessian = pairs.read("hessian", item)
             change = pairs.relative(item, pairing)
             left = lanewise(lambda b, f: jnp.where(b, -f, 0.0), busy, pairs.stiff(hessian, change))
             none = lanewise(jnp.zeros_like, left)
@@ -134,7 +140,8 @@ class Coupling:
         self.substitute("z_again", self.again())
 
         def add(item: Any, pairing: FingerPairing, sums: list[Lanes]) -> list[Lanes]:
-            left, hessian = pairs.read("left", item), pairs.read("hessian", item)
+            left = pairs.read("left", item)
+            hessian = pairs.read("hessian", item)
             answer = pairs.relative(item, pairing)
             pairs.write("answer", answer, item)
 
@@ -159,12 +166,15 @@ class Coupling:
         names = ("left", "answer", "along", "moved", "sum")
 
         def move(alpha, beta, left, answer, along, moved, total_):
-            along, moved = left + beta * along, answer + beta * moved
+            along = left + beta * along
+            moved = answer + beta * moved
             return along, moved, total_ + alpha * along, left - alpha * along
 
         def store(item: Any, pairing: FingerPairing, gain: Lanes) -> Lanes:
-            own, hessian = pairs.own_side(item), pairs.read("hessian", item)
-            old, first = [pairs.read(name, item) for name in names], pairs.read("first", item)
+            own = pairs.own_side(item)
+            hessian = pairs.read("hessian", item)
+            old = [pairs.read(name, item) for name in names]
+            first = pairs.read("first", item)
             along, moved, total_, left = lanewise(move, alpha, beta, *old)
             stiff = pairs.stiff(hessian, moved)
             left = lanewise(lambda a, r, f: r - a * f, alpha, left, stiff)
@@ -200,7 +210,8 @@ class Coupling:
 
         def step(i: Any, carry: tuple) -> tuple:
             names = ("axes", "w", "g", "inverse")
-            push, factors = self.pairs.pushed(i + 1), self.problem.read(*names, item=i)
+            push = self.pairs.pushed(i + 1)
+            factors = self.problem.read(*names, item=i)
             r, ro, z = lanewise(_again, carry, factors, push)
             self.problem.write("z_again", z, i)
             return r, ro
@@ -271,7 +282,8 @@ def solve_palm_again(
 
 def _again(carry, factors, push):
     """`elimination.eliminate_again` of a link, with a force on it."""
-    (r, ro), (axes, w, g, inverse) = carry, factors
+    r, ro = carry
+    axes, w, g, inverse = factors
     r = r + push
     y = contract(axes, r[None], 1)
     ro = ro + contract(g, y[:, None], 0)

@@ -54,9 +54,14 @@ class FingerCollision:
     """Gives a slot to each contact of fingers with one another, with themselves and the palm."""
 
     def __init__(self, step: StepMemory, pairs: BoundFingerContacts, at: dict[str, Any]):
-        self.step, self.pairs, self.p = step, pairs, step.p
-        self.scratch, self.block, self.like = step.scratch, step.block, step.like
-        self.count, self.palm_vel = self.p.links * self.p.k, at["vel"]
+        self.step = step
+        self.pairs = pairs
+        self.p = step.p
+        self.scratch = step.scratch
+        self.block = step.block
+        self.like = step.like
+        self.count = self.p.links * self.p.k
+        self.palm_vel = at["vel"]
         self.hull = step.p.scene.effects.surface == "hull"
         self.palm = None
         if step.p.scene.effects.finger_palm:
@@ -141,7 +146,8 @@ class FingerCollision:
     def body(self, item: Any) -> tuple[Any, Lanes, Lanes, Lanes]:
         """A ring's link, its numbers, the link's frame and the ring's centre."""
         row = jax.lax.div(item, jnp.full_like(item, self.p.k)) + 1
-        frame, numbers = self.read("frame", row), self.ring(item)
+        frame = self.read("frame", row)
+        numbers = self.ring(item)
         return row, numbers, frame, lanewise(ring_centre, self.read("joint", row), frame, numbers)
 
     def find(self) -> None:
@@ -198,7 +204,8 @@ class FingerCollision:
         """Fields of a contact of a link with another one on a lane, see `BoundContacts.begin`."""
 
         def moved(name: str) -> Lanes:
-            mine, theirs = self.side_of(name, rows[0]), self.side_of(name, rows[1], lane)
+            mine = self.side_of(name, rows[0])
+            theirs = self.side_of(name, rows[1], lane)
             return lanewise(jnp.subtract, mine, theirs)
 
         place = lanewise(with_axis, place)
@@ -252,7 +259,8 @@ class FingerCollision:
 
         def enter() -> None:
             place = self._between(numbers, frame, centre, other, t, None)
-            cone, held = self.pairs.of_row(1), friction_memory.of_row(self.step, self.pairs, 0)
+            cone = self.pairs.of_row(1)
+            held = friction_memory.of_row(self.step, self.pairs, 0)
             self._alone(place, cone, (row + jnp.zeros_like(other), other), held, item, near)
 
         any_of(near, enter)
@@ -272,7 +280,8 @@ class FingerCollision:
         """Place of a ring along the finger, in links from its base."""
         item = jnp.zeros_like(self.block.own) + item
         k = jnp.full_like(item, self.p.k)
-        link, number = jax.lax.div(item, k), jax.lax.rem(item, k)
+        link = jax.lax.div(item, k)
+        number = jax.lax.rem(item, k)
         places = ring_places(self.p.links, self.p.k)
         part = (number.astype(self.like.dtype) + 0.5) / self.p.k
         last = jnp.where(number == k - 1, places[-1, -1], 0.5 * part)
@@ -291,7 +300,8 @@ class FingerCollision:
         def enter() -> None:
             place = self._between(numbers, frame, centre, other, t, pairing.lane)
             held = friction_memory.of_row(self.step, self.pairs, row)
-            cone, link_ = self.pairs.of_row(row), link + jnp.zeros_like(other)
+            cone = self.pairs.of_row(row)
+            link_ = link + jnp.zeros_like(other)
             found = self._begun(place, cone, (link_, other), pairing.lane, held)
             self._enter(row, near, owner, found, other, item)
 
@@ -319,7 +329,8 @@ class FingerCollision:
         last = self.p.links
 
         def compare(segment, centre, best, number, end):
-            start, along = segment[:3], segment[3:6]
+            start = segment[:3]
+            along = segment[3:6]
             away = centre - start
             t = dot(away, along) * segment[6]
             t = jnp.minimum(jnp.maximum(t, 0.0), end)
@@ -370,7 +381,8 @@ class FingerCollision:
             def enter() -> None:
                 other = jnp.zeros_like(self.block.own) + jax.lax.div(j, jnp.full_like(j, apart)) + 1
                 link_ = link + jnp.zeros_like(other)
-                cone, lane = self.pairs.of_row(row), pairing.lane
+                cone = self.pairs.of_row(row)
+                lane = pairing.lane
                 found = self._begun(place, cone, (link_, other), lane, [])
                 number = item + self.count * j
                 self._enter(row, near, owner, found, other, number)

@@ -50,7 +50,8 @@ class FingerPairing:
     def __init__(self, block: Block, number: Any, dtype: Any, *, alone: bool):
         self.block = block
         self.number = (jnp.zeros_like(block.finger) + number).astype(jnp.int32)
-        same, one = self.number == 0, jnp.ones_like(block.finger, dtype)
+        same = self.number == 0
+        one = jnp.ones_like(block.finger, dtype)
         self.alone = same if alone else None
         self.half = lanes([jnp.where(same, one, 0.5 * one) if alone else 0.5 * one], (), wide=True)
         other = jax.lax.bitwise_xor(block.finger, self.number)
@@ -79,7 +80,8 @@ def pair_slots(scene: Scene) -> int:
 
     A ring has one contact with another finger, one with its own and one with the palm.
     """
-    d, e = scene.discretization, scene.effects
+    d = scene.discretization
+    e = scene.effects
     if e.surface == "hull":
         return d.links * d.hull_rings * (2 if e.finger_palm and touches_itself(scene) else 1)
     return min(4 * d.links * d.spheres_per_link, (d.links * d.spheres_per_link) ** 2)
@@ -105,7 +107,8 @@ class FingerContactSet(SlotSet):
         rows = fingers - self.first if e.finger_finger else 1
         how = "finger_finger", rows, slots, fingers * worlds
         super().__init__(scene, *how, gathers=gathers, remembers=remembers)
-        self.block, self.links = block, links
+        self.block = block
+        self.links = links
         n = ROWS[scene.effects.friction][0]
         self.more = {"row": 1, "hessian": n * (n + 1) // 2}
         self.more |= {f: n for f in ("first", "left", "answer", "along", "moved", "sum")}
@@ -153,7 +156,8 @@ class BoundFingerContacts(BoundSlots):
 
     def __init__(self, of: FingerContactSet, table: BoundTable, cones: dict[str, contact.Cone]):
         super().__init__(of, table, next(iter(cones.values())))
-        self.block, self._cones = Block(*of.block), cones
+        self.block = Block(*of.block)
+        self._cones = cones
 
     def pairing(self, row: Any) -> FingerPairing:
         return FingerPairing(
@@ -259,7 +263,8 @@ class BoundFingerContacts(BoundSlots):
 
     def relative(self, item: Any, pairing: FingerPairing) -> Lanes:
         """How the links' motion moves a slot's sides to each other, on its own side's lanes."""
-        contacts, place = self.set.contacts, self.place(item)
+        contacts = self.set.contacts
+        place = self.place(item)
 
         def of_side(field: str) -> Lanes:
             motion = self._on_rows(item, field)
@@ -384,7 +389,9 @@ class BoundFingerContacts(BoundSlots):
             return contact.constraint_update(contacts(place, cone), jar + alpha * step).force
 
         def load(item: Any, pairing: FingerPairing) -> None:
-            own, jar, step = self.own_side(item), self.read("jar", item), self.read("step", item)
+            own = self.own_side(item)
+            jar = self.read("jar", item)
+            step = self.read("step", item)
             self.load(
                 item, own, lanewise(response, own.place, self.cone, alpha, jar, step), pairing
             )

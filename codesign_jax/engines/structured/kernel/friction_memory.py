@@ -61,7 +61,8 @@ def of_item(step: StepMemory, contacts: BoundContacts, item: Any) -> tuple[Lanes
     """What an item's contacts hold, (3, k): along the world's axes, and as the state has it."""
     if not contacts.set.holds:
         return None
-    name, k = f"held.{contacts.set.name}", contacts.set.k
+    name = f"held.{contacts.set.name}"
+    k = contacts.set.k
     rows = [step.finger_state.read(name, item * k + j) for j in range(k)]
     return _both(step, contacts, lanewise(lambda rows: jnp.stack(rows, 1), rows))
 
@@ -95,7 +96,8 @@ def clear(step: StepMemory) -> None:
 
 def store(step: StepMemory, good: jax.Array) -> None:
     """Ends a step of the worlds that have moved."""
-    state, mask = step.finger_state, lanes([good], (), wide=False)
+    state = step.finger_state
+    mask = lanes([good], (), wide=False)
     for item in range(pairings(step)):
         new = step.scratch.read("new_grip", item)
         old = state.read(GRIP, item)
@@ -107,13 +109,16 @@ def store(step: StepMemory, good: jax.Array) -> None:
 
 def _store(step: StepMemory, contacts: BoundContacts, mask: Lanes) -> None:
     """Ends a step of a set's contacts; what does not touch holds nothing."""
-    name, state, k = f"held.{contacts.set.name}", step.finger_state, contacts.set.k
+    name = f"held.{contacts.set.name}"
+    state = step.finger_state
+    k = contacts.set.k
 
     def after(mask: jax.Array, share: jax.Array, new: jax.Array, old: jax.Array) -> jax.Array:
         return jnp.where(mask, jnp.where(share > 0, new, 0.0), old)
 
     def one(item: jax.Array, x: jax.Array) -> jax.Array:
-        share, new = contacts.read("share", item), contacts.read("held", item)
+        share = contacts.read("share", item)
+        new = contacts.read("held", item)
         for j in range(k):
             old = state.read(name, item * k + j)
             state.write(name, lanewise(after, mask, share[0, j], new[:, j], old), item * k + j)
@@ -124,7 +129,8 @@ def _store(step: StepMemory, contacts: BoundContacts, mask: Lanes) -> None:
 
 def sums(pairs: BoundFingerContacts, row: Any, alpha: Lanes, grip: Lanes) -> Lanes:
     """Sums of `holding.hold`, (4,), of a row's contacts where the last step has moved jar."""
-    contacts, pairing = pairs.set.contacts, pairs.pairing(row)
+    contacts = pairs.set.contacts
+    pairing = pairs.pairing(row)
 
     def add(sums, place, cone, alpha, jar, step, grip, counts):
         c = contacts(place, cone)
@@ -132,7 +138,8 @@ def sums(pairs: BoundFingerContacts, row: Any, alpha: Lanes, grip: Lanes) -> Lan
         return sums + counts * sum_axis(holding.hold(c, force, grip[:, None]), 1)
 
     def one(item: Any, sums: Lanes) -> Lanes:
-        jar, step = pairs.read("jar", item), pairs.read("step", item)
+        jar = pairs.read("jar", item)
+        step = pairs.read("step", item)
         counts = pairs.holds(item, pairing)
         with pairs.with_cone(row, item):
             args = sums, pairs.place(item), pairs.cone, alpha, jar, step, grip, counts
@@ -158,7 +165,8 @@ def settle(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
 
 def _settle(problem: Problem, contacts: BoundContacts, alpha: Lanes, mask: Lanes) -> None:
     """Keeps what a set's contacts hold behind the step, in the worlds of the mask."""
-    build, axes = contacts.set.contacts, turning(problem.m, contacts)
+    build = contacts.set.contacts
+    axes = turning(problem.m, contacts)
 
     def after(mask, place, cone, alpha, jar, step, old, axes):
         new = behind(build(place, cone), jar + alpha * step, old, axes)
@@ -166,7 +174,8 @@ def _settle(problem: Problem, contacts: BoundContacts, alpha: Lanes, mask: Lanes
 
     def one(item: Any) -> None:
         def store() -> None:
-            place, cone = contacts.place(item), contacts.cone_at(item)
+            place = contacts.place(item)
+            cone = contacts.cone_at(item)
             jar, step, old = (contacts.read(n, item) for n in ("jar", "step", "held"))
             found = lanewise(after, mask, place, cone, alpha, jar, step, old, axes)
             contacts.write("held", found, item)
@@ -201,7 +210,8 @@ def _settle_fingers(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
     assert pairs is not None
 
     def keep() -> None:
-        mask, first = lanes([which], (), wide=True), pairs.set.first
+        mask = lanes([which], (), wide=True)
+        first = pairs.set.first
 
         def one(row: jax.Array, x: jax.Array) -> jax.Array:
             before, old = problem.read(GRIP, "new_grip", item=row + first)
@@ -242,13 +252,15 @@ def _reverse(step: StepMemory, bars: CotangentTables, contacts: BoundContacts, g
 
 def held_bars(bars: CotangentTables, contacts: BoundContacts, item: Any) -> Lanes:
     """Cotangents of what an item's contacts hold, (3, k)."""
-    name, k = f"held.{contacts.set.name}", contacts.set.k
+    name = f"held.{contacts.set.name}"
+    k = contacts.set.k
     rows = [bars.finger_state.read(name, item * k + j) for j in range(k)]
     return lanewise(lambda rows: jnp.stack(rows, 1), rows)
 
 
 def _write_bars(bars: CotangentTables, contacts: BoundContacts, item: Any, value: Lanes) -> None:
-    name, k = f"held.{contacts.set.name}", contacts.set.k
+    name = f"held.{contacts.set.name}"
+    k = contacts.set.k
     for j in range(k):
         bars.finger_state.write(name, value[:, j], item * k + j)
 
@@ -265,7 +277,8 @@ def asks(problem: Problem, contacts: BoundContacts, item: Any) -> Lanes:
 
     It is the cotangent of jar, through the force, of what they hold behind the step.
     """
-    build, axes = contacts.set.contacts, turning(problem.m, contacts)
+    build = contacts.set.contacts
+    axes = turning(problem.m, contacts)
 
     def of_jar(jar, place, cone, held, bars, axes):
         return sum_axis(dot(bars, behind(build(place, cone), jar, held, axes)), 0)
@@ -274,7 +287,8 @@ def asks(problem: Problem, contacts: BoundContacts, item: Any) -> Lanes:
         return sum_axis(contact.contact_wrench(build(place, cone), change), 1)
 
     def found() -> list[Lanes]:
-        place, cone = contacts.place(item), contacts.cone_at(item)
+        place = contacts.place(item)
+        cone = contacts.cone_at(item)
         jar, held, bars = (contacts.read(n, item) for n in ("jar", "held", "held_bar"))
         one = lanes([problem.like + 1.0], (), wide=True)
         (change,) = pull(of_jar, (jar,), (place, cone, held, bars, axes), one)
@@ -290,10 +304,12 @@ def _reverse_fingers(
 
     What a finger holds is the opposite of what its partner holds.
     """
-    state, still = bars.finger_state, zeros((), step.like)
+    state = bars.finger_state
+    still = zeros((), step.like)
 
     for item in range(pairings(step)):
-        row, mine = item - pairs.set.first, state.read(GRIP, item)
+        row = item - pairs.set.first
+        mine = state.read(GRIP, item)
         found = zeros((4,), step.like)
         if 0 <= row < pairs.set.rows:
             ended = sums(pairs, row, still, step.finger_state.read(GRIP, item))
@@ -309,7 +325,8 @@ def at(step: StepMemory, pairing: FingerPairing) -> tuple[Lanes, ...]:
     """What the lanes' fingers hold, and "grip_bar"; nothing if the scene has no such state."""
     if not pairings(step):
         return ()
-    item, lane = pairing.number, step.block.lane
+    item = pairing.number
+    lane = step.block.lane
     held = step.finger_state.gather(GRIP, item, lane)
     return held, step.scratch.gather("grip_bar", item, lane)
 
@@ -318,7 +335,9 @@ def leave(bars: CotangentTables, pairing: FingerPairing, found: tuple) -> None:
     """Adds a contact's cotangents of `at` to those of the state."""
     if not found:
         return
-    item, lane, state = pairing.number, bars.block.lane, bars.finger_state
+    item = pairing.number
+    lane = bars.block.lane
+    state = bars.finger_state
     new = lanewise(jnp.add, state.gather(GRIP, item, lane), found[0])
     state.scatter(GRIP, new, item, lane)
 
@@ -329,13 +348,16 @@ def push(problem: Problem, pairs: BoundFingerContacts) -> None:
     A change of jar changes a contact's force by -K; with r the derivative of the sums by the
     force, the cotangent of jar is -K r.
     """
-    contacts, lane = pairs.set.contacts, problem.block.lane
+    contacts = pairs.set.contacts
+    lane = problem.block.lane
 
     def of_held(force, place, cone, held, bars):
         return held_work(contacts(place, cone), force, held, bars)
 
     def load(item: Any, pairing: FingerPairing) -> None:
-        which, side, jar = pairing.number, pairs.own_side(item), pairs.read("jar", item)
+        which = pairing.number
+        side = pairs.own_side(item)
+        jar = pairs.read("jar", item)
 
         def response(place, cone, jar):
             return contact.constraint_update(contacts(place, cone), jar).force

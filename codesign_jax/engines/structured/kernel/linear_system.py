@@ -22,7 +22,9 @@ class Elimination:
 
     def __init__(self, problem: Problem):
         self.problem = problem
-        self.block, self.links, self.like = problem.block, problem.links, problem.like
+        self.block = problem.block
+        self.links = problem.links
+        self.like = problem.like
 
     def backward(self, alpha: Lanes) -> tuple[el.Quadratic, Lanes]:
         """Eliminates the fingers from their tips.
@@ -82,12 +84,14 @@ class Elimination:
             return node, lanewise(jnp.add, work, more) if problem.pairs else work
 
         empty = [zeros(s, self.like) for s in ((21,), (6, 6), (21,), (6,), (6,))]
-        start, held = (el.Quadratic(*empty), zeros((), self.like)), self.last_on_object()
+        start = (el.Quadratic(*empty), zeros((), self.like))
+        held = self.last_on_object()
         node, work = loop(self.links, step, start, self.block.size, reverse=True)
         if problem.chambers:
             node, work = problem.chambers.close(node, work)
         if problem.pairs:
-            node, work = node._replace(r=problem.add_first(node.r)), self.block.sum(work)
+            node = node._replace(r=problem.add_first(node.r))
+            work = self.block.sum(work)
         node = self.block.sum(node)
         return node._replace(p=full(node.p), q=full(node.q)), work
 
@@ -149,7 +153,8 @@ class Elimination:
                 none = jnp.zeros_like(obj)
                 step = Iterate(none, none, obj)
                 return step, Eliminated(None, None, node.q, dot(node.r_object, obj))
-            armature, work = palm.armature, []
+            armature = palm.armature
+            work = []
             axes = (palm.axes, el.wrist_slides(armature))
             kept = []
             for subspace, inertia, twist in zip(
@@ -181,25 +186,37 @@ def with_palm(
       The objective, and the forces that an iterate leaves unbalanced on the wrist's joints.
     """
     push, pull, twist = palm.unbalanced(now)
-    own, obj = palm.palm.matrix(), palm.object.matrix()
+    own = palm.palm.matrix()
+    obj = palm.object.matrix()
     p, c, q, r, ro = (sum_fingers(v) for v in node)
-    p, r, q, ro = p + own, r + push, q + obj, ro + pull
+    p = p + own
+    r = r + push
+    q = q + obj
+    ro = ro + pull
     if "object_table" in pushes:
         inertia, wrench = pushes["object_table"]
-        q, ro = q + inertia, ro + wrench
+        q = q + inertia
+        ro = ro + wrench
     if "palm_table" in pushes:
         inertia, wrench = pushes["palm_table"]
-        p, r = p + inertia, r + wrench
+        p = p + inertia
+        r = r + wrench
     if "palm_object" in pushes:
         inertia, wrench = pushes["palm_object"]
-        p, c, q = p + inertia, c + inertia, q + inertia
-        r, ro = r + wrench, ro - wrench
+        p = p + inertia
+        c = c + inertia
+        q = q + inertia
+        r = r + wrench
+        ro = ro - wrench
     return el.Quadratic(p, c, q, r, ro), twist
 
 
 def _add(node: el.Quadratic, matrix, wrench, held: bool) -> el.Quadratic:
     p, c, q, r, ro = node
-    p, r = p + matrix, r + wrench
+    p = p + matrix
+    r = r + wrench
     if held:
-        c, q, ro = c + matrix, q + matrix, ro - wrench
+        c = c + matrix
+        q = q + matrix
+        ro = ro - wrench
     return el.Quadratic(p, c, q, r, ro)

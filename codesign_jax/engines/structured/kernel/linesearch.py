@@ -30,7 +30,9 @@ class LineSearch:
 
     def __init__(self, problem: Problem):
         self.problem = problem
-        self.block, self.links, self.like = problem.block, problem.links, problem.like
+        self.block = problem.block
+        self.links = problem.links
+        self.like = problem.like
 
     def prepare(self, now: Iterate, step: Iterate) -> tuple[Lanes, Lanes, Lanes]:
         """Substitutes back and prepares the line search.
@@ -139,7 +141,8 @@ class LineSearch:
             )
 
         def body(carry: list) -> list:
-            count, old = carry[0], rebuild(carry[1:])
+            count = carry[0]
+            old = rebuild(carry[1:])
             # A world that has found its step length keeps it: it must not depend on other worlds.
             left = jnp.abs(carry[-1]) > goal
             searching = lanes([left], (), wide=False)
@@ -174,7 +177,8 @@ def refine(
     alpha: jax.Array, low: jax.Array, high: jax.Array, first: jax.Array, second: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Next step length and bracket from the derivatives at alpha: Newton, else bisection."""
-    low, high = jnp.where(first <= 0, alpha, low), jnp.where(first > 0, alpha, high)
+    low = jnp.where(first <= 0, alpha, low)
+    high = jnp.where(first > 0, alpha, high)
     guess = alpha - first / jnp.maximum(second, 1e-30)
     inside = (guess >= low) & (guess <= high)
     middle = jnp.where(high > 1e30, 2.0 * low, 0.5 * (low + high))

@@ -25,7 +25,9 @@ class MemoryLayout:
           wide: Whether a row has a value for each finger and not only for each world.
           **groups: Number of items (links, slots) and shape of an item, by name.
         """
-        self.wide, self.groups, self.rows = wide, groups, 0
+        self.wide = wide
+        self.groups = groups
+        self.rows = 0
         self.offset: dict[str, int] = {}
         self.stride = {name: int(np.prod(shape)) for name, (_, shape) in groups.items()}
         for name, (count, _) in groups.items():
@@ -40,14 +42,16 @@ class MemoryLayout:
         belong to the same items. A kernel finds all numbers of a slot or of a link at fixed
         distances from one address.
         """
-        table, records = cls(wide, **groups), {}
+        table = cls(wide, **groups)
+        records = {}
         for name, (count, _) in groups.items():
             records.setdefault((name.rpartition(".")[0], count), []).append(name)
         table.rows = 0
         for (_, count), names in records.items():
             sizes = {name: table.stride[name] for name in names}
             for name in names:
-                table.offset[name], table.stride[name] = table.rows, sum(sizes.values())
+                table.offset[name] = table.rows
+                table.stride[name] = sum(sizes.values())
                 table.rows += sizes[name]
             table.rows += (count - 1) * sum(sizes.values())
         return table
@@ -98,7 +102,9 @@ class BoundTable:
     """
 
     def __init__(self, layout: MemoryLayout, ref: Any, world: jax.Array | None = None):
-        self.layout, self.ref, self.world = layout, ref, world
+        self.layout = layout
+        self.ref = ref
+        self.world = world
         self.dtype = ref.dtype
 
     def __contains__(self, name: str) -> bool:
@@ -176,7 +182,8 @@ def solid(tree: Any, size: int) -> tuple[list[jax.Array], Callable]:
         arrays += [splat(p, (size,), leaf.dtype) for p in leaf.parts.ravel()]
 
     def rebuild(values: Any) -> Any:
-        rest, new = list(values), []
+        rest = list(values)
+        new = []
         for leaf in leaves:
             parts = np.empty(leaf.parts.size, object)
             for k in range(parts.size):
@@ -230,11 +237,14 @@ class Block:
     """
 
     def __init__(self, fingers: int, worlds: int, team: int = 1):
-        self.fingers, self.worlds, self.team = fingers, worlds, team
+        self.fingers = fingers
+        self.worlds = worlds
+        self.team = team
         self.size = fingers * worlds * team
         self.lane = lane = jax.lax.broadcasted_iota(jnp.int32, (self.size,), 0)
         count = jnp.int32(worlds)
-        self.world, self.finger = jax.lax.rem(lane, count), jax.lax.div(lane, count)
+        self.world = jax.lax.rem(lane, count)
+        self.finger = jax.lax.div(lane, count)
         self.own = lane
         if team > 1:
             self.mate = jax.lax.rem(self.finger, jnp.int32(team))

@@ -51,7 +51,8 @@ class Tables(KernelLayout):
 
     def __init__(self, scene: Scene, *, backend: str, width: int, team: int | None = None):
         self.backend = backend
-        self.scene, self.lay = scene, layout(scene)
+        self.scene = scene
+        self.lay = layout(scene)
         self.hull = scene.effects.surface == "hull"
         n, self.links, self.axes = self.lay.dofs.shape
         self.fingers = held.lanes(scene)
@@ -76,13 +77,16 @@ class Tables(KernelLayout):
         self._tables()
 
     def _sets(self) -> list[ContactSet]:
-        e, k, n = self.scene.effects, self.k, len(surroundings.fields(self.scene))
+        e = self.scene.effects
+        k = self.k
+        n = len(surroundings.fields(self.scene))
         make = partial(ContactSet, self.scene, size=self.size)
         on = {"finger_object": k * e.finger_object, "finger_table": n * k * e.finger_table}
         fields = make if self.team == 1 else partial(TeamSdfContactSet, self.scene, self)
         sets = [fields(name, self.links, on[name]) for name in on if on[name]]
         if self.between:
-            block, slots = (self.fingers, self.block), pair_slots(self.scene)
+            block = (self.fingers, self.block)
+            slots = pair_slots(self.scene)
             how = {"gathers": self.gathers, "remembers": self.remembers}
             if self.team == 1:
                 sets.append(FingerContactSet(self.scene, block, self.links, slots, **how))
@@ -106,7 +110,8 @@ class Tables(KernelLayout):
         return self.backend in GATHERING or self.team > 1
 
     def _tables(self) -> None:
-        n, a = self.links, self.axes
+        n = self.links
+        a = self.axes
         one: tuple[int, ...] = ()
         more = {"ring": (n * self.k, (8,))} if self.k else {}
         if palm_touches(self.scene):
@@ -163,7 +168,8 @@ class Tables(KernelLayout):
             **dict.fromkeys(verdict.Bounds._fields, (1, one)),
             **some,
         )
-        joint, hold = (n, (a,)), {f"held.{name}": (n, (3,)) for name, n in self.held.items()}
+        joint = (n, (a,))
+        hold = {f"held.{name}": (n, (3,)) for name, n in self.held.items()}
         self.finger_state = MemoryLayout(True, finger=joint, finger_vel=joint, **hold, acc=joint)
         world_state = dict(wrist=6, position=3, quat=4, wrist_vel=6, linear_vel=3, angular_vel=3)
         world_state |= dict(step=1, going=1, speed=1, acc_wrist=6, acc_object=6)
@@ -217,8 +223,10 @@ class Packing(Tables):
 
     def pack_hand(self, hand: WorldModel) -> tuple[jax.Array, jax.Array]:
         """The hand's tables; padded fingers have no mass."""
-        worlds, n = hand.object_id.shape[1], self.num_fingers
-        dtype, lane = hand.mass.dtype, (n, worlds)
+        worlds = hand.object_id.shape[1]
+        n = self.num_fingers
+        dtype = hand.mass.dtype
+        lane = (n, worlds)
         links_first = ("centre", "inertia")
         arrays = {
             k: jnp.moveaxis(v, 1, 0) if k in links_first and v.size else v
@@ -265,7 +273,8 @@ class Packing(Tables):
 
     def _palm_slots(self, hand: WorldModel) -> jax.Array:
         """The palm's rings or spheres, shared out among the lanes."""
-        numbers, f = palm_numbers(self.scene, hand), self.fingers
+        numbers = palm_numbers(self.scene, hand)
+        f = self.fingers
         extra = self.palm_groups * f - len(numbers)
         padded = jnp.pad(numbers, [(0, extra), (0, 0), (0, 0)], "edge")
         padded = padded.at[len(numbers) :, LENGTH].set(0.0)
@@ -295,7 +304,8 @@ class Packing(Tables):
         worlds, steps, _ = ctrl.shape
         ctrl = lengthened(ctrl, 0, worlds + -worlds % self.block)
         blocks = jnp.moveaxis(ctrl.reshape(-1, self.block, steps, ctrl.shape[2]), 1, 3)
-        arm, pressure = blocks[:, :, :6], blocks[:, :, 6:]
+        arm = blocks[:, :, :6]
+        pressure = blocks[:, :, 6:]
         pad = [(0, 0)] * 2 + [(0, self.fingers - self.num_fingers), (0, 0)]
         return arm, jnp.pad(pressure, pad).reshape(*arm.shape[:2], self.columns)
 
@@ -307,7 +317,8 @@ class Packing(Tables):
 
     def path(self, fingers: jax.Array, worlds: jax.Array, states: bool) -> dict[str, jax.Array]:
         """Coordinates of recorded rows (block, time, row, lane or world)."""
-        steps, size = fingers.shape[1], self.links * self.axes
+        steps = fingers.shape[1]
+        size = self.links * self.axes
         names = [("qpos", "finger", ("wrist", "position", "quat"))]
         if states:
             names += [("qvel", "finger_vel", ("wrist_vel", "linear_vel", "angular_vel"))]
@@ -336,7 +347,9 @@ class Packing(Tables):
 
         Of positions alone if there are no velocities.
         """
-        joints, others, end = [], [], 6 + self.lay.dofs.size
+        joints = []
+        others = []
+        end = 6 + self.lay.dofs.size
         for x in (qpos,) if qvel is None else (qpos, qvel):
             finger = x[:, :, self.lay.dofs].reshape(*x.shape[:2], self.num_fingers, -1)
             joints.append(jnp.swapaxes(finger, 2, 3))
@@ -349,7 +362,8 @@ class Packing(Tables):
 
         Only positions, velocities and what is held have some.
         """
-        nq, nv = 13 + self.lay.dofs.size, 12 + self.lay.dofs.size
+        nq = 13 + self.lay.dofs.size
+        nv = 12 + self.lay.dofs.size
         fingers, worlds = self.rows_of(last[:, None, :nq], last[:, None, nq : nq + nv])
         hold = last[:, nq + 2 * nv + 3 :].reshape(len(last), 1, -1, self.fingers)
         found = jnp.concatenate([fingers, hold], 2), worlds
@@ -416,7 +430,8 @@ def palm_numbers(scene: Scene, hand: WorldModel) -> jax.Array:
         rows = [*hand.palm_point, *[hand.palm_radius] * 3, one, 0.0 * one]
         return jnp.stack(rows, 1)
     assert hand.palm_disc is not None and hand.section is not None
-    (radius, thick), width = hand.palm_disc[:, 0], hand.section[3, 0]
+    radius, thick = hand.palm_disc[:, 0]
+    width = hand.section[3, 0]
     half = 0.5 * radius
     rows = [
         [x * half, y * half, thick, half, half, thick, 4.0 * half**2 / width**2, 0.0 * half]

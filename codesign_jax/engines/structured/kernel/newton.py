@@ -55,12 +55,15 @@ class ChordStep:
     """
 
     def __init__(self, problem: Problem):
-        self.problem, self.block, self.links = problem, problem.block, problem.links
+        self.problem = problem
+        self.block = problem.block
+        self.links = problem.links
         self.like = problem.like
 
     def steady(self, alpha: Lanes) -> jax.Array:
         """Whether no contact of a world goes to another zone along the last step, (lane,)."""
-        problem, count = self.problem, zeros((), self.like)
+        problem = self.problem
+        count = zeros((), self.like)
         sets = [(self.links, c) for c in problem.fingers]
         sets += [(c.set.count, c) for c in problem.slots]
         for items, contacts in sets:
@@ -89,7 +92,8 @@ class ChordStep:
             problem.pairs.update_wrenches(alpha)
 
         def again(alpha, carry, body, moved, forces, factors, pushes, pair):
-            (r, ro, work), (axes, armature, *kept) = carry, factors
+            r, ro, work = carry
+            axes, armature, *kept = factors
             acc, motion = (a + alpha * b for a, b in moved)
             smooth, tau = forces
             push = total([smooth - make_body(*body).times(motion), *pushes.values()])
@@ -155,7 +159,8 @@ class ChordStep:
 
         Alpha is the length of the Newton step before it.
         """
-        problem, mask = self.problem, lanes([taken], (), wide=True)
+        problem = self.problem
+        mask = lanes([taken], (), wide=True)
 
         def move(parent, obj, axes, factors, before, alpha, taken):
             a, motion = el.substitute(axes, el.Factors(*factors), parent, obj)
@@ -183,7 +188,8 @@ class Newton:
     """The solver of one step in a kernel."""
 
     def __init__(self, problem: Problem):
-        self.problem, self.block = problem, problem.block
+        self.problem = problem
+        self.block = problem.block
         one = problem.block.team == 1
         self.elimination = (Elimination if one else TeamElimination)(problem)
         self.search = (LineSearch if one else TeamLineSearch)(problem)
@@ -210,7 +216,8 @@ class Newton:
             return jnp.where(going, alpha, 0.0), jnp.where(going, residual, before)
 
         def body(carry: list) -> list:
-            count, (now, before, last) = carry[0], rebuild(carry[1:])
+            count = carry[0]
+            now, before, last = rebuild(carry[1:])
             busy = waiting & (before.lane > tolerance)
             # A world that has converged keeps its iterate, so its contacts need not be looked at.
             with only(problem.slotted, busy):
@@ -265,7 +272,9 @@ class Newton:
         Returns:
           Iterate, length and decrement, see `ChordStep`; the length is that of "step_acc".
         """
-        chord, pairs, size = self.chord, self.problem.pairs, self.block.size
+        chord = self.chord
+        pairs = self.problem.pairs
+        size = self.block.size
         assert chord is not None
 
         def look(likely: jax.Array) -> tuple[Iterate, Lanes, Lanes]:

@@ -68,7 +68,8 @@ def rows(found: MeshLanes, fingers: int, dtype: Any) -> dict[str, jax.Array]:
 def read(
     scene: Scene, block: Block, world: BoundTable, hand: BoundTable, values: Any
 ) -> WorldObject:
-    size, shape = world.read("object_size"), world.read("object_id")
+    size = world.read("object_size")
+    shape = world.read("object_id")
     if values is None:
         return WorldObject(size, shape, block, None)
     indices = np.array(shapes.mesh_indices(scene), np.int32)
@@ -98,7 +99,8 @@ def _for_both(
     """
     if thing.mesh is None:
         return primitive()
-    mine, size = thing.mesh.meshed.lane, thing.block.size
+    mine = thing.mesh.meshed.lane
+    size = thing.block.size
     if len(shapes.mesh_indices(scene)) == len(scene.objects.object):
         return meshed() if near is None else choose(anywhere(near), meshed, like, size)
     plain = choose(anywhere(~mine), primitive, like, size)
@@ -137,7 +139,8 @@ def distance_of(scene: Scene, local: jax.Array, at: dict, still: dict) -> tuple:
       still: Index of the object and, with meshes, first value and nodes of the grid, whether the
         object is a mesh, and the distances at the corners of the points' cells, see `cell_values`.
     """
-    found, shape = None, still["object_id"].astype(jnp.int32)
+    found = None
+    shape = still["object_id"].astype(jnp.int32)
     if len(shapes.mesh_indices(scene)) < len(scene.objects.object):
         found = shapes.primitive_distance(scene, at["object_size"], shape, local)
     if "meshed" in still:
@@ -165,7 +168,9 @@ def points_of(scene: Scene, at: dict, still: dict) -> jax.Array:
       still: As in `distance_of`; of meshes the points themselves, in the object's frame, and the
         factor that they have.
     """
-    found, shape, columns = None, still["object_id"].astype(jnp.int32), at["columns"][:, :, 0]
+    found = None
+    shape = still["object_id"].astype(jnp.int32)
+    columns = at["columns"][:, :, 0]
     if len(shapes.mesh_indices(scene)) < len(scene.objects.object):
         found = shapes.primitive_points(scene, at["object_size"][:, 0], shape, columns)
     if "meshed" in still:
@@ -224,7 +229,8 @@ def _search(thing: WorldObject, columns: Lanes, scores: Callable, *known: Lanes)
     Scores takes points (3, finger, world), their indices and known points, see `meshes.lowest`.
     """
     assert thing.mesh is not None
-    block, support = thing.block, thing.mesh.support
+    block = thing.block
+    support = thing.mesh.support
     dtype = columns.dtype
     finger = block.finger.astype(dtype)
 

@@ -55,8 +55,12 @@ class Problem:
     """
 
     def __init__(self, m: StepMemory, palm: Palm):
-        self.m, self.palm, self.links, self.block = m, palm, m.p.links, m.block
-        self.rigid, found = not m.p.scene.effects.wrist, m.contacts
+        self.m = m
+        self.palm = palm
+        self.links = m.p.links
+        self.block = m.block
+        self.rigid = not m.p.scene.effects.wrist
+        found = m.contacts
         self.pairs: BoundFingerContacts | None = found.get("finger_finger")  # type: ignore[assignment]
         self.fingers = [found[n] for n in ("finger_object", "finger_table") if n in found]
         self.slots = [c for n, c in found.items() if not n.startswith("finger")]

@@ -161,7 +161,9 @@ class Program(Packing):
         self, inputs: tuple, trajectory: bool, states: int
     ) -> tuple[Callable, list[jax.ShapeDtypeStruct]]:
         """The kernel of arguments as a function of them, and its outputs."""
-        blocks, steps, dtype = inputs[0].shape[0], inputs[4].shape[1], inputs[4].dtype
+        blocks = inputs[0].shape[0]
+        steps = inputs[4].shape[1]
+        dtype = inputs[4].dtype
         shapes = [
             (blocks, self.finger_state.rows, self.columns),
             (blocks, self.world_state.rows, self.block),
@@ -169,7 +171,8 @@ class Program(Packing):
             (blocks, steps, len(self.trace), self.block),
         ]
         for stride, whole in _records(trajectory, states):
-            (angles, places), count = self.path_rows(whole), -(-steps // stride)
+            angles, places = self.path_rows(whole)
+            count = -(-steps // stride)
             shapes += [(blocks, count, angles, self.columns), (blocks, count, places, self.block)]
         if self.team > 1:
             shapes += [(blocks, self.onchip.rows, self.columns)]
@@ -198,7 +201,8 @@ class Program(Packing):
         (hand, world, finger_state0, world_state0, arm, pressure, *rest) = refs
         grid = rest.pop(0) if self.meshes else None
         (finger_state, world_state, scratch, trace, *path) = rest
-        block, onchip = Block(self.fingers, self.block, self.team), None
+        block = Block(self.fingers, self.block, self.team)
+        onchip = None
         if self.team > 1:
             share = partial(shared_memory.SharedColumns, block)
             *path, onchip = path
@@ -236,7 +240,8 @@ class Program(Packing):
 
         def body(carry: tuple) -> tuple:
             t, going = carry
-            now, fastest = number("step"), number("speed")
+            now = number("step")
+            fastest = number("speed")
 
             def undecided(distance: jax.Array, height: jax.Array) -> jax.Array:
                 return verdict.goes_on(bounds, distance, height, fastest, now, to_end=to_end)

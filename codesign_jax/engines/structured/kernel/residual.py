@@ -110,7 +110,8 @@ def of_rings(
         what they hold behind the step, and "share" of the contacts, which tells which are
         candidates.
     """
-    centre, places = sdf_collision.ring_centres(place.origin, place.frame, numbers), []
+    centre = sdf_collision.ring_centres(place.origin, place.frame, numbers)
+    places = []
     on_object = name.endswith("_object")
     looks = around(scene, at) if not on_object else [partial(look, scene, at=at, still=still)]
     for n, one in enumerate(looks):
@@ -119,7 +120,8 @@ def of_rings(
         if scene.effects.surface == "spheres":
             places.append(sdf_collision.balls_on_field(numbers, centre, *first))
             continue
-        offset, again = jnp.zeros_like(centre), first
+        offset = jnp.zeros_like(centre)
+        again = first
         if on_object or n >= scene.effects.table:  # the table is a plane
             offset = finger_collision.aimed(numbers, place.frame, *first)
             again = one(centre + offset, **values[1])
@@ -218,7 +220,9 @@ def of_palm(timestep: float, state: dict, arm, constants: dict, still: dict) -> 
     """Geometry and motions of palm and object, and the power of palm, wrist and object."""
     given = {name: still[name] for name in ("acc_wrist", "acc_object")}
     found = palm_and_object(timestep, state | given, arm, constants)
-    palm, now, virtual = found["palm"], found["now"], still["virtual_wrist"]
+    palm = found["palm"]
+    now = found["now"]
+    virtual = still["virtual_wrist"]
     along = palm_motion(virtual, palm.axes)
     power = dot(palm.palm.times(now.palm_motion) - palm.smooth_palm, along)
     object_force = palm.object.times(now.object_motion) - palm.smooth_object
@@ -236,7 +240,8 @@ def on_palm(
 ) -> jax.Array:
     """Power of a finger's ring or sphere, on a link, on the palm's disc of a size."""
     place, ring = mine
-    centre, disc = finger_collision.ring_centre(*place[:2], ring), (*palm[:2], size)
+    centre = finger_collision.ring_centre(*place[:2], ring)
+    disc = (*palm[:2], size)
     first = finger_collision.palm_distance(centre, disc)
     if scene.effects.surface == "spheres":
         found = finger_collision.ball_on_field(ring, centre, *first)

@@ -59,9 +59,15 @@ class ResidualVjp:
         virtual: Iterate,
         bars: CotangentTables,
     ):
-        self.step, self.p, self.at, self.thing = step, step.p, at, thing
-        self.contacts, self.scratch = step.contacts, step.scratch
-        self.virtual, self.bars, self.block = virtual, bars, step.block
+        self.step = step
+        self.p = step.p
+        self.at = at
+        self.thing = thing
+        self.contacts = step.contacts
+        self.scratch = step.scratch
+        self.virtual = virtual
+        self.bars = bars
+        self.block = step.block
         self.like = step.like
         self.one = lanes([self.like + 1.0], (), wide=True)
         self.object = {"columns": at["columns"], "object_vel": at["object_vel"]}
@@ -84,7 +90,8 @@ class ResidualVjp:
 
     def fingers(self, pressure: Lanes, centre_bar: Lanes) -> LinkMotion:
         """From the tips inwards; cotangents of what the palm hands on, on each lane."""
-        p, tips = self.p, self.p.links
+        p = self.p
+        tips = self.p.links
         touching = [n for n in ("finger_object", "finger_table") if n in self.contacts]
 
         def link(i: Any, after: LinkMotion) -> LinkMotion:
@@ -111,12 +118,14 @@ class ResidualVjp:
         return _add(bars, **{n: self.scratch.read(f"pairbar.{n}", i) for n in BodyMotion._fields})
 
     def _link(self, i: Any, after: LinkMotion, pressure: Lanes, centre_bar: Lanes) -> LinkMotion:
-        numbers, joint = self.step.link_constants(i), self.step.joint(i)
+        numbers = self.step.link_constants(i)
+        joint = self.step.joint(i)
         still = {"acc": joint.pop("acc"), "order": self.step.order(i)}
         still["virtual"] = self.scratch.read("virtual", i)
         share = self.step.hand.read("share", i + 1)
         still["centre_bar"] = lanewise(jnp.multiply, centre_bar, share)
-        run, joint = partial(residual.of_link, self.p.scene), joint | {"pressure": pressure}
+        run = partial(residual.of_link, self.p.scene)
+        joint = joint | {"pressure": pressure}
         before, own, moved = pull(run, (self.chain(i), numbers, joint), (still,), (after, self.one))
         self.bars.add({n: own.pop(n) for n in LINK_CONSTANTS}, i)
         sections = {n: own.pop(n) for n in FINGER_CONSTANTS if n in own}
@@ -147,7 +156,8 @@ class ResidualVjp:
     def palm_and_table(self, base: LinkMotion) -> LinkMotion:
         """Adds the contacts of the palm's rings or spheres, and of the object with the table."""
         names = [n for n in ("palm_object", "palm_table") if n in self.contacts]
-        at, now = self.at, self.at["now"]
+        at = self.at
+        now = self.at["now"]
         place = BodyMotion(
             at["place"], at["frame"], at["vel"], now.palm_motion, self.virtual.palm_motion
         )
@@ -190,15 +200,18 @@ class ResidualVjp:
     def _touching(
         self, name: str, i: Any, compute: Callable[[dict, dict], BodyMotion]
     ) -> BodyMotion:
-        at, empty = self._object(name), BodyMotion(*(self.none(n) for n in BodyMotion._fields))
+        at = self._object(name)
+        empty = BodyMotion(*(self.none(n) for n in BodyMotion._fields))
         contacts = self.contacts[name]
         still = self.still | self.of_contacts(name, i)
         return choose(contacts.touching(i), lambda: compute(at, still), empty, self.p.size)
 
     def _table(self) -> None:
-        contacts, p = self.contacts[residual.TABLE], self.p
+        contacts = self.contacts[residual.TABLE]
+        p = self.p
         finger = lanes([self.block.finger.astype(self.like.dtype)], (), wide=True)
-        at, still = self._object(residual.TABLE), self.still
+        at = self._object(residual.TABLE)
+        still = self.still
         if "meshed" in still:
             columns = self.at["columns"]
             still = still | {"factor": self.object["grid_factor"]}
@@ -270,16 +283,22 @@ def _add(bars: LinkMotion, **more: Lanes) -> LinkMotion:
     return bars._replace(**plus(old, more))
 
 
-CONE, ON_PALM = "cone.finger_finger", "cone.finger_palm"
+CONE = "cone.finger_finger"
+ON_PALM = "cone.finger_palm"
 
 
 class FingerContactsVjp:
     """Leaves the cotangents of the links with contacts between fingers as "pairbar"."""
 
     def __init__(self, sweep: ResidualVjp, pairs: BoundFingerContacts):
-        self.sweep, self.pairs, self.p, self.bars = sweep, pairs, sweep.p, sweep.bars
-        self.like, self.lane = sweep.like, sweep.block.lane
-        self.scratch, self.hand = sweep.scratch, sweep.step.hand
+        self.sweep = sweep
+        self.pairs = pairs
+        self.p = sweep.p
+        self.bars = sweep.bars
+        self.like = sweep.like
+        self.lane = sweep.block.lane
+        self.scratch = sweep.scratch
+        self.hand = sweep.step.hand
 
     def run(self) -> None:
         def clear(i: jax.Array, x: jax.Array) -> jax.Array:
@@ -289,7 +308,8 @@ class FingerContactsVjp:
             return x
 
         jax.lax.fori_loop(0, self.p.links + 1, clear, jnp.int32(0))
-        effects, hull = self.p.scene.effects, self.p.scene.effects.surface == "hull"
+        effects = self.p.scene.effects
+        hull = self.p.scene.effects.surface == "hull"
         if effects.finger_palm:
             self._leave_palm(
                 BodyMotion(*(self.sweep.none(n) for n in BodyMotion._fields)), first=True
@@ -319,7 +339,8 @@ class FingerContactsVjp:
     def _on_palm(self, item: Any, live: jax.Array) -> None:
         """Adds the cotangents of a ring or sphere and of the palm."""
         number, row, ring = self._ring(item)
-        at, step = self.sweep.at, self.sweep.step
+        at = self.sweep.at
+        step = self.sweep.step
         palm = self._body(jnp.zeros_like(row))._replace(origin=at["place"], frame=at["frame"])
         args = (self._body(row), ring), palm, step.constant("palm_disc"), step.constant(ON_PALM)
         run = partial(residual.on_palm, self.p.scene)

@@ -39,7 +39,10 @@ class SdfCollision:
     """Enters the contacts of fingers, palm and object with object and table."""
 
     def __init__(self, step: StepMemory, at: dict[str, Any], thing: WorldObject):
-        self.step, self.p, self.at, self.thing = step, step.p, at, thing
+        self.step = step
+        self.p = step.p
+        self.at = at
+        self.thing = thing
         self.contacts = step.contacts
         self.names = [n for n in ("finger_object", "finger_table") if n in self.contacts]
         self.hull = step.p.scene.effects.surface == "hull"
@@ -67,7 +70,8 @@ class SdfCollision:
         )
 
     def moves(self, name: str, motion: Lanes | None, vel: Lanes | None) -> tuple[Lanes, Lanes]:
-        at, now = self.at, self.at["now"]
+        at = self.at
+        now = self.at["now"]
         return (
             relative(name, motion, now.palm_motion, now.object_motion),
             relative(name, vel, at["vel"], at["object_vel"]),
@@ -107,7 +111,8 @@ class SdfCollision:
             contacts.every(one, [])  # type: ignore[attr-defined]
 
     def numbers(self, i: Any) -> Lanes:
-        k, read = self.p.k, partial(self.step.hand.read, "ring")
+        k = self.p.k
+        read = partial(self.step.hand.read, "ring")
         return lanewise(lambda rows: jnp.stack(rows, 1), [read(i * k + j) for j in range(k)])
 
     def on_field(
@@ -121,7 +126,8 @@ class SdfCollision:
         hold: tuple[Lanes, Lanes] | None,
     ) -> None:
         """Creates contacts of rings or balls of a body."""
-        contacts, looks = self.contacts[name], self.looks(name)
+        contacts = self.contacts[name]
+        looks = self.looks(name)
         found = [look(centre) for look in looks]
         friction = self.frictions(name, contacts.set.k // len(looks))
         if not self.hull:
@@ -136,7 +142,8 @@ class SdfCollision:
             places = []
             for n, (look, first) in enumerate(zip(looks, found, strict=True)):
                 if flat and n == 0:  # the table is a plane
-                    offset, again = lanewise(jnp.zeros_like, centre), first
+                    offset = lanewise(jnp.zeros_like, centre)
+                    again = first
                 else:
                     offset = lanewise(aimed, numbers, frame, *first)
                     again = look(lanewise(jnp.add, centre, offset))
@@ -147,7 +154,8 @@ class SdfCollision:
 
     def of_palm_and_object(self, state: dict) -> None:
         """Contacts of the palm's rings or spheres, and of the object with the table."""
-        p, at = self.p, self.at
+        p = self.p
+        at = self.at
         palm = [name for name in ("palm_object", "palm_table") if name in self.contacts]
         for i in range(p.palm_groups if palm else 0):
             numbers = lanewise(one_of, self.step.hand.read("palm_ring", i))
@@ -162,7 +170,8 @@ class SdfCollision:
         for i in range(on_table.set.count if on_table else 0):
             assert on_table is not None
             mine = range(i * p.fingers, min((i + 1) * p.fingers, len(slots)))
-            place, friction = Place(*self._deal([slots[k] for k in mine])), None
+            place = Place(*self._deal([slots[k] for k in mine]))
+            friction = None
             if rubs is not None:
                 (friction,) = self._deal([(rubs[:, k : k + 1],) for k in mine])
             moves = self.moves("object_table", None, None)
@@ -171,7 +180,9 @@ class SdfCollision:
 
     def _table_points(self, state: dict) -> list[Place]:
         """Each slot of the object on the table and the fixtures, lanes of a world."""
-        scene, columns, found = self.p.scene, self.at["columns"], []
+        scene = self.p.scene
+        columns = self.at["columns"]
+        found = []
         position = state["position"]
         if scene.effects.table:
             arms = objects.table_points(scene, self.thing, columns, position[2])
@@ -244,7 +255,8 @@ def slots_of(point, normal, gap):
 
 def may_touch(timestep, numbers, centre, distance, vel):
     """One where any of a link's rings may touch within the step, else zero."""
-    half, moving = numbers[3:6], vel[3:, None] + cross(vel[:3, None], centre)
+    half = numbers[3:6]
+    moving = vel[3:, None] + cross(vel[:3, None], centre)
     most = OUTSIDE * jnp.maximum(jnp.maximum(half[0], half[1]), half[2])
     speed = jnp.sqrt(dot(moving, moving)) + most * jnp.sqrt(dot(vel[:3], vel[:3]))
     near = distance < most + jnp.maximum(contact.MARGIN, timestep * speed)

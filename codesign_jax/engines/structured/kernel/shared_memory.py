@@ -24,7 +24,8 @@ from codesign_jax.scene import Scene
 
 TEAM = 8
 """Lanes of a team: six columns, the forces, and one for a second right side."""
-FORCES, AGAIN = 6, 7
+FORCES = 6
+AGAIN = 7
 """Lanes of the forces, and of conjugate gradients' right side in the rows of w."""
 WARP = 32
 UNUSED = ("body_centre", "tensor", "z", "z_again")
@@ -61,7 +62,9 @@ class SharedColumns:
     """Reference to a table of fingers, of which the lanes of a team share a column."""
 
     def __init__(self, block: Block, ref: Any):
-        self.ref, self.own, self.dtype = ref, block.own, ref.dtype
+        self.ref = ref
+        self.own = block.own
+        self.dtype = ref.dtype
         self.shape = (*ref.shape[:-1], block.size)
 
     def _at(self, index: Any) -> tuple:
@@ -81,7 +84,9 @@ class TeamRows:
     """Reads and writes a table's rows by the lanes of a team, each its own row."""
 
     def __init__(self, block: Block, table: BoundTable):
-        self.block, self.layout, self.ref = block, table.layout, table.ref
+        self.block = block
+        self.layout = table.layout
+        self.ref = table.ref
 
     def _at(self, name: str, item: Any, first: int, step: int) -> tuple:
         row = item * self.layout.stride[name] + self.block.mate * step
@@ -119,7 +124,8 @@ def where(mask: jax.Array, one: Any, other: Any) -> Any:
 
 def chosen(block: Block, values: Lanes, otherwise: Any = 0.0) -> jax.Array:
     """Component k of six values on lane k, shape (lane,)."""
-    parts, found = list(values.parts.ravel()), otherwise
+    parts = list(values.parts.ravel())
+    found = otherwise
     for k, part in enumerate(parts):
         found = jnp.where(block.mate == k, part, found)
     return found

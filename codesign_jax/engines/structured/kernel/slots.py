@@ -38,7 +38,8 @@ class SlotCounts:
     """
 
     def __init__(self, words: list[jax.Array], most: int):
-        self.words, self._most = words, most
+        self.words = words
+        self._most = most
         self._bits, self._each = _sizes(most)
 
     @classmethod
@@ -54,8 +55,10 @@ class SlotCounts:
 
     def of(self, row: jax.typing.ArrayLike) -> jax.Array:
         """A row's numbers, shape (lane,); `row` is a scalar."""
-        row, each = jnp.asarray(row, jnp.int32), jnp.int32(self._each)
-        which, place = jax.lax.div(row, each), jax.lax.rem(row, each)
+        row = jnp.asarray(row, jnp.int32)
+        each = jnp.int32(self._each)
+        which = jax.lax.div(row, each)
+        place = jax.lax.rem(row, each)
         word = self.words[0]
         for k, other in enumerate(self.words[1:], 1):
             word = jnp.where(which == k, other, word)
@@ -92,7 +95,10 @@ class SlotSet(ContactSet):
           remembers: Numbers that are kept of each slot beside its contact, see `remembered`.
         """
         super().__init__(scene, name, rows * (slots + 1) + int(gathers), 1, size)
-        self.rows, self.slots, self.gathers, self.remembers = rows, slots, gathers, remembers
+        self.rows = rows
+        self.slots = slots
+        self.gathers = gathers
+        self.remembers = remembers
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         return self.fields() | {f"{self.name}.count": (self.rows, ())}
@@ -148,7 +154,8 @@ class BoundSlots(BoundContacts):
 
     def keep_counts(self) -> None:
         """Keeps in registers how many slots lanes have filled, when all contacts are found."""
-        rows, most = range(self.set.rows), self.set.slots
+        rows = range(self.set.rows)
+        most = self.set.slots
         found = [self.read("count", row).lane.astype(jnp.int32) for row in rows]
         self._counts = SlotCounts.of_rows([jnp.minimum(n, most) for n in found], most)
         if self.set.gathers:
@@ -160,7 +167,8 @@ class BoundSlots(BoundContacts):
         All fields of it, as a number that is none, times no share, is none.
         """
         none = self.like
-        one, prefix = jnp.ones_like(none), f"{self.set.name}."
+        one = jnp.ones_like(none)
+        prefix = f"{self.set.name}."
         sound = {"gap": [one], "normal": [none, none, one]}
         for name, (_, shape) in fields.items():
             values = sound.get(name.removeprefix(prefix), [none] * math.prod(shape))
@@ -203,7 +211,8 @@ class BoundSlots(BoundContacts):
 
     def add(self, row: Any, which: jax.Array, fields: dict[str, Lanes], lane: jax.Array) -> None:
         """Gives contacts, with what is kept of them, a slot of a row on the lanes `which`."""
-        count, first = self.read("count", row).lane, row * (self.set.slots + 1)
+        count = self.read("count", row).lane
+        first = row * (self.set.slots + 1)
         filled = count.astype(jnp.int32)
         if not self.set.gathers:
             # Lanes without a contact in a slot have sound numbers there, and no touch.
@@ -219,7 +228,8 @@ class BoundSlots(BoundContacts):
 
     def fold(self, row: Any, body: Callable, start: Any) -> Any:
         """Folds body(item, tree of lanes) over the slots in use."""
-        used, first = self.used(row), row * (self.set.slots + 1)
+        used = self.used(row)
+        first = row * (self.set.slots + 1)
         arrays, rebuild = solid(start, self.set.size)
 
         def step(carry: list) -> list:
@@ -233,8 +243,11 @@ class BoundSlots(BoundContacts):
         if not self.set.gathers:
             return first + k
         assert self._counts is not None
-        mine, item = k < self._counts.of(row), jnp.full((self.set.size,), first + k, jnp.int32)
-        empty, spare = self.set.count - 1, self.set.slots  # that of the first row
+        mine = k < self._counts.of(row)
+        item = jnp.full((self.set.size,), first + k, jnp.int32)
+        # that of the first row
+        empty = self.set.count - 1
+        spare = self.set.slots
         return Slot(*(jnp.where(mine, item, jnp.int32(away)) for away in (empty, spare)))
 
     def update_constraint(self, item: Any, place: Place, alpha: Lanes) -> Lanes:

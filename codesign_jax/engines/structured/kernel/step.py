@@ -63,7 +63,8 @@ class Step(StepMemory):
         now, quality = Newton(Problem(self, geometry["palm"])).solve(now, waiting, *limits)
         distance = lanewise(lambda c: jnp.sqrt(dot(c, c)), centre).lane
         height = state["position"][2].lane
-        goes_on, slots = waiting & undecided(distance, height), []
+        goes_on = waiting & undecided(distance, height)
+        slots = []
         if p.slotted:
             slots = [self._overflow(waiting)]
             goes_on &= slots[0] == 0
@@ -107,7 +108,9 @@ class Step(StepMemory):
 
         Returns the warm start and the hand's centre from the object's.
         """
-        p, now, like = self.p, at["now"], self.like
+        p = self.p
+        now = at["now"]
+        like = self.like
         names = ("mount", "base", "share", "stub_centre")
         mount, base, share, stub = (self.hand.read(n) for n in names)
         frame, origin = lanewise(kin.mounted, at["place"], at["frame"], mount, base)
@@ -173,7 +176,8 @@ def palm_and_object(timestep: float, state: dict, arm, constants: dict) -> dict[
     Arm are the commands of the arm frame, `constants` those of `PALM_CONSTANTS` that the scene has.
     Without a stiffness of the wrist its accelerations follow from the commands.
     """
-    k, g = constants.get("wrist_stiffness"), constants.get("gravity")
+    k = constants.get("wrist_stiffness")
+    g = constants.get("gravity")
     s = State(**{k: state.get(k) for k in State._fields})
     place = kin._place(s)
     frame, axes, vel, bias = kin._wrist(place, s.wrist, s.wrist_vel)
@@ -215,9 +219,12 @@ def link_forces(scene: Scene, parent: tuple, constants: dict, joint: dict):
       What `parent` is for the next link, and what the solver needs, by name.
     """
     origin, frame, vel, bias, motion = parent
-    q, rate, pressure = joint["finger"], joint["finger_vel"], joint["pressure"]
+    q = joint["finger"]
+    rate = joint["finger_vel"]
+    pressure = joint["pressure"]
     hinges = [constants[n] for n in ("stiffness", "damping", "armature")]
-    cos, sin = jnp.cos(q), jnp.sin(q)
+    cos = jnp.cos(q)
+    sin = jnp.sin(q)
     origin, frame, axes = kin._turn_link(
         joint_axes(scene), origin, frame, constants["offset"], cos, sin, joint["order"]
     )
@@ -256,7 +263,8 @@ def semi_implicit_euler(
 
     Returns the largest velocity after the step, and whether the world has moved.
     """
-    p, h = step.p, step.p.scene.discretization.timestep
+    p = step.p
+    h = step.p.scene.discretization.timestep
     new = lanewise(partial(moved, h), state, at["columns"], now.wrist, now.object_motion)
     size = lanewise(_largest, new)
 

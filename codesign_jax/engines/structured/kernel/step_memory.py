@@ -88,7 +88,9 @@ class StepMemory:
         onchip: Any = None,
     ):
         """Takes the references; `onchip`: the table of shared memory, of teams."""
-        self.p, self.block, self.grid = layout, block, grid
+        self.p = layout
+        self.block = block
+        self.grid = grid
         self.hand = BoundTable(layout.hand, hand)
         self.world = BoundTable(layout.world, world, block.world)
         self.finger_state = BoundTable(layout.finger_state, finger_state)

@@ -28,7 +28,8 @@ class TeamSdfContactSet(ContactSet):
     def __init__(self, scene: Scene, tables: Any, name: str, links: int, k: int):
         """As `ContactSet`; one item more is no contact, another one takes what nobody reads."""
         super().__init__(scene, name, links * k + 2, 1, tables.size)
-        self.block, self.rings = (tables.fingers, tables.block, tables.team), links * k
+        self.block = (tables.fingers, tables.block, tables.team)
+        self.rings = links * k
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         """See `ContactSet`; with the Hessian and the force of each."""
@@ -132,7 +133,9 @@ class TeamFingerContactSet(FingerContactSet):
     def __init__(self, scene: Scene, block: tuple[int, int, int], *rest: Any, **how: Any):
         """As `FingerContactSet`; block: fingers, worlds and lanes of a team."""
         super().__init__(scene, block[:2], *rest, **how)
-        self.block, self.size = block, block[0] * block[1] * block[2]  # type: ignore[assignment]
+        # type: ignore[assignment]
+        self.block = block
+        self.size = block[0] * block[1] * block[2]
         self.more |= {"wrench": 6, "wrench_spare": TEAM - 6}
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
@@ -154,7 +157,8 @@ class BoundTeamFingerContacts(BoundFingerContacts):
 
     def __init__(self, *bound: Any):
         super().__init__(*bound)
-        self.parts, self._loaded = TeamRows(self.block, self.table), False
+        self.parts = TeamRows(self.block, self.table)
+        self._loaded = False
 
     def _lane(self) -> jax.Array:
         return self.block.own
@@ -168,17 +172,21 @@ class BoundTeamFingerContacts(BoundFingerContacts):
 
     def _item(self, row: Any, first: Any, number: jax.Array) -> Slot:
         assert self._counts is not None
-        mine, item = number < self._counts.of(row), first + number
-        empty, spare = self.set.count - 1, self.set.slots
+        mine = number < self._counts.of(row)
+        item = first + number
+        empty = self.set.count - 1
+        spare = self.set.slots
         return Slot(jnp.where(mine, item, empty), jnp.where(mine, item, spare))
 
     def add(self, row: Any, which: jax.Array, fields: dict[str, Lanes], lane: jax.Array) -> None:
         """See `BoundSlots`; lanes of a team append in their order."""
-        slots, count = self.set.slots, self.read("count", row).lane
+        slots = self.set.slots
+        count = self.read("count", row).lane
         rank, number = ranks(self.block, which)
         mine = jnp.where(which, jnp.minimum(count.astype(jnp.int32) + rank, slots), slots)
         for field, value in fields.items():
-            name, first = f"{self.set.name}.{field}", row * (slots + 1)
+            name = f"{self.set.name}.{field}"
+            first = row * (slots + 1)
             self.table.scatter(name, value, first + mine, lane)
         self.write("count", lanes([count + number.astype(count.dtype)], (), wide=True), row)
 

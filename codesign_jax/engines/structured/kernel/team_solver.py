@@ -29,10 +29,14 @@ class TeamLanes:
     """A problem's numbers as the lanes of a team share them."""
 
     def __init__(self, problem: Problem):
-        m, block = problem.m, problem.block
-        self.problem, self.block, self.like = problem, block, problem.like
+        m = problem.m
+        block = problem.block
+        self.problem = problem
+        self.block = block
+        self.like = problem.like
         assert m.onchip is not None
-        self.chip, self.scratch = TeamRows(block, m.onchip), TeamRows(block, m.scratch)
+        self.chip = TeamRows(block, m.onchip)
+        self.scratch = TeamRows(block, m.scratch)
         self.forces = self.mask(block.mate == FORCES)
 
     def mask(self, which: jax.Array, *, wide: bool = True) -> Lanes:
@@ -95,7 +99,8 @@ class TeamLanes:
             g = jnp.where(forces, -w, g)
             p, c, q = node
             p = p - contract(u, w[:, None], 0)
-            c, q = c - contract(u, g[:, None], 0), q - contract(h, g[:, None], 0)
+            c = c - contract(u, g[:, None], 0)
+            q = q - contract(h, g[:, None], 0)
             return [p, c, q], w, g, work
 
         columns = lanewise(project, *node[:2], axes, more)
@@ -153,7 +158,8 @@ class TeamLanes:
 
     def wrist(self, kept: list[el.Kept], axes: list[Lanes], obj: Lanes, z: list | None) -> Iterate:
         """Substitutes back at the wrist: slides, then hinges."""
-        motion, found = lanewise(jnp.zeros_like, obj), []
+        motion = lanewise(jnp.zeros_like, obj)
+        found = []
         part = chosen(self.block, obj)
         for k in (1, 0):
             a = self.accelerations(kept[k], chosen(self.block, motion), part, z and z[k])
@@ -168,14 +174,17 @@ class TeamElimination(Elimination):
 
     def __init__(self, problem: Problem):
         super().__init__(problem)
-        self.team, self.rings = TeamLanes(problem), problem.m.p.k
+        self.team = TeamLanes(problem)
+        self.rings = problem.m.p.k
         one = jnp.ones_like(self.like)
         unit = [jnp.where(self.block.mate == k, one, 0.0) for k in range(6)]
         self.unit = lanes(unit, (6,), wide=True)
 
     def backward(self, alpha: Lanes) -> tuple[Any, Lanes]:
         """See `Elimination`; the node is the lanes' columns of P with r, C, and Q with r_o."""
-        problem, team, pairs = self.problem, self.team, self.problem.pairs
+        problem = self.problem
+        team = self.team
+        pairs = self.problem.pairs
         assert pairs is not None
         pairs.update_constraints(alpha)
         for contacts in problem.fingers:
@@ -189,7 +198,8 @@ class TeamElimination(Elimination):
 
         def step(i: Any, carry: tuple) -> tuple:
             (p, c, q), work = carry
-            axes, acc = team.axes(i), problem.move("acc", i, alpha)
+            axes = team.axes(i)
+            acc = problem.move("acc", i, alpha)
             part = team.chip.get("motion", i) + alpha.lane * team.chip.get("step_motion", i)
             team.chip.put("motion", part, i)
             column = team.chip.rows("matrix", i)
@@ -218,14 +228,16 @@ class TeamElimination(Elimination):
             p, c, q = node
             return [p + own, c + held, q + jnp.where(forces, -held, held)]
 
-        none, forces = zeros((6,), self.like), self.team.forces
+        none = zeros((6,), self.like)
+        forces = self.team.forces
         for contacts in self.problem.fingers:
             own = contacts.columns(i, self.rings, self.unit, forces)  # type: ignore[attr-defined]
             node = lanewise(add, node, own, own if contacts.set.on_object else none, forces)
         return node
 
     def at_palm(self, now: Iterate, node: Any, slots: dict) -> tuple[Iterate, Eliminated]:
-        team, rigid = self.team, self.problem.rigid
+        team = self.team
+        rigid = self.problem.rigid
 
         def own(now, palm, pushes):
             none = jnp.zeros_like(palm.smooth_palm)
@@ -241,7 +253,8 @@ class TeamElimination(Elimination):
             for matrix, force in ((whole.p, whole.r), (whole.c, none), (whole.q, whole.r_object))
         ]
         node = lanewise(_plus, list(node), added)
-        kept, work = [], [zeros((), self.like)]
+        kept = []
+        work = [zeros((), self.like)]
         axes = [palm.axes, lanewise(el.wrist_slides, palm.armature)]
         for k, joint in enumerate((slice(3, 6), slice(0, 3))):
             if rigid:
@@ -251,7 +264,8 @@ class TeamElimination(Elimination):
             kept.append(new)
             work.append(done)
         (q,) = team.spread(q=node[2])
-        square, ro = team.narrowed(q[:, :6]), team.narrowed(q[:, FORCES])
+        square = team.narrowed(q[:, :6])
+        ro = team.narrowed(q[:, FORCES])
         obj = lanewise(el.solve_object, square, ro)
         part = self.block.over_team(lanewise(lambda w: total(w), work).lane, jnp.add)
         part = lanewise(lambda w, r, o: w + dot(r, o), lanes([part], (), wide=False), ro, obj)
@@ -270,7 +284,8 @@ class TeamCoupling(Coupling):
         self.team = TeamLanes(problem)
 
     def again(self) -> Iterate:
-        team, none = self.team, jnp.zeros_like(self.problem.like)
+        team = self.team
+        none = jnp.zeros_like(self.problem.like)
 
         def step(i: Any, carry: tuple) -> tuple:
             r, ro = (v.lane for v in carry)
@@ -293,7 +308,8 @@ class TeamCoupling(Coupling):
 
     def _row(self, i: Any, k: int, lane: int, value: jax.Array | None = None) -> jax.Array:
         """A lane's number in row k of w, on all lanes; or stores it."""
-        table, ref = self.team.chip.layout, self.team.chip.ref
+        table = self.team.chip.layout
+        ref = self.team.chip.ref
         place = i * table.stride["w"] + (table.offset["w"] + TEAM * k + lane)
         if value is not None:
             ref[place] = value
@@ -308,8 +324,11 @@ class TeamCoupling(Coupling):
         jax.lax.fori_loop(0, self.links, add, jnp.int32(0))
 
     def _wrist(self, r: jax.Array, ro: jax.Array) -> Iterate:
-        team, done, palm = self.team, self.done, self.problem.palm
-        z, kept = [], [done.hinges, done.slides]
+        team = self.team
+        done = self.done
+        palm = self.problem.palm
+        z = []
+        kept = [done.hinges, done.slides]
         axes = [palm.axes, lanewise(el.wrist_slides, palm.armature)]
         for k, own in enumerate(kept):
             if own is None:
@@ -325,7 +344,8 @@ class TeamCoupling(Coupling):
         return team.wrist(kept, axes, obj, z)  # type: ignore[arg-type]
 
     def substitute(self, z: str, step: Iterate) -> None:
-        team, at = self.team, FORCES if z == "z" else AGAIN
+        team = self.team
+        at = FORCES if z == "z" else AGAIN
         palm, obj = (chosen(self.block, v) for v in (step.palm_motion, step.object_motion))
 
         def one(i: Any, parent: Lanes) -> Lanes:
@@ -342,10 +362,13 @@ class TeamLineSearch(LineSearch):
 
     def __init__(self, problem: Problem):
         super().__init__(problem)
-        self.team, self.rings = TeamLanes(problem), problem.m.p.k
+        self.team = TeamLanes(problem)
+        self.rings = problem.m.p.k
 
     def prepare(self, now: Iterate, step: Iterate) -> tuple[Lanes, Lanes, Lanes]:
-        problem, team, pairs = self.problem, self.team, self.problem.pairs
+        problem = self.problem
+        team = self.team
+        pairs = self.problem.pairs
         assert pairs is not None
         palm, obj = (chosen(self.block, v) for v in (step.palm_motion, step.object_motion))
         first = team.one(jnp.where(self.block.mate == 0, jnp.ones_like(self.like), 0.0))
@@ -364,7 +387,8 @@ class TeamLineSearch(LineSearch):
             team.chip.put("step_motion", part, i)
             team.scratch.put("side.motion", part, i + 1)
             numbers = problem.read("armature", "acc", "tau", item=i)
-            push, column = team.one(team.scratch.get("smooth", i)), team.chip.rows("matrix", i)
+            push = team.one(team.scratch.get("smooth", i))
+            column = team.chip.rows("matrix", i)
             motion, moved = problem.read("motion", "step_motion", item=i)
             sums = lanewise(
                 smooth, sums, column, motion, moved, push, team.one(part), first, *numbers, a
@@ -387,7 +411,8 @@ class TeamLineSearch(LineSearch):
         return self.block.sum([team_sum(self.block, v) for v in sums])
 
     def contact_slopes(self, alpha: Lanes) -> list[Lanes]:
-        problem, sums = self.problem, [zeros((), self.like)] * 2
+        problem = self.problem
+        sums = [zeros((), self.like)] * 2
         first = self.team.one(jnp.where(self.block.mate == 0, jnp.ones_like(self.like), 0.0))
 
         def plus(sums: list[Lanes], new: list[Lanes]) -> list[Lanes]:

@@ -68,7 +68,9 @@ def charged(scene: Scene, hand: WorldModel, ctrl: jax.Array) -> jax.Array:
     A chamber gets the mass of air that has the wanted pressure while the finger bends freely.
     """
     assert hand.air is not None
-    wanted, links = jnp.moveaxis(ctrl[..., 6:], 0, -1), len(hand.stiffness)  # (time, finger, world)
+    # (time, finger, world)
+    wanted = jnp.moveaxis(ctrl[..., 6:], 0, -1)
+    links = len(hand.stiffness)
     gains = hand.gain[None] if hand.tip is None else hand.gain
     grown = jnp.zeros_like(wanted)
     for gain, stiffness, section in zip(

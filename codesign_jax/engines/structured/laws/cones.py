@@ -38,7 +38,8 @@ def make_cone(scene: Scene, friction: Any, *, bodies: int, ratio: Any, stiffer: 
       ratio: How much harder friction is.
       stiffer: Stiffness over `contact.normal_stiffness`.
     """
-    c, h = scene.contact, scene.discretization.timestep
+    c = scene.contact
+    h = scene.discretization.timestep
     how = {"ahead": scene.effects.surface == "hull"}
     normal = 2.0 / bodies * stiffer * contact_mass(scene, **how)
     reference = 1.0 / (h * (h + dissipation(scene, **how))), 1.0 / h + 0.0 * normal
@@ -57,7 +58,8 @@ def make_cones(scene: Scene, shape: jax.Array) -> Cones:
     on_object = scene.objects.object[0].friction
     for i, other in enumerate(scene.objects.object[1:], 1):
         on_object = jnp.where(shape == i, other.friction, on_object)
-    e, c = scene.effects, scene.contact
+    e = scene.effects
+    c = scene.contact
     ratio = c.held_friction_ratio if keeps(scene) else c.friction_ratio
     two, one = (partial(make_cone, scene, bodies=n, ratio=ratio) for n in (2, 1))
     # MuJoCo has one impratio for all contacts, so that spheres, which it simulates too, do here.

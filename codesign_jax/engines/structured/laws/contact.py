@@ -92,13 +92,15 @@ class Contacts(NamedTuple):
         with S = (mu_roll (1 - n n') + mu_spin n n') / mu both are isotropic: torsion and rolling
         are further tangential components of the cone of three dimensions.  S is symmetric.
         """
-        cone, n = self.cone, self.normal
+        cone = self.cone
+        n = self.normal
         assert cone.spin is not None and cone.roll is not None
         return cone.roll * omega + (cone.spin - cone.roll) * dot(n, omega) * n
 
     def reference(self, velocity: jax.Array) -> jax.Array:
         """Reference acceleration aref from the relative point velocity, shaped as that."""
-        cone, gap = self.cone, self.distance
+        cone = self.cone
+        gap = self.distance
         spring = jnp.where(gap < 0, cone.spring, cone.damper**2) * gap
         return -cone.damper * velocity - spring * self.direction
 
@@ -135,7 +137,8 @@ def constraint_update(contacts: Contacts, jar: jax.Array) -> ConeResponse:
     the middle zone 1/2 D_m (w_n - mu |w_t|)^2 with D_m = D_n / (1 + mu^2 / impratio), the top zone
     zero.
     """
-    cone, n = contacts.cone, contacts.direction
+    cone = contacts.cone
+    n = contacts.direction
     if cone.friction is None:
         return _update_frictionless(contacts, jar)
     normal = dot(n, jar)
@@ -200,10 +203,12 @@ class LineCost(NamedTuple):
 
 def line(contacts: Contacts, jar: jax.Array, step: jax.Array) -> LineCost:
     """Prepares the line search along a step of jar."""
-    n0, n1 = dot(contacts.normal, jar), dot(contacts.normal, step)
+    n0 = dot(contacts.normal, jar)
+    n1 = dot(contacts.normal, step)
     if contacts.cone.friction is None:
         return LineCost(n0, n1, None, None, None)
-    u, v = jar - n0 * contacts.direction, step - n1 * contacts.direction
+    u = jar - n0 * contacts.direction
+    v = step - n1 * contacts.direction
     return LineCost(n0, n1, dot(u, u), dot(u, v), dot(v, v))
 
 
@@ -284,7 +289,8 @@ def _full_inertia(contacts: Contacts, hessian: jax.Array) -> jax.Array:
 
     top = jnp.stack([hessian[place[i, j]] for i in range(3) for j in range(i, 3)])
     coulomb = contacts._replace(cone=contacts.cone._replace(spin=None, roll=None))
-    matrix, r = contact_inertia(coulomb, top), contacts.point
+    matrix = contact_inertia(coulomb, top)
+    r = contacts.point
     e = [contacts.turning(row(i, range(3, 6))) for i in range(3)]
     c = jnp.stack([contacts.turning(row(3 + i, range(3, 6))) for i in range(3)])  # C S
     turned = [contacts.turning(jnp.stack([c[i][j] for i in range(3)])) for j in range(3)]

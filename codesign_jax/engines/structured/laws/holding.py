@@ -20,7 +20,8 @@ def held(contacts: Contacts, grip: jax.Array) -> jax.Array:
     Args:
       grip: g, world axes, shape (3, ...).
     """
-    cone, n = contacts.cone, contacts.normal
+    cone = contacts.cone
+    n = contacts.normal
     # A slot in which a lane has no contact may have no stiffness either.
     some = contacts.active & (cone.tangent > 0)
     share = jnp.where(some, _elastic(contacts) / jnp.where(some, cone.tangent, 1.0), 0.0)
@@ -41,7 +42,8 @@ def hold(contacts: Contacts, force: jax.Array, grip: jax.Array) -> jax.Array:
     Args:
       grip: As in `held`.
     """
-    n, force = contacts.normal, force[:3]
+    n = contacts.normal
+    force = force[:3]
     normal = dot(n, force)
     weight = jnp.where(contacts.active, jnp.maximum(normal, _elastic(contacts)), 0.0)
     return jnp.concatenate([(normal + weight * dot(n, grip)) * n - force, weight[None]])

@@ -27,8 +27,10 @@ class Body(NamedTuple):
 
     def matrix(self) -> jax.Array:
         """Rows of the 6 x 6 spatial inertia, shape (6, 6, ...)."""
-        m, c = self.mass, self.centre
-        zero, square = jnp.zeros_like(m * c[0]), dot(c, c)
+        m = self.mass
+        c = self.centre
+        zero = jnp.zeros_like(m * c[0])
+        square = dot(c, c)
         m = m + zero
         skew = [
             [zero, -m * c[2], m * c[1]],
@@ -53,7 +55,8 @@ class Body(NamedTuple):
         Args:
           gravity: Magnitude of gravity, along -z [m/s^2]; None without the effect.
         """
-        omega, alpha = vel[:3], bias[:3]
+        omega = vel[:3]
+        alpha = bias[:3]
         point_vel = vel[3:] + cross(omega, self.centre)
         acc = bias[3:] + cross(alpha, self.centre) + cross(omega, point_vel)
         if gravity is not None:
@@ -91,7 +94,8 @@ class Centred(NamedTuple):
         Args:
           gravity: Magnitude of gravity, along -z [m/s^2]; None without the effect.
         """
-        omega, zero = vel[:3], jnp.zeros_like(vel[0])
+        omega = vel[:3]
+        zero = jnp.zeros_like(vel[0])
         weight = zero if gravity is None else -self.mass * gravity + zero
         moment = -cross(omega, apply_columns(self.tensor, omega))
         return spatial(moment, jnp.stack([zero, zero, weight]))

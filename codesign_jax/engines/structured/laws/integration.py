@@ -16,8 +16,10 @@ def integrate(state: State, columns: jax.Array, acc: Acc, h: float) -> State:
       h: Time step [s].
     """
     local = jnp.stack([total([columns[k, i] * acc.object[i] for i in range(3)]) for k in range(3)])
-    wrist_vel, finger_vel = state.wrist_vel + h * acc.wrist, state.finger_vel + h * acc.finger
-    linear, angular = state.linear_vel + h * acc.object[3:], state.angular_vel + h * local
+    wrist_vel = state.wrist_vel + h * acc.wrist
+    finger_vel = state.finger_vel + h * acc.finger
+    linear = state.linear_vel + h * acc.object[3:]
+    angular = state.angular_vel + h * local
     return State(
         state.wrist + h * wrist_vel,
         state.finger + h * finger_vel,
@@ -57,7 +59,8 @@ def _turn(quat: jax.Array, omega: jax.Array, h: float) -> jax.Array:
     # Without rotation the quotient is zero but its derivative is not.
     axis = jnp.where(square > 0, omega / speed * jnp.sin(half), 0.5 * h * omega)
     w, x, y, z = quat
-    a, (b, c, d) = jnp.cos(half), axis
+    a = jnp.cos(half)
+    b, c, d = axis
     turned = jnp.stack(
         [
             w * a - x * b - y * c - z * d,

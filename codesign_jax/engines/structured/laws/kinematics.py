@@ -92,11 +92,13 @@ def kinematics(hand: WorldModel, axis_names: tuple[str, ...], state: State) -> K
     place = _place(state)
     palm, wrist_axes, palm_vel, palm_bias = once(_wrist, place, state.wrist, state.wrist_vel)
     frame, origin = once(mounted, place, palm, hand.mount, hand.base)
-    vel, bias = palm_vel, palm_bias
+    vel = palm_vel
+    bias = palm_bias
     trig = once(lambda q: (jnp.cos(q), jnp.sin(q)), state.finger)
 
     def next_link(carry, link):
-        (origin, frame, vel, bias), (offset, cos, sin, rate, order) = carry, link
+        origin, frame, vel, bias = carry
+        offset, cos, sin, rate, order = link
         turn = partial(_turn_link, axis_names)
         origin, frame, subspace = once(turn, origin, frame, offset, cos, sin, order)
         vel, bias = once(_link_velocity, vel, bias, subspace, rate, order)
@@ -141,11 +143,14 @@ def _place(state: State) -> jax.Array:
 
 
 def _wrist(place: jax.Array, wrist: jax.Array, wrist_vel: jax.Array):
-    one, zero = jnp.ones_like(wrist[0]), jnp.zeros_like(wrist[0])
+    one = jnp.ones_like(wrist[0])
+    zero = jnp.zeros_like(wrist[0])
     frame = [jnp.stack([one if i == k else zero for i in range(3)]) for k in range(3)]
     none = jnp.stack([zero] * 3)
-    vel, bias = spatial(none, wrist_vel[:3]), spatial(none, none)
-    cos, sin = jnp.cos(wrist[3:]), jnp.sin(wrist[3:])
+    vel = spatial(none, wrist_vel[:3])
+    bias = spatial(none, none)
+    cos = jnp.cos(wrist[3:])
+    sin = jnp.sin(wrist[3:])
     axes = []
     for k, axis in enumerate(_WRIST):
         s = spatial(frame[axis], cross(place, frame[axis]))
@@ -159,7 +164,8 @@ def _wrist(place: jax.Array, wrist: jax.Array, wrist_vel: jax.Array):
 def _palm_columns(wrist: jax.Array) -> jax.Array:
     """Columns of the palm's orientation, as `_wrist` has them beside axes and velocities."""
     frame = list(jnp.eye(3, dtype=wrist.dtype).reshape(3, 3, *[1] * (wrist.ndim - 1)))
-    cos, sin = jnp.unstack(jnp.cos(wrist[3:])), jnp.unstack(jnp.sin(wrist[3:]))
+    cos = jnp.unstack(jnp.cos(wrist[3:]))
+    sin = jnp.unstack(jnp.sin(wrist[3:]))
     for axis, c, s in zip(_WRIST, cos, sin, strict=True):
         frame = rotate(frame, axis, c, s)
     return jnp.stack(jnp.broadcast_arrays(*frame))

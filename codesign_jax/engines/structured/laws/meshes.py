@@ -52,12 +52,14 @@ def tables(scene: Scene) -> MeshTables | None:
       InputError: with every mesh whose distance cannot be put on a grid.
     """
     problems: list[str] = []
-    grids, supports = {}, {}
+    grids = {}
+    supports = {}
     for i, shape in enumerate(scene.objects.object):
         if not shape.mesh:
             continue
         try:
-            grids[i], supports[i] = shape.mesh.grid, shape.mesh.support
+            grids[i] = shape.mesh.grid
+            supports[i] = shape.mesh.support
         except InputError as error:
             problems += [f"object {shape.name!r}: {p}" for p in error.problems]
     if problems:
@@ -81,8 +83,11 @@ def tables(scene: Scene) -> MeshTables | None:
     )
     start = 0
     for (i, grid), values in zip(grids.items(), flat, strict=True):
-        result.first[i], result.nodes[i], result.cell[i] = start, grid.values.shape, grid.cell
-        result.origin[i], result.half[i] = grid.origin, scene.objects.object[i].half_sizes[0]
+        result.first[i] = start
+        result.nodes[i] = grid.values.shape
+        result.cell[i] = grid.cell
+        result.origin[i] = grid.origin
+        result.half[i] = scene.objects.object[i].half_sizes[0]
         result.support[i] = np.resize(supports[i], (points, 3))  # repeats the points
         start += values.size
     return result
@@ -154,7 +159,8 @@ def signed_distance(lanes: MeshLanes, p: jax.Array) -> tuple[jax.Array, jax.Arra
 
 def locate(grid: GridLanes, p: jax.Array) -> GridCell:
     """Finds the cells of points (3, ..., world) in the object's frame."""
-    axes, nodes = range(3), grid.nodes.astype(jnp.int32)
+    axes = range(3)
+    nodes = grid.nodes.astype(jnp.int32)
     scaled = [(p[k] / grid.factor - grid.origin[k]) / grid.cell for k in axes]
     inside = [jnp.clip(scaled[k], 0.0, (nodes[k] - 1).astype(p.dtype)) for k in axes]
     # A place that is not a number has to lead to a cell too: kernels do not check indices.
@@ -181,12 +187,15 @@ def interpolate(grid: GridLanes, cell: GridCell, values: jax.Array) -> tuple[jax
 
     def edge(k: int) -> tuple[jax.Array, jax.Array]:
         """Interpolates along z on an edge of the cell."""
-        low, high = values[2 * k], values[2 * k + 1]
+        low = values[2 * k]
+        high = values[2 * k + 1]
         return low + z * (high - low), high - low
 
     (a, az), (b, bz), (c, cz), (d, dz) = (edge(k) for k in range(4))
-    low, high = a + y * (b - a), c + y * (d - c)
-    low_z, high_z = az + y * (bz - az), cz + y * (dz - cz)
+    low = a + y * (b - a)
+    high = c + y * (d - c)
+    low_z = az + y * (bz - az)
+    high_z = cz + y * (dz - cz)
     slope_y = (b - a) + x * ((d - c) - (b - a))
     slope = jnp.stack([high - low, slope_y, low_z + x * (high_z - low_z)])
     back = jnp.sqrt(dot(cell.beyond, cell.beyond) + _FAR**2)
@@ -231,7 +240,8 @@ def beside(
     point: jax.Array, index: jax.Array, first: jax.Array, second: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Scores by the distance on either side of the line through two points, (3, 1, world)."""
-    line, away = second - first, point - first
+    line = second - first
+    away = point - first
     length = jnp.sqrt(line[0] ** 2 + line[1] ** 2 + _FAR**2)
     side = (line[0] * away[1] - line[1] * away[0]) / length
     low = lowest(point, index)

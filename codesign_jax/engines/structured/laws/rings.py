@@ -130,9 +130,11 @@ def section_normal(half: jax.Array, local: jax.Array) -> jax.Array:
       half: Half axes.
       local: Direction of the ray in the section's frame, of any length, shape (3, ...).
     """
-    y, z = local[1] / half[1], local[2] / half[2]
+    y = local[1] / half[1]
+    z = local[2] / half[2]
     largest = jnp.maximum(jnp.maximum(jnp.abs(y), jnp.abs(z)), 1e-6)
-    y, z = (y / largest) ** 3 / half[1], (z / largest) ** 3 / half[2]
+    y = (y / largest) ** 3 / half[1]
+    z = (z / largest) ** 3 / half[2]
     size = jnp.sqrt(y * y + z * z + SMALL)
     return jnp.stack([jnp.zeros_like(y), y / size, z / size])
 
@@ -228,13 +230,15 @@ def between(
     other = section_frame(segment, t)
     away = centre - on_line(segment, t)
     apart = jnp.sqrt(dot(away, away) + SMALL)
-    line, normal = away / apart, jnp.zeros_like(away)
+    line = away / apart
+    normal = jnp.zeros_like(away)
     for axes, half, side in ((frame, ring.half, -1.0), (other, segment.half, 1.0)):
         own = apply_columns(axes, side * section_normal(half, side * apply_rows(axes, away)))
         along = dot(line, axes[0]) ** 2
         normal = normal + own + along * (line - own)
     normal = normal / jnp.sqrt(dot(normal, normal) + SMALL)
-    toward, back = -apply_rows(frame, normal), apply_rows(other, normal)
+    toward = -apply_rows(frame, normal)
+    back = apply_rows(other, normal)
     beyond = jnp.where((t >= 1.0) & (back[0] > 0), segment.half[0], 0.0)
     theirs, _ = support(jnp.stack([beyond, segment.half[1], segment.half[2]]), back)
     reach, unit = support(ring.half, toward)

@@ -70,7 +70,8 @@ def primitive_distance(
 
 def _by_kind(scene: Scene, shape: jax.Array, functions: dict[str, Callable]) -> Any:
     """What the function for the kind of each world's object returns, a tree of arrays."""
-    kinds, result = [s.type for s in scene.objects.object], None
+    kinds = [s.type for s in scene.objects.object]
+    result = None
     for kind in dict.fromkeys(k for k in kinds if k in functions):
         new = functions[kind]()
         if result is None:
@@ -106,8 +107,10 @@ def cylinder(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Signed distance of points (3, ...) from a cylinder (radius, half height), and gradient."""
     radial = jnp.sqrt(p[0] ** 2 + p[1] ** 2 + _TINY**2)
     sign = jnp.where(p[2] < 0, -1.0, 1.0).astype(p.dtype)
-    side, cap = radial - size[0], jnp.abs(p[2]) - size[1]
-    out_side, out_cap = jnp.maximum(side, 0.0), jnp.maximum(cap, 0.0)
+    side = radial - size[0]
+    cap = jnp.abs(p[2]) - size[1]
+    out_side = jnp.maximum(side, 0.0)
+    out_cap = jnp.maximum(cap, 0.0)
     square = out_side**2 + out_cap**2
     is_out = square > 0
     length = jnp.sqrt(jnp.where(is_out, square, 1.0))
@@ -139,7 +142,8 @@ def lowest_points(scene: Scene, hand: WorldModel, columns: jax.Array) -> jax.Arr
     """
 
     def points(size: jax.Array, columns: jax.Array) -> jax.Array:
-        indices, arms = mesh_indices(scene), None
+        indices = mesh_indices(scene)
+        arms = None
         if len(indices) < len(scene.objects.object):
             arms = primitive_points(scene, size, hand.object_id, columns)
         if indices:
@@ -193,7 +197,8 @@ def _rim_points(size: jax.Array, columns: jax.Array) -> jax.Array:
     across = cross(radial, axis)
     across_length = jnp.sqrt(jnp.maximum(dot(across, across), _TINY**2))
     across = across / across_length * size[0] * np.sqrt(3.0) / 2
-    lower, upper = half + radial, radial - half
+    lower = half + radial
+    upper = radial - half
     return jnp.stack([lower, upper, half - 0.5 * radial + across, half - 0.5 * radial - across], 1)
 
 
@@ -206,7 +211,8 @@ def _lowest_point(size: jax.Array, columns: jax.Array) -> jax.Array:
 
 def _cap_points(size: jax.Array, columns: jax.Array) -> jax.Array:
     """The lowest point of each cap of a capsule, shape (3, 4, world)."""
-    lowest, end = _lowest_point(size, columns), size[1] * columns[2]
+    lowest = _lowest_point(size, columns)
+    end = size[1] * columns[2]
     return jnp.stack([lowest[:, 0] + end, lowest[:, 0] - end, lowest[:, 2], lowest[:, 3]], 1)
 
 

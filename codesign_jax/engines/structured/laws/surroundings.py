@@ -67,7 +67,8 @@ def distance(
     local = _from_centre(fixture, _in_world(position, point))
     zero = jnp.zeros_like(local[0])
     if fixture.type == "plane":
-        gap, slope = local[2], jnp.stack([zero, zero, zero + 1.0])
+        gap = local[2]
+        slope = jnp.stack([zero, zero, zero + 1.0])
     else:
         size = jnp.stack([zero + float(s) for s in fixture.half_sizes])
         gap, slope = shapes.SHAPES[fixture.type].distance(size, local)
@@ -81,7 +82,8 @@ def towards(fixture: Fixture, position: jax.Array) -> tuple[jax.Array, jax.Array
       The distance (...), and rows of a rotation, shape (3, 3, ...).
     """
     gap, normal = distance(fixture, position, jnp.zeros_like(position))
-    one, zero = jnp.ones_like(gap), jnp.zeros_like(gap)
+    one = jnp.ones_like(gap)
+    zero = jnp.zeros_like(gap)
     aside = jnp.where(
         jnp.abs(normal[2]) < 0.9, jnp.stack([zero, zero, one]), jnp.stack([one, zero, zero])
     )
@@ -100,7 +102,8 @@ def edges(fixture: Fixture, position: jax.Array) -> jax.Array:
     size = [float(s) for s in fixture.half_sizes]
     if fixture.type == "cylinder":
         radial = jnp.sqrt(local[0] ** 2 + local[1] ** 2 + 1e-12)
-        scale, end = size[0] / radial, jnp.where(local[2] < 0, -size[1], size[1])
+        scale = size[0] / radial
+        end = jnp.where(local[2] < 0, -size[1], size[1])
         found = [jnp.stack([scale * local[0], scale * local[1], end])]
     else:
         excess = [jnp.abs(local[k]) - size[k] for k in range(3)]
@@ -110,10 +113,12 @@ def edges(fixture: Fixture, position: jax.Array) -> jax.Array:
         for edge in range(4):
             point = None
             for k in (2, 1, 0):
-                a, b = (k + 1) % 3, (k + 2) % 3
+                a = (k + 1) % 3
+                b = (k + 2) % 3
                 across, along = (a, b) if edge < 2 else (b, a)
                 own: list[Any] = [None] * 3
-                own[k], own[along] = side[k], near[along]
+                own[k] = side[k]
+                own[along] = near[along]
                 own[across] = jnp.zeros_like(side[k]) + (1 if edge % 2 else -1) * size[across]
                 new = jnp.stack(own)
                 first = (excess[k] >= excess[a]) & (excess[k] >= excess[b])

@@ -292,7 +292,8 @@ def between_rings(
         "end".
     """
     place, ring = mine
-    link, before, after = theirs.place, *theirs.frames
+    link = theirs.place
+    before, after = theirs.frames
     first = theirs.tip if theirs.first is None else theirs.first
     start = finger_collision.above(link.origin, before, link.frame, first)
     behind = finger_collision.above(theirs.origin, link.frame, after, theirs.tip)

@@ -1,22 +1,35 @@
-"""What speaks against a scene and designs before anything is simulated, and what to know of them.
+"""Before anything is simulated: which worlds may start, and warnings of scenes and designs.
 
-The scene's own checks look at one number at a time; these look at what a design makes of them.
+`invalid_start` judges the worlds of a batch as a part of its program; `notes` and `refusals` judge
+named designs by the same depths and say in words what is wrong.  The scene's own checks look at one
+number at a time; these look at the world that a design makes of them.
 """
 
+import dataclasses
+import itertools
 import math
 import operator
 from collections.abc import Mapping
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import model, rollout, start
-from codesign_jax.model import morphology
+from codesign_jax import model
+from codesign_jax.engines.structured import assembly
+from codesign_jax.engines.structured.coordinates import reset
+from codesign_jax.engines.structured.laws.kinematics import Kinematics, straight
+from codesign_jax.engines.structured.world_model import (
+    WorldModel,
+    apply_columns,
+    world_constants,
+)
+from codesign_jax.model import ModelFields, layout, morphology
 from codesign_jax.scene import Scene, key_frames
 from codesign_jax.scene.parameters import DesignSpace, params_of
-from codesign_jax.scene.schema import InputError
-from codesign_jax.types import Params
+from codesign_jax.scene.schema import InputError, nearest
+from codesign_jax.types import Params, Status, Trial
 
 SHAKE_STEPS = 20
 """Fewest time steps in a period of the shaking: the sampled sine then misses 1.2 % of its peak."""
@@ -27,6 +40,111 @@ ROLL = 0.5e-3
 """How far it sinks besides [m]: a lying cylinder that is drawn with edges rolls onto a facet."""
 SINK = 1e-3
 """Depth at rest [m] above which a contact is called soft: the paper's objects are 60 mm wide."""
+
+
+def nominal_trial(scene: Scene, shape: int | str = 0) -> Trial:
+    """Returns a trial without noise for an object of the set, by index or name.
+
+    Raises:
+      InputError: If the set has no such object.
+    """
+    names = [s.name for s in scene.objects.object]
+    if shape not in names and shape not in range(len(names)):
+        hint = nearest(str(shape), names)
+        raise InputError([f"object {shape!r} unknown in {scene.objects.name}; {hint}"])
+    index = names.index(shape) if isinstance(shape, str) else shape
+    zero = jnp.zeros(())
+    none = jnp.zeros(2)
+    one = jnp.ones(())
+    return Trial(jnp.int32(index), none, zero, none, one, one, one, one, one, none)
+
+
+def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
+    """Returns INVALID_START for worlds that cannot start, shape (world,) int32, else 0.
+
+    A world is refused if a field is not finite, a moving body has no mass or inertia, a spring or
+    damper is negative (walls that leave no chamber, a negative length), or if at the start any two
+    bodies that may touch overlap by more than the scene's limit of penetration: soft contacts would
+    drive them apart with energy that no actuator gave.
+    """
+    fields = jax.lax.stop_gradient(fields)  # a verdict has no derivative
+    scene = scene.structure
+    deep = jnp.maximum(depth(scene, fields), depth_between(scene, fields))
+    deep = jnp.maximum(deep, depth_in_palm(scene, fields))
+    bad = ~(deep <= fields.constants.limits.penetration)
+    # Constants in their ranges have a finite sum, for which XLA writes one loop; as rows of an
+    # array they would be one loop each.
+    bad |= ~jnp.isfinite(sum(jax.tree.leaves(fields.constants)))
+    others = jax.tree.leaves(fields._replace(constants=()))
+    bad |= ~jnp.isfinite(_rows(*others)).all(1)
+    moving = layout(scene).bodies.ravel()
+    bad |= ~(_rows(fields.body_mass[:, moving], fields.body_inertia[:, moving]) > 0).all(1)
+    bad |= ~(_rows(fields.jnt_stiffness, fields.dof_damping, fields.dof_armature) >= 0).all(1)
+    return jnp.where(bad, int(Status.INVALID_START), 0).astype(jnp.int32)
+
+
+def _rows(*arrays: jax.Array) -> jax.Array:
+    """All numbers of each world, of arrays with leading axis (world,), shape (world, number)."""
+    return jnp.concatenate([x.reshape(x.shape[0], -1) for x in arrays], 1)
+
+
+@partial(jax.jit, static_argnums=0)
+def depth(scene: Scene, fields: ModelFields) -> jax.Array:
+    """Deepest overlap of a finger, the palm or the object with another of them or the table [m].
+
+    The structured engine's contacts serve every engine: same spheres, shapes and pairs.  Fingers
+    are straight; how deep they stand in one another says `depth_between`.
+    """
+    alone = dataclasses.replace(scene.effects, finger_finger=False)
+    hand, kin, position = _straight(scene, fields)
+    scene = dataclasses.replace(scene, effects=alone)
+    every = assembly.contacts(scene, hand, kin, position)
+    found = [(-c.distance).reshape(-1, c.distance.shape[-1]).max(0) for c in every.values()]
+    if not found:
+        return jnp.zeros(fields.body_mass.shape[0], fields.body_mass.dtype)
+    return jnp.stack(found).max(0)
+
+
+@partial(jax.jit, static_argnums=0)
+def depth_between(scene: Scene, fields: ModelFields) -> jax.Array:
+    """Deepest overlap of two straight fingers that may touch [m], shape (world,).
+
+    As spheres around the links' middles, as high as the section: the vertices of two hulls in one
+    and the same place would not stand inside one another.
+    """
+    worlds = fields.start.shape[0]
+    count = scene.num_fingers
+    if not scene.effects.finger_finger or count == 1:
+        return jnp.full((worlds,), -jnp.inf, fields.start.dtype)
+    hand, kin, _ = _straight(scene, fields)
+    up = hand.centre[2]
+    middle = kin.origin + apply_columns(kin.link, hand.centre)
+    deepest = []
+    for a, b in itertools.combinations(range(count), 2):
+        away = middle[:, :, None, a] - middle[:, None, :, b]
+        reach = up[:, None, a] + up[None, :, b]
+        deepest.append((reach - jnp.sqrt((away**2).sum(0))).reshape(-1, worlds).max(0))
+    return jnp.stack(deepest).max(0)
+
+
+@partial(jax.jit, static_argnums=0)
+def depth_in_palm(scene: Scene, fields: ModelFields) -> jax.Array:
+    """Deepest overlap of a straight finger with the palm's disc [m], shape (world,).
+
+    By the rings or spheres that touch it in a simulation, of those that may.
+    """
+    if not scene.effects.finger_palm:
+        return jnp.full((fields.start.shape[0],), -jnp.inf, fields.start.dtype)
+    hand, kin, _ = _straight(scene, fields)
+    return assembly.depth_in_palm(scene, hand, kin)
+
+
+@partial(jax.jit, static_argnums=0)
+def _straight(scene: Scene, fields: ModelFields) -> tuple[WorldModel, Kinematics, jax.Array]:
+    """Worlds with straight fingers, and the place of the object's centre, (3, 1, world)."""
+    state = reset(scene, fields)
+    hand = world_constants(scene, fields)
+    return hand, straight(hand, state), state.position
 
 
 def notes(scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray]) -> list[str]:
@@ -168,12 +286,12 @@ def _overlaps(scene: Scene, designs: Params, names: list[str]) -> list[str]:
 
 @jax.jit
 def _depths(scene: Scene, designs: Params) -> tuple[jax.Array, ...]:
-    """What `start.invalid_start` judges by, each of shape (object, design); one program for all."""
+    """What `invalid_start` judges by, each of shape (object, design); one program for all."""
 
     def of_shape(index: jax.Array) -> tuple[jax.Array, ...]:
-        trial = rollout.nominal_trial(scene)._replace(shape=index)
+        trial = nominal_trial(scene)._replace(shape=index)
         fields = jax.vmap(lambda p: model.model_fields(scene, p, trial))(designs)
-        tests = start.depth, start.depth_between, start.depth_in_palm
+        tests = depth, depth_between, depth_in_palm
         return tuple(test(scene.structure, fields) for test in tests)
 
     return jax.lax.map(of_shape, jnp.arange(len(scene.objects.object)))

@@ -27,9 +27,9 @@ from codesign_jax import axes, control, model, reuse
 from codesign_jax.cost import outcome, shown
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording
+from codesign_jax.preflight import invalid_start
 from codesign_jax.scene import Scene, reach, schema, unit_slips
 from codesign_jax.scene.constants import batch_axes
-from codesign_jax.start import invalid_start
 from codesign_jax.types import Outcome, Params, Status, Trace, Trial, failed
 from codesign_jax.verdict import as_bit
 
@@ -136,23 +136,6 @@ def _draw(
 
     numbers = jnp.asarray(first) + jnp.arange(num_trials)
     return jax.vmap(draw, in_axes=(0, batch_axes(noises)))(numbers, noises)
-
-
-def nominal_trial(scene: Scene, shape: int | str = 0) -> Trial:
-    """Returns a trial without noise for an object of the set, by index or name.
-
-    Raises:
-      InputError: If the set has no such object.
-    """
-    names = [s.name for s in scene.objects.object]
-    if shape not in names and shape not in range(len(names)):
-        hint = schema.nearest(str(shape), names)
-        raise schema.InputError([f"object {shape!r} unknown in {scene.objects.name}; {hint}"])
-    index = names.index(shape) if isinstance(shape, str) else shape
-    zero = jnp.zeros(())
-    none = jnp.zeros(2)
-    one = jnp.ones(())
-    return Trial(jnp.int32(index), none, zero, none, one, one, one, one, one, none)
 
 
 def simulate(

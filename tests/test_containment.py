@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from codesign_jax import cli, model, preflight, rollout, runs, scene, start
+from codesign_jax import cli, model, preflight, rollout, runs, scene
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.types import Status
 from tests.helpers.grasps import (
@@ -75,7 +75,7 @@ def test_bad_starts_are_flagged_and_in_the_outcome():
     worlds = [base._replace(**{k: 0 * base.length + v for k, v in c.items()}) for c in changes]
     trials = stack(*[still()] * len(worlds))
     fields, _ = batch_inputs(the_scene, stack(*worlds), trials)
-    found = jax.jit(partial(start.invalid_start, the_scene))(fields)
+    found = jax.jit(partial(preflight.invalid_start, the_scene))(fields)
     bad = [False, True, True, True, True, True]
     np.testing.assert_array_equal(np.asarray(found) != 0, bad)
     engine = MujocoEngine(the_scene)
@@ -171,7 +171,7 @@ def deepest(compiled, data, geoms, others):
 
 
 def test_fingers_and_palm_are_as_deep_in_one_another_as_mujocos_geoms():
-    """By `start`, of hands with a sphere a link and a finger that is mounted into the palm."""
+    """By `preflight`, of hands with a sphere a link and a finger that is mounted into the palm."""
     effects = {"finger_finger": True, "finger_palm": True}
     sizes = {"links": 3, "spheres_per_link": 1}
     changes = {"effects": effects, "discretization": sizes, "limits": {"penetration": 0.002}}
@@ -184,7 +184,7 @@ def test_fingers_and_palm_are_as_deep_in_one_another_as_mujocos_geoms():
     @jax.jit
     def of_engines(designs):
         fields = jax.vmap(lambda p: model.model_fields(the_scene, p, still()))(designs)
-        tests = start.depth_between, start.depth_in_palm, start.invalid_start
+        tests = preflight.depth_between, preflight.depth_in_palm, preflight.invalid_start
         return fields.start, *(test(the_scene, fields) for test in tests)
 
     with jax.enable_x64(True):
@@ -233,7 +233,7 @@ def test_straight_fingers_rest_beside_the_palm():
     def depths(numbers, designs):
         fields = jax.vmap(lambda p: model.model_fields(numbers, p, still()))(designs)
         scenes = the_scene.structure, fields
-        return start.depth_in_palm(*scenes), start.invalid_start(*scenes)
+        return preflight.depth_in_palm(*scenes), preflight.invalid_start(*scenes)
 
     with jax.enable_x64(True):
         rest, into = (jax.tree.map(np.asarray, depths(s, designs)) for s in (the_scene, mounted))

@@ -15,7 +15,7 @@ from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.model.layout import friction_ratio
-from codesign_jax.start import invalid_start
+from codesign_jax.preflight import invalid_start
 from codesign_jax.types import Status
 from tests.helpers import grasps, oracles
 

@@ -21,9 +21,9 @@ types provenance compiler optimize
 scene
 axes model control verdict
 engines cost
-start policy
+preflight policy
 rollout
-own preflight measurements
+own measurements
 codesign env finger sampling
 batch
 runs

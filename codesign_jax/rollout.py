@@ -28,6 +28,7 @@ from codesign_jax.cost import outcome, shown
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording
 from codesign_jax.preflight import invalid_start
+from codesign_jax.preflight import nominal_trial as nominal_trial
 from codesign_jax.scene import Scene, reach, schema, unit_slips
 from codesign_jax.scene.constants import batch_axes
 from codesign_jax.types import Outcome, Params, Status, Trace, Trial, failed

@@ -197,6 +197,7 @@ def told(capsys, *arguments):
     return rates, [int(n) for n in counts], [float(v) for v in share], searched, output
 
 
+@pytest.mark.slow  # 14 s
 def test_its_counts_are_those_of_the_grasps_simulated_again(capsys):
     """At both accuracies: the design's first trials, simulated apart; the interval by SciPy."""
     rates, counts, share, searched, _ = told(capsys, "--design", "length=44")

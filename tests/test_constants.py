@@ -123,6 +123,7 @@ def test_changing_any_number_compiles_nothing(monkeypatch):
     assert len(compiled) == 2 and len(set(compiled)) == 1
 
 
+@pytest.mark.slow  # 7 s
 def test_derivatives_equal_differences():
     """Of every number that the engine reads, with respect to all constants, along a line."""
     the_scene = short(effects__friction="full", effects__neo_hookean=True)

@@ -170,6 +170,7 @@ def deepest(compiled, data, geoms, others):
     return -min(mujoco.mj_geomDistance(compiled, data, a, b, 1.0, None) for a, b in pairs)
 
 
+@pytest.mark.slow  # 7 s
 def test_fingers_and_palm_are_as_deep_in_one_another_as_mujocos_geoms():
     """By `preflight`, of hands with a sphere a link and a finger that is mounted into the palm."""
     effects = {"finger_finger": True, "finger_palm": True}
@@ -215,6 +216,7 @@ def test_fingers_and_palm_are_as_deep_in_one_another_as_mujocos_geoms():
     assert {line.split(":")[0] for line in found} == {str(i) for i in np.flatnonzero(deep)}
 
 
+@pytest.mark.slow  # 9 s
 def test_straight_fingers_rest_beside_the_palm():
     """Of any length, by the rings that press; a finger that is mounted into the palm is refused.
 

@@ -111,6 +111,7 @@ def test_what_records_no_forces_is_refused():
         jax.eval_shape(jax.grad(end), jnp.zeros(()))
 
 
+@pytest.mark.slow  # 14 s; quick: forces are what the momentum gains
 @pytest.mark.parametrize("text", ["down", "1,1,0"])
 def test_a_pull_takes_the_object_as_mujocos_external_force_does(text):
     """Stepped by MuJoCo alone, with `xfrc_applied`; by engines that share no step; and too much."""

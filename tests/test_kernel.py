@@ -156,6 +156,7 @@ def test_in_float32_an_object_moves_as_in_float64_under_a_far_hand(grasp, steppe
     assert errors.max() < 1e-3 and touching.min() > 0
 
 
+@pytest.mark.slow  # 6 s
 def test_neighbours_in_a_block_change_no_bit(grasp):
     """A world's numbers are the same whatever worlds share its vector."""
     scene, fields, ctrl = grasp

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from codesign_jax import scene as scenes
 from codesign_jax.compiler import launch
@@ -83,6 +84,7 @@ def test_one_finger_is_one_team():
     assert (pinch.fingers, pinch.block, pinch.columns, pinch.size) == (2, 1, 2, 16)
 
 
+@pytest.mark.slow  # 19 s
 def test_a_step_reads_nothing_that_it_has_not_written(monkeypatch):
     """Scratch memory that is no number when a step begins makes no number of it.
 

@@ -84,6 +84,7 @@ def optimizer(request):
     return make_optimizer(request.param, SPACE)
 
 
+@pytest.mark.slow  # 12 s; quick: populations are evosax's
 def test_each_finds_the_minimum_better_than_random_search():
     found = {}
     for name in NAMES:

@@ -138,6 +138,7 @@ def here(tmp_path, monkeypatch):
     sys.modules.pop("mine", None)
 
 
+@pytest.mark.slow  # 16 s; quick: test_resume
 def test_a_run_of_ones_own_code_goes_on_bit_for_bit(here, capsys):
     for episodes, folder in (("2", "whole"), ("1", "grown"), ("2", "grown")):
         assert cli.main([*OWN, "--episodes", episodes, "--out", folder]) == 0
@@ -188,6 +189,7 @@ def test_changed_code_is_refused_with_what_changed(here, capsys):
     assert snapshot(here / "run") == before
 
 
+@pytest.mark.slow  # 29 s; quick: test_docs runs optimize --policy
 def test_a_policy_is_searched_and_said_wherever_it_acts(here, capsys):
     """Its parameter is one of the design's; no command simulates its designs without it."""
     run = [*RUN, "--policy", "mine:Pull", "--optimizer", "random", "--episodes", "1"]

@@ -366,6 +366,7 @@ def pressing(scene, model, data):
     return found
 
 
+@pytest.mark.slow  # 35 s; quick: the same worlds' accelerations
 @pytest.mark.parametrize("surface", SURFACES)
 def test_recorded_forces_are_the_oracle_s(surface):
     """How fingers press on one another, on themselves and on the palm, in the two steps."""

@@ -162,6 +162,7 @@ def test_the_derivative_of_a_closed_loop_is_that_of_differences():
     np.testing.assert_allclose(slope, (one - two) / 100.0, rtol=1e-4)
 
 
+@pytest.mark.slow  # 7 s
 def test_pressures_stay_within_what_the_walls_stand_and_what_is_no_number_fails_its_world(worlds):
     """And is told where it is, if nothing is traced."""
     params, trials = worlds[0]

@@ -258,6 +258,7 @@ def checked(wrong=False):
     return SimpleNamespace(names=names, difference=difference, **found)
 
 
+@pytest.mark.slow  # 46 s; quick: test_engines differentiates this kernel
 def test_derivatives_by_every_group_equal_central_differences():
     """Hull, contact between fingers, palm, wrist, softening: everything that a scene may have."""
     c = checked()

@@ -300,6 +300,7 @@ def _reference(name, body, field, place):
     return dense_skin.on_field(body, field, PER_AREA, **window, along=250, around=400)
 
 
+@pytest.mark.slow  # 9 s
 def test_hands_grasp_whose_fingers_are_no_power_of_two():
     """Lanes that pad three fingers to four hold no finger: what they calculate is a number too."""
     names = "disturb ungrasp twist lateral_bending palm_object palm_table finger_table finger_palm"

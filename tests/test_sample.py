@@ -43,6 +43,7 @@ def run(*more, designs=10, trials=2, out="a.parquet", chunk=8):
     return cli.main([*COMMAND, *map(str, sizes), *more])
 
 
+@pytest.mark.slow  # 10 s
 def test_robust_draws_what_the_paper_keeps():
     """Factors with the spread that `objects.ROBUST` names; without it those of the paper are 1."""
     sizes = {"designs": 200, "chunk": 400}

@@ -149,6 +149,7 @@ def test_places_that_cannot_be_written_are_said_before_a_simulation(
     assert simulated == [] and [p.name for p in workplace.iterdir()] == ["file"]
 
 
+@pytest.mark.slow  # 10 s; quick: test_docs runs landscape
 def test_landscape_has_every_point(run, monkeypatch, capsys):
     """Cut into calls, it is what one evaluation of all designs says; files and report agree."""
     monkeypatch.setitem(batch.WORLDS, "cpu", 10)  # five designs; the last call is filled up

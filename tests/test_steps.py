@@ -171,6 +171,7 @@ def test_the_kernel_balances_rings_and_edges(tmp_path, shape):
 # --- fixtures: boxes, cylinders and planes that fingers, palm and object touch, against MuJoCo C --
 
 
+@pytest.mark.slow  # 9 s
 def test_an_object_rests_on_a_shelf_or_tips_over_its_edge(tmp_path):
     """Boxes of 60 mm with faces 20 and 35 mm beyond the edge, as in MuJoCo C after a second."""
     pairs = ("table", "finger_object", "finger_table", "palm_object", "palm_table", "twist")

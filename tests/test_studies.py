@@ -178,6 +178,7 @@ def test_a_ring_down_is_read_from_its_peaks():
     assert np.isnan(reality.Ring.of(time, 1 - np.exp(-time / 0.1)).decrement)
 
 
+@pytest.mark.slow  # 19 s
 def test_winners_of_a_search_are_judged_at_other_masses(tmp_path):
     """What they keep at a mass is what MuJoCo C says of them in the same trials."""
     sizes = "--preset 2d --optimizers screened-es:particles=6,trials=2,tests=2 --seeds 3 --tests 5"

@@ -200,6 +200,7 @@ def desk(tmp_path_factory):
     return Desk(cli.Studio(first=run, out=folder / "saved"))
 
 
+@pytest.mark.slow  # 15 s; the same in a browser: make test-browser
 def test_a_tab_shows_judges_improves_and_saves(desk, capsys, monkeypatch):
     """The verdict is that of `codesign evaluate`; a design of the run is the one in its record."""
     tab = Tab(desk)

@@ -37,7 +37,7 @@ FAULTS = {
     ),
     "time step x 10": Fault(
         "model/spec.py",
-        (("o.gravity = scene.disc", "o.gravity = 10 * scene.disc"),),
+        (("o.timestep = scene.disc", "o.timestep = 10 * scene.disc"),),
         "tests/test_beam_oracles.py::test_free_fall",
     ),
     "NaN guard": Fault(

@@ -20,8 +20,8 @@ from codesign_jax import rollout
 from codesign_jax.codesign import EpisodeInfo, Task, asked, episode_trials, told
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import block_lanes, staged
-from codesign_jax.optimize import Optimizer, State
-from codesign_jax.reuse import Program, shared
+from codesign_jax.optimize import Optimizer, OptimizerState
+from codesign_jax.reuse import SceneProgram, shared
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, Trial
@@ -36,7 +36,7 @@ LIMIT = 16_384
 class Request(NamedTuple):
     """An episode that a run wants."""
 
-    state: State  # the optimiser's state before it
+    state: OptimizerState  # the optimiser's state before it
     mask: Any  # parameters that may move, bool, shape (parameter,)
 
 
@@ -94,11 +94,13 @@ class Batch:
             "after", parts.after.compile, (request.state, _light(packed)), (request.mask, out)
         )
 
-    def __call__(self, requests: Sequence[Request]) -> list[tuple[State, EpisodeInfo]]:
+    def __call__(self, requests: Sequence[Request]) -> list[tuple[OptimizerState, EpisodeInfo]]:
         """Runs an episode for each request; states and reports in their order."""
         return self.begin(requests)()
 
-    def begin(self, requests: Sequence[Request]) -> Callable[[], list[tuple[State, EpisodeInfo]]]:
+    def begin(
+        self, requests: Sequence[Request]
+    ) -> Callable[[], list[tuple[OptimizerState, EpisodeInfo]]]:
         """Lets the devices begin an episode for each request; returns what goes on and answers.
 
         That takes about as long as the simulation, although it only tells the devices what to do:
@@ -109,7 +111,7 @@ class Batch:
         groups = [[requests[i] for i in group] for group in places]
         first = [self._launched(group) for group in groups[:1]]
 
-        def finish() -> list[tuple[State, EpisodeInfo]]:
+        def finish() -> list[tuple[OptimizerState, EpisodeInfo]]:
             found = []
             for group in groups:
                 # A group begins when the one before it has been judged and its arrays have left
@@ -148,7 +150,7 @@ class Batch:
             worlds = -(-joined * self._worlds(request) // len(self.devices))
             engine, space, trials, options = task.how
             made = _stages(engine, space, block_lanes(engine, worlds), trials, options)
-            ours = {n: Program(task.scene, getattr(made, n), self._optimizer) for n in _OURS}
+            ours = {n: SceneProgram(task.scene, getattr(made, n), self._optimizer) for n in _OURS}
             self._parts = made._replace(**ours)
         return self._parts
 
@@ -165,7 +167,7 @@ class Batch:
 
     def _judged(
         self, requests: Sequence[Request], launched: _Launched
-    ) -> list[tuple[State, EpisodeInfo]]:
+    ) -> list[tuple[OptimizerState, EpisodeInfo]]:
         assert self._parts is not None
         packed, drawn, running = launched
         home = tuple(jax.device_put(out, self.devices[0]) for out in running)
@@ -237,10 +239,10 @@ def _stages(
     """Draws an episode's trials; moves particles and prepares worlds; simulates them; judges."""
     stages = staged(engine, lanes, trajectory=options.to_end)
 
-    def draw(state: State, mask: Any, scene: Scene, optimizer: Optimizer) -> Trial:
+    def draw(state: OptimizerState, mask: Any, scene: Scene, optimizer: Optimizer) -> Trial:
         return episode_trials(scene, state.key, state.episode, num_trials)
 
-    def before(state: State, mask: Any, scene: Scene, optimizer: Optimizer) -> _Packed:
+    def before(state: OptimizerState, mask: Any, scene: Scene, optimizer: Optimizer) -> _Packed:
         population, worlds = asked(space, num_trials, state, mask, scene, optimizer)
         fields, ctrl, initial = rollout.prepare(*worlds, engine)
         trials = worlds[2]
@@ -248,11 +250,11 @@ def _stages(
         return _Packed(population, trials, initial, *blocks, None if options.cost is None else ctrl)
 
     def after(
-        begun: tuple[State, _Packed],
+        begun: tuple[OptimizerState, _Packed],
         found: tuple[Any, tuple],
         scene: Scene,
         optimizer: Optimizer,
-    ) -> tuple[State, EpisodeInfo]:
+    ) -> tuple[OptimizerState, EpisodeInfo]:
         state, packed = begun
         mask, out = found
         trace = stages.unpack(out, len(packed.population) * num_trials)

@@ -123,7 +123,7 @@ class World(NamedTuple):
     """Worlds between two periods, every array with a leading axis (world,).
 
     Attributes:
-      state: Their states, see `model.State`, shape (world, n).
+      state: Their states, see `model.RolloutState`, shape (world, n).
       pressure: Pressures in the chambers [Pa], shape (world, finger).
     """
 

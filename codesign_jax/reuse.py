@@ -32,7 +32,7 @@ from codesign_jax import files  # NumPy and JAX are imported where they are used
 ROOT = Path(__file__).parent
 UNRELATED = ("commands", "export", "optimize", "report", "runs", "studio")
 """Folders that no simulation depends on: they import engines, never the other way."""
-_UNTRACED = ("compiler", "files", "reuse", "store")
+_UNTRACED = ("compiler", "files", "reuse", "array_files")
 """What is not traced: to replace a name there is to change the machinery and no physics."""
 
 # The code that runs.  An editor or `git checkout` may change files after the import, so their state
@@ -343,7 +343,7 @@ def shared(build: Callable[..., Any]) -> Callable[..., Any]:
     return find
 
 
-class Program:
+class SceneProgram:
     """A jitted function of two arguments that gets a scene, or another one, as its third.
 
     `jax.jit`, `jax.vmap` and so on work on it as on a function.

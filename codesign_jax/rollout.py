@@ -29,7 +29,7 @@ from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording
 from codesign_jax.preflight import invalid_start
 from codesign_jax.preflight import nominal_trial as nominal_trial
-from codesign_jax.scene import Scene, reach, schema, unit_slips
+from codesign_jax.scene import Scene, mesh_margins, schema, unit_slips
 from codesign_jax.scene.constants import batch_axes
 from codesign_jax.types import Outcome, Params, Status, Trace, Trial, failed
 from codesign_jax.verdict import as_bit
@@ -255,7 +255,7 @@ def _check(scene: Scene, engine: Engine, params: Params, trials: Trial) -> None:
     axes.refuse_numbers(scene.checked(), len(trials.yaw), "world")
     unit_slips.refuse(params)
     for height in [params.height] if params.tip is None else [params.height, params.tip.height]:
-        reach.refuse(scene.objects, height / 2)
+        mesh_margins.refuse(scene.objects, height / 2)
 
 
 def _traced(

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 
 from codesign_jax import axes, rollout
 from codesign_jax.engines import Engine
-from codesign_jax.reuse import Program, shared
+from codesign_jax.reuse import SceneProgram, shared
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, Trial
@@ -99,7 +99,7 @@ def make_simulate(
       engine: Engine that simulates.
       space: Space of the designs.
     """
-    return Program(scene, _simulation(engine, space, rollout.Options()))
+    return SceneProgram(scene, _simulation(engine, space, rollout.Options()))
 
 
 @shared

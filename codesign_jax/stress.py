@@ -18,8 +18,8 @@ from codesign_jax.engines.mujoco import world_model
 from codesign_jax.model import morphology, overlap
 from codesign_jax.model.layout import touches_itself
 from codesign_jax.model.overlap import Overlaps
-from codesign_jax.reuse import Program, shared
-from codesign_jax.runs.choice import Case
+from codesign_jax.reuse import SceneProgram, shared
+from codesign_jax.runs.cases import Case
 from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.scene import Scene, silicones
 from codesign_jax.scene.parameters import DesignSpace
@@ -122,7 +122,7 @@ def simulate(
     scene = case.scene
     design = jnp.asarray(case.design, jnp.float32)
 
-    def simulated(run: Program, *constants: Scene) -> tuple[Outcome, jax.Array, Trial]:
+    def simulated(run: SceneProgram, *constants: Scene) -> tuple[Outcome, jax.Array, Trial]:
         result = interruptible(run, design, key, *constants)
         done(trials)
         return result
@@ -181,8 +181,8 @@ def _changed(table: Any, path: tuple[str, ...], change: Callable[[float], float]
     return dataclasses.replace(table, **{path[0]: new})
 
 
-def _program(scene: Scene, case: Case, trials: int) -> Program:
-    return Program(scene, _recorded(case.make_engine(scene), case.space, trials))
+def _program(scene: Scene, case: Case, trials: int) -> SceneProgram:
+    return SceneProgram(scene, _recorded(case.make_engine(scene), case.space, trials))
 
 
 @shared

@@ -223,7 +223,7 @@ class Trace(NamedTuple):
         ended at the limit of iterations, CONTACT_OVERFLOW), shape (time,) int32, or None if it does
         not tell.
       last: The state at the end, in which a decided world stays, shape (n,), or None: positions,
-        velocities, and what else a rollout that goes on from there needs, see `model.State`.
+        velocities, and what else a rollout that goes on from there needs, see `model.RolloutState`.
       residual: Residual of the step taken from each state, see `Outcome`, 0 of one that converged,
         shape (time,), or None if the engine does not tell.
       ctrl: Controls that a policy gave, shape (time, nu); None of those that were known beforehand.

@@ -28,7 +28,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from codesign_jax import codesign, parameters, scene, use_compilation_cache
-from codesign_jax.optimize import Space, State, reflect, schedule
+from codesign_jax.optimize import OptimizerState, Space, reflect, schedule
 from codesign_jax.optimize.protocol import episode_key, summarize
 
 use_compilation_cache()
@@ -84,7 +84,7 @@ class CrossEntropy:
         """All particles at the seed, a quarter of the range as first spread."""
         seed = jnp.asarray(seed_particle, float)
         memory = {"mean": seed, "spread": 0.25 * self._range()}
-        return State(jnp.tile(seed, (num_particles, 1)), jnp.int32(0), key, memory)
+        return OptimizerState(jnp.tile(seed, (num_particles, 1)), jnp.int32(0), key, memory)
 
     def ask(self, state, mask):
         """Draws; parameters that the mask closes keep the particles' values."""
@@ -99,7 +99,7 @@ class CrossEntropy:
         best = population[order[: max(2, round(self.share * len(cost)))]]
         spread = jnp.maximum(best.std(0), self.floor * self._range())
         memory = {"mean": best.mean(0), "spread": spread}
-        new = State(population[order], state.episode + 1, state.key, memory)
+        new = OptimizerState(population[order], state.episode + 1, state.key, memory)
         return new, summarize(cost, jnp.ones_like(cost), order)
 
 

@@ -31,7 +31,7 @@ from codesign_jax import codesign, rollout, scene
 from codesign_jax.batch import LIMIT
 from codesign_jax.codesign import stream_key
 from codesign_jax.engines import Engine, make_engine
-from codesign_jax.optimize import ParticleFilter, State, candidates, schedule
+from codesign_jax.optimize import OptimizerState, ParticleFilter, candidates, schedule
 from codesign_jax.scene import InputError, Scene, keypaths, parameters
 from codesign_jax.scene import constants as checks
 from codesign_jax.scene.beams import strain_pressure
@@ -362,9 +362,9 @@ def on_landscapes(space: DesignSpace, shapes: int = 3) -> Callable[..., Any]:
     def run(landscape, key, mask, shared):
         drawn = candidates(key, optimizer.space, np.arange(CANDIDATES))
         poor = costs(landscape, drawn, key, SCREEN, shared, TRIALS) > codesign.SEED_COST
-        start = State(jnp.tile(drawn[jnp.argmax(poor)], (PARTICLES, 1)), jnp.int32(0), key)
+        start = OptimizerState(jnp.tile(drawn[jnp.argmax(poor)], (PARTICLES, 1)), jnp.int32(0), key)
 
-        def episode(state: State, mask: jax.Array) -> tuple[State, jax.Array]:
+        def episode(state: OptimizerState, mask: jax.Array) -> tuple[OptimizerState, jax.Array]:
             moved = optimizer.ask(state, mask)
             cost = costs(landscape, moved, key, state.episode, shared, TRIALS)
             new, info = optimizer.tell(state, moved, cost)

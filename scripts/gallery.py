@@ -26,7 +26,7 @@ from codesign_jax.commands.flags import Evaluate
 from codesign_jax.report import animation
 from codesign_jax.report.replay import Camera
 from codesign_jax.report.verdicts import Judged
-from codesign_jax.runs import choice
+from codesign_jax.runs import cases
 
 RUNS = Path("runs") / "gallery"
 DOCS = Path("docs")
@@ -82,13 +82,13 @@ def find(hand: Hand) -> None:
     folder = RUNS / hand.name
     words = [*shlex.split(hand.command)[1:], "--reference-trials", "0"]
     cli.main([*words, "--out", str(folder)])
-    case = choice.case_of_run(folder)
+    case = cases.case_of_run(folder)
     preset = runs.read_run(folder)[1].preset
     text = common.design_text(case.space, common.DesignFile(preset, {}, **hand.names), case.design)
     hand.design.write_text(text, encoding="utf-8")
 
 
-def judge(hand: Hand, case: choice.Case) -> None:
+def judge(hand: Hand, case: cases.Case) -> None:
     """Writes the verdict as the first line of the design's file, if it is not there."""
     text = hand.design.read_text(encoding="utf-8")
     if not text.startswith("# keeps"):
@@ -96,7 +96,7 @@ def judge(hand: Hand, case: choice.Case) -> None:
         hand.design.write_text(f"# {judged}\n{text}", encoding="utf-8")
 
 
-def draw(hand: Hand, case: choice.Case) -> None:
+def draw(hand: Hand, case: cases.Case) -> None:
     """Simulates a grasp of each object without noise, and writes them as a film."""
     scene = case.scene
     params = case.space.params(jnp.asarray(case.design, jnp.float32))

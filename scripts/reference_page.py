@@ -15,7 +15,7 @@ import docstring_parser
 from codesign_jax import codesign, cost
 from codesign_jax import types as data
 from codesign_jax.export import tables as exported
-from codesign_jax.model import State
+from codesign_jax.model import RolloutState
 from codesign_jax.model.layout import AXES, WRIST, joint_axes, layout
 from codesign_jax.optimize import ParticleFilter
 from codesign_jax.scene import (
@@ -309,7 +309,7 @@ def _named() -> str:
         "Named tuples of `codesign_jax.types` and `codesign_jax.model`, shapes without the leading "
         "axes of a batch.",
     ]
-    for kind in (data.Params, data.Trial, data.Trace, data.Forces, State, data.Outcome):
+    for kind in (data.Params, data.Trial, data.Trace, data.Forces, RolloutState, data.Outcome):
         rows = [(f"`{name}`", text) for name, text in attributes(kind).items()]
         parts.append(
             f"### `{kind.__name__}`\n\n{_text(kind)}\n\n{_table(('field', 'meaning'), rows)}"

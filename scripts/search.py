@@ -33,8 +33,8 @@ from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.commands.common import changes
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine, make_engine
-from codesign_jax.optimize import NAMES, Optimizer, State
-from codesign_jax.reuse import Program
+from codesign_jax.optimize import NAMES, Optimizer, OptimizerState
+from codesign_jax.reuse import SceneProgram
 from codesign_jax.runs.progress import duration
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
@@ -132,7 +132,7 @@ class Study:
         objects = len(scene.objects.object)
         self.rounds = -(-case.tests // objects) * objects
         self.batch = min(chunk, seeds * case.worlds)
-        self.simulate = Program(scene, jax.jit(self._simulate))
+        self.simulate = SceneProgram(scene, jax.jit(self._simulate))
         self.ask = jax.jit(jax.vmap(lambda state: case.optimizer.ask(state, self.mask)))
         self.tell = jax.jit(
             jax.vmap(lambda state, x, c: case.optimizer.tell(state, x, c, self.mask)[0])
@@ -202,7 +202,7 @@ class Study:
             "kept": [np.round(self.kept[e], 4).tolist() for e in found],
         }
 
-    def _start(self) -> State:
+    def _start(self) -> OptimizerState:
         space = self.case.optimizer.space
         first = np.arange(self.case.particles)
         drawn = jax.jit(jax.vmap(lambda key: optimize.candidates(key, space, first)))(self.keys)
@@ -277,7 +277,7 @@ class Study:
         state = self.state._replace(key=jax.vmap(jax.random.key_data)(self.state.key))
         return jax.tree.leaves(state)
 
-    def _restore(self) -> tuple[State, Any]:
+    def _restore(self) -> tuple[OptimizerState, Any]:
         """What a file holds of the study; the arrays' order is that of a state."""
         n = self.case.particles
         zeros = jnp.zeros(self.mask.shape)

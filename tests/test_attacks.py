@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import rich.table
 
-from codesign_jax import files, runs, store, terminal
+from codesign_jax import array_files, files, runs, terminal
 from codesign_jax.commands import check, hosts, reference, status
 from codesign_jax.compiler.ffi import KernelUnavailable
 from codesign_jax.export import sheet
@@ -166,8 +166,8 @@ def test_texts_of_a_run_are_one_line_each_where_it_goes_on(run):
 
 def test_texts_of_results_are_one_line_each_and_no_html_on_a_sheet(tmp_path):
     kept = {"warnings": np.array([HOSTILE, "<script>"]), "empty": np.array([], str)}
-    store.save(tmp_path / "x.npz", kept)
-    found = store.load(tmp_path / "x.npz")
+    array_files.save(tmp_path / "x.npz", kept)
+    found = array_files.load(tmp_path / "x.npz")
     assert found["warnings"].tolist() == [SHOWN, "<script>"] and found["empty"].shape == (0,)
     rows = [(HOSTILE, "<img src=x>", "![a](http://b)")]
     section = sheet.SheetSection("t", ("a", "b", "c"), rows, [HOSTILE])
@@ -235,7 +235,7 @@ def test_results_that_are_not_shown_are_told(run, monkeypatch):
 
     def write(fresh, conditions):
         for place, about, arrays in zip(places, abouts, (fresh, conditions), strict=True):
-            store.keep(place, about, arrays)
+            array_files.save_results(place, about, arrays)
 
     write(outcomes(), stress())
     found = reference.kept(run, scene, settings)

@@ -7,7 +7,7 @@ import threading
 import numpy as np
 import pytest
 
-from codesign_jax import store
+from codesign_jax import array_files
 from codesign_jax.runs.checkpoint import Checkpoints, digest
 from scripts import faults
 
@@ -115,14 +115,14 @@ def damaged(content, count):
 def test_any_damage_of_arrays_is_one_error(tmp_path):
     path = tmp_path / "x.npz"
     arrays = {"a": np.arange(50.0), "name": np.array("text")}
-    store.save(path, arrays)
+    array_files.save(path, arrays)
     content = path.read_bytes()
     refused = 0
     for place, other in damaged(content, 150):
         path.write_bytes(other)
         try:
-            found = store.load(path)
-        except store.StoreError:
+            found = array_files.load(path)
+        except array_files.ArrayFileError:
             refused += 1
         else:  # a byte of a date, say
             assert found.keys() == arrays.keys(), place
@@ -131,27 +131,33 @@ def test_any_damage_of_arrays_is_one_error(tmp_path):
     assert refused > 100
     for other in (b"", b"PK", b"nothing", np.zeros(3).tobytes()):
         path.write_bytes(other)
-        with pytest.raises(store.StoreError, match="x.npz is damaged"):
-            store.load(path)
+        with pytest.raises(array_files.ArrayFileError, match="x.npz is damaged"):
+            array_files.load(path)
 
 
 def test_results_are_those_of_one_case_and_one_code(tmp_path, monkeypatch):
     path = tmp_path / "x.npz"
-    assert store.found(path, "a") == (None, "")
-    store.keep(path, {"seed": 1}, {"k": np.array(3)})
-    assert store.found(path, {"seed": 1}) == ({"k": 3}, "")
-    assert store.found(path, "b") == (None, "is of another design or other settings")
+    assert array_files.load_results(path, "a") == (None, "")
+    array_files.save_results(path, {"seed": 1}, {"k": np.array(3)})
+    assert array_files.load_results(path, {"seed": 1}) == ({"k": 3}, "")
+    assert array_files.load_results(path, "b") == (None, "is of another design or other settings")
     for owner, name, value in (
-        (store, "SCHEMA", 0),
-        (store.reuse, "code_digest", lambda: "other"),
-        (store.reuse, "code_digest", lambda: None),  # code that is not known is nobody's
+        (array_files, "SCHEMA", 0),
+        (array_files.reuse, "code_digest", lambda: "other"),
+        (array_files.reuse, "code_digest", lambda: None),  # code that is not known is nobody's
     ):
         with monkeypatch.context() as patch:
             patch.setattr(owner, name, value)
-            assert store.found(path, {"seed": 1}) == (None, "is of another version of the code")
+            assert array_files.load_results(path, {"seed": 1}) == (
+                None,
+                "is of another version of the code",
+            )
     with monkeypatch.context() as patch:  # not even its own
-        patch.setattr(store.reuse, "code_digest", lambda: None)
-        store.keep(path, "a", {"k": np.array(3)})
-        assert store.found(path, "a")[0] is None
+        patch.setattr(array_files.reuse, "code_digest", lambda: None)
+        array_files.save_results(path, "a", {"k": np.array(3)})
+        assert array_files.load_results(path, "a")[0] is None
     path.write_bytes(path.read_bytes()[:-1])
-    assert store.found(path, "a") == (None, "is damaged, or of another version of the code")
+    assert array_files.load_results(path, "a") == (
+        None,
+        "is damaged, or of another version of the code",
+    )

@@ -13,7 +13,7 @@ import pytest
 
 from codesign_jax import cli
 from codesign_jax.commands import status
-from codesign_jax.runs import choice
+from codesign_jax.runs import cases
 from codesign_jax.scene import library
 from tests.helpers.command_runs import EPISODES, RUN, command, finished_run, own_workplace  # noqa: F401
 from tests.helpers.toy_engine import TINY
@@ -130,7 +130,7 @@ def test_ctrl_c_is_one_line_and_ends_the_process(monkeypatch, capsys, request):
         going.wait(30)
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(choice.Case, "simulate", simulate)
+    monkeypatch.setattr(cases.Case, "simulate", simulate)
     monkeypatch.setattr(status, "leave", left.append)
     arguments = ["evaluate", "--scene", str(TINY), "--engine", "mujoco", "--trials", "1"]
     monkeypatch.setattr(sys, "argv", ["codesign", *arguments])

@@ -31,7 +31,7 @@ from codesign_jax.engines import make_engine
 from codesign_jax.model import overlap
 from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
-from codesign_jax.runs import choice, columns
+from codesign_jax.runs import cases, columns
 from codesign_jax.scene import beams, parameters, silicones
 from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import command, copied, finished_run, own_workplace  # noqa: F401
@@ -137,7 +137,7 @@ def test_where_a_policy_leaves_the_key_frames():
     ctrl[4, 2, 7] = 1e-3  # rounding
     found = trials_of(np.zeros(5), np.zeros(5))
     found.lost_time[3] = 6 * h
-    left = choice.departure(tiny, found, ctrl, planned)
+    left = cases.departure(tiny, found, ctrl, planned)
     np.testing.assert_allclose(left.time, [np.inf, 3 * h, 5 * h, np.inf, np.inf])
     np.testing.assert_allclose(left.lower, [0, -2e4, 0, 0, 0])
     np.testing.assert_allclose(left.place, [0, 0, 0.003, 0, 0])
@@ -145,7 +145,7 @@ def test_where_a_policy_leaves_the_key_frames():
     said = str(jax.tree.map(np.asarray, left))
     assert said.startswith("left the key frames in 2 of 5 grasps, first after 0.08 s (median); ")
     assert said.endswith("pressures by -20 to +1e-06 kPa, the arm by up to 3 mm and 5.73°")
-    none = choice.departure(tiny, found, planned, planned)
+    none = cases.departure(tiny, found, planned, planned)
     assert str(none) == "commanded nothing but the key frames in 5 grasps"
 
 

@@ -44,7 +44,7 @@ from codesign_jax.export import (
 from codesign_jax.export.play import play
 from codesign_jax.export.process import Process, Section, Size
 from codesign_jax.model import build_spec
-from codesign_jax.runs import choice
+from codesign_jax.runs import cases
 from codesign_jax.scene import hand, parameters, silicones
 from codesign_jax.types import Outcome
 from tests.helpers.command_runs import command
@@ -521,7 +521,7 @@ FREE = ["--tolerance", "free"]
 def by_toy(toy, tmp_path, monkeypatch):
     """The toy engine simulates; rates are those that were measured elsewhere."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(choice, "make_engine", lambda name, the_scene: toy)
+    monkeypatch.setattr(cases, "make_engine", lambda name, the_scene: toy)
 
 
 def test_command_writes_the_sheet(tmp_path, capsys, by_toy):

@@ -16,14 +16,14 @@ ROOT = Path(__file__).parents[1]
 LAYERS = """
 files sizes statistics terminal
 reuse
-store
+array_files
 types provenance compiler optimize
 scene
 axes model control verdict
 engines cost
 preflight policy
 rollout
-own measurements
+user_code measurements
 codesign env finger sampling
 batch
 runs

@@ -14,11 +14,11 @@ import pytest
 from PIL import Image
 from scipy import stats
 
-from codesign_jax import cli, model, rollout, runs, scene, store
+from codesign_jax import array_files, cli, model, rollout, runs, scene
 from codesign_jax.commands import reference
 from codesign_jax.engines import make_engine
 from codesign_jax.report import animation, bodies, verdicts, viewer
-from codesign_jax.runs import choice
+from codesign_jax.runs import cases
 from codesign_jax.scene import parameters
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome, Status, failed
@@ -126,7 +126,7 @@ def test_report_shows_the_best_tested_particle_with_its_interval(run, text):
     rows = list(csv.DictReader((run / "tests.csv").read_text().splitlines()))
     best = min(rows, key=lambda row: float(row["test_cost"]))  # the first of equal ones
     the_scene, _ = runs.read_run(run)
-    chosen = choice.choose(the_scene, choice.read_record(run))
+    chosen = cases.choose(the_scene, cases.read_record(run))
     kept = int(((chosen.outcomes.cost < 0.01) & ~failed(chosen.outcomes.status)).sum())
     low, high = stats.binomtest(kept, int(best["trials"])).proportion_ci(0.95, method="wilson")
     share = f"({100 * low:.0f} to {100 * high:.0f} %): not good"
@@ -152,22 +152,20 @@ def test_report_is_one_small_file_that_names_its_origin(run, text):
 def test_grasp_is_the_one_of_the_table(run):
     """Noise, design and verdict of a row of trials.csv come back from its three numbers."""
     the_scene, _ = runs.read_run(run)
-    record = choice.read_record(run)
+    record = cases.read_record(run)
     trials = csv.DictReader((run / "trials.csv").read_text().splitlines())
     rows = {tuple(int(r[n]) for n in ("episode", "particle", "trial")): r for r in trials}
     for place in ((1, 2, 0), (2, 0, 1)):
         episode, particle, trial = place
-        found = choice.find_grasp(
-            the_scene, record, episode=episode, particle=particle, trial=trial
-        )
+        found = cases.find_grasp(the_scene, record, episode=episode, particle=particle, trial=trial)
         assert found.place == place
         assert float(rows[place]["cost"]) == pytest.approx(float(found.outcome.cost), rel=1e-6)
     # The best one is the chosen particle's ancestor.
-    best = choice.find_grasp(the_scene, record)
-    chosen = choice.choose(the_scene, record)
+    best = cases.find_grasp(the_scene, record)
+    chosen = cases.choose(the_scene, record)
     np.testing.assert_array_equal(best.design, chosen.design)
     with pytest.raises(InputError) as error:
-        choice.find_grasp(the_scene, record, episode=4, trial=3)
+        cases.find_grasp(the_scene, record, episode=4, trial=3)
     assert len(error.value.problems) == 2 and "--episode = 4 is outside [1, 3]" in str(error.value)
 
 
@@ -198,9 +196,11 @@ def test_fresh_trials_at_reference_are_in_the_report(run, tmp_path, capsys):
     lost = np.where(cost == 2.0, 5.0, np.inf)
     found = Outcome(cost, status, lost, np.full(trials, -1))
     for design, words in (("own", True), ("other", False)):
-        case = choice.case_of_run(copy, accuracy="reference")
+        case = cases.case_of_run(copy, accuracy="reference")
         tested = case if design == "own" else case._replace(design=case.design + 1)
-        store.keep(copy / reference.FILE, tested.digest(settings.seed), found._asdict())
+        array_files.save_results(
+            copy / reference.FILE, tested.digest(settings.seed), found._asdict()
+        )
         page = tmp_path / f"{design}.html"
         assert cli.main(["report", str(copy), "--no-replay", "--out", str(page)]) == 0
         low, high = stats.binomtest(3, 5).proportion_ci(0.95, method="wilson")

@@ -15,12 +15,12 @@ import jax
 import numpy as np
 import pytest
 
-from codesign_jax import codesign, runs, scene, store
+from codesign_jax import array_files, codesign, runs, scene
 from codesign_jax.batch import Batch, Request, take
 from codesign_jax.commands import reference
 from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.runs.cases import Case
 from codesign_jax.runs.checkpoint import Checkpoints, digest
-from codesign_jax.runs.choice import Case
 from codesign_jax.scene import parameters
 from tests.helpers.command_runs import (  # noqa: F401
     EPISODES,
@@ -163,7 +163,7 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
     assert len(rows) == 6
     # Of another version of the code they are shown as such, and not gone on from.
     with monkeypatch.context() as patch:
-        patch.setattr(store.reuse, "code_digest", lambda: "another")
+        patch.setattr(array_files.reuse, "code_digest", lambda: "another")
         found, why = reference.stored(folder, settings)
         assert found.cost.size == 5 and why == "is of another version of the code"
         capsys.readouterr()

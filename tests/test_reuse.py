@@ -173,7 +173,7 @@ def test_a_kernel_is_refused_before_the_limit(monkeypatch):
 
 def test_a_forked_process_says_that_it_would_wait_for_ever(monkeypatch):
     """Only of a process that had simulated; its own first call is then an error at once."""
-    program = reuse.Program(grasps.pinch("sphere", 2), lambda *_: 3)
+    program = reuse.SceneProgram(grasps.pinch("sphere", 2), lambda *_: 3)
     monkeypatch.setattr(reuse, "process", {"begun": False, "forked": False})
     assert program(0, 0) == 3 and reuse.process["begun"]
     with warnings.catch_warnings():

@@ -13,7 +13,7 @@ import pytest
 
 from codesign_jax import runs
 from codesign_jax.batch import Batch
-from codesign_jax.runs import choice, manifest, tables
+from codesign_jax.runs import cases, manifest, tables
 from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.scene.schema import InputError
 from scripts import faults
@@ -208,13 +208,13 @@ def test_an_earlier_run_is_read_and_reported(archive, name, done, asked, tmp_pat
     """Its arrays are the numbers of the tables that were written beside them."""
     folder = unpacked(archive, tmp_path) / name
     scene, settings = runs.read_run(folder)
-    record = choice.read_record(folder)
+    record = cases.read_record(folder)
     assert (record.done, settings.episodes) == (done, asked)
     assert (record.test is not None) == (done == asked)
     trials = csv.DictReader((folder / "trials.csv").read_text().splitlines())
     costs = np.array([float(row["cost"]) for row in trials], np.float32)
     np.testing.assert_array_equal(np.ravel(record.history.outcomes.cost[:done]), costs)
-    assert choice.choose(scene, record).design.dtype == np.float32
+    assert cases.choose(scene, record).design.dtype == np.float32
     assert command("report", folder, "--no-replay") == 0
     assert f"{done} of {asked} episodes" in (folder / "report.html").read_text()
 

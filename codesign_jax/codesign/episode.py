@@ -15,8 +15,8 @@ from codesign_jax import axes, engines, rollout
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording
-from codesign_jax.optimize import Info, Optimizer, ParticleFilter, State
-from codesign_jax.reuse import Program, shared
+from codesign_jax.optimize import Info, Optimizer, OptimizerState, ParticleFilter
+from codesign_jax.reuse import SceneProgram, shared
 from codesign_jax.scene import InputError, Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, Params, Trial
@@ -34,8 +34,8 @@ class EpisodeInfo(NamedTuple):
       population: Particles as simulated [SI units], shape (particle, parameter).
       outcomes: Cost, status, time of loss and first bad step, each of shape (particle, trial).
       selection: Particle costs, and weights and ancestors of a resampling; see `optimize.Info`.
-      last: States at which the worlds ended, failed ones frozen at their last good one, see
-        `model.State`, shape (particle, trial, n), or None if the engine does not report them.
+      last: Final states of the worlds, shape (particle, trial, n), see `model.RolloutState`; a
+        failed world keeps its last valid state. None if the engine does not report states.
       drawn: The trials themselves, leading axis (trial,), of episodes that `batch.Batch` ran.
     """
 
@@ -128,15 +128,17 @@ class Task:
         """
         self.space.refuse_population(population)
         self.space.check(population)
-        return Program(self.scene, self._programs.evaluate)(jnp.asarray(population), key, scene)
+        return SceneProgram(self.scene, self._programs.evaluate)(
+            jnp.asarray(population), key, scene
+        )
 
     def episode(
         self,
         optimizer: Optimizer,
-        state: State,
+        state: OptimizerState,
         mask: jax.typing.ArrayLike | None = None,
         scene: Scene | None = None,
-    ) -> tuple[State, "EpisodeInfo"]:
+    ) -> tuple[OptimizerState, "EpisodeInfo"]:
         """Runs one episode: moves the particles, simulates, and tells the optimiser their costs.
 
         The noise of trial t derives from (root key, stream, episode, t), so that it depends neither
@@ -155,16 +157,16 @@ class Task:
     def run(
         self,
         optimizer: Optimizer,
-        state: State,
+        state: OptimizerState,
         masks: jax.typing.ArrayLike,
         scene: Scene | None = None,
-    ) -> tuple[State, "EpisodeInfo"]:
+    ) -> tuple[OptimizerState, "EpisodeInfo"]:
         """Runs a whole optimisation as one program, a `jax.lax.scan` over the episodes.
 
         It is a loop in Python over `episode` without a way to stop in between.  XLA rounds the
         model fields of the two programs, and of batches of other sizes, differently in the last
-        bit.  `jax.vmap` over the state runs many seeds in one batch, see `optimize.State`, and over
-        a scene's numbers many worlds' physics.
+        bit.  `jax.vmap` over the state runs many seeds in one batch, see
+        `optimize.OptimizerState`, and over a scene's numbers many worlds' physics.
 
         Args:
           optimizer: As of `episode`.
@@ -180,17 +182,17 @@ class Task:
     def _programs(self) -> "_Programs":
         return _programs(*self.how)
 
-    def _joined(self, program: Callable, optimizer: Optimizer) -> Program:
+    def _joined(self, program: Callable, optimizer: Optimizer) -> SceneProgram:
         """A program with its optimiser, which warns where that does not see costs of one's own."""
         weighs = self.cost is not None and isinstance(optimizer, ParticleFilter)
-        return (_Weighing if weighs else Program)(self.scene, program, optimizer)
+        return (_Weighing if weighs else SceneProgram)(self.scene, program, optimizer)
 
 
-class _Weighing(Program):
+class _Weighing(SceneProgram):
     """A program whose costs of one's own a particle filter weighs: negative ones count as 0."""
 
     def __call__(self, first: Any, second: Any, scene: Scene | None = None) -> Any:
-        """As of `Program`; a warning if a particle's cost is negative, but for traced ones."""
+        """As of `SceneProgram`; a warning if a particle's cost is negative, but for traced ones."""
         found = super().__call__(first, second, scene)
         costs = found[1].selection.cost
         if not isinstance(costs, jax.core.Tracer) and (np.asarray(costs) < 0).any():
@@ -206,7 +208,7 @@ class _Weighing(Program):
 def asked(
     space: DesignSpace,
     num_trials: int,
-    state: State,
+    state: OptimizerState,
     mask: jax.typing.ArrayLike,
     scene: Scene,
     optimizer: Optimizer,
@@ -219,13 +221,13 @@ def asked(
 
 def told(
     num_trials: int,
-    state: State,
+    state: OptimizerState,
     mask: jax.typing.ArrayLike,
     scene: Scene,
     optimizer: Optimizer,
     population: jax.Array,
     found: tuple[Outcome, jax.Array | None],
-) -> tuple[State, EpisodeInfo]:
+) -> tuple[OptimizerState, EpisodeInfo]:
     """The last part of an episode: costs of the worlds' outcomes and states at the end."""
     outcomes, last = rollout.grid(found, (len(population), num_trials))
     costs = particle_cost(scene, outcomes)
@@ -253,8 +255,8 @@ def _programs(
 
     @jax.jit  # is traced once for itself and for `run`
     def episode(
-        state: State, mask: jax.typing.ArrayLike, scene: Scene, optimizer: Optimizer
-    ) -> tuple[State, EpisodeInfo]:
+        state: OptimizerState, mask: jax.typing.ArrayLike, scene: Scene, optimizer: Optimizer
+    ) -> tuple[OptimizerState, EpisodeInfo]:
         _refuse_mask(space, mask)
         space.refuse_population(state.particles)
         own = state, mask, scene, optimizer
@@ -263,9 +265,9 @@ def _programs(
         return told(num_trials, *own, population, (outcomes, trace.last))
 
     def run(
-        state: State, masks: jax.typing.ArrayLike, scene: Scene, optimizer: Optimizer
-    ) -> tuple[State, EpisodeInfo]:
-        def one(state: State, mask: jax.Array) -> tuple[State, EpisodeInfo]:
+        state: OptimizerState, masks: jax.typing.ArrayLike, scene: Scene, optimizer: Optimizer
+    ) -> tuple[OptimizerState, EpisodeInfo]:
+        def one(state: OptimizerState, mask: jax.Array) -> tuple[OptimizerState, EpisodeInfo]:
             return episode(state, mask, scene, optimizer)
 
         return jax.lax.scan(one, state, jnp.asarray(masks))
@@ -288,7 +290,9 @@ def episode_trials(
     return rollout.sample_trials(scene, stream_key(key, STREAM_TRIAL, episode), num_trials)
 
 
-def closed(optimizer: Optimizer, population: jax.Array, key: jax.Array) -> tuple[State, np.ndarray]:
+def closed(
+    optimizer: Optimizer, population: jax.Array, key: jax.Array
+) -> tuple[OptimizerState, np.ndarray]:
     """State and mask of an episode that moves nothing: it simulates a population as it is.
 
     Args:

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 
-from codesign_jax import optimize, own
+from codesign_jax import optimize, user_code
 from codesign_jax.optimize import Optimizer, ParticleFilter, Space
 from codesign_jax.scene.parameters import DesignSpace
 
@@ -42,8 +42,8 @@ def make_optimizer(name: str, space: DesignSpace, *, num_particles: int | None =
     Raises:
       ValueError: If there is no such optimiser, or your own is not as `optimize.Optimizer` says.
     """
-    if own.is_own(name):
-        return own.make_optimizer(name, _box(space), num_particles)
+    if user_code.is_user_code(name):
+        return user_code.make_optimizer(name, _box(space), num_particles)
     return optimize.make_optimizer(name, _box(space))
 
 

@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import optimize, own, preflight, runs, sampling, verdict
+from codesign_jax import optimize, preflight, runs, sampling, user_code, verdict
 from codesign_jax.commands import common, reference
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Check
 from codesign_jax.engines import Engine
-from codesign_jax.runs import Settings, choice
-from codesign_jax.runs.choice import Case
+from codesign_jax.runs import Settings, cases
+from codesign_jax.runs.cases import Case
 from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.progress import Busy, duration
 from codesign_jax.scene import Scene, with_accuracy
@@ -141,7 +141,7 @@ def _settings(options: Check, case: Case) -> Settings:
 
 def _without_own_code(settings: Settings) -> Settings:
     """Settings of as many grasps that import nothing: a run's are a stranger's, maybe."""
-    optimizer = optimize.PAPER if own.is_own(settings.optimizer) else settings.optimizer
+    optimizer = optimize.PAPER if user_code.is_user_code(settings.optimizer) else settings.optimizer
     replaced = {"optimizer": optimizer, "cost": runs.SCENE_COST, "policy": ""}
     return dataclasses.replace(settings, **replaced)
 
@@ -171,7 +171,7 @@ def _timed(run: Run, designs: jax.Array, trials: Trial) -> tuple[Outcome, float]
 def _sample(options: Check, case: Case, run: Run, count: int) -> tuple[jax.Array, str]:
     """Designs of shape (count, parameter), repeated where there are fewer, and what they are."""
     if options.run_folder:
-        particles = choice.read_record(options.run_folder).state.particles
+        particles = cases.read_record(options.run_folder).state.particles
         found = np.unique(np.asarray(particles), axis=0)
         words = f"the {common.counted(len(found), 'final particle')} of {options.run_folder} "
         words += "that differ"

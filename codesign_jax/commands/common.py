@@ -19,16 +19,16 @@ from codesign_jax import engines, policy, rollout, terminal
 from codesign_jax import scene as scenes
 from codesign_jax.commands.flags import SceneFlags, Subject, TrialFlags
 from codesign_jax.engines import Engine
-from codesign_jax.own import make_policy
 from codesign_jax.reuse import use_compilation_cache as use_compilation_cache
-from codesign_jax.runs import choice, tables
-from codesign_jax.runs.choice import Case
+from codesign_jax.runs import cases, tables
+from codesign_jax.runs.cases import Case
 from codesign_jax.runs.reading import Tell
 from codesign_jax.scene import Scene, keypaths, library, objects, schema, texts
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.scene.schema import InputError
 from codesign_jax.terminal import Console
 from codesign_jax.types import Params
+from codesign_jax.user_code import make_policy
 
 MOST = 1000
 """Most runs of one command: a guard against a slip such as 0-99999."""
@@ -99,8 +99,8 @@ def find_case(options: Subject, *, tell: Tell = warn) -> Case:
             [f"--run brings design, hand and scene of its own; leave out {' and '.join(given)}"]
         )
     how = {"objects": options.objects, "accuracy": options.accuracy, "engine": options.engine}
-    case = choice.case_of_run(options.run_folder, overrides=changes(options), tell=tell, **how)
-    choice.refuse_other_policy(case.policy, options.policy)
+    case = cases.case_of_run(options.run_folder, overrides=changes(options), tell=tell, **how)
+    cases.refuse_other_policy(case.policy, options.policy)
     return case
 
 

@@ -21,7 +21,7 @@ from codesign_jax.commands.flags import Compare
 from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import RunResult, Settings, columns, manifest, tables
-from codesign_jax.runs.choice import Case
+from codesign_jax.runs.cases import Case
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import InputError

@@ -13,8 +13,8 @@ from codesign_jax.commands.flags import Evaluate
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording
 from codesign_jax.report import verdicts
-from codesign_jax.runs import choice, tables
-from codesign_jax.runs.choice import Case
+from codesign_jax.runs import cases, tables
+from codesign_jax.runs.cases import Case
 from codesign_jax.runs.progress import Busy, Meter
 from codesign_jax.scene.schema import InputError
 from codesign_jax.stress import Stress
@@ -72,7 +72,7 @@ def _of_particle(case: Case, options: Evaluate) -> Case:
         return case
     if options.run_folder is None:
         raise InputError(["--particle is one of a run: give its folder, or leave it out"])
-    record = choice.read_record(options.run_folder)
+    record = cases.read_record(options.run_folder)
     particles = np.asarray(record.state.particles)
     common.refuse(common.number_problems(("--particle", options.particle, 0, len(particles) - 1)))
     return case._replace(design=particles[options.particle])

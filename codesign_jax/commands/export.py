@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import engines, files, preflight, provenance, rollout, runs
-from codesign_jax.commands import common, drift, reference
+from codesign_jax.commands import common, reference, tolerance_study
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Export
 from codesign_jax.export import grasps, plain, process, sheet, tables, valves
 from codesign_jax.export.process import Process, Size
-from codesign_jax.runs.choice import Case
+from codesign_jax.runs.cases import Case
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.objects import Shape
 from codesign_jax.scene.schema import InputError
@@ -126,7 +126,7 @@ def write_files(
     valves.write(folder, case.scene, params)
     printed = None if options.no_parts else _parts(case, params, sizes, folder, options, console)
     if not options.no_sheet:
-        found = drift.simulate(case, engine, options, console) if engine else None
+        found = tolerance_study.simulate(case, engine, options, console) if engine else None
         with Busy(console, "writing the build sheet"):
             lacking = _sheet(case, params, sizes, (found, printed), folder, options)
         if lacking:
@@ -152,7 +152,7 @@ def _tell(case: Case, options: Export, console: Console) -> None:
     if not options.no_sheet:
         console.print(f"  {sheet.NAME}.md, {sheet.NAME}.pdf: build sheet and its drawings")
         if options.tolerance == "off":
-            most = drift.study(case, options).most * options.tolerance_trials
+            most = tolerance_study.study(case, options).most * options.tolerance_trials
             console.print(
                 "  the sheet has no tolerances: --tolerance free --overwrite simulates them, at "
                 f"most {most:,} grasps"

@@ -103,7 +103,7 @@ class RunOrDesign(Subject):
 
 
 @dataclasses.dataclass
-class Shown(Subject):
+class GraspFlags(Subject):
     """Which one grasp to show."""
 
     object: Text = None
@@ -334,7 +334,7 @@ class Landscape(Command, RunOrDesign):
 
 
 @dataclasses.dataclass
-class Render(Command, Shown, RunOrDesign):
+class Render(Command, GraspFlags, RunOrDesign):
     """Draw one grasp of a design or of a run: a film (.gif, .mp4) or a strip of pictures (.png)."""
 
     out: Path = Path("grasp.gif")
@@ -411,7 +411,7 @@ class Scenes(Command):
 
 
 @dataclasses.dataclass
-class Replay(Command, Shown, RunOrDesign):
+class Replay(Command, GraspFlags, RunOrDesign):
     """Show one grasp in 3D in a browser, or say how a failed world of a run failed.
 
     A page of its own that works offline: the best grasp of a run, any row of its trials.csv, or a

@@ -111,7 +111,7 @@ def pull(
     lay = model.layout(scene)
     joints = lay.dofs.size
     three = np.arange(3)
-    linear = 19 + 2 * joints + three  # the object's velocity in a state, see `model.State`
+    linear = 19 + 2 * joints + three  # the object's velocity in a state, see `model.RolloutState`
 
     def place(state: jax.Array) -> jax.Array:  # of the object, from the palm's
         return state[:, 6 + joints + three] - state[:, three]

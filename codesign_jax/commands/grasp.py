@@ -10,10 +10,10 @@ import numpy as np
 from codesign_jax import rollout, runs
 from codesign_jax.commands import common
 from codesign_jax.commands.common import find_case
-from codesign_jax.commands.flags import Shown
+from codesign_jax.commands.flags import GraspFlags
 from codesign_jax.engines.base import recording, tells_forces
-from codesign_jax.runs import choice
-from codesign_jax.runs.choice import Case
+from codesign_jax.runs import cases
+from codesign_jax.runs.cases import Case
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Trial
 
@@ -30,7 +30,7 @@ class Asked(NamedTuple):
     recorded: str | None  # how it ended in its run, in words; None if it is of no run
 
 
-def find(options: Shown) -> Asked:
+def find(options: GraspFlags) -> Asked:
     """The grasp that the flags name; simulates nothing."""
     places = {"--episode": options.episode, "--particle": options.particle}
     places |= {"--trial": options.trial}
@@ -46,19 +46,19 @@ def find(options: Shown) -> Asked:
     return _of_run(case, options, options.run_folder)
 
 
-def _of_run(case: Case, options: Shown, folder: Path) -> Asked:
+def _of_run(case: Case, options: GraspFlags, folder: Path) -> Asked:
     if options.objects is not None and options.object is None:
         raise InputError(["--objects replaces the run's: --object must say which one to grasp"])
     place = {"episode": options.episode, "particle": options.particle, "trial": options.trial}
-    record = choice.read_record(folder, tell=lambda text: None)  # `find_case` has said it
-    found = choice.find_grasp(runs.read_run(folder)[0], record, **place)
+    record = cases.read_record(folder, tell=lambda text: None)  # `find_case` has said it
+    found = cases.find_grasp(runs.read_run(folder)[0], record, **place)
     case = case._replace(design=found.design)
     if options.object is not None:
         return _nominal(case, options.object)
     name = case.scene.objects.object[int(found.trial.shape)].name
     episode, particle, trial = found.place
     text = f"episode {episode}, particle {particle}, trial {trial}: object {name}"
-    return Asked(case, found.trial, text, choice.ending(found.outcome))
+    return Asked(case, found.trial, text, cases.ending(found.outcome))
 
 
 def _nominal(case: Case, shape: int | str) -> Asked:
@@ -82,7 +82,7 @@ def simulate(asked: Asked, *, forces: bool = False) -> "Replay":
 
 def description(asked: Asked, shown: "Replay") -> list[str]:
     """Lines that say which grasp it is and how it ended."""
-    again = choice.ending(shown.outcome)
+    again = cases.ending(shown.outcome)
     ending = f"in the run: {asked.recorded}; here: {again}" if asked.recorded else again
     design = runs.describe(asked.case.space, asked.case.design)
     lines = [design, f"{asked.text}; {ending}"]

@@ -9,7 +9,7 @@ import numpy as np
 
 from codesign_jax.commands import common
 from codesign_jax.commands.flags import Landscape as Options
-from codesign_jax.runs.choice import Case
+from codesign_jax.runs.cases import Case
 from codesign_jax.scene import Scene, schema
 from codesign_jax.scene.schema import InputError
 

@@ -18,8 +18,8 @@ from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
 from codesign_jax.report import landscape
 from codesign_jax.report.landscape import Landscape
-from codesign_jax.reuse import Program, shared
-from codesign_jax.runs.choice import Case
+from codesign_jax.reuse import SceneProgram, shared
+from codesign_jax.runs.cases import Case
 from codesign_jax.runs.progress import Meter
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
@@ -122,7 +122,7 @@ def _in_scenes(
     key, count = noise
     base, tree = jax.tree.flatten(case.scene)
     varied = (numbers != numbers[0]).any(0)
-    run = Program(case.scene, _worlds(case.make_engine(), case.space, count))
+    run = SceneProgram(case.scene, _worlds(case.make_engine(), case.space, count))
 
     def scene_of(rows: np.ndarray | int) -> Scene:
         own = [numbers[rows, k] if varied[k] else value for k, value in enumerate(base)]

@@ -16,7 +16,6 @@ import numpy as np
 from codesign_jax import codesign, engines, files, optimize, preflight, runs, stress, verdict
 from codesign_jax.commands import common, compare, hosts, reference, status
 from codesign_jax.commands.flags import Optimize
-from codesign_jax.own import is_own, make_policy
 from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import Plan, RunResult, Settings, columns
@@ -26,6 +25,7 @@ from codesign_jax.scene import Scene, schema
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.scene.schema import InputError
 from codesign_jax.terminal import Console, say
+from codesign_jax.user_code import is_user_code, make_policy
 
 ALTERNATE = "alternate"
 DOMAINS = ("morphology", "control")
@@ -314,7 +314,7 @@ def _of_the_runs(options: Optimize, scene: Scene) -> tuple[str | None, int | Non
     folders = runs_of(options, scene, usual)
     if optimizer is None:
         found = runs.setting_of(folders, "optimizer")
-        optimizer = None if found is None or is_own(found) else found
+        optimizer = None if found is None or is_user_code(found) else found
     episodes = options.episodes
     return optimizer, runs.setting_of(folders, "episodes") if episodes is None else episodes
 

@@ -15,10 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import codesign, engines, rollout, store, stress, verdict
+from codesign_jax import array_files, codesign, engines, rollout, stress, verdict
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import Settings, columns, tables
-from codesign_jax.runs.choice import Case, case_of_run
+from codesign_jax.runs.cases import Case, case_of_run
 from codesign_jax.runs.progress import Meter
 from codesign_jax.scene import Scene, with_accuracy
 from codesign_jax.stress import Stress
@@ -68,7 +68,7 @@ def test(
     with Meter("reference test", min(verdict.USUAL, most), console, later=later) as meter:
 
         def keep(found: Outcome) -> None:
-            store.keep(folder / FILE, about, found._asdict())
+            array_files.save_results(folder / FILE, about, found._asdict())
 
         found = decided(case, key, most, meter, kept, keep)
     if kept is None or found.cost.size > kept.cost.size:
@@ -112,7 +112,7 @@ def decided(
 
 
 def _outcomes(folder: Path, about: str, *, any_code: bool = False) -> tuple[Outcome | None, str]:
-    arrays, why = store.found(folder / FILE, about, any_code=any_code)
+    arrays, why = array_files.load_results(folder / FILE, about, any_code=any_code)
     if arrays is None:
         return None, why
     shapes = {v.shape if v.dtype.kind in "biuf" else () for v in arrays.values()}
@@ -170,7 +170,7 @@ def stress_run(
         with Meter("other conditions", total, console, later=later) as meter:
             noise = _noise(settings, stress.STREAM)
             found = stress.simulate(case, STRESS_TRIALS, noise, done=meter.advance)
-        store.keep(folder / STRESS_FILE, about, found._asdict())
+        array_files.save_results(folder / STRESS_FILE, about, found._asdict())
     return case, found
 
 
@@ -180,7 +180,7 @@ def stored_stress(folder: Path, settings: Settings) -> tuple[Stress | None, str]
 
 
 def _stress(folder: Path, about: str, *, any_code: bool = False) -> tuple[Stress | None, str]:
-    arrays, why = store.found(folder / STRESS_FILE, about, any_code=any_code)
+    arrays, why = array_files.load_results(folder / STRESS_FILE, about, any_code=any_code)
     if arrays is None:
         return None, why
     try:

@@ -11,7 +11,7 @@ from codesign_jax import rollout, runs
 from codesign_jax.commands import common, grasp
 from codesign_jax.commands.flags import Replay
 from codesign_jax.runs import failures, manifest
-from codesign_jax.runs.choice import Case, refuse_other_policy
+from codesign_jax.runs.cases import Case, refuse_other_policy
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.terminal import Console, say

@@ -7,8 +7,8 @@ from codesign_jax.commands import common, grasp, reference
 from codesign_jax.commands.flags import Report
 from codesign_jax.report import page
 from codesign_jax.report.of_run import Run
-from codesign_jax.runs import Settings, choice
-from codesign_jax.runs.choice import Case
+from codesign_jax.runs import Settings, cases
+from codesign_jax.runs.cases import Case
 from codesign_jax.runs.manifest import read_provenance
 from codesign_jax.runs.progress import Busy
 from codesign_jax.runs.record import Record
@@ -24,15 +24,15 @@ def main(options: Report) -> int:
     common.use_compilation_cache()
     scene, settings = runs.read_run(options.folder)
     if not options.no_replay:
-        choice.refuse_other_policy(settings.policy, options.policy)
+        cases.refuse_other_policy(settings.policy, options.policy)
     name = options.engine or settings.engine
     common.refuse(common.engine_problems(name))
     path = options.out or options.folder / "report.html"
     common.refuse(common.place_problems("--out", path))
     notes: list[str] = []
-    record = choice.read_record(options.folder, tell=notes.append)
-    chosen = choice.choose(scene, record)
-    notes += [text for text in [choice.doubt(chosen)] if text]
+    record = cases.read_record(options.folder, tell=notes.append)
+    chosen = cases.choose(scene, record)
+    notes += [text for text in [cases.doubt(chosen)] if text]
     kept = reference.kept(options.folder, scene, settings)
     notes += kept.notes
     for note in notes:
@@ -60,9 +60,9 @@ def main(options: Report) -> int:
 
 def best_grasp(
     scene: Scene, settings: Settings, record: Record, engine: str, console: Console
-) -> "tuple[choice.Grasp, animation.Replay]":
+) -> "tuple[cases.Grasp, animation.Replay]":
     """The best grasp of the chosen design, simulated again to see how it moves."""
-    planned = choice.find_grasp(scene, record)
+    planned = cases.find_grasp(scene, record)
     space = design_space(scene.hand, settings.preset)
     case = Case(scene, space, planned.design, engine, settings.policy)
     with Busy(console, "simulating the best grasp again"):

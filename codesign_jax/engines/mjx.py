@@ -16,7 +16,7 @@ from codesign_jax import verdict
 from codesign_jax.engines.base import Equal, refuse_meshes
 from codesign_jax.model import (
     ModelFields,
-    State,
+    RolloutState,
     compile_template,
     layout,
     softening_moments,
@@ -94,7 +94,7 @@ class MjxEngine(Equal):
         build again what JAX has traced of a step.
         """
 
-        def body(carry: State, u: jax.Array) -> tuple[State, Trace]:
+        def body(carry: RolloutState, u: jax.Array) -> tuple[RolloutState, Trace]:
             return jax.vmap(partial(self._advance, trajectory))(fields, carry, u)
 
         start = split(self.scene, jnp.asarray(fields.start, ctrl.dtype))
@@ -104,8 +104,8 @@ class MjxEngine(Equal):
         return trace._replace(last=jnp.concatenate(end, 1))
 
     def _advance(
-        self, trajectory: bool, fields: ModelFields, carry: State, u: jax.Array
-    ) -> tuple[State, Trace]:
+        self, trajectory: bool, fields: ModelFields, carry: RolloutState, u: jax.Array
+    ) -> tuple[RolloutState, Trace]:
         lay = layout(self.scene)
         bounds = verdict.bounds(fields.constants)
         data = self.reset(fields).replace(

@@ -30,12 +30,12 @@ from codesign_jax.model.fields import (
 )
 from codesign_jax.model.layout import Layout, contact_invweight, joint_axes, layout
 from codesign_jax.model.spec import build_spec, compile_model, compile_template
-from codesign_jax.model.state import State, split
+from codesign_jax.model.state import RolloutState, split
 
 __all__ = [
     "Layout",
     "ModelFields",
-    "State",
+    "RolloutState",
     "build_spec",
     "compile_model",
     "compile_template",

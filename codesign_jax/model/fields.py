@@ -32,8 +32,9 @@ class ModelFields(NamedTuple):
 
     Every array has MuJoCo's name and shape for one world, `gravity` and `impratio` those of
     mjOption, but for five: `start` is the initial qpos, shape (nq,), or the state in which another
-    rollout ended, `Trace.last`, see `State`; `section` has height, wall, segment length and width
-    of the fingers [m], shape (finger, 4), where `neo_hookean`, `air_mass` or a hull needs them;
+    rollout ended, `Trace.last`, see `RolloutState`; `section` has height, wall, segment length and
+    width of the fingers [m], shape (finger, 4), where `neo_hookean`, `air_mass` or a hull needs
+    them;
     `threshold` has the numbers of `morphology.thresholds`, with the effect `lateral_threshold`;
     `tip` has height, wall and width at the tips of tapered fingers, shape (finger, 3), and
     `constants` are the world's numbers with the trial's factors, from which engines take what

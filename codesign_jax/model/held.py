@@ -83,7 +83,7 @@ def held(scene: Scene) -> dict[str, int]:
 
 
 def rows(scene: Scene) -> dict[str, slice]:
-    """Rows of `State.held`, three for each of `held`, by the pair of bodies."""
+    """Rows of `RolloutState.held`, three for each of `held`, by the pair of bodies."""
     found = {}
     first = 0
     for name, items in held(scene).items():

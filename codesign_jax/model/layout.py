@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.scene import Scene, by_structure, rigid
+from codesign_jax.scene import Scene, by_structure, rigid_bodies
 from codesign_jax.scene.hand import Hand
 from codesign_jax.scene.objects import ObjectSet, Shape
 from codesign_jax.scene.primitives import PRIMITIVES
@@ -318,11 +318,11 @@ def object_pose(objects: ObjectSet, trial: Trial) -> tuple[jax.Array, jax.Array]
     It is upright, see `Shape.upright`, turned about x and y by the trial's tilt, then by its yaw.
     """
     quats = [jnp.array(shape.upright) for shape in objects.object]
-    ups = [rigid.up(shape.upright) for shape in objects.object]
+    ups = [rigid_bodies.up(shape.upright) for shape in objects.object]
     if trial.tilt is not None:
         tilt = _after(_turn(trial.tilt[1], 2), _turn(trial.tilt[0], 1))
         quats = [_after(tilt, quat) for quat in quats]
-        ups = [rigid.up(quat) for quat in quats]
+        ups = [rigid_bodies.up(quat) for quat in quats]
     shapes = zip(objects.object, ups, strict=True)
     heights = jnp.stack([jnp.asarray(shape.rest_height(up)) for shape, up in shapes])
     quat = _after(_turn(trial.yaw, 3), jnp.stack(quats)[trial.shape])

@@ -10,7 +10,7 @@ from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import InputError
 
 
-class State(NamedTuple):
+class RolloutState(NamedTuple):
     """The parts of `Trace.last`, one behind the other: all that a time step takes from the last.
 
     `ModelFields.start` takes the same array, or its beginning: qpos, or qpos and qvel.
@@ -37,7 +37,7 @@ class State(NamedTuple):
     held: Any
 
 
-def split(scene: Scene, start: Any) -> State:
+def split(scene: Scene, start: Any) -> RolloutState:
     """The state that `ModelFields.start` has; what it lacks is that of a grasp's beginning.
 
     Args:
@@ -58,7 +58,7 @@ def split(scene: Scene, start: Any) -> State:
     """
     nv = 12 + layout(scene).dofs.size
     rows = 3 * sum(held.held(scene).values())
-    sizes = State(nv + 1, nv, nv, 1, 1, 1, rows * held.lanes(scene))
+    sizes = RolloutState(nv + 1, nv, nv, 1, 1, 1, rows * held.lanes(scene))
     ends = np.cumsum(sizes)
     n = start.shape[-1]
     if n not in {*ends[[0, 1, 6]]}:
@@ -70,7 +70,7 @@ def split(scene: Scene, start: Any) -> State:
         else np.zeros((*start.shape[:-1], size), start.dtype)
         for end, size in zip(ends, sizes, strict=True)
     ]
-    found = State(*parts)
+    found = RolloutState(*parts)
     if n > ends[1]:
         return found
     return found._replace(going=found.going + 1, speed=abs(found.qvel).max(-1, keepdims=True))

@@ -22,7 +22,7 @@ from codesign_jax.optimize.bounds import Space, reflect, strictly_below
 from codesign_jax.optimize.evolution import EVOSAX, Evolution
 from codesign_jax.optimize.names import DEFAULT, NAMES, PAPER, make_optimizer, problem
 from codesign_jax.optimize.particle_filter import ParticleFilter
-from codesign_jax.optimize.protocol import Info, Optimizer, State
+from codesign_jax.optimize.protocol import Info, Optimizer, OptimizerState
 from codesign_jax.optimize.resampling import MAX_PARTICLES, stochastic_universal
 from codesign_jax.optimize.retested import Retested
 from codesign_jax.optimize.schedule import schedule
@@ -49,7 +49,7 @@ __all__ = [
     "Retested",
     "Screened",
     "Space",
-    "State",
+    "OptimizerState",
     "answer",
     "candidates",
     "make_optimizer",

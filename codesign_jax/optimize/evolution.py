@@ -23,7 +23,7 @@ from jax.typing import ArrayLike
 from codesign_jax.optimize.bounds import Space, reflect
 from codesign_jax.optimize.protocol import (
     Info,
-    State,
+    OptimizerState,
     check_start,
     check_told,
     episode_key,
@@ -78,14 +78,14 @@ class Evolution:
         if self.name not in LEAST or not self.sigma > 0:
             raise ValueError(f"need a name of {', '.join(LEAST)} and sigma > 0: {self}")
 
-    def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
+    def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> OptimizerState:
         seed = check_start(self.space, key, seed_particle, num_particles, MAX_PARTICLES)
         if num_particles < LEAST[self.name]:
             raise ValueError(f"{num_particles=}: {self.name} needs at least {LEAST[self.name]}")
         if self.name == "open-es" and num_particles % 2:
             raise ValueError(f"{num_particles=}: open-es draws pairs, and needs an even number")
         particles = jnp.tile(seed, (num_particles, 1))
-        state = State(particles, jnp.zeros((), jnp.int32), key)
+        state = OptimizerState(particles, jnp.zeros((), jnp.int32), key)
         memory = {
             "mask": jnp.ones(seed.shape, bool),
             "cost": jnp.full(num_particles, jnp.inf, seed.dtype),
@@ -93,7 +93,7 @@ class Evolution:
         }
         return state._replace(memory=memory)
 
-    def ask(self, state: State, mask: ArrayLike) -> jax.Array:
+    def ask(self, state: OptimizerState, mask: ArrayLike) -> jax.Array:
         # The space's constraint may change a closed parameter, as with the particle filter.
         low = jnp.asarray(self.space.low)
         high = jnp.asarray(self.space.high)
@@ -103,8 +103,8 @@ class Evolution:
         return self.space.constrain(jnp.where(mask, moved, kept).astype(state.particles.dtype))
 
     def tell(
-        self, state: State, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
-    ) -> tuple[State, Info]:
+        self, state: OptimizerState, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
+    ) -> tuple[OptimizerState, Info]:
         assert state.memory is not None
         cost = check_told(state, population, cost)
         ranked = jnp.where(jnp.isfinite(cost), cost, jnp.inf)
@@ -125,10 +125,10 @@ class Evolution:
         }
         particles = jnp.concatenate([population, state.particles])[best]
         ancestors = jnp.where(best < cost.shape[0], best, -1).astype(jnp.int32)
-        next_state = State(particles, state.episode + 1, state.key, memory)
+        next_state = OptimizerState(particles, state.episode + 1, state.key, memory)
         return next_state, summarize(cost, jnp.ones_like(cost), ancestors)
 
-    def _asked(self, state: State, mask: ArrayLike) -> tuple[jax.Array, Any]:
+    def _asked(self, state: OptimizerState, mask: ArrayLike) -> tuple[jax.Array, Any]:
         """Points of the strategy in unit coordinates, and the strategy's state with them."""
         assert state.memory is not None
         strategy = self._strategy(state)
@@ -140,7 +140,7 @@ class Evolution:
         key = episode_key(state, STREAM_ASK)
         return strategy.algorithm.ask(key, start.replace(**kept), strategy.params)
 
-    def _start(self, state: State) -> Any:
+    def _start(self, state: OptimizerState) -> Any:
         """The strategy's state as it starts around the best particle."""
         algorithm, params = self._strategy(state)
         low = jnp.asarray(self.space.low)
@@ -153,7 +153,7 @@ class Evolution:
         # Nothing of it is evaluated yet. Among equal fitness the first is the swarm's best.
         return algorithm.init(key, swarm, jnp.full(len(swarm), jnp.inf, best.dtype), params)
 
-    def _strategy(self, state: State) -> "Strategy":
+    def _strategy(self, state: OptimizerState) -> "Strategy":
         return build(self.name, *state.particles.shape, self.sigma, str(state.particles.dtype))
 
 

@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 from codesign_jax.optimize.bounds import Space, reflect
 from codesign_jax.optimize.protocol import (
     Info,
-    State,
+    OptimizerState,
     check_start,
     check_told,
     episode_key,
@@ -59,13 +59,13 @@ class ParticleFilter:
         if not self.sigma >= 0 or not self.alpha > 0:
             raise ValueError(f"need sigma >= 0 and alpha > 0: {self.sigma=}, {self.alpha=}")
 
-    def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
+    def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> OptimizerState:
         """All particles at the seed particle."""
         seed_particle = check_start(self.space, key, seed_particle, num_particles, MAX_PARTICLES)
         particles = jnp.tile(seed_particle, (num_particles, 1))
-        return State(particles, jnp.zeros((), jnp.int32), key)
+        return OptimizerState(particles, jnp.zeros((), jnp.int32), key)
 
-    def ask(self, state: State, mask: ArrayLike) -> jax.Array:
+    def ask(self, state: OptimizerState, mask: ArrayLike) -> jax.Array:
         """Move the particles: step 1 of Fig. 5.
 
         Open parameters move by N(0, (sigma * range)**2) and are reflected at the bounds; closed
@@ -84,8 +84,8 @@ class ParticleFilter:
         return self.space.constrain(jnp.where(mask, moved, state.particles))
 
     def tell(
-        self, state: State, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
-    ) -> tuple[State, Info]:
+        self, state: OptimizerState, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
+    ) -> tuple[OptimizerState, Info]:
         """Weight and resample the population: steps 3 and 4 of Fig. 5.
 
         `weight = 1 / (alpha + cost)` (section VI.1), then stochastic universal sampling with one
@@ -97,5 +97,5 @@ class ParticleFilter:
         weight = finite / (self.alpha + jnp.where(finite, jnp.maximum(cost, 0), 0))
         u = jax.random.uniform(episode_key(state, STREAM_RESAMPLE))
         ancestors = stochastic_universal(u, weight)
-        next_state = State(population[ancestors], state.episode + 1, state.key)
+        next_state = OptimizerState(population[ancestors], state.episode + 1, state.key)
         return next_state, summarize(cost, jnp.where(finite.any(), weight, 1), ancestors)

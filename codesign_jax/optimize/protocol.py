@@ -20,7 +20,7 @@ from jax.typing import ArrayLike
 from codesign_jax.optimize.bounds import Space
 
 
-class State(NamedTuple):
+class OptimizerState(NamedTuple):
     """What one episode hands to the next.
 
     Attributes:
@@ -91,7 +91,7 @@ class Optimizer(Protocol):
     # An attribute `finalists` says how many of a run's final particles differ, if it went on long
     # enough: the final test then simulates so many, and not their copies.
 
-    def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
+    def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> OptimizerState:
         """The state before episode 0.
 
         Args:
@@ -106,7 +106,7 @@ class Optimizer(Protocol):
         """
         ...
 
-    def ask(self, state: State, mask: ArrayLike) -> jax.Array:
+    def ask(self, state: OptimizerState, mask: ArrayLike) -> jax.Array:
         """Particles to evaluate, shape (particle, parameter), inside the space.
 
         Args:
@@ -118,12 +118,12 @@ class Optimizer(Protocol):
         ...
 
     def tell(
-        self, state: State, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
-    ) -> tuple[State, Info]:
+        self, state: OptimizerState, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
+    ) -> tuple[OptimizerState, Info]:
         """The state of the next episode and what happened in this one.
 
         Args:
-          state: State that `population` was asked from.
+          state: OptimizerState that `population` was asked from.
           population: Evaluated particles, shape (particle, parameter).
           cost: Mean cost over the trials of each particle, shape (particle,); lower is better,
             and what is not finite has failed.
@@ -159,7 +159,7 @@ def _refuse_far(space: Space, particle: jax.Array) -> None:
         )
 
 
-def check_told(state: State, population: jax.Array, cost: ArrayLike) -> jax.Array:
+def check_told(state: OptimizerState, population: jax.Array, cost: ArrayLike) -> jax.Array:
     """Checks the arguments of `tell`; returns the costs as an array of the population's type."""
     cost = jnp.asarray(cost, population.dtype)
     if population.shape != state.particles.shape or cost.shape != population.shape[:1]:
@@ -169,7 +169,7 @@ def check_told(state: State, population: jax.Array, cost: ArrayLike) -> jax.Arra
     return cost
 
 
-def episode_key(state: State, stream: int) -> jax.Array:
+def episode_key(state: OptimizerState, stream: int) -> jax.Array:
     """Key of one stream of draws in the state's episode."""
     return jax.random.fold_in(jax.random.fold_in(state.key, stream), state.episode)
 

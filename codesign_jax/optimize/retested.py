@@ -15,7 +15,7 @@ from jax.typing import ArrayLike
 from codesign_jax.optimize.bounds import Space
 from codesign_jax.optimize.protocol import (
     Info,
-    State,
+    OptimizerState,
     check_start,
     check_told,
     episode_key,
@@ -51,7 +51,7 @@ class Retested:
 
     space: Space
 
-    def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
+    def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> OptimizerState:
         # The seed particle gives the parameters that a schedule closes from the start.
         seed = check_start(self.space, key, seed_particle, num_particles, MAX_PARTICLES)
         particles = jnp.tile(seed, (num_particles, 1))
@@ -60,9 +60,9 @@ class Retested:
             "cost": jnp.full(num_particles, jnp.inf, seed.dtype),  # mean over its episodes
             "episodes": jnp.ones(num_particles, jnp.int32),
         }
-        return State(particles, jnp.zeros((), jnp.int32), key, memory)
+        return OptimizerState(particles, jnp.zeros((), jnp.int32), key, memory)
 
-    def ask(self, state: State, mask: ArrayLike) -> jax.Array:
+    def ask(self, state: OptimizerState, mask: ArrayLike) -> jax.Array:
         assert state.memory is not None
         low = jnp.asarray(self.space.low)
         high = jnp.asarray(self.space.high)
@@ -74,8 +74,8 @@ class Retested:
         return self.space.constrain(jnp.where(jnp.any(mask), asked, state.particles))
 
     def tell(
-        self, state: State, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
-    ) -> tuple[State, Info]:
+        self, state: OptimizerState, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
+    ) -> tuple[OptimizerState, Info]:
         assert state.memory is not None
         cost = check_told(state, population, cost)
         again = self._again(state)
@@ -95,9 +95,9 @@ class Retested:
         rows = jnp.arange(len(cost))
         best = jnp.where(rows < self.finalists, rows, 0)
         copied = jnp.where(order < len(cost), order, -1)[best].astype(jnp.int32)
-        new = State(memory["designs"][best], state.episode + 1, state.key, memory)
+        new = OptimizerState(memory["designs"][best], state.episode + 1, state.key, memory)
         return new, summarize(cost, jnp.ones_like(cost), copied)
 
-    def _again(self, state: State) -> jax.Array:
+    def _again(self, state: OptimizerState) -> jax.Array:
         """Whether the episode simulates the best designs again."""
         return state.episode % 2 == 1

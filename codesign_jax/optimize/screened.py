@@ -28,7 +28,7 @@ from codesign_jax.optimize.bounds import Space, reflect
 from codesign_jax.optimize.evolution import OPEN_SIGMA, Strategy, arrays, build
 from codesign_jax.optimize.protocol import (
     Info,
-    State,
+    OptimizerState,
     check_start,
     check_told,
     episode_key,
@@ -92,12 +92,12 @@ class Screened:
         """Episode in which the strategy begins; before it all particles are random designs."""
         return self.screening + self.retests
 
-    def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> State:
+    def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> OptimizerState:
         # The seed particle gives the parameters that a schedule closes from the start.
         seed = check_start(self.space, key, seed_particle, num_particles, MAX_PARTICLES)
         if num_particles < LEAST:
             raise ValueError(f"{num_particles=}: a screened search needs at least {LEAST}")
-        state = State(jnp.tile(seed, (num_particles, 1)), jnp.zeros((), jnp.int32), key)
+        state = OptimizerState(jnp.tile(seed, (num_particles, 1)), jnp.zeros((), jnp.int32), key)
         memory = {
             "mask": jnp.ones(seed.shape, bool),
             "cost": jnp.full(num_particles, jnp.inf, seed.dtype),
@@ -105,7 +105,7 @@ class Screened:
         }
         return state._replace(memory=memory | self._start(state))
 
-    def ask(self, state: State, mask: ArrayLike) -> jax.Array:
+    def ask(self, state: OptimizerState, mask: ArrayLike) -> jax.Array:
         # The space's constraint may change a closed parameter, as with the particle filter.
         key = episode_key(state, STREAM_SCREEN)
         shape = state.particles.shape
@@ -117,8 +117,8 @@ class Screened:
         return self.space.constrain(jnp.where(again, state.particles, population))
 
     def tell(
-        self, state: State, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
-    ) -> tuple[State, Info]:
+        self, state: OptimizerState, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
+    ) -> tuple[OptimizerState, Info]:
         assert state.memory is not None
         cost = check_told(state, population, cost)
         ranked = jnp.where(jnp.isfinite(cost), cost, jnp.inf)
@@ -155,14 +155,16 @@ class Screened:
             screens, jnp.where(best < len(cost), best, -1), jnp.where(ago > 0, -1, 0)
         )
         particles = jnp.where(screens, screened, finalists)
-        next_state = State(particles, state.episode + 1, state.key, following)
+        next_state = OptimizerState(particles, state.episode + 1, state.key, following)
         return next_state, summarize(cost, jnp.ones_like(cost), copied.astype(jnp.int32))
 
-    def _screens(self, state: State) -> jax.Array:
+    def _screens(self, state: OptimizerState) -> jax.Array:
         """Whether the episode is one of random designs, drawn or simulated again."""
         return state.episode < self.begins
 
-    def _asked(self, state: State, mask: ArrayLike) -> tuple[jax.Array, Any, dict[str, Any]]:
+    def _asked(
+        self, state: OptimizerState, mask: ArrayLike
+    ) -> tuple[jax.Array, Any, dict[str, Any]]:
         """The average and the strategy's points, its state with them, and what was remembered."""
         assert state.memory is not None
         begun = jnp.all(mask == state.memory["mask"]) & (state.episode > self.begins)
@@ -178,7 +180,7 @@ class Screened:
         rest = jnp.tile(strategy.mean, (len(state.particles) - 1 - len(points), 1))
         return jnp.concatenate([memory["average"][None], points, rest]), strategy, memory
 
-    def _start(self, state: State) -> dict[str, Any]:
+    def _start(self, state: OptimizerState) -> dict[str, Any]:
         """Average and strategy as they start, at particle 0."""
         algorithm, params = self._strategy(state)
         low = jnp.asarray(self.space.low)
@@ -193,7 +195,7 @@ class Screened:
         high = jnp.asarray(self.space.high)
         return reflect(low + unit * (high - low), low, high)
 
-    def _strategy(self, state: State) -> Strategy:
+    def _strategy(self, state: OptimizerState) -> Strategy:
         n, width = state.particles.shape
         dtype = str(state.particles.dtype)
         # Its draws come in pairs; the last one of an even number of particles is its mean.

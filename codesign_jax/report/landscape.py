@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codesign_jax import store
+from codesign_jax import array_files
 from codesign_jax.runs import columns, tables
 from codesign_jax.scene.schema import InputError
 
@@ -33,7 +33,7 @@ def save(found: Landscape, folder: Path) -> list[Path]:
     """Writes a landscape as arrays and as a table of its points; returns the files."""
     npz = folder / FILE
     table = folder / TABLE
-    store.save(npz, found._asdict())
+    array_files.save(npz, found._asdict())
     axes = [
         f"{n}_{u}".rstrip("_").replace("[", "_").replace("]", "")
         for n, u in zip(found.names, found.units, strict=True)
@@ -53,9 +53,9 @@ def save(found: Landscape, folder: Path) -> list[Path]:
 def load(path: Path) -> Landscape:
     """Reads the arrays of a landscape."""
     try:
-        stored = store.load(path)
+        stored = array_files.load(path)
         return Landscape(**{name: stored[name] for name in Landscape._fields})
-    except (OSError, store.StoreError, KeyError) as error:
+    except (OSError, array_files.ArrayFileError, KeyError) as error:
         problem = (
             f"{path} is not a landscape of this version ({error}); codesign landscape writes one"
         )

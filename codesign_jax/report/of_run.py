@@ -7,7 +7,7 @@ import jax
 
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import Settings
-from codesign_jax.runs.choice import Chosen
+from codesign_jax.runs.cases import Chosen
 from codesign_jax.runs.record import History, Record
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space

@@ -12,8 +12,8 @@ from codesign_jax import codesign, files, types, verdict
 from codesign_jax.report import chosen, figures, landscape, markup, verdicts, viewer
 from codesign_jax.report.of_run import Run
 from codesign_jax.report.replay import Replay
-from codesign_jax.runs import SCENE_COST, choice, tables
-from codesign_jax.runs.choice import Grasp
+from codesign_jax.runs import SCENE_COST, cases, tables
+from codesign_jax.runs.cases import Grasp
 from codesign_jax.runs.scene_files import NAMES
 from codesign_jax.types import MEANINGS, WARNINGS
 
@@ -96,7 +96,7 @@ def _grasp(run: Run, grasp: tuple[Grasp, Replay] | None) -> str:
     planned, shown = grasp
     episode, particle, trial = planned.place
     name = run.scene.objects.object[int(planned.trial.shape)].name
-    before, again = (choice.ending(o) for o in (planned.outcome, shown.outcome))
+    before, again = (cases.ending(o) for o in (planned.outcome, shown.outcome))
     note = (
         f"The chosen design with the object {name}: trial {trial} of particle {particle} in "
         f"episode {episode}, simulated again. In the run: {before}; here: {again}."

@@ -230,9 +230,8 @@ class Checkpoints:
         if label is None and self._run is None:
             return
         try:
-            # type: ignore[index]
-            run = bytes(label["id"]).hex()
-            own = int(label["step"])
+            run = bytes(label["id"]).hex()  # type: ignore[index]
+            own = int(label["step"])  # type: ignore[index]
         except (KeyError, TypeError, ValueError):
             run = None
             own = step

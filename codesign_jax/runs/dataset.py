@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from codesign_jax import files, reuse, sampling, store
+from codesign_jax import array_files, files, reuse, sampling
 from codesign_jax.codesign import VERDICTS, verdicts
 from codesign_jax.model import morphology
 from codesign_jax.provenance import environment
@@ -112,12 +112,12 @@ class Shards:
 
     def load(self, shard: int) -> Outcome | None:
         try:
-            return Outcome(**store.load(self.folder / f"{shard}.npz"))
-        except (OSError, store.StoreError):
+            return Outcome(**array_files.load(self.folder / f"{shard}.npz"))
+        except (OSError, array_files.ArrayFileError):
             return None
 
     def save(self, shard: int, found: Outcome) -> None:
-        store.save(self.folder / f"{shard}.npz", found._asdict())
+        array_files.save(self.folder / f"{shard}.npz", found._asdict())
 
 
 class Names(NamedTuple):

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from codesign_jax import files, own, terminal
+from codesign_jax import files, terminal, user_code
 from codesign_jax import scene as scenes
 from codesign_jax.provenance import environment
 from codesign_jax.runs import manifest, reading, scene_files
@@ -35,7 +35,7 @@ _MOST_LINES = 16
 
 
 _INSIDE = {
-    own.FOLDER: re.compile(r"[A-Za-z_][\w.]*\.py"),
+    user_code.FOLDER: re.compile(r"[A-Za-z_][\w.]*\.py"),
     "checkpoints": re.compile(r"[0-9]+(\.sha256|\.orbax-checkpoint-tmp.*)?"),
     "failures": re.compile(r"episode-[0-9]+-particle-[0-9]+-trial-[0-9]+\.npz"),
     "figures": re.compile(r"(cost_evolution|landscape)\.png"),
@@ -159,7 +159,7 @@ def _resume(path: Path, settings: Settings, command: list[str]) -> list[str]:
 
 
 def _contents(scene: Scene, settings: Settings) -> dict[str, bytes]:
-    return scene_files.contents(scene) | own.contents(settings.own)
+    return scene_files.contents(scene) | user_code.contents(settings.own)
 
 
 def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str, Any]) -> None:
@@ -206,7 +206,7 @@ def _is_cut_short(path: Path, scene: Scene, settings: Settings, stored: dict[str
 
 def _other_code(path: Path, settings: Settings, stored: dict[str, Any]) -> list[str]:
     found = []
-    for name, content in own.contents(settings.own).items():
+    for name, content in user_code.contents(settings.own).items():
         if manifest.digests({name: content})[name] != stored["files"].get(name):
             diff = _diff(path, name, content.decode())
             found += [f"{Path(name).stem} was changed since the run was made:", *diff]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from codesign_jax import store, types
+from codesign_jax import array_files, types
 from codesign_jax.codesign import EpisodeInfo
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Trial
@@ -21,7 +21,7 @@ class Failure(NamedTuple):
 
     design: np.ndarray  # design as simulated [SI units], shape (parameter,)
     trial: Trial
-    # State in which it was frozen, see `model.State`; empty if the engine does not tell
+    # State in which it was frozen, see `model.RolloutState`; empty if the engine does not tell
     state: np.ndarray
     status: int  # bits of `Status`
     bad_step: int  # first bad time step, or -1 (STUCK)
@@ -46,7 +46,7 @@ def save(folder: Path, episode: int, info: EpisodeInfo) -> list[Path]:
             "bad_step": info.outcomes.bad_step[p, t],
             "place": np.array([episode, p, t]),
         }
-        store.save(path, arrays | {f"trial_{k}": v for k, v in trial._asdict().items()})
+        array_files.save(path, arrays | {f"trial_{k}": v for k, v in trial._asdict().items()})
         files.append(path)
     return files
 
@@ -55,7 +55,7 @@ def load(path: Path) -> Failure:
     if not path.exists():
         raise InputError([f"{path}: there is no such file or folder"])
     try:
-        values = store.load(path)
+        values = array_files.load(path)
         # Runs of before have no tilt.
         drawn = [n for n in Trial._fields if n != "tilt" or "trial_tilt" in values]
         trial = Trial(**{name: values[f"trial_{name}"] for name in drawn})

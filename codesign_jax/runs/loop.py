@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import codesign, optimize, own, types
+from codesign_jax import codesign, optimize, types, user_code
 from codesign_jax.batch import Request
 from codesign_jax.codesign import EpisodeInfo, FinalTest, Task
 from codesign_jax.engines import make_engine
-from codesign_jax.optimize import NoSeed, Optimizer, State, translated
+from codesign_jax.optimize import NoSeed, Optimizer, OptimizerState, translated
 from codesign_jax.policy import ControlLoop
 from codesign_jax.runs import failures, reading, tables
 from codesign_jax.runs import record as records
@@ -34,7 +34,7 @@ from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.types import Outcome, Status
 
-Asking = Generator[Request, tuple[State, EpisodeInfo], Any]
+Asking = Generator[Request, tuple[OptimizerState, EpisodeInfo], Any]
 """What yields episodes and is sent the state after each and its report."""
 
 
@@ -98,7 +98,7 @@ class RunResult(NamedTuple):
     """How a run ended.
 
     Attributes:
-      record: State and history, or None if the run was stopped before it had a seed.
+      record: OptimizerState and history, or None if the run was stopped before it had a seed.
       test: The final test, or None if there was none.
       signum: Signal that stopped the run early, or 0.
     """
@@ -115,19 +115,19 @@ def prepare(scene: Scene, settings: Settings) -> Plan:
       settings: Settings without `settings.check`'s problems.
 
     Raises:
-      InputError: If an optimiser, a cost or a policy of the user's own is none; see `own`.
+      InputError: If an optimiser, a cost or a policy of the user's own is none; see `user_code`.
     """
     space = design_space(scene.hand, settings.preset)
     mask = masks_of(scene, settings)
     engine = make_engine(settings.engine, scene)
     if settings.policy:
-        engine = ControlLoop(engine, own.make_policy(settings.policy, scene)[0])
+        engine = ControlLoop(engine, user_code.make_policy(settings.policy, scene)[0])
     n = settings.particles
     optimizer = codesign.make_optimizer(settings.optimizer, space, num_particles=n)
     task = Task(scene, space, settings.trials, engine)
     key = jax.random.key(settings.seed)
     if settings.cost != SCENE_COST:
-        cost, stops = own.make_cost(settings.cost, scene)
+        cost, stops = user_code.make_cost(settings.cost, scene)
         how = {"record_qpos": not stops, "stop_when_lost": stops}
         task = dataclasses.replace(task, cost=cost, **how)
     return Plan(task, settings, optimizer, mask, key)
@@ -181,7 +181,7 @@ class Loop:
         self._saved = 0
         self._unsaved: Callable[[], None] | None = None
 
-    def run(self) -> Generator[Request, tuple[State, EpisodeInfo], RunResult]:
+    def run(self) -> Generator[Request, tuple[OptimizerState, EpisodeInfo], RunResult]:
         """Runs what is left of the run; to stop it, `Stopped` is thrown in."""
         record = self._restore()
         signum = 0
@@ -249,7 +249,7 @@ class Loop:
             self._say(f"all {total} episodes are done in {self.run_directory.path}")
         return record
 
-    def _seed(self) -> Generator[Request, tuple[State, EpisodeInfo], Record]:
+    def _seed(self) -> Generator[Request, tuple[OptimizerState, EpisodeInfo], Record]:
         plan = self.plan
         settings = self.plan.settings
         if needs_poor_seed(plan):
@@ -264,7 +264,7 @@ class Loop:
         self._save(0, record)
         return record
 
-    def _poor_seed(self) -> Generator[Request, tuple[State, EpisodeInfo], Start]:
+    def _poor_seed(self) -> Generator[Request, tuple[OptimizerState, EpisodeInfo], Start]:
         plan = self.plan
         batch = self.plan.settings.particles
         search = codesign.seed_search(plan.scene, plan.optimizer, plan.key, batch=batch)
@@ -283,7 +283,7 @@ class Loop:
     ) -> Asking:
         """Answers what asks for populations by episodes in which nothing moves; tells of each."""
 
-        def answer(reply: tuple[State, EpisodeInfo]) -> Outcome:
+        def answer(reply: tuple[OptimizerState, EpisodeInfo]) -> Outcome:
             told()
             return reply[1].outcomes
 

@@ -14,7 +14,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from codesign_jax import files, own, terminal
+from codesign_jax import files, terminal, user_code
 from codesign_jax import scene as scenes
 from codesign_jax.provenance import environment, git_state
 from codesign_jax.runs import scene_files
@@ -93,7 +93,7 @@ def refuse_links(path: Path, names: Iterable[str] = (*FILES, *TABLES, LOCK)) -> 
 
 def read_provenance(path: Path) -> dict[str, Any]:
     """What is noted of a run; texts in it are one line each."""
-    refuse_links(path, [PROVENANCE, *scene_files.NAMES, scene_files.MESHES, own.FOLDER])
+    refuse_links(path, [PROVENANCE, *scene_files.NAMES, scene_files.MESHES, user_code.FOLDER])
     file = path / PROVENANCE
     try:
         size = file.stat().st_size
@@ -205,7 +205,7 @@ def _problem(stored: Any) -> str:
     stored = {"resumed": [], "extended": []} | stored
     wrong = [name for name, types in _TYPES.items() if not _fits(stored.get(name), types)]
     if not wrong:
-        folders = ([scene_files.MESHES], [own.FOLDER])
+        folders = ([scene_files.MESHES], [user_code.FOLDER])
         ours = (n in scene_files.NAMES or n.split("/")[:-1] in folders for n in stored["files"])
         right = {
             "settings": stored["settings"].keys() == _TYPES["settings"].keys(),  # type: ignore[attr-defined]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.codesign import EpisodeInfo
-from codesign_jax.optimize import State
+from codesign_jax.optimize import OptimizerState
 from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.settings import Settings
 from codesign_jax.types import Outcome, failed
@@ -81,7 +81,7 @@ def add_report(history: History, episode: int, info: EpisodeInfo) -> None:
 class Record:
     """What a run has so far; the content of a checkpoint."""
 
-    state: State  # state of the optimiser
+    state: OptimizerState  # state of the optimiser
     history: History  # reports of the episodes
     # Outcomes of the final test, shape (particle, trial), or None before it
     test: Outcome | None = None
@@ -133,7 +133,7 @@ def from_arrays(arrays: dict) -> Record:
         h = jax.tree.map(np.array, arrays["history"])
         key = jax.random.wrap_key_data(jnp.asarray(s["key"]))
         memory = jax.tree.map(jnp.asarray, s.get("memory"))
-        state = State(jnp.asarray(s["particles"]), jnp.asarray(s["episode"]), key, memory)
+        state = OptimizerState(jnp.asarray(s["particles"]), jnp.asarray(s["episode"]), key, memory)
         test = Outcome(**jax.tree.map(jnp.asarray, arrays["test"])) if "test" in arrays else None
         start = Start(**arrays["start"]) if "start" in arrays else None
         history = History(outcomes=Outcome(**h.pop("trials")), **h)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from codesign_jax import engines, optimize, own, sizes
+from codesign_jax import engines, optimize, sizes, user_code
 from codesign_jax.optimize import MAX_PARTICLES, schedule
 from codesign_jax.scene import Scene, schema
 from codesign_jax.scene.hand import Hand
@@ -116,14 +116,14 @@ def check(settings: Settings, hand: Hand | None) -> list[str]:
     if settings.engine not in engines.NAMES:
         hint = schema.nearest(settings.engine, engines.NAMES)
         found.append(f"--engine = {settings.engine!r} is not valid; {hint}")
-    if own.is_own(settings.optimizer):
-        problem = own.problem(settings.optimizer)
+    if user_code.is_user_code(settings.optimizer):
+        problem = user_code.problem(settings.optimizer)
     else:
         problem = optimize.problem(settings.optimizer, max(settings.particles, 0) or None)
     found += [f"--optimizer: {problem}"] if problem else []
-    if settings.cost != SCENE_COST and (problem := own.problem(settings.cost)):
+    if settings.cost != SCENE_COST and (problem := user_code.problem(settings.cost)):
         found.append(f"--cost: {problem}")
-    if settings.policy and (problem := own.problem(settings.policy)):
+    if settings.policy and (problem := user_code.problem(settings.policy)):
         found.append(f"--policy: {problem}")
     space = None
     if hand is not None:

@@ -20,7 +20,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.scene import Scene, check_together, reach, schema
+from codesign_jax.scene import Scene, check_together, mesh_margins, schema
 from codesign_jax.types import Trial
 
 
@@ -51,7 +51,7 @@ def _check(scene: Scene) -> None:
         problems = check_together(scene, "scene")
     if problems:
         raise schema.InputError(problems)
-    reach.refuse(scene.objects, scene.hand.palm.contact_radius)
+    mesh_margins.refuse(scene.objects, scene.hand.palm.contact_radius)
 
 
 _check_once = functools.lru_cache(maxsize=64)(_check)

@@ -11,9 +11,9 @@ from codesign_jax.scene import (
     key_frames,
     keypaths,
     library,
+    mesh_margins,
     objects,
-    reach,
-    rigid,
+    rigid_bodies,
     schema,
     silicones,
 )
@@ -89,7 +89,7 @@ def load(
             problems += error.problems
     if problems or parsed is None:
         raise schema.InputError(problems)
-    parts["objects"] = reach.fit(parts["objects"], parts["hand"])
+    parts["objects"] = mesh_margins.fit(parts["objects"], parts["hand"])
     law = bool(parsed.effects.neo_hookean)
     parts["hand"] = hand.with_strain(parts["hand"], parsed.limits.strain, neo_hookean=law)
     parts["hand"] = key_frames.with_parameters(parts["hand"], parts["control"])
@@ -200,7 +200,7 @@ def _fixture_problems(fixture: Fixture, where: str) -> list[str]:
     if len(fixture.size or ()) != len(sizes):
         words = f"{len(sizes)} values ({', '.join(sizes)})" if sizes else "no size"
         found.append(f"{where}: a {fixture.type} has {words}, not {list(fixture.size or ())}")
-    if fixture.orientation and (why := rigid.orientation_problem(fixture.orientation)):
+    if fixture.orientation and (why := rigid_bodies.orientation_problem(fixture.orientation)):
         found.append(f"{where}: orientation {why}")
     return found
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from codesign_jax.scene import keypaths, rigid, schema
+from codesign_jax.scene import keypaths, rigid_bodies, schema
 from codesign_jax.scene.primitives import PRIMITIVES, Primitive
 from codesign_jax.scene.schema import choice, quantity, table
 
@@ -169,7 +169,7 @@ class Shape(_ShapeFile):
     def upright(self) -> tuple[float, ...]:
         """Orientation on the table before the trial's noise, a unit quaternion (w, x, y, z)."""
         if self.orientation is not None:
-            return rigid.turned(self.orientation, self._base)
+            return rigid_bodies.turned(self.orientation, self._base)
         return self._base if self.mesh else self.primitive.upright
 
     @property
@@ -197,15 +197,15 @@ class Shape(_ShapeFile):
     @property
     def height(self) -> float:
         """Height of its highest point on the table [m]."""
-        up = np.array(rigid.up(self.upright))
+        up = np.array(rigid_bodies.up(self.upright))
         return float(self.rest_height(up) + self.rest_height(-up))
 
     @functools.cached_property
     def fall(self) -> tuple[int, float]:
         """By how much it turns on the table [deg] and sinks [m] before it rests, without noise."""
-        return rigid.fall(self.rest_height, rigid.up(self.upright))
+        return rigid_bodies.fall(self.rest_height, rigid_bodies.up(self.upright))
 
-    def resting(self) -> list[rigid.Resting]:
+    def resting(self) -> list[rigid_bodies.Resting]:
         """The poses in which it rests, the most probable first."""
         from codesign_jax.scene.meshes import support
 
@@ -213,7 +213,7 @@ class Shape(_ShapeFile):
             points = self.mesh.support  # on which it stands
         else:
             points = support.support_points(self.primitive.triangles(self.half_sizes).vertices)
-        return rigid.stable(points, self.unit_inertia, self._base)
+        return rigid_bodies.stable(points, self.unit_inertia, self._base)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -303,7 +303,9 @@ def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
         problems.append(f"{where}: inertia goes with a mass, not with a density")
     if given.pose is not None and given.orientation is not None:
         problems.append(f"{where}: give either orientation or pose")
-    if given.orientation is not None and (why := rigid.orientation_problem(given.orientation)):
+    if given.orientation is not None and (
+        why := rigid_bodies.orientation_problem(given.orientation)
+    ):
         problems.append(f"{where}: orientation {why}")
     if given.centre_of_mass is not None and len(given.centre_of_mass) != 3:
         problems.append(f"{where}: centre_of_mass must have three coordinates")
@@ -340,10 +342,10 @@ def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
     if shape is None:
         return None
     if given.inertia is not None:
-        why = rigid.inertia_problem(given.inertia, shape.mass, shape.radius)
+        why = rigid_bodies.inertia_problem(given.inertia, shape.mass, shape.radius)
         problems += [f"{where}: inertia {why}"] if why else []
     if given.pose is not None:
-        found = rigid.chosen(given.pose, shape.resting)
+        found = rigid_bodies.chosen(given.pose, shape.resting)
         if isinstance(found, str):
             problems.append(f"{where}: pose = {schema.shown(given.pose)} {found}")
             return None
@@ -388,7 +390,7 @@ def _mesh_shape(
             repaired=bool(values["repair"]),
             voxel_error=values["voxel_error"] or 5e-4,
             centre=None if centre is None else np.array(centre),
-            tensor=None if own is None else rigid.tensor(own) / mass,
+            tensor=None if own is None else rigid_bodies.tensor(own) / mass,
             content=content,
         )
     except schema.InputError as error:

@@ -6,7 +6,7 @@ and ranges of the fields, see `scripts/reference_page.py`.
 
 import dataclasses
 
-from codesign_jax.scene import rigid
+from codesign_jax.scene import rigid_bodies
 from codesign_jax.scene.schema import choice, quantity, table
 
 
@@ -71,7 +71,7 @@ class Fixture:
     def quaternion(self) -> tuple[float, ...]:
         """Its orientation, a unit quaternion (w, x, y, z)."""
         still = (1.0, 0.0, 0.0, 0.0)
-        return still if self.orientation is None else rigid.turned(self.orientation, still)
+        return still if self.orientation is None else rigid_bodies.turned(self.orientation, still)
 
     @property
     def half_sizes(self) -> tuple[float, ...]:

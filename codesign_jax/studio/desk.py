@@ -18,8 +18,8 @@ from codesign_jax.commands.flags import Studio as Options
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording, tells_forces
 from codesign_jax.report import animation
-from codesign_jax.runs import choice
-from codesign_jax.runs.choice import Case
+from codesign_jax.runs import cases
+from codesign_jax.runs.cases import Case
 from codesign_jax.scene import Scene, library
 from codesign_jax.scene.loading import with_accuracy
 from codesign_jax.types import Outcome, Params, Trial
@@ -111,7 +111,7 @@ class Desk:
         if folder := options.run_folder:
             own = {"preset": runs.read_run(folder)[1].preset, "scene": str(folder / "scene.toml")}
             self.file = dataclasses.replace(self.file, **own)
-            self.record = choice.read_record(folder, tell=lambda text: None)  # `find_case` said it
+            self.record = cases.read_record(folder, tell=lambda text: None)  # `find_case` said it
         self.accuracies = ("", *library.available("accuracy"))
         self.benches: dict[str, Bench] = {}
 

@@ -21,7 +21,7 @@ from codesign_jax.codesign import VERDICTS
 from codesign_jax.commands import common
 from codesign_jax.commands.flags import Studio as Options
 from codesign_jax.report import viewer
-from codesign_jax.runs import choice, tables
+from codesign_jax.runs import cases, tables
 from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.schema import InputError
@@ -176,7 +176,7 @@ def about(desk: Desk) -> dict[str, Any]:
     ]
     run = None
     if desk.record:
-        chosen = choice.choose(scene, desk.record)
+        chosen = cases.choose(scene, desk.record)
         particles = desk.record.history.cost.shape[1]
         run = {"episodes": desk.record.done, "particles": particles}
         run["chosen"] = [chosen.episode + 1, chosen.row]

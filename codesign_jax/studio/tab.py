@@ -24,7 +24,7 @@ from codesign_jax.commands import common
 from codesign_jax.model import morphology, overlap
 from codesign_jax.optimize import Screened
 from codesign_jax.report import animation, bodies, verdicts, viewer
-from codesign_jax.runs import choice
+from codesign_jax.runs import cases
 from codesign_jax.scene.parameters import fingers_of
 from codesign_jax.scene.schema import InputError
 from codesign_jax.studio import process
@@ -40,7 +40,7 @@ LOOKED_AT = 15
 """States of a grasp in which overlaps are sought: a tenth of a second."""
 
 
-class Shown(NamedTuple):
+class ShownGrasp(NamedTuple):
     """What a tab shows: what was asked for, with a legal design, and the grasp that came of it."""
 
     view: View
@@ -62,7 +62,7 @@ class Tab:
         self._tell = tell or self.send
         self._asked: collections.deque[View] = collections.deque(maxlen=1)  # the newest
         self._actions: collections.deque[Callable[[], None]] = collections.deque()
-        self._shown: Shown | None = None
+        self._shown: ShownGrasp | None = None
         self._looked = self._pictured = False
         self._outcomes: list[Outcome] = []  # of trials of the design that is shown
         self._search: tuple[Any, Any, int] | None = None  # optimiser, state, episodes done
@@ -165,7 +165,7 @@ class Tab:
         work = self._following(shown) if shown.view.resting else None
         return functools.partial(work, shown) if work else None, self._rest
 
-    def _following(self, shown: Shown) -> Callable[[Shown], None] | None:
+    def _following(self, shown: ShownGrasp) -> Callable[[ShownGrasp], None] | None:
         """What is still to be told of a design whose sliders rest."""
         if shown.view.pictures and not self._pictured:
             return self._tell_pictures
@@ -192,21 +192,21 @@ class Tab:
         if shown := self._shown:
             self._shown = shown._replace(view=shown.view._replace(resting=False))
 
-    def _tell_pictures(self, shown: Shown) -> None:
+    def _tell_pictures(self, shown: ShownGrasp) -> None:
         self._pictured = True
         self.send("pictures", viewer.strip(shown.bench.case.scene, shown.grasp))
 
-    def _tell_forces(self, shown: Shown) -> None:
+    def _tell_forces(self, shown: ShownGrasp) -> None:
         self._shown = shown._replace(grasp=shown.bench.grasp(shown.view, shown.bench.recorder))
         self.send("grasp", _told(self._shown))
 
-    def _tell_trials(self, shown: Shown) -> None:
+    def _tell_trials(self, shown: ShownGrasp) -> None:
         left = shown.view.trials - self._total
         found = shown.bench.outcomes(shown.view.design, self._total)
         self._outcomes.append(jax.tree.map(lambda v: v[:left], found))
         self._tell_verdict(shown)
 
-    def _tell_overlap(self, shown: Shown) -> None:
+    def _tell_overlap(self, shown: ShownGrasp) -> None:
         self._looked = True
         self.send("overlap", _deepest(shown))
 
@@ -227,7 +227,7 @@ class Tab:
         if before and (before.view.shape, before.view.noise) == (view.shape, view.noise):
             shown = before._replace(view=view)  # a slider was let go where it has been seen
         else:
-            shown = Shown(view, bench, bench.grasp(view))
+            shown = ShownGrasp(view, bench, bench.grasp(view))
         self._shown = shown
         self._looked = False
         self._pictured = False
@@ -235,7 +235,7 @@ class Tab:
         if view.resting:
             self._tell_verdict(shown)
 
-    def _tell_verdict(self, shown: Shown) -> None:
+    def _tell_verdict(self, shown: ShownGrasp) -> None:
         view = shown.view
         scene = shown.bench.case.scene
         ends: list[int] = []
@@ -272,7 +272,7 @@ class Tab:
             self.send("improving", False)
             self.send("state", "")
 
-    def _improve(self, shown: Shown, optimizer: Any, state: Any, done: int) -> None:
+    def _improve(self, shown: ShownGrasp, optimizer: Any, state: Any, done: int) -> None:
         """One episode, whose answer so far is shown."""
         state, info = shown.bench.task.episode(optimizer, state)
         ends = codesign.verdicts(jax.tree.map(np.asarray, info.outcomes))
@@ -290,7 +290,7 @@ class Tab:
 
     # ---- the run, and what is written
 
-    def _current(self) -> Shown:
+    def _current(self) -> ShownGrasp:
         if self._shown is None:
             raise InputError(["there is no grasp of this design; move a slider"])
         return self._shown
@@ -301,7 +301,7 @@ class Tab:
         desk = self._desk
         if place is not None and desk.record is not None:
             e, p = place
-            found = choice.find_grasp(desk.case.scene, desk.record, episode=e, particle=p).design
+            found = cases.find_grasp(desk.case.scene, desk.record, episode=e, particle=p).design
         view = self._current().view
         self._asked.append(view._replace(design=found, resting=True, number=None))
 
@@ -321,7 +321,7 @@ class Tab:
     def _page(self) -> None:
         view, bench, grasp = self._current()
         space = bench.case.space
-        lines = [runs.describe(space, view.design), choice.ending(grasp.outcome)]
+        lines = [runs.describe(space, view.design), cases.ending(grasp.outcome)]
         with self._desk.reserved("grasp", ".html") as path:
             viewer.write(bench.case.scene, grasp, path, title="A grasp in 3D", text=lines)
         self.send("done", f"written: {path}, for any browser, offline")
@@ -356,7 +356,7 @@ def _words(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"[:1000]
 
 
-def _told(shown: Shown) -> dict[str, Any]:
+def _told(shown: ShownGrasp) -> dict[str, Any]:
     view, bench, grasp = shown
     scene = bench.case.scene
     space = bench.case.space
@@ -379,14 +379,14 @@ def _told(shown: Shown) -> dict[str, Any]:
         "replay": replay,
         "design": common.shortest(space, view.design),
         "limits": limits,
-        "ending": choice.ending(grasp.outcome),
+        "ending": cases.ending(grasp.outcome),
         "cost": float(grasp.outcome.cost),
         "warnings": stress.of_design(scene, grasp.params),
         "series": series | {"lost": 1e3 * scene.cost.lost_distance},
     }
 
 
-def _deepest(shown: Shown) -> str:
+def _deepest(shown: ShownGrasp) -> str:
     scene = shown.bench.case.scene
     grasp = shown.grasp
     motion = bodies.motion(scene, grasp)

@@ -25,14 +25,14 @@ def make(
       qvel: Generalized velocities, shape (world, nv).
       acc: Accelerations, the solver's warm start, in the order of qvel, the object's as in
         `kinematics.Acc`, shape (world, nv).
-      hold: What contacts hold of friction, `held` in `model.State`; None for nothing.
+      hold: What contacts hold of friction, `held` in `model.RolloutState`; None for nothing.
     """
     start = model.split(scene, jnp.concatenate([qpos, qvel], 1))
     start = start if hold is None else start._replace(held=hold)
     return _in_lanes(scene, start._replace(acc=acc))
 
 
-def _in_lanes(scene: Scene, start: model.State) -> State:
+def _in_lanes(scene: Scene, start: model.RolloutState) -> State:
     lay = layout(scene)
     end = 6 + lay.dofs.size
     q, v, a, step, going, speed = (jnp.asarray(x).T[:, None] for x in start[:6])
@@ -84,7 +84,7 @@ def flat(state: State) -> jax.Array:
 
 
 def whole(state: State) -> jax.Array:
-    """The state as `Trace.last` has it, see `model.State`."""
+    """The state as `Trace.last` has it, see `model.RolloutState`."""
     # A step of a decided world leaves accelerations that nothing reads and that may be no numbers.
     acc = jnp.where(state.going[0, 0, :, None] > 0, flat_acc(state.acc), 0.0)
     numbers = (x[0].T for x in (state.step, state.going, state.speed))

@@ -18,7 +18,7 @@ from codesign_jax.engines.structured.laws import meshes
 from codesign_jax.engines.structured.laws.kinematics import State
 from codesign_jax.engines.structured.world_model import WorldModel, world_constants
 from codesign_jax.model import ModelFields
-from codesign_jax.scene import Scene, effects, reach
+from codesign_jax.scene import Scene, effects, mesh_margins
 from codesign_jax.types import Forces, Status, Trace
 
 FAR = 1e30
@@ -72,7 +72,7 @@ class StructuredEngine(Equal):
         effects.refuse(scene.effects, self.name)
         if (reason := launch.available(jax.default_backend())) is not None:
             raise _unavailable(reason)
-        reach.refuse(scene.objects, reach.contact_radius(scene.hand))
+        mesh_margins.refuse(scene.objects, mesh_margins.contact_radius(scene.hand))
         if segment is not None and segment < 1:
             raise ValueError(f"segment = {segment}: a segment has one time step at least")
         if truncate and segment is None:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 
-from codesign_jax import reuse, store
+from codesign_jax import array_files, reuse
 from codesign_jax.scene.meshes.surface import signed_distance
 
 # The error grows in proportion to the cell at edges and with its square elsewhere.
@@ -40,7 +40,7 @@ def build(vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float) -
       vertices: Positions in the body's frame [m], shape (vertex, 3).
       faces: Vertex indices, shape (face, 3).
       bound: Largest error [m].
-      reach: How far beyond the surface the grid goes [m]; see `codesign_jax.scene.reach`.
+      reach: How far beyond the surface the grid goes [m]; see `codesign_jax.scene.mesh_margins`.
     """
     points = near_surface(vertices, faces, 3000)
     exact = signed_distance(vertices, faces, points)
@@ -135,9 +135,9 @@ def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float, reac
     path = reuse.folder() / "meshes" / f"{name}.kept"
 
     def made() -> bytes:
-        return store.packed(build(vertices, faces, bound, reach)._asdict())
+        return array_files.packed(build(vertices, faces, bound, reach)._asdict())
 
-    found: dict[str, Any] = store.unpacked(
+    found: dict[str, Any] = array_files.unpacked(
         io.BytesIO(reuse.kept(path, made, worth=WORTH_KEEPING)), path
     )
     for name in ("cell", "error", "worst"):

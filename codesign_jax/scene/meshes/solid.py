@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from codesign_jax.scene.mesh_margins import LEAST
 from codesign_jax.scene.meshes import grid, mass, reading, repair, support, surface
-from codesign_jax.scene.reach import LEAST
 from codesign_jax.scene.schema import InputError
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
@@ -41,7 +41,7 @@ class Solid:
     reach: float = LEAST  # how far beyond the surface distances are known [m]
 
     def reaching(self, reach: float) -> "Solid":
-        """The solid with distances up to another way from its surface [m]; see `scene.reach`."""
+        """The solid with distances up to `reach` [m] from its surface; see `mesh_margins`."""
         if reach == self.reach:
             return self
         digest = hashlib.sha256(f"{self.digest} {reach!r}".encode()).hexdigest()

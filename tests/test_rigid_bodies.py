@@ -13,7 +13,7 @@ from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured.laws import rings, shapes
 from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.runs import scene_files
-from codesign_jax.scene import objects, primitives, rigid, schema
+from codesign_jax.scene import objects, primitives, rigid_bodies, schema
 from tests.helpers import grasps
 from tests.helpers.solids import box, object_file
 
@@ -46,8 +46,8 @@ def test_angles_turn_as_mujocos():
     text = """<mujoco><compiler eulerseq="XYZ"/><worldbody><body euler="20 -35 70">
       <geom size="1"/></body></worldbody></mujoco>"""
     theirs = mujoco.MjModel.from_xml_string(text).body_quat[1]
-    np.testing.assert_allclose(rigid.turned((20, -35, 70), (1, 0, 0, 0)), theirs, atol=1e-15)
-    np.testing.assert_allclose(rigid.turned(theirs, (1, 0, 0, 0)), theirs, atol=1e-15)
+    np.testing.assert_allclose(rigid_bodies.turned((20, -35, 70), (1, 0, 0, 0)), theirs, atol=1e-15)
+    np.testing.assert_allclose(rigid_bodies.turned(theirs, (1, 0, 0, 0)), theirs, atol=1e-15)
 
 
 @pytest.mark.parametrize("kind", SHAPES)
@@ -87,7 +87,9 @@ def test_a_tilted_box_rests_by_its_stable_poses(tmp_path):
     np.testing.assert_allclose([p.probability for p in found], [*sides.values()], atol=1e-6)
     for k, (height, angle) in enumerate(zip(sides, (None, 55, 35), strict=True), 1):
         shape = only(tmp_path, f'{MESH}; pose = "stable:{k}"')
-        assert shape.rest_height(rigid.up(shape.upright)) == pytest.approx(1e-3 * height, rel=1e-6)
+        assert shape.rest_height(rigid_bodies.up(shape.upright)) == pytest.approx(
+            1e-3 * height, rel=1e-6
+        )
         assert shape.height == pytest.approx(2e-3 * height, rel=1e-6)
         assert shape.fall == (0, 0.0)
         if angle:  # about x, along which the box was turned in its file
@@ -133,7 +135,7 @@ def test_what_topples_is_said_before_a_run(tmp_path, degrees):
 def put_down(shape):
     """MuJoCo's own model of a primitive two seconds after it was put on a plane."""
     quat, size = (" ".join(map(str, v)) for v in (shape.upright, shape.half_sizes))
-    height = shape.rest_height(rigid.up(shape.upright))
+    height = shape.rest_height(rigid_bodies.up(shape.upright))
     text = f"""<mujoco><worldbody><geom type="plane" size="1 1 1"/>
       <body pos="0 0 {height}" quat="{quat}"><freejoint/>
       <geom type="{shape.type}" size="{size}" mass="0.1"/></body></worldbody></mujoco>"""
@@ -220,13 +222,15 @@ def test_a_primitive_may_have_its_centre_of_mass_elsewhere(tmp_path):
     expected = np.sort(compiled.body_inertia[1])
     np.testing.assert_allclose(0.35 * np.sort(shape.unit_inertia), expected, rtol=1e-9)
     # STL has float32: 4e-9 m of 60 mm.
-    assert shape.rest_height(rigid.up(shape.upright)) == pytest.approx(0.06 + low, abs=1e-8)
+    assert shape.rest_height(rigid_bodies.up(shape.upright)) == pytest.approx(0.06 + low, abs=1e-8)
     assert shape.radius == pytest.approx(np.linalg.norm([0.02, 0.02, 0.06 - low]), abs=1e-8)
     assert len(shape.resting()) == 3  # its ends are two
     kept = scene.load("paper_spheres", object_set=tmp_path / "objects.toml")
     scene_files.write_scene(kept, tmp_path / "run")  # reads it back and compares
     lying = only(tmp_path, SHAPES["capsule"] + "; centre_of_mass = [0, 0, 0.01]")
-    assert lying.rest_height(rigid.up(lying.upright)) == pytest.approx(0.02, rel=2e-3)  # facets
+    assert lying.rest_height(rigid_bodies.up(lying.upright)) == pytest.approx(
+        0.02, rel=2e-3
+    )  # facets
 
 
 def test_mass_of_primitives_by_density(tmp_path):
@@ -281,7 +285,7 @@ def on_table(kind):
     size = SIZES[kind]
     quat = " ".join(map(str, shape.upright))
     text = f"""<mujoco><worldbody><geom type="plane" size="1 1 1"/>
-      <body pos="0 0 {shape.reach(size, rigid.up(shape.upright))}" quat="{quat}"><freejoint/>
+      <body pos="0 0 {shape.reach(size, rigid_bodies.up(shape.upright))}" quat="{quat}"><freejoint/>
       <geom type="{kind}" size="{" ".join(map(str, size))}" mass="1"/></body>
     </worldbody></mujoco>"""
     return mujoco.MjModel.from_xml_string(text)

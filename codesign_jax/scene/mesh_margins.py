@@ -25,14 +25,14 @@ _DEVIATIONS = 2
 """Standard deviations of the size noise by which an object may be smaller than its mesh."""
 
 
-def of(radius: float, size_noise: float) -> float:
+def needed(radius: float, size_noise: float) -> float:
     """How far from the surface of a mesh in its own size distances are needed [m].
 
     Args:
       radius: Largest radius of a contact sphere [m].
     """
-    needed = radius / (1 - _DEVIATIONS * size_noise)
-    return LEAST if needed <= LEAST else math.ceil(needed / _STEP - 1e-9) * _STEP
+    margin = radius / (1 - _DEVIATIONS * size_noise)
+    return LEAST if margin <= LEAST else math.ceil(margin / _STEP - 1e-9) * _STEP
 
 
 def contact_radius(hand: Hand) -> float:
@@ -60,9 +60,9 @@ def fit(objects: ObjectSet, hand: Hand) -> ObjectSet:
     """The set with the distances of its meshes as far out as the hand needs."""
     if not any(shape.mesh for shape in objects.object):
         return objects
-    needed = of(contact_radius(hand), objects.noise.size)
+    margin = needed(contact_radius(hand), objects.noise.size)
     shapes = (
-        dataclasses.replace(shape, mesh=shape.mesh.reaching(needed)) if shape.mesh else shape
+        dataclasses.replace(shape, mesh=shape.mesh.reaching(margin)) if shape.mesh else shape
         for shape in objects.object
     )
     return dataclasses.replace(objects, object=tuple(shapes))
@@ -78,13 +78,13 @@ def refuse(objects: ObjectSet, radius: Any) -> None:
         return
     largest = float(np.max(radius))
     noise = float(np.max(objects.noise.size))
+    margin = needed(largest * (1 - 1e-6), noise)
     problems = [
         f"object {shape.name!r}: distances reach {1e3 * shape.mesh.reach:g} mm from its surface, "
-        f"contact spheres of radius {1e3 * largest:g} mm need {1e3 * needed:g} mm: raise the "
+        f"contact spheres of radius {1e3 * largest:g} mm need {1e3 * margin:g} mm: raise the "
         "bounds of `height` or palm.contact_radius in the hand file, and read the scene again"
-        for needed in [of(largest * (1 - 1e-6), noise)]
         for shape in objects.object
-        if shape.mesh and shape.mesh.reach < needed
+        if shape.mesh and shape.mesh.reach < margin
     ]
     if problems:
         raise schema.InputError(problems)

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from codesign_jax import cli, own, preflight, runs
+from codesign_jax import cli, preflight, runs, user_code
 from tests.helpers.command_runs import assert_same_run, snapshot
 from tests.helpers.toy_engine import TINY
 
@@ -17,7 +17,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.optimize import Space, State
+from codesign_jax.optimize import Space, OptimizerState
 from codesign_jax.optimize.protocol import episode_key, summarize
 
 no_function = 3
@@ -34,7 +34,7 @@ class Climber:
     def init(self, key, seed_particle, num_particles):
         seed = jnp.asarray(seed_particle, float)
         memory = {"best": seed, "cost": jnp.inf * jnp.ones(())}
-        return State(jnp.tile(seed, (num_particles, 1)), jnp.int32(0), key, memory)
+        return OptimizerState(jnp.tile(seed, (num_particles, 1)), jnp.int32(0), key, memory)
 
     def ask(self, state, mask):
         low, high = jnp.asarray(self.space.low), jnp.asarray(self.space.high)
@@ -50,7 +50,7 @@ class Climber:
             "cost": jnp.minimum(cost[best], state.memory["cost"]),
         }
         order = jnp.argsort(cost).astype(jnp.int32)
-        new = State(population[order], state.episode + 1, state.key, memory)
+        new = OptimizerState(population[order], state.episode + 1, state.key, memory)
         return new, summarize(cost, jnp.ones_like(cost), order)
 
 
@@ -224,7 +224,7 @@ def test_a_policy_is_searched_and_said_wherever_it_acts(here, capsys):
     assert cli.main(files) == 0
     said = capsys.readouterr().out
     assert "a.toml keeps " in said and "b.toml keeps " in said and "difference: " in said
-    one, other = (own.make_policy("mine:Pull", the_scene)[0] for _ in range(2))
+    one, other = (user_code.make_policy("mine:Pull", the_scene)[0] for _ in range(2))
     assert one is other  # its programs are compiled once
 
 

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import control, own, rollout
+from codesign_jax import control, rollout, user_code
 from codesign_jax.codesign import episode_trials
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.policy import ControlLoop
-from codesign_jax.reuse import Program, shared
+from codesign_jax.reuse import SceneProgram, shared
 from codesign_jax.runs import scene_files
 from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.runs.reading import Tell, load_record, read_run
@@ -92,7 +92,7 @@ class Case(NamedTuple):
         engine = make_engine(self.engine, scene)
         if not self.policy:
             return engine
-        return ControlLoop(engine, own.make_policy(self.policy, scene)[0])
+        return ControlLoop(engine, user_code.make_policy(self.policy, scene)[0])
 
     def simulate(self, trials: int, key: jax.Array, first: int = 0) -> Outcome:
         """Outcomes in trials that depend on objects and key alone, arrays of shape (trial,).
@@ -111,7 +111,7 @@ class Case(NamedTuple):
         """As `simulate`, and where a policy left the key frames; None without a policy."""
         design = jnp.asarray(self.design, jnp.float32)
         self.space.check(design[None])
-        run = Program(self.scene, _in_trials(self.make_engine(), self.space, trials))
+        run = SceneProgram(self.scene, _in_trials(self.make_engine(), self.space, trials))
         return jax.tree.map(np.asarray, interruptible(run, design, (key, jnp.asarray(first))))
 
     def digest(self, *numbers: int) -> str:

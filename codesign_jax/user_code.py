@@ -1,6 +1,6 @@
-"""An optimiser, a cost or a policy of the user's own, named on the command line as `module:name`.
+"""Code of the user, named on the command line as `module:name`: an optimiser, a cost or a policy.
 
-The module is looked for in the working directory first, then among the installed packages.  It is
+The module is sought in the working directory first, then among the installed packages.  It is
 imported for a command line that names it and for nothing else: no file can ask for it.
 """
 
@@ -21,7 +21,7 @@ import numpy as np
 from codesign_jax import rollout
 from codesign_jax.engines import DEFAULT, make_engine
 from codesign_jax.engines.base import recording
-from codesign_jax.optimize import Optimizer, Space, State
+from codesign_jax.optimize import Optimizer, OptimizerState, Space
 from codesign_jax.policy import ControlLoop, Policy, searched
 from codesign_jax.rollout import CostFunction
 from codesign_jax.scene import InputError, Scene
@@ -33,7 +33,7 @@ FOLDER = "code"
 _NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 
 
-def is_own(name: str) -> bool:
+def is_user_code(name: str) -> bool:
     """Whether a name is one of the user's own, and none of this package's."""
     return ":" in name
 
@@ -57,7 +57,7 @@ def contents(names: Iterable[str]) -> dict[str, bytes]:
     where that is another; what these import is not among them.
     """
     found = {}
-    for name in filter(is_own, names):
+    for name in filter(is_user_code, names):
         thing = _load(name)
         for module in {name.partition(":")[0], getattr(thing, "__module__", None)} & {*sys.modules}:
             found[f"{FOLDER}/{module}.py"] = _source(name, module).read_bytes()
@@ -145,12 +145,15 @@ def _try(flag: str, make: Any, made: Optimizer, n: int) -> None:
     seed = jnp.asarray((low + high) / 2, float)
     mask = np.ones(low.shape, bool)
     state = _tried(flag, make, lambda: made.init(jax.random.key(0), seed, n))
-    if not isinstance(state, State) or np.shape(state.particles) != (n, low.size):
+    if not isinstance(state, OptimizerState) or np.shape(state.particles) != (n, low.size):
         raise InputError(
-            [f"{flag}: init must return an optimize.State with particles ({n}, {low.size})"]
+            [
+                f"{flag}: init must return an optimize.OptimizerState with particles "
+                f"({n}, {low.size})"
+            ]
         )
 
-    def episode(state: State) -> tuple[jax.Array, Any]:
+    def episode(state: OptimizerState) -> tuple[jax.Array, Any]:
         population = made.ask(state, mask)
         return population, made.tell(state, population, jnp.zeros(n), mask)
 

@@ -8,7 +8,7 @@ from codesign_jax import batch
 from codesign_jax.codesign import Task
 from codesign_jax.commands.flags import Export
 from codesign_jax.engines import Engine
-from codesign_jax.runs.choice import Case
+from codesign_jax.runs.cases import Case
 from codesign_jax.runs.progress import Meter
 from codesign_jax.statistics import Interval
 from codesign_jax.terminal import Console

@@ -27,7 +27,7 @@ _HEADS = ("about", "code", "schema")
 Arrays = Mapping[str, Any]
 
 
-class StoreError(ValueError):
+class ArrayFileError(ValueError):
     """A file is not what was written, or not of this kind; the message says so of the file."""
 
 
@@ -40,7 +40,7 @@ def save(path: Path, arrays: Arrays) -> None:
 def load(path: Path) -> dict[str, np.ndarray]:
     """Reads the arrays of a file; texts in them are one line each."""
     if path.exists() and not path.is_file():  # a FIFO would be waited for
-        raise StoreError(f"{path} is no file")
+        raise ArrayFileError(f"{path} is no file")
     with path.open("rb") as file:
         return unpacked(file, path)
 
@@ -65,8 +65,10 @@ def unpacked(file: BinaryIO, path: Path) -> dict[str, np.ndarray]:
             if str(arrays.pop(_DIGEST)) == _digest(arrays):
                 return {name: _lines(value) for name, value in arrays.items()}
     except Exception as error:  # zip, zlib and NumPy have a dozen kinds for what damage they find
-        raise StoreError(f"{path} is damaged, or another version wrote it: {error!r}") from error
-    raise StoreError(f"{path} is damaged: it does not hold what was written")
+        raise ArrayFileError(
+            f"{path} is damaged, or another version wrote it: {error!r}"
+        ) from error
+    raise ArrayFileError(f"{path} is damaged: it does not hold what was written")
 
 
 def _lines(value: np.ndarray) -> np.ndarray:
@@ -102,17 +104,19 @@ def refusal(arrays: Arrays, about: Any) -> str:
     return f"is of another {what}"
 
 
-def keep(path: Path, about: Any, results: Arrays) -> None:
-    """Writes results that `found` finds again, see `head`."""
+def save_results(path: Path, about: Any, results: Arrays) -> None:
+    """Writes results that `load_results` finds again, see `head`."""
     save(path, {**head(about), **results})
 
 
-def found(path: Path, about: Any, *, any_code: bool = False) -> tuple[dict[str, Any] | None, str]:
+def load_results(
+    path: Path, about: Any, *, any_code: bool = False
+) -> tuple[dict[str, Any] | None, str]:
     """Results of `about` that are in a file, or None; and what is amiss with them, if anything is.
 
     Args:
       path: The file; without it there is nothing amiss.
-      about: As of `keep`.
+      about: As of `save_results`.
       any_code: Whether results of another version of the code are returned, to be shown as such
         and not to go on from.
     """
@@ -122,7 +126,7 @@ def found(path: Path, about: Any, *, any_code: bool = False) -> tuple[dict[str, 
         return None, ""
     except OSError as error:
         return None, f"cannot be read ({error.strerror})"
-    except StoreError:
+    except ArrayFileError:
         return None, "is damaged, or of another version of the code"
     why = refusal(arrays, about)
     same_case = str(arrays.get("about")) == str(head(about)["about"])

@@ -3,8 +3,8 @@
 An orientation is three angles or a quaternion.  Roll, pitch and yaw [deg] turn about the axes x, y
 and z of the world, in this order; a quaternion is (w, x, y, z).
 
->>> from codesign_jax.scene import rigid
->>> [round(v, 3) for v in rigid.turned((90.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))]
+>>> from codesign_jax.scene import rigid_bodies
+>>> [round(v, 3) for v in rigid_bodies.turned((90.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))]
 [0.707, 0.707, 0.0, 0.0]
 """
 

@@ -3,7 +3,6 @@
 import dataclasses
 import importlib.util
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,7 @@ from codesign_jax import engines, files, preflight, provenance, rollout, runs
 from codesign_jax.commands import common, reference, tolerance_study
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Export
-from codesign_jax.export import grasps, plain, process, sheet, tables, valves
+from codesign_jax.export import grasps, motion, plain, process, sheet, tables, valves
 from codesign_jax.export.process import Process, Size
 from codesign_jax.runs.cases import Case
 from codesign_jax.runs.progress import Busy
@@ -21,9 +20,6 @@ from codesign_jax.scene.objects import Shape
 from codesign_jax.scene.schema import InputError
 from codesign_jax.terminal import Console
 from codesign_jax.types import Params, Trial
-
-if TYPE_CHECKING:
-    from codesign_jax.export import workshop
 
 
 def main(options: Export) -> int:
@@ -122,13 +118,15 @@ def write_files(
     """Writes all that is asked for; tolerances if there is an engine to simulate them."""
     _models(case, params, folder, options, console)
     nominal = jax.tree.map(np.asarray, rollout.nominal_trial(case.scene))
-    tables.write_commands(folder, case.scene, grasps.timed_controls(case.scene, params, nominal))
+    peaks = motion.write(folder, case.scene, params, nominal)
+    for warning in motion.warnings(peaks):
+        console.print(f"note: {warning}")
     valves.write(folder, case.scene, params)
     printed = None if options.no_parts else _parts(case, params, sizes, folder, options, console)
     if not options.no_sheet:
         found = tolerance_study.simulate(case, engine, options, console) if engine else None
         with Busy(console, "writing the build sheet"):
-            lacking = _sheet(case, params, sizes, (found, printed), folder, options)
+            lacking = _sheet(case, params, sizes, (found, printed, peaks), folder, options)
         if lacking:
             console.print(
                 f"the PDF writes ? for letters that no font here has: {' '.join(lacking)} "
@@ -145,6 +143,10 @@ def _tell(case: Case, options: Export, console: Console) -> None:
     console.print(
         f"  {tables.COMMANDS}: commands of arm and valves; turns: roll about x, then yaw, then "
         "pitch, positive towards +x, as above"
+    )
+    console.print(
+        f"  {tables.STILL}, {motion.PLAYER.name}: the same without the shaking, and a player of "
+        "arm and valves together"
     )
     console.print(f"  {valves.VALVES}, {valves.PLAYER.name}: pressures for regulators")
     if not options.no_parts:
@@ -166,8 +168,8 @@ def _parts(
     folder: Path,
     options: Export,
     console: Console,
-) -> "workshop.Printed":
-    from codesign_jax.export import meshes, palm, workshop  # needs the extra
+) -> process.Printed:
+    from codesign_jax.export import meshes, palm  # needs the extra
 
     folder = folder / meshes.FOLDER
     how = _process(options)
@@ -193,7 +195,7 @@ def _parts(
             )
     volume = made.body.volume() + sum(bar.volume() for bar in made.bars)
     names = [part.name for part in parts]
-    return workshop.Printed(names, volume, made.flange, made.below, problems)
+    return process.Printed(names, volume, made.flange, made.below, problems)
 
 
 def _models(case: Case, params: Params, folder: Path, options: Export, console: Console) -> None:
@@ -230,7 +232,7 @@ def _sheet(
     case: Case,
     params: Params,
     sizes: list[Size],
-    added: "tuple[sheet.Drift | None, workshop.Printed | None]",
+    added: tuple[sheet.Drift | None, process.Printed | None, dict[str, motion.Peaks]],
     folder: Path,
     options: Export,
 ) -> list[str]:
@@ -243,7 +245,7 @@ def _sheet(
     for note in kept.notes:
         common.warn(note)
     tested = None if kept.fresh is None else str(kept.fresh), kept.stress
-    found, printed = added
+    found, printed, peaks = added
     content = sheet.sheet_sections(case.scene, params, sizes, found, tested)
     title = f"Build sheet: {case.scene.hand.name}"
     source = f"Best final design of {options.run_folder}" if options.run_folder else "Design"
@@ -259,6 +261,11 @@ def _sheet(
     ]
     if printed:
         content[0].notes.extend(f"Warning: the palm: {words}." for words in printed.problems)
+    doubts = motion.warnings(peaks) + motion.room_warnings(case.scene, params)
+    content[0].notes.extend(f"Warning: {words}." for words in doubts)
+    nominal = jax.tree.map(np.asarray, rollout.nominal_trial(case.scene))
+    content.insert(4, motion.section(case.scene, params, nominal, peaks))
+    content.insert(5, motion.room_section(case.scene, params, sheet.sag(case.scene, sizes)))
     assembly = workshop.assembly_sections(case.scene, params, sizes, _process(options), printed)
     sheet.write(folder, title, lines, [*content, *assembly])
-    return drawing.write(folder, title, case.scene, params, sizes, printed)
+    return drawing.write(folder, title, case.scene, params, sizes, printed, _process(options))

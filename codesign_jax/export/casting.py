@@ -20,7 +20,7 @@ from typing import NamedTuple
 import manifold3d
 import numpy as np
 
-from codesign_jax.export.process import Process, Size, inlet
+from codesign_jax.export.process import FABRIC, Process, Size, inlet
 
 Line = Callable[[float], float]
 """A number that changes linearly along a finger."""
@@ -101,14 +101,17 @@ def _tube(size: Size, radius: float, start: float, end: float) -> manifold3d.Man
     return tube.rotate([0, 90, 0]).translate([start, 0, size.base.height / 2])
 
 
-def _pinned(part: manifold3d.Manifold, size: Size, process: Process) -> manifold3d.Manifold:
-    """A mould with the hole of the pin that keeps the inlet free, from outside into the core."""
-    radius = inlet(size, process) / 2
-    if not radius:
-        return part
+def pin(size: Size, process: Process) -> manifold3d.Manifold:
+    """The pin that keeps the inlet free, from outside of the tray into the core."""
     start, end = size.chamber_ends
     outside = -size.root - 4 * process.mould_wall - process.clearance
-    return part - _tube(size, radius, outside, start + min(PIN, (end - start) / 2))
+    radius = inlet(size, process) / 2
+    return _tube(size, radius, outside, start + min(PIN, (end - start) / 2))
+
+
+def _pinned(part: manifold3d.Manifold, size: Size, process: Process) -> manifold3d.Manifold:
+    """A mould with the hole of the pin."""
+    return part - pin(size, process) if inlet(size, process) else part
 
 
 def slope(size: Size, process: Process, x: float, z: float) -> float:
@@ -141,7 +144,7 @@ def _outside(size: Size, process: Process) -> Line:
     return shifted(_at_rim(size, process), process.mould_wall)
 
 
-def _overlap(size: Size) -> float:
+def overlap(size: Size) -> float:
     return min(OVERLAP, *((s.height - s.wall) / 2 for s in (size.base, size.tip)))
 
 
@@ -154,7 +157,7 @@ def _core(size: Size, process: Process) -> manifold3d.Manifold:
     core = prism(ends, half, shifted(low, -wall / 2), high, drafted)
     inside = shifted(_outside(size, process), process.clearance)
     below = shifted(rim, -wall)
-    depth = _overlap(size)
+    depth = overlap(size)
     frame = _around(size, shifted(inside, wall), below, shifted(rim, depth))
     frame -= _around(size, inside, rim, shifted(rim, depth + 1.0))
     opening = _at_rim(size, process)
@@ -181,8 +184,11 @@ def _base(size: Size, process: Process) -> manifold3d.Manifold:
     wall = process.mould_wall
     rim = _rim(size)
     wide = _at_rim(size, process)
-    top = shifted(rim, _overlap(size))
+    top = shifted(rim, overlap(size))
     room = shifted(wide, process.clearance)
     outer = _around(size, shifted(room, wall), lambda x: -wall, top)
     outer -= _around(size, wide, lambda x: 0.0, shifted(top, 1.0))
-    return outer - _around(size, room, rim, shifted(top, 1.0))
+    outer -= _around(size, room, rim, shifted(top, 1.0))
+    # The fabric leaves upwards behind the root.
+    behind = -size.root - room(-size.root) - FABRIC, -size.root
+    return outer - prism(behind, half_width(size), rim, shifted(top, 1.0))

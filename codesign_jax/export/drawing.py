@@ -13,9 +13,8 @@ from matplotlib.axes import Axes
 from scipy.spatial import ConvexHull
 
 from codesign_jax.export import fonts, posture, valves
-from codesign_jax.export.process import BACK, BAR, FABRIC, FLOOR, Section, Size
+from codesign_jax.export.process import BACK, BAR, FABRIC, FLOOR, Printed, Process, Section, Size
 from codesign_jax.export.sheet import NAME, castable, corners, places
-from codesign_jax.export.workshop import Printed
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
 
@@ -34,11 +33,17 @@ def write(
     params: Params,
     sizes: Sequence[Size],
     printed: Printed | None = None,
+    process: Process | None = None,
 ) -> list[str]:
-    """Writes the PDF; returns letters of the title that no font of this system has."""
+    """Writes the PDF; returns letters of the title that no font of this system has.
+
+    Args:
+      printed: The printed parts; None where they were left out.
+      process: What is decided about them; None: no drawing of the moulds.
+    """
     path = folder / f"{NAME}.pdf"
     with matplotlib.backends.backend_pdf.PdfPages(path) as file:
-        for page in pages(title, scene, params, sizes, printed):
+        for page in pages(title, scene, params, sizes, printed, process):
             file.savefig(page)
     return fonts.of_text(title).lacking
 
@@ -49,8 +54,9 @@ def pages(
     params: Params,
     sizes: Sequence[Size],
     printed: Printed | None = None,
+    process: Process | None = None,
 ) -> list[matplotlib.figure.Figure]:
-    """The pages: the hand, its fingers, and how it is held and turned."""
+    """The pages: the hand, its fingers, their moulds, and how it is held and turned."""
     alike = {}
     for i, size in enumerate(sizes):
         alike.setdefault(size, []).append(i)
@@ -58,6 +64,8 @@ def pages(
     found = [_hand_page(title, scene, params, sizes)]
     for first in range(0, len(rows), _ROWS):
         found.append(_fingers_page(title, rows[first : first + _ROWS]))
+    if printed and process:
+        found.append(_moulds_page(title, rows, process))
     found.append(_mounting_page(title, scene, params, sizes, printed))
     for k, page in enumerate(found, 1):
         page.text(0.94, 0.025, f"{k} of {len(found)}", fontsize=7, ha="right")
@@ -119,6 +127,23 @@ def _fingers_page(title: str, rows: list[tuple[Size, list[int]]]) -> matplotlib.
     figure.text(
         0.06, 0.05, "All in mm. Red: fabric. Left of the dashed line: the root.", fontsize=7
     )
+    return figure
+
+
+def _moulds_page(
+    title: str, rows: list[tuple[Size, list[int]]], process: Process
+) -> matplotlib.figure.Figure:
+    from codesign_jax.export import mould_drawing  # needs the extra
+
+    figure = _page(title)
+    size, fingers = max(rows, key=lambda row: row[0].length)
+    mould_drawing.page(figure, size, process, f"finger {', '.join(map(str, fingers))}")
+    words = (
+        "The longest finger's moulds, cut along the finger's middle and across it between two "
+        "bars; those of the others differ in size alone. The fabric's end hangs out over the root "
+        "as the flap that the clamp bar holds."
+    )
+    figure.text(0.06, 0.08, textwrap.fill(words, 120), fontsize=7, va="top")
     return figure
 
 

@@ -70,8 +70,11 @@ def at(rows, moment):
     return [a + share * (b - a) for a, b in zip(low, high, strict=True)]
 
 
-def scaled(rows, limits, divisors):
-    """The rows with each finger's pressure divided by its own number, or by one for all."""
+def scaled(rows, limits, divisors, cap=False):
+    """The rows with each finger's pressure divided by its own number, or by one for all.
+
+    Pressures above the limit of a finger's wall are refused, or cut to it with `cap`.
+    """
     count = len(rows[0]) - 1
     if len(divisors) not in (1, count):
         raise TableError(f"--divide takes 1 number or {count}, not {len(divisors)}")
@@ -81,10 +84,16 @@ def scaled(rows, limits, divisors):
     found = [[row[0], *(p / d for p, d in zip(row[1:], divisors, strict=True))] for row in rows]
     for finger, limit in enumerate(limits[:count]):
         most = max(row[1 + finger] for row in found)
-        if most > limit * (1 + 1e-6):
+        if most <= limit * (1 + 1e-6):
+            continue
+        if not cap:
             raise TableError(
-                f"finger {finger} would get {most:.1f} kPa, and its wall stands {limit:.1f} kPa"
+                f"finger {finger} would get {most:.1f} kPa, and its wall stands {limit:.1f} kPa; "
+                f"--cap sends no more than that, {100 * limit / most:.0f} % of the moment that it "
+                "is to have; for all of it cast a thicker wall or a stiffer silicone"
             )
+        for row in found:
+            row[1 + finger] = min(row[1 + finger], limit)
     return found
 
 
@@ -138,6 +147,29 @@ def serial_line(port, baud):
         os.close(place)
 
 
+def add_scaling(parser):
+    """The flags of `scaled`."""
+    parser.add_argument(
+        "--divide",
+        type=float,
+        nargs="+",
+        default=[1.0],
+        help="number by which pressures are divided, one for all fingers or one for each: the "
+        "moment of the real finger as a share of the model's (codesign finger --fit)",
+    )
+    parser.add_argument(
+        "--cap",
+        action="store_true",
+        help="cut pressures above the limit of a finger's wall to it, instead of refusing them",
+    )
+
+
+def closed_output():
+    """The exit status where nobody reads standard output any more."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 1
+
+
 def print_out(text):
     """Sends text to standard output at once."""
     sys.stdout.write(text)
@@ -158,21 +190,14 @@ def main(words=None):
     parser.add_argument("--port", help="serial line, such as /dev/ttyUSB0 or COM3")
     parser.add_argument("--baud", type=int, default=115200)
     parser.add_argument("--period", type=float, default=0.05, help="time between lines [s]")
-    parser.add_argument(
-        "--divide",
-        type=float,
-        nargs="+",
-        default=[1.0],
-        help="number by which pressures are divided, one for all fingers or one for each: the "
-        "moment of the real finger as a share of the model's (codesign finger --fit)",
-    )
+    add_scaling(parser)
     parser.add_argument("--no-wait", action="store_true", help="send all lines at once")
     options = parser.parse_args(words)
     signal.signal(signal.SIGTERM, stop)
     try:
         if not 0.001 <= options.period <= 10:
             raise TableError("--period must be 0.001 to 10 s")
-        rows = scaled(*read(options.table), options.divide)
+        rows = scaled(*read(options.table), options.divide, options.cap)
         wait = (lambda seconds: None) if options.no_wait else time.sleep
         if options.port is None:
             play(rows, print_out, options.period, wait)
@@ -182,8 +207,7 @@ def main(words=None):
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+        return closed_output()
     except (OSError, ValueError) as error:
         print(f"error: {getattr(error, 'strerror', None) or error}", file=sys.stderr)
         return 2

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from codesign_jax.scene.hand import Hand
@@ -96,6 +96,16 @@ class Size(NamedTuple):
         """Volume of the silicone with the root, with no inlet [mm^3]."""
         whole = _simpson(lambda x: self.at(x).width * self.at(x).height, -self.root, self.length)
         return whole - self.chamber_volume
+
+
+class Printed(NamedTuple):
+    """What was made of the parts; see `meshes` and `palm`."""
+
+    names: Sequence[str]  # names of the parts' files without their ending
+    palm_volume: float  # volume of the palm with its bars [mm^3]
+    flange: tuple[float, str, float, bool] | None  # screws to the wrist, as `palm.Flange`
+    below: float  # how far seats stand below the palm's underside [mm]
+    problems: Sequence[str] = ()  # what of the palm cannot be built, a sentence each
 
 
 def _simpson(area: Callable[[float], float], start: float, end: float) -> float:

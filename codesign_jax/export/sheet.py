@@ -56,7 +56,7 @@ def sheet_sections(
         _tests(scene, params, sizes, *tested),
         _fingers(scene, params, sizes),
         _mounts(scene, params),
-        _arm(scene, params),
+        _arm(scene, params, sizes),
         _valves(scene, params),
         tolerance_section(drift),
     ]
@@ -191,7 +191,19 @@ def _mounts(scene: Scene, params: Params) -> SheetSection:
     return SheetSection("Mounts", head, rows, notes)
 
 
-def _arm(scene: Scene, params: Params) -> SheetSection:
+def hand_mass(scene: Scene, sizes: Sequence[Size]) -> float:
+    """Mass of the palm with what it bears, and of the fingers in front of it [kg]."""
+    inside = sum(size.root * size.base.width * size.base.height for size in sizes)
+    cast = sum(size.volume for size in sizes) - inside
+    return scene.hand.palm.mass + 1e-9 * cast * scene.hand.material.density
+
+
+def sag(scene: Scene, sizes: Sequence[Size]) -> float:
+    """How far the hand's weight lowers the compliant wrist [mm]."""
+    return 1e3 * hand_mass(scene, sizes) * scene.gravity_on / scene.hand.wrist.linear_stiffness
+
+
+def _arm(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSection:
     rows = []
     for time, x, y, z, roll, pitch, yaw in valves.key_poses(scene, params):
         angles = {"roll": roll, "yaw": yaw, "pitch": pitch}
@@ -204,15 +216,25 @@ def _arm(scene: Scene, params: Params) -> SheetSection:
         f"Key frames of the control {scene.control.name!r}: pose of the arm frame, which is the "
         "middle of the palm's underside while the wrist is not deflected; between them linear"
         + (f", but held after row {', '.join(str(i + 1) for i in held)}" if held else "")
-        + ". commands.csv has every time step, in the same angles, signs and quaternion, and in "
-        "addition the shaking that tests the grasp, from the lift until the chambers are empty.",
-        _clearance(scene, rows),
+        + ". commands_still.csv has every time step of this path, in the same angles, signs and "
+        f"quaternion. commands.csv has in addition the shaking that tests the grasp{_shaken(scene)}"
+        ": its rows differ from this table there.",
+        _clearance(scene, sizes, rows),
         f"{pose.CONVENTION} The drawing on the last page of {NAME}.pdf shows each angle.",
     ]
     return SheetSection("Arm", (*head, "quaternion w x y z"), rows, notes)
 
 
-def _clearance(scene: Scene, rows: Sequence[Sequence[str]]) -> str:
+def _shaken(scene: Scene) -> str:
+    """When the arm is shaken, in words."""
+    ends = scene.phase_ends
+    if "disturb" not in ends:
+        return ""
+    end = ends["disturb"] + scene.phases.deflate_time
+    return f", between {ends['lift']:g} and {end:g} s"
+
+
+def _clearance(scene: Scene, sizes: Sequence[Size], rows: Sequence[Sequence[str]]) -> str:
     """How near the table the palm's rim is commanded, of rows of `_arm`."""
     radius = 1e3 * scene.hand.palm.radius
     lowest = np.inf
@@ -226,9 +248,24 @@ def _clearance(scene: Scene, rows: Sequence[Sequence[str]]) -> str:
             time = row[0]
     return (
         f"The palm's rim, {radius:.0f} mm from its middle, is commanded to {lowest:.0f} mm above "
-        f"the table at the lowest ({time} s), before the wrist gives way. The printed palm, its "
+        f"the table at the lowest ({time} s), before the wrist gives way"
+        f"{_rests(scene, sizes, lowest)}. The printed palm, its "
         "bars and whatever is behind it reach further than the simulated disc: move the empty "
         "hand there slowly first."
+    )
+
+
+def _rests(scene: Scene, sizes: Sequence[Size], height: float) -> str:
+    """Whether the palm rests on the table as the wrist sags, in words."""
+    if not scene.effects.wrist:
+        return ""
+    lower = sag(scene, sizes)
+    if height >= lower:
+        return f" by {lower:.0f} mm under the hand's weight"
+    force = 1e-3 * (lower - height) * scene.hand.wrist.linear_stiffness
+    return (
+        f" by {lower:.0f} mm under the hand's weight: the palm's rim then rests on the table, with "
+        f"{force:.1f} N if the wrist yields upwards alone"
     )
 
 
@@ -245,8 +282,25 @@ def _valves(scene: Scene, params: Params) -> SheetSection:
         "between. Without --port it writes to standard output; --help has the rest. Where "
         "`codesign finger MEASURED.csv --fit` gave a moment of less than the model's, add "
         "`--divide` with that number: the real finger needs more pressure.",
+        _margin(scene, params),
     ]
     return SheetSection("Valves", head, rows, notes)
+
+
+def _margin(scene: Scene, params: Params) -> str:
+    """How far the walls' limits let each finger's pressure be raised."""
+    limits = np.asarray(morphology.pressure_limits(scene.hand, params)) / 1e3
+    highest = valves.key_pressures(scene, params)[:, 1:].max(0)
+    shares = [
+        f"{p / limit:.2f} (finger {i})"
+        for i, (p, limit) in enumerate(zip(highest, limits, strict=True))
+    ]
+    return (
+        f"Smallest `--divide` that the walls' limits allow: {', '.join(shares)}. A smaller one is "
+        "refused; with `--cap` such a finger gets the pressure of its limit, and bends less than "
+        "designed. All of the moment then needs a thicker wall: export again with wall and "
+        "pressure raised."
+    )
 
 
 def tolerance_section(drift: Drift | None) -> SheetSection:

@@ -13,7 +13,7 @@ def words(silicone: Silicone) -> str:
     a, b = silicone.mix
     return (
         f"{silicone.name} (mix {a:g} A : {b:g} B by weight, pours for {silicone.pot_life:g} min, "
-        f"leaves the mould after {silicone.cure_time:g} h at 23 °C)"
+        f"leaves the mould after {silicone.cure_time:g} h at 23 °C [maker])"
     )
 
 

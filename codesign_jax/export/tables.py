@@ -16,6 +16,7 @@ from codesign_jax.scene import Scene
 from codesign_jax.types import Status, Trial, failed
 
 COMMANDS = "commands.csv"
+STILL = "commands_still.csv"
 MODELS = "model"
 GRASPS = "grasps.csv"
 NOTES = "README.txt"
@@ -36,7 +37,7 @@ COMMAND_COLUMNS = {
     "arm_qz": "likewise",
     "pressure_0_kPa": "gauge pressure in the chamber of finger 0; a column for each finger",
 }
-"""Meaning of the columns of commands.csv, a row for each time step."""
+"""Meaning of the columns of commands.csv and commands_still.csv, a row for each time step."""
 
 GRASP_COLUMNS = {
     "model": "name of the model's files",
@@ -69,8 +70,8 @@ def control_columns(scene: Scene) -> list[str]:
     return ["time_s", *arm, *(f"pressure_{i}_Pa" for i in range(scene.num_fingers))]
 
 
-def write_commands(folder: Path, scene: Scene, schedule: np.ndarray) -> Path:
-    """Writes commands.csv in mm, degrees and kPa; `schedule` as of `grasps.timed_controls`."""
+def write_commands(folder: Path, scene: Scene, schedule: np.ndarray, name: str = COMMANDS) -> Path:
+    """Writes commands in mm, degrees and kPa; `schedule` as of `grasps.timed_controls`."""
     arm = pose.of_controls(schedule[:, 1:])
     pressures = 1e-3 * schedule[:, 1 + len(WRIST) :]
     values = np.column_stack([arm, pose.quaternion(*arm[:, 3:].T), pressures])
@@ -82,7 +83,7 @@ def write_commands(folder: Path, scene: Scene, schedule: np.ndarray) -> Path:
         # float32 has 7 digits; + 0.0 writes -0 as 0.
         rows.append([f"{time:.9g}", phase, *(f"{v + 0.0:.7g}" for v in row)])
     head = [*COMMAND_COLUMNS][:-1] + [f"pressure_{i}_kPa" for i in range(scene.num_fingers)]
-    return write_table(folder / COMMANDS, head, rows)
+    return write_table(folder / name, head, rows)
 
 
 def write_grasps(

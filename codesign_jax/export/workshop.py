@@ -2,37 +2,15 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
-import numpy as np
-
-from codesign_jax.export import silicone
-from codesign_jax.export.process import BACK, Process, Size, inlet
-from codesign_jax.export.sheet import NAME, SheetSection
+from codesign_jax.export import shopping, silicone, valves
+from codesign_jax.export.process import FABRIC, Printed, Process, Size, inlet
+from codesign_jax.export.sheet import NAME, SheetSection, hand_mass, sag
 from codesign_jax.scene import Scene
-from codesign_jax.scene.silicones import Silicone
 from codesign_jax.types import Params
 
-PITCH = 2.0
-"""A turn of the thread along a finger [mm] [chosen]."""
-LOSS = 0.15
-"""Silicone that stays in cups and on moulds, as a share of what is cast [chosen]."""
-TUBE = 1.0
-"""Tube for each finger [m] [chosen]."""
-BARS = "M3 x 16"
-"""Screws of the clamp bars, which cut their thread into the palm."""
 PLASTIC = 1.24e-3
 """Density of printed PLA [g/mm^3]."""
-
-
-class Printed(NamedTuple):
-    """What was made of the parts; see `meshes` and `palm`."""
-
-    names: Sequence[str]  # names of the parts' files without their ending
-    palm_volume: float  # volume of the palm with its bars [mm^3]
-    flange: tuple[float, str, float, bool] | None  # screws to the wrist, as `palm.Flange`
-    below: float  # how far seats stand below the palm's underside [mm]
-    problems: Sequence[str] = ()  # what of the palm cannot be built, a sentence each
 
 
 def assembly_sections(
@@ -48,7 +26,7 @@ def assembly_sections(
       printed: The parts; None where they were left out.
     """
     return [
-        _shopping(scene, params, sizes, process, printed),
+        shopping.section(scene, params, sizes, process, printed),
         _castings(scene, sizes),
         _prints(scene, sizes, printed),
         _wrist(scene, sizes, printed),
@@ -64,117 +42,9 @@ def bottom(size: Size) -> float:
     return (end - start) * (areas[0] + 4 * areas[1] + areas[2]) / 6
 
 
-def fabric(size: Size) -> tuple[float, float]:
-    """Length and width of a finger's strip of fabric with the flap under the clamp bar [mm]."""
-    behind = size.at(-size.root).height + BACK
-    return size.length + size.root + behind, max(size.base.width, size.tip.width)
-
-
-def hand_mass(scene: Scene, sizes: Sequence[Size]) -> float:
-    """Mass of the palm with what it bears, and of the fingers in front of it [kg]."""
-    inside = sum(size.root * size.base.width * size.base.height for size in sizes)
-    cast = sum(size.volume for size in sizes) - inside
-    return scene.hand.palm.mass + 1e-9 * cast * scene.hand.material.density
-
-
-def _shopping(
-    scene: Scene,
-    params: Params,
-    sizes: Sequence[Size],
-    process: Process,
-    printed: Printed | None,
-) -> SheetSection:
-    count = len(sizes)
-    material = scene.hand.material
-    volume = sum(size.volume for size in sizes) / 1e3
-    middle = [(size, size.at(size.length / 2)) for size in sizes]
-    thread = sum(z.length / PITCH * 2 * (m.width + m.height) for z, m in middle) / 1e3
-    tubes = [inlet(size, process) for size in sizes]
-    widths = ", ".join(f"{d:g} mm" for d in dict.fromkeys(d or 2.0 for d in tubes))
-    strips = ", ".join("{:.0f} x {:.0f}".format(*fabric(size)) for size in sizes)
-    highest = float(np.max(np.asarray(params.pressure))) / 1e3
-    pins = sum(d > 0 for d in tubes)
-    with_loss = (1 + LOSS) * volume
-    grams = f"{1e-3 * with_loss * material.density:.0f} g"
-    rows = [
-        ("silicone", grams, f"{volume:.0f} cm³ cast + {100 * LOSS:.0f} % loss; {_silicone(scene)}"),
-        (
-            "fabric",
-            str(count),
-            f"{strips} mm; does not stretch, open weave (polyester mesh, glass)",
-        ),
-        (
-            "thread",
-            f"{thread:.1f} m",
-            f"polyester sewing thread; a turn every {PITCH:g} mm [chosen]",
-        ),
-        ("tube", f"{TUBE * count:g} m", f"polyurethane, outer diameter {widths} (--inlet)"),
-        ("push-in fittings", str(count), f"for tube of {widths}, with the regulators' thread"),
-        ("pressure regulators", str(count), _regulator(highest)),
-        ("compressed air", "1", f"dry, oil-free, at least {highest + 100:.0f} kPa gauge [chosen]"),
-        (
-            "silicone adhesive",
-            "1 tube",
-            "seals tubes and closes leaks; the silicone itself does too",
-        ),
-        (
-            "screws of the bars",
-            str(2 * count),
-            f"{BARS}, socket head; cut their thread in the palm",
-        ),
-        *_flange_screws(scene, printed),
-        ("steel pins", str(pins), f"of {widths}, 60 mm long (drill shanks): keep the inlets free"),
-        (
-            "filament",
-            "–",
-            "PLA or PETG. No resin print: its residues stop platinum silicones curing",
-        ),
-    ]
-    return SheetSection("What to buy", ("what", "how much", "which"), rows, [])
-
-
-def _silicone(scene: Scene) -> str:
-    material = scene.hand.material
-    law = "neo-Hookean" if scene.effects.neo_hookean else "linear"
-    needed = f"G = {material.shear_modulus / 1e3:g} kPa under the {law} law of bending"
-    named = silicone.of_material(material)
-    if named:
-        return f"{silicone.words(named)}; {needed}"
-    return (
-        f"platinum-cured, {needed}. The hand's file names none; nearest by docs/measurements.md "
-        f"is {silicone.words(_worked(scene))}. Measure the first finger (codesign "
-        "finger FILE --fit)"
-    )
-
-
-def _worked(scene: Scene) -> Silicone:
-    """The silicone whose mix and times the sheet gives."""
-    material = scene.hand.material
-    law = scene.effects.neo_hookean
-    return silicone.of_material(material) or silicone.nearest(material, neo_hookean=bool(law))
-
-
-def _regulator(highest: float) -> str:
-    top = next((v for v in (100, 500, 900) if v >= highest), None)
-    model = {100: "SMC ITV0010", 500: "SMC ITV0030", 900: "SMC ITV0050"}.get(top or 0)
-    text = f"proportional, electronic, a channel for each finger, up to {highest:.0f} kPa"
-    return f"{text}, which vents as well; such as {model} (0 to {top} kPa)" if model else text
-
-
-def _flange_screws(scene: Scene, printed: Printed | None) -> list[tuple[str, str, str]]:
-    if not printed or not printed.flange:
-        return []
-    diameter, thread, angle, sunk = printed.flange
-    length = 5 * math.ceil((1e3 * scene.hand.palm.thickness * (0.7 if sunk else 1) + 10) / 5)
-    circle = f"circle of {diameter:g} mm, the first {angle:g}° from x"
-    if diameter == 31.5:
-        circle += ": the flange 31.5-4-M5 of ISO 9409-1"
-    return [("screws to the wrist", "4", f"{thread} x {length}, socket head, from below; {circle}")]
-
-
 def _castings(scene: Scene, sizes: Sequence[Size]) -> SheetSection:
-    grams = 1e-6 * scene.hand.material.density * (1 + LOSS)
-    named = _worked(scene)
+    grams = 1e-6 * scene.hand.material.density * (1 + shopping.LOSS)
+    named = shopping.worked(scene)
     a, b = named.mix
     rows = []
     for i, size in enumerate(sizes):
@@ -184,7 +54,7 @@ def _castings(scene: Scene, sizes: Sequence[Size]) -> SheetSection:
         rows.append((str(i), *cells))
     head = ("finger", "shell g (A + B)", "bottom wall g (A + B)")
     notes = [
-        f"With {100 * LOSS:.0f} % loss, for {named.name}: mix only what is poured within "
+        f"With {100 * shopping.LOSS:.0f} % loss, for {named.name}: mix only what is poured within "
         f"{named.pot_life:g} min. Mix, pot life and cure: {silicone.SOURCE}.",
     ]
     return SheetSection("Silicone by casting", head, rows, notes)
@@ -236,7 +106,7 @@ def _wrist(scene: Scene, sizes: Sequence[Size], printed: Printed | None) -> Shee
     mass = hand_mass(scene, sizes)
     k = wrist.linear_stiffness
     turn = wrist.angular_stiffness
-    sag = 1e3 * mass * scene.gravity_on / k
+    lowered = sag(scene, sizes)
     rows = [
         (
             "along x, y and z, each",
@@ -255,26 +125,26 @@ def _wrist(scene: Scene, sizes: Sequence[Size], printed: Printed | None) -> Shee
     notes = [
         "The simulated hand hangs on springs in six directions, palm and fingers of "
         f"{1e3 * mass:.0f} g (without the fingers' roots, which the palm's mass has). Its weight "
-        f"lowers it by {sag:.0f} mm: the arm's z is that of the undeflected wrist, so leave "
+        f"lowers it by {lowered:.0f} mm: the arm's z is that of the undeflected wrist, so leave "
         "commands.csv as it is.",
         "**A stock part:** an arm with Cartesian impedance control (Franka Research 3, KUKA LBR "
         f"iiwa) is such a wrist. Screw the palm to its flange, set {k:g} N/m in translation, "
         f"{turn:g} N m/rad in rotation and a damping ratio of {ratio:.2g}, and give the controller "
         "no weight of the hand to compensate.",
-        _mechanical(scene, sag, printed),
+        _mechanical(scene, lowered, printed),
         "**A rigid mount:** another hand. See first what it keeps: codesign evaluate with --set "
         "effects.wrist=false.",
     ]
     return SheetSection("Wrist", ("direction", "stiffness", "to test", "damping"), rows, notes)
 
 
-def _mechanical(scene: Scene, sag: float, printed: Printed | None) -> str:
+def _mechanical(scene: Scene, lowered: float, printed: Printed | None) -> str:
     wrist = scene.hand.wrist
     k = wrist.linear_stiffness
     turn = wrist.angular_stiffness
     text = (
         f"**To build** (drawing: last page of {NAME}.pdf): three miniature linear guides, crossed, "
-        f"one above the other, each with {math.ceil((sag + 30) / 10) * 10:.0f} mm of travel to "
+        f"one above the other, each with {math.ceil((lowered + 30) / 10) * 10:.0f} mm of travel to "
         "either side, two tension springs that pull against each other, of "
         f"{k / 2e3:.3g} N/mm each, and a dashpot of {wrist.linear_damping:g} N s/m. Below them the "
         "palm on four rubber buffers"
@@ -299,8 +169,9 @@ def _order(
     process: Process,
     printed: Printed | None,
 ) -> SheetSection:
-    named = _worked(scene)
-    test = 0.5 * float(np.max(np.asarray(params.pressure))) / 1e3
+    named = shopping.worked(scene)
+    highest = valves.key_pressures(scene, params)[:, 1:].max(0)
+    tests = ", ".join(f"finger {i} {p:.0f} kPa" for i, p in enumerate(highest))
     pinned = any(inlet(size, process) for size in sizes)
     pin = (
         " Grease the pin and push it through the tray's end wall into the core."
@@ -311,21 +182,22 @@ def _order(
         "Print the parts; fit each core on its tray dry, it must sit without force. Wipe the "
         "moulds with release agent for silicone (optional on PLA) and let it dry.",
         "Mix as in 'Silicone by casting', stir for 3 min, scraping the sides, draw air out for 3 "
-        f"min at -90 kPa or more, and pour within {named.pot_life:g} min.",
+        f"min at -90 kPa or more [chosen], and pour within {named.pot_life:g} min [maker].",
         f"Shell: core on the tray.{pin} Pour in a thin stream between the bars until the tray is "
-        f"full to the rim, tap out bubbles, cure {named.cure_time:g} h at 23 °C. Pull the pin, "
-        "lift the core out with the shell, peel the shell from the core.",
+        f"full to the rim, tap out bubbles, cure {named.cure_time:g} h at 23 °C [maker]. Pull the "
+        "pin, lift the core out with the shell, peel the shell from the core.",
         "Bottom wall: lay the strip of fabric on the floor of the base mould, tip flush, the rest "
-        "hanging out over the root's end as the flap. Pour up to the step, set the shell in at "
-        f"once, its back upwards, press it down lightly, cure {named.cure_time:g} h.",
+        "up along the end wall behind the root and out over it as the flap; the mould has "
+        f"{FABRIC:g} mm of room for it there. Pour up to the step, set the shell in at "
+        f"once, its back upwards, press it down lightly, cure {named.cure_time:g} h [maker].",
         "Thread: wind it around the finger from the base to the tip, a turn every "
-        f"{PITCH:g} mm, snug and not pressing in; not around the root. Fix both ends with a drop "
-        "of silicone and rub a film over all of it.",
+        f"{shopping.PITCH:g} mm, snug and not pressing in; not around the root. Fix both ends with "
+        "a drop of silicone and rub a film over all of it.",
         "Tube: push it through the root until 10 mm of it, or half of a shorter chamber, are "
         "inside, seal with silicone adhesive around it, cure.",
-        f"Leak test: under water at {test:.0f} kPa for a minute, no bubbles; then close the tube: "
-        "the pressure must fall by less than 5 % in a minute [chosen]. Paint leaks with silicone "
-        "and test again.",
+        f"Leak test, at the highest pressure that is commanded: {tests}. Raise it slowly, under "
+        "water, and hold it for a minute: no bubbles; then close the tube: the pressure must fall "
+        "by less than 5 % in a minute [chosen]. Paint leaks with silicone and test again.",
         "Bend test: lay the finger on its side, raise the pressure slowly to the design's, and "
         "compare the angle of the tip with 'free bend'. Write pressures and angles into a file and "
         "fit the silicone: codesign finger FILE.csv --fit (docs/measurements.md).",
@@ -340,11 +212,14 @@ def _order(
         "+20° of roll, yaw and pitch, each alone, and compare with the drawing before anything "
         "else moves.",
         "Valves: finger 0 on channel 0 and so on. First play the pressures alone, with the hand in "
-        "the air (play_valves.py). Then play the arm alone, without pressure and without an object "
-        "(commands.csv). Then play both without an object, and at last with one. Start both from "
-        "one clock: the times of valves.csv and commands.csv are the same. Keep hands away.",
+        "the air: python play_hand.py --no-arm --valves PORT. Then drive the arm by its own slow "
+        "move to the first row of commands_still.csv, and play it without pressure and without an "
+        "object: python play_hand.py --no-valves --arm HOST:PORT --slow 4. Then both without an "
+        "object, at last with one, and only then at full speed: python play_hand.py --valves PORT "
+        "--arm HOST:PORT. Keep hands away and one on the emergency stop.",
     )
     if printed is None:
         steps = steps[:8] + ("Fix each finger to a palm of your own (--no-parts).", *steps[9:])
-    notes = [f"{k}. {step}" for k, step in enumerate(steps, 1)]
+    marks = f"[maker]: from {silicone.SOURCE}; [chosen]: ours. Moulds: the drawing of {NAME}.pdf."
+    notes = [marks, *(f"{k}. {step}" for k, step in enumerate(steps, 1))]
     return SheetSection("Order of work", (), [], notes)

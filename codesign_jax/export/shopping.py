@@ -1,0 +1,254 @@
+"""What to buy for a hand: silicone, textiles, air supply, valves and what drives them."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from codesign_jax.export import silicone, valves
+from codesign_jax.export.process import BACK, Printed, Process, Size, inlet
+from codesign_jax.export.sheet import SheetSection
+from codesign_jax.scene import Scene
+from codesign_jax.scene.silicones import Silicone
+from codesign_jax.types import Params
+
+PITCH = 2.0
+"""A turn of the thread along a finger [mm] [chosen]."""
+SPARE = 0.2
+"""Thread beyond what is wound, for ends and a second try, as a share [chosen]."""
+LOSS = 0.15
+"""Silicone that stays in cups and on moulds, as a share of what is cast [chosen]."""
+TUBE = 1.0
+"""Tube for each finger [m] [chosen]."""
+BARS = "M3 x 16"
+"""Screws of the clamp bars, which cut their thread into the palm."""
+ATMOSPHERE = 101.325
+"""Standard pressure, at which flows are given [kPa]."""
+RANGES = (100.0, 500.0, 900.0)
+"""Ends of the ranges in which small proportional regulators are sold [kPa]."""
+SIGNAL = 10.0
+"""Voltage at the end of a regulator's range [V] [chosen]: 0 to 10 V is usual, 0 to 5 V is sold."""
+BITS = 12
+"""Resolution of the analog outputs [chosen]."""
+
+
+def fabric(size: Size) -> tuple[float, float]:
+    """Length and width of a finger's strip of fabric with the flap under the clamp bar [mm]."""
+    behind = size.at(-size.root).height + BACK
+    return size.length + size.root + behind, max(size.base.width, size.tip.width)
+
+
+def section(
+    scene: Scene,
+    params: Params,
+    sizes: Sequence[Size],
+    process: Process,
+    printed: Printed | None,
+) -> SheetSection:
+    """The list; arguments as of `workshop.assembly_sections`."""
+    rows = [
+        *_castings(scene, sizes, process),
+        *_screws(scene, sizes, printed),
+        *_air(scene, params, sizes, process),
+        *_electric(scene, params),
+    ]
+    notes = [_firmware(scene, params)]
+    return SheetSection("What to buy", ("what", "how much", "which"), rows, notes)
+
+
+def _castings(scene: Scene, sizes: Sequence[Size], process: Process) -> list[tuple[str, str, str]]:
+    volume = sum(size.volume for size in sizes) / 1e3
+    grams = f"{1e-3 * (1 + LOSS) * volume * scene.hand.material.density:.0f} g"
+    middle = [(size, size.at(size.length / 2)) for size in sizes]
+    wound = sum(z.length / PITCH * 2 * (m.width + m.height) for z, m in middle) / 1e3
+    strips = ", ".join("{:.0f} x {:.0f}".format(*fabric(size)) for size in sizes)
+    pins = sum(inlet(size, process) > 0 for size in sizes)
+    return [
+        ("silicone", grams, f"{volume:.0f} cm³ cast + {100 * LOSS:.0f} % loss; {_silicone(scene)}"),
+        (
+            "fabric",
+            str(len(sizes)),
+            f"{strips} mm; does not stretch, open weave (polyester mesh, glass)",
+        ),
+        (
+            "thread",
+            f"{(1 + SPARE) * wound:.1f} m",
+            f"polyester sewing thread; {wound:.1f} m are wound, a turn every {PITCH:g} mm, "
+            f"+ {100 * SPARE:.0f} % spare [chosen]",
+        ),
+        (
+            "silicone adhesive",
+            "1 tube",
+            "seals tubes and closes leaks; the silicone itself does too",
+        ),
+        (
+            "steel pins",
+            str(pins),
+            f"of {_widths(sizes, process)}, 60 mm long (drill shanks): keep the inlets free",
+        ),
+        (
+            "filament",
+            "–",
+            "PLA or PETG. No resin print: its residues stop platinum silicones curing",
+        ),
+    ]
+
+
+def _widths(sizes: Sequence[Size], process: Process) -> str:
+    """Diameters of the tubes, each once."""
+    tubes = [inlet(size, process) or 2.0 for size in sizes]
+    return ", ".join(f"{d:g} mm" for d in dict.fromkeys(tubes))
+
+
+def _screws(
+    scene: Scene, sizes: Sequence[Size], printed: Printed | None
+) -> list[tuple[str, str, str]]:
+    bars = f"{BARS}, socket head; cut their thread in the palm"
+    return [
+        ("screws of the bars", str(2 * len(sizes)), bars),
+        *_flange_screws(scene, printed),
+    ]
+
+
+def _highest(scene: Scene, params: Params) -> float:
+    """The highest pressure that is commanded [kPa]."""
+    return float(valves.key_pressures(scene, params)[:, 1:].max())
+
+
+def flows(scene: Scene, params: Params, sizes: Sequence[Size]) -> np.ndarray:
+    """Air that fills each chamber as fast as is commanded, as wide as at rest [l/min, ANR].
+
+    The volume of a chamber times the rise of its pressure over the standard pressure; shape
+    (finger,).
+    """
+    rows = valves.key_pressures(scene, params)
+    spans = np.diff(rows[:, 0])
+    rises = np.diff(rows[:, 1:], axis=0)[spans > 0] / spans[spans > 0, None]
+    litres = np.array([size.chamber_volume for size in sizes]) * 1e-6
+    return 60 * litres * np.maximum(0.0, rises.max(0)) / ATMOSPHERE
+
+
+def _air(
+    scene: Scene, params: Params, sizes: Sequence[Size], process: Process
+) -> list[tuple[str, str, str]]:
+    count = len(sizes)
+    widths = _widths(sizes, process)
+    highest = _highest(scene, params)
+    flow = flows(scene, params, sizes)
+    fittings = f"for tube of {widths}, with the regulators' thread, or reducers from their tube"
+    return [
+        ("tube", f"{TUBE * count:g} m", f"polyurethane, outer diameter {widths} (--inlet)"),
+        ("push-in fittings", str(count), fittings),
+        ("pressure regulators", str(count), _regulator(highest, float(flow.max()))),
+        (
+            "manifold",
+            "1",
+            f"one inlet, {count} outlets to the regulators, tube of 6 mm between them [chosen]",
+        ),
+        (
+            "air preparation",
+            "1",
+            "filter of 5 µm, pressure reducer, and a shut-off valve that vents what is behind it "
+            "without power (3/2, 24 V, normally closed)",
+        ),
+        (
+            "compressed air",
+            "1",
+            f"dry, oil-free, at least {highest + 100:.0f} kPa gauge [chosen] and "
+            f"{flow.sum():.1f} l/min (ANR) while the chambers fill",
+        ),
+    ]
+
+
+def _range(scene: Scene, params: Params) -> float:
+    """End of the regulators' range [kPa]."""
+    highest = _highest(scene, params)
+    return next((v for v in RANGES if v >= highest), highest)
+
+
+def _electric(scene: Scene, params: Params) -> list[tuple[str, str, str]]:
+    count = scene.num_fingers
+    step = _range(scene, params) / 2**BITS
+    return [
+        (
+            "controller of the regulators",
+            "1",
+            "microcontroller board with a USB serial port, 115200 baud; runs the program below",
+        ),
+        (
+            "analog outputs",
+            str(count),
+            f"0 to {SIGNAL:g} V, {BITS} bits or more (a step is {step:.2g} kPa), as a module on "
+            "the board's bus (I²C, SPI)",
+        ),
+        (
+            "power supply",
+            "1",
+            f"24 V DC, {0.5 + 0.25 * count:.1f} A or more [chosen: 0.25 A a regulator, 0.5 A for "
+            "board and valve], fused; its 0 V joined to the board's and the outputs'",
+        ),
+        (
+            "emergency stop",
+            "1",
+            "opens the 24 V of regulators and shut-off valve, so that the chambers vent, and the "
+            "arm's stop circuit",
+        ),
+        (
+            "computer",
+            "1",
+            "Python 3.11 or newer, a USB port for the board and the arm's network: play_hand.py",
+        ),
+    ]
+
+
+def _firmware(scene: Scene, params: Params) -> str:
+    top = _range(scene, params)
+    return (
+        "Program of the controller: read a line up to its line feed, split it at the commas; the "
+        f"first cell is the time, cell k + 1 the pressure of finger k. Set output k to {SIGNAL:g} "
+        f"V x pressure / {top:g} kPa (regulators of 0 to {top:g} kPa at 0 to {SIGNAL:g} V), never "
+        "above the finger's limit of the table 'Fingers'. Set all outputs to 0 V when no line has "
+        "come for 0.5 s, and at the start."
+    )
+
+
+def _silicone(scene: Scene) -> str:
+    material = scene.hand.material
+    law = "neo-Hookean" if scene.effects.neo_hookean else "linear"
+    needed = f"G = {material.shear_modulus / 1e3:g} kPa under the {law} law of bending"
+    named = silicone.of_material(material)
+    if named:
+        return f"{silicone.words(named)}; {needed}"
+    return (
+        f"platinum-cured, {needed}. The hand's file names none; nearest by docs/measurements.md "
+        f"is {silicone.words(worked(scene))}. Measure the first finger (codesign "
+        "finger FILE --fit)"
+    )
+
+
+def worked(scene: Scene) -> Silicone:
+    """The silicone whose mix and times the sheet gives."""
+    material = scene.hand.material
+    law = scene.effects.neo_hookean
+    return silicone.of_material(material) or silicone.nearest(material, neo_hookean=bool(law))
+
+
+def _regulator(highest: float, flow: float) -> str:
+    top = next((v for v in RANGES if v >= highest), None)
+    model = {100: "SMC ITV0010", 500: "SMC ITV0030", 900: "SMC ITV0050"}.get(top or 0)
+    text = (
+        f"proportional, electronic, 24 V, input 0 to {SIGNAL:g} V, a channel for each finger, up "
+        f"to {highest:.0f} kPa, {flow:.1f} l/min (ANR) or more, vents as well and without power"
+    )
+    return f"{text}; such as {model} (0 to {top:g} kPa)" if model else text
+
+
+def _flange_screws(scene: Scene, printed: Printed | None) -> list[tuple[str, str, str]]:
+    if not printed or not printed.flange:
+        return []
+    diameter, thread, angle, sunk = printed.flange
+    length = 5 * math.ceil((1e3 * scene.hand.palm.thickness * (0.7 if sunk else 1) + 10) / 5)
+    circle = f"circle of {diameter:g} mm, the first {angle:g}° from x"
+    if diameter == 31.5:
+        circle += ": the flange 31.5-4-M5 of ISO 9409-1"
+    return [("screws to the wrist", "4", f"{thread} x {length}, socket head, from below; {circle}")]

@@ -6,6 +6,7 @@ import hashlib
 import itertools
 import json
 import os
+import socket
 import zipfile
 from pathlib import Path
 
@@ -28,12 +29,16 @@ from codesign_jax.export import (
     fonts,
     grasps,
     meshes,
+    motion,
+    mould_drawing,
     palm,
     plain,
+    play_hand,
     play_valves,
     pose,
     process,
     sheet,
+    shopping,
     silicone,
     skin,
     tables,
@@ -326,8 +331,10 @@ def test_sheet_has_dimensions_pressures_and_tolerances(page, tmp_path):
 def test_drawings_stand_apart_and_within_their_pages(page, title):
     the_scene, params, sizes, _ = page
     sizes = [*sizes[:2], TAPERED, *sizes[3:]]
-    hand, fingers, mounting = drawing.pages(title, the_scene, params, sizes)
-    for figure in (hand, fingers, mounting):
+    printed = process.Printed(["palm"], 1e5, None, 0.0)
+    drawn = drawing.pages(title, the_scene, params, sizes, printed, Process())
+    _, fingers, moulds, _ = drawn
+    for figure in drawn:
         FigureCanvasAgg(figure).draw()
         edge = figure.bbox
         texts = [*figure.texts, *(axes.title for axes in figure.axes)]
@@ -340,6 +347,42 @@ def test_drawings_stand_apart_and_within_their_pages(page, title):
             assert edge.y0 < box.y0 and box.y1 < edge.y1, text
     titles = [axes.get_title() for axes in fingers.axes]
     assert "finger 0, 1, 3" in titles and {"finger 2, base", "finger 2, tip"} < {*titles}
+    assert sum("bottom wall, cut" in axes.get_title() for axes in moulds.axes) == 1
+    assert len(drawing.pages(title, the_scene, params, sizes)) == 3  # no parts, no moulds
+
+
+@pytest.mark.parametrize(("plane", "at"), [("along", 0.0), ("along", 4.0), ("across", 50.0)])
+def test_cuts_of_the_moulds_have_the_sections_areas(plane, at):
+    """The shell and the bottom wall of a uniform finger, cut, against rectangles."""
+    size = USUAL._replace(root=10.0)
+    how = Process(inlet=0)
+    first, second = mould_drawing.castings(size, how)
+    width, height, wall = size.base
+    long = size.length + size.root
+    chamber = (size.length - 2 * size.end) * (height - 2 * wall)
+    whole = long * height - chamber
+    bottom = long * wall
+    if plane == "across":
+        whole = width * height - (width - 2 * wall) * (height - 2 * wall)
+        bottom = width * wall
+
+    def area(solid):
+        return sum(
+            0.5 * np.sum(v[:, 0] * np.roll(v[:, 1], -1) - v[:, 1] * np.roll(v[:, 0], -1))
+            for v in mould_drawing.cut(solid, plane, at)
+        )
+
+    # 0.01 mm beside the plane, which no side of a uniform finger feels.
+    assert area(first["silicone"]) == pytest.approx(whole - bottom, rel=1e-6)
+    assert area(second["cured shell"]) == pytest.approx(whole - bottom, rel=1e-6)
+    assert area(second["bottom wall"]) == pytest.approx(bottom, rel=1e-6)
+    # What is poured and what the moulds are made of never share room.
+    for solids in (first, second):
+        for one, two in itertools.combinations(solids.values(), 2):
+            assert (one ^ two).volume() < FINE
+    # The fabric, half a millimetre thick, has its way up behind the root.
+    strip = box((-10.6, -width / 2, wall + 0.1), (-10.1, width / 2, wall + 20.0))
+    assert (strip ^ second["base mould"]).volume() < FINE
 
 
 def test_letters_of_a_title(tmp_path, page):
@@ -383,8 +426,20 @@ def test_the_sheet_s_lists_add_up(page):
     [hangs] = [note for note in sections["Wrist"].notes if "lowers it by" in note]
     assert f"lowers it by {1e3 * weight / the_scene.hand.wrist.linear_stiffness:.0f} mm" in hangs
     text = sheet.markdown("x", [], [*sections.values()])
+    # 110 mm of 80 mm around, a turn every 2 mm, four times, and a fifth more.
+    assert bought["thread"][0] == f"{1.2 * 4 * 110 / 2 * 0.08:.1f} m"
+    # 10 cm^3 rise by 120 kPa within 1.5 s: l/min at standard pressure, of one and of all.
+    flow = 60 * 0.01 * 120 / 1.5 / 101.325
+    np.testing.assert_allclose(shopping.flows(the_scene, params, sizes), flow, rtol=1e-6)
+    assert f"{flow:.1f} l/min" in bought["pressure regulators"][1]
+    assert f"{4 * flow:.1f} l/min" in bought["compressed air"][1]
+    assert bought["analog outputs"][0] == "4" and "0.12 kPa" in bought["analog outputs"][1]
+    for part in ("controller of the regulators", "manifold", "power supply", "emergency stop"):
+        assert part in bought
     for words in (
-        "Leak test",
+        "Leak test, at the highest pressure that is commanded: finger 0 120 kPa, finger 1 120 kPa",
+        "10 V x pressure / 500 kPa",
+        "[maker]",
         "Bend test",
         "pours for ",
         "at 23 °C",
@@ -808,16 +863,17 @@ def test_commands_played_back_are_the_sheet_s_poses(tmp_path, settle):
     params = params._replace(arm=arm)
     nominal = jax.tree.map(np.asarray, rollout.nominal_trial(the_scene))
     controls = grasps.timed_controls(the_scene, params, nominal)
-    tables.write_commands(tmp_path, the_scene, controls)
-    rows = {round(float(row["time_s"]), 6): row for row in read(tmp_path / tables.COMMANDS)}
+    peaks = motion.write(tmp_path, the_scene, params, nominal)
+    rows = {round(float(row["time_s"]), 6): row for row in read(tmp_path / tables.STILL)}
+    shaken = {round(float(row["time_s"]), 6): row for row in read(tmp_path / tables.COMMANDS)}
     sizes = process.sizes(the_scene.hand, params, Process())
     sections = sheet.sheet_sections(the_scene, params, sizes, None)
     arms, pressures = (table_of(s) for s in sections if s.title in ("Arm", "Valves"))
     ends = the_scene.phase_ends
     compared = 0
     for k, time in enumerate(map(float, arms["time s"])):
-        if ends["lift"] < time <= ends["disturb"] or time not in rows:
-            continue  # shaken there
+        if time not in rows:
+            continue  # the end, which is no step
         row = rows[time]
         compared = compared + 1
         for name in ("x mm", "y mm", "z mm", "roll °", "yaw °", "pitch °"):
@@ -830,7 +886,23 @@ def test_commands_played_back_are_the_sheet_s_poses(tmp_path, settle):
         for f in range(the_scene.num_fingers):
             told = float(pressures[f"finger {f} kPa"][k])
             assert float(row[f"pressure_{f}_kPa"]) == pytest.approx(told, abs=0.051)
-    assert compared >= 4
+    assert compared >= 5
+    # The other table differs by the shaking alone, and only where the sheet says so.
+    for time, row in rows.items():
+        other = shaken[time]
+        unlike = {name for name in row if row[name] != other[name]}
+        assert unlike <= {"arm_roll_deg", "arm_pitch_deg", *(f"arm_q{c}" for c in "wxyz")}
+        off = [abs(float(row[n]) - float(other[n])) for n in ("arm_roll_deg", "arm_pitch_deg")]
+        assert max(off) <= the_scene.arm.shake_amplitude
+        assert not unlike or ends["lift"] < time < ends["disturb"] + the_scene.phases.deflate_time
+    assert peaks[tables.COMMANDS]["turn"] > 50 > peaks[tables.STILL]["turn"] == 0
+    told = motion.section(the_scene, params, nominal, peaks)
+    assert [row[0] for row in told.rows][1:] == [
+        tables.STILL,
+        tables.COMMANDS,
+        "limit of the player",
+    ]
+    assert "the arm would reach" in told.notes[-1].lower() and "--slow" in told.notes[-1]
     # MuJoCo turns the palm by the controls as the commands say, and the words are true.
     compiled = model.compile_model(the_scene, params, nominal)
     data = mujoco.MjData(compiled)
@@ -881,6 +953,11 @@ def test_pressures_reach_standard_output_and_a_serial_line(tmp_path, capsys):
         "0.000,0.000,0.000\n0.100,50.000,25.000\n0.200,12.500,0.000\n0.300,12.500,0.000\n"
         "0.400,12.500,0.000\n0.500,0.000,0.000\n"
     )
+    capped = [*words[:-1], "0.5", "--cap"]
+    assert play_valves.main(capped) == 0
+    assert "0.100,50.000,25.000\n0.200,20.000" in capsys.readouterr().out
+    rows, limits = play_valves.read(words[0])
+    assert play_valves.scaled(rows, limits, [0.5], cap=True)[1] == [0.2, 100.0, 50.0]
     ours, theirs = os.openpty()
     assert play_valves.main([*words, "--port", os.ttyname(theirs), "--baud", "9600"]) == 0
     received = b""
@@ -896,7 +973,7 @@ def test_pressures_reach_standard_output_and_a_serial_line(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("table", "divide", "words"),
     [
-        (JUMP, ["0.7"], "finger 0 would get 114.3 kPa, and its wall stands 100.0 kPa"),
+        (JUMP, ["0.7"], "finger 0 would get 114.3 kPa, and its wall stands 100.0 kPa; --cap"),
         (JUMP, ["1", "0.7"], "finger 1 would get 57.1 kPa"),
         (JUMP, ["1", "1", "1"], "1 number or 2, not 3"),
         (JUMP, ["0"], "above 0"),
@@ -912,6 +989,131 @@ def test_wrong_pressures_are_not_sent(tmp_path, capsys, table, divide, words):
     assert play_valves.main([str(tmp_path / "valves.csv"), "--divide", *divide]) == 2
     output = capsys.readouterr()
     assert words in output.err and not output.out
+
+
+# --- arm and chambers together -------------------------------------------------------------------
+
+
+def path_of(folder, heights, turns=None, step=0.01):
+    """A table of commands of an arm that rises, turned about x by angles [deg]."""
+    turns = np.radians(np.zeros(len(heights)) if turns is None else turns) / 2
+    rows = [
+        [f"{v:.9g}" for v in (k * step, 0, 0, z, np.cos(a), np.sin(a), 0, 0)]
+        for k, (z, a) in enumerate(zip(heights, turns, strict=True))
+    ]
+    return tables.write_table(folder / "commands.csv", ["time_s", *play_hand.POSE], rows)
+
+
+def test_corners_of_the_arm_s_path_are_rounded(tmp_path):
+    """A jump of the speed v over a mean of T is an acceleration v/T; a sine is damped by sinc."""
+    ramp = np.clip(np.arange(301) - 100, 0, 100) * 1.0  # 100 mm/s from 1 s to 2 s
+    rows = play_hand.read(path_of(tmp_path, ramp))
+    found = play_hand.peaks(play_hand.smoothed(rows, 0.1))
+    # The mean has 11 poses, 0.11 s.
+    assert found["speed"] == pytest.approx(100) and found["turn"] == 0
+    assert found["acceleration"] == pytest.approx(100 / 0.11, rel=1e-6)
+    assert play_hand.peaks(rows)["acceleration"] == pytest.approx(100 / 0.01)
+    smooth = play_hand.smoothed(rows, 0.1)
+    assert [smooth[0][0], smooth[-1][0]] == pytest.approx([-0.05, 3.05])
+    corner = play_valves.at(smooth, 1.0)[2]
+    assert 0 < corner < 100 * 0.1 / 8 * 1.25  # v T / 8, of 11 poses
+    time = np.arange(400) * 0.01
+    shaken = 10 * np.sin(2 * np.pi * time)
+    rows = play_hand.smoothed(play_hand.read(path_of(tmp_path, 0 * time, shaken)), 0.1)
+    inside = rows[50:-50]
+    found = play_hand.peaks(inside)
+    # The mean of 2n+1 samples damps a sine by sin((2n+1) x) / ((2n+1) sin x), x = pi f h.
+    x = np.pi * 0.01
+    damped = 10 * np.sin(11 * x) / (11 * np.sin(x))
+    # Means of quaternions are those of angles to the third order of 5 degrees.
+    assert found["turn"] == pytest.approx(2 * np.pi * damped, rel=2e-3)
+    slow = play_hand.peaks(play_hand.slowed(inside, 2.0))
+    assert slow["turn"] == pytest.approx(found["turn"] / 2)
+
+
+def test_arm_and_valves_are_played_from_one_clock(tmp_path, capsys):
+    commands = path_of(tmp_path, np.linspace(0, 50, 41))
+    (tmp_path / "valves.csv").write_text(JUMP)
+    words = [str(commands), "--pressures", str(tmp_path / "valves.csv"), "--no-wait"]
+    assert play_hand.main([*words, "--smooth", "0"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    arm = [line.removeprefix("arm,") for line in lines if line.startswith("arm,")]
+    sent = [line.removeprefix("valves,") for line in lines if line.startswith("valves,")]
+    assert (
+        len(arm) == 41 and arm[20] == "0.200,0.000,0.000,25.000,1.000000,0.000000,0.000000,0.000000"
+    )
+    assert sent[2] == "0.100,40.000,20.000" and sent[-1] == "0.410,0.000,0.000"
+    assert lines.index("valves," + sent[4]) + 1 == lines.index("arm," + arm[20])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.settimeout(5)
+        place = f"127.0.0.1:{listener.getsockname()[1]}"
+        assert play_hand.main([*words, "--smooth", "0", "--no-valves", "--arm", place]) == 0
+        received = [listener.recv(200).decode().strip() for _ in arm]
+    assert received == arm and not capsys.readouterr().out
+    # Ends early: the chambers are emptied.
+    poses = play_hand.read(commands)
+    pressures, _ = play_valves.read(tmp_path / "valves.csv")
+    got = []
+
+    def full(text):
+        raise OSError("the arm's line is gone")
+
+    with pytest.raises(OSError, match="gone"):
+        play_hand.play(poses, pressures, (full, got.append), (0.01, 0.05), lambda seconds: None)
+    assert got[-1] == "0.000,0.000,0.000\n"
+
+
+@pytest.mark.parametrize(
+    ("heights", "flags", "words"),
+    [
+        (np.arange(40) * 3.0, [], "reach 300 mm/s (--max-speed 250); try --slow 1.2,"),
+        (np.arange(40) * 3.0, ["--slow", "1.2"], None),
+        (np.arange(40) * 3.0, ["--max-speed", "400"], None),
+        (np.arange(40) * 2.0, ["--smooth", "0"], "reach 20000 mm/s² (--max-acceleration 13000)"),
+        (np.arange(40) * 2.0, ["--slow", "0"], "--slow must be 0.1 to 100"),
+        (np.arange(40) * 2.0, ["--arm", "here"], "--arm here is no HOST:PORT"),
+        (np.arange(40) * 2.0, ["--no-arm"], "--no-arm and --no-valves"),
+        (np.arange(40) * 2.0, ["--max-turn", "nan"], "--max-turn must be above 0"),
+        (np.arange(40) * np.nan, [], "line 2: a number is not finite"),
+        ([1.0], [], "fewer than three rows"),
+    ],
+)
+def test_what_an_arm_must_not_do_is_refused(tmp_path, capsys, heights, flags, words):
+    table = path_of(tmp_path, heights)
+    code = play_hand.main([str(table), "--no-valves", "--no-wait", *flags])
+    output = capsys.readouterr()
+    if words is None:
+        assert code == 0 and output.out
+    else:
+        assert code == 2 and words in output.err and not output.out
+
+
+def test_the_room_behind_a_tilted_palm(page):
+    """By hand: a palm pitched by 60 degrees, its rim 10 mm above the table."""
+    the_scene, params, _, _ = page
+    height = 1e3 * the_scene.hand.palm.radius * np.sin(np.radians(60)) + 10
+    reference = np.min(valves.key_poses(the_scene, params)[:, 3])
+    lifted = np.array(params.arm, float)
+    lifted[2] += 1e-3 * (height - reference)
+    lifted[3:] = np.radians([0.0, 60.0, 0.0])
+    tilted = params._replace(arm=lifted)
+    lowest = np.min(valves.key_poses(the_scene, tilted)[:, 3])
+    assert lowest == pytest.approx(height, abs=1e-3)
+    thick = 1e3 * the_scene.hand.palm.thickness
+    behind = np.array(motion.BEHIND) + thick
+    wanted = (height - motion.CLEAR + 0.5 * behind) / np.sin(np.radians(60))
+    np.testing.assert_allclose(motion.room(the_scene, tilted), wanted, rtol=1e-5)
+    length = motion.spacer(the_scene, tilted)
+    reached = height + 0.5 * (thick + length) - motion.LAST_LINK * np.sin(np.radians(60))
+    assert length > 0 and reached == pytest.approx(motion.CLEAR, abs=1e-3)
+    [words] = motion.room_warnings(the_scene, tilted)
+    assert f"spacer of {5 * np.ceil(length / 5):.0f} mm" in words
+    level = params._replace(arm=np.array([0, 0, 0.1, 0, 0, 0], float))
+    assert np.isinf(motion.room(the_scene, level)).all()
+    assert not motion.room_warnings(the_scene, level)
+    over = params._replace(arm=np.array([0, 0, 0.1, 0, np.radians(120), 0], float))
+    assert motion.spacer(the_scene, over) is None
 
 
 def test_an_interrupted_player_empties_the_chambers():

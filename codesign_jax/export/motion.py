@@ -20,6 +20,8 @@ BEHIND = (0.0, 50.0, 100.0, 200.0)
 """Distances behind the palm's upper side for which the room is given [mm]."""
 LAST_LINK = 60.0
 """Radius of an arm's last link, about, which has to find room behind the palm [mm] [chosen]."""
+LEAST_UP = 0.05
+"""Upward part of the palm's axis below which a spacer gains no room [chosen]."""
 
 Peaks = Mapping[str, float]
 """Largest speeds and accelerations by the names of `play_hand.LIMITS`."""
@@ -129,9 +131,11 @@ def spacer(scene: Scene, params: Params) -> float | None:
         turn: Rotation = pose.rotation(roll=roll, yaw=yaw, pitch=pitch)
         up = float(turn.as_matrix()[2, 2])
         lacking = LAST_LINK * np.sqrt(max(0.0, 1.0 - up**2)) + CLEAR - z - thick * up
-        if lacking > 0 and up < 0.05:
-            return None
-        needed = max(needed, lacking / max(up, 0.05))
+        if up < LEAST_UP:
+            if max(lacking, lacking - BEHIND[-1] * up) > 0:
+                return None
+            continue
+        needed = max(needed, lacking / up)
     return float(needed)
 
 

@@ -131,7 +131,8 @@ def slowed(rows, factor):
 
 def excess(found, limits, slow=1.0):
     """What of a path's peaks is above the limits, in words, and how slow it may be; or None."""
-    over = {name: found[name] / limits[name] for name in LIMITS if found[name] > limits[name]}
+    shares = {name: found[name] / limits[name] for name in LIMITS}
+    over = {name: share for name, share in shares.items() if share > 1 + 1e-6}
     if not over:
         return None
     words = ", ".join(
@@ -229,22 +230,28 @@ def _parser():
     return parser
 
 
+def _flag(name):
+    return f"max_{name.replace('-', '_')}"
+
+
 def _tables(options):
     """Rows of the arm and of the valves as they are to be played, each None if left out."""
     if not 0.001 <= options.period <= 1:
         raise TableError("--period must be 0.001 to 1 s")
     if not 0.1 <= options.slow <= 100:
         raise TableError("--slow must be 0.1 to 100")
+    for name in LIMITS:
+        if not getattr(options, _flag(name)) > 0:
+            raise TableError(f"--max-{name} must be above 0")
     if not 0 <= options.smooth <= 1:
         raise TableError("--smooth must be 0 to 1 s")
     if options.no_arm and options.no_valves:
-        raise TableError("neither arm nor valves are left")
+        raise TableError("--no-arm and --no-valves leave nothing to play")
     poses = None
     pressures = None
     if not options.no_arm:
         poses = smoothed(slowed(read(options.table), options.slow), options.smooth)
-        names = {name: f"max_{name.replace('-', '_')}" for name in LIMITS}
-        limits = {name: getattr(options, flag) for name, flag in names.items()}
+        limits = {name: getattr(options, _flag(name)) for name in LIMITS}
         check(poses, limits, options.slow)
     if not options.no_valves:
         rows, limits = play_valves.read(options.pressures)

@@ -75,7 +75,7 @@ def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
     # Constants in their ranges have a finite sum, for which XLA writes one loop; as rows of an
     # array they would be one loop each.
     bad |= ~jnp.isfinite(sum(jax.tree.leaves(fields.constants)))
-    others = jax.tree.leaves(fields._replace(constants=()))
+    others = jax.tree.leaves(fields._replace(constants=(), shape=()))
     bad |= ~jnp.isfinite(_rows(*others)).all(1)
     moving = layout(scene).bodies.ravel()
     bad |= ~(_rows(fields.body_mass[:, moving], fields.body_inertia[:, moving]) > 0).all(1)

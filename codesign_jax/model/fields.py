@@ -64,6 +64,7 @@ class ModelFields(NamedTuple):
     gravity: jax.Array
     impratio: jax.Array
     start: jax.Array
+    shape: jax.Array
     constants: Scene
     section: jax.Array | None = None
     threshold: jax.Array | None = None
@@ -87,7 +88,7 @@ class ModelFields(NamedTuple):
     @property
     def of_model(self) -> dict[str, jax.Array]:
         """The fields of mjModel by name, those of its mjOption as "opt.name"."""
-        others = ("start", "section", "threshold", "tip", "constants")
+        others = ("start", "shape", "section", "threshold", "tip", "constants")
         options = ("gravity", "impratio")
         given = {k: v for k, v in self._asdict().items() if v is not None}
         fields = {k: v for k, v in given.items() if k not in others}
@@ -185,6 +186,7 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
         gravity=_filled(np.zeros(3), dtype, (2, -scene.gravity_on)),
         impratio=friction_ratio(scene, scene.contact.friction_ratio),
         start=_start(scene, params, trial),
+        shape=jnp.asarray(trial.shape, jnp.int32),
         constants=scene.bare,
         section=_section(scene, params),
         threshold=(

@@ -160,6 +160,7 @@ def _adjoint(
     found = _reversed(settings, program, tables, path, bars, trajectory=trajectory)
     sound = program.sound  # pyright: ignore[reportAttributeAccessIssue]  # an AdjointProgram here
     fields_bar, ctrl_bar = pull_inputs(sound(found, path.taken))
+    fields_bar = fields_bar._replace(shape=None)  # an index has no derivative
     # A world of fields that are not numbers never moved, and has no derivative.
     return jax.tree.map(partial(_of_worlds, taken[:, 0] > 0), (fields_bar, ctrl_bar))
 

@@ -167,8 +167,7 @@ def _world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
     stub_centre = base + apply_columns(mount, vectors(fields.body_ipos, lay.stubs))
     palm = _palm(fields, lay.stubs, mount, stub_centre, last)
     sizes = fields.geom_size[:, lay.object_geoms]
-    rbound = fields.geom_rbound[:, lay.object_geoms]
-    shape = jnp.argmax(rbound, axis=1)  # the one not shrunk to INACTIVE
+    shape = fields.shape
     picked = jnp.take_along_axis(sizes, shape[:, None, None], axis=1)[:, 0]
     object_size = last(picked)[:, None]
     no_spheres = lay.spheres.size == 0

@@ -163,7 +163,9 @@ class Bench:
         """States before every step, and (qpos, qvel) after the last one, (world, 1, ...)."""
         dtype = jnp.float64 if self.wide else jnp.float32
         with floats(self.wide):
-            fields = jax.tree.map(lambda v: np.asarray(v, dtype), fields._replace(start=qpos))
+            numbers = fields._replace(start=qpos, shape=None)
+            numbers = jax.tree.map(lambda v: np.asarray(v, dtype), numbers)
+            fields = numbers._replace(shape=fields.shape)  # an index stays an integer
             count = ctrl.shape[1]
             start, advance = self._program
             hand, state = start(fields, jnp.asarray(qvel, dtype))

@@ -17,7 +17,7 @@ CHECKED := codesign_jax scripts tests notebooks
 # What is imported is compiled once: without its bytecode every process compiles it again, for 7 s.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo docs interpreter test quick test-browser test-ptx test-gpu test-slow stability faults notebooks benchmark effects accuracy reality lint format types clean help
+.PHONY: demo docs release interpreter test quick test-browser test-ptx test-gpu test-slow stability faults notebooks benchmark effects accuracy reality lint format types clean help
 
 help:
 	@echo "make demo        co-design a gripper, 23 parameters, on the CPU, with figures and a film"
@@ -34,6 +34,7 @@ help:
 	@echo "make reality     the simulation beside published measurements: docs/reality.md"
 	@echo "make accuracy    what accuracy costs in time, and what moves a verdict"
 	@echo "make docs        the documentation as a site without a network: site/index.html"
+	@echo "make release     everything but the upload: wheel, sdist, an empty environment; dist/"
 	@echo "make format      ruff format          make clean       remove what make built"
 
 interpreter:
@@ -101,6 +102,10 @@ accuracy: $(STAMP)
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "site/index.html opens in a browser as it is"
+
+# Downloads all dependencies once more, for the empty environment.
+release: $(STAMP)
+	$(BIN)/python -m scripts.release
 
 lint: $(STAMP)
 	$(BIN)/ruff check $(CHECKED)

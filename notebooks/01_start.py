@@ -16,11 +16,23 @@
 #
 # A hand is a file, a grasp is a jitted function of its parameters, and co-design moves both the
 # hand's morphology and its control.  Open this file as a notebook with jupytext, or run its cells
-# in an editor.  `CODESIGN_FAST=1` shrinks it to a check that everything runs.
+# in an editor; `make release` writes it as dist/01_start.ipynb.  On Colab, upload that notebook,
+# and the wheel from the same folder to the files of the session.  `CODESIGN_FAST=1` shrinks the
+# notebook to a check that everything runs.
 
 # %%
+import importlib.util
 import os
+import subprocess
+import sys
+from pathlib import Path
 
+if importlib.util.find_spec("codesign_jax") is None:  # a machine without it, such as Colab's
+    wheels = sorted(Path().glob("codesign_jax-*.whl"))
+    package = str(wheels[-1]) if wheels else "codesign-jax"
+    subprocess.run([sys.executable, "-m", "pip", "install", "-q", package], check=True)
+
+# %%
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt

@@ -15,7 +15,6 @@ import docstring_parser
 from codesign_jax import codesign, cost
 from codesign_jax import types as data
 from codesign_jax.export import tables as exported
-from codesign_jax.model import RolloutState
 from codesign_jax.model.layout import AXES, WRIST, joint_axes, layout
 from codesign_jax.optimize import ParticleFilter
 from codesign_jax.scene import (
@@ -104,7 +103,7 @@ def page() -> str:
             parts.append(_parameters())
         if schema is objects._ObjectSetFile:
             parts.append(_primitives())
-    parts += [_state(load_scene("paper")), _cost(), _status(), _exported(), _named()]
+    parts += [_state(load_scene("paper")), _cost(), _status(), _exported()]
     return "\n\n".join(parts) + "\n"
 
 
@@ -299,21 +298,6 @@ def _exported() -> str:
     ):
         table = _table(("column", "meaning"), [(f"`{c}`", text) for c, text in columns.items()])
         parts.append(f"### {name}\n\nA row for {rows}.\n\n{table}")
-    return "\n\n".join(parts)
-
-
-def _named() -> str:
-    """The named tuples that pass between functions."""
-    parts = [
-        "## Data of the library",
-        "Named tuples of `codesign_jax.types` and `codesign_jax.model`, shapes without the leading "
-        "axes of a batch.",
-    ]
-    for kind in (data.Params, data.Trial, data.Trace, data.Forces, RolloutState, data.Outcome):
-        rows = [(f"`{name}`", text) for name, text in attributes(kind).items()]
-        parts.append(
-            f"### `{kind.__name__}`\n\n{_text(kind)}\n\n{_table(('field', 'meaning'), rows)}"
-        )
     return "\n\n".join(parts)
 
 

@@ -1,4 +1,4 @@
-"""The shell examples of README and docs: every command is one that the program takes."""
+"""Pages are right: commands run, figures are those of the data, keys are complete, links lead."""
 
 import json
 import re
@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import codesign_jax
 from codesign_jax import cli, preflight
 from codesign_jax.commands import (
     check,
@@ -205,7 +206,7 @@ def test_all_figures_are_of_one_kernel_or_their_pages_say_that_they_are_not():
     for key, pages in BEFORE.items():
         for page in pages:
             text = " ".join((ROOT / page).read_text().split())
-            assert re.search(r"contact\S* before", text), (page, key)
+            assert re.search(r"earlier\S* model", text), (page, key)
             if page.startswith("docs/notes"):
                 assert all(commit in text for commit in older[key]), (page, key, older[key])
 
@@ -237,6 +238,32 @@ BUILT_IN = {
 def test_the_committed_reference_is_what_the_code_says():
     again = "python -m scripts.reference_page"
     assert reference_page.PAGE.read_text(encoding="utf-8") == reference_page.page(), again
+
+
+def test_the_api_pages_document_the_public_names():
+    """Modules by their names, what they define on the page of the module."""
+    pages = sorted((ROOT / "docs" / "api").glob("*.md"))
+    text = "".join(page.read_text(encoding="utf-8") for page in pages)
+    on_pages = re.findall(r"^::: codesign_jax\.(\w+)", text, re.M)
+    assert len(on_pages) == len(set(on_pages)) and set(on_pages) <= set(codesign_jax.__all__)
+    for name in set(codesign_jax.__all__) - set(on_pages):
+        module = getattr(codesign_jax, name).__module__
+        assert module.split(".")[1] in on_pages, name
+
+
+def make_targets(text):
+    """Targets of the calls of make in a text."""
+    calls = re.findall(r"\bmake ((?:[a-z][a-z-]*[ `]*)+)", text)
+    return {target for call in calls for target in call.split("`")[0].split()}
+
+
+def test_the_workflow_calls_targets_of_the_makefile():
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    defined = set(re.search(r"^\.PHONY: (.*)", makefile, re.M)[1].split())
+    workflow = (ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8")
+    called = {t for line in re.findall(r"- run: (make .*)", workflow) for t in make_targets(line)}
+    assert called == {"docs", "lint", "release", "test", "types"}
+    assert called <= defined
 
 
 FREE = "fixed", "group", "pressure"  # tables whose keys are names

@@ -24,13 +24,13 @@ KERNEL = "a7ad6c4c"
 """The commit that last changed what the kernel of the default scene computes: results name it.
 
 A commit that changes the kernels' text (scripts.same_kernels tells) and what grasps do comes in its
-place; what is not measured again is marked as of the contact before (tests/test_docs.py).
+place; what is not measured again is marked as of the earlier model (tests/test_docs.py).
 """
 
 
 def before(made: dict[str, Any]) -> str:
     """The mark of what was measured with another kernel."""
-    return "" if made.get("kernel") == KERNEL else ", contact before"
+    return "" if made.get("kernel") == KERNEL else ", earlier model"
 
 
 def command() -> str:

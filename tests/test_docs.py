@@ -149,22 +149,6 @@ def test_the_user_s_pages_are_a_manual():
         assert not commits(page.read_text(encoding="utf-8")), page.name
 
 
-def test_the_front_page_has_the_measured_rates():
-    rates = {}
-    for k, machine in enumerate(("cpu", "h100")):
-        data = json.loads((ROOT / "docs" / "data" / f"rates_{machine}.json").read_text())
-        for one in data["records"]:
-            if (one["scene"], one["engine"]) == ("paper", "structured"):
-                column = 2 * k + ("random", "winners").index(one["designs"])
-                rates[one["worlds"], column] = one["grasps_per_s"]
-    table = (ROOT / "README.md").read_text().split("<!-- rates:begin -->")[1].split("<!--")[0]
-    shown = {}
-    for row in table.strip().splitlines()[2:]:
-        worlds, *cells = (cell.split()[0].replace(",", "") for cell in row.strip("| ").split("|"))
-        shown |= {(int(worlds), k): float(v) for k, v in enumerate(cells) if v != "–"}
-    assert shown == pytest.approx(rates, rel=0.05)  # two digits
-
-
 def commits(text):
     """Hashes of commits: seven to forty hexadecimal digits, letters and figures among them."""
     return re.findall(r"\b(?=[0-9a-f]*[a-f])(?=[0-9a-f]*[0-9])[0-9a-f]{7,40}\b", text)

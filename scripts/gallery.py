@@ -35,6 +35,8 @@ RATE = 10.0
 SIZE = (280, 280)
 QUALITY = 45
 """Frames of a second, pixels, and WebP's quality: ten films of 9 s have less than 2 MB."""
+CLOSE = 0.42
+"""Distance of the camera [m]."""
 TRIALS = 100
 SEED = 1000
 
@@ -105,10 +107,15 @@ def draw(hand: Hand, case: cases.Case) -> None:
     shown = animation.replay(scene, case.make_engine(), params, trials)
     ends = [codesign.VERDICTS[int(codesign.verdicts(one.outcome))] for one in shown]
     print(hand.name, *zip(hand.shown, ends, strict=True))
-    seen = animation.CAMERA._replace(**({"distance": 0.55} | hand.camera))
+    seen = animation.CAMERA._replace(**({"distance": CLOSE} | hand.camera))
 
     def row(times: np.ndarray, camera: Camera) -> list[np.ndarray]:
-        parts = [animation.frames(scene, one, times, size=SIZE, camera=camera) for one in shown]
+        parts = []
+        for one in shown:
+            # A hand that names a place is looked at there.
+            moving = animation.following(scene, one, times, camera)
+            cameras = camera if "lookat" in hand.camera else moving
+            parts.append(animation.frames(scene, one, times, size=SIZE, camera=cameras))
         return [*np.concatenate(parts, axis=2)]
 
     frames = row(np.arange(0.0, scene.end_time, 1 / RATE), seen)

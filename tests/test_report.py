@@ -17,7 +17,7 @@ from scipy import stats
 from codesign_jax import array_files, cli, model, rollout, runs, scene
 from codesign_jax.commands import reference
 from codesign_jax.engines import make_engine
-from codesign_jax.report import animation, bodies, verdicts, viewer
+from codesign_jax.report import animation, bodies, painter, raster, verdicts, viewer
 from codesign_jax.runs import cases
 from codesign_jax.scene import parameters
 from codesign_jax.scene.schema import InputError
@@ -61,6 +61,69 @@ def test_a_picture_shows_the_object_where_a_pinhole_camera_does(grasp):
     red, _, blue = np.moveaxis(picture.astype(int), -1, 0)
     found = np.argwhere(red > blue + 60)[:, ::-1].mean(0)  # orange; the hand is above it
     np.testing.assert_allclose(found + 0.5, wanted, atol=1.5)  # its near faces are larger
+
+
+def test_the_nearest_triangle_is_that_of_a_ray_s_first_hit():
+    """Each pixel's ray against each triangle by Möller and Trumbore's formula."""
+    random = np.random.default_rng(2)
+    middle = random.uniform([-0.2, -0.2, 0.5], [0.2, 0.2, 1.0], (60, 1, 3))
+    triangles = middle + random.normal(0, 0.08, (60, 3, 3))
+    size = (37, 29)
+    scale = 30.0
+    corners = triangles[..., :2] / triangles[..., 2:] * scale + np.array(size) / 2
+    found = raster.nearest(corners, triangles[..., 2], size)
+    column, row = np.meshgrid(*map(np.arange, size))
+    flat = np.stack([column.ravel() + 0.5, row.ravel() + 0.5], 1)
+    rays = np.column_stack([(flat - np.array(size) / 2) / scale, np.ones(len(flat))])
+    origin, first, second = (triangles[:, k] for k in range(3))
+    edges = first - origin, second - origin
+    across = np.cross(rays[:, None], edges[1])
+    scaled = 1 / (across * edges[0]).sum(-1)
+    u = -(across * origin).sum(-1) * scaled
+    turned = np.cross(-origin, edges[0])
+    v = (rays[:, None] * turned).sum(-1) * scaled
+    away = (edges[1] * turned).sum(-1) * scaled
+    away = np.where((u >= 0) & (v >= 0) & (u + v <= 1) & (away > 0), away, np.inf)
+    hit = np.isfinite(away).any(1)
+    assert 100 < hit.sum() < len(hit)
+    np.testing.assert_array_equal(np.sort(found.at), np.flatnonzero(hit))
+    np.testing.assert_array_equal(found.face, away.argmin(1)[found.at])
+    np.testing.assert_allclose(found.away, away.min(1)[found.at], rtol=1e-9)
+    place = (found.share[..., None] * triangles[found.face]).sum(1)
+    np.testing.assert_allclose(place, found.away[:, None] * rays[found.at], atol=1e-9)
+
+
+def test_an_object_has_its_shadow_where_light_falls_from_it(grasp):
+    """The table under the light's ray through the object's middle is darker than around."""
+    the_scene, replay = grasp
+    lifted = np.array(replay.qpos[:1])
+    lifted[0, -7:-4] = [0.0, 0.0, 0.1]
+    lifted[0, :3] = [0.3, 0.3, 0.2]  # the hand is aside
+    camera = animation.Camera(azimuth=90.0, elevation=-70.0, distance=0.7, lookat=(0.0, 0.0, 0.0))
+    [picture] = painter.paint(the_scene, replay, lifted, (120, 120), camera)
+    view = painter.View(camera, (120, 120))
+    fall = painter.light(camera)
+    middle = np.array([0.0, 0.0, 0.1]) - 0.1 / fall[2] * fall
+    assert np.linalg.norm(middle) > 0.05  # not behind the object
+
+    def brightness(place):
+        column, row = np.floor(view.pixels(np.array([place]))[0][0]).astype(int)
+        return float(picture[row - 1 : row + 2, column - 1 : column + 2].mean())
+
+    around = [brightness(middle + [0.12 * np.cos(a), 0.12 * np.sin(a), 0]) for a in (2, 4, 6)]
+    assert brightness(middle) < 0.8 * min(around)
+
+
+def test_a_camera_follows_hand_and_object(grasp):
+    the_scene, replay = grasp
+    times = np.array([0.0, 3.0, the_scene.end_time])
+    seen = animation.following(the_scene, replay, times, animation.CAMERA, lag=0.0)
+    middle = (replay.qpos[:, :3] + replay.qpos[:, -7:-4]) / 2
+    h = the_scene.discretization.timestep
+    steps = np.minimum(np.rint(times / h).astype(int), len(middle) - 1)
+    np.testing.assert_allclose([camera.lookat for camera in seen], middle[steps])
+    drawn = animation.frames(the_scene, replay, times, size=(40, 40), camera=seen)
+    assert drawn.shape == (3, 40, 40, 3)
 
 
 def test_gif_plays_in_real_time(grasp, tmp_path):

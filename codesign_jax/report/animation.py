@@ -1,6 +1,6 @@
 """Pictures of grasps: films (.gif by Pillow, .mp4 by PyAV) and strips of pictures."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -33,12 +33,13 @@ def frames(
     times: np.ndarray,
     *,
     size: tuple[int, int] = (320, 320),
-    camera: Camera = CAMERA,
+    camera: Camera | Sequence[Camera] = CAMERA,
 ) -> np.ndarray:
     """Draws a grasp at given times.
 
     Args:
       times: Times of the frames [s], shape (frame,).
+      camera: One that stays, or one for each frame, as of `following`.
 
     Returns:
       Frames, uint8, shape (frame, height, width, 3).
@@ -47,11 +48,37 @@ def frames(
 
 
 def _pictures(
-    scene: Scene, grasp: Replay, times: np.ndarray, size: tuple[int, int], camera: Camera
+    scene: Scene,
+    grasp: Replay,
+    times: np.ndarray,
+    size: tuple[int, int],
+    camera: Camera | Sequence[Camera],
 ) -> Iterator[np.ndarray]:
+    return painter.paint(scene, grasp, grasp.qpos[_steps(scene, grasp, times)], size, camera)
+
+
+def _steps(scene: Scene, grasp: Replay, times: np.ndarray) -> np.ndarray:
     step = np.rint(times / scene.discretization.timestep).astype(int)
-    qpos = grasp.qpos[np.clip(step, 0, len(grasp.qpos) - 1)]
-    return painter.paint(scene, grasp, qpos, size, camera)
+    return np.clip(step, 0, len(grasp.qpos) - 1)
+
+
+def following(
+    scene: Scene, grasp: Replay, times: np.ndarray, camera: Camera, *, lag: float = 0.8
+) -> list[Camera]:
+    """Cameras that look at the middle between palm and object, at given times.
+
+    Args:
+      times: Times of the frames [s], shape (frame,).
+      camera: Directions and distance of all of them.
+      lag: Time around each frame over which the place looked at is a mean [s].
+    """
+    middle = (grasp.qpos[:, :3] + grasp.qpos[:, -7:-4]) / 2
+    half = round(lag / scene.discretization.timestep / 2)
+    wide = np.pad(middle, ((half, half), (0, 0)), "edge")
+    window = np.ones(2 * half + 1) / (2 * half + 1)
+    smooth = np.stack([np.convolve(column, window, "valid") for column in wide.T], 1)
+    places = smooth[_steps(scene, grasp, times)]
+    return [camera._replace(lookat=tuple(map(float, place))) for place in places]
 
 
 def write_film(

@@ -65,15 +65,14 @@ class Options(NamedTuple):
 
     @property
     def to_end(self) -> bool:
-        """Whether worlds are simulated to the end though they are lost.
+        """Whether worlds are simulated to the end though they are lost."""
+        return self.record_qpos or self.stop_when_lost is False
 
-        Raises:
-          InputError: If they are to stop, and to be recorded: an engine records whole grasps.
-        """
+    def refuse(self) -> None:
+        """Refuses worlds that are to stop, and to be recorded: an engine records whole grasps."""
         if self.record_qpos and self.stop_when_lost:
             problem = "record_qpos=True records whole grasps: leave out stop_when_lost=True"
             raise schema.InputError([problem])
-        return self.record_qpos or self.stop_when_lost is False
 
 
 # Folded into a trial's key for draws that came later, so that earlier ones stay as they are.
@@ -266,6 +265,7 @@ def _traced(
     how: Options,
     steps: int | None = None,
 ) -> tuple[Trace, Any, jax.Array]:
+    how.refuse()
     forces = how.record_forces or getattr(how.cost, "record_forces", False)
     engine = recording(engine) if forces else engine
     ctrl: Any

@@ -261,7 +261,7 @@ class Study:
         seed, particle, trial = np.indices(shape).reshape(3, -1)
         designs = np.asarray(populations)
 
-        def run(rows: np.ndarray, device: Any) -> Outcome:
+        def run(rows: np.ndarray) -> Outcome:
             own = jax.tree.map(lambda v: v[seed[rows], trial[rows]], trials)
             return self.simulate(designs[seed[rows], particle[rows]], own, scene)
 

@@ -23,8 +23,9 @@ from codesign_jax import array_files, files, runs, terminal
 from codesign_jax.commands import check, hosts, reference, status
 from codesign_jax.compiler.ffi import KernelUnavailable
 from codesign_jax.export import sheet
-from codesign_jax.runs import directory, loop, manifest, progress
+from codesign_jax.runs import directory, manifest, progress
 from codesign_jax.runs import record as records
+from codesign_jax.runs import run as run_of
 from codesign_jax.runs.columns import FILES, TABLES
 from codesign_jax.scene import InputError
 from codesign_jax.stress import Stress
@@ -347,7 +348,7 @@ def test_a_cost_that_is_no_number_is_blamed_itself(bad_step, blamed):
     step = np.full(4, bad_step)
     found = Outcome(np.zeros(4), status, np.zeros(4), step)  # type: ignore[arg-type]
     with pytest.raises(runs.AllFailed) as error:
-        loop.refuse_all_failed(found, Path("r"), "mine:c")
+        run_of.refuse_all_failed(found, Path("r"), "mine:c")
     assert ("--cost mine:c returned NaN" in str(error.value)) == blamed
     assert ("timestep" in str(error.value)) != blamed
 

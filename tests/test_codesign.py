@@ -9,7 +9,6 @@ import pytest
 
 from codesign_jax import codesign
 from codesign_jax.optimize import schedule
-from tests.helpers import episodes
 from tests.helpers.toy_engine import tiny
 
 PARTICLES = 8
@@ -18,11 +17,11 @@ TRIALS = 3
 
 @pytest.fixture(scope="module")
 def setup():
-    """Scene, space, engine, filter and the episode function."""
+    """Scene, task, filter and the episode function."""
     the_scene, space, engine = tiny()
     optimizer = codesign.make_filter(space)
-    episode = partial(codesign.Task(the_scene, space, TRIALS, engine).episode, optimizer)
-    return the_scene, space, engine, optimizer, episode
+    task = codesign.Task(the_scene, space, TRIALS, engine)
+    return the_scene, task, optimizer, partial(task.episode, optimizer)
 
 
 def start(optimizer, seed=0, particles=PARTICLES, design=(0.05, 0.0)):
@@ -31,7 +30,7 @@ def start(optimizer, seed=0, particles=PARTICLES, design=(0.05, 0.0)):
 
 
 def test_episode_is_move_evaluate_weigh_and_resample(setup):
-    the_scene, space, engine, optimizer, episode = setup
+    the_scene, task, optimizer, episode = setup
     state = start(optimizer)
     mask = np.array([True, True])
     new, info = episode(state, mask)
@@ -44,45 +43,49 @@ def test_episode_is_move_evaluate_weigh_and_resample(setup):
 
 
 def test_noise_differs_between_episodes_seeds_and_the_test(setup):
-    the_scene, space, engine, optimizer, episode = setup
+    the_scene, task, optimizer, episode = setup
     closed = np.zeros(2, bool)
     first, info = episode(start(optimizer), closed)
     seen = [info, episode(first, closed)[1], episode(start(optimizer, seed=1), closed)[1]]
-    evaluate = episodes.evaluate_by(episode, optimizer)
-    testing = codesign.testing(the_scene, first.particles, first.key, num_trials=2 * TRIALS)
-    test = episodes.answered(testing, evaluate)
     rows = [i.outcomes.cost[0] for i in seen]
-    rows += [test.outcomes.cost[0, :TRIALS], test.outcomes.cost[0, TRIALS:]]
+    keys = [codesign.test_key(first.key, k) for k in range(2)]
+    rows += [task.evaluate(first.particles, key).cost[0] for key in keys]
     assert len(np.unique(np.asarray(rows), axis=0)) == 5
 
 
 def test_a_run_vmaps_over_seeds_and_is_the_loop_of_its_episodes(setup):
     """Each seed of a batch with its own schedule, as a loop over single episodes."""
-    the_scene, space, engine, optimizer, episode = setup
-    run = partial(codesign.Task(the_scene, space, TRIALS, engine).run, optimizer)
-    masks = np.stack(
-        [schedule(n, np.array(space.is_morphology), 3) for n in ("concurrent", "control")]
-    )
+    the_scene, task, optimizer, episode = setup
+    run = partial(task.run, optimizer)
+    domains = np.array(task.space.is_morphology)
+    masks = np.stack([schedule(n, domains, 3) for n in ("concurrent", "control")])
     starts = [start(optimizer, 0), start(optimizer, 7, design=(0.09, 0.03))]
-    ends, infos = jax.jit(jax.vmap(run))(jax.tree.map(lambda *v: jnp.stack(v), *starts), masks)
+    both = jax.tree.map(lambda *v: jnp.stack(v), *starts)
+    ends, infos = jax.jit(jax.vmap(run))(both, masks)
+    beside = task.side_by_side(optimizer)
     # Two programs round differently, which may move a loss by one time step.
-    step = the_scene.discretization.timestep
+    same = partial(np.testing.assert_allclose, atol=3 * the_scene.discretization.timestep)
+    states, together = beside.episode(both, masks[:, 0])
+    same(together.outcomes.cost, infos.outcomes.cost[:, 0])
+    same(together.drawn.position, infos.drawn.position[:, 0])
+    np.testing.assert_allclose(states.particles[0], episode(starts[0], masks[0, 0])[0].particles)
+    again = beside.evaluate(both.particles, both.key)
+    same(again.cost[1], task.evaluate(starts[1].particles, starts[1].key).cost)
     for k, state in enumerate(starts):
         for e in range(3):
             state, want = episode(state, masks[k, e])
-            np.testing.assert_allclose(infos.outcomes.cost[k, e], want.outcomes.cost, atol=3 * step)
+            same(infos.outcomes.cost[k, e], want.outcomes.cost)
         np.testing.assert_allclose(ends.particles[k], state.particles, rtol=1e-5)
     assert np.ptp(infos.outcomes.cost) > 0.1
 
 
 def test_seed_is_poor_and_reproducible(setup):
-    the_scene, space, _, optimizer, episode = setup
-    evaluate = episodes.evaluate_by(episode, optimizer)
+    the_scene, task, optimizer, _ = setup
+    space = task.space
 
     def find(seed):
         key = jax.random.key(seed)
-        search = codesign.seed_search(the_scene, optimizer, key, batch=PARTICLES)
-        return episodes.answered(search, evaluate)
+        return codesign.seed_search(the_scene, optimizer, key, task.evaluate, batch=PARTICLES)
 
     a, cost, drawn = find(0)
     b, *_ = find(0)
@@ -91,20 +94,6 @@ def test_seed_is_poor_and_reproducible(setup):
     np.testing.assert_array_equal(a, b)
     assert (np.asarray(a) != np.asarray(c)).any()
     assert (np.asarray(a) >= space.low).all() and (np.asarray(a) <= space.high).all()
-
-
-def test_final_test_counts_the_last_episode(setup):
-    the_scene, _, _, optimizer, episode = setup
-    state, info = episode(start(optimizer), np.ones(2, bool))
-    kept = jax.tree.map(lambda v: v[info.selection.ancestors], info.outcomes)
-    evaluate = episodes.evaluate_by(episode, optimizer)
-    how = {"num_trials": 4, "previous": kept}
-    testing = codesign.testing(the_scene, state.particles, state.key, **how)
-    result = episodes.answered(testing, evaluate)
-    # Four more trials take two rounds of three, and three were there.
-    assert result.outcomes.cost.shape == (PARTICLES, 9)
-    np.testing.assert_array_equal(result.outcomes.cost[:, :3], kept.cost)
-    np.testing.assert_allclose(result.cost, result.outcomes.cost.mean(1), rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import pytest
 
 from codesign_jax import cli, model, preflight, rollout, runs, scene
 from codesign_jax.engines.mujoco import MujocoEngine
+from codesign_jax.runs.run import Run
 from codesign_jax.types import Status
 from tests.helpers.grasps import (
     batch_inputs,
@@ -91,12 +92,12 @@ def test_bad_starts_are_flagged_and_in_the_outcome():
 )
 def failing_run(request, tmp_path_factory):
     """A tiny optimisation in which some trials are too fast."""
-    save = runs.loop.Loop.save
+    save = Run.save
 
-    def without_devices(loop):
+    def without_devices(run):
         # They simulate the next episode: what is given to them would wait for its end.
         with jax.transfer_guard_host_to_device("disallow_explicit"):
-            save(loop)
+            save(run)
 
     folder = tmp_path_factory.mktemp("failing") / "run"
     sizes = ["--particles", "3", "--trials", "2", "--episodes", "1", "--test-trials", "0"]
@@ -111,7 +112,7 @@ def failing_run(request, tmp_path_factory):
         *sizes,
     ]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runs.loop.Loop, "save", without_devices)
+        patch.setattr(Run, "save", without_devices)
         cli.main([*run, "--set", "limits.speed=12"])
     return folder
 

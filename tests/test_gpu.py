@@ -16,7 +16,6 @@ import pytest
 
 from codesign_jax import policy, rollout
 from codesign_jax.compiler import launch, thread
-from codesign_jax.engines.base import staged
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.world_model import world_constants
@@ -140,29 +139,6 @@ def test_neighbours_in_a_block_change_no_bit(name):
     for key in ("distance", "height", "speed", "moved"):
         want = np.asarray(found[0][key])[order]
         np.testing.assert_array_equal(found[1][key], want, err_msg=key)
-
-
-@pytest.mark.parametrize("name", ["hull", "hull and fingers"])
-def test_staged_blocks_are_narrow_for_few_worlds(name):
-    """What `codesign optimize` simulates by: widths follow the joined batch, bits do not.
-
-    Teams of lanes have blocks of one world, whose two fingers are the columns of its tables.
-    """
-    scene = gpu_cases.short_scene(name)
-    fields, ctrl = gpu_cases.inputs(scene, 40)
-    engine = StructuredEngine(scene)
-    ctrl = ctrl[:, :200]
-    widths = [engine.block_lanes(worlds) for worlds in (40, 16_384)]
-    assert widths[0] < widths[1] == 32
-
-    def run(lanes):
-        parts = staged(engine, lanes)
-        blocks, common = jax.jit(parts.pack)(fields, ctrl)
-        assert blocks[0].shape[-1] == (lanes if name == "hull" else 2)
-        out = jax.jit(parts.launch)(blocks, common)
-        return jax.jit(lambda out: parts.unpack(out, len(ctrl)))(out)
-
-    jax.tree.map(np.testing.assert_array_equal, *map(run, widths))
 
 
 # Ten rounds of a map that doubles differences; a few roundings of 6e-8 in each.

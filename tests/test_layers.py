@@ -19,7 +19,7 @@ reuse
 array_files
 types provenance compiler optimize
 scene
-axes model control verdict
+axes model control verdict devices
 engines cost
 preflight policy
 rollout

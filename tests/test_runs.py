@@ -21,7 +21,6 @@ from codesign_jax.runs.record import Record
 from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import library, parameters
 from codesign_jax.scene.schema import InputError
-from tests.helpers import episodes
 from tests.helpers.command_runs import RUN, command, copied, own_workplace, snapshot, without  # noqa: F401
 from tests.helpers.toy_engine import tiny
 
@@ -41,7 +40,8 @@ def toy_run():
     the_scene, space, engine = tiny()
     s = settings()
     optimizer = codesign.make_filter(space)
-    episode = partial(codesign.Task(the_scene, space, s.trials, engine).episode, optimizer)
+    task = codesign.Task(the_scene, space, s.trials, engine)
+    episode = partial(task.episode, optimizer)
     state = optimizer.init(jax.random.key(0), np.array([0.05, 0.0]), s.particles)
     record = Record(state, records.empty_history(s, space.num_parameters))
     for e in range(s.episodes):
@@ -49,10 +49,10 @@ def toy_run():
         records.add_report(record.history, e, info)
     particles = record.state.particles
     key = record.state.key
-    how = {"num_trials": s.test_trials, "previous": record.last_outcomes()}
-    testing = codesign.testing(the_scene, particles, key, **how)
-    test = episodes.answered(testing, episodes.evaluate_by(episode, optimizer))
-    record.test = test.outcomes
+    keys = [codesign.test_key(key, k) for k in range(s.test_rounds)]
+    parts = [record.last_outcomes(), *(task.evaluate(particles, key) for key in keys)]
+    record.test = jax.tree.map(lambda *v: np.concatenate(v, axis=1), *parts)
+    test = codesign.summarize_test(the_scene, record.test)
     return the_scene, space, record, test
 
 
@@ -120,8 +120,7 @@ def read(path):
 
 def test_tables_hold_the_history_with_units(toy_run, tmp_path):
     the_scene, space, record, test = toy_run
-    tables.write_episodes(tmp_path, the_scene, space, record.history, 0, 3)
-    tables.write_tests(tmp_path, space, np.asarray(record.state.particles), test)
+    tables.write_run(tmp_path, the_scene, space, record)
     history = record.history
     trials = read(tmp_path / "trials.csv")
     assert [np.float32(r["cost"]) for r in trials] == history.outcomes.cost.ravel().tolist()
@@ -140,8 +139,7 @@ def test_tables_hold_the_history_with_units(toy_run, tmp_path):
 
 def test_every_file_and_column_is_described_on_the_page(toy_run, tmp_path):
     the_scene, space, record, test = toy_run
-    tables.write_episodes(tmp_path, the_scene, space, record.history, 0, 3)
-    tables.write_tests(tmp_path, space, np.asarray(record.state.particles), test)
+    tables.write_run(tmp_path, the_scene, space, record)
     assert {p.name for p in tmp_path.glob("*.csv")} == {*columns.TABLES}
     head, *sections = (ROOT / "docs" / "files.md").read_text(encoding="utf-8").split("\n## ")
     assert {*re.findall(r"^\| `(\S+)` \|", head, re.M)} == columns.FILES | {*columns.TABLES}

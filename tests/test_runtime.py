@@ -238,11 +238,22 @@ except ValueError as error:
     assert "out_specs" in str(error), error
 else:
     raise AssertionError("results that differ between devices were taken for equal ones")
+from codesign_jax.devices import shared_out
+weighed = lambda factor, worlds: {"product": factor * worlds["x"], "sum": worlds["x"].sum(1)}
+runs = jax.vmap(shared_out(weighed, 3), in_axes=(None, 0))  # seven worlds of two runs
+worlds = {"x": np.arange(42.0, dtype=np.float32).reshape(2, 7, 3)}
+got = jax.jit(runs)(2.0, worlds)
+np.testing.assert_array_equal(got["product"], 2 * worlds["x"])
+np.testing.assert_array_equal(got["sum"], worlds["x"].sum(2))
+assert len(got["sum"].devices()) == 3
 """
 
 
 def test_kept_code_runs_in_another_process_on_several_devices(folder):
-    """Shares of `shard_map` use the pool together; XLA knows that their results differ."""
+    """Shares of `shard_map` use the pool together; XLA knows that their results differ.
+
+    And `devices.shared_out`, by which a task's worlds are shared.
+    """
     x, table = kernels.numbers(12)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(handlers, "known", lambda name: False)  # another test may have compiled it

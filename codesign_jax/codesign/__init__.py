@@ -16,12 +16,10 @@ The front page has an optimisation in ten lines; `notebooks/` go on from there.
 from codesign_jax.codesign.episode import (
     STREAM_TRIAL,
     EpisodeInfo,
+    SideBySide,
     Task,
-    asked,
-    closed,
     episode_trials,
     stream_key,
-    told,
 )
 from codesign_jax.codesign.experiment import (
     CONVERGED_COST,
@@ -33,7 +31,7 @@ from codesign_jax.codesign.experiment import (
     convergence_episode,
     seed_search,
     summarize_test,
-    testing,
+    test_key,
 )
 from codesign_jax.codesign.optimizers import make_filter, make_optimizer
 from codesign_jax.cost import particle_cost
@@ -49,9 +47,8 @@ __all__ = [
     "VERDICTS",
     "EpisodeInfo",
     "FinalTest",
+    "SideBySide",
     "Task",
-    "asked",
-    "closed",
     "convergence_episode",
     "episode_trials",
     "make_filter",
@@ -60,7 +57,6 @@ __all__ = [
     "seed_search",
     "stream_key",
     "summarize_test",
-    "testing",
-    "told",
+    "test_key",
     "verdicts",
 ]

@@ -11,7 +11,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import axes, engines, rollout
+from codesign_jax import axes, devices, engines, rollout
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording
@@ -36,14 +36,14 @@ class EpisodeInfo(NamedTuple):
       selection: Particle costs, and weights and ancestors of a resampling; see `optimize.Info`.
       last: Final states of the worlds, shape (particle, trial, n), see `model.RolloutState`; a
         failed world keeps its last valid state. None if the engine does not report states.
-      drawn: The trials themselves, leading axis (trial,), of episodes that `batch.Batch` ran.
+      drawn: The trials that every particle met, leading axis (trial,).
     """
 
     population: jax.Array
     outcomes: Outcome
     selection: Info
-    last: jax.Array | None = None
-    drawn: Trial | None = None
+    last: jax.Array | None
+    drawn: Trial
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -62,6 +62,7 @@ class Task:
         attribute `record_forces = True`, its trace has the contact forces.
       record_qpos: As in `rollout.Options`, for a cost of one's own.
       stop_when_lost: As in `rollout.Options`, for a cost of one's own.
+      devices: Devices of this process that share the worlds of a call.
 
     >>> from codesign_jax import Task, parameters, scene
     >>> grasping = scene.load("paper")
@@ -77,6 +78,7 @@ class Task:
     cost: rollout.CostFunction | None = None
     record_qpos: bool = False
     stop_when_lost: bool | None = None
+    devices: int = 1
 
     def __post_init__(self) -> None:
         """Makes the engine.
@@ -85,6 +87,7 @@ class Task:
           InputError: If the space is none, or there are no trials, or the engine is that of a scene
             of another structure or records no forces where they are asked for, or worlds are to be
             recorded and to stop.
+          ValueError: If there are not so many devices.
         """
         problems = []
         if not isinstance(self.space, DesignSpace):
@@ -99,13 +102,12 @@ class Task:
         if getattr(self.cost, "record_forces", False):
             object.__setattr__(self, "engine", recording(self.engine))
         axes.refuse_other(self.scene, self.engine)
-        self.how[-1].to_end  # noqa: B018  # refuses options that exclude each other
+        self._options.refuse()
+        devices.take(self.devices)
 
     @property
-    def how(self) -> tuple[Any, ...]:
-        """What its programs are built from, see `reuse.shared`."""
-        options = rollout.Options(self.record_qpos, self.stop_when_lost, cost=self.cost)
-        return self.engine, self.space, self.trials, options
+    def _options(self) -> rollout.Options:
+        return rollout.Options(self.record_qpos, self.stop_when_lost, cost=self.cost)
 
     def evaluate(
         self,
@@ -154,6 +156,15 @@ class Task:
         mask = np.ones(self.space.num_parameters, bool) if mask is None else mask
         return self._joined(self._programs.episode, optimizer)(state, mask, scene)
 
+    def side_by_side(self, optimizer: Optimizer) -> "SideBySide":
+        """`episode` and `evaluate` of several runs at once, whose arrays have an axis (run,).
+
+        They are `jax.vmap` of the two: one program simulates the worlds of all runs, and rounds
+        otherwise than one of another number of runs.
+        """
+        episode = SceneProgram(self.scene, self._programs.episodes, optimizer)
+        return SideBySide(episode, SceneProgram(self.scene, self._programs.evaluations))
+
     def run(
         self,
         optimizer: Optimizer,
@@ -180,7 +191,7 @@ class Task:
 
     @functools.cached_property
     def _programs(self) -> "_Programs":
-        return _programs(*self.how)
+        return _programs(self.engine, self.space, self.trials, self.devices, self._options)
 
     def _joined(self, program: Callable, optimizer: Optimizer) -> SceneProgram:
         """A program with its optimiser, which warns where that does not see costs of one's own."""
@@ -205,64 +216,55 @@ class _Weighing(SceneProgram):
         return found
 
 
-def asked(
-    space: DesignSpace,
-    num_trials: int,
-    state: OptimizerState,
-    mask: jax.typing.ArrayLike,
-    scene: Scene,
-    optimizer: Optimizer,
-) -> tuple[jax.Array, tuple[Scene, Params, Trial]]:
-    """The first part of an episode: the particles, and the worlds that they ask for."""
-    population = optimizer.ask(state, mask)
-    noise = episode_trials(scene, state.key, state.episode, num_trials)
-    return population, rollout.crossed(scene, jax.vmap(space.params)(population), noise)
+class SideBySide(NamedTuple):
+    """Programs of several runs; all but the scene has a leading axis (run,)."""
 
-
-def told(
-    num_trials: int,
-    state: OptimizerState,
-    mask: jax.typing.ArrayLike,
-    scene: Scene,
-    optimizer: Optimizer,
-    population: jax.Array,
-    found: tuple[Outcome, jax.Array | None],
-) -> tuple[OptimizerState, EpisodeInfo]:
-    """The last part of an episode: costs of the worlds' outcomes and states at the end."""
-    outcomes, last = rollout.grid(found, (len(population), num_trials))
-    costs = particle_cost(scene, outcomes)
-    new, selection = optimizer.tell(state, population, costs, mask)
-    return new, EpisodeInfo(population, outcomes, selection, last)
+    episode: SceneProgram  # from states and masks to states and reports, see `Task.episode`
+    evaluate: SceneProgram  # from populations and keys to outcomes, see `Task.evaluate`
 
 
 class _Programs(NamedTuple):
     """What a task runs."""
 
     evaluate: Any
+    evaluations: Any
     episode: Any
+    episodes: Any
     run: Any
 
 
 @shared
 def _programs(
-    engine: Engine, space: DesignSpace, num_trials: int, options: rollout.Options
+    engine: Engine, space: DesignSpace, num_trials: int, count: int, options: rollout.Options
 ) -> _Programs:
-    how = options._asdict()
+    def worlds(scene: Scene, hands: Params, trials: Trial) -> tuple[Outcome, jax.Array | None]:
+        outcome, trace = rollout.simulate(scene, engine, hands, trials, **options._asdict())
+        return outcome, trace.last
 
+    def simulate(
+        scene: Scene, population: jax.Array, trials: Trial
+    ) -> tuple[Outcome, jax.Array | None]:
+        """Outcomes and last states of every particle in all trials, by particle and trial."""
+        every = rollout.crossed(scene, jax.vmap(space.params)(population), trials)
+        results = devices.shared_out(worlds, count)(*every)
+        return rollout.grid(results, (len(population), num_trials))
+
+    @jax.jit  # is traced once for itself and for `evaluations`
     def evaluate(population: jax.Array, key: jax.Array, scene: Scene) -> Outcome:
-        trials = rollout.sample_trials(scene, key, num_trials)
-        return rollout.evaluate(scene, engine, jax.vmap(space.params)(population), trials, **how)
+        return simulate(scene, population, rollout.sample_trials(scene, key, num_trials))[0]
 
-    @jax.jit  # is traced once for itself and for `run`
+    @jax.jit  # is traced once for itself, `episodes` and `run`
     def episode(
         state: OptimizerState, mask: jax.typing.ArrayLike, scene: Scene, optimizer: Optimizer
     ) -> tuple[OptimizerState, EpisodeInfo]:
+        """Fig. 5 of the paper: move, simulate, weigh and resample."""
         _refuse_mask(space, mask)
         space.refuse_population(state.particles)
-        own = state, mask, scene, optimizer
-        population, (worlds, hands, trials) = asked(space, num_trials, *own)
-        outcomes, trace = rollout.simulate(worlds, engine, hands, trials, **how)
-        return told(num_trials, *own, population, (outcomes, trace.last))
+        population = optimizer.ask(state, mask)
+        trials = episode_trials(scene, state.key, state.episode, num_trials)
+        outcomes, last = simulate(scene, population, trials)
+        new, selection = optimizer.tell(state, population, particle_cost(scene, outcomes), mask)
+        return new, EpisodeInfo(population, outcomes, selection, last, trials)
 
     def run(
         state: OptimizerState, masks: jax.typing.ArrayLike, scene: Scene, optimizer: Optimizer
@@ -272,7 +274,13 @@ def _programs(
 
         return jax.lax.scan(one, state, jnp.asarray(masks))
 
-    return _Programs(evaluate, episode, run)
+    return _Programs(
+        evaluate,
+        jax.vmap(evaluate, in_axes=(0, 0, None)),
+        episode,
+        jax.vmap(episode, in_axes=(0, 0, None, None)),
+        run,
+    )
 
 
 def _refuse_mask(space: DesignSpace, mask: jax.typing.ArrayLike) -> None:
@@ -288,19 +296,6 @@ def episode_trials(
 ) -> Trial:
     """Trials of an episode of the run with this root key, leading axis (trial,)."""
     return rollout.sample_trials(scene, stream_key(key, STREAM_TRIAL, episode), num_trials)
-
-
-def closed(
-    optimizer: Optimizer, population: jax.Array, key: jax.Array
-) -> tuple[OptimizerState, np.ndarray]:
-    """State and mask of an episode that moves nothing: it simulates a population as it is.
-
-    Args:
-      population: Particles [SI units], shape (particle, parameter).
-    """
-    state = optimizer.init(key, population[0], len(population))
-    mask = np.zeros(np.shape(optimizer.space.low), bool)
-    return state._replace(particles=jnp.asarray(population)), mask
 
 
 def stream_key(key: jax.Array, stream: int, index: jax.typing.ArrayLike = 0) -> jax.Array:

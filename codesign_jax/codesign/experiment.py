@@ -1,15 +1,14 @@
 """How the paper's experiments begin, end and are measured (section VI.4)."""
 
-from collections.abc import Generator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.codesign.episode import stream_key
+from codesign_jax.codesign.episode import STREAM_TRIAL, stream_key
 from codesign_jax.cost import particle_cost
-from codesign_jax.optimize import Optimizer, rejection, translated
+from codesign_jax.optimize import Optimizer, rejection
 from codesign_jax.scene import Scene
 from codesign_jax.types import Outcome
 
@@ -46,18 +45,18 @@ def seed_search(
     scene: Scene,
     optimizer: Optimizer,
     key: jax.Array,
+    evaluate: Callable[[jax.Array, jax.Array], Outcome],
     *,
     batch: int,
     threshold: float = SEED_COST,
-) -> Generator[tuple[jax.Array, jax.Array], Outcome, tuple[jax.Array, float, int]]:
+) -> tuple[jax.Array, float, int]:
     """Draws the particle that a run starts from by rejection sampling (section VI.4).
-
-    A generator: it yields (population, key), and is sent their outcomes; see `optimize.answer`.
 
     Args:
       optimizer: Optimiser whose space is sampled.
       key: Root key of the run.
-      batch: Candidates of one request.
+      evaluate: From candidates and a key to their outcomes, such as `Task.evaluate`.
+      batch: Candidates of one call.
       threshold: Cost above which a candidate is poor enough.
 
     Returns:
@@ -66,43 +65,28 @@ def seed_search(
     Raises:
       NoSeed: If no candidate is poor enough.
     """
-    noise = stream_key(key, STREAM_SCREEN)
-    seeds, costs, drawn = yield from translated(
-        rejection(key, optimizer.space, 1, threshold=threshold, batch=batch),
-        lambda population: (population, noise),
-        lambda outcomes: particle_cost(scene, outcomes),
-    )
+    noise = _first(stream_key(key, STREAM_SCREEN))
+
+    def cost(candidates: jax.Array) -> jax.Array:
+        return particle_cost(scene, evaluate(candidates, noise))
+
+    how = {"threshold": threshold, "batch": batch}
+    seeds, costs, drawn = rejection(key, optimizer.space, 1, cost, **how)
     return seeds[0], float(costs[0]), drawn
 
 
-def testing(
-    scene: Scene,
-    particles: jax.Array,
-    key: jax.Array,
-    *,
-    num_trials: int,
-    previous: Outcome | None = None,
-) -> Generator[tuple[jax.Array, jax.Array], Outcome, FinalTest]:
-    """Tests final particles on new trials, together with the trials they had already.
+def test_key(key: jax.Array, index: int) -> jax.Array:
+    """Key of the trials of a round of the final test of the run with this root key.
 
-    The paper's test: 36 more trials in 2D, which makes 42 with the last episode's 6, and 72 more
-    in 23D, which makes 78.  A generator: it yields (population, key), and is sent their outcomes.
-
-    Args:
-      particles: Particles [SI units], shape (particle, parameter).
-      key: Root key of the run.
-      num_trials: Further trials of each particle; requests go on until there are as many, so that a
-        multiple of an answer's trials gives exactly that many.
-      previous: Outcomes that count as well, shape (particle, trial), such as the last episode's.
+    The paper's test is 36 more trials of the final particles in 2D, which makes 42 with the last
+    episode's 6, and 72 more in 23D, which makes 78; a round is as many trials as an episode's.
     """
-    parts = [] if previous is None else [previous]
-    done = 0
-    chunk = 0
-    while done < num_trials:
-        parts.append((yield particles, stream_key(key, STREAM_TEST, chunk)))
-        done = done + parts[-1].cost.shape[1]
-        chunk = chunk + 1
-    return summarize_test(scene, jax.tree.map(lambda *v: jnp.concatenate(v, axis=1), *parts))
+    return _first(stream_key(key, STREAM_TEST, index))
+
+
+def _first(key: jax.Array) -> jax.Array:
+    # As an episode's first trials: tests and seeds of earlier versions stay the same.
+    return stream_key(key, STREAM_TRIAL)
 
 
 def summarize_test(scene: Scene, outcomes: Outcome) -> FinalTest:

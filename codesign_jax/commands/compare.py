@@ -323,4 +323,4 @@ def read(scene: Scene, folder: Path) -> RunResult | None:
     if record is None or record.failed_outcomes() is not None:
         return None
     test = None if record.test is None else codesign.summarize_test(scene, record.test)
-    return RunResult(record, test, 0)
+    return RunResult(record, test)

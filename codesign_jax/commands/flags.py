@@ -177,14 +177,14 @@ class Optimize(Command, SceneFlags):
     """Root of all random numbers."""
     seeds: Text = None
     """Several seeds, such as 0-9 or 1,3,5: a run of each, simulated in one batch, and a
-    comparison. Each is the run that it would be alone."""
+    comparison. Each draws the random numbers that it would draw alone."""
     devices: Count = None
-    """Devices that share the batch; default: every GPU of this host. Results do not depend on
-    it."""
+    """Devices that share the batch; default: every GPU of this host. Results may differ in
+    their last bits."""
     chunk: Count = None
-    """Most grasps that a device simulates in one call; default: 16384. An episode of one
-    run is never cut. Larger calls are faster on a GPU that has memory for them
-    (docs/performance.md). Results do not depend on it."""
+    """Most grasps that a device simulates in one call; default: 16384. Runs that have no
+    room go on when the others have ended. Larger calls are faster on a GPU that has memory
+    for them (docs/performance.md)."""
     distributed: Text = None
     """With --seeds, one process on each of several hosts, which share the seeds: auto under SLURM
     or MPI, or ADDRESS:PORT,PROCESSES,INDEX. The folder must be one that all see."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -128,7 +128,7 @@ def _in_scenes(
         own = [numbers[rows, k] if varied[k] else value for k, value in enumerate(base)]
         return jax.tree.unflatten(tree, own)
 
-    def call(rows: np.ndarray, device: Any) -> Outcome:
+    def call(rows: np.ndarray) -> Outcome:
         drawn = [rollout.sample_trials(scene_of(row), key, count) for row in rows]
         trials = jax.tree.map(lambda *v: jnp.concatenate(v), *drawn)
         every = np.repeat(rows, count)

@@ -7,7 +7,7 @@ from codesign_jax.commands import common, grasp, reference
 from codesign_jax.commands.flags import Report
 from codesign_jax.report import page
 from codesign_jax.report.of_run import Run
-from codesign_jax.runs import Settings, cases
+from codesign_jax.runs import Settings, cases, directory
 from codesign_jax.runs.cases import Case
 from codesign_jax.runs.manifest import read_provenance
 from codesign_jax.runs.progress import Busy
@@ -31,6 +31,7 @@ def main(options: Report) -> int:
     common.refuse(common.place_problems("--out", path))
     notes: list[str] = []
     record = cases.read_record(options.folder, tell=notes.append)
+    whole = not notes
     chosen = cases.choose(scene, record)
     notes += [text for text in [cases.doubt(chosen)] if text]
     kept = reference.kept(options.folder, scene, settings)
@@ -53,6 +54,8 @@ def main(options: Report) -> int:
     shown = None if options.no_replay else best_grasp(scene, settings, record, name, console)
     with Busy(console, "writing the report"):
         page.write(run, shown, path)
+    if whole:  # else the tables may be all that is left of what is damaged
+        directory.write_tables(options.folder, scene, settings, record)
     size = path.stat().st_size / 1e6
     console.print(f"report: {path} ({size:.1f} MB, for any browser, offline)")
     return 0

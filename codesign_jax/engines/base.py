@@ -1,7 +1,6 @@
 """The interface behind which every engine stands."""
 
-from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import jax
 
@@ -37,46 +36,6 @@ class Engine(Protocol):
           shows of worlds that are decided before the end.
         """
         ...
-
-
-class Staged(NamedTuple):
-    """A rollout in three parts, so that many batches share the middle one, the costly one.
-
-    Outputs of a batch have the same bits whatever batches it was joined with, as `pack` and
-    `unpack` are programs of a batch's own size, and blocks do not depend on each other.
-
-    Attributes:
-      pack: (fields, controls) to (blocks, common): arrays with a leading axis (block,), and those
-        that every block reads, the same for all batches of a scene.
-      launch: (blocks, common) to arrays with a leading axis (block,).
-      unpack: (those arrays, number of worlds) to the trace.
-      joins: Whether `launch` takes the blocks of several batches, one behind the other, and any
-        part of them; otherwise it wants those of one batch.
-    """
-
-    pack: Callable[[ModelFields, jax.Array], tuple[tuple, tuple]]
-    launch: Callable[[tuple, tuple], tuple]
-    unpack: Callable[[tuple, int], Trace]
-    joins: bool
-
-
-def block_lanes(engine: Engine, worlds: int) -> int | None:
-    """Lanes of the blocks in which an engine packs worlds; None if it has no blocks."""
-    own: Any = getattr(engine, "block_lanes", None)
-    return None if own is None else own(worlds)
-
-
-def staged(engine: Engine, lanes: int | None = None, *, trajectory: bool = False) -> Staged:
-    """The engine's own parts, or the whole rollout as the middle one."""
-    own: Any = getattr(engine, "staged", None)
-    if own is not None:
-        return own(lanes, trajectory=trajectory)
-    return Staged(
-        pack=lambda fields, ctrl: ((fields, ctrl), ()),
-        launch=lambda blocks, common: engine.rollout(*blocks, trajectory=trajectory),
-        unpack=lambda trace, worlds: trace,
-        joins=False,
-    )
 
 
 def tells_forces(engine: Engine) -> bool:

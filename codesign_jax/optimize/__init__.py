@@ -29,10 +29,8 @@ from codesign_jax.optimize.schedule import schedule
 from codesign_jax.optimize.screened import Screened
 from codesign_jax.optimize.seeding import (
     NoSeed,
-    answer,
     candidates,
     rejection,
-    translated,
 )
 
 __all__ = [
@@ -50,7 +48,6 @@ __all__ = [
     "Screened",
     "Space",
     "OptimizerState",
-    "answer",
     "candidates",
     "make_optimizer",
     "problem",
@@ -58,6 +55,5 @@ __all__ = [
     "rejection",
     "schedule",
     "stochastic_universal",
-    "translated",
     "strictly_below",
 ]

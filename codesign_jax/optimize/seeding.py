@@ -1,7 +1,6 @@
 """Seed particles by rejection sampling."""
 
-from collections.abc import Callable, Generator
-from typing import Any, TypeVar
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +8,6 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from codesign_jax.optimize.bounds import Space
-
-T = TypeVar("T")
 
 STREAM_SEED = 0x73656564
 """Stream of the candidates ("seed")."""
@@ -46,11 +43,12 @@ def rejection(
     key: jax.Array,
     space: Space,
     num_seeds: int,
+    cost: Callable[[jax.Array], ArrayLike],
     *,
     threshold: float = 2.0,
     batch: int = 64,
     max_batches: int = 100,
-) -> Generator[jax.Array, ArrayLike, tuple[jax.Array, jax.Array, int]]:
+) -> tuple[jax.Array, jax.Array, int]:
     """Draws seed particles that are not solutions yet.
 
     Deimel et al. (2017), section VI.4: seeds are drawn with cost > 2.0 to avoid runs whose initial
@@ -61,13 +59,11 @@ def rejection(
       key: Typed key from `jax.random.key`.
       space: Bounds and constraint of the parameters.
       num_seeds: Number of seed particles to find.
+      cost: From candidates, shape (particle, parameter), to their costs, shape (particle,). A cost
+        that is not finite is never accepted.
       threshold: Cost above which a candidate is accepted.
-      batch: Candidates of one request.
-      max_batches: Requests after which to give up.
-
-    Yields:
-      Candidates, shape (particle, parameter); it is sent their costs, shape (particle,). A cost
-      that is not finite is never accepted.
+      batch: Candidates of one call of `cost`.
+      max_batches: Calls after which to give up.
 
     Returns:
       Seeds, shape (seed, parameter), their costs, shape (seed,), and the number of candidates
@@ -84,10 +80,10 @@ def rejection(
     accepted = np.empty(0, int)
     for start in range(0, batch * max_batches, batch):
         drawn.append(candidates(key, space, np.arange(start, start + batch)))
-        cost = np.asarray((yield drawn[-1]))
-        if cost.shape != (batch,):
-            raise ValueError(f"costs have shape {cost.shape} for {batch} particles")
-        costs = np.concatenate([costs, cost])
+        more = np.asarray(cost(drawn[-1]))
+        if more.shape != (batch,):
+            raise ValueError(f"costs have shape {more.shape} for {batch} particles")
+        costs = np.concatenate([costs, more])
         accepted = np.flatnonzero(np.isfinite(costs) & (costs > threshold))[:num_seeds]
         if accepted.size == num_seeds:
             seeds = jnp.concatenate(drawn)[accepted]
@@ -97,25 +93,3 @@ def rejection(
         f"{costs.size} candidates; the highest finite cost was "
         f"{np.max(costs, initial=-np.inf, where=np.isfinite(costs)):g}"
     )
-
-
-def answer(asking: Generator[Any, Any, T], reply: Callable[[Any], Any]) -> T:
-    """Answers everything that a generator asks for; returns what it returns."""
-    try:
-        request = next(asking)
-        while True:
-            request = asking.send(reply(request))
-    except StopIteration as stop:
-        return stop.value
-
-
-def translated(
-    asking: Generator[Any, Any, T], request: Callable[[Any], Any], reply: Callable[[Any], Any]
-) -> Generator[Any, Any, T]:
-    """A generator that asks for request(x) where another asks for x, and is told reply(answer)."""
-    try:
-        wanted = next(asking)
-        while True:
-            wanted = asking.send(reply((yield request(wanted))))
-    except StopIteration as stop:
-        return stop.value

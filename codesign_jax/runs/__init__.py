@@ -10,12 +10,13 @@ The numerical modules know nothing of files; this package knows nothing of physi
 
 from codesign_jax.runs.directory import check_folder, setting_of
 from codesign_jax.runs.errors import AllFailed, RunError
-from codesign_jax.runs.loop import Plan, RunResult, needs_poor_seed, prepare, variant
+from codesign_jax.runs.loop import Results, optimize, run_names
+from codesign_jax.runs.plan import Plan, needs_poor_seed, prepare, variant
 from codesign_jax.runs.reading import load_record, read_run
 from codesign_jax.runs.record import History, Record
+from codesign_jax.runs.run import FAILURES, RunResult
 from codesign_jax.runs.settings import SCENE_COST, Settings, check, make_settings
 from codesign_jax.runs.tables import describe, failure_counts, status_names, warning_counts
-from codesign_jax.runs.together import FAILURES, Results, optimize, run_names
 
 __all__ = [
     "FAILURES",

@@ -247,10 +247,13 @@ def _place(record: Record, particle: int) -> tuple[int, int]:
     row = int(record.history.ancestors[last, particle])
     if row >= 0:
         return last, row
-    # One of the best so far, from an earlier episode.
-    others = record.history.population[:last]
-    apart = np.abs(others - np.asarray(record.state.particles)[particle]).sum(-1)
-    episode, row = np.unravel_index(apart.argmin(), apart.shape)
+    # One of the best so far: the last earlier episode that simulated this very design.
+    same = (record.history.population[:last] == np.asarray(record.state.particles)[particle]).all(
+        -1
+    )
+    if not same.any():  # against `optimize.Info.ancestors`, as an optimiser of the user's may do
+        return last, int(record.history.cost[last].argmin())
+    episode, row = np.argwhere(same)[-1]
     return int(episode), int(row)
 
 

@@ -20,12 +20,14 @@ from typing import Any
 from codesign_jax import files, terminal, user_code
 from codesign_jax import scene as scenes
 from codesign_jax.provenance import environment
-from codesign_jax.runs import manifest, reading, scene_files
+from codesign_jax.runs import manifest, reading, scene_files, tables
 from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.runs.columns import FILES, TABLES
 from codesign_jax.runs.manifest import LOCK, PROVENANCE
+from codesign_jax.runs.record import Record
 from codesign_jax.runs.settings import Settings, masks_of
 from codesign_jax.scene import Scene
+from codesign_jax.scene.parameters import design_space
 from codesign_jax.scene.schema import InputError
 
 EVENTS = "events.log"
@@ -142,6 +144,13 @@ def locked(path: Path) -> Iterator[None]:
         file.write(str(os.getpid()))
         file.flush()
         yield
+
+
+def write_tables(path: Path, scene: Scene, settings: Settings, record: Record) -> None:
+    """Writes a run's tables from its checkpoint, unless a process has the run or none may write."""
+    if os.access(path, os.W_OK):
+        with contextlib.suppress(InputError), locked(path):
+            tables.write_run(path, scene, design_space(scene.hand, settings.preset), record)
 
 
 def _resume(path: Path, settings: Settings, command: list[str]) -> list[str]:

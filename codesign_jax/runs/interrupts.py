@@ -69,25 +69,13 @@ class Interrupts:
 
     def call(self, function: Callable[..., T], *arguments: Any) -> T:
         """Runs a function and waits until its arrays are there."""
-        return self.begin(lambda: lambda: function(*arguments))()
+        return self.begin(function, *arguments)()
 
-    def begin(self, function: Callable[..., Callable[[], T]], *arguments: Any) -> Callable[[], T]:
-        """Runs a function, then the one that it returns; returns what waits for that."""
+    def begin(self, function: Callable[..., T], *arguments: Any) -> Callable[[], T]:
+        """Begins to run a function; returns what waits until its arrays are there."""
         if self.signum:
             raise Stopped(self.signum)
-        begun = threading.Event()
-
-        def work() -> T:
-            try:
-                finish = function(*arguments)
-            finally:
-                begun.set()
-            return jax.block_until_ready(finish())
-
-        future = self._worker.submit(work)
-        # Until the devices have something to do, other Python code would only slow them down.
-        while not begun.wait(0.2):
-            pass
+        future = self._worker.submit(lambda: jax.block_until_ready(function(*arguments)))
 
         def result() -> T:
             while not future.done():

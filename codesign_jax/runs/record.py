@@ -161,7 +161,7 @@ def _shapes(record: Any, settings: Settings) -> Iterator[tuple[str, Any, tuple]]
     for name in ("cost", "weight", "ancestors"):
         yield name, getattr(history, name), (e, n)
     if record.test is not None:
-        # The last episode's trials may be among them, see `codesign.testing`.
+        # The last episode's trials may be among them, see `run.Run.finish`.
         tested = n, max(np.shape(record.test.cost)[-1], settings.test_rounds * settings.trials)
         for name, value in record.test._asdict().items():
             if value is not None or name not in _NOT_EVERYWHERE:

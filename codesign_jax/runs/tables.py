@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from codesign_jax import files, types
-from codesign_jax.codesign import VERDICTS, FinalTest, verdicts
+from codesign_jax.codesign import VERDICTS, FinalTest, summarize_test, verdicts
 from codesign_jax.runs.columns import MORE, REFERENCE, TABLES
 from codesign_jax.runs.record import History, Record
 from codesign_jax.scene import Scene
@@ -34,44 +34,27 @@ def design_columns(space: DesignSpace) -> list[str]:
     return [f"{name}_{unit}" for name, unit in zip(names, space.units, strict=True)]
 
 
-def write_episodes(
-    folder: Path, scene: Scene, space: DesignSpace, history: History, start: int, stop: int
+def write_run(
+    folder: Path, scene: Scene, space: DesignSpace, record: Record, since: int = 0
 ) -> None:
-    """Writes the rows of episodes start to stop: replaces the files if start is 0, else appends."""
-    for name, rows in _of_episodes(scene, space, history, range(start, stop)).items():
-        path = folder / name
-        text = _text(name, space, rows, named=start == 0)
-        if start == 0:
-            _replace(path, text)
-        else:
-            files.append(path, text)
+    """Writes the tables of a run: all of them anew, or the rows from an episode on.
 
-
-def write_tests(folder: Path, space: DesignSpace, particles: np.ndarray, test: FinalTest) -> None:
-    _replace(folder / TESTS, _text(TESTS, space, _of_test(space, particles, test)))
-
-
-def mend(
-    folder: Path, scene: Scene, space: DesignSpace, record: Record, test: FinalTest | None
-) -> list[str]:
-    """Makes the files those of a run; returns the names of those that differed.
-
-    A process that was killed between a checkpoint and its rows leaves files without these; others
-    were damaged or changed by somebody.
+    Args:
+      since: Index of the first episode whose rows are appended; 0 replaces the files.
     """
-    wanted = _of_episodes(scene, space, record.history, range(record.done))
-    if test is not None:
-        wanted[TESTS] = _of_test(space, np.asarray(record.state.particles), test)
-    differing = []
-    for name, rows in wanted.items():
-        text = _text(name, space, rows)
-        if _content(folder / name) != text.encode():
+    span = range(since, record.done)
+    for name, rows in _of_episodes(scene, space, record.history, span).items():
+        text = _text(name, space, rows, named=since == 0)
+        if since == 0:
             _replace(folder / name, text)
-            differing.append(name)
-    if TESTS not in wanted and (folder / TESTS).exists():
-        (folder / TESTS).unlink()
-        differing.append(TESTS)
-    return differing
+        else:
+            files.append(folder / name, text)
+    if record.test is None:
+        (folder / TESTS).unlink(missing_ok=True)
+    else:
+        test = summarize_test(scene, record.test)
+        rows = _of_test(space, np.asarray(record.state.particles), test)
+        _replace(folder / TESTS, _text(TESTS, space, rows))
 
 
 def episodes_in(folder: Path) -> int:

@@ -34,7 +34,6 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--chunk", type=int, default=LIMIT, help="most worlds of a call")
     parser.add_argument("--devices", type=int, help="by default all that are visible")
-    parser.add_argument("--every", type=int, default=4, help="episodes between checkpoints")
     parser.add_argument("--fresh", action="store_true", help="delete what is there of it")
     parser.add_argument("--data", type=Path, default=Path("docs/data/experiments"))
     parser.add_argument("--figures", type=Path, default=Path("docs/figures"))
@@ -71,7 +70,7 @@ Found = tuple[int, simulate.Arrays | None, int]
 def _strategies(args: argparse.Namespace, the_plan: simulate.Strategies, the_scene: Scene) -> Found:
     folder = args.out / args.experiment
     plans = simulate.plans(the_plan, the_scene, args.engine, folder, args.seed)
-    how = {"fresh": args.fresh, "every": args.every, "devices": args.devices, "chunk": args.chunk}
+    how = {"fresh": args.fresh, "devices": args.devices, "chunk": args.chunk}
     done = runs.optimize(plans, sys.argv, **how)
     problems = {place: r for place, r in done.runs.items() if isinstance(r, Exception)}
     for place, error in problems.items():

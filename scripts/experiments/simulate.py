@@ -13,6 +13,7 @@ import numpy as np
 from rich.console import Console
 
 from codesign_jax import batch, codesign, runs
+from codesign_jax.devices import take
 from codesign_jax.engines import make_engine
 from codesign_jax.runs import Record
 from codesign_jax.runs.progress import Meter
@@ -227,11 +228,12 @@ def landscape(
     space = design_space(scene.hand, plan.preset)
     designs = grid(space, plan.points)
     flat = designs.reshape(-1, designs.shape[-1])
-    task = codesign.Task(scene, space, plan.trials, make_engine(engine, scene))
+    count = len(take(devices))
+    task = codesign.Task(scene, space, plan.trials, make_engine(engine, scene), devices=count)
     key = codesign.stream_key(jax.random.key(seed), STREAM_GRID)
-    size = batch.size(len(flat), plan.trials, most=chunk, devices=len(batch.take(devices)))
+    size = batch.size(len(flat), plan.trials, most=chunk, devices=count)
     with Meter(plan.name, plan.grasps, console) as meter:
-        outcome = batch.evaluate(task, key, flat, size, meter.advance, devices=devices)
+        outcome = batch.evaluate(task, key, flat, size, meter.advance)
     shape = (plan.points, plan.points, plan.trials)
     found = {"trial_cost": outcome.cost, "status": outcome.status.astype(np.uint8)}
     found = {name: values.reshape(shape) for name, values in found.items()}

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from codesign_jax import reuse
 from codesign_jax.compiler import launch
 from codesign_jax.compiler.launch import KernelUnavailable
-from codesign_jax.engines.base import Equal, Staged
+from codesign_jax.engines.base import Equal
 from codesign_jax.engines.structured import coordinates, forces, transforms
-from codesign_jax.engines.structured.kernel import Limits, Program, lanes_here
+from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.kernel.adjoint import RecordedPath, recorded
 from codesign_jax.engines.structured.kernel.memory import lengthened
 from codesign_jax.engines.structured.laws import meshes
@@ -23,10 +23,6 @@ from codesign_jax.types import Forces, Status, Trace
 
 FAR = 1e30
 """A bound that no number exceeds."""
-
-
-PIECE = 1024
-"""Worlds of a piece in which `StructuredEngine` computes the tables of teams."""
 
 
 LANES = 64
@@ -212,22 +208,8 @@ class StructuredEngine(Equal):
         return (*tables, *program.pack_state(state), *program.pack_controls(ctrl), *mesh)
 
     def _tables(self, program: Program, fields: ModelFields) -> tuple[jax.Array, ...]:
-        """The hands' tables.
-
-        XLA fuses a program of another number of worlds in another way and rounds in another way.
-        Where a block is one world its numbers are therefore computed in pieces of one size.
-        """
-        pieces = max(2, -(-len(fields.start) // PIECE))  # XLA would do without a loop of one round
-
-        def split(x: jax.Array) -> jax.Array:
-            return lengthened(x, 0, pieces * PIECE).reshape(pieces, PIECE, *x.shape[1:])
-
-        def pack(fields: ModelFields) -> tuple[jax.Array, jax.Array]:
-            return program.pack_hand(world_constants(self.scene, fields))
-
-        found = jax.lax.map(pack, jax.tree.map(split, fields))
-        blocks = -(-len(fields.start) // program.block)
-        return tuple(x.reshape(-1, *x.shape[2:])[:blocks] for x in found)
+        """The hands' tables."""
+        return program.pack_hand(world_constants(self.scene, fields))
 
     def record(
         self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False
@@ -241,43 +223,6 @@ class StructuredEngine(Equal):
         taken = program.by_block(found["moved"].sum(1)[:, None, None, None])
         path = jax.tree.map(lambda x: program.by_world(x, len(ctrl)), recorded(out, taken))
         return self._trace(found, end, trajectory), path
-
-    def block_lanes(self, worlds: int) -> int:
-        """See `base.block_lanes`: a GPU with few worlds is faster with narrow blocks."""
-        return lanes_here(self.scene, jnp.result_type(float), worlds)
-
-    def staged(self, lanes: int | None = None, *, trajectory: bool = False) -> Staged:
-        """See `base.staged`: the kernel's blocks, which hold a few worlds each."""
-
-        def program(width: int) -> Program:
-            return Program(self.scene, self.limits, backend=jax.default_backend(), width=width)
-
-        team = program(1).team  # lanes that share a column of a table
-
-        def pack(fields: ModelFields, ctrl: jax.Array) -> tuple[tuple, tuple]:
-            here = program(lanes or lanes_here(self.scene, ctrl.dtype))
-            if team > 1:
-                inputs = self._inputs(here, fields, ctrl)
-                return (inputs[:-1], inputs[-1:]) if here.meshes else (inputs, ())
-            hand = world_constants(self.scene, fields)
-            state = self.reset(fields)
-            # What is calculated is apart from how it is laid out, so that XLA rounds alike
-            # whatever the width.
-            inputs = here.inputs(*jax.lax.optimization_barrier((hand, state, ctrl)))
-            return (inputs[:-1], inputs[-1:]) if here.meshes else (inputs, ())
-
-        # The last axis of the first table, in and out, are the fingers of a block.
-        def launch(blocks: tuple, common: tuple) -> tuple:
-            here = program(blocks[0].shape[-1] * team)
-            return tuple(_execute(here, (*blocks, *common), trajectory=trajectory))
-
-        def unpack(out: tuple, worlds: int) -> Trace:
-            here = program(out[0].shape[-1] * team)
-            outputs = here.outputs(out, worlds, trajectory=trajectory)
-            found, end = jax.lax.optimization_barrier(outputs)
-            return self._trace(found, end, trajectory)
-
-        return Staged(pack, launch, unpack, joins=True)
 
     def _trace(self, found: dict[str, jax.Array], end: State, trajectory: bool) -> Trace:
         series = found["distance"], found["height"], found["speed"]

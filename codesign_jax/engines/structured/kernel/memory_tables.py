@@ -262,7 +262,7 @@ class Packing(Tables):
         wide = {k: self._widen(arrays[k]) for k in self.hand.groups}
         arrays["object_id"] = hand.object_id.astype(dtype)
         narrow = {k: arrays[k] for k in self.world.groups}
-        if self.team > 1:  # XLA rounds alike however many worlds it lays out
+        if self.team > 1:  # Alike in the program of `StructuredEngine.tables` and in a rollout
             wide, narrow = jax.lax.optimization_barrier((wide, narrow))
         return self.hand.pack(self.fingers, self.block, **wide), self.world.pack(
             1, self.block, **narrow

@@ -48,7 +48,7 @@ def on_page_markdown(markdown: str, *, page: Any, config: Any, files: Files) -> 
     made = {target: source for source, target in PAGES.items()}
     source = made.get(page.file.src_uri, f"docs/{page.file.src_uri}")
     picture = posixpath.relpath("figures/way_of_data.svg", posixpath.dirname(page.file.src_uri))
-    markdown = _DIAGRAM.sub(f"![The way of data]({picture})", markdown)
+    markdown = _DIAGRAM.sub(f"![Data flow]({picture})", markdown)
     parts = _CODE.split(markdown)
     parts[::2] = [_relinked(text, source, page.file.src_uri) for text in parts[::2]]
     return "".join(parts)

@@ -33,21 +33,35 @@ UNITS = {
     "mm": ("length", 1e-3),
     "cm": ("length", 1e-2),
     "m": ("length", 1.0),
+    "s": ("time", 1.0),
+    "ms": ("time", 1e-3),
 }
 """Units of a column: what they measure, and how many SI units they are."""
 
 COLUMNS = {
-    "pressure": ("pressure", "gauge pressure of the chamber"),
+    "pressure": ("pressure", "gauge pressure of the chamber; 0 where a file has no such column"),
     "angle": ("angle", "angle between the finger's base and its free tip"),
+    "tip_x": ("length", "place of the free tip along the unbent finger, from its base"),
+    "tip_y": ("length", "place of the free tip across it, towards the bending"),
     "tip_force": ("force", "force on a tip that is held where it was, the rest free to bow"),
     "blocked_force": ("force", "force on the tip of a finger that is kept straight"),
-    "load": ("force", "force on the tip, across the unbent finger, against its bending"),
-    "deflection": ("length", "how far the load moves the tip, in the load's direction"),
+    "load": ("force", "force on the tip: a weight hung from it"),
+    "deflection": (
+        "length",
+        "how far the load moves the tip, across the unbent finger and against its bending",
+    ),
+    "sideways": ("length", "how far the load moves the tip out of the plane of the bending"),
+    "time": ("time", "time of a picture of a finger that was held straight and let go"),
+    "drop": ("length", "drop of its tip at that time, by its weight and the load"),
 }
 """Columns of a file of measurements: what their unit measures, and what they are."""
 
-MEASURED = ("angle", "tip_force", "blocked_force", "deflection")
+BY_PRESSURE = ("angle", "tip_x", "tip_y", "tip_force", "blocked_force")
+"""Columns that need a pressure."""
+MEASURED = (*BY_PRESSURE, "deflection", "sideways", "drop")
 """Columns that are compared with the model."""
+NEEDED = {"deflection": "load", "sideways": "load", "drop": "time"}
+"""Columns that stand beside another one."""
 MOST_CHARACTERS = 1_000_000
 """Largest size of a file."""
 _SEPARATORS = (";", "\t", ",")
@@ -194,18 +208,28 @@ def _cell(text: str, separator: str, where: str, problems: list[str]) -> float:
 
 
 def _missing(table: dict[str, np.ndarray]) -> list[str]:
-    if "pressure" not in table:
-        return ["no column of the pressure, such as pressure_kPa"]
+    """What a table lacks; one without pressures gets those of an empty chamber."""
     names = [n for n in MEASURED if n in table and np.isfinite(table[n]).any()]
+    rows = len(next(iter(table.values())))
+    if "pressure" not in table:
+        if not names or any(n in BY_PRESSURE for n in names):
+            return ["no column of the pressure, such as pressure_kPa"]
+        table["pressure"] = np.zeros(rows)
     problems = []
     if not names:
         problems.append(f"no measured value; columns of them: {', '.join(MEASURED)}")
+    loads_alone = np.all([np.isnan(table[n]) for n in BY_PRESSURE if n in table] or [True], axis=0)
+    table["pressure"] = np.where(loads_alone, np.nan_to_num(table["pressure"]), table["pressure"])
     if np.isnan(table["pressure"]).any():
         problems.append("a row has no pressure")
     elif (table["pressure"] < 0).any():
         problems.append("a pressure is below 0; gauge pressures are meant")
-    if "deflection" in table:
-        loads = table.get("load", np.full(len(table["pressure"]), np.nan))
-        if np.isnan(loads[np.isfinite(table["deflection"])]).any():
-            problems.append("a deflection has no load beside it, in a column such as load_N")
+    for name, other in NEEDED.items():
+        if name in table:
+            beside = table.get(other, np.full(rows, np.nan))
+            if np.isnan(beside[np.isfinite(table[name])]).any():
+                unit = {"load": "N", "time": "s"}[other]
+                problems.append(
+                    f"a {name} has no {other} beside it, in a column such as {other}_{unit}"
+                )
     return problems

@@ -12,9 +12,11 @@ from codesign_jax import finger as fingers
 from codesign_jax.commands import common
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Finger as Options
-from codesign_jax.finger import Finger, Fit
+from codesign_jax.files import atomically
+from codesign_jax.finger import Finger, Posterior
+from codesign_jax.finger.posterior import words
 from codesign_jax.runs import tables
-from codesign_jax.scene import schema
+from codesign_jax.scene import draws, schema
 from codesign_jax.scene.hand import Material
 from codesign_jax.scene.schema import InputError
 from codesign_jax.scene.silicones import LAWS
@@ -27,9 +29,26 @@ SHOWN = {
     "blocked_force": ("N", 1.0),
     "load": ("N", 1.0),
     "deflection": ("mm", 1e-3),
+    "sideways": ("mm", 1e-3),
+    "tip_x": ("mm", 1e-3),
+    "tip_y": ("mm", 1e-3),
+    "time": ("s", 1.0),
+    "drop": ("mm", 1e-3),
 }
 """Units of what is printed, and how many SI units they are."""
 
+MOST_ROWS = 40
+"""Rows that are printed; a film has hundreds."""
+CONSTANTS = {
+    "shear_modulus": ("G", "kPa", 1e3),
+    "moment_factor": ("moment over the section's", "", 1.0),
+    "lateral_factor": ("stiffness sideways over theory's", "", 1.0),
+    "torsion_factor": ("stiffness of twist over theory's", "", 1.0),
+    "damping_time": ("damping time", "ms", 1e-3),
+}
+"""Names of a finger's constants, the unit in which they are printed, and its size."""
+SHOWN_ADVICE = 3
+"""Further measurements that are named."""
 POINTS = 11
 """Pressures of a curve without measurements."""
 
@@ -40,6 +59,9 @@ def main(options: Options) -> int:
     problems = common.number_problems(("--finger", options.finger, 0, case.scene.num_fingers - 1))
     if options.fit and options.measured is None:
         problems.append("--fit needs measurements: give a file, codesign finger FILE.csv --fit")
+    if options.posterior and not options.fit:
+        problems.append("--posterior is that of a fit: add --fit")
+    problems += common.place_problems("--posterior", options.posterior, ".toml")
     common.refuse(problems + common.place_problems("--out", options.out, ".csv"))
     measured = options.measured and fingers.read(options.measured)
     mine = fingers.of_design(case.scene, params, options.finger)
@@ -70,35 +92,40 @@ def _about(mine: Finger, number: int, hand: str) -> str:
     size = f"{1e3 * mine.length:.4g} mm long, {' to '.join(dict.fromkeys(ends))}"
     return (
         f"finger {number} of {hand}: {size}; bending law {law}, G = "
-        f"{1e-3 * mine.shear_modulus:.4g} kPa, {mine.links} links, without weight"
+        f"{1e-3 * mine.constants.shear_modulus:.4g} kPa, {mine.links} links"
     )
 
 
 def compare(mine: Finger, table: dict[str, np.ndarray], options: Options, console: Console) -> None:
     """Prints and writes what was measured, predicted and fitted."""
     models = {"model": mine}
-    fit: Fit | None = None
+    fit: Posterior | None = None
     if options.fit:
         fit = fingers.fit(mine, table)
-        models["fitted"] = mine.of_material(fit.shear_modulus, fit.gain)
+        models["fitted"] = mine.of_material(**fit.value)
     found = {which: fingers.predict(model, table) for which, model in models.items()}
     columns = _columns(table, found, measured=options.measured is not None)
     shown = Table(box=box.SIMPLE)
     for name in columns:
         shown.add_column(name.replace("_", " "), justify="right")
-    for row in zip(*columns.values(), strict=True):
+    for row in [*zip(*columns.values(), strict=True)][:MOST_ROWS]:
         shown.add_row(*("" if math.isnan(v) else f"{v:.4g}" for v in row))
     common.print_table(console, shown)
+    if (rows := len(table["pressure"])) > MOST_ROWS:
+        console.print(f"{rows - MOST_ROWS} more rows: --out writes all of them")
     for line in chain.from_iterable(_without_rest(table, *item) for item in found.items()):
         console.print(line)
     if options.measured:
         for which, values in found.items():
             console.print(f"{which}: {_errors(table, values)}")
         for name in fingers.opposed(table, found["model"]):
-            console.print(f"warning: measured and predicted {_words(name)} differ in sign")
+            console.print(f"warning: measured and predicted {words(name)} differ in sign")
     if fit:
-        for line in _of_fit(fit, table, mine.neo_hookean):
+        for line in [*_of_fit(fit, mine), *_next(mine, fit, table)]:
             console.print(line)
+        if options.posterior:
+            _write(fit, mine, options)
+            console.print(f"posterior: {options.posterior}")
     if options.out:
         texts = {n: ["" if math.isnan(v) else f"{v:.9g}" for v in c] for n, c in columns.items()}
         rows = (dict(zip(texts, row, strict=True)) for row in zip(*texts.values(), strict=True))
@@ -113,7 +140,7 @@ def _without_rest(
     for name, pressures in fingers.without_rest(table, found).items():
         places = ", ".join(f"{pressure / 1e3:.4g}" for pressure in pressures)
         yield (
-            f"warning: {which}: no rest found for the {_words(name)} at {places} kPa: "
+            f"warning: {which}: no rest found for the {words(name)} at {places} kPa: "
             f"{fingers.TOO_FAR}"
         )
 
@@ -147,42 +174,66 @@ def _errors(table: dict[str, np.ndarray], values: dict[str, np.ndarray]) -> str:
     return ", ".join(parts) + ", root mean square" if parts else "no rest where it was measured"
 
 
-def _of_fit(fit: Fit, table: dict[str, np.ndarray], neo_hookean: bool) -> list[str]:
-    modulus, gain = fingers.fitted(table)
+def _of_fit(fit: Posterior, mine: Finger) -> list[str]:
+    """What was fitted, and how a hand takes it."""
     lines = []
-    if modulus:
-        value = f"{fit.shear_modulus:.4g}"
-        if wrong := schema.field_problem("G", float(value), Material, "shear_modulus"):
-            words = "the table's units, signs and the design's section do not fit one another"
-            raise ValueError(f"fitted: {wrong}: {words}")
+    value = fit.value
+    told = fit.told
+    for name in fit.names:
+        label, unit, size = CONSTANTS[name]
+        if wrong := schema.field_problem(label, float(f"{value[name]:.4g}"), Material, name):
+            reason = "the table's units, signs and the design's section do not fit one another"
+            raise ValueError(f"fitted: {wrong}: {reason}")
+        number = f"{value[name] / size:.4g} {unit}".rstrip()
+        told_or_not = "" if told[name] else "; hardly told by these measurements"
+        lines.append(f"fitted: {label} = {number}, {_error(fit, name)}{told_or_not}")
+    if {"shear_modulus", "moment_factor"} <= set(fit.names) and not told["moment_factor"]:
         lines.append(
-            f"fitted: G = {1e-3 * fit.shear_modulus:.4g} kPa, {_error(fit.spread[0])}: "
-            f"--set hand.material.law={LAWS[neo_hookean]} hand.material.shear_modulus={value}"
+            "angles alone give the ratio of modulus and moment, here with a standard error of "
+            f"{100 * fit.ratio_sd:.2g} %; a column tip_force or blocked_force tells them apart"
         )
-    if gain:
+    taken = [f"hand.material.{n}={value[n]:.4g}" for n in fit.names if told[n]]
+    if "shear_modulus" in fit.names:
+        law = f"hand.material.law={LAWS[mine.neo_hookean]}"
+        taken = [law, f"hand.material.shear_modulus={value['shear_modulus']:.4g}"] + [
+            word for word in taken if "shear_modulus" not in word
+        ]
+    lines.append(f"to simulate it: --set {' '.join(taken)}")
+    factor = value.get("moment_factor", 1.0) / mine.constants.moment_factor
+    if told.get("moment_factor", False):
         lines.append(
-            f"fitted: moment {fit.gain:.4g} of the model's at the same pressure, "
-            f"{_error(fit.spread[1])}"
-        )
-        given = ", with the fitted G in it," if modulus else ""
-        lines.append(
-            f"on the real hand divide a simulated design's pressures by {fit.gain:.4g} "
-            f"(play_valves.py --divide {fit.gain:.4g}); to simulate the real finger{given} "
-            f"multiply the simulated pressures by {fit.gain:.4g} instead"
-        )
-    elif modulus:
-        lines.append(
-            "the moment is the model's: angles alone give its ratio to G; a column tip_force or "
-            "blocked_force tells them apart"
+            f"on the real hand divide the pressures of a design that was searched without it by "
+            f"{factor:.4g} (play_valves.py --divide {factor:.4g})"
         )
     return lines
 
 
-def _error(spread: float) -> str:
-    if math.isnan(spread):
+def _error(fit: Posterior, name: str) -> str:
+    low, high = fit.interval[name]
+    if math.isnan(low):
         return "no standard error (as many numbers as values)"
-    return f"standard error {100 * spread:.2g} %"
+    _, unit, size = CONSTANTS[name]
+    span = f"{low / size:.4g} to {high / size:.4g} {unit}".rstrip()
+    return f"standard error {100 * fit.sd[name]:.2g} %, 90 % interval {span}"
 
 
-def _words(name: str) -> str:
-    return name.replace("_", " ")
+def _next(mine: Finger, fit: Posterior, table: dict[str, np.ndarray]) -> list[str]:
+    """Which measurements would narrow the constants most."""
+    try:
+        best = fingers.advice(mine, fit, table)[:SHOWN_ADVICE]
+    except ValueError:
+        return []
+    return [f"to narrow them by {100 * one.less:.0f} %, measure {one.words}" for one in best]
+
+
+def _write(fit: Posterior, mine: Finger, options: Options) -> None:
+    """Writes the posterior as a table of constants."""
+    if np.isnan(fit.covariance).any():
+        raise ValueError("--posterior: as many numbers as values, so that there is none")
+    keys = [f"hand.material.{n}" for n in fit.names]
+    source = f"codesign finger, {options.measured.name if options.measured else ''}"
+    law = LAWS[mine.neo_hookean]
+    table = draws.of_logs(keys, fit.mean, fit.covariance, law, source)
+    assert options.posterior is not None
+    with atomically(options.posterior) as part:
+        part.write_text(draws.text(table), encoding="utf-8")

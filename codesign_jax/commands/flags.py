@@ -447,11 +447,11 @@ class Studio(Command, RunOrDesign):
 
 @dataclasses.dataclass
 class Finger(Command, Subject):
-    """Predict one finger's bending and forces over pressure, and compare it with measurements.
+    """Predict one finger's bending and forces, and fit its constants to measurements.
 
-    A file of measurements is a CSV whose head names columns and their units: pressure_kPa, and one
-    or more of angle_deg, tip_force_N, blocked_force_N, and deflection_mm beside load_N
-    (docs/measurements.md).
+    A file of measurements is a CSV whose head names columns and their units: angle_deg, tip_x_mm,
+    tip_y_mm, tip_force_N and blocked_force_N stand beside pressure_kPa, deflection_mm and
+    sideways_mm beside load_N, and drop_mm beside time_s (docs/measurements.md).
     """
 
     measured: Annotated[
@@ -461,6 +461,9 @@ class Finger(Command, Subject):
     finger: int = 0
     """Which finger of the hand."""
     fit: Flag = False
-    """Fit the shear modulus, and where forces were measured the moment per pressure, too."""
+    """Fit the constants that the measurements tell, with their intervals, and say which further
+    measurement would narrow them most."""
+    posterior: File = None
+    """With --fit: write the constants' distribution (.toml), for --constants."""
     out: File = None
     """Write what is printed, measured and predicted, as a table (.csv)."""

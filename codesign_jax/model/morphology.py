@@ -105,6 +105,7 @@ def finger_beams(hand: Hand, params: Params, links: int) -> Beam:
     return found._replace(
         lateral=material.lateral_factor * found.lateral,
         torsion=material.torsion_factor * found.torsion,
+        moment_per_pressure=material.moment_factor * found.moment_per_pressure,
     )
 
 

@@ -145,6 +145,7 @@ class Material:
       damping_time: Kelvin-Voigt damping time beta: a joint's damping is beta times its stiffness.
       lateral_factor: Factor on the stiffness of bending sideways.
       torsion_factor: Factor on the stiffness of twist.
+      moment_factor: Factor on the bending moment per pressure, which follows from the section.
     """
 
     shear_modulus: float = quantity("Pa", 1e3, 1e7)
@@ -154,6 +155,7 @@ class Material:
     law: str | None = choice(*silicones.LAWS, default=None)
     lateral_factor: float = quantity("", 0.05, 20, default=1.0)
     torsion_factor: float = quantity("", 0.05, 20, default=1.0)
+    moment_factor: float = quantity("", 0.1, 10, default=1.0)
 
 
 @table
@@ -269,7 +271,9 @@ def highest_pressure(hand: "Hand", height: Any, wall: Any, tip: Any = None) -> A
 
 def with_strain(hand: "Hand", strain: float | None, *, neo_hookean: bool) -> "Hand":
     """A hand whose pressures stretch no wall of a free finger by more than a strain, if any."""
-    own = (strain, hand.section.width, hand.material.shear_modulus, neo_hookean)
+    # The pressure of a strain goes with the modulus over the moment's factor.
+    modulus = hand.material.shear_modulus / hand.material.moment_factor
+    own = (strain, hand.section.width, modulus, neo_hookean)
     limit = dataclasses.replace(hand.pressure_limit, strain=None if strain is None else own)
     return dataclasses.replace(hand, pressure_limit=limit)
 

@@ -17,6 +17,7 @@ _FOLDERS = {
     "scenes": (_PACKAGE / "scenes",),
     "controls": (_PACKAGE / "controls",),
     "accuracy": (_PACKAGE / "scenes" / "accuracy",),
+    "constants": (_PACKAGE / "constants",),
 }
 MOST_BYTES = 1 << 18
 """Largest file that is read; those that come with the package have 4 kB."""

@@ -1,0 +1,272 @@
+"""The constants of a finger that measurements tell, and how sure they are.
+
+The most likely constants, in their logarithms, are those of least squares over measured values and
+priors.  Their posterior is Laplace's: the Gaussian whose precision is the Gauss-Newton matrix of
+those squares.  The noise of a column is estimated from its residuals, and is taken as larger by as
+much as Student's 90 % interval is wider than the Gaussian's.  Residuals of one release follow one
+another closely; by their correlation r between neighbours n of them count as n (1 - r) / (1 + r),
+as those of a first-order process do.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy import optimize
+
+from codesign_jax.finger.prediction import Table, opposed, predict, releases, without_rest
+from codesign_jax.finger.rest import TOO_FAR, Finger, NoRest
+from codesign_jax.measurements import BY_PRESSURE, MEASURED
+
+TOLD_BY = {
+    "shear_modulus": ("angle", "tip_x", "tip_y", "deflection", "sideways", "drop"),
+    "moment_factor": BY_PRESSURE,
+    "lateral_factor": ("sideways",),
+    "torsion_factor": ("sideways",),
+    "damping_time": ("drop",),
+}
+"""Columns that tell of a constant; the angle of a free tip depends on modulus and moment by their
+ratio alone, forces on a held tip (nearly) on the moment, deflections on the modulus."""
+PRIOR = {
+    "shear_modulus": math.inf,
+    "moment_factor": 0.2,
+    "lateral_factor": 0.31,
+    "torsion_factor": 0.23,
+    "damping_time": 0.5,
+}
+"""Standard deviations of the logarithms about the hand's own before anything is measured: those of
+`stress.FACTORS` for the factors on stiffness; the others are [chosen]."""
+ROUNDS = 3
+"""Gauss-Newton steps, each with the noise that the last one left."""
+STEP = 1e-4
+"""Step of logarithms in differences."""
+_EXACT = 1e-7
+"""Least noise relative to a column's size."""
+_FEW = 4.0
+"""Degrees of freedom below which a column's noise is joined with that of all."""
+_HALF = 1.6448536
+"""Half of the Gaussian's 90 % interval."""
+
+
+class Posterior(NamedTuple):
+    """What measurements say of a finger's constants; K of them."""
+
+    names: tuple[str, ...]  # fields of `Constants`
+    mean: np.ndarray  # logarithms of the most likely ones [SI], shape (K,)
+    covariance: np.ndarray  # of the logarithms, shape (K, K); NaN without enough values
+    noise: dict[str, float]  # noise of a value of each column [SI]
+    share: dict[str, float]  # share of a column's values that count
+    told: dict[str, bool]  # whether the values narrow a constant to two thirds of its prior
+
+    @property
+    def value(self) -> dict[str, float]:
+        """The most likely constants [SI]."""
+        return dict(zip(self.names, np.exp(self.mean).tolist(), strict=True))
+
+    @property
+    def sd(self) -> dict[str, float]:
+        """Standard deviations of the logarithms, by constant."""
+        return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    @property
+    def ratio_sd(self) -> float:
+        """Standard deviation of the logarithm of modulus over moment, on which angles depend."""
+        way = np.array(
+            [{"shear_modulus": 1.0, "moment_factor": -1.0}.get(n, 0) for n in self.names]
+        )
+        return math.sqrt(way @ self.covariance @ way)
+
+    @property
+    def interval(self) -> dict[str, tuple[float, float]]:
+        """Interval in which a constant is with a probability of 90 % [SI], by constant."""
+        half = _HALF * np.sqrt(np.diag(self.covariance))
+        ends = np.exp([self.mean - half, self.mean + half])
+        return {n: (float(a), float(b)) for n, a, b in zip(self.names, *ends, strict=True)}
+
+
+def fit(finger: Finger, table: Table) -> Posterior:
+    """Fits the constants that a table tells of, about those of the finger.
+
+    Raises:
+      ValueError: If the measurement does not give them, its signs are not the model's, or the
+        finger has no rest where something was measured.
+    """
+    columns = [n for n in MEASURED if n in table and np.isfinite(table[n]).any()]
+    refuse_values(finger, table, columns)
+    problem = _Problem(finger, table, columns)
+    logs = problem.solved(problem.start())
+    scales = np.full(len(columns), 0.02)
+    for _ in range(ROUNDS):
+        step, scales = problem.improved(logs, scales)
+        logs = logs + step
+    covariance = problem.covariance
+    narrowed = np.sqrt(np.diag(covariance)) < [PRIOR[n] / 1.5 for n in problem.names]
+    if _different_values(table, columns) - problem.told < 0.5:
+        covariance = np.full_like(covariance, math.nan)
+    mean = logs + np.log([getattr(finger.constants, n) for n in problem.names])
+    return Posterior(
+        problem.names,
+        mean,
+        covariance,
+        dict(zip(columns, (scales * problem.sizes).tolist(), strict=True)),
+        dict(zip(columns, problem.share.tolist(), strict=True)),
+        dict(zip(problem.names, narrowed.tolist(), strict=True)),
+    )
+
+
+class _Problem:
+    """Least squares over the logarithms of factors on a finger's constants."""
+
+    def __init__(self, finger: Finger, table: Table, columns: list[str]):
+        self.finger = finger
+        self.table = table
+        self.columns = columns
+        self.names = tuple(n for n, by in TOLD_BY.items() if set(by) & set(columns))
+        self.sizes = np.array([math.sqrt(np.nanmean(table[n] ** 2)) for n in columns])
+        self.rows = [np.isfinite(table[n]) for n in columns]
+        self.column = np.repeat(np.arange(len(columns)), [r.sum() for r in self.rows])
+        self.precision = np.array([PRIOR[n] ** -2 for n in self.names])
+        self.share = np.ones(len(columns))  # of the values of a column that count
+        self.told = 0.0  # number of constants that the values themselves tell
+        self.covariance = np.zeros((0, 0))
+
+    def material(self, logs: np.ndarray) -> Finger:
+        return scaled(self.finger, self.names, logs)
+
+    def start(self) -> np.ndarray:
+        """Factors to begin with: a release swings about the drop that the modulus gives."""
+        logs = np.zeros(len(self.names))
+        if "drop" in self.columns and "shear_modulus" in self.names:
+            for _ in range(2):
+                model = predict(self.material(logs), self.table)["drop"]
+                ratio = np.nanmean(model) / np.nanmean(self.table["drop"])
+                logs[self.names.index("shear_modulus")] += math.log(ratio)
+        return logs
+
+    def errors(self, logs: np.ndarray) -> np.ndarray:
+        """Errors of the values relative to their column's size."""
+        model = predict(self.material(logs), self.table)
+        if lacking := without_rest(self.table, model):
+            lowest = min(v.min() for v in lacking.values())
+            modulus = self.material(logs).constants.shear_modulus / 1e3
+            words = f"a finger of G = {modulus:.4g} kPa has no rest at {lowest / 1e3:g} kPa"
+            raise NoRest(f"{words}: {TOO_FAR}")
+        parts = zip(self.columns, self.rows, self.sizes, strict=True)
+        return np.concatenate([(model[n] - self.table[n])[r] / size for n, r, size in parts])
+
+    def solved(self, logs: np.ndarray) -> np.ndarray:
+        """The most likely factors if all columns err alike."""
+        prior = 0.02 * np.sqrt(self.precision)
+
+        def residual(x: np.ndarray) -> np.ndarray:
+            return np.append(self.errors(x), prior * x)
+
+        # Close enough for the steps that follow.
+        found = optimize.least_squares(residual, logs, x_scale=0.3, diff_step=STEP, ftol=1e-4)
+        if np.linalg.matrix_rank(found.jac) < len(logs):
+            raise ValueError("the measured values do not depend on what is fitted to them")
+        return found.x
+
+    def improved(self, logs: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A Gauss-Newton step under the noise of each column, and the noise that is left."""
+        errors = self.errors(logs)
+        slopes = slopes_of(self.errors, logs, errors)
+        if "drop" in self.columns:
+            place = self.columns.index("drop")
+            self.share[place] = self._of_drops(errors[self.column == place])
+        share = self.share[self.column]
+        prior = np.diag(self.precision)
+        weight = share / scales[self.column] ** 2
+        precision = gram(slopes, weight) + prior
+        step = -np.linalg.solve(precision, slopes.T @ (weight * errors) + prior @ logs)
+        left = errors + slopes @ step
+        # Constants that each column tells: the trace of its part of the hat matrix.
+        hat = weight * (slopes * np.linalg.solve(precision, slopes.T).T).sum(1)
+        told = np.bincount(self.column, hat)
+        self.told = float(told.sum())
+        new, wider = _noise(self.column, share, left, told)
+        weight = share / (new * wider)[self.column] ** 2
+        self.covariance = np.linalg.inv(gram(slopes, weight) + prior)
+        return step, new
+
+    def _of_drops(self, errors: np.ndarray) -> float:
+        """Share of the drops that count, by the correlation of each with the next one."""
+        places = np.flatnonzero(self.rows[self.columns.index("drop")])
+        value = dict(zip(places, errors, strict=True))
+        every = [np.array([value[r] for r in rows]) for rows in releases(self.table)]
+        above = sum(float(v[1:] @ v[:-1]) for v in every)
+        squares = sum(float(v @ v) for v in every)
+        near = min(max(above / squares, 0.0), 0.99) if squares else 0.0
+        return (1 - near) / (1 + near)
+
+
+def scaled(finger: Finger, names: tuple[str, ...], logs: np.ndarray) -> Finger:
+    """The finger with exp(logs) times the constants of these names."""
+    factors = dict(zip(names, np.exp(logs), strict=True))
+    return finger.of_material(
+        **{n: float(f) * getattr(finger.constants, n) for n, f in factors.items()}
+    )
+
+
+def slopes_of(
+    function: Callable[[np.ndarray], np.ndarray], logs: np.ndarray, base: np.ndarray
+) -> np.ndarray:
+    """Differences of a function of logarithms from its value at them, shape (value, K)."""
+    moved = [function(logs + STEP * unit) for unit in np.eye(len(logs))]
+    return (np.stack(moved, -1) - base[:, None]) / STEP
+
+
+def gram(slopes: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Sum over values of weight times slope times slope, shape (K, K)."""
+    return slopes.T @ (weight[:, None] * slopes)
+
+
+def _noise(
+    column: np.ndarray, share: np.ndarray, left: np.ndarray, told: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Noise of each column, and by how much Student's interval is wider than the Gaussian's.
+
+    A column with few degrees of freedom joins as many of all columns'.
+    """
+    from scipy import stats
+
+    degrees = np.maximum(np.bincount(column, share) - told, 0.0)
+    squares = np.bincount(column, share * left**2)
+    whole = float(degrees.sum())
+    if whole < 0.5:  # as many constants as values: nothing tells the noise
+        return np.full_like(degrees, _EXACT), np.ones_like(degrees)
+    joined = np.minimum(np.maximum(_FEW - degrees, 0.0), whole)
+    variance = (squares + joined * squares.sum() / whole) / (degrees + joined)
+    wider = stats.t.ppf(0.95, np.maximum(degrees + joined, 0.5)) / _HALF
+    return np.sqrt(np.maximum(variance, _EXACT**2)), wider
+
+
+def refuse_values(finger: Finger, table: Table, columns: list[str]) -> None:
+    """Refuses columns that no material explains: of zeros, and of the other sign."""
+    for name in columns:
+        if not np.nan_to_num(table[name]).any():
+            raise ValueError(f"every measured {words(name)} is 0: there is nothing to fit")
+    if not table["pressure"].any() and set(columns) <= set(BY_PRESSURE):
+        raise ValueError("every pressure is 0: there is nothing to fit")
+    if wrong := opposed(table, predict(finger, table)):
+        raise ValueError(
+            f"{' and '.join(map(words, wrong))} of the other sign than the model's: bending "
+            "under pressure, and what resists it, count as positive; change the signs in the file"
+        )
+
+
+def _different_values(table: Table, columns: list[str]) -> int:
+    """Number of measured values; a row that is repeated to the last digit counts once."""
+    blank = np.zeros_like(table["pressure"])
+    beside = [np.nan_to_num(table.get(n, blank)) for n in ("load", "time")]
+    count = 0
+    for name in columns:
+        rows = np.stack([table["pressure"], *beside, table[name]], 1)
+        count += len(np.unique(rows[np.isfinite(table[name])], axis=0))
+    return count
+
+
+def words(name: str) -> str:
+    """A column's name in words."""
+    return name.replace("_", " ")

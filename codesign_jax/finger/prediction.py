@@ -1,0 +1,129 @@
+"""What a finger does where something was measured."""
+
+import contextlib
+from collections.abc import Mapping
+
+import numpy as np
+
+from codesign_jax.finger import swing
+from codesign_jax.finger.rest import Finger, NoRest, Rest, sideways, tip_place
+from codesign_jax.measurements import MEASURED
+
+FREE = ("angle", "tip_x", "tip_y", "deflection", "sideways")
+"""Columns that are told of the free finger."""
+HELD_TIP = 0.25
+"""Share of a period by which the first picture of a release may be off."""
+
+Table = Mapping[str, np.ndarray]
+"""Columns of `measurements.COLUMNS` [SI units], shape (row,); NaN where a row has none."""
+
+
+def predict(finger: Finger, table: Table) -> dict[str, np.ndarray]:
+    """What a finger does where something was measured.
+
+    Returns:
+      Columns of `MEASURED` that the table has, shape (row,); NaN where the row has none, or the
+      finger no rest.  Drops are those of the time at which each release fits best: a film does not
+      say when the finger was let go.
+    """
+    rows = len(table["pressure"])
+    found = {name: np.full(rows, np.nan) for name in MEASURED if name in table}
+    free = held = Rest(np.zeros(finger.links), 0.0, 0.0)
+    for row in np.argsort(table["pressure"], kind="stable"):  # each begins where the last one ended
+        pressure = float(table["pressure"][row])
+        asked = {n for n in found if np.isfinite(table[n][row])}
+        if "blocked_force" in asked:
+            found["blocked_force"][row] = pressure * finger.gain[0] / finger.length
+        if "tip_force" in asked:
+            with contextlib.suppress(NoRest):
+                held = Rest.of(finger, pressure, held=True, start=held)
+                found["tip_force"][row] = held.force
+        if asked.intersection(FREE):
+            with contextlib.suppress(NoRest):
+                free = Rest.of(finger, pressure, start=free)
+                load = float(table["load"][row]) if "load" in table else np.nan
+                for name, value in _of_free(finger, free, pressure, load, asked).items():
+                    found[name][row] = value
+    if "drop" in found:
+        found["drop"] = _drops(finger, table)
+    return found
+
+
+def _of_free(
+    finger: Finger, free: Rest, pressure: float, load: float, asked: set[str]
+) -> dict[str, float]:
+    """Those values of `FREE` that are asked for."""
+    values: dict[str, float] = {}
+    if "angle" in asked:
+        values["angle"] = free.angles.sum()
+    if asked & {"tip_x", "tip_y"}:
+        places = dict(zip(("tip_x", "tip_y"), tip_place(finger, free), strict=True))
+        values |= {name: place for name, place in places.items() if name in asked}
+    if "sideways" in asked:
+        values["sideways"] = sideways(finger, free, load)
+    if "deflection" in asked:
+        values["deflection"] = free.height - Rest.of(finger, pressure, load, start=free).height
+    return values
+
+
+def releases(table: Table) -> list[np.ndarray]:
+    """Rows of each release: times rise, and weight and pressure are the same."""
+    rows = np.flatnonzero(np.isfinite(table["drop"]))
+    loads = np.nan_to_num(table.get("load", np.zeros_like(table["pressure"])))
+    state = np.stack([loads, table["pressure"]], 1)[rows]
+    new = (np.diff(table["time"][rows]) <= 0) | (np.diff(state, axis=0) != 0).any(1)
+    return np.split(rows, np.flatnonzero(new) + 1)
+
+
+def _drops(finger: Finger, table: Table) -> np.ndarray:
+    found = np.full(len(table["drop"]), np.nan)
+    loads = np.nan_to_num(table.get("load", np.zeros_like(table["pressure"])))
+    every = releases(table)
+    periods = [swing.first_period(finger, float(loads[rows[0]])) for rows in every]
+    margin = HELD_TIP * max(periods)
+    # One number of time steps for all of them is one program.
+    spans = [np.ptp(table["time"][rows]) for rows in every]
+    until = max(spans) + 2 * margin
+    curves: dict[tuple[float, float], tuple[np.ndarray, np.ndarray]] = {}
+    for rows in every:
+        state = float(loads[rows[0]]), float(table["pressure"][rows[0]])
+        if state not in curves:
+            curves[state] = swing.released(finger, *state, until, min(periods) / swing.STEPS)
+        time = table["time"][rows] - table["time"][rows[0]]
+        found[rows] = _aligned(curves[state], time, table["drop"][rows], margin)
+    return found
+
+
+def _aligned(
+    curve: tuple[np.ndarray, np.ndarray], time: np.ndarray, drop: np.ndarray, margin: float
+) -> np.ndarray:
+    """The curve at the times, moved by at most the margin to where it fits the drops best."""
+    step = curve[0][1]
+    shifts = np.arange(-margin, margin, max(step, margin / 50))
+    every = np.interp(time + shifts[:, None], *curve, left=0.0)
+    best = int(((every - drop) ** 2).sum(1).argmin())
+    low = shifts[max(best - 1, 0)]
+    high = shifts[min(best + 1, len(shifts) - 1)]
+    for _ in range(3):  # Gauss-Newton for the shift; the grid has found its valley
+        middle = (low + high) / 2
+        value, after = (np.interp(time + s, *curve, left=0.0) for s in (middle, middle + step))
+        slope = (after - value) / step
+        size = (slope**2).sum()
+        move = (slope * (drop - value)).sum() / size if size else 0.0
+        low = high = float(np.clip(middle + move, -margin, margin))
+    return np.interp(time + low, *curve, left=0.0)
+
+
+def without_rest(table: Table, found: Table) -> dict[str, np.ndarray]:
+    """Pressures [Pa] at which a finger has no rest, in rising order, by the column that lacks it.
+
+    Args:
+      found: What `predict` makes of the table.
+    """
+    lacking = {n: np.isfinite(table[n]) & np.isnan(v) for n, v in found.items()}
+    return {n: np.unique(table["pressure"][rows]) for n, rows in lacking.items() if rows.any()}
+
+
+def opposed(table: Table, found: Table) -> list[str]:
+    """Columns that were measured with the other sign than that of `predict`, most of their rows."""
+    return [n for n, v in found.items() if np.nansum(v * table[n]) < 0]

@@ -1,0 +1,156 @@
+"""A finger that is held straight and let go: the drop of its tip over time.
+
+The finger lies level, its inextensible layer below, so that its weight, and a weight hung from its
+tip, bend it as pressure does.  The equations of motion are those of its chain in the plane,
+M(q) q'' = forces, with Kelvin-Voigt damping; they are integrated by ROS2 (Verwer, Spee, Blom and
+Hundsdorfer 1999), a Rosenbrock method that is L-stable and of second order with any Jacobian, here
+that of the straight finger.
+"""
+
+import math
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax.finger.rest import Finger
+from codesign_jax.model import morphology
+
+STEPS = 150
+"""Time steps of the first mode's period."""
+MOST = 20_000
+"""Most time steps of a release."""
+GRAVITY = 9.80665
+"""Standard acceleration of gravity, at the bench [m/s^2]."""
+GAMMA = 1 - math.sqrt(0.5)
+"""ROS2's parameter, with which it is L-stable."""
+
+
+class Chain(NamedTuple):
+    """Numbers of a finger that swings; joints' of shape (N,), all SI."""
+
+    stiffness: Any
+    moment: Any  # of pressure
+    damping: Any
+    segment: Any
+    section: morphology.Section
+    bodies: Any
+    load: Any  # mass of the weight at the tip [kg]
+
+
+def chain(finger: Finger, load: float, pressure: float) -> Chain:
+    """The chain of a finger with a weight [N] hung from its tip, at a gauge pressure [Pa]."""
+    whole = partial(np.broadcast_to, shape=(finger.links,))
+    stiffness = whole(finger.stiffness)
+    return Chain(
+        stiffness=stiffness,
+        moment=pressure * whole(finger.gain),
+        damping=finger.constants.damping_time * stiffness,
+        segment=finger.segment,
+        section=morphology.Section(*map(whole, finger.section)),
+        bodies=finger.bodies,
+        load=load / GRAVITY,
+    )
+
+
+def first_period(finger: Finger, load: float) -> float:
+    """Period of the slowest mode of the straight finger without damping [s]."""
+    with jax.enable_x64(True):
+        own = jax.tree.map(jnp.asarray, chain(finger, load, 0.0))
+        mass = np.asarray(_mass(own, jnp.zeros(finger.links)))
+    root = 1 / np.sqrt(np.asarray(own.stiffness))
+    slowest = np.linalg.eigvalsh(root[:, None] * mass * root)[-1]
+    return 2 * math.pi * math.sqrt(slowest)
+
+
+def released(
+    finger: Finger, load: float, pressure: float, until: float, step: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times [s] and drops of the tip [m], shape (time,), from the release of the straight finger.
+
+    Args:
+      load: Weight hung from the tip [N].
+      pressure: Gauge pressure [Pa].
+      until: Time at which it ends [s].
+      step: Largest time step [s]; `first_period` over `STEPS` errs by less than 1e-3 of the period.
+
+    Raises:
+      ValueError: If that is more than `MOST` steps.
+    """
+    if until / step > MOST:
+        raise ValueError(f"a release of {until:g} s takes more than {MOST:,} time steps")
+    # A power of two, so that fingers of nearly the same period are one program.
+    count = 2 ** math.ceil(math.log2(until / step))
+    step = until / (count - 1)
+    with jax.enable_x64(True):
+        own = jax.tree.map(jnp.asarray, chain(finger, load, pressure))
+        drops = _drops(count, finger.neo_hookean, own, jnp.asarray(step))
+        return step * np.arange(count), np.asarray(drops)
+
+
+def _places(own: Chain, q: jax.Array) -> jax.Array:
+    """Places of the segments' centres and of the tip, across the straight finger too; (N + 1, 2).
+
+    Along the finger and downwards [m].
+    """
+    direction = jnp.cumsum(q)
+    cosine = jnp.cos(direction)
+    sine = jnp.sin(direction)
+    along = own.bodies.along
+    up = own.bodies.up
+    joints = own.segment * jnp.stack([jnp.cumsum(cosine), jnp.cumsum(sine)], -1)
+    before = jnp.concatenate([jnp.zeros((1, 2)), joints[:-1]])
+    centre = jnp.stack([along * cosine + up * sine, along * sine - up * cosine], -1)
+    half = own.segment / 2 * jnp.stack([cosine[-1], sine[-1]])
+    return jnp.concatenate([before + centre, (before[-1] + half)[None]])
+
+
+def _masses(own: Chain) -> jax.Array:
+    return jnp.append(own.bodies.mass, own.load)
+
+
+def _mass(own: Chain, q: jax.Array) -> jax.Array:
+    """The mass matrix, shape (N, N)."""
+    slopes = jax.jacfwd(partial(_places, own))(q)
+    turning = jnp.cumsum(own.bodies.inertia[::-1])[::-1]
+    number = jnp.arange(q.size)
+    of_turns = turning[jnp.maximum(number[:, None], number)]
+    return jnp.einsum("b,bdi,bdj->ij", _masses(own), slopes, slopes) + of_turns
+
+
+def _acceleration(own: Chain, neo_hookean: bool, q: jax.Array, rate: jax.Array) -> jax.Array:
+    def speed(at: jax.Array) -> jax.Array:
+        return jax.jvp(partial(_places, own), (at,), (rate,))[1]
+
+    slopes = jax.jacfwd(partial(_places, own))(q)
+    bias = jax.jvp(speed, (q,), (rate,))[1]
+    fall = jnp.array([0.0, GRAVITY]) - bias
+    forces = jnp.einsum("b,bdi,bd->i", _masses(own), slopes, fall)
+    spring = own.stiffness * q
+    if neo_hookean:
+        height, wall, width = own.section
+        spring *= 1 - morphology.softening(q / own.segment, height, wall, width=width)
+    forces += own.moment - spring - own.damping * rate
+    return jnp.linalg.solve(_mass(own, q), forces)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _drops(count: int, neo_hookean: bool, own: Chain, step: jax.Array) -> jax.Array:
+    links = own.stiffness.size
+
+    def slope(state: jax.Array) -> jax.Array:
+        rate = state[links:]
+        return jnp.concatenate([rate, _acceleration(own, neo_hookean, state[:links], rate)])
+
+    start = jnp.zeros(2 * links)
+    inverse = jnp.linalg.inv(jnp.eye(2 * links) - GAMMA * step * jax.jacfwd(slope)(start))
+
+    def advance(state: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
+        first = inverse @ slope(state)
+        second = inverse @ (slope(state + step * first) - 2 * first)
+        new = state + step * (1.5 * first + 0.5 * second)
+        return new, _places(own, state[:links])[-1, 1]
+
+    return jax.lax.scan(advance, start, None, length=count)[1]

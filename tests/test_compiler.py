@@ -269,6 +269,9 @@ def test_operations_on_integers(backend, dtype):
         "ge": lambda x, y: x >= y,
         "ne": lambda x, y: x != y,
         "to float": lambda x, y: x.astype(jnp.float32).astype(x.dtype) // 512,
+        "bits of a float": lambda x, y: jax.lax.bitcast_convert_type(
+            x.astype(jnp.float32), jnp.int32
+        ).astype(x.dtype),
         "power": lambda x, y: jax.lax.integer_pow(x, 3),
         "swap": lambda x, y: jax.lax.rev(x, (0,)),
         "to other": lambda x, y: x.astype(jnp.int32).astype(x.dtype),

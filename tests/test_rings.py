@@ -300,6 +300,19 @@ def _reference(name, body, field, place):
     return dense_skin.on_field(body, field, PER_AREA, **window, along=250, around=400)
 
 
+@pytest.mark.parametrize(("dtype", "few"), [(np.float32, 1e-6), (np.float64, 1e-9)])
+def test_roots_are_powers(dtype, few):
+    """Their derivative too, to the steps' precision: eight rounding errors in float32."""
+    x = np.geomspace(1e-9, 10, 1000).astype(dtype)
+    for root, power in ((rings.cube_root, 1 / 3), (rings.inverse_cube_root, -1 / 3)):
+        with jax.enable_x64(dtype == np.float64):
+            y, slope = jax.jvp(root, (jnp.asarray(x),), (jnp.ones_like(x),))
+        assert y.dtype == dtype
+        exact = x.astype(np.float64) ** power
+        np.testing.assert_allclose(y, exact, rtol=few)
+        np.testing.assert_allclose(slope, power * exact / x, rtol=few)
+
+
 @pytest.mark.slow  # 9 s
 def test_hands_grasp_whose_fingers_are_no_power_of_two():
     """Lanes that pad three fingers to four hold no finger: what they calculate is a number too."""

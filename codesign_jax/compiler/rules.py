@@ -281,6 +281,10 @@ def _convert(w: Instructions, equation: Any, x: Value) -> Value:
     return w.convert("sext" if kind == "i64" else "trunc", x, kind)
 
 
+def _bits_as(w: Instructions, equation: Any, x: Value) -> Value:
+    return w.convert("bitcast", x, kind_of(equation.outvars[0].aval.dtype))
+
+
 def _reverse(w: Instructions, equation: Any, x: Value) -> Value:
     shape = equation.invars[0].aval.shape
     dimensions = equation.params["dimensions"]
@@ -342,6 +346,7 @@ RULES: dict[str, Rule] = {
     "shift_right_logical": _shift("lshr"),
     "select_n": _select_n,
     "convert_element_type": _convert,
+    "bitcast_convert_type": _bits_as,
     "iota": lambda w, e: w.lane_index(),
     "population_count": lambda w, e, x: w.intrinsic("ctpop", x),
     "rev": _reverse,

@@ -61,13 +61,49 @@ class Place(NamedTuple):
     share: jax.Array  # Its stiffness over `contact.normal_stiffness`, same shape
 
 
-def cube_root(x: jax.Array) -> jax.Array:
-    """Cube root of numbers from 1e-9 to 10: Halley's iteration from the fourth root."""
-    y = 0.6 * jnp.sqrt(jnp.sqrt(x))
-    for _ in range(4):
-        cube = y * y * y
-        y = y * (cube + 2.0 * x) / (2.0 * cube + x)
+ROOT_BITS = 1_419_910_442
+"""The bits of a float32's inverse cube root are about this number less a third of its own bits.
+
+The bits of a positive float32, read as an integer, are 2^23 times the sum of its binary logarithm
+and 127, but for 0.09 at most.  Hence 4/3 of the bits of 1, less 5.6e5 so that the largest errors to
+both sides are alike.
+"""
+
+
+@jax.custom_jvp
+def inverse_cube_root(x: jax.Array) -> jax.Array:
+    """x^(-1/3) of numbers from 1e-9 to 10.
+
+    In float32 by Newton's method for the root of y^-3 - x, which needs no division, from a guess
+    within 4 %: three steps leave 2e-7.  In float64 by Halley's method from the fourth root.
+    """
+    if x.dtype != jnp.float32:
+        y = 0.6 * jnp.sqrt(jnp.sqrt(x))
+        for _ in range(4):
+            cube = y * y * y
+            y = y * (cube + 2.0 * x) / (2.0 * cube + x)
+        return 1.0 / y
+    bits = jax.lax.bitcast_convert_type(x, jnp.int32).astype(x.dtype)
+    guess = (ROOT_BITS - bits * (1.0 / 3.0)).astype(jnp.int32)
+    y = jax.lax.bitcast_convert_type(guess, x.dtype)
+    third = x * (1.0 / 3.0)
+    for _ in range(3):
+        y = y * (4.0 / 3.0 - third * (y * y * y))
     return y
+
+
+@inverse_cube_root.defjvp
+def _inverse_cube_root_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
+    (x,) = primals
+    (dx,) = tangents
+    y = inverse_cube_root(x)
+    return y, -y / (3.0 * x) * dx
+
+
+def cube_root(x: jax.Array) -> jax.Array:
+    """See `inverse_cube_root`."""
+    y = inverse_cube_root(x)
+    return x * (y * y)
 
 
 def support(half: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -79,11 +115,12 @@ def support(half: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array
     """
     along = half * direction
     largest = jnp.sqrt(dot(along, along) + SMALL)
-    unit = along / largest
+    unit = along * (1.0 / largest)
     squares = [u * u + FLOOR for u in jnp.unstack(unit)]
-    root = jnp.sqrt(total([s / cube_root(s) for s in squares]))  # of the sum of |u|^(4/3)
+    # Of the sum of |u|^(4/3)
+    root = jnp.sqrt(total([s * inverse_cube_root(s) for s in squares]))
     reach = root * jnp.sqrt(root)
-    return largest * reach, unit / reach
+    return largest * reach, unit * (1.0 / reach)
 
 
 def cap(unit: jax.Array, u: jax.Array) -> jax.Array:
@@ -120,7 +157,7 @@ def arm(ring: Ring, reach: jax.Array, unit: jax.Array, gap: jax.Array) -> jax.Ar
     """Centre of the cap from the ring's centre, in its frame, shape (3, ...)."""
     root = jnp.sqrt(jnp.minimum(jnp.maximum(-gap, 0.0) / reach, 1.0) + 1e-6)
     spread = 1.15 * root * jnp.sqrt(root)
-    return ring.half * unit / cube_root(unit * unit + spread * spread)
+    return ring.half * unit * inverse_cube_root(unit * unit + spread * spread)
 
 
 def section_normal(half: jax.Array, local: jax.Array) -> jax.Array:

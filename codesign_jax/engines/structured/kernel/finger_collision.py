@@ -26,7 +26,7 @@ from codesign_jax.engines.structured.kernel.finger_contacts import (
     BoundFingerContacts,
     FingerPairing,
 )
-from codesign_jax.engines.structured.kernel.memory import BoundTable, loop
+from codesign_jax.engines.structured.kernel.memory import BoundTable, loop, solid
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import cross, dot
@@ -46,7 +46,8 @@ def fields(links: int) -> dict[str, tuple[int, tuple[int, ...]]]:
     """Where the fingers are, for the lanes of the others."""
     rows = links + 1
     found = {"frame": (rows, (3, 3)), "joint": (rows, (3,)), "end": (rows + 1, (3,))}
-    found |= {"line": (rows, (7,)), "other": (rows, (7,)), "fastest": (1, ())}
+    found |= {"line": (rows, (7,)), "other": (rows, (7,))}
+    found |= {"fastest": (1, ()), "other_size": (1, (2,))}
     return {f"pair.{name}": group for name, group in found.items()}
 
 
@@ -97,10 +98,10 @@ class FingerCollision:
         first = (jnp.asarray(row) - 1) * self.p.k - 1
         return jnp.maximum(first, 0)
 
-    def largest(self, lane: jax.Array | None = None) -> Lanes:
+    def largest(self) -> Lanes:
         """Numbers of the largest ring of a finger: of its last one, or of either end's."""
-        tip = self.ring(self.count - 1, lane)
-        return lanewise(jnp.maximum, tip, self.ring(0, lane)) if self.p.tapered else tip
+        tip = self.ring(self.count - 1)
+        return lanewise(jnp.maximum, tip, self.ring(0)) if self.p.tapered else tip
 
     def start(self, motion: Lanes, vel: Lanes, frame: Lanes, base: Lanes) -> None:
         """Empties the slots; stores what belongs to the palm."""
@@ -169,6 +170,8 @@ class FingerCollision:
                 # The segments of the other finger's centre line.
                 copy = lambda i: self.write("other", pairing.swap(self.read("line", i)), i)  # noqa: E731, B023
                 each(self.p.links + 1, copy)
+                size = lanewise(_stacked, self.reach(self.largest()), self.read("fastest"))
+                self.write("other_size", pairing.swap(size))
             one = self._on_finger if self.hull else self._on_spheres
             self._each_ring(0, lambda *ring: one(row, pairing, owner, *ring))
             return x
@@ -188,39 +191,92 @@ class FingerCollision:
 
     # Contacts
 
+    def reach(self, numbers: Lanes) -> Lanes:
+        """How far a ring's section reaches from its centre [m]."""
+        return lanewise(lambda ring: REACH * jnp.maximum(ring[4], ring[5]), numbers)
+
     def _near(self, square: jax.Array, mine: Lanes, theirs: Lanes, speed: Lanes) -> jax.Array:
+        """Whether sections may touch in this step.
+
+        Args:
+          square: Squared distance of their centres [m^2].
+          mine: Reach of one section; `theirs`: of the other one [m].
+          speed: Bound of the speed at which they approach [m/s].
+        """
         h = self.p.scene.discretization.timestep
 
-        def reach(mine, theirs, speed):
-            most = [REACH * jnp.maximum(r[4], r[5]) for r in (mine, theirs)]
-            return most[0] + most[1] + jnp.maximum(contact.MARGIN, h * speed)
+        def most(mine, theirs, speed):
+            return mine + theirs + jnp.maximum(contact.MARGIN, h * speed)
 
-        far = lanewise(reach, mine, theirs, speed).lane
+        far = lanewise(most, mine, theirs, speed).lane
         return square < far * far
 
     def _begun(
-        self, place: Place, cone: Any, rows: tuple, lane: jax.Array | None, held: list[Lanes]
+        self, place: Place, cone: Any, row: Any, theirs: list[Lanes], held: list[Lanes]
     ) -> dict[str, Lanes]:
-        """Fields of a contact of a link with another one on a lane, see `BoundContacts.begin`."""
+        """Fields of a contact of a link with another body, see `BoundContacts.begin`.
 
-        def moved(name: str) -> Lanes:
-            mine = self.side_of(name, rows[0])
-            theirs = self.side_of(name, rows[1], lane)
-            return lanewise(jnp.subtract, mine, theirs)
-
+        Args:
+          row: The link.
+          theirs: Motion and velocity of the other body, see `_moves`.
+        """
         place = lanewise(with_axis, place)
         run = partial(begun, margin(self.p.scene))
-        place, jar = lanewise(run, place, cone, moved("motion"), moved("vel"))
+        moves = lanewise(_differences, self._moves(row), theirs)
+        place, jar = lanewise(run, place, cone, *moves)
         for g in held:
             jar = lanewise(_with_held, jar, place, cone, g)
-        return kept(place, jar) | {"row": self._number(rows[0])}
+        return kept(place, jar) | {"row": self._number(row)}
+
+    def _moves(self, row: Any, lane: jax.Array | None = None) -> list[Lanes]:
+        """Motion and velocity of links; arguments as `read`."""
+        return [self.side_of(name, row, lane) for name in ("motion", "vel")]
+
+    def _of_rows(
+        self, read: Callable, row: jax.Array, which: jax.Array, pairing: FingerPairing | None
+    ) -> Any:
+        """read(row of each lane, lane of the finger that has it), a tree of lanes.
+
+        Vectors gather number by number: there the rows of the lanes `which`, of which there are
+        few, are read one after the other. Other lanes get what one of these has.
+
+        Args:
+          row: int32, shape (lane,).
+          pairing: Whose partner has the rows; None for the lanes' own fingers.
+        """
+        if self.pairs.set.gathers:
+            return read(row, None if pairing is None else pairing.lane)
+        # The lanes that have the rows read them, and then pass them on.
+        left = jnp.where(which, row, -1)
+        if pairing is not None:
+            left = pairing.swap(lanes([left], (), wide=True)).lane
+        first = jnp.max(left)
+        arrays, rebuild = solid(read(first), self.block.size)
+
+        def step(carry: list) -> list:
+            now, left, *values = carry
+            chosen = left == now
+            new = solid(read(now), self.block.size)[0]
+            values = [jnp.where(chosen, a, b) for a, b in zip(new, values, strict=True)]
+            left = jnp.where(chosen, -1, left)
+            return [jnp.max(left), left, *values]
+
+        left = jnp.where(left == first, -1, left)
+        start = [jnp.max(left), left, *arrays]
+        found = rebuild(jax.lax.while_loop(lambda c: c[0] >= 0, step, start)[2:])
+        return found if pairing is None else pairing.swap(found)
 
     def _number(self, value: Any) -> Lanes:
         return lanes([self.like + jnp.asarray(value, self.like.dtype)], (1, 1), wide=True)
 
-    def _alone(self, place: Place, cone: Any, rows: tuple, held: list, item: Any, mine: Any):
-        """Gives a slot to a contact of a finger with the palm or itself."""
-        found = self._begun(place, cone, rows, None, held) | {"other": self._number(rows[1])}
+    def _alone(self, found: dict[str, Lanes], other: Any, item: Any, mine: jax.Array) -> None:
+        """Gives a slot to a contact of a finger with the palm or itself.
+
+        Args:
+          found: See `_begun`.
+          other: Link of the other side, 0 for the palm; `item`: the ring.
+        """
+        found |= {"other": self._number(other)}
         found |= self.pairs.remembered({"owner": 1.0, "ring": item})
         which = mine & (found["share"].lane > 0)
         any_of(which, lambda: self.pairs.add(0, which, found, self.block.own))
@@ -241,27 +297,30 @@ class FingerCollision:
                 place = lanewise(on_field, numbers, frame, centre, offset, *again)
             else:
                 place = lanewise(ball_on_field, numbers, centre, *field)
-            rows = row, jnp.zeros_like(jnp.asarray(row))
-            self._alone(place, self.pairs.of_row(0), rows, [], item, mine)
+            palm = jnp.zeros_like(jnp.asarray(row))
+            found = self._begun(place, self.pairs.of_row(0), row, self._moves(palm), [])
+            self._alone(found, palm, item, mine)
 
         any_of(mine & near, enter)
 
     def _near_palm(self, distance: Lanes, numbers: Lanes) -> jax.Array:
         size = lanewise(jnp.maximum, distance, zeros((), self.like)).lane
-        none = lanewise(jnp.zeros_like, numbers)
-        return self._near(size * size, numbers, none, self.read("fastest"))
+        none = zeros((), self.like)
+        return self._near(size * size, self.reach(numbers), none, self.read("fastest"))
 
     def _on_itself(self, item: Any, mine: jax.Array) -> None:
         row, numbers, frame, centre = self.body(item)
         square, other, t = self._nearest("line", centre, item)
         theirs = self.largest() if self.p.tapered else numbers
-        near = mine & self._near(square, numbers, theirs, self.read("fastest"))
+        reaches = self.reach(numbers), self.reach(theirs)
+        near = mine & self._near(square, *reaches, self.read("fastest"))
 
         def enter() -> None:
-            place = self._between(numbers, frame, centre, other, t, None)
-            cone = self.pairs.of_row(1)
+            segment, moves = self._of_rows(self._segment, other, near, None)
+            place = self._between(numbers, frame, centre, segment, other, t)
             held = friction_memory.of_row(self.step, self.pairs, 0)
-            self._alone(place, cone, (row + jnp.zeros_like(other), other), held, item, near)
+            found = self._begun(place, self.pairs.of_row(1), row, moves, held)
+            self._alone(found, other, item, near)
 
         any_of(near, enter)
 
@@ -293,16 +352,15 @@ class FingerCollision:
     ) -> None:
         link, numbers, frame, centre = self.body(item)
         square, other, t = self._nearest("other", centre)
-        speed = lanewise(jnp.add, *(self.read("fastest", 0, at) for at in (None, pairing.lane)))
-        theirs = self.largest(pairing.lane)
-        near = owner & mine & self._near(square, numbers, theirs, speed)
+        theirs = self.read("other_size")
+        speed = lanewise(jnp.add, self.read("fastest"), theirs[1])
+        near = owner & mine & self._near(square, self.reach(numbers), theirs[0], speed)
 
         def enter() -> None:
-            place = self._between(numbers, frame, centre, other, t, pairing.lane)
+            segment, moves = self._of_rows(self._segment, other, near, pairing)
+            place = self._between(numbers, frame, centre, segment, other, t)
             held = friction_memory.of_row(self.step, self.pairs, row)
-            cone = self.pairs.of_row(row)
-            link_ = link + jnp.zeros_like(other)
-            found = self._begun(place, cone, (link_, other), pairing.lane, held)
+            found = self._begun(place, self.pairs.of_row(row), link, moves, held)
             self._enter(row, near, owner, found, other, item)
 
         any_of(near, enter)
@@ -352,17 +410,24 @@ class FingerCollision:
         square, number, t = (best[k].lane for k in range(3))
         return square, number.astype(jnp.int32), t
 
-    def _between(
-        self, numbers: Lanes, frame: Lanes, centre: Lanes, row: jax.Array, t: Any, lane: Any
-    ) -> Place:
-        """Contact of the lanes' rings with segments of a lane's finger; `rings.between`."""
-        rows = neighbours(row, self.p.links)
-        frames = tuple(self.read("frame", r, lane) for r in rows)
+    def _segment(self, row: Any, lane: jax.Array | None = None) -> tuple[tuple, list[Lanes]]:
+        """Segments' ends, frames and sections, and their links' motion; arguments as `read`."""
+        frames = tuple(self.read("frame", r, lane) for r in neighbours(row, self.p.links))
         ends = self.read("end", row, lane), self.read("end", row + 1, lane)
-        tip = self.ring(self.ring_at(row + 1), lane)
+        return (ends, frames, self.ring(self.ring_at(row + 1), lane)), self._moves(row, lane)
+
+    def _between(
+        self, numbers: Lanes, frame: Lanes, centre: Lanes, segment: tuple, row: jax.Array, t: Any
+    ) -> Place:
+        """Contact of the lanes' rings with segments; `rings.between`.
+
+        Args:
+          segment: Their ends, frames and sections, see `_segment`.
+          row: Their links.
+        """
         last = lanes([jnp.where(row == self.p.links, self.like + 1.0, self.like)], (), wide=True)
         where = lanes([t], (), wide=True)
-        return lanewise(between, numbers, frame, centre, (ends, frames, tip, last), where)
+        return lanewise(between, numbers, frame, centre, (*segment, last), where)
 
     # Spheres
 
@@ -379,11 +444,9 @@ class FingerCollision:
             near = owner & (place.gap.lane < 0)
 
             def enter() -> None:
-                other = jnp.zeros_like(self.block.own) + jax.lax.div(j, jnp.full_like(j, apart)) + 1
-                link_ = link + jnp.zeros_like(other)
-                cone = self.pairs.of_row(row)
-                lane = pairing.lane
-                found = self._begun(place, cone, (link_, other), lane, [])
+                other = jax.lax.div(j, jnp.full_like(j, apart)) + 1
+                moves = pairing.swap(self._moves(other))
+                found = self._begun(place, self.pairs.of_row(row), link, moves, [])
                 number = item + self.count * j
                 self._enter(row, near, owner, found, other, number)
 
@@ -478,6 +541,14 @@ def _faster(most, vel, palm, origin, numbers):
 
 def with_axis(place: Place) -> Place:
     return Place(*(v[:, None] for v in place[:2]), *(v[None, None] for v in place[2:]))
+
+
+def _stacked(*numbers):
+    return jnp.stack(numbers)
+
+
+def _differences(mine: list, theirs: list) -> list:
+    return [a - b for a, b in zip(mine, theirs, strict=True)]
 
 
 def _with_held(jar, place, cone, grip):

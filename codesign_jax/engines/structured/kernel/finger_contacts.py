@@ -114,6 +114,11 @@ class FingerContactSet(SlotSet):
         self.more |= {f: n for f in ("first", "left", "answer", "along", "moved", "sum")}
         if self.alone:
             self.more |= {"other": 1}
+        # The fields of a slot that say which link each lane's side is on.
+        self.row_fields = ("row", "other") if self.alone else ("row",)
+        if not gathers:
+            for field in self.row_fields:
+                self.more |= {f"{field}_listed": 1, f"{field}_count": 1}
 
     def cone_rows(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         """See `ContactSet`; one cone between fingers and one on the palm, if there are both."""
@@ -294,25 +299,63 @@ class BoundFingerContacts(BoundSlots):
 
         return self._each_row(item, field, take, start)
 
+    def keep_counts(self) -> None:
+        """See `BoundSlots`; where lanes do not gather, lists the rows of each slot's lanes."""
+        super().keep_counts()
+        if self.set.gathers:
+            return
+
+        def store(item: Any, pairing: FingerPairing) -> None:
+            self._list_rows(item, "row")
+            if pairing.alone is not None:
+                any_of(pairing.alone, lambda: self._list_rows(item, "other"))
+
+        self.do(store)
+
+    def _list_rows(self, item: Any, field: str) -> None:
+        """Lists the different rows at which a slot's lanes touch.
+
+        The k-th row is stored on the k-th lane of the field's list, their number on all lanes.
+        """
+        nothing = jnp.full_like(self.like, -1.0)
+
+        def step(carry: list) -> list:
+            count, row, left, listed = carry
+            left = jnp.where(left == row, -1, left)
+            listed = jnp.where(self._lane() == count, row.astype(listed.dtype), listed)
+            return [count + 1, jnp.max(left), left, listed]
+
+        left = self._touched_rows(item, field)
+        first = [jnp.int32(0), jnp.max(left), left, nothing]
+        count, _, _, listed = jax.lax.while_loop(lambda c: c[1] >= 0, step, first)
+        counts = self.like + count.astype(self.like.dtype)
+        self.write(f"{field}_listed", lanes([listed], (1, 1), wide=True), item)
+        self.write(f"{field}_count", lanes([counts], (1, 1), wide=True), item)
+
+    def _touched_rows(self, item: Any, field: str) -> jax.Array:
+        """Row of each lane's side of a slot, int32, shape (lane,); -1 where nothing touches."""
+        touches = self.read("share", item).lane > 0
+        return jnp.where(touches, self.read(field, item).lane.astype(jnp.int32), -1)
+
     def _each_row(self, item: Any, field: str, body: Callable, start: Any) -> Any:
         """Folds body(row, lanes that touch there, tree of lanes) over the rows of a slot's lanes.
 
         Few lanes of a block touch in one slot, at two rows if it is one contact: on CPUs whose
         vectors gather number by number that is faster than to gather.
         """
-        touches = self.read("share", item).lane > 0
-        left = jnp.where(touches, self.read(field, item).lane.astype(jnp.int32), -1)
+        rows = self._touched_rows(item, field)
         arrays, rebuild = solid(start, self.set.size)
+        name = f"{self.set.name}.{field}"
+        count = self.table.number(f"{name}_count", item, 0).astype(jnp.int32)
 
         def step(carry: list) -> list:
-            row, left, *values = carry
-            chosen = left == row
-            left = jnp.where(chosen, -1, left)
-            new = solid(body(row, chosen, rebuild(values)), self.set.size)[0]
-            return [jnp.max(left), left, *new]
+            k, *values = carry
+            row = self.table.number(f"{name}_listed", item, k).astype(jnp.int32)
+            new = solid(body(row, rows == row, rebuild(values)), self.set.size)[0]
+            return [k + 1, *new]
 
-        first = [jnp.max(left), left, *arrays]
-        return rebuild(jax.lax.while_loop(lambda c: c[0] >= 0, step, first)[2:])
+        first = [jnp.int32(0), *arrays]
+        return rebuild(jax.lax.while_loop(lambda c: c[0] < count, step, first)[1:])
 
     def clear_wrenches(self) -> None:
         def clear(row: Any, x: jax.Array) -> jax.Array:

@@ -129,6 +129,11 @@ class BoundTable:
         for row, part in zip(self._rows(name, item), value.parts.ravel(), strict=True):
             self.ref[(row, *where)] = splat(part, size, value.dtype)
 
+    def number(self, name: str, item: Any, lane: Any) -> jax.Array:
+        """The number of one lane, a scalar, of an item with one component."""
+        (row,) = self._rows(name, item)
+        return self.ref[row, lane]
+
     def gather(self, name: str, item: jax.Array, lane: jax.Array) -> Lanes:
         """Each lane's item of a lane, of a table of fingers; both are int32 of shape (lane,)."""
         values = [self.ref[row, lane] for row in self._rows(name, item)]

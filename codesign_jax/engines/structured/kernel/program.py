@@ -25,10 +25,19 @@ from codesign_jax.engines.structured.lanewise import lanes, of_code
 from codesign_jax.engines.structured.laws import air
 from codesign_jax.engines.structured.laws.kinematics import State
 from codesign_jax.engines.structured.world_model import WorldModel
-from codesign_jax.model import layout
+from codesign_jax.model import held
 from codesign_jax.scene import Scene
 
 TRACE = ("distance", "height", "speed", "residual", "iterations", "moved")
+
+
+WORLDS_THAT_WAIT = 2
+"""Most worlds of a CPU's block whose fingers touch one another.
+
+Worlds of a block wait for one another in every loop, most of all in those over contacts of fingers:
+good designs are simulated 1.2 times as fast with two worlds a block as with the four that fill a
+vector of 64 bytes, and 1.1 times as fast as with one.
+"""
 
 
 class Limits(NamedTuple):
@@ -293,9 +302,13 @@ def block_spec(shape: tuple[int, ...], blocks: int) -> pl.BlockSpec:
 
 def lanes_here(scene: Scene, dtype: Any, worlds: int | None = None) -> int:
     """Lanes of a block on this device for so many worlds, if it is known; `launch.block_lanes`."""
-    fingers = layout(scene).dofs.shape[0]
-    total = None if worlds is None else worlds << (fingers - 1).bit_length()
-    return block_lanes(jax.default_backend(), dtype, total)
+    fingers = held.lanes(scene)
+    total = None if worlds is None else worlds * fingers
+    platform = jax.default_backend()
+    lanes = block_lanes(platform, dtype, total)
+    if platform == "cpu" and scene.effects.finger_finger:
+        return min(lanes, WORLDS_THAT_WAIT * fingers)
+    return lanes
 
 
 def copy_rows(rows: tuple[Any, Any], read: Callable, target: Any, *where: Any, at: tuple = ()):

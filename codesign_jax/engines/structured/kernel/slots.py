@@ -221,10 +221,34 @@ class BoundSlots(BoundContacts):
                 away = lanewise(jnp.zeros_like, value) if field == "share" else value
                 self.write(field, away, fresh)
         mine = jnp.where(which, jnp.minimum(filled, self.set.slots), self.set.slots)
-        for field, value in fields.items():
-            self.table.scatter(f"{self.set.name}.{field}", value, first + mine, lane)
+        if self.set.gathers:
+            for field, value in fields.items():
+                self.table.scatter(f"{self.set.name}.{field}", value, first + mine, lane)
+        else:
+            self._fill(first, jnp.where(which, mine, -1), fields)
         more = jnp.where(which, count + 1.0, count)
         self.write("count", lanes([more], (), wide=True), row)
+
+    def _fill(self, first: Any, slot: jax.Array, fields: dict[str, Lanes]) -> None:
+        """Stores the lanes' contacts, one slot after the other: vectors scatter slowly.
+
+        Args:
+          first: Item of the row's first slot.
+          slot: The slot of each lane behind it, int32, shape (lane,); -1 for lanes without a
+            contact.
+        """
+
+        def store(carry: list) -> list:
+            now, left = carry
+            chosen = left == now
+            mask = lanes([chosen], (), wide=True)
+            for field, value in fields.items():
+                before = self.read(field, first + now)
+                self.write(field, lanewise(jnp.where, mask, value, before), first + now)
+            left = jnp.where(chosen, -1, left)
+            return [jnp.max(left), left]
+
+        jax.lax.while_loop(lambda c: c[0] >= 0, store, [jnp.max(slot), slot])
 
     def fold(self, row: Any, body: Callable, start: Any) -> Any:
         """Folds body(item, tree of lanes) over the slots in use."""

@@ -6,7 +6,7 @@ import os
 import shlex
 import sys
 import traceback
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,14 +40,9 @@ def main(options: Optimize) -> int:
         return _distributed(options)
     scene, settings = resolve(options)
     every = runs_of(options, scene, settings)
-    # Everything that speaks against the runs, before anything that takes time.
     plan = runs.prepare(scene, settings)
     plans = {folder: runs.variant(plan, own) for folder, own in every.items()}
-    place = options.out or next(iter(every))
-    common.refuse(common.place_problems("--out", place, folder=True))
-    _refuse_links(options, every)
-    for folder, own in every.items():
-        runs.check_folder(folder, scene, own, fresh=options.fresh)
+    _refuse(options, scene, every)
     for note in preflight.notes(scene, plan.space, _ends(plan.space)):
         say(note)
     if options.dry_run:
@@ -55,29 +50,34 @@ def main(options: Optimize) -> int:
             say(note)
         _dry_run(plan, len(every), options)
         return 0
-    devices = options.devices
-    chunk = options.chunk
     most = reference.most_trials(options.reference_trials, settings)
     after = _after(scene, most)
-    how = {"fresh": options.fresh, "after": after, "devices": devices, "chunk": chunk}
-    found = runs.optimize(plans, sys.argv, **how)
-    results: dict[Path, RunResult | None] = {}
-    called = runs.run_names(every) if several(options) else {}
-    for folder, result in found.runs.items():
-        results[folder] = result if isinstance(result, RunResult) else None
-        if isinstance(result, Exception):
-            _tell_error(f"{called[folder]}: " if called else "", result)
-    if found.signum:
-        return 128 + found.signum
+    how = {"devices": options.devices, "chunk": options.chunk, "after": after}
+    done = runs.optimize(plans, sys.argv, fresh=options.fresh, **how)
+    names = runs.run_names(every) if several(options) else {}
+    errors = {folder: r for folder, r in done.runs.items() if isinstance(r, Exception)}
+    for folder, error in errors.items():
+        _tell_error(f"{names[folder]}: " if names else "", error)
+    if done.signum:
+        return 128 + done.signum
     console = Console()
-    left = [f for f, result in results.items() if result is not None and result.record is not None]
-    while left:
-        folder = left.pop(0)
-        if called:
-            console.print(f"{called[folder]}:")
-        _tell(plans[folder], results[folder], folder, (most, len(left) * after), console)
-    failed = int(None in results.values())
-    return (_compare(options) if called else 0) or failed
+    ended = {folder: r for folder, r in done.runs.items() if isinstance(r, RunResult)}
+    for k, (folder, result) in enumerate(ended.items()):
+        if names:
+            console.print(f"{names[folder]}:")
+        later = (len(ended) - k - 1) * after
+        _tell(plans[folder], result, folder, (most, later), console)
+    compared = _compare(options) if names else 0
+    return compared or int(bool(errors))
+
+
+def _refuse(options: Optimize, scene: Scene, every: Mapping[Path, Settings]) -> None:
+    """Refuses folders in which runs cannot start or go on, before anything that takes time."""
+    place = options.out or next(iter(every))
+    common.refuse(common.place_problems("--out", place, folder=True))
+    _refuse_links(options, every)
+    for folder, settings in every.items():
+        runs.check_folder(folder, scene, settings, fresh=options.fresh)
 
 
 def _tell_error(name: str, error: Exception) -> None:
@@ -124,10 +124,10 @@ def _after(scene: Scene, most: int) -> float:
 
 
 def _tell(
-    plan: Plan, result: RunResult | None, folder: Path, work: tuple[int, float], console: Console
+    plan: Plan, result: RunResult, folder: Path, work: tuple[int, float], console: Console
 ) -> None:
     """Tells how a run ended, with its verdict; `work`: most fresh grasps, and grasps after it."""
-    assert result is not None and result.record is not None
+    assert result.record is not None
     _summarize(plan, result, console)
     most, later = work
     if result.test is None:

@@ -49,7 +49,8 @@ def test_noise_differs_between_episodes_seeds_and_the_test(setup):
     seen = [info, episode(first, closed)[1], episode(start(optimizer, seed=1), closed)[1]]
     rows = [i.outcomes.cost[0] for i in seen]
     keys = [codesign.test_key(first.key, k) for k in range(2)]
-    rows += [task.evaluate(first.particles, key).cost[0] for key in keys]
+    tests = [codesign.frozen(optimizer, first.particles, key) for key in keys]
+    rows += [episode(*test)[1].outcomes.cost[0] for test in tests]
     assert len(np.unique(np.asarray(rows), axis=0)) == 5
 
 
@@ -65,12 +66,10 @@ def test_a_run_vmaps_over_seeds_and_is_the_loop_of_its_episodes(setup):
     beside = task.side_by_side(optimizer)
     # Two programs round differently, which may move a loss by one time step.
     same = partial(np.testing.assert_allclose, atol=3 * the_scene.discretization.timestep)
-    states, together = beside.episode(both, masks[:, 0])
+    states, together = beside(both, masks[:, 0])
     same(together.outcomes.cost, infos.outcomes.cost[:, 0])
     same(together.drawn.position, infos.drawn.position[:, 0])
     np.testing.assert_allclose(states.particles[0], episode(starts[0], masks[0, 0])[0].particles)
-    again = beside.evaluate(both.particles, both.key)
-    same(again.cost[1], task.evaluate(starts[1].particles, starts[1].key).cost)
     for k, state in enumerate(starts):
         for e in range(3):
             state, want = episode(state, masks[k, e])
@@ -80,12 +79,17 @@ def test_a_run_vmaps_over_seeds_and_is_the_loop_of_its_episodes(setup):
 
 
 def test_seed_is_poor_and_reproducible(setup):
-    the_scene, task, optimizer, _ = setup
+    the_scene, task, optimizer, episode = setup
     space = task.space
+
+    def evaluate(population, key):
+        _, info = episode(*codesign.frozen(optimizer, population, key))
+        np.testing.assert_array_equal(info.population, population)
+        return info.outcomes
 
     def find(seed):
         key = jax.random.key(seed)
-        return codesign.seed_search(the_scene, optimizer, key, task.evaluate, batch=PARTICLES)
+        return codesign.seed_search(the_scene, optimizer, key, evaluate, batch=PARTICLES)
 
     a, cost, drawn = find(0)
     b, *_ = find(0)

@@ -17,7 +17,6 @@ import pytest
 
 from codesign_jax import array_files, runs
 from codesign_jax.commands import reference
-from codesign_jax.optimize import OptimizerState
 from codesign_jax.runs.cases import Case
 from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.runs.interrupts import Interrupts
@@ -259,7 +258,7 @@ def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch
     episodes = []
 
     def interrupted(interrupts, function, *arguments):
-        if isinstance(arguments[0], OptimizerState):
+        if np.any(arguments[1]):  # an episode that moves something
             episodes.append(function)
             if len(episodes) == 2:  # the first was compiled
                 os.kill(os.getpid(), signal.SIGTERM)

@@ -212,7 +212,10 @@ def test_an_earlier_run_is_read_and_reported(archive, name, done, asked, tmp_pat
     trials = csv.DictReader((folder / "trials.csv").read_text().splitlines())
     costs = np.array([float(row["cost"]) for row in trials], np.float32)
     np.testing.assert_array_equal(np.ravel(record.history.outcomes.cost[:done]), costs)
-    assert cases.choose(scene, record).design.dtype == np.float32
+    chosen = cases.choose(scene, record)
+    assert chosen.design.dtype == np.float32
+    simulated = record.history.population[chosen.episode, chosen.row]
+    np.testing.assert_array_equal(simulated, chosen.design)
     assert command("report", folder, "--no-replay") == 0
     assert f"{done} of {asked} episodes" in (folder / "report.html").read_text()
 

@@ -40,8 +40,7 @@ def toy_run():
     the_scene, space, engine = tiny()
     s = settings()
     optimizer = codesign.make_filter(space)
-    task = codesign.Task(the_scene, space, s.trials, engine)
-    episode = partial(task.episode, optimizer)
+    episode = partial(codesign.Task(the_scene, space, s.trials, engine).episode, optimizer)
     state = optimizer.init(jax.random.key(0), np.array([0.05, 0.0]), s.particles)
     record = Record(state, records.empty_history(s, space.num_parameters))
     for e in range(s.episodes):
@@ -50,7 +49,8 @@ def toy_run():
     particles = record.state.particles
     key = record.state.key
     keys = [codesign.test_key(key, k) for k in range(s.test_rounds)]
-    parts = [record.last_outcomes(), *(task.evaluate(particles, key) for key in keys)]
+    tests = [codesign.frozen(optimizer, particles, key) for key in keys]
+    parts = [record.last_outcomes(), *(episode(*test)[1].outcomes for test in tests)]
     record.test = jax.tree.map(lambda *v: np.concatenate(v, axis=1), *parts)
     test = codesign.summarize_test(the_scene, record.test)
     return the_scene, space, record, test

@@ -16,9 +16,9 @@ The front page has an optimisation in ten lines; `notebooks/` go on from there.
 from codesign_jax.codesign.episode import (
     STREAM_TRIAL,
     EpisodeInfo,
-    SideBySide,
     Task,
     episode_trials,
+    frozen,
     stream_key,
 )
 from codesign_jax.codesign.experiment import (
@@ -47,10 +47,10 @@ __all__ = [
     "VERDICTS",
     "EpisodeInfo",
     "FinalTest",
-    "SideBySide",
     "Task",
     "convergence_episode",
     "episode_trials",
+    "frozen",
     "make_filter",
     "make_optimizer",
     "particle_cost",

@@ -156,14 +156,13 @@ class Task:
         mask = np.ones(self.space.num_parameters, bool) if mask is None else mask
         return self._joined(self._programs.episode, optimizer)(state, mask, scene)
 
-    def side_by_side(self, optimizer: Optimizer) -> "SideBySide":
-        """`episode` and `evaluate` of several runs at once, whose arrays have an axis (run,).
+    def side_by_side(self, optimizer: Optimizer) -> SceneProgram:
+        """`episode` of several runs: a function of states and masks with a leading axis (run,).
 
-        They are `jax.vmap` of the two: one program simulates the worlds of all runs, and rounds
+        It is `jax.vmap` of `episode`: one program simulates the worlds of all runs, and rounds
         otherwise than one of another number of runs.
         """
-        episode = SceneProgram(self.scene, self._programs.episodes, optimizer)
-        return SideBySide(episode, SceneProgram(self.scene, self._programs.evaluations))
+        return SceneProgram(self.scene, self._programs.episodes, optimizer)
 
     def run(
         self,
@@ -216,18 +215,10 @@ class _Weighing(SceneProgram):
         return found
 
 
-class SideBySide(NamedTuple):
-    """Programs of several runs; all but the scene has a leading axis (run,)."""
-
-    episode: SceneProgram  # from states and masks to states and reports, see `Task.episode`
-    evaluate: SceneProgram  # from populations and keys to outcomes, see `Task.evaluate`
-
-
 class _Programs(NamedTuple):
     """What a task runs."""
 
     evaluate: Any
-    evaluations: Any
     episode: Any
     episodes: Any
     run: Any
@@ -249,7 +240,6 @@ def _programs(
         results = devices.shared_out(worlds, count)(*every)
         return rollout.grid(results, (len(population), num_trials))
 
-    @jax.jit  # is traced once for itself and for `evaluations`
     def evaluate(population: jax.Array, key: jax.Array, scene: Scene) -> Outcome:
         return simulate(scene, population, rollout.sample_trials(scene, key, num_trials))[0]
 
@@ -274,13 +264,7 @@ def _programs(
 
         return jax.lax.scan(one, state, jnp.asarray(masks))
 
-    return _Programs(
-        evaluate,
-        jax.vmap(evaluate, in_axes=(0, 0, None)),
-        episode,
-        jax.vmap(episode, in_axes=(0, 0, None, None)),
-        run,
-    )
+    return _Programs(evaluate, episode, jax.vmap(episode, in_axes=(0, 0, None, None)), run)
 
 
 def _refuse_mask(space: DesignSpace, mask: jax.typing.ArrayLike) -> None:
@@ -296,6 +280,21 @@ def episode_trials(
 ) -> Trial:
     """Trials of an episode of the run with this root key, leading axis (trial,)."""
     return rollout.sample_trials(scene, stream_key(key, STREAM_TRIAL, episode), num_trials)
+
+
+def frozen(
+    optimizer: Optimizer, population: jax.Array, key: jax.Array
+) -> tuple[OptimizerState, np.ndarray]:
+    """State and mask of an episode that moves nothing: it simulates particles as they are.
+
+    Its trials are those of the first episode of a run with this root key.
+
+    Args:
+      population: Particles [SI units], shape (particle, parameter).
+    """
+    state = optimizer.init(key, population[0], len(population))
+    mask = np.zeros(np.shape(optimizer.space.low), bool)
+    return state._replace(particles=jnp.asarray(population)), mask
 
 
 def stream_key(key: jax.Array, stream: int, index: jax.typing.ArrayLike = 0) -> jax.Array:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from codesign_jax.codesign.episode import STREAM_TRIAL, stream_key
+from codesign_jax.codesign.episode import stream_key
 from codesign_jax.cost import particle_cost
 from codesign_jax.optimize import Optimizer, rejection
 from codesign_jax.scene import Scene
@@ -55,7 +55,8 @@ def seed_search(
     Args:
       optimizer: Optimiser whose space is sampled.
       key: Root key of the run.
-      evaluate: From candidates and a key to their outcomes, such as `Task.evaluate`.
+      evaluate: From candidates and the root key of an episode that moves nothing (`frozen`) to
+        their outcomes.
       batch: Candidates of one call.
       threshold: Cost above which a candidate is poor enough.
 
@@ -65,7 +66,7 @@ def seed_search(
     Raises:
       NoSeed: If no candidate is poor enough.
     """
-    noise = _first(stream_key(key, STREAM_SCREEN))
+    noise = stream_key(key, STREAM_SCREEN)
 
     def cost(candidates: jax.Array) -> jax.Array:
         return particle_cost(scene, evaluate(candidates, noise))
@@ -76,17 +77,12 @@ def seed_search(
 
 
 def test_key(key: jax.Array, index: int) -> jax.Array:
-    """Key of the trials of a round of the final test of the run with this root key.
+    """Root key of a round of the final test of a run, an episode that moves nothing (`frozen`).
 
     The paper's test is 36 more trials of the final particles in 2D, which makes 42 with the last
     episode's 6, and 72 more in 23D, which makes 78; a round is as many trials as an episode's.
     """
-    return _first(stream_key(key, STREAM_TEST, index))
-
-
-def _first(key: jax.Array) -> jax.Array:
-    # As an episode's first trials: tests and seeds of earlier versions stay the same.
-    return stream_key(key, STREAM_TRIAL)
+    return stream_key(key, STREAM_TEST, index)
 
 
 def summarize_test(scene: Scene, outcomes: Outcome) -> FinalTest:

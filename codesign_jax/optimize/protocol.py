@@ -113,7 +113,7 @@ class Optimizer(Protocol):
           state: Current state.
           mask: True where a parameter is open, bool, shape (parameter,). Closed parameters have
             values of the state's particles. Where all are closed, the result is these
-            particles.
+            particles: that is how particles are tested by an episode's own program.
         """
         ...
 

@@ -248,9 +248,8 @@ def _place(record: Record, particle: int) -> tuple[int, int]:
     if row >= 0:
         return last, row
     # One of the best so far: the last earlier episode that simulated this very design.
-    same = (record.history.population[:last] == np.asarray(record.state.particles)[particle]).all(
-        -1
-    )
+    design = np.asarray(record.state.particles)[particle]
+    same = (record.history.population[:last] == design).all(-1)
     if not same.any():  # against `optimize.Info.ancestors`, as an optimiser of the user's may do
         return last, int(record.history.cost[last].argmin())
     episode, row = np.argwhere(same)[-1]

@@ -22,7 +22,7 @@ import numpy as np
 
 from codesign_jax import codesign
 from codesign_jax.batch import LIMIT
-from codesign_jax.codesign import Task
+from codesign_jax.codesign import EpisodeInfo, Task
 from codesign_jax.devices import take
 from codesign_jax.optimize import OptimizerState, candidates
 from codesign_jax.runs.directory import open_run
@@ -138,7 +138,7 @@ class Search:
         self._runs = runs
         self._task = task
         self._plan = runs[0].plan
-        self._programs = task.side_by_side(self._plan.optimizer)
+        self._episode = task.side_by_side(self._plan.optimizer)
         self._compiled: dict[Any, Callable] = {}
         self._rows: list[Run] = []  # runs that are simulated
         self._progress = progress
@@ -187,9 +187,9 @@ class Search:
         run.begin(seed, start)
 
     def _outcomes(self, population: jax.Array, key: jax.Array) -> Outcome:
-        """Outcomes of one run's particles in the trials of a key."""
-        outcomes = self._simulate("evaluate", np.asarray(population)[None], key[None])
-        return _row(outcomes, 0)
+        """Outcomes of one run's particles, by an episode that moves nothing."""
+        [(_, info)] = self._simulate([codesign.frozen(self._plan.optimizer, population, key)])
+        return info.outcomes
 
     def _run_episodes(self) -> None:
         """The loop of Fig. 5; runs that were ahead of the others wait for them.
@@ -203,60 +203,68 @@ class Search:
             group = [run for run in self._going() if run.done == e]
             if not group:
                 continue
-            masks = np.stack([run.plan.mask[e] for run in runs])
             # Move, simulate, weigh, resample.
-            states, infos = self._simulate("episode", _joined([run.state for run in runs]), masks)
-            for row, run in enumerate(runs):
+            every = self._simulate([(run.state, run.plan.mask[e]) for run in runs])
+            for run, (state, info) in zip(runs, every, strict=True):
                 if run in group and run.error is None:
-                    run.add(_row(states, row)._replace(key=run.state.key), _row(infos, row))
+                    run.add(state, info)
 
     def _test(self) -> None:
         """The final test: the final particles in trials of its own."""
         settings = self._plan.settings
+        optimizer = self._plan.optimizer
         runs = self._rows
         going = self._going()
         if not going:
             return
         chosen = [finalists(run.plan, np.asarray(run.state.particles)) for run in runs]
         size = max(len(few) for few, _ in chosen)
-        particles = np.stack([few[np.arange(size) % len(few)] for few, _ in chosen])
+        particles = [few[np.arange(size) % len(few)] for few, _ in chosen]
         self._progress.begin("testing the final particles")
         rounds = []
         for k in range(settings.test_rounds):
-            keys = jnp.stack([codesign.test_key(run.plan.key, k) for run in runs])
-            rounds.append(self._simulate("evaluate", particles, keys))
+            keys = [codesign.test_key(run.plan.key, k) for run in runs]
+            asked = zip(particles, keys, strict=True)
+            rounds.append(self._simulate([codesign.frozen(optimizer, *each) for each in asked]))
             self._progress.tested(len(going) * size * settings.trials)
-        for row, (run, (_, places)) in enumerate(zip(runs, chosen, strict=True)):
-            parts = [_row(outcomes, row) for outcomes in rounds]
-            test = jax.tree.map(lambda *v: np.concatenate(v, axis=1), *parts)
+        for run, (_, places), *parts in zip(runs, chosen, *rounds, strict=True):
+            outcomes = [info.outcomes for _, info in parts]
+            test = jax.tree.map(lambda *v: np.concatenate(v, axis=1), *outcomes)
             if run in going and run.error is None:
                 self._let(run, run.finish, jax.tree.map(lambda v, p=places: v[p], test))
 
-    def _simulate(self, name: str, first: Any, second: Any) -> Any:
-        """Results of a program of `Task.side_by_side` as NumPy arrays, without keys.
+    def _simulate(
+        self, asked: list[tuple[OptimizerState, np.ndarray]]
+    ) -> list[tuple[OptimizerState, EpisodeInfo]]:
+        """An episode of each run, from its state and mask: the state after it and the report.
 
-        The episodes before are saved while it runs.
+        The results are arrays of NumPy.  The episodes before are saved meanwhile.
         """
-        program = self._program(name, first, second)
+        keys = jnp.stack([state.key for state, _ in asked])
+        arrays = [(state._replace(key=None), mask) for state, mask in asked]  # type: ignore[arg-type]
+        states, masks = jax.tree.map(lambda *v: np.stack(v), *arrays)
+        states = states._replace(key=keys)
+        program = self._program(states, masks)
         start = time.perf_counter()
-        wait = self._interrupts.begin(program, first, second)
+        wait = self._interrupts.begin(program, states, masks)
         self._save()
-        results = wait()
-        if name == "episode":
-            results = results[0]._replace(key=None), results[1]
-        results = jax.device_get(results)
+        states, infos = wait()
+        results = jax.device_get((states._replace(key=None), infos))
         self._seconds = time.perf_counter() - start
-        return results
+        rows = [jax.tree.map(lambda v, r=row: v[r], results) for row in range(len(asked))]
+        return [
+            (new._replace(key=state.key), info)
+            for (state, _), (new, info) in zip(asked, rows, strict=True)
+        ]
 
-    def _program(self, name: str, first: Any, second: Any) -> Callable:
+    def _program(self, states: OptimizerState, masks: np.ndarray) -> Callable:
         """Compiles apart from the first call, so that its time is not an episode's."""
-        shapes = name, *(np.shape(v) for v in jax.tree.leaves(first))
-        if shapes not in self._compiled:
+        shape = np.shape(states.particles)
+        if shape not in self._compiled:
             text = self._progress.text
             self._progress.begin("compiling")
             start = time.perf_counter()
-            program = getattr(self._programs, name)
-            self._compiled[shapes] = self._interrupts.call(program.compile, first, second)
+            self._compiled[shape] = self._interrupts.call(self._episode.compile, states, masks)
             count = self._task.devices
             where = self._task.engine.name + (f", {count} devices" if count > 1 else "")
             message = f"compiled in {time.perf_counter() - start:.1f} s (engine {where})"
@@ -264,7 +272,7 @@ class Search:
             self._progress.begin(text)
             for run in self._going():
                 run.log(message)
-        return self._compiled[shapes]
+        return self._compiled[shape]
 
     def _save(self) -> None:
         for run in self._runs:
@@ -284,15 +292,3 @@ class Search:
             raise
         except Exception as error:
             run.fail(error)
-
-
-def _joined(states: list[OptimizerState]) -> OptimizerState:
-    """States with a leading axis (run,)."""
-    keys = jnp.stack([state.key for state in states])
-    arrays = [state._replace(key=None) for state in states]  # type: ignore[arg-type]
-    return jax.tree.map(lambda *v: np.stack(v), *arrays)._replace(key=keys)
-
-
-def _row(tree: Any, row: int) -> Any:
-    """Arrays of one run, of those with a leading axis (run,)."""
-    return jax.tree.map(lambda v: v[row], tree)

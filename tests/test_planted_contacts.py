@@ -38,8 +38,8 @@ SLOTS = 14
 """Between two fingers, and of a finger with itself and the palm."""
 
 # Stages of the kernel: functions that it evaluates lane by lane.
-FIELD = "rings_on_field"
-AIM = "aimed"
+FIELD = "ring_on_field"
+AIM = "aim"
 BETWEEN = "between"
 BALLS = "balls"
 BEGUN = "begun"

@@ -14,11 +14,12 @@ import numpy as np
 from codesign_jax.engines.structured.kernel import finger_collision, memory_tables
 from codesign_jax.engines.structured.kernel.contact_sets import margin
 from codesign_jax.engines.structured.lanes import dot, once
-from codesign_jax.engines.structured.laws import holding, rings, shapes, surroundings
+from codesign_jax.engines.structured.laws import holding, shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
 from codesign_jax.engines.structured.laws.contact import Cone, Contacts, candidates
 from codesign_jax.engines.structured.laws.kinematics import Kinematics, Spatial, mounted, relative
-from codesign_jax.engines.structured.laws.rings import Place, Ring
+from codesign_jax.engines.structured.laws.rings import Place
+from codesign_jax.engines.structured.laws.touch import ring_centre, touch
 from codesign_jax.engines.structured.world_model import WorldModel, apply_columns
 from codesign_jax.model import held
 from codesign_jax.model.held import rings_of_link
@@ -63,27 +64,29 @@ def contacts(
         distance, gradient = once(lambda p: shapes.signed_distance(scene, hand, p), local)
         return distance, apply_columns(kin.object, gradient)
 
-    def of_body(names: dict[str, bool], ring: Ring, origin: jax.Array, frame: jax.Array) -> None:
-        centre = origin + apply_columns(frame, ring.centre)
+    def of_body(
+        names: dict[str, bool], numbers: jax.Array, origin: jax.Array, frame: jax.Array
+    ) -> None:
+        centre = ring_centre(origin, frame, numbers)
         for name in (n for n in names if names[n]):
             around = [partial(f, position) for f in surroundings.fields(scene)]
             looks = around if name.endswith("_table") else [of_object]
             places = []
             for look in looks:
-                places.append(_on_field(scene, look, ring, frame, centre))
+                places.append(_touch(scene, look, numbers, frame, centre))
             if places:
                 finger = name.startswith("finger")
-                add(name, _joined(places, int(finger)), ring.half.shape[2 if finger else 1])
+                add(name, _joined(places, int(finger)), numbers.shape[2 if finger else 1])
 
     if count := rings_of_link(scene):
         numbers = memory_tables.ring_numbers(scene, hand, count)
         numbers = jnp.moveaxis(numbers.reshape(-1, count, *numbers.shape[1:]), 2, 0)
         on = {"finger_object": e.finger_object, "finger_table": e.finger_table}
-        of_body(on, Ring.of(numbers), kin.origin[:, :, None], kin.link[:, :, :, None])
+        of_body(on, numbers, kin.origin[:, :, None], kin.link[:, :, :, None])
     if palm_touches(scene):
         numbers = jnp.moveaxis(memory_tables.palm_numbers(scene, hand), 1, 0)
         on = {"palm_object": e.palm_object, "palm_table": e.palm_table}
-        of_body(on, Ring.of(numbers), kin.place, kin.palm)
+        of_body(on, numbers, kin.place, kin.palm)
     if e.object_table and surroundings.slots(scene):
         places = _of_object(scene, hand, kin, position, of_object)
         add("object_table", _joined(places, 0))
@@ -135,15 +138,12 @@ def _candidates(scene: Scene, place: Place, cone: Cone, moving: jax.Array | None
     return c._replace(cone=cone.of_share(share))
 
 
-def _on_field(
-    scene: Scene, look: Callable, ring: Ring, frame: jax.Array, centre: jax.Array
+def _touch(
+    scene: Scene, look: Callable, numbers: jax.Array, frame: jax.Array, centre: jax.Array
 ) -> Place:
-    """Contacts of rings or spheres with what `look` tells the distance of, and its gradient."""
-    first = look(centre)
-    if scene.effects.surface == "spheres":
-        return rings.ball_on_field(ring.half[0], centre, *first)
-    offset = once(rings.aim, ring, frame, *first)
-    return once(rings.on_field, ring, frame, centre, offset, *look(centre + offset))
+    """Contacts of rings or spheres with a surface, see `touch`."""
+    surface = scene.effects.surface
+    return touch(surface, numbers, frame, centre, look(centre), look, apply=once)
 
 
 def _joined(places: list[Place], axis: int) -> Place:
@@ -228,7 +228,7 @@ def hand_contacts(
     frames = jnp.concatenate([base_frame[:, :, None], kin.link], 2)
     joints = jnp.concatenate([base[:, None], kin.origin], 1)
     frame = frames[:, :, link]
-    centre = once(finger_collision.ring_centre, joints[:, link], frame, numbers)
+    centre = once(ring_centre, joints[:, link], frame, numbers)
     lines = _centre_lines(scene, frames, joints, numbers, centre) if hull else None
     alone = np.stack([np.arange(n)] * 2)
     two = np.stack(np.triu_indices(n, 1))
@@ -294,7 +294,7 @@ def _on_palm(
     frame, centre = pose
     disc = kin.place[:, None], kin.palm[:, :, None], hand.palm_disc[:, None]
     look = partial(finger_collision.palm_distance, palm=disc)
-    place = _on_field(scene, look, Ring.of(numbers), frame, centre)
+    place = _touch(scene, look, numbers, frame, centre)
     sizes = row[:, None, None], numbers, hand.offset[0], first
     return place._replace(share=place.share * finger_collision.free_of_palm(*sizes))
 
@@ -308,7 +308,7 @@ def depth_in_palm(scene: Scene, hand: WorldModel, kin: Kinematics) -> jax.Array:
     own = numbers[:, first * k :]
     link = np.arange(first * k, numbers.shape[1]) // k
     frame = kin.link[:, :, link]
-    centre = once(finger_collision.ring_centre, kin.origin[:, link], frame, own)
+    centre = once(ring_centre, kin.origin[:, link], frame, own)
     place = _on_palm(scene, hand, kin, (link + 1, own, numbers[:, 0]), (frame, centre))
     depth = jnp.where(place.share > 0, -place.gap, -jnp.inf)
     return depth.reshape(-1, depth.shape[-1]).max(0)

@@ -25,6 +25,7 @@ from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
 from codesign_jax.engines.structured.laws.contact import Contacts
 from codesign_jax.engines.structured.laws.kinematics import next_motion, palm_motion
 from codesign_jax.engines.structured.laws.rings import Segment
+from codesign_jax.engines.structured.laws.touch import aim, ring_centre, ring_centres, touch
 from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model.held import EDGES, ROUND
 from codesign_jax.scene import Scene
@@ -110,22 +111,18 @@ def of_rings(
         what they hold behind the step, and "share" of the contacts, which tells which are
         candidates.
     """
-    centre = sdf_collision.ring_centres(place.origin, place.frame, numbers)
+    centre = ring_centres(place.origin, place.frame, numbers)
     places = []
     on_object = name.endswith("_object")
     looks = around(scene, at) if not on_object else [partial(look, scene, at=at, still=still)]
     for n, one in enumerate(looks):
         values = [{"values": still.get(k)} if on_object else {} for k in ("values", "values_again")]
         first = one(centre, **values[0])
-        if scene.effects.surface == "spheres":
-            places.append(sdf_collision.balls_on_field(numbers, centre, *first))
-            continue
-        offset = jnp.zeros_like(centre)
-        again = first
-        if on_object or n >= scene.effects.table:  # the table is a plane
-            offset = finger_collision.aimed(numbers, place.frame, *first)
-            again = one(centre + offset, **values[1])
-        places.append(sdf_collision.rings_on_field(numbers, place.frame, centre, offset, *again))
+        again = partial(one, **values[1])
+        plane = not on_object and n < scene.effects.table  # the table comes first
+        surface = scene.effects.surface
+        touched = touch(surface, numbers, place.frame, centre, first, again, plane=plane)
+        places.append(sdf_collision.as_kept(touched))
     found = sdf_collision.beside(places)
     found = found._replace(share=jnp.where(still["share"] > 0, found.share, 0.0))
     cone = _cone(scene, name, at)
@@ -138,11 +135,13 @@ def of_rings(
     return of_contacts(contacts, *(m[:, None] for m in moves), hold=hold)
 
 
-def aim(scene: Scene, name: str, place: BodyMotion, numbers, at: dict, still: dict) -> jax.Array:
-    """Where rings look at a field once more, shape (3, k, ...)."""
-    centre = sdf_collision.ring_centres(place.origin, place.frame, numbers)
+def second_look(
+    scene: Scene, name: str, place: BodyMotion, numbers, at: dict, still: dict
+) -> jax.Array:
+    """Where rings look at a field again, see `touch`, shape (3, k, ...)."""
+    centre = ring_centres(place.origin, place.frame, numbers)
     first = look(scene, centre, at, still, still.get("values"))
-    return centre + finger_collision.aimed(numbers, place.frame, *first)
+    return centre + aim(numbers, place.frame, *first)
 
 
 def of_table(
@@ -240,24 +239,15 @@ def on_palm(
 ) -> jax.Array:
     """Power of a finger's ring or sphere, on a link, on the palm's disc of a size."""
     place, ring = mine
-    centre = finger_collision.ring_centre(*place[:2], ring)
-    disc = (*palm[:2], size)
-    first = finger_collision.palm_distance(centre, disc)
-    if scene.effects.surface == "spheres":
-        found = finger_collision.ball_on_field(ring, centre, *first)
-    else:
-        offset = finger_collision.aimed(ring, place.frame, *first)
-        again = finger_collision.palm_distance(centre + offset, disc)
-        found = finger_collision.on_field(ring, place.frame, centre, offset, *again)
+    centre = ring_centre(*place[:2], ring)
+    on_disc = partial(finger_collision.palm_distance, palm=(*palm[:2], size))
+    found = touch(scene.effects.surface, ring, place.frame, centre, on_disc(centre), on_disc)
     return _between(scene, found, place[2:], palm[2:], numbers)
 
 
 def between_spheres(scene: Scene, mine: tuple, theirs: tuple, numbers: Any) -> jax.Array:
     """Power of two fingers' spheres on one another: links, and the spheres' numbers."""
-    one, other = (
-        finger_collision.ring_centre(place.origin, place.frame, ring)
-        for place, ring in (mine, theirs)
-    )
+    one, other = (ring_centre(place.origin, place.frame, ring) for place, ring in (mine, theirs))
     found = finger_collision.balls(mine[1], one, theirs[1], other)
     return _between(scene, found, mine[0][2:], theirs[0][2:], numbers)
 
@@ -297,9 +287,9 @@ def between_rings(
     first = theirs.tip if theirs.first is None else theirs.first
     start = finger_collision.above(link.origin, before, link.frame, first)
     behind = finger_collision.above(theirs.origin, link.frame, after, theirs.tip)
-    tip = finger_collision.ring_centre(link.origin, link.frame, theirs.tip)
+    tip = ring_centre(link.origin, link.frame, theirs.tip)
     ends = start, jnp.where(still["last"] > 0, tip, behind)
-    centre = finger_collision.ring_centre(*place[:2], ring)
+    centre = ring_centre(*place[:2], ring)
     t = rings.nearest(centre, Segment(ends, None, None), still["end"])  # type: ignore[arg-type]
     other = ends, (before, link.frame, after), theirs.tip, still["last"]
     found = finger_collision.between(ring, place.frame, centre, other, t)

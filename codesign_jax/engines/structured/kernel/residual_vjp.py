@@ -17,7 +17,6 @@ from codesign_jax.engines.structured.kernel import (
     friction_memory,
     objects,
     residual,
-    sdf_collision,
 )
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, only_on, plus, pull
@@ -40,6 +39,7 @@ from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
 from codesign_jax.engines.structured.laws.kinematics import mounted
+from codesign_jax.engines.structured.laws.touch import ring_centres
 from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model import held
 from codesign_jax.model.layout import touches_itself
@@ -180,10 +180,10 @@ class ResidualVjp:
 
         def compute(at: dict, still: dict) -> BodyMotion:
             if "meshed" in still and name.endswith("_object"):
-                centre = lanewise(sdf_collision.ring_centres, place.origin, place.frame, numbers)
+                centre = lanewise(ring_centres, place.origin, place.frame, numbers)
                 still = still | {"values": self._values(centre)}
                 if self.p.hull:
-                    run = partial(residual.aim, self.p.scene, name)
+                    run = partial(residual.second_look, self.p.scene, name)
                     again = lanewise(run, place, numbers, at, still)
                     still = still | {"values_again": self._values(again)}
             run = partial(residual.of_rings, self.p.scene, name)

@@ -13,12 +13,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import friction_memory, objects
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
-from codesign_jax.engines.structured.kernel.finger_collision import (
-    FingerCollision,
-    aimed,
-    ball_on_field,
-    on_field,
-)
+from codesign_jax.engines.structured.kernel.finger_collision import FingerCollision
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.problem import relative
 from codesign_jax.engines.structured.kernel.slots import any_of
@@ -28,6 +23,7 @@ from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact, shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import own_friction
 from codesign_jax.engines.structured.laws.rings import Place
+from codesign_jax.engines.structured.laws.touch import ring_centres, touch
 from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model import held
 
@@ -45,7 +41,7 @@ class SdfCollision:
         self.thing = thing
         self.contacts = step.contacts
         self.names = [n for n in ("finger_object", "finger_table") if n in self.contacts]
-        self.hull = step.p.scene.effects.surface == "hull"
+        self.surface = step.p.scene.effects.surface
 
     def looks(self, name: str) -> list[Callable[[Lanes], tuple[Lanes, Lanes]]]:
         """The object, or table and fixtures: from points (3, k) to distances (k,) and gradients."""
@@ -130,25 +126,25 @@ class SdfCollision:
         looks = self.looks(name)
         found = [look(centre) for look in looks]
         friction = self.frictions(name, contacts.set.k // len(looks))
-        if not self.hull:
-            places = [lanewise(balls_on_field, numbers, centre, *first) for first in found]
-            return contacts.create(i, joined(places), *moves, friction=friction)
+        flat = not name.endswith("_object") and self.p.scene.effects.table  # the table comes first
+
+        def places() -> Place:
+            every = []
+            for n, (look, first) in enumerate(zip(looks, found, strict=True)):
+                plane = flat and n == 0
+                body = numbers, frame, centre
+                place = touch(self.surface, *body, first, look, plane=plane, apply=lanewise)
+                every.append(lanewise(as_kept, place))
+            return joined(every)
+
+        if self.surface == "spheres":
+            return contacts.create(i, places(), *moves, friction=friction)
         run = partial(may_touch, self.p.scene.discretization.timestep)
         near = [lanewise(run, numbers, centre, first[0], moves[1]).lane for first in found]
         contacts.write("share", zeros((1, contacts.set.k), self.step.like), i)
-        flat = not name.endswith("_object") and self.p.scene.effects.table
 
         def create() -> None:
-            places = []
-            for n, (look, first) in enumerate(zip(looks, found, strict=True)):
-                if flat and n == 0:  # the table is a plane
-                    offset = lanewise(jnp.zeros_like, centre)
-                    again = first
-                else:
-                    offset = lanewise(aimed, numbers, frame, *first)
-                    again = look(lanewise(jnp.add, centre, offset))
-                places.append(lanewise(rings_on_field, numbers, frame, centre, offset, *again))
-            contacts.create(i, joined(places), *moves, friction=friction, hold=hold)
+            contacts.create(i, places(), *moves, friction=friction, hold=hold)
 
         any_of(total(near) > 0, create)
 
@@ -228,10 +224,6 @@ class SdfCollision:
         return dealt
 
 
-def ring_centres(origin, frame, numbers):
-    return origin[:, None] + apply_columns(frame[:, :, None], numbers[:3])
-
-
 def joined(places: list[Place]) -> Place:
     """Contacts with several fields, one behind the other."""
     return places[0] if len(places) == 1 else lanewise(lambda *p: beside(list(p)), *places)
@@ -267,16 +259,6 @@ def may_touch(timestep, numbers, centre, distance, vel):
 def as_kept(place: Place) -> Place:
     """Gaps and shares with an axis of one component, as sets keep them."""
     return place._replace(gap=place.gap[None], share=place.share[None])
-
-
-def rings_on_field(numbers, frame, centre, offset, distance, normal):
-    """See `rings.on_field`; of a link's rings."""
-    return as_kept(on_field(numbers, frame, centre, offset, distance, normal))
-
-
-def balls_on_field(numbers, centre, distance, normal):
-    """Contacts of a body's spheres, whose half axes are the radius."""
-    return as_kept(ball_on_field(numbers, centre, distance, normal))
 
 
 def one_of(numbers):

@@ -1,0 +1,95 @@
+"""One contact of a ring or sphere with a distance field: look, aim, look again, touch.
+
+A field is a function that looks: from points (3, ...) to their distance from a body (...) and the
+gradient of the distance (3, ...), a unit vector in world axes.  The object, the table, fixtures and
+the palm's disc are fields.  The kernel, its adjoint and `assembly` call `touch` for all of them.
+
+Rings are given by their numbers, shape (8, ...), see `rings.Ring`.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured.laws import rings
+from codesign_jax.engines.structured.laws.rings import Place, Ring
+from codesign_jax.engines.structured.world_model import apply_columns
+
+
+def directly(function: Callable, *args: Any) -> Any:
+    """Calls a stage of `touch` on arrays."""
+    return function(*args)
+
+
+def touch(
+    surface: str,
+    numbers: Any,
+    frame: Any,
+    centre: Any,
+    first: tuple[Any, Any],
+    look: Callable[[Any], tuple[Any, Any]],
+    *,
+    plane: bool = False,
+    apply: Callable = directly,
+) -> Place:
+    """Contacts of rings, or spheres, of a body with a distance field.
+
+    Args:
+      surface: The scene's `effects.surface`, "hull" for rings or "spheres".
+      numbers: Their numbers, shape (8, ...).
+      frame: The body's frame, columns (3, 3, ...).
+      centre: Their centres [m], world axes, shape (3, ...); see `ring_centre`.
+      first: What `look` found at the centres.
+      look: The field.
+      plane: Whether the field is that of a plane, which looks alike from everywhere.
+      apply: Evaluates apply(stage, *args): `lanewise` in a kernel, `once` over whole arrays.
+    """
+    if surface == "spheres":
+        return apply(ball_on_field, numbers, centre, *first)
+    if plane:
+        offset = apply(jnp.zeros_like, centre)
+        return apply(ring_on_field, numbers, frame, centre, offset, *first)
+    offset = apply(aim, numbers, frame, *first)
+    again = look(apply(jnp.add, centre, offset))
+    return apply(ring_on_field, numbers, frame, centre, offset, *again)
+
+
+# Stages
+
+
+def ring_centre(origin: jax.Array, frame: jax.Array, numbers: jax.Array) -> jax.Array:
+    """Centre of a ring on a body, from the body's origin and frame."""
+    return origin + apply_columns(frame, numbers[:3])
+
+
+def ring_centres(origin: jax.Array, frame: jax.Array, numbers: jax.Array) -> jax.Array:
+    """Centres of k rings on a body; numbers of shape (8, k, ...)."""
+    return ring_centre(origin[:, None], frame[:, :, None], numbers)
+
+
+def aim(
+    numbers: jax.Array, frame: jax.Array, distance: jax.Array, gradient: jax.Array
+) -> jax.Array:
+    """From centres to where the field is looked at again, see `rings.aim`."""
+    return rings.aim(Ring.of(numbers), frame, distance, gradient)
+
+
+def ring_on_field(
+    numbers: jax.Array,
+    frame: jax.Array,
+    centre: jax.Array,
+    offset: jax.Array,
+    distance: jax.Array,
+    normal: jax.Array,
+) -> Place:
+    """Contacts of rings, see `rings.on_field`."""
+    return rings.on_field(Ring.of(numbers), frame, centre, offset, distance, normal)
+
+
+def ball_on_field(
+    numbers: jax.Array, centre: jax.Array, distance: jax.Array, normal: jax.Array
+) -> Place:
+    """Contacts of spheres, all of whose half axes are the radius; see `rings.ball_on_field`."""
+    return rings.ball_on_field(numbers[3] * numbers[6], centre, distance, normal)

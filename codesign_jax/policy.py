@@ -156,9 +156,9 @@ class ControlLoop(Equal):
     def _key(self) -> tuple:
         return self.engine, self.policy, self.scene.hand.pressure_limit
 
-    def recording(self) -> "ControlLoop":
-        """As an engine whose traces have the contact forces."""
-        return ControlLoop(recording(self.engine), self.policy)
+    def recording(self, *, touch: bool = False) -> "ControlLoop":
+        """As an engine whose traces have the contact forces, see `base.recording`."""
+        return ControlLoop(recording(self.engine, touch=touch), self.policy)
 
     commands = staticmethod(control.plan)
     """What `rollout.prepare` makes for `rollout`: the plan instead of controls."""

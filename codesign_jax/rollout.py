@@ -55,12 +55,15 @@ class Options(NamedTuple):
         but a cost of one's own that reads the trace must say which.
       record_forces: Whether the trace has the contact forces, see `Forces`; engine structured
         alone, and without derivatives.  A cost's attribute of this name says the same.
+      record_touch: Whether these have the object's contacts ring by ring as well, see `Touch`;
+        implies `record_forces`.  Ten numbers a ring and time step.
       cost: A cost of one's own in place of the scene's, see `CostFunction`.
     """
 
     record_qpos: bool = False
     stop_when_lost: bool | None = None
     record_forces: bool = False
+    record_touch: bool = False
     cost: CostFunction | None = None
 
     @property
@@ -266,8 +269,9 @@ def _traced(
     steps: int | None = None,
 ) -> tuple[Trace, Any, jax.Array]:
     how.refuse()
-    forces = how.record_forces or getattr(how.cost, "record_forces", False)
-    engine = recording(engine) if forces else engine
+    asked = how.record_forces or how.record_touch
+    if asked or getattr(how.cost, "record_forces", False):
+        engine = recording(engine, touch=how.record_touch)
     ctrl: Any
     fields, ctrl, initial = prepare(scene, params, trials, engine)
     if steps is not None and isinstance(ctrl, control.Plan):

@@ -169,6 +169,31 @@ class Phased(Protocol):
         ...
 
 
+class Touch(NamedTuple):
+    """How the rings of the fingers, or of the palm, touch the object: a map for tactile sensors.
+
+    Rings are the places where a hand of a hull is tested for contact; of a hand of spheres they are
+    those. A finger's follow one another from its base to its tip, as many on each link. The force
+    on the object is `tangential - pressing * normal`, and its sum over the rings is that of
+    `Forces`. Vectors and points are in the world frame, forces those of the step taken, geometry
+    that of its beginning. In the shapes n stands for (finger, ring), of the palm for (ring,).
+
+    Attributes:
+      point: Where the contact acts [m], shape (..., n, 3); where nothing touches, the place that is
+        nearest to the object.
+      normal: Unit vector from the object to the ring, shape (..., n, 3).
+      gap: Distance between ring and object [m], negative in contact, shape (..., n).
+      pressing: Normal force [N], never negative, 0 where nothing touches, shape (..., n).
+      tangential: Friction force on the object [N], shape (..., n, 3).
+    """
+
+    point: jax.Array
+    normal: jax.Array
+    gap: jax.Array
+    pressing: jax.Array
+    tangential: jax.Array
+
+
 class Forces(NamedTuple):
     """Contact forces over time steps, world frame; a step that was not taken has none.
 
@@ -188,6 +213,8 @@ class Forces(NamedTuple):
       depth: Largest depth at the step's beginning [m], 0 where nothing touches, by kind of contact
         as far as the scene has it: "finger_object", "finger_table", "palm_object", "palm_table",
         "object_table", "finger_finger", "finger_itself", "finger_palm", shape (...).
+      touch: The object's contacts ring by ring, if they were asked for (`record_touch`): "finger"
+        and "palm" as far as the scene has these contacts, see `Touch`; else None.
     """
 
     finger: jax.Array
@@ -199,6 +226,7 @@ class Forces(NamedTuple):
     finger_finger: jax.Array
     finger_palm: jax.Array
     depth: dict[str, jax.Array]
+    touch: dict[str, Touch] | None = None
 
 
 class Trace(NamedTuple):

@@ -36,7 +36,7 @@ def grasp_of(surface):
         one = jax.tree.map(lambda v: np.asarray(v)[None], (fields, ctrl))
 
         def run(fields, ctrl):
-            recorded = engine.recording().rollout(fields, ctrl, trajectory=True)
+            recorded = engine.recording(touch=True).rollout(fields, ctrl, trajectory=True)
             return engine.states(fields, ctrl, trajectory=True)[1], recorded
 
         found, trace = jax.tree.map(np.asarray, jax.jit(run)(*one))
@@ -62,6 +62,25 @@ def test_forces_on_the_object_are_what_its_momentum_gains(grasp):
     assert held.sum() > 20 and forces.depth["finger_object"][0, held].max() > 1e-4
 
 
+def test_forces_of_the_rings_add_up(grasp):
+    """To those of fingers and palm, which are what the object's momentum gains."""
+    scene, _, _, trace = grasp
+    forces = trace.forces
+    for name, touch in forces.touch.items():
+        pushed = touch.tangential - touch.pressing[..., None] * touch.normal
+        expected = getattr(forces, name)
+        # Sums of 16 forces in float64.
+        np.testing.assert_allclose(pushed.sum(-2), expected, rtol=1e-10, atol=1e-12)
+        across = (touch.tangential * touch.normal).sum(-1)
+        np.testing.assert_allclose(across, 0.0, atol=1e-12)
+        slipping = np.linalg.norm(touch.tangential, axis=-1)
+        friction = scene.objects.object[0].friction
+        assert (slipping <= friction * touch.pressing + 1e-9).all()
+    grip = forces.touch["finger"].pressing
+    np.testing.assert_allclose(grip.sum(-1), forces.grip, rtol=1e-10, atol=1e-12)
+    assert (grip >= 0).all() and (grip > 0).any((0, 1, 2)).sum() > 1  # more than one ring
+
+
 def test_forces_are_mujocos():
     """Of every contact, by its own solver, at the states and velocities of the path."""
     scene, (fields, ctrl), found, trace = grasp_of("spheres")
@@ -72,6 +91,8 @@ def test_forces_are_mujocos():
     weight = fields.body_mass[0, lay.object] * scene.gravity
     kinds = {body: ("finger", f) for f, row in enumerate(lay.bodies) for body in row}
     kinds |= {1: ("palm",), 0: ("table",)}
+    geoms = lay.spheres.reshape(len(lay.spheres), -1)
+    spheres = {int(geom): place for place, geom in np.ndenumerate(geoms)}
     for k in range(5, ctrl.shape[1], 7):
         data.qpos[:] = found["qpos"][0, k]
         data.qvel[:] = found["qvel"][0, k]
@@ -79,6 +100,7 @@ def test_forces_are_mujocos():
         mujoco.mj_forward(own, data)
         forces = jax.tree.map(lambda v, k=k: v[0, k], trace.forces)
         sums = {"finger": np.zeros((2, 3)), "palm": np.zeros(3), "table": np.zeros(3)}
+        rings = np.zeros_like(forces.touch["finger"].tangential)
         for i in range(data.ncon):
             contact = data.contact[i]
             force = np.zeros(6)
@@ -87,10 +109,19 @@ def test_forces_are_mujocos():
             if lay.object in bodies:
                 sign = 1 if bodies[1] == lay.object else -1  # the force on the second body
                 kind, *index = kinds[int(bodies[bodies != lay.object][0])]
-                sums[kind][tuple(index)] += sign * contact.frame.reshape(3, 3).T @ force[:3]
+                acting = sign * contact.frame.reshape(3, 3).T @ force[:3]
+                sums[kind][tuple(index)] += acting
+                if kind == "finger":
+                    ring = tuple(spheres[int(contact.geom[bodies != lay.object][0])])
+                    rings[ring] += acting
+                    point = forces.touch["finger"].point[ring]
+                    np.testing.assert_allclose(point, contact.pos, atol=1e-10)  # rounding
         touched += data.ncon
         for name, expected in sums.items():
             np.testing.assert_allclose(getattr(forces, name), expected, atol=1e-6 * weight)
+        touch = forces.touch["finger"]
+        pushed = touch.tangential - touch.pressing[..., None] * touch.normal
+        np.testing.assert_allclose(pushed, rings, atol=1e-6 * weight)
     assert touched > 100
 
 

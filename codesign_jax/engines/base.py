@@ -43,12 +43,12 @@ def tells_forces(engine: Engine) -> bool:
     return hasattr(getattr(engine, "engine", engine), "recording")
 
 
-def recording(engine: Engine) -> Engine:
-    """The engine as one whose traces have the contact forces."""
+def recording(engine: Engine, *, touch: bool = False) -> Engine:
+    """The engine as one whose traces have the contact forces; `touch`: ring by ring as well."""
     own: Any = getattr(engine, "recording", None)
     if own is None or not tells_forces(engine):
         raise InputError([f"engine {engine.name} records no forces; engine structured does"])
-    return own()
+    return own(touch=touch)
 
 
 class Equal:

@@ -177,9 +177,9 @@ class StructuredEngine(Equal):
         out = _execute(program, inputs, trajectory=trajectory)
         return self._trace(*program.outputs(out, len(ctrl), trajectory=trajectory), trajectory)
 
-    def recording(self) -> "Recording":
-        """As an engine whose traces have the contact forces."""
-        return Recording(self)
+    def recording(self, *, touch: bool = False) -> "Recording":
+        """As an engine whose traces have the contact forces, see `base.recording`."""
+        return Recording(self, touch=touch)
 
     def states(
         self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False
@@ -247,16 +247,18 @@ class StructuredEngine(Equal):
 class Recording(Equal):
     """The engine `structured` as one whose traces have `Trace.forces`; without derivatives."""
 
-    def __init__(self, engine: StructuredEngine):
+    def __init__(self, engine: StructuredEngine, *, touch: bool = False):
+        """Prepares the engine; `touch`: forces have the object's contacts ring by ring."""
         self.engine = engine
+        self.touch = touch
         self.scene = engine.scene
         self.name = engine.name
 
     def _key(self) -> tuple:
-        return (self.engine,)
+        return self.engine, self.touch
 
-    def recording(self) -> "Recording":
-        return self
+    def recording(self, *, touch: bool = False) -> "Recording":
+        return Recording(self.engine, touch=touch or self.touch)
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
         run = jax.custom_vjp(transforms.folded(partial(self._simulate, trajectory)))
@@ -289,7 +291,7 @@ class Recording(Equal):
         def step(now: tuple) -> Forces:
             qpos, qvel, acc, moved, *held = now
             state = coordinates.make(self.scene, qpos, qvel, acc, *held)
-            every = forces.forces(self.scene, hand, state, state.acc)
+            every = forces.forces(self.scene, hand, state, state.acc, touch=self.touch)
             return jax.tree.map(
                 lambda v: jnp.where(moved.reshape(-1, *[1] * (v.ndim - 1)) > 0, v, 0.0), every
             )

@@ -25,13 +25,18 @@ from codesign_jax.engines.structured.laws.kinematics import (
 from codesign_jax.engines.structured.world_model import WorldModel
 from codesign_jax.model import layout
 from codesign_jax.scene import Scene
-from codesign_jax.types import Forces
+from codesign_jax.types import Forces, Touch
 
 
-def forces(scene: Scene, hand: WorldModel, state: State, acc: Acc) -> Forces:
+def forces(
+    scene: Scene, hand: WorldModel, state: State, acc: Acc, *, touch: bool = False
+) -> Forces:
     """Forces of a step of a batch, every array with a leading axis (world,).
 
     The states are those before the step, with the friction that contacts held then.
+
+    Args:
+      touch: Whether to tell the object's contacts ring by ring, `Forces.touch`.
     """
     kin = kinematics(hand, layout(scene).axes, state)
     velocity = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
@@ -44,13 +49,17 @@ def forces(scene: Scene, hand: WorldModel, state: State, acc: Acc) -> Forces:
     net |= {name: none for name in ("finger_object", "finger_table")}
     grip = none[0]
     depth = {}
+    rings = {}
     hold = assembly.grips(scene, state.held, kin)
     for name, contacts in found.items():
         own = hold.get(name)
-        force, normal = once(partial(_acting, name), contacts, motion, velocity, own)
+        acting = once(partial(_acting, name), contacts, motion, velocity, own)
+        force, normal = once(partial(_sums, name), contacts, acting)
         net[name] = force
         if name == "finger_object":
             grip = normal
+        if touch and name in ("finger_object", "palm_object"):
+            rings[name.removesuffix("_object")] = once(_touch, contacts, acting)
         depth[name] = _deepest(contacts)
     between = jnp.zeros((fingers, fingers, worlds), state.wrist.dtype)
     on_palm = none[0]
@@ -80,13 +89,14 @@ def forces(scene: Scene, hand: WorldModel, state: State, acc: Acc) -> Forces:
         finger_finger=jnp.moveaxis(between, -1, 0),
         finger_palm=on_palm.T,
         depth=depth,
+        touch=rings if touch else None,
     )
 
 
 def _acting(
     name: str, contacts: Contacts, motion: Spatial, velocity: Spatial, hold: jax.Array | None
-) -> tuple[jax.Array, jax.Array]:
-    """Sums over a set's contacts: forces on the first body, (3, finger or 1, world), and normal.
+) -> jax.Array:
+    """Forces of a set's contacts on the first body, shape (3, ...).
 
     The first body is the finger, the palm, or the object on the table; hold is the friction that
     they hold, if they do.
@@ -94,12 +104,45 @@ def _acting(
     speed = contacts.relative(relative(name, velocity))
     jar = contacts.relative(relative(name, motion)) - contacts.reference(speed)
     jar = jar if hold is None else jar + holding.held(contacts, hold)
-    force = _force(contacts, jar)
+    return _force(contacts, jar)
+
+
+def _sums(name: str, contacts: Contacts, force: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Sums over a set's contacts: forces, shape (3, finger or 1, world), and normal forces."""
     normal = dot(contacts.normal, force)
     lanes = force.shape[-2:]
     if not name.startswith("finger"):
         lanes = 1, lanes[1]
     return force.reshape(3, -1, *lanes).sum(1), normal.reshape(-1, *lanes).sum(0)
+
+
+def _touch(contacts: Contacts, force: jax.Array) -> Touch:
+    """The contacts ring by ring, with axes (world, finger, ring), or (world, ring) of the palm.
+
+    Args:
+      contacts: Of fingers, items (link, ring of the link, finger, world), or of the palm, items
+        (ring, 1, world), with the object.
+      force: Forces on the hand, shape (3, ...).
+    """
+    pressing = dot(contacts.normal, force)
+    of_palm = pressing.ndim == 3
+
+    def by_ring(values: jax.Array) -> jax.Array:
+        values = jnp.broadcast_to(values, pressing.shape)
+        if of_palm:
+            return values[:, 0].T
+        return jnp.moveaxis(values.reshape(-1, *values.shape[2:]), 0, 2).swapaxes(0, 1)
+
+    def vectors(values: jax.Array) -> jax.Array:
+        return jnp.stack([by_ring(v) for v in values], -1)
+
+    return Touch(
+        point=vectors(contacts.point),
+        normal=vectors(contacts.normal),
+        gap=by_ring(contacts.distance),
+        pressing=by_ring(pressing),
+        tangential=vectors(pressing * contacts.normal - force),
+    )
 
 
 def _pressing(met: HandContacts, motion: Spatial, velocity: Spatial) -> jax.Array:

@@ -25,7 +25,7 @@ from codesign_jax.engines.structured.world_model import (
     apply_columns,
     world_constants,
 )
-from codesign_jax.model import ModelFields, layout, morphology
+from codesign_jax.model import ModelFields, morphology
 from codesign_jax.scene import Scene, key_frames
 from codesign_jax.scene.parameters import DesignSpace, params_of
 from codesign_jax.scene.schema import InputError, nearest
@@ -77,9 +77,8 @@ def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
     bad |= ~jnp.isfinite(sum(jax.tree.leaves(fields.constants)))
     others = jax.tree.leaves(fields._replace(constants=(), shape=()))
     bad |= ~jnp.isfinite(_rows(*others)).all(1)
-    moving = layout(scene).bodies.ravel()
-    bad |= ~(_rows(fields.body_mass[:, moving], fields.body_inertia[:, moving]) > 0).all(1)
-    bad |= ~(_rows(fields.jnt_stiffness, fields.dof_damping, fields.dof_armature) >= 0).all(1)
+    bad |= ~(_rows(fields.mass[:, :, 1:], fields.inertia[:, :, 1:]) > 0).all(1)
+    bad |= ~(_rows(fields.stiffness, fields.damping, fields.armature) >= 0).all(1)
     return jnp.where(bad, int(Status.INVALID_START), 0).astype(jnp.int32)
 
 
@@ -101,7 +100,7 @@ def depth(scene: Scene, fields: ModelFields) -> jax.Array:
     every = assembly.contacts(scene, hand, kin, position)
     found = [(-c.distance).reshape(-1, c.distance.shape[-1]).max(0) for c in every.values()]
     if not found:
-        return jnp.zeros(fields.body_mass.shape[0], fields.body_mass.dtype)
+        return jnp.zeros_like(fields.object_mass)
     return jnp.stack(found).max(0)
 
 

@@ -7,13 +7,15 @@ Importing this module needs the package `warp`; MJX brings MuJoCo Warp itself al
 
 import copy
 import time
+from functools import partial
 from importlib import import_module
 from typing import Any
 
+import jax
 import mujoco
 import numpy as np
 
-from codesign_jax.model import ModelFields, compile_template, layout
+from codesign_jax.model import ModelFields, compile_template, layout, mujoco_fields
 from codesign_jax.scene import Scene
 from codesign_jax.types import Trace
 
@@ -91,10 +93,11 @@ class WarpProgram:
         # Warp never resets a world and refuses the flag that asks for that.
         template.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         begin = time.perf_counter()
-        names = [n for n in fields.of_model if n not in _ABSENT]
+        arrays = jax.jit(jax.vmap(partial(mujoco_fields, scene.structure)))(fields)
+        names = [n for n in arrays.of_model if n not in _ABSENT]
         self.model = mjw.put_model(template, dict.fromkeys(names, self.worlds))
         for name in names:
-            self._assign(name, np.asarray(getattr(fields, name), np.float32))
+            self._assign(name, np.asarray(getattr(arrays, name), np.float32))
         self.data = mjw.make_data(template, nworld=self.worlds, nconmax=CONTACTS, njmax=ROWS)
         self.start = wp.array(np.asarray(fields.start, np.float32), dtype=float)
         table = np.ascontiguousarray(np.moveaxis(np.asarray(ctrl, np.float32), 1, 0))

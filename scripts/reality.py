@@ -99,7 +99,7 @@ def released(beam: Mapping[str, Any], beam_scene: Scene) -> tuple[np.ndarray, np
     lay = model.layout(beam_scene)
     worlds = jax.tree.map(lambda v: jnp.stack([v] * len(beam["weight"])), fields)
     loads = np.array(beam["weight"]) / beam_scene.gravity
-    worlds = _weighted(worlds, lay, beam["length"] / lay.links / 2, loads)
+    worlds = _weighted(worlds, beam["length"] / lay.links / 2, loads)
     steps = round(DURATION / beam_scene.discretization.timestep)
     ctrl = np.zeros((len(loads), steps, 7), np.float32)
     ctrl[:, :, 2] = beam_scene.arm.start_height
@@ -120,21 +120,20 @@ def _finger_joints(start: np.ndarray, lay: Any) -> np.ndarray:
     return places
 
 
-def _weighted(fields: Any, lay: Any, extent: float, loads: np.ndarray) -> Any:
+def _weighted(fields: Any, extent: float, loads: np.ndarray) -> Any:
     """Fields with point masses [kg] at the end of the last body, `extent` [m] from its joint."""
-    last = lay.bodies[0, -1]
-    bodies = np.append(lay.stubs, lay.bodies[0])
-    place = np.array(fields.body_ipos)
-    place[:, bodies, 2] = 0.0
-    mass = np.array(fields.body_mass)
-    inertia = np.array(fields.body_inertia)
-    own = mass[:, last].copy()
-    centre = (own * place[:, last, 0] + loads * extent) / (own + loads)
-    more = own * (centre - place[:, last, 0]) ** 2 + loads * (extent - centre) ** 2
-    inertia[:, last, 1:] += more[:, None]
-    mass[:, last] += loads
-    place[:, last, 0] = centre
-    return fields._replace(body_mass=mass, body_inertia=inertia, body_ipos=place)
+    place = np.array(fields.centre)
+    place[..., 1] = 0.0
+    mass = np.array(fields.mass)
+    inertia = np.array(fields.inertia)
+    own = mass[:, 0, -1].copy()
+    along = place[:, 0, -1, 0]
+    centre = (own * along + loads * extent) / (own + loads)
+    more = own * (centre - along) ** 2 + loads * (extent - centre) ** 2
+    inertia[:, 0, -1, 1:] += more[:, None]
+    mass[:, 0, -1] += loads
+    place[:, 0, -1, 0] = centre
+    return fields._replace(mass=mass, inertia=inertia, centre=place)
 
 
 class Ring(NamedTuple):

@@ -315,7 +315,7 @@ def fill(the_scene, model_, data, fields):
     lay = model.layout(the_scene)
     n = 1.4
     for f, joints in enumerate(lay.dofs[..., 0]):
-        gain = float(fields.actuator_gainprm[0, 6 + f, 0])
+        gain = float(fields.gain[0, f, 0])
         height, _, segment, _ = np.asarray(fields.section)[0, f]
         stiffness = model_.jnt_stiffness[joints[0]]
         straight = 4 * gain / height * segment

@@ -250,7 +250,7 @@ def bent(scene, engine, world, x, broken):
     def inputs(x, broken):
         new = hand._replace(length=x[0] * hand.length, pressure=x[1] * hand.pressure)
         fields = model.model_fields(scene, new, trial)
-        fields = fields._replace(jnt_stiffness=x[2] * fields.jnt_stiffness)
+        fields = fields._replace(stiffness=x[2] * fields.stiffness)
         ctrl = control.commands(scene, new, trial)
         return fields, ctrl.at[40:, 6].set(jnp.where(broken, jnp.nan, ctrl[40:, 6]))
 

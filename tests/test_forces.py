@@ -52,7 +52,7 @@ def test_forces_on_the_object_are_what_its_momentum_gains(grasp):
     scene, (fields, _), found, trace = grasp
     h = scene.discretization.timestep
     forces = trace.forces
-    mass = fields.body_mass[0, model.layout(scene).object]
+    mass = fields.object_mass[0]
     gained = np.diff(found["qvel"][0, :, -6:-3], axis=0) / h + [0, 0, scene.gravity]
     total = (forces.finger.sum(2) + forces.palm + forces.table)[0, :-1]
     # What 100 Newton iterations leave, of a weight of one newton.
@@ -88,7 +88,7 @@ def test_forces_are_mujocos():
     data = mujoco.MjData(own)
     lay = model.layout(scene)
     touched = 0
-    weight = fields.body_mass[0, lay.object] * scene.gravity
+    weight = fields.object_mass[0] * scene.gravity
     kinds = {body: ("finger", f) for f, row in enumerate(lay.bodies) for body in row}
     kinds |= {1: ("palm",), 0: ("table",)}
     geoms = lay.spheres.reshape(len(lay.spheres), -1)

@@ -189,7 +189,7 @@ def test_an_object_rests_on_a_shelf_or_tips_over_its_edge(tmp_path):
         stays, falls = np.asarray(trace.height[:, -1])
         assert abs(stays - 0.03) < 1e-3 and falls < -0.1
         if trace.forces is not None:
-            weight = 9.81 * float(fields.body_mass[0, -1])
+            weight = 9.81 * float(fields.object_mass[0])
             push = np.asarray(trace.forces.table[:, -2, 2])
             np.testing.assert_allclose(push, [weight, 0.0], rtol=1e-3, atol=1e-3 * weight)
 

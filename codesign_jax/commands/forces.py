@@ -123,7 +123,7 @@ def pull(
         still = ctrl[:, held - 1 : held]
         assert begun.last is not None
         first = place(begun.last)
-        mass = fields.body_mass[:, lay.object, None]
+        mass = fields.object_mass[:, None]
 
         def goes_on(carry: tuple) -> jax.Array:
             return (carry[0] < MOST) & (jnp.isinf(carry[2]) & kept).any()

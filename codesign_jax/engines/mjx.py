@@ -16,9 +16,11 @@ from codesign_jax import verdict
 from codesign_jax.engines.base import Equal, refuse_meshes
 from codesign_jax.model import (
     ModelFields,
+    MujocoFields,
     RolloutState,
     compile_template,
     layout,
+    mujoco_fields,
     softening_moments,
     split,
 )
@@ -59,13 +61,13 @@ class MjxEngine(Equal):
     def _key(self) -> tuple:
         return self.scene.structure, self.data.qpos.dtype
 
-    def model(self, fields: ModelFields) -> mjx.Model:
-        """Returns the template with the fields of one world.
+    def model(self, arrays: MujocoFields) -> mjx.Model:
+        """Returns the template with the arrays of one world.
 
         NumPy fields become JAX arrays: MJX takes a NumPy field for the same at every body of a
         depth of the tree, and refuses fingers whose mounts lie at different points.
         """
-        given = {k: v for k, v in fields.of_model.items() if k not in _STATIC}
+        given = {k: v for k, v in arrays.of_model.items() if k not in _STATIC}
         values = {name: jnp.asarray(value) for name, value in given.items()}
         return self.template.tree_replace(values)  # type: ignore[arg-type]
 
@@ -73,19 +75,21 @@ class MjxEngine(Equal):
         """Returns the start state of one world."""
         return self.data.replace(qpos=fields.qpos, qvel=jnp.asarray(fields.qvel))
 
-    def step(self, fields: ModelFields, data: mjx.Data, ctrl: jax.Array) -> mjx.Data:
+    def step(
+        self, arrays: MujocoFields, fields: ModelFields, data: mjx.Data, ctrl: jax.Array
+    ) -> mjx.Data:
         """Advances one world by one time step under controls of shape (nu,)."""
         bend = layout(self.scene).dofs[..., 0]
         moments = None
         if self.scene.effects.neo_hookean:
             moments = softening_moments(self.scene, fields, data.qpos[bend])
-        if fields.wrap_prm is not None:
-            share = (fields.wrap_prm - self.template.wrap_prm).reshape(bend.shape)
-            more = share * (fields.actuator_gainprm[6:, 0] * ctrl[6:])[:, None]
+        if arrays.wrap_prm is not None:
+            share = (arrays.wrap_prm - self.template.wrap_prm).reshape(bend.shape)
+            more = share * (arrays.actuator_gainprm[6:, 0] * ctrl[6:])[:, None]
             moments = more if moments is None else moments + more
         if moments is not None:
             data = data.replace(qfrc_applied=data.qfrc_applied.at[bend].set(moments))
-        return mjx.step(self.model(fields), data.replace(ctrl=ctrl))
+        return mjx.step(self.model(arrays), data.replace(ctrl=ctrl))
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
         """See `Engine.rollout`.
@@ -95,8 +99,9 @@ class MjxEngine(Equal):
         """
 
         def body(carry: RolloutState, u: jax.Array) -> tuple[RolloutState, Trace]:
-            return jax.vmap(partial(self._advance, trajectory))(fields, carry, u)
+            return jax.vmap(partial(self._advance, trajectory))(arrays, fields, carry, u)
 
+        arrays = jax.vmap(partial(mujoco_fields, self.scene.structure))(fields)
         start = split(self.scene, jnp.asarray(fields.start, ctrl.dtype))
         with jax.default_matmul_precision("highest"):  # TF32 would spoil the solver on a GPU
             end, trace = jax.lax.scan(body, start, jnp.moveaxis(ctrl, 1, 0))
@@ -104,14 +109,19 @@ class MjxEngine(Equal):
         return trace._replace(last=jnp.concatenate(end, 1))
 
     def _advance(
-        self, trajectory: bool, fields: ModelFields, carry: RolloutState, u: jax.Array
+        self,
+        trajectory: bool,
+        arrays: MujocoFields,
+        fields: ModelFields,
+        carry: RolloutState,
+        u: jax.Array,
     ) -> tuple[RolloutState, Trace]:
         lay = layout(self.scene)
         bounds = verdict.bounds(fields.constants)
         data = self.reset(fields).replace(
             qpos=carry.qpos, qvel=carry.qvel, qacc_warmstart=carry.acc
         )
-        new = self.step(fields, data, u)
+        new = self.step(arrays, fields, data, u)
         # Positions computed by a step belong to the state before it.
         weights = jnp.asarray(lay.centre_weights, u.dtype)
         centre = weights @ new.xipos

@@ -10,7 +10,15 @@ import numpy as np
 
 from codesign_jax import verdict
 from codesign_jax.engines.base import Equal, refuse_meshes
-from codesign_jax.model import ModelFields, compile_template, layout, softening_moments, split
+from codesign_jax.model import (
+    ModelFields,
+    MujocoFields,
+    compile_template,
+    layout,
+    mujoco_fields,
+    softening_moments,
+    split,
+)
 from codesign_jax.scene import Scene, effects
 from codesign_jax.types import Status, Trace
 
@@ -57,6 +65,7 @@ class MujocoEngine(Equal):
         )
         # Of the constants C needs the bounds alone: each argument is an array for XLA to fill.
         inputs = (
+            _arrays(self.scene.structure, fields),
             fields._replace(constants=()),
             _bounds(fields.constants),
             ctrl,
@@ -65,13 +74,18 @@ class MujocoEngine(Equal):
         return jax.pure_callback(run, shapes, *inputs, vmap_method="sequential")
 
     def _run(
-        self, trajectory: bool, fields: ModelFields, bounds: verdict.Bounds, ctrl: jax.Array
+        self,
+        trajectory: bool,
+        arrays: MujocoFields,
+        fields: ModelFields,
+        bounds: verdict.Bounds,
+        ctrl: jax.Array,
     ) -> Trace:
         dtype = np.asarray(ctrl).dtype
-        inputs = (fields, bounds, ctrl)
-        fields, bounds, wide = jax.tree.map(lambda v: np.asarray(v, np.float64), inputs)
+        inputs = (arrays, fields, bounds, ctrl)
+        arrays, fields, bounds, wide = jax.tree.map(lambda v: np.asarray(v, np.float64), inputs)
         with self._lock:
-            trace = self._simulate(fields, bounds, wide, trajectory)
+            trace = self._simulate((arrays, fields), bounds, wide, trajectory)
         return jax.tree.map(lambda v: v if v.dtype == np.int32 else v.astype(dtype), trace)
 
     def _batch(self, num_worlds: int) -> mujoco.batch.Batch:
@@ -82,13 +96,18 @@ class MujocoEngine(Equal):
         return self._batches[num_worlds]
 
     def _simulate(
-        self, fields: ModelFields, bounds: verdict.Bounds, ctrl: np.ndarray, trajectory: bool
+        self,
+        worlds_of: tuple[MujocoFields, ModelFields],
+        bounds: verdict.Bounds,
+        ctrl: np.ndarray,
+        trajectory: bool,
     ) -> Trace:
         worlds, steps = ctrl.shape[:2]
         scene = self.scene
         nq = self.template.nq
         batch = self._batch(worlds)
-        write_fields(batch, fields)
+        arrays, fields = worlds_of
+        write_fields(batch, arrays, fields)
         start = split(scene, fields.start)
         last = np.concatenate(start, 1)
         end = split(scene, last)  # views
@@ -180,6 +199,13 @@ class MujocoEngine(Equal):
 
 
 _bounds = jax.jit(verdict.bounds)
+_one = jax.jit(mujoco_fields, static_argnums=0)
+
+
+@partial(jax.jit, static_argnums=0)
+def _arrays(scene: Scene, fields: ModelFields) -> MujocoFields:
+    """MuJoCo's arrays of worlds, with leading axis (world,)."""
+    return jax.vmap(partial(mujoco_fields, scene))(fields)
 
 
 def _decisions(
@@ -247,12 +273,12 @@ def _apply_softening(
     batch.bind("qfrc_applied")[ids[:, None, None], bend] = softening_moments(scene, mine, angles)
 
 
-def write_fields(batch: mujoco.batch.Batch, fields: ModelFields) -> None:
+def write_fields(batch: mujoco.batch.Batch, arrays: MujocoFields, fields: ModelFields) -> None:
     """Gives every simulation of a batch its model fields and start state."""
     batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
     batch.bind("qpos")[:] = fields.qpos
     batch.bind("qvel")[:] = fields.qvel
-    for name, value in fields.of_model.items():
+    for name, value in arrays.of_model.items():
         batch.expand(name)[:] = value
     batch.bind("qacc_warmstart")[:] = 0.0
 
@@ -262,7 +288,9 @@ def world_model(scene: Scene, fields: ModelFields) -> mujoco.MjModel:
     import copy
 
     model = copy.deepcopy(compile_template(scene))
-    for name, value in fields.of_model.items():
+    with jax.enable_x64(True):  # of fields in float64 also where JAX has float32
+        arrays = jax.tree.map(np.asarray, _one(scene.structure, fields))
+    for name, value in arrays.of_model.items():
         value = np.asarray(value, np.float64)
         if name == "opt.impratio":
             model.opt.impratio = value.item()

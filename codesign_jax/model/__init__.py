@@ -29,12 +29,14 @@ from codesign_jax.model.fields import (
     softening_moments,
 )
 from codesign_jax.model.layout import Layout, contact_invweight, joint_axes, layout
+from codesign_jax.model.mujoco_fields import MujocoFields, mujoco_fields
 from codesign_jax.model.spec import build_spec, compile_model, compile_template
 from codesign_jax.model.state import RolloutState, split
 
 __all__ = [
     "Layout",
     "ModelFields",
+    "MujocoFields",
     "RolloutState",
     "build_spec",
     "compile_model",
@@ -44,6 +46,7 @@ __all__ = [
     "joint_springs",
     "layout",
     "model_fields",
+    "mujoco_fields",
     "softening_moments",
     "split",
 ]

@@ -1,98 +1,102 @@
-"""Parameters to batched model fields, as a pure function: one topology, no recompile."""
+"""Parameters and a trial to the numbers of a world, as a pure function: no recompile for others."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.model import morphology, pairs
+from codesign_jax.model import morphology
 from codesign_jax.model.layout import (
-    Layout,
-    contact_invweight,
-    friction_ratio,
-    geom_bounds,
     implicit_spring,
     layout,
     mounts,
     object_pose,
     object_size,
-    palm_points,
     wrist_springs,
 )
-from codesign_jax.model.spec import compile_template, palm_inertia
-from codesign_jax.scene import Scene, by_structure, key_frames
+from codesign_jax.scene import Scene, key_frames
 from codesign_jax.scene.constants import with_trial
 from codesign_jax.types import Params, Trial
 
 
 class ModelFields(NamedTuple):
-    """The fields of mjModel that depend on parameters, trial and constants, and the start state.
+    """The hand and the object of a world as numbers, and the state in which it starts.
 
-    Every array has MuJoCo's name and shape for one world, `gravity` and `impratio` those of
-    mjOption, but for five: `start` is the initial qpos, shape (nq,), or the state in which another
-    rollout ended, `Trace.last`, see `RolloutState`; `section` has height, wall, segment length and
-    width of the fingers [m], shape (finger, 4), where `neo_hookean`, `air_mass` or a hull needs
-    them;
-    `threshold` has the numbers of `morphology.thresholds`, with the effect `lateral_threshold`;
-    `tip` has height, wall and width at the tips of tapered fingers, shape (finger, 3), and
-    `constants` are the world's numbers with the trial's factors, from which engines take what
-    MuJoCo has no field for: limits, the cost's window, and friction by pair of bodies.
+    They are in the order of fingers and links; `mujoco_fields` makes MuJoCo's arrays of them. A
+    finger has N + 1 bodies, of which the first one, half a segment, belongs to the palm, and N
+    joints with an axis each for `layout.joint_axes`.
+
+    Attributes:
+      base: Base points of the fingers in the palm frame [m], shape (finger, 3).
+      mount: Their orientations, unit quaternions, shape (finger, 4).
+      offset: Place of each joint along the body before it [m], shape (finger, N).
+      mass: Masses of the bodies [kg], shape (finger, N + 1).
+      centre: Their centres of mass from their beginnings: along and up [m], shape
+        (finger, N + 1, 2).
+      inertia: Their principal inertia [kg m^2], shape (finger, N + 1, 3).
+      stiffness: Stiffness of the joints [N m/rad], shape (finger, N, axis).
+      damping: Their damping with the part of `layout.implicit_spring` [N m s/rad], same shape.
+      armature: Their armature, that part alone [kg m^2], same shape.
+      gain: Bending moment per pressure [m^3], shape (finger, 1), of tapered fingers (finger, N).
+      spheres: Contact spheres of the moving links, place along the link and radius [m], shape
+        (finger, N, k, 2), k of them a link; k is 0 of fingers of rings.
+      on_palm: 1 of spheres that may touch the palm, else 0, shape (finger, N, k); None where none
+        may.
+      object_mass: The object's mass [kg], shape ().
+      object_inertia: Its principal inertia [kg m^2], shape (3,).
+      object_size: Sizes of the geoms of all shapes of the object set [m], shape (shape, 3).
+      shape: The trial's: the index of the object in the object set, int32 of shape ().
+      start: Initial qpos in MuJoCo's order, shape (nq,), or the state in which another rollout
+        ended, `Trace.last`, see `RolloutState`.
+      constants: The world's numbers with the trial's factors: what does not depend on the design,
+        limits, the cost's window, and friction by pair of bodies.
+      section: Height, wall, segment length and width of the fingers [m], shape (finger, 4); None
+        where neither `neo_hookean`, `air_mass` nor a hull needs them.
+      threshold: Numbers of `morphology.thresholds`; None without the effect `lateral_threshold`.
+      tip: Height, wall and width at the tips of tapered fingers [m], shape (finger, 3), or None.
     """
 
-    body_pos: jax.Array
-    body_quat: jax.Array
-    body_ipos: jax.Array
-    body_mass: jax.Array
-    body_subtreemass: jax.Array
-    body_inertia: jax.Array
-    geom_pos: jax.Array
-    geom_size: jax.Array
-    geom_rbound: jax.Array
-    geom_aabb: jax.Array
-    jnt_stiffness: jax.Array
-    dof_damping: jax.Array
-    dof_armature: jax.Array
-    dof_M0: jax.Array
-    actuator_gainprm: jax.Array
-    actuator_biasprm: jax.Array
-    body_invweight0: jax.Array
-    pair_friction: jax.Array
-    pair_solref: jax.Array
-    pair_solimp: jax.Array
-    gravity: jax.Array
-    impratio: jax.Array
-    start: jax.Array
+    base: jax.Array
+    mount: jax.Array
+    offset: jax.Array
+    mass: jax.Array
+    centre: jax.Array
+    inertia: jax.Array
+    stiffness: jax.Array
+    damping: jax.Array
+    armature: jax.Array
+    gain: jax.Array
+    spheres: jax.Array
+    on_palm: jax.Array | None
+    object_mass: jax.Array
+    object_inertia: jax.Array
+    object_size: jax.Array
     shape: jax.Array
+    start: jax.Array
     constants: Scene
     section: jax.Array | None = None
     threshold: jax.Array | None = None
     tip: jax.Array | None = None
-    wrap_prm: jax.Array | None = None
-    # Of fingers of spheres that touch the palm: a short one's first spheres do not
-    pair_margin: jax.Array | None = None
+
+    @property
+    def num_dofs(self) -> int:
+        """Degrees of freedom nv: of the wrist, the joints and the object."""
+        return 12 + int(np.prod(self.stiffness.shape[-3:]))
 
     @property
     def qpos(self) -> jax.Array:
         """Generalized positions at the start, shape (..., nq)."""
-        return self.start[..., : self.dof_damping.shape[-1] + 1]
+        return self.start[..., : self.num_dofs + 1]
 
     @property
     def qvel(self) -> Any:
         """Generalized velocities at the start, shape (..., nv); zero unless `start` has them."""
-        nv = self.dof_damping.shape[-1]
+        nv = self.num_dofs
         given = self.start[..., nv + 1 : 2 * nv + 1]
-        return given if given.shape[-1] else np.zeros(self.dof_damping.shape, self.start.dtype)
-
-    @property
-    def of_model(self) -> dict[str, jax.Array]:
-        """The fields of mjModel by name, those of its mjOption as "opt.name"."""
-        others = ("start", "shape", "section", "threshold", "tip", "constants")
-        options = ("gravity", "impratio")
-        given = {k: v for k, v in self._asdict().items() if v is not None}
-        fields = {k: v for k, v in given.items() if k not in others}
-        return {f"opt.{k}" if k in options else k: v for k, v in fields.items()}
+        if given.shape[-1]:
+            return given
+        return np.zeros((*self.start.shape[:-1], nv), self.start.dtype)
 
 
 def joint_springs(scene: Scene, params: Params) -> tuple[jax.Array, jax.Array]:
@@ -102,10 +106,8 @@ def joint_springs(scene: Scene, params: Params) -> tuple[jax.Array, jax.Array]:
     file; the object's are free.
     """
     lay = layout(scene)
-    hand = scene.hand
-    beams = morphology.finger_beams(hand, params, lay.links)
-    each = morphology.joint_springs(hand, params, beams, lay.links, lay.axes)
-    finger, own = (_picked(jnp.broadcast_to(v, lay.dofs.shape).ravel(), lay.hinges) for v in each)
+    each = finger_springs(scene, params)
+    finger, own = (picked(v.ravel(), lay.hinges) for v in each)
     springs = wrist_springs(scene)
     wrist, wrist_damping = (jnp.stack([jnp.asarray(x, finger.dtype) for x in v]) for v in springs)
     free = jnp.zeros(6, finger.dtype)
@@ -113,116 +115,89 @@ def joint_springs(scene: Scene, params: Params) -> tuple[jax.Array, jax.Array]:
     return stiffness, jnp.concatenate([wrist_damping, own, free])
 
 
+def finger_springs(scene: Scene, params: Params) -> tuple[jax.Array, jax.Array]:
+    """Physical stiffness and damping of the fingers' joints, shape (finger, N, axis) each."""
+    lay = layout(scene)
+    hand = scene.hand
+    beams = morphology.finger_beams(hand, params, lay.links)
+    stiffness, damping = morphology.joint_springs(hand, params, beams, lay.links, lay.axes)
+    return jnp.broadcast_to(stiffness, lay.dofs.shape), jnp.broadcast_to(damping, lay.dofs.shape)
+
+
 def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
-    """Returns the batched model fields and the start state of one world; pure, vmap it for batches.
+    """Returns the numbers of one world; pure, vmap it for batches.
 
     Args:
       scene: The scene; its numbers may be traced.
       params: Parameters of the hand; all physics in the float type of these.
       trial: The trial's object and noise.
     """
-    template = compile_template(scene)
     lay = layout(scene)
     dtype = params.length.dtype
     scene = _in_type(with_trial(scene, trial), dtype)
     beam = morphology.finger_beams(scene.hand, params, lay.links)
-
-    def filled(name: str, *parts: tuple[Any, Any]) -> jax.Array:
-        return _filled(getattr(template, name), dtype, *parts)
-
     links = morphology.segments(scene.hand, params, lay.links)
-    gains = beam.moment_per_pressure
-    extents = links.extent
-    masses = links.mass
+    bodies = links.mass.shape
+    centre = [jnp.broadcast_to(v, bodies) for v in (links.along, links.up)]
+    base, mount = mounts(scene.hand, params.spread)
+    stiffness, own_damping = finger_springs(scene, params)
+    damping, armature = implicit_spring(scene, stiffness, own_damping)
     size, object_mass, object_inertia = object_size(scene.objects, trial)
-    bodies = np.concatenate([lay.stubs[:, None], lay.bodies], 1)
-    mount_pos, mount_quat = mounts(scene.hand, params.spread)
-    palm = scene.hand.palm
-    stiffness, damping = joint_springs(scene, params)
-    rigid = not scene.effects.wrist
-    wrist = implicit_spring(scene, stiffness[:6], damping[:6], rigid=rigid)
-    others = implicit_spring(scene, stiffness[6:], damping[6:])
-    damping, armature = (jnp.concatenate(parts) for parts in zip(wrist, others, strict=True))
-    geom_size, rbound, aabb = _geom_fields(scene, params, size, filled)
-    friction, solref, solimp = _pairs(scene, dtype)
-    return ModelFields(
-        body_pos=filled("body_pos", (lay.stubs, mount_pos), ((lay.bodies, 0), links.offset)),
-        body_quat=filled("body_quat", (lay.stubs, mount_quat)),
-        body_ipos=filled(
-            "body_ipos",
-            ((bodies, 0), links.along),
-            ((bodies, 2), links.up),
-            ((1, 2), palm.thickness / 2),
-        ),
-        body_mass=filled("body_mass", (1, palm.mass), (bodies, masses), (lay.object, object_mass)),
-        body_subtreemass=filled("body_subtreemass", *_subtree_mass(lay, palm, masses, object_mass)),
-        body_inertia=filled(
-            "body_inertia",
-            (bodies, links.inertia),
-            (lay.object, object_inertia),
-            (1, jnp.stack(palm_inertia(scene))),
-        ),
-        geom_pos=filled("geom_pos", *_sphere_positions(scene, params, extents)),
-        geom_size=geom_size,
-        geom_rbound=rbound,
-        geom_aabb=aabb,
-        # The wrist's springs are its position actuators; only the fingers have passive ones.
-        jnt_stiffness=filled("jnt_stiffness", (lay.dofs, _picked(stiffness, lay.dofs))),
-        dof_damping=damping,
-        dof_armature=armature,
-        # MuJoCo takes the inertia of a free body from this constant; of other bodies it does not.
-        dof_M0=filled("dof_M0", (slice(-6, -3), object_mass), (slice(-3, None), object_inertia)),
-        actuator_gainprm=filled(
-            "actuator_gainprm",
-            ((slice(6), 0), stiffness[:6]),
-            ((slice(6, None), 0), gains[:, 0]),
-        ),
-        actuator_biasprm=filled("actuator_biasprm", ((slice(6), 1), -stiffness[:6])),
-        # Declared, not derived; see contact_invweight.  The world keeps zero.
-        body_invweight0=filled("body_invweight0", (slice(1, None), contact_invweight(scene))),
-        pair_friction=friction,
-        pair_solref=solref,
-        pair_solimp=solimp,
-        gravity=_filled(np.zeros(3), dtype, (2, -scene.gravity_on)),
-        impratio=friction_ratio(scene, scene.contact.friction_ratio),
-        start=_start(scene, params, trial),
+    threshold = None
+    if scene.effects.lateral_threshold:
+        threshold = morphology.thresholds(scene.hand, params, beam, lay.links)
+    fields = ModelFields(
+        base=base,
+        mount=mount,
+        offset=links.offset,
+        mass=links.mass,
+        centre=jnp.stack(centre, -1),
+        inertia=links.inertia,
+        stiffness=stiffness,
+        damping=damping,
+        armature=armature,
+        gain=beam.moment_per_pressure,
+        spheres=_spheres(scene, params, links),
+        on_palm=_on_palm(scene, params),
+        object_mass=object_mass,
+        object_inertia=object_inertia,
+        object_size=size,
         shape=jnp.asarray(trial.shape, jnp.int32),
+        start=_start(scene, params, trial),
         constants=scene.bare,
         section=_section(scene, params),
-        threshold=(
-            morphology.thresholds(scene.hand, params, beam, lay.links)
-            if scene.effects.lateral_threshold
-            else None
-        ),
-        wrap_prm=None if params.tip is None else (gains / gains[:, :1]).reshape(-1),
+        threshold=threshold,
         tip=None if params.tip is None else jnp.stack(params.tip, -1),
-        pair_margin=_margins(scene, params) if lay.disc.size and lay.spheres.size else None,
     )
+    return _in_type(fields, dtype)
 
 
-def _filled(base: np.ndarray, dtype: Any, *parts: tuple[Any, Any]) -> jax.Array:
-    """An array with other numbers in known places, where the last part wins.
-
-    One gather of all numbers: a CPU's XLA makes a loop of every `.at[places].set(values)`.
-    """
-    source = np.arange(base.size, dtype=np.int32).reshape(base.shape)
-    numbers = [jnp.asarray(base, dtype).ravel()]
-    count = base.size
-    for places, given in parts:
-        values = jnp.asarray(given, dtype)
-        source[places] = np.arange(count, count + values.size).reshape(values.shape)
-        numbers.append(values.ravel())
-        count += values.size
-    return _picked(jnp.concatenate(numbers), source)
-
-
-def _picked(array: jax.Array, places: np.ndarray) -> jax.Array:
-    # Without operations that check the places.
+def picked(array: jax.Array, places: np.ndarray) -> jax.Array:
+    """The array at places that are known to be in it, without operations that check them."""
     return array.at[places].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
-def _in_type(scene: Scene, dtype: Any) -> Scene:
-    return jax.tree.map(lambda v: jnp.asarray(v, dtype), scene)
+def _in_type(tree: Any, dtype: Any) -> Any:
+    def cast(value: Any) -> jax.Array:
+        return value if getattr(value, "dtype", None) == jnp.int32 else jnp.asarray(value, dtype)
+
+    return jax.tree.map(cast, tree)
+
+
+def _spheres(scene: Scene, params: Params, links: morphology.Segments) -> jax.Array:
+    shape = layout(scene).spheres.shape
+    if not np.prod(shape):
+        return jnp.zeros((*shape, 2), params.length.dtype)
+    along = morphology.sphere_places(links.extent, shape[2])
+    radius = morphology.sphere_radii(scene.hand, params, *shape[1:])
+    return jnp.stack([along, jnp.broadcast_to(radius, shape)], -1)
+
+
+def _on_palm(scene: Scene, params: Params) -> jax.Array | None:
+    lay = layout(scene)
+    if not (lay.disc.size and lay.spheres.size):
+        return None
+    return morphology.spheres_on_palm(scene.hand, params, *lay.spheres.shape[1:])
 
 
 def _section(scene: Scene, params: Params) -> jax.Array | None:
@@ -231,46 +206,6 @@ def _section(scene: Scene, params: Params) -> jax.Array | None:
         return None
     width = scene.hand.section.width + 0 * params.height
     return jnp.stack([params.height, params.wall, params.length / layout(scene).links, width], -1)
-
-
-@by_structure
-def _pair_kinds(scene: Scene) -> np.ndarray:
-    template = compile_template(scene)
-    lay = layout(scene)
-    kinds = np.zeros(template.npair, np.int32)  # see layout: one width in every precision
-    for i, pair in enumerate(zip(template.pair_geom1, template.pair_geom2, strict=True)):
-        touched = np.isin(lay.object_geoms, pair)
-        if min(pair) <= len(scene.fixture):  # the table or a fixture
-            table = pairs.OBJECT_TABLE if touched.any() else pairs.HAND_TABLE
-            kinds[i] = pairs.around(scene, min(pair), table)
-        elif np.isin(lay.disc, pair).any():
-            kinds[i] = pairs.PALM
-        else:
-            kinds[i] = np.argmax(touched) if touched.any() else pairs.FINGERS
-    return np.where(kinds < 0, kinds + len(pairs.frictions(scene)), kinds).astype(np.int32)
-
-
-def _pairs(scene: Scene, dtype: Any) -> list[jax.Array]:
-    """MuJoCo's friction (pair, 5), solref (pair, 2) and solimp (pair, 5) of the contact pairs."""
-    kinds = _pair_kinds(scene)
-    found = (pairs.frictions(scene), pairs.impedances(scene))
-    own = (jnp.stack([jnp.asarray(v, dtype) for v in values])[kinds] for values in found)
-    return [
-        jnp.stack([jnp.broadcast_to(jnp.asarray(v, dtype), len(kinds)) for v in row], -1)
-        for row in pairs.numbers(scene, *own)
-    ]
-
-
-def _margins(scene: Scene, params: Params) -> jax.Array:
-    """MuJoCo's margin of the contact pairs [m], shape (pair,)."""
-    lay = layout(scene)
-    template = compile_template(scene)
-    geoms = np.stack([template.pair_geom1, template.pair_geom2], 1)
-    on_palm = (geoms == lay.disc).any(1)
-    sphere = np.where(on_palm, geoms.max(1) - lay.spheres.min(), 0)  # behind the disc
-    free = morphology.spheres_on_palm(scene.hand, params, *lay.spheres.shape[1:])
-    margins = pairs.margin(_picked(jnp.ravel(free), sphere))
-    return jnp.where(on_palm, margins, 0.0).astype(params.length.dtype)
 
 
 def softening_moments(scene: Scene, fields: ModelFields, angles: Any) -> Any:
@@ -293,60 +228,8 @@ def softening_moments(scene: Scene, fields: ModelFields, angles: Any) -> Any:
         places = morphology.at_joints(layout(scene).links)
         ends = zip((height, wall, width), range(3), strict=True)
         height, wall, width = (a + (fields.tip[..., i : i + 1] - a) * places for a, i in ends)
-    stiffness = fields.jnt_stiffness[..., layout(scene).dofs[..., 0]]
+    stiffness = fields.stiffness[..., 0]
     return stiffness * angles * morphology.softening(angles / segment, height, wall, width=width)
-
-
-def _subtree_mass(lay: Layout, palm: Any, masses: jax.Array, object_mass: jax.Array) -> list[tuple]:
-    tails = jnp.cumsum(masses[:, ::-1], 1)[:, ::-1]
-    hand = palm.mass + tails[:, 0].sum()
-    fingers = [(lay.stubs, tails[:, 0]), (lay.bodies, tails[:, 1:])]
-    return [*fingers, (0, hand + object_mass), (1, hand), (lay.object, object_mass)]
-
-
-def _sphere_positions(scene: Scene, params: Params, extents: jax.Array) -> list[tuple]:
-    lay = layout(scene)
-    parts: list[tuple] = [(lay.palm, palm_points(scene))] if lay.palm.size else []
-    if lay.disc.size:
-        parts.append(((lay.disc, 2), jnp.asarray(scene.hand.palm.thickness) / 2))
-    if not lay.spheres.size:
-        return parts
-    count = lay.spheres.shape[2]
-    along = morphology.sphere_places(extents, count)
-    up = morphology.sphere_radii(scene.hand, params, lay.links, count)
-    return [*parts, ((lay.spheres, 0), along), ((lay.spheres, 2), up)]
-
-
-def _geom_fields(
-    scene: Scene, params: Params, size: jax.Array, filled: Callable
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    lay = layout(scene)
-    sizes: list[tuple] = []
-    radii: list[tuple] = []
-    boxes: list[tuple] = []
-    palm = scene.hand.palm
-    spheres = [(lay.palm, palm.contact_radius)] if lay.palm.size else []
-    if lay.spheres.size:
-        count = lay.spheres.shape[2]
-        radius = morphology.sphere_radii(scene.hand, params, lay.links, count)
-        spheres.append((lay.spheres, radius))
-    for where, radius in spheres:
-        sizes.append(((where, 0), radius))
-        radii.append((where, radius))
-        boxes.append(((where, slice(3, None)), jnp.asarray(radius)[..., None]))
-    solids = [
-        (g, s.type, size[i])
-        for i, (g, s) in enumerate(zip(lay.object_geoms, scene.objects.object, strict=True))
-    ]
-    if lay.disc.size:
-        disc = jnp.stack([jnp.asarray(v) for v in (palm.radius, palm.thickness / 2, 0.0)])
-        solids.append((lay.disc[0], "cylinder", disc))
-    for g, kind, extent in solids:
-        radius, half = geom_bounds(kind, extent)
-        sizes.append((g, extent))
-        radii.append((g, radius))
-        boxes.append(((g, slice(3, None)), half))
-    return filled("geom_size", *sizes), filled("geom_rbound", *radii), filled("geom_aabb", *boxes)
 
 
 def _start(scene: Scene, params: Params, trial: Trial) -> jax.Array:

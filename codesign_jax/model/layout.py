@@ -17,9 +17,6 @@ from codesign_jax.scene.objects import ObjectSet, Shape
 from codesign_jax.scene.primitives import PRIMITIVES
 from codesign_jax.types import Trial
 
-# An object body carries one geom for each shape of the set; those that a trial does not use shrink
-# to this fraction, deep inside the one in use, where nothing touches them.
-INACTIVE = 1e-3
 # Wrist hinges turn in the order roll (x), yaw (z), pitch (y).  Yaw is in the middle, where +-90
 # degrees is singular, because the disturbance adds up to 40 degrees to roll and pitch but nothing
 # to yaw.
@@ -301,15 +298,27 @@ def mounts(hand: Hand, spread: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def object_size(objects: ObjectSet, trial: Trial) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Geom sizes (shape, 3), mass and principal inertia (3,) of the object."""
+    """Sizes of all shapes (shape, 3), and mass and principal inertia (3,) of the trial's."""
     shapes = objects.object
     full = jnp.stack([jnp.stack([jnp.asarray(v) for v in s.half_sizes]) for s in shapes])
     size = trial.size * full
     mass = trial.mass * jnp.stack([jnp.asarray(s.mass) for s in shapes])[trial.shape]
     unit = jnp.stack([_unit_inertia(s, size[i], trial.size) for i, s in enumerate(shapes)])
-    unit = unit[trial.shape]
-    active = jnp.arange(len(shapes)) == trial.shape
-    return jnp.where(active[:, None], size, INACTIVE * size), mass, mass * unit
+    return size, mass, mass * unit[trial.shape]
+
+
+INACTIVE = 1e-3
+"""Size of the geoms of a model's object that its trial does not use, over their own."""
+
+
+def geom_sizes(size: Any, shape: Any) -> Any:
+    """Sizes (shape, 3) of the geoms of an object body, which carries one for each shape of the set.
+
+    Those that a trial does not use are `INACTIVE`, deep inside the one in use, where nothing
+    touches them.
+    """
+    used = np.arange(len(size)) == shape
+    return jnp.where(used[:, None], size, INACTIVE * size)
 
 
 def object_pose(objects: ObjectSet, trial: Trial) -> tuple[jax.Array, jax.Array]:

@@ -17,6 +17,7 @@ from codesign_jax.model.layout import (
     contact_invweight,
     first_on_palm,
     friction_ratio,
+    geom_sizes,
     hinge_order,
     implicit_spring,
     layout,
@@ -302,6 +303,7 @@ def _add_object(
     visual: bool,
 ) -> None:
     sizes, mass, inertia = solid
+    sizes = geom_sizes(sizes, int(trial.shape))
     rest, quat = pose
     body = spec.worldbody.add_body(name="object", pos=[*np.asarray(trial.position), float(rest)])
     body.quat = quat

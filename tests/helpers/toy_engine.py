@@ -5,7 +5,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import model, scene
+from codesign_jax import scene
 from codesign_jax.scene import parameters
 from codesign_jax.types import Trace
 
@@ -25,13 +25,12 @@ class ToyEngine:
         self.scene = the_scene
         self.failing = list(failing)
         self.traced = 0
-        self.first_link = int(model.layout(the_scene).bodies[0, 0])
 
     def rollout(self, fields, ctrl, *, trajectory=False):
         """See `Engine.rollout`."""
         self.traced += 1
         worlds, steps = ctrl.shape[:2]
-        length = 2 * self.scene.discretization.links * fields.body_pos[:, self.first_link, 0]
+        length = 2 * self.scene.discretization.links * fields.offset[:, 0, 0]
         # From the start of the window at 0.5 s to past its end at 1.0 s, and a little noise.
         noise = 20 * fields.start[:, -7]
         lost = 0.5 + 8 * (length - 0.03) + 0.3 * ctrl[:, 20, 2] + noise

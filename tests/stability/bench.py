@@ -204,11 +204,8 @@ class Bench:
 
 def loaded(fields, factor):
     """Fields, NumPy arrays, whose object is heavier by a factor."""
-    heavier = {n: np.array(getattr(fields, n)) for n in ("body_mass", "body_inertia", "dof_M0")}
-    heavier["body_mass"][:, -1] *= factor
-    heavier["body_inertia"][:, -1] *= factor
-    heavier["dof_M0"][:, -6:] *= factor
-    return fields._replace(**heavier)
+    heavier = {n: np.array(getattr(fields, n)) for n in ("object_mass", "object_inertia")}
+    return fields._replace(**{name: factor * value for name, value in heavier.items()})
 
 
 def moving(engine: StructuredEngine, fields, qvel):

@@ -5,7 +5,6 @@ import functools
 
 import numpy as np
 
-from codesign_jax import model
 from codesign_jax.scene.objects import Shape
 from codesign_jax.scene.tables import Fixture
 from tests.helpers import grasps
@@ -82,7 +81,7 @@ def pinch_drops(engine, step, precision):
     b = bench(firm(), engine, step, precision)
     fields, ctrl = lifted(b, 20.0)
     time = np.arange(0, ctrl.shape[1], CHUNK) * b.h
-    mass = fields.body_mass[0, -1]
+    mass = fields.object_mass[0]
     masses = 1 + 0.02 * np.maximum(time - 5.5, 0) / mass
     history = b.run(fields, ctrl, masses=masses)
     below = hanging(history)
@@ -110,8 +109,8 @@ def pressed(b):
     params, trial = grasps.hand_world(b.scene, length=0.09, pressure=190e3)
     params = at_height(params, 0.05)
     fields = b.fields([params], [trial])
-    link = fields.body_mass[0, model.layout(b.scene).bodies[0, 0]]
-    trial = trial._replace(mass=2000 * link / fields.body_mass[0, -1])
+    link = fields.mass[0, 0, 1]
+    trial = trial._replace(mass=2000 * link / fields.object_mass[0])
     fields = b.fields([params], [trial])
     ctrl = b.commands([params], [trial])[:, : round(3.5 / b.h)]
     return fields, np.concatenate([ctrl, np.repeat(ctrl[:, -1:], round(1.5 / b.h), 1)], 1)

@@ -1,6 +1,5 @@
-"""Constants of a rollout in lane layout, taken from the same model fields as every engine uses."""
+"""Constants of a rollout in lane layout, taken from the model fields."""
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -12,7 +11,9 @@ from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.laws.cones import Cones, frictions, make_cones
 from codesign_jax.engines.structured.laws.meshes import MeshLanes, mesh_lanes
 from codesign_jax.model import Layout, ModelFields, layout
+from codesign_jax.model.layout import implicit_spring, palm_points, wrist_springs
 from codesign_jax.model.morphology import at_joints
+from codesign_jax.model.spec import palm_inertia
 from codesign_jax.scene import Scene
 from codesign_jax.verdict import Bounds, bounds
 
@@ -149,60 +150,62 @@ def world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
 @partial(jax.jit, static_argnums=0)
 def _world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
     lay = layout(scene)
+    numbers = jax.tree.map(lambda v: v[None], fields.constants)
 
     def last(array: jax.Array) -> jax.Array:
         return jnp.moveaxis(array, 0, -1)
 
-    def by_link(array: jax.Array, ids: np.ndarray) -> jax.Array:
-        """(world, item, ...) at ids (finger, link, ...) to (..., link, ..., finger, world)."""
-        picked = jnp.moveaxis(array[:, ids], 1, -1)  # (world, link, ..., finger)
-        return last(picked)
+    def by_link(array: jax.Array) -> jax.Array:
+        """(world, finger, link, ...) to (link, ..., finger, world)."""
+        return last(jnp.moveaxis(array, 1, -1))
 
-    def vectors(array: jax.Array, ids: np.ndarray) -> jax.Array:
-        picked = jnp.moveaxis(array[:, ids], -1, 1)  # (world, 3, finger, ...)
-        return last(jnp.moveaxis(picked, 2, -1))
+    def vectors(array: jax.Array) -> jax.Array:
+        """(world, finger, ..., 3) to (3, ..., finger, world)."""
+        return last(jnp.moveaxis(jnp.moveaxis(array, -1, 1), 2, -1))
 
-    mount = rotation_columns(vectors(fields.body_quat, lay.stubs))
-    base = vectors(fields.body_pos, lay.stubs)
-    stub_centre = base + apply_columns(mount, vectors(fields.body_ipos, lay.stubs))
-    palm = _palm(fields, lay.stubs, mount, stub_centre, last)
-    sizes = fields.geom_size[:, lay.object_geoms]
+    mount = rotation_columns(vectors(fields.mount))
+    base = vectors(fields.base)
+    centre = vectors(_along_and_up(fields.centre))
+    stub_centre = base + apply_columns(mount, centre[:, 0])
+    inertia = vectors(fields.inertia)
+    palm = _palm(numbers, fields, stub_centre, inertia[:, 0], mount)
     shape = fields.shape
-    picked = jnp.take_along_axis(sizes, shape[:, None, None], axis=1)[:, 0]
+    picked = jnp.take_along_axis(fields.object_size, shape[:, None, None], axis=1)[:, 0]
     object_size = last(picked)[:, None]
+    wrist = _wrist(numbers, fields.object_mass[None])
+    palm_point, palm_radius = _palm_points(numbers, lay, fields.object_mass[None])
     no_spheres = lay.spheres.size == 0
-    numbers = jax.tree.map(lambda v: v[None], fields.constants)
     return WorldModel(
         mount=mount,
         base=base,
-        offset=by_link(fields.body_pos[..., 0], lay.bodies),
-        mass=by_link(fields.body_mass, lay.bodies),
-        centre=vectors(fields.body_ipos, lay.bodies),
-        inertia=vectors(fields.body_inertia, lay.bodies),
-        stiffness=by_link(fields.jnt_stiffness, lay.dofs),
-        damping=by_link(fields.dof_damping, lay.dofs),
-        armature=by_link(fields.dof_armature, lay.dofs),
-        gain=_gain(fields, lay, last),
-        sphere=jnp.zeros((0,)) if no_spheres else vectors(fields.geom_pos, lay.spheres),
-        radius=jnp.zeros((0,)) if no_spheres else by_link(fields.geom_size[..., 0], lay.spheres),
+        offset=by_link(fields.offset),
+        mass=by_link(fields.mass)[1:],
+        centre=centre[:, 1:],
+        inertia=inertia[:, 1:],
+        stiffness=by_link(fields.stiffness),
+        damping=by_link(fields.damping),
+        armature=by_link(fields.armature),
+        gain=by_link(fields.gain) if scene.hand.section.tapered else last(fields.gain[..., 0]),
+        sphere=jnp.zeros((0,)) if no_spheres else vectors(_along_and_up(fields.spheres)),
+        radius=jnp.zeros((0,)) if no_spheres else by_link(fields.spheres[..., 1]),
         stub_centre=stub_centre,
         palm_mass=palm[0],
         palm_centre=palm[1],
         palm_inertia=palm[2],
-        palm_point=jnp.moveaxis(last(fields.geom_pos[:, lay.palm]), 0, 1),
-        palm_radius=last(fields.geom_size[:, lay.palm, 0]),
-        wrist_stiffness=last(fields.actuator_gainprm[:, :6, 0])[:, None],
-        wrist_damping=last(fields.dof_damping[:, :6])[:, None],
-        wrist_armature=last(fields.dof_armature[:, :6])[:, None],
-        object_mass=last(fields.body_mass[:, lay.object])[None],
-        object_inertia=last(fields.body_inertia[:, lay.object])[:, None],
+        palm_point=palm_point,
+        palm_radius=palm_radius,
+        wrist_stiffness=wrist[0],
+        wrist_damping=wrist[1],
+        wrist_armature=wrist[2],
+        object_mass=fields.object_mass[None],
+        object_inertia=last(fields.object_inertia)[:, None],
         object_size=object_size,
         object_id=shape[None],
         mesh=mesh_lanes(scene, shape[None], object_size),
         cones=make_cones(numbers, shape[None]),
         friction=frictions(numbers),
         bounds=bounds(numbers),
-        gravity=-fields.gravity[None, :, 2] if scene.effects.gravity else None,
+        gravity=numbers.gravity if scene.effects.gravity else None,
         section=None if fields.section is None else fields.section.transpose(2, 1, 0),
         tip=None if fields.tip is None else fields.tip.transpose(2, 1, 0),
         threshold=None if fields.threshold is None else fields.threshold.transpose(2, 3, 1, 0),
@@ -221,30 +224,62 @@ def _air(scene: Scene) -> jax.Array:
     return jnp.stack([jnp.asarray(p.exponent), jnp.asarray(p.atmosphere)])
 
 
-def _gain(fields: ModelFields, lay: Layout, last: Callable) -> jax.Array:
-    of_finger = last(fields.actuator_gainprm[:, 6 : 6 + len(lay.stubs), 0])
-    if fields.wrap_prm is None:
-        return of_finger
-    share = fields.wrap_prm.reshape(-1, len(lay.stubs), lay.links)
-    return share.transpose(2, 1, 0) * of_finger
+def _along_and_up(places: jax.Array) -> jax.Array:
+    """Places in links' frames from those along and up, (..., 2) to (..., 3)."""
+    along = places[..., 0]
+    return jnp.stack([along, jnp.zeros_like(along), places[..., 1]], -1)
 
 
-def _palm(fields: ModelFields, stubs: np.ndarray, mount: jax.Array, stub_centre: jax.Array, last):
-    """Mass, centre and inertia of the palm with its half segments, in the palm frame."""
-    masses = jnp.concatenate([last(fields.body_mass[:, 1])[None], last(fields.body_mass[:, stubs])])
-    palm_centre = last(fields.body_ipos[:, 1])[:, None]
-    centres = jnp.concatenate([palm_centre, stub_centre], 1)
-    palm_principal = last(fields.body_inertia[:, 1])[:, None]
-    stub_principal = last(jnp.moveaxis(fields.body_inertia[:, stubs], -1, 1))
+def _wrist(scene: Scene, like: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Stiffness, and damping and armature with the implicit terms, shape (6, 1, world) each.
+
+    Args:
+      scene: Numbers of shape (1, world).
+      like: An array of that shape.
+    """
+
+    def rows(values: list) -> jax.Array:
+        return jnp.stack([jnp.broadcast_to(jnp.asarray(v, like.dtype), like.shape) for v in values])
+
+    stiffness, own = map(rows, wrist_springs(scene))
+    rigid = not scene.effects.wrist
+    return stiffness, *implicit_spring(scene, stiffness, own, rigid=rigid)
+
+
+def _palm_points(scene: Scene, lay: Layout, like: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Centres (3, sphere, world) and radii (sphere, world) of the palm's contact spheres."""
+    count = len(lay.palm)
+    if not count:
+        return jnp.zeros((3, 0, like.shape[1]), like.dtype), jnp.zeros((0, like.shape[1]))
+    radius = jnp.broadcast_to(scene.hand.palm.contact_radius, (count, like.shape[1]))
+    return jnp.moveaxis(palm_points(scene)[:, :, 0], 0, 1), radius
+
+
+def _palm(
+    scene: Scene, fields: ModelFields, centres: jax.Array, inertia: jax.Array, mount: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Mass, centre and inertia of the palm with its half segments, in the palm frame.
+
+    Args:
+      scene: Numbers of shape (1, world).
+      centres: Centres of the half segments there, shape (3, finger, world).
+      inertia: Their principal inertia, same shape.
+      mount: Columns of their orientations, shape (3, 3, finger, world).
+    """
+    own = scene.hand.palm
+    none = jnp.zeros_like(own.mass)
+    masses = jnp.concatenate([own.mass, fields.mass[:, :, 0].T])
+    palm_centre = jnp.stack([none, none, own.thickness / 2])
+    centres = jnp.concatenate([palm_centre, centres], 1)
     eye = jnp.broadcast_to(
         jnp.eye(3, dtype=masses.dtype)[:, :, None, None], (3, 3, *palm_centre.shape[1:])
     )
     frames = jnp.concatenate([eye, mount], 2)
-    principal = jnp.concatenate([palm_principal, stub_principal], 1)
+    principal = jnp.concatenate([jnp.stack(palm_inertia(scene)), inertia], 1)
     mass = masses.sum(0, keepdims=True)
     centre = (masses * centres).sum(1, keepdims=True) / mass
     away = centres - centre
-    own = total([principal[k] * frames[k][:, None] * frames[k][None] for k in range(3)])
+    turned = total([principal[k] * frames[k][:, None] * frames[k][None] for k in range(3)])
     unit = jnp.eye(3, dtype=masses.dtype)[:, :, None, None]
     shift = masses * (dot(away, away) * unit - away[:, None] * away[None])
-    return mass, centre, (own + shift).sum(2, keepdims=True)
+    return mass, centre, (turned + shift).sum(2, keepdims=True)

@@ -24,20 +24,12 @@ from codesign_jax.export import mjcf
 from codesign_jax.model import contact_invweight
 from codesign_jax.model.held import keeps
 from codesign_jax.model.pairs import SOLIMP
-from codesign_jax.scene import Scene, silicones
+from codesign_jax.scene import Scene, effects, silicones
 from codesign_jax.types import Trial
 
 _SOFTNESS = (1e-4 / (1 - 1e-4), (1 - 1e-4) / 1e-4)
 """Of (1 - d) / d, as MuJoCo keeps an impedance d between 0.0001 and 0.9999."""
 
-
-_LEFT_OUT = {
-    "neo_hookean": "joints have the linear law of bending, and the modulus that bends walls alike",
-    "lateral_threshold": "pressure does not resist sideways bending",
-    "air_mass": "pressures are what the valves ask for, whatever the chambers' volumes do",
-    "friction_memory": "what is held creeps",
-}
-"""What a model is like without an effect that plain MuJoCo does not have."""
 
 NONE: Mapping[str, float] = MappingProxyType({})
 
@@ -48,11 +40,12 @@ class Inexpressible(ValueError):
 
 def differences(scene: Scene) -> list[str]:
     """What of a scene the model lacks or has in another form, a sentence each."""
-    acts = {name: getattr(scene.effects, name) for name in _LEFT_OUT}
+    left_out = {name: effect.plain for name, effect in effects.EFFECTS.items() if effect.plain}
+    acts = {name: getattr(scene.effects, name) for name in left_out}
     acts |= {"friction_memory": keeps(scene)}
     found = [
         f"the model is without effects.{name}: {how}"
-        for name, how in _LEFT_OUT.items()
+        for name, how in left_out.items()
         if acts[name]
     ]
     if scene.effects.surface == "hull":

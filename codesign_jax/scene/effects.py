@@ -21,6 +21,8 @@ class Effect(NamedTuple):
     # Why an engine cannot do a value of the effect, by engine and value
     refused: Mapping[str, Mapping[Any, str]] = {}
     hull: bool = False  # whether it acts with the surface "hull" alone
+    # What the model is like that `codesign export` writes for plain MuJoCo, which lacks the effect
+    plain: str = ""
 
 
 _PRESCRIBED = (
@@ -59,20 +61,24 @@ EFFECTS: Mapping[str, Effect] = {
     "friction_memory": Effect(
         "with the hull nothing that is held creeps: friction is kept from step to step",
         hull=True,
+        plain="what is held creeps",
     ),
     "disturb": Effect("the arm is shaken after the lift"),
     "ungrasp": Effect("the fingers let go at the end"),
     "neo_hookean": Effect(
-        "rubber at large strain: fingers soften as they bend; not given: as the hand's material"
+        "rubber at large strain: fingers soften as they bend; not given: as the hand's material",
+        plain="joints have the linear law of bending, and the modulus that bends walls alike",
     ),
     "lateral_threshold": Effect(
         "pressure resists sideways bending up to a moment",
         {"mujoco": {True: _SPRINGS}, "mjx": {True: _SPRINGS}},
+        plain="pressure does not resist sideways bending",
     ),
     "pressure_dynamics": Effect("chambers fill with a lag and under the supply's limits"),
     "air_mass": Effect(
         "valves meter air: its pressure falls as a chamber grows",
         {"mujoco": {True: _SPRINGS}, "mjx": {True: _SPRINGS}},
+        plain="pressures are what the valves ask for, whatever the chambers' volumes do",
     ),
     "gravity": Effect("everything has weight"),
 }

@@ -10,6 +10,7 @@ import numpy as np
 from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.laws.cones import Cones, frictions, make_cones
 from codesign_jax.engines.structured.laws.meshes import MeshLanes, mesh_lanes
+from codesign_jax.engines.structured.laws.step_numbers import step_numbers
 from codesign_jax.model import Layout, ModelFields, layout
 from codesign_jax.model.layout import implicit_spring, palm_points, wrist_springs
 from codesign_jax.model.morphology import at_joints
@@ -54,8 +55,8 @@ class WorldModel(NamedTuple):
     mesh: MeshLanes | None  # Meshes of the worlds; None if the scene has none
     cones: Cones  # Parameters of the contacts
     bounds: Bounds  # When a world is decided, of shape (1, world) each
-    # Magnitude of gravity [m/s^2], shape (1, world); None without the effect
-    gravity: jax.Array | None = None
+    # Those of `laws.step_numbers` that the scene has, by name, shape (..., 1, world)
+    step_numbers: dict[str, jax.Array]
     # Height, wall, segment length and width of the fingers at their bases, shape (4, finger,
     # world); None where no effect needs them, see `ModelFields`
     section: jax.Array | None = None
@@ -205,7 +206,7 @@ def _world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
         cones=make_cones(numbers, shape[None]),
         friction=frictions(numbers),
         bounds=bounds(numbers),
-        gravity=numbers.gravity if scene.effects.gravity else None,
+        step_numbers={k: jnp.asarray(n.value(numbers)) for k, n in step_numbers(scene).items()},
         section=None if fields.section is None else fields.section.transpose(2, 1, 0),
         tip=None if fields.tip is None else fields.tip.transpose(2, 1, 0),
         threshold=None if fields.threshold is None else fields.threshold.transpose(2, 3, 1, 0),

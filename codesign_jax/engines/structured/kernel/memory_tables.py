@@ -31,6 +31,7 @@ from codesign_jax.engines.structured.laws import shapes, surroundings
 from codesign_jax.engines.structured.laws.air import volumes
 from codesign_jax.engines.structured.laws.cones import own_friction
 from codesign_jax.engines.structured.laws.kinematics import Acc, State
+from codesign_jax.engines.structured.laws.step_numbers import step_numbers
 from codesign_jax.engines.structured.world_model import WorldModel, joint_sections, sections
 from codesign_jax.model import held, layout
 from codesign_jax.model.held import palm_groups, rings_of_link
@@ -143,8 +144,7 @@ class Tables(KernelLayout):
         some: dict[str, tuple[int, tuple[int, ...]]] = {}
         for contacts in self.sets:
             some |= contacts.cone_rows()
-        if self.scene.effects.gravity:
-            some |= {"gravity": (1, one)}
+        some |= {name: (1, number.shape) for name, number in step_numbers(self.scene).items()}
         if own_friction(self.scene, "object_table"):
             some |= {"friction": (1, (2 * len(surroundings.fields(self.scene)),))}
         if self.scene.effects.wrist:
@@ -233,6 +233,7 @@ class Packing(Tables):
             for k, v in hand._asdict().items()
         }
         arrays |= hand.bounds._asdict()
+        arrays |= hand.step_numbers
         for name, cone in hand.cones._asdict().items():
             if cone is None:
                 continue

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, ContactSet
 from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, MemoryLayout
 from codesign_jax.engines.structured.lanewise import Lanes, lanes
+from codesign_jax.engines.structured.laws.step_numbers import step_numbers
 from codesign_jax.model import Layout
 from codesign_jax.model.layout import hinge_sign
 from codesign_jax.scene import Scene
@@ -20,9 +21,9 @@ PALM_CONSTANTS = (
     "object_mass",
     "object_inertia",
     "wrist_stiffness",
-    "gravity",
 )
-"""Constants of the worlds that `palm_and_object` takes; some scenes lack the last ones."""
+"""Constants of the worlds that `palm_and_object` takes beside `laws.step_numbers`; some scenes lack
+the last one."""
 LINK_CONSTANTS = ("offset", "mass", "centre", "inertia", "stiffness", "damping", "armature")
 """Constants of each link that `link_forces` takes."""
 FINGER_CONSTANTS = ("gain", "section", "threshold")
@@ -119,16 +120,19 @@ class StepMemory:
 
     def palm_constants(self) -> dict[str, Lanes]:
         """Constants that `palm_and_object` takes, by name, of those that the scene has."""
-        return {n: self.constant(n) for n in PALM_CONSTANTS if n in self.world}
+        found = {n: self.constant(n) for n in PALM_CONSTANTS if n in self.world}
+        return found | self.step_numbers()
 
     def link_constants(self, i: Any) -> dict[str, Lanes]:
         """Constants that `link_forces` takes, by name, of those that the scene has."""
         found = {n: self.hand.read(n, i) for n in LINK_CONSTANTS}
         row = i if self.p.tapered else 0
         found |= {n: self.hand.read(n, row) for n in FINGER_CONSTANTS if n in self.hand}
-        if "gravity" in self.world:
-            found["gravity"] = self.constant("gravity")
-        return found
+        return found | self.step_numbers()
+
+    def step_numbers(self) -> dict[str, Lanes]:
+        """Those of `laws.step_numbers` that the scene has, by name."""
+        return {n: self.constant(n) for n in step_numbers(self.p.scene)}
 
     def joint(self, i: Any) -> dict[str, Lanes]:
         """Angles, velocities and accelerations of a joint, by name."""

@@ -352,7 +352,7 @@ def test_derivatives_of_scenes(name, tmp_path):
             print(group, *(f"{v:.2e}" for v in row))
         slopes = dict(zip((group for _, group in case.groups), slope, strict=True))
         size = "grid_factor" if name.startswith("mesh") else "object_size"
-        assert slopes["cone.hand_object"] and slopes[size]
+        assert slopes["cone.finger_object"] and slopes[size]
         assert np.min(errors, 0).max() < BOUND
 
 

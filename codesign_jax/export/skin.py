@@ -68,7 +68,7 @@ def add(scene: Scene, spec: mujoco.MjSpec, params: Params) -> dict[str, float]:
             shares[name] = ball.share
             if e.finger_object:
                 add_pair(scene, spec, name, "object_0", 0)
-            for other, kind in surroundings(scene, pairs.HAND_TABLE) if e.finger_table else []:
+            for other, kind in surroundings(scene, pairs.FINGER_TABLE) if e.finger_table else []:
                 add_pair(scene, spec, other, name, kind)
             if e.finger_palm and _on_palm(scene, params, f, ball):
                 add_pair(scene, spec, name, "palm_disc", pairs.PALM)

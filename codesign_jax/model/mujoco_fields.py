@@ -174,7 +174,7 @@ def _pair_kinds(scene: Scene) -> np.ndarray:
     for i, pair in enumerate(zip(template.pair_geom1, template.pair_geom2, strict=True)):
         touched = np.isin(lay.object_geoms, pair)
         if min(pair) <= len(scene.fixture):  # the table or a fixture
-            table = pairs.OBJECT_TABLE if touched.any() else pairs.HAND_TABLE
+            table = pairs.OBJECT_TABLE if touched.any() else pairs.FINGER_TABLE
             kinds[i] = pairs.around(scene, min(pair), table)
         elif np.isin(lay.disc, pair).any():
             kinds[i] = pairs.PALM

@@ -11,7 +11,7 @@ from codesign_jax.model.layout import IMPEDANCE, dissipation, palm_impedance
 from codesign_jax.scene import Scene
 
 OBJECT_TABLE = -4
-HAND_TABLE = -3
+FINGER_TABLE = -3
 FINGERS = -2
 PALM = -1
 SOLIMP = (0.001, 0.5, 2.0)

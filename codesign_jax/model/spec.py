@@ -360,7 +360,7 @@ def _add_pairs(scene: Scene, spec: mujoco.MjSpec, params: Params) -> None:
         for name in (fingers if e.finger_object else []) + (palm if e.palm_object else []):
             add(name, f"object_{i}", i)
     for name in (fingers if e.finger_table else []) + (palm if e.palm_table else []):
-        for other, kind in surroundings(scene, pairs.HAND_TABLE):
+        for other, kind in surroundings(scene, pairs.FINGER_TABLE):
             add(other, name, kind)
     if e.finger_finger:
         for first, second in itertools.combinations(fingers, 2):

@@ -76,16 +76,16 @@ class WorldModel(NamedTuple):
 
 
 def sections(hand: WorldModel, places: np.ndarray) -> tuple[Any, Any, Any]:
-    """Height, wall and width of fingers at shares of their length, (place, finger, world) each.
+    """Height, wall and width of fingers at places along them, (place, finger, world) each.
 
-    The axis of the places has length 1 where fingers are not tapered.
+    Places are 0 at the base and 1 at the tip.  The axis of the places has length 1 where fingers are not tapered.
     """
     assert hand.section is not None
     base = [hand.section[k][None] for k in (0, 1, 3)]
     if hand.tip is None:
         return base[0], base[1], base[2]
-    share = np.asarray(places, hand.section.dtype)[:, None, None]
-    found = [a + share * (b - a) for a, b in zip(base, hand.tip, strict=True)]
+    along = np.asarray(places, hand.section.dtype)[:, None, None]
+    found = [a + along * (b - a) for a, b in zip(base, hand.tip, strict=True)]
     return found[0], found[1], found[2]
 
 

@@ -258,16 +258,16 @@ def add_speed_cotangent(
     p = step.p
     top = _folded(step, state, _largest, jnp.maximum)
     number = _folded(step, state, _count, jnp.add, top)
-    share = lanewise(_share, lanes([bar], (), wide=False), number)
+    each = lanewise(_divided, lanes([bar], (), wide=False), number)
 
     def link(i: Any, x: Any) -> Any:
-        bars.add_joint({"finger_vel": lanewise(_slope, _rates(step, i), top, share)}, i)
+        bars.add_joint({"finger_vel": lanewise(_slope, _rates(step, i), top, each)}, i)
         return x
 
     jax.lax.fori_loop(0, p.links, link, jnp.int32(0))
     for name in VELOCITIES:
         old = bars.world_state.read(name)
-        bars.world_state.write(name, plus(old, lanewise(_slope, state[name], top, share)))
+        bars.world_state.write(name, plus(old, lanewise(_slope, state[name], top, each)))
 
 
 def _rates(step: StepMemory, i: Any) -> Lanes:
@@ -304,10 +304,10 @@ def _count(x, velocities, top):
     return x
 
 
-def _share(bar, number):
+def _divided(bar, number):
     return bar / jnp.maximum(number, 1.0)
 
 
-def _slope(velocities, top, share):
+def _slope(velocities, top, each):
     sign = jnp.where(velocities > 0, 1.0, jnp.where(velocities < 0, -1.0, 0.0))
-    return jnp.where(jnp.abs(velocities) == top, sign * share, 0.0)
+    return jnp.where(jnp.abs(velocities) == top, sign * each, 0.0)

@@ -32,7 +32,7 @@ JOINT = ("finger", "finger_vel", "acc")
 
 def fields(links: int, axes: int) -> dict[str, tuple[int, tuple[int, ...]]]:
     """Rows of scratch memory: c, g'a of the last step, w, s, r_1, r_o1, and y_1 of the joints."""
-    found = dict.fromkeys(("air_stiffness", "air_step", "air_share", "air_sum"), (1, ()))
+    found = dict.fromkeys(("air_stiffness", "air_step", "air_series", "air_sum"), (1, ()))
     return {**found, "air_palm": (1, (6,)), "air_object": (1, (6,)), "air_joint": (links, (axes,))}
 
 
@@ -129,14 +129,15 @@ class Chambers:
 
         start = none, none, zeros((), self.step.like)
         palm, obj, give = loop(self.links, one, start, self.size, reverse=True)
-        share = lanewise(lambda c, e: c / (1 + c * e), *self._of_finger("stiffness"), give)
-        for name, value in (("palm", palm), ("object", obj), ("share", share)):
+        # Stiffness of the air in series with the finger's compliance `give`
+        series = lanewise(lambda c, e: c / (1 + c * e), *self._of_finger("stiffness"), give)
+        for name, value in (("palm", palm), ("object", obj), ("series", series)):
             self.step.write(f"air_{name}", value)
 
-        def square(share, a, b):
-            return share * a[:, None] * b[None]
+        def square(series, a, b):
+            return series * a[:, None] * b[None]
 
-        pp, po, oo = (lanewise(square, share, *v) for v in ((palm, palm), (palm, obj), (obj, obj)))
+        pp, po, oo = (lanewise(square, series, *v) for v in ((palm, palm), (palm, obj), (obj, obj)))
         r, ro, less = self.close_again("z", node.r, node.r_object)
         p = lanewise(jnp.add, node.p, upper(pp))
         q = lanewise(jnp.add, node.q, upper(oo))
@@ -154,18 +155,18 @@ class Chambers:
         total = self._sum(dot, "air_joint", z)
         self.step.write("air_sum", total)
 
-        def less(r, ro, total, share, palm, obj):
-            return r - share * total * palm, ro - share * total * obj, share * total * total
+        def less(r, ro, total, series, palm, obj):
+            return r - series * total * palm, ro - series * total * obj, series * total * total
 
-        return lanewise(less, r, ro, total, *self._of_finger("share", "palm", "object"))
+        return lanewise(less, r, ro, total, *self._of_finger("series", "palm", "object"))
 
     def settle(self, z: str, motion: Lanes, object_motion: Lanes) -> None:
         """Takes the chambers' part from the joints' factors, once palm and object are known."""
 
-        def pressure(share, total, palm, obj, motion, object_motion):
-            return share * (total + dot(palm, motion) + dot(obj, object_motion))
+        def pressure(series, total, palm, obj, motion, object_motion):
+            return series * (total + dot(palm, motion) + dot(obj, object_motion))
 
-        known = self._of_finger("share", "sum", "palm", "object")
+        known = self._of_finger("series", "sum", "palm", "object")
         change = lanewise(pressure, *known, motion, object_motion)
 
         def take(z, y, inverse, change):

@@ -31,6 +31,7 @@ from codesign_jax.engines.structured.laws import shapes, surroundings
 from codesign_jax.engines.structured.laws.air import volumes
 from codesign_jax.engines.structured.laws.cones import own_friction
 from codesign_jax.engines.structured.laws.kinematics import Acc, State
+from codesign_jax.engines.structured.laws.rings import RING_OVERLAP
 from codesign_jax.engines.structured.laws.step_numbers import step_numbers
 from codesign_jax.engines.structured.world_model import WorldModel, joint_sections, sections
 from codesign_jax.model import held, layout
@@ -412,7 +413,7 @@ def ring_numbers(scene: Scene, hand: WorldModel, k: int) -> jax.Array:
     height, _, width = sections(hand, places.ravel())
     length = np.full((links, k), 1.0 / k)
     length[-1] *= 0.5
-    half = 0.6 * length
+    half = RING_OVERLAP * length
     half[-1, -1] = TIP
     along, length, half = (v.reshape(-1, 1, 1) for v in (along, length, half))
     tip = (np.arange(links * k) == links * k - 1).reshape(-1, 1, 1)

@@ -22,13 +22,10 @@ from codesign_jax.engines.structured.lanes import cross, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact, shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import own_friction
-from codesign_jax.engines.structured.laws.rings import Place
+from codesign_jax.engines.structured.laws.rings import RING_RADIUS, Place
 from codesign_jax.engines.structured.laws.touch import ring_centres, touch
 from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model import held
-
-OUTSIDE = 1.5
-"""Farthest point of a ring over the largest of its half axes."""
 
 
 class SdfCollision:
@@ -249,7 +246,7 @@ def may_touch(timestep, numbers, centre, distance, vel):
     """One where any of a link's rings may touch within the step, else zero."""
     half = numbers[3:6]
     moving = vel[3:, None] + cross(vel[:3, None], centre)
-    most = OUTSIDE * jnp.maximum(jnp.maximum(half[0], half[1]), half[2])
+    most = RING_RADIUS * jnp.maximum(jnp.maximum(half[0], half[1]), half[2])
     speed = jnp.sqrt(dot(moving, moving)) + most * jnp.sqrt(dot(vel[:3], vel[:3]))
     near = distance < most + jnp.maximum(contact.MARGIN, timestep * speed)
     found = jnp.where(near & (numbers[6] > 0), 1.0, 0.0)

@@ -15,18 +15,16 @@ from codesign_jax.scene import Scene
 class Cones(NamedTuple):
     """Cones by what touches, numbers of shape (1, world); None where nothing of it does."""
 
-    hand_object: Cone | None  # Fingers or palm on the object
-    hand_table: Cone | None  # Fingers or palm on the table
+    finger_object: Cone | None  # Fingers or palm on the object
+    finger_table: Cone | None  # Fingers or palm on the table
     object_table: Cone | None  # The object on the table
     finger_finger: Cone | None  # Fingers on one another and on themselves
     finger_palm: Cone | None  # Fingers on the palm's disc
 
 
 def which_cone(pair: str) -> str:
-    """The field of `Cones` for a pair of bodies, which is named as in `problem.relative`."""
-    if pair in Cones._fields:
-        return pair
-    return "hand_object" if pair.endswith("_object") else "hand_table"
+    """The field of `Cones` for a pair of bodies: the palm's contacts have the fingers' cones."""
+    return {"palm_object": "finger_object", "palm_table": "finger_table"}.get(pair, pair)
 
 
 def make_cone(scene: Scene, friction: Any, *, bodies: int, ratio: Any, stiffer: Any = 1.0) -> Cone:
@@ -66,8 +64,8 @@ def make_cones(scene: Scene, shape: jax.Array) -> Cones:
     between = c.finger_finger_friction_ratio if e.surface == "hull" else c.friction_ratio
     stiffer = c.finger_palm_stiffness / c.normal_stiffness
     return Cones(
-        hand_object=two(on_object) if e.finger_object or e.palm_object else None,
-        hand_table=one(c.finger_table_friction) if e.finger_table or e.palm_table else None,
+        finger_object=two(on_object) if e.finger_object or e.palm_object else None,
+        finger_table=one(c.finger_table_friction) if e.finger_table or e.palm_table else None,
         object_table=one(scene.objects.table.friction) if e.object_table else None,
         finger_finger=(
             two(c.finger_finger_friction, ratio=between)

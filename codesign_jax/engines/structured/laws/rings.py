@@ -29,6 +29,17 @@ FLOOR = 1e-6
 """Of squares of numbers up to one, where the slope of a root would have none."""
 
 
+SECTION_RADIUS = 1.2
+"""Bound of the farthest point of a section |y/a|^4 + |z/b|^4 = 1 over the larger half axis: with
+a = b it is 2^(1/4) = 1.19."""
+RING_RADIUS = 1.5
+"""Bound of the farthest point of a ring over the largest half axis: with e = a = b it is
+3^(1/4) = 1.32, and a distance read from a mesh's grid needs room."""
+RING_OVERLAP = 0.6
+"""Half axis e of a ring along the finger over its part of the finger's length; with 0.5 rings would
+meet in their tips and leave gaps between their sides [ours]."""
+
+
 class Ring(NamedTuple):
     """Rings on a link."""
 
@@ -124,9 +135,10 @@ def support(half: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array
 
 
 def cap(unit: jax.Array, u: jax.Array) -> jax.Array:
-    """Area of the part of |y|^4 + |z|^4 = 1 beyond a line at the share 1 - u of its support.
+    """Area of the part of |y|^4 + |z|^4 = 1 beyond a line at 1 - u of its support.
 
-    A fit within 10 %: P on a face, E on an edge, by t from 0 to 1 in between.
+    A fit [ours] within 10 % of the area by quadrature, see docs/hull.md: a face's law, whose
+    direction is an axis, and an edge's, whose direction is a diagonal, by t from 0 to 1 in between.
     """
     root = jnp.sqrt(u)
     y, z = (jnp.sqrt(v * v + FLOOR) for v in (unit[1], unit[2]))
@@ -138,7 +150,7 @@ def cap(unit: jax.Array, u: jax.Array) -> jax.Array:
 
 
 def stiffness(ring: Ring, reach: jax.Array, unit: jax.Array, axial: jax.Array, gap: jax.Array):
-    """Share of the scene's stiffness at a gap (...), see `Place`.
+    """Contact stiffness over the scene's at a gap (...), see `Place.share`.
 
     Args:
       reach: Its support, and `unit` what else `support` returns.

@@ -4,6 +4,7 @@ import threading
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import mujoco.batch
 import numpy as np
@@ -12,7 +13,6 @@ from codesign_jax import verdict
 from codesign_jax.engines.base import Equal, refuse_meshes
 from codesign_jax.model import (
     ModelFields,
-    MujocoFields,
     compile_template,
     layout,
     mujoco_fields,
@@ -63,10 +63,11 @@ class MujocoEngine(Equal):
             jax.ShapeDtypeStruct((worlds, steps), np.int32),
             jax.ShapeDtypeStruct((worlds, nq + 2 * nv + 3), ctrl.dtype),
         )
-        # Of the constants C needs the bounds alone: each argument is an array for XLA to fill.
+        # One array of all constants: each argument is an array for XLA to fill.
+        constants = jnp.stack([jnp.asarray(v) for v in jax.tree.leaves(fields.constants)], 1)
         inputs = (
-            _arrays(self.scene.structure, fields),
             fields._replace(constants=()),
+            constants,
             _bounds(fields.constants),
             ctrl,
         )
@@ -76,16 +77,18 @@ class MujocoEngine(Equal):
     def _run(
         self,
         trajectory: bool,
-        arrays: MujocoFields,
         fields: ModelFields,
+        constants: jax.Array,
         bounds: verdict.Bounds,
         ctrl: jax.Array,
     ) -> Trace:
         dtype = np.asarray(ctrl).dtype
-        inputs = (arrays, fields, bounds, ctrl)
-        arrays, fields, bounds, wide = jax.tree.map(lambda v: np.asarray(v, np.float64), inputs)
+        inputs = (fields, constants, bounds, ctrl)
+        fields, numbers, bounds, wide = jax.tree.map(lambda v: np.asarray(v, np.float64), inputs)
+        tree = jax.tree.structure(self.scene.bare)
+        fields = fields._replace(constants=jax.tree.unflatten(tree, list(numbers.T)))
         with self._lock:
-            trace = self._simulate((arrays, fields), bounds, wide, trajectory)
+            trace = self._simulate(fields, bounds, wide, trajectory)
         return jax.tree.map(lambda v: v if v.dtype == np.int32 else v.astype(dtype), trace)
 
     def _batch(self, num_worlds: int) -> mujoco.batch.Batch:
@@ -97,7 +100,7 @@ class MujocoEngine(Equal):
 
     def _simulate(
         self,
-        worlds_of: tuple[MujocoFields, ModelFields],
+        fields: ModelFields,
         bounds: verdict.Bounds,
         ctrl: np.ndarray,
         trajectory: bool,
@@ -106,8 +109,7 @@ class MujocoEngine(Equal):
         scene = self.scene
         nq = self.template.nq
         batch = self._batch(worlds)
-        arrays, fields = worlds_of
-        write_fields(batch, arrays, fields)
+        write_fields(self.scene, batch, fields)
         start = split(scene, fields.start)
         last = np.concatenate(start, 1)
         end = split(scene, last)  # views
@@ -199,13 +201,6 @@ class MujocoEngine(Equal):
 
 
 _bounds = jax.jit(verdict.bounds)
-_one = jax.jit(mujoco_fields, static_argnums=0)
-
-
-@partial(jax.jit, static_argnums=0)
-def _arrays(scene: Scene, fields: ModelFields) -> MujocoFields:
-    """MuJoCo's arrays of worlds, with leading axis (world,)."""
-    return jax.vmap(partial(mujoco_fields, scene))(fields)
 
 
 def _decisions(
@@ -269,17 +264,19 @@ def _apply_softening(
 ) -> None:
     bend = layout(scene).dofs[..., 0]
     angles = batch.bind("qpos")[ids][:, bend]
-    mine = jax.tree.map(lambda v: v[ids], fields)
+    mine = jax.tree.map(lambda v: v[ids], fields._replace(constants=()))
     batch.bind("qfrc_applied")[ids[:, None, None], bend] = softening_moments(scene, mine, angles)
 
 
-def write_fields(batch: mujoco.batch.Batch, arrays: MujocoFields, fields: ModelFields) -> None:
+def write_fields(scene: Scene, batch: mujoco.batch.Batch, fields: ModelFields) -> None:
     """Gives every simulation of a batch its model fields and start state."""
+    worlds = [jax.tree.map(lambda v, w=w: v[w], fields) for w in range(len(fields.start))]
+    models = [mujoco_fields(scene, world, np).of_model for world in worlds]
     batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
     batch.bind("qpos")[:] = fields.qpos
     batch.bind("qvel")[:] = fields.qvel
-    for name, value in arrays.of_model.items():
-        batch.expand(name)[:] = value
+    for name in models[0]:
+        batch.expand(name)[:] = np.stack([model[name] for model in models])
     batch.bind("qacc_warmstart")[:] = 0.0
 
 
@@ -288,12 +285,11 @@ def world_model(scene: Scene, fields: ModelFields) -> mujoco.MjModel:
     import copy
 
     model = copy.deepcopy(compile_template(scene))
-    with jax.enable_x64(True):  # of fields in float64 also where JAX has float32
-        arrays = jax.tree.map(np.asarray, _one(scene.structure, fields))
+    wide = jax.tree.map(lambda v: np.asarray(v, np.float64), fields)
+    arrays = mujoco_fields(scene, wide, np)
     for name, value in arrays.of_model.items():
-        value = np.asarray(value, np.float64)
         if name == "opt.impratio":
-            model.opt.impratio = value.item()
+            model.opt.impratio = float(value)
         elif name == "opt.gravity":
             model.opt.gravity[:] = value
         else:

@@ -262,12 +262,12 @@ def beyond_base(along: Any, height: Any) -> Any:
 _PALM_RING = ((0, 0), (1, 0), (0, 1), (-1, 0), (0, -1))
 
 
-def palm_points(scene: Scene) -> jax.Array:
+def palm_points(scene: Scene, numpy: Any = jnp) -> Any:
     """Centres of the palm's contact spheres in the palm frame, whose origin is on the underside."""
     p = scene.hand.palm
-    ring = jnp.asarray(p.contact_ring)
-    up = jnp.asarray(p.contact_radius)
-    return jnp.stack([jnp.stack([x * ring, y * ring, up]) for x, y in _PALM_RING])
+    ring = numpy.asarray(p.contact_ring)
+    up = numpy.asarray(p.contact_radius)
+    return numpy.stack([numpy.stack([x * ring, y * ring, up]) for x, y in _PALM_RING])
 
 
 def mount_points(hand: Hand, spread: Any, numpy: Any = jnp) -> tuple[Any, Any, Any]:
@@ -311,14 +311,14 @@ INACTIVE = 1e-3
 """Size of the geoms of a model's object that its trial does not use, over their own."""
 
 
-def geom_sizes(size: Any, shape: Any) -> Any:
+def geom_sizes(size: Any, shape: Any, numpy: Any = jnp) -> Any:
     """Sizes (shape, 3) of the geoms of an object body, which carries one for each shape of the set.
 
     Those that a trial does not use are `INACTIVE`, deep inside the one in use, where nothing
     touches them.
     """
     used = np.arange(len(size)) == shape
-    return jnp.where(used[:, None], size, INACTIVE * size)
+    return numpy.where(used[:, None], size, INACTIVE * size)
 
 
 def object_pose(objects: ObjectSet, trial: Trial) -> tuple[jax.Array, jax.Array]:
@@ -363,7 +363,7 @@ def _unit_inertia(shape: Shape, size: jax.Array, factor: jax.Array) -> jax.Array
     return jnp.stack(shape.primitive.inertia(size))
 
 
-def geom_bounds(kind: str, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+def geom_bounds(kind: str, size: Any, numpy: Any = jnp) -> tuple[Any, Any]:
     """Bounding radius () and axis-aligned half extents (3,) of a geom; a mesh's is a box."""
     found = PRIMITIVES["box" if kind == "mesh" else kind]
-    return found.radius(size), jnp.stack(found.half_extents(size))
+    return found.radius(size), numpy.stack(found.half_extents(size))

@@ -65,12 +65,13 @@ class MujocoFields(NamedTuple):
         return {f"opt.{k}" if k in options else k: v for k, v in given.items()}
 
 
-def mujoco_fields(scene: Scene, fields: ModelFields) -> MujocoFields:
+def mujoco_fields(scene: Scene, fields: ModelFields, numpy: Any = jnp) -> MujocoFields:
     """Returns MuJoCo's arrays of one world; pure, vmap it for batches.
 
     Args:
       scene: A scene of the structure of the fields'; its numbers are not read.
       fields: The world's.
+      numpy: The module that computes: NumPy outside of JAX, in float64 as MuJoCo C wants it.
     """
     template = compile_template(scene)
     lay = layout(scene)
@@ -78,25 +79,25 @@ def mujoco_fields(scene: Scene, fields: ModelFields) -> MujocoFields:
     numbers = fields.constants
 
     def filled(name: str, *parts: tuple[Any, Any]) -> jax.Array:
-        return _filled(getattr(template, name), dtype, *parts)
+        return _filled(numpy, getattr(template, name), dtype, *parts)
 
     bodies = np.concatenate([lay.stubs[:, None], lay.bodies], 1)
     palm = numbers.hand.palm
     thing = lay.object
     wrist_stiffness, wrist_damping = wrist_springs(numbers)
-    wrist_stiffness = jnp.stack([jnp.asarray(v, dtype) for v in wrist_stiffness])
-    wrist_damping = jnp.stack([jnp.asarray(v, dtype) for v in wrist_damping])
+    wrist_stiffness = numpy.stack([numpy.asarray(v, dtype) for v in wrist_stiffness])
+    wrist_damping = numpy.stack([numpy.asarray(v, dtype) for v in wrist_damping])
     rigid = not scene.effects.wrist
     wrist = implicit_spring(numbers, wrist_stiffness, wrist_damping, rigid=rigid)
-    free = jnp.zeros(6, dtype)
+    free = numpy.zeros(6, dtype)
 
     def by_dof(wrist: jax.Array, joints: jax.Array) -> jax.Array:
-        return jnp.concatenate([wrist, picked(joints.ravel(), lay.hinges), free])
+        return numpy.concatenate([wrist, _picked(numpy, joints.ravel(), lay.hinges), free])
 
-    gain = jnp.broadcast_to(fields.gain, lay.dofs.shape[:2])
+    gain = numpy.broadcast_to(fields.gain, lay.dofs.shape[:2])
     tapered = scene.hand.section.tapered
-    geom_size, rbound, aabb = _geom_fields(scene, fields, filled)
-    friction, solref, solimp = _pairs(numbers, dtype)
+    geom_size, rbound, aabb = _geom_fields(numpy, scene, fields, filled)
+    friction, solref, solimp = _pairs(numpy, numbers, dtype)
     return MujocoFields(
         body_pos=filled("body_pos", (lay.stubs, fields.base), ((lay.bodies, 0), fields.offset)),
         body_quat=filled("body_quat", (lay.stubs, fields.mount)),
@@ -110,15 +111,15 @@ def mujoco_fields(scene: Scene, fields: ModelFields) -> MujocoFields:
             "body_mass", (1, palm.mass), (bodies, fields.mass), (thing, fields.object_mass)
         ),
         body_subtreemass=filled(
-            "body_subtreemass", *_subtree_mass(lay, palm, fields.mass, fields.object_mass)
+            "body_subtreemass", *_subtree_mass(numpy, lay, palm, fields.mass, fields.object_mass)
         ),
         body_inertia=filled(
             "body_inertia",
             (bodies, fields.inertia),
             (thing, fields.object_inertia),
-            (1, jnp.stack(palm_inertia(numbers))),
+            (1, numpy.stack(palm_inertia(numbers))),
         ),
-        geom_pos=filled("geom_pos", *_sphere_positions(numbers, fields)),
+        geom_pos=filled("geom_pos", *_sphere_positions(numpy, numbers, fields)),
         geom_size=geom_size,
         geom_rbound=rbound,
         geom_aabb=aabb,
@@ -143,27 +144,31 @@ def mujoco_fields(scene: Scene, fields: ModelFields) -> MujocoFields:
         pair_friction=friction,
         pair_solref=solref,
         pair_solimp=solimp,
-        gravity=_filled(np.zeros(3), dtype, (2, -numbers.gravity_on)),
+        gravity=_filled(numpy, np.zeros(3), dtype, (2, -numbers.gravity_on)),
         impratio=friction_ratio(numbers, numbers.contact.friction_ratio),
         wrap_prm=(gain / gain[:, :1]).reshape(-1) if tapered else None,
-        pair_margin=None if fields.on_palm is None else _margins(scene, fields.on_palm),
+        pair_margin=None if fields.on_palm is None else _margins(numpy, scene, fields.on_palm),
     )
 
 
-def _filled(base: np.ndarray, dtype: Any, *parts: tuple[Any, Any]) -> jax.Array:
+def _picked(numpy: Any, array: Any, places: np.ndarray) -> Any:
+    return array[places] if numpy is np else picked(array, places)
+
+
+def _filled(numpy: Any, base: np.ndarray, dtype: Any, *parts: tuple[Any, Any]) -> jax.Array:
     """An array with other numbers in known places, where the last part wins.
 
     One gather of all numbers: a CPU's XLA makes a loop of every `.at[places].set(values)`.
     """
     source = np.arange(base.size, dtype=np.int32).reshape(base.shape)
-    numbers = [jnp.asarray(base, dtype).ravel()]
+    numbers = [numpy.asarray(base, dtype).ravel()]
     count = base.size
     for places, given in parts:
-        values = jnp.asarray(given, dtype)
+        values = numpy.asarray(given, dtype)
         source[places] = np.arange(count, count + values.size).reshape(values.shape)
         numbers.append(values.ravel())
         count += values.size
-    return picked(jnp.concatenate(numbers), source)
+    return _picked(numpy, numpy.concatenate(numbers), source)
 
 
 @by_structure
@@ -183,40 +188,42 @@ def _pair_kinds(scene: Scene) -> np.ndarray:
     return np.where(kinds < 0, kinds + len(pairs.frictions(scene)), kinds).astype(np.int32)
 
 
-def _pairs(scene: Scene, dtype: Any) -> list[jax.Array]:
+def _pairs(numpy: Any, scene: Scene, dtype: Any) -> list[jax.Array]:
     """MuJoCo's friction (pair, 5), solref (pair, 2) and solimp (pair, 5) of the contact pairs."""
     kinds = _pair_kinds(scene)
     found = (pairs.frictions(scene), pairs.impedances(scene))
-    own = (jnp.stack([jnp.asarray(v, dtype) for v in values])[kinds] for values in found)
+    own = (numpy.stack([numpy.asarray(v, dtype) for v in values])[kinds] for values in found)
     return [
-        jnp.stack([jnp.broadcast_to(jnp.asarray(v, dtype), len(kinds)) for v in row], -1)
+        numpy.stack([numpy.broadcast_to(numpy.asarray(v, dtype), len(kinds)) for v in row], -1)
         for row in pairs.numbers(scene, *own)
     ]
 
 
-def _margins(scene: Scene, on_palm: jax.Array) -> jax.Array:
+def _margins(numpy: Any, scene: Scene, on_palm: jax.Array) -> jax.Array:
     """MuJoCo's margin of the contact pairs [m], shape (pair,)."""
     lay = layout(scene)
     template = compile_template(scene)
     geoms = np.stack([template.pair_geom1, template.pair_geom2], 1)
     with_disc = (geoms == lay.disc).any(1)
     sphere = np.where(with_disc, geoms.max(1) - lay.spheres.min(), 0)  # behind the disc
-    margins = pairs.margin(picked(on_palm.ravel(), sphere))
-    return jnp.where(with_disc, margins, 0.0)
+    margins = pairs.margin(_picked(numpy, on_palm.ravel(), sphere))
+    return numpy.where(with_disc, margins, 0.0)
 
 
-def _subtree_mass(lay: Layout, palm: Any, masses: jax.Array, object_mass: jax.Array) -> list[tuple]:
-    tails = jnp.cumsum(masses[:, ::-1], 1)[:, ::-1]
+def _subtree_mass(
+    numpy: Any, lay: Layout, palm: Any, masses: jax.Array, object_mass: jax.Array
+) -> list[tuple]:
+    tails = numpy.cumsum(masses[:, ::-1], 1)[:, ::-1]
     hand = palm.mass + tails[:, 0].sum()
     fingers = [(lay.stubs, tails[:, 0]), (lay.bodies, tails[:, 1:])]
     return [*fingers, (0, hand + object_mass), (1, hand), (lay.object, object_mass)]
 
 
-def _sphere_positions(scene: Scene, fields: ModelFields) -> list[tuple]:
+def _sphere_positions(numpy: Any, scene: Scene, fields: ModelFields) -> list[tuple]:
     lay = layout(scene)
-    parts: list[tuple] = [(lay.palm, palm_points(scene))] if lay.palm.size else []
+    parts: list[tuple] = [(lay.palm, palm_points(scene, numpy))] if lay.palm.size else []
     if lay.disc.size:
-        parts.append(((lay.disc, 2), jnp.asarray(scene.hand.palm.thickness) / 2))
+        parts.append(((lay.disc, 2), numpy.asarray(scene.hand.palm.thickness) / 2))
     if not lay.spheres.size:
         return parts
     along, radius = (fields.spheres[..., i] for i in range(2))
@@ -224,7 +231,7 @@ def _sphere_positions(scene: Scene, fields: ModelFields) -> list[tuple]:
 
 
 def _geom_fields(
-    scene: Scene, fields: ModelFields, filled: Callable
+    numpy: Any, scene: Scene, fields: ModelFields, filled: Callable
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     lay = layout(scene)
     sizes: list[tuple] = []
@@ -237,18 +244,18 @@ def _geom_fields(
     for where, radius in spheres:
         sizes.append(((where, 0), radius))
         radii.append((where, radius))
-        boxes.append(((where, slice(3, None)), jnp.asarray(radius)[..., None]))
+        boxes.append(((where, slice(3, None)), numpy.asarray(radius)[..., None]))
     shapes = scene.objects.object
-    extents = geom_sizes(fields.object_size, fields.shape)
+    extents = geom_sizes(fields.object_size, fields.shape, numpy)
     solids = [
         (g, s.type, extents[i])
         for i, (g, s) in enumerate(zip(lay.object_geoms, shapes, strict=True))
     ]
     if lay.disc.size:
-        disc = jnp.stack([jnp.asarray(v) for v in (palm.radius, palm.thickness / 2, 0.0)])
+        disc = numpy.stack([numpy.asarray(v) for v in (palm.radius, palm.thickness / 2, 0.0)])
         solids.append((lay.disc[0], "cylinder", disc))
     for g, kind, extent in solids:
-        radius, half = geom_bounds(kind, extent)
+        radius, half = geom_bounds(kind, extent, numpy)
         sizes.append((g, extent))
         radii.append((g, radius))
         boxes.append(((g, slice(3, None)), half))

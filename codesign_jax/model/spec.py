@@ -303,7 +303,7 @@ def _add_object(
     visual: bool,
 ) -> None:
     sizes, mass, inertia = solid
-    sizes = geom_sizes(sizes, int(trial.shape))
+    sizes = geom_sizes(sizes, int(trial.shape), np)
     rest, quat = pose
     body = spec.worldbody.add_body(name="object", pos=[*np.asarray(trial.position), float(rest)])
     body.quat = quat

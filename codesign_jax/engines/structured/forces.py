@@ -121,16 +121,15 @@ def _touch(contacts: Contacts, force: jax.Array) -> Touch:
 
     Args:
       contacts: Of fingers, items (link, ring of the link, finger, world), or of the palm, items
-        (ring, 1, world), with the object.
+        (ring, world), with the object.
       force: Forces on the hand, shape (3, ...).
     """
     pressing = dot(contacts.normal, force)
-    of_palm = pressing.ndim == 3
 
     def by_ring(values: jax.Array) -> jax.Array:
         values = jnp.broadcast_to(values, pressing.shape)
-        if of_palm:
-            return values[:, 0].T
+        if values.ndim == 2:
+            return values.T
         return jnp.moveaxis(values.reshape(-1, *values.shape[2:]), 0, 2).swapaxes(0, 1)
 
     def vectors(values: jax.Array) -> jax.Array:

@@ -78,7 +78,8 @@ class WorldModel(NamedTuple):
 def sections(hand: WorldModel, places: np.ndarray) -> tuple[Any, Any, Any]:
     """Height, wall and width of fingers at places along them, (place, finger, world) each.
 
-    Places are 0 at the base and 1 at the tip.  The axis of the places has length 1 where fingers are not tapered.
+    Places are 0 at the base and 1 at the tip.  Their axis has length 1 where fingers are not
+    tapered.
     """
     assert hand.section is not None
     base = [hand.section[k][None] for k in (0, 1, 3)]

@@ -84,16 +84,7 @@ def mujoco_fields(scene: Scene, fields: ModelFields, numpy: Any = jnp) -> Mujoco
     bodies = np.concatenate([lay.stubs[:, None], lay.bodies], 1)
     palm = numbers.hand.palm
     thing = lay.object
-    wrist_stiffness, wrist_damping = wrist_springs(numbers)
-    wrist_stiffness = numpy.stack([numpy.asarray(v, dtype) for v in wrist_stiffness])
-    wrist_damping = numpy.stack([numpy.asarray(v, dtype) for v in wrist_damping])
-    rigid = not scene.effects.wrist
-    wrist = implicit_spring(numbers, wrist_stiffness, wrist_damping, rigid=rigid)
-    free = numpy.zeros(6, dtype)
-
-    def by_dof(wrist: jax.Array, joints: jax.Array) -> jax.Array:
-        return numpy.concatenate([wrist, _picked(numpy, joints.ravel(), lay.hinges), free])
-
+    wrist, damping, armature = _dofs(numpy, scene, fields)
     gain = numpy.broadcast_to(fields.gain, lay.dofs.shape[:2])
     tapered = scene.hand.section.tapered
     geom_size, rbound, aabb = _geom_fields(numpy, scene, fields, filled)
@@ -125,8 +116,8 @@ def mujoco_fields(scene: Scene, fields: ModelFields, numpy: Any = jnp) -> Mujoco
         geom_aabb=aabb,
         # The wrist's springs are its position actuators; only the fingers have passive ones.
         jnt_stiffness=filled("jnt_stiffness", (lay.dofs, fields.stiffness)),
-        dof_damping=by_dof(wrist[0], fields.damping),
-        dof_armature=by_dof(wrist[1], fields.armature),
+        dof_damping=damping,
+        dof_armature=armature,
         # MuJoCo takes the inertia of a free body from this constant; of other bodies it does not.
         dof_M0=filled(
             "dof_M0",
@@ -135,10 +126,10 @@ def mujoco_fields(scene: Scene, fields: ModelFields, numpy: Any = jnp) -> Mujoco
         ),
         actuator_gainprm=filled(
             "actuator_gainprm",
-            ((slice(6), 0), wrist_stiffness),
+            ((slice(6), 0), wrist),
             ((slice(6, None), 0), gain[:, 0]),
         ),
-        actuator_biasprm=filled("actuator_biasprm", ((slice(6), 1), -wrist_stiffness)),
+        actuator_biasprm=filled("actuator_biasprm", ((slice(6), 1), -wrist)),
         # Declared, not derived; see contact_invweight.  The world keeps zero.
         body_invweight0=filled("body_invweight0", (slice(1, None), contact_invweight(numbers))),
         pair_friction=friction,
@@ -149,6 +140,22 @@ def mujoco_fields(scene: Scene, fields: ModelFields, numpy: Any = jnp) -> Mujoco
         wrap_prm=(gain / gain[:, :1]).reshape(-1) if tapered else None,
         pair_margin=None if fields.on_palm is None else _margins(numpy, scene, fields.on_palm),
     )
+
+
+def _dofs(numpy: Any, scene: Scene, fields: ModelFields) -> tuple[Any, Any, Any]:
+    """Stiffness of the wrist's dofs (6,), and damping and armature of all dofs, (nv,) each."""
+    lay = layout(scene)
+    dtype = fields.mass.dtype
+    springs = wrist_springs(fields.constants)
+    stiffness, own = (numpy.stack([numpy.asarray(v, dtype) for v in k]) for k in springs)
+    rigid = not scene.effects.wrist
+    wrist = implicit_spring(fields.constants, stiffness, own, rigid=rigid)
+    free = numpy.zeros(6, dtype)
+
+    def by_dof(wrist: Any, joints: Any) -> Any:
+        return numpy.concatenate([wrist, _picked(numpy, joints.ravel(), lay.hinges), free])
+
+    return stiffness, by_dof(wrist[0], fields.damping), by_dof(wrist[1], fields.armature)
 
 
 def _picked(numpy: Any, array: Any, places: np.ndarray) -> Any:

@@ -203,6 +203,39 @@ class HandContacts(NamedTuple):
         return jar if self.grip is None else jar + holding.held(c, self.grip)
 
 
+class _FingerRings(NamedTuple):
+    """The rings or spheres of all fingers, items from base to tip."""
+
+    number: np.ndarray  # Number of each item, shape (item,)
+    link: np.ndarray  # Its link, 1 for the first one that moves, same shape
+    numbers: jax.Array  # Numbers of rings, shape (8, item, finger, world)
+    frame: jax.Array  # Frames of their links, shape (3, 3, item, finger, world)
+    centre: jax.Array  # Their centres, shape (3, item, finger, world)
+    lines: "_CentreLines | None"  # Of fingers of rings
+
+    def of(self, fingers: np.ndarray) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Numbers, frames and centres of some fingers, which may come several times."""
+        return self.numbers[:, :, fingers], self.frame[:, :, :, fingers], self.centre[:, :, fingers]
+
+
+def _finger_rings(scene: Scene, hand: WorldModel, kin: Kinematics) -> _FingerRings:
+    k = rings_of_link(scene)
+    numbers = jnp.moveaxis(memory_tables.ring_numbers(scene, hand, k), 1, 0)
+    shape = (*numbers.shape[:2], scene.num_fingers, kin.place.shape[-1])
+    numbers = jnp.broadcast_to(numbers, shape)
+    item = np.arange(scene.discretization.links * k)
+    link = item // k + 1
+    base_frame, base = mounted(kin.place, kin.palm, hand.mount, hand.base)
+    frames = jnp.concatenate([base_frame[:, :, None], kin.link], 2)
+    joints = jnp.concatenate([base[:, None], kin.origin], 1)
+    frame = frames[:, :, link]
+    centre = once(ring_centre, joints[:, link], frame, numbers)
+    lines = None
+    if scene.effects.surface == "hull":
+        lines = _centre_lines(scene, frames, joints, numbers, centre)
+    return _FingerRings(item, link, numbers, frame, centre, lines)
+
+
 def hand_contacts(
     scene: Scene, hand: WorldModel, kin: Kinematics, velocity: Spatial, hold: jax.Array
 ) -> dict[str, HandContacts]:
@@ -213,25 +246,13 @@ def hand_contacts(
     """
     e = scene.effects
     found = {}
-    links = scene.discretization.links
     k = rings_of_link(scene)
-    n = scene.num_fingers
     on_itself = touches_itself(scene)
-    hull = e.surface == "hull"
     if not k or not (e.finger_finger or e.finger_palm or on_itself):
         return {}
-    numbers = jnp.moveaxis(memory_tables.ring_numbers(scene, hand, k), 1, 0)
-    numbers = jnp.broadcast_to(numbers, (*numbers.shape[:2], n, kin.place.shape[-1]))
-    item = np.arange(links * k)
-    link = item // k + 1
-    base_frame, base = mounted(kin.place, kin.palm, hand.mount, hand.base)
-    frames = jnp.concatenate([base_frame[:, :, None], kin.link], 2)
-    joints = jnp.concatenate([base[:, None], kin.origin], 1)
-    frame = frames[:, :, link]
-    centre = once(ring_centre, joints[:, link], frame, numbers)
-    lines = _centre_lines(scene, frames, joints, numbers, centre) if hull else None
-    alone = np.stack([np.arange(n)] * 2)
-    two = np.stack(np.triu_indices(n, 1))
+    rings = _finger_rings(scene, hand, kin)
+    alone = np.stack([np.arange(scene.num_fingers)] * 2)
+    two = np.stack(np.triu_indices(scene.num_fingers, 1))
     grip = None
     rows = held.rows(scene).get("finger_finger")
     if rows is not None:
@@ -248,36 +269,49 @@ def hand_contacts(
         run = partial(_candidates, scene)
         found[name] = met._replace(contacts=once(run, place, cone, met.relative(velocity)))
 
-    def with_lines(first: np.ndarray, second: np.ndarray, own: bool) -> tuple[Place, jax.Array]:
-        assert lines is not None
-        ring = numbers[:, :, first]
-        mine = frame[:, :, :, first]
-        at = centre[:, :, first]
-        square, other, t = lines.nearest(at, second, lines.last(numbers) if own else None)
-        place = once(finger_collision.between, ring, mine, at, lines.sections(other, second), t)
-        return place._replace(share=jnp.where(square < FAR, place.share, 0.0)), other
-
     if e.finger_palm:
-        first = (first_on_palm(links) - 1) * k
-        own = link[first:], numbers[:, first:], numbers[:, 0]
-        place = _on_palm(scene, hand, kin, own, (frame[:, :, first:], centre[:, first:]))
-        add("finger_palm", place, link[first:], jnp.int32(0), alone)
+        first = (first_on_palm(scene.discretization.links) - 1) * k
+        link = rings.link[first:]
+        own = link, rings.numbers[:, first:], rings.numbers[:, 0]
+        place = _on_palm(
+            scene, hand, kin, own, (rings.frame[:, :, first:], rings.centre[:, first:])
+        )
+        add("finger_palm", place, link, jnp.int32(0), alone)
     if on_itself:
-        place, other = with_lines(*alone, own=True)
-        add("finger_itself", place, link, other, alone)
-    if e.finger_finger and hull:
-        place, other = with_lines(*two, own=False)
-        add("finger_finger", place, link, other, two)
+        place, other = _on_lines(rings, alone, own=True)
+        add("finger_itself", place, rings.link, other, alone)
+    if e.finger_finger and rings.lines is not None:
+        place, other = _on_lines(rings, two, own=False)
+        add("finger_finger", place, rings.link, other, two)
     elif e.finger_finger:
-        mine, theirs = (v.ravel() for v in np.meshgrid(item, item, indexing="ij"))
+        mine, theirs = (v.ravel() for v in np.meshgrid(rings.number, rings.number, indexing="ij"))
         sides = [
             (v[:, i][:, :, f])
             for i, f in ((mine, two[0]), (theirs, two[1]))
-            for v in (numbers, centre)
+            for v in (rings.numbers, rings.centre)
         ]
         place = once(finger_collision.balls, *sides)
-        add("finger_finger", place, link[mine], jnp.asarray(link[theirs])[:, None, None], two)
+        others = jnp.asarray(rings.link[theirs])[:, None, None]
+        add("finger_finger", place, rings.link[mine], others, two)
     return found
+
+
+def _on_lines(rings: _FingerRings, fingers: np.ndarray, *, own: bool) -> tuple[Place, jax.Array]:
+    """Contacts of the first fingers' rings with the second ones' centre lines, and their segments.
+
+    Args:
+      fingers: First and second finger of the pairs, shape (2, pair).
+      own: Whether both are the same finger.
+    """
+    lines = rings.lines
+    assert lines is not None
+    first, second = fingers
+    numbers, frame, centre = rings.of(first)
+    last = lines.last(rings.numbers) if own else None
+    square, other, t = lines.nearest(centre, second, last)
+    section = lines.sections(other, second)
+    place = once(finger_collision.between, numbers, frame, centre, section, t)
+    return place._replace(share=jnp.where(square < FAR, place.share, 0.0)), other
 
 
 def _on_palm(

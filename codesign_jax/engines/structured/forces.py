@@ -16,6 +16,7 @@ from codesign_jax.engines.structured.laws import holding
 from codesign_jax.engines.structured.laws.contact import Contacts, constraint_update
 from codesign_jax.engines.structured.laws.kinematics import (
     Acc,
+    Kinematics,
     Spatial,
     State,
     kinematics,
@@ -61,17 +62,8 @@ def forces(
         if touch and name in ("finger_object", "palm_object"):
             rings[name.removesuffix("_object")] = once(_touch, contacts, acting)
         depth[name] = _deepest(contacts)
-    between = jnp.zeros((fingers, fingers, worlds), state.wrist.dtype)
-    on_palm = none[0]
-    met = assembly.hand_contacts(scene, hand, kin, velocity, state.held)
-    for name, these in met.items():
-        normal = once(_pressing, these, motion, velocity)
-        depth[name] = _deepest(these.contacts)
-        one, two = these.fingers
-        if name == "finger_palm":
-            on_palm = normal
-        else:
-            between = between.at[one, two].set(normal).at[two, one].set(normal)
+    between, on_palm, more = _of_hand(scene, hand, kin, state.held, (motion, velocity))
+    depth |= more
 
     def each(force: jax.Array) -> jax.Array:
         return jnp.moveaxis(force, (2, 1), (0, 1))
@@ -91,6 +83,37 @@ def forces(
         depth=depth,
         touch=rings if touch else None,
     )
+
+
+def _of_hand(
+    scene: Scene,
+    hand: WorldModel,
+    kin: Kinematics,
+    hold: jax.Array,
+    motions: tuple[Spatial, Spatial],
+) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
+    """Normal forces between fingers, (finger, finger, world), and on the palm; largest depths.
+
+    Args:
+      hold: As in `State`.
+      motions: Accelerations and velocities of the bodies.
+    """
+    fingers = scene.num_fingers
+    worlds = kin.place.shape[-1]
+    dtype = kin.place.dtype
+    between = jnp.zeros((fingers, fingers, worlds), dtype)
+    on_palm = jnp.zeros((fingers, worlds), dtype)
+    depth = {}
+    motion, velocity = motions
+    for name, these in assembly.hand_contacts(scene, hand, kin, velocity, hold).items():
+        normal = once(_pressing, these, motion, velocity)
+        depth[name] = _deepest(these.contacts)
+        one, two = these.fingers
+        if name == "finger_palm":
+            on_palm = normal
+        else:
+            between = between.at[one, two].set(normal).at[two, one].set(normal)
+    return between, on_palm, depth
 
 
 def _acting(

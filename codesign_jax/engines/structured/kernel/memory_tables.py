@@ -112,6 +112,27 @@ class Tables(KernelLayout):
         return self.backend in GATHERING or self.team > 1
 
     def _tables(self) -> None:
+        """Lays out all tables."""
+        self.hand = self._hand_table()
+        self.world = self._world_table()
+        joint = (self.links, (self.axes,))
+        hold = {f"held.{name}": (n, (3,)) for name, n in self.held.items()}
+        self.finger_state = MemoryLayout(True, finger=joint, finger_vel=joint, **hold, acc=joint)
+        world_state = dict(wrist=6, position=3, quat=4, wrist_vel=6, linear_vel=3, angular_vel=3)
+        world_state |= dict(step=1, going=1, speed=1, acc_wrist=6, acc_object=6)
+        self.world_state = MemoryLayout(
+            False, **{name: (1, (size,)) for name, size in world_state.items()}
+        )
+        scratch = self._scratch_groups()
+        if self.team > 1:
+            onchip = shared_memory.layout(self.links, self.axes)
+            self.onchip = MemoryLayout.by_item(True, **onchip)
+            elsewhere = {*onchip, *shared_memory.UNUSED}
+            scratch = {name: group for name, group in scratch.items() if name not in elsewhere}
+        self.scratch = MemoryLayout.by_item(True, **scratch)
+
+    def _hand_table(self) -> MemoryLayout:
+        """Constants of fingers and links."""
         n = self.links
         a = self.axes
         one: tuple[int, ...] = ()
@@ -124,8 +145,8 @@ class Tables(KernelLayout):
             more |= {"threshold": (self.rows, (3,))}
         if self.scene.effects.air_mass:
             more |= {"volume": (1, one)}
-        support, grid = objects.tables(self.scene, self.fingers)
-        self.hand = MemoryLayout(
+        support, _ = objects.tables(self.scene, self.fingers)
+        return MemoryLayout(
             True,
             mount=(1, (3, 3)),
             base=(1, (3,)),
@@ -142,6 +163,10 @@ class Tables(KernelLayout):
             **more,
             **support,
         )
+
+    def _world_table(self) -> MemoryLayout:
+        """Constants of worlds: of palm, wrist, object, contacts and verdict."""
+        one: tuple[int, ...] = ()
         some: dict[str, tuple[int, tuple[int, ...]]] = {}
         for contacts in self.sets:
             some |= contacts.cone_rows()
@@ -154,7 +179,8 @@ class Tables(KernelLayout):
             some |= {"palm_disc": (1, (2,))}
         if self.scene.effects.air_mass:
             some |= {"air": (1, (2,))}
-        self.world = MemoryLayout(
+        _, grid = objects.tables(self.scene, self.fingers)
+        return MemoryLayout(
             False,
             palm_mass=(1, one),
             palm_centre=(1, (3,)),
@@ -169,14 +195,11 @@ class Tables(KernelLayout):
             **dict.fromkeys(verdict.Bounds._fields, (1, one)),
             **some,
         )
-        joint = (n, (a,))
-        hold = {f"held.{name}": (n, (3,)) for name, n in self.held.items()}
-        self.finger_state = MemoryLayout(True, finger=joint, finger_vel=joint, **hold, acc=joint)
-        world_state = dict(wrist=6, position=3, quat=4, wrist_vel=6, linear_vel=3, angular_vel=3)
-        world_state |= dict(step=1, going=1, speed=1, acc_wrist=6, acc_object=6)
-        self.world_state = MemoryLayout(
-            False, **{name: (1, (size,)) for name, size in world_state.items()}
-        )
+
+    def _scratch_groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
+        """What a step leaves for its parts: bodies, forces, factors, contacts."""
+        n = self.links
+        a = self.axes
         fields: dict[str, tuple[int, tuple[int, ...]]] = {
             "axes": (n, (a, 6)),
             "body_centre": (n, (3,)),
@@ -204,15 +227,7 @@ class Tables(KernelLayout):
             fields |= {"inverse": (n, (a, a)), "z_again": (n, (a,))}
         if any(isinstance(s, FingerContactSet) for s in self.sets):
             fields |= finger_collision.fields(n)
-        if self.team > 1:
-            onchip = shared_memory.layout(n, a)
-            self.onchip = MemoryLayout.by_item(True, **onchip)
-            fields = {
-                name: f
-                for name, f in fields.items()
-                if name not in {*onchip, *shared_memory.UNUSED}
-            }
-        self.scratch = MemoryLayout.by_item(True, **fields)
+        return fields
 
 
 LENGTH = 6

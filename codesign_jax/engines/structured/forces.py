@@ -5,6 +5,7 @@ at both.  They are functions of what a rollout records, and no part of the kerne
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -60,7 +61,7 @@ def forces(
         if name == "finger_object":
             grip = normal
         if touch and name in ("finger_object", "palm_object"):
-            rings[name.removesuffix("_object")] = once(_touch, contacts, acting)
+            rings[name.removesuffix("_object")] = once(_touch, contacts, acting, state.position)
         depth[name] = _deepest(contacts)
     between, on_palm, more = _of_hand(scene, hand, kin, state.held, (motion, velocity))
     depth |= more
@@ -139,13 +140,14 @@ def _sums(name: str, contacts: Contacts, force: jax.Array) -> tuple[jax.Array, j
     return force.reshape(3, -1, *lanes).sum(1), normal.reshape(-1, *lanes).sum(0)
 
 
-def _touch(contacts: Contacts, force: jax.Array) -> Touch:
+def _touch(contacts: Contacts, force: jax.Array, position: jax.Array) -> Touch:
     """The contacts ring by ring, with axes (world, finger, ring), or (world, ring) of the palm.
 
     Args:
       contacts: Of fingers, items (link, ring of the link, finger, world), or of the palm, items
         (ring, world), with the object.
       force: Forces on the hand, shape (3, ...).
+      position: The object's centre, from which contact points are counted, shape (3, 1, world).
     """
     pressing = dot(contacts.normal, force)
 
@@ -155,11 +157,11 @@ def _touch(contacts: Contacts, force: jax.Array) -> Touch:
             return values.T
         return jnp.moveaxis(values.reshape(-1, *values.shape[2:]), 0, 2).swapaxes(0, 1)
 
-    def vectors(values: jax.Array) -> jax.Array:
+    def vectors(values: Any) -> jax.Array:
         return jnp.stack([by_ring(v) for v in values], -1)
 
     return Touch(
-        point=vectors(contacts.point),
+        point=vectors([x + origin for x, origin in zip(contacts.point, position, strict=True)]),
         normal=vectors(contacts.normal),
         gap=by_ring(contacts.distance),
         pressing=by_ring(pressing),

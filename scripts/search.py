@@ -133,10 +133,8 @@ class Study:
         self.rounds = -(-case.tests // objects) * objects
         self.batch = min(chunk, seeds * case.worlds)
         self.simulate = SceneProgram(scene, jax.jit(self._simulate))
-        self.ask = jax.jit(jax.vmap(lambda state: case.optimizer.ask(state, self.mask)))
-        self.tell = jax.jit(
-            jax.vmap(lambda state, x, c: case.optimizer.tell(state, x, c, self.mask)[0])
-        )
+        task = codesign.Task(scene, space, case.trials, engine)
+        self.episode = task.side_by_side(case.optimizer)
         episodes = self._episodes(budget)
         first = getattr(case.optimizer, "screening", 0) + getattr(case.optimizer, "retests", 0) + 1
         self.marks = sorted(
@@ -174,13 +172,16 @@ class Study:
         """Simulates an episode, or judges the designs of a mark; returns its grasps."""
         if self.done in self.marks and self.done not in self.kept:
             return self._mark()
-        population = self.ask(self.state)
-        outcome = self._all(
-            population, self._noise(codesign.STREAM_TRIAL, self.done), self.case.trials
-        )
-        cost = self._costs(outcome)
+
+        def run(seeds: np.ndarray) -> tuple[Any, ...]:
+            states = jax.tree.map(lambda v: v[seeds], self.state)
+            new, info = self.episode(states, jnp.tile(self.mask, (len(seeds), 1)))
+            return new._replace(key=None), info.population, info.selection.cost
+
+        parts = in_chunks(run, len(self.keys), max(1, self.batch // self.case.worlds))
+        state, population, cost = jax.tree.map(lambda *v: np.concatenate(v), *parts)
+        self.state = state._replace(key=self.keys)  # root keys, which stay
         self.last = population, cost
-        self.state = self.tell(self.state, population, cost)
         return cost.size * self.case.trials
 
     def save(self) -> None:

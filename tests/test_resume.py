@@ -212,37 +212,38 @@ def test_a_run_keeps_its_optimiser(finished, tmp_path, capsys):
 BASE = without(RUN, "--seed")
 
 
-TWO = [*BASE, "--episodes", "2", "--seeds", "2-3"]
+THREE = [*BASE, "--episodes", "2", "--seeds", "2-4"]
 
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory):
-    """Folder of two seeds in one batch, and what was printed."""
-    folder = tmp_path_factory.mktemp("compared") / "both"
+    """Folder of three seeds in one batch, and what was printed."""
+    folder = tmp_path_factory.mktemp("compared") / "seeds"
     text = io.StringIO()
     with contextlib.redirect_stdout(text):
-        assert command(*TWO, "--out", folder) == 0
+        assert command(*THREE, "--out", folder) == 0
     return folder, text.getvalue()
 
 
 def test_seeds_are_compared(compared):
-    both, output = compared
-    assert "  2 runs  mean" in output
-    assert stored(both / "seed-2") != stored(both / "seed-3")
+    folder, output = compared
+    assert "  3 runs  mean" in output
+    assert len({stored(folder / f"seed-{seed}") for seed in (2, 3, 4)}) == 3
     table = output[output.rindex("judged by") :]
     rows = [line for line in table.splitlines() if "final test" in line]
-    assert [row.split()[0] for row in rows] == ["2", "3"]
-    assert "of 2 runs found a good design" in table and "Wald's sequential test" in table
+    assert [row.split()[0] for row in rows] == ["2", "3", "4"]
+    assert "of 3 runs found a good design" in table and "Wald's sequential test" in table
     assert "; for objects of " in table
     assert "% of such runs (95 % interval)" in table
-    rows = [*csv.DictReader((both / "seeds.csv").read_text().splitlines())]
+    rows = [*csv.DictReader((folder / "seeds.csv").read_text().splitlines())]
     names = ("seed", "schedule", "first", "finished", "run")
     assert [tuple(row[name] for name in names) for row in rows] == [
         ("2", "concurrent", "morphology", "1", "seed-2"),
         ("3", "concurrent", "morphology", "1", "seed-3"),
+        ("4", "concurrent", "morphology", "1", "seed-4"),
     ]
     for row in rows:
-        tests = csv.DictReader((both / row["run"] / "tests.csv").read_text().splitlines())
+        tests = csv.DictReader((folder / row["run"] / "tests.csv").read_text().splitlines())
         best = min(tests, key=lambda r: float(r["test_cost"]))
         assert row["best_test_cost"] == best["test_cost"] and row["trials"] == best["trials"]
         assert int(row["paper_successes"]) <= int(row["particles"]) and row["verdict"]

@@ -1,6 +1,5 @@
 """The command line: wrong input is said in words and creates nothing; Ctrl-C; SLURM."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -128,7 +127,8 @@ def test_ctrl_c_is_one_line_and_ends_the_process(monkeypatch, capsys, request):
 
     def press():
         going.wait(30)
-        os.kill(os.getpid(), signal.SIGINT)
+        # To the thread that waits: one of JAX's would take it without waking that.
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
 
     monkeypatch.setattr(cases.Case, "simulate", simulate)
     monkeypatch.setattr(status, "leave", left.append)

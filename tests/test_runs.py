@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from codesign_jax import codesign, files, optimize, runs, scene
-from codesign_jax.runs import columns, directory, loop, scene_files, tables
+from codesign_jax.runs import columns, directory, scene_files, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs import settings as settings_module
 from codesign_jax.runs.directory import open_run
+from codesign_jax.runs.plan import finalists as finalists_of_plan
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import library, parameters
@@ -96,10 +97,15 @@ def test_the_planned_test_is_the_one_that_is_simulated(preset, episodes, finalis
     own = settings(preset=preset, particles=8, episodes=episodes, optimizer=optimize.DEFAULT)
     plan = runs.prepare(tiny()[0], own)
     state = plan.optimizer.init(jax.random.key(0), plan.space.default(), own.particles)
-    for mask in plan.mask:
+
+    @jax.jit
+    def episode(state, mask):
         asked = plan.optimizer.ask(state, mask)
-        state, _ = plan.optimizer.tell(state, asked, jnp.arange(8.0), mask)
-    tested, _ = loop.finalists(plan, np.asarray(state.particles))
+        return plan.optimizer.tell(state, asked, jnp.arange(8.0), mask)[0]
+
+    for mask in plan.mask:
+        state = episode(state, mask)
+    tested, _ = finalists_of_plan(plan, np.asarray(state.particles))
     assert len(tested) * own.trials * own.test_rounds == plan.test_grasps
     assert len(tested) == finalists
 

@@ -1,4 +1,4 @@
-"""The `codesign` command.  Nothing heavy is imported before its flags are parsed."""
+"""The `codesign` command.  Heavy modules are imported after its flags are parsed."""
 
 import importlib.metadata
 import os
@@ -71,7 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
             COMMANDS,  # type: ignore[arg-type]
             args=arguments,
             prog="codesign",
-            description="Co-design of soft hand morphology and control; --version says which.",
+            description="Co-design of hand morphology and control; --version prints the version.",
         )
         return command.run()
 

@@ -1,3 +1,5 @@
+# pyright: strict, reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownVariableType=false, reportUnknownLambdaType=false, reportMissingTypeStubs=false
 """Particles x trials in one batch: noise, commands, model fields, engine and cost put together.
 
 >>> import jax
@@ -18,7 +20,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.stats import norm
@@ -350,7 +351,7 @@ def _by_own(
 ) -> Outcome:
     if ctrl is None:
         raise ValueError("a cost of one's own needs the controls")
-    returned = own(scene, trace, ctrl)
+    returned: Any = own(scene, trace, ctrl)
     if returned is None:
         raise ValueError("a cost is one number for each world, not None: does it return one?")
     value = jnp.asarray(returned)

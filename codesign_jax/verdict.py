@@ -1,3 +1,5 @@
+# pyright: strict, reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownVariableType=false, reportUnknownLambdaType=false, reportMissingTypeStubs=false
 """Verdicts: when a world is decided, how a trial ended, and whether a design is good.
 
 A world is decided when its object is lost within the cost's window (paper Fig. 3) or when it

@@ -169,7 +169,8 @@ def _limits(schema: type, field: dataclasses.Field) -> tuple[str, str, str]:
     elif "options" in limits:
         span = ", ".join(f"`{option}`" for option in limits["options"])
     else:
-        span = {bool: "`true`, `false`", str: "text", dict: "a table"}.get(_base(hint), "a number")
+        base = typing.get_origin(_base(hint)) or _base(hint)
+        span = {bool: "`true`, `false`", str: "text", dict: "a table"}.get(base, "a number")
         several = [kind for kind in typing.get_args(hint) if typing.get_origin(kind) is tuple]
         if several:
             groups = typing.get_origin(typing.get_args(several[0])[0]) is tuple

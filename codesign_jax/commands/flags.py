@@ -1,4 +1,4 @@
-"""The flags of all commands.  Nothing heavy is imported here: `--help` is to be quick."""
+"""The flags of all commands.  This module imports nothing heavy, so that `--help` is fast."""
 
 import dataclasses
 import importlib
@@ -9,28 +9,28 @@ import tyro
 
 from codesign_jax import sizes
 
-# A flag given twice adds to what was given before.
+# A repeated flag adds to its earlier values.
 Overrides = Annotated[
     tuple[tuple[str, ...], ...],
     tyro.conf.UseAppendAction,
     tyro.conf.arg(
         name="set",
         metavar="KEY=VALUE ...",
-        help="Values that replace those of the scene, hand and objects files, by key path: "
+        help="Replace values of the scene, hand and objects files, by key path: "
         "gravity=3.7 discretization.links=5 hand.material=dragon_skin_10 "
         "objects.object.sphere.mass=0.2",
         help_behavior_hint="",
     ),
 ]
 
-# Without a default of its own: the help text says what takes its place.
+# Without a default of its own: the help text says which value is used instead.
 Text = Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="")]
 Count = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
 ENGINE = tyro.conf.arg(
     metavar="STR",
-    help="Engine that simulates: structured (ours); or, of scenes with contact spheres such as "
-    "paper_spheres and not of the default one, mujoco (C, float64) and mjx (stock). Default: "
-    "structured, or the run's own.",
+    help="Simulation engine: structured (ours); or, for scenes with contact spheres such as "
+    "paper_spheres, but not for the default scene, mujoco (C, float64) or mjx (stock). Default: "
+    "structured, or the run's engine.",
     help_behavior_hint="",
 )
 Engine = Annotated[str | None, ENGINE]
@@ -40,22 +40,22 @@ Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior
 
 @dataclasses.dataclass
 class TrialFlags:
-    """What is grasped, and how exactly that is simulated."""
+    """Objects, and accuracy of their simulation."""
 
     objects: Text = None
     """Object set: a built-in name or a .toml file; default: the scene's."""
     accuracy: Text = None
-    """Instead of the scene's discretization and solver: fast, standard, fine or reference (errors
-    and costs: docs/accuracy.md), or a .toml."""
+    """Preset that replaces the scene's discretization and solver: fast, standard, fine or reference
+    (docs/accuracy.md compares their errors and run times), or a .toml file."""
     overrides: Overrides = ()
     robust: Flag = False
-    """Draw friction, mass, size, stiffness and placement more widely for every trial: a hand that
-    does not depend on one of them (docs/command_line.md). --set objects.noise... still holds."""
+    """Vary friction, mass, size, stiffness and placement more widely between trials, for a hand
+    that depends on none of them (docs/command_line.md). --set objects.noise... overrides this."""
 
 
 @dataclasses.dataclass
 class SceneFlags(TrialFlags):
-    """The scene that is simulated."""
+    """The simulated scene."""
 
     scene: Text = None
     """Scene: a built-in name or a .toml file; default: the run's, or paper."""
@@ -65,31 +65,31 @@ class SceneFlags(TrialFlags):
 
 @dataclasses.dataclass
 class Subject(SceneFlags):
-    """Which design, of what scene, simulated by which engine."""
+    """The design, its scene and the engine."""
 
     design: Annotated[
         tuple[tuple[str, ...], ...],
         tyro.conf.UseAppendAction,
         tyro.conf.arg(metavar="FILE NAME=VALUE ...", help_behavior_hint=""),
     ] = ()
-    """The design: a .toml file that `codesign studio` saved, with the names of scene and hand, or
+    """The design: a .toml file saved by `codesign studio`, with the names of scene and hand, or
     numbers in the hand file's units, e.g. length=148 arm_z=-59, which replace the file's."""
     run_folder: Annotated[
         Path | None, tyro.conf.arg(name="run", metavar="PATH", help_behavior_hint="")
     ] = None
-    """Take scene, design space and best particle from this run folder; --accuracy, --objects, --set
-    and --engine then replace the run's."""
+    """Run folder that provides scene, design space and best particle; --accuracy, --objects, --set
+    and --engine replace the run's values."""
     preset: Text = None
-    """Design space that the names belong to; default: the run's, the design file's, or 2d."""
+    """Design space of the names; default: the run's, the design file's, or 2d."""
     engine: Engine = None
     policy: Text = None
-    """MODULE:CLASS, a policy of your own that commands the hand (docs/control.md); with --run that
+    """MODULE:CLASS, your own policy that commands the hand (docs/control.md); with --run the policy
     of the run."""
 
 
 @dataclasses.dataclass
 class RunOrDesign(Subject):
-    """As `Subject`, where the run may also come first, as in `codesign report RUN`."""
+    """Like `Subject`; the run may also be the first argument, as in `codesign report RUN`."""
 
     first: Annotated[
         Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[RUN]", help_behavior_hint="")
@@ -104,7 +104,7 @@ class RunOrDesign(Subject):
 
 @dataclasses.dataclass
 class GraspFlags(Subject):
-    """Which one grasp to show."""
+    """The grasp to show."""
 
     object: Text = None
     """Object to grasp, without noise; default: the set's first, or the trial of the run."""
@@ -117,13 +117,13 @@ class GraspFlags(Subject):
 
 
 def _size(name: str, meaning: str) -> Any:
-    """A flag of a run's size, whose help says the default."""
+    """A flag for a size of a run; its help text names the default."""
     text = f"{meaning}; default: {sizes.text(name)}."
     return tyro.conf.arg(metavar="INT", help=text, help_behavior_hint="")
 
 
 class Command:
-    """A command: its flags are fields, its work is `main` of the module of its name."""
+    """A command: its fields are flags, and `main` of the module of its name implements it."""
 
     package = "commands"
 
@@ -137,47 +137,47 @@ class Command:
 class Optimize(Command, SceneFlags):
     """Co-design morphology and control of a hand.
 
-    The same command again resumes the run in its folder, and more --episodes extend it.  Sizes that
-    are not given depend on the optimiser: those of all but the default are the paper's.
+    Repeat the command to resume the run in its folder; increase --episodes to extend it.  The
+    default sizes depend on the optimiser: all except the default optimiser use the paper's.
     """
 
     preset: str = "2d"
     """Design space: 2d, full (the whole table, 23d of the default hand) or another preset."""
     schedule: str = "concurrent"
-    """Strategy: concurrent, single, switch-K (K switches), morphology or control. Several, such as
-    single,switch-4,concurrent: runs of each, simulated in one batch, and a comparison."""
+    """Strategy: concurrent, single, switch-K (K switches), morphology or control. Several,
+    such as single,switch-4,concurrent, run in one batch and are compared."""
     first: Literal["morphology", "control", "alternate"] = "morphology"
     """Domain of the first episode with single and switch-K; alternate: morphology for even seeds,
     control for odd ones, as in the paper's experiments."""
     optimizer: Text = None
     """Optimiser: screened-es, the default of a new run, particle-filter (the paper's),
-    cma-es, open-es, pso or random (docs/command_line.md); or MODULE:CLASS, one of
-    your own. A run goes on with its own."""
+    cma-es, open-es, pso or random (docs/command_line.md); or MODULE:CLASS, your
+    own optimiser. A resumed run keeps its optimiser."""
     cost: Text = None
-    """MODULE:FUNCTION, a cost of your own instead of the scene's: a number from scene, trace and
+    """MODULE:FUNCTION, your own cost instead of the scene's: a function of scene, trace and
     controls of a grasp (docs/command_line.md)."""
     policy: Text = None
-    """MODULE:CLASS, a policy of your own that commands the hand by what it observes; its parameters
+    """MODULE:CLASS, your own policy that observes the grasp and commands the hand; its parameters
     are searched too (docs/control.md)."""
     engine: Engine = None
     particles: Annotated[int | None, _size("particles", "Particles")] = None
     trials: Annotated[
         int | None,
-        _size("trials", "Trials of a particle in an episode, best a multiple of the objects"),
+        _size("trials", "Trials per particle and episode, preferably a multiple of the objects"),
     ] = None
     episodes: Annotated[int | None, _size("episodes", "Episodes")] = None
     test_trials: Annotated[
         int | None,
-        _size("test_trials", "Further trials of each particle of the final test; 0: none"),
+        _size("test_trials", "Additional trials of each particle in the final test; 0: none"),
     ] = None
     reference_trials: Count = None
-    """Most fresh trials at accuracy reference of the particle that tested best, which go on until
-    they decide its verdict; default: 600 with engine structured; 0: none."""
+    """Maximum number of fresh trials, at accuracy reference, of the particle that tested best;
+    they end when the verdict is decided. Default: 600 with engine structured; 0: none."""
     seed: int = 0
-    """Root of all random numbers."""
+    """Seed of all random numbers."""
     seeds: Text = None
-    """Several seeds, such as 0-9 or 1,3,5: a run of each, simulated in one batch, and a
-    comparison. Each draws the random numbers that it would draw alone."""
+    """Several seeds, such as 0-9 or 1,3,5: one run for each, simulated in one batch, and a
+    comparison. Each run draws the same random numbers as alone."""
     devices: Count = None
     """Devices that share the batch; default: every GPU of this host. Results may differ in
     their last bits."""
@@ -192,77 +192,79 @@ class Optimize(Command, SceneFlags):
     """Run folder; default: runs/HAND-PRESET-SCHEDULE-SEED, with the optimiser before the seed if
     it is another. With --seeds or several --schedule a folder of run folders."""
     fresh: Flag = False
-    """Delete an earlier run in the folder and start anew."""
+    """Delete an earlier run in the folder and start again."""
     dry_run: Flag = False
     """Print the resolved scene and the number of grasps; write nothing."""
 
 
 @dataclasses.dataclass(kw_only=True)
 class Compare(Command, TrialFlags):
-    """Compare runs: a row for each, and how many of each kind found a good design.
+    """Compare runs: one row for each, and the share of runs that found a good design.
 
-    With --trials the designs of two runs are simulated in the same trials, and their difference
-    comes with its 95 % interval; so are two design files, and one design with a policy and without.
+    With --trials, the designs of two runs are simulated in the same trials, and their difference is
+    given with its 95 % interval. Two design files can be compared in the same way, and one design
+    with and without a policy.
     """
 
     folders: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER ...")]
     """Run folders, or folders of run folders; or one or two design files (.toml)."""
     trials: Count = None
-    """Trials in which the two designs are compared; default: none of runs, only what they found,
-    and 150 of design files."""
+    """Trials for comparing two designs; default: 150 for design files, none for runs, whose
+    results are listed instead."""
     seed: int = 0
-    """Root of these trials' noise."""
+    """Seed of the trials' noise."""
     engine: Text = None
-    """Engine that simulates them; default: the runs'."""
+    """Simulation engine; default: the runs' engine."""
     policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="STR ...", help_behavior_hint="")] = ()
-    """MODULE:CLASS of the runs that were made with a policy, to simulate their designs; with one
-    design alone, the policy that is compared with none."""
+    """MODULE:CLASS, the policy of runs that were made with one, to simulate their designs; with a
+    single design, the policy to compare with no policy."""
     out: File = None
     """Write a table of the runs (.csv, docs/files.md)."""
 
 
 @dataclasses.dataclass
 class Evaluate(Command, RunOrDesign):
-    """Evaluate one design: costs of each object, how sure they are, an animation if asked for."""
+    """Evaluate one design: cost and success for each object, with intervals, and the verdict."""
 
     trials: Count = None
-    """Trials, taking turns between the objects; default: as many as decide the verdict, at most 600
+    """Trials; the objects take turns. Default: as many as decide the verdict, at most 600
     (docs/command_line.md)."""
     seed: int = 0
-    """Root of the trials' noise."""
+    """Seed of the trials' noise."""
     particle: Count = None
-    """With a run: a final particle, as in its tests.csv, instead of the one that tested best."""
+    """With a run: a final particle, numbered as in its tests.csv; default: the one that tested
+    best."""
     out: File = None
-    """Write a table of the trials, with their noise and how they ended (.csv)."""
+    """Write a table of the trials with their noise and outcomes (.csv)."""
     stress: Flag = False
-    """Then grasps with heavier objects, less friction, the other bending law and other constants,
-    12 of each or --trials, and warnings of the design itself (docs/command_line.md)."""
+    """Also simulate heavier objects, less friction, the other bending law and other constants, 12
+    grasps (or --trials) for each, and check the design for warnings (docs/command_line.md)."""
     forces: File = None
-    """Write contact forces and depths of the first trial of each object, a row for each time step
-    (.csv, docs/files.md), and say how hard the fingers grip."""
+    """Write contact forces and depths of the first trial of each object, one row per time step
+    (.csv, docs/files.md), and print the grip forces of the fingers."""
     pull: Annotated[Text, tyro.conf.arg(metavar="down|x|y|z|X,Y,Z")] = None
-    """Then say how hard each object can be pulled in a direction of the world frame before it
-    leaves the hand, which stands still [N]."""
+    """Also find the force [N] that pulls each object out of the resting hand, in a direction of the
+    world frame."""
     render: File = None
-    """Draw the first trial of each object: a film (.gif, .mp4) or a strip of pictures (.png)."""
+    """Draw the first trial of each object as a film (.gif, .mp4) or a strip of pictures (.png)."""
     dry_run: Flag = False
     """Print the number of grasps; simulate nothing."""
 
 
 @dataclasses.dataclass
 class Check(Command, RunOrDesign):
-    """Measure on this machine, in about a minute, how fast and how exact a scene is.
+    """Measure speed and accuracy of a scene on this machine, in about a minute.
 
     Simulates a batch of grasps at the scene's accuracy, and as many of them at accuracy reference
-    as there is time for: grasps a second, verdicts that differ, and how long a search takes. The
-    designs are those that a run ended with, one that is given, or a mixture of random and better
+    as time allows. Prints grasps per second, the share of verdicts that differ, and the duration of
+    a search. The designs are the last ones of a run, a given one, or a mixture of random and better
     ones.
     """
 
     grasps: Count = None
-    """Grasps of the batch; default: those of an episode of a search."""
+    """Grasps in the batch; default: the size of an episode."""
     seconds: float = 30.0
-    """Time for the grasps at accuracy reference, as far as it can be known before [s]."""
+    """Approximate time for the grasps at accuracy reference [s]."""
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -277,7 +279,7 @@ class Export(Command, RunOrDesign):
     trials: int = 0
     """Grasps with noise to export as models, beside one without noise for each object."""
     seed: int = 0
-    """Root of the trials' noise."""
+    """Seed of the trials' noise."""
     no_parts: Flag = False
     """Leave out the fingers and their moulds."""
     end_wall: float = 0.0
@@ -310,23 +312,23 @@ class Export(Command, RunOrDesign):
 class Landscape(Command, RunOrDesign):
     """Draw the mean cost over a grid of two numbers: a figure, a table and arrays.
 
-    The numbers are parameters of the design, or any of the scene by their key paths. With --run and
-    two parameters the files go to the run folder, and its report shows them.
+    Each number is a parameter of the design, or any number of the scene by its key path. With
+    --run and two parameters the files go to the run folder, and its report shows them.
     """
 
     parameters: Annotated[
         tuple[str, ...], tyro.conf.arg(metavar="NAME KEY=LOW:HIGH", help_behavior_hint="")
     ] = ()
     """The two parameters, such as length arm_z=20:60 (in the hand file's units), or keys with their
-    ranges, such as objects.object.friction=0.2:1 objects.object.mass=0.05:0.5, which without an
-    entry's name mean all of a list; default: those of a design space of two. The rest stays as it
-    is."""
+    ranges, such as objects.object.friction=0.2:1 objects.object.mass=0.05:0.5; a key without the
+    name of an entry sets all entries of a list. Default: the parameters of a design space of two.
+    All other numbers stay fixed."""
     points: int = 20
-    """Points along each parameter's range, its ends included."""
+    """Points along each range, including its ends."""
     trials: int = 6
-    """Trials of each point, taking turns between the objects; all points have the same ones."""
+    """Trials of each point; the objects take turns, and all points have the same trials."""
     seed: int = 0
-    """Root of the trials' noise."""
+    """Seed of the trials' noise."""
     out: File = None
     """Folder of the files; default: the run folder, or landscape."""
     dry_run: Flag = False
@@ -335,29 +337,29 @@ class Landscape(Command, RunOrDesign):
 
 @dataclasses.dataclass
 class Render(Command, GraspFlags, RunOrDesign):
-    """Draw one grasp of a design or of a run: a film (.gif, .mp4) or a strip of pictures (.png)."""
+    """Draw one grasp of a design or run as a film (.gif, .mp4) or a strip of pictures (.png)."""
 
     out: Path = Path("grasp.gif")
     """The film or strip: .gif, .mp4 or .png."""
     times: Annotated[
         tuple[float, ...], tyro.conf.arg(metavar="SECONDS ...", help_behavior_hint="")
     ] = ()
-    """Times of a strip's pictures [s]; default: the end of each phase."""
+    """Times of the pictures in a strip [s]; default: the end of each phase."""
     size: int = 320
     """Width and height of a picture in pixels."""
     camera: Annotated[
         tuple[str, ...], tyro.conf.arg(metavar="VIEW NAME=NUMBER ...", help_behavior_hint="")
     ] = ()
-    """Where it is seen from: front, side or top, and any of azimuth=125 elevation=-20 [degrees]
-    distance=0.62 [m] x=0 y=0 z=0.15 [m, the point looked at], as of MuJoCo's free camera."""
+    """View (front, side or top) and numbers of MuJoCo's free camera: azimuth=125 elevation=-20
+    [degrees] distance=0.62 [m] x=0 y=0 z=0.15 [m, the point that it looks at]."""
 
 
 @dataclasses.dataclass
 class Report(Command):
-    """Write the report of a run: one HTML file, with the best grasp in 3D, that works offline.
+    """Write the report of a run: one HTML file with the best grasp in 3D, which works offline.
 
-    It has the chosen design and its success, the evolution of cost and parameters, the landscape
-    (where `codesign landscape --run` was there before), failures by cause, and provenance.
+    The report shows the chosen design and its success, cost and parameters over the episodes, the
+    landscape (after `codesign landscape --run`), failures by cause, and provenance.
     """
 
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -365,84 +367,85 @@ class Report(Command):
     out: File = None
     """The file; default: report.html in the run folder."""
     engine: Text = None
-    """Engine that simulates the best grasp again; default: the run's."""
+    """Engine for the grasp in 3D; default: the run's engine."""
     policy: Text = None
-    """MODULE:CLASS, the policy of a run that has one, to simulate it again."""
+    """MODULE:CLASS, the policy of the run, if it was made with one."""
     no_replay: Flag = False
-    """Leave the grasp in 3D out: nothing is simulated."""
+    """Omit the grasp in 3D, and simulate nothing."""
 
 
 @dataclasses.dataclass(kw_only=True)
 class Sample(Command, SceneFlags):
-    """Simulate random designs, one row a grasp of a Parquet file: a data set.
+    """Make a data set: simulate random designs and write a Parquet file with one row per grasp.
 
-    Designs are uniform between their bounds, with pressures lowered under the limit of their
-    walls. The same command again goes on where it was stopped.
+    Designs are uniform between their bounds, with pressures lowered to the limit of their walls.
+    Repeat the command to continue after an interruption.
     """
 
     out: Annotated[Path, tyro.conf.arg(metavar="PATH")]
-    """The file, .parquet; what is done of it is kept in a folder beside it until it is finished."""
+    """The file, .parquet; a folder beside it keeps partial results until it is finished."""
     designs: int = 1000
     """Number of designs."""
     trials: int = 3
-    """Trials of each design, each with noise of its own; objects take turns."""
+    """Trials of each design, each with its own noise; the objects take turns."""
     preset: str = "2d"
     """Design space: 2d, full (the whole table, 23d of the default hand) or another preset."""
     engine: Annotated[str, ENGINE] = "structured"
     seed: int = 0
-    """Root of designs and noise."""
+    """Seed of designs and noise."""
     chunk: Count = None
-    """Most grasps of a call, after each of which the outcomes are saved; default: 512 on CPUs,
-    16384 on a GPU. Results depend on it in the last bits only."""
+    """Maximum number of grasps per call; outcomes are saved after each call. Default: 512 on CPUs,
+    16384 on a GPU. The choice changes the last bits of results only."""
     dry_run: Flag = False
     """Print the number of grasps; simulate and write nothing."""
 
 
 @dataclasses.dataclass
 class Scenes(Command):
-    """List what is built in; of a scene its effects: on, off, or unsupported by an engine."""
+    """List built-in scenes, hands, object sets and controls, or the effects of one scene."""
 
     name: Annotated[
         str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[NAME]", help_behavior_hint="")
     ] = None
-    """Scene: a built-in name or a .toml file; default: names of all that is built in."""
+    """Scene: a built-in name or a .toml file; default: list the names of all built-in files."""
     engine: Text = None
     """Show the effects in this engine only."""
 
 
 @dataclasses.dataclass
 class Replay(Command, GraspFlags, RunOrDesign):
-    """Show one grasp in 3D in a browser, or say how a failed world of a run failed.
+    """Show one grasp in 3D in a browser, or explain how a world of a run failed.
 
-    A page of its own that works offline: the best grasp of a run, any row of its trials.csv, or a
-    design. A failed world (RUN is a file of a run folder's failures/) is simulated again.
+    Writes a page that works offline, with the best grasp of a run, any row of its trials.csv, or a
+    grasp of a design. A failed world (RUN: a file in a run folder's failures/) is simulated again.
     """
 
     out: File = None
-    """The page; default: replay.html in the run folder, or here."""
+    """The page; default: replay.html in the run folder or the working directory."""
     open: Flag = False
-    """Open it in the browser."""
+    """Open the page in the browser."""
 
 
 @dataclasses.dataclass
 class Studio(Command, RunOrDesign):
     """Open a page with the hand in 3D and a slider for each parameter of its design.
 
-    A moved slider is simulated at once; trials and the verdict follow. Designs can be saved,
-    exported, improved by a short search, and those of a run looked through. The page is served on
-    this machine alone, to the browser that opens the printed address.
+    The page simulates a moved slider at once; trials and the verdict follow. It can save a design,
+    export it, improve it by a short search, and browse the designs of a run. It is served on
+    localhost only, to browsers that open the printed address.
     """
 
     package = "studio"
 
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("studio")
-    """Folder of what is saved from the page."""
+    """Folder for designs and exports saved from the page."""
     open: Flag = False
     """Open the page in the browser."""
     port: int = 0
-    """Port of the page; 0: one that is free."""
+    """Port of the page; 0: a free one."""
     host: Annotated[str, tyro.conf.arg(metavar="HOST")] = "127.0.0.1"
-    """Name or address to serve at; other machines reach any but loopback, with the token."""
+    """Host name or address to serve on. Any but loopback can be reached by other machines that
+    have the token."""
 
 
 @dataclasses.dataclass

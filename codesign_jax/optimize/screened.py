@@ -139,11 +139,12 @@ class Screened:
         new, _ = algorithm.tell(key, unit[points], told, asked, params)
         weight = self.recency / (memory["averaged"] + self.recency)
         average = memory["average"] + weight * (new.mean - memory["average"])
-        now = {"average": average, "averaged": memory["averaged"] + 1, "strategy": arrays(new)}
+        averaged = memory["averaged"] + 1
+        now = {"average": average, "averaged": averaged, "strategy": arrays(new)}
         # The averages that were simulated, newest first, and which of them the final test takes.
         way = jnp.concatenate([population[:1], state.memory["way"][:-1]])
         rows = jnp.arange(len(cost))
-        third = now["averaged"] // 3
+        third = averaged // 3
         ago = jnp.where(rows < self.finalists, jnp.array([0, 2, 1])[rows % 3] * third, 0)
         finalists = way[jnp.minimum(ago, len(cost) - 1)]
         following = jax.tree.map(partial(jnp.where, screens), memory, now) | {

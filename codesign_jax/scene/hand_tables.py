@@ -334,7 +334,7 @@ class Preset:
 
     name: str
     free: tuple[Free, ...]
-    fixed: dict = dataclasses.field(default_factory=dict)
+    fixed: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Makes tuples of TOML's arrays, as those of other tables are."""

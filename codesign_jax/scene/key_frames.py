@@ -109,9 +109,9 @@ class ControlFile:
 
     name: str
     description: str
-    frame: tuple[dict, ...] = dataclasses.field(metadata={"table": Frame})
+    frame: tuple[dict[str, Any], ...] = dataclasses.field(metadata={"table": Frame})
     parameter: tuple[ControlParameter, ...] = ()
-    group: dict = dataclasses.field(default_factory=dict)
+    group: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
 @table
@@ -334,7 +334,7 @@ class _Reader:
             fingers = []
         self.groups[name] = fingers
 
-    def _frame(self, entry: dict, path: str, now: tuple[Sum, ...]) -> Frame:
+    def _frame(self, entry: dict[str, Any], path: str, now: tuple[Sum, ...]) -> Frame:
         known = [f.name for f in dataclasses.fields(Frame)]
         values: dict[str, Any] = {"time": Sum("s", 0.0)}
         for key, value in entry.items():
@@ -471,12 +471,14 @@ def _ends(row: Parameter) -> tuple[float, float]:
     return row.low * factor, row.high * factor  # type: ignore[operator]
 
 
-def _range(factors: Mapping[str, float], ends: Mapping[str, tuple[float, float]]) -> tuple:
+def _range(
+    factors: Mapping[str, float], ends: Mapping[str, tuple[float, float]]
+) -> tuple[Any, ...]:
     both = [sorted((f * ends[n][0], f * ends[n][1])) for n, f in factors.items() if n]
     return tuple(factors.get("", 0.0) + sum(pair[side] for pair in both) for side in (0, 1))
 
 
-def _falling(frames: tuple[Frame, ...], ends: Mapping, where: str) -> Iterator[str]:
+def _falling(frames: tuple[Frame, ...], ends: Mapping[str, Any], where: str) -> Iterator[str]:
     """Times that do not grow; a frame that repeats the one before may have its time."""
     for i, (a, b) in enumerate(zip(frames, frames[1:], strict=False), 1):
         first = _factors(a.time)
@@ -497,7 +499,7 @@ def _falling(frames: tuple[Frame, ...], ends: Mapping, where: str) -> Iterator[s
             )
 
 
-def _walls(hand: Hand) -> Iterator[tuple]:
+def _walls(hand: Hand) -> Iterator[tuple[Any, ...]]:
     for bounds in hands.all_bounds(hand):
         both = zip(bounds["wall"], bounds.get("tip_wall", bounds["wall"]), strict=True)
         thinnest = [map(min, *ends) for ends in both]  # of a tapered finger
@@ -506,7 +508,7 @@ def _walls(hand: Hand) -> Iterator[tuple]:
 
 
 def _too_high(
-    frames: tuple[Frame, ...], own: Mapping, low: Any, high: Any, limits: Any, where: str
+    frames: tuple[Frame, ...], own: Mapping[str, Any], low: Any, high: Any, limits: Any, where: str
 ) -> Iterator[str]:
     for i, frame in enumerate(frames):
         for finger, value in enumerate(frame.pressure or ()):

@@ -25,8 +25,8 @@ def read(
     name: str | pathlib.Path,
     overrides: Mapping[Any, Any] | None,
     problems: list[str],
-    prepare: Callable[[dict, dict[Path, Any]], None] = lambda table, changes: None,
-) -> tuple[dict, pathlib.Path, Any]:
+    prepare: Callable[[dict[str, Any], dict[Path, Any]], None] = lambda table, changes: None,
+) -> tuple[dict[str, Any], pathlib.Path, Any]:
     """Reads a file of hands, objects or controls, with other values in it.
 
     Args:
@@ -119,7 +119,12 @@ def below(changes: Mapping[Path, Any], key: str) -> dict[Path, Any]:
 
 
 def apply(
-    table: dict, changes: Mapping[Path, Any], where: str, problems: list[str], *, root: str = ""
+    table: dict[str, Any],
+    changes: Mapping[Path, Any],
+    where: str,
+    problems: list[str],
+    *,
+    root: str = "",
 ) -> dict[str, str]:
     """Changes values of a file that was read, before its schema checks keys and values.
 
@@ -192,12 +197,12 @@ def _apply(
     _apply(place[key], rest, value, (names, given), problems, places)
 
 
-def _names(entries: list) -> list[str]:
+def _names(entries: list[Any]) -> list[str]:
     names = [str(e["name"]) for e in entries if isinstance(e, dict) and "name" in e]
     return names or [str(i) for i in range(len(entries))]
 
 
-def _index(entries: list, key: str) -> int | None:
+def _index(entries: list[Any], key: str) -> int | None:
     for i, entry in enumerate(entries):
         if isinstance(entry, dict) and entry.get("name") == key:
             return i

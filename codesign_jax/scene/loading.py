@@ -21,8 +21,14 @@ from codesign_jax.scene.description import Scene, SceneFile
 from codesign_jax.scene.primitives import PRIMITIVES
 from codesign_jax.scene.tables import Accuracy, Fixture
 
-GONE = ("effects.soft_touch", "effects.speculative_palm", "contact.touch_depth")
-GONE += ("contact.time_constant", "contact.impedance", "discretization.spring_damping")
+GONE = (
+    "effects.soft_touch",
+    "effects.speculative_palm",
+    "contact.touch_depth",
+    "contact.time_constant",
+    "contact.impedance",
+    "discretization.spring_damping",
+)
 """Keys of earlier scene files, which have no effect any more; see docs/hull.md and, for the last,
 `discretization.integrator` in docs/physics.md, whose default is the former "added"."""
 _OF_ACCURACY = ("discretization", "solver", "newton")
@@ -109,7 +115,7 @@ def _with_law(scene: SceneFile, material: hand.Material, where: str, problems: l
     return dataclasses.replace(scene, effects=dataclasses.replace(scene.effects, neo_hookean=law))
 
 
-def _leave_out(table: dict, changes: dict[tuple, Any], where: str) -> None:
+def _leave_out(table: dict[str, Any], changes: dict[tuple[Any, ...], Any], where: str) -> None:
     found = []
     for key in (tuple(name.split(".")) for name in GONE):
         inside = table.get(key[0])

@@ -354,7 +354,9 @@ def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
     return shape
 
 
-def _off_centre(values: dict, path: Path, where: str, problems: list[str]) -> Shape | None:
+def _off_centre(
+    values: dict[str, Any], path: Path, where: str, problems: list[str]
+) -> Shape | None:
     """A primitive as the mesh of its surface, which may have its centre of mass anywhere."""
     primitive = PRIMITIVES[values["type"]]
     size = (*values["size"], 0.0, 0.0)[:3]
@@ -365,7 +367,7 @@ def _off_centre(values: dict, path: Path, where: str, problems: list[str]) -> Sh
     return _mesh_shape(values | mesh, path, where, problems, content)
 
 
-def _primitive(values: dict) -> Shape:
+def _primitive(values: dict[str, Any]) -> Shape:
     primitive = PRIMITIVES[values["type"]]
     size = (*values["size"], 0.0, 0.0)[:3]
     mass = values["mass"]
@@ -373,11 +375,16 @@ def _primitive(values: dict) -> Shape:
     if mass is None:
         mass = values["density"] * primitive.volume(size)
     own = inertia and tuple(v / mass for v in inertia[:3])
-    return Shape(**values | {"mass": mass, "density": None, "own_inertia": own})
+    changed: dict[str, Any] = {"mass": mass, "density": None, "own_inertia": own}
+    return Shape(**values | changed)
 
 
 def _mesh_shape(
-    values: dict, path: Path, where: str, problems: list[str], content: bytes | None = None
+    values: dict[str, Any],
+    path: Path,
+    where: str,
+    problems: list[str],
+    content: bytes | None = None,
 ) -> Shape | None:
     from codesign_jax.scene import meshes
 
@@ -398,4 +405,5 @@ def _mesh_shape(
         return None
     # Written back as a mass, so that the same file read again gives the same object.
     mass = values["density"] * mesh.volume if mass is None else mass
-    return Shape(**values | {"mass": mass, "density": None, "mesh": mesh})
+    changed: dict[str, Any] = {"mass": mass, "density": None, "mesh": mesh}
+    return Shape(**values | changed)

@@ -411,7 +411,7 @@ def design_space(hand: Hand, preset: str = "full") -> DesignSpace:
 
 def without_effect(hand: Hand) -> dict[str, str]:
     """Parameters that change nothing in a hand, with the reason; no preset searches them."""
-    shares = [finger.spread for finger in hand.finger]
+    shares: list[Any] = [finger.spread for finger in hand.finger]  # a number may be an array
     if all(isinstance(share, int | float) and share == 0 for share in shares):
         return {"spread": "every finger has spread = 0"}
     return {}

@@ -29,13 +29,13 @@ class Primitive(NamedTuple):
     # Distance of its farthest point from the centre [m], a function of its sizes
     radius: Callable[[Any], Any]
     # Of its bounding box in its own frame [m], three numbers, likewise
-    half_extents: Callable[[Any], tuple]
+    half_extents: Callable[[Any], tuple[Any, ...]]
     # Principal inertia of the solid per mass [m^2], three numbers, likewise
-    inertia: Callable[[Any], tuple]
+    inertia: Callable[[Any], tuple[Any, ...]]
     triangles: Callable[[Any], Any]  # its surface as a trimesh.Trimesh, likewise
 
 
-def block_inertia(mass: Any, x: Any, y: Any, z: Any) -> tuple:
+def block_inertia(mass: Any, x: Any, y: Any, z: Any) -> tuple[Any, ...]:
     """Principal inertia of a solid block with edges x, y, z [m] about its centre [kg m^2]."""
     return mass * (y**2 + z**2) / 12, mass * (x**2 + z**2) / 12, mass * (x**2 + y**2) / 12
 
@@ -45,12 +45,12 @@ def _across(up: Any) -> Any:
     return (up[0] ** 2 + up[1] ** 2 + 1e-37) ** 0.5
 
 
-def _cylinder_inertia(size: Any) -> tuple:
+def _cylinder_inertia(size: Any) -> tuple[Any, ...]:
     across = size[0] ** 2 / 4 + size[1] ** 2 / 3
     return across, across, size[0] ** 2 / 2
 
 
-def _capsule_inertia(size: Any) -> tuple:
+def _capsule_inertia(size: Any) -> tuple[Any, ...]:
     """Cylinder and two half balls, whose centres of mass lie 3/8 r beyond the cylinder's ends."""
     radius = size[0]
     half = size[1]

@@ -229,13 +229,13 @@ def table(cls: type[T]) -> type[T]:
     rest_of = _getter(static)
     keys = tuple(map(jax.tree_util.GetAttrKey, data))
 
-    def parts(value: T) -> tuple[tuple, tuple]:
+    def parts(value: T) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         return leaves_of(value), rest_of(value)
 
-    def named_parts(value: T) -> tuple[tuple, tuple]:
+    def named_parts(value: T) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         return tuple(zip(keys, leaves_of(value), strict=True)), rest_of(value)
 
-    def whole(rest: tuple, leaves: typing.Iterable) -> T:
+    def whole(rest: tuple[Any, ...], leaves: typing.Iterable[Any]) -> T:
         made = object.__new__(cls)
         made.__dict__.update(zip(static, rest, strict=True))
         made.__dict__.update(zip(data, leaves, strict=True))
@@ -247,7 +247,7 @@ def table(cls: type[T]) -> type[T]:
     return cls
 
 
-def _getter(names: tuple[str, ...]) -> typing.Callable[[Any], tuple]:
+def _getter(names: tuple[str, ...]) -> typing.Callable[[Any], tuple[Any, ...]]:
     """A function to the attributes of these names, as a tuple."""
     if len(names) > 1:
         return operator.attrgetter(*names)
@@ -269,7 +269,7 @@ def _check_when_made(cls: type) -> None:
     cls.__init__ = checked
 
 
-def _known_problem(path: str, value: Any, field: dataclasses.Field) -> str | None:
+def _known_problem(path: str, value: Any, field: dataclasses.Field[Any]) -> str | None:
     """What is wrong with the numbers of a field of a table, as far as they are known."""
     if isinstance(value, tuple):
         found = (_known_problem(f"{path}[{i}]", v, field) for i, v in enumerate(value))
@@ -301,7 +301,7 @@ def replaced(table: T, **changes: Any) -> T:
     return made
 
 
-def _is_leaf(field: dataclasses.Field) -> bool:
+def _is_leaf(field: dataclasses.Field[Any]) -> bool:
     return "low" in field.metadata and not field.metadata["structure"]
 
 
@@ -309,7 +309,7 @@ def _holds_tables(hint: Any) -> bool:
     return hint in _tables or any(map(_holds_tables, typing.get_args(hint)))
 
 
-def each(table: T, leaf: typing.Callable[[dataclasses.Field], Any]) -> T:
+def each(table: T, leaf: typing.Callable[[dataclasses.Field[Any]], Any]) -> T:
     """The table with leaf(field) in place of each of its leaves."""
     changes: dict[str, Any] = {}
     for field in dataclasses.fields(table):  # type: ignore[arg-type]
@@ -333,16 +333,18 @@ def typical(table: T) -> T:
     return each(table, lambda field: field.metadata["typical"])
 
 
-def _range(field: dataclasses.Field) -> Range:
+def _range(field: dataclasses.Field[Any]) -> Range:
     return Range(*(field.metadata[key] for key in ("unit", "low", "high")))
 
 
-def _required(field: dataclasses.Field) -> bool:
+def _required(field: dataclasses.Field[Any]) -> bool:
     missing = dataclasses.MISSING
     return field.default is missing and field.default_factory is missing
 
 
-def _value(hint: Any, value: Any, path: str, field: dataclasses.Field, problems: list[str]) -> Any:
+def _value(
+    hint: Any, value: Any, path: str, field: dataclasses.Field[Any], problems: list[str]
+) -> Any:
     if isinstance(hint, types.UnionType):
         # "X | None": TOML has no null, so a given value is an X. "X | tuple[X, ...]": one or many.
         kinds = [a for a in typing.get_args(hint) if a is not type(None)]
@@ -359,14 +361,16 @@ def _value(hint: Any, value: Any, path: str, field: dataclasses.Field, problems:
         return tuple(_value(item, v, f"{path}[{i}]", field, problems) for i, v in enumerate(value))
     if dataclasses.is_dataclass(hint):
         return parse(hint, value, path, problems)  # type: ignore[arg-type]
-    if hint is dict:
+    if typing.get_origin(hint) is dict:
         if not isinstance(value, dict):
             problems.append(f"{path} must be a table, not {type(value).__name__}")
         return value
     return _scalar(hint, value, path, field, problems)
 
 
-def _scalar(hint: Any, value: Any, path: str, field: dataclasses.Field, problems: list[str]) -> Any:
+def _scalar(
+    hint: Any, value: Any, path: str, field: dataclasses.Field[Any], problems: list[str]
+) -> Any:
     accepted = (int, float) if hint is float else hint
     if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):
         problems.append(f"{path} = {shown(value)} must be {_kind(hint, field)}")
@@ -391,7 +395,7 @@ def _scalar(hint: Any, value: Any, path: str, field: dataclasses.Field, problems
         return None
 
 
-def _kind(hint: type, field: dataclasses.Field) -> str:
+def _kind(hint: type, field: dataclasses.Field[Any]) -> str:
     if hint is bool:
         return "true or false"
     if hint is str:

@@ -5,6 +5,7 @@ and ranges of the fields, see `scripts/reference_page.py`.
 """
 
 import dataclasses
+from typing import Any
 
 from codesign_jax.scene import rigid_bodies
 from codesign_jax.scene.schema import choice, quantity, table
@@ -285,9 +286,9 @@ class Accuracy:
     """
 
     description: str
-    discretization: dict
-    solver: dict
-    newton: dict = dataclasses.field(default_factory=dict)
+    discretization: dict[str, Any]
+    solver: dict[str, Any]
+    newton: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
 @table

@@ -30,7 +30,9 @@ def repair(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
     return vertices, faces, report
 
 
-def _merge(vertices: np.ndarray, faces: np.ndarray, report: list[str]):
+def _merge(
+    vertices: np.ndarray, faces: np.ndarray, report: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
     near = _MERGE * np.ptp(vertices, axis=0).max()
     pairs = KDTree(vertices).query_pairs(near, output_type="ndarray")
     if not len(pairs):

@@ -21,7 +21,7 @@ from codesign_jax.types import Params, Trial
 
 
 class Plan(NamedTuple):
-    """What the key frames command over a grasp, and what a grasp adds to any command.
+    """Commands of the key frames over a grasp, and additions that apply to any command.
 
     Attributes:
       pose: Pose of the arm frame: x, y, z [m], roll, pitch, yaw [rad], shape (time, 6); positive

@@ -155,7 +155,7 @@ def _first(condition: jax.Array) -> jax.Array:
 
 
 def _solved(trace: Trace, decided: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """How the solver ended in the steps before the one at which the trial was decided."""
+    """State of the solver in the steps before the trial was decided."""
     dtype = trace.distance.dtype
     untold = jnp.full((), jnp.nan, dtype)
     if trace.status is None:

@@ -50,7 +50,7 @@ def append(path: Path, text: str) -> None:
 
 
 def special(folder: Path, names: Iterable[str]) -> list[str]:
-    """What lies under these names in a folder and is neither a file nor a folder.
+    """Entries of these names in a folder that are neither files nor folders.
 
     A link leads out of the folder, a FIFO has its reader wait for ever; archives may hold both.
     Folders are looked into. A name that is not there is none of them.

@@ -46,7 +46,7 @@ PERIOD = 0.05
 
 
 class Pose(NamedTuple):
-    """Where a body is, in the world frame.
+    """Pose of a body in the world frame.
 
     Attributes:
       position: Origin of its frame [m], shape (..., 3).
@@ -58,7 +58,7 @@ class Pose(NamedTuple):
 
 
 class Command(NamedTuple):
-    """What the hand is told to do over a period.
+    """Command to the hand for a period.
 
     The disturbance and the trial's noise are added to the pose, and the air supply acts on the
     pressures.  A pressure below zero or above the limit of the finger's wall is moved to that end.
@@ -74,7 +74,7 @@ class Command(NamedTuple):
 
 
 class Observation(NamedTuple):
-    """What a policy observes of its world at the beginning of a period.
+    """Observation of a world at the beginning of a period.
 
     Attributes:
       time: Time since the beginning of the grasp [s], shape ().
@@ -201,7 +201,7 @@ class ControlLoop(Equal):
         return trace._replace(last=carry[0].state)
 
     def first_command(self, params: Params, trial: Trial) -> Command:
-        """What the policy commands over a grasp's first period: it is asked, nothing is simulated.
+        """The policy's command for the first period of a grasp, without a simulation.
 
         Raises:
           InputError: As `rollout`.
@@ -209,7 +209,7 @@ class ControlLoop(Equal):
         return self._rehearsed(params, trial, 1)
 
     def rehearsed(self, params: Params, trial: Trial) -> Command:
-        """What the policy commands over a grasp in which nothing moves, shape (step, ...).
+        """The policy's commands over a motionless grasp, shape (step, ...).
 
         It is asked in every whole period and observes hand and object where they begin, while time
         and key frames go on: nothing is simulated.
@@ -304,7 +304,7 @@ def searched(scene: Scene, policy: Policy) -> Scene:
 
 
 def doubts(loop: ControlLoop, params: Params, trial: Trial) -> list[str]:
-    """What is no error in a policy's commands, and hardly meant: kPa for Pa."""
+    """Warnings about a policy's commands that are legal but suspicious: kPa given as Pa."""
     command = jax.jit(loop.rehearsed)(params, trial)
     words = unit_slips.kilopascals(np.asarray(command.pressure))
     if not words:
@@ -335,7 +335,7 @@ def begin(scene: Scene, fields: ModelFields, plan: Plan) -> World:
 def observe(
     engine: Engine, hand: WorldModel, fields: ModelFields, world: World, plan: Plan
 ) -> Observation:
-    """What policies observe, every array with a leading axis (world,)."""
+    """Observations for policies; every array has the leading axis (world,)."""
     scene: Scene = engine.scene  # type: ignore[attr-defined]
     state = coordinates.reset(scene, fields._replace(start=world.state))
     found = kinematics(hand, layout(scene).axes, state)

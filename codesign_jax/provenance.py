@@ -1,4 +1,4 @@
-"""What a result depends on besides its inputs: code, versions and machine."""
+"""Code, versions and machine that a result depends on besides its inputs."""
 
 import importlib.metadata
 import platform

@@ -1,4 +1,4 @@
-"""What may be reused: programs within a process; programs, kernels and grids of meshes on disk.
+"""Reuse of programs within a process, and of programs, kernels and grids of meshes on disk.
 
 All of it is known by the code that made it, the versions of packages, and kernels by the device.
 
@@ -144,7 +144,7 @@ def _environment() -> tuple[str, str]:
 
 
 def problems() -> list[str]:
-    """What is wrong with the environment variables, in words."""
+    """Problems with the environment variables, in words."""
     switch, most = _environment()
     found = [] if switch in ("on", "off") else [f"CODESIGN_CACHE = {switch!r} must be on or off"]
     if not (most.isascii() and most.isdecimal() and len(most) <= 18):

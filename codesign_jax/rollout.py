@@ -48,7 +48,7 @@ a grasp up to the loss of the object only, and its qpos needs `record_qpos=True`
 
 
 class Options(NamedTuple):
-    """How worlds are simulated and judged: keywords of `simulate`, `grasp` and `evaluate`.
+    """Options of simulation and judgement: keywords of `simulate`, `grasp` and `evaluate`.
 
     Attributes:
       record_qpos: Whether the trace holds qpos of every step; such worlds go on when they are lost.
@@ -290,7 +290,7 @@ def prepare(
     trials: Trial,
     engine: Engine | None = None,
 ) -> tuple[model.ModelFields, Any, jax.Array]:
-    """What a batch of worlds is, before an engine simulates it.
+    """Inputs of an engine for a batch of worlds.
 
     Args:
       scene: The scene; its numbers of shape () or (world,).

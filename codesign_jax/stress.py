@@ -1,4 +1,4 @@
-"""What a builder should know of a design: what it keeps under other conditions, and warnings.
+"""Tests of a design under other conditions, and warnings about the design.
 
 Mass, friction and other constants are data of one program; the other bending law is a program.
 """
@@ -146,7 +146,7 @@ def simulate(
 
 
 def sets(scene: Scene) -> int:
-    """How often `simulate` simulates its trials: as they are, by the other law, and of variants."""
+    """Number of simulations of each trial by `simulate`: unchanged, by the other law, and variants."""
     return 2 + len([*variants(scene)])
 
 

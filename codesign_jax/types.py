@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 
 class Status(enum.IntFlag):
-    """What went wrong in a world, as bits; OK is zero.
+    """Faults of a world, as bits; OK is zero.
 
     Every bit but those of `WARNINGS` makes the trial a failed one, see `failed`: a verdict counts
     it as lost, and a mean cost leaves it out or takes the maximum for it (`cost.failure`). All of
@@ -124,7 +124,7 @@ class Params(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """One trial's object and noise.
+    """Object and noise of a trial.
 
     Attributes:
       shape: Index of the object in the object set, shape () int32.
@@ -157,7 +157,7 @@ class Trial(NamedTuple):
 
 
 class Phased(Protocol):
-    """What knows the phases of a grasp: a scene."""
+    """An object with the phases of a grasp, such as a scene."""
 
     @property
     def num_steps(self) -> int:
@@ -230,7 +230,7 @@ class Forces(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """What a rollout reports of every time step; entry k describes the state at time k * timestep.
+    """A rollout's report of every time step; entry k is the state at time k * timestep.
 
     A world that failed stays in its last good state: the one before a step to a state that is too
     fast or not finite, and the first one below the table.  From the failure on its speed is that of

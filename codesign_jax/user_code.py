@@ -39,7 +39,7 @@ def is_user_code(name: str) -> bool:
 
 
 def problem(name: str) -> str | None:
-    """What is wrong with the name itself, in words; nothing is imported."""
+    """The problem with the name itself, in words; nothing is imported."""
     module, colon, attribute = name.rpartition(":")
     if colon and module.endswith(".py"):
         dotted = ".".join(Path(module.removesuffix(".py")).parts)

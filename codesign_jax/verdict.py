@@ -33,7 +33,7 @@ FAR = 3e38
 
 
 class Bounds(NamedTuple):
-    """What decides a world: numbers, or arrays that broadcast to those of the worlds."""
+    """Thresholds that decide a world: numbers, or arrays that broadcast to the worlds' arrays."""
 
     # Distance from object centre to hand centre from which on the object is lost [m]
     lost_distance: Any
@@ -123,7 +123,7 @@ VERDICTS = ("kept", "lost", "not_released", "failed")
 
 
 def verdicts(outcomes: Outcome) -> np.ndarray:
-    """How trials ended, as indices of `VERDICTS`: the one rule of tables, reports and commands.
+    """Outcomes of trials as indices of `VERDICTS`; tables, reports and commands use this rule.
 
     Lost is what did not fail and lost its object within the window of the scene's cost, whatever
     a cost of one's own says.  Of the trials that failed, not released are those in which the hand
@@ -145,12 +145,12 @@ def verdicts(outcomes: Outcome) -> np.ndarray:
 
 
 def kept(outcomes: Outcome) -> np.ndarray:
-    """Which trials kept their object and let go of it at the end, bool, shaped as the outcomes."""
+    """Whether trials kept their object and released it at the end, shaped like the outcomes."""
     return verdicts(outcomes) == VERDICTS.index("kept")
 
 
 class Tally(NamedTuple):
-    """How trials ended, numbers of them; the four add up to all."""
+    """Numbers of trials by outcome; the four add up to all trials."""
 
     kept: int  # neither lost nor failed
     lost: int  # the object left the hand within the window of the cost
@@ -233,7 +233,7 @@ def evidence(kept: int, total: int) -> float:
 
 
 def word(kept: int, total: int) -> str:
-    """What a design is, good, not good or `OPEN`: the only place that decides.
+    """The word for a design: good, not good or `OPEN`; no other function decides it.
 
     A kept grasp more never makes a verdict worse, a lost one never better.  It may be asked for
     after every grasp, and trials may be added: `ERROR` bounds the probability of ever being wrong.
@@ -258,7 +258,7 @@ def _more(ratio: float, total: int) -> int:
 
 
 def good(outcomes: Outcome) -> np.ndarray:
-    """Which designs are good, bool; of outcomes with the trial as the last axis."""
+    """Whether designs are good, from outcomes with the trial as the last axis."""
     every = kept(outcomes)
     found = [word(int(n), every.shape[-1]) == "good" for n in every.sum(-1).ravel()]
     return np.array(found).reshape(every.shape[:-1])
@@ -295,7 +295,7 @@ def _goes_on(outcomes: Outcome, most: int) -> bool:
 
 
 class Characteristic(NamedTuple):
-    """What `sequential` does with a design that keeps a certain share of its grasps."""
+    """Behaviour of the test `sequential` for a design with a given true share of kept grasps."""
 
     good: float  # probabilities of the three ends
     not_good: float

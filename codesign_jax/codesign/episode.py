@@ -28,7 +28,7 @@ STREAM_TRIAL = 0x7472696C
 
 
 class EpisodeInfo(NamedTuple):
-    """What one episode reports.
+    """The report of an episode.
 
     Attributes:
       population: Particles as simulated [SI units], shape (particle, parameter).
@@ -48,7 +48,7 @@ class EpisodeInfo(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Task:
-    """What is optimised: grasps of hands of a design space, and what they cost.
+    """A problem to optimise: grasps by hands of a design space, and their cost.
 
     Its functions are programs that all scenes of one structure share (`programs`): another scene of
     the same structure, as by `dataclasses.replace(scene, gravity=3.7)`, compiles nothing.
@@ -202,7 +202,7 @@ class _Weighing(SceneProgram):
     """A program whose costs of one's own a particle filter weighs: negative ones count as 0."""
 
     def __call__(self, first: Any, second: Any, scene: Scene | None = None) -> Any:
-        """As of `SceneProgram`; a warning if a particle's cost is negative, but for traced ones."""
+        """Like `SceneProgram`, but warns of negative particle costs, except traced ones."""
         found = super().__call__(first, second, scene)
         costs = found[1].selection.cost
         if not isinstance(costs, jax.core.Tracer) and (np.asarray(costs) < 0).any():
@@ -216,7 +216,7 @@ class _Weighing(SceneProgram):
 
 
 class _Programs(NamedTuple):
-    """What a task runs."""
+    """The programs of a task."""
 
     evaluate: Any
     episode: Any

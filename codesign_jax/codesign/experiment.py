@@ -1,4 +1,4 @@
-"""How the paper's experiments begin, end and are measured (section VI.4)."""
+"""Start, end and measures of the paper's experiments (section VI.4)."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -28,7 +28,7 @@ SEED_COST = 2.0
 
 
 class FinalTest(NamedTuple):
-    """How particles did in the final test.
+    """Results of particles in the final test.
 
     Attributes:
       outcomes: Arrays of shape (particle, trial).

@@ -1,1 +1,1 @@
-"""What the subcommands of `codesign` do, once their flags are parsed."""
+"""Implementations of the subcommands of `codesign`."""

@@ -75,7 +75,7 @@ def main(options: Check) -> int:
 def simulate(
     case: Case, settings: Settings, finer: Scene, options: Check, console: Console
 ) -> tuple[str, Measured, Measured]:
-    """What the designs are, and their grasps in the scene and in the finer one.
+    """A description of the designs, and their grasps in the scene and in the finer scene.
 
     The second are the first of the first ones: the same designs and trials.
     """
@@ -113,7 +113,7 @@ def _refuse(options: Check, case: Case, finer: Scene) -> None:
 
 
 def _head(case: Case, load: float) -> list[str]:
-    """What is checked and where; warnings."""
+    """The subject and the machine of the check, and warnings."""
     device = jax.devices()[0]
     where = f"{os.cpu_count()} CPU cores"
     if hasattr(os, "sched_getaffinity"):

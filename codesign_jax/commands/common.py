@@ -1,4 +1,4 @@
-"""What the commands share: designs, notes and JAX's compilation cache."""
+"""Helpers of several commands: designs, notes and JAX's compilation cache."""
 
 import dataclasses
 import importlib.util
@@ -57,7 +57,7 @@ class DesignFile:
 
 
 def design_file(options: SceneFlags) -> DesignFile:
-    """What the file of --design names, if there is one; flags that name the same hold."""
+    """Names in the file of --design, if one is given; flags override them."""
     words = [*chain.from_iterable(getattr(options, "design", ()))]
     names = ("preset", "scene", "hand", "objects")
     flags = {name: given for name in names if (given := getattr(options, name, None))}
@@ -251,7 +251,7 @@ def place_problems(flag: str, path: Path | None, *suffixes: str, folder: bool = 
 
 
 def number_problems(*numbers: tuple[str, float | None, float, float]) -> list[str]:
-    """What is wrong with numbers of a command line."""
+    """Problems with numbers of a command line."""
     given = [(flag, v, "", low, high) for flag, v, low, high in numbers if v is not None]
     return [problem for number in given if (problem := schema.range_problem(*number))]
 
@@ -262,7 +262,7 @@ def print_table(console: Console, table: Table) -> None:
 
 
 def picture_problems(flag: str, path: Path | None) -> list[str]:
-    """What is wrong with the path of a picture."""
+    """Problems with the path of a picture."""
     problems = place_problems(flag, path, ".gif", ".mp4", ".png")
     if path and path.suffix == ".mp4" and importlib.util.find_spec("av") is None:
         problems.append(f"{flag} {path} needs PyAV: pip install -e '.[report]' in the checkout")

@@ -58,7 +58,7 @@ class Compared(NamedTuple):
 
     @property
     def kind(self) -> dict[str, str]:
-        """What runs may differ in, beside their seeds, by the column's name."""
+        """Properties besides the seed in which runs may differ, by column."""
         own = {"scene": self.scene.name, "hand": self.scene.hand.name}
         own["objects"] = self.scene.objects.name
         return own | {_WORDS.get(n, n): str(getattr(self.settings, n)) for n in _OF_SETTINGS}
@@ -171,7 +171,7 @@ def compare_pair(pair: dict[str, Case], options: Compare, console: Console) -> N
 
 
 def difference(first: np.ndarray, second: np.ndarray, names: list[str]) -> list[str]:
-    """Says how often each of two designs kept the object, in the same trials.
+    """Prints how often each of two designs kept the object, in the same trials.
 
     Args:
       first: Which trials the first design kept, shape (trial,) bool.
@@ -249,7 +249,7 @@ def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Table:
 
 
 def _summary(own: list[Compared]) -> tuple[str, ...]:
-    """How the runs of a kind did; what is not known of them is empty."""
+    """Summary of the runs of a kind; unknown values are empty."""
     size = own[0].settings.particles * own[0].settings.trials
     episodes = [run.converged for run in own]
     # Of an even number the upper one of the two in the middle: never, if half of them never do.

@@ -154,7 +154,7 @@ def _untried(case: Case, options: Evaluate) -> list[str]:
 
 
 def of_objects(case: Case, engine: Engine, options: Evaluate, console: Console) -> None:
-    """Of the first trial of each object: its forces, the pull that ends it, and a drawing."""
+    """Forces, pull test and drawing of the first trial of each object."""
     from codesign_jax.report import animation
 
     scene = case.scene

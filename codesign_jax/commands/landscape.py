@@ -118,7 +118,7 @@ def _in_scenes(
     size: int,
     advance: Callable[[int], None],
 ) -> Outcome:
-    """As `simulated_designs`, each point in its own scene; one program for all of them."""
+    """Like `simulated_designs`, with a scene for each point; one program simulates all."""
     key, count = noise
     base, tree = jax.tree.flatten(case.scene)
     varied = (numbers != numbers[0]).any(0)

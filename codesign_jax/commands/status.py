@@ -18,7 +18,7 @@ _REMEDIES[errno.EIO] = "the disk or the network to it fails; when it works"
 
 
 def words(error: Exception) -> str:
-    """What an error says to a user, in a line; of a full or broken disk also what to do."""
+    """An error as one line for the user, with advice if a disk is full or broken."""
     if not isinstance(error, OSError) or error.strerror is None:
         return str(error)
     name = os.fsdecode(error.filename or "a file").encode("utf-8", "backslashreplace").decode()

@@ -65,7 +65,7 @@ class Equal:
 
 
 def refuse_meshes(scene: Scene, engine: str) -> None:
-    """Says which objects an engine that collides by MuJoCo's own geoms cannot simulate.
+    """Refuses objects that an engine with MuJoCo's own collision detection cannot simulate.
 
     MuJoCo takes a mesh for its convex hull, and its vertices, unlike a primitive's sizes, cannot
     differ between the worlds of a batch, as the size noise asks for.

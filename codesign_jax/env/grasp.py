@@ -1,4 +1,4 @@
-"""One grasp as an environment, whose observation, action and reward are methods."""
+"""A grasp as an environment; observation, action and reward are methods."""
 
 import contextlib
 import dataclasses
@@ -43,7 +43,7 @@ class Data(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class State:
-    """What `reset` and `step` return; names are those of Brax and MuJoCo Playground.
+    """Result of `reset` and `step`, with the names of Brax and MuJoCo Playground.
 
     Attributes:
       data: The world.
@@ -120,7 +120,7 @@ class GraspEnv:
         self.episode_length = -(-scene.num_steps // self._steps)
 
     def observe(self, seen: Observation) -> jax.Array:
-        """What the agent observes: what a hand feels, and not where the object is.
+        """The agent's observation: signals of sensors on a hand, without the object's position.
 
         Time of the grasp and of the phase [s]; and of each finger its pressure over the limit of
         its wall, how far it is bent [rad], how fast that changes [rad/s], how hard it presses on
@@ -258,7 +258,7 @@ class GraspEnv:
         )
 
     def seen(self, data: Data) -> Observation:
-        """What is observed of a world."""
+        """The observation of a world."""
         fields, world, plan = _batch((data.fields, data.world, self._ahead(data)))
         hand = world_constants(self.scene, fields)
         return _one(policy.observe(self.engine, hand, fields, world, plan))

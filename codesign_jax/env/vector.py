@@ -113,7 +113,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
 
 class SingleEnv(gymnasium.Env):
-    """One grasp at a time; see `gymnasium.Env`."""
+    """A single grasp as a `gymnasium.Env`."""
 
     metadata = {"render_modes": []}
 

@@ -32,12 +32,12 @@ def rings_of_link(scene: Scene) -> int:
 
 
 def surfaces(scene: Scene) -> int:
-    """How many surfaces do not move: the table, if the scene has it, and the fixtures."""
+    """Number of static surfaces: the table, if the scene has one, and the fixtures."""
     return int(scene.effects.table) + len(scene.fixture)
 
 
 def object_points(scene: Scene) -> list[int]:
-    """How many points of the object, or of its own, each surface that does not move may touch."""
+    """Largest number of contact points between the object and each static surface."""
     flat = any(shape.type not in ROUND for shape in scene.objects.object)
     each = [4 + EDGES[fixture.type] * flat for fixture in scene.fixture]
     return [4] * scene.effects.table + each

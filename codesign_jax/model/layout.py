@@ -1,4 +1,4 @@
-"""Where a scene's parts lie in the model's arrays, and the numbers its geometry shares.
+"""Indices of a scene's parts in the model's arrays, and numbers shared by its geometry.
 
 Both ways to a model use it: `spec` compiles one hand with MuJoCo, `fields` computes batches of
 them.
@@ -26,7 +26,7 @@ AXES = {"bend": (0, 1, 0), "lateral": (0, 0, 1), "twist": (1, 0, 0)}
 
 
 class Layout(NamedTuple):
-    """Where a scene's parts lie in the model's arrays.
+    """Indices of a scene's parts in the model's arrays.
 
     Attributes:
       links: Number of segments N of a finger.

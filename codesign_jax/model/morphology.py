@@ -268,7 +268,7 @@ def thresholds(hand: Hand, params: Params, beams: Beam, links: int) -> jax.Array
 
 
 def threshold_moments(numbers: tuple, pressure: Any, bend: Any, lateral: Any) -> tuple[Any, Any]:
-    """What the bottom layer's tension adds to a joint, see `thresholds`.
+    """Moment that the tension of the bottom layer adds to a joint, see `thresholds`.
 
     The stored energy P (sqrt(q^2 + q_0^2) - q_0) has P = max(T w/2, 0), q the lateral angle and q_0
     that of `SLACK`.  Its moment on the lateral hinge is that of a spring P / sqrt(q^2 + q_0^2)

@@ -1,4 +1,4 @@
-"""What poses of a hand say of its design: where fingers overlap, and how far their walls stretch.
+"""Checks of a design by its poses: overlaps of fingers, and strains of their walls.
 
 A link reaches from its joint to the next one, the last to the tip's flat face, with the outline
 |y/a|^4 + |z/b|^4 = 1.  A depth is the distance to it, to first order, or to the tip's face where

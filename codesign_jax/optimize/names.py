@@ -50,7 +50,7 @@ def make_optimizer(name: str, space: Space) -> Optimizer:
 
 
 def problem(name: str, num_particles: int | None = None) -> str | None:
-    """What speaks against an optimiser, in words; None if nothing does.
+    """The reason why an optimiser cannot be used, in words; None if there is none.
 
     Args:
       name: Its name.

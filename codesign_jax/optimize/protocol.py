@@ -1,4 +1,4 @@
-"""What every optimiser has in common: `init`, `ask` and `tell`, a state and a report.
+"""The interface of optimisers: `init`, `ask` and `tell`, a state and a report.
 
 One episode of any of them is
 
@@ -21,7 +21,7 @@ from codesign_jax.optimize.bounds import Space
 
 
 class OptimizerState(NamedTuple):
-    """What one episode hands to the next.
+    """State of an optimiser between two episodes.
 
     Attributes:
       particles: What the run has found so far, which the final test takes: the particles after
@@ -41,7 +41,7 @@ class OptimizerState(NamedTuple):
 
 
 class Info(NamedTuple):
-    """What one episode reports.
+    """The optimiser's report of an episode.
 
     Attributes:
       cost: Costs as given, shape (particle,).
@@ -65,7 +65,7 @@ class Info(NamedTuple):
 
 
 class Optimizer(Protocol):
-    """What `Task.episode` and `Task.run` take; also one of your own.
+    """Interface of an optimiser, yours included, for `Task.episode` and `Task.run`.
 
     It is an argument of jitted programs and so has to be a pytree, such as a dataclass registered
     with `jax.tree_util.register_dataclass`: arrays as leaves, everything else static.

@@ -185,7 +185,7 @@ def grip(forces: Forces, scene: Scene) -> matplotlib.figure.Figure:
 
 
 def failures(status: np.ndarray) -> matplotlib.figure.Figure:
-    """How often each cause of failure occurs in each episode.
+    """Frequency of each cause of failure in each episode.
 
     Args:
       status: Bits of `Status`, shape (episode, particle, trial).

@@ -1,4 +1,4 @@
-"""What a report is made from."""
+"""The inputs of a report."""
 
 from pathlib import Path
 from typing import Any, NamedTuple

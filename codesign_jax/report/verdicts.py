@@ -1,4 +1,4 @@
-"""What simulated trials say about a design, in words; the rule is `verdict.judge`.
+"""Verdicts on simulated trials, in words; the rule is `verdict.judge`.
 
 Trials are kept, lost, not released or failed, and all of them are counted: shares and intervals are
 of all trials, so that a trial that failed is one that did not keep its object.  A verdict names the
@@ -44,7 +44,7 @@ class Judged(NamedTuple):
 
     @property
     def details(self) -> str:
-        """How the trials ended and at what accuracy, in a line."""
+        """Outcomes and accuracy of the trials, in a line."""
         size = self.scene.discretization
         named = f"accuracy {self.accuracy}, " if self.accuracy else ""
         how = f"{named}steps of {1e3 * size.timestep:g} ms, {size.links} links a finger"
@@ -68,7 +68,7 @@ class Judged(NamedTuple):
 
 
 def objects(scene: Scene) -> str:
-    """What a verdict holds for, such as "objects of 50 g, friction 0.85"."""
+    """The conditions of a verdict, such as "objects of 50 g, friction 0.85"."""
     shapes = scene.objects.object
     noise = scene.objects.noise
     masses = [1e3 * float(shape.mass) for shape in shapes]
@@ -86,7 +86,7 @@ def _span(values: Iterable[float]) -> str:
 
 
 def of_trials(scene: Scene, outcomes: Outcome) -> str:
-    """Says how trials ended: numbers of them, mean cost, warnings."""
+    """Numbers of trials by outcome, their mean cost, and warnings."""
     warnings = runs.warning_counts(outcomes.status)
     found = tally(outcomes)
     causes = f" ({runs.failure_counts(outcomes.status)})" if found.failed else ""
@@ -108,7 +108,7 @@ def mean_cost(scene: Scene, outcomes: Outcome) -> str:
 
 
 def solver(outcomes: Outcome) -> list[str]:
-    """Says in a line how often the solver stopped at its limit; no line if it never did."""
+    """A line on how often the solver stopped at its limit; no line if it never did."""
     shares, residuals = (_told(v) for v in (outcomes.capped, outcomes.residual))
     if not shares.any():
         return []
@@ -127,7 +127,7 @@ def _told(values: Any) -> np.ndarray:
 
 
 def warnings(judged: Judged) -> list[str]:
-    """Says in a line that many trials failed, and what may be done about it; no line if few did."""
+    """A line with advice if many trials failed; no line otherwise."""
     scene = judged.scene
     found = tally(judged.outcomes)
     count = found.not_released + found.failed

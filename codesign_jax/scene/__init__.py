@@ -1,4 +1,4 @@
-"""What is simulated and what may change, as data: hand, objects, effects, phases, numbers.
+"""Scenes as data: hand, objects, effects, phases, and the numbers that may change.
 
 `load` reads a scene file with the hand and the objects that it names, and checks all of them.
 `parameters` has the design space, `constants` the numbers that may be traced, `effects` what each

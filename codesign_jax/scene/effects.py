@@ -1,4 +1,4 @@
-"""What each effect of a scene means, and which engines simulate it.
+"""The effects of a scene, and the engines that simulate each.
 
 Effects are static: one that is off has no joint, contact or branch in the compiled program.  An
 engine that cannot do what a scene asks for refuses the scene when it is built.

@@ -313,7 +313,7 @@ class Free:
         return tuple(lows), tuple(highs)
 
     def groups(self, count: int) -> list[tuple[int, ...]]:
-        """Which of `count` values are one and the same, in the order of each group's first."""
+        """Groups of tied values among `count`, ordered by their first members."""
         if self.tied is True:
             return [tuple(range(count))]
         given = () if self.tied is False else self.tied

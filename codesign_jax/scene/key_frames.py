@@ -401,7 +401,7 @@ class _Reader:
 
 
 def check(scene: Any, where: str) -> list[str]:
-    """What is wrong with key frames in some design of the hand's presets."""
+    """Problems with key frames in any design of the hand's presets."""
     own = {row.name: _ends(row.row) for row in scene.control.parameter}
     fixed = {name: (value, value) for name, value in _scene_times(scene).items()}
     problems = [*_falling(scene.control.frame, fixed | own, where)]
@@ -411,7 +411,7 @@ def check(scene: Any, where: str) -> list[str]:
 
 
 def doubts(scene: Any, where: str) -> list[str]:
-    """What is no error in key frames, and hardly meant: kPa for Pa, frames after the grasp."""
+    """Warnings about legal but suspicious key frames: kPa given as Pa, frames after the grasp."""
     return [*_faint(scene.control, where), *_late(scene, where), *_unused(scene.control, where)]
 
 

@@ -1,4 +1,4 @@
-"""How far from a mesh distances are needed: as far away as a contact of the scene's hand begins.
+"""Margins around meshes in which distances are needed: where contacts of the hand begin.
 
 Beyond its grid a mesh's distance is taken for larger than it is, so that a contact would begin
 late. A scene that is read has grids for its hand; one that was put together otherwise is refused.
@@ -26,7 +26,7 @@ _DEVIATIONS = 2
 
 
 def needed(radius: float, size_noise: float) -> float:
-    """How far from the surface of a mesh in its own size distances are needed [m].
+    """Margin around a mesh, in its nominal size, in which distances are needed [m].
 
     Args:
       radius: Largest radius of a contact sphere [m].

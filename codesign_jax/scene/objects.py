@@ -162,7 +162,7 @@ class Shape(_ShapeFile):
 
     @property
     def primitive(self) -> Primitive:
-        """What is known of its kind; a mesh's is that of its bounding box."""
+        """Record of the object's primitive; for a mesh, of its bounding box."""
         return PRIMITIVES["box" if self.mesh else self.type]
 
     @property

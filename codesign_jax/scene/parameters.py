@@ -227,7 +227,7 @@ class DesignSpace:
         return [problem for end in ends if (problem := unit_slips.outside(*end))]
 
     def _above_the_limit(self, rows: np.ndarray) -> int:
-        """How many designs [SI], shape (design, parameter), have a pressure above its limit."""
+        """Number of designs [SI], shape (design, parameter), with a pressure above its limit."""
         source = np.asarray(self.source)
         start = _offsets(self.hand)
         full = np.where(source >= 0, rows[:, np.maximum(source, 0)], np.asarray(self.base))

@@ -56,7 +56,7 @@ def up(quaternion: Any) -> list[Any]:
 
 
 def orientation_problem(orientation: Sequence[float]) -> str | None:
-    """What is wrong with an orientation, or None."""
+    """The problem with an orientation, or None."""
     if len(orientation) not in (3, 4):
         return "must be roll, pitch and yaw in degrees, or a quaternion w, x, y, z"
     norm = float(np.linalg.norm(orientation))

@@ -270,7 +270,7 @@ def _check_when_made(cls: type) -> None:
 
 
 def _known_problem(path: str, value: Any, field: dataclasses.Field[Any]) -> str | None:
-    """What is wrong with the numbers of a field of a table, as far as they are known."""
+    """The problem with the numbers of a field of a table, as far as they are known."""
     if isinstance(value, tuple):
         found = (_known_problem(f"{path}[{i}]", v, field) for i, v in enumerate(value))
         return next(filter(None, found), None)
@@ -286,7 +286,7 @@ def _known_problem(path: str, value: Any, field: dataclasses.Field[Any]) -> str 
 
 
 def near_problem(path: str, value: float, expected: Range) -> str | None:
-    """As `range_problem`, for numbers that were a float32: the one nearest to a bound is inside."""
+    """Like `range_problem` for former float32 numbers: the one nearest to a bound is inside."""
     low, high = (b + side * 1e-6 * abs(b) for b, side in ((expected.low, -1), (expected.high, 1)))
     if low <= value <= high:
         return None
@@ -294,7 +294,7 @@ def near_problem(path: str, value: float, expected: Range) -> str | None:
 
 
 def replaced(table: T, **changes: Any) -> T:
-    """As `dataclasses.replace`, for numbers of the program's own, which may leave their ranges."""
+    """Like `dataclasses.replace`, for computed numbers, which may leave their ranges."""
     made = object.__new__(type(table))
     made.__dict__.update({f.name: getattr(table, f.name) for f in dataclasses.fields(table)})  # type: ignore[arg-type]
     made.__dict__.update(changes)

@@ -233,7 +233,7 @@ def complete(table: dict[str, Any], where: str, problems: list[str]) -> None:
 
 
 def law_problem(neo_hookean: bool | None, material: Any, where: str) -> str | None:
-    """Says that a scene's bending law is not the one that its hand's modulus belongs to, or None.
+    """A warning if the scene's bending law differs from the law of the hand's modulus, or None.
 
     Args:
       neo_hookean: The scene's `effects.neo_hookean`; None where it leaves the law to the hand.
@@ -271,5 +271,5 @@ def under(scene: Any, *, neo_hookean: bool) -> Any:
 
 
 def of_law(law: str | None) -> bool:
-    """What `effects.neo_hookean` is under a law; without one walls are linear."""
+    """Value of `effects.neo_hookean` for a law; without a law walls are linear."""
     return law == NEO_HOOKEAN

@@ -101,7 +101,7 @@ def text(total: Sum) -> str | float:
 
 
 def unit_words(name: str, factor: float | None, unit: str) -> str | None:
-    """What is wrong with a term whose name is a unit, as in "50 kPa"; None if it is no unit."""
+    """The problem with a term whose name is a unit, as in "50 kPa"; None if it is no unit."""
     if name not in _WRITTEN:
         return None
     kind, size = _WRITTEN[name]
@@ -196,7 +196,7 @@ class _Reader:
 
 
 def _foreign(character: str) -> str:
-    """What is wrong with a character that no sum has."""
+    """The problem with a character that is not allowed in a sum."""
     if character == ",":
         return f"{_NO_SUM}: it has a comma; the decimal sign is a point"
     if character in "()[]{}":

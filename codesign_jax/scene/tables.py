@@ -13,7 +13,7 @@ from codesign_jax.scene.schema import choice, quantity, table
 
 @dataclasses.dataclass(frozen=True)
 class Effects:
-    """What is simulated; an effect that is off has no joint, contact or branch in the program.
+    """Parts of the physics; an effect that is off has no joint, contact or branch in the program.
 
     `codesign_jax.scene.effects` says what each means and which engines have it.  The bending law,
     `neo_hookean`, is None in a file that leaves it to the hand's material, in a `Scene` never.

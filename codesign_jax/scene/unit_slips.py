@@ -53,7 +53,7 @@ def kilopascals(pressures: np.typing.ArrayLike) -> str | None:
 
 
 def outside(name: str, unit: str, low: float, high: float, values: np.ndarray) -> str | None:
-    """What is wrong with the first value, if any, that is outside of bounds, or None.
+    """The problem with the first value outside its bounds, or None.
 
     Args:
       values: The values, shape (n,).
@@ -64,7 +64,7 @@ def outside(name: str, unit: str, low: float, high: float, values: np.ndarray) -
 
 
 def slips(name: str, row: str, values: np.ndarray) -> list[str]:
-    """What is wrong with the first value, if any, that looks like one of another unit."""
+    """The problem with the first value that seems to have another unit, or None."""
     if row not in PARAMETERS:  # of the control: only its bounds say what makes sense
         return []
     kind = PARAMETERS[row]

@@ -128,7 +128,7 @@ def _nodes(low: np.ndarray, cell: float, shape: np.ndarray) -> np.ndarray:
 
 
 def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float) -> Grid:
-    """As `build`, but what took longer than a tenth of a second is kept on disk."""
+    """Like `build`; grids that take longer than a tenth of a second are kept on disk."""
     name = reuse.key(key, bound, reach, traced=False)
     if name is None or reuse.limit() is None:
         return build(vertices, faces, bound, reach)

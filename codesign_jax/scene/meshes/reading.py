@@ -68,7 +68,7 @@ def read(path: Path) -> Read:
 
 
 def parsed(path: Path, content: bytes) -> Read:
-    """What a file of this name and content has."""
+    """The mesh in a file of this name and content."""
     kind = path.suffix.lower().removeprefix(".")
     if foreign := texts.foreign(content):
         raise InputError([f"{path.name}: {foreign}"])

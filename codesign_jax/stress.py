@@ -146,7 +146,7 @@ def simulate(
 
 
 def sets(scene: Scene) -> int:
-    """Number of simulations of each trial by `simulate`: unchanged, by the other law, and variants."""
+    """Number of simulations of each trial by `simulate`: unchanged, other law, and variants."""
     return 2 + len([*variants(scene)])
 
 

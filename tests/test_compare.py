@@ -392,7 +392,7 @@ def test_the_characteristic_of_the_test_is_exact(share):
 
 def test_the_page_has_the_numbers_of_the_test():
     """Expected grasps and chances, of a row for each share."""
-    page = (ROOT / "docs" / "command_line.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "verdict.md").read_text(encoding="utf-8")
     table = page.split("| true share |")[1].split("\n\n")[0].splitlines()[2:]
     shares = []
     for row in table:

@@ -228,7 +228,7 @@ class Evaluate(Command, RunOrDesign):
 
     trials: Count = None
     """Trials; the objects take turns. Default: as many as decide the verdict, at most 600
-    (docs/command_line.md)."""
+    (docs/verdict.md)."""
     seed: int = 0
     """Seed of the trials' noise."""
     particle: Count = None
@@ -238,7 +238,7 @@ class Evaluate(Command, RunOrDesign):
     """Write a table of the trials with their noise and outcomes (.csv)."""
     stress: Flag = False
     """Also simulate heavier objects, less friction, the other bending law and other constants, 12
-    grasps (or --trials) for each, and check the design for warnings (docs/command_line.md)."""
+    grasps (or --trials) for each, and check the design for warnings (docs/verdict.md)."""
     forces: File = None
     """Write contact forces and depths of the first trial of each object, one row per time step
     (.csv, docs/files.md), and print the grip forces of the fingers."""

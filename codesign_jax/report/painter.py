@@ -111,11 +111,17 @@ def paint(
     for pose, seen in zip(poses, cameras, strict=True):
         now = (pose.tobytes(), seen)
         if picture is None or now != before:  # what was lost stands still
-            colors = _picture(scene, body, pose, seen, size)
-            image = Image.fromarray((255 * np.clip(colors, 0, 1)).astype(np.uint8))
-            picture = np.asarray(image.resize(size, Image.Resampling.BOX))
+            picture = _picture(body, pose, seen, size, table=scene.effects.table)
             before = now
         yield picture
+
+
+def still(parts: Sequence[Part], camera: Camera, size: tuple[int, int]) -> np.ndarray:
+    """A picture of rigid parts in the world's frame on the table, as `paint` makes them."""
+    world = np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
+    body = _body([*parts], world)
+    body.checked[:] = np.nan
+    return _picture(body, world, camera, size, table=True)
 
 
 def _finer(scene: Scene) -> Scene:
@@ -175,15 +181,15 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def _picture(
-    scene: Scene, body: _Body, pose: np.ndarray, camera: Camera, size: tuple[int, int]
+    body: _Body, pose: np.ndarray, camera: Camera, size: tuple[int, int], *, table: bool
 ) -> np.ndarray:
-    """Colours from 0 to 1, `_SMOOTH` pixels a pixel of each side, shape (height, width, 3)."""
+    """A picture, uint8, shape (height, width, 3)."""
     vertices = np.concatenate([bodies.vertices(part, pose) for part in body.parts])
     triangles = vertices.astype(np.float32)[body.face]
     area = _areas(triangles)
     shadows = _Shadows(triangles, camera)
     # What is behind has no edges that need more pixels.
-    colors = _behind(scene, View(camera, size), shadows)
+    colors = _behind(View(camera, size), shadows, table=table)
     colors = colors.repeat(_SMOOTH, 0).repeat(_SMOOTH, 1).reshape(-1, 3)
     view = View(camera, (_SMOOTH * size[0], _SMOOTH * size[1]))
     corners, away = view.pixels(triangles)
@@ -201,7 +207,9 @@ def _picture(
     color = np.where(check[:, None], _DARKER, 1.0) * body.color[face]
     lit = shadows.lit(place + 0.002 * normal)
     colors[seen.at] = _shaded(color, normal, -_unit(rays), shadows.light, lit, place[:, 2])
-    return colors.reshape(_SMOOTH * size[1], _SMOOTH * size[0], 3)
+    levels = (255 * np.clip(colors, 0, 1)).astype(np.uint8)
+    image = Image.fromarray(levels.reshape(_SMOOTH * size[1], _SMOOTH * size[0], 3))
+    return np.asarray(image.resize(size, Image.Resampling.BOX))
 
 
 def _shaded(
@@ -228,12 +236,12 @@ def _shaded(
     return color * (0.72 * sky + 0.54 * direct)[:, None] + (0.14 * shine + 0.08 * rim)[:, None]
 
 
-def _behind(scene: Scene, view: View, shadows: "_Shadows") -> np.ndarray:
+def _behind(view: View, shadows: "_Shadows", *, table: bool) -> np.ndarray:
     """Sky and table, shape (height, width, 3): the plane z = 0 fades into the sky."""
     rays = view.rays(np.arange(view.size[0] * view.size[1]))
     share = np.clip(0.5 + 0.9 * _unit(rays)[:, 2:], 0, 1)
     colors = (1 - share) * _SKY[0] + share * _SKY[1]
-    if scene.effects.table and view.eye[2] > 0:
+    if table and view.eye[2] > 0:
         _table(colors, rays, view, shadows)
     return colors.reshape(view.size[1], view.size[0], 3)
 

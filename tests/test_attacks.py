@@ -4,10 +4,13 @@ SECURITY.md names these tests beside its promises.
 """
 
 import copy
+import gc
 import io
 import json
 import os
+import signal
 import sys
+import time
 import types
 import unicodedata
 import zipfile
@@ -23,7 +26,7 @@ from codesign_jax import array_files, files, runs, terminal
 from codesign_jax.commands import check, hosts, reference, status
 from codesign_jax.compiler.ffi import KernelUnavailable
 from codesign_jax.export import sheet
-from codesign_jax.runs import directory, manifest, progress
+from codesign_jax.runs import directory, manifest, progress, scene_files
 from codesign_jax.runs import record as records
 from codesign_jax.runs import run as run_of
 from codesign_jax.runs.columns import FILES, TABLES
@@ -92,6 +95,29 @@ def test_no_file_of_a_run_is_opened_through_a_link_or_waited_for(kind, run, tmp_
         if before.exists():
             before.rename(place)
     assert runs.load_record(run) is not None  # the same folder without them
+
+
+def test_a_folder_in_the_place_of_a_run_s_file_is_refused_before_anything_changes(run):
+    """Tables, figures' data and results of tests: what is written last would fail last."""
+    scene, settings = runs.read_run(run)
+    folders = {"checkpoints", "failures", "figures", "meshes", "code"}
+    for name in sorted({*FILES, *TABLES} - folders - {"provenance.json", *scene_files.NAMES}):
+        place = run / name
+        before = place.read_bytes() if place.exists() else None
+        place.unlink(missing_ok=True)
+        place.mkdir()
+        whole = {p: p.read_bytes() for p in run.rglob("*") if p.is_file()}
+        with (
+            pytest.raises(InputError, match=f"{name} is a folder, and a run has a file"),
+            directory.open_run(run, scene, settings, ["codesign"]),
+        ):
+            pass
+        after = {p: p.read_bytes() for p in run.rglob("*") if p.is_file()}
+        after.pop(run / manifest.LOCK, None)
+        assert after == {p: v for p, v in whole.items() if p.name != manifest.LOCK}
+        place.rmdir()
+        if before is not None:
+            place.write_bytes(before)
 
 
 def test_a_scene_file_of_a_run_that_is_a_link_is_not_read(run, tmp_path):
@@ -323,6 +349,30 @@ def failing(error):
         raise error
 
     return fail
+
+
+def test_ctrl_c_within_a_callback_of_garbage_collection_is_not_lost():
+    """JAX has such a callback, whose exceptions Python ignores; the handler before comes back."""
+    sent = []
+
+    def callback(phase, info):
+        if not sent:
+            sent.append(phase)
+            signal.raise_signal(signal.SIGINT)
+
+    def work():
+        gc.collect()
+        time.sleep(30)  # the signal ends it
+        return 0
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    gc.callbacks.append(callback)
+    try:
+        assert status.of(work) == status.INTERRUPTED and sent
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        gc.callbacks.remove(callback)
+        signal.signal(signal.SIGINT, before)
 
 
 def test_what_this_machine_lacks_is_one_line(monkeypatch, capsys):

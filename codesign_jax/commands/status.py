@@ -1,10 +1,14 @@
 """Exit statuses.  Nothing heavy is imported here: `--help` is to be quick."""
 
+import contextlib
 import errno
+import gc
 import os
 import signal
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from types import FrameType
 from typing import NoReturn
 
 from codesign_jax.terminal import say
@@ -28,13 +32,42 @@ def words(error: Exception) -> str:
     return found
 
 
+@contextlib.contextmanager
+def _interruptible() -> Iterator[None]:
+    """Has Ctrl-C raise KeyboardInterrupt also where Python's own handler would lose it."""
+    own = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    own = own and threading.current_thread() is threading.main_thread()
+    if own:
+        signal.signal(signal.SIGINT, _interrupt)
+    try:
+        yield
+    finally:
+        if own:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Raises KeyboardInterrupt, and later where a callback of garbage collection runs.
+
+    Python ignores the exceptions of such a callback, and JAX has one.
+    """
+    callbacks = {getattr(function, "__code__", None) for function in gc.callbacks}
+    while frame is not None:
+        if frame.f_code in callbacks:
+            threading.Timer(0.05, os.kill, (os.getpid(), number)).start()
+            return
+        frame = frame.f_back
+    raise KeyboardInterrupt
+
+
 def of(run: Callable[[], int]) -> int:
     """Runs a parsed command and returns its exit status.
 
     Wrong input, files that can no longer be written or read, and Ctrl-C are said on stderr.
     """
     try:
-        return run()
+        with _interruptible():
+            return run()
     except ValueError as error:
         from codesign_jax.scene.schema import InputError
 

@@ -109,6 +109,7 @@ def check_folder(path: Path, scene: Scene, settings: Settings, *, fresh: bool = 
         _refuse_to_delete(path)
     else:
         _refuse_other(path, scene, settings, stored)
+        _refuse_folders(path)
         if problem := reading.lost(path):
             raise InputError([problem])
 
@@ -276,6 +277,19 @@ def _refuse_foreign(path: Path) -> None:
             hint = f"if it is a run that lost {PROVENANCE}, put that back from a copy; or {hint}"
         problem = f"--out {path} holds {_some(others)} and no {PROVENANCE}: {hint}"
         raise InputError([f"{problem}. Nothing was changed"])
+
+
+def _refuse_folders(path: Path) -> None:
+    """Refuses folders where a run has files, which it could not write when it gets there."""
+    names = {*FILES, *TABLES, LOCK} - {*_INSIDE}
+    problems = [
+        f"{path / name} is a folder, and a run has a file of this name: move it elsewhere. "
+        "Nothing was changed"
+        for name in sorted(names)
+        if (path / name).is_dir()
+    ]
+    if problems:
+        raise InputError(problems)
 
 
 def _refuse_to_delete(path: Path) -> None:

@@ -47,10 +47,10 @@ def load(path: Path) -> dict[str, np.ndarray]:
 
 def packed(arrays: Arrays) -> bytes:
     """Arrays by name, without those that are None, and the digest of all of them."""
-    found: dict[str, Any] = {n: np.asarray(v) for n, v in arrays.items() if v is not None}
-    found[_DIGEST] = np.array(_digest(found))
+    stored: dict[str, Any] = {n: np.asarray(v) for n, v in arrays.items() if v is not None}
+    stored[_DIGEST] = np.array(_digest(stored))
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **found)
+    np.savez_compressed(buffer, **stored)
     return buffer.getvalue()
 
 
@@ -79,12 +79,12 @@ def _lines(value: np.ndarray) -> np.ndarray:
 
 
 def _digest(arrays: Arrays) -> str:
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for name in sorted(arrays):
         value = np.ascontiguousarray(arrays[name])
-        found.update(f"{name} {value.dtype.str} {arrays[name].shape}\n".encode())
-        found.update(value.tobytes())
-    return found.hexdigest()
+        digest.update(f"{name} {value.dtype.str} {arrays[name].shape}\n".encode())
+        digest.update(value.tobytes())
+    return digest.hexdigest()
 
 
 def head(about: Any) -> dict[str, np.ndarray]:
@@ -97,7 +97,7 @@ def head(about: Any) -> dict[str, np.ndarray]:
 
 def refusal(arrays: Arrays, about: Any) -> str:
     """Why results are not taken for those of `about`, with the file as subject; else nothing."""
-    different = [name for name, own in head(about).items() if str(arrays.get(name)) != str(own)]
+    different = [name for name, value in head(about).items() if str(arrays.get(name)) != str(value)]
     if not different:
         return ""
     what = "design or other settings" if different == ["about"] else "version of the code"

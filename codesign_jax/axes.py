@@ -68,12 +68,12 @@ def refuse_other(scene: Any, engine: Any) -> None:
     )
 
 
-def _differences(one: Any, other: Any, path: str) -> list[str]:
+def _differences(first: Any, other: Any, path: str) -> list[str]:
     """Key paths in which two scenes as nested dictionaries differ."""
-    if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
-        below = (_differences(one[k], other[k], f"{path}.{k}" if path else k) for k in one)
+    if isinstance(first, dict) and isinstance(other, dict) and first.keys() == other.keys():
+        below = (_differences(first[k], other[k], f"{path}.{k}" if path else k) for k in first)
         return [key for keys in below for key in keys]
-    return [] if repr(one) == repr(other) else [path]
+    return [] if repr(first) == repr(other) else [path]
 
 
 def refuse_numbers(scene: Scene, count: int, axis: str) -> None:

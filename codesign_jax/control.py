@@ -124,8 +124,8 @@ def supplied(
     def step(now: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
         return now + jnp.clip(gain * (goal - now), -p.rate * h, p.rate * h), now
 
-    end, found = jax.lax.scan(step, target[0] if start is None else start, target)
-    return found, end
+    end, pressures = jax.lax.scan(step, target[0] if start is None else start, target)
+    return pressures, end
 
 
 def reachable(scene: Scene, wanted: jax.Array) -> jax.Array:

@@ -40,8 +40,8 @@ def append(path: Path, text: str) -> None:
     too, such as of a copy by `cp -al`, the others stay as they are.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    how = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
-    with naming(path), os.fdopen(os.open(path, how, 0o666), "ab") as file:
+    flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
+    with naming(path), os.fdopen(os.open(path, flags, 0o666), "ab") as file:
         if os.fstat(file.fileno()).st_nlink == 1:
             file.write(text.encode())
             return
@@ -58,7 +58,7 @@ def special(folder: Path, names: Iterable[str]) -> list[str]:
     Returns:
       Paths relative to the folder, sorted.
     """
-    found = []
+    names_found = []
     left = [*names]
     while left:
         name = left.pop()
@@ -69,8 +69,8 @@ def special(folder: Path, names: Iterable[str]) -> list[str]:
             continue
         left += [f"{name}/{other}" for other in inside]
         if not stat.S_ISDIR(mode) and not stat.S_ISREG(mode):
-            found.append(name)
-    return sorted(found)
+            names_found.append(name)
+    return sorted(names_found)
 
 
 @contextlib.contextmanager
@@ -210,8 +210,8 @@ def _remove_listed(path: Path, name: str, digest: str) -> None:
 
 def _names(path: Path) -> list[str]:
     """Paths of the files below a folder, relative to it."""
-    found = (Path(folder, name) for folder, _, names in os.walk(path) for name in names)
-    return sorted(place.relative_to(path).as_posix() for place in found)
+    paths = (Path(folder, name) for folder, _, names in os.walk(path) for name in names)
+    return sorted(place.relative_to(path).as_posix() for place in paths)
 
 
 def _digest(path: Path) -> str:

@@ -187,16 +187,16 @@ class ControlLoop(Equal):
             return (world, told), trace._replace(last=None)
 
         carry = (begin(self.scene, fields, plan), self._remembered(plan.params))
-        found = []
+        parts = []
         periods, rest = divmod(plan.pose.shape[1], self.steps)
         if periods:
             now = {k: _split(v[:, : periods * self.steps], periods) for k, v in series.items()}
             carry, traces = jax.lax.scan(period, carry, now)
-            found.append(jax.tree.map(_joined, traces))
+            parts.append(jax.tree.map(_joined, traces))
         if rest:
             carry, trace = period(carry, {k: v[:, -rest:] for k, v in series.items()})
-            found.append(trace)
-        trace = jax.tree.map(lambda *v: jnp.concatenate(v, 1), *found)
+            parts.append(trace)
+        trace = jax.tree.map(lambda *v: jnp.concatenate(v, 1), *parts)
         self._refuse_nonfinite(trace.ctrl)
         return trace._replace(last=carry[0].state)
 
@@ -338,7 +338,7 @@ def observe(
     """Observations for policies; every array has the leading axis (world,)."""
     scene: Scene = engine.scene  # type: ignore[attr-defined]
     state = coordinates.reset(scene, fields._replace(start=world.state))
-    found = kinematics(hand, layout(scene).axes, state)
+    motion = kinematics(hand, layout(scene).axes, state)
 
     def pose(place: jax.Array, columns: jax.Array) -> Pose:
         """From lanes (3, ...) about the object and (column, 3, ...) with the worlds last."""
@@ -347,13 +347,13 @@ def observe(
             jnp.moveaxis(place, (-1, 0), (0, -1)), jnp.moveaxis(columns, (-1, 1, 0), (0, -2, -1))
         )
 
-    none = jnp.zeros_like(found.place)
-    velocity = found.object_vel[:, 0].T
+    none = jnp.zeros_like(motion.place)
+    velocity = motion.object_vel[:, 0].T
     step = model.split(scene, world.state).step[:, 0]
     phase, since = jax.vmap(_phase)(fields.constants, step)
     joint, rate = (jnp.moveaxis(v, (3, 2), (0, 1)) for v in (state.finger, state.finger_vel))
-    palm = pose(found.place[:, 0], found.palm[:, :, 0])
-    thing = pose(none[:, 0], found.object[:, :, 0])
+    palm = pose(motion.place[:, 0], motion.palm[:, :, 0])
+    thing = pose(none[:, 0], motion.object[:, :, 0])
     return Observation(
         time=step * scene.discretization.timestep,
         phase=phase,
@@ -363,7 +363,7 @@ def observe(
         joint=joint,
         joint_velocity=rate,
         palm=palm,
-        link=pose(jnp.swapaxes(found.origin, 1, 2), jnp.swapaxes(found.link, 2, 3)),
+        link=pose(jnp.swapaxes(motion.origin, 1, 2), jnp.swapaxes(motion.link, 2, 3)),
         object=thing,
         object_velocity=jnp.concatenate([velocity[:, 3:], velocity[:, :3]], 1),
         forces=_forces(scene, hand, state) if hasattr(engine, "recording") else None,

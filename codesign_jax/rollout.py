@@ -168,10 +168,10 @@ def simulate(
         finger is so high that its contacts begin farther from a mesh than distances reach; of
         traced ones no values are known.
     """
-    how = Options(**options)
+    chosen_options = Options(**options)
     _check(scene, engine, params, trials)
-    trace, ctrl, initial = _traced(scene, engine, params, trials, how)
-    return judge(scene, trace, ctrl, initial, trials, how), trace
+    trace, ctrl, initial = _traced(scene, engine, params, trials, chosen_options)
+    return judge(scene, trace, ctrl, initial, trials, chosen_options), trace
 
 
 def grasp(
@@ -243,8 +243,8 @@ def crossed(scene: Scene, params: Params, trials: Trial) -> tuple[Scene, Params,
     count = trials.yaw.shape[0]
     every_p = jax.tree.map(lambda v: jnp.repeat(v, count, axis=0), params)
     every_t = jax.tree.map(lambda v: jnp.tile(v, (particles,) + (1,) * (v.ndim - 1)), trials)
-    own = jax.tree.map(lambda v: jnp.tile(v, particles) if jnp.ndim(v) else v, scene)
-    return own, every_p, every_t
+    scenes = jax.tree.map(lambda v: jnp.tile(v, particles) if jnp.ndim(v) else v, scene)
+    return scenes, every_p, every_t
 
 
 def grid(tree: Any, shape: tuple[int, ...]) -> Any:
@@ -266,13 +266,13 @@ def _traced(
     engine: Engine,
     params: Params,
     trials: Trial,
-    how: Options,
+    options: Options,
     steps: int | None = None,
 ) -> tuple[Trace, Any, jax.Array]:
-    how.refuse()
-    asked = how.record_forces or how.record_touch
-    if asked or getattr(how.cost, "record_forces", False):
-        engine = recording(engine, touch=how.record_touch)
+    options.refuse()
+    asked = options.record_forces or options.record_touch
+    if asked or getattr(options.cost, "record_forces", False):
+        engine = recording(engine, touch=options.record_touch)
     ctrl: Any
     fields, ctrl, initial = prepare(scene, params, trials, engine)
     if steps is not None and isinstance(ctrl, control.Plan):
@@ -280,8 +280,8 @@ def _traced(
         ctrl = ctrl._replace(**series)
     elif steps is not None:
         ctrl = ctrl[:, :steps]
-    trace = engine.rollout(fields, ctrl, trajectory=how.to_end)
-    return trace if how.record_qpos else trace._replace(qpos=trace.qpos[..., :0]), ctrl, initial
+    trace = engine.rollout(fields, ctrl, trajectory=options.to_end)
+    return trace if options.record_qpos else trace._replace(qpos=trace.qpos[..., :0]), ctrl, initial
 
 
 def prepare(
@@ -323,7 +323,7 @@ def judge(
     ctrl: jax.Array | None,
     initial: jax.Array,
     trials: Trial,
-    how: Options,
+    options: Options,
 ) -> Outcome:
     """Outcomes of a batch of worlds, with leading axis (world,).
 
@@ -335,23 +335,25 @@ def judge(
     if trace.ctrl is not None:
         ctrl = trace.ctrl
 
-    def world(own: Scene, t: Trace, u: jax.Array | None, i: jax.Array, trial: Trial) -> Outcome:
-        result = outcome(own, t, i, trial)
-        if how.cost is None:
+    def world(
+        world_scene: Scene, t: Trace, u: jax.Array | None, i: jax.Array, trial: Trial
+    ) -> Outcome:
+        result = outcome(world_scene, t, i, trial)
+        if options.cost is None:
             return result
-        seen = shown(t, how.record_qpos, how.stop_when_lost)
-        return _by_own(own, how.cost, seen, u, result)
+        seen = shown(t, options.record_qpos, options.stop_when_lost)
+        return _by_own(world_scene, options.cost, seen, u, result)
 
     every = jax.vmap(world, in_axes=(batch_axes(scene), 0, 0, 0, 0))
     return every(scene, trace, ctrl, initial, trials)
 
 
 def _by_own(
-    scene: Scene, own: CostFunction, trace: Trace, ctrl: jax.Array | None, result: Outcome
+    scene: Scene, cost: CostFunction, trace: Trace, ctrl: jax.Array | None, result: Outcome
 ) -> Outcome:
     if ctrl is None:
         raise ValueError("a cost of one's own needs the controls")
-    returned: Any = own(scene, trace, ctrl)
+    returned: Any = cost(scene, trace, ctrl)
     if returned is None:
         raise ValueError("a cost is one number for each world, not None: does it return one?")
     value = jnp.asarray(returned)

@@ -79,11 +79,11 @@ def _drawn(
     shapes = len(scene.objects.object)
 
     def trials(i: jax.Array) -> Trial:
-        own = jax.random.fold_in(root, i)
-        found = rollout.sample_trials(scene, own, num_trials)
+        design_key = jax.random.fold_in(root, i)
+        sampled = rollout.sample_trials(scene, design_key, num_trials)
         # Remainders first: the product itself may be larger than an int32.
         turn = (i % shapes) * (num_trials % shapes) + jnp.arange(num_trials)
-        return found._replace(shape=turn % shapes)
+        return sampled._replace(shape=turn % shapes)
 
     return Drawn(designs, jax.vmap(trials)(first + jnp.arange(n)))
 
@@ -110,7 +110,7 @@ def _simulation(
         shape = trials.yaw.shape
         hands = jax.vmap(space.params)(jnp.repeat(designs, shape[1], axis=0))
         flat = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), trials)
-        found, _ = rollout.simulate(scene, engine, hands, flat, **options._asdict())
-        return rollout.grid(found, shape)
+        outcomes, _ = rollout.simulate(scene, engine, hands, flat, **options._asdict())
+        return rollout.grid(outcomes, shape)
 
     return simulate

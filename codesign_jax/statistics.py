@@ -22,8 +22,8 @@ def wilson(successes: int, total: int) -> Interval:
     """Share of successes with Wilson's score interval (Wilson 1927)."""
     from scipy import stats  # takes half a second to import: commands do so once they are done
 
-    found = stats.binomtest(successes, total).proportion_ci(0.95, method="wilson")
-    return Interval(successes / total, float(found.low), float(found.high))
+    interval = stats.binomtest(successes, total).proportion_ci(0.95, method="wilson")
+    return Interval(successes / total, float(interval.low), float(interval.high))
 
 
 def paired(both: int, first: int, second: int, total: int) -> Interval:

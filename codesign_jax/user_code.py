@@ -56,12 +56,12 @@ def contents(names: Iterable[str]) -> dict[str, bytes]:
     They are the file that each name's module was read from, and the one that defines the object
     where that is another; what these import is not among them.
     """
-    found = {}
+    code_files = {}
     for name in filter(is_user_code, names):
         thing = _load(name)
         for module in {name.partition(":")[0], getattr(thing, "__module__", None)} & {*sys.modules}:
-            found[f"{FOLDER}/{module}.py"] = _source(name, module).read_bytes()
-    return found
+            code_files[f"{FOLDER}/{module}.py"] = _source(name, module).read_bytes()
+    return code_files
 
 
 def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
@@ -79,11 +79,13 @@ def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
 
     def judge(trace: Trace, params: Params, trials: Any) -> Outcome:
         _, ctrl, initial = rollout.prepare(scene, params, trials)
-        how = rollout.Options(record_qpos=not stops, stop_when_lost=stops, cost=cost)
-        return rollout.judge(scene, trace, ctrl, initial, trials, how)
+        options = rollout.Options(record_qpos=not stops, stop_when_lost=stops, cost=cost)
+        return rollout.judge(scene, trace, ctrl, initial, trials, options)
 
-    one = jax.tree.map(lambda v: jnp.asarray(v)[None], (_hand(scene), rollout.nominal_trial(scene)))
-    fields, ctrl, _ = jax.eval_shape(lambda p, t: rollout.prepare(scene, p, t), *one)
+    world = jax.tree.map(
+        lambda v: jnp.asarray(v)[None], (_hand(scene), rollout.nominal_trial(scene))
+    )
+    fields, ctrl, _ = jax.eval_shape(lambda p, t: rollout.prepare(scene, p, t), *world)
     dtype = jnp.result_type(float)
     series: Any = jax.ShapeDtypeStruct((1, scene.num_steps), dtype)
     size = (1, scene.num_steps, fields.start.shape[-1] if not stops else 0)
@@ -92,7 +94,7 @@ def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
     if forces:
         engine = recording(make_engine(DEFAULT, scene))
         trace = trace._replace(forces=jax.eval_shape(engine.rollout, fields, ctrl).forces)
-    _tried(flag, cost, lambda: jax.eval_shape(judge, trace, *one))
+    _tried(flag, cost, lambda: jax.eval_shape(judge, trace, *world))
     return cost, stops
 
 
@@ -106,16 +108,16 @@ def make_policy(name: str, scene: Scene) -> tuple[Policy, Scene]:
 
 @functools.lru_cache(maxsize=16)
 def _policy(flag: str, code: Any, scene: Scene) -> tuple[Policy, Scene]:
-    found = code
-    if inspect.isclass(found):
-        _refuse_signature(flag, found, ("scene",))
-        found = _tried(flag, code, lambda: code(scene))
-    _refuse_signature(flag, found, ("carry", "observation"))
-    scene = _tried(flag, code, lambda: searched(scene, found))
-    loop = ControlLoop(make_engine(DEFAULT, scene), found)
+    policy = code
+    if inspect.isclass(policy):
+        _refuse_signature(flag, policy, ("scene",))
+        policy = _tried(flag, code, lambda: code(scene))
+    _refuse_signature(flag, policy, ("carry", "observation"))
+    scene = _tried(flag, code, lambda: searched(scene, policy))
+    loop = ControlLoop(make_engine(DEFAULT, scene), policy)
     world = _hand(scene), rollout.nominal_trial(scene)
     _tried(flag, code, lambda: jax.eval_shape(loop.first_command, *world))
-    return found, scene
+    return policy, scene
 
 
 def make_optimizer(name: str, space: Space, num_particles: int | None = None) -> Optimizer:
@@ -241,11 +243,13 @@ def _where(error: BaseException, code: Any) -> str:
     """An error with the line of the user's code that it comes from; of its last line if no code."""
     words = f"{type(error).__name__}: {' '.join(str(error).split())}"
     try:
-        own = None if code is None else inspect.getsourcefile(code)
+        source_file = None if code is None else inspect.getsourcefile(code)
     except TypeError:
-        own = None
+        source_file = None
     frames = traceback.extract_tb(error.__traceback__)
     lines = [
-        f for f in frames if f.filename == own or (own is None and "importlib" not in f.filename)
+        f
+        for f in frames
+        if f.filename == source_file or (source_file is None and "importlib" not in f.filename)
     ]
     return f"{words} ({lines[-1].filename}, line {lines[-1].lineno})" if lines else words

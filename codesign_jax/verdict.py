@@ -260,8 +260,8 @@ def _more(ratio: float, total: int) -> int:
 def good(outcomes: Outcome) -> np.ndarray:
     """Whether designs are good, from outcomes with the trial as the last axis."""
     every = kept(outcomes)
-    found = [word(int(n), every.shape[-1]) == "good" for n in every.sum(-1).ravel()]
-    return np.array(found).reshape(every.shape[:-1])
+    good_designs = [word(int(n), every.shape[-1]) == "good" for n in every.sum(-1).ravel()]
+    return np.array(good_designs).reshape(every.shape[:-1])
 
 
 def sequential(

@@ -71,8 +71,8 @@ def seed_search(
     def cost(candidates: jax.Array) -> jax.Array:
         return particle_cost(scene, evaluate(candidates, noise))
 
-    how = {"threshold": threshold, "batch": batch}
-    seeds, costs, drawn = rejection(key, optimizer.space, 1, cost, **how)
+    options = {"threshold": threshold, "batch": batch}
+    seeds, costs, drawn = rejection(key, optimizer.space, 1, cost, **options)
     return seeds[0], float(costs[0]), drawn
 
 

@@ -81,9 +81,9 @@ class Retested:
         again = self._again(state)
         known = state.memory["cost"]
         count = state.memory["episodes"]
-        found = jnp.where(jnp.isfinite(cost), cost, jnp.inf)
-        found = jnp.where(again, known + (found - known) / (count + 1), found)
-        costs = jnp.concatenate([found, jnp.where(again, jnp.inf, known)])
+        costs_now = jnp.where(jnp.isfinite(cost), cost, jnp.inf)
+        costs_now = jnp.where(again, known + (costs_now - known) / (count + 1), costs_now)
+        costs = jnp.concatenate([costs_now, jnp.where(again, jnp.inf, known)])
         counts = jnp.concatenate([jnp.where(again, count + 1, 1), count])
         # Newer designs come first among equal ones; what failed once is out.
         order = jnp.argsort(costs + (PRIOR - costs) / (counts + 1))[: len(cost)]

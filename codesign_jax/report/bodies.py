@@ -50,14 +50,17 @@ def parts(scene: Scene, grasp: Replay) -> list[Part]:
     """Meshes of fingers, palm and object; bodies are numbered as in MuJoCo's model."""
     lay = model.layout(scene)
     palm = scene.hand.palm
-    found = [_finger(scene, grasp, f, lay) for f in range(scene.num_fingers)]
+    bodies = [_finger(scene, grasp, f, lay) for f in range(scene.num_fingers)]
     disc = PRIMITIVES["cylinder"].triangles((palm.radius, palm.thickness / 2))
     disc.apply_translation([0, 0, palm.thickness / 2])
-    found.append(_rigid("palm", PALM, disc.vertices, disc.faces, 1))
+    bodies.append(_rigid("palm", PALM, disc.vertices, disc.faces, 1))
     for fixture in scene.fixture:
-        found += _fixture(fixture)
+        bodies += _fixture(fixture)
     vertices, faces = object_mesh(scene, int(grasp.trial.shape))
-    return [*found, _rigid("object", OBJECT, vertices * float(grasp.trial.size), faces, lay.object)]
+    return [
+        *bodies,
+        _rigid("object", OBJECT, vertices * float(grasp.trial.size), faces, lay.object),
+    ]
 
 
 def motion(scene: Scene, grasp: Replay, *, rate: float = 25.0) -> Motion:
@@ -71,12 +74,12 @@ def poses(scene: Scene, grasp: Replay, qpos: np.ndarray) -> np.ndarray:
     """Poses of all bodies at these positions, by MuJoCo's kinematics; see `Motion`."""
     compiled = model.compile_model(scene, grasp.params, grasp.trial)
     data = mujoco.MjData(compiled)
-    found = []
+    poses_now = []
     for q in qpos:
         data.qpos[:] = q
         mujoco.mj_kinematics(compiled, data)
-        found.append(np.concatenate([data.xpos, data.xquat], 1))
-    return np.array(found, np.float32)
+        poses_now.append(np.concatenate([data.xpos, data.xquat], 1))
+    return np.array(poses_now, np.float32)
 
 
 def object_mesh(scene: Scene, index: int) -> tuple[np.ndarray, np.ndarray]:

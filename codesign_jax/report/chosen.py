@@ -51,13 +51,15 @@ def _by_object(run: Run, judged: Judged) -> str:
     turns = np.arange(count) % (count if run.reference is not None else run.settings.trials)
     rows = []
     for k, name in enumerate(names):
-        own = turns % len(names) == k
-        if own.any():
-            mine = jax.tree.map(lambda v, own=own: np.asarray(v)[own], judged.outcomes)
-            found = verdict.tally(mine)
-            share = wilson(found.kept, found.total)
+        of_object = turns % len(names) == k
+        if of_object.any():
+            mine = jax.tree.map(
+                lambda v, of_object=of_object: np.asarray(v)[of_object], judged.outcomes
+            )
+            counts = verdict.tally(mine)
+            share = wilson(counts.kept, counts.total)
             span = f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
-            rows.append((name, f"{found.kept} of {found.total}", span, *found[1:]))
+            rows.append((name, f"{counts.kept} of {counts.total}", span, *counts[1:]))
     head = ("object", "kept", "95 % interval of all", "lost", "not released", "failed otherwise")
     return markup.table(head, rows, (1, 2, 3, 4, 5))
 

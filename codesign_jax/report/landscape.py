@@ -29,24 +29,24 @@ class Landscape(NamedTuple):
     design: np.ndarray
 
 
-def save(found: Landscape, folder: Path) -> list[Path]:
+def save(landscape: Landscape, folder: Path) -> list[Path]:
     """Writes a landscape as arrays and as a table of its points; returns the files."""
     npz = folder / FILE
     table = folder / TABLE
-    array_files.save(npz, found._asdict())
+    array_files.save(npz, landscape._asdict())
     axes = [
         f"{n}_{u}".rstrip("_").replace("[", "_").replace("]", "")
-        for n, u in zip(found.names, found.units, strict=True)
+        for n, u in zip(landscape.names, landscape.units, strict=True)
     ]
 
     def row(i: int, j: int) -> tables.Row:
-        place = dict(zip(axes, (found.first[i], found.second[j]), strict=True))
-        numbers = {n: f"{v:.9g}" for n, v in (place | {"mean_cost": found.cost[i, j]}).items()}
-        counts = {"kept_trials": found.kept[i, j], "counted_trials": found.counted[i, j]}
-        return numbers | {n: int(v) for n, v in (counts | {"trials": found.trials}).items()}
+        place = dict(zip(axes, (landscape.first[i], landscape.second[j]), strict=True))
+        numbers = {n: f"{v:.9g}" for n, v in (place | {"mean_cost": landscape.cost[i, j]}).items()}
+        counts = {"kept_trials": landscape.kept[i, j], "counted_trials": landscape.counted[i, j]}
+        return numbers | {n: int(v) for n, v in (counts | {"trials": landscape.trials}).items()}
 
     head = [*axes, *columns.MORE[TABLE].columns]
-    tables.write(table, head, (row(*place) for place in np.ndindex(*found.cost.shape)))
+    tables.write(table, head, (row(*place) for place in np.ndindex(*landscape.cost.shape)))
     return [npz, table]
 
 

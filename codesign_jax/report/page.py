@@ -138,25 +138,25 @@ def _parameters(run: Run) -> str:
 def _landscape(run: Run) -> str:
     path = run.folder / landscape.FILE
     space = run.space
-    found = landscape.load(path) if path.exists() else None
+    grid = landscape.load(path) if path.exists() else None
     words = "A dot is a particle of any episode, coloured by its cost. "
     command = []
-    if found is None:
+    if grid is None:
         if space.num_parameters != 2:
             return ""
         words = words + "The whole landscape: "
         command = ["landscape", "--run", str(run.folder)]
         figure = figures.designs(run.history, space, run.chosen.design, None)
     else:
-        grey = f"the mean cost over {int(found.trials)} trials a point, white where all are kept."
-        if tuple(found.names) == space.names:
+        grey = f"the mean cost over {int(grid.trials)} trials a point, white where all are kept."
+        if tuple(grid.names) == space.names:
             words += f"In grey {grey}"
-            figure = figures.designs(run.history, space, run.chosen.design, found)
+            figure = figures.designs(run.history, space, run.chosen.design, grid)
         else:
-            own = np.allclose(found.design, run.chosen.design)
+            own = np.allclose(grid.design, run.chosen.design)
             around = "the chosen design" if own else "another design, which landscape.npz has"
             words = f"In grey {grey} The other parameters are those of {around}."
-            figure = figures.landscape(found)
+            figure = figures.landscape(grid)
     section = markup.paragraph(words, "", command), figures.html(figure, "landscape")
     return markup.section("Landscape", *section)
 
@@ -197,10 +197,10 @@ def _provenance(run: Run) -> str:
     for word, step in steps:
         rows.append((f"{word} {step['time']}", shlex.join(["codesign", *step["command"][1:]])))
     texts = [(run.folder / name) for name in NAMES]
-    found = {path.name: path.read_text(encoding="utf-8") for path in texts if path.exists()}
-    found["provenance.json"] = json.dumps(p, indent=2)
+    files_shown = {path.name: path.read_text(encoding="utf-8") for path in texts if path.exists()}
+    files_shown["provenance.json"] = json.dumps(p, indent=2)
     details = [
         f"<details><summary>{markup.text(name)}</summary><pre>{markup.text(text)}</pre></details>"
-        for name, text in found.items()
+        for name, text in files_shown.items()
     ]
     return markup.section("Provenance", markup.table((), rows), *details)

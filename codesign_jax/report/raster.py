@@ -65,9 +65,9 @@ def _weights(corners: np.ndarray, face: np.ndarray, x: np.ndarray, y: np.ndarray
     area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = 1 / area
-        found = []
+        edges = []
         for p, q in ((b, c), (c, a)):
             slope = (q - p) * inverse[:, None]
             start = -slope[:, 0] * p[:, 1] + slope[:, 1] * p[:, 0]
-            found.append(slope[face, 0] * y - slope[face, 1] * x + start[face])
-        return np.stack([*found, 1 - found[0] - found[1]], 1)
+            edges.append(slope[face, 0] * y - slope[face, 1] * x + start[face])
+        return np.stack([*edges, 1 - edges[0] - edges[1]], 1)

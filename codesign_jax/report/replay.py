@@ -53,11 +53,11 @@ def replay(scene: Scene, engine: Engine, params: Params, trials: Trial) -> list[
     worlds = jax.tree.map(lambda v: jnp.broadcast_to(v, (count, *jnp.shape(v))), params)
     outcomes, trace = jax.tree.map(np.asarray, _simulate(scene, engine, worlds, trials))
 
-    def one(tree, i: int):
+    def at_index(tree, i: int):
         return jax.tree.map(lambda v: np.asarray(v)[i], tree)
 
     return [
-        Replay(*(one(v, i) for v in (worlds, trials, outcomes, trace.qpos, trace)))
+        Replay(*(at_index(v, i) for v in (worlds, trials, outcomes, trace.qpos, trace)))
         for i in range(count)
     ]
 

@@ -22,8 +22,8 @@ MANY = 0.1
 
 def depths(forces: Forces) -> str:
     """The largest depth of each kind of contact over forces of any shape, in words."""
-    found = {k.replace("_", " on "): 1e3 * float(np.max(v)) for k, v in forces.depth.items()}
-    words = [f"{k} {v:.2g} mm" for k, v in found.items() if v > 0]
+    depths_mm = {k.replace("_", " on "): 1e3 * float(np.max(v)) for k, v in forces.depth.items()}
+    words = [f"{k} {v:.2g} mm" for k, v in depths_mm.items() if v > 0]
     return ", ".join(words) or "nothing touched"
 
 
@@ -39,21 +39,21 @@ class Judged(NamedTuple):
     @property
     def verdict(self) -> Verdict:
         """The verdict; failed trials count as not kept."""
-        found = tally(self.outcomes)
-        return judge(found.kept, found.total)
+        counts = tally(self.outcomes)
+        return judge(counts.kept, counts.total)
 
     @property
     def details(self) -> str:
         """Outcomes and accuracy of the trials, in a line."""
         size = self.scene.discretization
         named = f"accuracy {self.accuracy}, " if self.accuracy else ""
-        how = f"{named}steps of {1e3 * size.timestep:g} ms, {size.links} links a finger"
-        return f"{of_trials(self.scene, self.outcomes)}; {how}"
+        accuracy = f"{named}steps of {1e3 * size.timestep:g} ms, {size.links} links a finger"
+        return f"{of_trials(self.scene, self.outcomes)}; {accuracy}"
 
     def __str__(self) -> str:
         """The verdict in a sentence; that there is none if every trial failed."""
-        found = tally(self.outcomes)
-        if found.failed == found.total:
+        counts = tally(self.outcomes)
+        if counts.failed == counts.total:
             causes = runs.failure_counts(self.outcomes.status)
             return f"no verdict: every trial failed ({causes})"
         said = self.verdict.sentence(f"{self.grasps} of {objects(self.scene)}")
@@ -88,9 +88,9 @@ def _span(values: Iterable[float]) -> str:
 def of_trials(scene: Scene, outcomes: Outcome) -> str:
     """Numbers of trials by outcome, their mean cost, and warnings."""
     warnings = runs.warning_counts(outcomes.status)
-    found = tally(outcomes)
-    causes = f" ({runs.failure_counts(outcomes.status)})" if found.failed else ""
-    text = f"{found}{causes}; {mean_cost(scene, outcomes)}"
+    counts = tally(outcomes)
+    causes = f" ({runs.failure_counts(outcomes.status)})" if counts.failed else ""
+    text = f"{counts}{causes}; {mean_cost(scene, outcomes)}"
     return text + (f"; warnings: {warnings}" if warnings else "")
 
 
@@ -129,13 +129,13 @@ def _told(values: Any) -> np.ndarray:
 def warnings(judged: Judged) -> list[str]:
     """A line with advice if many trials failed; no line otherwise."""
     scene = judged.scene
-    found = tally(judged.outcomes)
-    count = found.not_released + found.failed
-    if count <= MANY * found.total or found.failed == found.total:
+    counts = tally(judged.outcomes)
+    count = counts.not_released + counts.failed
+    if count <= MANY * counts.total or counts.failed == counts.total:
         return []
     causes = runs.failure_counts(judged.outcomes.status)
-    text = f"warning: {count} of {found.total} trials failed ({causes})"
-    text += "; STUCK: the hand did not let go of the object" if found.not_released else ""
+    text = f"warning: {count} of {counts.total} trials failed ({causes})"
+    text += "; STUCK: the hand did not let go of the object" if counts.not_released else ""
     if scene.cost.failure == "exclude":
         text += (
             ". The mean cost leaves them out, so that a search does not avoid such designs: "

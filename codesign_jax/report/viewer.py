@@ -120,14 +120,14 @@ def strip(scene: Scene, grasp: Replay) -> list[tuple[str, str]]:
     moments = [("start", 0.0), *((f"end of {name}", end) for name, end in ends[1:])]
     moments.insert(k + 1, amid)
     times = np.array([time for _, time in moments])
-    found = []
+    captioned = []
     pictures = animation.frames(scene, grasp, times, size=(240, 240))
     for (caption, time), frame in zip(moments, pictures, strict=True):
         file = io.BytesIO()
         Image.fromarray(frame).quantize(64).save(file, "png", optimize=True)
         picture = base64.b64encode(file.getvalue()).decode()
-        found.append((f"{caption}, {time:g} s", picture))
-    return found
+        captioned.append((f"{caption}, {time:g} s", picture))
+    return captioned
 
 
 def phases(scene: Scene) -> list[tuple[str, float]]:

@@ -114,9 +114,9 @@ def strain_pressure(
       shear_modulus: G of the silicone [Pa].
       neo_hookean: Whether the bending law is that of a neo-Hookean wall, else the linear one.
     """
-    own = beam(height, wall, width=width, shear_modulus=shear_modulus, density=1.0)
+    section = beam(height, wall, width=width, shear_modulus=shear_modulus, density=1.0)
     curvature = strain / height
-    moment = own.bending * curvature
+    moment = section.bending * curvature
     if neo_hookean:
         moment *= 1 - softening(curvature, height, wall, width=width)
-    return moment / own.moment_per_pressure
+    return moment / section.moment_per_pressure

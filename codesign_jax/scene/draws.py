@@ -162,11 +162,11 @@ def check(table: Constants, where: str) -> list[str]:
 
 def correlations(table: Constants) -> np.ndarray:
     """Correlations of the normal scores, shape (constant, constant)."""
-    found = np.eye(len(table.constant))
+    matrix = np.eye(len(table.constant))
     for i, entry in enumerate(table.constant):
-        found[i, : len(entry.correlation)] = entry.correlation
-        found[: len(entry.correlation), i] = entry.correlation
-    return found
+        matrix[i, : len(entry.correlation)] = entry.correlation
+        matrix[: len(entry.correlation), i] = entry.correlation
+    return matrix
 
 
 def root(table: Constants) -> np.ndarray:

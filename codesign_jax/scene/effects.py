@@ -87,8 +87,8 @@ EFFECTS: Mapping[str, Effect] = {
 def refusals(effects: Any, engine: str) -> dict[str, str]:
     """Returns why an engine cannot do a scene's effects, by effect; empty if it can."""
     values = dataclasses.asdict(effects)
-    found = {name: EFFECTS[name].refused.get(engine, {}).get(v) for name, v in values.items()}
-    return {name: reason for name, reason in found.items() if reason}
+    reasons = {name: EFFECTS[name].refused.get(engine, {}).get(v) for name, v in values.items()}
+    return {name: reason for name, reason in reasons.items() if reason}
 
 
 def refuse(effects: Any, engine: str) -> None:

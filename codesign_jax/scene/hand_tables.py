@@ -273,8 +273,8 @@ def with_strain(hand: "Hand", strain: float | None, *, neo_hookean: bool) -> "Ha
     """A hand whose pressures stretch no wall of a free finger by more than a strain, if any."""
     # The pressure of a strain goes with the modulus over the moment's factor.
     modulus = hand.material.shear_modulus / hand.material.moment_factor
-    own = (strain, hand.section.width, modulus, neo_hookean)
-    limit = dataclasses.replace(hand.pressure_limit, strain=None if strain is None else own)
+    strain_data = (strain, hand.section.width, modulus, neo_hookean)
+    limit = dataclasses.replace(hand.pressure_limit, strain=None if strain is None else strain_data)
     return dataclasses.replace(hand, pressure_limit=limit)
 
 

@@ -160,13 +160,13 @@ def read_parameters(rows: Any, where: str) -> tuple[ControlParameter, ...]:
     problems: list[str] = []
     reader = _Reader({}, where, 0, problems)
     given = [keypaths.plain(row, where) for row in rows]
-    found = [schema.parse(ControlParameter, row, where, problems) for row in given]
-    for i, row in enumerate(found):
+    parsed = [schema.parse(ControlParameter, row, where, problems) for row in given]
+    for i, row in enumerate(parsed):
         if row is not None:
             reader.parameter(row, f"{where}[{i}]")
     if problems:
         raise schema.InputError(problems)
-    return tuple(row for row in found if row is not None)
+    return tuple(row for row in parsed if row is not None)
 
 
 def with_parameters(hand: Hand, control: Control) -> Hand:
@@ -188,8 +188,8 @@ def without_parameters(hand: Hand) -> Hand:
 def times(scene: Any, params: Params) -> jax.Array:
     """Times of the key frames [s], shape (frame,)."""
     names = _names(scene, params)
-    found = [_value(frame.time, names) for frame in scene.control.frame]
-    return jnp.stack([jnp.asarray(t, float) for t in found])
+    frame_times = [_value(frame.time, names) for frame in scene.control.frame]
+    return jnp.stack([jnp.asarray(t, float) for t in frame_times])
 
 
 def poses(scene: Any, params: Params, count: int | None = None) -> jax.Array:
@@ -235,10 +235,10 @@ def pressures(scene: Any, params: Params) -> list[tuple[Any, jax.Array]]:
 
 
 def _names(scene: Any, params: Params) -> dict[str, Any]:
-    found = _scene_times(scene)
-    found |= {key: getattr(scene.arm, key) for key in ("start_height", "zero_height")}
-    found |= {f"arm_{axis}": params.arm[i] for i, axis in enumerate(POSE)}
-    return found | {"pressure": params.pressure} | (params.control or {})
+    values = _scene_times(scene)
+    values |= {key: getattr(scene.arm, key) for key in ("start_height", "zero_height")}
+    values |= {f"arm_{axis}": params.arm[i] for i, axis in enumerate(POSE)}
+    return values | {"pressure": params.pressure} | (params.control or {})
 
 
 def _scene_times(scene: Any) -> dict[str, Any]:
@@ -246,8 +246,8 @@ def _scene_times(scene: Any) -> dict[str, Any]:
 
 
 def _value(total: Sum, names: Mapping[str, Any]) -> Any:
-    own = ((1.0 if t.factor is None else t.factor, names[t.name]) for t in total.term)
-    parts = [factor * value for factor, value in own]
+    terms = ((1.0 if t.factor is None else t.factor, names[t.name]) for t in total.term)
+    parts = [factor * value for factor, value in terms]
     if total.number is not None:
         parts.insert(0, total.number * (UNITS["deg"][1] if total.unit == "deg" else 1.0))
     value = parts[0] if parts else 0.0
@@ -258,8 +258,8 @@ def _value(total: Sum, names: Mapping[str, Any]) -> Any:
 
 def _factors(total: Sum) -> dict[str, Any]:
     """Factors by name; that of no name is the number."""
-    found = {t.name: 1.0 if t.factor is None else t.factor for t in total.term}
-    return found if total.number is None else found | {"": total.number}
+    factors = {t.name: 1.0 if t.factor is None else t.factor for t in total.term}
+    return factors if total.number is None else factors | {"": total.number}
 
 
 # --- reading -------------------------------------------------------------------------------------

@@ -116,15 +116,15 @@ def _with_law(scene: SceneFile, material: hand.Material, where: str, problems: l
 
 
 def _leave_out(table: dict[str, Any], changes: dict[tuple[Any, ...], Any], where: str) -> None:
-    found = []
+    left_out = []
     for key in (tuple(name.split(".")) for name in GONE):
         inside = table.get(key[0])
         if isinstance(inside, dict) and inside.pop(key[1], None) is not None:
-            found.append(".".join(key))
+            left_out.append(".".join(key))
         if changes.pop(key, None) is not None:
-            found.append(".".join(key))
-    if found:
-        names = ", ".join(found)
+            left_out.append(".".join(key))
+    if left_out:
+        names = ", ".join(left_out)
         text = f"{where} is read without {names}: they have no effect any more"
         warnings.warn(text, stacklevel=3)
 
@@ -200,15 +200,15 @@ def _check(scene: SceneFile, where: str, problems: list[str]) -> None:
 
 def _fixture_problems(fixture: Fixture, where: str) -> list[str]:
     sizes = PRIMITIVES[fixture.type].sizes if fixture.type in PRIMITIVES else ()
-    found = []
+    problems = []
     if len(fixture.position) != 3:
-        found.append(f"{where}: position must have three coordinates")
+        problems.append(f"{where}: position must have three coordinates")
     if len(fixture.size or ()) != len(sizes):
         words = f"{len(sizes)} values ({', '.join(sizes)})" if sizes else "no size"
-        found.append(f"{where}: a {fixture.type} has {words}, not {list(fixture.size or ())}")
+        problems.append(f"{where}: a {fixture.type} has {words}, not {list(fixture.size or ())}")
     if fixture.orientation and (why := rigid_bodies.orientation_problem(fixture.orientation)):
-        found.append(f"{where}: orientation {why}")
-    return found
+        problems.append(f"{where}: orientation {why}")
+    return problems
 
 
 def check_together(scene: SceneFile, where: str) -> list[str]:

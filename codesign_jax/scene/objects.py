@@ -276,8 +276,8 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Obj
     shapes = [_shape(shape, path, problems) for shape in parsed.object]
     if problems:
         raise schema.InputError(problems)
-    found = tuple(s for s in shapes if s is not None)
-    return ObjectSet(parsed.name, parsed.description, parsed.noise, parsed.table, found)
+    shapes_read = tuple(s for s in shapes if s is not None)
+    return ObjectSet(parsed.name, parsed.description, parsed.noise, parsed.table, shapes_read)
 
 
 def _size_problems(given: _ObjectSetFile, path: Path) -> list[str]:
@@ -345,12 +345,12 @@ def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
         why = rigid_bodies.inertia_problem(given.inertia, shape.mass, shape.radius)
         problems += [f"{where}: inertia {why}"] if why else []
     if given.pose is not None:
-        found = rigid_bodies.chosen(given.pose, shape.resting)
-        if isinstance(found, str):
-            problems.append(f"{where}: pose = {schema.shown(given.pose)} {found}")
+        resting = rigid_bodies.chosen(given.pose, shape.resting)
+        if isinstance(resting, str):
+            problems.append(f"{where}: pose = {schema.shown(given.pose)} {resting}")
             return None
         # Written back as an orientation, so that another trimesh reads the same object.
-        shape = dataclasses.replace(shape, pose=None, orientation=found.orientation)
+        shape = dataclasses.replace(shape, pose=None, orientation=resting.orientation)
     return shape
 
 
@@ -374,8 +374,8 @@ def _primitive(values: dict[str, Any]) -> Shape:
     inertia = values["inertia"]
     if mass is None:
         mass = values["density"] * primitive.volume(size)
-    own = inertia and tuple(v / mass for v in inertia[:3])
-    changed: dict[str, Any] = {"mass": mass, "density": None, "own_inertia": own}
+    own_inertia = inertia and tuple(v / mass for v in inertia[:3])
+    changed: dict[str, Any] = {"mass": mass, "density": None, "own_inertia": own_inertia}
     return Shape(**values | changed)
 
 
@@ -389,7 +389,7 @@ def _mesh_shape(
     from codesign_jax.scene import meshes
 
     mass, inertia, centre = (values[key] for key in ("mass", "inertia", "centre_of_mass"))
-    own = inertia if inertia is not None and len(inertia) in (3, 6) else None
+    given_inertia = inertia if inertia is not None and len(inertia) in (3, 6) else None
     try:
         mesh = meshes.load(
             path.parent / values["file"],
@@ -397,7 +397,7 @@ def _mesh_shape(
             repaired=bool(values["repair"]),
             voxel_error=values["voxel_error"] or 5e-4,
             centre=None if centre is None else np.array(centre),
-            tensor=None if own is None else rigid_bodies.tensor(own) / mass,
+            tensor=None if given_inertia is None else rigid_bodies.tensor(given_inertia) / mass,
             content=content,
         )
     except schema.InputError as error:

@@ -212,13 +212,13 @@ class DesignSpace:
         """Refuses numbers that are none, designs of shape (design, parameter) in any units."""
         bad: np.ndarray = ~np.isfinite(rows)
         names = zip(self.names, np.asarray(bad.any(0)), rows.T, bad.T, strict=True)
-        found = [
+        problems = [
             f"{name} = {column[where][0]} is not a finite number"
             for name, any_bad, column, where in names
             if any_bad
         ]
-        if found:
-            raise schema.InputError(found)
+        if problems:
+            raise schema.InputError(problems)
 
     def _outside(
         self, units: Sequence[str], low: np.ndarray, high: np.ndarray, rows: np.ndarray

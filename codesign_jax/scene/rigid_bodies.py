@@ -81,7 +81,7 @@ def stable(points: np.ndarray, inertia: Sequence[float], base: Sequence[float]) 
     size = np.abs(points).max()  # trimesh merges faces by lengths in units of the file
     hull = trimesh.PointCloud(points / size).convex_hull
     poses, chances = trimesh.poses.compute_stable_poses(hull, center_mass=np.zeros(3), seed=0)
-    own = Rotation.from_quat(np.roll(base, -1)).as_matrix().T
+    base_rotation = Rotation.from_quat(np.roll(base, -1)).as_matrix().T
     groups = []
     total = sum(inertia)
     for turn, chance in zip(poses[:, :3, :3], chances, strict=True):
@@ -90,17 +90,17 @@ def stable(points: np.ndarray, inertia: Sequence[float], base: Sequence[float]) 
         for group in groups:
             near = abs(height - group[0]) < _ALIKE * height
             if near and abs(moment - group[1]) < _ALIKE * total:
-                group[2].append((chance, _levelled(turn @ own)))
+                group[2].append((chance, _levelled(turn @ base_rotation)))
                 break
         else:
-            groups.append((height, moment, [(chance, _levelled(turn @ own))]))
-    found = []
+            groups.append((height, moment, [(chance, _levelled(turn @ base_rotation))]))
+    resting = []
     for _, _, members in groups:
         most = max(chance for chance, _ in members)
         likely = [turn for chance, turn in members if chance > most / 2]
         least = Rotation.from_matrix(max(likely, key=_plainness))
-        found.append(Resting(_quaternion(least), float(sum(chance for chance, _ in members))))
-    return sorted(found, key=lambda pose: -pose.probability)
+        resting.append(Resting(_quaternion(least), float(sum(chance for chance, _ in members))))
+    return sorted(resting, key=lambda pose: -pose.probability)
 
 
 def _levelled(turn: np.ndarray) -> np.ndarray:
@@ -116,13 +116,13 @@ def _plainness(turn: np.ndarray) -> tuple[float, float]:
     return round(float(np.trace(turn)), 6), float(np.abs(turn).max(0).sum())
 
 
-def chosen(pose: str, found: Callable[[], list[Resting]]) -> Resting | str:
+def chosen(pose: str, find_poses: Callable[[], list[Resting]]) -> Resting | str:
     """The pose of this name, or what is wrong with it."""
     match = _STABLE.fullmatch(pose)
     if match is None:
         return 'must be "stable", or "stable:2" for the second most probable pose'
     index = int(match[1] or 1)
-    poses = found()
+    poses = find_poses()
     if index <= len(poses):
         return poses[index - 1]
     some = ", ".join(f"{i} ({100 * p.probability:.0f} %)" for i, p in enumerate(poses[:9], 1))

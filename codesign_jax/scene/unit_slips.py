@@ -24,8 +24,8 @@ def refuse(params: Params) -> None:
     if any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(params)):
         return
     arm = [f"arm_{axis}" for axis in ("x", "y", "z", "roll", "pitch", "yaw")]
-    own = [name for name in Params._fields if name not in ("arm", "control", "tip")]
-    values = {name: getattr(params, name) for name in own}
+    names = [name for name in Params._fields if name not in ("arm", "control", "tip")]
+    values = {name: getattr(params, name) for name in names}
     if params.tip is not None:
         values |= {f"tip_{name}": v for name, v in params.tip._asdict().items()}
     values |= {name: np.asarray(params.arm)[..., i] for i, name in enumerate(arm)}

@@ -54,13 +54,13 @@ def principal_axes(tensor: np.ndarray) -> np.ndarray:
     if off <= _SYMMETRIC * np.trace(tensor):
         return np.eye(3)
     vectors = np.linalg.eigh(tensor)[1]
-    found = []
+    candidates = []
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             axes = vectors[:, list(order)] * signs
             if np.linalg.det(axes) > 0:
-                found.append(axes)
-    return max(found, key=np.trace)
+                candidates.append(axes)
+    return max(candidates, key=np.trace)
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:

@@ -90,12 +90,12 @@ def _turn_outwards(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray):
     a = corner[:, 0]
     b = corner[:, 1]
     c = corner[:, 2]
-    names, own = np.unique(part, return_inverse=True)
-    volume = np.bincount(own, weights=np.einsum("fi,fi->f", a, np.cross(b, c)))
-    each = [faces[own == k] for k in range(len(names))]
+    names, part_index = np.unique(part, return_inverse=True)
+    volume = np.bincount(part_index, weights=np.einsum("fi,fi->f", a, np.cross(b, c)))
+    each = [faces[part_index == k] for k in range(len(names))]
     firsts = vertices[[mine[0, 0] for mine in each]]
     enclosed = [abs(winding(vertices, mine, firsts)) > 0.5 for mine in each]
     np.fill_diagonal(around := np.array(enclosed), False)
     cavity = around.sum(0) % 2 == 1
-    inward = ((volume < 0) != cavity)[own]
+    inward = ((volume < 0) != cavity)[part_index]
     return np.where(inward[:, None], faces[:, ::-1], faces), inward

@@ -11,8 +11,8 @@ from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Params, Tip, Trial
 
-_TRIAL = Trial._make([(), (2,), (), (2,), (), (), (), (), (), (2,)])
-"""Shapes of one trial."""
+_TRIAL = Trial._make([(), (2,), (), (2,), (), (), (), (), (), (2,), None])
+"""Shapes of one trial, without constants of its own."""
 
 
 def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -> None:
@@ -25,7 +25,8 @@ def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -
         problems.append("params.tip is for hands with section.tapered, which need it")
     elif params.tip is not None:
         problems += _problems("params.tip", params.tip, Tip(fingers, fingers, fingers), axes[0])
-    problems += _problems("trials", trials, _TRIAL, axes[1])
+    one_trial = _TRIAL._replace(constants=(len(scene.drawn.constant),))
+    problems += _problems("trials", trials, one_trial, axes[1])
     if not problems and axes[0] == axes[1]:
         counts = len(params.length), len(trials.yaw)
         if counts[0] != counts[1]:

@@ -30,7 +30,7 @@ from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording
 from codesign_jax.preflight import invalid_start
 from codesign_jax.preflight import nominal_trial as nominal_trial
-from codesign_jax.scene import Scene, mesh_margins, schema, unit_slips
+from codesign_jax.scene import Scene, draws, mesh_margins, schema, unit_slips
 from codesign_jax.scene.constants import batch_axes
 from codesign_jax.types import Outcome, Params, Status, Trace, Trial, failed
 from codesign_jax.verdict import as_bit
@@ -82,6 +82,8 @@ class Options(NamedTuple):
 # Folded into a trial's key for draws that came later, so that earlier ones stay as they are.
 _LATER = 1
 _HAND_MASS = 2
+_CONSTANTS = 0x636F6E73
+"""Stream of the trials' constants ("cons")."""
 
 
 def sample_trials(
@@ -106,7 +108,11 @@ def sample_trials(
     reuse.begin()
     axes.refuse_draws(key, num_trials)
     axes.refuse_numbers(scene.checked(), num_trials, "trial")
-    return _draw(num_trials, len(scene.objects.object), key, scene.objects.noise, first)
+    found = _draw(num_trials, len(scene.objects.object), key, scene.objects.noise, first)
+    if not scene.drawn.constant:
+        return found
+    own = jax.random.fold_in(key, _CONSTANTS)
+    return found._replace(constants=draws.deviations(scene.drawn, own, num_trials, first))
 
 
 @partial(jax.jit, static_argnums=(0, 1))

@@ -5,7 +5,7 @@ Mass, friction and other constants are data of one program; the other bending la
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from codesign_jax.model.overlap import Overlaps
 from codesign_jax.reuse import SceneProgram, shared
 from codesign_jax.runs.cases import Case
 from codesign_jax.runs.interrupts import interruptible
-from codesign_jax.scene import Scene, silicones
+from codesign_jax.scene import Scene, draws, silicones
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.scene.schema import InputError
 from codesign_jax.statistics import wilson
@@ -35,19 +35,11 @@ HEAVIEST = 0.5
 """Largest mass [kg] of an object that is made heavier."""
 FRICTION = 0.4
 """A coefficient between silicone and a smooth or dusty object."""
-FACTORS = {
-    ("hand", "material", "shear_modulus"): (0.6, 1.65),
-    ("hand", "material", "lateral_factor"): (0.44, 1.3),
-    ("hand", "material", "torsion_factor"): (0.5, 1.1),
-    ("hand", "wrist", "linear_stiffness"): (0.6, 7.0),
-    ("hand", "wrist", "angular_stiffness"): (0.1, 1.4),
-    ("objects", "object", "friction"): (0.7, 1.4),
-    ("objects", "table", "friction"): (0.57, 1.4),
-    ("contact", "normal_stiffness"): (0.3, 4.5),
-    ("contact", "friction_ratio"): (0.12, 2.5),
-}
-"""Ranges of factors on constants that nobody knows before a hand is built, drawn log-uniformly:
-those between 5 and 95 % of the sets that no target of docs/calibration.md rules out."""
+UNMEASURED = "unmeasured"
+"""Table of the constants that nobody knows before a hand is built."""
+OWN_MODULUS = (0.6, 1.65)
+"""Range of the modulus of a silicone that is not named: moduli of one silicone by different tests
+differ by 1.5 times, see docs/reality.md."""
 STREAM = 0x73747265
 """Stream of the trials' noise at the end of a run, and root of the draws ("stre")."""
 HELD = 10
@@ -159,26 +151,36 @@ def variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
             grams = dict.fromkeys(f"{1e3 * m:.0f}" for m in (min(heavier), max(heavier)))
             path = ("objects", "object", "mass")
             place = iter(heavier)
-            own = _changed(scene, path, lambda _, place=place: next(place))
+            own = draws.changed(scene, path, lambda _, place=place: next(place))
             yield f"objects of {' to '.join(grams)} g", own
-    own = _changed(scene, ("objects", "object", "friction"), lambda _: FRICTION)
+    own = draws.changed(scene, ("objects", "object", "friction"), lambda _: FRICTION)
     yield f"friction {FRICTION} on the hand", own
-    random = np.random.default_rng(STREAM)
-    for _ in range(DRAWS):
-        own = scene
-        for path, ends in FACTORS.items():
-            factor = float(np.exp(random.uniform(*np.log(ends))))
-            own = _changed(own, path, lambda v, factor=factor: v * factor)
-        yield f"{DRAWS} draws of other constants", own
+    table = unknown(scene)
+    if not table.constant:
+        return
+    values = np.asarray(draws.deviations(table, jax.random.key(STREAM), DRAWS), float)
+    for own in values:
+        yield f"{DRAWS} draws of other constants", draws.applied(scene, table, own.tolist())
 
 
-def _changed(table: Any, path: tuple[str, ...], change: Callable[[float], float]) -> Any:
-    if not path:
-        return change(table)
-    if isinstance(table, tuple):
-        return tuple(_changed(entry, path, change) for entry in table)
-    new = _changed(getattr(table, path[0]), path[1:], change)
-    return dataclasses.replace(table, **{path[0]: new})
+def unknown(scene: Scene) -> draws.Constants:
+    """Constants of a scene of which nothing is known: those that it draws itself are left out.
+
+    The modulus of a silicone that is named is within the interval that measurements give.
+    """
+    known = {entry.key for entry in scene.drawn.constant}
+    silicone = scene.hand.material.silicone
+    low, high = OWN_MODULUS
+    if silicone is not None:
+        rubber = silicones.get(silicone)
+        low, high = (end / rubber.shear_modulus for end in rubber.interval)
+    found = []
+    for entry in draws.read(UNMEASURED).constant:
+        if entry.key == "hand.material.shear_modulus":
+            entry = dataclasses.replace(entry, low=low, high=high)
+        if entry.key not in known:
+            found.append(entry)
+    return draws.Constants(constant=tuple(found))
 
 
 def _program(scene: Scene, case: Case, trials: int) -> SceneProgram:

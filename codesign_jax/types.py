@@ -137,6 +137,8 @@ class Trial(NamedTuple):
       stiffness: Factor on the fingers' shear modulus, shape (); None for 1.
       hand_mass: Factor on the masses of fingers and palm, shape (); None for 1.
       tilt: Rotation of the object about x and then y, before its yaw [rad], shape (2,); None for 0.
+      constants: Factors on the constants of `Scene.drawn`, or shifts of them, shape (constant,);
+        None for the scene's own.
 
     >>> from codesign_jax import rollout, scene
     >>> trial = rollout.nominal_trial(scene.load("paper"), "sphere")
@@ -154,6 +156,7 @@ class Trial(NamedTuple):
     stiffness: jax.Array | None = None
     hand_mass: jax.Array | None = None
     tilt: jax.Array | None = None
+    constants: jax.Array | None = None
 
 
 class Phased(Protocol):

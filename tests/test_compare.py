@@ -1,6 +1,7 @@
 """Designs beside one another, at finer steps and under other conditions; verdicts on them."""
 
 import csv
+import dataclasses
 import itertools
 import re
 import shutil
@@ -32,7 +33,7 @@ from codesign_jax.model import overlap
 from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import cases, columns
-from codesign_jax.scene import beams, parameters, silicones
+from codesign_jax.scene import beams, draws, parameters, silicones
 from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import command, copied, finished_run, own_workplace  # noqa: F401
 from tests.helpers.toy_engine import TINY
@@ -538,8 +539,16 @@ def test_conditions_are_numbers_within_the_files_ranges():
         assert other.phases == PAPER.phases and other.hand.palm == PAPER.hand.palm
     assert [o.mass for o in found[1][1].objects.object] == [0.5] * 3
     ratio = [c.contact.normal_stiffness / PAPER.contact.normal_stiffness for _, c in found[3:]]
-    low, high = stress.FACTORS["contact", "normal_stiffness"]
-    assert len({*ratio}) == len(ratio) and low <= min(ratio) and max(ratio) <= high
+    table = {entry.key: entry for entry in stress.unknown(PAPER).constant}
+    stiffness = table["contact.normal_stiffness"]
+    assert len({*ratio}) == len(ratio)
+    assert stiffness.low <= min(ratio) and max(ratio) <= stiffness.high
+    # The modulus within what was measured of the silicone, and not what the scene draws itself.
+    modulus = table["hand.material.shear_modulus"]
+    assert (modulus.low, modulus.high) == (1.0, pytest.approx(101 / 88))
+    drawn = dataclasses.replace(PAPER, drawn=draws.Constants(constant=(stiffness,)))
+    left = {entry.key for entry in stress.unknown(drawn).constant}
+    assert table.keys() - left == {"contact.normal_stiffness"}
     masses = {f"objects.object.{o.name}.mass": 0.18 for o in PAPER.objects.object}
     heavy = scene.load("paper", overrides=masses | {"objects.object.sphere.mass": 0.7})
     [(name, numbers), (after, _), *_] = stress.variants(heavy)

@@ -14,11 +14,13 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from codesign_jax import control, model, rollout, scene
+from codesign_jax.commands import common, flags
 from codesign_jax.compiler import launch
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.world_model import world_constants
+from codesign_jax.runs import scene_files
 from codesign_jax.scene import constants, effects, schema
 from tests.helpers import grasps
 from tests.helpers.grasps import hand_world, hurried, off, pinch, random_constants
@@ -173,6 +175,114 @@ def test_later_noise_leaves_earlier_draws_alone():
             assert (getattr(plain, name) == 1).all(), name
         else:
             np.testing.assert_array_equal(value, getattr(plain, name), err_msg=name)
+
+
+DRAWN = """
+[[constant]]
+key = "hand.material.shear_modulus"
+distribution = "lognormal"
+mean = 90e3
+sd = 0.2
+source = "a test"
+
+[[constant]]
+key = "hand.material.damping_time"
+distribution = "normal"
+mean = 5e-3
+sd = 4e-4
+correlation = [-0.8]
+source = "a test"
+
+[[constant]]
+key = "objects.object.friction"
+distribution = "uniform"
+change = "factor"
+low = 0.8
+high = 1.1
+source = "a test"
+
+[[constant]]
+key = "hand.finger.1.tilt"
+distribution = "normal"
+change = "shift"
+mean = 0.0
+sd = 2.0
+source = "a test"
+"""
+"""A constant of each kind."""
+
+
+def with_draws(folder, text=DRAWN, **overrides):
+    """A scene as --constants has it."""
+    path = folder / "constants.toml"
+    path.write_text(text)
+    options = flags.TrialFlags(constants=str(path))
+    return scene.load("paper_spheres", overrides=common.changes(options) | overrides)
+
+
+def test_every_trial_has_constants_of_its_own(tmp_path):
+    """The fields of a trial are those of a scene with its numbers; the middle is the scene's."""
+    drawing = with_draws(tmp_path)
+    assert drawing.hand.material.shear_modulus == 90e3
+    key = jax.random.key(1)
+    trials = rollout.sample_trials(drawing, key, 400)
+    plain = rollout.sample_trials(scene.load("paper_spheres"), key, 400)
+    np.testing.assert_array_equal(trials.mass, plain.mass)
+    later = rollout.sample_trials(drawing, key, 2, 7)
+    np.testing.assert_array_equal(later.constants, trials.constants[7:9])
+    factor, shift, friction, tilt = np.asarray(trials.constants, float).T
+    # Standard errors of 400 draws: 3.5 % of a deviation, 5 % of it of a mean.
+    assert np.log(factor).std() == pytest.approx(0.2, rel=0.12)
+    assert shift.std() == pytest.approx(4e-4, rel=0.12) and tilt.std() == pytest.approx(2, rel=0.12)
+    assert np.corrcoef(np.log(factor), shift)[0, 1] == pytest.approx(-0.8, abs=0.08)
+    assert 0.8 <= friction.min() and friction.max() <= 1.1
+    trial = jax.tree.map(lambda v: v[0], trials)
+    own = constants.with_trial(drawing, trial)
+    assert own.hand.material.shear_modulus == pytest.approx(90e3 * factor[0])
+    assert own.hand.material.damping_time == pytest.approx(5e-3 + shift[0])
+    tilts = [b.tilt - a.tilt for a, b in zip(drawing.hand.finger, own.hand.finger, strict=True)]
+    np.testing.assert_allclose(tilts, [0, tilt[0], 0, 0], rtol=1e-5)
+    ratios = [
+        b.friction / a.friction
+        for a, b in zip(drawing.objects.object, own.objects.object, strict=True)
+    ]
+    np.testing.assert_allclose(ratios, friction[0], rtol=1e-6)
+    assert own.objects.table.friction == drawing.objects.table.friction
+
+
+def test_tables_of_other_numbers_share_their_programs(tmp_path):
+    """And a scene is written with its table, and read as it was."""
+    drawing = with_draws(tmp_path)
+    other = with_draws(tmp_path, DRAWN.replace("sd = 0.2", "sd = 0.1"))
+    assert drawing.structure == other.structure != scene.load("paper_spheres").structure
+    scene_files.write_scene(drawing, tmp_path / "run")
+    again = scene.load(tmp_path / "run" / "scene.toml")
+    assert again.drawn == drawing.drawn
+    left = common.changes(flags.TrialFlags(constants="none"))
+    assert scene.load(tmp_path / "run" / "scene.toml", overrides=left).drawn.constant == ()
+
+
+NO_TABLES = {
+    'key = "hand.material.shear_modulus"': ('key = "hand.material.modulus"', "is not a known key"),
+    'key = "hand.finger.1.tilt"': ('key = "objects.object.friction"', "given more than once"),
+    'key = "objects.object.friction"': ('key = "phases.lift"', "'phases.lift' is no constant"),
+    "correlation = [-0.8]": ("correlation = [0.1, 0.2]", "correlation has 2 numbers, 1 before it"),
+    "sd = 0.2": ("sd = -0.2", "is outside [0, 1e+09]"),
+    "low = 0.8": ("low = 1.2", "low = 1.2 must be below high = 1.1"),
+    "mean = 90e3": ("mean = 0.0", "mean of a lognormal is above 0"),
+    "sd = 2.0": ("low = 1.0", "has mean and sd, and no other number"),
+}
+
+
+@pytest.mark.parametrize("right", NO_TABLES)
+def test_a_table_that_is_none_is_refused(right, tmp_path):
+    wrong, why = NO_TABLES[right]
+    with pytest.raises(schema.InputError) as error:
+        with_draws(tmp_path, DRAWN.replace(right, wrong))
+    assert why in str(error.value)
+    law = 'law = "linear"\n' + DRAWN
+    with pytest.raises(schema.InputError, match="that of the law 'linear', and the scene has"):
+        with_draws(tmp_path, law, **{"hand.material.law": "neo_hookean"})
 
 
 BAD = {

@@ -64,6 +64,7 @@ def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("examples")
     shutil.copy(TINY.parent / "box.toml", place / "my_objects.toml")
     (place / "measured.csv").write_text("pressure_kPa,angle_deg\n20,18.9\n40,37.2\n")
+    shutil.copy(ROOT / "codesign_jax" / "constants" / "unmeasured.toml", place / "posterior.toml")
     policy = re.search(r"^```python\n(.*?)^```", CONTROL.read_text(), re.S | re.M)
     (place / "mine.py").write_text(policy[1])
     shutil.copytree(ROOT / "docs" / "gallery", place / "docs" / "gallery")

@@ -23,7 +23,7 @@ from codesign_jax.reuse import use_compilation_cache as use_compilation_cache
 from codesign_jax.runs import cases, tables
 from codesign_jax.runs.cases import Case
 from codesign_jax.runs.reading import Tell
-from codesign_jax.scene import Scene, keypaths, library, objects, schema, texts
+from codesign_jax.scene import Scene, draws, keypaths, library, objects, schema, texts
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.scene.schema import InputError
 from codesign_jax.terminal import Console
@@ -38,10 +38,14 @@ PRESET = "2d"
 
 
 def changes(options: TrialFlags) -> dict[keypaths.Path, Any]:
-    """Values by key path that --robust and --set replace; what --set names holds."""
+    """Values by key path that --constants, --robust and --set replace; what --set names holds."""
+    found: dict[keypaths.Path, Any] = {}
+    if options.constants is not None:
+        table = draws.read(options.constants)
+        found |= draws.nominal(table) | {("drawn",): draws.plain(table)}
     noise = dataclasses.asdict(objects.ROBUST) if options.robust else {}
-    given = keypaths.parse(chain.from_iterable(options.overrides))
-    return {("objects", "noise", name): value for name, value in noise.items()} | given
+    found |= {("objects", "noise", name): value for name, value in noise.items()}
+    return found | keypaths.parse(chain.from_iterable(options.overrides))
 
 
 @dataclasses.dataclass(frozen=True)

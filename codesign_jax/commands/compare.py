@@ -145,7 +145,8 @@ def _pair(options: Compare, places: list[Path], *, runs: bool) -> dict[str, Case
 
 
 def _subject(options: Compare, place: Path, *, of_run: bool) -> flags.Subject:
-    how = {n: getattr(options, n) for n in ("accuracy", "objects", "overrides", "robust", "engine")}
+    names = ("accuracy", "objects", "overrides", "constants", "robust", "engine")
+    how = {n: getattr(options, n) for n in names}
     if of_run:
         own = runs.read_run(place)[1].policy
         policy = own if own in options.policy else None

@@ -48,6 +48,10 @@ class TrialFlags:
     """Preset that replaces the scene's discretization and solver: fast, standard, fine or reference
     (docs/accuracy.md compares their errors and run times), or a .toml file."""
     overrides: Overrides = ()
+    constants: Text = None
+    """Draw constants for every trial from a table of what is known of them: a .toml that `codesign
+    finger --posterior` wrote, or unmeasured for those of a hand of which nothing was measured; none
+    for those of the scene or run alone (docs/uncertainty.md)."""
     robust: Flag = False
     """Vary friction, mass, size, stiffness and placement more widely between trials, for a hand
     that depends on none of them (docs/command_line.md). --set objects.noise... overrides this."""

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from codesign_jax.finger import swing
-from codesign_jax.finger.posterior import PRIOR, Posterior, gram, scaled, slopes_of
+from codesign_jax.finger.posterior import Posterior, gram, priors, scaled, slopes_of
 from codesign_jax.finger.prediction import Table, predict
 from codesign_jax.finger.rest import Constants, Finger, NoRest
 
@@ -69,7 +69,7 @@ def _own(finger: Finger, names: tuple[str, ...]) -> np.ndarray:
 
 def _precision(posterior: Posterior, names: tuple[str, ...]) -> np.ndarray:
     """The posterior's precision, and that of the priors of what it does not have."""
-    found = np.diag([min(PRIOR[n], UNKNOWN_MODULUS) ** -2 for n in names])
+    found = np.diag([min(priors()[n], UNKNOWN_MODULUS) ** -2 for n in names])
     places = [names.index(n) for n in posterior.names]
     found[np.ix_(places, places)] = np.linalg.inv(posterior.covariance)
     return found

@@ -8,6 +8,7 @@ another closely; by their correlation r between neighbours n of them count as n 
 as those of a first-order process do.
 """
 
+import functools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -18,6 +19,7 @@ from scipy import optimize
 from codesign_jax.finger.prediction import Table, opposed, predict, releases, without_rest
 from codesign_jax.finger.rest import TOO_FAR, Finger, NoRest
 from codesign_jax.measurements import BY_PRESSURE, MEASURED
+from codesign_jax.scene import draws
 
 TOLD_BY = {
     "shear_modulus": ("angle", "tip_x", "tip_y", "deflection", "sideways", "drop"),
@@ -28,15 +30,8 @@ TOLD_BY = {
 }
 """Columns that tell of a constant; the angle of a free tip depends on modulus and moment by their
 ratio alone, forces on a held tip (nearly) on the moment, deflections on the modulus."""
-PRIOR = {
-    "shear_modulus": math.inf,
-    "moment_factor": 0.2,
-    "lateral_factor": 0.31,
-    "torsion_factor": 0.23,
-    "damping_time": 0.5,
-}
-"""Standard deviations of the logarithms about the hand's own before anything is measured: those of
-`stress.FACTORS` for the factors on stiffness; the others are [chosen]."""
+HAND = "hand.material."
+"""Where the keys of a finger's constants begin."""
 ROUNDS = 3
 """Gauss-Newton steps, each with the noise that the last one left."""
 STEP = 1e-4
@@ -85,6 +80,17 @@ class Posterior(NamedTuple):
         return {n: (float(a), float(b)) for n, a, b in zip(self.names, *ends, strict=True)}
 
 
+@functools.cache
+def priors() -> dict[str, float]:
+    """Standard deviations of the logarithms about the hand's own before anything is measured.
+
+    They are those of a hand that was not measured, but that nothing is assumed of the modulus.
+    """
+    table = draws.read("unmeasured").constant
+    found = {e.key.removeprefix(HAND): e.spread for e in table if e.key.startswith(HAND)}
+    return found | {"shear_modulus": math.inf}
+
+
 def fit(finger: Finger, table: Table) -> Posterior:
     """Fits the constants that a table tells of, about those of the finger.
 
@@ -101,7 +107,7 @@ def fit(finger: Finger, table: Table) -> Posterior:
         step, scales = problem.improved(logs, scales)
         logs = logs + step
     covariance = problem.covariance
-    narrowed = np.sqrt(np.diag(covariance)) < [PRIOR[n] / 1.5 for n in problem.names]
+    narrowed = np.sqrt(np.diag(covariance)) < [priors()[n] / 1.5 for n in problem.names]
     if _different_values(table, columns) - problem.told < 0.5:
         covariance = np.full_like(covariance, math.nan)
     mean = logs + np.log([getattr(finger.constants, n) for n in problem.names])
@@ -126,7 +132,7 @@ class _Problem:
         self.sizes = np.array([math.sqrt(np.nanmean(table[n] ** 2)) for n in columns])
         self.rows = [np.isfinite(table[n]) for n in columns]
         self.column = np.repeat(np.arange(len(columns)), [r.sum() for r in self.rows])
-        self.precision = np.array([PRIOR[n] ** -2 for n in self.names])
+        self.precision = np.array([priors()[n] ** -2 for n in self.names])
         self.share = np.ones(len(columns))  # of the values of a column that count
         self.told = 0.0  # number of constants that the values themselves tell
         self.covariance = np.zeros((0, 0))

@@ -46,7 +46,8 @@ def save(folder: Path, episode: int, info: EpisodeInfo) -> list[Path]:
             "bad_step": info.outcomes.bad_step[p, t],
             "place": np.array([episode, p, t]),
         }
-        array_files.save(path, arrays | {f"trial_{k}": v for k, v in trial._asdict().items()})
+        given = {f"trial_{k}": v for k, v in trial._asdict().items() if v is not None}
+        array_files.save(path, arrays | given)
         files.append(path)
     return files
 
@@ -56,8 +57,9 @@ def load(path: Path) -> Failure:
         raise InputError([f"{path}: there is no such file or folder"])
     try:
         values = array_files.load(path)
-        # Runs of before have no tilt.
-        drawn = [n for n in Trial._fields if n != "tilt" or "trial_tilt" in values]
+        # Earlier runs have no tilt, and most scenes no constants that are drawn.
+        left_out = {n for n in ("tilt", "constants") if f"trial_{n}" not in values}
+        drawn = [n for n in Trial._fields if n not in left_out]
         trial = Trial(**{name: values[f"trial_{name}"] for name in drawn})
         place = tuple(int(v) for v in values["place"])
         status = int(values["status"])

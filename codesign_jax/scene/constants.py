@@ -20,7 +20,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.scene import Scene, check_together, mesh_margins, schema
+from codesign_jax.scene import Scene, check_together, draws, mesh_margins, schema
 from codesign_jax.types import Trial
 
 
@@ -90,8 +90,11 @@ def batch_axes(tree: Any) -> Any:
 def with_trial(scene: Scene, trial: Trial) -> Scene:
     """The scene with a trial's factors on its numbers.
 
-    Those are the friction of all contacts, the shear modulus and the masses of fingers and palm.
+    Those are the friction of all contacts, the shear modulus and the masses of fingers and palm;
+    and the constants of `Scene.drawn`.
     """
+    if trial.constants is not None:
+        scene = draws.applied(scene, scene.drawn, trial.constants)
     hand = scene.hand
     objects = scene.objects
     contact = scene.contact

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import jax
 
-from codesign_jax.scene import hand, key_frames, objects, schema
+from codesign_jax.scene import draws, hand, key_frames, objects, schema
 from codesign_jax.scene.schema import quantity
 from codesign_jax.scene.tables import (
     Arm,
@@ -45,6 +45,7 @@ class SceneFile:
       control: Name of a built-in control, or the path of a control file, relative to the scene
         file; docs/control.md.
       fixture: Static bodies beside the table.
+      drawn: Constants that are drawn for every trial.
       gravity: Acceleration of gravity, only with `effects.gravity`.
     """
 
@@ -64,6 +65,7 @@ class SceneFile:
     newton: Newton = Newton()
     control: str = "paper"
     fixture: tuple[Fixture, ...] = ()
+    drawn: draws.Constants = draws.Constants()
     gravity: float = quantity("m/s^2", 0, 100, kw_only=True)
 
 
@@ -122,6 +124,7 @@ class Scene(SceneFile):
             hand=hand.structure(self.hand),
             objects=objects.structure(self.objects),
             control=key_frames.structure(self.control),
+            drawn=draws.structure(self.drawn),
             fixture=tuple(dataclasses.replace(f, name="") for f in self.fixture),
         )
 

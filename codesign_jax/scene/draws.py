@@ -2,20 +2,23 @@
 
 A file of them has a table `[[constant]]` for each.  `codesign finger --posterior` writes the
 constants of a finger that was measured; `constants/unmeasured.toml` has those of a hand before it
-is built.
+is built.  A scene with such a table (`Scene.drawn`) has other constants in every trial.
 
 >>> import jax
 >>> from codesign_jax.scene import draws
 >>> table = draws.read("unmeasured")
->>> values = draws.drawn(table, jax.random.key(0), 1000)  # (draw, constant)
+>>> values = draws.deviations(table, jax.random.key(0), 1000)  # (draw, constant)
 >>> place = [entry.key for entry in table.constant].index("objects.object.friction")
 >>> bool(0.7 <= values[:, place].min() and values[:, place].max() <= 1.4)  # a factor
 True
 """
 
 import dataclasses
+import functools
 import math
-from collections.abc import Sequence
+import operator
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +33,12 @@ from codesign_jax.scene.schema import choice, quantity
 
 CHANGES = ("value", "factor", "shift")
 """What a draw is: the constant itself, a factor on the scene's, or what is added to it."""
+ROOTS = ("hand", "objects", "contact")
+"""Where the keys of constants begin."""
 _WIDEST = 1e9
 
 
+@schema.table
 @dataclasses.dataclass(frozen=True)
 class Constant:
     """A constant and its distribution.
@@ -56,11 +62,11 @@ class Constant:
     source: str
     distribution: str = choice("lognormal", "normal", "loguniform", "uniform")
     change: str = choice(*CHANGES, default="value")
-    mean: float | None = quantity("", -_WIDEST, _WIDEST, structure=True, default=None)
-    sd: float | None = quantity("", 0, _WIDEST, structure=True, default=None)
-    low: float | None = quantity("", -_WIDEST, _WIDEST, structure=True, default=None)
-    high: float | None = quantity("", -_WIDEST, _WIDEST, structure=True, default=None)
-    correlation: tuple[float, ...] = quantity("", -1, 1, structure=True, default=())
+    mean: float | None = quantity("", -_WIDEST, _WIDEST, default=None)
+    sd: float | None = quantity("", 0, _WIDEST, default=None)
+    low: float | None = quantity("", -_WIDEST, _WIDEST, default=None)
+    high: float | None = quantity("", -_WIDEST, _WIDEST, default=None)
+    correlation: tuple[float, ...] = quantity("", -1, 1, default=())
 
     @property
     def path(self) -> tuple[str, ...]:
@@ -73,14 +79,19 @@ class Constant:
         return self.distribution.startswith("log")
 
     @property
-    def middle(self) -> float:
-        """Its mean, of logarithmic distributions its median."""
+    def middle(self) -> Any:
+        """Its mean, of logarithmic distributions its median; a number, or traced."""
         if self.mean is not None:
             return self.mean
         assert self.low is not None and self.high is not None
         if self.logarithmic:
-            return math.sqrt(self.low * self.high)
+            return (self.low * self.high) ** 0.5
         return (self.low + self.high) / 2
+
+    @property
+    def is_factor(self) -> bool:
+        """Whether a draw multiplies the scene's own number, which is the middle, or is added."""
+        return self.change == "factor" or (self.change == "value" and self.logarithmic)
 
     @property
     def spread(self) -> float:
@@ -91,8 +102,14 @@ class Constant:
         ends = np.log([self.low, self.high]) if self.logarithmic else (self.low, self.high)
         return float(ends[1] - ends[0]) / math.sqrt(12)
 
-    def of_score(self, score: Any) -> Any:
-        """The draw of a normal score, any shape; JAX."""
+    def deviation(self, score: Any) -> Any:
+        """The factor on the scene's number, or the shift of it, of a normal score; JAX."""
+        value = self._of_score(score)
+        if self.change != "value":
+            return value
+        return value / self.middle if self.logarithmic else value - self.middle
+
+    def _of_score(self, score: Any) -> Any:
         if self.mean is not None and self.sd is not None:
             if self.logarithmic:
                 return self.mean * jnp.exp(self.sd * score)
@@ -104,6 +121,7 @@ class Constant:
         return self.low + (self.high - self.low) * share
 
 
+@schema.table
 @dataclasses.dataclass(frozen=True)
 class Constants:
     """Constants that are drawn, together.
@@ -169,21 +187,91 @@ def correlations(table: Constants) -> np.ndarray:
     return matrix
 
 
-def root(table: Constants) -> np.ndarray:
-    """A root of the correlations, by which independent scores are multiplied."""
-    values, vectors = np.linalg.eigh(correlations(table))
-    return vectors * np.sqrt(np.maximum(values, 0.0))
+def scores(table: Constants, key: jax.Array) -> jax.Array:
+    """Normal scores of the constants with their correlations, shape (constant,)."""
+    size = len(table.constant)
+    free = jax.random.normal(key, (size,))
+    if not any(entry.correlation for entry in table.constant):
+        return free
+    near = jnp.eye(size)
+    for i, entry in enumerate(table.constant):
+        for k, value in enumerate(entry.correlation):
+            near = near.at[i, k].set(value).at[k, i].set(value)
+    # Rounded correlations of 1 have no root.
+    return jnp.linalg.cholesky(near + 1e-6 * jnp.eye(size)) @ free
 
 
-def drawn(table: Constants, key: jax.Array, count: int) -> jax.Array:
-    """Draws, shape (draw, constant): in the units of their keys, or factors.
+def deviations(
+    table: Constants, key: jax.Array, count: int, first: jax.typing.ArrayLike = 0
+) -> jax.Array:
+    """Factors on, or shifts of, the scene's constants, shape (draw, constant).
 
     Draw t is that of fold_in(key, t), so that more draws do not change earlier ones.
     """
-    size = len(table.constant)
-    keys = jax.vmap(lambda t: jax.random.fold_in(key, t))(jnp.arange(count))
-    scores = jax.vmap(lambda k: jax.random.normal(k, (size,)))(keys) @ root(table).T
-    return jnp.stack([e.of_score(scores[:, i]) for i, e in enumerate(table.constant)], -1)
+    numbers = jnp.asarray(first) + jnp.arange(count)
+    found = jax.vmap(lambda t: scores(table, jax.random.fold_in(key, t)))(numbers)
+    return jnp.stack([e.deviation(found[:, i]) for i, e in enumerate(table.constant)], -1)
+
+
+def applied(scene: Any, table: Constants, own: Any) -> Any:
+    """The scene with deviations of its constants, which may be traced.
+
+    Args:
+      own: The deviations of each constant, shape (constant,), or a sequence of arrays (trial,).
+    """
+    for i, entry in enumerate(table.constant):
+        operation = operator.mul if entry.is_factor else operator.add
+        scene = changed(scene, entry.path, functools.partial(operation, own[i]))
+    return scene
+
+
+def changed(table: Any, path: Sequence[str], change: Callable[[Any], Any]) -> Any:
+    """A table with change(number) in place of the numbers of a key path."""
+    if not path:
+        return change(table)
+    if isinstance(table, tuple):
+        named = [
+            str(getattr(e, "name", i)) == path[0] or str(i) == path[0] for i, e in enumerate(table)
+        ]
+        if any(named):
+            pairs = zip(table, named, strict=True)
+            return tuple(changed(e, path[1:], change) if mine else e for e, mine in pairs)
+        return tuple(changed(entry, path, change) for entry in table)
+    return schema.replaced(table, **{path[0]: changed(getattr(table, path[0]), path[1:], change)})
+
+
+def structure(table: Constants) -> Constants:
+    """The table without what no program depends on."""
+    entries = tuple(dataclasses.replace(entry, source="") for entry in table.constant)
+    return dataclasses.replace(table, constant=entries)
+
+
+def key_problems(scene: Any, table: Constants, where: str) -> list[str]:
+    """Keys that are no constants which a trial may have."""
+    known = set()
+    for path, _ in jax.tree_util.tree_leaves_with_path(scene):
+        key = jax.tree_util.keystr(path).lstrip(".")
+        known |= {re.sub(r"\[\d+\]", "", key), re.sub(r"\[(\d+)\]", r".\1", key)}
+    for shape in scene.objects.object:
+        known |= {f"objects.object.{shape.name}.{n}" for n in ("friction", "mass")}
+    known = {key for key in known if key.split(".")[0] in ROOTS}
+    problems = []
+    for entry in table.constant:
+        if entry.key not in known:
+            problems.append(
+                f"{where}: {entry.key!r} is no constant; {schema.nearest(entry.key, known)}"
+            )
+    return problems
+
+
+def nominal(table: Constants) -> dict[tuple[str, ...], Any]:
+    """Values by key path that make a scene's own constants the middle of their distributions."""
+    found: dict[tuple[str, ...], Any] = {
+        e.path: e.middle for e in table.constant if e.change == "value"
+    }
+    if table.law is not None and ("hand", "material", "shear_modulus") in found:
+        found["hand", "material", "law"] = table.law
+    return found
 
 
 def of_logs(
@@ -215,8 +303,8 @@ def _short(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-def text(table: Constants) -> str:
-    """The table as a file has it."""
+def plain(table: Constants) -> dict[str, Any]:
+    """The table as a file has it, as dictionaries and lists."""
     entries = [
         {
             k: list(v) if isinstance(v, tuple) else v
@@ -226,4 +314,9 @@ def text(table: Constants) -> str:
         for e in table.constant
     ]
     top = {} if table.law is None else {"law": table.law}
-    return tomli_w.dumps(top | {"constant": entries})
+    return top | {"constant": entries}
+
+
+def text(table: Constants) -> str:
+    """The file of a table."""
+    return tomli_w.dumps(plain(table))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from codesign_jax.scene import (
+    draws,
     hand,
     key_frames,
     keypaths,
@@ -101,9 +102,24 @@ def load(
     parts["hand"] = key_frames.with_parameters(parts["hand"], parts["control"])
     names = [f.name for f in dataclasses.fields(SceneFile) if f.name not in parts]
     scene = Scene(**parts, **{n: getattr(parsed, n) for n in names})
-    if problems := key_frames.check(scene, "control"):
+    problems = key_frames.check(scene, "control") + _draw_problems(scene, path.name)
+    if problems:
         raise schema.InputError(problems)
     return scene
+
+
+def _draw_problems(scene: Scene, where: str) -> list[str]:
+    """What is wrong with the constants that are drawn."""
+    table = scene.drawn
+    problems = draws.check(table, f"{where}.drawn") or draws.key_problems(scene, table, "constants")
+    modulus = any(entry.key == "hand.material.shear_modulus" for entry in table.constant)
+    law = silicones.LAWS[bool(scene.effects.neo_hookean)]
+    if modulus and table.law not in (None, law):
+        problems.append(
+            f"{where}: the shear modulus of the constants is that of the law {table.law!r}, and "
+            f"the scene has {law!r}"
+        )
+    return problems
 
 
 def _with_law(scene: SceneFile, material: hand.Material, where: str, problems: list[str]) -> Any:

@@ -293,7 +293,7 @@ def near_problem(path: str, value: float, expected: Range) -> str | None:
     return range_problem(path, value, expected.unit, expected.low, expected.high)
 
 
-def replaced(table: T, **changes: Any) -> T:
+def replaced(table: T, /, **changes: Any) -> T:
     """Like `dataclasses.replace`, for computed numbers, which may leave their ranges."""
     made = object.__new__(type(table))
     made.__dict__.update({f.name: getattr(table, f.name) for f in dataclasses.fields(table)})  # type: ignore[arg-type]

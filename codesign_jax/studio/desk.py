@@ -129,6 +129,7 @@ class Desk:
         given = self.options
         named = {"accuracy": accuracy or self.options.accuracy}
         named |= {"engine": self.case.engine, "policy": given.policy}
+        named |= {"constants": given.constants}
         found = [word for k, v in named.items() if v is not None for word in (f"--{k}", v)]
         for words in given.overrides:
             found += ["--set", *words]

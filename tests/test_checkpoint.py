@@ -2,7 +2,9 @@
 
 import re
 import shutil
+import sys
 import threading
+import types
 
 import numpy as np
 import pytest
@@ -71,6 +73,25 @@ def test_no_save_waits_for_the_deletion_of_old_steps_or_fails_with_it(tmp_path, 
     assert words.endswith("1 is not ours")
     found = restore(tmp_path)
     assert found.step == 5 and equal(found.arrays, arrays(5)) and found.damaged == ()
+
+
+def test_after_a_failed_save_its_threads_are_silent_and_no_others(tmp_path, monkeypatch):
+    """Tensorstore's threads report to an event loop that the failure has closed."""
+    told = []
+    monkeypatch.setattr(sys, "unraisablehook", told.append)
+    folder = tmp_path / "checkpoints"
+    store = Checkpoints(folder)
+    store.save(1, arrays(1))
+    assert sys.unraisablehook == told.append
+    shutil.rmtree(folder)
+    folder.write_text("no folder")
+    with pytest.raises(OSError, match="checkpoint 2 could not be written"):
+        store.save(2, arrays(2))
+    closed = types.SimpleNamespace(exc_value=RuntimeError("Event loop is closed"))
+    other = types.SimpleNamespace(exc_value=RuntimeError("another"))
+    for found in (closed, other):
+        sys.unraisablehook(found)
+    assert told == [other]
 
 
 @pytest.mark.parametrize("way", ["flipped", "longer", "deleted"])

@@ -12,10 +12,12 @@ digests were not compared.
 """
 
 import errno
+import functools
 import hashlib
 import logging
 import os
 import re
+import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -127,12 +129,15 @@ class Checkpoints:
         import orbax.checkpoint as ocp
 
         labelled = arrays if self._run is None else arrays | {_LABEL: _label(self._run, step)}
+        before = sys.unraisablehook
+        sys.unraisablehook = functools.partial(_without_closed_loops, before)
         try:
             saved = self._manager.save(step, args=ocp.args.StandardSave(labelled))
             if saved:
                 self._write_digests(step, labelled)
         except (OSError, ValueError) as error:  # the latter is how tensorstore says it
-            raise _unsaved(self.folder / str(step), error) from error
+            raise _unsaved(self.folder / str(step), error) from error  # its threads go on
+        sys.unraisablehook = before
         if not saved:
             raise OSError(f"checkpoint {step} was not written: {self.folder} holds a newer step")
         self._forget_old_digests()
@@ -284,6 +289,18 @@ def _label(run: str, step: int) -> Arrays:
         "step": np.array(step, np.int32),
         "schema": np.array(SCHEMA, np.int32),
     }
+
+
+def _without_closed_loops(hook: Callable[[Any], Any], found: Any) -> None:
+    """A hook for unraisable exceptions without those of tensorstore's threads after a failure.
+
+    Where one file of a step cannot be written, the threads that write the others find the event
+    loop closed that they report to, and each would print that.
+    """
+    if not (
+        isinstance(found.exc_value, RuntimeError) and "Event loop is closed" in str(found.exc_value)
+    ):
+        hook(found)
 
 
 def _unsaved(place: Path, error: Exception) -> OSError:

@@ -415,7 +415,8 @@ def spread(scene: Scene, command: Command, plan: Plan, *, of: str) -> Command:
         raise InputError(problems)
     # The upper end is the limit of the wall, or the design's own pressure where that is higher.
     p = plan.params
-    top = jax.vmap(partial(highest_pressure, scene.hand))(p.height, p.wall, p.tip)
+    tip = None if p.tip is None else p.tip.wall
+    top = jax.vmap(partial(highest_pressure, scene.hand))(p.wall, tip)
     top = jnp.maximum(top, p.pressure)[:, None]
     # Comparisons let what is no number pass, and have the derivative of what is at an end.
     pose, pressure = found

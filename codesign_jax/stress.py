@@ -22,6 +22,7 @@ from codesign_jax.reuse import SceneProgram, shared
 from codesign_jax.runs.cases import Case
 from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.scene import Scene, draws, silicones
+from codesign_jax.scene.buildable import rim_drop
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.scene.schema import InputError
 from codesign_jax.statistics import wilson
@@ -249,9 +250,7 @@ def of_design(scene: Scene, params: Params) -> list[str]:
             found.append(
                 f"finger {f} bends by {np.degrees(bend):.0f}° without load, more than a turn"
             )
-    roll, pitch, yaw = np.asarray(params.arm, float)[3:]
-    up = np.cos(roll) * np.cos(pitch) + np.sin(roll) * np.sin(yaw) * np.sin(pitch)
-    rim = scene.hand.palm.radius * np.sqrt(1 - min(up**2, 1.0))
+    rim = float(rim_drop(scene.hand.palm.radius, *np.asarray(params.arm, float)[3:]))
     low = scene.arm.zero_height + float(params.arm[2]) - rim
     if low < 0:
         found.append(f"the palm's rim is commanded {-1e3 * low:.0f} mm below the table")

@@ -183,7 +183,7 @@ def test_pressures_stay_within_what_the_walls_stand_and_what_is_no_number_fails_
     with pytest.raises(InputError, match=r"commands pressure\[0\] = nan at 0.31 s in world 0"):
         engine._refuse_nonfinite(trace.ctrl)  # as at the end of a rollout
     ctrl = np.asarray(trace.ctrl)[:, :30]
-    limit = jax.vmap(scene.hand.pressure_limit.of)(params.height, params.wall)
+    limit = scene.hand.pressure_limit.of(params.wall)
     top = np.maximum(limit, params.pressure)[:, :1]
     np.testing.assert_allclose(ctrl[:, 1:, 6], np.broadcast_to(top, (2, 29)), rtol=1e-6)
     assert (ctrl[..., 7] == 0).all()

@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax
-import numpy as np
 
 from codesign_jax import optimize, user_code
 from codesign_jax.optimize import Optimizer, ParticleFilter, Space
@@ -48,4 +47,4 @@ def make_optimizer(name: str, space: DesignSpace, *, num_particles: int | None =
 
 
 def _box(space: DesignSpace) -> Space:
-    return Space(np.asarray(space.low), np.asarray(space.high), _Projection(space.structure))
+    return Space(*space.box, _Projection(space.structure))

@@ -162,7 +162,7 @@ class GraspEnv:
     def limit(self) -> jax.Array:
         """Pressures that the fingers' walls stand [Pa], shape (finger,)."""
         p = self.params
-        return highest_pressure(self.scene.hand, p.height, p.wall, p.tip)
+        return highest_pressure(self.scene.hand, p.wall, None if p.tip is None else p.tip.wall)
 
     @property
     def action_size(self) -> int:

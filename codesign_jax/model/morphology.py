@@ -59,11 +59,10 @@ def chamber_volumes(hand: Hand, params: Params) -> Any:
 
 
 def pressure_limits(hand: Hand, params: Params) -> np.ndarray:
-    """Highest pressures of a hand's fingers [Pa], shaped as their heights."""
-    height, wall, tip = jax.tree.map(
-        lambda v: np.asarray(v, float), (params.height, params.wall, params.tip)
-    )
-    return np.asarray(highest_pressure(hand, height, wall, tip))
+    """Highest pressures of a hand's fingers by Table I [Pa], shaped as their walls."""
+    wall = np.asarray(params.wall, float)
+    tip = None if params.tip is None else np.asarray(params.tip.wall, float)
+    return np.asarray(highest_pressure(hand, wall, tip))
 
 
 class Section(NamedTuple):

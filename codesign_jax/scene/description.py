@@ -120,7 +120,7 @@ class Scene(SceneFile):
             self,
             name="",
             description="",
-            limits=dataclasses.replace(self.limits, strain=None),
+            limits=self.limits.of_worlds,
             hand=hand.structure(self.hand),
             objects=objects.structure(self.objects),
             control=key_frames.structure(self.control),

@@ -33,7 +33,6 @@ from codesign_jax.scene.hand_tables import (
     Wrist,
     highest_pressure,
     per_finger,
-    with_strain,
 )
 
 
@@ -45,6 +44,7 @@ def structure(hand: Hand) -> Hand:
         description="",
         parameter=(),
         preset=(),
+        buildable=None,
         pressure_limit=PressureLimit(0.0),
         material=dataclasses.replace(hand.material, silicone=None, law=None),
     )
@@ -324,5 +324,4 @@ __all__ = [
     "highest_pressure",
     "load",
     "structure",
-    "with_strain",
 ]

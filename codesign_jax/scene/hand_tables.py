@@ -9,7 +9,6 @@ import math
 from typing import Any, NamedTuple
 
 from codesign_jax.scene import silicones
-from codesign_jax.scene.beams import strain_pressure
 from codesign_jax.scene.schema import choice, quantity, table
 
 # Unit of a file -> (SI unit, factor).
@@ -234,48 +233,24 @@ class PressureLimit:
     """
 
     per_wall: float = quantity("Pa/m", 1e5, 1e9, structure=True)
-    # What `limits.strain` of the scene needs; see `with_strain`.
-    strain: tuple[float, float, float, bool] | None = dataclasses.field(
-        default=None, metadata={"in_file": False}
-    )
 
-    def of(self, height: Any, wall: Any, width: Any = None) -> Any:
-        """Highest pressure of sections of a height, wall and width [m], any shape [Pa].
-
-        Without a width it is the hand's.
-        """
-        highest = self.per_wall * wall
-        if self.strain is None:
-            return highest
-        strain, own, modulus, neo_hookean = self.strain
-        how: dict[str, Any] = {"width": own if width is None else width}
-        how |= {"shear_modulus": modulus, "neo_hookean": neo_hookean}
-        stretched = strain_pressure(strain, height, wall, **how)
-        return highest + (stretched - highest) * (stretched < highest)
+    def of(self, wall: Any) -> Any:
+        """Highest pressure of sections of a wall [m], any shape [Pa]."""
+        return self.per_wall * wall
 
 
-def highest_pressure(hand: "Hand", height: Any, wall: Any, tip: Any = None) -> Any:
-    """Highest pressure of fingers of a height and wall [m], any shape [Pa].
+def highest_pressure(hand: "Hand", wall: Any, tip: Any = None) -> Any:
+    """Highest pressure of fingers of a wall [m], any shape [Pa].
 
     Args:
-      height: Section height, of tapered fingers at the base.
-      tip: Height, wall and width at the tip, the lower of whose limits counts; None without taper.
+      wall: Thickness of the walls, of tapered fingers at the base.
+      tip: Thickness at the tip, the lower of whose limits counts; None without taper.
     """
-    limit = hand.pressure_limit.of
-    highest = limit(height, wall)
+    highest = hand.pressure_limit.of(wall)
     if tip is None:
         return highest
-    there = limit(*tip)
+    there = hand.pressure_limit.of(tip)
     return highest + (there - highest) * (there < highest)
-
-
-def with_strain(hand: "Hand", strain: float | None, *, neo_hookean: bool) -> "Hand":
-    """A hand whose pressures stretch no wall of a free finger by more than a strain, if any."""
-    # The pressure of a strain goes with the modulus over the moment's factor.
-    modulus = hand.material.shear_modulus / hand.material.moment_factor
-    strain_data = (strain, hand.section.width, modulus, neo_hookean)
-    limit = dataclasses.replace(hand.pressure_limit, strain=None if strain is None else strain_data)
-    return dataclasses.replace(hand, pressure_limit=limit)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -327,6 +302,7 @@ class Preset:
 
     Attributes:
       name: Name of the preset, as for `--preset`; "full" is the whole table.
+      limits: Whether designs stay within `[limits]` of the scene; false: within Table I alone.
       free: The free parameters.
       fixed: Values of other parameters by name, in the table's units: a number, or an array with
         one for each finger.
@@ -335,6 +311,7 @@ class Preset:
     name: str
     free: tuple[Free, ...]
     fixed: dict[str, Any] = dataclasses.field(default_factory=dict)
+    limits: bool = True
 
     def __post_init__(self) -> None:
         """Makes tuples of TOML's arrays, as those of other tables are."""
@@ -343,7 +320,7 @@ class Preset:
 
     def __hash__(self) -> int:
         """Hashes the preset although TOML gives `fixed` as a dict."""
-        return hash((self.name, self.free, tuple(sorted(self.fixed.items()))))
+        return hash((self.name, self.free, tuple(sorted(self.fixed.items())), self.limits))
 
 
 @table
@@ -366,6 +343,8 @@ class Hand:
     parameter: tuple[Parameter, ...]
     pressure_limit: PressureLimit
     preset: tuple[Preset, ...] = ()
+    # What `[limits]` of a scene makes of it; see `buildable.Buildable`.
+    buildable: Any = dataclasses.field(default=None, metadata={"in_file": False})
 
     def width(self, row: Parameter) -> int:
         """Number of values of a row of the parameter table."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from codesign_jax.scene import (
+    buildable,
     draws,
     hand,
     key_frames,
@@ -98,7 +99,11 @@ def load(
         raise schema.InputError(problems)
     parts["objects"] = mesh_margins.fit(parts["objects"], parts["hand"])
     law = bool(parsed.effects.neo_hookean)
-    parts["hand"] = hand.with_strain(parts["hand"], parsed.limits.strain, neo_hookean=law)
+    top = max((shape.height for shape in parts["objects"].object), default=0.0)
+    built = buildable.buildable(
+        parts["hand"], parsed.limits, parsed.arm, top, neo_hookean=law
+    )
+    parts["hand"] = dataclasses.replace(parts["hand"], buildable=built)
     parts["hand"] = key_frames.with_parameters(parts["hand"], parts["control"])
     names = [f.name for f in dataclasses.fields(SceneFile) if f.name not in parts]
     scene = Scene(**parts, **{n: getattr(parsed, n) for n in names})
@@ -199,6 +204,7 @@ def _beside(path: Path, name: str) -> str | Path:
 
 def _check(scene: SceneFile, where: str, problems: list[str]) -> None:
     problems += check_together(scene, where)
+    problems += buildable.problems(scene.limits, where)
     for fixture in scene.fixture:
         problems += _fixture_problems(fixture, f"{where}.fixture {fixture.name}")
     e = scene.effects

@@ -29,6 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.scene import schema, unit_slips
+from codesign_jax.scene.buildable import Buildable
 from codesign_jax.scene.hand import UNITS, Free, Hand, Parameter, Preset, structure
 from codesign_jax.scene.hand_tables import PARAMETERS, TIP, highest_pressure, per_finger
 from codesign_jax.types import Params, Tip
@@ -47,13 +48,14 @@ class DesignSpace:
       names: Names of the free parameters, e.g. "length[2]", "length[0+3]" or "length" where tied.
       units: Units in which the hand file states them.
       scale: Factor from that unit to SI, shape (parameter,).
-      bounds: Lower and upper bounds [SI], as tuples, which can be hashed; `low` and `high` are
-        arrays.
+      bounds: Lower and upper bounds [SI] of legal designs, as tuples, which can be hashed; `low`
+        and `high` are arrays.
       is_morphology: True for morphology, False for control, shape (parameter,).
       base: Full vector with the fixed values and defaults [SI], shape (full,).
       source: For each full entry the design entry that fills it, or -1, shape (full,).
       idle: Parameters that the preset leaves free, but which have no effect and are fixed at their
         default: name and why.
+      buildable: The limits that proposals of a search keep besides; None for Table I alone.
     """
 
     hand: Hand
@@ -65,6 +67,7 @@ class DesignSpace:
     base: tuple[float, ...]
     source: tuple[int, ...]
     idle: tuple[tuple[str, str], ...] = ()
+    buildable: Buildable | None = None
 
     @property
     def low(self) -> np.ndarray:
@@ -75,6 +78,16 @@ class DesignSpace:
     def high(self) -> np.ndarray:
         """Upper bounds [SI], shape (parameter,)."""
         return np.array(self.bounds[1])
+
+    @functools.cached_property
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds [SI] in which a search proposes designs, each of shape (parameter,)."""
+        if self.buildable is None:
+            return self.low, self.high
+        rows = [name.split("[")[0] for name in self.names]
+        ends = zip(rows, *self.bounds, strict=True)
+        low, high = zip(*(self.buildable.bounds(*end) for end in ends), strict=True)
+        return np.array(low), np.array(high)
 
     @property
     def num_parameters(self) -> int:
@@ -94,7 +107,8 @@ class DesignSpace:
             self,
             hand=dataclasses.replace(self.hand, parameter=tuple(rows)),
             scale=zeros,
-            bounds=(zeros, zeros),
+            # Limits of a scene are projected within the bounds.
+            bounds=(zeros, zeros) if self.buildable is None else self.bounds,
             idle=(),
             base=tuple(0.0 if source >= 0 else value for value, source in place),
         )
@@ -117,10 +131,11 @@ class DesignSpace:
         return unflatten(self.hand, self.expand(design))
 
     def project(self, design: jax.typing.ArrayLike) -> jax.Array:
-        """Lowers free pressures under their limit p_i < per_wall * d_i (Table I).
+        """The nearest design that a search may propose, parameter by parameter.
 
-        If the scene has `limits.strain`, also under the pressure at which the walls of a free
-        finger have that strain.
+        Free pressures are lowered under their limit p_i < per_wall * d_i (Table I). Where limits of
+        the scene hold, those lower them further, lengths and angles of the arm are clipped to the
+        box, and the arm is raised; see `buildable`.
 
         Args:
           design: Design vector [SI], shape (parameter,).
@@ -133,11 +148,11 @@ class DesignSpace:
         return _projected(self, jnp.asarray(design))
 
     def sample(self, key: jax.Array, n: int, *, first: Any = 0) -> jax.Array:
-        """Draws legal designs: within the bounds, pressures under the limit of their walls.
+        """Draws designs that a search may propose: within the box, and projected.
 
-        Every parameter is uniform between its bounds and independent of the others, but for
-        pressures above their limit, which are lowered to it (`project`): such a finger has the
-        highest pressure that its wall allows. Design i draws from fold_in(key, i), so that more
+        Every parameter is uniform in the box and independent of the others, but for what `project`
+        changes: a finger with a pressure above its limit has the highest one that it may have.
+        Design i draws from fold_in(key, i), so that more
         designs do not change earlier ones, and any of them can be drawn without the others.
 
         Args:
@@ -229,12 +244,10 @@ class DesignSpace:
     def _above_the_limit(self, rows: np.ndarray) -> int:
         """Number of designs [SI], shape (design, parameter), with a pressure above its limit."""
         source = np.asarray(self.source)
-        start = _offsets(self.hand)
         full = np.where(source >= 0, rows[:, np.maximum(source, 0)], np.asarray(self.base))
-        fingers = np.arange(len(self.hand.finger))
-        caps = _caps(self.hand, lambda name: full[:, start[name] + fingers])
+        values = _Values(self, full)
         # A pressure at its limit is a legal one, also as a float32.
-        above = full[:, start["pressure"] + fingers] > caps * (1 + 1e-6)
+        above = values("pressure") > _caps(self.hand, values) * (1 + 1e-6)
         return int(above.any(1).sum())
 
     def refuse_population(self, population: np.typing.ArrayLike) -> None:
@@ -303,21 +316,64 @@ class DesignSpace:
 @functools.partial(jax.jit, static_argnums=0)
 def _projected(space: DesignSpace, design: jax.Array) -> jax.Array:
     """`DesignSpace.project` of a design whose units are known to be right; one program a space."""
-    full = space.expand(design)
-    offsets = _offsets(space.hand)
-    fingers = len(space.hand.finger)
-    caps = _caps(space.hand, lambda name: full[offsets[name] :][:fingers]) * _STRICT
-    start = offsets["pressure"]
-    for i in range(len(space.hand.finger)):
-        j = space.source[start + i]
+    if space.buildable is not None:
+        design = _lengthened(space, jnp.clip(design, *_representable(space)))
+    values = _Values(space, space.expand(design))
+    caps = _caps(space.hand, values)
+    if space.buildable is not None:
+        tip = tuple(values(name) for name in TIP) if space.hand.section.tapered else None
+        caps = space.buildable.highest_pressure(caps, values, tip)
+    for i, j in enumerate(values.places("pressure")):
         if j >= 0:
-            design = design.at[j].min(caps[i])
+            design = design.at[j].min(caps[i] * _STRICT)
+    return design if space.buildable is None else _raised(space, design)
+
+
+def _lengthened(space: DesignSpace, design: jax.Array) -> jax.Array:
+    """A design whose free lengths are the least ones of their fingers' heights, or more."""
+    assert space.buildable is not None
+    values = _Values(space, space.expand(design))
+    least = space.buildable.least_length(values("height"))
+    for i, j in enumerate(values.places("length")):
+        if j >= 0:
+            design = design.at[j].max(jnp.minimum(least[i], space.box[1][j]))
     return design
 
 
+def _raised(space: DesignSpace, design: jax.Array) -> jax.Array:
+    """A design whose arm is high enough, as far as its height is free and in its bounds."""
+    assert space.buildable is not None
+    values = _Values(space, space.expand(design))
+    [j] = values.places("arm_z")
+    if j < 0:
+        return design
+    angles = (values(name)[0] for name in ("arm_roll", "arm_pitch", "arm_yaw"))
+    least = space.buildable.least_height(*angles)
+    return design.at[j].max(jnp.minimum(least, space.box[1][j]))
+
+
+class _Values:
+    """Values of a full vector by name, and where a design has them."""
+
+    def __init__(self, space: DesignSpace, full: Any):
+        self.space = space
+        self.full = full
+
+    def __call__(self, name: str) -> Any:
+        return self.full[..., self._slice(name)]
+
+    def places(self, name: str) -> tuple[int, ...]:
+        """Entries of the design, -1 for a value that is fixed."""
+        return self.space.source[self._slice(name)]
+
+    def _slice(self, name: str) -> slice:
+        start = _offsets(self.space.hand)[name]
+        return slice(start, start + self.space.hand.width(_row(self.space.hand, name)))
+
+
 def _caps(hand: Hand, value: Callable[[str], Any]) -> Any:
-    tip = [value(name) for name in TIP] if hand.section.tapered else None
-    return highest_pressure(hand, value("height"), value("wall"), tip)
+    """Highest pressures by Table I [Pa], shape (..., finger)."""
+    return highest_pressure(hand, value("wall"), value("tip_wall") if hand.section.tapered else None)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -333,11 +389,13 @@ def _sampled(space: DesignSpace, n: int, key: jax.Array, first: Any) -> jax.Arra
 
 
 def _representable(space: DesignSpace) -> tuple[np.ndarray, np.ndarray]:
+    """The box in the float type of programs, rounded inwards."""
     kind = np.dtype(jnp.result_type(float))
-    low = space.low.astype(kind)
-    high = space.high.astype(kind)
-    low = np.where(low < space.low, np.nextafter(low, kind.type(np.inf)), low)
-    return low, np.where(high > space.high, np.nextafter(high, kind.type(-np.inf)), high)
+    least, most = space.box
+    low = least.astype(kind)
+    high = most.astype(kind)
+    low = np.where(low < least, np.nextafter(low, kind.type(np.inf)), low)
+    return low, np.where(high > most, np.nextafter(high, kind.type(-np.inf)), high)
 
 
 def _refuse_draws(key: Any, n: Any) -> None:
@@ -466,6 +524,7 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
         tuple(base),
         tuple(source.tolist()),
         tuple(idle.items()),
+        hand.buildable if preset.limits else None,
     )
 
 

@@ -294,16 +294,42 @@ class Accuracy:
 @table
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """Bounds beyond which a world has failed although its numbers are finite.
+    """Bounds beyond which a world has failed although its numbers are finite, and what can be built.
+
+    All but the first two limit the designs that a search proposes, and no simulation: every
+    proposal is projected onto them.  A key that is not given is no limit, and a preset of the
+    hand with `limits = false` has Table I alone.
 
     Attributes:
       speed: Largest velocity of any joint.
       penetration: How far the object's centre may be below the table, if there is one, and any body
         in another at the start.
-      strain: Largest strain of the walls of a free finger at its pressure; a search lowers
-        pressures until the walls stay below it. Not given: no such limit.
+      strain: Largest strain of the walls of a free finger at its pressure, which is lowered.
+      free_bend: Largest bend of a free finger at its pressure, which is lowered; a full turn coils.
+      pressure_margin: Share by which pressures stay below the lowest of their limits, Table I's,
+        `strain` and `free_bend`.
+      finger_length: Least and largest length of a finger.
+      finger_slenderness: Least length of a finger over the height of its section: a shorter one is
+        a prop.
+      arm_tilt: Largest roll and pitch of the arm.
+      palm_clearance: Least height of the palm's rim over the table, as commanded; `arm_z` is
+        raised.
+      wrist_force: Largest force of the wrist's springs where the palm is commanded into the table
+        or into the tallest object; `arm_z` is raised. A stiff arm stops there.
     """
 
     speed: float = quantity("rad/s or m/s", 1, 1e9)
     penetration: float = quantity("m", 1e-4, 1)
     strain: float | None = quantity("", 0.05, 10, structure=True, default=None)
+    free_bend: float | None = quantity("deg", 10, 36000, structure=True, default=None)
+    pressure_margin: float | None = quantity("", 0, 0.9, structure=True, default=None)
+    finger_length: tuple[float, ...] | None = quantity("m", 0, 1, structure=True, default=None)
+    finger_slenderness: float | None = quantity("", 0, 20, structure=True, default=None)
+    arm_tilt: float | None = quantity("deg", 0, 180, structure=True, default=None)
+    palm_clearance: float | None = quantity("m", -1, 1, structure=True, default=None)
+    wrist_force: float | None = quantity("N", 0, 1e6, structure=True, default=None)
+
+    @property
+    def of_worlds(self) -> "Limits":
+        """Without those of a search."""
+        return Limits(self.speed, self.penetration)

@@ -1,0 +1,155 @@
+"""What can be built, as a constraint of a search: `[limits]` of a scene, projected onto designs.
+
+Each limit of the table has a closed form in the parameters, so that nothing is simulated to hold
+it: a pressure is lowered, a length, an angle or the arm's height is clipped.  The projection is
+differentiable wherever it is not exactly at a limit.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax.scene.beams import strain_pressure
+from codesign_jax.scene.hand_tables import Hand
+from codesign_jax.scene.tables import Arm, Limits
+
+Value = Callable[[str], Any]
+"""Values of a parameter by its name [SI]: of every finger, or of the hand."""
+FLAT = 1e-12
+"""Squared sine of a palm's tilt below which its rim counts as level: its slope is infinite there,
+and the rim of a palm of 0.1 m is 0.1 um higher than that."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Buildable:
+    """The limits of a scene with the numbers of hand and arm that they need.
+
+    Attributes:
+      limits: The scene's.
+      width: Width of the fingers' section, of tapered ones at the base [m].
+      shear_modulus: Of the silicone [Pa].
+      neo_hookean: Whether the bending law is that of a neo-Hookean wall.
+      palm_radius: Radius of the palm [m].
+      zero_height: Height of the palm at which `arm_z` is zero [m].
+      stiffness: Stiffness of the wrist's slides [N/m].
+      top: Height of the tallest object on the table [m].
+    """
+
+    limits: Limits
+    width: float
+    shear_modulus: float
+    neo_hookean: bool
+    palm_radius: float
+    zero_height: float
+    stiffness: float
+    top: float
+
+    def bounds(self, name: str, low: float, high: float) -> tuple[float, float]:
+        """The bounds of a parameter [SI] within the limits that concern it alone."""
+        if name == "length" and self.limits.finger_length is not None:
+            least, most = self.limits.finger_length
+            return max(low, least), min(high, most)
+        if name in ("arm_roll", "arm_pitch") and self.limits.arm_tilt is not None:
+            most = float(np.radians(self.limits.arm_tilt))
+            return max(low, -most), min(high, most)
+        return low, high
+
+    def least_length(self, height: Any) -> Any:
+        """Least length of fingers of a height [m], any shape."""
+        return (self.limits.finger_slenderness or 0.0) * height
+
+    def highest_pressure(self, table: Any, value: Value, tip: tuple | None) -> Any:
+        """Highest pressures of fingers [Pa], shape (..., finger).
+
+        Args:
+          table: Those of Table I.
+          value: Parameters of the fingers.
+          tip: Height, wall and width at the tip of tapered fingers, or None.  A tapered finger
+            bends by less than its most curved end would, so that each end is limited.
+        """
+        ends: list[tuple[Any, Any, Any]] = [(value("height"), value("wall"), self.width)]
+        if tip is not None:
+            ends.append(tip)
+        caps = table
+        for height, wall, width in ends:
+            for strain in self._strains(height, value("length")):
+                caps = _smaller(caps, self._pressure(strain, height, wall, width))
+        return caps * (1 - (self.limits.pressure_margin or 0.0))
+
+    def least_height(self, roll: Any, pitch: Any, yaw: Any) -> Any:
+        """Least `arm_z` [m] of an arm with these angles [rad], any shape."""
+        rim = rim_drop(self.palm_radius, roll, pitch, yaw)
+        heights = [-np.inf + 0 * rim]
+        if self.limits.palm_clearance is not None:
+            heights.append(rim + self.limits.palm_clearance)
+        if self.limits.wrist_force is not None:
+            yielded = self.limits.wrist_force / self.stiffness
+            heights += [rim - yielded, self.top - yielded + 0 * rim]
+        highest = heights[0]
+        for height in heights[1:]:
+            highest = jnp.maximum(highest, height)
+        return highest - self.zero_height
+
+    def _strains(self, height: Any, length: Any) -> list[Any]:
+        """Strains of the top wall that a free finger must not exceed."""
+        found = []
+        if self.limits.strain is not None:
+            found.append(self.limits.strain + 0 * height)
+        if self.limits.free_bend is not None:
+            found.append(np.radians(self.limits.free_bend) * height / length)
+        return found
+
+    def _pressure(self, strain: Any, height: Any, wall: Any, width: Any) -> Any:
+        how: dict[str, Any] = {"width": width, "shear_modulus": self.shear_modulus}
+        return strain_pressure(strain, height, wall, neo_hookean=self.neo_hookean, **how)
+
+
+def buildable(hand: Hand, limits: Limits, arm: Arm, top: float, *, neo_hookean: bool) -> Any:
+    """The limits that a search in a scene keeps; None if the scene has none.
+
+    Args:
+      hand: The scene's hand.
+      limits: Its limits.
+      arm: Its arm.
+      top: Height of its tallest object [m].
+      neo_hookean: Its bending law.
+    """
+    if limits == limits.of_worlds:
+        return None
+    return Buildable(
+        limits,
+        hand.section.width,
+        hand.material.shear_modulus,
+        neo_hookean,
+        hand.palm.radius,
+        arm.zero_height,
+        hand.wrist.linear_stiffness,
+        top,
+    )
+
+
+def problems(limits: Limits, where: str) -> list[str]:
+    """What is wrong with numbers of `[limits]` that are each in range."""
+    pair = limits.finger_length
+    if pair is None:
+        return []
+    key = f"{where}.limits.finger_length = {list(pair)}"
+    if len(pair) != 2:
+        return [f"{key} must have two entries, least and largest length [m], not {len(pair)}"]
+    if not pair[0] < pair[1]:
+        return [f"{key}: the least length must be below the largest one"]
+    return []
+
+
+def rim_drop(radius: Any, roll: Any, pitch: Any, yaw: Any) -> Any:
+    """How far the rim of a palm is below its centre [m], by the arm's angles [rad], any shape."""
+    up = jnp.cos(roll) * jnp.cos(pitch) + jnp.sin(roll) * jnp.sin(yaw) * jnp.sin(pitch)
+    return radius * jnp.sqrt(jnp.maximum(1 - up**2, FLAT))
+
+
+def _smaller(one: Any, other: Any) -> Any:
+    """The smaller of two arrays; NumPy's stay NumPy's."""
+    return one + (other - one) * (other < one)

@@ -379,6 +379,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, default=Path("runs/search"), help="folder")
     parser.add_argument("--preset", default="23d")
     parser.add_argument("--scene", default="paper")
+    parser.add_argument("--hand", help="hand instead of the scene's")
     parser.add_argument("--objects", help="object set instead of the scene's")
     parser.add_argument("--robust", action="store_true", help="as of codesign optimize")
     own: dict[str, Any] = {"dest": "overrides", "nargs": "+", "action": "append", "default": []}
@@ -404,12 +405,13 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 def search(args: argparse.Namespace, name: str) -> None:
     """Runs an optimiser's study to its end and writes what its designs keep."""
-    scene = scenes.load(args.scene, object_set=args.objects, overrides=changes(args))
+    files = {"hand_name": args.hand, "object_set": args.objects}
+    scene = scenes.load(args.scene, **files, overrides=changes(args))
     engine = make_engine("structured", scene)
     space = design_space(scene.hand, args.preset)
     case = make_case(name, space, args.preset, len(scene.objects.object))
     changed = ["--robust"] * args.robust + [*chain.from_iterable(args.overrides)]
-    words = [Path(args.objects).stem] if args.objects else []
+    words = [Path(name).stem for name in (args.hand, args.objects) if name]
     words += [args.preset, name, *(re.sub(r"^--|^[a-z_.]+[.](?=.*=)", "", c) for c in changed)]
     stem = re.sub("[:,]", "-", "-".join(dict.fromkeys(words))).replace("=", "")
     if len(stem) > LONGEST_STEM:
@@ -417,7 +419,8 @@ def search(args: argparse.Namespace, name: str) -> None:
     how = {n: getattr(args, n) for n in ("seeds", "budget", "tests", "marks", "at")}
     how["chunk"] = 512 if jax.default_backend() == "cpu" else 16_384
     study = Study(case, scene, engine, space, **how, path=args.out / f"{stem}.npz")
-    row = {"preset": args.preset, "scene": args.scene, "objects": args.objects, "changes": changed}
+    row = {"preset": args.preset, "scene": args.scene, "hand": args.hand, "objects": args.objects}
+    row["changes"] = changed
     row |= {"tests": args.tests, "optimizer": name}
     grasps = 0
     start = time.monotonic()
@@ -440,10 +443,13 @@ def search(args: argparse.Namespace, name: str) -> None:
 
 
 def at_mass(args: argparse.Namespace, mass: str) -> Scene:
-    """The scene as its files have it, with every object at a mass [kg]."""
-    plain = scenes.load(args.scene, object_set=args.objects)
+    """The scene and hand as their files have them, with each of its objects at a mass [kg].
+
+    Objects are the scene's own, also for designs that were found with others.
+    """
+    plain = scenes.load(args.scene, hand_name=args.hand)
     own = {("objects", "object", s.name, "mass"): float(mass) for s in plain.objects.object}
-    return scenes.load(args.scene, object_set=args.objects, overrides=own)
+    return scenes.load(args.scene, hand_name=args.hand, overrides=own)
 
 
 def main(arguments: list[str] | None = None) -> int:

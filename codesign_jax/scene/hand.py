@@ -187,7 +187,7 @@ def _check_presets(
             if key in rows:
                 _check_fixed(f"{path}.fixed.{key}", value, rows[key], hand, problems)
         free = [f.name for f in preset.free]
-        if not free:
+        if not free and preset.fixed:
             problems.append(f"{path} leaves no parameter free")
         for f in preset.free:
             if f.name in preset.fixed:
@@ -251,7 +251,8 @@ def _group_problem(free: Free, count: int) -> str:
 
 
 def _check_sections(hand: Hand, where: str, problems: list[str]) -> None:
-    places = [where, *(f"{where}.preset {preset.name}" for preset in hand.preset)]
+    own = [f"{where}.preset {preset.name}" for preset in hand.preset if not preset.whole]
+    places = [where, *own]
     for path, bounds in zip(places, all_bounds(hand), strict=True):
         lowest = {name: low for name, (low, _) in bounds.items()}
         width = (hand.section.width,) * len(hand.finger)
@@ -287,9 +288,9 @@ def _check_sections(hand: Hand, where: str, problems: list[str]) -> None:
 
 
 def all_bounds(hand: Hand) -> Iterator[dict[str, tuple[tuple[float, ...], tuple[float, ...]]]]:
-    """Lowest and highest values [SI] of every parameter, of the whole table and of each preset."""
+    """Lowest and highest values [SI] of every parameter, of the whole table and of other presets."""
     everything = Preset("full", tuple(Free(p.name) for p in hand.parameter))
-    for preset in (everything, *hand.preset):
+    for preset in (everything, *(p for p in hand.preset if not p.whole)):
         yield {p.name: _bounds(p, preset, hand) for p in hand.parameter}
 
 

@@ -303,13 +303,13 @@ class Preset:
     Attributes:
       name: Name of the preset, as for `--preset`; "full" is the whole table.
       limits: Whether designs stay within `[limits]` of the scene; false: within Table I alone.
-      free: The free parameters.
+      free: The free parameters; with none fixed either, those of the whole table.
       fixed: Values of other parameters by name, in the table's units: a number, or an array with
         one for each finger.
     """
 
     name: str
-    free: tuple[Free, ...]
+    free: tuple[Free, ...] = ()
     fixed: dict[str, Any] = dataclasses.field(default_factory=dict)
     limits: bool = True
 
@@ -317,6 +317,11 @@ class Preset:
         """Makes tuples of TOML's arrays, as those of other tables are."""
         fixed = {k: tuple(v) if isinstance(v, list) else v for k, v in self.fixed.items()}
         object.__setattr__(self, "fixed", fixed)
+
+    @property
+    def whole(self) -> bool:
+        """Whether all parameters of the table are free, within its bounds."""
+        return not self.free and not self.fixed
 
     def __hash__(self) -> int:
         """Hashes the preset although TOML gives `fixed` as a dict."""

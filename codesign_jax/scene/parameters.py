@@ -464,7 +464,7 @@ def design_space(hand: Hand, preset: str = "full") -> DesignSpace:
             hint = _hint(preset, [*known, "full", f"{total}d"])
             raise schema.InputError([f"preset {preset!r} unknown for hand {hand.name}; {hint}"])
         chosen = known[preset]
-    return _build(hand, chosen, everything=not chosen.free)
+    return _build(hand, chosen, everything=chosen.whole)
 
 
 def without_effect(hand: Hand) -> dict[str, str]:

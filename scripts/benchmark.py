@@ -62,7 +62,7 @@ def make_worlds(chosen: Scene, designs: str, count: int) -> work.Worlds:
     """
     if designs == "mixed":
         return work.make_worlds(chosen, count)
-    space = parameters.design_space(chosen.hand, "23d")
+    space = parameters.design_space(chosen.hand, "23d").of_table
     key = jax.random.key(work.SEED)
     objects = len(chosen.objects.object)
     trials = rollout.sample_trials(chosen, key, count)

@@ -33,7 +33,7 @@ from codesign_jax.model import overlap
 from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import cases, columns
-from codesign_jax.scene import beams, draws, parameters, silicones
+from codesign_jax.scene import beams, draws, parameters
 from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import command, copied, finished_run, own_workplace  # noqa: F401
 from tests.helpers.toy_engine import TINY
@@ -629,39 +629,3 @@ def test_the_strain_s_pressure_is_that_of_the_wall_s_stress(neo_hookean):
     chamber = (width - 2 * wall) * (height - 2 * wall) * height / 2
     curvature = optimize.brentq(lambda k: moment(k) - pressure * chamber, 1.0, 500.0)
     assert curvature * height == pytest.approx(strain, rel=1e-6)
-
-
-@pytest.mark.parametrize("law", silicones.LAWS)
-def test_no_design_of_a_space_is_beyond_the_strain(law):
-    """Those that are drawn and projected; pressures alone change. Without the limit Table I allows
-    more."""
-    limited = scene.load(
-        "paper",
-        overrides={
-            "limits.strain": 1.0,
-            "hand.material.law": law,
-            "hand.material.shear_modulus": 40e3,
-        },
-    )
-    space = parameters.design_space(limited.hand, "full")
-    drawn = {s: np.asarray(s.sample(jax.random.key(1), 200)) for s in (space, SPACE)}
-
-    def highest(designs):
-        """Largest pressure of each design over that of the strain."""
-        own = parameters.params_of(SPACE, designs)
-        how = {
-            "width": PAPER.hand.section.width,
-            "shear_modulus": 40e3,
-        }
-        caps = beams.strain_pressure(
-            1.0, own.height, own.wall, neo_hookean=silicones.of_law(law), **how
-        )
-        return np.asarray(own.pressure / caps).max(1)
-
-    before = highest(drawn[SPACE])
-    after = highest(drawn[space])
-    assert before.max() > 1.2 and after.max() <= 1 and (after[before > 1] > 0.999).all()
-    same = [k for k, name in enumerate(space.names) if not name.startswith("pressure")]
-    np.testing.assert_array_equal(drawn[space][:, same], drawn[SPACE][:, same])
-    with pytest.warns(UserWarning, match="pressure above the limit"):
-        space.check(drawn[SPACE])

@@ -85,7 +85,8 @@ def _check(options: Options, case: Case) -> None:
 def make_plane(case: Case, pair: tuple[Axis, Axis]) -> Plane:
     """A regular grid over two axes, ends included.
 
-    Pressures are lowered under the limit that the walls set, as of every particle.
+    Pressures are lowered under the limit that the walls set (Table I); limits of the scene hold for
+    searches alone.
     """
     space = case.space
     values = np.meshgrid(*(axis.values for axis in pair), indexing="ij")
@@ -93,7 +94,7 @@ def make_plane(case: Case, pair: tuple[Axis, Axis]) -> Plane:
     for axis, own in zip(pair, values, strict=True):
         if axis.column is not None:
             designs[:, axis.column] = own.ravel() * space.scale[axis.column]
-    projected = jax.jit(jax.vmap(space.project))(designs)
+    projected = jax.jit(jax.vmap(space.of_table.project))(designs)
     return Plane(pair, np.asarray(projected), grid.numbers(case.scene, pair))
 
 

@@ -21,6 +21,8 @@ Value = Callable[[str], Any]
 FLAT = 1e-12
 """Squared sine of a palm's tilt below which its rim counts as level: its slope is infinite there,
 and the rim of a palm of 0.1 m is 0.1 um higher than that."""
+PLACES = np.linspace(0, 1, 9)
+"""Places along a tapered finger, shares of its length, whose sections are looked at."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +32,7 @@ class Buildable:
     Attributes:
       limits: The scene's.
       width: Width of the fingers' section, of tapered ones at the base [m].
-      shear_modulus: Of the silicone [Pa].
+      shear_modulus: Of the silicone, over `moment_factor` [Pa].
       neo_hookean: Whether the bending law is that of a neo-Hookean wall.
       palm_radius: Radius of the palm [m].
       zero_height: Height of the palm at which `arm_z` is zero [m].
@@ -67,14 +69,18 @@ class Buildable:
         Args:
           table: Those of Table I.
           value: Parameters of the fingers.
-          tip: Height, wall and width at the tip of tapered fingers, or None.  A tapered finger
-            bends by less than its most curved end would, so that each end is limited.
+          tip: Height, wall and width at the tip of tapered fingers, or None.  No section of a
+            tapered finger may bend as a whole finger of that section must not.
         """
-        ends: list[tuple[Any, Any, Any]] = [(value("height"), value("wall"), self.width)]
+        base = value("height"), value("wall"), self.width
+        sections = [base]
         if tip is not None:
-            ends.append(tip)
+            sections = [
+                tuple(a + (b - a) * place for a, b in zip(base, tip, strict=True))
+                for place in PLACES
+            ]
         caps = table
-        for height, wall, width in ends:
+        for height, wall, width in sections:
             for strain in self._strains(height, value("length")):
                 caps = _smaller(caps, self._pressure(strain, height, wall, width))
         return caps * (1 - (self.limits.pressure_margin or 0.0))
@@ -122,7 +128,8 @@ def buildable(hand: Hand, limits: Limits, arm: Arm, top: float, *, neo_hookean: 
     return Buildable(
         limits,
         hand.section.width,
-        hand.material.shear_modulus,
+        # The pressure of a strain goes with the modulus over the moment's factor.
+        hand.material.shear_modulus / hand.material.moment_factor,
         neo_hookean,
         hand.palm.radius,
         arm.zero_height,

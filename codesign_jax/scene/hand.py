@@ -288,7 +288,7 @@ def _check_sections(hand: Hand, where: str, problems: list[str]) -> None:
 
 
 def all_bounds(hand: Hand) -> Iterator[dict[str, tuple[tuple[float, ...], tuple[float, ...]]]]:
-    """Lowest and highest values [SI] of every parameter, of the whole table and of other presets."""
+    """Lowest and highest values [SI] of every parameter, of the table and of other presets."""
     everything = Preset("full", tuple(Free(p.name) for p in hand.parameter))
     for preset in (everything, *(p for p in hand.preset if not p.whole)):
         yield {p.name: _bounds(p, preset, hand) for p in hand.parameter}

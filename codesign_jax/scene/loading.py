@@ -100,9 +100,7 @@ def load(
     parts["objects"] = mesh_margins.fit(parts["objects"], parts["hand"])
     law = bool(parsed.effects.neo_hookean)
     top = max((shape.height for shape in parts["objects"].object), default=0.0)
-    built = buildable.buildable(
-        parts["hand"], parsed.limits, parsed.arm, top, neo_hookean=law
-    )
+    built = buildable.buildable(parts["hand"], parsed.limits, parsed.arm, top, neo_hookean=law)
     parts["hand"] = dataclasses.replace(parts["hand"], buildable=built)
     parts["hand"] = key_frames.with_parameters(parts["hand"], parts["control"])
     names = [f.name for f in dataclasses.fields(SceneFile) if f.name not in parts]

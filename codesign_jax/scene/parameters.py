@@ -90,6 +90,11 @@ class DesignSpace:
         return np.array(low), np.array(high)
 
     @property
+    def of_table(self) -> "DesignSpace":
+        """The space with Table I alone, without limits of a scene."""
+        return dataclasses.replace(self, buildable=None)
+
+    @property
     def num_parameters(self) -> int:
         """Number of free parameters."""
         return len(self.names)
@@ -373,7 +378,9 @@ class _Values:
 
 def _caps(hand: Hand, value: Callable[[str], Any]) -> Any:
     """Highest pressures by Table I [Pa], shape (..., finger)."""
-    return highest_pressure(hand, value("wall"), value("tip_wall") if hand.section.tapered else None)
+    return highest_pressure(
+        hand, value("wall"), value("tip_wall") if hand.section.tapered else None
+    )
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -514,7 +521,7 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
         words = f"preset {preset.name!r} of hand {hand.name} leaves nothing to search"
         raise schema.InputError([f"{words}: {left}"])
     names, units, scale, low, high, domain = zip(*columns, strict=True)
-    return DesignSpace(
+    space = DesignSpace(
         _table_alone(hand),
         names,
         units,
@@ -526,6 +533,22 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
         tuple(idle.items()),
         hand.buildable if preset.limits else None,
     )
+    _refuse_empty(space, hand.name)
+    return space
+
+
+def _refuse_empty(space: DesignSpace, hand_name: str) -> None:
+    """Refuses limits of a scene that leave nothing of a parameter's range."""
+    columns = map(space.in_units, (*space.box, *space.bounds))
+    ends = zip(space.names, space.units, *columns, strict=True)
+    problems = [
+        f"{name}: limits of the scene ({least:g} to {most:g} {unit}) leave nothing of the range of "
+        f"hand {hand_name}, {low:g} to {high:g} {unit}"
+        for name, unit, least, most, low, high in ends
+        if least > most
+    ]
+    if problems:
+        raise schema.InputError(problems)
 
 
 def _table_alone(hand: Hand) -> Hand:

@@ -294,7 +294,7 @@ class Accuracy:
 @table
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """Bounds beyond which a world has failed although its numbers are finite, and what can be built.
+    """Bounds beyond which a finite world has failed, and limits of what can be built.
 
     All but the first two limit the designs that a search proposes, and no simulation: every
     proposal is projected onto them.  A key that is not given is no limit, and a preset of the

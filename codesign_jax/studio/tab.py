@@ -219,7 +219,8 @@ class Tab:
             self.send("state", "compiling for this accuracy: up to a minute the first time ...")
         bench = self._desk.bench(view.accuracy)
         before = self._shown
-        view = view._replace(design=np.asarray(bench.case.space.project(view.design), float))
+        space = bench.case.space.of_table
+        view = view._replace(design=np.asarray(space.project(view.design), float))
         same = before and before.bench is bench and np.array_equal(before.view.design, view.design)
         if not (before and same):
             self._outcomes = []

@@ -100,7 +100,7 @@ class Landscape:
 SWITCHES = tuple(f"switch-{k}" for k in (1, 2, 4, 8, 16, 32))
 
 _TWO = Strategies("2d", "2d", ("single", *SWITCHES, "concurrent"), 30, 10, 64, 6, 36)
-_MANY = Strategies("23d", "23d", ("single", "switch-1", "concurrent"), 30, 60, 128, 6, 72)
+_MANY = Strategies("23d", "paper-23d", ("single", "switch-1", "concurrent"), 30, 60, 128, 6, 72)
 PAPER: dict[str, Strategies | Landscape] = {
     "2d": _TWO,
     "23d": _MANY,
@@ -114,7 +114,7 @@ TOTAL_GRASPS = sum(PAPER_GRASPS.values())
 # Two links and few runs: the whole path in seconds.
 TINY: dict[str, Strategies | Landscape] = {
     "2d": Strategies("2d", "2d", ("single", "concurrent"), 2, 2, 2, 3, 3),
-    "23d": Strategies("23d", "23d", ("single", "concurrent"), 2, 2, 2, 3, 3),
+    "23d": Strategies("23d", "paper-23d", ("single", "concurrent"), 2, 2, 2, 3, 3),
     "landscape": Landscape("landscape", "2d", 2, 3),
 }
 SIZES = {"paper": (PAPER, ()), "tiny": (TINY, ("discretization.links=2",))}

@@ -53,7 +53,7 @@ def designs(chosen: Scene, count: int) -> jax.Array:
     low = np.array(table.low)
     high = np.array(table.high)
     unit = rng.random((count, len(low) + len(GOOD)))
-    random = jax.vmap(table.project)(jnp.asarray(low + (high - low) * unit[:, : len(low)]))
+    random = jax.vmap(table.of_table.project)(jnp.asarray(low + (high - low) * unit[:, : len(low)]))
     middle = np.array([GOOD[n][0] for n in plane.names])
     half = np.array([GOOD[n][1] for n in plane.names])
     turn = 2.0 * unit[:, len(low) :] - 1.0

@@ -1,0 +1,223 @@
+"""What can be built as a constraint of a search: closed forms, every optimiser, each limit off."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from codesign_jax import codesign, optimize, scene, stress
+from codesign_jax.model import morphology
+from codesign_jax.scene import InputError, parameters, silicones
+
+PAPER = scene.load("paper")
+SPACE = parameters.design_space(PAPER.hand, "23d")
+TABLE = parameters.design_space(PAPER.hand, "paper-23d")
+UNLIMITED = {
+    "strain": 10.0,
+    "free_bend": 36000.0,
+    "pressure_margin": 0.0,
+    "finger_length": [0.01, 0.18],
+    "finger_slenderness": 0.0,
+    "arm_tilt": 180.0,
+    "palm_clearance": -1.0,
+    "wrist_force": 1e6,
+}
+"""Every limit at its open end."""
+
+
+def limited(**limits):
+    """The scene and its space with these limits and no other one."""
+    own = {f"limits.{name}": value for name, value in {**UNLIMITED, **limits}.items()}
+    made = scene.load("paper", overrides=own)
+    return made, parameters.design_space(made.hand, "23d")
+
+
+def drawn(space, count=200):
+    return np.asarray(space.sample(jax.random.key(3), count))
+
+
+def projected(space, designs):
+    return np.asarray(jax.jit(jax.vmap(space.project))(designs))
+
+
+def each_params(space, designs):
+    every = jax.tree.map(np.asarray, parameters.params_of(space, designs))
+    return [jax.tree.map(lambda v, i=i: v[i], every) for i in range(len(designs))]
+
+
+def columns(name):
+    return [k for k, own in enumerate(SPACE.names) if own.split("[")[0] == name]
+
+
+def test_no_proposal_has_a_warning_and_the_paper_s_space_has_table_i_alone():
+    designs = drawn(SPACE)
+    for params in each_params(SPACE, designs):
+        assert stress.of_design(PAPER, params) == []
+    np.testing.assert_array_equal(projected(SPACE, designs), designs)
+    assert TABLE.names == SPACE.names and TABLE.bounds == SPACE.bounds
+    assert TABLE.buildable is None is parameters.design_space(PAPER.hand, "2d").buildable
+    of_table = drawn(TABLE)
+    warned = [bool(stress.of_design(PAPER, p)) for p in each_params(TABLE, of_table)]
+    assert 0.2 < np.mean(warned)
+    # Table I's own scene has no limits to keep.
+    spheres = scene.load("paper_spheres")
+    assert parameters.design_space(spheres.hand).buildable is None
+
+
+@pytest.mark.parametrize("law", silicones.LAWS)
+def test_a_lowered_pressure_bends_the_free_finger_by_the_limit(law):
+    """By `free_bends`, which halves intervals where the projection inverts in closed form."""
+    material = {"hand.material.law": law, "hand.material.shear_modulus": 40e3}
+    own = {f"limits.{n}": v for n, v in {**UNLIMITED, "free_bend": 90.0}.items()}
+    made = scene.load("paper", overrides=own | material)
+    space = parameters.design_space(made.hand, "23d")
+    designs = drawn(TABLE, 60)
+    pressures = columns("pressure")
+    found = projected(space, designs)
+    lowered = found[:, pressures] < designs[:, pressures] * (1 - 1e-5)
+    bends = np.degrees(
+        [
+            morphology.free_bends(made.hand, p, neo_hookean=silicones.of_law(law))
+            for p in each_params(space, found)
+        ]
+    )
+    # Pressures are rounded to float32, and stay below the limit by 1e-6 of it.
+    np.testing.assert_allclose(bends[lowered], 90, rtol=2e-5)
+    assert lowered.mean() > 0.3 and (bends <= 90 * (1 + 1e-6)).all()
+    others = np.setdiff1d(np.arange(len(space.names)), pressures)
+    np.testing.assert_array_equal(found[:, others], designs[:, others])
+
+
+def test_a_lowered_pressure_strains_the_wall_by_the_limit_less_the_margin():
+    """Strain is curvature times height; half the margin's pressure is half the limit's."""
+    _, space = limited(strain=0.5)
+    designs = drawn(TABLE, 60)
+    found = projected(space, designs)
+    pressures = columns("pressure")
+    lowered = found[:, pressures] < designs[:, pressures] * (1 - 1e-5)
+    strains = []
+    for p in each_params(space, found):
+        bends = morphology.free_bends(PAPER.hand, p, neo_hookean=True)
+        strains.append(bends / p.length * p.height)
+    np.testing.assert_allclose(np.array(strains)[lowered], 0.5, rtol=2e-5)
+    _, half = limited(strain=0.5, pressure_margin=0.5)
+    lower = projected(half, designs)[:, pressures]
+    np.testing.assert_allclose(lower[lowered], 0.5 * found[:, pressures][lowered], rtol=1e-6)
+
+
+def test_no_tapered_finger_bends_by_more_than_the_limit():
+    own = {f"limits.{n}": v for n, v in {**UNLIMITED, "free_bend": 60.0}.items()}
+    made = scene.load("paper", hand_name="tapered4", overrides=own)
+    space = parameters.design_space(made.hand, "full")
+    bends = [
+        np.degrees(morphology.free_bends(made.hand, p, neo_hookean=True)).max()
+        for p in each_params(space, drawn(space, 40))
+    ]
+    assert 45 < max(bends) <= 60 * (1 + 1e-5)
+
+
+def test_lengths_angles_and_height_are_clipped():
+    """By trigonometry: the rim of a palm that is pitched alone is radius * sin(pitch) lower."""
+    _, space = limited(finger_length=[0.03, 0.1], finger_slenderness=2.5)
+    found = projected(space, drawn(TABLE))
+    lengths = found[:, columns("length")]
+    least = np.maximum(0.03, 2.5 * found[:, columns("height")])
+    assert (lengths >= least * (1 - 1e-6)).all() and (lengths <= 0.1 * (1 + 1e-6)).all()
+    assert lengths.max() > 0.099
+    _, space = limited(arm_tilt=15.0)
+    tilts = np.degrees(
+        projected(space, drawn(TABLE))[:, columns("arm_roll") + columns("arm_pitch")]
+    )
+    assert np.abs(tilts).max() == pytest.approx(15, rel=1e-5)
+    design = SPACE.default()
+    design[columns("arm_z")] = -0.05
+    pitch = np.radians(12.0)
+    design[columns("arm_pitch")] = pitch
+    made, space = limited(palm_clearance=0.01)
+    [raised] = projected(space, design[None])[:, columns("arm_z")[0]]
+    rim = made.hand.palm.radius * np.sin(pitch)
+    assert made.arm.zero_height + raised == pytest.approx(0.01 + rim, rel=1e-4)
+    # The cylinder, 72 mm high, is the tallest object.
+    made, space = limited(wrist_force=2.0)
+    [raised] = projected(space, design[None])[:, columns("arm_z")[0]]
+    pushed = 0.072 - (made.arm.zero_height + raised)
+    assert made.hand.wrist.linear_stiffness * pushed == pytest.approx(2.0, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", UNLIMITED)
+def test_each_limit_is_closed_on_its_own(name):
+    """With one at its open end something is drawn that the scene's limits would change."""
+    own = scene.load("paper", overrides={f"limits.{name}": UNLIMITED[name]})
+    designs = drawn(parameters.design_space(own.hand, "23d"), 2000)
+    changed = (projected(SPACE, designs) != designs).any(0)
+    moved = {SPACE.names[k].split("[")[0] for k in np.flatnonzero(changed)}
+    expected = {"finger_length": "length", "finger_slenderness": "length"}
+    expected |= {"wrist_force": "arm_z", "arm_tilt": "arm_roll"}
+    expected |= dict.fromkeys(("strain", "free_bend", "pressure_margin"), "pressure")
+    if name == "palm_clearance":  # the wrist's force holds the palm higher than 5 mm
+        assert not moved
+        _, clear = limited(palm_clearance=0.005)
+        _, unlimited = limited()
+        rows = drawn(unlimited)
+        assert (projected(clear, rows) != rows).any(0)[columns("arm_z")].all()
+    else:
+        assert expected[name] in moved
+
+
+def test_the_projection_s_gradient_is_finite():
+    """Also of a level palm, whose rim has a kink, and at every limit."""
+    gradient = jax.jit(jax.vmap(jax.jacobian(SPACE.project)))
+    designs = np.array(drawn(TABLE, 20))
+    designs[0, columns("arm_roll") + columns("arm_pitch")] = 0.0
+    assert np.isfinite(gradient(jnp.asarray(designs))).all()
+    inside = SPACE.default()[None]
+    inside[0, columns("pressure")] = 30e3
+    inside[0, columns("arm_pitch")] = 0.1
+    np.testing.assert_allclose(gradient(jnp.asarray(inside))[0], np.eye(23), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", optimize.NAMES)
+def test_every_optimiser_proposes_and_recommends_what_can_be_built(name):
+    made = codesign.make_optimizer(name, SPACE)
+    count = 12
+    mask = np.ones(SPACE.num_parameters, bool)
+    first = optimize.candidates(jax.random.key(1), made.space, np.arange(1))[0]
+    state = made.init(jax.random.key(0), first, count)
+    ask = jax.jit(made.ask)
+    tell = jax.jit(made.tell)
+    random = np.random.default_rng(0)
+    changes = {}
+    if dataclasses.is_dataclass(made) and hasattr(made, "screening"):
+        changes = {"screening": 1, "retests": 1}
+    made = dataclasses.replace(made, **changes)
+    for _ in range(4):
+        population = ask(state, mask)
+        np.testing.assert_array_equal(projected(SPACE, population), population)
+        state, _ = tell(state, population, random.random(count).astype(np.float32), mask)
+    for params in each_params(SPACE, np.asarray(state.particles)):
+        assert stress.of_design(PAPER, params) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"finger_length": [0.04]}, "must have two entries, least and largest length [m], not 1"),
+        ({"finger_length": [0.2, 0.1]}, "the least length must be below the largest one"),
+        ({"finger_length": 0.04}, "limits.finger_length must be an array, not float"),
+        ({"finger_length": [0.2, 0.3]}, "(200 to 180 mm) leave nothing of the range of hand pneu"),
+        (
+            {"free_bend": 6.28},
+            "limits.free_bend = 6.28 is outside [10, 36000] deg; did you mean 359.8",
+        ),
+        ({"strain": 120}, "limits.strain = 120 is outside [0.05, 10]"),
+        ({"wrist_force": "soft"}, "limits.wrist_force = 'soft' must be a number in [0, 1e+06] N"),
+        ({"free_bent": 360}, "did you mean 'limits.free_bend'?"),
+    ],
+)
+def test_bad_limits_are_refused(changes, expected):
+    own = {f"limits.{name}": value for name, value in changes.items()}
+    with pytest.raises(InputError) as error:
+        parameters.design_space(scene.load("paper", overrides=own).hand)
+    assert expected in str(error.value)

@@ -52,6 +52,10 @@ STREAM_JUDGE = 0x6A756467
 LONGEST_STEM = 100
 """Longest name of a study's files that says all of its changes."""
 PAGE = Path("docs/notes/search.md")
+LIMITED = "23d"
+"""Preset of the whole table within the scene's limits."""
+TABLE = "paper-23d"
+"""Preset of the whole table without them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -304,12 +308,13 @@ def order(row: dict[str, Any]) -> tuple:
     """Where a row stands: 23D first, the paper's objects first, the default's order of names."""
     name = row["optimizer"].split(":")[0]
     place = NAMES.index(name) if name in NAMES else len(NAMES)
-    return row["preset"] != "23d", row.get("objects") or "", place, row["optimizer"]
+    few = row["preset"] not in (LIMITED, TABLE)
+    return few, row["preset"] != LIMITED, row.get("objects") or "", place, row["optimizer"]
 
 
 def table(rows: list[dict[str, Any]]) -> str:
     """A row for each optimiser: what its recommended designs keep at its last mark."""
-    head = "optimiser|preset|objects|seeds|grasps of a seed|median kept|5 % of the seeds below|"
+    head = "optimiser|preset|hand|objects|seeds|grasps of a seed|median kept|5 % of the seeds below|"
     head += "share of seeds that keep 95 % (95 % interval)|commit"
     found = [head.split("|")]
     for row in sorted((r for r in rows if not variant(r["optimizer"])), key=order):
@@ -318,6 +323,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             [
                 f"`{row['optimizer']}`",
                 row["preset"],
+                row.get("hand") or "pneuflex4",
                 row.get("objects") or "three",
                 str(kept.size),
                 f"{row['grasps'][-1]:,}",
@@ -348,8 +354,10 @@ def masses_table(rows: list[dict[str, Any]]) -> str:
     """What recommended designs keep where every object has one of these masses."""
     found = []
     for row in sorted((r for r in rows if "masses" in r), key=order):
-        head = ["searched with"]
-        cells = [" ".join(row["changes"]) or "objects as they are"]
+        head = ["preset", "hand", "searched with"]
+        objects = row.get("objects") or "objects as they are"
+        cells = [row["preset"], row.get("hand") or "pneuflex4"]
+        cells.append(" ".join(row["changes"]) or objects)
         for mass, kept in row["masses"].items():
             head += [f"{1e3 * float(mass):g} g: kept on average", "seeds that keep 95 %"]
             cells += [f"{np.mean(kept):.3f}", share_of(np.array(kept))]
@@ -377,7 +385,7 @@ def variant(name: str) -> bool:
 def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = provenance.parser(__doc__)
     parser.add_argument("--out", type=Path, default=Path("runs/search"), help="folder")
-    parser.add_argument("--preset", default="23d")
+    parser.add_argument("--preset", default=LIMITED)
     parser.add_argument("--scene", default="paper")
     parser.add_argument("--hand", help="hand instead of the scene's")
     parser.add_argument("--objects", help="object set instead of the scene's")
@@ -460,7 +468,7 @@ def main(arguments: list[str] | None = None) -> int:
             sys.exit(f"error: {args.report} has no results of scripts.search")
         plain = [row for row in rows if "kept" in row and not row.get("changes")]
         output.fill(args.page, table(plain), "search")
-        same = [r for r in plain if (r["preset"], r.get("objects")) == ("23d", None)]
+        same = [r for r in plain if (r["preset"], r.get("objects")) == (TABLE, None)]
         same = [row for row in same if row["optimizer"].startswith(optimize.DEFAULT)]
         output.fill(args.page, variants_table(same), "variants")
         if any("masses" in row for row in rows):

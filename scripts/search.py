@@ -314,7 +314,8 @@ def order(row: dict[str, Any]) -> tuple:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """A row for each optimiser: what its recommended designs keep at its last mark."""
-    head = "optimiser|preset|hand|objects|seeds|grasps of a seed|median kept|5 % of the seeds below|"
+    head = "optimiser|preset|hand|objects|seeds|grasps of a seed|median kept|"
+    head += "5 % of the seeds below|"
     head += "share of seeds that keep 95 % (95 % interval)|commit"
     found = [head.split("|")]
     for row in sorted((r for r in rows if not variant(r["optimizer"])), key=order):

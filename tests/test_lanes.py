@@ -72,7 +72,8 @@ def test_one_finger_is_one_team():
     for the_scene, backend, want in (
         (paper, "gpu", shared_memory.TEAM),
         (paper, "cpu", 1),
-        (spheres, "gpu", 1),
+        (scenes.load("paper", overrides={"effects": {"surface": "spheres"}}), "gpu", 8),
+        (spheres, "gpu", 1),  # its fingers do not touch one another
         (eight, "gpu", 1),
     ):
         programs = [Program(the_scene, limits, backend=backend, width=w) for w in (4, 8, 32)]

@@ -441,7 +441,7 @@ class FingerCollision:
         def with_other(j: Any) -> None:
             theirs = pairing.swap(self.body(j)[1:])
             place = lanewise(balls, numbers, centre, theirs[0], theirs[2])
-            near = owner & (place.gap.lane < 0)
+            near = owner & mine & (place.gap.lane < 0)
 
             def enter() -> None:
                 other = jax.lax.div(j, jnp.full_like(j, apart)) + 1

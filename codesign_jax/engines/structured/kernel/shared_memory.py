@@ -38,7 +38,7 @@ def lanes_of_a_finger(scene: Scene, backend: str, fingers: int) -> int:
     It follows from the scene's structure and the backend alone, since last bits depend on it.
     """
     e = scene.effects
-    coupled = e.surface == "hull" and e.finger_finger and scene.num_fingers > 1
+    coupled = e.finger_finger and scene.num_fingers > 1
     return TEAM if backend == "gpu" and coupled and fingers * TEAM <= WARP else 1
 
 

@@ -101,16 +101,22 @@ class Buildable:
 
     def _strains(self, height: Any, length: Any) -> list[Any]:
         """Strains of the top wall that a free finger must not exceed."""
-        found = []
+        strains = []
         if self.limits.strain is not None:
-            found.append(self.limits.strain + 0 * height)
+            strains.append(self.limits.strain + 0 * height)
         if self.limits.free_bend is not None:
-            found.append(np.radians(self.limits.free_bend) * height / length)
-        return found
+            strains.append(np.radians(self.limits.free_bend) * height / length)
+        return strains
 
     def _pressure(self, strain: Any, height: Any, wall: Any, width: Any) -> Any:
-        how: dict[str, Any] = {"width": width, "shear_modulus": self.shear_modulus}
-        return strain_pressure(strain, height, wall, neo_hookean=self.neo_hookean, **how)
+        return strain_pressure(
+            strain,
+            height,
+            wall,
+            width=width,
+            shear_modulus=self.shear_modulus,
+            neo_hookean=self.neo_hookean,
+        )
 
 
 def buildable(hand: Hand, limits: Limits, arm: Arm, top: float, *, neo_hookean: bool) -> Any:
@@ -157,6 +163,6 @@ def rim_drop(radius: Any, roll: Any, pitch: Any, yaw: Any) -> Any:
     return radius * jnp.sqrt(jnp.maximum(1 - up**2, FLAT))
 
 
-def _smaller(one: Any, other: Any) -> Any:
+def _smaller(first: Any, second: Any) -> Any:
     """The smaller of two arrays; NumPy's stay NumPy's."""
-    return one + (other - one) * (other < one)
+    return first + (second - first) * (second < first)

@@ -30,6 +30,8 @@ SILICONE = (0.36, 0.57, 0.80)
 PRINTED = (0.80, 0.80, 0.78)
 CORE = (0.93, 0.72, 0.40)
 DARK = (0.42, 0.44, 0.49)
+VIEW = "{ azimuth: 1.9, elevation: 0.25, distance: 0.45, target: [0.02, -0.02, 0.27] }"
+"""The studio's camera, as web/replay.js has it."""
 
 
 def axes() -> None:
@@ -91,6 +93,7 @@ def studio() -> None:
     with _served() as address, _page(address) as page:
         page.wait_for_selector("#studio .trials button:nth-child(24):is(.kept, .lost)")
         page.evaluate("document.querySelector('.replay').replay.pause()")
+        page.evaluate(f"Object.assign(document.querySelector('.replay').replay.camera(), {VIEW})")
         page.evaluate("document.querySelector('.replay').replay.seek(6.0)")
         page.wait_for_timeout(500)
         page.screenshot(path=FIGURES / "studio.png")
@@ -120,7 +123,7 @@ def _page(address: str):
     flags = ["--headless", "--no-sandbox", "--enable-unsafe-swiftshader"]
     with sync_api.sync_playwright() as play:
         browser = play.chromium.launch(executable_path=program, args=flags)
-        page = browser.new_page(viewport={"width": 1000, "height": 667})
+        page = browser.new_page(viewport={"width": 1200, "height": 800})
         page.set_default_timeout(300_000)
         page.goto(address)
         yield page

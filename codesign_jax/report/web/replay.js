@@ -121,10 +121,12 @@ function startReplay(root, data) {
     void main() {
       if (kind == 1) { result = color; return; }                      // shadow
       if (kind == 2) {                                                // table: a square is 5 cm
-        vec2 cell = floor(place.xy / 0.05);
-        float dark = mod(cell.x + cell.y, 2.0);
+        vec2 off = abs(fract(place.xy / 0.05 + 0.5) - 0.5) * 0.05;    // from the nearest lines, in m
+        vec2 wide = max(vec2(0.0008), fwidth(place.xy));
+        vec2 line = clamp(1.0 - off / wide, 0.0, 1.0) * min(vec2(1.0), 0.0016 / wide);
+        float dark = max(line.x, line.y);
         float fade = smoothstep(0.25, ${data.table.toFixed(3)}, length(place.xy));
-        result = vec4(mix(mix(color.rgb, color.rgb * 0.93, dark), vec3(0.965, 0.972, 0.98), fade), 1.0);
+        result = vec4(mix(mix(color.rgb, color.rgb * 0.78, dark), vec3(0.965, 0.972, 0.98), fade), 1.0);
         return;
       }
       vec3 n = normalize(cross(dFdx(place), dFdy(place)));

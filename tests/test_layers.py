@@ -27,7 +27,7 @@ user_code measurements
 codesign env finger sampling
 batch
 runs
-stress
+stress tolerances
 report
 export
 commands

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import preflight, rollout, runs, stress, types, verdict
+from codesign_jax import preflight, rollout, runs, stress, tolerances, types, verdict
 from codesign_jax.commands import common, forces, reference
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Evaluate
@@ -19,6 +19,9 @@ from codesign_jax.runs.progress import Busy, Meter
 from codesign_jax.scene.schema import InputError
 from codesign_jax.stress import Stress
 from codesign_jax.terminal import Console
+
+OFF = ("off",)
+"""Value of --tolerances where it is not given."""
 
 
 def main(options: Evaluate) -> int:
@@ -46,6 +49,8 @@ def main(options: Evaluate) -> int:
     one = simulate(case, options, console)
     other = other_conditions(case, options, console) if options.stress else None
     tell_verdict(case, one, other, options, console)
+    if options.tolerances != OFF:
+        cast_hands(case, options, console)
     if options.render or options.forces or options.pull:
         of_objects(case, engine, options, console)
     return int(types.failed(one.status).all())  # no trial says anything of the design
@@ -57,9 +62,12 @@ def _size(case: Case, options: Evaluate) -> str:
         text = f"grasps: until the verdict is decided, at most {verdict.MOST}"
     else:
         text = f"grasps: {options.trials}"
-    if not options.stress:
-        return text
-    return f"{text}, {_of_each(options) * stress.sets(case.scene)} more"
+    more = 0
+    if options.stress:
+        more += _of_each(options) * stress.sets(case.scene)
+    if options.tolerances != OFF:
+        more += (options.hands + 1) * (options.trials or tolerances.TRIALS)
+    return f"{text}, {more} more" if more else text
 
 
 def _of_each(options: Evaluate) -> int:
@@ -82,6 +90,9 @@ def _check(options: Evaluate, engine: str) -> None:
     problems = common.number_problems(
         ("--trials", options.trials, 1, 100_000), ("--seed", options.seed, 0, 2**31 - 1)
     )
+    problems += common.number_problems(("--hands", options.hands, 8, 100_000))
+    if options.tolerances != OFF:
+        tolerances.read(options.tolerances)
     problems += common.picture_problems("--render", options.render)
     problems += common.place_problems("--out", options.out, ".csv")
     problems += common.place_problems("--forces", options.forces, ".csv")
@@ -127,6 +138,20 @@ def other_conditions(case: Case, options: Evaluate, console: Console) -> Stress:
         found = stress.simulate(case, count, key, meter.advance)
     reference.tell_stress(case, found, console)
     return found
+
+
+def cast_hands(case: Case, options: Evaluate, console: Console) -> None:
+    """Simulates hands as they are cast, and prints what share of them is good."""
+    given = tolerances.read(options.tolerances)
+    count = options.trials or tolerances.TRIALS
+    total = (options.hands + 1) * count
+    with Meter("cast hands", total, console) as meter:
+        key = jax.random.key(options.seed)
+        found = tolerances.simulate(
+            case, given, key, hands=options.hands, trials=count, done=meter.advance
+        )
+    for line in tolerances.lines(found, given):
+        console.print(line)
 
 
 def tell_verdict(

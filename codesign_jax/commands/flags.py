@@ -243,6 +243,14 @@ class Evaluate(Command, RunOrDesign):
     stress: Flag = False
     """Also simulate heavier objects, less friction, the other bending law and other constants, 12
     grasps (or --trials) for each, and check the design for warnings (docs/verdict.md)."""
+    tolerances: Annotated[
+        tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ...", help_behavior_hint="")
+    ] = ("off",)
+    """Then hands as they are cast, each with deviations of its own: what share of them keeps 95 %,
+    and which tolerance to tighten. Without values wall=0.3 mm length=1 mm modulus=10 % mount=2 deg;
+    two standard deviations each (docs/uncertainty.md)."""
+    hands: int = 64
+    """With --tolerances: hands that are cast, with 24 grasps each or --trials."""
     forces: File = None
     """Write contact forces and depths of the first trial of each object, one row per time step
     (.csv, docs/files.md), and print the grip forces of the fingers."""

@@ -73,6 +73,7 @@ class Yield(NamedTuple):
     trials: int  # grasps of each
     scores: np.ndarray  # deviations over their standard deviations, shape (hand, deviation)
     kinds: tuple[str, ...]  # kind of each deviation
+    given: Mapping[str, float]  # tolerances that are not the usual ones, by kind
 
     @property
     def needed(self) -> int:
@@ -84,6 +85,44 @@ class Yield(NamedTuple):
         """Share of hands that are good, with Wilson's interval."""
         cast = self.kept[1:]
         return wilson(int((cast >= self.needed).sum()), len(cast))
+
+    @property
+    def head(self) -> tuple[str, str, str]:
+        """Names of the columns of `rows`."""
+        return "tolerance of the", "+-", "good hands if halved"
+
+    @property
+    def rows(self) -> list[tuple[str, str, str]]:
+        """Each kind, its tolerance, and the gain in good hands if that is halved; best first."""
+        table = []
+        gains = sorted(self.halved().items(), key=lambda pair: -pair[1].value)
+        for name, gain in gains:
+            kind = KINDS.get(name)
+            size = "as drawn"
+            if kind is not None:
+                size = f"{self.given.get(name, kind.usual):g} {kind.unit}"
+            points = (
+                f"{100 * gain.value:+.0f} points ({100 * gain.low:+.0f} to {100 * gain.high:+.0f})"
+            )
+            table.append(("scene's constants" if kind is None else kind.words, size, points))
+        return table
+
+    @property
+    def summary(self) -> str:
+        """The share of good hands in words."""
+        share, low, high = self.share
+        return (
+            f"{100 * share:.0f} % of {len(self.kept) - 1} cast hands keep {100 * WANTED:.0f} % of "
+            f"{self.trials} grasps ({100 * low:.0f} to {100 * high:.0f} %); the design itself "
+            f"keeps {self.kept[0]}"
+        )
+
+    def lines(self) -> list[str]:
+        """The share of good hands, and what each tolerance is worth, as aligned text."""
+        table = [self.head, *self.rows]
+        widths = [max(len(row[k]) for row in table) for k in range(3)]
+        cells = [(a.ljust(widths[0]), b.rjust(widths[1]), c) for a, b, c in table]
+        return [f"tolerances: {self.summary}", *("  " + "  ".join(c).rstrip() for c in cells)]
 
     def halved(self) -> dict[str, Interval]:
         """By how much the share of good hands grows if one kind of deviations is halved.
@@ -247,37 +286,7 @@ def simulate(
         parts.append(verdict.kept(outcome).sum(1))
         done(outcome.cost.size)
     zero = np.zeros((1, len(kinds)))
-    return Yield(np.concatenate(parts), trials, np.vstack([zero, scores]), kinds)
-
-
-def rows(found: Yield, given: Mapping[str, float]) -> list[tuple[str, str, str]]:
-    """What deviates, its tolerance, and the gain in good hands if that is halved; best first."""
-    table = []
-    for name, gain in sorted(found.halved().items(), key=lambda pair: -pair[1].value):
-        kind = KINDS.get(name)
-        size = "as drawn" if kind is None else f"{given.get(name, kind.usual):g} {kind.unit}"
-        points = f"{100 * gain.value:+.0f} points ({100 * gain.low:+.0f} to {100 * gain.high:+.0f})"
-        words = "constants of the scene" if kind is None else kind.words
-        table.append((words, size, points))
-    return table
-
-
-def summary(found: Yield) -> str:
-    """The share of good hands in words."""
-    share, low, high = found.share
-    return (
-        f"{100 * share:.0f} % of {len(found.kept) - 1} cast hands keep {100 * WANTED:.0f} % of "
-        f"{found.trials} grasps ({100 * low:.0f} to {100 * high:.0f} %); the design itself keeps "
-        f"{found.kept[0]}"
-    )
-
-
-def lines(found: Yield, given: Mapping[str, float]) -> list[str]:
-    """The share of good hands, and what each tolerance is worth, as aligned text."""
-    table = [("tolerance of the", "+-", "good hands if halved"), *rows(found, given)]
-    widths = [max(len(row[k]) for row in table) for k in range(3)]
-    cells = [(a.ljust(widths[0]), b.rjust(widths[1]), c) for a, b, c in table]
-    return [f"tolerances: {summary(found)}", *("  " + "  ".join(row).rstrip() for row in cells)]
+    return Yield(np.concatenate(parts), trials, np.vstack([zero, scores]), kinds, given)
 
 
 def _standard(values: np.ndarray) -> np.ndarray:

@@ -79,7 +79,7 @@ WRONG = {
     "export --design lenght=95 arm_z=900 --trials 1 --out out": (
         "--design 'lenght' is not a parameter; did you mean 'length'|arm_z"
     ),
-    f"export --scene {TINY} --set effects.surface=hull --engine mujoco --tolerance all --out out": (
+    f"export --scene {TINY} --set effects.surface=hull --engine mujoco --tolerances --out out": (
         "not supported by engine mujoco: effects.surface"
     ),
     "export --trials -1 --out out": "--trials",

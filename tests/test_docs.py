@@ -135,7 +135,7 @@ def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch)
 @pytest.mark.parametrize("example", [e for e in CODESIGN if not re.search("failures|studio", e)])
 def test_every_command_runs_at_a_small_size(example, here, monkeypatch):
     size = {"optimize": [*SMALL, "--fresh"], "evaluate": ["--trials", "3"]}
-    size["export"] = ["--overwrite", "--trials", "0", "--tolerance-trials", "1"]
+    size["export"] = ["--overwrite", "--trials", "0", "--hands", "8"]
     size["landscape"] = ["--points", "2", "--trials", "1"]
     size["sample"] = ["--designs", "2", "--trials", "1"]
     arguments = here_alone(example)

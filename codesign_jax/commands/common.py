@@ -11,17 +11,19 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import tomli_w
 from rich.table import Table
 
-from codesign_jax import engines, policy, rollout, terminal
+from codesign_jax import engines, policy, rollout, terminal, tolerances
 from codesign_jax import scene as scenes
-from codesign_jax.commands.flags import SceneFlags, Subject, TrialFlags
+from codesign_jax.commands.flags import Evaluate, Export, SceneFlags, Subject, TrialFlags
 from codesign_jax.engines import Engine
 from codesign_jax.reuse import use_compilation_cache as use_compilation_cache
 from codesign_jax.runs import cases, tables
 from codesign_jax.runs.cases import Case
+from codesign_jax.runs.progress import Meter
 from codesign_jax.runs.reading import Tell
 from codesign_jax.scene import Scene, draws, keypaths, library, objects, schema, texts
 from codesign_jax.scene.parameters import DesignSpace, design_space
@@ -35,6 +37,25 @@ MOST = 1000
 SCENE = "paper"
 PRESET = "2d"
 """Scene and design space where none is named."""
+
+
+OFF = ("off",)
+"""Value of --tolerances where it is not given."""
+
+
+def cast_hands(
+    case: Case, options: Evaluate | Export, trials: int, console: Console
+) -> tolerances.Yield:
+    """Simulates hands as they are cast, with so many grasps each, and prints what they keep."""
+    given = tolerances.read(options.tolerances)
+    with Meter("cast hands", (options.hands + 1) * trials, console) as meter:
+        key = jax.random.key(options.seed)
+        found = tolerances.simulate(
+            case, given, key, hands=options.hands, trials=trials, done=meter.advance
+        )
+    for line in found.lines():
+        console.print(line)
+    return found
 
 
 def changes(options: TrialFlags) -> dict[keypaths.Path, Any]:

@@ -20,9 +20,6 @@ from codesign_jax.scene.schema import InputError
 from codesign_jax.stress import Stress
 from codesign_jax.terminal import Console
 
-OFF = ("off",)
-"""Value of --tolerances where it is not given."""
-
 
 def main(options: Evaluate) -> int:
     common.use_compilation_cache()
@@ -49,8 +46,8 @@ def main(options: Evaluate) -> int:
     one = simulate(case, options, console)
     other = other_conditions(case, options, console) if options.stress else None
     tell_verdict(case, one, other, options, console)
-    if options.tolerances != OFF:
-        cast_hands(case, options, console)
+    if options.tolerances != common.OFF:
+        common.cast_hands(case, options, options.trials or tolerances.TRIALS, console)
     if options.render or options.forces or options.pull:
         of_objects(case, engine, options, console)
     return int(types.failed(one.status).all())  # no trial says anything of the design
@@ -65,7 +62,7 @@ def _size(case: Case, options: Evaluate) -> str:
     more = 0
     if options.stress:
         more += _of_each(options) * stress.sets(case.scene)
-    if options.tolerances != OFF:
+    if options.tolerances != common.OFF:
         more += (options.hands + 1) * (options.trials or tolerances.TRIALS)
     return f"{text}, {more} more" if more else text
 
@@ -91,7 +88,7 @@ def _check(options: Evaluate, engine: str) -> None:
         ("--trials", options.trials, 1, 100_000), ("--seed", options.seed, 0, 2**31 - 1)
     )
     problems += common.number_problems(("--hands", options.hands, 8, 100_000))
-    if options.tolerances != OFF:
+    if options.tolerances != common.OFF:
         tolerances.read(options.tolerances)
     problems += common.picture_problems("--render", options.render)
     problems += common.place_problems("--out", options.out, ".csv")
@@ -138,20 +135,6 @@ def other_conditions(case: Case, options: Evaluate, console: Console) -> Stress:
         found = stress.simulate(case, count, key, meter.advance)
     reference.tell_stress(case, found, console)
     return found
-
-
-def cast_hands(case: Case, options: Evaluate, console: Console) -> None:
-    """Simulates hands as they are cast, and prints what share of them is good."""
-    given = tolerances.read(options.tolerances)
-    count = options.trials or tolerances.TRIALS
-    total = (options.hands + 1) * count
-    with Meter("cast hands", total, console) as meter:
-        key = jax.random.key(options.seed)
-        found = tolerances.simulate(
-            case, given, key, hands=options.hands, trials=count, done=meter.advance
-        )
-    for line in tolerances.lines(found, given):
-        console.print(line)
 
 
 def tell_verdict(

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import engines, files, preflight, provenance, rollout, runs
-from codesign_jax.commands import common, reference, tolerance_study
+from codesign_jax import files, preflight, provenance, rollout, runs, tolerances
+from codesign_jax.commands import common, reference
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Export
 from codesign_jax.export import grasps, motion, plain, process, sheet, tables, valves
@@ -35,8 +35,8 @@ def main(options: Export) -> int:
         notes += sheet.idle_fingers(case.scene, params, sizes)
     if case.policy:
         notes.append(f"commands are those of the key frames: policy {case.policy} is left out")
-    simulating = options.tolerance != "off" and not options.no_sheet
-    engine = case.make_engine() if simulating else None
+    if options.tolerances != common.OFF and not options.no_sheet:
+        case.make_engine()  # refuses the scene before anything is written
     console = Console()
     if options.run_folder:
         console.print(f"best final design of {options.run_folder}")
@@ -46,7 +46,7 @@ def main(options: Export) -> int:
     earlier = (options.out / files.MANIFEST).is_file()
     try:
         with files.whole_folder(options.out, replace=options.overwrite) as folder:
-            write_files(case, params, sizes, engine, folder, options, console)
+            write_files(case, params, sizes, folder, options, console)
     except OSError as error:
         raise InputError([f"--out {options.out}: {error.strerror}"]) from error
     _tell(case, options, console)
@@ -81,9 +81,10 @@ def _check(options: Export, case: Case) -> None:
     problems = common.number_problems(
         ("--trials", options.trials, 0, 10_000),
         ("--seed", options.seed, 0, 2**31 - 1),
-        ("--tolerance-steps", options.tolerance_steps, 1, 100),
-        ("--tolerance-trials", options.tolerance_trials, 1, 100_000),
+        ("--hands", options.hands, 8, 100_000),
     )
+    if options.tolerances != common.OFF:
+        tolerances.read(options.tolerances)
     out = options.out
     if out.exists() and (not out.is_dir() or any(out.iterdir())) and not options.overwrite:
         problems.append(f"--out {out} exists; choose another folder, or give --overwrite")
@@ -110,12 +111,11 @@ def write_files(
     case: Case,
     params: Params,
     sizes: list[Size],
-    engine: engines.Engine | None,
     folder: Path,
     options: Export,
     console: Console,
 ) -> None:
-    """Writes all that is asked for; tolerances if there is an engine to simulate them."""
+    """Writes all that is asked for."""
     _models(case, params, folder, options, console)
     nominal = jax.tree.map(np.asarray, rollout.nominal_trial(case.scene))
     peaks = motion.write(folder, case.scene, params, nominal)
@@ -124,7 +124,9 @@ def write_files(
     valves.write(folder, case.scene, params)
     printed = None if options.no_parts else _parts(case, params, sizes, folder, options, console)
     if not options.no_sheet:
-        found = tolerance_study.simulate(case, engine, options, console) if engine else None
+        found = None
+        if options.tolerances != common.OFF:
+            found = common.cast_hands(case, options, tolerances.TRIALS, console)
         with Busy(console, "writing the build sheet"):
             lacking = _sheet(case, params, sizes, (found, printed, peaks), folder, options)
         if lacking:
@@ -153,11 +155,10 @@ def _tell(case: Case, options: Export, console: Console) -> None:
         console.print("  parts/: fingers, moulds, palm and clamp bars, in millimetres")
     if not options.no_sheet:
         console.print(f"  {sheet.NAME}.md, {sheet.NAME}.pdf: build sheet and its drawings")
-        if options.tolerance == "off":
-            most = tolerance_study.study(case, options).most * options.tolerance_trials
+        if options.tolerances == common.OFF:
             console.print(
-                "  the sheet has no tolerances: --tolerance free --overwrite simulates them, at "
-                f"most {most:,} grasps"
+                "  the sheet has no tolerances: --tolerances --overwrite simulates them, "
+                f"{(options.hands + 1) * tolerances.TRIALS:,} grasps"
             )
 
 
@@ -232,7 +233,7 @@ def _sheet(
     case: Case,
     params: Params,
     sizes: list[Size],
-    added: tuple[sheet.Drift | None, process.Printed | None, dict[str, motion.Peaks]],
+    added: tuple[tolerances.Yield | None, process.Printed | None, dict[str, motion.Peaks]],
     folder: Path,
     options: Export,
 ) -> list[str]:

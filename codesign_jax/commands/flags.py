@@ -34,6 +34,9 @@ ENGINE = tyro.conf.arg(
     help_behavior_hint="",
 )
 Engine = Annotated[str | None, ENGINE]
+Tolerances = Annotated[
+    tuple[str, ...], tyro.conf.arg(metavar="[NAME=VALUE ...]", help_behavior_hint="")
+]
 File = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
 
@@ -243,9 +246,7 @@ class Evaluate(Command, RunOrDesign):
     stress: Flag = False
     """Also simulate heavier objects, less friction, the other bending law and other constants, 12
     grasps (or --trials) for each, and check the design for warnings (docs/verdict.md)."""
-    tolerances: Annotated[
-        tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ...", help_behavior_hint="")
-    ] = ("off",)
+    tolerances: Tolerances = ("off",)
     """Then hands as they are cast, each with deviations of its own: what share of them keeps 95 %,
     and which tolerance to tighten. Without values wall=0.3 mm length=1 mm modulus=10 % mount=2 deg;
     two standard deviations each (docs/uncertainty.md)."""
@@ -308,14 +309,11 @@ class Export(Command, RunOrDesign):
     """Slope of the moulds' side faces [deg]."""
     no_sheet: Flag = False
     """Leave out the build sheet."""
-    tolerance: Literal["off", "free", "all"] = "off"
-    """Simulate how far which parameters may drift: none, the design space's free ones (in 2d at
-    most 756 grasps, in 23d 8,316) or those of the hand's whole table (at most 8,316). The command
-    tells the number first, and the time as soon as it has measured its rate."""
-    tolerance_steps: int = 5
-    """Values of a parameter to try on each side, until one fails."""
-    tolerance_trials: int = 36
-    """Grasps of each value; at 36 a value without a failure is above 90 % with 95 % confidence."""
+    tolerances: Tolerances = ("off",)
+    """Simulate hands as they are cast: the sheet says what share of them keeps 95 %, and which
+    tolerance to tighten, as of `codesign evaluate --tolerances`."""
+    hands: int = 64
+    """With --tolerances: hands that are cast, with 24 grasps each."""
     overwrite: Flag = False
     """Write into a folder that has files already."""
 

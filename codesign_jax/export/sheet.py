@@ -10,12 +10,11 @@ from scipy.spatial.transform import Rotation
 from codesign_jax import stress, terminal
 from codesign_jax.export import pose, valves
 from codesign_jax.export.process import Size
-from codesign_jax.export.tolerance import NEAREST, WANTED, Side, Tolerance
 from codesign_jax.model import morphology
 from codesign_jax.model.layout import mounts
 from codesign_jax.scene import Scene
-from codesign_jax.statistics import Interval
 from codesign_jax.stress import Stress
+from codesign_jax.tolerances import Yield
 from codesign_jax.types import Params
 
 NAME = "build_sheet"
@@ -33,22 +32,11 @@ class SheetSection(NamedTuple):
 Tested = tuple[str | None, Stress | None]
 
 
-class Drift(NamedTuple):
-    """What simulated grasps say about tolerances."""
-
-    nominal: Interval  # success of the design itself
-    trials: int  # trials of each step
-    steps: int  # steps on each side
-    engine: str  # engine that simulated
-    rows: list[Tolerance]  # tolerances; empty if the design itself has too few successes
-    fixed: int = 0  # parameters of the hand's table that were not moved
-
-
 def sheet_sections(
     scene: Scene,
     params: Params,
     sizes: Sequence[Size],
-    drift: Drift | None,
+    cast: Yield | None,
     tested: Tested = (None, None),
 ) -> list[SheetSection]:
     """The sheet's content."""
@@ -58,7 +46,7 @@ def sheet_sections(
         _mounts(scene, params),
         _arm(scene, params, sizes),
         _valves(scene, params),
-        tolerance_section(drift),
+        tolerance_section(cast),
     ]
 
 
@@ -303,51 +291,17 @@ def _margin(scene: Scene, params: Params) -> str:
     )
 
 
-def tolerance_section(drift: Drift | None) -> SheetSection:
-    """Tolerances as a table, or how to have them simulated."""
-    if drift is None:
-        note = "Not simulated: codesign export --tolerance free says how far parameters may drift."
-        return SheetSection("Tolerance", (), [], [note])
-    nominal = f"Of {drift.trials} grasps of the design itself {_percent(drift.nominal)} succeed"
-    limit = f"{100 * WANTED:.0f} %"
-    if not drift.rows:
-        note = f"{nominal}, fewer than {limit}: it has no tolerance to give."
-        return SheetSection("Tolerance", (), [], [note])
-    rows = []
-    for row in drift.rows:
-        sides = [part for side in (row.down, row.up) for part in _side(side)]
-        rows.append((row.name, row.unit, f"{row.value:.4g}", *sides))
-    factor = NEAREST ** (-1 / (drift.steps - 1)) if drift.steps > 1 else 1.0
+def tolerance_section(cast: Yield | None) -> SheetSection:
+    """What share of cast hands is good, or how to have them simulated."""
+    if cast is None:
+        note = "Not simulated: codesign export --tolerances says what share of cast hands is good."
+        return SheetSection("Tolerances", (), [], [note])
     notes = [
-        f"{nominal}. Each parameter alone; every value met the same {drift.trials} trials "
-        f"(engine {drift.engine}); behind it the share of successes with its 95 % interval "
-        "(Wilson). A success keeps the object and lets go of it. Down to and up to: the last value "
-        f"before the share falls below {limit}; fails at: the next value tried.",
-        f"Resolution: {drift.steps} values a side, the first at {NEAREST:.3g} of the way to the "
-        f"limit, each {factor:.2g} times as far as the one before. The limits are Table I's, "
-        "or the design space's where that is wider, and the pressure limit.",
+        f"{cast.summary}. All hands met the same trials. A tolerance is two standard deviations of "
+        "a normal distribution, of each finger by itself and of the silicone of the whole hand. "
+        "Gains are those of a regression over these grasps, with 95 % intervals.",
     ]
-    if drift.fixed:
-        notes.append(
-            f"{drift.fixed} further parameters of the hand's table were not moved; codesign export "
-            "--tolerance all moves each of them."
-        )
-    head = ("parameter", "unit", "value", "down to", "fails at", "up to", "fails at")
-    return SheetSection(f"Tolerance: drift until fewer than {limit} succeed", head, rows, notes)
-
-
-def _side(side: Side) -> tuple[str, str]:
-    if not side.room:
-        return "at its limit", "–"
-    good = "none" if side.good is None else f"{side.good.value:.4g}: {_percent(side.good.share)}"
-    if side.bad is None:
-        return good, "not within the limits"
-    return good, f"{side.bad.value:.4g}: {_percent(side.bad.share)}"
-
-
-def _percent(share: Interval) -> str:
-    value, low, high = (100 * v for v in share)
-    return f"{value:.0f} % [{low:.0f}, {high:.0f}]"
+    return SheetSection("Tolerances: hands as they are cast", cast.head, cast.rows, notes)
 
 
 def markdown(title: str, lines: Sequence[str], content: Sequence[SheetSection]) -> str:

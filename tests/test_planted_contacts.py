@@ -38,9 +38,10 @@ SLOTS = 14
 """Between two fingers, and of a finger with itself and the palm."""
 
 # Stages of the kernel: functions that it evaluates lane by lane.
-FIELD = "ring_on_field"
+FIELD = "ring_place"
 AIM = "aim"
-BETWEEN = "between"
+BETWEEN = "place_of"
+LINE = "facing_line"
 BALLS = "balls"
 BEGUN = "begun"
 HELD = "_with_held"
@@ -212,7 +213,7 @@ HULL = {
     "contacts beside the caps": place(FIELD, point=lambda v: 0.9 * v),
     "contacts beside the caps between fingers": place(BETWEEN, point=lambda v: 0.9 * v),
     "fields are looked at once": Fault({AIM: lambda f, *a: 0 * f(*a)}),
-    "segments touch where they begin": Fault({BETWEEN: without_last}),
+    "segments touch where they begin": Fault({LINE: without_last}),
     "what does not touch is no contact": Fault({BEGUN: touched}),
     "gaps close when they are half as wide": Fault({BEGUN: half_gap}),
     "a line search of one stiffness": Fault({RAY: one_stiffness, SLOPES: one_stiffness}),

@@ -31,15 +31,13 @@ from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import cross, dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.laws import contact, rings, shapes
-from codesign_jax.engines.structured.laws.rings import Place, Ring, Segment
+from codesign_jax.engines.structured.laws import contact, rings, shapes, touch
+from codesign_jax.engines.structured.laws.rings import Facing, Place, Ring, Segment
 from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model.layout import beyond_base, first_on_palm, touches_itself
 
 SURELY = 1.0 - 1e-4
 """At a joint two segments have one nearest place, which is the first one's, whatever is rounded."""
-REACH = 1.2
-"""Farthest point of a section over the larger one of its half axes."""
 
 
 def fields(links: int) -> dict[str, tuple[int, tuple[int, ...]]]:
@@ -192,23 +190,22 @@ class FingerCollision:
     # Contacts
 
     def reach(self, numbers: Lanes) -> Lanes:
-        """How far a ring's section reaches from its centre [m]."""
-        return lanewise(lambda ring: REACH * jnp.maximum(ring[4], ring[5]), numbers)
+        """How far a ring reaches from its centre [m]."""
+        return lanewise(touch.ring_reach, numbers)
+
+    def _gap(self, speed: Lanes) -> jax.Array:
+        """Largest gap that bodies of this speed to each other may close in this step [m]."""
+        return lanewise(partial(closed, self.p.scene.discretization.timestep), speed).lane
 
     def _near(self, square: jax.Array, mine: Lanes, theirs: Lanes, speed: Lanes) -> jax.Array:
-        """Whether sections may touch in this step.
+        """Whether rings may touch in this step.
 
         Args:
           square: Squared distance of their centres [m^2].
-          mine: Reach of one section; `theirs`: of the other one [m].
+          mine: Reach of one ring; `theirs`: of the other one [m].
           speed: Bound of the speed at which they approach [m/s].
         """
-        h = self.p.scene.discretization.timestep
-
-        def most(mine, theirs, speed):
-            return mine + theirs + jnp.maximum(contact.MARGIN, h * speed)
-
-        far = lanewise(most, mine, theirs, speed).lane
+        far = lanewise(jnp.add, mine, theirs).lane + self._gap(speed)
         return square < far * far
 
     def _begun(
@@ -283,25 +280,30 @@ class FingerCollision:
 
     def _on_palm(self, item: Any, mine: jax.Array) -> None:
         row, numbers, frame, centre = self.body(item)
-        field = lanewise(palm_distance, centre, self.palm)
+
+        def look(point: Lanes) -> tuple[Lanes, Lanes]:
+            return lanewise(palm_distance, point, self.palm)
+
+        field = look(centre)
         place = lanes([self.like + jnp.asarray(row, self.like.dtype)], (), wide=True)
         sizes = self.step.hand.read("offset", 0), self.ring(0)
         mine = mine & (lanewise(free_of_palm, place, numbers, *sizes).lane > 0)
         near = self._near_palm(field[0], numbers)
 
-        def enter() -> None:
-            if self.hull:
-                offset = lanewise(aimed, numbers, frame, *field)
-                there = lanewise(jnp.add, centre, offset)
-                again = lanewise(palm_distance, there, self.palm)
-                place = lanewise(on_field, numbers, frame, centre, offset, *again)
-            else:
-                place = lanewise(ball_on_field, numbers, centre, *field)
+        def add(place: Place) -> None:
             palm = jnp.zeros_like(jnp.asarray(row))
             found = self._begun(place, self.pairs.of_row(0), row, self._moves(palm), [])
             self._alone(found, palm, item, mine)
 
-        any_of(mine & near, enter)
+        def enter() -> None:
+            facing = touch.facing(numbers, frame, centre, field, look, apply=lanewise)
+            close = mine & (facing.gap.lane < self._gap(self.read("fastest")))
+            any_of(close, lambda: add(lanewise(touch.ring_place, numbers, frame, centre, facing)))
+
+        def enter_ball() -> None:
+            add(lanewise(touch.ball_on_field, numbers, centre, *field))
+
+        any_of(mine & near, enter if self.hull else enter_ball)
 
     def _near_palm(self, distance: Lanes, numbers: Lanes) -> jax.Array:
         size = lanewise(jnp.maximum, distance, zeros((), self.like)).lane
@@ -317,10 +319,16 @@ class FingerCollision:
 
         def enter() -> None:
             segment, moves = self._of_rows(self._segment, other, near, None)
-            place = self._between(numbers, frame, centre, segment, other, t)
-            held = friction_memory.of_row(self.step, self.pairs, 0)
-            found = self._begun(place, self.pairs.of_row(1), row, moves, held)
-            self._alone(found, other, item, near)
+            facing = self._facing(numbers, frame, centre, segment, other, t)
+            close = near & (facing.gap.lane < self._gap(self.read("fastest")))
+
+            def add() -> None:
+                place = lanewise(place_of, numbers, frame, centre, facing)
+                held = friction_memory.of_row(self.step, self.pairs, 0)
+                found = self._begun(place, self.pairs.of_row(1), row, moves, held)
+                self._alone(found, other, item, close)
+
+            any_of(close, add)
 
         any_of(near, enter)
 
@@ -358,10 +366,16 @@ class FingerCollision:
 
         def enter() -> None:
             segment, moves = self._of_rows(self._segment, other, near, pairing)
-            place = self._between(numbers, frame, centre, segment, other, t)
-            held = friction_memory.of_row(self.step, self.pairs, row)
-            found = self._begun(place, self.pairs.of_row(row), link, moves, held)
-            self._enter(row, near, owner, found, other, item)
+            facing = self._facing(numbers, frame, centre, segment, other, t)
+            close = near & (facing.gap.lane < self._gap(speed))
+
+            def add() -> None:
+                place = lanewise(place_of, numbers, frame, centre, facing)
+                held = friction_memory.of_row(self.step, self.pairs, row)
+                found = self._begun(place, self.pairs.of_row(row), link, moves, held)
+                self._enter(row, close, owner, found, other, item)
+
+            any_of(close, add)
 
         any_of(near, enter)
 
@@ -416,10 +430,10 @@ class FingerCollision:
         ends = self.read("end", row, lane), self.read("end", row + 1, lane)
         return (ends, frames, self.ring(self.ring_at(row + 1), lane)), self._moves(row, lane)
 
-    def _between(
+    def _facing(
         self, numbers: Lanes, frame: Lanes, centre: Lanes, segment: tuple, row: jax.Array, t: Any
-    ) -> Place:
-        """Contact of the lanes' rings with segments; `rings.between`.
+    ) -> Facing:
+        """How the lanes' rings face segments; `rings.facing_line`.
 
         Args:
           segment: Their ends, frames and sections, see `_segment`.
@@ -427,7 +441,7 @@ class FingerCollision:
         """
         last = lanes([jnp.where(row == self.p.links, self.like + 1.0, self.like)], (), wide=True)
         where = lanes([t], (), wide=True)
-        return lanewise(between, numbers, frame, centre, (*segment, last), where)
+        return lanewise(facing_line, numbers, frame, centre, (*segment, last), where)
 
     # Spheres
 
@@ -476,17 +490,13 @@ def ring_centre(origin, frame, numbers):
     return origin + apply_columns(frame, numbers[:3])
 
 
-def aimed(numbers, frame, distance, gradient):
-    return rings.aim(Ring.of(numbers), frame, distance, gradient)
+def closed(timestep, speed):
+    """Largest gap that bodies of a speed to each other may close in a step [m]."""
+    return jnp.maximum(contact.MARGIN, timestep * speed)
 
 
-def on_field(numbers, frame, centre, offset, distance, normal):
-    return rings.on_field(Ring.of(numbers), frame, centre, offset, distance, normal)
-
-
-def ball_on_field(numbers, centre, distance, normal):
-    """See `rings.ball_on_field`; of a sphere all half axes are the radius."""
-    return rings.ball_on_field(numbers[3] * numbers[6], centre, distance, normal)
+def place_of(numbers, frame, centre, facing):
+    return rings.place(Ring.of(numbers), frame, centre, facing)
 
 
 def free_of_palm(row, numbers, offset, first):
@@ -510,11 +520,16 @@ def arc(tip, largest):
     return jnp.maximum(3.0, 1.8 * 2.0 * largest[5] / (tip[3] / TIP))
 
 
-def between(numbers, frame, centre, other, t):
-    """See `rings.between`; other: ends, frames, a ring's section, whether it is the last one."""
+def facing_line(numbers, frame, centre, other, t):
+    """See `rings.facing_line`; other: ends, frames, a ring's section, if it is the last one."""
     ends, frames, tip, last = other
     segment = Segment(ends, frames, jnp.stack([last * tip[3], tip[4], tip[5]]))
-    return rings.between(Ring.of(numbers), frame, centre, segment, t)
+    return rings.facing_line(Ring.of(numbers), frame, centre, segment, t)
+
+
+def between(numbers, frame, centre, other, t):
+    """See `rings.between`; arguments as `facing_line`."""
+    return place_of(numbers, frame, centre, facing_line(numbers, frame, centre, other, t))
 
 
 def balls(numbers, centre, theirs, their_centre):

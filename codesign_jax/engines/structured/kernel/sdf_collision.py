@@ -13,17 +13,23 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import friction_memory, objects
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
-from codesign_jax.engines.structured.kernel.finger_collision import FingerCollision
+from codesign_jax.engines.structured.kernel.finger_collision import FingerCollision, closed
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.problem import relative
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import cross, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.laws import contact, shapes, surroundings
+from codesign_jax.engines.structured.laws import shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import own_friction
-from codesign_jax.engines.structured.laws.rings import RING_RADIUS, Place
-from codesign_jax.engines.structured.laws.touch import ring_centres, touch
+from codesign_jax.engines.structured.laws.rings import Facing, Place
+from codesign_jax.engines.structured.laws.touch import (
+    ball_on_field,
+    facing,
+    ring_centres,
+    ring_place,
+    ring_reach,
+)
 from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model import held
 
@@ -123,27 +129,30 @@ class SdfCollision:
         looks = self.looks(name)
         found = [look(centre) for look in looks]
         friction = self.frictions(name, contacts.set.k // len(looks))
-        flat = not name.endswith("_object") and self.p.scene.effects.table  # the table comes first
-
-        def places() -> Place:
-            every = []
-            for n, (look, first) in enumerate(zip(looks, found, strict=True)):
-                plane = flat and n == 0
-                body = numbers, frame, centre
-                place = touch(self.surface, *body, first, look, plane=plane, apply=lanewise)
-                every.append(lanewise(as_kept, place))
-            return joined(every)
-
         if self.surface == "spheres":
-            return contacts.create(i, places(), *moves, friction=friction)
-        run = partial(may_touch, self.p.scene.discretization.timestep)
-        near = [lanewise(run, numbers, centre, first[0], moves[1]).lane for first in found]
+            places = [lanewise(ball_on_field, numbers, centre, *first) for first in found]
+            places = [lanewise(as_kept, place) for place in places]
+            return contacts.create(i, joined(places), *moves, friction=friction)
+        flat = not name.endswith("_object") and self.p.scene.effects.table  # the table comes first
+        run = partial(closed_gap, self.p.scene.discretization.timestep)
+        most = lanewise(run, numbers, centre, moves[1])
+        near = [lanewise(may_touch, numbers, first[0], most).lane for first in found]
         contacts.write("share", zeros((1, contacts.set.k), self.step.like), i)
 
-        def create() -> None:
-            contacts.create(i, places(), *moves, friction=friction, hold=hold)
+        def look_again() -> None:
+            faced = []
+            for n, (look, first) in enumerate(zip(looks, found, strict=True)):
+                body = numbers, frame, centre
+                faced.append(facing(*body, first, look, plane=flat and n == 0, apply=lanewise))
+            close = [lanewise(any_closes, one.gap, most).lane for one in faced]
+            any_of(total(close) > 0, lambda: create(faced))
 
-        any_of(total(near) > 0, create)
+        def create(faced: list[Facing]) -> None:
+            places = [lanewise(ring_place, numbers, frame, centre, one) for one in faced]
+            places = [lanewise(as_kept, place) for place in places]
+            contacts.create(i, joined(places), *moves, friction=friction, hold=hold)
+
+        any_of(total(near) > 0, look_again)
 
     def of_palm_and_object(self, state: dict) -> None:
         """Contacts of the palm's rings or spheres, and of the object with the table."""
@@ -242,14 +251,27 @@ def slots_of(point, normal, gap):
     ]
 
 
-def may_touch(timestep, numbers, centre, distance, vel):
-    """One where any of a link's rings may touch within the step, else zero."""
-    half = numbers[3:6]
+def closed_gap(timestep, numbers, centre, vel):
+    """Largest gaps that a link's rings may close within the step [m], (k,)."""
     moving = vel[3:, None] + cross(vel[:3, None], centre)
-    most = RING_RADIUS * jnp.maximum(jnp.maximum(half[0], half[1]), half[2])
-    speed = jnp.sqrt(dot(moving, moving)) + most * jnp.sqrt(dot(vel[:3], vel[:3]))
-    near = distance < most + jnp.maximum(contact.MARGIN, timestep * speed)
-    found = jnp.where(near & (numbers[6] > 0), 1.0, 0.0)
+    turning = ring_reach(numbers) * jnp.sqrt(dot(vel[:3], vel[:3]))
+    return closed(timestep, jnp.sqrt(dot(moving, moving)) + turning)
+
+
+def may_touch(numbers, distance, most):
+    """One where any of a link's rings may touch within the step, else zero.
+
+    Args:
+      distance: Of the rings' centres [m], (k,).
+      most: See `closed_gap`.
+    """
+    real = numbers[6] > 0
+    return any_closes(jnp.where(real, distance - ring_reach(numbers), jnp.inf), most)
+
+
+def any_closes(gap, most):
+    """One where any of a link's rings has a smaller gap than `closed_gap`, else zero."""
+    found = jnp.where(gap < most, 1.0, 0.0)
     return sum(found[k] for k in range(found.shape[0]))
 
 

@@ -27,14 +27,6 @@ SMALL = 1e-18
 """Of squared lengths [m^2], likewise."""
 FLOOR = 1e-6
 """Of squares of numbers up to one, where the slope of a root would have none."""
-
-
-SECTION_RADIUS = 1.2
-"""Bound of the farthest point of a section |y/a|^4 + |z/b|^4 = 1 over the larger half axis: with
-a = b it is 2^(1/4) = 1.19."""
-RING_RADIUS = 1.5
-"""Bound of the farthest point of a ring over the largest half axis: with e = a = b it is
-3^(1/4) = 1.32, and a distance read from a mesh's grid needs room."""
 RING_OVERLAP = 0.6
 """Half axis e of a ring along the finger over its part of the finger's length; with 0.5 rings would
 meet in their tips and leave gaps between their sides [ours]."""
@@ -188,6 +180,32 @@ def section_normal(half: jax.Array, local: jax.Array) -> jax.Array:
     return jnp.stack([jnp.zeros_like(y), y / size, z / size])
 
 
+def farthest(half: jax.Array) -> jax.Array:
+    """Distance of a ring's farthest point from its centre [m], shape (...)."""
+    square = half * half
+    return jnp.sqrt(jnp.sqrt(dot(square, square)))
+
+
+class Facing(NamedTuple):
+    """How a ring faces another body."""
+
+    normal: jax.Array  # From the other side to the ring, shape (3, ...)
+    gap: jax.Array  # Negative in contact [m], shape (...)
+    reach: jax.Array  # The ring's support towards the other side, and below what else
+    unit: jax.Array  # `support` returns, shape (3, ...)
+    axial: jax.Array  # Component along the finger of the direction to the other side
+    yields: jax.Array  # Share of the depth by which this side yields
+    fade: jax.Array  # Share of the stiffness that is left
+
+
+def place(ring: Ring, frame: jax.Array, centre: jax.Array, facing: Facing) -> Place:
+    """A ring's contact with the body that it faces."""
+    normal, gap, reach, unit, axial, yields, fade = facing
+    share = stiffness(ring, reach, unit, axial, yields * gap) * fade
+    point = centre + apply_columns(frame, arm(ring, reach, unit, gap)) - 0.5 * gap * normal
+    return Place(point, normal, gap, share)
+
+
 # Against distance fields
 
 
@@ -208,6 +226,17 @@ def aim(ring: Ring, frame: jax.Array, distance: jax.Array, gradient: jax.Array) 
     return apply_columns(frame, jnp.where(moves, away, 0.0))
 
 
+def facing_field(
+    ring: Ring, frame: jax.Array, offset: jax.Array, distance: jax.Array, normal: jax.Array
+) -> Facing:
+    """How a ring faces what a distance field describes; arguments as `on_field`."""
+    toward = -apply_rows(frame, normal)
+    reach, unit = support(ring.half, toward)
+    gap = distance - dot(normal, offset) - reach
+    one = jnp.ones_like(gap)
+    return Facing(normal, gap, reach, unit, toward[0], one, one)
+
+
 def on_field(
     ring: Ring,
     frame: jax.Array,
@@ -222,11 +251,7 @@ def on_field(
       offset: See `aim`; any where the field is that of a plane.
       normal: Its unit gradient there, world axes.
     """
-    toward = -apply_rows(frame, normal)
-    reach, unit = support(ring.half, toward)
-    gap = distance - dot(normal, offset) - reach
-    place = centre + apply_columns(frame, arm(ring, reach, unit, gap)) - 0.5 * gap * normal
-    return Place(place, normal, gap, stiffness(ring, reach, unit, toward[0], gap))
+    return place(ring, frame, centre, facing_field(ring, frame, offset, distance, normal))
 
 
 def ball_on_field(
@@ -265,16 +290,13 @@ def section_frame(segment: Segment, t: jax.Array) -> jax.Array:
     return jnp.stack([x, y, cross(x, y)])
 
 
-def between(
+def facing_line(
     ring: Ring, frame: jax.Array, centre: jax.Array, segment: Segment, t: jax.Array
-) -> Place:
-    """A ring's contact with another finger, or with its own; the other side's rings look for none.
+) -> Facing:
+    """How a ring faces another finger, or its own; arguments as `between`.
 
     The normal is the mean of both sections' own, where the line between the centres leaves them;
     along a finger, as at its ends, it is that line.
-
-    Args:
-      t: Where that is nearest to the ring's centre, see `nearest`.
     """
     other = section_frame(segment, t)
     away = centre - on_line(segment, t)
@@ -293,9 +315,18 @@ def between(
     reach, unit = support(ring.half, toward)
     gap = dot(normal, away) - reach - theirs
     # Both sides yield by half of the depth.
-    share = stiffness(ring, reach, unit, toward[0], 0.5 * gap) * _fade(apart)
-    place = centre + apply_columns(frame, arm(ring, reach, unit, gap)) - 0.5 * gap * normal
-    return Place(place, normal, gap, share)
+    return Facing(normal, gap, reach, unit, toward[0], 0.5 * jnp.ones_like(gap), _fade(apart))
+
+
+def between(
+    ring: Ring, frame: jax.Array, centre: jax.Array, segment: Segment, t: jax.Array
+) -> Place:
+    """A ring's contact with another finger, or with its own; the other side's rings look for none.
+
+    Args:
+      t: Where that is nearest to the ring's centre, see `nearest`.
+    """
+    return place(ring, frame, centre, facing_line(ring, frame, centre, segment, t))
 
 
 def _fade(apart: jax.Array) -> jax.Array:

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.laws import rings
-from codesign_jax.engines.structured.laws.rings import Place, Ring
+from codesign_jax.engines.structured.laws.rings import Facing, Place, Ring
 from codesign_jax.engines.structured.world_model import apply_columns
 
 
@@ -48,12 +48,27 @@ def touch(
     """
     if surface == "spheres":
         return apply(ball_on_field, numbers, centre, *first)
+    found = facing(numbers, frame, centre, first, look, plane=plane, apply=apply)
+    return apply(ring_place, numbers, frame, centre, found)
+
+
+def facing(
+    numbers: Any,
+    frame: Any,
+    centre: Any,
+    first: tuple[Any, Any],
+    look: Callable[[Any], tuple[Any, Any]],
+    *,
+    plane: bool = False,
+    apply: Callable = directly,
+) -> Facing:
+    """The first half of `touch` of rings: how they face the field, and at which gap."""
     if plane:
         offset = apply(jnp.zeros_like, centre)
-        return apply(ring_on_field, numbers, frame, centre, offset, *first)
+        return apply(ring_facing, numbers, frame, offset, *first)
     offset = apply(aim, numbers, frame, *first)
     again = look(apply(jnp.add, centre, offset))
-    return apply(ring_on_field, numbers, frame, centre, offset, *again)
+    return apply(ring_facing, numbers, frame, offset, *again)
 
 
 # Stages
@@ -76,16 +91,25 @@ def aim(
     return rings.aim(Ring.of(numbers), frame, distance, gradient)
 
 
-def ring_on_field(
+def ring_facing(
     numbers: jax.Array,
     frame: jax.Array,
-    centre: jax.Array,
     offset: jax.Array,
     distance: jax.Array,
     normal: jax.Array,
-) -> Place:
-    """Contacts of rings, see `rings.on_field`."""
-    return rings.on_field(Ring.of(numbers), frame, centre, offset, distance, normal)
+) -> Facing:
+    """How rings face a field, see `rings.facing_field`."""
+    return rings.facing_field(Ring.of(numbers), frame, offset, distance, normal)
+
+
+def ring_place(numbers: jax.Array, frame: jax.Array, centre: jax.Array, facing: Facing) -> Place:
+    """Contacts of rings with what they face, see `rings.place`."""
+    return rings.place(Ring.of(numbers), frame, centre, facing)
+
+
+def ring_reach(numbers: jax.Array) -> jax.Array:
+    """Distance of rings' farthest points from their centres [m]."""
+    return rings.farthest(Ring.of(numbers).half)
 
 
 def ball_on_field(

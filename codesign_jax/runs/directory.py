@@ -148,10 +148,16 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def write_tables(path: Path, scene: Scene, settings: Settings, record: Record) -> None:
-    """Writes a run's tables from its checkpoint, unless a process has the run or none may write."""
+    """Writes a run's tables from its checkpoint.
+
+    Nothing changes where a process has the run open, where nobody may write, or where a folder is
+    in the place of a file.
+    """
     if os.access(path, os.W_OK):
-        with contextlib.suppress(InputError), locked(path):
-            tables.write_run(path, scene, design_space(scene.hand, settings.preset), record)
+        with contextlib.suppress(InputError):
+            _refuse_folders(path)
+            with locked(path):
+                tables.write_run(path, scene, design_space(scene.hand, settings.preset), record)
 
 
 def _resume(path: Path, settings: Settings, command: list[str]) -> list[str]:

@@ -129,7 +129,7 @@ def test_every_part_of_the_package_has_its_layer():
 def test_the_map_of_contributing_has_the_same_order():
     """Its rows are the lines of `LAYERS`."""
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    table = text.split("what its files have in common |\n|---|---|\n")[1].split("\n\n")[0]
+    table = text.split("of `codesign_jax` | content |\n|---|---|\n")[1].split("\n\n")[0]
     named = [re.findall(r"`([a-z_]+)/?`", row.split("|")[1]) for row in table.splitlines()]
     assert [set(row) for row in named] == [set(line.split()) for line in LAYERS.strip().split("\n")]
 

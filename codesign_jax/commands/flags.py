@@ -57,7 +57,7 @@ class TrialFlags:
     for those of the scene or run alone (docs/uncertainty.md)."""
     robust: Flag = False
     """Vary friction, mass, size, stiffness and placement more widely between trials, for a hand
-    that depends on none of them (docs/command_line.md). --set objects.noise... overrides this."""
+    that depends on none of them (docs/optimisers.md). --set objects.noise... overrides this."""
 
 
 @dataclasses.dataclass
@@ -158,11 +158,11 @@ class Optimize(Command, SceneFlags):
     control for odd ones, as in the paper's experiments."""
     optimizer: Text = None
     """Optimiser: screened-es, the default of a new run, particle-filter (the paper's),
-    cma-es, open-es, pso or random (docs/command_line.md); or MODULE:CLASS, your
+    cma-es, open-es, pso or random (docs/optimisers.md); or MODULE:CLASS, your
     own optimiser. A resumed run keeps its optimiser."""
     cost: Text = None
     """MODULE:FUNCTION, your own cost instead of the scene's: a function of scene, trace and
-    controls of a grasp (docs/command_line.md)."""
+    controls of a grasp (docs/optimisers.md)."""
     policy: Text = None
     """MODULE:CLASS, your own policy that observes the grasp and commands the hand; its parameters
     are searched too (docs/control.md)."""

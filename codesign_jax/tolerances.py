@@ -101,9 +101,9 @@ class Yield(NamedTuple):
             size = "as drawn"
             if kind is not None:
                 size = f"{self.given.get(name, kind.usual):g} {kind.unit}"
-            points = (
-                f"{100 * gain.value:+.0f} points ({100 * gain.low:+.0f} to {100 * gain.high:+.0f})"
-            )
+            # Plus 0.0, so that none is written as -0.
+            value, low, high = (round(100 * v) + 0.0 for v in gain)
+            points = f"{value:+.0f} points ({low:+.0f} to {high:+.0f})"
             table.append(("scene's constants" if kind is None else kind.words, size, points))
         return table
 

@@ -14,7 +14,6 @@ from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.world_model import world_constants
-from codesign_jax.model.layout import friction_ratio
 from codesign_jax.preflight import invalid_start
 from codesign_jax.types import Status
 from tests.helpers import grasps, oracles
@@ -138,8 +137,7 @@ def test_in_float32_an_object_moves_as_in_float64_under_a_far_hand(grasp, steppe
     ratio = np.float32(30)  # as in the scene `paper`
     contact = dataclasses.replace(own.constants.contact, friction_ratio=ratio)
     constants = dataclasses.replace(own.constants, contact=contact)
-    impratio = friction_ratio(scene, ratio)
-    own = own._replace(impratio=impratio, constants=constants)
+    own = own._replace(constants=constants)
     qpos, qvel = (np.zeros((count, n)) for n in (own.start.size, own.start.size - 1))
     qpos = qpos + own.start
     u = np.repeat(np.asarray(ctrl[:1, 0]), count, 0)

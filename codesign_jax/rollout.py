@@ -56,8 +56,8 @@ class Options(NamedTuple):
         but a cost of one's own that reads the trace must say which.
       record_forces: Whether the trace has the contact forces, see `Forces`; engine structured
         alone, and without derivatives.  A cost's attribute of this name says the same.
-      record_touch: Whether these have the object's contacts ring by ring as well, see `Touch`;
-        implies `record_forces`.  Ten numbers a ring and time step.
+      record_touch: Whether the forces include the contacts of the object ring by ring, see `Touch`:
+        eleven numbers for each ring and time step.  Implies `record_forces`.
       cost: A cost of one's own in place of the scene's, see `CostFunction`.
     """
 

@@ -173,20 +173,20 @@ class Phased(Protocol):
 
 
 class Touch(NamedTuple):
-    """How the rings of the fingers, or of the palm, touch the object: a map for tactile sensors.
+    """Contacts of the object with each ring of the fingers, or of the palm: a map of touch.
 
-    Rings are the places where a hand of a hull is tested for contact; of a hand of spheres they are
-    those. A finger's follow one another from its base to its tip, as many on each link. The force
-    on the object is `tangential - pressing * normal`, and its sum over the rings is that of
-    `Forces`. Vectors and points are in the world frame, forces those of the step taken, geometry
-    that of its beginning. In the shapes n stands for (finger, ring), of the palm for (ring,).
+    Fingers are tested for contact at rings, or at spheres with `effects.surface = "spheres"`. Rings
+    are numbered from a finger's base to its tip, the same number on each link. The force on the
+    object is `tangential - pressing * normal`; summed over the rings it equals the force in
+    `Forces`. Points and vectors are in the world frame. Forces act during the step; the geometry is
+    the one at its beginning. In the shapes n stands for (finger, ring), or (ring,) for the palm.
 
     Attributes:
-      point: Where the contact acts [m], shape (..., n, 3); where nothing touches, the place that is
-        nearest to the object.
+      point: Point of contact [m], shape (..., n, 3); for rings that do not touch, a point between
+        the ring and the object.
       normal: Unit vector from the object to the ring, shape (..., n, 3).
       gap: Distance between ring and object [m], negative in contact, shape (..., n).
-      pressing: Normal force [N], never negative, 0 where nothing touches, shape (..., n).
+      pressing: Normal force [N], at least 0, and 0 for rings that do not touch, shape (..., n).
       tangential: Friction force on the object [N], shape (..., n, 3).
     """
 
@@ -216,8 +216,8 @@ class Forces(NamedTuple):
       depth: Largest depth at the step's beginning [m], 0 where nothing touches, by kind of contact
         as far as the scene has it: "finger_object", "finger_table", "palm_object", "palm_table",
         "object_table", "finger_finger", "finger_itself", "finger_palm", shape (...).
-      touch: The object's contacts ring by ring, if they were asked for (`record_touch`): "finger"
-        and "palm" as far as the scene has these contacts, see `Touch`; else None.
+      touch: Contacts of the object ring by ring with the option `record_touch`, else None: "finger"
+        and "palm", if the scene has these contacts; see `Touch`.
     """
 
     finger: jax.Array

@@ -36,21 +36,22 @@ class ModelFields(NamedTuple):
         (finger, N + 1, 2).
       inertia: Their principal inertia [kg m^2], shape (finger, N + 1, 3).
       stiffness: Stiffness of the joints [N m/rad], shape (finger, N, axis).
-      damping: Their damping with the part of `layout.implicit_spring` [N m s/rad], same shape.
-      armature: Their armature, that part alone [kg m^2], same shape.
+      damping: Their damping with the implicit term [N m s/rad], same shape; see
+        `layout.implicit_spring`.
+      armature: Their armature, which has implicit terms only [kg m^2], same shape.
       gain: Bending moment per pressure [m^3], shape (finger, 1), of tapered fingers (finger, N).
-      spheres: Contact spheres of the moving links, place along the link and radius [m], shape
-        (finger, N, k, 2), k of them a link; k is 0 of fingers of rings.
-      on_palm: 1 of spheres that may touch the palm, else 0, shape (finger, N, k); None where none
-        may.
+      spheres: Place along the link and radius of the contact spheres [m], shape (finger, N, k, 2)
+        with k spheres a link; k is 0 with the surface "hull".
+      on_palm: Whether a sphere may touch the palm, 1 or 0, shape (finger, N, k); None in scenes
+        where no sphere may.
       object_mass: The object's mass [kg], shape ().
       object_inertia: Its principal inertia [kg m^2], shape (3,).
-      object_size: Sizes of the geoms of all shapes of the object set [m], shape (shape, 3).
-      shape: The trial's: the index of the object in the object set, int32 of shape ().
+      object_size: Sizes of all shapes of the object set [m], shape (shape, 3).
+      shape: Index of the trial's object in the object set, int32 of shape ().
       start: Initial qpos in MuJoCo's order, shape (nq,), or the state in which another rollout
         ended, `Trace.last`, see `RolloutState`.
-      constants: The world's numbers with the trial's factors: what does not depend on the design,
-        limits, the cost's window, and friction by pair of bodies.
+      constants: The scene's numbers with the trial's factors. Engines read from them everything
+        that does not depend on the design: limits, the cost's window, friction by pair of bodies.
       section: Height, wall, segment length and width of the fingers [m], shape (finger, 4); None
         where neither `neo_hookean`, `air_mass` nor a hull needs them.
       threshold: Numbers of `morphology.thresholds`; None without the effect `lateral_threshold`.

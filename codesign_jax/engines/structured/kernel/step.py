@@ -25,6 +25,7 @@ from codesign_jax.engines.structured.laws import kinematics as kin
 from codesign_jax.engines.structured.laws.inertia import Body, Centred
 from codesign_jax.engines.structured.laws.integration import integrate, rigid_arm
 from codesign_jax.engines.structured.laws.kinematics import State, next_motion, palm_motion
+from codesign_jax.engines.structured.laws.step_numbers import pushed
 from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model.layout import joint_axes
 from codesign_jax.scene import Scene
@@ -194,7 +195,12 @@ def palm_and_object(timestep: float, state: dict, arm, constants: dict) -> dict[
     if k is None:
         acc = rigid_arm(arm, state["wrist"], state["wrist_vel"], timestep), acc[1]
     now = Iterate(acc[0], palm_motion(acc[0], axes), acc[1])
-    smooth = palm.smooth_force(vel, bias, g), thing.smooth_force(object_vel, g)
+    smooth_palm = palm.smooth_force(vel, bias, g)
+    smooth_palm = pushed("palm", smooth_palm, palm.mass, centre, constants)
+    smooth_object = thing.smooth_force(object_vel, g)
+    origin = jnp.zeros_like(smooth_object[:3])  # the object's centre
+    smooth_object = pushed("object", smooth_object, thing.mass, origin, constants)
+    smooth = smooth_palm, smooth_object
     return {
         "place": place,
         "frame": frame,
@@ -243,12 +249,13 @@ def link_forces(scene: Scene, parent: tuple, constants: dict, joint: dict):
     if "section" in constants:
         bend = bend + inertia.softening_moment(constants["section"], hinges[0][:1], q[:1])
     tau = jnp.concatenate([bend, tau[1:]])
+    smooth = body.smooth_force(vel, bias, constants.get("gravity"))
     stored = {
         "axes": axes,
         "body_centre": body.centre,
         "tensor": triangle(body.tensor),
         "motion": motion,
-        "smooth": body.smooth_force(vel, bias, constants.get("gravity")),
+        "smooth": pushed("link", smooth, body.mass, body.centre, constants),
         "tau": tau,
     }
     if own.moment is not None:

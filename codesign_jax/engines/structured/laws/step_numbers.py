@@ -1,12 +1,15 @@
 """Numbers of the scene that forces of a step read: a line each is all that the kernel needs.
 
 `palm_and_object` and `link_forces` of `kernel/step.py` find them among their constants by these
-names, and the reverse pass has their derivatives.
+names, and the reverse pass has their derivatives.  A number may bring its force on bodies along.
 """
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
+
+from codesign_jax.engines.structured.lanes import cross, spatial
 from codesign_jax.scene import Scene
 
 
@@ -16,6 +19,10 @@ class StepNumber(NamedTuple):
     value: Callable[[Scene], Any]  # From a scene's numbers of shape (1, world): (*shape, 1, world)
     on: Callable[[Any], bool]  # Whether a scene with these effects has it
     shape: tuple[int, ...] = ()
+    # Force at a body's centre of mass, (3, ...), of the number and the body's mass; None of numbers
+    # that `Body.smooth_force` takes
+    force: Callable[[jax.Array, jax.Array], jax.Array] | None = None
+    bodies: tuple[str, ...] = ()  # On which it acts: "palm", "object", "link"
 
 
 STEP_NUMBERS = {
@@ -27,3 +34,18 @@ STEP_NUMBERS = {
 def step_numbers(scene: Scene) -> dict[str, StepNumber]:
     """Those that a scene has, by name."""
     return {name: number for name, number in STEP_NUMBERS.items() if number.on(scene.effects)}
+
+
+def pushed(body: str, smooth: jax.Array, mass: Any, centre: Any, constants: dict) -> jax.Array:
+    """Smooth forces on a body, (6, ...), with those that numbers among its constants bring along.
+
+    Args:
+      body: Which, as in `StepNumber.bodies`.
+      mass: Its mass [kg].
+      centre: Its centre of mass [m], shape (3, ...).
+    """
+    for name, number in STEP_NUMBERS.items():
+        if number.force is not None and body in number.bodies and name in constants:
+            force = number.force(constants[name], mass)
+            smooth = smooth + spatial(cross(centre, force), force)
+    return smooth

@@ -19,6 +19,11 @@ from codesign_jax.compiler import launch
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.kernel import Limits, Program
+from codesign_jax.engines.structured.laws.step_numbers import (
+    STEP_NUMBERS,
+    StepNumber,
+    pushed,
+)
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.runs import scene_files
 from codesign_jax.scene import constants, effects, schema
@@ -488,3 +493,21 @@ def test_a_combination_builds_or_is_refused(values, shape):
             assert np.isfinite(trace.speed).all() and np.isfinite(trace.distance).all()
         elif name == "structured":
             assert "while" in str(step_jaxpr(scene))
+
+
+def test_a_number_of_a_step_may_bring_a_force_along(monkeypatch):
+    """At the centre of mass of the bodies that it names: a wrench about the world's origin."""
+
+    def force(number, mass):
+        return mass * jnp.stack([number, 0 * number, 0 * number])
+
+    wind = StepNumber(lambda scene: 2.0, lambda effects: True, force=force, bodies=("object",))
+    monkeypatch.setitem(STEP_NUMBERS, "wind", wind)
+    centre = np.array([0.1, 0.2, 0.3])
+    pushing = {"wind": jnp.asarray(2.0)}
+    found = pushed("object", jnp.ones(6), 0.5, jnp.asarray(centre), pushing)
+    expected = [*np.cross(centre, [1.0, 0.0, 0.0]), 1.0, 0.0, 0.0]
+    np.testing.assert_allclose(found - 1.0, expected, atol=1e-6)  # float32
+    for body, numbers in (("palm", pushing), ("object", {})):
+        same = pushed(body, jnp.ones(6), 0.5, jnp.asarray(centre), numbers)
+        np.testing.assert_array_equal(same, 1.0)

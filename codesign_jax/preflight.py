@@ -98,7 +98,7 @@ def depth(scene: Scene, fields: ModelFields) -> jax.Array:
     hand, kin, position = _straight(scene, fields)
     scene = dataclasses.replace(scene, effects=alone)
     every = assembly.contacts(scene, hand, kin, position)
-    found = [(-c.distance).reshape(-1, c.distance.shape[-1]).max(0) for c in every.values()]
+    found = [(-c.gap).reshape(-1, c.gap.shape[-1]).max(0) for c in every.values()]
     if not found:
         return jnp.zeros_like(fields.object_mass)
     return jnp.stack(found).max(0)

@@ -27,7 +27,7 @@ FIXED = (
     "end",
     "speed",
     "penetration",
-    "share",
+    "centre_weight",
 )
 FIXED += ("support", "grid_first", "grid_nodes", "grid_reach")
 """Rows of the tables that no derivative is asked for: indices, bounds, and what only saves time."""

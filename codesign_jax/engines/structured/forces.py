@@ -163,7 +163,7 @@ def _touch(contacts: Contacts, force: jax.Array, position: jax.Array) -> Touch:
     return Touch(
         point=vectors([x + origin for x, origin in zip(contacts.point, position, strict=True)]),
         normal=vectors(contacts.normal),
-        gap=by_ring(contacts.distance),
+        gap=by_ring(contacts.gap),
         pressing=by_ring(pressing),
         tangential=vectors(pressing * contacts.normal - force),
     )
@@ -181,5 +181,5 @@ def _force(contacts: Contacts, jar: jax.Array) -> jax.Array:
 
 def _deepest(contacts: Contacts) -> jax.Array:
     """Largest depth of a set's contacts, shape (world,)."""
-    depth = jnp.where(contacts.active, jnp.maximum(-contacts.distance, 0.0), 0.0)
+    depth = jnp.where(contacts.active, jnp.maximum(-contacts.gap, 0.0), 0.0)
     return depth.reshape(-1, depth.shape[-1]).max(0)

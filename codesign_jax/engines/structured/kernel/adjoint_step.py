@@ -86,8 +86,8 @@ class ReverseStep(Step):
         problem = Problem(self, at["palm"]._replace(**right))
         virtual = AdjointSolve(problem).solve()
         sweep = ResidualVjp(self, state, at, thing, virtual, bars)
-        if problem.pairs:
-            FingerContactsVjp(sweep, problem.pairs).run()
+        if problem.finger_pairs:
+            FingerContactsVjp(sweep, problem.finger_pairs).run()
         metered = p.scene.effects.air_mass
         end = chambers.end_pressures(self, pressure) if metered else pressure
         base = sweep.fingers(end, self._centre_bar(centre, shown.distance))
@@ -214,8 +214,8 @@ class AdjointSolve(Elimination):
         node, work = self.backward(still)
         palm = problem.palm
         none = Iterate(*(_none(v) for v in (palm.smooth_wrist, *[palm.smooth_object] * 2)))
-        step, done = self.at_palm(none, node, self.slot_pushes(still))
-        if (pairs := problem.pairs) is not None:
+        step, done = self.at_palm(none, node, self.dealt_pushes(still))
+        if (pairs := problem.finger_pairs) is not None:
             done = done._replace(work=lanewise(jnp.add, done.work, work))
             exact = float(jnp.finfo(self.like.dtype).eps) ** 1.5
             coupling = Coupling(problem, pairs, done, tolerance=exact, iterations=ITERATIONS)

@@ -38,6 +38,15 @@ from codesign_jax.model.layout import beyond_base, first_on_palm, touches_itself
 
 SURELY = 1.0 - 1e-4
 """At a joint two segments have one nearest place, which is the first one's, whatever is rounded."""
+APART_LINKS = 3.0
+"""Least distance along a finger at which it touches itself [links]: the rings of neighbours overlap
+as their joint bends [ours]."""
+APART_HEIGHTS = 1.8
+"""The same in heights of the largest section [ours]: bent by half a turn about its own lower edge a
+finger's centre line is pi/2 = 1.57 heights long, and what is nearer along it does not meet."""
+SURFACE_RADIUS = 4.0
+"""Bound of the distance of a link's surface from its joint, in half heights of its first ring, for
+the speed with which it moves as the link turns [ours]."""
 
 
 def fields(links: int) -> dict[str, tuple[int, tuple[int, ...]]]:
@@ -517,7 +526,9 @@ def palm_distance(point, palm):
 
 def arc(tip, largest):
     """Least distance along a finger at which it touches itself, in links."""
-    return jnp.maximum(3.0, 1.8 * 2.0 * largest[5] / (tip[3] / TIP))
+    heights = APART_HEIGHTS * 2.0 * Ring.of(largest).half[2]
+    link = Ring.of(tip).half[0] / TIP
+    return jnp.maximum(APART_LINKS, heights / link)
 
 
 def facing_line(numbers, frame, centre, other, t):
@@ -550,7 +561,7 @@ def _faster(most, vel, palm, origin, numbers):
     """Bound of the speed of a finger's surface relative to the palm [m/s]."""
     moving = vel - palm
     speed = moving[3:] + cross(moving[:3], origin)
-    turning = jnp.sqrt(dot(moving[:3], moving[:3])) * 4.0 * numbers[5]
+    turning = jnp.sqrt(dot(moving[:3], moving[:3])) * SURFACE_RADIUS * numbers[5]
     return jnp.maximum(most, jnp.sqrt(dot(speed, speed)) + turning)
 
 

@@ -44,7 +44,7 @@ class FingerPairing:
     Attributes:
       lane: Lane of the finger that each lane's finger is paired with, shape (lane,).
       alone: Whether the number is 0, shape (lane,); None if it never is.
-      half: The share of a contact that a lane counts: two fingers' is on two lanes.
+      half: The fraction of a contact that a lane counts: two fingers' is on two lanes.
     """
 
     def __init__(self, block: Block, number: Any, dtype: Any, *, alone: bool):

@@ -151,7 +151,7 @@ def sums(pairs: BoundFingerContacts, row: Any, alpha: Lanes, grip: Lanes) -> Lan
 
 def settle(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
     """Keeps what contacts of worlds hold whose iteration ends with a step of this length."""
-    some = [c for c in (*problem.fingers, *problem.slots) if c.set.holds]
+    some = [c for c in (*problem.per_link, *problem.dealt) if c.set.holds]
 
     def keep() -> None:
         for contacts in some:
@@ -206,7 +206,7 @@ def behind(
 
 
 def _settle_fingers(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
-    pairs = problem.pairs
+    pairs = problem.finger_pairs
     assert pairs is not None
 
     def keep() -> None:

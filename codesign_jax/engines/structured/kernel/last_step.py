@@ -43,17 +43,17 @@ def steady(problem: Problem, alpha: Lanes, *, between: bool) -> jax.Array:
     def add(item: Any, sums: Lanes, contacts: BoundContacts) -> Lanes:
         return lanewise(jnp.add, sums, contacts.changes(item, alpha))
 
-    for contacts in problem.slots:
+    for contacts in problem.dealt:
         one = partial(add, contacts=contacts)
         count = loop(contacts.set.count, one, count, block.size)
-    for contacts in problem.fingers:
+    for contacts in problem.per_link:
         if block.team > 1:
             dealt = lambda item, _, sums, c=contacts: add(item, sums, c)  # noqa: E731
             count = contacts.every(dealt, count)  # type: ignore[attr-defined]
         else:
             count = loop(problem.links, partial(add, contacts=contacts), count, block.size)
-    if between and problem.pairs:
-        pairs = problem.pairs
+    if between and problem.finger_pairs:
+        pairs = problem.finger_pairs
         count = pairs.each(lambda item, _, sums: add(item, sums, pairs), count)
     if block.team > 1:
         count = team_sum(block, count)
@@ -96,8 +96,8 @@ class ChordStep:
         problem = self.problem
         if chambers := problem.chambers:
             chambers.move(alpha)
-        if problem.pairs:
-            problem.pairs.update_wrenches(alpha)
+        if problem.finger_pairs:
+            problem.finger_pairs.update_wrenches(alpha)
 
         def again(alpha, carry, body, moved, forces, factors, pushes, pair):
             r, ro, work = carry
@@ -116,8 +116,8 @@ class ChordStep:
         def one(i: Any, carry: tuple) -> tuple:
             names = [("acc", "step_acc"), ("motion", "step_motion")]
             moved = [problem.read(*pair, item=i) for pair in names]
-            pushes = {c.set.name: c.wrench(i, alpha) for c in problem.fingers}
-            pair = problem.pairs.pushed(i + 1) if problem.pairs else None
+            pushes = {c.set.name: c.wrench(i, alpha) for c in problem.per_link}
+            pair = problem.finger_pairs.pushed(i + 1) if problem.finger_pairs else None
             factors = problem.read("axes", "armature", "w", "g", "inverse", item=i)
             forces = problem.read("smooth", "tau", item=i)
             args = alpha, carry, problem.body_of(i), moved, forces, factors, pushes, pair
@@ -131,7 +131,7 @@ class ChordStep:
         if chambers:
             r, ro, less = chambers.close_again("z_again", r, ro)
             work = lanewise(jnp.subtract, work, less)
-        r = problem.add_first(r) if problem.pairs else r
+        r = problem.add_first(r) if problem.finger_pairs else r
         r, ro, work = self.block.sum((r, ro, work))
         given = now, problem.palm, done, r, ro, work, self._pushes(alpha)
         step, work = lanewise(self._at_palm, *given)
@@ -142,7 +142,7 @@ class ChordStep:
     def _pushes(self, alpha: Lanes) -> dict[str, Lanes]:
         """Wrenches of the contacts of palm and object, by name."""
         pushes = {}
-        for c in self.problem.slots:
+        for c in self.problem.dealt:
 
             def add(i: Any, sums: Lanes, c: BoundContacts = c) -> Lanes:
                 return lanewise(jnp.add, sums, c.wrench(i, alpha))

@@ -38,8 +38,8 @@ class Elimination:
         problem = self.problem
         if problem.chambers:
             problem.chambers.move(alpha)
-        if problem.pairs:
-            self.between_fingers(problem.pairs, alpha)
+        if problem.finger_pairs:
+            self.between_fingers(problem.finger_pairs, alpha)
 
         def load(node, body, motion, smooth, pair):
             link = make_body(*body)
@@ -64,10 +64,10 @@ class Elimination:
             acc, motion = self.accelerations(i, alpha)
             smooth, tau = self.smooth(i)
             axes, armature = problem.read("axes", "armature", item=i)
-            pair = problem.pairs.pushed(i + 1) if problem.pairs else None
+            pair = problem.finger_pairs.pushed(i + 1) if problem.finger_pairs else None
             node = node._replace(p=full(node.p), q=full(node.q))
             node = lanewise(load, node, problem.body_of(i), motion, smooth, pair)
-            for contacts in problem.fingers:
+            for contacts in problem.per_link:
                 node = self.touch(node, contacts, i, alpha)
             forces = axes, armature, tau, acc
 
@@ -75,13 +75,13 @@ class Elimination:
                 new, kept, more = lanewise(how, node, *forces)
                 for name, value in zip(("w", "g", "z"), kept.factors, strict=True):
                     problem.write(name, value, i)
-                if problem.slotted or problem.chambers:
+                if problem.in_slots or problem.chambers:
                     problem.write("inverse", kept.inverse, i)
                 return new._replace(p=upper(new.p), q=upper(new.q)), more
 
             ways = (partial(eliminated, eliminate), partial(eliminated, free))
             node, more = ways[1]() if held is None else either(i <= held, *ways, self.block.size)
-            return node, lanewise(jnp.add, work, more) if problem.pairs else work
+            return node, lanewise(jnp.add, work, more) if problem.finger_pairs else work
 
         empty = [zeros(s, self.like) for s in ((21,), (6, 6), (21,), (6,), (6,))]
         start = (el.Quadratic(*empty), zeros((), self.like))
@@ -89,7 +89,7 @@ class Elimination:
         node, work = loop(self.links, step, start, self.block.size, reverse=True)
         if problem.chambers:
             node, work = problem.chambers.close(node, work)
-        if problem.pairs:
+        if problem.finger_pairs:
             node = node._replace(r=problem.add_first(node.r))
             work = self.block.sum(work)
         node = self.block.sum(node)
@@ -119,17 +119,17 @@ class Elimination:
 
     def last_on_object(self) -> jax.Array | None:
         """Last link with contacts with the object, -1 for none; None if the scene has none."""
-        held = [c for c in self.problem.fingers if c.set.on_object]
+        held = [c for c in self.problem.per_link if c.set.on_object]
 
         def later(i: Any, last: jax.Array) -> jax.Array:
             return jnp.where(held[0].touching(i), jnp.asarray(i, jnp.int32), last)
 
         return jax.lax.fori_loop(0, self.links, later, jnp.int32(-1)) if held else None
 
-    def slot_pushes(self, alpha: Lanes) -> dict[str, tuple[Lanes, Lanes]]:
+    def dealt_pushes(self, alpha: Lanes) -> dict[str, tuple[Lanes, Lanes]]:
         """Contact inertia and wrench of the palm's and the object's contacts; see `backward`."""
         pushes = {}
-        for c in self.problem.slots:
+        for c in self.problem.dealt:
 
             def add(i: Any, carry: tuple, c: BoundContacts = c) -> tuple:
                 matrix, wrench = self.push(c, i, alpha)
@@ -143,7 +143,7 @@ class Elimination:
         return pushes
 
     def at_palm(self, now: Iterate, node: el.Quadratic, slots: dict) -> tuple[Iterate, Eliminated]:
-        """Solves for wrist and object; slots: what `slot_pushes` returns."""
+        """Solves for wrist and object; slots: what `dealt_pushes` returns."""
         rigid = self.problem.rigid
 
         def solve(now: Iterate, palm: Palm, node: el.Quadratic, pushes: dict) -> tuple:

@@ -64,10 +64,10 @@ class LineSearch:
             )
             problem.write("step_acc", a, i)
             problem.write("step_motion", moved, i)
-            if problem.pairs:
-                problem.pairs.put("motion", moved, i + 1)
+            if problem.finger_pairs:
+                problem.finger_pairs.put("motion", moved, i + 1)
             terms = [touch]
-            for contacts in problem.fingers:
+            for contacts in problem.per_link:
                 rel = relative(contacts.set.name, moved, step.palm_motion, step.object_motion)
                 terms.append(contacts.prepare_linesearch(i, rel))
             touch = lanewise(lambda t: total(t), terms)
@@ -76,14 +76,14 @@ class LineSearch:
 
         none = zeros((), self.like)
         parent = problem.widened(step.palm_motion)
-        if problem.pairs:
-            problem.pairs.put("motion", parent, 0)
+        if problem.finger_pairs:
+            problem.finger_pairs.put("motion", parent, 0)
         _, slope, curvature, touch = loop(
             self.links, one, (parent, none, none, none), self.block.size
         )
         if problem.chambers:
             curvature = lanewise(jnp.add, curvature, problem.chambers.curvature())
-        between = [problem.pairs.prepare_all()] if problem.pairs else []
+        between = [problem.finger_pairs.prepare_all()] if problem.finger_pairs else []
         touch = self.prepare_slots(lanewise(lambda t: total(t), [touch, *between]), step)
         slope, curvature, touch = self.block.sum((slope, curvature, touch))
         slope, curvature = lanewise(_rest, now, step, problem.palm, slope, curvature)
@@ -91,7 +91,7 @@ class LineSearch:
 
     def prepare_slots(self, touch: Lanes, step: Iterate) -> Lanes:
         """Adds the slopes of the palm's and the object's contacts along the step."""
-        for contacts in self.problem.slots:
+        for contacts in self.problem.dealt:
 
             def add(i: Any, sum_: Lanes, contacts: BoundContacts = contacts) -> Lanes:
                 rel = relative(contacts.set.name, None, step.palm_motion, step.object_motion)
@@ -114,12 +114,12 @@ class LineSearch:
 
         problem = self.problem
         sums = [zeros((), self.like)] * 2
-        if sets := problem.fingers:
+        if sets := problem.per_link:
             sums = loop(self.links, lambda i, s: add(i, s, sets), sums, self.block.size)
-        for c in problem.slots:
+        for c in problem.dealt:
             sums = loop(c.set.count, lambda i, s, c=c: add(i, s, [c]), sums, self.block.size)
-        if problem.pairs:
-            sums = problem.pairs.slopes_of_all(alpha, sums)
+        if problem.finger_pairs:
+            sums = problem.finger_pairs.slopes_of_all(alpha, sums)
         return sums
 
     def find(
@@ -146,7 +146,7 @@ class LineSearch:
             # A world that has found its step length keeps it: it must not depend on other worlds.
             left = jnp.abs(carry[-1]) > goal
             searching = lanes([left], (), wide=False)
-            with only(self.problem.slotted, left):
+            with only(self.problem.in_slots, left):
                 one, two = evaluate(old[0])
             new = (*lanewise(refine, *old[:3], one, two), one)
             new = [lanewise(jnp.where, searching, a, b) for a, b in zip(new, old, strict=True)]

@@ -75,7 +75,7 @@ class Tables(KernelLayout):
         self.meshes = bool(shapes.mesh_indices(scene))
         self.sets = self._sets()
         self.held = held.held(scene)
-        self.slotted = any(isinstance(s, SlotSet) for s in self.sets)
+        self.has_slots = any(isinstance(s, SlotSet) for s in self.sets)
         self._tables()
 
     def _sets(self) -> list[ContactSet]:
@@ -151,7 +151,7 @@ class Tables(KernelLayout):
             mount=(1, (3, 3)),
             base=(1, (3,)),
             stub_centre=(1, (3,)),
-            share=(n + 1, one),
+            centre_weight=(n + 1, one),
             gain=(self.rows, one),
             offset=(n, one),
             mass=(n, one),
@@ -223,7 +223,7 @@ class Tables(KernelLayout):
             fields |= contacts.groups()
         if self.scene.effects.air_mass:
             fields |= chambers.fields(n, a)
-        if self.slotted or self.scene.effects.air_mass:
+        if self.has_slots or self.scene.effects.air_mass:
             fields |= {"inverse": (n, (a, a)), "z_again": (n, (a,))}
         if any(isinstance(s, FingerContactSet) for s in self.sets):
             fields |= finger_collision.fields(n)
@@ -255,9 +255,9 @@ class Packing(Tables):
                 continue
             arrays[f"cone.{name}"] = jnp.stack([v for v in cone if v is not None])
         # Weights of the segments in the hand's centre: half segments at the palm and at the tip.
-        share = np.ones(self.links + 1, dtype)
-        share[[0, -1]] = 0.5
-        arrays["share"] = jnp.broadcast_to(share[:, None, None], (self.links + 1, *lane))
+        weight = np.ones(self.links + 1, dtype)
+        weight[[0, -1]] = 0.5
+        arrays["centre_weight"] = jnp.broadcast_to(weight[:, None, None], (self.links + 1, *lane))
         if palm_touches(self.scene):
             arrays["palm_ring"] = self._palm_slots(hand)
         if "section" in self.hand.groups:
@@ -270,7 +270,7 @@ class Packing(Tables):
             arrays |= objects.rows(hand.mesh, self.fingers, dtype)
         extra = self.fingers - n
         if extra:
-            for name in ("share", "mass", "inertia", "gain"):
+            for name in ("centre_weight", "mass", "inertia", "gain"):
                 pad = [(0, 0)] * (arrays[name].ndim - 2) + [(0, extra), (0, 0)]
                 arrays[name] = jnp.pad(arrays[name], pad)
             if self.k:

@@ -58,9 +58,9 @@ class Newton:
         self.search = (LineSearch if one else TeamLineSearch)(problem)
         self.coupling = Coupling if one else TeamCoupling
         # A chord's step would take a GPU as long as it saves: there an iteration ends without one.
-        threads = bool(problem.slotted) and problem.slotted[0].set.gathers
+        threads = bool(problem.in_slots) and problem.in_slots[0].set.gathers
         self.settles = threads
-        self.chord = ChordStep(problem) if problem.slotted and one and not threads else None
+        self.chord = ChordStep(problem) if problem.in_slots and one and not threads else None
 
     def solve(
         self, now: Iterate, waiting: jax.Array, iterations: int, evaluations: int, tolerance: float
@@ -84,7 +84,7 @@ class Newton:
             now, before, last = rebuild(carry[1:])
             busy = waiting & (before.lane > tolerance)
             # A world that has converged keeps its iterate, so its contacts need not be looked at.
-            with only(problem.slotted, busy):
+            with only(problem.in_slots, busy):
                 step, done = self.direction(now, last, ~busy)
                 slope, curvature, first = self.search.prepare(now, step)
                 residual, scale = lanewise(_residual, slope, first, problem.palm, now.object_motion)
@@ -126,7 +126,7 @@ class Newton:
           residual: The decrement; `alpha`: length of the step.
           likely: Lanes of worlds whose decrement is near the tolerance, see `STEADY`.
         """
-        with only(self.problem.slotted, likely):
+        with only(self.problem.in_slots, likely):
             ends = likely & steady(self.problem, alpha, between=True)
         newton = (alpha.lane > LENGTHS[0]) & (alpha.lane < LENGTHS[1])
         mask = lanes([ends & newton], (), wide=False)
@@ -155,7 +155,7 @@ class Newton:
           Iterate, length and decrement, see `ChordStep`; the length is that of "step_acc".
         """
         chord = self.chord
-        pairs = self.problem.pairs
+        pairs = self.problem.finger_pairs
         size = self.block.size
         assert chord is not None
 
@@ -180,7 +180,7 @@ class Newton:
             small = lanes([found], (), wide=False)
             return there, length, lanewise(jnp.where, small, new, residual)
 
-        with only(self.problem.slotted, likely):
+        with only(self.problem.in_slots, likely):
             still = likely & steady(self.problem, alpha, between=False)
             as_was = now, alpha, residual
             return choose(anywhere(still), lambda: look(still), as_was, size)
@@ -190,9 +190,9 @@ class Newton:
 
         Last is the length of the last step; the step of idle lanes is of no use.
         """
-        pairs = self.problem.pairs
+        pairs = self.problem.finger_pairs
         node, work = self.elimination.backward(last)
-        step, done = self.elimination.at_palm(now, node, self.elimination.slot_pushes(last))
+        step, done = self.elimination.at_palm(now, node, self.elimination.dealt_pushes(last))
         if pairs is None:
             return step, done
         done = done._replace(work=lanewise(jnp.add, done.work, work))
@@ -203,8 +203,13 @@ class Newton:
         return choose(pairs.touching_now(), correct, step, self.block.size), done
 
 
+WEIGHT_SQUARE = 100.0
+"""Square of an acceleration of about g [m^2/s^4], whatever the scene's gravity is: the solver's
+tolerance is relative to the objective at this acceleration."""
+
+
 def _residual(slope, first, palm: Palm, motion):
     # Typical size of the objective: object and palm at g, plus the object's present motion.
     mass = palm.object.mass
-    scale = 100.0 * (mass + palm.palm.mass) + mass * dot(motion[3:], motion[3:])
+    scale = WEIGHT_SQUARE * (mass + palm.palm.mass) + mass * dot(motion[3:], motion[3:])
     return jnp.maximum(-slope - first, 0.0) / scale, scale

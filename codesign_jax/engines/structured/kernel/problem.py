@@ -48,9 +48,11 @@ class Problem:
       palm: Palm, wrist and object.
       links: Moving links of a finger; `block`: the lanes; `like`: zeros of their shape and type.
       rigid: Whether the wrist's accelerations are known and no unknowns.
-      pairs: Contacts between fingers, if there are any; `slotted`: the same as a list.
-      fingers: Contacts of the fingers with the object and the table.
-      slots: Contacts of the palm, and of the object with the table.
+      finger_pairs: Contacts between fingers, with themselves and with the palm; None without.
+      in_slots: The contact sets that are kept in slots: these, or none.
+      per_link: Contacts of the fingers with the object and the table, whose items are links.
+      dealt: Contacts of the palm, and of the object with the table, whose items are dealt to the
+        fingers' lanes.
       chambers: Chambers with a mass of air; None without the effect.
     """
 
@@ -61,10 +63,10 @@ class Problem:
         self.block = m.block
         self.rigid = not m.p.scene.effects.wrist
         found = m.contacts
-        self.pairs: BoundFingerContacts | None = found.get("finger_finger")  # type: ignore[assignment]
-        self.fingers = [found[n] for n in ("finger_object", "finger_table") if n in found]
-        self.slots = [c for n, c in found.items() if not n.startswith("finger")]
-        self.slotted = [self.pairs] if self.pairs else []
+        self.finger_pairs: BoundFingerContacts | None = found.get("finger_finger")  # type: ignore[assignment]
+        self.per_link = [found[n] for n in ("finger_object", "finger_table") if n in found]
+        self.dealt = [c for n, c in found.items() if not n.startswith("finger")]
+        self.in_slots = [self.finger_pairs] if self.finger_pairs else []
         self.like = jnp.zeros((self.block.size,), palm.armature.dtype)
         self.chambers = Chambers(m) if "air_step" in m.scratch else None
 
@@ -88,8 +90,8 @@ class Problem:
 
     def add_first(self, r: Lanes) -> Lanes:
         """Adds the contacts between fingers that act on the palm."""
-        assert self.pairs is not None
-        return lanewise(jnp.add, r, self.pairs.pushed(0))
+        assert self.finger_pairs is not None
+        return lanewise(jnp.add, r, self.finger_pairs.pushed(0))
 
     def widened(self, motion: Lanes) -> Lanes:
         return lanewise(jnp.add, motion, zeros(motion.shape[:-2], self.like))

@@ -73,7 +73,7 @@ class Program(Packing):
         """
         super().__init__(scene, backend=backend, width=width, team=team)
         self.limits = limits
-        self.trace = (*TRACE, "overflow") if self.slotted else TRACE
+        self.trace = (*TRACE, "overflow") if self.has_slots else TRACE
 
     @classmethod
     def here(

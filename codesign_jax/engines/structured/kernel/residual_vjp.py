@@ -122,8 +122,8 @@ class ResidualVjp:
         joint = self.step.joint(i)
         still = {"acc": joint.pop("acc"), "order": self.step.order(i)}
         still["virtual"] = self.scratch.read("virtual", i)
-        share = self.step.hand.read("share", i + 1)
-        still["centre_bar"] = lanewise(jnp.multiply, centre_bar, share)
+        weight = self.step.hand.read("centre_weight", i + 1)
+        still["centre_bar"] = lanewise(jnp.multiply, centre_bar, weight)
         run = partial(residual.of_link, self.p.scene)
         joint = joint | {"pressure": pressure}
         before, own, moved = pull(run, (self.chain(i), numbers, joint), (still,), (after, self.one))
@@ -145,7 +145,7 @@ class ResidualVjp:
             middle = place + apply_columns(frame, stub)
             return turned, origin, sum(weight[k] * middle[k] for k in range(3))
 
-        weight = lanewise(jnp.multiply, centre_bar, read("share"))
+        weight = lanewise(jnp.multiply, centre_bar, read("centre_weight"))
         given = (palm, *(read(n) for n in names))
         (place, frame), *own = pull(run, given, (weight,), (base.frame, base.origin, self.one))
         self.bars.add(dict(zip(names, own, strict=True)))

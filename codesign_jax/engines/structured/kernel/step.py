@@ -66,7 +66,7 @@ class Step(StepMemory):
         height = state["position"][2].lane
         goes_on = waiting & undecided(distance, height)
         slots = []
-        if p.slotted:
+        if p.has_slots:
             slots = [self._overflow(waiting)]
             goes_on &= slots[0] == 0
         new_speed, good = semi_implicit_euler(self, state, geometry, now, goes_on, speed)
@@ -112,12 +112,12 @@ class Step(StepMemory):
         p = self.p
         now = at["now"]
         like = self.like
-        names = ("mount", "base", "share", "stub_centre")
-        mount, base, share, stub = (self.hand.read(n) for n in names)
+        names = ("mount", "base", "centre_weight", "stub_centre")
+        mount, base, weight, stub = (self.hand.read(n) for n in names)
         frame, origin = lanewise(kin.mounted, at["place"], at["frame"], mount, base)
         weight = lanewise(
-            lambda x, f, s, share: share * (x + apply_columns(f, s)),
-            at["place"], at["frame"], stub, share
+            lambda x, f, s, weight: weight * (x + apply_columns(f, s)),
+            at["place"], at["frame"], stub, weight
         )  # fmt: skip
         wide = zeros((6,), like)
         vel, bias, motion = (
@@ -148,8 +148,8 @@ class Step(StepMemory):
                 stored = team_rows(stored, (constants["mass"], centre, stored["tensor"]))
             for name, value in stored.items():
                 self.write(name, value, i)
-            share = self.hand.read("share", i + 1)
-            middle = lanewise(lambda m, c, s: m + s * c, middle, centre, share)
+            weight = self.hand.read("centre_weight", i + 1)
+            middle = lanewise(lambda m, c, s: m + s * c, middle, centre, weight)
             fields.of_link(i, carry)
             if search:
                 search.link(i, carry[4], carry[2], carry[1], carry[0])

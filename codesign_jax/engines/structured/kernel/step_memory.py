@@ -49,7 +49,7 @@ class KernelLayout:
     hull: bool  # Whether fingers have rings
     meshes: bool  # Whether there are objects with meshes
     sets: list[ContactSet]  # The contacts
-    slotted: bool  # Whether any of them are in slots
+    has_slots: bool  # Whether any of them are in slots
     held: dict[str, int]  # What contacts hold of friction, see `model.held`
     # Rows of the tables; `onchip` with teams only.
     hand: MemoryLayout

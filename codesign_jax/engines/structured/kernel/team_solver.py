@@ -184,10 +184,10 @@ class TeamElimination(Elimination):
         """See `Elimination`; the node is the lanes' columns of P with r, C, and Q with r_o."""
         problem = self.problem
         team = self.team
-        pairs = self.problem.pairs
+        pairs = self.problem.finger_pairs
         assert pairs is not None
         pairs.update_constraints(alpha)
-        for contacts in problem.fingers:
+        for contacts in problem.per_link:
             contacts.update_constraints(alpha)  # type: ignore[attr-defined]
 
         def add_link(p, forces, force, column):
@@ -230,7 +230,7 @@ class TeamElimination(Elimination):
 
         none = zeros((6,), self.like)
         forces = self.team.forces
-        for contacts in self.problem.fingers:
+        for contacts in self.problem.per_link:
             own = contacts.columns(i, self.rings, self.unit, forces)  # type: ignore[attr-defined]
             node = lanewise(add, node, own, own if contacts.set.on_object else none, forces)
         return node
@@ -368,7 +368,7 @@ class TeamLineSearch(LineSearch):
     def prepare(self, now: Iterate, step: Iterate) -> tuple[Lanes, Lanes, Lanes]:
         problem = self.problem
         team = self.team
-        pairs = self.problem.pairs
+        pairs = self.problem.finger_pairs
         assert pairs is not None
         palm, obj = (chosen(self.block, v) for v in (step.palm_motion, step.object_motion))
         first = team.one(jnp.where(self.block.mate == 0, jnp.ones_like(self.like), 0.0))
@@ -400,7 +400,7 @@ class TeamLineSearch(LineSearch):
         _, (slope, curvature) = loop(self.links, one, start, self.block.size)
         touch = self.prepare_slots(zeros((), self.like), step)
         terms = [lanewise(jnp.multiply, touch, first), pairs.prepare_all()]
-        for contacts in problem.fingers:
+        for contacts in problem.per_link:
             terms.append(contacts.prepare_all(pairs, self.rings, step.object_motion))  # type: ignore[attr-defined]
         touch = lanewise(lambda t: total(t), terms)
         slope, curvature, touch = self.total([slope, curvature, touch])
@@ -418,14 +418,14 @@ class TeamLineSearch(LineSearch):
         def plus(sums: list[Lanes], new: list[Lanes]) -> list[Lanes]:
             return lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), sums, new)
 
-        for c in problem.slots:
+        for c in problem.dealt:
             add = lambda i, s, c=c: plus(s, c.slopes(i, alpha))  # noqa: E731
             sums = loop(c.set.count, add, sums, self.block.size)
         sums = [lanewise(jnp.multiply, v, first) for v in sums]
-        for c in problem.fingers:
+        for c in problem.per_link:
             sums = c.every(lambda item, _, s, c=c: plus(s, c.slopes(item, alpha)), sums)  # type: ignore[attr-defined]
-        assert problem.pairs is not None
-        return problem.pairs.slopes_of_all(alpha, sums)
+        assert problem.finger_pairs is not None
+        return problem.finger_pairs.slopes_of_all(alpha, sums)
 
 
 def team_rows(stored: dict[str, Lanes], body: tuple) -> dict[str, Lanes]:

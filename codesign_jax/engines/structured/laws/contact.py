@@ -41,12 +41,12 @@ class Cone(NamedTuple):
     roll: jax.Array | float | None = None  # Rolling friction over Coulomb friction [m]
 
     def of_share(self, share: jax.Array) -> "Cone":
-        """That of contacts with a share of the scene's stiffness; 0 of what is none."""
+        """This cone with its stiffness scaled by `share`, which is 0 where there is no contact."""
         tangent = None if self.tangent is None else self.tangent * share
         return self._replace(normal=self.normal * share, tangent=tangent)
 
     def of_friction(self, friction: jax.Array) -> "Cone":
-        """That of contacts with other Coulomb coefficients and the same stiffness."""
+        """This cone with other Coulomb coefficients and the same stiffness."""
         if self.friction is None:
             return self
         ratio = friction * jnp.sqrt(self.normal / self.tangent)
@@ -62,7 +62,7 @@ class Contacts(NamedTuple):
 
     point: jax.Array  # Contact points, shape (3, ...)
     normal: jax.Array  # Unit normals, shape (3, ...)
-    distance: jax.Array  # Signed distance [m], negative in contact, shape (...)
+    gap: jax.Array  # Distance of the surfaces [m], negative in contact, shape (...)
     cone: Cone  # Their parameters, see `Cone.of_share`
 
     @property
@@ -100,7 +100,7 @@ class Contacts(NamedTuple):
     def reference(self, velocity: jax.Array) -> jax.Array:
         """Reference acceleration aref from the relative point velocity, shaped as that."""
         cone = self.cone
-        gap = self.distance
+        gap = self.gap
         spring = jnp.where(gap < 0, cone.spring, cone.damper**2) * gap
         return -cone.damper * velocity - spring * self.direction
 

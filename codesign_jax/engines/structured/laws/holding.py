@@ -24,8 +24,8 @@ def held(contacts: Contacts, grip: jax.Array) -> jax.Array:
     n = contacts.normal
     # A slot in which a lane has no contact may have no stiffness either.
     some = contacts.active & (cone.tangent > 0)
-    share = jnp.where(some, _elastic(contacts) / jnp.where(some, cone.tangent, 1.0), 0.0)
-    tangent = share * (grip - dot(n, grip) * n)
+    elastic = jnp.where(some, _elastic(contacts) / jnp.where(some, cone.tangent, 1.0), 0.0)
+    tangent = elastic * (grip - dot(n, grip) * n)
     if cone.spin is None:
         return tangent
     return jnp.concatenate([tangent, jnp.zeros_like(tangent)])
@@ -52,7 +52,7 @@ def hold(contacts: Contacts, force: jax.Array, grip: jax.Array) -> jax.Array:
 def _elastic(contacts: Contacts) -> jax.Array:
     """Normal force of a contact at rest."""
     cone = contacts.cone
-    return cone.normal * cone.spring * jnp.maximum(-contacts.distance, 0.0)
+    return cone.normal * cone.spring * jnp.maximum(-contacts.gap, 0.0)
 
 
 def quotient(sums: jax.Array) -> jax.Array:

@@ -26,12 +26,12 @@ STEPS = 8
 PALM = "palm_and_object"
 LINK = "link_forces"
 JAR = "begun"
-RESPONSE = "BoundContacts._push.<locals>.response"
-RAY = "BoundContacts.line.<locals>.ray"
-SLOPES = "BoundContacts._slopes.<locals>.both"
+RESPONSE = "inertia_and_wrench"
+RAY = "cost_along_line"
+SLOPES = "slopes_along_line"
 SOLVE = "Elimination.at_palm.<locals>.solve"
-ELIMINATE = "Elimination.backward.<locals>.eliminate"
-CENTRE = "Step._forward.<locals>.link.<locals>.<lambda>"
+ELIMINATE = "eliminate_joint"
+CENTRE = "add_weighted"
 
 
 def link(**wrong: Callable):

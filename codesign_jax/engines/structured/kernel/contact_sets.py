@@ -192,21 +192,13 @@ class BoundContacts:
         return full(triangle), wrench
 
     def _push(self, item: Any, alpha: Lanes) -> list[Lanes]:
-        contacts = self.set.contacts
-
-        def response(place, cone, jar):
-            c = contacts(place, cone)
-            r = contact.constraint_update(c, jar)
-            matrix = contact.contact_inertia(c, r.hessian)
-            return sum_axis(matrix, 2), sum_axis(contact.contact_wrench(c, r.force), 1)
-
         # All is read before anything is stored, see `finger_contacts.OwnSide`.
         jar = self.read("jar", item)
         step = self.read("step", item)
         place = self.place(item)
         jar = lanewise(tree_add_scaled, alpha, jar, step)
         self.write("jar", jar, item)
-        matrix, wrench = lanewise(response, place, self.cone_at(item), jar)
+        matrix, wrench = lanewise(inertia_and_wrench, place, self.cone_at(item), jar)
         return [upper(matrix), wrench]
 
     def wrench(self, item: Any, alpha: Lanes) -> Lanes:
@@ -255,16 +247,8 @@ class BoundContacts:
 
     def line(self, item: Any, change: Lanes) -> Lanes:
         """Stores the contacts' cost along a change of jar; returns its slope at 0."""
-        contacts = self.set.contacts
-
-        def ray(place, cone, jar, change):
-            c = contacts(place, cone)
-            line = contact.line(c, jar, change)
-            first, _ = contact.slopes(c, line, 0.0)
-            return jnp.stack([v for v in line if v is not None]), sum_axis(first, 0)
-
         given = self.place(item), self.cone_at(item), self.read("jar", item), change
-        line, slope = lanewise(ray, *given)
+        line, slope = lanewise(cost_along_line, *given)
         self.write("step", change, item)
         self.write("ray", line, item)
         return slope
@@ -274,17 +258,36 @@ class BoundContacts:
         return self.if_touching(item, lambda: self._slopes(item, alpha), [(), ()])
 
     def _slopes(self, item: Any, alpha: Lanes) -> list[Lanes]:
-        of_line = self.set.of_line
-
-        def both(share, cone, ray, alpha):
-            c = of_line(share, cone)
-            line = LineCost(*(ray[i] if i < ray.shape[0] else None for i in range(5)))
-            first, second = contact.slopes(c, line, alpha)
-            return [sum_axis(first, 0), sum_axis(second, 0)]
-
         share = self.read("share", item)
         cone = self.cone_at(item)
-        return lanewise(both, share, cone, self.read("ray", item), alpha)
+        return lanewise(slopes_along_line, share, cone, self.read("ray", item), alpha)
+
+
+# Stages that the kernel evaluates lane by lane
+
+
+def inertia_and_wrench(place, cone, jar):
+    """Sums over an item's contacts: the inertia (6, 6) that they add, and their wrench (6,)."""
+    c = ContactSet.contacts(place, cone)
+    r = contact.constraint_update(c, jar)
+    matrix = contact.contact_inertia(c, r.hessian)
+    return sum_axis(matrix, 2), sum_axis(contact.contact_wrench(c, r.force), 1)
+
+
+def cost_along_line(place, cone, jar, change):
+    """Numbers of the contacts' cost along a change of jar, see `LineCost`, and its slope at 0."""
+    c = ContactSet.contacts(place, cone)
+    line = contact.line(c, jar, change)
+    first, _ = contact.slopes(c, line, 0.0)
+    return jnp.stack([v for v in line if v is not None]), sum_axis(first, 0)
+
+
+def slopes_along_line(share, cone, ray, alpha):
+    """First and second derivative of that cost at alpha, summed over an item's contacts."""
+    c = ContactSet.of_line(share, cone)
+    line = LineCost(*(ray[i] if i < ray.shape[0] else None for i in range(5)))
+    first, second = contact.slopes(c, line, alpha)
+    return [sum_axis(first, 0), sum_axis(second, 0)]
 
 
 def margin(scene: Scene) -> float:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel.contact_sets import ROWS, zeros
+from codesign_jax.engines.structured.kernel.contact_sets import ROWS, ContactSet, zeros
 from codesign_jax.engines.structured.kernel.memory import (
     Block,
     BoundTable,
@@ -374,12 +374,7 @@ class BoundFingerContacts(BoundSlots):
 
     def load(self, item: Any, own: OwnSide, force: Lanes, pairing: FingerPairing) -> None:
         """Adds a slot's force to its own side's wrench, and takes it from the other side's."""
-        contacts = self.set.contacts
-
-        def wrench(place, cone, force):
-            return sum_axis(contact.contact_wrench(contacts(place, cone), force), 1)
-
-        more = lanewise(wrench, own.place, self.cone, force)
+        more = lanewise(wrench_of_force, own.place, self.cone, force)
         self._add_wrench(item, "row", more, own.wrench, own.row)
         if pairing.alone is not None:
 
@@ -480,3 +475,8 @@ def _times(triangle: jax.Array, x: jax.Array) -> jax.Array:
     place = {(i, j): k for k, (i, j) in enumerate((i, j) for i in range(n) for j in range(i, n))}
     rows = [jnp.stack([triangle[place[min(i, j), max(i, j)]] for j in range(n)]) for i in range(n)]
     return jnp.stack([dot(row, x) for row in rows])
+
+
+def wrench_of_force(place, cone, force):
+    """Wrench (6,) of the forces of a slot's contacts."""
+    return sum_axis(contact.contact_wrench(ContactSet.contacts(place, cone), force), 1)

@@ -17,6 +17,29 @@ from codesign_jax.engines.structured.lanes import contract, dot, sum_fingers, to
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 
 
+def load_link(node, body, motion, smooth, pair):
+    """Adds a link's inertia, and the forces that its motion leaves unbalanced, to a node."""
+    link = make_body(*body)
+    push = smooth - link.times(motion)
+    push = push if pair is None else push + pair
+    return node._replace(p=node.p + link.matrix(), r=node.r + push)
+
+
+def eliminate_joint(node, axes, armature, tau, acc):
+    """Eliminates a joint; with the product of its force and its step."""
+    tau = tau - armature * acc
+    y = contract(axes, node.r[None], 1) + tau
+    node, kept = el.eliminate(node, axes, armature, tau)
+    return node, kept, dot(y, kept.factors.z)
+
+
+def eliminate_free_joint(node, *forces):
+    """`eliminate_joint` of a subtree that does not touch the object: c, q and r_object are 0."""
+    new, kept, more = eliminate_joint(node._replace(c=None), *forces)
+    factors = kept.factors._replace(g=jnp.zeros_like(kept.factors.w))
+    return new._replace(c=node.c), kept._replace(factors=factors), more
+
+
 class Elimination:
     """The elimination of one step's problem."""
 
@@ -41,24 +64,6 @@ class Elimination:
         if problem.finger_pairs:
             self.between_fingers(problem.finger_pairs, alpha)
 
-        def load(node, body, motion, smooth, pair):
-            link = make_body(*body)
-            push = smooth - link.times(motion)
-            push = push if pair is None else push + pair
-            return node._replace(p=node.p + link.matrix(), r=node.r + push)
-
-        def eliminate(node, axes, armature, tau, acc):
-            tau = tau - armature * acc
-            y = contract(axes, node.r[None], 1) + tau
-            node, kept = el.eliminate(node, axes, armature, tau)
-            return node, kept, dot(y, kept.factors.z)
-
-        def free(node, *forces):
-            """`eliminate` where the subtree does not touch the object: c, q and r_object are 0."""
-            new, kept, more = eliminate(node._replace(c=None), *forces)
-            factors = kept.factors._replace(g=jnp.zeros_like(kept.factors.w))
-            return new._replace(c=node.c), kept._replace(factors=factors), more
-
         def step(i: Any, carry: tuple) -> tuple:
             node, work = carry
             acc, motion = self.accelerations(i, alpha)
@@ -66,7 +71,7 @@ class Elimination:
             axes, armature = problem.read("axes", "armature", item=i)
             pair = problem.finger_pairs.pushed(i + 1) if problem.finger_pairs else None
             node = node._replace(p=full(node.p), q=full(node.q))
-            node = lanewise(load, node, problem.body_of(i), motion, smooth, pair)
+            node = lanewise(load_link, node, problem.body_of(i), motion, smooth, pair)
             for contacts in problem.per_link:
                 node = self.touch(node, contacts, i, alpha)
             forces = axes, armature, tau, acc
@@ -79,7 +84,7 @@ class Elimination:
                     problem.write("inverse", kept.inverse, i)
                 return new._replace(p=upper(new.p), q=upper(new.q)), more
 
-            ways = (partial(eliminated, eliminate), partial(eliminated, free))
+            ways = (partial(eliminated, eliminate_joint), partial(eliminated, eliminate_free_joint))
             node, more = ways[1]() if held is None else either(i <= held, *ways, self.block.size)
             return node, lanewise(jnp.add, work, more) if problem.finger_pairs else work
 

@@ -149,7 +149,7 @@ class Step(StepMemory):
             for name, value in stored.items():
                 self.write(name, value, i)
             weight = self.hand.read("centre_weight", i + 1)
-            middle = lanewise(lambda m, c, s: m + s * c, middle, centre, weight)
+            middle = lanewise(add_weighted, middle, centre, weight)
             fields.of_link(i, carry)
             if search:
                 search.link(i, carry[4], carry[2], carry[1], carry[0])
@@ -169,6 +169,11 @@ class Step(StepMemory):
         count = p.num_fingers * p.links
         middle = self.block.sum(middle)
         return now, lanewise(lambda c: c / count, middle)
+
+
+def add_weighted(total, centre, weight):
+    """Adds a link's centre, times its weight in the hand's centre."""
+    return total + weight * centre
 
 
 def palm_and_object(timestep: float, state: dict, arm, constants: dict) -> dict[str, Any]:

@@ -63,7 +63,7 @@ class Buildable:
         """Least length of fingers of a height [m], any shape."""
         return (self.limits.finger_slenderness or 0.0) * height
 
-    def highest_pressure(self, table: Any, value: Value, tip: tuple | None) -> Any:
+    def highest_pressure(self, table: Any, value: Value, tip: tuple[Any, ...] | None) -> Any:
         """Highest pressures of fingers [Pa], shape (..., finger).
 
         Args:

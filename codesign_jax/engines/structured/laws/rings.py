@@ -11,7 +11,7 @@ secant F(d)/d at the step's beginning, with d no less than `NOMINAL`.
 All functions take components in front and any axes behind; frames are columns (3, 3, ...).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -187,15 +187,15 @@ def farthest(half: jax.Array) -> jax.Array:
 
 
 class Facing(NamedTuple):
-    """How a ring faces another body."""
+    """How a ring faces another body; in a kernel its fields are lanes."""
 
     normal: jax.Array  # From the other side to the ring, shape (3, ...)
-    gap: jax.Array  # Negative in contact [m], shape (...)
+    gap: Any  # Negative in contact [m], shape (...)
     reach: jax.Array  # The ring's support towards the other side, and below what else
     unit: jax.Array  # `support` returns, shape (3, ...)
     axial: jax.Array  # Component along the finger of the direction to the other side
-    yields: jax.Array  # Share of the depth by which this side yields
-    fade: jax.Array  # Share of the stiffness that is left
+    yields: jax.Array  # Fraction of the depth by which this side yields
+    fade: jax.Array  # Fraction of the stiffness that is left
 
 
 def place(ring: Ring, frame: jax.Array, centre: jax.Array, facing: Facing) -> Place:

@@ -391,6 +391,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--hand", help="hand instead of the scene's")
     parser.add_argument("--objects", help="object set instead of the scene's")
     parser.add_argument("--robust", action="store_true", help="as of codesign optimize")
+    parser.add_argument("--constants", help="as of codesign optimize")
     own: dict[str, Any] = {"dest": "overrides", "nargs": "+", "action": "append", "default": []}
     parser.add_argument("--set", **own, help="KEY=VALUE, as of codesign optimize")
     text = "judge the last designs once more with all objects at each of these masses [kg]"
@@ -420,6 +421,7 @@ def search(args: argparse.Namespace, name: str) -> None:
     space = design_space(scene.hand, args.preset)
     case = make_case(name, space, args.preset, len(scene.objects.object))
     changed = ["--robust"] * args.robust + [*chain.from_iterable(args.overrides)]
+    changed += [f"--constants={Path(args.constants).stem}"] if args.constants else []
     words = [Path(name).stem for name in (args.hand, args.objects) if name]
     words += [args.preset, name, *(re.sub(r"^--|^[a-z_.]+[.](?=.*=)", "", c) for c in changed)]
     stem = re.sub("[:,]", "-", "-".join(dict.fromkeys(words))).replace("=", "")

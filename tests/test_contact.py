@@ -197,7 +197,7 @@ def some_contacts(friction, rng, count):
     return contact.Contacts(
         point=jnp.asarray(0.05 * rng.normal(size=(3, 1, count))),
         normal=jnp.asarray(normal / np.linalg.norm(normal, axis=0)),
-        distance=jnp.asarray(np.full((1, count), -1e-3)),
+        gap=jnp.asarray(np.full((1, count), -1e-3)),
         cone=jax.jit(lambda: cones.make_cone(scene, 0.8, bodies=2, ratio=30.0))(),
     )
 

@@ -873,7 +873,9 @@ def test_commands_played_back_are_the_sheet_s_poses(tmp_path, settle):
         off = [abs(float(row[n]) - float(other[n])) for n in ("arm_roll_deg", "arm_pitch_deg")]
         assert max(off) <= the_scene.arm.shake_amplitude
         assert not unlike or ends["lift"] < time < ends["disturb"] + the_scene.phases.deflate_time
-    assert peaks[tables.COMMANDS]["turn"] > 50 > peaks[tables.STILL]["turn"] == 0
+    assert peaks[tables.COMMANDS]["turn"] > 50
+    # Quaternions of a still arm differ by rounding alone.
+    assert peaks[tables.STILL]["turn"] < 1e-9
     told = motion.section(the_scene, params, nominal, peaks)
     assert [row[0] for row in told.rows][1:] == [
         tables.STILL,

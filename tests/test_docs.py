@@ -166,7 +166,6 @@ BEFORE = {
     "contact_depths.json": ("docs/hull.md",),
     "effects.json": ("docs/effects.md",),
     "experiments": ("docs/results.md", "docs/notes/results.md"),
-    "rates_cpu.json": ("docs/performance.md", "README.md"),
     "rates_h100.json": ("docs/performance.md", "README.md"),
     "search": ("docs/notes/search.md",),
     "stability.json": ("docs/notes/stability.md",),

@@ -496,7 +496,7 @@ def test_a_combination_builds_or_is_refused(values, shape):
 
 
 def test_a_number_of_a_step_may_bring_a_force_along(monkeypatch):
-    """At the centre of mass of the bodies that it names: a wrench about the world's origin."""
+    """At the centre of mass of the bodies that it names: a wrench about the object's centre."""
 
     def force(number, mass):
         return mass * jnp.stack([number, 0 * number, 0 * number])

@@ -178,7 +178,7 @@ ITERATIONS = 300
 
 
 class AdjointSolve(Elimination):
-    """The elimination with a right side that acts on the joints alone.
+    """The elimination with right sides in the place of forces; contacts give their stiffness alone.
 
     The right side of the fingers' joints is read from the scratch table, "acc_bar"; that of wrist
     and object stands in the place of their smooth forces.

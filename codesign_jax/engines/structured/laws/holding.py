@@ -12,8 +12,9 @@ def held(contacts: Contacts, grip: jax.Array) -> jax.Array:
 
     With the effect `friction_memory` the tangential force of a contact that sticks is
       f = -D_t (a + b v) - E g,
-    with its elastic normal force E = D k |r| and g the friction coefficient that the two bodies
-    used in the step before, see `hold`.  Below the cone the force so grows until nothing moves,
+    with its elastic normal force E = D K |gap|, K the stiffness of its reference acceleration, and
+    g the friction coefficient that the two bodies used in the step before, see `hold`.  Below the
+    cone the force so grows until nothing moves,
     where without g it keeps v in proportion to f.  The cone bounds it as before: a spring of
     tangential stiffness D_t b / h with a slider (Cundall and Strack 1979, Geotechnique 29, 47).
 

@@ -24,7 +24,7 @@ NOMINAL = 0.5e-3
 FADE = 1e-3
 """Distance of two centre lines at which their contact has lost 3 parts in 10 of its force [m]."""
 SMALL = 1e-18
-"""Of squared lengths [m^2], likewise."""
+"""Least square of a length [m^2], of which a root still has a slope."""
 FLOOR = 1e-6
 """Of squares of numbers up to one, where the slope of a root would have none."""
 RING_OVERLAP = 0.6
@@ -61,7 +61,7 @@ class Place(NamedTuple):
     point: jax.Array  # Where it acts [m], shape (3, ...)
     normal: jax.Array  # From the other side to the ring, shape (3, ...)
     gap: jax.Array  # Negative in contact [m], shape (...)
-    share: jax.Array  # Its stiffness over `contact.normal_stiffness`, same shape
+    share: jax.Array  # Its stiffness over that of its pair of bodies, same shape
 
 
 ROOT_BITS = 1_419_910_442

@@ -3,10 +3,14 @@
 import csv
 import dataclasses
 import hashlib
+import io
 import itertools
 import json
 import os
+import signal
 import socket
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
 
@@ -1020,7 +1024,9 @@ def test_arm_and_valves_are_played_from_one_clock(tmp_path, capsys):
     arm = [line.removeprefix("arm,") for line in lines if line.startswith("arm,")]
     sent = [line.removeprefix("valves,") for line in lines if line.startswith("valves,")]
     assert (
-        len(arm) == 41 and arm[20] == "0.200,0.000,0.000,25.000,1.000000,0.000000,0.000000,0.000000"
+        len(arm) == 41
+        and arm[20]
+        == "0.200,0.000000,0.000000,25.000000,1.000000000,0.000000000,0.000000000,0.000000000"
     )
     assert sent[2] == "0.100,40.000,20.000" and sent[-1] == "0.410,0.000,0.000"
     assert lines.index("valves," + sent[4]) + 1 == lines.index("arm," + arm[20])
@@ -1028,7 +1034,8 @@ def test_arm_and_valves_are_played_from_one_clock(tmp_path, capsys):
         listener.bind(("127.0.0.1", 0))
         listener.settimeout(5)
         place = f"127.0.0.1:{listener.getsockname()[1]}"
-        assert play_hand.main([*words, "--smooth", "0", "--no-valves", "--arm", place]) == 0
+        in_time = [*words[:-1], "--no-prompt", "--smooth", "0", "--no-valves", "--arm", place]
+        assert play_hand.main(in_time) == 0
         received = [listener.recv(200).decode().strip() for _ in arm]
     assert received == arm and not capsys.readouterr().out
     # Ends early: the chambers are emptied.
@@ -1052,7 +1059,9 @@ def test_arm_and_valves_are_played_from_one_clock(tmp_path, capsys):
         (np.arange(40) * 3.0, ["--max-speed", "400"], None),
         (np.arange(40) * 2.0, ["--smooth", "0"], "reach 20000 mm/s² (--max-acceleration 13000)"),
         (np.arange(40) * 2.0, ["--slow", "0"], "--slow must be 0.1 to 100"),
-        (np.arange(40) * 2.0, ["--arm", "here"], "--arm here is no HOST:PORT"),
+        (np.arange(40) * 2.0, ["--arm", "here", "--no-prompt"], "--arm here is no HOST:PORT"),
+        (np.arange(40) * 2.0, ["--arm", "a:1", "--no-wait"], "--no-wait is too fast for an arm"),
+        (np.arange(40) * 2.0, ["--max-acceleration", "1e-3"], "no --slow to 100 is enough"),
         (np.arange(40) * 2.0, ["--no-arm"], "--no-arm and --no-valves"),
         (np.arange(40) * 2.0, ["--max-turn", "nan"], "--max-turn must be above 0"),
         (np.arange(40) * np.nan, [], "line 2: a number is not finite"),
@@ -1061,12 +1070,97 @@ def test_arm_and_valves_are_played_from_one_clock(tmp_path, capsys):
 )
 def test_what_an_arm_must_not_do_is_refused(tmp_path, capsys, heights, flags, words):
     table = path_of(tmp_path, heights)
-    code = play_hand.main([str(table), "--no-valves", "--no-wait", *flags])
+    wait = [] if "--no-prompt" in flags else ["--no-wait"]
+    code = play_hand.main([str(table), "--no-valves", *wait, *flags])
     output = capsys.readouterr()
     if words is None:
         assert code == 0 and output.out
     else:
         assert code == 2 and words in output.err and not output.out
+
+
+@pytest.mark.parametrize("slow", [1.0, 2.3, 4.0])
+def test_poses_are_checked_as_they_are_sent(tmp_path, capsys, slow):
+    """Differences of the lines themselves; the proposal of a refusal is accepted."""
+    time = np.arange(200) * 0.01
+    shaken = 30 * np.sin(2 * np.pi * 1.4 * time)
+    table = path_of(tmp_path, 100 * np.clip(time, 0, 1), shaken)
+    loose = ["--max-turn", "1e9", "--max-turn-acceleration", "1e9"]
+    words = [str(table), "--no-valves", "--no-wait", "--slow"]
+    assert play_hand.main([*words, str(slow), *loose]) == 0
+    sent = [line.split(",")[1:] for line in capsys.readouterr().out.splitlines()]
+    angles = 2 * np.degrees(np.arctan2(*np.array(sent, float)[:, [5, 4]].T))
+    speeds = np.diff(angles, prepend=angles[0], append=angles[-1]) / 0.01
+    found = play_hand.peaks(play_hand.prepared(play_hand.read(table), slow, 0.1, 0.01))
+    # Rounding to 1e-9 of a quaternion is 1e-7 degrees, by 1e-4 s^2.
+    assert found["turn"] == pytest.approx(np.abs(speeds).max(), rel=1e-3)
+    assert found["turn-acceleration"] == pytest.approx(
+        np.abs(np.diff(speeds)).max() / 0.01, rel=1e-3
+    )
+    limits = {key: most for key, (most, _) in play_hand.LIMITS.items()}
+    fast = bool(play_hand.excess(found, limits))
+    assert fast == (slow < 2) and play_hand.main([*words, str(slow)]) == 2 * fast
+    said = capsys.readouterr().err
+    if fast:
+        proposal = said.partition("--slow ")[2].partition(",")[0]
+        assert play_hand.main([*words, proposal]) == 0
+        assert play_hand.main([*words, f"{float(proposal) - 0.2:.1f}"]) == 2
+
+
+def test_the_mean_is_over_real_time_at_any_slowness(tmp_path):
+    """A jump of the speed by 100/slow mm/s within 11 poses."""
+    ramp = np.clip(np.arange(301) - 100, 0, 100) * 1.0
+    rows = play_hand.read(path_of(tmp_path, ramp))
+    for slow in (1, 5, 20):
+        found = play_hand.peaks(play_hand.prepared(rows, slow, 0.1, 0.01))
+        assert found["acceleration"] == pytest.approx(100 / slow / 0.11, rel=1e-6)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="Windows has no SIGHUP")
+@pytest.mark.parametrize("name", ["play_hand", "play_valves"])
+@pytest.mark.parametrize("ending", ["SIGHUP", "SIGTERM"])
+def test_a_signal_ends_with_zeros(tmp_path, name, ending):
+    (tmp_path / "valves.csv").write_text("time_s,pressure_0_kPa\n0,10\n60,10\n")
+    hand = ["--no-arm", "--no-prompt", "--pressures"] if name == "play_hand" else []
+    program = Path(play_valves.__file__).with_name(f"{name}.py")
+    words = [sys.executable, "-B", str(program), *hand, str(tmp_path / "valves.csv")]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as player:
+        assert player.stdout.readline().endswith("0.000,10.000\n")
+        player.send_signal(getattr(signal, ending))
+        last = player.communicate(timeout=10)[0].splitlines()[-1]
+    assert last.endswith(",0.000") and player.returncode == 130
+
+
+def test_without_a_terminal_the_arm_waits_for_a_flag(tmp_path, capsys, monkeypatch):
+    table = path_of(tmp_path, np.arange(4) * 0.1)
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    assert play_hand.main([str(table), "--no-valves"]) == 2
+    output = capsys.readouterr()
+    assert "standard input is no terminal: --no-prompt" in output.err and not output.out
+    assert play_hand.main([str(table), "--no-valves", "--no-prompt"]) == 0
+    assert capsys.readouterr().out
+    # The end of a terminal's input is no Enter.
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
+    assert play_hand.main([str(table), "--no-valves"]) == 130
+    assert not capsys.readouterr().out
+
+
+def test_one_finger_is_held_at_a_pressure(tmp_path, capsys):
+    path = tmp_path / "valves.csv"
+    path.write_text(JUMP)
+    rows, limits = play_valves.read(path)
+    held = play_valves.scaled(play_valves.held(rows, 1, 40.0), limits, [1.0])
+    assert play_valves.at(held, 2.5) == [0, 20] and play_valves.at(held, 1000) == [0, 40]
+    for words, problem in {
+        ("--hold", "2", "10"): "--hold takes a finger of 0 to 1, not 2",
+        ("--hold", "0.5", "10"): "not 0.5",
+        ("--hold", "1", "nan"): "--hold takes a pressure of 0 kPa or more",
+        ("--hold", "1", "60"): "finger 1 would get 60.0 kPa, and its wall stands 50.0 kPa",
+        ("--hold", "1", "10", "--no-wait"): "--hold needs real time",
+    }.items():
+        assert play_valves.main([str(path), *words]) == 2
+        output = capsys.readouterr()
+        assert problem in output.err and not output.out
 
 
 def test_the_room_behind_a_tilted_palm(page):

@@ -38,17 +38,30 @@ def write(folder: Path, scene: Scene, params: Params, trial: Trial) -> dict[str,
     for name, how in ((tables.STILL, still(scene)), (tables.COMMANDS, scene)):
         schedule = grasps.timed_controls(how, params, trial)
         tables.write_commands(folder, scene, schedule, name)
-        found[name] = peaks(schedule, play_hand.SMOOTH)
+        found[name] = peaks(schedule)
     (folder / PLAYER.name).write_text(PLAYER.read_text(encoding="utf-8"), encoding="utf-8")
     return found
 
 
-def peaks(schedule: np.ndarray, smooth: float) -> Peaks:
-    """Peaks of a schedule of controls; arguments as of `grasps.timed_controls`, and a time [s]."""
+def arm_rows(schedule: np.ndarray) -> list[list[float]]:
+    """Rows of `play_hand.read` of a schedule of controls, see `grasps.timed_controls`."""
     arm = pose.of_controls(schedule[:, 1 : 1 + len(WRIST)])
     turns = pose.quaternion(*arm[:, 3:].T)
-    rows = np.column_stack([schedule[:, 0], arm[:, :3], turns]).tolist()
-    return play_hand.peaks(play_hand.smoothed(rows, smooth))
+    rows: list[list[float]] = np.column_stack([schedule[:, 0], arm[:, :3], turns]).tolist()
+    return rows
+
+
+def peaks(schedule: np.ndarray) -> Peaks:
+    """Peaks of a schedule of controls as the player sends it, with its defaults.
+
+    They have the least factor by which the player must slow it down, by the name "slow": 1 if it
+    need not, infinite if none is enough.
+    """
+    rows = arm_rows(schedule)
+    found = play_hand.peaks(play_hand.prepared(rows, 1.0, play_hand.SMOOTH, play_hand.PERIOD))
+    limits = {name: most for name, (most, _) in play_hand.LIMITS.items()}
+    slow = play_hand.least_slow(rows, limits, 1.0, play_hand.SMOOTH, play_hand.PERIOD)
+    return {**found, "slow": slow or np.inf}
 
 
 def warnings(found: Mapping[str, Peaks], names: Sequence[str] = (tables.STILL,)) -> list[str]:
@@ -56,12 +69,13 @@ def warnings(found: Mapping[str, Peaks], names: Sequence[str] = (tables.STILL,))
     limits = {name: most for name, (most, _) in play_hand.LIMITS.items()}
     sentences = []
     for name in names:
-        over = play_hand.excess(found[name], limits)
-        if over:
-            words, slow = over
+        words = play_hand.excess(found[name], limits)
+        if words:
+            slow = found[name]["slow"]
+            how = f"with --slow {slow:g}" if np.isfinite(slow) else "with a longer --smooth"
             sentences.append(
-                f"the arm would reach {words} with {name}: {PLAYER.name} plays it with "
-                f"--slow {slow:g} or slower, or with the limits of your arm"
+                f"the arm would reach {words} with {name}: {PLAYER.name} plays it {how}, or with "
+                "the limits of your arm"
             )
     return sentences
 
@@ -69,8 +83,8 @@ def warnings(found: Mapping[str, Peaks], names: Sequence[str] = (tables.STILL,))
 def section(scene: Scene, params: Params, trial: Trial, found: Mapping[str, Peaks]) -> SheetSection:
     """Peak speeds and accelerations; arguments as `write`, and what it returned."""
     raw = {
-        f"{tables.STILL}, jumps within a time step": peaks(
-            grasps.timed_controls(still(scene), params, trial), 0.0
+        f"{tables.STILL}, jumps within a time step": play_hand.peaks(
+            arm_rows(grasps.timed_controls(still(scene), params, trial))
         )
     }
     limits = {"limit of the player": {name: most for name, (most, _) in play_hand.LIMITS.items()}}
@@ -85,10 +99,12 @@ def section(scene: Scene, params: Params, trial: Trial, found: Mapping[str, Peak
         f"The arm's tables are straight between key frames: its speed jumps there. {PLAYER.name} "
         f"sends the mean over {play_hand.SMOOTH:g} s (--smooth), which makes accelerations of the "
         "jumps and moves a corner of the path by at most an eighth of the jump times that; it "
-        "refuses a path above its limits, 250 mm/s of ISO 10218-1 (reduced speed, a person may "
-        "stand by) and a Franka Emika Panda's. Give those of your arm (--help), or --slow 1.5 and "
-        "the like, by which all takes longer. If your arm's own controller plays the table, give "
-        "it a blend and these limits.",
+        "refuses a path above its limits, 250 mm/s and those of a Franka Emika Panda. Give those "
+        "of your arm (--help), or --slow 1.5 and the like, by which all takes longer. If your "
+        "arm's own controller plays the table, give it a blend and these limits.",
+        "250 mm/s is no permission to stand by: ISO 10218-1 has that speed for manual mode, with "
+        "an enabling device in the hand of the person inside. An arm that this player drives runs "
+        "by itself: nobody within its reach.",
         f"{tables.COMMANDS} is {tables.STILL} with the shaking that tests the grasp in the "
         f"simulation, by up to {scene.arm.shake_amplitude:g}° of roll and pitch at "
         f"{scene.arm.shake_frequency:g} Hz, from the lift until the chambers are empty. A hand "

@@ -11,24 +11,29 @@ it in the simulation, which commands.csv has.  The pressures are those of valves
 Every 10 ms (--period) the arm gets its pose as a datagram (UDP) of ASCII text: time [s], position
 of the arm frame [mm], and its orientation as a unit quaternion w, x, y, z, in the table's frame:
 
-    2.750,51.599,-56.640,45.071,0.811290,0.421470,0.353369,0.198250
+    2.750,51.599120,-56.640035,45.071204,0.811290107,0.421470092,0.353369013,0.198250044
 
 A program beside the arm's driver takes the newest datagram as the arm's target.  Every 50 ms the
 valves get a line as play_valves.py has it, and at the end zeros.  On standard output a line
 begins with "arm," or "valves,".
 
+The player waits for Enter.  Where standard input is no terminal it refuses to start, unless
+--no-prompt is given.  Ctrl-C, SIGTERM and SIGHUP (a terminal that closes, a lost connection) end
+it with zeros for the valves.
+
 Corners of the path are rounded: a pose is the mean of those within --smooth seconds around it, so
-that a jump of the speed becomes an acceleration; the path begins half of that before time 0.  A
-path that is faster than the limits is refused.
-Their defaults: 250 mm/s, the reduced speed of ISO 10218-1 at which a person may stand by, and
-13 m/s^2, 2.5 rad/s and 25 rad/s^2, the limits of a Franka Emika Panda.
+that a jump of the speed becomes an acceleration; the path begins half of that before time 0.  The
+poses are checked as they are sent, after --slow, --period and --smooth: a path that is faster
+than the limits is refused.
+Their defaults: 250 mm/s, the number of the reduced speed of ISO 10218-1, and 13 m/s^2, 2.5 rad/s
+and 25 rad/s^2, the limits of a Franka Emika Panda.  The standard has that speed for manual mode
+with an enabling device in a person's hand: it does not make this program safe to stand by.
 """
 
 import argparse
 import contextlib
 import csv
 import math
-import signal
 import socket
 import sys
 import time
@@ -50,6 +55,9 @@ LIMITS = {
 """Largest speeds and accelerations of the arm by the names of their flags, with units."""
 SMOOTH = 0.1
 """Time over which poses are averaged [s] [chosen]: less than the wrist's own period of 0.4 s."""
+
+PERIOD = 0.01
+"""Time between the poses that are sent [s]."""
 
 
 def read(path):
@@ -81,7 +89,8 @@ def read(path):
 def smoothed(rows, duration):
     """The rows with each pose as the mean over a time [s] around it.
 
-    They begin half of that before the first row, and end as much after the last one, at rest.
+    The rows are evenly spaced.  The means begin half of that time before the first row, and end as
+    much after the last one, at rest.
     """
     step = rows[1][0] - rows[0][0]
     half = round(duration / step / 2)
@@ -93,6 +102,24 @@ def smoothed(rows, duration):
         length = math.hypot(*mean[3:])
         found.append([rows[0][0] + k * step, *mean[:3], *(v / length for v in mean[3:])])
     return found
+
+
+def resampled(rows, period):
+    """Poses at the multiples of a period [s], linear between the rows; not of unit length."""
+    first = math.floor(rows[0][0] / period)
+    last = math.ceil(rows[-1][0] / period)
+    times = [k * period for k in range(first, last + 1)]
+    return [[time, *play_valves.at(rows, time)] for time in times]
+
+
+def prepared(rows, slow, smooth, period):
+    """Poses as they are sent: slowed by a factor, at each period [s], the mean over a time [s].
+
+    The mean is over real time, after the slowing.
+    """
+    means = smoothed(resampled(slowed(rows, slow), period), smooth)
+    # The times of `play`, to the last digit, so that no pose is interpolated again.
+    return [[round(row[0] / period) * period, *row[1:]] for row in means]
 
 
 def _turned(before, after):
@@ -129,34 +156,51 @@ def slowed(rows, factor):
     return [[factor * row[0], *row[1:]] for row in rows]
 
 
-def excess(found, limits, slow=1.0):
-    """What of a path's peaks is above the limits, in words, and how slow it may be; or None."""
-    shares = {name: found[name] / limits[name] for name in LIMITS}
-    over = {name: share for name, share in shares.items() if share > 1 + 1e-6}
+def excess(found, limits):
+    """Which of a path's peaks are above the limits, in words, or None."""
+    over = [name for name in LIMITS if found[name] > limits[name] * (1 + 1e-6)]
     if not over:
         return None
-    words = ", ".join(
+    return ", ".join(
         f"{found[name]:.0f} {LIMITS[name][1]} (--max-{name} {limits[name]:g})" for name in over
     )
-    return words, math.ceil(10 * slow * max(over.values())) / 10
 
 
-def check(rows, limits, slow):
-    """Refuses a path that is faster than the limits."""
-    over = excess(peaks(rows), limits, slow)
-    if over:
-        words, slower = over
-        raise TableError(
-            f"the arm would reach {words}; try --slow {slower:g}, or give the limits of your arm"
-        )
+def least_slow(rows, limits, slow, smooth, period):
+    """A factor --slow, in tenths, with which `check` accepts a path; None if 100 is too fast.
+
+    Speeds fall with the factor, accelerations at most with its square: each try goes as far as
+    that, and at least a tenth further, until the poses as they are sent keep the limits.
+    """
+    while slow <= 100:
+        found = peaks(prepared(rows, slow, smooth, period))
+        if not excess(found, limits):
+            return slow
+        shares = {name: found[name] / limits[name] for name in LIMITS}
+        roots = [v**0.5 if name.endswith("acceleration") else v for name, v in shares.items()]
+        tenths = math.ceil(10 * slow * max(roots) - 1e-6)
+        slow = max(tenths, math.floor(10 * slow + 1e-6) + 1) / 10
+    return None
+
+
+def check(rows, limits, slow, smooth, period):
+    """Poses as they are sent, or an error where they are faster than the limits."""
+    poses = prepared(rows, slow, smooth, period)
+    words = excess(peaks(poses), limits)
+    if words:
+        slower = least_slow(rows, limits, slow, smooth, period)
+        hint = f"try --slow {slower:g}" if slower else "no --slow to 100 is enough: raise --smooth"
+        raise TableError(f"the arm would reach {words}; {hint}, or give the limits of your arm")
+    return poses
 
 
 def arm_line(rows, moment):
     """A pose as it is sent."""
     x, y, z, *turn = play_valves.at(rows, moment)
     length = math.hypot(*turn)
-    cells = [f"{v:.3f}" for v in (moment, x, y, z)] + [f"{v / length:.6f}" for v in turn]
-    return ",".join(cells) + "\n"
+    # More digits than an arm follows: coarser steps would be accelerations within a period.
+    place = [f"{v:.6f}" for v in (x, y, z)]
+    return ",".join([f"{moment:.3f}", *place, *(f"{v / length:.9f}" for v in turn)]) + "\n"
 
 
 def play(poses, pressures, outputs, periods, wait=time.sleep, clock=time.monotonic):
@@ -220,13 +264,16 @@ def _parser():
     parser.add_argument("--baud", type=int, default=115200)
     parser.add_argument("--no-arm", action="store_true", help="the valves alone")
     parser.add_argument("--no-valves", action="store_true", help="the arm alone")
-    parser.add_argument("--period", type=float, default=0.01, help="time between poses [s]")
+    parser.add_argument("--period", type=float, default=PERIOD, help="time between poses [s]")
     parser.add_argument("--slow", type=float, default=1.0, help="all takes this times as long")
     parser.add_argument("--smooth", type=float, default=SMOOTH, help="time of a mean pose [s]")
     for name, (most, unit) in LIMITS.items():
         parser.add_argument(f"--max-{name}", type=float, default=most, help=f"of the arm [{unit}]")
     play_valves.add_scaling(parser)
-    parser.add_argument("--no-wait", action="store_true", help="send all lines at once")
+    parser.add_argument("--no-prompt", action="store_true", help="start without Enter")
+    parser.add_argument(
+        "--no-wait", action="store_true", help="write all lines at once, to standard output alone"
+    )
     return parser
 
 
@@ -247,12 +294,14 @@ def _tables(options):
         raise TableError("--smooth must be 0 to 1 s")
     if options.no_arm and options.no_valves:
         raise TableError("--no-arm and --no-valves leave nothing to play")
+    if options.no_wait and (options.arm or options.valves):
+        raise TableError("--no-wait is too fast for an arm and valves: leave it, or both of them")
     poses = None
     pressures = None
     if not options.no_arm:
-        poses = smoothed(slowed(read(options.table), options.slow), options.smooth)
         limits = {name: getattr(options, _flag(name)) for name in LIMITS}
-        check(poses, limits, options.slow)
+        rows = read(options.table)
+        poses = check(rows, limits, options.slow, options.smooth, options.period)
     if not options.no_valves:
         rows, limits = play_valves.read(options.pressures)
         scaled = play_valves.scaled(rows, limits, options.divide, options.cap)
@@ -262,18 +311,21 @@ def _tables(options):
 
 def _started(poses, options):
     """Lets a person start at a terminal once the arm stands where its path begins."""
-    if options.no_wait or not sys.stdin.isatty():
+    if options.no_wait or options.no_prompt:
         return
+    if not sys.stdin.isatty():
+        raise TableError("standard input is no terminal: --no-prompt starts without Enter")
     if poses:
         print(f"the arm must stand at {arm_line(poses, poses[0][0])}", end="", file=sys.stderr)
     print("Enter starts, Ctrl-C ends and empties the chambers", file=sys.stderr)
-    sys.stdin.readline()
+    if not sys.stdin.readline():
+        raise KeyboardInterrupt  # Ctrl-D, or the terminal is gone
 
 
 def main(words=None):
     """The program; returns its exit status."""
     options = _parser().parse_args(words)
-    signal.signal(signal.SIGTERM, play_valves.stop)
+    play_valves.catch_stops()
     wait = (lambda seconds: None) if options.no_wait else time.sleep
     try:
         poses, pressures = _tables(options)

@@ -3,6 +3,10 @@
     python play_valves.py                        # to standard output, in time
     python play_valves.py --port /dev/ttyUSB0    # to a serial line: 8 bits, no parity, 1 stop bit
     python play_valves.py --no-wait > table.csv  # all lines at once
+    python play_valves.py --port /dev/ttyUSB0 --hold 2 50    # 50 kPa in finger 2 until Ctrl-C
+
+--hold is for the tests of one finger, of leaks and of its bend: its pressure rises within 5 s and
+stays until the program is interrupted; the other fingers get zeros.
 
 A line is the time [s] and the gauge pressure of each finger [kPa], in the order of the fingers,
 with commas between and a line feed at the end, ASCII, a point as the decimal sign:
@@ -10,8 +14,9 @@ with commas between and a line feed at the end, ASCII, a point as the decimal si
     2.750,60.000,60.000,60.000,60.000
 
 A new line replaces the pressures of the one before.  The last line has zeros, which empty all
-chambers, and comes also when the program is interrupted (Ctrl-C, SIGTERM) or fails.  A regulator
-that hears nothing for half a second should empty its chamber by itself.
+chambers, and comes also when the program is interrupted (Ctrl-C, SIGTERM, SIGHUP of a terminal
+that closes or a lost connection) or fails.  A regulator that hears nothing for half a second should
+empty its chamber by itself.
 
 valves.csv has a row for each change, between which pressures are linear; two rows of one time are
 a jump.  Needs Python alone; a serial line goes through pyserial where that is installed, and else
@@ -19,6 +24,7 @@ through the system's terminal interface (not on Windows).
 """
 
 import argparse
+import bisect
 import contextlib
 import csv
 import math
@@ -61,7 +67,7 @@ def read(path):
 
 def at(rows, moment):
     """Pressures at a time: linear between rows; of rows of one time the last."""
-    after = next((k for k, row in enumerate(rows) if row[0] > moment), len(rows))
+    after = bisect.bisect_right(rows, moment, key=lambda row: row[0])
     if after in (0, len(rows)):
         return rows[min(after, len(rows) - 1)][1:]
     start, *low = rows[after - 1]
@@ -95,6 +101,23 @@ def scaled(rows, limits, divisors, cap=False):
         for row in found:
             row[1 + finger] = min(row[1 + finger], limit)
     return found
+
+
+RISE = 5.0
+"""Time in which the pressure of a finger under test rises [s] [chosen]."""
+HOLD = 24 * 3600.0
+"""Longest test of a finger [s] [chosen]."""
+
+
+def held(rows, finger, pressure):
+    """Rows that raise one finger to a pressure [kPa] and hold it; `rows` give their number."""
+    count = len(rows[0]) - 1
+    if finger not in range(count):
+        raise TableError(f"--hold takes a finger of 0 to {count - 1}, not {finger:g}")
+    if not 0 <= pressure < math.inf:
+        raise TableError("--hold takes a pressure of 0 kPa or more")
+    full = [pressure * (k == finger) for k in range(count)]
+    return [[0.0, *[0.0] * count], [RISE, *full], [HOLD, *full]]
 
 
 def line(moment, pressures):
@@ -177,8 +200,22 @@ def print_out(text):
 
 
 def stop(number, frame):
-    """Ends the program so that chambers are emptied first."""
+    """Ends the program so that chambers are emptied first, whatever signal follows."""
+    for name in _stops():
+        signal.signal(name, signal.SIG_IGN)
     raise KeyboardInterrupt
+
+
+def _stops():
+    """Signals that end the program; Windows has no SIGHUP."""
+    return [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
+
+
+def catch_stops():
+    """Lets signals end the program by `stop`; what is ignored (nohup) stays ignored."""
+    for name in _stops():
+        if signal.getsignal(name) != signal.SIG_IGN:
+            signal.signal(name, stop)
 
 
 def main(words=None):
@@ -190,14 +227,26 @@ def main(words=None):
     parser.add_argument("--port", help="serial line, such as /dev/ttyUSB0 or COM3")
     parser.add_argument("--baud", type=int, default=115200)
     parser.add_argument("--period", type=float, default=0.05, help="time between lines [s]")
+    parser.add_argument(
+        "--hold",
+        nargs=2,
+        type=float,
+        metavar=("FINGER", "KPA"),
+        help="raise one finger alone to a pressure and hold it until Ctrl-C",
+    )
     add_scaling(parser)
     parser.add_argument("--no-wait", action="store_true", help="send all lines at once")
     options = parser.parse_args(words)
-    signal.signal(signal.SIGTERM, stop)
+    catch_stops()
     try:
         if not 0.001 <= options.period <= 10:
             raise TableError("--period must be 0.001 to 10 s")
-        rows = scaled(*read(options.table), options.divide, options.cap)
+        if options.hold and options.no_wait:
+            raise TableError("--hold needs real time: leave --no-wait")
+        rows, limits = read(options.table)
+        if options.hold:
+            rows = held(rows, *options.hold)
+        rows = scaled(rows, limits, options.divide, options.cap)
         wait = (lambda seconds: None) if options.no_wait else time.sleep
         if options.port is None:
             play(rows, print_out, options.period, wait)

@@ -51,6 +51,7 @@ class Hand:
       sentence: What the hand does.
       shown: Objects that it is seen with.
       camera: What its camera has of its own.
+      earlier: Whether design and verdict are of an earlier model, until the search is run again.
     """
 
     name: str
@@ -59,6 +60,7 @@ class Hand:
     shown: list[str]
     names: dict[str, str] = dataclasses.field(default_factory=dict)
     camera: dict[str, Any] = dataclasses.field(default_factory=dict)
+    earlier: bool = False
 
     @property
     def command(self) -> str:
@@ -133,7 +135,8 @@ def draw(hand: Hand, case: cases.Case) -> None:
 def row(hand: Hand) -> str:
     """What the page says of a hand."""
     verdict = hand.design.read_text(encoding="utf-8").splitlines()[0].removeprefix("# ")
-    words = f"**[{hand.name}](gallery/{hand.name}.toml)**: {hand.sentence} It {verdict}."
+    words = f"**[{hand.name}](gallery/{hand.name}.toml)**: {hand.sentence} It {verdict}"
+    words += " (earlier model)." if hand.earlier else "."
     return f"| ![{hand.name}](gallery/{hand.name}.webp) | {words}<br><br>`{hand.command}` |"
 
 
@@ -150,12 +153,15 @@ def main(names: list[str]) -> None:
     (DOCS / "gallery.md").write_text("\n".join([HEAD, *rows, ""]), encoding="utf-8")
 
 
-HEAD = """# Hands that were found
+HEAD = """# Gallery
 
-Each hand is of one search, by the command beside it; `bin` and `shelf` are the best of 12 seeds,
-chosen by 42 more trials, `edge` is the best of three ([how](scenes.md)). `codesign evaluate
---design docs/gallery/bin.toml --trials 100 --seed 1000` repeats the verdict of `bin`: the file
-names scene, hand and what else is not the default. Another machine may find another hand.
+*Earlier model* marks hands of a model with a linear wall of 40 kPa, the implicit Euler method, friction without
+memory, and no limits of what can be built. Evaluate such a hand again before you use it.
+
+The command beside each hand is its search. `bin` and `shelf` are the best of 12 seeds, chosen by 42 more trials, and
+`edge` is the best of three ([scenes](scenes.md)). `codesign evaluate --design docs/gallery/bin.toml --trials 100 --seed
+1000` repeats the verdict of `bin`; the file names scene, hand, objects and control where they are not the default.
+Another machine may end with another hand.
 
 | | |
 | --- | --- |"""

@@ -155,13 +155,15 @@ def main(names: list[str]) -> None:
 
 HEAD = """# Gallery
 
-*Earlier model* marks hands of a model with a linear wall of 40 kPa, the implicit Euler method, friction without
-memory, and no limits of what can be built. Evaluate such a hand again before you use it.
+*Earlier model* marks hands of a model with a linear wall of 40 kPa, the implicit Euler method,
+friction without memory, and no limits of what can be built. Evaluate such a hand again before you
+use it.
 
-The command beside each hand is its search. `bin` and `shelf` are the best of 12 seeds, chosen by 42 more trials, and
-`edge` is the best of three ([scenes](scenes.md)). `codesign evaluate --design docs/gallery/bin.toml --trials 100 --seed
-1000` repeats the verdict of `bin`; the file names scene, hand, objects and control where they are not the default.
-Another machine may end with another hand.
+The command beside each hand is its search. `bin` and `shelf` are the best of 12 seeds, chosen by
+42 more trials, and `edge` is the best of three ([scenes](scenes.md)). `codesign evaluate --design
+docs/gallery/bin.toml --trials 100 --seed 1000` repeats the verdict of `bin`; the file names
+scene, hand, objects and control where they are not the default. Another machine may end with
+another hand.
 
 | | |
 | --- | --- |"""

@@ -10,7 +10,7 @@ import re
 import secrets
 import shutil
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 
@@ -90,7 +90,9 @@ _ABOUT = "Files of this folder with their SHA-256. Writing it again replaces the
 
 
 @contextlib.contextmanager
-def whole_folder(path: Path, *, replace: bool = True) -> Iterator[Path]:
+def whole_folder(
+    path: Path, *, replace: bool = True, facts: Mapping[str, str] | None = None
+) -> Iterator[Path]:
     """Fills a folder as a whole: what is written to the yielded one appears there at the end.
 
     `MANIFEST` lists what was written.  Where the folder has one already, the files that it lists
@@ -100,6 +102,7 @@ def whole_folder(path: Path, *, replace: bool = True) -> Iterator[Path]:
     Args:
       path: The folder.
       replace: Whether it may have files by the time that the new ones are complete.
+      facts: What `MANIFEST` says of the folder beside its files, by other names than those.
 
     Raises:
       OSError: Also if another call is filling the same folder, and if it has files that are not to
@@ -110,7 +113,7 @@ def whole_folder(path: Path, *, replace: bool = True) -> Iterator[Path]:
     part, lock = _begin(path)
     try:
         yield part
-        _write_manifest(part, _digests(part))
+        _write_manifest(part, _digests(part), facts=facts)
         _move(part, path, replace=replace)
     finally:
         os.close(lock)
@@ -223,8 +226,14 @@ def _digests(path: Path) -> dict[str, str]:
     return {name: _digest(path / name) for name in _names(path)}
 
 
-def _write_manifest(folder: Path, digests: dict[str, str], name: str = MANIFEST) -> None:
-    text = json.dumps({"about": _ABOUT, "files": digests}, indent=1, ensure_ascii=False)
+def _write_manifest(
+    folder: Path,
+    digests: dict[str, str],
+    name: str = MANIFEST,
+    facts: Mapping[str, str] | None = None,
+) -> None:
+    content = {"about": _ABOUT, **(facts or {}), "files": digests}
+    text = json.dumps(content, indent=1, ensure_ascii=False)
     (folder / name).write_text(text + "\n", encoding="utf-8")
 
 

@@ -306,7 +306,9 @@ def page():
 def test_sheet_has_dimensions_pressures_and_tolerances(page, tmp_path):
     content = sheet.sheet_sections(*page)
     text = sheet.write(tmp_path, "Build sheet", ["Design: x"], content).read_text()
-    fingers = "| 0 | 110.0 | 20.0 | 20.0 | 5.00 | 100.0 x 10.0 x 10.0 | 38.0 | 40.7 | 120.0 (200) |"
+    fingers = (
+        "| 0 | 110.00 | 20.00 | 20.00 | 5.00 | 100.00 x 10.00 x 10.00 | 38.0 | 40.7 | 120.0 (200) |"
+    )
     assert fingers in text  # 120 x 20 x 20 with the root - 100 x 10 x 10 = 38 cm^3 of 1.07 g
     assert "| walls of each finger | 0.5 mm | +4" in text and "cast hands keep 95 %" in text
 
@@ -422,6 +424,14 @@ def test_the_sheet_s_lists_add_up(page):
     assert bought["analog outputs"][0] == "4" and "0.12 kPa" in bought["analog outputs"][1]
     for part in ("controller of the regulators", "manifold", "power supply", "emergency stop"):
         assert part in bought
+    # Walls of 5 mm stand 200 kPa.
+    assert "finger 0 200, finger 1 200" in bought["relief valves"][1]
+    assert bought["dump valves"][0] == "4" and "normally open" in bought["dump valves"][1]
+    assert "goggles" in bought and "vacuum pump and chamber" in bought and "scale" in bought
+    # 250 g of palm less 100 cm^3 of plastic of 1.24 g.
+    assert bought["ballast"][0] == "126 g"
+    thick = 1e3 * the_scene.hand.palm.thickness
+    assert f"; {thick - 5.5:.1f} mm of palm" in bought["screws to the wrist"][1]
     for words in (
         "Leak test, at the highest pressure that is commanded: finger 0 120 kPa, finger 1 120 kPa",
         "10 V x pressure / 500 kPa",
@@ -464,6 +474,27 @@ def test_a_finger_that_does_nothing_is_named(page, length, pressure, idle):
     )
     found = sheet.idle_fingers(the_scene, params, process.sizes(the_scene.hand, params, Process()))
     assert [words.startswith("finger 0 does next to nothing") for words in found] == [True] * idle
+
+
+def test_the_sheet_says_how_fingers_press_and_whence_the_object_falls(page):
+    """A level hand: a tip is the length times the sine of the tilt below the palm."""
+    the_scene, params, sizes, _ = page
+    level = params._replace(arm=np.array([0, 0, params.arm[2], 0, 0, 0], float))
+    poses = valves.key_poses(the_scene, level)
+    lowest = poses[:, 3].min()
+    tilts = np.radians([finger.tilt for finger in the_scene.hand.finger])
+    wanted = lowest - np.array([size.length for size in sizes]) * np.sin(tilts)
+    heights = sheet.tip_heights(the_scene, level, sizes)
+    np.testing.assert_allclose(heights, wanted, atol=1e-3)  # float32
+    low = level._replace(arm=level.arm - 1e-3 * (heights.min() + 20) * np.eye(6)[2])
+    words = sheet._pressed(the_scene, low, sizes)
+    force = 0.02 * the_scene.hand.wrist.linear_stiffness
+    assert "by up to 20 mm" in words and f"at most {force:.1f} N" in words
+    assert "A rigid mount rams them" in words
+    high = level._replace(arm=level.arm - 1e-3 * (heights.min() - 20) * np.eye(6)[2])
+    assert "None is pressed on the table" in sheet._pressed(the_scene, high, sizes)
+    [words] = sheet._dropped(the_scene, level)
+    assert f"{poses[:, 3].max() - lowest:.0f} mm above its lowest pose" in words
 
 
 # --- the palm: fingers fit into its seats, in any hand -------------------------------------------
@@ -577,6 +608,9 @@ def test_command_writes_the_sheet(tmp_path, capsys, by_toy):
     text = (tmp_path / "out" / "build_sheet.md").read_text()
     assert "100 % of 8 cast hands keep 95 % of 24 grasps" in text
     assert "| walls of each finger | 0.2 mm |" in text and "Design; scene tiny" in text
+    listed = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    assert f"Design: {listed['design']}. Export: {listed['command']}" in text
+    assert listed["command"].startswith("codesign ") and listed["design"]
     assert (tmp_path / "out" / "build_sheet.pdf").exists()
     assert {p.name for p in tmp_path.iterdir()} - {"cache"} == {"out", "plain"}
     lines = (tmp_path / "out" / "valves.csv").read_text().splitlines()

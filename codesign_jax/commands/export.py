@@ -2,6 +2,9 @@
 
 import dataclasses
 import importlib.util
+import shlex
+import sys
+from itertools import chain
 from pathlib import Path
 
 import jax
@@ -45,7 +48,8 @@ def main(options: Export) -> int:
         console.print(note)
     earlier = (options.out / files.MANIFEST).is_file()
     try:
-        with files.whole_folder(options.out, replace=options.overwrite) as folder:
+        about = _origin(options)
+        with files.whole_folder(options.out, replace=options.overwrite, facts=about) as folder:
             write_files(case, params, sizes, folder, options, console)
     except OSError as error:
         raise InputError([f"--out {options.out}: {error.strerror}"]) from error
@@ -55,6 +59,16 @@ def main(options: Export) -> int:
     if others := files.foreign(options.out):
         console.print(f"  left there, no part of this export: {_some(others)}")
     return 0
+
+
+def _origin(options: Export) -> dict[str, str]:
+    """Where the design is from, and the command, as manifest and sheet have them."""
+    if options.run_folder:
+        settings = runs.read_run(options.run_folder)[1]
+        design = f"best final design of the run {options.run_folder}, seed {settings.seed}"
+    else:
+        design = " ".join(chain.from_iterable(options.design)) or "the default of the hand"
+    return {"design": design, "command": shlex.join(["codesign", *sys.argv[1:]])}
 
 
 def _some(names: list[str], most: int = 8) -> str:
@@ -250,10 +264,12 @@ def _sheet(
     content = sheet.sheet_sections(case.scene, params, sizes, found, tested)
     title = f"Build sheet: {case.scene.hand.name}"
     source = f"Best final design of {options.run_folder}" if options.run_folder else "Design"
+    origin = _origin(options)
     code = provenance.git_state()
     version = provenance.environment()["versions"]["codesign-jax"]  # type: ignore[index]
     objects = ", ".join(map(_described, case.scene.objects.object))
     lines = [
+        f"Design: {origin['design']}. Export: {origin['command']}",
         f"{source}; scene {case.scene.name}, objects {objects}; "
         f"codesign-jax {version}, commit {code['commit'] or 'unknown'}"
         f"{' with changes' if code.get('modified') else ''}. Predictions of a simulation, not "

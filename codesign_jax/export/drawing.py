@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 
 from codesign_jax.export import fonts, posture, valves
 from codesign_jax.export.process import BACK, BAR, FABRIC, FLOOR, Printed, Process, Section, Size
-from codesign_jax.export.sheet import NAME, castable, corners, places
+from codesign_jax.export.sheet import NAME, corners, places
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
 
@@ -210,7 +210,7 @@ def _section(axes: Axes, section: Section, label: str) -> None:
     axes.plot([-width / 2, width / 2], [0, 0], color="tab:red", lw=2)
     axes.text(0, -0.06 * height, f"{width:.1f}", ha="center", va="top", fontsize=6)
     axes.text(-0.53 * width, height / 2, f"{height:.1f}", ha="right", va="center", fontsize=6)
-    axes.text(0, wall / 2, castable(wall), ha="center", va="center", fontsize=6)
+    axes.text(0, wall / 2, f"{wall:.2f}", ha="center", va="center", fontsize=6)
     _finish(axes, label)
     axes.set(xlim=(-0.85 * width, 0.85 * width), ylim=(-5, height + 2))
 
@@ -232,8 +232,8 @@ def _side_view(axes: Axes, size: Size, label: str) -> None:
     axes.text(size.length / 2, -1.5, f"{size.length:.1f}", ha="center", va="top", fontsize=6)
     if size.root:
         axes.text(-size.root / 2, -1.5, f"{size.root:g}", ha="center", va="top", fontsize=6)
-    chambers = dict.fromkeys("{:.1f} x {:.1f}".format(*s.chamber) for s in (first, last))
-    text = f"chamber {end - start:.1f} x {' to '.join(chambers)}"
+    chambers = dict.fromkeys("{:.2f} x {:.2f}".format(*s.chamber) for s in (first, last))
+    text = f"chamber {end - start:.2f} x {' to '.join(chambers)}"
     above = max(size.base.height, size.tip.height) + 1.5
     axes.text(size.length / 2, above, text, ha="center", va="bottom", fontsize=6)
     _finish(axes, label)

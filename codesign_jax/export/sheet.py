@@ -101,14 +101,14 @@ def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSectio
         limit = limits[i]
         ends = list(dict.fromkeys((size.base, size.tip)))  # one, unless it is tapered
         start, end = size.chamber_ends
-        chambers = [" x ".join(f"{v:.1f}" for v in size.at(x).chamber) for x in (start, end)]
+        chambers = [" x ".join(f"{v:.2f}" for v in size.at(x).chamber) for x in (start, end)]
         rows.append(
             (
                 str(i),
-                f"{size.length:.1f}",
-                *(" to ".join(f"{s[k]:.1f}" for s in ends) for k in range(2)),
-                " to ".join(castable(s.wall) for s in ends),
-                f"{end - start:.1f} x {' to '.join(dict.fromkeys(chambers))}",
+                f"{size.length:.2f}",
+                *(" to ".join(f"{s[k]:.2f}" for s in ends) for k in range(2)),
+                " to ".join(f"{s.wall:.2f}" for s in ends),
+                f"{end - start:.2f} x {' to '.join(dict.fromkeys(chambers))}",
                 f"{size.volume / 1e3:.1f}",
                 f"{1e-6 * size.volume * density:.1f}",
                 f"{pressure / 1e3:.1f} ({limit / 1e3:.0f})",
@@ -119,13 +119,30 @@ def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSectio
     head += ("silicone cm³", "mass g", "pressure kPa (limit)", "free bend °")
     ends = "as thick as the others"
     if any(size.end != size.base.wall for size in sizes):
-        ends = f"{', '.join(dict.fromkeys(castable(size.end) for size in sizes))} mm"
+        ends = f"{', '.join(dict.fromkeys(f'{size.end:.2f}' for size in sizes))} mm"
     notes = [
-        f"Walls to 0.05 mm; at base and tip: {ends}. Lengths are those in front of the palm; "
-        "silicone and mass include the root behind it, which the palm holds. Free bend: predicted "
-        "by beam theory for a straight finger at its pressure, without load; measure it first."
+        f"Sizes as in the files; walls at base and tip: {ends}. Lengths are those in front of the "
+        "palm; silicone and mass include the root behind it, which the palm holds. Free bend: "
+        "predicted by beam theory for a straight finger at its pressure, without load; measure it "
+        "first.",
+        _limit_meaning(scene),
     ]
     return SheetSection("Fingers", head, rows, notes)
+
+
+def _limit_meaning(scene: Scene) -> str:
+    """What the limits of pressures are, and are not."""
+    strain = scene.limits.strain
+    searched = (
+        f" A search keeps the walls of a free finger below a strain of {100 * strain:.0f} %."
+        if strain is not None
+        else ""
+    )
+    return (
+        "Limit: the hand file's highest pressure for a wall of this thickness (pressure_limit), at "
+        "which designs end. It is no burst pressure: no burst test of such a finger exists."
+        f"{searched}"
+    )
 
 
 def corners(scene: Scene, params: Params, sizes: Sequence[Size]) -> np.ndarray:
@@ -144,11 +161,6 @@ def corners(scene: Scene, params: Params, sizes: Sequence[Size]) -> np.ndarray:
         ]
         found.append(1e3 * place + Rotation.from_quat([x, y, z, w]).apply(own))
     return np.array(found)
-
-
-def castable(thickness: float) -> str:
-    """A thickness [mm] to the twentieth of a millimetre that a mould gives."""
-    return f"{round(20 * thickness) / 20:.2f}"
 
 
 def places(scene: Scene, params: Params) -> tuple[np.ndarray, np.ndarray]:
@@ -208,6 +220,8 @@ def _arm(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSection:
         f"quaternion. commands.csv has in addition the shaking that tests the grasp{_shaken(scene)}"
         ": its rows differ from this table there.",
         _clearance(scene, sizes, rows),
+        _pressed(scene, params, sizes),
+        *_dropped(scene, params),
         f"{pose.CONVENTION} The drawing on the last page of {NAME}.pdf shows each angle.",
     ]
     return SheetSection("Arm", (*head, "quaternion w x y z"), rows, notes)
@@ -241,6 +255,56 @@ def _clearance(scene: Scene, sizes: Sequence[Size], rows: Sequence[Sequence[str]
         "bars and whatever is behind it reach further than the simulated disc: move the empty "
         "hand there slowly first."
     )
+
+
+def tip_heights(scene: Scene, params: Params, sizes: Sequence[Size]) -> np.ndarray:
+    """Lowest heights of the straight fingers' tips over the table, as commanded [mm], (finger,)."""
+    tips = corners(scene, params, sizes)[:, 4:]
+    heights = []
+    for _, _, _, z, roll, pitch, yaw in valves.key_poses(scene, params):
+        turn = pose.rotation(roll=roll, yaw=yaw, pitch=pitch).as_matrix()
+        heights.append(z + (tips @ turn[2]).min(1))
+    return np.min(heights, 0)
+
+
+def _pressed(scene: Scene, params: Params, sizes: Sequence[Size]) -> str:
+    """How far the straight fingers are commanded into the table, and what that means."""
+    heights = tip_heights(scene, params, sizes)
+    told = ", ".join(f"finger {i} {h + 0.0:.0f} mm" for i, h in enumerate(heights))
+    text = f"Lowest tips of the straight fingers over the table, as commanded: {told}."
+    depth = -float(heights.min())
+    if depth <= 0:
+        return f"{text} None is pressed on the table before the wrist sags."
+    text += f" Below 0 the path drives the fingers into the table, by up to {depth:.0f} mm"
+    if scene.effects.wrist:
+        force = 1e-3 * depth * scene.hand.wrist.linear_stiffness
+        text += (
+            f": the fingers bend and the wrist gives way, with at most {force:.1f} N beside the "
+            "hand's weight if the wrist yields upwards alone"
+        )
+    return (
+        f"{text}. A rigid mount rams them by that much: raise z, or play the path without pressure "
+        "and stop above the table first."
+    )
+
+
+def _dropped(scene: Scene, params: Params) -> list[str]:
+    """From which height the object falls when the chambers are emptied, a sentence."""
+    poses = valves.key_poses(scene, params)
+    pressures = valves.key_pressures(scene, params)
+    full = pressures[:, 1:].max(1) > 0
+    if not full.any():
+        return []
+    # The player empties what the table leaves full.
+    end = pressures[full, 0][-1]
+    height = float(np.interp(end, poses[:, 0], poses[:, 3]) - poses[:, 3].min())
+    if height < 5:
+        return []
+    return [
+        f"The chambers are emptied from {end:g} s on with the hand {height:.0f} mm above its "
+        "lowest pose: the object falls from there. Lay something soft below it, or lower the arm "
+        "first."
+    ]
 
 
 def _rests(scene: Scene, sizes: Sequence[Size], height: float) -> str:

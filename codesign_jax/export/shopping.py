@@ -8,6 +8,7 @@ import numpy as np
 from codesign_jax.export import silicone, valves
 from codesign_jax.export.process import BACK, Printed, Process, Size, inlet
 from codesign_jax.export.sheet import SheetSection
+from codesign_jax.model import morphology
 from codesign_jax.scene import Scene
 from codesign_jax.scene.silicones import Silicone
 from codesign_jax.types import Params
@@ -28,6 +29,16 @@ RANGES = (100.0, 500.0, 900.0)
 """Ends of the ranges in which small proportional regulators are sold [kPa]."""
 SIGNAL = 10.0
 """Voltage at the end of a regulator's range [V] [chosen]: 0 to 10 V is usual, 0 to 5 V is sold."""
+PLASTIC = 1.24e-3
+"""Density of printed PLA [g/mm^3]."""
+ENGAGED = 8.0
+"""Length of thread in the flange that is aimed at [mm] [chosen], within half a step of 5 mm."""
+LEFT_OUT = (
+    "A finger that is left out: plug its tube at the regulator and leave its channel at 0 V, cover "
+    "its seat, and add its mass (table 'Fingers') to the ballast: without it the wrist sags less "
+    "than in the simulation."
+)
+"""How to build a hand without one of its fingers."""
 BITS = 12
 """Resolution of the analog outputs [chosen]."""
 
@@ -48,11 +59,13 @@ def section(
     """The list; arguments as of `workshop.assembly_sections`."""
     rows = [
         *_castings(scene, sizes, process),
+        *_workshop(scene, params, sizes, printed),
         *_screws(scene, sizes, printed),
         *_air(scene, params, sizes, process),
+        *_safety(scene, params),
         *_electric(scene, params),
     ]
-    notes = [_firmware(scene, params)]
+    notes = [LEFT_OUT, _firmware(scene, params)]
     return SheetSection("What to buy", ("what", "how much", "which"), rows, notes)
 
 
@@ -107,6 +120,58 @@ def _screws(
     return [
         ("screws of the bars", str(2 * len(sizes)), bars),
         *_flange_screws(scene, printed),
+    ]
+
+
+def _workshop(
+    scene: Scene, params: Params, sizes: Sequence[Size], printed: Printed | None
+) -> list[tuple[str, str, str]]:
+    """Tools and auxiliaries, and the ballast of the palm."""
+    rows = [
+        ("release agent", "1 can", "for silicone; printed trays release with it more easily"),
+        ("grease", "1 tube", "silicone-free (petroleum jelly): on the pins"),
+        (
+            "vacuum pump and chamber",
+            "1",
+            "to -90 kPa or more, chamber of four times the mixed volume. Without: mix slowly, pour "
+            "a thin stream from high above into one corner, tap the mould; some bubbles remain, so "
+            "that the leak test decides",
+        ),
+        ("scale", "1", "to 0.1 g"),
+        ("tap", "1", "M3, for the palm's holes of the bars' screws where the plastic splits"),
+        (
+            "pressure gauge",
+            "1",
+            f"0 to {_range(scene, params):g} kPa, class 1.6 or better, for leak and bend tests",
+        ),
+    ]
+    if printed:
+        lacking = 1e3 * scene.hand.palm.mass - PLASTIC * printed.palm_volume
+        if lacking > 0:
+            rows.append(("ballast", f"{lacking:.0f} g", "less screws, tubes, plate: nuts, washers"))
+    return rows
+
+
+def _safety(scene: Scene, params: Params) -> list[tuple[str, str, str]]:
+    """What keeps a failed regulator from bursting a finger, and the air from staying in it."""
+    count = str(scene.num_fingers)
+    limits = 1e-3 * morphology.pressure_limits(scene.hand, params)
+    told = ", ".join(f"finger {i} {limit:.0f}" for i, limit in enumerate(limits))
+    return [
+        (
+            "relief valves",
+            count,
+            "between regulator and finger, open below the finger's limit in kPa: "
+            f"{told}. The supply is above it: a failed regulator would pass it on. Or one for all "
+            f"behind the pressure reducer at {limits.min():.0f} kPa, if all commands are below it",
+        ),
+        (
+            "dump valves",
+            count,
+            "2/2, 24 V, normally open, between regulator and finger, to the open air: some "
+            "regulators hold their outlet pressure without power (check with the maker)",
+        ),
+        ("goggles", "1 a person", "wherever a finger is under pressure, also in leak tests"),
     ]
 
 
@@ -184,14 +249,15 @@ def _electric(scene: Scene, params: Params) -> list[tuple[str, str, str]]:
         (
             "power supply",
             "1",
-            f"24 V DC, {0.5 + 0.25 * count:.1f} A or more [chosen: 0.25 A a regulator, 0.5 A for "
-            "board and valve], fused; its 0 V joined to the board's and the outputs'",
+            f"24 V DC, {0.5 + 0.5 * count:.1f} A or more [chosen: 0.25 A a regulator and a dump "
+            "valve, 0.5 A for board and valve], fused; its 0 V joined to the board's and the "
+            "outputs'",
         ),
         (
             "emergency stop",
             "1",
-            "opens the 24 V of regulators and shut-off valve, so that the chambers vent, and the "
-            "arm's stop circuit",
+            "opens the 24 V of regulators, dump valves and shut-off valve, so that the chambers "
+            "vent and the object falls, and the arm's stop circuit",
         ),
         (
             "computer",
@@ -238,7 +304,7 @@ def _regulator(highest: float, flow: float) -> str:
     model = {100: "SMC ITV0010", 500: "SMC ITV0030", 900: "SMC ITV0050"}.get(top or 0)
     text = (
         f"proportional, electronic, 24 V, input 0 to {SIGNAL:g} V, a channel for each finger, up "
-        f"to {highest:.0f} kPa, {flow:.1f} l/min (ANR) or more, vents as well and without power"
+        f"to {highest:.0f} kPa, {flow:.1f} l/min (ANR) or more, vents as well"
     )
     return f"{text}; such as {model} (0 to {top:g} kPa)" if model else text
 
@@ -247,8 +313,25 @@ def _flange_screws(scene: Scene, printed: Printed | None) -> list[tuple[str, str
     if not printed or not printed.flange:
         return []
     diameter, thread, angle, sunk = printed.flange
-    length = 5 * math.ceil((1e3 * scene.hand.palm.thickness * (0.7 if sunk else 1) + 10) / 5)
+    # The counterbore is as deep as the head, of the thread's diameter, and half a millimetre.
+    counterbore = float(thread.removeprefix("M")) + 0.5 if sunk else 0.0
+    held = 1e3 * scene.hand.palm.thickness - counterbore
+    length = 5 * math.floor((held + ENGAGED + 2.5) / 5)
+    heads = f"heads in counterbores of {counterbore:g} mm" if sunk else "heads below the underside"
     circle = f"circle of {diameter:g} mm, the first {angle:g}° from x"
     if diameter == 31.5:
         circle += ": the flange 31.5-4-M5 of ISO 9409-1"
-    return [("screws to the wrist", "4", f"{thread} x {length}, socket head, from below; {circle}")]
+    return [
+        (
+            "screws to the wrist",
+            "4",
+            f"{thread} x {length}, socket head, from below, {heads}; {held:.1f} mm of palm, "
+            f"{length - held:.1f} mm of thread in the flange: see that it is as deep; {circle}",
+        ),
+        (
+            "adapter plate",
+            "0 or 1",
+            "where the arm's flange has another pattern: aluminium of 8 mm or more with both "
+            "circles; its thickness belongs to the tool centre point",
+        ),
+    ]

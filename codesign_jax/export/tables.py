@@ -91,6 +91,10 @@ def write_grasps(
 ) -> Iterator[str]:
     """Writes notes, models, controls, player and grasps.csv, as far as its lines are asked for."""
     lines = ["Grasps of codesign-jax for plain MuJoCo: python play.py NAME.xml; docs/export.md"]
+    lines.append(
+        f"NAME.mjb: written by MuJoCo {mujoco.__version__}, and read by that version alone; "
+        "NAME.xml is for any from 3.17 on"
+    )
     lines += [f"Unlike the scene {scene.name}: {text}" for text in plain.differences(scene)]
     (folder / NOTES).write_text("\n".join(lines) + "\n", encoding="utf-8")
     rows = []

@@ -9,9 +9,6 @@ from codesign_jax.export.sheet import NAME, SheetSection, hand_mass, sag
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
 
-PLASTIC = 1.24e-3
-"""Density of printed PLA [g/mm^3]."""
-
 
 def assembly_sections(
     scene: Scene,
@@ -78,7 +75,7 @@ def _prints(scene: Scene, sizes: Sequence[Size], printed: Printed | None) -> She
             rows.append((name, "1", f"{uses[what]}, finger {which}: cast {len(fingers)}"))
         else:
             rows.append((name, "0", f"finger {which} as it is to be: to compare, not to print"))
-    mass = PLASTIC * printed.palm_volume
+    mass = shopping.PLASTIC * printed.palm_volume
     wanted = 1e3 * scene.hand.palm.mass
     notes = [
         "Files in parts/, STL and 3MF, in mm, as they stand on the printer's bed: layers of 0.15 "
@@ -133,7 +130,7 @@ def _wrist(scene: Scene, sizes: Sequence[Size], printed: Printed | None) -> Shee
         "no weight of the hand to compensate.",
         _mechanical(scene, lowered, printed),
         "**A rigid mount:** another hand. See first what it keeps: codesign evaluate with --set "
-        "effects.wrist=false.",
+        "effects.wrist=false, and how far the path drives its fingers into the table ('Arm').",
     ]
     return SheetSection("Wrist", ("direction", "stiffness", "to test", "damping"), rows, notes)
 
@@ -195,9 +192,11 @@ def _order(
         "a drop of silicone and rub a film over all of it.",
         "Tube: push it through the root until 10 mm of it, or half of a shorter chamber, are "
         "inside, seal with silicone adhesive around it, cure.",
-        f"Leak test, at the highest pressure that is commanded: {tests}. Raise it slowly, under "
-        "water, and hold it for a minute: no bubbles; then close the tube: the pressure must fall "
-        "by less than 5 % in a minute [chosen]. Paint leaks with silicone and test again.",
+        f"Leak test, at the highest pressure that is commanded: {tests}. Wear goggles, with the "
+        "relief valve in the line. Raise it slowly, under water, and hold it for a minute (python "
+        "play_valves.py --port PORT --hold FINGER KPA): no bubbles; then close the tube: the "
+        "pressure must fall by less than 5 % in a minute [chosen]. Paint leaks with silicone and "
+        "test again.",
         "Bend test: lay the finger on its side, raise the pressure slowly to the design's, and "
         "compare the angle of the tip with 'free bend'. Write pressures and angles into a file and "
         "fit the silicone: codesign finger FILE.csv --fit (docs/measurements.md).",
@@ -216,7 +215,7 @@ def _order(
         "move to the first row of commands_still.csv, and play it without pressure and without an "
         "object: python play_hand.py --no-valves --arm HOST:PORT --slow 4. Then both without an "
         "object, at last with one, and only then at full speed: python play_hand.py --valves PORT "
-        "--arm HOST:PORT. Keep hands away and one on the emergency stop.",
+        "--arm HOST:PORT. Nobody within the arm's reach, goggles on, a hand on the emergency stop.",
     )
     if printed is None:
         steps = steps[:8] + ("Fix each finger to a palm of your own (--no-parts).", *steps[9:])

@@ -607,7 +607,7 @@ def test_command_writes_the_sheet(tmp_path, capsys, by_toy):
     assert "build_sheet.pdf: build sheet" in output and "no tolerances" not in output
     text = (tmp_path / "out" / "build_sheet.md").read_text()
     assert "100 % of 8 cast hands keep 95 % of 24 grasps" in text
-    assert "| walls of each finger | 0.2 mm |" in text and "Design; scene tiny" in text
+    assert "| walls of each finger | 0.2 mm |" in text and "Scene tiny" in text
     listed = json.loads((tmp_path / "out" / "manifest.json").read_text())
     assert f"Design: {listed['design']}. Export: {listed['command']}" in text
     assert listed["command"].startswith("codesign ") and listed["design"]

@@ -263,14 +263,13 @@ def _sheet(
     found, printed, peaks = added
     content = sheet.sheet_sections(case.scene, params, sizes, found, tested)
     title = f"Build sheet: {case.scene.hand.name}"
-    source = f"Best final design of {options.run_folder}" if options.run_folder else "Design"
     origin = _origin(options)
     code = provenance.git_state()
     version = provenance.environment()["versions"]["codesign-jax"]  # type: ignore[index]
     objects = ", ".join(map(_described, case.scene.objects.object))
     lines = [
         f"Design: {origin['design']}. Export: {origin['command']}",
-        f"{source}; scene {case.scene.name}, objects {objects}; "
+        f"Scene {case.scene.name}, objects {objects}; "
         f"codesign-jax {version}, commit {code['commit'] or 'unknown'}"
         f"{' with changes' if code.get('modified') else ''}. Predictions of a simulation, not "
         "measurements.",

@@ -162,8 +162,8 @@ def _safety(scene: Scene, params: Params) -> list[tuple[str, str, str]]:
             "relief valves",
             count,
             "between regulator and finger, open below the finger's limit in kPa: "
-            f"{told}. The supply is above it: a failed regulator would pass it on. Or one for all "
-            f"behind the pressure reducer at {limits.min():.0f} kPa, if all commands are below it",
+            f"{told}; and above its highest pressure of the table 'Valves'. The supply is above "
+            f"the limits, and a failed regulator passes it on",
         ),
         (
             "dump valves",

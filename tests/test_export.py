@@ -54,7 +54,7 @@ from codesign_jax.export.play import play
 from codesign_jax.export.process import Process, Section, Size
 from codesign_jax.model import build_spec
 from codesign_jax.runs import cases
-from codesign_jax.scene import hand, parameters, silicones
+from codesign_jax.scene import beams, hand, parameters, silicones
 from codesign_jax.scene.schema import InputError
 from tests.helpers.command_runs import command
 from tests.helpers.grasps import (
@@ -495,6 +495,18 @@ def test_the_sheet_says_how_fingers_press_and_whence_the_object_falls(page):
     assert "None is pressed on the table" in sheet._pressed(the_scene, high, sizes)
     [words] = sheet._dropped(the_scene, level)
     assert f"{poses[:, 3].max() - lowest:.0f} mm above its lowest pose" in words
+    # The closed form of the strain's pressure gives the limits back.
+    strains = sheet.limit_strains(the_scene, params)
+    material = the_scene.hand.material
+    pressures = beams.strain_pressure(
+        strains,
+        params.height,
+        params.wall,
+        width=the_scene.hand.section.width,
+        shear_modulus=material.shear_modulus / material.moment_factor,
+        neo_hookean=bool(the_scene.effects.neo_hookean),
+    )
+    np.testing.assert_allclose(pressures, 2e5, rtol=1e-5)  # float32
 
 
 # --- the palm: fingers fit into its seats, in any hand -------------------------------------------

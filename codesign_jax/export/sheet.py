@@ -125,24 +125,37 @@ def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSectio
         "palm; silicone and mass include the root behind it, which the palm holds. Free bend: "
         "predicted by beam theory for a straight finger at its pressure, without load; measure it "
         "first.",
-        _limit_meaning(scene),
+        _limit_meaning(scene, params),
     ]
     return SheetSection("Fingers", head, rows, notes)
 
 
-def _limit_meaning(scene: Scene) -> str:
+def limit_strains(scene: Scene, params: Params) -> np.ndarray:
+    """Strain of a free finger's upper wall at its limit of pressure, shape (finger,).
+
+    Curvature times height, kappa h, of fingers without taper.
+    """
+    limits = morphology.pressure_limits(scene.hand, params)
+    law = bool(scene.effects.neo_hookean)
+    full = params._replace(pressure=limits)
+    bends = np.asarray(morphology.free_bends(scene.hand, full, neo_hookean=law))
+    return np.abs(bends) * np.asarray(params.height) / np.asarray(params.length)
+
+
+def _limit_meaning(scene: Scene, params: Params) -> str:
     """What the limits of pressures are, and are not."""
-    strain = scene.limits.strain
-    searched = (
-        f" A search keeps the walls of a free finger below a strain of {100 * strain:.0f} %."
-        if strain is not None
-        else ""
+    text = (
+        "Limit: the end of the design space, a pressure proportional to the wall (pressure_limit "
+        "of the hand's file). It is no burst pressure: no burst test of such a finger exists, and "
+        "a bubble or a thin place lowers it."
     )
-    return (
-        "Limit: the hand file's highest pressure for a wall of this thickness (pressure_limit), at "
-        "which designs end. It is no burst pressure: no burst test of such a finger exists."
-        f"{searched}"
-    )
+    if params.tip is None:
+        strains = limit_strains(scene, params)
+        told = ", ".join(f"finger {i} {100 * v:.0f} %" for i, v in enumerate(strains))
+        text += f" Strain of a free finger's upper wall at its limit by beam theory: {told}."
+    if scene.limits.strain is not None:
+        text += f" A search keeps that strain below {100 * scene.limits.strain:.0f} %."
+    return text
 
 
 def corners(scene: Scene, params: Params, sizes: Sequence[Size]) -> np.ndarray:

@@ -163,7 +163,7 @@ def _safety(scene: Scene, params: Params) -> list[tuple[str, str, str]]:
             count,
             "between regulator and finger, open below the finger's limit in kPa: "
             f"{told}; and above its highest pressure of the table 'Valves'. The supply is above "
-            f"the limits, and a failed regulator passes it on",
+            "the limits, and a failed regulator passes it on",
         ),
         (
             "dump valves",

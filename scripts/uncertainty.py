@@ -6,8 +6,7 @@ python -m scripts.uncertainty --constants posterior.toml --preset full    # of a
 Each seed is searched twice, with constants that are drawn for every trial and with the middle of
 their distributions, and both designs are judged in the same fresh trials, each of which has a hand
 of its own: constants drawn from the table, in place of the true ones that nobody knows.  Prints the
-table of docs/uncertainty.md and draws docs/figures/uncertainty.png.  30 pairs take some minutes of
-an H100.
+table of docs/uncertainty.md and draws docs/figures/uncertainty.png.
 """
 
 import argparse

@@ -326,26 +326,21 @@ def main(words=None):
     """The program; returns its exit status."""
     options = _parser().parse_args(words)
     play_valves.catch_stops()
+    return play_valves.exit_status(lambda: _run(options))
+
+
+def _run(options):
     wait = (lambda seconds: None) if options.no_wait else time.sleep
-    try:
-        poses, pressures = _tables(options)
-        arm = datagrams(options.arm) if options.arm else _prefixed("arm")
-        valves = (
-            play_valves.serial_line(options.valves, options.baud)
-            if options.valves
-            else _prefixed("valves")
-        )
-        with arm as to_arm, valves as to_valves:
-            _started(poses, options)
-            play(poses, pressures, (to_arm, to_valves), (options.period, 0.05), wait)
-    except KeyboardInterrupt:
-        return 130
-    except BrokenPipeError:
-        return play_valves.closed_output()
-    except (OSError, ValueError) as error:
-        print(f"error: {getattr(error, 'strerror', None) or error}", file=sys.stderr)
-        return 2
-    return 0
+    poses, pressures = _tables(options)
+    arm = datagrams(options.arm) if options.arm else _prefixed("arm")
+    valves = (
+        play_valves.serial_line(options.valves, options.baud)
+        if options.valves
+        else _prefixed("valves")
+    )
+    with arm as to_arm, valves as to_valves:
+        _started(poses, options)
+        play(poses, pressures, (to_arm, to_valves), (options.period, 0.05), wait)
 
 
 if __name__ == "__main__":

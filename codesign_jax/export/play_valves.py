@@ -238,21 +238,13 @@ def main(words=None):
     parser.add_argument("--no-wait", action="store_true", help="send all lines at once")
     options = parser.parse_args(words)
     catch_stops()
+    return exit_status(lambda: _run(options))
+
+
+def exit_status(work):
+    """Does a player's work and returns its exit status; an error is one line on stderr."""
     try:
-        if not 0.001 <= options.period <= 10:
-            raise TableError("--period must be 0.001 to 10 s")
-        if options.hold and options.no_wait:
-            raise TableError("--hold needs real time: leave --no-wait")
-        rows, limits = read(options.table)
-        if options.hold:
-            rows = held(rows, *options.hold)
-        rows = scaled(rows, limits, options.divide, options.cap)
-        wait = (lambda seconds: None) if options.no_wait else time.sleep
-        if options.port is None:
-            play(rows, print_out, options.period, wait)
-        else:
-            with serial_line(options.port, options.baud) as send:
-                play(rows, send, options.period, wait)
+        work()
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
@@ -261,6 +253,23 @@ def main(words=None):
         print(f"error: {getattr(error, 'strerror', None) or error}", file=sys.stderr)
         return 2
     return 0
+
+
+def _run(options):
+    if not 0.001 <= options.period <= 10:
+        raise TableError("--period must be 0.001 to 10 s")
+    if options.hold and options.no_wait:
+        raise TableError("--hold needs real time: leave --no-wait")
+    rows, limits = read(options.table)
+    if options.hold:
+        rows = held(rows, *options.hold)
+    rows = scaled(rows, limits, options.divide, options.cap)
+    wait = (lambda seconds: None) if options.no_wait else time.sleep
+    if options.port is None:
+        play(rows, print_out, options.period, wait)
+    else:
+        with serial_line(options.port, options.baud) as send:
+            play(rows, send, options.period, wait)
 
 
 if __name__ == "__main__":

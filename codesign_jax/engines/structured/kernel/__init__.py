@@ -1,5 +1,5 @@
 """The structured engine's rollout as one kernel."""
 
-from codesign_jax.engines.structured.kernel.program import TRACE, Limits, Program, lanes_here
+from codesign_jax.engines.structured.kernel.program import TRACE, Limits, Program
 
-__all__ = ["TRACE", "Limits", "Program", "lanes_here"]
+__all__ = ["TRACE", "Limits", "Program"]

@@ -187,10 +187,10 @@ def _threads(h: Handler) -> str:
     with c.when(c.let(f"icmp ne ptr {error}, null")):
         _destroy(h, error)
         c.do(f"store i64 1, ptr {number}")
-    found = c.let(f"load i64, ptr {number}")
+    threads = c.let(f"load i64, ptr {number}")
     # Not LLVM's maximum: a kernel that uses it declares it, and a second declaration is an error.
-    more = c.let(f"icmp sgt i64 {found}, 1")
-    return c.let(f"select i1 {more}, i64 {found}, i64 1")
+    positive = c.let(f"icmp sgt i64 {threads}, 1")
+    return c.let(f"select i1 {positive}, i64 {threads}, i64 1")
 
 
 def _destroy(h: Handler, error: str) -> None:

@@ -105,10 +105,10 @@ def installed_version() -> tuple[int, int]:
         raise KernelUnavailable(
             f"the header of XLA's foreign function interface: {error}"
         ) from error
-    found = [re.search(rf"#define XLA_FFI_API_{n} (\d+)", text) for n in ("MAJOR", "MINOR")]
-    if None in found:
+    matches = [re.search(rf"#define XLA_FFI_API_{n} (\d+)", text) for n in ("MAJOR", "MINOR")]
+    if None in matches:
         raise KernelUnavailable(f"{header().name} states no version of XLA's interface")
-    major, minor = (int(f[1]) for f in found if f)
+    major, minor = (int(match[1]) for match in matches if match)
     return major, minor
 
 

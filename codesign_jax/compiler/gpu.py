@@ -73,18 +73,18 @@ class Driver:
 def driver() -> Driver:
     """The driver of this computer, initialised."""
     try:
-        found = Driver(ctypes.CDLL("libcuda.so.1"))
+        opened = Driver(ctypes.CDLL("libcuda.so.1"))
     except OSError as error:
         raise KernelUnavailable(f"NVIDIA's driver cannot be loaded: {error}") from error
-    found("cuInit", 0)
+    opened("cuInit", 0)
     version = ctypes.c_int()
-    found("cuDriverGetVersion", ctypes.byref(version))
+    opened("cuDriverGetVersion", ctypes.byref(version))
     if version.value < _OLDEST_DRIVER:
         raise KernelUnavailable(
             f"NVIDIA's driver supports CUDA {version.value // 1000}.{version.value % 1000 // 10}; "
             f"kernels need {_OLDEST_DRIVER // 1000}.0"
         )
-    return found
+    return opened
 
 
 def load(driver: Driver, text: str, device: int) -> int:

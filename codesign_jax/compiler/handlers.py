@@ -180,8 +180,12 @@ class Handler:
             with c.when(c.let(f"icmp eq i32 {kind}, {ffi.METADATA}")):
                 metadata = c.get(extension, ffi.MetadataExtension, "metadata")
                 fits = "true"
-                found = ("%frame", ffi.CallFrame), (self.api, ffi.Api), (metadata, ffi.Metadata)
-                for k, (base, structure) in enumerate(found):
+                structures = (
+                    ("%frame", ffi.CallFrame),
+                    (self.api, ffi.Api),
+                    (metadata, ffi.Metadata),
+                )
+                for k, (base, structure) in enumerate(structures):
                     size = c.get(base, structure, "struct_size")
                     c.do(f"store i64 {size}, ptr {c.byte('@' + seen(self.name), 8 * k)}")
                     large = c.let(f"icmp uge i64 {size}, {ffi.size(structure)}")
@@ -196,9 +200,9 @@ class Handler:
         """Checks the arrays that XLA passes; returns the number of blocks."""
         c = self.code
         blocks = ""
-        for which, role in (("args", INPUT), ("rets", OUTPUT)):
+        for part, role in (("args", INPUT), ("rets", OUTPUT)):
             places = self.layout.of(role)
-            given = c.at("%frame", ffi.CallFrame, which)
+            given = c.at("%frame", ffi.CallFrame, part)
             self._demand(
                 [
                     f"uge i64 {c.get(given, ffi.Arguments, 'struct_size')}, "
@@ -217,30 +221,30 @@ class Handler:
         c = self.code
         array = self.layout.arrays[place]
         rank = 1 + len(array.shape)
-        what = f"array {place} to be {array}"
+        requirement = f"array {place} to be {array}"
         self._demand(
             [
                 f"uge i64 {c.get(buffer, ffi.Buffer, 'struct_size')}, {ffi.size(ffi.Buffer)}",
                 f"eq i32 {c.get(buffer, ffi.Buffer, 'dtype')}, {ffi.DTYPES[array.dtype]}",
                 f"eq i64 {c.get(buffer, ffi.Buffer, 'rank')}, {rank}",
             ],
-            what,
+            requirement,
         )
         dims = c.get(buffer, ffi.Buffer, "dims")
         sizes = [c.let(f"load i64, ptr {c.byte(dims, 8 * k)}") for k in range(rank)]
         wanted: list[object] = [1 if array.shared else blocks or sizes[0], *array.shape]
-        self._demand([f"eq i64 {s}, {w}" for s, w in zip(sizes, wanted, strict=True)], what)
+        self._demand([f"eq i64 {s}, {w}" for s, w in zip(sizes, wanted, strict=True)], requirement)
         self.data[place] = c.get(buffer, ffi.Buffer, "data")
         return blocks or ("" if array.shared else sizes[0])
 
-    def _demand(self, tests: list[str], what: str) -> None:
+    def _demand(self, tests: list[str], requirement: str) -> None:
         """Returns an error unless all comparisons hold."""
         c = self.code
         holds = "true"
         for test in tests:
             holds = c.let(f"and i1 {holds}, {c.let('icmp ' + test)}")
         with c.when(c.let(f"xor i1 {holds}, true")):
-            self.fail(ffi.INVALID_ARGUMENT, self.message(f"kernel {self.name} needs {what}"))
+            self.fail(ffi.INVALID_ARGUMENT, self.message(f"kernel {self.name} needs {requirement}"))
 
 
 OPTIMIZATION = "CODESIGN_KERNEL_OPTIMIZATION"

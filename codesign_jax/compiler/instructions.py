@@ -72,7 +72,7 @@ class Instructions:
     def inverse_square_root(self, x: Value) -> Value:
         return self.divide(self.constant(numpy_type(x.kind)(1)), self.square_root(x))
 
-    def grown(self, name: str, a: Value, b: Value, result: Value) -> Value:
+    def note_growth(self, name: str, a: Value, b: Value, result: Value) -> Value:
         """Called with each sum, difference or product of integers; returns the result."""
         return result
 
@@ -123,13 +123,13 @@ class Instructions:
     def narrow(self, value: Value) -> Value:
         """The scalar of a value that is known to be the same on all lanes."""
         if value.text is not None:
-            found = self.scalar_of.get(value.text)
-            return value if found is None else found._replace(known=found.known + value.known)
+            scalar = self.scalar_of.get(value.text)
+            return value if scalar is None else scalar._replace(known=scalar.known + value.known)
         if value.wide and np.min(value.known) == np.max(value.known):
             return Value(value.kind, False, None, np.min(value.known))
         return value
 
-    def alike(self, *values: Value) -> list[Value]:
+    def same_width(self, *values: Value) -> list[Value]:
         if any(v.wide for v in values):
             return [self.splat(v) for v in values]
         return list(values)
@@ -145,7 +145,7 @@ class Instructions:
         return Value(value.kind, False, None, numpy_type(value.kind)(number))
 
     def compute(self, operation: str, *args: Value, kind: str | None = None) -> Value:
-        args = tuple(self.alike(*args))
+        args = tuple(self.same_width(*args))
         first = args[0]
         wide = args[0].wide
         operands = ", ".join([self.operand(a) for a in args])
@@ -156,16 +156,18 @@ class Instructions:
         self, name: str, *args: Value, flags: str = "contract ", extra: str = ""
     ) -> Value:
         """The result of one of LLVM's overloaded functions on floats or integers."""
-        args = tuple(self.alike(*args))
+        args = tuple(self.same_width(*args))
         kind = args[0].kind
         wide = args[0].wide
         full = f"llvm.{name}.{self.suffix(kind, wide)}"
-        one = self.type(kind, wide)
-        more = [part.rsplit(" ", 1)[0] for part in extra.split(", ") if part]
-        self.declared.add(f"declare {one} @{full}({', '.join([one] * len(args) + more)})")
+        operand_type = self.type(kind, wide)
+        extra_types = [part.rsplit(" ", 1)[0] for part in extra.split(", ") if part]
+        self.declared.add(
+            f"declare {operand_type} @{full}({', '.join([operand_type] * len(args) + extra_types)})"
+        )
         operands = ", ".join([self.typed(a) for a in args] + ([extra] if extra else []))
         flags = flags if is_float(kind) else ""
-        return Value(kind, wide, self.emit(f"call {flags}{one} @{full}({operands})"))
+        return Value(kind, wide, self.emit(f"call {flags}{operand_type} @{full}({operands})"))
 
     def suffix(self, kind: str, wide: bool) -> str:
         scalar = {"b": "i1"}.get(kind, kind)
@@ -180,7 +182,7 @@ class Instructions:
         text = self.emit(f"{operation} {self.typed(value)} to {self.type(kind, value.wide)}")
         return Value(kind, value.wide, text)
 
-    def whole(self, x: Value, kind: str = "i32") -> Value:
+    def to_integer(self, x: Value, kind: str = "i32") -> Value:
         """A float without its fraction; 0 for what is not a number, the nearest integer beyond."""
         source = self.suffix(x.kind, x.wide)
         target = self.suffix(kind, x.wide)
@@ -193,7 +195,7 @@ class Instructions:
         """One of two values, lane by lane if `which` differs between the lanes."""
         if which.is_known and not which.wide:
             return yes if which.known else no
-        yes, no = self.alike(yes, no)
+        yes, no = self.same_width(yes, no)
         if which.wide:
             yes = self.splat(yes)
             no = self.splat(no)

@@ -131,15 +131,15 @@ def launch(
         return kernel_jaxpr(call, avals)
 
     # Of code that is not known no kernel is found again, neither on disk nor in this process.
-    known = reuse.key(kernel.origin)
-    origin = known or str(uuid.uuid4())
+    key = reuse.key(kernel.origin)
+    origin = key or str(uuid.uuid4())
     with _no_collection():
-        name = register(origin, trace, layout, keep=known is not None)
-    made = [k for k, a in enumerate(layout.arrays[len(inputs) :]) if a.role == OUTPUT]
+        name = register(origin, trace, layout, keep=key is not None)
+    computed = [k for k, a in enumerate(layout.arrays[len(inputs) :]) if a.role == OUTPUT]
     varying = _varying(inputs)
-    shapes = [jax.ShapeDtypeStruct(outputs[k].shape, outputs[k].dtype, **varying) for k in made]
+    shapes = [jax.ShapeDtypeStruct(outputs[k].shape, outputs[k].dtype, **varying) for k in computed]
     results: list[jax.Array | None] = [None] * len(outputs)
-    for k, result in zip(made, jax.ffi.ffi_call(name, shapes)(*inputs), strict=True):
+    for k, result in zip(computed, jax.ffi.ffi_call(name, shapes)(*inputs), strict=True):
         results[k] = None if k in (*kernel.scratch, *kernel.onchip) else result
     return results
 
@@ -173,8 +173,10 @@ def describe(inputs: Any, outputs: Any, kernel: Kernel) -> Layout:
             role = ONCHIP
         shared = k in kernel.shared
         if x.shape[0] != (1 if shared else blocks):
-            what = "is shared and must have one block" if shared else f"must have {blocks} blocks"
-            raise ValueError(f"array {k} of shape {x.shape} {what}")
+            requirement = (
+                "is shared and must have one block" if shared else f"must have {blocks} blocks"
+            )
+            raise ValueError(f"array {k} of shape {x.shape} {requirement}")
         if shared and role != INPUT:
             raise ValueError(f"array {k} is an output; only inputs can be shared")
         name = np.dtype(x.dtype).name
@@ -246,7 +248,7 @@ def _pallas_call(jaxpr: Any) -> Any:
         for value in equation.params.values():
             inner = getattr(value, "jaxpr", value)
             if hasattr(inner, "eqns"):
-                found = _pallas_call(inner)
-                if found is not None:
-                    return found
+                call = _pallas_call(inner)
+                if call is not None:
+                    return call
     return None

@@ -49,18 +49,18 @@ def _polynomial(w: Instructions, x: Value, first: int, terms: int) -> Value:
 
 def _of_angle(w: Instructions, x: Value, shift: int) -> Value:
     """Sine of an angle to which `shift` quarter turns are added."""
-    one = numpy_type(x.kind)
-    turns = w.intrinsic("rint", w.compute("fmul", x, w.like(x, 2 / np.pi)), flags="")
-    rest = x
+    dtype = numpy_type(x.kind)
+    quarter_turns = w.intrinsic("rint", w.compute("fmul", x, w.like(x, 2 / np.pi)), flags="")
+    remainder = x
     for part in half_pi_parts(x.kind):
-        rest = w.fma(turns, w.like(x, one(-part)), rest)
-    square = w.compute("fmul", rest, rest)
-    sine = w.compute("fmul", _polynomial(w, square, 1, _TERMS[x.kind]), rest)
+        remainder = w.fma(quarter_turns, w.like(x, dtype(-part)), remainder)
+    square = w.compute("fmul", remainder, remainder)
+    sine = w.compute("fmul", _polynomial(w, square, 1, _TERMS[x.kind]), remainder)
     cosine = _polynomial(w, square, 0, _TERMS[x.kind])
-    quarter = RULES["add"](w, None, w.whole(turns), Value("i32", False, None, shift))
+    quadrant = RULES["add"](w, None, w.to_integer(quarter_turns), Value("i32", False, None, shift))
 
     def bit(k: int) -> Value:
-        masked = w.compute("and", quarter, Value("i32", False, None, k))
+        masked = w.compute("and", quadrant, Value("i32", False, None, k))
         return w.compute("icmp ne", masked, Value("i32", False, None, 0), kind="b")
 
     value = w.select(bit(1), cosine, sine)
@@ -112,7 +112,7 @@ def _arithmetic(name: str) -> Rule:
             fused = "" if name != "mul" and {a.text, b.text} & w.exchanged else " contract"
             return w.compute(f"f{name}{fused}", a, b)
         known = _folded(name, a.kind, a, b) or _offset(name, a, b)
-        return w.grown(name, a, b, known or w.compute(name, a, b))
+        return w.note_growth(name, a, b, known or w.compute(name, a, b))
 
     return rule
 
@@ -135,14 +135,14 @@ def _offset(name: str, a: Value, b: Value) -> Value | None:
 def _divide(w: Instructions, equation: Any, a: Value, b: Value) -> Value:
     if is_float(a.kind):
         return w.divide(a, b)
-    return _whole_division(w, "sdiv", a, b)
+    return _integer_division(w, "sdiv", a, b)
 
 
 def _remainder(w: Instructions, equation: Any, a: Value, b: Value) -> Value:
-    return w.compute("frem", a, b) if is_float(a.kind) else _whole_division(w, "srem", a, b)
+    return w.compute("frem", a, b) if is_float(a.kind) else _integer_division(w, "srem", a, b)
 
 
-def _whole_division(w: Instructions, operation: str, a: Value, b: Value) -> Value:
+def _integer_division(w: Instructions, operation: str, a: Value, b: Value) -> Value:
     """Quotient or remainder of integers; those that processors trap at have XLA's results.
 
     x / 0 is -1, x rem 0 is x, and the smallest integer over -1 is itself, with remainder 0.
@@ -273,7 +273,7 @@ def _convert(w: Instructions, equation: Any, x: Value) -> Value:
     if is_float(x.kind) and is_float(kind):
         return w.convert("fpext" if kind == "f64" else "fptrunc", x, kind)
     if is_float(x.kind):
-        return w.whole(x, kind)
+        return w.to_integer(x, kind)
     if is_float(kind):
         return w.convert("uitofp" if x.kind == "b" else "sitofp", x, kind)
     if x.kind == "b":
@@ -281,7 +281,7 @@ def _convert(w: Instructions, equation: Any, x: Value) -> Value:
     return w.convert("sext" if kind == "i64" else "trunc", x, kind)
 
 
-def _bits_as(w: Instructions, equation: Any, x: Value) -> Value:
+def _bitcast(w: Instructions, equation: Any, x: Value) -> Value:
     return w.convert("bitcast", x, kind_of(equation.outvars[0].aval.dtype))
 
 
@@ -346,7 +346,7 @@ RULES: dict[str, Rule] = {
     "shift_right_logical": _shift("lshr"),
     "select_n": _select_n,
     "convert_element_type": _convert,
-    "bitcast_convert_type": _bits_as,
+    "bitcast_convert_type": _bitcast,
     "iota": lambda w, e: w.lane_index(),
     "population_count": lambda w, e, x: w.intrinsic("ctpop", x),
     "rev": _reverse,

@@ -37,13 +37,13 @@ def rounds_ahead(lines: int, length: int) -> int:
 
 def adjacent(offsets: list[int], row: int, lanes: int) -> list[tuple[int, int]]:
     """Runs of adjacent rows: first offset and number, at most as many as lanes."""
-    found: list[tuple[int, int]] = []
+    runs: list[tuple[int, int]] = []
     for offset in offsets:
-        if found and offset == found[-1][0] + row * found[-1][1] and found[-1][1] < lanes:
-            found[-1] = (found[-1][0], found[-1][1] + 1)
+        if runs and offset == runs[-1][0] + row * runs[-1][1] and runs[-1][1] < lanes:
+            runs[-1] = (runs[-1][0], runs[-1][1] + 1)
         else:
-            found.append((offset, 1))
-    return found
+            runs.append((offset, 1))
+    return runs
 
 
 LANES = 32
@@ -60,11 +60,13 @@ class ThreadWriter(Writer):
         # Mask of the warp's threads that take part, one bit each; LLVM reads i32 as signed.
         self.all = f"i32 {-1 if lanes == LANES else (1 << lanes) - 1}"
         self.growth: dict[str, int] = {}  # of integers [1] and addresses [bytes], in each round
-        self.born: dict[str, int] = {}  # line behind an address
-        self.found: list[dict[tuple, Any]] = [{}]  # computed already, one scope a region
+        self.address_lines: dict[str, int] = {}  # line behind an address
+        self.computed: list[dict[tuple, Any]] = [{}]  # computed already, one scope a region
         # The loops around: line at which a body begins, rounds, and its reads by address.
-        self.ahead: list[tuple[int, int, dict[str, PrefetchedRows]]] = []
-        self.meeting = False  # between the loads of a group, before which the threads have met
+        self.loops: list[tuple[int, int, dict[str, PrefetchedRows]]] = []
+        self.grouped_loads = (
+            False  # between the loads of a group, before which the threads have met
+        )
         # Where lanes exchange through memory, whether they have since they last met.
         self.stored = self.loaded = False
         self.spans: set[int] = set()  # numbers of rows that are asked for at once
@@ -103,10 +105,10 @@ class ThreadWriter(Writer):
         return Value(value.kind, True, self.emit(f"bitcast i64 {both} to {kind}"))
 
     def _swap(self, value: Value, mask: int) -> Value:
-        one = LLVM_TYPES[value.kind]
+        scalar = LLVM_TYPES[value.kind]
         full = f"llvm.nvvm.shfl.sync.bfly.{value.kind}"
-        self.declared.add(f"declare {one} @{full}(i32, {one}, i32, i32)")
-        call = f"call {one} @{full}({self.all}, {self.typed(value)}, i32 {mask}, i32 31)"
+        self.declared.add(f"declare {scalar} @{full}(i32, {scalar}, i32, i32)")
+        call = f"call {scalar} @{full}({self.all}, {self.typed(value)}, i32 {mask}, i32 31)"
         return Value(value.kind, True, self.emit(call))
 
     def over_lanes(self, name: str, value: Value) -> Value:
@@ -125,10 +127,10 @@ class ThreadWriter(Writer):
 
     def _once(self, key: tuple, make: Any) -> Any:
         """What was made for a key where control has come from, or is made now."""
-        for scope in self.found:
+        for scope in self.computed:
             if key in scope:
                 return scope[key]
-        self.found[-1][key] = result = make()
+        self.computed[-1][key] = result = make()
         return result
 
     # Arithmetic: in float32 what the kernel's tolerance is far above, two units in the last place
@@ -160,18 +162,18 @@ class ThreadWriter(Writer):
         wide = any(i.wide for i in indices)
         kind = LLVM_TYPES[ref.kind]
         foreign = self._is_foreign(ref, indices)
-        if foreign and not self.meeting:
-            self._meet()
+        if foreign and not self.grouped_loads:
+            self._warp_barrier()
         if ref.exchanged:
             if self.stored:
-                self._meet()
+                self._warp_barrier()
             self.loaded = True
         space = f"ptr addrspace({ref.space})"
         text = self.emit(f"load {kind}, {space} {place}, align {SIZES[ref.kind]}")
         if foreign:
-            self.meeting = not self.last_of_group
+            self.grouped_loads = not self.last_of_group
             if self.last_of_group:
-                self._meet()
+                self._warp_barrier()
         if ref.shape[-1] == self.lanes and self.growth.get(base):
             self._read_ahead(base, offset)
         return Value(ref.kind, wide, text)
@@ -180,7 +182,7 @@ class ThreadWriter(Writer):
         _, _, place = self._address(ref, indices)
         if ref.exchanged:
             if self.loaded:
-                self._meet()
+                self._warp_barrier()
             self.stored = True
         space = f"ptr addrspace({ref.space})"
         self.lines.append(f"store {self.typed(value)}, {space} {place}, align {SIZES[ref.kind]}")
@@ -193,18 +195,18 @@ class ThreadWriter(Writer):
         for index, stride in zip(indices, strides, strict=True):
             offset += int(stride) * int(index.known)
             if not index.is_known:
-                base = self._step(base, index, int(stride), ref.space)
+                base = self._offset_address(base, index, int(stride), ref.space)
         if not offset:
             return base, 0, base
         space = f"ptr addrspace({ref.space})"
         place = self.emit(f"getelementptr inbounds i8, {space} {base}, i64 {offset}")
         return base, offset, place
 
-    def _step(self, base: str, index: Value, stride: int, space: int) -> str:
+    def _offset_address(self, base: str, index: Value, stride: int, space: int) -> str:
         key = (base, index.text, stride)
-        return self._once(key, lambda: self._behind(base, index, stride, space))
+        return self._once(key, lambda: self._new_address(base, index, stride, space))
 
-    def _behind(self, base: str, index: Value, stride: int, space: int) -> str:
+    def _new_address(self, base: str, index: Value, stride: int, space: int) -> str:
         assert index.text is not None
         wide = index.text
         if index.kind != "i64":
@@ -213,7 +215,7 @@ class ThreadWriter(Writer):
         pointer = f"ptr addrspace({space}) {base}"
         place = self.emit(f"getelementptr inbounds i8, {pointer}, i64 {step}")
         self.growth[place] = self.growth.get(base, 0) + stride * self.growth.get(index.text, 0)
-        self.born[place] = len(self.lines)
+        self.address_lines[place] = len(self.lines)
         return place
 
     def branch(self, equation: Any, args: list) -> list:
@@ -229,21 +231,21 @@ class ThreadWriter(Writer):
         return self._scoped(super().loop, equation, args)
 
     def _scoped(self, write: Any, equation: Any, args: list) -> list:
-        self.found.append({})
+        self.computed.append({})
         results = write(equation, args)
-        self.found.pop()
+        self.computed.pop()
         return results
 
     def start(self, label: str) -> None:
         """The two branches of a conditional know nothing of each other."""
         super().start(label)
         self.stored = self.loaded = True
-        if len(self.found) > 1:
-            self.found[-1] = {}
+        if len(self.computed) > 1:
+            self.computed[-1] = {}
 
     # Asking for memory ahead
 
-    def grown(self, name: str, a: Value, b: Value, result: Value) -> Value:
+    def note_growth(self, name: str, a: Value, b: Value, result: Value) -> Value:
         """Notes how integers grow from round to round."""
         if result.text is None:
             return result
@@ -262,22 +264,22 @@ class ThreadWriter(Writer):
         *_, lane = indices
         return ref.shape[-1] == self.lanes and lane.wide and lane != self.lane
 
-    def _meet(self) -> None:
-        """Warp barrier: what threads stored before it is visible to all of them after it."""
+    def _warp_barrier(self) -> None:
+        """Makes what threads stored before it visible to all of them after it."""
         self.declared.add("declare void @llvm.nvvm.bar.warp.sync(i32)")
         self.lines.append(f"call void @llvm.nvvm.bar.warp.sync({self.all})")
         self.stored = self.loaded = False
 
     def _read_ahead(self, base: str, offset: int) -> None:
         """Notes a read for the innermost loop in which its address is computed."""
-        line = self.born[base]
-        for first, _, reads in reversed(self.ahead):
+        line = self.address_lines[base]
+        for first, _, reads in reversed(self.loops):
             if first <= line:
                 reads.setdefault(base, PrefetchedRows(line, [])).offsets.append(offset)
                 return
 
     def begin_loop(self, counters: list[str], length: int) -> None:
-        self.ahead.append((len(self.lines), length, {}))
+        self.loops.append((len(self.lines), length, {}))
         self.growth |= {name: 1 for name in counters}
 
     def end_loop(self) -> None:
@@ -286,7 +288,7 @@ class ThreadWriter(Writer):
         Without it every round waits for memory: a kernel of this size leaves room for two warps on
         a scheduler, which cannot hide it.
         """
-        first, length, reads = self.ahead.pop()
+        first, length, reads = self.loops.pop()
         rounds = rounds_ahead(len(self.lines) - first, length)
         if not rounds:
             return

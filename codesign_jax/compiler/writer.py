@@ -14,7 +14,7 @@ from codesign_jax.compiler.rules import RULES
 from codesign_jax.compiler.values import Ref, Value
 
 _INLINE = ("jit", "pjit", "closed_call", "custom_jvp_call", "remat2", "checkpoint")
-_SAME = (
+_NO_OPERATION = (
     "broadcast_in_dim",
     "broadcast_to",
     "reshape",
@@ -49,15 +49,15 @@ class Writer(Instructions):
 
     def _phis(self, values: list[Value], source: str) -> tuple[list[Value], list[int]]:
         """Values that depend on where control comes from, and their lines, which `_close` ends."""
-        found = []
+        results = []
         lines = []
         for value in values:
             name = "%" + self.name()
             lines.append(len(self.lines))
             kind = self.type(value.kind, value.wide)
             self.lines.append(f"{name} = phi {kind} [ {self.operand(value)}, %{source} ]")
-            found.append(Value(value.kind, value.wide, name))
-        return found, lines
+            results.append(Value(value.kind, value.wide, name))
+        return results, lines
 
     def _close(self, lines: list[int], values: list[str], source: str) -> None:
         for line, value in zip(lines, values, strict=True):
@@ -140,28 +140,28 @@ class Writer(Instructions):
 
     def branch(self, equation: Any, args: list) -> list:
         """A conditional of two branches; its predicate is the same on all lanes."""
-        which = args[0]
+        predicate = args[0]
         operands = args[1:]
         if len(equation.params["branches"]) != 2:
             raise NotImplementedError("a kernel's conditional has two branches: nest them")
         no, yes = equation.params["branches"]
-        if which.kind != "b":
-            which = self.compute("icmp ne", which, self.like(which, 0), kind="b")
+        if predicate.kind != "b":
+            predicate = self.compute("icmp ne", predicate, self.like(predicate, 0), kind="b")
         labels = (self.name("L"), self.name("L"))
         end = self.name("L")
-        which = self._condition(which)
-        self.lines.append(f"br {which}, label %{labels[0]}, label %{labels[1]}")
-        found = []
+        predicate = self._condition(predicate)
+        self.lines.append(f"br {predicate}, label %{labels[0]}, label %{labels[1]}")
+        outcomes = []
         sources = []
         for branch, label in zip((yes, no), labels, strict=True):
             self.start(label)
             values = self.run(branch.jaxpr, branch.consts, operands)
-            found.append(self._carried(equation.outvars, values))
+            outcomes.append(self._carried(equation.outvars, values))
             sources.append(self.here)
             self.lines.append(f"br label %{end}")
         self.start(end)
-        results, lines = self._phis(found[0], sources[0])
-        self._close(lines, [self.operand(v) for v in found[1]], sources[1])
+        results, lines = self._phis(outcomes[0], sources[0])
+        self._close(lines, [self.operand(v) for v in outcomes[1]], sources[1])
         return results
 
     # Memory
@@ -169,32 +169,32 @@ class Writer(Instructions):
     def indices(self, ref: Ref, equation: Any, leaves: list[Value]) -> list[Value]:
         """Index in each dimension of an access to memory; a whole slice is the lane."""
         (indexer,) = jax.tree.unflatten(equation.params["tree"], leaves)
-        found = []
+        positions = []
         for index, size in zip(indexer.indices, ref.shape, strict=True):
             if isinstance(index, Value):
-                found.append(self.narrow(index))
+                positions.append(self.narrow(index))
             elif isinstance(index, int | np.integer):
-                found.append(Value("i32", False, None, int(index)))
+                positions.append(Value("i32", False, None, int(index)))
             elif index.size == size == self.lanes:  # a slice
-                found.append(self.lane_index())
+                positions.append(self.lane_index())
             else:
                 raise NotImplementedError(
                     f"a kernel's slice has {index.size} of {size} elements: it must be whole and "
                     f"have one of each of the {self.lanes} lanes"
                 )
-        return found
+        return positions
 
-    def _reads_on(self, equation: Any) -> bool:
+    def _read_follows(self, equation: Any) -> bool:
         """Whether the same array is read next at the same lanes, but for indices in between."""
         for other in self.following:
             if other.primitive.name == "get":
                 same = other.invars[0] is equation.invars[0]
                 return same and other.invars[-1] is equation.invars[-1]
-            if other.primitive.name not in ("add", "mul", "convert_element_type", *_SAME):
+            if other.primitive.name not in ("add", "mul", "convert_element_type", *_NO_OPERATION):
                 return False
         return False
 
-    def _one_a_lane(self, equation: Any) -> None:
+    def _check_shape(self, equation: Any) -> None:
         shape = equation.outvars[0].aval.shape
         if shape not in ((), (self.lanes,)):
             raise NotImplementedError(
@@ -231,15 +231,15 @@ class Writer(Instructions):
         if name in _INLINE:
             inner = params.get("jaxpr", params.get("call_jaxpr"))
             return self.run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), args)
-        if name in _SAME:
+        if name in _NO_OPERATION:
             return [self.splat(args[0]) if equation.outvars[0].aval.shape else args[0]]
         control = {"scan": self.loop, "while": self.while_loop, "cond": self.branch}
         if name in control:
             return control[name](equation, args)
         if name in ("get", "swap"):
-            self._one_a_lane(equation)
+            self._check_shape(equation)
         if name == "get":
-            self.last_of_group = not self._reads_on(equation)
+            self.last_of_group = not self._read_follows(equation)
             return [self.load(args[0], self.indices(args[0], equation, args[1:]))]
         if name == "swap":
             place = self.indices(args[0], equation, args[2:])
@@ -272,11 +272,11 @@ def scan_parts(params: dict[str, Any]) -> tuple[int, int, int]:
 
 def counters(jaxpr: Any, consts: int) -> list[int]:
     """Which of a loop's carried values grow by one in every round."""
-    found = []
+    places = []
     carried = jaxpr.invars[consts:]
     for k, (before, after) in enumerate(zip(carried, jaxpr.outvars, strict=True)):
         for e in jaxpr.eqns:
             step = e.invars[1] if e.primitive.name == "add" else None
             if isinstance(step, core.Literal) and e.outvars[0] is after and e.invars[0] is before:
-                found += [k] if step.val == 1 else []
-    return found
+                places += [k] if step.val == 1 else []
+    return places

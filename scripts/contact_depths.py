@@ -1,6 +1,6 @@
 """How deep fingers, object and palm stand in one another over grasps.
 
-python -m scripts.contact_depths docs/data/search/winners.npz --trials 3 --out runs/depths.json
+python -m scripts.contact_depths docs/data/search/buildable.npz --trials 3 --out runs/depths.json
 python -m scripts.contact_depths runs/ten --trials 18 --batch 1024 --out runs/depths.json
 
 A file is the .npz of a search of `scripts.search` (what it recommends in the end), a .json whose

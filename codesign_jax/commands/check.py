@@ -134,9 +134,9 @@ def _settings(options: Check, case: Case) -> Settings:
     if options.run_folder:
         return runs.read_run(options.run_folder)[1]
     objects = len(case.scene.objects.object)
-    how = {"optimizer": optimize.DEFAULT, "objects": objects}
+    arguments = {"optimizer": optimize.DEFAULT, "objects": objects}
     preset = common.design_file(options).preset
-    return runs.make_settings(preset, "concurrent", "morphology", case.engine, 0, **how)
+    return runs.make_settings(preset, "concurrent", "morphology", case.engine, 0, **arguments)
 
 
 def _without_own_code(settings: Settings) -> Settings:
@@ -164,23 +164,23 @@ def _draw(case: Case, stream: int, first: int, count: int) -> sampling.Drawn:
 
 def _timed(run: Run, designs: jax.Array, trials: Trial) -> tuple[Outcome, float]:
     begin = time.perf_counter()
-    found = jax.tree.map(np.asarray, interruptible(run, designs, trials))
-    return found, time.perf_counter() - begin
+    outcomes = jax.tree.map(np.asarray, interruptible(run, designs, trials))
+    return outcomes, time.perf_counter() - begin
 
 
 def _sample(options: Check, case: Case, run: Run, count: int) -> tuple[jax.Array, str]:
     """Designs of shape (count, parameter), repeated where there are fewer, and what they are."""
     if options.run_folder:
         particles = cases.read_record(options.run_folder).state.particles
-        found = np.unique(np.asarray(particles), axis=0)
-        words = f"the {common.counted(len(found), 'final particle')} of {options.run_folder} "
+        designs = np.unique(np.asarray(particles), axis=0)
+        words = f"the {common.counted(len(designs), 'final particle')} of {options.run_folder} "
         words += "that differ"
     elif options.design:
-        found = np.asarray(case.design)[None]
+        designs = np.asarray(case.design)[None]
         words = runs.describe(case.space, case.design)
     else:
-        found, words = _mixed(options, case, run, count)
-    return jnp.asarray(np.resize(found, (count, found.shape[1])), jnp.float32), words
+        designs, words = _mixed(options, case, run, count)
+    return jnp.asarray(np.resize(designs, (count, designs.shape[1])), jnp.float32), words
 
 
 def _mixed(options: Check, case: Case, run: Run, count: int) -> tuple[np.ndarray, str]:

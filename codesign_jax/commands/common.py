@@ -50,23 +50,23 @@ def cast_hands(
     given = tolerances.read(options.tolerances)
     with Meter("cast hands", (options.hands + 1) * trials, console) as meter:
         key = jax.random.key(options.seed)
-        found = tolerances.simulate(
+        hand_yield = tolerances.simulate(
             case, given, key, hands=options.hands, trials=trials, done=meter.advance
         )
-    for line in found.lines():
+    for line in hand_yield.lines():
         console.print(line)
-    return found
+    return hand_yield
 
 
 def changes(options: TrialFlags) -> dict[keypaths.Path, Any]:
     """Values by key path that --constants, --robust and --set replace; what --set names holds."""
-    found: dict[keypaths.Path, Any] = {}
+    values: dict[keypaths.Path, Any] = {}
     if options.constants is not None:
         table = draws.read(options.constants)
-        found |= draws.nominal(table) | {("drawn",): draws.plain(table)}
+        values |= draws.nominal(table) | {("drawn",): draws.plain(table)}
     noise = dataclasses.asdict(objects.ROBUST) if options.robust else {}
-    found |= {("objects", "noise", name): value for name, value in noise.items()}
-    return found | keypaths.parse(chain.from_iterable(options.overrides))
+    values |= {("objects", "noise", name): value for name, value in noise.items()}
+    return values | keypaths.parse(chain.from_iterable(options.overrides))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,16 +115,24 @@ def find_case(options: Subject, *, tell: Tell = warn) -> Case:
             scene = make_policy(options.policy, scene)[1]
         space = design_space(scene.hand, design_file(options).preset)
         design = find_design(space, words)
-        how = options.engine or engines.DEFAULT, options.policy or ""
-        return Case(scene, space, design, *how)
-    own = {"--hand": options.hand, "--scene": options.scene, "--preset": options.preset}
-    given = ["--design"] * bool(options.design) + [f for f, v in own.items() if v is not None]
+        engine_and_policy = options.engine or engines.DEFAULT, options.policy or ""
+        return Case(scene, space, design, *engine_and_policy)
+    subject_flags = {"--hand": options.hand, "--scene": options.scene, "--preset": options.preset}
+    given = ["--design"] * bool(options.design) + [
+        f for f, v in subject_flags.items() if v is not None
+    ]
     if given:
         raise InputError(
             [f"--run brings design, hand and scene of its own; leave out {' and '.join(given)}"]
         )
-    how = {"objects": options.objects, "accuracy": options.accuracy, "engine": options.engine}
-    case = cases.case_of_run(options.run_folder, overrides=changes(options), tell=tell, **how)
+    replacements = {
+        "objects": options.objects,
+        "accuracy": options.accuracy,
+        "engine": options.engine,
+    }
+    case = cases.case_of_run(
+        options.run_folder, overrides=changes(options), tell=tell, **replacements
+    )
     cases.refuse_other_policy(case.policy, options.policy)
     return case
 
@@ -146,8 +154,8 @@ def shortest(space: DesignSpace, design: np.ndarray) -> list[float]:
 
 def design_text(space: DesignSpace, file: DesignFile, design: np.ndarray) -> str:
     """A design [SI units] as the .toml text that --design opens again, in what the file names."""
-    own, others = tables.by_finger(space)
-    places = {space.names[k]: k for k in others} | own
+    per_finger, others = tables.by_finger(space)
+    places = {space.names[k]: k for k in others} | per_finger
     values = [f"{value:.9g}" for value in shortest(space, design)]
     lines = ["# A design in the hand file's units, for --design."]
     names = {name: v for name, v in dataclasses.asdict(file).items() if v and name != "design"}
@@ -162,7 +170,7 @@ def design_text(space: DesignSpace, file: DesignFile, design: np.ndarray) -> str
 
 def open_designs(words: Sequence[str]) -> tuple[dict[str, list[str]], DesignFile]:
     """Splits the words of --design into NAME=VALUE pairs, by the file that has them; the file."""
-    found: dict[str, list[str]] = {}
+    pairs_by_file: dict[str, list[str]] = {}
     file = DesignFile(PRESET, {})
     direct = []
     for word in keypaths.joined(words):
@@ -174,13 +182,13 @@ def open_designs(words: Sequence[str]) -> tuple[dict[str, list[str]], DesignFile
         file = schema.parse(DesignFile, library.read(path), path.name, problems)
         if file is None:
             raise InputError(problems)
-        pairs = found.setdefault(path.name, [])
+        pairs = pairs_by_file.setdefault(path.name, [])
         for name, value in file.design.items():
             if isinstance(value, list):
                 pairs += [f"{name}[{k}]={v}" for k, v in enumerate(value)]
             else:
                 pairs.append(f"{name}={value}")
-    return found | {"--design": direct}, file
+    return pairs_by_file | {"--design": direct}, file
 
 
 def find_design(space: DesignSpace, words: Sequence[str]) -> np.ndarray:
@@ -323,19 +331,19 @@ def policy_notes(engine: Engine, params: Params) -> list[str]:
     """Warnings of what a policy commands, if the engine asks one; nothing is simulated."""
     if not isinstance(engine, policy.ControlLoop):
         return []
-    found = policy.doubts(engine, params, rollout.nominal_trial(engine.scene))
-    return [f"warning: {text}" for text in found]
+    doubts = policy.doubts(engine, params, rollout.nominal_trial(engine.scene))
+    return [f"warning: {text}" for text in doubts]
 
 
 def parse_seeds(text: str) -> list[int]:
     """Reads seeds such as "0-9" or "1,3,5-7", in ascending order."""
-    found: set[int] = set()
+    seeds: set[int] = set()
     for part in text.split(","):
         match = re.fullmatch(r"\s*([0-9]{1,10})(?:-([0-9]{1,10}))?\s*", part)
         first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, -1)
         if last < first or last >= 2**31:
             raise InputError([f"--seeds {text!r} must be seeds such as 0-9 or 1,3,5"])
-        if last - first >= MOST or len(found) > MOST:
+        if last - first >= MOST or len(seeds) > MOST:
             raise InputError([f"--seeds {text!r} names more than {MOST} runs"])
-        found |= set(range(first, last + 1))
-    return sorted(found)
+        seeds |= set(range(first, last + 1))
+    return sorted(seeds)

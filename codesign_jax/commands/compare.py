@@ -59,9 +59,9 @@ class Compared(NamedTuple):
     @property
     def kind(self) -> dict[str, str]:
         """Properties besides the seed in which runs may differ, by column."""
-        own = {"scene": self.scene.name, "hand": self.scene.hand.name}
-        own["objects"] = self.scene.objects.name
-        return own | {_WORDS.get(n, n): str(getattr(self.settings, n)) for n in _OF_SETTINGS}
+        properties = {"scene": self.scene.name, "hand": self.scene.hand.name}
+        properties["objects"] = self.scene.objects.name
+        return properties | {_WORDS.get(n, n): str(getattr(self.settings, n)) for n in _OF_SETTINGS}
 
 
 def main(options: Compare) -> int:
@@ -98,16 +98,16 @@ def main(options: Compare) -> int:
 
 
 def _runs_in(folder: Path) -> list[Path]:
-    found = manifest.runs_inside(folder, "**")
-    if (folder / manifest.PROVENANCE).exists() or not found:
+    folders = manifest.runs_inside(folder, "**")
+    if (folder / manifest.PROVENANCE).exists() or not folders:
         runs.read_run(folder)  # which says what is wrong
         return [folder]
-    return found
+    return folders
 
 
 def read_all(every: Mapping[Path, tuple[Scene, Settings]]) -> dict[Path, Compared]:
     """The runs in folders as they are, with the fresh trials that these have, by folder."""
-    found = {}
+    compared = {}
     for folder, (scene, settings) in every.items():
         result = read(scene, folder)
         fresh = None
@@ -119,8 +119,8 @@ def read_all(every: Mapping[Path, tuple[Scene, Settings]]) -> dict[Path, Compare
             if kept is not None:
                 other, _ = reference.stored_stress(folder, settings)
                 fresh = reference.judged(scene, kept, other)
-        found[folder] = Compared(scene, settings, result, fresh)
-    return found
+        compared[folder] = Compared(scene, settings, result, fresh)
+    return compared
 
 
 def _pair(options: Compare, places: list[Path], *, runs: bool) -> dict[str, Case]:
@@ -133,8 +133,8 @@ def _pair(options: Compare, places: list[Path], *, runs: bool) -> dict[str, Case
     if len(cases) == 1:
         [case] = cases
         return {f"{names[0]} with {case.policy}": case, "without": case._replace(policy="")}
-    one, other = cases
-    if one.scene.objects != other.scene.objects:
+    first, other = cases
+    if first.scene.objects != other.scene.objects:
         what = "runs" if runs else "designs"
         raise InputError(
             [f"the two {what} have other objects or noise: --objects says which to take"]
@@ -146,14 +146,16 @@ def _pair(options: Compare, places: list[Path], *, runs: bool) -> dict[str, Case
 
 def _subject(options: Compare, place: Path, *, of_run: bool) -> flags.Subject:
     names = ("accuracy", "objects", "overrides", "constants", "robust", "engine")
-    how = {n: getattr(options, n) for n in names}
+    arguments = {n: getattr(options, n) for n in names}
     if of_run:
-        own = runs.read_run(place)[1].policy
-        policy = own if own in options.policy else None
-        return flags.Subject(run_folder=place, policy=policy, **how)
+        policy_of_run = runs.read_run(place)[1].policy
+        policy = policy_of_run if policy_of_run in options.policy else None
+        return flags.Subject(run_folder=place, policy=policy, **arguments)
     if len(options.policy) > 1:
         raise InputError(["--policy takes one policy beside design files"])
-    return flags.Subject(design=((str(place),),), policy=next(iter(options.policy), None), **how)
+    return flags.Subject(
+        design=((str(place),),), policy=next(iter(options.policy), None), **arguments
+    )
 
 
 def compare_pair(pair: dict[str, Case], options: Compare, console: Console) -> None:
@@ -180,8 +182,8 @@ def difference(first: np.ndarray, second: np.ndarray, names: list[str]) -> list[
     only = int((first & ~second).sum()), int((~first & second).sum())
     both = int((first & second).sum())
     total = len(first)
-    found = statistics.paired(both, *only, total)
-    value, low, high = (100 * v for v in found)
+    interval = statistics.paired(both, *only, total)
+    value, low, high = (100 * v for v in interval)
     word = f"{names[value < 0]} keeps more"
     if low <= 0 <= high:
         word = "no difference is shown"
@@ -200,10 +202,10 @@ def _needed(first: int, second: int, total: int) -> int:
 
     By the normal distribution's variance of a difference of paired shares.
     """
-    one = first / total
+    share = first / total
     other = second / total
-    variance = one + other - (one - other) ** 2
-    return math.ceil(1.96**2 * variance / (one - other) ** 2)
+    variance = share + other - (share - other) ** 2
+    return math.ceil(1.96**2 * variance / (share - other) ** 2)
 
 
 def of_test(scene: Scene, result: RunResult) -> Judged:
@@ -221,14 +223,14 @@ def compare(every: Mapping[Path, Compared], console: Console, *, named: bool = F
     groups: dict[tuple[str, ...], list[Compared]] = {}
     rows = []
     for folder, run in every.items():
-        own = tuple(kinds[folder][n] for n in differ)
-        groups.setdefault(own, []).append(run)
+        key = tuple(kinds[folder][n] for n in differ)
+        groups.setdefault(key, []).append(run)
         name = [folder.as_posix()] if named else []
-        rows.append((*name, *own, str(run.settings.seed), *_row(run)))
+        rows.append((*name, *key, str(run.settings.seed), *_row(run)))
     head = ("seed", "converged", "judged by", "kept", "lost", "not released", "failed", "verdict")
     head += ("other conditions",)
     common.print_table(console, _table((*["run"] * named, *differ, *head), rows))
-    rows = [(*kind, *_summary(own)) for kind, own in groups.items()]
+    rows = [(*kind, *_summary(group)) for kind, group in groups.items()]
     if len(groups) > 1:
         head = ("converged", "grasps until then, median", "good", "95 % interval")
         common.print_table(console, _table((*differ, *head), rows))
@@ -249,21 +251,21 @@ def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Table:
     return table
 
 
-def _summary(own: list[Compared]) -> tuple[str, ...]:
+def _summary(group: list[Compared]) -> tuple[str, ...]:
     """Summary of the runs of a kind; unknown values are empty."""
-    size = own[0].settings.particles * own[0].settings.trials
-    episodes = [run.converged for run in own]
+    size = group[0].settings.particles * group[0].settings.trials
+    episodes = [run.converged for run in group]
     # Of an even number the upper one of the two in the middle: never, if half of them never do.
-    middle = sorted(np.inf if e is None else (e - 1) * size for e in episodes)[len(own) // 2]
-    converged = f"{sum(e is not None for e in episodes)} of {len(own)}"
+    middle = sorted(np.inf if e is None else (e - 1) * size for e in episodes)[len(group) // 2]
+    converged = f"{sum(e is not None for e in episodes)} of {len(group)}"
     grasps = "never" if np.isinf(middle) else f"{middle:.0f}"
-    found = [judged for run in own if (judged := run.judged) is not None]
-    if not found:
+    judgements = [judged for run in group if (judged := run.judged) is not None]
+    if not judgements:
         return converged, grasps, "", ""
-    good = sum(judged.verdict.word == "good" for judged in found)
-    share = statistics.wilson(good, len(found))
+    good = sum(judged.verdict.word == "good" for judged in judgements)
+    share = statistics.wilson(good, len(judgements))
     interval = f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
-    return converged, grasps, f"{good} of {len(found)}", interval
+    return converged, grasps, f"{good} of {len(judgements)}", interval
 
 
 def write_table(every: Mapping[Path, Compared], path: Path) -> None:
@@ -273,18 +275,18 @@ def write_table(every: Mapping[Path, Compared], path: Path) -> None:
 
 def _values(place: Path, run: Compared, path: Path) -> dict[str, object]:
     """The row of a run in a place, for a table's path; what is not known is empty."""
-    found: dict[str, object] = dict.fromkeys(columns.MORE[columns.SEEDS].columns, "")
-    found["run"] = Path(os.path.relpath(place, path.parent)).as_posix()
-    found |= {name: getattr(run.settings, name) for name in ("seed", "schedule", "first")}
+    row: dict[str, object] = dict.fromkeys(columns.MORE[columns.SEEDS].columns, "")
+    row["run"] = Path(os.path.relpath(place, path.parent)).as_posix()
+    row |= {name: getattr(run.settings, name) for name in ("seed", "schedule", "first")}
     record = run.result and run.result.record
-    found["finished"] = int(bool(record) and record.done == run.settings.episodes)
-    found["converged_episode"] = run.converged or ""
+    row["finished"] = int(bool(record) and record.done == run.settings.episodes)
+    row["converged_episode"] = run.converged or ""
     if run.result is None or run.result.record is None or run.result.test is None:
-        return found
+        return row
     test = run.result.test
     chosen = of_test(run.scene, run.result)
     first = np.unique(np.asarray(run.result.record.state.particles), axis=0, return_index=True)[1]
-    found |= {
+    row |= {
         "best_test_cost": f"{np.asarray(test.cost).min():.9g}",
         "kept_trials": verdict.tally(chosen.outcomes).kept,
         "trials": chosen.outcomes.cost.size,
@@ -295,10 +297,10 @@ def _values(place: Path, run: Compared, path: Path) -> dict[str, object]:
     }
     if run.fresh is not None:
         counts = verdict.tally(run.fresh.outcomes)._asdict()
-        found |= {f"fresh_{name}_trials": number for name, number in counts.items()}
+        row |= {f"fresh_{name}_trials": number for name, number in counts.items()}
         mean = float(cost.particle_cost(run.fresh.scene, run.fresh.outcomes))
-        found["fresh_cost"] = f"{mean:.9g}"
-    return found
+        row["fresh_cost"] = f"{mean:.9g}"
+    return row
 
 
 def _row(run: Compared) -> tuple[str, ...]:
@@ -309,8 +311,8 @@ def _row(run: Compared) -> tuple[str, ...]:
     if judged is None:
         return (converged, *[""] * 7)
     where = "final test" if run.fresh is None else f"{judged.accuracy}"
-    found = verdict.tally(judged.outcomes)
-    numbers = f"{found.kept} of {found.total}", *map(str, found[1:])
+    tally = verdict.tally(judged.outcomes)
+    numbers = f"{tally.kept} of {tally.total}", *map(str, tally[1:])
     return (converged, where, *numbers, judged.verdict.word, judged.limits)
 
 

@@ -43,14 +43,14 @@ def main(options: Evaluate) -> int:
             console.print(note)
         console.print(_size(case, options))
         return 0
-    one = simulate(case, options, console)
+    outcomes = simulate(case, options, console)
     other = other_conditions(case, options, console) if options.stress else None
-    tell_verdict(case, one, other, options, console)
+    tell_verdict(case, outcomes, other, options, console)
     if options.tolerances != common.OFF:
         common.cast_hands(case, options, options.trials or tolerances.TRIALS, console)
     if options.render or options.forces or options.pull:
         of_objects(case, engine, options, console)
-    return int(types.failed(one.status).all())  # no trial says anything of the design
+    return int(types.failed(outcomes.status).all())  # no trial says anything of the design
 
 
 def _size(case: Case, options: Evaluate) -> str:
@@ -105,26 +105,26 @@ def simulate(case: Case, options: Evaluate, console: Console) -> types.Outcome:
     if asked is None:
         later = _of_each(options) * stress.sets(case.scene) if options.stress else 0
         with Meter("trials", verdict.USUAL, console, later=later) as meter:
-            one = reference.decided(case, key, verdict.MOST, meter)
+            outcomes = reference.decided(case, key, verdict.MOST, meter)
     else:
         with Busy(console, f"simulating {common.counted(asked, 'grasp')}"):
-            one = case.simulate(asked, key)
+            outcomes = case.simulate(asked, key)
     names = [shape.name for shape in case.scene.objects.object]
-    for k, name in enumerate(names[: one.cost.size]):
-        own = jax.tree.map(lambda v, k=k: v[k :: len(names)], one)
-        console.print(f"{name:>12}: {verdicts.of_trials(case.scene, own)}")
-    judged = verdicts.Judged(case.scene, one, options.accuracy)
-    for line in [f"{'all':>12}: {judged.details}", *verdicts.solver(one)]:
+    for k, name in enumerate(names[: outcomes.cost.size]):
+        object_outcomes = jax.tree.map(lambda v, k=k: v[k :: len(names)], outcomes)
+        console.print(f"{name:>12}: {verdicts.of_trials(case.scene, object_outcomes)}")
+    judged = verdicts.Judged(case.scene, outcomes, options.accuracy)
+    for line in [f"{'all':>12}: {judged.details}", *verdicts.solver(outcomes)]:
         console.print(line)
     if case.policy:
         with Busy(console, "asking what the policy commanded"):
             told = case.observe(verdict.BATCH if asked is None else asked, key)[1]
         console.print(f"policy {case.policy} {told}")
     if options.out:
-        drawn = rollout.sample_trials(case.scene, key, one.cost.size)
-        tables.write_grasps(options.out, case.scene, jax.tree.map(np.asarray, drawn), one)
+        drawn = rollout.sample_trials(case.scene, key, outcomes.cost.size)
+        tables.write_grasps(options.out, case.scene, jax.tree.map(np.asarray, drawn), outcomes)
         console.print(f"table: {options.out}")
-    return one
+    return outcomes
 
 
 def other_conditions(case: Case, options: Evaluate, console: Console) -> Stress:
@@ -132,20 +132,20 @@ def other_conditions(case: Case, options: Evaluate, console: Console) -> Stress:
     count = _of_each(options)
     with Meter("other conditions", count * stress.sets(case.scene), console) as meter:
         key = jax.random.key(options.seed)
-        found = stress.simulate(case, count, key, meter.advance)
-    reference.tell_stress(case, found, console)
-    return found
+        stress_result = stress.simulate(case, count, key, meter.advance)
+    reference.tell_stress(case, stress_result, console)
+    return stress_result
 
 
 def tell_verdict(
     case: Case,
-    one: types.Outcome,
+    outcomes: types.Outcome,
     other: Stress | None,
     options: Evaluate,
     console: Console,
 ) -> None:
     """Prints the verdict of the trials, and what speaks against it."""
-    judged = verdicts.Judged(case.scene, one, options.accuracy, stress=other)
+    judged = verdicts.Judged(case.scene, outcomes, options.accuracy, stress=other)
     for line in [*verdicts.warnings(judged), f"verdict: {judged}"]:
         console.print(line)
 
@@ -181,8 +181,8 @@ def of_objects(case: Case, engine: Engine, options: Evaluate, console: Console) 
     if options.pull:
         with Busy(console, "pulling"):
             along = forces.direction(options.pull)
-            found = forces.pull(scene, engine, params, trials, along)
-        for shape, force in zip(np.asarray(trials.shape), found, strict=True):
+            pulls = forces.pull(scene, engine, params, trials, along)
+        for shape, force in zip(np.asarray(trials.shape), pulls, strict=True):
             name = scene.objects.object[int(shape)].name
             console.print(f"{name:>12}: {forces.in_words(force)}")
     if options.render:

@@ -138,11 +138,11 @@ def write_files(
     valves.write(folder, case.scene, params)
     printed = None if options.no_parts else _parts(case, params, sizes, folder, options, console)
     if not options.no_sheet:
-        found = None
+        hand_yield = None
         if options.tolerances != common.OFF:
-            found = common.cast_hands(case, options, tolerances.TRIALS, console)
+            hand_yield = common.cast_hands(case, options, tolerances.TRIALS, console)
         with Busy(console, "writing the build sheet"):
-            lacking = _sheet(case, params, sizes, (found, printed, peaks), folder, options)
+            lacking = _sheet(case, params, sizes, (hand_yield, printed, peaks), folder, options)
         if lacking:
             console.print(
                 f"the PDF writes ? for letters that no font here has: {' '.join(lacking)} "
@@ -187,11 +187,11 @@ def _parts(
     from codesign_jax.export import meshes, palm  # needs the extra
 
     folder = folder / meshes.FOLDER
-    how = _process(options)
+    settings = _process(options)
     folder.mkdir(exist_ok=True)
     with Busy(console, "making fingers, moulds and the palm"):
-        made = palm.palm(case.scene, params, sizes, how)
-        parts = [*meshes.write(folder, sizes, how), *meshes.write_palm(folder, made)]
+        made = palm.palm(case.scene, params, sizes, settings)
+        parts = [*meshes.write(folder, sizes, settings), *meshes.write_palm(folder, made)]
     for part in parts:
         edges = " x ".join(f"{v:.1f}" for v in part.extents)
         console.print(f"part {part.name}: {edges} mm, {part.volume / 1e3:.1f} cm^3")
@@ -203,7 +203,7 @@ def _parts(
     if made.flange is None:
         console.print("note: the palm has no room for screws to the wrist")
     for i, size in enumerate(sizes):
-        if how.inlet and not process.inlet(size, how):
+        if settings.inlet and not process.inlet(size, settings):
             low = min(size.base.chamber)
             console.print(
                 f"finger {i} has no inlet: its chamber of {low:g} mm is narrower than the tube"
@@ -228,13 +228,13 @@ def _models(case: Case, params: Params, folder: Path, options: Export, console: 
 def _trials(case: Case, options: Export) -> list[tuple[str, Trial]]:
     scene = case.scene
     names = tables.names_of([shape.name for shape in scene.objects.object])
-    found = [(name, rollout.nominal_trial(scene, i)) for i, name in enumerate(names)]
+    trials = [(name, rollout.nominal_trial(scene, i)) for i, name in enumerate(names)]
     if options.trials:
         noisy = rollout.sample_trials(scene, jax.random.key(options.seed), options.trials)
         for t in range(options.trials):
             trial = jax.tree.map(lambda v, t=t: v[t], noisy)
-            found.append((f"trial_{t:03d}_{names[int(trial.shape)]}", trial))
-    return [(name, jax.tree.map(np.asarray, trial)) for name, trial in found]
+            trials.append((f"trial_{t:03d}_{names[int(trial.shape)]}", trial))
+    return [(name, jax.tree.map(np.asarray, trial)) for name, trial in trials]
 
 
 def _described(shape: Shape) -> str:
@@ -260,8 +260,8 @@ def _sheet(
     for note in kept.notes:
         common.warn(note)
     tested = None if kept.fresh is None else str(kept.fresh), kept.stress
-    found, printed, peaks = added
-    content = sheet.sheet_sections(case.scene, params, sizes, found, tested)
+    hand_yield, printed, peaks = added
+    content = sheet.sheet_sections(case.scene, params, sizes, hand_yield, tested)
     title = f"Build sheet: {case.scene.hand.name}"
     origin = _origin(options)
     code = provenance.git_state()

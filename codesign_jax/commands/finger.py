@@ -103,8 +103,8 @@ def compare(mine: Finger, table: dict[str, np.ndarray], options: Options, consol
     if options.fit:
         fit = fingers.fit(mine, table)
         models["fitted"] = mine.of_material(**fit.value)
-    found = {which: fingers.predict(model, table) for which, model in models.items()}
-    columns = _columns(table, found, measured=options.measured is not None)
+    predictions = {which: fingers.predict(model, table) for which, model in models.items()}
+    columns = _columns(table, predictions, measured=options.measured is not None)
     shown = Table(box=box.SIMPLE)
     for name in columns:
         shown.add_column(name.replace("_", " "), justify="right")
@@ -113,12 +113,12 @@ def compare(mine: Finger, table: dict[str, np.ndarray], options: Options, consol
     common.print_table(console, shown)
     if (rows := len(table["pressure"])) > MOST_ROWS:
         console.print(f"{rows - MOST_ROWS} more rows: --out writes all of them")
-    for line in chain.from_iterable(_without_rest(table, *item) for item in found.items()):
+    for line in chain.from_iterable(_without_rest(table, *item) for item in predictions.items()):
         console.print(line)
     if options.measured:
-        for which, values in found.items():
+        for which, values in predictions.items():
             console.print(f"{which}: {_errors(table, values)}")
-        for name in fingers.opposed(table, found["model"]):
+        for name in fingers.opposed(table, predictions["model"]):
             console.print(f"warning: measured and predicted {words(name)} differ in sign")
     if fit:
         for line in [*_of_fit(fit, mine), *_next(mine, fit, table)]:
@@ -134,10 +134,10 @@ def compare(mine: Finger, table: dict[str, np.ndarray], options: Options, consol
 
 
 def _without_rest(
-    table: dict[str, np.ndarray], which: str, found: dict[str, np.ndarray]
+    table: dict[str, np.ndarray], which: str, prediction: dict[str, np.ndarray]
 ) -> Iterator[str]:
     """Says where a finger has no rest, after what it has."""
-    for name, pressures in fingers.without_rest(table, found).items():
+    for name, pressures in fingers.without_rest(table, prediction).items():
         places = ", ".join(f"{pressure / 1e3:.4g}" for pressure in pressures)
         yield (
             f"warning: {which}: no rest found for the {words(name)} at {places} kPa: "
@@ -146,7 +146,7 @@ def _without_rest(
 
 
 def _columns(
-    table: dict[str, np.ndarray], found: dict[str, dict[str, np.ndarray]], *, measured: bool
+    table: dict[str, np.ndarray], predictions: dict[str, dict[str, np.ndarray]], *, measured: bool
 ) -> dict[str, np.ndarray]:
     """Columns to print, by name and unit; measured and predicted ones beside each other."""
     columns = {}
@@ -157,7 +157,7 @@ def _columns(
         elif name in table:
             if measured:
                 columns[f"{name}_{unit}"] = table[name] / size
-            for which, values in found.items():
+            for which, values in predictions.items():
                 columns[f"{which}_{name}_{unit}"] = values[name] / size
     return columns
 
@@ -223,7 +223,10 @@ def _next(mine: Finger, fit: Posterior, table: dict[str, np.ndarray]) -> list[st
         best = fingers.advice(mine, fit, table)[:SHOWN_ADVICE]
     except ValueError:
         return []
-    return [f"to narrow them by {100 * one.less:.0f} %, measure {one.words}" for one in best]
+    return [
+        f"to narrow them by {100 * measurement.less:.0f} %, measure {measurement.words}"
+        for measurement in best
+    ]
 
 
 def _write(fit: Posterior, mine: Finger, options: Options) -> None:

@@ -31,19 +31,19 @@ OUT = 0.02
 
 def columns(forces: Forces) -> dict[str, Any]:
     """Forces by the names of their columns, arrays as of one trial."""
-    found = {}
+    table = {}
     for name in ("finger", "palm", "table", "finger_table", "palm_table"):
         value = getattr(forces, name)
         each = {name: value} if value.ndim == 2 else {}
         each |= {f"{name}_{i}": value[:, i] for i in range(value.shape[1] if not each else 0)}
         for who, vector in each.items():
-            found |= {f"{who}_{axis}_N": vector[:, k] for k, axis in enumerate("xyz")}
+            table |= {f"{who}_{axis}_N": vector[:, k] for k, axis in enumerate("xyz")}
     fingers = range(forces.grip.shape[1])
-    found |= {f"grip_{i}_N": forces.grip[:, i] for i in fingers}
+    table |= {f"grip_{i}_N": forces.grip[:, i] for i in fingers}
     pairs = [(i, j) for i in fingers for j in fingers[i:]]
-    found |= {f"finger_finger_{i}_{j}_N": forces.finger_finger[:, i, j] for i, j in pairs}
-    found |= {f"finger_palm_{i}_N": forces.finger_palm[:, i] for i in fingers}
-    return found | {f"depth_{kind}_mm": 1e3 * depth for kind, depth in forces.depth.items()}
+    table |= {f"finger_finger_{i}_{j}_N": forces.finger_finger[:, i, j] for i, j in pairs}
+    table |= {f"finger_palm_{i}_N": forces.finger_palm[:, i] for i in fingers}
+    return table | {f"depth_{kind}_mm": 1e3 * depth for kind, depth in forces.depth.items()}
 
 
 def write(path: Path, scene: Scene, grasps: list[Replay]) -> None:
@@ -83,13 +83,13 @@ def direction(text: str) -> np.ndarray:
     """Unit vector of what `--pull` was given: down, x, y, z, or three numbers such as 1,0,-1."""
     axes = {"down": (0, 0, -1), "x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
     try:
-        found = np.array(axes[text] if text in axes else text.split(","), float)
+        vector = np.array(axes[text] if text in axes else text.split(","), float)
     except ValueError:
-        found = np.zeros(0)
-    if found.shape != (3,) or not np.isfinite(found).all() or not found.any():
+        vector = np.zeros(0)
+    if vector.shape != (3,) or not np.isfinite(vector).all() or not vector.any():
         words = "must be down, x, y, z or three numbers in the world frame, such as 1,0,-1"
         raise InputError([f"--pull {text} {words}"])
-    return found / np.linalg.norm(found)
+    return vector / np.linalg.norm(vector)
 
 
 def pull(
@@ -131,13 +131,13 @@ def pull(
         def pulled(carry: tuple) -> tuple:
             # A step finds the velocities at its end, v + h a, from contacts at these: what a force
             # adds to v before it is exact.
-            force, state, found = carry
+            force, state, least_force = carry
             force = force + RATE * step
             start = state.at[:, linear].add(step * force / mass * along)
             trace = engine.rollout(fields._replace(start=start), still, trajectory=True)
             assert trace.last is not None
             out = jnp.linalg.norm(place(trace.last) - first, axis=1) > OUT
-            return force, trace.last, jnp.where(out, jnp.minimum(found, force), found)
+            return force, trace.last, jnp.where(out, jnp.minimum(least_force, force), least_force)
 
         kept = begun.distance[:, -1] < scene.cost.lost_distance
         start = jnp.zeros(()), begun.last, jnp.full_like(begun.distance[:, -1], jnp.inf)

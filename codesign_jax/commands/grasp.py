@@ -51,14 +51,14 @@ def _of_run(case: Case, options: GraspFlags, folder: Path) -> Asked:
         raise InputError(["--objects replaces the run's: --object must say which one to grasp"])
     place = {"episode": options.episode, "particle": options.particle, "trial": options.trial}
     record = cases.read_record(folder, tell=lambda text: None)  # `find_case` has said it
-    found = cases.find_grasp(runs.read_run(folder)[0], record, **place)
-    case = case._replace(design=found.design)
+    grasp = cases.find_grasp(runs.read_run(folder)[0], record, **place)
+    case = case._replace(design=grasp.design)
     if options.object is not None:
         return _nominal(case, options.object)
-    name = case.scene.objects.object[int(found.trial.shape)].name
-    episode, particle, trial = found.place
+    name = case.scene.objects.object[int(grasp.trial.shape)].name
+    episode, particle, trial = grasp.place
     text = f"episode {episode}, particle {particle}, trial {trial}: object {name}"
-    return Asked(case, found.trial, text, cases.ending(found.outcome))
+    return Asked(case, grasp.trial, text, cases.ending(grasp.outcome))
 
 
 def _nominal(case: Case, shape: int | str) -> Asked:

@@ -53,8 +53,8 @@ def _problem(word: str, case: Case) -> str:
         limits = [case.space.in_units(np.array(v))[k] for v in (case.space.low, case.space.high)]
         bounds = [round(float(limit), 9) for limit in limits]
         for value in ends:
-            if found := schema.range_problem(name, value, case.space.units[k], *bounds):
-                return f"--parameters {found}"
+            if problem := schema.range_problem(name, value, case.space.units[k], *bounds):
+                return f"--parameters {problem}"
         return ""
     if not equals:
         return f"--parameters {name!r} is not a parameter; {_meant(name, case.space.names)}"
@@ -98,12 +98,14 @@ def _changed(case: Case, options: Options, paths: list[tuple[str, ...]], value: 
     """The scene with another number, as --set makes it, with its checks."""
     pairs = tuple(f"{'.'.join(path)}={float(value)!r}" for path in paths)
     # Of a run that came first, `run_folder` has it already.
-    own = dataclasses.replace(options, first=None, overrides=(*options.overrides, pairs))
-    found = common.find_case(own, tell=lambda text: None).scene
-    if found.structure != case.scene.structure:
+    changed_options = dataclasses.replace(
+        options, first=None, overrides=(*options.overrides, pairs)
+    )
+    scene = common.find_case(changed_options, tell=lambda text: None).scene
+    if scene.structure != case.scene.structure:
         key = ".".join(paths[0])
         raise InputError([f"--parameters {key} is structure, not a number: --set changes it"])
-    return found
+    return scene
 
 
 def _entries(value: Any, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
@@ -149,12 +151,14 @@ def numbers(scene: Scene, pair: tuple[Axis, Axis]) -> np.ndarray | None:
     if not any(axis.scenes for axis in pair):
         return None
     base = np.array(jax.tree.leaves(scene), float)
-    own = [np.array([jax.tree.leaves(one) for one in axis.scenes], float) for axis in pair]
-    found = []
+    leaves = [
+        np.array([jax.tree.leaves(variant) for variant in axis.scenes], float) for axis in pair
+    ]
+    rows = []
     for place in np.ndindex(*(len(axis.values) for axis in pair)):
         row = base.copy()
-        for k, every in zip(place, own, strict=True):
+        for k, every in zip(place, leaves, strict=True):
             if every.size:
                 row = np.where(every[k] != base, every[k], row)
-        found.append(row)
-    return np.array(found)
+        rows.append(row)
+    return np.array(rows)

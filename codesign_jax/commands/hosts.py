@@ -63,8 +63,8 @@ def run(options: Optimize) -> tuple[int, int]:
     mine = ",".join(map(str, chosen[index::count]))
     code = 0
     if mine:
-        own = dataclasses.replace(options, distributed=None, seeds=mine)
-        code = in_a_process(own.run)
+        host_options = dataclasses.replace(options, distributed=None, seeds=mine)
+        code = in_a_process(host_options.run)
     if code < 128:  # not stopped by a signal
         with Busy(Console(), f"waiting for the runs of {count} processes"):
             jax.distributed.shutdown()

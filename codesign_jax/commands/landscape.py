@@ -55,18 +55,18 @@ def main(options: Options) -> int:
     if options.dry_run:
         return 0
     simulated = simulated_designs(case, made, size, options, console)
-    found = summarize(case, made, simulated, options.seed)
-    print_summary(case, found, console)
-    write_files(found, folder, console)
+    result = summarize(case, made, simulated, options.seed)
+    print_summary(case, result, console)
+    write_files(result, folder, console)
     return 0
 
 
 def _folder(options: Options, case: Case, pair: tuple[Axis, Axis]) -> Path:
-    own = options.run_folder
+    run_folder = options.run_folder
     folder = Path("landscape")
     of_designs = all(axis.column is not None for axis in pair)
-    if own is not None and of_designs and case.scene == runs.read_run(own)[0]:
-        folder = own
+    if run_folder is not None and of_designs and case.scene == runs.read_run(run_folder)[0]:
+        folder = run_folder
     if options.out is not None:
         folder = options.out
     common.refuse(common.place_problems("--out", folder, folder=True))
@@ -91,9 +91,9 @@ def make_plane(case: Case, pair: tuple[Axis, Axis]) -> Plane:
     space = case.space
     values = np.meshgrid(*(axis.values for axis in pair), indexing="ij")
     designs = np.tile(np.asarray(case.design, np.float32), (values[0].size, 1))
-    for axis, own in zip(pair, values, strict=True):
+    for axis, coordinates in zip(pair, values, strict=True):
         if axis.column is not None:
-            designs[:, axis.column] = own.ravel() * space.scale[axis.column]
+            designs[:, axis.column] = coordinates.ravel() * space.scale[axis.column]
     projected = jax.jit(jax.vmap(space.of_table.project))(designs)
     return Plane(pair, np.asarray(projected), grid.numbers(case.scene, pair))
 
@@ -126,21 +126,21 @@ def _in_scenes(
     run = SceneProgram(case.scene, _worlds(case.make_engine(), case.space, count))
 
     def scene_of(rows: np.ndarray | int) -> Scene:
-        own = [numbers[rows, k] if varied[k] else value for k, value in enumerate(base)]
-        return jax.tree.unflatten(tree, own)
+        leaves = [numbers[rows, k] if varied[k] else value for k, value in enumerate(base)]
+        return jax.tree.unflatten(tree, leaves)
 
     def call(rows: np.ndarray) -> Outcome:
         drawn = [rollout.sample_trials(scene_of(row), key, count) for row in rows]
         trials = jax.tree.map(lambda *v: jnp.concatenate(v), *drawn)
         every = np.repeat(rows, count)
-        own = jnp.asarray(designs[every], jnp.float32)
-        return rollout.grid(run(own, trials, scene_of(every)), (len(rows), count))
+        repeated_designs = jnp.asarray(designs[every], jnp.float32)
+        return rollout.grid(run(repeated_designs, trials, scene_of(every)), (len(rows), count))
 
-    found = []
+    outcomes = []
     for outcome in batch.in_chunks(call, len(designs), size):
-        found.append(outcome)
+        outcomes.append(outcome)
         advance(outcome.cost.size)
-    return jax.tree.map(lambda *v: np.concatenate(v), *found)
+    return jax.tree.map(lambda *v: np.concatenate(v), *outcomes)
 
 
 @shared
@@ -152,56 +152,56 @@ def _worlds(engine: Engine, space: DesignSpace, num_trials: int) -> Callable:
     return simulated
 
 
-def summarize(case: Case, made: Plane, found: Outcome, seed: int) -> Landscape:
+def summarize(case: Case, made: Plane, outcomes: Outcome, seed: int) -> Landscape:
     """The landscape of a grid's outcomes, arrays of shape (design, trial), in trials of a seed."""
     shape = tuple(len(axis.values) for axis in made.axes)
-    counted = ~failed(found.status)
-    kept = verdict.kept(found)
+    counted = ~failed(outcomes.status)
+    kept = verdict.kept(outcomes)
     return Landscape(
         names=np.array([axis.name for axis in made.axes]),
         units=np.array([axis.unit for axis in made.axes]),
         first=made.axes[0].values,
         second=made.axes[1].values,
-        cost=np.asarray(particle_cost(case.scene, found)).reshape(shape),
+        cost=np.asarray(particle_cost(case.scene, outcomes)).reshape(shape),
         kept=kept.sum(1).reshape(shape),
         counted=counted.sum(1).reshape(shape),
-        trials=np.array(found.cost.shape[1]),
+        trials=np.array(outcomes.cost.shape[1]),
         seed=np.array(seed),
         design=np.asarray(case.design),
     )
 
 
-def print_summary(case: Case, found: Landscape, console: Console) -> None:
+def print_summary(case: Case, result: Landscape, console: Console) -> None:
     """Prints the number of good designs, the best one, and failed trials."""
-    i, j = np.unravel_index(int(found.cost.argmin()), found.cost.shape)
-    good = int((found.cost < codesign.SUCCESS_COST).sum())
+    i, j = np.unravel_index(int(result.cost.argmin()), result.cost.shape)
+    good = int((result.cost < codesign.SUCCESS_COST).sum())
     place = " ".join(
         f"{name}={value:.4g} {unit}".rstrip()
         for name, value, unit in zip(
-            found.names, (found.first[i], found.second[j]), found.units, strict=True
+            result.names, (result.first[i], result.second[j]), result.units, strict=True
         )
     )
     console.print(
-        f"{good} of {found.cost.size} points have a mean cost below {codesign.SUCCESS_COST}; "
-        f"lowest: {found.cost[i, j]:.4f} at {place}"
+        f"{good} of {result.cost.size} points have a mean cost below {codesign.SUCCESS_COST}; "
+        f"lowest: {result.cost[i, j]:.4f} at {place}"
     )
-    best = float((found.kept / found.trials).max())
+    best = float((result.kept / result.trials).max())
     console.print(
-        f"kept: {found.kept.sum()} of {found.kept.size * int(found.trials)}; most of a "
+        f"kept: {result.kept.sum()} of {result.kept.size * int(result.trials)}; most of a "
         f"point: {100 * best:.0f} %"
     )
-    bad = int((int(found.trials) - found.counted).sum())
+    bad = int((int(result.trials) - result.counted).sum())
     if bad:
-        console.print(f"{bad} of {found.cost.size * int(found.trials)} trials failed")
+        console.print(f"{bad} of {result.cost.size * int(result.trials)} trials failed")
 
 
-def write_files(found: Landscape, folder: Path, console: Console) -> None:
+def write_files(result: Landscape, folder: Path, console: Console) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    for path in landscape.save(found, folder):
+    for path in landscape.save(result, folder):
         console.print(f"landscape: {path}")
     from codesign_jax.report import figures
 
     path = folder / "figures" / "landscape.png"
     with files.naming(path):
-        figures.save(figures.landscape(found), path)
+        figures.save(figures.landscape(result), path)
     console.print(f"figure: {path}")

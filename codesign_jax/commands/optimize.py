@@ -41,7 +41,7 @@ def main(options: Optimize) -> int:
     scene, settings = resolve(options)
     every = runs_of(options, scene, settings)
     plan = runs.prepare(scene, settings)
-    plans = {folder: runs.variant(plan, own) for folder, own in every.items()}
+    plans = {folder: runs.variant(plan, run_settings) for folder, run_settings in every.items()}
     _refuse(options, scene, every)
     for note in preflight.notes(scene, plan.space, _ends(plan.space)):
         say(note)
@@ -52,8 +52,8 @@ def main(options: Optimize) -> int:
         return 0
     most = reference.most_trials(options.reference_trials, settings)
     after = _after(scene, most)
-    how = {"devices": options.devices, "chunk": options.chunk, "after": after}
-    done = runs.optimize(plans, sys.argv, fresh=options.fresh, **how)
+    arguments = {"devices": options.devices, "chunk": options.chunk, "after": after}
+    done = runs.optimize(plans, sys.argv, fresh=options.fresh, **arguments)
     names = runs.run_names(every) if several(options) else {}
     errors = {folder: r for folder, r in done.runs.items() if isinstance(r, Exception)}
     for folder, error in errors.items():
@@ -106,13 +106,15 @@ def _compare(options: Optimize) -> int:
     """Compares the command's runs as their folders have them; whether one of them failed."""
     scene, settings = resolve(dataclasses.replace(options, fresh=False))
     every = runs_of(options, scene, settings)
-    found = compare.read_all({folder: (scene, own) for folder, own in every.items()})
+    compared = compare.read_all(
+        {folder: (scene, run_settings) for folder, run_settings in every.items()}
+    )
     console = Console()
     table = (options.out or Path("runs")) / columns.SEEDS
-    compare.compare(found, console)
-    compare.write_table(found, table)
+    compare.compare(compared, console)
+    compare.write_table(compared, table)
     console.print(f"table: {table}")
-    return int(any(run.result is None for run in found.values()))
+    return int(any(run.result is None for run in compared.values()))
 
 
 def _after(scene: Scene, most: int) -> float:
@@ -138,10 +140,10 @@ def _tell(
         slower = reference.steps_and_links(plan.scene)
         others = stress.sets(plan.scene)
         coming = (later + reference.STRESS_TRIALS * others) / slower
-        found = reference.test(folder, plan.settings, most, console, coming)
+        outcomes = reference.test(folder, plan.settings, most, console, coming)
         case, other = reference.stress_run(folder, plan.settings, console, later)
         reference.tell_stress(case, other, console)
-        _judge(plan, result, reference.judged(plan.scene, found, other), folder, console)
+        _judge(plan, result, reference.judged(plan.scene, outcomes, other), folder, console)
     path = folder / "figures" / "cost_evolution.png"
     with Busy(console, "drawing"), files.naming(path):
         from codesign_jax.report import figures
@@ -277,9 +279,9 @@ def resolve(options: Optimize) -> tuple[Scene, Settings]:
     )
     problems += _flag_problems(options)
     for name in schedules:
-        own = dataclasses.replace(settings, schedule=name)
-        found = runs.check(own, scene.hand if scene else None)
-        problems += [problem for problem in found if problem not in problems]
+        candidate = dataclasses.replace(settings, schedule=name)
+        messages = runs.check(candidate, scene.hand if scene else None)
+        problems += [problem for problem in messages if problem not in problems]
     if problems or scene is None:
         raise InputError(problems)
     return scene, settings
@@ -308,13 +310,13 @@ def _of_the_runs(options: Optimize, scene: Scene) -> tuple[str | None, int | Non
     """
     optimizer = options.optimizer
     cost = options.cost or runs.SCENE_COST
-    own: dict[str, Any] = {"optimizer": optimizer or optimize.DEFAULT, "cost": cost}
-    own["policy"] = options.policy or ""
-    usual = runs.make_settings(options.preset, "", "", "", 0, **own)
+    choices: dict[str, Any] = {"optimizer": optimizer or optimize.DEFAULT, "cost": cost}
+    choices["policy"] = options.policy or ""
+    usual = runs.make_settings(options.preset, "", "", "", 0, **choices)
     folders = runs_of(options, scene, usual)
     if optimizer is None:
-        found = runs.setting_of(folders, "optimizer")
-        optimizer = None if found is None or is_user_code(found) else found
+        recorded = runs.setting_of(folders, "optimizer")
+        optimizer = None if recorded is None or is_user_code(recorded) else recorded
     episodes = options.episodes
     return optimizer, runs.setting_of(folders, "episodes") if episodes is None else episodes
 
@@ -326,13 +328,13 @@ def several(options: Optimize) -> bool:
 
 def runs_of(options: Optimize, scene: Scene, settings: Settings) -> dict[Path, Settings]:
     """Settings of each run by its folder: of every strategy those of every seed."""
-    found = {}
+    settings_by_folder = {}
     for name in options.schedule.split(","):
         for seed in [options.seed] if options.seeds is None else common.parse_seeds(options.seeds):
             first = DOMAINS[seed % 2] if options.first == ALTERNATE else options.first
-            own = dataclasses.replace(settings, schedule=name, first=first, seed=seed)
-            found[_folder(options, scene, own)] = own
-    return found
+            run_settings = dataclasses.replace(settings, schedule=name, first=first, seed=seed)
+            settings_by_folder[_folder(options, scene, run_settings)] = run_settings
+    return settings_by_folder
 
 
 def _folder(options: Optimize, scene: Scene, settings: Settings) -> Path:

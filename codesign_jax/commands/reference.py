@@ -67,14 +67,14 @@ def test(
         console.print(f"{folder / FILE} {why}: simulated again")
     with Meter("reference test", min(verdict.USUAL, most), console, later=later) as meter:
 
-        def keep(found: Outcome) -> None:
-            array_files.save_results(folder / FILE, about, found._asdict())
+        def keep(outcomes: Outcome) -> None:
+            array_files.save_results(folder / FILE, about, outcomes._asdict())
 
-        found = decided(case, key, most, meter, kept, keep)
-    if kept is None or found.cost.size > kept.cost.size:
-        drawn = rollout.sample_trials(case.scene, key, found.cost.size)
-        tables.write_grasps(folder / columns.REFERENCE, case.scene, drawn, found)
-    return found
+        outcomes = decided(case, key, most, meter, kept, keep)
+    if kept is None or outcomes.cost.size > kept.cost.size:
+        drawn = rollout.sample_trials(case.scene, key, outcomes.cost.size)
+        tables.write_grasps(folder / columns.REFERENCE, case.scene, drawn, outcomes)
+    return outcomes
 
 
 def decided(
@@ -83,7 +83,7 @@ def decided(
     most: int,
     meter: Meter,
     previous: Outcome | None = None,
-    keep: Callable[[Outcome], None] = lambda found: None,
+    keep: Callable[[Outcome], None] = lambda outcomes: None,
 ) -> Outcome:
     """Outcomes of as many trials as decide whether a design is good, see `verdict.sequential`.
 
@@ -99,16 +99,16 @@ def decided(
     def simulate(first: int, count: int) -> Outcome:
         return case.simulate(count, key, first)
 
-    found = previous
+    outcomes = previous
     if previous is not None:
-        meter.found(previous.cost.size)
-    for found in verdict.sequential(simulate, most, previous):
-        keep(found)
-        ends = verdict.tally(found)
+        meter.resume(previous.cost.size)
+    for outcomes in verdict.sequential(simulate, most, previous):
+        keep(outcomes)
+        ends = verdict.tally(outcomes)
         meter.total = min(most, ends.total + verdict.judge(ends.kept, ends.total).more)
         meter.advance(ends.total - meter.done)
-    assert found is not None
-    return found
+    assert outcomes is not None
+    return outcomes
 
 
 def _outcomes(folder: Path, about: str, *, any_code: bool = False) -> tuple[Outcome | None, str]:
@@ -121,9 +121,9 @@ def _outcomes(folder: Path, about: str, *, any_code: bool = False) -> tuple[Outc
     return (Outcome(**arrays), why) if len(shapes) == 1 else (None, _NO_RESULT)
 
 
-def judged(scene: Scene, found: Outcome, other: Stress | None = None) -> Judged:
+def judged(scene: Scene, outcomes: Outcome, other: Stress | None = None) -> Judged:
     """Outcomes of the test with the scene that was simulated, and those of other conditions."""
-    return Judged(with_accuracy(scene, ACCURACY), found, ACCURACY, stress=other)
+    return Judged(with_accuracy(scene, ACCURACY), outcomes, ACCURACY, stress=other)
 
 
 def steps_and_links(scene: Scene) -> float:
@@ -141,15 +141,15 @@ def stored(folder: Path, settings: Settings) -> tuple[Outcome | None, str]:
     return _outcomes(folder, _finer(folder, settings).digest(settings.seed), any_code=True)
 
 
-def tell_stress(case: Case, found: Stress, console: Console) -> None:
+def tell_stress(case: Case, result: Stress, console: Console) -> None:
     """Prints what grasps under other conditions found, and the warnings of the design."""
     console.print(
-        f"under other conditions, {found.trials} grasps each, steps of "
+        f"under other conditions, {result.trials} grasps each, steps of "
         f"{1e3 * case.scene.discretization.timestep:g} ms:"
     )
     params = jax.tree.map(np.asarray, case.space.params(jnp.asarray(case.design)))
-    warnings = [*stress.of_design(case.scene, params), *found.warnings]
-    for line in [*found.lines(), *(f"warning: {words}" for words in warnings)]:
+    warnings = [*stress.of_design(case.scene, params), *result.warnings]
+    for line in [*result.lines(), *(f"warning: {words}" for words in warnings)]:
         console.print(line)
 
 
@@ -162,16 +162,16 @@ def stress_run(
       later: What is simulated after it, for the time left, in grasps of the run's accuracy.
     """
     case, about = _stress_case(folder, settings)
-    found, why = _stress(folder, about)
+    result, why = _stress(folder, about)
     if why:
         console.print(f"{folder / STRESS_FILE} {why}: simulated again")
-    if found is None:
+    if result is None:
         total = STRESS_TRIALS * stress.sets(case.scene)
         with Meter("other conditions", total, console, later=later) as meter:
             noise = _noise(settings, stress.STREAM)
-            found = stress.simulate(case, STRESS_TRIALS, noise, done=meter.advance)
-        array_files.save_results(folder / STRESS_FILE, about, found._asdict())
-    return case, found
+            result = stress.simulate(case, STRESS_TRIALS, noise, done=meter.advance)
+        array_files.save_results(folder / STRESS_FILE, about, result._asdict())
+    return case, result
 
 
 def stored_stress(folder: Path, settings: Settings) -> tuple[Stress | None, str]:
@@ -185,13 +185,13 @@ def _stress(folder: Path, about: str, *, any_code: bool = False) -> tuple[Stress
         return None, why
     try:
         texts = {k: tuple(map(str, arrays[k].tolist())) for k in ("conditions", "warnings")}
-        found = Stress(kept=arrays["kept"].astype(int), trials=int(arrays["trials"]), **texts)
+        result = Stress(kept=arrays["kept"].astype(int), trials=int(arrays["trials"]), **texts)
     except (KeyError, TypeError, ValueError):
         return None, _NO_RESULT
-    whole = found.kept.shape == (len(found.conditions),) and found.trials > 0
-    if not whole or not ((0 <= found.kept) & (found.kept <= found.trials)).all():
+    whole = result.kept.shape == (len(result.conditions),) and result.trials > 0
+    if not whole or not ((0 <= result.kept) & (result.kept <= result.trials)).all():
         return None, _NO_RESULT
-    return found, why
+    return result, why
 
 
 class Kept(NamedTuple):

@@ -77,8 +77,8 @@ def draw(asked: grasp.Asked, options: Render, camera: "Camera", console: Console
     scene = asked.case.scene
     size = (options.size, options.size)
     with Busy(console, "drawing"):
-        how: Any = {"size": size, "camera": camera}
+        arguments: Any = {"size": size, "camera": camera}
         if options.times:
-            how["times"] = options.times
-        animation.write(scene, [shown], options.out, **how)
+            arguments["times"] = options.times
+        animation.write(scene, [shown], options.out, **arguments)
     console.print(f"picture: {options.out}")

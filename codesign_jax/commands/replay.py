@@ -52,13 +52,13 @@ def write_page(asked: grasp.Asked, path: Path, console: Console) -> Path:
 def show_failures(folder: Path) -> None:
     """Prints the first failed worlds of a run folder."""
     scene, _ = runs.read_run(folder)
-    found = sorted((folder / failures.FOLDER).glob("*.npz"))
-    for path in found[:MOST]:
+    paths = sorted((folder / failures.FOLDER).glob("*.npz"))
+    for path in paths[:MOST]:
         failure = failures.load(path)
         verdict = _verdict(failure.status, failure.bad_step, scene.discretization.timestep)
         say(f"failed world {path}: {verdict}")
-    if found[MOST:]:
-        say(f"and {len(found) - MOST} more in {folder / failures.FOLDER}")
+    if paths[MOST:]:
+        say(f"and {len(paths) - MOST} more in {folder / failures.FOLDER}")
 
 
 def explain(path: Path, engine: str | None, policy: str | None) -> int:
@@ -82,8 +82,8 @@ def explain(path: Path, engine: str | None, policy: str | None) -> int:
     world = space.params(jnp.asarray(failure.design)), failure.trial
     simulator = Case(scene, space, failure.design, name, settings.policy).make_engine()
     run = jax.jit(lambda p, t: rollout.simulate(scene, simulator, p, t))
-    found = run(*jax.tree.map(lambda v: jnp.asarray(v)[None], world))
-    outcome, trace = jax.tree.map(lambda v: np.asarray(v)[0], found)
+    results = run(*jax.tree.map(lambda v: jnp.asarray(v)[None], world))
+    outcome, trace = jax.tree.map(lambda v: np.asarray(v)[0], results)
     bad = int(outcome.bad_step)
     say(f"again in {name}: {_verdict(int(outcome.status), bad, h)}")
     if bad < 0:

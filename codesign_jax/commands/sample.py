@@ -47,13 +47,13 @@ def main(options: Sample) -> int:
             left.unlink()  # what a killed process was writing
         with Interrupts(console.print) as interrupts:
             try:
-                found = _simulate(options.designs, question, engine, outcomes, interrupts, console)
+                counts = _simulate(options.designs, question, engine, outcomes, interrupts, console)
             except Stopped as stopped:
                 console.print("stopped; the same command goes on")
                 return 128 + stopped.signum
         dataset.write(options.out, question, options.designs, outcomes)
         files.remove(outcomes.folder)
-    _report(options.out, found, console)
+    _report(options.out, counts, console)
     return 0
 
 
@@ -101,9 +101,9 @@ def _simulate(
     counts = np.zeros(len(VERDICTS), int)
     total = question.shards(designs)
 
-    def count(shard: int, found: Outcome) -> int:
+    def count(shard: int, outcome: Outcome) -> int:
         wanted = min(question.chunk, designs - shard * question.chunk)
-        ends = np.bincount(verdicts(found)[:wanted].ravel(), minlength=len(counts))
+        ends = np.bincount(verdicts(outcome)[:wanted].ravel(), minlength=len(counts))
         counts[:] += ends
         return int(ends.sum())
 
@@ -114,7 +114,7 @@ def _simulate(
             if outcome is None:
                 left.append(shard)
             else:
-                meter.found(count(shard, outcome))
+                meter.resume(count(shard, outcome))
         if done := total - len(left):
             calls = common.counted(total, "call")
             meter.message(f"going on after {done} of {calls}, from {outcomes.folder}")

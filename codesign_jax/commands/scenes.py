@@ -31,6 +31,6 @@ def _table(scene: scenes.Scene, engines: tuple[str, ...]) -> Table:
     states = [Column(engine, min_width=len("unsupported")) for engine in engines]
     table = Table(Column("effect", no_wrap=True), *states, "meaning", box=box.SIMPLE)
     for name, effect in effects.EFFECTS.items():
-        found = [effects.state(scene.effects, name, engine) for engine in engines]
-        table.add_row(name, *found, effect.meaning)
+        cells = [effects.state(scene.effects, name, engine) for engine in engines]
+        table.add_row(name, *cells, effect.meaning)
     return table

@@ -26,23 +26,23 @@ def words(error: Exception) -> str:
     if not isinstance(error, OSError) or error.strerror is None:
         return str(error)
     name = os.fsdecode(error.filename or "a file").encode("utf-8", "backslashreplace").decode()
-    found = f"{name}: {error.strerror}"
+    text = f"{name}: {error.strerror}"
     if remedy := _REMEDIES.get(error.errno or 0):
-        found += f"; {remedy}, and give the same command again: what was saved is whole"
-    return found
+        text += f"; {remedy}, and give the same command again: what was saved is whole"
+    return text
 
 
 @contextlib.contextmanager
 def _interruptible() -> Iterator[None]:
     """Has Ctrl-C raise KeyboardInterrupt also where Python's own handler would lose it."""
-    own = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    own = own and threading.current_thread() is threading.main_thread()
-    if own:
+    is_default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    is_default = is_default and threading.current_thread() is threading.main_thread()
+    if is_default:
         signal.signal(signal.SIGINT, _interrupt)
     try:
         yield
     finally:
-        if own:
+        if is_default:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

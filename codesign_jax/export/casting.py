@@ -86,13 +86,13 @@ def _chamber(size: Size) -> tuple[Line, Line, Line]:
 
 def _finger(size: Size, process: Process) -> manifold3d.Manifold:
     block = prism(size.ends, half_width(size), lambda x: 0.0, lambda x: size.at(x).height)
-    found = block - prism(size.chamber_ends, *_chamber(size))
+    finger = block - prism(size.chamber_ends, *_chamber(size))
     radius = inlet(size, process) / 2
     if radius:
         start, end = size.chamber_ends
         reach = min(1.0, (end - start) / 2)
-        found -= _tube(size, radius, -size.root - 1.0, start + reach)
-    return found
+        finger -= _tube(size, radius, -size.root - 1.0, start + reach)
+    return finger
 
 
 def _tube(size: Size, radius: float, start: float, end: float) -> manifold3d.Manifold:
@@ -165,8 +165,8 @@ def _core(size: Size, process: Process) -> manifold3d.Manifold:
     spine = prism(ends, half, below, rim)
     across = lambda x: size.at(x).width / 2 + inside(x)  # noqa: E731
     bars = [prism((x - w / 2, x + w / 2), across, below, rim) for x, w in bars_of(size)]
-    found = manifold3d.Manifold.batch_boolean([core, frame, spine, *bars], manifold3d.OpType.Add)
-    return _pinned(found, size, process)
+    solid = manifold3d.Manifold.batch_boolean([core, frame, spine, *bars], manifold3d.OpType.Add)
+    return _pinned(solid, size, process)
 
 
 def bars_of(size: Size) -> list[tuple[float, float]]:

@@ -61,15 +61,15 @@ def pages(
     for i, size in enumerate(sizes):
         alike.setdefault(size, []).append(i)
     rows = [*alike.items()]
-    found = [_hand_page(title, scene, params, sizes)]
+    figures = [_hand_page(title, scene, params, sizes)]
     for first in range(0, len(rows), _ROWS):
-        found.append(_fingers_page(title, rows[first : first + _ROWS]))
+        figures.append(_fingers_page(title, rows[first : first + _ROWS]))
     if printed and process:
-        found.append(_moulds_page(title, rows, process))
-    found.append(_mounting_page(title, scene, params, sizes, printed))
-    for k, page in enumerate(found, 1):
-        page.text(0.94, 0.025, f"{k} of {len(found)}", fontsize=7, ha="right")
-    return found
+        figures.append(_moulds_page(title, rows, process))
+    figures.append(_mounting_page(title, scene, params, sizes, printed))
+    for k, page in enumerate(figures, 1):
+        page.text(0.94, 0.025, f"{k} of {len(figures)}", fontsize=7, ha="right")
+    return figures
 
 
 def _page(title: str) -> matplotlib.figure.Figure:
@@ -96,12 +96,12 @@ def _hand_page(
     title: str, scene: Scene, params: Params, sizes: Sequence[Size]
 ) -> matplotlib.figure.Figure:
     figure = _page(title)
-    found = corners(scene, params, sizes)
-    _view(figure.add_axes((0.08, 0.56, 0.40, 0.32)), scene, found, "front: x, z", 0, 2)
-    _view(figure.add_axes((0.54, 0.56, 0.40, 0.32)), scene, found, "side: y, z", 1, 2)
-    _view(figure.add_axes((0.08, 0.16, 0.40, 0.32)), scene, found, "from above: x, y", 0, 1)
+    points = corners(scene, params, sizes)
+    _view(figure.add_axes((0.08, 0.56, 0.40, 0.32)), scene, points, "front: x, z", 0, 2)
+    _view(figure.add_axes((0.54, 0.56, 0.40, 0.32)), scene, points, "side: y, z", 1, 2)
+    _view(figure.add_axes((0.08, 0.16, 0.40, 0.32)), scene, points, "from above: x, y", 0, 1)
     _palm(figure.add_axes((0.54, 0.16, 0.40, 0.32)), scene, params)
-    extent = np.ptp(np.concatenate(found), axis=0)
+    extent = np.ptp(np.concatenate(points), axis=0)
     words = (
         f"Straight fingers, without pressure, span {extent[0]:.0f} x {extent[1]:.0f} x "
         f"{extent[2]:.0f} mm. Red: fabric, which faces inwards. z = 0: the palm's underside. "

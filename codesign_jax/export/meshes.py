@@ -29,7 +29,7 @@ class Part(NamedTuple):
 
 def write(folder: Path, sizes: list[Size], process: Process) -> list[Part]:
     """Writes fingers and moulds, equal fingers once, as they stand on a printer's bed."""
-    found = []
+    printed_parts = []
     for size in dict.fromkeys(sizes):
         fingers = tuple(i for i, other in enumerate(sizes) if other == size)
         label = "_".join(map(str, fingers))
@@ -37,8 +37,8 @@ def write(folder: Path, sizes: list[Size], process: Process) -> list[Part]:
             name = f"finger_{label}" + ("" if kind == "finger" else f"_{kind}")
             meshes = [_save(folder / f"{name}.{ending}", solid) for ending in FORMATS]
             extents = tuple(float(v) for v in meshes[0].extents)
-            found.append(Part(name, fingers, float(meshes[0].volume), extents))
-    return found
+            printed_parts.append(Part(name, fingers, float(meshes[0].volume), extents))
+    return printed_parts
 
 
 def write_palm(folder: Path, made: Palm) -> list[Part]:
@@ -54,7 +54,7 @@ def write_palm(folder: Path, made: Palm) -> list[Part]:
         key = *np.round(high - low, 3).tolist(), round(bar.volume(), 2)
         alike.setdefault(key, []).append(i)
     solids |= {("bar", tuple(fingers)): made.bars[fingers[0]] for fingers in alike.values()}
-    found = []
+    printed_parts = []
     for (kind, fingers), solid in solids.items():
         name = kind if kind == "palm" else f"{kind}_{'_'.join(map(str, fingers))}"
         stands = closed(_stands(solid))
@@ -62,17 +62,17 @@ def write_palm(folder: Path, made: Palm) -> list[Part]:
             continue
         meshes = [_save(folder / f"{name}.{ending}", stands) for ending in FORMATS]
         extents = tuple(float(v) for v in meshes[0].extents)
-        found.append(Part(name, fingers, float(meshes[0].volume), extents))
-    return found
+        printed_parts.append(Part(name, fingers, float(meshes[0].volume), extents))
+    return printed_parts
 
 
 def _stands(solid: manifold3d.Manifold) -> manifold3d.Manifold:
     return solid.translate([0, 0, -solid.bounding_box()[2]])
 
 
-def standing(found: Parts) -> Parts:
+def standing(pieces: Parts) -> Parts:
     """Parts as they stand on z = 0 with their openings up."""
-    turned = found._replace(tray=found.tray.rotate([180, 0, 0]))
+    turned = pieces._replace(tray=pieces.tray.rotate([180, 0, 0]))
     return Parts(*map(_stands, turned))
 
 

@@ -27,10 +27,10 @@ def text(spec: mujoco.MjSpec) -> str:
         for attribute, value in _numbers(spec, model, element, parent).items():
             element.set(attribute, " ".join(repr(float(v)) for v in np.ravel(value)))
     ElementTree.indent(root)
-    found = ElementTree.tostring(root, encoding="unicode") + "\n"
-    if lost := differences(model, mujoco.MjModel.from_xml_string(found)):
+    xml = ElementTree.tostring(root, encoding="unicode") + "\n"
+    if lost := differences(model, mujoco.MjModel.from_xml_string(xml)):
         raise RuntimeError(f"numbers of the model that its MJCF does not have: {', '.join(lost)}")
-    return found
+    return xml
 
 
 def differences(first: mujoco.MjModel, second: mujoco.MjModel) -> list[str]:
@@ -71,8 +71,8 @@ def _numbers(
         return {name: getattr(o, name) for name in names}
     if element.tag == "pair" and parent is not None and parent.tag == "contact":
         geoms = [model.geom(element.get(key)).id for key in ("geom1", "geom2")]
-        found = np.stack([model.pair_geom1, model.pair_geom2], 1)
-        index = np.nonzero((found == geoms).all(1) | (found == geoms[::-1]).all(1))[0][0]
+        pairs = np.stack([model.pair_geom1, model.pair_geom2], 1)
+        index = np.nonzero((pairs == geoms).all(1) | (pairs == geoms[::-1]).all(1))[0][0]
         names = ("friction", "solref", "solimp")
         return {name: getattr(model, f"pair_{name}")[index] for name in names}
     if element.tag == "inertial" and parent is not None:
@@ -87,12 +87,12 @@ def _numbers(
     return _written(element, names, accessor(model)(element.get("name")))
 
 
-def _written(element: ElementTree.Element, names: dict[str, str], found: Any) -> dict[str, Any]:
+def _written(element: ElementTree.Element, names: dict[str, str], values: Any) -> dict[str, Any]:
     """Numbers of those attributes that the writer has given; others have MuJoCo's default."""
     numbers = {}
     for attribute, field in names.items():
         if (given := element.get(attribute)) is not None:
-            numbers[attribute] = np.ravel(getattr(found, field))[: len(given.split())]
+            numbers[attribute] = np.ravel(getattr(values, field))[: len(given.split())]
     return numbers
 
 

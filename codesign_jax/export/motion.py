@@ -34,13 +34,13 @@ def still(scene: Scene) -> Scene:
 
 def write(folder: Path, scene: Scene, params: Params, trial: Trial) -> dict[str, Peaks]:
     """Writes the arm's two tables and the player; returns the peaks of each as it is played."""
-    found = {}
-    for name, how in ((tables.STILL, still(scene)), (tables.COMMANDS, scene)):
-        schedule = grasps.timed_controls(how, params, trial)
+    peaks_by_table = {}
+    for name, variant in ((tables.STILL, still(scene)), (tables.COMMANDS, scene)):
+        schedule = grasps.timed_controls(variant, params, trial)
         tables.write_commands(folder, scene, schedule, name)
-        found[name] = peaks(schedule)
+        peaks_by_table[name] = peaks(schedule)
     (folder / PLAYER.name).write_text(PLAYER.read_text(encoding="utf-8"), encoding="utf-8")
-    return found
+    return peaks_by_table
 
 
 def arm_rows(schedule: np.ndarray) -> list[list[float]]:
@@ -58,29 +58,33 @@ def peaks(schedule: np.ndarray) -> Peaks:
     need not, infinite if none is enough.
     """
     rows = arm_rows(schedule)
-    found = play_hand.peaks(play_hand.prepared(rows, 1.0, play_hand.SMOOTH, play_hand.PERIOD))
+    values = play_hand.peaks(play_hand.prepared(rows, 1.0, play_hand.SMOOTH, play_hand.PERIOD))
     limits = {name: most for name, (most, _) in play_hand.LIMITS.items()}
     slow = play_hand.least_slow(rows, limits, 1.0, play_hand.SMOOTH, play_hand.PERIOD)
-    return {**found, "slow": slow or np.inf}
+    return {**values, "slow": slow or np.inf}
 
 
-def warnings(found: Mapping[str, Peaks], names: Sequence[str] = (tables.STILL,)) -> list[str]:
+def warnings(
+    peaks_by_table: Mapping[str, Peaks], names: Sequence[str] = (tables.STILL,)
+) -> list[str]:
     """Peaks above the player's limits, a sentence for each of the tables."""
     limits = {name: most for name, (most, _) in play_hand.LIMITS.items()}
     sentences = []
     for name in names:
-        words = play_hand.excess(found[name], limits)
+        words = play_hand.excess(peaks_by_table[name], limits)
         if words:
-            slow = found[name]["slow"]
-            how = f"with --slow {slow:g}" if np.isfinite(slow) else "with a longer --smooth"
+            slow = peaks_by_table[name]["slow"]
+            remedy = f"with --slow {slow:g}" if np.isfinite(slow) else "with a longer --smooth"
             sentences.append(
-                f"the arm would reach {words} with {name}: {PLAYER.name} plays it {how}, or with "
-                "the limits of your arm"
+                f"the arm would reach {words} with {name}: {PLAYER.name} plays it {remedy}, or "
+                "with the limits of your arm"
             )
     return sentences
 
 
-def section(scene: Scene, params: Params, trial: Trial, found: Mapping[str, Peaks]) -> SheetSection:
+def section(
+    scene: Scene, params: Params, trial: Trial, peaks_by_table: Mapping[str, Peaks]
+) -> SheetSection:
     """Peak speeds and accelerations; arguments as `write`, and what it returned."""
     raw = {
         f"{tables.STILL}, jumps within a time step": play_hand.peaks(
@@ -90,7 +94,7 @@ def section(scene: Scene, params: Params, trial: Trial, found: Mapping[str, Peak
     limits = {"limit of the player": {name: most for name, (most, _) in play_hand.LIMITS.items()}}
     rows = [
         (name, *(f"{values[key]:.0f}" for key in play_hand.LIMITS))
-        for name, values in (raw | dict(found) | limits).items()
+        for name, values in (raw | dict(peaks_by_table) | limits).items()
     ]
     units = [unit for _, unit in play_hand.LIMITS.values()]
     head = ("table", f"speed {units[0]}", f"acceleration {units[1]}")
@@ -109,7 +113,10 @@ def section(scene: Scene, params: Params, trial: Trial, found: Mapping[str, Peak
         f"simulation, by up to {scene.arm.shake_amplitude:g}° of roll and pitch at "
         f"{scene.arm.shake_frequency:g} Hz, from the lift until the chambers are empty. A hand "
         "that only grasps has no need of it.",
-        *(f"{words[0].upper()}{words[1:]}." for words in warnings(found, [tables.COMMANDS])),
+        *(
+            f"{words[0].upper()}{words[1:]}."
+            for words in warnings(peaks_by_table, [tables.COMMANDS])
+        ),
     ]
     return SheetSection("Arm: speeds", head, rows, notes)
 
@@ -129,9 +136,9 @@ def room(scene: Scene, params: Params) -> np.ndarray:
     height = keys[:, 3, None] + behind * up[:, None] - CLEAR
     across = np.sqrt(np.maximum(0.0, 1.0 - up**2))[:, None]
     with np.errstate(divide="ignore"):
-        found = np.where(across > 1e-3, height / np.maximum(across, 1e-3), np.inf)
-    found = np.where((across <= 1e-3) & (height < 0), 0.0, found)
-    return np.maximum(0.0, found.min(0))
+        radius = np.where(across > 1e-3, height / np.maximum(across, 1e-3), np.inf)
+    radius = np.where((across <= 1e-3) & (height < 0), 0.0, radius)
+    return np.maximum(0.0, radius.min(0))
 
 
 def spacer(scene: Scene, params: Params) -> float | None:

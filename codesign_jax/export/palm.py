@@ -80,21 +80,21 @@ def palm(scene: Scene, params: Params, sizes: list[Size], process: Process) -> P
     other differences are tried.  The last one stays, closed or not.
     """
     for step in APART:
-        found = _palm(scene, params, sizes, process, [step * i for i in range(len(sizes))])
-        if (body := closed(found.body)) is not None:
-            return found._replace(body=body)
-    return found
+        candidate = _palm(scene, params, sizes, process, [step * i for i in range(len(sizes))])
+        if (body := closed(candidate.body)) is not None:
+            return candidate._replace(body=body)
+    return candidate
 
 
 def closed(solid: Solid) -> Solid | None:
     """The solid without edges of which STL's float32 makes a point; None if that opens it."""
     for shortest in SHORTEST:
-        found = solid.simplify(shortest)
-        surface = found.to_mesh64()
+        simplified = solid.simplify(shortest)
+        surface = simplified.to_mesh64()
         vertices = np.asarray(surface.vert_properties)[:, :3].astype(np.float32)
         faces = np.asarray(surface.tri_verts)
         if trimesh.Trimesh(vertices, faces, process=True).is_watertight:
-            return found
+            return simplified
     return None
 
 
@@ -147,11 +147,11 @@ def _palm(
 def frames(scene: Scene, params: Params) -> list[np.ndarray]:
     """Frames of the fingers' bases in the palm's, as 3 x 4 matrices [mm]."""
     position, turn = (np.asarray(v) for v in mounts(scene.hand, np.asarray(params.spread)))
-    found = []
+    matrices = []
     for place, (w, x, y, z) in zip(position, turn, strict=True):
         rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
-        found.append(np.column_stack([rotation, 1e3 * place]))
-    return found
+        matrices.append(np.column_stack([rotation, 1e3 * place]))
+    return matrices
 
 
 def _placed(solid: Solid, frame: np.ndarray) -> Solid:
@@ -270,19 +270,19 @@ def _flange(radius: float, thickness: float, taken: Solid) -> tuple[Flange | Non
         for angle in range(45, 135, 5):
             middles = [np.radians(angle + 90 * k) for k in range(4)]
             room = []
-            found = []
+            holes = []
             for at in middles:
                 place = [diameter / 2 * np.cos(at), diameter / 2 * np.sin(at), -1.0]
                 # The head's way in is clear over all of the thickness, and a wall around it.
                 wide = head / 2 + 1.5
                 room.append(Solid.cylinder(thickness + 30, wide, wide, SEGMENTS).translate(place))
                 through = Solid.cylinder(thickness + 30, hole / 2, hole / 2, SEGMENTS)
-                found.append(through.translate(place))
+                holes.append(through.translate(place))
                 if sunk:
                     top = Solid.cylinder(1.0 + high, head / 2, head / 2, SEGMENTS)
-                    found.append(top.translate(place))
+                    holes.append(top.translate(place))
             if (_sum(room) ^ taken).volume() < OVERLAP:
-                return Flange(diameter, thread, float(angle % 90), sunk), found
+                return Flange(diameter, thread, float(angle % 90), sunk), holes
     return None, []
 
 
@@ -312,7 +312,7 @@ def _root(size: Size) -> Solid:
 def _collisions(
     sizes: list[Size], places: list[np.ndarray], bars: list[Solid], pockets: list[Solid]
 ) -> list[str]:
-    found = []
+    problems = []
     roots = [_placed(_root(size), place) for size, place in zip(sizes, places, strict=True)]
     clamps = [_placed(bar, place) for bar, place in zip(bars, places, strict=True)]
     walls = [
@@ -321,9 +321,9 @@ def _collisions(
     ]
     for i, j in itertools.combinations(range(len(sizes)), 2):
         if (roots[i] ^ roots[j]).volume() > OVERLAP:
-            found.append(f"the bases of fingers {i} and {j} stand in one another")
+            problems.append(f"the bases of fingers {i} and {j} stand in one another")
         elif (clamps[i] ^ clamps[j]).volume() > OVERLAP:
-            found.append(f"the clamp bars of fingers {i} and {j} meet: file their ends")
+            problems.append(f"the clamp bars of fingers {i} and {j} meet: file their ends")
         elif max((walls[i] ^ pockets[j]).volume(), (walls[j] ^ pockets[i]).volume()) > OVERLAP:
-            found.append(f"the seat of one of fingers {i} and {j} cuts into the other's")
-    return found
+            problems.append(f"the seat of one of fingers {i} and {j} cuts into the other's")
+    return problems

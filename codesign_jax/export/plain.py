@@ -43,16 +43,16 @@ def differences(scene: Scene) -> list[str]:
     left_out = {name: effect.plain for name, effect in effects.EFFECTS.items() if effect.plain}
     acts = {name: getattr(scene.effects, name) for name in left_out}
     acts |= {"friction_memory": keeps(scene)}
-    found = [
-        f"the model is without effects.{name}: {how}"
-        for name, how in left_out.items()
+    sentences = [
+        f"the model is without effects.{name}: {sentence}"
+        for name, sentence in left_out.items()
         if acts[name]
     ]
     if scene.effects.surface == "hull":
-        found.append(
+        sentences.append(
             'the model has effects.surface = "hull" as spheres at its rings and capsules of fingers'
         )
-    return found + [
+    return sentences + [
         f"the model has the mesh {shape.name!r} as its convex hull"
         for shape in scene.objects.object
         if shape.mesh

@@ -95,13 +95,13 @@ def smoothed(rows, duration):
     step = rows[1][0] - rows[0][0]
     half = round(duration / step / 2)
     last = len(rows) - 1
-    found = []
+    means = []
     for k in range(-half, last + half + 1):
         near = [rows[min(max(k + i, 0), last)][1:] for i in range(-half, half + 1)]
         mean = [sum(column) / len(near) for column in zip(*near, strict=True)]
         length = math.hypot(*mean[3:])
-        found.append([rows[0][0] + k * step, *mean[:3], *(v / length for v in mean[3:])])
-    return found
+        means.append([rows[0][0] + k * step, *mean[:3], *(v / length for v in mean[3:])])
+    return means
 
 
 def resampled(rows, period):
@@ -140,15 +140,15 @@ def peaks(rows):
     pairs = [*zip(rows, rows[1:], strict=False)]
     moved = [[(q - p) / step for p, q in zip(a[1:4], b[1:4], strict=True)] for a, b in pairs]
     turned = [[v / step for v in _turned(a[4:], b[4:])] for a, b in pairs]
-    found = {}
+    values = {}
     for name, speeds in (("", moved), ("turn", turned)):
         # At rest before the first row and after the last.
         path = [[0.0] * 3, *speeds, [0.0] * 3]
-        found[name or "speed"] = max(math.hypot(*v) for v in speeds)
-        found[f"{name}-acceleration".strip("-")] = max(
+        values[name or "speed"] = max(math.hypot(*v) for v in speeds)
+        values[f"{name}-acceleration".strip("-")] = max(
             math.dist(a, b) / step for a, b in zip(path, path[1:], strict=False)
         )
-    return found
+    return values
 
 
 def slowed(rows, factor):
@@ -156,13 +156,13 @@ def slowed(rows, factor):
     return [[factor * row[0], *row[1:]] for row in rows]
 
 
-def excess(found, limits):
+def excess(values, limits):
     """Which of a path's peaks are above the limits, in words, or None."""
-    over = [name for name in LIMITS if found[name] > limits[name] * (1 + 1e-6)]
+    over = [name for name in LIMITS if values[name] > limits[name] * (1 + 1e-6)]
     if not over:
         return None
     return ", ".join(
-        f"{found[name]:.0f} {LIMITS[name][1]} (--max-{name} {limits[name]:g})" for name in over
+        f"{values[name]:.0f} {LIMITS[name][1]} (--max-{name} {limits[name]:g})" for name in over
     )
 
 
@@ -173,10 +173,10 @@ def least_slow(rows, limits, slow, smooth, period):
     that, and at least a tenth further, until the poses as they are sent keep the limits.
     """
     while slow <= 100:
-        found = peaks(prepared(rows, slow, smooth, period))
-        if not excess(found, limits):
+        values = peaks(prepared(rows, slow, smooth, period))
+        if not excess(values, limits):
             return slow
-        shares = {name: found[name] / limits[name] for name in LIMITS}
+        shares = {name: values[name] / limits[name] for name in LIMITS}
         roots = [v**0.5 if name.endswith("acceleration") else v for name, v in shares.items()]
         tenths = math.ceil(10 * slow * max(roots) - 1e-6)
         slow = max(tenths, math.floor(10 * slow + 1e-6) + 1) / 10

@@ -87,9 +87,11 @@ def scaled(rows, limits, divisors, cap=False):
     divisors = divisors * count if len(divisors) == 1 else divisors
     if not all(v > 0 and math.isfinite(v) for v in divisors):
         raise TableError("--divide takes numbers above 0")
-    found = [[row[0], *(p / d for p, d in zip(row[1:], divisors, strict=True))] for row in rows]
+    scaled_rows = [
+        [row[0], *(p / d for p, d in zip(row[1:], divisors, strict=True))] for row in rows
+    ]
     for finger, limit in enumerate(limits[:count]):
-        most = max(row[1 + finger] for row in found)
+        most = max(row[1 + finger] for row in scaled_rows)
         if most <= limit * (1 + 1e-6):
             continue
         if not cap:
@@ -98,9 +100,9 @@ def scaled(rows, limits, divisors, cap=False):
                 f"--cap sends no more than that, {100 * limit / most:.0f} % of the moment that it "
                 "is to have; for all of it cast a thicker wall or a stiffer silicone"
             )
-        for row in found:
+        for row in scaled_rows:
             row[1 + finger] = min(row[1 + finger], limit)
-    return found
+    return scaled_rows
 
 
 RISE = 5.0

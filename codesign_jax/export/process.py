@@ -115,7 +115,7 @@ def _simpson(area: Callable[[float], float], start: float, end: float) -> float:
 
 def sizes(hand: Hand, params: Params, process: Process) -> list[Size]:
     """Dimensions of a hand's fingers."""
-    found = []
+    fingers = []
     problems = []
     for i, length in enumerate(params.length):
         base = hand.section.width, params.height[i], params.wall[i]
@@ -124,7 +124,7 @@ def sizes(hand: Hand, params: Params, process: Process) -> list[Size]:
         length, *both = (round(1e3 * float(v), 4) for v in (length, *base, *tip))
         ends = Section(*both[:3]), Section(*both[3:])
         size = Size(length, *ends, process.end_wall or ends[0].wall, process.root)
-        found.append(size)
+        fingers.append(size)
         if size.length - 2 * size.end < 1.0:
             problems.append(
                 f"finger {i} of {length:g} mm has no room for a chamber of 1 mm between end walls "
@@ -132,7 +132,7 @@ def sizes(hand: Hand, params: Params, process: Process) -> list[Size]:
             )
     if problems:
         raise InputError(problems)
-    return found
+    return fingers
 
 
 def inlet(size: Size, process: Process) -> float:
@@ -142,11 +142,11 @@ def inlet(size: Size, process: Process) -> float:
 
 def problems(process: Process) -> list[str]:
     """What is out of range in a process, by the names of the flags."""
-    found = []
+    messages = []
     for field in dataclasses.fields(process):
         name = f"--{field.name.replace('_', '-')}"
         value = getattr(process, field.name)
         limits = (field.metadata[key] for key in ("unit", "low", "high"))
         problem = range_problem(name, value, *limits)
-        found += [problem] if problem else []
-    return found
+        messages += [problem] if problem else []
+    return messages

@@ -55,15 +55,15 @@ def _tests(
     params: Params,
     sizes: Sequence[Size],
     verdict: str | None,
-    found: Stress | None,
+    result: Stress | None,
 ) -> SheetSection:
     title = f"Verdict: {verdict or 'not judged at accuracy reference'}"
-    warnings = stress.of_design(scene, params) + [*(found.warnings if found else ())]
+    warnings = stress.of_design(scene, params) + [*(result.warnings if result else ())]
     warnings += idle_fingers(scene, params, sizes)
     notes = [f"Warning: {words}." for words in warnings]
-    if not found:
+    if not result:
         return SheetSection(title, (), [], notes)
-    return SheetSection(title, found.head, found.rows, notes)
+    return SheetSection(title, result.head, result.rows, notes)
 
 
 IDLE = 10.0
@@ -74,20 +74,20 @@ _FURTHEST = 2.331
 
 def idle_fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> list[str]:
     """Fingers that do next to nothing, a sentence each."""
-    found = []
+    sentences = []
     bends = morphology.free_bends(scene.hand, params)
     for i, (size, bend) in enumerate(zip(sizes, bends, strict=True)):
         angle = float(bend)
         reached = min(abs(angle), _FURTHEST)
         travel = size.length * (1 - np.cos(reached)) / reached if reached else 0.0
         if travel < IDLE:
-            found.append(
+            sentences.append(
                 f"finger {i} does next to nothing: {size.length:.0f} mm long, it bends by "
                 f"{np.degrees(angle):.0f}° and moves its tip by {travel:.1f} mm. It may be left "
                 "out, with its seat empty and its column of valves.csv unused; the simulation "
                 "has it"
             )
-    return found
+    return sentences
 
 
 def _fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSection:
@@ -164,16 +164,16 @@ def corners(scene: Scene, params: Params, sizes: Sequence[Size]) -> np.ndarray:
     The first four are those of the base, around it, the first two on the fabric.
     """
     position, turn = (np.asarray(v) for v in mounts(scene.hand, np.asarray(params.spread)))
-    found = []
+    fingers = []
     for size, place, (w, x, y, z) in zip(sizes, position, turn, strict=True):
         ends = [(0.0, size.base), (size.length, size.tip)]
-        own = [
+        outline = [
             (along, side * section.width / 2, up * section.height)
             for along, section in ends
             for side, up in ((-1, 0), (1, 0), (1, 1), (-1, 1))
         ]
-        found.append(1e3 * place + Rotation.from_quat([x, y, z, w]).apply(own))
-    return np.array(found)
+        fingers.append(1e3 * place + Rotation.from_quat([x, y, z, w]).apply(outline))
+    return np.array(fingers)
 
 
 def places(scene: Scene, params: Params) -> tuple[np.ndarray, np.ndarray]:

@@ -38,7 +38,7 @@ def balls(scene: Scene, finger: int, params: Params) -> list[Ball]:
     k = scene.discretization.hull_rings
     width = scene.hand.section.width
     along = ring_places(links, k)
-    found = []
+    spheres = []
     segment = float(params.length[finger]) / links
     places = (along + at_joints(links)[:, None] * links) / links
     size = sections(scene.hand, params, places.ravel())
@@ -50,8 +50,8 @@ def balls(scene: Scene, finger: int, params: Params) -> list[Ball]:
         across = widths[finger, i * k + j]
         share = segment / k * (0.5 if i == links - 1 else 1.0) * across / width**2
         place = np.array([at * segment, 0.0, height / 2])
-        found.append(Ball(f"finger_{finger}_ring_{i + 1}_{j}", i + 1, place, float(share)))
-    return found
+        spheres.append(Ball(f"finger_{finger}_ring_{i + 1}_{j}", i + 1, place, float(share)))
+    return spheres
 
 
 def add(scene: Scene, spec: mujoco.MjSpec, params: Params) -> dict[str, float]:

@@ -127,11 +127,11 @@ def _in_trials(engine: Engine, space: DesignSpace, num_trials: int) -> Callable:
         trials = rollout.sample_trials(scene, noise[0], num_trials, noise[1])
         hand = jax.tree.map(lambda v: v[None], space.params(design))
         worlds = rollout.crossed(scene, hand, trials)
-        found, trace = rollout.simulate(worlds[0], engine, *worlds[1:])
+        outcome, trace = rollout.simulate(worlds[0], engine, *worlds[1:])
         if trace.ctrl is None:
-            return found, None
+            return outcome, None
         planned = jax.vmap(partial(control.commands, scene))(*worlds[1:])
-        return found, departure(scene, found, trace.ctrl, planned)
+        return outcome, departure(scene, outcome, trace.ctrl, planned)
 
     return simulated
 
@@ -140,7 +140,7 @@ LEAST = 1e-5
 """Difference of a command, in bar, metres or radians, from which on it is one: rounding is less."""
 
 
-def departure(scene: Scene, found: Outcome, ctrl: jax.Array, planned: jax.Array) -> Departure:
+def departure(scene: Scene, outcomes: Outcome, ctrl: jax.Array, planned: jax.Array) -> Departure:
     """Where commands of grasps leave the key frames, until each grasp was decided.
 
     Args:
@@ -152,8 +152,10 @@ def departure(scene: Scene, found: Outcome, ctrl: jax.Array, planned: jax.Array)
     """
     steps = ctrl.shape[1]
     h = scene.discretization.timestep
-    end = jnp.where(found.bad_step < 0, steps, found.bad_step)
-    end = jnp.minimum(end, jnp.where(jnp.isfinite(found.lost_time), found.lost_time / h, steps))
+    end = jnp.where(outcomes.bad_step < 0, steps, outcomes.bad_step)
+    end = jnp.minimum(
+        end, jnp.where(jnp.isfinite(outcomes.lost_time), outcomes.lost_time / h, steps)
+    )
     counts = np.arange(steps) < end[:, None]
     apart = jnp.where(counts[..., None], ctrl - planned, 0.0)
     place = jnp.linalg.norm(apart[..., :3], axis=-1)
@@ -184,8 +186,8 @@ def case_of_run(
     tell: Tell = lambda text: None,
 ) -> Case:
     """The design that a run found; objects, accuracy, values and engine may replace the run's."""
-    how = {"object_set": objects, "accuracy": accuracy, "overrides": overrides}
-    scene, settings = read_run(folder, **how)
+    replacements = {"object_set": objects, "accuracy": accuracy, "overrides": overrides}
+    scene, settings = read_run(folder, **replacements)
     # By the run's own rule for failed trials, whatever the overrides say.
     chosen = choose(read_run(folder)[0], read_record(folder, tell=tell))
     if problem := doubt(chosen):
@@ -272,8 +274,8 @@ def find_grasp(
         ("--particle", particle, 0, particles - 1),
         ("--trial", trial, 0, trials - 1),
     )
-    found = [range_problem(n, v, "", low, high) for n, v, low, high in asked if v is not None]
-    if problems := [problem for problem in found if problem]:
+    checks = [range_problem(n, v, "", low, high) for n, v, low, high in asked if v is not None]
+    if problems := [problem for problem in checks if problem]:
         raise InputError(problems)
     chosen = choose(scene, record)
     last = record.done - 1 if particle is not None else chosen.episode

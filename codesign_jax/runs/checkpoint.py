@@ -236,14 +236,14 @@ class Checkpoints:
             return
         try:
             run = bytes(label["id"]).hex()  # type: ignore[index]
-            own = int(label["step"])  # type: ignore[index]
+            labelled = int(label["step"])  # type: ignore[index]
         except (KeyError, TypeError, ValueError):
             run = None
-            own = step
+            labelled = step
         if run != self._run:
             raise self._foreign(step, "of another run")
-        if own != step:
-            raise self._foreign(step, f"step {own} under another name")
+        if labelled != step:
+            raise self._foreign(step, f"step {labelled} under another name")
 
     def _foreign(self, step: int, what: str) -> RunError:
         return RunError(
@@ -291,16 +291,17 @@ def _label(run: str, step: int) -> Arrays:
     }
 
 
-def _without_closed_loops(hook: Callable[[Any], Any], found: Any) -> None:
+def _without_closed_loops(hook: Callable[[Any], Any], unraisable: Any) -> None:
     """A hook for unraisable exceptions without those of tensorstore's threads after a failure.
 
     Where one file of a step cannot be written, the threads that write the others find the event
     loop closed that they report to, and each would print that.
     """
     if not (
-        isinstance(found.exc_value, RuntimeError) and "Event loop is closed" in str(found.exc_value)
+        isinstance(unraisable.exc_value, RuntimeError)
+        and "Event loop is closed" in str(unraisable.exc_value)
     ):
-        hook(found)
+        hook(unraisable)
 
 
 def _unsaved(place: Path, error: Exception) -> OSError:

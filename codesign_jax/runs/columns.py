@@ -11,8 +11,8 @@ class CsvTable(NamedTuple):
     designs: str | None = None
 
     def head(self, designs: list[str]) -> list[str]:
-        own = [] if self.designs is None else [self.designs + name for name in designs]
-        return [*self.columns, *own]
+        columns = [] if self.designs is None else [self.designs + name for name in designs]
+        return [*self.columns, *columns]
 
 
 _OUTCOME = "cost", "lost_time_s", "status", "first_bad_step", "steps_at_limit", "residual"

@@ -59,16 +59,16 @@ class Question:
         meshes = [hashlib.sha256(every[name]).hexdigest() for name in sorted({*every} - {*texts})]
         # What code that is not known has simulated is no part of anything else.
         code = reuse.code_digest() or f"unknown {uuid.uuid4()}"
-        own = {name: getattr(self, name) for name in _NAMES}
-        return own | {"scene": texts, "meshes": meshes, "code": code}
+        fields = {name: getattr(self, name) for name in _NAMES}
+        return fields | {"scene": texts, "meshes": meshes, "code": code}
 
     def drawn(self, shard: int) -> Drawn:
         """Designs and trials of a shard, NumPy arrays."""
         first = shard * self.chunk
         key = jax.random.key(self.seed)
         sizes = {"n": self.chunk, "num_trials": self.trials}
-        found = sampling.draw(self.scene, self.space, key, first=np.int32(first), **sizes)
-        return jax.tree.map(np.asarray, found)
+        drawn = sampling.draw(self.scene, self.space, key, first=np.int32(first), **sizes)
+        return jax.tree.map(np.asarray, drawn)
 
     def shards(self, designs: int) -> int:
         """Number of shards of so many designs; the last one may have more than are wanted."""
@@ -86,10 +86,10 @@ class Shards:
     def question(self) -> dict[str, Any] | None:
         """`Question.described` of what has begun; None if nothing has."""
         try:
-            found = json.loads(self._question.read_text("utf-8"))
+            question = json.loads(self._question.read_text("utf-8"))
         except (OSError, ValueError):
             return None
-        return found if isinstance(found, dict) else None
+        return question if isinstance(question, dict) else None
 
     def refuse_other(self, question: Question) -> None:
         """Refuses what is there if it is of another question, or no part of a data set."""
@@ -116,8 +116,8 @@ class Shards:
         except (OSError, array_files.ArrayFileError):
             return None
 
-    def save(self, shard: int, found: Outcome) -> None:
-        array_files.save(self.folder / f"{shard}.npz", found._asdict())
+    def save(self, shard: int, outcomes: Outcome) -> None:
+        array_files.save(self.folder / f"{shard}.npz", outcomes._asdict())
 
 
 class Names(NamedTuple):
@@ -142,9 +142,9 @@ def _schema(pa: ModuleType, space: DesignSpace, notes: dict[str, Any]) -> Any:
     for name, (kind, unit, text) in GRASPS.items():
         named = pa.dictionary(pa.int16(), pa.string())
         about = {"description": text} | ({"unit": unit} if unit else {})
-        own = named if kind == "name" else getattr(pa, kind)()
+        arrow_type = named if kind == "name" else getattr(pa, kind)()
         empty = name in MAY_BE_EMPTY
-        fields.append(pa.field(name, own, nullable=empty, metadata=about))
+        fields.append(pa.field(name, arrow_type, nullable=empty, metadata=about))
     for column, name, unit in zip(design_columns(space), space.names, space.units, strict=True):
         about = {"description": "the design", "unit": unit, "parameter": name}
         fields.append(pa.field(column, pa.float32(), nullable=False, metadata=about))
@@ -168,31 +168,31 @@ def _table(pa: ModuleType, schema: Any, columns: dict[str, Any], shape: tuple[in
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def rows(question: Question, shard: int, drawn: Drawn, found: Outcome) -> dict[str, Any]:
+def rows(question: Question, shard: int, drawn: Drawn, outcomes: Outcome) -> dict[str, Any]:
     """Values of the columns for a shard, arrays that broadcast to (design, trial)."""
     trials = drawn.trials
-    status = np.asarray(found.status)
+    status = np.asarray(outcomes.status)
     texts, index = np.unique(status, return_inverse=True)
-    bad_step = np.asarray(found.bad_step)
+    bad_step = np.asarray(outcomes.bad_step)
     values = {
         "design": (shard * question.chunk + np.arange(question.chunk))[:, None],
         "trial": np.arange(question.trials),
         "object": Names(trials.shape, [s.name for s in question.scene.objects.object]),
         **noise_values(trials),
-        "verdict": Names(verdicts(found), [*VERDICTS]),
-        "cost": found.cost,
-        "lost_time_s": found.lost_time,
+        "verdict": Names(verdicts(outcomes), [*VERDICTS]),
+        "cost": outcomes.cost,
+        "lost_time_s": outcomes.lost_time,
         "status": Names(index.reshape(status.shape), [status_names(s) for s in texts]),
         "first_bad_step": np.ma.masked_less(bad_step, 0),
-        "steps_at_limit": np.ma.masked_invalid(np.asarray(found.capped)),
-        "residual": np.ma.masked_invalid(np.asarray(found.residual)),
+        "steps_at_limit": np.ma.masked_invalid(np.asarray(outcomes.capped)),
+        "residual": np.ma.masked_invalid(np.asarray(outcomes.residual)),
     }
     designs = question.space.in_units(drawn.designs)
-    own = design_columns(question.space)
+    columns = design_columns(question.space)
     hands = params_of(question.space, drawn.designs)
     air = 1e6 * np.asarray(morphology.chamber_volumes(question.scene.hand, hands)).sum(-1)
     values["chamber_volume_cm3"] = air[:, None]
-    return values | {name: designs[:, k, None] for k, name in enumerate(own)}
+    return values | {name: designs[:, k, None] for k, name in enumerate(columns)}
 
 
 def write(path: Path, question: Question, designs: int, outcomes: Shards) -> None:
@@ -209,9 +209,9 @@ def write(path: Path, question: Question, designs: int, outcomes: Shards) -> Non
         pa.parquet.ParquetWriter(temporary, schema, compression="zstd") as writer,
     ):
         for shard in range(question.shards(designs)):
-            found = outcomes.load(shard)
-            assert found is not None
-            values = rows(question, shard, question.drawn(shard), found)
+            outcome = outcomes.load(shard)
+            assert outcome is not None
+            values = rows(question, shard, question.drawn(shard), outcome)
             group.append(_table(pa, schema, values, shape).slice(0, left))
             left -= group[-1].num_rows
             if not left or sum(table.num_rows for table in group) >= ROWS:

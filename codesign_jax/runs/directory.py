@@ -116,12 +116,12 @@ def check_folder(path: Path, scene: Scene, settings: Settings, *, fresh: bool = 
 
 def setting_of(paths: Iterable[Path], name: str) -> Any:
     """A setting of the runs in folders, such as their episodes; None if no folder has a run."""
-    found = [path for path in paths if (path / PROVENANCE).exists()]
-    values = {path: manifest.read_provenance(path)["settings"][name] for path in found}
+    folders = [path for path in paths if (path / PROVENANCE).exists()]
+    values = {path: manifest.read_provenance(path)["settings"][name] for path in folders}
     if len(set(values.values())) > 1:
         least, most = (f(values, key=lambda path: values[path]) for f in (min, max))
-        one = values[least]
-        told = f"{one} {name}" if isinstance(one, int) else f"{name} {one}"
+        value = values[least]
+        told = f"{value} {name}" if isinstance(value, int) else f"{name} {value}"
         problem = f"{least} has {told} and {most} {values[most]}: say by --{name} what all "
         problem += "are to have"
         raise InputError([problem])
@@ -175,7 +175,7 @@ def _resume(path: Path, settings: Settings, command: list[str]) -> list[str]:
 
 
 def _contents(scene: Scene, settings: Settings) -> dict[str, bytes]:
-    return scene_files.contents(scene) | user_code.contents(settings.own)
+    return scene_files.contents(scene) | user_code.contents(settings.user_code)
 
 
 def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str, Any]) -> None:
@@ -221,12 +221,12 @@ def _is_cut_short(path: Path, scene: Scene, settings: Settings, stored: dict[str
 
 
 def _other_code(path: Path, settings: Settings, stored: dict[str, Any]) -> list[str]:
-    found = []
-    for name, content in user_code.contents(settings.own).items():
+    lines = []
+    for name, content in user_code.contents(settings.user_code).items():
         if manifest.digests({name: content})[name] != stored["files"].get(name):
             diff = _diff(path, name, content.decode())
-            found += [f"{Path(name).stem} was changed since the run was made:", *diff]
-    return found
+            lines += [f"{Path(name).stem} was changed since the run was made:", *diff]
+    return lines
 
 
 def _own_command(stored: dict[str, Any]) -> list[str]:
@@ -325,14 +325,14 @@ def _top(path: Path) -> list[str]:
 
 
 def _all(path: Path) -> list[str]:
-    found = []
+    names = []
     for name in _top(path):
         inside = path / name
         if name in _INSIDE and inside.is_dir() and not inside.is_symlink():
-            found += [f"{name}/{other}" for other in _top(inside)]
+            names += [f"{name}/{other}" for other in _top(inside)]
         else:
-            found.append(name)
-    return found
+            names.append(name)
+    return names
 
 
 def _named(name: str) -> str:
@@ -340,8 +340,8 @@ def _named(name: str) -> str:
 
     A killed process leaves its temporaries.
     """
-    found = re.fullmatch(r"(.*?\.(?:toml|json|csv|log|npz|html|sha256|png))\.[^/]*tmp", name)
-    return found[1] if found else name
+    match = re.fullmatch(r"(.*?\.(?:toml|json|csv|log|npz|html|sha256|png))\.[^/]*tmp", name)
+    return match[1] if match else name
 
 
 def _is_of_a_run(path: Path, name: str) -> bool:

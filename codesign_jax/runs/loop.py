@@ -179,9 +179,9 @@ class Search:
             run.begin(candidates(plan.key, plan.optimizer.space, [0])[0])
             return
         self._progress.begin("looking for a poor seed")
-        how = {"batch": plan.settings.particles}
+        arguments = {"batch": plan.settings.particles}
         seed, cost, drawn = codesign.seed_search(
-            plan.scene, plan.optimizer, plan.key, self._outcomes, **how
+            plan.scene, plan.optimizer, plan.key, self._outcomes, **arguments
         )
         start = Start(np.asarray(seed), np.asarray(cost, np.float32), np.asarray(drawn))
         run.begin(seed, start)

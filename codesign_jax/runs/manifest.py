@@ -144,14 +144,14 @@ def changed_files(path: Path, stored: Mapping[str, Any]) -> list[str]:
     Other comments or another layout of a TOML file are no difference.
     """
     noted = stored["files"]
-    found = [name for name, digest in noted.items() if _digest(path / name) != digest]
-    if not found or not set(found) <= set(scene_files.NAMES):
-        return found
+    changed = [name for name, digest in noted.items() if _digest(path / name) != digest]
+    if not changed or not set(changed) <= set(scene_files.NAMES):
+        return changed
     try:
         texts = scene_files.scene_texts(scenes.load(path / "scene.toml"))
     except InputError:
-        return found
-    return [n for n in found if sha256(texts[n].encode()).hexdigest() != noted[n]]
+        return changed
+    return [n for n in changed if sha256(texts[n].encode()).hexdigest() != noted[n]]
 
 
 def refuse_changed(path: Path, stored: Mapping[str, Any]) -> None:
@@ -188,8 +188,8 @@ def _digest(path: Path) -> str:
 
 def runs_inside(path: Path, pattern: str = "*") -> list[Path]:
     """The run folders in a folder, seed-2 before seed-10."""
-    found = [file.parent for file in path.glob(f"{pattern}/{PROVENANCE}")]
-    return sorted(found, key=lambda folder: (folder.parent, len(folder.name), folder.name))
+    folders = [file.parent for file in path.glob(f"{pattern}/{PROVENANCE}")]
+    return sorted(folders, key=lambda folder: (folder.parent, len(folder.name), folder.name))
 
 
 def _hint(path: Path) -> str:

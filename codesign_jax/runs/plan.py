@@ -48,8 +48,8 @@ class Plan(NamedTuple):
     @property
     def grasps(self) -> int:
         """Grasps of the episodes and the final test, without those that find the seed."""
-        own = self.settings
-        return own.episodes * own.particles * own.trials + self.test_grasps
+        settings = self.settings
+        return settings.episodes * settings.particles * settings.trials + self.test_grasps
 
 
 def prepare(scene: Scene, settings: Settings) -> Plan:
@@ -72,8 +72,8 @@ def prepare(scene: Scene, settings: Settings) -> Plan:
     key = jax.random.key(settings.seed)
     if settings.cost != SCENE_COST:
         cost, stops = user_code.make_cost(settings.cost, scene)
-        how = {"record_qpos": not stops, "stop_when_lost": stops}
-        task = dataclasses.replace(task, cost=cost, **how)
+        changes = {"record_qpos": not stops, "stop_when_lost": stops}
+        task = dataclasses.replace(task, cost=cost, **changes)
     return Plan(task, settings, optimizer, mask, key)
 
 

@@ -67,34 +67,34 @@ def load_record(folder: Path, *, tell: Tell | None = None) -> Record | None:
     settings = Settings(**stored["settings"])
     try:
         with Checkpoints(folder / "checkpoints", run=stored["id"], read_only=True) as store:
-            found = store.restore()
-        record = records.from_arrays(found.arrays) if found.arrays else None
+            restored = store.restore()
+        record = records.from_arrays(restored.arrays) if restored.arrays else None
         if record is not None:
             records.refuse_other(record, settings)
     except (RunError, OSError) as error:
         raise InputError([f"run {folder}: {error}"]) from error
     if record is None:
-        if problem := lost(folder, found):
+        if problem := lost(folder, restored):
             raise InputError([problem])
         return None
-    if found.damaged:
-        steps = "; ".join(f"{step}: {reason}" for step, reason in found.damaged)
+    if restored.damaged:
+        steps = "; ".join(f"{step}: {reason}" for step, reason in restored.damaged)
         test = "with" if record.test is not None else "without"
         tell(
-            f"{folder} has damaged checkpoints ({steps}). Read instead is checkpoint {found.step}, "
-            f"after episode {record.done} of {settings.episodes}, {test} the final test: another "
-            "design may be the best there. The command of codesign optimize that made the run "
-            "computes again what is lost"
+            f"{folder} has damaged checkpoints ({steps}). Read instead is checkpoint "
+            f"{restored.step}, after episode {record.done} of {settings.episodes}, {test} the final "
+            "test: another design may be the best there. The command of codesign optimize that made "
+            "the run computes again what is lost"
         )
     return record
 
 
-def lost(folder: Path, found: Restored | None = None) -> str:
+def lost(folder: Path, restored: Restored | None = None) -> str:
     """Says that a run has no whole checkpoint while its tables have episodes; else nothing."""
     episodes = tables.episodes_in(folder)
-    if not episodes or (found is None and (folder / "checkpoints").is_dir()):
+    if not episodes or (restored is None and (folder / "checkpoints").is_dir()):
         return ""
-    damaged = found.damaged if found else ()
+    damaged = restored.damaged if restored else ()
     steps = "; ".join(f"{step}: {reason}" for step, reason in damaged)
     what = f"no checkpoint that is whole ({steps})" if steps else "lost its checkpoints"
     return (

@@ -170,9 +170,9 @@ class Run:
     def fail(self, error: Exception) -> None:
         """Ends the run; events.log has the traceback as well, where it is none of `FAILURES`."""
         self.error = error
-        how = str(error) if isinstance(error, FAILURES) else "".join(format_exception(error))
+        text = str(error) if isinstance(error, FAILURES) else "".join(format_exception(error))
         with contextlib.suppress(OSError):  # a full disk may be why it failed
-            for line in f"failed: {how.rstrip()}".splitlines():
+            for line in f"failed: {text.rstrip()}".splitlines():
                 self.log(line)
 
     def say(self, message: str) -> None:

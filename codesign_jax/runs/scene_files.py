@@ -43,11 +43,11 @@ def scene_texts(scene: Scene) -> dict[str, str]:
 
 def contents(scene: Scene) -> dict[str, bytes]:
     """Returns all files of a resolved scene, its meshes included, by name in the folder."""
-    found = {name: text.encode() for name, text in scene_texts(scene).items()}
+    file_bytes = {name: text.encode() for name, text in scene_texts(scene).items()}
     for i, shape in enumerate(scene.objects.object):
         if shape.mesh:
-            found[_mesh_name(shape, i)] = shape.mesh.content
-    return found
+            file_bytes[_mesh_name(shape, i)] = shape.mesh.content
+    return file_bytes
 
 
 def digest(scene: Scene, engine: str, designs: np.ndarray, *numbers: int) -> str:
@@ -98,14 +98,14 @@ def _plain(value: Any) -> Any:
 
 def _units(value: Any, place: str = "") -> dict[str, str]:
     """Units of a dataclass's numbers by dotted key path; those of an array's entries are alike."""
-    found: dict[str, str] = {}
+    units: dict[str, str] = {}
     if isinstance(value, tuple):
         for entry in value:
-            found |= _units(entry, place)
+            units |= _units(entry, place)
     elif dataclasses.is_dataclass(value):
         for field in dataclasses.fields(value):
             inside = _units(getattr(value, field.name), f"{place}{field.name}.")
             # The writer puts an array of small tables under its own key, an entry a line.
             listed = [f"{k.rpartition('.')[2]} in {u}" for k, u in inside.items() if u]
-            found |= inside | {place + field.name: field.metadata.get("unit", ", ".join(listed))}
-    return found
+            units |= inside | {place + field.name: field.metadata.get("unit", ", ".join(listed))}
+    return units

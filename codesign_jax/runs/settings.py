@@ -49,7 +49,7 @@ class Settings:
     policy: str = ""
 
     @property
-    def own(self) -> tuple[str, ...]:
+    def user_code(self) -> tuple[str, ...]:
         """Names of the user's own code, beside those of this package."""
         return self.optimizer, self.cost, self.policy
 
@@ -108,33 +108,33 @@ def check(settings: Settings, hand: Hand | None) -> list[str]:
     Args:
       hand: The hand, or None if it could not be read; then its presets are not checked.
     """
-    found = []
+    problems = []
     for name, (low, high) in _RANGES.items():
         flag = f"--{name.replace('_', '-')}"
         if problem := schema.range_problem(flag, getattr(settings, name), "", low, high):
-            found.append(problem)
+            problems.append(problem)
     if settings.engine not in engines.NAMES:
         hint = schema.nearest(settings.engine, engines.NAMES)
-        found.append(f"--engine = {settings.engine!r} is not valid; {hint}")
+        problems.append(f"--engine = {settings.engine!r} is not valid; {hint}")
     if user_code.is_user_code(settings.optimizer):
         problem = user_code.problem(settings.optimizer)
     else:
         problem = optimize.problem(settings.optimizer, max(settings.particles, 0) or None)
-    found += [f"--optimizer: {problem}"] if problem else []
+    problems += [f"--optimizer: {problem}"] if problem else []
     if settings.cost != SCENE_COST and (problem := user_code.problem(settings.cost)):
-        found.append(f"--cost: {problem}")
+        problems.append(f"--cost: {problem}")
     if settings.policy and (problem := user_code.problem(settings.policy)):
-        found.append(f"--policy: {problem}")
+        problems.append(f"--policy: {problem}")
     space = None
     if hand is not None:
         try:
             space = design_space(hand, settings.preset)
         except schema.InputError as error:
-            found += [f"--{problem}" for problem in error.problems]
+            problems += [f"--{problem}" for problem in error.problems]
     low, high = _RANGES["episodes"]
     if low <= settings.episodes <= high:  # it is as long as the run
-        found += _schedule_problems(settings, space)
-    return found
+        problems += _schedule_problems(settings, space)
+    return problems
 
 
 def _schedule_problems(settings: Settings, space: DesignSpace | None) -> list[str]:

@@ -88,23 +88,25 @@ def write_grasps(path: Path, scene: Scene, trials: Trial, outcomes: Outcome) -> 
     noise = noise_values(trials)
 
     def row(t: int) -> Row:
-        one = jax.tree.map(lambda v: np.asarray(v)[t], outcomes)
-        found = {"trial": t, "object": names[int(trials.shape[t])]}
+        outcome = jax.tree.map(lambda v: np.asarray(v)[t], outcomes)
+        cells = {"trial": t, "object": names[int(trials.shape[t])]}
         drawn = {name: _number(v[t]) for name, v in noise.items()}
-        return found | drawn | {"verdict": VERDICTS[verdicts(one)]} | _ending(one)
+        return cells | drawn | {"verdict": VERDICTS[verdicts(outcome)]} | _ending(outcome)
 
     write(path, [*MORE[REFERENCE].columns], (row(t) for t in range(len(outcomes.cost))))
 
 
 def by_finger(space: DesignSpace) -> tuple[dict[str, list[int]], list[int]]:
     """Indices of the parameters that each finger has of its own, by name, and of the others."""
-    own: dict[str, list[int]] = {}
+    per_finger: dict[str, list[int]] = {}
     for k, name in enumerate(space.names):
         if len(fingers_of(name)) == 1:
-            own.setdefault(name.partition("[")[0], []).append(k)
-    own = {name: places for name, places in own.items() if len(places) == len(space.hand.finger)}
-    fingers = {k for places in own.values() for k in places}
-    return own, [k for k in range(space.num_parameters) if k not in fingers]
+            per_finger.setdefault(name.partition("[")[0], []).append(k)
+    per_finger = {
+        name: places for name, places in per_finger.items() if len(places) == len(space.hand.finger)
+    }
+    fingers = {k for places in per_finger.values() for k in places}
+    return per_finger, [k for k in range(space.num_parameters) if k not in fingers]
 
 
 def describe(space: DesignSpace, design: np.ndarray, title: str = "design") -> str:
@@ -113,15 +115,15 @@ def describe(space: DesignSpace, design: np.ndarray, title: str = "design") -> s
     Where fingers have parameters of their own, a table with a row for each finger, and one of the
     other parameters.
     """
-    own, others = by_finger(space)
+    per_finger, others = by_finger(space)
     values = [f"{value:.4g}" for value in space.in_units(design)]
     units = ["" if unit == "1" else unit for unit in space.units]
-    if not own:
+    if not per_finger:
         pairs = zip(space.names, values, units, strict=True)
         return f"{title}: " + " ".join(
             f"{name}={value} {unit}".rstrip() for name, value, unit in pairs
         )
-    fingers = [[name, units[at[0]], *(values[k] for k in at)] for name, at in own.items()]
+    fingers = [[name, units[at[0]], *(values[k] for k in at)] for name, at in per_finger.items()]
     index = ["finger", "", *map(str, range(len(fingers[0]) - 2))]
     hand = [[space.names[k], units[k], values[k]] for k in others]
     return "\n".join([f"{title}:", *_aligned([index, *fingers]), *_aligned(hand)])
@@ -186,8 +188,8 @@ def _trials(history: History, scene: Scene, span: range) -> Iterator[Row]:
     trials = history.outcomes
     for e in span:
         for i, t in np.ndindex(*trials.cost.shape[1:]):
-            own = {"episode": e + 1, "particle": i, "trial": t, "object": names[t % len(names)]}
-            yield own | _ending(jax.tree.map(lambda v, at=(e, i, t): v[at], trials))
+            cells = {"episode": e + 1, "particle": i, "trial": t, "object": names[t % len(names)]}
+            yield cells | _ending(jax.tree.map(lambda v, at=(e, i, t): v[at], trials))
 
 
 def _told(value: Any) -> str:

@@ -82,9 +82,9 @@ def load_record(folder: Path, *, tell: Tell | None = None) -> Record | None:
         test = "with" if record.test is not None else "without"
         tell(
             f"{folder} has damaged checkpoints ({steps}). Read instead is checkpoint "
-            f"{restored.step}, after episode {record.done} of {settings.episodes}, {test} the final "
-            "test: another design may be the best there. The command of codesign optimize that made "
-            "the run computes again what is lost"
+            f"{restored.step}, after episode {record.done} of {settings.episodes}, {test} the "
+            "final test: another design may be the best there. The command of codesign optimize "
+            "that made the run computes again what is lost"
         )
     return record
 

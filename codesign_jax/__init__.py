@@ -102,8 +102,8 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     if name in _HOME:
         home = importlib.import_module(_HOME[name])
-        found = getattr(home, name, None)
-        return importlib.import_module(f"{_HOME[name]}.{name}") if found is None else found
+        attribute = getattr(home, name, None)
+        return importlib.import_module(f"{_HOME[name]}.{name}") if attribute is None else attribute
     return importlib.import_module(f"codesign_jax.{name}")
 
 

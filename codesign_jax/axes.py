@@ -18,8 +18,8 @@ _TRIAL = Trial._make([(), (2,), (), (2,), (), (), (), (), (), (2,), None])
 def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -> None:
     """Refuses hands and trials without their leading axes."""
     fingers = (scene.num_fingers,)
-    one = Params(*[fingers, fingers, fingers, (), (6,), fingers])  # type: ignore[list-item]
-    problems = _problems("params", params._replace(control=None, tip=None), one, axes[0])
+    shapes = Params(*[fingers, fingers, fingers, (), (6,), fingers])  # type: ignore[list-item]
+    problems = _problems("params", params._replace(control=None, tip=None), shapes, axes[0])
     problems += _control_problems(scene, params)
     if scene.hand.section.tapered != (params.tip is not None):
         problems.append("params.tip is for hands with section.tapered, which need it")
@@ -36,10 +36,10 @@ def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -
 
 
 def _control_problems(scene: Scene, params: Params) -> list[str]:
-    one = {p.name: (scene.num_fingers,) * (p.per == "finger") for p in scene.control.parameter}
+    expected = {p.name: (scene.num_fingers,) * (p.per == "finger") for p in scene.control.parameter}
     given = {k: np.shape(v) for k, v in (params.control or {}).items()}
-    if given.keys() != one.keys():
-        names = [", ".join(v) or "none" for v in (given, one)]
+    if given.keys() != expected.keys():
+        names = [", ".join(v) or "none" for v in (given, expected)]
         return [
             f"params.control has {names[0]}; the scene's control {scene.control.name!r} needs "
             f"{names[1]}"
@@ -47,7 +47,7 @@ def _control_problems(scene: Scene, params: Params) -> list[str]:
     leading = np.shape(params.length)[:-1]
     return [
         f"params.control[{k!r}] has shape {given[k]}, not {(*leading, *shape)}"
-        for k, shape in one.items()
+        for k, shape in expected.items()
         if given[k] != (*leading, *shape)
     ]
 
@@ -56,10 +56,12 @@ def refuse_other(scene: Any, engine: Any) -> None:
     """Refuses a scene that is not one that the engine was made for."""
     if not isinstance(scene, Scene):
         raise InputError([f"scene is a {type(scene).__name__}, not a Scene; scene.load reads one"])
-    own = getattr(engine, "scene", None)
-    if own is None or own.structure == scene.structure:
+    engine_scene = getattr(engine, "scene", None)
+    if engine_scene is None or engine_scene.structure == scene.structure:
         return
-    keys = _differences(dataclasses.asdict(own.structure), dataclasses.asdict(scene.structure), "")
+    keys = _differences(
+        dataclasses.asdict(engine_scene.structure), dataclasses.asdict(scene.structure), ""
+    )
     some = ", ".join(keys[:3]) + (", ..." if len(keys) > 3 else "")
     raise InputError(
         [
@@ -98,18 +100,18 @@ def refuse_draws(key: Any, count: int) -> None:
         raise InputError([words])
 
 
-def _problems(what: str, batch: Any, one: Any, axis: str) -> list[str]:
+def _problems(what: str, batch: Any, shapes: Any, axis: str) -> list[str]:
     given = {k: np.shape(v) for k, v in batch._asdict().items() if v is not None}
-    if all(shape == getattr(one, k) for k, shape in given.items()):
+    if all(shape == getattr(shapes, k) for k, shape in given.items()):
         return [
             f"{what} have no axis ({axis},); of one, jax.tree.map(lambda v: v[None], {what}) "
             "makes a batch"
         ]
     counts = {shape[0] for shape in given.values() if shape}
     problems = [
-        f"{what}.{k} has shape {shape}, not ({', '.join(map(str, (axis, *getattr(one, k))))})"
+        f"{what}.{k} has shape {shape}, not ({', '.join(map(str, (axis, *getattr(shapes, k))))})"
         for k, shape in given.items()
-        if not shape or shape[1:] != getattr(one, k)
+        if not shape or shape[1:] != getattr(shapes, k)
     ]
     if not problems and len(counts) > 1:
         lengths = ", ".join(f"{k} {shape[0]}" for k, shape in given.items())

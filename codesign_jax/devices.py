@@ -50,7 +50,7 @@ def shared_out(simulate: Callable[..., Any], count: int) -> Callable[..., Any]:
         filled = jax.tree.map(lambda v: v[rows] if jnp.ndim(v) else v, arguments)
         specs = jax.tree.map(lambda v: by_world if jnp.ndim(v) else PartitionSpec(), filled)
         # No check of what varies between devices: the kernels' calls do not tell.
-        how = {"mesh": mesh, "in_specs": specs, "out_specs": by_world, "check_vma": False}
-        return jax.tree.map(lambda v: v[:worlds], jax.shard_map(simulate, **how)(*filled))
+        sharding = {"mesh": mesh, "in_specs": specs, "out_specs": by_world, "check_vma": False}
+        return jax.tree.map(lambda v: v[:worlds], jax.shard_map(simulate, **sharding)(*filled))
 
     return run

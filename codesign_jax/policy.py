@@ -174,7 +174,7 @@ class ControlLoop(Equal):
         hand = world_constants(self.scene, fields)
         pack = getattr(self.engine, "tables", None)
         # Worlds keep their constants, which a GPU would take a millisecond a period to lay out.
-        how = {} if pack is None else {"tables": pack(fields)}
+        arguments = {} if pack is None else {"tables": pack(fields)}
         series = {"pose": plan.pose, "pressure": plan.pressure, "shake": plan.shake}
 
         def period(carry: tuple, now: dict[str, jax.Array]) -> tuple[tuple, Trace]:
@@ -182,7 +182,7 @@ class ControlLoop(Equal):
             ahead = plan._replace(**now)
             told, command = self._asked(hand, fields, world, memory, ahead)
             world, trace = advance(
-                self.engine, fields, world, ahead, command, trajectory=trajectory, **how
+                self.engine, fields, world, ahead, command, trajectory=trajectory, **arguments
             )
             return (world, told), trace._replace(last=None)
 
@@ -262,10 +262,10 @@ class ControlLoop(Equal):
         if init is None:
             return ()
 
-        def one(params: Params) -> Any:
+        def initial(params: Params) -> Any:
             return jax.tree.map(jnp.asarray, init(params))
 
-        return jax.vmap(one)(params)
+        return jax.vmap(initial)(params)
 
     def _refuse_memory(self, before: Any, after: Any) -> None:
         trees = [jax.tree.flatten(tree) for tree in (before, after)]
@@ -376,14 +376,16 @@ def _forces(scene: Scene, hand: WorldModel, state: State) -> Forces:
     What fingers hold on one another is that after the step, from which the force between two that
     slide differs a little.
     """
-    found = forces(scene, hand, before(state, scene.discretization.timestep), state.acc)
-    found = jax.lax.stop_gradient(found)  # accelerations of a rollout have no derivative
+    contact_forces = forces(scene, hand, before(state, scene.discretization.timestep), state.acc)
+    contact_forces = jax.lax.stop_gradient(
+        contact_forces
+    )  # accelerations of a rollout have no derivative
     moved = (state.step[0, 0] > 0) & (state.going[0, 0] > 0)
 
     def kept(v: jax.Array) -> jax.Array:
         return jnp.where(moved.reshape(-1, *[1] * (v.ndim - 1)), v, 0.0)
 
-    return jax.tree.map(kept, found)
+    return jax.tree.map(kept, contact_forces)
 
 
 def _phase(scene: Scene, step: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -402,7 +404,7 @@ def spread(scene: Scene, command: Command, plan: Plan, *, of: str) -> Command:
       command: Commands with a leading axis (world,).
     """
     problems = []
-    found = []
+    commands = []
     for name, like in (("pose", plan.pose), ("pressure", plan.pressure)):
         given = jnp.asarray(getattr(command, name), like.dtype)
         if given.shape == (len(like), like.shape[2]):
@@ -410,7 +412,7 @@ def spread(scene: Scene, command: Command, plan: Plan, *, of: str) -> Command:
         elif given.shape != like.shape:
             shapes = given.shape[1:], like.shape[2:], like.shape[1:]
             problems.append("{} returned {} of shape {}, not {} or {}".format(of, name, *shapes))
-        found.append(given)
+        commands.append(given)
     if problems:
         raise InputError(problems)
     # The upper end is the limit of the wall, or the design's own pressure where that is higher.
@@ -419,7 +421,7 @@ def spread(scene: Scene, command: Command, plan: Plan, *, of: str) -> Command:
     top = jax.vmap(partial(highest_pressure, scene.hand))(p.wall, tip)
     top = jnp.maximum(top, p.pressure)[:, None]
     # Comparisons let what is no number pass, and have the derivative of what is at an end.
-    pose, pressure = found
+    pose, pressure = commands
     pressure = jnp.where(pressure < 0, 0.0, pressure)
     return Command(pose, jnp.where(pressure > top, top, pressure))
 
@@ -430,21 +432,23 @@ def advance(
     world: World,
     plan: Plan,
     command: Command,
-    **how: Any,
+    **options: Any,
 ) -> tuple[World, Trace]:
     """Simulates a period under commands of shape (world, step, ...); how: of `engine.rollout`."""
     scene: Scene = engine.scene  # type: ignore[attr-defined]
 
-    def controls(own: Scene, now: jax.Array, shake: jax.Array, tilt: jax.Array, told: Command):
+    def controls(
+        constants: Scene, now: jax.Array, shake: jax.Array, tilt: jax.Array, told: Command
+    ):
         pressure = told.pressure
         end = told.pressure[-1]
         if scene.effects.pressure_dynamics:
-            pressure, end = control.supplied(own, pressure, now)
+            pressure, end = control.supplied(constants, pressure, now)
         return control.actuated(told.pose, pressure, shake, tilt), end
 
     given = fields.constants, world.pressure, plan.shake, plan.tilt, command
     ctrl, pressure = jax.vmap(controls)(*given)
-    trace = engine.rollout(fields._replace(start=world.state), ctrl, **how)
+    trace = engine.rollout(fields._replace(start=world.state), ctrl, **options)
     if trace.last is None:
         raise InputError([f"engine {engine.name} does not tell states to go on from"])
     return World(trace.last, pressure), trace._replace(ctrl=ctrl)

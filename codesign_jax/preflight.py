@@ -55,8 +55,8 @@ def nominal_trial(scene: Scene, shape: int | str = 0) -> Trial:
     index = names.index(shape) if isinstance(shape, str) else shape
     zero = jnp.zeros(())
     none = jnp.zeros(2)
-    one = jnp.ones(())
-    return Trial(jnp.int32(index), none, zero, none, one, one, one, one, one, none)
+    unity = jnp.ones(())
+    return Trial(jnp.int32(index), none, zero, none, unity, unity, unity, unity, unity, none)
 
 
 def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
@@ -98,10 +98,10 @@ def depth(scene: Scene, fields: ModelFields) -> jax.Array:
     hand, kin, position = _straight(scene, fields)
     scene = dataclasses.replace(scene, effects=alone)
     every = assembly.contacts(scene, hand, kin, position)
-    found = [(-c.gap).reshape(-1, c.gap.shape[-1]).max(0) for c in every.values()]
-    if not found:
+    depths = [(-c.gap).reshape(-1, c.gap.shape[-1]).max(0) for c in every.values()]
+    if not depths:
         return jnp.zeros_like(fields.object_mass)
-    return jnp.stack(found).max(0)
+    return jnp.stack(depths).max(0)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -149,9 +149,9 @@ def _straight(scene: Scene, fields: ModelFields) -> tuple[WorldModel, Kinematics
 def notes(scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray]) -> list[str]:
     """Warnings of named designs [SI units], and how exact the scene's meshes are."""
     params = params_of(space, np.array([*designs.values()], np.float32))
-    found = refusals(scene, params, [*designs])
-    if found:
-        raise InputError(found)
+    problems = refusals(scene, params, [*designs])
+    if problems:
+        raise InputError(problems)
     told = [f"warning: {text}" for text in warnings(scene, params, [*designs])]
     idle = [f"not searched: {name}, which has no effect: {why}" for name, why in space.idle]
     return told + idle + mesh_notes(scene)
@@ -159,62 +159,62 @@ def notes(scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray]) -
 
 def warnings(scene: Scene, designs: Params, names: list[str]) -> list[str]:
     """What designs, arrays with leading axis (design,), may not mean as they seem to."""
-    found = _scene_warnings(scene)
+    doubts = _scene_warnings(scene)
     for i, name in enumerate(names):
-        found += _reach(scene, jax.tree.map(operator.itemgetter(i), designs), name)
-    return found
+        doubts += _reach(scene, jax.tree.map(operator.itemgetter(i), designs), name)
+    return doubts
 
 
 def refusals(scene: Scene, designs: Params, names: list[str]) -> list[str]:
     """Why designs, arrays with leading axis (design,), must not be simulated."""
     limit = morphology.pressure_limits(scene.hand, designs)
-    found = [
+    problems = [
         f"{names[i]}: finger {f}: pressure {designs.pressure[i, f]:.4g} Pa is above the limit of "
         f"{limit[i, f]:.4g} Pa for a wall of {designs.wall[i, f]:g} m"
         for i, f in np.argwhere(np.asarray(designs.pressure) > limit * (1 + 1e-6))
     ]
-    return found + _overlaps(scene, designs, names)
+    return problems + _overlaps(scene, designs, names)
 
 
 def mesh_notes(scene: Scene) -> list[str]:
     """Repairs of the scene's meshes and errors of their distances, which are built for it."""
-    found = []
+    lines = []
     for shape in scene.objects.object:
         if shape.mesh:
             grid = shape.mesh.grid
             cell, error, worst = (1e3 * v for v in (grid.cell, grid.error, grid.worst))
-            found += [f"object {shape.name}: {line}" for line in shape.mesh.repairs]
-            found.append(
+            lines += [f"object {shape.name}: {line}" for line in shape.mesh.repairs]
+            lines.append(
                 f"object {shape.name}: distances on {cell:.2g} mm cells, error near the surface "
                 f"below {error:.2g} mm (99 %), {worst:.2g} mm at worst"
             )
-    return found
+    return lines
 
 
 def _scene_warnings(scene: Scene) -> list[str]:
     h = scene.discretization.timestep
-    found = key_frames.doubts(scene, "control")
+    doubts = key_frames.doubts(scene, "control")
     rate = scene.arm.shake_frequency
     if scene.effects.disturb and rate * h * SHAKE_STEPS > 1:
-        found.append(
+        doubts.append(
             f"arm.shake_frequency = {rate:g} Hz has {1 / (rate * h):.1f} time steps of {h:g} s in "
             f"a period: below {SHAKE_STEPS} the shaking is not the sine asked for"
         )
     for i, finger in enumerate(scene.hand.finger):
         if 0 < abs(finger.tilt) <= math.pi / 2:
-            found.append(
+            doubts.append(
                 f"hand.finger.{i}.tilt = {finger.tilt:g} deg leaves the palm nearly flat; did you "
                 f"mean {math.degrees(finger.tilt):.3g}? (radians given where degrees are expected)"
             )
     if (tilt := scene.objects.noise.tilt) and not scene.phases.settle:
-        found.append(
+        doubts.append(
             f"noise.tilt = {tilt:g} deg puts objects askew on the table, and they fall while the "
             "hand comes: phases.settle = 1 gives them a second before"
         )
     for shape in scene.objects.object:
         angle, sunk = shape.fall
         if angle > FALL and sunk > ROLL:
-            found.append(
+            doubts.append(
                 f"object {shape.name!r} does not rest as it is put on the table: it topples by "
                 f'{angle} degrees before the hand comes; pose = "stable" in its [[object]] puts it '
                 "as it comes to rest most often"
@@ -222,22 +222,22 @@ def _scene_warnings(scene: Scene) -> list[str]:
         stiffness = scene.contact.normal_stiffness
         sunk = shape.mass * scene.gravity / (2 * stiffness)
         if sunk > SINK:
-            found.append(
+            doubts.append(
                 f"object {shape.name!r} of {shape.mass:g} kg sinks {1e3 * sunk:.1f} mm into the "
                 f"table on one contact: contact.normal_stiffness = {stiffness:g} N/m is soft for "
                 "its weight"
             )
-    return found
+    return doubts
 
 
-def _reach(scene: Scene, one: Params, name: str) -> list[str]:
+def _reach(scene: Scene, design: Params, name: str) -> list[str]:
     if not scene.effects.finger_object:
         return []
-    palm = float(key_frames.poses(scene, one)[:, 2].min())
+    palm = float(key_frames.poses(scene, design)[:, 2].min())
     tilt = np.deg2rad([f.tilt for f in scene.hand.finger])
-    lowest = float((palm - one.length * np.sin(tilt)).min())
+    lowest = float((palm - design.length * np.sin(tilt)).min())
     # An arm that is turned may bring a finger lower, by no more than its whole length.
-    turned = float(palm - one.length.max() - max(f.base_distance for f in scene.hand.finger))
+    turned = float(palm - design.length.max() - max(f.base_distance for f in scene.hand.finger))
     top = max(2 * shape.radius for shape in scene.objects.object)
     if turned > top:
         return [
@@ -253,7 +253,7 @@ def _overlaps(scene: Scene, designs: Params, names: list[str]) -> list[str]:
     with_objects, fingers, palm = map(np.asarray, _depths(numbers, singles))
     fixtures = ", a fixture" if scene.fixture else ""
     limit = scene.limits.penetration
-    found = []
+    problems = []
     for i, name in enumerate(names):
         inside = [
             (
@@ -275,12 +275,12 @@ def _overlaps(scene: Scene, designs: Params, names: list[str]) -> list[str]:
                 "mount it further out or tilt it further down, or set effects.finger_palm = false",
             ),
         ]
-        found += [
+        problems += [
             f"{name}: {what} (limits.penetration = {1e3 * limit:g} mm); {remedy}"
             for deep, what, remedy in inside
             if not deep <= limit
         ]
-    return found
+    return problems
 
 
 @jax.jit

@@ -41,7 +41,7 @@ _UNTRACED = ("compiler", "files", "reuse", "array_files")
 
 def _state() -> dict[str, tuple[int, ...]]:
     """Each file of code, with the time of its inode's last change, which no program sets back."""
-    found = {}
+    states = {}
     folders = [""]
     with contextlib.suppress(OSError):  # a file goes away while its state is read
         while folders:
@@ -50,10 +50,10 @@ def _state() -> dict[str, tuple[int, ...]]:
                 name = f"{folder}{entry.name}"
                 if entry.name.endswith(".py"):
                     s = entry.stat()
-                    found[name] = (s.st_dev, s.st_ino, s.st_size, s.st_mtime_ns, s.st_ctime_ns)
+                    states[name] = (s.st_dev, s.st_ino, s.st_size, s.st_mtime_ns, s.st_ctime_ns)
                 elif entry.is_dir() and name not in UNRELATED and entry.name != "__pycache__":
                     folders.append(f"{name}/")
-    return found
+    return states
 
 
 at_import = _state()
@@ -68,17 +68,17 @@ def code_digest(*, traced: bool = True) -> str | None:
     """
     if (traced and replaced()) or _state() != at_import:
         return None
-    found = _content_digest()
-    return found if _state() == at_import else None  # edited while it was read
+    current = _content_digest()
+    return current if _state() == at_import else None  # edited while it was read
 
 
 @functools.cache
 def _content_digest() -> str:
-    found = hashlib.sha256()
+    sha = hashlib.sha256()
     for name in sorted(at_import):
         code = (ROOT / name).read_bytes()
-        found.update(f"{name} {len(code)}\n".encode() + code)
-    return found.hexdigest()
+        sha.update(f"{name} {len(code)}\n".encode() + code)
+    return sha.hexdigest()
 
 
 def note() -> None:
@@ -103,17 +103,19 @@ def replaced() -> list[str]:
 
 
 def _names(module: object) -> dict[str, object]:
-    found = {}
-    own = getattr(module, "__name__", None)
+    members = {}
+    module_name = getattr(module, "__name__", None)
     for name, value in getattr(module, "__dict__", {}).items():
         if name.startswith("__"):
             continue
-        found[name] = value
-        if getattr(value, "__module__", None) == own and isinstance(value, types.FunctionType):
-            found[f"{name}()"] = value.__code__
-        elif getattr(value, "__module__", None) == own and isinstance(value, type):
-            found |= {f"{name}.{key}": v for key, v in vars(value).items() if key[:2] != "__"}
-    return found
+        members[name] = value
+        if getattr(value, "__module__", None) == module_name and isinstance(
+            value, types.FunctionType
+        ):
+            members[f"{name}()"] = value.__code__
+        elif getattr(value, "__module__", None) == module_name and isinstance(value, type):
+            members |= {f"{name}.{key}": v for key, v in vars(value).items() if key[:2] != "__"}
+    return members
 
 
 def key(*parts: object, traced: bool = True) -> str | None:
@@ -146,10 +148,10 @@ def _environment() -> tuple[str, str]:
 def problems() -> list[str]:
     """Problems with the environment variables, in words."""
     switch, most = _environment()
-    found = [] if switch in ("on", "off") else [f"CODESIGN_CACHE = {switch!r} must be on or off"]
+    messages = [] if switch in ("on", "off") else [f"CODESIGN_CACHE = {switch!r} must be on or off"]
     if not (most.isascii() and most.isdecimal() and len(most) <= 18):
-        found.append(f"CODESIGN_CACHE_BYTES = {most[:40]!r} must be a number of bytes")
-    return found
+        messages.append(f"CODESIGN_CACHE_BYTES = {most[:40]!r} must be a number of bytes")
+    return messages
 
 
 def limit() -> int | None:
@@ -178,11 +180,11 @@ def kept(path: Path | None, build: Callable[[], bytes], *, worth: float = 0.0) -
     if path is None or most is None:
         return build()
     with contextlib.suppress(OSError):
-        found = path.read_bytes()
-        if found[:32] == hashlib.sha256(path.name.encode() + found[32:]).digest():
+        stored = path.read_bytes()
+        if stored[:32] == hashlib.sha256(path.name.encode() + stored[32:]).digest():
             with contextlib.suppress(OSError):  # of somebody else
                 os.utime(path)
-            return found[32:]
+            return stored[32:]
     start = time.perf_counter()
     content = build()
     if time.perf_counter() - start >= worth:
@@ -196,16 +198,16 @@ def kept(path: Path | None, build: Callable[[], bytes], *, worth: float = 0.0) -
 
 def _evict(newest: Path, most: int) -> None:
     """Deletes a folder's files that were not used for the longest time; the newest stays."""
-    found = []
+    entries = []
     for path in newest.parent.iterdir():
         with contextlib.suppress(OSError):  # another process deletes as well
             state = path.stat()
             if path.suffix == newest.suffix:
-                found.append((state.st_mtime_ns, state.st_size, path))
+                entries.append((state.st_mtime_ns, state.st_size, path))
             elif path.suffix == ".tmp" and time.time() - state.st_mtime > 3600:  # abandoned
                 path.unlink()
-    total = sum(size for _, size, _ in found)
-    for _, size, path in sorted(found):
+    total = sum(size for _, size, _ in entries)
+    for _, size, path in sorted(entries):
         if total > most and path != newest:
             path.unlink(missing_ok=True)
             total -= size
@@ -330,15 +332,15 @@ def shared(build: Callable[..., Any]) -> Callable[..., Any]:
         _relieve()
         return jax.tree.map(jax.jit, build(*arguments))
 
-    found = functools.lru_cache(maxsize=32)(jitted)
-    forgetters.append(found.cache_clear)
+    cached = functools.lru_cache(maxsize=32)(jitted)
+    forgetters.append(cached.cache_clear)
 
     @functools.wraps(build)
     def find(engine: Any, space: Any, *arguments: Any) -> Any:
         if getattr(arguments[-1], "cost", None) is not None:
             return jitted(engine, space, *arguments)
         known = isinstance(engine, Hashable) and code_digest() is not None
-        return (found if known else jitted)(engine, space.structure, *arguments)
+        return (cached if known else jitted)(engine, space.structure, *arguments)
 
     return find
 
@@ -357,21 +359,23 @@ class SceneProgram:
 
     def __call__(self, first: Any, second: Any, scene: Any = None) -> Any:
         """Calls the program; the scene is checked and takes the place of its own."""
-        own = self._arrays(scene)
-        return _run(lambda: self._jitted(first, second, own, *self._more))
+        scene_arrays = self._arrays(scene)
+        return _run(lambda: self._jitted(first, second, scene_arrays, *self._more))
 
     def compile(self, first: Any, second: Any) -> Callable[..., Any]:
         """Compiles the program ahead for arguments like these; a function to call it by."""
-        own = self._arrays(None)
-        compiled = _run(lambda: self._jitted.lower(first, second, own, *self._more).compile())
-        return lambda first, second: compiled(first, second, own, *self._more)
+        scene_arrays = self._arrays(None)
+        compiled = _run(
+            lambda: self._jitted.lower(first, second, scene_arrays, *self._more).compile()
+        )
+        return lambda first, second: compiled(first, second, scene_arrays, *self._more)
 
     def _arrays(self, scene: Any) -> Any:
         import jax
 
         # Python's floats would be traced apart from arrays.
-        found = self._scene.checked(scene)
-        return jax.tree.map(lambda v: jax.numpy.asarray(v, float), found.bare)
+        checked = self._scene.checked(scene)
+        return jax.tree.map(lambda v: jax.numpy.asarray(v, float), checked.bare)
 
 
 # Whether programs have run in this process, and whether it was forked from one in which they had.

@@ -108,11 +108,13 @@ def sample_trials(
     reuse.begin()
     axes.refuse_draws(key, num_trials)
     axes.refuse_numbers(scene.checked(), num_trials, "trial")
-    found = _draw(num_trials, len(scene.objects.object), key, scene.objects.noise, first)
+    trials = _draw(num_trials, len(scene.objects.object), key, scene.objects.noise, first)
     if not scene.drawn.constant:
-        return found
-    own = jax.random.fold_in(key, _CONSTANTS)
-    return found._replace(constants=draws.deviations(scene.drawn, own, num_trials, first))
+        return trials
+    constants_key = jax.random.fold_in(key, _CONSTANTS)
+    return trials._replace(
+        constants=draws.deviations(scene.drawn, constants_key, num_trials, first)
+    )
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -122,11 +124,11 @@ def _draw(
     """Trials of a set of so many shapes; one program where nothing else is compiled with it."""
 
     def draw(t: jax.Array, noise: Any) -> Trial:
-        own = jax.random.fold_in(key, t)
-        others = jax.vmap(partial(jax.random.fold_in, own))(np.array([_LATER, _HAND_MASS]))
+        trial_key = jax.random.fold_in(key, t)
+        others = jax.vmap(partial(jax.random.fold_in, trial_key))(np.array([_LATER, _HAND_MASS]))
         # The first numbers of a key are the same however many are drawn, so that one draw of all
         # is three draws, with two thirds of the operations.
-        every = jax.vmap(lambda k: jax.random.normal(k, (7,)))(jnp.append(own, others))
+        every = jax.vmap(lambda k: jax.random.normal(k, (7,)))(jnp.append(trial_key, others))
         z = every[0]
         later = every[1]
         hand_mass = every[2, 0]

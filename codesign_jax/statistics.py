@@ -32,7 +32,7 @@ def paired(both: int, first: int, second: int, total: int) -> Interval:
     It joins Wilson's intervals of the two shares by their correlation: with no trial in which the
     two differ it has a width, unlike Wald's and the bootstrap's.
     """
-    one = wilson(both + first, total)
+    share = wilson(both + first, total)
     other = wilson(both + second, total)
     neither = total - both - first - second
     product = (both + first) * (second + neither) * (both + second) * (first + neither)
@@ -44,9 +44,9 @@ def paired(both: int, first: int, second: int, total: int) -> Interval:
     def width(a: float, b: float) -> float:
         return math.sqrt(max(a * a - 2 * phi * a * b + b * b, 0.0))
 
-    value = one.value - other.value
-    low = value - width(one.value - one.low, other.high - other.value)
-    high = value + width(one.high - one.value, other.value - other.low)
+    value = share.value - other.value
+    low = value - width(share.value - share.low, other.high - other.value)
+    high = value + width(share.high - share.value, other.value - other.low)
     return Interval(value, low, high)
 
 

@@ -74,7 +74,7 @@ class Stress(NamedTuple):
     @property
     def rows(self) -> list[tuple[str, str, str]]:
         """A row for each condition; of several sets what the worst and the best one keep."""
-        found = []
+        table_rows = []
         for name, kept in self.by_condition.items():
             total = self.trials * kept.size
             share, low, high = wilson(int(kept.sum()), total)
@@ -84,8 +84,8 @@ class Stress(NamedTuple):
                 high = kept.max() / self.trials
                 what = ", by draw"
             span = f"{100 * low:.0f} to {100 * high:.0f} %{what}"
-            found.append((name, f"{100 * share:.0f} % of {total}", span))
-        return found
+            table_rows.append((name, f"{100 * share:.0f} % of {total}", span))
+        return table_rows
 
     @property
     def limits(self) -> str:
@@ -121,10 +121,10 @@ def simulate(
         return result
 
     run = _program(scene, case, trials)
-    found, qpos, drawn = simulated(run)
+    outcomes, qpos, drawn = simulated(run)
     params = jax.tree.map(np.asarray, jax.jit(case.space.params)(design))
-    warnings = _in_grasps(scene, params, *jax.tree.map(np.asarray, (found, qpos, drawn)))
-    every = [(AS_IT_IS, found)]
+    warnings = _in_grasps(scene, params, *jax.tree.map(np.asarray, (outcomes, qpos, drawn)))
+    every = [(AS_IT_IS, outcomes)]
     every += [(name, simulated(run, c)[0]) for name, c in variants(scene)]
     other = silicones.under(scene, neo_hookean=not scene.effects.neo_hookean)
     name = f"{'neo-Hookean' if other.effects.neo_hookean else 'linear'} bending law"
@@ -152,16 +152,16 @@ def variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
             grams = dict.fromkeys(f"{1e3 * m:.0f}" for m in (min(heavier), max(heavier)))
             path = ("objects", "object", "mass")
             place = iter(heavier)
-            own = draws.changed(scene, path, lambda _, place=place: next(place))
-            yield f"objects of {' to '.join(grams)} g", own
-    own = draws.changed(scene, ("objects", "object", "friction"), lambda _: FRICTION)
-    yield f"friction {FRICTION} on the hand", own
+            heavier_scene = draws.changed(scene, path, lambda _, place=place: next(place))
+            yield f"objects of {' to '.join(grams)} g", heavier_scene
+    slippery = draws.changed(scene, ("objects", "object", "friction"), lambda _: FRICTION)
+    yield f"friction {FRICTION} on the hand", slippery
     table = unknown(scene)
     if not table.constant:
         return
     values = np.asarray(draws.deviations(table, jax.random.key(STREAM), DRAWS), float)
-    for own in values:
-        yield f"{DRAWS} draws of other constants", draws.applied(scene, table, own.tolist())
+    for deviation in values:
+        yield f"{DRAWS} draws of other constants", draws.applied(scene, table, deviation.tolist())
 
 
 def unknown(scene: Scene) -> draws.Constants:
@@ -175,13 +175,13 @@ def unknown(scene: Scene) -> draws.Constants:
     if silicone is not None:
         rubber = silicones.get(silicone)
         low, high = (end / rubber.shear_modulus for end in rubber.interval)
-    found = []
+    constants = []
     for entry in draws.read(UNMEASURED).constant:
         if entry.key == "hand.material.shear_modulus":
             entry = dataclasses.replace(entry, low=low, high=high)
         if entry.key not in known:
-            found.append(entry)
-    return draws.Constants(constant=tuple(found))
+            constants.append(entry)
+    return draws.Constants(constant=tuple(constants))
 
 
 def _program(scene: Scene, case: Case, trials: int) -> SceneProgram:
@@ -196,16 +196,16 @@ def _recorded(engine: Engine, space: DesignSpace, num_trials: int) -> Callable:
         trials = rollout.sample_trials(scene, key, num_trials)
         hand = jax.tree.map(lambda v: v[None], space.params(design))
         scene, hands, trials = rollout.crossed(scene, hand, trials)
-        found, trace = rollout.simulate(scene, engine, hands, trials, record_qpos=True)
-        return found, trace.qpos[:, ::HELD], trials
+        outcomes, trace = rollout.simulate(scene, engine, hands, trials, record_qpos=True)
+        return outcomes, trace.qpos[:, ::HELD], trials
 
     return simulated
 
 
 def _in_grasps(
-    scene: Scene, params: Params, found: Outcome, qpos: np.ndarray, trials: Trial
+    scene: Scene, params: Params, outcomes: Outcome, qpos: np.ndarray, trials: Trial
 ) -> list[str]:
-    kept = np.flatnonzero(verdict.kept(found))
+    kept = np.flatnonzero(verdict.kept(outcomes))
     first = [kept[trials.shape[kept] == k][:1] for k in range(len(scene.objects.object))]
     times = np.arange(qpos.shape[1]) * HELD
     closed, held, end = (scene.steps_to(t) for t in (scene.phase_ends["approach"], *scene.window))
@@ -228,33 +228,33 @@ def _poses(
     fields = jax.jit(model.model_fields, static_argnums=0)(scene, params, trial)
     compiled = world_model(scene, jax.tree.map(np.asarray, fields))
     data = mujoco.MjData(compiled)
-    found = []
+    poses = []
     for state in qpos:
         data.qpos[:] = state
         mujoco.mj_kinematics(compiled, data)
-        found.append((data.xpos.copy(), data.xmat.reshape(-1, 3, 3).copy()))
-    place, turn = zip(*found, strict=True)
+        poses.append((data.xpos.copy(), data.xmat.reshape(-1, 3, 3).copy()))
+    place, turn = zip(*poses, strict=True)
     return np.stack(place), np.stack(turn)
 
 
 def of_design(scene: Scene, params: Params) -> list[str]:
     """Warnings of a design itself, of which nothing is simulated."""
-    found: list[str] = []
+    warnings: list[str] = []
     limits = morphology.pressure_limits(scene.hand, params)
     law = bool(scene.effects.neo_hookean)
     for f, bend in enumerate(morphology.free_bends(scene.hand, params, neo_hookean=law)):
         limit = limits[f]
         if float(params.pressure[f]) > 0.99 * limit:
-            found.append(f"finger {f}: its pressure is at its limit, {limit / 1e3:.0f} kPa")
+            warnings.append(f"finger {f}: its pressure is at its limit, {limit / 1e3:.0f} kPa")
         if bend > TURN:
-            found.append(
+            warnings.append(
                 f"finger {f} bends by {np.degrees(bend):.0f}° without load, more than a turn"
             )
     rim = float(rim_drop(scene.hand.palm.radius, *np.asarray(params.arm, float)[3:]))
     low = scene.arm.zero_height + float(params.arm[2]) - rim
     if low < 0:
-        found.append(f"the palm's rim is commanded {-1e3 * low:.0f} mm below the table")
-    return found
+        warnings.append(f"the palm's rim is commanded {-1e3 * low:.0f} mm below the table")
+    return warnings
 
 
 def of_bends(strain: np.ndarray, held: np.ndarray) -> list[str]:
@@ -266,19 +266,19 @@ def of_bends(strain: np.ndarray, held: np.ndarray) -> list[str]:
     """
     if not strain.size:
         return []
-    found = []
+    warnings = []
     most = strain.max((0, 1, 3))
     for f in np.flatnonzero(most > STRAIN):
-        found.append(
+        warnings.append(
             f"finger {f}: its walls stretch by {100 * most[f]:.0f} % in grasps, more than the "
             f"{100 * STRAIN:.0f} % up to which silicones were measured"
         )
     angles = np.median(held.sum(-1), 1).max(0)
     for f in np.flatnonzero(angles > TURN):
-        found.append(
+        warnings.append(
             f"finger {f} bends by {np.degrees(angles[f]):.0f}° in grasps, more than a turn"
         )
-    return found
+    return warnings
 
 
 def of_overlaps(scene: Scene, params: Params, depths: list[Overlaps]) -> list[str]:
@@ -290,14 +290,14 @@ def of_overlaps(scene: Scene, params: Params, depths: list[Overlaps]) -> list[st
     ends = [(params.height, scene.hand.section.width)]
     ends += [] if params.tip is None else [(params.tip.height, params.tip.width)]
     thin = np.min([np.minimum(*map(np.asarray, pair)) for pair in ends], 0)
-    found = []
+    warnings = []
     for i, j in np.argwhere(fingers > DEEP):
         deep = f"{1e3 * fingers[i, j]:.0f} mm"
         if i == j:
             more = "" if touches_itself(scene) else ": the simulation has no such contact"
-            found.append(f"finger {i} stands {deep} deep in itself{more}")
+            warnings.append(f"finger {i} stands {deep} deep in itself{more}")
         elif fingers[i, j] > thin[j] / 3 and (fingers[i, j] >= fingers[j, i] or i < j):
-            found.append(f"finger {i} stands {deep} deep in finger {j}, more than a third of it")
+            warnings.append(f"finger {i} stands {deep} deep in finger {j}, more than a third of it")
     for f in np.flatnonzero(palm > DEEP):
-        found.append(f"finger {f} stands {1e3 * palm[f]:.0f} mm deep in the palm")
-    return found
+        warnings.append(f"finger {f} stands {1e3 * palm[f]:.0f} mm deep in the palm")
+    return warnings

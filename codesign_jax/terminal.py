@@ -40,14 +40,14 @@ _AS_THEY_ARE["soft_wrap"] = True
 class Console(rich.console.Console):
     """Prints each text as one line, as it is and as long as it is, and so the cells of tables."""
 
-    def __init__(self, **how: Any):
+    def __init__(self, **options: Any):
         """Takes rich's arguments."""
-        tolerate(how.get("file") or sys.stdout)
-        super().__init__(**_AS_THEY_ARE | how)
+        tolerate(options.get("file") or sys.stdout)
+        super().__init__(**_AS_THEY_ARE | options)
 
-    def render_str(self, text: str, **how: Any) -> rich.text.Text:
+    def render_str(self, text: str, **options: Any) -> rich.text.Text:
         """The one way of a text through rich's console."""
-        return super().render_str(line(text), **how)
+        return super().render_str(line(text), **options)
 
 
 def say(*lines: str, error: bool = False) -> None:

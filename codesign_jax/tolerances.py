@@ -138,18 +138,18 @@ class Yield(NamedTuple):
             gains.append(self._gains(random.choice(rows, len(rows)), virtual, names))
         low, high = np.quantile(gains, (0.025, 0.975), axis=0)
         ends = zip(names, gains[0], low, high, strict=True)
-        return {name: Interval(*map(float, found)) for name, *found in ends}
+        return {name: Interval(*map(float, bounds)) for name, *bounds in ends}
 
     def _gains(self, rows: np.ndarray, virtual: np.ndarray, names: list[str]) -> np.ndarray:
         # The design itself is known best: its grasps count once in every fit.
         chosen = np.append(0, rows)
         slopes = regression(self._terms(self.scores[chosen]), self.kept[chosen], self.trials)
         now = self._good(virtual, slopes)
-        found = []
+        gains = []
         for name in names:
             half = np.where(np.array(self.kinds) == name, 0.5, 1.0)
-            found.append(self._good(half * virtual, slopes) - now)
-        return np.array(found)
+            gains.append(self._good(half * virtual, slopes) - now)
+        return np.array(gains)
 
     def _good(self, scores: np.ndarray, slopes: np.ndarray) -> float:
         """Share of hands with these deviations that are good, by the regression."""
@@ -222,7 +222,7 @@ def read(words: tuple[str, ...]) -> dict[str, float]:
     Raises:
       InputError: With every word that is none.
     """
-    found = {}
+    values = {}
     problems = []
     for word in words:
         name, _, text = word.partition("=")
@@ -236,10 +236,10 @@ def read(words: tuple[str, ...]) -> dict[str, float]:
         if not 0 <= value <= 20 * KINDS[name].usual:
             most = f"{20 * KINDS[name].usual:g} {KINDS[name].unit}"
             problems.append(f"--tolerances {schema.shown(word)} must be a number from 0 to {most}")
-        found[name] = value
+        values[name] = value
     if problems:
         raise schema.InputError(problems)
-    return found
+    return values
 
 
 def simulate(
@@ -261,21 +261,23 @@ def simulate(
       done: Is told the grasps of each call.
     """
     scene = case.scene
-    own, kinds = table(scene, given)
+    deviating_constants, kinds = table(scene, given)
     known = scene.drawn
     random = jax.random.fold_in(key, STREAM)
-    cast = np.array(draws.deviations(own, random, hands))
-    spread = np.array([entry.sd for entry in own.constant])
-    factor = np.array([entry.is_factor for entry in own.constant])
+    cast = np.array(draws.deviations(deviating_constants, random, hands))
+    spread = np.array([entry.sd for entry in deviating_constants.constant])
+    factor = np.array([entry.is_factor for entry in deviating_constants.constant])
     scores = np.where(factor, np.log(np.where(factor, cast, 1.0)), cast) / spread
     if known.constant:
         more = np.array(draws.deviations(known, jax.random.fold_in(random, 1), hands))
         cast = np.hstack([cast, more])
         scores = np.hstack([scores, _standard(more)])
         kinds += (CONSTANTS,) * more.shape[1]
-    exact = np.array([entry.deviation(0.0) for entry in (*own.constant, *known.constant)])
+    exact = np.array(
+        [entry.deviation(0.0) for entry in (*deviating_constants.constant, *known.constant)]
+    )
     every = np.vstack([exact, cast])
-    run = SceneProgram(scene, _cast(case.make_engine(), case.space, own, trials))
+    run = SceneProgram(scene, _cast(case.make_engine(), case.space, deviating_constants, trials))
     design = jnp.asarray(case.design, jnp.float32)
     parts = []
     for outcome in batch.in_chunks(
@@ -295,11 +297,13 @@ def _standard(values: np.ndarray) -> np.ndarray:
 
 
 @shared
-def _cast(engine: Engine, space: DesignSpace, own: draws.Constants, count: int) -> Callable:
+def _cast(
+    engine: Engine, space: DesignSpace, deviation_table: draws.Constants, count: int
+) -> Callable:
     """Grasps of hands with deviations, first those of the table and then the scene's constants."""
-    of_design = [i for i, entry in enumerate(own.constant) if entry.path[0] == "design"]
-    of_scene = [i for i in range(len(own.constant)) if i not in of_design]
-    left = draws.Constants(constant=tuple(own.constant[i] for i in of_scene))
+    of_design = [i for i, entry in enumerate(deviation_table.constant) if entry.path[0] == "design"]
+    of_scene = [i for i in range(len(deviation_table.constant)) if i not in of_design]
+    left = draws.Constants(constant=tuple(deviation_table.constant[i] for i in of_scene))
 
     def simulated(design: jax.Array, noise: tuple[jax.Array, jax.Array], scene: Scene) -> Outcome:
         key, deviations = noise
@@ -307,16 +311,16 @@ def _cast(engine: Engine, space: DesignSpace, own: draws.Constants, count: int) 
         trials = rollout.sample_trials(scene, key, count)
         params = jax.tree.map(lambda v: jnp.repeat(v[None], hands, 0), space.params(design))
         for i in of_design:
-            params = deviating(params, own.constant[i].path, deviations[:, i])
+            params = deviating(params, deviation_table.constant[i].path, deviations[:, i])
         each = jnp.repeat(deviations, count, 0)
         if scene.drawn.constant:
             trials = trials._replace(constants=None)
         _, params, worlds = rollout.crossed(scene, params, trials)
         if scene.drawn.constant:
-            worlds = worlds._replace(constants=each[:, len(own.constant) :])
+            worlds = worlds._replace(constants=each[:, len(deviation_table.constant) :])
         changed = draws.applied(scene, left, [each[:, i] for i in of_scene])
-        found, _ = rollout.simulate(changed, engine, params, worlds)
-        return rollout.grid(found, (hands, count))
+        outcomes, _ = rollout.simulate(changed, engine, params, worlds)
+        return rollout.grid(outcomes, (hands, count))
 
     return simulated
 

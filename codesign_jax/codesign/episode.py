@@ -203,8 +203,8 @@ class _Weighing(SceneProgram):
 
     def __call__(self, first: Any, second: Any, scene: Scene | None = None) -> Any:
         """Like `SceneProgram`, but warns of negative particle costs, except traced ones."""
-        found = super().__call__(first, second, scene)
-        costs = found[1].selection.cost
+        results = super().__call__(first, second, scene)
+        costs = results[1].selection.cost
         if not isinstance(costs, jax.core.Tracer) and (np.asarray(costs) < 0).any():
             warnings.warn(
                 "a cost of your own is negative: the particle filter weighs by 1 / (alpha + cost) "
@@ -212,7 +212,7 @@ class _Weighing(SceneProgram):
                 "constant, or take an optimiser that compares, such as cma-es",
                 stacklevel=2,
             )
-        return found
+        return results
 
 
 class _Programs(NamedTuple):
@@ -259,10 +259,10 @@ def _programs(
     def run(
         state: OptimizerState, masks: jax.typing.ArrayLike, scene: Scene, optimizer: Optimizer
     ) -> tuple[OptimizerState, EpisodeInfo]:
-        def one(state: OptimizerState, mask: jax.Array) -> tuple[OptimizerState, EpisodeInfo]:
+        def step(state: OptimizerState, mask: jax.Array) -> tuple[OptimizerState, EpisodeInfo]:
             return episode(state, mask, scene, optimizer)
 
-        return jax.lax.scan(one, state, jnp.asarray(masks))
+        return jax.lax.scan(step, state, jnp.asarray(masks))
 
     return _Programs(evaluate, episode, jax.vmap(episode, in_axes=(0, 0, None, None)), run)
 

@@ -104,8 +104,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     def _seed(self, seed: Any) -> None:
         count = self.num_envs
-        one = isinstance(seed, int | np.integer)
-        seeds = [int(seed) + i for i in range(count)] if one else list(seed)
+        single = isinstance(seed, int | np.integer)
+        seeds = [int(seed) + i for i in range(count)] if single else list(seed)
         if len(seeds) != count:
             raise InputError([f"seed has {len(seeds)} entries for {count} environments"])
         drawn = jnp.array([s is None for s in seeds])

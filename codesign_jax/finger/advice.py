@@ -51,7 +51,7 @@ def advice(finger: Finger, posterior: Posterior, table: Table) -> list[Advice]:
     names = tuple(n for n in Constants._fields if getattr(likely.constants, n) > 0)
     before = _precision(posterior, names)
     start = np.trace(np.linalg.inv(before))
-    found = []
+    suggestions = []
     for words, rows in candidates(likely, table).items():
         try:
             more = _more(likely, names, rows, posterior)
@@ -59,8 +59,8 @@ def advice(finger: Finger, posterior: Posterior, table: Table) -> list[Advice]:
             continue
         after = np.linalg.inv(before + more)
         sd = dict(zip(names, np.sqrt(np.diag(after)).tolist(), strict=True))
-        found.append(Advice(words, float(1 - np.trace(after) / start), sd))
-    return sorted(found, key=lambda one: -one.less)
+        suggestions.append(Advice(words, float(1 - np.trace(after) / start), sd))
+    return sorted(suggestions, key=lambda suggestion: -suggestion.less)
 
 
 def _own(finger: Finger, names: tuple[str, ...]) -> np.ndarray:
@@ -69,10 +69,10 @@ def _own(finger: Finger, names: tuple[str, ...]) -> np.ndarray:
 
 def _precision(posterior: Posterior, names: tuple[str, ...]) -> np.ndarray:
     """The posterior's precision, and that of the priors of what it does not have."""
-    found = np.diag([min(priors()[n], UNKNOWN_MODULUS) ** -2 for n in names])
+    precision = np.diag([min(priors()[n], UNKNOWN_MODULUS) ** -2 for n in names])
     places = [names.index(n) for n in posterior.names]
-    found[np.ix_(places, places)] = np.linalg.inv(posterior.covariance)
-    return found
+    precision[np.ix_(places, places)] = np.linalg.inv(posterior.covariance)
+    return precision
 
 
 def _more(finger: Finger, names: tuple[str, ...], rows: Table, posterior: Posterior) -> np.ndarray:
@@ -108,12 +108,12 @@ def candidates(finger: Finger, table: Table) -> dict[str, dict[str, np.ndarray]]
     stiffness = float(np.mean(finger.stiffness)) * finger.segment
     gain = float(np.mean(finger.gain))
     weight = 0.3 * stiffness / finger.length**2
-    found: dict[str, dict[str, np.ndarray]] = {}
+    tables: dict[str, dict[str, np.ndarray]] = {}
 
     def add(words: str, column: str, **given: float | np.ndarray) -> None:
         rows = np.size(given.get("time", np.zeros(ROWS)))
         whole = {"pressure": 0.0, **given, column: np.nan}
-        found[words] = {n: np.broadcast_to(np.asarray(v, float), rows) for n, v in whole.items()}
+        tables[words] = {n: np.broadcast_to(np.asarray(v, float), rows) for n, v in whole.items()}
 
     grams = f"{1e3 * weight / swing.GRAVITY:.2g} g"
     if gain > 0:
@@ -129,4 +129,4 @@ def candidates(finger: Finger, table: Table) -> dict[str, dict[str, np.ndarray]]
     period = swing.first_period(finger, 0.0)
     times = np.linspace(0, PERIODS * period, PICTURES + 1)[1:]
     add("the ring-down without a weight, filmed", "drop", time=times, load=0.0)
-    return found
+    return tables

@@ -87,8 +87,8 @@ def priors() -> dict[str, float]:
     They are those of a hand that was not measured, but that nothing is assumed of the modulus.
     """
     table = draws.read("unmeasured").constant
-    found = {e.key.removeprefix(HAND): e.spread for e in table if e.key.startswith(HAND)}
-    return found | {"shear_modulus": math.inf}
+    spreads = {e.key.removeprefix(HAND): e.spread for e in table if e.key.startswith(HAND)}
+    return spreads | {"shear_modulus": math.inf}
 
 
 def fit(finger: Finger, table: Table) -> Posterior:
@@ -169,10 +169,10 @@ class _Problem:
             return np.append(self.errors(x), prior * x)
 
         # Close enough for the steps that follow.
-        found = optimize.least_squares(residual, logs, x_scale=0.3, diff_step=STEP, ftol=1e-4)
-        if np.linalg.matrix_rank(found.jac) < len(logs):
+        solution = optimize.least_squares(residual, logs, x_scale=0.3, diff_step=STEP, ftol=1e-4)
+        if np.linalg.matrix_rank(solution.jac) < len(logs):
             raise ValueError("the measured values do not depend on what is fitted to them")
-        return found.x
+        return solution.x
 
     def improved(self, logs: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A Gauss-Newton step under the noise of each column, and the noise that is left."""

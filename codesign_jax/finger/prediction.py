@@ -27,26 +27,26 @@ def predict(finger: Finger, table: Table) -> dict[str, np.ndarray]:
       say when the finger was let go.
     """
     rows = len(table["pressure"])
-    found = {name: np.full(rows, np.nan) for name in MEASURED if name in table}
+    predicted = {name: np.full(rows, np.nan) for name in MEASURED if name in table}
     free = held = Rest(np.zeros(finger.links), 0.0, 0.0)
     for row in np.argsort(table["pressure"], kind="stable"):  # each begins where the last one ended
         pressure = float(table["pressure"][row])
-        asked = {n for n in found if np.isfinite(table[n][row])}
+        asked = {n for n in predicted if np.isfinite(table[n][row])}
         if "blocked_force" in asked:
-            found["blocked_force"][row] = pressure * finger.gain[0] / finger.length
+            predicted["blocked_force"][row] = pressure * finger.gain[0] / finger.length
         if "tip_force" in asked:
             with contextlib.suppress(NoRest):
                 held = Rest.of(finger, pressure, held=True, start=held)
-                found["tip_force"][row] = held.force
+                predicted["tip_force"][row] = held.force
         if asked.intersection(FREE):
             with contextlib.suppress(NoRest):
                 free = Rest.of(finger, pressure, start=free)
                 load = float(table["load"][row]) if "load" in table else np.nan
                 for name, value in _of_free(finger, free, pressure, load, asked).items():
-                    found[name][row] = value
-    if "drop" in found:
-        found["drop"] = _drops(finger, table)
-    return found
+                    predicted[name][row] = value
+    if "drop" in predicted:
+        predicted["drop"] = _drops(finger, table)
+    return predicted
 
 
 def _of_free(
@@ -76,7 +76,7 @@ def releases(table: Table) -> list[np.ndarray]:
 
 
 def _drops(finger: Finger, table: Table) -> np.ndarray:
-    found = np.full(len(table["drop"]), np.nan)
+    drops = np.full(len(table["drop"]), np.nan)
     loads = np.nan_to_num(table.get("load", np.zeros_like(table["pressure"])))
     every = releases(table)
     periods = [swing.first_period(finger, float(loads[rows[0]])) for rows in every]
@@ -90,8 +90,8 @@ def _drops(finger: Finger, table: Table) -> np.ndarray:
         if state not in curves:
             curves[state] = swing.released(finger, *state, until, min(periods) / swing.STEPS)
         time = table["time"][rows] - table["time"][rows[0]]
-        found[rows] = _aligned(curves[state], time, table["drop"][rows], margin)
-    return found
+        drops[rows] = _aligned(curves[state], time, table["drop"][rows], margin)
+    return drops
 
 
 def _aligned(
@@ -114,16 +114,16 @@ def _aligned(
     return np.interp(time + low, *curve, left=0.0)
 
 
-def without_rest(table: Table, found: Table) -> dict[str, np.ndarray]:
+def without_rest(table: Table, predicted: Table) -> dict[str, np.ndarray]:
     """Pressures [Pa] at which a finger has no rest, in rising order, by the column that lacks it.
 
     Args:
       found: What `predict` makes of the table.
     """
-    lacking = {n: np.isfinite(table[n]) & np.isnan(v) for n, v in found.items()}
+    lacking = {n: np.isfinite(table[n]) & np.isnan(v) for n, v in predicted.items()}
     return {n: np.unique(table["pressure"][rows]) for n, rows in lacking.items() if rows.any()}
 
 
-def opposed(table: Table, found: Table) -> list[str]:
+def opposed(table: Table, predicted: Table) -> list[str]:
     """Columns that were measured with the other sign than that of `predict`, most of their rows."""
-    return [n for n, v in found.items() if np.nansum(v * table[n]) < 0]
+    return [n for n, v in predicted.items() if np.nansum(v * table[n]) < 0]

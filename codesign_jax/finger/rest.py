@@ -122,9 +122,9 @@ def of_design(scene: Scene, params: Params, index: int) -> Finger:
 
 def _bodies(hand: Hand, params: Params, links: int, index: int) -> Bodies:
     """The segments behind a finger's joints; the first half of the first one does not move."""
-    found = morphology.segments(hand, params, links)
-    up = np.broadcast_to(found.up, found.mass.shape)
-    parts = (found.mass, found.inertia[..., 1], found.along, up)
+    segments = morphology.segments(hand, params, links)
+    up = np.broadcast_to(segments.up, segments.mass.shape)
+    parts = (segments.mass, segments.inertia[..., 1], segments.along, up)
     return Bodies(*(np.asarray(v[index, 1:], float) for v in parts))
 
 
@@ -197,10 +197,10 @@ class Rest(NamedTuple):
         if start is not None:
             first[:n] = start.angles
             first[n:] = start.force * finger.length / unit
-        found = optimize.root(residual, first, jac=slopes, tol=1e-12)
-        if np.abs(residual(found.x)).max() > 1e-8:
+        solution = optimize.root(residual, first, jac=slopes, tol=1e-12)
+        if np.abs(residual(solution.x)).max() > 1e-8:
             raise NoRest(f"no rest found at {pressure / 1e3:g} kPa: {TOO_FAR}")
-        return cls(found.x[:n], force(found.x), float(levers(found.x[:n])[1][0]))
+        return cls(solution.x[:n], force(solution.x), float(levers(solution.x[:n])[1][0]))
 
 
 def sideways(finger: Finger, rest: Rest, load: float) -> float:

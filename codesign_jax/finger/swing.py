@@ -58,9 +58,9 @@ def chain(finger: Finger, load: float, pressure: float) -> Chain:
 def first_period(finger: Finger, load: float) -> float:
     """Period of the slowest mode of the straight finger without damping [s]."""
     with jax.enable_x64(True):
-        own = jax.tree.map(jnp.asarray, chain(finger, load, 0.0))
-        mass = np.asarray(_mass(own, jnp.zeros(finger.links)))
-    root = 1 / np.sqrt(np.asarray(own.stiffness))
+        model = jax.tree.map(jnp.asarray, chain(finger, load, 0.0))
+        mass = np.asarray(_mass(model, jnp.zeros(finger.links)))
+    root = 1 / np.sqrt(np.asarray(model.stiffness))
     slowest = np.linalg.eigvalsh(root[:, None] * mass * root)[-1]
     return 2 * math.pi * math.sqrt(slowest)
 
@@ -85,12 +85,12 @@ def released(
     count = 2 ** math.ceil(math.log2(until / step))
     step = until / (count - 1)
     with jax.enable_x64(True):
-        own = jax.tree.map(jnp.asarray, chain(finger, load, pressure))
-        drops = _drops(count, finger.neo_hookean, own, jnp.asarray(step))
+        model = jax.tree.map(jnp.asarray, chain(finger, load, pressure))
+        drops = _drops(count, finger.neo_hookean, model, jnp.asarray(step))
         return step * np.arange(count), np.asarray(drops)
 
 
-def _places(own: Chain, q: jax.Array) -> jax.Array:
+def _places(model: Chain, q: jax.Array) -> jax.Array:
     """Places of the segments' centres and of the tip, across the straight finger too; (N + 1, 2).
 
     Along the finger and downwards [m].
@@ -98,51 +98,51 @@ def _places(own: Chain, q: jax.Array) -> jax.Array:
     direction = jnp.cumsum(q)
     cosine = jnp.cos(direction)
     sine = jnp.sin(direction)
-    along = own.bodies.along
-    up = own.bodies.up
-    joints = own.segment * jnp.stack([jnp.cumsum(cosine), jnp.cumsum(sine)], -1)
+    along = model.bodies.along
+    up = model.bodies.up
+    joints = model.segment * jnp.stack([jnp.cumsum(cosine), jnp.cumsum(sine)], -1)
     before = jnp.concatenate([jnp.zeros((1, 2)), joints[:-1]])
     centre = jnp.stack([along * cosine + up * sine, along * sine - up * cosine], -1)
-    half = own.segment / 2 * jnp.stack([cosine[-1], sine[-1]])
+    half = model.segment / 2 * jnp.stack([cosine[-1], sine[-1]])
     return jnp.concatenate([before + centre, (before[-1] + half)[None]])
 
 
-def _masses(own: Chain) -> jax.Array:
-    return jnp.append(own.bodies.mass, own.load)
+def _masses(model: Chain) -> jax.Array:
+    return jnp.append(model.bodies.mass, model.load)
 
 
-def _mass(own: Chain, q: jax.Array) -> jax.Array:
+def _mass(model: Chain, q: jax.Array) -> jax.Array:
     """The mass matrix, shape (N, N)."""
-    slopes = jax.jacfwd(partial(_places, own))(q)
-    turning = jnp.cumsum(own.bodies.inertia[::-1])[::-1]
+    slopes = jax.jacfwd(partial(_places, model))(q)
+    turning = jnp.cumsum(model.bodies.inertia[::-1])[::-1]
     number = jnp.arange(q.size)
     of_turns = turning[jnp.maximum(number[:, None], number)]
-    return jnp.einsum("b,bdi,bdj->ij", _masses(own), slopes, slopes) + of_turns
+    return jnp.einsum("b,bdi,bdj->ij", _masses(model), slopes, slopes) + of_turns
 
 
-def _acceleration(own: Chain, neo_hookean: bool, q: jax.Array, rate: jax.Array) -> jax.Array:
+def _acceleration(model: Chain, neo_hookean: bool, q: jax.Array, rate: jax.Array) -> jax.Array:
     def speed(at: jax.Array) -> jax.Array:
-        return jax.jvp(partial(_places, own), (at,), (rate,))[1]
+        return jax.jvp(partial(_places, model), (at,), (rate,))[1]
 
-    slopes = jax.jacfwd(partial(_places, own))(q)
+    slopes = jax.jacfwd(partial(_places, model))(q)
     bias = jax.jvp(speed, (q,), (rate,))[1]
     fall = jnp.array([0.0, GRAVITY]) - bias
-    forces = jnp.einsum("b,bdi,bd->i", _masses(own), slopes, fall)
-    spring = own.stiffness * q
+    forces = jnp.einsum("b,bdi,bd->i", _masses(model), slopes, fall)
+    spring = model.stiffness * q
     if neo_hookean:
-        height, wall, width = own.section
-        spring *= 1 - morphology.softening(q / own.segment, height, wall, width=width)
-    forces += own.moment - spring - own.damping * rate
-    return jnp.linalg.solve(_mass(own, q), forces)
+        height, wall, width = model.section
+        spring *= 1 - morphology.softening(q / model.segment, height, wall, width=width)
+    forces += model.moment - spring - model.damping * rate
+    return jnp.linalg.solve(_mass(model, q), forces)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _drops(count: int, neo_hookean: bool, own: Chain, step: jax.Array) -> jax.Array:
-    links = own.stiffness.size
+def _drops(count: int, neo_hookean: bool, model: Chain, step: jax.Array) -> jax.Array:
+    links = model.stiffness.size
 
     def slope(state: jax.Array) -> jax.Array:
         rate = state[links:]
-        return jnp.concatenate([rate, _acceleration(own, neo_hookean, state[:links], rate)])
+        return jnp.concatenate([rate, _acceleration(model, neo_hookean, state[:links], rate)])
 
     start = jnp.zeros(2 * links)
     inverse = jnp.linalg.inv(jnp.eye(2 * links) - GAMMA * step * jax.jacfwd(slope)(start))
@@ -151,6 +151,6 @@ def _drops(count: int, neo_hookean: bool, own: Chain, step: jax.Array) -> jax.Ar
         first = inverse @ slope(state)
         second = inverse @ (slope(state + step * first) - 2 * first)
         new = state + step * (1.5 * first + 0.5 * second)
-        return new, _places(own, state[:links])[-1, 1]
+        return new, _places(model, state[:links])[-1, 1]
 
     return jax.lax.scan(advance, start, None, length=count)[1]

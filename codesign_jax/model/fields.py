@@ -108,12 +108,12 @@ def joint_springs(scene: Scene, params: Params) -> tuple[jax.Array, jax.Array]:
     """
     lay = layout(scene)
     each = finger_springs(scene, params)
-    finger, own = (picked(v.ravel(), lay.hinges) for v in each)
+    finger, joint_damping = (picked(v.ravel(), lay.hinges) for v in each)
     springs = wrist_springs(scene)
     wrist, wrist_damping = (jnp.stack([jnp.asarray(x, finger.dtype) for x in v]) for v in springs)
     free = jnp.zeros(6, finger.dtype)
     stiffness = jnp.concatenate([wrist, finger, free])
-    return stiffness, jnp.concatenate([wrist_damping, own, free])
+    return stiffness, jnp.concatenate([wrist_damping, joint_damping, free])
 
 
 def finger_springs(scene: Scene, params: Params) -> tuple[jax.Array, jax.Array]:

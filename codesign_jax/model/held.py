@@ -71,7 +71,7 @@ def held(scene: Scene) -> dict[str, int]:
     many = surfaces(scene)
     rings = scene.discretization.links * rings_of_link(scene)
     palm = palm_groups(scene) if palm_touches(scene) else 0
-    found = {
+    counts = {
         "finger_finger": count * ((e.finger_finger and scene.num_fingers > 1) or e.finger_itself),
         "finger_object": rings * e.finger_object,
         "finger_table": many * rings * e.finger_table,
@@ -79,14 +79,14 @@ def held(scene: Scene) -> dict[str, int]:
         "palm_table": many * palm * e.palm_table,
         "object_table": -(-sum(object_points(scene)) // count) * e.object_table,
     }
-    return {name: items for name, items in found.items() if items}
+    return {name: items for name, items in counts.items() if items}
 
 
 def rows(scene: Scene) -> dict[str, slice]:
     """Rows of `RolloutState.held`, three for each of `held`, by the pair of bodies."""
-    found = {}
+    slices = {}
     first = 0
     for name, items in held(scene).items():
-        found[name] = slice(first, first + 3 * items)
+        slices[name] = slice(first, first + 3 * items)
         first += 3 * items
-    return found
+    return slices

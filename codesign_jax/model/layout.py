@@ -98,8 +98,8 @@ def layout(scene: Scene) -> Layout:
     forward = hinge_sign(np.arange(links)) > 0
     dofs = np.where(forward[:, None], dofs, dofs[:, :, ::-1])
     e = scene.effects
-    own = e.finger_object or e.finger_table or e.finger_finger or e.finger_palm
-    touching = e.surface == "spheres" and own
+    fingers_touch = e.finger_object or e.finger_table or e.finger_finger or e.finger_palm
+    touching = e.surface == "spheres" and fingers_touch
     k = scene.discretization.spheres_per_link if touching else 0
     still = 1 + len(scene.fixture)  # the table and the fixtures, of the world
     palm = still + np.arange(len(_PALM_RING) if palm_touches(scene) else 0)
@@ -365,5 +365,5 @@ def _unit_inertia(shape: Shape, size: jax.Array, factor: jax.Array) -> jax.Array
 
 def geom_bounds(kind: str, size: Any, numpy: Any = jnp) -> tuple[Any, Any]:
     """Bounding radius () and axis-aligned half extents (3,) of a geom; a mesh's is a box."""
-    found = PRIMITIVES["box" if kind == "mesh" else kind]
-    return found.radius(size), numpy.stack(found.half_extents(size))
+    shape = PRIMITIVES["box" if kind == "mesh" else kind]
+    return shape.radius(size), numpy.stack(shape.half_extents(size))

@@ -99,19 +99,21 @@ def finger_beams(hand: Hand, params: Params, links: int) -> Beam:
     N is 1 where they are the same all along.
     """
     material = hand.material
-    own = sections(hand, params, at_joints(links))
-    found = _beam(hand, own)
-    return found._replace(
-        lateral=material.lateral_factor * found.lateral,
-        torsion=material.torsion_factor * found.torsion,
-        moment_per_pressure=material.moment_factor * found.moment_per_pressure,
+    section = sections(hand, params, at_joints(links))
+    beams = _beam(hand, section)
+    return beams._replace(
+        lateral=material.lateral_factor * beams.lateral,
+        torsion=material.torsion_factor * beams.torsion,
+        moment_per_pressure=material.moment_factor * beams.moment_per_pressure,
     )
 
 
-def _beam(hand: Hand, own: Section) -> Beam:
+def _beam(hand: Hand, section: Section) -> Beam:
     modulus = hand.material.shear_modulus
     density = hand.material.density
-    return beam(own.height, own.wall, width=own.width, shear_modulus=modulus, density=density)
+    return beam(
+        section.height, section.wall, width=section.width, shear_modulus=modulus, density=density
+    )
 
 
 def free_bends(hand: Hand, params: Params, *, neo_hookean: bool | None = None) -> np.ndarray:
@@ -132,7 +134,7 @@ def free_bends(hand: Hand, params: Params, *, neo_hookean: bool | None = None) -
     return np.asarray(curvature.mean(1) * exact.length)
 
 
-def _softened(linear: np.ndarray, own: Section) -> np.ndarray:
+def _softened(linear: np.ndarray, section: Section) -> np.ndarray:
     """Curvature of neo-Hookean walls that have a curvature by the linear law, of any shape.
 
     At large strain they carry a quarter of the linear moment, so that it is at most four times as
@@ -142,7 +144,7 @@ def _softened(linear: np.ndarray, own: Section) -> np.ndarray:
     high = 4 * linear
     for _ in range(50):
         middle = (low + high) / 2
-        lacking = softening(middle, own.height, own.wall, width=own.width)
+        lacking = softening(middle, section.height, section.wall, width=section.width)
         enough = middle * (1 - lacking) >= linear
         low = np.where(enough, low, middle)
         high = np.where(enough, middle, high)
@@ -186,8 +188,8 @@ def _contents(hand: Hand, params: Params, start: np.ndarray, span: np.ndarray) -
     """Mean mass per length of bodies, and their centres along, as a share, and up [m]."""
 
     def at(places: np.ndarray) -> tuple[Any, Any]:
-        own = sections(hand, params, places)
-        return _beam(hand, own).line_density, own.height / 2
+        section = sections(hand, params, places)
+        return _beam(hand, section).line_density, section.height / 2
 
     if params.tip is None:
         density, up = at(start)

@@ -147,9 +147,9 @@ def _dofs(numpy: Any, scene: Scene, fields: ModelFields) -> tuple[Any, Any, Any]
     lay = layout(scene)
     dtype = fields.mass.dtype
     springs = wrist_springs(fields.constants)
-    stiffness, own = (numpy.stack([numpy.asarray(v, dtype) for v in k]) for k in springs)
+    stiffness, damping = (numpy.stack([numpy.asarray(v, dtype) for v in k]) for k in springs)
     rigid = not scene.effects.wrist
-    wrist = implicit_spring(fields.constants, stiffness, own, rigid=rigid)
+    wrist = implicit_spring(fields.constants, stiffness, damping, rigid=rigid)
     free = numpy.zeros(6, dtype)
 
     def by_dof(wrist: Any, joints: Any) -> Any:
@@ -198,11 +198,11 @@ def _pair_kinds(scene: Scene) -> np.ndarray:
 def _pairs(numpy: Any, scene: Scene, dtype: Any) -> list[jax.Array]:
     """MuJoCo's friction (pair, 5), solref (pair, 2) and solimp (pair, 5) of the contact pairs."""
     kinds = _pair_kinds(scene)
-    found = (pairs.frictions(scene), pairs.impedances(scene))
-    own = (numpy.stack([numpy.asarray(v, dtype) for v in values])[kinds] for values in found)
+    tables = (pairs.frictions(scene), pairs.impedances(scene))
+    columns = (numpy.stack([numpy.asarray(v, dtype) for v in values])[kinds] for values in tables)
     return [
         numpy.stack([numpy.broadcast_to(numpy.asarray(v, dtype), len(kinds)) for v in row], -1)
-        for row in pairs.numbers(scene, *own)
+        for row in pairs.numbers(scene, *columns)
     ]
 
 

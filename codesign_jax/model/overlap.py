@@ -66,26 +66,26 @@ def overlaps(scene: Scene, params: Params, place: np.ndarray, turn: np.ndarray) 
         half = halves[f]
         span = float(params.length[f]) / links * whole
         local = [
-            np.c_[np.full(_AROUND, part * s), unit * own + [0, own[1]]]
-            for s, own in zip(span, half, strict=True)
+            np.c_[np.full(_AROUND, part * s), unit * rim + [0, rim[1]]]
+            for s, rim in zip(span, half, strict=True)
             for part in _ALONG
         ]
         face = np.concatenate([unit * half[-1] * part for part in _INNER]) + [0, half[-1, 1]]
         local.append(np.c_[np.full(len(face), span[-1]), face])
-        own = np.repeat(np.arange(links), _AROUND * len(_ALONG))
-        own = np.append(own, np.full(len(face), links - 1))
-        at = np.array(bodies)[own]
+        links_at = np.repeat(np.arange(links), _AROUND * len(_ALONG))
+        links_at = np.append(links_at, np.full(len(face), links - 1))
+        at = np.array(bodies)[links_at]
         local = np.concatenate(local)
-        along = (own + 0.5) * float(params.length[f]) / links + local[:, 0]
+        along = (links_at + 0.5) * float(params.length[f]) / links + local[:, 0]
         free = beyond_base(along, float(params.height[f]))
-        beyond.append(free & (own >= first_on_palm(links) - 1))
+        beyond.append(free & (links_at >= first_on_palm(links) - 1))
         moved = np.einsum("spij,pj->spi", turn[:, at], local)
         points.append(place[:, at] + moved)
-        owners.append(own)
+        owners.append(links_at)
         sizes.append((span, *half.T))
-    found = np.zeros((len(place), count, count))
+    depths = np.zeros((len(place), count, count))
     palm = np.zeros((len(place), count))
-    for i, own in enumerate(owners):
+    for i, links_at in enumerate(owners):
         free = points[i][:, beyond[i]]
         x, y, z = np.moveaxis((free - place[:, None, 1]) @ turn[:, 1], -1, 0)
         inside = np.minimum(disc.radius - np.hypot(x, y), np.minimum(z, disc.thickness - z))
@@ -94,10 +94,10 @@ def overlaps(scene: Scene, params: Params, place: np.ndarray, turn: np.ndarray) 
             away = points[i][:, None] - place[:, bodies, None]
             depth = _depths(away @ turn[:, bodies], *sizes[j])
             if i == j:
-                near = np.abs(own - np.arange(links)[:, None]) < _APART
+                near = np.abs(links_at - np.arange(links)[:, None]) < _APART
                 depth = np.where(near, 0.0, depth)
-            found[:, i, j] = depth.max((1, 2))
-    return Overlaps(found, palm)
+            depths[:, i, j] = depth.max((1, 2))
+    return Overlaps(depths, palm)
 
 
 def _depths(local: np.ndarray, span: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -22,15 +22,17 @@ def frictions(scene: Scene) -> list[Any]:
     """Coulomb coefficient of each kind of pair."""
     c = scene.contact
     others = [c.finger_table_friction, c.finger_finger_friction, c.finger_palm_friction]
-    own = [f.friction for f in scene.fixture if f.friction is not None]
+    of_fixtures = [f.friction for f in scene.fixture if f.friction is not None]
     on_object = [s.friction for s in scene.objects.object]
-    return [*on_object, *own, scene.objects.table.friction, *others]
+    return [*on_object, *of_fixtures, scene.objects.table.friction, *others]
 
 
 def around(scene: Scene, which: int, table: int) -> int:
     """Kind of a pair with the table, number 0, or a fixture, from 1 on."""
-    own = [i for i, f in enumerate(scene.fixture, 1) if f.friction is not None]
-    return len(scene.objects.object) + own.index(which) if which in own else table
+    with_friction = [i for i, f in enumerate(scene.fixture, 1) if f.friction is not None]
+    return (
+        len(scene.objects.object) + with_friction.index(which) if which in with_friction else table
+    )
 
 
 def impedances(scene: Scene) -> list[Any]:

@@ -49,10 +49,10 @@ def compile_template(scene: Scene) -> mujoco.MjModel:
 
 def template_world(scene: Scene) -> tuple[Params, Trial]:
     """Parameters and trial of the template, as NumPy arrays."""
-    one = np.ones(scene.num_fingers)
-    params = Params(0.1 * one, 0.02 * one, 0.004 * one, np.zeros(()), np.zeros(6), 0.0 * one)
+    ones = np.ones(scene.num_fingers)
+    params = Params(0.1 * ones, 0.02 * ones, 0.004 * ones, np.zeros(()), np.zeros(6), 0.0 * ones)
     if scene.hand.section.tapered:
-        params = params._replace(tip=Tip(0.015 * one, 0.003 * one, 0.02 * one))
+        params = params._replace(tip=Tip(0.015 * ones, 0.003 * ones, 0.02 * ones))
     zero = np.zeros(())
     unit = np.ones(())
     return params, Trial(np.int32(0), np.zeros(2), zero, np.zeros(2), *[unit] * 5)
@@ -253,8 +253,8 @@ def _add_finger(
         if i == 0:
             continue
         for name in hinge_order(scene, i - 1):
-            stiffness, own = (v[i - 1, lay.axes.index(name)] for v in springs)
-            damping, armature = implicit_spring(scene, stiffness, own)
+            stiffness, joint_damping = (v[i - 1, lay.axes.index(name)] for v in springs)
+            damping, armature = implicit_spring(scene, stiffness, joint_damping)
             _hinge(
                 body,
                 f"finger_{f}_{name}_{i}",
@@ -336,16 +336,16 @@ def add_pair(
     """Adds a contact pair."""
     condim = {"none": 1, "coulomb": 3, "full": 6}[scene.effects.friction]
     pair = spec.add_pair(geomname1=first, geomname2=second, condim=condim)
-    own = pairs.frictions(scene)[kind], pairs.impedances(scene)[kind]
-    pair.friction, pair.solref, pair.solimp = pairs.numbers(scene, *own)
+    properties = pairs.frictions(scene)[kind], pairs.impedances(scene)[kind]
+    pair.friction, pair.solref, pair.solimp = pairs.numbers(scene, *properties)
     return pair
 
 
 def surroundings(scene: Scene, table: int) -> list[tuple[str, int]]:
     """Geoms of table and fixtures that may be touched, and the kinds of pairs with them."""
     names = ["table", *(f"fixture_{i}" for i in range(len(scene.fixture)))]
-    found = [(name, pairs.around(scene, i, table)) for i, name in enumerate(names)]
-    return found if scene.effects.table else found[1:]
+    geoms = [(name, pairs.around(scene, i, table)) for i, name in enumerate(names)]
+    return geoms if scene.effects.table else geoms[1:]
 
 
 def _add_pairs(scene: Scene, spec: mujoco.MjSpec, params: Params) -> None:

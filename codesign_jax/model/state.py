@@ -70,7 +70,7 @@ def split(scene: Scene, start: Any) -> RolloutState:
         else np.zeros((*start.shape[:-1], size), start.dtype)
         for end, size in zip(ends, sizes, strict=True)
     ]
-    found = RolloutState(*parts)
+    state = RolloutState(*parts)
     if n > ends[1]:
-        return found
-    return found._replace(going=found.going + 1, speed=abs(found.qvel).max(-1, keepdims=True))
+        return state
+    return state._replace(going=state.going + 1, speed=abs(state.qvel).max(-1, keepdims=True))

@@ -159,9 +159,9 @@ def write_strip(
     return path
 
 
-def write(scene: Scene, grasps: list[Replay], path: Path, **how: Any) -> Path:
+def write(scene: Scene, grasps: list[Replay], path: Path, **options: Any) -> Path:
     """Writes a strip or a film, by the path's ending; see `write_strip` and `write_film`."""
-    return (write_strip if path.suffix == STRIP else write_film)(scene, grasps, path, **how)
+    return (write_strip if path.suffix == STRIP else write_film)(scene, grasps, path, **options)
 
 
 def _common_palette(images: list[Image.Image]) -> Image.Image:

@@ -37,10 +37,10 @@ def design(run: Run) -> str:
 def _builder(run: Run) -> list[str]:
     warnings = stress.of_design(run.scene, run.space.params(run.chosen.design))
     parts = []
-    if found := run.stress:
-        warnings += found.warnings
-        words = f"Under other conditions, {found.trials} grasps each at the run's accuracy:"
-        parts = [markup.paragraph(words), markup.table(found.head, found.rows, (1, 2))]
+    if result := run.stress:
+        warnings += result.warnings
+        words = f"Under other conditions, {result.trials} grasps each at the run's accuracy:"
+        parts = [markup.paragraph(words), markup.table(result.head, result.rows, (1, 2))]
     return [*parts, *(markup.paragraph(f"Warning: {words}.", "warning") for words in warnings)]
 
 
@@ -69,7 +69,7 @@ def _parameters(run: Run) -> str:
     values, low, high = (
         space.in_units(np.asarray(v)) for v in (run.chosen.design, space.low, space.high)
     )
-    own, others = tables.by_finger(space)
+    per_finger, others = tables.by_finger(space)
 
     def scale(k: int) -> markup.Html:
         at = 100 * float((values[k] - low[k]) / (high[k] - low[k]))
@@ -81,10 +81,10 @@ def _parameters(run: Run) -> str:
         return f"{name} {space.units[k]}"
 
     parts = [markup.paragraph("Below each value its place in its range.", "note")]
-    if own:
-        head = ("finger", *(named(name, at[0]) for name, at in own.items()))
-        count = len(next(iter(own.values())))
-        rows = [(str(f), *(scale(at[f]) for at in own.values())) for f in range(count)]
+    if per_finger:
+        head = ("finger", *(named(name, at[0]) for name, at in per_finger.items()))
+        count = len(next(iter(per_finger.values())))
+        rows = [(str(f), *(scale(at[f]) for at in per_finger.values())) for f in range(count)]
         parts.append(markup.table(head, rows, (*range(1, len(head)),)))
     if others:
         head = [named(space.names[k], k) for k in others]

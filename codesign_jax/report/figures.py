@@ -77,38 +77,38 @@ def cost_evolution(
     return figure
 
 
-def landscape(found: Landscape) -> matplotlib.figure.Figure:
+def landscape(surface: Landscape) -> matplotlib.figure.Figure:
     """The mean cost over a grid of two parameters as Fig. 8 of the paper: white where low.
 
     Lines enclose where the mean cost is below the thresholds of convergence and of success.
     """
     figure = _figure(5.6, 4.4)
     axes = figure.add_subplot()
-    _landscape(axes, found)
+    _landscape(axes, surface)
     lines = ((CONVERGED_COST, _ORANGE, "--"), (SUCCESS_COST, "tab:red", "-"))
-    x = found.first
-    y = found.second
-    cost = found.cost.T
+    x = surface.first
+    y = surface.second
+    cost = surface.cost.T
     for level, color, style in lines:
         if cost.min() < level <= cost.max():
             axes.contour(x, y, cost, [level], colors=color, linestyles=style, linewidths=1.2)
             axes.plot([], [], color=color, ls=style, lw=1.2, label=f"below {level:g}")
     if axes.get_legend_handles_labels()[1]:
         axes.legend(loc="upper left", fontsize=8)
-    labels = [f"{n} [{u}]" for n, u in zip(found.names, found.units, strict=True)]
+    labels = [f"{n} [{u}]" for n, u in zip(surface.names, surface.units, strict=True)]
     axes.set(xlabel=labels[0], ylabel=labels[1])
     return figure
 
 
-def _landscape(axes: Axes, found: Landscape) -> None:
-    grid = found.first, found.second, found.cost.T
+def _landscape(axes: Axes, surface: Landscape) -> None:
+    grid = surface.first, surface.second, surface.cost.T
     image = axes.pcolormesh(*grid, cmap="gray_r", shading="nearest", vmin=0, rasterized=True)
-    label = f"mean cost of {int(found.trials)} trials"
+    label = f"mean cost of {int(surface.trials)} trials"
     axes.figure.colorbar(image, ax=axes, label=label)
 
 
 def designs(
-    history: History, space: DesignSpace, chosen: np.ndarray, found: Landscape | None
+    history: History, space: DesignSpace, chosen: np.ndarray, surface: Landscape | None
 ) -> matplotlib.figure.Figure:
     """All particles of a run with two parameters, over the landscape where there is one.
 
@@ -117,8 +117,8 @@ def designs(
     """
     figure = _figure(6.4, 4.4)
     axes = figure.add_subplot()
-    if found is not None:
-        _landscape(axes, found)
+    if surface is not None:
+        _landscape(axes, surface)
     x, y = space.in_units(history.population.reshape(-1, 2)).T
     dots = {"s": 14, "edgecolors": "white", "linewidths": 0.4, "vmin": 0, "rasterized": True}
     scatter = axes.scatter(x, y, c=history.cost.ravel(), label="particle", **dots)
@@ -177,8 +177,8 @@ def grip(forces: Forces, scene: Scene) -> matplotlib.figure.Figure:
         axes.plot(time, force, lw=1.2, label=name)
     for name, end in scene.phase_ends.items():
         axes.axvline(end, color="0.5", lw=0.8, ls=":")
-        how = {"rotation": 90, "ha": "right", "va": "top", "fontsize": 7, "color": "0.4"}
-        axes.text(end, 1.0, f"{name} ", transform=axes.get_xaxis_transform(), **how)
+        style = {"rotation": 90, "ha": "right", "va": "top", "fontsize": 7, "color": "0.4"}
+        axes.text(end, 1.0, f"{name} ", transform=axes.get_xaxis_transform(), **style)
     axes.set(xlabel="time [s]", ylabel="force [N]")
     _above(axes, len(series))
     return figure

@@ -31,8 +31,8 @@ class Run(NamedTuple):
     @property
     def judged(self) -> Judged:
         """The trials that judge the design: the fresh ones, or else those that chose it."""
-        own = "grasps of " + ("its final test" if self.chosen.tested else "its last episode")
-        return self.reference or Judged(self.scene, self.chosen.outcomes, None, own, self.stress)
+        grasps = "grasps of " + ("its final test" if self.chosen.tested else "its last episode")
+        return self.reference or Judged(self.scene, self.chosen.outcomes, None, grasps, self.stress)
 
     @property
     def space(self) -> DesignSpace:

@@ -153,8 +153,8 @@ def _landscape(run: Run) -> str:
             words += f"In grey {grey}"
             figure = figures.designs(run.history, space, run.chosen.design, grid)
         else:
-            own = np.allclose(grid.design, run.chosen.design)
-            around = "the chosen design" if own else "another design, which landscape.npz has"
+            same = np.allclose(grid.design, run.chosen.design)
+            around = "the chosen design" if same else "another design, which landscape.npz has"
             words = f"In grey {grey} The other parameters are those of {around}."
             figure = figures.landscape(grid)
     section = markup.paragraph(words, "", command), figures.html(figure, "landscape")

@@ -291,7 +291,7 @@ class _Shadows:
         pixels, away = self._seen(points)
         column, row = np.clip(pixels, 2, _SHADOWS - 3).astype(np.int32).T
         at = row * _SHADOWS + column
-        found = np.zeros(len(points), np.float32)
+        brightness = np.zeros(len(points), np.float32)
         for by in _BESIDE:
-            found += self.depth[at + by] > away - _BIAS
-        return found / len(_BESIDE)
+            brightness += self.depth[at + by] > away - _BIAS
+        return brightness / len(_BESIDE)

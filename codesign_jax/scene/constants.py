@@ -73,8 +73,8 @@ def _leaf_problems(path: str, value: Any, expected: schema.Range, mixed: bool) -
     if numbers.dtype.kind not in "fiu" and numbers.dtype != jnp.bfloat16:
         return [f"{key} = {value!r} must be a number"]
     every = numbers.astype(float).reshape(-1)
-    found = (schema.near_problem(key, float(v), expected) for v in np.unique(every))
-    return [p for p in found if p][:1]
+    problems = (schema.near_problem(key, float(v), expected) for v in np.unique(every))
+    return [p for p in problems if p][:1]
 
 
 def _known(scene: Scene) -> bool:

@@ -110,8 +110,8 @@ class Scene(SceneFile):
         """
         from codesign_jax.scene.constants import check
 
-        check(found := other or self)
-        return found
+        check(scene := other or self)
+        return scene
 
     @functools.cached_property
     def bare(self) -> "Scene":

@@ -209,11 +209,11 @@ def deviations(
     Draw t is that of fold_in(key, t), so that more draws do not change earlier ones.
     """
     numbers = jnp.asarray(first) + jnp.arange(count)
-    found = jax.vmap(lambda t: scores(table, jax.random.fold_in(key, t)))(numbers)
-    return jnp.stack([e.deviation(found[:, i]) for i, e in enumerate(table.constant)], -1)
+    normal = jax.vmap(lambda t: scores(table, jax.random.fold_in(key, t)))(numbers)
+    return jnp.stack([e.deviation(normal[:, i]) for i, e in enumerate(table.constant)], -1)
 
 
-def applied(scene: Any, table: Constants, own: Any) -> Any:
+def applied(scene: Any, table: Constants, shifts: Any) -> Any:
     """The scene with deviations of its constants, which may be traced.
 
     Args:
@@ -221,7 +221,7 @@ def applied(scene: Any, table: Constants, own: Any) -> Any:
     """
     for i, entry in enumerate(table.constant):
         operation = operator.mul if entry.is_factor else operator.add
-        scene = changed(scene, entry.path, functools.partial(operation, own[i]))
+        scene = changed(scene, entry.path, functools.partial(operation, shifts[i]))
     return scene
 
 
@@ -266,12 +266,12 @@ def key_problems(scene: Any, table: Constants, where: str) -> list[str]:
 
 def nominal(table: Constants) -> dict[tuple[str, ...], Any]:
     """Values by key path that make a scene's own constants the middle of their distributions."""
-    found: dict[tuple[str, ...], Any] = {
+    values: dict[tuple[str, ...], Any] = {
         e.path: e.middle for e in table.constant if e.change == "value"
     }
-    if table.law is not None and ("hand", "material", "shear_modulus") in found:
-        found["hand", "material", "law"] = table.law
-    return found
+    if table.law is not None and ("hand", "material", "shear_modulus") in values:
+        values["hand", "material", "law"] = table.law
+    return values
 
 
 def of_logs(

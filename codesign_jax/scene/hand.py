@@ -226,8 +226,8 @@ def _check_free(free: Free, row: Parameter, path: str, hand: Hand, problems: lis
                 f"{path}.{name} = {list(value)} must be a number [{row.unit}]: "
                 "tied = true gives all fingers one value"
             )
-    if found := _group_problem(free, hand.width(row)):
-        problems.append(f"{path}.tied: {found}")
+    if problem := _group_problem(free, hand.width(row)):
+        problems.append(f"{path}.tied: {problem}")
         return
     for low, high in dict.fromkeys(zip(*free.bounds(row, hand.width(row)), strict=True)):
         if low >= high:
@@ -251,8 +251,8 @@ def _group_problem(free: Free, count: int) -> str:
 
 
 def _check_sections(hand: Hand, where: str, problems: list[str]) -> None:
-    own = [f"{where}.preset {preset.name}" for preset in hand.preset if not preset.whole]
-    places = [where, *own]
+    preset_places = [f"{where}.preset {preset.name}" for preset in hand.preset if not preset.whole]
+    places = [where, *preset_places]
     for path, bounds in zip(places, all_bounds(hand), strict=True):
         lowest = {name: low for name, (low, _) in bounds.items()}
         width = (hand.section.width,) * len(hand.finger)
@@ -261,19 +261,19 @@ def _check_sections(hand: Hand, where: str, problems: list[str]) -> None:
             ends.append(("tip_", "tip_width", lowest["tip_width"]))
         # Equal fingers have the same problems, which are told once.
         fingers = dict.fromkeys(
-            (own, across, *numbers)
-            for own, across, widths in ends
+            (prefix, across, *numbers)
+            for prefix, across, widths in ends
             for numbers in zip(
-                lowest[f"{own}height"],
+                lowest[f"{prefix}height"],
                 widths,
-                bounds[f"{own}wall"][1],
-                lowest[f"{own}wall"],
+                bounds[f"{prefix}wall"][1],
+                lowest[f"{prefix}wall"],
                 lowest["pressure"],
                 strict=True,
             )
         )
-        for own, across, height, width, wall, thinnest, pressure in fingers:
-            for name, size in ((f"{own}height", height), (across, width)):
+        for prefix, across, height, width, wall, thinnest, pressure in fingers:
+            for name, size in ((f"{prefix}height", height), (across, width)):
                 if size <= 2 * wall:
                     problems.append(
                         f"{path}: a {name} of {size:g} m leaves no air chamber "

@@ -178,8 +178,8 @@ def with_parameters(hand: Hand, control: Control) -> Hand:
 
 def without_parameters(hand: Hand) -> Hand:
     """The hand as its file has it."""
-    own = tuple(p for p in hand.parameter if p.name in PARAMETERS)
-    return dataclasses.replace(hand, parameter=own)
+    parameters = tuple(p for p in hand.parameter if p.name in PARAMETERS)
+    return dataclasses.replace(hand, parameter=parameters)
 
 
 # --- values over a design ------------------------------------------------------------------------
@@ -267,13 +267,13 @@ def _factors(total: Sum) -> dict[str, Any]:
 
 def _frame_table(frame: Frame) -> dict[str, Any]:
     given = {f.name: getattr(frame, f.name) for f in dataclasses.fields(frame)}
-    found = {
+    entries = {
         k: sums.text(v) if isinstance(v, Sum) else v for k, v in given.items() if v is not None
     }
     if frame.pressure is not None:
         values = [sums.text(v) for v in frame.pressure]
-        found["pressure"] = values if len(set(frame.pressure)) > 1 else values[0]
-    return found
+        entries["pressure"] = values if len(set(frame.pressure)) > 1 else values[0]
+    return entries
 
 
 _UNITS = {f.name: f.metadata["unit"] for f in dataclasses.fields(Frame) if "unit" in f.metadata}
@@ -355,7 +355,7 @@ class _Reader:
 
     def _pressure(self, value: Any, path: str, now: tuple[Sum, ...]) -> tuple[Sum, ...]:
         if isinstance(value, dict):
-            found: list[Sum] = list(now)
+            per_finger: list[Sum] = list(now)
             for name, entry in value.items():
                 if name not in self.groups:
                     why = schema.nearest(name, self.groups)
@@ -363,16 +363,16 @@ class _Reader:
                     continue
                 given = self._sum(entry, f"{path}.{name}", "Pa")
                 for finger in self.groups[name]:
-                    found[finger] = given
+                    per_finger[finger] = given
         elif isinstance(value, list):
             if len(value) != self.fingers:
                 self.problems.append(
                     f"{path} has {len(value)} entries, the hand {self.fingers} fingers"
                 )
-            found = [self._sum(v, f"{path}[{i}]", "Pa") for i, v in enumerate(value)]
+            per_finger = [self._sum(v, f"{path}[{i}]", "Pa") for i, v in enumerate(value)]
         else:
-            found = [self._sum(value, path, "Pa")] * self.fingers
-        return tuple(found)
+            per_finger = [self._sum(value, path, "Pa")] * self.fingers
+        return tuple(per_finger)
 
     def _sum(self, value: Any, path: str, unit: str) -> Sum:
         total = sums.read(value, unit)
@@ -402,11 +402,11 @@ class _Reader:
 
 def check(scene: Any, where: str) -> list[str]:
     """Problems with key frames in any design of the hand's presets."""
-    own = {row.name: _ends(row.row) for row in scene.control.parameter}
+    ranges = {row.name: _ends(row.row) for row in scene.control.parameter}
     fixed = {name: (value, value) for name, value in _scene_times(scene).items()}
-    problems = [*_falling(scene.control.frame, fixed | own, where)]
+    problems = [*_falling(scene.control.frame, fixed | ranges, where)]
     for low, high, limits in _walls(scene.hand):
-        problems += _too_high(scene.control.frame, own, low, high, limits, where)
+        problems += _too_high(scene.control.frame, ranges, low, high, limits, where)
     return list(dict.fromkeys(problems))
 
 
@@ -508,7 +508,12 @@ def _walls(hand: Hand) -> Iterator[tuple[Any, ...]]:
 
 
 def _too_high(
-    frames: tuple[Frame, ...], own: Mapping[str, Any], low: Any, high: Any, limits: Any, where: str
+    frames: tuple[Frame, ...],
+    ranges: Mapping[str, Any],
+    low: Any,
+    high: Any,
+    limits: Any,
+    where: str,
 ) -> Iterator[str]:
     for i, frame in enumerate(frames):
         for finger, value in enumerate(frame.pressure or ()):
@@ -519,7 +524,7 @@ def _too_high(
                 {*limits[finger], min(max(high[finger], limits[finger][0]), limits[finger][1])}
             )
             for limit in places:
-                ends = {**own, "pressure": (min(low[finger], limit), min(high[finger], limit))}
+                ends = {**ranges, "pressure": (min(low[finger], limit), min(high[finger], limit))}
                 least, most = _range(factors, ends)
                 key = f"{where}.frame[{i}].pressure"
                 text = schema.shown(sums.text(value))

@@ -42,7 +42,7 @@ def read(
 
 def parse(pairs: Iterable[str]) -> dict[Path, Any]:
     """Reads KEY=VALUE; the later of two values of one key holds."""
-    found: dict[Path, Any] = {}
+    values: dict[Path, Any] = {}
     problems = []
     for pair in joined(pairs):
         key, equals, text = pair.partition("=")
@@ -51,11 +51,11 @@ def parse(pairs: Iterable[str]) -> dict[Path, Any]:
             given = schema.shown(pair)
             problems.append(f"--set {given} must be KEY=VALUE, such as discretization.links=5")
         else:
-            found.pop(path, None)  # values are applied in the order in which they were given
-            found[path] = _toml_value(text)
+            values.pop(path, None)  # values are applied in the order in which they were given
+            values[path] = _toml_value(text)
     if problems:
         raise schema.InputError(problems)
-    return found
+    return values
 
 
 def joined(words: Iterable[str]) -> list[str]:
@@ -64,15 +64,15 @@ def joined(words: Iterable[str]) -> list[str]:
     >>> joined(["gravity", "=", "3.7", "arm_z=", "10", "length", "=95"])
     ['gravity=3.7', 'arm_z=10', 'length=95']
     """
-    found: list[str] = []
+    joined_words: list[str] = []
     for word in words:
-        before = found[-1] if found else ""
+        before = joined_words[-1] if joined_words else ""
         open_end = before.endswith("=") and "=" not in word
         if open_end or (word.startswith("=") and before and "=" not in before):
-            found[-1] = before + word
+            joined_words[-1] = before + word
         else:
-            found.append(word)
-    return found
+            joined_words.append(word)
+    return joined_words
 
 
 def flatten(values: Mapping[Any, Any]) -> dict[Path, Any]:
@@ -80,7 +80,7 @@ def flatten(values: Mapping[Any, Any]) -> dict[Path, Any]:
     if library.too_deep(values):
         deepest = library.DEEPEST
         raise schema.InputError([f"values are nested more than {deepest} tables deep"])
-    found: dict[Path, Any] = {}
+    leaves: dict[Path, Any] = {}
     for key, value in values.items():
         path = _path(key) if isinstance(key, str) else key
         if not (isinstance(path, tuple) and path and all(isinstance(part, str) for part in path)):
@@ -88,10 +88,10 @@ def flatten(values: Mapping[Any, Any]) -> dict[Path, Any]:
                 [f"{schema.shown(key)} is no key path such as 'solver.iterations'"]
             )
         if isinstance(value, Mapping):
-            found |= {path + rest: v for rest, v in flatten(value).items()}
+            leaves |= {path + rest: v for rest, v in flatten(value).items()}
         else:
-            found[path] = plain(value, ".".join(path))
-    return found
+            leaves[path] = plain(value, ".".join(path))
+    return leaves
 
 
 def plain(value: Any, key: str) -> Any:

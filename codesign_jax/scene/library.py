@@ -29,11 +29,11 @@ DEEPEST = 12
 
 def available(kind: str) -> dict[str, Path]:
     """Returns the built-in files of a kind of `_FOLDERS` by name."""
-    found: dict[str, Path] = {}
+    files: dict[str, Path] = {}
     for folder in _FOLDERS[kind]:
         if folder.is_dir():
-            found |= {p.stem: p for p in sorted(folder.glob("*.toml"))}
-    return found
+            files |= {p.stem: p for p in sorted(folder.glob("*.toml"))}
+    return files
 
 
 def find(kind: str, name: str | Path) -> Path:

@@ -66,8 +66,8 @@ def load(
     changes = keypaths.flatten(_preset(accuracy, problems)) | keypaths.flatten(overrides or {})
     _leave_out(table, changes, path.name)
     inside = {key: keypaths.below(changes, key) for key in ("hand", "objects", "control")}
-    own = {p: v for p, v in changes.items() if p[0] not in inside or len(p) == 1}
-    places = keypaths.apply(table, own, path.name, problems)
+    top_level = {p: v for p, v in changes.items() if p[0] not in inside or len(p) == 1}
+    places = keypaths.apply(table, top_level, path.name, problems)
     parsed = schema.parse(SceneFile, table, path.name, problems)
     if parsed is not None:
         _check(parsed, path.name, problems)
@@ -89,7 +89,7 @@ def load(
         parsed = _with_law(parsed, parts["hand"].material, path.name, problems)
         problems = keypaths.as_given(problems, places)
         # A path that the caller gives is not beside the scene's file.
-        given = ("control",) in own
+        given = ("control",) in top_level
         source = parsed.control if given else _beside(path, parsed.control)
         try:
             parts["control"] = key_frames.load(source, parts["hand"], overrides=inside["control"])

@@ -192,11 +192,11 @@ class DesignSpace:
             return
         columns = np.moveaxis(np.asarray(designs, float), -1, 0)
         rows = [name.split("[")[0] for name in self.names]
-        found = []
+        slips = []
         for name, row, column in zip(self.names, rows, columns, strict=True):
-            found += unit_slips.slips(name, row, column)
-        if found:
-            raise schema.InputError(found)
+            slips += unit_slips.slips(name, row, column)
+        if slips:
+            raise schema.InputError(slips)
         unit_slips.hint_at_kilopascals(columns[[row == "pressure" for row in rows]])
 
     def check(self, designs: np.typing.ArrayLike) -> None:

@@ -148,14 +148,14 @@ def _slips(unit: str) -> typing.Iterator[tuple[float, str]]:
     if match is None:
         return
     prefix, base, rest = match.groups()
-    own = next(power for power, name in _PREFIXES.items() if name == (prefix or ""))
+    power_of_unit = next(power for power, name in _PREFIXES.items() if name == (prefix or ""))
     for power in _SLIPS:
-        other = _PREFIXES.get(own + power)
+        other = _PREFIXES.get(power_of_unit + power)
         if other is not None and other != "µ":
             name = f"{other}{base}{rest}"
             yield 10.0**power, f"{_COMMON.get(name, name)} given where {unit} is expected"
     if base == "m" and not rest.startswith("^"):
-        yield 10.0 ** (_CENTI - own), f"cm{rest} given where {unit} is expected"
+        yield 10.0 ** (_CENTI - power_of_unit), f"cm{rest} given where {unit} is expected"
 
 
 def range_problem(path: str, value: float, unit: str, low: float, high: float) -> str | None:
@@ -262,8 +262,8 @@ def _check_when_made(cls: type) -> None:
     @functools.wraps(make)
     def checked(self: Any, *given: Any, **named: Any) -> None:
         make(self, *given, **named)
-        found = (_known_problem(f"{name}.{f.name}", getattr(self, f.name), f) for f in numbers)
-        if problems := [problem for problem in found if problem]:
+        checks = (_known_problem(f"{name}.{f.name}", getattr(self, f.name), f) for f in numbers)
+        if problems := [problem for problem in checks if problem]:
             raise InputError(problems)
 
     cls.__init__ = checked
@@ -272,8 +272,8 @@ def _check_when_made(cls: type) -> None:
 def _known_problem(path: str, value: Any, field: dataclasses.Field[Any]) -> str | None:
     """The problem with the numbers of a field of a table, as far as they are known."""
     if isinstance(value, tuple):
-        found = (_known_problem(f"{path}[{i}]", v, field) for i, v in enumerate(value))
-        return next(filter(None, found), None)
+        entry_problems = (_known_problem(f"{path}[{i}]", v, field) for i, v in enumerate(value))
+        return next(filter(None, entry_problems), None)
     if isinstance(value, bool | str):
         return f"{path} = {shown(value)} must be {_kind(float, field)}"
     known = isinstance(value, int | float | np.number | np.ndarray)

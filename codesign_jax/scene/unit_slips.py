@@ -29,9 +29,9 @@ def refuse(params: Params) -> None:
     if params.tip is not None:
         values |= {f"tip_{name}": v for name, v in params.tip._asdict().items()}
     values |= {name: np.asarray(params.arm)[..., i] for i, name in enumerate(arm)}
-    found = [slip for name, v in values.items() for slip in slips(name, name, np.asarray(v))]
-    if found:
-        raise schema.InputError(found)
+    mistakes = [slip for name, v in values.items() for slip in slips(name, name, np.asarray(v))]
+    if mistakes:
+        raise schema.InputError(mistakes)
     hint_at_kilopascals(np.asarray(params.pressure, float))
 
 

@@ -48,11 +48,11 @@ class View(NamedTuple):
 class Bench:
     """A scene at one accuracy, with the programs that simulate it."""
 
-    def __init__(self, found: Case) -> None:
-        self.case = found
-        self.engine = found.make_engine()
+    def __init__(self, case: Case) -> None:
+        self.case = case
+        self.engine = case.make_engine()
         self.recorder = recording(self.engine) if tells_forces(self.engine) else None
-        self.objects = len(found.scene.objects.object)
+        self.objects = len(case.scene.objects.object)
 
     @functools.cached_property
     def trials(self) -> Trial:
@@ -81,8 +81,8 @@ class Bench:
     def outcomes(self, design: np.ndarray, first: int) -> Outcome:
         """Outcomes of the next `BATCH` trials, arrays of shape (trial,)."""
         trials = jax.tree.map(lambda v: v[first : first + BATCH], self.trials)
-        found = _outcomes(self.case.scene, self.engine, self.params(design), trials)
-        return jax.tree.map(np.asarray, found)
+        outcomes = _outcomes(self.case.scene, self.engine, self.params(design), trials)
+        return jax.tree.map(np.asarray, outcomes)
 
     def warm(self, design: np.ndarray) -> None:
         """Compiles the programs that a moved slider needs."""
@@ -109,8 +109,11 @@ class Desk:
         self.file = common.design_file(options)
         self.record = None
         if folder := options.run_folder:
-            own = {"preset": runs.read_run(folder)[1].preset, "scene": str(folder / "scene.toml")}
-            self.file = dataclasses.replace(self.file, **own)
+            fields = {
+                "preset": runs.read_run(folder)[1].preset,
+                "scene": str(folder / "scene.toml"),
+            }
+            self.file = dataclasses.replace(self.file, **fields)
             self.record = cases.read_record(folder, tell=lambda text: None)  # `find_case` said it
         self.accuracies = ("", *library.available("accuracy"))
         self.benches: dict[str, Bench] = {}
@@ -118,10 +121,10 @@ class Desk:
     def bench(self, accuracy: str) -> Bench:
         """The programs of an accuracy."""
         if accuracy not in self.benches:
-            found = self.case
+            case = self.case
             if accuracy:
-                found = found._replace(scene=with_accuracy(found.scene, accuracy))
-            self.benches[accuracy] = Bench(found)
+                case = case._replace(scene=with_accuracy(case.scene, accuracy))
+            self.benches[accuracy] = Bench(case)
         return self.benches[accuracy]
 
     def flags(self, accuracy: str) -> list[str]:
@@ -130,10 +133,10 @@ class Desk:
         named = {"accuracy": accuracy or self.options.accuracy}
         named |= {"engine": self.case.engine, "policy": given.policy}
         named |= {"constants": given.constants}
-        found = [word for k, v in named.items() if v is not None for word in (f"--{k}", v)]
+        flags = [word for k, v in named.items() if v is not None for word in (f"--{k}", v)]
         for words in given.overrides:
-            found += ["--set", *words]
-        return found + ["--robust"] * given.robust
+            flags += ["--set", *words]
+        return flags + ["--robust"] * given.robust
 
     @contextlib.contextmanager
     def reserved(self, stem: str, ending: str = "") -> Iterator[Path]:

@@ -77,8 +77,8 @@ class Guard:
         port = re.search(r":([0-9]{1,5})$", hosts[0])
         cookie = f"codesign-studio-{port[1] if port else 80}"
         if path == SOCKET:
-            own = [[f"{scheme}://{hosts[0]}"] for scheme in ("http", "https")]
-            if origins not in own or not self._known(_cookie(headers, cookie)):
+            same_origin = [[f"{scheme}://{hosts[0]}"] for scheme in ("http", "https")]
+            if origins not in same_origin or not self._known(_cookie(headers, cookie)):
                 return connection.respond(HTTPStatus.FORBIDDEN, _MISSING)
             return None
         if path != "/":
@@ -107,8 +107,8 @@ def _cookie(headers: Headers, name: str) -> str:
     """The value of a cookie; empty without one."""
     for text in headers.get_all("Cookie"):
         try:
-            if found := SimpleCookie(text).get(name):
-                return found.value
+            if morsel := SimpleCookie(text).get(name):
+                return morsel.value
         except CookieError:
             continue
     return ""

@@ -157,9 +157,9 @@ def about(desk: Desk) -> dict[str, Any]:
     """What a page is told first: the design's parameters, and what there is to choose from."""
     scene = desk.case.scene
     space = desk.case.space
-    own, others = tables.by_finger(space)
-    fingers = range(scene.num_fingers if own else 0)
-    groups = {f"Finger {f}": {k[f]: name for name, k in own.items()} for f in fingers}
+    per_finger, others = tables.by_finger(space)
+    fingers = range(scene.num_fingers if per_finger else 0)
+    groups = {f"Finger {f}": {k[f]: name for name, k in per_finger.items()} for f in fingers}
     for title, morphology in (("Hand", True), ("Control", False)):
         groups[title] = {k: space.names[k] for k in others if space.is_morphology[k] == morphology}
     low, high = (space.in_units(v) for v in (space.low, space.high))

@@ -83,9 +83,9 @@ class Tab:
         """Waits for messages, by kind; None once the tab is closed."""
         with self._filled:
             self._filled.wait_for(lambda: self._outbox or self._closed)
-            found = self._outbox
+            messages = self._outbox
             self._outbox = {}
-            return None if self._closed else found
+            return None if self._closed else messages
 
     def close(self) -> None:
         """There are no more messages."""
@@ -202,8 +202,8 @@ class Tab:
 
     def _tell_trials(self, shown: ShownGrasp) -> None:
         left = shown.view.trials - self._total
-        found = shown.bench.outcomes(shown.view.design, self._total)
-        self._outcomes.append(jax.tree.map(lambda v: v[:left], found))
+        outcomes = shown.bench.outcomes(shown.view.design, self._total)
+        self._outcomes.append(jax.tree.map(lambda v: v[:left], outcomes))
         self._tell_verdict(shown)
 
     def _tell_overlap(self, shown: ShownGrasp) -> None:
@@ -243,11 +243,11 @@ class Tab:
         sentence = "the verdict comes ..."
         cost = None
         if self._outcomes:
-            found = jax.tree.map(lambda *v: np.concatenate(v)[: view.trials], *self._outcomes)
-            ends = codesign.verdicts(found).tolist()
-            sentence = str(verdicts.Judged(scene, found, grasps="grasps"))
-            if not failed(found.status).all():
-                cost = float(codesign.particle_cost(scene, found))
+            outcomes = jax.tree.map(lambda *v: np.concatenate(v)[: view.trials], *self._outcomes)
+            ends = codesign.verdicts(outcomes).tolist()
+            sentence = str(verdicts.Judged(scene, outcomes, grasps="grasps"))
+            if not failed(outcomes.status).all():
+                cost = float(codesign.particle_cost(scene, outcomes))
         design = common.shortest(shown.bench.case.space, view.design)
         told = {"number": view.number, "total": view.trials, "design": design}
         self.send("verdict", told | {"ends": ends, "sentence": sentence, "cost": cost})
@@ -298,13 +298,13 @@ class Tab:
 
     def _of_run(self, place: list[int] | None) -> None:
         """Shows a particle of an episode, counted from 1; the chosen design without a place."""
-        found = self._desk.case.design
+        design = self._desk.case.design
         desk = self._desk
         if place is not None and desk.record is not None:
             e, p = place
-            found = cases.find_grasp(desk.case.scene, desk.record, episode=e, particle=p).design
+            design = cases.find_grasp(desk.case.scene, desk.record, episode=e, particle=p).design
         view = self._current().view
-        self._asked.append(view._replace(design=found, resting=True, number=None))
+        self._asked.append(view._replace(design=design, resting=True, number=None))
 
     def _save(self) -> None:
         words = ["codesign", "evaluate", *self._saved()]
@@ -396,6 +396,6 @@ def _deepest(shown: ShownGrasp) -> str:
     pose = motion.pose[np.minimum((times * motion.rate).astype(int), len(motion.pose) - 1)]
     turns = Rotation.from_quat(pose[..., 3:].reshape(-1, 4), scalar_first=True).as_matrix()
     turns = turns.reshape(*pose.shape[:2], 3, 3)
-    found = overlap.overlaps(scene, grasp.params, pose[..., :3], turns)
-    fingers, palm = (1e3 * depth.max() for depth in found)
+    overlaps = overlap.overlaps(scene, grasp.params, pose[..., :3], turns)
+    fingers, palm = (1e3 * depth.max() for depth in overlaps)
     return f"Deepest overlap: {fingers:.1f} mm in fingers, {palm:.1f} mm in the palm"

@@ -137,9 +137,9 @@ def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float, reac
     def made() -> bytes:
         return array_files.packed(build(vertices, faces, bound, reach)._asdict())
 
-    found: dict[str, Any] = array_files.unpacked(
+    arrays: dict[str, Any] = array_files.unpacked(
         io.BytesIO(reuse.kept(path, made, worth=WORTH_KEEPING)), path
     )
     for name in ("cell", "error", "worst"):
-        found[name] = float(found[name])
-    return Grid(**found)
+        arrays[name] = float(arrays[name])
+    return Grid(**arrays)

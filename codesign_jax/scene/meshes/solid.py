@@ -121,8 +121,8 @@ def load(
       centre: Centre of mass in the file's frame [m], shape (3,); None for a homogeneous body's.
       tensor: Inertia about it per mass [m^2], in the file's axes, shape (3, 3); likewise.
     """
-    found = reading.read(path) if content is None else reading.parsed(path, content)
-    vertices, faces, content, digest = found
+    mesh = reading.read(path) if content is None else reading.parsed(path, content)
+    vertices, faces, content, digest = mesh
     repairs: list[str] = []
     with np.errstate(over="ignore", invalid="ignore"):
         problems = _size_problems(np.ptp(vertices, axis=0).max(), unit)

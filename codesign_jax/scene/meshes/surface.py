@@ -18,9 +18,9 @@ def signed_distance(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray)
     """
     import igl  # which takes half a second, and only scenes with meshes need it
 
-    how: Any = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-    found = igl.signed_distance(points, vertices, _indices(faces), sign_type=how)
-    return np.asarray(found[0])
+    sign: Any = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
+    result = igl.signed_distance(points, vertices, _indices(faces), sign_type=sign)
+    return np.asarray(result[0])
 
 
 def winding(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:

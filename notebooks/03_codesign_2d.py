@@ -77,8 +77,10 @@ def by_strategy(values):
 means = by_strategy(infos.selection.mean_cost)
 paths = by_strategy(infos.population.mean(2))
 for name, mean in zip(strategies, means, strict=True):
-    found = [codesign.convergence_episode(m) for m in mean]
-    print(f"{name:>10}: converged from episode {[None if e is None else e + 1 for e in found]}")
+    convergence = [codesign.convergence_episode(m) for m in mean]
+    print(
+        f"{name:>10}: converged from episode {[None if e is None else e + 1 for e in convergence]}"
+    )
 
 # %% [markdown]
 # The line of each run is the mean of its particles.  Who may move in one direction only finds a

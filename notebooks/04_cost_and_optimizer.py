@@ -116,19 +116,19 @@ optimizers = {name: codesign.make_optimizer(name, space) for name in names}
 optimizers["cross-entropy"] = CrossEntropy(codesign.make_filter(space).space)
 masks = schedule("concurrent", np.array(space.is_morphology), episodes)
 start = space.from_units(np.array([130.0, 90.0]))  # mm, mm
-found = {}
+infos = {}
 task = codesign.Task(grasping, space, trials, cost=looseness, stop_when_lost=True)
 for name, optimizer in optimizers.items():
     state = optimizer.init(jax.random.key(1), start, particles)
-    end, found[name] = task.run(optimizer, state, masks)
-    best = int(jnp.argmin(found[name].selection.best_cost))
-    row = int(found[name].selection.best_index[best])
-    design = np.round(space.in_units(np.asarray(found[name].population[best, row])), 1)
-    print(f"{name:>15}: lowest cost {found[name].selection.best_cost[best]:.3f} at {design} mm")
+    end, infos[name] = task.run(optimizer, state, masks)
+    best = int(jnp.argmin(infos[name].selection.best_cost))
+    row = int(infos[name].selection.best_index[best])
+    design = np.round(space.in_units(np.asarray(infos[name].population[best, row])), 1)
+    print(f"{name:>15}: lowest cost {infos[name].selection.best_cost[best]:.3f} at {design} mm")
 
 # %%
 figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-for name, info in found.items():
+for name, info in infos.items():
     best = np.minimum.accumulate(np.asarray(info.selection.best_cost))
     axes[0].plot(np.arange(episodes) + 1, best, ".-", label=name)
     axes[1].plot(

@@ -56,8 +56,8 @@ def costs(engine, step, links, calls=2):
     task = codesign.Task(chosen, space, trials, make_engine(engine, chosen))
     for _ in range(calls):  # the first one compiles
         start = time.perf_counter()
-        found = np.asarray(task.evaluate(jnp.asarray(designs), jax.random.key(1)).cost)
-    return found, time.perf_counter() - start
+        design_costs = np.asarray(task.evaluate(jnp.asarray(designs), jax.random.key(1)).cost)
+    return design_costs, time.perf_counter() - start
 
 
 # %% [markdown]
@@ -75,10 +75,10 @@ if not FAST:
 reference, _ = costs(*(("mujoco", 5, 2) if FAST else ("structured", 1, 20)), calls=1)
 results = []
 for engine, step, links in settings:
-    found, seconds = costs(engine, step, links)
-    flips = np.mean((found < 0.01) != (reference < 0.01))
-    bias = np.abs(found.mean(1) - reference.mean(1)).mean()
-    results.append((engine, step, links, 1e3 * seconds / found.size, flips, bias))
+    result, seconds = costs(engine, step, links)
+    flips = np.mean((result < 0.01) != (reference < 0.01))
+    bias = np.abs(result.mean(1) - reference.mean(1)).mean()
+    results.append((engine, step, links, 1e3 * seconds / result.size, flips, bias))
     print(
         f"{engine:>10} {step:>4} ms, {links:>2} links: {results[-1][3]:6.1f} ms a grasp, "
         f"{flips:.0%} of the verdicts differ, a design's mean cost by {bias:.2f}"

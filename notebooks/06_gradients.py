@@ -104,8 +104,8 @@ variance = jnp.var(measured, axis=0).mean()
 
 def misfit(logs):
     """Mean squared error of the tip over its variance, of logarithms of a material."""
-    found = tips(engine, logs)
-    return jnp.mean((found - measured) ** 2) / variance, found
+    predicted = tips(engine, logs)
+    return jnp.mean((predicted - measured) ** 2) / variance, predicted
 
 
 gradient = jax.jit(jax.value_and_grad(misfit, has_aux=True))

@@ -78,9 +78,9 @@ def scaled(friction=1.0, stiffness=1.0, contact=1.0, palm=1.0):
     )
 
 
-def kept(own, seed=0):
+def kept(constants, seed=0):
     """Whether each grasp keeps its object, shape (design, trial)."""
-    cost = evaluate(designs, jax.random.key(seed), own).cost
+    cost = evaluate(designs, jax.random.key(seed), constants).cost
     return np.asarray(cost) < codesign.SUCCESS_COST
 
 

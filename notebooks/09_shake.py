@@ -61,14 +61,14 @@ names = "shear modulus", "pressure gain", "friction", "contact stiffness", "obje
 def ends(logs):
     """Positions of all bodies at the end, of factors exp(logs) on the constants, (world, 5)."""
     modulus, gain, friction, stiffness, mass = jnp.exp(logs).T
-    own = trials._replace(
+    scaled_trials = trials._replace(
         stiffness=modulus * trials.stiffness,
         friction=friction * trials.friction,
         mass=mass * trials.mass,
     )
     contact = grasping.contact
     contact = replace(contact, normal_stiffness=stiffness * contact.normal_stiffness)
-    new, *_ = rollout.prepare(replace(grasping, contact=contact), hands, own)
+    new, *_ = rollout.prepare(replace(grasping, contact=contact), hands, scaled_trials)
     driven = window.at[:, :, 6:].multiply(gain[:, None, None])
     return engine.rollout(new._replace(start=state), driven).last[:, : fields.qpos.shape[1]]
 
@@ -101,11 +101,11 @@ def residuals(logs):
 @jax.jit
 def linearized(logs, key):
     """Half of the sum of squares, its gradient, and an estimate of J'J."""
-    found, pull = jax.vjp(residuals, jnp.tile(logs, (count, 1)))
-    signs = jax.random.rademacher(key, (5, *found.shape), found.dtype)
-    [bars] = jax.vmap(pull)(jnp.concatenate([found[None], signs]))
+    misfits, pull = jax.vjp(residuals, jnp.tile(logs, (count, 1)))
+    signs = jax.random.rademacher(key, (5, *misfits.shape), misfits.dtype)
+    [bars] = jax.vmap(pull)(jnp.concatenate([misfits[None], signs]))
     matrix = jnp.einsum("pwi,pwj->ij", bars[1:], bars[1:]) / 5
-    return (found**2).sum() / 2, bars[0].sum(0), matrix
+    return (misfits**2).sum() / 2, bars[0].sum(0), matrix
 
 
 @jax.jit

@@ -60,14 +60,14 @@ class Touch(env.GraspEnv):
     """Its observation is (finger, feature), flat: four of time, then what each finger feels."""
 
     def observe(self, seen):
-        one = jnp.ones(self.scene.num_fingers)
+        ones = jnp.ones(self.scene.num_fingers)
         forces = seen.forces
         lifted = seen.phase == 2
         shaken = seen.phase > 2
-        times = one, one * lifted, one * shaken, one * shaken * seen.phase_time  # ever stronger
+        times = ones, ones * lifted, ones * shaken, ones * shaken * seen.phase_time  # ever stronger
         carried = (forces.finger.sum(0) + forces.palm)[2]  # by the hand [N]
         bend = 0.5 * seen.joint[..., 0].sum(-1)
-        felt = 0.2 * one * carried, 0.2 * forces.finger[:, 2], 0.05 * forces.grip, bend
+        felt = 0.2 * ones * carried, 0.2 * forces.finger[:, 2], 0.05 * forces.grip, bend
         return jnp.stack([*times, *felt], 1).ravel()
 
     def act(self, seen, action):
@@ -124,24 +124,24 @@ trials, candidates, generations = (3, 4, 1) if FAST else (96, 24, 45)
 def train(weights, seed):
     """The mean of the last generation."""
     search = CMA_ES(population_size=candidates, solution=weights)
-    how = search.default_params.replace(std_init=0.2)
-    state = search.init(jax.random.key(seed), weights, how)
+    hyperparameters = search.default_params.replace(std_init=0.2)
+    state = search.init(jax.random.key(seed), weights, hyperparameters)
     for key in jax.random.split(jax.random.key(seed), generations):
         start = reset(jax.random.split(key, trials))  # new objects and noise
-        population, state = search.ask(key, state, how)
+        population, state = search.ask(key, state, hyperparameters)
         reward = evaluate(population, start)
-        state, _ = search.tell(key, population, -reward, state, how)
+        state, _ = search.tell(key, population, -reward, state, hyperparameters)
     return state.mean
 
 
 first = train(jnp.zeros(4 * fingers), 1)
-found = {}
+results = {}
 fresh = reset(jax.random.split(jax.random.key(99), 6 if FAST else 768))
 for name, more in (("by time", 0), ("by touch", features - 4)):
     weights = train(jnp.append(first, jnp.zeros(more)), 2)
-    found[name] = reward, held = np.asarray(judge(weights, fresh))
+    results[name] = reward, held = np.asarray(judge(weights, fresh))
     print(f"{name}: reward {reward.mean():.3f}, held {100 * held.mean():.0f} % of the time")
-gain = found["by touch"][0] - found["by time"][0]
+gain = results["by touch"][0] - results["by time"][0]
 error = 1.96 * gain.std() / np.sqrt(len(gain))
 print(f"by touch {gain.mean():+.3f} +- {error:.3f} (95 %), {len(gain)} fresh trials of both")
 
@@ -149,7 +149,7 @@ print(f"by touch {gain.mean():+.3f} +- {error:.3f} (95 %), {len(gain)} fresh tri
 mass = grasping.objects.object[0].mass * np.asarray(fresh.data.trial.mass)  # kg, of all alike
 few = np.array_split(np.argsort(mass), 2 if FAST else 12)
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3), layout="constrained")
-for name, (reward, held) in found.items():
+for name, (reward, held) in results.items():
     pressure = 2 * (1 - reward.astype(float) / np.maximum(held, 1e-6))  # while it is held
     centre = [1000 * mass[k].mean() for k in few]
     left.plot(centre, [held[k].mean() for k in few], "o-", label=name)

@@ -34,29 +34,29 @@ NOISE = {"angle": 0.02, "tip_force": 0.05, "sideways": 0.03, "drop": 0.02}
 """Noise of a column, of its root mean square."""
 
 
-def measured(own: finger.Finger) -> dict[str, dict[str, np.ndarray]]:
+def measured(truth: finger.Finger) -> dict[str, dict[str, np.ndarray]]:
     """Tables of each measurement, with its noise."""
     random = np.random.default_rng(71)
     pressure = np.linspace(10e3, 60e3, 6)
-    times = np.linspace(0.0, 4 * swing.first_period(own, 0.0), 60)
+    times = np.linspace(0.0, 4 * swing.first_period(truth, 0.0), 60)
     asked = {
         "angles": ("angle", {"pressure": pressure}),
         "tip forces": ("tip_force", {"pressure": pressure}),
         "weights, sideways": ("sideways", {"pressure": np.repeat([0, 60e3], 3), "load": 0.3}),
         "a ring-down": ("drop", {"pressure": 0.0, "time": times, "load": 0.0}),
     }
-    found = {}
+    tables = {}
     for words, (column, given) in asked.items():
         rows = max(np.size(v) for v in given.values())
         table = {n: np.broadcast_to(np.asarray(v, float), rows).copy() for n, v in given.items()}
         if column == "drop":
             step = times[-1] / (8 * swing.STEPS)
-            clean = np.interp(times, *swing.released(own, 0.0, 0.0, times[-1] + step, step))
+            clean = np.interp(times, *swing.released(truth, 0.0, 0.0, times[-1] + step, step))
         else:
-            clean = finger.predict(own, table | {column: np.zeros(rows)})[column]
+            clean = finger.predict(truth, table | {column: np.zeros(rows)})[column]
         scale = NOISE[column] * np.sqrt((clean**2).mean())
-        found[words] = table | {column: clean + scale * random.normal(size=rows)}
-    return found
+        tables[words] = table | {column: clean + scale * random.normal(size=rows)}
+    return tables
 
 
 def joined(tables: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -99,12 +99,12 @@ def draw(steps: list[str], intervals: list[dict[str, np.ndarray]], folder: Path)
     """The 90 % intervals over the truth after each measurement."""
     figure = output.new_figure(8.4, 2.8)
     axes = figure.subplots(1, 1)
-    for k, (step, found) in enumerate(zip(steps, intervals, strict=True)):
+    for k, (step, ends) in enumerate(zip(steps, intervals, strict=True)):
         for place, name in enumerate(LABELS):
-            if name in found:
+            if name in ends:
                 label = step if name == "shear_modulus" else None
                 x = place + 0.15 * (k - 1.5)
-                axes.plot([x, x], found[name], f"C{k}", lw=4, solid_capstyle="butt", label=label)
+                axes.plot([x, x], ends[name], f"C{k}", lw=4, solid_capstyle="butt", label=label)
     axes.axhline(1, color="k", lw=0.5)
     axes.set_xticks(range(len(LABELS)), list(LABELS.values()))
     axes.set(yscale="log", ylabel="90 % interval over the truth", yticks=[0.5, 0.7, 1, 1.4, 2])

@@ -165,10 +165,10 @@ def machine(run: dict[str, Any]) -> str:
 def rates(files: list[dict[str, Any]]) -> str:
     """Grasps a second in the default scene: batches against machines and designs, in Markdown."""
     cells: dict[tuple[str, str], dict[int, str]] = {}
-    for found in files:
-        for record in found["records"]:
+    for content in files:
+        for record in content["records"]:
             if record["scene"] == "paper" and record["engine"] == "structured":
-                column = machine(found["runs"][record["run"]]), DESIGNS[record["designs"]]
+                column = machine(content["runs"][record["run"]]), DESIGNS[record["designs"]]
                 rate = record["grasps_per_s"]
                 worlds = record["worlds"]
                 text = f"{_rounded(rate)} ({_rounded(worlds / rate)} s)"
@@ -190,9 +190,9 @@ def rates(files: list[dict[str, Any]]) -> str:
 def machines(files: list[dict[str, Any]]) -> str:
     """What measured the default scene's rates, in a line; the files have the commits."""
     made: dict[str, None] = {}
-    for found in files:
-        for record in found["records"]:
-            run = found["runs"][record["run"]]
+    for content in files:
+        for record in content["records"]:
+            run = content["runs"][record["run"]]
             if record["scene"] == "paper":
                 made[f"{machine(run)}, JAX {run['jax']}, {run['date'][:10]}"] = None
     return f"Measured on {'; on '.join(made)} (`docs/data/rates_*.json`)."
@@ -202,18 +202,18 @@ def peers(files: list[dict[str, Any]]) -> str:
     """This engine beside each peer: the same grasps on the same machine, in Markdown."""
     head = "scene, machine, peer, peer's grasps a second, this engine's, times as many"
     rows = [[*head.split(", "), "same verdicts"]]
-    for found in files:
-        for theirs in found["records"]:
+    for content in files:
+        for theirs in content["records"]:
             if theirs["engine"] == "structured":
                 continue
-            ours = _beside(found["records"], theirs)
-            where = machine(found["runs"][theirs["run"]])
+            ours = _beside(content["records"], theirs)
+            where = machine(content["runs"][theirs["run"]])
             where += f", {theirs['worlds']:,} grasps" if theirs["worlds"] else ""
             numbers = [theirs["grasps_per_s"], ours["grasps_per_s"]]
             shown = [_rounded(n) for n in numbers]
             ratio = f"{numbers[1] / numbers[0]:.0f}"
             same = _same(ours.get("verdicts", ""), theirs.get("verdicts", ""))
-            peer = theirs["engine"] + provenance.before(found["runs"][theirs["run"]])
+            peer = theirs["engine"] + provenance.before(content["runs"][theirs["run"]])
             rows.append([theirs["scene"], where, peer, *shown, ratio, same])
     return output.markdown(rows)
 
@@ -268,10 +268,12 @@ def main() -> None:
         return fill_pages()
     # Warp allocates beside JAX, which otherwise takes most of the device's memory.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    found = json.loads(args.json.read_text()) if args.json.exists() else {"runs": [], "records": []}
-    found["runs"].append(provenance.measurement(args.commit))
-    platform = found["runs"][-1]["platform"]
-    warp = found["runs"][-1]["warp"]
+    content = (
+        json.loads(args.json.read_text()) if args.json.exists() else {"runs": [], "records": []}
+    )
+    content["runs"].append(provenance.measurement(args.commit))
+    platform = content["runs"][-1]["platform"]
+    warp = content["runs"][-1]["warp"]
     for name in args.cases:
         file, effects, kinds, engines = CASES[name]
         chosen = scene.load(file, overrides={"effects": effects})
@@ -285,10 +287,10 @@ def main() -> None:
                 for count in sizes:
                     begin = time.perf_counter()
                     new = {"scene": name, "designs": designs, "engine": named(engine)}
-                    new |= {"worlds": count, "run": len(found["runs"]) - 1}
+                    new |= {"worlds": count, "run": len(content["runs"]) - 1}
                     new |= measured(chosen, designs, engine, count, args.calls)
-                    found["records"] = replaced(found["records"], new)
-                    output.write_json(args.json, found)
+                    content["records"] = replaced(content["records"], new)
+                    output.write_json(args.json, content)
                     words = f"{new['grasps_per_s']} grasps/s, kept {new['kept']:.0%}"
                     took = time.perf_counter() - begin
                     print(name, designs, named(engine), count, words, f"({took:.0f} s)", flush=True)

@@ -112,13 +112,13 @@ def near_best(units: np.ndarray, distances: np.ndarray, count: int, seed: int) -
 
 def values(units: np.ndarray) -> dict[str, np.ndarray]:
     """Values in the units of `OPEN`, shape (set,), of points of the unit cube, (set, constant)."""
-    found = {}
+    constants = {}
     for (name, o), u in zip(OPEN.items(), np.asarray(units, float).T, strict=True):
         low, high = (np.log([o.low, o.high]) if o.log else np.array([o.low, o.high])) + 0.0
-        found[name] = np.exp(low + u * (high - low)) if o.log else low + u * (high - low)
+        constants[name] = np.exp(low + u * (high - low)) if o.log else low + u * (high - low)
     u = np.asarray(units, float)[:, list(OPEN).index("pair_gap")]
-    least = least_gap(found["width"])
-    return found | {"pair_gap": least + u * (OPEN["pair_gap"].high - least)}
+    least = least_gap(constants["width"])
+    return constants | {"pair_gap": least + u * (OPEN["pair_gap"].high - least)}
 
 
 def least_gap(width: Any) -> Any:
@@ -136,7 +136,7 @@ def own_set(the_scene: Scene) -> np.ndarray:
     material = hand.material
     wrist = hand.wrist
     arm = the_scene.arm
-    own = {
+    constants = {
         "tilt": hand.finger[0].tilt,
         "base_x": 1e3 * x,
         "pair_gap": 2e3 * y,
@@ -159,7 +159,7 @@ def own_set(the_scene: Scene) -> np.ndarray:
     ranges = OPEN | {"pair_gap": OPEN["pair_gap"]._replace(low=float(least_gap(width)))}
     scaled = {k: np.log if o.log else np.asarray for k, o in ranges.items()}
     ends = {k: (scaled[k](o.low), scaled[k](o.high)) for k, o in ranges.items()}
-    return np.array([(scaled[k](own[k]) - a) / (b - a) for k, (a, b) in ends.items()])
+    return np.array([(scaled[k](constants[k]) - a) / (b - a) for k, (a, b) in ends.items()])
 
 
 def numbers(the_scene: Scene, chosen: Mapping[str, np.ndarray]) -> Scene:
@@ -289,16 +289,16 @@ class Wave:
             set_, design, trial = jnp.indices((each, len(flat), self.trials)).reshape(3, -1)
             params = jax.tree.map(lambda v: v[design], jax.vmap(self.space.params)(flat))
             drawn = jax.tree.map(lambda v: v[set_, trial], jax.vmap(draw)(keys))
-            own = jax.tree.map(lambda v: v[set_] if jnp.ndim(v) else v, sets)
-            return rollout.simulate(own, self.engine, params, drawn)[0]
+            scenes = jax.tree.map(lambda v: v[set_] if jnp.ndim(v) else v, sets)
+            return rollout.simulate(scenes, self.engine, params, drawn)[0]
 
         for first in range(sum(len(d) for d in done), len(self.units), each):
             # Filled up with the last set, so that every call has the compiled size.
             index = np.minimum(np.arange(first, first + each), len(self.units) - 1)
             part = lambda v, i=index: jnp.asarray(v[i] if np.ndim(v) else v, jnp.float32)  # noqa: E731
             keys = jax.vmap(lambda i: stream_key(root, STREAM_WAVE, i))(jnp.asarray(index))
-            found = jax.tree.map(np.asarray, simulate(jax.tree.map(part, every), keys))
-            cost = np.where(failed(found.status), np.nan, found.cost)
+            outcomes = jax.tree.map(np.asarray, simulate(jax.tree.map(part, every), keys))
+            cost = np.where(failed(outcomes.status), np.nan, outcomes.cost)
             cost = cost.reshape(each, self.points, self.points, self.trials)
             done.append(cost[: len(self.units) - first].astype(np.float32))
             say(done)
@@ -347,8 +347,8 @@ def on_landscapes(space: DesignSpace, shapes: int = 3) -> Callable[..., Any]:
         return jnp.array([1 - a, a]) @ square @ jnp.array([1 - b, b])
 
     def costs(landscape, particles, key, number, shared, trials):
-        own = stream_key(key, 0x6C616E64, jnp.asarray(number, jnp.int32))
-        keys = jax.vmap(lambda i: jax.random.fold_in(own, i))(
+        base_key = stream_key(key, 0x6C616E64, jnp.asarray(number, jnp.int32))
+        keys = jax.vmap(lambda i: jax.random.fold_in(base_key, i))(
             jnp.where(shared, 0, jnp.arange(len(particles)))
         )
 
@@ -413,11 +413,16 @@ def free_strain(chosen: Mapping[str, np.ndarray], hand: Hand, *, neo_hookean: bo
     limit = np.broadcast_to(hand.pressure_limit.per_wall * wall, (len(height), len(wall)))
     largest = []
     for width in 1e-3 * chosen["width"]:
-        own = {"width": width, "shear_modulus": hand.material.shear_modulus}
+        beam = {"width": width, "shear_modulus": hand.material.shear_modulus}
         every = strain[:, None, None]
-        pressure = strain_pressure(every, height, wall, **own, neo_hookean=neo_hookean)
+        pressure = strain_pressure(every, height, wall, **beam, neo_hookean=neo_hookean)
         pairs = zip(limit.ravel(), pressure.reshape(len(strain), -1).T, strict=True)
-        largest.append(max(np.interp(highest, own, strain) for highest, own in pairs))
+        largest.append(
+            max(
+                np.interp(highest, largest_pressures, strain)
+                for highest, largest_pressures in pairs
+            )
+        )
     return np.array(largest)
 
 
@@ -435,7 +440,7 @@ def score(
     mean = np.where(good.any(-1), mean, maximum[:, None, None])
     filled = np.where(good, costs, mean[..., None]).astype(np.float32)
     run = on_landscapes(space)
-    found = {}
+    efforts = {}
     success: dict[str, np.ndarray] = {}
     for noise in ("shared", "own"):
         parts = [run(filled[i : i + 32], noise == "shared") for i in range(0, len(filled), 32)]
@@ -445,7 +450,7 @@ def score(
             for kind in ("first", "stays"):
                 episodes = episodes_to_converge(every[:, k], stays=kind == "stays")
                 middle = np.median(np.minimum(episodes, EPISODES + 1), axis=-1)
-                found[name, kind, noise] = np.log(PARTICLES * TRIALS * middle)
+                efforts[name, kind, noise] = np.log(PARTICLES * TRIALS * middle)
 
     def at_least(value: Any, wanted: Any, deviation: float) -> np.ndarray:
         return np.maximum(wanted - value, 0.0) / deviation
@@ -455,10 +460,10 @@ def score(
     # runs sqrt(2 p (1 - p) / 30) = 0.12; of a mean of six trials near a cost of 1 0.3; of a share
     # of 0.15 on a grid of 144 points 0.03; of a strain of 1.5 the 4 % that its law may err by
     # (docs/measurements.md).  That success "quickly increases" is read as 12 of 30.
-    readings = [np.abs(v - np.log(420.0)) for k, v in found.items() if k[0] == "concurrent"]
+    readings = [np.abs(v - np.log(420.0)) for k, v in efforts.items() if k[0] == "concurrent"]
     late = []
     for kind in ("first", "stays"):
-        times = [found[s, kind, "own"] for s in reversed(STRATEGIES)]
+        times = [efforts[s, kind, "own"] for s in reversed(STRATEGIES)]
         gaps = [np.maximum(a - b, 0) for a, b in zip(times, times[1:], strict=False)]
         late.append(np.max(gaps, 0))
     heights = np.array([saddle(m) for m in mean])
@@ -483,7 +488,7 @@ def told(units: np.ndarray, distances: Mapping[str, np.ndarray], count: int = 5)
     """Lines about a score: what each statement rules out, what is left, and the best sets."""
     every = np.stack([*distances.values()], -1)
     kept = (every <= CUTOFF).all(-1)
-    found = values(units)
+    constants = values(units)
     lines = [f"{kept.sum()} of {len(units)} sets are not ruled out"]
     lines += [f"  {name}: rules out {(d > CUTOFF).sum()}" for name, d in distances.items()]
     best = np.argsort(every.max(-1), kind="stable")[:count]
@@ -491,9 +496,9 @@ def told(units: np.ndarray, distances: Mapping[str, np.ndarray], count: int = 5)
     for name, o in OPEN.items():
         span = "–"
         if kept.any():
-            low, high = np.percentile(found[name][kept], [5, 95])
+            low, high = np.percentile(constants[name][kept], [5, 95])
             span = f"{low:.3g} to {high:.3g}"
-        shown = ", ".join(f"{v:.3g}" for v in found[name][best])
+        shown = ", ".join(f"{v:.3g}" for v in constants[name][best])
         lines.append(f"  {name} {o.unit}: {span} | {shown}")
     worst = [list(distances)[k] for k in every[best].argmax(-1)]
     numbers = (f"{d:.2f} ({name})" for d, name in zip(every[best].max(-1), worst, strict=True))
@@ -506,11 +511,11 @@ def score_file(path: Path, the_scene: Scene) -> int:
         units = file["units"]
         costs = file["costs"]
     units = units[: len(costs)]
-    found = score(costs, values(units), the_scene)
+    scores = score(costs, values(units), the_scene)
     out = path.with_name(f"{path.stem}_scores.npz")
-    distances = np.stack([*found.values()], -1)
+    distances = np.stack([*scores.values()], -1)
     output.write_arrays(out, {"units": units, "distances": distances, "names": [*OPEN]})
-    print("\n".join([str(out), *told(units, found)]))
+    print("\n".join([str(out), *told(units, scores)]))
     return 0
 
 
@@ -520,10 +525,10 @@ def sets_of(args: Any, the_scene: Scene) -> np.ndarray:
         units = near_best(*scored(args.near), args.sets, args.seed)
     else:
         units = space_filling(args.sets, args.seed)
-    own = own_set(the_scene)
+    scene_set = own_set(the_scene)
     fixed = [list(OPEN).index(name) for name in args.fix]
-    units[:, fixed] = own[fixed]
-    return np.concatenate([units, *[own[None]] * args.own])
+    units[:, fixed] = scene_set[fixed]
+    return np.concatenate([units, *[scene_set[None]] * args.scene_sets])
 
 
 def main() -> int:
@@ -537,8 +542,8 @@ def main() -> int:
     parser.add_argument("--near", type=Path, metavar="SCORES", help=near)
     fix = "constants that every set has of the scene"
     parser.add_argument("--fix", nargs="+", default=[], choices=OPEN, metavar="NAME", help=fix)
-    own = "how often the scene's own set comes behind them, each time in other trials"
-    parser.add_argument("--own", type=int, default=0, metavar="TIMES", help=own)
+    text = "how often the scene's own set comes behind them, each time in other trials"
+    parser.add_argument("--own", type=int, default=0, metavar="TIMES", help=text)
     parser.add_argument("--chunk", type=int, default=LIMIT, help="most worlds of a call")
     changed = "values of the scene, hand and objects by key path"
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help=changed)
@@ -575,9 +580,9 @@ def simulated(path: Path, units: np.ndarray) -> np.ndarray:
     """
     with np.load(path, allow_pickle=False) as file:
         costs = file["costs"]
-        own = file["units"]
+        stored = file["units"]
     count = len(costs)
-    if own.shape[1:] != units.shape[1:] or not np.array_equal(own[:count], units[:count]):
+    if stored.shape[1:] != units.shape[1:] or not np.array_equal(stored[:count], units[:count]):
         raise InputError([f"{path} has other sets; choose another --out or remove it"])
     return costs
 

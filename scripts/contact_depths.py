@@ -94,7 +94,7 @@ def tube(joints: np.ndarray, turn: np.ndarray, size: tuple[float, float, float])
     return Tube(centre, frame, along, segment, half, np.concatenate([body, cap], 1), place)
 
 
-def in_tube(rings: np.ndarray, solid: Tube, own: tuple[np.ndarray, float] | None = None) -> Any:
+def in_tube(rings: np.ndarray, solid: Tube, itself: tuple[np.ndarray, float] | None = None) -> Any:
     """Depth of the deepest point of each state in a finger [m], 0 where none is, shape (state,).
 
     Args:
@@ -102,16 +102,16 @@ def in_tube(rings: np.ndarray, solid: Tube, own: tuple[np.ndarray, float] | None
       solid: The finger.
       own: Of the finger's own rings their places along it, and from which distance on they count.
     """
-    found = np.zeros(len(rings))
+    deepest = np.zeros(len(rings))
     last = len(solid.along) - 1
     if not rings.size:
-        return found  # a ball has no edges
+        return deepest  # a ball has no edges
     reach = np.linalg.norm(solid.half[1:]) + solid.along[1]
     wide = np.linalg.norm(rings - rings[:, :, -1:], axis=-1).max()
     gap = rings[:, :, -1, None].astype(np.float32) - solid.centre[:, None].astype(np.float32)
     near = np.einsum("sijk,sijk->sij", gap, gap) < (reach + wide) ** 2
-    if own is not None:
-        near &= np.abs(own[0][:, None] - solid.along) > own[1]
+    if itself is not None:
+        near &= np.abs(itself[0][:, None] - solid.along) > itself[1]
     for s in np.flatnonzero(near.any((1, 2))):
         ring, k = np.nonzero(near[s])
         away = rings[s, ring] - solid.centre[s, k][:, None]
@@ -137,8 +137,8 @@ def in_tube(rings: np.ndarray, solid: Tube, own: tuple[np.ndarray, float] | None
                 support = ((directions * solid.half) ** (4 / 3)).sum(1) ** 0.75
                 depth = (support - np.abs(local[some]) @ directions.T).min(1)
                 depth = np.where(tip[some], depth, np.minimum(depth, to_tip[some]))
-                found[s] = max(found[s], depth.max())
-    return found
+                deepest[s] = max(deepest[s], depth.max())
+    return deepest
 
 
 def in_disc(palm: Any, place: np.ndarray, turn: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -205,20 +205,20 @@ def measured(
     def deeper(name: str, depth: np.ndarray) -> None:
         surface_series[name] = np.maximum(surface_series[name], depth)
 
-    for f, one in enumerate(tubes):
-        least = max(ARC[0] * one.segment, ARC[1] * 2 * one.half[2])
-        deeper("self", in_tube(one.rings, one, (one.place, least)))
+    for f, finger_tube in enumerate(tubes):
+        least = max(ARC[0] * finger_tube.segment, ARC[1] * 2 * finger_tube.half[2])
+        deeper("self", in_tube(finger_tube.rings, finger_tube, (finger_tube.place, least)))
         for other in tubes[:f] + tubes[f + 1 :]:
-            depth = in_tube(one.rings, other)
+            depth = in_tube(finger_tube.rings, other)
             deeper("finger", depth)
             deeper("share", depth / (2 * other.half[1:].min()))
-        free = one.place > PALM_FROM * lay.links * one.segment
-        free &= beyond_base(one.place, 2 * one.half[2])
+        free = finger_tube.place > PALM_FROM * lay.links * finger_tube.segment
+        free &= beyond_base(finger_tube.place, 2 * finger_tube.half[2])
         if free.any():
-            deeper("palm", in_disc(palm, place[:, 1], turn[:, 1], one.rings[:, free]))
-        points = one.rings.reshape(len(qpos), -1, 3) - centre[:, None]
+            deeper("palm", in_disc(palm, place[:, 1], turn[:, 1], finger_tube.rings[:, free]))
+        points = finger_tube.rings.reshape(len(qpos), -1, 3) - centre[:, None]
         deeper("object", in_object(shape.type, size, points @ frame))
-        deeper("object", in_tube(edges[:, :, None], one))
+        deeper("object", in_tube(edges[:, :, None], finger_tube))
     first, begin, end = (int(scene.last_step(p)) for p in ("approach", "inflate", "disturb"))
     hold = slice(begin - first, end - first)
     surface_series["object_palm"] = in_disc(palm, place[:, 1], turn[:, 1], skin[:, :, None])
@@ -253,15 +253,15 @@ def measured(
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Quantiles over the kept grasps, and how many of them are beyond a limit."""
     kept = [r for r in rows if r["kept"]]
-    found: dict[str, Any] = {"grasps": len(rows), "kept": len(kept)}
-    found["failed"] = sum(r["failed"] for r in rows)
+    statistics: dict[str, Any] = {"grasps": len(rows), "kept": len(kept)}
+    statistics["failed"] = sum(r["failed"] for r in rows)
     for key in list(kept[0])[4:] if kept else ():  # behind what a lost grasp has as well
         values = np.array([r[key] for r in kept])
         quantiles = np.quantile(values, [0.5, 0.9, 0.95, 0.99, 1]).round(2).tolist()
-        found[key] = dict(zip(("median", "90%", "95%", "99%", "most"), quantiles, strict=True))
+        statistics[key] = dict(zip(("median", "90%", "95%", "99%", "most"), quantiles, strict=True))
         if key in LIMITS:
-            found[key] |= {"limit": LIMITS[key], "beyond": int((values > LIMITS[key]).sum())}
-    return found
+            statistics[key] |= {"limit": LIMITS[key], "beyond": int((values > LIMITS[key]).sum())}
+    return statistics
 
 
 def grasps(scene: Scene, designs: np.ndarray, args: argparse.Namespace) -> list[dict[str, Any]]:
@@ -286,10 +286,10 @@ def grasps(scene: Scene, designs: np.ndarray, args: argparse.Namespace) -> list[
             t = jax.tree.map(lambda v, w=world: v[w % args.trials], trials)
             outcome, trace = jax.tree.map(np.asarray, run(p, t))
             bad = types.failed(outcome.status)
-            found = []
+            pending = []
             kept = ~bad & (outcome.cost < SUCCESS_COST)
             for i in range(min(size, total - first)):
-                own, trial = jax.tree.map(lambda v, i=i: v[i], (p, t))
+                hand, trial = jax.tree.map(lambda v, i=i: v[i], (p, t))
                 row = {"design": int(world[i]) // args.trials, "kept": bool(kept[i])}
                 row |= {
                     "object": scene.objects.object[int(trial.shape)].name,
@@ -299,8 +299,8 @@ def grasps(scene: Scene, designs: np.ndarray, args: argparse.Namespace) -> list[
                 if kept[i]:
                     states = trace.qpos[i, start:]
                     depth = {k: v[i, start:] for k, v in trace.forces.depth.items()}
-                    found.append((row, pool.submit(measured, scene, own, trial, states, depth)))
-            for row, depths in found:
+                    pending.append((row, pool.submit(measured, scene, hand, trial, states, depth)))
+            for row, depths in pending:
                 row |= depths.result()
             print(f"{len(rows):,} of {total:,}", flush=True)
     return rows
@@ -338,11 +338,11 @@ def main() -> None:
     rows = grasps(scene, designs, args)
     made = {"command": shlex.join(["python", "-m", "scripts.contact_depths", *sys.argv[1:]])}
     made |= {**provenance.git_state(args.commit), **provenance.environment()}
-    found = [{"vector": v.tolist()} for v in designs]
+    content = [{"vector": v.tolist()} for v in designs]
     for row in rows:
-        found[row["design"]].setdefault("grasps", []).append(row)
+        content[row["design"]].setdefault("grasps", []).append(row)
     with files.atomically(args.out) as part:
-        text = json.dumps({**made, "summary": summary(rows), "designs": found}, indent=1)
+        text = json.dumps({**made, "summary": summary(rows), "designs": content}, indent=1)
         part.write_text(text + "\n")
     print(json.dumps(summary(rows), indent=1))
 

@@ -45,8 +45,10 @@ def variants(base: Scene) -> dict[str, Scene]:
             if value != now:
                 word = {True: "on", False: "off"}.get(value, value)
                 changes[f"{field.name} {word}"] = {field.name: value}
-    found = {AS_IT_IS: base} | {name: changed(base, **change) for name, change in changes.items()}
-    return {n: v for n, v in found.items() if not refusals(v.effects, "structured")}
+    by_change = {AS_IT_IS: base} | {
+        name: changed(base, **change) for name, change in changes.items()
+    }
+    return {n: v for n, v in by_change.items() if not refusals(v.effects, "structured")}
 
 
 def changed(base: Scene, **effects: Any) -> Scene:
@@ -108,8 +110,8 @@ def measure(everything: dict[str, Scene], path: Path, *, commit: str | None, qui
         kept, start = decide(variant, worlds)
         expected = kept if expected is None else expected
         rate = wilson(int(kept.sum()), kept.size)
-        found = {"success": float(kept.mean()), "success_low": rate.low, "success_high": rate.high}
-        results["effects"][name] = found | {"same_verdict": float((kept == expected).mean())}
+        shares = {"success": float(kept.mean()), "success_low": rate.low, "success_high": rate.high}
+        results["effects"][name] = shares | {"same_verdict": float((kept == expected).mean())}
         print(name, results["effects"][name], flush=True)
         programs[name] = program(variant, few, start[: TIMED * trials])
     times: dict[str, list[float]] = {name: [] for name in programs}

@@ -81,15 +81,15 @@ def finished(tmp_path_factory) -> tuple[Path, float]:
     return folder / "run", took
 
 
-def differences(one: Path, other: Path) -> list[str]:
+def differences(first: Path, other: Path) -> list[str]:
     """What of two runs' results is not the same bit for bit, and temporary files that were left."""
     content = lambda path: path.read_bytes() if path.is_file() else None  # noqa: E731
-    found = [n for n in (*WHOLE, *SOURCES) if content(one / n) != content(other / n)]
-    records = [runs.load_record(folder) for folder in (one, other)]
+    names = [n for n in (*WHOLE, *SOURCES) if content(first / n) != content(other / n)]
+    records = [runs.load_record(folder) for folder in (first, other)]
     digests = [record and digest(to_arrays(record)) for record in records]
-    found += ["the record"] * (digests[0] is None or digests[0] != digests[1])
-    left = [p.name for p in one.rglob("*") if p.name.endswith((".tmp", ".part"))]
-    return found + left + [p.name for p in one.rglob("*.orbax-checkpoint-tmp*")]
+    names += ["the record"] * (digests[0] is None or digests[0] != digests[1])
+    left = [p.name for p in first.rglob("*") if p.name.endswith((".tmp", ".part"))]
+    return names + left + [p.name for p in first.rglob("*.orbax-checkpoint-tmp*")]
 
 
 # --- kills and failing disks ----------------------------------------------------------------------
@@ -263,8 +263,8 @@ def toml_files(draw: Any, kinds: tuple[str, ...] = KINDS):
     places = re.compile(r'(?<== ).*|-?\d[\d_.]*(e-?\d+)?|"[^"\n]*"|^[\w.]+(?= =)', re.M)
     for _ in range(draw(st.integers(1, 3))):
         lines = text.split("\n")
-        if draw(st.booleans()) and (found := [*places.finditer(text)]):
-            match = found[draw(st.integers(0, len(found) - 1))]
+        if draw(st.booleans()) and (spans := [*places.finditer(text)]):
+            match = spans[draw(st.integers(0, len(spans) - 1))]
             text = text[: match.start()] + draw(hostile_value) + text[match.end() :]
         else:
             i, j = (draw(st.integers(0, len(lines) - 1)) for _ in range(2))
@@ -296,7 +296,7 @@ def command_lines(draw: Any) -> list[str]:
     command = draw(st.sampled_from([*NEVER]))
     text = st.one_of(st.sampled_from((*TEXTS, *NUMBERS)), pair, st.text(max_size=5))
     flag = st.tuples(st.sampled_from(FLAGS), text)
-    words = [word for one in draw(st.lists(flag, max_size=3)) for word in one]
+    words = [word for words_of_flag in draw(st.lists(flag, max_size=3)) for word in words_of_flag]
     return [command, *words, *draw(st.lists(text, max_size=1)), *NEVER[command]]
 
 
@@ -337,11 +337,11 @@ def try_toml(kind: str, data: bytes, folder: Path) -> bool:
     path = folder / "mutated.toml"
     path.write_bytes(data)
     names = {"scenes": "scene", "hands": "hand_name", "objects": "object_set"}
-    how: dict[str, Any] = {names.get(kind, kind): str(path)}
+    arguments: dict[str, Any] = {names.get(kind, kind): str(path)}
     if kind == "controls":
-        how = {"overrides": {"control": str(path)}}
+        arguments = {"overrides": {"control": str(path)}}
     loaded: list[scenes.Scene] = []
-    if refused(lambda: loaded.append(scenes.load(how.pop("scene", "paper"), **how))):
+    if refused(lambda: loaded.append(scenes.load(arguments.pop("scene", "paper"), **arguments))):
         return True
     reads_back(loaded[0], folder)
     return False
@@ -367,11 +367,11 @@ def try_mesh(kind: str, data: bytes, folder: Path) -> bool:
     """Reads a mesh; what is accepted is finite and has a volume."""
     path = folder / f"mutated.{kind}"
     path.write_bytes(data)
-    found: list[Any] = []
-    how = {"unit": "m", "repaired": True, "voxel_error": 5e-3}
-    if refused(lambda: found.append(meshes.load(path, **how))):
+    solids: list[Any] = []
+    options = {"unit": "m", "repaired": True, "voxel_error": 5e-3}
+    if refused(lambda: solids.append(meshes.load(path, **options))):
         return True
-    solid = found[0]
+    solid = solids[0]
     numbers = (solid.grid.values, solid.support, solid.vertices, solid.inertia, solid.upright)
     assert all(np.isfinite(v).all() for v in numbers) and solid.volume > 0
     return False

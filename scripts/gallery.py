@@ -107,23 +107,23 @@ def draw(hand: Hand, case: cases.Case) -> None:
     named = [rollout.nominal_trial(scene, name) for name in hand.shown]
     trials = jax.tree.map(lambda *v: jnp.stack(v), *named)
     shown = animation.replay(scene, case.make_engine(), params, trials)
-    ends = [codesign.VERDICTS[int(codesign.verdicts(one.outcome))] for one in shown]
+    ends = [codesign.VERDICTS[int(codesign.verdicts(grasp.outcome))] for grasp in shown]
     print(hand.name, *zip(hand.shown, ends, strict=True))
     seen = animation.CAMERA._replace(**({"distance": CLOSE} | hand.camera))
 
     def row(times: np.ndarray, camera: Camera) -> list[np.ndarray]:
         parts = []
-        for one in shown:
+        for grasp in shown:
             # A hand that names a place is looked at there.
-            moving = animation.following(scene, one, times, camera)
+            moving = animation.following(scene, grasp, times, camera)
             cameras = camera if "lookat" in hand.camera else moving
-            parts.append(animation.frames(scene, one, times, size=SIZE, camera=cameras))
+            parts.append(animation.frames(scene, grasp, times, size=SIZE, camera=cameras))
         return [*np.concatenate(parts, axis=2)]
 
     frames = row(np.arange(0.0, scene.end_time, 1 / RATE), seen)
     first, *others = (Image.fromarray(frame) for frame in frames)
-    how = {"duration": round(1e3 / RATE), "loop": 0, "quality": QUALITY, "method": 6}
-    first.save(FOLDER / f"{hand.name}.webp", save_all=True, append_images=others, **how)
+    options = {"duration": round(1e3 / RATE), "loop": 0, "quality": QUALITY, "method": 6}
+    first.save(FOLDER / f"{hand.name}.webp", save_all=True, append_images=others, **options)
     times = np.array([2.0, 2.7, 3.5, 4.5, 6.0, 7.9, 8.9])
     turns = (seen.azimuth, seen.azimuth + 90)
     sides = [seen._replace(azimuth=turn, elevation=-8.0) for turn in turns]

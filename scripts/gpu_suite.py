@@ -59,8 +59,8 @@ def main() -> int:
 
     def write() -> None:
         seconds = round(time.monotonic() - begin, 1)
-        found = {"provenance": made, "seconds": seconds, "tests": recorder.tests}
-        output.write_json(arguments.json, found)
+        content = {"provenance": made, "seconds": seconds, "tests": recorder.tests}
+        output.write_json(arguments.json, content)
 
     recorder = Recorder(write)
     return run_tests(recorder, arguments.processes)

@@ -20,7 +20,7 @@ HEAD = """\
 # Eight shapes beyond the primitives, made by scripts/make_objects.py; all numbers are [chosen].
 # Meshes need the structured engine.  SI units except for the files', which are in millimetres.
 name = "{name}"
-description = "Capsule, cone, torus, ring segment, mug, bottle, superquadric and L-bracket{how}"
+description = "Capsule, cone, torus, ring segment, mug, bottle, superquadric and L-bracket{origin}"
 
 [noise]                    # standard deviations, as in the paper's set
 position = 0.005
@@ -220,8 +220,8 @@ def main() -> None:
     _write(folder / "household_poses.toml", ", in each stable pose", posed)
 
 
-def _write(path: Path, how: str, entries: list[str]) -> None:
-    path.write_text(HEAD.format(name=path.stem, how=how) + "".join(entries), encoding="utf-8")
+def _write(path: Path, origin: str, entries: list[str]) -> None:
+    path.write_text(HEAD.format(name=path.stem, origin=origin) + "".join(entries), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -55,10 +55,12 @@ def beam_scene(beam: Mapping[str, Any], timestep: float, changes: Mapping[Any, A
     linear.  Shear, which a chain of hinges lacks, lowers that E I by the share that it has in the
     beam's deflection by a load at its tip.
     """
-    own = {"effects.surface": "spheres", "discretization.timestep": timestep}
-    own |= {f"effects.{name}": False for name in BARE.split()}
-    own |= {"phases.approach": 0.1, "phases.inflate": 0.2, "phases.lift": DURATION}
-    base = scene.load("paper", overrides={**own, "hand.material": "dragon_skin_10", **changes})
+    overrides = {"effects.surface": "spheres", "discretization.timestep": timestep}
+    overrides |= {f"effects.{name}": False for name in BARE.split()}
+    overrides |= {"phases.approach": 0.1, "phases.inflate": 0.2, "phases.lift": DURATION}
+    base = scene.load(
+        "paper", overrides={**overrides, "hand.material": "dragon_skin_10", **changes}
+    )
     rubber = base.hand.material
     height = beam["height"]
     slender = beam["height"] / beam["length"]
@@ -73,9 +75,9 @@ def beam_scene(beam: Mapping[str, Any], timestep: float, changes: Mapping[Any, A
     )
     mount = hand.Finger(azimuth=0.0, spread=0.0, tilt=0.0, radius=0.0)
     section = hand.Section(width=beam["width"])
-    one = dataclasses.replace(base.hand, finger=(mount,), section=section, material=material)
+    beam_hand = dataclasses.replace(base.hand, finger=(mount,), section=section, material=material)
     effects = dataclasses.replace(base.effects, neo_hookean=False)
-    return dataclasses.replace(base, hand=one, effects=effects)
+    return dataclasses.replace(base, hand=beam_hand, effects=effects)
 
 
 def wall(beam: Mapping[str, Any]) -> float:
@@ -89,10 +91,10 @@ def released(beam: Mapping[str, Any], beam_scene: Scene) -> tuple[np.ndarray, np
     The weight is a point mass at the tip face, added to the chain's last body; the masses of all
     bodies lie on the line of the hinges, which stands for the beam's middle.
     """
-    one = np.ones(1)
+    ones = np.ones(1)
     params = Params(
-        beam["length"] * one, height=beam["height"] * one, wall=wall(beam) * one,
-        spread=np.zeros(()), arm=np.zeros(6), pressure=0 * one,
+        beam["length"] * ones, height=beam["height"] * ones, wall=wall(beam) * ones,
+        spread=np.zeros(()), arm=np.zeros(6), pressure=0 * ones,
     )  # fmt: skip
     trial = rollout.nominal_trial(beam_scene)
     fields = jax.jit(model.model_fields, static_argnums=0)(beam_scene, params, trial)
@@ -126,10 +128,10 @@ def _weighted(fields: Any, extent: float, loads: np.ndarray) -> Any:
     place[..., 1] = 0.0
     mass = np.array(fields.mass)
     inertia = np.array(fields.inertia)
-    own = mass[:, 0, -1].copy()
+    link_mass = mass[:, 0, -1].copy()
     along = place[:, 0, -1, 0]
-    centre = (own * along + loads * extent) / (own + loads)
-    more = own * (centre - along) ** 2 + loads * (extent - centre) ** 2
+    centre = (link_mass * along + loads * extent) / (link_mass + loads)
+    more = link_mass * (centre - along) ** 2 + loads * (extent - centre) ** 2
     inertia[:, 0, -1, 1:] += more[:, None]
     mass[:, 0, -1] += loads
     place[:, 0, -1, 0] = centre
@@ -168,8 +170,10 @@ def beam_rows(rings: Mapping[str, Sequence[Ring]], beam: Mapping[str, Any]) -> l
     """The table of a beam's rests and swings: what was measured, then what was simulated."""
     columns = ["drop mm", "its ratio", "period s", "its ratio", "decrement"]
     rows = [["", *columns]]
-    own = [Ring(1e-3 * d, p, q) for d, p, q in zip(*(beam[k] for k in Ring._fields), strict=True)]
-    for name, each in {"measured": own, **rings}.items():
+    measured_rings = [
+        Ring(1e-3 * d, p, q) for d, p, q in zip(*(beam[k] for k in Ring._fields), strict=True)
+    ]
+    for name, each in {"measured": measured_rings, **rings}.items():
         cells = [name]
         for values, form in (
             ([1e3 * r.drop for r in each], "{:.1f}"),
@@ -222,8 +226,8 @@ def fitted_law(stress: Any, law: Any, strains: np.ndarray) -> tuple[float, np.nd
     """
     wanted = np.array([moment(stress, e) for e in strains])
     grid = np.linspace(0.01, 4, 600)
-    own = np.array([moment(law, e) for e in strains])
-    modulus = float(np.exp(np.log(wanted / own).mean()))
+    moments = np.array([moment(law, e) for e in strains])
+    modulus = float(np.exp(np.log(wanted / moments).mean()))
     bent = np.interp(wanted, modulus * np.array([moment(law, e) for e in grid]), grid)
     return modulus, bent / strains - 1
 
@@ -239,7 +243,7 @@ def tension() -> dict[str, Any]:
     table = np.array([r.split(",") for r in text[1:]], float)
     stretch = np.linspace(1.0, 3.0, 2001)[1:]
     first = stretch**2 + 2 / stretch
-    found = {}
+    stresses = {}
     for k, name in enumerate(names):
         pulled = np.interp(stretch - 1, [0, *table[:, 0]], [0, *table[:, k + 1]])
         slope = pulled / (stretch - stretch**-2)
@@ -248,8 +252,8 @@ def tension() -> dict[str, Any]:
             s = 1 + strain
             return np.interp(s**2 + 1 + s**-2, first, slope) * (s - s**-3)
 
-        found[name] = stress
-    return found
+        stresses[name] = stress
+    return stresses
 
 
 def plane_strain() -> Any:
@@ -369,9 +373,9 @@ def main() -> int:
     try:
         changes = keypaths.parse(args.changes)
         for step in STEPS:
-            own = beam_scene(beam, step, changes)
-            time, drops = curve = released(beam, own)
-            name = f"{1e3 * own.discretization.timestep:g} ms"
+            bare = beam_scene(beam, step, changes)
+            time, drops = curve = released(beam, bare)
+            name = f"{1e3 * bare.discretization.timestep:g} ms"
             curves[name] = curve
             rings[name] = [Ring.of(time, d) for d in drops]
     except InputError as error:

@@ -123,9 +123,9 @@ def _inner(schema: type, field: dataclasses.Field) -> type | None:
 
 def _tables(schema: type, path: str) -> list[str]:
     """The table of a schema's own values, then those of the tables in it."""
-    own = [f for f in _fields(schema) if _inner(schema, f) is None]
+    values = [f for f in _fields(schema) if _inner(schema, f) is None]
     meanings = _meanings(schema)
-    rows = [(f"`{f.name}`", *_limits(schema, f), meanings[f.name]) for f in own]
+    rows = [(f"`{f.name}`", *_limits(schema, f), meanings[f.name]) for f in values]
     parts = [_table(("key", "unit", "range", "default", "meaning"), rows)]
     for field in _fields(schema):
         inner = _inner(schema, field)
@@ -145,15 +145,15 @@ def _meanings(schema: type) -> dict[str, str]:
 
 def attributes(described: Any) -> dict[str, str]:
     """Meanings of a class' attributes by name, from its docstring."""
-    found = docstring_parser.parse(described.__doc__, docstring_parser.DocstringStyle.GOOGLE)
-    named = (p for p in found.params if p.args[0] == "attribute")
+    docstring = docstring_parser.parse(described.__doc__, docstring_parser.DocstringStyle.GOOGLE)
+    named = (p for p in docstring.params if p.args[0] == "attribute")
     return {p.arg_name: " ".join((p.description or "").split()) for p in named}
 
 
 def _text(described: Any) -> str:
     """What a docstring says before its sections, a line for each paragraph."""
-    found = docstring_parser.parse(described.__doc__, docstring_parser.DocstringStyle.GOOGLE)
-    paragraphs = (found.description or "").split("\n\n")
+    docstring = docstring_parser.parse(described.__doc__, docstring_parser.DocstringStyle.GOOGLE)
+    paragraphs = (docstring.description or "").split("\n\n")
     return "\n\n".join(" ".join(p.split()) for p in paragraphs)
 
 

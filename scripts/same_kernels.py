@@ -51,17 +51,17 @@ def texts(values: dict[str, Any], backend: str) -> list[str]:
     )
     space = parameters.design_space(chosen.hand)
     trials = rollout.sample_trials(chosen, jax.random.key(0), WORLDS)
-    found: dict[str, str] = {}
+    texts_by_key: dict[str, str] = {}
 
     def record(call: Any, inputs: Any, outputs: Any, kernel: Any) -> list[Any]:
         avals = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in inputs]
         # Asked for with one block and then with all of them; the text is that of a block.
         key = repr((kernel, [(x.shape[1:], x.dtype) for x in avals]))
-        if key not in found:
+        if key not in texts_by_key:
             layout = launch.describe(inputs, outputs, kernel)
             jaxpr = launch.kernel_jaxpr(call, avals)
             cpus = backend == "cpu"
-            found[key] = (
+            texts_by_key[key] = (
                 cpu.block_code(jaxpr, layout) if cpus else thread.write(jaxpr, layout, "kernel")
             )
         unread = {*kernel.scratch, *kernel.onchip}
@@ -81,24 +81,24 @@ def texts(values: dict[str, Any], backend: str) -> list[str]:
     ):
         jax.clear_caches()  # what was traced for the other backend
         jax.eval_shape(function, jnp.asarray(space.default(), jnp.float32), trials)
-    return [*found.values()]
+    return [*texts_by_key.values()]
 
 
 def digests() -> dict[str, list[str]]:
     """SHA-256 of the texts, by scene and backend."""
-    found = {}
+    by_case = {}
     for name, values in SCENES.items():
         for backend in ("cpu", "gpu"):
             every = texts(values, backend)
-            found[f"{name}, {backend}"] = [hashlib.sha256(t.encode()).hexdigest() for t in every]
+            by_case[f"{name}, {backend}"] = [hashlib.sha256(t.encode()).hexdigest() for t in every]
             print(name, backend, [len(t) for t in every], file=sys.stderr, flush=True)
-    return found
+    return by_case
 
 
 def of(folder: Path) -> dict[str, list[str]]:
     """The digests of a checkout, by a process that imports the package from there."""
-    own = folder / "scripts" / Path(__file__).name
-    command = [sys.executable, str(own if own.exists() else Path(__file__)), "--print"]
+    script = folder / "scripts" / Path(__file__).name
+    command = [sys.executable, str(script if script.exists() else Path(__file__)), "--print"]
     environment = {**os.environ, "PYTHONPATH": str(folder), "JAX_PLATFORMS": "cpu"}
     done = subprocess.run(command, cwd=folder, env=environment, stdout=subprocess.PIPE, check=True)
     return json.loads(done.stdout)

@@ -88,16 +88,16 @@ def make_case(name: str, space: DesignSpace, preset: str, objects: int = 3) -> C
     kind, _, changes = name.partition(":")
     given = dict(pair.split("=") for pair in changes.split(",") if pair)
     sizes = {n: int(given.pop(n)) for n in ("particles", "trials") if n in given}
-    how = preset, "concurrent", "morphology", "structured", 0
-    usual = runs.make_settings(*how, optimizer=kind, objects=objects, **sizes)
+    choices = preset, "concurrent", "morphology", "structured", 0
+    usual = runs.make_settings(*choices, optimizer=kind, objects=objects, **sizes)
     made: Any = codesign.make_optimizer(kind, space)
     own_test = getattr(made, "finalists", None)
     tests = int(given.pop("tests", usual.test_trials if own_test else ROUNDS))
     finalists = min(own_test or CANDIDATES, usual.particles)
     if tests == 0 and not made.keeps_best:
         raise ValueError(f"{name}: tests=0 is for optimisers whose first particle is the best")
-    own = {n: _as(type(getattr(made, n)), v) for n, v in given.items()}
-    optimizer = dataclasses.replace(made, **own)
+    options = {n: _as(type(getattr(made, n)), v) for n, v in given.items()}
+    optimizer = dataclasses.replace(made, **options)
     return Case(name, optimizer, usual.particles, usual.trials, tests, finalists)
 
 
@@ -198,13 +198,13 @@ class Study:
 
     def row(self) -> dict[str, Any]:
         """Grasps of a seed at each mark, all counted, and the share that its design keeps."""
-        found = sorted(self.kept)
+        marks = sorted(self.kept)
         return {
             "optimizer": self.case.name,
             "particles": self.case.particles,
             "trials": self.case.trials,
-            "grasps": [int(self.before + e * self.case.worlds + self.tested) for e in found],
-            "kept": [np.round(self.kept[e], 4).tolist() for e in found],
+            "grasps": [int(self.before + e * self.case.worlds + self.tested) for e in marks],
+            "kept": [np.round(self.kept[e], 4).tolist() for e in marks],
         }
 
     def _start(self) -> OptimizerState:
@@ -253,7 +253,7 @@ class Study:
         return jax.vmap(lambda key: codesign.stream_key(key, stream, index))(self.keys)
 
     def _costs(self, outcome: Outcome) -> jax.Array:
-        return jax.jit(lambda found: particle_cost(self.scene, found))(outcome)
+        return jax.jit(lambda outcomes: particle_cost(self.scene, outcomes))(outcome)
 
     def _all(
         self, populations: jax.Array, keys: jax.Array, count: int, scene: Scene | None = None
@@ -267,12 +267,12 @@ class Study:
         designs = np.asarray(populations)
 
         def run(rows: np.ndarray) -> Outcome:
-            own = jax.tree.map(lambda v: v[seed[rows], trial[rows]], trials)
-            return self.simulate(designs[seed[rows], particle[rows]], own, scene)
+            drawn = jax.tree.map(lambda v: v[seed[rows], trial[rows]], trials)
+            return self.simulate(designs[seed[rows], particle[rows]], drawn, scene)
 
         parts = in_chunks(run, len(seed), self.batch)
-        found = jax.tree.map(lambda *v: np.concatenate(v), *parts)
-        return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]), found)
+        outcomes = jax.tree.map(lambda *v: np.concatenate(v), *parts)
+        return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]), outcomes)
 
     def _simulate(self, designs: jax.Array, trials: Trial, scene: Scene) -> Outcome:
         hands = jax.vmap(self.space.params)(designs)
@@ -317,10 +317,10 @@ def table(rows: list[dict[str, Any]]) -> str:
     head = "optimiser|preset|hand|objects|seeds|grasps of a seed|median kept|"
     head += "5 % of the seeds below|"
     head += "share of seeds that keep 95 % (95 % interval)|commit"
-    found = [head.split("|")]
+    table_rows = [head.split("|")]
     for row in sorted((r for r in rows if not variant(r["optimizer"])), key=order):
         kept = np.array(row["kept"][-1])
-        found.append(
+        table_rows.append(
             [
                 f"`{row['optimizer']}`",
                 row["preset"],
@@ -334,26 +334,26 @@ def table(rows: list[dict[str, Any]]) -> str:
                 row["provenance"]["commit"][:7],
             ]
         )
-    return output.markdown(found)
+    return output.markdown(table_rows)
 
 
 def variants_table(rows: list[dict[str, Any]]) -> str:
     """What one other constant of the default search is worth on the same seeds, at each mark."""
-    found = []
+    table_rows = []
     for row in sorted(rows, key=lambda row: (row["optimizer"] != optimize.DEFAULT, order(row))):
         head = ["search"]
         cells = [f"`{row['optimizer']}`"]
         for grasps, kept in zip(row["grasps"], np.array(row["kept"]), strict=True):
             head += [f"after {grasps:,} grasps: seeds that keep 95 %", "5 % below", "mean kept"]
             cells += [share_of(kept), f"{np.quantile(kept, 0.05):.3f}", f"{kept.mean():.3f}"]
-        found = found or [[*head, "commit"]]
-        found.append([*cells, row["provenance"]["commit"][:7]])
-    return output.markdown(found)
+        table_rows = table_rows or [[*head, "commit"]]
+        table_rows.append([*cells, row["provenance"]["commit"][:7]])
+    return output.markdown(table_rows)
 
 
 def masses_table(rows: list[dict[str, Any]]) -> str:
     """What recommended designs keep where every object has one of these masses."""
-    found = []
+    table_rows = []
     for row in sorted((r for r in rows if "masses" in r), key=order):
         head = ["preset", "hand", "searched with"]
         objects = row.get("objects") or "objects as they are"
@@ -362,9 +362,9 @@ def masses_table(rows: list[dict[str, Any]]) -> str:
         for mass, kept in row["masses"].items():
             head += [f"{1e3 * float(mass):g} g: kept on average", "seeds that keep 95 %"]
             cells += [f"{np.mean(kept):.3f}", share_of(np.array(kept))]
-        found = found or [[*head, "commit"]]
-        found.append([*cells, row["provenance"]["commit"][:7]])
-    return output.markdown(found)
+        table_rows = table_rows or [[*head, "commit"]]
+        table_rows.append([*cells, row["provenance"]["commit"][:7]])
+    return output.markdown(table_rows)
 
 
 def share_of(kept: np.ndarray) -> str:
@@ -392,8 +392,8 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--objects", help="object set instead of the scene's")
     parser.add_argument("--robust", action="store_true", help="as of codesign optimize")
     parser.add_argument("--constants", help="as of codesign optimize")
-    own: dict[str, Any] = {"dest": "overrides", "nargs": "+", "action": "append", "default": []}
-    parser.add_argument("--set", **own, help="KEY=VALUE, as of codesign optimize")
+    flag: dict[str, Any] = {"dest": "overrides", "nargs": "+", "action": "append", "default": []}
+    parser.add_argument("--set", **flag, help="KEY=VALUE, as of codesign optimize")
     text = "judge the last designs once more with all objects at each of these masses [kg]"
     parser.add_argument("--masses", nargs="+", default=[], help=text)
     parser.add_argument("--designs", type=Path, help="judge those of an .npz at --masses alone")
@@ -427,9 +427,9 @@ def search(args: argparse.Namespace, name: str) -> None:
     stem = re.sub("[:,]", "-", "-".join(dict.fromkeys(words))).replace("=", "")
     if len(stem) > LONGEST_STEM:
         stem = f"{stem[:LONGEST_STEM]}-{zlib.crc32(stem.encode()):08x}"
-    how = {n: getattr(args, n) for n in ("seeds", "budget", "tests", "marks", "at")}
-    how["chunk"] = 512 if jax.default_backend() == "cpu" else 16_384
-    study = Study(case, scene, engine, space, **how, path=args.out / f"{stem}.npz")
+    arguments = {n: getattr(args, n) for n in ("seeds", "budget", "tests", "marks", "at")}
+    arguments["chunk"] = 512 if jax.default_backend() == "cpu" else 16_384
+    study = Study(case, scene, engine, space, **arguments, path=args.out / f"{stem}.npz")
     row = {"preset": args.preset, "scene": args.scene, "hand": args.hand, "objects": args.objects}
     row["changes"] = changed
     row |= {"tests": args.tests, "optimizer": name}
@@ -443,8 +443,8 @@ def search(args: argparse.Namespace, name: str) -> None:
     if args.designs is None:
         row |= study.row()
     if args.masses:
-        found = work.winners(args.designs or study.path)[: args.seeds]
-        row["masses"] = {m: study.judge(found, at_mass(args, m)).tolist() for m in args.masses}
+        designs = work.winners(args.designs or study.path)[: args.seeds]
+        row["masses"] = {m: study.judge(designs, at_mass(args, m)).tolist() for m in args.masses}
     row["seconds"] = round(time.monotonic() - start)
     row["provenance"] = provenance.results(args.commit)
     output.write_json(args.out / f"{stem}{'-masses' * bool(args.designs)}.json", row)
@@ -459,8 +459,8 @@ def at_mass(args: argparse.Namespace, mass: str) -> Scene:
     Objects are the scene's own, also for designs that were found with others.
     """
     plain = scenes.load(args.scene, hand_name=args.hand)
-    own = {("objects", "object", s.name, "mass"): float(mass) for s in plain.objects.object}
-    return scenes.load(args.scene, hand_name=args.hand, overrides=own)
+    masses = {("objects", "object", s.name, "mass"): float(mass) for s in plain.objects.object}
+    return scenes.load(args.scene, hand_name=args.hand, overrides=masses)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -68,13 +68,13 @@ def main() -> int:
     parser.add_argument("--pages", action="store_true", help="fill the table into the page")
     args = parser.parse_args()
     table = draws.read(args.constants)
-    own = {"drawn": ["--constants", args.constants], "middle": ["--set", *middle(table)]}
+    arms = {"drawn": ["--constants", args.constants], "middle": ["--set", *middle(table)]}
     sizes = [word if word.isdecimal() else f"--{word}" for word in args.sizes]
     shares = {}
     for words, arm in ARMS.items():
         folder = args.out / arm
         line = ["optimize", "--preset", args.preset, "--seeds", f"0-{args.pairs - 1}"]
-        line += ["--reference-trials", "0", "--out", str(folder), *own[arm], *sizes]
+        line += ["--reference-trials", "0", "--out", str(folder), *arms[arm], *sizes]
         if code := cli.main(line):
             return code
         runs = sorted(p for p in folder.iterdir() if p.is_dir())
@@ -91,14 +91,14 @@ def main() -> int:
 
 def judged(run: Path, args: argparse.Namespace) -> tuple[float, float]:
     """Share of grasps that a run's design keeps with drawn constants, and in the middle of them."""
-    found = []
+    shares = []
     words = tuple(middle(draws.read(args.constants)))
     drawing = flags.TrialFlags(constants=args.constants)
     for given in (drawing, flags.TrialFlags(constants="none", overrides=(words,))):
         case = cases.case_of_run(run, overrides=common.changes(given))
         outcome = case.simulate(args.grasps, jax.random.key(STREAM))
-        found.append(float(verdict.kept(outcome).mean()))
-    return found[0], found[1]
+        shares.append(float(verdict.kept(outcome).mean()))
+    return shares[0], shares[1]
 
 
 def compared(shares: dict[str, list[tuple[float, float]]]) -> tuple[list[list[str]], np.ndarray]:
@@ -109,8 +109,8 @@ def compared(shares: dict[str, list[tuple[float, float]]]) -> tuple[list[list[st
         rows.append([words, f"{drawn.mean():.1f}", f"{drawn.min():.0f}", f"{at_middle.mean():.1f}"])
     first, second = (np.array(pairs)[:, 0] for pairs in shares.values())
     difference = 100 * (first - second)
-    found = statistics.bootstrap(lambda rows: difference[rows].mean(-1), len(difference))
-    text = f"{difference.mean():+.1f} ({found.low:+.1f} to {found.high:+.1f})"
+    interval = statistics.bootstrap(lambda rows: difference[rows].mean(-1), len(difference))
+    text = f"{difference.mean():+.1f} ({interval.low:+.1f} to {interval.high:+.1f})"
     rows.append([f"difference, {len(difference)} pairs", text, "", ""])
     return rows, difference
 

@@ -36,12 +36,12 @@ def main() -> int:
     args = parser.parse_args()
     use_compilation_cache()
     if args.report:
-        found = report.Budget(json.loads(args.merge.read_text()))
-        for mark, text in found.tables().items():
+        results = report.Budget(json.loads(args.merge.read_text()))
+        for mark, text in results.tables().items():
             print(f"{text}\n")
             output.fill(args.docs / "accuracy.md", text, mark)
-        print(report.draw_budget(found, args.docs / "figures" / "budget.png"))
-        print(report.draw_against_time(found, args.docs / "figures" / "accuracy_time.png"))
+        print(report.draw_budget(results, args.docs / "figures" / "budget.png"))
+        print(report.draw_against_time(results, args.docs / "figures" / "accuracy_time.png"))
         return 0
     if args.merge:
         output.write_json(args.merge, budget.merged(args.out), indent=None)

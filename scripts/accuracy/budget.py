@@ -178,8 +178,8 @@ class Study:
             the_scene = calibrated(the_scene, count, len(self.designs))
 
         @jax.jit
-        def run(designs: jax.Array, trials: Trial, own: Scene) -> Any:
-            return rollout.simulate(own, engine, jax.vmap(space.params)(designs), trials)[0]
+        def run(designs: jax.Array, trials: Trial, numbers: Scene) -> Any:
+            return rollout.simulate(numbers, engine, jax.vmap(space.params)(designs), trials)[0]
 
         arguments = jnp.asarray(designs, jnp.float32), trials, the_scene
         start = time.perf_counter()
@@ -234,35 +234,35 @@ def simulate(study: Study, names: list[str], folder: Path, commit: str | None) -
     """Simulates the variants that have no file yet."""
     for name in [n for n in names if not path_of(folder, n).exists()]:
         try:
-            found = study.run(name, commit)
+            record = study.run(name, commit)
         except InputError as error:  # an effect that the surface does not have: a result as well
-            found = {"variant": dataclasses.asdict(VARIANTS[name]), "refused": str(error)}
-        output.write_json(path_of(folder, name), {"name": name, **found})
-        print(f"{name}: {found.get('seconds', found.get('refused'))} s", flush=True)
+            record = {"variant": dataclasses.asdict(VARIANTS[name]), "refused": str(error)}
+        output.write_json(path_of(folder, name), {"name": name, **record})
+        print(f"{name}: {record.get('seconds', record.get('refused'))} s", flush=True)
         jax.clear_caches()
 
 
 def measure(study: Study, names: list[str], folder: Path, commit: str | None) -> None:
     """Measures rates, one variant after another; a kind of device has a file of its own."""
     path = folder / f"times_{jax.devices()[0].platform}.json"
-    found = json.loads(path.read_text()) if path.exists() else {"rates": {}}
-    for name in [n for n in names if n not in found["rates"]]:
-        found["rates"][name] = study.rate(name)
-        found["made"] = provenance.measurement(commit)
-        output.write_json(path, found)
-        print(f"{name}: {found['rates'][name]['grasps_per_s']:.0f} grasps/s", flush=True)
+    measured = json.loads(path.read_text()) if path.exists() else {"rates": {}}
+    for name in [n for n in names if n not in measured["rates"]]:
+        measured["rates"][name] = study.rate(name)
+        measured["made"] = provenance.measurement(commit)
+        output.write_json(path, measured)
+        print(f"{name}: {measured['rates'][name]['grasps_per_s']:.0f} grasps/s", flush=True)
 
 
 def merged(folder: Path) -> dict[str, Any]:
     every = {name: path_of(folder, name) for name in VARIANTS}
     times = {p.stem.split("_")[1]: json.loads(p.read_text()) for p in folder.glob("times_*.json")}
-    found: dict[str, Any] = {
+    content: dict[str, Any] = {
         "variants": {n: json.loads(p.read_text()) for n, p in every.items() if p.exists()},
         "rates": times,
     }
     if (path := folder / "tips.json").exists():
-        found["tips"] = json.loads(path.read_text())
-    return found
+        content["tips"] = json.loads(path.read_text())
+    return content
 
 
 # --- finger tips in the air -----------------------------------------------------------------------
@@ -319,14 +319,14 @@ def motion(
         # The object on the table is the only contact: without it there is nothing to solve.
         compiled.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         data = mujoco.MjData(compiled)
-        found = []
+        positions = []
         data.qpos[:] = fields.start[world]
         for k in range(ctrl.shape[1]):
             if k % stride == 0:
-                found.append(tips(the_scene, compiled, data.qpos))
+                positions.append(tips(the_scene, compiled, data.qpos))
             data.ctrl[:] = ctrl[world, k]
             mujoco.mj_step(compiled, data)
-        return np.array(found)
+        return np.array(positions)
 
     return np.array(_each(of_world, hands))
 
@@ -348,17 +348,17 @@ def tips(the_scene: Scene, compiled: mujoco.MjModel, qpos: np.ndarray) -> np.nda
     return data.xpos[last] + data.xmat[last].reshape(-1, 3, 3)[:, :, 0] * along[:, None]
 
 
-def error(found: np.ndarray, exact: np.ndarray) -> float:
+def error(simulated: np.ndarray, exact: np.ndarray) -> float:
     """Root mean square distance of tips [mm]."""
-    return float(1e3 * np.sqrt((np.linalg.norm(found - exact, axis=-1) ** 2).mean()))
+    return float(1e3 * np.sqrt((np.linalg.norm(simulated - exact, axis=-1) ** 2).mean()))
 
 
 def measure_tips(folder: Path, commit: str | None) -> None:
     """Writes the error of every variant's step, links and damping to tips.json."""
     named = {}
     for name, variant in VARIANTS.items():
-        found = variant.scene().discretization
-        named[name] = (found.timestep, found.links, found.integrator)
+        settings = variant.scene().discretization
+        named[name] = (settings.timestep, settings.links, settings.integrator)
     exact = motion(REFERENCE, "mujoco")
     errors = {s: error(motion(s), exact) for s in dict.fromkeys(named.values())}
     content = {"tip_rms_mm": {n: errors[s] for n, s in named.items()}}

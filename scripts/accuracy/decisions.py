@@ -27,10 +27,10 @@ def flips(row: dict[str, Any], trials: int) -> tuple[float, float, float]:
     return wilson(row["gained"] + row["lost"], trials)
 
 
-def draw(found: dict[str, Any], path: Path) -> Path:
+def draw(content: dict[str, Any], path: Path) -> Path:
     """A bar for each variant, shortest first, with the rank correlation of the designs' shares."""
-    trials = found["designs"] * found["trials"]
-    rows = sorted(found["variants"], key=lambda row: -row["gained"] - row["lost"])
+    trials = content["designs"] * content["trials"]
+    rows = sorted(content["variants"], key=lambda row: -row["gained"] - row["lost"])
     figure = output.new_figure(9, 4.6)
     axis = figure.subplots()
     for y, row in enumerate(rows):
@@ -42,7 +42,7 @@ def draw(found: dict[str, Any], path: Path) -> Path:
         axis.text(high + 0.4, y, text, va="center", fontsize=8)
     axis.set_yticks(range(len(rows)), [row["variant"].replace("`", "") for row in rows], fontsize=8)
     axis.set_xlim(0, 32)
-    axis.set_xlabel(f"verdicts that change [%], {found['designs']} designs that keep 30 to 95 %")
+    axis.set_xlabel(f"verdicts that change [%], {content['designs']} designs that keep 30 to 95 %")
     for words, color in KINDS.values():
         axis.bar(0, 0, color=color, label=words)
     axis.legend(frameon=False, fontsize=8, loc="upper right")

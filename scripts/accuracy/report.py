@@ -97,20 +97,20 @@ def compare(a: np.ndarray, b: np.ndarray) -> dict[str, Interval]:
         rank = float(spearman(mean_costs(a), mean_costs(b)))
         return [kept.mean() - expected.mean(), (kept != expected).mean(), rank]
 
-    found = two_way(values, a[:, :trials], b[:, :trials], resamples=RESAMPLES)
-    return dict(zip(("success_difference", "flipped", "rank"), found, strict=True))
+    intervals = two_way(values, a[:, :trials], b[:, :trials], resamples=RESAMPLES)
+    return dict(zip(("success_difference", "flipped", "rank"), intervals, strict=True))
 
 
 class Budget:
     """Costs of all variants that a file has, and their comparisons."""
 
-    def __init__(self, found: dict[str, Any]):
+    def __init__(self, content: dict[str, Any]):
         """Decodes the file."""
         scene = load("paper")
-        records = {n: r for n, r in found["variants"].items() if "lost" in r}
+        records = {n: r for n, r in content["variants"].items() if "lost" in r}
         self.costs = {n: budget.costs(scene, r) for n, r in records.items()}
-        self.rates = {n: r["rates"] for n, r in found.get("rates", {}).items()}
-        self.tips: dict[str, float] = found.get("tips", {}).get("tip_rms_mm", {})
+        self.rates = {n: r["rates"] for n, r in content.get("rates", {}).items()}
+        self.tips: dict[str, float] = content.get("tips", {}).get("tip_rms_mm", {})
         self._compared: dict[tuple[str, str], dict[str, Interval]] = {}
 
     def compared(self, of: str, to: str) -> dict[str, Interval] | None:
@@ -138,10 +138,10 @@ class Budget:
 
     def tables(self) -> dict[str, str]:
         """Markdown by the name of its marks on docs/accuracy.md."""
-        found = {"budget": f"{output.markdown(budget_table(self))}\n\n{luck(self)}"}
+        texts = {"budget": f"{output.markdown(budget_table(self))}\n\n{luck(self)}"}
         if "truth" in self.costs:
-            found["against-truth"] = output.markdown(presets_table(self))
-        return found
+            texts["against-truth"] = output.markdown(presets_table(self))
+        return texts
 
 
 def interval(value: Interval, form: str = ".1%") -> str:
@@ -155,27 +155,27 @@ def points(value: Interval) -> str:
     return f"{middle:+.1f} [{low:+.1f}, {high:+.1f}]"
 
 
-def presets_table(found: Budget) -> list[list[str]]:
+def presets_table(results: Budget) -> list[list[str]]:
     head = ["setting", "success, points from the truth", "verdicts that flip", "rank correlation"]
     head += ["flips by a micrometre", "finger tip in the air"]
     rows = [[*head, *(f"grasps/s, {m}" for m in RATED.values())]]
-    rows += [found.row(name, f"`{name}`") for name in PRESETS]
-    rows += [found.row(n, words) for n, words in CANDIDATES.items() if n in found.costs]
-    return rows if found.rates else [row[: -len(RATED)] for row in rows]
+    rows += [results.row(name, f"`{name}`") for name in PRESETS]
+    rows += [results.row(n, words) for n, words in CANDIDATES.items() if n in results.costs]
+    return rows if results.rates else [row[: -len(RATED)] for row in rows]
 
 
-def budget_table(found: Budget) -> list[list[str]]:
+def budget_table(results: Budget) -> list[list[str]]:
     rows = [["change", "verdicts that flip", "success, points", "rank correlation", "of"]]
     for change in CHANGES:
-        if beside := found.compared(change.to, change.of):
+        if beside := results.compared(change.to, change.of):
             cells = interval(beside["flipped"]), points(beside["success_difference"])
             rows.append([change.words, *cells, f"{beside['rank'].value:.2f}", change.kind])
     return rows
 
 
-def luck(found: Budget) -> str:
+def luck(results: Budget) -> str:
     """What six trials tell of a design: a sentence."""
-    cost = found.costs["truth" if "truth" in found.costs else "standard"]
+    cost = results.costs["truth" if "truth" in results.costs else "standard"]
     kept = (cost < SUCCESS_COST).astype(float)
     six = np.sqrt((kept.mean(1) * (1 - kept.mean(1))).mean() / 6)
     blocks = [mean_costs(cost[:, i : i + 6]) for i in range(0, cost.shape[1] - 5, 6)]
@@ -187,9 +187,9 @@ def luck(found: Budget) -> str:
     )
 
 
-def draw_budget(found: Budget, path: Path) -> Path:
+def draw_budget(results: Budget, path: Path) -> Path:
     """The budget as bars with their intervals, by kind."""
-    shown = [(c, r) for c in CHANGES if (r := found.compared(c.to, c.of))]
+    shown = [(c, r) for c in CHANGES if (r := results.compared(c.to, c.of))]
     figure = output.new_figure(7.5, 0.28 * len(shown) + 1.0)
     axes = figure.subplots()
     for place, (change, result) in enumerate(shown):
@@ -246,7 +246,7 @@ class Place(NamedTuple):
     error: Interval
 
 
-def marks(found: Budget) -> tuple[list[Place], list[Place]]:
+def marks(results: Budget) -> tuple[list[Place], list[Place]]:
     """Marks of verdicts and of finger tips, one for each machine whose rate is known.
 
     In the air engines solve the same equations, so that MuJoCo C has this engine's error there.
@@ -255,22 +255,22 @@ def marks(found: Budget) -> tuple[list[Place], list[Place]]:
     def places(errors: dict[str, Interval]) -> list[Place]:
         every = []
         for (name, error), (machine, rates) in (
-            (e, r) for e in errors.items() for r in found.rates.items()
+            (e, r) for e in errors.items() for r in results.rates.items()
         ):
             if rate := rates.get(name):
                 who = f"{C if C in name else 'this engine'}, {RATED[machine]}"
                 every.append(Place(who, WORDS[name], rate["grasps_per_s"], error))
         return every
 
-    beside = {name: found.compared(name, "truth") for name in WORDS}
+    beside = {name: results.compared(name, "truth") for name in WORDS}
     flipped = {name: c["flipped"] for name, c in beside.items() if c}
-    tips = {n: Interval(*[found.tips[n]] * 3) for n in IN_THE_AIR if n in found.tips}
+    tips = {n: Interval(*[results.tips[n]] * 3) for n in IN_THE_AIR if n in results.tips}
     return places(flipped), places(tips)
 
 
-def draw_against_time(found: Budget, path: Path) -> Path:
+def draw_against_time(results: Budget, path: Path) -> Path:
     """Errors of verdicts and of finger tips against grasps a second, side by side."""
-    left, right = marks(found)
+    left, right = marks(results)
     figure = output.new_figure(12.5, 5.8)
     verdict, tip = figure.subplots(1, 2)
     words = "grasps a second: whole grasps of designs that hold"
@@ -294,7 +294,7 @@ def draw_against_time(found: Budget, path: Path) -> Path:
         axis.set_xlim(axis.get_xlim()[0] / 2)  # room for the name of a mark at the edge
         axis.xaxis.set_major_formatter(ticker.ScalarFormatter())
         axis.xaxis.set_minor_formatter(ticker.NullFormatter())
-    moved = found.compared("truth, moved", "truth")
+    moved = results.compared("truth, moved", "truth")
     if moved and (floor := 100 * moved["flipped"].value):
         verdict.axhline(floor, color="0.4", ls=":", lw=1)
         verdict.text(

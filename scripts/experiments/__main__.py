@@ -70,27 +70,27 @@ Found = tuple[int, simulate.Arrays | None, int]
 def _strategies(args: argparse.Namespace, the_plan: simulate.Strategies, the_scene: Scene) -> Found:
     folder = args.out / args.experiment
     plans = simulate.plans(the_plan, the_scene, args.engine, folder, args.seed)
-    how = {"fresh": args.fresh, "devices": args.devices, "chunk": args.chunk}
-    done = runs.optimize(plans, sys.argv, **how)
+    arguments = {"fresh": args.fresh, "devices": args.devices, "chunk": args.chunk}
+    done = runs.optimize(plans, sys.argv, **arguments)
     problems = {place: r for place, r in done.runs.items() if isinstance(r, Exception)}
     for place, error in problems.items():
         print(f"error: {place}: {error}", file=sys.stderr)
     code = int(bool(problems)) or (128 + done.signum if done.signum else 0)
-    found = simulate.gather(the_plan, folder, args.seed)
-    if found is None or not found["cost"].shape[2]:
+    gathered = simulate.gather(the_plan, folder, args.seed)
+    if gathered is None or not gathered["cost"].shape[2]:
         return code, None, 0
     space = parameters.design_space(the_scene.hand, the_plan.preset)
-    tested = the_plan.worlds * the_plan.rounds if "test_status" in found else 0
-    kept = simulate.of_strategies(the_plan, the_scene, space, found)
-    return code, kept, found["status"].size + tested
+    tested = the_plan.worlds * the_plan.rounds if "test_status" in gathered else 0
+    kept = simulate.of_strategies(the_plan, the_scene, space, gathered)
+    return code, kept, gathered["status"].size + tested
 
 
 def _landscape(args: argparse.Namespace, the_plan: simulate.Landscape, the_scene: Scene) -> Found:
-    how = {"seed": args.seed, "chunk": args.chunk, "devices": args.devices}
-    how["console"] = Console(highlight=False, soft_wrap=True)
-    found = simulate.landscape(the_plan, the_scene, args.engine, **how)
+    arguments = {"seed": args.seed, "chunk": args.chunk, "devices": args.devices}
+    arguments["console"] = Console(highlight=False, soft_wrap=True)
+    simulated = simulate.landscape(the_plan, the_scene, args.engine, **arguments)
     space = parameters.design_space(the_scene.hand, the_plan.preset)
-    return 0, simulate.of_landscape(the_scene, space, found), the_plan.grasps
+    return 0, simulate.of_landscape(the_scene, space, simulated), the_plan.grasps
 
 
 def main() -> int:

@@ -43,12 +43,12 @@ def winners(data: Path, name: str) -> tuple[list[str], np.ndarray]:
     Returns:
       Names of the strategies, and particles [SI units] of shape (strategy, run, parameter).
     """
-    found = report.load_study(data, name)
-    if found is None or not found.tested:
+    study = report.load_study(data, name)
+    if study is None or not study.tested:
         raise FileNotFoundError(f"{data} holds no {name} with a final test")
-    best = np.argmin(found.data["test_exclude"], axis=-1)
-    chosen = np.take_along_axis(found.data["final_particles"], best[..., None, None], axis=2)
-    return found.strategies, chosen[:, :, 0]
+    best = np.argmin(study.data["test_exclude"], axis=-1)
+    chosen = np.take_along_axis(study.data["final_particles"], best[..., None, None], axis=2)
+    return study.strategies, chosen[:, :, 0]
 
 
 def simulate(
@@ -68,16 +68,18 @@ def simulate(
     drawn = rollout.sample_trials(the_scene, stream_key(jax.random.key(0), STREAM_FRESH, 0), trials)
     made = make_engine(engine, the_scene)
     outcome = jax.jit(lambda p, t: rollout.evaluate(the_scene, made, p, t))(joined, drawn)
-    found = {}
+    arrays = {}
     start = 0
     for name, particles in every.items():
         shape = particles.shape[:2]
         count = int(np.prod(particles.shape[:2]))
         part = slice(start, start + count)
-        found[f"{name}|cost"] = np.asarray(outcome.cost[part], np.float16).reshape(*shape, trials)
-        found[f"{name}|status"] = np.asarray(outcome.status[part], np.uint8).reshape(*shape, trials)
+        arrays[f"{name}|cost"] = np.asarray(outcome.cost[part], np.float16).reshape(*shape, trials)
+        arrays[f"{name}|status"] = np.asarray(outcome.status[part], np.uint8).reshape(
+            *shape, trials
+        )
         start += count
-    return found
+    return arrays
 
 
 def run(args: argparse.Namespace) -> None:
@@ -87,17 +89,17 @@ def run(args: argparse.Namespace) -> None:
     notes: dict[str, Any] = {"runs": []}
     if path.exists():
         notes = json.loads(path.with_suffix(".json").read_text())
-    found = {name: winners(args.data, name) for name in args.experiments}
-    arrays |= {f"{name}|strategies": np.array(names) for name, (names, _) in found.items()}
-    every = {name: particles for name, (_, particles) in found.items()}
+    chosen = {name: winners(args.data, name) for name in args.experiments}
+    arrays |= {f"{name}|strategies": np.array(names) for name, (names, _) in chosen.items()}
+    every = {name: particles for name, (_, particles) in chosen.items()}
     for accuracy in args.accuracies:
         label = accuracy if args.engine == "structured" else f"{args.engine}, {accuracy}"
         label += f", {args.label}" if args.label else ""
         if all(f"{name}|{label}|cost" in arrays for name in every):
             continue
         overrides = keypaths.parse(args.set)
-        how = {"accuracy": accuracy, "object_set": args.objects, "overrides": overrides}
-        the_scene = scene.load(args.scene, **how)
+        arguments = {"accuracy": accuracy, "object_set": args.objects, "overrides": overrides}
+        the_scene = scene.load(args.scene, **arguments)
         new = simulate(the_scene, args.engine, every, args.trials)
         for key, value in new.items():
             name, what = key.split("|")
@@ -109,10 +111,10 @@ def run(args: argparse.Namespace) -> None:
 
 def summary(data: Path) -> str:
     """The tables of what was simulated, one an experiment."""
-    found = report.load(data, "fresh")
-    if found is None:
+    loaded = report.load(data, "fresh")
+    if loaded is None:
         raise FileNotFoundError(f"{data} holds no fresh.npz")
-    arrays = found[0]
+    arrays = loaded[0]
     text = []
     for name in EXPERIMENTS:
         labels = [k.split("|")[1] for k in arrays if k.startswith(f"{name}|") and "cost" in k]

@@ -88,10 +88,10 @@ def load(folder: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]
 
 def load_study(folder: Path, name: str) -> Study | None:
     """Reads an experiment on strategies; None where its files are missing."""
-    found = load(folder, name)
-    if found is None:
+    loaded = load(folder, name)
+    if loaded is None:
         return None
-    data, notes = found
+    data, notes = loaded
     return Study(notes["settings"]["plan"], notes, data)
 
 
@@ -122,15 +122,15 @@ def regions(
     cost = data[rule]
     labels, count = ndimage.label(cost < threshold)  # type: ignore[misc]
     axes = np.meshgrid(data["first_axis"], data["second_axis"], indexing="ij")
-    found = []
+    parts = []
     for label in range(1, count + 1):
         points = labels == label
         where = np.stack([a[points] for a in axes])
         mean = float(cost[points].mean())
-        found.append(
+        parts.append(
             Region(float(points.mean()), where.mean(1), where.min(1), where.max(1), mean, points)
         )
-    return sorted((r for r in found if r.share >= smallest), key=lambda r: -r.share)
+    return sorted((r for r in parts if r.share >= smallest), key=lambda r: -r.share)
 
 
 # --- figures --------------------------------------------------------------------------------------
@@ -400,8 +400,8 @@ def mean(simulations: np.ndarray) -> Interval:
     """Mean with its interval; without end where a run never converged."""
     if not np.isfinite(simulations).all():
         return Interval(np.inf, np.inf, np.inf)
-    found = statistics.bootstrap(lambda k: simulations[k].mean(-1), len(simulations))
-    return Interval(*(round(v) for v in found))
+    interval = statistics.bootstrap(lambda k: simulations[k].mean(-1), len(simulations))
+    return Interval(*(round(v) for v in interval))
 
 
 def _growth_row(two: Study, many: Study) -> tuple[str, str]:
@@ -436,13 +436,15 @@ def _grasps_row(studies: dict[str, Study | None], grid) -> tuple[str, str]:
 def _regions(grid) -> str:
     parts = []
     for threshold in _THRESHOLDS:
-        found = regions(grid[0], threshold)
-        shares = ", ".join(f"{100 * r.share:.1f} %" for r in found)
-        parts.append(f"cost < {threshold:g}: {len(found)}" + (f" ({shares})" if found else ""))
+        components = regions(grid[0], threshold)
+        shares = ", ".join(f"{100 * r.share:.1f} %" for r in components)
+        parts.append(
+            f"cost < {threshold:g}: {len(components)}" + (f" ({shares})" if components else "")
+        )
     units = grid[0]["units"]
     names = grid[0]["parameters"]
-    found = regions(grid[0], LANDSCAPE_THRESHOLD)
-    for letter, region in zip("abcdefgh", found, strict=False):
+    components = regions(grid[0], LANDSCAPE_THRESHOLD)
+    for letter, region in zip("abcdefgh", components, strict=False):
         ends = ", ".join(
             f"{names[i]} {region.low[i]:.0f} to {region.high[i]:.0f} {units[i]}" for i in (0, 1)
         )

@@ -137,14 +137,16 @@ def plans(
 ) -> dict[Path, runs.Plan]:
     """Every run by its folder."""
     sizes = {n: getattr(plan, n) for n in ("particles", "trials", "episodes", "test_trials")}
-    how = plan.preset, plan.strategies[0], plan.first()[0], engine
-    base = runs.prepare(scene, runs.make_settings(*how, seed, **sizes))
-    found = {}
+    arguments = plan.preset, plan.strategies[0], plan.first()[0], engine
+    base = runs.prepare(scene, runs.make_settings(*arguments, seed, **sizes))
+    plans_by_folder = {}
     for name, places in folders(plan, folder, seed).items():
         for r, (place, first) in enumerate(zip(places, plan.first(), strict=True)):
             changed = {"schedule": name, "first": first, "seed": seed + r}
-            found[place] = runs.variant(base, dataclasses.replace(base.settings, **changed))
-    return found
+            plans_by_folder[place] = runs.variant(
+                base, dataclasses.replace(base.settings, **changed)
+            )
+    return plans_by_folder
 
 
 def gather(plan: Strategies, folder: Path, seed: int) -> Arrays | None:
@@ -168,17 +170,17 @@ def gather(plan: Strategies, folder: Path, seed: int) -> Arrays | None:
     tested = all(record.test is not None for record in records)
     rows = [_one(record, done, tested) for record in records]
     shape = (len(every), plan.runs)
-    found = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-    found = {name: values.reshape(*shape, *values.shape[1:]) for name, values in found.items()}
+    arrays = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    arrays = {name: values.reshape(*shape, *values.shape[1:]) for name, values in arrays.items()}
     starts = [record.start for record in records[: plan.runs] if record.start is not None]
     names = {"design": "seeds", "cost": "seed_cost", "candidates": "seed_candidates"}
-    return found | {new: np.array([getattr(s, old) for s in starts]) for old, new in names.items()}
+    return arrays | {new: np.array([getattr(s, old) for s in starts]) for old, new in names.items()}
 
 
 def _one(record: Record, done: int, tested: bool) -> Arrays:
     history = record.history
     trials = record.history.outcomes
-    found = {
+    arrays = {
         "particles": np.asarray(record.state.particles),
         "cost": history.cost[:done],
         "trial_cost": trials.cost[:done],
@@ -188,11 +190,11 @@ def _one(record: Record, done: int, tested: bool) -> Arrays:
     if tested:
         assert record.test is not None
         test = {"cost": record.test.cost, "status": record.test.status}
-        found |= {
+        arrays |= {
             "test_cost": np.asarray(test["cost"]),
             "test_status": np.asarray(test["status"]).astype(np.uint8),
         }
-    return found
+    return arrays
 
 
 # --- the landscape --------------------------------------------------------------------------------
@@ -235,9 +237,9 @@ def landscape(
     with Meter(plan.name, plan.grasps, console) as meter:
         outcome = batch.evaluate(task, key, flat, size, meter.advance)
     shape = (plan.points, plan.points, plan.trials)
-    found = {"trial_cost": outcome.cost, "status": outcome.status.astype(np.uint8)}
-    found = {name: values.reshape(shape) for name, values in found.items()}
-    return {"designs": designs, **found}
+    arrays = {"trial_cost": outcome.cost, "status": outcome.status.astype(np.uint8)}
+    arrays = {name: values.reshape(shape) for name, values in arrays.items()}
+    return {"designs": designs, **arrays}
 
 
 # --- what is kept ---------------------------------------------------------------------------------
@@ -261,25 +263,27 @@ def failures(status: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
     return np.stack([((status & bit) != 0).sum(axes) for bit in BITS], -1).astype(np.int32)
 
 
-def of_strategies(plan: Strategies, scene: Scene, space: DesignSpace, found: Arrays) -> Arrays:
+def of_strategies(plan: Strategies, scene: Scene, space: DesignSpace, gathered: Arrays) -> Arrays:
     """What is kept of `gather`; docs/notes/results.md says what each array is."""
-    cost = found["cost"]
-    status = found["status"]
+    cost = gathered["cost"]
+    status = gathered["status"]
     quartiles = np.quantile(cost, [0.25, 0.5, 0.75], axis=-1).astype(np.float32)
-    means = both_means(scene, found["trial_cost"], status)
-    if "test_cost" in found:
-        test = both_means(scene, found["test_cost"], found["test_status"])
-        test_status = found["test_status"]
+    means = both_means(scene, gathered["trial_cost"], status)
+    if "test_cost" in gathered:
+        test = both_means(scene, gathered["test_cost"], gathered["test_status"])
+        test_status = gathered["test_status"]
     else:  # not a number: the final test is not complete
-        test = {rule: np.full(found["particles"].shape[:3], np.nan, np.float32) for rule in means}
-        test_status = np.zeros((*found["particles"].shape[:3], 1), np.uint8)
+        test = {
+            rule: np.full(gathered["particles"].shape[:3], np.nan, np.float32) for rule in means
+        }
+        test_status = np.zeros((*gathered["particles"].shape[:3], 1), np.uint8)
     return {
         "strategies": np.array(plan.strategies),
         "first": np.array(plan.first()),
         "parameters": np.array(space.names),
-        "seeds": found["seeds"],
-        "seed_cost": found["seed_cost"],
-        "seed_candidates": found["seed_candidates"],
+        "seeds": gathered["seeds"],
+        "seed_cost": gathered["seed_cost"],
+        "seed_candidates": gathered["seed_candidates"],
         "mean": cost.mean(-1),
         "best": cost.min(-1),
         "quartiles": np.moveaxis(quartiles, 0, -1),
@@ -288,19 +292,19 @@ def of_strategies(plan: Strategies, scene: Scene, space: DesignSpace, found: Arr
         "failed": failures(status, (3, 4)),
         # Enough for Fig. 6; half precision is finer than the costs' own steps matter in a plot.
         "particle_cost": cost[-1].astype(np.float16),
-        "final_particles": found["particles"],
+        "final_particles": gathered["particles"],
         "test_exclude": test["exclude"],
         "test_worst": test["worst"],
         "test_failed": failures(test_status, (3,)).astype(np.int16),
     }
 
 
-def of_landscape(scene: Scene, space: DesignSpace, found: Arrays) -> Arrays:
+def of_landscape(scene: Scene, space: DesignSpace, simulated: Arrays) -> Arrays:
     """What is kept of `landscape`."""
-    cost = found["trial_cost"]
-    status = found["status"]
+    cost = simulated["trial_cost"]
+    status = simulated["status"]
     means = both_means(scene, cost, status)
-    designs = space.in_units(found["designs"])
+    designs = space.in_units(simulated["designs"])
     return {
         "parameters": np.array(space.names),
         "units": np.array(space.units),

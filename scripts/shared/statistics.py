@@ -81,10 +81,10 @@ def two_way(
         index = np.ix_(rng.integers(0, rows, rows), rng.integers(0, columns, columns))
         drawn.append(statistics(*(t[index] for t in tables)))
     tail = (1 - _CONFIDENCE) / 2
-    found = np.array(drawn, float)
-    low, high = np.full((2, found.shape[1]), np.nan)
-    some = ~np.isnan(found).all(0)
-    low[some], high[some] = np.nanquantile(found[:, some], [tail, 1 - tail], axis=0)
+    resampled = np.array(drawn, float)
+    low, high = np.full((2, resampled.shape[1]), np.nan)
+    some = ~np.isnan(resampled).all(0)
+    low[some], high[some] = np.nanquantile(resampled[:, some], [tail, 1 - tail], axis=0)
     return [Interval(*map(float, v)) for v in zip(statistics(*tables), low, high, strict=True)]
 
 

@@ -543,7 +543,7 @@ def main() -> int:
     fix = "constants that every set has of the scene"
     parser.add_argument("--fix", nargs="+", default=[], choices=OPEN, metavar="NAME", help=fix)
     text = "how often the scene's own set comes behind them, each time in other trials"
-    parser.add_argument("--own", type=int, default=0, metavar="TIMES", help=text)
+    parser.add_argument("--own", dest="scene_sets", type=int, default=0, metavar="TIMES", help=text)
     parser.add_argument("--chunk", type=int, default=LIMIT, help="most worlds of a call")
     changed = "values of the scene, hand and objects by key path"
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help=changed)

@@ -34,11 +34,11 @@ def test_power_is_numpy_s():
     """To sixteen times rounding, by which the last four squarings multiply it."""
     base = np.geomspace(0.05, 20, 500)
     exponent = np.linspace(1, 1.7, 8)[:, None]
-    found = air.power(jnp.float32(base), jnp.float32(exponent))
-    np.testing.assert_allclose(found, base**exponent, rtol=4e-6)
+    powers = air.power(jnp.float32(base), jnp.float32(exponent))
+    np.testing.assert_allclose(powers, base**exponent, rtol=4e-6)
     with jax.enable_x64(True):
-        found = air.power(jnp.asarray(base), exponent)
-    np.testing.assert_allclose(found, base**exponent, rtol=1e-13)
+        powers = air.power(jnp.asarray(base), exponent)
+    np.testing.assert_allclose(powers, base**exponent, rtol=1e-13)
 
 
 def root(function):
@@ -86,8 +86,8 @@ class Finger:
 @pytest.mark.parametrize("neo_hookean", [False, True])
 def test_a_free_finger_has_the_wanted_pressure(neo_hookean):
     with jax.enable_x64(True):
-        how = {"effects__neo_hookean": neo_hookean, "pneumatics__exponent": 1.4}
-        the_scene = grasps.pinch("sphere", links=1, effects__air_mass=True, **how)
+        overrides = {"effects__neo_hookean": neo_hookean, "pneumatics__exponent": 1.4}
+        the_scene = grasps.pinch("sphere", links=1, effects__air_mass=True, **overrides)
         params, trial = grasps.hand_world(the_scene, wall=0.003, length=0.1)
         fields, ctrl = grasps.world_inputs(the_scene, params, trial)
         hand = grasps.lanes(the_scene, grasps.repeat(fields, 1))
@@ -119,8 +119,8 @@ def swung():
     In the first world it is heavy and damped, in the second one weightless, undamped and bent
     further than at rest.
     """
-    how = {"effects__air_mass": True, "discretization__timestep": 1e-3}
-    plain = grasps.pinch("sphere", links=1, **how, **grasps.off(BARE))
+    overrides = {"effects__air_mass": True, "discretization__timestep": 1e-3}
+    plain = grasps.pinch("sphere", links=1, **overrides, **grasps.off(BARE))
     with jax.enable_x64(True):
         params, trial = grasps.hand_world(plain, wall=0.003, length=0.1)
         worlds = []
@@ -142,8 +142,8 @@ def swung():
         def run(fields, ctrl):
             return engine.advance(world_constants(plain, fields), engine.reset(fields), ctrl)[0]
 
-        found = run(fields, np.repeat(held, 2, 0))
-    return plain, params, fields, *(np.asarray(found[n])[..., 6] for n in ("qpos", "qvel"))
+        outputs = run(fields, np.repeat(held, 2, 0))
+    return plain, params, fields, *(np.asarray(outputs[n])[..., 6] for n in ("qpos", "qvel"))
 
 
 def test_a_loaded_finger_rests_where_the_closed_form_does():
@@ -272,8 +272,8 @@ def numbers_of(*factors):
 
 
 def explicit(right, the_scene, parent, constants, joint):
-    carry, found = right(the_scene, parent, constants, joint)
-    return carry, found | {"armature_now": constants["armature"]}
+    carry, numbers = right(the_scene, parent, constants, joint)
+    return carry, numbers | {"armature_now": constants["armature"]}
 
 
 FAULTS = {
@@ -361,11 +361,11 @@ def simulated(name):
         with planted(faults):
             run = jax.jit(partial(simulate, the_scene))
             ctrl = np.repeat(ctrl[:, None], 2, 1)
-            found = run(fields_, (qpos, qvel), ctrl, np.arange(len(qpos)))
+            outputs = run(fields_, (qpos, qvel), ctrl, np.arange(len(qpos)))
     (fill if name == "air" else stiffen)(the_scene, model_, data, fields)
     mujoco.mj_forward(model_, data)
     assert data.ncon > 3
-    acc = (np.asarray(found["qvel"])[:, 1] - qvel) / the_scene.discretization.timestep
+    acc = (np.asarray(outputs["qvel"])[:, 1] - qvel) / the_scene.discretization.timestep
     return np.linalg.norm(acc - data.qacc, axis=1) / np.linalg.norm(data.qacc)
 
 

@@ -194,8 +194,8 @@ def test_texts_of_a_run_are_one_line_each_where_it_goes_on(run):
 def test_texts_of_results_are_one_line_each_and_no_html_on_a_sheet(tmp_path):
     kept = {"warnings": np.array([HOSTILE, "<script>"]), "empty": np.array([], str)}
     array_files.save(tmp_path / "x.npz", kept)
-    found = array_files.load(tmp_path / "x.npz")
-    assert found["warnings"].tolist() == [SHOWN, "<script>"] and found["empty"].shape == (0,)
+    loaded = array_files.load(tmp_path / "x.npz")
+    assert loaded["warnings"].tolist() == [SHOWN, "<script>"] and loaded["empty"].shape == (0,)
     rows = [(HOSTILE, "<img src=x>", "![a](http://b)")]
     section = sheet.SheetSection("t", ("a", "b", "c"), rows, [HOSTILE])
     text = sheet.markdown(HOSTILE, ["<b>"], [section])
@@ -239,8 +239,8 @@ def test_check_imports_nothing_that_a_run_names(key, run, workplace, monkeypatch
 
 
 def stress(**changed):
-    found = {"conditions": np.array(["as it is"]), "kept": np.array([3]), "trials": np.array(12)}
-    return found | {"warnings": np.array(["a warning"])} | changed
+    arrays = {"conditions": np.array(["as it is"]), "kept": np.array([3]), "trials": np.array(12)}
+    return arrays | {"warnings": np.array(["a warning"])} | changed
 
 
 def outcomes(**changed):
@@ -265,8 +265,8 @@ def test_results_that_are_not_shown_are_told(run, monkeypatch):
             array_files.save_results(place, about, arrays)
 
     write(outcomes(), stress())
-    found = reference.kept(run, scene, settings)
-    assert found.fresh is not None and isinstance(found.stress, Stress) and not found.notes
+    results = reference.kept(run, scene, settings)
+    assert results.fresh is not None and isinstance(results.stress, Stress) and not results.notes
     wrong = [
         (outcomes(more=np.zeros(4)), stress()),
         (outcomes(cost=np.zeros((4, 2))), stress()),
@@ -398,9 +398,9 @@ def test_what_this_machine_lacks_is_one_line(monkeypatch, capsys):
 def test_a_cost_that_is_no_number_is_blamed_itself(bad_step, blamed):
     status = np.full(4, int(Status.NONFINITE))
     step = np.full(4, bad_step)
-    found = Outcome(np.zeros(4), status, np.zeros(4), step)  # type: ignore[arg-type]
+    outcome = Outcome(np.zeros(4), status, np.zeros(4), step)  # type: ignore[arg-type]
     with pytest.raises(runs.AllFailed) as error:
-        run_of.refuse_all_failed(found, Path("r"), "mine:c")
+        run_of.refuse_all_failed(outcome, Path("r"), "mine:c")
     assert ("--cost mine:c returned NaN" in str(error.value)) == blamed
     assert ("timestep" in str(error.value)) != blamed
 
@@ -413,7 +413,7 @@ def test_a_process_says_for_whom_it_waits(monkeypatch, capsys):
     begin = progress.Busy.begin
     monkeypatch.setattr(progress.Busy, "begin", lambda s, t: (shown.append(s), begin(s, t))[1])
 
-    def wait(*where, **how):
+    def wait(*where, **options):
         now[0] = 6.0
         shown[-1].tick()
 

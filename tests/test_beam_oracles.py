@@ -41,7 +41,7 @@ def finger_scene(
         discretization__integrator=integrator,
         **off(without + " lateral_bending twist" * bending_only),
     )
-    one = dataclasses.replace(
+    finger_hand = dataclasses.replace(
         the_scene.hand,
         finger=(hand.Finger(azimuth=0.0, spread=0.0, radius=0.0, tilt=0.0),),
         wrist=hand.Wrist(1e5, 1e4, 1e3, 1e2),
@@ -49,7 +49,7 @@ def finger_scene(
             the_scene.hand.material, shear_modulus=shear_modulus, damping_time=beta
         ),
     )
-    return dataclasses.replace(the_scene, hand=one, gravity=gravity)
+    return dataclasses.replace(the_scene, hand=finger_hand, gravity=gravity)
 
 
 def elastica(load):
@@ -79,17 +79,17 @@ class Finger:
         self.layout = model.layout(scene)
         self.length = length
         self.links = links
-        one = np.ones(1)
+        ones = np.ones(1)
         zero = np.zeros(())
-        params = Params(length * one, height * one, wall * one, zero, np.zeros(6), 0 * one)
+        params = Params(length * ones, height * ones, wall * ones, zero, np.zeros(6), 0 * ones)
         trial = Trial(np.int32(0), np.zeros(2), zero, np.zeros(2), np.ones(()), np.ones(()))
         self.model = model.compile_model(scene, params, trial)
         self.data = mujoco.MjData(self.model)
         self.data.qpos[2] = self.data.ctrl[2] = 0.3
         width = scene.hand.section.width
         material = scene.hand.material
-        how = {"shear_modulus": material.shear_modulus, "density": material.density}
-        self.beam = morphology.beam(height, wall, width=width, **how)
+        constants = {"shear_modulus": material.shear_modulus, "density": material.density}
+        self.beam = morphology.beam(height, wall, width=width, **constants)
 
     def tip(self):
         """Position [m], (3,), and orientation, (3, 3), of the tip in the frame of the root."""
@@ -436,29 +436,29 @@ def test_segments_are_a_finger_cut_in_pieces(links):
     hand = scene.load("paper").hand
     params = Params(*np.array([[0.09, 0.13], [0.018, 0.021], [0.004, 0.005]]), 0.0, None, None)
     beams = morphology.finger_beams(hand, params, links)
-    found = morphology.segments(hand, params, links)
+    segments = morphology.segments(hand, params, links)
     length = params.length
     height = params.height
     mass = beams.line_density[:, 0] * params.length
-    joint = np.cumsum(found.offset, 1)
+    joint = np.cumsum(segments.offset, 1)
     # A joint stands in the middle of each segment.
     np.testing.assert_allclose(joint, np.outer(length, (np.arange(links) + 0.5) / links))
     start = np.concatenate([0 * joint[:, :1], joint], 1)
-    np.testing.assert_allclose(start[:, 1:], (start + found.extent)[:, :-1], rtol=1e-12)
-    centre = start + found.extent / 2
-    np.testing.assert_allclose(found.mass.sum(1), mass)
-    np.testing.assert_allclose((found.mass * centre).sum(1), mass * length / 2)
-    about = (found.inertia[..., 1] + found.mass * centre**2).sum(1)
+    np.testing.assert_allclose(start[:, 1:], (start + segments.extent)[:, :-1], rtol=1e-12)
+    centre = start + segments.extent / 2
+    np.testing.assert_allclose(segments.mass.sum(1), mass)
+    np.testing.assert_allclose((segments.mass * centre).sum(1), mass * length / 2)
+    about = (segments.inertia[..., 1] + segments.mass * centre**2).sum(1)
     np.testing.assert_allclose(about, mass * (length**2 / 3 + height**2 / 12))
     for name, rigidity in (("bend", "bending"), ("lateral", "lateral"), ("twist", "torsion")):
         stiffness, damping = morphology.joint_springs(hand, params, beams, links, (name,))
         whole = length / getattr(beams, rigidity)[:, 0]
         np.testing.assert_allclose(links / stiffness[:, 0, 0], whole)
         np.testing.assert_allclose(damping, hand.material.damping_time * stiffness)
-    spheres = morphology.sphere_places(found.extent, 3)
+    spheres = morphology.sphere_places(segments.extent, 3)
     assert spheres.shape == (2, links, 3)
-    np.testing.assert_allclose(spheres.mean(2), found.extent[:, 1:] / 2)
-    np.testing.assert_allclose(np.diff(spheres, axis=2).max(2), found.extent[:, 1:] / 3)
+    np.testing.assert_allclose(spheres.mean(2), segments.extent[:, 1:] / 2)
+    np.testing.assert_allclose(np.diff(spheres, axis=2).max(2), segments.extent[:, 1:] / 3)
 
 
 def tapered():
@@ -490,12 +490,12 @@ def test_a_tapered_finger_is_the_integral_of_its_sections():
         up = integral(lambda s: beam(s)[0] / 2 * beam(s)[1].line_density) / mass
         bend = integral(lambda s: beam(s)[1].moment_per_pressure / beam(s)[1].bending)
         for links in (1, 3, 10):
-            found = morphology.segments(hand, params, links)
-            start = np.concatenate([[0], np.cumsum(found.offset[f])])
-            assert found.mass[f].sum() == pytest.approx(mass, rel=1e-12)
-            centre = start + found.along[f]
-            assert (centre * found.mass[f]).sum() / mass == pytest.approx(along, rel=1e-12)
-            assert (found.up[f] * found.mass[f]).sum() / mass == pytest.approx(up, rel=1e-12)
+            segments = morphology.segments(hand, params, links)
+            start = np.concatenate([[0], np.cumsum(segments.offset[f])])
+            assert segments.mass[f].sum() == pytest.approx(mass, rel=1e-12)
+            centre = start + segments.along[f]
+            assert (centre * segments.mass[f]).sum() / mass == pytest.approx(along, rel=1e-12)
+            assert (segments.up[f] * segments.mass[f]).sum() / mass == pytest.approx(up, rel=1e-12)
             # Midpoints: the error of a joint's angle goes with the square of its segment.
             beams = morphology.finger_beams(hand, params, links)
             springs, _ = morphology.joint_springs(hand, params, beams, links, ("bend",))
@@ -510,12 +510,12 @@ def test_a_tapered_finger_is_the_integral_of_its_sections():
 # --- one finger on the bench, against MuJoCo's chain ----------------------------------------------
 
 
-def on_the_bench(own):
+def on_the_bench(chain):
     """The finger of the bench that is the one of MuJoCo's chain."""
     zero = np.zeros(())
-    one = np.ones(1)
-    params = Params(own.length * one, 0.02 * one, 0.005 * one, zero, np.zeros(6), 0 * one)
-    return bench.of_design(own.scene, params, 0)
+    ones = np.ones(1)
+    params = Params(chain.length * ones, 0.02 * ones, 0.005 * ones, zero, np.zeros(6), 0 * ones)
+    return bench.of_design(chain.scene, params, 0)
 
 
 @pytest.mark.parametrize("alpha", [1, 2])
@@ -534,9 +534,9 @@ def test_a_small_load_moves_a_bent_tip_sideways_as_the_chain_s(bend):
     chain = Finger(10, bending_only=False)
     moved = balanced(chain, rigidity, np.array([0.0, 1e-3, 0.0]), np.deg2rad(bend))[1]
     spring = rigidity * chain.links / chain.length
-    own = on_the_bench(chain)._replace(lateral=spring[1:2], twist=spring[2:])
+    bench_finger = on_the_bench(chain)._replace(lateral=spring[1:2], twist=spring[2:])
     bent = rest.Rest(np.full(10, np.deg2rad(bend) / 10), 0.0, 0.0)
-    assert rest.sideways(own, bent, 1e-3) == pytest.approx(moved, rel=0.02)
+    assert rest.sideways(bench_finger, bent, 1e-3) == pytest.approx(moved, rel=0.02)
 
 
 def test_a_released_finger_swings_as_the_chain_s():
@@ -551,8 +551,8 @@ def test_a_released_finger_swings_as_the_chain_s():
         mujoco.mj_step(chain.model, chain.data)
         mujoco.mj_kinematics(chain.model, chain.data)
         tips.append(-chain.tip()[0][2])
-    own = on_the_bench(chain)
-    step = swing.first_period(own, 0.0) / swing.STEPS
-    time, drop = swing.released(own, 0.0, 0.0, 0.3, step)
+    bench_finger = on_the_bench(chain)
+    step = swing.first_period(bench_finger, 0.0) / swing.STEPS
+    time, drop = swing.released(bench_finger, 0.0, 0.0, 0.3, step)
     expected = np.interp(1e-3 * (np.arange(300) + 1), time, drop)
     np.testing.assert_allclose(tips, expected, atol=0.02 * expected.max())

@@ -29,8 +29,8 @@ UNLIMITED = {
 
 def limited(**limits):
     """The scene and its space with these limits and no other one."""
-    own = {f"limits.{name}": value for name, value in {**UNLIMITED, **limits}.items()}
-    made = scene.load("paper", overrides=own)
+    overrides = {f"limits.{name}": value for name, value in {**UNLIMITED, **limits}.items()}
+    made = scene.load("paper", overrides=overrides)
     return made, parameters.design_space(made.hand, "23d")
 
 
@@ -48,7 +48,7 @@ def each_params(space, designs):
 
 
 def columns(name):
-    return [k for k, own in enumerate(SPACE.names) if own.split("[")[0] == name]
+    return [k for k, parameter in enumerate(SPACE.names) if parameter.split("[")[0] == name]
 
 
 def test_no_proposal_has_a_warning_and_the_paper_s_space_has_table_i_alone():
@@ -70,46 +70,46 @@ def test_no_proposal_has_a_warning_and_the_paper_s_space_has_table_i_alone():
 def test_a_lowered_pressure_bends_the_free_finger_by_the_limit(law):
     """By `free_bends`, which halves intervals where the projection inverts in closed form."""
     material = {"hand.material.law": law, "hand.material.shear_modulus": 40e3}
-    own = {f"limits.{n}": v for n, v in {**UNLIMITED, "free_bend": 90.0}.items()}
-    made = scene.load("paper", overrides=own | material)
+    limits = {f"limits.{n}": v for n, v in {**UNLIMITED, "free_bend": 90.0}.items()}
+    made = scene.load("paper", overrides=limits | material)
     space = parameters.design_space(made.hand, "23d")
     designs = drawn(TABLE, 60)
     pressures = columns("pressure")
-    found = projected(space, designs)
-    lowered = found[:, pressures] < designs[:, pressures] * (1 - 1e-5)
+    legal = projected(space, designs)
+    lowered = legal[:, pressures] < designs[:, pressures] * (1 - 1e-5)
     bends = np.degrees(
         [
             morphology.free_bends(made.hand, p, neo_hookean=silicones.of_law(law))
-            for p in each_params(space, found)
+            for p in each_params(space, legal)
         ]
     )
     # Pressures are rounded to float32, and stay below the limit by 1e-6 of it.
     np.testing.assert_allclose(bends[lowered], 90, rtol=2e-5)
     assert lowered.mean() > 0.3 and (bends <= 90 * (1 + 1e-6)).all()
     others = np.setdiff1d(np.arange(len(space.names)), pressures)
-    np.testing.assert_array_equal(found[:, others], designs[:, others])
+    np.testing.assert_array_equal(legal[:, others], designs[:, others])
 
 
 def test_a_lowered_pressure_strains_the_wall_by_the_limit_less_the_margin():
     """Strain is curvature times height; half the margin's pressure is half the limit's."""
     _, space = limited(strain=0.5)
     designs = drawn(TABLE, 60)
-    found = projected(space, designs)
+    legal = projected(space, designs)
     pressures = columns("pressure")
-    lowered = found[:, pressures] < designs[:, pressures] * (1 - 1e-5)
+    lowered = legal[:, pressures] < designs[:, pressures] * (1 - 1e-5)
     strains = []
-    for p in each_params(space, found):
+    for p in each_params(space, legal):
         bends = morphology.free_bends(PAPER.hand, p, neo_hookean=True)
         strains.append(bends / p.length * p.height)
     np.testing.assert_allclose(np.array(strains)[lowered], 0.5, rtol=2e-5)
     _, half = limited(strain=0.5, pressure_margin=0.5)
     lower = projected(half, designs)[:, pressures]
-    np.testing.assert_allclose(lower[lowered], 0.5 * found[:, pressures][lowered], rtol=1e-6)
+    np.testing.assert_allclose(lower[lowered], 0.5 * legal[:, pressures][lowered], rtol=1e-6)
 
 
 def test_no_tapered_finger_bends_by_more_than_the_limit():
-    own = {f"limits.{n}": v for n, v in {**UNLIMITED, "free_bend": 60.0}.items()}
-    made = scene.load("paper", hand_name="tapered4", overrides=own)
+    limits = {f"limits.{n}": v for n, v in {**UNLIMITED, "free_bend": 60.0}.items()}
+    made = scene.load("paper", hand_name="tapered4", overrides=limits)
     space = parameters.design_space(made.hand, "full")
     bends = [
         np.degrees(morphology.free_bends(made.hand, p, neo_hookean=True)).max()
@@ -121,9 +121,9 @@ def test_no_tapered_finger_bends_by_more_than_the_limit():
 def test_lengths_angles_and_height_are_clipped():
     """By trigonometry: the rim of a palm that is pitched alone is radius * sin(pitch) lower."""
     _, space = limited(finger_length=[0.03, 0.1], finger_slenderness=2.5)
-    found = projected(space, drawn(TABLE))
-    lengths = found[:, columns("length")]
-    least = np.maximum(0.03, 2.5 * found[:, columns("height")])
+    legal = projected(space, drawn(TABLE))
+    lengths = legal[:, columns("length")]
+    least = np.maximum(0.03, 2.5 * legal[:, columns("height")])
     assert (lengths >= least * (1 - 1e-6)).all() and (lengths <= 0.1 * (1 + 1e-6)).all()
     assert lengths.max() > 0.099
     _, space = limited(arm_tilt=15.0)
@@ -149,8 +149,8 @@ def test_lengths_angles_and_height_are_clipped():
 @pytest.mark.parametrize("name", UNLIMITED)
 def test_each_limit_is_closed_on_its_own(name):
     """With one at its open end something is drawn that the scene's limits would change."""
-    own = scene.load("paper", overrides={f"limits.{name}": UNLIMITED[name]})
-    designs = drawn(parameters.design_space(own.hand, "23d"), 2000)
+    open_scene = scene.load("paper", overrides={f"limits.{name}": UNLIMITED[name]})
+    designs = drawn(parameters.design_space(open_scene.hand, "23d"), 2000)
     changed = (projected(SPACE, designs) != designs).any(0)
     moved = {SPACE.names[k].split("[")[0] for k in np.flatnonzero(changed)}
     expected = {"finger_length": "length", "finger_slenderness": "length"}
@@ -217,7 +217,7 @@ def test_every_optimiser_proposes_and_recommends_what_can_be_built(name):
     ],
 )
 def test_bad_limits_are_refused(changes, expected):
-    own = {f"limits.{name}": value for name, value in changes.items()}
+    limits = {f"limits.{name}": value for name, value in changes.items()}
     with pytest.raises(InputError) as error:
-        parameters.design_space(scene.load("paper", overrides=own).hand)
+        parameters.design_space(scene.load("paper", overrides=limits).hand)
     assert expected in str(error.value)

@@ -47,11 +47,11 @@ def restore(folder):
 
 
 def test_round_trip_is_bitwise(folder):
-    found = restore(folder)
-    assert found.step == 4 and found.damaged == ()
-    assert equal(found.arrays, arrays(4))
-    assert found.arrays["state"]["particles"].dtype == np.float32
-    assert found.arrays["state"]["episode"].shape == ()
+    restored = restore(folder)
+    assert restored.step == 4 and restored.damaged == ()
+    assert equal(restored.arrays, arrays(4))
+    assert restored.arrays["state"]["particles"].dtype == np.float32
+    assert restored.arrays["state"]["episode"].shape == ()
 
 
 def test_no_save_waits_for_the_deletion_of_old_steps_or_fails_with_it(tmp_path, monkeypatch):
@@ -71,8 +71,8 @@ def test_no_save_waits_for_the_deletion_of_old_steps_or_fails_with_it(tmp_path, 
     (words,) = said
     assert words.startswith(f"old checkpoints in {tmp_path} could not be deleted: ")
     assert words.endswith("1 is not ours")
-    found = restore(tmp_path)
-    assert found.step == 5 and equal(found.arrays, arrays(5)) and found.damaged == ()
+    restored = restore(tmp_path)
+    assert restored.step == 5 and equal(restored.arrays, arrays(5)) and restored.damaged == ()
 
 
 def test_after_a_failed_save_its_threads_are_silent_and_no_others(tmp_path, monkeypatch):
@@ -89,8 +89,8 @@ def test_after_a_failed_save_its_threads_are_silent_and_no_others(tmp_path, monk
         store.save(2, arrays(2))
     closed = types.SimpleNamespace(exc_value=RuntimeError("Event loop is closed"))
     other = types.SimpleNamespace(exc_value=RuntimeError("another"))
-    for found in (closed, other):
-        sys.unraisablehook(found)
+    for unraisable in (closed, other):
+        sys.unraisablehook(unraisable)
     assert told == [other]
 
 
@@ -99,10 +99,10 @@ def test_damage_of_any_file_falls_back_to_the_step_before(folder, way):
     for path in [p for p in sorted((folder / "4").rglob("*")) if p.is_file()]:
         content = path.read_bytes()
         faults.damaged(path, way)
-        found = restore(folder)
-        assert found.step == 3, path
-        assert equal(found.arrays, arrays(3))
-        [(step, reason)] = found.damaged
+        restored = restore(folder)
+        assert restored.step == 3, path
+        assert equal(restored.arrays, arrays(3))
+        [(step, reason)] = restored.damaged
         assert step == 4 and path.name in reason
         path.write_bytes(content)
     assert restore(folder).step == 4, "putting the bytes back heals it"
@@ -113,8 +113,8 @@ def test_arrays_that_differ_from_what_was_saved_are_refused(folder):
     digests = folder / "4.sha256"
     text = digests.read_text()
     digests.write_text(re.sub(r"# arrays \w+", f"# arrays {digest(arrays(9))}", text))
-    found = restore(folder)
-    assert found.step == 3 and found.damaged == ((4, "its arrays' digest differs"),)
+    restored = restore(folder)
+    assert restored.step == 3 and restored.damaged == ((4, "its arrays' digest differs"),)
 
 
 def flipped(content, place=30):
@@ -142,13 +142,13 @@ def test_any_damage_of_arrays_is_one_error(tmp_path):
     for place, other in damaged(content, 150):
         path.write_bytes(other)
         try:
-            found = array_files.load(path)
+            loaded = array_files.load(path)
         except array_files.ArrayFileError:
             refused += 1
         else:  # a byte of a date, say
-            assert found.keys() == arrays.keys(), place
+            assert loaded.keys() == arrays.keys(), place
             for name, value in arrays.items():
-                np.testing.assert_array_equal(found[name], value)
+                np.testing.assert_array_equal(loaded[name], value)
     assert refused > 100
     for other in (b"", b"PK", b"nothing", np.zeros(3).tobytes()):
         path.write_bytes(other)

@@ -114,11 +114,13 @@ def test_the_interval_of_a_difference_covers_as_often_as_it_says():
         for b in range(total + 1 - a)
         for c in range(total + 1 - a - b)
     ]
-    found = np.array([statistics.paired(*table, total) for table in tables])
+    intervals = np.array([statistics.paired(*table, total) for table in tables])
     counts = np.array([(a, b, c, total - a - b - c) for a, b, c in tables])
     for shares in ((0.9, 0.05, 0.03, 0.02), (0.6, 0.3, 0.05, 0.05), (0.3, 0.2, 0.2, 0.3)):
         weights = stats.multinomial(total, shares).pmf(counts)
-        inside = (found[:, 1] <= shares[1] - shares[2]) & (shares[1] - shares[2] <= found[:, 2])
+        inside = (intervals[:, 1] <= shares[1] - shares[2]) & (
+            shares[1] - shares[2] <= intervals[:, 2]
+        )
         covered.append(weights[inside].sum())
     # Newcombe's own evaluation has a mean of 0.95 and no less than 0.92 at such sizes.
     assert min(covered) > 0.92 and np.mean(covered) < 0.995
@@ -136,9 +138,9 @@ def test_where_a_policy_leaves_the_key_frames():
     ctrl[2, 6, 4] = 0.1
     ctrl[3, 6:, 7] = 5e4  # after the object was lost
     ctrl[4, 2, 7] = 1e-3  # rounding
-    found = trials_of(np.zeros(5), np.zeros(5))
-    found.lost_time[3] = 6 * h
-    left = cases.departure(tiny, found, ctrl, planned)
+    outcomes = trials_of(np.zeros(5), np.zeros(5))
+    outcomes.lost_time[3] = 6 * h
+    left = cases.departure(tiny, outcomes, ctrl, planned)
     np.testing.assert_allclose(left.time, [np.inf, 3 * h, 5 * h, np.inf, np.inf])
     np.testing.assert_allclose(left.lower, [0, -2e4, 0, 0, 0])
     np.testing.assert_allclose(left.place, [0, 0, 0.003, 0, 0])
@@ -146,7 +148,7 @@ def test_where_a_policy_leaves_the_key_frames():
     said = str(jax.tree.map(np.asarray, left))
     assert said.startswith("left the key frames in 2 of 5 grasps, first after 0.08 s (median); ")
     assert said.endswith("pressures by -20 to +1e-06 kPa, the arm by up to 3 mm and 5.73°")
-    none = cases.departure(tiny, found, planned, planned)
+    none = cases.departure(tiny, outcomes, planned, planned)
     assert str(none) == "commanded nothing but the key frames in 5 grasps"
 
 
@@ -159,17 +161,17 @@ def test_how_many_trials_would_show_a_difference(first, second, total):
     needed = int(re.search(r"about ([\d,]+) trials", said)[1].replace(",", ""))
     scale = needed / total
     pair = [round(scale * n) for n in (first, second)]
-    found = statistics.paired(round(scale * total) - sum(pair), *pair, round(scale * total))
+    interval = statistics.paired(round(scale * total) - sum(pair), *pair, round(scale * total))
     # Newcombe's interval is wider than the normal one at few trials, by less than its half.
-    assert abs(found.value) > 0.5 * (found.high - found.low) / 2
+    assert abs(interval.value) > 0.5 * (interval.high - interval.low) / 2
 
 
 def outcomes_of(first, second, total):
     """Which trials two designs kept, of which so many one alone did."""
-    one, other = np.ones((2, total), bool)
+    kept, other = np.ones((2, total), bool)
     other[:first] = False
-    one[first : first + second] = False
-    return one, other
+    kept[first : first + second] = False
+    return kept, other
 
 
 # --- `codesign check`: its counts are those of the grasps simulated again, and refusals -----------
@@ -217,8 +219,10 @@ def test_its_counts_are_those_of_the_grasps_simulated_again(capsys):
     assert counts == [kept[0].sum(), kept[0].size, kept[1].sum(), (kept[0] != kept[1]).sum()]
     assert rates[0][1] == 4 and rates[1][1] == counts[1]
     interval = stats.binomtest(counts[3], counts[1]).proportion_ci(method="wilson")
-    found = [counts[3] / counts[1], interval.low, interval.high]
-    np.testing.assert_allclose(share, np.multiply(found, 100), rtol=0.05, atol=1e-9)  # two digits
+    expected = [counts[3] / counts[1], interval.low, interval.high]
+    np.testing.assert_allclose(
+        share, np.multiply(expected, 100), rtol=0.05, atol=1e-9
+    )  # two digits
     grasps, minutes, seconds = map(int, searched)
     # Beside what compiling takes; the rate is told with three digits.
     assert 60 * minutes + seconds >= 0.99 * grasps / rates[0][0] - 1
@@ -296,13 +300,13 @@ def test_a_table_of_trials_has_noise_and_endings(finished, tmp_path, capsys):
     assert command(*asked, "--out", table) == 0
     output = capsys.readouterr().out
     assert f"particle 1 of {finished}" in output and f"length={float(rows[1][-2]):.4g} mm" in output
-    found = [*csv.DictReader(table.read_text().splitlines())]
-    assert [*found[0]] == [*columns.MORE[columns.REFERENCE].columns]
+    written = [*csv.DictReader(table.read_text().splitlines())]
+    assert [*written[0]] == [*columns.MORE[columns.REFERENCE].columns]
     drawn = rollout.sample_trials(runs.read_run(finished)[0], jax.random.key(seed), 3)
-    for row, x, mass in zip(found, drawn.position[:, 0], drawn.mass, strict=True):
+    for row, x, mass in zip(written, drawn.position[:, 0], drawn.mass, strict=True):
         assert float(row["noise_x_m"]) == pytest.approx(float(x), rel=1e-6)
         assert float(row["noise_mass_factor"]) == pytest.approx(float(mass), rel=1e-6)
-    kept = sum(row["verdict"] == "kept" for row in found)
+    kept = sum(row["verdict"] == "kept" for row in written)
     assert f"all: kept {kept} of 3, " in output
     for wrong, words in (
         ([finished, "--particle", "99"], "--particle = 99 is outside"),
@@ -332,10 +336,10 @@ def test_a_table_of_trials_has_noise_and_endings(finished, tmp_path, capsys):
 )
 def test_one_rule_judges_designs(kept, total, word, more):
     """By binomial likelihoods of SciPy; the interval is SciPy's."""
-    found = verdict.judge(kept, total)
-    assert (found.word, found.more) == (word, more)
+    judgement = verdict.judge(kept, total)
+    assert (judgement.word, judgement.more) == (word, more)
     low, high = stats.binomtest(kept, total).proportion_ci(0.95, method="wilson")
-    assert (found.share.low, found.share.high) == pytest.approx((low, high))
+    assert (judgement.share.low, judgement.share.high) == pytest.approx((low, high))
     ratio = np.subtract(*stats.binom.logpmf(kept, total, [verdict.WANTED, verdict.POOR]))
     assert verdict.evidence(kept, total) == pytest.approx(ratio)
     decided = {"good": ratio, "not good": -ratio}.get(word, -abs(ratio))
@@ -363,12 +367,12 @@ def test_verdicts_are_monotone_and_what_decides_decides():
 def test_the_characteristic_of_the_test_is_exact(share):
     """By the closed form of a design that loses nothing, and by all sequences of a short test."""
     for batch, most in ((1, 600), (20, 600), (20, 90)):
-        found = verdict.characteristic(share, batch, most)
-        assert sum(found[:3]) == pytest.approx(1)
+        characteristic = verdict.characteristic(share, batch, most)
+        assert sum(characteristic[:3]) == pytest.approx(1)
         # The errors that are promised, at any number of looks.
-        assert share > verdict.POOR or found.good <= verdict.ERROR
-        assert share < verdict.WANTED or found.not_good <= verdict.ERROR
-        assert found.grasps <= most
+        assert share > verdict.POOR or characteristic.good <= verdict.ERROR
+        assert share < verdict.WANTED or characteristic.not_good <= verdict.ERROR
+        assert characteristic.grasps <= most
     if share == 1.0:
         alone = np.log(1 / verdict.ERROR) / np.log(verdict.WANTED / verdict.POOR)
         assert verdict.characteristic(share, 1).grasps == np.ceil(alone) == 56
@@ -387,8 +391,8 @@ def test_the_characteristic_of_the_test_is_exact(share):
                 ends[word] += chance
                 grasps += chance * total
                 break
-    found = verdict.characteristic(share, batch, most)
-    assert [*found] == pytest.approx([*ends.values(), grasps], abs=1e-12)
+    characteristic = verdict.characteristic(share, batch, most)
+    assert [*characteristic] == pytest.approx([*ends.values(), grasps], abs=1e-12)
 
 
 def test_the_page_has_the_numbers_of_the_test():
@@ -429,10 +433,10 @@ def test_trials_go_on_until_they_decide(outcomes, most, known, expected):
         return jax.tree.map(lambda v: v[first : first + count], every)
 
     previous = jax.tree.map(lambda v: v[:known], every) if known else None
-    found = [*verdict.sequential(simulate, most, previous)]
+    batches = [*verdict.sequential(simulate, most, previous)]
     assert [first for first, _ in calls] == [*range(known, expected, min(20, most))]
     assert len({count for _, count in calls}) <= 1
-    end = found[-1] if found else previous
+    end = batches[-1] if batches else previous
     np.testing.assert_array_equal(end.cost, every.cost[:expected])
 
 
@@ -448,8 +452,8 @@ def test_a_verdict_is_a_sentence():
     assert str(kept).endswith(
         "(44 to 100 %): not enough trials, 53 more at this share would decide"
     )
-    how = "kept 3 of 3, 0 lost, 0 not released; mean cost 0.0000; accuracy fine, steps of 20 ms, "
-    assert kept.details.startswith(how)
+    text = "kept 3 of 3, 0 lost, 0 not released; mean cost 0.0000; accuracy fine, steps of 20 ms, "
+    assert kept.details.startswith(text)
     broken = str(Judged(tiny, trials_of([3.0] * 3, [Status.NONFINITE] * 3)))
     assert broken == "no verdict: every trial failed (NONFINITE 3)"
 
@@ -466,8 +470,8 @@ def test_a_verdict_is_a_sentence():
 )
 def test_a_verdict_names_what_it_holds_for(overrides, words):
     rubbing = {f"objects.object.{shape.name}.friction": 0.7 for shape in PAPER.objects.object}
-    own = scene.load("paper", overrides=rubbing | overrides)
-    judged = Judged(own, trials_of([0.0] * 60, [0] * 60))
+    rubbing_scene = scene.load("paper", overrides=rubbing | overrides)
+    judged = Judged(rubbing_scene, trials_of([0.0] * 60, [0] * 60))
     text = f"keeps 100 % of 60 fresh grasps of {words} (94 to 100 %): good; "
     assert str(judged) == f"{text}other conditions not tried"
 
@@ -486,10 +490,10 @@ def test_a_verdict_names_what_it_holds_for(overrides, words):
 def test_a_second_word_names_conditions_under_which_it_does_not_hold(kept, words):
     """Draws of other constants are one condition."""
     names = (stress.AS_IT_IS, "objects of 500 g", "friction 0.4 on the hand", "draws", "draws")
-    found = stress.Stress(names, np.array(kept), 12, ())
-    assert found.limits.startswith(words)
-    judged = Judged(PAPER, trials_of([0.0] * 60, [0] * 60), stress=found)
-    assert str(judged).endswith(f": good; {found.limits}")
+    result = stress.Stress(names, np.array(kept), 12, ())
+    assert result.limits.startswith(words)
+    judged = Judged(PAPER, trials_of([0.0] * 60, [0] * 60), stress=result)
+    assert str(judged).endswith(f": good; {result.limits}")
 
 
 @pytest.mark.parametrize(
@@ -502,9 +506,9 @@ def test_a_second_word_names_conditions_under_which_it_does_not_hold(kept, words
 def test_verdicts_count_all_trials_and_means_follow_the_rule(rule, mean, mean_in_words):
     """Costs 0, 1 and a failed trial: 1/2 without it, (0 + 1 + 3) / 3 with it as the worst."""
     tiny = scene.load(TINY, overrides={"cost.failure": rule})
-    found = trials_of([0.0, 1.0, 3.0], [0, Status.SOLVER_CAP, Status.STUCK], lost=[1])
-    judged = Judged(tiny, found)
-    row = verdicts.of_trials(tiny, found)
+    outcomes = trials_of([0.0, 1.0, 3.0], [0, Status.SOLVER_CAP, Status.STUCK], lost=[1])
+    judged = Judged(tiny, outcomes)
+    row = verdicts.of_trials(tiny, outcomes)
     assert row == f"kept 1 of 3, 1 lost, 1 not released; {mean_in_words}; warnings: SOLVER_CAP 1"
     assert str(judged).startswith("keeps 33 % of 3 fresh") and row in judged.details
     [warning] = verdicts.warnings(judged)
@@ -530,15 +534,15 @@ HAND = jax.tree.map(np.asarray, SPACE.params(SPACE.default()))
 
 def test_conditions_are_numbers_within_the_files_ranges():
     """Masses are four and ten times as large, at most 500 g; what is not named stays."""
-    found = [*stress.variants(PAPER)]
-    names = [name for name, _ in found]
+    variants = [*stress.variants(PAPER)]
+    names = [name for name, _ in variants]
     assert names[:3] == ["objects of 200 g", "objects of 500 g", "friction 0.4 on the hand"]
     assert len(names) == 3 + stress.DRAWS and len({*names[3:]}) == 1
-    for _, other in found:
+    for _, other in variants:
         constants.check(other)
         assert other.phases == PAPER.phases and other.hand.palm == PAPER.hand.palm
-    assert [o.mass for o in found[1][1].objects.object] == [0.5] * 3
-    ratio = [c.contact.normal_stiffness / PAPER.contact.normal_stiffness for _, c in found[3:]]
+    assert [o.mass for o in variants[1][1].objects.object] == [0.5] * 3
+    ratio = [c.contact.normal_stiffness / PAPER.contact.normal_stiffness for _, c in variants[3:]]
     table = {entry.key: entry for entry in stress.unknown(PAPER).constant}
     stiffness = table["contact.normal_stiffness"]
     assert len({*ratio}) == len(ratio)
@@ -574,22 +578,22 @@ def test_overlaps_are_depths_of_sections():
     depth = 0.004
     height = float(HAND.height[0])
     place[0, lay.bodies[1]] = place[0, lay.bodies[0]] + [0, 0, height - depth]
-    found = overlap.overlaps(PAPER, HAND, place, turn).fingers[0]
+    depths = overlap.overlaps(PAPER, HAND, place, turn).fingers[0]
     # To first order: the rounded outline is 1 % nearer beside the middle.
-    assert found[1, 0] == pytest.approx(depth, rel=0.02) == found[0, 1]
-    found[1, 0] = found[0, 1] = 0
-    assert not found.any()
+    assert depths[1, 0] == pytest.approx(depth, rel=0.02) == depths[0, 1]
+    depths[1, 0] = depths[0, 1] = 0
+    assert not depths.any()
     lay, place, turn = placed()
     place[0, lay.bodies[2][7]] = place[0, lay.bodies[2][1]] + [0, 0, height - depth]
     place[0, lay.bodies[3][5]] = [0, 0, PAPER.hand.palm.thickness - depth]
-    found = overlap.overlaps(PAPER, HAND, place, turn)
-    assert found.fingers[0, 2, 2] == pytest.approx(depth, rel=0.02)
-    assert found.palm[0] == pytest.approx([0, 0, 0, depth])
-    words = stress.of_overlaps(PAPER, HAND, [found])
+    overlaps = overlap.overlaps(PAPER, HAND, place, turn)
+    assert overlaps.fingers[0, 2, 2] == pytest.approx(depth, rel=0.02)
+    assert overlaps.palm[0] == pytest.approx([0, 0, 0, depth])
+    words = stress.of_overlaps(PAPER, HAND, [overlaps])
     assert words[0] == "finger 2 stands 4 mm deep in itself"
     assert words[1] == "finger 3 stands 4 mm deep in the palm" and len(words) == 2
     without = scene.load("paper", overrides={"effects.finger_itself": False})
-    words = stress.of_overlaps(without, HAND, [found])
+    words = stress.of_overlaps(without, HAND, [overlaps])
     assert words[0].endswith("deep in itself: the simulation has no such contact")
 
 
@@ -614,8 +618,8 @@ def test_the_strain_s_pressure_is_that_of_the_wall_s_stress(neo_hookean):
     width = 0.024
     modulus = 35e3
     strain = 1.3
-    how = {"width": width, "shear_modulus": modulus, "neo_hookean": neo_hookean}
-    pressure = beams.strain_pressure(strain, np.array(height), np.array(wall), **how)
+    properties = {"width": width, "shear_modulus": modulus, "neo_hookean": neo_hookean}
+    pressure = beams.strain_pressure(strain, np.array(height), np.array(wall), **properties)
 
     def stress_at(e):
         return modulus * (1 + e - (1 + e) ** -3) if neo_hookean else 4 * modulus * e

@@ -151,10 +151,10 @@ def control_operations():
         def going(c):
             return (jnp.max((c[0] < 9).astype(jnp.int32)) > 0) & (c[1] < 40)
 
-        found, rounds = jax.lax.while_loop(
+        result, rounds = jax.lax.while_loop(
             going, lambda c: (jnp.minimum(c[0] + jnp.abs(y) + 1, 10), c[1] + 1), (x, jnp.int32(0))
         )
-        return found + rounds
+        return result + rounds
 
     def branch(x, y):
         some = jnp.max((x > 2).astype(jnp.int32)) > 0
@@ -332,13 +332,19 @@ def exchange(lanes, backend):
 
     def kernel(x, out, table, onchip):
         lane = jax.lax.broadcasted_iota(jnp.int32, (lanes,), 0)
-        own = jax.lax.rem(lane, columns)
+        column = jax.lax.rem(lane, columns)
         mate = jax.lax.div(lane, columns)
 
         def body(k, total):
             for ref in (table, onchip):
-                ref[mate, own] = x[0, :] * (mate + k).astype(jnp.float32)
-                total = total + ref[0, own] + ref[1, own] * 2 + ref[2, own] * 4 + ref[3, own] * 8
+                ref[mate, column] = x[0, :] * (mate + k).astype(jnp.float32)
+                total = (
+                    total
+                    + ref[0, column]
+                    + ref[1, column] * 2
+                    + ref[2, column] * 4
+                    + ref[3, column] * 8
+                )
             return total
 
         out[0, :] = jax.lax.fori_loop(0, 3, body, jnp.zeros(lanes))

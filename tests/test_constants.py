@@ -160,8 +160,8 @@ def test_derivatives_equal_differences():
         # of some 700 numbers, whose slopes partly cancel.
         h = 1e-4
         moved = [total(jax.tree.map(lambda v, w, s=s: v + s * h * w, start, way)) for s in (1, -1)]
-        found = sum(jax.tree.leaves(products))
-        np.testing.assert_allclose(found, (moved[0] - moved[1]) / (2 * h), rtol=1e-5)
+        derivative = sum(jax.tree.leaves(products))
+        np.testing.assert_allclose(derivative, (moved[0] - moved[1]) / (2 * h), rtol=1e-5)
 
 
 def test_later_noise_leaves_earlier_draws_alone():
@@ -242,17 +242,19 @@ def test_every_trial_has_constants_of_its_own(tmp_path):
     assert np.corrcoef(np.log(factor), shift)[0, 1] == pytest.approx(-0.8, abs=0.08)
     assert 0.8 <= friction.min() and friction.max() <= 1.1
     trial = jax.tree.map(lambda v: v[0], trials)
-    own = constants.with_trial(drawing, trial)
-    assert own.hand.material.shear_modulus == pytest.approx(90e3 * factor[0])
-    assert own.hand.material.damping_time == pytest.approx(5e-3 + shift[0])
-    tilts = [b.tilt - a.tilt for a, b in zip(drawing.hand.finger, own.hand.finger, strict=True)]
+    trial_scene = constants.with_trial(drawing, trial)
+    assert trial_scene.hand.material.shear_modulus == pytest.approx(90e3 * factor[0])
+    assert trial_scene.hand.material.damping_time == pytest.approx(5e-3 + shift[0])
+    tilts = [
+        b.tilt - a.tilt for a, b in zip(drawing.hand.finger, trial_scene.hand.finger, strict=True)
+    ]
     np.testing.assert_allclose(tilts, [0, tilt[0], 0, 0], rtol=1e-5)
     ratios = [
         b.friction / a.friction
-        for a, b in zip(drawing.objects.object, own.objects.object, strict=True)
+        for a, b in zip(drawing.objects.object, trial_scene.objects.object, strict=True)
     ]
     np.testing.assert_allclose(ratios, friction[0], rtol=1e-6)
-    assert own.objects.table.friction == drawing.objects.table.friction
+    assert trial_scene.objects.table.friction == drawing.objects.table.friction
 
 
 def test_tables_of_other_numbers_share_their_programs(tmp_path):
@@ -505,9 +507,9 @@ def test_a_number_of_a_step_may_bring_a_force_along(monkeypatch):
     monkeypatch.setitem(STEP_NUMBERS, "wind", wind)
     centre = np.array([0.1, 0.2, 0.3])
     pushing = {"wind": jnp.asarray(2.0)}
-    found = pushed("object", jnp.ones(6), 0.5, jnp.asarray(centre), pushing)
+    wrench = pushed("object", jnp.ones(6), 0.5, jnp.asarray(centre), pushing)
     expected = [*np.cross(centre, [1.0, 0.0, 0.0]), 1.0, 0.0, 0.0]
-    np.testing.assert_allclose(found - 1.0, expected, atol=1e-6)  # float32
+    np.testing.assert_allclose(wrench - 1.0, expected, atol=1e-6)  # float32
     for body, numbers in (("palm", pushing), ("object", {})):
         same = pushed(body, jnp.ones(6), 0.5, jnp.asarray(centre), numbers)
         np.testing.assert_array_equal(same, 1.0)

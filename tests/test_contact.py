@@ -77,15 +77,17 @@ def test_a_contact_is_the_least_of_a_convex_problem(gap, speed):
     with jax.enable_x64(True):
         cone = cones.make_cone(scene, MU, bodies=2, ratio=1.0)
         up = jnp.array([0.0, 0.0, 1.0])
-        one = contact.Contacts(0.0 * up, up, jnp.float64(gap), cone)
-        wanted = one.reference(speed * up)
-        pushed = jax.jit(lambda a: contact.constraint_update(one, a * up - wanted).force[2])
-        found = scipy.optimize.brentq(lambda a: MASS * (a + GRAVITY) - float(pushed(a)), -1e4, 1e4)
+        pair = contact.Contacts(0.0 * up, up, jnp.float64(gap), cone)
+        wanted = pair.reference(speed * up)
+        pushed = jax.jit(lambda a: contact.constraint_update(pair, a * up - wanted).force[2])
+        acceleration = scipy.optimize.brentq(
+            lambda a: MASS * (a + GRAVITY) - float(pushed(a)), -1e4, 1e4
+        )
     k = scene.contact.normal_stiffness
     coming = gap / h if gap > 0 else gap / (h + tau)
     after = (MASS * (speed / h - GRAVITY) - k * (h + tau) * coming) / (MASS / h + k * (h + tau))
     after = after if -k * (h + tau) * (after + coming) > 0 else speed - h * GRAVITY
-    assert speed + h * found == pytest.approx(after, abs=1e-9)
+    assert speed + h * acceleration == pytest.approx(after, abs=1e-9)
 
 
 @pytest.mark.parametrize("shape", ["box", "cylinder"])

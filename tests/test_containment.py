@@ -76,9 +76,9 @@ def test_bad_starts_are_flagged_and_in_the_outcome():
     worlds = [base._replace(**{k: 0 * base.length + v for k, v in c.items()}) for c in changes]
     trials = stack(*[still()] * len(worlds))
     fields, _ = batch_inputs(the_scene, stack(*worlds), trials)
-    found = jax.jit(partial(preflight.invalid_start, the_scene))(fields)
+    flags = jax.jit(partial(preflight.invalid_start, the_scene))(fields)
     bad = [False, True, True, True, True, True]
-    np.testing.assert_array_equal(np.asarray(found) != 0, bad)
+    np.testing.assert_array_equal(np.asarray(flags) != 0, bad)
     engine = MujocoEngine(the_scene)
     few = slice(2)
     run = jax.jit(lambda p, t: rollout.simulate(the_scene, engine, p, t)[0])
@@ -138,8 +138,8 @@ def test_failed_worlds_are_saved_and_replayed(failing_run, capsys):
 def test_all_failed_stops_with_a_diagnosis(tmp_path, capsys):
     folder = tmp_path / "run"
     sizes = ["--particles", "3", "--trials", "2", "--episodes", "2", "--test-trials", "0"]
-    own = ["--scene", str(TINY), "--engine", "mujoco", "--out", str(folder)]
-    arguments = ["optimize", *own, *sizes]
+    flags = ["--scene", str(TINY), "--engine", "mujoco", "--out", str(folder)]
+    arguments = ["optimize", *flags, *sizes]
     assert cli.main([*arguments, "--set", "limits.speed=1"]) == 1
     message = capsys.readouterr().err
     assert "every one of 6 trials failed (SPEED 6)" in message
@@ -192,8 +192,8 @@ def test_fingers_and_palm_are_as_deep_in_one_another_as_mujocos_geoms():
     with jax.enable_x64(True):
         places, between, palm, invalid = map(np.asarray, of_engines(designs))
     for i in range(len(places)):
-        one = jax.tree.map(lambda v, i=i: v[i], designs)
-        compiled = model.compile_model(the_scene, one, still())
+        design = jax.tree.map(lambda v, i=i: v[i], designs)
+        compiled = model.compile_model(the_scene, design, still())
         data = mujoco.MjData(compiled)
         data.qpos[:] = places[i]
         mujoco.mj_kinematics(compiled, data)
@@ -201,20 +201,20 @@ def test_fingers_and_palm_are_as_deep_in_one_another_as_mujocos_geoms():
         fingers = [[compiled.geom(name(f, k)).id for k in (1, 2, 3)] for f in range(4)]
         pairs = itertools.combinations(fingers, 2)
         # MuJoCo's own iteration for a sphere and a cylinder ends at 1e-6.
-        found = max(deepest(compiled, data, a, b) for a, b in pairs)
-        assert between[i] == pytest.approx(found, abs=1e-6)
+        depth = max(deepest(compiled, data, a, b) for a, b in pairs)
+        assert between[i] == pytest.approx(depth, abs=1e-6)
         disc = [compiled.geom("palm_disc").id]
         # Joints are at 1/6, 1/2 and 5/6 of the length, spheres in the middles behind them.
-        along = np.outer(one.length, [1 / 3, 2 / 3, 11 / 12])
-        beyond = (along >= one.height[:, None]) & (along >= one.length[:, None] / 4)
+        along = np.outer(design.length, [1 / 3, 2 / 3, 11 / 12])
+        beyond = (along >= design.height[:, None]) & (along >= design.length[:, None] / 4)
         free = [np.array(geoms)[far] for geoms, far in zip(fingers, beyond, strict=True)]
-        found = max(deepest(compiled, data, geoms, disc) for geoms in free if len(geoms))
-        assert palm[i] == pytest.approx(found, abs=1e-6)
+        depth = max(deepest(compiled, data, geoms, disc) for geoms in free if len(geoms))
+        assert palm[i] == pytest.approx(depth, abs=1e-6)
     deep = np.maximum(between, palm) > 0.002
     assert 0 < deep.sum() and palm.max() > 0.002
     np.testing.assert_array_equal(invalid != 0, deep)
-    found = preflight.refusals(the_scene, designs, [*map(str, range(len(deep)))])
-    assert {line.split(":")[0] for line in found} == {str(i) for i in np.flatnonzero(deep)}
+    messages = preflight.refusals(the_scene, designs, [*map(str, range(len(deep)))])
+    assert {line.split(":")[0] for line in messages} == {str(i) for i in np.flatnonzero(deep)}
 
 
 @pytest.mark.slow  # 9 s

@@ -40,7 +40,7 @@ SMALL = ["--particles", "3", "--trials", "3", "--episodes", "1", "--test-trials"
 
 def examples(program):
     """Arguments of every call of a program in the pages' code blocks, without comments."""
-    found = []
+    calls = []
     for page in PAGES:
         fenced = re.findall(r"^```(\w*)\n(.*?)^```", page.read_text(), re.S | re.M)
         blocks = [text for language, text in fenced if language in ("", "bash", "sh")]
@@ -51,8 +51,8 @@ def examples(program):
             while words and re.fullmatch(r"[A-Z_]+=\S*", words[0]):
                 words = words[1:]  # variables of the environment
             if words[:1] == [program]:
-                found.append(words[1:])
-    return found
+                calls.append(words[1:])
+    return calls
 
 
 CODESIGN = list(dict.fromkeys(shlex.join(words) for words in examples("codesign")))
@@ -203,8 +203,8 @@ def test_all_figures_are_of_one_kernel_or_their_pages_say_that_they_are_not():
 
 def links(text):
     """Files that a page links to or shows, without what lies on other hosts and in the page."""
-    found = re.findall(r"\]\(([^)\s]+)\)|^\[[^\]]+\]: (\S+)", text, re.M)
-    return [a or b for a, b in found if not re.match(r"https?:|#", a or b)]
+    targets = re.findall(r"\]\(([^)\s]+)\)|^\[[^\]]+\]: (\S+)", text, re.M)
+    return [a or b for a, b in targets if not re.match(r"https?:|#", a or b)]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
@@ -261,7 +261,7 @@ FREE = "fixed", "group", "pressure"  # tables whose keys are names
 
 def documented(page):
     """Keys of each kind of file on the page: (heading, table, key), with "" for the top level."""
-    found = set()
+    keys = set()
     heading = ""
     table = ""
     for line in page.splitlines():
@@ -271,8 +271,8 @@ def documented(page):
         elif name := re.match(r"### `\[+([a-z_.]+)\]+`", line):
             table = name[1]
         elif key := re.match(r"\| `([a-z_]+)` \|", line):
-            found.add((heading, table, key[1]))
-    return found
+            keys.add((heading, table, key[1]))
+    return keys
 
 
 def used(heading, table, values):
@@ -321,7 +321,7 @@ CONSTANT = "section", "material", "palm", "wrist", "contact", "arm"
 
 def kinds(path):
     """Kind by key of a file's constants: that of the comment in its line, or of its table."""
-    found = {}
+    kinds_by_key = {}
     table = ""
     of_table = ""
     for line in path.read_text(encoding="utf-8").splitlines():
@@ -332,8 +332,8 @@ def kinds(path):
             table = header[1]
             of_table = "".join(named)
         elif (key := re.match(r"([a-z_]+) = (?!true|false)", code)) and table in CONSTANT:
-            found[f"{table}.{key[1]}"] = "".join(named) or of_table
-    return found
+            kinds_by_key[f"{table}.{key[1]}"] = "".join(named) or of_table
+    return kinds_by_key
 
 
 def test_every_constant_is_measured_chosen_or_fitted():

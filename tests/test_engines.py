@@ -60,8 +60,8 @@ def test_vmap_is_a_larger_batch():
     mixed = jax.jit(jax.vmap(jax.vmap(engine.rollout), in_axes=(0, 3)))(two[0], moved)
     for name in ("distance", "height", "speed", "status", "last"):
         expected = np.asarray(getattr(want, name))
-        found = np.asarray(getattr(mixed, name)).reshape(expected.shape)
-        np.testing.assert_array_equal(found, expected, err_msg=name)
+        values = np.asarray(getattr(mixed, name)).reshape(expected.shape)
+        np.testing.assert_array_equal(values, expected, err_msg=name)
     shared = jax.jit(jax.vmap(engine.rollout, in_axes=(0, None)))(
         jax.tree.map(lambda v: v[:, None], fields), ctrl[:1]
     )
@@ -147,9 +147,9 @@ def test_a_trace_means_the_same_on_every_engine(decided, name, trajectory):
     # the first step, or beyond all numbers.
     assert outcome.bad_step.tolist() == [-1, 0, 11, 0, 1]
     assert outcome.status[:4].tolist() == [Status.OK, Status.PENETRATION, *[Status.NONFINITE] * 2]
-    assert all(found.status[4] & (Status.SPEED | Status.NONFINITE) for found in (ours, outcome))
+    assert all(result.status[4] & (Status.SPEED | Status.NONFINITE) for result in (ours, outcome))
     untold = {"residual": None} | ({"capped": None} if name == "mjx" else {})  # how a solver ended
-    told = (found._replace(**untold) for found in (ours, outcome))
+    told = (result._replace(**untold) for result in (ours, outcome))
     for a, b in zip(*map(jax.tree.leaves, told), strict=True):
         np.testing.assert_allclose(a[:4], b[:4])
     np.testing.assert_array_equal(ours.bad_step, outcome.bad_step)
@@ -273,8 +273,8 @@ def slopes_of_a_share(value, x, broken):
 
     part = jax.sharding.PartitionSpec("device")
     mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("device",))
-    how = {"mesh": mesh, "in_specs": part, "out_specs": part, "check_vma": False}
-    return jax.shard_map(slopes, **how)(x, broken)
+    arguments = {"mesh": mesh, "in_specs": part, "out_specs": part, "check_vma": False}
+    return jax.shard_map(slopes, **arguments)(x, broken)
 
 
 @pytest.mark.parametrize(

@@ -90,8 +90,8 @@ EXACT = 1e-4
 def written(tmp_path_factory):
     """Folder of the parts of three fingers, and what was said of them."""
     folder = tmp_path_factory.mktemp("parts")
-    found = meshes.write(folder, [USUAL, FLAT, USUAL, SHORT], Process())
-    return folder, {part.name: part for part in found}
+    printed_parts = meshes.write(folder, [USUAL, FLAT, USUAL, SHORT], Process())
+    return folder, {part.name: part for part in printed_parts}
 
 
 def test_equal_fingers_are_written_once_in_both_formats(written):
@@ -153,14 +153,14 @@ def box(low, high):
 def test_what_the_moulds_hold_is_the_finger(tmp_path, draft):
     """The closed mould's cavity, from the files: the shell; the base's pocket: the bottom wall."""
     size = USUAL
-    how = Process(draft=draft, inlet=0.0)
-    meshes.write(tmp_path, [size], how)
+    settings = Process(draft=draft, inlet=0.0)
+    meshes.write(tmp_path, [size], settings)
     length = size.length
     width, height, wall = size.base
     # Back into the frame of the finger: the tray was turned over, the core's bars stood below it.
-    tray = solid(tmp_path / "finger_0_tray.stl").translate([0, 0, -height - how.mould_wall])
+    tray = solid(tmp_path / "finger_0_tray.stl").translate([0, 0, -height - settings.mould_wall])
     tray = tray.rotate([180, 0, 0])
-    core = solid(tmp_path / "finger_0_core.stl").translate([0, 0, wall - how.mould_wall])
+    core = solid(tmp_path / "finger_0_core.stl").translate([0, 0, wall - settings.mould_wall])
     assert (tray ^ core).volume() == pytest.approx(0, abs=1e-2)  # they fit: rounding of float32
     room = box([-2, -width / 2 - 2, wall], [length + 2, width / 2 + 2, height])
     cast = room - tray - core
@@ -174,7 +174,7 @@ def test_what_the_moulds_hold_is_the_finger(tmp_path, draft):
     chamber = length - 2 * wall, size.base.chamber[0]
     shell = prism(length, width, wall, height) - prism(*chamber, wall, height - wall)
     assert cast.volume() == pytest.approx(shell, rel=EXACT)
-    base = solid(tmp_path / "finger_0_base.stl").translate([0, 0, -how.mould_wall])
+    base = solid(tmp_path / "finger_0_base.stl").translate([0, 0, -settings.mould_wall])
     pocket = box([-2, -width / 2 - 2, 0], [length + 2, width / 2 + 2, wall]) - base
     bottom = (length + 2 * side(wall)) * (width + 2 * side(wall)) * wall
     assert pocket.volume() == pytest.approx(bottom, rel=EXACT)
@@ -191,14 +191,14 @@ def test_what_the_moulds_hold_is_the_finger(tmp_path, draft):
 def test_moulds_of_a_tapered_finger_hold_it(tmp_path, root):
     """Shell and bottom wall are the finger, by Simpson's rule over its sections; walls have the
     thickness of the place."""
-    how = Process(inlet=0.0)
+    settings = Process(inlet=0.0)
     size = TAPERED._replace(root=root)
-    meshes.write(tmp_path, [size], how)
+    meshes.write(tmp_path, [size], settings)
     finger, tray, core, base = (
         solid(tmp_path / f"finger_0{kind}.stl") for kind in ("", "_tray", "_core", "_base")
     )
     assert finger.volume() == pytest.approx(size.volume, rel=EXACT)
-    made = casting.parts(size, how)
+    made = casting.parts(size, settings)
     for part, file in zip(made, (finger, tray, core, base), strict=True):
         assert part.volume() == pytest.approx(file.volume(), rel=EXACT)
     assert (made.tray ^ made.core).volume() == pytest.approx(0, abs=1e-6)
@@ -224,8 +224,8 @@ def test_moulds_of_a_tapered_finger_hold_it(tmp_path, root):
 @pytest.mark.parametrize("size", [USUAL._replace(root=10.0), TAPERED._replace(root=5.0), SHORT])
 def test_a_pin_keeps_the_inlet_free(size):
     """From outside of the tray into the core, through nothing but their holes."""
-    how = Process(inlet=2.0)
-    made = casting.parts(size, how)
+    settings = Process(inlet=2.0)
+    made = casting.parts(size, settings)
     start, end = size.chamber_ends
     depth = min(casting.PIN, (end - start) / 2)
     pin = manifold3d.Manifold.cylinder(60, 0.99, 0.99, 32).rotate([0, 90, 0])
@@ -258,23 +258,26 @@ def test_the_worth_of_a_tolerance_is_found():
     """Of 64 hands, against a hundred thousand of which that tolerance is halved."""
     truth = cast(100_000, 1).share.value
     expected = {name: cast(100_000, 1, name).share.value - truth for name in dict.fromkeys(KINDS)}
-    found = cast(64, 2)
-    assert found.needed == 23 and found.share.low < truth < found.share.high
-    gains = found.halved()
+    hand_yield = cast(64, 2)
+    assert hand_yield.needed == 23 and hand_yield.share.low < truth < hand_yield.share.high
+    gains = hand_yield.halved()
     # The ridge draws slopes to 0, so that the gain of walls, 48 points, is up to a sixth short.
     assert gains["wall"].value == pytest.approx(expected["wall"], rel=0.2)
     for name in ("length", "modulus"):
         assert gains[name].low - 0.03 < expected[name] < gains[name].high + 0.03
-    assert [row[0] for row in found.rows][0] == tolerances.KINDS["wall"].words
-    assert found.rows[0][1] == "0.5 mm" and "of 64 cast hands keep 95 % of 24" in found.summary
+    assert [row[0] for row in hand_yield.rows][0] == tolerances.KINDS["wall"].words
+    assert (
+        hand_yield.rows[0][1] == "0.5 mm"
+        and "of 64 cast hands keep 95 % of 24" in hand_yield.summary
+    )
 
 
 def test_deviations_are_those_of_each_finger():
     """A finger's own wall, at the tip as well, and the mounts and modulus of a table."""
     the_scene = scene.load("paper")
-    own, kinds = tolerances.table(the_scene, {"length": 0.0})
+    deviations, kinds = tolerances.table(the_scene, {"length": 0.0})
     assert kinds == ("wall",) * 4 + ("modulus",) + ("mount",) * 8
-    spread = {entry.key: entry.sd for entry in own.constant}
+    spread = {entry.key: entry.sd for entry in deviations.constant}
     assert spread["design.wall.2"] == pytest.approx(0.15e-3)
     assert spread["hand.material.shear_modulus"] == pytest.approx(0.05)
     assert spread["hand.finger.3.azimuth"] == 1.0
@@ -329,8 +332,8 @@ def test_drawings_stand_apart_and_within_their_pages(page, title):
         texts = [*figure.texts, *(axes.title for axes in figure.axes)]
         # Letters of a font that has no bold variant end up to a point further.
         boxes = {t.get_text(): t.get_window_extent() for t in texts if t.get_text()}
-        for (text, one), (other, two) in itertools.combinations(boxes.items(), 2):
-            assert not one.overlaps(two), (text, other)
+        for (text, first), (other, second) in itertools.combinations(boxes.items(), 2):
+            assert not first.overlaps(second), (text, other)
         for text, box in boxes.items():
             assert edge.x0 < box.x0 and box.x1 < edge.x1, text
             assert edge.y0 < box.y0 and box.y1 < edge.y1, text
@@ -344,8 +347,8 @@ def test_drawings_stand_apart_and_within_their_pages(page, title):
 def test_cuts_of_the_moulds_have_the_sections_areas(plane, at):
     """The shell and the bottom wall of a uniform finger, cut, against rectangles."""
     size = USUAL._replace(root=10.0)
-    how = Process(inlet=0)
-    first, second = mould_drawing.castings(size, how)
+    settings = Process(inlet=0)
+    first, second = mould_drawing.castings(size, settings)
     width, height, wall = size.base
     long = size.length + size.root
     chamber = (size.length - 2 * size.end) * (height - 2 * wall)
@@ -367,8 +370,8 @@ def test_cuts_of_the_moulds_have_the_sections_areas(plane, at):
     assert area(second["bottom wall"]) == pytest.approx(bottom, rel=1e-6)
     # What is poured and what the moulds are made of never share room.
     for solids in (first, second):
-        for one, two in itertools.combinations(solids.values(), 2):
-            assert (one ^ two).volume() < FINE
+        for part, other in itertools.combinations(solids.values(), 2):
+            assert (part ^ other).volume() < FINE
     # The fabric, half a millimetre thick, has its way up behind the root.
     strip = box((-10.6, -width / 2, wall + 0.1), (-10.1, width / 2, wall + 20.0))
     assert (strip ^ second["base mould"]).volume() < FINE
@@ -376,9 +379,9 @@ def test_cuts_of_the_moulds_have_the_sections_areas(plane, at):
 
 def test_letters_of_a_title(tmp_path, page):
     """Mathematics is text, what no font has is a question mark and is named."""
-    found = fonts.of_text("a\nhand $x_{2 of 日本 \U0010fffd\U0010fffd")
-    assert found.text.startswith("a hand $x_{2 of ") and found.text.endswith("??")
-    assert "\U0010fffd" in found.lacking and "a" not in found.lacking
+    rendered = fonts.of_text("a\nhand $x_{2 of 日本 \U0010fffd\U0010fffd")
+    assert rendered.text.startswith("a hand $x_{2 of ") and rendered.text.endswith("??")
+    assert "\U0010fffd" in rendered.lacking and "a" not in rendered.lacking
     the_scene, params, sizes, _ = page
     assert drawing.write(tmp_path, "\U0010fffd $\\frac", the_scene, params, sizes) == ["\U0010fffd"]
     data = (tmp_path / "build_sheet.pdf").read_bytes()
@@ -390,11 +393,11 @@ def test_letters_of_a_title(tmp_path, page):
 def test_the_sheet_s_lists_add_up(page):
     """Silicone of the solids, all fingers' castings, and what every step of the work takes."""
     the_scene, params, sizes, _ = page
-    how = Process()
-    made = palm.palm(the_scene, params, sizes, how)
+    settings = Process()
+    made = palm.palm(the_scene, params, sizes, settings)
     printed = workshop.Printed(["palm", "bar_0_1"], 1e5, made.flange, made.below)
     sections = {
-        x.title: x for x in workshop.assembly_sections(the_scene, params, sizes, how, printed)
+        x.title: x for x in workshop.assembly_sections(the_scene, params, sizes, settings, printed)
     }
     bought = {row[0]: row[1:] for row in sections["What to buy"].rows}
     solids = [casting.parts(size, Process(inlet=0)).finger.volume() for size in sizes]
@@ -457,8 +460,8 @@ def test_the_sheet_s_lists_add_up(page):
 def test_a_hand_s_silicone_is_named_or_the_nearest_is(change, named, nearest):
     plain = hand.Material(27.6e3, 1070.0, 3e-3)
     material = dataclasses.replace(plain, **change)
-    own = silicone.of_material(material)
-    assert (own and own.name) == named and silicone.nearest(
+    rubber = silicone.of_material(material)
+    assert (rubber and rubber.name) == named and silicone.nearest(
         material, neo_hookean=silicones.of_law(material.law)
     ).name == nearest
 
@@ -468,13 +471,18 @@ def test_a_hand_s_silicone_is_named_or_the_nearest_is(change, named, nearest):
 )
 def test_a_finger_that_does_nothing_is_named(page, length, pressure, idle):
     the_scene, params, _, _ = page
-    one = np.array([True, False, False, False])
+    first_finger = np.array([True, False, False, False])
     rest = params
     params = rest._replace(
-        length=np.where(one, length, rest.length), pressure=np.where(one, pressure, rest.pressure)
+        length=np.where(first_finger, length, rest.length),
+        pressure=np.where(first_finger, pressure, rest.pressure),
     )
-    found = sheet.idle_fingers(the_scene, params, process.sizes(the_scene.hand, params, Process()))
-    assert [words.startswith("finger 0 does next to nothing") for words in found] == [True] * idle
+    sentences = sheet.idle_fingers(
+        the_scene, params, process.sizes(the_scene.hand, params, Process())
+    )
+    assert [words.startswith("finger 0 does next to nothing") for words in sentences] == [
+        True
+    ] * idle
 
 
 def test_the_sheet_says_how_fingers_press_and_whence_the_object_falls(page):
@@ -535,9 +543,9 @@ def test_fingers_fit_into_the_palm(name, tmp_path):
     the_scene = scene.load("paper_spheres", hand_name=hand, overrides=HANDS[name])
     space = parameters.design_space(the_scene.hand, "full")
     params = jax.tree.map(np.asarray, space.params(space.default()))
-    how = Process()
-    sizes = process.sizes(the_scene.hand, params, how)
-    made = palm.palm(the_scene, params, sizes, how)
+    settings = Process()
+    sizes = process.sizes(the_scene.hand, params, settings)
+    made = palm.palm(the_scene, params, sizes, settings)
     meshes.write_palm(tmp_path, made)
     body = solid(tmp_path / "palm.stl")
     low = made.body.bounding_box()[2]
@@ -546,7 +554,7 @@ def test_fingers_fit_into_the_palm(name, tmp_path):
     assert low == pytest.approx(-made.below, abs=1e-6)
     assert made.below == 0 or name == "level"
     for i, (size, frame) in enumerate(zip(sizes, palm.frames(the_scene, params), strict=True)):
-        finger = casting.parts(size, how).finger.transform(frame)
+        finger = casting.parts(size, settings).finger.transform(frame)
         bar = made.bars[i].transform(frame)
         assert (body ^ finger).volume() < FINE and (body ^ bar).volume() < FINE
         # The bar presses the root by its share of the height, over the root's length and width.
@@ -560,7 +568,7 @@ def test_fingers_fit_into_the_palm(name, tmp_path):
             moved = finger.translate(frame[:, :3] @ [x, y, z])
             assert (body ^ moved).volume() > 1, (i, x, y, z)
         # Each screw cuts its thread in the palm and passes the bar; the tube comes out on top.
-        for x, y in palm.screws(size, how):
+        for x, y in palm.screws(size, settings):
             for radius, cuts in ((1.2, False), (1.5, True)):
                 screw = manifold3d.Manifold.cylinder(16, radius, radius, 32)
                 screw = screw.translate([x, y, size.pressed + process.BAR - 16]).transform(frame)
@@ -588,13 +596,13 @@ def test_the_assembly_stands_as_mujoco_has_it(page):
     mujoco.mj_kinematics(compiled, data)
     palm = data.xmat[1].reshape(3, 3)
     drawn = sheet.corners(the_scene, params, sizes)
-    for stub, size, found in zip(model.layout(the_scene).stubs, sizes, drawn, strict=True):
+    for stub, size, outline in zip(model.layout(the_scene).stubs, sizes, drawn, strict=True):
         place = 1e3 * (data.xpos[stub] - data.xpos[1]) @ palm
         turn = palm.T @ data.xmat[stub].reshape(3, 3)
         half = size.base.width / 2
         high = size.tip.height
-        np.testing.assert_allclose(found[0], place + turn @ [0, -half, 0], atol=1e-3)
-        np.testing.assert_allclose(found[6], place + turn @ [size.length, half, high], atol=1e-3)
+        np.testing.assert_allclose(outline[0], place + turn @ [0, -half, 0], atol=1e-3)
+        np.testing.assert_allclose(outline[6], place + turn @ [size.length, half, high], atol=1e-3)
 
 
 TOY = ["export", "--scene", str(TINY), "--no-parts", "--design", "length=100", "arm_z=40"]
@@ -767,9 +775,9 @@ def errors(states, trace, index):
 def test_plain_mujoco_plays_the_files_as_the_engine(grasped, tmp_path):
     the_scene, worlds, trace, judged = grasped
     assert np.isinf(judged.lost_time).tolist() == [True, False, False]
-    found = [grasps.grasp(the_scene, *world) for world in worlds]
+    simulated = [grasps.grasp(the_scene, *world) for world in worlds]
     trials = [(f"grasp_{i}", trial) for i, (_, trial) in enumerate(worlds)]
-    list(tables.write_grasps(tmp_path, the_scene, trials, found))
+    list(tables.write_grasps(tmp_path, the_scene, trials, simulated))
     for i, (name, _) in enumerate(trials):
         controls = np.loadtxt(tmp_path / f"{name}_controls.csv", delimiter=",", skiprows=1)
         xml = mujoco.MjModel.from_xml_path(str(tmp_path / f"{name}.xml"))
@@ -780,7 +788,9 @@ def test_plain_mujoco_plays_the_files_as_the_engine(grasped, tmp_path):
             assert when == judged.lost_time[i]
             # Rounding of 1e-16 grows while fingers slide on the sphere, here to 1e-11.
             assert errors(states, trace, i).max() < 1e-7
-        assert found[i].outcome.status == judged.status[i] & ~8  # plain MuJoCo tells no warnings
+        assert (
+            simulated[i].outcome.status == judged.status[i] & ~8
+        )  # plain MuJoCo tells no warnings
 
 
 def assert_declared(alone, spec, shares):
@@ -840,9 +850,9 @@ def test_spheres_stand_where_the_engine_has_its_rings(skinned):
     hand = lanes(alone, repeat(fields, 1))
     rings = np.asarray(memory_tables.ring_numbers(alone, hand, 2))[:, :, 1, 0]
     segment = params.length[1] / alone.discretization.links
-    found = skin.balls(alone, 1, params)
-    np.testing.assert_allclose([b.place for b in found], rings[:, :3], atol=1e-6)
-    np.testing.assert_allclose([b.share for b in found], rings[:, 6], rtol=1e-5)
+    spheres = skin.balls(alone, 1, params)
+    np.testing.assert_allclose([b.place for b in spheres], rings[:, :3], atol=1e-6)
+    np.testing.assert_allclose([b.share for b in spheres], rings[:, 6], rtol=1e-5)
     total = sum(share for name, share in shares.items() if name.startswith("finger_1"))
     length = params.length[1] - segment / 2  # the half link at the palm is the palm's
     assert total == pytest.approx(length / alone.hand.section.width)
@@ -1041,10 +1051,10 @@ def test_corners_of_the_arm_s_path_are_rounded(tmp_path):
     """A jump of the speed v over a mean of T is an acceleration v/T; a sine is damped by sinc."""
     ramp = np.clip(np.arange(301) - 100, 0, 100) * 1.0  # 100 mm/s from 1 s to 2 s
     rows = play_hand.read(path_of(tmp_path, ramp))
-    found = play_hand.peaks(play_hand.smoothed(rows, 0.1))
+    peaks = play_hand.peaks(play_hand.smoothed(rows, 0.1))
     # The mean has 11 poses, 0.11 s.
-    assert found["speed"] == pytest.approx(100) and found["turn"] == 0
-    assert found["acceleration"] == pytest.approx(100 / 0.11, rel=1e-6)
+    assert peaks["speed"] == pytest.approx(100) and peaks["turn"] == 0
+    assert peaks["acceleration"] == pytest.approx(100 / 0.11, rel=1e-6)
     assert play_hand.peaks(rows)["acceleration"] == pytest.approx(100 / 0.01)
     smooth = play_hand.smoothed(rows, 0.1)
     assert [smooth[0][0], smooth[-1][0]] == pytest.approx([-0.05, 3.05])
@@ -1054,14 +1064,14 @@ def test_corners_of_the_arm_s_path_are_rounded(tmp_path):
     shaken = 10 * np.sin(2 * np.pi * time)
     rows = play_hand.smoothed(play_hand.read(path_of(tmp_path, 0 * time, shaken)), 0.1)
     inside = rows[50:-50]
-    found = play_hand.peaks(inside)
+    peaks = play_hand.peaks(inside)
     # The mean of 2n+1 samples damps a sine by sin((2n+1) x) / ((2n+1) sin x), x = pi f h.
     x = np.pi * 0.01
     damped = 10 * np.sin(11 * x) / (11 * np.sin(x))
     # Means of quaternions are those of angles to the third order of 5 degrees.
-    assert found["turn"] == pytest.approx(2 * np.pi * damped, rel=2e-3)
+    assert peaks["turn"] == pytest.approx(2 * np.pi * damped, rel=2e-3)
     slow = play_hand.peaks(play_hand.slowed(inside, 2.0))
-    assert slow["turn"] == pytest.approx(found["turn"] / 2)
+    assert slow["turn"] == pytest.approx(peaks["turn"] / 2)
 
 
 def test_arm_and_valves_are_played_from_one_clock(tmp_path, capsys):
@@ -1140,14 +1150,14 @@ def test_poses_are_checked_as_they_are_sent(tmp_path, capsys, slow):
     sent = [line.split(",")[1:] for line in capsys.readouterr().out.splitlines()]
     angles = 2 * np.degrees(np.arctan2(*np.array(sent, float)[:, [5, 4]].T))
     speeds = np.diff(angles, prepend=angles[0], append=angles[-1]) / 0.01
-    found = play_hand.peaks(play_hand.prepared(play_hand.read(table), slow, 0.1, 0.01))
+    peaks = play_hand.peaks(play_hand.prepared(play_hand.read(table), slow, 0.1, 0.01))
     # Rounding to 1e-9 of a quaternion is 1e-7 degrees, by 1e-4 s^2.
-    assert found["turn"] == pytest.approx(np.abs(speeds).max(), rel=1e-3)
-    assert found["turn-acceleration"] == pytest.approx(
+    assert peaks["turn"] == pytest.approx(np.abs(speeds).max(), rel=1e-3)
+    assert peaks["turn-acceleration"] == pytest.approx(
         np.abs(np.diff(speeds)).max() / 0.01, rel=1e-3
     )
     limits = {key: most for key, (most, _) in play_hand.LIMITS.items()}
-    fast = bool(play_hand.excess(found, limits))
+    fast = bool(play_hand.excess(peaks, limits))
     assert fast == (slow < 2) and play_hand.main([*words, str(slow)]) == 2 * fast
     said = capsys.readouterr().err
     if fast:
@@ -1161,8 +1171,8 @@ def test_the_mean_is_over_real_time_at_any_slowness(tmp_path):
     ramp = np.clip(np.arange(301) - 100, 0, 100) * 1.0
     rows = play_hand.read(path_of(tmp_path, ramp))
     for slow in (1, 5, 20):
-        found = play_hand.peaks(play_hand.prepared(rows, slow, 0.1, 0.01))
-        assert found["acceleration"] == pytest.approx(100 / slow / 0.11, rel=1e-6)
+        peaks = play_hand.peaks(play_hand.prepared(rows, slow, 0.1, 0.01))
+        assert peaks["acceleration"] == pytest.approx(100 / slow / 0.11, rel=1e-6)
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="Windows has no SIGHUP")
@@ -1263,8 +1273,8 @@ def test_the_table_of_valves_is_what_the_control_commands(tmp_path):
         'interpolation = "held" },\n{ time = "approach", pressure = "pressure" },\n'
         '{ time = "lift", pressure = 0 },\n]\n'
     )
-    own = {"control": str(tmp_path / "held.toml"), "phases.settle": 0.5}
-    the_scene = scene.load("paper_spheres", overrides=own)
+    overrides = {"control": str(tmp_path / "held.toml"), "phases.settle": 0.5}
+    the_scene = scene.load("paper_spheres", overrides=overrides)
     space = parameters.design_space(the_scene.hand, "2d")
     params = jax.tree.map(np.asarray, space.params(space.default()))
     valves.write(tmp_path, the_scene, params)
@@ -1283,11 +1293,15 @@ def test_the_table_of_valves_is_what_the_control_commands(tmp_path):
 def test_command_writes_models_of_the_default_scene_s_kind(tmp_path, capsys):
     """Hull, effects that plain MuJoCo does not have, and a mesh: models without them, and notes."""
     out = tmp_path / "out"
-    own = ["effects.surface=hull", "effects.finger_finger=true", "effects.friction_memory=true"]
+    settings = [
+        "effects.surface=hull",
+        "effects.finger_finger=true",
+        "effects.friction_memory=true",
+    ]
     mug = 'name = "mug"; type = "mesh"; unit = "mm"; mass = 0.1; friction = 0.8; '
     mesh = object_file(tmp_path, f'{mug}file = "{ROOT / "objects" / "household" / "mug.stl"}"')
-    own += ["effects.neo_hookean=true", "--objects", mesh]
-    arguments = ["--scene", TINY, "--out", out, "--no-parts", "--no-sheet", "--set", *own]
+    settings += ["effects.neo_hookean=true", "--objects", mesh]
+    arguments = ["--scene", TINY, "--out", out, "--no-parts", "--no-sheet", "--set", *settings]
     assert command("export", *arguments) == 0
     said = capsys.readouterr().out
     notes = (out / "model" / "README.txt").read_text()

@@ -43,18 +43,18 @@ def test_closed_forms_of_beams(links):
     columns = [n for n in finger.MEASURED if n != "drop"]
     table = {n: np.array([pressure]) for n in ("pressure", *columns)}
     table["load"] = np.array([load])
-    found = {n: v.item() for n, v in finger.predict(mine, table).items()}
-    assert found["angle"] == pytest.approx(moment * mine.length / rigidity, rel=1e-9)
-    assert found["blocked_force"] == pytest.approx(moment / mine.length, rel=1e-12)
+    predicted = {n: v.item() for n, v in finger.predict(mine, table).items()}
+    assert predicted["angle"] == pytest.approx(moment * mine.length / rigidity, rel=1e-9)
+    assert predicted["blocked_force"] == pytest.approx(moment / mine.length, rel=1e-12)
     # At these loads geometric nonlinearity is of the square of the angles, 1e-4.
-    assert found["tip_force"] == pytest.approx(1.5 * moment / mine.length / chain, rel=1e-3)
+    assert predicted["tip_force"] == pytest.approx(1.5 * moment / mine.length / chain, rel=1e-3)
     expected = load * mine.length**3 / (3 * rigidity) * chain
-    assert found["deflection"] == pytest.approx(expected, rel=1e-3)
+    assert predicted["deflection"] == pytest.approx(expected, rel=1e-3)
     aside = expected * stiffness / mine.lateral[0]
-    assert found["sideways"] == pytest.approx(aside, rel=1e-3)
+    assert predicted["sideways"] == pytest.approx(aside, rel=1e-3)
     # A circle's chord, whose sag of the chain is 1 / (8 N^2) off at most.
-    assert found["tip_y"] == pytest.approx(moment * mine.length**2 / (2 * rigidity), rel=1e-3)
-    assert found["tip_x"] == pytest.approx(mine.length, rel=1e-3)
+    assert predicted["tip_y"] == pytest.approx(moment * mine.length**2 / (2 * rigidity), rel=1e-3)
+    assert predicted["tip_x"] == pytest.approx(mine.length, rel=1e-3)
 
 
 def synthetic(truth, noise, seed=0, columns=("angle", "tip_force")):
@@ -80,8 +80,8 @@ NOISE = {"angle": 0.02, "tip_force": 0.05, "deflection": 0.03, "sideways": 0.03}
 def of_unknown_truth(random, mine, columns, rows=4):
     """Constants drawn from the priors, and noisy values of such a finger."""
     spread = posterior.priors() | {"shear_modulus": 0.3}
-    own = mine.constants._asdict()
-    truth = {n: own[n] * np.exp(random.normal() * spread[n]) for n in own}
+    constants = mine.constants._asdict()
+    truth = {n: constants[n] * np.exp(random.normal() * spread[n]) for n in constants}
     blank = dict.fromkeys(columns, np.zeros(rows))
     table = {"pressure": np.linspace(5e3, 40e3, rows), "load": np.full(rows, 0.05), **blank}
     clean = finger.predict(mine.of_material(**truth), table)
@@ -131,9 +131,9 @@ def test_moments_are_told_from_moduli_by_forces_alone():
     mine = made(3)
     truth = mine.of_material(52e3)
     for columns, told in ((("angle",), False), (("angle", "tip_force"), True)):
-        found = finger.fit(mine, synthetic(truth, 0.02, 1, columns))
-        assert found.told["moment_factor"] == told
-    near = found.covariance[0, 1] / np.sqrt(np.prod(np.diag(found.covariance)))
+        fitted = finger.fit(mine, synthetic(truth, 0.02, 1, columns))
+        assert fitted.told["moment_factor"] == told
+    near = fitted.covariance[0, 1] / np.sqrt(np.prod(np.diag(fitted.covariance)))
     assert 0 < near < 1
 
 
@@ -146,15 +146,15 @@ def beam(links, modulus):
     extent[-1] /= 2
     mass = beam["density"] * beam["width"] * height * extent
     bodies = rest.Bodies(mass, mass * (extent**2 + height**2) / 12, extent / 2, np.zeros(links))
-    one = np.ones(1)
+    ones = np.ones(1)
     bending = 3 * modulus * beam["width"] * height**3 / 12 / (1 + 0.9 * (height / length) ** 2)
-    spring = bending / (length / links) * one
-    section = morphology.Section(height * one, 0.49 * height * one, beam["width"] * one)
+    spring = bending / (length / links) * ones
+    section = morphology.Section(height * ones, 0.49 * height * ones, beam["width"] * ones)
     constants = rest.Constants(modulus, 1.0, 1.0, 1.0, 3e-3)
-    own = rest.Finger(
-        length / links, links, section, constants, spring, 0 * one, False, spring, spring, bodies
+    cantilever = rest.Finger(
+        length / links, links, section, constants, spring, 0 * ones, False, spring, spring, bodies
     )
-    return own, beam
+    return cantilever, beam
 
 
 @pytest.mark.parametrize("weight, modulus", [(0, (94, 104)), (1, (88, 97))])
@@ -164,7 +164,7 @@ def test_a_release_gives_eth_s_modulus_and_damping(weight, modulus):
     The page has G of 88 to 101 kPa.  The damping time is decrement * period / (2 pi^2) of a small
     swing of a massless spring; here it is that of the whole curve, up to a fifth less.
     """
-    own, beam_ = beam(5, 60e3)
+    cantilever, beam_ = beam(5, 60e3)
     time = np.arange(0.0, 1.0, 0.01)
     period = beam_["period"][weight]
     fall = np.exp(-beam_["decrement"][weight] * time / period) * np.cos(2 * np.pi * time / period)
@@ -172,10 +172,10 @@ def test_a_release_gives_eth_s_modulus_and_damping(weight, modulus):
     load = blank + beam_["weight"][weight]
     drop = 1e-3 * beam_["drop"][weight] * (1 - fall)
     table = {"pressure": blank, "load": load, "time": time + 0.3, "drop": drop}
-    found = finger.fit(own, table).value
-    assert modulus[0] < found["shear_modulus"] / 1e3 < modulus[1]
+    fitted = finger.fit(cantilever, table).value
+    assert modulus[0] < fitted["shear_modulus"] / 1e3 < modulus[1]
     expected = beam_["decrement"][weight] * period / (2 * np.pi**2)
-    assert found["damping_time"] == pytest.approx(expected, rel=0.25)
+    assert fitted["damping_time"] == pytest.approx(expected, rel=0.25)
 
 
 def test_advice_names_what_was_not_measured():
@@ -183,17 +183,19 @@ def test_advice_names_what_was_not_measured():
     mine = made(3)
     truth = mine.of_material(52e3, 0.9)
     table = synthetic(truth, 0.02, 1, ("angle",))
-    found = finger.fit(mine, table)
-    best = finger.advice(mine, found, table)
-    assert [one.less for one in best] == sorted((one.less for one in best), reverse=True)
-    assert best[0].less > 0.2 and all(0 <= one.less < 1 for one in best)
-    force = next(one for one in best if "tip force" in one.words)
-    assert force.sd["moment_factor"] < 0.2 * found.sd["moment_factor"]
+    fitted = finger.fit(mine, table)
+    best = finger.advice(mine, fitted, table)
+    assert [suggestion.less for suggestion in best] == sorted(
+        (suggestion.less for suggestion in best), reverse=True
+    )
+    assert best[0].less > 0.2 and all(0 <= suggestion.less < 1 for suggestion in best)
+    force = next(suggestion for suggestion in best if "tip force" in suggestion.words)
+    assert force.sd["moment_factor"] < 0.2 * fitted.sd["moment_factor"]
     more = finger.fit(mine, synthetic(truth, 0.03, 2, ("angle", "tip_force")))
     # Five values of a usual noise, against eight whose own noise is estimated.
     assert 0.4 < more.sd["moment_factor"] / force.sd["moment_factor"] < 2
     after = finger.advice(mine, more, table)
-    again = next(one for one in after if "tip force" in one.words)
+    again = next(suggestion for suggestion in after if "tip force" in suggestion.words)
     assert again.less < force.less
 
 
@@ -210,12 +212,12 @@ def test_a_posterior_is_written_as_a_table_of_constants(tmp_path, capsys):
     assert table.law == "linear"
     keys = [entry.key for entry in table.constant]
     assert keys == ["hand.material.shear_modulus", "hand.material.moment_factor"]
-    found = finger.fit(made(3), finger.read(path))
+    fitted = finger.fit(made(3), finger.read(path))
     factors = draws.deviations(table, jax.random.key(0), 4000)
     values = np.log(factors * np.array([entry.mean for entry in table.constant]))
     # Of 4,000 draws a deviation is known to 1.1 %, a mean to 1.6 % of it.
-    np.testing.assert_allclose(values.mean(0), found.mean, atol=0.06 * values.std(0).max())
-    np.testing.assert_allclose(np.cov(values.T), found.covariance, rtol=0.15)
+    np.testing.assert_allclose(values.mean(0), fitted.mean, atol=0.06 * values.std(0).max())
+    np.testing.assert_allclose(np.cov(values.T), fitted.covariance, rtol=0.15)
     assert cli.main(line[:2] + line[3:]) == 2
     assert "--posterior is that of a fit: add --fit" in capsys.readouterr().err
 
@@ -236,8 +238,8 @@ def test_a_free_neo_hookean_finger_is_the_chain_s(pressure):
 def test_a_fit_under_the_neo_hookean_law_is_exact_without_noise():
     mine = made(3, "neo_hookean")
     truth = (52e3, 0.8)
-    found = finger.fit(mine, synthetic(mine.of_material(*truth), 0.0))
-    np.testing.assert_allclose([*found.value.values()], truth, rtol=1e-6)
+    fitted = finger.fit(mine, synthetic(mine.of_material(*truth), 0.0))
+    np.testing.assert_allclose([*fitted.value.values()], truth, rtol=1e-6)
 
 
 def test_a_file_is_read_in_its_units(tmp_path):

@@ -33,14 +33,14 @@ def grasp_of(surface):
         hand, trial = grasps.hand_world(scene)
         trial = trial._replace(arm_tilt=np.array([0.02, -0.03]), yaw=np.array(0.1))
         fields, ctrl = grasps.world_inputs(scene, hand, trial)
-        one = jax.tree.map(lambda v: np.asarray(v)[None], (fields, ctrl))
+        inputs = jax.tree.map(lambda v: np.asarray(v)[None], (fields, ctrl))
 
         def run(fields, ctrl):
             recorded = engine.recording(touch=True).rollout(fields, ctrl, trajectory=True)
             return engine.states(fields, ctrl, trajectory=True)[1], recorded
 
-        found, trace = jax.tree.map(np.asarray, jax.jit(run)(*one))
-    return scene, one, found, trace
+        states, trace = jax.tree.map(np.asarray, jax.jit(run)(*inputs))
+    return scene, inputs, states, trace
 
 
 @pytest.fixture(scope="module", params=["spheres", "hull"])
@@ -49,11 +49,11 @@ def grasp(request):
 
 
 def test_forces_on_the_object_are_what_its_momentum_gains(grasp):
-    scene, (fields, _), found, trace = grasp
+    scene, (fields, _), states, trace = grasp
     h = scene.discretization.timestep
     forces = trace.forces
     mass = fields.object_mass[0]
-    gained = np.diff(found["qvel"][0, :, -6:-3], axis=0) / h + [0, 0, scene.gravity]
+    gained = np.diff(states["qvel"][0, :, -6:-3], axis=0) / h + [0, 0, scene.gravity]
     total = (forces.finger.sum(2) + forces.palm + forces.table)[0, :-1]
     # What 100 Newton iterations leave, of a weight of one newton.
     np.testing.assert_allclose(total, mass * gained, atol=1e-4 * mass * scene.gravity)
@@ -83,9 +83,9 @@ def test_forces_of_the_rings_add_up(grasp):
 
 def test_forces_are_mujocos():
     """Of every contact, by its own solver, at the states and velocities of the path."""
-    scene, (fields, ctrl), found, trace = grasp_of("spheres")
-    own = oracles.exact(scene, grasps.nth(fields, 0))
-    data = mujoco.MjData(own)
+    scene, (fields, ctrl), states, trace = grasp_of("spheres")
+    compiled = oracles.exact(scene, grasps.nth(fields, 0))
+    data = mujoco.MjData(compiled)
     lay = model.layout(scene)
     touched = 0
     weight = fields.object_mass[0] * scene.gravity
@@ -94,18 +94,18 @@ def test_forces_are_mujocos():
     geoms = lay.spheres.reshape(len(lay.spheres), -1)
     spheres = {int(geom): place for place, geom in np.ndenumerate(geoms)}
     for k in range(5, ctrl.shape[1], 7):
-        data.qpos[:] = found["qpos"][0, k]
-        data.qvel[:] = found["qvel"][0, k]
+        data.qpos[:] = states["qpos"][0, k]
+        data.qvel[:] = states["qvel"][0, k]
         data.ctrl[:] = ctrl[0, k]
-        mujoco.mj_forward(own, data)
+        mujoco.mj_forward(compiled, data)
         forces = jax.tree.map(lambda v, k=k: v[0, k], trace.forces)
         sums = {"finger": np.zeros((2, 3)), "palm": np.zeros(3), "table": np.zeros(3)}
         rings = np.zeros_like(forces.touch["finger"].tangential)
         for i in range(data.ncon):
             contact = data.contact[i]
             force = np.zeros(6)
-            mujoco.mj_contactForce(own, data, i, force)
-            bodies = own.geom_bodyid[contact.geom]
+            mujoco.mj_contactForce(compiled, data, i, force)
+            bodies = compiled.geom_bodyid[contact.geom]
             if lay.object in bodies:
                 sign = 1 if bodies[1] == lay.object else -1  # the force on the second body
                 kind, *index = kinds[int(bodies[bodies != lay.object][0])]
@@ -135,8 +135,8 @@ def test_what_records_no_forces_is_refused():
 
     def end(height):
         params = world[0]._replace(arm=world[0].arm + height)
-        found = rollout.grasp(scene, engine, params, world[1], steps=3, record_forces=True)
-        return found.height[-1]
+        outcome = rollout.grasp(scene, engine, params, world[1], steps=3, record_forces=True)
+        return outcome.height[-1]
 
     with pytest.raises(NotImplementedError, match="has no derivative"):
         jax.eval_shape(jax.grad(end), jnp.zeros(()))
@@ -151,27 +151,27 @@ def test_a_pull_takes_the_object_as_mujocos_external_force_does(text):
     along = push.direction(text)
     space = parameters.design_space(scene.hand, "2d")
     hand = space.params(space.default())
-    one = jax.tree.map(lambda v: np.asarray(v)[None], rollout.nominal_trial(scene))
-    found = [
-        push.pull(scene, make_engine(n, scene), hand, one, along)[0]
+    trials = jax.tree.map(lambda v: np.asarray(v)[None], rollout.nominal_trial(scene))
+    pulls = [
+        push.pull(scene, make_engine(n, scene), hand, trials, along)[0]
         for n in ("structured", "mujoco")
     ]
-    expected = pulled_by_mujoco(scene, hand, one, along)
+    expected = pulled_by_mujoco(scene, hand, trials, along)
     # A step of the pull, for rounding; float32 grips a little later.
-    assert abs(found[1] - expected) < 1.5 * push.RATE * scene.discretization.timestep
-    np.testing.assert_allclose(found[0], expected, rtol=0.15)
-    assert found[0] > 1
+    assert abs(pulls[1] - expected) < 1.5 * push.RATE * scene.discretization.timestep
+    np.testing.assert_allclose(pulls[0], expected, rtol=0.15)
+    assert pulls[0] > 1
 
 
 def pulled_by_mujoco(scene, hand, trials, along):
     """The force [N] at which the object has left its place."""
     fields, ctrl = grasps.world_inputs(scene, hand, grasps.nth(trials, 0))
-    own = world_model(scene, fields)
+    compiled = world_model(scene, fields)
     lay = model.layout(scene)
     h = scene.discretization.timestep
-    data = mujoco.MjData(own)
+    data = mujoco.MjData(compiled)
     count = int(scene.last_step("lift")) + 1
-    data.qpos[:] = fields.start[: own.nq]
+    data.qpos[:] = fields.start[: compiled.nq]
 
     def place():
         return data.qpos[-7:-4] - data.qpos[:3]
@@ -185,7 +185,7 @@ def pulled_by_mujoco(scene, hand, trials, along):
         force = push.RATE * h * max(0, k - count + 1)
         data.ctrl[:] = ctrl[min(k, count - 1)]
         data.xfrc_applied[lay.object, :3] = force * along
-        mujoco.mj_step(own, data)
+        mujoco.mj_step(compiled, data)
     return np.inf
 
 

@@ -42,8 +42,8 @@ def on_cpu(tmp_path):
         def read():
             process.communicate()
             assert process.returncode == 0, "the CPU's part failed, see above"
-            with np.load(path) as found:
-                return dict(found)
+            with np.load(path) as arrays:
+                return dict(arrays)
 
         return read
 
@@ -132,13 +132,13 @@ def test_neighbours_in_a_block_change_no_bit(name):
     mixed = jax.tree.map(
         lambda v: jnp.take(v, order, v.shape.index(40)) if 40 in v.shape else v, few
     )
-    found = []
+    outputs = []
     for width, inputs in zip(widths, (few, mixed), strict=True):
         program = Program(scene, Limits(8, 8, 1e-6), backend="gpu", width=width)
-        found.append(jax.jit(program.run)(*inputs))
+        outputs.append(jax.jit(program.run)(*inputs))
     for key in ("distance", "height", "speed", "moved"):
-        want = np.asarray(found[0][key])[order]
-        np.testing.assert_array_equal(found[1][key], want, err_msg=key)
+        want = np.asarray(outputs[0][key])[order]
+        np.testing.assert_array_equal(outputs[1][key], want, err_msg=key)
 
 
 # Ten rounds of a map that doubles differences; a few roundings of 6e-8 in each.

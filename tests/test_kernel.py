@@ -86,8 +86,8 @@ def stepped(grasp):
     @jax.jit
     def run(fields, qpos, qvel, ctrl):
         start = engine.place(engine.reset(fields), qpos, qvel)
-        found, new = engine.advance(world_constants(scene, fields), start, ctrl[:, None])
-        return engine.qvel(new), found["residual"].T
+        outputs, new = engine.advance(world_constants(scene, fields), start, ctrl[:, None])
+        return engine.qvel(new), outputs["residual"].T
 
     return run
 
@@ -95,12 +95,12 @@ def stepped(grasp):
 def by_mujoco(scene, fields, *states):
     """Accelerations of a world in states of qpos, qvel and ctrl, and numbers of contacts."""
     data = mujoco.MjData(compiled := oracles.exact(scene, fields))
-    found = []
+    accelerations = []
     for state in zip(*states, strict=True):
         data.qpos[:], data.qvel[:], data.ctrl[:] = state
         mujoco.mj_forward(compiled, data)
-        found.append((data.qacc.copy(), data.ncon))
-    return map(np.array, zip(*found, strict=True))
+        accelerations.append((data.qacc.copy(), data.ncon))
+    return map(np.array, zip(*accelerations, strict=True))
 
 
 def test_float32_is_close_to_mujoco_in_contact(grasp, stepped):
@@ -109,14 +109,14 @@ def test_float32_is_close_to_mujoco_in_contact(grasp, stepped):
     The palm at 50 to 70 mm presses the straight fingers onto the table.
     """
     scene, fields, ctrl = grasp
-    own = grasps.nth(fields, 0)
-    qpos = np.repeat(own.start[None].astype(np.float32), COUNT, 0)
+    world_fields = grasps.nth(fields, 0)
+    qpos = np.repeat(world_fields.start[None].astype(np.float32), COUNT, 0)
     qpos[:, 2] = np.linspace(0.05, 0.07, COUNT)
     u = np.repeat(np.asarray(ctrl[:1, 150]), COUNT, 0)
     still = np.zeros((COUNT, qpos.shape[1] - 1), np.float32)
-    after, residual = stepped(grasps.repeat(own, COUNT), qpos, still, u)
+    after, residual = stepped(grasps.repeat(world_fields, COUNT), qpos, still, u)
     assert float(residual.max()) < 1e-6
-    acc, touching = by_mujoco(scene, own, qpos, still, u)
+    acc, touching = by_mujoco(scene, world_fields, qpos, still, u)
     error = np.linalg.norm(after / scene.discretization.timestep - acc, axis=1)
     assert (error < 1e-4 * np.linalg.norm(acc, axis=1)).all(), error
     assert min(touching) > 4  # more than the object on the table
@@ -133,23 +133,25 @@ def test_in_float32_an_object_moves_as_in_float64_under_a_far_hand(grasp, steppe
     scene, fields, ctrl = grasp
     count = COUNT
     random = np.random.default_rng(0)
-    own = grasps.nth(fields, 0)
+    world_fields = grasps.nth(fields, 0)
     ratio = np.float32(30)  # as in the scene `paper`
-    contact = dataclasses.replace(own.constants.contact, friction_ratio=ratio)
-    constants = dataclasses.replace(own.constants, contact=contact)
-    own = own._replace(constants=constants)
-    qpos, qvel = (np.zeros((count, n)) for n in (own.start.size, own.start.size - 1))
-    qpos = qpos + own.start
+    contact = dataclasses.replace(world_fields.constants.contact, friction_ratio=ratio)
+    constants = dataclasses.replace(world_fields.constants, contact=contact)
+    world_fields = world_fields._replace(constants=constants)
+    qpos, qvel = (
+        np.zeros((count, n)) for n in (world_fields.start.size, world_fields.start.size - 1)
+    )
+    qpos = qpos + world_fields.start
     u = np.repeat(np.asarray(ctrl[:1, 0]), count, 0)
     qpos[:, 2], qpos[:, -5] = 2.0, qpos[:, -5] - random.uniform(1e-5, 5e-4, count)
     qvel[:, -6:] = random.normal(size=(count, 6)) * [0.1, 0.1, 0.05, 2, 2, 2]
     u[:, :6] = qpos[:, :6]
     qpos, qvel, u = (v.astype(np.float32) for v in (qpos, qvel, u))
-    after = np.asarray(stepped(grasps.repeat(own, count), qpos, qvel, u)[0])
+    after = np.asarray(stepped(grasps.repeat(world_fields, count), qpos, qvel, u)[0])
     acc = (after.astype(float) - qvel) / scene.discretization.timestep
-    expected, touching = by_mujoco(scene, own, qpos, qvel, u)
-    found, expected = (v[:, -6:].reshape(-1, 2, 3) for v in (acc, expected))
-    errors = np.linalg.norm(found - expected, axis=2) / np.linalg.norm(expected, axis=2)
+    expected, touching = by_mujoco(scene, world_fields, qpos, qvel, u)
+    accelerations, expected = (v[:, -6:].reshape(-1, 2, 3) for v in (acc, expected))
+    errors = np.linalg.norm(accelerations - expected, axis=2) / np.linalg.norm(expected, axis=2)
     # Between both, by a factor of more than a hundred.
     assert errors.max() < 1e-3 and touching.min() > 0
 

@@ -34,8 +34,8 @@ def worlds(the_scene, count=3):
         params = parameters.params_of(space, designs)
         tilt = jnp.array([0.03, -0.05])
         trial = rollout.nominal_trial(the_scene)._replace(arm_tilt=tilt)
-        found = jax.jit(jax.vmap(lambda p: control.commands(the_scene, p, trial)))(params)
-    return jax.tree.map(np.asarray, params), np.asarray(found)
+        commands = jax.jit(jax.vmap(lambda p: control.commands(the_scene, p, trial)))(params)
+    return jax.tree.map(np.asarray, params), np.asarray(commands)
 
 
 def by_numpy(the_scene, table, params):
@@ -70,11 +70,11 @@ def by_numpy(the_scene, table, params):
         rows.append([now[axis] for axis in POSE] + [*now["pressure"]])
         held.append(frame.get("interpolation") == "held")
     time = np.arange(the_scene.num_steps) * the_scene.discretization.timestep
-    found = np.stack([np.interp(time, times, column) for column in np.transpose(rows)], 1)
+    commands = np.stack([np.interp(time, times, column) for column in np.transpose(rows)], 1)
     for i in np.flatnonzero(held):
-        found[(time >= times[i]) & (time < times[i + 1])] = rows[i]
-    x, y, z, roll, pitch, yaw = found[:, :6].T
-    return np.column_stack([x, y, z, roll + 0.03, yaw, -0.05 - pitch, found[:, 6:]])
+        commands[(time >= times[i]) & (time < times[i + 1])] = rows[i]
+    x, y, z, roll, pitch, yaw = commands[:, :6].T
+    return np.column_stack([x, y, z, roll + 0.03, yaw, -0.05 - pitch, commands[:, 6:]])
 
 
 @pytest.mark.parametrize("name", [*CONTROLS, "page"])
@@ -84,13 +84,13 @@ def test_commands_are_those_of_the_file(name, tmp_path):
     if name == "page":
         path.write_text(re.findall(r"```toml\n(.*?)```", PAGE.read_text(), re.DOTALL)[0])
     the_scene = load(path)
-    params, found = worlds(the_scene)
-    for i in range(len(found)):
-        one = jax.tree.map(lambda v, i=i: v[i], params)
-        expected = by_numpy(the_scene, tomllib.loads(path.read_text()), one)
+    params, commands = worlds(the_scene)
+    for i in range(len(commands)):
+        design = jax.tree.map(lambda v, i=i: v[i], params)
+        expected = by_numpy(the_scene, tomllib.loads(path.read_text()), design)
         # Interpolated in another order of operations: 1e-12 of the largest number.
-        np.testing.assert_allclose(found[i], expected, rtol=1e-12, atol=1e-12 * 150e3)
-        np.testing.assert_allclose(found[i][:, :6], expected[:, :6], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(commands[i], expected, rtol=1e-12, atol=1e-12 * 150e3)
+        np.testing.assert_allclose(commands[i][:, :6], expected[:, :6], rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", CONTROLS)
@@ -103,21 +103,21 @@ def test_a_control_is_written_as_it_was_read(name, tmp_path):
 
 def test_numbers_of_a_control_are_data():
     """Another number in a file, or another bound: the same structure."""
-    one = load("push_close")
+    base = load("push_close")
     other = load(
         "push_close",
         **{"control.frame.2.time": "approach + 0.5", "control.parameter.push.high": 30},
     )
-    assert one != other and one.structure == other.structure
-    assert one.structure != load("slide").structure
-    assert one.control.frame[2].time.number == 0.4
-    frames = [*one.control.frame]
+    assert base != other and base.structure == other.structure
+    assert base.structure != load("slide").structure
+    assert base.control.frame[2].time.number == 0.4
+    frames = [*base.control.frame]
     time = dataclasses.replace(frames[2].time, number=1.6)
     frames[2] = dataclasses.replace(frames[2], time=time)
-    control = dataclasses.replace(one.control, frame=tuple(frames))
+    control = dataclasses.replace(base.control, frame=tuple(frames))
     words = r"scene\.control\.frame\[3\]\.time .* 0\.8 s before"
     with pytest.raises(scene.InputError, match=words):
-        scene.constants.check(dataclasses.replace(one, control=control))
+        scene.constants.check(dataclasses.replace(base, control=control))
 
 
 FRAME = {"time": "approach"}
@@ -214,18 +214,18 @@ DOUBTS = {
 @pytest.mark.parametrize("message", DOUBTS)
 def test_what_is_hardly_meant_is_told_and_simulated(message, tmp_path):
     path = write(tmp_path, frame=DOUBTS[message], group={"few": [0]})
-    found = key_frames.doubts(load(path, **{"effects.ungrasp": False}), "control")
-    found = [text for text in found if message in text or "no key frame reads" not in text]
-    assert [text[: len(message)] for text in found] == ([message] if message else [])
+    doubts = key_frames.doubts(load(path, **{"effects.ungrasp": False}), "control")
+    doubts = [text for text in doubts if message in text or "no key frame reads" not in text]
+    assert [text[: len(message)] for text in doubts] == ([message] if message else [])
 
 
 def test_a_parameter_of_the_control_in_the_wrong_unit_is_told(tmp_path):
     squeeze = {"name": "squeeze", "unit": "Pa", "low": 0, "high": 80, "default": 40}
     frames = [{"time": 0}, FRAME | {"pressure": "squeeze"}]
-    found, _ = key_frames.doubts(
+    doubts, _ = key_frames.doubts(
         load(write(tmp_path, parameter=[squeeze], frame=frames)), "control"
     )
-    assert "parameter squeeze: the largest pressure is 80 Pa, next to none" in found
+    assert "parameter squeeze: the largest pressure is 80 Pa, next to none" in doubts
 
 
 @pytest.mark.parametrize("name", CONTROLS)
@@ -247,9 +247,9 @@ def test_a_factor_may_stand_before_and_behind_a_name(spelling):
     half = sums.Sum("Pa", None, (sums.Term("pressure", 0.5),))
     assert sums.read(spelling, "Pa") == half
     for minus in ("-", "\N{MINUS SIGN}", "\N{EN DASH}", "\N{HYPHEN}"):
-        found = sums.read(f"{spelling} {minus} 3e3 {minus} 2*push", "Pa")
-        assert found == sums.Sum("Pa", -3e3, (*half.term, sums.Term("push", -2.0)))
-        assert sums.read(sums.text(found), "Pa") == found
+        parsed = sums.read(f"{spelling} {minus} 3e3 {minus} 2*push", "Pa")
+        assert parsed == sums.Sum("Pa", -3e3, (*half.term, sums.Term("push", -2.0)))
+        assert sums.read(sums.text(parsed), "Pa") == parsed
 
 
 @pytest.mark.parametrize(

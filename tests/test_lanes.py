@@ -50,11 +50,11 @@ def test_one_program_for_closures_of_one_code_over_equal_numbers():
         (5, array, wide, other, 7 * x * y),
         (6, array, wide, other, 7 * x * y),
     ):
-        found = lanewise.lanewise(scaled(factor), left, right)
-        product = np.stack([np.asarray(part) for part in found["product"].parts.ravel()])
+        results = lanewise.lanewise(scaled(factor), left, right)
+        product = np.stack([np.asarray(part) for part in results["product"].parts.ravel()])
         np.testing.assert_allclose(product, expected, rtol=1e-6)
-        np.testing.assert_array_equal(found["first"].parts.ravel()[0], left.parts.ravel()[0])
-        assert found["one"].lane == 1.0 and len(counted) == traces
+        np.testing.assert_array_equal(results["first"].parts.ravel()[0], left.parts.ravel()[0])
+        assert results["one"].lane == 1.0 and len(counted) == traces
     assert lanewise.lanewise(jnp.multiply, half, half).parts.ravel().tolist() == [0.25, 0.0625]
 
 
@@ -98,7 +98,7 @@ def test_a_step_reads_nothing_that_it_has_not_written(monkeypatch):
     fields, ctrl = work.inputs(scene, work.make_worlds(scene, 64))
     advance = Step.advance
 
-    def spoiled(self, *args, **how):
+    def spoiled(self, *args, **kwargs):
         for table in (self.scratch, self.onchip):
             if table is not None:
                 ref = table.ref
@@ -109,17 +109,17 @@ def test_a_step_reads_nothing_that_it_has_not_written(monkeypatch):
                     return x
 
                 jax.lax.fori_loop(0, ref.shape[-2], spoil, jnp.int32(0))
-        return advance(self, *args, **how)
+        return advance(self, *args, **kwargs)
 
     monkeypatch.setattr(Step, "advance", spoiled)
     # Kernels are kept by their scene and limits: nobody else has this tolerance.
-    how = {"backend": "cpu", "width": 4 * shared_memory.TEAM, "team": shared_memory.TEAM}
-    program = Program(scene, Limits(8, 8, 1.02e-6), **how)
+    options = {"backend": "cpu", "width": 4 * shared_memory.TEAM, "team": shared_memory.TEAM}
+    program = Program(scene, Limits(8, 8, 1.02e-6), **options)
     start = StructuredEngine(scene).reset(fields)
     run = jax.jit(lambda f, c: program.simulate(world_constants(scene, f), start, c))
-    found, last = run(fields, ctrl[:, :5])
-    moved = np.asarray(found["distance"])
+    outputs, last = run(fields, ctrl[:, :5])
+    moved = np.asarray(outputs["distance"])
     assert np.isfinite(moved).all() and (np.diff(moved, axis=1) != 0).all()
-    assert np.isfinite(found["residual"]).all() and np.isfinite(last.finger).all()
+    assert np.isfinite(outputs["residual"]).all() and np.isfinite(last.finger).all()
     rows = held.rows(scene)["finger_finger"]
     assert np.abs(np.asarray(last.held[rows])).max() > 0  # some start with fingers in one another

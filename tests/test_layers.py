@@ -42,12 +42,12 @@ STUDIES = {"accuracy", "benchmark", "effects", "experiments", "search"}
 
 def modules(root=ROOT):
     """Files by the dotted names of their modules."""
-    found = {}
+    paths = {}
     for top in TOPS:
         for path in sorted((root / top).rglob("*.py")):
             parts = path.relative_to(root).with_suffix("").parts
-            found[".".join(parts).removesuffix(".__init__")] = path
-    return found
+            paths[".".join(parts).removesuffix(".__init__")] = path
+    return paths
 
 
 @functools.cache
@@ -72,9 +72,9 @@ def imports(tree, names, *, inside=True, types=True):
         elif isinstance(node, ast.ImportFrom):
             for alias in node.names:
                 full = f"{node.module}.{alias.name}"
-                found = full if full in names else node.module
-                if found in names:
-                    yield found
+                module = full if full in names else node.module
+                if module in names:
+                    yield module
         elif inside or not isinstance(node, ast.FunctionDef):
             yield from imports(node, names, inside=inside, types=types)
 
@@ -95,9 +95,13 @@ def within(mine, theirs):
     root = ["codesign_jax", "engines", "structured"]
     if mine[:3] != root or theirs[:3] != root:
         return None
-    one, two = (parts[3] if len(parts) > 3 else "" for parts in (mine, theirs))
-    if one in STRUCTURED and two in STRUCTURED and STRUCTURED.index(two) > STRUCTURED.index(one):
-        return f"{two} comes after {one}"
+    my_folder, their_folder = (parts[3] if len(parts) > 3 else "" for parts in (mine, theirs))
+    if (
+        my_folder in STRUCTURED
+        and their_folder in STRUCTURED
+        and STRUCTURED.index(their_folder) > STRUCTURED.index(my_folder)
+    ):
+        return f"{their_folder} comes after {my_folder}"
     return None
 
 
@@ -183,15 +187,15 @@ def test_no_kernel_depends_on_what_its_key_leaves_out():
     folders = {path.name for path in (ROOT / "codesign_jax").iterdir() if path.is_dir()}
     assert set(reuse.UNRELATED) <= folders
     links = graph(types=False)
-    found = set()
+    reached = set()
     left = ["codesign_jax.engines.structured.kernel.program"]
     while left:
         name = left.pop()
-        if name not in found:
-            found.add(name)
+        if name not in reached:
+            reached.add(name)
             left += links.get(name, ())
-    assert "codesign_jax.engines.structured.kernel.newton" in found
-    assert not {n for n in found if n.split(".")[1:2] and n.split(".")[1] in reuse.UNRELATED}
+    assert "codesign_jax.engines.structured.kernel.newton" in reached
+    assert not {n for n in reached if n.split(".")[1:2] and n.split(".")[1] in reuse.UNRELATED}
 
 
 def parallel(tree):

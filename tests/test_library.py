@@ -139,8 +139,8 @@ FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 
 def examples(name):
     """Tests of a public name: its own docstring and, of a module, those of what it defines."""
-    found = doctest.DocTestFinder(exclude_empty=True).find(getattr(codesign_jax, name), name)
-    return [test for test in found if test.examples]
+    tests = doctest.DocTestFinder(exclude_empty=True).find(getattr(codesign_jax, name), name)
+    return [test for test in tests if test.examples]
 
 
 # They compile kernels of the default scene, 20 s; quick: test_policy, the same calls.
@@ -207,13 +207,13 @@ with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
     cli.main(["--help"])
 print(json.dumps([found, loaded, meshes, cli.__file__, "optimize" in text.getvalue()]))
 """
-    found, fingers, meshes, path, works = run_installed(installed, program, tmp_path)
+    files, fingers, meshes, path, works = run_installed(installed, program, tmp_path)
     assert path.startswith(str(installed)) and works
     [entry] = (installed).glob("codesign_jax-*.dist-info/entry_points.txt")
     assert "codesign = codesign_jax.cli:main" in entry.read_text()
     for kind, folder in (("hands", ROOT), ("objects", ROOT), ("scenes", ROOT / "codesign_jax")):
-        assert set(found[kind]) == {p.stem for p in (folder / kind).glob("*.toml")}
-        assert all(path.startswith(str(installed)) for path in found[kind].values())
+        assert set(files[kind]) == {p.stem for p in (folder / kind).glob("*.toml")}
+        assert all(path.startswith(str(installed)) for path in files[kind].values())
     assert len(meshes) == 8 and all(path.startswith(str(installed)) for path in meshes.values())
     assert fingers["pneuflex4"] == 4 and fingers["tripod3"] == 3
 

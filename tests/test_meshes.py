@@ -48,16 +48,16 @@ def test_mass_of_a_box_in_any_pose(tmp_path):
     pose[:3, :3] = Rotation.from_rotvec([0.3, 0.9, -0.5]).as_matrix()
     pose[:3, 3] = [0.1, -0.2, 0.05]
     mesh.apply_transform(pose)
-    found = solid(tmp_path, mesh)
-    assert found.volume == pytest.approx(8 * half.prod(), rel=1e-12)
+    body = solid(tmp_path, mesh)
+    assert body.volume == pytest.approx(8 * half.prod(), rel=1e-12)
     expected = (half**2).sum() / 3 - half**2 / 3
-    np.testing.assert_allclose(np.sort(found.inertia), np.sort(expected), rtol=1e-9)
-    np.testing.assert_allclose(np.sort(found.half_sizes), half, rtol=1e-9)
+    np.testing.assert_allclose(np.sort(body.inertia), np.sort(expected), rtol=1e-9)
+    np.testing.assert_allclose(np.sort(body.half_sizes), half, rtol=1e-9)
     turned = np.zeros(9)
-    mujoco.mju_quat2Mat(turned, found.upright)
-    back = found.vertices @ turned.reshape(3, 3).T + pose[:3, 3]
+    mujoco.mju_quat2Mat(turned, body.upright)
+    back = body.vertices @ turned.reshape(3, 3).T + pose[:3, 3]
     np.testing.assert_allclose(back, mesh.vertices, atol=1e-12)
-    low = (found.hull @ turned.reshape(3, 3)[2]).min()
+    low = (body.hull @ turned.reshape(3, 3)[2]).min()
     assert -low == pytest.approx(pose[2, 3] - mesh.vertices[:, 2].min(), rel=1e-9)
 
 
@@ -65,14 +65,14 @@ def test_exact_distance_is_the_least_over_all_faces():
     """Inside, outside and in the corner of an L."""
     mesh = bracket()
     points = np.random.default_rng(1).uniform(-0.02, 0.08, (500, 3))
-    found = surface.signed_distance(mesh.vertices, mesh.faces, points)
+    distances = surface.signed_distance(mesh.vertices, mesh.faces, points)
     every = np.repeat(mesh.triangles, 500, 0), np.tile(points, (len(mesh.faces), 1))
     away = np.linalg.norm(trimesh.triangles.closest_point(*every) - every[1], axis=1)
-    np.testing.assert_allclose(np.abs(found), away.reshape(-1, 500).min(0), atol=1e-15)
+    np.testing.assert_allclose(np.abs(distances), away.reshape(-1, 500).min(0), atol=1e-15)
     x, y, z = points.T
     inside = (0 < y) & (y < 0.044) & (0 < x) & (x < 0.064) & (0 < z) & (z < 0.064)
     inside &= (x < 0.022) | (z < 0.022)
-    np.testing.assert_array_equal(found < 0, inside)
+    np.testing.assert_array_equal(distances < 0, inside)
 
 
 @pytest.mark.parametrize("bound", [5e-4, pytest.param(3e-4, marks=pytest.mark.slow)])
@@ -157,9 +157,9 @@ def test_a_surface_that_cuts_through_itself(tmp_path):
     """Two overlapping boxes are watertight and wound alike, but no body."""
     other = box()
     other.apply_translation([0.02, 0.01, 0])
-    found = solid(tmp_path, trimesh.util.concatenate([box(), other]), voxel_error=1e-3)
+    merged = solid(tmp_path, trimesh.util.concatenate([box(), other]), voxel_error=1e-3)
     with pytest.raises(schema.InputError, match="cuts through itself"):
-        _ = found.grid
+        _ = merged.grid
 
 
 def test_parts_that_overlap_are_named_where_they_have_no_grid(tmp_path, monkeypatch):
@@ -236,9 +236,9 @@ def test_an_obj_of_many_groups_is_read_as_one_without(group, tmp_path, monkeypat
     path.write_text("\n".join(text))
     load = trimesh.load_mesh
 
-    def loaded(file, **how):
+    def loaded(file, **options):
         assert not any(word in file.getvalue() for word in (b"usemtl", b"g a", b"o a", b"s "))
-        return load(file, **how)
+        return load(file, **options)
 
     monkeypatch.setattr(trimesh, "load_mesh", loaded)
     after = reading.read(path)
@@ -410,8 +410,8 @@ def test_primitives_and_meshes_share_a_batch_and_a_program(grasps):
     """In the kernel's blocks of a few worlds, whose other worlds change no bit of a world."""
     *_, path, _ = grasps
     for value in path:
-        one, reverse = np.split(value, 2)
-        np.testing.assert_array_equal(one[::-1], reverse)
+        forward, reverse = np.split(value, 2)
+        np.testing.assert_array_equal(forward[::-1], reverse)
 
 
 def test_the_kernel_balances_all_forces_on_meshes(grasps):
@@ -440,8 +440,8 @@ def test_accelerations_of_a_meshed_box_equal_mujoco(grasps, tmp_path):
     with jax.enable_x64(True):
         trial = stack(trials["mesh box"]._replace(shape=np.int32(0)))
         fields, ctrl = batch_inputs(twin, stack(params), trial)
-        own = oracles.Path(*(v[world] for v in path))
-        errors, _, touching = oracles.against_mujoco(twin, fields, np.asarray(ctrl), own)
+        box_path = oracles.Path(*(v[world] for v in path))
+        errors, _, touching = oracles.against_mujoco(twin, fields, np.asarray(ctrl), box_path)
     # The grid's distances are float32: 2e-9 m at 30 mm, of the 1e-3 m that the fingers press in;
     # 1e-7 measured.
     assert errors.max() < 1e-6

@@ -73,8 +73,8 @@ def worlds(request):
 
 def noisy(objects):
     """Numbers of an object set with noise of friction, stiffness and the hand's masses."""
-    one = np.ones_like(objects.noise.position)
-    noise = {"friction": 0.3 * one, "stiffness": 0.2 * one, "hand_mass": 0.2 * one}
+    ones = np.ones_like(objects.noise.position)
+    noise = {"friction": 0.3 * ones, "stiffness": 0.2 * ones, "hand_mass": 0.2 * ones}
     return dataclasses.replace(objects, noise=dataclasses.replace(objects.noise, **noise))
 
 
@@ -152,22 +152,22 @@ def test_implicit_springs_equal_mujocos_discrete_integrator():
     twin, stiffness = discrete_twin(the_scene, params, trial)
     twin.jnt_stiffness[:6] = stiffness[:6]
     twin.actuator_gainprm[:6, 0] = twin.actuator_biasprm[:6, 1] = 0.0
-    one = mujoco.MjData(ours)
+    data = mujoco.MjData(ours)
     other = mujoco.MjData(twin)
     worst = 0.0
     for step in range(100):
         target = np.array([0.0, 0.01, 0.02, 0.1, 0.0, 0.3]) * step / 100
-        one.ctrl[:6] = target
-        one.ctrl[6:] = 1200.0 * step
-        other.ctrl[:] = one.ctrl
+        data.ctrl[:6] = target
+        data.ctrl[6:] = 1200.0 * step
+        other.ctrl[:] = data.ctrl
         other.qfrc_applied[:6] = stiffness[:6] * target
         for name in ("qpos", "qvel"):
-            getattr(other, name)[:] = getattr(one, name)
-        mujoco.mj_step(ours, one)
+            getattr(other, name)[:] = getattr(data, name)
+        mujoco.mj_step(ours, data)
         mujoco.mj_step(twin, other)
         # The object falls on the table in both; only the hand is compared.
-        worst = max(worst, np.abs(one.qacc[:-6] - other.qacc[:-6]).max())
-    assert np.abs(one.qpos[6:-7]).max() > 0.05  # it did bend
+        worst = max(worst, np.abs(data.qacc[:-6] - other.qacc[:-6]).max())
+    assert np.abs(data.qpos[6:-7]).max() > 0.05  # it did bend
     # Accelerations of up to 10 rad/s^2 to rounding, with the condition of M (measured 3e-13).
     assert worst < 1e-11
 
@@ -195,7 +195,7 @@ def test_every_kind_of_pair_has_its_own_numbers():
         ("finger", "palm"): 0.51,
     }
     c = the_scene.contact
-    found = set()
+    kinds = set()
     for i in range(compiled.npair):
         pair = compiled.pair_geom1[i], compiled.pair_geom2[i]
         kind = tuple(sorted(compiled.geom(g).name.split("_")[0] for g in pair))
@@ -210,5 +210,5 @@ def test_every_kind_of_pair_has_its_own_numbers():
         # MuJoCo divides by d^2 and multiplies by d.
         spring, damper = -compiled.pair_solref[i] / d
         np.testing.assert_allclose([spring * mass, damper * h], [stiffness, 1.0], rtol=1e-9)
-        found.add(kind)
-    assert found == set(want)
+        kinds.add(kind)
+    assert kinds == set(want)

@@ -86,13 +86,13 @@ def optimizer(request):
 
 @pytest.mark.slow  # 12 s; quick: populations are evosax's
 def test_each_finds_the_minimum_better_than_random_search():
-    found = {}
+    lowest = {}
     for name in NAMES:
         made = make_optimizer(name, SPACE)
-        found[name] = sphere(np.asarray(run(made, start(made), OPEN)[0].particles)).min()
-    assert all(found[name] < found["random"] for name in set(NAMES) - {"random"}), found
+        lowest[name] = sphere(np.asarray(run(made, start(made), OPEN)[0].particles)).min()
+    assert all(lowest[name] < lowest["random"] for name in set(NAMES) - {"random"}), lowest
     # Random search is better than a random design, and CMA-ES converges linearly on a sphere.
-    assert found["random"] < 2 and found["cma-es"] < 0.02, found
+    assert lowest["random"] < 2 and lowest["cma-es"] < 0.02, lowest
 
 
 def by_evosax(name, count, std):
@@ -101,17 +101,19 @@ def by_evosax(name, count, std):
 
     zeros = jnp.zeros(WIDTH)
     if name == "cma-es":
-        own = algorithms.CMA_ES(count, zeros)
-        return own, own.default_params.replace(std_init=jnp.float32(std))
+        strategy = algorithms.CMA_ES(count, zeros)
+        return strategy, strategy.default_params.replace(std_init=jnp.float32(std))
     if name == "open-es":
         descent = optax.sgd(np.sqrt(2 * np.pi * WIDTH) * 2 / 3 * std**2)
         schedule = optax.constant_schedule(std)
-        own = algorithms.Open_ES(count, zeros, optimizer=descent, std_schedule=schedule)
+        strategy = algorithms.Open_ES(count, zeros, optimizer=descent, std_schedule=schedule)
     elif name == "pso":
-        own = algorithms.PSO(count, zeros)
+        strategy = algorithms.PSO(count, zeros)
     else:
-        own = algorithms.RandomSearch(count, zeros, partial(jax.random.uniform, shape=(WIDTH,)))
-    return own, own.default_params
+        strategy = algorithms.RandomSearch(
+            count, zeros, partial(jax.random.uniform, shape=(WIDTH,))
+        )
+    return strategy, strategy.default_params
 
 
 @pytest.mark.parametrize("name", EVOSAX)
@@ -123,15 +125,15 @@ def test_populations_are_those_of_evosax_called_directly(name):
     def key(stream, episode):
         return jax.random.fold_in(jax.random.fold_in(jax.random.key(0), stream), episode)
 
-    own, params = by_evosax(name, PARTICLES, 0.25 if name == "cma-es" else 0.15)
+    strategy, params = by_evosax(name, PARTICLES, 0.25 if name == "cma-es" else 0.15)
     begun = ((SEED - LOW) / (HIGH - LOW),)
     if name == "pso":
         swarm = jax.random.uniform(key(evolution.STREAM_START, 0), (PARTICLES, WIDTH))
         begun = swarm.at[0].set(begun[0]), jnp.full(PARTICLES, jnp.inf)
-    state = own.init(key(0, 0), *begun, params)
+    state = strategy.init(key(0, 0), *begun, params)
     free = np.arange(WIDTH) != LIMITED
     for episode in range(count):
-        asked, state = own.ask(key(evolution.STREAM_ASK, episode), state, params)
+        asked, state = strategy.ask(key(evolution.STREAM_ASK, episode), state, params)
         folded = 1 - np.abs(1 - np.asarray(asked, np.float64) % 2)  # mirrors at 0 and 1
         evaluated = (ours[episode] - LOW) / (HIGH - LOW)
         # Two programs round differently, by 1e-7, which the eigenvectors of a covariance near
@@ -139,7 +141,7 @@ def test_populations_are_those_of_evosax_called_directly(name):
         np.testing.assert_allclose(evaluated[:, free], folded[:, free], rtol=0, atol=5e-4)
         # The costs themselves, of which CMA-ES makes its ranks.
         told = key(evolution.STREAM_TELL, episode), asked, infos[episode].cost
-        state, _ = own.tell(*told, state, params)
+        state, _ = strategy.tell(*told, state, params)
 
 
 def test_the_default_averages_the_means_of_evosax():
@@ -155,13 +157,13 @@ def test_the_default_averages_the_means_of_evosax():
     kept = np.sort(costs[:3], axis=None)[:PARTICLES]
     np.testing.assert_allclose(costs[3:], [kept, kept], rtol=1e-6)  # sorted: no noise here
     count = PARTICLES - 2
-    own, params = by_evosax("open-es", count, 0.15)
+    evosax_strategy, params = by_evosax("open-es", count, 0.15)
     keys = [
         jax.random.fold_in(jax.random.fold_in(jax.random.key(0), stream), 5)
         for stream in (screened.STREAM_MOVE, screened.STREAM_TELL)
     ]
-    begun = own.init(jax.random.key(1), best, params)
-    asked, strategy = own.ask(keys[0], begun, params)
+    begun = evosax_strategy.init(jax.random.key(1), best, params)
+    asked, strategy = evosax_strategy.ask(keys[0], begun, params)
     near = partial(np.testing.assert_allclose, rtol=0, atol=1e-5)  # float32
     average = best
     for t in range(1, 4):
@@ -173,7 +175,7 @@ def test_the_default_averages_the_means_of_evosax():
             drawn = unit[1 : count + 1]
             costs = info.cost[1 : count + 1]
             near(drawn[:, free], 1 - np.abs(1 - np.asarray(asked)[:, free] % 2))
-            near(mean, own.tell(keys[1], asked, costs, strategy, params)[0].mean)
+            near(mean, evosax_strategy.tell(keys[1], asked, costs, strategy, params)[0].mean)
             rest = np.broadcast_to(best, (PARTICLES - 1 - count, WIDTH))
             near(unit[count + 1 :, free], rest[:, free])
         average = average + 4 / (t + 3) * (mean - average)

@@ -175,8 +175,8 @@ def test_groups_of_fingers_share_a_value(tied, names, fingers):
     low = (60.0, 70.0, 80.0, 90.0)
     high = (100.0, 110.0, 120.0, 130.0)
     free = (hand.Free("length", tied, low, high), hand.Free("pressure", tied), hand.Free("wall"))
-    own = dataclasses.replace(HAND, preset=(hand.Preset("own", free),))
-    space = parameters.design_space(own, "own")
+    tied_hand = dataclasses.replace(HAND, preset=(hand.Preset("own", free),))
+    space = parameters.design_space(tied_hand, "own")
     lengths = [n for n in space.names if n.startswith("length")]
     assert lengths == names
     values = np.asarray(space.default(), np.float32)
@@ -192,9 +192,9 @@ def test_groups_of_fingers_share_a_value(tied, names, fingers):
     pressures = [n.startswith("pressure") for n in space.names]
     design[pressures] = 150e3
     design[[n.startswith("wall") for n in space.names]] = walls
-    found = np.asarray(space.project(design))[pressures]
+    allowed = np.asarray(space.project(design))[pressures]
     limits = [min(walls[i] for i in range(4) if fingers[i] == k) * 40e6 for k in range(len(names))]
-    np.testing.assert_allclose(found, np.minimum(limits, 150e3), rtol=1e-5)
+    np.testing.assert_allclose(allowed, np.minimum(limits, 150e3), rtol=1e-5)
 
 
 THUMB = hand.load("thumb4")
@@ -230,9 +230,9 @@ def test_sampled_designs_are_legal_and_uniform_where_no_limit_acts(the_hand):
     thick = np.ones(designs.shape, bool)
     thick[:, free] = limit > space.high[free]
     scaled = (designs - space.low) / (space.high - space.low)
-    found = [stats.kstest(scaled[thick[:, k], k], "uniform").pvalue for k in range(len(free))]
+    p_values = [stats.kstest(scaled[thick[:, k], k], "uniform").pvalue for k in range(len(free))]
     # The smallest of 23 p-values of a true hypothesis is below 1e-4 once in 400 seeds.
-    assert min(found) > 1e-4
+    assert min(p_values) > 1e-4
     lowered = (np.asarray(params.pressure) > limit * (1 - 1e-5)).any(1).mean()
     assert 0.2 < lowered < 0.5  # so the limit was met
 

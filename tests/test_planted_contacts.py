@@ -66,8 +66,8 @@ def place(stage, **wrong):
     """Wrong fields of a contact."""
 
     def change(right, *args):
-        found = right(*args)
-        return found._replace(**{name: f(getattr(found, name)) for name, f in wrong.items()})
+        result = right(*args)
+        return result._replace(**{name: f(getattr(result, name)) for name, f in wrong.items()})
 
     return Fault({stage: change})
 
@@ -81,8 +81,8 @@ def one_stiffness(right, first, *rest):
 
 def unwanted(right, margin, where, cone, motion, velocity):
     """Accelerations over what is wanted as if nothing were."""
-    found, jar = right(margin, where, cone, motion, velocity)
-    return found, jar - right(margin, where, cone, 0 * motion, velocity)[1]
+    contact, jar = right(margin, where, cone, motion, velocity)
+    return contact, jar - right(margin, where, cone, 0 * motion, velocity)[1]
 
 
 def at_rest(right, margin, where, cone, motion, velocity):
@@ -92,8 +92,8 @@ def at_rest(right, margin, where, cone, motion, velocity):
 
 def touched(right, margin, where, *rest):
     """Only what touches at the step's beginning is a contact."""
-    found, jar = right(margin, where, *rest)
-    return found._replace(share=jnp.where(found.gap < 0, found.share, 0.0)), jar
+    contact, jar = right(margin, where, *rest)
+    return contact._replace(share=jnp.where(contact.gap < 0, contact.share, 0.0)), jar
 
 
 def half_gap(right, margin, where, *rest):
@@ -130,8 +130,8 @@ def not_emptied(right, mine, self, row):
 
 def no_flag(right, mine, self):
     """Too few slots are not told."""
-    found = right(self)
-    return jnp.where(mine, 0 * found, found)
+    flag = right(self)
+    return jnp.where(mine, 0 * flag, flag)
 
 
 def own_half(right, mine, self, item, pairing):
@@ -148,8 +148,8 @@ def one_side(right, mine, self, item, field, more, *rest):
 
 def pulled(right, *args):
     """Both sides of a sphere's contact with the palm are pushed the wrong way."""
-    found = right(*args)
-    return found._replace(normal=-found.normal)
+    contact = right(*args)
+    return contact._replace(normal=-contact.normal)
 
 
 def passed_over(right, mine, self, busy):
@@ -157,16 +157,16 @@ def passed_over(right, mine, self, busy):
     return right(self, busy & ~mine)
 
 
-def on_parent(right, mine, self, row, which, owner, one, other, alike):
+def on_parent(right, mine, self, row, which, owner, side, other, alike):
     """Contacts between fingers act on the link before theirs."""
-    behind = lanewise(lambda r: jnp.maximum(r - 1, 0), one["row"])
-    right(self, row, which, owner, one | {"row": chosen(mine, behind, one["row"])}, other, alike)
+    behind = lanewise(lambda r: jnp.maximum(r - 1, 0), side["row"])
+    right(self, row, which, owner, side | {"row": chosen(mine, behind, side["row"])}, other, alike)
 
 
-def same_way(right, mine, self, row, which, owner, one, other, alike):
+def same_way(right, mine, self, row, which, owner, side, other, alike):
     """Both fingers are pushed the same way."""
-    other = other | {"normal": chosen(mine, one["normal"], other["normal"])}
-    right(self, row, which, owner, one, other, alike)
+    other = other | {"normal": chosen(mine, side["normal"], other["normal"])}
+    right(self, row, which, owner, side, other, alike)
 
 
 def without_last(right, *args):
@@ -228,7 +228,7 @@ HULL = {
     "fingers hold by one contact": Fault({HOLD: lambda f, sums, *rest: f(0 * sums, *rest)}, NEXT),
     "rings hold nothing": Fault({RINGS_HELD: lambda f, jar, *rest: jar}, later=True),
     "rings hold the other way": Fault({RINGS_HOLD: lambda f, *a: -f(*a)}, NEXT),
-    "what rings hold does not turn": Fault({TURN: lambda f, columns, own: own}, later=True),
+    "what rings hold does not turn": Fault({TURN: lambda f, columns, hold: hold}, later=True),
     # slots
     "a pairing has one slot": Fault({}, methods={(BoundSlots, "add"): first_only}),
     "a slot of the step before": Fault(
@@ -269,7 +269,7 @@ class Worlds(NamedTuple):
     """
 
     faults: dict[str, Fault]
-    found: dict[str, np.ndarray]
+    outputs: dict[str, np.ndarray]
     solve: Callable
     start: tuple
     short: np.ndarray
@@ -277,7 +277,7 @@ class Worlds(NamedTuple):
 
     def error(self, world, step=0, *, short=False):
         """Relative error of a step's accelerations."""
-        qpos, qvel = (self.found[name][world, step:] for name in ("qpos", "qvel"))
+        qpos, qvel = (self.outputs[name][world, step:] for name in ("qpos", "qvel"))
         expected = self.solve(qpos[0], qvel[0], self.start[1])[0] if step else self.start[0]
         expected = self.short if short else expected
         acc = (qvel[1] - qvel[0]) / self.timestep
@@ -312,17 +312,17 @@ def simulated(surface):
         with planted(faults):
             run = jax.jit(partial(simulate, scene, iterations=ITERATIONS[surface]))
             ctrl = jnp.asarray(np.repeat(ctrl[:, None], 3, 1))
-            found = run(fields, (qpos, qvel), ctrl, np.arange(len(each)))
+            outputs = run(fields, (qpos, qvel), ctrl, np.arange(len(each)))
     solve = partial(solved, scene, *states["main"][:2])
-    found = jax.tree.map(np.asarray, found)
+    outputs = jax.tree.map(np.asarray, outputs)
     start = len(faults)
     held = np.zeros(3), np.zeros((scene.num_fingers, 3)), {}
-    start = solve(found["qpos"][start, 0], found["qvel"][start, 0], held)
+    start = solve(outputs["qpos"][start, 0], outputs["qvel"][start, 0], held)
     assert surface == "hull" or min(kinds(*states["main"][:2])) > 0
     assert surface == "hull" or on_palm(*states["main"][:2]) > 0
     model, data, _ = states[SHORT]
     short = solved(scene, model, data, data.qpos.copy(), data.qvel.copy(), held, 0.012)[0]
-    return Worlds(faults, found, solve, start, short, scene.discretization.timestep)
+    return Worlds(faults, outputs, solve, start, short, scene.discretization.timestep)
 
 
 def solved(scene, model, data, qpos, qvel, held, length=0.1):
@@ -341,19 +341,23 @@ def solved(scene, model, data, qpos, qvel, held, length=0.1):
     print(dense.num_hull, dense.pairs, dense.on_palm, dense.ahead, dense.itself)
     first = not np.any(held[0]) and length == 0.1
     assert not first or min(dense.pairs, dense.on_palm, dense.itself, 4 * dense.ahead) > 3
-    found = dense.solve()
-    own = np.array([dense.next_grip(f) for f in range(scene.num_fingers)])
+    acceleration = dense.solve()
+    grips = np.array([dense.next_grip(f) for f in range(scene.num_fingers)])
     holds = dense.next_holds()
     # Some contact of each kind holds something that the second step begins with.
     kinds = {name if isinstance(name, str) else name[2] for name, g in holds.items() if g.any()}
     assert not first or kinds >= {True, "lowest"}
-    return found, (dense.next_grip(), own, holds), dense.normal_forces(scene.num_fingers + 1)
+    return (
+        acceleration,
+        (dense.next_grip(), grips, holds),
+        dense.normal_forces(scene.num_fingers + 1),
+    )
 
 
 def pressing(scene, model, data):
     """MuJoCo's normal forces between fingers and, last, on the palm."""
     lay = layout(scene)
-    found = np.zeros([scene.num_fingers + 1] * 2)
+    pressed = np.zeros([scene.num_fingers + 1] * 2)
     sides = {body: f for f, row in enumerate(lay.bodies) for body in (*row, lay.stubs[f])}
     sides[model.body("palm").id] = -1
     for i in range(data.ncon):
@@ -362,9 +366,9 @@ def pressing(scene, model, data):
         ends = [sides.get(int(body)) for body in model.geom_bodyid[geoms]]
         mujoco.mj_contactForce(model, data, i, force)
         if None not in ends:
-            found[*ends] += force[0]
-            found[*ends[::-1]] += force[0]
-    return found
+            pressed[*ends] += force[0]
+            pressed[*ends[::-1]] += force[0]
+    return pressed
 
 
 @pytest.mark.slow  # 35 s; quick: the same worlds' accelerations
@@ -375,8 +379,8 @@ def test_recorded_forces_are_the_oracle_s(surface):
     scene = scene_of(surface)
     sound = len(worlds.faults)
     fingers = scene.num_fingers
-    names = [n for n in ("qpos", "qvel", "acc", "held") if n in worlds.found]
-    state = [worlds.found[n][sound, :2] for n in names]
+    names = [n for n in ("qpos", "qvel", "acc", "held") if n in worlds.outputs]
+    state = [worlds.outputs[n][sound, :2] for n in names]
     with jax.enable_x64(True):
         fields = grasps.nth(curled(scene, *STATES[surface]["main"])[2], 0)
         fields = grasps.repeat(fields, 2)
@@ -386,12 +390,14 @@ def test_recorded_forces_are_the_oracle_s(surface):
             here = coordinates.make(scene, *state)
             return forces(scene, world_constants(scene, fields), here, here.acc)
 
-        found = jax.tree.map(np.asarray, run(fields, state))
+        recorded = jax.tree.map(np.asarray, run(fields, state))
     second = worlds.solve(state[0][1], state[1][1], worlds.start[1])
     for k, expected in enumerate((worlds.start[2], second[2])):
         largest = expected.max()
-        np.testing.assert_allclose(found.finger_finger[k], expected[:-1, :-1], atol=1e-6 * largest)
-        np.testing.assert_allclose(found.finger_palm[k], expected[-1, :-1], atol=1e-6 * largest)
+        np.testing.assert_allclose(
+            recorded.finger_finger[k], expected[:-1, :-1], atol=1e-6 * largest
+        )
+        np.testing.assert_allclose(recorded.finger_palm[k], expected[-1, :-1], atol=1e-6 * largest)
         assert (expected[0, 1] > 0) and (expected[-1] > 0).any()
         assert np.diag(expected[:fingers, :fingers]).any() == (surface == "hull")
 
@@ -403,11 +409,11 @@ def test_sound_worlds_equal_the_oracle(surface):
     sound = len(worlds.faults)
     assert worlds.error(sound) < BOUND
     assert worlds.error(sound, 1) < 2 * BOUND  # see `ITERATIONS`
-    assert not worlds.found["overflow"][sound].any()
+    assert not worlds.outputs["overflow"][sound].any()
     assert worlds.error(sound + 1, short=True) < BOUND
-    assert not worlds.found["overflow"][sound + 1].any()
+    assert not worlds.outputs["overflow"][sound + 1].any()
     if surface == "hull":
-        assert (worlds.found["overflow"][sound + 2 :, 0] == 1).all()
+        assert (worlds.outputs["overflow"][sound + 2 :, 0] == 1).all()
 
 
 @pytest.mark.parametrize(
@@ -424,4 +430,4 @@ def test_a_planted_fault_is_noticed(surface, name):
     elif fault.check == SHORT:
         assert not worlds.error(world, short=True) < 100 * BOUND
     else:
-        assert worlds.found["overflow"][world, 0] == 0
+        assert worlds.outputs["overflow"][world, 0] == 0

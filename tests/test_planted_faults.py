@@ -170,8 +170,8 @@ def wrong():
     with jax.enable_x64(True), planted(FAULTS):
         scene = grasps.pinch("box", links=2, effects__palm_object=False, effects__palm_table=False)
         fields, state, ctrl = touching(scene)
-        found = jax.jit(partial(simulate, scene))(fields, state, ctrl, np.arange(len(ctrl)))
-    path = oracles.Path(*(np.asarray(found[n]) for n in oracles.Path._fields))
+        outputs = jax.jit(partial(simulate, scene))(fields, state, ctrl, np.arange(len(ctrl)))
+    path = oracles.Path(*(np.asarray(outputs[n]) for n in oracles.Path._fields))
     return scene, fields, np.asarray(ctrl), path
 
 
@@ -205,24 +205,26 @@ def touching(scene):
 def errors(wrong, world):
     """Errors of a world's steps by what is compared with MuJoCo C."""
     scene, fields, ctrl, path = wrong
-    one = slice(world, world + 1)
-    own = oracles.Path(*(v[one] for v in path))
-    batch = jax.tree.map(lambda v: v[one], fields)
-    acceleration, far, touching = oracles.against_mujoco(scene, batch, ctrl[one], own)
+    row = slice(world, world + 1)
+    trajectory = oracles.Path(*(v[row] for v in path))
+    batch = jax.tree.map(lambda v: v[row], fields)
+    acceleration, far, touching = oracles.against_mujoco(scene, batch, ctrl[row], trajectory)
     compiled = world_model(scene, grasps.nth(fields, world))
     moved = []
-    for qpos, qvel, after in zip(own.qpos[0], own.qvel[0, 1:], own.qpos[0, 1:], strict=False):
+    for qpos, qvel, after in zip(
+        trajectory.qpos[0], trajectory.qvel[0, 1:], trajectory.qpos[0, 1:], strict=False
+    ):
         expected = qpos.copy()
         mujoco.mj_integratePos(compiled, expected, qvel, scene.discretization.timestep)
         moved.append(np.abs(expected - after).max())
-    found = {"acceleration": acceleration.max(), "position": np.max(moved), "distance": far.max()}
-    return found, touching
+    largest = {"acceleration": acceleration.max(), "position": np.max(moved), "distance": far.max()}
+    return largest, touching
 
 
 def test_the_sound_world_equals_mujoco(wrong):
     """All checks pass without a fault, and everything touches that a fault could hide in."""
-    found, touching = errors(wrong, len(FAULTS))
-    assert all(found[name] < bound for name, bound in BOUNDS.items()), found
+    largest, touching = errors(wrong, len(FAULTS))
+    assert all(largest[name] < bound for name, bound in BOUNDS.items()), largest
     assert touching.max() >= 4 and touching.min() > 0
 
 
@@ -230,5 +232,5 @@ def test_the_sound_world_equals_mujoco(wrong):
 def test_a_planted_fault_is_noticed(wrong, name):
     """By a hundred times its bound, or because nothing is left but NaN."""
     check = FAULTS[name].check
-    found, _ = errors(wrong, list(FAULTS).index(name))
-    assert not found[check] < 100 * BOUNDS[check], found
+    largest, _ = errors(wrong, list(FAULTS).index(name))
+    assert not largest[check] < 100 * BOUNDS[check], largest

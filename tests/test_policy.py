@@ -54,7 +54,7 @@ def worlds():
     @jax.jit
     def run(params, trials):
         ways = [{}, {"record_forces": True}]
-        return [rollout.simulate(SCENE, engine, params, trials, **how) for how in ways]
+        return [rollout.simulate(SCENE, engine, params, trials, **options) for options in ways]
 
     return inputs, *run(*inputs)
 
@@ -81,15 +81,18 @@ def test_who_replays_the_key_frames_simulates_the_open_loop(worlds):
 
     @jax.jit
     def run(params, trials):
-        found = rollout.simulate(SCENE, engine, params, trials, record_forces=True)
-        return found, rollout.prepare(SCENE, params, trials)[1]
+        simulated = rollout.simulate(SCENE, engine, params, trials, record_forces=True)
+        return simulated, rollout.prepare(SCENE, params, trials)[1]
 
-    (again, found), ctrl = run(*inputs)
-    np.testing.assert_array_equal(found.ctrl, ctrl)
-    both = (outcome, trace._replace(forces=None)), (again, found._replace(ctrl=None, forces=None))
+    (again, replayed), ctrl = run(*inputs)
+    np.testing.assert_array_equal(replayed.ctrl, ctrl)
+    both = (
+        (outcome, trace._replace(forces=None)),
+        (again, replayed._replace(ctrl=None, forces=None)),
+    )
     jax.tree.map(np.testing.assert_array_equal, *both)
     # Two programs of plain JAX, of forces of 10 N in float32.
-    for a, b in zip(*map(jax.tree.leaves, (found.forces, trace.forces)), strict=True):
+    for a, b in zip(*map(jax.tree.leaves, (replayed.forces, trace.forces)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
 
 
@@ -113,13 +116,13 @@ def test_what_is_observed_is_where_mujoco_has_it(worlds):
     lay = layout(scene)
     bodies = {"palm": 1, "object": lay.object}
     for w in range(len(last)):
-        own = world_model(scene, grasps.nth(fields, w))
-        data = mujoco.MjData(own)
+        compiled = world_model(scene, grasps.nth(fields, w))
+        data = mujoco.MjData(compiled)
         data.qpos = state.qpos[w]
         data.qvel = state.qvel[w]
-        mujoco.mj_kinematics(own, data)
-        mujoco.mj_comPos(own, data)
-        mujoco.mj_comVel(own, data)
+        mujoco.mj_kinematics(compiled, data)
+        mujoco.mj_comPos(compiled, data)
+        mujoco.mj_comVel(compiled, data)
         for name, body in [*bodies.items(), ("link", lay.bodies)]:
             pose = jax.tree.map(lambda v, w=w: v[w], getattr(seen, name))
             # Chains of a few rotations in float32, over 0.2 m.
@@ -127,7 +130,7 @@ def test_what_is_observed_is_where_mujoco_has_it(worlds):
             matrix = data.xmat[body].reshape(*np.shape(body), 3, 3)
             np.testing.assert_allclose(pose.rotation, matrix, atol=5e-6)
         speed = np.zeros(6)
-        mujoco.mj_objectVelocity(own, data, mujoco.mjtObj.mjOBJ_BODY, lay.object, speed, 0)
+        mujoco.mj_objectVelocity(compiled, data, mujoco.mjtObj.mjOBJ_BODY, lay.object, speed, 0)
         np.testing.assert_allclose(seen.object_velocity[w], speed[[3, 4, 5, 0, 1, 2]], atol=1e-5)
     # Of the step before, from the state after it: 1e-7 m/s are 1e-5 N.
     for a, b in zip(jax.tree.leaves(seen.forces), jax.tree.leaves(pushed), strict=True):
@@ -156,10 +159,10 @@ def test_the_derivative_of_a_closed_loop_is_that_of_differences():
 
     with jax.enable_x64(True):
         slope = float(jax.jit(jax.grad(distance))(5e3))
-        one, two = (float(jax.jit(distance)(5e3 + d)) for d in (50.0, -50.0))
+        above, below = (float(jax.jit(distance)(5e3 + d)) for d in (50.0, -50.0))
     assert abs(slope) > 1e-9
     # Differences of 1e-12 m, of contacts that bend over the 100 Pa.
-    np.testing.assert_allclose(slope, (one - two) / 100.0, rtol=1e-4)
+    np.testing.assert_allclose(slope, (above - below) / 100.0, rtol=1e-4)
 
 
 @pytest.mark.slow  # 7 s
@@ -190,15 +193,17 @@ def test_pressures_stay_within_what_the_walls_stand_and_what_is_no_number_fails_
     # The tip of a tapered finger stands less than its base.
     tapered = scenes.load("paper", hand_name="tapered4")
     space = parameters.design_space(tapered.hand, "full")
-    one = jax.tree.map(lambda v: v[None], jax.jit(space.params)(space.default()))
-    thin = one._replace(tip=one.tip._replace(wall=0.5 * one.wall), pressure=0.0 * one.pressure)
+    design = jax.tree.map(lambda v: v[None], jax.jit(space.params)(space.default()))
+    thin = design._replace(
+        tip=design.tip._replace(wall=0.5 * design.wall), pressure=0.0 * design.pressure
+    )
     none = jnp.zeros((1, 2, 6)), jnp.full((1, 2, tapered.num_fingers), 1e9)
     plan = control.Plan(*[None] * len(control.Plan._fields))._replace(
         pose=none[0], pressure=none[1], params=thin
     )
-    found = policy.spread(tapered, policy.Command(*none), plan, of="policy").pressure
+    pressures = policy.spread(tapered, policy.Command(*none), plan, of="policy").pressure
     want = morphology.pressure_limits(tapered.hand, thin)[:, None]
-    np.testing.assert_allclose(found, np.broadcast_to(want, found.shape), rtol=1e-6)
+    np.testing.assert_allclose(pressures, np.broadcast_to(want, pressures.shape), rtol=1e-6)
 
 
 @pytest.mark.slow  # quick: test_docs takes the policy, tests below step an environment
@@ -216,17 +221,17 @@ def test_the_page_s_policy_and_environment_do_what_they_say(monkeypatch):
     engine = policy.ControlLoop(make_engine("structured", scene), firmer)
     params, trials = grasps.random_worlds(scene, 3, 4)
     plan = rollout.prepare(scene, params, trials, engine)[1]
-    found = {}
+    ratios = {}
     run = jax.jit(partial(rollout.simulate, scene, engine))
     for gain in (0.0, 50.0):
         control = {"gain": jnp.full(4, gain)}
         trace = run(params._replace(control=control), trials)[1]
-        found[gain] = np.asarray(trace.ctrl)[..., 6:] / np.maximum(plan.pressure, 1.0)
+        ratios[gain] = np.asarray(trace.ctrl)[..., 6:] / np.maximum(plan.pressure, 1.0)
     closed = round(scene.phases.inflate / scene.discretization.timestep)
-    np.testing.assert_allclose(found[0.0][:, 1 + closed :], 1.0, rtol=1e-5)
-    np.testing.assert_allclose(found[50.0][:, :closed], found[0.0][:, :closed], rtol=1e-6)
-    assert (found[50.0][:, -1] > 1.01).any() and (
-        np.diff(found[50.0][:, closed:], axis=1) >= -1e-5
+    np.testing.assert_allclose(ratios[0.0][:, 1 + closed :], 1.0, rtol=1e-5)
+    np.testing.assert_allclose(ratios[50.0][:, :closed], ratios[0.0][:, :closed], rtol=1e-6)
+    assert (ratios[50.0][:, -1] > 1.01).any() and (
+        np.diff(ratios[50.0][:, closed:], axis=1) >= -1e-5
     ).all()
     monkeypatch.setattr("codesign_jax.scene.load", lambda name: grasps.short_grasp())
     exec(blocks[1], names)

@@ -59,8 +59,8 @@ def test_a_picture_shows_the_object_where_a_pinhole_camera_does(grasp):
     focal = side / 2 / np.tan(np.radians(45.0) / 2)  # MuJoCo's field of view
     wanted = side / 2 + focal * np.array([place[0], 0.1 - place[2]]) / (away + place[1])
     red, _, blue = np.moveaxis(picture.astype(int), -1, 0)
-    found = np.argwhere(red > blue + 60)[:, ::-1].mean(0)  # orange; the hand is above it
-    np.testing.assert_allclose(found + 0.5, wanted, atol=1.5)  # its near faces are larger
+    centre = np.argwhere(red > blue + 60)[:, ::-1].mean(0)  # orange; the hand is above it
+    np.testing.assert_allclose(centre + 0.5, wanted, atol=1.5)  # its near faces are larger
 
 
 def test_the_nearest_triangle_is_that_of_a_ray_s_first_hit():
@@ -71,7 +71,7 @@ def test_the_nearest_triangle_is_that_of_a_ray_s_first_hit():
     size = (37, 29)
     scale = 30.0
     corners = triangles[..., :2] / triangles[..., 2:] * scale + np.array(size) / 2
-    found = raster.nearest(corners, triangles[..., 2], size)
+    pixels = raster.nearest(corners, triangles[..., 2], size)
     column, row = np.meshgrid(*map(np.arange, size))
     flat = np.stack([column.ravel() + 0.5, row.ravel() + 0.5], 1)
     rays = np.column_stack([(flat - np.array(size) / 2) / scale, np.ones(len(flat))])
@@ -86,11 +86,11 @@ def test_the_nearest_triangle_is_that_of_a_ray_s_first_hit():
     away = np.where((u >= 0) & (v >= 0) & (u + v <= 1) & (away > 0), away, np.inf)
     hit = np.isfinite(away).any(1)
     assert 100 < hit.sum() < len(hit)
-    np.testing.assert_array_equal(np.sort(found.at), np.flatnonzero(hit))
-    np.testing.assert_array_equal(found.face, away.argmin(1)[found.at])
-    np.testing.assert_allclose(found.away, away.min(1)[found.at], rtol=1e-9)
-    place = (found.share[..., None] * triangles[found.face]).sum(1)
-    np.testing.assert_allclose(place, found.away[:, None] * rays[found.at], atol=1e-9)
+    np.testing.assert_array_equal(np.sort(pixels.at), np.flatnonzero(hit))
+    np.testing.assert_array_equal(pixels.face, away.argmin(1)[pixels.at])
+    np.testing.assert_allclose(pixels.away, away.min(1)[pixels.at], rtol=1e-9)
+    place = (pixels.share[..., None] * triangles[pixels.face]).sum(1)
+    np.testing.assert_allclose(place, pixels.away[:, None] * rays[pixels.at], atol=1e-9)
 
 
 def test_an_object_has_its_shadow_where_light_falls_from_it(grasp):
@@ -220,9 +220,11 @@ def test_grasp_is_the_one_of_the_table(run):
     rows = {tuple(int(r[n]) for n in ("episode", "particle", "trial")): r for r in trials}
     for place in ((1, 2, 0), (2, 0, 1)):
         episode, particle, trial = place
-        found = cases.find_grasp(the_scene, record, episode=episode, particle=particle, trial=trial)
-        assert found.place == place
-        assert float(rows[place]["cost"]) == pytest.approx(float(found.outcome.cost), rel=1e-6)
+        row_grasp = cases.find_grasp(
+            the_scene, record, episode=episode, particle=particle, trial=trial
+        )
+        assert row_grasp.place == place
+        assert float(rows[place]["cost"]) == pytest.approx(float(row_grasp.outcome.cost), rel=1e-6)
     # The best one is the chosen particle's ancestor.
     best = cases.find_grasp(the_scene, record)
     chosen = cases.choose(the_scene, record)
@@ -257,12 +259,12 @@ def test_fresh_trials_at_reference_are_in_the_report(run, tmp_path, capsys):
     cost = np.array([0.0, 0.0, 0.0, 2.0, 3.0])
     status = np.array([0, 0, 0, 0, int(Status.STUCK)])
     lost = np.where(cost == 2.0, 5.0, np.inf)
-    found = Outcome(cost, status, lost, np.full(trials, -1))
+    outcomes = Outcome(cost, status, lost, np.full(trials, -1))
     for design, words in (("own", True), ("other", False)):
         case = cases.case_of_run(copy, accuracy="reference")
         tested = case if design == "own" else case._replace(design=case.design + 1)
         array_files.save_results(
-            copy / reference.FILE, tested.digest(settings.seed), found._asdict()
+            copy / reference.FILE, tested.digest(settings.seed), outcomes._asdict()
         )
         page = tmp_path / f"{design}.html"
         assert cli.main(["report", str(copy), "--no-replay", "--out", str(page)]) == 0

@@ -161,8 +161,8 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
     # Of another version of the code they are shown as such, and not gone on from.
     with monkeypatch.context() as patch:
         patch.setattr(array_files.reuse, "code_digest", lambda: "another")
-        found, why = reference.stored(folder, settings)
-        assert found.cost.size == 5 and why == "is of another version of the code"
+        reloaded, why = reference.stored(folder, settings)
+        assert reloaded.cost.size == 5 and why == "is of another version of the code"
         capsys.readouterr()
         assert command("report", folder, "--no-replay") == 0
         assert command("compare", folder) == 0
@@ -307,8 +307,10 @@ def test_hosts_share_the_seeds(tmp_path, capsys):
     assert [host.returncode for host in hosts] == [0, 0], outputs
     # Each seed beside other ones: it draws the same numbers, and rounds otherwise.
     names = ("seed-3", "seed-4", "seed-5")
-    one, two = ([runs.load_record(tmp_path / k / name) for name in names] for k in ("one", "two"))
-    for a, b in zip(one, two, strict=True):
+    first, second = (
+        [runs.load_record(tmp_path / k / name) for name in names] for k in ("one", "two")
+    )
+    for a, b in zip(first, second, strict=True):
         np.testing.assert_allclose(a.history.population[0], b.history.population[0], rtol=1e-5)
         assert b.done == 2 and b.test is not None
     tables = [(tmp_path / name / "seeds.csv").read_text().count("\n") for name in ("one", "two")]

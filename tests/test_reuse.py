@@ -115,7 +115,7 @@ def test_nothing_traced_is_found_once_the_code_is_not_known(monkeypatch):
     """A function's key does not have the functions that it calls."""
     space = types.SimpleNamespace(structure="s")
     built = []
-    find = reuse.shared(lambda *how: built.append(how) or (lambda v: v))
+    find = reuse.shared(lambda *arguments: built.append(arguments) or (lambda v: v))
     first = find("engine", space, None)
     assert find("engine", space, None) is first
     lanewise.of_code("a")
@@ -146,7 +146,7 @@ def test_programs_go_when_many_maps_are_taken(monkeypatch):
     built = []
     monkeypatch.setattr(reuse, "forgetters", [])
     monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(1))
-    find = reuse.shared(lambda *how: built.append(how) or (lambda v: v + 1))
+    find = reuse.shared(lambda *arguments: built.append(arguments) or (lambda v: v + 1))
 
     def get(number):
         return find("engine", types.SimpleNamespace(structure=number), None)
@@ -240,14 +240,14 @@ def use_all(monkeypatch):
 
 def test_one_switch_turns_all_caches_off(place, monkeypatch):
     monkeypatch.setenv("CODESIGN_CACHE", "off")
-    found = use_all(monkeypatch)
+    mesh_grid = use_all(monkeypatch)
     assert not place.exists() and not jax.config.jax_enable_compilation_cache
-    np.testing.assert_allclose(found.origin, -0.04)  # as far out as asked for
+    np.testing.assert_allclose(mesh_grid.origin, -0.04)  # as far out as asked for
     monkeypatch.setenv("CODESIGN_CACHE", "on")
     jax.config.update("jax_enable_compilation_cache", True)
     compilation_cache.reset_cache()  # another process
-    np.testing.assert_array_equal(found.values, use_all(monkeypatch).values)
-    np.testing.assert_array_equal(found.values, use_all(monkeypatch).values)
+    np.testing.assert_array_equal(mesh_grid.values, use_all(monkeypatch).values)
+    np.testing.assert_array_equal(mesh_grid.values, use_all(monkeypatch).values)
     names = {(p.parent.name, p.name.rpartition("-")[2]) for p in place.rglob("*") if p.is_file()}
     assert {("jax", "cache"), ("jax", "atime")} <= names
     assert len([*place.glob("meshes/*.kept")]) == len([*place.glob("jax/kernels/*.kept")]) == 1

@@ -76,14 +76,14 @@ def none(tree):
 def without(place, *fields):
     """Of several cotangents one, or fields of it, is zero."""
 
-    def change(found):
-        new = list(found)
+    def change(values):
+        new = list(values)
         new[place] = (
             none(new[place])
             if not fields
             else new[place]._replace(**{f: none(getattr(new[place], f)) for f in fields})
         )
-        return type(found)(new)
+        return type(values)(new)
 
     return change
 
@@ -159,20 +159,20 @@ class Planted:
         stage = name_of(function)
         for change, mine in self.each("seeds", stage):
             bars = chosen(mine, change(bars), bars)
-        found = cotangents.pull(function, args, fixed, bars)
+        pulled = cotangents.pull(function, args, fixed, bars)
         for change, mine in self.each("results", stage):
-            found = chosen(mine, change(found), found)
-        return found
+            pulled = chosen(mine, change(pulled), pulled)
+        return pulled
 
     def method(self, owner, name):
         """Instead of a method."""
         right = getattr(owner, name)
 
         def call(*args, **kwargs):
-            found = right(*args, **kwargs)
+            result = right(*args, **kwargs)
             for change, mine in self.each("methods", (owner, name)):
-                found = chosen(mine, change(found, *args), found)
-            return found
+                result = chosen(mine, change(result, *args), result)
+            return result
 
         return call
 
@@ -238,24 +238,24 @@ def checked(wrong=False):
         orders = np.arange(len(each)), np.random.default_rng(2).permutation(len(each))
         assert (orders[1] != orders[0]).all() or wrong
         out = case.execute(tables)
-        found = []
+        cotangent_sets = []
         with planted(faults) if wrong else contextlib.nullcontext():
             for order in orders:
                 number = np.full(tables[1].shape[0] * case.program.block, 1e3)
                 number[: len(each)] = order
                 tables[1][:, place] = (DEEP + number).reshape(-1, case.program.block)
-                found.append(case.bars(tables, out, [each[k] for k in order]))
-        slopes = np.array([case.along(found[0], w) for w in range(len(each))])
+                cotangent_sets.append(case.bars(tables, out, [each[k] for k in order]))
+        slopes = np.array([case.along(cotangent_sets[0], w) for w in range(len(each))])
         difference, trace = case.differences(first, STEP)
     assert (trace["moved"] == 1).all()
     count = len(faults)
     alone = tuple(
         [[case.world(b, w) for b in bars[:6]] for w in np.argsort(order)[count : count + 3]]
-        for bars, order in zip(found, orders, strict=True)
+        for bars, order in zip(cotangent_sets, orders, strict=True)
     )
     names = [name for _, name in case.groups]
-    found = {"sound": slopes[count:], "wrong": slopes[:count], "alone": alone}
-    return SimpleNamespace(names=names, difference=difference, **found)
+    slopes_by_kind = {"sound": slopes[count:], "wrong": slopes[:count], "alone": alone}
+    return SimpleNamespace(names=names, difference=difference, **slopes_by_kind)
 
 
 @pytest.mark.slow  # 46 s; quick: test_engines differentiates this kernel
@@ -345,8 +345,8 @@ def test_derivatives_of_scenes(name, tmp_path):
         # With the capsule the differences by the wrist's start err by 2e-6 at a step of 1e-6, by a
         # hundredth at a tenth of it, and by 7e-10 at 2e-8; below that rounding grows.
         for step in (1e-7, 2e-8) if name == "capsule" else (1e-6, 1e-7):
-            difference, found = case.differences(weights, step)
-            assert (found["moved"] == 1).all()
+            difference, outputs = case.differences(weights, step)
+            assert (outputs["moved"] == 1).all()
             errors.append(np.abs(slope - difference) / np.abs(slope).max())
         for (_, group), *row in zip(case.groups, slope, *errors, strict=True):
             print(group, *(f"{v:.2e}" for v in row))
@@ -459,5 +459,5 @@ def test_gradients_of_random_worlds_are_finite():
     count = 2000
     fields, ctrl = grasps.batch_inputs(the_scene, *grasps.random_worlds(the_scene, 0, count))
     engine = StructuredEngine(the_scene)
-    found = jax.jit(jax.grad(lambda c: engine.rollout(fields, c).distance.sum()))(ctrl[:, :420])
-    assert np.isfinite(found).all() and (np.abs(found).max((1, 2)) > 0).mean() > 0.99
+    gradients = jax.jit(jax.grad(lambda c: engine.rollout(fields, c).distance.sum()))(ctrl[:, :420])
+    assert np.isfinite(gradients).all() and (np.abs(gradients).max((1, 2)) > 0).mean() > 0.99

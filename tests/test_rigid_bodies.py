@@ -83,8 +83,8 @@ def test_a_tilted_box_rests_by_its_stable_poses(tmp_path):
         height = round(trimesh.transform_points(mesh.vertices, matrix)[:, 2].mean())
         sides[height] = sides.get(height, 0.0) + chance
     assert [*sides] == [20, 25, 60]
-    found = only(tmp_path, MESH, mesh).resting()
-    np.testing.assert_allclose([p.probability for p in found], [*sides.values()], atol=1e-6)
+    resting = only(tmp_path, MESH, mesh).resting()
+    np.testing.assert_allclose([p.probability for p in resting], [*sides.values()], atol=1e-6)
     for k, (height, angle) in enumerate(zip(sides, (None, 55, 35), strict=True), 1):
         shape = only(tmp_path, f'{MESH}; pose = "stable:{k}"')
         assert shape.rest_height(rigid_bodies.up(shape.upright)) == pytest.approx(
@@ -202,8 +202,8 @@ def test_a_mesh_has_the_mass_centre_and_inertia_of_its_file(tmp_path):
         0.35 * np.sort(shape.unit_inertia), np.sort(compiled.body_inertia[1]), rtol=1e-6
     )
     frame = Rotation.from_quat(np.roll(shape.mesh.upright, -1)).as_matrix()
-    found = 0.35 * frame @ np.diag(shape.unit_inertia) @ frame.T
-    np.testing.assert_allclose(found, full, atol=1e-6 * full.max())
+    inertia = 0.35 * frame @ np.diag(shape.unit_inertia) @ frame.T
+    np.testing.assert_allclose(inertia, full, atol=1e-6 * full.max())
     # STL has float32: 4e-9 m of 60 mm.
     back = shape.mesh.vertices @ frame.T + data.xipos[1]
     np.testing.assert_allclose(np.sort(back, 0), np.sort(1e-3 * mesh.vertices, 0), atol=1e-8)
@@ -310,8 +310,8 @@ def test_triangles_lie_on_the_surface_and_have_its_inertia(kind):
     shape = primitives.PRIMITIVES[kind]
     size = SIZES[kind]
     mesh = shape.triangles(size)
-    own = np.diag(mesh.moment_inertia) / mesh.volume
-    np.testing.assert_allclose(shape.inertia(size), own, rtol=5e-3)
+    inertia = np.diag(mesh.moment_inertia) / mesh.volume
+    np.testing.assert_allclose(shape.inertia(size), inertia, rtol=5e-3)
     np.testing.assert_allclose(mesh.bounds[1], shape.half_extents(size), rtol=2e-3)
     way = np.array([0.48, -0.6, 0.64])
     assert shape.reach(size, way) == pytest.approx((mesh.vertices @ way).max(), rel=2e-3)
@@ -387,9 +387,9 @@ def test_distances_equal_mujoco(kind):
     # Both are closed forms in float64; they differ by rounding of lengths below a metre.
     both = outside | inside
     np.testing.assert_allclose(gap[both], want[both], rtol=0, atol=1e-14)
-    found = np.asarray(got.normal)[:, 0].T
+    normals = np.asarray(got.normal)[:, 0].T
     # The witness points give the direction; two of them wrong by rounding, a gap apart, turn it.
-    angle = np.linalg.norm(found - normal, axis=1)
+    angle = np.linalg.norm(normals - normal, axis=1)
     near = outside & (gap > 1e-3)
     assert np.all(angle[near] < 1e-14 / gap[near])
     # Contact points lie half way between the surfaces.

@@ -46,8 +46,8 @@ def _numbers(height, segment, width):
     section = np.array([height, 0.0, segment, width])[:, None, None]
     with jax.enable_x64(True):
         hand = SimpleNamespace(section=jnp.asarray(section), tip=None)
-        found = memory_tables.ring_numbers(scene, hand, scene.discretization.hull_rings)
-        return np.asarray(found)[..., 0, 0].T
+        numbers = memory_tables.ring_numbers(scene, hand, scene.discretization.hull_rings)
+        return np.asarray(numbers)[..., 0, 0].T
 
 
 def ringed(bodies):
@@ -56,11 +56,11 @@ def ringed(bodies):
     frames = []
     centres = []
     for body in bodies:
-        own, link = ring_numbers(body)
+        ring, link = ring_numbers(body)
         frame = body.frames[link + 1]
-        numbers.append(own)
+        numbers.append(ring)
         frames.append(frame)
-        centres.append(body.joints[link] + np.einsum("rij,jr->ri", frame, own[:3]))
+        centres.append(body.joints[link] + np.einsum("rij,jr->ri", frame, ring[:3]))
     columns = np.stack(frames).transpose(3, 2, 1, 0)
     return np.stack(numbers, -1), columns, np.stack(centres).transpose(2, 1, 0)
 
@@ -90,8 +90,8 @@ def laws():
 
         def nearest(ring, frame, centre, ends, frames, half):
             many = jax.vmap(each, (None, None, None, -1, -1, -1))
-            apart, found = many(ring, frame, centre, ends, frames, half)
-            return jax.tree.map(lambda v: v[apart.argmin()], found)
+            apart, results = many(ring, frame, centre, ends, frames, half)
+            return jax.tree.map(lambda v: v[apart.argmin()], results)
 
         every = jax.vmap(nearest, (-1, -1, -1, None, None, None))
         return jax.vmap(every, -1)(numbers, frame, centre, ends, frames, half)
@@ -112,8 +112,8 @@ def on_fields(bodies, fields):
     aim, on_field, _ = laws()
 
     def seen(points):
-        found = [f(points[..., i].T) for i, f in enumerate(fields)]
-        return np.stack([d for d, _ in found], -1), np.stack([n.T for _, n in found], -1)
+        pairs = [f(points[..., i].T) for i, f in enumerate(fields)]
+        return np.stack([d for d, _ in pairs], -1), np.stack([n.T for _, n in pairs], -1)
 
     with jax.enable_x64(True):
         numbers, frame, centre = ringed(bodies)
@@ -123,7 +123,7 @@ def on_fields(bodies, fields):
 
 def segments(bodies):
     """Ends (2, 3, segment, body), frames (3, 3, 3, ...) and half axes of centre lines."""
-    found = []
+    centre_lines = []
     for body in bodies:
         numbers, _ = ring_numbers(body)
         turn = body.frames
@@ -135,8 +135,8 @@ def segments(bodies):
         frames = [turn[np.clip(row + k, 0, LINKS)] for k in (-1, 0, 1)]
         half = np.array([[tip * (k == LINKS), a, b] for k in row])
         columns = np.stack(frames).transpose(0, 3, 2, 1)
-        found.append((np.stack([line[:-1], line[1:]]).transpose(0, 2, 1), columns, half.T))
-    return tuple(np.stack(v, -1) for v in zip(*found, strict=True))
+        centre_lines.append((np.stack([line[:-1], line[1:]]).transpose(0, 2, 1), columns, half.T))
+    return tuple(np.stack(v, -1) for v in zip(*centre_lines, strict=True))
 
 
 def on_fingers(bodies, others):
@@ -319,11 +319,11 @@ def test_hands_grasp_whose_fingers_are_no_power_of_two():
     names = "disturb ungrasp twist lateral_bending palm_object palm_table finger_table finger_palm"
     off = dict.fromkeys((*names.split(), "finger_finger", "finger_itself"), False)
     ends = {"approach": 0.5, "inflate": 1.0, "lift": 1.2}
-    how = {"discretization": {"links": 2}, "effects": off, "phases": ends}
+    overrides = {"discretization": {"links": 2}, "effects": off, "phases": ends}
     # A low hand with soft walls, which the default pressures close.
-    how |= {"arm.zero_height": 0.005, "hand.material.law": "linear"}
-    how |= {"hand.material.shear_modulus": 40e3}
-    the_scene = load("paper", hand_name="tripod3", overrides=how)
+    overrides |= {"arm.zero_height": 0.005, "hand.material.law": "linear"}
+    overrides |= {"hand.material.shear_modulus": 40e3}
+    the_scene = load("paper", hand_name="tripod3", overrides=overrides)
     space = parameters.design_space(the_scene.hand)
     params = space.params(space.default())
     trial = rollout.nominal_trial(the_scene, "sphere")
@@ -396,11 +396,11 @@ def test_a_finger_is_as_deep_in_another_one_as_it_was_moved(angle, depth):
     across = dense_skin.finger(LENGTH, base=[0.055, 0, 0] - turn[:, 0] * 0.055, turn=turn)
     down = turned([0, 1, 0], np.pi / 2)
     above = dense_skin.finger(LENGTH, base=[0.045, 0, LENGTH], turn=down)
-    one = tube(dense_skin.finger(LENGTH))
+    straight_tube = tube(dense_skin.finger(LENGTH))
     for other in (tube(across, HEIGHT - depth), tube(above, HEIGHT - depth)):
-        for a, b in ((one, other), (other, one)):
-            found = contact_depths.in_tube(a.rings, b)
-            np.testing.assert_allclose(found, [max(depth, 0)], atol=0.05e-3)
+        for a, b in ((straight_tube, other), (other, straight_tube)):
+            depths = contact_depths.in_tube(a.rings, b)
+            np.testing.assert_allclose(depths, [max(depth, 0)], atol=0.05e-3)
 
 
 @pytest.mark.parametrize("kind", ["box", "cylinder"])
@@ -410,14 +410,14 @@ def test_an_edge_of_an_object_is_in_a_finger(kind):
     size = np.array([0.03, 0.03, 0.03])
     depth = 2e-3
     edges, skin = contact_depths.surface(shape, size)
-    one = tube(dense_skin.finger(LENGTH))
+    straight_tube = tube(dense_skin.finger(LENGTH))
     inclined = turned([0, 1, 0], np.pi / 4)
     low = (edges @ inclined.T)[:, 2].min()
     at = np.array([0.0567, 0, HEIGHT - depth - low])
     assert (skin @ inclined.T)[:, 2].min() > low - 1e-9
-    found = contact_depths.in_tube((edges @ inclined.T + at)[None, :, None], one)
-    np.testing.assert_allclose(found, depth, atol=0.1e-3)
-    away = one.rings.reshape(1, -1, 3) - [0.055, 0, HEIGHT - depth + size[2]]
+    depths = contact_depths.in_tube((edges @ inclined.T + at)[None, :, None], straight_tube)
+    np.testing.assert_allclose(depths, depth, atol=0.1e-3)
+    away = straight_tube.rings.reshape(1, -1, 3) - [0.055, 0, HEIGHT - depth + size[2]]
     np.testing.assert_allclose(contact_depths.in_object(kind, size, away), depth, atol=1e-6)
 
 
@@ -488,8 +488,8 @@ def hanging(pads):
         def halve(_, ends):
             low, high = ends
             acc = 0.5 * (low + high)
-            found = WEIGHT * acc - LOAD - -pushed(acc, velocity, grip)[2].sum(0) > 0
-            return jnp.where(found, low, acc), jnp.where(found, acc, high)
+            above = WEIGHT * acc - LOAD - -pushed(acc, velocity, grip)[2].sum(0) > 0
+            return jnp.where(above, low, acc), jnp.where(above, acc, high)
 
         far = 1e4 + 0 * velocity
         acc = sum(jax.lax.fori_loop(0, 60, halve, (-far, far))) / 2
@@ -534,9 +534,9 @@ def held_hands():
     A function of start, controls and steps of a piece: a sum of the end, the end, and the traces.
     """
     off = "finger_table palm_object palm_table finger_palm finger_itself twist"
-    how = {"effects__finger_finger": True, "effects__friction_memory": True}
-    how |= grasps.off(off) | {"effects__surface": "hull"}
-    chosen = grasps.pinch("box", links=2, **how)
+    overrides = {"effects__finger_finger": True, "effects__friction_memory": True}
+    overrides |= grasps.off(off) | {"effects__surface": "hull"}
+    chosen = grasps.pinch("box", links=2, **overrides)
     engine = make_engine("structured", chosen)
     with jax.enable_x64(True):
         begin = curled(chosen, STEPS, bend=0.8, height=0.12)
@@ -546,15 +546,15 @@ def held_hands():
     hold = np.asarray(model.split(chosen, start).held).reshape(-1, 2)
     rows = friction_held.rows(chosen)
     assert set(rows) == {"finger_finger", "finger_object", "object_table"}
-    assert min(np.abs(hold[own]).max() for own in rows.values()) > 0.05
+    assert min(np.abs(hold[part]).max() for part in rows.values()) > 0.05
 
-    def one(start, ctrl):
+    def advance(start, ctrl):
         trace = engine.rollout(fields._replace(start=start), ctrl)
         return trace.last, (trace.distance, trace.height, trace.speed)
 
     def pieces(start, ctrl, size):
         parts = jnp.moveaxis(ctrl.reshape(1, -1, size, ctrl.shape[2]), 1, 0)
-        last, shown = jax.lax.scan(one, start, parts)
+        last, shown = jax.lax.scan(advance, start, parts)
         shown = jnp.stack(shown).reshape(3, -1)
         end = model.split(chosen, last)
         return shown.sum() + end.qpos.sum() + end.held.sum(), (last, shown)
@@ -566,5 +566,5 @@ def test_a_rollout_in_pieces_is_that_of_one_piece(held_hands):
     """What fingers hold, the solver's warm start and the time of the grasp pass on: equal bits."""
     start, ctrl, pieces = held_hands
     with jax.enable_x64(True):
-        found = [jax.jit(partial(pieces, size=n))(start, ctrl)[1] for n in (STEPS, 1)]
-    jax.tree.map(np.testing.assert_array_equal, *found)
+        series = [jax.jit(partial(pieces, size=n))(start, ctrl)[1] for n in (STEPS, 1)]
+    jax.tree.map(np.testing.assert_array_equal, *series)

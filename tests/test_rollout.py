@@ -65,9 +65,9 @@ def test_order_of_particles_and_trials_does_not_matter():
     order = np.array([2, 3, 0, 1])
     shuffled = evaluate(designs[particles], nth(trials, order))
     twins = evaluate(jnp.stack([designs[0]] * 5), trials)
-    for one, mixed, same in zip(whole, shuffled, twins, strict=True):
-        np.testing.assert_array_equal(mixed, one[particles][:, order])
-        np.testing.assert_array_equal(same, jnp.stack([one[0]] * 5))
+    for values, mixed, same in zip(whole, shuffled, twins, strict=True):
+        np.testing.assert_array_equal(mixed, values[particles][:, order])
+        np.testing.assert_array_equal(same, jnp.stack([values[0]] * 5))
 
 
 @pytest.mark.parametrize("axis, sign, column", [(4, 1, 0), (3, 1, 1)])
@@ -105,8 +105,8 @@ def pneuflex():
     params = stack(*(p for c in changes for p in [design(the_scene, **c)] * 3))
     trials = stack(*[rollout.nominal_trial(the_scene, s) for s in range(3)] * 5)
     simulate = partial(rollout.simulate, the_scene, make_engine("mujoco", the_scene))
-    found = jax.jit(simulate)(params, trials)
-    return the_scene, *jax.tree.map(lambda v: np.reshape(v, (5, 3, *v.shape[1:])), found)
+    results = jax.jit(simulate)(params, trials)
+    return the_scene, *jax.tree.map(lambda v: np.reshape(v, (5, 3, *v.shape[1:])), results)
 
 
 def test_a_good_design_grasps_every_object(pneuflex):

@@ -42,12 +42,12 @@ def run(whole, tmp_path):
     return shutil.copytree(whole, tmp_path / "run")
 
 
-@pytest.mark.parametrize("how", faults.WAYS)
-def test_damage_of_the_newest_checkpoint_is_said_and_nothing_is_changed(how, run):
+@pytest.mark.parametrize("way", faults.WAYS)
+def test_damage_of_the_newest_checkpoint_is_said_and_nothing_is_changed(way, run):
     """Of another file in each way; `test_checkpoint` has every file."""
     step = run / "checkpoints" / str(NEWEST)
     paths = [p for p in sorted(step.rglob("*")) if p.stat().st_size and p.is_file()]
-    faults.damaged(paths[faults.WAYS.index(how) % len(paths)], how)
+    faults.damaged(paths[faults.WAYS.index(way) % len(paths)], way)
     before = sorted(os.walk(run))
     said = []
     record = runs.load_record(run, tell=said.append)
@@ -60,11 +60,11 @@ def test_damage_of_the_newest_checkpoint_is_said_and_nothing_is_changed(how, run
         runs.load_record(run)
 
 
-@pytest.mark.parametrize(("name", "how"), [("sha256", "a folder"), ("d", "flipped")])
-def test_a_resumption_mends_damage_and_says_so(name, how, run, whole, capsys):
+@pytest.mark.parametrize(("name", "way"), [("sha256", "a folder"), ("d", "flipped")])
+def test_a_resumption_mends_damage_and_says_so(name, way, run, whole, capsys):
     """From the older checkpoint, to the same bits: of the file of digests, and of the data."""
     largest = max((run / "checkpoints" / str(NEWEST)).rglob("d/*"), key=lambda p: p.stat().st_size)
-    faults.damaged(largest if name == "d" else run / "checkpoints" / f"{NEWEST}.sha256", how)
+    faults.damaged(largest if name == "d" else run / "checkpoints" / f"{NEWEST}.sha256", way)
     assert command(*RUN, "--out", run) == 0
     assert f"checkpoint {NEWEST} is lost" in capsys.readouterr().out
     assert f"checkpoint {NEWEST} is lost" in (run / "events.log").read_text()
@@ -73,8 +73,8 @@ def test_a_resumption_mends_damage_and_says_so(name, how, run, whole, capsys):
 
 def relabelled(run, identity):
     """Saves the newest step of a run as one of a run with this identity, or with none."""
-    own = manifest.read_provenance(run)["id"]
-    with Checkpoints(run / "checkpoints", run=own, read_only=True) as store:
+    run_id = manifest.read_provenance(run)["id"]
+    with Checkpoints(run / "checkpoints", run=run_id, read_only=True) as store:
         arrays = store.restore().arrays
     shutil.rmtree(run / "checkpoints")
     with Checkpoints(run / "checkpoints", run=identity) as store:
@@ -106,8 +106,8 @@ def test_changed_scene_files_are_refused_by_all_that_read_the_run(run, capsys):
     runs.read_run(run)
     path.write_text(text.replace("    0.03,", "    0.031,"))
     assert path.read_text() != text
-    own = ["optimize", "--scene", run / "scene.toml", *RUN[3:], "--out", run]
-    for arguments in (["report", run, "--no-replay"], ["evaluate", run, "--dry-run"], own):
+    resumption = ["optimize", "--scene", run / "scene.toml", *RUN[3:], "--out", run]
+    for arguments in (["report", run, "--no-replay"], ["evaluate", run, "--dry-run"], resumption):
         assert command(*arguments) == 2
         error = capsys.readouterr().err
         assert "objects.toml was changed since the run was made" in error, arguments

@@ -94,9 +94,11 @@ def test_sizes_default_to_the_papers():
 )
 def test_the_planned_test_is_the_one_that_is_simulated(preset, episodes, finalists):
     """A search for many parameters that ends among its random designs tests all of them."""
-    own = settings(preset=preset, particles=8, episodes=episodes, optimizer=optimize.DEFAULT)
-    plan = runs.prepare(tiny()[0], own)
-    state = plan.optimizer.init(jax.random.key(0), plan.space.default(), own.particles)
+    run_settings = settings(
+        preset=preset, particles=8, episodes=episodes, optimizer=optimize.DEFAULT
+    )
+    plan = runs.prepare(tiny()[0], run_settings)
+    state = plan.optimizer.init(jax.random.key(0), plan.space.default(), run_settings.particles)
 
     @jax.jit
     def episode(state, mask):
@@ -106,7 +108,7 @@ def test_the_planned_test_is_the_one_that_is_simulated(preset, episodes, finalis
     for mask in plan.mask:
         state = episode(state, mask)
     tested, _ = finalists_of_plan(plan, np.asarray(state.particles))
-    assert len(tested) * own.trials * own.test_rounds == plan.test_grasps
+    assert len(tested) * run_settings.trials * run_settings.test_rounds == plan.test_grasps
     assert len(tested) == finalists
 
 
@@ -179,9 +181,9 @@ def run(tmp_path):
     return copied(tmp_path / "run")
 
 
-def start(folder, **how):
+def start(folder, **options):
     """Opens a run folder and closes it again; returns its notes."""
-    with open_run(folder, tiny()[0], SETTINGS, ["codesign", "optimize"], **how) as (_, notes):
+    with open_run(folder, tiny()[0], SETTINGS, ["codesign", "optimize"], **options) as (_, notes):
         return notes
 
 
@@ -199,8 +201,8 @@ def mine(tmp_path):
 @pytest.mark.parametrize("more", [(), ("--fresh",)])
 def test_a_users_own_scene_stays_where_it_is(more, mine, capsys):
     before = snapshot(mine)
-    own = ["optimize", "--scene", mine / "scene.toml", "--engine", "mujoco", "--out", mine]
-    assert command(*own, *more) == 2
+    arguments = ["optimize", "--scene", mine / "scene.toml", "--engine", "mujoco", "--out", mine]
+    assert command(*arguments, *more) == 2
     error = capsys.readouterr().err
     assert f"{mine} holds control.toml, hand.toml, meshes/capsule.stl and 2 more" in error
     assert "choose another folder" in error

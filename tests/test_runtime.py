@@ -132,13 +132,13 @@ class Xla:
 def arrays(layout, blocks, seed=0):
     """Random inputs and empty outputs of a layout, as NumPy arrays."""
     rng = np.random.default_rng(seed)
-    found = {"input": [], "output": []}
+    by_role = {"input": [], "output": []}
     for array in layout.arrays:
-        if array.role in found:
+        if array.role in by_role:
             shape = (1 if array.shared else blocks, *array.shape)
             values = rng.standard_normal(shape) if array.role == "input" else np.zeros(shape)
-            found[array.role].append(values.astype(array.dtype))
-    return found["input"], found["output"]
+            by_role[array.role].append(values.astype(array.dtype))
+    return by_role["input"], by_role["output"]
 
 
 LAYOUT = Layout(
@@ -198,16 +198,16 @@ def test_calls_of_one_program_and_of_many_threads():
     batches = [kernels.numbers(n) for n in (1, 2, 7, 64)]
     program = jax.jit(lambda b: [kernels.run(x, t, 500) for x, t in b]).lower(batches).compile()
     want = program(batches)
-    found = []
+    results = []
     alone = [jax.jit(partial(kernels.run, rounds=500))(x, t) for x, t in batches]
-    call = [lambda: found.append(jax.block_until_ready(program(batches)))] * 4
+    call = [lambda: results.append(jax.block_until_ready(program(batches)))] * 4
     threads = [threading.Thread(target=c) for c in call]
     for t in threads:
         t.start()
     for t in threads:
         t.join()
-    assert len(found) == 4
-    for got in [alone, *found]:
+    assert len(results) == 4
+    for got in [alone, *results]:
         jax.tree.map(np.testing.assert_array_equal, want, got)
 
 
@@ -361,8 +361,8 @@ def test_why_kernels_cannot_run(monkeypatch, platform, cause, reason):
     gpu.driver.cache_clear()
     cause(monkeypatch)
     try:
-        found = launch.available(platform)
-        assert found is not None
+        problem = launch.available(platform)
+        assert problem is not None
         with pytest.raises(launch.KernelUnavailable, match=reason):
             kernels.run(*kernels.numbers(2), backend=platform)
     finally:

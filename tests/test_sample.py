@@ -65,11 +65,11 @@ def killed_after(saves, monkeypatch, **sizes):
     save = dataset.Shards.save
     done = []
 
-    def counted(self, shard, found):
+    def counted(self, shard, outcomes):
         if len(done) == saves:
             raise Killed
         done.append(shard)
-        save(self, shard, found)
+        save(self, shard, outcomes)
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
         patch.setattr(dataset.Shards, "save", counted)
@@ -80,24 +80,24 @@ def killed_after(saves, monkeypatch, **sizes):
 def test_outcomes_are_those_of_each_grasp_by_itself():
     drawn = sampling.draw(THREE, SPACE, KEY, first=4, n=4, num_trials=2)
     engine = ToyEngine(THREE)
-    found = sampling.make_simulate(THREE, engine, SPACE)(drawn.designs, drawn.trials)
-    assert found.cost.shape == (4, 2) and len(np.unique(found.cost)) > 3
+    outcomes = sampling.make_simulate(THREE, engine, SPACE)(drawn.designs, drawn.trials)
+    assert outcomes.cost.shape == (4, 2) and len(np.unique(outcomes.cost)) > 3
     every = jax.jit(lambda p, t: rollout.evaluate(THREE, engine, p, t))
     hands = parameters.params_of(SPACE, drawn.designs)
     for i in (1, 3):  # all designs in the trials of one
         cost = every(hands, nth(drawn.trials, i)).cost
-        np.testing.assert_allclose(found.cost[i], cost[i], atol=1e-5)
+        np.testing.assert_allclose(outcomes.cost[i], cost[i], atol=1e-5)
 
 
 def air_of(designs):
     """Air in the chambers of designs [cm^3], as the moulds' volumes have it but for end walls."""
     hands = parameters.params_of(SPACE, designs)
-    found = []
+    volumes = []
     for k in range(len(designs)):
-        own = nth(hands, k)
-        sizes = process.sizes(THREE.hand, jax.tree.map(np.asarray, own), process.Process())
-        found.append(sum(s._replace(end=0.0).chamber_volume for s in sizes) / 1e3)
-    return np.array(found)
+        hand = nth(hands, k)
+        sizes = process.sizes(THREE.hand, jax.tree.map(np.asarray, hand), process.Process())
+        volumes.append(sum(s._replace(end=0.0).chamber_volume for s in sizes) / 1e3)
+    return np.array(volumes)
 
 
 def test_a_row_has_design_noise_and_outcome(place, capsys):

@@ -94,15 +94,15 @@ OF_LIBRARIES = [
 
 @pytest.mark.parametrize("key, value, expected", OF_LIBRARIES)
 def test_numbers_arrays_and_paths_of_libraries_are_taken(key, value, expected):
-    found = scene.load("paper", overrides={key: value})
+    loaded = scene.load("paper", overrides={key: value})
     for part in keypaths.flatten({key: 0}).popitem()[0]:
-        found = found[int(part)] if part.isdecimal() else getattr(found, part)
-    if isinstance(found, key_frames.Control):
-        found = found.name
-    if isinstance(found, tuple):
-        found = tuple(getattr(v, "number", v) for v in found)
-    assert found == expected
-    assert [type(v) for v in np.atleast_1d(expected)] == [type(v) for v in np.atleast_1d(found)]
+        loaded = loaded[int(part)] if part.isdecimal() else getattr(loaded, part)
+    if isinstance(loaded, key_frames.Control):
+        loaded = loaded.name
+    if isinstance(loaded, tuple):
+        loaded = tuple(getattr(v, "number", v) for v in loaded)
+    assert loaded == expected
+    assert [type(v) for v in np.atleast_1d(expected)] == [type(v) for v in np.atleast_1d(loaded)]
 
 
 OF_NO_FILE = {
@@ -139,9 +139,9 @@ def test_a_key_path_changes_its_value_and_the_resolved_scene_has_it(pair, tmp_pa
 def test_key_paths_may_be_nested_or_dotted_and_the_last_of_a_key_holds():
     nested = {"hand": {"wrist": {"linear_stiffness": 60}}, "solver.iterations": 7}
     pairs = ["solver.iterations=9", "hand.wrist={linear_stiffness=60}", "solver.iterations=7"]
-    one = scene.load(overrides=nested)
-    assert one.solver.iterations == 7 and one.hand.wrist.linear_stiffness == 60.0
-    assert scene.load(overrides=keypaths.parse(pairs)) == one
+    nested_scene = scene.load(overrides=nested)
+    assert nested_scene.solver.iterations == 7 and nested_scene.hand.wrist.linear_stiffness == 60.0
+    assert scene.load(overrides=keypaths.parse(pairs)) == nested_scene
 
 
 # Key paths, and what is said of each.
@@ -197,23 +197,23 @@ def test_a_modulus_comes_with_its_law(pairs):
         (problem,) = problems_of(load, "paper")
         assert LAWS[pairs] in problem
         return
-    found = load("paper")
-    material = found.hand.material
-    assert (found.effects.neo_hookean, material.shear_modulus) == (
+    loaded = load("paper")
+    material = loaded.hand.material
+    assert (loaded.effects.neo_hookean, material.shear_modulus) == (
         LAWS[pairs][0],
         1e3 * LAWS[pairs][1],
     )
     assert material.lateral_factor == scene.load("paper").hand.material.lateral_factor
     # In Python the law of another hand is not that of the scene's effects.
-    law = silicones.LAWS[not found.effects.neo_hookean]
+    law = silicones.LAWS[not loaded.effects.neo_hookean]
     other = dataclasses.replace(material, law=law)
-    changed = dataclasses.replace(found, hand=dataclasses.replace(found.hand, material=other))
+    changed = dataclasses.replace(loaded, hand=dataclasses.replace(loaded.hand, material=other))
     with pytest.raises(schema.InputError, match="stands against hand.material.law"):
         constants.check(changed)
     # Names of silicones and laws are no part of what is compiled: numbers are data.
     plain = dataclasses.replace(material, law=None, silicone=None, shear_modulus=1e5)
-    changed = dataclasses.replace(found, hand=dataclasses.replace(found.hand, material=plain))
-    assert changed.structure == found.structure
+    changed = dataclasses.replace(loaded, hand=dataclasses.replace(loaded.hand, material=plain))
+    assert changed.structure == loaded.structure
 
 
 def test_a_hand_file_names_its_silicone_in_a_line(tmp_path):
@@ -224,8 +224,8 @@ def test_a_hand_file_names_its_silicone_in_a_line(tmp_path):
     mine = hand.load(tmp_path / "mine.toml").material
     assert mine.law == "neo_hookean" and mine.shear_modulus == silicones.get(mine.silicone)[2]
     assert scene.load("paper", hand_name=tmp_path / "mine.toml").effects.neo_hookean
-    one = hand.load(tmp_path / "mine.toml", overrides={"material": "dragon_skin_20"}).material
-    assert one.shear_modulus == silicones.get("dragon_skin_20").shear_modulus
+    material = hand.load(tmp_path / "mine.toml", overrides={"material": "dragon_skin_20"}).material
+    assert material.shear_modulus == silicones.get("dragon_skin_20").shear_modulus
     with pytest.raises(schema.InputError, match="'ecoflex' unknown; valid: dragon_skin_10, "):
         silicones.get("ecoflex")
 
@@ -252,9 +252,9 @@ def test_silicones_lie_within_their_measurements():
 )
 def test_blanks_around_the_sign_of_a_value_are_let_pass(words):
     links = ("discretization", "links")
-    found = keypaths.parse([*words, "discretization.links=5"])
-    assert found == {("gravity",): 3.7, links: 5}
-    assert keypaths.parse(["discretization.links=5", *words]) == found
+    values = keypaths.parse([*words, "discretization.links=5"])
+    assert values == {("gravity",): 3.7, links: 5}
+    assert keypaths.parse(["discretization.links=5", *words]) == values
     design = [w.replace("gravity", "length") for w in words]
     assert common.open_designs(design)[0]["--design"] == ["length=3.7"]
 
@@ -262,8 +262,8 @@ def test_blanks_around_the_sign_of_a_value_are_let_pass(words):
 def test_signs_of_an_editor_are_read_in_numbers_and_kept_in_names():
     minus = "\N{MINUS SIGN}"
     dash = "\N{EN DASH}"
-    found = keypaths.parse([f"gravity={minus}3.7", f'hand.name="a{dash}b"', f"scene=c{dash}d"])
-    assert [*found.values()] == [-3.7, f"a{dash}b", f"c{dash}d"]
+    values = keypaths.parse([f"gravity={minus}3.7", f'hand.name="a{dash}b"', f"scene=c{dash}d"])
+    assert [*values.values()] == [-3.7, f"a{dash}b", f"c{dash}d"]
 
 
 @pytest.mark.parametrize(
@@ -326,8 +326,8 @@ def test_phases_out_of_order():
 def test_keys_of_earlier_scene_files_are_read_with_a_warning():
     gone = {"contact.time_constant": 0.04, "effects.soft_touch": True}
     with pytest.warns(UserWarning, match="without effects.soft_touch, contact.time_constant:"):
-        found = scene.load("paper", overrides=gone)
-    assert found == scene.load("paper")
+        loaded = scene.load("paper", overrides=gone)
+    assert loaded == scene.load("paper")
     with pytest.raises(schema.InputError, match="contact.impedence"):
         scene.load("paper", overrides={"contact.impedence": 0.9})
 

@@ -40,11 +40,11 @@ def workplace(tmp_path, monkeypatch):
 def simulated(monkeypatch):
     """Worlds that were simulated for pictures."""
     counts = []
-    own = animation.replay
+    original = animation.replay
 
     def replay(the_scene, engine, params, trials):
         counts.append(trials.yaw.shape[0])
-        return own(the_scene, engine, params, trials)
+        return original(the_scene, engine, params, trials)
 
     monkeypatch.setattr(animation, "replay", replay)
     return counts
@@ -91,7 +91,7 @@ def test_replay_writes_the_best_grasp_of_a_run(run, simulated, tmp_path, capsys)
 
 
 def test_wrong_grasps_are_refused_in_words(run, workplace, capsys):
-    own = ["--run", str(run)]
+    run_flags = ["--run", str(run)]
     cases = {
         ("render", *DESIGN, "--trial", "0"): "--trial: numbers of a run's trials.csv",
         ("render", *DESIGN, "--object", "spheer"): "did you mean 'sphere'",
@@ -102,10 +102,10 @@ def test_wrong_grasps_are_refused_in_words(run, workplace, capsys):
         ("render", *DESIGN, "--camera", "distance=0"): "distance = 0.0 is outside [0.05, 10] m",
         ("render", *DESIGN, "--size", "5000"): "--size = 5000 is outside [16, 4096]",
         ("render", *DESIGN, "--out", "a.png", "--times", "5"): "outside [0, 1.2] s",
-        ("render", *own, "--trial", "0", "--object", "sphere"): "exclude each other",
-        ("render", *own, "--trial", "3"): "--trial = 3 is outside [0, 2]",
-        ("replay", *own, "--objects", "household"): "--object must say",
-        ("replay", *own, "--out", "a.gif"): "must end in .html",
+        ("render", *run_flags, "--trial", "0", "--object", "sphere"): "exclude each other",
+        ("render", *run_flags, "--trial", "3"): "--trial = 3 is outside [0, 2]",
+        ("replay", *run_flags, "--objects", "household"): "--object must say",
+        ("replay", *run_flags, "--out", "a.gif"): "must end in .html",
         ("landscape", *DESIGN, "--parameters", "length", "arm_q"): "did you mean 'arm_z'",
         ("landscape", *DESIGN[:4], "--preset", "full"): "must name two of length[0]",
         (*GRID, "gravity", "length"): "'gravity' is not a parameter",
@@ -124,7 +124,7 @@ def test_wrong_grasps_are_refused_in_words(run, workplace, capsys):
         assert cli.main([*arguments]) == 2, arguments
         assert words in capsys.readouterr().err
     with pytest.raises(SystemExit):  # by the parser
-        cli.main(["replay", str(run), *own])
+        cli.main(["replay", str(run), *run_flags])
     assert "give one of them" in " ".join(capsys.readouterr().err.split())  # lines are filled
     assert not list(workplace.iterdir()), "nothing was written"
 
@@ -156,13 +156,13 @@ def test_landscape_has_every_point(run, monkeypatch, capsys):
     sizes = ["--points", "3", "--trials", "2", "--seed", "5"]
     assert cli.main(["landscape", "--run", str(run), *sizes]) == 0
     assert "grasps: 18 in 2 calls" in capsys.readouterr().out
-    found = landscape.load(run / landscape.FILE)
+    plane = landscape.load(run / landscape.FILE)
     the_scene, settings = runs.read_run(run)
     space = design_space(the_scene.hand, settings.preset)
     low, high = (space.in_units(np.array(v)) for v in (space.low, space.high))
-    np.testing.assert_allclose(found.first, np.linspace(low[0], high[0], 3))
-    np.testing.assert_allclose(found.second, np.linspace(low[1], high[1], 3))
-    designs = space.from_units([[a, b] for a in found.first for b in found.second])
+    np.testing.assert_allclose(plane.first, np.linspace(low[0], high[0], 3))
+    np.testing.assert_allclose(plane.second, np.linspace(low[1], high[1], 3))
+    designs = space.from_units([[a, b] for a in plane.first for b in plane.second])
     engine = make_engine("mujoco", the_scene)
     evaluate = codesign.Task(the_scene, space, 2, engine).evaluate
     # As many designs in a call as the command has: the same program, which is there already.
@@ -171,14 +171,14 @@ def test_landscape_has_every_point(run, monkeypatch, capsys):
     cost = codesign.particle_cost(
         the_scene, joined
     )  # leaves out failed trials, such as a stuck one
-    np.testing.assert_allclose(found.cost.ravel(), cost, rtol=1e-6)
+    np.testing.assert_allclose(plane.cost.ravel(), cost, rtol=1e-6)
     assert len(np.unique(cost.round(3))) > 3, "points differ"
-    np.testing.assert_array_equal(found.counted.ravel(), (~failed(joined.status)).sum(1))
+    np.testing.assert_array_equal(plane.counted.ravel(), (~failed(joined.status)).sum(1))
     rows = list(csv.DictReader((run / landscape.TABLE).read_text().splitlines()))
     assert len(rows) == 9
-    assert float(rows[5]["length_mm"]) == pytest.approx(found.first[1])
-    assert float(rows[5]["arm_z_mm"]) == pytest.approx(found.second[2])
-    assert float(rows[5]["mean_cost"]) == pytest.approx(found.cost[1, 2], rel=1e-8)
+    assert float(rows[5]["length_mm"]) == pytest.approx(plane.first[1])
+    assert float(rows[5]["arm_z_mm"]) == pytest.approx(plane.second[2])
+    assert float(rows[5]["mean_cost"]) == pytest.approx(plane.cost[1, 2], rel=1e-8)
     assert (run / "figures" / "landscape.png").exists()
     assert cli.main(["report", str(run), "--no-replay"]) == 0
     assert "mean cost over 2 trials a point" in (run / "report.html").read_text(encoding="utf-8")
@@ -217,16 +217,18 @@ def test_a_landscape_is_over_any_numbers(words, names, varied):
             assert case.space.in_units(made.designs[2 * i + j])[k] == pytest.approx(wanted)
         if made.numbers is None:
             continue
-        own = {n: float(values[n]) for n in varied}
+        numbers = {n: float(values[n]) for n in varied}
         count = len(case.scene.objects.object)
-        own = {
+        numbers = {
             n.replace("object.mass", f"object.{k}.mass"): v
-            for n, v in own.items()
+            for n, v in numbers.items()
             for k in range(count)
         }
-        wanted = scenes.load(TINY, overrides=own)
-        found = jax.tree.unflatten(tree, made.numbers[2 * i + j].tolist())
-        np.testing.assert_allclose(jax.tree.leaves(found), jax.tree.leaves(wanted), rtol=1e-12)
+        wanted = scenes.load(TINY, overrides=numbers)
+        point_scene = jax.tree.unflatten(tree, made.numbers[2 * i + j].tolist())
+        np.testing.assert_allclose(
+            jax.tree.leaves(point_scene), jax.tree.leaves(wanted), rtol=1e-12
+        )
 
 
 def test_missing_extra_is_one_line(monkeypatch, capsys):

@@ -95,8 +95,8 @@ def test_steps_of_the_kernel_equal_mujocos(tmp_path, name):
     shape, effects, fixtures = (SCENES | SLOW)[name]
     with jax.enable_x64(True):
         scene = loaded(tmp_path, fixtures, shape, **effects)
-        fields, ctrl, found = path_of(scene)
-        errors, far, touching = oracles.against_mujoco(scene, fields, ctrl, found)
+        fields, ctrl, trajectory = path_of(scene)
+        errors, far, touching = oracles.against_mujoco(scene, fields, ctrl, trajectory)
         # A difference of velocities over 10 ms loses two of 16 digits, and MuJoCo's own Newton
         # stops at rounding of its cost.  Its rigid arm gives way by the hand's forces over 1e9 kg,
         # which stiff fingers multiply: 1.6e-8 with a wrist of 1e9, 2e-10 of 1e11.
@@ -107,11 +107,11 @@ def test_steps_of_the_kernel_equal_mujocos(tmp_path, name):
                 assert touching.max() > (1 if shape == "sphere" else 4)
             return
         plain = loaded(tmp_path, "", shape)
-        _, _, fewer = oracles.against_mujoco(plain, a_grasp(plain)[0], ctrl, found)
+        _, _, fewer = oracles.against_mujoco(plain, a_grasp(plain)[0], ctrl, trajectory)
         assert (touching > fewer).mean() > 0.3  # fixtures are touched in many steps
         for fault, (sound, wrong) in FAULTS.items():
             other = loaded(tmp_path, fixtures.replace(sound, wrong), shape)
-            errors, *_ = oracles.against_mujoco(other, a_grasp(other)[0], ctrl, found)
+            errors, *_ = oracles.against_mujoco(other, a_grasp(other)[0], ctrl, trajectory)
             assert errors.max() > 1e-3, fault
 
 
@@ -146,11 +146,11 @@ def test_steps_of_mjx_equal_mujocos(tmp_path, effects, fixtures):
             oracles.soften(scene, fields, data)
             if k % 70 == 20:
                 ours = ours.replace(qpos=data.qpos.copy(), qvel=data.qvel.copy())
-                found = step(fields, ours, ctrl[0, k])
+                state = step(fields, ours, ctrl[0, k])
                 mujoco.mj_forward(oracle, data)
                 scale = max(np.linalg.norm(data.qacc), oracles.FLOOR)
                 # MJX keeps its warm start where it is good enough: 4e-9 at rest.
-                assert np.linalg.norm(found.qacc - data.qacc) / scale < 1e-7, k
+                assert np.linalg.norm(state.qacc - data.qacc) / scale < 1e-7, k
             mujoco.mj_step(oracle, data)
             most = max(most, data.ncon)
         assert most > 1 or not fixtures
@@ -163,8 +163,8 @@ def test_the_kernel_balances_rings_and_edges(tmp_path, shape):
     alone = {"effects.surface": "hull", "effects.finger_itself": False, "effects.table": False}
     with jax.enable_x64(True):
         scene = loaded(tmp_path, WALL + POST + SHELF, shape, **alone)
-        fields, ctrl, found = path_of(scene)
-        later = oracles.Path(*(v[:, 1:] for v in found))
+        fields, ctrl, trajectory = path_of(scene)
+        later = oracles.Path(*(v[:, 1:] for v in trajectory))
         assert oracles.unbalanced(scene, fields, ctrl[:, 1:], later, 10).max() < 1e-8
 
 

@@ -35,12 +35,12 @@ def test_sets_fill_their_ranges_and_every_beginning_does():
     # A Sobol sequence has one of its first 16 points in each sixteenth of every axis.
     for column in units[:16].T:
         assert sorted(np.floor(16 * column)) == list(range(16))
-    found = calibration.values(units)
+    constants = calibration.values(units)
     for name, o in OPEN.items():
-        assert o.low <= found[name].min() and found[name].max() <= o.high
+        assert o.low <= constants[name].min() and constants[name].max() <= o.high
     middle = calibration.values(np.full((1, len(OPEN)), 0.5))
     assert middle["mass"] == pytest.approx(np.sqrt(20 * 300)) and middle["tilt"] == 60.0
-    assert (found["pair_gap"] >= found["width"] + 2.0).all()
+    assert (constants["pair_gap"] >= constants["width"] + 2.0).all()
 
 
 def wells(ridge=2.6, floor=2.6):
@@ -81,8 +81,8 @@ def test_a_second_wave_is_near_the_best_of_the_first(tmp_path):
     path = tmp_path / "scores.npz"
     names = [*OPEN]
     more = np.insert(units, 4, 0.5, axis=1)
-    own = dict(units=more, distances=distances, names=[*names[:4], "shear_modulus", *names[4:]])
-    output.write_arrays(path, own)
+    arrays = dict(units=more, distances=distances, names=[*names[:4], "shear_modulus", *names[4:]])
+    output.write_arrays(path, arrays)
     np.testing.assert_array_equal(calibration.scored(path)[0], units)
     output.write_arrays(path, dict(units=units[:, 1:], distances=distances, names=names[1:]))
     with pytest.raises(scene.InputError, match="has no constant tilt"):
@@ -104,21 +104,21 @@ def test_statements_rule_out_what_they_should():
     paper = scene.load("paper")
     flat = [np.full((12, 12), c) for c in (0.0, 2.5)]
     costs = np.repeat(np.array([*flat, wells()])[..., None], 6, -1)
-    own = calibration.values(np.stack([calibration.own_set(paper)] * 3))
-    np.testing.assert_allclose(own["cost_maximum"], paper.cost.maximum, rtol=1e-9)
-    found = calibration.score(costs, own, paper)
+    constants = calibration.values(np.stack([calibration.own_set(paper)] * 3))
+    np.testing.assert_allclose(constants["cost_maximum"], paper.cost.maximum, rtol=1e-9)
+    scores = calibration.score(costs, constants, paper)
     # p M_p h / EI is 1.707 at 25 mm of height, 2 mm of wall, 80 kPa and 35 kPa, and goes by 1/G.
     soft = linear_hand(35.0)
-    [strain, *same] = calibration.free_strain(own, soft, neo_hookean=False)
+    [strain, *same] = calibration.free_strain(constants, soft, neo_hookean=False)
     assert strain == pytest.approx(1.707, abs=1e-3) and same == [strain] * 2
     # A neo-Hookean wall of the same modulus is up to four times softer at large strain.
-    softer = calibration.free_strain(own, soft, neo_hookean=True)
+    softer = calibration.free_strain(constants, soft, neo_hookean=True)
     assert softer[0] > 1.5 * strain
     own_strain = calibration.free_strain(
-        own, paper.hand, neo_hookean=bool(paper.effects.neo_hookean)
+        constants, paper.hand, neo_hookean=bool(paper.effects.neo_hookean)
     )
-    np.testing.assert_allclose(found["free strain"], np.maximum(own_strain - 1.5, 0) / 0.06)
-    good, bad, two = (({n: d[i] for n, d in found.items()}) for i in range(3))
+    np.testing.assert_allclose(scores["free strain"], np.maximum(own_strain - 1.5, 0) / 0.06)
+    good, bad, two = (({n: d[i] for n, d in scores.items()}) for i in range(3))
     assert good["solutions"] == 0 and good["poor seeds"] > calibration.CUTOFF
     assert good["420 simulations"] > calibration.CUTOFF, "after the first episode"
     assert bad["solutions"] == pytest.approx(2.0) and bad["single is poor"] > calibration.CUTOFF
@@ -182,24 +182,26 @@ def test_a_ring_down_is_read_from_its_peaks():
 def test_winners_of_a_search_are_judged_at_other_masses(tmp_path):
     """What they keep at a mass is what MuJoCo C says of them in the same trials."""
     sizes = "--preset 2d --optimizers screened-es:particles=6,trials=2,tests=2 --seeds 3 --tests 5"
-    how = [*sizes.split(), "--marks", "1", "--budget", "50", "--scene", str(toy_engine.TINY)]
-    how += ["--out", str(tmp_path), "--commit", "abcdef0"]
-    assert search.main([*how, "--set", "objects.noise.mass_range=10"]) == 0
+    arguments = [*sizes.split(), "--marks", "1", "--budget", "50", "--scene", str(toy_engine.TINY)]
+    arguments += ["--out", str(tmp_path), "--commit", "abcdef0"]
+    assert search.main([*arguments, "--set", "objects.noise.mass_range=10"]) == 0
     [path] = tmp_path.glob("*.json")
     masses = ["--masses", "0.05", "2"]
-    assert search.main([*how, "--designs", str(path.with_suffix(".npz")), *masses]) == 0
+    assert search.main([*arguments, "--designs", str(path.with_suffix(".npz")), *masses]) == 0
     [judged] = (json.loads(p.read_text()) for p in tmp_path.glob("*-masses.json"))
     row = json.loads(path.read_text())
     designs = work.winners(path.with_suffix(".npz"))
     assert row["changes"] == ["objects.noise.mass_range=10"] and len(row["kept"][-1]) == 3
-    own = scene.load(toy_engine.TINY, overrides={"objects.object.0.mass": 2.0})
-    space = parameters.design_space(own.hand, "2d")
-    engine = make_engine("mujoco", own)
+    heavy_scene = scene.load(toy_engine.TINY, overrides={"objects.object.0.mass": 2.0})
+    space = parameters.design_space(heavy_scene.hand, "2d")
+    engine = make_engine("mujoco", heavy_scene)
     for seed, design in enumerate(designs):
         key = codesign.stream_key(jax.random.key(seed), search.STREAM_JUDGE, 0)
         hand = jax.tree.map(lambda v: v[None], space.params(design))
-        found = rollout.evaluate(own, engine, hand, rollout.sample_trials(own, key, 5))
-        assert judged["masses"]["2"][seed] == np.mean(found.cost < codesign.SUCCESS_COST)
+        outcome = rollout.evaluate(
+            heavy_scene, engine, hand, rollout.sample_trials(heavy_scene, key, 5)
+        )
+        assert judged["masses"]["2"][seed] == np.mean(outcome.cost < codesign.SUCCESS_COST)
     light, heavy = (np.mean(judged["masses"][m]) for m in ("0.05", "2"))
     assert heavy != light
     table = search.masses_table([judged])
@@ -219,16 +221,16 @@ def test_presets_replace_the_scene_s_values_and_overrides_replace_theirs():
     fast = scene.load("paper_spheres", accuracy="fast", overrides={"discretization": {"links": 7}})
     assert (fast.discretization.links, fast.newton.iterations) == (7, 4)
     for name, iterations in {"fast": 4, "fine": 6}.items():
-        found = scene.load("paper", accuracy=name)
-        assert StructuredEngine(found).limits.iterations == iterations
+        loaded = scene.load("paper", accuracy=name)
+        assert StructuredEngine(loaded).limits.iterations == iterations
 
 
 def test_the_command_line_takes_a_preset(capsys):
-    found, _ = optimize.resolve(
+    resolved, _ = optimize.resolve(
         cli.Optimize(accuracy="fast", engine="mujoco", overrides=(("solver.iterations=7",),))
     )
-    assert found.discretization == scene.Discretization(0.01, 10, 1, integrator="newmark")
-    assert found.solver.iterations == 7
+    assert resolved.discretization == scene.Discretization(0.01, 10, 1, integrator="newmark")
+    assert resolved.solver.iterations == 7
     assert cli.main(["evaluate", "--accuracy", "fastest"]) == 2
     assert "'fastest' unknown; did you mean 'fast'" in capsys.readouterr().err
 
@@ -259,13 +261,13 @@ def test_mujoco_converges_with_the_scene_s_own_limits():
             d.ctrl[:] = ctrl[w, k]
             if k >= first and k % 30 == 0:
                 mujoco.mj_forward(truth, d)
-                for m, data, found in zip(others, datas, errors, strict=True):
+                for m, data, series in zip(others, datas, errors, strict=True):
                     data.qpos[:] = d.qpos
                     data.qvel[:] = d.qvel
                     data.ctrl[:] = d.ctrl
                     mujoco.mj_forward(m, data)
                     away = np.linalg.norm(data.qacc - d.qacc)
-                    found.append(away / max(np.linalg.norm(d.qacc), 100.0))
+                    series.append(away / max(np.linalg.norm(d.qacc), 100.0))
             mujoco.mj_step(truth, d)
     assert max(errors[0]) < 1e-3 and max(errors[1]) > 1e-2
 
@@ -348,9 +350,9 @@ def test_paired_tests():
 def test_both_readings_of_converged():
     """Below 1 in the second episode, above in the third, and below from the fourth on."""
     means = np.array([[[2.0, 0.5, 1.5, 0.9, 0.2], [2.0] * 5]])
-    one = results.Study({}, {}, {"mean_exclude": means})
-    np.testing.assert_array_equal(one.first_below(), [[2.0, np.inf]])
-    np.testing.assert_array_equal(one.convergence(), [[4.0, np.inf]])
+    study = results.Study({}, {}, {"mean_exclude": means})
+    np.testing.assert_array_equal(study.first_below(), [[2.0, np.inf]])
+    np.testing.assert_array_equal(study.convergence(), [[4.0, np.inf]])
 
 
 def test_the_results_page_has_the_tables_of_its_data():

@@ -99,17 +99,17 @@ def test_a_tunnel_may_have_another_port(guarded):
     """Its page has a cookie of that port: tunnels to two machines may end at one port there."""
     token, port = guarded
     hosts = {"localhost:9000": 9000, "127.0.0.1:1": 1, "[::1]:65535": 65535, "LOCALHOST": 80}
-    for host, own in hosts.items():
+    for host, cookie_port in hosts.items():
         answer, _ = asked(port, f"/?token={token}", Host=host)
         cookie = answer.headers["Set-Cookie"].split(";")[0]
-        assert (answer.status, cookie) == (200, f"codesign-studio-{own}={token}")
+        assert (answer.status, cookie) == (200, f"codesign-studio-{cookie_port}={token}")
         opening = {"Connection": "Upgrade", "Upgrade": "websocket", "Host": host}
         opening |= {"Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA=="}
         for origin, status in (
             (f"http://{host}", 101),
             (f"https://{host}", 101),  # a proxy with TLS
             (f"http://localhost:{port}", 403),
-            (f"http://stranger.example:{own}", 403),
+            (f"http://stranger.example:{cookie_port}", 403),
             (f"{host}", 403),
         ):
             given = opening | {"Cookie": cookie, "Origin": origin}
@@ -147,17 +147,17 @@ def test_a_stranger_s_page_opens_no_socket(guarded):
     """A stranger's page has another origin; cookies alone, which ports share, are not enough."""
     token, port = guarded
     url = f"ws://127.0.0.1:{port}/socket"
-    own = f"http://127.0.0.1:{port}"
+    same_origin = f"http://127.0.0.1:{port}"
     cookie = {"Cookie": f"a=b; codesign-studio-{port}={token}"}
-    with connect(url, origin=own, additional_headers=cookie) as socket:
+    with connect(url, origin=same_origin, additional_headers=cookie) as socket:
         socket.send("hello")
         assert socket.recv() == "hello"
         with pytest.raises(ConnectionClosed):
             socket.send("x" * (server.MOST_BYTES + 1))
             socket.recv()
     for origin, headers in (
-        (own, {}),
-        (own, {"Cookie": f"codesign-studio-{port + 1}={token}"}),
+        (same_origin, {}),
+        (same_origin, {"Cookie": f"codesign-studio-{port + 1}={token}"}),
         ("http://stranger.example", cookie),
         (f"http://127.0.0.1:{port + 1}", cookie),
         ("null", cookie),
@@ -210,32 +210,35 @@ def test_a_tab_shows_judges_improves_and_saves(desk, capsys, monkeypatch):
         {"title": "Control", "members": [1]},
     ]
     tab.receive(show([1e9, 30.0], resting=False))
-    found = settled(tab)
-    assert found["grasp"]["design"] == pytest.approx([180, 30]), "within its bounds"
-    assert "verdict" not in found and "overlap" not in found, "not while a slider moves"
+    messages = settled(tab)
+    assert messages["grasp"]["design"] == pytest.approx([180, 30]), "within its bounds"
+    assert "verdict" not in messages and "overlap" not in messages, "not while a slider moves"
     tab.receive(show([100.0, 0.0]))
-    found = settled(tab)
-    assert found["overlap"].startswith("Deepest overlap: ")
-    assert len(found["grasp"]["series"]["height"]) == found["grasp"]["replay"]["frames"]
+    messages = settled(tab)
+    assert messages["overlap"].startswith("Deepest overlap: ")
+    assert len(messages["grasp"]["series"]["height"]) == messages["grasp"]["replay"]["frames"]
     design = ["--scene", TINY, "--engine", "mujoco", "--design", "length=100", "arm_z=0"]
     assert command("evaluate", *design, "--trials", COUNTS[0]) == 0
     verdict = capsys.readouterr().out.split("verdict: ")[1].strip()
-    assert found["verdict"]["sentence"] == verdict.replace("fresh ", "")
+    assert messages["verdict"]["sentence"] == verdict.replace("fresh ", "")
     tab.receive('{"run": [2, 1]}')
     kept = cases.find_grasp(desk.case.scene, desk.record, episode=2, particle=1).design
-    found = settled(tab)["grasp"]
-    assert found["design"] == pytest.approx(desk.case.space.in_units(kept).tolist(), rel=1e-6)
+    messages = settled(tab)["grasp"]
+    assert messages["design"] == pytest.approx(desk.case.space.in_units(kept).tolist(), rel=1e-6)
     monkeypatch.setattr(tabs, "EPISODES", 2)
     monkeypatch.setattr(tabs, "PARTICLES", 4)
     tab.receive(show([100.0, 0.0], number=7))
     settled(tab)
     tab.receive('{"improve": true}')
-    found = settled(tab)
-    assert found["grasp"]["number"] is None and (found["improving"], found["state"]) == (False, "")
-    better = found["grasp"]["design"]
+    messages = settled(tab)
+    assert messages["grasp"]["number"] is None and (messages["improving"], messages["state"]) == (
+        False,
+        "",
+    )
+    better = messages["grasp"]["design"]
     assert better == pytest.approx([100.0, 0.0], abs=60), "near it"
     assert np.abs(np.subtract(better, [100.0, 0.0])).min() > 1, "and elsewhere"
-    assert len(found["verdict"]["ends"]) == COUNTS[0], "and judged"
+    assert len(messages["verdict"]["ends"]) == COUNTS[0], "and judged"
     tab.receive(show([100.0, 0.0], number=8))
     settled(tab)
     tab.receive('{"save": true}')
@@ -370,9 +373,9 @@ def test_one_command_runs_at_a_time(desk, monkeypatch, tmp_path):
     monkeypatch.setattr(desk.options, "out", place)
     tab = Tab(desk)
     other = Tab(desk)
-    for one in (tab, other):
-        one.receive(show([100.0, 0.0]))
-        settled(one)
+    for client in (tab, other):
+        client.receive(show([100.0, 0.0]))
+        settled(client)
     tab.receive('{"export": true}')
     assert settled(tab)["done"].endswith(process.RUNNING)
     for again, action in itertools.product((tab, other), ("export", "report")):
@@ -491,9 +494,9 @@ def served(desk):
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory):
     """A studio that has begun, and its address."""
-    with served(Desk(cli.Studio(**OPTIONS, out=tmp_path_factory.mktemp("studio")))) as found:
-        found[0].begin()
-        yield found
+    with served(Desk(cli.Studio(**OPTIONS, out=tmp_path_factory.mktemp("studio")))) as studio:
+        studio[0].begin()
+        yield studio
 
 
 @contextlib.contextmanager
@@ -502,8 +505,8 @@ def visited(browser, address, width=1200):
     page = browser.new_context(viewport={"width": width, "height": 800}).new_page()
     complaints = []
     page.on("pageerror", lambda error: complaints.append(str(error)))
-    own = address.split("?")[0]
-    page.on("request", lambda r: None if r.url.startswith(own) else complaints.append(r.url))
+    origin = address.split("?")[0]
+    page.on("request", lambda r: None if r.url.startswith(origin) else complaints.append(r.url))
     page.goto(address)
     yield page
     page.context.close()
@@ -667,6 +670,6 @@ def test_names_of_phases_have_room(browser, opened, width):
         for box in boxes:
             assert chart["x"] <= box["x"] and box["x"] + box["width"] <= chart["x"] + chart["width"]
             assert box["y"] + box["height"] <= chart["y"] + chart["height"] + 1  # a rounded pixel
-        for one, other in itertools.combinations(boxes, 2):
-            apart = one["x"] + one["width"] < other["x"] or one["y"] != other["y"]
-            assert apart or other["x"] + other["width"] < one["x"]
+        for first, other in itertools.combinations(boxes, 2):
+            apart = first["x"] + first["width"] < other["x"] or first["y"] != other["y"]
+            assert apart or other["x"] + other["width"] < first["x"]

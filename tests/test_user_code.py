@@ -224,8 +224,8 @@ def test_a_policy_is_searched_and_said_wherever_it_acts(here, capsys):
     assert cli.main(files) == 0
     said = capsys.readouterr().out
     assert "a.toml keeps " in said and "b.toml keeps " in said and "difference: " in said
-    one, other = (user_code.make_policy("mine:Pull", the_scene)[0] for _ in range(2))
-    assert one is other  # its programs are compiled once
+    first, other = (user_code.make_policy("mine:Pull", the_scene)[0] for _ in range(2))
+    assert first is other  # its programs are compiled once
 
 
 def test_a_dry_run_tells_of_a_policy_that_commands_kilopascals(here, capsys):

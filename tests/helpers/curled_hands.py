@@ -29,8 +29,8 @@ def curled(the_scene, seed, bend, height, length=0.1):
     oracle.opt.iterations = 200
     oracle.opt.ls_iterations = 50
     data = mujoco.MjData(oracle)
-    found = state(the_scene, seed, bend, height, length)
-    fields, data.qpos[:], data.qvel[:], data.ctrl[:] = found
+    world = state(the_scene, seed, bend, height, length)
+    fields, data.qpos[:], data.qvel[:], data.ctrl[:] = world
     return oracle, data, jax.tree.map(lambda x: x[None], fields)
 
 

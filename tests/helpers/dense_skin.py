@@ -148,9 +148,9 @@ def on_finger(body, other, per_area, cells=40):
         axes = [lo + s * (np.arange(n) + 0.5) for lo, s, n in zip(low, step, counts, strict=True)]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
         point = body.base + grid @ turn.T
-        own, outward = inside(body, point)
+        ours, outward = inside(body, point)
         theirs, away = inside(other, point)
-        both = own & theirs
+        both = ours & theirs
         if not both.any():
             return Push(np.zeros(3), np.zeros(3), 0.0)
         low = grid[both].min(0) - step

@@ -87,9 +87,9 @@ class Dense:
 
     def jac(self, point, body):
         """Jacobian of a body's point, (3, nv)."""
-        found = np.zeros((3, self.oracle.nv))
-        mujoco.mj_jac(self.oracle, self.data, found, None, point, body)
-        return found
+        jacobian = np.zeros((3, self.oracle.nv))
+        mujoco.mj_jac(self.oracle, self.data, jacobian, None, point, body)
+        return jacobian
 
     def _add(
         self,
@@ -108,10 +108,10 @@ class Dense:
         """Adds a contact, if it may act within the step."""
         c = self.scene.contact
         h = self.scene.discretization.timestep
-        own, other = (self.jac(point, body) for body in ends)
+        first, other = (self.jac(point, body) for body in ends)
         frame = np.linalg.svd(normal[None])[2]
         frame[0] = normal
-        jac = frame @ (own - other)
+        jac = frame @ (first - other)
         speed = jac @ self.data.qvel
         if gap >= max(0.002, -h * speed[0]):
             return
@@ -192,7 +192,7 @@ def project(z, slope):
 class DensePairs(Dense):
     """A step's problem with the contacts of fingers with each other, themselves and the palm."""
 
-    def __init__(self, scene, oracle, data, hand, grip=None, own=None, holds=None):
+    def __init__(self, scene, oracle, data, hand, grip=None, finger_grips=None, holds=None):
         """As `Dense`.
 
         grip: Friction coefficient that the first of two fingers uses on the second one, (3,).
@@ -200,7 +200,7 @@ class DensePairs(Dense):
         """
         super().__init__(scene, oracle, data, hand, holds)
         self.grip = grip
-        self.own = own
+        self.finger_grips = finger_grips
         self.pairs = self.on_palm = self.itself = self.ahead = 0
         self.sides = {}
         for f, finger in enumerate(self.fingers):
@@ -222,11 +222,11 @@ class DensePairs(Dense):
 
     def normal_forces(self, size):
         """Sums by first and second finger, or a size less one for the palm, in the solution."""
-        found = np.zeros((size, size))
+        forces = np.zeros((size, size))
         for row, sides in self.sides.items():
             for ends in {sides, sides[::-1]}:
-                found[ends] += self.force(row)[0]
-        return found
+                forces[ends] += self.force(row)[0]
+        return forces
 
     def _on_palm(self, f, ring):
         c = self.scene.contact
@@ -252,7 +252,7 @@ class DensePairs(Dense):
         end = ring.along - max(3.0, 1.8 * finger.height / finger.segment)
         if end >= 0.5:
             point, normal, gap, share, body = between(ring, finger, 0.5, end)
-            grip = None if self.own is None else self.own[f]
+            grip = None if self.finger_grips is None else self.finger_grips[f]
             rest = c.finger_finger_friction, 2, c.finger_finger_friction_ratio, grip, 1.0, f
             self._add(point, normal, gap, share, (ring.body, body), *rest)
         self._count("itself", before, f, f)
@@ -268,9 +268,9 @@ class DensePairs(Dense):
     def next_holds(self):
         """What contacts with object and table use in the solution, by name."""
         names = {name for *_, name in self.held if isinstance(name, tuple) or name == "lowest"}
-        found = {name: self.next_grip(name) for name in names}
+        grips = {name: self.next_grip(name) for name in names}
         on_object = {name: isinstance(name, tuple) and name[2] for name in names}
-        return {n: self.turn.T @ g if on_object[n] else g for n, g in found.items()}
+        return {n: self.turn.T @ g if on_object[n] else g for n, g in grips.items()}
 
     def next_grip(self, name="two"):
         """What the first finger uses in the solution: tangential over normal forces, or elastic."""
@@ -344,7 +344,7 @@ class Rings:
 
     def nearest(self, point, low, high):
         """Segment and share of it that is nearest to a point, between two places along."""
-        found = ()
+        best = ()
         for i, (a, b) in enumerate(zip(self.points, self.points[1:], strict=False)):
             start, end = self.places[i : i + 2]
             if i == 0 and low > 0:
@@ -354,9 +354,9 @@ class Rings:
                 continue
             t = np.clip((point - a) @ (b - a) / ((b - a) @ (b - a)), *ends)
             square = ((point - a - t * (b - a)) ** 2).sum()
-            if not found or square < (1 - 1e-4) * found[0]:
-                found = square, i, t
-        return found[1:]
+            if not best or square < (1 - 1e-4) * best[0]:
+                best = square, i, t
+        return best[1:]
 
 
 def reach(half, direction):
@@ -428,9 +428,9 @@ def between(ring, other, low, high):
     half = np.array([other.rings[-1].half[0] if i == other.links else 0.0, *ring.half[1:]])
     half[1:] = other.rings[-1].half[1:]
     for frame, size, sign in ((ring.frame, ring.half, -1), (section, half, 1)):
-        own = sign * frame @ own_normal(size, sign * frame.T @ away)
+        face_normal = sign * frame @ own_normal(size, sign * frame.T @ away)
         along = (line @ frame[:, 0]) ** 2
-        normal = normal + (1 - along) * own + along * line
+        normal = normal + (1 - along) * face_normal + along * line
     normal = normal / np.linalg.norm(normal)
     back = section.T @ normal
     toward = -ring.frame.T @ normal

@@ -117,8 +117,8 @@ class Case:
         blocks = -(-worlds // self.program.block)
         tables = []
         for x in self.tables[:6]:
-            one = self.world(x)[..., None]
-            block = np.repeat(one, self.program.block, -1).reshape(x.shape[1:])
+            column = self.world(x)[..., None]
+            block = np.repeat(column, self.program.block, -1).reshape(x.shape[1:])
             tables.append(np.repeat(block[None], blocks, 0))
         return tables + [x.copy() for x in self.tables[6:]]
 
@@ -139,19 +139,19 @@ class Case:
 
     def _opposite(self, values):
         """Rows of what fingers hold on one another, of values (row, finger): equal and opposite."""
-        found = np.zeros_like(values)
+        opposite = np.zeros_like(values)
         fingers = np.arange(values.shape[1])
         rows = self.rows(2, f"held.{FINGERS}")
         for item, row in enumerate(np.arange(values.shape[0])[rows][::3]):
             other = fingers ^ item
             mine = values[row : row + 3] * ((fingers < other) | (item == 0))
-            found[row : row + 3] = mine - mine[:, other] * (item > 0)
-        return found
+            opposite[row : row + 3] = mine - mine[:, other] * (item > 0)
+        return opposite
 
     def directions(self):
         """A random direction for each group, as large as its numbers."""
         random = np.random.default_rng(0)
-        found = []
+        directions = []
         for k, name in self.groups:
             here = self.world(self.tables[k])
             rows = self.rows(k, name)
@@ -163,8 +163,8 @@ class Case:
                 along = self._opposite(along)
             if name == "quat":  # it stays one
                 along[rows] -= here[rows] * (here[rows] * along[rows]).sum()
-            found.append(along)
-        return found
+            directions.append(along)
+        return directions
 
     def differences(self, weights, step):
         """Central differences of the weighted results along the groups' directions; the trace."""
@@ -183,16 +183,16 @@ class Case:
 
         @jax.jit
         def results(out):
-            found, last = self.program.outputs(out, count, states=True)
-            return found, coordinates.flat(last)
+            outputs, last = self.program.outputs(out, count, states=True)
+            return outputs, coordinates.flat(last)
 
-        found, last = jax.tree.map(np.asarray, results(self.execute(tables)))
-        entries = np.stack([found[n] for n in ("distance", "height", "speed")], 2)
+        outputs, last = jax.tree.map(np.asarray, results(self.execute(tables)))
+        entries = np.stack([outputs[n] for n in ("distance", "height", "speed")], 2)
         value = last @ weights.last
         value = value + np.einsum("wte,te->w", entries, weights.entries)
-        value = value + np.einsum("wtq,tq->w", found["qpos"], weights.qpos)
+        value = value + np.einsum("wtq,tq->w", outputs["qpos"], weights.qpos)
         sides = value[:-1].reshape(-1, 2)
-        return (sides[:, 0] - sides[:, 1]) / (2 * step), found
+        return (sides[:, 0] - sides[:, 1]) / (2 * step), outputs
 
     def execute(self, tables):
         """What the forward kernel makes of tables, all states recorded."""

@@ -97,20 +97,20 @@ def random_constants(the_scene, seed, count=None):
     """
     random = np.random.default_rng(seed)
     shape = () if count is None else (count,)
-    found = jax.tree.map(
+    varied = jax.tree.map(
         lambda v, r: np.clip(v * random.uniform(0.8, 1.2, shape), r.low, r.high),
         the_scene,
         schema.ranges(the_scene),
     )
     slow = jax.tree.map(lambda v: v * random.uniform(0.97, 1.03, shape), the_scene.phases)
-    return dataclasses.replace(found, phases=jax.tree.map(np.asarray, slow))
+    return dataclasses.replace(varied, phases=jax.tree.map(np.asarray, slow))
 
 
 def still(shape=0):
     """A trial without noise, as NumPy arrays."""
     zero = np.zeros(())
-    one = np.ones(())
-    return Trial(np.int32(shape), np.zeros(2), zero, np.zeros(2), one, one, one, one, one)
+    unity = np.ones(())
+    return Trial(np.int32(shape), np.zeros(2), zero, np.zeros(2), unity, unity, unity, unity, unity)
 
 
 def hand_world(the_scene, **changes):

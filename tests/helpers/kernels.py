@@ -31,14 +31,14 @@ def call(x, table, rounds=10):
     dtype = x.dtype
     lanes = x.shape[2]
 
-    def spec(rows, own=True):
-        return pl.BlockSpec((None, rows, lanes), lambda i: (i if own else 0, 0, 0))
+    def spec(rows, per_block=True):
+        return pl.BlockSpec((None, rows, lanes), lambda i: (i if per_block else 0, 0, 0))
 
     outputs = [jax.ShapeDtypeStruct((blocks, rows, lanes), dtype) for rows in (1, 3)]
     function = pl.pallas_call(
         partial(body, rounds),
         grid=(blocks,),
-        in_specs=[spec(2), spec(1, own=False)],
+        in_specs=[spec(2), spec(1, per_block=False)],
         out_specs=[spec(1), spec(3)],
         out_shape=outputs,
     )

@@ -47,8 +47,8 @@ def path(engine, fields, ctrl):
         state = engine.reset(fields)
         return engine.advance(world_constants(engine.scene, fields), state, ctrl)[0]
 
-    found = run(fields, jnp.asarray(ctrl))
-    return Path(*(np.asarray(found[name]) for name in Path._fields))
+    outputs = run(fields, jnp.asarray(ctrl))
+    return Path(*(np.asarray(outputs[name]) for name in Path._fields))
 
 
 def exact(scene, fields):
@@ -60,7 +60,7 @@ def exact(scene, fields):
     return compiled
 
 
-def against_mujoco(scene, fields, ctrl, found, stride=1):
+def against_mujoco(scene, fields, ctrl, trajectory, stride=1):
     """Errors of a path's steps against MuJoCo C, which converges at each of its states.
 
     Relative ones of accelerations, of distances [m], and numbers of contacts, (world, state). The
@@ -73,20 +73,20 @@ def against_mujoco(scene, fields, ctrl, found, stride=1):
     far = []
     touching = []
     for world in range(len(ctrl)):
-        own = grasps.nth(fields, world)
-        data = mujoco.MjData(compiled := exact(scene, own))
+        world_fields = grasps.nth(fields, world)
+        data = mujoco.MjData(compiled := exact(scene, world_fields))
         for k in range(1, ctrl.shape[1] - 1, stride):
-            qpos = found.qpos[world, k]
-            qvel, after = found.qvel[world, k : k + 2]
+            qpos = trajectory.qpos[world, k]
+            qvel, after = trajectory.qvel[world, k : k + 2]
             data.qpos[:] = qpos
             data.qvel[:] = qvel
             data.ctrl[:] = ctrl[world, k]
-            soften(scene, own, data)
+            soften(scene, world_fields, data)
             mujoco.mj_forward(compiled, data)
             scale = max(np.linalg.norm(data.qacc), FLOOR)
             errors.append(np.linalg.norm((after - qvel) / h - data.qacc) / scale)
             away = data.xipos[lay.object] - lay.centre_weights @ data.xipos
-            far.append(abs(np.linalg.norm(away) - found.distance[world, k]))
+            far.append(abs(np.linalg.norm(away) - trajectory.distance[world, k]))
             touching.append(data.ncon)
     return (np.array(v).reshape(len(ctrl), -1) for v in (errors, far, touching))
 
@@ -98,7 +98,7 @@ def soften(scene, fields, data):
         data.qfrc_applied[bend] = model.softening_moments(scene, fields, data.qpos[bend])
 
 
-def unbalanced(scene, fields, ctrl, found, stride):
+def unbalanced(scene, fields, ctrl, trajectory, stride):
     """Forces that a path's accelerations leave unbalanced: the gradient of a step's objective.
 
     Mass matrix and smooth forces are MuJoCo C's.  Forces of contacts are found over whole arrays,
@@ -108,7 +108,7 @@ def unbalanced(scene, fields, ctrl, found, stride):
     """
     end = 6 + model.layout(scene).dofs.size
     count = -(-ctrl.shape[1] // stride)
-    states = [v[:, ::stride] for v in (found.qpos, found.qvel, found.acc, ctrl)]
+    states = [v[:, ::stride] for v in (trajectory.qpos, trajectory.qvel, trajectory.acc, ctrl)]
     qpos, qvel, acc, u = (np.asarray(v).reshape(-1, v.shape[-1]) for v in states)
     many = jax.tree.map(lambda v: np.repeat(np.asarray(v), count, 0), fields)
 
@@ -140,14 +140,14 @@ def unbalanced(scene, fields, ctrl, found, stride):
     left = np.empty((2, *pushed.shape))
     for k in range(len(qpos)):
         if k % count == 0:
-            own = grasps.nth(fields, k // count)
-            oracle = world_model(scene, own)
+            world_fields = grasps.nth(fields, k // count)
+            oracle = world_model(scene, world_fields)
             data = mujoco.MjData(oracle)
             mass = np.zeros((oracle.nv, oracle.nv))
         data.qpos[:] = qpos[k]
         data.qvel[:] = qvel[k]
         data.ctrl[:] = u[k]
-        soften(scene, own, data)
+        soften(scene, world_fields, data)
         mujoco.mj_forward(oracle, data)
         mujoco.mj_fullM(oracle, data, mass)
         # MuJoCo's object moves by (linear, angular in its own axes), ours by (angular, linear).

@@ -60,10 +60,10 @@ def cone_of(name, other):
     """Contacts of a pair of bodies have the friction cone of another pair."""
 
     def cone(right, mine, self, read, pair=""):
-        found = right(self, read, pair)
+        sound = right(self, read, pair)
         if (pair or self.name) != name:
-            return found
-        return chosen(mine, right(self, read, other), found, wide=False)
+            return sound
+        return chosen(mine, right(self, read, other), sound, wide=False)
 
     return Fault({}, methods={(ContactSet, "cone"): cone})
 
@@ -104,25 +104,25 @@ class Planted:
         """Lanes on which a fault is now."""
         fault = [*self.faults.values()][number]
         step = self.step
-        own = step.constant("penetration").lane - DEEP == number
+        active = step.constant("penetration").lane - DEEP == number
         if fault.finger is not None:
-            own = own & (step.block.finger == fault.finger)
+            active = active & (step.block.finger == fault.finger)
         if fault.later:
-            own = own & (step.world_state.read("acc_object")[0].lane != 0)
-        return own
+            active = active & (step.world_state.read("acc_object")[0].lane != 0)
+        return active
 
     def method(self, owner: type, name: str) -> Callable:
         """A method that is wrong in the worlds of all faults that have it."""
         right = getattr(owner, name)
 
         def call(this, *args):
-            own = right
+            patched = right
             for number, (title, fault) in enumerate(self.faults.items()):
                 change = fault.methods.get((owner, name))
                 if change is not None:
                     self.used.add((title, name))
-                    own = partial(change, own, self.lanes(number))
-            return own(this, *args)
+                    patched = partial(change, patched, self.lanes(number))
+            return patched(this, *args)
 
         return call
 

@@ -104,8 +104,8 @@ class Bench:
         """Model fields of worlds, float64 NumPy arrays with a leading world axis."""
         with floats(True):
             worlds = zip(*(jax.tree.map(jnp.asarray, v) for v in (params, trials)), strict=True)
-            found = [grasps.world_inputs(self.scene, p, t)[0] for p, t in worlds]
-            return jax.tree.map(lambda *v: np.stack(v), *found)
+            batch = [grasps.world_inputs(self.scene, p, t)[0] for p, t in worlds]
+            return jax.tree.map(lambda *v: np.stack(v), *batch)
 
     def commands(self, params, trials) -> np.ndarray:
         """The grasp's controls, (world, time, nu)."""
@@ -191,9 +191,9 @@ class Bench:
             return world_constants(self.scene, fields), moving(engine, fields, qvel)
 
         def advance(hand, state, ctrl):
-            found, end = engine.advance(hand, state, ctrl)
+            outputs, end = engine.advance(hand, state, ctrl)
             last = engine.qpos(end)[:, None], engine.qvel(end)[:, None]
-            before = [found[name] for name in oracles.Path._fields]
+            before = [outputs[name] for name in oracles.Path._fields]
             after = [
                 jnp.concatenate([a[:, 1:], b], 1) for a, b in zip(before[:2], last, strict=True)
             ]

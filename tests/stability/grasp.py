@@ -146,7 +146,7 @@ def random_failures(engine, step, precision):
     """Of a million and of 114,688 such grasps 1e-6 and 9e-6 failed (docs/notes/stability.md)."""
     base = scene.load("paper")
     run = jax.jit(lambda p, t: rollout.simulate(base, make_engine(engine, base), p, t)[0].status)
-    found = [np.asarray(run(*grasps.random_worlds(base, seed, 256))) for seed in range(8)]
-    counted = np.concatenate(found) & ~int(WARNINGS)
+    statuses = [np.asarray(run(*grasps.random_worlds(base, seed, 256))) for seed in range(8)]
+    counted = np.concatenate(statuses) & ~int(WARNINGS)
     stuck = np.mean(counted == Status.STUCK)
     return Found(np.mean((counted & ~int(Status.STUCK)) != 0), 1e-4, f"{stuck:.2%} are STUCK")

@@ -172,23 +172,23 @@ PADDED = 38, "capsule of 45 g between two pads"
 @case(*PADDED, "way in 5 s, at 12 and 60 N", unit="m", quick="structured")
 def pads_hold(engine, step, precision):
     """With the paper's friction: it slips by the tangential springs' way alone."""
-    found = []
+    slips = []
     for press in 12.0, 60.0:
         share = 0.8 * 2 * press / (WEIGHT * GRAVITY)
-        found.append(slipped(engine, step, precision, press, share, 5.0)[0])
-    return Found(max(np.abs(found)), 1e-5)
+        slips.append(slipped(engine, step, precision, press, share, 5.0)[0])
+    return Found(max(np.abs(slips)), 1e-5)
 
 
 @case(*PADDED, "way in 5 s, at 1.02 and 1.10 of the critical friction", unit="m")
 def pads_hold_at_the_limit(engine, step, precision):
     """Nothing moves any more in the last half."""
-    found = [slipped(engine, step, precision, 12.0, share, 5.0) for share in (1.02, 1.10)]
-    late = max(abs(last) for _, last in found)
-    return Found(max(abs(way) for way, _ in found), 1e-4, f"{late:.2g} m in the last half")
+    slips = [slipped(engine, step, precision, 12.0, share, 5.0) for share in (1.02, 1.10)]
+    late = max(abs(last) for _, last in slips)
+    return Found(max(abs(way) for way, _ in slips), 1e-4, f"{late:.2g} m in the last half")
 
 
 @case(*PADDED, "way in 0.5 s, at 0.90 and 0.98 of it", unit="m", lower=True)
 def pads_let_go(engine, step, precision):
     """It slips: the cone of what is pressed by bodies that do not give way is oily."""
-    found = [slipped(engine, step, precision, 12.0, share, 0.5)[0] for share in (0.90, 0.98)]
-    return Found(min(found), 5e-3)
+    slips = [slipped(engine, step, precision, 12.0, share, 0.5)[0] for share in (0.90, 0.98)]
+    return Found(min(slips), 5e-3)

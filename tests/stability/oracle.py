@@ -32,12 +32,12 @@ class Reader:
 
     def pushes(self):
         """Contacts of the present state: names of both geoms, normal force [N] and MuJoCo's row."""
-        found = []
+        contacts = []
         force = np.zeros(6)
         for i, c in enumerate(self.data.contact):
             mujoco.mj_contactForce(self.model, self.data, i, force)
             names = [
                 mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_GEOM, int(g)) for g in c.geom
             ]
-            found.append((names, force[0], c))
-        return found
+            contacts.append((names, force[0], c))
+        return contacts

@@ -66,32 +66,32 @@ class Case:
 
     def run(self, step: float, precision: str) -> dict[str, Any]:
         """Measures a variant; returns its row of the table."""
-        found = self.measure(self.engine, step, precision)
-        row = {"case": self.number, "precision": precision, "step": step, "note": found.note}
+        result = self.measure(self.engine, step, precision)
+        row = {"case": self.number, "precision": precision, "step": step, "note": result.note}
         names = ("name", "title", "invariant", "engine", "lower", "unit", "failure")
         row |= {name: getattr(self, name) for name in names}
         # of NumPy's, JSON has none
-        measured = float(found.measured)
-        bound = float(found.bound)
+        measured = float(result.measured)
+        bound = float(result.bound)
         row |= {"measured": measured, "bound": bound, "margin": margin(self.lower, measured, bound)}
         row["passed"] = row["margin"] >= 1
         return row
 
 
-def case(number: int, title: str, invariant: str, *, engines=BOTH[:1], name: str = "", **how):
+def case(number: int, title: str, invariant: str, *, engines=BOTH[:1], name: str = "", **options):
     """Registers a function as a hard case of each engine; `how`: see `Case`."""
 
     def register(measure):
         for engine in engines:
             full = f"{name or measure.__name__}-{engine}"
             assert full not in CASES, f"two cases are called {full}"
-            CASES[full] = Case(number, full, title, invariant, engine, measure, **how)
+            CASES[full] = Case(number, full, title, invariant, engine, measure, **options)
         return measure
 
     return register
 
 
-def case_of_both_scenes(number, title, *what, quick="", failure="", **how):
+def case_of_both_scenes(number, title, *what, quick="", failure="", **options):
     """Registers a function (scene, engine, step, precision): the spheres', and the default one.
 
     Of the default one alone `failure` says why it fails.
@@ -100,9 +100,9 @@ def case_of_both_scenes(number, title, *what, quick="", failure="", **how):
     def register(measure):
         name = measure.__name__
         spheres, default = (functools.partial(measure, n) for n in ("paper_spheres", "paper"))
-        case(number, title, *what, name=name, engines=BOTH, quick=quick, **how)(spheres)
-        how.update(name=f"{name}_default", failure=failure)
-        case(number, f"{title}, default scene", *what, **how)(default)
+        case(number, title, *what, name=name, engines=BOTH, quick=quick, **options)(spheres)
+        options.update(name=f"{name}_default", failure=failure)
+        case(number, f"{title}, default scene", *what, **options)(default)
 
     return register
 

@@ -377,9 +377,8 @@ def _forces(scene: Scene, hand: WorldModel, state: State) -> Forces:
     slide differs a little.
     """
     contact_forces = forces(scene, hand, before(state, scene.discretization.timestep), state.acc)
-    contact_forces = jax.lax.stop_gradient(
-        contact_forces
-    )  # accelerations of a rollout have no derivative
+    # Accelerations of a rollout have no derivative.
+    contact_forces = jax.lax.stop_gradient(contact_forces)
     moved = (state.step[0, 0] > 0) & (state.going[0, 0] > 0)
 
     def kept(v: jax.Array) -> jax.Array:
@@ -434,7 +433,7 @@ def advance(
     command: Command,
     **options: Any,
 ) -> tuple[World, Trace]:
-    """Simulates a period under commands of shape (world, step, ...); how: of `engine.rollout`."""
+    """Simulates a period under commands of shape (world, step, ...); `options`: of the engine."""
     scene: Scene = engine.scene  # type: ignore[attr-defined]
 
     def controls(

@@ -104,16 +104,14 @@ def replaced() -> list[str]:
 
 def _names(module: object) -> dict[str, object]:
     members = {}
-    module_name = getattr(module, "__name__", None)
+    home = getattr(module, "__name__", None)
     for name, value in getattr(module, "__dict__", {}).items():
         if name.startswith("__"):
             continue
         members[name] = value
-        if getattr(value, "__module__", None) == module_name and isinstance(
-            value, types.FunctionType
-        ):
+        if getattr(value, "__module__", None) == home and isinstance(value, types.FunctionType):
             members[f"{name}()"] = value.__code__
-        elif getattr(value, "__module__", None) == module_name and isinstance(value, type):
+        elif getattr(value, "__module__", None) == home and isinstance(value, type):
             members |= {f"{name}.{key}": v for key, v in vars(value).items() if key[:2] != "__"}
     return members
 

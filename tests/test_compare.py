@@ -220,9 +220,8 @@ def test_its_counts_are_those_of_the_grasps_simulated_again(capsys):
     assert rates[0][1] == 4 and rates[1][1] == counts[1]
     interval = stats.binomtest(counts[3], counts[1]).proportion_ci(method="wilson")
     expected = [counts[3] / counts[1], interval.low, interval.high]
-    np.testing.assert_allclose(
-        share, np.multiply(expected, 100), rtol=0.05, atol=1e-9
-    )  # two digits
+    # The table has two digits.
+    np.testing.assert_allclose(share, np.multiply(expected, 100), rtol=0.05, atol=1e-9)
     grasps, minutes, seconds = map(int, searched)
     # Beside what compiling takes; the rate is told with three digits.
     assert 60 * minutes + seconds >= 0.99 * grasps / rates[0][0] - 1

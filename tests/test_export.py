@@ -788,9 +788,8 @@ def test_plain_mujoco_plays_the_files_as_the_engine(grasped, tmp_path):
             assert when == judged.lost_time[i]
             # Rounding of 1e-16 grows while fingers slide on the sphere, here to 1e-11.
             assert errors(states, trace, i).max() < 1e-7
-        assert (
-            simulated[i].outcome.status == judged.status[i] & ~8
-        )  # plain MuJoCo tells no warnings
+        # Plain MuJoCo tells no warnings.
+        assert simulated[i].outcome.status == judged.status[i] & ~8
 
 
 def assert_declared(alone, spec, shares):

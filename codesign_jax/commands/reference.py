@@ -101,7 +101,7 @@ def decided(
 
     outcomes = previous
     if previous is not None:
-        meter.resume(previous.cost.size)
+        meter.count(previous.cost.size)
     for outcomes in verdict.sequential(simulate, most, previous):
         keep(outcomes)
         ends = verdict.tally(outcomes)

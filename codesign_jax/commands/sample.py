@@ -114,7 +114,7 @@ def _simulate(
             if outcome is None:
                 left.append(shard)
             else:
-                meter.resume(count(shard, outcome))
+                meter.count(count(shard, outcome))
         if done := total - len(left):
             calls = common.counted(total, "call")
             meter.message(f"going on after {done} of {calls}, from {outcomes.folder}")

@@ -118,7 +118,7 @@ def without_rest(table: Table, predicted: Table) -> dict[str, np.ndarray]:
     """Pressures [Pa] at which a finger has no rest, in rising order, by the column that lacks it.
 
     Args:
-      found: What `predict` makes of the table.
+      predicted: What `predict` makes of the table.
     """
     lacking = {n: np.isfinite(table[n]) & np.isnan(v) for n, v in predicted.items()}
     return {n: np.unique(table["pressure"][rows]) for n, rows in lacking.items() if rows.any()}

@@ -145,7 +145,7 @@ def departure(scene: Scene, outcomes: Outcome, ctrl: jax.Array, planned: jax.Arr
 
     Args:
       scene: The scene.
-      found: How the grasps ended, arrays of shape (trial,).
+      outcomes: How the grasps ended, arrays of shape (trial,).
       ctrl: Commands, shape (trial, time, 6 + finger): the arm's places [m] and angles [rad], and
         pressures [Pa].
       planned: Those of the key frames, of the same shape.

@@ -115,14 +115,14 @@ class Meter(Live):
         self.later = later
         self.begin(f"{text}: compiling, then {total} grasps")
 
-    def resume(self, grasps: int) -> None:
+    def count(self, grasps: int) -> None:
         """Counts grasps that an earlier process simulated."""
         self.done += grasps
         self._bar.update(self._task, completed=self.done, total=self.total)
 
     def advance(self, grasps: int) -> None:
         """Counts grasps that were just simulated; the first call compiled, and has no rate."""
-        self.resume(grasps)
+        self.count(grasps)
         now = time.monotonic()
         text = f"{self._name}: {self.done} of {self.total} grasps"
         start, before = self._compiled = self._compiled or (now, self.done)

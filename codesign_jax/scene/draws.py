@@ -217,7 +217,7 @@ def applied(scene: Any, table: Constants, shifts: Any) -> Any:
     """The scene with deviations of its constants, which may be traced.
 
     Args:
-      own: The deviations of each constant, shape (constant,), or a sequence of arrays (trial,).
+      shifts: The deviations of each constant, shape (constant,), or a sequence of arrays (trial,).
     """
     for i, entry in enumerate(table.constant):
         operation = operator.mul if entry.is_factor else operator.add

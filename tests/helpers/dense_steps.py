@@ -196,7 +196,7 @@ class DensePairs(Dense):
         """As `Dense`.
 
         grip: Friction coefficient that the first of two fingers uses on the second one, (3,).
-        own: That each finger's outer part uses on its inner one, (finger, 3).
+        finger_grips: That each finger's outer part uses on its inner one, (finger, 3).
         """
         super().__init__(scene, oracle, data, hand, holds)
         self.grip = grip

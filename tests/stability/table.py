@@ -79,7 +79,7 @@ class Case:
 
 
 def case(number: int, title: str, invariant: str, *, engines=BOTH[:1], name: str = "", **options):
-    """Registers a function as a hard case of each engine; `how`: see `Case`."""
+    """Registers a function as a hard case of each engine; `options`: see `Case`."""
 
     def register(measure):
         for engine in engines:

@@ -100,7 +100,8 @@ def in_tube(rings: np.ndarray, solid: Tube, itself: tuple[np.ndarray, float] | N
     Args:
       rings: Points around their last one, shape (state, ring, point, 3).
       solid: The finger.
-      itself: Of the finger's own rings their places along it, and from which distance on they count.
+      itself: Of the finger's own rings their places along it, and from which distance on they
+        count.
     """
     deepest = np.zeros(len(rings))
     last = len(solid.along) - 1

@@ -54,5 +54,5 @@ def in_chunks(run: Callable[[np.ndarray], Any], count: int, size: int) -> Iterat
     """
     for start in range(0, count, size):
         rows = np.minimum(np.arange(start, start + size), count - 1)
-        wanted = min(size, count - start)
-        yield jax.tree.map(lambda v, n=wanted: np.asarray(v)[:n], run(rows))
+        length = min(size, count - start)
+        yield jax.tree.map(lambda v, n=length: np.asarray(v)[:n], run(rows))

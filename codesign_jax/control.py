@@ -100,7 +100,7 @@ def _between(place: tuple[jax.Array, ...], knots: jax.Array) -> jax.Array:
 
 
 def supplied(
-    scene: Scene, wanted: jax.Array, start: jax.Array | None = None
+    scene: Scene, commanded: jax.Array, start: jax.Array | None = None
 ) -> tuple[jax.Array, jax.Array]:
     """Chamber pressures that the air supply reaches from the wanted ones, both (time, finger).
 
@@ -119,7 +119,7 @@ def supplied(
     h = scene.discretization.timestep
     lagging = p.lag > 0
     gain = jnp.where(lagging, -jnp.expm1(-h / jnp.where(lagging, p.lag, 1.0)), 1.0)
-    target = reachable(scene, wanted)
+    target = reachable(scene, commanded)
 
     def step(now: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
         return now + jnp.clip(gain * (goal - now), -p.rate * h, p.rate * h), now
@@ -128,9 +128,9 @@ def supplied(
     return pressures, end
 
 
-def reachable(scene: Scene, wanted: jax.Array) -> jax.Array:
+def reachable(scene: Scene, commanded: jax.Array) -> jax.Array:
     """Wanted pressures [Pa] as far as the air supply has them."""
-    return jnp.minimum(wanted, scene.pneumatics.maximum)
+    return jnp.minimum(commanded, scene.pneumatics.maximum)
 
 
 def _shake(scene: Scene, time: np.ndarray) -> tuple[jax.Array, jax.Array]:

@@ -180,11 +180,11 @@ class ControlLoop(Equal):
         def period(carry: tuple, now: dict[str, jax.Array]) -> tuple[tuple, Trace]:
             world, memory = carry
             ahead = plan._replace(**now)
-            told, command = self._asked(hand, fields, world, memory, ahead)
+            answer, command = self._asked(hand, fields, world, memory, ahead)
             world, trace = advance(
                 self.engine, fields, world, ahead, command, trajectory=trajectory, **arguments
             )
-            return (world, told), trace._replace(last=None)
+            return (world, answer), trace._replace(last=None)
 
         carry = (begin(self.scene, fields, plan), self._remembered(plan.params))
         parts = []
@@ -353,7 +353,7 @@ def observe(
     phase, since = jax.vmap(_phase)(fields.constants, step)
     joint, rate = (jnp.moveaxis(v, (3, 2), (0, 1)) for v in (state.finger, state.finger_vel))
     palm = pose(motion.place[:, 0], motion.palm[:, :, 0])
-    thing = pose(none[:, 0], motion.object[:, :, 0])
+    object_pose = pose(none[:, 0], motion.object[:, :, 0])
     return Observation(
         time=step * scene.discretization.timestep,
         phase=phase,
@@ -364,7 +364,7 @@ def observe(
         joint_velocity=rate,
         palm=palm,
         link=pose(jnp.swapaxes(motion.origin, 1, 2), jnp.swapaxes(motion.link, 2, 3)),
-        object=thing,
+        object=object_pose,
         object_velocity=jnp.concatenate([velocity[:, 3:], velocity[:, :3]], 1),
         forces=_forces(scene, hand, state) if hasattr(engine, "recording") else None,
     )
@@ -379,10 +379,10 @@ def _forces(scene: Scene, hand: WorldModel, state: State) -> Forces:
     contact_forces = forces(scene, hand, before(state, scene.discretization.timestep), state.acc)
     # Accelerations of a rollout have no derivative.
     contact_forces = jax.lax.stop_gradient(contact_forces)
-    moved = (state.step[0, 0] > 0) & (state.going[0, 0] > 0)
+    stepped = (state.step[0, 0] > 0) & (state.going[0, 0] > 0)
 
     def kept(v: jax.Array) -> jax.Array:
-        return jnp.where(moved.reshape(-1, *[1] * (v.ndim - 1)), v, 0.0)
+        return jnp.where(stepped.reshape(-1, *[1] * (v.ndim - 1)), v, 0.0)
 
     return jax.tree.map(kept, contact_forces)
 
@@ -437,13 +437,13 @@ def advance(
     scene: Scene = engine.scene  # type: ignore[attr-defined]
 
     def controls(
-        constants: Scene, now: jax.Array, shake: jax.Array, tilt: jax.Array, told: Command
+        constants: Scene, now: jax.Array, shake: jax.Array, tilt: jax.Array, command: Command
     ):
-        pressure = told.pressure
-        end = told.pressure[-1]
+        pressure = command.pressure
+        end = command.pressure[-1]
         if scene.effects.pressure_dynamics:
             pressure, end = control.supplied(constants, pressure, now)
-        return control.actuated(told.pose, pressure, shake, tilt), end
+        return control.actuated(command.pose, pressure, shake, tilt), end
 
     given = fields.constants, world.pressure, plan.shake, plan.tilt, command
     ctrl, pressure = jax.vmap(controls)(*given)

@@ -152,9 +152,9 @@ def notes(scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray]) -
     problems = refusals(scene, params, [*designs])
     if problems:
         raise InputError(problems)
-    told = [f"warning: {text}" for text in warnings(scene, params, [*designs])]
+    lines = [f"warning: {text}" for text in warnings(scene, params, [*designs])]
     idle = [f"not searched: {name}, which has no effect: {why}" for name, why in space.idle]
-    return told + idle + mesh_notes(scene)
+    return lines + idle + mesh_notes(scene)
 
 
 def warnings(scene: Scene, designs: Params, names: list[str]) -> list[str]:

@@ -278,8 +278,8 @@ def _traced(
     steps: int | None = None,
 ) -> tuple[Trace, Any, jax.Array]:
     options.refuse()
-    asked = options.record_forces or options.record_touch
-    if asked or getattr(options.cost, "record_forces", False):
+    needed = options.record_forces or options.record_touch
+    if needed or getattr(options.cost, "record_forces", False):
         engine = recording(engine, touch=options.record_touch)
     ctrl: Any
     fields, ctrl, initial = prepare(scene, params, trials, engine)

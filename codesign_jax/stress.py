@@ -208,8 +208,10 @@ def _in_grasps(
     kept = np.flatnonzero(verdict.kept(outcomes))
     first = [kept[trials.shape[kept] == k][:1] for k in range(len(scene.objects.object))]
     times = np.arange(qpos.shape[1]) * HELD
-    closed, held, end = (scene.steps_to(t) for t in (scene.phase_ends["approach"], *scene.window))
-    whole = (times >= closed) & (times < end)
+    approached, held, end = (
+        scene.steps_to(t) for t in (scene.phase_ends["approach"], *scene.window)
+    )
+    whole = (times >= approached) & (times < end)
     hold = (times >= held) & (times < end)
     bends = overlap.bend_angles(scene, qpos[kept])
     lines = of_bends(overlap.wall_strain(scene, params, bends[:, whole]), bends[:, hold])

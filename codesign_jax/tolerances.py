@@ -335,8 +335,8 @@ def deviating(params: Params, path: tuple[str, ...], shift: jax.Array) -> Params
     """
     name = path[1]
     finger = int(path[2])
-    moved = getattr(params, name).at[:, finger].add(shift)
-    params = params._replace(**{name: moved})
+    sizes = getattr(params, name).at[:, finger].add(shift)
+    params = params._replace(**{name: sizes})
     if name == "wall" and params.tip is not None:
         tip = params.tip._replace(wall=params.tip.wall.at[:, finger].add(shift))
         params = params._replace(tip=tip)

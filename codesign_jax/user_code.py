@@ -58,8 +58,9 @@ def contents(names: Iterable[str]) -> dict[str, bytes]:
     """
     code_files = {}
     for name in filter(is_user_code, names):
-        thing = _load(name)
-        for module in {name.partition(":")[0], getattr(thing, "__module__", None)} & {*sys.modules}:
+        target = _load(name)
+        modules = {name.partition(":")[0], getattr(target, "__module__", None)}
+        for module in modules & {*sys.modules}:
             code_files[f"{FOLDER}/{module}.py"] = _source(name, module).read_bytes()
     return code_files
 
@@ -159,10 +160,10 @@ def _try(flag: str, make: Any, made: Optimizer, n: int) -> None:
         population = made.ask(state, mask)
         return population, made.tell(state, population, jnp.zeros(n), mask)
 
-    population, told = _tried(flag, make, lambda: jax.eval_shape(episode, state))
+    population, result = _tried(flag, make, lambda: jax.eval_shape(episode, state))
     if population.shape != (n, low.size):
         raise InputError([f"{flag}: ask returns {population.shape}, not ({n}, {low.size})"])
-    if not (isinstance(told, tuple) and len(told) == 2 and _same(state, told[0])):
+    if not (isinstance(result, tuple) and len(result) == 2 and _same(state, result[0])):
         raise InputError(
             [
                 f"{flag}: tell must return a state, with the arrays of init's in shape and type, "
@@ -190,8 +191,8 @@ def _load(name: str, flag: str = "") -> Any:
     if words := problem(name):
         raise InputError([f"{flag}: {words}".removeprefix(": ")])
     module, _, attribute = name.partition(":")
-    here = str(Path.cwd())
-    sys.path.insert(0, here)
+    folder = str(Path.cwd())
+    sys.path.insert(0, folder)
     try:
         importlib.invalidate_caches()
         imported = importlib.import_module(module)
@@ -199,12 +200,12 @@ def _load(name: str, flag: str = "") -> Any:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise InputError([f"{begin}: {_where(error, None)}"]) from error
         raise InputError(
-            [f"{begin}: there is no module {module!r} in {here} or among the installed packages"]
+            [f"{begin}: there is no module {module!r} in {folder} or among the installed packages"]
         ) from error
     except (Exception, SystemExit) as error:
         raise InputError([f"{begin}: importing it fails: {_where(error, None)}"]) from error
     finally:
-        sys.path.remove(here)
+        sys.path.remove(folder)
     if not hasattr(imported, attribute):
         place = getattr(imported, "__file__", None) or module
         raise InputError([f"{begin}: {place} has no {attribute!r}"])
@@ -221,15 +222,15 @@ def _source(name: str, module: str) -> Path:
 
 
 def _refuse_signature(flag: str, function: Any, arguments: tuple[str, ...]) -> None:
-    wanted = f"a function of ({', '.join(arguments)})"
+    expected = f"a function of ({', '.join(arguments)})"
     if not callable(function):
-        raise InputError([f"{flag}: it is {type(function).__name__}, not {wanted}"])
+        raise InputError([f"{flag}: it is {type(function).__name__}, not {expected}"])
     try:
         inspect.signature(function).bind(*arguments)
     except ValueError:  # it does not tell
         pass
     except TypeError as error:
-        raise InputError([f"{flag}: it must be {wanted}: {error}"]) from error
+        raise InputError([f"{flag}: it must be {expected}: {error}"]) from error
 
 
 def _tried(flag: str, code: Any, call: Callable[[], Any]) -> Any:

@@ -106,8 +106,8 @@ def failures(scene: Scene, trace: Trace) -> jax.Array:
     bits |= as_bit(trace.speed > scene.limits.speed, Status.SPEED)
     bits |= as_bit(trace.height < -bounds(scene).penetration, Status.PENETRATION)
     if trace.status is not None:
-        told = jnp.asarray(trace.status, jnp.int32)
-        bits |= jnp.where(failed(told), told, jnp.zeros_like(told))
+        status = jnp.asarray(trace.status, jnp.int32)
+        bits |= jnp.where(failed(status), status, jnp.zeros_like(status))
     return bits
 
 

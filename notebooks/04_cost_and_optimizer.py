@@ -48,13 +48,13 @@ space = parameters.design_space(grasping.hand, "2d")  # finger length and arm he
 # `stop_when_lost=True` it stops there, which is faster, and its last entry repeats.
 
 # %%
-closed = grasping.last_step("inflate") + 1
+first = grasping.last_step("inflate") + 1
 shaken = grasping.last_step() + 1
 
 
 def looseness(scene, trace, ctrl):
     """Mean distance of object and hand while it is to be held, over the lost distance."""
-    return jnp.mean(jnp.minimum(trace.distance[closed:shaken] / scene.cost.lost_distance, 2.0))
+    return jnp.mean(jnp.minimum(trace.distance[first:shaken] / scene.cost.lost_distance, 2.0))
 
 
 # %% [markdown]

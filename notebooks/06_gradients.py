@@ -136,8 +136,8 @@ for _ in range(steps):
 history = np.array(history)
 names = ("shear modulus", "damping time")
 true = np.exp(truth)
-for name, wanted, value in zip(names, true, history[-1], strict=False):
-    print(f"{name}: found {value:.4g}, true {wanted:.4g} ({100 * (value / wanted - 1):+.1f} %)")
+for name, target, value in zip(names, true, history[-1], strict=False):
+    print(f"{name}: found {value:.4g}, true {target:.4g} ({100 * (value / target - 1):+.1f} %)")
 
 # %%
 figure, axes = plt.subplots(1, 3, figsize=(12, 3.4), layout="constrained")

@@ -39,14 +39,14 @@ def measured(truth: finger.Finger) -> dict[str, dict[str, np.ndarray]]:
     random = np.random.default_rng(71)
     pressure = np.linspace(10e3, 60e3, 6)
     times = np.linspace(0.0, 4 * swing.first_period(truth, 0.0), 60)
-    asked = {
+    columns = {
         "angles": ("angle", {"pressure": pressure}),
         "tip forces": ("tip_force", {"pressure": pressure}),
         "weights, sideways": ("sideways", {"pressure": np.repeat([0, 60e3], 3), "load": 0.3}),
         "a ring-down": ("drop", {"pressure": 0.0, "time": times, "load": 0.0}),
     }
     tables = {}
-    for words, (column, given) in asked.items():
+    for words, (column, given) in columns.items():
         rows = max(np.size(v) for v in given.values())
         table = {n: np.broadcast_to(np.asarray(v, float), rows).copy() for n, v in given.items()}
         if column == "drop":

@@ -63,7 +63,7 @@ def _velocity(
 def _places(
     xipos: wp.array2d(dtype=wp.vec3),
     weights: wp.array(dtype=float),
-    thing: int,
+    body: int,
     step: wp.array(dtype=int),
     out: wp.array3d(dtype=float),
 ):
@@ -71,7 +71,7 @@ def _places(
     centre = wp.vec3(0.0, 0.0, 0.0)
     for i in range(weights.shape[0]):
         centre = centre + weights[i] * xipos[world, i]
-    place = xipos[world, thing]
+    place = xipos[world, body]
     out[step[0], world, 0] = wp.length(place - centre)
     out[step[0], world, 1] = place[2]
 
@@ -103,7 +103,7 @@ class WarpProgram:
         table = np.ascontiguousarray(np.moveaxis(np.asarray(ctrl, np.float32), 1, 0))
         self.table = wp.array(table, dtype=float)
         self.weights = wp.array(lay.centre_weights.astype(np.float32), dtype=float)
-        self.thing = int(lay.object)
+        self.body = int(lay.object)
         self.index = wp.zeros(1, dtype=int)
         self.out = wp.zeros((self.steps, self.worlds, 3), dtype=float)
         self._reset()
@@ -132,7 +132,7 @@ class WarpProgram:
         wp.launch(_velocity, self.worlds, [data.qvel, at], [self.out])
         mjw.step(self.model, data)
         # Positions computed by a step belong to the state before it.
-        wp.launch(_places, self.worlds, [data.xipos, self.weights, self.thing, at], [self.out])
+        wp.launch(_places, self.worlds, [data.xipos, self.weights, self.body, at], [self.out])
         wp.launch(_count, 1, [], [at])
 
     def run(self) -> tuple[Trace, float]:

@@ -106,8 +106,8 @@ def near_best(units: np.ndarray, distances: np.ndarray, count: int, seed: int) -
       distances: Their implausibility by each statement, shape (n, statement).
     """
     best = units[np.argsort(distances.max(-1), kind="stable")[:BEST]]
-    moved = best[np.arange(count) % len(best)] + NEAR * (2 * space_filling(count, seed) - 1)
-    return 1 - np.abs(1 - np.abs(moved))  # reflected at both ends of a range
+    proposals = best[np.arange(count) % len(best)] + NEAR * (2 * space_filling(count, seed) - 1)
+    return 1 - np.abs(1 - np.abs(proposals))  # reflected at both ends of a range
 
 
 def values(units: np.ndarray) -> dict[str, np.ndarray]:
@@ -365,9 +365,9 @@ def on_landscapes(space: DesignSpace, shapes: int = 3) -> Callable[..., Any]:
         start = OptimizerState(jnp.tile(drawn[jnp.argmax(poor)], (PARTICLES, 1)), jnp.int32(0), key)
 
         def episode(state: OptimizerState, mask: jax.Array) -> tuple[OptimizerState, jax.Array]:
-            moved = optimizer.ask(state, mask)
-            cost = costs(landscape, moved, key, state.episode, shared, TRIALS)
-            new, info = optimizer.tell(state, moved, cost)
+            population = optimizer.ask(state, mask)
+            cost = costs(landscape, population, key, state.episode, shared, TRIALS)
+            new, info = optimizer.tell(state, population, cost)
             return new, info.mean_cost
 
         end, mean = jax.lax.scan(episode, start, mask)
@@ -452,8 +452,8 @@ def score(
                 middle = np.median(np.minimum(episodes, EPISODES + 1), axis=-1)
                 efforts[name, kind, noise] = np.log(PARTICLES * TRIALS * middle)
 
-    def at_least(value: Any, wanted: Any, deviation: float) -> np.ndarray:
-        return np.maximum(wanted - value, 0.0) / deviation
+    def at_least(value: Any, least: Any, deviation: float) -> np.ndarray:
+        return np.maximum(least - value, 0.0) / deviation
 
     single, some, all_at_once = (success[s] for s in STRATEGIES)
     # Deviations: of the logarithm of a median of 30 runs 0.25; of a difference of two shares of 30
@@ -484,7 +484,7 @@ def score(
     }
 
 
-def told(units: np.ndarray, distances: Mapping[str, np.ndarray], count: int = 5) -> list[str]:
+def summary(units: np.ndarray, distances: Mapping[str, np.ndarray], count: int = 5) -> list[str]:
     """Lines about a score: what each statement rules out, what is left, and the best sets."""
     every = np.stack([*distances.values()], -1)
     kept = (every <= CUTOFF).all(-1)
@@ -515,7 +515,7 @@ def score_file(path: Path, the_scene: Scene) -> int:
     out = path.with_name(f"{path.stem}_scores.npz")
     distances = np.stack([*scores.values()], -1)
     output.write_arrays(out, {"units": units, "distances": distances, "names": [*OPEN]})
-    print("\n".join([str(out), *told(units, scores)]))
+    print("\n".join([str(out), *summary(units, scores)]))
     return 0
 
 

@@ -224,11 +224,11 @@ def fitted_law(stress: Any, law: Any, strains: np.ndarray) -> tuple[float, np.nd
     for every material: `silicones.EQUAL_BEND` over all of `STRAINS`.  The errors are those of the
     curvature under the same moment, at the outermost fibre's strains.
     """
-    wanted = np.array([moment(stress, e) for e in strains])
+    stress_moments = np.array([moment(stress, e) for e in strains])
     grid = np.linspace(0.01, 4, 600)
     moments = np.array([moment(law, e) for e in strains])
-    modulus = float(np.exp(np.log(wanted / moments).mean()))
-    bent = np.interp(wanted, modulus * np.array([moment(law, e) for e in grid]), grid)
+    modulus = float(np.exp(np.log(stress_moments / moments).mean()))
+    bent = np.interp(stress_moments, modulus * np.array([moment(law, e) for e in grid]), grid)
     return modulus, bent / strains - 1
 
 

@@ -77,7 +77,7 @@ def _links_out(path: Path) -> list[str]:
 
 def _relinked(text: str, source: str, page: str) -> str:
     folder = posixpath.dirname(source)
-    here = posixpath.dirname(page)
+    base = posixpath.dirname(page)
 
     def replace(match: re.Match) -> str:
         target = _target(folder, match[2])
@@ -86,7 +86,7 @@ def _relinked(text: str, source: str, page: str) -> str:
         there = PAGES.get(target) or _shown(target)
         if there is None and (ROOT / target).is_file():
             there = f"repository/{target}"
-        return match[0] if there is None else match[1] + posixpath.relpath(there, here or ".")
+        return match[0] if there is None else match[1] + posixpath.relpath(there, base or ".")
 
     # In the repository a link's text is the file's name, in the site it is in words.
     named = _FILE_NAME.sub(lambda m: f"[{m[1].replace('_', ' ').lower()}]", text)

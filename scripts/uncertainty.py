@@ -33,15 +33,17 @@ ARMS = {"under the distribution": "drawn", "at its middle": "middle"}
 def middle(table: draws.Constants) -> list[str]:
     """KEY=VALUE of a scene whose constants are in the middle of their distributions."""
     scene = scenes.load(overrides=draws.nominal(table))
-    moved = draws.applied(scene, table, [float(entry.deviation(0.0)) for entry in table.constant])
+    middle_scene = draws.applied(
+        scene, table, [float(entry.deviation(0.0)) for entry in table.constant]
+    )
     law = silicones.LAWS[bool(scene.effects.neo_hookean)]
     named = {("hand", "material", "law"): law} | draws.nominal(table)
     words = [f"{'.'.join(path)}={value}" for path, value in named.items()]
     if not any(word.startswith(MODULUS) for word in words):
-        words.append(f"{MODULUS}={moved.hand.material.shear_modulus:.9g}")
+        words.append(f"{MODULUS}={middle_scene.hand.material.shear_modulus:.9g}")
     for entry in table.constant:
         if entry.change != "value" and entry.key != MODULUS:
-            words += [f"{key}={value:.9g}" for key, value in _numbers(moved, entry.path)]
+            words += [f"{key}={value:.9g}" for key, value in _numbers(middle_scene, entry.path)]
     return words
 
 

@@ -94,7 +94,7 @@ def test_a_second_wave_is_near_the_best_of_the_first(tmp_path):
     assert len(calibration.simulated(wave, np.concatenate([units[:9], near]))) == 7
     with pytest.raises(scene.InputError, match="has other sets"):
         calibration.simulated(wave, near)
-    lines = calibration.told(units, {"middle": 9 * distances[:, 0], "first": distances[:, 1]})
+    lines = calibration.summary(units, {"middle": 9 * distances[:, 0], "first": distances[:, 1]})
     assert lines[0] == f"{(9 * distances[:, 0] <= 3).sum()} of 40 sets are not ruled out"
     assert [line.split()[0] for line in lines[4:-1]] == names
 

@@ -238,8 +238,8 @@ def compare(every: Mapping[Path, Compared], console: Console, *, named: bool = F
     if good and len(groups) == 1:
         console.print(f"{good} runs found a good design: {interval} of such runs (95 % interval)")
     if good:
-        things = {verdicts.objects(run.judged.scene) for run in every.values() if run.judged}
-        console.print(f"{verdict.RULE}; for {', or '.join(sorted(things))}")
+        object_words = {verdicts.objects(run.judged.scene) for run in every.values() if run.judged}
+        console.print(f"{verdict.RULE}; for {', or '.join(sorted(object_words))}")
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Table:

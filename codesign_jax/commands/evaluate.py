@@ -101,14 +101,14 @@ def _check(options: Evaluate, engine: str) -> None:
 def simulate(case: Case, options: Evaluate, console: Console) -> types.Outcome:
     """Simulates the trials and prints how they ended, by object and in all; outcomes (trial,)."""
     key = jax.random.key(options.seed)
-    asked = options.trials
-    if asked is None:
+    trials = options.trials
+    if trials is None:
         later = _of_each(options) * stress.sets(case.scene) if options.stress else 0
         with Meter("trials", verdict.USUAL, console, later=later) as meter:
             outcomes = reference.decided(case, key, verdict.MOST, meter)
     else:
-        with Busy(console, f"simulating {common.counted(asked, 'grasp')}"):
-            outcomes = case.simulate(asked, key)
+        with Busy(console, f"simulating {common.counted(trials, 'grasp')}"):
+            outcomes = case.simulate(trials, key)
     names = [shape.name for shape in case.scene.objects.object]
     for k, name in enumerate(names[: outcomes.cost.size]):
         object_outcomes = jax.tree.map(lambda v, k=k: v[k :: len(names)], outcomes)
@@ -118,8 +118,8 @@ def simulate(case: Case, options: Evaluate, console: Console) -> types.Outcome:
         console.print(line)
     if case.policy:
         with Busy(console, "asking what the policy commanded"):
-            told = case.observe(verdict.BATCH if asked is None else asked, key)[1]
-        console.print(f"policy {case.policy} {told}")
+            report = case.observe(verdict.BATCH if trials is None else trials, key)[1]
+        console.print(f"policy {case.policy} {report}")
     if options.out:
         drawn = rollout.sample_trials(case.scene, key, outcomes.cost.size)
         tables.write_grasps(options.out, case.scene, jax.tree.map(np.asarray, drawn), outcomes)

@@ -178,21 +178,21 @@ def _of_fit(fit: Posterior, mine: Finger) -> list[str]:
     """What was fitted, and how a hand takes it."""
     lines = []
     value = fit.value
-    told = fit.told
+    identified = fit.identified
     for name in fit.names:
         label, unit, size = CONSTANTS[name]
         if wrong := schema.field_problem(label, float(f"{value[name]:.4g}"), Material, name):
             reason = "the table's units, signs and the design's section do not fit one another"
             raise ValueError(f"fitted: {wrong}: {reason}")
         number = f"{value[name] / size:.4g} {unit}".rstrip()
-        told_or_not = "" if told[name] else "; hardly told by these measurements"
-        lines.append(f"fitted: {label} = {number}, {_error(fit, name)}{told_or_not}")
-    if {"shear_modulus", "moment_factor"} <= set(fit.names) and not told["moment_factor"]:
+        doubt = "" if identified[name] else "; hardly told by these measurements"
+        lines.append(f"fitted: {label} = {number}, {_error(fit, name)}{doubt}")
+    if {"shear_modulus", "moment_factor"} <= set(fit.names) and not identified["moment_factor"]:
         lines.append(
             "angles alone give the ratio of modulus and moment, here with a standard error of "
             f"{100 * fit.ratio_sd:.2g} %; a column tip_force or blocked_force tells them apart"
         )
-    taken = [f"hand.material.{n}={value[n]:.4g}" for n in fit.names if told[n]]
+    taken = [f"hand.material.{n}={value[n]:.4g}" for n in fit.names if identified[n]]
     if "shear_modulus" in fit.names:
         law = f"hand.material.law={LAWS[mine.neo_hookean]}"
         taken = [law, f"hand.material.shear_modulus={value['shear_modulus']:.4g}"] + [
@@ -200,7 +200,7 @@ def _of_fit(fit: Posterior, mine: Finger) -> list[str]:
         ]
     lines.append(f"to simulate it: --set {' '.join(taken)}")
     factor = value.get("moment_factor", 1.0) / mine.constants.moment_factor
-    if told.get("moment_factor", False):
+    if identified.get("moment_factor", False):
         lines.append(
             f"on the real hand divide the pressures of a design that was searched without it by "
             f"{factor:.4g} (play_valves.py --divide {factor:.4g})"

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from codesign_jax.report.replay import Replay
 
 
-class Asked(NamedTuple):
+class PlannedGrasp(NamedTuple):
     """A grasp to simulate."""
 
     case: Case  # scene, design and engine
@@ -30,7 +30,7 @@ class Asked(NamedTuple):
     recorded: str | None  # how it ended in its run, in words; None if it is of no run
 
 
-def find(options: GraspFlags) -> Asked:
+def find(options: GraspFlags) -> PlannedGrasp:
     """The grasp that the flags name; simulates nothing."""
     places = {"--episode": options.episode, "--particle": options.particle}
     places |= {"--trial": options.trial}
@@ -46,7 +46,7 @@ def find(options: GraspFlags) -> Asked:
     return _of_run(case, options, options.run_folder)
 
 
-def _of_run(case: Case, options: GraspFlags, folder: Path) -> Asked:
+def _of_run(case: Case, options: GraspFlags, folder: Path) -> PlannedGrasp:
     if options.objects is not None and options.object is None:
         raise InputError(["--objects replaces the run's: --object must say which one to grasp"])
     place = {"episode": options.episode, "particle": options.particle, "trial": options.trial}
@@ -58,35 +58,35 @@ def _of_run(case: Case, options: GraspFlags, folder: Path) -> Asked:
     name = case.scene.objects.object[int(grasp.trial.shape)].name
     episode, particle, trial = grasp.place
     text = f"episode {episode}, particle {particle}, trial {trial}: object {name}"
-    return Asked(case, grasp.trial, text, cases.ending(grasp.outcome))
+    return PlannedGrasp(case, grasp.trial, text, cases.ending(grasp.outcome))
 
 
-def _nominal(case: Case, shape: int | str) -> Asked:
+def _nominal(case: Case, shape: int | str) -> PlannedGrasp:
     trial = jax.tree.map(np.asarray, rollout.nominal_trial(case.scene, shape))
     name = case.scene.objects.object[int(trial.shape)].name
-    return Asked(case, trial, f"object {name}, without noise", None)
+    return PlannedGrasp(case, trial, f"object {name}, without noise", None)
 
 
-def simulate(asked: Asked, *, forces: bool = False) -> "Replay":
+def simulate(planned: PlannedGrasp, *, forces: bool = False) -> "Replay":
     """Simulates the grasp and keeps its trajectory, with the forces where an engine tells them."""
     from codesign_jax.report import animation
 
-    case = asked.case
+    case = planned.case
     params = case.space.params(jnp.asarray(case.design, jnp.float32))
-    trials = jax.tree.map(lambda v: v[None], asked.trial)
+    trials = jax.tree.map(lambda v: v[None], planned.trial)
     engine = case.make_engine()
     if forces and tells_forces(engine):
         engine = recording(engine)
     return animation.replay(case.scene, engine, params, trials)[0]
 
 
-def description(asked: Asked, shown: "Replay") -> list[str]:
+def description(planned: PlannedGrasp, shown: "Replay") -> list[str]:
     """Lines that say which grasp it is and how it ended."""
     again = cases.ending(shown.outcome)
-    ending = f"in the run: {asked.recorded}; here: {again}" if asked.recorded else again
-    design = runs.describe(asked.case.space, asked.case.design)
-    lines = [design, f"{asked.text}; {ending}"]
-    if asked.recorded not in (None, again):
+    ending = f"in the run: {planned.recorded}; here: {again}" if planned.recorded else again
+    design = runs.describe(planned.case.space, planned.case.design)
+    lines = [design, f"{planned.text}; {ending}"]
+    if planned.recorded not in (None, again):
         lines.append(
             "The two differ: contact is chaotic, and a batch of another size, another machine or "
             "other settings lead elsewhere."

@@ -345,7 +345,7 @@ def _folder(options: Optimize, scene: Scene, settings: Settings) -> Path:
     names = [scene.hand.name, settings.preset, settings.schedule, str(settings.seed)]
     others = (settings.optimizer, optimize.DEFAULT), (settings.cost, runs.SCENE_COST)
     others = *others, (settings.policy, "")
-    names[3:3] = [asked.replace(":", ".") for asked, usual in others if asked != usual]
+    names[3:3] = [value.replace(":", ".") for value, usual in others if value != usual]
     name = "-".join(names)
     # Whoever wrote the files would choose a place on this disk.
     if name[0] in ".-~" or "/" in name or "\\" in name or len(os.fsencode(name)) > _LONGEST:

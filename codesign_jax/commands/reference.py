@@ -41,10 +41,10 @@ STREAM_REFERENCE = 0x72656665
 """Stream of the fresh trials' noise ("refe")."""
 
 
-def most_trials(asked: int | None, settings: Settings) -> int:
+def most_trials(trials: int | None, settings: Settings) -> int:
     """Most fresh trials of a run: as asked for, or `MOST` with the engine that is fast."""
-    if asked is not None:
-        return asked
+    if trials is not None:
+        return trials
     return verdict.MOST if settings.engine == engines.DEFAULT and settings.test_trials else 0
 
 

@@ -17,11 +17,11 @@ def main(options: Render) -> int:
     common.use_compilation_cache()
     _check(options)
     camera = _camera(options.camera)
-    asked = grasp.find(options)
-    end = asked.case.scene.end_time
+    planned = grasp.find(options)
+    end = planned.case.scene.end_time
     late = [t for t in options.times if not 0 <= t <= end]
     common.refuse([f"--times {t:g} is outside [0, {end:g}] s, a grasp" for t in late])
-    draw(asked, options, camera, Console())
+    draw(planned, options, camera, Console())
     return 0
 
 
@@ -67,14 +67,14 @@ def _camera(words: Sequence[str]) -> "Camera":
     return camera._replace(lookat=at, **numbers)
 
 
-def draw(asked: grasp.Asked, options: Render, camera: "Camera", console: Console) -> None:
+def draw(planned: grasp.PlannedGrasp, options: Render, camera: "Camera", console: Console) -> None:
     with Busy(console, "simulating the grasp"):
-        shown = grasp.simulate(asked)
+        shown = grasp.simulate(planned)
     from codesign_jax.report import animation
 
-    lines = "\n".join(grasp.description(asked, shown)).split("\n")
+    lines = "\n".join(grasp.description(planned, shown)).split("\n")
     console.print(*lines, sep="\n")
-    scene = asked.case.scene
+    scene = planned.case.scene
     size = (options.size, options.size)
     with Busy(console, "drawing"):
         arguments: Any = {"size": size, "camera": camera}

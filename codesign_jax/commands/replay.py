@@ -27,26 +27,26 @@ def main(options: Replay) -> int:
         return explain(options.first, options.engine, options.policy)
     path = options.out or (options.run_folder or Path()) / "replay.html"
     common.refuse(common.place_problems("--out", path, ".html"))
-    asked = grasp.find(options)
+    planned = grasp.find(options)
     console = Console()
     places = options.episode, options.particle, options.trial, options.object
     if options.run_folder is not None and places == (None,) * 4:
         show_failures(options.run_folder)
-    write_page(asked, path, console)
+    write_page(planned, path, console)
     console.print(f"replay: {path} (for any browser, offline)")
     if options.open:
         webbrowser.open(path.resolve().as_uri())
     return 0
 
 
-def write_page(asked: grasp.Asked, path: Path, console: Console) -> Path:
+def write_page(planned: grasp.PlannedGrasp, path: Path, console: Console) -> Path:
     with Busy(console, "simulating the grasp"):
-        shown = grasp.simulate(asked)
+        shown = grasp.simulate(planned)
     from codesign_jax.report import viewer
 
-    lines = grasp.description(asked, shown)
+    lines = grasp.description(planned, shown)
     console.print(*"\n".join(lines).split("\n"), sep="\n")
-    return viewer.write(asked.case.scene, shown, path, title="A grasp in 3D", text=lines)
+    return viewer.write(planned.case.scene, shown, path, title="A grasp in 3D", text=lines)
 
 
 def show_failures(folder: Path) -> None:

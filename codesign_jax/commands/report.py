@@ -69,4 +69,6 @@ def best_grasp(
     space = design_space(scene.hand, settings.preset)
     case = Case(scene, space, planned.design, engine, settings.policy)
     with Busy(console, "simulating the best grasp again"):
-        return planned, grasp.simulate(grasp.Asked(case, planned.trial, "", None), forces=True)
+        return planned, grasp.simulate(
+            grasp.PlannedGrasp(case, planned.trial, "", None), forces=True
+        )

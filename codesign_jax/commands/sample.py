@@ -102,8 +102,8 @@ def _simulate(
     total = question.shards(designs)
 
     def count(shard: int, outcome: Outcome) -> int:
-        wanted = min(question.chunk, designs - shard * question.chunk)
-        ends = np.bincount(verdicts(outcome)[:wanted].ravel(), minlength=len(counts))
+        count = min(question.chunk, designs - shard * question.chunk)
+        ends = np.bincount(verdicts(outcome)[:count].ravel(), minlength=len(counts))
         counts[:] += ends
         return int(ends.sum())
 

@@ -112,15 +112,15 @@ def _lacking_platform() -> str | None:
     """Why JAX has no device where one was asked for; None if it has one."""
     import jax
 
-    asked = jax.config.jax_platforms  # type: ignore[attr-defined]
-    if not asked:
+    platforms = jax.config.jax_platforms  # type: ignore[attr-defined]
+    if not platforms:
         return None
     try:
         jax.devices()
     except Exception as error:  # each of JAX's plugins has its own
         why = f" ({error})" if str(error) else ""
         return (
-            f"JAX_PLATFORMS={asked} asks for a device that JAX has not got here{why}: leave it "
+            f"JAX_PLATFORMS={platforms} asks for a device that JAX has not got here{why}: leave it "
             "out, or give cpu"
         )
     return None

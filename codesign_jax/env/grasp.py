@@ -216,8 +216,8 @@ class GraspEnv:
         data: Data = state.data
         plan = self._ahead(data)
         before = self.seen(data)  # once more: a program leaves out what nothing reads
-        told = _batch(self.act(before, action))
-        command = policy.spread(self.scene, told, _batch(plan), of="act")
+        action_command = _batch(self.act(before, action))
+        command = policy.spread(self.scene, action_command, _batch(plan), of="act")
         fields, world, ahead = _batch((data.fields, data.world, plan))
         advanced = policy.advance(self.engine, fields, world, ahead, command)
         world, trace = _one(advanced)

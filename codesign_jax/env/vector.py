@@ -92,9 +92,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         shape = np.shape(actions)
-        wanted = self.action_space.shape
-        if shape != wanted:
-            words = f"{self.num_envs} environments take actions of shape {wanted}, not {shape}"
+        expected = self.action_space.shape
+        if shape != expected:
+            words = f"{self.num_envs} environments take actions of shape {expected}, not {shape}"
             raise InputError([words])
         self._keys, state = self._step(self._keys, self._state, jnp.asarray(actions))
         self._state = state

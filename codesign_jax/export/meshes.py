@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from codesign_jax.export.casting import Parts, parts
-from codesign_jax.export.palm import Palm, closed
+from codesign_jax.export.palm import Palm, without_short_edges
 from codesign_jax.export.process import Process, Size
 
 FOLDER = "parts"
@@ -57,7 +57,7 @@ def write_palm(folder: Path, made: Palm) -> list[Part]:
     printed_parts = []
     for (kind, fingers), solid in solids.items():
         name = kind if kind == "palm" else f"{kind}_{'_'.join(map(str, fingers))}"
-        stands = closed(_stands(solid))
+        stands = without_short_edges(_stands(solid))
         if stands is None:
             continue
         meshes = [_save(folder / f"{name}.{ending}", stands) for ending in FORMATS]

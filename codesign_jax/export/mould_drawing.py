@@ -98,8 +98,8 @@ def _fabric(size: Size, process: Process, plane: str) -> np.ndarray:
 def _fill(axes: Axes, outlines: Sequence[Any], color: str) -> None:
     if not len(outlines):
         return
-    closed = (Path(np.vstack([v, v[:1]])) for v in map(np.asarray, outlines))
-    whole = Path.make_compound_path(*closed)
+    loops = (Path(np.vstack([v, v[:1]])) for v in map(np.asarray, outlines))
+    whole = Path.make_compound_path(*loops)
     axes.add_patch(PathPatch(whole, facecolor=color, edgecolor="0.2", lw=0.6))
 
 

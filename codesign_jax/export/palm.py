@@ -81,12 +81,12 @@ def palm(scene: Scene, params: Params, sizes: list[Size], process: Process) -> P
     """
     for step in APART:
         candidate = _palm(scene, params, sizes, process, [step * i for i in range(len(sizes))])
-        if (body := closed(candidate.body)) is not None:
+        if (body := without_short_edges(candidate.body)) is not None:
             return candidate._replace(body=body)
     return candidate
 
 
-def closed(solid: Solid) -> Solid | None:
+def without_short_edges(solid: Solid) -> Solid | None:
     """The solid without edges of which STL's float32 makes a point; None if that opens it."""
     for shortest in SHORTEST:
         simplified = solid.simplify(shortest)

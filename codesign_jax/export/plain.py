@@ -88,8 +88,8 @@ def text(scene: Scene, spec: mujoco.MjSpec, shares: Mapping[str, float] = NONE) 
     for pair in spec.pairs:
         names = pair.geomname1, pair.geomname2
         bodies = [body_of[name] for name in names]
-        wanted = declared * sum(body > 0 for body in bodies) / _share(pair, shares)
-        if not _absorb(pair, wanted / compiled[bodies].sum()):
+        mass = declared * sum(body > 0 for body in bodies) / _share(pair, shares)
+        if not _absorb(pair, mass / compiled[bodies].sum()):
             why = "" if scene.effects.wrist else ", for effects.wrist = false makes the palm heavy"
             raise Inexpressible(
                 f"the contact of {names[0]} and {names[1]} would need an impedance outside of "

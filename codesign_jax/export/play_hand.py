@@ -138,10 +138,10 @@ def peaks(rows):
     """Largest speed and acceleration of rows, by the names and units of `LIMITS`."""
     step = rows[1][0] - rows[0][0]
     pairs = [*zip(rows, rows[1:], strict=False)]
-    moved = [[(q - p) / step for p, q in zip(a[1:4], b[1:4], strict=True)] for a, b in pairs]
+    velocities = [[(q - p) / step for p, q in zip(a[1:4], b[1:4], strict=True)] for a, b in pairs]
     turned = [[v / step for v in _turned(a[4:], b[4:])] for a, b in pairs]
     values = {}
-    for name, speeds in (("", moved), ("turn", turned)):
+    for name, speeds in (("", velocities), ("turn", turned)):
         # At rest before the first row and after the last.
         path = [[0.0] * 3, *speeds, [0.0] * 3]
         values[name or "speed"] = max(math.hypot(*v) for v in speeds)

@@ -151,8 +151,8 @@ def _limit_meaning(scene: Scene, params: Params) -> str:
     )
     if params.tip is None:
         strains = limit_strains(scene, params)
-        told = ", ".join(f"finger {i} {100 * v:.0f} %" for i, v in enumerate(strains))
-        text += f" Strain of a free finger's upper wall at its limit by beam theory: {told}."
+        words = ", ".join(f"finger {i} {100 * v:.0f} %" for i, v in enumerate(strains))
+        text += f" Strain of a free finger's upper wall at its limit by beam theory: {words}."
     if scene.limits.strain is not None:
         text += f" A search keeps that strain below {100 * scene.limits.strain:.0f} %."
     return text
@@ -283,8 +283,8 @@ def tip_heights(scene: Scene, params: Params, sizes: Sequence[Size]) -> np.ndarr
 def _pressed(scene: Scene, params: Params, sizes: Sequence[Size]) -> str:
     """How far the straight fingers are commanded into the table, and what that means."""
     heights = tip_heights(scene, params, sizes)
-    told = ", ".join(f"finger {i} {h + 0.0:.0f} mm" for i, h in enumerate(heights))
-    text = f"Lowest tips of the straight fingers over the table, as commanded: {told}."
+    words = ", ".join(f"finger {i} {h + 0.0:.0f} mm" for i, h in enumerate(heights))
+    text = f"Lowest tips of the straight fingers over the table, as commanded: {words}."
     depth = -float(heights.min())
     if depth <= 0:
         return f"{text} None is pressed on the table before the wrist sags."

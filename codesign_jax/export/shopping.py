@@ -156,13 +156,13 @@ def _safety(scene: Scene, params: Params) -> list[tuple[str, str, str]]:
     """What keeps a failed regulator from bursting a finger, and the air from staying in it."""
     count = str(scene.num_fingers)
     limits = 1e-3 * morphology.pressure_limits(scene.hand, params)
-    told = ", ".join(f"finger {i} {limit:.0f}" for i, limit in enumerate(limits))
+    words = ", ".join(f"finger {i} {limit:.0f}" for i, limit in enumerate(limits))
     return [
         (
             "relief valves",
             count,
             "between regulator and finger, open below the finger's limit in kPa: "
-            f"{told}; and above its highest pressure of the table 'Valves'. The supply is above "
+            f"{words}; and above its highest pressure of the table 'Valves'. The supply is above "
             "the limits, and a failed regulator passes it on",
         ),
         (

@@ -76,14 +76,14 @@ def _prints(scene: Scene, sizes: Sequence[Size], printed: Printed | None) -> She
         else:
             rows.append((name, "0", f"finger {which} as it is to be: to compare, not to print"))
     mass = shopping.PLASTIC * printed.palm_volume
-    wanted = 1e3 * scene.hand.palm.mass
+    simulated_mass = 1e3 * scene.hand.palm.mass
     notes = [
         "Files in parts/, STL and 3MF, in mm, as they stand on the printer's bed: layers of 0.15 "
         "mm, 4 perimeters; palm and bars with 50 % infill or more, moulds with 15 %. Sand the "
         "trays' inside: layers show on the finger.",
         f"Palm and bars weigh {mass:.0f} g if printed solid; the simulated palm weighs "
-        f"{wanted:.0f} g with all that it bears but the fingers (screws, tubes, the wrist's upper "
-        "plate). Add what is missing in the middle of its upper side.",
+        f"{simulated_mass:.0f} g with all that it bears but the fingers (screws, tubes, the "
+        "wrist's upper plate). Add what is missing in the middle of its upper side.",
         "The groove in the palm's upper side points to x. Dimples in its underside count each "
         "finger from 1: finger 0 has one.",
     ]

@@ -78,10 +78,10 @@ def _precision(posterior: Posterior, names: tuple[str, ...]) -> np.ndarray:
 def _more(finger: Finger, names: tuple[str, ...], rows: Table, posterior: Posterior) -> np.ndarray:
     """The precision that a candidate adds."""
     [column] = [n for n in rows if np.isnan(rows[n]).all()]
-    asked = {**rows, column: np.zeros_like(rows["pressure"])}
+    candidate = {**rows, column: np.zeros_like(rows["pressure"])}
 
     def values(logs: np.ndarray) -> np.ndarray:
-        return _predicted(scaled(finger, names, logs), asked, column)
+        return _predicted(scaled(finger, names, logs), candidate, column)
 
     base = values(np.zeros(len(names)))
     if not np.isfinite(base).all():
@@ -94,13 +94,13 @@ def _more(finger: Finger, names: tuple[str, ...], rows: Table, posterior: Poster
     return gram(slopes, np.full(len(base), share / max(noise, 0.1 * usual) ** 2))
 
 
-def _predicted(finger: Finger, asked: Table, column: str) -> np.ndarray:
+def _predicted(finger: Finger, candidate: Table, column: str) -> np.ndarray:
     if column != "drop":
-        return predict(finger, asked)[column]
-    until = asked["time"][-1]
+        return predict(finger, candidate)[column]
+    until = candidate["time"][-1]
     step = until / (4 * swing.STEPS)
-    load = float(asked["load"][0])
-    return np.interp(asked["time"], *swing.released(finger, load, 0.0, until, step))
+    load = float(candidate["load"][0])
+    return np.interp(candidate["time"], *swing.released(finger, load, 0.0, until, step))
 
 
 def candidates(finger: Finger, table: Table) -> dict[str, dict[str, np.ndarray]]:

@@ -52,7 +52,7 @@ class Posterior(NamedTuple):
     covariance: np.ndarray  # of the logarithms, shape (K, K); NaN without enough values
     noise: dict[str, float]  # noise of a value of each column [SI]
     share: dict[str, float]  # share of a column's values that count
-    told: dict[str, bool]  # whether the values narrow a constant to two thirds of its prior
+    identified: dict[str, bool]  # whether the values narrow a constant to two thirds of its prior
 
     @property
     def value(self) -> dict[str, float]:
@@ -108,7 +108,7 @@ def fit(finger: Finger, table: Table) -> Posterior:
         logs = logs + step
     covariance = problem.covariance
     narrowed = np.sqrt(np.diag(covariance)) < [priors()[n] / 1.5 for n in problem.names]
-    if _different_values(table, columns) - problem.told < 0.5:
+    if _different_values(table, columns) - problem.effective_constants < 0.5:
         covariance = np.full_like(covariance, math.nan)
     mean = logs + np.log([getattr(finger.constants, n) for n in problem.names])
     return Posterior(
@@ -134,7 +134,7 @@ class _Problem:
         self.column = np.repeat(np.arange(len(columns)), [r.sum() for r in self.rows])
         self.precision = np.array([priors()[n] ** -2 for n in self.names])
         self.share = np.ones(len(columns))  # of the values of a column that count
-        self.told = 0.0  # number of constants that the values themselves tell
+        self.effective_constants = 0.0  # number of constants that the values themselves tell
         self.covariance = np.zeros((0, 0))
 
     def material(self, logs: np.ndarray) -> Finger:
@@ -189,9 +189,9 @@ class _Problem:
         left = errors + slopes @ step
         # Constants that each column tells: the trace of its part of the hat matrix.
         hat = weight * (slopes * np.linalg.solve(precision, slopes.T).T).sum(1)
-        told = np.bincount(self.column, hat)
-        self.told = float(told.sum())
-        new, wider = _noise(self.column, share, left, told)
+        leverage = np.bincount(self.column, hat)
+        self.effective_constants = float(leverage.sum())
+        new, wider = _noise(self.column, share, left, leverage)
         weight = share / (new * wider)[self.column] ** 2
         self.covariance = np.linalg.inv(gram(slopes, weight) + prior)
         return step, new
@@ -219,8 +219,8 @@ def slopes_of(
     function: Callable[[np.ndarray], np.ndarray], logs: np.ndarray, base: np.ndarray
 ) -> np.ndarray:
     """Differences of a function of logarithms from its value at them, shape (value, K)."""
-    moved = [function(logs + STEP * unit) for unit in np.eye(len(logs))]
-    return (np.stack(moved, -1) - base[:, None]) / STEP
+    values = [function(logs + STEP * unit) for unit in np.eye(len(logs))]
+    return (np.stack(values, -1) - base[:, None]) / STEP
 
 
 def gram(slopes: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -229,7 +229,7 @@ def gram(slopes: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def _noise(
-    column: np.ndarray, share: np.ndarray, left: np.ndarray, told: np.ndarray
+    column: np.ndarray, share: np.ndarray, left: np.ndarray, leverage: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Noise of each column, and by how much Student's interval is wider than the Gaussian's.
 
@@ -237,7 +237,7 @@ def _noise(
     """
     from scipy import stats
 
-    degrees = np.maximum(np.bincount(column, share) - told, 0.0)
+    degrees = np.maximum(np.bincount(column, share) - leverage, 0.0)
     squares = np.bincount(column, share * left**2)
     whole = float(degrees.sum())
     if whole < 0.5:  # as many constants as values: nothing tells the noise

@@ -31,18 +31,18 @@ def predict(finger: Finger, table: Table) -> dict[str, np.ndarray]:
     free = held = Rest(np.zeros(finger.links), 0.0, 0.0)
     for row in np.argsort(table["pressure"], kind="stable"):  # each begins where the last one ended
         pressure = float(table["pressure"][row])
-        asked = {n for n in predicted if np.isfinite(table[n][row])}
-        if "blocked_force" in asked:
+        names = {n for n in predicted if np.isfinite(table[n][row])}
+        if "blocked_force" in names:
             predicted["blocked_force"][row] = pressure * finger.gain[0] / finger.length
-        if "tip_force" in asked:
+        if "tip_force" in names:
             with contextlib.suppress(NoRest):
                 held = Rest.of(finger, pressure, held=True, start=held)
                 predicted["tip_force"][row] = held.force
-        if asked.intersection(FREE):
+        if names.intersection(FREE):
             with contextlib.suppress(NoRest):
                 free = Rest.of(finger, pressure, start=free)
                 load = float(table["load"][row]) if "load" in table else np.nan
-                for name, value in _of_free(finger, free, pressure, load, asked).items():
+                for name, value in _of_free(finger, free, pressure, load, names).items():
                     predicted[name][row] = value
     if "drop" in predicted:
         predicted["drop"] = _drops(finger, table)
@@ -50,18 +50,18 @@ def predict(finger: Finger, table: Table) -> dict[str, np.ndarray]:
 
 
 def _of_free(
-    finger: Finger, free: Rest, pressure: float, load: float, asked: set[str]
+    finger: Finger, free: Rest, pressure: float, load: float, names: set[str]
 ) -> dict[str, float]:
     """Those values of `FREE` that are asked for."""
     values: dict[str, float] = {}
-    if "angle" in asked:
+    if "angle" in names:
         values["angle"] = free.angles.sum()
-    if asked & {"tip_x", "tip_y"}:
+    if names & {"tip_x", "tip_y"}:
         places = dict(zip(("tip_x", "tip_y"), tip_place(finger, free), strict=True))
-        values |= {name: place for name, place in places.items() if name in asked}
-    if "sideways" in asked:
+        values |= {name: place for name, place in places.items() if name in names}
+    if "sideways" in names:
         values["sideways"] = sideways(finger, free, load)
-    if "deflection" in asked:
+    if "deflection" in names:
         values["deflection"] = free.height - Rest.of(finger, pressure, load, start=free).height
     return values
 

@@ -83,7 +83,7 @@ def mujoco_fields(scene: Scene, fields: ModelFields, numpy: Any = jnp) -> Mujoco
 
     bodies = np.concatenate([lay.stubs[:, None], lay.bodies], 1)
     palm = numbers.hand.palm
-    thing = lay.object
+    body = lay.object
     wrist, damping, armature = _dofs(numpy, scene, fields)
     gain = numpy.broadcast_to(fields.gain, lay.dofs.shape[:2])
     tapered = scene.hand.section.tapered
@@ -99,7 +99,7 @@ def mujoco_fields(scene: Scene, fields: ModelFields, numpy: Any = jnp) -> Mujoco
             ((1, 2), palm.thickness / 2),
         ),
         body_mass=filled(
-            "body_mass", (1, palm.mass), (bodies, fields.mass), (thing, fields.object_mass)
+            "body_mass", (1, palm.mass), (bodies, fields.mass), (body, fields.object_mass)
         ),
         body_subtreemass=filled(
             "body_subtreemass", *_subtree_mass(numpy, lay, palm, fields.mass, fields.object_mass)
@@ -107,7 +107,7 @@ def mujoco_fields(scene: Scene, fields: ModelFields, numpy: Any = jnp) -> Mujoco
         body_inertia=filled(
             "body_inertia",
             (bodies, fields.inertia),
-            (thing, fields.object_inertia),
+            (body, fields.object_inertia),
             (1, numpy.stack(palm_inertia(numbers))),
         ),
         geom_pos=filled("geom_pos", *_sphere_positions(numpy, numbers, fields)),

@@ -98,9 +98,9 @@ class Evolution:
         low = jnp.asarray(self.space.low)
         high = jnp.asarray(self.space.high)
         unit, _ = self._asked(state, mask)
-        moved = reflect(low + unit * (high - low), low, high)
+        proposal = reflect(low + unit * (high - low), low, high)
         kept = jnp.where(jnp.any(mask), state.particles[:1], state.particles)
-        return self.space.constrain(jnp.where(mask, moved, kept).astype(state.particles.dtype))
+        return self.space.constrain(jnp.where(mask, proposal, kept).astype(state.particles.dtype))
 
     def tell(
         self, state: OptimizerState, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True
@@ -110,11 +110,13 @@ class Evolution:
         ranked = jnp.where(jnp.isfinite(cost), cost, jnp.inf)
         # CMA-ES knows ranks only.  evosax gives equal costs a common weight below their share,
         # which shrinks steps on a plateau such as "every grasp is lost"; rows are a fair draw.
-        told = jnp.argsort(jnp.argsort(ranked)) if self.name == "cma-es" else ranked
+        values = jnp.argsort(jnp.argsort(ranked)) if self.name == "cma-es" else ranked
         strategy = self._strategy(state)
-        unit, asked = self._asked(state, mask)
+        unit, strategy_state = self._asked(state, mask)
         key = episode_key(state, STREAM_TELL)
-        new, _ = strategy.algorithm.tell(key, unit, told.astype(unit.dtype), asked, strategy.params)
+        new, _ = strategy.algorithm.tell(
+            key, unit, values.astype(unit.dtype), strategy_state, strategy.params
+        )
         # Newer particles come first, so that they win among equal costs.
         costs = jnp.concatenate([ranked, state.memory["cost"]])
         best = jnp.argsort(costs)[: cost.shape[0]]

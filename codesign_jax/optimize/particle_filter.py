@@ -80,8 +80,8 @@ class ParticleFilter:
         key = episode_key(state, STREAM_MOVE)
         keys = jax.vmap(lambda particle: jax.random.fold_in(key, particle))(jnp.arange(n))
         noise = jax.vmap(lambda k: jax.random.normal(k, (width,), state.particles.dtype))(keys)
-        moved = reflect(state.particles + self.sigma * (high - low) * noise, low, high)
-        return self.space.constrain(jnp.where(mask, moved, state.particles))
+        proposal = reflect(state.particles + self.sigma * (high - low) * noise, low, high)
+        return self.space.constrain(jnp.where(mask, proposal, state.particles))
 
     def tell(
         self, state: OptimizerState, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True

@@ -70,8 +70,8 @@ class Retested:
         dtype = state.particles.dtype
         unit = jax.random.uniform(episode_key(state, STREAM_DRAW), shape, dtype)
         drawn = jnp.where(mask, low + unit * (high - low), state.particles[:1]).astype(dtype)
-        asked = jnp.where(self._again(state), state.memory["designs"], drawn)
-        return self.space.constrain(jnp.where(jnp.any(mask), asked, state.particles))
+        proposal = jnp.where(self._again(state), state.memory["designs"], drawn)
+        return self.space.constrain(jnp.where(jnp.any(mask), proposal, state.particles))
 
     def tell(
         self, state: OptimizerState, population: jax.Array, cost: ArrayLike, mask: ArrayLike = True

@@ -131,12 +131,12 @@ class Screened:
         costs = jnp.concatenate([ranked, jnp.where(tests > 0, jnp.inf, known)])
         best = jnp.argsort(costs)[: len(cost)]
         screened = jnp.concatenate([population, state.particles])[best]
-        unit, asked, memory = self._asked(state, mask)
+        unit, strategy_state, memory = self._asked(state, mask)
         algorithm, params = self._strategy(state)
         points = slice(1, 1 + algorithm.population_size)
-        told = ranked[points].astype(unit.dtype)
+        fitness = ranked[points].astype(unit.dtype)
         key = episode_key(state, STREAM_TELL)
-        new, _ = algorithm.tell(key, unit[points], told, asked, params)
+        new, _ = algorithm.tell(key, unit[points], fitness, strategy_state, params)
         weight = self.recency / (memory["averaged"] + self.recency)
         average = memory["average"] + weight * (new.mean - memory["average"])
         averaged = memory["averaged"] + 1

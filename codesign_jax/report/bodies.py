@@ -106,11 +106,11 @@ def vertices(part: Part, pose: np.ndarray) -> np.ndarray:
         mujoco.mju_quat2Mat(turn[body], quat.astype(float))
     turn = turn.reshape(-1, 3, 3)
     place = pose[:, :3]
-    moved = [
+    placed = [
         place[b] + np.einsum("vij,vj->vi", turn[b], local)
         for b, local in zip(part.body.T, (part.first, part.second), strict=True)
     ]
-    return (1 - part.weight[:, None]) * moved[0] + part.weight[:, None] * moved[1]
+    return (1 - part.weight[:, None]) * placed[0] + part.weight[:, None] * placed[1]
 
 
 def _finger(scene: Scene, grasp: Replay, f: int, lay: model.Layout) -> Part:

@@ -162,8 +162,8 @@ def departure(scene: Scene, outcomes: Outcome, ctrl: jax.Array, planned: jax.Arr
     turn = jnp.abs(apart[..., 3:6]).max(-1)
     pressure = apart[..., 6:]
     size = jnp.maximum(jnp.maximum(place, turn), 1e-5 * jnp.abs(pressure).max(-1))
-    moved = size > LEAST
-    first = jnp.where(moved.any(1), moved.argmax(1) * h, jnp.inf)
+    departs = size > LEAST
+    first = jnp.where(departs.any(1), departs.argmax(1) * h, jnp.inf)
     lower = jnp.minimum(pressure, 0).min((1, 2))
     higher = jnp.maximum(pressure, 0).max((1, 2))
     return Departure(first, lower, higher, place.max(1), turn.max(1))
@@ -269,12 +269,12 @@ def find_grasp(
     """A grasp of a run, by the numbers of trials.csv."""
     history = record.history
     _, particles, trials = history.outcomes.cost.shape
-    asked = (
+    numbers = (
         ("--episode", episode, 1, record.done),
         ("--particle", particle, 0, particles - 1),
         ("--trial", trial, 0, trials - 1),
     )
-    checks = [range_problem(n, v, "", low, high) for n, v, low, high in asked if v is not None]
+    checks = [range_problem(n, v, "", low, high) for n, v, low, high in numbers if v is not None]
     if problems := [problem for problem in checks if problem]:
         raise InputError(problems)
     chosen = choose(scene, record)

@@ -121,8 +121,8 @@ def setting_of(paths: Iterable[Path], name: str) -> Any:
     if len(set(values.values())) > 1:
         least, most = (f(values, key=lambda path: values[path]) for f in (min, max))
         value = values[least]
-        told = f"{value} {name}" if isinstance(value, int) else f"{name} {value}"
-        problem = f"{least} has {told} and {most} {values[most]}: say by --{name} what all "
+        words = f"{value} {name}" if isinstance(value, int) else f"{name} {value}"
+        problem = f"{least} has {words} and {most} {values[most]}: say by --{name} what all "
         problem += "are to have"
         raise InputError([problem])
     return next(iter(values.values()), None)
@@ -246,11 +246,11 @@ def _diff(path: Path, name: str, text: str) -> list[str]:
 
 
 def _extension_problems(scene: Scene, settings: Settings, before: int) -> list[str]:
-    asked = settings.episodes
-    both = f"the run has {before} episodes, asked for are {asked}"
-    if asked < before:
+    episodes = settings.episodes
+    both = f"the run has {before} episodes, asked for are {episodes}"
+    if episodes < before:
         return [f"{both}, and a run can be extended, but not shortened"]
-    masks = [masks_of(scene, dataclasses.replace(settings, episodes=n)) for n in (before, asked)]
+    masks = [masks_of(scene, dataclasses.replace(settings, episodes=n)) for n in (before, episodes)]
     if (masks[0] != masks[1][:before]).any():
         return [
             f"{both}, and schedule {settings.schedule} divides its episodes: it would have "

@@ -224,8 +224,8 @@ class Search:
         rounds = []
         for k in range(settings.test_rounds):
             keys = [codesign.test_key(run.plan.key, k) for run in runs]
-            asked = zip(particles, keys, strict=True)
-            rounds.append(self._simulate([codesign.frozen(optimizer, *each) for each in asked]))
+            questions = zip(particles, keys, strict=True)
+            rounds.append(self._simulate([codesign.frozen(optimizer, *each) for each in questions]))
             self._progress.tested(len(going) * size * settings.trials)
         for run, (_, places), *parts in zip(runs, chosen, *rounds, strict=True):
             outcomes = [info.outcomes for _, info in parts]
@@ -234,14 +234,14 @@ class Search:
                 self._let(run, run.finish, jax.tree.map(lambda v, p=places: v[p], test))
 
     def _simulate(
-        self, asked: list[tuple[OptimizerState, np.ndarray]]
+        self, episodes: list[tuple[OptimizerState, np.ndarray]]
     ) -> list[tuple[OptimizerState, EpisodeInfo]]:
         """An episode of each run, from its state and mask: the state after it and the report.
 
         The results are arrays of NumPy.  The episodes before are saved meanwhile.
         """
-        keys = jnp.stack([state.key for state, _ in asked])
-        arrays = [(state._replace(key=None), mask) for state, mask in asked]  # type: ignore[arg-type]
+        keys = jnp.stack([state.key for state, _ in episodes])
+        arrays = [(state._replace(key=None), mask) for state, mask in episodes]  # type: ignore[arg-type]
         states, masks = jax.tree.map(lambda *v: np.stack(v), *arrays)
         states = states._replace(key=keys)
         program = self._program(states, masks)
@@ -251,10 +251,10 @@ class Search:
         states, infos = wait()
         results = jax.device_get((states._replace(key=None), infos))
         self._seconds = time.perf_counter() - start
-        rows = [jax.tree.map(lambda v, r=row: v[r], results) for row in range(len(asked))]
+        rows = [jax.tree.map(lambda v, r=row: v[r], results) for row in range(len(episodes))]
         return [
             (new._replace(key=state.key), info)
-            for (state, _), (new, info) in zip(asked, rows, strict=True)
+            for (state, _), (new, info) in zip(episodes, rows, strict=True)
         ]
 
     def _program(self, states: OptimizerState, masks: np.ndarray) -> Callable:

@@ -94,10 +94,10 @@ class Record:
 
     def failed_outcomes(self) -> Outcome | None:
         """The final test or the last episode, where every trial of it failed."""
-        told = [] if self.test is None else [self.test]
+        outcomes = [] if self.test is None else [self.test]
         if self.done:
-            told.append(jax.tree.map(lambda v: v[self.done - 1], self.history.outcomes))
-        return next((every for every in told if failed(np.asarray(every.status)).all()), None)
+            outcomes.append(jax.tree.map(lambda v: v[self.done - 1], self.history.outcomes))
+        return next((every for every in outcomes if failed(np.asarray(every.status)).all()), None)
 
     def last_outcomes(self) -> Outcome:
         """Outcomes in the last episode of the particle filter's final particles.
@@ -203,14 +203,13 @@ def _problem(record: Record, settings: Settings) -> str:
 def refuse_other(record: Record, settings: Settings) -> None:
     """Refuses a record that is not of a run of these settings."""
     sizes = np.shape(record.history.outcomes.cost)[1:]
-    asked = settings.particles, settings.trials, settings.episodes
     if len(sizes) == 2 and np.shape(record.state.episode) == ():
         done = record.done
-        if asked[:2] != sizes or done > asked[2]:
+        if (settings.particles, settings.trials) != sizes or done > settings.episodes:
             raise RunError(
                 f"its checkpoints have {done} episodes of {sizes[0]} particles and {sizes[1]} "
-                f"trials, and provenance.json {asked[2]} of {asked[0]} and {asked[1]}: put back "
-                "the one that belongs to them"
+                f"trials, and provenance.json {settings.episodes} of {settings.particles} and "
+                f"{settings.trials}: put back the one that belongs to them"
             )
     if problem := _problem(record, settings):
         raise RunError(

@@ -90,8 +90,8 @@ def make_settings(
     usual = by_preset.get(preset, by_preset[""])
     if screens:
         usual = usual._replace(trials=max(objects, usual.trials))
-    asked = (particles, trials, episodes, test_trials)
-    n, t, e, test = (s if a is None else a for a, s in zip(asked, usual, strict=True))
+    given_sizes = (particles, trials, episodes, test_trials)
+    n, t, e, test = (s if a is None else a for a, s in zip(given_sizes, usual, strict=True))
     return Settings(preset, schedule, first, engine, n, t, e, seed, test, optimizer, cost, policy)
 
 

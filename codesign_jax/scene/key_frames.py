@@ -379,8 +379,8 @@ class _Reader:
         if isinstance(total, str):
             self.problems.append(f"{path} = {schema.shown(value)} {total}")
             return Sum(unit, 0.0)
-        wanted = UNITS[unit][0]
-        fitting = [name for name, u in self.units.items() if u == wanted]
+        expected = UNITS[unit][0]
+        fitting = [name for name, u in self.units.items() if u == expected]
         for term in total.term:
             if term.name not in self.units and (
                 why := sums.unit_words(term.name, term.factor, unit)
@@ -389,9 +389,9 @@ class _Reader:
             elif term.name not in self.units:
                 why = schema.nearest(term.name, fitting)
                 self.problems.append(f"{path} names an unknown parameter {term.name!r}; {why}")
-            elif self.units[term.name] != wanted:
+            elif self.units[term.name] != expected:
                 self.problems.append(
-                    f"{path}: {term.name!r} has the unit {self.units[term.name]}, not {wanted}; "
+                    f"{path}: {term.name!r} has the unit {self.units[term.name]}, not {expected}; "
                     f"valid: {', '.join(fitting)}"
                 )
         return total

@@ -321,8 +321,8 @@ def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
                 f"{where}: size of a {kind} has {len(sizes)} values, not {len(given.size)}"
                 f" ({', '.join(sizes)})"
             )
-        moved = given.centre_of_mass is not None
-        if given.inertia is not None and any(given.inertia[3:]) and not moved:
+        shifted = given.centre_of_mass is not None
+        if given.inertia is not None and any(given.inertia[3:]) and not shifted:
             problems.append(f"{where}: inertia of a {kind} is xx, yy and zz in its own axes")
     problems += [f"{where}: {key} of a {kind} is missing" for key in missing]
     problems += [f"{where}: a {kind} has no {key}" for key in foreign]

@@ -249,8 +249,8 @@ class Tab:
             if not failed(outcomes.status).all():
                 cost = float(codesign.particle_cost(scene, outcomes))
         design = common.shortest(shown.bench.case.space, view.design)
-        told = {"number": view.number, "total": view.trials, "design": design}
-        self.send("verdict", told | {"ends": ends, "sentence": sentence, "cost": cost})
+        message = {"number": view.number, "total": view.trials, "design": design}
+        self.send("verdict", message | {"ends": ends, "sentence": sentence, "cost": cost})
 
     # ---- a search from here
 

@@ -123,15 +123,15 @@ class Budget:
 
     def row(self, name: str, words: str) -> list[str]:
         beside = self.compared(name, "truth")
-        moved = self.compared(name, f"{name}, moved")
+        repeated = self.compared(name, f"{name}, moved")
         rates = [self.rates.get(machine, {}).get(name) for machine in RATED]
         cells = [words, *["–"] * 5]
         if beside:
             cells[1] = points(beside["success_difference"])
             cells[2] = interval(beside["flipped"])
             cells[3] = interval(beside["rank"], ".2f")
-        if moved:
-            cells[4] = f"{moved['flipped'].value:.1%}"
+        if repeated:
+            cells[4] = f"{repeated['flipped'].value:.1%}"
         if name in self.tips:
             cells[5] = f"{self.tips[name]:.2g} mm"
         return cells + [f"{r['grasps_per_s']:,.0f}" if r else "–" for r in rates]
@@ -180,10 +180,10 @@ def luck(results: Budget) -> str:
     six = np.sqrt((kept.mean(1) * (1 - kept.mean(1))).mean() / 6)
     blocks = [mean_costs(cost[:, i : i + 6]) for i in range(0, cost.shape[1] - 5, 6)]
     ranks = [spearman(a, b) for a, b in zip(blocks, blocks[1:], strict=False)]
-    told = f"{np.mean(ranks):.2f}" if ranks else "none"
+    words = f"{np.mean(ranks):.2f}" if ranks else "none"
     return (
         f"Luck of six trials: a design's success has a standard error of {100 * six:.0f} points; "
-        f"ranks by six trials and by six others correlate by {told}."
+        f"ranks by six trials and by six others correlate by {words}."
     )
 
 
@@ -294,8 +294,8 @@ def draw_against_time(results: Budget, path: Path) -> Path:
         axis.set_xlim(axis.get_xlim()[0] / 2)  # room for the name of a mark at the edge
         axis.xaxis.set_major_formatter(ticker.ScalarFormatter())
         axis.xaxis.set_minor_formatter(ticker.NullFormatter())
-    moved = results.compared("truth, moved", "truth")
-    if moved and (floor := 100 * moved["flipped"].value):
+    repeated = results.compared("truth, moved", "truth")
+    if repeated and (floor := 100 * repeated["flipped"].value):
         verdict.axhline(floor, color="0.4", ls=":", lw=1)
         verdict.text(
             0.99, floor, "a micrometre flips this share of the truth's own", fontsize=8,
@@ -346,9 +346,9 @@ def _apart(axis: Axes, points: list[tuple[float, float]], least: float = 0.04) -
     height = scale.transform(np.reshape(points, (-1, 2)))[:, 1]
     order = np.argsort(height, kind="stable")
     steps = least * np.arange(len(order))
-    wanted = height[order] - steps
+    heights = height[order] - steps
     # Between the lowest heights of which none is too low and the highest of which none too high.
-    up = np.maximum.accumulate(wanted)
-    down = np.minimum.accumulate(wanted[::-1])[::-1]
+    up = np.maximum.accumulate(heights)
+    down = np.minimum.accumulate(heights[::-1])[::-1]
     height[order] = (up + down) / 2 + steps
     return [float(y) for _, y in scale.inverted().transform([(0.0, h) for h in height])]

@@ -102,15 +102,15 @@ def _between(place: tuple[jax.Array, ...], knots: jax.Array) -> jax.Array:
 def supplied(
     scene: Scene, commanded: jax.Array, start: jax.Array | None = None
 ) -> tuple[jax.Array, jax.Array]:
-    """Chamber pressures that the air supply reaches from the wanted ones, both (time, finger).
+    """Chamber pressures that the air supply reaches from the commanded ones, both (time, finger).
 
-    tau dp/dt = min(wanted, maximum) - p with |dp/dt| <= rate, from the first wanted pressure on.
-    `wanted` is held over each time step, over which the lag is solved exactly.  The chamber's
-    volume does not enter, so pressures are known beforehand and cost a step nothing.
+    tau dp/dt = min(commanded, maximum) - p with |dp/dt| <= rate, from the first commanded pressure
+    on.  `commanded` is held over each time step, over which the lag is solved exactly.  The
+    chamber's volume does not enter, so pressures are known beforehand and cost a step nothing.
 
     Args:
-      wanted: Wanted pressures [Pa].
-      start: Pressures at the beginning, shape (finger,), instead of the first wanted ones.
+      commanded: Commanded pressures [Pa].
+      start: Pressures at the beginning, shape (finger,), instead of the first commanded ones.
 
     Returns:
       The pressures, and those at the end of the last step, shape (finger,).
@@ -129,7 +129,7 @@ def supplied(
 
 
 def reachable(scene: Scene, commanded: jax.Array) -> jax.Array:
-    """Wanted pressures [Pa] as far as the air supply has them."""
+    """Commanded pressures [Pa] as far as the air supply has them."""
     return jnp.minimum(commanded, scene.pneumatics.maximum)
 
 

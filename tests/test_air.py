@@ -91,17 +91,17 @@ def test_a_free_finger_has_the_wanted_pressure(neo_hookean):
         params, trial = grasps.hand_world(the_scene, wall=0.003, length=0.1)
         fields, ctrl = grasps.world_inputs(the_scene, params, trial)
         hand = grasps.lanes(the_scene, grasps.repeat(fields, 1))
-        wanted = np.array(ctrl)[None, :1]
-        wanted[..., 6:] = WANTED
+        controls = np.array(ctrl)[None, :1]
+        controls[..., 6:] = WANTED
         mine = Finger(the_scene, params, 1.4, neo_hookean)
 
         @jax.jit
-        def reached(hand, wanted, grown):
-            charge = air.charged(the_scene, hand, wanted)[0, 0, 6]
+        def reached(hand, controls, grown):
+            charge = air.charged(the_scene, hand, controls)[0, 0, 6]
             given = air.volumes(hand, 1)[0, 0], hand.air[:, 0, 0], (grown, 0.0, 0.0)
             return air.end_pressure(1.0, charge, *given)
 
-        pressure, fall = reached(hand, wanted, mine.gain * mine.free)
+        pressure, fall = reached(hand, controls, mine.gain * mine.free)
     assert pressure == pytest.approx(WANTED, rel=1e-9)
     ends = (mine.pressure(mine.free + a) for a in (1e-6, -1e-6))
     slope = np.subtract(*ends) / (2e-6 * mine.gain)
@@ -319,10 +319,10 @@ def fill(the_scene, model_, data, fields):
         height, _, segment, _ = np.asarray(fields.section)[0, f]
         stiffness = model_.jnt_stiffness[joints[0]]
         straight = 4 * gain / height * segment
-        wanted = data.ctrl[6 + f]
+        pressure = data.ctrl[6 + f]
         volume = straight + gain * data.qpos[joints].sum()
-        free = straight + gain * len(joints) * gain * wanted / stiffness
-        absolute = (wanted + ATMOSPHERE) * (free / volume) ** n
+        free = straight + gain * len(joints) * gain * pressure / stiffness
+        absolute = (pressure + ATMOSPHERE) * (free / volume) ** n
         fall = n * absolute / volume
         data.ctrl[6 + f] = absolute - ATMOSPHERE - h * fall * gain * data.qvel[joints].sum()
         model_.tendon_armature[f] = h * h * fall * gain**2

@@ -279,9 +279,9 @@ def test_princeton_beam(links, far, aside):
     for load, angle, *expected in PRINCETON:
         turn = np.deg2rad(angle)
         force = load * np.array([0.0, -np.cos(turn), np.sin(turn)])
-        moved = balanced(finger, princeton_rigidity(), force) - [finger.length, 0.0, 0.0]
-        np.testing.assert_allclose(moved, expected, atol=far * finger.length)
-        assert moved[1] == pytest.approx(expected[1], rel=aside, abs=1e-9)
+        displacement = balanced(finger, princeton_rigidity(), force) - [finger.length, 0.0, 0.0]
+        np.testing.assert_allclose(displacement, expected, atol=far * finger.length)
+        assert displacement[1] == pytest.approx(expected[1], rel=aside, abs=1e-9)
 
 
 @pytest.mark.parametrize("bend, load", [(60, 0.3), (120, 0.3), (180, 0.3), (120, 1.0)])
@@ -532,11 +532,11 @@ def test_a_small_load_moves_a_bent_tip_sideways_as_the_chain_s(bend):
     """As its forty links, which ten of them lack 1.2 % of: axes in the middle of a joint's bend."""
     rigidity = np.array([6.8e-3, 5.1e-3, 1.75e-3])
     chain = Finger(10, bending_only=False)
-    moved = balanced(chain, rigidity, np.array([0.0, 1e-3, 0.0]), np.deg2rad(bend))[1]
+    displacement = balanced(chain, rigidity, np.array([0.0, 1e-3, 0.0]), np.deg2rad(bend))[1]
     spring = rigidity * chain.links / chain.length
     bench_finger = on_the_bench(chain)._replace(lateral=spring[1:2], twist=spring[2:])
     bent = rest.Rest(np.full(10, np.deg2rad(bend) / 10), 0.0, 0.0)
-    assert rest.sideways(bench_finger, bent, 1e-3) == pytest.approx(moved, rel=0.02)
+    assert rest.sideways(bench_finger, bent, 1e-3) == pytest.approx(displacement, rel=0.02)
 
 
 def test_a_released_finger_swings_as_the_chain_s():

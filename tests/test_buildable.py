@@ -152,18 +152,18 @@ def test_each_limit_is_closed_on_its_own(name):
     open_scene = scene.load("paper", overrides={f"limits.{name}": UNLIMITED[name]})
     designs = drawn(parameters.design_space(open_scene.hand, "23d"), 2000)
     changed = (projected(SPACE, designs) != designs).any(0)
-    moved = {SPACE.names[k].split("[")[0] for k in np.flatnonzero(changed)}
+    parameters_changed = {SPACE.names[k].split("[")[0] for k in np.flatnonzero(changed)}
     expected = {"finger_length": "length", "finger_slenderness": "length"}
     expected |= {"wrist_force": "arm_z", "arm_tilt": "arm_roll"}
     expected |= dict.fromkeys(("strain", "free_bend", "pressure_margin"), "pressure")
     if name == "palm_clearance":  # the wrist's force holds the palm higher than 5 mm
-        assert not moved
+        assert not parameters_changed
         _, clear = limited(palm_clearance=0.005)
         _, unlimited = limited()
         rows = drawn(unlimited)
         assert (projected(clear, rows) != rows).any(0)[columns("arm_z")].all()
     else:
-        assert expected[name] in moved
+        assert expected[name] in parameters_changed
 
 
 def test_the_projection_s_gradient_is_finite():

@@ -77,21 +77,21 @@ def test_no_save_waits_for_the_deletion_of_old_steps_or_fails_with_it(tmp_path, 
 
 def test_after_a_failed_save_its_threads_are_silent_and_no_others(tmp_path, monkeypatch):
     """Tensorstore's threads report to an event loop that the failure has closed."""
-    told = []
-    monkeypatch.setattr(sys, "unraisablehook", told.append)
+    reports = []
+    monkeypatch.setattr(sys, "unraisablehook", reports.append)
     folder = tmp_path / "checkpoints"
     store = Checkpoints(folder)
     store.save(1, arrays(1))
-    assert sys.unraisablehook == told.append
+    assert sys.unraisablehook == reports.append
     shutil.rmtree(folder)
     folder.write_text("no folder")
     with pytest.raises(OSError, match="checkpoint 2 could not be written"):
         store.save(2, arrays(2))
-    closed = types.SimpleNamespace(exc_value=RuntimeError("Event loop is closed"))
+    loop_error = types.SimpleNamespace(exc_value=RuntimeError("Event loop is closed"))
     other = types.SimpleNamespace(exc_value=RuntimeError("another"))
-    for unraisable in (closed, other):
+    for unraisable in (loop_error, other):
         sys.unraisablehook(unraisable)
-    assert told == [other]
+    assert reports == [other]
 
 
 @pytest.mark.parametrize("way", ["flipped", "longer", "deleted"])

@@ -44,9 +44,9 @@ def test_episode_is_move_evaluate_weigh_and_resample(setup):
 
 def test_noise_differs_between_episodes_seeds_and_the_test(setup):
     the_scene, task, optimizer, episode = setup
-    closed = np.zeros(2, bool)
-    first, info = episode(start(optimizer), closed)
-    seen = [info, episode(first, closed)[1], episode(start(optimizer, seed=1), closed)[1]]
+    mask = np.zeros(2, bool)
+    first, info = episode(start(optimizer), mask)
+    seen = [info, episode(first, mask)[1], episode(start(optimizer, seed=1), mask)[1]]
     rows = [i.outcomes.cost[0] for i in seen]
     keys = [codesign.test_key(first.key, k) for k in range(2)]
     tests = [codesign.frozen(optimizer, first.particles, key) for key in keys]

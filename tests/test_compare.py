@@ -187,7 +187,7 @@ def less_fine(monkeypatch):
     monkeypatch.setattr(reference, "ACCURACY", FINER)
 
 
-def told(capsys, *arguments):
+def read_numbers(capsys, *arguments):
     """Numbers of the lines that follow the design's."""
     assert command(*SUBJECT, *arguments) == 0
     output = capsys.readouterr().out
@@ -203,7 +203,7 @@ def told(capsys, *arguments):
 @pytest.mark.slow  # 14 s
 def test_its_counts_are_those_of_the_grasps_simulated_again(capsys):
     """At both accuracies: the design's first trials, simulated apart; the interval by SciPy."""
-    rates, counts, share, searched, _ = told(capsys, "--design", "length=44")
+    rates, counts, share, searched, _ = read_numbers(capsys, "--design", "length=44")
     kept = []
     for accuracy in (None, FINER):
         the_scene = scene.load(TINY, accuracy=accuracy)
@@ -285,9 +285,9 @@ def test_a_design_is_opened_from_its_file(workplace, capsys, monkeypatch):
         "design.lenght = 95\ndesign.arm_z = [1, 2]\npreset = '2d'"
     )
     assert command("evaluate", "--dry-run", "--design", "wrong.toml") == 2
-    told = capsys.readouterr().err
-    assert "wrong.toml 'lenght' is not a parameter; did you mean 'length'?" in told
-    assert "wrong.toml 'arm_z[0]' is not a parameter" in told
+    errors = capsys.readouterr().err
+    assert "wrong.toml 'lenght' is not a parameter; did you mean 'length'?" in errors
+    assert "wrong.toml 'arm_z[0]' is not a parameter" in errors
 
 
 def test_a_table_of_trials_has_noise_and_endings(finished, tmp_path, capsys):
@@ -295,8 +295,8 @@ def test_a_table_of_trials_has_noise_and_endings(finished, tmp_path, capsys):
     rows = [line.split(",") for line in (finished / "tests.csv").read_text().splitlines()[1:]]
     table = tmp_path / "new" / "trials.csv"
     seed = 4
-    asked = ["evaluate", finished, "--particle", "1", "--trials", "3", "--seed", seed]
-    assert command(*asked, "--out", table) == 0
+    arguments = ["evaluate", finished, "--particle", "1", "--trials", "3", "--seed", seed]
+    assert command(*arguments, "--out", table) == 0
     output = capsys.readouterr().out
     assert f"particle 1 of {finished}" in output and f"length={float(rows[1][-2]):.4g} mm" in output
     written = [*csv.DictReader(table.read_text().splitlines())]

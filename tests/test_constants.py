@@ -159,9 +159,9 @@ def test_derivatives_equal_differences():
         # A central difference's error is of order h^2, and of 1e-16 / 1e-6 / h by rounding, in each
         # of some 700 numbers, whose slopes partly cancel.
         h = 1e-4
-        moved = [total(jax.tree.map(lambda v, w, s=s: v + s * h * w, start, way)) for s in (1, -1)]
+        ends = [total(jax.tree.map(lambda v, w, s=s: v + s * h * w, start, way)) for s in (1, -1)]
         derivative = sum(jax.tree.leaves(products))
-        np.testing.assert_allclose(derivative, (moved[0] - moved[1]) / (2 * h), rtol=1e-5)
+        np.testing.assert_allclose(derivative, (ends[0] - ends[1]) / (2 * h), rtol=1e-5)
 
 
 def test_later_noise_leaves_earlier_draws_alone():

@@ -78,8 +78,8 @@ def test_a_contact_is_the_least_of_a_convex_problem(gap, speed):
         cone = cones.make_cone(scene, MU, bodies=2, ratio=1.0)
         up = jnp.array([0.0, 0.0, 1.0])
         pair = contact.Contacts(0.0 * up, up, jnp.float64(gap), cone)
-        wanted = pair.reference(speed * up)
-        pushed = jax.jit(lambda a: contact.constraint_update(pair, a * up - wanted).force[2])
+        reference = pair.reference(speed * up)
+        pushed = jax.jit(lambda a: contact.constraint_update(pair, a * up - reference).force[2])
         acceleration = scipy.optimize.brentq(
             lambda a: MASS * (a + GRAVITY) - float(pushed(a)), -1e4, 1e4
         )
@@ -175,12 +175,12 @@ def test_supply_against_an_integrator():
     p = scene.phases
     end = scene.window[1]
     keys = [p.approach, p.inflate, end, end + p.deflate_time]
-    wanted = 130e3 * np.interp(time, keys, [0.0, 1.0, 1.0, 0.0])[None]
+    commanded = 130e3 * np.interp(time, keys, [0.0, 1.0, 1.0, 0.0])[None]
     with jax.enable_x64(True):
-        reached = np.asarray(control.supplied(scene, jnp.asarray(wanted).T)[0]).T[0]
+        reached = np.asarray(control.supplied(scene, jnp.asarray(commanded).T)[0]).T[0]
 
     def rate(t, p):
-        goal = min(wanted[0, min(int(t / h + 1e-9), count - 1)], 90e3)
+        goal = min(commanded[0, min(int(t / h + 1e-9), count - 1)], 90e3)
         return np.clip((goal - p) / 0.15, -120e3, 120e3)
 
     options = {"max_step": 0.02, "rtol": 1e-6, "atol": 1.0}

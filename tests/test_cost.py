@@ -121,8 +121,8 @@ def with_status(bits, lost_from=None, residuals=None):
     residual = np.zeros(STEPS, np.float32)
     for array, values in ((status, bits), (residual, residuals or {})):
         array[[*values]] = [*values.values()]
-    told = None if residuals is None else jnp.asarray(residual)
-    return trace(lost_from)._replace(status=jnp.asarray(status), residual=told)
+    recorded = None if residuals is None else jnp.asarray(residual)
+    return trace(lost_from)._replace(status=jnp.asarray(status), residual=recorded)
 
 
 @pytest.mark.parametrize(
@@ -151,15 +151,15 @@ def test_a_trial_tells_how_its_solver_ended_and_warns_above_the_scene_s_threshol
     """Share and largest residual of the capped steps before the verdict."""
     strict = scene.load("paper_spheres", overrides={"newton.residual": 0.5})
 
-    def told(residuals, lost_from=None):
+    def outcome(residuals, lost_from=None):
         bits = {100: CAP, 200 if lost_from is None else 500: CAP}
         return grasps.outcome(strict, with_status(bits, lost_from, residuals))
 
-    quiet = told({100: 0.3, 200: 0.5, 300: 9.0})  # that of a solved step is no news
+    quiet = outcome({100: 0.3, 200: 0.5, 300: 9.0})  # that of a solved step is no news
     assert quiet.status == Status.OK and float(quiet.residual) == 0.5
     assert float(quiet.capped) == pytest.approx(2 / (STEPS - 1))  # nothing reads the last step
-    assert told({100: 0.3, 200: 0.51}).status == CAP
-    early = told({100: 0.3, 500: 0.9}, 400)
+    assert outcome({100: 0.3, 200: 0.51}).status == CAP
+    early = outcome({100: 0.3, 500: 0.9}, 400)
     assert early.status == Status.OK and float(early.capped) == pytest.approx(1 / 400)
     steps_only = evaluate(with_status({100: CAP}))  # as of MuJoCo C: any such step is a warning
     assert steps_only.status == CAP and np.isnan(steps_only.residual)

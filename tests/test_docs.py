@@ -74,7 +74,7 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture
-def here(folder, monkeypatch):
+def workdir(folder, monkeypatch):
     monkeypatch.chdir(folder)
     return folder
 
@@ -111,7 +111,7 @@ SIMULATES = {
 
 
 @pytest.mark.parametrize("example", CODESIGN)
-def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch):
+def test_every_command_goes_as_far_as_its_simulation(example, workdir, monkeypatch):
     """Scene, design and files are the example's own; nothing is compiled that places or steps."""
     arguments = here_alone(example)
     reached = []
@@ -133,7 +133,7 @@ def test_every_command_goes_as_far_as_its_simulation(example, here, monkeypatch)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("example", [e for e in CODESIGN if not re.search("failures|studio", e)])
-def test_every_command_runs_at_a_small_size(example, here, monkeypatch):
+def test_every_command_runs_at_a_small_size(example, workdir, monkeypatch):
     size = {"optimize": [*SMALL, "--fresh"], "evaluate": ["--trials", "3"]}
     size["export"] = ["--overwrite", "--trials", "0", "--hands", "8"]
     size["landscape"] = ["--points", "2", "--trials", "1"]

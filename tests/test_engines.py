@@ -56,8 +56,8 @@ def test_vmap_is_a_larger_batch():
     want = jax.jit(engine.rollout)(fields, ctrl)
     fields, ctrl = jax.tree.map(np.asarray, (fields, ctrl))  # whose axes NumPy moves
     two = jax.tree.map(lambda v: v.reshape(2, 2, 1, *v.shape[1:]), (fields, ctrl))
-    moved = np.moveaxis(two[1], 0, 3)
-    mixed = jax.jit(jax.vmap(jax.vmap(engine.rollout), in_axes=(0, 3)))(two[0], moved)
+    controls = np.moveaxis(two[1], 0, 3)
+    mixed = jax.jit(jax.vmap(jax.vmap(engine.rollout), in_axes=(0, 3)))(two[0], controls)
     for name in ("distance", "height", "speed", "status", "last"):
         expected = np.asarray(getattr(want, name))
         values = np.asarray(getattr(mixed, name)).reshape(expected.shape)
@@ -149,8 +149,8 @@ def test_a_trace_means_the_same_on_every_engine(decided, name, trajectory):
     assert outcome.status[:4].tolist() == [Status.OK, Status.PENETRATION, *[Status.NONFINITE] * 2]
     assert all(result.status[4] & (Status.SPEED | Status.NONFINITE) for result in (ours, outcome))
     untold = {"residual": None} | ({"capped": None} if name == "mjx" else {})  # how a solver ended
-    told = (result._replace(**untold) for result in (ours, outcome))
-    for a, b in zip(*map(jax.tree.leaves, told), strict=True):
+    compared = (result._replace(**untold) for result in (ours, outcome))
+    for a, b in zip(*map(jax.tree.leaves, compared), strict=True):
         np.testing.assert_allclose(a[:4], b[:4])
     np.testing.assert_array_equal(ours.bad_step, outcome.bad_step)
     shown = [

@@ -283,8 +283,8 @@ def test_deviations_are_those_of_each_finger():
     assert spread["hand.finger.3.azimuth"] == 1.0
     space = parameters.design_space(the_scene.hand, "full")
     params = jax.tree.map(lambda v: jnp.stack([v, v]), space.params(space.default()))
-    moved = tolerances.deviating(params, ("design", "wall", "2"), jnp.array([0.0, 1e-4]))
-    assert np.argwhere(np.asarray(moved.wall != params.wall)).tolist() == [[1, 2]]
+    thicker = tolerances.deviating(params, ("design", "wall", "2"), jnp.array([0.0, 1e-4]))
+    assert np.argwhere(np.asarray(thicker.wall != params.wall)).tolist() == [[1, 2]]
     assert tolerances.read(("wall=0.5",)) == {"wall": 0.5}
     with pytest.raises(InputError) as error:
         tolerances.read(("wal=0.5", "mount=x", "length=-1"))
@@ -492,9 +492,9 @@ def test_the_sheet_says_how_fingers_press_and_whence_the_object_falls(page):
     poses = valves.key_poses(the_scene, level)
     lowest = poses[:, 3].min()
     tilts = np.radians([finger.tilt for finger in the_scene.hand.finger])
-    wanted = lowest - np.array([size.length for size in sizes]) * np.sin(tilts)
+    expected = lowest - np.array([size.length for size in sizes]) * np.sin(tilts)
     heights = sheet.tip_heights(the_scene, level, sizes)
-    np.testing.assert_allclose(heights, wanted, atol=1e-3)  # float32
+    np.testing.assert_allclose(heights, expected, atol=1e-3)  # float32
     low = level._replace(arm=level.arm - 1e-3 * (heights.min() + 20) * np.eye(6)[2])
     words = sheet._pressed(the_scene, low, sizes)
     force = 0.02 * the_scene.hand.wrist.linear_stiffness
@@ -565,8 +565,8 @@ def test_fingers_fit_into_the_palm(name, tmp_path):
         assert size.pressed == pytest.approx(0.95 * size.base.height)
         # The root cannot turn or sink: a hair to either side, in or backwards it meets the palm.
         for x, y, z in ((-1, 0, 0), (0, 0.5, 0), (0, -0.5, 0), (0, 0, -0.5)):
-            moved = finger.translate(frame[:, :3] @ [x, y, z])
-            assert (body ^ moved).volume() > 1, (i, x, y, z)
+            displaced = finger.translate(frame[:, :3] @ [x, y, z])
+            assert (body ^ displaced).volume() > 1, (i, x, y, z)
         # Each screw cuts its thread in the palm and passes the bar; the tube comes out on top.
         for x, y in palm.screws(size, settings):
             for radius, cuts in ((1.2, False), (1.5, True)):
@@ -924,8 +924,8 @@ def test_commands_played_back_are_the_sheet_s_poses(tmp_path, settle):
         written = [float(v) for v in arms["quaternion w x y z"][k].split()]
         np.testing.assert_allclose(written, turn, atol=5.1e-5)  # four digits behind the point
         for f in range(the_scene.num_fingers):
-            told = float(pressures[f"finger {f} kPa"][k])
-            assert float(row[f"pressure_{f}_kPa"]) == pytest.approx(told, abs=0.051)
+            pressure = float(pressures[f"finger {f} kPa"][k])
+            assert float(row[f"pressure_{f}_kPa"]) == pytest.approx(pressure, abs=0.051)
     assert compared >= 5
     # The other table differs by the shaking alone, and only where the sheet says so.
     for time, row in rows.items():
@@ -938,13 +938,13 @@ def test_commands_played_back_are_the_sheet_s_poses(tmp_path, settle):
     assert peaks[tables.COMMANDS]["turn"] > 50
     # Quaternions of a still arm differ by rounding alone.
     assert peaks[tables.STILL]["turn"] < 1e-9
-    told = motion.section(the_scene, params, nominal, peaks)
-    assert [row[0] for row in told.rows][1:] == [
+    section = motion.section(the_scene, params, nominal, peaks)
+    assert [row[0] for row in section.rows][1:] == [
         tables.STILL,
         tables.COMMANDS,
         "limit of the player",
     ]
-    assert "the arm would reach" in told.notes[-1].lower() and "--slow" in told.notes[-1]
+    assert "the arm would reach" in section.notes[-1].lower() and "--slow" in section.notes[-1]
     # MuJoCo turns the palm by the controls as the commands say, and the words are true.
     compiled = model.compile_model(the_scene, params, nominal)
     data = mujoco.MjData(compiled)
@@ -1238,8 +1238,8 @@ def test_the_room_behind_a_tilted_palm(page):
     assert lowest == pytest.approx(height, abs=1e-3)
     thick = 1e3 * the_scene.hand.palm.thickness
     behind = np.array(motion.BEHIND) + thick
-    wanted = (height - motion.CLEAR + 0.5 * behind) / np.sin(np.radians(60))
-    np.testing.assert_allclose(motion.room(the_scene, tilted), wanted, rtol=1e-5)
+    expected = (height - motion.CLEAR + 0.5 * behind) / np.sin(np.radians(60))
+    np.testing.assert_allclose(motion.room(the_scene, tilted), expected, rtol=1e-5)
     length = motion.spacer(the_scene, tilted)
     reached = height + 0.5 * (thick + length) - motion.LAST_LINK * np.sin(np.radians(60))
     assert length > 0 and reached == pytest.approx(motion.CLEAR, abs=1e-3)

@@ -130,9 +130,9 @@ def test_moments_are_told_from_moduli_by_forces_alone():
     """Angles give the ratio of both: there the prior of the moment is all that is known of it."""
     mine = made(3)
     truth = mine.of_material(52e3)
-    for columns, told in ((("angle",), False), (("angle", "tip_force"), True)):
+    for columns, identified in ((("angle",), False), (("angle", "tip_force"), True)):
         fitted = finger.fit(mine, synthetic(truth, 0.02, 1, columns))
-        assert fitted.identified["moment_factor"] == told
+        assert fitted.identified["moment_factor"] == identified
     near = fitted.covariance[0, 1] / np.sqrt(np.prod(np.diag(fitted.covariance)))
     assert 0 < near < 1
 

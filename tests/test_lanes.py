@@ -118,8 +118,8 @@ def test_a_step_reads_nothing_that_it_has_not_written(monkeypatch):
     start = StructuredEngine(scene).reset(fields)
     run = jax.jit(lambda f, c: program.simulate(world_constants(scene, f), start, c))
     outputs, last = run(fields, ctrl[:, :5])
-    moved = np.asarray(outputs["distance"])
-    assert np.isfinite(moved).all() and (np.diff(moved, axis=1) != 0).all()
+    distance = np.asarray(outputs["distance"])
+    assert np.isfinite(distance).all() and (np.diff(distance, axis=1) != 0).all()
     assert np.isfinite(outputs["residual"]).all() and np.isfinite(last.finger).all()
     rows = held.rows(scene)["finger_finger"]
     assert np.abs(np.asarray(last.held[rows])).max() > 0  # some start with fingers in one another

@@ -205,8 +205,8 @@ def test_every_kind_of_pair_has_its_own_numbers():
         d = compiled.pair_solimp[i, 0]
         h = the_scene.discretization.timestep
         mass = d / (1 - d) / (2 * model.contact_invweight(the_scene))
-        wanted = stiffness * h * (h + max(c.dissipation_time, 1.5 * h))
-        np.testing.assert_allclose(mass, wanted, rtol=1e-9)
+        expected = stiffness * h * (h + max(c.dissipation_time, 1.5 * h))
+        np.testing.assert_allclose(mass, expected, rtol=1e-9)
         # MuJoCo divides by d^2 and multiplies by d.
         spring, damper = -compiled.pair_solref[i] / d
         np.testing.assert_allclose([spring * mass, damper * h], [stiffness, 1.0], rtol=1e-9)

@@ -133,15 +133,15 @@ def test_populations_are_those_of_evosax_called_directly(name):
     state = strategy.init(key(0, 0), *begun, params)
     free = np.arange(WIDTH) != LIMITED
     for episode in range(count):
-        asked, state = strategy.ask(key(evolution.STREAM_ASK, episode), state, params)
-        folded = 1 - np.abs(1 - np.asarray(asked, np.float64) % 2)  # mirrors at 0 and 1
+        points, state = strategy.ask(key(evolution.STREAM_ASK, episode), state, params)
+        folded = 1 - np.abs(1 - np.asarray(points, np.float64) % 2)  # mirrors at 0 and 1
         evaluated = (ours[episode] - LOW) / (HIGH - LOW)
         # Two programs round differently, by 1e-7, which the eigenvectors of a covariance near
         # unity magnify by the inverse gap of its eigenvalues, some hundreds.
         np.testing.assert_allclose(evaluated[:, free], folded[:, free], rtol=0, atol=5e-4)
         # The costs themselves, of which CMA-ES makes its ranks.
-        told = key(evolution.STREAM_TELL, episode), asked, infos[episode].cost
-        state, _ = strategy.tell(*told, state, params)
+        arguments = key(evolution.STREAM_TELL, episode), points, infos[episode].cost
+        state, _ = strategy.tell(*arguments, state, params)
 
 
 def test_the_default_averages_the_means_of_evosax():
@@ -163,7 +163,7 @@ def test_the_default_averages_the_means_of_evosax():
         for stream in (screened.STREAM_MOVE, screened.STREAM_TELL)
     ]
     begun = evosax_strategy.init(jax.random.key(1), best, params)
-    asked, strategy = evosax_strategy.ask(keys[0], begun, params)
+    points, strategy = evosax_strategy.ask(keys[0], begun, params)
     near = partial(np.testing.assert_allclose, rtol=0, atol=1e-5)  # float32
     average = best
     for t in range(1, 4):
@@ -174,8 +174,8 @@ def test_the_default_averages_the_means_of_evosax():
         if t == 1:  # later ones draw along eigenvectors, whose sign hangs on the last bit
             drawn = unit[1 : count + 1]
             costs = info.cost[1 : count + 1]
-            near(drawn[:, free], 1 - np.abs(1 - np.asarray(asked)[:, free] % 2))
-            near(mean, evosax_strategy.tell(keys[1], asked, costs, strategy, params)[0].mean)
+            near(drawn[:, free], 1 - np.abs(1 - np.asarray(points)[:, free] % 2))
+            near(mean, evosax_strategy.tell(keys[1], points, costs, strategy, params)[0].mean)
             rest = np.broadcast_to(best, (PARTICLES - 1 - count, WIDTH))
             near(unit[count + 1 :, free], rest[:, free])
         average = average + 4 / (t + 3) * (mean - average)
@@ -187,14 +187,14 @@ def test_with_few_parameters_the_best_random_designs_are_simulated_again():
     noise = np.random.default_rng(0)
     made = make_optimizer(optimize.DEFAULT, space)
     assert not isinstance(make_optimizer(optimize.DEFAULT, SPACE), type(made))
-    told = {}
+    costs_by_design = {}
 
     def cost(population):
         """Noisy grasps: of the best design two thirds cost nothing, of others fewer."""
         unit = (population - LOW[:3]) / (HIGH[:3] - LOW[:3])
         lost = noise.random(len(unit)) < 1 / 3 + 2 / 3 * np.abs(unit - TARGET[:3]).max(-1)
         for row, value in zip(population, lost, strict=True):
-            told.setdefault(row.tobytes(), []).append(float(value))
+            costs_by_design.setdefault(row.tobytes(), []).append(float(value))
         return lost.astype(np.float32)
 
     state = made.init(jax.random.key(0), SEED[:3], 12)
@@ -203,11 +203,14 @@ def test_with_few_parameters_the_best_random_designs_are_simulated_again():
     assert stats.kstest(drawn, "uniform").pvalue > 0.01
     assert (np.unique(populations[1::2].reshape(-1, 3), axis=0).shape[0]) < 20 * 12 / 2
     # By the mean with one episode of cost 1 besides, of all that was ever simulated.
-    ranked = sorted(told, key=lambda row: (sum(told[row]) + 1) / (len(told[row]) + 1))
-    means = [np.mean(told[row]) for row in ranked[:3]]
+    ranked = sorted(
+        costs_by_design,
+        key=lambda row: (sum(costs_by_design[row]) + 1) / (len(costs_by_design[row]) + 1),
+    )
+    means = [np.mean(costs_by_design[row]) for row in ranked[:3]]
     designs = [row.tobytes() for row in np.asarray(state.memory["designs"])]
     np.testing.assert_allclose(state.memory["cost"][:3], means, rtol=1e-5)
-    assert designs[:3] == ranked[:3] and len(told[ranked[0]]) > 5
+    assert designs[:3] == ranked[:3] and len(costs_by_design[ranked[0]]) > 5
     rows = [row.tobytes() for row in np.asarray(state.particles)]
     assert rows == designs[:3] + designs[:1] * 9
     copied = np.asarray(infos[-1].ancestors)

@@ -74,9 +74,9 @@ def test_closed_parameters_keep_their_bits_and_open_ones_move_inside_the_box():
     outside = np.array([1.0, 200.0, 20.0, 20.0, 0.5], np.float32)  # a default may lie outside
     population = ask(FILTER.init(jax.random.key(0), outside, 8), IS_MORPHOLOGY)
     np.testing.assert_array_equal(population[:, ~IS_MORPHOLOGY], np.tile(outside[[2, 4]], (8, 1)))
-    moved = np.asarray(population)[:, IS_MORPHOLOGY]
-    assert np.all(moved != outside[IS_MORPHOLOGY])
-    assert np.all((moved >= LOW[IS_MORPHOLOGY]) & (moved <= HIGH[IS_MORPHOLOGY]))
+    values = np.asarray(population)[:, IS_MORPHOLOGY]
+    assert np.all(values != outside[IS_MORPHOLOGY])
+    assert np.all((values >= LOW[IS_MORPHOLOGY]) & (values <= HIGH[IS_MORPHOLOGY]))
 
 
 def test_moves_have_the_stated_deviation():
@@ -89,7 +89,7 @@ def test_moves_have_the_stated_deviation():
     assert np.abs(correlation).max() < 0.08
 
 
-def told(cost):
+def update(cost):
     state = FILTER.init(jax.random.key(1), TARGET, 4)
     population = ask(state, OPEN)
     return population, *tell(state, population, jnp.asarray(cost, jnp.float32))
@@ -97,7 +97,7 @@ def told(cost):
 
 def test_weights_follow_the_paper():
     cost = np.array([0.0, 0.8, 1.8, 3.0])
-    population, state, info = told(cost)
+    population, state, info = update(cost)
     expected = 1 / (0.2 + cost)
     expected /= expected.sum()
     np.testing.assert_allclose(info.weight, expected, rtol=1e-6)
@@ -110,7 +110,7 @@ def test_weights_follow_the_paper():
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_failed_particle_dies_out(bad):
-    _, _, info = told([bad, 1.0, bad, 0.5])
+    _, _, info = update([bad, 1.0, bad, 0.5])
     assert set(np.asarray(info.ancestors)) == {1, 3}
     assert info.best_index == 3 and info.best_cost == 0.5 and info.mean_cost == 0.75
     np.testing.assert_array_equal(info.weight[jnp.array([0, 2])], 0)
@@ -118,7 +118,7 @@ def test_a_failed_particle_dies_out(bad):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_where_every_particle_failed_all_survive(bad):
-    population, state, info = told([bad] * 4)
+    population, state, info = update([bad] * 4)
     np.testing.assert_array_equal(state.particles, population)
     np.testing.assert_array_equal(info.weight, 0.25)
     assert info.best_cost == np.inf and info.mean_cost == np.inf

@@ -136,8 +136,8 @@ def no_flag(right, mine, self):
 
 def own_half(right, mine, self, item, pairing):
     """A relative motion without the other side's part."""
-    moved = right(self, item, pairing)
-    return chosen(mine, lanewise(lambda m: 0.5 * m, moved), moved)
+    motion = right(self, item, pairing)
+    return chosen(mine, lanewise(lambda m: 0.5 * m, motion), motion)
 
 
 def one_side(right, mine, self, item, field, more, *rest):
@@ -387,8 +387,8 @@ def test_recorded_forces_are_the_oracle_s(surface):
 
         @jax.jit
         def run(fields, state):
-            here = coordinates.make(scene, *state)
-            return forces(scene, world_constants(scene, fields), here, here.acc)
+            rows = coordinates.make(scene, *state)
+            return forces(scene, world_constants(scene, fields), rows, rows.acc)
 
         recorded = jax.tree.map(np.asarray, run(fields, state))
     second = worlds.solve(state[0][1], state[1][1], worlds.start[1])

@@ -210,14 +210,18 @@ def errors(wrong, world):
     batch = jax.tree.map(lambda v: v[row], fields)
     acceleration, far, touching = oracles.against_mujoco(scene, batch, ctrl[row], trajectory)
     compiled = world_model(scene, grasps.nth(fields, world))
-    moved = []
+    deviations = []
     for qpos, qvel, after in zip(
         trajectory.qpos[0], trajectory.qvel[0, 1:], trajectory.qpos[0, 1:], strict=False
     ):
         expected = qpos.copy()
         mujoco.mj_integratePos(compiled, expected, qvel, scene.discretization.timestep)
-        moved.append(np.abs(expected - after).max())
-    largest = {"acceleration": acceleration.max(), "position": np.max(moved), "distance": far.max()}
+        deviations.append(np.abs(expected - after).max())
+    largest = {
+        "acceleration": acceleration.max(),
+        "position": np.max(deviations),
+        "distance": far.max(),
+    }
     return largest, touching
 
 

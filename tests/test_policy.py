@@ -227,11 +227,11 @@ def test_the_page_s_policy_and_environment_do_what_they_say(monkeypatch):
         control = {"gain": jnp.full(4, gain)}
         trace = run(params._replace(control=control), trials)[1]
         ratios[gain] = np.asarray(trace.ctrl)[..., 6:] / np.maximum(plan.pressure, 1.0)
-    closed = round(scene.phases.inflate / scene.discretization.timestep)
-    np.testing.assert_allclose(ratios[0.0][:, 1 + closed :], 1.0, rtol=1e-5)
-    np.testing.assert_allclose(ratios[50.0][:, :closed], ratios[0.0][:, :closed], rtol=1e-6)
+    inflated = round(scene.phases.inflate / scene.discretization.timestep)
+    np.testing.assert_allclose(ratios[0.0][:, 1 + inflated :], 1.0, rtol=1e-5)
+    np.testing.assert_allclose(ratios[50.0][:, :inflated], ratios[0.0][:, :inflated], rtol=1e-6)
     assert (ratios[50.0][:, -1] > 1.01).any() and (
-        np.diff(ratios[50.0][:, closed:], axis=1) >= -1e-5
+        np.diff(ratios[50.0][:, inflated:], axis=1) >= -1e-5
     ).all()
     monkeypatch.setattr("codesign_jax.scene.load", lambda name: grasps.short_grasp())
     exec(blocks[1], names)
@@ -319,8 +319,8 @@ def test_what_is_observed_is_what_a_hand_feels(episode):
     np.testing.assert_allclose(felt[:, 0], SCENE.end_time, rtol=1e-6)
     np.testing.assert_allclose(felt[:, 2:4] * grasp.limit, seen.pressure, rtol=1e-5)
     assert felt.shape == (4, grasp.observation_size)
-    moved = seen._replace(object=None, object_velocity=None)
-    np.testing.assert_array_equal(*map(jax.vmap(grasp.observe), (moved, seen)))
+    blind = seen._replace(object=None, object_velocity=None)
+    np.testing.assert_array_equal(*map(jax.vmap(grasp.observe), (blind, seen)))
 
 
 @pytest.mark.slow  # quick: the vector environment, which begins ended grasps anew as well

@@ -57,10 +57,10 @@ def test_a_picture_shows_the_object_where_a_pinhole_camera_does(grasp):
     camera = animation.Camera(azimuth=90.0, elevation=0.0, distance=away, lookat=(0.0, 0.0, 0.1))
     [picture] = animation.frames(the_scene, replay, np.zeros(1), size=(side, side), camera=camera)
     focal = side / 2 / np.tan(np.radians(45.0) / 2)  # MuJoCo's field of view
-    wanted = side / 2 + focal * np.array([place[0], 0.1 - place[2]]) / (away + place[1])
+    expected = side / 2 + focal * np.array([place[0], 0.1 - place[2]]) / (away + place[1])
     red, _, blue = np.moveaxis(picture.astype(int), -1, 0)
     centre = np.argwhere(red > blue + 60)[:, ::-1].mean(0)  # orange; the hand is above it
-    np.testing.assert_allclose(centre + 0.5, wanted, atol=1.5)  # its near faces are larger
+    np.testing.assert_allclose(centre + 0.5, expected, atol=1.5)  # its near faces are larger
 
 
 def test_the_nearest_triangle_is_that_of_a_ray_s_first_hit():

@@ -166,9 +166,9 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
         capsys.readouterr()
         assert command("report", folder, "--no-replay") == 0
         assert command("compare", folder) == 0
-        told = capsys.readouterr()
-        assert told.err.count("reference.npz is of another version of the code") == 2
-        assert "fine" in told.out
+        output = capsys.readouterr()
+        assert output.err.count("reference.npz is of another version of the code") == 2
+        assert "fine" in output.out
     assert reference.most_trials(None, settings) == 0  # MuJoCo C would take minutes
     quick = dataclasses.replace(settings, engine="structured")
     assert reference.most_trials(None, quick) == 600

@@ -266,12 +266,12 @@ def compared(name):
     bodies, others = zip(*pairs, strict=True)
     only = pairs if name in WHOLE else pairs[: len(DEPTHS)]
     if name in FIELDS:
-        wanted = [_reference(name, *pair, p) for pair, (p, _) in zip(only, grid, strict=False)]
+        references = [_reference(name, *pair, p) for pair, (p, _) in zip(only, grid, strict=False)]
         force, moment = on_fields(bodies, others)
     else:
-        wanted = [dense_skin.on_finger(b, o, PER_AREA) for b, o in only]
+        references = [dense_skin.on_finger(b, o, PER_AREA) for b, o in only]
         force, moment = on_fingers(bodies, others)
-    want, turn = (np.array([w[i] for w in wanted]).reshape(-1, len(DEPTHS), 3) for i in (0, 1))
+    want, turn = (np.array([w[i] for w in references]).reshape(-1, len(DEPTHS), 3) for i in (0, 1))
     force, moment = (v.reshape(PLACES, len(DEPTHS), 3) for v in (force, moment))
     size, full = (np.linalg.norm(v, axis=-1) for v in (force, want))
     cosine = (force * want).sum(-1) / np.maximum(size * full, 1e-12)

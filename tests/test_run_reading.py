@@ -201,14 +201,14 @@ def unpacked(archive, folder):
     return folder
 
 
-@pytest.mark.parametrize(("archive", "name", "done", "asked"), RUNS)
-def test_an_earlier_run_is_read_and_reported(archive, name, done, asked, tmp_path):
+@pytest.mark.parametrize(("archive", "name", "done", "episodes"), RUNS)
+def test_an_earlier_run_is_read_and_reported(archive, name, done, episodes, tmp_path):
     """Its arrays are the numbers of the tables that were written beside them."""
     folder = unpacked(archive, tmp_path) / name
     scene, settings = runs.read_run(folder)
     record = cases.read_record(folder)
-    assert (record.done, settings.episodes) == (done, asked)
-    assert (record.test is not None) == (done == asked)
+    assert (record.done, settings.episodes) == (done, episodes)
+    assert (record.test is not None) == (done == episodes)
     trials = csv.DictReader((folder / "trials.csv").read_text().splitlines())
     costs = np.array([float(row["cost"]) for row in trials], np.float32)
     np.testing.assert_array_equal(np.ravel(record.history.outcomes.cost[:done]), costs)
@@ -217,7 +217,7 @@ def test_an_earlier_run_is_read_and_reported(archive, name, done, asked, tmp_pat
     simulated = record.history.population[chosen.episode, chosen.row]
     np.testing.assert_array_equal(simulated, chosen.design)
     assert command("report", folder, "--no-replay") == 0
-    assert f"{done} of {asked} episodes" in (folder / "report.html").read_text()
+    assert f"{done} of {episodes} episodes" in (folder / "report.html").read_text()
 
 
 def test_an_earlier_run_is_evaluated_and_goes_on(tmp_path, capsys):
@@ -225,9 +225,9 @@ def test_an_earlier_run_is_evaluated_and_goes_on(tmp_path, capsys):
     before = (folder / "trials.csv").read_text()
     assert command("evaluate", "--run", folder, "--trials", "2") == 0
     # By the scene that the run keeps: the files of tests/data may change.
-    asked = ["--scene", folder / "scene.toml", "--engine", "mujoco", "--particles", "4"]
-    asked += ["--trials", "2", "--test-trials", "2", "--seed", "3", "--episodes", "4"]
-    assert command("optimize", *asked, "--out", folder) == 0
+    arguments = ["--scene", folder / "scene.toml", "--engine", "mujoco", "--particles", "4"]
+    arguments += ["--trials", "2", "--test-trials", "2", "--seed", "3", "--episodes", "4"]
+    assert command("optimize", *arguments, "--out", folder) == 0
     assert "resuming episode 4/4" in capsys.readouterr().out
     assert (folder / "trials.csv").read_text().startswith(before)
     assert command("evaluate", "--run", folder, "--trials", "2") == 0

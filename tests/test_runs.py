@@ -102,8 +102,8 @@ def test_the_planned_test_is_the_one_that_is_simulated(preset, episodes, finalis
 
     @jax.jit
     def episode(state, mask):
-        asked = plan.optimizer.ask(state, mask)
-        return plan.optimizer.tell(state, asked, jnp.arange(8.0), mask)[0]
+        population = plan.optimizer.ask(state, mask)
+        return plan.optimizer.tell(state, population, jnp.arange(8.0), mask)[0]
 
     for mask in plan.mask:
         state = episode(state, mask)

@@ -186,8 +186,8 @@ def test_any_number_of_threads_gives_the_same_bits(handler, pool, threads, block
     np.testing.assert_array_equal(out, alone)
     # Ten rounds of a map that doubles differences; a few roundings of 6e-8 in each.
     np.testing.assert_allclose(out, kernels.expected(x, table), atol=2**10 * 4 * 6e-8)
-    wanted = max(min(threads, blocks) - 1, 0)
-    assert xla.scheduled == (min(wanted, 2) if pool == "refused" else wanted)
+    tasks = max(min(threads, blocks) - 1, 0)
+    assert xla.scheduled == (min(tasks, 2) if pool == "refused" else tasks)
     assert len(xla.destroyed) == len(xla.errors)
     xla.run_late()
     np.testing.assert_array_equal(out, alone)
@@ -260,10 +260,10 @@ def test_kept_code_runs_in_another_process_on_several_devices(folder):
         patch.setattr(handlers, "register", lambda *_: None)
         jax.jit(kernels.run).lower(x, table)
     assert list(folder.rglob("*.kept"))
-    here = {**os.environ, "PYTHONPATH": os.pathsep.join([".", *sys.path])}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([".", *sys.path])}
     done = subprocess.run(
         [sys.executable, "-c", DEVICES, str(folder)],
-        env=here,
+        env=environment,
         cwd=Path(__file__).parent.parent,
         capture_output=True,
         text=True,

@@ -239,8 +239,8 @@ def test_silicones_lie_within_their_measurements():
         # Crosshead strain is too large, so that its modulus is the lowest of all.
         assert s.crosshead_modulus < min(s.shear_modulus, s.sheet_modulus)
         if "geometric" in s.source:
-            wanted = np.sqrt(s.crosshead_modulus * s.sheet_modulus)
-            assert s.shear_modulus == pytest.approx(wanted, rel=0.005)  # three digits
+            expected = np.sqrt(s.crosshead_modulus * s.sheet_modulus)
+            assert s.shear_modulus == pytest.approx(expected, rel=0.005)  # three digits
             np.testing.assert_allclose(
                 s.interval, [s.crosshead_modulus, s.sheet_modulus], rtol=3e-3
             )
@@ -281,8 +281,10 @@ def test_signs_of_an_editor_are_read_in_numbers_and_kept_in_names():
 def test_centimetres_are_guessed_where_nothing_nearer_explains_a_length(
     value, unit, low, high, guess
 ):
-    told = schema.range_problem("size", value, unit, low, high)
-    assert told and (told.endswith(f"did you mean {guess}") if guess else "mean" not in told)
+    problem = schema.range_problem("size", value, unit, low, high)
+    assert problem and (
+        problem.endswith(f"did you mean {guess}") if guess else "mean" not in problem
+    )
 
 
 @pytest.mark.parametrize("pair", WRONG_PATHS)
@@ -398,16 +400,16 @@ def test_a_wrong_hand_file(tmp_path, old, new, expected):
 
 
 def test_sections_at_the_tips_are_for_tapered_fingers():
-    def told(hand_name, changes):
+    def problem_of(hand_name, changes):
         with pytest.raises(schema.InputError) as error:
             scene.load("paper", hand_name=hand_name, overrides=changes)
         return " ".join(error.value.problems)
 
-    missing = told("pneuflex4", {"hand.section.tapered": True})
+    missing = problem_of("pneuflex4", {"hand.section.tapered": True})
     assert "parameter 'tip_wall' must be given once, not 0 times" in missing
-    needless = told("tapered4", {"hand.section.tapered": False})
+    needless = problem_of("tapered4", {"hand.section.tapered": False})
     assert "parameter 'tip_width' needs section.tapered = true" in needless
-    thick = told("tapered4", {"hand.parameter.tip_height.low": 7})
+    thick = problem_of("tapered4", {"hand.parameter.tip_height.low": 7})
     assert "a tip_height of 0.007 m leaves no air chamber between walls of 0.004 m" in thick
 
 

@@ -213,8 +213,8 @@ def test_a_landscape_is_over_any_numbers(words, names, varied):
     for i, j in np.ndindex(2, 2):
         values = {n: axis.values[k] for n, axis, k in zip(names, pair, (i, j), strict=True)}
         for k, name in enumerate(case.space.names):
-            wanted = values.get(name, case.space.in_units(case.design)[k])
-            assert case.space.in_units(made.designs[2 * i + j])[k] == pytest.approx(wanted)
+            expected = values.get(name, case.space.in_units(case.design)[k])
+            assert case.space.in_units(made.designs[2 * i + j])[k] == pytest.approx(expected)
         if made.numbers is None:
             continue
         numbers = {n: float(values[n]) for n in varied}
@@ -224,10 +224,10 @@ def test_a_landscape_is_over_any_numbers(words, names, varied):
             for n, v in numbers.items()
             for k in range(count)
         }
-        wanted = scenes.load(TINY, overrides=numbers)
+        expected_scene = scenes.load(TINY, overrides=numbers)
         point_scene = jax.tree.unflatten(tree, made.numbers[2 * i + j].tolist())
         np.testing.assert_allclose(
-            jax.tree.leaves(point_scene), jax.tree.leaves(wanted), rtol=1e-12
+            jax.tree.leaves(point_scene), jax.tree.leaves(expected_scene), rtol=1e-12
         )
 
 

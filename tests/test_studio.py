@@ -55,7 +55,7 @@ def guarded():
         yield guard.token, listening.socket.getsockname()[1]
 
 
-def asked(port, path, method="GET", **headers):
+def get(port, path, method="GET", **headers):
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
     with contextlib.closing(connection):
         connection.putrequest(method, path, skip_host=True)  # and no check of the path
@@ -68,7 +68,7 @@ def asked(port, path, method="GET", **headers):
 
 def test_a_page_is_served_by_its_token(guarded):
     token, port = guarded
-    answer, text = asked(port, f"/?token={token}")
+    answer, text = get(port, f"/?token={token}")
     assert (answer.status, text) == (200, PAGE)
     # By openssl: printf '1 < 2' | openssl dgst -sha256 -binary | base64
     digest = "'sha256-T8Xibs7zV8KTQdRXjpKJTlizX17SudRlddrZKaeFg9E='"
@@ -76,7 +76,7 @@ def test_a_page_is_served_by_its_token(guarded):
     cookie = answer.headers["Set-Cookie"]
     assert "HttpOnly" in cookie and "SameSite=Strict" in cookie
     assert "Path" not in cookie, "behind a proxy it is sent to this page's path alone"
-    assert asked(port, "/", Cookie=cookie.split(";")[0])[0].status == 200
+    assert get(port, "/", Cookie=cookie.split(";")[0])[0].status == 200
     for path, headers in (
         ("/", {}),
         (f"/?token={token[:-1]}", {}),
@@ -85,13 +85,13 @@ def test_a_page_is_served_by_its_token(guarded):
         (f"/?token={token}", {"Host": f"localhost:{port}@stranger.example"}),
         (f"/?token={token}", {"Host": "localhost:x"}),
     ):
-        answer, text = asked(port, path, **headers)
+        answer, text = get(port, path, **headers)
         assert answer.status == 403 and PAGE not in text
         assert "Set-Cookie" not in answer.headers
         if "Host" in headers:
             assert f"ssh -L {port}:localhost:{port} HOST" in text, "what to do"
     for path in ("/../etc/passwd", "/user/me/proxy/8791/"):
-        answer, text = asked(port, f"{path}?token={token}")
+        answer, text = get(port, f"{path}?token={token}")
         assert answer.status == 404 and f"ssh -L {port}" in text
 
 
@@ -100,7 +100,7 @@ def test_a_tunnel_may_have_another_port(guarded):
     token, port = guarded
     hosts = {"localhost:9000": 9000, "127.0.0.1:1": 1, "[::1]:65535": 65535, "LOCALHOST": 80}
     for host, cookie_port in hosts.items():
-        answer, _ = asked(port, f"/?token={token}", Host=host)
+        answer, _ = get(port, f"/?token={token}", Host=host)
         cookie = answer.headers["Set-Cookie"].split(";")[0]
         assert (answer.status, cookie) == (200, f"codesign-studio-{cookie_port}={token}")
         opening = {"Connection": "Upgrade", "Upgrade": "websocket", "Host": host}
@@ -113,13 +113,13 @@ def test_a_tunnel_may_have_another_port(guarded):
             (f"{host}", 403),
         ):
             given = opening | {"Cookie": cookie, "Origin": origin}
-            assert asked(port, "/socket", **given)[0].status == status
+            assert get(port, "/socket", **given)[0].status == status
 
 
 def test_odd_requests_are_refused_and_do_not_fail(guarded):
     token, port = guarded
     for method in ("HEAD", "POST", "PUT", "OPTIONS", "TRACE", "get"):
-        answer, text = asked(port, f"/?token={token}", method)
+        answer, text = get(port, f"/?token={token}", method)
         assert (answer.status, answer.headers["Allow"], text) == (405, "GET", "")
     for path in (
         f"//[::1?token={token}",
@@ -129,7 +129,7 @@ def test_odd_requests_are_refused_and_do_not_fail(guarded):
         "//",
         "/socket/",
     ):
-        assert asked(port, path)[0].status == 404
+        assert get(port, path)[0].status == 404
     for query in (
         "token=%ff",
         "token=%00",
@@ -138,9 +138,9 @@ def test_odd_requests_are_refused_and_do_not_fail(guarded):
         "&" * 2000,
         "token=%ED%A0%80",
     ):
-        assert asked(port, f"/?{query}")[0].status == 403
+        assert get(port, f"/?{query}")[0].status == 403
     for cookie in (f"codesign-studio-{port}=\xff".encode("latin-1"), b"\xff=\xff", b'a="', b";;;="):
-        assert asked(port, "/", Cookie=cookie)[0].status == 403
+        assert get(port, "/", Cookie=cookie)[0].status == 403
 
 
 def test_a_stranger_s_page_opens_no_socket(guarded):
@@ -204,8 +204,8 @@ def desk(tmp_path_factory):
 def test_a_tab_shows_judges_improves_and_saves(desk, capsys, monkeypatch):
     """The verdict is that of `codesign evaluate`; a design of the run is the one in its record."""
     tab = Tab(desk)
-    told = about(desk)
-    assert told["groups"] == [
+    description = about(desk)
+    assert description["groups"] == [
         {"title": "Hand", "members": [0]},
         {"title": "Control", "members": [1]},
     ]
@@ -386,8 +386,8 @@ def test_one_command_runs_at_a_time(desk, monkeypatch, tmp_path):
     assert printed == "exported: it"
     design = place / "design-1.toml"
     folder = place / "export-1"
-    wanted = ["codesign", "export", "--design", design, "--engine", "mujoco", "--out", folder]
-    assert shlex.split(line) == [str(word) for word in wanted]
+    expected = ["codesign", "export", "--design", design, "--engine", "mujoco", "--out", folder]
+    assert shlex.split(line) == [str(word) for word in expected]
     python = [sys.executable, "-P", "-m", "codesign_jax.cli"]
     assert children.lines == [[*python, *shlex.split(line)[1:]]]
     for action in ("export", "export", "report"):
@@ -414,12 +414,12 @@ def test_a_command_imports_nothing_of_the_working_directory(workplace, monkeypat
     monkeypatch.setenv("PYTHONPATH", str(Path(codesign_jax.__file__).parents[1]))
     for name in ("rich", "tyro", "colorsys", "codesign_jax"):
         (workplace / f"{name}.py").write_text("open('RAN', 'w')\nraise SystemExit('it ran')")
-    told = []
-    process.start(["--version"], told.append)
-    until(lambda: len(told) == 2)
+    lines = []
+    process.start(["--version"], lines.append)
+    until(lambda: len(lines) == 2)
     until(lambda: not process.under_way())
-    assert told[0] == f"codesign --version{process.RUNNING}"
-    assert importlib.metadata.version("codesign-jax") in told[1]
+    assert lines[0] == f"codesign --version{process.RUNNING}"
+    assert importlib.metadata.version("codesign-jax") in lines[1]
     assert not (workplace / "RAN").exists()
 
 
@@ -431,7 +431,7 @@ def test_the_page_is_served_while_the_simulation_is_compiled(desk, monkeypatch, 
         """Stands in for the compiler: meanwhile somebody opens the printed address."""
         [address] = re.findall(r"http:\S+", capsys.readouterr().out)
         port, token = re.search(r":(\d+)/\?token=(\S+)", address).groups()
-        answer, _ = asked(int(port), f"/?token={token}")
+        answer, _ = get(int(port), f"/?token={token}")
         cookie = {"Cookie": answer.headers["Set-Cookie"].split(";")[0]}
         url = f"127.0.0.1:{port}"
         with connect(f"ws://{url}/socket", origin=f"http://{url}", additional_headers=cookie) as s:

@@ -126,7 +126,7 @@ OWN = [*RUN, "--optimizer", "mine:Climber", "--cost", "mine:low"]
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
+def workdir(tmp_path, monkeypatch):
     """A working directory with a module of the user's."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delitem(sys.modules, "mine", raising=False)
@@ -139,20 +139,20 @@ def here(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow  # 16 s; quick: test_resume
-def test_a_run_of_ones_own_code_goes_on_bit_for_bit(here, capsys):
+def test_a_run_of_ones_own_code_goes_on_bit_for_bit(workdir, capsys):
     for episodes, folder in (("2", "whole"), ("1", "grown"), ("2", "grown")):
         assert cli.main([*OWN, "--episodes", episodes, "--out", folder]) == 0
-    assert_same_run(here / "grown", here / "whole")
+    assert_same_run(workdir / "grown", workdir / "whole")
     said = capsys.readouterr().out
     assert "lowest mean cost of an episode, by mine:low" in said and "converged from" not in said
-    assert (here / "grown" / "code" / "mine.py").read_text() == MINE
-    noted = json.loads((here / "grown" / "provenance.json").read_text())
+    assert (workdir / "grown" / "code" / "mine.py").read_text() == MINE
+    noted = json.loads((workdir / "grown" / "provenance.json").read_text())
     assert [noted["settings"][name] for name in ("optimizer", "cost")] == OWN[-3::2]
-    record = runs.load_record(here / "grown")
+    record = runs.load_record(workdir / "grown")
     assert record is not None and np.ptp(record.history.outcomes.cost[1]) > 0.01
 
 
-def test_a_cost_of_forces_asks_for_them_of_an_engine_that_has_them(here, capsys):
+def test_a_cost_of_forces_asks_for_them_of_an_engine_that_has_them(workdir, capsys):
     assert cli.main([*RUN, "--cost", "mine:gripped", "--out", "run"]) == 2
     assert "engine mujoco records no forces" in capsys.readouterr().err
     assert cli.main([*RUN, "--cost", "mine:unrecorded", "--out", "run"]) == 2
@@ -160,19 +160,19 @@ def test_a_cost_of_forces_asks_for_them_of_an_engine_that_has_them(here, capsys)
 
 
 @pytest.mark.slow  # a kernel; quick: forces are recorded (test_forces), and the refusals above
-def test_a_cost_reads_forces_if_it_asks_for_them(here):
+def test_a_cost_reads_forces_if_it_asks_for_them(workdir):
     sizes = ["--particles", "2", "--trials", "1", "--test-trials", "0", "--reference-trials", "0"]
     run = ["optimize", "--scene", str(TINY), *sizes, "--cost", "mine:gripped", "--out", "run"]
     assert cli.main([*run, "--optimizer", "random", "--episodes", "2", "--seed", "3"]) == 0
-    record = runs.load_record(here / "run")
+    record = runs.load_record(workdir / "run")
     costs = np.asarray(record.history.outcomes.cost)
     assert (costs >= 1).all() and (costs <= 2).all() and (costs < 2).any()
 
 
-def test_changed_code_is_refused_with_what_changed(here, capsys):
+def test_changed_code_is_refused_with_what_changed(workdir, capsys):
     assert cli.main([*OWN, "--episodes", "1", "--out", "run"]) == 0
-    before = snapshot(here / "run")
-    (here / "mine.py").write_text(MINE.replace("0.2 - trace", "0.3 - trace"))
+    before = snapshot(workdir / "run")
+    (workdir / "mine.py").write_text(MINE.replace("0.2 - trace", "0.3 - trace"))
     sys.modules.pop("mine")  # as in another process
     assert cli.main([*OWN, "--episodes", "2", "--out", "run"]) == 2
     said = capsys.readouterr().err
@@ -181,21 +181,21 @@ def test_changed_code_is_refused_with_what_changed(here, capsys):
     assert cli.main([*OWN[:-1], "mine:until_lost", "--out", "run"]) == 2
     assert "--cost: the run has mine:low, asked for is mine:until_lost" in capsys.readouterr().err
     # What is the run's is not imported for whoever reads it, or asks for nothing.
-    (here / "mine.py").unlink()
+    (workdir / "mine.py").unlink()
     sys.modules.pop("mine")
     assert cli.main([*RUN, "--out", "run"]) == 2
     assert "mine" not in sys.modules
-    assert runs.load_record(here / "run") is not None
-    assert snapshot(here / "run") == before
+    assert runs.load_record(workdir / "run") is not None
+    assert snapshot(workdir / "run") == before
 
 
 @pytest.mark.slow  # 29 s; quick: test_docs runs optimize --policy
-def test_a_policy_is_searched_and_said_wherever_it_acts(here, capsys):
+def test_a_policy_is_searched_and_said_wherever_it_acts(workdir, capsys):
     """Its parameter is one of the design's; no command simulates its designs without it."""
     run = [*RUN, "--policy", "mine:Pull", "--optimizer", "random", "--episodes", "1"]
     assert cli.main([*run, "--out", "run"]) == 0
     assert "share" in capsys.readouterr().out
-    the_scene, settings = runs.read_run(here / "run")
+    the_scene, settings = runs.read_run(workdir / "run")
     assert settings.policy == "mine:Pull" and the_scene.control.parameter[0].name == "share"
     trials = ["--trials", "2", "--run", "run"]
     assert cli.main(["evaluate", *trials]) == 2
@@ -205,9 +205,15 @@ def test_a_policy_is_searched_and_said_wherever_it_acts(here, capsys):
         design = ["--scene", str(TINY), "--engine", "mujoco", "--design", f"share={share}"]
         table = ["--out", f"{share}.csv"]
         cli.main(["evaluate", "--policy", "mine:Pull", *design, "--trials", "2", *table])
-        kept.append((here / f"{share}.csv").read_text())
+        kept.append((workdir / f"{share}.csv").read_text())
     assert kept[0] != kept[1]
-    pair = ["compare", "run", str(shutil.copytree(here / "run", here / "copy")), "--trials", "2"]
+    pair = [
+        "compare",
+        "run",
+        str(shutil.copytree(workdir / "run", workdir / "copy")),
+        "--trials",
+        "2",
+    ]
     assert cli.main(pair) == 2
     assert "the run was made with --policy mine:Pull" in capsys.readouterr().err
     assert cli.main([*pair, "--policy", "mine:Pull", "mine:Narrow"]) == 2
@@ -218,8 +224,8 @@ def test_a_policy_is_searched_and_said_wherever_it_acts(here, capsys):
     assert "run with mine:Pull keeps " in said and "without keeps " in said
     assert "policy mine:Pull left the key frames in 2 of 2 grasps" in said
     assert "of the same 2 trials" in said
-    (here / "a.toml").write_text(f'preset = "2d"\nscene = "{TINY}"\n[design]\nlength = 44\n')
-    (here / "b.toml").write_text(f'preset = "2d"\nscene = "{TINY}"\n[design]\nlength = 100\n')
+    (workdir / "a.toml").write_text(f'preset = "2d"\nscene = "{TINY}"\n[design]\nlength = 44\n')
+    (workdir / "b.toml").write_text(f'preset = "2d"\nscene = "{TINY}"\n[design]\nlength = 100\n')
     files = ["compare", "a.toml", "b.toml", "--engine", "mujoco", "--trials", "2"]
     assert cli.main(files) == 0
     said = capsys.readouterr().out
@@ -228,7 +234,7 @@ def test_a_policy_is_searched_and_said_wherever_it_acts(here, capsys):
     assert first is other  # its programs are compiled once
 
 
-def test_a_dry_run_tells_of_a_policy_that_commands_kilopascals(here, capsys):
+def test_a_dry_run_tells_of_a_policy_that_commands_kilopascals(workdir, capsys):
     """It is asked over the whole grasp, most of which begins with empty chambers."""
     dry = ["evaluate", "--scene", str(TINY), "--engine", "mujoco", "--dry-run", "--policy"]
     assert cli.main([*dry, "mine:Pull"]) == 0
@@ -255,12 +261,12 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("asked", WRONG)
-def test_what_is_wrong_is_said_before_anything_is_created(asked, here, capsys):
-    (here / "broken.py").write_text("1 / 0\n")
-    before = snapshot(here)
-    assert cli.main([*RUN, *asked.split(), "--episodes", "1", "--out", "run"]) == 2
+@pytest.mark.parametrize("flags", WRONG)
+def test_what_is_wrong_is_said_before_anything_is_created(flags, workdir, capsys):
+    (workdir / "broken.py").write_text("1 / 0\n")
+    before = snapshot(workdir)
+    assert cli.main([*RUN, *flags.split(), "--episodes", "1", "--out", "run"]) == 2
     said = capsys.readouterr().err
-    assert said.startswith(f"error: {asked.split()[0]}") and WRONG[asked] in said, said
+    assert said.startswith(f"error: {flags.split()[0]}") and WRONG[flags] in said, said
     sys.modules.pop("broken", None)
-    assert {k: v for k, v in snapshot(here).items() if "__pycache__" not in str(k)} == before
+    assert {k: v for k, v in snapshot(workdir).items() if "__pycache__" not in str(k)} == before

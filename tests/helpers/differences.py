@@ -153,16 +153,16 @@ class Case:
         random = np.random.default_rng(0)
         directions = []
         for k, name in self.groups:
-            here = self.world(self.tables[k])
+            numbers = self.world(self.tables[k])
             rows = self.rows(k, name)
-            along = np.zeros_like(here)
-            noise = random.normal(size=here.shape)
-            size = {2: 0.1, 3: 0.1, 4: 0.01, 5: np.abs(here).max()}.get(k)
-            along[rows] = noise[rows] * (np.abs(here[rows]) if size is None else size)
+            along = np.zeros_like(numbers)
+            noise = random.normal(size=numbers.shape)
+            size = {2: 0.1, 3: 0.1, 4: 0.01, 5: np.abs(numbers).max()}.get(k)
+            along[rows] = noise[rows] * (np.abs(numbers[rows]) if size is None else size)
             if name == f"held.{FINGERS}":
                 along = self._opposite(along)
             if name == "quat":  # it stays one
-                along[rows] -= here[rows] * (here[rows] * along[rows]).sum()
+                along[rows] -= numbers[rows] * (numbers[rows] * along[rows]).sum()
             directions.append(along)
         return directions
 

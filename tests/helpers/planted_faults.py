@@ -126,7 +126,7 @@ class Planted:
 
         return call
 
-    def wanted(self) -> set[tuple[str, str]]:
+    def expected_stages(self) -> set[tuple[str, str]]:
         """What `used` has once the kernel was traced, if it has all stages of the faults."""
         return {
             (name, stage)
@@ -158,7 +158,7 @@ def planted(faults: Mapping[str, Fault]) -> Iterator[Planted]:
         patch.setattr(program, "of_code", lambda _: None)
         patch.setattr(reuse, "kept", lambda path, build: build())
         yield fault
-    missing = fault.wanted() - fault.used
+    missing = fault.expected_stages() - fault.used
     assert not missing, f"stages that the kernel has no more: {missing}"
 
 

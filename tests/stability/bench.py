@@ -146,12 +146,14 @@ class Bench:
             rows = []
             data.qpos[:] = qpos[w]
             data.qvel[:] = qvel[w]
-            thing = compiled.body_mass[-1], compiled.body_inertia[-1].copy()
+            properties = compiled.body_mass[-1], compiled.body_inertia[-1].copy()
             for k, u in enumerate(ctrl[w]):
                 if masses is not None and k % CHUNK == 0:
                     factor = masses[k // CHUNK]
-                    compiled.body_mass[-1], compiled.body_inertia[-1] = (factor * v for v in thing)
-                    compiled.dof_M0[-6:-3], compiled.dof_M0[-3:] = (factor * v for v in thing)
+                    compiled.body_mass[-1], compiled.body_inertia[-1] = (
+                        factor * v for v in properties
+                    )
+                    compiled.dof_M0[-6:-3], compiled.dof_M0[-3:] = (factor * v for v in properties)
                 data.ctrl[:] = u
                 oracles.soften(self.scene, grasps.nth(fields, w), data)
                 mujoco.mj_step(compiled, data)

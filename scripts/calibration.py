@@ -162,19 +162,14 @@ def own_set(the_scene: Scene) -> np.ndarray:
     return np.array([(scaled[k](constants[k]) - a) / (b - a) for k, (a, b) in ends.items()])
 
 
-def numbers(the_scene: Scene, chosen: Mapping[str, np.ndarray]) -> Scene:
-    """The scene with the numbers of sets in it: leaves of shape () or (set,)."""
-    if any(f.base is None for f in the_scene.hand.finger):
-        raise InputError(["calibration moves base points; give each finger a base"])
-    c = the_scene
-    v = chosen
+def _hand_of_sets(hand: Hand, v: Mapping[str, np.ndarray]) -> Hand:
+    """The hand with the numbers of sets."""
     x = 1e-3 * v["base_x"]
     y = 0.5e-3 * v["pair_gap"]
-    hand = c.hand
-    wrist = c.hand.wrist
+    wrist = hand.wrist
     linear = v["wrist_linear"]
     angular = v["wrist_angular"]
-    hand = replace(
+    return replace(
         hand,
         finger=tuple(
             replace(f, tilt=v["tilt"], base=(right * x, front * y))
@@ -195,6 +190,14 @@ def numbers(the_scene: Scene, chosen: Mapping[str, np.ndarray]) -> Scene:
             angular_damping=wrist.angular_damping * np.sqrt(angular / wrist.angular_stiffness),
         ),
     )
+
+
+def numbers(the_scene: Scene, chosen: Mapping[str, np.ndarray]) -> Scene:
+    """The scene with the numbers of sets in it: leaves of shape () or (set,)."""
+    if any(f.base is None for f in the_scene.hand.finger):
+        raise InputError(["calibration moves base points; give each finger a base"])
+    c = the_scene
+    v = chosen
     factor = 1e-3 * v["half_size"] / c.objects.object[0].half_sizes[0]
     shapes = tuple(
         replace(
@@ -208,7 +211,7 @@ def numbers(the_scene: Scene, chosen: Mapping[str, np.ndarray]) -> Scene:
     table = replace(c.objects.table, friction=v["table_friction"])
     c = replace(
         c,
-        hand=hand,
+        hand=_hand_of_sets(c.hand, v),
         objects=replace(c.objects, object=shapes, table=table),
         arm=replace(
             c.arm,

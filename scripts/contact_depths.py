@@ -170,18 +170,8 @@ def surface(shape: Any, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return edges.reshape(-1, 3), np.asarray(mesh.subdivide_to_size(0.005).vertices)
 
 
-def measured(
-    scene: Scene, params: Any, trial: Any, qpos: np.ndarray, recorded: dict[str, np.ndarray]
-) -> dict[str, float]:
-    """Depths [mm], durations [s], and bending while held, of a grasp in states (state, nq).
-
-    Args:
-      recorded: Depths of `types.Forces` in these states [m], by kind of contact, (state,) each.
-    """
-    h = scene.discretization.timestep
-    lay = model.layout(scene)
-    palm = scene.hand.palm
-    compiled = model.compile_model(scene, params, trial)
+def poses(compiled: mujoco.MjModel, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places (state, body, 3) and orientations (state, body, 3, 3) of bodies, by MuJoCo C."""
     data = mujoco.MjData(compiled)
     place = []
     turn = []
@@ -190,21 +180,30 @@ def measured(
         mujoco.mj_kinematics(compiled, data)
         place.append(data.xpos.copy())
         turn.append(data.xmat.reshape(-1, 3, 3).copy())
-    place = np.stack(place)
-    turn = np.stack(turn)
-    shape = scene.objects.object[int(trial.shape)]
-    size = float(trial.size) * np.array(shape.half_sizes)
+    return np.stack(place), np.stack(turn)
+
+
+def surface_depths(
+    scene: Scene,
+    tubes: list[Tube],
+    place: np.ndarray,
+    turn: np.ndarray,
+    solid: tuple[str, np.ndarray, np.ndarray],
+) -> dict[str, np.ndarray]:
+    """Depths of fingers' surfaces [m], one as a share of a finger, by kind of contact, (state,).
+
+    Args:
+      solid: The object's type, its half sizes, and points of its edges, (state, point, 3).
+    """
+    kind, size, edges = solid
+    lay = model.layout(scene)
+    palm = scene.hand.palm
     centre = place[:, lay.object]
     frame = turn[:, lay.object]
-    edges, skin = (centre[:, None] + v @ frame.swapaxes(-1, -2) for v in surface(shape, size))
-    tubes = []
-    for f, bodies in enumerate(lay.bodies):
-        sizes = float(params.length[f]), scene.hand.section.width, float(params.height[f])
-        tubes.append(tube(place[:, bodies], turn[:, [lay.stubs[f], *bodies]], sizes))
-    surface_series = {n: np.zeros(len(qpos)) for n in ("self", "finger", "share", "palm", "object")}
+    depths = {n: np.zeros(len(place)) for n in ("self", "finger", "share", "palm", "object")}
 
     def deeper(name: str, depth: np.ndarray) -> None:
-        surface_series[name] = np.maximum(surface_series[name], depth)
+        depths[name] = np.maximum(depths[name], depth)
 
     for f, finger_tube in enumerate(tubes):
         least = max(ARC[0] * finger_tube.segment, ARC[1] * 2 * finger_tube.half[2])
@@ -217,12 +216,38 @@ def measured(
         free &= beyond_base(finger_tube.place, 2 * finger_tube.half[2])
         if free.any():
             deeper("palm", in_disc(palm, place[:, 1], turn[:, 1], finger_tube.rings[:, free]))
-        points = finger_tube.rings.reshape(len(qpos), -1, 3) - centre[:, None]
-        deeper("object", in_object(shape.type, size, points @ frame))
+        points = finger_tube.rings.reshape(len(place), -1, 3) - centre[:, None]
+        deeper("object", in_object(kind, size, points @ frame))
         deeper("object", in_tube(edges[:, :, None], finger_tube))
+    return depths
+
+
+def measured(
+    scene: Scene, params: Any, trial: Any, qpos: np.ndarray, recorded: dict[str, np.ndarray]
+) -> dict[str, float]:
+    """Depths [mm], durations [s], and bending while held, of a grasp in states (state, nq).
+
+    Args:
+      recorded: Depths of `types.Forces` in these states [m], by kind of contact, (state,) each.
+    """
+    h = scene.discretization.timestep
+    lay = model.layout(scene)
+    place, turn = poses(model.compile_model(scene, params, trial), qpos)
+    shape = scene.objects.object[int(trial.shape)]
+    size = float(trial.size) * np.array(shape.half_sizes)
+    centre = place[:, lay.object]
+    frame = turn[:, lay.object]
+    edges, skin = (centre[:, None] + v @ frame.swapaxes(-1, -2) for v in surface(shape, size))
+    tubes = []
+    for f, bodies in enumerate(lay.bodies):
+        sizes = float(params.length[f]), scene.hand.section.width, float(params.height[f])
+        tubes.append(tube(place[:, bodies], turn[:, [lay.stubs[f], *bodies]], sizes))
+    surface_series = surface_depths(scene, tubes, place, turn, (shape.type, size, edges))
     first, begin, end = (int(scene.last_step(p)) for p in ("approach", "inflate", "disturb"))
     hold = slice(begin - first, end - first)
-    surface_series["object_palm"] = in_disc(palm, place[:, 1], turn[:, 1], skin[:, :, None])
+    surface_series["object_palm"] = in_disc(
+        scene.hand.palm, place[:, 1], turn[:, 1], skin[:, :, None]
+    )
     none = np.zeros(len(qpos))
     series = {name: recorded.get(kind, none) for name, kind in RINGS.items()}
     hinges = lay.dofs[..., 0]  # hinges that bend

@@ -159,23 +159,36 @@ def _mechanical(scene: Scene, lowered: float, printed: Printed | None) -> str:
     )
 
 
-def _order(
-    scene: Scene,
-    params: Params,
-    sizes: Sequence[Size],
-    process: Process,
-    printed: Printed | None,
-) -> SheetSection:
+# Steps that are the same for every hand.
+_MOUNTING = (
+    "Seats: thread the tube through the seat's hole and out at the top. Lay the root in the "
+    "pocket, fabric towards the palm's middle, its base flush with the lower edge. Fold the "
+    "flap up behind the root and over the back wall, lay the bar on it, and drive both screws "
+    "through the fabric until the bar sits on the seat's rim. Cut the flap.",
+    "Palm: ballast as in 'What to print'; screws from below into the wrist; groove towards "
+    "the arm frame's x.",
+    "Arm: set its tool centre point to the middle of the palm's underside. z = 0 is where that "
+    "lies on the table with the wrist undeflected; x = y = 0 is the object's place. Turn by "
+    "+20° of roll, yaw and pitch, each alone, and compare with the drawing before anything "
+    "else moves.",
+    "Valves: finger 0 on channel 0 and so on. First play the pressures alone, with the hand in "
+    "the air: python play_hand.py --no-arm --valves PORT. Then drive the arm by its own slow "
+    "move to the first row of commands_still.csv, and play it without pressure and without an "
+    "object: python play_hand.py --no-valves --arm HOST:PORT --slow 4. Then both without an "
+    "object, at last with one, and only then at full speed: python play_hand.py --valves PORT "
+    "--arm HOST:PORT. Nobody within the arm's reach, goggles on, a hand on the emergency stop.",
+)
+
+
+def _casting_steps(scene: Scene, tests: str, *, pinned: bool) -> tuple[str, ...]:
+    """Steps that make one finger; `tests`: the highest pressure of each."""
     named = shopping.worked(scene)
-    highest = valves.key_pressures(scene, params)[:, 1:].max(0)
-    tests = ", ".join(f"finger {i} {p:.0f} kPa" for i, p in enumerate(highest))
-    pinned = any(inlet(size, process) for size in sizes)
     pin = (
         " Grease the pin and push it through the tray's end wall into the core."
         if pinned
         else " There is no pin for the inlet: pierce the root after casting."
     )
-    steps = (
+    return (
         "Print the parts; fit each core on its tray dry, it must sit without force. Wipe the "
         "moulds with release agent for silicone (optional on PLA) and let it dry.",
         "Mix as in 'Silicone by casting', stir for 3 min, scraping the sides, draw air out for 3 "
@@ -200,25 +213,23 @@ def _order(
         "Bend test: lay the finger on its side, raise the pressure slowly to the design's, and "
         "compare the angle of the tip with 'free bend'. Write pressures and angles into a file and "
         "fit the silicone: codesign finger FILE.csv --fit (docs/measurements.md).",
-        "Seats: thread the tube through the seat's hole and out at the top. Lay the root in the "
-        "pocket, fabric towards the palm's middle, its base flush with the lower edge. Fold the "
-        "flap up behind the root and over the back wall, lay the bar on it, and drive both screws "
-        "through the fabric until the bar sits on the seat's rim. Cut the flap.",
-        "Palm: ballast as in 'What to print'; screws from below into the wrist; groove towards "
-        "the arm frame's x.",
-        "Arm: set its tool centre point to the middle of the palm's underside. z = 0 is where that "
-        "lies on the table with the wrist undeflected; x = y = 0 is the object's place. Turn by "
-        "+20° of roll, yaw and pitch, each alone, and compare with the drawing before anything "
-        "else moves.",
-        "Valves: finger 0 on channel 0 and so on. First play the pressures alone, with the hand in "
-        "the air: python play_hand.py --no-arm --valves PORT. Then drive the arm by its own slow "
-        "move to the first row of commands_still.csv, and play it without pressure and without an "
-        "object: python play_hand.py --no-valves --arm HOST:PORT --slow 4. Then both without an "
-        "object, at last with one, and only then at full speed: python play_hand.py --valves PORT "
-        "--arm HOST:PORT. Nobody within the arm's reach, goggles on, a hand on the emergency stop.",
     )
+
+
+def _order(
+    scene: Scene,
+    params: Params,
+    sizes: Sequence[Size],
+    process: Process,
+    printed: Printed | None,
+) -> SheetSection:
+    highest = valves.key_pressures(scene, params)[:, 1:].max(0)
+    tests = ", ".join(f"finger {i} {p:.0f} kPa" for i, p in enumerate(highest))
+    pinned = any(inlet(size, process) for size in sizes)
+    mounting = _MOUNTING
     if printed is None:
-        steps = steps[:8] + ("Fix each finger to a palm of your own (--no-parts).", *steps[9:])
+        mounting = ("Fix each finger to a palm of your own (--no-parts).", *mounting[1:])
+    steps = (*_casting_steps(scene, tests, pinned=pinned), *mounting)
     marks = f"[maker]: from {silicone.SOURCE}; [chosen]: ours. Moulds: the drawing of {NAME}.pdf."
     notes = [marks, *(f"{k}. {step}" for k, step in enumerate(steps, 1))]
     return SheetSection("Order of work", (), [], notes)

@@ -81,35 +81,13 @@ def mujoco_fields(scene: Scene, fields: ModelFields, numpy: Any = jnp) -> Mujoco
     def filled(name: str, *parts: tuple[Any, Any]) -> jax.Array:
         return _filled(numpy, getattr(template, name), dtype, *parts)
 
-    bodies = np.concatenate([lay.stubs[:, None], lay.bodies], 1)
-    palm = numbers.hand.palm
-    body = lay.object
     wrist, damping, armature = _dofs(numpy, scene, fields)
     gain = numpy.broadcast_to(fields.gain, lay.dofs.shape[:2])
     tapered = scene.hand.section.tapered
     geom_size, rbound, aabb = _geom_fields(numpy, scene, fields, filled)
     friction, solref, solimp = _pairs(numpy, numbers, dtype)
     return MujocoFields(
-        body_pos=filled("body_pos", (lay.stubs, fields.base), ((lay.bodies, 0), fields.offset)),
-        body_quat=filled("body_quat", (lay.stubs, fields.mount)),
-        body_ipos=filled(
-            "body_ipos",
-            ((bodies, 0), fields.centre[..., 0]),
-            ((bodies, 2), fields.centre[..., 1]),
-            ((1, 2), palm.thickness / 2),
-        ),
-        body_mass=filled(
-            "body_mass", (1, palm.mass), (bodies, fields.mass), (body, fields.object_mass)
-        ),
-        body_subtreemass=filled(
-            "body_subtreemass", *_subtree_mass(numpy, lay, palm, fields.mass, fields.object_mass)
-        ),
-        body_inertia=filled(
-            "body_inertia",
-            (bodies, fields.inertia),
-            (body, fields.object_inertia),
-            (1, numpy.stack(palm_inertia(numbers))),
-        ),
+        **_body_fields(numpy, lay, fields, filled),
         geom_pos=filled("geom_pos", *_sphere_positions(numpy, numbers, fields)),
         geom_size=geom_size,
         geom_rbound=rbound,
@@ -130,8 +108,6 @@ def mujoco_fields(scene: Scene, fields: ModelFields, numpy: Any = jnp) -> Mujoco
             ((slice(6, None), 0), gain[:, 0]),
         ),
         actuator_biasprm=filled("actuator_biasprm", ((slice(6), 1), -wrist)),
-        # Declared, not derived; see contact_invweight.  The world keeps zero.
-        body_invweight0=filled("body_invweight0", (slice(1, None), contact_invweight(numbers))),
         pair_friction=friction,
         pair_solref=solref,
         pair_solimp=solimp,
@@ -139,6 +115,40 @@ def mujoco_fields(scene: Scene, fields: ModelFields, numpy: Any = jnp) -> Mujoco
         impratio=friction_ratio(numbers, numbers.contact.friction_ratio),
         wrap_prm=(gain / gain[:, :1]).reshape(-1) if tapered else None,
         pair_margin=None if fields.on_palm is None else _margins(numpy, scene, fields.on_palm),
+    )
+
+
+def _body_fields(
+    numpy: Any, lay: Layout, fields: ModelFields, filled: Callable[..., jax.Array]
+) -> dict[str, jax.Array]:
+    """Places, masses and inertias of all bodies, by the names of MuJoCo's arrays."""
+    numbers = fields.constants
+    palm = numbers.hand.palm
+    body = lay.object
+    bodies = np.concatenate([lay.stubs[:, None], lay.bodies], 1)
+    return dict(
+        body_pos=filled("body_pos", (lay.stubs, fields.base), ((lay.bodies, 0), fields.offset)),
+        body_quat=filled("body_quat", (lay.stubs, fields.mount)),
+        body_ipos=filled(
+            "body_ipos",
+            ((bodies, 0), fields.centre[..., 0]),
+            ((bodies, 2), fields.centre[..., 1]),
+            ((1, 2), palm.thickness / 2),
+        ),
+        body_mass=filled(
+            "body_mass", (1, palm.mass), (bodies, fields.mass), (body, fields.object_mass)
+        ),
+        body_subtreemass=filled(
+            "body_subtreemass", *_subtree_mass(numpy, lay, palm, fields.mass, fields.object_mass)
+        ),
+        body_inertia=filled(
+            "body_inertia",
+            (bodies, fields.inertia),
+            (body, fields.object_inertia),
+            (1, numpy.stack(palm_inertia(numbers))),
+        ),
+        # Declared, not derived; see contact_invweight.  The world keeps zero.
+        body_invweight0=filled("body_invweight0", (slice(1, None), contact_invweight(numbers))),
     )
 
 

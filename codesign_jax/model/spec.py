@@ -238,31 +238,20 @@ def _add_finger(
             body.pos, body.quat = mount
         else:
             body.pos = [links.offset[f, i - 1], 0, 0]
-        extent = links.extent[f, i]
         body.explicitinertial = True
         body.mass = links.mass[f, i]
         body.ipos = [links.along[f, i], 0, up[i]]
         body.inertia = links.inertia[f, i]
         if visual and scene.effects.surface == "spheres":
-            kind = mujoco.mjtGeom.mjGEOM_BOX
-            half = [extent / 2, width[i] / 2, up[i]]
-            name = f"finger_{f}_block_{i}"
-            body.add_geom(
-                name=name, type=kind, size=half, pos=body.ipos, rgba=_COLORS["finger"], **_PASSIVE
-            )
+            half = [links.extent[f, i] / 2, width[i] / 2, up[i]]
+            _add_block(body, f"finger_{f}_block_{i}", half)
         if i == 0:
             continue
         for name in hinge_order(scene, i - 1):
             stiffness, joint_damping = (v[i - 1, lay.axes.index(name)] for v in springs)
             damping, armature = implicit_spring(scene, stiffness, joint_damping)
-            _hinge(
-                body,
-                f"finger_{f}_{name}_{i}",
-                AXES[name],
-                stiffness=stiffness,
-                damping=damping,
-                armature=armature,
-            )
+            spring = {"stiffness": stiffness, "damping": damping, "armature": armature}
+            _hinge(body, f"finger_{f}_{name}_{i}", AXES[name], **spring)
         tendon.wrap_joint(f"finger_{f}_bend_{i}", gains[i - 1] / gains[0])
         for j, (x, radius) in enumerate(zip(spheres[i - 1], radii[i - 1], strict=True)):
             _sphere(body, f"finger_{f}_sphere_{i}_{j}", [x, 0, radius], radius)
@@ -274,6 +263,13 @@ def _add_finger(
     actuator.gainprm[0] = gains[0]
     if visual and scene.effects.surface == "hull":
         _add_skin(scene, spec, params, f)
+
+
+def _add_block(body: mujoco.MjsBody, name: str, half: list[float]) -> None:
+    """A link's block, which is for looking at only, around the link's centre of mass."""
+    kind = mujoco.mjtGeom.mjGEOM_BOX
+    color = _COLORS["finger"]
+    body.add_geom(name=name, type=kind, size=half, pos=body.ipos, rgba=color, **_PASSIVE)
 
 
 def _add_skin(scene: Scene, spec: mujoco.MjSpec, params: Params, f: int) -> None:

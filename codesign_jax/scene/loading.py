@@ -72,19 +72,8 @@ def load(
     if parsed is not None:
         _check(parsed, path.name, problems)
     problems = keypaths.as_given(problems, places)
-    parts = {}
-    for key, loader, chosen in (
-        ("hand", hand.load, hand_name),
-        ("objects", objects.load, object_set),
-    ):
-        named = table.get(key)
-        if chosen is None and not isinstance(named, str):
-            continue  # missing or of the wrong type: `parse` has said so
-        try:
-            source = _beside(path, str(named)) if chosen is None else chosen
-            parts[key] = loader(source, overrides=inside[key])
-        except schema.InputError as error:
-            problems += error.problems
+    chosen = {"hand": hand_name, "objects": object_set}
+    parts = _hand_and_objects(path, table, chosen, inside, problems)
     if parsed is not None and "hand" in parts:
         parsed = _with_law(parsed, parts["hand"].material, path.name, problems)
         problems = keypaths.as_given(problems, places)
@@ -97,6 +86,37 @@ def load(
             problems += error.problems
     if problems or parsed is None:
         raise schema.InputError(problems)
+    return _completed(parsed, parts, path.name)
+
+
+def _hand_and_objects(
+    path: Path,
+    table: Mapping[str, Any],
+    chosen: Mapping[str, str | Path | None],
+    overrides: Mapping[str, Any],
+    problems: list[str],
+) -> dict[str, Any]:
+    """Hand and objects by the scene's keys: those chosen, or else those that its table names."""
+    parts = {}
+    for key, load_part in {"hand": hand.load, "objects": objects.load}.items():
+        source = chosen[key]
+        if source is None:
+            if not isinstance(table.get(key), str):
+                continue  # missing or of the wrong type: `parse` has said so
+            source = _beside(path, table[key])
+        try:
+            parts[key] = load_part(source, overrides=overrides[key])
+        except schema.InputError as error:
+            problems += error.problems
+    return parts
+
+
+def _completed(parsed: SceneFile, parts: dict[str, Any], where: str) -> Scene:
+    """The scene of a file and its parts, with what follows from them.
+
+    Raises:
+      InputError: with every problem between control, hand and constants.
+    """
     parts["objects"] = mesh_margins.fit(parts["objects"], parts["hand"])
     law = bool(parsed.effects.neo_hookean)
     top = max((shape.height for shape in parts["objects"].object), default=0.0)
@@ -105,7 +125,7 @@ def load(
     parts["hand"] = key_frames.with_parameters(parts["hand"], parts["control"])
     names = [f.name for f in dataclasses.fields(SceneFile) if f.name not in parts]
     scene = Scene(**parts, **{n: getattr(parsed, n) for n in names})
-    problems = key_frames.check(scene, "control") + _draw_problems(scene, path.name)
+    problems = key_frames.check(scene, "control") + _draw_problems(scene, where)
     if problems:
         raise schema.InputError(problems)
     return scene

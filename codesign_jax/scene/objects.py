@@ -290,13 +290,10 @@ def _size_problems(given: _ObjectSetFile, path: Path) -> list[str]:
     return [f"{path.name}: the meshes have {total >> 20} MiB, more than {MOST_BYTES >> 20} MiB"]
 
 
-def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
-    """Checks which keys go together, and reads the mesh."""
-    before = len(problems)
-    where = f"{path.name}.object {given.name}"
+def _key_problems(given: _ShapeFile, where: str) -> list[str]:
+    """Problems with keys that do not go together."""
+    problems = []
     kind = given.type
-    missing = []
-    foreign = []
     if (given.mass is None) == (given.density is None):
         problems.append(f"{where}: a {kind} has either a mass or a density")
     if given.inertia is not None and given.mass is None:
@@ -326,7 +323,15 @@ def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
             problems.append(f"{where}: inertia of a {kind} is xx, yy and zz in its own axes")
     problems += [f"{where}: {key} of a {kind} is missing" for key in missing]
     problems += [f"{where}: a {kind} has no {key}" for key in foreign]
-    if len(problems) > before:
+    return problems
+
+
+def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
+    """The object of a table; None with problems, which are added to the others."""
+    where = f"{path.name}.object {given.name}"
+    kind = given.type
+    if key_problems := _key_problems(given, where):
+        problems += key_problems
         return None
     values = {f.name: getattr(given, f.name) for f in dataclasses.fields(given)}
     try:

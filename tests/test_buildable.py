@@ -66,6 +66,16 @@ def test_no_proposal_has_a_warning_and_the_paper_s_space_has_table_i_alone():
     assert parameters.design_space(spheres.hand).buildable is None
 
 
+@pytest.mark.parametrize("name", ["bin", "edge", "shelf"])
+def test_no_proposal_for_surroundings_has_a_warning_of_a_finger(name):
+    """The palm of `shelf` is upright and that of `edge` reaches below the table: no limit there."""
+    made = scene.load(name)
+    space = parameters.design_space(made.hand, "full")
+    designs = drawn(space, 60)
+    warned = [w for p in each_params(space, designs) for w in stress.of_design(made, p)]
+    assert not [w for w in warned if name == "bin" or w.startswith("finger")]
+
+
 @pytest.mark.parametrize("law", silicones.LAWS)
 def test_a_lowered_pressure_bends_the_free_finger_by_the_limit(law):
     """By `free_bends`, which halves intervals where the projection inverts in closed form."""

@@ -4,7 +4,8 @@
 
 The hands are those of docs/gallery/hands.toml, the design of each is docs/gallery/NAME.toml; where
 that is not there, its search is run, in runs/gallery/NAME, where an interrupted one goes on.  A
-design is judged in 100 fresh trials at the accuracy of the search, and its grasp without noise is
+design is judged at the accuracy of the search: in 100 fresh trials, in 48 with objects of each of
+some masses, and as 64 hands that are cast with the usual tolerances.  Its grasp without noise is
 drawn; look.png in runs/gallery/NAME shows it from two sides, to be looked at.
 """
 
@@ -20,13 +21,14 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from codesign_jax import cli, codesign, rollout, runs
+from codesign_jax import cli, codesign, rollout, runs, tolerances, verdict
 from codesign_jax.commands import common
 from codesign_jax.commands.flags import Evaluate
 from codesign_jax.report import animation
 from codesign_jax.report.replay import Camera
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import cases
+from codesign_jax.scene import draws
 
 RUNS = Path("runs") / "gallery"
 DOCS = Path("docs")
@@ -39,6 +41,9 @@ CLOSE = 0.42
 """Distance of the camera [m]."""
 TRIALS = 100
 SEED = 1000
+MASSES = (0.1, 0.2, 0.3, 0.5)
+HEAVY_TRIALS = 48
+"""Masses of all objects [kg] in place of their own, and trials with each."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,11 +98,35 @@ def find(hand: Hand) -> None:
 
 
 def judge(hand: Hand, case: cases.Case) -> None:
-    """Writes the verdict as the first line of the design's file, if it is not there."""
+    """Writes verdict, masses and yield before the design in its file, if they are not there."""
     text = hand.design.read_text(encoding="utf-8")
     if not text.startswith("# keeps"):
         judged = Judged(case.scene, case.simulate(TRIALS, jax.random.key(SEED)))
-        hand.design.write_text(f"# {judged}\n{text}", encoding="utf-8")
+        text = f"# {judged}\n{text}"
+    first, second, *rest = text.splitlines()
+    if not second.startswith("# of heavier"):
+        rest = [second, *rest]
+        second = f"# of heavier objects {heavier(case)}; {cast(case)}"
+    hand.design.write_text("\n".join([first, second, *rest, ""]), encoding="utf-8")
+
+
+def heavier(case: cases.Case) -> str:
+    """What the hand keeps of objects that all have one of `MASSES` above their own, in words."""
+    shares = []
+    own = max(shape.mass for shape in case.scene.objects.object)
+    for mass in (m for m in MASSES if m > own):
+        scene = draws.changed(case.scene, ("objects", "object", "mass"), lambda _, m=mass: m)
+        outcome = case._replace(scene=scene).simulate(HEAVY_TRIALS, jax.random.key(SEED + 1))
+        share = 100 * verdict.kept(outcome).mean()
+        shares.append(f"{share:.0f} % at {1e3 * mass:.0f} g")
+    return "it keeps " + ", ".join(shares)
+
+
+def cast(case: cases.Case) -> str:
+    """How many cast hands keep what is wanted, in words."""
+    hands = tolerances.simulate(case, {}, jax.random.key(SEED + 2))
+    good = int((hands.kept[1:] >= hands.needed).sum())
+    return f"{good} of {len(hands.kept) - 1} cast hands keep {100 * verdict.WANTED:.0f} %"
 
 
 def draw(hand: Hand, case: cases.Case) -> None:
@@ -134,9 +163,11 @@ def draw(hand: Hand, case: cases.Case) -> None:
 
 def row(hand: Hand) -> str:
     """What the page says of a hand."""
-    verdict = hand.design.read_text(encoding="utf-8").splitlines()[0].removeprefix("# ")
-    words = f"**[{hand.name}](gallery/{hand.name}.toml)**: {hand.sentence} It {verdict}"
+    judged = hand.design.read_text(encoding="utf-8").splitlines()
+    words = f"**[{hand.name}](gallery/{hand.name}.toml)**: {hand.sentence} It {judged[0][2:]}"
     words += " (earlier model)." if hand.earlier else "."
+    if judged[1].startswith("# of heavier"):
+        words += f" O{judged[1][3:]}."
     return f"| ![{hand.name}](gallery/{hand.name}.webp) | {words}<br><br>`{hand.command}` |"
 
 
@@ -149,6 +180,11 @@ def main(names: list[str]) -> None:
             case = common.find_case(Evaluate(design=((str(hand.design),),)))
             judge(hand, case)
             draw(hand, case)
+    write_page()
+
+
+def write_page() -> None:
+    """Writes docs/gallery.md."""
     rows = [row(hand) for hand in hands() if hand.design.exists()]
     (DOCS / "gallery.md").write_text("\n".join([HEAD, *rows, ""]), encoding="utf-8")
 

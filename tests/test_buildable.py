@@ -68,7 +68,7 @@ def test_no_proposal_has_a_warning_and_the_paper_s_space_has_table_i_alone():
 
 @pytest.mark.parametrize("name", ["bin", "edge", "shelf"])
 def test_no_proposal_for_surroundings_has_a_warning_of_a_finger(name):
-    """The palm of `shelf` is upright and that of `edge` reaches below the table: no limit there."""
+    """The palm of `shelf` is upright and that of `edge` tilted: they have no limit there."""
     made = scene.load(name)
     space = parameters.design_space(made.hand, "full")
     designs = drawn(space, 60)

@@ -19,7 +19,7 @@ from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.scene import parameters, silicones
 from codesign_jax.types import Outcome
 from scripts import benchmark, calibration, reality, search
-from scripts.accuracy import budget, report
+from scripts.accuracy import budget, decisions, report
 from scripts.calibration import OPEN
 from scripts.experiments import report as results
 from scripts.experiments import simulate
@@ -291,6 +291,36 @@ def test_the_page_has_the_tables_of_its_data(monkeypatch):
     for mark, text in made.tables().items():
         shown = page.split(f"<!-- {mark}:begin -->")[1].split(f"<!-- {mark}:end -->")[0]
         assert _without_intervals(shown.strip()) == _without_intervals(text), mark
+
+
+def test_a_choice_between_two_hands_gains_half_of_their_difference():
+    """Hands that keep all, half and none of any trials: pairs differ by 50, 50 and 100 points."""
+    kept = np.zeros((3, 8), bool)
+    kept[0] = True
+    kept[1, ::2] = True
+    truth = decisions.halves(kept)
+    assert truth.shape == (3, 4, 2)
+    assert decisions.gain(truth, truth) == pytest.approx((0.25 + 0.25 + 0.5) / 3)
+    assert decisions.rank(truth, truth) == pytest.approx(1)
+    flips, rank, gain, regret = decisions.measures(truth[::-1], truth)
+    assert (flips, rank) == (pytest.approx(2 / 3), pytest.approx(-1))
+    assert regret == pytest.approx(-2 * gain) == pytest.approx(2 / 3)
+    # A setting that cannot tell the hands apart is a toss of a coin.
+    assert decisions.gain(np.ones_like(truth), truth) == 0
+    # What chooses in one half of the trials is valued by the other half alone.
+    lucky = decisions.halves(np.array([[1, 1, 0, 0], [0, 0, 1, 1]], bool))
+    assert decisions.gain(lucky, lucky) == pytest.approx(-0.5)
+
+
+def test_hard_designs_are_near_winners_and_within_the_limits():
+    space = parameters.design_space(scene.load("paper").hand, "23d")
+    winners = work.winners()[:4]
+    found = decisions.neighbours(space, winners)
+    assert found.shape == (4 * decisions.NEIGHBOURS, 23)
+    np.testing.assert_allclose(jax.vmap(space.project)(found), found, rtol=1e-6)
+    low, high = space.box
+    away = (found - np.repeat(winners, decisions.NEIGHBOURS, axis=0)) / (high - low)
+    assert 0.04 < away.std() < decisions.SPREAD
 
 
 def _without_intervals(text):

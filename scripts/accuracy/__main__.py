@@ -7,9 +7,10 @@ python -m scripts.accuracy --out runs/budget --tip              # errors of the 
 python -m scripts.accuracy --out runs/budget --merge docs/data/budget.json
 python -m scripts.accuracy --merge docs/data/budget.json --report     # page and figures
 
-All variants have the same designs, what the default search recommended in its first seeds, and the
-same trials.  The truth has the finer step, links and rings; `finer` refines all three again.
-A variant has a file of its own, so that several processes share the work.
+All variants have the same designs and the same trials.  The designs are those that the default
+search recommended in its first seeds, or those of a file (--of).  The truth has the finer step,
+links and rings; `finer` refines all three again.  A variant has a file of its own, so that several
+processes share the work.
 """
 
 import json
@@ -18,13 +19,15 @@ from pathlib import Path
 
 from codesign_jax import use_compilation_cache
 from scripts.accuracy import budget, report
-from scripts.shared import output, provenance
+from scripts.shared import output, provenance, work
 
 
 def main() -> int:
     parser = provenance.parser(__doc__)
     parser.add_argument("--out", type=Path, default=Path("runs/budget"), help="folder of the files")
-    parser.add_argument("--designs", type=int, default=budget.DESIGNS)
+    text = "an .npz of a search or of scripts.accuracy.decisions"
+    parser.add_argument("--of", type=Path, default=work.WINNERS, metavar="FILE", help=text)
+    parser.add_argument("--designs", type=int, default=budget.DESIGNS, help="the first ones")
     parser.add_argument("--trials", type=int, default=budget.TRIALS)
     parser.add_argument("--share", default="1/1", metavar="I/N", help="every N-th variant")
     parser.add_argument("--only", default="", help="these variants, with ; between")
@@ -50,7 +53,7 @@ def main() -> int:
     if args.tip:
         budget.measure_tips(args.out, args.commit)
         return 0
-    study = budget.Study(args.designs, args.trials)
+    study = budget.Study(work.winners(args.of)[: args.designs], args.trials)
     first, count = (int(n) for n in args.share.split("/"))
     chosen = args.only.split(";") if args.only else budget.TIMED if args.time else budget.VARIANTS
     run = budget.measure if args.time else budget.simulate

@@ -96,6 +96,8 @@ VARIANTS: dict[str, Variant] = {
     "linear law": Variant(
         changes=("hand.material.law=linear", "hand.material.shear_modulus=49.5e3")
     ),
+    # The end of the interval of Dragon Skin 10's modulus.
+    "101 kPa": Variant(changes=("hand.material.shear_modulus=101e3",)),
     "lateral threshold": Variant(changes=("effects.lateral_threshold=true",)),
     "spheres": Variant(changes=(SPHERES,)),
     "spheres, MuJoCo C": Variant(changes=(SPHERES,), few=True, engine="mujoco"),
@@ -123,9 +125,10 @@ DEAR = ("reference", "spheres, MuJoCo C")
 class Study:
     """Designs and trials, and what variants make of them."""
 
-    def __init__(self, designs: int, trials: int):
+    def __init__(self, designs: np.ndarray, trials: int):
+        """Keeps the designs, shape (design, 23), and the count of their trials."""
         self.trials = trials
-        self.designs = work.winners()[:designs]
+        self.designs = designs
 
     def run(self, name: str, commit: str | None = None) -> dict[str, Any]:
         """Simulates a variant; what its file holds."""

@@ -1,56 +1,225 @@
-"""What decides which of two hands is better: the figure at the front of the accuracy page.
+"""Which of two hands is better, by each accuracy: the figure at the front of the accuracy page.
 
-python -m scripts.accuracy.decisions      # draws docs/data/hard_designs.json
+python -m scripts.accuracy.decisions --pick     # designs that keep 30 to 95 %, in HARD
+python -m scripts.accuracy --of docs/data/search/hard.npz --designs 48 --trials 24 \\
+    --out runs/hard --only "fast;standard;fine;reference;..."          # the variants of ROWS
+python -m scripts.accuracy --out runs/hard --merge docs/data/decisions.json
+python -m scripts.accuracy.decisions            # the figure and the table of the page
+
+A hand is chosen from two by half of the trials at one setting, and valued by the other half at
+`reference`, so that no trial is counted on both sides.  The gain of a choice is the kept share of
+the chosen hand beyond the mean of the two, in the mean over all pairs; the regret of a setting is
+the gain of choosing by `reference` less its gain.
 """
 
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from codesign_jax.statistics import wilson
-from scripts.shared import output
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.axes import Axes
 
-DATA = Path(__file__).parents[2] / "docs/data/hard_designs.json"
-FIGURE = Path("docs/figures/decisions.png")
-KINDS = {
-    "chance": ("a micrometre", "0.6"),
-    "step": ("time step, integrator, accuracy", "tab:blue"),
-    "contact": ("constants of the contact", "tab:green"),
-    "rubber": ("constants of the rubber", "tab:red"),
-}
-"""What a variant changes: its words and its colour."""
+from codesign_jax import rollout, scene, use_compilation_cache
+from codesign_jax.codesign import SUCCESS_COST
+from codesign_jax.engines import make_engine
+from codesign_jax.scene import parameters
+from codesign_jax.statistics import Interval
+from codesign_jax.types import failed
+from scripts.accuracy import budget
+from scripts.accuracy.report import interval, points
+from scripts.shared import output, provenance, work
+from scripts.shared.statistics import spearman, two_way
+
+DOCS = Path(__file__).parents[2] / "docs"
+HARD = DOCS / "data" / "search" / "hard.npz"
+DATA = DOCS / "data" / "decisions.json"
+FIGURE = DOCS / "figures" / "decisions.png"
+NEIGHBOURS = 3
+SPREAD = 0.1
+"""Designs near each winner, and their standard deviation, a share of each parameter's range."""
+TRIALS = 12
+SEED = 11
+"""Trials that pick hard designs; no other study draws from this seed."""
+LEAST = 0.3
+MOST = 0.95
+TRUTH = "reference"
+RESAMPLES = 1000
 
 
-def flips(row: dict[str, Any], trials: int) -> tuple[float, float, float]:
-    """Share of a variant's verdicts that flip, and its interval of 95 % over trials."""
-    return wilson(row["gained"] + row["lost"], trials)
+class Row(NamedTuple):
+    """A setting: its variant, its words and its kind."""
+
+    variant: str
+    words: str
+    kind: str
 
 
-def draw(content: dict[str, Any], path: Path) -> Path:
-    """A bar for each variant, shortest first, with the rank correlation of the designs' shares."""
-    trials = content["designs"] * content["trials"]
-    rows = sorted(content["variants"], key=lambda row: -row["gained"] - row["lost"])
-    figure = output.new_figure(9, 4.6)
-    axis = figure.subplots()
-    for y, row in enumerate(rows):
-        share, low, high = (100 * value for value in flips(row, trials))
-        color = KINDS[row["kind"]][1]
-        axis.barh(y, share, color=color, alpha=0.85)
-        axis.plot([low, high], [y, y], color="0.2", lw=1)
-        text = f"{share:.0f} %, rank correlation {row['rank']:.2f}"
-        axis.text(high + 0.4, y, text, va="center", fontsize=8)
-    axis.set_yticks(range(len(rows)), [row["variant"].replace("`", "") for row in rows], fontsize=8)
-    axis.set_xlim(0, 32)
-    axis.set_xlabel(f"verdicts that change [%], {content['designs']} designs that keep 30 to 95 %")
-    for words, color in KINDS.values():
-        axis.bar(0, 0, color=color, label=words)
-    axis.legend(frameon=False, fontsize=8, loc="upper right")
+PRESET = "preset of accuracy"
+CHANCE = "chance"
+CONTACT = "contact"
+RUBBER = "rubber"
+COLORS = {PRESET: "tab:blue", CHANCE: "0.5", CONTACT: "tab:green", RUBBER: "tab:red"}
+ROWS = (
+    Row("fast", "`fast`", PRESET),
+    Row("standard", "`standard`", PRESET),
+    Row("fine", "`fine`", PRESET),
+    Row("reference", "`reference`", PRESET),
+    Row("standard, moved", "`standard`, objects moved by a micrometre", CHANCE),
+    Row("twice the stiffness", "`standard`, skin of 8 kN/m in place of 4", CONTACT),
+    Row("fingers creep", "`standard`, no friction memory", CONTACT),
+    Row("101 kPa", "`standard`, silicone of 101 kPa in place of 88", RUBBER),
+    Row("linear law", "`standard`, linear bending law", RUBBER),
+)
+
+
+# --- hard designs ---------------------------------------------------------------------------------
+
+
+def neighbours(space: parameters.DesignSpace, winners: np.ndarray) -> np.ndarray:
+    """Designs near winners that a search may propose, shape (design, parameter)."""
+    rng = np.random.default_rng(SEED)
+    every = np.repeat(winners, NEIGHBOURS, axis=0)
+    low, high = space.box
+    moved = every + SPREAD * (high - low) * rng.normal(size=every.shape)
+    inside = np.clip(moved, low, high)
+    return np.asarray(jax.jit(jax.vmap(space.project))(jnp.asarray(inside, jnp.float32)))
+
+
+def pick() -> Path:
+    """Writes the neighbours of winners that keep `LEAST` to `MOST` of `TRIALS` grasps."""
+    grasping = scene.load("paper")
+    space = parameters.design_space(grasping.hand, "23d")
+    engine = make_engine("structured", grasping)
+    drawn = rollout.sample_trials(grasping, jax.random.key(SEED), TRIALS)
+    designs = neighbours(space, work.winners())
+
+    @jax.jit
+    def run(vectors: jax.Array, trials: Any) -> Any:
+        return rollout.simulate(grasping, engine, jax.vmap(space.params)(vectors), trials)[0]
+
+    outcome = run(*budget.crossed(designs, drawn))
+    kept = (np.asarray(outcome.cost) < SUCCESS_COST) & ~failed(np.asarray(outcome.status))
+    share = kept.reshape(len(designs), TRIALS).mean(1)
+    hard = (share >= LEAST) & (share <= MOST)
+    print(f"{hard.sum()} of {hard.size} keep {LEAST:.0%} to {MOST:.0%} of {TRIALS} grasps")
+    return output.write_arrays(HARD, {"designs0": designs[hard]})
+
+
+# --- choices --------------------------------------------------------------------------------------
+
+
+def halves(kept: np.ndarray) -> np.ndarray:
+    """Kept grasps (design, trial) as (design, trial of a half, half)."""
+    most = kept.shape[1] // 2
+    return np.stack([kept[:, :most], kept[:, most : 2 * most]], axis=-1).astype(float)
+
+
+def gain(by: np.ndarray, truth: np.ndarray) -> float:
+    """What choosing between two designs gains, a share of grasps, over a toss of a coin.
+
+    Args:
+      by: Kept grasps at the setting that chooses, (design, trial of a half, half).
+      truth: At the setting that values; each half of the trials is valued by the other one.
+    """
+    chooses = by.mean(1)
+    values = truth.mean(1)[:, ::-1]
+    first, second = np.triu_indices(len(by), 1)
+    choice = np.sign(chooses[first] - chooses[second])
+    return float((choice * (values[first] - values[second]) / 2).mean())
+
+
+def rank(by: np.ndarray, truth: np.ndarray) -> float:
+    """Spearman's correlation of the shares in one half of the trials and in the other at truth."""
+    chooses = by.mean(1).T
+    values = truth.mean(1)[:, ::-1].T
+    return float(np.mean(spearman(chooses, values)))
+
+
+def measures(by: np.ndarray, truth: np.ndarray) -> list[float]:
+    """Share of verdicts that differ, rank correlation, gain and regret."""
+    own = gain(by, truth)
+    return [float((by != truth).mean()), rank(by, truth), own, gain(truth, truth) - own]
+
+
+def compared(by: np.ndarray, truth: np.ndarray) -> dict[str, Interval]:
+    """`measures` with intervals of 95 % over designs and trials, by their names."""
+    found = two_way(measures, by, truth, resamples=RESAMPLES)
+    return dict(zip(("flipped", "rank", "gain", "regret"), found, strict=True))
+
+
+def kept_of(found: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Halves of the kept grasps of every variant of a file."""
+    grasping = scene.load("paper")
+    records = found["variants"]
+    return {n: halves(budget.costs(grasping, r) < SUCCESS_COST) for n, r in records.items()}
+
+
+def results(found: dict[str, Any]) -> list[tuple[Row, dict[str, Interval]]]:
+    """The rows that a file has, with their measures."""
+    kept = kept_of(found)
+    return [(r, compared(kept[r.variant], kept[TRUTH])) for r in ROWS if r.variant in kept]
+
+
+def table(rows: list[tuple[Row, dict[str, Interval]]]) -> str:
+    """The measures of every row, in Markdown."""
+    cells = [["chosen by", "verdicts that flip", "rank correlation", "regret, points"]]
+    for row, found in rows:
+        told = [interval(found["flipped"]), interval(found["rank"], ".2f")]
+        regret = points(found["regret"])
+        cells.append([row.words, *told, "–" if row.variant == TRUTH else regret])
+    return output.markdown(cells)
+
+
+# --- the figure -----------------------------------------------------------------------------------
+
+
+def draw(rows: list[tuple[Row, dict[str, Interval]]], path: Path) -> Path:
+    """Rank correlations and gains as dots with their intervals, a line for each setting."""
+    figure = output.new_figure(9, 4.4)
+    left, right = figure.subplots(1, 2, sharey=True)
+    truth = next(found for row, found in rows if row.variant == TRUTH)
+    _dots(left, rows, "rank", 1.0)
+    left.axvline(truth["rank"].value, color="0.7", lw=1, zorder=0)
+    left.set_xlabel("rank correlation with other trials at reference")
+    left.set_xlim(0, 1)
+    _dots(right, rows, "gain", 100.0)
+    right.axvline(100 * truth["gain"].value, color="0.7", lw=1, zorder=0)
+    right.set_xlabel("points that choosing the better of two hands gains")
+    right.set_xlim(left=0)
+    words = [row.words.replace("`", "") for row, _ in rows]
+    left.set_yticks(range(len(rows)), words, fontsize=9)
+    left.invert_yaxis()
+    for kind, color in COLORS.items():
+        right.plot([], [], "o", color=color, label=kind)
+    right.legend(frameon=False, fontsize=8, loc="lower left")
     return output.save_figure(figure, path)
 
 
+def _dots(axes: Axes, rows: list[tuple[Row, dict[str, Interval]]], name: str, scale: float) -> None:
+    """A dot with its interval for each row."""
+    for y, (row, found) in enumerate(rows):
+        middle, low, high = (scale * v for v in found[name])
+        color = COLORS[row.kind]
+        axes.plot([low, high], [y, y], color=color, lw=1.5)
+        axes.plot(middle, y, "o", color=color, ms=6)
+
+
 def main() -> int:
-    print(draw(json.loads(DATA.read_text()), FIGURE))
+    parser = provenance.parser(__doc__)
+    parser.add_argument("--pick", action="store_true", help="pick hard designs and stop")
+    args = parser.parse_args()
+    use_compilation_cache()
+    if args.pick:
+        print(pick())
+        return 0
+    rows = results(json.loads(DATA.read_text()))
+    text = table(rows)
+    print(text)
+    output.fill(DOCS / "accuracy.md", text, "decisions")
+    print(draw(rows, FIGURE))
     return 0
 
 

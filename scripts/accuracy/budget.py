@@ -97,7 +97,9 @@ VARIANTS: dict[str, Variant] = {
         changes=("hand.material.law=linear", "hand.material.shear_modulus=49.5e3")
     ),
     # The end of the interval of Dragon Skin 10's modulus.
-    "101 kPa": Variant(changes=("hand.material.shear_modulus=101e3",)),
+    "101 kPa": Variant(
+        changes=("hand.material.law=neo_hookean", "hand.material.shear_modulus=101e3")
+    ),
     "lateral threshold": Variant(changes=("effects.lateral_threshold=true",)),
     "spheres": Variant(changes=(SPHERES,)),
     "spheres, MuJoCo C": Variant(changes=(SPHERES,), few=True, engine="mujoco"),

@@ -146,29 +146,29 @@ def measures(by: np.ndarray, truth: np.ndarray) -> list[float]:
 
 def compared(by: np.ndarray, truth: np.ndarray) -> dict[str, Interval]:
     """`measures` with intervals of 95 % over designs and trials, by their names."""
-    found = two_way(measures, by, truth, resamples=RESAMPLES)
-    return dict(zip(("flipped", "rank", "gain", "regret"), found, strict=True))
+    intervals = two_way(measures, by, truth, resamples=RESAMPLES)
+    return dict(zip(("flipped", "rank", "gain", "regret"), intervals, strict=True))
 
 
-def kept_of(found: dict[str, Any]) -> dict[str, np.ndarray]:
+def kept_of(content: dict[str, Any]) -> dict[str, np.ndarray]:
     """Halves of the kept grasps of every variant of a file."""
     grasping = scene.load("paper")
-    records = found["variants"]
+    records = content["variants"]
     return {n: halves(budget.costs(grasping, r) < SUCCESS_COST) for n, r in records.items()}
 
 
-def results(found: dict[str, Any]) -> list[tuple[Row, dict[str, Interval]]]:
+def results(content: dict[str, Any]) -> list[tuple[Row, dict[str, Interval]]]:
     """The rows that a file has, with their measures."""
-    kept = kept_of(found)
+    kept = kept_of(content)
     return [(r, compared(kept[r.variant], kept[TRUTH])) for r in ROWS if r.variant in kept]
 
 
 def table(rows: list[tuple[Row, dict[str, Interval]]]) -> str:
     """The measures of every row, in Markdown."""
     cells = [["chosen by", "verdicts that flip", "rank correlation", "regret, points"]]
-    for row, found in rows:
-        told = [interval(found["flipped"]), interval(found["rank"], ".2f")]
-        regret = points(found["regret"])
+    for row, intervals in rows:
+        told = [interval(intervals["flipped"]), interval(intervals["rank"], ".2f")]
+        regret = points(intervals["regret"])
         cells.append([row.words, *told, "–" if row.variant == TRUTH else regret])
     return output.markdown(cells)
 
@@ -180,7 +180,7 @@ def draw(rows: list[tuple[Row, dict[str, Interval]]], path: Path) -> Path:
     """Rank correlations and gains as dots with their intervals, a line for each setting."""
     figure = output.new_figure(9, 4.4)
     left, right = figure.subplots(1, 2, sharey=True)
-    truth = next(found for row, found in rows if row.variant == TRUTH)
+    truth = next(intervals for row, intervals in rows if row.variant == TRUTH)
     _dots(left, rows, "rank", 1.0)
     left.axvline(truth["rank"].value, color="0.7", lw=1, zorder=0)
     left.set_xlabel("rank correlation with other trials at reference")
@@ -200,8 +200,8 @@ def draw(rows: list[tuple[Row, dict[str, Interval]]], path: Path) -> Path:
 
 def _dots(axes: Axes, rows: list[tuple[Row, dict[str, Interval]]], name: str, scale: float) -> None:
     """A dot with its interval for each row."""
-    for y, (row, found) in enumerate(rows):
-        middle, low, high = (scale * v for v in found[name])
+    for y, (row, intervals) in enumerate(rows):
+        middle, low, high = (scale * v for v in intervals[name])
         color = COLORS[row.kind]
         axes.plot([low, high], [y, y], color=color, lw=1.5)
         axes.plot(middle, y, "o", color=color, ms=6)

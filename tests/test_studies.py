@@ -18,12 +18,16 @@ from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.scene import parameters, silicones
 from codesign_jax.types import Outcome
-from scripts import benchmark, calibration, reality, search
+from scripts import benchmark, calibration, reality
 from scripts.accuracy import budget, decisions, report
 from scripts.calibration import OPEN
 from scripts.experiments import report as results
 from scripts.experiments import simulate
 from scripts.experiments.simulate import PAPER, TOTAL_GRASPS
+from scripts.search import __main__ as search
+from scripts.search import study as search_study
+from scripts.search import tables as search_tables
+from scripts.search import turbo
 from scripts.shared import output, statistics, work
 from tests.helpers import toy_engine
 from tests.helpers.toy_engine import tiny
@@ -178,6 +182,20 @@ def test_a_ring_down_is_read_from_its_peaks():
     assert np.isnan(reality.Ring.of(time, 1 - np.exp(-time / 0.1)).decrement)
 
 
+def test_a_trust_region_grows_shrinks_and_starts_anew_by_the_rules_of_turbo():
+    """Eriksson et al. 2019, section 2: sides of 0.8, at most 1.6, anew below 2^-7."""
+    region = turbo.Region()
+    sides = []
+    for cost in (3.0, 2.0, 1.0, 0.9, 0.8, 0.7, 0.6):
+        region = region.after(np.array([cost, 3.0]), count=0, patience=4)
+        sides.append(region.length)
+    assert sides == [0.8, 0.8, 1.6, 1.6, 1.6, 1.6, 1.6]
+    for batch in range(4 * 8 - 1):
+        region = region.after(np.array([0.6]), count=batch, patience=4)
+    assert region.length == 1.6 / 2**7 and region.best == 0.6
+    assert region.after(np.array([0.6]), count=31, patience=4) == turbo.Region(first=32)
+
+
 @pytest.mark.slow  # 19 s
 def test_winners_of_a_search_are_judged_at_other_masses(tmp_path):
     """What they keep at a mass is what MuJoCo C says of them in the same trials."""
@@ -196,7 +214,7 @@ def test_winners_of_a_search_are_judged_at_other_masses(tmp_path):
     space = parameters.design_space(heavy_scene.hand, "2d")
     engine = make_engine("mujoco", heavy_scene)
     for seed, design in enumerate(designs):
-        key = codesign.stream_key(jax.random.key(seed), search.STREAM_JUDGE, 0)
+        key = codesign.stream_key(jax.random.key(seed), search_study.STREAM_JUDGE, 0)
         hand = jax.tree.map(lambda v: v[None], space.params(design))
         outcome = rollout.evaluate(
             heavy_scene, engine, hand, rollout.sample_trials(heavy_scene, key, 5)
@@ -204,7 +222,7 @@ def test_winners_of_a_search_are_judged_at_other_masses(tmp_path):
         assert judged["masses"]["2"][seed] == np.mean(outcome.cost < codesign.SUCCESS_COST)
     light, heavy = (np.mean(judged["masses"][m]) for m in ("0.05", "2"))
     assert heavy != light
-    table = search.masses_table([judged])
+    table = search_tables.masses_table([judged])
     assert "2000 g: kept on average | seeds that keep 95 % | commit |\n" in table
 
 

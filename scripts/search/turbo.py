@@ -1,7 +1,7 @@
 """Bayesian optimisation beside the default search: TuRBO-1 on Gaussian processes of BoTorch.
 
-python -m scripts.turbo --preset 23d --seeds 10 --out runs/search
-python -m scripts.turbo --preset 2d --budget 936 --particles 12 --tests 200 --out runs/search
+python -m scripts.search.turbo --preset 23d --seeds 10 --out runs/search
+python -m scripts.search.turbo --preset 2d --budget 936 --particles 12 --tests 200 --out runs/search
 
 Needs `botorch`, which is no dependency of the project.  The method is that of Eriksson et al.
 (2019), "Scalable Global Optimization via Local Bayesian Optimization": a trust region around the
@@ -28,7 +28,7 @@ from codesign_jax import scene as scenes
 from codesign_jax.engines import make_engine
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.verdict import WANTED
-from scripts.search import Study, make_case
+from scripts.search.study import Study, make_case
 from scripts.shared import output, provenance
 
 LONGEST = 1.6
@@ -142,9 +142,9 @@ class Searches:
         particles = self.study.case.particles
         proposals = np.stack(self._proposals(number, particles))
         designs = self.project(jnp.asarray(self.low + self.span * proposals, jnp.float32))
-        noise = self.study._noise(codesign.STREAM_TRIAL, number)
-        outcome = self.study._all(designs, noise, self.study.case.trials)
-        costs = np.asarray(self.study._costs(outcome))
+        noise = self.study.noise(codesign.STREAM_TRIAL, number)
+        outcome = self.study.outcomes(designs, noise, self.study.case.trials)
+        costs = np.asarray(self.study.costs(outcome))
         self.units.append((np.asarray(designs, float) - self.low) / self.span)
         self.costs.append(costs)
         patience = max(4, math.ceil(len(self.low) / particles))
@@ -176,9 +176,9 @@ class Searches:
         costs = np.concatenate(self.costs, axis=1)
         order = np.argsort(costs, axis=1)[:, : case.finalists, None]
         finalists = self.low + self.span * np.take_along_axis(units, order, axis=1)
-        noise = self.study._noise(codesign.STREAM_TEST, len(self.units))
-        outcome = self.study._all(jnp.asarray(finalists, jnp.float32), noise, self.study.rounds)
-        best = np.asarray(self.study._costs(outcome)).argmin(1)
+        noise = self.study.noise(codesign.STREAM_TEST, len(self.units))
+        outcome = self.study.outcomes(jnp.asarray(finalists, jnp.float32), noise, self.study.rounds)
+        best = np.asarray(self.study.costs(outcome)).argmin(1)
         return finalists[np.arange(self.seeds), best]
 
 

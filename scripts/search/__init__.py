@@ -1,0 +1,1 @@
+"""Optimisers compared over many seeds with equal numbers of grasps."""

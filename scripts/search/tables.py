@@ -1,0 +1,71 @@
+"""Tables of the note on the search, from the files of its studies."""
+
+from typing import Any
+
+import numpy as np
+
+from codesign_jax.optimize import NAMES
+from codesign_jax.statistics import wilson
+from codesign_jax.verdict import WANTED
+from scripts.shared import output
+
+LIMITED = "23d"
+"""Preset of the whole table within the scene's limits."""
+TABLE = "paper-23d"
+"""Preset of the whole table without them."""
+
+
+def order(row: dict[str, Any]) -> tuple:
+    """Where a row stands: 23D first, the paper's objects first, the default's order of names."""
+    name = row["optimizer"].split(":")[0]
+    place = NAMES.index(name) if name in NAMES else len(NAMES)
+    few = row["preset"] not in (LIMITED, TABLE)
+    return few, row["preset"] != LIMITED, row.get("objects") or "", place, row["optimizer"]
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """A row for each optimiser: what its recommended designs keep at its last mark."""
+    head = "optimiser|preset|hand|objects|seeds|grasps of a seed|median kept|"
+    head += "5 % of the seeds below|"
+    head += "share of seeds that keep 95 % (95 % interval)|commit"
+    table_rows = [head.split("|")]
+    for row in sorted(rows, key=order):
+        kept = np.array(row["kept"][-1])
+        table_rows.append(
+            [
+                f"`{row['optimizer']}`",
+                row["preset"],
+                row.get("hand") or "pneuflex4",
+                row.get("objects") or "three",
+                str(kept.size),
+                f"{row['grasps'][-1]:,}",
+                f"{np.median(kept):.3f}",
+                f"{np.quantile(kept, 0.05):.3f}",
+                share_of(kept),
+                row["provenance"]["commit"][:7],
+            ]
+        )
+    return output.markdown(table_rows)
+
+
+def masses_table(rows: list[dict[str, Any]]) -> str:
+    """What recommended designs keep where every object has one of these masses."""
+    table_rows = []
+    for row in sorted((r for r in rows if "masses" in r), key=order):
+        head = ["preset", "hand", "searched with"]
+        objects = row.get("objects") or "objects as they are"
+        cells = [row["preset"], row.get("hand") or "pneuflex4"]
+        cells.append(" ".join(row["changes"]) or objects)
+        for mass, kept in row["masses"].items():
+            head += [f"{1e3 * float(mass):g} g: kept on average", "seeds that keep 95 %"]
+            cells += [f"{np.mean(kept):.3f}", share_of(np.array(kept))]
+        table_rows = table_rows or [[*head, "commit"]]
+        table_rows.append([*cells, row["provenance"]["commit"][:7]])
+    return output.markdown(table_rows)
+
+
+def share_of(kept: np.ndarray) -> str:
+    """Share of the seeds that keep `WANTED`, with its interval."""
+    good = int((kept >= WANTED).sum())
+    share = wilson(good, kept.size)
+    return f"{good / kept.size:.2f} ({share.low:.2f} to {share.high:.2f})"

@@ -10,6 +10,8 @@ batches that improve, halves after as many that do not as the space has paramete
 proposal (at least four), and starts anew once it is small.  Trials, final test and judging trials
 are those of `scripts.search` for random designs.
 """
+# pyright: reportMissingImports=false
+# BoTorch and PyTorch are no dependencies.
 
 import math
 import sys

@@ -1,129 +1,171 @@
 """Hands searched under what is known of the constants, against hands searched at its middle.
 
-python -m scripts.uncertainty --out runs/uncertainty                      # again to go on
-python -m scripts.uncertainty --constants posterior.toml --preset full    # of a finger of one's own
+python -m scripts.uncertainty --out runs/uncertainty                 # again to go on
+python -m scripts.uncertainty --constants posterior.toml             # of a finger of one's own
 
 Each seed is searched twice, with constants that are drawn for every trial and with the middle of
 their distributions, and both designs are judged in the same fresh trials, each of which has a hand
 of its own: constants drawn from the table, in place of the true ones that nobody knows.  Prints the
-table of docs/uncertainty.md and draws docs/figures/uncertainty.png.
+table of docs/uncertainty.md and draws docs/figures/uncertainty.png.  All seeds go in lock step, as
+in scripts.search.
 """
 
 import argparse
+import dataclasses
 import sys
+import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
-from codesign_jax import cli, verdict
 from codesign_jax import scene as scenes
-from codesign_jax.commands import common, flags
-from codesign_jax.runs import cases
-from codesign_jax.scene import draws, silicones
+from codesign_jax import use_compilation_cache
+from codesign_jax.engines import make_engine
+from codesign_jax.optimize import DEFAULT
+from codesign_jax.scene import Scene, draws
+from codesign_jax.scene.parameters import design_space
+from scripts import search
 from scripts.shared import output, provenance, statistics
 
 DOCS = Path(__file__).parents[1] / "docs"
-STREAM = 0x74727468
-"""Root of the trials that judge ("trth")."""
-MODULUS = "hand.material.shear_modulus"
 ARMS = {"under the distribution": "drawn", "at its middle": "middle"}
-
-
-def middle(table: draws.Constants) -> list[str]:
-    """KEY=VALUE of a scene whose constants are in the middle of their distributions."""
-    scene = scenes.load(overrides=draws.nominal(table))
-    middle_scene = draws.applied(
-        scene, table, [float(entry.deviation(0.0)) for entry in table.constant]
-    )
-    law = silicones.LAWS[bool(scene.effects.neo_hookean)]
-    named = {("hand", "material", "law"): law} | draws.nominal(table)
-    words = [f"{'.'.join(path)}={value}" for path, value in named.items()]
-    if not any(word.startswith(MODULUS) for word in words):
-        words.append(f"{MODULUS}={middle_scene.hand.material.shear_modulus:.9g}")
-    for entry in table.constant:
-        if entry.change != "value" and entry.key != MODULUS:
-            words += [f"{key}={value:.9g}" for key, value in _numbers(middle_scene, entry.path)]
-    return words
-
-
-def _numbers(table: object, path: tuple[str, ...], place: str = "") -> list[tuple[str, float]]:
-    """Key paths and numbers that a key means."""
-    if not path:
-        return [(place, float(table))]  # type: ignore[arg-type]
-    if isinstance(table, tuple):
-        every = [_numbers(entry, path, f"{place}.{i}") for i, entry in enumerate(table)]
-        return [pair for pairs in every for pair in pairs]
-    where = f"{place}.{path[0]}" if place else path[0]
-    return _numbers(getattr(table, path[0]), path[1:], where)
+"""Kinds of searches by their words in the table, and names of their scenes."""
 
 
 def main() -> int:
-    parser = provenance.parser(__doc__)
-    parser.add_argument("--constants", default="unmeasured", metavar="TABLE")
-    parser.add_argument("--preset", default="full")
-    parser.add_argument("--pairs", type=int, default=30)
-    parser.add_argument("--grasps", type=int, default=600, help="that judge each design")
-    parser.add_argument("--sizes", nargs="+", default=[], metavar="FLAG", help="of optimize")
-    parser.add_argument("--out", type=Path, default=Path("runs/uncertainty"), metavar="FOLDER")
-    parser.add_argument("--figures", type=Path, default=DOCS / "figures", metavar="FOLDER")
-    parser.add_argument("--pages", action="store_true", help="fill the table into the page")
-    args = parser.parse_args()
-    table = draws.read(args.constants)
-    arms = {"drawn": ["--constants", args.constants], "middle": ["--set", *middle(table)]}
-    sizes = [word if word.isdecimal() else f"--{word}" for word in args.sizes]
-    shares = {}
-    for words, arm in ARMS.items():
-        folder = args.out / arm
-        line = ["optimize", "--preset", args.preset, "--seeds", f"0-{args.pairs - 1}"]
-        line += ["--reference-trials", "0", "--out", str(folder), *arms[arm], *sizes]
-        if code := cli.main(line):
-            return code
-        runs = sorted(p for p in folder.iterdir() if p.is_dir())
-        shares[words] = [judged(run, args) for run in runs]
-    rows, differences = compared(shares)
+    args = parse()
+    use_compilation_cache()
+    worlds = worlds_of(draws.read(args.constants))
+    start = time.monotonic()
+    studies = make_studies(worlds, args)
+    for arm, study in studies.items():
+        while not study.finished:
+            study.step()
+            study.save()  # the next command goes on here, whatever ends this one
+            seconds = time.monotonic() - start
+            print(f"{arm}: episode {study.done}/{study.marks[-1]}, {seconds:.0f} s", flush=True)
+    kept = {words: judged(studies, arm, worlds) for words, arm in ARMS.items()}
+    rows, differences = compared(kept)
     text = output.markdown(rows)
     print(text)
-    output.write_json(args.out / "uncertainty.json", {"rows": rows, **shares})
+    grasps = studies["drawn"].row()["grasps"][-1]
+    result: dict[str, Any] = {"constants": args.constants, "preset": args.preset}
+    result |= {"grasps of a search": grasps, "grasps that judge": args.grasps}
+    result |= {"seconds": round(time.monotonic() - start), "rows": rows, "kept": kept}
+    result["provenance"] = provenance.results(args.commit)
+    output.write_json(args.out / "uncertainty.json", result)
     if args.pages:
         output.fill(DOCS / "uncertainty.md", text, "pairs")
-    print(draw(shares, differences, args.figures))
+    print(draw(kept, differences, args.figures))
     return 0
 
 
-def judged(run: Path, args: argparse.Namespace) -> tuple[float, float]:
-    """Share of grasps that a run's design keeps with drawn constants, and in the middle of them."""
-    shares = []
-    words = tuple(middle(draws.read(args.constants)))
-    drawing = flags.TrialFlags(constants=args.constants)
-    for given in (drawing, flags.TrialFlags(constants="none", overrides=(words,))):
-        case = cases.case_of_run(run, overrides=common.changes(given))
-        outcome = case.simulate(args.grasps, jax.random.key(STREAM))
-        shares.append(float(verdict.kept(outcome).mean()))
-    return shares[0], shares[1]
+def parse() -> argparse.Namespace:
+    parser = provenance.parser(__doc__)
+    parser.add_argument("--constants", default="unmeasured", metavar="TABLE")
+    parser.add_argument("--preset", default=search.LIMITED)
+    parser.add_argument("--pairs", type=int, default=30)
+    parser.add_argument("--budget", type=int, default=2400, help="grasps of a search, all counted")
+    parser.add_argument("--grasps", type=int, default=400, help="that judge each design")
+    parser.add_argument("--optimizer", default=DEFAULT, help="as of scripts.search")
+    parser.add_argument("--out", type=Path, default=Path("runs/uncertainty"), metavar="FOLDER")
+    parser.add_argument("--figures", type=Path, default=DOCS / "figures", metavar="FOLDER")
+    parser.add_argument("--pages", action="store_true", help="fill the table into the page")
+    return parser.parse_args()
 
 
-def compared(shares: dict[str, list[tuple[float, float]]]) -> tuple[list[list[str]], np.ndarray]:
-    """The table, and the paired differences of the shares with drawn constants."""
+def worlds_of(table: draws.Constants) -> dict[str, Scene]:
+    """The scene with drawn constants, and with those in the middle of their distributions.
+
+    Both have the same structure, and so the same programs: in the second scene the distributions
+    have no width.
+    """
+    own: dict[Any, Any] = {("drawn",): draws.plain(table)}
+    scene = scenes.load(overrides=draws.nominal(table) | own)
+    return {"drawn": scene, "middle": dataclasses.replace(scene, drawn=middle(table))}
+
+
+def middle(table: draws.Constants) -> draws.Constants:
+    """The table with the middle of each distribution in place of the distribution."""
+    entries = []
+    for entry in table.constant:
+        if entry.mean is not None:
+            entries.append(dataclasses.replace(entry, sd=0.0))
+        else:
+            value = float(entry.middle)
+            entries.append(dataclasses.replace(entry, low=value, high=value))
+    return dataclasses.replace(table, constant=tuple(entries))
+
+
+def make_studies(worlds: dict[str, Scene], args: argparse.Namespace) -> dict[str, search.Study]:
+    """The searches of all seeds in each scene, new or from the files of the folder."""
+    space = design_space(worlds["drawn"].hand, args.preset)
+    case = search.make_case(args.optimizer, space, args.preset)
+    name = f"{args.preset}-{Path(args.constants).stem}"
+    studies = {}
+    for arm, scene in worlds.items():
+        studies[arm] = search.Study(
+            case,
+            scene,
+            make_engine("structured", scene),
+            space,
+            seeds=args.pairs,
+            budget=args.budget,
+            tests=args.grasps,
+            marks=1,
+            chunk=512 if jax.default_backend() == "cpu" else 16_384,
+            path=args.out / f"{name}-{arm}.npz",
+        )
+    # One program simulates both: its numbers are those of the scene that it gets.
+    studies["middle"].simulate = studies["drawn"].simulate
+    return studies
+
+
+def judged(
+    studies: dict[str, search.Study], arm: str, worlds: dict[str, Scene]
+) -> dict[str, list[float]]:
+    """Share of grasps that the design of each seed keeps in each scene, in the same trials."""
+    study = studies[arm]
+    last = study.marks[-1]
+    kept = {}
+    for name, scene in worlds.items():
+        # A search's own scene has judged its designs already.
+        shares = study.kept[last] if name == arm else study.judge(study.designs[last], scene)
+        kept[name] = shares.tolist()
+    return kept
+
+
+def compared(kept: dict[str, dict[str, list[float]]]) -> tuple[list[list[str]], np.ndarray]:
+    """The table, and the paired differences of the shares with drawn constants [%]."""
     rows = [["searched", "kept with drawn constants %", "the worst seed %", "kept in the middle %"]]
-    for words, pairs in shares.items():
-        drawn, at_middle = 100 * np.array(pairs).T
-        rows.append([words, f"{drawn.mean():.1f}", f"{drawn.min():.0f}", f"{at_middle.mean():.1f}"])
-    first, second = (np.array(pairs)[:, 0] for pairs in shares.values())
-    difference = 100 * (first - second)
-    interval = statistics.bootstrap(lambda rows: difference[rows].mean(-1), len(difference))
-    text = f"{difference.mean():+.1f} ({interval.low:+.1f} to {interval.high:+.1f})"
-    rows.append([f"difference, {len(difference)} pairs", text, "", ""])
-    return rows, difference
+    for words, shares in kept.items():
+        drawn = 100 * np.array(shares["drawn"])
+        at_middle = 100 * np.mean(shares["middle"])
+        rows.append([words, f"{drawn.mean():.1f}", f"{drawn.min():.0f}", f"{at_middle:.1f}"])
+    first, second = kept.values()
+    cells = []
+    for name in ("drawn", "middle"):
+        difference = 100 * (np.array(first[name]) - np.array(second[name]))
+        cells.append(with_interval(difference))
+    rows.append([f"difference, {len(first['drawn'])} pairs", cells[0], "", cells[1]])
+    return rows, 100 * (np.array(first["drawn"]) - np.array(second["drawn"]))
 
 
-def draw(shares: dict, differences: np.ndarray, folder: Path) -> Path:
+def with_interval(differences: np.ndarray) -> str:
+    """Mean of paired differences, and its interval from resampled pairs."""
+    found = statistics.bootstrap(lambda pairs: differences[pairs].mean(-1), len(differences))
+    return f"{found.value:+.1f} ({found.low:+.1f} to {found.high:+.1f})"
+
+
+def draw(kept: dict[str, dict[str, list[float]]], differences: np.ndarray, folder: Path) -> Path:
     """The kept share of each pair, one kind of search over the other."""
     figure = output.new_figure(3.6, 3.4)
     axes = figure.subplots(1, 1)
-    over, under = (100 * np.array(pairs)[:, 0] for pairs in shares.values())
-    axes.plot(under, over, "o", ms=4)
-    low = min(over.min(), under.min()) - 2
+    under, at_middle = (100 * np.array(shares["drawn"]) for shares in kept.values())
+    axes.plot(at_middle, under, "o", ms=4)
+    low = min(under.min(), at_middle.min()) - 2
     axes.plot([low, 100], [low, 100], "k", lw=0.5)
     axes.set(xlabel="kept, searched at the middle [%]", ylabel="kept, searched under all [%]")
     axes.set_title(f"{(differences > 0).sum()} of {len(differences)} pairs above", fontsize=9)

@@ -173,7 +173,9 @@ def _limits(schema: type, field: dataclasses.Field) -> tuple[str, str, str]:
         base = typing.get_origin(_base(hint)) or _base(hint)
         span = {bool: "`true`, `false`", str: "text", dict: "a table"}.get(base, "a number")
         several = [kind for kind in typing.get_args(hint) if typing.get_origin(kind) is tuple]
-        if several:
+        if base is tuple:
+            span = "groups of fingers"
+        elif several:
             groups = typing.get_origin(typing.get_args(several[0])[0]) is tuple
             span += ", or groups of fingers" if groups else ", or one for each finger"
     return limits.get("unit", ""), span, _default(field)

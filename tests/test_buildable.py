@@ -1,15 +1,16 @@
 """What can be built as a constraint of a search: closed forms, every optimiser, each limit off."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from codesign_jax import codesign, optimize, scene, stress
+from codesign_jax import codesign, control, optimize, rollout, scene, stress
 from codesign_jax.model import morphology
-from codesign_jax.scene import InputError, parameters, silicones
+from codesign_jax.scene import InputError, buildable, parameters, silicones
 
 PAPER = scene.load("paper")
 SPACE = parameters.design_space(PAPER.hand, "23d")
@@ -230,4 +231,102 @@ def test_bad_limits_are_refused(changes, expected):
     limits = {f"limits.{name}": value for name, value in changes.items()}
     with pytest.raises(InputError) as error:
         parameters.design_space(scene.load("paper", overrides=limits).hand)
+    assert expected in str(error.value)
+
+
+# --- pressure lines ------------------------------------------------------------------------------
+
+
+def with_valves(**valves):
+    own = {f"hand.valves.{name}": value for name, value in valves.items()}
+    made = scene.load("paper", overrides=own)
+    return made, parameters.design_space(made.hand, "23d")
+
+
+@pytest.mark.parametrize(
+    ("pressures", "highest", "lines", "expected"),
+    [
+        ([10, 90, 20, 80], [100] * 4, 2, [15, 85, 15, 85]),
+        ([10, 90, 20, 80], [100] * 4, 3, [10, 85, 20, 85]),  # as near as [15, 90, 15, 80]
+        ([10, 90, 20, 80], [100, 90, 18, 82], 1, [18] * 4),
+        ([10, 90, 20, 80], [100, 90, 20, 82], 2, [15, 82, 15, 82]),
+        ([50, 50, 50, 50], [50.0] * 4, 2, [50] * 4),
+        ([30, 10, 10, 30], [40.0] * 4, 3, [30, 10, 10, 30]),
+    ],
+)
+def test_fingers_share_the_nearest_pressures(pressures, highest, lines, expected):
+    found = buildable.on_lines(jnp.array(pressures, float), jnp.array(highest, float), lines)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_fingers_of_lines_are_those_of_the_nearest_groups():
+    """Against all ways to put five fingers on lines, where no limit interferes."""
+    random = np.random.default_rng(1)
+    for lines in (2, 3):
+        for pressures in random.random((20, 5)):
+            found = np.asarray(buildable.on_lines(jnp.asarray(pressures), jnp.ones(5), lines))
+            least = np.inf
+            for line in itertools.product(range(lines), repeat=5):
+                means = [pressures[np.equal(line, k)].mean() for k in line]
+                least = min(least, np.square(pressures - means).sum())
+            assert len(np.unique(found)) == lines
+            assert np.square(found - pressures).sum() == pytest.approx(least, rel=1e-4)
+
+
+def test_searched_lines_limit_the_pressures_of_each_proposal():
+    for lines in (2, 3):
+        made, space = with_valves(lines=lines)
+        designs = drawn(space)
+        pressures = designs[:, columns("pressure")]
+        assert {len(np.unique(row)) for row in pressures} <= {*range(1, lines + 1)}
+        np.testing.assert_array_equal(projected(space, designs), designs)
+        for params in each_params(space, designs[:40]):
+            assert stress.of_design(made, params) == []
+        # Every pair of fingers shares a line in some design.
+        for i, j in itertools.combinations(range(4), 2):
+            assert (pressures[:, i] == pressures[:, j]).any()
+    with pytest.warns(UserWarning, match="1 of 1 designs with more pressures than the hand's 3"):
+        space.check(np.where(np.arange(23) == columns("pressure")[0], 7e3, drawn(SPACE, 1)))
+
+
+def test_fingers_of_one_line_get_the_same_pressure_course():
+    made, space = with_valves(groups=[[0, 1], [2, 3]])
+    assert [n for n in space.names if "pressure" in n] == ["pressure[0+1]", "pressure[2+3]"]
+    params = space.params(space.default())._replace(pressure=jnp.array([9e4, 9e4, 7e4, 7e4]))
+    course = np.asarray(control.commands(made, params, rollout.nominal_trial(made)))[:, -4:]
+    np.testing.assert_array_equal(course[:, 0], course[:, 1])
+    np.testing.assert_array_equal(course[:, 2], course[:, 3])
+    assert course[:, 0].max() == pytest.approx(9e4) and course[:, 2].max() == pytest.approx(7e4)
+    # One line is a group of all fingers, as a preset with `tied = true` has it.
+    one = with_valves(lines=1)[1]
+    assert one.num_parameters == 20 and "pressure" in one.names
+    np.testing.assert_array_equal(drawn(one), drawn(with_valves(groups=[[0, 1, 2, 3]])[1]))
+    # As many lines as fingers are those of a hand without the table, and no line is simulated.
+    four = with_valves(lines=4)
+    np.testing.assert_array_equal(drawn(four[1]), drawn(SPACE))
+    assert four[0].structure == made.structure == PAPER.structure
+
+
+@pytest.mark.parametrize(
+    ("hand", "changes", "expected"),
+    [
+        ("pneuflex4", {"lines": 5}, "lines = 5 must be at most 4, the fingers"),
+        ("pneuflex4", {"lines": 0}, "lines = 0 is outside [1, 100]"),
+        ("pneuflex4", {"lines": 2, "groups": [[0, 1]]}, "not both"),
+        ("pneuflex4", {"groups": [[0, 7]]}, "fingers are numbered from 0 to 3"),
+        ("pneuflex4", {"groups": [[0, 1], [1, 2]]}, "a finger is in one group only"),
+        ("pneuflex4", {"groups": [[0]]}, "a group has two or more fingers"),
+        ("pneuflex4", {"line": 2}, "did you mean 'hand.valves.lines'?"),
+        ("thumb4", {"groups": [[2, 3]]}, "fixes unlike pressures of fingers [2, 3] of one line"),
+        ("two_stage", {"groups": [[1, 2]]}, "fingers [1, 2] may share a pressure line, and have"),
+        ("two_stage", {"lines": 2}, "give hand.valves.groups in place of lines"),
+    ],
+)
+def test_bad_lines_are_refused(hand, changes, expected):
+    own = {f"hand.valves.{name}": value for name, value in changes.items()}
+    if hand == "two_stage":
+        own["control"] = hand
+        hand = "pneuflex4"
+    with pytest.raises(InputError) as error:
+        parameters.design_space(scene.load("paper", hand_name=hand, overrides=own).hand, "2d")
     assert expected in str(error.value)

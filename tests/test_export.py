@@ -617,6 +617,39 @@ def by_toy(toy, tmp_path, monkeypatch):
     monkeypatch.setattr(cases, "make_engine", lambda name, the_scene: toy)
 
 
+def test_lines_are_what_is_bought_and_played(page, tmp_path):
+    """Three lines of four fingers: two share one, whose regulator fills both."""
+    the_scene, params, sizes, _ = page
+    params = params._replace(
+        wall=np.array([0.005, 0.005, 0.005, 0.004]),
+        pressure=np.array([1.2e5, 9e4, 1.1e5, 1.2e5]),
+    )
+    alone = 60 * 0.01 * 120 / 1.5 / 101.325
+    for own in (hand.Valves(groups=((0, 3),)), hand.Valves(lines=3)):
+        shared = dataclasses.replace(
+            the_scene, hand=dataclasses.replace(the_scene.hand, valves=own)
+        )
+        assert valves.lines(shared, params) == [(0, 3), (1,), (2,)]
+        bought = {
+            r[0]: r[1:] for r in shopping.section(shared, params, sizes, Process(), None).rows
+        }
+        for part in ("pressure regulators", "relief valves", "dump valves", "analog outputs"):
+            assert bought[part][0] == "3", part
+        assert f"{2 * alone:.1f} l/min" in bought["pressure regulators"][1]
+        assert bought["branches"] == ("1", "of a regulator's tube, with 2 outlets")
+        assert "line 0 (fingers 0, 3) 160, finger 1 200" in bought["relief valves"][1]
+        rows, limits = play_valves.read(valves.write(tmp_path, shared, params))
+        assert max(row[1:] for row in rows) == pytest.approx([120, 90, 110])
+        assert limits == pytest.approx([160, 200, 200], abs=1e-3)
+        sections = {s.title: s for s in sheet.sheet_sections(shared, params, sizes, None)}
+        assert sections["Valves"].head[1:3] == ("line 0 (fingers 0, 3) kPa", "finger 1 kPa")
+    two = dataclasses.replace(
+        the_scene, hand=dataclasses.replace(the_scene.hand, valves=hand.Valves(lines=2))
+    )
+    with pytest.raises(InputError, match="the design needs 3 pressure lines"):
+        valves.lines(two, params)
+
+
 def test_command_writes_the_sheet(tmp_path, capsys, by_toy, monkeypatch):
     assert cli.main([*TOY, "--out", str(tmp_path / "plain")]) == 0
     output = capsys.readouterr().out

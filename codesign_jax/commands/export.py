@@ -40,6 +40,7 @@ def main(options: Export) -> int:
         notes.append(f"commands are those of the key frames: policy {case.policy} is left out")
     if options.tolerances != common.OFF and not options.no_sheet:
         case.make_engine()  # refuses the scene before anything is written
+    valves.lines(case.scene, params)  # refuses a design of more lines than the hand has
     console = Console()
     if options.run_folder:
         console.print(f"best final design of {options.run_folder}")

@@ -84,7 +84,7 @@ def idle_fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> list[st
             sentences.append(
                 f"finger {i} does next to nothing: {size.length:.0f} mm long, it bends by "
                 f"{np.degrees(angle):.0f}° and moves its tip by {travel:.1f} mm. It may be left "
-                "out, with its seat empty and its column of valves.csv unused; the simulation "
+                "out, with its seat empty and its tube plugged; the simulation "
                 "has it"
             )
     return sentences
@@ -337,28 +337,34 @@ def _rests(scene: Scene, sizes: Sequence[Size], height: float) -> str:
 def _valves(scene: Scene, params: Params) -> SheetSection:
     rows = [
         (f"{time:g}", *(f"{p:.1f}" for p in pressures))
-        for time, *pressures in valves.key_pressures(scene, params)
+        for time, *pressures in valves.line_pressures(scene, params)
     ]
-    head = ("time s", *(f"finger {i} kPa" for i in range(scene.num_fingers)))
+    names = [valves.name_of(*line) for line in enumerate(valves.lines(scene, params))]
+    head = ("time s", *(f"{name} kPa" for name in names))
     notes = [
         f"Gauge pressures, linear between rows; the same table: {valves.VALVES}. "
         f"`python {valves.PLAYER.name} --port PORT` sends it to regulators over a serial line, a "
-        "line for each 50 ms: the time in s and a pressure in kPa for each finger, with commas "
+        "line for each 50 ms: the time in s and a pressure in kPa for each column, with commas "
         "between. Without --port it writes to standard output; --help has the rest. Where "
         "`codesign finger MEASURED.csv --fit` gave a moment of less than the model's, add "
         "`--divide` with that number: the real finger needs more pressure.",
         _margin(scene, params),
     ]
+    if len(names) < scene.num_fingers:
+        notes.append(
+            "Fingers of one line hang on one regulator, by tubes of equal length from a branch. "
+            "The players call a line by its number here, as `finger`."
+        )
     return SheetSection("Valves", head, rows, notes)
 
 
 def _margin(scene: Scene, params: Params) -> str:
-    """How far the walls' limits let each finger's pressure be raised."""
-    limits = np.asarray(morphology.pressure_limits(scene.hand, params)) / 1e3
-    highest = valves.key_pressures(scene, params)[:, 1:].max(0)
+    """How far the walls' limits let each line's pressure be raised."""
+    limits = valves.line_limits(scene, params)
+    highest = valves.line_pressures(scene, params)[:, 1:].max(0)
+    names = [valves.name_of(*line) for line in enumerate(valves.lines(scene, params))]
     shares = [
-        f"{p / limit:.2f} (finger {i})"
-        for i, (p, limit) in enumerate(zip(highest, limits, strict=True))
+        f"{p / limit:.2f} ({name})" for name, p, limit in zip(names, highest, limits, strict=True)
     ]
     return (
         f"Smallest `--divide` that the walls' limits allow: {', '.join(shares)}. A smaller one is "

@@ -8,7 +8,6 @@ import numpy as np
 from codesign_jax.export import silicone, valves
 from codesign_jax.export.process import BACK, Printed, Process, Size, inlet
 from codesign_jax.export.sheet import SheetSection
-from codesign_jax.model import morphology
 from codesign_jax.scene import Scene
 from codesign_jax.scene.silicones import Silicone
 from codesign_jax.types import Params
@@ -34,9 +33,9 @@ PLASTIC = 1.24e-3
 ENGAGED = 8.0
 """Length of thread in the flange that is aimed at [mm] [chosen], within half a step of 5 mm."""
 LEFT_OUT = (
-    "A finger that is left out: plug its tube at the regulator and leave its channel at 0 V, cover "
-    "its seat, and add its mass (table 'Fingers') to the ballast: without it the wrist sags less "
-    "than in the simulation."
+    "A finger that is left out: plug its tube at the regulator, whose channel stays at 0 V if no "
+    "other finger is on its line, cover its seat, and add its mass (table 'Fingers') to the "
+    "ballast: without it the wrist sags less than in the simulation."
 )
 """How to build a hand without one of its fingers."""
 BITS = 12
@@ -154,21 +153,23 @@ def _workshop(
 
 def _safety(scene: Scene, params: Params) -> list[tuple[str, str, str]]:
     """What keeps a failed regulator from bursting a finger, and the air from staying in it."""
-    count = str(scene.num_fingers)
-    limits = 1e-3 * morphology.pressure_limits(scene.hand, params)
-    words = ", ".join(f"finger {i} {limit:.0f}" for i, limit in enumerate(limits))
+    limits = valves.line_limits(scene, params)
+    count = str(len(limits))
+    names = [valves.name_of(*line) for line in enumerate(valves.lines(scene, params))]
+    pairs = zip(names, limits, strict=True)
+    words = ", ".join(f"{name} {limit:.0f}" for name, limit in pairs)
     return [
         (
             "relief valves",
             count,
-            "between regulator and finger, open below the finger's limit in kPa: "
+            "between regulator and fingers, open below the fingers' limit in kPa: "
             f"{words}; and above its highest pressure of the table 'Valves'. The supply is above "
             "the limits, and a failed regulator passes it on",
         ),
         (
             "dump valves",
             count,
-            "2/2, 24 V, normally open, between regulator and finger, to the open air: some "
+            "2/2, 24 V, normally open, between regulator and fingers, to the open air: some "
             "regulators hold their outlet pressure without power (check with the maker)",
         ),
         ("goggles", "1 a person", "wherever a finger is under pressure, also in leak tests"),
@@ -200,16 +201,21 @@ def _air(
     widths = _widths(sizes, process)
     highest = _highest(scene, params)
     flow = flows(scene, params, sizes)
+    lines = valves.lines(scene, params)
+    regulators = str(len(lines))
+    largest = max(float(flow[[*fingers]].sum()) for fingers in lines)
     fittings = f"for tube of {widths}, with the regulators' thread, or reducers from their tube"
     return [
         ("tube", f"{TUBE * count:g} m", f"polyurethane, outer diameter {widths} (--inlet)"),
         ("push-in fittings", str(count), fittings),
-        ("pressure regulators", str(count), _regulator(highest, float(flow.max()))),
+        ("pressure regulators", regulators, _regulator(highest, largest)),
         (
             "manifold",
             "1",
-            f"one inlet, {count} outlets to the regulators, tube of 6 mm between them [chosen]",
+            f"one inlet, {regulators} outlets to the regulators, tube of 6 mm between them "
+            "[chosen]",
         ),
+        *_branches(lines),
         (
             "air preparation",
             "1",
@@ -225,6 +231,15 @@ def _air(
     ]
 
 
+def _branches(lines: Sequence[Sequence[int]]) -> list[tuple[str, str, str]]:
+    """Branches of the tubes to fingers that share a pressure line."""
+    shared = [len(fingers) for fingers in lines if len(fingers) > 1]
+    if not shared:
+        return []
+    outlets = ", ".join(map(str, shared))
+    return [("branches", str(len(shared)), f"of a regulator's tube, with {outlets} outlets")]
+
+
 def _range(scene: Scene, params: Params) -> float:
     """End of the regulators' range [kPa]."""
     highest = _highest(scene, params)
@@ -232,7 +247,7 @@ def _range(scene: Scene, params: Params) -> float:
 
 
 def _electric(scene: Scene, params: Params) -> list[tuple[str, str, str]]:
-    count = scene.num_fingers
+    count = len(valves.lines(scene, params))
     step = _range(scene, params) / 2**BITS
     return [
         (
@@ -271,11 +286,17 @@ def _firmware(scene: Scene, params: Params) -> str:
     top = _range(scene, params)
     return (
         "Program of the controller: read a line up to its line feed, split it at the commas; the "
-        f"first cell is the time, cell k + 1 the pressure of finger k. Set output k to {SIGNAL:g} "
-        f"V x pressure / {top:g} kPa (regulators of 0 to {top:g} kPa at 0 to {SIGNAL:g} V), never "
-        "above the finger's limit of the table 'Fingers'. Set all outputs to 0 V when no line has "
-        "come for 0.5 s, and at the start."
+        f"first cell is the time, cell k + 1 the pressure of {_columns(scene, params)}. Set output "
+        f"k to {SIGNAL:g} V x pressure / {top:g} kPa (regulators of 0 to {top:g} kPa at 0 to "
+        f"{SIGNAL:g} V), never above its limit at the head of valves.csv. Set all outputs to 0 V "
+        "when no line has come for 0.5 s, and at the start."
     )
+
+
+def _columns(scene: Scene, params: Params) -> str:
+    """What column k of the table of pressures is, in words."""
+    several = len(valves.lines(scene, params)) < scene.num_fingers
+    return "line k" if several else "finger k"
 
 
 def _silicone(scene: Scene) -> str:
@@ -303,7 +324,7 @@ def _regulator(highest: float, flow: float) -> str:
     top = next((v for v in RANGES if v >= highest), None)
     model = {100: "SMC ITV0010", 500: "SMC ITV0030", 900: "SMC ITV0050"}.get(top or 0)
     text = (
-        f"proportional, electronic, 24 V, input 0 to {SIGNAL:g} V, a channel for each finger, up "
+        f"proportional, electronic, 24 V, input 0 to {SIGNAL:g} V, a channel each, up "
         f"to {highest:.0f} kPa, {flow:.1f} l/min (ANR) or more, vents as well"
     )
     return f"{text}; such as {model} (0 to {top:g} kPa)" if model else text

@@ -1,12 +1,13 @@
 """Pressures of the key frames as a short table, and the program that sends them to regulators."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from codesign_jax.export.tables import write_table
 from codesign_jax.model import morphology
-from codesign_jax.scene import Scene, key_frames
+from codesign_jax.scene import InputError, Scene, key_frames
 from codesign_jax.types import Params
 
 VALVES = "valves.csv"
@@ -40,16 +41,58 @@ def key_pressures(scene: Scene, params: Params) -> np.ndarray:
     return np.array(rows)
 
 
+def lines(scene: Scene, params: Params) -> list[tuple[int, ...]]:
+    """Fingers of each pressure line; the first fingers of the lines ascend.
+
+    Raises:
+      InputError: If the design has more pressures than the hand has lines.
+    """
+    count = scene.num_fingers
+    valves = scene.hand.valves
+    if most := valves.searched(count):
+        courses: dict[tuple[float, ...], list[int]] = {}
+        for finger, course in enumerate(key_pressures(scene, params)[:, 1:].T):
+            courses.setdefault(tuple(np.round(course, 4)), []).append(finger)
+        groups = [tuple(fingers) for fingers in courses.values()]
+        if len(groups) > most:
+            words = f"the design needs {len(groups)} pressure lines, and the hand has valves.lines"
+            raise InputError([f"{words} = {most}"])
+        return groups
+    shared = valves.known(count)
+    others = {*range(count)} - {k for group in shared for k in group}
+    return sorted([*shared, *((k,) for k in others)], key=min)
+
+
+def name_of(line: int, fingers: Sequence[int]) -> str:
+    """A line's name on the build sheet: that of its finger, or its number and its fingers."""
+    if len(fingers) == 1:
+        return f"finger {fingers[0]}"
+    return f"line {line} (fingers {', '.join(map(str, fingers))})"
+
+
+def line_pressures(scene: Scene, params: Params) -> np.ndarray:
+    """Time [s] and commanded pressure of each line [kPa], shape (row, 1 + line)."""
+    first = [min(fingers) for fingers in lines(scene, params)]
+    rows = key_pressures(scene, params)
+    return rows[:, [0, *(1 + k for k in first)]]
+
+
+def line_limits(scene: Scene, params: Params) -> np.ndarray:
+    """Limit of each line's pressure by the walls of its fingers [kPa], shape (line,)."""
+    limits = 1e-3 * np.asarray(morphology.pressure_limits(scene.hand, params))
+    return np.array([limits[[*fingers]].min() for fingers in lines(scene, params)])
+
+
 def _times(scene: Scene, params: Params) -> np.ndarray:
     return np.asarray(key_frames.times(scene, params)) + scene.phases.settle
 
 
 def write(folder: Path, scene: Scene, params: Params) -> Path:
-    """Writes the table with the limits of the fingers' walls, and the program beside it."""
-    limits = 1e-3 * np.asarray(morphology.pressure_limits(scene.hand, params))
-    head = ["time_s", *(f"pressure_{i}_kPa" for i in range(scene.num_fingers))]
+    """Writes the table with the limits of the lines' walls, and the program beside it."""
+    limits = line_limits(scene, params)
+    head = ["time_s", *(f"pressure_{i}_kPa" for i in range(len(limits)))]
     # Rounded upwards in the fourth digit behind the point: a pressure at its limit stays legal.
     rows = [["# limit kPa", *(f"{v + 5e-4:.3f}" for v in limits)], head]
-    rows += [[f"{v:.9g}" for v in row] for row in key_pressures(scene, params)]
+    rows += [[f"{v:.9g}" for v in row] for row in line_pressures(scene, params)]
     (folder / PLAYER.name).write_text(PLAYER.read_text(encoding="utf-8"), encoding="utf-8")
     return write_table(folder / VALVES, rows[0], rows[1:])

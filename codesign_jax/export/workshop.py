@@ -171,12 +171,14 @@ _MOUNTING = (
     "lies on the table with the wrist undeflected; x = y = 0 is the object's place. Turn by "
     "+20° of roll, yaw and pitch, each alone, and compare with the drawing before anything "
     "else moves.",
-    "Valves: finger 0 on channel 0 and so on. First play the pressures alone, with the hand in "
+)
+_PLAYING = (
+    "Valves: {channels}. First play the pressures alone, with the hand in "
     "the air: python play_hand.py --no-arm --valves PORT. Then drive the arm by its own slow "
     "move to the first row of commands_still.csv, and play it without pressure and without an "
     "object: python play_hand.py --no-valves --arm HOST:PORT --slow 4. Then both without an "
     "object, at last with one, and only then at full speed: python play_hand.py --valves PORT "
-    "--arm HOST:PORT. Nobody within the arm's reach, goggles on, a hand on the emergency stop.",
+    "--arm HOST:PORT. Nobody within the arm's reach, goggles on, a hand on the emergency stop."
 )
 
 
@@ -229,7 +231,10 @@ def _order(
     mounting = _MOUNTING
     if printed is None:
         mounting = ("Fix each finger to a palm of your own (--no-parts).", *mounting[1:])
-    steps = (*_casting_steps(scene, tests, pinned=pinned), *mounting)
+    lines = enumerate(valves.lines(scene, params))
+    channels = ", ".join(f"{valves.name_of(*line)} on channel {line[0]}" for line in lines)
+    casting = _casting_steps(scene, tests, pinned=pinned)
+    steps = (*casting, *mounting, _PLAYING.format(channels=channels))
     marks = f"[maker]: from {silicone.SOURCE}; [chosen]: ours. Moulds: the drawing of {NAME}.pdf."
     notes = [marks, *(f"{k}. {step}" for k, step in enumerate(steps, 1))]
     return SheetSection("Order of work", (), [], notes)

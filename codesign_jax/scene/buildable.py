@@ -6,6 +6,7 @@ differentiable wherever it is not exactly at a limit.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -161,6 +162,40 @@ def rim_drop(radius: Any, roll: Any, pitch: Any, yaw: Any) -> Any:
     """How far the rim of a palm is below its centre [m], by the arm's angles [rad], any shape."""
     up = jnp.cos(roll) * jnp.cos(pitch) + jnp.sin(roll) * jnp.sin(yaw) * jnp.sin(pitch)
     return radius * jnp.sqrt(jnp.maximum(1 - up**2, FLAT))
+
+
+def on_lines(pressures: Any, highest: Any, lines: int) -> Any:
+    """The nearest pressures of fingers that share so many pressure lines [Pa], shape (finger,).
+
+    A line has the mean of its fingers' pressures, or the lowest of their highest ones. The fingers
+    of a line follow one another in the order of their pressures, as the nearest groups of numbers
+    do (W. D. Fisher, On grouping for maximum homogeneity, J. Am. Stat. Assoc. 53, 1958), and all
+    groups of that kind are compared.
+
+    Args:
+      pressures: Pressures of the fingers [Pa], none above its highest, shape (finger,).
+      highest: Highest pressures of the fingers [Pa], shape (finger,).
+      lines: Number of lines, at most that of the fingers.
+    """
+    count = len(pressures)
+    order = jnp.argsort(pressures)
+    sorted_pressures = pressures[order]
+    sorted_highest = highest[order]
+    candidates = []
+    for cuts in itertools.combinations(range(1, count), lines - 1):
+        lengths = np.diff([0, *cuts, count])
+        parts = np.split(np.arange(count), cuts)
+        values = [_of_line(sorted_pressures[part], sorted_highest[part]) for part in parts]
+        candidates.append(jnp.repeat(jnp.stack(values), lengths, total_repeat_length=count))
+    groupings = jnp.stack(candidates)
+    nearest = jnp.square(groupings - sorted_pressures).sum(-1).argmin()
+    return jnp.zeros_like(pressures).at[order].set(groupings[nearest])
+
+
+def _of_line(pressures: Any, highest: Any) -> Any:
+    """Pressure of the line of some fingers [Pa]; equal pressures stay what they are."""
+    mean = pressures[0] + (pressures - pressures[0]).mean()
+    return jnp.minimum(mean, highest.min())
 
 
 def _smaller(first: Any, second: Any) -> Any:

@@ -30,6 +30,7 @@ from codesign_jax.scene.hand_tables import (
     Preset,
     PressureLimit,
     Section,
+    Valves,
     Wrist,
     highest_pressure,
     per_finger,
@@ -44,6 +45,7 @@ def structure(hand: Hand) -> Hand:
         description="",
         parameter=(),
         preset=(),
+        valves=Valves(),
         buildable=None,
         pressure_limit=PressureLimit(0.0),
         material=dataclasses.replace(hand.material, silicone=None, law=None),
@@ -68,6 +70,7 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Han
         problems.append(f"{path.name}.finger must name at least one finger")
     elif hand is not None:
         _check_mounts(hand, path.name, problems)
+        problems += valve_problems(hand.valves, len(hand.finger), f"{path.name}.valves")
         rows = _check_table(hand, path.name, problems)
         _check_presets(hand, rows, path.name, problems)
         if not problems:
@@ -226,7 +229,11 @@ def _check_free(free: Free, row: Parameter, path: str, hand: Hand, problems: lis
                 f"{path}.{name} = {list(value)} must be a number [{row.unit}]: "
                 "tied = true gives all fingers one value"
             )
-    if problem := _group_problem(free, hand.width(row)):
+    width = hand.width(row)
+    if width == 1 and not isinstance(free.tied, bool):
+        problems.append(f"{path}.tied: {free.name} is one value, which no groups of fingers share")
+        return
+    if not isinstance(free.tied, bool) and (problem := group_problem(free.tied, width)):
         problems.append(f"{path}.tied: {problem}")
         return
     for low, high in dict.fromkeys(zip(*free.bounds(row, hand.width(row)), strict=True)):
@@ -234,14 +241,22 @@ def _check_free(free: Free, row: Parameter, path: str, hand: Hand, problems: lis
             problems.append(f"{path}: low {low:g} must be below high {high:g}")
 
 
-def _group_problem(free: Free, count: int) -> str:
-    """Why the groups of fingers that share a value are none, or nothing."""
-    if isinstance(free.tied, bool):
-        return ""
-    members = [k for group in free.tied for k in group]
-    if count == 1:
-        return f"{free.name} is one value, which no groups of fingers share"
-    if any(len(group) < 2 for group in free.tied):
+def valve_problems(valves: Valves, fingers: int, where: str) -> list[str]:
+    """What is wrong with the pressure lines of a hand with so many fingers."""
+    problems = []
+    if valves.lines is not None and valves.groups is not None:
+        problems.append(f"{where}: give the number of lines, or the groups of fingers, not both")
+    if valves.lines is not None and valves.lines > fingers:
+        problems.append(f"{where}.lines = {valves.lines} must be at most {fingers}, the fingers")
+    if valves.groups is not None and (found := group_problem(valves.groups, fingers)):
+        problems.append(f"{where}.groups: {found}")
+    return problems
+
+
+def group_problem(groups: tuple[tuple[int, ...], ...], count: int) -> str:
+    """Why groups among `count` fingers that share something are none, or nothing."""
+    members = [k for group in groups for k in group]
+    if any(len(group) < 2 for group in groups):
         return "a group has two or more fingers"
     if any(not 0 <= k < count for k in members):
         return f"fingers are numbered from 0 to {count - 1}"
@@ -321,6 +336,7 @@ __all__ = [
     "Preset",
     "PressureLimit",
     "Section",
+    "Valves",
     "Wrist",
     "highest_pressure",
     "load",

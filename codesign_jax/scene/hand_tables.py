@@ -239,6 +239,35 @@ class PressureLimit:
         return self.per_wall * wall
 
 
+@dataclasses.dataclass(frozen=True)
+class Valves:
+    """Pressure lines, each with a regulator and a valve: fingers of one line have one pressure.
+
+    A search finds which fingers share one of so many `lines`, or the `groups` say it.  Without
+    either each finger has a line of its own.  They bound the design space, not the simulation.
+
+    Attributes:
+      lines: Number of lines, at most that of the fingers; instead of `groups`.
+      groups: Fingers that share a line, such as [[0, 3], [1, 2]], counted from 0; a finger of no
+        group has its own line.
+    """
+
+    lines: int | None = quantity("", 1, 100, structure=True, default=None)
+    groups: tuple[tuple[int, ...], ...] | None = None
+
+    def known(self, count: int) -> tuple[tuple[int, ...], ...]:
+        """Groups among `count` fingers that share a line in every design."""
+        if self.lines == 1 and count > 1:
+            return (tuple(range(count)),)
+        return self.groups or ()
+
+    def searched(self, count: int) -> int:
+        """Number of lines onto which a search puts `count` fingers; 0 if that is known."""
+        if self.lines is None or not 1 < self.lines < count:
+            return 0
+        return self.lines
+
+
 def highest_pressure(hand: "Hand", wall: Any, tip: Any = None) -> Any:
     """Highest pressure of fingers of a wall [m], any shape [Pa].
 
@@ -295,6 +324,16 @@ class Free:
         others = {*range(count)} - {k for group in given for k in group}
         return sorted([*given, *((k,) for k in others)], key=min)
 
+    def joined(self, groups: tuple[tuple[int, ...], ...], count: int) -> "Free":
+        """The parameter where further groups among `count` values are tied."""
+        parts = [{*group} for group in self.groups(count)]
+        for group in groups:
+            touched = [part for part in parts if part & {*group}]
+            parts = [part for part in parts if part not in touched]
+            parts.append({*group}.union(*touched))
+        tied = tuple(tuple(sorted(part)) for part in parts if len(part) > 1)
+        return dataclasses.replace(self, tied=tied)
+
 
 @dataclasses.dataclass(frozen=True)
 class Preset:
@@ -348,6 +387,7 @@ class Hand:
     parameter: tuple[Parameter, ...]
     pressure_limit: PressureLimit
     preset: tuple[Preset, ...] = ()
+    valves: Valves = Valves()
     # What `[limits]` of a scene makes of it; see `buildable.Buildable`.
     buildable: Any = dataclasses.field(default=None, metadata={"in_file": False})
 

@@ -407,7 +407,28 @@ def check(scene: Any, where: str) -> list[str]:
     problems = [*_falling(scene.control.frame, fixed | ranges, where)]
     for low, high, limits in _walls(scene.hand):
         problems += _too_high(scene.control.frame, ranges, low, high, limits, where)
+    problems += _unlike_lines(scene.control, scene.hand, where)
     return list(dict.fromkeys(problems))
+
+
+def _unlike_lines(control: Control, hand: Hand, where: str) -> Iterator[str]:
+    """Fingers of one pressure line whose pressures differ."""
+    count = len(hand.finger)
+    groups = hand.valves.known(count)
+    hint = ""
+    if hand.valves.searched(count):
+        groups = (tuple(range(count)),)
+        hint = "; give hand.valves.groups in place of lines"
+        for row in control.parameter:
+            if row.per == "finger":
+                yield f"{where}.parameter {row.name}: fingers may share a pressure line{hint}"
+    for i, frame in enumerate(control.frame):
+        for group in groups:
+            if frame.pressure is not None and len({frame.pressure[k] for k in group}) > 1:
+                words = (
+                    f"fingers {list(group)} may share a pressure line, and have unlike pressures"
+                )
+                yield f"{where}.frame[{i}].pressure: {words}{hint}"
 
 
 def doubts(scene: Any, where: str) -> list[str]:

@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.scene import schema, unit_slips
-from codesign_jax.scene.buildable import Buildable
+from codesign_jax.scene.buildable import Buildable, on_lines
 from codesign_jax.scene.hand import UNITS, Free, Hand, Parameter, Preset, structure
 from codesign_jax.scene.hand_tables import PARAMETERS, TIP, highest_pressure, per_finger
 from codesign_jax.types import Params, Tip
@@ -138,7 +138,8 @@ class DesignSpace:
     def project(self, design: jax.typing.ArrayLike) -> jax.Array:
         """The nearest design that a search may propose, parameter by parameter.
 
-        Free pressures are lowered under their limit p_i < per_wall * d_i (Table I). Where limits of
+        Free pressures are lowered under their limit p_i < per_wall * d_i (Table I), and fingers
+        that share a pressure line get one; see `buildable.on_lines`. Where limits of
         the scene hold, those lower them further, lengths and angles of the arm are clipped to the
         box, and the arm is raised; see `buildable`.
 
@@ -224,6 +225,11 @@ class DesignSpace:
                 f"{above} of {len(rows)} designs with a pressure above the limit of the wall, to "
                 "which space.project lowers it"
             )
+        if several := self._off_the_lines(rows):
+            problems.append(
+                f"{several} of {len(rows)} designs with more pressures than the hand's "
+                f"{self.hand.valves.lines} lines, which space.project groups"
+            )
         if problems:
             text = f"designs that are not legal, simulated all the same: {'; '.join(problems)}"
             warnings.warn(text, stacklevel=3)
@@ -246,11 +252,23 @@ class DesignSpace:
         ends = zip(self.names, units, low, high, rows.T, strict=True)
         return [problem for end in ends if (problem := unit_slips.outside(*end))]
 
-    def _above_the_limit(self, rows: np.ndarray) -> int:
-        """Number of designs [SI], shape (design, parameter), with a pressure above its limit."""
+    def _values_of(self, rows: np.ndarray) -> "_Values":
+        """Values by name of designs [SI], shape (design, parameter)."""
         source = np.asarray(self.source)
         full = np.where(source >= 0, rows[:, np.maximum(source, 0)], np.asarray(self.base))
-        values = _Values(self, full)
+        return _Values(self, full)
+
+    def _off_the_lines(self, rows: np.ndarray) -> int:
+        """Number of designs [SI], shape (design, parameter), with more pressures than lines."""
+        lines = self.hand.valves.searched(len(self.hand.finger))
+        if not lines:
+            return 0
+        pressures = np.sort(self._values_of(rows)("pressure"))
+        return int(((np.diff(pressures) > 0).sum(1) >= lines).sum())
+
+    def _above_the_limit(self, rows: np.ndarray) -> int:
+        """Number of designs [SI], shape (design, parameter), with a pressure above its limit."""
+        values = self._values_of(rows)
         # A pressure at its limit is a legal one, also as a float32.
         above = values("pressure") > _caps(self.hand, values) * (1 + 1e-6)
         return int(above.any(1).sum())
@@ -331,7 +349,22 @@ def _projected(space: DesignSpace, design: jax.Array) -> jax.Array:
     for i, j in enumerate(values.places("pressure")):
         if j >= 0:
             design = design.at[j].min(caps[i] * _STRICT)
+    design = _on_lines(space, design, caps * _STRICT)
     return design if space.buildable is None else _raised(space, design)
+
+
+def _on_lines(space: DesignSpace, design: jax.Array, highest: jax.Array) -> jax.Array:
+    """A design whose fingers share the hand's pressure lines, where a search chooses by which.
+
+    Args:
+      highest: Highest pressures of the fingers [Pa], shape (finger,).
+    """
+    values = _Values(space, space.expand(design))
+    places = np.array(values.places("pressure"))
+    lines = space.hand.valves.searched(len(places))
+    if not lines or (places < 0).any():
+        return design
+    return design.at[places].set(on_lines(design[places], highest, lines))
 
 
 def _lengthened(space: DesignSpace, design: jax.Array) -> jax.Array:
@@ -506,9 +539,11 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
             continue  # those of the control are free in every preset
         if row.name in idle:
             continue
-        spec = free.get(row.name, Free(row.name))
         factor = UNITS[row.unit][1]
         width = hand.width(row)
+        spec = free.get(row.name, Free(row.name))
+        if width > 1 and UNITS[row.unit][0] == "Pa":
+            spec = spec.joined(hand.valves.known(width), width)
         low, high = spec.bounds(row, width)
         for group in spec.groups(width):
             source[[offsets[row.name] + k for k in group]] = len(columns)
@@ -534,6 +569,7 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
         hand.buildable if preset.limits else None,
     )
     _refuse_empty(space, hand.name)
+    _refuse_unlike_fingers(space, f"preset {preset.name!r} of hand {hand.name}")
     return space
 
 
@@ -551,11 +587,41 @@ def _refuse_empty(space: DesignSpace, hand_name: str) -> None:
         raise schema.InputError(problems)
 
 
+def _refuse_unlike_fingers(space: DesignSpace, where: str) -> None:
+    """Refuses pressures that fingers of one pressure line cannot have."""
+    values = _Values(space, np.asarray(space.base))
+    places = np.array(values.places("pressure"))
+    fixed = values("pressure")
+    count = len(places)
+    valves = space.hand.valves
+    free = places[0] >= 0  # of all fingers, or of none
+    low = space.low[places]
+    high = space.high[places]
+    problems = []
+    for group in valves.known(count):
+        line = [*group]
+        if not free and np.ptp(fixed[line]) > 0:
+            problems.append(f"{where} fixes unlike pressures of fingers {line} of one line")
+        if free and low[line].max() >= high[line].min():
+            problems.append(f"{where}: fingers {line} of one line have no pressure in common")
+    if lines := valves.searched(count):
+        if not free and len(np.unique(fixed)) > lines:
+            problems.append(f"{where} fixes more pressures than valves.lines = {lines}")
+        if free and (np.ptp(low) > 0 or np.ptp(high) > 0):
+            problems.append(
+                f"{where}: valves.lines = {lines} needs pressures with the same bounds for all "
+                "fingers; give valves.groups instead"
+            )
+    if problems:
+        raise schema.InputError(problems)
+
+
 def _table_alone(hand: Hand) -> Hand:
     return dataclasses.replace(
         structure(schema.typical(hand)),
         parameter=hand.parameter,
         pressure_limit=hand.pressure_limit,
+        valves=hand.valves,
     )
 
 

@@ -279,7 +279,8 @@ def test_searched_lines_limit_the_pressures_of_each_proposal():
         designs = drawn(space)
         pressures = designs[:, columns("pressure")]
         assert {len(np.unique(row)) for row in pressures} <= {*range(1, lines + 1)}
-        np.testing.assert_array_equal(projected(space, designs), designs)
+        # Two programs round the highest pressure of a line in the last bit of float32.
+        np.testing.assert_allclose(projected(space, designs), designs, rtol=2e-7)
         for params in each_params(space, designs[:40]):
             assert stress.of_design(made, params) == []
         # Every pair of fingers shares a line in some design.

@@ -26,8 +26,7 @@ from codesign_jax.engines import make_engine
 from codesign_jax.optimize import DEFAULT
 from codesign_jax.scene import Scene, draws
 from codesign_jax.scene.parameters import design_space
-from scripts import search
-from scripts.shared import output, provenance, statistics
+from scripts.shared import lock_step, output, provenance, statistics
 
 DOCS = Path(__file__).parents[1] / "docs"
 ARMS = {"under the distribution": "drawn", "at its middle": "middle"}
@@ -65,7 +64,7 @@ def main() -> int:
 def parse() -> argparse.Namespace:
     parser = provenance.parser(__doc__)
     parser.add_argument("--constants", default="unmeasured", metavar="TABLE")
-    parser.add_argument("--preset", default=search.LIMITED)
+    parser.add_argument("--preset", default="23d")
     parser.add_argument("--pairs", type=int, default=30)
     parser.add_argument("--budget", type=int, default=2400, help="grasps of a search, all counted")
     parser.add_argument("--grasps", type=int, default=400, help="that judge each design")
@@ -99,14 +98,14 @@ def middle(table: draws.Constants) -> draws.Constants:
     return dataclasses.replace(table, constant=tuple(entries))
 
 
-def make_studies(worlds: dict[str, Scene], args: argparse.Namespace) -> dict[str, search.Study]:
+def make_studies(worlds: dict[str, Scene], args: argparse.Namespace) -> dict[str, lock_step.Study]:
     """The searches of all seeds in each scene, new or from the files of the folder."""
     space = design_space(worlds["drawn"].hand, args.preset)
-    case = search.make_case(args.optimizer, space, args.preset)
+    case = lock_step.make_case(args.optimizer, space, args.preset)
     name = f"{args.preset}-{Path(args.constants).stem}"
     studies = {}
     for arm, scene in worlds.items():
-        studies[arm] = search.Study(
+        studies[arm] = lock_step.Study(
             case,
             scene,
             make_engine("structured", scene),
@@ -124,7 +123,7 @@ def make_studies(worlds: dict[str, Scene], args: argparse.Namespace) -> dict[str
 
 
 def judged(
-    studies: dict[str, search.Study], arm: str, worlds: dict[str, Scene]
+    studies: dict[str, lock_step.Study], arm: str, worlds: dict[str, Scene]
 ) -> dict[str, list[float]]:
     """Share of grasps that the design of each seed keeps in each scene, in the same trials."""
     study = studies[arm]

@@ -25,10 +25,9 @@ from scripts.experiments import report as results
 from scripts.experiments import simulate
 from scripts.experiments.simulate import PAPER, TOTAL_GRASPS
 from scripts.search import __main__ as search
-from scripts.search import study as search_study
 from scripts.search import tables as search_tables
 from scripts.search import turbo
-from scripts.shared import output, statistics, work
+from scripts.shared import lock_step, output, statistics, work
 from tests.helpers import toy_engine
 from tests.helpers.toy_engine import tiny
 
@@ -214,7 +213,7 @@ def test_winners_of_a_search_are_judged_at_other_masses(tmp_path):
     space = parameters.design_space(heavy_scene.hand, "2d")
     engine = make_engine("mujoco", heavy_scene)
     for seed, design in enumerate(designs):
-        key = codesign.stream_key(jax.random.key(seed), search_study.STREAM_JUDGE, 0)
+        key = codesign.stream_key(jax.random.key(seed), lock_step.STREAM_JUDGE, 0)
         hand = jax.tree.map(lambda v: v[None], space.params(design))
         outcome = rollout.evaluate(
             heavy_scene, engine, hand, rollout.sample_trials(heavy_scene, key, 5)

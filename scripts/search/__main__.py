@@ -31,13 +31,14 @@ from codesign_jax.runs.progress import duration
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.verdict import WANTED
-from scripts.search.study import Study, make_case
-from scripts.search.tables import LIMITED, masses_table, table
+from scripts.search.tables import LIMITED, lines_table, masses_table, table
 from scripts.shared import output, provenance, work
+from scripts.shared.lock_step import Study, make_case
 
 LONGEST_STEM = 100
 """Longest name of a study's files that says all of its changes."""
 PAGE = Path("docs/notes/search.md")
+LINES_PAGE = Path("docs/optimisers.md")
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
@@ -128,6 +129,8 @@ def main(arguments: list[str] | None = None) -> int:
             sys.exit(f"error: {args.report} has no results of scripts.search")
         plain = [row for row in rows if "kept" in row and not row.get("changes")]
         output.fill(args.page, table(plain), "search")
+        if text := lines_table(rows):
+            output.fill(LINES_PAGE, text, "valves")
         if any("masses" in row for row in rows):
             output.fill(args.page, masses_table(rows), "masses")
         return 0

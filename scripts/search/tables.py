@@ -4,15 +4,17 @@ from typing import Any
 
 import numpy as np
 
-from codesign_jax.optimize import NAMES
+from codesign_jax.optimize import DEFAULT, NAMES
 from codesign_jax.statistics import wilson
 from codesign_jax.verdict import WANTED
-from scripts.shared import output
+from scripts.shared import output, statistics
 
 LIMITED = "23d"
 """Preset of the whole table within the scene's limits."""
 TABLE = "paper-23d"
 """Preset of the whole table without them."""
+LINES = "hand.valves.lines="
+"""Change of a search in which fingers share pressure lines."""
 
 
 def order(row: dict[str, Any]) -> tuple:
@@ -61,6 +63,34 @@ def masses_table(rows: list[dict[str, Any]]) -> str:
             cells += [f"{np.mean(kept):.3f}", share_of(np.array(kept))]
         table_rows = table_rows or [[*head, "commit"]]
         table_rows.append([*cells, row["provenance"]["commit"][:7]])
+    return output.markdown(table_rows)
+
+
+def lines_table(rows: list[dict[str, Any]]) -> str:
+    """What fingers that share pressure lines cost, against those of the same seeds with their own.
+
+    Empty without such a search.
+    """
+    usual = (LIMITED, None, DEFAULT)
+    rows = [r for r in rows if (r["preset"], r.get("objects"), r.get("optimizer")) == usual]
+    rows = [row for row in rows if "kept" in row]
+    shared = [row for row in rows if "".join(row["changes"]).startswith(LINES)]
+    if not shared:
+        return ""
+    [unchanged] = [row for row in rows if not row["changes"]]
+    head = ["pressure lines", "seeds", "grasps of a seed", "kept on average %", "cost in points"]
+    table_rows = [head]
+    for row in sorted(shared, key=lambda row: row["changes"], reverse=True):
+        grasps = row["grasps"][-1]
+        kept = 100 * np.array(row["kept"][-1])
+        alone = 100 * np.array(unchanged["kept"][unchanged["grasps"].index(grasps)][: kept.size])
+        cost = statistics.bootstrap(lambda seeds, v=alone - kept: v[seeds].mean(-1), kept.size)
+        cells = [str(kept.size), f"{grasps:,}"]
+        if len(table_rows) == 1:
+            table_rows.append(["one for each finger", *cells, f"{alone.mean():.1f}", "–"])
+        words = f"{cost.value:.1f} ({cost.low:.1f} to {cost.high:.1f})"
+        lines = row["changes"][0].removeprefix(LINES)
+        table_rows.append([lines, *cells, f"{kept.mean():.1f}", words])
     return output.markdown(table_rows)
 
 

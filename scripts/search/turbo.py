@@ -30,8 +30,8 @@ from codesign_jax import scene as scenes
 from codesign_jax.engines import make_engine
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.verdict import WANTED
-from scripts.search.study import Study, make_case
 from scripts.shared import output, provenance
+from scripts.shared.lock_step import Study, make_case
 
 LONGEST = 1.6
 FIRST = 0.8

@@ -29,10 +29,10 @@ import numpy as np
 from codesign_jax import control, model
 from codesign_jax.control import Plan
 from codesign_jax.engines.base import Engine, Equal, recording
-from codesign_jax.engines.structured import coordinates
-from codesign_jax.engines.structured.forces import forces
+from codesign_jax.engines.structured import coordinates, forces
 from codesign_jax.engines.structured.laws.integration import before
-from codesign_jax.engines.structured.laws.kinematics import State, kinematics
+from codesign_jax.engines.structured.laws.kinematics import kinematics
+from codesign_jax.engines.structured.transforms import folded
 from codesign_jax.engines.structured.world_model import WorldModel, world_constants
 from codesign_jax.model import ModelFields
 from codesign_jax.model.layout import WRIST, layout
@@ -89,8 +89,8 @@ class Observation(NamedTuple):
       object: Pose of the object, whose origin is its centre of mass.
       object_velocity: Its linear [m/s] and angular [rad/s] velocity, shape (6,).
       forces: Contact forces over the time step before, zero at the beginning; they have no
-        derivative. What is not read is not computed: those between fingers and on the palm take
-        longer than the simulation. None with another engine than structured.
+        derivative. A policy that does not read them costs no time for them. None with another
+        engine than structured.
     """
 
     time: jax.Array
@@ -246,7 +246,10 @@ class ControlLoop(Equal):
     def _asked(
         self, hand: WorldModel, fields: ModelFields, world: World, memory: Any, plan: Plan
     ) -> tuple[Any, Command]:
-        answer = jax.vmap(self.policy)(memory, observe(self.engine, hand, fields, world, plan))
+        seen = observe(self.engine, hand, fields, world, plan, with_forces=False)
+        if seen.forces is not None and reads_forces(self.policy, memory, seen):
+            seen = seen._replace(forces=_forces(self.scene, fields, world))
+        answer = jax.vmap(self.policy)(memory, seen)
         if not (isinstance(answer, tuple) and [*map(type, answer[1:])] == [Command]):
             raise InputError([f"{self.called} must return (carry, policy.Command)"])
         self._refuse_memory(memory, answer[0])
@@ -332,10 +335,36 @@ def begin(scene: Scene, fields: ModelFields, plan: Plan) -> World:
     return World(state, first)
 
 
+def reads_forces(policy: Policy, memory: Any, seen: Observation) -> bool:
+    """Whether a policy reads the contact forces that it observes, which a kernel has to find.
+
+    Args:
+      memory: Memory of policies, and `seen`: their observations, with a leading axis (world,).
+    """
+
+    def answer(contact_forces: Forces) -> Any:
+        return jax.vmap(policy)(memory, seen._replace(forces=contact_forces))
+
+    program = jax.make_jaxpr(answer)(seen.forces).jaxpr
+    read = {id(value) for equation in program.eqns for value in equation.invars}
+    read |= {id(value) for value in program.outvars}
+    return any(id(value) in read for value in program.invars)
+
+
 def observe(
-    engine: Engine, hand: WorldModel, fields: ModelFields, world: World, plan: Plan
+    engine: Engine,
+    hand: WorldModel,
+    fields: ModelFields,
+    world: World,
+    plan: Plan,
+    *,
+    with_forces: bool = True,
 ) -> Observation:
-    """Observations for policies; every array has the leading axis (world,)."""
+    """Observations for policies; every array has the leading axis (world,).
+
+    Args:
+      with_forces: Whether contact forces are found; else zeros stand for them.
+    """
     scene: Scene = engine.scene  # type: ignore[attr-defined]
     state = coordinates.reset(scene, fields._replace(start=world.state))
     motion = kinematics(hand, layout(scene).axes, state)
@@ -354,6 +383,9 @@ def observe(
     joint, rate = (jnp.moveaxis(v, (3, 2), (0, 1)) for v in (state.finger, state.finger_vel))
     palm = pose(motion.place[:, 0], motion.palm[:, :, 0])
     object_pose = pose(none[:, 0], motion.object[:, :, 0])
+    contact_forces = None
+    if hasattr(engine, "recording"):
+        contact_forces = _forces(scene, fields, world) if with_forces else _no_forces(scene, world)
     return Observation(
         time=step * scene.discretization.timestep,
         phase=phase,
@@ -366,25 +398,37 @@ def observe(
         link=pose(jnp.swapaxes(motion.origin, 1, 2), jnp.swapaxes(motion.link, 2, 3)),
         object=object_pose,
         object_velocity=jnp.concatenate([velocity[:, 3:], velocity[:, :3]], 1),
-        forces=_forces(scene, hand, state) if hasattr(engine, "recording") else None,
+        forces=contact_forces,
     )
 
 
-def _forces(scene: Scene, hand: WorldModel, state: State) -> Forces:
-    """Contact forces of the steps that led to states.
+def _forces(scene: Scene, fields: ModelFields, world: World) -> Forces:
+    """Contact forces of the steps that led to the worlds' states.
 
     What fingers hold on one another is that after the step, from which the force between two that
     slide differs a little.
     """
-    contact_forces = forces(scene, hand, before(state, scene.discretization.timestep), state.acc)
+
+    def of_worlds(fields: ModelFields, start: jax.Array) -> Forces:
+        state = coordinates.reset(scene, fields._replace(start=start))
+        hand = world_constants(scene, fields)
+        earlier = before(state, scene.discretization.timestep)
+        contact_forces = forces.forces(scene, hand, earlier)
+        stepped = (state.step[0, 0] > 0) & (state.going[0, 0] > 0)
+
+        def kept(v: jax.Array) -> jax.Array:
+            return jnp.where(stepped.reshape(-1, *[1] * (v.ndim - 1)), v, 0.0)
+
+        return jax.tree.map(kept, contact_forces)
+
     # Accelerations of a rollout have no derivative.
-    contact_forces = jax.lax.stop_gradient(contact_forces)
-    stepped = (state.step[0, 0] > 0) & (state.going[0, 0] > 0)
+    given = jax.lax.stop_gradient((fields, world.state))
+    return folded(of_worlds)(*given)
 
-    def kept(v: jax.Array) -> jax.Array:
-        return jnp.where(stepped.reshape(-1, *[1] * (v.ndim - 1)), v, 0.0)
 
-    return jax.tree.map(kept, contact_forces)
+def _no_forces(scene: Scene, world: World) -> Forces:
+    shapes = forces.shapes(scene, len(world.state), world.state.dtype)
+    return jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
 
 
 def _phase(scene: Scene, step: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import model
-from codesign_jax.engines.structured import assembly
+from codesign_jax.engines.structured import overlaps
 from codesign_jax.engines.structured.coordinates import reset
 from codesign_jax.engines.structured.laws.kinematics import Kinematics, straight
 from codesign_jax.engines.structured.world_model import (
@@ -97,8 +97,8 @@ def depth(scene: Scene, fields: ModelFields) -> jax.Array:
     alone = dataclasses.replace(scene.effects, finger_finger=False)
     hand, kin, position = _straight(scene, fields)
     scene = dataclasses.replace(scene, effects=alone)
-    every = assembly.contacts(scene, hand, kin, position)
-    depths = [(-c.gap).reshape(-1, c.gap.shape[-1]).max(0) for c in every.values()]
+    every = overlaps.places(scene, hand, kin, position)
+    depths = [(-place.gap).reshape(-1, place.gap.shape[-1]).max(0) for place in every.values()]
     if not depths:
         return jnp.zeros_like(fields.object_mass)
     return jnp.stack(depths).max(0)
@@ -135,7 +135,7 @@ def depth_in_palm(scene: Scene, fields: ModelFields) -> jax.Array:
     if not scene.effects.finger_palm:
         return jnp.full((fields.start.shape[0],), -jnp.inf, fields.start.dtype)
     hand, kin, _ = _straight(scene, fields)
-    return assembly.depth_in_palm(scene, hand, kin)
+    return overlaps.depth_in_palm(scene, hand, kin)
 
 
 @partial(jax.jit, static_argnums=0)

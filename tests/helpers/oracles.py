@@ -13,11 +13,20 @@ import numpy as np
 
 from codesign_jax import model
 from codesign_jax.engines.mujoco import world_model
-from codesign_jax.engines.structured import assembly, coordinates
+from codesign_jax.engines.structured import coordinates, overlaps
+from codesign_jax.engines.structured.kernel.contact_sets import margin
 from codesign_jax.engines.structured.lanes import dot
-from codesign_jax.engines.structured.laws.contact import constraint_update
+from codesign_jax.engines.structured.laws import surroundings
+from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
+from codesign_jax.engines.structured.laws.contact import (
+    Cone,
+    Contacts,
+    candidates,
+    constraint_update,
+)
 from codesign_jax.engines.structured.laws.kinematics import (
     Acc,
+    Kinematics,
     Spatial,
     kinematics,
     propagate,
@@ -98,6 +107,24 @@ def soften(scene, fields, data):
         data.qfrc_applied[bend] = model.softening_moments(scene, fields, data.qpos[bend])
 
 
+def touching(scene, hand, kin: Kinematics, position, velocity: Spatial):
+    """Contacts with object, table and fixtures over whole arrays, by pair of bodies."""
+    found = {}
+    for name, place in overlaps.places(scene, hand, kin, position).items():
+        cone = getattr(hand.cones, which_cone(name))
+        fingers = name.startswith("finger")
+        if own_friction(scene, name):
+            fields = 1 if name.endswith("_object") else len(surroundings.fields(scene))
+            count = place.gap.shape[int(fingers)] // fields
+            friction = hand.friction[np.array(surroundings.touched(scene, name, count))]
+            cone = Cone.of_friction(cone, friction if fingers else friction[:, 0])
+        contacts = Contacts(*place[:3], cone.of_share(place.share))
+        approach = -dot(place.normal, contacts.relative(relative(name, velocity)))
+        share = candidates(place.share, place.gap, approach, cone, margin(scene))
+        found[name] = contacts._replace(cone=cone.of_share(share))
+    return found
+
+
 def unbalanced(scene, fields, ctrl, trajectory, stride):
     """Forces that a path's accelerations leave unbalanced: the gradient of a step's objective.
 
@@ -118,7 +145,7 @@ def unbalanced(scene, fields, ctrl, trajectory, stride):
         hand = world_constants(scene, many)
         kin = kinematics(hand, model.layout(scene).axes, state)
         velocity = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
-        contacts = assembly.contacts(scene, hand, kin, state.position, velocity)
+        contacts = touching(scene, hand, kin, state.position, velocity)
 
         def power(virtual: Acc, acc: Acc):
             motion = propagate(kin, acc)

@@ -291,7 +291,7 @@ class Recording(Equal):
         def step(now: tuple) -> Forces:
             qpos, qvel, acc, moved, *held = now
             state = coordinates.make(self.scene, qpos, qvel, acc, *held)
-            every = forces.forces(self.scene, hand, state, state.acc, touch=self.touch)
+            every = forces.forces(self.scene, hand, state, touch=self.touch)
             return jax.tree.map(
                 lambda v: jnp.where(moved.reshape(-1, *[1] * (v.ndim - 1)) > 0, v, 0.0), every
             )

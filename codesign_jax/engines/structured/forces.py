@@ -1,185 +1,177 @@
-"""Contact forces of a step, from the state before it and the accelerations that it found.
+"""Contact forces of states, as sums over the contacts that a kernel stores."""
 
-A step's contact forces are those that its accelerations leave to the contacts: the laws of contact
-at both.  They are functions of what a rollout records, and no part of the kernel.
-"""
-
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from codesign_jax.engines.structured import assembly
-from codesign_jax.engines.structured.assembly import HandContacts
-from codesign_jax.engines.structured.lanes import dot, once
-from codesign_jax.engines.structured.laws import holding
-from codesign_jax.engines.structured.laws.contact import Contacts, constraint_update
-from codesign_jax.engines.structured.laws.kinematics import (
-    Acc,
-    Kinematics,
-    Spatial,
-    State,
-    kinematics,
-    propagate,
-    relative,
-)
+from codesign_jax.engines.structured.kernel.contact_forces import ForceProgram
+from codesign_jax.engines.structured.kernel.finger_contacts import FingerContactSet
+from codesign_jax.engines.structured.lanes import dot
+from codesign_jax.engines.structured.laws.kinematics import State
 from codesign_jax.engines.structured.world_model import WorldModel
-from codesign_jax.model import layout
+from codesign_jax.model.held import PALM_RINGS
+from codesign_jax.model.layout import layout, touches_itself
 from codesign_jax.scene import Scene
 from codesign_jax.types import Forces, Touch
 
 
-def forces(
-    scene: Scene, hand: WorldModel, state: State, acc: Acc, *, touch: bool = False
-) -> Forces:
-    """Forces of a step of a batch, every array with a leading axis (world,).
-
-    The states are those before the step, with the friction that contacts held then.
+def forces(scene: Scene, hand: WorldModel, state: State, *, touch: bool = False) -> Forces:
+    """Forces of the step from states by the accelerations that they have.
 
     Args:
+      state: States before the step, with the friction that contacts held then.
       touch: Whether to tell the object's contacts ring by ring, `Forces.touch`.
+
+    Returns:
+      The forces, every array with a leading axis (world,).
     """
-    kin = kinematics(hand, layout(scene).axes, state)
-    velocity = Spatial(kin.palm_vel, kin.vel, kin.object_vel)
-    motion = propagate(kin, acc)
-    found = assembly.contacts(scene, hand, kin, state.position, velocity)
-    fingers = scene.num_fingers
-    worlds = state.wrist.shape[-1]
-    none = jnp.zeros((3, fingers, worlds), state.wrist.dtype)
-    net = {name: none[:, :1] for name in ("palm_object", "palm_table", "object_table")}
-    net |= {name: none for name in ("finger_object", "finger_table")}
-    grip = none[0]
-    depth = {}
-    rings = {}
-    hold = assembly.grips(scene, state.held, kin)
-    for name, contacts in found.items():
-        own = hold.get(name)
-        acting = once(partial(_acting, name), contacts, motion, velocity, own)
-        force, normal = once(partial(_sums, name), contacts, acting)
-        net[name] = force
-        if name == "finger_object":
-            grip = normal
-        if touch and name in ("finger_object", "palm_object"):
-            rings[name.removesuffix("_object")] = once(_touch, contacts, acting, state.position)
-        depth[name] = _deepest(contacts)
-    between, on_palm, more = _of_hand(scene, hand, kin, state.held, (motion, velocity))
-    depth |= more
-
-    def each(force: jax.Array) -> jax.Array:
-        return jnp.moveaxis(force, (2, 1), (0, 1))
-
-    def alone(force: jax.Array) -> jax.Array:
-        return force[:, 0].T
-
-    return Forces(
-        finger=-each(net["finger_object"]),
-        palm=-alone(net["palm_object"]),
-        table=alone(net["object_table"]),
-        grip=grip.T,
-        finger_table=each(net["finger_table"]),
-        palm_table=alone(net["palm_table"]),
-        finger_finger=jnp.moveaxis(between, -1, 0),
-        finger_palm=on_palm.T,
-        depth=depth,
-        touch=rings if touch else None,
-    )
+    program = ForceProgram.of(scene, state.wrist.dtype, state.wrist.shape[-1])
+    stored = program.stored(hand, state)
+    return _summed(program, stored, state.position, touch=touch)
 
 
-def _of_hand(
-    scene: Scene,
-    hand: WorldModel,
-    kin: Kinematics,
-    hold: jax.Array,
-    motions: tuple[Spatial, Spatial],
-) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
-    """Normal forces between fingers, (finger, finger, world), and on the palm; largest depths.
+def shapes(scene: Scene, worlds: int, dtype: Any) -> Forces:
+    """Shapes of the forces of so many worlds, without `Forces.touch`."""
+    program = ForceProgram.of(scene, dtype, worlds)
+    position = jax.ShapeDtypeStruct((3, 1, worlds), dtype)
+
+    def summed(stored: dict[str, jax.Array], position: jax.Array) -> Forces:
+        return _summed(program, stored, position, touch=False)
+
+    return jax.eval_shape(summed, program.shapes(worlds, dtype), position)
+
+
+def _summed(
+    program: ForceProgram, stored: dict[str, jax.Array], position: jax.Array, *, touch: bool
+) -> Forces:
+    """Sums of what `ForceProgram.stored` returns.
 
     Args:
-      hold: As in `State`.
-      motions: Accelerations and velocities of the bodies.
-    """
-    fingers = scene.num_fingers
-    worlds = kin.place.shape[-1]
-    dtype = kin.place.dtype
-    between = jnp.zeros((fingers, fingers, worlds), dtype)
-    on_palm = jnp.zeros((fingers, worlds), dtype)
-    depth = {}
-    motion, velocity = motions
-    for name, these in assembly.hand_contacts(scene, hand, kin, velocity, hold).items():
-        normal = once(_pressing, these, motion, velocity)
-        depth[name] = _deepest(these.contacts)
-        one, two = these.fingers
-        if name == "finger_palm":
-            on_palm = normal
-        else:
-            between = between.at[one, two].set(normal).at[two, one].set(normal)
-    return between, on_palm, depth
-
-
-def _acting(
-    name: str, contacts: Contacts, motion: Spatial, velocity: Spatial, hold: jax.Array | None
-) -> jax.Array:
-    """Forces of a set's contacts on the first body, shape (3, ...).
-
-    The first body is the finger, the palm, or the object on the table; hold is the friction that
-    they hold, if they do.
-    """
-    speed = contacts.relative(relative(name, velocity))
-    jar = contacts.relative(relative(name, motion)) - contacts.reference(speed)
-    jar = jar if hold is None else jar + holding.held(contacts, hold)
-    return _force(contacts, jar)
-
-
-def _sums(name: str, contacts: Contacts, force: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Sums over a set's contacts: forces, shape (3, finger or 1, world), and normal forces."""
-    normal = dot(contacts.normal, force)
-    lanes = force.shape[-2:]
-    if not name.startswith("finger"):
-        lanes = 1, lanes[1]
-    return force.reshape(3, -1, *lanes).sum(1), normal.reshape(-1, *lanes).sum(0)
-
-
-def _touch(contacts: Contacts, force: jax.Array, position: jax.Array) -> Touch:
-    """The contacts ring by ring, with axes (world, finger, ring), or (world, ring) of the palm.
-
-    Args:
-      contacts: Of fingers, items (link, ring of the link, finger, world), or of the palm, items
-        (ring, world), with the object.
-      force: Forces on the hand, shape (3, ...).
       position: The object's centre, from which contact points are counted, shape (3, 1, world).
     """
-    pressing = dot(contacts.normal, force)
+    scene = program.scene
+    fingers = scene.num_fingers
+    lane = program.fingers, position.shape[-1]
+    none = jnp.zeros((1, 3, 1, *lane), position.dtype)
 
-    def by_ring(values: jax.Array) -> jax.Array:
-        values = jnp.broadcast_to(values, pressing.shape)
-        if values.ndim == 2:
-            return values.T
-        return jnp.moveaxis(values.reshape(-1, *values.shape[2:]), 0, 2).swapaxes(0, 1)
+    def net(name: str) -> jax.Array:
+        """Sums over a set's contacts on each lane, shape (3, lane, world)."""
+        return stored.get(f"{name}.force", none).sum((0, 2))
 
-    def vectors(values: Any) -> jax.Array:
-        return jnp.stack([by_ring(v) for v in values], -1)
+    def of_fingers(force: jax.Array) -> jax.Array:
+        return jnp.moveaxis(force[:, :fingers], (2, 1), (0, 1))
 
-    return Touch(
-        point=vectors([x + origin for x, origin in zip(contacts.point, position, strict=True)]),
-        normal=vectors(contacts.normal),
-        gap=by_ring(contacts.gap),
-        pressing=by_ring(pressing),
-        tangential=vectors(pressing * contacts.normal - force),
+    def of_body(force: jax.Array) -> jax.Array:
+        return force.sum(1).T
+
+    grip = none[0, 0, 0]
+    if "finger_object.force" in stored:
+        grip = _pressing(stored, "finger_object").sum((0, 1))
+    fields = [s.name for s in program.sets if not isinstance(s, FingerContactSet)]
+    depth = {name: _deepest(stored, name) for name in fields}
+    between, on_palm, more = _between_fingers(program, stored, none[0, 0, 0])
+    return Forces(
+        finger=-of_fingers(net("finger_object")),
+        palm=-of_body(net("palm_object")),
+        table=of_body(net("object_table")),
+        grip=grip[:fingers].T,
+        finger_table=of_fingers(net("finger_table")),
+        palm_table=of_body(net("palm_table")),
+        finger_finger=jnp.moveaxis(between[:fingers, :fingers], -1, 0),
+        finger_palm=on_palm[:fingers].T,
+        depth=depth | more,
+        touch=_touches(program, stored, position) if touch else None,
     )
 
 
-def _pressing(met: HandContacts, motion: Spatial, velocity: Spatial) -> jax.Array:
-    """Sums of the normal forces of the pairs' contacts, shape (pair, world)."""
-    force = _force(met.contacts, met.jar(motion, velocity))
-    return dot(met.contacts.normal, force).sum(0)
+def _between_fingers(
+    program: ForceProgram, stored: dict[str, jax.Array], none: jax.Array
+) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
+    """Normal forces between fingers, shape (lane, lane, world), and on the palm; largest depths.
+
+    Args:
+      none: Zeros of the shape (lane, world).
+    """
+    lanes, worlds = none.shape
+    between = jnp.zeros((lanes, lanes, worlds), none.dtype)
+    pressing = stored.get("finger_finger.pressing")
+    if pressing is None:
+        return between, none, {}
+    (pairs,) = (s for s in program.sets if isinstance(s, FingerContactSet))
+    finger = np.arange(lanes)
+    for row in range(pairs.rows):
+        partner = finger ^ (row + pairs.first)
+        between = between.at[finger, partner].set(pressing[row, 0])
+    deepest = stored["finger_finger.depth"].max(2)
+    effects = program.scene.effects
+    depth = {}
+    if effects.finger_finger and program.scene.num_fingers > 1:
+        depth["finger_finger"] = deepest[int(pairs.alone) :, 0].max(0)
+    if touches_itself(program.scene):
+        depth["finger_itself"] = deepest[0, 0]
+    if effects.finger_palm:
+        depth["finger_palm"] = deepest[0, 1]
+    return between, pressing[0, 1] if pairs.alone else none, depth
 
 
-def _force(contacts: Contacts, jar: jax.Array) -> jax.Array:
-    return jnp.where(contacts.active, constraint_update(contacts, jar).force[:3], 0.0)
+def _touches(
+    program: ForceProgram, stored: dict[str, jax.Array], position: jax.Array
+) -> dict[str, Touch]:
+    """The object's contacts with the rings of fingers and palm, if the scene has them."""
+    scene = program.scene
+    found = {}
+    if "finger_object.force" in stored:
+
+        def by_ring(values: jax.Array) -> jax.Array:
+            # (link, component, ring of the link, finger, world)
+            rings = jnp.moveaxis(values[:, :, :, : scene.num_fingers], (4, 3), (0, 1))
+            # (world, finger, link, component, ring of the link)
+            rings = jnp.swapaxes(rings, 3, 4)
+            return rings.reshape(*rings.shape[:2], -1, rings.shape[4])
+
+        found["finger"] = _touch(stored, "finger_object", position, by_ring)
+    if "palm_object.force" in stored:
+        spheres = layout(scene).palm.size
+        count = PALM_RINGS if scene.effects.surface == "hull" else spheres
+
+        def by_palm_ring(values: jax.Array) -> jax.Array:
+            # (group, component, 1, lane, world): the groups' rings are dealt to the lanes.
+            rings = jnp.moveaxis(values[:, :, 0], (3, 1), (0, 3))
+            return rings.reshape(rings.shape[0], -1, rings.shape[3])[:, :count]
+
+        found["palm"] = _touch(stored, "palm_object", position, by_palm_ring)
+    return found
 
 
-def _deepest(contacts: Contacts) -> jax.Array:
+def _touch(stored: dict[str, jax.Array], name: str, position: jax.Array, by_ring: Any) -> Touch:
+    """Contacts of the object ring by ring.
+
+    Args:
+      by_ring: From values (item, component, k, lane, world) to (world, ..., ring, component).
+    """
+    point = stored[f"{name}.point"] + position[:, None]
+    normal = stored[f"{name}.normal"]
+    force = stored[f"{name}.force"]
+    pressing = _pressing(stored, name)[:, None]
+    return Touch(
+        point=by_ring(point),
+        normal=by_ring(normal),
+        gap=by_ring(stored[f"{name}.gap"])[..., 0],
+        pressing=by_ring(pressing)[..., 0],
+        tangential=by_ring(pressing * normal - force),
+    )
+
+
+def _pressing(stored: dict[str, jax.Array], name: str) -> jax.Array:
+    """Normal forces of a set's contacts, shape (item, k, lane, world)."""
+    normal, force = (jnp.moveaxis(stored[f"{name}.{field}"], 1, 0) for field in ("normal", "force"))
+    return dot(normal, force)
+
+
+def _deepest(stored: dict[str, jax.Array], name: str) -> jax.Array:
     """Largest depth of a set's contacts, shape (world,)."""
-    depth = jnp.where(contacts.active, jnp.maximum(-contacts.gap, 0.0), 0.0)
+    touches = stored[f"{name}.share"] > 0
+    depth = jnp.where(touches, jnp.maximum(-stored[f"{name}.gap"], 0.0), 0.0)
     return depth.reshape(-1, depth.shape[-1]).max(0)

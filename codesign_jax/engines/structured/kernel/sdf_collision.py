@@ -134,8 +134,7 @@ class SdfCollision:
             places = [lanewise(as_kept, place) for place in places]
             return contacts.create(i, joined(places), *moves, friction=friction)
         flat = not name.endswith("_object") and self.p.scene.effects.table  # the table comes first
-        run = partial(closed_gap, self.p.scene.discretization.timestep)
-        most = lanewise(run, numbers, centre, moves[1])
+        most = self.closing_gap(numbers, centre, moves[1])
         near = [lanewise(may_touch, numbers, first[0], most).lane for first in found]
         contacts.write("share", zeros((1, contacts.set.k), self.step.like), i)
 
@@ -153,6 +152,11 @@ class SdfCollision:
             contacts.create(i, joined(places), *moves, friction=friction, hold=hold)
 
         any_of(total(near) > 0, look_again)
+
+    def closing_gap(self, numbers: Lanes, centre: Lanes, velocity: Lanes) -> Lanes:
+        """Largest gaps that rings may close within the step, see `closed_gap`."""
+        run = partial(closed_gap, self.p.scene.discretization.timestep)
+        return lanewise(run, numbers, centre, velocity)
 
     def of_palm_and_object(self, state: dict) -> None:
         """Contacts of the palm's rings or spheres, and of the object with the table."""

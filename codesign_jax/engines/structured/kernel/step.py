@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import chambers, friction_memory, objects
-from codesign_jax.engines.structured.kernel.contact_sets import zeros
+from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, ContactSet, zeros
 from codesign_jax.engines.structured.kernel.finger_collision import FingerCollision
 from codesign_jax.engines.structured.kernel.finger_contacts import BoundFingerContacts
 from codesign_jax.engines.structured.kernel.memory import loop
@@ -92,8 +92,16 @@ class Step(StepMemory):
         at = lanewise(run, state, arm, self.palm_constants())
         thing = objects.read(p.scene, self.block, self.world, self.hand, self.grid)
         self.columns = at["columns"]
-        self.contacts = {c.name: c.bind(self.scratch, self.constant) for c in p.sets}
+        self.contacts = {c.name: self.bound(c) for c in p.sets}
         return state, at, thing, *self._forward(state, at, pressure, thing)
+
+    def bound(self, contacts: ContactSet) -> BoundContacts:
+        """A contact set with its memory."""
+        return contacts.bind(self.scratch, self.constant)
+
+    def fields(self, at: dict[str, Any], thing: WorldObject) -> SdfCollision:
+        """The search for contacts with distance fields; arguments as `assemble` has them."""
+        return SdfCollision(self, at, thing)
 
     def _overflow(self, waiting: jax.Array) -> jax.Array:
         """One for worlds that had too few slots for their contacts in this step, else zero."""
@@ -133,7 +141,7 @@ class Step(StepMemory):
         self.search = search
         if search:
             search.start(motion, vel, frame, origin)
-        fields = SdfCollision(self, at, thing)
+        fields = self.fields(at, thing)
 
         def link(i: Any, carry: tuple) -> tuple:
             origin, frame, vel, bias, motion, middle = carry

@@ -2,7 +2,7 @@
 
 A field is a function that looks: from points (3, ...) to their distance from a body (...) and the
 gradient of the distance (3, ...), a unit vector in world axes.  The object, the table, fixtures and
-the palm's disc are fields.  The adjoint's residual and `assembly` call `touch` for all of them, the
+the palm's disc are fields.  The adjoint's residual and `overlaps` call `touch` for all of them, the
 kernel its two stages, `facing` and `ring_place`, with a test of the gap between them.
 
 Rings are given by their numbers, shape (8, ...), see `rings.Ring`.

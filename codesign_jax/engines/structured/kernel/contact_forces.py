@@ -1,0 +1,221 @@
+"""The forces of a state's contacts as one kernel: a step's forward pass, with no solver behind it.
+
+The forward pass finds the contacts of a state and their jar at its accelerations.  At those that
+solved a step, the force of a contact is the one that the solver ended with: it is a function of jar
+alone.  Here it is stored beside the contact's place, for every kind of contact in the same fields.
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax import reuse
+from codesign_jax.compiler.launch import Kernel, launch
+from codesign_jax.engines.structured.kernel.contact_sets import (
+    BoundContacts,
+    ContactSet,
+    begun,
+    margin,
+    with_held,
+    zeros,
+)
+from codesign_jax.engines.structured.kernel.finger_contacts import (
+    BoundFingerContacts,
+    FingerContactSet,
+)
+from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, MemoryLayout
+from codesign_jax.engines.structured.kernel.program import Limits, Program
+from codesign_jax.engines.structured.kernel.sdf_collision import SdfCollision
+from codesign_jax.engines.structured.kernel.step import Step
+from codesign_jax.engines.structured.lanes import dot, sum_axis
+from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise, of_code
+from codesign_jax.engines.structured.laws import contact
+from codesign_jax.engines.structured.laws.contact import Cone
+from codesign_jax.engines.structured.laws.kinematics import State
+from codesign_jax.engines.structured.laws.rings import Place
+from codesign_jax.engines.structured.world_model import WorldModel
+from codesign_jax.scene import Scene
+
+FAR = 1e3
+"""A gap that no ring has [m]."""
+FIELDS = {"point": 3, "normal": 3, "gap": 1, "share": 1, "force": 3}
+"""Components of the fields of a contact: its `Place`, and the force on its first body [N], world
+axes. The first body is the finger, the palm, or the object on table and fixtures."""
+PAIR = ("pressing", "depth")
+"""Sum of the normal forces [N] and largest depth [m] of a pairing of fingers, see
+`finger_contacts`: with the other finger, or itself, and with the palm."""
+
+
+class ForceProgram(Program):
+    """Tables and kernel of the contact forces of states.
+
+    Attributes:
+      record: Rows of what the kernel stores: for each item of a contact set `FIELDS`, shape
+        (component, k), and for each pairing of fingers `PAIR`, shape (2,).
+    """
+
+    @classmethod
+    def of(cls, scene: Scene, dtype: Any, worlds: int) -> "ForceProgram":
+        """The program for this device, type and number of worlds."""
+        unused = Limits(0, 0, 0.0)
+        return cls.here(scene, unused, dtype, worlds, team=1)  # type: ignore[return-value]
+
+    def _tables(self) -> None:
+        super()._tables()
+        record = {}
+        for contacts in self.sets:
+            between = isinstance(contacts, FingerContactSet)
+            fields = dict.fromkeys(PAIR, 2) if between else FIELDS
+            for field, size in fields.items():
+                items = (
+                    (contacts.rows, (size,)) if between else (contacts.count, (size, contacts.k))
+                )
+                record[f"{contacts.name}.{field}"] = items
+        self.record = MemoryLayout(True, **record)
+
+    def stored(self, hand: WorldModel, state: State) -> dict[str, jax.Array]:
+        """What the kernel stores, by name, shape (item, ..., finger of the block, world).
+
+        What does not touch has no share; where no finger touches another one, nothing is stored.
+        """
+        worlds = state.wrist.shape[-1]
+        if not self.record.rows:
+            return {}
+        inputs = self.inputs(hand, state, self._commands(state))
+        (record,) = self._run(inputs)
+        found = self.record.unpack(record, self.fingers, self.fingers, worlds)
+        return {name: found[name] for name in self.record.groups}
+
+    def shapes(self, worlds: int, dtype: Any) -> dict[str, jax.ShapeDtypeStruct]:
+        """Shapes of what `stored` returns."""
+        lane = self.fingers, worlds
+        return {
+            name: jax.ShapeDtypeStruct((count, *shape, *lane), dtype)
+            for name, (count, shape) in self.record.groups.items()
+        }
+
+    def _commands(self, state: State) -> jax.Array:
+        """Controls (world, 1, nu) by which a rigid wrist has the state's accelerations.
+
+        Chambers have no part in contacts.
+        """
+        h = self.scene.discretization.timestep
+        arm = state.wrist + h * (state.wrist_vel + h * state.acc.wrist)
+        arm = arm.reshape(6, -1).T
+        none = jnp.zeros((len(arm), self.num_fingers), arm.dtype)
+        return jnp.concatenate([arm, none], 1)[:, None]
+
+    def _run(self, inputs: tuple) -> list[jax.Array]:
+        blocks = inputs[0].shape[0]
+        shapes = [(blocks, self.record.rows, self.size), (blocks, self.scratch.rows, self.size)]
+        call, outputs = self.call(self._kernel, "forces", inputs, shapes, inputs[4].dtype)
+        if self.backend == "interpreter":
+            return call(*inputs)[:1]
+        of_code(reuse.code_digest())
+        origin = repr((self.scene.structure, "forces"))
+        shared = (len(inputs) - 1,) if self.meshes else ()
+        kernel = Kernel(origin, self.backend, self.size, shared, scratch=(1,), level=1)
+        return launch(call, inputs, outputs, kernel)[:1]  # type: ignore[return-value]
+
+    def _kernel(self, *refs: Any) -> None:
+        hand, world, finger_state, world_state, arm, pressure, *rest = refs
+        grid = rest.pop(0) if self.meshes else None
+        record, scratch = rest
+        block = Block(self.fingers, self.block)
+        tables = hand, world, finger_state, world_state, scratch, grid
+        step = ForceStep(self, block, *tables)
+        commands = lanes([arm[0, k, block.world] for k in range(6)], (6,), wide=False)
+        chamber = lanes([pressure[(0,)]], (), wide=True)
+        step.store(BoundTable(self.record, record), commands, chamber)
+
+
+class ForceStep(Step):
+    """The forward pass of a step, which stores the force of each contact."""
+
+    record: BoundTable
+
+    def store(self, record: BoundTable, arm: Lanes, pressure: Lanes) -> None:
+        """Stores the forces of the state's contacts; arguments as `Step.assemble`."""
+        self.record = record
+        self.assemble(arm, pressure)
+        pairs = self.contacts.get("finger_finger")
+        if isinstance(pairs, BoundFingerContacts):
+            self._store_pairs(pairs)
+
+    def bound(self, contacts: ContactSet) -> BoundContacts:
+        """See `Step`; contacts of fields are stored as soon as they are found."""
+        if isinstance(contacts, FingerContactSet):
+            return super().bound(contacts)
+        return StoredContacts(contacts, self.record, contacts.cone(self.constant))
+
+    def fields(self, at: dict[str, Any], thing: Any) -> SdfCollision:
+        return EveryRing(self, at, thing)
+
+    def _store_pairs(self, pairs: BoundFingerContacts) -> None:
+        def of_row(row: jax.Array, x: jax.Array) -> jax.Array:
+            alone = pairs.pairing(row).alone
+
+            def add(item: Any, sums: list[Lanes]) -> list[Lanes]:
+                palm = jnp.zeros_like(self.like)
+                if alone is not None:
+                    palm = jnp.where(alone & (pairs.read("other", item).lane < 0.5), 1.0, palm)
+                side = lanes([palm], (), wide=True)
+                with pairs.with_cone(row, item):
+                    given = pairs.place(item), pairs.cone, pairs.read("jar", item)
+                    return lanewise(with_slot, sums, side, *given)
+
+            none = zeros((2,), self.like)
+            for name, value in zip(PAIR, pairs.fold(row, add, [none, none]), strict=True):
+                self.record.write(f"{pairs.set.name}.{name}", value, row)
+            return x
+
+        jax.lax.fori_loop(0, pairs.set.rows, of_row, jnp.int32(0))
+
+
+class StoredContacts(BoundContacts):
+    """Contacts of a set whose forces are stored."""
+
+    def create(
+        self,
+        item: Any,
+        place: Place,
+        motion: Lanes,
+        velocity: Lanes,
+        friction: Lanes | None = None,
+        hold: tuple[Lanes, Lanes] | None = None,
+    ) -> None:
+        """See `BoundContacts`."""
+        cone = self.cone
+        if friction is not None:
+            cone = lanewise(Cone.of_friction, cone, friction[0])
+        place, jar = lanewise(partial(begun, margin(self.set.scene)), place, cone, motion, velocity)
+        if hold is not None:
+            jar = lanewise(with_held, jar, place, cone, hold[0])
+        force = lanewise(solved_force, place, cone, jar)
+        for field, value in (place._asdict() | {"force": force}).items():
+            self.write(field, value, item)
+
+
+class EveryRing(SdfCollision):
+    """Tells the places of rings that are far from the object as well."""
+
+    def closing_gap(self, numbers: Lanes, centre: Lanes, velocity: Lanes) -> Lanes:
+        return lanewise(lambda numbers: FAR + 0.0 * numbers[6], numbers)
+
+
+def solved_force(place, cone, jar):
+    """Forces (3, k) of an item's contacts."""
+    contacts = ContactSet.contacts(place, cone)
+    force = contact.constraint_update(contacts, jar).force[:3]
+    return jnp.where(contacts.active, force, 0.0)
+
+
+def with_slot(sums, palm, place, cone, jar):
+    """Adds a slot's contact to a pairing's `PAIR`; palm: 1 for a contact with the palm, else 0."""
+    pressing, depth = sums
+    force = sum_axis(dot(place.normal, solved_force(place, cone, jar)), 0)
+    deep = jnp.where(place.share[0, 0] > 0, jnp.maximum(-place.gap[0, 0], 0.0), 0.0)
+    side = jnp.stack([1.0 - palm, palm])
+    return [pressing + side * force, jnp.maximum(depth, side * deep)]

@@ -1,0 +1,135 @@
+"""Places at which bodies touch or nearly do, over arrays of all worlds: for checks before a start.
+
+A kernel finds contacts link by link, where one can be compiled; here the same laws are called on
+whole arrays, for every engine and device.
+"""
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax.engines.structured.kernel import finger_collision, memory_tables
+from codesign_jax.engines.structured.lanes import once
+from codesign_jax.engines.structured.laws import shapes, surroundings
+from codesign_jax.engines.structured.laws.kinematics import Kinematics
+from codesign_jax.engines.structured.laws.rings import Place
+from codesign_jax.engines.structured.laws.touch import ring_centre, touch
+from codesign_jax.engines.structured.world_model import WorldModel, apply_columns
+from codesign_jax.model import held
+from codesign_jax.model.held import rings_of_link
+from codesign_jax.model.layout import first_on_palm, palm_touches
+from codesign_jax.scene import Scene
+
+Look = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
+"""From points to their distance from a body and its gradient, see `laws.touch`."""
+
+
+def places(
+    scene: Scene, hand: WorldModel, kin: Kinematics, position: jax.Array
+) -> dict[str, Place]:
+    """Places of the contacts with object, table and fixtures that the scene has, by pair of bodies.
+
+    Items of fingers are (link, ring of the link, finger), of the others (item,); several fields are
+    one behind the other.
+
+    Args:
+      position: The object's centre, shape (3, 1, world).
+    """
+    effects = scene.effects
+    on_object = partial(_object_distance, scene, hand, kin)
+    around = [partial(field, position) for field in surroundings.fields(scene)]
+    found = {}
+
+    def add(name: str, numbers: jax.Array, origin: jax.Array, frame: jax.Array) -> None:
+        looks = around if name.endswith("_table") else [on_object]
+        if not getattr(effects, name) or not looks:
+            return
+        centre = ring_centre(origin, frame, numbers)
+        axis = int(name.startswith("finger"))
+        found[name] = _joined([_touch(scene, x, numbers, frame, centre) for x in looks], axis)
+
+    if count := rings_of_link(scene):
+        numbers = memory_tables.ring_numbers(scene, hand, count)
+        numbers = jnp.moveaxis(numbers.reshape(-1, count, *numbers.shape[1:]), 2, 0)
+        for name in ("finger_object", "finger_table"):
+            add(name, numbers, kin.origin[:, :, None], kin.link[:, :, :, None])
+    if palm_touches(scene):
+        numbers = jnp.moveaxis(memory_tables.palm_numbers(scene, hand), 1, 0)
+        for name in ("palm_object", "palm_table"):
+            add(name, numbers, kin.place, kin.palm)
+    if effects.object_table and surroundings.slots(scene):
+        found["object_table"] = _joined(_of_object(scene, hand, kin, position, on_object), 0)
+    return found
+
+
+def depth_in_palm(scene: Scene, hand: WorldModel, kin: Kinematics) -> jax.Array:
+    """Deepest overlap with the palm's disc of rings or spheres that may touch it [m], (world,)."""
+    assert hand.palm_disc is not None
+    k = rings_of_link(scene)
+    first = (first_on_palm(scene.discretization.links) - 1) * k
+    numbers = jnp.moveaxis(memory_tables.ring_numbers(scene, hand, k), 1, 0)
+    numbers = jnp.broadcast_to(numbers, (*numbers.shape[:2], *kin.origin.shape[2:]))
+    inner = numbers[:, first:]
+    link = np.arange(first, numbers.shape[1]) // k
+    frame = kin.link[:, :, link]
+    centre = once(ring_centre, kin.origin[:, link], frame, inner)
+    disc = kin.place[:, None], kin.palm[:, :, None], hand.palm_disc[:, None]
+    look = partial(finger_collision.palm_distance, palm=disc)
+    place = _touch(scene, look, inner, frame, centre)
+    row = link[:, None, None] + 1
+    free = finger_collision.free_of_palm(row, inner, hand.offset[0], numbers[:, 0])
+    depth = jnp.where(place.share * free > 0, -place.gap, -jnp.inf)
+    return depth.reshape(-1, depth.shape[-1]).max(0)
+
+
+def _object_distance(
+    scene: Scene, hand: WorldModel, kin: Kinematics, point: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Distance of points from the object, and its gradient along the world's axes."""
+    local = shapes.in_object(kin.object, point)
+    distance, gradient = once(lambda p: shapes.signed_distance(scene, hand, p), local)
+    return distance, apply_columns(kin.object, gradient)
+
+
+def _touch(
+    scene: Scene, look: Look, numbers: jax.Array, frame: jax.Array, centre: jax.Array
+) -> Place:
+    """Contacts of rings or spheres with a surface, see `touch`."""
+    surface = scene.effects.surface
+    return touch(surface, numbers, frame, centre, look(centre), look, apply=once)
+
+
+def _joined(several: list[Place], axis: int) -> Place:
+    """Contacts with several fields, one behind the other along an axis of the items."""
+    if len(several) == 1:
+        return several[0]
+    axes = (axis + 1, axis + 1, axis, axis)
+    fields = zip(axes, zip(*several, strict=True), strict=True)
+    return Place(*(jnp.concatenate(values, at) for at, values in fields))
+
+
+def _of_object(
+    scene: Scene, hand: WorldModel, kin: Kinematics, position: jax.Array, on_object: Look
+) -> list[Place]:
+    """Contacts of the object with table and fixtures, items first."""
+    found = []
+    ones = jnp.ones_like
+    if scene.effects.table:
+        place = shapes.object_on_table(scene, hand, kin.object, position[2])
+        found.append(Place(*place, ones(place[2])))
+    flat = [i for i, s in enumerate(scene.objects.object) if s.type not in held.ROUND]
+    for fixture in scene.fixture:
+        _, rows = surroundings.towards(fixture, position)
+        arms = shapes.lowest_points(scene, hand, surroundings.faced(rows, kin.object))
+        place = surroundings.object_on(fixture, position, rows[:, :, 0], arms)
+        found.append(Place(*place, ones(place[2])))
+        if flat and held.EDGES[fixture.type]:
+            point = surroundings.edges(fixture, position)
+            edges = surroundings.edge_on(point, *on_object(point))
+            on, normal, gap = (v[..., 0, :] for v in edges)
+            faces = jnp.isin(hand.object_id, jnp.array(flat))
+            found.append(Place(on, normal, gap, jnp.where(faces, ones(gap), 0.0)))
+    return found

@@ -206,7 +206,21 @@ def _reversed(
     if settings.segment is None:
         hand_bar, world_bar, *rest = program.adjoint(inputs, path, bars)
         return hand_bar, program.summed(world_bar), *rest
+    return _reversed_by_segment(settings, program, inputs, path, bars, trajectory=trajectory)
+
+
+def _reversed_by_segment(
+    settings: Settings,
+    program: Any,
+    inputs: tuple,
+    path: RecordedPath,
+    bars: Cotangents,
+    *,
+    trajectory: bool,
+) -> tuple:
+    """`_reversed` of a path of which the first states of segments were stored."""
     size = settings.segment
+    assert size is not None
     hand, world, _, _, arm, pressure, *grid = inputs
     steps = arm.shape[1]
     count = path.finger.shape[1]

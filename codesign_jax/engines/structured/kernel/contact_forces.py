@@ -110,7 +110,7 @@ class ForceProgram(Program):
     def _run(self, inputs: tuple) -> list[jax.Array]:
         blocks = inputs[0].shape[0]
         shapes = [(blocks, self.record.rows, self.size), (blocks, self.scratch.rows, self.size)]
-        call, outputs = self.call(self._kernel, "forces", inputs, shapes, inputs[4].dtype)
+        call, outputs = self.call(self._force_kernel, "forces", inputs, shapes, inputs[4].dtype)
         if self.backend == "interpreter":
             return call(*inputs)[:1]
         of_code(reuse.code_digest())
@@ -119,7 +119,7 @@ class ForceProgram(Program):
         kernel = Kernel(origin, self.backend, self.size, shared, scratch=(1,), level=1)
         return launch(call, inputs, outputs, kernel)[:1]  # type: ignore[return-value]
 
-    def _kernel(self, *refs: Any) -> None:
+    def _force_kernel(self, *refs: Any) -> None:
         hand, world, finger_state, world_state, arm, pressure, *rest = refs
         grid = rest.pop(0) if self.meshes else None
         record, scratch = rest

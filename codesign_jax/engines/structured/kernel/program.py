@@ -21,7 +21,7 @@ from codesign_jax.engines.structured.kernel import shared_memory
 from codesign_jax.engines.structured.kernel.memory import Block, anywhere
 from codesign_jax.engines.structured.kernel.memory_tables import Packing
 from codesign_jax.engines.structured.kernel.step import Step
-from codesign_jax.engines.structured.lanewise import lanes, of_code
+from codesign_jax.engines.structured.lanewise import Lanes, lanes, of_code
 from codesign_jax.engines.structured.laws import air
 from codesign_jax.engines.structured.laws.kinematics import State
 from codesign_jax.engines.structured.world_model import WorldModel
@@ -207,85 +207,134 @@ class Program(Packing):
         return call, outputs
 
     def _kernel(self, steps: int, to_end: bool, states: int, *refs: Any) -> None:
-        (hand, world, finger_state0, world_state0, arm, pressure, *rest) = refs
-        grid = rest.pop(0) if self.meshes else None
+        rollout = BlockRollout(self, refs, _records(to_end, states))
+        rollout.start()
+        done = rollout.run(steps, to_end=to_end)
+        rollout.repeat_last(done, steps)
+
+
+class BlockRollout:
+    """The rollout of a block of worlds in the kernel of a program."""
+
+    def __init__(self, program: Program, refs: tuple, records: list[tuple[int, bool]]):
+        """Takes the references to inputs and outputs; `records` as `_records` returns them."""
+        (hand, world, finger_start, world_start, arm, pressure, *rest) = refs
+        grid = rest.pop(0) if program.meshes else None
         (finger_state, world_state, scratch, trace, *path) = rest
-        block = Block(self.fingers, self.block, self.team)
+        block = Block(program.fingers, program.block, program.team)
         onchip = None
-        if self.team > 1:
+        if program.team > 1:
             share = partial(shared_memory.SharedColumns, block)
             *path, onchip = path
-            hand, finger_state0, pressure = map(share, (hand, finger_state0, pressure))
+            hand, finger_start, pressure = map(share, (hand, finger_start, pressure))
             finger_state, scratch, onchip = map(share, (finger_state, scratch, onchip))
             path[::2] = map(share, path[::2])
-        step = Step(self, block, hand, world, finger_state, world_state, scratch, grid, onchip)
-        own = block.world
-        rows = self.finger_state.rows, self.world_state.rows
-        copy_rows((0, rows[0]), lambda k: finger_state0[(k,)], finger_state)
-        copy_rows((0, rows[1]), lambda k: world_state0[k, own], world_state, own)
+        tables = hand, world, finger_state, world_state, scratch, grid, onchip
+        self.program = program
+        self.records = records
+        self.step = Step(program, block, *tables)
+        self.world = block.world
+        self.start_state = finger_start, world_start
+        self.state = finger_state, world_state
+        self.commands = arm, pressure
+        self.trace = trace
+        self.path = path
+
+    def start(self) -> None:
+        """Copies the start state to the state."""
+        finger_start, world_start = self.start_state
+        fingers, worlds = self.state
+        own = self.world
+        rows = self.program.finger_state.rows, self.program.world_state.rows
+        copy_rows((0, rows[0]), lambda k: finger_start[(k,)], fingers)
+        copy_rows((0, rows[1]), lambda k: world_start[k, own], worlds, own)
+
+    def run(self, steps: int, *, to_end: bool) -> jax.Array:
+        """Steps until all worlds are decided; returns the number of steps.
+
+        Args:
+          steps: Largest number of steps.
+          to_end: Whether worlds that lost their object go on.
+        """
+        step = self.step
         bounds = verdict.Bounds(*(step.constant(n).lane for n in verdict.Bounds._fields))
-
-        def number(name: str) -> jax.Array:
-            return step.world_state.read(name).lane
-
-        def keep(**numbers: jax.Array) -> None:
-            for name, value in numbers.items():
-                step.world_state.write(name, lanes([value], (), wide=False))
-
-        def store(place: jax.Array, whole: bool, fingers: Any, worlds: Any) -> None:
-            angles, places = self.path_rows(whole)
-            copy_rows((0, angles), lambda k: finger_state[(k,)], fingers, at=(place,))
-            copy_rows((0, places), lambda k: world_state[k, own], worlds, own, at=(place,))
-
-        def record(t: jax.Array) -> None:
-            for k, (stride, whole) in enumerate(_records(to_end, states)):
-                target = path[2 * k : 2 * k + 2]
-                if stride == 1:
-                    store(t, whole, *target)
-                else:
-                    every = jnp.int32(stride)
-                    put = partial(store, jax.lax.div(t, every), whole, *target)
-                    jax.lax.cond(jax.lax.rem(t, every) == 0, put, lambda: None)
 
         def body(carry: tuple) -> tuple:
             t, going = carry
-            now = number("step")
-            fastest = number("speed")
+            now = self._number("step")
+            fastest = self._number("speed")
 
             def undecided(distance: jax.Array, height: jax.Array) -> jax.Array:
                 return verdict.goes_on(bounds, distance, height, fastest, now, to_end=to_end)
 
-            record(t)
-            commands = lanes([arm[t, k, own] for k in range(6)], (6,), wide=False)
-            chamber = lanes([pressure[t]], (), wide=True)
+            self._record(t)
+            command = self._command(t)
             entry, new_speed, moved = step.advance(
-                commands, chamber, undecided, going > 0, fastest, self.limits
+                *command, undecided, going > 0, fastest, self.program.limits
             )
             going = jnp.where(moved, going, 0.0)
             for k, value in enumerate((*entry[:2], fastest, *entry[2:4], going, *entry[4:])):
-                trace[t, k, own] = value
-            keep(step=now + 1.0, going=going, speed=new_speed)
+                self.trace[t, k, self.world] = value
+            self._keep(step=now + 1.0, going=going, speed=new_speed)
             return t + 1, going
 
         def goes_on(carry: tuple) -> jax.Array:
             # The first step also tells where worlds are that were decided before.
             return (carry[0] < steps) & (anywhere(carry[1] > 0) | (carry[0] == 0))
 
-        done, _ = jax.lax.while_loop(goes_on, body, (jnp.int32(0), number("going")))
+        return jax.lax.while_loop(goes_on, body, (jnp.int32(0), self._number("going")))[0]
 
-        # As for decided worlds of a block that goes on: no residual, and the speed that they have.
-        last_speed = number("speed")
+    def repeat_last(self, done: jax.Array, steps: int) -> None:
+        """Repeats the trace's last entries from step `done` on.
+
+        They are those of decided worlds of a block that goes on: no residual, and their speed.
+        """
+        last_speed = self._number("speed")
         none = jnp.zeros_like(last_speed)
         ended = {"speed": last_speed, "residual": none, "overflow": none}
+        own = self.world
+        trace = self.trace
 
         def repeat(t: jax.Array, x: jax.Array) -> jax.Array:
-            record(t)
-            for k, name in enumerate(self.trace):
+            self._record(t)
+            for k, name in enumerate(self.program.trace):
                 trace[t, k, own] = ended.get(name, trace[done - 1, k, own])
-            keep(step=number("step") + 1.0)
+            self._keep(step=self._number("step") + 1.0)
             return x
 
         jax.lax.fori_loop(done, steps, repeat, jnp.int32(0))
+
+    def _command(self, t: jax.Array) -> tuple[Lanes, Lanes]:
+        """Commands of the arm frame and pressures of the chambers at a step."""
+        arm, pressure = self.commands
+        pose = lanes([arm[t, k, self.world] for k in range(6)], (6,), wide=False)
+        return pose, lanes([pressure[t]], (), wide=True)
+
+    def _number(self, name: str) -> jax.Array:
+        return self.step.world_state.read(name).lane
+
+    def _keep(self, **numbers: jax.Array) -> None:
+        for name, value in numbers.items():
+            self.step.world_state.write(name, lanes([value], (), wide=False))
+
+    def _record(self, t: jax.Array) -> None:
+        """Records the state before step t where it is asked for."""
+        for k, (stride, whole) in enumerate(self.records):
+            target = self.path[2 * k : 2 * k + 2]
+            if stride == 1:
+                self._store(t, whole, *target)
+            else:
+                every = jnp.int32(stride)
+                put = partial(self._store, jax.lax.div(t, every), whole, *target)
+                jax.lax.cond(jax.lax.rem(t, every) == 0, put, lambda: None)
+
+    def _store(self, place: jax.Array, whole: bool, fingers: Any, worlds: Any) -> None:
+        """Stores the whole state, or its positions, at a place of the record."""
+        finger_state, world_state = self.state
+        own = self.world
+        angles, places = self.program.path_rows(whole)
+        copy_rows((0, angles), lambda k: finger_state[(k,)], fingers, at=(place,))
+        copy_rows((0, places), lambda k: world_state[k, own], worlds, own, at=(place,))
 
 
 def _records(trajectory: bool, states: int) -> list[tuple[int, bool]]:

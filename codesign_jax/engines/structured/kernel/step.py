@@ -112,6 +112,21 @@ class Step(StepMemory):
     def keep(self, i: Any, chain: tuple) -> None:
         """Called with what the forward pass carries before joint i, and behind the last one."""
 
+    def _bases(self, at: dict) -> tuple[Lanes, ...]:
+        """The fingers' bases: origin, frame, velocity, bias, motion, and weighted centre."""
+        names = ("mount", "base", "centre_weight", "stub_centre")
+        mount, base, weight, stub = (self.hand.read(n) for n in names)
+        frame, origin = lanewise(kin.mounted, at["place"], at["frame"], mount, base)
+
+        def weighted(place, frame, stub, weight):
+            return weight * (place + apply_columns(frame, stub))
+
+        weight = lanewise(weighted, at["place"], at["frame"], stub, weight)
+        wide = zeros((6,), self.like)
+        palm = at["vel"], at["bias"], at["now"].palm_motion
+        vel, bias, motion = (lanewise(jnp.add, v, wide) for v in palm)
+        return origin, frame, vel, bias, motion, weight
+
     def _forward(self, state: dict, at: dict, pressure: Lanes, thing: WorldObject):
         """Bodies, forces and contacts from the palm to the tips, left in the scratch table.
 
@@ -120,18 +135,8 @@ class Step(StepMemory):
         p = self.p
         now = at["now"]
         like = self.like
-        names = ("mount", "base", "centre_weight", "stub_centre")
-        mount, base, weight, stub = (self.hand.read(n) for n in names)
-        frame, origin = lanewise(kin.mounted, at["place"], at["frame"], mount, base)
-        weight = lanewise(
-            lambda x, f, s, weight: weight * (x + apply_columns(f, s)),
-            at["place"], at["frame"], stub, weight
-        )  # fmt: skip
-        wide = zeros((6,), like)
-        vel, bias, motion = (
-            lanewise(jnp.add, v, wide) for v in (at["vel"], at["bias"], now.palm_motion)
-        )
-
+        start = self._bases(at)
+        origin, frame, vel, _, motion, _ = start
         if p.scene.effects.air_mass:
             pressure = chambers.end_pressures(self, pressure)
         pairs = self.contacts.get("finger_finger")
@@ -142,6 +147,7 @@ class Step(StepMemory):
         if search:
             search.start(motion, vel, frame, origin)
         fields = self.fields(at, thing)
+        still = zeros((6,), like)
 
         def link(i: Any, carry: tuple) -> tuple:
             origin, frame, vel, bias, motion, middle = carry
@@ -151,7 +157,7 @@ class Step(StepMemory):
             constants = self.link_constants(i)
             carry, stored = lanewise(run, carry[:5], constants, joint)
             centre = stored["body_centre"]
-            stored |= {"step_acc": zeros((p.axes,), like), "step_motion": wide}
+            stored |= {"step_acc": zeros((p.axes,), like), "step_motion": still}
             if p.team > 1:
                 stored = team_rows(stored, (constants["mass"], centre, stored["tensor"]))
             for name, value in stored.items():
@@ -163,7 +169,6 @@ class Step(StepMemory):
                 search.link(i, carry[4], carry[2], carry[1], carry[0])
             return (*carry, middle)
 
-        start = (origin, frame, vel, bias, motion, weight)
         origin, frame, vel, bias, motion, middle = loop(p.links, link, start, p.size)
         self.keep(p.links, (origin, frame, vel, bias, motion))
         if search:

@@ -45,10 +45,10 @@ def tells_forces(engine: Engine) -> bool:
 
 def recording(engine: Engine, *, touch: bool = False) -> Engine:
     """The engine as one whose traces have the contact forces; `touch`: ring by ring as well."""
-    own: Any = getattr(engine, "recording", None)
-    if own is None or not tells_forces(engine):
+    method: Any = getattr(engine, "recording", None)
+    if method is None or not tells_forces(engine):
         raise InputError([f"engine {engine.name} records no forces; engine structured does"])
-    return own(touch=touch)
+    return method(touch=touch)
 
 
 class Equal:

@@ -122,9 +122,9 @@ class StructuredEngine(Equal):
         far = jnp.full_like(hand.bounds.speed, FAR)
         hand = hand._replace(bounds=hand.bounds._replace(speed=far, penetration=far))
         program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl))
-        how = {"trajectory": True, "states": True}
+        outputs = {"trajectory": True, "states": True}
         return program.outputs(
-            _execute(program, program.inputs(hand, state, ctrl), **how), len(ctrl), **how
+            _execute(program, program.inputs(hand, state, ctrl), **outputs), len(ctrl), **outputs
         )
 
     def rollout(
@@ -186,10 +186,10 @@ class StructuredEngine(Equal):
     ) -> tuple[Trace, dict[str, jax.Array]]:
         """`simulate`, and qpos, qvel and accelerations of every step, see `Program.simulate`."""
         program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl))
-        how = {"trajectory": trajectory, "states": True}
-        out = _execute(program, self._inputs(program, fields, ctrl), **how)
-        found, end = program.outputs(out, len(ctrl), **how)
-        return self._trace(found, end, trajectory), found
+        outputs = {"trajectory": trajectory, "states": True}
+        out = _execute(program, self._inputs(program, fields, ctrl), **outputs)
+        series, end = program.outputs(out, len(ctrl), **outputs)
+        return self._trace(series, end, trajectory), series
 
     def _inputs(
         self,
@@ -219,10 +219,10 @@ class StructuredEngine(Equal):
         program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl), team=1)
         inputs = program.inputs(world_constants(self.scene, fields), self.reset(fields), ctrl)
         out = _execute(program, inputs, trajectory=trajectory, states=self.segment or 1)
-        found, end = program.outputs(out, len(ctrl), trajectory=trajectory)
-        taken = program.by_block(found["moved"].sum(1)[:, None, None, None])
+        series, end = program.outputs(out, len(ctrl), trajectory=trajectory)
+        taken = program.by_block(series["moved"].sum(1)[:, None, None, None])
         path = jax.tree.map(lambda x: program.by_world(x, len(ctrl)), recorded(out, taken))
-        return self._trace(found, end, trajectory), path
+        return self._trace(series, end, trajectory), path
 
     def _trace(self, found: dict[str, jax.Array], end: State, trajectory: bool) -> Trace:
         series = found["distance"], found["height"], found["speed"]
@@ -235,13 +235,13 @@ class StructuredEngine(Equal):
             *series, qpos, self._status(found), coordinates.whole(end), residual=jnp.sqrt(left)
         )
 
-    def _status(self, found: dict[str, jax.Array]) -> jax.Array:
+    def _status(self, series: dict[str, jax.Array]) -> jax.Array:
         """SOLVER_CAP above the tolerance, CONTACT_OVERFLOW; int32 of shape (world, time)."""
-        above = found["residual"] > self.limits.tolerance
+        above = series["residual"] > self.limits.tolerance
         status = jnp.where(above, int(Status.SOLVER_CAP), 0).astype(jnp.int32)
-        if "overflow" not in found:
+        if "overflow" not in series:
             return status
-        return status | jnp.where(found["overflow"] > 0, int(Status.CONTACT_OVERFLOW), 0)
+        return status | jnp.where(series["overflow"] > 0, int(Status.CONTACT_OVERFLOW), 0)
 
 
 class Recording(Equal):
@@ -270,8 +270,8 @@ class Recording(Equal):
         return run(fields, ctrl)
 
     def _simulate(self, trajectory: bool, fields: ModelFields, ctrl: jax.Array) -> Trace:
-        trace, found = self.engine.states(fields, ctrl, trajectory=trajectory)
-        worlds, steps = found["moved"].shape[:2]
+        trace, states = self.engine.states(fields, ctrl, trajectory=trajectory)
+        worlds, steps = states["moved"].shape[:2]
         # Several steps of few worlds at once: an operation on few numbers costs its start.
         chunk = min(max(1, LANES // worlds), steps)
         rounds = -(-steps // chunk)
@@ -296,14 +296,14 @@ class Recording(Equal):
                 lambda v: jnp.where(moved.reshape(-1, *[1] * (v.ndim - 1)) > 0, v, 0.0), every
             )
 
-        names = [k for k in ("qpos", "qvel", "acc", "moved", "held") if k in found]
-        every = jax.lax.map(step, tuple(split(found[k]) for k in names))
+        names = [k for k in ("qpos", "qvel", "acc", "moved", "held") if k in states]
+        every = jax.lax.map(step, tuple(split(states[k]) for k in names))
         return trace._replace(forces=jax.tree.map(joined, every))
 
 
-def _execute(program: Program, inputs: tuple, **how: Any) -> list[jax.Array | None]:
+def _execute(program: Program, inputs: tuple, **outputs: Any) -> list[jax.Array | None]:
     try:
-        return program.execute(inputs, **how)
+        return program.execute(inputs, **outputs)
     except KernelUnavailable as error:
         raise _unavailable(str(error)) from error
 

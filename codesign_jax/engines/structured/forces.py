@@ -121,7 +121,7 @@ def _touches(
 ) -> dict[str, Touch]:
     """The object's contacts with the rings of fingers and palm, if the scene has them."""
     scene = program.scene
-    found = {}
+    touches = {}
     if "finger_object.force" in stored:
 
         def by_ring(values: jax.Array) -> jax.Array:
@@ -131,7 +131,7 @@ def _touches(
             rings = jnp.swapaxes(rings, 3, 4)
             return rings.reshape(*rings.shape[:2], -1, rings.shape[4])
 
-        found["finger"] = _touch(stored, "finger_object", position, by_ring)
+        touches["finger"] = _touch(stored, "finger_object", position, by_ring)
     if "palm_object.force" in stored:
         spheres = layout(scene).palm.size
         count = PALM_RINGS if scene.effects.surface == "hull" else spheres
@@ -141,8 +141,8 @@ def _touches(
             rings = jnp.moveaxis(values[:, :, 0], (3, 1), (0, 3))
             return rings.reshape(rings.shape[0], -1, rings.shape[3])[:, :count]
 
-        found["palm"] = _touch(stored, "palm_object", position, by_palm_ring)
-    return found
+        touches["palm"] = _touch(stored, "palm_object", position, by_palm_ring)
+    return touches
 
 
 def _touch(stored: dict[str, jax.Array], name: str, position: jax.Array, by_ring: Any) -> Touch:

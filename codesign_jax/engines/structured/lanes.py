@@ -38,11 +38,11 @@ def scan_links(step: Callable, first: Any, links: Any) -> tuple[Any, Any]:
     rows = [x.reshape(count, -1) for x in leading]
 
     def body(carry: Any, i: jax.Array) -> tuple[Any, Any]:
-        own = [
+        arrays = [
             jax.lax.dynamic_index_in_dim(x, i, 0, keepdims=False).reshape(like.shape[1:])
             for x, like in zip(rows, leading, strict=True)
         ]
-        carry, out = step(carry, jax.tree.unflatten(treedef, own))
+        carry, out = step(carry, jax.tree.unflatten(treedef, arrays))
         out_shapes[:] = [x.shape for x in jax.tree.leaves(out)]
         return carry, jax.tree.map(lambda x: x.reshape(-1), out)
 

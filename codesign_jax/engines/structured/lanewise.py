@@ -134,7 +134,7 @@ def _program(call: _Call) -> Callable[[list], Any]:
     Tracing is most of the time that a kernel takes to compile, and its functions come again: for
     each pair of bodies, and in the kernel of the next scene.
     """
-    found: list = []  # As the function is traced: its result, with places instead of values
+    result: list = []  # As the function is traced: its result, with places instead of values
 
     def run(*values: Any) -> list:
         filled = [
@@ -145,7 +145,7 @@ def _program(call: _Call) -> Callable[[list], Any]:
         leaves, tree = jax.tree.flatten(out, is_leaf=lambda x: isinstance(x, Lanes))
         arrays: list = []
         places: dict[int, int] = {}
-        found[:] = [_emptied(leaf, arrays, places) for leaf in leaves], tree
+        result[:] = [_emptied(leaf, arrays, places) for leaf in leaves], tree
         return arrays
 
     run.__name__ = getattr(call.function, "__name__", "lanewise")
@@ -153,7 +153,7 @@ def _program(call: _Call) -> Callable[[list], Any]:
 
     def use(values: list) -> Any:
         arrays = jitted(*values)
-        shells, tree = found
+        shells, tree = result
         leaves = [Lanes(_fill(x.parts, arrays), x.shape, x.dtype) for x in shells]
         return jax.tree.unflatten(tree, leaves)
 

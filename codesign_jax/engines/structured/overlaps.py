@@ -41,7 +41,7 @@ def places(
     effects = scene.effects
     on_object = partial(_object_distance, scene, hand, kin)
     around = [partial(field, position) for field in surroundings.fields(scene)]
-    found = {}
+    by_pair = {}
 
     def add(name: str, numbers: jax.Array, origin: jax.Array, frame: jax.Array) -> None:
         looks = around if name.endswith("_table") else [on_object]
@@ -49,7 +49,7 @@ def places(
             return
         centre = ring_centre(origin, frame, numbers)
         axis = int(name.startswith("finger"))
-        found[name] = _joined([_touch(scene, x, numbers, frame, centre) for x in looks], axis)
+        by_pair[name] = _joined([_touch(scene, x, numbers, frame, centre) for x in looks], axis)
 
     if count := rings_of_link(scene):
         numbers = memory_tables.ring_numbers(scene, hand, count)
@@ -61,8 +61,8 @@ def places(
         for name in ("palm_object", "palm_table"):
             add(name, numbers, kin.place, kin.palm)
     if effects.object_table and surroundings.slots(scene):
-        found["object_table"] = _joined(_of_object(scene, hand, kin, position, on_object), 0)
-    return found
+        by_pair["object_table"] = _joined(_of_object(scene, hand, kin, position, on_object), 0)
+    return by_pair
 
 
 def depth_in_palm(scene: Scene, hand: WorldModel, kin: Kinematics) -> jax.Array:
@@ -115,21 +115,21 @@ def _of_object(
     scene: Scene, hand: WorldModel, kin: Kinematics, position: jax.Array, on_object: Look
 ) -> list[Place]:
     """Contacts of the object with table and fixtures, items first."""
-    found = []
+    each = []
     ones = jnp.ones_like
     if scene.effects.table:
         place = shapes.object_on_table(scene, hand, kin.object, position[2])
-        found.append(Place(*place, ones(place[2])))
+        each.append(Place(*place, ones(place[2])))
     flat = [i for i, s in enumerate(scene.objects.object) if s.type not in held.ROUND]
     for fixture in scene.fixture:
         _, rows = surroundings.towards(fixture, position)
         arms = shapes.lowest_points(scene, hand, surroundings.faced(rows, kin.object))
         place = surroundings.object_on(fixture, position, rows[:, :, 0], arms)
-        found.append(Place(*place, ones(place[2])))
+        each.append(Place(*place, ones(place[2])))
         if flat and held.EDGES[fixture.type]:
             point = surroundings.edges(fixture, position)
             edges = surroundings.edge_on(point, *on_object(point))
             on, normal, gap = (v[..., 0, :] for v in edges)
             faces = jnp.isin(hand.object_id, jnp.array(flat))
-            found.append(Place(on, normal, gap, jnp.where(faces, ones(gap), 0.0)))
-    return found
+            each.append(Place(on, normal, gap, jnp.where(faces, ones(gap), 0.0)))
+    return each

@@ -95,8 +95,8 @@ def folded(function: Callable) -> Callable:
 
     @mapped.def_vmap
     def _(size: int, batched: Any, *args: Any):
-        def merge(x: jax.Array, own: bool) -> jax.Array:
-            x = x if own else jnp.broadcast_to(x, (size, *x.shape))
+        def merge(x: jax.Array, mapped_axis: bool) -> jax.Array:
+            x = x if mapped_axis else jnp.broadcast_to(x, (size, *x.shape))
             return x.reshape(size * x.shape[1], *x.shape[2:])
 
         def split(x: jax.Array) -> jax.Array:
@@ -157,9 +157,9 @@ def _adjoint(
     if trajectory:
         bars = bars._replace(path=program.rows_of(_gathered(taken, cotangent.qpos)))
     path, bars = jax.tree.map(program.by_block, (path, bars))
-    found = _reversed(settings, program, tables, path, bars, trajectory=trajectory)
+    bars_of_inputs = _reversed(settings, program, tables, path, bars, trajectory=trajectory)
     sound = program.sound  # pyright: ignore[reportAttributeAccessIssue]  # an AdjointProgram here
-    fields_bar, ctrl_bar = pull_inputs(sound(found, path.taken))
+    fields_bar, ctrl_bar = pull_inputs(sound(bars_of_inputs, path.taken))
     fields_bar = fields_bar._replace(shape=None)  # an index has no derivative
     # A world of fields that are not numbers never moved, and has no derivative.
     return jax.tree.map(partial(_of_worlds, taken[:, 0] > 0), (fields_bar, ctrl_bar))
@@ -224,8 +224,8 @@ def _reversed_by_segment(
     hand, world, _, _, arm, pressure, *grid = inputs
     steps = arm.shape[1]
     count = path.finger.shape[1]
-    how = {"backend": program.backend, "width": program.size, "team": 1}
-    again = Program(settings.scene, settings.limits, **how)  # type: ignore[arg-type]
+    options = {"backend": program.backend, "width": program.size, "team": 1}
+    again = Program(settings.scene, settings.limits, **options)  # type: ignore[arg-type]
 
     def split(x: jax.Array) -> jax.Array:
         """(block, time, ...) to (segment, block, time of the segment, ...)."""
@@ -235,13 +235,13 @@ def _reversed_by_segment(
     def segment(ends: tuple, given: tuple) -> tuple[tuple, tuple]:
         number, start, commands, shown = given
         taken = jnp.clip(path.taken - number * size, 0, size)
-        own = (hand, world, *start, *commands, *grid)
-        out = again.execute(own, trajectory=trajectory, states=1)
+        given_inputs = (hand, world, *start, *commands, *grid)
+        out = again.execute(given_inputs, trajectory=trajectory, states=1)
         here = recorded(out, taken)
         finger_bar, state_bar, *sums = ends
         cotangents = Cotangents(finger_bar, state_bar, shown[0], shown[1:])
-        found = program.adjoint(own, here, cotangents, tuple(sums))
-        hand_bar, world_bar, *state, arm_bar, pressure_bar = found[:6]
+        cotangents_before = program.adjoint(given_inputs, here, cotangents, tuple(sums))
+        hand_bar, world_bar, *state, arm_bar, pressure_bar = cotangents_before[:6]
         state = [(jnp.zeros_like(x) if settings.truncate else x)[:, None] for x in state]
         return (*state, hand_bar, world_bar), (arm_bar, pressure_bar)
 

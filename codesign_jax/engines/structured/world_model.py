@@ -86,8 +86,8 @@ def sections(hand: WorldModel, places: np.ndarray) -> tuple[Any, Any, Any]:
     if hand.tip is None:
         return base[0], base[1], base[2]
     along = np.asarray(places, hand.section.dtype)[:, None, None]
-    found = [a + along * (b - a) for a, b in zip(base, hand.tip, strict=True)]
-    return found[0], found[1], found[2]
+    sizes = [a + along * (b - a) for a, b in zip(base, hand.tip, strict=True)]
+    return sizes[0], sizes[1], sizes[2]
 
 
 def joint_sections(hand: WorldModel, links: int) -> jax.Array:
@@ -243,9 +243,9 @@ def _wrist(scene: Scene, like: jax.Array) -> tuple[jax.Array, jax.Array, jax.Arr
     def rows(values: list) -> jax.Array:
         return jnp.stack([jnp.broadcast_to(jnp.asarray(v, like.dtype), like.shape) for v in values])
 
-    stiffness, own = map(rows, wrist_springs(scene))
+    stiffness, wrist_damping = map(rows, wrist_springs(scene))
     rigid = not scene.effects.wrist
-    return stiffness, *implicit_spring(scene, stiffness, own, rigid=rigid)
+    return stiffness, *implicit_spring(scene, stiffness, wrist_damping, rigid=rigid)
 
 
 def _palm_points(scene: Scene, lay: Layout, like: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -268,10 +268,10 @@ def _palm(
       inertia: Their principal inertia, same shape.
       mount: Columns of their orientations, shape (3, 3, finger, world).
     """
-    own = scene.hand.palm
-    none = jnp.zeros_like(own.mass)
-    masses = jnp.concatenate([own.mass, fields.mass[:, :, 0].T])
-    palm_centre = jnp.stack([none, none, own.thickness / 2])
+    palm = scene.hand.palm
+    none = jnp.zeros_like(palm.mass)
+    masses = jnp.concatenate([palm.mass, fields.mass[:, :, 0].T])
+    palm_centre = jnp.stack([none, none, palm.thickness / 2])
     centres = jnp.concatenate([palm_centre, centres], 1)
     eye = jnp.broadcast_to(
         jnp.eye(3, dtype=masses.dtype)[:, :, None, None], (3, 3, *palm_centre.shape[1:])

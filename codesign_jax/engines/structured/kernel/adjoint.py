@@ -59,8 +59,8 @@ class Cotangents(NamedTuple):
 class AdjointProgram(Program):
     """Tables and kernel of a rollout's derivative."""
 
-    def __init__(self, *args: Any, **how: Any):
-        super().__init__(*args, **{**how, "team": 1})
+    def __init__(self, *args: Any, **options: Any):
+        super().__init__(*args, **{**options, "team": 1})
 
     remembers = ("owner", "ring")
 
@@ -92,16 +92,16 @@ class AdjointProgram(Program):
         given = self._arguments(inputs, path, bars, sums)
         call, outputs = self._adjoint_call(given)
         if self.backend == "interpreter":
-            found = call(*given)[:6]
+            cotangents = call(*given)[:6]
         else:
             of_code(reuse.code_digest())
             origin = repr((self.scene.structure, "adjoint"))
             shared = (len(given) - 1,) if self.meshes else ()
             # At LLVM's level 1 it is as fast, with the same bits, after two thirds of LLVM's time.
             kernel = Kernel(origin, self.backend, self.size, shared, scratch=(6, 7, 8), level=1)
-            found = launch(call, given, outputs, kernel)[:6]
+            cotangents = launch(call, given, outputs, kernel)[:6]
         grid = (jnp.zeros_like(inputs[-1]),) if self.meshes else ()
-        return (*cast("list[jax.Array]", found), *grid)
+        return (*cast("list[jax.Array]", cotangents), *grid)
 
     def no_sums(self, blocks: int, dtype: Any) -> tuple:
         """Cotangents of the constants before the last step: those of the hand, and the worlds'."""
@@ -118,8 +118,8 @@ class AdjointProgram(Program):
         lane = jnp.tile(some, (1, 1, self.fingers))
         masks = lane, some, lane, some, some[:, None], lane
         pairs = zip(masks, bars, strict=False)
-        found = [jnp.where(mask | jnp.isfinite(x), x, 0.0) for mask, x in pairs]
-        return (*found, *bars[6:])
+        cleared = [jnp.where(mask | jnp.isfinite(x), x, 0.0) for mask, x in pairs]
+        return (*cleared, *bars[6:])
 
     def _arguments(
         self, inputs: tuple, path: RecordedPath, bars: Cotangents, sums: tuple | None = None
@@ -159,7 +159,7 @@ class AdjointProgram(Program):
         hand_bar, world_bar, finger_bar, state_bar, arm_bar, pressure_bar, *rest = rest
         scratch, finger_state, world_state = rest
         block = Block(self.fingers, self.block)
-        own = block.world
+        lane_world = block.world
         none = jnp.zeros((self.size,), scratch.dtype)
         bars = CotangentTables(self, block, (hand_bar, world_bar, finger_bar, state_bar), scratch)
         tables = hand, world, finger_state, world_state, scratch, grid
@@ -167,40 +167,47 @@ class AdjointProgram(Program):
         copy_rows((0, self.hand.rows), lambda k: hand_sum[(k,)], hand_bar)
         copy_rows((0, self.world_bars.rows), lambda k: world_sum[(k,)], world_bar)
         copy_rows((0, self.finger_state.rows), lambda k: finger_seed[(0, k)], finger_bar)
-        copy_rows((0, self.world_state.rows), lambda k: world_seed[0, k, own], state_bar, own)
-        count = taken[0, 0, own]
+        copy_rows(
+            (0, self.world_state.rows),
+            lambda k: world_seed[0, k, lane_world],
+            state_bar,
+            lane_world,
+        )
+        count = taken[0, 0, lane_world]
         last = jnp.minimum(jnp.max(count.astype(jnp.int32)), steps - 1)
 
         def quiet(t: jax.Array, x: jax.Array) -> jax.Array:
             for k in range(6):
-                arm_bar[t, k, own] = none
+                arm_bar[t, k, lane_world] = none
             pressure_bar[(t, slice(None))] = none
             return x
 
         def reverse(back: jax.Array, x: jax.Array) -> jax.Array:
             t = last - back
             moved = t.astype(count.dtype) < count
-            self._load(t, steps, moved, states, (finger_state, world_state), own)
-            commands = [jnp.where(moved, arm[t, k, own], 0.0) for k in range(6)]
+            self._load(t, steps, moved, states, (finger_state, world_state), lane_world)
+            commands = [jnp.where(moved, arm[t, k, lane_world], 0.0) for k in range(6)]
             chamber = jnp.where(moved, pressure[(t,)], 0.0)
-            shown = TraceCotangents(*(trace[t, k, own] for k in range(3)))
+            shown = TraceCotangents(*(trace[t, k, lane_world] for k in range(3)))
             arms = step.reverse(
                 lanes(commands, (6,), wide=False), lanes([chamber], (), wide=True), moved, shown
             )
             for k in range(6):
-                arm_bar[t, k, own] = jnp.where(moved, arms[k].lane, 0.0)
+                arm_bar[t, k, lane_world] = jnp.where(moved, arms[k].lane, 0.0)
             pressure_bar[(t, slice(None))] = jnp.where(moved, bars.of_step("pressure").lane, 0.0)
             if path:
                 angles, places = self.path_rows(states=False)
                 copy_rows((0, angles), lambda k: finger_bar[(k,)] + path[0][(t, k)], finger_bar)
-                rows = lambda k: state_bar[k, own] + path[1][t, k, own]  # noqa: E731
-                copy_rows((0, places), rows, state_bar, own)
+                rows = lambda k: state_bar[k, lane_world] + path[1][t, k, lane_world]  # noqa: E731
+                copy_rows((0, places), rows, state_bar, lane_world)
             return x
 
         jax.lax.fori_loop(last + 1, steps, quiet, jnp.int32(0))
         jax.lax.fori_loop(0, last + 1, reverse, jnp.int32(0))
 
-    def _load(self, t: Any, steps: int, moved: Any, states: list, target: tuple, own: Any) -> None:
+    def _load(
+        self, t: Any, steps: int, moved: Any, states: list, target: tuple, lane_world: Any
+    ) -> None:
         """Loads the state before a step, with the step's accelerations.
 
         A recorded row has the acceleration of the step before it, the solver's warm start.  Where a
@@ -217,10 +224,10 @@ class AdjointProgram(Program):
             return jnp.where(moved, acc, 0.0)
 
         def of_world(k: jax.Array) -> jax.Array:
-            acc = jnp.where(more, worlds[after, k, own], world_end[0, k, own])
+            acc = jnp.where(more, worlds[after, k, lane_world], world_end[0, k, lane_world])
             return jnp.where(moved, acc, 0.0)
 
         copy_rows((0, first[0]), lambda k: fingers[(t, k)], target[0])
-        copy_rows((0, first[1]), lambda k: worlds[t, k, own], target[1], own)
+        copy_rows((0, first[1]), lambda k: worlds[t, k, lane_world], target[1], lane_world)
         copy_rows((first[0], ends[0]), of_finger, target[0])
-        copy_rows((first[1], ends[1]), of_world, target[1], own)
+        copy_rows((first[1], ends[1]), of_world, target[1], lane_world)

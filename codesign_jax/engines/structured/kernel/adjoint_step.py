@@ -107,21 +107,21 @@ class ReverseStep(Step):
         after = {n: self.bars.world_state.read(n) for n in MOVED}
         given = old, at["columns"], now.wrist, now.object_motion
         run = partial(moved, h)
-        own, columns, wrist, obj = pull(run, given, (), only_on(go, after))
+        state_bars, columns, wrist, obj = pull(run, given, (), only_on(go, after))
         self.bars.add_once({"columns": columns})
 
         def joint(i: Any, x: Any) -> Any:
             given = tuple(self.joint(i).values())
             bars = [self.bars.finger_state.read(n, i) for n in JOINT[:2]]
             *new, acc = pull(partial(_turned, h), given, (), only_on(go, bars))
-            for name, one, other in zip(JOINT, new, bars, strict=False):
-                value = lanewise(jnp.where, go, one, other)
+            for name, new_bar, bar in zip(JOINT, new, bars, strict=False):
+                value = lanewise(jnp.where, go, new_bar, bar)
                 self.bars.finger_state.write(name, value, i)
             self.scratch.write("acc_bar", acc, i)
             return x
 
         jax.lax.fori_loop(0, p.links, joint, jnp.int32(0))
-        before = {n: lanewise(jnp.where, go, own[n], after[n]) for n in MOVED}
+        before = {n: lanewise(jnp.where, go, state_bars[n], after[n]) for n in MOVED}
         return before, (wrist, obj)
 
     def _centre_bar(self, centre: Lanes, bar: jax.Array) -> Lanes:
@@ -150,19 +150,19 @@ class ReverseStep(Step):
         now, virtual, wrist_bar = accelerations
         still = {"acc_wrist": now.wrist, "acc_object": now.object_motion}
         still |= {"virtual_wrist": virtual.wrist, "object_along": virtual.object_motion}
-        own = {n: self.bars.of_step(n) for n in self.bars.names if n != "pressure"}
-        base, own = self.block.sum((base, own))
-        one = lanes([self.like + 1.0], (), wide=False)
+        step_bars = {n: self.bars.of_step(n) for n in self.bars.names if n != "pressure"}
+        base, step_bars = self.block.sum((base, step_bars))
+        unit = lanes([self.like + 1.0], (), wide=False)
         given = {n: state[n] for n in MOVED}, arm, self.palm_constants()
         run = partial(residual.of_palm, p.scene.discretization.timestep)
         acc = wrist_bar if not p.scene.effects.wrist else lanewise(jnp.zeros_like, wrist_bar)
-        height = plus(own["height"], lanes([shown.height], (), wide=False))
-        bars = base, own["columns"], own["object_vel"], height, acc, one
-        found, arm_bar, constant_bars = pull(run, given, (still,), bars)
+        height = plus(step_bars["height"], lanes([shown.height], (), wide=False))
+        bars = base, step_bars["columns"], step_bars["object_vel"], height, acc, unit
+        state_bars, arm_bar, constant_bars = pull(run, given, (still,), bars)
         self.bars.add_once(constant_bars)
         if p.scene.fixture:
-            found["position"] = plus(found["position"], own["position"])
-        for name, value in plus(found, before).items():
+            state_bars["position"] = plus(state_bars["position"], step_bars["position"])
+        for name, value in plus(state_bars, before).items():
             self.bars.world_state.write(name, value)
         any_of(shown.speed != 0, lambda: add_speed_cotangent(self, self.bars, state, shown.speed))
         return arm_bar
@@ -228,7 +228,7 @@ class AdjointSolve(Elimination):
     def _substitute(self, step: Iterate) -> None:
         problem = self.problem
 
-        def one(i: Any, parent: Lanes) -> Lanes:
+        def link(i: Any, parent: Lanes) -> Lanes:
             axes, *factors = problem.read("axes", "w", "g", "z", item=i)
 
             def move(axes, factors, parent, obj):
@@ -241,7 +241,7 @@ class AdjointSolve(Elimination):
 
         parent = problem.widened(step.palm_motion)
         problem.write("chain.along", parent, 0)
-        loop(self.links, one, parent, self.block.size)
+        loop(self.links, link, parent, self.block.size)
 
 
 def _none(value: Lanes) -> Lanes:
@@ -280,16 +280,16 @@ def _folded(
     """function(x, velocities, *more) folded over all velocities of a world."""
     p = step.p
 
-    def one(i: Any, x: Lanes) -> Lanes:
+    def link(i: Any, x: Lanes) -> Lanes:
         return lanewise(function, x, _rates(step, i), *more)
 
     first = zeros((), step.like)
-    found = lanes(
-        [step.block.fold(loop(p.links, one, first, p.size).lane, combine)], (), wide=False
+    result = lanes(
+        [step.block.fold(loop(p.links, link, first, p.size).lane, combine)], (), wide=False
     )
     for name in VELOCITIES:
-        found = lanewise(function, found, state[name], *more)
-    return found
+        result = lanewise(function, result, state[name], *more)
+    return result
 
 
 def _largest(x, velocities):

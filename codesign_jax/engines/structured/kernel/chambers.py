@@ -32,8 +32,8 @@ JOINT = ("finger", "finger_vel", "acc")
 
 def fields(links: int, axes: int) -> dict[str, tuple[int, tuple[int, ...]]]:
     """Rows of scratch memory: c, g'a of the last step, w, s, r_1, r_o1, and y_1 of the joints."""
-    found = dict.fromkeys(("air_stiffness", "air_step", "air_series", "air_sum"), (1, ()))
-    return {**found, "air_palm": (1, (6,)), "air_object": (1, (6,)), "air_joint": (links, (axes,))}
+    rows = dict.fromkeys(("air_stiffness", "air_step", "air_series", "air_sum"), (1, ()))
+    return {**rows, "air_palm": (1, (6,)), "air_object": (1, (6,)), "air_joint": (links, (axes,))}
 
 
 def end_pressures(step: StepMemory, charge: Lanes) -> Lanes:
@@ -58,15 +58,15 @@ def reverse(step: StepMemory, bars: CotangentTables, charge: Lanes) -> None:
         turned = [jnp.stack([gain * v] + [0 * v] * (p.axes - 1)) for v in grown[:2]]
         return turned, sum(joint[n][0] * v for n, v in zip(JOINT, grown, strict=True))
 
-    def one(i: Any, x: jax.Array) -> jax.Array:
+    def link(i: Any, x: jax.Array) -> jax.Array:
         row = i if p.tapered else 0
         gain = step.hand.read("gain", row)
-        turned, own = lanewise(moments, gain, step.joint(i), grown)
+        turned, gain_bar = lanewise(moments, gain, step.joint(i), grown)
         bars.add_joint(dict(zip(JOINT[:2], turned, strict=True)), i)
-        bars.add({"gain": own}, row)
+        bars.add({"gain": gain_bar}, row)
         return x
 
-    jax.lax.fori_loop(0, p.links, one, jnp.int32(0))
+    jax.lax.fori_loop(0, p.links, link, jnp.int32(0))
 
 
 def _law(step: StepMemory) -> Callable:
@@ -80,11 +80,11 @@ def _given(step: StepMemory, charge: Lanes) -> tuple:
     def add(sums, gain, joint):
         return [v + gain * joint[n][0] for v, n in zip(sums, JOINT, strict=True)]
 
-    def one(i: Any, sums: list[Lanes]) -> list[Lanes]:
+    def link(i: Any, sums: list[Lanes]) -> list[Lanes]:
         gain = step.hand.read("gain", i if p.tapered else 0)
         return lanewise(add, sums, gain, step.joint(i))
 
-    grown = loop(p.links, one, [zeros((), like)] * 3, p.size)
+    grown = loop(p.links, link, [zeros((), like)] * 3, p.size)
     return charge, step.hand.read("volume"), step.constant("air"), grown
 
 
@@ -122,13 +122,13 @@ class Chambers:
             r, ro, new = el.eliminate_again(axes, el.Kept(el.Factors(w, g, y), inverse), r, ro, tau)
             return (r, ro, give + dot(y, new.z)), y
 
-        def one(i: Any, carry: tuple) -> tuple:
+        def link(i: Any, carry: tuple) -> tuple:
             carry, y = lanewise(again, carry, *self._read(i, "gain", "axes", "w", "g", "inverse"))
             self.step.write("air_joint", y, i)
             return carry
 
         start = none, none, zeros((), self.step.like)
-        palm, obj, give = loop(self.links, one, start, self.size, reverse=True)
+        palm, obj, give = loop(self.links, link, start, self.size, reverse=True)
         # Stiffness of the air in series with the finger's compliance `give`
         series = lanewise(lambda c, e: c / (1 + c * e), *self._of_finger("stiffness"), give)
         for name, value in (("palm", palm), ("object", obj), ("series", series)):
@@ -191,16 +191,16 @@ class Chambers:
     def _change(self, name: str, function: Callable, *names: Any) -> None:
         """Replaces what is kept of each joint by a function of it and of more."""
 
-        def one(i: Any, x: jax.Array) -> jax.Array:
+        def link(i: Any, x: jax.Array) -> jax.Array:
             self.step.write(name, lanewise(function, *self._read(i, name, *names)), i)
             return x
 
-        jax.lax.fori_loop(0, self.links, one, jnp.int32(0))
+        jax.lax.fori_loop(0, self.links, link, jnp.int32(0))
 
     def _sum(self, function: Callable, *names: str) -> Lanes:
         """Sum over the joints of a function of what is kept of each."""
 
-        def one(i: Any, total: Lanes) -> Lanes:
+        def link(i: Any, total: Lanes) -> Lanes:
             return lanewise(lambda t, *v: t + function(*v), total, *self._read(i, *names))
 
-        return loop(self.links, one, zeros((), self.step.like), self.size)
+        return loop(self.links, link, zeros((), self.step.like), self.size)

@@ -85,8 +85,8 @@ class ForceProgram(Program):
             return {}
         inputs = self.inputs(hand, state, self._commands(state))
         (record,) = self._run(inputs)
-        found = self.record.unpack(record, self.fingers, self.fingers, worlds)
-        return {name: found[name] for name in self.record.groups}
+        unpacked = self.record.unpack(record, self.fingers, self.fingers, worlds)
+        return {name: unpacked[name] for name in self.record.groups}
 
     def shapes(self, worlds: int, dtype: Any) -> dict[str, jax.ShapeDtypeStruct]:
         """Shapes of what `stored` returns."""

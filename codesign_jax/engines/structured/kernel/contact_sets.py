@@ -43,8 +43,8 @@ def cone_fields(scene: Scene) -> list[str]:
 
 def cone_of(scene: Scene, numbers: Any) -> Cone:
     """The cone of a scene's contacts from its numbers, in the order of `cone_fields`."""
-    found: dict[str, Any] = dict.fromkeys(Cone._fields)
-    return Cone(**found | {name: numbers[i] for i, name in enumerate(cone_fields(scene))})
+    fields: dict[str, Any] = dict.fromkeys(Cone._fields)
+    return Cone(**fields | {name: numbers[i] for i, name in enumerate(cone_fields(scene))})
 
 
 def zeros(shape: tuple[int, ...], like: jax.Array) -> Lanes:
@@ -176,11 +176,11 @@ class BoundContacts:
     def each_item(self, body: Callable[[Any], None]) -> None:
         """Runs body(item), which stores something, for all items."""
 
-        def one(item: jax.Array, x: jax.Array) -> jax.Array:
+        def step(item: jax.Array, x: jax.Array) -> jax.Array:
             body(item)
             return x
 
-        jax.lax.fori_loop(0, self.set.count, one, jnp.int32(0))
+        jax.lax.fori_loop(0, self.set.count, step, jnp.int32(0))
 
     def place(self, item: Any) -> Place:
         return Place(*(self.read(field, item) for field in Place._fields))

@@ -56,15 +56,15 @@ def pull(function: Callable, args: tuple, fixed: tuple, bars: Any) -> Any:
         if not is_number(part)
     ]
     seeds = [splat(s, p.shape, p.dtype) for s, p in zip(seeds, primals, strict=True)]
-    (found,) = back(seeds)
+    (arg_bars,) = back(seeds)
     shells = [_nothing(leaf) for leaf in leaves]
-    for (n, at), bar in zip(spots, found, strict=True):
+    for (n, at), bar in zip(spots, arg_bars, strict=True):
         shells[n].parts[at] = bar
     return jax.tree.unflatten(tree, shells)
 
 
-def plus(one: Any, other: Any) -> Any:
-    return lanewise(_sum, one, other)
+def plus(first: Any, second: Any) -> Any:
+    return lanewise(_sum, first, second)
 
 
 def only_on(mask: Lanes, tree: Any) -> Any:
@@ -72,8 +72,8 @@ def only_on(mask: Lanes, tree: Any) -> Any:
     return lanewise(_where, mask, tree)
 
 
-def _sum(one: Any, other: Any) -> Any:
-    return jax.tree.map(jnp.add, one, other)
+def _sum(first: Any, second: Any) -> Any:
+    return jax.tree.map(jnp.add, first, second)
 
 
 def _where(mask: jax.Array, tree: Any) -> Any:

@@ -75,9 +75,9 @@ class Coupling:
         self.substitute("z", step)
         self._begin(lanes([~idle], (), wide=False))
         none = jnp.zeros_like(work)
-        one = jnp.ones_like(work)
+        ones = jnp.ones_like(work)
         # Squared error and curvature; squared error and length of the step before; work.
-        start = (jnp.int32(0), *self._products(), one, none, work)
+        start = (jnp.int32(0), *self._products(), ones, none, work)
 
         def misses(size: jax.Array, work: jax.Array) -> jax.Array:
             return size > self.tolerance * jnp.abs(work)
@@ -89,16 +89,16 @@ class Coupling:
         def body(carry: tuple) -> tuple:
             count, size, bent, last, length, work = carry
             turn = jnp.where(length > 0, size / last, none)
-            curvature = bent - turn * size / jnp.where(length > 0, length, one)
+            curvature = bent - turn * size / jnp.where(length > 0, length, ones)
             sound = misses(size, work) & (curvature > 0)
-            length = jnp.where(sound, size / jnp.where(sound, curvature, one), none)
+            length = jnp.where(sound, size / jnp.where(sound, curvature, ones), none)
             # The step of a world that has converged has length zero: its contacts add nothing.
             with self.pairs.only(sound):
                 work = work + length * self._advance(length, turn)
                 new, bent = self._products()
             # A world that has converged keeps its values: they must not depend on other worlds.
             kept = jnp.where(sound, jnp.maximum(new, 0.0), none)
-            return count + 1, kept, bent, jnp.where(sound, size, one), length, work
+            return count + 1, kept, bent, jnp.where(sound, size, ones), length, work
 
         work = jax.lax.while_loop(going, body, start)[-1]
         more = self._result(lanes([work > 0], (), wide=False))
@@ -119,7 +119,7 @@ class Coupling:
         pairs.clear_wrenches()
 
         def store(item: Any, pairing: FingerPairing) -> None:
-            own = pairs.own_side(item)
+            side = pairs.own_side(item)
             hessian = pairs.read("hessian", item)
             change = pairs.relative(item, pairing)
             left = lanewise(lambda b, f: jnp.where(b, -f, 0.0), busy, pairs.stiff(hessian, change))
@@ -127,7 +127,7 @@ class Coupling:
             fields = {"first": change, "left": left, "along": none, "moved": none, "sum": none}
             for field, value in fields.items():
                 pairs.write(field, value, item)
-            pairs.load(item, own, left, pairing)
+            pairs.load(item, side, left, pairing)
 
         pairs.do(store)
 
@@ -171,7 +171,7 @@ class Coupling:
             return along, moved, total_ + alpha * along, left - alpha * along
 
         def store(item: Any, pairing: FingerPairing, gain: Lanes) -> Lanes:
-            own = pairs.own_side(item)
+            side = pairs.own_side(item)
             hessian = pairs.read("hessian", item)
             old = [pairs.read(name, item) for name in names]
             first = pairs.read("first", item)
@@ -180,7 +180,7 @@ class Coupling:
             left = lanewise(lambda a, r, f: r - a * f, alpha, left, stiff)
             for name, value in zip(("left", *names[2:]), (left, along, moved, total_), strict=True):
                 pairs.write(name, value, item)
-            pairs.load(item, own, left, pairing)
+            pairs.load(item, side, left, pairing)
 
             def add(gain, half, along, first):
                 return gain + half * sum_axis(dot(along, first), 0)
@@ -220,10 +220,10 @@ class Coupling:
         if chambers := self.problem.chambers:
             r, ro, _ = chambers.close_again("z_again", r, ro)
         r = self.problem.add_first(r)
-        found = self._palm(*self.block.sum((r, ro)))
+        at_palm = self._palm(*self.block.sum((r, ro)))
         if chambers:
-            chambers.settle("z_again", found.palm_motion, found.object_motion)
-        return found
+            chambers.settle("z_again", at_palm.palm_motion, at_palm.object_motion)
+        return at_palm
 
     def _palm(self, r: Lanes, ro: Lanes) -> Iterate:
         palm = self.problem.palm
@@ -232,7 +232,7 @@ class Coupling:
     def substitute(self, z: str, step: Iterate) -> None:
         """Leaves the links' motion with the sides, see `LineSearch.prepare`."""
 
-        def one(i: Any, parent: Lanes) -> Lanes:
+        def link(i: Any, parent: Lanes) -> Lanes:
             axes, *factors = self.problem.read("axes", "w", "g", z, item=i)
 
             def move(axes, factors, parent, obj):
@@ -244,7 +244,7 @@ class Coupling:
 
         parent = self.problem.widened(step.palm_motion)
         self.pairs.put("motion", parent, 0)
-        loop(self.links, one, parent, self.block.size)
+        loop(self.links, link, parent, self.block.size)
 
 
 def solve_palm_again(

@@ -93,8 +93,8 @@ def _joint_inverse(axes: jax.Array, u: jax.Array, armature: jax.Array) -> jax.Ar
     """D^-1 with D = S'P S + armature."""
     n = axes.shape[0]
     eye = jnp.eye(n, dtype=axes.dtype)[:, :, None, None]
-    own = contract(axes[:, None], u[None], 2) + eye * armature[:, None]
-    return inverse_spd(own)
+    matrix = contract(axes[:, None], u[None], 2) + eye * armature[:, None]
+    return inverse_spd(matrix)
 
 
 def _factor(inverse: jax.Array, u: jax.Array, h: jax.Array | None, y: jax.Array):

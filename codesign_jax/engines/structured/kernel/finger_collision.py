@@ -52,10 +52,10 @@ the speed with which it moves as the link turns [ours]."""
 def fields(links: int) -> dict[str, tuple[int, tuple[int, ...]]]:
     """Where the fingers are, for the lanes of the others."""
     rows = links + 1
-    found = {"frame": (rows, (3, 3)), "joint": (rows, (3,)), "end": (rows + 1, (3,))}
-    found |= {"line": (rows, (7,)), "other": (rows, (7,))}
-    found |= {"fastest": (1, ()), "other_size": (1, (2,))}
-    return {f"pair.{name}": group for name, group in found.items()}
+    rows_by_name = {"frame": (rows, (3, 3)), "joint": (rows, (3,)), "end": (rows + 1, (3,))}
+    rows_by_name |= {"line": (rows, (7,)), "other": (rows, (7,))}
+    rows_by_name |= {"fastest": (1, ()), "other_size": (1, (2,))}
+    return {f"pair.{name}": group for name, group in rows_by_name.items()}
 
 
 class FingerCollision:
@@ -145,11 +145,11 @@ class FingerCollision:
         place = self.read("joint", self.p.links), self.read("frame", self.p.links)
         self.write("end", lanewise(ring_centre, *place, tip), self.p.links + 1)
 
-        def one(row: Any) -> None:
+        def segment(row: Any) -> None:
             ends = self.read("end", row), self.read("end", row + 1)
             self.write("line", lanewise(_line, *ends), row)
 
-        each(self.p.links + 1, one)
+        each(self.p.links + 1, segment)
 
     def body(self, item: Any) -> tuple[Any, Lanes, Lanes, Lanes]:
         """A ring's link, its numbers, the link's frame and the ring's centre."""
@@ -179,20 +179,20 @@ class FingerCollision:
                 each(self.p.links + 1, copy)
                 size = lanewise(_stacked, self.reach(self.largest()), self.read("fastest"))
                 self.write("other_size", pairing.swap(size))
-            one = self._on_finger if self.hull else self._on_spheres
-            self._each_ring(0, lambda *ring: one(row, pairing, owner, *ring))
+            search = self._on_finger if self.hull else self._on_spheres
+            self._each_ring(0, lambda *ring: search(row, pairing, owner, *ring))
             return x
 
         jax.lax.fori_loop(int(self.pairs.set.alone), self.pairs.set.rows, pairing, jnp.int32(0))
 
-    def _each_ring(self, link: int, one: Callable) -> None:
-        """Runs one(item, lanes that have it) for all rings from a link on, dealt to the lanes."""
+    def _each_ring(self, link: int, search: Callable) -> None:
+        """Runs search(item, lanes that have it) for all rings from a link on, dealt to lanes."""
         first = link * self.p.k
         count = self.count - first
 
         def ring(k: Any) -> None:
             item, mine = self.block.dealt(count, k)
-            one(item + first, self.like > -1 if mine is None else mine)
+            search(item + first, self.like > -1 if mine is None else mine)
 
         each(self.block.rounds(count), ring)
 
@@ -269,23 +269,23 @@ class FingerCollision:
 
         left = jnp.where(left == first, -1, left)
         start = [jnp.max(left), left, *arrays]
-        found = rebuild(jax.lax.while_loop(lambda c: c[0] >= 0, step, start)[2:])
-        return found if pairing is None else pairing.swap(found)
+        gathered = rebuild(jax.lax.while_loop(lambda c: c[0] >= 0, step, start)[2:])
+        return gathered if pairing is None else pairing.swap(gathered)
 
     def _number(self, value: Any) -> Lanes:
         return lanes([self.like + jnp.asarray(value, self.like.dtype)], (1, 1), wide=True)
 
-    def _alone(self, found: dict[str, Lanes], other: Any, item: Any, mine: jax.Array) -> None:
+    def _alone(self, candidate: dict[str, Lanes], other: Any, item: Any, mine: jax.Array) -> None:
         """Gives a slot to a contact of a finger with the palm or itself.
 
         Args:
-          found: See `_begun`.
+          candidate: See `_begun`.
           other: Link of the other side, 0 for the palm; `item`: the ring.
         """
-        found |= {"other": self._number(other)}
-        found |= self.pairs.remembered({"owner": 1.0, "ring": item})
-        which = mine & (found["share"].lane > 0)
-        any_of(which, lambda: self.pairs.add(0, which, found, self.block.own))
+        candidate |= {"other": self._number(other)}
+        candidate |= self.pairs.remembered({"owner": 1.0, "ring": item})
+        which = mine & (candidate["share"].lane > 0)
+        any_of(which, lambda: self.pairs.add(0, which, candidate, self.block.own))
 
     def _on_palm(self, item: Any, mine: jax.Array) -> None:
         row, numbers, frame, centre = self.body(item)
@@ -301,8 +301,8 @@ class FingerCollision:
 
         def add(place: Place) -> None:
             palm = jnp.zeros_like(jnp.asarray(row))
-            found = self._begun(place, self.pairs.of_row(0), row, self._moves(palm), [])
-            self._alone(found, palm, item, mine)
+            candidate = self._begun(place, self.pairs.of_row(0), row, self._moves(palm), [])
+            self._alone(candidate, palm, item, mine)
 
         def enter() -> None:
             facing = touch.facing(numbers, frame, centre, field, look, apply=lanewise)
@@ -334,8 +334,8 @@ class FingerCollision:
             def add() -> None:
                 place = lanewise(place_of, numbers, frame, centre, facing)
                 held = friction_memory.of_row(self.step, self.pairs, 0)
-                found = self._begun(place, self.pairs.of_row(1), row, moves, held)
-                self._alone(found, other, item, close)
+                candidate = self._begun(place, self.pairs.of_row(1), row, moves, held)
+                self._alone(candidate, other, item, close)
 
             any_of(close, add)
 
@@ -361,8 +361,8 @@ class FingerCollision:
         places = ring_places(self.p.links, self.p.k)
         part = (number.astype(self.like.dtype) + 0.5) / self.p.k
         last = jnp.where(number == k - 1, places[-1, -1], 0.5 * part)
-        own = jnp.where(link == self.p.links - 1, last, part)
-        return link.astype(self.like.dtype) + (0.5 + own)
+        along = jnp.where(link == self.p.links - 1, last, part)
+        return link.astype(self.like.dtype) + (0.5 + along)
 
     def _on_finger(
         self, row: Any, pairing: FingerPairing, owner: jax.Array, item: Any, mine: Any
@@ -381,8 +381,8 @@ class FingerCollision:
             def add() -> None:
                 place = lanewise(place_of, numbers, frame, centre, facing)
                 held = friction_memory.of_row(self.step, self.pairs, row)
-                found = self._begun(place, self.pairs.of_row(row), link, moves, held)
-                self._enter(row, close, owner, found, other, item)
+                candidate = self._begun(place, self.pairs.of_row(row), link, moves, held)
+                self._enter(row, close, owner, candidate, other, item)
 
             any_of(close, add)
 
@@ -421,7 +421,7 @@ class FingerCollision:
             new = jnp.stack([square, number + 0.0 * square, t])
             return jnp.where(better, new, best)
 
-        def one(row: Any, best: Lanes) -> Lanes:
+        def nearer(row: Any, best: Lanes) -> Lanes:
             number = self.like + jnp.asarray(row).astype(self.like.dtype)
             end = self.like + 1.0 if itself is None else self.last_of(itself, row)
             place, end = (lanes([v], (), wide=True) for v in (number, end))
@@ -429,7 +429,7 @@ class FingerCollision:
 
         best = lanes([self.like + 1.0, self.like, self.like], (3,), wide=True)
         first = int(itself is not None)  # a finger's half link at the palm is the palm's
-        best = loop(last + 1 - first, lambda k, b: one(k + first, b), best, self.block.size)
+        best = loop(last + 1 - first, lambda k, b: nearer(k + first, b), best, self.block.size)
         square, number, t = (best[k].lane for k in range(3))
         return square, number.astype(jnp.int32), t
 
@@ -469,9 +469,9 @@ class FingerCollision:
             def enter() -> None:
                 other = jax.lax.div(j, jnp.full_like(j, apart)) + 1
                 moves = pairing.swap(self._moves(other))
-                found = self._begun(place, self.pairs.of_row(row), link, moves, [])
+                candidate = self._begun(place, self.pairs.of_row(row), link, moves, [])
                 number = item + self.count * j
-                self._enter(row, near, owner, found, other, number)
+                self._enter(row, near, owner, candidate, other, number)
 
             any_of(near, enter)
 
@@ -584,8 +584,8 @@ def _with_held(jar, place, cone, grip):
 def each(count: int, body: Callable[[Any], None]) -> None:
     """Runs body(item), which stores something, for all items."""
 
-    def one(k: jax.Array, x: jax.Array) -> jax.Array:
+    def step(k: jax.Array, x: jax.Array) -> jax.Array:
         body(k)
         return x
 
-    jax.lax.fori_loop(0, count, one, jnp.int32(0))
+    jax.lax.fori_loop(0, count, step, jnp.int32(0))

@@ -51,9 +51,11 @@ class FingerPairing:
         self.block = block
         self.number = (jnp.zeros_like(block.finger) + number).astype(jnp.int32)
         same = self.number == 0
-        one = jnp.ones_like(block.finger, dtype)
+        ones = jnp.ones_like(block.finger, dtype)
         self.alone = same if alone else None
-        self.half = lanes([jnp.where(same, one, 0.5 * one) if alone else 0.5 * one], (), wide=True)
+        self.half = lanes(
+            [jnp.where(same, ones, 0.5 * ones) if alone else 0.5 * ones], (), wide=True
+        )
         other = jax.lax.bitwise_xor(block.finger, self.number)
         self.lane = other * block.worlds + block.world
 
@@ -105,8 +107,8 @@ class FingerContactSet(SlotSet):
         self.alone = e.finger_palm or touches_itself(scene)
         self.first = int(not self.alone)
         rows = fingers - self.first if e.finger_finger else 1
-        how = "finger_finger", rows, slots, fingers * worlds
-        super().__init__(scene, *how, gathers=gathers, remembers=remembers)
+        sizes = "finger_finger", rows, slots, fingers * worlds
+        super().__init__(scene, *sizes, gathers=gathers, remembers=remembers)
         self.block = block
         self.links = links
         n = ROWS[scene.effects.friction][0]
@@ -235,26 +237,26 @@ class BoundFingerContacts(BoundSlots):
         def of_row(row: Any, carry: Any) -> Any:
             pairing = self.pairing(row)
 
-            def one(item: Any, c: Any) -> Any:
+            def slot(item: Any, c: Any) -> Any:
                 with self.with_cone(row, item):
                     return body(item, pairing, c)
 
-            return self.fold(row, one, carry)
+            return self.fold(row, slot, carry)
 
         return loop(self.set.rows, of_row, start, self.set.size)
 
     def do(self, body: Callable) -> None:
         """Runs body(item, pairing), which stores something, over all slots in use."""
 
-        def one(item: Any, pairing: FingerPairing, carry: list) -> list:
+        def slot(item: Any, pairing: FingerPairing, carry: list) -> list:
             body(item, pairing)
             return carry
 
-        self.each(one, [])
+        self.each(slot, [])
 
     def touching_now(self) -> jax.Array:
-        def most(row: Any, found: jax.Array) -> jax.Array:
-            return jnp.maximum(found, self.used(row))
+        def most(row: Any, count: jax.Array) -> jax.Array:
+            return jnp.maximum(count, self.used(row))
 
         return jax.lax.fori_loop(0, self.set.rows, most, jnp.int32(0)) > 0
 
@@ -279,12 +281,12 @@ class BoundFingerContacts(BoundSlots):
 
             return lanewise(moved, place, self.cone, motion)
 
-        own = of_side("row")
+        mine = of_side("row")
         if pairing.alone is None:
-            return lanewise(jnp.subtract, own, pairing.swap(own))
-        ways = (lambda: of_side("other")), (lambda: pairing.swap(own))
+            return lanewise(jnp.subtract, mine, pairing.swap(mine))
+        ways = (lambda: of_side("other")), (lambda: pairing.swap(mine))
         theirs = either(anywhere(pairing.alone), *ways, self.set.size)
-        return lanewise(jnp.subtract, own, theirs)
+        return lanewise(jnp.subtract, mine, theirs)
 
     def _on_rows(self, item: Any, field: str) -> Lanes:
         """Motions of the links in a field of a slot's lanes; zeros where nothing touches."""
@@ -293,9 +295,9 @@ class BoundFingerContacts(BoundSlots):
             return self.table.gather("side.motion", row, self.block.own)
         start = zeros((6,), self.like)
 
-        def take(row: Any, chosen: jax.Array, found: Lanes) -> Lanes:
+        def take(row: Any, chosen: jax.Array, motions: Lanes) -> Lanes:
             new = self.table.read("side.motion", row)
-            return lanewise(jnp.where, lanes([chosen], (), wide=True), new, found)
+            return lanewise(jnp.where, lanes([chosen], (), wide=True), new, motions)
 
         return self._each_row(item, field, take, start)
 
@@ -372,10 +374,10 @@ class BoundFingerContacts(BoundSlots):
         wrench = self.table.gather("side.push", row, self.block.own)
         return OwnSide(self.place(item), row, wrench)
 
-    def load(self, item: Any, own: OwnSide, force: Lanes, pairing: FingerPairing) -> None:
+    def load(self, item: Any, side: OwnSide, force: Lanes, pairing: FingerPairing) -> None:
         """Adds a slot's force to its own side's wrench, and takes it from the other side's."""
-        more = lanewise(wrench_of_force, own.place, self.cone, force)
-        self._add_wrench(item, "row", more, own.wrench, own.row)
+        more = lanewise(wrench_of_force, side.place, self.cone, force)
+        self._add_wrench(item, "row", more, side.wrench, side.row)
         if pairing.alone is not None:
 
             def opposite() -> None:
@@ -413,8 +415,8 @@ class BoundFingerContacts(BoundSlots):
         self.clear_wrenches()
 
         def store(item: Any, pairing: FingerPairing) -> None:
-            own = self.own_side(item)
-            self.load(item, own, self.update_constraint(item, own.place, alpha), pairing)
+            side = self.own_side(item)
+            self.load(item, side, self.update_constraint(item, side.place, alpha), pairing)
 
         self.do(store)
 
@@ -427,11 +429,11 @@ class BoundFingerContacts(BoundSlots):
             return contact.constraint_update(contacts(place, cone), jar + alpha * step).force
 
         def load(item: Any, pairing: FingerPairing) -> None:
-            own = self.own_side(item)
+            side = self.own_side(item)
             jar = self.read("jar", item)
             step = self.read("step", item)
             self.load(
-                item, own, lanewise(response, own.place, self.cone, alpha, jar, step), pairing
+                item, side, lanewise(response, side.place, self.cone, alpha, jar, step), pairing
             )
 
         self.do(load)
@@ -461,8 +463,8 @@ def _only_where(mask, value):
     return jnp.where(mask, value, 0.0)
 
 
-def _where(mask, one, other):
-    return jax.tree.map(lambda a, b: jnp.where(mask, a, b), one, other)
+def _where(mask, chosen, other):
+    return jax.tree.map(lambda a, b: jnp.where(mask, a, b), chosen, other)
 
 
 def _add_where(chosen, sums, more):

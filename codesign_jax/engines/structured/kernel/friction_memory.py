@@ -73,19 +73,19 @@ def of_ring(
     """`of_item` of rings, one on each of a team's lanes, shape (lane,)."""
     if not contacts.set.holds:
         return None
-    own = step.finger_state.gather(f"held.{contacts.set.name}", ring, step.block.own)
-    return _both(step, contacts, lanewise(lambda v: v[:, None], own))
+    grip = step.finger_state.gather(f"held.{contacts.set.name}", ring, step.block.own)
+    return _both(step, contacts, lanewise(lambda v: v[:, None], grip))
 
 
-def _both(step: StepMemory, contacts: BoundContacts, own: Lanes) -> tuple[Lanes, Lanes]:
+def _both(step: StepMemory, contacts: BoundContacts, grip: Lanes) -> tuple[Lanes, Lanes]:
     if not contacts.set.on_object:
-        return own, own
-    return lanewise(in_world, step.columns, own), own
+        return grip, grip
+    return lanewise(in_world, step.columns, grip), grip
 
 
-def in_world(columns: jax.Array, own: jax.Array) -> jax.Array:
+def in_world(columns: jax.Array, grip: jax.Array) -> jax.Array:
     """What contacts on the object hold, along the world's axes."""
-    return apply_columns(columns, own)
+    return apply_columns(columns, grip)
 
 
 def clear(step: StepMemory) -> None:
@@ -116,7 +116,7 @@ def _store(step: StepMemory, contacts: BoundContacts, mask: Lanes) -> None:
     def after(mask: jax.Array, share: jax.Array, new: jax.Array, old: jax.Array) -> jax.Array:
         return jnp.where(mask, jnp.where(share > 0, new, 0.0), old)
 
-    def one(item: jax.Array, x: jax.Array) -> jax.Array:
+    def store_item(item: jax.Array, x: jax.Array) -> jax.Array:
         share = contacts.read("share", item)
         new = contacts.read("held", item)
         for j in range(k):
@@ -124,7 +124,7 @@ def _store(step: StepMemory, contacts: BoundContacts, mask: Lanes) -> None:
             state.write(name, lanewise(after, mask, share[0, j], new[:, j], old), item * k + j)
         return x
 
-    jax.lax.fori_loop(0, step.p.held[contacts.set.name] // k, one, jnp.int32(0))
+    jax.lax.fori_loop(0, step.p.held[contacts.set.name] // k, store_item, jnp.int32(0))
 
 
 def sums(pairs: BoundFingerContacts, row: Any, alpha: Lanes, grip: Lanes) -> Lanes:
@@ -137,7 +137,7 @@ def sums(pairs: BoundFingerContacts, row: Any, alpha: Lanes, grip: Lanes) -> Lan
         force = contact.constraint_update(c, tree_add_scaled(alpha, jar, step)).force
         return sums + counts * sum_axis(holding.hold(c, force, grip[:, None]), 1)
 
-    def one(item: Any, sums: Lanes) -> Lanes:
+    def slot(item: Any, sums: Lanes) -> Lanes:
         jar = pairs.read("jar", item)
         step = pairs.read("step", item)
         counts = pairs.holds(item, pairing)
@@ -145,8 +145,8 @@ def sums(pairs: BoundFingerContacts, row: Any, alpha: Lanes, grip: Lanes) -> Lan
             args = sums, pairs.place(item), pairs.cone, alpha, jar, step, grip, counts
             return lanewise(add, *args)
 
-    found = pairs.fold(row, one, zeros((4,), pairs.like))
-    return found if pairs.block.team == 1 else team_sum(pairs.block, found)
+    added = pairs.fold(row, slot, zeros((4,), pairs.like))
+    return added if pairs.block.team == 1 else team_sum(pairs.block, added)
 
 
 def settle(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
@@ -172,17 +172,17 @@ def _settle(problem: Problem, contacts: BoundContacts, alpha: Lanes, mask: Lanes
         new = behind(build(place, cone), jar + alpha * step, old, axes)
         return jnp.where(mask, new, old)
 
-    def one(item: Any) -> None:
+    def settle_item(item: Any) -> None:
         def store() -> None:
             place = contacts.place(item)
             cone = contacts.cone_at(item)
             jar, step, old = (contacts.read(n, item) for n in ("jar", "step", "held"))
-            found = lanewise(after, mask, place, cone, alpha, jar, step, old, axes)
-            contacts.write("held", found, item)
+            new = lanewise(after, mask, place, cone, alpha, jar, step, old, axes)
+            contacts.write("held", new, item)
 
         jax.lax.cond(contacts.touching(item), store, lambda: None)
 
-    contacts.each_item(one)
+    contacts.each_item(settle_item)
 
 
 def turning(step: StepMemory, contacts: BoundContacts) -> Lanes | None:
@@ -201,8 +201,8 @@ def behind(
     """
     grip = before if axes is None else apply_columns(axes, before)
     force = contact.constraint_update(contacts, jar).force
-    found = holding.quotient(holding.hold(contacts, force, grip))
-    return found if axes is None else apply_rows(axes, found)
+    grip_after = holding.quotient(holding.hold(contacts, force, grip))
+    return grip_after if axes is None else apply_rows(axes, grip_after)
 
 
 def _settle_fingers(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
@@ -213,13 +213,13 @@ def _settle_fingers(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
         mask = lanes([which], (), wide=True)
         first = pairs.set.first
 
-        def one(row: jax.Array, x: jax.Array) -> jax.Array:
+        def settle_row(row: jax.Array, x: jax.Array) -> jax.Array:
             before, old = problem.read(GRIP, "new_grip", item=row + first)
             new = lanewise(holding.quotient, sums(pairs, row, alpha, before))
             problem.write("new_grip", lanewise(jnp.where, mask, new, old), row + first)
             return x
 
-        jax.lax.fori_loop(0, pairs.set.rows, one, jnp.int32(0))
+        jax.lax.fori_loop(0, pairs.set.rows, settle_row, jnp.int32(0))
 
     with only([pairs], which):
         any_of(which & pairs.touching_worlds(), keep)
@@ -242,12 +242,12 @@ def _reverse(step: StepMemory, bars: CotangentTables, contacts: BoundContacts, g
     """Leaves the cotangents of a set's contacts as "held_bar"."""
     rest = lanewise(jnp.logical_not, go)
 
-    def one(item: Any) -> None:
-        found = held_bars(bars, contacts, item)
-        contacts.write("held_bar", only_on(go, found), item)
-        _write_bars(bars, contacts, item, only_on(rest, found))
+    def reverse_item(item: Any) -> None:
+        held_bar = held_bars(bars, contacts, item)
+        contacts.write("held_bar", only_on(go, held_bar), item)
+        _write_bars(bars, contacts, item, only_on(rest, held_bar))
 
-    contacts.each_item(one)
+    contacts.each_item(reverse_item)
 
 
 def held_bars(bars: CotangentTables, contacts: BoundContacts, item: Any) -> Lanes:
@@ -286,15 +286,15 @@ def asks(problem: Problem, contacts: BoundContacts, item: Any) -> Lanes:
     def wrench(place, cone, change):
         return sum_axis(contact.contact_wrench(build(place, cone), change), 1)
 
-    def found() -> list[Lanes]:
+    def wrenches() -> list[Lanes]:
         place = contacts.place(item)
         cone = contacts.cone_at(item)
         jar, held, bars = (contacts.read(n, item) for n in ("jar", "held", "held_bar"))
-        one = lanes([problem.like + 1.0], (), wide=True)
-        (change,) = pull(of_jar, (jar,), (place, cone, held, bars, axes), one)
+        unit = lanes([problem.like + 1.0], (), wide=True)
+        (change,) = pull(of_jar, (jar,), (place, cone, held, bars, axes), unit)
         return [lanewise(wrench, place, cone, change)]
 
-    return contacts.if_touching(item, found, [(6,)])[0]
+    return contacts.if_touching(item, wrenches, [(6,)])[0]
 
 
 def _reverse_fingers(
@@ -310,13 +310,13 @@ def _reverse_fingers(
     for item in range(pairings(step)):
         row = item - pairs.set.first
         mine = state.read(GRIP, item)
-        found = zeros((4,), step.like)
+        grip_bar = zeros((4,), step.like)
         if 0 <= row < pairs.set.rows:
             ended = sums(pairs, row, still, step.finger_state.read(GRIP, item))
             theirs = pairs.pairing(row).swap(mine)
             both = lanewise(jnp.subtract, mine, theirs) if item else mine
-            (found,) = pull(holding.quotient, (ended,), (), only_on(go, both))
-        step.scratch.write("grip_bar", found, item)
+            (grip_bar,) = pull(holding.quotient, (ended,), (), only_on(go, both))
+        step.scratch.write("grip_bar", grip_bar, item)
         rest = only_on(lanewise(jnp.logical_not, go), mine)
         state.write(GRIP, rest, item)
 
@@ -331,14 +331,14 @@ def at(step: StepMemory, pairing: FingerPairing) -> tuple[Lanes, ...]:
     return held, step.scratch.gather("grip_bar", item, lane)
 
 
-def leave(bars: CotangentTables, pairing: FingerPairing, found: tuple) -> None:
+def leave(bars: CotangentTables, pairing: FingerPairing, grip_bars: tuple) -> None:
     """Adds a contact's cotangents of `at` to those of the state."""
-    if not found:
+    if not grip_bars:
         return
     item = pairing.number
     lane = bars.block.lane
     state = bars.finger_state
-    new = lanewise(jnp.add, state.gather(GRIP, item, lane), found[0])
+    new = lanewise(jnp.add, state.gather(GRIP, item, lane), grip_bars[0])
     state.scatter(GRIP, new, item, lane)
 
 
@@ -365,8 +365,8 @@ def push(problem: Problem, pairs: BoundFingerContacts) -> None:
         force = lanewise(response, side.place, pairs.cone, jar)
         held = problem.m.finger_state.gather(GRIP, which, lane)
         bars = problem.m.scratch.gather("grip_bar", which, lane)
-        one = lanes([problem.like + 1.0], (), wide=True)
-        (r,) = pull(of_held, (force,), (side.place, pairs.cone, held, bars), one)
+        unit = lanes([problem.like + 1.0], (), wide=True)
+        (r,) = pull(of_held, (force,), (side.place, pairs.cone, held, bars), unit)
         r = lanewise(jnp.multiply, pairs.holds(item, pairing), r)
         change = lanewise(jnp.negative, pairs.stiff(pairs.read("hessian", item), r))
         pairs.load(item, side, change, pairing)

@@ -113,7 +113,7 @@ class ChordStep:
             r, ro, new = el.eliminate_again(axes, kept, r, ro, tau)
             return (r, ro, work + dot(y, new.z)), new.z
 
-        def one(i: Any, carry: tuple) -> tuple:
+        def link(i: Any, carry: tuple) -> tuple:
             names = [("acc", "step_acc"), ("motion", "step_motion")]
             moved = [problem.read(*pair, item=i) for pair in names]
             pushes = {c.set.name: c.wrench(i, alpha) for c in problem.per_link}
@@ -127,7 +127,7 @@ class ChordStep:
 
         none = zeros((6,), self.like)
         start = none, none, zeros((), self.like)
-        r, ro, work = loop(self.links, one, start, self.block.size, reverse=True)
+        r, ro, work = loop(self.links, link, start, self.block.size, reverse=True)
         if chambers:
             r, ro, less = chambers.close_again("z_again", r, ro)
             work = lanewise(jnp.subtract, work, less)
@@ -147,8 +147,8 @@ class ChordStep:
             def add(i: Any, sums: Lanes, c: BoundContacts = c) -> Lanes:
                 return lanewise(jnp.add, sums, c.wrench(i, alpha))
 
-            found = loop(c.set.count, add, zeros((6,), self.like), self.block.size)
-            pushes[c.set.name] = self.block.sum(found)
+            wrench = loop(c.set.count, add, zeros((6,), self.like), self.block.size)
+            pushes[c.set.name] = self.block.sum(wrench)
         return pushes
 
     @staticmethod
@@ -174,7 +174,7 @@ class ChordStep:
             a, motion = el.substitute(axes, el.Factors(*factors), parent, obj)
             return motion, jnp.where(taken, tree_add_scaled(alpha, a, before), before)
 
-        def one(i: Any, parent: Lanes) -> Lanes:
+        def link(i: Any, parent: Lanes) -> Lanes:
             axes, before = problem.read("axes", "step_acc", item=i)
             factors = problem.read("w", "g", "z_again", item=i)
             args = step.object_motion, axes, factors, before, alpha, mask
@@ -182,4 +182,4 @@ class ChordStep:
             problem.write("step_acc", acc, i)
             return motion
 
-        loop(self.links, one, problem.widened(step.palm_motion), self.block.size)
+        loop(self.links, link, problem.widened(step.palm_motion), self.block.size)

@@ -76,8 +76,8 @@ class Elimination:
                 node = self.touch(node, contacts, i, alpha)
             forces = axes, armature, tau, acc
 
-            def eliminated(how: Callable) -> tuple[el.Quadratic, Lanes]:
-                new, kept, more = lanewise(how, node, *forces)
+            def eliminated(eliminate: Callable) -> tuple[el.Quadratic, Lanes]:
+                new, kept, more = lanewise(eliminate, node, *forces)
                 for name, value in zip(("w", "g", "z"), kept.factors, strict=True):
                     problem.write(name, value, i)
                 if problem.in_slots or problem.chambers:
@@ -191,10 +191,10 @@ def with_palm(
       The objective, and the forces that an iterate leaves unbalanced on the wrist's joints.
     """
     push, pull, twist = palm.unbalanced(now)
-    own = palm.palm.matrix()
+    inertia_of_palm = palm.palm.matrix()
     obj = palm.object.matrix()
     p, c, q, r, ro = (sum_fingers(v) for v in node)
-    p = p + own
+    p = p + inertia_of_palm
     r = r + push
     q = q + obj
     ro = ro + pull

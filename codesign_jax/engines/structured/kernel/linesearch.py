@@ -51,7 +51,7 @@ class LineSearch:
             stiff = total([armature[k] * a[k] * a[k] for k in range(a.shape[0])])
             return a, moved, slope, stiff + dot(link.times(moved), moved)
 
-        def one(i: Any, carry: tuple) -> tuple:
+        def link(i: Any, carry: tuple) -> tuple:
             parent, slope, curvature, touch = carry
             names = ("motion", "smooth", "tau", "axes", "armature", "acc")
             a, moved, s, c = lanewise(
@@ -79,7 +79,7 @@ class LineSearch:
         if problem.finger_pairs:
             problem.finger_pairs.put("motion", parent, 0)
         _, slope, curvature, touch = loop(
-            self.links, one, (parent, none, none, none), self.block.size
+            self.links, link, (parent, none, none, none), self.block.size
         )
         if problem.chambers:
             curvature = lanewise(jnp.add, curvature, problem.chambers.curvature())
@@ -135,10 +135,8 @@ class LineSearch:
         """
 
         def evaluate(alpha: Lanes) -> tuple[Lanes, Lanes]:
-            one, two = self.total(self.contact_slopes(alpha))
-            return lanewise(
-                lambda s, c, a, f, g: (s + a * c + f, c + g), slope, curvature, alpha, one, two
-            )
+            of_contacts = self.total(self.contact_slopes(alpha))
+            return lanewise(with_contacts, slope, curvature, alpha, *of_contacts)
 
         def body(carry: list) -> list:
             count = carry[0]
@@ -147,8 +145,8 @@ class LineSearch:
             left = jnp.abs(carry[-1]) > goal
             searching = lanes([left], (), wide=False)
             with only(self.problem.in_slots, left):
-                one, two = evaluate(old[0])
-            new = (*lanewise(refine, *old[:3], one, two), one)
+                derivative, second = evaluate(old[0])
+            new = (*lanewise(refine, *old[:3], derivative, second), derivative)
             new = [lanewise(jnp.where, searching, a, b) for a, b in zip(new, old, strict=True)]
             return [count + 1, *solid(tuple(new), self.block.size)[0]]
 
@@ -156,10 +154,10 @@ class LineSearch:
             return (carry[0] < evaluations) & anywhere(jnp.abs(carry[-1]) > goal)
 
         goal = jnp.maximum(floor, LINE_TOLERANCE * jnp.abs(lanewise(jnp.add, slope, first).lane))
-        one = lanewise(jnp.ones_like, slope)
+        unit = lanewise(jnp.ones_like, slope)
         none = lanewise(jnp.zeros_like, slope)
         far = lanewise(lambda x: jnp.full_like(x, FAR), slope)
-        start, rebuild = solid((one, none, far, far), self.block.size)
+        start, rebuild = solid((unit, none, far, far), self.block.size)
         return rebuild(jax.lax.while_loop(going, body, [jnp.int32(0), *start])[1:])[0]
 
 
@@ -171,6 +169,11 @@ def _rest(now: Iterate, step: Iterate, palm: Palm, slope, curvature):
     bent = dot(palm.palm.times(step.palm_motion), step.palm_motion)
     bent = bent + dot(palm.object.times(step.object_motion), step.object_motion)
     return slope, curvature + bent + dot(palm.armature * step.wrist, step.wrist)
+
+
+def with_contacts(slope, curvature, alpha, contact_slope, contact_curvature):
+    """Slope at alpha of the smooth part and of contacts, and curvature."""
+    return slope + alpha * curvature + contact_slope, curvature + contact_curvature
 
 
 def refine(

@@ -166,17 +166,17 @@ def choose(which: jax.Array, compute: Callable, otherwise: Any, size: int) -> An
     return rebuild(jax.lax.cond(which, some, lambda: arrays))
 
 
-def either(which: jax.Array, one: Callable, other: Callable, size: int) -> Any:
-    """one() where a scalar is true, else other(): trees of lanes of the same structure."""
-    found: list[Callable] = []
+def either(which: jax.Array, first: Callable, second: Callable, size: int) -> Any:
+    """first() where a scalar is true, else second(): trees of lanes of the same structure."""
+    rebuilders: list[Callable] = []
 
     def run(compute: Callable) -> list[jax.Array]:
         arrays, rebuild = solid(compute(), size)
-        found.append(rebuild)
+        rebuilders.append(rebuild)
         return arrays
 
-    arrays = jax.lax.cond(which, lambda: run(one), lambda: run(other))
-    return found[0](arrays)
+    arrays = jax.lax.cond(which, lambda: run(first), lambda: run(second))
+    return rebuilders[0](arrays)
 
 
 def solid(tree: Any, size: int) -> tuple[list[jax.Array], Callable]:

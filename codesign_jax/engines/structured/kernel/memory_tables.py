@@ -89,12 +89,12 @@ class Tables(KernelLayout):
         if self.between:
             block = (self.fingers, self.block)
             slots = pair_slots(self.scene)
-            how = {"gathers": self.gathers, "remembers": self.remembers}
+            options = {"gathers": self.gathers, "remembers": self.remembers}
             if self.team == 1:
-                sets.append(FingerContactSet(self.scene, block, self.links, slots, **how))
+                sets.append(FingerContactSet(self.scene, block, self.links, slots, **options))
             else:
                 block = (*block, self.team)
-                sets.append(TeamFingerContactSet(self.scene, block, self.links, slots, **how))
+                sets.append(TeamFingerContactSet(self.scene, block, self.links, slots, **options))
         on = {"palm_object": int(e.palm_object), "palm_table": n * e.palm_table}
         sets += [make(name, self.palm_groups, on[name]) for name in on if on[name]]
         groups = -(-surroundings.slots(self.scene) // self.fingers)
@@ -135,7 +135,7 @@ class Tables(KernelLayout):
         """Constants of fingers and links."""
         n = self.links
         a = self.axes
-        one: tuple[int, ...] = ()
+        scalar: tuple[int, ...] = ()
         more = {"ring": (n * self.k, (8,))} if self.k else {}
         if palm_touches(self.scene):
             more |= {"palm_ring": (self.palm_groups, (8,))}
@@ -144,17 +144,17 @@ class Tables(KernelLayout):
         if self.scene.effects.lateral_threshold:
             more |= {"threshold": (self.rows, (3,))}
         if self.scene.effects.air_mass:
-            more |= {"volume": (1, one)}
+            more |= {"volume": (1, scalar)}
         support, _ = objects.tables(self.scene, self.fingers)
         return MemoryLayout(
             True,
             mount=(1, (3, 3)),
             base=(1, (3,)),
             stub_centre=(1, (3,)),
-            centre_weight=(n + 1, one),
-            gain=(self.rows, one),
-            offset=(n, one),
-            mass=(n, one),
+            centre_weight=(n + 1, scalar),
+            gain=(self.rows, scalar),
+            offset=(n, scalar),
+            mass=(n, scalar),
             centre=(n, (3,)),
             inertia=(n, (3,)),
             stiffness=(n, (a,)),
@@ -166,7 +166,7 @@ class Tables(KernelLayout):
 
     def _world_table(self) -> MemoryLayout:
         """Constants of worlds: of palm, wrist, object, contacts and verdict."""
-        one: tuple[int, ...] = ()
+        scalar: tuple[int, ...] = ()
         some: dict[str, tuple[int, tuple[int, ...]]] = {}
         for contacts in self.sets:
             some |= contacts.cone_rows()
@@ -182,17 +182,17 @@ class Tables(KernelLayout):
         _, grid = objects.tables(self.scene, self.fingers)
         return MemoryLayout(
             False,
-            palm_mass=(1, one),
+            palm_mass=(1, scalar),
             palm_centre=(1, (3,)),
             palm_inertia=(1, (3, 3)),
             wrist_damping=(1, (6,)),
             wrist_armature=(1, (6,)),
-            object_mass=(1, one),
+            object_mass=(1, scalar),
             object_inertia=(1, (3,)),
             object_size=(1, (3,)),
-            object_id=(1, one),
+            object_id=(1, scalar),
             **grid,
-            **dict.fromkeys(verdict.Bounds._fields, (1, one)),
+            **dict.fromkeys(verdict.Bounds._fields, (1, scalar)),
             **some,
         )
 
@@ -306,8 +306,8 @@ class Packing(Tables):
             "acc": state.acc.finger,
         }
         for name, rows in held.rows(self.scene).items():
-            own = state.held[rows]
-            finger_state[f"held.{name}"] = own.reshape(-1, 3, *own.shape[1:])
+            grips = state.held[rows]
+            finger_state[f"held.{name}"] = grips.reshape(-1, 3, *grips.shape[1:])
         wide = {k: self._widen(v) for k, v in finger_state.items()}
         narrow = {k: arrays[k] for k in self.world_state.groups}
         packed = self.world_state.pack(1, self.block, **narrow)
@@ -340,7 +340,7 @@ class Packing(Tables):
         if states:
             names += [("qvel", "finger_vel", ("wrist_vel", "linear_vel", "angular_vel"))]
             names += [("acc", "acc", ("acc_wrist", "acc_object"))]
-        found = {}
+        coordinates = {}
         for name, joint, others in names:
             rows = self.finger_state.offset[joint] + self.lay.hinges[:size]
             split = (-1, steps, size, self.fingers, self.block)
@@ -350,14 +350,14 @@ class Packing(Tables):
             where = [(self.world_state.offset[o], self.world_state.groups[o][1][0]) for o in others]
             rows = np.concatenate([np.arange(first, first + count) for first, count in where])
             rest = jnp.moveaxis(worlds[:, :, rows], 3, 1).reshape(-1, steps, rows.size)
-            found[name] = jnp.concatenate([rest[..., :6], joints, rest[..., 6:]], -1)
+            coordinates[name] = jnp.concatenate([rest[..., :6], joints, rest[..., 6:]], -1)
         if states and self.held:
             count = 3 * sum(self.held.values())
             first = self.finger_state.offset[f"held.{next(iter(self.held))}"]
             hold = fingers[:, :, first : first + count]
             hold = hold.reshape(-1, steps, count, self.fingers, self.block)
-            found["held"] = jnp.moveaxis(hold, 4, 1).reshape(-1, steps, count * self.fingers)
-        return found
+            coordinates["held"] = jnp.moveaxis(hold, 4, 1).reshape(-1, steps, count * self.fingers)
+        return coordinates
 
     def rows_of(self, qpos: jax.Array, qvel: jax.Array | None = None) -> tuple:
         """Rows (world, time, row, finger or 1) of coordinates, or of their cotangents; see `path`.
@@ -383,11 +383,11 @@ class Packing(Tables):
         nv = 12 + self.lay.dofs.size
         fingers, worlds = self.rows_of(last[:, None, :nq], last[:, None, nq : nq + nv])
         hold = last[:, nq + 2 * nv + 3 :].reshape(len(last), 1, -1, self.fingers)
-        found = jnp.concatenate([fingers, hold], 2), worlds
+        cotangents = jnp.concatenate([fingers, hold], 2), worlds
         rows = self.path_rows(states=True)
         return tuple(
             jnp.pad(x, [(0, 0), (0, 0), (0, n - x.shape[2]), (0, 0)])
-            for x, n in zip(found, rows, strict=True)
+            for x, n in zip(cotangents, rows, strict=True)
         )  # type: ignore[return-value]
 
     def by_world(self, rows: jax.Array, worlds: int) -> jax.Array:
@@ -417,11 +417,11 @@ class Packing(Tables):
 def ring_numbers(scene: Scene, hand: WorldModel, k: int) -> jax.Array:
     """Numbers of the fingers' rings or spheres, see `rings.Ring`, (link * k, 8, finger, world)."""
     if scene.effects.surface == "spheres":
-        one = jnp.ones_like(hand.radius)
-        rows = [*hand.sphere, *[hand.radius] * 3, one, 0.0 * one]
-        return jnp.stack(rows, 2).reshape(-1, 8, *one.shape[2:])
+        ones = jnp.ones_like(hand.radius)
+        rows = [*hand.sphere, *[hand.radius] * 3, ones, 0.0 * ones]
+        return jnp.stack(rows, 2).reshape(-1, 8, *ones.shape[2:])
     assert hand.section is not None
-    segment, own = hand.section[2:]
+    segment, skin_width = hand.section[2:]
     links = scene.discretization.links
     along = ring_places(links, k)
     places = (along + np.arange(links)[:, None] + 0.5) / links
@@ -434,7 +434,10 @@ def ring_numbers(scene: Scene, hand: WorldModel, k: int) -> jax.Array:
     tip = (np.arange(links * k) == links * k - 1).reshape(-1, 1, 1)
     rows = [along * segment, 0.0, 0.5 * height, half * segment, 0.5 * width, 0.5 * height]
     # The skin is as stiff everywhere: a narrower section stands for less of it.
-    widths = length * segment / width if hand.tip is None else length * segment * width / own**2
+    if hand.tip is None:
+        widths = length * segment / width
+    else:
+        widths = length * segment * width / skin_width**2
     rows += [widths, tip.astype(width.dtype)]
     shape = (links * k, *segment.shape)
     return jnp.stack([jnp.broadcast_to(jnp.asarray(v, width.dtype), shape) for v in rows], 1)
@@ -443,8 +446,8 @@ def ring_numbers(scene: Scene, hand: WorldModel, k: int) -> jax.Array:
 def palm_numbers(scene: Scene, hand: WorldModel) -> jax.Array:
     """Numbers of the rings or spheres of the palm, as `ring_numbers`, (item, 8, world)."""
     if scene.effects.surface == "spheres":
-        one = jnp.ones_like(hand.palm_radius)
-        rows = [*hand.palm_point, *[hand.palm_radius] * 3, one, 0.0 * one]
+        ones = jnp.ones_like(hand.palm_radius)
+        rows = [*hand.palm_point, *[hand.palm_radius] * 3, ones, 0.0 * ones]
         return jnp.stack(rows, 1)
     assert hand.palm_disc is not None and hand.section is not None
     radius, thick = hand.palm_disc[:, 0]

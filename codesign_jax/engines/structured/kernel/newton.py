@@ -53,14 +53,14 @@ class Newton:
     def __init__(self, problem: Problem):
         self.problem = problem
         self.block = problem.block
-        one = problem.block.team == 1
-        self.elimination = (Elimination if one else TeamElimination)(problem)
-        self.search = (LineSearch if one else TeamLineSearch)(problem)
-        self.coupling = Coupling if one else TeamCoupling
+        alone = problem.block.team == 1
+        self.elimination = (Elimination if alone else TeamElimination)(problem)
+        self.search = (LineSearch if alone else TeamLineSearch)(problem)
+        self.coupling = Coupling if alone else TeamCoupling
         # A chord's step would take a GPU as long as it saves: there an iteration ends without one.
         threads = bool(problem.in_slots) and problem.in_slots[0].set.gathers
         self.settles = threads
-        self.chord = ChordStep(problem) if problem.in_slots and one and not threads else None
+        self.chord = ChordStep(problem) if problem.in_slots and alone and not threads else None
 
     def solve(
         self, now: Iterate, waiting: jax.Array, iterations: int, evaluations: int, tolerance: float
@@ -95,9 +95,9 @@ class Newton:
             now = lanewise(tree_add_scaled, alpha, now, step)
             if self.chord:
                 likely = busy & (residual.lane > tolerance) & (residual.lane <= LARGEST)
-                found = now, alpha, residual
-                confirm = partial(self.confirm, *found, done, scale, likely, tolerance)
-                now, alpha, residual = choose(anywhere(likely), confirm, found, self.block.size)
+                iterate = now, alpha, residual
+                confirm = partial(self.confirm, *iterate, done, scale, likely, tolerance)
+                now, alpha, residual = choose(anywhere(likely), confirm, iterate, self.block.size)
             if self.settles:
                 largest = STEADY * tolerance
                 likely = busy & (residual.lane > tolerance) & (residual.lane <= largest)
@@ -162,8 +162,8 @@ class Newton:
         def look(likely: jax.Array) -> tuple[Iterate, Lanes, Lanes]:
             more, work = chord.step(now, done, alpha)
             new = lanewise(jnp.divide, work, scale)
-            found = likely & (new.lane >= 0) & (new.lane <= tolerance)
-            taken = found if pairs is None else found & ~pairs.touching_worlds()
+            converged = likely & (new.lane >= 0) & (new.lane <= tolerance)
+            taken = converged if pairs is None else converged & ~pairs.touching_worlds()
 
             def take() -> tuple[Iterate, Lanes]:
                 chord.take(more, alpha, taken)
@@ -177,7 +177,7 @@ class Newton:
                 return there, lanewise(lambda t, a: jnp.where(t, 1.0, a), mask, alpha)
 
             there, length = choose(anywhere(taken), take, (now, alpha), size)
-            small = lanes([found], (), wide=False)
+            small = lanes([converged], (), wide=False)
             return there, length, lanewise(jnp.where, small, new, residual)
 
         with only(self.problem.in_slots, likely):

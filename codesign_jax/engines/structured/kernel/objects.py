@@ -44,22 +44,29 @@ class WorldObject(NamedTuple):
 
 def tables(scene: Scene, fingers: int) -> tuple[dict, dict]:
     """Groups that meshes add to the table of the hand and to the table of the worlds."""
-    if not (found := meshes.tables(scene)):
+    if not (mesh := meshes.tables(scene)):
         return {}, {}
-    one: tuple[int, ...] = ()
-    rows = max(1, found.support.shape[1] // fingers)
-    world = {"first": one, "nodes": (3,), "origin": (3,), "cell": one, "factor": one, "reach": one}
+    scalar: tuple[int, ...] = ()
+    rows = max(1, mesh.support.shape[1] // fingers)
+    world = {
+        "first": scalar,
+        "nodes": (3,),
+        "origin": (3,),
+        "cell": scalar,
+        "factor": scalar,
+        "reach": scalar,
+    }
     return {"support": (rows, (3,))}, {f"grid_{k}": (1, shape) for k, shape in world.items()}
 
 
-def rows(found: MeshLanes, fingers: int, dtype: Any) -> dict[str, jax.Array]:
+def rows(mesh: MeshLanes, fingers: int, dtype: Any) -> dict[str, jax.Array]:
     """Arrays for the rows of `tables`: support points are dealt to the lanes of the fingers."""
-    support = found.support
+    support = mesh.support
     if support.shape[1] < fingers:
         support = jnp.tile(support, (1, fingers // support.shape[1], 1))
     dealt = support.reshape(3, -1, fingers, support.shape[2])
     reach = jnp.sqrt((support**2).sum(0).max(0))[None]
-    grid = {k: v.astype(dtype) for k, v in found.grid._asdict().items()}
+    grid = {k: v.astype(dtype) for k, v in mesh.grid._asdict().items()}
     return {"support": dealt.swapaxes(0, 1)} | {
         f"grid_{k}": v for k, v in (grid | {"reach": reach}).items()
     }
@@ -74,7 +81,7 @@ def read(
         return WorldObject(size, shape, block, None)
     indices = np.array(shapes.mesh_indices(scene), np.int32)
     meshed = lanewise(lambda s: jnp.isin(s.astype(jnp.int32), indices), shape)
-    found = MeshMemory(
+    memory = MeshMemory(
         values,
         partial(hand.read, "support"),
         hand.layout.groups["support"][0],
@@ -82,7 +89,7 @@ def read(
         world.read("grid_reach"),
         meshed,
     )
-    return WorldObject(size, shape, block, found)
+    return WorldObject(size, shape, block, memory)
 
 
 def _for_both(
@@ -139,16 +146,16 @@ def distance_of(scene: Scene, local: jax.Array, at: dict, still: dict) -> tuple:
       still: Index of the object and, with meshes, first value and nodes of the grid, whether the
         object is a mesh, and the distances at the corners of the points' cells, see `cell_values`.
     """
-    found = None
+    nearest = None
     shape = still["object_id"].astype(jnp.int32)
     if len(shapes.mesh_indices(scene)) < len(scene.objects.object):
-        found = shapes.primitive_distance(scene, at["object_size"], shape, local)
+        nearest = shapes.primitive_distance(scene, at["object_size"], shape, local)
     if "meshed" in still:
         grid = GridLanes(**{k: (at | still)[f"grid_{k}"] for k in GridLanes._fields})
         new = meshes.interpolate(grid, meshes.locate(grid, local), still["values"])
-        found = new if found is None else _pick(still["meshed"], new, found)
-    assert found is not None
-    return found
+        nearest = new if nearest is None else _pick(still["meshed"], new, nearest)
+    assert nearest is not None
+    return nearest
 
 
 def cell_values(thing: WorldObject, local: Lanes) -> Lanes:
@@ -168,21 +175,21 @@ def points_of(scene: Scene, at: dict, still: dict) -> jax.Array:
       still: As in `distance_of`; of meshes the points themselves, in the object's frame, and the
         factor that they have.
     """
-    found = None
+    points = None
     shape = still["object_id"].astype(jnp.int32)
     columns = at["columns"][:, :, 0]
     if len(shapes.mesh_indices(scene)) < len(scene.objects.object):
-        found = shapes.primitive_points(scene, at["object_size"][:, 0], shape, columns)
+        points = shapes.primitive_points(scene, at["object_size"][:, 0], shape, columns)
     if "meshed" in still:
         support = still["support"] * (at["grid_factor"] / still["factor"])
         new = meshes.turned(columns, support)
-        found = new if found is None else _pick(still["meshed"], new, found)
-    assert found is not None
-    return found
+        points = new if points is None else _pick(still["meshed"], new, points)
+    assert points is not None
+    return points
 
 
-def _pick(mine: jax.Array, one: Any, other: Any) -> Any:
-    return jax.tree.map(partial(jnp.where, mine), one, other)
+def _pick(mine: jax.Array, first: Any, second: Any) -> Any:
+    return jax.tree.map(partial(jnp.where, mine), first, second)
 
 
 def _gather(ref: Any, index: Lanes, dtype: Any) -> Lanes:
@@ -209,8 +216,8 @@ def table_points(scene: Scene, thing: WorldObject, columns: Lanes, height: Lanes
         search = partial(_search, thing, columns)
         (first,) = search(lambda *a: (meshes.lowest(*a),))
         (second,) = search(lambda *a: (meshes.farthest(*a),), first)
-        found = [first, second, *search(meshes.beside, first, second)]
-        return lanewise(lambda points: jnp.concatenate(points, 1), found)
+        lowest = [first, second, *search(meshes.beside, first, second)]
+        return lanewise(lambda points: jnp.concatenate(points, 1), lowest)
 
     near = None
     if thing.mesh is not None:

@@ -62,10 +62,10 @@ class Problem:
         self.links = m.p.links
         self.block = m.block
         self.rigid = not m.p.scene.effects.wrist
-        found = m.contacts
-        self.finger_pairs: BoundFingerContacts | None = found.get("finger_finger")  # type: ignore[assignment]
-        self.per_link = [found[n] for n in ("finger_object", "finger_table") if n in found]
-        self.dealt = [c for n, c in found.items() if not n.startswith("finger")]
+        sets = m.contacts
+        self.finger_pairs: BoundFingerContacts | None = sets.get("finger_finger")  # type: ignore[assignment]
+        self.per_link = [sets[n] for n in ("finger_object", "finger_table") if n in sets]
+        self.dealt = [c for n, c in sets.items() if not n.startswith("finger")]
         self.in_slots = [self.finger_pairs] if self.finger_pairs else []
         self.like = jnp.zeros((self.block.size,), palm.armature.dtype)
         self.chambers = Chambers(m) if "air_step" in m.scratch else None

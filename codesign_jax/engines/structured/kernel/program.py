@@ -77,11 +77,11 @@ class Program(Packing):
 
     @classmethod
     def here(
-        cls, scene: Scene, limits: Limits, dtype: Any, worlds: int | None = None, **how: Any
+        cls, scene: Scene, limits: Limits, dtype: Any, worlds: int | None = None, **options: Any
     ) -> "Program":
         """The program for this device, type and number of worlds, see `lanes_here`."""
         width = lanes_here(scene, dtype, worlds)
-        return cls(scene, limits, backend=jax.default_backend(), width=width, **how)
+        return cls(scene, limits, backend=jax.default_backend(), width=width, **options)
 
     def run(self, hand: WorldModel, state: State, ctrl: jax.Array) -> dict[str, jax.Array]:
         """Runs a rollout; returns `trace` by name, shape (world, time)."""
@@ -144,15 +144,15 @@ class Program(Packing):
         # (block, world, time, entry)
         trace = jnp.moveaxis(out[3], 3, 1)
         trace = trace.reshape(-1, trace.shape[2], len(self.trace))[:worlds]
-        found = {name: trace[..., k] for k, name in enumerate(self.trace)}
+        series = {name: trace[..., k] for k, name in enumerate(self.trace)}
         if trajectory or states:
-            found |= {k: v[:worlds] for k, v in self.path(out[4], out[5], states=states).items()}
+            series |= {k: v[:worlds] for k, v in self.path(out[4], out[5], states=states).items()}
         last = self.unpack_state(out[0], out[1], worlds)
         if states:
             # A row holds the acceleration of the step before it, the solver's warm start.
             end = coordinates.flat_acc(last.acc)[:, None]
-            found["acc"] = jnp.concatenate([found["acc"][:, 1:], end], 1)
-        return found, last
+            series["acc"] = jnp.concatenate([series["acc"][:, 1:], end], 1)
+        return series, last
 
     def jaxpr(self, hand: WorldModel, state: State, ctrl: jax.Array) -> Any:
         """The jaxpr of a block of a rollout's kernel; arguments may be `jax.ShapeDtypeStruct`."""
@@ -244,10 +244,10 @@ class BlockRollout:
         """Copies the start state to the state."""
         finger_start, world_start = self.start_state
         fingers, worlds = self.state
-        own = self.world
+        world = self.world
         rows = self.program.finger_state.rows, self.program.world_state.rows
         copy_rows((0, rows[0]), lambda k: finger_start[(k,)], fingers)
-        copy_rows((0, rows[1]), lambda k: world_start[k, own], worlds, own)
+        copy_rows((0, rows[1]), lambda k: world_start[k, world], worlds, world)
 
     def run(self, steps: int, *, to_end: bool) -> jax.Array:
         """Steps until all worlds are decided; returns the number of steps.
@@ -292,13 +292,13 @@ class BlockRollout:
         last_speed = self._number("speed")
         none = jnp.zeros_like(last_speed)
         ended = {"speed": last_speed, "residual": none, "overflow": none}
-        own = self.world
+        world = self.world
         trace = self.trace
 
         def repeat(t: jax.Array, x: jax.Array) -> jax.Array:
             self._record(t)
             for k, name in enumerate(self.program.trace):
-                trace[t, k, own] = ended.get(name, trace[done - 1, k, own])
+                trace[t, k, world] = ended.get(name, trace[done - 1, k, world])
             self._keep(step=self._number("step") + 1.0)
             return x
 
@@ -331,22 +331,22 @@ class BlockRollout:
     def _store(self, place: jax.Array, whole: bool, fingers: Any, worlds: Any) -> None:
         """Stores the whole state, or its positions, at a place of the record."""
         finger_state, world_state = self.state
-        own = self.world
+        world = self.world
         angles, places = self.program.path_rows(whole)
         copy_rows((0, angles), lambda k: finger_state[(k,)], fingers, at=(place,))
-        copy_rows((0, places), lambda k: world_state[k, own], worlds, own, at=(place,))
+        copy_rows((0, places), lambda k: world_state[k, world], worlds, world, at=(place,))
 
 
 def _records(trajectory: bool, states: int) -> list[tuple[int, bool]]:
     """What is recorded: every how many steps, and whether whole states or positions."""
-    found = [(1, states == 1)] if trajectory or states == 1 else []
-    return found + ([(states, True)] if states > 1 else [])
+    records = [(1, states == 1)] if trajectory or states == 1 else []
+    return records + ([(states, True)] if states > 1 else [])
 
 
 def block_spec(shape: tuple[int, ...], blocks: int) -> pl.BlockSpec:
     """A block's part of an array with a leading axis of blocks, or of one that all share."""
-    own = shape[0] == blocks
-    return pl.BlockSpec((None, *shape[1:]), lambda i: (i * own, *[0] * (len(shape) - 1)))
+    by_block = shape[0] == blocks
+    return pl.BlockSpec((None, *shape[1:]), lambda i: (i * by_block, *[0] * (len(shape) - 1)))
 
 
 def lanes_here(scene: Scene, dtype: Any, worlds: int | None = None) -> int:
@@ -363,8 +363,8 @@ def lanes_here(scene: Scene, dtype: Any, worlds: int | None = None) -> int:
 def copy_rows(rows: tuple[Any, Any], read: Callable, target: Any, *where: Any, at: tuple = ()):
     """Stores read(row) in rows of a table; what is before and behind the row in the index."""
 
-    def one(k: jax.Array, x: jax.Array) -> jax.Array:
+    def copy(k: jax.Array, x: jax.Array) -> jax.Array:
         target[(*at, k, *where)] = read(k)
         return x
 
-    jax.lax.fori_loop(*rows, one, jnp.int32(0))
+    jax.lax.fori_loop(*rows, copy, jnp.int32(0))

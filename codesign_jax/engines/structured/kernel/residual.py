@@ -68,8 +68,8 @@ def of_contacts(
     work = 0.0
     if hold:
         grip, bars, axes = hold
-        own = grip if axes is None else apply_columns(axes, grip)
-        jar = jar + holding.held(contacts, own)
+        world_grip = grip if axes is None else apply_columns(axes, grip)
+        jar = jar + holding.held(contacts, world_grip)
         work = sum_axis(dot(bars, behind(contacts, jar, grip, axes)), 0)
     force = contact.constraint_update(contacts, jar).force
     return sum_axis(dot(force, contacts.relative(along)), 0) + work
@@ -115,21 +115,21 @@ def of_rings(
     places = []
     on_object = name.endswith("_object")
     looks = around(scene, at) if not on_object else [partial(look, scene, at=at, still=still)]
-    for n, one in enumerate(looks):
+    for n, field in enumerate(looks):
         values = [{"values": still.get(k)} if on_object else {} for k in ("values", "values_again")]
-        first = one(centre, **values[0])
-        again = partial(one, **values[1])
+        first = field(centre, **values[0])
+        again = partial(field, **values[1])
         plane = not on_object and n < scene.effects.table  # the table comes first
         surface = scene.effects.surface
         touched = touch(surface, numbers, place.frame, centre, first, again, plane=plane)
         places.append(sdf_collision.as_kept(touched))
-    found = sdf_collision.beside(places)
-    found = found._replace(share=jnp.where(still["share"] > 0, found.share, 0.0))
+    candidates = sdf_collision.beside(places)
+    candidates = candidates._replace(share=jnp.where(still["share"] > 0, candidates.share, 0.0))
     cone = _cone(scene, name, at)
     if own_friction(scene, name):
         which = surroundings.touched(scene, name, numbers.shape[1])
         cone = cone.of_friction(jnp.stack([at["friction"][i] for i in which]))
-    contacts = ContactSet.contacts(found, cone)
+    contacts = ContactSet.contacts(candidates, cone)
     moves = _from_object(name, place[2:], at, still)
     hold = _held(name, held, at, still)
     return of_contacts(contacts, *(m[:, None] for m in moves), hold=hold)
@@ -175,25 +175,25 @@ def of_table(
 
 def _of_object(scene: Scene, at: dict, still: dict) -> tuple:
     """Point, normal (3, slot, world) and gap of the object on table and fixtures."""
-    found = []
+    places = []
     if scene.effects.table:
-        found.append(shapes.on_table(objects.points_of(scene, at, still), at["height"]))
+        places.append(shapes.on_table(objects.points_of(scene, at, still), at["height"]))
     flat = any(shape.type not in ROUND for shape in scene.objects.object)
     for j, fixture in enumerate(scene.fixture):
         position = at["position"]
         _, rows = surroundings.towards(fixture, position)
         turned = at | {"columns": surroundings.faced(rows, at["columns"])}
-        own = still | {"support": still[f"support_{j}"]} if "meshed" in still else still
-        arms = objects.points_of(scene, turned, own)
-        found.append(surroundings.object_on(fixture, position, rows[:, :, 0], arms))
+        constants = still | {"support": still[f"support_{j}"]} if "meshed" in still else still
+        arms = objects.points_of(scene, turned, constants)
+        places.append(surroundings.object_on(fixture, position, rows[:, :, 0], arms))
         if flat and EDGES[fixture.type]:
             point = surroundings.edges(fixture, position)
             seen = look(scene, point, at, still, still.get(f"values_{j}"))
             edge = surroundings.edge_on(point, *seen)
-            found.append(tuple(v[..., 0, :] for v in edge))
-    if len(found) == 1:
-        return found[0]
-    return tuple(jnp.concatenate(v, -2) for v in zip(*found, strict=True))
+            places.append(tuple(v[..., 0, :] for v in edge))
+    if len(places) == 1:
+        return places[0]
+    return tuple(jnp.concatenate(v, -2) for v in zip(*places, strict=True))
 
 
 TABLE = "object_table"
@@ -206,21 +206,21 @@ def of_link(scene: Scene, chain: LinkMotion, numbers: dict, joint: dict, still: 
     accelerations of the joint, the order of its hinges, and the cotangent of the centre of mass.
     """
     joint = joint | {"acc": still["acc"], "order": still["order"]}
-    after, found = link_forces(scene, chain[:5], numbers, joint)
-    along = next_motion(chain.along, found["axes"], still["virtual"])
-    body = make_body(numbers["mass"], found["body_centre"], found["tensor"])
-    armature = found.get("armature_now", numbers["armature"])
-    inertial = armature * still["acc"] - found["tau"]
-    power = dot(body.times(after[4]) - found["smooth"], along) + dot(inertial, still["virtual"])
-    return LinkMotion(*after, along), dot(still["centre_bar"], found["body_centre"]) - power
+    after, stored = link_forces(scene, chain[:5], numbers, joint)
+    along = next_motion(chain.along, stored["axes"], still["virtual"])
+    body = make_body(numbers["mass"], stored["body_centre"], stored["tensor"])
+    armature = stored.get("armature_now", numbers["armature"])
+    inertial = armature * still["acc"] - stored["tau"]
+    power = dot(body.times(after[4]) - stored["smooth"], along) + dot(inertial, still["virtual"])
+    return LinkMotion(*after, along), dot(still["centre_bar"], stored["body_centre"]) - power
 
 
 def of_palm(timestep: float, state: dict, arm, constants: dict, still: dict) -> tuple:
     """Geometry and motions of palm and object, and the power of palm, wrist and object."""
     given = {name: still[name] for name in ("acc_wrist", "acc_object")}
-    found = palm_and_object(timestep, state | given, arm, constants)
-    palm = found["palm"]
-    now = found["now"]
+    bodies = palm_and_object(timestep, state | given, arm, constants)
+    palm = bodies["palm"]
+    now = bodies["now"]
     virtual = still["virtual_wrist"]
     along = palm_motion(virtual, palm.axes)
     power = dot(palm.palm.times(now.palm_motion) - palm.smooth_palm, along)
@@ -228,10 +228,10 @@ def of_palm(timestep: float, state: dict, arm, constants: dict, still: dict) -> 
     power = power + dot(object_force, still["object_along"])
     power = power + dot(palm.armature * now.wrist - palm.smooth_wrist, virtual)
     place = LinkMotion(
-        found["place"], found["frame"], found["vel"], found["bias"], now.palm_motion, along
+        bodies["place"], bodies["frame"], bodies["vel"], bodies["bias"], now.palm_motion, along
     )
     height = state["position"][2]
-    return place, found["columns"], found["object_vel"], height, now.wrist, -power
+    return place, bodies["columns"], bodies["object_vel"], height, now.wrist, -power
 
 
 def on_palm(
@@ -241,15 +241,17 @@ def on_palm(
     place, ring = mine
     centre = ring_centre(*place[:2], ring)
     on_disc = partial(finger_collision.palm_distance, palm=(*palm[:2], size))
-    found = touch(scene.effects.surface, ring, place.frame, centre, on_disc(centre), on_disc)
-    return _between(scene, found, place[2:], palm[2:], numbers)
+    contact_place = touch(
+        scene.effects.surface, ring, place.frame, centre, on_disc(centre), on_disc
+    )
+    return _between(scene, contact_place, place[2:], palm[2:], numbers)
 
 
 def between_spheres(scene: Scene, mine: tuple, theirs: tuple, numbers: Any) -> jax.Array:
     """Power of two fingers' spheres on one another: links, and the spheres' numbers."""
-    one, other = (ring_centre(place.origin, place.frame, ring) for place, ring in (mine, theirs))
-    found = finger_collision.balls(mine[1], one, theirs[1], other)
-    return _between(scene, found, mine[0][2:], theirs[0][2:], numbers)
+    first, second = (ring_centre(place.origin, place.frame, ring) for place, ring in (mine, theirs))
+    contact_place = finger_collision.balls(mine[1], first, theirs[1], second)
+    return _between(scene, contact_place, mine[0][2:], theirs[0][2:], numbers)
 
 
 class CentreLineSegment(NamedTuple):
@@ -292,22 +294,26 @@ def between_rings(
     centre = ring_centre(*place[:2], ring)
     t = rings.nearest(centre, Segment(ends, None, None), still["end"])  # type: ignore[arg-type]
     other = ends, (before, link.frame, after), theirs.tip, still["last"]
-    found = finger_collision.between(ring, place.frame, centre, other, t)
-    return _between(scene, found, place[2:], link[2:], numbers, held)
+    contact_place = finger_collision.between(ring, place.frame, centre, other, t)
+    return _between(scene, contact_place, place[2:], link[2:], numbers, held)
 
 
 def _between(
-    scene: Scene, found: Any, mine: Any, theirs: Any, numbers: Any, held: tuple = ()
+    scene: Scene, contact_place: Any, mine: Any, theirs: Any, numbers: Any, held: tuple = ()
 ) -> jax.Array:
-    one = ContactSet.contacts(finger_collision.with_axis(found), cone_of(scene, numbers))
-    vel, motion, along = (one.relative((a - b)[:, None]) for a, b in zip(mine, theirs, strict=True))
-    jar = motion - one.reference(vel)
+    contacts = ContactSet.contacts(
+        finger_collision.with_axis(contact_place), cone_of(scene, numbers)
+    )
+    vel, motion, along = (
+        contacts.relative((a - b)[:, None]) for a, b in zip(mine, theirs, strict=True)
+    )
+    jar = motion - contacts.reference(vel)
     if not held:
-        force = contact.constraint_update(one, jar).force
+        force = contact.constraint_update(contacts, jar).force
         return sum_axis(dot(force, along), 0)
     grip, bars = held
-    force = contact.constraint_update(one, jar + holding.held(one, grip[:, None])).force
-    return sum_axis(dot(force, along), 0) + held_work(one, force, grip, bars)
+    force = contact.constraint_update(contacts, jar + holding.held(contacts, grip[:, None])).force
+    return sum_axis(dot(force, along), 0) + held_work(contacts, force, grip, bars)
 
 
 def _from_object(name: str, moves: Any, at: dict, still: dict) -> list:

@@ -126,11 +126,13 @@ class ResidualVjp:
         still["centre_bar"] = lanewise(jnp.multiply, centre_bar, weight)
         run = partial(residual.of_link, self.p.scene)
         joint = joint | {"pressure": pressure}
-        before, own, moved = pull(run, (self.chain(i), numbers, joint), (still,), (after, self.one))
-        self.bars.add({n: own.pop(n) for n in LINK_CONSTANTS}, i)
-        sections = {n: own.pop(n) for n in FINGER_CONSTANTS if n in own}
+        before, bars, moved = pull(
+            run, (self.chain(i), numbers, joint), (still,), (after, self.one)
+        )
+        self.bars.add({n: bars.pop(n) for n in LINK_CONSTANTS}, i)
+        sections = {n: bars.pop(n) for n in FINGER_CONSTANTS if n in bars}
         self.bars.add(sections, i if self.p.tapered else 0)
-        self.bars.add(own | {"pressure": moved.pop("pressure")})
+        self.bars.add(bars | {"pressure": moved.pop("pressure")})
         self.bars.add_joint(moved, i)
         return before
 
@@ -147,8 +149,8 @@ class ResidualVjp:
 
         weight = lanewise(jnp.multiply, centre_bar, read("centre_weight"))
         given = (palm, *(read(n) for n in names))
-        (place, frame), *own = pull(run, given, (weight,), (base.frame, base.origin, self.one))
-        self.bars.add(dict(zip(names, own, strict=True)))
+        (place, frame), *bars = pull(run, given, (weight,), (base.frame, base.origin, self.one))
+        self.bars.add(dict(zip(names, bars, strict=True)))
         return base._replace(origin=place, frame=frame)
 
     # Contacts
@@ -188,12 +190,12 @@ class ResidualVjp:
                     still = still | {"values_again": self._values(again)}
             run = partial(residual.of_rings, self.p.scene, name)
             args = place, numbers, at, self.held(name, i)
-            found, own, shared, held = pull(run, args, (still,), self.one)
+            body_bars, ring_bars, shared, held = pull(run, args, (still,), self.one)
             friction_memory.add_held(self.bars, self.contacts[name], i, held)
             for j in range(k):
-                self.bars.add({table: own[:, j]}, i * k + j)
+                self.bars.add({table: ring_bars[:, j]}, i * k + j)
             self.bars.add(shared)
-            return found
+            return body_bars
 
         return self._touching(name, i, compute)
 
@@ -228,11 +230,11 @@ class ResidualVjp:
 
             def compute(i: int = i) -> None:
                 run = partial(residual.of_table, p.scene, p.fingers, i)
-                own = still | self.of_contacts(residual.TABLE, i)
+                constants = still | self.of_contacts(residual.TABLE, i)
                 args = at, self.held(residual.TABLE, i)
-                found, held = pull(run, args, (finger, own), self.one)
+                bars, held = pull(run, args, (finger, constants), self.one)
                 friction_memory.add_held(self.bars, contacts, i, held)
-                self.bars.add(found)
+                self.bars.add(bars)
 
             jax.lax.cond(contacts.touching(i), compute, lambda: None)
 
@@ -329,8 +331,8 @@ class FingerContactsVjp:
                     any_of(itself, lambda: self._on_itself(item, pairing, itself))
                 live = live & ~pairing.alone
             if effects.finger_finger:
-                one = self._on_finger if hull else self._spheres
-                any_of(live, lambda: one(item, pairing, live))
+                reverse = self._on_finger if hull else self._spheres
+                any_of(live, lambda: reverse(item, pairing, live))
 
         self.pairs.do(slot)
 
@@ -344,9 +346,11 @@ class FingerContactsVjp:
         palm = self._body(jnp.zeros_like(row))._replace(origin=at["place"], frame=at["frame"])
         args = (self._body(row), ring), palm, step.constant("palm_disc"), step.constant(ON_PALM)
         run = partial(residual.on_palm, self.p.scene)
-        (place, own), palm, disc, cone = only_on(self._side(live), pull(run, args, (), self._one))
+        (place, ring_bar), palm, disc, cone = only_on(
+            self._side(live), pull(run, args, (), self._one)
+        )
         self.bars.add({ON_PALM: cone, "palm_disc": disc})
-        self.bars.add({"ring": own}, number, self.lane)
+        self.bars.add({"ring": ring_bar}, number, self.lane)
         self._leave_palm(palm)
         self._leave(place._asdict(), row)
 
@@ -364,14 +368,14 @@ class FingerContactsVjp:
         other = jax.lax.div(self.pairs.read("ring", item).lane.astype(jnp.int32), self._count)
         theirs = self._body(row_of(other, self.p.k), pairing.lane), self._numbers(other, pairing)
         args = (self._body(row), ring), theirs, self.sweep.step.constant(CONE)
-        found = pull(partial(residual.between_spheres, self.p.scene), args, (), self._one)
-        (place, own), swapped, cone = only_on(self._side(live), found)
+        bars = pull(partial(residual.between_spheres, self.p.scene), args, (), self._one)
+        (place, ring_bar), swapped, cone = only_on(self._side(live), bars)
         self.bars.add({CONE: cone})
-        self.bars.add({"ring": own}, number, self.lane)
+        self.bars.add({"ring": ring_bar}, number, self.lane)
         self._leave(place._asdict(), row)
-        (place, own), other = pairing.swap((swapped, self._float(other)))
+        (place, ring_bar), other = pairing.swap((swapped, self._float(other)))
         other = other.lane.astype(jnp.int32)
-        self.bars.add({"ring": own}, other, self.lane)
+        self.bars.add({"ring": ring_bar}, other, self.lane)
         self._leave(place._asdict(), row_of(other, self.p.k))
 
     def _on_finger(self, item: Any, pairing: FingerPairing, live: jax.Array) -> None:
@@ -398,17 +402,17 @@ class FingerContactsVjp:
     ) -> CentreLineSegment:
         """Adds the cotangents of a ring; returns those of the segment that it touches."""
         number, row, ring = self._ring(item)
-        before, own, after = finger_collision.neighbours(other, self.p.links)
+        before, link, after = finger_collision.neighbours(other, self.p.links)
         frames = tuple(self._chain("frame", r, lane) for r in (before, after))
         sections = [self._numbers(n, pairing, lane) for n in self._sections(other)]
         line = CentreLineSegment(
-            self._body(own, lane), self._chain("origin", after, lane), frames, *sections
+            self._body(link, lane), self._chain("origin", after, lane), frames, *sections
         )
         still |= {"last": self._float(jnp.where(other == self.p.links, self.like + 1.0, self.like))}
         held = friction_memory.at(self.sweep.step, pairing)
         args = (self._body(row), ring), line, self.sweep.step.constant(CONE), held
-        found = pull(partial(residual.between_rings, self.p.scene), args, (still,), self._one)
-        (place, own_ring), line, cone, kept = only_on(self._side(live), found)
+        bars = pull(partial(residual.between_rings, self.p.scene), args, (still,), self._one)
+        (place, own_ring), line, cone, kept = only_on(self._side(live), bars)
         friction_memory.leave(self.bars, pairing, kept)
         self.bars.add({CONE: cone})
         self.bars.add({"ring": own_ring}, number, self.lane)
@@ -416,8 +420,8 @@ class FingerContactsVjp:
         return line
 
     def _leave_line(self, line: CentreLineSegment, row: jax.Array) -> None:
-        before, own, after = finger_collision.neighbours(row, self.p.links)
-        self._leave(line.place._asdict(), own)
+        before, link, after = finger_collision.neighbours(row, self.p.links)
+        self._leave(line.place._asdict(), link)
         self._leave({"frame": line.frames[0]}, before)
         self._leave({"origin": line.origin, "frame": line.frames[1]}, after)
         bars = line.tip, line.first

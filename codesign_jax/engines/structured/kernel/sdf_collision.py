@@ -93,7 +93,7 @@ class SdfCollision:
             contacts = self.contacts[name]
             contacts.begin_step()  # type: ignore[attr-defined]
 
-            def one(
+            def ring(
                 slot: Any,
                 item: jax.Array,
                 nothing: list,
@@ -107,7 +107,7 @@ class SdfCollision:
                 self.on_field(name, slot, numbers, frame, centre, moves, hold)
                 return nothing
 
-            contacts.every(one, [])  # type: ignore[attr-defined]
+            contacts.every(ring, [])  # type: ignore[attr-defined]
 
     def numbers(self, i: Any) -> Lanes:
         k = self.p.k
@@ -127,27 +127,27 @@ class SdfCollision:
         """Creates contacts of rings or balls of a body."""
         contacts = self.contacts[name]
         looks = self.looks(name)
-        found = [look(centre) for look in looks]
+        seen = [look(centre) for look in looks]
         friction = self.frictions(name, contacts.set.k // len(looks))
         if self.surface == "spheres":
-            places = [lanewise(ball_on_field, numbers, centre, *first) for first in found]
+            places = [lanewise(ball_on_field, numbers, centre, *first) for first in seen]
             places = [lanewise(as_kept, place) for place in places]
             return contacts.create(i, joined(places), *moves, friction=friction)
         flat = not name.endswith("_object") and self.p.scene.effects.table  # the table comes first
         most = self.closing_gap(numbers, centre, moves[1])
-        near = [lanewise(may_touch, numbers, first[0], most).lane for first in found]
+        near = [lanewise(may_touch, numbers, first[0], most).lane for first in seen]
         contacts.write("share", zeros((1, contacts.set.k), self.step.like), i)
 
         def look_again() -> None:
             faced = []
-            for n, (look, first) in enumerate(zip(looks, found, strict=True)):
+            for n, (look, first) in enumerate(zip(looks, seen, strict=True)):
                 body = numbers, frame, centre
                 faced.append(facing(*body, first, look, plane=flat and n == 0, apply=lanewise))
-            close = [lanewise(any_closes, one.gap, most).lane for one in faced]
+            close = [lanewise(any_closes, face.gap, most).lane for face in faced]
             any_of(total(close) > 0, lambda: create(faced))
 
         def create(faced: list[Facing]) -> None:
-            places = [lanewise(ring_place, numbers, frame, centre, one) for one in faced]
+            places = [lanewise(ring_place, numbers, frame, centre, face) for face in faced]
             places = [lanewise(as_kept, place) for place in places]
             contacts.create(i, joined(places), *moves, friction=friction, hold=hold)
 
@@ -188,11 +188,11 @@ class SdfCollision:
         """Each slot of the object on the table and the fixtures, lanes of a world."""
         scene = self.p.scene
         columns = self.at["columns"]
-        found = []
+        places = []
         position = state["position"]
         if scene.effects.table:
             arms = objects.table_points(scene, self.thing, columns, position[2])
-            found += lanewise(lambda a, h: slots_of(*shapes.on_table(a, h)), arms, position[2])
+            places += lanewise(lambda a, h: slots_of(*shapes.on_table(a, h)), arms, position[2])
         kinds = [shape.type in held.ROUND for shape in scene.objects.object]
         for fixture in scene.fixture:
             gap, rows = lanewise(partial(surroundings.towards, fixture), position)
@@ -202,7 +202,7 @@ class SdfCollision:
             def on(position, rows, arms, fixture=fixture):
                 return slots_of(*surroundings.object_on(fixture, position, rows, arms))
 
-            found += lanewise(on, position, rows, arms)
+            places += lanewise(on, position, rows, arms)
             if all(kinds) or fixture.type == "plane":
                 continue
             point = lanewise(partial(surroundings.edges, fixture), position)
@@ -216,8 +216,8 @@ class SdfCollision:
                 mine = jnp.isin(shape.astype(jnp.int32), jnp.array(flat))
                 return [s._replace(share=jnp.where(mine, s.share, 0.0)) for s in slots]
 
-            found += lanewise(back, point, distance, gradient, self.thing.shape)
-        return found
+            places += lanewise(back, point, distance, gradient, self.thing.shape)
+        return places
 
     def _deal(self, slots: list) -> list[Lanes]:
         """Deals the slots, each of several (component, 1, world), out to the finger lanes."""
@@ -248,9 +248,9 @@ def beside(places: list[Place]) -> Place:
 
 def slots_of(point, normal, gap):
     """Contacts of an object's points (3, point, world) as a place each."""
-    one = jnp.ones_like(gap)
+    ones = jnp.ones_like(gap)
     return [
-        Place(*(v[:, k : k + 1] for v in (point, normal, gap[None], one[None])))
+        Place(*(v[:, k : k + 1] for v in (point, normal, gap[None], ones[None])))
         for k in range(gap.shape[0])
     ]
 
@@ -275,8 +275,8 @@ def may_touch(numbers, distance, most):
 
 def any_closes(gap, most):
     """One where any of a link's rings has a smaller gap than `closed_gap`, else zero."""
-    found = jnp.where(gap < most, 1.0, 0.0)
-    return sum(found[k] for k in range(found.shape[0]))
+    closes = jnp.where(gap < most, 1.0, 0.0)
+    return sum(closes[k] for k in range(closes.shape[0]))
 
 
 def as_kept(place: Place) -> Place:

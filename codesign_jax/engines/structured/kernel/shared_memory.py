@@ -48,12 +48,12 @@ def layout(links: int, axes: int) -> dict[str, tuple[int, tuple[int, ...]]]:
     Rows of eight are columns of the team; two spare rows take what lanes without a component store.
     """
     rows = axes, TEAM
-    found: dict[str, tuple[int, ...]] = {"axes": rows, "w": rows, "g": rows}
-    found |= {"inverse": (axes, axes), "matrix": (6, TEAM)}
+    shapes: dict[str, tuple[int, ...]] = {"axes": rows, "w": rows, "g": rows}
+    shapes |= {"inverse": (axes, axes), "matrix": (6, TEAM)}
     for name in ("motion", "step_motion"):
-        found |= {name: (6,), f"{name}_spare": (TEAM - 6,)}
+        shapes |= {name: (6,), f"{name}_spare": (TEAM - 6,)}
     shared = {"u": rows, "h": rows, "q": (6, TEAM), "f": (TEAM,)}
-    return {name: (links, shape) for name, shape in found.items()} | {
+    return {name: (links, shape) for name, shape in shapes.items()} | {
         f"shared.{name}": (1, shape) for name, shape in shared.items()
     }
 
@@ -103,8 +103,8 @@ class TeamRows:
     def rows(self, name: str, item: Any = 0) -> Lanes:
         """The lane's column of a matrix, shape (row,)."""
         count = self.layout.groups[name][1][0]
-        found = [self.get(name, item, TEAM * k) for k in range(count)]
-        return lanes(found, (count,), wide=True)
+        parts = [self.get(name, item, TEAM * k) for k in range(count)]
+        return lanes(parts, (count,), wide=True)
 
     def put_rows(self, name: str, value: Lanes, item: Any = 0) -> None:
         for k, part in enumerate(value.parts.ravel()):
@@ -117,18 +117,18 @@ def team_sum(block: Block, value: Lanes) -> Lanes:
     return lanes(parts, value.shape[:-2], wide=True)
 
 
-def where(mask: jax.Array, one: Any, other: Any) -> Any:
+def where(mask: jax.Array, first: Any, second: Any) -> Any:
     which = lanes([mask], (), wide=True)
-    return lanewise(lambda w, a, b: jax.tree.map(partial(jnp.where, w), a, b), which, one, other)
+    return lanewise(lambda w, a, b: jax.tree.map(partial(jnp.where, w), a, b), which, first, second)
 
 
 def chosen(block: Block, values: Lanes, otherwise: Any = 0.0) -> jax.Array:
     """Component k of six values on lane k, shape (lane,)."""
     parts = list(values.parts.ravel())
-    found = otherwise
+    component = otherwise
     for k, part in enumerate(parts):
-        found = jnp.where(block.mate == k, part, found)
-    return found
+        component = jnp.where(block.mate == k, part, component)
+    return component
 
 
 def ranks(block: Block, which: jax.Array) -> tuple[jax.Array, jax.Array]:

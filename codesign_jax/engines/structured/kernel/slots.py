@@ -156,8 +156,8 @@ class BoundSlots(BoundContacts):
         """Keeps in registers how many slots lanes have filled, when all contacts are found."""
         rows = range(self.set.rows)
         most = self.set.slots
-        found = [self.read("count", row).lane.astype(jnp.int32) for row in rows]
-        self._counts = SlotCounts.of_rows([jnp.minimum(n, most) for n in found], most)
+        counts = [self.read("count", row).lane.astype(jnp.int32) for row in rows]
+        self._counts = SlotCounts.of_rows([jnp.minimum(n, most) for n in counts], most)
         if self.set.gathers:
             self.write_empty(self.set.fields(), self.set.count - 1)
 
@@ -167,9 +167,9 @@ class BoundSlots(BoundContacts):
         All fields of it, as a number that is none, times no share, is none.
         """
         none = self.like
-        one = jnp.ones_like(none)
+        ones = jnp.ones_like(none)
         prefix = f"{self.set.name}."
-        sound = {"gap": [one], "normal": [none, none, one]}
+        sound = {"gap": [ones], "normal": [none, none, ones]}
         for name, (_, shape) in fields.items():
             values = sound.get(name.removeprefix(prefix), [none] * math.prod(shape))
             self.table.write(name, lanes(values, shape, wide=True), item)
@@ -279,8 +279,8 @@ class BoundSlots(BoundContacts):
         contacts = self.set.contacts
 
         def response(place, cone, jar):
-            found = contact.constraint_update(contacts(place, cone), jar)
-            return found.hessian, found.force
+            update = contact.constraint_update(contacts(place, cone), jar)
+            return update.hessian, update.force
 
         jar = lanewise(tree_add_scaled, alpha, self.read("jar", item), self.read("step", item))
         self.write("jar", jar, item)

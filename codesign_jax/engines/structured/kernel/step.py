@@ -259,11 +259,11 @@ def link_forces(scene: Scene, parent: tuple, constants: dict, joint: dict):
         origin + apply_columns(frame, constants["centre"]),
         inertia.principal_tensor(frame, constants["inertia"]),
     )
-    own = inertia.springs(scene, tuple(hinges), constants.get("threshold"), pressure, q)
-    tau = -own.stiffness * q - own.damping * rate
+    springs = inertia.springs(scene, tuple(hinges), constants.get("threshold"), pressure, q)
+    tau = -springs.stiffness * q - springs.damping * rate
     bend = tau[:1] + constants["gain"] * pressure
-    if own.moment is not None:
-        bend = bend + own.moment
+    if springs.moment is not None:
+        bend = bend + springs.moment
     if "section" in constants:
         bend = bend + inertia.softening_moment(constants["section"], hinges[0][:1], q[:1])
     tau = jnp.concatenate([bend, tau[1:]])
@@ -276,8 +276,8 @@ def link_forces(scene: Scene, parent: tuple, constants: dict, joint: dict):
         "smooth": pushed("link", smooth, body.mass, body.centre, constants),
         "tau": tau,
     }
-    if own.moment is not None:
-        stored["armature_now"] = own.armature
+    if springs.moment is not None:
+        stored["armature_now"] = springs.armature
     return (origin, frame, vel, bias, motion), stored
 
 

@@ -120,15 +120,15 @@ class StepMemory:
 
     def palm_constants(self) -> dict[str, Lanes]:
         """Constants that `palm_and_object` takes, by name, of those that the scene has."""
-        found = {n: self.constant(n) for n in PALM_CONSTANTS if n in self.world}
-        return found | self.step_numbers()
+        constants = {n: self.constant(n) for n in PALM_CONSTANTS if n in self.world}
+        return constants | self.step_numbers()
 
     def link_constants(self, i: Any) -> dict[str, Lanes]:
         """Constants that `link_forces` takes, by name, of those that the scene has."""
-        found = {n: self.hand.read(n, i) for n in LINK_CONSTANTS}
+        constants = {n: self.hand.read(n, i) for n in LINK_CONSTANTS}
         row = i if self.p.tapered else 0
-        found |= {n: self.hand.read(n, row) for n in FINGER_CONSTANTS if n in self.hand}
-        return found | self.step_numbers()
+        constants |= {n: self.hand.read(n, row) for n in FINGER_CONSTANTS if n in self.hand}
+        return constants | self.step_numbers()
 
     def step_numbers(self) -> dict[str, Lanes]:
         """Those of `laws.step_numbers` that the scene has, by name."""

@@ -72,11 +72,11 @@ class BoundTeamSdfContacts(BoundSlots):
     def each_item(self, body: Callable[[Any], None]) -> None:
         """See `BoundContacts`; a lane each."""
 
-        def one(item: Slot, _: Any, nothing: list) -> list:
+        def step(item: Slot, _: Any, nothing: list) -> list:
             body(item)
             return nothing
 
-        self.every(one, [])
+        self.every(step, [])
 
     def update_constraints(self, alpha: Lanes) -> None:
         """Adds the last step of the line search to jar; stores Hessians and forces."""
@@ -100,19 +100,19 @@ class BoundTeamSdfContacts(BoundSlots):
 
         def column(sums, place, cone, hessian, force, unit, forces):
             c = contacts(place, cone)
-            one = jnp.where(forces, force, _times(hessian, c.relative(unit[:, None])))
-            return sums + contact.contact_wrench(c, one)[:, 0]
+            response = jnp.where(forces, force, _times(hessian, c.relative(unit[:, None])))
+            return sums + contact.contact_wrench(c, response)[:, 0]
 
-        found = self._zeros((6,))[0]
+        sums = self._zeros((6,))[0]
         for item in (i * k + j for j in range(k)):
 
-            def add(item: Any = item, found: Lanes = found) -> Lanes:
+            def add(item: Any = item, sums: Lanes = sums) -> Lanes:
                 kept = [self.read(name, item) for name in ("hessian", "force")]
-                args = found, self.place(item), self.cone, *kept, unit, forces
+                args = sums, self.place(item), self.cone, *kept, unit, forces
                 return lanewise(column, *args)
 
-            found = choose(self.touching(item), add, found, self.set.size)
-        return found
+            sums = choose(self.touching(item), add, sums, self.set.size)
+        return sums
 
     def prepare_all(self, pairs: BoundFingerContacts, k: int, obj: Lanes) -> Lanes:
         """`prepare_linesearch` of all items, k a link; slopes at 0, each on its lane."""
@@ -130,9 +130,9 @@ class BoundTeamSdfContacts(BoundSlots):
 class TeamFingerContactSet(FingerContactSet):
     """Contacts between fingers, a pairing's slots dealt to the lanes."""
 
-    def __init__(self, scene: Scene, block: tuple[int, int, int], *rest: Any, **how: Any):
+    def __init__(self, scene: Scene, block: tuple[int, int, int], *rest: Any, **options: Any):
         """As `FingerContactSet`; block: fingers, worlds and lanes of a team."""
-        super().__init__(scene, block[:2], *rest, **how)
+        super().__init__(scene, block[:2], *rest, **options)
         # type: ignore[assignment]
         self.block = block
         self.size = block[0] * block[1] * block[2]
@@ -140,12 +140,12 @@ class TeamFingerContactSet(FingerContactSet):
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         """See `FingerContactSet`; spare rows take what lanes without a component store."""
-        found: dict[str, tuple[int, tuple[int, ...]]] = {}
+        groups: dict[str, tuple[int, tuple[int, ...]]] = {}
         for name, (count, shape) in super().groups().items():
-            found[name] = count, shape
+            groups[name] = count, shape
             if name in ("side.motion", "side.push"):
-                found[f"{name}_spare"] = count, (TEAM - 6,)
-        return found
+                groups[f"{name}_spare"] = count, (TEAM - 6,)
+        return groups
 
     def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundTeamFingerContacts":
         cones = {name: self.cone(read, name) for name in self._names()}
@@ -194,23 +194,23 @@ class BoundTeamFingerContacts(BoundFingerContacts):
         """See `BoundFingerContacts`; wrenches are added up later."""
         return OwnSide(self.place(item), None, None)
 
-    def load(self, item: Any, own: OwnSide, force: Lanes, pairing: FingerPairing) -> None:
+    def load(self, item: Any, side: OwnSide, force: Lanes, pairing: FingerPairing) -> None:
         """Keeps a slot's wrench, which is added to its side's when the pass has ended."""
         contacts = self.set.contacts
 
         def wrench(place, cone, force):
             return contact.contact_wrench(contacts(place, cone), force)
 
-        self.write("wrench", lanewise(wrench, own.place, self.cone, force), item)
+        self.write("wrench", lanewise(wrench, side.place, self.cone, force), item)
         self._loaded = True
 
     def each(self, body: Callable, start: Any) -> Any:
         """See `BoundFingerContacts`; adds up the wrenches of the pass."""
-        found = super().each(body, start)
+        result = super().each(body, start)
         if self._loaded:
             self._loaded = False
             self._add_wrenches()
-        return found
+        return result
 
     def clear_wrenches(self) -> None:
         def clear(row: Any, x: jax.Array) -> jax.Array:
@@ -224,7 +224,7 @@ class BoundTeamFingerContacts(BoundFingerContacts):
         name = f"{self.set.name}.wrench"
 
         def of_row(row: Any, x: jax.Array) -> jax.Array:
-            def one(k: jax.Array, x: jax.Array) -> jax.Array:
+            def slot_wrench(k: jax.Array, x: jax.Array) -> jax.Array:
                 slot = self._item(row, row * (self.set.slots + 1), k)
                 # Lanes without a component read what nobody wrote, which may be no number.
                 more = jnp.where(self.block.mate < 6, self.parts.get(name, slot.source), 0.0)
@@ -237,6 +237,6 @@ class BoundTeamFingerContacts(BoundFingerContacts):
                 return x
 
             assert self._counts is not None
-            return jax.lax.fori_loop(0, jnp.max(self._counts.of(row)), one, x)
+            return jax.lax.fori_loop(0, jnp.max(self._counts.of(row)), slot_wrench, x)
 
         jax.lax.fori_loop(0, self.set.rows, of_row, jnp.int32(0))

@@ -65,10 +65,10 @@ class TeamLanes:
         masks = [self.mask(self.block.mate == k) for k in range(6)]
 
         def pick(matrix, forces, at, masks):
-            found = jnp.where(at, forces, 0.0)
+            component = jnp.where(at, forces, 0.0)
             for k, mask in enumerate(masks):
-                found = jnp.where(mask, matrix[:, k], found)
-            return found
+                component = jnp.where(mask, matrix[:, k], component)
+            return component
 
         return lanewise(pick, matrix, forces, self.forces, masks)
 
@@ -117,15 +117,15 @@ class TeamLanes:
         Lanes without a component have zero.  Without z a lane, `at`, has the joint accelerations at
         rest in its column of w.
         """
-        own = self.mask(self.block.mate == at)
+        at_rest = self.mask(self.block.mate == at)
 
-        def part(w, g, parent, obj, own):
+        def part(w, g, parent, obj, at_rest):
             moved = g * obj - w * parent
-            return moved if z is not None else jnp.where(own, w, moved)
+            return moved if z is not None else jnp.where(at_rest, w, moved)
 
         w, g, _ = kept.factors
-        found = team_sum(self.block, lanewise(part, w, g, self.one(parent), self.one(obj), own))
-        return found if z is None else lanewise(jnp.add, found, z)
+        acc = team_sum(self.block, lanewise(part, w, g, self.one(parent), self.one(obj), at_rest))
+        return acc if z is None else lanewise(jnp.add, acc, z)
 
     def again(self, axes: list, kept: el.Kept, r: jax.Array, ro: jax.Array) -> tuple:
         """`elimination.eliminate_again` of the lanes' components; also the joint accelerations.
@@ -159,13 +159,13 @@ class TeamLanes:
     def wrist(self, kept: list[el.Kept], axes: list[Lanes], obj: Lanes, z: list | None) -> Iterate:
         """Substitutes back at the wrist: slides, then hinges."""
         motion = lanewise(jnp.zeros_like, obj)
-        found = []
+        joints = []
         part = chosen(self.block, obj)
         for k in (1, 0):
             a = self.accelerations(kept[k], chosen(self.block, motion), part, z and z[k])
-            found.append(a)
+            joints.append(a)
             motion = lanewise(lambda m, s, a: m + contract(s, a[:, None], 0), motion, axes[k], a)
-        wrist = lanewise(lambda a: jnp.concatenate(a), found)
+        wrist = lanewise(lambda a: jnp.concatenate(a), joints)
         return Iterate(self.narrowed(wrist), self.narrowed(motion), obj)
 
 
@@ -176,8 +176,8 @@ class TeamElimination(Elimination):
         super().__init__(problem)
         self.team = TeamLanes(problem)
         self.rings = problem.m.p.k
-        one = jnp.ones_like(self.like)
-        unit = [jnp.where(self.block.mate == k, one, 0.0) for k in range(6)]
+        ones = jnp.ones_like(self.like)
+        unit = [jnp.where(self.block.mate == k, ones, 0.0) for k in range(6)]
         self.unit = lanes(unit, (6,), wide=True)
 
     def backward(self, alpha: Lanes) -> tuple[Any, Lanes]:
@@ -224,29 +224,29 @@ class TeamElimination(Elimination):
         return self.block.sum((p, c, q)), lanes([whole], (), wide=False)
 
     def touched(self, node: list[Lanes], i: Any) -> list[Lanes]:
-        def add(node, own, held, forces):
+        def add(node, columns, held, forces):
             p, c, q = node
-            return [p + own, c + held, q + jnp.where(forces, -held, held)]
+            return [p + columns, c + held, q + jnp.where(forces, -held, held)]
 
         none = zeros((6,), self.like)
         forces = self.team.forces
         for contacts in self.problem.per_link:
-            own = contacts.columns(i, self.rings, self.unit, forces)  # type: ignore[attr-defined]
-            node = lanewise(add, node, own, own if contacts.set.on_object else none, forces)
+            columns = contacts.columns(i, self.rings, self.unit, forces)  # type: ignore[attr-defined]
+            node = lanewise(add, node, columns, columns if contacts.set.on_object else none, forces)
         return node
 
     def at_palm(self, now: Iterate, node: Any, slots: dict) -> tuple[Iterate, Eliminated]:
         team = self.team
         rigid = self.problem.rigid
 
-        def own(now, palm, pushes):
+        def palm_and_object(now, palm, pushes):
             none = jnp.zeros_like(palm.smooth_palm)
             square = jnp.zeros((6, *none.shape), none.dtype)
             empty = el.Quadratic(square, square, square, none, none)
             return with_palm(now, palm, empty, pushes)
 
         palm = self.problem.palm
-        whole, twist = lanewise(own, now, palm, slots)
+        whole, twist = lanewise(palm_and_object, now, palm, slots)
         none = lanewise(jnp.zeros_like, whole.r)
         added = [
             team.column(matrix, force)
@@ -330,11 +330,11 @@ class TeamCoupling(Coupling):
         z = []
         kept = [done.hinges, done.slides]
         axes = [palm.axes, lanewise(el.wrist_slides, palm.armature)]
-        for k, own in enumerate(kept):
-            if own is None:
+        for k, factors in enumerate(kept):
+            if factors is None:
                 break
             parts = [chosen(self.block, axes[k][n]) for n in range(3)]
-            r, ro, new = team.again(parts, own, r, ro)
+            r, ro, new = team.again(parts, factors, r, ro)
             z.append(new)
         force = team.narrowed(team.vector(ro))
         obj = lanewise(el.solve_object, done.q, force)
@@ -348,13 +348,13 @@ class TeamCoupling(Coupling):
         at = FORCES if z == "z" else AGAIN
         palm, obj = (chosen(self.block, v) for v in (step.palm_motion, step.object_motion))
 
-        def one(i: Any, parent: Lanes) -> Lanes:
+        def link(i: Any, parent: Lanes) -> Lanes:
             _, motion = team.outward(i, parent.lane, obj, at)
             team.scratch.put("side.motion", motion, i + 1)
             return team.one(motion)
 
         self.pairs.put("motion", self.problem.widened(step.palm_motion), 0)
-        loop(self.links, one, team.one(palm + 0 * obj), self.block.size)
+        loop(self.links, link, team.one(palm + 0 * obj), self.block.size)
 
 
 class TeamLineSearch(LineSearch):
@@ -380,7 +380,7 @@ class TeamLineSearch(LineSearch):
             slope = slope + first * joints - (smooth - dot(column, motion)) * part
             return [slope, curvature + first * stiff + dot(column, moved) * part]
 
-        def one(i: Any, carry: tuple) -> tuple:
+        def link(i: Any, carry: tuple) -> tuple:
             parent, sums = carry
             a, part = team.outward(i, parent.lane, obj, FORCES)
             problem.write("step_acc", a, i)
@@ -397,7 +397,7 @@ class TeamLineSearch(LineSearch):
 
         pairs.put("motion", problem.widened(step.palm_motion), 0)
         start = team.one(palm + 0 * obj), [zeros((), self.like)] * 2
-        _, (slope, curvature) = loop(self.links, one, start, self.block.size)
+        _, (slope, curvature) = loop(self.links, link, start, self.block.size)
         touch = self.prepare_slots(zeros((), self.like), step)
         terms = [lanewise(jnp.multiply, touch, first), pairs.prepare_all()]
         for contacts in problem.per_link:
@@ -443,5 +443,5 @@ def team_rows(stored: dict[str, Lanes], body: tuple) -> dict[str, Lanes]:
     return {k: v for k, v in stored.items() if k not in unused} | {"axes": axes, "matrix": matrix}
 
 
-def _plus(one, other):
-    return [a + b for a, b in zip(one, other, strict=True)]
+def _plus(first, second):
+    return [a + b for a, b in zip(first, second, strict=True)]

@@ -30,10 +30,10 @@ def power(base: Any, exponent: Any) -> Any:
         base = jnp.sqrt(base)
     t = (base - 1) / (base + 1)
     log = sum(2 / k * t**k for k in range(13, 0, -2))
-    found = 1.0
+    series = 1.0
     for k in range(13, 0, -1):
-        found = 1 + exponent * log * found / k
-    return found**16
+        series = 1 + exponent * log * series / k
+    return series**16
 
 
 def end_pressure(timestep: float, charge: Any, volume: Any, air: Any, grown: Any) -> tuple:
@@ -76,8 +76,8 @@ def charged(scene: Scene, hand: WorldModel, ctrl: jax.Array) -> jax.Array:
     for gain, stiffness, section in zip(
         gains, hand.stiffness[:, 0], joint_sections(hand, links), strict=False
     ):
-        own = section if scene.effects.neo_hookean else None
-        grown += links / len(gains) * gain * _free_angle(gain * wanted, stiffness, own)
+        softening = section if scene.effects.neo_hookean else None
+        grown += links / len(gains) * gain * _free_angle(gain * wanted, stiffness, softening)
     ratio = 1 + grown / volumes(hand, links)
     absolute = jnp.maximum(wanted + hand.air[1], 0.0)
     charge = absolute * power(jnp.maximum(ratio, LEAST), hand.air[0])

@@ -38,12 +38,12 @@ def make_cone(scene: Scene, friction: Any, *, bodies: int, ratio: Any, stiffer: 
     """
     c = scene.contact
     h = scene.discretization.timestep
-    how = {"ahead": scene.effects.surface == "hull"}
-    normal = 2.0 / bodies * stiffer * contact_mass(scene, **how)
-    reference = 1.0 / (h * (h + dissipation(scene, **how))), 1.0 / h + 0.0 * normal
+    surface = {"ahead": scene.effects.surface == "hull"}
+    normal = 2.0 / bodies * stiffer * contact_mass(scene, **surface)
+    reference = 1.0 / (h * (h + dissipation(scene, **surface))), 1.0 / h + 0.0 * normal
     if scene.effects.friction == "none":
         return Cone(normal, None, None, None, *reference)  # type: ignore[arg-type]
-    impratio = friction_ratio(scene, ratio, **how)
+    impratio = friction_ratio(scene, ratio, **surface)
     cone = Cone(normal, impratio * normal, friction, friction / jnp.sqrt(impratio), *reference)
     if scene.effects.friction != "full":
         return cone
@@ -59,21 +59,24 @@ def make_cones(scene: Scene, shape: jax.Array) -> Cones:
     e = scene.effects
     c = scene.contact
     ratio = c.held_friction_ratio if keeps(scene) else c.friction_ratio
-    two, one = (partial(make_cone, scene, bodies=n, ratio=ratio) for n in (2, 1))
+    two_skins = partial(make_cone, scene, bodies=2, ratio=ratio)
+    one_skin = partial(make_cone, scene, bodies=1, ratio=ratio)
     # MuJoCo has one impratio for all contacts, so that spheres, which it simulates too, do here.
     between = c.finger_finger_friction_ratio if e.surface == "hull" else c.friction_ratio
     stiffer = c.finger_palm_stiffness / c.normal_stiffness
     return Cones(
-        finger_object=two(on_object) if e.finger_object or e.palm_object else None,
-        finger_table=one(c.finger_table_friction) if e.finger_table or e.palm_table else None,
-        object_table=one(scene.objects.table.friction) if e.object_table else None,
+        finger_object=two_skins(on_object) if e.finger_object or e.palm_object else None,
+        finger_table=one_skin(c.finger_table_friction) if e.finger_table or e.palm_table else None,
+        object_table=one_skin(scene.objects.table.friction) if e.object_table else None,
         finger_finger=(
-            two(c.finger_finger_friction, ratio=between)
+            two_skins(c.finger_finger_friction, ratio=between)
             if e.finger_finger or e.finger_itself
             else None
         ),
         finger_palm=(
-            two(c.finger_palm_friction, ratio=between, stiffer=stiffer) if e.finger_palm else None
+            two_skins(c.finger_palm_friction, ratio=between, stiffer=stiffer)
+            if e.finger_palm
+            else None
         ),
     )
 
@@ -92,8 +95,9 @@ def frictions(scene: Scene) -> jax.Array | None:
     if not own_friction(scene, "object_table"):
         return None
     tables = scene.contact.finger_table_friction, scene.objects.table.friction
-    own = [fixture.friction for fixture in scene.fixture]
-    found = []
+    coefficients = []
     for table in tables:
-        found += [table] * scene.effects.table + [table if v is None else v for v in own]
-    return jnp.stack([jnp.asarray(v) for v in found])
+        coefficients += [table] * scene.effects.table
+        for fixture in scene.fixture:
+            coefficients.append(table if fixture.friction is None else fixture.friction)
+    return jnp.stack([jnp.asarray(v) for v in coefficients])

@@ -216,12 +216,12 @@ def same_zone(contacts: Contacts, ray: LineCost, alpha: jax.Array) -> jax.Array:
     """Whether the contacts are in one zone of the cone, see `constraint_update`, at 0 and alpha."""
     normals = ray.n0, ray.n0 + alpha * ray.n1
     if contacts.cone.friction is None:
-        one, two = (normal < 0 for normal in normals)
-        return ~contacts.active | (one == two)
+        before, after = (normal < 0 for normal in normals)
+        return ~contacts.active | (before == after)
     squares = ray.uu, ray.uu + alpha * (2 * ray.uv + alpha * ray.vv)
     lengths = [jnp.sqrt(jnp.maximum(s, 0.0) + 1e-30) for s in squares]
-    one, two = (_zones(contacts, n, size) for n, size in zip(normals, lengths, strict=True))
-    return (one[0] == two[0]) & (one[1] == two[1])
+    before, after = (_zones(contacts, n, size) for n, size in zip(normals, lengths, strict=True))
+    return (before[0] == after[0]) & (before[1] == after[1])
 
 
 def slopes(contacts: Contacts, ray: LineCost, alpha: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -143,9 +143,9 @@ def _place(state: State) -> jax.Array:
 
 
 def _wrist(place: jax.Array, wrist: jax.Array, wrist_vel: jax.Array):
-    one = jnp.ones_like(wrist[0])
+    ones = jnp.ones_like(wrist[0])
     zero = jnp.zeros_like(wrist[0])
-    frame = [jnp.stack([one if i == k else zero for i in range(3)]) for k in range(3)]
+    frame = [jnp.stack([ones if i == k else zero for i in range(3)]) for k in range(3)]
     none = jnp.stack([zero] * 3)
     vel = spatial(none, wrist_vel[:3])
     bias = spatial(none, none)

@@ -233,8 +233,8 @@ def facing_field(
     toward = -apply_rows(frame, normal)
     reach, unit = support(ring.half, toward)
     gap = distance - dot(normal, offset) - reach
-    one = jnp.ones_like(gap)
-    return Facing(normal, gap, reach, unit, toward[0], one, one)
+    ones = jnp.ones_like(gap)
+    return Facing(normal, gap, reach, unit, toward[0], ones, ones)
 
 
 def on_field(
@@ -259,8 +259,8 @@ def ball_on_field(
 ) -> Place:
     """The round case of `on_field`."""
     gap = distance - radius
-    one = jnp.where(radius > 0, jnp.ones_like(gap), 0.0)
-    return Place(centre - normal * (radius + 0.5 * gap), normal, gap, one)
+    share = jnp.where(radius > 0, jnp.ones_like(gap), 0.0)
+    return Place(centre - normal * (radius + 0.5 * gap), normal, gap, share)
 
 
 # Against centre lines
@@ -280,10 +280,10 @@ def on_line(segment: Segment, t: jax.Array) -> jax.Array:
 
 def section_frame(segment: Segment, t: jax.Array) -> jax.Array:
     """Frame of the section there: it turns from one link's middle to the next one's."""
-    before, own, after = segment.frames
+    before, link, after = segment.frames
     aside = t - 0.5
     other = jnp.where(aside < 0, before, after)
-    mean = own + jnp.abs(aside) * (other - own)
+    mean = link + jnp.abs(aside) * (other - link)
     x = mean[0] / jnp.sqrt(dot(mean[0], mean[0]))
     y = mean[1] - dot(mean[1], x) * x
     y = y / jnp.sqrt(dot(y, y))
@@ -304,9 +304,9 @@ def facing_line(
     line = away / apart
     normal = jnp.zeros_like(away)
     for axes, half, side in ((frame, ring.half, -1.0), (other, segment.half, 1.0)):
-        own = apply_columns(axes, side * section_normal(half, side * apply_rows(axes, away)))
+        bulge = apply_columns(axes, side * section_normal(half, side * apply_rows(axes, away)))
         along = dot(line, axes[0]) ** 2
-        normal = normal + own + along * (line - own)
+        normal = normal + bulge + along * (line - bulge)
     normal = normal / jnp.sqrt(dot(normal, normal) + SMALL)
     toward = -apply_rows(frame, normal)
     back = apply_rows(other, normal)
@@ -342,8 +342,8 @@ def ball_on_ball(
     square = dot(away, away)
     apart = square > 0
     length = jnp.sqrt(jnp.where(apart, square, 1.0))
-    one = jnp.ones_like(square)
-    normal = jnp.where(apart, away / length, jnp.stack([-one, 0 * one, 0 * one]))
+    ones = jnp.ones_like(square)
+    normal = jnp.where(apart, away / length, jnp.stack([-ones, 0 * ones, 0 * ones]))
     gap = jnp.where(apart, length, 0.0) - radius - their_radius
-    some = jnp.where((radius > 0) & (their_radius > 0), one, 0.0)
+    some = jnp.where((radius > 0) & (their_radius > 0), ones, 0.0)
     return Place(centre - normal * (radius + 0.5 * gap), normal, gap, some)

@@ -82,10 +82,10 @@ def towards(fixture: Fixture, position: jax.Array) -> tuple[jax.Array, jax.Array
       The distance (...), and rows of a rotation, shape (3, 3, ...).
     """
     gap, normal = distance(fixture, position, jnp.zeros_like(position))
-    one = jnp.ones_like(gap)
+    ones = jnp.ones_like(gap)
     zero = jnp.zeros_like(gap)
     aside = jnp.where(
-        jnp.abs(normal[2]) < 0.9, jnp.stack([zero, zero, one]), jnp.stack([one, zero, zero])
+        jnp.abs(normal[2]) < 0.9, jnp.stack([zero, zero, ones]), jnp.stack([ones, zero, zero])
     )
     first = cross(aside, normal)
     first = first / jnp.sqrt(dot(first, first))
@@ -116,11 +116,11 @@ def edges(fixture: Fixture, position: jax.Array) -> jax.Array:
                 a = (k + 1) % 3
                 b = (k + 2) % 3
                 across, along = (a, b) if edge < 2 else (b, a)
-                own: list[Any] = [None] * 3
-                own[k] = side[k]
-                own[along] = near[along]
-                own[across] = jnp.zeros_like(side[k]) + (1 if edge % 2 else -1) * size[across]
-                new = jnp.stack(own)
+                corner: list[Any] = [None] * 3
+                corner[k] = side[k]
+                corner[along] = near[along]
+                corner[across] = jnp.zeros_like(side[k]) + (1 if edge % 2 else -1) * size[across]
+                new = jnp.stack(corner)
                 first = (excess[k] >= excess[a]) & (excess[k] >= excess[b])
                 point = new if point is None else jnp.where(first, new, point)
             found.append(point)

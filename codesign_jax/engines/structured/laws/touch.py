@@ -49,8 +49,8 @@ def touch(
     """
     if surface == "spheres":
         return apply(ball_on_field, numbers, centre, *first)
-    found = facing(numbers, frame, centre, first, look, plane=plane, apply=apply)
-    return apply(ring_place, numbers, frame, centre, found)
+    faced = facing(numbers, frame, centre, first, look, plane=plane, apply=apply)
+    return apply(ring_place, numbers, frame, centre, faced)
 
 
 def facing(

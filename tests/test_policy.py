@@ -91,9 +91,28 @@ def test_who_replays_the_key_frames_simulates_the_open_loop(worlds):
         (again, replayed._replace(ctrl=None, forces=None)),
     )
     jax.tree.map(np.testing.assert_array_equal, *both)
-    # Two programs of plain JAX, of forces of 10 N in float32.
+    # Of states that are recorded and that are found back from those after them, float32.
     for a, b in zip(*map(jax.tree.leaves, (replayed.forces, trace.forces)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("reads", [True, False])
+def test_forces_are_found_for_policies_that_read_them(worlds, monkeypatch, reads):
+    """Others compile no kernel for them."""
+    asked = []
+
+    def found(scene, fields, world):
+        asked.append(fields)
+        return policy._no_forces(scene, world)
+
+    def step(carry, seen):
+        light = jnp.where(seen.forces.grip.sum() > 0, 0.5, 1.0) if reads else 1.0
+        return carry, seen.plan._replace(pressure=light * seen.plan.pressure)
+
+    monkeypatch.setattr(policy, "_forces", found)
+    simulate = partial(rollout.simulate, SCENE, loop(SCENE, step, period=0.25))
+    jax.eval_shape(simulate, *worlds[0])
+    assert bool(asked) == reads
 
 
 def test_what_is_observed_is_where_mujoco_has_it(worlds):

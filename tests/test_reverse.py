@@ -115,7 +115,7 @@ FAULTS = {
         results={"asks.<locals>.of_jar": without(0)}
     ),
     "what fingers hold asks nothing of accelerations": Fault(
-        results={"push.<locals>.of_held": without(0)}
+        results={"load_cotangents.<locals>.of_held": without(0)}
     ),
     "both fingers own a contact": Fault(
         methods={(residual_vjp, "only_on"): lambda right, mask, tree: tree}

@@ -75,17 +75,17 @@ class ReverseStep(Step):
         p = self.p
         bars = self.bars
         bars.begin()
-        state, at, thing, now, centre = self.assemble(arm, pressure)
+        state, bodies, world_object, now, centre = self.assemble(arm, pressure)
         go = lanes([moved], (), wide=False)
-        before, acc_bar = self._integration(state, at, now, go)
+        before, acc_bar = self._integration(state, bodies, now, go)
         if p.held:
             friction_memory.reverse(self, bars, go)
         # The right side of wrist and object stands in the place of their only forces.
         right = {"smooth_wrist": acc_bar[0], "smooth_object": acc_bar[1]}
-        right["smooth_palm"] = _none(at["palm"].smooth_palm)
-        problem = Problem(self, at["palm"]._replace(**right))
+        right["smooth_palm"] = _none(bodies["palm"].smooth_palm)
+        problem = Problem(self, bodies["palm"]._replace(**right))
         virtual = AdjointSolve(problem).solve()
-        sweep = ResidualVjp(self, state, at, thing, virtual, bars)
+        sweep = ResidualVjp(self, state, bodies, world_object, virtual, bars)
         if problem.finger_pairs:
             FingerContactsVjp(sweep, problem.finger_pairs).run()
         metered = p.scene.effects.air_mass
@@ -96,7 +96,9 @@ class ReverseStep(Step):
         base = sweep.palm_and_table(base)
         return self._palm_bars(state, arm, base, before, (now, virtual, acc_bar[0]), shown)
 
-    def _integration(self, state: dict, at: dict, now: Iterate, go: Lanes) -> tuple[dict, tuple]:
+    def _integration(
+        self, state: dict, bodies: dict, now: Iterate, go: Lanes
+    ) -> tuple[dict, tuple]:
         """Cotangents of the state that the integration starts at, and of the accelerations.
 
         Of wrist and object; those of the fingers' accelerations go to the scratch table, "acc_bar".
@@ -105,7 +107,7 @@ class ReverseStep(Step):
         h = self.p.scene.discretization.timestep
         old = {n: state[n] for n in MOVED}
         after = {n: self.bars.world_state.read(n) for n in MOVED}
-        given = old, at["columns"], now.wrist, now.object_motion
+        given = old, bodies["columns"], now.wrist, now.object_motion
         run = partial(moved, h)
         state_bars, columns, wrist, obj = pull(run, given, (), only_on(go, after))
         self.bars.add_once({"columns": columns})
@@ -191,8 +193,8 @@ class AdjointSolve(Elimination):
         smooth, right = self.problem.read("smooth", "acc_bar", item=i)
         return [_none(smooth), right]
 
-    def push(self, contacts: BoundContacts, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
-        matrix, wrench = contacts.push(item, alpha)
+    def of_contacts(self, contacts: BoundContacts, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
+        matrix, wrench = contacts.inertia_and_wrench(item, alpha)
         if contacts.set.holds:
             return matrix, friction_memory.asks(self.problem, contacts, item)
         return matrix, _none(wrench)
@@ -201,7 +203,7 @@ class AdjointSolve(Elimination):
         pairs.update_constraints(alpha)
         pairs.clear_wrenches()
         if friction_memory.pairings(self.problem.m):
-            friction_memory.push(self.problem, pairs)
+            friction_memory.load_cotangents(self.problem, pairs)
 
     def solve(self) -> Iterate:
         """Virtual accelerations of the wrist, and virtual motions of palm and object.

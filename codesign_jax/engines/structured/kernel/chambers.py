@@ -160,7 +160,7 @@ class Chambers:
 
         return lanewise(less, r, ro, total, *self._of_finger("series", "palm", "object"))
 
-    def settle(self, z: str, motion: Lanes, object_motion: Lanes) -> None:
+    def substitute(self, z: str, motion: Lanes, object_motion: Lanes) -> None:
         """Takes the chambers' part from the joints' factors, once palm and object are known."""
 
         def pressure(series, total, palm, obj, motion, object_motion):

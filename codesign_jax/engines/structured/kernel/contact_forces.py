@@ -150,8 +150,8 @@ class ForceStep(Step):
             return super().bound(contacts)
         return StoredContacts(contacts, self.record, contacts.cone(self.constant))
 
-    def fields(self, at: dict[str, Any], thing: Any) -> SdfCollision:
-        return EveryRing(self, at, thing)
+    def fields(self, bodies: dict[str, Any], world_object: Any) -> SdfCollision:
+        return EveryRing(self, bodies, world_object)
 
     def _store_pairs(self, pairs: BoundFingerContacts) -> None:
         def of_row(row: jax.Array, x: jax.Array) -> jax.Array:

@@ -14,6 +14,7 @@ from codesign_jax.engines.structured.kernel.memory import (
     BoundTable,
     anywhere,
     full,
+    loop,
     solid,
     tree_add_scaled,
     upper,
@@ -182,16 +183,22 @@ class BoundContacts:
 
         jax.lax.fori_loop(0, self.set.count, step, jnp.int32(0))
 
+    def fold_items(self, body: Callable, start: Any) -> Any:
+        """Folds body(item, tree of lanes) over all items."""
+        return loop(self.set.count, body, start, self.set.size)
+
     def place(self, item: Any) -> Place:
         return Place(*(self.read(field, item) for field in Place._fields))
 
-    def push(self, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
+    def inertia_and_wrench(self, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
         """Adds the last step to jar; returns the contacts' inertia (6, 6) and wrench (6,) there."""
         parts: list[tuple] = [(21,), (6,)]
-        triangle, wrench = self.if_touching(item, lambda: self._push(item, alpha), parts)
+        triangle, wrench = self.if_touching(
+            item, lambda: self._inertia_and_wrench(item, alpha), parts
+        )
         return full(triangle), wrench
 
-    def _push(self, item: Any, alpha: Lanes) -> list[Lanes]:
+    def _inertia_and_wrench(self, item: Any, alpha: Lanes) -> list[Lanes]:
         # All is read before anything is stored, see `finger_contacts.OwnSide`.
         jar = self.read("jar", item)
         step = self.read("step", item)

@@ -102,10 +102,10 @@ class Coupling:
 
         work = jax.lax.while_loop(going, body, start)[-1]
         more = self._result(lanes([work > 0], (), wide=False))
-        self._settle()
+        self._add_correction()
         return lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), step, more)
 
-    def _settle(self) -> None:
+    def _add_correction(self) -> None:
         def add(i: Any, x: jax.Array) -> jax.Array:
             z = lanewise(jnp.add, *self.problem.read("z", "z_again", item=i))
             self.problem.write("z", z, i)
@@ -222,7 +222,7 @@ class Coupling:
         r = self.problem.add_first(r)
         at_palm = self._palm(*self.block.sum((r, ro)))
         if chambers:
-            chambers.settle("z_again", at_palm.palm_motion, at_palm.object_motion)
+            chambers.substitute("z_again", at_palm.palm_motion, at_palm.object_motion)
         return at_palm
 
     def _palm(self, r: Lanes, ro: Lanes) -> Iterate:

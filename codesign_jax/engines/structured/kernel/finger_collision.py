@@ -61,7 +61,7 @@ def fields(links: int) -> dict[str, tuple[int, tuple[int, ...]]]:
 class FingerCollision:
     """Gives a slot to each contact of fingers with one another, with themselves and the palm."""
 
-    def __init__(self, step: StepMemory, pairs: BoundFingerContacts, at: dict[str, Any]):
+    def __init__(self, step: StepMemory, pairs: BoundFingerContacts, bodies: dict[str, Any]):
         self.step = step
         self.pairs = pairs
         self.p = step.p
@@ -69,11 +69,11 @@ class FingerCollision:
         self.block = step.block
         self.like = step.like
         self.count = self.p.links * self.p.k
-        self.palm_vel = at["vel"]
+        self.palm_vel = bodies["vel"]
         self.hull = step.p.scene.effects.surface == "hull"
         self.palm = None
         if step.p.scene.effects.finger_palm:
-            self.palm = at["place"], at["frame"], step.constant("palm_disc")
+            self.palm = bodies["place"], bodies["frame"], step.constant("palm_disc")
 
     # Where fingers are
 
@@ -217,6 +217,19 @@ class FingerCollision:
         far = lanewise(jnp.add, mine, theirs).lane + self._gap(speed)
         return square < far * far
 
+    def _if_close(
+        self, near: jax.Array, faced: Facing, speed: Lanes, add: Callable[[jax.Array], None]
+    ) -> None:
+        """Runs add(lanes whose rings are close), if any may touch in this step.
+
+        Args:
+          near: Lanes to look at.
+          faced: How their rings face the other body.
+          speed: Bound of the speed at which they approach [m/s].
+        """
+        close = near & (faced.gap.lane < self._gap(speed))
+        any_of(close, lambda: add(close))
+
     def _begun(
         self, place: Place, cone: Any, row: Any, theirs: list[Lanes], held: list[Lanes]
     ) -> dict[str, Lanes]:
@@ -305,9 +318,12 @@ class FingerCollision:
             self._alone(candidate, palm, item, mine)
 
         def enter() -> None:
-            facing = touch.facing(numbers, frame, centre, field, look, apply=lanewise)
-            close = mine & (facing.gap.lane < self._gap(self.read("fastest")))
-            any_of(close, lambda: add(lanewise(touch.ring_place, numbers, frame, centre, facing)))
+            faced = touch.facing(numbers, frame, centre, field, look, apply=lanewise)
+
+            def add_ring(_: jax.Array) -> None:
+                add(lanewise(touch.ring_place, numbers, frame, centre, faced))
+
+            self._if_close(mine, faced, self.read("fastest"), add_ring)
 
         def enter_ball() -> None:
             add(lanewise(touch.ball_on_field, numbers, centre, *field))
@@ -328,16 +344,15 @@ class FingerCollision:
 
         def enter() -> None:
             segment, moves = self._of_rows(self._segment, other, near, None)
-            facing = self._facing(numbers, frame, centre, segment, other, t)
-            close = near & (facing.gap.lane < self._gap(self.read("fastest")))
+            faced = self._facing(numbers, frame, centre, segment, other, t)
 
-            def add() -> None:
-                place = lanewise(place_of, numbers, frame, centre, facing)
+            def add(close: jax.Array) -> None:
+                place = lanewise(place_of, numbers, frame, centre, faced)
                 held = friction_memory.of_row(self.step, self.pairs, 0)
                 candidate = self._begun(place, self.pairs.of_row(1), row, moves, held)
                 self._alone(candidate, other, item, close)
 
-            any_of(close, add)
+            self._if_close(near, faced, self.read("fastest"), add)
 
         any_of(near, enter)
 
@@ -375,16 +390,15 @@ class FingerCollision:
 
         def enter() -> None:
             segment, moves = self._of_rows(self._segment, other, near, pairing)
-            facing = self._facing(numbers, frame, centre, segment, other, t)
-            close = near & (facing.gap.lane < self._gap(speed))
+            faced = self._facing(numbers, frame, centre, segment, other, t)
 
-            def add() -> None:
-                place = lanewise(place_of, numbers, frame, centre, facing)
+            def add(close: jax.Array) -> None:
+                place = lanewise(place_of, numbers, frame, centre, faced)
                 held = friction_memory.of_row(self.step, self.pairs, row)
                 candidate = self._begun(place, self.pairs.of_row(row), link, moves, held)
                 self._enter(row, close, owner, candidate, other, item)
 
-            any_of(close, add)
+            self._if_close(near, faced, speed, add)
 
         any_of(near, enter)
 

@@ -245,6 +245,10 @@ class BoundFingerContacts(BoundSlots):
 
         return loop(self.set.rows, of_row, start, self.set.size)
 
+    def fold_items(self, body: Callable, start: Any) -> Any:
+        """See `BoundContacts`; over all slots in use."""
+        return self.each(lambda item, _, carry: body(item, carry), start)
+
     def do(self, body: Callable) -> None:
         """Runs body(item, pairing), which stores something, over all slots in use."""
 

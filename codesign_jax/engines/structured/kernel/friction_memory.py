@@ -149,21 +149,21 @@ def sums(pairs: BoundFingerContacts, row: Any, alpha: Lanes, grip: Lanes) -> Lan
     return added if pairs.block.team == 1 else team_sum(pairs.block, added)
 
 
-def settle(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
+def keep(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
     """Keeps what contacts of worlds hold whose iteration ends with a step of this length."""
     some = [c for c in (*problem.per_link, *problem.dealt) if c.set.holds]
 
-    def keep() -> None:
+    def keep_all() -> None:
         for contacts in some:
-            _settle(problem, contacts, alpha, lanes([which], (), wide=True))
+            _keep_of_set(problem, contacts, alpha, lanes([which], (), wide=True))
 
     if some:
-        any_of(which, keep)
+        any_of(which, keep_all)
     if pairings(problem.m):
-        _settle_fingers(problem, alpha, which)
+        _keep_of_fingers(problem, alpha, which)
 
 
-def _settle(problem: Problem, contacts: BoundContacts, alpha: Lanes, mask: Lanes) -> None:
+def _keep_of_set(problem: Problem, contacts: BoundContacts, alpha: Lanes, mask: Lanes) -> None:
     """Keeps what a set's contacts hold behind the step, in the worlds of the mask."""
     build = contacts.set.contacts
     axes = turning(problem.m, contacts)
@@ -172,7 +172,7 @@ def _settle(problem: Problem, contacts: BoundContacts, alpha: Lanes, mask: Lanes
         new = behind(build(place, cone), jar + alpha * step, old, axes)
         return jnp.where(mask, new, old)
 
-    def settle_item(item: Any) -> None:
+    def keep_item(item: Any) -> None:
         def store() -> None:
             place = contacts.place(item)
             cone = contacts.cone_at(item)
@@ -182,7 +182,7 @@ def _settle(problem: Problem, contacts: BoundContacts, alpha: Lanes, mask: Lanes
 
         jax.lax.cond(contacts.touching(item), store, lambda: None)
 
-    contacts.each_item(settle_item)
+    contacts.each_item(keep_item)
 
 
 def turning(step: StepMemory, contacts: BoundContacts) -> Lanes | None:
@@ -205,24 +205,24 @@ def behind(
     return grip_after if axes is None else apply_rows(axes, grip_after)
 
 
-def _settle_fingers(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
+def _keep_of_fingers(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
     pairs = problem.finger_pairs
     assert pairs is not None
 
-    def keep() -> None:
+    def keep_all() -> None:
         mask = lanes([which], (), wide=True)
         first = pairs.set.first
 
-        def settle_row(row: jax.Array, x: jax.Array) -> jax.Array:
+        def keep_row(row: jax.Array, x: jax.Array) -> jax.Array:
             before, old = problem.read(GRIP, "new_grip", item=row + first)
             new = lanewise(holding.quotient, sums(pairs, row, alpha, before))
             problem.write("new_grip", lanewise(jnp.where, mask, new, old), row + first)
             return x
 
-        jax.lax.fori_loop(0, pairs.set.rows, settle_row, jnp.int32(0))
+        jax.lax.fori_loop(0, pairs.set.rows, keep_row, jnp.int32(0))
 
     with only([pairs], which):
-        any_of(which & pairs.touching_worlds(), keep)
+        any_of(which & pairs.touching_worlds(), keep_all)
 
 
 def reverse(step: StepMemory, bars: CotangentTables, go: Lanes) -> None:
@@ -321,7 +321,7 @@ def _reverse_fingers(
         state.write(GRIP, rest, item)
 
 
-def at(step: StepMemory, pairing: FingerPairing) -> tuple[Lanes, ...]:
+def hold_of_pairing(step: StepMemory, pairing: FingerPairing) -> tuple[Lanes, ...]:
     """What the lanes' fingers hold, and "grip_bar"; nothing if the scene has no such state."""
     if not pairings(step):
         return ()
@@ -332,7 +332,7 @@ def at(step: StepMemory, pairing: FingerPairing) -> tuple[Lanes, ...]:
 
 
 def leave(bars: CotangentTables, pairing: FingerPairing, grip_bars: tuple) -> None:
-    """Adds a contact's cotangents of `at` to those of the state."""
+    """Adds a contact's cotangents of `hold_of_pairing` to those of the state."""
     if not grip_bars:
         return
     item = pairing.number
@@ -342,7 +342,7 @@ def leave(bars: CotangentTables, pairing: FingerPairing, grip_bars: tuple) -> No
     state.scatter(GRIP, new, item, lane)
 
 
-def push(problem: Problem, pairs: BoundFingerContacts) -> None:
+def load_cotangents(problem: Problem, pairs: BoundFingerContacts) -> None:
     """Loads the links with what "grip_bar" asks of the step's accelerations.
 
     A change of jar changes a contact's force by -K; with r the derivative of the sums by the

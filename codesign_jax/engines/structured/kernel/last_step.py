@@ -43,18 +43,9 @@ def steady(problem: Problem, alpha: Lanes, *, between: bool) -> jax.Array:
     def add(item: Any, sums: Lanes, contacts: BoundContacts) -> Lanes:
         return lanewise(jnp.add, sums, contacts.changes(item, alpha))
 
-    for contacts in problem.dealt:
-        one = partial(add, contacts=contacts)
-        count = loop(contacts.set.count, one, count, block.size)
-    for contacts in problem.per_link:
-        if block.team > 1:
-            dealt = lambda item, _, sums, c=contacts: add(item, sums, c)  # noqa: E731
-            count = contacts.every(dealt, count)  # type: ignore[attr-defined]
-        else:
-            count = loop(problem.links, partial(add, contacts=contacts), count, block.size)
-    if between and problem.finger_pairs:
-        pairs = problem.finger_pairs
-        count = pairs.each(lambda item, _, sums: add(item, sums, pairs), count)
+    sets = [*problem.dealt, *problem.per_link, *(problem.in_slots if between else [])]
+    for contacts in sets:
+        count = contacts.fold_items(partial(add, contacts=contacts), count)
     if block.team > 1:
         count = team_sum(block, count)
     return block.sum(count).lane == 0
@@ -136,7 +127,7 @@ class ChordStep:
         given = now, problem.palm, done, r, ro, work, self._pushes(alpha)
         step, work = lanewise(self._at_palm, *given)
         if chambers:
-            chambers.settle("z_again", step.palm_motion, step.object_motion)
+            chambers.substitute("z_again", step.palm_motion, step.object_motion)
         return step, work
 
     def _pushes(self, alpha: Lanes) -> dict[str, Lanes]:
@@ -147,7 +138,7 @@ class ChordStep:
             def add(i: Any, sums: Lanes, c: BoundContacts = c) -> Lanes:
                 return lanewise(jnp.add, sums, c.wrench(i, alpha))
 
-            wrench = loop(c.set.count, add, zeros((6,), self.like), self.block.size)
+            wrench = c.fold_items(add, zeros((6,), self.like))
             pushes[c.set.name] = self.block.sum(wrench)
         return pushes
 

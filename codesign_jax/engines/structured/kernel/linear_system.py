@@ -73,7 +73,7 @@ class Elimination:
             node = node._replace(p=full(node.p), q=full(node.q))
             node = lanewise(load_link, node, problem.body_of(i), motion, smooth, pair)
             for contacts in problem.per_link:
-                node = self.touch(node, contacts, i, alpha)
+                node = self.add_contacts(node, contacts, i, alpha)
             forces = axes, armature, tau, acc
 
             def eliminated(eliminate: Callable) -> tuple[el.Quadratic, Lanes]:
@@ -110,15 +110,19 @@ class Elimination:
         """Smooth forces on a link and on the joint before it."""
         return self.problem.read("smooth", "tau", item=i)
 
-    def push(self, contacts: BoundContacts, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
-        return contacts.push(item, alpha)
+    def of_contacts(self, contacts: BoundContacts, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
+        return contacts.inertia_and_wrench(item, alpha)
 
     def between_fingers(self, pairs: BoundFingerContacts, alpha: Lanes) -> None:
         pairs.update_constraints(alpha)
 
-    def touch(self, node: el.Quadratic, contacts: BoundContacts, i: Any, alpha: Lanes) -> Any:
+    def add_contacts(
+        self, node: el.Quadratic, contacts: BoundContacts, i: Any, alpha: Lanes
+    ) -> Any:
         def add() -> el.Quadratic:
-            return lanewise(_add, node, *self.push(contacts, i, alpha), contacts.set.on_object)
+            return lanewise(
+                _add, node, *self.of_contacts(contacts, i, alpha), contacts.set.on_object
+            )
 
         return choose(contacts.touching(i), add, node, self.block.size)
 
@@ -137,13 +141,13 @@ class Elimination:
         for c in self.problem.dealt:
 
             def add(i: Any, carry: tuple, c: BoundContacts = c) -> tuple:
-                matrix, wrench = self.push(c, i, alpha)
+                matrix, wrench = self.of_contacts(c, i, alpha)
                 return lanewise(
                     lambda a, b: jax.tree.map(jnp.add, a, b), carry, (upper(matrix), wrench)
                 )
 
             start = (zeros((21,), self.like), zeros((6,), self.like))
-            triangle, wrench = self.block.sum(loop(c.set.count, add, start, self.block.size))
+            triangle, wrench = self.block.sum(c.fold_items(add, start))
             pushes[c.set.name] = (full(triangle), wrench)
         return pushes
 
@@ -178,7 +182,7 @@ class Elimination:
 
         step, done = lanewise(solve, now, self.problem.palm, node, slots)
         if self.problem.chambers:
-            self.problem.chambers.settle("z", step.palm_motion, step.object_motion)
+            self.problem.chambers.substitute("z", step.palm_motion, step.object_motion)
         return step, done
 
 

@@ -43,7 +43,7 @@ from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 class Convergence(NamedTuple):
     """How the iteration stands: relative decrement, lanes of a world; count, a scalar."""
 
-    residual: Any
+    decrement: Any
     count: jax.Array
 
 
@@ -59,7 +59,7 @@ class Newton:
         self.coupling = Coupling if alone else TeamCoupling
         # A chord's step would take a GPU as long as it saves: there an iteration ends without one.
         threads = bool(problem.in_slots) and problem.in_slots[0].set.gathers
-        self.settles = threads
+        self.accepts_steady = threads
         self.chord = ChordStep(problem) if problem.in_slots and alone and not threads else None
 
     def solve(
@@ -74,10 +74,10 @@ class Newton:
         """
         problem = self.problem
 
-        def hold(before, alpha, residual):
+        def hold(before, alpha, decrement):
             # A world that has converged keeps its iterate: it must not depend on other worlds.
             going = before > tolerance
-            return jnp.where(going, alpha, 0.0), jnp.where(going, residual, before)
+            return jnp.where(going, alpha, 0.0), jnp.where(going, decrement, before)
 
         def body(carry: list) -> list:
             count = carry[0]
@@ -87,26 +87,28 @@ class Newton:
             with only(problem.in_slots, busy):
                 step, done = self.direction(now, last, ~busy)
                 slope, curvature, first = self.search.prepare(now, step)
-                residual, scale = lanewise(_residual, slope, first, problem.palm, now.object_motion)
+                decrement, scale = lanewise(
+                    _decrement, slope, first, problem.palm, now.object_motion
+                )
                 floor = jnp.where(busy, LINE_TOLERANCE * tolerance * scale.lane, FAR)
                 alpha = self.search.find(slope, curvature, first, floor, evaluations)
-            alpha, residual = lanewise(hold, before, alpha, residual)
+            alpha, decrement = lanewise(hold, before, alpha, decrement)
             newton = alpha  # of the contacts, which the chord's step does not move
             now = lanewise(tree_add_scaled, alpha, now, step)
             if self.chord:
-                likely = busy & (residual.lane > tolerance) & (residual.lane <= LARGEST)
-                iterate = now, alpha, residual
+                likely = busy & (decrement.lane > tolerance) & (decrement.lane <= LARGEST)
+                iterate = now, alpha, decrement
                 confirm = partial(self.confirm, *iterate, done, scale, likely, tolerance)
-                now, alpha, residual = choose(anywhere(likely), confirm, iterate, self.block.size)
-            if self.settles:
+                now, alpha, decrement = choose(anywhere(likely), confirm, iterate, self.block.size)
+            if self.accepts_steady:
                 largest = STEADY * tolerance
-                likely = busy & (residual.lane > tolerance) & (residual.lane <= largest)
-                settle = partial(self.settle, residual, alpha, likely, tolerance)
-                residual = choose(anywhere(likely), settle, residual, self.block.size)
+                likely = busy & (decrement.lane > tolerance) & (decrement.lane <= largest)
+                accept = partial(self.accept_steady, decrement, alpha, likely, tolerance)
+                decrement = choose(anywhere(likely), accept, decrement, self.block.size)
             if friction_memory.kept(problem):
-                ends = busy & ((residual.lane <= tolerance) | (count + 1 >= iterations))
-                friction_memory.settle(problem, newton, ends)
-            return [count + 1, *solid((now, residual, alpha), self.block.size)[0]]
+                ends = busy & ((decrement.lane <= tolerance) | (count + 1 >= iterations))
+                friction_memory.keep(problem, newton, ends)
+            return [count + 1, *solid((now, decrement, alpha), self.block.size)[0]]
 
         def going(carry: list) -> jax.Array:
             return (carry[0] < iterations) & anywhere(waiting & (carry[-2] > tolerance))
@@ -115,28 +117,30 @@ class Newton:
         none = lanewise(lambda a: jnp.zeros_like(a[0]), now.wrist)
         start, rebuild = solid((now, far, none), self.block.size)
         count, *arrays = jax.lax.while_loop(going, body, [jnp.int32(0), *start])
-        now, residual, last = rebuild(arrays)
+        now, decrement, last = rebuild(arrays)
         loop(problem.links, lambda i, _: (problem.move("acc", i, last), [])[1], [], self.block.size)
-        return now, Convergence(residual, count)
+        return now, Convergence(decrement, count)
 
-    def settle(self, residual: Lanes, alpha: Lanes, likely: jax.Array, tolerance: float) -> Lanes:
+    def accept_steady(
+        self, decrement: Lanes, alpha: Lanes, likely: jax.Array, tolerance: float
+    ) -> Lanes:
         """The decrement, or the tolerance where the step that it is of is taken as the last one.
 
         Args:
-          residual: The decrement; `alpha`: length of the step.
+          decrement: The decrement; `alpha`: length of the step.
           likely: Lanes of worlds whose decrement is near the tolerance, see `STEADY`.
         """
         with only(self.problem.in_slots, likely):
             ends = likely & steady(self.problem, alpha, between=True)
         newton = (alpha.lane > LENGTHS[0]) & (alpha.lane < LENGTHS[1])
         mask = lanes([ends & newton], (), wide=False)
-        return lanewise(lambda e, r: jnp.where(e, tolerance, r), mask, residual)
+        return lanewise(lambda e, r: jnp.where(e, tolerance, r), mask, decrement)
 
     def confirm(
         self,
         now: Iterate,
         alpha: Lanes,
-        residual: Lanes,
+        decrement: Lanes,
         done: Eliminated,
         scale: Lanes,
         likely: jax.Array,
@@ -145,7 +149,7 @@ class Newton:
         """Ends the iteration of worlds whose next decrement would be below the tolerance.
 
         Args:
-          now: The iterate behind the step; `alpha`: its length; `residual`: relative decrement
+          now: The iterate behind the step; `alpha`: its length; `decrement`: relative decrement
             before.
           done: What `direction` left of the palm's elimination.
           scale: Scale of the decrement.
@@ -178,11 +182,11 @@ class Newton:
 
             there, length = choose(anywhere(taken), take, (now, alpha), size)
             small = lanes([converged], (), wide=False)
-            return there, length, lanewise(jnp.where, small, new, residual)
+            return there, length, lanewise(jnp.where, small, new, decrement)
 
         with only(self.problem.in_slots, likely):
             still = likely & steady(self.problem, alpha, between=False)
-            as_was = now, alpha, residual
+            as_was = now, alpha, decrement
             return choose(anywhere(still), lambda: look(still), as_was, size)
 
     def direction(self, now: Iterate, last: Lanes, idle: jax.Array) -> tuple[Iterate, Eliminated]:
@@ -208,7 +212,7 @@ WEIGHT_SQUARE = 100.0
 tolerance is relative to the objective at this acceleration."""
 
 
-def _residual(slope, first, palm: Palm, motion):
+def _decrement(slope, first, palm: Palm, motion):
     # Typical size of the objective: object and palm at g, plus the object's present motion.
     mass = palm.object.mass
     scale = WEIGHT_SQUARE * (mass + palm.palm.mass) + mass * dot(motion[3:], motion[3:])

@@ -94,7 +94,7 @@ def read(
 
 def _for_both(
     scene: Scene,
-    thing: WorldObject,
+    world_object: WorldObject,
     primitive: Callable,
     meshed: Callable,
     like: Any,
@@ -104,84 +104,86 @@ def _for_both(
 
     Lanes that are not `near`, by default none, may get zeros for a mesh.
     """
-    if thing.mesh is None:
+    if world_object.mesh is None:
         return primitive()
-    mine = thing.mesh.meshed.lane
-    size = thing.block.size
+    mine = world_object.mesh.meshed.lane
+    size = world_object.block.size
     if len(shapes.mesh_indices(scene)) == len(scene.objects.object):
         return meshed() if near is None else choose(anywhere(near), meshed, like, size)
     plain = choose(anywhere(~mine), primitive, like, size)
     other = choose(anywhere(mine if near is None else near & mine), meshed, like, size)
 
-    return lanewise(_pick, thing.mesh.meshed, other, plain)
+    return lanewise(_pick, world_object.mesh.meshed, other, plain)
 
 
-def signed_distance(scene: Scene, thing: WorldObject, local: Lanes) -> tuple[Lanes, Lanes]:
+def signed_distance(scene: Scene, world_object: WorldObject, local: Lanes) -> tuple[Lanes, Lanes]:
     """Signed distance (...) and unit gradient (3, ...) at points (3, ...) of the object's frame."""
 
     def primitive() -> tuple[Lanes, Lanes]:
         def compute(size, shape, local):
             return shapes.primitive_distance(scene, size, shape.astype(jnp.int32), local)
 
-        return lanewise(compute, thing.size, thing.shape, local)
+        return lanewise(compute, world_object.size, world_object.shape, local)
 
     def meshed() -> tuple[Lanes, Lanes]:
-        assert thing.mesh is not None
-        grid = thing.mesh.grid
+        assert world_object.mesh is not None
+        grid = world_object.mesh.grid
         cell = lanewise(meshes.locate, grid, local)
-        values = _gather(thing.mesh.values, lanewise(meshes.corners, grid, cell), local.dtype)
+        values = _gather(
+            world_object.mesh.values, lanewise(meshes.corners, grid, cell), local.dtype
+        )
         return lanewise(meshes.interpolate, grid, cell, values)
 
     none = lanewise(lambda p: (jnp.zeros_like(p[0]), jnp.zeros_like(p)), local)
-    return _for_both(scene, thing, primitive, meshed, none)
+    return _for_both(scene, world_object, primitive, meshed, none)
 
 
-def distance_of(scene: Scene, local: jax.Array, at: dict, still: dict) -> tuple:
+def distance_of(scene: Scene, local: jax.Array, variables: dict, still: dict) -> tuple:
     """`signed_distance` as a function of arrays that has a derivative.
 
     Args:
       scene: The scene.
       local: Points (3, ...) in the object's frame.
-      at: Sizes of the object, and origin, cell and factor of a mesh's grid, by name.
+      variables: Sizes of the object, and origin, cell and factor of a mesh's grid, by name.
       still: Index of the object and, with meshes, first value and nodes of the grid, whether the
         object is a mesh, and the distances at the corners of the points' cells, see `cell_values`.
     """
     nearest = None
     shape = still["object_id"].astype(jnp.int32)
     if len(shapes.mesh_indices(scene)) < len(scene.objects.object):
-        nearest = shapes.primitive_distance(scene, at["object_size"], shape, local)
+        nearest = shapes.primitive_distance(scene, variables["object_size"], shape, local)
     if "meshed" in still:
-        grid = GridLanes(**{k: (at | still)[f"grid_{k}"] for k in GridLanes._fields})
+        grid = GridLanes(**{k: (variables | still)[f"grid_{k}"] for k in GridLanes._fields})
         new = meshes.interpolate(grid, meshes.locate(grid, local), still["values"])
         nearest = new if nearest is None else _pick(still["meshed"], new, nearest)
     assert nearest is not None
     return nearest
 
 
-def cell_values(thing: WorldObject, local: Lanes) -> Lanes:
+def cell_values(world_object: WorldObject, local: Lanes) -> Lanes:
     """Distances at the corners of the grid cells in which points (3, ...) lie, shape (8, ...)."""
-    assert thing.mesh is not None
-    grid = thing.mesh.grid
+    assert world_object.mesh is not None
+    grid = world_object.mesh.grid
     index = lanewise(lambda g, p: meshes.corners(g, meshes.locate(g, p)), grid, local)
-    return _gather(thing.mesh.values, index, local.dtype)
+    return _gather(world_object.mesh.values, index, local.dtype)
 
 
-def points_of(scene: Scene, at: dict, still: dict) -> jax.Array:
+def points_of(scene: Scene, variables: dict, still: dict) -> jax.Array:
     """`table_points` as a function of arrays that has a derivative.
 
     Args:
       scene: The scene.
-      at: Columns, sizes and, of meshes, factor of the object, by name.
+      variables: Columns, sizes and, of meshes, factor of the object, by name.
       still: As in `distance_of`; of meshes the points themselves, in the object's frame, and the
         factor that they have.
     """
     points = None
     shape = still["object_id"].astype(jnp.int32)
-    columns = at["columns"][:, :, 0]
+    columns = variables["columns"][:, :, 0]
     if len(shapes.mesh_indices(scene)) < len(scene.objects.object):
-        points = shapes.primitive_points(scene, at["object_size"][:, 0], shape, columns)
+        points = shapes.primitive_points(scene, variables["object_size"][:, 0], shape, columns)
     if "meshed" in still:
-        support = still["support"] * (at["grid_factor"] / still["factor"])
+        support = still["support"] * (variables["grid_factor"] / still["factor"])
         new = meshes.turned(columns, support)
         points = new if points is None else _pick(still["meshed"], new, points)
     assert points is not None
@@ -199,7 +201,7 @@ def _gather(ref: Any, index: Lanes, dtype: Any) -> Lanes:
     return Lanes(parts, index.shape, dtype)
 
 
-def table_points(scene: Scene, thing: WorldObject, columns: Lanes, height: Lanes) -> Lanes:
+def table_points(scene: Scene, world_object: WorldObject, columns: Lanes, height: Lanes) -> Lanes:
     """Four points that may touch the table, from the centre, shape (3, 4, world).
 
     Height is that of the objects' centres above the table.
@@ -210,34 +212,36 @@ def table_points(scene: Scene, thing: WorldObject, columns: Lanes, height: Lanes
             shape = shape.astype(jnp.int32)
             return shapes.primitive_points(scene, size[:, 0], shape, columns[:, :, 0])
 
-        return lanewise(compute, thing.size, thing.shape, columns)
+        return lanewise(compute, world_object.size, world_object.shape, columns)
 
     def meshed() -> Lanes:
-        search = partial(_search, thing, columns)
+        search = partial(_search, world_object, columns)
         (first,) = search(lambda *a: (meshes.lowest(*a),))
         (second,) = search(lambda *a: (meshes.farthest(*a),), first)
         lowest = [first, second, *search(meshes.beside, first, second)]
         return lanewise(lambda points: jnp.concatenate(points, 1), lowest)
 
     near = None
-    if thing.mesh is not None:
+    if world_object.mesh is not None:
         # A mesh whose centre is higher than its farthest point touches nothing: the search for
         # its points is left out, and zeros, its centre, touch nothing either.
-        clear = lanewise(jnp.subtract, height, thing.mesh.reach)
+        clear = lanewise(jnp.subtract, height, world_object.mesh.reach)
         near = clear.lane < 0
     none = lanewise(lambda c: jnp.zeros((3, 4, c.shape[-1]), c.dtype), columns)
-    return _for_both(scene, thing, primitive, meshed, none, near)
+    return _for_both(scene, world_object, primitive, meshed, none, near)
 
 
-def _search(thing: WorldObject, columns: Lanes, scores: Callable, *known: Lanes) -> list[Lanes]:
+def _search(
+    world_object: WorldObject, columns: Lanes, scores: Callable, *known: Lanes
+) -> list[Lanes]:
     """The support points with the largest scores, from the centre, shape (3,), lanes of a world.
 
     Each finger's lane goes through its part of the points; then the lanes of a world compare.
     Scores takes points (3, finger, world), their indices and known points, see `meshes.lowest`.
     """
-    assert thing.mesh is not None
-    block = thing.block
-    support = thing.mesh.support
+    assert world_object.mesh is not None
+    block = world_object.block
+    support = world_object.mesh.support
     dtype = columns.dtype
     finger = block.finger.astype(dtype)
 
@@ -258,7 +262,9 @@ def _search(thing: WorldObject, columns: Lanes, scores: Callable, *known: Lanes)
         index = lanes([place], (), wide=True)
         return lanewise(compare, columns, support(k), index, known, best)
 
-    best = loop(thing.mesh.rows - 1, lambda k, best: row(k + 1, best), row(0, None), block.size)
+    best = loop(
+        world_object.mesh.rows - 1, lambda k, best: row(k + 1, best), row(0, None), block.size
+    )
     return [_among_fingers(block, *b) for b in best]
 
 

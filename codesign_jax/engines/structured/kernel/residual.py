@@ -75,37 +75,37 @@ def of_contacts(
     return sum_axis(dot(force, contacts.relative(along)), 0) + work
 
 
-def _held(name: str, held: dict, at: dict, still: dict) -> tuple:
+def _held(name: str, held: dict, variables: dict, still: dict) -> tuple:
     """What `of_contacts` needs of the friction that a pair of bodies holds."""
     if not held:
         return ()
-    axes = at["columns"] if name.endswith("_object") else None
+    axes = variables["columns"] if name.endswith("_object") else None
     return held["held"], still["held_bar"], axes
 
 
-def look(scene: Scene, point, at: dict, still: dict, values: Any = None):
+def look(scene: Scene, point, variables: dict, still: dict, values: Any = None):
     """Distance of points of the hand from the object, and its gradient, world axes."""
-    local = shapes.in_object(at["columns"], point)
+    local = shapes.in_object(variables["columns"], point)
     still = still if values is None else still | {"values": values}
-    distance, gradient = objects.distance_of(scene, local, at, still)
-    return distance, apply_columns(at["columns"], gradient)
+    distance, gradient = objects.distance_of(scene, local, variables, still)
+    return distance, apply_columns(variables["columns"], gradient)
 
 
-def around(scene: Scene, at: dict) -> list[Callable]:
+def around(scene: Scene, variables: dict) -> list[Callable]:
     """Distance fields of table and fixtures: from points to distances and their gradients."""
     if not scene.fixture:
-        return [partial(shapes.table_distance, at["height"])]
-    return [partial(field, at["position"]) for field in surroundings.fields(scene)]
+        return [partial(shapes.table_distance, variables["height"])]
+    return [partial(field, variables["position"]) for field in surroundings.fields(scene)]
 
 
 def of_rings(
-    scene: Scene, name: str, place: BodyMotion, numbers, at: dict, held: dict, still: dict
+    scene: Scene, name: str, place: BodyMotion, numbers, variables: dict, held: dict, still: dict
 ) -> jax.Array:
     """Power of the contacts of the rings, or spheres, of a link or the palm.
 
     Args:
       numbers: Numbers of its rings, see `rings.Ring`, shape (8, k, ...).
-      at: The object and the constants of the contacts, by name.
+      variables: The object and the constants of the contacts, by name.
       held: What they hold of friction, "held"; nothing where they hold none.
       still: What has no derivative here: accelerations, indices and values of grids, cotangents of
         what they hold behind the step, and "share" of the contacts, which tells which are
@@ -114,7 +114,11 @@ def of_rings(
     centre = ring_centres(place.origin, place.frame, numbers)
     places = []
     on_object = name.endswith("_object")
-    looks = around(scene, at) if not on_object else [partial(look, scene, at=at, still=still)]
+    looks = (
+        around(scene, variables)
+        if not on_object
+        else [partial(look, scene, variables=variables, still=still)]
+    )
     for n, field in enumerate(looks):
         values = [{"values": still.get(k)} if on_object else {} for k in ("values", "values_again")]
         first = field(centre, **values[0])
@@ -125,27 +129,27 @@ def of_rings(
         places.append(sdf_collision.as_kept(touched))
     candidates = sdf_collision.beside(places)
     candidates = candidates._replace(share=jnp.where(still["share"] > 0, candidates.share, 0.0))
-    cone = _cone(scene, name, at)
+    cone = _cone(scene, name, variables)
     if own_friction(scene, name):
         which = surroundings.touched(scene, name, numbers.shape[1])
-        cone = cone.of_friction(jnp.stack([at["friction"][i] for i in which]))
+        cone = cone.of_friction(jnp.stack([variables["friction"][i] for i in which]))
     contacts = ContactSet.contacts(candidates, cone)
-    moves = _from_object(name, place[2:], at, still)
-    hold = _held(name, held, at, still)
+    moves = _from_object(name, place[2:], variables, still)
+    hold = _held(name, held, variables, still)
     return of_contacts(contacts, *(m[:, None] for m in moves), hold=hold)
 
 
 def second_look(
-    scene: Scene, name: str, place: BodyMotion, numbers, at: dict, still: dict
+    scene: Scene, name: str, place: BodyMotion, numbers, variables: dict, still: dict
 ) -> jax.Array:
     """Where rings look at a field again, see `touch`, shape (3, k, ...)."""
     centre = ring_centres(place.origin, place.frame, numbers)
-    first = look(scene, centre, at, still, still.get("values"))
+    first = look(scene, centre, variables, still, still.get("values"))
     return centre + aim(numbers, place.frame, *first)
 
 
 def of_table(
-    scene: Scene, fingers: int, item: int, at: dict, held: dict, finger: Any, still: dict
+    scene: Scene, fingers: int, item: int, variables: dict, held: dict, finger: Any, still: dict
 ) -> jax.Array:
     """Power of the object's points on the table that an item deals to the fingers' lanes.
 
@@ -159,36 +163,38 @@ def of_table(
             lane = jnp.where(finger == k - item * fingers, place[..., k, None, :], lane)
         return lane
 
-    point, normal, gap = map(deal, _of_object(scene, at, still))
+    point, normal, gap = map(deal, _of_object(scene, variables, still))
     used = (finger < slots - item * fingers) & (still["share"][0, 0] > 0)
-    cone = _cone(scene, TABLE, at)
+    cone = _cone(scene, TABLE, variables)
     if own_friction(scene, TABLE):
         which = surroundings.touched(scene, TABLE, 1)
-        rubs = jnp.stack([at["friction"][i, 0] for i in which])
+        rubs = jnp.stack([variables["friction"][i, 0] for i in which])
         cone = cone.of_friction(deal(rubs)[None])
     cone = cone.of_share(jnp.where(used, 1.0, 0.0)[None])
     contacts = Contacts(point[:, None], normal[:, None], gap[None], cone)
-    moves = at["object_vel"], still["object_motion"], still["object_along"]
-    hold = _held(TABLE, held, at, still)
+    moves = variables["object_vel"], still["object_motion"], still["object_along"]
+    hold = _held(TABLE, held, variables, still)
     return of_contacts(contacts, *(m[:, None] for m in moves), hold=hold)
 
 
-def _of_object(scene: Scene, at: dict, still: dict) -> tuple:
+def _of_object(scene: Scene, variables: dict, still: dict) -> tuple:
     """Point, normal (3, slot, world) and gap of the object on table and fixtures."""
     places = []
     if scene.effects.table:
-        places.append(shapes.on_table(objects.points_of(scene, at, still), at["height"]))
+        places.append(
+            shapes.on_table(objects.points_of(scene, variables, still), variables["height"])
+        )
     flat = any(shape.type not in ROUND for shape in scene.objects.object)
     for j, fixture in enumerate(scene.fixture):
-        position = at["position"]
+        position = variables["position"]
         _, rows = surroundings.towards(fixture, position)
-        turned = at | {"columns": surroundings.faced(rows, at["columns"])}
+        turned = variables | {"columns": surroundings.faced(rows, variables["columns"])}
         constants = still | {"support": still[f"support_{j}"]} if "meshed" in still else still
         arms = objects.points_of(scene, turned, constants)
         places.append(surroundings.object_on(fixture, position, rows[:, :, 0], arms))
         if flat and EDGES[fixture.type]:
             point = surroundings.edges(fixture, position)
-            seen = look(scene, point, at, still, still.get(f"values_{j}"))
+            seen = look(scene, point, variables, still, still.get(f"values_{j}"))
             edge = surroundings.edge_on(point, *seen)
             places.append(tuple(v[..., 0, :] for v in edge))
     if len(places) == 1:
@@ -316,13 +322,13 @@ def _between(
     return sum_axis(dot(force, along), 0) + held_work(contacts, force, grip, bars)
 
 
-def _from_object(name: str, moves: Any, at: dict, still: dict) -> list:
+def _from_object(name: str, moves: Any, variables: dict, still: dict) -> list:
     """Velocity, acceleration and virtual acceleration from the object's, if it is touched."""
     if not name.endswith("_object"):
         return list(moves)
-    obj = at["object_vel"], still["object_motion"], still["object_along"]
+    obj = variables["object_vel"], still["object_motion"], still["object_along"]
     return [m - o for m, o in zip(moves, obj, strict=True)]
 
 
-def _cone(scene: Scene, name: str, at: dict) -> contact.Cone:
-    return cone_of(scene, at[f"cone.{which_cone(name)}"])
+def _cone(scene: Scene, name: str, variables: dict) -> contact.Cone:
+    return cone_of(scene, variables[f"cone.{which_cone(name)}"])

@@ -54,15 +54,15 @@ class ResidualVjp:
         self,
         step: Step,
         state: dict[str, Lanes],
-        at: dict[str, Any],
-        thing: WorldObject,
+        bodies: dict[str, Any],
+        world_object: WorldObject,
         virtual: Iterate,
         bars: CotangentTables,
     ):
         self.step = step
         self.p = step.p
-        self.at = at
-        self.thing = thing
+        self.bodies = bodies
+        self.world_object = world_object
         self.contacts = step.contacts
         self.scratch = step.scratch
         self.virtual = virtual
@@ -70,18 +70,18 @@ class ResidualVjp:
         self.block = step.block
         self.like = step.like
         self.one = lanes([self.like + 1.0], (), wide=True)
-        self.object = {"columns": at["columns"], "object_vel": at["object_vel"]}
+        self.object = {"columns": bodies["columns"], "object_vel": bodies["object_vel"]}
         self.object |= {"height": state["position"][2]}
         if self.p.scene.fixture:
             self.object |= {"position": state["position"]}
         names = ("object_size", "grid_origin", "grid_cell", "grid_factor")
         self.object |= {n: step.constant(n) for n in names if n in step.world}
         self.still: dict[str, Any] = {"object_id": step.constant("object_id")}
-        self.still |= {"object_motion": at["now"].object_motion}
+        self.still |= {"object_motion": bodies["now"].object_motion}
         self.still |= {"object_along": virtual.object_motion}
-        if thing.mesh is not None:
+        if world_object.mesh is not None:
             self.still |= {n: step.constant(n) for n in ("grid_first", "grid_nodes")}
-            self.still |= {"meshed": thing.mesh.meshed}
+            self.still |= {"meshed": world_object.mesh.meshed}
 
     def chain(self, i: Any) -> LinkMotion:
         """What the link before joint i hands on."""
@@ -139,7 +139,7 @@ class ResidualVjp:
     def _mount(self, base: LinkMotion, centre_bar: Lanes) -> LinkMotion:
         read = self.step.hand.read
         names = ("mount", "base", "stub_centre")
-        palm = self.at["place"], self.at["frame"]
+        palm = self.bodies["place"], self.bodies["frame"]
 
         def run(palm, mount, base, stub, weight):
             place, frame = palm
@@ -158,10 +158,14 @@ class ResidualVjp:
     def palm_and_table(self, base: LinkMotion) -> LinkMotion:
         """Adds the contacts of the palm's rings or spheres, and of the object with the table."""
         names = [n for n in ("palm_object", "palm_table") if n in self.contacts]
-        at = self.at
-        now = self.at["now"]
+        bodies = self.bodies
+        now = self.bodies["now"]
         place = BodyMotion(
-            at["place"], at["frame"], at["vel"], now.palm_motion, self.virtual.palm_motion
+            bodies["place"],
+            bodies["frame"],
+            bodies["vel"],
+            now.palm_motion,
+            self.virtual.palm_motion,
         )
         if "palmbar.origin" in self.scratch:
             more = {n: self.scratch.read(f"palmbar.{n}") for n in BodyMotion._fields}
@@ -180,16 +184,16 @@ class ResidualVjp:
         rows = [self.step.hand.read(table, i * k + j) for j in range(k)]
         numbers = lanewise(lambda rows: jnp.stack(rows, 1), rows)
 
-        def compute(at: dict, still: dict) -> BodyMotion:
+        def compute(variables: dict, still: dict) -> BodyMotion:
             if "meshed" in still and name.endswith("_object"):
                 centre = lanewise(ring_centres, place.origin, place.frame, numbers)
                 still = still | {"values": self._values(centre)}
                 if self.p.hull:
                     run = partial(residual.second_look, self.p.scene, name)
-                    again = lanewise(run, place, numbers, at, still)
+                    again = lanewise(run, place, numbers, variables, still)
                     still = still | {"values_again": self._values(again)}
             run = partial(residual.of_rings, self.p.scene, name)
-            args = place, numbers, at, self.held(name, i)
+            args = place, numbers, variables, self.held(name, i)
             body_bars, ring_bars, shared, held = pull(run, args, (still,), self.one)
             friction_memory.add_held(self.bars, self.contacts[name], i, held)
             for j in range(k):
@@ -202,20 +206,20 @@ class ResidualVjp:
     def _touching(
         self, name: str, i: Any, compute: Callable[[dict, dict], BodyMotion]
     ) -> BodyMotion:
-        at = self._object(name)
+        variables = self._object(name)
         empty = BodyMotion(*(self.none(n) for n in BodyMotion._fields))
         contacts = self.contacts[name]
         still = self.still | self.of_contacts(name, i)
-        return choose(contacts.touching(i), lambda: compute(at, still), empty, self.p.size)
+        return choose(contacts.touching(i), lambda: compute(variables, still), empty, self.p.size)
 
     def _table(self) -> None:
         contacts = self.contacts[residual.TABLE]
         p = self.p
         finger = lanes([self.block.finger.astype(self.like.dtype)], (), wide=True)
-        at = self._object(residual.TABLE)
+        variables = self._object(residual.TABLE)
         still = self.still
         if "meshed" in still:
-            columns = self.at["columns"]
+            columns = self.bodies["columns"]
             still = still | {"factor": self.object["grid_factor"]}
             still |= {"support": self._support(columns, self.object["height"])}
             for j, fixture in enumerate(p.scene.fixture):
@@ -231,7 +235,7 @@ class ResidualVjp:
             def compute(i: int = i) -> None:
                 run = partial(residual.of_table, p.scene, p.fingers, i)
                 constants = still | self.of_contacts(residual.TABLE, i)
-                args = at, self.held(residual.TABLE, i)
+                args = variables, self.held(residual.TABLE, i)
                 bars, held = pull(run, args, (finger, constants), self.one)
                 friction_memory.add_held(self.bars, contacts, i, held)
                 self.bars.add(bars)
@@ -263,12 +267,12 @@ class ResidualVjp:
 
     def _support(self, columns: Lanes, height: Lanes) -> Lanes:
         """Points that may touch a table of these axes, in the object's frame."""
-        points = objects.table_points(self.p.scene, self.thing, columns, height)
+        points = objects.table_points(self.p.scene, self.world_object, columns, height)
         return lanewise(_turned_back, columns, points)
 
     def _values(self, centre: Lanes) -> Lanes:
-        local = lanewise(shapes.in_object, self.at["columns"], centre)
-        return objects.cell_values(self.thing, local)
+        local = lanewise(shapes.in_object, self.bodies["columns"], centre)
+        return objects.cell_values(self.world_object, local)
 
 
 def _turned_back(columns: jax.Array, points: jax.Array) -> jax.Array:
@@ -341,9 +345,11 @@ class FingerContactsVjp:
     def _on_palm(self, item: Any, live: jax.Array) -> None:
         """Adds the cotangents of a ring or sphere and of the palm."""
         number, row, ring = self._ring(item)
-        at = self.sweep.at
+        bodies = self.sweep.bodies
         step = self.sweep.step
-        palm = self._body(jnp.zeros_like(row))._replace(origin=at["place"], frame=at["frame"])
+        palm = self._body(jnp.zeros_like(row))._replace(
+            origin=bodies["place"], frame=bodies["frame"]
+        )
         args = (self._body(row), ring), palm, step.constant("palm_disc"), step.constant(ON_PALM)
         run = partial(residual.on_palm, self.p.scene)
         (place, ring_bar), palm, disc, cone = only_on(
@@ -409,7 +415,7 @@ class FingerContactsVjp:
             self._body(link, lane), self._chain("origin", after, lane), frames, *sections
         )
         still |= {"last": self._float(jnp.where(other == self.p.links, self.like + 1.0, self.like))}
-        held = friction_memory.at(self.sweep.step, pairing)
+        held = friction_memory.hold_of_pairing(self.sweep.step, pairing)
         args = (self._body(row), ring), line, self.sweep.step.constant(CONE), held
         bars = pull(partial(residual.between_rings, self.p.scene), args, (still,), self._one)
         (place, own_ring), line, cone, kept = only_on(self._side(live), bars)

@@ -37,11 +37,11 @@ from codesign_jax.model import held
 class SdfCollision:
     """Enters the contacts of fingers, palm and object with object and table."""
 
-    def __init__(self, step: StepMemory, at: dict[str, Any], thing: WorldObject):
+    def __init__(self, step: StepMemory, bodies: dict[str, Any], world_object: WorldObject):
         self.step = step
         self.p = step.p
-        self.at = at
-        self.thing = thing
+        self.bodies = bodies
+        self.world_object = world_object
         self.contacts = step.contacts
         self.names = [n for n in ("finger_object", "finger_table") if n in self.contacts]
         self.surface = step.p.scene.effects.surface
@@ -54,9 +54,9 @@ class SdfCollision:
         return [partial(lanewise, field, position) for field in surroundings.fields(self.p.scene)]
 
     def _object(self, point: Lanes) -> tuple[Lanes, Lanes]:
-        columns = self.at["columns"]
+        columns = self.bodies["columns"]
         local = lanewise(shapes.in_object, columns, point)
-        distance, gradient = objects.signed_distance(self.p.scene, self.thing, local)
+        distance, gradient = objects.signed_distance(self.p.scene, self.world_object, local)
         return distance, lanewise(apply_columns, columns, gradient)
 
     def frictions(self, name: str, count: int = 1) -> Lanes | None:
@@ -69,11 +69,11 @@ class SdfCollision:
         )
 
     def moves(self, name: str, motion: Lanes | None, vel: Lanes | None) -> tuple[Lanes, Lanes]:
-        at = self.at
-        now = self.at["now"]
+        bodies = self.bodies
+        now = self.bodies["now"]
         return (
             relative(name, motion, now.palm_motion, now.object_motion),
-            relative(name, vel, at["vel"], at["object_vel"]),
+            relative(name, vel, bodies["vel"], bodies["object_vel"]),
         )
 
     def of_link(self, i: Any, carry: tuple) -> None:
@@ -161,15 +161,15 @@ class SdfCollision:
     def of_palm_and_object(self, state: dict) -> None:
         """Contacts of the palm's rings or spheres, and of the object with the table."""
         p = self.p
-        at = self.at
+        bodies = self.bodies
         palm = [name for name in ("palm_object", "palm_table") if name in self.contacts]
         for i in range(p.palm_groups if palm else 0):
             numbers = lanewise(one_of, self.step.hand.read("palm_ring", i))
-            centre = lanewise(ring_centres, at["place"], at["frame"], numbers)
+            centre = lanewise(ring_centres, bodies["place"], bodies["frame"], numbers)
             for name in palm:
                 moves = self.moves(name, None, None)
                 hold = friction_memory.of_item(self.step, self.contacts[name], i)
-                self.on_field(name, i, numbers, at["frame"], centre, moves, hold)
+                self.on_field(name, i, numbers, bodies["frame"], centre, moves, hold)
         on_table = self.contacts.get("object_table")
         slots = self._table_points(state) if on_table else []
         rubs = self.frictions("object_table")
@@ -187,17 +187,17 @@ class SdfCollision:
     def _table_points(self, state: dict) -> list[Place]:
         """Each slot of the object on the table and the fixtures, lanes of a world."""
         scene = self.p.scene
-        columns = self.at["columns"]
+        columns = self.bodies["columns"]
         places = []
         position = state["position"]
         if scene.effects.table:
-            arms = objects.table_points(scene, self.thing, columns, position[2])
+            arms = objects.table_points(scene, self.world_object, columns, position[2])
             places += lanewise(lambda a, h: slots_of(*shapes.on_table(a, h)), arms, position[2])
         kinds = [shape.type in held.ROUND for shape in scene.objects.object]
         for fixture in scene.fixture:
             gap, rows = lanewise(partial(surroundings.towards, fixture), position)
             turned = lanewise(surroundings.faced, rows, columns)
-            arms = objects.table_points(scene, self.thing, turned, gap)
+            arms = objects.table_points(scene, self.world_object, turned, gap)
 
             def on(position, rows, arms, fixture=fixture):
                 return slots_of(*surroundings.object_on(fixture, position, rows, arms))
@@ -216,7 +216,7 @@ class SdfCollision:
                 mine = jnp.isin(shape.astype(jnp.int32), jnp.array(flat))
                 return [s._replace(share=jnp.where(mine, s.share, 0.0)) for s in slots]
 
-            places += lanewise(back, point, distance, gradient, self.thing.shape)
+            places += lanewise(back, point, distance, gradient, self.world_object.shape)
         return places
 
     def _deal(self, slots: list) -> list[Lanes]:

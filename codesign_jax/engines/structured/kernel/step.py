@@ -72,7 +72,7 @@ class Step(StepMemory):
         new_speed, good = semi_implicit_euler(self, state, geometry, now, goes_on, speed)
         count = jnp.full_like(height, quality.count)
         # Residuals of decided worlds are reported as 0; no iterations are spent on them.
-        residual = jnp.where(waiting, quality.residual.lane, 0.0)
+        residual = jnp.where(waiting, quality.decrement.lane, 0.0)
         return (distance, height, residual, count, *slots), new_speed, good
 
     def assemble(self, arm: Lanes, pressure: Lanes) -> tuple:
@@ -89,19 +89,19 @@ class Step(StepMemory):
         p = self.p
         state = {name: self.world_state.read(name) for name in p.world_state.groups}
         run = partial(palm_and_object, p.scene.discretization.timestep)
-        at = lanewise(run, state, arm, self.palm_constants())
-        thing = objects.read(p.scene, self.block, self.world, self.hand, self.grid)
-        self.columns = at["columns"]
+        bodies = lanewise(run, state, arm, self.palm_constants())
+        world_object = objects.read(p.scene, self.block, self.world, self.hand, self.grid)
+        self.columns = bodies["columns"]
         self.contacts = {c.name: self.bound(c) for c in p.sets}
-        return state, at, thing, *self._forward(state, at, pressure, thing)
+        return state, bodies, world_object, *self._forward(state, bodies, pressure, world_object)
 
     def bound(self, contacts: ContactSet) -> BoundContacts:
         """A contact set with its memory."""
         return contacts.bind(self.scratch, self.constant)
 
-    def fields(self, at: dict[str, Any], thing: WorldObject) -> SdfCollision:
+    def fields(self, bodies: dict[str, Any], world_object: WorldObject) -> SdfCollision:
         """The search for contacts with distance fields; arguments as `assemble` has them."""
-        return SdfCollision(self, at, thing)
+        return SdfCollision(self, bodies, world_object)
 
     def _overflow(self, waiting: jax.Array) -> jax.Array:
         """One for worlds that had too few slots for their contacts in this step, else zero."""
@@ -112,41 +112,41 @@ class Step(StepMemory):
     def keep(self, i: Any, chain: tuple) -> None:
         """Called with what the forward pass carries before joint i, and behind the last one."""
 
-    def _bases(self, at: dict) -> tuple[Lanes, ...]:
+    def _bases(self, bodies: dict) -> tuple[Lanes, ...]:
         """The fingers' bases: origin, frame, velocity, bias, motion, and weighted centre."""
         names = ("mount", "base", "centre_weight", "stub_centre")
         mount, base, weight, stub = (self.hand.read(n) for n in names)
-        frame, origin = lanewise(kin.mounted, at["place"], at["frame"], mount, base)
+        frame, origin = lanewise(kin.mounted, bodies["place"], bodies["frame"], mount, base)
 
         def weighted(place, frame, stub, weight):
             return weight * (place + apply_columns(frame, stub))
 
-        weight = lanewise(weighted, at["place"], at["frame"], stub, weight)
+        weight = lanewise(weighted, bodies["place"], bodies["frame"], stub, weight)
         wide = zeros((6,), self.like)
-        palm = at["vel"], at["bias"], at["now"].palm_motion
+        palm = bodies["vel"], bodies["bias"], bodies["now"].palm_motion
         vel, bias, motion = (lanewise(jnp.add, v, wide) for v in palm)
         return origin, frame, vel, bias, motion, weight
 
-    def _forward(self, state: dict, at: dict, pressure: Lanes, thing: WorldObject):
+    def _forward(self, state: dict, bodies: dict, pressure: Lanes, world_object: WorldObject):
         """Bodies, forces and contacts from the palm to the tips, left in the scratch table.
 
         Returns the warm start and the hand's centre from the object's.
         """
         p = self.p
-        now = at["now"]
+        now = bodies["now"]
         like = self.like
-        start = self._bases(at)
+        start = self._bases(bodies)
         origin, frame, vel, _, motion, _ = start
         if p.scene.effects.air_mass:
             pressure = chambers.end_pressures(self, pressure)
         pairs = self.contacts.get("finger_finger")
         search = (
-            FingerCollision(self, pairs, at) if isinstance(pairs, BoundFingerContacts) else None
+            FingerCollision(self, pairs, bodies) if isinstance(pairs, BoundFingerContacts) else None
         )
         self.search = search
         if search:
             search.start(motion, vel, frame, origin)
-        fields = self.fields(at, thing)
+        fields = self.fields(bodies, world_object)
         still = zeros((6,), like)
 
         def link(i: Any, carry: tuple) -> tuple:
@@ -205,7 +205,7 @@ def palm_and_object(timestep: float, state: dict, arm, constants: dict) -> dict[
     turned = inertia.turned_tensor(frame, constants["palm_inertia"])
     palm = Body(constants["palm_mass"], centre, turned)
     tensor = inertia.principal_tensor(columns, constants["object_inertia"])
-    thing = Centred(constants["object_mass"], tensor)
+    grasped = Centred(constants["object_mass"], tensor)
     spring = -constants["wrist_damping"] * state["wrist_vel"]
     if k is not None:
         spring = k * (arm - state["wrist"]) + spring
@@ -215,9 +215,9 @@ def palm_and_object(timestep: float, state: dict, arm, constants: dict) -> dict[
     now = Iterate(acc[0], palm_motion(acc[0], axes), acc[1])
     smooth_palm = palm.smooth_force(vel, bias, g)
     smooth_palm = pushed("palm", smooth_palm, palm.mass, centre, constants)
-    smooth_object = thing.smooth_force(object_vel, g)
+    smooth_object = grasped.smooth_force(object_vel, g)
     origin = jnp.zeros_like(smooth_object[:3])  # the object's centre
-    smooth_object = pushed("object", smooth_object, thing.mass, origin, constants)
+    smooth_object = pushed("object", smooth_object, grasped.mass, origin, constants)
     smooth = smooth_palm, smooth_object
     return {
         "place": place,
@@ -227,7 +227,7 @@ def palm_and_object(timestep: float, state: dict, arm, constants: dict) -> dict[
         "columns": columns,
         "object_vel": object_vel,
         "now": now,
-        "palm": Palm(palm, thing, *smooth, spring, constants["wrist_armature"], axes),
+        "palm": Palm(palm, grasped, *smooth, spring, constants["wrist_armature"], axes),
     }
 
 
@@ -282,7 +282,7 @@ def link_forces(scene: Scene, parent: tuple, constants: dict, joint: dict):
 
 
 def semi_implicit_euler(
-    step: StepMemory, state: dict, at: dict, now: Iterate, goes_on: Any, speed: Any
+    step: StepMemory, state: dict, bodies: dict, now: Iterate, goes_on: Any, speed: Any
 ):
     """Semi-implicit Euler; worlds that are decided or whose step fails stay as they were.
 
@@ -290,7 +290,7 @@ def semi_implicit_euler(
     """
     p = step.p
     h = step.p.scene.discretization.timestep
-    new = lanewise(partial(moved, h), state, at["columns"], now.wrist, now.object_motion)
+    new = lanewise(partial(moved, h), state, bodies["columns"], now.wrist, now.object_motion)
     size = lanewise(_largest, new)
 
     def link(i: Any, largest: Lanes) -> Lanes:

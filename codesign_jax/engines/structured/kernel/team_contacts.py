@@ -78,6 +78,10 @@ class BoundTeamSdfContacts(BoundSlots):
 
         self.every(step, [])
 
+    def fold_items(self, body: Callable, start: Any) -> Any:
+        """See `BoundContacts`; a lane each."""
+        return self.every(lambda item, _, carry: body(item, carry), start)
+
     def update_constraints(self, alpha: Lanes) -> None:
         """Adds the last step of the line search to jar; stores Hessians and forces."""
 

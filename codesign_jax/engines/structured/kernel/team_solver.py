@@ -209,7 +209,9 @@ class TeamElimination(Elimination):
             p = lanewise(add_link, p, team.forces, force, column)
             tau, armature = problem.read("tau", "armature", item=i)
             more = lanewise(joint, armature, tau, acc, team.forces)
-            node, kept, done = team.eliminate(self.touched([p, c, q], i), axes, armature, more)
+            node, kept, done = team.eliminate(
+                self.with_contacts([p, c, q], i), axes, armature, more
+            )
             for name, value in zip("wg", kept.factors[:2], strict=True):
                 team.chip.put_rows(name, value, i)
             problem.write("inverse", kept.inverse, i)
@@ -223,7 +225,7 @@ class TeamElimination(Elimination):
         whole = self.block.fold(self.block.over_team(work.lane, jnp.add), jnp.add)
         return self.block.sum((p, c, q)), lanes([whole], (), wide=False)
 
-    def touched(self, node: list[Lanes], i: Any) -> list[Lanes]:
+    def with_contacts(self, node: list[Lanes], i: Any) -> list[Lanes]:
         def add(node, columns, held, forces):
             p, c, q = node
             return [p + columns, c + held, q + jnp.where(forces, -held, held)]
@@ -315,7 +317,7 @@ class TeamCoupling(Coupling):
             ref[place] = value
         return ref[place]
 
-    def _settle(self) -> None:
+    def _add_correction(self) -> None:
         def add(i: Any, x: jax.Array) -> jax.Array:
             for k in range(self._axes):
                 self._row(i, k, FORCES, self._row(i, k, FORCES) + self._row(i, k, AGAIN))

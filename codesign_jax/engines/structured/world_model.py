@@ -170,11 +170,9 @@ def _world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
     centre = vectors(_along_and_up(fields.centre))
     stub_centre = base + apply_columns(mount, centre[:, 0])
     inertia = vectors(fields.inertia)
-    palm = _palm(numbers, fields, stub_centre, inertia[:, 0], mount)
     shape = fields.shape
     picked = jnp.take_along_axis(fields.object_size, shape[:, None, None], axis=1)[:, 0]
     object_size = last(picked)[:, None]
-    wrist = _wrist(numbers, fields.object_mass[None])
     palm_point, palm_radius = _palm_points(numbers, lay, fields.object_mass[None])
     no_spheres = lay.spheres.size == 0
     return WorldModel(
@@ -191,14 +189,10 @@ def _world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
         sphere=jnp.zeros((0,)) if no_spheres else vectors(_along_and_up(fields.spheres)),
         radius=jnp.zeros((0,)) if no_spheres else by_link(fields.spheres[..., 1]),
         stub_centre=stub_centre,
-        palm_mass=palm[0],
-        palm_centre=palm[1],
-        palm_inertia=palm[2],
+        **_palm(numbers, fields, stub_centre, inertia[:, 0], mount),
         palm_point=palm_point,
         palm_radius=palm_radius,
-        wrist_stiffness=wrist[0],
-        wrist_damping=wrist[1],
-        wrist_armature=wrist[2],
+        **_wrist(numbers, fields.object_mass[None]),
         object_mass=fields.object_mass[None],
         object_inertia=last(fields.object_inertia)[:, None],
         object_size=object_size,
@@ -232,8 +226,10 @@ def _along_and_up(places: jax.Array) -> jax.Array:
     return jnp.stack([along, jnp.zeros_like(along), places[..., 1]], -1)
 
 
-def _wrist(scene: Scene, like: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Stiffness, and damping and armature with the implicit terms, shape (6, 1, world) each.
+def _wrist(scene: Scene, like: jax.Array) -> dict[str, jax.Array]:
+    """The wrist's stiffness, damping and armature with the implicit terms, by field.
+
+    Their shape is (6, 1, world).
 
     Args:
       scene: Numbers of shape (1, world).
@@ -245,7 +241,12 @@ def _wrist(scene: Scene, like: jax.Array) -> tuple[jax.Array, jax.Array, jax.Arr
 
     stiffness, wrist_damping = map(rows, wrist_springs(scene))
     rigid = not scene.effects.wrist
-    return stiffness, *implicit_spring(scene, stiffness, wrist_damping, rigid=rigid)
+    damping, armature = implicit_spring(scene, stiffness, wrist_damping, rigid=rigid)
+    return {
+        "wrist_stiffness": stiffness,
+        "wrist_damping": damping,
+        "wrist_armature": armature,
+    }
 
 
 def _palm_points(scene: Scene, lay: Layout, like: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -259,8 +260,8 @@ def _palm_points(scene: Scene, lay: Layout, like: jax.Array) -> tuple[jax.Array,
 
 def _palm(
     scene: Scene, fields: ModelFields, centres: jax.Array, inertia: jax.Array, mount: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Mass, centre and inertia of the palm with its half segments, in the palm frame.
+) -> dict[str, jax.Array]:
+    """Mass, centre and inertia of the palm with its half segments, in the palm frame, by field.
 
     Args:
       scene: Numbers of shape (1, world).
@@ -284,4 +285,8 @@ def _palm(
     turned = total([principal[k] * frames[k][:, None] * frames[k][None] for k in range(3)])
     unit = jnp.eye(3, dtype=masses.dtype)[:, :, None, None]
     shift = masses * (dot(away, away) * unit - away[:, None] * away[None])
-    return mass, centre, (turned + shift).sum(2, keepdims=True)
+    return {
+        "palm_mass": mass,
+        "palm_centre": centre,
+        "palm_inertia": (turned + shift).sum(2, keepdims=True),
+    }

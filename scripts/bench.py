@@ -43,7 +43,7 @@ def measured(truth: finger.Finger) -> dict[str, dict[str, np.ndarray]]:
         "angles": ("angle", {"pressure": pressure}),
         "tip forces": ("tip_force", {"pressure": pressure}),
         "weights, sideways": ("sideways", {"pressure": np.repeat([0, 60e3], 3), "load": 0.3}),
-        "a ring-down": ("drop", {"pressure": 0.0, "time": times, "load": 0.0}),
+        "a release": ("drop", {"pressure": 0.0, "time": times, "load": 0.0}),
     }
     tables = {}
     for words, (column, given) in columns.items():

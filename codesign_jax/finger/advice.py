@@ -128,5 +128,5 @@ def candidates(finger: Finger, table: Table) -> dict[str, dict[str, np.ndarray]]
     add(f"the way that {grams} move the tip sideways, empty, {ROWS} times", "sideways", load=weight)
     period = swing.first_period(finger, 0.0)
     times = np.linspace(0, PERIODS * period, PICTURES + 1)[1:]
-    add("the ring-down without a weight, filmed", "drop", time=times, load=0.0)
+    add("a release without a weight, filmed", "drop", time=times, load=0.0)
     return tables

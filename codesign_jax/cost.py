@@ -34,7 +34,7 @@ def outcome(
     c = c_max (t_end - t_lost) / (t_end - t_0), where t_lost is the first time in [t_0, t_end) at
     which the object is `lost_distance` or more from the hand centre; 0 if it is kept.  A trial is
     decided once it is lost: what happens later neither fails it nor needs simulating.  A failed
-    trial is neither kept nor lost and shows c_max; `particle_cost` decides what it counts.
+    trial is not kept and shows c_max; `particle_cost` decides how it counts in a mean cost.
 
     Args:
       scene: The scene; its numbers may be traced.

@@ -48,7 +48,7 @@ GRASP_COLUMNS = {
     "object_roll_deg": "its turn about x, before the others",
     "object_pitch_deg": "its turn about y, before that about the vertical",
     "arm_roll_tilt_deg": "noise of the arm's roll, part of the controls",
-    "arm_pitch_tilt_deg": "noise of the arm's pitch, of its sign in commands.csv",
+    "arm_pitch_tilt_deg": "noise of the arm's pitch, with the sign convention of commands.csv",
     "object_mass_factor": "factor on the object's mass",
     "object_size_factor": "factor on its size",
     "friction_factor": "factor on the friction of all contacts",

@@ -53,8 +53,8 @@ class Constant:
       sd: Its standard deviation; of "lognormal" that of the logarithm.
       low: Its lower end.
       high: Its upper end.
-      correlation: With each of the constants before it, of their normal scores; as many as are
-        given, the others 0.
+      correlation: Correlations of its normal score with those of the constants before it, in their
+        order; those not given are 0.
       source: Where the distribution comes from.
     """
 

@@ -129,8 +129,9 @@ class Section:
 class Material:
     """Silicone of the fingers: `material = NAME`, or a table of its name or of own numbers.
 
-    A shear modulus belongs to a bending law. A silicone's name gives both, its density and its
-    damping; without a name, or for a batch that was measured, law and modulus are given together.
+    A shear modulus belongs to a bending law. A silicone's name determines law, modulus,
+    density and damping; without a name, or for a batch that was measured, law and modulus are given
+    together.
     The two factors scale the stiffness that `morphology` derives for bending sideways and for
     torsion: for the former the fabric's side is the neutral line, which is an upper bound; for the
     latter walls are thin, which is a lower one.
@@ -206,7 +207,7 @@ class Parameter:
     Attributes:
       name: Which parameter; every one is given once.
       per: Whether each finger has a value of its own, or the hand has one.
-      domain: What a schedule counts the parameter among.
+      domain: The group of parameters to which a schedule assigns it.
       unit: Unit of the row's numbers, and of presets, commands and CSV columns.
       low: Lower bound.
       high: Upper bound.

@@ -47,8 +47,8 @@ class Noise:
       friction: Of the friction of all contacts, relative.
       stiffness: Of the fingers' shear modulus, relative.
       hand_mass: Of the masses of fingers and palm, relative.
-      mass_range: Largest factor by which an object is heavier besides, drawn log-uniformly from 1;
-        1 for none. No standard deviation.
+      mass_range: Not a standard deviation: an additional factor on the mass is drawn log-uniformly
+        between 1 and this value; 1 switches it off.
     """
 
     position: float = quantity("m", 0, 0.1)
@@ -109,8 +109,8 @@ class _ShapeFile:
       inertia: Inertia about the centre of mass in the axes of its file: xx, yy and zz, of a mesh
         and with a centre of mass also xy, xz and yz; goes with a mass. Not given: that of a
         homogeneous body about its centre.
-      centre_of_mass: Centre of mass in the frame of its file, of a primitive from its centre, which
-        is then simulated as the mesh of its surface. Not given: that of a homogeneous body.
+      centre_of_mass: Centre of mass in the frame of its file; for a primitive, from its centre, and
+        the primitive is then simulated as a mesh. Not given: that of a homogeneous body.
       file: Mesh file, beside the object file if the path is relative.
       unit: Unit of the mesh file's numbers, metres if not given.
       repair: Whether to repair a mesh.

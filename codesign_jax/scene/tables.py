@@ -16,7 +16,8 @@ class Effects:
     """Parts of the physics; an effect that is off has no joint, contact or branch in the program.
 
     `codesign_jax.scene.effects` says what each means and which engines have it.  The bending law,
-    `neo_hookean`, is None in a file that leaves it to the hand's material, in a `Scene` never.
+    `neo_hookean`, may be omitted in a file, and then follows the hand's material; in a `Scene` it
+    always has a value.
     """
 
     lateral_bending: bool = True
@@ -157,8 +158,8 @@ class Contact:
     `rolling_friction` N, both lengths as in MuJoCo, if the effect `friction` is "full".
 
     Attributes:
-      normal_stiffness: Normal stiffness of a skin of the finger's width squared, the same for every
-        morphology and time step, and of a contact sphere; a contact with the table is twice as
+      normal_stiffness: Normal stiffness of a square of skin as wide as the finger, and of a contact
+        sphere; the same for every morphology and time step. A contact with the table is twice as
         stiff.
       dissipation_time: Time constant of the skin's dissipation: its damping over its stiffness.
       friction_ratio: A contact without memory creeps by its friction force / (normal_stiffness *
@@ -264,8 +265,8 @@ class Newton:
         a line search has at most six.
       decrement: Relative Newton decrement at which a world has converged, a share of the cost's
         scale. A step that ends above it has stopped at the limit of iterations.
-      residual: Residual of such a step, the root of its decrement, above which the trial has the
-        warning SOLVER_CAP; see `Outcome`.
+      residual: A step that ends at the limit of iterations with a residual (root of its decrement)
+        above this value gives the trial the warning SOLVER_CAP; see `Outcome`.
     """
 
     iterations: int = quantity("", 1, 1000, structure=True, default=24)
@@ -296,16 +297,18 @@ class Accuracy:
 class Limits:
     """Bounds beyond which a finite world has failed, and limits of what can be built.
 
-    All but the first two limit the designs that a search proposes, and no simulation: every
-    proposal is projected onto them.  A key that is not given is no limit, and a preset of the
+    All but the first two limit the designs that a search proposes; they do not affect a simulation.
+    Every proposal is projected onto them.  A key that is not given is no limit, and a preset of the
     hand with `limits = false` has Table I alone.
 
     Attributes:
       speed: Largest velocity of any joint.
       penetration: How far the object's centre may be below the table, if there is one, and any body
         in another at the start.
-      strain: Largest strain of the walls of a free finger at its pressure, which is lowered.
-      free_bend: Largest bend of a free finger at its pressure, which is lowered; a full turn coils.
+      strain: Largest strain of the walls of a free finger at its pressure; a higher pressure is
+        lowered to meet it.
+      free_bend: Largest bend of a free finger at its pressure; a higher pressure is lowered to meet
+        it. More than a full turn is a coil.
       pressure_margin: Share by which pressures stay below the lowest of their limits, Table I's,
         `strain` and `free_bend`.
       finger_length: Least and largest length of a finger.

@@ -135,7 +135,7 @@ def _table(name: str, arrays: dict[str, np.ndarray], labels: Sequence[str]) -> s
     rows = [head]
     for s, strategy in enumerate(arrays[f"{name}|strategies"]):
         kept = [_kept(arrays, name, label)[s] for label in labels]
-        cells = [report.label(str(strategy))]
+        cells = [str(strategy)]
         for i, share in enumerate(kept):
             whole = wilson(int((share == 1).sum()), share.size)
             cells += [f"{100 * share.mean():.1f} %"]

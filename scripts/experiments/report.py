@@ -315,7 +315,7 @@ def details(study: Study) -> str:
     trials = study.per_episode * study.plan["runs"] * study.episodes
     for s, strategy in enumerate(study.strategies):
         cells = [
-            label(strategy),
+            strategy,
             *(
                 _percent(wilson(int(v[s].sum()), v[s].size)) if study.tested else "not tested"
                 for v in (good, strict)
@@ -348,7 +348,7 @@ def _against_last(study: Study) -> list[str]:
         "|---|---|---|",
     ]
     for s in others:
-        cells = [label(study.strategies[s]), *(_p(float(c[s])) for c in columns)]
+        cells = [study.strategies[s], *(_p(float(c[s])) for c in columns)]
         cells[1] = cells[1] if study.tested else "–"
         lines.append(f"| {' | '.join(cells)} |")
     return lines
@@ -364,7 +364,7 @@ def _rows(name: str, study: Study) -> list[tuple[str, str]]:
     success = study.success()
     episodes = study.convergence()
     ratios = ", ".join(
-        f"{label(s)} {100 * r.mean():.0f} %" for s, r in zip(study.strategies, success, strict=True)
+        f"{s} {100 * r.mean():.0f} %" for s, r in zip(study.strategies, success, strict=True)
     )
     ratios += f"; Page's trend test p {_p(statistics.trend(1.0 * success))}"
     if len(success) > 4:
@@ -372,7 +372,7 @@ def _rows(name: str, study: Study) -> list[tuple[str, str]]:
     ratios = ratios if study.tested else "not tested: the runs have not ended"
     finite = np.minimum(episodes, study.plan["episodes"] + 1)
     medians = ", ".join(
-        f"{label(s)} {_number(float(statistics.quantile(e, 0.5)))}"
+        f"{s} {_number(float(statistics.quantile(e, 0.5)))}"
         for s, e in zip(study.strategies, episodes, strict=True)
     )
     both = [statistics.median(study.convergence(r)[-1] * study.per_episode) for r in RULES]
@@ -437,9 +437,11 @@ def _regions(grid) -> str:
     parts = []
     for threshold in _THRESHOLDS:
         components = regions(grid[0], threshold)
-        shares = ", ".join(f"{100 * r.share:.1f} %" for r in components)
+        shares = " and ".join(f"{100 * r.share:.1f} %" for r in components)
+        word = "region" if len(components) == 1 else "regions"
         parts.append(
-            f"cost < {threshold:g}: {len(components)}" + (f" ({shares})" if components else "")
+            f"cost < {threshold:g}: {len(components)} {word}"
+            + (f" ({shares} of the landscape)" if components else "")
         )
     units = grid[0]["units"]
     names = grid[0]["parameters"]

@@ -303,7 +303,9 @@ def tip_stiffness(pressures: Sequence[float]) -> list[list[str]]:
     default = scene.load("paper")
     space = parameters.design_space(default.hand)
     mine = fingers.of_design(default, space.params(np.asarray(space.default())), 0)
-    rows = [["pressure kPa", "free bend °", "force on the plate N", "loss of force per opening N/m"]]
+    rows = [
+        ["pressure kPa", "free bend °", "force on the plate N", "loss of force per opening N/m"]
+    ]
     held = fingers.Rest(np.zeros(mine.links), 0.0, 0.0)
     for pressure in pressures:
         free = fingers.Rest.of(mine, 1e3 * pressure)

@@ -89,8 +89,9 @@ class ParticleFilter:
         """Weight and resample the population: steps 3 and 4 of Fig. 5.
 
         `weight = 1 / (alpha + cost)` (section VI.1), with alpha = 0.2 by default (the optimiser's
-        `alpha`); then stochastic universal sampling with one uniform number. A cost that is not finite gets weight zero; where none is finite, every
-        particle survives once. The weight needs costs of at least zero; lower ones count as zero.
+        `alpha`); then stochastic universal sampling with one uniform number. A cost that is not
+        finite gets weight zero; where none is finite, every particle survives once. The weight
+        needs costs of at least zero; lower ones count as zero.
         """
         cost = check_told(state, population, cost)
         finite = jnp.isfinite(cost)

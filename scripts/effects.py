@@ -160,7 +160,8 @@ def measured(results: dict[str, Any]) -> str:
     p = results["provenance"]
     load = results["load"]
     made = f"{results['designs']} designs in {results['trials']} trials each; {p['cpus']} cores, "
-    made += f"jax {p['jax']}; timed at a load of {max(load):.0f}."
+    made += f"jax {p['jax']}; timed while other programs used the machine (load average "
+    made += f"{max(load):.0f})."
     return f"{made}\n\n{output.markdown(table)}"
 
 

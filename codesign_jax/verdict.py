@@ -118,7 +118,7 @@ def as_bit(condition: jax.Array, bit: Status) -> jax.Array:
 
 # ---- how a trial ended
 
-VERDICTS = ("kept", "lost", "not_released", "failed")
+VERDICTS = ("kept", "lost", "not_released", "fault")
 """How a trial ends, see `verdicts`."""
 
 
@@ -139,7 +139,7 @@ def verdicts(outcomes: Outcome) -> np.ndarray:
     status = np.asarray(outcomes.status)
     lost = np.isfinite(outcomes.lost_time)
     held = VERDICTS.index("not_released")
-    broken = VERDICTS.index("failed")
+    broken = VERDICTS.index("fault")
     bad = np.where(status & Status.STUCK, held, broken)
     return np.where(failed(status), bad, lost.astype(int))
 
@@ -155,7 +155,7 @@ class Tally(NamedTuple):
     kept: int  # neither lost nor failed
     lost: int  # the object left the hand within the window of the cost
     not_released: int  # the hand did not let go of the object
-    failed: int  # those that failed otherwise: faults of the simulation
+    fault: int  # the simulation failed, see `Status`
 
     @property
     def total(self) -> int:
@@ -166,7 +166,7 @@ class Tally(NamedTuple):
         """In words, such as "kept 20 of 24, 3 lost, 1 not released"."""
         words = f"kept {self.kept} of {self.total}, {self.lost} lost"
         words += f", {self.not_released} not released"
-        return words + (f", {self.failed} failed" if self.failed else "")
+        return words + (f", {self.fault} fault" + "s" * (self.fault > 1) if self.fault else "")
 
 
 def tally(outcomes: Outcome) -> Tally:
@@ -191,8 +191,8 @@ USUAL = 73
 """Expected number of grasps of `sequential` for a design that keeps 99 % of them."""
 RULE = (
     f"good, not good: Wald's sequential test between shares of {100 * POOR:.0f} and "
-    f"{100 * WANTED:.0f} % kept, with errors of at most {100 * ERROR:.0f} %; trials that failed or "
-    "did not let go count as lost"
+    f"{100 * WANTED:.0f} % kept, with errors of at most {100 * ERROR:.0f} %; every trial that is not "
+    "kept counts against the design"
 )
 """The rule of `judge` in words."""
 

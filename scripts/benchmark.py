@@ -33,7 +33,10 @@ ROOT = Path(__file__).parents[1]
 FILES = "docs/data/rates_*.json"
 PAGES = {"README.md": ("rates",), "docs/performance.md": ("rates", "measured", "peers")}
 """Pages with the marks of the tables that they hold."""
-BATCHES = {60: ", an episode of the paper's 2D", 360: ", of its 23D experiment"}
+BATCHES = {
+    60: " (an episode of the paper with 2 parameters)",
+    360: " (an episode of the paper with 23 parameters)",
+}
 DESIGNS = {"random": "random designs", "winners": "winners"}
 SPHERES = {"surface": "spheres"}
 """What engines without the skinned hull can simulate of the default scene."""

@@ -124,7 +124,7 @@ def test_a_row_has_design_noise_and_outcome(place, capsys):
     np.testing.assert_allclose(rows["chamber_volume_cm3"], air, rtol=1e-4)
     bad = np.isin(np.arange(20) % 8, [1, 4])
     np.testing.assert_array_equal(rows["status"] == "NONFINITE", bad)
-    np.testing.assert_array_equal(rows["verdict"] == "failed", bad)
+    np.testing.assert_array_equal(rows["verdict"] == "fault", bad)
     np.testing.assert_array_equal(
         rows["verdict"] == "lost", ~bad & np.isfinite(rows["lost_time_s"])
     )

@@ -521,7 +521,7 @@ def page(browser, opened):
         yield page
 
 
-COMPLETE = f"#studio .trials button:nth-child({COUNTS[0]}):is(.kept, .lost, .not_released, .failed)"
+COMPLETE = f"#studio .trials button:nth-child({COUNTS[0]}):is(.kept, .lost, .not_released, .fault)"
 LENGTH = "#studio input[type=range][aria-label=length]"
 
 

@@ -227,7 +227,7 @@ def compare(every: Mapping[Path, Compared], console: Console, *, named: bool = F
         groups.setdefault(key, []).append(run)
         name = [folder.as_posix()] if named else []
         rows.append((*name, *key, str(run.settings.seed), *_row(run)))
-    head = ("seed", "converged", "judged by", "kept", "lost", "not released", "failed", "verdict")
+    head = ("seed", "converged", "judged by", "kept", "lost", "not released", "faults", "verdict")
     head += ("other conditions",)
     common.print_table(console, _table((*["run"] * named, *differ, *head), rows))
     rows = [(*kind, *_summary(group)) for kind, group in groups.items()]

@@ -60,7 +60,7 @@ def _by_object(run: Run, judged: Judged) -> str:
             share = wilson(counts.kept, counts.total)
             span = f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
             rows.append((name, f"{counts.kept} of {counts.total}", span, *counts[1:]))
-    head = ("object", "kept", "95 % interval of all", "lost", "not released", "failed otherwise")
+    head = ("object", "kept", "95 % interval of all", "lost", "not released", "faults")
     return markup.table(head, rows, (1, 2, 3, 4, 5))
 
 

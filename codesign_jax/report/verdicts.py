@@ -1,8 +1,8 @@
 """Verdicts on simulated trials, in words; the rule is `verdict.judge`.
 
-Trials are kept, lost, not released or failed, and all of them are counted: shares and intervals are
-of all trials, so that a trial that failed is one that did not keep its object.  A verdict names the
-masses and the friction that it holds for, and the other conditions under which it does not.
+A trial is kept, lost, not released or a fault.  Shares and intervals are of all trials, so that each
+trial that is not kept counts against the design.  A verdict names the masses and the friction that
+it holds for, and the other conditions under which it does not.
 """
 
 from collections.abc import Iterable
@@ -53,7 +53,7 @@ class Judged(NamedTuple):
     def __str__(self) -> str:
         """The verdict in a sentence; that there is none if every trial failed."""
         counts = tally(self.outcomes)
-        if counts.failed == counts.total:
+        if counts.fault == counts.total:
             causes = runs.failure_counts(self.outcomes.status)
             return f"no verdict: every trial failed ({causes})"
         said = self.verdict.sentence(f"{self.grasps} of {objects(self.scene)}")
@@ -89,7 +89,7 @@ def of_trials(scene: Scene, outcomes: Outcome) -> str:
     """Numbers of trials by outcome, their mean cost, and warnings."""
     warnings = runs.warning_counts(outcomes.status)
     counts = tally(outcomes)
-    causes = f" ({runs.failure_counts(outcomes.status)})" if counts.failed else ""
+    causes = f" ({runs.failure_counts(outcomes.status)})" if counts.fault else ""
     text = f"{counts}{causes}; {mean_cost(scene, outcomes)}"
     return text + (f"; warnings: {warnings}" if warnings else "")
 
@@ -130,8 +130,8 @@ def warnings(judged: Judged) -> list[str]:
     """A line with advice if many trials failed; no line otherwise."""
     scene = judged.scene
     counts = tally(judged.outcomes)
-    count = counts.not_released + counts.failed
-    if count <= MANY * counts.total or counts.failed == counts.total:
+    count = counts.not_released + counts.fault
+    if count <= MANY * counts.total or counts.fault == counts.total:
         return []
     causes = runs.failure_counts(judged.outcomes.status)
     text = f"warning: {count} of {counts.total} trials failed ({causes})"

@@ -156,8 +156,8 @@ def points(value: Interval) -> str:
 
 
 def presets_table(results: Budget) -> list[list[str]]:
-    head = ["setting", "success, points from the truth", "verdicts that flip", "rank correlation"]
-    head += ["flips by a micrometre", "finger tip in the air"]
+    head = ["setting", "kept share, points from the truth", "verdicts that flip"]
+    head += ["rank correlation", "flips by a micrometre", "finger tip in the air"]
     rows = [[*head, *(f"grasps/s, {m}" for m in RATED.values())]]
     rows += [results.row(name, f"`{name}`") for name in PRESETS]
     rows += [results.row(n, words) for n, words in CANDIDATES.items() if n in results.costs]
@@ -165,7 +165,7 @@ def presets_table(results: Budget) -> list[list[str]]:
 
 
 def budget_table(results: Budget) -> list[list[str]]:
-    rows = [["change", "verdicts that flip", "success, points", "rank correlation", "of"]]
+    rows = [["change", "verdicts that flip", "kept share, points", "rank correlation", "kind"]]
     for change in CHANGES:
         if beside := results.compared(change.to, change.of):
             cells = interval(beside["flipped"]), points(beside["success_difference"])
@@ -182,8 +182,8 @@ def luck(results: Budget) -> str:
     ranks = [spearman(a, b) for a, b in zip(blocks, blocks[1:], strict=False)]
     words = f"{np.mean(ranks):.2f}" if ranks else "none"
     return (
-        f"Luck of six trials: a design's success has a standard error of {100 * six:.0f} points; "
-        f"ranks by six trials and by six others correlate by {words}."
+        f"With six trials of each design, its kept share has a standard error of {100 * six:.0f} "
+        f"points; ranks by six trials and by six others correlate by {words}."
     )
 
 

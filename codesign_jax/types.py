@@ -19,9 +19,9 @@ import jax.numpy as jnp
 class Status(enum.IntFlag):
     """Faults of a world, as bits; OK is zero.
 
-    Every bit but those of `WARNINGS` makes the trial a failed one, see `failed`: a verdict counts
-    it as lost, and a mean cost leaves it out or takes the maximum for it (`cost.failure`). All of
-    these but STUCK are faults of the simulation; STUCK is the hand's grip, which does not let go.
+    Every bit but those of `WARNINGS` makes the trial a failed one, see `failed`: it is not kept,
+    and a mean cost excludes it or takes the maximum for it (`cost.failure`). All of these but STUCK
+    are faults of the simulation; a STUCK hand does not release the object.
 
     Attributes:
       NONFINITE: A number of the state, or a cost of the user's own, was not finite.

@@ -125,10 +125,9 @@ VERDICTS = ("kept", "lost", "not_released", "fault")
 def verdicts(outcomes: Outcome) -> np.ndarray:
     """Outcomes of trials as indices of `VERDICTS`; tables, reports and commands use this rule.
 
-    Lost is what did not fail and lost its object within the window of the scene's cost, whatever
-    a cost of one's own says.  Of the trials that failed, not released are those in which the hand
-    kept the object and did not let go of it at the end (STUCK); the others are faults of the
-    simulation.
+    A trial is lost if it did not fail and lost its object within the window of the scene's cost,
+    whatever the user's own cost says.  A trial that failed is not released if the hand held the
+    object and did not release it at the end (STUCK); otherwise it is a fault of the simulation.
 
     Args:
       outcomes: Outcomes, arrays of any shape.
@@ -191,8 +190,8 @@ USUAL = 73
 """Expected number of grasps of `sequential` for a design that keeps 99 % of them."""
 RULE = (
     f"good, not good: Wald's sequential test between shares of {100 * POOR:.0f} and "
-    f"{100 * WANTED:.0f} % kept, with errors of at most {100 * ERROR:.0f} %; every trial that is not "
-    "kept counts against the design"
+    f"{100 * WANTED:.0f} % kept, with errors of at most {100 * ERROR:.0f} %; every trial that is "
+    "not kept counts against the design"
 )
 """The rule of `judge` in words."""
 

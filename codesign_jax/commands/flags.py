@@ -231,7 +231,7 @@ class Compare(Command, TrialFlags):
 
 @dataclasses.dataclass
 class Evaluate(Command, RunOrDesign):
-    """Evaluate one design: cost and kept grasps for each object, with intervals, and the verdict."""
+    """Evaluate one design: costs and kept grasps by object, with intervals, and the verdict."""
 
     trials: Count = None
     """Trials; the objects take turns. Default: as many as decide the verdict, at most 600

@@ -21,7 +21,7 @@ class Landscape(NamedTuple):
     first: np.ndarray  # values of the first one in its unit, shape (n,)
     second: np.ndarray  # values of the second one, shape (m,)
     cost: np.ndarray  # mean cost by the scene's rule for failed trials, shape (n, m)
-    kept: np.ndarray  # trials that kept the object (cost below the limit of success), shape (n, m)
+    kept: np.ndarray  # trials that kept the object, shape (n, m)
     counted: np.ndarray  # trials that did not fail, shape (n, m)
     trials: np.ndarray  # trials of a point, shape ()
     seed: np.ndarray  # root of their noise, shape ()

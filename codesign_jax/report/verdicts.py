@@ -1,8 +1,8 @@
 """Verdicts on simulated trials, in words; the rule is `verdict.judge`.
 
-A trial is kept, lost, not released or a fault.  Shares and intervals are of all trials, so that each
-trial that is not kept counts against the design.  A verdict names the masses and the friction that
-it holds for, and the other conditions under which it does not.
+A trial is kept, lost, not released or a fault.  Shares and intervals are of all trials, so that
+each trial that is not kept counts against the design.  A verdict names the masses and the friction
+that it holds for, and the other conditions under which it does not.
 """
 
 from collections.abc import Iterable

@@ -49,7 +49,7 @@ FILES = (
         "codesign_jax/controls/",
         "`--set control=NAME`, or the key `control` of a scene file",
     ),
-    ("Presets of accuracy", Accuracy, "codesign_jax/scenes/accuracy/", "`--accuracy`"),
+    ("Accuracies", Accuracy, "codesign_jax/scenes/accuracy/", "`--accuracy`"),
 )
 
 _SPACE = "\u00a0"  # at which no line of a table's cell is broken

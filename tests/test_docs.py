@@ -221,7 +221,7 @@ BUILT_IN = {
     "Hand files": ROOT / "hands",
     "Object files": ROOT / "objects",
     "Control files": ROOT / "codesign_jax" / "controls",
-    "Presets of accuracy": ROOT / "codesign_jax" / "scenes" / "accuracy",
+    "Accuracies": ROOT / "codesign_jax" / "scenes" / "accuracy",
 }
 
 
@@ -279,7 +279,7 @@ def used(heading, table, values):
     """Keys of a TOML file as `documented` has them, without those of tables of free keys."""
     for key, value in values.items():
         rows = value if isinstance(value, list) else [value]
-        if not isinstance(rows[0], dict) or key in FREE or heading.startswith("Presets"):
+        if not isinstance(rows[0], dict) or key in FREE or heading == "Accuracies":
             yield heading, table, key
             continue
         for row in rows:

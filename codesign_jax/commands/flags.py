@@ -48,7 +48,7 @@ class TrialFlags:
     objects: Text = None
     """Object set: a built-in name or a .toml file; default: the scene's."""
     accuracy: Text = None
-    """Preset that replaces the scene's discretization and solver: fast, standard, fine or reference
+    """Accuracy in place of the scene's discretization and solver: fast, standard, fine or reference
     (docs/accuracy.md compares their errors and run times), or a .toml file."""
     overrides: Overrides = ()
     constants: Text = None

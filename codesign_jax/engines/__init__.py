@@ -61,7 +61,7 @@ _INSTEAD = {"iterations": "iterations", "ls_iterations": "evaluations", "toleran
 def solver_problems(scene: Scene) -> list[str]:
     """Why engine structured must not simulate a scene: its own limits of [solver] have no effect.
 
-    MuJoCo's [solver] table stands beside structured's [newton]. Values that no preset of accuracy
+    MuJoCo's [solver] table stands beside structured's [newton]. Values that no accuracy
     has were written by somebody who wants them to act; with a [newton] table of its own as well the
     scene is one for all engines.
     """

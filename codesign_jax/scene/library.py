@@ -1,4 +1,4 @@
-"""Finds and reads the TOML files of hands, objects, scenes and presets of accuracy."""
+"""Finds and reads the TOML files of hands, objects, scenes and accuracies."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""Scene files: read with hand, objects and a preset of accuracy, and checked as a whole."""
+"""Scene files: read with hand, objects and an accuracy, and checked as a whole."""
 
 import dataclasses
 import warnings
@@ -34,7 +34,7 @@ GONE = (
 """Keys of earlier scene files, which have no effect any more; see docs/hull.md and, for the last,
 `discretization.integrator` in docs/physics.md, whose default is the former "added"."""
 _OF_ACCURACY = ("discretization", "solver", "newton")
-"""Tables of a scene that a preset of accuracy replaces values of."""
+"""Tables of a scene that an accuracy replaces values of."""
 
 
 def load(
@@ -51,9 +51,9 @@ def load(
       name: Name of a built-in scene, or a path ending in .toml.
       hand_name: Hand to use instead of the scene's.
       object_set: Object set to use instead of the scene's.
-      accuracy: Preset of discretization and solver to use instead of the scene's: "fast",
+      accuracy: Named discretization and solver to use instead of the scene's: "fast",
         "standard", "fine", "reference", or a path ending in .toml; see `load_accuracy`.
-      overrides: Values by key path that replace the files' and the preset's, nested or dotted,
+      overrides: Values by key path that replace the files' and the accuracy's, nested or dotted,
         e.g. {"discretization": {"links": 5}, "hand.material.shear_modulus": 60e3}; see `keypaths`.
         That of "control" names another control: a built-in one, or a path ending in .toml.
 
@@ -186,7 +186,7 @@ def load_accuracy(name: str | Path) -> Accuracy:
 
 
 def with_accuracy(scene: Scene, name: str | Path) -> Scene:
-    """A scene with the values of a preset of accuracy in place of its own.
+    """A scene with the values of an accuracy in place of its own.
 
     Args:
       scene: The scene, checked; whether its other numbers go together with these is not.
@@ -204,7 +204,7 @@ def with_accuracy(scene: Scene, name: str | Path) -> Scene:
 
 
 def _preset(name: str | Path | None, problems: list[str]) -> dict[str, dict[str, Any]]:
-    """Overrides of a preset of accuracy; none without a name or with problems."""
+    """Overrides of an accuracy; none without a name or with problems."""
     if name is None:
         return {}
     try:

@@ -1,4 +1,4 @@
-"""The tables of a scene file, and a preset of accuracy.
+"""The tables of a scene file, and an accuracy.
 
 The `Attributes` of each docstring are the meanings that `docs/reference.md` shows beside the units
 and ranges of the fields, see `scripts/reference_page.py`.
@@ -240,7 +240,7 @@ class Solver:
     """MuJoCo's options of its contact solver, which the engines `mujoco` and `mjx` read.
 
     The engine `structured` measures convergence otherwise, see `Newton`, and refuses other values
-    than a preset's where `[newton]` is not set as well.
+    than those of an accuracy where `[newton]` is not set as well.
 
     Attributes:
       iterations: Largest number of Newton iterations.
@@ -277,13 +277,13 @@ class Newton:
 
 @dataclasses.dataclass(frozen=True)
 class Accuracy:
-    """Values of a preset of accuracy; docs/accuracy.md has its measured errors and cost.
+    """Values of an accuracy; docs/accuracy.md has its measured errors and cost.
 
     Attributes:
-      description: What the preset is for.
-      discretization: Values of the scene's table `[discretization]` that the preset replaces.
-      solver: Values of the scene's table `[solver]` that the preset replaces.
-      newton: Values of the scene's table `[newton]` that the preset replaces.
+      description: What the accuracy is for.
+      discretization: Values of the scene's table `[discretization]` that the accuracy replaces.
+      solver: Values of the scene's table `[solver]` that the accuracy replaces.
+      newton: Values of the scene's table `[newton]` that the accuracy replaces.
     """
 
     description: str

@@ -127,7 +127,7 @@ class Section:
 @table
 @dataclasses.dataclass(frozen=True)
 class Material:
-    """Silicone of the fingers: `material = NAME`, or a table of its name or of own numbers.
+    """Silicone of the fingers: `material = NAME`, or a table with its name or with numbers.
 
     A shear modulus belongs to a bending law. A silicone's name determines law, modulus,
     density and damping; without a name, or for a batch that was measured, law and modulus are given
@@ -137,7 +137,7 @@ class Material:
     latter walls are thin, which is a lower one.
 
     Attributes:
-      silicone: Name of the silicone, see docs/measurements.md. Not given: own numbers.
+      silicone: Name of the silicone, see docs/measurements.md. Not given: the numbers below.
       law: Bending law of the walls that the modulus belongs to. Not given, without a silicone:
         `effects.neo_hookean` of the scene says it.
       shear_modulus: Shear modulus G; required without a silicone, as the next two.

@@ -47,12 +47,12 @@ class Effects:
 @table
 @dataclasses.dataclass(frozen=True)
 class Fixture:
-    """A static body of the surroundings, which fingers, palm and object touch as the table.
+    """A static body of the surroundings, which fingers, palm and object touch like the table.
 
     Attributes:
-      name: What it is, for messages.
+      name: Its name, as in messages.
       type: Its shape; a plane has its body below it.
-      position: Its centre, of a plane a point of it; the table is z = 0, the object at the origin.
+      position: Its centre, or a point of a plane; the table is z = 0, the object at the origin.
       size: Half lengths of a box, or radius and half height of a cylinder.
       orientation: Roll, pitch and yaw, which turn about x, y and z in this order, or a unit
         quaternion w, x, y, z. An unturned cylinder stands, the normal of a plane is z.
@@ -99,7 +99,7 @@ class Phases:
       deflate_time: Time that the chambers take to empty from the start of the un-grasp phase on;
         fits into that phase.
       settle: Time before the grasp in which the arm waits at its start and the object comes to
-        rest; it is simulated, but no part of the cost.
+        rest; it is simulated, but is not part of the cost.
     """
 
     approach: float = quantity("s", 0.01, 60)
@@ -136,12 +136,12 @@ class Cost:
     """Cost of a trial (paper Fig. 3).
 
     Attributes:
-      maximum: Cost of a trial that loses its object as the lift begins, and what a failed trial
-        shows; a kept object costs 0.
+      maximum: Cost of a trial that loses its object at the start of the lift, and the cost that
+        tables show for a failed trial; a kept object costs 0.
       lost_distance: Distance between the centres of object and hand from which on the object is
         lost.
-      failure: What a failed trial counts in its particle's mean cost: "exclude" leaves it out (the
-        paper's rule), "worst" scores it with `maximum`.
+      failure: How a failed trial counts in its particle's mean cost: "exclude" leaves it out (the
+        paper's rule), "worst" counts it with `maximum`.
     """
 
     maximum: float = quantity("", 0.1, 100)
@@ -318,7 +318,8 @@ class Limits:
       palm_clearance: Least height of the palm's rim over the table, as commanded; `arm_z` is
         raised.
       wrist_force: Largest force of the wrist's springs where the palm is commanded into the table
-        or into the tallest object; `arm_z` is raised. A stiff arm stops there.
+        or into the tallest object; `arm_z` is raised to meet it, because a
+        stiff arm would stop there.
     """
 
     speed: float = quantity("rad/s or m/s", 1, 1e9)

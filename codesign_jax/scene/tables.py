@@ -318,8 +318,8 @@ class Limits:
       palm_clearance: Least height of the palm's rim over the table, as commanded; `arm_z` is
         raised.
       wrist_force: Largest force of the wrist's springs where the palm is commanded into the table
-        or into the tallest object; `arm_z` is raised to meet it, because a
-        stiff arm would stop there.
+        or into the tallest object; `arm_z` is raised to meet it, because a stiff arm would stop
+        there.
     """
 
     speed: float = quantity("rad/s or m/s", 1, 1e9)

@@ -6,11 +6,17 @@ they were; hostile input is refused with the project's own error.  FAULTS=N asks
 of each kind.  It needs Linux, and a C compiler for failing disks: faults_shim.c is a library that
 is loaded before all others, counts operations on files below a folder, and lets one of them fail.
 
+An import takes longer than the run, and changes no file of it: most processes are forks of one that
+has imported everything and used nothing of JAX, and every twentieth is a new interpreter.
+
 Hypothesis makes the input; tests/test_meshes.py tries a little of it.
 """
 
 import contextlib
+import ctypes
 import io
+import itertools
+import multiprocessing
 import os
 import random
 import re
@@ -22,7 +28,7 @@ import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, NoReturn
 
 import hypothesis
 import numpy as np
@@ -58,27 +64,16 @@ def run(*arguments: str | Path) -> tuple[int, str]:
     return code, said.getvalue()
 
 
-def process(*arguments: str | Path, more: dict[str, str] | None = None) -> subprocess.Popen:
-    command = [sys.executable, "-m", "codesign_jax.cli", *map(str, arguments)]
-    environment = os.environ | (more or {})
-    pipe = subprocess.PIPE
-    both = subprocess.STDOUT
-    return subprocess.Popen(command, env=environment, text=True, stdout=pipe, stderr=both)
-
-
 @pytest.fixture(scope="session")
-def finished(tmp_path_factory) -> tuple[Path, float]:
-    """A run that nothing interrupted, and the seconds that a process takes for it."""
+def finished(tmp_path_factory) -> Path:
+    """A run that nothing interrupted, alike in this process and in one of its own."""
     folder = tmp_path_factory.mktemp("finished")
-    code, said = run(*COMMAND, "--out", folder / "first")  # compiles
+    code, said = run(*COMMAND, "--out", folder / "first")
     assert code == 0, said
-    begin = time.monotonic()
-    done = process(*COMMAND, "--out", folder / "run")
-    said = done.communicate()[0]
-    assert done.returncode == 0, said
-    took = time.monotonic() - begin
+    command = [sys.executable, "-m", "codesign_jax.cli", *COMMAND, "--out", folder / "run"]
+    subprocess.run(command, check=True, capture_output=True)
     assert differences(folder / "first", folder / "run") == []
-    return folder / "run", took
+    return folder / "run"
 
 
 def differences(first: Path, other: Path) -> list[str]:
@@ -94,114 +89,214 @@ def differences(first: Path, other: Path) -> list[str]:
 
 # --- kills and failing disks ----------------------------------------------------------------------
 
-
-@pytest.mark.parametrize("number", range(CASES))
-def test_a_killed_run_goes_on_bit_for_bit(number, finished, tmp_path):
-    whole, took = finished
-    chance = random.Random(number)
-    for _ in range(1 + number % 3):
-        begun = process(*COMMAND, "--out", tmp_path / "run")
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            begun.wait(chance.uniform(0.05, 1.0) * took)
-        chosen = chance.choice((signal.SIGKILL, signal.SIGINT, signal.SIGTERM))
-        begun.send_signal(chosen)
-        said = begun.communicate()[0]
-        # Before the command has its handlers, a signal ends the process as it ends any other.
-        assert begun.returncode in (0, -chosen, 128 + chosen), said
-        assert "Traceback" not in said or begun.returncode == -signal.SIGINT, said
-    code, said = run(*COMMAND, "--out", tmp_path / "run")
-    assert code == 0, said
-    assert differences(tmp_path / "run", whole) == []
-
-
 SHIM = Path(__file__).with_name("faults_shim.c")
 COMPILER = shutil.which(os.environ.get("CC", "cc"))
 MODES = {"count": 0, "killed": 1, "full": 2, "broken": 3, "read-only": 4}
 
 
-@pytest.fixture(scope="session")
-def shim(tmp_path_factory) -> Callable[[Path, int, str], dict[str, str]]:
-    """A function of a folder, the number of an operation there, and what happens at it.
+class Fault(NamedTuple):
+    """What happens at a file operation below a folder.
 
-    It returns the variables of a process: killed within a write, a full disk from there on
-    (ENOSPC), an error once (EIO), or a disk that cannot be written from there on (EROFS).
+    Killed within a write, a full disk from there on (ENOSPC), an error once (EIO), a disk that
+    cannot be written from there on (EROFS); or nothing: the operations are counted.
     """
+
+    folder: Path
+    number: int
+    mode: str
+
+    def arm(self) -> None:
+        """Has it happen in this process, in which the shim is loaded."""
+        folder = os.fsencode(self.folder)
+        ctypes.CDLL(None).shim_arm(folder, ctypes.c_long(self.number), MODES[self.mode])
+
+
+def run_command(arguments: list[str], output: Path, fault: Fault | None) -> NoReturn:
+    """The command, as a process of its own runs it; what it says goes to a file."""
+    descriptor = os.open(output, os.O_WRONLY | os.O_CREAT)
+    os.dup2(descriptor, 1)
+    os.dup2(descriptor, 2)
+    sys.argv = ["codesign", *arguments]
+    if fault is not None:
+        fault.arm()
+    try:
+        code = cli.main()
+    except KeyboardInterrupt:  # before the command has its handlers: how the interpreter ends
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGINT)
+    if fault is not None and fault.mode == "count":
+        print("operations:", ctypes.CDLL(None).shim_count())
+    sys.exit(code)
+
+
+class Processes:
+    """Starts the command in processes of its own."""
+
+    def __init__(self, folder: Path):
+        self._folder = folder
+        self._count = itertools.count()
+
+    def start(
+        self, folder: Path, fault: Fault | None = None, *, interpreter: bool = False
+    ) -> tuple[multiprocessing.Process, Path]:
+        """Starts the run in a folder; returns the process and the file of what it says."""
+        output = self._folder / f"{next(self._count)}.txt"
+        context: Any = multiprocessing.get_context("spawn" if interpreter else "forkserver")
+        arguments = [*COMMAND, "--out", str(folder)]
+        process = context.Process(target=run_command, args=(arguments, output, fault))
+        process.start()
+        return process, output
+
+    def run(self, folder: Path, fault: Fault | None = None, **options: bool) -> tuple[int, str]:
+        """Exit status of a run, negative that of a signal, and what it says."""
+        process, output = self.start(folder, fault, **options)
+        process.join()
+        return process.exitcode or 0, text_of(output)
+
+
+def text_of(output: Path) -> str:
+    """What a process has said; nothing if it ended before it could."""
+    return output.read_text(encoding="utf-8", errors="replace") if output.exists() else ""
+
+
+@pytest.fixture(scope="session")
+def processes(finished, tmp_path_factory) -> Processes:
+    """Processes with the shim, which does nothing until a fault is armed."""
     if COMPILER is None:
         pytest.skip("no C compiler: install one as `cc`, or name it in CC")
-    place = tmp_path_factory.mktemp("shim") / "shim.so"
+    folder = tmp_path_factory.mktemp("processes")
     flags = ["-O1", "-shared", "-fPIC", "-Wall", "-Wextra", "-Werror"]
-    subprocess.run([COMPILER, *flags, "-o", place, SHIM, "-ldl", "-lpthread"], check=True)
-    return lambda folder, at, mode: {
-        "LD_PRELOAD": str(place),
-        "FAULTS_FOLDER": str(folder),
-        "FAULTS_AT": str(at),
-        "FAULTS_MODE": str(MODES[mode]),
-    }
+    libraries = ["-ldl", "-lpthread"]
+    subprocess.run([COMPILER, *flags, "-o", folder / "shim.so", SHIM, *libraries], check=True)
+    os.environ["LD_PRELOAD"] = str(folder / "shim.so")  # until this process ends
+    # What `finished` has imported in this process.
+    names = [name for name in sys.modules if name.startswith(("codesign_jax", "orbax"))]
+    multiprocessing.set_forkserver_preload([__name__, *names])
+    return Processes(folder)
+
+
+@pytest.fixture(scope="session")
+def seconds(processes, tmp_path_factory) -> tuple[float, float]:
+    """How long a run takes in a fork and in a new interpreter."""
+    taken = []
+    for name in ("warm", "fork", "interpreter"):
+        begin = time.monotonic()
+        folder = tmp_path_factory.mktemp("timed") / name
+        code, said = processes.run(folder, interpreter=name == "interpreter")
+        assert code == 0, said
+        taken.append(time.monotonic() - begin)
+    return taken[1], taken[2]
+
+
+@pytest.fixture(scope="session")
+def operations(processes, tmp_path_factory) -> int:
+    """Number of a run's file operations."""
+    folder = tmp_path_factory.mktemp("counted") / "run"
+    code, said = processes.run(folder, Fault(folder, 0, "count"))
+    assert code == 0, said
+    return int(said.split("operations: ")[1])
 
 
 @pytest.mark.parametrize("number", range(CASES))
-@pytest.mark.parametrize("mode", [m for m in MODES if m != "count"])
-def test_a_run_whose_disk_fails_says_so_and_goes_on(mode, number, finished, tmp_path, shim):
+def test_a_killed_run_goes_on_bit_for_bit(number, finished, processes, seconds, tmp_path):
     folder = tmp_path / "run"
-    at = random.Random(f"{mode} {number}").randrange(1, 400)
-    begun = process(*COMMAND, "--out", folder, more=shim(folder, at, mode))
-    said = begun.communicate()[0]
-    if mode == "killed":
-        assert begun.returncode in (0, -signal.SIGKILL), said
-    elif begun.returncode != 0:  # 0: an operation that it can do without, or none so late
-        assert begun.returncode in (1, 2) and "error:" in said and "Traceback" not in said, said
+    chance = random.Random(number)
+    interpreter = number % 20 == 19
+    for _ in range(1 + number % 3):
+        process, output = processes.start(folder, interpreter=interpreter)
+        process.join(chance.uniform(0.02, 1.0) * seconds[interpreter])
+        chosen = chance.choice((signal.SIGKILL, signal.SIGINT, signal.SIGTERM))
+        if process.is_alive():
+            os.kill(process.pid, chosen)
+        process.join()
+        said = text_of(output)
+        # Before the command has its handlers, a signal ends the process as it ends any other.
+        assert process.exitcode in (0, -chosen, 128 + chosen), said
+        assert "Traceback" not in said, said
     code, said = run(*COMMAND, "--out", folder)
     assert code == 0, said
-    assert differences(folder, finished[0]) == []
+    assert differences(folder, finished) == []
+
+
+@pytest.mark.parametrize("mode", [mode for mode in MODES if mode != "count"])
+@pytest.mark.parametrize("number", range(CASES))
+def test_a_run_whose_disk_fails_says_so_and_goes_on(
+    mode, number, finished, processes, operations, tmp_path
+):
+    folder = tmp_path / "run"
+    fault = Fault(folder, 1 + number * operations // CASES, mode)
+    code, said = processes.run(folder, fault, interpreter=number % 20 == 19)
+    if mode == "killed":
+        assert code in (0, -signal.SIGKILL), said
+    elif code != 0:  # 0: an operation that it can do without
+        assert code in (1, 2) and "error:" in said and "Traceback" not in said, said
+    code, said = run(*COMMAND, "--out", folder)
+    assert code == 0, said
+    assert differences(folder, finished) == []
 
 
 # --- damage ---------------------------------------------------------------------------------------
 
 
-def damaged(path: Path, way: str) -> None:
+WHOLE_FILE = ("deleted", "a folder", "emptied", "zeros", "other")
+AT_A_PLACE = ("half", "flipped", "longer")
+READERS = (("evaluate", "--dry-run", "--run"), ("landscape", "--dry-run"), ("report",))
+
+
+def damaged(path: Path, way: str, place: float) -> None:
+    """Damages a file: as a whole, or at a place, a share of its bytes."""
     data = path.read_bytes()
-    middle = len(data) // 2
+    at = int(place * len(data))
     if way == "deleted":
         path.unlink()
     elif way == "a folder":
         path.unlink()
         path.mkdir()
     else:
-        flipped = data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :] if data else b"x"
-        ways = {"emptied": b"", "half": data[:middle], "zeros": bytes(len(data))}
-        ways |= {"flipped": flipped, "longer": data + b"\n\x00more", "other": bytes(range(256))}
+        flipped = data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :] if data else b"x"
+        ways = {"emptied": b"", "half": data[:at], "zeros": bytes(len(data))}
+        ways |= {"flipped": flipped, "longer": data[:at] + b"\n\x00more" + data[at:]}
+        ways |= {"other": bytes(range(256))}
         path.write_bytes(ways[way])
 
 
-WAYS = ("deleted", "a folder", "emptied", "half", "zeros", "flipped", "longer", "other")
-READERS = (("evaluate", "--dry-run", "--run"), ("landscape", "--dry-run"), ("report",))
+def damage_cases(folder: Path, way: str) -> list[tuple[Path, float]]:
+    """Files of a run and places in them: those of the folder and the newest step come first."""
+    checkpoints = folder / "checkpoints"
+    newest = str(max(int(path.name) for path in checkpoints.iterdir() if path.is_dir()))
+    names = [path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.is_file()]
+    random.Random(way).shuffle(names)
+    names.sort(key=lambda n: n.parts[0] == checkpoints.name and n.parts[1].split(".")[0] != newest)
+    chance = random.Random(f"{way} place")
+    cases = [(name, 0.5) for name in names]
+    while way in AT_A_PLACE and len(cases) < CASES:
+        cases += [(name, chance.random()) for name in names]
+    return cases[:CASES]
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_damage_is_mended_or_refused(way, finished, tmp_path):
-    """Each file of the newest checkpoint and of the folder in turn; readers never fail unsaid."""
-    whole = finished[0]
-    names = [p.relative_to(whole) for p in sorted(whole.rglob("*")) if p.is_file()]
-    newest = max(int(n.parts[1]) for n in names if len(n.parts) > 2 and n.parts[1].isdigit())
-    chosen = [n for n in names if len(n.parts) == 1 or n.parts[1].split(".")[0] == str(newest)]
-    random.Random(way).shuffle(chosen)
-    for name in chosen[: 2 * CASES]:
-        folder = Path(shutil.copytree(whole, tmp_path / "run", symlinks=True))
-        damaged(folder / name, way)
-        before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-        for reader, *flags in READERS:
-            out = ["--out", tmp_path / "out.html"] if reader == "report" else []
-            code, said = run(reader, *flags, folder, *out)
-            assert code in (0, 1, 2) and (code == 0 or "error:" in said), (name, reader, said)
-        code, said = run(*COMMAND, "--out", folder)
-        if code:
-            assert code in (1, 2) and "error:" in said, (name, said)
-            # A reader that looks whether the run goes on leaves its number in the lock.
-            after = {p: p.read_bytes() for p in before if p.is_file() and p.name != manifest.LOCK}
-            assert after == {p: v for p, v in before.items() if p in after}, name
-        else:
-            assert differences(folder, whole) == [], name
-        shutil.rmtree(folder)
+@pytest.mark.parametrize("way", (*WHOLE_FILE, *AT_A_PLACE))
+@pytest.mark.parametrize("number", range(CASES))
+def test_damage_is_mended_or_refused(way, number, finished, tmp_path):
+    """Each file of the run in turn; readers never fail without a word."""
+    cases = damage_cases(finished, way)
+    if number >= len(cases):
+        pytest.skip("every file was damaged in this way")
+    name, place = cases[number]
+    folder = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True))
+    damaged(folder / name, way, place)
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    for reader, *flags in READERS:
+        out = ["--out", tmp_path / "out.html"] if reader == "report" else []
+        code, said = run(reader, *flags, folder, *out)
+        assert code in (0, 1, 2) and (code == 0 or "error:" in said), (name, reader, said)
+    code, said = run(*COMMAND, "--out", folder)
+    if code:
+        assert code in (1, 2) and "error:" in said, (name, said)
+        # A reader that looks whether the run goes on leaves its number in the lock.
+        after = {p: p.read_bytes() for p in before if p.is_file() and p.name != manifest.LOCK}
+        assert after == {p: v for p, v in before.items() if p in after}, name
+    else:
+        assert differences(folder, finished) == [], name
 
 
 # --- hostile input --------------------------------------------------------------------------------

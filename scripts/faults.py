@@ -170,8 +170,8 @@ def processes(finished, tmp_path_factory) -> Processes:
     subprocess.run([COMPILER, *flags, "-o", folder / "shim.so", SHIM, *libraries], check=True)
     os.environ["LD_PRELOAD"] = str(folder / "shim.so")  # until this process ends
     # What `finished` has imported in this process.
-    names = [name for name in sys.modules if name.startswith(("codesign_jax", "orbax"))]
-    multiprocessing.set_forkserver_preload([__name__, *names])
+    names = [name for name in sys.modules if name.startswith("codesign_jax")]
+    multiprocessing.set_forkserver_preload([__name__, "orbax.checkpoint", *names])
     return Processes(folder)
 
 
@@ -240,11 +240,12 @@ def test_a_run_whose_disk_fails_says_so_and_goes_on(
 
 WHOLE_FILE = ("deleted", "a folder", "emptied", "zeros", "other")
 AT_A_PLACE = ("half", "flipped", "longer")
+WAYS = (*WHOLE_FILE, *AT_A_PLACE)
 READERS = (("evaluate", "--dry-run", "--run"), ("landscape", "--dry-run"), ("report",))
 
 
-def damaged(path: Path, way: str, place: float) -> None:
-    """Damages a file: as a whole, or at a place, a share of its bytes."""
+def damaged(path: Path, way: str, place: float = 0.5) -> None:
+    """Damages a file: as a whole, or at a place, which is a share of its bytes."""
     data = path.read_bytes()
     at = int(place * len(data))
     if way == "deleted":
@@ -274,7 +275,7 @@ def damage_cases(folder: Path, way: str) -> list[tuple[Path, float]]:
     return cases[:CASES]
 
 
-@pytest.mark.parametrize("way", (*WHOLE_FILE, *AT_A_PLACE))
+@pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("number", range(CASES))
 def test_damage_is_mended_or_refused(way, number, finished, tmp_path):
     """Each file of the run in turn; readers never fail without a word."""

@@ -15,6 +15,7 @@ import codesign_jax
 from codesign_jax import cli, preflight
 from codesign_jax.commands import (
     check,
+    common,
     compare,
     evaluate,
     export,
@@ -96,7 +97,8 @@ SIMULATES = {
     "compare": [(compare, "compare_pair")],
     "evaluate": [
         (evaluate, name) for name in ("simulate", "other_conditions", "tell_verdict", "of_objects")
-    ],
+    ]
+    + [(common, "cast_hands")],
     "export": [(export, "write_files")],
     "finger": [(finger, "compare")],
     "landscape": [

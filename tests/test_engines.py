@@ -53,7 +53,8 @@ def test_vmap_is_a_larger_batch():
     scene = grasps.pinch("sphere", **SHORT)
     fields, ctrl = grasps.batch_inputs(scene, *grasps.random_worlds(scene, 3, 4))
     engine = StructuredEngine(scene)
-    want = jax.jit(engine.rollout)(fields, ctrl)
+    run = jax.jit(engine.rollout)
+    want = run(fields, ctrl)
     fields, ctrl = jax.tree.map(np.asarray, (fields, ctrl))  # whose axes NumPy moves
     two = jax.tree.map(lambda v: v.reshape(2, 2, 1, *v.shape[1:]), (fields, ctrl))
     controls = np.moveaxis(two[1], 0, 3)
@@ -65,7 +66,7 @@ def test_vmap_is_a_larger_batch():
     shared = jax.jit(jax.vmap(engine.rollout, in_axes=(0, None)))(
         jax.tree.map(lambda v: v[:, None], fields), ctrl[:1]
     )
-    alone = jax.jit(engine.rollout)(fields, np.repeat(ctrl[:1], 4, 0))
+    alone = run(fields, np.repeat(ctrl[:1], 4, 0))
     np.testing.assert_array_equal(shared.distance[:, 0], alone.distance)
 
 

@@ -46,9 +46,8 @@ SCENE = grasps.short_grasp()
 
 
 @pytest.fixture(scope="module")
-def worlds():
-    """Four random worlds, and how they end by the key frames, without and with recorded forces."""
-    inputs = grasps.random_worlds(SCENE, 1, 4)
+def simulate():
+    """How four worlds end by the key frames, without and with recorded forces: one program."""
     engine = make_engine("structured", SCENE)
 
     @jax.jit
@@ -56,7 +55,14 @@ def worlds():
         ways = [{}, {"record_forces": True}]
         return [rollout.simulate(SCENE, engine, params, trials, **options) for options in ways]
 
-    return inputs, *run(*inputs)
+    return run
+
+
+@pytest.fixture(scope="module")
+def worlds(simulate):
+    """Four random worlds, and how they end."""
+    inputs = grasps.random_worlds(SCENE, 1, 4)
+    return inputs, *simulate(*inputs)
 
 
 def test_recording_changes_no_bit_and_a_lost_object_has_no_forces(worlds):
@@ -315,13 +321,13 @@ def episode():
     return grasp, states, worlds
 
 
-def test_actions_that_change_nothing_make_the_grasp_of_the_key_frames(episode):
+def test_actions_that_change_nothing_make_the_grasp_of_the_key_frames(episode, simulate):
     """Its end and its cost; what is held adds up to what the cost leaves."""
     grasp, states, _ = episode
     trials = states[0].data.trial
     params = jax.tree.map(lambda v: jnp.repeat(v[None], 4, 0), grasp.params)
-    simulate = jax.jit(partial(rollout.simulate, SCENE, make_engine("structured", SCENE)))
-    outcome, trace = simulate(params, trials)
+    (outcome, trace), _ = simulate(params, trials)
+    assert simulate._cache_size() == 1
     ends = [model.split(SCENE, s).qpos for s in (states[-1].data.world.state, trace.last)]
     # Two programs round model fields differently, and contact lets that grow.
     np.testing.assert_allclose(*ends, atol=1e-5)

@@ -80,6 +80,7 @@ class Case:
         """Packs the world into tables; width: lanes of a block."""
         engine = StructuredEngine(scene, **EXACT)
         self.program = AdjointProgram(scene, engine.limits, backend=backend, width=width)
+        self._reverse = jax.jit(self._cotangents)
         self.start, (hand, state) = start, self._lanes(scene, engine, start)
         ctrl = jnp.asarray(start.ctrl)[None]
         self.tables = [np.array(x) for x in jax.jit(self.program.inputs)(hand, state, ctrl)]
@@ -201,21 +202,20 @@ class Case:
 
     def bars(self, tables, out, weights):
         """Cotangents of tables for weights of each world, by what `execute` made of them."""
-        program = self.program
         count = tables[0].shape[0] * self.program.block
         missing = [weights[0].times(0.0)] * (count - len(weights))
         last, entries, qpos = (np.stack(x) for x in zip(*weights, *missing, strict=True))
-
-        def run(tables, out, last, entries, qpos):
-            trace, _ = program.outputs(out, count)
-            taken = program.by_block(trace["moved"].sum(1)[:, None, None, None])
-            rows = Cotangents(*program.rows_of_end(last), entries[..., None], program.rows_of(qpos))
-            rows = jax.tree.map(program.by_block, rows)
-            hand, world, *rest = program.adjoint(tables, recorded(out, taken), rows)
-            return hand, program.summed(world), *rest
-
         tables = tuple(map(jnp.asarray, tables))
-        return [np.asarray(x) for x in jax.jit(run)(tables, out, last, entries, qpos)]
+        return [np.asarray(x) for x in self._reverse(tables, out, last, entries, qpos)]
+
+    def _cotangents(self, tables, out, last, entries, qpos):
+        program = self.program
+        trace, _ = program.outputs(out, len(last))
+        taken = program.by_block(trace["moved"].sum(1)[:, None, None, None])
+        rows = Cotangents(*program.rows_of_end(last), entries[..., None], program.rows_of(qpos))
+        rows = jax.tree.map(program.by_block, rows)
+        hand, world, *rest = program.adjoint(tables, recorded(out, taken), rows)
+        return hand, program.summed(world), *rest
 
     def along(self, bars, world=0):
         """Derivatives of a world along the groups' directions."""

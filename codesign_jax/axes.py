@@ -37,18 +37,18 @@ def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -
 
 def _control_problems(scene: Scene, params: Params) -> list[str]:
     expected = {p.name: (scene.num_fingers,) * (p.per == "finger") for p in scene.control.parameter}
-    given = {k: np.shape(v) for k, v in (params.control or {}).items()}
-    if given.keys() != expected.keys():
-        names = [", ".join(v) or "none" for v in (given, expected)]
+    shapes = {k: np.shape(v) for k, v in (params.control or {}).items()}
+    if shapes.keys() != expected.keys():
+        names = [", ".join(v) or "none" for v in (shapes, expected)]
         return [
             f"params.control has {names[0]}; the scene's control {scene.control.name!r} needs "
             f"{names[1]}"
         ]
     leading = np.shape(params.length)[:-1]
     return [
-        f"params.control[{k!r}] has shape {given[k]}, not {(*leading, *shape)}"
+        f"params.control[{k!r}] has shape {shapes[k]}, not {(*leading, *shape)}"
         for k, shape in expected.items()
-        if given[k] != (*leading, *shape)
+        if shapes[k] != (*leading, *shape)
     ]
 
 
@@ -101,19 +101,19 @@ def refuse_draws(key: Any, count: int) -> None:
 
 
 def _problems(what: str, batch: Any, shapes: Any, axis: str) -> list[str]:
-    given = {k: np.shape(v) for k, v in batch._asdict().items() if v is not None}
-    if all(shape == getattr(shapes, k) for k, shape in given.items()):
+    array_shapes = {k: np.shape(v) for k, v in batch._asdict().items() if v is not None}
+    if all(shape == getattr(shapes, k) for k, shape in array_shapes.items()):
         return [
             f"{what} have no axis ({axis},); of one, jax.tree.map(lambda v: v[None], {what}) "
             "makes a batch"
         ]
-    counts = {shape[0] for shape in given.values() if shape}
+    counts = {shape[0] for shape in array_shapes.values() if shape}
     problems = [
         f"{what}.{k} has shape {shape}, not ({', '.join(map(str, (axis, *getattr(shapes, k))))})"
-        for k, shape in given.items()
+        for k, shape in array_shapes.items()
         if not shape or shape[1:] != getattr(shapes, k)
     ]
     if not problems and len(counts) > 1:
-        lengths = ", ".join(f"{k} {shape[0]}" for k, shape in given.items())
+        lengths = ", ".join(f"{k} {shape[0]}" for k, shape in array_shapes.items())
         problems = [f"the arrays of {what} have different lengths: {lengths}"]
     return problems

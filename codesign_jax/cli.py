@@ -52,7 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
     Args:
       arguments: Arguments without the program's name; default: those of the process.
     """
-    given = sys.argv[1:] if arguments is None else arguments
+    words = sys.argv[1:] if arguments is None else arguments
 
     def run() -> int:
         terminal.tolerate(sys.stdout)  # the parser of flags prints too
@@ -60,9 +60,9 @@ def main(arguments: list[str] | None = None) -> int:
             # XLA's alarm of a compilation of two minutes reads like a crash; what fails is raised.
             os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
             warnings.showwarning = lambda text, *_: terminal.say(f"warning: {text}", error=True)
-        if given == ["--version"]:
+        if words == ["--version"]:
             return _version()
-        bad = [a for a in given if a.encode(errors="replace").decode() != a]
+        bad = [a for a in words if a.encode(errors="replace").decode() != a]
         if problems := [f"{a[:100]!r} is no UTF-8 text" for a in bad] + reuse.problems():
             from codesign_jax.scene.schema import InputError
 

@@ -89,8 +89,10 @@ def _place(scene: Scene, params: Params, time: np.ndarray) -> tuple[jax.Array, .
     after = jnp.minimum(reached, len(at) - 1)
     span = at[after] - at[before]
     share = (now - at[before]) / jnp.where(span > 0, span, 1.0)
-    held = np.array([frame.interpolation == "held" for frame in scene.control.frame])
-    return before, after, jnp.where(jnp.asarray(held)[before], 0.0, share) if held.any() else share
+    holds = np.array([frame.interpolation == "held" for frame in scene.control.frame])
+    if holds.any():
+        share = jnp.where(jnp.asarray(holds)[before], 0.0, share)
+    return before, after, share
 
 
 def _between(place: tuple[jax.Array, ...], knots: jax.Array) -> jax.Array:

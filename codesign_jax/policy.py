@@ -449,13 +449,13 @@ def spread(scene: Scene, command: Command, plan: Plan, *, of: str) -> Command:
     problems = []
     commands = []
     for name, like in (("pose", plan.pose), ("pressure", plan.pressure)):
-        given = jnp.asarray(getattr(command, name), like.dtype)
-        if given.shape == (len(like), like.shape[2]):
-            given = jnp.broadcast_to(given[:, None], like.shape)
-        elif given.shape != like.shape:
-            shapes = given.shape[1:], like.shape[2:], like.shape[1:]
+        series = jnp.asarray(getattr(command, name), like.dtype)
+        if series.shape == (len(like), like.shape[2]):
+            series = jnp.broadcast_to(series[:, None], like.shape)
+        elif series.shape != like.shape:
+            shapes = series.shape[1:], like.shape[2:], like.shape[1:]
             problems.append("{} returned {} of shape {}, not {} or {}".format(of, name, *shapes))
-        commands.append(given)
+        commands.append(series)
     if problems:
         raise InputError(problems)
     # The upper end is the limit of the wall, or the design's own pressure where that is higher.
@@ -489,8 +489,8 @@ def advance(
             pressure, end = control.supplied(constants, pressure, now)
         return control.actuated(command.pose, pressure, shake, tilt), end
 
-    given = fields.constants, world.pressure, plan.shake, plan.tilt, command
-    ctrl, pressure = jax.vmap(controls)(*given)
+    inputs = fields.constants, world.pressure, plan.shake, plan.tilt, command
+    ctrl, pressure = jax.vmap(controls)(*inputs)
     trace = engine.rollout(fields._replace(start=world.state), ctrl, **options)
     if trace.last is None:
         raise InputError([f"engine {engine.name} does not tell states to go on from"])

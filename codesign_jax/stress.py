@@ -208,11 +208,11 @@ def _in_grasps(
     kept = np.flatnonzero(verdict.kept(outcomes))
     first = [kept[trials.shape[kept] == k][:1] for k in range(len(scene.objects.object))]
     times = np.arange(qpos.shape[1]) * HELD
-    approached, held, end = (
+    approached, lifted, end = (
         scene.steps_to(t) for t in (scene.phase_ends["approach"], *scene.window)
     )
     whole = (times >= approached) & (times < end)
-    hold = (times >= held) & (times < end)
+    hold = (times >= lifted) & (times < end)
     bends = overlap.bend_angles(scene, qpos[kept])
     lines = of_bends(overlap.wall_strain(scene, params, bends[:, whole]), bends[:, hold])
     depths = []
@@ -259,12 +259,12 @@ def of_design(scene: Scene, params: Params) -> list[str]:
     return warnings
 
 
-def of_bends(strain: np.ndarray, held: np.ndarray) -> list[str]:
+def of_bends(strain: np.ndarray, bends: np.ndarray) -> list[str]:
     """Warnings of walls that stretch and fingers that coil in kept grasps.
 
     Args:
       strain: Strain of the walls, shape (grasp, state, finger, link).
-      held: Bend of the joints while the object is held [rad], shape (grasp, state, finger, link).
+      bends: Bend of the joints while the object is held [rad], shape (grasp, state, finger, link).
     """
     if not strain.size:
         return []
@@ -275,7 +275,7 @@ def of_bends(strain: np.ndarray, held: np.ndarray) -> list[str]:
             f"finger {f}: its walls stretch by {100 * most[f]:.0f} % in grasps, more than the "
             f"{100 * STRAIN:.0f} % up to which silicones were measured"
         )
-    angles = np.median(held.sum(-1), 1).max(0)
+    angles = np.median(bends.sum(-1), 1).max(0)
     for f in np.flatnonzero(angles > TURN):
         warnings.append(
             f"finger {f} bends by {np.degrees(angles[f]):.0f}° in grasps, more than a turn"

@@ -73,7 +73,7 @@ class Yield(NamedTuple):
     trials: int  # grasps of each
     scores: np.ndarray  # deviations over their standard deviations, shape (hand, deviation)
     kinds: tuple[str, ...]  # kind of each deviation
-    given: Mapping[str, float]  # tolerances that are not the usual ones, by kind
+    tolerance_widths: Mapping[str, float]  # tolerances that are not the usual ones, by kind
 
     @property
     def needed(self) -> int:
@@ -100,7 +100,7 @@ class Yield(NamedTuple):
             kind = KINDS.get(name)
             size = "as drawn"
             if kind is not None:
-                size = f"{self.given.get(name, kind.usual):g} {kind.unit}"
+                size = f"{self.tolerance_widths.get(name, kind.usual):g} {kind.unit}"
             # Plus 0.0, so that none is written as -0.
             value, low, high = (round(100 * v) + 0.0 for v in gain)
             points = f"{value:+.0f} points ({low:+.0f} to {high:+.0f})"
@@ -187,16 +187,18 @@ def regression(terms: np.ndarray, kept: np.ndarray, trials: int) -> np.ndarray:
     return optimize.minimize(cost, start, jac=True, hess=curvature, method="trust-exact").x
 
 
-def table(scene: Scene, given: Mapping[str, float]) -> tuple[draws.Constants, tuple[str, ...]]:
+def table(
+    scene: Scene, tolerance_widths: Mapping[str, float]
+) -> tuple[draws.Constants, tuple[str, ...]]:
     """The deviations of a hand, and their kinds.
 
     Args:
-      given: Tolerances by name in their units; others have their usual values, those of 0 none.
+      tolerance_widths: Tolerances by name in their units; others have their usual values, those of 0 none.
     """
     entries = []
     kinds = []
     for name, kind in KINDS.items():
-        spread = given.get(name, kind.usual) * kind.size / 2
+        spread = tolerance_widths.get(name, kind.usual) * kind.size / 2
         if not spread:
             continue
         keys = [k.format(i) for k in kind.keys for i in range(scene.num_fingers)]
@@ -244,7 +246,7 @@ def read(words: tuple[str, ...]) -> dict[str, float]:
 
 def simulate(
     case: Case,
-    given: Mapping[str, float],
+    tolerance_widths: Mapping[str, float],
     key: jax.Array,
     *,
     hands: int = HANDS,
@@ -254,14 +256,14 @@ def simulate(
     """Simulates the design and hands that deviate from it, all in the same trials.
 
     Args:
-      given: Tolerances by name, see `table`.
+      tolerance_widths: Tolerances by name, see `table`.
       key: Key of trials and deviations.
       hands: Number of hands beside the design.
       trials: Grasps of each.
       done: Is told the grasps of each call.
     """
     scene = case.scene
-    deviating_constants, kinds = table(scene, given)
+    deviating_constants, kinds = table(scene, tolerance_widths)
     known = scene.drawn
     random = jax.random.fold_in(key, STREAM)
     cast = np.array(draws.deviations(deviating_constants, random, hands))
@@ -288,7 +290,7 @@ def simulate(
         parts.append(verdict.kept(outcome).sum(1))
         done(outcome.cost.size)
     zero = np.zeros((1, len(kinds)))
-    return Yield(np.concatenate(parts), trials, np.vstack([zero, scores]), kinds, given)
+    return Yield(np.concatenate(parts), trials, np.vstack([zero, scores]), kinds, tolerance_widths)
 
 
 def _standard(values: np.ndarray) -> np.ndarray:

@@ -137,9 +137,9 @@ def verdicts(outcomes: Outcome) -> np.ndarray:
     """
     status = np.asarray(outcomes.status)
     lost = np.isfinite(outcomes.lost_time)
-    held = VERDICTS.index("not_released")
+    stuck = VERDICTS.index("not_released")
     broken = VERDICTS.index("fault")
-    bad = np.where(status & Status.STUCK, held, broken)
+    bad = np.where(status & Status.STUCK, stuck, broken)
     return np.where(failed(status), bad, lost.astype(int))
 
 

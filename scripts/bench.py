@@ -46,9 +46,9 @@ def measured(truth: finger.Finger) -> dict[str, dict[str, np.ndarray]]:
         "a release": ("drop", {"pressure": 0.0, "time": times, "load": 0.0}),
     }
     tables = {}
-    for words, (column, given) in columns.items():
-        rows = max(np.size(v) for v in given.values())
-        table = {n: np.broadcast_to(np.asarray(v, float), rows).copy() for n, v in given.items()}
+    for words, (column, states) in columns.items():
+        rows = max(np.size(v) for v in states.values())
+        table = {n: np.broadcast_to(np.asarray(v, float), rows).copy() for n, v in states.items()}
         if column == "drop":
             step = times[-1] / (8 * swing.STEPS)
             clean = np.interp(times, *swing.released(truth, 0.0, 0.0, times[-1] + step, step))

@@ -83,7 +83,7 @@ class Hand:
 def hands() -> list[Hand]:
     """Those of the page."""
     named = tomllib.loads((FOLDER / "hands.toml").read_text(encoding="utf-8"))
-    return [Hand(name, **given) for name, given in named.items()]
+    return [Hand(name, **fields) for name, fields in named.items()]
 
 
 def find(hand: Hand) -> None:

@@ -306,12 +306,12 @@ def tip_stiffness(pressures: Sequence[float]) -> list[list[str]]:
     rows = [
         ["pressure kPa", "free bend °", "force on the plate N", "loss of force per opening N/m"]
     ]
-    held = fingers.Rest(np.zeros(mine.links), 0.0, 0.0)
+    blocked = fingers.Rest(np.zeros(mine.links), 0.0, 0.0)
     for pressure in pressures:
         free = fingers.Rest.of(mine, 1e3 * pressure)
-        held = fingers.Rest.of(mine, 1e3 * pressure, held=True, start=held)
-        less = fingers.Rest.of(mine, 1e3 * pressure, 0.99 * held.force, start=held)
-        numbers = math.degrees(free.angles.sum()), held.force, 0.01 * held.force / less.height
+        blocked = fingers.Rest.of(mine, 1e3 * pressure, held=True, start=blocked)
+        less = fingers.Rest.of(mine, 1e3 * pressure, 0.99 * blocked.force, start=blocked)
+        numbers = math.degrees(free.angles.sum()), blocked.force, 0.01 * blocked.force / less.height
         forms = ("{:.0f}", "{:.2f}", "{:.0f}")
         cells = [form.format(v) for form, v in zip(forms, numbers, strict=True)]
         rows.append([f"{pressure:g}", *cells])

@@ -47,11 +47,11 @@ def cast_hands(
     case: Case, options: Evaluate | Export, trials: int, console: Console
 ) -> tolerances.Yield:
     """Simulates hands as they are cast, with so many grasps each, and prints what they keep."""
-    given = tolerances.read(options.tolerances)
+    tolerance_widths = tolerances.read(options.tolerances)
     with Meter("cast hands", (options.hands + 1) * trials, console) as meter:
         key = jax.random.key(options.seed)
         hand_yield = tolerances.simulate(
-            case, given, key, hands=options.hands, trials=trials, done=meter.advance
+            case, tolerance_widths, key, hands=options.hands, trials=trials, done=meter.advance
         )
     for line in hand_yield.lines():
         console.print(line)
@@ -85,7 +85,7 @@ def design_file(options: SceneFlags) -> DesignFile:
     """Names in the file of --design, if one is given; flags override them."""
     words = [*chain.from_iterable(getattr(options, "design", ()))]
     names = ("preset", "scene", "hand", "objects")
-    flags = {name: given for name in names if (given := getattr(options, name, None))}
+    flags = {name: value for name in names if (value := getattr(options, name, None))}
     return dataclasses.replace(open_designs(words)[1], **flags)
 
 
@@ -118,12 +118,12 @@ def find_case(options: Subject, *, tell: Tell = warn) -> Case:
         engine_and_policy = options.engine or engines.DEFAULT, options.policy or ""
         return Case(scene, space, design, *engine_and_policy)
     subject_flags = {"--hand": options.hand, "--scene": options.scene, "--preset": options.preset}
-    given = ["--design"] * bool(options.design) + [
+    foreign = ["--design"] * bool(options.design) + [
         f for f, v in subject_flags.items() if v is not None
     ]
-    if given:
+    if foreign:
         raise InputError(
-            [f"--run brings design, hand and scene of its own; leave out {' and '.join(given)}"]
+            [f"--run brings design, hand and scene of its own; leave out {' and '.join(foreign)}"]
         )
     replacements = {
         "objects": options.objects,
@@ -207,15 +207,15 @@ def parse_design(
     lows = dict(zip(space.names, space.in_units(np.array(space.low)), strict=True))
     highs = dict(zip(space.names, space.in_units(np.array(space.high)), strict=True))
     units = dict(zip(space.names, space.units, strict=True))
-    given = [pair.partition("=") for pair in pairs]
+    entries = [pair.partition("=") for pair in pairs]
     # A name without an index is all fingers' parameter: one value for each of them.
-    given = [(each, v) for name, _, v in given for each in _members(name, space)]
+    entries = [(each, v) for name, _, v in entries for each in _members(name, space)]
     problems = [
-        f"{where} {name!r} is given more than once: {', '.join(v for n, v in given if n == name)}"
-        for name, count in Counter(name for name, _ in given).items()
+        f"{where} {name!r} is given more than once: {', '.join(v for n, v in entries if n == name)}"
+        for name, count in Counter(name for name, _ in entries).items()
         if count > 1
     ]
-    for name, text in given:
+    for name, text in entries:
         if name in dict(space.idle):
             words = f"{where} {name!r} has no effect: {dict(space.idle)[name]}; leave it out"
             problems.append(words)
@@ -245,11 +245,11 @@ def _members(name: str, space: DesignSpace) -> list[str]:
 def by_default(space: DesignSpace, words: Sequence[str]) -> str:
     """Says which parameters of a design are the hand file's defaults; empty if none is."""
     pairs = chain.from_iterable(open_designs(words)[0].values())
-    given = {each for pair in pairs for each in _members(pair.partition("=")[0], space)}
-    left = [name for name in space.names if name not in given]
+    names = {each for pair in pairs for each in _members(pair.partition("=")[0], space)}
+    left = [name for name in space.names if name not in names]
     if not left:
         return ""
-    if not given:
+    if not names:
         return "the hand file's default design; --design NAME=VALUE changes it"
     groups = dict.fromkeys(name.split("[")[0] for name in left)
     return f"not given, so the hand file's defaults: {', '.join(groups)}"
@@ -285,8 +285,8 @@ def place_problems(flag: str, path: Path | None, *suffixes: str, folder: bool = 
 
 def number_problems(*numbers: tuple[str, float | None, float, float]) -> list[str]:
     """Problems with numbers of a command line."""
-    given = [(flag, v, "", low, high) for flag, v, low, high in numbers if v is not None]
-    return [problem for number in given if (problem := schema.range_problem(*number))]
+    ranges = [(flag, v, "", low, high) for flag, v, low, high in numbers if v is not None]
+    return [problem for number in ranges if (problem := schema.range_problem(*number))]
 
 
 def print_table(console: Console, table: Table) -> None:
@@ -306,10 +306,10 @@ def engine_problems(name: str, overrides: Sequence[Sequence[str]] = ()) -> list[
     """An engine that there is not, or values of [solver] for one that does not read them."""
     if name not in engines.NAMES:
         return [f"--engine = {name!r} is not valid; {schema.nearest(name, engines.NAMES)}"]
-    given = keypaths.parse(chain.from_iterable(overrides)) if name == "structured" else {}
+    values = keypaths.parse(chain.from_iterable(overrides)) if name == "structured" else {}
     return [
         engines.solver_problem(f"--set {'.'.join(path)}={value}", path[1] if path[1:] else "")
-        for path, value in given.items()
+        for path, value in values.items()
         if path[0] == "solver"
     ]
 

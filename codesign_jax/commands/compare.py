@@ -125,10 +125,10 @@ def read_all(every: Mapping[Path, tuple[Scene, Settings]]) -> dict[Path, Compare
 
 def _pair(options: Compare, places: list[Path], *, runs: bool) -> dict[str, Case]:
     """The two designs by what they are called; one alone is with its policy and without it."""
-    given = [_subject(options, place, of_run=runs) for place in places]
-    if runs and (unknown := {*options.policy} - {subject.policy for subject in given}):
+    subjects = [_subject(options, place, of_run=runs) for place in places]
+    if runs and (unknown := {*options.policy} - {subject.policy for subject in subjects}):
         raise InputError([f"--policy {name}: neither run was made with it" for name in unknown])
-    cases = [find_case(subject) for subject in given]
+    cases = [find_case(subject) for subject in subjects]
     names = [str(place) for place in places]
     if len(cases) == 1:
         [case] = cases

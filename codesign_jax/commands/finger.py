@@ -68,8 +68,8 @@ def main(options: Options) -> int:
     console = Console()
     console.print(_about(mine, options.finger, case.scene.hand.name))
     if not options.run_folder:
-        given = [*chain.from_iterable(options.design)]
-        if note := common.by_default(case.space, given):
+        pairs = [*chain.from_iterable(options.design)]
+        if note := common.by_default(case.space, pairs):
             console.print(note)
     table = measured
     if table is None:

@@ -105,7 +105,7 @@ def pull(
     """
     if isinstance(engine, ControlLoop):
         raise InputError(["--pull holds the hand as key frames do: leave out --policy"])
-    held = int(scene.last_step("lift")) + 1
+    steps = int(scene.last_step("lift")) + 1
     step = scene.discretization.timestep
     hands = jax.tree.map(lambda v: jnp.repeat(v[None], len(trials.yaw), 0), params)
     lay = model.layout(scene)
@@ -119,8 +119,8 @@ def pull(
     @jax.jit
     def run(hands: Params, trials: Trial) -> jax.Array:
         fields, ctrl, _ = rollout.prepare(scene, hands, trials)
-        begun = engine.rollout(fields, ctrl[:, :held], trajectory=True)
-        still = ctrl[:, held - 1 : held]
+        begun = engine.rollout(fields, ctrl[:, :steps], trajectory=True)
+        still = ctrl[:, steps - 1 : steps]
         assert begun.last is not None
         first = place(begun.last)
         mass = fields.object_mass[:, None]

@@ -34,9 +34,9 @@ def find(options: GraspFlags) -> PlannedGrasp:
     """The grasp that the flags name; simulates nothing."""
     places = {"--episode": options.episode, "--particle": options.particle}
     places |= {"--trial": options.trial}
-    given = " and ".join(flag for flag, value in places.items() if value is not None)
-    if given and not options.run_folder:
-        raise InputError([f"{given}: numbers of a run's trials.csv, so --run must say of which"])
+    flags = " and ".join(flag for flag, value in places.items() if value is not None)
+    if flags and not options.run_folder:
+        raise InputError([f"{flags}: numbers of a run's trials.csv, so --run must say of which"])
     if options.trial is not None and options.object is not None:
         raise InputError(["--trial and --object exclude each other: a trial has its object"])
     case = find_case(options)

@@ -42,8 +42,8 @@ def check(text: str) -> tuple[str, int, int] | None:
 
 def join(text: str) -> tuple[int, int]:
     """Meets the others, before anything of JAX is used: which of how many processes this is."""
-    given = check(text)
-    address, count, index = given or (None, None, None)
+    membership = check(text)
+    address, count, index = membership or (None, None, None)
     jax.config.update("jax_platforms", "cpu")  # this process leaves the GPUs to the one that runs
     others = "the other processes"
     if count is not None:

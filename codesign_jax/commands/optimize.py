@@ -349,6 +349,6 @@ def _folder(options: Optimize, scene: Scene, settings: Settings) -> Path:
     name = "-".join(names)
     # Whoever wrote the files would choose a place on this disk.
     if name[0] in ".-~" or "/" in name or "\\" in name or len(os.fsencode(name)) > _LONGEST:
-        given = schema.shown(name)
-        raise InputError([f"{given}, of hand and preset, is no name of a folder: give --out"])
+        text = schema.shown(name)
+        raise InputError([f"{text}, of hand and preset, is no name of a folder: give --out"])
     return Path("runs") / name

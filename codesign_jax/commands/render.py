@@ -44,8 +44,8 @@ def _camera(words: Sequence[str]) -> "Camera":
     problems = []
     numbers = {}
     for word in words:
-        name, given, text = word.partition("=")
-        if not given and name in VIEWS:
+        name, equals, text = word.partition("=")
+        if not equals and name in VIEWS:
             camera = VIEWS[name]
             continue
         if name not in _LIMITS:

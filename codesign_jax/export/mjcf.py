@@ -91,8 +91,8 @@ def _written(element: ElementTree.Element, names: dict[str, str], values: Any) -
     """Numbers of those attributes that the writer has given; others have MuJoCo's default."""
     numbers = {}
     for attribute, field in names.items():
-        if (given := element.get(attribute)) is not None:
-            numbers[attribute] = np.ravel(getattr(values, field))[: len(given.split())]
+        if (entry := element.get(attribute)) is not None:
+            numbers[attribute] = np.ravel(getattr(values, field))[: len(entry.split())]
     return numbers
 
 

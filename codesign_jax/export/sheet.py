@@ -224,11 +224,11 @@ def _arm(scene: Scene, params: Params, sizes: Sequence[Size]) -> SheetSection:
         cells = [f"{v + 0.0:.1f}" for v in (x, y, z, *(angles[a] for a in pose.ANGLES))]
         rows.append((f"{time:g}", *cells, " ".join(f"{v + 0.0:.4f}" for v in turn)))
     head = ("time s", "x mm", "y mm", "z mm", *(f"{name} °" for name in pose.ANGLES))
-    held = [i for i, f in enumerate(scene.control.frame) if f.interpolation == "held"]
+    holds = [i for i, f in enumerate(scene.control.frame) if f.interpolation == "held"]
     notes = [
         f"Key frames of the control {scene.control.name!r}: pose of the arm frame, which is the "
         "middle of the palm's underside while the wrist is not deflected; between them linear"
-        + (f", but held after row {', '.join(str(i + 1) for i in held)}" if held else "")
+        + (f", but held after row {', '.join(str(i + 1) for i in holds)}" if holds else "")
         + ". commands_still.csv has every time step of this path, in the same angles, signs and "
         f"quaternion. commands.csv has in addition the shaking that tests the grasp{_shaken(scene)}"
         ": its rows differ from this table there.",

@@ -336,8 +336,8 @@ def _flange_screws(scene: Scene, printed: Printed | None) -> list[tuple[str, str
     diameter, thread, angle, sunk = printed.flange
     # The counterbore is as deep as the head, of the thread's diameter, and half a millimetre.
     counterbore = float(thread.removeprefix("M")) + 0.5 if sunk else 0.0
-    held = 1e3 * scene.hand.palm.thickness - counterbore
-    length = 5 * math.floor((held + ENGAGED + 2.5) / 5)
+    clamped = 1e3 * scene.hand.palm.thickness - counterbore
+    length = 5 * math.floor((clamped + ENGAGED + 2.5) / 5)
     heads = f"heads in counterbores of {counterbore:g} mm" if sunk else "heads below the underside"
     circle = f"circle of {diameter:g} mm, the first {angle:g}° from x"
     if diameter == 31.5:
@@ -346,8 +346,8 @@ def _flange_screws(scene: Scene, printed: Printed | None) -> list[tuple[str, str
         (
             "screws to the wrist",
             "4",
-            f"{thread} x {length}, socket head, from below, {heads}; {held:.1f} mm of palm, "
-            f"{length - held:.1f} mm of thread in the flange: see that it is as deep; {circle}",
+            f"{thread} x {length}, socket head, from below, {heads}; {clamped:.1f} mm of palm, "
+            f"{length - clamped:.1f} mm of thread in the flange: see that it is as deep; {circle}",
         ),
         (
             "adapter plate",

@@ -110,9 +110,9 @@ def candidates(finger: Finger, table: Table) -> dict[str, dict[str, np.ndarray]]
     weight = 0.3 * stiffness / finger.length**2
     tables: dict[str, dict[str, np.ndarray]] = {}
 
-    def add(words: str, column: str, **given: float | np.ndarray) -> None:
-        rows = np.size(given.get("time", np.zeros(ROWS)))
-        whole = {"pressure": 0.0, **given, column: np.nan}
+    def add(words: str, column: str, **columns: float | np.ndarray) -> None:
+        rows = np.size(columns.get("time", np.zeros(ROWS)))
+        whole = {"pressure": 0.0, **columns, column: np.nan}
         tables[words] = {n: np.broadcast_to(np.asarray(v, float), rows) for n, v in whole.items()}
 
     grams = f"{1e3 * weight / swing.GRAVITY:.2g} g"

@@ -28,7 +28,7 @@ def predict(finger: Finger, table: Table) -> dict[str, np.ndarray]:
     """
     rows = len(table["pressure"])
     predicted = {name: np.full(rows, np.nan) for name in MEASURED if name in table}
-    free = held = Rest(np.zeros(finger.links), 0.0, 0.0)
+    free = blocked = Rest(np.zeros(finger.links), 0.0, 0.0)
     for row in np.argsort(table["pressure"], kind="stable"):  # each begins where the last one ended
         pressure = float(table["pressure"][row])
         names = {n for n in predicted if np.isfinite(table[n][row])}
@@ -36,8 +36,8 @@ def predict(finger: Finger, table: Table) -> dict[str, np.ndarray]:
             predicted["blocked_force"][row] = pressure * finger.gain[0] / finger.length
         if "tip_force" in names:
             with contextlib.suppress(NoRest):
-                held = Rest.of(finger, pressure, held=True, start=held)
-                predicted["tip_force"][row] = held.force
+                blocked = Rest.of(finger, pressure, held=True, start=blocked)
+                predicted["tip_force"][row] = blocked.force
         if names.intersection(FREE):
             with contextlib.suppress(NoRest):
                 free = Rest.of(finger, pressure, start=free)

@@ -72,9 +72,9 @@ class Finger(NamedTuple):
         damping_time: float | None = None,
     ) -> "Finger":
         """The finger of other constants of its material; None for its own."""
-        given = (shear_modulus, moment_factor, lateral_factor, torsion_factor, damping_time)
+        values = (shear_modulus, moment_factor, lateral_factor, torsion_factor, damping_time)
         new = Constants(
-            *(b if a is None else a for a, b in zip(given, self.constants, strict=True))
+            *(b if a is None else a for a, b in zip(values, self.constants, strict=True))
         )
         old = self.constants
         softer = new.shear_modulus / old.shear_modulus

@@ -94,9 +94,9 @@ class ModelFields(NamedTuple):
     def qvel(self) -> Any:
         """Generalized velocities at the start, shape (..., nv); zero unless `start` has them."""
         nv = self.num_dofs
-        given = self.start[..., nv + 1 : 2 * nv + 1]
-        if given.shape[-1]:
-            return given
+        speeds = self.start[..., nv + 1 : 2 * nv + 1]
+        if speeds.shape[-1]:
+            return speeds
         return np.zeros((*self.start.shape[:-1], nv), self.start.dtype)
 
 

@@ -61,8 +61,8 @@ class MujocoFields(NamedTuple):
     def of_model(self) -> dict[str, jax.Array]:
         """The fields of mjModel by name, those of its mjOption as "opt.name"."""
         options = ("gravity", "impratio")
-        given = {k: v for k, v in self._asdict().items() if v is not None}
-        return {f"opt.{k}" if k in options else k: v for k, v in given.items()}
+        arrays = {k: v for k, v in self._asdict().items() if v is not None}
+        return {f"opt.{k}" if k in options else k: v for k, v in arrays.items()}
 
 
 def mujoco_fields(scene: Scene, fields: ModelFields, numpy: Any = jnp) -> MujocoFields:
@@ -180,8 +180,8 @@ def _filled(numpy: Any, base: np.ndarray, dtype: Any, *parts: tuple[Any, Any]) -
     source = np.arange(base.size, dtype=np.int32).reshape(base.shape)
     numbers = [numpy.asarray(base, dtype).ravel()]
     count = base.size
-    for places, given in parts:
-        values = numpy.asarray(given, dtype)
+    for places, part in parts:
+        values = numpy.asarray(part, dtype)
         source[places] = np.arange(count, count + values.size).reshape(values.shape)
         numbers.append(values.ravel())
         count += values.size

@@ -169,11 +169,11 @@ def departure(scene: Scene, outcomes: Outcome, ctrl: jax.Array, planned: jax.Arr
     return Departure(first, lower, higher, place.max(1), turn.max(1))
 
 
-def refuse_other_policy(policy: str, given: str | None) -> None:
+def refuse_other_policy(policy: str, named: str | None) -> None:
     """Refuses to import a run's policy that the command line does not name, or to leave it out."""
-    if policy != (given or ""):
+    if policy != (named or ""):
         made = f"--policy {policy}" if policy else "no policy"
-        raise InputError([f"the run was made with {made}; --policy is {given or 'not given'}"])
+        raise InputError([f"the run was made with {made}; --policy is {named or 'not given'}"])
 
 
 def case_of_run(

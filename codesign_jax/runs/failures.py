@@ -46,8 +46,8 @@ def save(folder: Path, episode: int, info: EpisodeInfo) -> list[Path]:
             "bad_step": info.outcomes.bad_step[p, t],
             "place": np.array([episode, p, t]),
         }
-        given = {f"trial_{k}": v for k, v in trial._asdict().items() if v is not None}
-        array_files.save(path, arrays | given)
+        trial_arrays = {f"trial_{k}": v for k, v in trial._asdict().items() if v is not None}
+        array_files.save(path, arrays | trial_arrays)
         files.append(path)
     return files
 

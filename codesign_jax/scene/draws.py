@@ -159,8 +159,8 @@ def check(table: Constants, where: str) -> list[str]:
         place = f"{where}.constant {entry.key}"
         names = ("mean", "sd") if entry.distribution.endswith("normal") else ("low", "high")
         numbers = [getattr(entry, n) for n in names]
-        given = {n for n in ("mean", "sd", "low", "high") if getattr(entry, n) is not None}
-        if given != set(names):
+        present = {n for n in ("mean", "sd", "low", "high") if getattr(entry, n) is not None}
+        if present != set(names):
             words = f"{' and '.join(names)}, and no other number"
             problems.append(f"{place}: distribution {entry.distribution!r} has {words}")
         elif entry.logarithmic and numbers[0] <= 0:

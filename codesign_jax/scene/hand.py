@@ -204,9 +204,9 @@ def _check_presets(
 def _check_fixed(path: str, value: Any, row: Parameter, hand: Hand, problems: list[str]) -> None:
     for number in value if isinstance(value, tuple) else (value,):
         if isinstance(number, bool) or not isinstance(number, int | float):
-            given = list(value) if isinstance(value, tuple) else value
+            numbers = list(value) if isinstance(value, tuple) else value
             many = ", or one for each finger" if row.per == "finger" else ""
-            problems.append(f"{path} = {schema.shown(given)} must be a number [{row.unit}]{many}")
+            problems.append(f"{path} = {schema.shown(numbers)} must be a number [{row.unit}]{many}")
             return
     if _fits(path, value, row, hand, problems):
         for finger, (number, low, high) in _by_finger(value, row.low, row.high):

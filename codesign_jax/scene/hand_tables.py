@@ -321,9 +321,9 @@ class Free:
         """Groups of tied values among `count`, ordered by their first members."""
         if self.tied is True:
             return [tuple(range(count))]
-        given = () if self.tied is False else self.tied
-        others = {*range(count)} - {k for group in given for k in group}
-        return sorted([*given, *((k,) for k in others)], key=min)
+        groups = () if self.tied is False else self.tied
+        others = {*range(count)} - {k for group in groups for k in group}
+        return sorted([*groups, *((k,) for k in others)], key=min)
 
     def joined(self, groups: tuple[tuple[int, ...], ...], count: int) -> "Free":
         """The parameter where further groups among `count` values are tied."""

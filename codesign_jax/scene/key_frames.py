@@ -159,8 +159,8 @@ def read_parameters(rows: Any, where: str) -> tuple[ControlParameter, ...]:
     """Parameters from rows as those of a file, for what else than key frames has some."""
     problems: list[str] = []
     reader = _Reader({}, where, 0, problems)
-    given = [keypaths.plain(row, where) for row in rows]
-    parsed = [schema.parse(ControlParameter, row, where, problems) for row in given]
+    tables = [keypaths.plain(row, where) for row in rows]
+    parsed = [schema.parse(ControlParameter, row, where, problems) for row in tables]
     for i, row in enumerate(parsed):
         if row is not None:
             reader.parameter(row, f"{where}[{i}]")
@@ -200,8 +200,8 @@ def poses(scene: Any, params: Params, count: int | None = None) -> jax.Array:
     pose["z"] = scene.arm.start_height
     rows = []
     for frame in scene.control.frame[:count]:
-        given = {axis: getattr(frame, axis) for axis in POSE}
-        pose |= {axis: _value(v, names) for axis, v in given.items() if v is not None}
+        fields = {axis: getattr(frame, axis) for axis in POSE}
+        pose |= {axis: _value(v, names) for axis, v in fields.items() if v is not None}
         rows.append(jnp.stack([jnp.asarray(v, dtype) for v in pose.values()]))
     return jnp.stack(rows)
 
@@ -266,9 +266,9 @@ def _factors(total: Sum) -> dict[str, Any]:
 
 
 def _frame_table(frame: Frame) -> dict[str, Any]:
-    given = {f.name: getattr(frame, f.name) for f in dataclasses.fields(frame)}
+    fields = {f.name: getattr(frame, f.name) for f in dataclasses.fields(frame)}
     entries = {
-        k: sums.text(v) if isinstance(v, Sum) else v for k, v in given.items() if v is not None
+        k: sums.text(v) if isinstance(v, Sum) else v for k, v in fields.items() if v is not None
     }
     if frame.pressure is not None:
         values = [sums.text(v) for v in frame.pressure]
@@ -361,9 +361,9 @@ class _Reader:
                     why = schema.nearest(name, self.groups)
                     self.problems.append(f"{path}.{name} is not a group; {why}")
                     continue
-                given = self._sum(entry, f"{path}.{name}", "Pa")
+                total = self._sum(entry, f"{path}.{name}", "Pa")
                 for finger in self.groups[name]:
-                    per_finger[finger] = given
+                    per_finger[finger] = total
         elif isinstance(value, list):
             if len(value) != self.fingers:
                 self.problems.append(
@@ -439,8 +439,8 @@ def doubts(scene: Any, where: str) -> list[str]:
 def _faint(control: Control, where: str) -> Iterator[str]:
     """Numbers that are pressures of nearly zero."""
     for i, frame in enumerate(control.frame):
-        given = dict.fromkeys(v.number for v in frame.pressure or () if v.number is not None)
-        for number in given:
+        numbers = dict.fromkeys(v.number for v in frame.pressure or () if v.number is not None)
+        for number in numbers:
             if words := unit_slips.kilopascals(number):
                 yield f"{where}.frame[{i}].pressure: its number {words}"
     for row in control.parameter:

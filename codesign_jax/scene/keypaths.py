@@ -48,8 +48,8 @@ def parse(pairs: Iterable[str]) -> dict[Path, Any]:
         key, equals, text = pair.partition("=")
         path = _path(key.strip())
         if not equals or not all(path):
-            given = schema.shown(pair)
-            problems.append(f"--set {given} must be KEY=VALUE, such as discretization.links=5")
+            shown = schema.shown(pair)
+            problems.append(f"--set {shown} must be KEY=VALUE, such as discretization.links=5")
         else:
             values.pop(path, None)  # values are applied in the order in which they were given
             values[path] = _toml_value(text)
@@ -164,7 +164,7 @@ def _apply(
     places: dict[str, str],
 ) -> None:
     """Changes one value; `where` has the names of the place in messages, and as it is given."""
-    names, given = where
+    names, place_name = where
     rest = path[1:]
     key: Any = path[0]
     if len(rest) >= library.DEEPEST:
@@ -174,7 +174,7 @@ def _apply(
         index = _index(place, key)
         if index is None:
             hint = schema.nearest(key, _names(place))
-            problems.append(f"{given} has no entry {schema.shown(key)}; {hint}")
+            problems.append(f"{place_name} has no entry {schema.shown(key)}; {hint}")
             return
         # The schema names an entry by its index, other checks by its name.
         names = tuple(n + form for n in names for form in (f"[{index}]", f" {key}"))
@@ -183,18 +183,18 @@ def _apply(
         names = tuple(f"{name}.{key}" for name in names)
     else:
         value = schema.shown(place)
-        problems.append(f"{given} = {value} is no table: it has no key {schema.shown(key)}")
+        problems.append(f"{place_name} = {value} is no table: it has no key {schema.shown(key)}")
         return
-    given += f"[{path[0]}]" if path[0].isdecimal() else "." * bool(given) + path[0]
+    place_name += f"[{path[0]}]" if path[0].isdecimal() else "." * bool(place_name) + path[0]
     if not rest or (isinstance(place, dict) and key not in place):
-        places |= dict.fromkeys(names, given)
+        places |= dict.fromkeys(names, place_name)
     if not rest:
         place[key] = value
         return
     if isinstance(place, dict):
         # A table that the file leaves out; if there is no such table, the schema says so.
         place.setdefault(key, {})
-    _apply(place[key], rest, value, (names, given), problems, places)
+    _apply(place[key], rest, value, (names, place_name), problems, places)
 
 
 def _names(entries: list[Any]) -> list[str]:

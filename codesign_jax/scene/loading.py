@@ -78,8 +78,8 @@ def load(
         parsed = _with_law(parsed, parts["hand"].material, path.name, problems)
         problems = keypaths.as_given(problems, places)
         # A path that the caller gives is not beside the scene's file.
-        given = ("control",) in top_level
-        source = parsed.control if given else _beside(path, parsed.control)
+        from_caller = ("control",) in top_level
+        source = parsed.control if from_caller else _beside(path, parsed.control)
         try:
             parts["control"] = key_frames.load(source, parts["hand"], overrides=inside["control"])
         except schema.InputError as error:

@@ -280,9 +280,9 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Obj
     return ObjectSet(parsed.name, parsed.description, parsed.noise, parsed.table, shapes_read)
 
 
-def _size_problems(given: _ObjectSetFile, path: Path) -> list[str]:
+def _size_problems(object_set: _ObjectSetFile, path: Path) -> list[str]:
     total = 0
-    for file in [path.parent / shape.file for shape in given.object if shape.file is not None]:
+    for file in [path.parent / shape.file for shape in object_set.object if shape.file is not None]:
         with contextlib.suppress(OSError, ValueError):  # said where it is read
             total += file.stat().st_size
     if total <= MOST_BYTES:
@@ -290,54 +290,54 @@ def _size_problems(given: _ObjectSetFile, path: Path) -> list[str]:
     return [f"{path.name}: the meshes have {total >> 20} MiB, more than {MOST_BYTES >> 20} MiB"]
 
 
-def _key_problems(given: _ShapeFile, where: str) -> list[str]:
+def _key_problems(entry: _ShapeFile, where: str) -> list[str]:
     """Problems with keys that do not go together."""
     problems = []
-    kind = given.type
-    if (given.mass is None) == (given.density is None):
+    kind = entry.type
+    if (entry.mass is None) == (entry.density is None):
         problems.append(f"{where}: a {kind} has either a mass or a density")
-    if given.inertia is not None and given.mass is None:
+    if entry.inertia is not None and entry.mass is None:
         problems.append(f"{where}: inertia goes with a mass, not with a density")
-    if given.pose is not None and given.orientation is not None:
+    if entry.pose is not None and entry.orientation is not None:
         problems.append(f"{where}: give either orientation or pose")
-    if given.orientation is not None and (
-        why := rigid_bodies.orientation_problem(given.orientation)
+    if entry.orientation is not None and (
+        why := rigid_bodies.orientation_problem(entry.orientation)
     ):
         problems.append(f"{where}: orientation {why}")
-    if given.centre_of_mass is not None and len(given.centre_of_mass) != 3:
+    if entry.centre_of_mass is not None and len(entry.centre_of_mass) != 3:
         problems.append(f"{where}: centre_of_mass must have three coordinates")
     if kind == "mesh":
-        missing = ["file"] if given.file is None else []
-        foreign = ["size"] if given.size is not None else []
+        missing = ["file"] if entry.file is None else []
+        foreign = ["size"] if entry.size is not None else []
     else:
-        missing = ["size"] if given.size is None else []
-        foreign = [k for k in _MESH_KEYS if getattr(given, k) is not None]
+        missing = ["size"] if entry.size is None else []
+        foreign = [k for k in _MESH_KEYS if getattr(entry, k) is not None]
         sizes = PRIMITIVES[kind].sizes
-        if given.size is not None and len(given.size) != len(sizes):
+        if entry.size is not None and len(entry.size) != len(sizes):
             problems.append(
-                f"{where}: size of a {kind} has {len(sizes)} values, not {len(given.size)}"
+                f"{where}: size of a {kind} has {len(sizes)} values, not {len(entry.size)}"
                 f" ({', '.join(sizes)})"
             )
-        shifted = given.centre_of_mass is not None
-        if given.inertia is not None and any(given.inertia[3:]) and not shifted:
+        shifted = entry.centre_of_mass is not None
+        if entry.inertia is not None and any(entry.inertia[3:]) and not shifted:
             problems.append(f"{where}: inertia of a {kind} is xx, yy and zz in its own axes")
     problems += [f"{where}: {key} of a {kind} is missing" for key in missing]
     problems += [f"{where}: a {kind} has no {key}" for key in foreign]
     return problems
 
 
-def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
+def _shape(entry: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
     """The object of a table; None with problems, which are added to the others."""
-    where = f"{path.name}.object {given.name}"
-    kind = given.type
-    if key_problems := _key_problems(given, where):
+    where = f"{path.name}.object {entry.name}"
+    kind = entry.type
+    if key_problems := _key_problems(entry, where):
         problems += key_problems
         return None
-    values = {f.name: getattr(given, f.name) for f in dataclasses.fields(given)}
+    values = {f.name: getattr(entry, f.name) for f in dataclasses.fields(entry)}
     try:
         if kind == "mesh":
             shape = _mesh_shape(values, path, where, problems)
-        elif given.centre_of_mass is not None:
+        elif entry.centre_of_mass is not None:
             shape = _off_centre(values, path, where, problems)
         else:
             shape = _primitive(values)
@@ -346,13 +346,13 @@ def _shape(given: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
         return None
     if shape is None:
         return None
-    if given.inertia is not None:
-        why = rigid_bodies.inertia_problem(given.inertia, shape.mass, shape.radius)
+    if entry.inertia is not None:
+        why = rigid_bodies.inertia_problem(entry.inertia, shape.mass, shape.radius)
         problems += [f"{where}: inertia {why}"] if why else []
-    if given.pose is not None:
-        resting = rigid_bodies.chosen(given.pose, shape.resting)
+    if entry.pose is not None:
+        resting = rigid_bodies.chosen(entry.pose, shape.resting)
         if isinstance(resting, str):
-            problems.append(f"{where}: pose = {schema.shown(given.pose)} {resting}")
+            problems.append(f"{where}: pose = {schema.shown(entry.pose)} {resting}")
             return None
         # Written back as an orientation, so that another trimesh reads the same object.
         shape = dataclasses.replace(shape, pose=None, orientation=resting.orientation)

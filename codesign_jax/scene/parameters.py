@@ -325,15 +325,15 @@ class DesignSpace:
           InputError: If the last axis is not that of the parameters, or a number is not finite.
         """
         self._refuse_shape(design, "..., ")
-        given = np.asarray(design, float)
+        values = np.asarray(design, float)
         scale = np.asarray(self.scale)
-        rows = given.reshape(-1, self.num_parameters)
+        rows = values.reshape(-1, self.num_parameters)
         self._refuse_infinite(rows)
         problems = self._outside(self.units, self.low / scale, self.high / scale, rows)
         if words := "; ".join(problems):
             text = f"design outside of the space's bounds, which is simulated all the same: {words}"
             warnings.warn(text, stacklevel=2)
-        return given * scale
+        return values * scale
 
 
 @functools.partial(jax.jit, static_argnums=0)

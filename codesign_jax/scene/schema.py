@@ -260,8 +260,8 @@ def _check_when_made(cls: type) -> None:
     numbers = [field for field in dataclasses.fields(cls) if _is_leaf(field)]
 
     @functools.wraps(make)
-    def checked(self: Any, *given: Any, **named: Any) -> None:
-        make(self, *given, **named)
+    def checked(self: Any, *arguments: Any, **named: Any) -> None:
+        make(self, *arguments, **named)
         checks = (_known_problem(f"{name}.{f.name}", getattr(self, f.name), f) for f in numbers)
         if problems := [problem for problem in checks if problem]:
             raise InputError(problems)

@@ -115,19 +115,19 @@ def unit_words(name: str, factor: float | None, unit: str) -> str | None:
 class _Reader:
     """Reads the text of one sum; a ValueError says what is wrong with it."""
 
-    def __init__(self, given: str):
-        self.tokens = self._tokens(texts.typed(given))
+    def __init__(self, expression: str):
+        self.tokens = self._tokens(texts.typed(expression))
         self.place = 0
 
     @staticmethod
-    def _tokens(given: str) -> list[tuple[str, str]]:
+    def _tokens(expression: str) -> list[tuple[str, str]]:
         tokens = []
         place = 0
-        given = given.rstrip()
-        while place < len(given):
-            match = _TOKEN.match(given, place)
+        expression = expression.rstrip()
+        while place < len(expression):
+            match = _TOKEN.match(expression, place)
             if match is None:
-                raise ValueError(_foreign(given[place:].lstrip()[0]))
+                raise ValueError(_foreign(expression[place:].lstrip()[0]))
             kind = str(match.lastgroup)
             tokens.append((kind, match[kind]))
             place = match.end()

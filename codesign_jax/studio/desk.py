@@ -129,14 +129,14 @@ class Desk:
 
     def flags(self, accuracy: str) -> list[str]:
         """Flags that name to another command what a design's file does not."""
-        given = self.options
+        options = self.options
         named = {"accuracy": accuracy or self.options.accuracy}
-        named |= {"engine": self.case.engine, "policy": given.policy}
-        named |= {"constants": given.constants}
+        named |= {"engine": self.case.engine, "policy": options.policy}
+        named |= {"constants": options.constants}
         flags = [word for k, v in named.items() if v is not None for word in (f"--{k}", v)]
-        for words in given.overrides:
+        for words in options.overrides:
             flags += ["--set", *words]
-        return flags + ["--robust"] * given.robust
+        return flags + ["--robust"] * options.robust
 
     @contextlib.contextmanager
     def reserved(self, stem: str, ending: str = "") -> Iterator[Path]:

@@ -84,8 +84,8 @@ class Guard:
         if path != "/":
             words = "There is the page / alone. A proxy has to take its own path away. "
             return connection.respond(HTTPStatus.NOT_FOUND, words + tunnel)
-        given = parse_qs(query).get("token", [""])[0]
-        if not (self._known(given) or self._known(_cookie(headers, cookie))):
+        token = parse_qs(query).get("token", [""])[0]
+        if not (self._known(token) or self._known(_cookie(headers, cookie))):
             return connection.respond(HTTPStatus.FORBIDDEN, _MISSING)
         more = Headers()
         more["Content-Type"] = "text/html; charset=utf-8"

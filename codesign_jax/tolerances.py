@@ -193,7 +193,8 @@ def table(
     """The deviations of a hand, and their kinds.
 
     Args:
-      tolerance_widths: Tolerances by name in their units; others have their usual values, those of 0 none.
+      tolerance_widths: Tolerances by name in their units; others have their usual values, those
+        of 0 none.
     """
     entries = []
     kinds = []

@@ -34,7 +34,7 @@ NOISE = {"angle": 0.02, "tip_force": 0.05, "sideways": 0.03, "drop": 0.02}
 """Noise of a column, of its root mean square."""
 
 
-def measured(truth: finger.Finger) -> dict[str, dict[str, np.ndarray]]:
+def measure(truth: finger.Finger) -> dict[str, dict[str, np.ndarray]]:
     """Tables of each measurement, with its noise."""
     random = np.random.default_rng(71)
     pressure = np.linspace(10e3, 60e3, 6)
@@ -76,7 +76,7 @@ def main() -> int:
     loaded = scene.load("paper")
     space = parameters.design_space(loaded.hand, "2d")
     mine = finger.of_design(loaded, space.params(space.from_units([110.0, 0.0])), 0)
-    every = measured(mine.of_material(**TRUTH))
+    every = measure(mine.of_material(**TRUTH))
     steps = list(every)
     rows = [["measured", *(f"{label} ± %" for label in LABELS.values()), "next"]]
     intervals = []

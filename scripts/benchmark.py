@@ -114,7 +114,7 @@ def _outcomes(chosen: Scene, result: Any) -> Outcome:
     return jax.tree.map(np.asarray, result)
 
 
-def measured(chosen: Scene, designs: str, engine: str, count: int, calls: int) -> dict[str, Any]:
+def measure(chosen: Scene, designs: str, engine: str, count: int, calls: int) -> dict[str, Any]:
     """Times one batch, compiled and warmed up before."""
     program = _program(chosen, engine, make_worlds(chosen, designs, count))
     result, first = program.run()
@@ -291,7 +291,7 @@ def main() -> None:
                     begin = time.perf_counter()
                     new = {"scene": name, "designs": designs, "engine": named(engine)}
                     new |= {"worlds": count, "run": len(content["runs"]) - 1}
-                    new |= measured(chosen, designs, engine, count, args.calls)
+                    new |= measure(chosen, designs, engine, count, args.calls)
                     content["records"] = replaced(content["records"], new)
                     output.write_json(args.json, content)
                     words = f"{new['grasps_per_s']} grasps/s, kept {new['kept']:.0%}"

@@ -230,7 +230,7 @@ def numbers(the_scene: Scene, chosen: Mapping[str, np.ndarray]) -> Scene:
     return c
 
 
-def scored(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def load_scores(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Sets in the unit cube, (set, constant), and distances, (set, statement), of a score's file.
 
     A constant of the file that is not in `OPEN` any more is left out.
@@ -249,7 +249,7 @@ def scored(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def left(path: Path = DATA) -> np.ndarray:
     """Sets that no target ruled out, of a file of scores, in the unit cube, (set, constant)."""
-    units, distances = scored(path)
+    units, distances = load_scores(path)
     return units[(distances <= CUTOFF).all(-1)]
 
 
@@ -525,7 +525,7 @@ def score_file(path: Path, the_scene: Scene) -> int:
 def sets_of(args: Any, the_scene: Scene) -> np.ndarray:
     """The sets of a wave: around the best of another one or filling the ranges, then the own."""
     if args.near:
-        units = near_best(*scored(args.near), args.sets, args.seed)
+        units = near_best(*load_scores(args.near), args.sets, args.seed)
     else:
         units = space_filling(args.sets, args.seed)
     scene_set = own_set(the_scene)
@@ -558,7 +558,7 @@ def main() -> int:
         units = sets_of(args, the_scene)
         done = []
         if args.out.exists():
-            done = [simulated(args.out, units)]
+            done = [load_costs(args.out, units)]
     except InputError as error:
         parser.error(str(error))
     space = parameters.design_space(the_scene.hand, "2d")
@@ -575,7 +575,7 @@ def main() -> int:
     return 0
 
 
-def simulated(path: Path, units: np.ndarray) -> np.ndarray:
+def load_costs(path: Path, units: np.ndarray) -> np.ndarray:
     """Costs of the first sets of a wave, of the file that it has written so far.
 
     Raises:

@@ -222,7 +222,7 @@ def surface_depths(
     return depths
 
 
-def measured(
+def measure(
     scene: Scene, params: Any, trial: Any, qpos: np.ndarray, recorded: dict[str, np.ndarray]
 ) -> dict[str, float]:
     """Depths [mm], durations [s], and bending while held, of a grasp in states (state, nq).
@@ -325,7 +325,7 @@ def grasps(scene: Scene, designs: np.ndarray, args: argparse.Namespace) -> list[
                 if kept[i]:
                     states = trace.qpos[i, start:]
                     depth = {k: v[i, start:] for k, v in trace.forces.depth.items()}
-                    pending.append((row, pool.submit(measured, scene, hand, trial, states, depth)))
+                    pending.append((row, pool.submit(measure, scene, hand, trial, states, depth)))
             for row, depths in pending:
                 row |= depths.result()
             print(f"{len(rows):,} of {total:,}", flush=True)

@@ -244,7 +244,7 @@ WAYS = (*WHOLE_FILE, *AT_A_PLACE)
 READERS = (("evaluate", "--dry-run", "--run"), ("landscape", "--dry-run"), ("report",))
 
 
-def damaged(path: Path, way: str, place: float = 0.5) -> None:
+def damage(path: Path, way: str, place: float = 0.5) -> None:
     """Damages a file: as a whole, or at a place, which is a share of its bytes."""
     data = path.read_bytes()
     at = int(place * len(data))
@@ -284,7 +284,7 @@ def test_damage_is_mended_or_refused(way, number, finished, tmp_path):
         pytest.skip("every file was damaged in this way")
     name, place = cases[number]
     folder = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True))
-    damaged(folder / name, way, place)
+    damage(folder / name, way, place)
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     for reader, *flags in READERS:
         out = ["--out", tmp_path / "out.html"] if reader == "report" else []

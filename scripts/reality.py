@@ -39,7 +39,7 @@ BARE += " finger_finger finger_palm finger_itself friction_memory disturb"
 """Effects without which a finger is a beam in the air on a fixed base."""
 
 
-def measured() -> dict[str, Any]:
+def measurements() -> dict[str, Any]:
     """The tables of docs/data/measured.toml."""
     return tomllib.loads(MEASURED.read_text(encoding="utf-8"))
 
@@ -258,7 +258,7 @@ def tension() -> dict[str, Any]:
 
 def plane_strain() -> Any:
     """Measured stress in plane strain [kPa] of Ecoflex 00-30 as a function of strain."""
-    table = measured()["plane_strain"]
+    table = measurements()["plane_strain"]
     return lambda strain: np.interp(strain, [0, *table["strain"]], [0, *table["stress"]])
 
 
@@ -346,7 +346,7 @@ def draw_laws(folder: Path) -> Path:
     """Measured plane strain beside both laws, each with the modulus that bends walls best."""
     figure = output.new_figure(8.4, 3.0)
     left, right = figure.subplots(1, 2)
-    table = measured()["plane_strain"]
+    table = measurements()["plane_strain"]
     stress = plane_strain()
     strains = STRAINS[:-1]
     strain = np.linspace(0, 1.25, 100)
@@ -369,7 +369,7 @@ def main() -> int:
     parser.add_argument("--figures", type=Path, default=DOCS / "figures", metavar="FOLDER")
     parser.add_argument("--pages", action="store_true", help="fill the tables into the pages")
     args = parser.parse_args()
-    beam = measured()["beam"]
+    beam = measurements()["beam"]
     rings = {}
     curves = {}
     try:

@@ -98,7 +98,7 @@ def test_after_a_failed_save_its_threads_are_silent_and_no_others(tmp_path, monk
 def test_damage_of_any_file_falls_back_to_the_step_before(folder, way):
     for path in [p for p in sorted((folder / "4").rglob("*")) if p.is_file()]:
         content = path.read_bytes()
-        faults.damaged(path, way)
+        faults.damage(path, way)
         restored = restore(folder)
         assert restored.step == 3, path
         assert equal(restored.arrays, arrays(3))

@@ -47,7 +47,7 @@ def test_damage_of_the_newest_checkpoint_is_said_and_nothing_is_changed(way, run
     """Of another file in each way; `test_checkpoint` has every file."""
     step = run / "checkpoints" / str(NEWEST)
     paths = [p for p in sorted(step.rglob("*")) if p.stat().st_size and p.is_file()]
-    faults.damaged(paths[faults.WAYS.index(way) % len(paths)], way)
+    faults.damage(paths[faults.WAYS.index(way) % len(paths)], way)
     before = sorted(os.walk(run))
     said = []
     record = runs.load_record(run, tell=said.append)
@@ -64,7 +64,7 @@ def test_damage_of_the_newest_checkpoint_is_said_and_nothing_is_changed(way, run
 def test_a_resumption_mends_damage_and_says_so(name, way, run, whole, capsys):
     """From the older checkpoint, to the same bits: of the file of digests, and of the data."""
     largest = max((run / "checkpoints" / str(NEWEST)).rglob("d/*"), key=lambda p: p.stat().st_size)
-    faults.damaged(largest if name == "d" else run / "checkpoints" / f"{NEWEST}.sha256", way)
+    faults.damage(largest if name == "d" else run / "checkpoints" / f"{NEWEST}.sha256", way)
     assert command(*RUN, "--out", run) == 0
     assert f"checkpoint {NEWEST} is lost" in capsys.readouterr().out
     assert f"checkpoint {NEWEST} is lost" in (run / "events.log").read_text()

@@ -86,17 +86,17 @@ def test_a_second_wave_is_near_the_best_of_the_first(tmp_path):
     more = np.insert(units, 4, 0.5, axis=1)
     arrays = dict(units=more, distances=distances, names=[*names[:4], "shear_modulus", *names[4:]])
     output.write_arrays(path, arrays)
-    np.testing.assert_array_equal(calibration.scored(path)[0], units)
+    np.testing.assert_array_equal(calibration.load_scores(path)[0], units)
     output.write_arrays(path, dict(units=units[:, 1:], distances=distances, names=names[1:]))
     with pytest.raises(scene.InputError, match="has no constant tilt"):
-        calibration.scored(path)
+        calibration.load_scores(path)
     # So are costs of other sets.
     wave = tmp_path / "wave.npz"
     output.write_arrays(wave, dict(units=units, costs=np.zeros((7, 2, 2, 3))))
-    assert len(calibration.simulated(wave, units)) == 7
-    assert len(calibration.simulated(wave, np.concatenate([units[:9], near]))) == 7
+    assert len(calibration.load_costs(wave, units)) == 7
+    assert len(calibration.load_costs(wave, np.concatenate([units[:9], near]))) == 7
     with pytest.raises(scene.InputError, match="has other sets"):
-        calibration.simulated(wave, near)
+        calibration.load_costs(wave, near)
     lines = calibration.summary(units, {"middle": 9 * distances[:, 0], "first": distances[:, 1]})
     assert lines[0] == f"{(9 * distances[:, 0] <= 3).sum()} of 40 sets are not ruled out"
     assert [line.split()[0] for line in lines[4:-1]] == names
@@ -298,7 +298,7 @@ def test_every_variant_is_a_scene_and_every_row_has_its_variants(tmp_path):
     named |= {*report.PRESETS, *report.CANDIDATES, *budget.TIMED, *report.WORDS}
     assert named <= set(budget.VARIANTS)
     assert len({budget.path_of(tmp_path, name) for name in budget.VARIANTS}) == len(scenes)
-    json.dumps(budget.merged(tmp_path))
+    json.dumps(budget.merge(tmp_path))
 
 
 def test_the_page_has_the_tables_of_its_data(monkeypatch):

@@ -83,19 +83,21 @@ def simulate(
     trials = len(case.scene.objects.object)
     count = max(_LEAST, (options.grasps or settings.particles * settings.trials) // trials)
     with Busy(console, "compiling") as busy:
-        run, compiling = _compiled(case.scene, engines[0], case, count)
+        run, compiling = _compile(case.scene, engines[0], case, count)
         busy.say("simulating at the scene's accuracy")
         designs, words = _sample(options, case, run, count)
         drawn = _draw(case, 1, 0, count).trials
-        outcomes, seconds = min((_timed(run, designs, drawn) for _ in range(2)), key=lambda m: m[1])
+        outcomes, seconds = min(
+            (_time_call(run, designs, drawn) for _ in range(2)), key=lambda m: m[1]
+        )
         usual = Measured(case.scene, outcomes, seconds, compiling)
         few = options.seconds * usual.rate / reference.steps_and_links(case.scene) / trials
         few = int(np.clip(few, _LEAST, count))
         busy.say(f"compiling at accuracy {reference.ACCURACY}")
-        run, compiling = _compiled(finer, engines[1], case, few)
+        run, compiling = _compile(finer, engines[1], case, few)
         busy.say(f"simulating {few * trials} grasps at accuracy {reference.ACCURACY}")
         some = designs[:few], jax.tree.map(lambda v: v[:few], drawn)
-        fine = Measured(finer, *_timed(run, *some), compiling)
+        fine = Measured(finer, *_time_call(run, *some), compiling)
     return words, usual, fine
 
 
@@ -149,7 +151,7 @@ def _without_own_code(settings: Settings) -> Settings:
 Run = Callable[[jax.Array, Trial], Outcome]
 
 
-def _compiled(scene: Scene, engine: Engine, case: Case, count: int) -> tuple[Run, float]:
+def _compile(scene: Scene, engine: Engine, case: Case, count: int) -> tuple[Run, float]:
     program = sampling.make_simulate(scene, engine, case.space)
     like = _draw(case, 0, 0, count)
     begin = time.perf_counter()
@@ -162,7 +164,7 @@ def _draw(case: Case, stream: int, first: int, count: int) -> sampling.Drawn:
     return sampling.draw(case.scene, case.space, key, **sizes)
 
 
-def _timed(run: Run, designs: jax.Array, trials: Trial) -> tuple[Outcome, float]:
+def _time_call(run: Run, designs: jax.Array, trials: Trial) -> tuple[Outcome, float]:
     begin = time.perf_counter()
     outcomes = jax.tree.map(np.asarray, interruptible(run, designs, trials))
     return outcomes, time.perf_counter() - begin
@@ -189,7 +191,7 @@ def _mixed(options: Check, case: Case, run: Run, count: int) -> tuple[np.ndarray
     costs = []
     while len(designs) < _ROUNDS and time.perf_counter() - begin < options.seconds / _ROUNDS:
         drawn = _draw(case, 0, count * len(designs), count)
-        outcomes, _ = _timed(run, *drawn)
+        outcomes, _ = _time_call(run, *drawn)
         designs.append(np.asarray(drawn.designs))
         costs.append(np.where(failed(outcomes.status), np.inf, outcomes.cost).mean(1))
     every = np.concatenate(designs)

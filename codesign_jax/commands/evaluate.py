@@ -105,7 +105,7 @@ def simulate(case: Case, options: Evaluate, console: Console) -> types.Outcome:
     if trials is None:
         later = _of_each(options) * stress.sets(case.scene) if options.stress else 0
         with Meter("trials", verdict.USUAL, console, later=later) as meter:
-            outcomes = reference.decided(case, key, verdict.MOST, meter)
+            outcomes = reference.decide(case, key, verdict.MOST, meter)
     else:
         with Busy(console, f"simulating {common.counted(trials, 'grasp')}"):
             outcomes = case.simulate(trials, key)

@@ -54,7 +54,7 @@ def main(options: Options) -> int:
     console.print(f"grasps: {len(made.designs) * options.trials} in {count}")
     if options.dry_run:
         return 0
-    simulated = simulated_designs(case, made, size, options, console)
+    simulated = simulate_designs(case, made, size, options, console)
     result = summarize(case, made, simulated, options.seed)
     print_summary(case, result, console)
     write_files(result, folder, console)
@@ -98,7 +98,7 @@ def make_plane(case: Case, pair: tuple[Axis, Axis]) -> Plane:
     return Plane(pair, np.asarray(projected), grid.numbers(case.scene, pair))
 
 
-def simulated_designs(
+def simulate_designs(
     case: Case, made: Plane, size: int, options: Options, console: Console
 ) -> Outcome:
     """Outcomes, arrays of shape (point, trial); all points meet trials of the same key."""
@@ -119,7 +119,7 @@ def _in_scenes(
     size: int,
     advance: Callable[[int], None],
 ) -> Outcome:
-    """Like `simulated_designs`, with a scene for each point; one program simulates all."""
+    """Like `simulate_designs`, with a scene for each point; one program simulates all."""
     key, count = noise
     base, tree = jax.tree.flatten(case.scene)
     varied = (numbers != numbers[0]).any(0)

@@ -70,14 +70,14 @@ def test(
         def keep(outcomes: Outcome) -> None:
             array_files.save_results(folder / FILE, about, outcomes._asdict())
 
-        outcomes = decided(case, key, most, meter, kept, keep)
+        outcomes = decide(case, key, most, meter, kept, keep)
     if kept is None or outcomes.cost.size > kept.cost.size:
         drawn = rollout.sample_trials(case.scene, key, outcomes.cost.size)
         tables.write_grasps(folder / columns.REFERENCE, case.scene, drawn, outcomes)
     return outcomes
 
 
-def decided(
+def decide(
     case: Case,
     key: jax.Array,
     most: int,

@@ -109,7 +109,7 @@ def mean_cost(scene: Scene, outcomes: Outcome) -> str:
 
 def solver(outcomes: Outcome) -> list[str]:
     """A line on how often the solver stopped at its limit; no line if it never did."""
-    shares, residuals = (_told(v) for v in (outcomes.capped, outcomes.residual))
+    shares, residuals = (_finite(v) for v in (outcomes.capped, outcomes.residual))
     if not shares.any():
         return []
     text = f"solver: {100 * shares.mean():.2g} % of the steps ended at the limit of iterations"
@@ -120,7 +120,7 @@ def solver(outcomes: Outcome) -> list[str]:
     return [text]
 
 
-def _told(values: Any) -> np.ndarray:
+def _finite(values: Any) -> np.ndarray:
     """The numbers among values; none for None."""
     numbers = np.ravel(np.asarray(values, float))
     return numbers[np.isfinite(numbers)]

@@ -192,7 +192,7 @@ def _trials(history: History, scene: Scene, span: range) -> Iterator[Row]:
             yield cells | _ending(jax.tree.map(lambda v, at=(e, i, t): v[at], trials))
 
 
-def _told(value: Any) -> str:
+def _number_or_empty(value: Any) -> str:
     """A number; empty if it is not one, or none was told."""
     return "" if value is None or np.isnan(value) else _number(value)
 
@@ -205,8 +205,8 @@ def _ending(outcome: Outcome) -> Row:
         "lost_time_s": _number(outcome.lost_time),
         "status": status_names(outcome.status),
         "first_bad_step": bad_step if bad_step >= 0 else "",
-        "steps_at_limit": _told(outcome.capped),
-        "residual": _told(outcome.residual),
+        "steps_at_limit": _number_or_empty(outcome.capped),
+        "residual": _number_or_empty(outcome.residual),
     }
 
 

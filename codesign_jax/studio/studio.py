@@ -83,7 +83,7 @@ class Studio:
         self._wake = threading.Event()
         self._begun = self._ended = False
         self.guard = server.Guard(_page(), everywhere=desk.options.host not in LOCAL)
-        self._told: dict[str, Any] = {}  # of the newest command, for tabs that connect again
+        self._messages: dict[str, Any] = {}  # of the newest command, for tabs that connect again
 
     def listen(self, host: str, port: int) -> tuple[Server, str]:
         """A server whose `serve_forever` serves the studio, and the page's address."""
@@ -104,7 +104,7 @@ class Studio:
 
     def tell(self, kind: str, content: Any) -> None:
         """Sends a message of a command to all tabs, also to those that are opened later."""
-        self._told[kind] = content
+        self._messages[kind] = content
         for tab in list(self.tabs):
             tab.send(kind, content)
 
@@ -117,7 +117,7 @@ class Studio:
             tab.send("about", about(self.desk))
             if not self._begun:
                 tab.send("state", "compiling the simulation: a minute or two the first time ...")
-            for kind, content in self._told.items():
+            for kind, content in self._messages.items():
                 tab.send(kind, content)
             for text in connection:
                 tab.receive(text)

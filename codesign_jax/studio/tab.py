@@ -198,7 +198,7 @@ class Tab:
 
     def _tell_forces(self, shown: ShownGrasp) -> None:
         self._shown = shown._replace(grasp=shown.bench.grasp(shown.view, shown.bench.recorder))
-        self.send("grasp", _told(self._shown))
+        self.send("grasp", _grasp_message(self._shown))
 
     def _tell_trials(self, shown: ShownGrasp) -> None:
         left = shown.view.trials - self._total
@@ -232,7 +232,7 @@ class Tab:
         self._shown = shown
         self._looked = False
         self._pictured = False
-        self.send("grasp", _told(shown))
+        self.send("grasp", _grasp_message(shown))
         if view.resting:
             self._tell_verdict(shown)
 
@@ -357,7 +357,7 @@ def _words(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"[:1000]
 
 
-def _told(shown: ShownGrasp) -> dict[str, Any]:
+def _grasp_message(shown: ShownGrasp) -> dict[str, Any]:
     view, bench, grasp = shown
     scene = bench.case.scene
     space = bench.case.space

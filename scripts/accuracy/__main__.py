@@ -47,7 +47,7 @@ def main() -> int:
         print(report.draw_against_time(results, args.docs / "figures" / "accuracy_time.png"))
         return 0
     if args.merge:
-        output.write_json(args.merge, budget.merged(args.out), indent=None)
+        output.write_json(args.merge, budget.merge(args.out), indent=None)
         return 0
     args.out.mkdir(parents=True, exist_ok=True)
     if args.tip:

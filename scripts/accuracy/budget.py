@@ -258,7 +258,7 @@ def measure(study: Study, names: list[str], folder: Path, commit: str | None) ->
         print(f"{name}: {measured['rates'][name]['grasps_per_s']:.0f} grasps/s", flush=True)
 
 
-def merged(folder: Path) -> dict[str, Any]:
+def merge(folder: Path) -> dict[str, Any]:
     every = {name: path_of(folder, name) for name in VARIANTS}
     times = {p.stem.split("_")[1]: json.loads(p.read_text()) for p in folder.glob("times_*.json")}
     content: dict[str, Any] = {

@@ -103,7 +103,7 @@ SIMULATES = {
     "finger": [(finger, "compare")],
     "landscape": [
         (landscape, name)
-        for name in ("simulated_designs", "summarize", "print_summary", "write_files")
+        for name in ("simulate_designs", "summarize", "print_summary", "write_files")
     ],
     "render": [(render, "draw")],
     "replay": [(replay, "explain"), (replay, "write_page")],

@@ -149,28 +149,28 @@ def _begin(path: Path) -> tuple[Path, int]:
 @contextlib.contextmanager
 def _mutex(folder: Path) -> Iterator[bool]:
     """Lets one process at a time in; yields whether the file system can do that."""
-    place = os.open(folder, os.O_RDONLY)
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(place, fcntl.LOCK_EX)
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
         exclusive = True
     except OSError:
         exclusive = False
     try:
         yield exclusive
     finally:
-        os.close(place)
+        os.close(descriptor)
 
 
 def _in_use(folder: Path) -> bool:
-    place = os.open(folder, os.O_RDONLY)
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(place, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
     except OSError:
         return False
     finally:
-        os.close(place)
+        os.close(descriptor)
     return False
 
 
@@ -188,11 +188,11 @@ def _move(part: Path, path: Path, *, replace: bool) -> None:
     with atomically(path / MANIFEST) as temporary:
         _write_manifest(temporary.parent, before | after, temporary.name)
     for name in after:
-        place = path / name
-        if place.is_dir() and not place.is_symlink():
+        target = path / name
+        if target.is_dir() and not target.is_symlink():
             raise IsADirectoryError(errno.EISDIR, f"{name} is a folder where a file belongs")
-        place.parent.mkdir(parents=True, exist_ok=True)
-        shutil.move(part / name, place)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.move(part / name, target)
     for name in before.keys() - after.keys():
         _remove_listed(path, name, before[name])
     shutil.move(part / MANIFEST, path / MANIFEST)
@@ -200,12 +200,12 @@ def _move(part: Path, path: Path, *, replace: bool) -> None:
 
 def _remove_listed(path: Path, name: str, digest: str) -> None:
     """Deletes a file of an earlier manifest if it is within the folder and as it was written."""
-    place = path / name
-    inside = place.parent.resolve().is_relative_to(path)
-    if not inside or place.is_symlink() or not place.is_file() or _digest(place) != digest:
+    file = path / name
+    inside = file.parent.resolve().is_relative_to(path)
+    if not inside or file.is_symlink() or not file.is_file() or _digest(file) != digest:
         return
-    place.unlink()
-    for parent in place.parents:
+    file.unlink()
+    for parent in file.parents:
         if parent == path or any(parent.iterdir()):
             break
         parent.rmdir()
@@ -214,7 +214,7 @@ def _remove_listed(path: Path, name: str, digest: str) -> None:
 def _names(path: Path) -> list[str]:
     """Paths of the files below a folder, relative to it."""
     paths = (Path(folder, name) for folder, _, names in os.walk(path) for name in names)
-    return sorted(place.relative_to(path).as_posix() for place in paths)
+    return sorted(file.relative_to(path).as_posix() for file in paths)
 
 
 def _digest(path: Path) -> str:

@@ -164,8 +164,8 @@ def kernel_file(name: str) -> Path | None:
     """File of a kernel, beside JAX's programs; None where these are not kept, or are remote."""
     import jax
 
-    place = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-    return None if not place or "://" in str(place) else Path(place) / "kernels" / f"{name}.kept"
+    cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    return None if not cache or "://" in str(cache) else Path(cache) / "kernels" / f"{name}.kept"
 
 
 def kept(path: Path | None, build: Callable[[], bytes], *, worth: float = 0.0) -> bytes:
@@ -233,26 +233,27 @@ def use_compilation_cache() -> None:
     if most is None:
         jax.config.update("jax_enable_compilation_cache", False)
     elif jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
-        place = folder() / "jax"
-        check_programs(place)
-        jax.config.update("jax_compilation_cache_dir", str(place))
-        if os.access(place, os.W_OK) or not place.exists():  # JAX locks a folder that has a limit
+        programs = folder() / "jax"
+        check_programs(programs)
+        jax.config.update("jax_compilation_cache_dir", str(programs))
+        # JAX locks a folder that has a limit.
+        if os.access(programs, os.W_OK) or not programs.exists():
             jax.config.update("jax_compilation_cache_max_size", most)
         # Small programs too, of which a command has dozens: JAX keeps those that take a second.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
-def check_programs(place: Path) -> None:
+def check_programs(programs: Path) -> None:
     """Deletes what JAX wrote since the last check and cannot be unpacked, and dates the rest.
 
     JAX (`lru_cache.py`) writes no program as a whole and writes over nothing: what a full disk or a
     power cut left would stay, with a warning in each process.
     """
-    checked = place / "checked"
+    checked = programs / "checked"
     now = time.time_ns()
     with contextlib.suppress(OSError):  # no folder, a read-only one, or a full disk: no matter
         last = checked.stat().st_mtime_ns - 10**9 if checked.exists() else 0
-        for path in place.glob("*-cache"):
+        for path in programs.glob("*-cache"):
             with contextlib.suppress(OSError):  # another process deletes as well
                 files.clear_place(path)
                 used = path.with_name(f"{path.name[:-6]}-atime")

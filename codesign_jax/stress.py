@@ -151,8 +151,8 @@ def variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
         if heavier != (*masses,):
             grams = dict.fromkeys(f"{1e3 * m:.0f}" for m in (min(heavier), max(heavier)))
             path = ("objects", "object", "mass")
-            place = iter(heavier)
-            heavier_scene = draws.changed(scene, path, lambda _, place=place: next(place))
+            each = iter(heavier)
+            heavier_scene = draws.changed(scene, path, lambda _, each=each: next(each))
             yield f"objects of {' to '.join(grams)} g", heavier_scene
     slippery = draws.changed(scene, ("objects", "object", "friction"), lambda _: FRICTION)
     yield f"friction {FRICTION} on the hand", slippery

@@ -100,10 +100,10 @@ def draw(steps: list[str], intervals: list[dict[str, np.ndarray]], folder: Path)
     figure = output.new_figure(8.4, 2.8)
     axes = figure.subplots(1, 1)
     for k, (step, ends) in enumerate(zip(steps, intervals, strict=True)):
-        for place, name in enumerate(LABELS):
+        for column, name in enumerate(LABELS):
             if name in ends:
                 label = step if name == "shear_modulus" else None
-                x = place + 0.15 * (k - 1.5)
+                x = column + 0.15 * (k - 1.5)
                 axes.plot([x, x], ends[name], f"C{k}", lw=4, solid_capstyle="butt", label=label)
     axes.axhline(1, color="k", lw=0.5)
     axes.set_xticks(range(len(LABELS)), list(LABELS.values()))

@@ -342,9 +342,9 @@ def on_landscapes(space: DesignSpace, shapes: int = 3) -> Callable[..., Any]:
 
     def trial_cost(landscape: jax.Array, design: jax.Array, trial: jax.Array) -> jax.Array:
         points = jnp.array(landscape.shape[:2])
-        place = (design - low) / (high - low) * (points - 1)
-        i, j = corner = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, points - 2)
-        a, b = place - corner
+        position = (design - low) / (high - low) * (points - 1)
+        i, j = corner = jnp.clip(jnp.floor(position).astype(jnp.int32), 0, points - 2)
+        a, b = position - corner
         at = (i, j, trial)
         square = jax.lax.dynamic_slice(landscape, at, (2, 2, 1))[..., 0]
         return jnp.array([1 - a, a]) @ square @ jnp.array([1 - b, b])

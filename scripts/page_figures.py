@@ -45,9 +45,9 @@ def axes() -> None:
     turns = {**posture.TURNS, "pitch +90°: fingers along +x": {"roll": 0, "yaw": 0, "pitch": 90}}
     figure = matplotlib.figure.Figure(figsize=(11, 2.6))
     for k, (words, angles) in enumerate(turns.items()):
-        place = figure.add_axes((0.01 + 0.198 * k, 0.02, 0.188, 0.86))
-        posture.draw(place, fingers, (1e3 * disc.radius, 1e3 * disc.thickness), angles, words)
-        place.title.set_fontsize(8)
+        panel = figure.add_axes((0.01 + 0.198 * k, 0.02, 0.188, 0.86))
+        posture.draw(panel, fingers, (1e3 * disc.radius, 1e3 * disc.thickness), angles, words)
+        panel.title.set_fontsize(8)
     figure.savefig(FIGURES / "axes.png", dpi=110)
 
 

@@ -117,25 +117,25 @@ def released(beam: Mapping[str, Any], beam_scene: Scene) -> tuple[np.ndarray, np
 
 def _finger_joints(start: np.ndarray, lay: Any) -> np.ndarray:
     """Which numbers of qpos are bends of the finger."""
-    places = np.zeros(len(start), bool)
-    places[np.asarray(lay.dofs).ravel()] = True
-    return places
+    bends = np.zeros(len(start), bool)
+    bends[np.asarray(lay.dofs).ravel()] = True
+    return bends
 
 
 def _weighted(fields: Any, extent: float, loads: np.ndarray) -> Any:
     """Fields with point masses [kg] at the end of the last body, `extent` [m] from its joint."""
-    place = np.array(fields.centre)
-    place[..., 1] = 0.0
+    centres = np.array(fields.centre)
+    centres[..., 1] = 0.0
     mass = np.array(fields.mass)
     inertia = np.array(fields.inertia)
     link_mass = mass[:, 0, -1].copy()
-    along = place[:, 0, -1, 0]
+    along = centres[:, 0, -1, 0]
     centre = (link_mass * along + loads * extent) / (link_mass + loads)
     more = link_mass * (centre - along) ** 2 + loads * (extent - centre) ** 2
     inertia[:, 0, -1, 1:] += more[:, None]
     mass[:, 0, -1] += loads
-    place[:, 0, -1, 0] = centre
-    return fields._replace(mass=mass, inertia=inertia, centre=place)
+    centres[:, 0, -1, 0] = centre
+    return fields._replace(mass=mass, inertia=inertia, centre=centres)
 
 
 class Ring(NamedTuple):

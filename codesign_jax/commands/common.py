@@ -155,12 +155,12 @@ def shortest(space: DesignSpace, design: np.ndarray) -> list[float]:
 def design_text(space: DesignSpace, file: DesignFile, design: np.ndarray) -> str:
     """A design [SI units] as the .toml text that --design opens again, in what the file names."""
     per_finger, others = tables.by_finger(space)
-    places = {space.names[k]: k for k in others} | per_finger
+    columns = {space.names[k]: k for k in others} | per_finger
     values = [f"{value:.9g}" for value in shortest(space, design)]
     lines = ["# A design in the hand file's units, for --design."]
     names = {name: v for name, v in dataclasses.asdict(file).items() if v and name != "design"}
     lines += [tomli_w.dumps(names), "[design]"]
-    for name, k in places.items():
+    for name, k in columns.items():
         several = isinstance(k, list)
         text = f"[{', '.join(values[i] for i in k)}]" if several else values[k]
         key = f'"{name}"' if "[" in name else name
@@ -271,16 +271,16 @@ def place_problems(flag: str, path: Path | None, *suffixes: str, folder: bool = 
         return []
     if suffixes and path.suffix not in suffixes:
         return [f"{flag} {path} must end in {' or '.join(suffixes)}"]
-    place = path.absolute() if folder else path.absolute().parent
+    parent = path.absolute() if folder else path.absolute().parent
     try:
         if not folder and path.is_dir():
             return [f"{flag} {path} cannot be written: it is a folder"]
-        while not place.exists():
-            place = place.parent
-        with tempfile.TemporaryFile(dir=place):
+        while not parent.exists():
+            parent = parent.parent
+        with tempfile.TemporaryFile(dir=parent):
             return []
     except OSError as error:
-        return [f"{flag} {path} cannot be written: {error.strerror} ({place})"]
+        return [f"{flag} {path} cannot be written: {error.strerror} ({parent})"]
 
 
 def number_problems(*numbers: tuple[str, float | None, float, float]) -> list[str]:

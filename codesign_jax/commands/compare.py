@@ -65,7 +65,7 @@ class Compared(NamedTuple):
 
 
 def main(options: Compare) -> int:
-    designs = [place for place in options.folders if place.suffix == ".toml"]
+    designs = [path for path in options.folders if path.suffix == ".toml"]
     folders = [] if designs else [run for folder in options.folders for run in _runs_in(folder)]
     problems = common.number_problems(
         ("--trials", options.trials, 1, 100_000), ("--seed", options.seed, 0, 2**31 - 1)
@@ -76,15 +76,15 @@ def main(options: Compare) -> int:
         problems.append("compare takes design files (.toml) or run folders, not both")
     if designs and options.out is not None:
         problems.append("--out is a table of runs; leave it out beside design files")
-    places = designs or folders
-    alone = len(places) == 1 and len(options.policy) == 1
+    paths = designs or folders
+    alone = len(paths) == 1 and len(options.policy) == 1
     if designs and len(designs) != 2 and not alone:
         problems.append("compare takes two design files, or one with --policy against none")
-    if options.trials is not None and len(places) != 2 and not alone:
+    if options.trials is not None and len(paths) != 2 and not alone:
         problems.append(f"--trials compares two designs; the folders have {len(folders)} runs")
     common.refuse(problems + common.place_problems("--out", options.out, ".csv"))
     simulates = bool(designs) or options.trials is not None
-    pair = _pair(options, places, runs=not designs) if simulates else {}
+    pair = _pair(options, paths, runs=not designs) if simulates else {}
     console = Console()
     if folders:
         every = read_all({folder: runs.read_run(folder) for folder in folders})
@@ -123,13 +123,13 @@ def read_all(every: Mapping[Path, tuple[Scene, Settings]]) -> dict[Path, Compare
     return compared
 
 
-def _pair(options: Compare, places: list[Path], *, runs: bool) -> dict[str, Case]:
+def _pair(options: Compare, paths: list[Path], *, runs: bool) -> dict[str, Case]:
     """The two designs by what they are called; one alone is with its policy and without it."""
-    subjects = [_subject(options, place, of_run=runs) for place in places]
+    subjects = [_subject(options, path, of_run=runs) for path in paths]
     if runs and (unknown := {*options.policy} - {subject.policy for subject in subjects}):
         raise InputError([f"--policy {name}: neither run was made with it" for name in unknown])
     cases = [find_case(subject) for subject in subjects]
-    names = [str(place) for place in places]
+    names = [str(path) for path in paths]
     if len(cases) == 1:
         [case] = cases
         return {f"{names[0]} with {case.policy}": case, "without": case._replace(policy="")}
@@ -144,17 +144,17 @@ def _pair(options: Compare, places: list[Path], *, runs: bool) -> dict[str, Case
     return dict(zip(names, cases, strict=True))
 
 
-def _subject(options: Compare, place: Path, *, of_run: bool) -> flags.Subject:
+def _subject(options: Compare, path: Path, *, of_run: bool) -> flags.Subject:
     names = ("accuracy", "objects", "overrides", "constants", "robust", "engine")
     arguments = {n: getattr(options, n) for n in names}
     if of_run:
-        policy_of_run = runs.read_run(place)[1].policy
+        policy_of_run = runs.read_run(path)[1].policy
         policy = policy_of_run if policy_of_run in options.policy else None
-        return flags.Subject(run_folder=place, policy=policy, **arguments)
+        return flags.Subject(run_folder=path, policy=policy, **arguments)
     if len(options.policy) > 1:
         raise InputError(["--policy takes one policy beside design files"])
     return flags.Subject(
-        design=((str(place),),), policy=next(iter(options.policy), None), **arguments
+        design=((str(path),),), policy=next(iter(options.policy), None), **arguments
     )
 
 
@@ -270,13 +270,13 @@ def _summary(group: list[Compared]) -> tuple[str, ...]:
 
 def write_table(every: Mapping[Path, Compared], path: Path) -> None:
     head = [*columns.MORE[columns.SEEDS].columns]
-    tables.write(path, head, (_values(place, run, path) for place, run in every.items()))
+    tables.write(path, head, (_values(folder, run, path) for folder, run in every.items()))
 
 
-def _values(place: Path, run: Compared, path: Path) -> dict[str, object]:
+def _values(folder: Path, run: Compared, path: Path) -> dict[str, object]:
     """The row of a run in a place, for a table's path; what is not known is empty."""
     row: dict[str, object] = dict.fromkeys(columns.MORE[columns.SEEDS].columns, "")
-    row["run"] = Path(os.path.relpath(place, path.parent)).as_posix()
+    row["run"] = Path(os.path.relpath(folder, path.parent)).as_posix()
     row |= {name: getattr(run.settings, name) for name in ("seed", "schedule", "first")}
     record = run.result and run.result.record
     row["finished"] = int(bool(record) and record.done == run.settings.episodes)

@@ -138,9 +138,9 @@ def _without_rest(
 ) -> Iterator[str]:
     """Says where a finger has no rest, after what it has."""
     for name, pressures in fingers.without_rest(table, prediction).items():
-        places = ", ".join(f"{pressure / 1e3:.4g}" for pressure in pressures)
+        text = ", ".join(f"{pressure / 1e3:.4g}" for pressure in pressures)
         yield (
-            f"warning: {which}: no rest found for the {words(name)} at {places} kPa: "
+            f"warning: {which}: no rest found for the {words(name)} at {text} kPa: "
             f"{fingers.TOO_FAR}"
         )
 

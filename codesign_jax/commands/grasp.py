@@ -32,9 +32,9 @@ class PlannedGrasp(NamedTuple):
 
 def find(options: GraspFlags) -> PlannedGrasp:
     """The grasp that the flags name; simulates nothing."""
-    places = {"--episode": options.episode, "--particle": options.particle}
-    places |= {"--trial": options.trial}
-    flags = " and ".join(flag for flag, value in places.items() if value is not None)
+    numbers = {"--episode": options.episode, "--particle": options.particle}
+    numbers |= {"--trial": options.trial}
+    flags = " and ".join(flag for flag, value in numbers.items() if value is not None)
     if flags and not options.run_folder:
         raise InputError([f"{flags}: numbers of a run's trials.csv, so --run must say of which"])
     if options.trial is not None and options.object is not None:
@@ -49,9 +49,9 @@ def find(options: GraspFlags) -> PlannedGrasp:
 def _of_run(case: Case, options: GraspFlags, folder: Path) -> PlannedGrasp:
     if options.objects is not None and options.object is None:
         raise InputError(["--objects replaces the run's: --object must say which one to grasp"])
-    place = {"episode": options.episode, "particle": options.particle, "trial": options.trial}
+    numbers = {"episode": options.episode, "particle": options.particle, "trial": options.trial}
     record = cases.read_record(folder, tell=lambda text: None)  # `find_case` has said it
-    grasp = cases.find_grasp(runs.read_run(folder)[0], record, **place)
+    grasp = cases.find_grasp(runs.read_run(folder)[0], record, **numbers)
     case = case._replace(design=grasp.design)
     if options.object is not None:
         return _nominal(case, options.object)

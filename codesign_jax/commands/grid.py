@@ -155,9 +155,9 @@ def numbers(scene: Scene, pair: tuple[Axis, Axis]) -> np.ndarray | None:
         np.array([jax.tree.leaves(variant) for variant in axis.scenes], float) for axis in pair
     ]
     rows = []
-    for place in np.ndindex(*(len(axis.values) for axis in pair)):
+    for point in np.ndindex(*(len(axis.values) for axis in pair)):
         row = base.copy()
-        for k, every in zip(place, leaves, strict=True):
+        for k, every in zip(point, leaves, strict=True):
             if every.size:
                 row = np.where(every[k] != base, every[k], row)
         rows.append(row)

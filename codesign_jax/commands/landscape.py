@@ -175,7 +175,7 @@ def print_summary(case: Case, result: Landscape, console: Console) -> None:
     """Prints the number of good designs, the best one, and failed trials."""
     i, j = np.unravel_index(int(result.cost.argmin()), result.cost.shape)
     good = int((result.cost < codesign.SUCCESS_COST).sum())
-    place = " ".join(
+    point = " ".join(
         f"{name}={value:.4g} {unit}".rstrip()
         for name, value, unit in zip(
             result.names, (result.first[i], result.second[j]), result.units, strict=True
@@ -183,7 +183,7 @@ def print_summary(case: Case, result: Landscape, console: Console) -> None:
     )
     console.print(
         f"{good} of {result.cost.size} points have a mean cost below {codesign.SUCCESS_COST}; "
-        f"lowest: {result.cost[i, j]:.4f} at {place}"
+        f"lowest: {result.cost[i, j]:.4f} at {point}"
     )
     best = float((result.kept / result.trials).max())
     console.print(

@@ -73,8 +73,8 @@ def main(options: Optimize) -> int:
 
 def _refuse(options: Optimize, scene: Scene, every: Mapping[Path, Settings]) -> None:
     """Refuses folders in which runs cannot start or go on, before anything that takes time."""
-    place = options.out or next(iter(every))
-    common.refuse(common.place_problems("--out", place, folder=True))
+    first = options.out or next(iter(every))
+    common.refuse(common.place_problems("--out", first, folder=True))
     _refuse_links(options, every)
     for folder, settings in every.items():
         runs.check_folder(folder, scene, settings, fresh=options.fresh)
@@ -158,8 +158,8 @@ def _refuse_links(options: Optimize, folders: Iterable[Path]) -> None:
     """Refuses links below --out, where a command of several runs chooses the folders."""
     if options.out is None:
         return
-    places = {place for folder in folders for place in (folder, *folder.parents)}
-    links = sorted(p for p in places if options.out in p.parents and p.is_symlink())
+    every = {parent for folder in folders for parent in (folder, *folder.parents)}
+    links = sorted(p for p in every if options.out in p.parents and p.is_symlink())
     hint = "is a symbolic link: put the folder itself in its place"
     common.refuse([f"{link} {hint}" for link in links])
 

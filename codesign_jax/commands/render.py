@@ -62,8 +62,8 @@ def _camera(words: Sequence[str]) -> "Camera":
         else:
             numbers[name] = value
     common.refuse(problems)
-    place = zip("xyz", camera.lookat, strict=True)
-    at = tuple(numbers.pop(axis, value) for axis, value in place)
+    coordinates = zip("xyz", camera.lookat, strict=True)
+    at = tuple(numbers.pop(axis, value) for axis, value in coordinates)
     return camera._replace(lookat=at, **numbers)
 
 

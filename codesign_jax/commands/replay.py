@@ -29,8 +29,8 @@ def main(options: Replay) -> int:
     common.refuse(common.place_problems("--out", path, ".html"))
     planned = grasp.find(options)
     console = Console()
-    places = options.episode, options.particle, options.trial, options.object
-    if options.run_folder is not None and places == (None,) * 4:
+    choices = options.episode, options.particle, options.trial, options.object
+    if options.run_folder is not None and choices == (None,) * 4:
         show_failures(options.run_folder)
     write_page(planned, path, console)
     console.print(f"replay: {path} (for any browser, offline)")
@@ -77,8 +77,8 @@ def explain(path: Path, engine: str | None, policy: str | None) -> int:
     for bit in Status(failure.status):
         say(f"  {bit.name}: {MEANINGS[bit]}")
     numbers = zip(("--episode", "--particle", "--trial"), failure.place, strict=True)
-    place = " ".join(f"{flag} {number}" for flag, number in numbers)
-    say(f"in 3D: codesign replay {path.parent.parent} {place}")
+    flags = " ".join(f"{flag} {number}" for flag, number in numbers)
+    say(f"in 3D: codesign replay {path.parent.parent} {flags}")
     world = space.params(jnp.asarray(failure.design)), failure.trial
     simulator = Case(scene, space, failure.design, name, settings.policy).make_engine()
     run = jax.jit(lambda p, t: rollout.simulate(scene, simulator, p, t))

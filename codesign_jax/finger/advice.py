@@ -70,8 +70,8 @@ def _own(finger: Finger, names: tuple[str, ...]) -> np.ndarray:
 def _precision(posterior: Posterior, names: tuple[str, ...]) -> np.ndarray:
     """The posterior's precision, and that of the priors of what it does not have."""
     precision = np.diag([min(priors()[n], UNKNOWN_MODULUS) ** -2 for n in names])
-    places = [names.index(n) for n in posterior.names]
-    precision[np.ix_(places, places)] = np.linalg.inv(posterior.covariance)
+    indices = [names.index(n) for n in posterior.names]
+    precision[np.ix_(indices, indices)] = np.linalg.inv(posterior.covariance)
     return precision
 
 

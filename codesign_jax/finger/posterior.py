@@ -179,8 +179,8 @@ class _Problem:
         errors = self.errors(logs)
         slopes = slopes_of(self.errors, logs, errors)
         if "drop" in self.columns:
-            place = self.columns.index("drop")
-            self.share[place] = self._of_drops(errors[self.column == place])
+            column = self.columns.index("drop")
+            self.share[column] = self._of_drops(errors[self.column == column])
         share = self.share[self.column]
         prior = np.diag(self.precision)
         weight = share / scales[self.column] ** 2
@@ -198,8 +198,8 @@ class _Problem:
 
     def _of_drops(self, errors: np.ndarray) -> float:
         """Share of the drops that count, by the correlation of each with the next one."""
-        places = np.flatnonzero(self.rows[self.columns.index("drop")])
-        value = dict(zip(places, errors, strict=True))
+        indices = np.flatnonzero(self.rows[self.columns.index("drop")])
+        value = dict(zip(indices, errors, strict=True))
         every = [np.array([value[r] for r in rows]) for rows in releases(self.table)]
         above = sum(float(v[1:] @ v[:-1]) for v in every)
         squares = sum(float(v @ v) for v in every)

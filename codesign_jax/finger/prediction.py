@@ -57,8 +57,8 @@ def _of_free(
     if "angle" in names:
         values["angle"] = free.angles.sum()
     if names & {"tip_x", "tip_y"}:
-        places = dict(zip(("tip_x", "tip_y"), tip_place(finger, free), strict=True))
-        values |= {name: place for name, place in places.items() if name in names}
+        coordinates = dict(zip(("tip_x", "tip_y"), tip_place(finger, free), strict=True))
+        values |= {name: value for name, value in coordinates.items() if name in names}
     if "sideways" in names:
         values["sideways"] = sideways(finger, free, load)
     if "deflection" in names:

@@ -40,13 +40,13 @@ def save(landscape: Landscape, folder: Path) -> list[Path]:
     ]
 
     def row(i: int, j: int) -> tables.Row:
-        place = dict(zip(axes, (landscape.first[i], landscape.second[j]), strict=True))
-        numbers = {n: f"{v:.9g}" for n, v in (place | {"mean_cost": landscape.cost[i, j]}).items()}
+        point = dict(zip(axes, (landscape.first[i], landscape.second[j]), strict=True))
+        numbers = {n: f"{v:.9g}" for n, v in (point | {"mean_cost": landscape.cost[i, j]}).items()}
         counts = {"kept_trials": landscape.kept[i, j], "counted_trials": landscape.counted[i, j]}
         return numbers | {n: int(v) for n, v in (counts | {"trials": landscape.trials}).items()}
 
     head = [*axes, *columns.MORE[TABLE].columns]
-    tables.write(table, head, (row(*place) for place in np.ndindex(*landscape.cost.shape)))
+    tables.write(table, head, (row(*point) for point in np.ndindex(*landscape.cost.shape)))
     return [npz, table]
 
 

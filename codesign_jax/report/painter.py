@@ -69,8 +69,8 @@ class View:
         Args:
           at: Indices of pixels in the rows one after another, shape (pixel,).
         """
-        place = np.stack([at % self.size[0], at // self.size[0]], 1) + 0.5
-        return (place - self.middle) / self.scale @ self.axes[:2] + self.axes[2]
+        pixel = np.stack([at % self.size[0], at // self.size[0]], 1) + 0.5
+        return (pixel - self.middle) / self.scale @ self.axes[:2] + self.axes[2]
 
 
 def light(camera: Camera) -> np.ndarray:
@@ -142,9 +142,9 @@ def _body(parts: list[Part], start: np.ndarray) -> _Body:
     checked = np.full((first[-1], 3), np.nan)
     checked[first[-2] :] = parts[-1].first
     # A mesh may have a place several times.
-    places = np.concatenate([np.column_stack([p.first, p.second]) for p in parts])
+    vertices = np.concatenate([np.column_stack([p.first, p.second]) for p in parts])
     owner = np.repeat(np.arange(len(parts)), [len(part.first) for part in parts])
-    keys = np.column_stack([owner, np.round(places * 1e6).astype(np.int64)])
+    keys = np.column_stack([owner, np.round(vertices * 1e6).astype(np.int64)])
     _, same = np.unique(keys, axis=0, return_inverse=True)
     triangles = np.concatenate([bodies.vertices(part, start) for part in parts])[face]
     around = _around(same.ravel()[face].ravel(), _areas(triangles))
@@ -167,9 +167,9 @@ def _around(vertex: np.ndarray, area: np.ndarray) -> scipy.sparse.csr_array:
     beside = order[start[vertex[corner]] + rank] // 3
     unit = _unit(area)
     alike = (unit[corner // 3] * unit[beside]).sum(1) > _CREASE
-    places = corner[alike], beside[alike]
+    pairs = corner[alike], beside[alike]
     shape = len(vertex), len(area)
-    return scipy.sparse.csr_array((np.ones(len(places[0]), np.float32), places), shape)
+    return scipy.sparse.csr_array((np.ones(len(pairs[0]), np.float32), pairs), shape)
 
 
 def _areas(triangles: np.ndarray) -> np.ndarray:
@@ -199,14 +199,14 @@ def _picture(
     face = faces[seen.face]
     share = seen.share[:, :, None]
     rays = view.rays(seen.at)
-    place = view.eye + seen.away[:, None] * rays
+    points = view.eye + seen.away[:, None] * rays
     normals = (body.around @ area).reshape(-1, 3, 3)
     normal = _unit((share * _unit(normals[face])).sum(1))
     local = (share * body.checked[body.face[face]]).sum(1)
     check = np.floor(local / _CHECK + 0.25).sum(1) % 2 == 1  # NaN, of other parts, is not 1
     color = np.where(check[:, None], _DARKER, 1.0) * body.color[face]
-    lit = shadows.lit(place + 0.002 * normal)
-    colors[seen.at] = _shaded(color, normal, -_unit(rays), shadows.light, lit, place[:, 2])
+    lit = shadows.lit(points + 0.002 * normal)
+    colors[seen.at] = _shaded(color, normal, -_unit(rays), shadows.light, lit, points[:, 2])
     levels = (255 * np.clip(colors, 0, 1)).astype(np.uint8)
     image = Image.fromarray(levels.reshape(_SMOOTH * size[1], _SMOOTH * size[0], 3))
     return np.asarray(image.resize(size, Image.Resampling.BOX))
@@ -249,18 +249,18 @@ def _behind(view: View, shadows: "_Shadows", *, table: bool) -> np.ndarray:
 def _table(colors: np.ndarray, rays: np.ndarray, view: View, shadows: "_Shadows") -> None:
     below = np.flatnonzero(rays[:, 2] < -1e-3)
     along = -view.eye[2] / rays[below, 2]
-    place = view.eye + along[:, None] * rays[below]
-    radius = np.hypot(place[:, 0], place[:, 1])
+    points = view.eye + along[:, None] * rays[below]
+    radius = np.hypot(points[:, 0], points[:, 1])
     near = radius < _REACH
     below = below[near]
-    place = place[near]
+    points = points[near]
     fade = np.clip((_REACH - radius[near]) / (0.5 * _REACH), 0, 1)[:, None]
     # A line that is thinner than a pixel is as wide as one and fainter.
     blur = np.maximum(_WIDTH, along[near] / view.scale)
-    off = np.abs(place[:, :2] / _GRID - np.round(place[:, :2] / _GRID)) * _GRID
+    off = np.abs(points[:, :2] / _GRID - np.round(points[:, :2] / _GRID)) * _GRID
     line = np.clip(1.0 - off / blur[:, None], 0, 1).max(1) * _WIDTH / blur
     color = _TOP + line[:, None] * (_LINE - _TOP)
-    bright = 0.66 + 0.34 * shadows.lit(place)
+    bright = 0.66 + 0.34 * shadows.lit(points)
     colors[below] = (1 - fade) * colors[below] + fade * color * bright[:, None]
 
 

@@ -37,9 +37,9 @@ def nearest(
     span = np.maximum(high - low + 1, 0)
     count = span[:, 0] * span[:, 1]
     face = np.repeat(np.arange(len(corners)), count)
-    place = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
-    column = low[face, 0] + place % span[face, 0]
-    row = low[face, 1] + place // span[face, 0]
+    offset = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
+    column = low[face, 0] + offset % span[face, 0]
+    row = low[face, 1] + offset // span[face, 0]
     weight = _weights(corners, face, column + 0.5, row + 0.5)
     inside = (weight >= 0).all(1)
     face = face[inside]

@@ -158,15 +158,15 @@ def departure(scene: Scene, outcomes: Outcome, ctrl: jax.Array, planned: jax.Arr
     )
     counts = np.arange(steps) < end[:, None]
     apart = jnp.where(counts[..., None], ctrl - planned, 0.0)
-    place = jnp.linalg.norm(apart[..., :3], axis=-1)
+    distance = jnp.linalg.norm(apart[..., :3], axis=-1)
     turn = jnp.abs(apart[..., 3:6]).max(-1)
     pressure = apart[..., 6:]
-    size = jnp.maximum(jnp.maximum(place, turn), 1e-5 * jnp.abs(pressure).max(-1))
+    size = jnp.maximum(jnp.maximum(distance, turn), 1e-5 * jnp.abs(pressure).max(-1))
     departs = size > LEAST
     first = jnp.where(departs.any(1), departs.argmax(1) * h, jnp.inf)
     lower = jnp.minimum(pressure, 0).min((1, 2))
     higher = jnp.maximum(pressure, 0).max((1, 2))
-    return Departure(first, lower, higher, place.max(1), turn.max(1))
+    return Departure(first, lower, higher, distance.max(1), turn.max(1))
 
 
 def refuse_other_policy(policy: str, named: str | None) -> None:

@@ -164,22 +164,22 @@ class Checkpoints:
 
     def _steps(self) -> list[int]:
         """Numbers of the steps that are there, whole or not."""
-        places = self.folder.iterdir() if self.folder.exists() else ()
-        names = [path.name for path in places if path.is_dir()]
+        paths = self.folder.iterdir() if self.folder.exists() else ()
+        names = [path.name for path in paths if path.is_dir()]
         return [int(name) for name in names if re.fullmatch("0|[1-9][0-9]{0,8}", name)]
 
     def discard(self, steps: Iterable[int]) -> None:
         """Deletes damaged steps, so that their numbers can be saved again."""
         for step in steps:
             # Not the manager's delete: it fails on a step whose files are missing.
-            places = self.folder / str(step), self._digests(step)
+            paths = self.folder / str(step), self._digests(step)
             try:
-                for place in places:
-                    files.remove(place)
+                for path in paths:
+                    files.remove(path)
             except OSError as error:
                 raise RunError(
                     f"checkpoint {step} is damaged, and cannot be deleted ({error.strerror}): "
-                    f"delete {places[0]} and {places[1]} by hand. The same command then goes on "
+                    f"delete {paths[0]} and {paths[1]} by hand. The same command then goes on "
                     "from the checkpoint before"
                 ) from error
         self._close()  # orbax remembers the steps that it met
@@ -304,16 +304,16 @@ def _without_closed_loops(hook: Callable[[Any], Any], unraisable: Any) -> None:
         hook(unraisable)
 
 
-def _unsaved(place: Path, error: Exception) -> OSError:
+def _unsaved(path: Path, error: Exception) -> OSError:
     text = str(error)
     for number in (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EACCES, errno.EFBIG):
         if getattr(error, "errno", None) == number or os.strerror(number) in text:
             reason = os.strerror(number)
             return OSError(
-                number, f"checkpoint {place.name} could not be written: {reason}", str(place.parent)
+                number, f"checkpoint {path.name} could not be written: {reason}", str(path.parent)
             )
     problem = text.splitlines()[0][:200] if text else type(error).__name__
-    return OSError(f"checkpoint {place.name} could not be written to {place.parent}: {problem}")
+    return OSError(f"checkpoint {path.name} could not be written to {path.parent}: {problem}")
 
 
 def _leaves(arrays: Arrays, prefix: str = "") -> Iterator[tuple[str, np.ndarray]]:

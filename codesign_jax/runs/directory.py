@@ -131,8 +131,8 @@ def setting_of(paths: Iterable[Path], name: str) -> Any:
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
     """Holds the folder's lock; the kernel releases it with the process, however it ends."""
-    place = os.open(path / LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
-    with os.fdopen(place, "r+") as file:
+    descriptor = os.open(path / LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+    with os.fdopen(descriptor, "r+") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:

@@ -61,10 +61,10 @@ def load(path: Path) -> Failure:
         left_out = {n for n in ("tilt", "constants") if f"trial_{n}" not in values}
         drawn = [n for n in Trial._fields if n not in left_out]
         trial = Trial(**{name: values[f"trial_{name}"] for name in drawn})
-        place = tuple(int(v) for v in values["place"])
+        numbers = tuple(int(v) for v in values["place"])
         status = int(values["status"])
         bad_step = int(values["bad_step"])
-        return Failure(values["design"], trial, values["state"], status, bad_step, place)  # type: ignore[arg-type]
+        return Failure(values["design"], trial, values["state"], status, bad_step, numbers)  # type: ignore[arg-type]
     except (OSError, ValueError, KeyError, TypeError) as error:
         problem = f"{path} is not a failed world of a run, which are .npz files in its {FOLDER}/"
         raise InputError([problem]) from error

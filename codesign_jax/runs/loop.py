@@ -227,11 +227,11 @@ class Search:
             questions = zip(particles, keys, strict=True)
             rounds.append(self._simulate([codesign.frozen(optimizer, *each) for each in questions]))
             self._progress.tested(len(going) * size * settings.trials)
-        for run, (_, places), *parts in zip(runs, chosen, *rounds, strict=True):
+        for run, (_, rows), *parts in zip(runs, chosen, *rounds, strict=True):
             outcomes = [info.outcomes for _, info in parts]
             test = jax.tree.map(lambda *v: np.concatenate(v, axis=1), *outcomes)
             if run in going and run.error is None:
-                self._let(run, run.finish, jax.tree.map(lambda v, p=places: v[p], test))
+                self._let(run, run.finish, jax.tree.map(lambda v, p=rows: v[p], test))
 
     def _simulate(
         self, episodes: list[tuple[OptimizerState, np.ndarray]]

@@ -76,12 +76,12 @@ def _mesh_name(shape: Shape, index: int) -> str:
 
 def _document(table: dict[str, Any], units: dict[str, str]) -> str:
     lines = []
-    place = ""
+    prefix = ""
     for line in tomli_w.dumps(table).split("\n")[:-1]:  # texts may hold other ends of lines
         if header := re.fullmatch(r"\[+(.*?)\]+", line):
-            place = header[1] + "."
+            prefix = header[1] + "."
         key, equals, _ = line.partition(" = ")
-        unit = units.get(place + key, "") if equals else ""
+        unit = units.get(prefix + key, "") if equals else ""
         lines.append(f"{line}  # {unit}" if unit else line)
     return "\n".join(lines) + "\n"
 
@@ -96,16 +96,16 @@ def _plain(value: Any) -> Any:
     return [_plain(v) for v in value] if isinstance(value, tuple | list) else value
 
 
-def _units(value: Any, place: str = "") -> dict[str, str]:
+def _units(value: Any, prefix: str = "") -> dict[str, str]:
     """Units of a dataclass's numbers by dotted key path; those of an array's entries are alike."""
     units: dict[str, str] = {}
     if isinstance(value, tuple):
         for entry in value:
-            units |= _units(entry, place)
+            units |= _units(entry, prefix)
     elif dataclasses.is_dataclass(value):
         for field in dataclasses.fields(value):
-            inside = _units(getattr(value, field.name), f"{place}{field.name}.")
+            inside = _units(getattr(value, field.name), f"{prefix}{field.name}.")
             # The writer puts an array of small tables under its own key, an entry a line.
             listed = [f"{k.rpartition('.')[2]} in {u}" for k, u in inside.items() if u]
-            units |= inside | {place + field.name: field.metadata.get("unit", ", ".join(listed))}
+            units |= inside | {prefix + field.name: field.metadata.get("unit", ", ".join(listed))}
     return units

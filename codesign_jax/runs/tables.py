@@ -103,9 +103,11 @@ def by_finger(space: DesignSpace) -> tuple[dict[str, list[int]], list[int]]:
         if len(fingers_of(name)) == 1:
             per_finger.setdefault(name.partition("[")[0], []).append(k)
     per_finger = {
-        name: places for name, places in per_finger.items() if len(places) == len(space.hand.finger)
+        name: columns
+        for name, columns in per_finger.items()
+        if len(columns) == len(space.hand.finger)
     }
-    fingers = {k for places in per_finger.values() for k in places}
+    fingers = {k for columns in per_finger.values() for k in columns}
     return per_finger, [k for k in range(space.num_parameters) if k not in fingers]
 
 

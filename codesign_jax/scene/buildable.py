@@ -77,8 +77,8 @@ class Buildable:
         sections = [base]
         if tip is not None:
             sections = [
-                tuple(a + (b - a) * place for a, b in zip(base, tip, strict=True))
-                for place in PLACES
+                tuple(a + (b - a) * share for a, b in zip(base, tip, strict=True))
+                for share in PLACES
             ]
         caps = table
         for height, wall, width in sections:

@@ -156,22 +156,22 @@ def check(table: Constants, where: str) -> list[str]:
     problems = []
     keys = [entry.key for entry in table.constant]
     for i, entry in enumerate(table.constant):
-        place = f"{where}.constant {entry.key}"
+        key = f"{where}.constant {entry.key}"
         names = ("mean", "sd") if entry.distribution.endswith("normal") else ("low", "high")
         numbers = [getattr(entry, n) for n in names]
         present = {n for n in ("mean", "sd", "low", "high") if getattr(entry, n) is not None}
         if present != set(names):
             words = f"{' and '.join(names)}, and no other number"
-            problems.append(f"{place}: distribution {entry.distribution!r} has {words}")
+            problems.append(f"{key}: distribution {entry.distribution!r} has {words}")
         elif entry.logarithmic and numbers[0] <= 0:
-            problems.append(f"{place}: {names[0]} of a {entry.distribution} is above 0")
+            problems.append(f"{key}: {names[0]} of a {entry.distribution} is above 0")
         elif names[0] == "low" and not numbers[0] < numbers[1]:
-            problems.append(f"{place}: low = {numbers[0]:g} must be below high = {numbers[1]:g}")
+            problems.append(f"{key}: low = {numbers[0]:g} must be below high = {numbers[1]:g}")
         if entry.key in keys[:i]:
-            problems.append(f"{place} is given more than once")
+            problems.append(f"{key} is given more than once")
         if len(entry.correlation) > i:
             problems.append(
-                f"{place}: correlation has {len(entry.correlation)} numbers, {i} before it"
+                f"{key}: correlation has {len(entry.correlation)} numbers, {i} before it"
             )
     if not problems and (np.linalg.eigvalsh(correlations(table)) < -1e-6).any():
         problems.append(f"{where}: the correlations contradict one another")

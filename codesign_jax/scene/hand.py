@@ -63,7 +63,7 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Han
       InputError: with every problem in the file.
     """
     problems: list[str] = []
-    table, path, places = keypaths.read("hands", name, overrides, problems, silicones.prepare)
+    table, path, key_paths = keypaths.read("hands", name, overrides, problems, silicones.prepare)
     silicones.complete(table, path.name, problems)
     hand = schema.parse(Hand, table, path.name, problems)
     if hand is not None and not hand.finger:
@@ -76,7 +76,7 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Han
         if not problems:
             _check_sections(hand, path.name, problems)
     if problems or hand is None:
-        raise schema.InputError(keypaths.as_given(problems, places))
+        raise schema.InputError(keypaths.as_given(problems, key_paths))
     return hand
 
 
@@ -267,8 +267,8 @@ def group_problem(groups: tuple[tuple[int, ...], ...], count: int) -> str:
 
 def _check_sections(hand: Hand, where: str, problems: list[str]) -> None:
     preset_places = [f"{where}.preset {preset.name}" for preset in hand.preset if not preset.whole]
-    places = [where, *preset_places]
-    for path, bounds in zip(places, all_bounds(hand), strict=True):
+    paths = [where, *preset_places]
+    for path, bounds in zip(paths, all_bounds(hand), strict=True):
         lowest = {name: low for name, (low, _) in bounds.items()}
         width = (hand.section.width,) * len(hand.finger)
         ends = [("", "section.width", width)]

@@ -148,10 +148,10 @@ def structure(control: Control) -> Control:
 def load(name: str | Path, hand: Hand, *, overrides: Mapping[Any, Any] | None = None) -> Control:
     """Reads a control and checks what does not depend on the scene's numbers; `check` does."""
     problems: list[str] = []
-    table, path, places = keypaths.read("controls", name, overrides, problems)
+    table, path, key_paths = keypaths.read("controls", name, overrides, problems)
     control = _Reader(table, path.name, len(hand.finger), problems).control()
     if problems or control is None:
-        raise schema.InputError(keypaths.as_given(problems, places))
+        raise schema.InputError(keypaths.as_given(problems, key_paths))
     return control
 
 
@@ -541,10 +541,10 @@ def _too_high(
             factors = _factors(value)
             # A search keeps `pressure` below the limit of its wall, so that the worst design is at
             # an end of the limits, or where the limit begins to hold.
-            places = sorted(
+            pressures = sorted(
                 {*limits[finger], min(max(high[finger], limits[finger][0]), limits[finger][1])}
             )
-            for limit in places:
+            for limit in pressures:
                 ends = {**ranges, "pressure": (min(low[finger], limit), min(high[finger], limit))}
                 least, most = _range(factors, ends)
                 key = f"{where}.frame[{i}].pressure"

@@ -131,23 +131,23 @@ def apply(
     Returns places of the changes as the schema names them, such as "paper.toml.noise", with what
     was given, such as "objects.noise"; for `as_given`. `root` is the scene's key of the file.
     """
-    places: dict[str, str] = {}
+    key_paths: dict[str, str] = {}
     for path, value in changes.items():
-        _apply(table, path, value, ((where,), root), problems, places)
-    return places
+        _apply(table, path, value, ((where,), root), problems, key_paths)
+    return key_paths
 
 
-def as_given(problems: list[str], places: Mapping[str, str]) -> list[str]:
+def as_given(problems: list[str], key_paths: Mapping[str, str]) -> list[str]:
     """Messages about changed values, with the keys as they were given instead of the file's."""
-    longest = sorted(places, key=len, reverse=True)
-    return [_as_given(problem, longest, places) for problem in problems]
+    longest = sorted(key_paths, key=len, reverse=True)
+    return [_as_given(problem, longest, key_paths) for problem in problems]
 
 
-def _as_given(problem: str, longest: list[str], places: Mapping[str, str]) -> str:
-    for place in longest:
-        rest = problem.removeprefix(place)
+def _as_given(problem: str, longest: list[str], key_paths: Mapping[str, str]) -> str:
+    for key_path in longest:
+        rest = problem.removeprefix(key_path)
         if rest != problem and not re.match(r"\w", rest):
-            key, unknown, hint = f"{places[place]}{rest}".partition(" is not a known key; ")
+            key, unknown, hint = f"{key_paths[key_path]}{rest}".partition(" is not a known key; ")
             parent = key.rpartition(".")[0]
             if parent:
                 hint = hint.replace("did you mean '", f"did you mean '{parent}.")
@@ -156,12 +156,12 @@ def _as_given(problem: str, longest: list[str], places: Mapping[str, str]) -> st
 
 
 def _apply(
-    place: Any,
+    node: Any,
     path: Path,
     value: Any,
     where: tuple[tuple[str, ...], str],
     problems: list[str],
-    places: dict[str, str],
+    key_paths: dict[str, str],
 ) -> None:
     """Changes one value; `where` has the names of the place in messages, and as it is given."""
     names, place_name = where
@@ -170,31 +170,31 @@ def _apply(
     if len(rest) >= library.DEEPEST:
         problems.append(f"{schema.shown('.'.join(path))} is no key: it has {len(path):,} parts")
         return
-    if isinstance(place, list):
-        index = _index(place, key)
+    if isinstance(node, list):
+        index = _index(node, key)
         if index is None:
-            hint = schema.nearest(key, _names(place))
+            hint = schema.nearest(key, _names(node))
             problems.append(f"{place_name} has no entry {schema.shown(key)}; {hint}")
             return
         # The schema names an entry by its index, other checks by its name.
         names = tuple(n + form for n in names for form in (f"[{index}]", f" {key}"))
         key = index
-    elif isinstance(place, dict):
+    elif isinstance(node, dict):
         names = tuple(f"{name}.{key}" for name in names)
     else:
-        value = schema.shown(place)
+        value = schema.shown(node)
         problems.append(f"{place_name} = {value} is no table: it has no key {schema.shown(key)}")
         return
     place_name += f"[{path[0]}]" if path[0].isdecimal() else "." * bool(place_name) + path[0]
-    if not rest or (isinstance(place, dict) and key not in place):
-        places |= dict.fromkeys(names, place_name)
+    if not rest or (isinstance(node, dict) and key not in node):
+        key_paths |= dict.fromkeys(names, place_name)
     if not rest:
-        place[key] = value
+        node[key] = value
         return
-    if isinstance(place, dict):
+    if isinstance(node, dict):
         # A table that the file leaves out; if there is no such table, the schema says so.
-        place.setdefault(key, {})
-    _apply(place[key], rest, value, (names, place_name), problems, places)
+        node.setdefault(key, {})
+    _apply(node[key], rest, value, (names, place_name), problems, key_paths)
 
 
 def _names(entries: list[Any]) -> list[str]:

@@ -67,16 +67,16 @@ def load(
     _leave_out(table, changes, path.name)
     inside = {key: keypaths.below(changes, key) for key in ("hand", "objects", "control")}
     top_level = {p: v for p, v in changes.items() if p[0] not in inside or len(p) == 1}
-    places = keypaths.apply(table, top_level, path.name, problems)
+    key_paths = keypaths.apply(table, top_level, path.name, problems)
     parsed = schema.parse(SceneFile, table, path.name, problems)
     if parsed is not None:
         _check(parsed, path.name, problems)
-    problems = keypaths.as_given(problems, places)
+    problems = keypaths.as_given(problems, key_paths)
     chosen = {"hand": hand_name, "objects": object_set}
     parts = _hand_and_objects(path, table, chosen, inside, problems)
     if parsed is not None and "hand" in parts:
         parsed = _with_law(parsed, parts["hand"].material, path.name, problems)
-        problems = keypaths.as_given(problems, places)
+        problems = keypaths.as_given(problems, key_paths)
         # A path that the caller gives is not beside the scene's file.
         from_caller = ("control",) in top_level
         source = parsed.control if from_caller else _beside(path, parsed.control)

@@ -261,9 +261,9 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Obj
       InputError: with every problem in the file and in its meshes.
     """
     problems: list[str] = []
-    table, path, places = keypaths.read("objects", name, overrides, problems)
+    table, path, key_paths = keypaths.read("objects", name, overrides, problems)
     parsed = schema.parse(_ObjectSetFile, table, path.name, problems)
-    problems = keypaths.as_given(problems, places)
+    problems = keypaths.as_given(problems, key_paths)
     if parsed is None:
         raise schema.InputError(problems)
     if not parsed.object:

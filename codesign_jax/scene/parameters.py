@@ -106,7 +106,7 @@ class DesignSpace:
         Values of fixed parameters and the pressure limit stay: programs have them as constants.
         """
         zeros = (0.0,) * self.num_parameters
-        place = zip(self.base, self.source, strict=True)
+        entries = zip(self.base, self.source, strict=True)
         rows = (dataclasses.replace(p, low=0.0, high=0.0, default=0.0) for p in self.hand.parameter)
         return dataclasses.replace(
             self,
@@ -115,7 +115,7 @@ class DesignSpace:
             # Limits of a scene are projected within the bounds.
             bounds=(zeros, zeros) if self.buildable is None else self.bounds,
             idle=(),
-            base=tuple(0.0 if source >= 0 else value for value, source in place),
+            base=tuple(0.0 if source >= 0 else value for value, source in entries),
         )
 
     def expand(self, design: jax.typing.ArrayLike) -> jax.Array:

@@ -122,15 +122,15 @@ class _Reader:
     @staticmethod
     def _tokens(expression: str) -> list[tuple[str, str]]:
         tokens = []
-        place = 0
+        position = 0
         expression = expression.rstrip()
-        while place < len(expression):
-            match = _TOKEN.match(expression, place)
+        while position < len(expression):
+            match = _TOKEN.match(expression, position)
             if match is None:
-                raise ValueError(_foreign(expression[place:].lstrip()[0]))
+                raise ValueError(_foreign(expression[position:].lstrip()[0]))
             kind = str(match.lastgroup)
             tokens.append((kind, match[kind]))
-            place = match.end()
+            position = match.end()
         return tokens
 
     def total(self) -> tuple[float | None, dict[str, float]]:

@@ -102,8 +102,8 @@ class Tab:
             if kind == "show":
                 self._asked.append(self._view(**content))
             elif kind == "run":
-                place = content and [int(v) for v in content]
-                self._actions.append(lambda: self._of_run(place))
+                numbers = content and [int(v) for v in content]
+                self._actions.append(lambda: self._of_run(numbers))
             else:
                 self._actions.append(actions[kind])
         except Exception as error:  # whatever is sent, the tab goes on
@@ -296,12 +296,12 @@ class Tab:
             raise InputError(["there is no grasp of this design; move a slider"])
         return self._shown
 
-    def _of_run(self, place: list[int] | None) -> None:
+    def _of_run(self, numbers: list[int] | None) -> None:
         """Shows a particle of an episode, counted from 1; the chosen design without a place."""
         design = self._desk.case.design
         desk = self._desk
-        if place is not None and desk.record is not None:
-            e, p = place
+        if numbers is not None and desk.record is not None:
+            e, p = numbers
             design = cases.find_grasp(desk.case.scene, desk.record, episode=e, particle=p).design
         view = self._current().view
         self._asked.append(view._replace(design=design, resting=True, number=None))

@@ -192,11 +192,11 @@ def draw_budget(results: Budget, path: Path) -> Path:
     shown = [(c, r) for c in CHANGES if (r := results.compared(c.to, c.of))]
     figure = output.new_figure(7.5, 0.28 * len(shown) + 1.0)
     axes = figure.subplots()
-    for place, (change, result) in enumerate(shown):
+    for row, (change, result) in enumerate(shown):
         middle, low, high = (100 * v for v in result["flipped"])
-        axes.barh(-place, middle, color=COLORS[change.kind], alpha=0.8)
+        axes.barh(-row, middle, color=COLORS[change.kind], alpha=0.8)
         error = [[middle - low], [high - middle]]
-        axes.errorbar(middle, -place, xerr=error, fmt="none", color="black", capsize=2)
+        axes.errorbar(middle, -row, xerr=error, fmt="none", color="black", capsize=2)
     words = [c.words.replace("`", "") for c, _ in shown]
     axes.set_yticks([-k for k in range(len(shown))], words, fontsize=8)
     handles = [Patch(color=color, alpha=0.8) for color in COLORS.values()]

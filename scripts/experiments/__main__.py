@@ -72,9 +72,9 @@ def _strategies(args: argparse.Namespace, the_plan: simulate.Strategies, the_sce
     plans = simulate.plans(the_plan, the_scene, args.engine, folder, args.seed)
     arguments = {"fresh": args.fresh, "devices": args.devices, "chunk": args.chunk}
     done = runs.optimize(plans, sys.argv, **arguments)
-    problems = {place: r for place, r in done.runs.items() if isinstance(r, Exception)}
-    for place, error in problems.items():
-        print(f"error: {place}: {error}", file=sys.stderr)
+    problems = {run_folder: r for run_folder, r in done.runs.items() if isinstance(r, Exception)}
+    for run_folder, error in problems.items():
+        print(f"error: {run_folder}: {error}", file=sys.stderr)
     code = int(bool(problems)) or (128 + done.signum if done.signum else 0)
     gathered = simulate.gather(the_plan, folder, args.seed)
     if gathered is None or not gathered["cost"].shape[2]:

@@ -140,10 +140,10 @@ def plans(
     arguments = plan.preset, plan.strategies[0], plan.first()[0], engine
     base = runs.prepare(scene, runs.make_settings(*arguments, seed, **sizes))
     plans_by_folder = {}
-    for name, places in folders(plan, folder, seed).items():
-        for r, (place, first) in enumerate(zip(places, plan.first(), strict=True)):
+    for name, run_folders in folders(plan, folder, seed).items():
+        for r, (run_folder, first) in enumerate(zip(run_folders, plan.first(), strict=True)):
             changed = {"schedule": name, "first": first, "seed": seed + r}
-            plans_by_folder[place] = runs.variant(
+            plans_by_folder[run_folder] = runs.variant(
                 base, dataclasses.replace(base.settings, **changed)
             )
     return plans_by_folder
@@ -160,8 +160,8 @@ def gather(plan: Strategies, folder: Path, seed: int) -> Arrays | None:
       (run,). None if a run has not begun.
     """
     every = [
-        [runs.load_record(place) for place in places]
-        for places in folders(plan, folder, seed).values()
+        [runs.load_record(run_folder) for run_folder in run_folders]
+        for run_folders in folders(plan, folder, seed).values()
     ]
     records = [record for row in every for record in row if record is not None]
     if len(records) < plan.num_runs:

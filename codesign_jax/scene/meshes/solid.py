@@ -134,8 +134,8 @@ def load(
         raise InputError([f"{path.name}: {p}" for p in problems])
     vertices = vertices * UNITS[unit]
     if centre is not None and not _inside(vertices, centre):
-        place = ", ".join(f"{1e3 * v:g}" for v in centre)
-        raise InputError([f"{path.name}: centre_of_mass at {place} mm is outside its convex hull"])
+        point = ", ".join(f"{1e3 * v:g}" for v in centre)
+        raise InputError([f"{path.name}: centre_of_mass at {point} mm is outside its convex hull"])
     body = mass.body(vertices, faces, centre, tensor)
     options = f"{unit} {repaired} {voxel_error!r}"
     if centre is not None or tensor is not None:  # others keep the grids that they have on disk

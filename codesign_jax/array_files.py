@@ -100,8 +100,8 @@ def refusal(arrays: Arrays, about: Any) -> str:
     different = [name for name, value in head(about).items() if str(arrays.get(name)) != str(value)]
     if not different:
         return ""
-    what = "design or other settings" if different == ["about"] else "version of the code"
-    return f"is of another {what}"
+    difference = "design or other settings" if different == ["about"] else "version of the code"
+    return f"is of another {difference}"
 
 
 def save_results(path: Path, about: Any, results: Arrays) -> None:

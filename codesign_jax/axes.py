@@ -100,20 +100,20 @@ def refuse_draws(key: Any, count: int) -> None:
         raise InputError([words])
 
 
-def _problems(what: str, batch: Any, shapes: Any, axis: str) -> list[str]:
+def _problems(name: str, batch: Any, shapes: Any, axis: str) -> list[str]:
     array_shapes = {k: np.shape(v) for k, v in batch._asdict().items() if v is not None}
     if all(shape == getattr(shapes, k) for k, shape in array_shapes.items()):
         return [
-            f"{what} have no axis ({axis},); of one, jax.tree.map(lambda v: v[None], {what}) "
+            f"{name} have no axis ({axis},); of one, jax.tree.map(lambda v: v[None], {name}) "
             "makes a batch"
         ]
     counts = {shape[0] for shape in array_shapes.values() if shape}
     problems = [
-        f"{what}.{k} has shape {shape}, not ({', '.join(map(str, (axis, *getattr(shapes, k))))})"
+        f"{name}.{k} has shape {shape}, not ({', '.join(map(str, (axis, *getattr(shapes, k))))})"
         for k, shape in array_shapes.items()
         if not shape or shape[1:] != getattr(shapes, k)
     ]
     if not problems and len(counts) > 1:
         lengths = ", ".join(f"{k} {shape[0]}" for k, shape in array_shapes.items())
-        problems = [f"the arrays of {what} have different lengths: {lengths}"]
+        problems = [f"the arrays of {name} have different lengths: {lengths}"]
     return problems

@@ -59,15 +59,15 @@ def special(folder: Path, names: Iterable[str]) -> list[str]:
       Paths relative to the folder, sorted.
     """
     names_found = []
-    left = [*names]
-    while left:
-        name = left.pop()
+    pending = [*names]
+    while pending:
+        name = pending.pop()
         try:
             mode = os.lstat(folder / name).st_mode
             inside = os.listdir(folder / name) if stat.S_ISDIR(mode) else []
         except OSError:  # it is not there, or no longer; or it cannot be read, as its reader says
             continue
-        left += [f"{name}/{other}" for other in inside]
+        pending += [f"{name}/{other}" for other in inside]
         if not stat.S_ISDIR(mode) and not stat.S_ISREG(mode):
             names_found.append(name)
     return sorted(names_found)

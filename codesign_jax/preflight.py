@@ -276,8 +276,8 @@ def _overlaps(scene: Scene, designs: Params, names: list[str]) -> list[str]:
             ),
         ]
         problems += [
-            f"{name}: {what} (limits.penetration = {1e3 * limit:g} mm); {remedy}"
-            for deep, what, remedy in inside
+            f"{name}: {overlap} (limits.penetration = {1e3 * limit:g} mm); {remedy}"
+            for deep, overlap, remedy in inside
             if not deep <= limit
         ]
     return problems

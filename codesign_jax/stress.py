@@ -78,12 +78,12 @@ class Stress(NamedTuple):
         for name, kept in self.by_condition.items():
             total = self.trials * kept.size
             share, low, high = wilson(int(kept.sum()), total)
-            what = ""
+            suffix = ""
             if kept.size > 1:
                 low = kept.min() / self.trials
                 high = kept.max() / self.trials
-                what = ", by draw"
-            span = f"{100 * low:.0f} to {100 * high:.0f} %{what}"
+                suffix = ", by draw"
+            span = f"{100 * low:.0f} to {100 * high:.0f} %{suffix}"
             table_rows.append((name, f"{100 * share:.0f} % of {total}", span))
         return table_rows
 

@@ -306,7 +306,9 @@ def _cast(
     """Grasps of hands with deviations, first those of the table and then the scene's constants."""
     of_design = [i for i, entry in enumerate(deviation_table.constant) if entry.path[0] == "design"]
     of_scene = [i for i in range(len(deviation_table.constant)) if i not in of_design]
-    left = draws.Constants(constant=tuple(deviation_table.constant[i] for i in of_scene))
+    scene_deviations = draws.Constants(
+        constant=tuple(deviation_table.constant[i] for i in of_scene)
+    )
 
     def simulated(design: jax.Array, noise: tuple[jax.Array, jax.Array], scene: Scene) -> Outcome:
         key, deviations = noise
@@ -321,7 +323,7 @@ def _cast(
         _, params, worlds = rollout.crossed(scene, params, trials)
         if scene.drawn.constant:
             worlds = worlds._replace(constants=each[:, len(deviation_table.constant) :])
-        changed = draws.applied(scene, left, [each[:, i] for i in of_scene])
+        changed = draws.applied(scene, scene_deviations, [each[:, i] for i in of_scene])
         outcomes, _ = rollout.simulate(changed, engine, params, worlds)
         return rollout.grid(outcomes, (hands, count))
 

@@ -126,11 +126,13 @@ def make_optimizer(name: str, space: Space, num_particles: int | None = None) ->
     flag = f"--optimizer {name}"
     make = _load(name, "--optimizer")
     _refuse_signature(flag, make, ("space",))
-    made = _tried(flag, make, lambda: make(space))
-    missing = [n for n in ("space", "keeps_best", "init", "ask", "tell") if not hasattr(made, n)]
+    optimizer = _tried(flag, make, lambda: make(space))
+    missing = [
+        n for n in ("space", "keeps_best", "init", "ask", "tell") if not hasattr(optimizer, n)
+    ]
     if missing:
         raise InputError([f"{flag}: it lacks {', '.join(missing)} of optimize.Optimizer"])
-    if any(leaf is made for leaf in jax.tree.leaves(made)):
+    if any(leaf is optimizer for leaf in jax.tree.leaves(optimizer)):
         raise InputError(
             [
                 f"{flag}: it is no pytree: make it a dataclass and register that with "
@@ -138,16 +140,16 @@ def make_optimizer(name: str, space: Space, num_particles: int | None = None) ->
             ]
         )
     if num_particles is not None:
-        _try(flag, make, made, num_particles)
-    return made
+        _try(flag, make, optimizer, num_particles)
+    return optimizer
 
 
-def _try(flag: str, make: Any, made: Optimizer, n: int) -> None:
-    low = np.asarray(made.space.low)
-    high = np.asarray(made.space.high)
+def _try(flag: str, make: Any, optimizer: Optimizer, n: int) -> None:
+    low = np.asarray(optimizer.space.low)
+    high = np.asarray(optimizer.space.high)
     seed = jnp.asarray((low + high) / 2, float)
     mask = np.ones(low.shape, bool)
-    state = _tried(flag, make, lambda: made.init(jax.random.key(0), seed, n))
+    state = _tried(flag, make, lambda: optimizer.init(jax.random.key(0), seed, n))
     if not isinstance(state, OptimizerState) or np.shape(state.particles) != (n, low.size):
         raise InputError(
             [
@@ -157,8 +159,8 @@ def _try(flag: str, make: Any, made: Optimizer, n: int) -> None:
         )
 
     def episode(state: OptimizerState) -> tuple[jax.Array, Any]:
-        population = made.ask(state, mask)
-        return population, made.tell(state, population, jnp.zeros(n), mask)
+        population = optimizer.ask(state, mask)
+        return population, optimizer.tell(state, population, jnp.zeros(n), mask)
 
     population, result = _tried(flag, make, lambda: jax.eval_shape(episode, state))
     if population.shape != (n, low.size):

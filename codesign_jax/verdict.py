@@ -325,12 +325,14 @@ def characteristic(share: float, batch: int = BATCH, most: int = MOST) -> Charac
         undecided = np.convolve(undecided, losses)
         ratio = evidence(total - np.arange(undecided.size), total)  # type: ignore[arg-type]
         decided = ratio >= _DECISIVE - 1e-9, ratio <= -_DECISIVE + 1e-9
-        now = np.array([undecided[which].sum() for which in decided])
+        now = np.array([undecided[region].sum() for region in decided])
         ends += now
         expected += total * now.sum()
         undecided = np.where(decided[0] | decided[1], 0.0, undecided)
-    left = float(undecided.sum())
-    return Characteristic(float(ends[0]), float(ends[1]), left, float(expected + total * left))
+    undecided_share = float(undecided.sum())
+    return Characteristic(
+        float(ends[0]), float(ends[1]), undecided_share, float(expected + total * undecided_share)
+    )
 
 
 def _percent(share: float) -> str:

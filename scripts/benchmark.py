@@ -104,8 +104,8 @@ def _program(chosen: Scene, engine: str, worlds: work.Worlds) -> Any:
 
         fields, ctrl = work.inputs(chosen, worlds)
         return WarpProgram(chosen, fields, np.asarray(ctrl))
-    made = make_engine(engine, chosen)
-    return JaxProgram(lambda p, t: rollout.simulate(chosen, made, p, t)[0], *worlds)
+    simulator = make_engine(engine, chosen)
+    return JaxProgram(lambda p, t: rollout.simulate(chosen, simulator, p, t)[0], *worlds)
 
 
 def _outcomes(chosen: Scene, result: Any) -> Outcome:
@@ -192,13 +192,13 @@ def rates(files: list[dict[str, Any]]) -> str:
 
 def machines(files: list[dict[str, Any]]) -> str:
     """What measured the default scene's rates, in a line; the files have the commits."""
-    made: dict[str, None] = {}
+    lines: dict[str, None] = {}
     for content in files:
         for record in content["records"]:
             run = content["runs"][record["run"]]
             if record["scene"] == "paper":
-                made[f"{machine(run)}, JAX {run['jax']}, {run['date'][:10]}"] = None
-    return f"Measured on {'; on '.join(made)} (`docs/data/rates_*.json`)."
+                lines[f"{machine(run)}, JAX {run['jax']}, {run['date'][:10]}"] = None
+    return f"Measured on {'; on '.join(lines)} (`docs/data/rates_*.json`)."
 
 
 def peers(files: list[dict[str, Any]]) -> str:

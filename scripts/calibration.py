@@ -247,7 +247,7 @@ def load_scores(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return units[:, [names.index(name) for name in OPEN]], distances
 
 
-def left(path: Path = DATA) -> np.ndarray:
+def remaining_sets(path: Path = DATA) -> np.ndarray:
     """Sets that no target ruled out, of a file of scores, in the unit cube, (set, constant)."""
     units, distances = load_scores(path)
     return units[(distances <= CUTOFF).all(-1)]

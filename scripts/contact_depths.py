@@ -362,13 +362,13 @@ def main() -> None:
     scene = scenes.load("paper", overrides=keypaths.parse(args.set))
     designs = np.stack([v for path in args.files for v in designs_of(path)[: args.count]])
     rows = grasps(scene, designs, args)
-    made = {"command": shlex.join(["python", "-m", "scripts.contact_depths", *sys.argv[1:]])}
-    made |= {**provenance.git_state(args.commit), **provenance.environment()}
+    notes = {"command": shlex.join(["python", "-m", "scripts.contact_depths", *sys.argv[1:]])}
+    notes |= {**provenance.git_state(args.commit), **provenance.environment()}
     content = [{"vector": v.tolist()} for v in designs]
     for row in rows:
         content[row["design"]].setdefault("grasps", []).append(row)
     with files.atomically(args.out) as part:
-        text = json.dumps({**made, "summary": summary(rows), "designs": content}, indent=1)
+        text = json.dumps({**notes, "summary": summary(rows), "designs": content}, indent=1)
         part.write_text(text + "\n")
     print(json.dumps(summary(rows), indent=1))
 

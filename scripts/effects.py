@@ -159,10 +159,10 @@ def measured(results: dict[str, Any]) -> str:
         table.append([name, *cells, f"× {r['ratio']:.2f} ({low:.2f} to {high:.2f})"])
     p = results["provenance"]
     load = results["load"]
-    made = f"{results['designs']} designs in {results['trials']} trials each; {p['cpus']} cores, "
-    made += f"jax {p['jax']}; timed while other programs used the machine (load average "
-    made += f"{max(load):.0f})."
-    return f"{made}\n\n{output.markdown(table)}"
+    caption = f"{results['designs']} designs in {results['trials']} trials each; {p['cpus']} cores, "
+    caption += f"jax {p['jax']}; timed while other programs used the machine (load average "
+    caption += f"{max(load):.0f})."
+    return f"{caption}\n\n{output.markdown(table)}"
 
 
 def main() -> None:

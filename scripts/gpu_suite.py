@@ -55,11 +55,11 @@ def main() -> int:
     # Many processes share the GPU's memory.
     os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     begin = time.monotonic()
-    made = provenance.measurement(arguments.commit)
+    measurement = provenance.measurement(arguments.commit)
 
     def write() -> None:
         seconds = round(time.monotonic() - begin, 1)
-        content = {"provenance": made, "seconds": seconds, "tests": recorder.tests}
+        content = {"provenance": measurement, "seconds": seconds, "tests": recorder.tests}
         output.write_json(arguments.json, content)
 
     recorder = Recorder(write)

@@ -58,16 +58,16 @@ def parts() -> None:
     params = jax.tree.map(np.asarray, space.params(space.default()))
     settings = process.Process()
     sizes = process.sizes(grasping.hand, params, settings)
-    made = meshes.standing(casting.parts(sizes[0], settings))
+    standing = meshes.standing(casting.parts(sizes[0], settings))
     whole = palm.palm(grasping, params, sizes, settings)
-    cut = made.finger.trim_by_plane((0.0, 1.0, 0.0), 0.0)
+    cut = standing.finger.trim_by_plane((0.0, 1.0, 0.0), 0.0)
     under = whole.body.rotate([180, 0, 0])
     bar = whole.bars[0]
     laid = (
         ("finger", cut, SILICONE, (-72.0, -72.0)),
-        ("tray", made.tray, PRINTED, (-72.0, -22.0)),
-        ("core", made.core, CORE, (-72.0, 26.0)),
-        ("base mould", made.base, PRINTED, (-72.0, 72.0)),
+        ("tray", standing.tray, PRINTED, (-72.0, -22.0)),
+        ("core", standing.core, CORE, (-72.0, 26.0)),
+        ("base mould", standing.base, PRINTED, (-72.0, 72.0)),
         ("palm", under, DARK, (72.0, 22.0)),
         ("bar", bar, CORE, (52.0, -66.0)),
     )

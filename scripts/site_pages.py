@@ -45,8 +45,8 @@ def on_files(files: Files, config: Any) -> Files:
 
 def on_page_markdown(markdown: str, *, page: Any, config: Any, files: Files) -> str:
     """Turns the repository's links into the site's."""
-    made = {target: source for source, target in PAGES.items()}
-    source = made.get(page.file.src_uri, f"docs/{page.file.src_uri}")
+    sources = {target: source for source, target in PAGES.items()}
+    source = sources.get(page.file.src_uri, f"docs/{page.file.src_uri}")
     picture = posixpath.relpath("figures/way_of_data.svg", posixpath.dirname(page.file.src_uri))
     markdown = _DIAGRAM.sub(f"![Data flow]({picture})", markdown)
     parts = _CODE.split(markdown)

@@ -246,12 +246,12 @@ def by_default(space: DesignSpace, words: Sequence[str]) -> str:
     """Says which parameters of a design are the hand file's defaults; empty if none is."""
     pairs = chain.from_iterable(open_designs(words)[0].values())
     names = {each for pair in pairs for each in _members(pair.partition("=")[0], space)}
-    left = [name for name in space.names if name not in names]
-    if not left:
+    defaults = [name for name in space.names if name not in names]
+    if not defaults:
         return ""
     if not names:
         return "the hand file's default design; --design NAME=VALUE changes it"
-    groups = dict.fromkeys(name.split("[")[0] for name in left)
+    groups = dict.fromkeys(name.split("[")[0] for name in defaults)
     return f"not given, so the hand file's defaults: {', '.join(groups)}"
 
 

@@ -135,9 +135,9 @@ def _pair(options: Compare, paths: list[Path], *, runs: bool) -> dict[str, Case]
         return {f"{names[0]} with {case.policy}": case, "without": case._replace(policy="")}
     first, other = cases
     if first.scene.objects != other.scene.objects:
-        what = "runs" if runs else "designs"
+        compared = "runs" if runs else "designs"
         raise InputError(
-            [f"the two {what} have other objects or noise: --objects says which to take"]
+            [f"the two {compared} have other objects or noise: --objects says which to take"]
         )
     if names[0] == names[1]:
         names[1] += " again"
@@ -164,10 +164,10 @@ def compare_pair(pair: dict[str, Case], options: Compare, console: Console) -> N
     count = TRIALS if options.trials is None else options.trials
     for name, case in pair.items():
         with Busy(console, f"simulating {common.counted(count, 'grasp')}"):
-            outcome, left = case.observe(count, jax.random.key(options.seed))
+            outcome, departure = case.observe(count, jax.random.key(options.seed))
         console.print(f"{name} {Judged(case.scene, outcome, options.accuracy)}")
-        if left is not None:
-            console.print(f"policy {case.policy} {left}")
+        if departure is not None:
+            console.print(f"policy {case.policy} {departure}")
         kept.append(verdict.kept(outcome))
     for line in difference(*kept, names=[*pair]):
         console.print(line)

@@ -29,8 +29,10 @@ def main(options: Evaluate) -> int:
     notes = preflight.notes(case.scene, case.space, {"the design": case.design})
     console = Console()
     if options.run_folder:
-        which = "best final design" if options.particle is None else f"particle {options.particle}"
-        console.print(f"{which} of {options.run_folder}")
+        subject = (
+            "best final design" if options.particle is None else f"particle {options.particle}"
+        )
+        console.print(f"{subject} of {options.run_folder}")
     console.print(*runs.describe(case.space, case.design).split("\n"), sep="\n")
     if not options.run_folder:
         words = [*chain.from_iterable(options.design)]
@@ -152,12 +154,12 @@ def tell_verdict(
 
 def _untried(case: Case, options: Evaluate) -> list[str]:
     names = [shape.name for shape in case.scene.objects.object]
-    left = [] if options.trials is None else names[options.trials :]
-    if not left:
+    untried = [] if options.trials is None else names[options.trials :]
+    if not untried:
         return []
     return [
         f"warning: --trials {options.trials} tries {options.trials} of {len(names)} objects, and "
-        f"not {', '.join(left)}; --trials {len(names)} tries each once"
+        f"not {', '.join(untried)}; --trials {len(names)} tries each once"
     ]
 
 

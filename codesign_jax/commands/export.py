@@ -191,17 +191,17 @@ def _parts(
     settings = _process(options)
     folder.mkdir(exist_ok=True)
     with Busy(console, "making fingers, moulds and the palm"):
-        made = palm.palm(case.scene, params, sizes, settings)
-        parts = [*meshes.write(folder, sizes, settings), *meshes.write_palm(folder, made)]
+        built = palm.palm(case.scene, params, sizes, settings)
+        parts = [*meshes.write(folder, sizes, settings), *meshes.write_palm(folder, built)]
     for part in parts:
         edges = " x ".join(f"{v:.1f}" for v in part.extents)
         console.print(f"part {part.name}: {edges} mm, {part.volume / 1e3:.1f} cm^3")
-    problems = list(made.problems)
+    problems = list(built.problems)
     if not any(part.name == "palm" for part in parts):
         problems.append("its surface does not close, so that no file of it was written")
     for problem in problems:
         console.print(f"note: the palm cannot be built as it is: {problem}")
-    if made.flange is None:
+    if built.flange is None:
         console.print("note: the palm has no room for screws to the wrist")
     for i, size in enumerate(sizes):
         if settings.inlet and not process.inlet(size, settings):
@@ -209,9 +209,9 @@ def _parts(
             console.print(
                 f"finger {i} has no inlet: its chamber of {low:g} mm is narrower than the tube"
             )
-    volume = made.body.volume() + sum(bar.volume() for bar in made.bars)
+    volume = built.body.volume() + sum(bar.volume() for bar in built.bars)
     names = [part.name for part in parts]
-    return process.Printed(names, volume, made.flange, made.below, problems)
+    return process.Printed(names, volume, built.flange, built.below, problems)
 
 
 def _models(case: Case, params: Params, folder: Path, options: Export, console: Console) -> None:

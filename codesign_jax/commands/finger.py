@@ -103,7 +103,7 @@ def compare(mine: Finger, table: dict[str, np.ndarray], options: Options, consol
     if options.fit:
         fit = fingers.fit(mine, table)
         models["fitted"] = mine.of_material(**fit.value)
-    predictions = {which: fingers.predict(model, table) for which, model in models.items()}
+    predictions = {label: fingers.predict(model, table) for label, model in models.items()}
     columns = _columns(table, predictions, measured=options.measured is not None)
     shown = Table(box=box.SIMPLE)
     for name in columns:
@@ -116,8 +116,8 @@ def compare(mine: Finger, table: dict[str, np.ndarray], options: Options, consol
     for line in chain.from_iterable(_without_rest(table, *item) for item in predictions.items()):
         console.print(line)
     if options.measured:
-        for which, values in predictions.items():
-            console.print(f"{which}: {_errors(table, values)}")
+        for label, values in predictions.items():
+            console.print(f"{label}: {_errors(table, values)}")
         for name in fingers.opposed(table, predictions["model"]):
             console.print(f"warning: measured and predicted {words(name)} differ in sign")
     if fit:
@@ -134,13 +134,13 @@ def compare(mine: Finger, table: dict[str, np.ndarray], options: Options, consol
 
 
 def _without_rest(
-    table: dict[str, np.ndarray], which: str, prediction: dict[str, np.ndarray]
+    table: dict[str, np.ndarray], label: str, prediction: dict[str, np.ndarray]
 ) -> Iterator[str]:
     """Says where a finger has no rest, after what it has."""
     for name, pressures in fingers.without_rest(table, prediction).items():
         text = ", ".join(f"{pressure / 1e3:.4g}" for pressure in pressures)
         yield (
-            f"warning: {which}: no rest found for the {words(name)} at {text} kPa: "
+            f"warning: {label}: no rest found for the {words(name)} at {text} kPa: "
             f"{fingers.TOO_FAR}"
         )
 
@@ -157,8 +157,8 @@ def _columns(
         elif name in table:
             if measured:
                 columns[f"{name}_{unit}"] = table[name] / size
-            for which, values in predictions.items():
-                columns[f"{which}_{name}_{unit}"] = values[name] / size
+            for label, values in predictions.items():
+                columns[f"{label}_{name}_{unit}"] = values[name] / size
     return columns
 
 

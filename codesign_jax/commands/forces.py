@@ -36,8 +36,8 @@ def columns(forces: Forces) -> dict[str, Any]:
         value = getattr(forces, name)
         each = {name: value} if value.ndim == 2 else {}
         each |= {f"{name}_{i}": value[:, i] for i in range(value.shape[1] if not each else 0)}
-        for who, vector in each.items():
-            table |= {f"{who}_{axis}_N": vector[:, k] for k, axis in enumerate("xyz")}
+        for body, vector in each.items():
+            table |= {f"{body}_{axis}_N": vector[:, k] for k, axis in enumerate("xyz")}
     fingers = range(forces.grip.shape[1])
     table |= {f"grip_{i}_N": forces.grip[:, i] for i in fingers}
     pairs = [(i, j) for i in fingers for j in fingers[i:]]

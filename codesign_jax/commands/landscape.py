@@ -43,19 +43,19 @@ def main(options: Options) -> int:
     _check(options, case)
     pair = grid.axes(case, options)
     folder = _folder(options, case, pair)
-    made = make_plane(case, pair)
+    plane = make_plane(case, pair)
     console = Console()
     if case.space.num_parameters > sum(axis.column is not None for axis in pair):
         console.print(*runs.describe(case.space, case.design, "around").split("\n"), sep="\n")
     for note in preflight.notes(case.scene, case.space, {"the design": case.design}):
         console.print(note)
-    size = batch.size(len(made.designs), options.trials)
-    count = common.counted(-(-len(made.designs) // size), "call")
-    console.print(f"grasps: {len(made.designs) * options.trials} in {count}")
+    size = batch.size(len(plane.designs), options.trials)
+    count = common.counted(-(-len(plane.designs) // size), "call")
+    console.print(f"grasps: {len(plane.designs) * options.trials} in {count}")
     if options.dry_run:
         return 0
-    simulated = simulate_designs(case, made, size, options, console)
-    result = summarize(case, made, simulated, options.seed)
+    simulated = simulate_designs(case, plane, size, options, console)
+    result = summarize(case, plane, simulated, options.seed)
     print_summary(case, result, console)
     write_files(result, folder, console)
     return 0
@@ -99,16 +99,16 @@ def make_plane(case: Case, pair: tuple[Axis, Axis]) -> Plane:
 
 
 def simulate_designs(
-    case: Case, made: Plane, size: int, options: Options, console: Console
+    case: Case, plane: Plane, size: int, options: Options, console: Console
 ) -> Outcome:
     """Outcomes, arrays of shape (point, trial); all points meet trials of the same key."""
     key = jax.random.key(options.seed)
     count = options.trials
-    with Meter("landscape", len(made.designs) * count, console) as meter:
-        if made.numbers is None:
+    with Meter("landscape", len(plane.designs) * count, console) as meter:
+        if plane.numbers is None:
             task = Task(case.scene, case.space, count, case.make_engine())
-            return batch.evaluate(task, key, made.designs, size, meter.advance)
-        return _in_scenes(case, made.designs, made.numbers, (key, count), size, meter.advance)
+            return batch.evaluate(task, key, plane.designs, size, meter.advance)
+        return _in_scenes(case, plane.designs, plane.numbers, (key, count), size, meter.advance)
 
 
 def _in_scenes(
@@ -152,16 +152,16 @@ def _worlds(engine: Engine, space: DesignSpace, num_trials: int) -> Callable:
     return simulated
 
 
-def summarize(case: Case, made: Plane, outcomes: Outcome, seed: int) -> Landscape:
+def summarize(case: Case, plane: Plane, outcomes: Outcome, seed: int) -> Landscape:
     """The landscape of a grid's outcomes, arrays of shape (design, trial), in trials of a seed."""
-    shape = tuple(len(axis.values) for axis in made.axes)
+    shape = tuple(len(axis.values) for axis in plane.axes)
     counted = ~failed(outcomes.status)
     kept = verdict.kept(outcomes)
     return Landscape(
-        names=np.array([axis.name for axis in made.axes]),
-        units=np.array([axis.unit for axis in made.axes]),
-        first=made.axes[0].values,
-        second=made.axes[1].values,
+        names=np.array([axis.name for axis in plane.axes]),
+        units=np.array([axis.unit for axis in plane.axes]),
+        first=plane.axes[0].values,
+        second=plane.axes[1].values,
         cost=np.asarray(particle_cost(case.scene, outcomes)).reshape(shape),
         kept=kept.sum(1).reshape(shape),
         counted=counted.sum(1).reshape(shape),

@@ -43,8 +43,8 @@ def main(options: Sample) -> int:
     outcomes.folder.mkdir(parents=True, exist_ok=True)
     with locked(outcomes.folder):
         outcomes.begin(question)
-        for left in options.out.parent.glob(f"{options.out.name}.*.tmp"):
-            left.unlink()  # what a killed process was writing
+        for path in options.out.parent.glob(f"{options.out.name}.*.tmp"):
+            path.unlink()  # what a killed process was writing
         with Interrupts(console.print) as interrupts:
             try:
                 counts = _simulate(options.designs, question, engine, outcomes, interrupts, console)
@@ -108,17 +108,17 @@ def _simulate(
         return int(ends.sum())
 
     with Meter("sample", designs * question.trials, console) as meter:
-        left = []
+        missing = []
         for shard in range(total):
             outcome = outcomes.load(shard)
             if outcome is None:
-                left.append(shard)
+                missing.append(shard)
             else:
                 meter.count(count(shard, outcome))
-        if done := total - len(left):
+        if done := total - len(missing):
             calls = common.counted(total, "call")
             meter.message(f"going on after {done} of {calls}, from {outcomes.folder}")
-        for shard in left:
+        for shard in missing:
             answer = interrupts.call(lambda s=shard: simulate(*question.drawn(s)))
             outcome = jax.tree.map(np.asarray, answer)
             outcomes.save(shard, outcome)

@@ -41,19 +41,19 @@ def write(folder: Path, sizes: list[Size], process: Process) -> list[Part]:
     return printed_parts
 
 
-def write_palm(folder: Path, made: Palm) -> list[Part]:
+def write_palm(folder: Path, built: Palm) -> list[Part]:
     """Writes the palm and its clamp bars, equal bars once, as they stand on a printer's bed.
 
     Seats that stand in one another may leave a surface that no file can say as a closed one; such
     a palm is left out.
     """
-    solids = {("palm", tuple(range(len(made.bars)))): made.body}
+    solids = {("palm", tuple(range(len(built.bars)))): built.body}
     alike: dict[tuple, list[int]] = {}
-    for i, bar in enumerate(made.bars):
+    for i, bar in enumerate(built.bars):
         low, high = np.reshape(bar.bounding_box(), (2, 3))
         key = *np.round(high - low, 3).tolist(), round(bar.volume(), 2)
         alike.setdefault(key, []).append(i)
-    solids |= {("bar", tuple(fingers)): made.bars[fingers[0]] for fingers in alike.values()}
+    solids |= {("bar", tuple(fingers)): built.bars[fingers[0]] for fingers in alike.values()}
     printed_parts = []
     for (kind, fingers), solid in solids.items():
         name = kind if kind == "palm" else f"{kind}_{'_'.join(map(str, fingers))}"

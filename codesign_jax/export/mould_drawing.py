@@ -47,15 +47,15 @@ def cut(solid: Solid, plane: str, at: float) -> list[np.ndarray]:
 
 def castings(size: Size, process: Process) -> tuple[dict[str, Solid], dict[str, Solid]]:
     """Solids of the two castings by what they are, as they stand while the silicone cures."""
-    made = casting.parts(size, process)
+    pieces = casting.parts(size, process)
     low = prism(
         size.ends, shifted(half_width(size), 1.0), lambda x: -1.0, lambda x: size.at(x).wall
     )
-    shell = made.finger - low
-    first = {"tray": made.tray, "silicone": shell, "core": made.core}
+    shell = pieces.finger - low
+    first = {"tray": pieces.tray, "silicone": shell, "core": pieces.core}
     if inlet(size, process):
         first["pin"] = casting.pin(size, process)
-    second = {"base mould": made.base, "bottom wall": made.finger ^ low, "cured shell": shell}
+    second = {"base mould": pieces.base, "bottom wall": pieces.finger ^ low, "cured shell": shell}
     return {name: solid.rotate([180, 0, 0]) for name, solid in first.items()}, second
 
 

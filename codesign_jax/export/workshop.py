@@ -66,15 +66,15 @@ def _prints(scene: Scene, sizes: Sequence[Size], printed: Printed | None) -> She
     for name in printed.names:
         kind, _, label = name.partition("_")
         fingers = [part for part in label.split("_") if part.isdigit()]
-        which = ", ".join(fingers)
+        numbers = ", ".join(fingers)
         if kind == "palm":
             rows.append((name, "1", "the palm; underside down, no supports inside the seats"))
         elif kind == "bar":
-            rows.append((name, str(len(fingers)), f"clamp bar of finger {which}; lies flat"))
-        elif (what := label.rpartition("_")[2]) in uses:
-            rows.append((name, "1", f"{uses[what]}, finger {which}: cast {len(fingers)}"))
+            rows.append((name, str(len(fingers)), f"clamp bar of finger {numbers}; lies flat"))
+        elif (part_kind := label.rpartition("_")[2]) in uses:
+            rows.append((name, "1", f"{uses[part_kind]}, finger {numbers}: cast {len(fingers)}"))
         else:
-            rows.append((name, "0", f"finger {which} as it is to be: to compare, not to print"))
+            rows.append((name, "0", f"finger {numbers} as it is to be: to compare, not to print"))
     mass = shopping.PLASTIC * printed.palm_volume
     simulated_mass = 1e3 * scene.hand.palm.mass
     notes = [

@@ -186,12 +186,12 @@ class _Problem:
         weight = share / scales[self.column] ** 2
         precision = gram(slopes, weight) + prior
         step = -np.linalg.solve(precision, slopes.T @ (weight * errors) + prior @ logs)
-        left = errors + slopes @ step
+        residuals = errors + slopes @ step
         # Constants that each column tells: the trace of its part of the hat matrix.
         hat = weight * (slopes * np.linalg.solve(precision, slopes.T).T).sum(1)
         leverage = np.bincount(self.column, hat)
         self.effective_constants = float(leverage.sum())
-        new, wider = _noise(self.column, share, left, leverage)
+        new, wider = _noise(self.column, share, residuals, leverage)
         weight = share / (new * wider)[self.column] ** 2
         self.covariance = np.linalg.inv(gram(slopes, weight) + prior)
         return step, new
@@ -229,7 +229,7 @@ def gram(slopes: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def _noise(
-    column: np.ndarray, share: np.ndarray, left: np.ndarray, leverage: np.ndarray
+    column: np.ndarray, share: np.ndarray, residuals: np.ndarray, leverage: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Noise of each column, and by how much Student's interval is wider than the Gaussian's.
 
@@ -238,7 +238,7 @@ def _noise(
     from scipy import stats
 
     degrees = np.maximum(np.bincount(column, share) - leverage, 0.0)
-    squares = np.bincount(column, share * left**2)
+    squares = np.bincount(column, share * residuals**2)
     whole = float(degrees.sum())
     if whole < 0.5:  # as many constants as values: nothing tells the noise
         return np.full_like(degrees, _EXACT), np.ones_like(degrees)

@@ -27,11 +27,11 @@ def frictions(scene: Scene) -> list[Any]:
     return [*on_object, *of_fixtures, scene.objects.table.friction, *others]
 
 
-def around(scene: Scene, which: int, table: int) -> int:
+def around(scene: Scene, index: int, table: int) -> int:
     """Kind of a pair with the table, number 0, or a fixture, from 1 on."""
     with_friction = [i for i, f in enumerate(scene.fixture, 1) if f.friction is not None]
     return (
-        len(scene.objects.object) + with_friction.index(which) if which in with_friction else table
+        len(scene.objects.object) + with_friction.index(index) if index in with_friction else table
     )
 
 

@@ -56,8 +56,8 @@ class Judged(NamedTuple):
         if counts.fault == counts.total:
             causes = runs.failure_counts(self.outcomes.status)
             return f"no verdict: every trial failed ({causes})"
-        said = self.verdict.sentence(f"{self.grasps} of {objects(self.scene)}")
-        return "; ".join([said, *([self.limits] if self.limits else [])])
+        sentence = self.verdict.sentence(f"{self.grasps} of {objects(self.scene)}")
+        return "; ".join([sentence, *([self.limits] if self.limits else [])])
 
     @property
     def limits(self) -> str:

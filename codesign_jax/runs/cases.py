@@ -59,13 +59,13 @@ class Departure(NamedTuple):
 
     def __str__(self) -> str:
         """In words, such as "left the key frames in 3 of 20 grasps, first after 1.3 s (median)"."""
-        left = np.isfinite(self.time)
-        if not left.any():
-            return f"commanded nothing but the key frames in {left.size} grasps"
+        departed = np.isfinite(self.time)
+        if not departed.any():
+            return f"commanded nothing but the key frames in {departed.size} grasps"
         low, high = (1e-3 * f(v) for f, v in ((np.min, self.lower), (np.max, self.higher)))
         return (
-            f"left the key frames in {left.sum()} of {left.size} grasps, first after "
-            f"{np.median(self.time[left]):.3g} s (median); pressures by {low:.3g} to "
+            f"left the key frames in {departed.sum()} of {departed.size} grasps, first after "
+            f"{np.median(self.time[departed]):.3g} s (median); pressures by {low:.3g} to "
             f"{high:+.3g} kPa, the arm by up to {1e3 * np.max(self.place):.3g} mm and "
             f"{np.degrees(np.max(self.turn)):.3g}°"
         )
@@ -172,8 +172,10 @@ def departure(scene: Scene, outcomes: Outcome, ctrl: jax.Array, planned: jax.Arr
 def refuse_other_policy(policy: str, named: str | None) -> None:
     """Refuses to import a run's policy that the command line does not name, or to leave it out."""
     if policy != (named or ""):
-        made = f"--policy {policy}" if policy else "no policy"
-        raise InputError([f"the run was made with {made}; --policy is {named or 'not given'}"])
+        policy_words = f"--policy {policy}" if policy else "no policy"
+        raise InputError(
+            [f"the run was made with {policy_words}; --policy is {named or 'not given'}"]
+        )
 
 
 def case_of_run(

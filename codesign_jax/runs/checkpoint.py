@@ -90,8 +90,8 @@ class Checkpoints:
         if not read_only:
             self.folder.mkdir(parents=True, exist_ok=True)
             # Not by orbax, which begins a thread for it and does not wait for that when it closes.
-            for left in self.folder.glob(f"*{_TEMPORARY}*"):
-                files.remove(left)
+            for path in self.folder.glob(f"*{_TEMPORARY}*"):
+                files.remove(path)
         self._tell = tell
         self._run = run
         self._opened: Any = None
@@ -245,9 +245,9 @@ class Checkpoints:
         if labelled != step:
             raise self._foreign(step, f"step {labelled} under another name")
 
-    def _foreign(self, step: int, what: str) -> RunError:
+    def _foreign(self, step: int, state: str) -> RunError:
         return RunError(
-            f"{self.folder / str(step)} is {what}, and nothing was changed. Move it and "
+            f"{self.folder / str(step)} is {state}, and nothing was changed. Move it and "
             f"{self._digests(step).name} to where they belong"
         )
 

@@ -99,8 +99,8 @@ class Shards:
             raise InputError([f"{part} is no part of a data set; choose another --out"])
         others = [n for n, v in question.described.items() if before and before.get(n) != v]
         if others:
-            what = f"{part} has a part of other grasps ({', '.join(others)} differ)"
-            raise InputError([f"{what}; choose another --out, or delete the folder"])
+            difference = f"{part} has a part of other grasps ({', '.join(others)} differ)"
+            raise InputError([f"{difference}; choose another --out, or delete the folder"])
 
     @property
     def names(self) -> list[str]:
@@ -127,12 +127,12 @@ class Names(NamedTuple):
     texts: list[str]
 
 
-def pyarrow_module(what: str) -> ModuleType:
+def pyarrow_module(purpose: str) -> ModuleType:
     try:
         import pyarrow
         import pyarrow.parquet
     except ModuleNotFoundError as error:
-        message = f"{what} needs {error.name}: pip install -e '.[parquet]' in the checkout"
+        message = f"{purpose} needs {error.name}: pip install -e '.[parquet]' in the checkout"
         raise InputError([message]) from error
     return pyarrow
 
@@ -202,7 +202,7 @@ def write(path: Path, question: Question, designs: int, outcomes: Shards) -> Non
     notes |= {"status_bits": {str(int(bit)): bit.name for bit in Status if bit}}
     schema = _schema(pa, question.space, notes)
     shape = (question.chunk, question.trials)
-    left = designs * question.trials
+    remaining = designs * question.trials
     group = []
     with (
         files.atomically(path) as temporary,
@@ -212,9 +212,9 @@ def write(path: Path, question: Question, designs: int, outcomes: Shards) -> Non
             outcome = outcomes.load(shard)
             assert outcome is not None
             values = rows(question, shard, question.drawn(shard), outcome)
-            group.append(_table(pa, schema, values, shape).slice(0, left))
-            left -= group[-1].num_rows
-            if not left or sum(table.num_rows for table in group) >= ROWS:
+            group.append(_table(pa, schema, values, shape).slice(0, remaining))
+            remaining -= group[-1].num_rows
+            if not remaining or sum(table.num_rows for table in group) >= ROWS:
                 # Groups are written as they are, whatever the writer's own size is.
                 table = pa.concat_tables(group).unify_dictionaries()
                 writer.write_table(table, row_group_size=table.num_rows)

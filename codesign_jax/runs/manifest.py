@@ -160,10 +160,10 @@ def refuse_changed(path: Path, stored: Mapping[str, Any]) -> None:
     if not changed:
         return
     missing = [name for name in changed if not (path / name).exists()]
-    what = "is missing" if missing == changed else "was changed"
+    state = "is missing" if missing == changed else "was changed"
     raise InputError(
         [
-            f"{', '.join(str(path / name) for name in changed)} {what} since the run was made, so "
+            f"{', '.join(str(path / name) for name in changed)} {state} since the run was made, so "
             "that its results are not those of this scene. Put back the file as it was. To try "
             "other values on the run's design leave the file and give --set KEY=VALUE; a run of "
             f"the new scene needs a folder of its own. Or, to accept the files as they are, delete "

@@ -128,8 +128,8 @@ class Meter(Live):
         start, before = self._compiled = self._compiled or (now, self.done)
         if now > start and not self.console.is_terminal:  # the bar says as much
             rate = (self.done - before) / (now - start)
-            left = duration((max(self.total - self.done, 0) + self.later) / rate)
-            text += f", {rate:.1f} grasps/s, about {left} left"
+            time_left = duration((max(self.total - self.done, 0) + self.later) / rate)
+            text += f", {rate:.1f} grasps/s, about {time_left} left"
         self.say(text)
 
 
@@ -170,15 +170,15 @@ class Progress(Live):
         tested = self._part
         self._part = 0
         self._tested += tested
-        left = max(self._test - self._tested, 0) + self._after
+        remaining = max(self._test - self._tested, 0) + self._after
         if reports:
             grasps = sum(r.grasps for r in reports)
             first = min(r.done for r in reports)
-            pace = self._pace(grasps + tested, seconds, left + (self.total - first) * grasps)
+            pace = self._pace(grasps + tested, seconds, remaining + (self.total - first) * grasps)
             self.message(f"{self._line(reports, first, grasps)}  {pace}")
             self._bar.update(self._task, description=pace)
         elif tested:
-            pace = self._pace(tested, seconds, left)
+            pace = self._pace(tested, seconds, remaining)
             words = f"final test {self._tested}/{self._test} grasps  {pace}"
             self.say(words)
 
@@ -195,15 +195,15 @@ class Progress(Live):
             f"  failed {failed}/{grasps}"
         )
 
-    def _pace(self, grasps: int, seconds: float, left: float) -> str:
+    def _pace(self, grasps: int, seconds: float, remaining: float) -> str:
         """Counts grasps that took so long; their rate of late and the time left, in words."""
         self._done += grasps
-        self._bar.update(self._task, completed=self._done, total=self._done + left)
+        self._bar.update(self._task, completed=self._done, total=self._done + remaining)
         # A search begins with hands that lose their objects, which ends a grasp early.
         self._seconds = 0.8 * self._seconds + seconds
         self._grasps = 0.8 * self._grasps + grasps
         rate = self._grasps / max(self._seconds, 1e-9)
-        return f"{rate:.1f} grasps/s  ETA {duration(left / rate)}"
+        return f"{rate:.1f} grasps/s  ETA {duration(remaining / rate)}"
 
 
 class Report(NamedTuple):

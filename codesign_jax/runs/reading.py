@@ -96,9 +96,9 @@ def lost(folder: Path, restored: Restored | None = None) -> str:
         return ""
     damaged = restored.damaged if restored else ()
     steps = "; ".join(f"{step}: {reason}" for step, reason in damaged)
-    what = f"no checkpoint that is whole ({steps})" if steps else "lost its checkpoints"
+    loss = f"no checkpoint that is whole ({steps})" if steps else "lost its checkpoints"
     return (
-        f"run {folder} has {what}, while its tables have {episodes} "
+        f"run {folder} has {loss}, while its tables have {episodes} "
         f"episode{'s' * (episodes != 1)}. Put checkpoints/ back from a copy; or copy the tables, "
         "if they are wanted, and begin anew with codesign optimize --fresh"
     )

@@ -466,9 +466,9 @@ def _late(scene: Any, where: str) -> Iterator[str]:
         least, most = _range(factors, ends)
         if most <= last + 1e-9:
             continue
-        which = "never reached" if least > last + 1e-9 else "not reached in some designs"
+        state = "never reached" if least > last + 1e-9 else "not reached in some designs"
         yield (
-            f"{where}.frame[{i}].time = {schema.shown(sums.text(frame.time))} is {which}: the "
+            f"{where}.frame[{i}].time = {schema.shown(sums.text(frame.time))} is {state}: the "
             f"grasp ends after {last:g} s"
         )
 
@@ -482,9 +482,9 @@ def _unused(control: Control, where: str) -> Iterator[str]:
             values = getattr(frame, name) or ()
             for total in values if isinstance(values, tuple) else (values,):
                 used |= {term.name for term in total.term}
-    left = [n for n in (*(f"arm_{axis}" for axis in POSE), "pressure") if n not in used]
-    if left:
-        yield f"{where}: no key frame reads {', '.join(left)}: without a policy it has no effect"
+    unread = [n for n in (*(f"arm_{axis}" for axis in POSE), "pressure") if n not in used]
+    if unread:
+        yield f"{where}: no key frame reads {', '.join(unread)}: without a policy it has no effect"
 
 
 def _ends(row: Parameter) -> tuple[float, float]:

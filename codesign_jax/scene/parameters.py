@@ -552,9 +552,9 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
             ends = low[group[0]] * factor, high[group[0]] * factor
             columns.append((f"{row.name}{fingers}", row.unit, factor, *ends, morphology))
     if not columns:
-        left = "; ".join(f"{name} has no effect: {why}" for name, why in idle.items())
+        reasons = "; ".join(f"{name} has no effect: {why}" for name, why in idle.items())
         words = f"preset {preset.name!r} of hand {hand.name} leaves nothing to search"
-        raise schema.InputError([f"{words}: {left}"])
+        raise schema.InputError([f"{words}: {reasons}"])
     names, units, scale, low, high, domain = zip(*columns, strict=True)
     space = DesignSpace(
         _table_alone(hand),

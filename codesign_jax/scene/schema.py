@@ -236,10 +236,10 @@ def table(cls: type[T]) -> type[T]:
         return tuple(zip(keys, leaves_of(value), strict=True)), rest_of(value)
 
     def whole(rest: tuple[Any, ...], leaves: typing.Iterable[Any]) -> T:
-        made = object.__new__(cls)
-        made.__dict__.update(zip(static, rest, strict=True))
-        made.__dict__.update(zip(data, leaves, strict=True))
-        return made
+        instance = object.__new__(cls)
+        instance.__dict__.update(zip(static, rest, strict=True))
+        instance.__dict__.update(zip(data, leaves, strict=True))
+        return instance
 
     jax.tree_util.register_pytree_with_keys(cls, named_parts, whole, parts)
     _tables.add(cls)
@@ -295,10 +295,10 @@ def near_problem(path: str, value: float, expected: Range) -> str | None:
 
 def replaced(table: T, /, **changes: Any) -> T:
     """Like `dataclasses.replace`, for computed numbers, which may leave their ranges."""
-    made = object.__new__(type(table))
-    made.__dict__.update({f.name: getattr(table, f.name) for f in dataclasses.fields(table)})  # type: ignore[arg-type]
-    made.__dict__.update(changes)
-    return made
+    instance = object.__new__(type(table))
+    instance.__dict__.update({f.name: getattr(table, f.name) for f in dataclasses.fields(table)})  # type: ignore[arg-type]
+    instance.__dict__.update(changes)
+    return instance
 
 
 def _is_leaf(field: dataclasses.Field[Any]) -> bool:

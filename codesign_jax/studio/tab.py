@@ -201,9 +201,9 @@ class Tab:
         self.send("grasp", _grasp_message(self._shown))
 
     def _tell_trials(self, shown: ShownGrasp) -> None:
-        left = shown.view.trials - self._total
+        remaining = shown.view.trials - self._total
         outcomes = shown.bench.outcomes(shown.view.design, self._total)
-        self._outcomes.append(jax.tree.map(lambda v: v[:left], outcomes))
+        self._outcomes.append(jax.tree.map(lambda v: v[:remaining], outcomes))
         self._tell_verdict(shown)
 
     def _tell_overlap(self, shown: ShownGrasp) -> None:

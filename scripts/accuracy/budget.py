@@ -201,9 +201,9 @@ def crossed(designs: np.ndarray, drawn: Trial) -> tuple[np.ndarray, Trial]:
 
 def calibrated(the_scene: Scene, trials: int, designs: int) -> Scene:
     """A scene with numbers of each world: a set for each trial, of those that are not ruled out."""
-    left = calibration.left()
-    rows = np.random.default_rng(SEED).permutation(len(left))[np.arange(trials) % len(left)]
-    numbers = calibration.numbers(the_scene, calibration.values(left[rows]))
+    sets = calibration.remaining_sets()
+    rows = np.random.default_rng(SEED).permutation(len(sets))[np.arange(trials) % len(sets)]
+    numbers = calibration.numbers(the_scene, calibration.values(sets[rows]))
     index = np.tile(np.arange(trials), designs)
     return jax.tree.map(lambda v: jnp.asarray(v[index] if np.ndim(v) else v, jnp.float32), numbers)
 
@@ -308,8 +308,8 @@ def motion(
         params = jax.vmap(lambda v: parameters.unflatten(the_scene.hand, v))(vectors)
         trials = jax.tree.map(lambda x: np.asarray(x)[np.arange(hands) % work.TRIALS], drawn)
         cast = lambda x: np.asarray(x).astype(float_type) if x.dtype.kind == "f" else x  # noqa: E731
-        made = work.inputs(the_scene, work.Worlds(*jax.tree.map(cast, (params, trials))))
-        fields, ctrl = jax.tree.map(np.asarray, made)
+        inputs = work.inputs(the_scene, work.Worlds(*jax.tree.map(cast, (params, trials))))
+        fields, ctrl = jax.tree.map(np.asarray, inputs)
         ctrl = ctrl[:, :count]
         if engine != "mujoco":
             run = jax.jit(

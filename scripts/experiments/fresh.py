@@ -66,8 +66,8 @@ def simulate(
         params.append(jax.jit(jax.vmap(space.params))(flat))
     joined = jax.tree.map(lambda *v: jnp.concatenate(v), *params)
     drawn = rollout.sample_trials(the_scene, stream_key(jax.random.key(0), STREAM_FRESH, 0), trials)
-    made = make_engine(engine, the_scene)
-    outcome = jax.jit(lambda p, t: rollout.evaluate(the_scene, made, p, t))(joined, drawn)
+    simulator = make_engine(engine, the_scene)
+    outcome = jax.jit(lambda p, t: rollout.evaluate(the_scene, simulator, p, t))(joined, drawn)
     arrays = {}
     start = 0
     for name, particles in every.items():
@@ -102,8 +102,8 @@ def run(args: argparse.Namespace) -> None:
         the_scene = scene.load(args.scene, **arguments)
         new = simulate(the_scene, args.engine, every, args.trials)
         for key, value in new.items():
-            name, what = key.split("|")
-            arrays[f"{name}|{label}|{what}"] = value
+            name, kind = key.split("|")
+            arrays[f"{name}|{label}|{kind}"] = value
         notes["runs"].append({"label": label, **provenance.results(args.commit)})
         write(args.data, "fresh", arrays, notes)
         print(f"{label}: {sum(new[f'{n}|cost'].size for n in every):,} grasps", flush=True)
@@ -155,7 +155,7 @@ def _kept(
     arrays: dict[str, np.ndarray], name: str, label: str, trials: int | None = None
 ) -> np.ndarray:
     """Share of grasps that kept the object, failed trials left out, shape (strategy, run)."""
-    cost, status = (arrays[f"{name}|{label}|{what}"][..., :trials] for what in ("cost", "status"))
+    cost, status = (arrays[f"{name}|{label}|{kind}"][..., :trials] for kind in ("cost", "status"))
     good = ~failed(status)
     return ((cost == 0) & good).sum(-1) / np.maximum(good.sum(-1), 1)
 

@@ -28,9 +28,9 @@ place; what is not measured again is marked as of the earlier model (tests/test_
 """
 
 
-def before(made: dict[str, Any]) -> str:
+def before(run: dict[str, Any]) -> str:
     """The mark of what was measured with another kernel."""
-    return "" if made.get("kernel") == KERNEL else ", earlier model"
+    return "" if run.get("kernel") == KERNEL else ", earlier model"
 
 
 def command() -> str:
@@ -47,9 +47,11 @@ def command() -> str:
 def parser(description: str | None) -> argparse.ArgumentParser:
     """A command line with the module's docstring and the option --commit."""
     raw = argparse.RawDescriptionHelpFormatter
-    made = argparse.ArgumentParser(description=description, formatter_class=raw)
-    made.add_argument("--commit", help="commit of the code where there is no repository to ask")
-    return made
+    command_line = argparse.ArgumentParser(description=description, formatter_class=raw)
+    command_line.add_argument(
+        "--commit", help="commit of the code where there is no repository to ask"
+    )
+    return command_line
 
 
 def results(commit: str | None = None) -> dict[str, object]:

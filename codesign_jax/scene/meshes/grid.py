@@ -134,11 +134,11 @@ def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float, reac
         return build(vertices, faces, bound, reach)
     path = reuse.folder() / "meshes" / f"{name}.kept"
 
-    def made() -> bytes:
+    def build_packed() -> bytes:
         return array_files.packed(build(vertices, faces, bound, reach)._asdict())
 
     arrays: dict[str, Any] = array_files.unpacked(
-        io.BytesIO(reuse.kept(path, made, worth=WORTH_KEEPING)), path
+        io.BytesIO(reuse.kept(path, build_packed, worth=WORTH_KEEPING)), path
     )
     for name in ("cell", "error", "worst"):
         arrays[name] = float(arrays[name])

@@ -175,13 +175,17 @@ def _size_problems(longest: float, unit: str) -> list[str]:
 def surface_problems(vertices: np.ndarray, faces: np.ndarray, repaired: bool = False) -> list[str]:
     """Returns why the faces do not bound a body, a line for each reason."""
     edges = repair.half_edges(faces)
-    which, count = np.unique(np.sort(edges, 1), axis=0, return_inverse=True, return_counts=True)[1:]
+    edge_numbers, count = np.unique(
+        np.sort(edges, 1), axis=0, return_inverse=True, return_counts=True
+    )[1:]
     problems = []
     if (count == 1).any():
         problems.append(f"not watertight: {(count == 1).sum()} edges belong to one face only")
     if (count > 2).any():
         problems.append(f"{(count > 2).sum()} edges belong to more than two faces")
-    forward = np.bincount(which.reshape(-1), weights=np.where(edges[:, 0] < edges[:, 1], 1, -1))
+    forward = np.bincount(
+        edge_numbers.reshape(-1), weights=np.where(edges[:, 0] < edges[:, 1], 1, -1)
+    )
     if clashing := int(((count == 2) & (forward != 0)).sum()):
         problems.append(f"faces point to different sides at {clashing} edges")
     a, b, c = (vertices[faces[:, k]] - vertices.mean(0) for k in range(3))

@@ -98,8 +98,8 @@ def test_a_free_finger_has_the_wanted_pressure(neo_hookean):
         @jax.jit
         def reached(hand, controls, grown):
             charge = air.charged(the_scene, hand, controls)[0, 0, 6]
-            given = air.volumes(hand, 1)[0, 0], hand.air[:, 0, 0], (grown, 0.0, 0.0)
-            return air.end_pressure(1.0, charge, *given)
+            arguments = air.volumes(hand, 1)[0, 0], hand.air[:, 0, 0], (grown, 0.0, 0.0)
+            return air.end_pressure(1.0, charge, *arguments)
 
         pressure, fall = reached(hand, controls, mine.gain * mine.free)
     assert pressure == pytest.approx(WANTED, rel=1e-9)
@@ -134,15 +134,15 @@ def swung():
             begun[6] = start
             worlds.append(fields._replace(start=begun))
         fields = grasps.stack(*worlds)
-        held = np.repeat(np.array(ctrl)[None, :1], 1000, 1)
-        held[..., 6:] = WANTED
+        controls = np.repeat(np.array(ctrl)[None, :1], 1000, 1)
+        controls[..., 6:] = WANTED
         engine = StructuredEngine(plain, tolerance=1e-24)
 
         @jax.jit
         def run(fields, ctrl):
             return engine.advance(world_constants(plain, fields), engine.reset(fields), ctrl)[0]
 
-        outputs = run(fields, np.repeat(held, 2, 0))
+        outputs = run(fields, np.repeat(controls, 2, 0))
     return plain, params, fields, *(np.asarray(outputs[n])[..., 6] for n in ("qpos", "qvel"))
 
 
@@ -286,7 +286,7 @@ FAULTS = {
             }
         ),
         "the pressure of a step is that of its start": Fault(
-            {"end_pressure": lambda right, h, *given: right(0 * h, *given)}
+            {"end_pressure": lambda right, h, *arguments: right(0 * h, *arguments)}
         ),
         "pressures of a step's end stay": Fault(
             {"Chambers.move.<locals>.push": lambda right, tau, *_: tau}

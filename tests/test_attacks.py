@@ -174,10 +174,10 @@ def test_every_way_to_print_shows_what_a_terminal_would_obey(encoding, monkeypat
         console.print(table)
     terminal.say(HOSTILE, "日")
     stream.seek(0)
-    said = stream.read()
-    assert not {*said} & {"\x1b", "\x07", "\r", "\u2028"} and "\nsecond" not in said
-    assert said.count(SHOWN) == 5
-    assert ("日" if encoding == "utf-8" else r"\u65e5") in said
+    output = stream.read()
+    assert not {*output} & {"\x1b", "\x07", "\r", "\u2028"} and "\nsecond" not in output
+    assert output.count(SHOWN) == 5
+    assert ("日" if encoding == "utf-8" else r"\u65e5") in output
 
 
 def test_texts_of_a_run_are_one_line_each_where_it_goes_on(run):

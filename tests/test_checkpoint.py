@@ -57,18 +57,18 @@ def test_round_trip_is_bitwise(folder):
 def test_no_save_waits_for_the_deletion_of_old_steps_or_fails_with_it(tmp_path, monkeypatch):
     """Deletions begin when all saves are done, and are refused then."""
     saved = threading.Event()
-    said = []
+    messages = []
 
     def refuse(path, *rest, **more):
         assert saved.wait(60), "a save waits for this"
         raise PermissionError(f"{path} is not ours")
 
-    with Checkpoints(tmp_path, keep=2, tell=said.append) as store:
+    with Checkpoints(tmp_path, keep=2, tell=messages.append) as store:
         monkeypatch.setattr(shutil, "rmtree", refuse)
         for step in range(1, 6):
             store.save(step, arrays(step))
         saved.set()
-    (words,) = said
+    (words,) = messages
     assert words.startswith(f"old checkpoints in {tmp_path} could not be deleted: ")
     assert words.endswith("1 is not ours")
     restored = restore(tmp_path)

@@ -145,8 +145,8 @@ def test_ctrl_c_is_one_line_and_ends_the_process(monkeypatch, capsys, request):
 
 def test_scenes_names_what_is_built_in(capsys):
     assert cli.main(["scenes"]) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     kinds = ("scenes", "hands", "objects", "controls")
-    assert all(name in said for kind in kinds for name in library.available(kind))
-    assert "lateral_bending" not in said
+    assert all(name in output for kind in kinds for name in library.available(kind))
+    assert "lateral_bending" not in output
     assert cli.main(["scenes", "edge"]) == 0 and "lateral_bending" in capsys.readouterr().out

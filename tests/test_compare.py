@@ -75,9 +75,9 @@ def test_two_designs_meet_the_same_trials(place, capsys):
     """Counts add up, and a design beside itself differs in no trial."""
     runs = [place / "particle-filter", place / "today"]
     assert command("compare", *runs, "--trials", "12") == 0
-    said = capsys.readouterr().out
-    assert said.count("of 12 fresh grasps") == 2 and "of the same 12 trials" in said
-    assert "95 % interval by Newcombe; McNemar's exact test" in said
+    output = capsys.readouterr().out
+    assert output.count("of 12 fresh grasps") == 2 and "of the same 12 trials" in output
+    assert "95 % interval by Newcombe; McNemar's exact test" in output
     copy = Path(shutil.copytree(place / "today", place / "copy"))
     assert command("compare", place / "today", copy, "--trials", "3") == 0
     assert f"0 by {place / 'today'} alone, 0 by {copy} alone" in capsys.readouterr().out
@@ -145,9 +145,11 @@ def test_where_a_policy_leaves_the_key_frames():
     np.testing.assert_allclose(left.lower, [0, -2e4, 0, 0, 0])
     np.testing.assert_allclose(left.place, [0, 0, 0.003, 0, 0])
     np.testing.assert_allclose(left.turn, [0, 0, 0.1, 0, 0])
-    said = str(jax.tree.map(np.asarray, left))
-    assert said.startswith("left the key frames in 2 of 5 grasps, first after 0.08 s (median); ")
-    assert said.endswith("pressures by -20 to +1e-06 kPa, the arm by up to 3 mm and 5.73°")
+    sentence = str(jax.tree.map(np.asarray, left))
+    assert sentence.startswith(
+        "left the key frames in 2 of 5 grasps, first after 0.08 s (median); "
+    )
+    assert sentence.endswith("pressures by -20 to +1e-06 kPa, the arm by up to 3 mm and 5.73°")
     none = cases.departure(tiny, outcomes, planned, planned)
     assert str(none) == "commanded nothing but the key frames in 5 grasps"
 
@@ -155,10 +157,10 @@ def test_where_a_policy_leaves_the_key_frames():
 @pytest.mark.parametrize(("first", "second", "total"), [(30, 12, 400), (5, 2, 24), (0, 3, 60)])
 def test_how_many_trials_would_show_a_difference(first, second, total):
     """With so many at the same shares the interval is about to leave out 0."""
-    said = " ".join(compare.difference(*outcomes_of(first, second, total), names=["a", "b"]))
-    if "no difference" not in said:
+    output = " ".join(compare.difference(*outcomes_of(first, second, total), names=["a", "b"]))
+    if "no difference" not in output:
         return
-    needed = int(re.search(r"about ([\d,]+) trials", said)[1].replace(",", ""))
+    needed = int(re.search(r"about ([\d,]+) trials", output)[1].replace(",", ""))
     scale = needed / total
     pair = [round(scale * n) for n in (first, second)]
     interval = statistics.paired(round(scale * total) - sum(pair), *pair, round(scale * total))
@@ -441,10 +443,10 @@ def test_trials_go_on_until_they_decide(outcomes, most, known, expected):
 
 def test_a_verdict_is_a_sentence():
     """A share below a limit is not rounded to it."""
-    said = verdict.judge(97, 100).sentence()
-    assert said == "keeps 97 % of 100 fresh grasps (92 to 99 %): good"
-    said = verdict.judge(128, 138).sentence()
-    assert said.startswith("keeps 93 % of 138") and "more than 10,000 more at" in said
+    sentence = verdict.judge(97, 100).sentence()
+    assert sentence == "keeps 97 % of 100 fresh grasps (92 to 99 %): good"
+    sentence = verdict.judge(128, 138).sentence()
+    assert sentence.startswith("keeps 93 % of 138") and "more than 10,000 more at" in sentence
     assert "keeps 99.6 % of 250 grasps of its" in verdict.judge(249, 250).sentence("grasps of its")
     tiny = scene.load(TINY)
     kept = Judged(tiny, trials_of([0.0] * 3, [0] * 3), "fine")

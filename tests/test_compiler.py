@@ -33,8 +33,8 @@ def run(functions, inputs, out_dtype, backend):
     lanes = inputs[0].shape[-1]
 
     def kernel(*refs):
-        *given, out = refs
-        values = [ref[0, :] for ref in given]
+        *inputs, out = refs
+        values = [ref[0, :] for ref in inputs]
         for k, function in enumerate(functions):
             out[k, :] = function(*values).astype(out_dtype)
 
@@ -285,8 +285,8 @@ def write(function, *kinds, lanes=8):
     """A function of vectors in LLVM's language, as vectors and as threads."""
 
     def kernel(*refs):
-        *given, out = refs
-        out[0, :] = function(*(ref[0, :] for ref in given))
+        *inputs, out = refs
+        out[0, :] = function(*(ref[0, :] for ref in inputs))
 
     for writer, size in ((vector, lanes), (thread, 32)):
         spec = pl.BlockSpec((None, 1, size), lambda i: (i, 0, 0))

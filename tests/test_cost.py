@@ -94,13 +94,13 @@ def test_a_stuck_object_fails_the_trial():
     # One that was lost before cannot be stuck.
     assert evaluate(trace(400, distance={last: 0.05}, height={last: 0.25})).status == Status.OK
     without = scene.load("paper_spheres", overrides={"effects": {"ungrasp": False}})
-    held = jax.tree.map(lambda v: v[: without.num_steps], trace())
-    assert cost.outcome(without, held).status == Status.OK
+    without_release = jax.tree.map(lambda v: v[: without.num_steps], trace())
+    assert cost.outcome(without, without_release).status == Status.OK
 
 
 def test_whether_an_object_rests_is_told_by_its_own_size():
     """A sphere of 30 mm that is held at 40 mm is stuck; a cuboid may stand there on a corner."""
-    held = trace(distance={STEPS - 1: 0.05}, height={STEPS - 1: 0.04})
+    distant = trace(distance={STEPS - 1: 0.05}, height={STEPS - 1: 0.04})
     for name, size, status in (
         ("sphere", 1.0, Status.STUCK),
         ("sphere", 1.4, Status.OK),  # this trial's has 42 mm
@@ -108,7 +108,7 @@ def test_whether_an_object_rests_is_told_by_its_own_size():
         ("cuboid", 0.7, Status.STUCK),  # 36 mm from its centre to a corner
     ):
         trial = rollout.nominal_trial(SCENE, name)._replace(size=jnp.float32(size))
-        assert judge(held, trial).status == status, (name, size)
+        assert judge(distant, trial).status == status, (name, size)
 
 
 CAP = Status.SOLVER_CAP

@@ -1191,9 +1191,9 @@ def test_poses_are_checked_as_they_are_sent(tmp_path, capsys, slow):
     limits = {key: most for key, (most, _) in play_hand.LIMITS.items()}
     fast = bool(play_hand.excess(peaks, limits))
     assert fast == (slow < 2) and play_hand.main([*words, str(slow)]) == 2 * fast
-    said = capsys.readouterr().err
+    output = capsys.readouterr().err
     if fast:
-        proposal = said.partition("--slow ")[2].partition(",")[0]
+        proposal = output.partition("--slow ")[2].partition(",")[0]
         assert play_hand.main([*words, proposal]) == 0
         assert play_hand.main([*words, f"{float(proposal) - 0.2:.1f}"]) == 2
 
@@ -1244,8 +1244,8 @@ def test_one_finger_is_held_at_a_pressure(tmp_path, capsys):
     path = tmp_path / "valves.csv"
     path.write_text(JUMP)
     rows, limits = play_valves.read(path)
-    held = play_valves.scaled(play_valves.held(rows, 1, 40.0), limits, [1.0])
-    assert play_valves.at(held, 2.5) == [0, 20] and play_valves.at(held, 1000) == [0, 40]
+    hold = play_valves.scaled(play_valves.hold_rows(rows, 1, 40.0), limits, [1.0])
+    assert play_valves.at(hold, 2.5) == [0, 20] and play_valves.at(hold, 1000) == [0, 40]
     for words, problem in {
         ("--hold", "2", "10"): "--hold takes a finger of 0 to 1, not 2",
         ("--hold", "0.5", "10"): "not 0.5",
@@ -1335,11 +1335,11 @@ def test_command_writes_models_of_the_default_scene_s_kind(tmp_path, capsys):
     settings += ["effects.neo_hookean=true", "--objects", mesh]
     arguments = ["--scene", TINY, "--out", out, "--no-parts", "--no-sheet", "--set", *settings]
     assert command("export", *arguments) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     notes = (out / "model" / "README.txt").read_text()
     for words in ("without effects.neo_hookean", "without effects.friction_memory", "mesh 'mug'"):
-        assert f"note: the model {'has the ' * ('mesh' in words)}" in said
-        assert words in said and words in notes
+        assert f"note: the model {'has the ' * ('mesh' in words)}" in output
+        assert words in output and words in notes
     [mug] = scene.load("paper", object_set=mesh).objects.object
     loaded = mujoco.MjModel.from_xml_path(str(out / "model" / "mug.xml"))
     data = mujoco.MjData(loaded)

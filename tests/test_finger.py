@@ -328,8 +328,8 @@ def test_what_no_material_explains_is_refused(text, tmp_path, capsys):
     path = tmp_path / "finger.csv"
     path.write_text(f"pressure_kPa,{text}\n")
     assert cli.main(["finger", str(path), "--fit", *rubber(40e3)]) == 2
-    said = capsys.readouterr()
-    assert UNFIT[text] in said.err and "--set" not in said.out
+    output = capsys.readouterr()
+    assert UNFIT[text] in output.err and "--set" not in output.out
 
 
 FITTED = {
@@ -351,14 +351,14 @@ def test_a_standard_error_needs_more_values_than_numbers(text, tmp_path, capsys)
     path = tmp_path / "finger.csv"
     path.write_text(f"pressure_kPa,{text}\n")
     assert cli.main(["finger", str(path), "--fit", *rubber(40e3)]) == 0
-    said = capsys.readouterr().out
-    errors = [float(e) for e in re.findall(r"standard error ([0-9.e+-]+) %", said)]
+    output = capsys.readouterr().out
+    errors = [float(e) for e in re.findall(r"standard error ([0-9.e+-]+) %", output)]
     if FITTED[text] is None:
-        assert not errors and "no standard error (as many numbers as values)" in said
+        assert not errors and "no standard error (as many numbers as values)" in output
     else:
         low, high = FITTED[text]
         assert all(low < error < high for error in errors) and errors
-    [proposed] = re.findall(r"--set (.*)", said)
+    [proposed] = re.findall(r"--set (.*)", output)
     material = scene.load("paper", overrides=keypaths.parse(proposed.split())).hand.material
     assert material.law == "linear"
     assert f"shear_modulus={material.shear_modulus:.4g}" in proposed
@@ -368,16 +368,16 @@ def test_rows_that_have_a_rest_are_printed_and_the_others_named(tmp_path, capsys
     """Also with measurements, whose signs are compared with the model's without a fit."""
     soft = rubber(8.9e3)
     assert cli.main(["finger", *soft]) == 0
-    said = capsys.readouterr().out
-    rows = [line.split() for line in said.splitlines() if re.match(r" +\d", line)]
+    output = capsys.readouterr().out
+    rows = [line.split() for line in output.splitlines() if re.match(r" +\d", line)]
     assert len(rows) == 11 and len(rows[3]) == 4 and len(rows[-1]) == 3
-    assert re.search(r"warning: model: no rest found for the tip force at [\d, ]*120 kPa", said)
+    assert re.search(r"warning: model: no rest found for the tip force at [\d, ]*120 kPa", output)
     path = tmp_path / "finger.csv"
     path.write_text("pressure_kPa,angle_deg,tip_force_N\n30,-20,\n120,,3\n")
     assert cli.main(["finger", str(path), *soft]) == 0
-    said = capsys.readouterr().out
-    assert "no rest found for the tip force at 120 kPa" in said
-    assert "warning: measured and predicted angle differ in sign" in said
+    output = capsys.readouterr().out
+    assert "no rest found for the tip force at 120 kPa" in output
+    assert "warning: measured and predicted angle differ in sign" in output
 
 
 def test_the_command_compares_and_fits(tmp_path, capsys):
@@ -389,12 +389,12 @@ def test_the_command_compares_and_fits(tmp_path, capsys):
     line = ["finger", str(path), "--fit", "--design", "length=110", "--out", str(out)]
     line += ["--set", *(f"{k}={v}" for k, v in material().items())]
     assert cli.main(line) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     assert (
-        "--set hand.material.law=linear hand.material.shear_modulus=5e+04" in said
-        and "110 mm long" in said
+        "--set hand.material.law=linear hand.material.shear_modulus=5e+04" in output
+        and "110 mm long" in output
     )
-    assert "model: angle errs by" in said and "(25 %)" in said  # 50 / 40 - 1
+    assert "model: angle errs by" in output and "(25 %)" in output  # 50 / 40 - 1
     head, *rows = out.read_text().splitlines()
     assert head == "pressure_kPa,angle_deg,model_angle_deg,fitted_angle_deg" and len(rows) == 2
     # A finger of 0.8 times the model's moment bends as the model does if its pressure is divided
@@ -406,12 +406,12 @@ def test_the_command_compares_and_fits(tmp_path, capsys):
     ]
     path.write_text("pressure_kPa,angle_deg,blocked_force_N\n" + "\n".join(rows))
     assert cli.main(line) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "moment over the section's = 0.8, " in said
-    assert "shear_modulus=5e+04 hand.material.moment_factor=0.8" in said
-    assert "divide the pressures of a design that was searched without it by 0.8 " in said
+    output = " ".join(capsys.readouterr().out.split())
+    assert "moment over the section's = 0.8, " in output
+    assert "shear_modulus=5e+04 hand.material.moment_factor=0.8" in output
+    assert "divide the pressures of a design that was searched without it by 0.8 " in output
     for wrong in (["--fit"], ["--finger", "4"], ["--out", "table.txt"], ["no.csv"]):
         assert cli.main(["finger", *wrong]) == 2
-    said = capsys.readouterr().err
-    assert "--fit needs measurements" in said and "--finger = 4 is outside [0, 3]" in said
-    assert "must end in .csv" in said and "no.csv: No such file" in said
+    output = capsys.readouterr().err
+    assert "--fit needs measurements" in output and "--finger = 4 is outside [0, 3]" in output
+    assert "must end in .csv" in output and "no.csv: No such file" in output

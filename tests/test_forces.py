@@ -58,8 +58,8 @@ def test_forces_on_the_object_are_what_its_momentum_gains(grasp):
     # What 100 Newton iterations leave, of a weight of one newton.
     np.testing.assert_allclose(total, mass * gained, atol=1e-4 * mass * scene.gravity)
     assert forces.table[0, 60, 2] == pytest.approx(mass * scene.gravity, rel=1e-3)
-    held = (forces.grip[0] > 0).any(1)
-    assert held.sum() > 20 and forces.depth["finger_object"][0, held].max() > 1e-4
+    gripped = (forces.grip[0] > 0).any(1)
+    assert gripped.sum() > 20 and forces.depth["finger_object"][0, gripped].max() > 1e-4
 
 
 def test_forces_of_the_rings_add_up(grasp):
@@ -198,13 +198,13 @@ def test_what_cannot_be_pulled_is_said():
 def test_a_table_of_forces_has_each_step(tmp_path, capsys):
     path = tmp_path / "forces.csv"
     assert cli.main(["evaluate", "--scene", str(TINY), "--trials", "1", "--forces", str(path)]) == 0
-    said = capsys.readouterr().out
-    assert re.search(r"sphere: grip [\d.e-]+ \+ [\d.e-]+ N by finger", said) and " mm" in said
+    output = capsys.readouterr().out
+    assert re.search(r"sphere: grip [\d.e-]+ \+ [\d.e-]+ N by finger", output) and " mm" in output
     scene = load(TINY)
     rows = [*csv.DictReader(path.read_text().splitlines())]
     assert len(rows) == scene.num_steps and rows[-1]["object"] == "sphere"
-    held = rows[int(scene.last_step("lift"))]
-    push_up = sum(float(held[f"finger_{i}_z_N"]) for i in (0, 1)) + float(held["palm_z_N"])
+    row = rows[int(scene.last_step("lift"))]
+    push_up = sum(float(row[f"finger_{i}_z_N"]) for i in (0, 1)) + float(row["palm_z_N"])
     # Carried, in the last step of the lift; the trial's object has 15 % of noise in its mass.
     assert push_up == pytest.approx(scene.gravity * scene.objects.object[0].mass, rel=0.5)
-    assert float(held["table_z_N"]) == 0 and float(held["depth_finger_object_mm"]) > 0
+    assert float(row["table_z_N"]) == 0 and float(row["depth_finger_object_mm"]) > 0

@@ -48,7 +48,7 @@ def by_numpy(the_scene, table, params):
     now |= {"z": the_scene.arm.start_height, "pressure": np.zeros(the_scene.num_fingers)}
     times = []
     rows = []
-    held = []
+    holds = []
     for frame in table["frame"]:
         now = dict(now)
         for key, value in frame.items():
@@ -68,10 +68,10 @@ def by_numpy(the_scene, table, params):
                 now[key] = eval(text, {"np": np}, names)
         times.append(eval(str(frame["time"]), {}, names))
         rows.append([now[axis] for axis in POSE] + [*now["pressure"]])
-        held.append(frame.get("interpolation") == "held")
+        holds.append(frame.get("interpolation") == "held")
     time = np.arange(the_scene.num_steps) * the_scene.discretization.timestep
     commands = np.stack([np.interp(time, times, column) for column in np.transpose(rows)], 1)
-    for i in np.flatnonzero(held):
+    for i in np.flatnonzero(holds):
         commands[(time >= times[i]) & (time < times[i + 1])] = rows[i]
     x, y, z, roll, pitch, yaw = commands[:, :6].T
     return np.column_stack([x, y, z, roll + 0.03, yaw, -0.05 - pitch, commands[:, 6:]])

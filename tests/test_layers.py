@@ -80,10 +80,10 @@ def imports(tree, names, *, inside=True, types=True):
 
 
 @functools.cache
-def graph(**which):
+def graph(**options):
     """Modules that each module imports; `inside`: also those that functions import when called."""
     names = modules()
-    return {n: set(imports(parse(path), names, **which)) for n, path in names.items()}
+    return {n: set(imports(parse(path), names, **options)) for n, path in names.items()}
 
 
 # Within the engine `structured`: what stands in a folder may import those before it.

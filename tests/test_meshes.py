@@ -136,7 +136,7 @@ def test_all_problems_at_once(tmp_path):
     )
     with pytest.raises(schema.InputError) as caught:
         objects.load(path)
-    said = caught.value.problems
+    messages = caught.value.problems
     for expected in (
         "object a: open.off: is 60 m long",
         "object a: open.off: not watertight",
@@ -149,8 +149,8 @@ def test_all_problems_at_once(tmp_path):
         "object e: a box has either a mass or a density",
         "object e: a box has no file",
     ):
-        assert sum(expected in p for p in said) == 1, (expected, said)
-    assert len(said) == 10
+        assert sum(expected in p for p in messages) == 1, (expected, messages)
+    assert len(messages) == 10
 
 
 def test_a_surface_that_cuts_through_itself(tmp_path):
@@ -289,8 +289,8 @@ def test_repair_mends_and_says_what(tmp_path):
     faces[5, 0] = len(vertices) - 1  # a seam
     faces = np.vstack([faces, faces[7]])  # a face twice
     torn = trimesh.Trimesh(vertices, faces, process=False)
-    said = problems(tmp_path, torn)
-    assert any("not watertight" in p for p in said)
+    messages = problems(tmp_path, torn)
+    assert any("not watertight" in p for p in messages)
     mended = solid(tmp_path, torn, repaired=True)
     assert mended.volume == pytest.approx(mesh.volume, rel=1e-5)
     assert mended.repairs == (
@@ -467,18 +467,18 @@ FOREIGN = {
 }
 
 
-@pytest.mark.parametrize("said", FOREIGN)
+@pytest.mark.parametrize("message", FOREIGN)
 @pytest.mark.parametrize("kind", ["toml", *reading.FORMATS])
-def test_files_of_another_kind_are_named(tmp_path, kind, said):
+def test_files_of_another_kind_are_named(tmp_path, kind, message):
     path = tmp_path / f"file.{kind}"
-    path.write_bytes(FOREIGN[said])
+    path.write_bytes(FOREIGN[message])
     call = scene.load if kind == "toml" else reading.read
     [problem] = refusals(call, path)
-    assert said in problem
+    assert message in problem
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "message"),
     [
         ("gravity = " + "9" * 400, "characters) is outside [0, 100] m/s^2"),
         ("gravity = " + "9" * 5000, "not valid TOML: a whole number has thousands of digits"),
@@ -488,12 +488,12 @@ def test_files_of_another_kind_are_named(tmp_path, kind, said):
         ('x = "\x1b[2J"', "not valid TOML: Illegal character"),
     ],
 )
-def test_files_that_are_too_much(tmp_path, line, said):
+def test_files_that_are_too_much(tmp_path, line, message):
     path = tmp_path / "scene.toml"
     text = PAPER.read_text()
     path.write_text(line + "\n" + text.replace("gravity = 9.81", "", line.startswith("gravity")))
     problems = refusals(scene.load, path)
-    assert any(said in p for p in problems), problems
+    assert any(message in p for p in problems), problems
     assert len(problems) < 40 and all(len(p) < 1000 for p in problems)
 
 
@@ -503,7 +503,7 @@ def test_an_error_never_speaks_to_the_terminal():
 
 
 @pytest.mark.parametrize(
-    ("overrides", "said"),
+    ("overrides", "message"),
     [
         ({"gravity": 10**6000}, "too long to show"),
         ({".".join("a" * 3000): 1}, "3,000 parts"),
@@ -512,9 +512,9 @@ def test_an_error_never_speaks_to_the_terminal():
         ({"hand.finger": [{}] * 1001}, "1,001 entries, more than 1,000"),
     ],
 )
-def test_values_that_are_too_much(overrides, said):
+def test_values_that_are_too_much(overrides, message):
     problems = refusals(scene.load, "paper_spheres", overrides=overrides)
-    assert any(said in p for p in problems), problems
+    assert any(message in p for p in problems), problems
 
 
 def load_mesh(path, **options):
@@ -560,13 +560,13 @@ def test_gltf_holds_all_of_itself_and_does_not_grow(tmp_path):
     def huge(tree):
         tree["accessors"][0]["count"] = 10**12
 
-    for change, said in (
+    for change, message in (
         (elsewhere, "in another file, 'box.bin'; save it as .glb"),
         (doubled, "a node has two parents"),
         (huge, "more than 200,000 faces"),
     ):
         (problem,) = refusals(load_mesh, gltf(tmp_path, change))
-        assert said in problem
+        assert message in problem
 
 
 def test_a_run_has_the_bytes_that_were_read(tmp_path):

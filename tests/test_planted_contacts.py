@@ -316,16 +316,16 @@ def simulated(surface):
     solve = partial(solved, scene, *states["main"][:2])
     outputs = jax.tree.map(np.asarray, outputs)
     start = len(faults)
-    held = np.zeros(3), np.zeros((scene.num_fingers, 3)), {}
-    start = solve(outputs["qpos"][start, 0], outputs["qvel"][start, 0], held)
+    start_grips = np.zeros(3), np.zeros((scene.num_fingers, 3)), {}
+    start = solve(outputs["qpos"][start, 0], outputs["qvel"][start, 0], start_grips)
     assert surface == "hull" or min(kinds(*states["main"][:2])) > 0
     assert surface == "hull" or on_palm(*states["main"][:2]) > 0
     model, data, _ = states[SHORT]
-    short = solved(scene, model, data, data.qpos.copy(), data.qvel.copy(), held, 0.012)[0]
+    short = solved(scene, model, data, data.qpos.copy(), data.qvel.copy(), start_grips, 0.012)[0]
     return Worlds(faults, outputs, solve, start, short, scene.discretization.timestep)
 
 
-def solved(scene, model, data, qpos, qvel, held, length=0.1):
+def solved(scene, model, data, qpos, qvel, start_grips, length=0.1):
     """Accelerations by MuJoCo C, of rings by a dense solve; what fingers hold then; how they press.
 
     The last is a matrix of normal forces, of each finger and, in the last row, of the palm.
@@ -337,9 +337,9 @@ def solved(scene, model, data, qpos, qvel, held, length=0.1):
         return data.qacc.copy(), None, pressing(scene, model, data)
     with jax.enable_x64(True):
         hand, _ = grasps.hand_world(scene, length=length)
-    dense = dense_steps.DensePairs(scene, model, data, hand, *held)
+    dense = dense_steps.DensePairs(scene, model, data, hand, *start_grips)
     print(dense.num_hull, dense.pairs, dense.on_palm, dense.ahead, dense.itself)
-    first = not np.any(held[0]) and length == 0.1
+    first = not np.any(start_grips[0]) and length == 0.1
     assert not first or min(dense.pairs, dense.on_palm, dense.itself, 4 * dense.ahead) > 3
     acceleration = dense.solve()
     grips = np.array([dense.next_grip(f) for f in range(scene.num_fingers)])

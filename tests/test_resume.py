@@ -129,10 +129,10 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
     assert command("report", folder, "--no-replay") == 0
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert "Under other conditions, 12 grasps each" in page and "neo-Hookean bending law" in page
-    said = text.splitlines()
-    line = next(x for x in said if x.startswith("verdict: "))
+    lines = text.splitlines()
+    line = next(x for x in lines if x.startswith("verdict: "))
     assert "of 2 fresh grasps" in line
-    assert any("accuracy fine, steps of 5 ms, 10 links a finger" in x for x in said)
+    assert any("accuracy fine, steps of 5 ms, 10 links a finger" in x for x in lines)
 
     def never(*arguments):
         raise AssertionError("simulated again")

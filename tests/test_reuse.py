@@ -214,9 +214,11 @@ def place(tmp_path, monkeypatch):
 def test_a_wrong_limit_is_refused_before_anything_is_done(text, monkeypatch, capsys):
     monkeypatch.setenv("CODESIGN_CACHE_BYTES", text)
     assert cli.main(["scenes", "hands"]) == 2
-    said = capsys.readouterr()
-    assert "error: CODESIGN_CACHE_BYTES = " in said.err and "must be a number of bytes" in said.err
-    assert not said.out
+    output = capsys.readouterr()
+    assert (
+        "error: CODESIGN_CACHE_BYTES = " in output.err and "must be a number of bytes" in output.err
+    )
+    assert not output.out
     with pytest.raises(ValueError, match="CODESIGN_CACHE_BYTES"):
         reuse.use_compilation_cache()
 

@@ -399,15 +399,15 @@ def ptx(the_scene):
     ends = shape(1, rows[0], size), shape(1, rows[1], block)
     whole = shape(steps, rows[0], size), shape(steps, rows[1], block)
     path = RecordedPath(*whole, *ends, shape(1, 1, block))
-    given = program._arguments(inputs, path, Cotangents(*ends, shape(steps, 3, block)))
+    arguments = program._arguments(inputs, path, Cotangents(*ends, shape(steps, 3, block)))
 
-    def code(call, outputs, given, scratch):
+    def code(call, outputs, arguments, scratch):
         layout = launch.describe(
-            given, outputs, launch.Kernel("test", "gpu", size, scratch=scratch)
+            arguments, outputs, launch.Kernel("test", "gpu", size, scratch=scratch)
         )
-        return gpu.device_code(launch.kernel_jaxpr(call, list(given)), layout)
+        return gpu.device_code(launch.kernel_jaxpr(call, list(arguments)), layout)
 
-    yield code(*program._adjoint_call(given), given, (6, 7, 8))
+    yield code(*program._adjoint_call(arguments), arguments, (6, 7, 8))
     forward = Program(the_scene, program.limits, backend="gpu", width=32)
     yield code(*forward._call(inputs, False, 1), inputs, (2,))
 

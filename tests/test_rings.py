@@ -521,9 +521,9 @@ def test_a_load_slips_below_the_critical_friction_and_holds_above(pads):
 
 def test_spheres_keep_nothing():
     """Their contact is that of MuJoCo, which has no state, so that every engine simulates it."""
-    for surface, held in ("hull", True), ("spheres", False):
+    for surface, remembers in ("hull", True), ("spheres", False):
         chosen = scene.load("paper", overrides={"effects.surface": surface})
-        assert chosen.effects.friction_memory and bool(friction_held.held(chosen)) == held
+        assert chosen.effects.friction_memory and bool(friction_held.held(chosen)) == remembers
     make_engine("mujoco", chosen)
 
 

@@ -49,10 +49,10 @@ def test_damage_of_the_newest_checkpoint_is_said_and_nothing_is_changed(way, run
     paths = [p for p in sorted(step.rglob("*")) if p.stat().st_size and p.is_file()]
     faults.damage(paths[faults.WAYS.index(way) % len(paths)], way)
     before = sorted(os.walk(run))
-    said = []
-    record = runs.load_record(run, tell=said.append)
+    messages = []
+    record = runs.load_record(run, tell=messages.append)
     assert record is not None and record.test is None and record.done == 3
-    (words,) = said
+    (words,) = messages
     assert f"{run} has damaged checkpoints ({NEWEST}: " in words
     assert f"Read instead is checkpoint {NEWEST - 1}, after episode 3 of 3, without the" in words
     assert sorted(os.walk(run)) == before
@@ -170,7 +170,7 @@ def test_a_full_disk_names_the_file_that_could_not_be_written(name, run, monkeyp
 def test_an_unexpected_error_keeps_its_traceback(run, monkeypatch, capsys):
     """On the terminal and in events.log: it is a bug, or the device's."""
 
-    def broken(*given):
+    def broken(*arguments):
         raise RuntimeError("a bug of somebody's")
 
     monkeypatch.setattr(Interrupts, "begin", broken)

@@ -65,10 +65,10 @@ class Xla:
             values = ctypes.addressof(pointers)
             return ffi.Arguments(struct_size=size, size=len(arrays), values=values)
 
-        given = {"args": arguments(inputs), "rets": arguments(outputs)}
+        operands = {"args": arguments(inputs), "rets": arguments(outputs)}
         api = ctypes.addressof(self.api)
         size = ffi.size(ffi.CallFrame)
-        frame = ffi.CallFrame(struct_size=size, api=api, stage=3, **given)
+        frame = ffi.CallFrame(struct_size=size, api=api, stage=3, **operands)
         pointer = FUNCTION(address)(ctypes.addressof(frame))
         return self.errors[pointer - 1] if pointer else None
 
@@ -91,8 +91,8 @@ class Xla:
             thread.join()
 
     def _create(self, record):
-        given = ffi.ErrorCreate.from_address(record)
-        self.errors.append((given.errc, ctypes.string_at(given.message).decode()))
+        request = ffi.ErrorCreate.from_address(record)
+        self.errors.append((request.errc, ctypes.string_at(request.message).decode()))
         return len(self.errors)
 
     def _destroy(self, record):
@@ -107,14 +107,14 @@ class Xla:
         if not self.threads:
             self.errors.append((12, "no pool"))
             return len(self.errors)
-        given = ffi.NumThreads.from_address(record)
-        c_int64.from_address(given.num_threads).value = self.threads
+        request = ffi.NumThreads.from_address(record)
+        c_int64.from_address(request.num_threads).value = self.threads
         return None
 
     def _schedule(self, record):
-        given = ffi.Schedule.from_address(record)
-        function = ctypes.CFUNCTYPE(None, c_void_p)(given.task)
-        data = given.data
+        request = ffi.Schedule.from_address(record)
+        function = ctypes.CFUNCTYPE(None, c_void_p)(request.task)
+        data = request.data
         self.scheduled += 1
         if self.pool == "refused" and self.scheduled > 1:
             self.errors.append((8, "the pool is full"))

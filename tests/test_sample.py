@@ -132,8 +132,8 @@ def test_a_row_has_design_noise_and_outcome(place, capsys):
     # The toy engine has no solver: nothing is told of it.
     assert {*rows["steps_at_limit"], *rows["residual"]} == {None}
     counts = {name: int((rows["verdict"] == name).sum()) for name in codesign.VERDICTS}
-    said = ", ".join(f"{name} {n} ({5 * n:.1f} %)" for name, n in counts.items())
-    assert f"of 20 grasps: {said}" in capsys.readouterr().out and counts["lost"] > 0
+    shares = ", ".join(f"{name} {n} ({5 * n:.1f} %)" for name, n in counts.items())
+    assert f"of 20 grasps: {shares}" in capsys.readouterr().out and counts["lost"] > 0
 
 
 def test_a_killed_command_goes_on_to_the_same_bytes(place, monkeypatch, capsys):

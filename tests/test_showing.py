@@ -66,13 +66,13 @@ def test_render_draws_a_row_of_the_table(run, workplace, simulated, capsys):
     with Image.open(workplace / "g.gif") as image:
         assert image.size == (32, 32) and image.n_frames > 2
     assert simulated == [1]
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     rows = list(csv.DictReader((run / "trials.csv").read_text().splitlines()))
     [row] = [r for r in rows if [r["episode"], r["particle"], r["trial"]] == ["1", "2", "1"]]
     lost = float(row["lost_time_s"])
     verdict = "object kept" if np.isinf(lost) else f"object lost at {lost:.2f} s"
     # MuJoCo C in float64 meets the same grasp again, whatever the batch.
-    assert f"in the run: {verdict}; here: {verdict}" in said
+    assert f"in the run: {verdict}; here: {verdict}" in output
 
 
 def test_replay_writes_the_best_grasp_of_a_run(run, simulated, tmp_path, capsys):

@@ -182,10 +182,10 @@ def test_an_object_rests_on_a_shelf_or_tips_over_its_edge(tmp_path):
     start[:, -7:] = [0.0, 0.0, 0.03, 1.0, 0.0, 0.0, 0.0]
     start[:, -7] = [0.0, 0.015]
     fields = fields._replace(start=start)
-    held = np.repeat(np.asarray(ctrl[:, :1]), 100, 1)
+    controls = np.repeat(np.asarray(ctrl[:, :1]), 100, 1)
     engines = make_engine("structured", the_scene).recording(), make_engine("mujoco", the_scene)
     for engine in engines:
-        trace = jax.jit(partial(engine.rollout, trajectory=True))(fields, held)
+        trace = jax.jit(partial(engine.rollout, trajectory=True))(fields, controls)
         stays, falls = np.asarray(trace.height[:, -1])
         assert abs(stays - 0.03) < 1e-3 and falls < -0.1
         if trace.forces is not None:

@@ -112,8 +112,8 @@ def test_a_tunnel_may_have_another_port(guarded):
             (f"http://stranger.example:{cookie_port}", 403),
             (f"{host}", 403),
         ):
-            given = opening | {"Cookie": cookie, "Origin": origin}
-            assert get(port, "/socket", **given)[0].status == status
+            headers = opening | {"Cookie": cookie, "Origin": origin}
+            assert get(port, "/socket", **headers)[0].status == status
 
 
 def test_odd_requests_are_refused_and_do_not_fail(guarded):

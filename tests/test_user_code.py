@@ -143,8 +143,10 @@ def test_a_run_of_ones_own_code_goes_on_bit_for_bit(workdir, capsys):
     for episodes, folder in (("2", "whole"), ("1", "grown"), ("2", "grown")):
         assert cli.main([*OWN, "--episodes", episodes, "--out", folder]) == 0
     assert_same_run(workdir / "grown", workdir / "whole")
-    said = capsys.readouterr().out
-    assert "lowest mean cost of an episode, by mine:low" in said and "converged from" not in said
+    output = capsys.readouterr().out
+    assert (
+        "lowest mean cost of an episode, by mine:low" in output and "converged from" not in output
+    )
     assert (workdir / "grown" / "code" / "mine.py").read_text() == MINE
     noted = json.loads((workdir / "grown" / "provenance.json").read_text())
     assert [noted["settings"][name] for name in ("optimizer", "cost")] == OWN[-3::2]
@@ -175,9 +177,11 @@ def test_changed_code_is_refused_with_what_changed(workdir, capsys):
     (workdir / "mine.py").write_text(MINE.replace("0.2 - trace", "0.3 - trace"))
     sys.modules.pop("mine")  # as in another process
     assert cli.main([*OWN, "--episodes", "2", "--out", "run"]) == 2
-    said = capsys.readouterr().err
-    assert "mine was changed since the run was made" in said
-    assert "-    return jnp.abs(0.2 - trace" in said and "+    return jnp.abs(0.3 - trace" in said
+    output = capsys.readouterr().err
+    assert "mine was changed since the run was made" in output
+    assert (
+        "-    return jnp.abs(0.2 - trace" in output and "+    return jnp.abs(0.3 - trace" in output
+    )
     assert cli.main([*OWN[:-1], "mine:until_lost", "--out", "run"]) == 2
     assert "--cost: the run has mine:low, asked for is mine:until_lost" in capsys.readouterr().err
     # What is the run's is not imported for whoever reads it, or asks for nothing.
@@ -220,16 +224,16 @@ def test_a_policy_is_searched_and_said_wherever_it_acts(workdir, capsys):
     assert "--policy mine:Narrow: neither run was made with it" in capsys.readouterr().err
     capsys.readouterr()
     assert cli.main(["compare", "run", "--policy", "mine:Pull", "--trials", "2"]) == 0
-    said = capsys.readouterr().out
-    assert "run with mine:Pull keeps " in said and "without keeps " in said
-    assert "policy mine:Pull left the key frames in 2 of 2 grasps" in said
-    assert "of the same 2 trials" in said
+    output = capsys.readouterr().out
+    assert "run with mine:Pull keeps " in output and "without keeps " in output
+    assert "policy mine:Pull left the key frames in 2 of 2 grasps" in output
+    assert "of the same 2 trials" in output
     (workdir / "a.toml").write_text(f'preset = "2d"\nscene = "{TINY}"\n[design]\nlength = 44\n')
     (workdir / "b.toml").write_text(f'preset = "2d"\nscene = "{TINY}"\n[design]\nlength = 100\n')
     files = ["compare", "a.toml", "b.toml", "--engine", "mujoco", "--trials", "2"]
     assert cli.main(files) == 0
-    said = capsys.readouterr().out
-    assert "a.toml keeps " in said and "b.toml keeps " in said and "difference: " in said
+    output = capsys.readouterr().out
+    assert "a.toml keeps " in output and "b.toml keeps " in output and "difference: " in output
     first, other = (user_code.make_policy("mine:Pull", the_scene)[0] for _ in range(2))
     assert first is other  # its programs are compiled once
 
@@ -240,9 +244,11 @@ def test_a_dry_run_tells_of_a_policy_that_commands_kilopascals(workdir, capsys):
     assert cli.main([*dry, "mine:Pull"]) == 0
     assert "while nothing moves" not in capsys.readouterr().out
     assert cli.main([*dry, "mine:late"]) == 0
-    said = capsys.readouterr().out
-    assert "policy late: the highest pressure that it commands while nothing moves is 80 Pa" in said
-    assert "did you mean 80000?" in said
+    output = capsys.readouterr().out
+    assert (
+        "policy late: the highest pressure that it commands while nothing moves is 80 Pa" in output
+    )
+    assert "did you mean 80000?" in output
     assert cli.main([*RUN, "--policy", "mine:late", "--out", "run", "--dry-run"]) == 0
     assert "did you mean 80000?" in capsys.readouterr().out
 
@@ -266,7 +272,7 @@ def test_what_is_wrong_is_said_before_anything_is_created(flags, workdir, capsys
     (workdir / "broken.py").write_text("1 / 0\n")
     before = snapshot(workdir)
     assert cli.main([*RUN, *flags.split(), "--episodes", "1", "--out", "run"]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith(f"error: {flags.split()[0]}") and WRONG[flags] in said, said
+    output = capsys.readouterr().err
+    assert output.startswith(f"error: {flags.split()[0]}") and WRONG[flags] in output, output
     sys.modules.pop("broken", None)
     assert {k: v for k, v in snapshot(workdir).items() if "__pycache__" not in str(k)} == before

@@ -111,7 +111,7 @@ HOLD = 24 * 3600.0
 """Longest test of a finger [s] [chosen]."""
 
 
-def held(rows, finger, pressure):
+def hold_rows(rows, finger, pressure):
     """Rows that raise one finger to a pressure [kPa] and hold it; `rows` give their number."""
     count = len(rows[0]) - 1
     if finger not in range(count):
@@ -264,7 +264,7 @@ def _run(options):
         raise TableError("--hold needs real time: leave --no-wait")
     rows, limits = read(options.table)
     if options.hold:
-        rows = held(rows, *options.hold)
+        rows = hold_rows(rows, *options.hold)
     rows = scaled(rows, limits, options.divide, options.cap)
     wait = (lambda seconds: None) if options.no_wait else time.sleep
     if options.port is None:

@@ -12,7 +12,7 @@ def chromium_launcher():
     names = ("chromium", "chromium-browser", "google-chrome", "chromium-headless-shell")
     program = next(filter(None, map(shutil.which, names)), None)
     off = ("background-networking", "component-update", "sync", "gpu")
-    flags = ["--headless", "--no-sandbox", *(f"--disable-{what}" for what in off)]
+    flags = ["--headless", "--no-sandbox", *(f"--disable-{feature}" for feature in off)]
     with api.sync_playwright() as play:
 
         def start(*more):

@@ -86,8 +86,8 @@ def assert_same_run(folder, finished):
 
 def without(arguments, flag):
     """The arguments without a flag and its values."""
-    given = [k for k, argument in enumerate(arguments) if argument == flag]
-    return [a for k, a in enumerate(arguments) if k not in given and k - 1 not in given]
+    positions = [k for k, argument in enumerate(arguments) if argument == flag]
+    return [a for k, a in enumerate(arguments) if k not in positions and k - 1 not in positions]
 
 
 def copied(folder: Path) -> Path:

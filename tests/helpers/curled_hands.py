@@ -41,8 +41,8 @@ def kinds(oracle, data):
         for pair in data.contact.geom
     ]
     fingers = [sum(n.startswith("finger") for n in pair) for pair in names]
-    held = sum("finger" in a + b and "object" in a + b for a, b in names)
-    return fingers.count(2), held
+    on_object = sum("finger" in a + b and "object" in a + b for a, b in names)
+    return fingers.count(2), on_object
 
 
 def on_palm(oracle, data):

@@ -82,8 +82,8 @@ class Dense:
         ):
             place = on_field(ring, field)
             on_object = field is from_object
-            held = self._held((*number, on_object), on_object)
-            self._add(*place, (ring.body, other), friction, bodies, **held)
+            grips_of_ring = self._held((*number, on_object), on_object)
+            self._add(*place, (ring.body, other), friction, bodies, **grips_of_ring)
 
     def jac(self, point, body):
         """Jacobian of a body's point, (3, nv)."""
@@ -275,13 +275,13 @@ class DensePairs(Dense):
     def next_grip(self, name="two"):
         """What the first finger uses in the solution: tangential over normal forces, or elastic."""
         above = below = 0.0
-        for row, frame, elastic, grip, sign, which in self.held:
-            if which != name:
+        for row, frame, elastic, grip, sign, label in self.held:
+            if label != name:
                 continue
             force = self.force(row)
             weight = max(force[0], elastic)
-            held = weight * frame[0] * (frame[0] @ grip) - frame[1:].T @ force[1:]
-            above = above + sign * held
+            tangential = weight * frame[0] * (frame[0] @ grip) - frame[1:].T @ force[1:]
+            above = above + sign * tangential
             below = below + weight
         return above / below if below else np.zeros(3)
 

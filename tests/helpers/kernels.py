@@ -48,8 +48,8 @@ def call(x, table, rounds=10):
 def run(x, table, rounds=10, backend="cpu"):
     """Runs the kernel on x (block, 2, lane) and a shared table (1, 1, lane)."""
     function, outputs = call(x, table, rounds)
-    what = launch.Kernel(f"logistic {rounds}", backend, x.shape[2], shared=(1,), scratch=(1,))
-    result, none = launch.launch(function, (x, table), outputs, what)
+    kernel = launch.Kernel(f"logistic {rounds}", backend, x.shape[2], shared=(1,), scratch=(1,))
+    result, none = launch.launch(function, (x, table), outputs, kernel)
     assert none is None
     return result
 

@@ -92,8 +92,8 @@ class Planted:
     @staticmethod
     def wrong(change, function, *args):
         """A stage's wrong result."""
-        given = getattr(function, "args", ())
-        return change(getattr(function, "func", function), *given, *args)
+        leading = getattr(function, "args", ())
+        return change(getattr(function, "func", function), *leading, *args)
 
     @staticmethod
     def choose(mine, wrong, right):

@@ -91,7 +91,7 @@ def case(number: int, title: str, invariant: str, *, engines=BOTH[:1], name: str
     return register
 
 
-def case_of_both_scenes(number, title, *what, quick="", failure="", **options):
+def case_of_both_scenes(number, title, *invariant, quick="", failure="", **options):
     """Registers a function (scene, engine, step, precision): the spheres', and the default one.
 
     Of the default one alone `failure` says why it fails.
@@ -100,9 +100,9 @@ def case_of_both_scenes(number, title, *what, quick="", failure="", **options):
     def register(measure):
         name = measure.__name__
         spheres, default = (functools.partial(measure, n) for n in ("paper_spheres", "paper"))
-        case(number, title, *what, name=name, engines=BOTH, quick=quick, **options)(spheres)
+        case(number, title, *invariant, name=name, engines=BOTH, quick=quick, **options)(spheres)
         options.update(name=f"{name}_default", failure=failure)
-        case(number, f"{title}, default scene", *what, **options)(default)
+        case(number, f"{title}, default scene", *invariant, **options)(default)
 
     return register
 
@@ -155,15 +155,15 @@ def to_markdown(rows: list[dict[str, Any]]) -> str:
         least = min(math.inf if r["margin"] is None else r["margin"] for r in part)
         # Cases that are simulated no more stand in the table with the cause of their failure.
         causes = {r.get("failure") or "not explained" for r in part if not r["passed"]}
-        said = ["**fails**: " + "; ".join(sorted(causes))] if causes else []
-        said += ["; ".join(sorted({r["note"] for r in part if r["note"]}))]
+        remarks = ["**fails**: " + "; ".join(sorted(causes))] if causes else []
+        remarks += ["; ".join(sorted({r["note"] for r in part if r["note"]}))]
         made = ", ".join(sorted({r["commit"] + provenance.before(r) for r in part}))
         engine = "MuJoCo C" if first["engine"] == "mujoco" else first["engine"]
         lines.append(
             f"| {first['case']} {first['title']} | {first['invariant']} | "
             f"{engine}, {first['precision']} | {values} {first['unit']} | "
             f"{'>=' if first['lower'] else '<='} {bounds} | {number(least)} | "
-            f"{made} | {' '.join(said).strip()} |"
+            f"{made} | {' '.join(remarks).strip()} |"
         )
     return "\n".join(lines) + "\n"
 

@@ -28,7 +28,7 @@ def at_height(params, z):
     return params._replace(arm=params.arm + z * (np.arange(6) == 2))
 
 
-def held(the_bench, fields, seconds):
+def holding_controls(the_bench, fields, seconds):
     """Controls that hold every hand where it starts, without pressure."""
     fingers = the_bench.scene.num_fingers
     rows = [np.r_[start[:6], np.zeros(fingers)] for start in fields.start]
@@ -75,7 +75,7 @@ def spawned(engine, step, precision):
     thick = compiled.geom_size[lay.spheres[0, 1, 0], 0]
     qpos[1, -7:-4] = finger + [0, radius + thick - deep, 0]
     qpos[2, -7:-4] = qpos[2, :3] - [0, 0, radius - deep]
-    history = b.run(fields, held(b, fields, 1.0), qpos)
+    history = b.run(fields, holding_controls(b, fields, 1.0), qpos)
     speed = np.linalg.norm(history.object_velocity, axis=-1).max(1)
     note = "table {:.2f}, finger {:.2f}, palm {:.2f} m/s".format(*speed)
     return Found(speed.max(), 1.0, note)

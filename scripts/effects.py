@@ -159,9 +159,11 @@ def measured(results: dict[str, Any]) -> str:
         table.append([name, *cells, f"× {r['ratio']:.2f} ({low:.2f} to {high:.2f})"])
     p = results["provenance"]
     load = results["load"]
-    caption = f"{results['designs']} designs in {results['trials']} trials each; {p['cpus']} cores, "
-    caption += f"jax {p['jax']}; timed while other programs used the machine (load average "
-    caption += f"{max(load):.0f})."
+    caption = (
+        f"{results['designs']} designs in {results['trials']} trials each; {p['cpus']} cores, "
+        f"jax {p['jax']}; timed while other programs used the machine (load average "
+        f"{max(load):.0f})."
+    )
     return f"{caption}\n\n{output.markdown(table)}"
 
 

@@ -118,9 +118,8 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
     settings = runs.read_run(folder)[1]
     text = capsys.readouterr().out
     stress, _ = reference.stored_stress(folder, settings)
-    assert (
-        stress is not None and [*dict.fromkeys(stress.conditions)][-1] == "neo-Hookean bending law"
-    )
+    assert stress is not None
+    assert [*dict.fromkeys(stress.conditions)][-1] == "neo-Hookean bending law"
     assert f"; {stress.limits}" in text
     for words in ("under other conditions, 12 grasps each", *stress.lines()):
         assert " ".join(words.split()) in " ".join(text.split())
@@ -156,8 +155,7 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
     assert more == [(2, 5)]
     five = reference.stored(folder, settings)[0]
     np.testing.assert_array_equal(five.cost, [*two.cost, *[two.cost[0]] * 3])
-    rows = (folder / "reference.csv").read_text().splitlines()
-    assert len(rows) == 6
+    assert len((folder / "reference.csv").read_text().splitlines()) == 6
     # Of another version of the code they are shown as such, and not gone on from.
     with monkeypatch.context() as patch:
         patch.setattr(array_files.reuse, "code_digest", lambda: "another")
@@ -169,6 +167,10 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
         output = capsys.readouterr()
         assert output.err.count("reference.npz is of another version of the code") == 2
         assert "fine" in output.out
+
+
+def test_the_engine_decides_how_many_fresh_trials_there_are(finished):
+    settings = runs.read_run(finished)[1]
     assert reference.most_trials(None, settings) == 0  # MuJoCo C would take minutes
     quick = dataclasses.replace(settings, engine="structured")
     assert reference.most_trials(None, quick) == 600

@@ -109,7 +109,7 @@ def soften(scene, fields, data):
 
 def touching(scene, hand, kin: Kinematics, position, velocity: Spatial):
     """Contacts with object, table and fixtures over whole arrays, by pair of bodies."""
-    found = {}
+    scaled = {}
     for name, place in overlaps.places(scene, hand, kin, position).items():
         cone = getattr(hand.cones, which_cone(name))
         fingers = name.startswith("finger")
@@ -121,8 +121,20 @@ def touching(scene, hand, kin: Kinematics, position, velocity: Spatial):
         contacts = Contacts(*place[:3], cone.of_share(place.share))
         approach = -dot(place.normal, contacts.relative(relative(name, velocity)))
         share = candidates(place.share, place.gap, approach, cone, margin(scene))
-        found[name] = contacts._replace(cone=cone.of_share(share))
-    return found
+        scaled[name] = contacts._replace(cone=cone.of_share(share))
+    return scaled
+
+
+def to_mujoco(data, end):
+    """Matrix from our velocities to MuJoCo's, whose object, from `end` on, moves otherwise.
+
+    By (linear, angular in its own axes) instead of (angular, linear).
+    """
+    turn = np.eye(len(data.qvel))
+    turn[end:, end:] = 0.0
+    turn[end : end + 3, end + 3 :] = np.eye(3)
+    turn[end + 3 :, end : end + 3] = data.body("object").xmat.reshape(3, 3).T
+    return turn
 
 
 def unbalanced(scene, fields, ctrl, trajectory, stride):
@@ -177,11 +189,7 @@ def unbalanced(scene, fields, ctrl, trajectory, stride):
         soften(scene, world_fields, data)
         mujoco.mj_forward(oracle, data)
         mujoco.mj_fullM(oracle, data, mass)
-        # MuJoCo's object moves by (linear, angular in its own axes), ours by (angular, linear).
-        turn = np.eye(oracle.nv)
-        turn[end:, end:] = 0.0
-        turn[end : end + 3, end + 3 :] = np.eye(3)
-        turn[end + 3 :, end : end + 3] = data.body("object").xmat.reshape(3, 3).T
+        turn = to_mujoco(data, end)
         smooth = turn.T @ data.qfrc_smooth
         left[0, k] = turn.T @ mass @ turn @ acc[k] - smooth - pushed[k]
         left[1, k] = -smooth - at_rest[k]

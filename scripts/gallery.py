@@ -113,8 +113,8 @@ def judge(hand: Hand, case: cases.Case) -> None:
 def heavier(case: cases.Case) -> str:
     """What the hand keeps of objects that all have one of `MASSES` above their own, in words."""
     shares = []
-    own = max(shape.mass for shape in case.scene.objects.object)
-    for mass in (m for m in MASSES if m > own):
+    heaviest = max(shape.mass for shape in case.scene.objects.object)
+    for mass in (m for m in MASSES if m > heaviest):
         scene = draws.changed(case.scene, ("objects", "object", "mass"), lambda _, m=mass: m)
         outcome = case._replace(scene=scene).simulate(HEAVY_TRIALS, jax.random.key(SEED + 1))
         share = 100 * verdict.kept(outcome).mean()

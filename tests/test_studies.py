@@ -332,11 +332,11 @@ def test_a_choice_between_two_hands_gains_half_of_their_difference():
 def test_hard_designs_are_near_winners_and_within_the_limits():
     space = parameters.design_space(scene.load("paper").hand, "23d")
     winners = work.winners()[:4]
-    found = decisions.neighbours(space, winners)
-    assert found.shape == (4 * decisions.NEIGHBOURS, 23)
-    np.testing.assert_allclose(jax.vmap(space.project)(found), found, rtol=1e-6)
+    designs = decisions.neighbours(space, winners)
+    assert designs.shape == (4 * decisions.NEIGHBOURS, 23)
+    np.testing.assert_allclose(jax.vmap(space.project)(designs), designs, rtol=1e-6)
     low, high = space.box
-    away = (found - np.repeat(winners, decisions.NEIGHBOURS, axis=0)) / (high - low)
+    away = (designs - np.repeat(winners, decisions.NEIGHBOURS, axis=0)) / (high - low)
     assert 0.04 < away.std() < decisions.SPREAD
 
 

@@ -140,8 +140,13 @@ def rank(by: np.ndarray, truth: np.ndarray) -> float:
 
 def measures(by: np.ndarray, truth: np.ndarray) -> list[float]:
     """Share of verdicts that differ, rank correlation, gain and regret."""
-    own = gain(by, truth)
-    return [float((by != truth).mean()), rank(by, truth), own, gain(truth, truth) - own]
+    setting_gain = gain(by, truth)
+    return [
+        float((by != truth).mean()),
+        rank(by, truth),
+        setting_gain,
+        gain(truth, truth) - setting_gain,
+    ]
 
 
 def compared(by: np.ndarray, truth: np.ndarray) -> dict[str, Interval]:

@@ -81,8 +81,8 @@ def worlds_of(table: draws.Constants) -> dict[str, Scene]:
     Both have the same structure, and so the same programs: in the second scene the distributions
     have no width.
     """
-    own: dict[Any, Any] = {("drawn",): draws.plain(table)}
-    scene = scenes.load(overrides=draws.nominal(table) | own)
+    constants: dict[Any, Any] = {("drawn",): draws.plain(table)}
+    scene = scenes.load(overrides=draws.nominal(table) | constants)
     return {"drawn": scene, "middle": dataclasses.replace(scene, drawn=middle(table))}
 
 
@@ -154,8 +154,8 @@ def compared(kept: dict[str, dict[str, list[float]]]) -> tuple[list[list[str]], 
 
 def with_interval(differences: np.ndarray) -> str:
     """Mean of paired differences, and its interval from resampled pairs."""
-    found = statistics.bootstrap(lambda pairs: differences[pairs].mean(-1), len(differences))
-    return f"{found.value:+.1f} ({found.low:+.1f} to {found.high:+.1f})"
+    interval = statistics.bootstrap(lambda pairs: differences[pairs].mean(-1), len(differences))
+    return f"{interval.value:+.1f} ({interval.low:+.1f} to {interval.high:+.1f})"
 
 
 def draw(kept: dict[str, dict[str, list[float]]], differences: np.ndarray, folder: Path) -> Path:

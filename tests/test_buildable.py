@@ -236,8 +236,8 @@ def test_bad_limits_are_refused(changes, expected):
 
 
 def with_valves(**valves):
-    own = {f"hand.valves.{name}": value for name, value in valves.items()}
-    made = scene.load("paper", overrides=own)
+    overrides = {f"hand.valves.{name}": value for name, value in valves.items()}
+    made = scene.load("paper", overrides=overrides)
     return made, parameters.design_space(made.hand, "23d")
 
 
@@ -253,8 +253,8 @@ def with_valves(**valves):
     ],
 )
 def test_fingers_share_the_nearest_pressures(pressures, highest, lines, expected):
-    found = buildable.on_lines(jnp.array(pressures, float), jnp.array(highest, float), lines)
-    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    allowed = buildable.on_lines(jnp.array(pressures, float), jnp.array(highest, float), lines)
+    np.testing.assert_allclose(allowed, expected, rtol=1e-6)
 
 
 def test_fingers_of_lines_are_those_of_the_nearest_groups():
@@ -262,13 +262,13 @@ def test_fingers_of_lines_are_those_of_the_nearest_groups():
     random = np.random.default_rng(1)
     for lines in (2, 3):
         for pressures in random.random((20, 5)):
-            found = np.asarray(buildable.on_lines(jnp.asarray(pressures), jnp.ones(5), lines))
+            allowed = np.asarray(buildable.on_lines(jnp.asarray(pressures), jnp.ones(5), lines))
             least = np.inf
             for line in itertools.product(range(lines), repeat=5):
                 means = [pressures[np.equal(line, k)].mean() for k in line]
                 least = min(least, np.square(pressures - means).sum())
-            assert len(np.unique(found)) == lines
-            assert np.square(found - pressures).sum() == pytest.approx(least, rel=1e-4)
+            assert len(np.unique(allowed)) == lines
+            assert np.square(allowed - pressures).sum() == pytest.approx(least, rel=1e-4)
 
 
 def test_searched_lines_limit_the_pressures_of_each_proposal():
@@ -297,9 +297,9 @@ def test_fingers_of_one_line_get_the_same_pressure_course():
     np.testing.assert_array_equal(course[:, 2], course[:, 3])
     assert course[:, 0].max() == pytest.approx(9e4) and course[:, 2].max() == pytest.approx(7e4)
     # One line is a group of all fingers, as a preset with `tied = true` has it.
-    one = with_valves(lines=1)[1]
-    assert one.num_parameters == 20 and "pressure" in one.names
-    np.testing.assert_array_equal(drawn(one), drawn(with_valves(groups=[[0, 1, 2, 3]])[1]))
+    single = with_valves(lines=1)[1]
+    assert single.num_parameters == 20 and "pressure" in single.names
+    np.testing.assert_array_equal(drawn(single), drawn(with_valves(groups=[[0, 1, 2, 3]])[1]))
     # As many lines as fingers are those of a hand without the table, and no line is simulated.
     four = with_valves(lines=4)
     np.testing.assert_array_equal(drawn(four[1]), drawn(SPACE))
@@ -322,10 +322,10 @@ def test_fingers_of_one_line_get_the_same_pressure_course():
     ],
 )
 def test_bad_lines_are_refused(hand, changes, expected):
-    own = {f"hand.valves.{name}": value for name, value in changes.items()}
+    overrides = {f"hand.valves.{name}": value for name, value in changes.items()}
     if hand == "two_stage":
-        own["control"] = hand
+        overrides["control"] = hand
         hand = "pneuflex4"
     with pytest.raises(InputError) as error:
-        parameters.design_space(scene.load("paper", hand_name=hand, overrides=own).hand, "2d")
+        parameters.design_space(scene.load("paper", hand_name=hand, overrides=overrides).hand, "2d")
     assert expected in str(error.value)

@@ -625,9 +625,9 @@ def test_lines_are_what_is_bought_and_played(page, tmp_path):
         pressure=np.array([1.2e5, 9e4, 1.1e5, 1.2e5]),
     )
     alone = 60 * 0.01 * 120 / 1.5 / 101.325
-    for own in (hand.Valves(groups=((0, 3),)), hand.Valves(lines=3)):
+    for lines in (hand.Valves(groups=((0, 3),)), hand.Valves(lines=3)):
         shared = dataclasses.replace(
-            the_scene, hand=dataclasses.replace(the_scene.hand, valves=own)
+            the_scene, hand=dataclasses.replace(the_scene.hand, valves=lines)
         )
         assert valves.lines(shared, params) == [(0, 3), (1,), (2,)]
         bought = {

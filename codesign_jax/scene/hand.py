@@ -248,8 +248,8 @@ def valve_problems(valves: Valves, fingers: int, where: str) -> list[str]:
         problems.append(f"{where}: give the number of lines, or the groups of fingers, not both")
     if valves.lines is not None and valves.lines > fingers:
         problems.append(f"{where}.lines = {valves.lines} must be at most {fingers}, the fingers")
-    if valves.groups is not None and (found := group_problem(valves.groups, fingers)):
-        problems.append(f"{where}.groups: {found}")
+    if valves.groups is not None and (problem := group_problem(valves.groups, fingers)):
+        problems.append(f"{where}.groups: {problem}")
     return problems
 
 

@@ -105,20 +105,20 @@ def test_who_replays_the_key_frames_simulates_the_open_loop(worlds):
 @pytest.mark.parametrize("reads", [True, False])
 def test_forces_are_found_for_policies_that_read_them(worlds, monkeypatch, reads):
     """Others compile no kernel for them."""
-    asked = []
+    calls = []
 
-    def found(scene, fields, world):
-        asked.append(fields)
+    def record(scene, fields, world):
+        calls.append(fields)
         return policy._no_forces(scene, world)
 
     def step(carry, seen):
         light = jnp.where(seen.forces.grip.sum() > 0, 0.5, 1.0) if reads else 1.0
         return carry, seen.plan._replace(pressure=light * seen.plan.pressure)
 
-    monkeypatch.setattr(policy, "_forces", found)
+    monkeypatch.setattr(policy, "_forces", record)
     simulate = partial(rollout.simulate, SCENE, loop(SCENE, step, period=0.25))
     jax.eval_shape(simulate, *worlds[0])
-    assert bool(asked) == reads
+    assert bool(calls) == reads
 
 
 def test_what_is_observed_is_where_mujoco_has_it(worlds):

@@ -109,7 +109,7 @@ def soften(scene, fields, data):
 
 def touching(scene, hand, kin: Kinematics, position, velocity: Spatial):
     """Contacts with object, table and fixtures over whole arrays, by pair of bodies."""
-    scaled = {}
+    by_pair = {}
     for name, place in overlaps.places(scene, hand, kin, position).items():
         cone = getattr(hand.cones, which_cone(name))
         fingers = name.startswith("finger")
@@ -121,8 +121,8 @@ def touching(scene, hand, kin: Kinematics, position, velocity: Spatial):
         contacts = Contacts(*place[:3], cone.of_share(place.share))
         approach = -dot(place.normal, contacts.relative(relative(name, velocity)))
         share = candidates(place.share, place.gap, approach, cone, margin(scene))
-        scaled[name] = contacts._replace(cone=cone.of_share(share))
-    return scaled
+        by_pair[name] = contacts._replace(cone=cone.of_share(share))
+    return by_pair
 
 
 def to_mujoco(data, end):

@@ -27,6 +27,7 @@ from codesign_jax.engines.structured.kernel.finger_contacts import (
     FingerPairing,
 )
 from codesign_jax.engines.structured.kernel.memory import BoundTable, loop, solid
+from codesign_jax.engines.structured.kernel.ring_pairs import RingPairs
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import cross, dot
@@ -173,6 +174,9 @@ class FingerCollision:
             pairing = self.pairs.pairing(row)
             other = jax.lax.div(pairing.lane, jnp.int32(self.p.block))
             owner = (self.block.finger < other) & (other < self.p.num_fingers)
+            if self.hull and not self.pairs.set.gathers:
+                RingPairs(self, row, pairing, owner).find()
+                return x
             if self.hull:
                 # The segments of the other finger's centre line.
                 copy = lambda i: self.write("other", pairing.swap(self.read("line", i)), i)  # noqa: E731, B023
@@ -202,11 +206,11 @@ class FingerCollision:
         """How far a ring reaches from its centre [m]."""
         return lanewise(touch.ring_reach, numbers)
 
-    def _gap(self, speed: Lanes) -> jax.Array:
+    def gap(self, speed: Lanes) -> jax.Array:
         """Largest gap that bodies of this speed to each other may close in this step [m]."""
         return lanewise(partial(closed, self.p.scene.discretization.timestep), speed).lane
 
-    def _near(self, square: jax.Array, mine: Lanes, theirs: Lanes, speed: Lanes) -> jax.Array:
+    def near(self, square: jax.Array, mine: Lanes, theirs: Lanes, speed: Lanes) -> jax.Array:
         """Whether rings may touch in this step.
 
         Args:
@@ -214,10 +218,10 @@ class FingerCollision:
           mine: Reach of one ring; `theirs`: of the other one [m].
           speed: Bound of the speed at which they approach [m/s].
         """
-        far = lanewise(jnp.add, mine, theirs).lane + self._gap(speed)
+        far = lanewise(jnp.add, mine, theirs).lane + self.gap(speed)
         return square < far * far
 
-    def _if_close(
+    def if_close(
         self, near: jax.Array, faced: Facing, speed: Lanes, add: Callable[[jax.Array], None]
     ) -> None:
         """Runs add(lanes whose rings are close), if any may touch in this step.
@@ -227,31 +231,38 @@ class FingerCollision:
           faced: How their rings face the other body.
           speed: Bound of the speed at which they approach [m/s].
         """
-        close = near & (faced.gap.lane < self._gap(speed))
+        close = near & (faced.gap.lane < self.gap(speed))
         any_of(close, lambda: add(close))
 
-    def _begun(
-        self, place: Place, cone: Any, row: Any, theirs: list[Lanes], held: list[Lanes]
+    def begun(
+        self,
+        place: Place,
+        cone: Any,
+        row: Any,
+        mine: list[Lanes],
+        theirs: list[Lanes],
+        held: list[Lanes],
     ) -> dict[str, Lanes]:
         """Fields of a contact of a link with another body, see `BoundContacts.begin`.
 
         Args:
           row: The link.
-          theirs: Motion and velocity of the other body, see `_moves`.
+          mine: Its motion and velocity, see `moves`; `theirs`: those of the other body.
+          held: What the contact holds of friction, (3,), or nothing.
         """
         place = lanewise(with_axis, place)
         run = partial(begun, margin(self.p.scene))
-        moves = lanewise(_differences, self._moves(row), theirs)
+        moves = lanewise(_differences, mine, theirs)
         place, jar = lanewise(run, place, cone, *moves)
         for g in held:
             jar = lanewise(_with_held, jar, place, cone, g)
         return kept(place, jar) | {"row": self._number(row)}
 
-    def _moves(self, row: Any, lane: jax.Array | None = None) -> list[Lanes]:
+    def moves(self, row: Any, lane: jax.Array | None = None) -> list[Lanes]:
         """Motion and velocity of links; arguments as `read`."""
         return [self.side_of(name, row, lane) for name in ("motion", "vel")]
 
-    def _of_rows(
+    def of_rows(
         self, read: Callable, row: jax.Array, which: jax.Array, pairing: FingerPairing | None
     ) -> Any:
         """read(row of each lane, lane of the finger that has it), a tree of lanes.
@@ -269,7 +280,7 @@ class FingerCollision:
         left = jnp.where(which, row, -1)
         if pairing is not None:
             left = pairing.swap(lanes([left], (), wide=True)).lane
-        first = jnp.max(left)
+        first = jnp.maximum(jnp.max(left), 0)
         arrays, rebuild = solid(read(first), self.block.size)
 
         def step(carry: list) -> list:
@@ -292,7 +303,7 @@ class FingerCollision:
         """Gives a slot to a contact of a finger with the palm or itself.
 
         Args:
-          candidate: See `_begun`.
+          candidate: See `begun`.
           other: Link of the other side, 0 for the palm; `item`: the ring.
         """
         candidate |= {"other": self._number(other)}
@@ -314,7 +325,9 @@ class FingerCollision:
 
         def add(place: Place) -> None:
             palm = jnp.zeros_like(jnp.asarray(row))
-            candidate = self._begun(place, self.pairs.of_row(0), row, self._moves(palm), [])
+            cone = self.pairs.of_row(0)
+            theirs = self.moves(palm)
+            candidate = self.begun(place, cone, row, self.moves(row), theirs, [])
             self._alone(candidate, palm, item, mine)
 
         def enter() -> None:
@@ -323,7 +336,7 @@ class FingerCollision:
             def add_ring(_: jax.Array) -> None:
                 add(lanewise(touch.ring_place, numbers, frame, centre, faced))
 
-            self._if_close(mine, faced, self.read("fastest"), add_ring)
+            self.if_close(mine, faced, self.read("fastest"), add_ring)
 
         def enter_ball() -> None:
             add(lanewise(touch.ball_on_field, numbers, centre, *field))
@@ -333,26 +346,28 @@ class FingerCollision:
     def _near_palm(self, distance: Lanes, numbers: Lanes) -> jax.Array:
         size = lanewise(jnp.maximum, distance, zeros((), self.like)).lane
         none = zeros((), self.like)
-        return self._near(size * size, self.reach(numbers), none, self.read("fastest"))
+        return self.near(size * size, self.reach(numbers), none, self.read("fastest"))
 
     def _on_itself(self, item: Any, mine: jax.Array) -> None:
         row, numbers, frame, centre = self.body(item)
-        square, other, t = self._nearest("line", centre, item)
+        square, other, t = self.nearest("line", centre, item)
         theirs = self.largest() if self.p.tapered else numbers
         reaches = self.reach(numbers), self.reach(theirs)
-        near = mine & self._near(square, *reaches, self.read("fastest"))
+        near = mine & self.near(square, *reaches, self.read("fastest"))
 
         def enter() -> None:
-            segment, moves = self._of_rows(self._segment, other, near, None)
-            faced = self._facing(numbers, frame, centre, segment, other, t)
+            segment, moves = self.of_rows(self.segment, other, near, None)
+            faced = self.facing(numbers, frame, centre, segment, other, t)
 
             def add(close: jax.Array) -> None:
-                place = lanewise(place_of, numbers, frame, centre, faced)
+                place = self.place(numbers, frame, centre, faced)
                 held = friction_memory.of_row(self.step, self.pairs, 0)
-                candidate = self._begun(place, self.pairs.of_row(1), row, moves, held)
+                candidate = self.begun(
+                    place, self.pairs.of_row(1), row, self.moves(row), moves, held
+                )
                 self._alone(candidate, other, item, close)
 
-            self._if_close(near, faced, self.read("fastest"), add)
+            self.if_close(near, faced, self.read("fastest"), add)
 
         any_of(near, enter)
 
@@ -360,6 +375,10 @@ class FingerCollision:
         """The last place along a finger [links] that one of its rings touches."""
         tip = self.ring(self.count - 1)
         return self._along(item) - lanewise(arc, tip, self.largest()).lane
+
+    def _rows_back(self, item: Any) -> jax.Array:
+        """Segments that begin before the last place of any lane's `_end`, or more, a scalar."""
+        return jnp.max((self._end(item) + 1.5).astype(jnp.int32))
 
     def last_of(self, item: Any, row: Any) -> jax.Array:
         """The last place on a segment, 0 to 1, that rings of the same finger touch."""
@@ -383,39 +402,60 @@ class FingerCollision:
         self, row: Any, pairing: FingerPairing, owner: jax.Array, item: Any, mine: Any
     ) -> None:
         link, numbers, frame, centre = self.body(item)
-        square, other, t = self._nearest("other", centre)
+        square, other, t = self.nearest("other", centre)
         theirs = self.read("other_size")
         speed = lanewise(jnp.add, self.read("fastest"), theirs[1])
-        near = owner & mine & self._near(square, self.reach(numbers), theirs[0], speed)
+        near = owner & mine & self.near(square, self.reach(numbers), theirs[0], speed)
 
         def enter() -> None:
-            segment, moves = self._of_rows(self._segment, other, near, pairing)
-            faced = self._facing(numbers, frame, centre, segment, other, t)
+            segment, moves = self.of_rows(self.segment, other, near, pairing)
+            faced = self.facing(numbers, frame, centre, segment, other, t)
 
             def add(close: jax.Array) -> None:
-                place = lanewise(place_of, numbers, frame, centre, faced)
+                place = self.place(numbers, frame, centre, faced)
                 held = friction_memory.of_row(self.step, self.pairs, row)
-                candidate = self._begun(place, self.pairs.of_row(row), link, moves, held)
-                self._enter(row, close, owner, candidate, other, item)
+                candidate = self.begun(
+                    place, self.pairs.of_row(row), link, self.moves(link), moves, held
+                )
+                self.enter(row, close, owner, candidate, other, item)
 
-            self._if_close(near, faced, speed, add)
+            self.if_close(near, faced, speed, add)
 
         any_of(near, enter)
 
-    def _enter(
-        self, row: Any, near: Any, owner: jax.Array, mine: dict, other: Any, item: Any
+    def enter(
+        self,
+        row: Any,
+        near: jax.Array,
+        owner: jax.Array,
+        contact: dict[str, Lanes],
+        other: Any,
+        item: Any,
+        second: jax.Array | None = None,
     ) -> None:
-        """Gives contacts of two fingers a slot; other: the second one's links."""
-        which = near & (mine["share"].lane > 0)
-        step = mine.pop("step")
+        """Gives contacts of two fingers a slot.
+
+        Args:
+          near: Lanes that may have found a contact.
+          owner: Lanes of the rings' fingers.
+          contact: See `begun`.
+          other: The other finger's links.
+          item: The ring.
+          second: Lanes of the other finger, if they have looked; else the owners have.
+        """
+        which = near & (contact["share"].lane > 0)
+        step = contact["step"]
+        mine = {name: value for name, value in contact.items() if name != "step"}
         theirs = mine | {"row": self._number(other)}
         theirs |= {name: lanewise(jnp.negative, mine[name]) for name in ("normal", "jar")}
         none = {"other": zeros((1, 1), self.like)} if self.pairs.set.alone else {}
 
         alike = self.pairs.remembered({"owner": owner, "ring": item}) | none | {"step": step}
-        any_of(which, lambda: self.pairs.enter(row, which, owner, mine, theirs, alike))
+        fields = (mine, theirs) if second is None else (theirs, mine)
+        finder = owner if second is None else second
+        any_of(which, lambda: self.pairs.enter(row, which, finder, *fields, alike))
 
-    def _nearest(self, name: str, centre: Lanes, itself: Any = None) -> tuple:
+    def nearest(self, name: str, centre: Lanes, itself: Any = None) -> tuple:
         """The nearest place of a centre line: squared distance, segment, and where along it.
 
         Args:
@@ -443,28 +483,35 @@ class FingerCollision:
 
         best = lanes([self.like + 1.0, self.like, self.like], (3,), wide=True)
         first = int(itself is not None)  # a finger's half link at the palm is the palm's
-        best = loop(last + 1 - first, lambda k, b: nearer(k + first, b), best, self.block.size)
+        count: Any = last + 1 - first
+        if itself is not None and not self.pairs.set.gathers:
+            count = jnp.clip(self._rows_back(itself), 0, count)
+        best = loop(count, lambda k, b: nearer(k + first, b), best, self.block.size)
         square, number, t = (best[k].lane for k in range(3))
         return square, number.astype(jnp.int32), t
 
-    def _segment(self, row: Any, lane: jax.Array | None = None) -> tuple[tuple, list[Lanes]]:
+    def segment(self, row: Any, lane: jax.Array | None = None) -> tuple[tuple, list[Lanes]]:
         """Segments' ends, frames and sections, and their links' motion; arguments as `read`."""
         frames = tuple(self.read("frame", r, lane) for r in neighbours(row, self.p.links))
         ends = self.read("end", row, lane), self.read("end", row + 1, lane)
-        return (ends, frames, self.ring(self.ring_at(row + 1), lane)), self._moves(row, lane)
+        return (ends, frames, self.ring(self.ring_at(row + 1), lane)), self.moves(row, lane)
 
-    def _facing(
+    def facing(
         self, numbers: Lanes, frame: Lanes, centre: Lanes, segment: tuple, row: jax.Array, t: Any
     ) -> Facing:
         """How the lanes' rings face segments; `rings.facing_line`.
 
         Args:
-          segment: Their ends, frames and sections, see `_segment`.
+          segment: Their ends, frames and sections, see `segment`.
           row: Their links.
         """
         last = lanes([jnp.where(row == self.p.links, self.like + 1.0, self.like)], (), wide=True)
         where = lanes([t], (), wide=True)
         return lanewise(facing_line, numbers, frame, centre, (*segment, last), where)
+
+    def place(self, numbers: Lanes, frame: Lanes, centre: Lanes, facing: Facing) -> Place:
+        """Contacts of rings with what they face; `rings.place`."""
+        return lanewise(place_of, numbers, frame, centre, facing)
 
     # Spheres
 
@@ -482,10 +529,12 @@ class FingerCollision:
 
             def enter() -> None:
                 other = jax.lax.div(j, jnp.full_like(j, apart)) + 1
-                moves = pairing.swap(self._moves(other))
-                candidate = self._begun(place, self.pairs.of_row(row), link, moves, [])
+                moves = pairing.swap(self.moves(other))
+                candidate = self.begun(
+                    place, self.pairs.of_row(row), link, self.moves(link), moves, []
+                )
                 number = item + self.count * j
-                self._enter(row, near, owner, candidate, other, number)
+                self.enter(row, near, owner, candidate, other, number)
 
             any_of(near, enter)
 

@@ -5,7 +5,7 @@ finger's lane looks with the next ring of the first one: no lane waits.
 """
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,9 +18,6 @@ from codesign_jax.engines.structured.kernel.shared_memory import where
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.lanes import dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-
-if TYPE_CHECKING:
-    from codesign_jax.engines.structured.kernel.finger_collision import FingerCollision
 
 SAFE = 1e-4
 """Distance that a ring keeps from being near [m]: above any rounding of places, and above what
@@ -35,9 +32,8 @@ class RingPairs:
       second: Lanes of the fingers that they look at.
     """
 
-    def __init__(
-        self, search: "FingerCollision", row: jax.Array, pairing: FingerPairing, first: jax.Array
-    ):
+    def __init__(self, search: Any, row: jax.Array, pairing: FingerPairing, first: jax.Array):
+        """Begins the search of a row of slots; search: the `FingerCollision` that it is a part of."""
         self.search = search
         self.pairs = search.pairs
         self.row = row

@@ -33,7 +33,7 @@ class RingPairs:
     """
 
     def __init__(self, search: Any, row: jax.Array, pairing: FingerPairing, first: jax.Array):
-        """Begins the search of a row of slots; search: the `FingerCollision` that it is a part of."""
+        """Begins the search of a row of slots; search: the `FingerCollision` that begins it."""
         self.search = search
         self.pairs = search.pairs
         self.row = row

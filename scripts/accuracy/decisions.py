@@ -1,10 +1,12 @@
-"""Which of two hands is better, by each accuracy: the figure at the front of the accuracy page.
+"""Which of two hands is better: the figures of the accuracy page on designs that are hard to judge.
 
 python -m scripts.accuracy.decisions --pick     # designs that keep 30 to 95 %, in HARD
 python -m scripts.accuracy --of docs/data/search/hard.npz --designs 48 --trials 24 \\
     --out runs/hard --only "fast;standard;fine;reference;..."          # the variants of ROWS
 python -m scripts.accuracy --out runs/hard --merge docs/data/decisions.json
-python -m scripts.accuracy.decisions            # the figure and the table of the page
+python -m scripts.accuracy.decisions            # the figures and the table of the page
+
+The verdicts that one change flips are in CHANGES, a count for each change.
 
 A hand is chosen from two by half of the trials at one setting, and valued by the other half at
 `reference`, so that no trial is counted on both sides.  The gain of a choice is the kept share of
@@ -26,7 +28,7 @@ from codesign_jax import rollout, scene, use_compilation_cache
 from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import parameters
-from codesign_jax.statistics import Interval
+from codesign_jax.statistics import Interval, wilson
 from codesign_jax.types import failed
 from scripts.accuracy import budget
 from scripts.accuracy.report import interval, points
@@ -36,7 +38,16 @@ from scripts.shared.statistics import spearman, two_way
 DOCS = Path(__file__).parents[2] / "docs"
 HARD = DOCS / "data" / "search" / "hard.npz"
 DATA = DOCS / "data" / "decisions.json"
-FIGURE = DOCS / "figures" / "decisions.png"
+FIGURE = DOCS / "figures" / "choices.png"
+CHANGES = DOCS / "data" / "hard_designs.json"
+CHANGES_FIGURE = DOCS / "figures" / "decisions.png"
+KINDS = {
+    "chance": ("a micrometre", "0.6"),
+    "step": ("time step, integrator, accuracy", "tab:blue"),
+    "contact": ("constants of the contact", "tab:green"),
+    "rubber": ("constants of the rubber", "tab:red"),
+}
+"""What a change concerns: its words and its colour."""
 NEIGHBOURS = 3
 SPREAD = 0.1
 """Designs near each winner, and their standard deviation, a share of each parameter's range."""
@@ -212,6 +223,45 @@ def _dots(axes: Axes, rows: list[tuple[Row, dict[str, Interval]]], name: str, sc
         axes.plot(middle, y, "o", color=color, ms=6)
 
 
+# --- changes --------------------------------------------------------------------------------------
+
+
+def rank_interval(rank: float, designs: int) -> Interval:
+    """Interval of 95 % of Spearman's correlation over designs, by Fisher's transformation.
+
+    Its variance for ranks: D. G. Bonett, T. A. Wright, Sample size requirements for estimating
+    Pearson, Kendall and Spearman correlations, Psychometrika 65, 2000.
+    """
+    # A correlation that is stored as 1.00 may be 0.995.
+    inside = np.clip(rank, -0.995, 0.995)
+    error = 1.96 * np.sqrt((1 + inside**2 / 2) / (designs - 3))
+    low, high = np.tanh(np.arctanh(inside) + np.array([-error, error]))
+    return Interval(rank, float(low), float(high))
+
+
+def draw_changes(content: dict[str, Any], path: Path) -> Path:
+    """A bar for each change, shortest first, with the rank correlation of the designs' shares."""
+    trials = content["designs"] * content["trials"]
+    rows = sorted(content["variants"], key=lambda row: -row["gained"] - row["lost"])
+    figure = output.new_figure(9, 4.6)
+    axes = figure.subplots()
+    for y, row in enumerate(rows):
+        flips = wilson(row["gained"] + row["lost"], trials)
+        share, low, high = (100 * value for value in flips)
+        axes.barh(y, share, color=KINDS[row["kind"]][1], alpha=0.85)
+        axes.plot([low, high], [y, y], color="0.2", lw=1)
+        ranks = rank_interval(row["rank"], content["designs"])
+        text = f"{share:.0f} %, ranks {ranks.value:.2f} ({ranks.low:.2f} to {ranks.high:.2f})"
+        axes.text(high + 0.4, y, text, va="center", fontsize=8)
+    axes.set_yticks(range(len(rows)), [row["variant"].replace("`", "") for row in rows], fontsize=8)
+    axes.set_xlim(0, 34)
+    axes.set_xlabel(f"verdicts that change [%], {content['designs']} designs that keep 30 to 95 %")
+    for words, color in KINDS.values():
+        axes.bar(0, 0, color=color, label=words)
+    axes.legend(frameon=False, fontsize=8, loc="upper right")
+    return output.save_figure(figure, path)
+
+
 def main() -> int:
     parser = provenance.parser(__doc__)
     parser.add_argument("--pick", action="store_true", help="pick hard designs and stop")
@@ -219,6 +269,9 @@ def main() -> int:
     use_compilation_cache()
     if args.pick:
         print(pick())
+        return 0
+    print(draw_changes(json.loads(CHANGES.read_text()), CHANGES_FIGURE))
+    if not DATA.exists():
         return 0
     rows = results(json.loads(DATA.read_text()))
     text = table(rows)

@@ -1,4 +1,4 @@
-"""The command line: wrong input is said in words and creates nothing; Ctrl-C; SLURM."""
+"""The command line: wrong input is said in words and creates nothing; Ctrl-C."""
 
 import signal
 import subprocess

@@ -16,9 +16,9 @@ from codesign_jax.commands import optimize
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.scene import parameters, silicones
+from codesign_jax.scene import draws, parameters, silicones
 from codesign_jax.types import Outcome
-from scripts import benchmark, calibration, reality
+from scripts import benchmark, calibration, reality, uncertainty
 from scripts.accuracy import budget, decisions, report
 from scripts.calibration import OPEN
 from scripts.experiments import report as results
@@ -193,6 +193,28 @@ def test_a_trust_region_grows_shrinks_and_starts_anew_by_the_rules_of_turbo():
         region = region.after(np.array([0.6]), count=batch, patience=4)
     assert region.length == 1.6 / 2**7 and region.best == 0.6
     assert region.after(np.array([0.6]), count=31, patience=4) == turbo.Region(first=32)
+
+
+def test_the_middle_of_distributions_is_theirs_without_a_width():
+    """Draws of both tables are simulated by one program."""
+    table = draws.read("unmeasured")
+    wide, narrow = uncertainty.worlds_of(table).values()
+    assert wide.structure == narrow.structure
+    found = draws.deviations(narrow.drawn, jax.random.key(0), 4)
+    middles = [float(entry.deviation(0.0)) for entry in table.constant]
+    np.testing.assert_allclose(found, np.tile(middles, (4, 1)), rtol=1e-5)
+    assert np.ptp(draws.deviations(wide.drawn, jax.random.key(0), 4), axis=0).min() > 0.01
+
+
+def test_pairs_of_designs_are_compared_by_seed():
+    kept = {
+        "under": {"drawn": [0.9, 0.8, 1.0], "middle": [0.9, 0.9, 0.9]},
+        "at": {"drawn": [0.8, 0.7, 0.9], "middle": [0.9, 0.9, 0.9]},
+    }
+    rows, differences = uncertainty.compared(kept)
+    np.testing.assert_allclose(differences, 10)
+    assert rows[1] == ["under", "90.0", "80", "90.0"]
+    assert rows[3] == ["difference, 3 pairs", "+10.0 (+10.0 to +10.0)", "", "+0.0 (+0.0 to +0.0)"]
 
 
 @pytest.mark.slow  # 19 s

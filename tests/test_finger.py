@@ -415,3 +415,15 @@ def test_the_command_compares_and_fits(tmp_path, capsys):
     output = capsys.readouterr().err
     assert "--fit needs measurements" in output and "--finger = 4 is outside [0, 3]" in output
     assert "must end in .csv" in output and "no.csv: No such file" in output
+
+
+def test_the_page_s_table_is_compared(tmp_path, capsys):
+    """Angles, forces, weights and the pictures of a release in one file."""
+    page = (Path(__file__).parents[1] / "docs" / "measurements.md").read_text(encoding="utf-8")
+    path = tmp_path / "measured.csv"
+    path.write_text("# finger" + page.split("```\n# finger", 1)[1].split("```")[0])
+    out = tmp_path / "out.csv"
+    assert cli.main(["finger", str(path), "--out", str(out)]) == 0
+    assert "drop errs by" in capsys.readouterr().out
+    head, *rows = out.read_text().splitlines()
+    assert "time_s,drop_mm,model_drop_mm" in head and len(rows) == 7

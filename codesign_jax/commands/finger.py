@@ -15,6 +15,7 @@ from codesign_jax.commands.flags import Finger as Options
 from codesign_jax.files import atomically
 from codesign_jax.finger import Finger, Posterior
 from codesign_jax.finger.posterior import words
+from codesign_jax.measurements import MEASURED
 from codesign_jax.runs import tables
 from codesign_jax.scene import draws, schema
 from codesign_jax.scene.hand import Material
@@ -151,7 +152,7 @@ def _columns(
     """Columns to print, by name and unit; measured and predicted ones beside each other."""
     columns = {}
     for name, (unit, size) in SHOWN.items():
-        if name in ("pressure", "load"):
+        if name not in MEASURED:
             if name in table:
                 columns[f"{name}_{unit}"] = table[name] / size
         elif name in table:

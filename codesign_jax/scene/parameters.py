@@ -30,7 +30,7 @@ import numpy as np
 
 from codesign_jax.scene import schema, unit_slips
 from codesign_jax.scene.buildable import Buildable, on_lines
-from codesign_jax.scene.hand import UNITS, Free, Hand, Parameter, Preset, structure
+from codesign_jax.scene.hand import UNITS, Free, Hand, Parameter, Preset, Valves, structure
 from codesign_jax.scene.hand_tables import PARAMETERS, TIP, highest_pressure, per_finger
 from codesign_jax.types import Params, Tip
 
@@ -91,8 +91,9 @@ class DesignSpace:
 
     @property
     def of_table(self) -> "DesignSpace":
-        """The space with Table I alone, without limits of a scene."""
-        return dataclasses.replace(self, buildable=None)
+        """The space with Table I alone, without limits of a scene and searched pressure lines."""
+        hand = dataclasses.replace(self.hand, valves=Valves())
+        return dataclasses.replace(self, hand=hand, buildable=None)
 
     @property
     def num_parameters(self) -> int:

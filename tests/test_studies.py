@@ -200,9 +200,9 @@ def test_the_middle_of_distributions_is_theirs_without_a_width():
     table = draws.read("unmeasured")
     wide, narrow = uncertainty.worlds_of(table).values()
     assert wide.structure == narrow.structure
-    found = draws.deviations(narrow.drawn, jax.random.key(0), 4)
+    factors = draws.deviations(narrow.drawn, jax.random.key(0), 4)
     middles = [float(entry.deviation(0.0)) for entry in table.constant]
-    np.testing.assert_allclose(found, np.tile(middles, (4, 1)), rtol=1e-5)
+    np.testing.assert_allclose(factors, np.tile(middles, (4, 1)), rtol=1e-5)
     assert np.ptp(draws.deviations(wide.drawn, jax.random.key(0), 4), axis=0).min() > 0.01
 
 

@@ -39,11 +39,11 @@ def pytest_configure(config):
 # Files of more than five seconds, the longest first: what is left for the end is short, so that no
 # worker waits for the other.
 LONG = """
-test_resume test_policy test_user_code test_planted_contacts test_engines test_steps test_forces
-test_rings test_reverse test_studies test_compare test_containment test_run_reading test_library
-test_optimizers test_kernel test_docs test_sample test_rigid_bodies test_constants test_lanes
-test_air test_meshes test_codesign test_rollout test_showing test_runs test_scene
-test_studio test_export test_report test_runtime test_particle_filter test_planted_faults
+test_resume test_policy test_export test_rings test_docs test_buildable test_engines test_finger
+test_constants test_run_reading test_compare test_library test_steps test_reverse
+test_planted_contacts test_forces test_attacks test_containment test_kernel test_meshes
+test_user_code test_optimizers test_air test_codesign test_hard_cases test_scene test_rigid_bodies
+test_rollout test_sample test_runs test_report test_particle_filter
 """.split()
 
 

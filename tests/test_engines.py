@@ -50,7 +50,7 @@ SHORT = {"links": 2} | grasps.hurried(0.3, 0.5, 1.2, without=OFF)
 
 def test_vmap_is_a_larger_batch():
     """Nested, over axes in any place, and with controls that all share: the same bits."""
-    scene = grasps.pinch("sphere", **SHORT)
+    scene = grasps.pinch("sphere", **SHORT, **grasps.off("finger_object twist"))
     fields, ctrl = grasps.batch_inputs(scene, *grasps.random_worlds(scene, 3, 4))
     engine = StructuredEngine(scene)
     run = jax.jit(engine.rollout)

@@ -1,6 +1,6 @@
 // Lets the n-th file operation below a folder fail, or end the process there with half of a write done.
-// Preloaded (LD_PRELOAD) by scripts/faults/shim.py, which has the modes; Linux and glibc.
-// It is inert until `shim_arm`, or the variables FAULTS_FOLDER, FAULTS_AT, FAULTS_MODE at start, name a folder.
+// Preloaded (LD_PRELOAD) by scripts/faults.py, which has the modes; Linux and glibc.
+// It does nothing until `shim_arm` names a folder.
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <errno.h>
@@ -40,11 +40,7 @@ long shim_count(void) { return count; }
 
 static void renew(void) { pthread_mutex_init(&one, NULL); }  // another thread may hold it in a fork
 
-__attribute__((constructor)) static void begin(void) {
-  const char *path = getenv("FAULTS_FOLDER"), *n = getenv("FAULTS_AT"), *how = getenv("FAULTS_MODE");
-  if (path && n && how) shim_arm(path, atol(n), atoi(how));
-  pthread_atfork(NULL, NULL, renew);
-}
+__attribute__((constructor)) static void begin(void) { pthread_atfork(NULL, NULL, renew); }
 
 static int below(const char *path) {
   return folder_length && path && !strncmp(path, folder, folder_length) &&

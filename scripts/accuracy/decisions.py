@@ -48,9 +48,8 @@ KINDS = {
     "rubber": ("constants of the rubber", "tab:red"),
 }
 """What a change concerns: its words and its colour."""
-NEIGHBOURS = 3
 SPREAD = 0.1
-"""Designs near each winner, and their standard deviation, a share of each parameter's range."""
+"""Standard deviation of a design near a winner, a share of each parameter's range."""
 TRIALS = 12
 SEED = 11
 """Trials that pick hard designs; no other study draws from this seed."""
@@ -90,12 +89,10 @@ ROWS = (
 
 
 def neighbours(space: parameters.DesignSpace, winners: np.ndarray) -> np.ndarray:
-    """Designs near winners that a search may propose, shape (design, parameter)."""
-    rng = np.random.default_rng(SEED)
-    every = np.repeat(winners, NEIGHBOURS, axis=0)
+    """A design near each winner that a search may propose, shape (design, parameter)."""
     low, high = space.box
-    moved = every + SPREAD * (high - low) * rng.normal(size=every.shape)
-    inside = np.clip(moved, low, high)
+    normal = np.random.default_rng(SEED).normal(size=winners.shape)
+    inside = np.clip(winners + SPREAD * (high - low) * normal, low, high)
     return np.asarray(jax.jit(jax.vmap(space.project))(jnp.asarray(inside, jnp.float32)))
 
 

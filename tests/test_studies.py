@@ -332,7 +332,7 @@ def test_the_page_has_the_tables_of_its_data(monkeypatch):
         assert _without_intervals(shown.strip()) == _without_intervals(text), mark
 
 
-def test_a_choice_between_two_hands_gains_half_of_their_difference():
+def test_a_choice_between_two_hands_gains_half_of_their_difference(monkeypatch):
     """Hands that keep all, half and none of any trials: pairs differ by 50, 50 and 100 points."""
     kept = np.zeros((3, 8), bool)
     kept[0] = True
@@ -341,9 +341,12 @@ def test_a_choice_between_two_hands_gains_half_of_their_difference():
     assert truth.shape == (3, 4, 2)
     assert decisions.gain(truth, truth) == pytest.approx((0.25 + 0.25 + 0.5) / 3)
     assert decisions.rank(truth, truth) == pytest.approx(1)
-    flips, rank, gain, regret = decisions.measures(truth[::-1], truth)
-    assert (flips, rank) == (pytest.approx(2 / 3), pytest.approx(-1))
-    assert regret == pytest.approx(-2 * gain) == pytest.approx(2 / 3)
+    monkeypatch.setattr(decisions, "RESAMPLES", 20)
+    wrong = decisions.compared(truth[::-1], truth)
+    assert wrong["flipped"].value == pytest.approx(2 / 3)
+    assert wrong["rank"].value == pytest.approx(-1)
+    assert wrong["regret"].value == pytest.approx(2 / 3)
+    assert decisions.compared(truth, truth)["regret"] == (0, 0, 0)
     # A setting that cannot tell the hands apart is a toss of a coin.
     assert decisions.gain(np.ones_like(truth), truth) == 0
     # What chooses in one half of the trials is valued by the other half alone.

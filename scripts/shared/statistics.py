@@ -75,7 +75,7 @@ def two_way(
       it is in all of them.
     """
     rng = np.random.default_rng(seed)
-    rows, columns = tables[0].shape
+    rows, columns = tables[0].shape[:2]
     drawn = []
     for _ in range(resamples):
         index = np.ix_(rng.integers(0, rows, rows), rng.integers(0, columns, columns))

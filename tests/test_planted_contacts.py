@@ -20,6 +20,7 @@ from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.forces import forces
 from codesign_jax.engines.structured.kernel import memory_tables
 from codesign_jax.engines.structured.kernel.finger_contacts import BoundFingerContacts
+from codesign_jax.engines.structured.kernel.ring_pairs import RingPairs
 from codesign_jax.engines.structured.kernel.slots import BoundSlots, SlotCounts
 from codesign_jax.engines.structured.lanewise import lanes, lanewise
 from codesign_jax.engines.structured.laws.rings import Place
@@ -31,7 +32,7 @@ from tests.helpers.planted_faults import Fault, chosen, cone_of, planted, simula
 
 BOUND = 1e-8
 """As in test_steps.py."""
-ITERATIONS = {"hull": 12, "spheres": 11}
+ITERATIONS = {"hull": 12, "spheres": 11, "vectors": 12}
 """Of Newton's method.  With many to spare a wrong matrix of the conjugate gradients would cost
 iterations and change no result."""
 SLOTS = 14
@@ -152,6 +153,18 @@ def pulled(right, *args):
     return contact._replace(normal=-contact.normal)
 
 
+def first_ring(right, mine, self, contact, other, close, items):
+    """The second finger's lane finds nothing."""
+    right(self, contact, other, close & ~(mine & self.second), items)
+
+
+def at_rest_there(right, mine, self, row, near):
+    """The second finger's links do not move."""
+    segment, moves = right(self, row, near)
+    still = [lanewise(lambda m: 0 * m, v) for v in moves]
+    return segment, [chosen(mine, a, b) for a, b in zip(still, moves, strict=True)]
+
+
 def passed_over(right, mine, self, busy):
     """Contacts of a world that still iterates are passed over."""
     return right(self, busy & ~mine)
@@ -252,10 +265,17 @@ SPHERES = {
     "normals between spheres point inwards": place(BALLS, normal=jnp.negative),
     **PAIRS,
 }
-SURFACES = {"hull": HULL, "spheres": SPHERES}
+VECTORS = {
+    "every second ring is passed over": Fault({}, methods={(RingPairs, "_enter"): first_ring}),
+    "rings turn at the wrong speed": Fault({}, methods={(RingPairs, "_segment"): at_rest_there}),
+}
+"""Of hulls whose lanes do not gather, as on a CPU."""
+SURFACES = {"hull": HULL, "spheres": SPHERES, "vectors": VECTORS}
+QUICK = ["hull", "spheres", pytest.param("vectors", marks=pytest.mark.slow)]  # 30 s
 STATES = {
     "hull": {"main": (16, 0.95, 0.06), SHORT: (2, 0.6, 0.3, 0.012), "overflow": (1, 1.5, 0.045)},
     "spheres": {"main": (3, 1.9, 0.045), SHORT: (2, -1.2, 0.3, 0.012)},
+    "vectors": {"main": (16, 0.95, 0.06), SHORT: (2, 0.6, 0.3, 0.012)},
 }
 """Arguments of `curled`: seed, bend, height and length [m]. Contacts of every kind, none, and with
 rings more than `SLOTS` of one kind."""
@@ -285,7 +305,8 @@ class Worlds(NamedTuple):
 
 
 def scene_of(surface):
-    settings = {"effects__finger_finger": True, "effects__surface": surface}
+    shape = "spheres" if surface == "spheres" else "hull"
+    settings = {"effects__finger_finger": True, "effects__surface": shape}
     settings |= {"effects__palm_object": False, "effects__palm_table": False}
     settings |= {"effects__finger_palm": True}
     settings |= {"contact__finger_finger_friction": 0.6}  # neither the object's nor the palm's
@@ -303,7 +324,7 @@ def simulated(surface):
         scene = scene_of(surface)
         faults = SURFACES[surface]
         patch.setattr(memory_tables, "pair_slots", lambda _: SLOTS)
-        if surface == "hull":  # as on a GPU; spheres, and the slow tests' hulls, as on this CPU
+        if surface == "hull":  # as on a GPU; the others as on this CPU
             patch.setattr(memory_tables, "GATHERING", ("cpu", "gpu"))
         states = {name: curled(scene, *state) for name, state in STATES[surface].items()}
         checks = [f.check if f.check in states else "main" for f in faults.values()]
@@ -318,8 +339,8 @@ def simulated(surface):
     start = len(faults)
     start_grips = np.zeros(3), np.zeros((scene.num_fingers, 3)), {}
     start = solve(outputs["qpos"][start, 0], outputs["qvel"][start, 0], start_grips)
-    assert surface == "hull" or min(kinds(*states["main"][:2])) > 0
-    assert surface == "hull" or on_palm(*states["main"][:2]) > 0
+    assert surface != "spheres" or min(kinds(*states["main"][:2])) > 0
+    assert surface != "spheres" or on_palm(*states["main"][:2]) > 0
     model, data, _ = states[SHORT]
     short = solved(scene, model, data, data.qpos.copy(), data.qvel.copy(), start_grips, 0.012)[0]
     return Worlds(faults, outputs, solve, start, short, scene.discretization.timestep)
@@ -399,10 +420,10 @@ def test_recorded_forces_are_the_oracle_s(surface):
         )
         np.testing.assert_allclose(recorded.finger_palm[k], expected[-1, :-1], atol=1e-6 * largest)
         assert (expected[0, 1] > 0) and (expected[-1] > 0).any()
-        assert np.diag(expected[:fingers, :fingers]).any() == (surface == "hull")
+        assert np.diag(expected[:fingers, :fingers]).any() == (surface != "spheres")
 
 
-@pytest.mark.parametrize("surface", SURFACES)
+@pytest.mark.parametrize("surface", QUICK)
 def test_sound_worlds_equal_the_oracle(surface):
     """Two steps, and flags in the state that has too many contacts, and in no other."""
     worlds = simulated(surface)
@@ -417,7 +438,12 @@ def test_sound_worlds_equal_the_oracle(surface):
 
 
 @pytest.mark.parametrize(
-    ("surface", "name"), [(surface, name) for surface in SURFACES for name in SURFACES[surface]]
+    ("surface", "name"),
+    [
+        pytest.param(surface, name, marks=[pytest.mark.slow] if surface == "vectors" else [])
+        for surface in SURFACES
+        for name in SURFACES[surface]
+    ],
 )
 def test_a_planted_fault_is_noticed(surface, name):
     """By a hundred times the bound, because nothing is left but NaN, or by a flag that lacks."""

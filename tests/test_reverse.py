@@ -97,7 +97,7 @@ def without(place, *fields):
     return change
 
 
-PUSH = (AdjointSolve, "push")
+CONTACTS = (AdjointSolve, "of_contacts")
 SMOOTH = (AdjointSolve, "smooth")
 FAULTS = {
     "links do not hand on what velocities cause": Fault(results={"of_link": without(0, "bias")}),
@@ -130,10 +130,10 @@ FAULTS = {
         methods={(residual_vjp, "only_on"): lambda right, mask, tree: tree}
     ),
     "contacts push on the right side": Fault(
-        methods={PUSH: lambda right, self, contacts, *rest: contacts.push(*rest)}
+        methods={CONTACTS: lambda right, self, contacts, *rest: contacts.inertia_and_wrench(*rest)}
     ),
     "contacts of another stiffness": Fault(
-        methods={PUSH: lambda right, *_: (lanewise(lambda m: 0.99 * m, right[0]), right[1])}
+        methods={CONTACTS: lambda right, *_: (lanewise(lambda m: 0.99 * m, right[0]), right[1])}
     ),
     "smooth forces on the right side": Fault(
         methods={SMOOTH: lambda right, self, i: [*self.problem.read("smooth", item=i), right[1]]}

@@ -102,11 +102,11 @@ class Phases:
         rest; it is simulated, but is not part of the cost.
     """
 
-    approach: float = quantity("s", 0.01, 60)
-    inflate: float = quantity("s", 0.01, 60)
-    lift: float = quantity("s", 0.01, 60)
-    disturb: float = quantity("s", 0.01, 60)
-    ungrasp: float = quantity("s", 0.01, 60, structure=True)
+    approach: float = quantity("s", 0.01, 600)
+    inflate: float = quantity("s", 0.01, 600)
+    lift: float = quantity("s", 0.01, 600)
+    disturb: float = quantity("s", 0.01, 600)
+    ungrasp: float = quantity("s", 0.01, 600, structure=True)
     deflate_time: float = quantity("s", 0.001, 60)
     settle: float = quantity("s", 0, 60, structure=True, default=0.0)
 

@@ -167,7 +167,6 @@ BEFORE = {
     "budget.json": ("docs/accuracy.md", "docs/notes/accuracy.md"),
     "contact_depths.json": ("docs/hull.md",),
     "experiments": ("docs/results.md", "docs/notes/results.md"),
-    "stability.json": ("docs/notes/stability.md",),
 }
 """Files or folders of docs/data with what was measured with another kernel; pages that show it."""
 

@@ -68,13 +68,16 @@ def pinch(name="paper_spheres", **settings) -> Scene:
 
 
 @functools.lru_cache(maxsize=8)
-def bench(base: Scene, engine: str, step: float, precision: str) -> "Bench":
+def bench(
+    base: Scene, engine: str, step: float, precision: str, tolerance: float | None = None
+) -> "Bench":
     """The bench of a scene, engine, time step and precision; compiled once while in use.
 
+    The structured engine stops at a Newton decrement of `tolerance`, by default the scene's.
     Only the last few are kept: XLA's programs take 1,200 memory maps each, of 65,530 that Linux
     gives a process, and at the limit XLA aborts (docs/notes/structured-engine.md).
     """
-    return Bench(refined(base, step), engine, precision)
+    return Bench(refined(base, step), engine, precision, tolerance)
 
 
 @contextlib.contextmanager
@@ -93,8 +96,13 @@ def floats(wide: bool):
 class Bench:
     """A scene in one engine and precision."""
 
-    def __init__(self, the_scene: Scene, engine: str, precision: str):
+    def __init__(
+        self, the_scene: Scene, engine: str, precision: str, tolerance: float | None = None
+    ):
         self.scene = the_scene
+        self.limits: dict = {}
+        if tolerance is not None:  # as far as rounding allows
+            self.limits = {"tolerance": tolerance, "iterations": 100, "evaluations": 40}
         self.engine = engine
         self.wide = precision == "float64"
         assert self.wide or engine == "structured"  # MuJoCo C is built for float64
@@ -137,6 +145,11 @@ class Bench:
             np.concatenate([path.qpos[:, 1:], last], 1),
             np.concatenate([path.qvel[:, 1:], speed], 1),
         )
+
+    def path(self, fields, ctrl) -> oracles.Path:
+        """States before every step of the structured engine, from the fields' start at rest."""
+        qvel = np.zeros((len(ctrl), fields.start.shape[1] - 1))
+        return self._structured(fields, ctrl, fields.start, qvel)[0]
 
     def _mujoco(self, fields, ctrl, qpos, qvel, masses) -> History:
         out = []
@@ -187,7 +200,7 @@ class Bench:
     @functools.cached_property
     def _program(self):
         """Compiled start, and compiled chunk of steps."""
-        engine = StructuredEngine(self.scene)
+        engine = StructuredEngine(self.scene, **self.limits)
 
         def start(fields, qvel):
             return world_constants(self.scene, fields), moving(engine, fields, qvel)

@@ -9,6 +9,7 @@ ROWS = pytest.StashKey[list]()
 
 def pytest_addoption(parser):
     parser.addoption("--stability-table", type=Path, help="docs folder that gets the margins")
+    parser.addoption("--stability-commit", help="commit of the code where there is no repository")
 
 
 def pytest_configure(config):
@@ -26,4 +27,5 @@ def pytest_sessionfinish(session):
     if folder and session.config.stash[ROWS]:
         from tests.stability import table
 
-        table.write(folder, session.config.stash[ROWS])
+        commit = session.config.getoption("--stability-commit")
+        table.write(folder, session.config.stash[ROWS], commit)

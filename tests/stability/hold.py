@@ -1,4 +1,4 @@
-"""Hard cases 12, 13, 38: an object between two fingers, or two pads, that press on it."""
+"""Hard cases 12, 13, 18, 38: an object between two fingers, or two pads, that press on it."""
 
 import dataclasses
 import functools
@@ -126,6 +126,30 @@ def heavy_rest(name, engine, step, precision):
     history = b.run(*pressed(b))
     # Creep of 1 mm/s at 20 mm; a solver that loses digits to the mass ratio rattles.
     return Found(history.speed[0, -round(0.3 / b.h) :].max(), 0.05)
+
+
+# --- 18: no limit cycle ----------------------------------------------------------------------
+
+
+@case_of_both_scenes(
+    18,
+    "opposed fingers squeeze the box",
+    "largest joint speed after 3.5 s of rest",
+    unit="rad/s",
+)
+def squeeze(name, engine, step, precision):
+    """Opposed fingers on the box from 3.5 s on; largest finger speed from 7 to 8 s."""
+    b = bench(pinch(name), engine, step, precision)
+    params, trial = grasps.hand_world(b.scene, length=0.09, pressure=190e3)
+    fields = b.fields([at_height(params, 0.05)], [trial])
+    ctrl = b.commands([at_height(params, 0.05)], [trial])[:, : round(3.5 / b.h)]
+    ctrl = np.concatenate([ctrl, np.repeat(ctrl[:, -1:], round(4.5 / b.h), 1)], 1)
+    history = b.run(fields, ctrl)
+    late = np.abs(history.qvel[0, -round(1 / b.h) :, 6:-6]).max()
+    # Creep of 1 mm/s at 100 mm is 0.01 rad/s; a limit cycle has rad/s.
+    sunk = hanging(history)
+    note = f"sinks by {1e3 * (sunk[-1] - sunk[-round(4.5 / b.h)]):.1f} mm in 4.5 s"
+    return Found(late, 0.05, note)
 
 
 # --- 38: two pads ----------------------------------------------------------------------------

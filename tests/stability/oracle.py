@@ -19,6 +19,7 @@ class Reader:
         self.model.opt.tolerance = 0.0
         self.model.opt.iterations = 200
         self.data = mujoco.MjData(self.model)
+        self.armature = np.diag(self.model.dof_armature)
 
     def at(self, qpos, qvel=None, ctrl=None):
         """Sets a state and computes everything of it; returns MuJoCo's data."""
@@ -29,6 +30,18 @@ class Reader:
             d.ctrl[:] = ctrl
         mujoco.mj_forward(self.model, d)
         return d
+
+    def kinetic(self, qpos, qvel, dofs):
+        """Kinetic energy [J] of some velocities, without the inertia of implicit springs."""
+        self.data.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        mujoco.mj_crb(self.model, self.data)
+        full = np.zeros((self.model.nv, self.model.nv))
+        mujoco.mj_fullM(self.model, self.data, full)
+        moving = np.zeros(self.model.nv)
+        moving[dofs] = np.asarray(qvel)[dofs]
+        return 0.5 * moving @ (full - self.armature) @ moving
 
     def pushes(self):
         """Contacts of the present state: names of both geoms, normal force [N] and MuJoCo's row."""

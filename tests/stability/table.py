@@ -5,6 +5,7 @@ import functools
 import itertools
 import json
 import math
+import platform
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -42,7 +43,8 @@ class Case:
       precisions: Those of the structured engine; MuJoCo C is built for float64.
       quick: The engine whose first step and precision `make test` runs.
       lower: Whether the bound is a lower one.
-      failure: Why it fails, if it does.
+      failure: Cause of its failure, if it fails.
+      fails_at: Pairs of step and precision that fail; all of them if there is none.
     """
 
     number: int
@@ -57,6 +59,7 @@ class Case:
     quick: str = ""
     lower: bool = False
     failure: str = ""
+    fails_at: tuple[tuple[float, str], ...] = ()
 
     @property
     def variants(self) -> list[tuple[float, str]]:
@@ -68,8 +71,10 @@ class Case:
         """Measures a variant; returns its row of the table."""
         result = self.measure(self.engine, step, precision)
         row = {"case": self.number, "precision": precision, "step": step, "note": result.note}
-        names = ("name", "title", "invariant", "engine", "lower", "unit", "failure")
+        names = ("name", "title", "invariant", "engine", "lower", "unit")
         row |= {name: getattr(self, name) for name in names}
+        fails = not self.fails_at or (step, precision) in self.fails_at
+        row["failure"] = self.failure if fails else ""
         # of NumPy's, JSON has none
         measured = float(result.measured)
         bound = float(result.bound)
@@ -117,21 +122,37 @@ def margin(lower: bool, measured: float, bound: float) -> float:
     return top / low
 
 
-def write(docs: Path, new: list[dict[str, Any]]) -> None:
-    """Puts rows in the place of the same ones of the stored table, and the table into its page."""
-    state = git_state()
+def current(rows: list[dict[str, Any]]) -> dict[tuple, dict[str, Any]]:
+    """Stored rows of variants that exist, by name, step and precision; others are obsolete."""
+    variants = {(c.name, *variant) for c in CASES.values() for variant in c.variants}
+    by_variant = {(r["name"], r["step"], r["precision"]): r for r in rows}
+    return {key: row for key, row in by_variant.items() if key in variants}
+
+
+def write(docs: Path, new: list[dict[str, Any]], commit: str | None = None) -> None:
+    """Puts rows into the stored table and the table into its page; obsolete rows are dropped.
+
+    Args:
+      docs: The folder of the documentation.
+      new: Rows of this run, which replace those of the same variants.
+      commit: Commit of the code where there is no repository to ask.
+    """
+    state = git_state(commit)
     made = str(state["commit"])[:7] + (" with changes" if state.get("modified") else "")
+    versions: Any = environment()["versions"]
+    made_with = {name: versions[name] for name in ("jax", "mujoco")}
+    made_with["python"] = platform.python_version()
     path = docs / "data" / "stability.json"
     page = docs / "notes" / "stability.md"
     old = json.loads(path.read_text())["rows"] if path.exists() else []
-    rows = {(r["name"], r["step"], r["precision"]): r for r in old}
+    rows = current(old)
     for row in new:
         # JSON has no infinite numbers.
         plain = {k: None if v in (math.inf, -math.inf) else v for k, v in row.items()}
-        plain |= {"commit": made, "kernel": provenance.KERNEL}
+        plain |= {"commit": made, "kernel": provenance.KERNEL, **made_with}
         rows[row["name"], row["step"], row["precision"]] = plain
     kept = sorted(rows.values(), key=lambda r: (r["case"], r["name"], r["precision"], -r["step"]))
-    data = {"command": "make stability", **environment(), "rows": kept}
+    data = {"command": "make stability", "rows": kept}
     path.write_text(json.dumps(data, indent=1) + "\n")
     head, tail = page.read_text().split("<!-- table:begin -->")
     tail = tail.split("<!-- table:end -->")[1]
@@ -153,7 +174,6 @@ def to_markdown(rows: list[dict[str, Any]]) -> str:
             values += f" ({'; '.join('h' if s == 1 else f'h/{1 / s:g}' for s in steps)})"
         bounds = ", ".join(sorted({number(r["bound"]) for r in part}))
         least = min(math.inf if r["margin"] is None else r["margin"] for r in part)
-        # Cases that are simulated no more stand in the table with the cause of their failure.
         causes = {r.get("failure") or "not explained" for r in part if not r["passed"]}
         remarks = ["**fails**: " + "; ".join(sorted(causes))] if causes else []
         remarks += ["; ".join(sorted({r["note"] for r in part if r["note"]}))]

@@ -38,7 +38,7 @@ def rigid(name):
 
 def asymmetric(b):
     """Fields, controls and start of a grasp off the middle, tilted and turned, without spread."""
-    params, trial = grasps.hand_world(b.scene, length=0.09, pressure=190e3, spread=0.0)
+    params, trial = grasps.hand_world(b.scene, length=0.09, pressure=150e3, spread=0.0)
     params = params._replace(
         length=np.array([0.090, 0.094]), arm=params.arm + 0.05 * (np.arange(6) == 2)
     )

@@ -12,7 +12,6 @@ from tests.stability import (  # noqa: F401  (they register their cases)
     decision,
     grasp,
     hold,
-    momentum,
     symmetry,
     table,
     touch,

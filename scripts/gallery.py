@@ -196,19 +196,20 @@ def write_page() -> None:
 HEAD = """# Gallery
 
 The default search found these hands within the [limits](optimisers.md#what-can-be-built) of what
-can be built. They are cast in Dragon Skin 10. The command below each hand is its search; another
-machine may end with another hand.
+can be built, and none of these designs has a [warning](verdict.md#before-you-build). They are cast
+in Dragon Skin 10. The command below each hand is its search; another machine may end with another
+hand.
 
 * **Verdict.** Each hand met 100 fresh trials at the accuracy of its search, `standard`. *Friction*
-  is between object and hand. `codesign evaluate --design docs/gallery/bin.toml --trials 100 --seed
-  1000` repeats the verdict of `bin`; the file names scene, hand, objects and control where they are
-  not the default.
+  is between object and hand. `codesign evaluate --design docs/gallery/shelf.toml --trials 100
+  --seed 1000` repeats the verdict of `shelf`; the file names scene, hand, objects and control where
+  they are not the default.
 * **Heavier objects.** All objects have the stated mass, in 48 trials for each.
 * **Cast hands.** 64 hands with the usual [tolerances](uncertainty.md#cast-hands), 24 grasps each.
 
-*Earlier model* marks hands of a model with a linear wall of 40 kPa, implicit Euler, no friction
-memory in the contacts of objects, and no limits of what can be built. Evaluate such a hand again
-before you use it."""
+The exceptions are marked *earlier model*: hands of a model with a linear wall of 40 kPa, implicit
+Euler, no friction memory in the contacts of objects, and no limits of what can be built. Evaluate
+such a hand again before you use it."""
 
 if __name__ == "__main__":
     main(sys.argv[1:])

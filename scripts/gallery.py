@@ -204,8 +204,11 @@ hand.
   is between object and hand. `codesign evaluate --design docs/gallery/shelf.toml --trials 100
   --seed 1000` repeats the verdict of `shelf`; the file names scene, hand, objects and control where
   they are not the default.
-* **Heavier objects.** All objects have the stated mass, in 48 trials for each.
-* **Cast hands.** 64 hands with the usual [tolerances](uncertainty.md#cast-hands), 24 grasps each.
+* **More trials.** *N more at this share would decide* means that N further trials would decide the
+  verdict if the kept share stayed the same.
+* **Heavier objects.** For each stated mass, all objects have this mass in 48 trials.
+* **Cast hands.** We simulated 64 hands with the usual [tolerances](uncertainty.md#cast-hands) of
+  casting, in 24 grasps each. The page states how many of these hands keep at least 95 %.
 
 The exceptions are marked *earlier model*: hands of a model with a linear wall of 40 kPa, implicit
 Euler, no friction memory in the contacts of objects, and no limits of what can be built. Evaluate

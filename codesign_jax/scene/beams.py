@@ -14,7 +14,7 @@ class Beam(NamedTuple):
 
     Attributes:
       bending: Stiffness EI_b about the inextensible bottom layer [N m^2].
-      lateral: Stiffness EI_lat about the side that carries no tension [N m^2].
+      lateral: Stiffness EI_lat about the side on which the fabric is taut [N m^2].
       torsion: Stiffness G J [N m^2].
       line_density: Mass per length [kg/m].
       moment_per_pressure: Bending moment per gauge pressure A_c y_c [m^3].

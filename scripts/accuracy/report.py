@@ -157,7 +157,8 @@ def points(value: Interval) -> str:
 
 def presets_table(results: Budget) -> list[list[str]]:
     head = ["setting", "kept share, points from the truth", "verdicts that flip"]
-    head += ["rank correlation", "flips by a micrometre", "finger tip in the air"]
+    head += ["rank correlation", "verdicts that flip if the object moves by a micrometre"]
+    head += ["error of the finger tip in the air"]
     rows = [[*head, *(f"grasps/s, {m}" for m in RATED.values())]]
     rows += [results.row(name, f"`{name}`") for name in PRESETS]
     rows += [results.row(n, words) for n, words in CANDIDATES.items() if n in results.costs]
@@ -183,7 +184,7 @@ def luck(results: Budget) -> str:
     words = f"{np.mean(ranks):.2f}" if ranks else "none"
     return (
         f"With six trials of each design, its kept share has a standard error of {100 * six:.0f} "
-        f"points; ranks by six trials and by six others correlate by {words}."
+        f"points; the designs' ranks in six trials and in six other trials correlate by {words}."
     )
 
 

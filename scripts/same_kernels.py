@@ -3,9 +3,9 @@
 python -m scripts.same_kernels /path/to/other/checkout      # exit status 1 if any differs
 
 Compares the LLVM text that the compiler writes for a block on CPUs and for a thread on NVIDIA GPUs
-(no GPU is needed), of rollouts and of a derivative, both in this Python environment.  Run it before
-a change that must leave the simulation as it is goes to main.  A checkout that has this module runs
-its own copy of it, so that the names that it uses may move.
+(no GPU is needed), of rollouts, a derivative and recorded forces, both in this Python environment.
+Run it before a change that must leave the simulation as it is goes to main.  A checkout that has
+this module runs its own copy of it, so that the names that it uses may move.
 """
 
 import argparse
@@ -28,20 +28,21 @@ SCENES: dict[str, dict[str, Any]] = {
         "effects": {"pressure_dynamics": True, "lateral_threshold": True}
     },
     "derivative of paper": {"derivative": True},
+    "forces of paper": {"forces": True},
 }
 WORLDS = 64
 STEPS = 20
 
 
 def texts(values: dict[str, Any], backend: str) -> list[str]:
-    """LLVM texts of the kernels that a rollout of a scene asks for, the derivative's last."""
+    """LLVM texts of the kernels that a rollout of a scene asks for, in the order of the calls."""
     import jax
     import jax.numpy as jnp
 
     from codesign_jax import rollout, scene
     from codesign_jax.compiler import cpu, launch, thread
     from codesign_jax.engines.structured import StructuredEngine
-    from codesign_jax.engines.structured.kernel import adjoint, program
+    from codesign_jax.engines.structured.kernel import adjoint, contact_forces, program
     from codesign_jax.scene import parameters
 
     chosen = scene.load(
@@ -69,7 +70,12 @@ def texts(values: dict[str, Any], backend: str) -> list[str]:
 
     def distance(design: jax.Array, trials: Any) -> jax.Array:
         engine = StructuredEngine(chosen)
-        run = lambda trial: rollout.grasp(chosen, engine, space.params(design), trial, steps=STEPS)  # noqa: E731
+
+        def run(trial: Any) -> Any:
+            params = space.params(design)
+            forces = values.get("forces", False)
+            return rollout.grasp(chosen, engine, params, trial, steps=STEPS, record_forces=forces)
+
         return jax.vmap(run)(trials).distance.sum()
 
     function = jax.grad(distance) if values.get("derivative") else distance
@@ -78,6 +84,7 @@ def texts(values: dict[str, Any], backend: str) -> list[str]:
         mock.patch.object(launch, "available", lambda platform: None),
         mock.patch.object(program, "launch", record),
         mock.patch.object(adjoint, "launch", record),
+        mock.patch.object(contact_forces, "launch", record),
     ):
         jax.clear_caches()  # what was traced for the other backend
         jax.eval_shape(function, jnp.asarray(space.default(), jnp.float32), trials)

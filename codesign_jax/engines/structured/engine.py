@@ -224,15 +224,15 @@ class StructuredEngine(Equal):
         path = jax.tree.map(lambda x: program.by_world(x, len(ctrl)), recorded(out, taken))
         return self._trace(series, end, trajectory), path
 
-    def _trace(self, found: dict[str, jax.Array], end: State, trajectory: bool) -> Trace:
-        series = found["distance"], found["height"], found["speed"]
+    def _trace(self, entries: dict[str, jax.Array], end: State, trajectory: bool) -> Trace:
+        series = entries["distance"], entries["height"], entries["speed"]
         shape = (*series[0].shape, 0)
-        qpos = found["qpos"] if trajectory else jnp.zeros(shape, series[0].dtype)
+        qpos = entries["qpos"] if trajectory else jnp.zeros(shape, series[0].dtype)
         # The decrement is a share of forces times accelerations, its root one of forces.  What a
         # step that converged leaves is rounding.
-        left = jnp.where(found["residual"] > self.limits.tolerance, found["residual"], 0.0)
+        left = jnp.where(entries["residual"] > self.limits.tolerance, entries["residual"], 0.0)
         return Trace(
-            *series, qpos, self._status(found), coordinates.whole(end), residual=jnp.sqrt(left)
+            *series, qpos, self._status(entries), coordinates.whole(end), residual=jnp.sqrt(left)
         )
 
     def _status(self, series: dict[str, jax.Array]) -> jax.Array:

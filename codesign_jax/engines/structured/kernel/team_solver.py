@@ -42,7 +42,7 @@ class TeamLanes:
     def mask(self, which: jax.Array, *, wide: bool = True) -> Lanes:
         return lanes([which], (), wide=wide)
 
-    def one(self, value: jax.Array) -> Lanes:
+    def as_lanes(self, value: jax.Array) -> Lanes:
         return lanes([value], (), wide=True)
 
     def axes(self, i: Any) -> Lanes:
@@ -124,7 +124,8 @@ class TeamLanes:
             return moved if z is not None else jnp.where(at_rest, w, moved)
 
         w, g, _ = kept.factors
-        acc = team_sum(self.block, lanewise(part, w, g, self.one(parent), self.one(obj), at_rest))
+        motions = self.as_lanes(parent), self.as_lanes(obj)
+        acc = team_sum(self.block, lanewise(part, w, g, *motions, at_rest))
         return acc if z is None else lanewise(jnp.add, acc, z)
 
     def again(self, axes: list, kept: el.Kept, r: jax.Array, ro: jax.Array) -> tuple:
@@ -139,7 +140,7 @@ class TeamLanes:
             return r - dot(w, y), ro + dot(g, y), contract(kept.inverse, y[None], 1)
 
         value = lanes(y, (len(y),), wide=True)
-        r, ro, z = lanewise(reduce, kept, self.one(r), self.one(ro), value)
+        r, ro, z = lanewise(reduce, kept, self.as_lanes(r), self.as_lanes(ro), value)
         return r.lane, ro.lane, z  # pyright: ignore[reportAttributeAccessIssue]  # lanewise gives Lanes
 
     def link(self, i: Any) -> el.Kept:
@@ -150,7 +151,7 @@ class TeamLanes:
         """A joint's accelerations and its link's motion, by components; see `accelerations`."""
         a = self.accelerations(self.link(i), parent, obj, None, at)
         axes = self.chip.rows("axes", i)
-        return a, lanewise(lambda p, s, a: p + dot(s, a), self.one(parent), axes, a).lane
+        return a, lanewise(lambda p, s, a: p + dot(s, a), self.as_lanes(parent), axes, a).lane
 
     def narrowed(self, value: Lanes) -> Lanes:
         """What is the same on all lanes of a world, as its own."""
@@ -296,9 +297,9 @@ class TeamCoupling(Coupling):
             r, ro, z = team.again(axes, team.link(i), r, ro)
             for k, part in enumerate(z.parts.ravel()):
                 self._row(i, k, AGAIN, part)
-            return team.one(r), team.one(ro)
+            return team.as_lanes(r), team.as_lanes(ro)
 
-        start = team.one(none), team.one(none)
+        start = team.as_lanes(none), team.as_lanes(none)
         r, ro = loop(self.links, step, start, self.block.size, reverse=True)
         r = r.lane + team.scratch.get("side.push", 0)
         r, ro = (self.block.fold(v, jnp.add) for v in (r, ro.lane))
@@ -353,10 +354,10 @@ class TeamCoupling(Coupling):
         def link(i: Any, parent: Lanes) -> Lanes:
             _, motion = team.outward(i, parent.lane, obj, at)
             team.scratch.put("side.motion", motion, i + 1)
-            return team.one(motion)
+            return team.as_lanes(motion)
 
         self.pairs.put("motion", self.problem.widened(step.palm_motion), 0)
-        loop(self.links, link, team.one(palm + 0 * obj), self.block.size)
+        loop(self.links, link, team.as_lanes(palm + 0 * obj), self.block.size)
 
 
 class TeamLineSearch(LineSearch):
@@ -373,7 +374,7 @@ class TeamLineSearch(LineSearch):
         pairs = self.problem.finger_pairs
         assert pairs is not None
         palm, obj = (chosen(self.block, v) for v in (step.palm_motion, step.object_motion))
-        first = team.one(jnp.where(self.block.mate == 0, jnp.ones_like(self.like), 0.0))
+        first = team.as_lanes(jnp.where(self.block.mate == 0, jnp.ones_like(self.like), 0.0))
 
         def smooth(sums, column, motion, moved, smooth, part, first, armature, acc, tau, a):
             slope, curvature = sums
@@ -389,16 +390,16 @@ class TeamLineSearch(LineSearch):
             team.chip.put("step_motion", part, i)
             team.scratch.put("side.motion", part, i + 1)
             numbers = problem.read("armature", "acc", "tau", item=i)
-            push = team.one(team.scratch.get("smooth", i))
+            push = team.as_lanes(team.scratch.get("smooth", i))
             column = team.chip.rows("matrix", i)
             motion, moved = problem.read("motion", "step_motion", item=i)
             sums = lanewise(
-                smooth, sums, column, motion, moved, push, team.one(part), first, *numbers, a
+                smooth, sums, column, motion, moved, push, team.as_lanes(part), first, *numbers, a
             )
-            return team.one(part), sums
+            return team.as_lanes(part), sums
 
         pairs.put("motion", problem.widened(step.palm_motion), 0)
-        start = team.one(palm + 0 * obj), [zeros((), self.like)] * 2
+        start = team.as_lanes(palm + 0 * obj), [zeros((), self.like)] * 2
         _, (slope, curvature) = loop(self.links, link, start, self.block.size)
         touch = self.prepare_slots(zeros((), self.like), step)
         terms = [lanewise(jnp.multiply, touch, first), pairs.prepare_all()]
@@ -415,7 +416,7 @@ class TeamLineSearch(LineSearch):
     def contact_slopes(self, alpha: Lanes) -> list[Lanes]:
         problem = self.problem
         sums = [zeros((), self.like)] * 2
-        first = self.team.one(jnp.where(self.block.mate == 0, jnp.ones_like(self.like), 0.0))
+        first = self.team.as_lanes(jnp.where(self.block.mate == 0, jnp.ones_like(self.like), 0.0))
 
         def plus(sums: list[Lanes], new: list[Lanes]) -> list[Lanes]:
             return lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), sums, new)

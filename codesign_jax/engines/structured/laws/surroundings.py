@@ -104,12 +104,12 @@ def edges(fixture: Fixture, position: jax.Array) -> jax.Array:
         radial = jnp.sqrt(local[0] ** 2 + local[1] ** 2 + 1e-12)
         scale = size[0] / radial
         end = jnp.where(local[2] < 0, -size[1], size[1])
-        found = [jnp.stack([scale * local[0], scale * local[1], end])]
+        points = [jnp.stack([scale * local[0], scale * local[1], end])]
     else:
         excess = [jnp.abs(local[k]) - size[k] for k in range(3)]
         near = [jnp.minimum(jnp.maximum(local[k], -size[k]), size[k]) for k in range(3)]
         side = [jnp.where(local[k] < 0, -size[k], size[k]) for k in range(3)]
-        found = []
+        points = []
         for edge in range(4):
             point = None
             for k in (2, 1, 0):
@@ -123,13 +123,13 @@ def edges(fixture: Fixture, position: jax.Array) -> jax.Array:
                 new = jnp.stack(corner)
                 first = (excess[k] >= excess[a]) & (excess[k] >= excess[b])
                 point = new if point is None else jnp.where(first, new, point)
-            found.append(point)
+            points.append(point)
     turn = turn_of(fixture)
     return jnp.stack(
         [
             jnp.stack([v + float(fixture.position[k]) for k, v in enumerate(_turned(turn, p))])
             - position
-            for p in found
+            for p in points
         ],
         1,
     )

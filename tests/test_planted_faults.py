@@ -143,8 +143,8 @@ FAULTS = {
     "contacts of the iteration before": Fault(
         {"tree_add_scaled": lambda f, alpha, value, change: value}
     ),
-    "angles after explicit Euler": Fault({"turned": explicit}, "position"),
-    "spin in the wrong frame": Fault({"moved": spin_in_world_axes}),
+    "angles after explicit Euler": Fault({"joint_after_step": explicit}, "position"),
+    "spin in the wrong frame": Fault({"body_after_step": spin_in_world_axes}),
     # wrong weight
     "links a tenth too heavy": Fault(link(mass=lambda m: 1.1 * m)),
     "a whole weight for half segments": Fault(

@@ -24,7 +24,7 @@ from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
 from codesign_jax.engines.structured.kernel.residual import LinkMotion
 from codesign_jax.engines.structured.kernel.residual_vjp import FingerContactsVjp, ResidualVjp
 from codesign_jax.engines.structured.kernel.slots import any_of
-from codesign_jax.engines.structured.kernel.step import Step, moved, turned
+from codesign_jax.engines.structured.kernel.step import Step, body_after_step, joint_after_step
 from codesign_jax.engines.structured.kernel.step_memory import KernelLayout, StepMemory
 from codesign_jax.engines.structured.lanes import dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -108,14 +108,14 @@ class ReverseStep(Step):
         old = {n: state[n] for n in MOVED}
         after = {n: self.bars.world_state.read(n) for n in MOVED}
         given = old, bodies["columns"], now.wrist, now.object_motion
-        run = partial(moved, h)
+        run = partial(body_after_step, h)
         state_bars, columns, wrist, obj = pull(run, given, (), only_on(go, after))
         self.bars.add_once({"columns": columns})
 
         def joint(i: Any, x: Any) -> Any:
             given = tuple(self.joint(i).values())
             bars = [self.bars.finger_state.read(n, i) for n in JOINT[:2]]
-            *new, acc = pull(partial(_turned, h), given, (), only_on(go, bars))
+            *new, acc = pull(partial(_joint_after_step, h), given, (), only_on(go, bars))
             for name, new_bar, bar in zip(JOINT, new, bars, strict=False):
                 value = lanewise(jnp.where, go, new_bar, bar)
                 self.bars.finger_state.write(name, value, i)
@@ -170,8 +170,8 @@ class ReverseStep(Step):
         return arm_bar
 
 
-def _turned(h: float, q, rate, acc):
-    rate, q, _ = turned(h, q, rate, acc)
+def _joint_after_step(h: float, q, rate, acc):
+    rate, q, _ = joint_after_step(h, q, rate, acc)
     return q, rate
 
 

@@ -85,12 +85,15 @@ class Elimination:
                 return new._replace(p=upper(new.p), q=upper(new.q)), more
 
             ways = (partial(eliminated, eliminate_joint), partial(eliminated, eliminate_free_joint))
-            node, more = ways[1]() if held is None else either(i <= held, *ways, self.block.size)
+            if last_touching is None:
+                node, more = ways[1]()
+            else:
+                node, more = either(i <= last_touching, *ways, self.block.size)
             return node, lanewise(jnp.add, work, more) if problem.finger_pairs else work
 
         empty = [zeros(s, self.like) for s in ((21,), (6, 6), (21,), (6,), (6,))]
         start = (el.Quadratic(*empty), zeros((), self.like))
-        held = self.last_on_object()
+        last_touching = self.last_on_object()
         node, work = loop(self.links, step, start, self.block.size, reverse=True)
         if problem.chambers:
             node, work = problem.chambers.close(node, work)
@@ -128,12 +131,12 @@ class Elimination:
 
     def last_on_object(self) -> jax.Array | None:
         """Last link with contacts with the object, -1 for none; None if the scene has none."""
-        held = [c for c in self.problem.per_link if c.set.on_object]
+        on_object = [c for c in self.problem.per_link if c.set.on_object]
 
         def later(i: Any, last: jax.Array) -> jax.Array:
-            return jnp.where(held[0].touching(i), jnp.asarray(i, jnp.int32), last)
+            return jnp.where(on_object[0].touching(i), jnp.asarray(i, jnp.int32), last)
 
-        return jax.lax.fori_loop(0, self.links, later, jnp.int32(-1)) if held else None
+        return jax.lax.fori_loop(0, self.links, later, jnp.int32(-1)) if on_object else None
 
     def dealt_pushes(self, alpha: Lanes) -> dict[str, tuple[Lanes, Lanes]]:
         """Contact inertia and wrench of the palm's and the object's contacts; see `backward`."""
@@ -220,11 +223,11 @@ def with_palm(
     return el.Quadratic(p, c, q, r, ro), twist
 
 
-def _add(node: el.Quadratic, matrix, wrench, held: bool) -> el.Quadratic:
+def _add(node: el.Quadratic, matrix, wrench, on_object: bool) -> el.Quadratic:
     p, c, q, r, ro = node
     p = p + matrix
     r = r + wrench
-    if held:
+    if on_object:
         c = c + matrix
         q = q + matrix
         ro = ro - wrench

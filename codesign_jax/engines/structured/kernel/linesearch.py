@@ -52,7 +52,7 @@ class LineSearch:
             return a, moved, slope, stiff + dot(link.times(moved), moved)
 
         def link(i: Any, carry: tuple) -> tuple:
-            parent, slope, curvature, touch = carry
+            parent, slope, curvature, contact_slope = carry
             names = ("motion", "smooth", "tau", "axes", "armature", "acc")
             a, moved, s, c = lanewise(
                 substitute,
@@ -66,28 +66,29 @@ class LineSearch:
             problem.write("step_motion", moved, i)
             if problem.finger_pairs:
                 problem.finger_pairs.put("motion", moved, i + 1)
-            terms = [touch]
+            terms = [contact_slope]
             for contacts in problem.per_link:
                 rel = relative(contacts.set.name, moved, step.palm_motion, step.object_motion)
                 terms.append(contacts.prepare_linesearch(i, rel))
-            touch = lanewise(lambda t: total(t), terms)
+            contact_slope = lanewise(lambda t: total(t), terms)
             slope, curvature = lanewise(lambda a, b, c, d: (a + b, c + d), slope, s, curvature, c)
-            return moved, slope, curvature, touch
+            return moved, slope, curvature, contact_slope
 
         none = zeros((), self.like)
         parent = problem.widened(step.palm_motion)
         if problem.finger_pairs:
             problem.finger_pairs.put("motion", parent, 0)
-        _, slope, curvature, touch = loop(
+        _, slope, curvature, contact_slope = loop(
             self.links, link, (parent, none, none, none), self.block.size
         )
         if problem.chambers:
             curvature = lanewise(jnp.add, curvature, problem.chambers.curvature())
         between = [problem.finger_pairs.prepare_all()] if problem.finger_pairs else []
-        touch = self.prepare_slots(lanewise(lambda t: total(t), [touch, *between]), step)
-        slope, curvature, touch = self.block.sum((slope, curvature, touch))
+        contact_slope = lanewise(lambda t: total(t), [contact_slope, *between])
+        contact_slope = self.prepare_slots(contact_slope, step)
+        slope, curvature, contact_slope = self.block.sum((slope, curvature, contact_slope))
         slope, curvature = lanewise(_rest, now, step, problem.palm, slope, curvature)
-        return slope, curvature, touch
+        return slope, curvature, contact_slope
 
     def prepare_slots(self, touch: Lanes, step: Iterate) -> Lanes:
         """Adds the slopes of the palm's and the object's contacts along the step."""

@@ -290,11 +290,13 @@ def semi_implicit_euler(
     """
     p = step.p
     h = step.p.scene.discretization.timestep
-    new = lanewise(partial(moved, h), state, bodies["columns"], now.wrist, now.object_motion)
+    new = lanewise(
+        partial(body_after_step, h), state, bodies["columns"], now.wrist, now.object_motion
+    )
     size = lanewise(_largest, new)
 
     def link(i: Any, largest: Lanes) -> Lanes:
-        rate, q, top = lanewise(partial(turned, h), *step.joint(i).values())
+        rate, q, top = lanewise(partial(joint_after_step, h), *step.joint(i).values())
         step.scratch.write("new_finger", q, i)
         step.scratch.write("new_finger_vel", rate, i)
         return lanewise(_worse, largest, top)
@@ -321,9 +323,9 @@ def semi_implicit_euler(
     return jnp.where(goes_on, largest, speed), good
 
 
-def moved(h: float, state: dict, columns, wrist, obj) -> dict:
+def body_after_step(h: float, state: dict, columns, wrist, obj) -> dict:
     names = ("wrist", "position", "quat", "wrist_vel", "linear_vel", "angular_vel")
-    # The fingers' joints are moved link by link, see `turned`.
+    # The fingers' joints are moved link by link, see `joint_after_step`.
     old = State(finger=0.0, finger_vel=0.0, acc=None, **{n: state[n] for n in names})  # type: ignore[arg-type]
     new = integrate(old, columns, kin.Acc(wrist, 0.0, obj), h)  # type: ignore[arg-type]
     return {n: getattr(new, n) for n in names}
@@ -345,7 +347,7 @@ def _largest(new: dict):
     return jnp.where(place == place, top, place)
 
 
-def turned(h: float, q, rate, acc):
+def joint_after_step(h: float, q, rate, acc):
     """A joint after the step: velocities, angles, and the largest velocity."""
     rate = rate + h * acc
     q = q + h * rate

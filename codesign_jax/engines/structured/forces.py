@@ -158,7 +158,7 @@ def _touch(stored: dict[str, jax.Array], name: str, position: jax.Array, by_ring
     return Touch(
         point=by_ring(point),
         normal=by_ring(normal),
-        gap=by_ring(stored[f"{name}.gap"])[..., 0],
+        gap=by_ring(stored[f"{name}.gap"][:, None])[..., 0],
         pressing=by_ring(pressing)[..., 0],
         tangential=by_ring(pressing * normal - force),
     )

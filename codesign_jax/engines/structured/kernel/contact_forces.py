@@ -18,6 +18,7 @@ from codesign_jax.engines.structured.kernel.contact_sets import (
     ContactSet,
     begun,
     margin,
+    place_shapes,
     with_held,
     zeros,
 )
@@ -40,9 +41,6 @@ from codesign_jax.scene import Scene
 
 FAR = 1e3
 """A gap that no ring has [m]."""
-FIELDS = {"point": 3, "normal": 3, "gap": 1, "share": 1, "force": 3}
-"""Components of the fields of a contact: its `Place`, and the force on its first body [N], world
-axes. The first body is the finger, the palm, or the object on table and fixtures."""
 PAIR = ("pressing", "depth")
 """Sum of the normal forces [N] and largest depth [m] of a pairing of fingers, see
 `finger_contacts`: with the other finger, or itself, and with the palm."""
@@ -52,8 +50,10 @@ class ForceProgram(Program):
     """Tables and kernel of the contact forces of states.
 
     Attributes:
-      record: Rows of what the kernel stores: for each item of a contact set `FIELDS`, shape
-        (component, k), and for each pairing of fingers `PAIR`, shape (2,).
+      record: Rows of what the kernel stores: for each item of a contact set the `Place` of its k
+        contacts, and "force", shape (3, k): the force on the first body [N], world axes, which is
+        the finger, the palm, or the object on table and fixtures. For each pairing of fingers
+        `PAIR`, shape (2,).
     """
 
     @classmethod
@@ -64,15 +64,14 @@ class ForceProgram(Program):
 
     def _tables(self) -> None:
         super()._tables()
-        record = {}
+        record: dict[str, tuple[int, tuple[int, ...]]] = {}
         for contacts in self.sets:
-            between = isinstance(contacts, FingerContactSet)
-            fields = dict.fromkeys(PAIR, 2) if between else FIELDS
-            for field, size in fields.items():
-                items = (
-                    (contacts.rows, (size,)) if between else (contacts.count, (size, contacts.k))
-                )
-                record[f"{contacts.name}.{field}"] = items
+            if isinstance(contacts, FingerContactSet):
+                record |= {f"{contacts.name}.{field}": (contacts.rows, (2,)) for field in PAIR}
+                continue
+            shapes = place_shapes(contacts.k) | {"force": (3, contacts.k)}
+            for field, shape in shapes.items():
+                record[f"{contacts.name}.{field}"] = contacts.count, shape
         self.record = MemoryLayout(True, **record)
 
     def stored(self, hand: WorldModel, state: State) -> dict[str, jax.Array]:
@@ -216,6 +215,6 @@ def with_slot(sums, palm, place, cone, jar):
     """Adds a slot's contact to a pairing's `PAIR`; palm: 1 for a contact with the palm, else 0."""
     pressing, depth = sums
     force = sum_axis(dot(place.normal, solved_force(place, cone, jar)), 0)
-    deep = jnp.where(place.share[0, 0] > 0, jnp.maximum(-place.gap[0, 0], 0.0), 0.0)
+    deep = jnp.where(place.share[0] > 0, jnp.maximum(-place.gap[0], 0.0), 0.0)
     side = jnp.stack([1.0 - palm, palm])
     return [pressing + side * force, jnp.maximum(depth, side * deep)]

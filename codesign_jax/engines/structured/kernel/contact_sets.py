@@ -48,6 +48,11 @@ def cone_of(scene: Scene, numbers: Any) -> Cone:
     return Cone(**fields | {name: numbers[i] for i, name in enumerate(cone_fields(scene))})
 
 
+def place_shapes(k: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of the fields of a `Place` of k contacts, as they are stored."""
+    return {"point": (3, k), "normal": (3, k), "gap": (k,), "share": (k,)}
+
+
 def zeros(shape: tuple[int, ...], like: jax.Array) -> Lanes:
     """Lanes of zeros of a finger each, like an array over the lanes."""
     count = 1
@@ -72,11 +77,11 @@ class ContactSet:
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         rows, ray = ROWS[self.scene.effects.friction]
-        fields = {name: 3 for name in ("point", "normal")} | {"gap": 1, "share": 1}
-        fields |= {"jar": rows, "step": rows, "ray": ray}
-        fields |= {"friction": 1} if self.own_friction else {}
-        fields |= {"held": 3} if self.holds else {}
-        return {f"{self.name}.{f}": (self.count, (n, self.k)) for f, n in fields.items()}
+        shapes = place_shapes(self.k)
+        shapes |= {"jar": (rows, self.k), "step": (rows, self.k), "ray": (ray, self.k)}
+        shapes |= {"friction": (1, self.k)} if self.own_friction else {}
+        shapes |= {"held": (3, self.k)} if self.holds else {}
+        return {f"{self.name}.{field}": (self.count, shape) for field, shape in shapes.items()}
 
     def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundContacts":
         """The set in a kernel's memory; `read` reads constants of the worlds by name."""
@@ -91,12 +96,12 @@ class ContactSet:
 
     @staticmethod
     def contacts(place: Place, cone: Cone) -> Contacts:
-        return Contacts(place.point, place.normal, place.gap[0], cone.of_share(place.share[0]))
+        return Contacts(place.point, place.normal, place.gap, cone.of_share(place.share))
 
     @staticmethod
     def of_line(share: jax.Array, cone: Cone) -> Contacts:
         """What a line search needs of contacts."""
-        return Contacts(share, share, share[0], cone.of_share(share[0]))
+        return Contacts(share[None], share[None], share, cone.of_share(share))
 
 
 class BoundContacts:
@@ -317,5 +322,5 @@ def begun(
     c = ContactSet.contacts(place, cone)
     speed = c.relative(velocity[:, None])
     approach = -dot(place.normal, speed)
-    share = contact.candidates(place.share[0], place.gap[0], approach, cone, margin)
-    return place._replace(share=share[None]), c.relative(motion[:, None]) - c.reference(speed)
+    share = contact.candidates(place.share, place.gap, approach, cone, margin)
+    return place._replace(share=share), c.relative(motion[:, None]) - c.reference(speed)

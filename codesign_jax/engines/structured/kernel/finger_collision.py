@@ -629,7 +629,7 @@ def _faster(most, vel, palm, origin, numbers):
 
 
 def with_axis(place: Place) -> Place:
-    return Place(*(v[:, None] for v in place[:2]), *(v[None, None] for v in place[2:]))
+    return Place(*(v[:, None] for v in place[:2]), *(v[None] for v in place[2:]))
 
 
 def _stacked(*numbers):

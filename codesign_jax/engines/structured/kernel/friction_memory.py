@@ -121,7 +121,7 @@ def _store(step: StepMemory, contacts: BoundContacts, mask: Lanes) -> None:
         new = contacts.read("held", item)
         for j in range(k):
             old = state.read(name, item * k + j)
-            state.write(name, lanewise(after, mask, share[0, j], new[:, j], old), item * k + j)
+            state.write(name, lanewise(after, mask, share[j], new[:, j], old), item * k + j)
         return x
 
     jax.lax.fori_loop(0, step.p.held[contacts.set.name] // k, store_item, jnp.int32(0))

@@ -126,7 +126,7 @@ def of_rings(
         plane = not on_object and n < scene.effects.table  # the table comes first
         surface = scene.effects.surface
         touched = touch(surface, numbers, place.frame, centre, first, again, plane=plane)
-        places.append(sdf_collision.as_kept(touched))
+        places.append(touched)
     candidates = sdf_collision.beside(places)
     candidates = candidates._replace(share=jnp.where(still["share"] > 0, candidates.share, 0.0))
     cone = _cone(scene, name, variables)
@@ -164,7 +164,7 @@ def of_table(
         return lane
 
     point, normal, gap = map(deal, _of_object(scene, variables, still))
-    used = (finger < slots - item * fingers) & (still["share"][0, 0] > 0)
+    used = (finger < slots - item * fingers) & (still["share"][0] > 0)
     cone = _cone(scene, TABLE, variables)
     if own_friction(scene, TABLE):
         which = surroundings.touched(scene, TABLE, 1)

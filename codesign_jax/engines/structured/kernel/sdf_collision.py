@@ -131,12 +131,11 @@ class SdfCollision:
         friction = self.frictions(name, contacts.set.k // len(looks))
         if self.surface == "spheres":
             places = [lanewise(ball_on_field, numbers, centre, *first) for first in seen]
-            places = [lanewise(as_kept, place) for place in places]
             return contacts.create(i, joined(places), *moves, friction=friction)
         flat = not name.endswith("_object") and self.p.scene.effects.table  # the table comes first
         most = self.closing_gap(numbers, centre, moves[1])
         near = [lanewise(may_touch, numbers, first[0], most).lane for first in seen]
-        contacts.write("share", zeros((1, contacts.set.k), self.step.like), i)
+        contacts.write("share", zeros((contacts.set.k,), self.step.like), i)
 
         def look_again() -> None:
             faced = []
@@ -148,7 +147,6 @@ class SdfCollision:
 
         def create(faced: list[Facing]) -> None:
             places = [lanewise(ring_place, numbers, frame, centre, face) for face in faced]
-            places = [lanewise(as_kept, place) for place in places]
             contacts.create(i, joined(places), *moves, friction=friction, hold=hold)
 
         any_of(total(near) > 0, look_again)
@@ -230,7 +228,7 @@ class SdfCollision:
                 for k, value in enumerate(values):
                     lane = jnp.where(self.step.block.finger == k, value.parts[c].item(), lane)
                 parts.append(lane)
-            dealt.append(lanes(parts, (len(parts), 1), wide=True))
+            dealt.append(lanes(parts, values[0].shape[:-2], wide=True))
         return dealt
 
 
@@ -243,14 +241,16 @@ def beside(places: list[Place]) -> Place:
     """The same of arrays."""
     if len(places) == 1:
         return places[0]
-    return Place(*(jnp.concatenate(v, 1) for v in zip(*places, strict=True)))
+    axes = 1, 1, 0, 0  # of the items, by field
+    fields = zip(axes, zip(*places, strict=True), strict=True)
+    return Place(*(jnp.concatenate(values, axis) for axis, values in fields))
 
 
 def slots_of(point, normal, gap):
     """Contacts of an object's points (3, point, world) as a place each."""
     ones = jnp.ones_like(gap)
     return [
-        Place(*(v[:, k : k + 1] for v in (point, normal, gap[None], ones[None])))
+        Place(point[:, k : k + 1], normal[:, k : k + 1], gap[k : k + 1], ones[k : k + 1])
         for k in range(gap.shape[0])
     ]
 
@@ -277,11 +277,6 @@ def any_closes(gap, most):
     """One where any of a link's rings has a smaller gap than `closed_gap`, else zero."""
     closes = jnp.where(gap < most, 1.0, 0.0)
     return sum(closes[k] for k in range(closes.shape[0]))
-
-
-def as_kept(place: Place) -> Place:
-    """Gaps and shares with an axis of one component, as sets keep them."""
-    return place._replace(gap=place.gap[None], share=place.share[None])
 
 
 def one_of(numbers):

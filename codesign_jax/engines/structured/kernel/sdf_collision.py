@@ -177,7 +177,7 @@ class SdfCollision:
             place = Place(*self._deal([slots[k] for k in mine]))
             friction = None
             if rubs is not None:
-                (friction,) = self._deal([(rubs[:, k : k + 1],) for k in mine])
+                (friction,) = self._deal([(rubs[:, k],) for k in mine])
             moves = self.moves("object_table", None, None)
             hold = friction_memory.of_item(self.step, on_table, i)
             on_table.create(i, place, *moves, friction=friction, hold=hold)
@@ -228,7 +228,7 @@ class SdfCollision:
                 for k, value in enumerate(values):
                     lane = jnp.where(self.step.block.finger == k, value.parts[c].item(), lane)
                 parts.append(lane)
-            dealt.append(lanes(parts, values[0].shape[:-2], wide=True))
+            dealt.append(lanes(parts, (*values[0].shape[:-2], 1), wide=True))
         return dealt
 
 

@@ -164,7 +164,7 @@ def draw(hand: Hand, case: cases.Case) -> None:
 def section(hand: Hand) -> str:
     """What the page shows and says of a hand."""
     judged = hand.design.read_text(encoding="utf-8").splitlines()
-    words = f"{hand.sentence} It {judged[0][2:]}"
+    words = f"{hand.sentence} The hand {judged[0][2:]}"
     words += " (earlier model)." if hand.earlier else "."
     if judged[1].startswith("# of heavier"):
         words += f" O{judged[1][3:]}."

@@ -20,7 +20,7 @@ from codesign_jax import rollout, use_compilation_cache
 from codesign_jax import scene as scenes
 from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.engines import make_engine
-from codesign_jax.scene import Scene, parameters, silicones
+from codesign_jax.scene import Effects, Scene, parameters, silicones
 from codesign_jax.scene.effects import EFFECTS, ENGINES, refusals
 from codesign_jax.statistics import wilson
 from codesign_jax.types import failed
@@ -135,14 +135,18 @@ def measure(everything: dict[str, Scene], path: Path, *, commit: str | None, qui
 def support_table() -> list[list[str]]:
     """What each effect means and which engines have it, in words."""
     table = [["effect", "meaning", *ENGINES]]
+    options = {f.name: f.metadata.get("options") for f in dataclasses.fields(Effects)}
     for name, effect in EFFECTS.items():
+        values = {v: v for v in options[name] or ()} or {True: "true", False: "false"}
         cells = []
         for engine in ENGINES:
             refused = effect.refused.get(engine, {})
-            words = [f"not {str(v).lower() if isinstance(v, bool) else v}" for v in refused]
             hull = "hull" in EFFECTS["surface"].refused.get(engine, {})
             idle = hull and "with the hull" in effect.meaning
-            cells.append(", ".join(words) or ("no hull" if idle else "yes"))
+            if refused:
+                cells.append("only " + ", ".join(w for v, w in values.items() if v not in refused))
+            else:
+                cells.append("no hull" if idle else "yes")
         table.append([f"`{name}`", effect.meaning, *cells])
     return table
 

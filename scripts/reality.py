@@ -168,7 +168,13 @@ class Ring(NamedTuple):
 
 def beam_rows(rings: Mapping[str, Sequence[Ring]], beam: Mapping[str, Any]) -> list[list[str]]:
     """The table of a beam's rests and swings: what was measured, then what was simulated."""
-    columns = ["drop mm", "its ratio", "period s", "its ratio", "decrement"]
+    columns = [
+        "drop mm",
+        "drop / drop without weight",
+        "period s",
+        "period / period without weight",
+        "decrement",
+    ]
     rows = [["", *columns]]
     measured_rings = [
         Ring(1e-3 * d, p, q) for d, p, q in zip(*(beam[k] for k in Ring._fields), strict=True)

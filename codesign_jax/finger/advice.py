@@ -122,10 +122,11 @@ def candidates(finger: Finger, table: Table) -> dict[str, dict[str, np.ndarray]]
         upto = f"at {ROWS} pressures up to {top / 1e3:.3g} kPa"
         add(f"the angle {upto}", "angle", pressure=steps)
         add(f"the tip force {upto}", "tip_force", pressure=steps)
-        words = f"the way that {grams} move the tip sideways, inflated to {top / 1e3:.3g} kPa"
+        words = f"the sideways displacement of the tip by {grams} at {top / 1e3:.3g} kPa"
         add(f"{words}, {ROWS} times", "sideways", pressure=top, load=weight)
     add(f"the deflection by {grams}, empty, {ROWS} times", "deflection", load=weight)
-    add(f"the way that {grams} move the tip sideways, empty, {ROWS} times", "sideways", load=weight)
+    words = f"the sideways displacement of the tip by {grams}, empty"
+    add(f"{words}, {ROWS} times", "sideways", load=weight)
     period = swing.first_period(finger, 0.0)
     times = np.linspace(0, PERIODS * period, PICTURES + 1)[1:]
     add("a release without a weight, filmed", "drop", time=times, load=0.0)

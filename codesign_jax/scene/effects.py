@@ -66,7 +66,8 @@ EFFECTS: Mapping[str, Effect] = {
     "disturb": Effect("the arm is shaken after the lift"),
     "ungrasp": Effect("the fingers release the object at the end"),
     "neo_hookean": Effect(
-        "rubber at large strain: fingers soften as they bend; default: as the hand's material",
+        "rubber at large strain: fingers soften as they bend; if not set, the bending law of the "
+        "hand's material applies",
         plain="joints have the linear bending law, with the modulus that bends walls equally",
     ),
     "lateral_threshold": Effect(

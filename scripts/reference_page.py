@@ -274,12 +274,15 @@ def _state(scene: Scene) -> str:
 def _cost() -> str:
     lines = ["## Cost formula", "Of a trial (`codesign_jax.cost.outcome`):", _text(cost.outcome)]
     lines += ["Of a particle (`codesign_jax.cost.particle_cost`):", _text(cost.particle_cost)]
-    lines += ["Of its survival (`ParticleFilter.tell`):", _text(ParticleFilter.tell)]
+    lines += [
+        "How the costs of the particles decide which survive (`ParticleFilter.tell`):",
+        _text(ParticleFilter.tell),
+    ]
     lines += [
         f"A run has converged once an episode's mean cost is below {codesign.CONVERGED_COST:g}; a "
         "particle has solved the task if its cost in the final test is below "
-        f"{codesign.SUCCESS_COST:g}; a seed particle must cost more than {codesign.SEED_COST:g} "
-        "(paper, section VI.4)."
+        f"{codesign.SUCCESS_COST:g}. A seed particle is the first candidate with a mean cost "
+        f"above {codesign.SEED_COST:g} (paper, section VI.4)."
     ]
     return "\n\n".join(lines)
 

@@ -29,8 +29,8 @@ COMMAND_COLUMNS = {
     "arm_z_mm": "height of the palm's underside above the table, if the wrist is not deflected",
     "arm_roll_deg": "orientation of X_D: turned about x by this angle, ...",
     "arm_yaw_deg": "... then about its own z, ...",
-    "arm_pitch_deg": "... then about its own y; positive points the fingers towards +x, as in "
-    "designs, control files and the build sheet, which is a left-handed turn",
+    "arm_pitch_deg": "... then about its own y; a positive angle, which is a left-handed turn, "
+    "points the fingers towards +x, as in designs, control files and the build sheet",
     "arm_qw": "the same orientation as a unit quaternion w, x, y, z, for arms that take one",
     "arm_qx": "likewise",
     "arm_qy": "likewise",

@@ -44,8 +44,8 @@ class Constant:
     """A constant and its distribution.
 
     Attributes:
-      key: Key path of a number of the scene, such as `hand.material.shear_modulus`; one that leaves
-        out an entry of a list means all of its entries.
+      key: Key path of a number of the scene, such as `hand.material.shear_modulus`. A path that
+        does not say which entry of a list, such as `hand.finger.tilt`, means all entries.
       distribution: "lognormal" and "normal" have `mean` and `sd`, "loguniform" and "uniform" `low`
         and `high`.
       change: What a draw is: the constant's "value", a "factor" on the scene's, or a "shift".

@@ -133,11 +133,12 @@ class Material:
     density and damping; without a name, or for a batch that was measured, law and modulus are given
     together.
     The two factors scale the stiffness that `morphology` derives for bending sideways and for
-    torsion: for the former the fabric's side is the neutral line, which is an upper bound; for the
-    latter walls are thin, which is a lower one.
+    torsion. The derived sideways stiffness is an upper bound: its neutral line is at the fabric's
+    side. The derived torsional stiffness is a lower bound: it assumes thin walls.
 
     Attributes:
-      silicone: Name of the silicone, see docs/measurements.md. Not given: the numbers below.
+      silicone: Name of the silicone, see docs/measurements.md. Not given: `law`,
+        `shear_modulus`, `density` and `damping_time` apply.
       law: Bending law of the walls that the modulus belongs to. Not given, without a silicone:
         `effects.neo_hookean` of the scene says it.
       shear_modulus: Shear modulus G; required without a silicone, as the next two.
@@ -244,8 +245,9 @@ class PressureLimit:
 class Valves:
     """Pressure lines, each with a regulator and a valve: fingers of one line have one pressure.
 
-    A search finds which fingers share one of so many `lines`, or the `groups` say it.  Without
-    either each finger has a line of its own.  They bound the design space, not the simulation.
+    With `lines`, a search finds which fingers share a line; with `groups`, the file says it.
+    Without either key each finger has a line of its own.  The keys bound the design space, not the
+    simulation.
 
     Attributes:
       lines: Number of lines, at most that of the fingers; instead of `groups`.

@@ -104,7 +104,8 @@ class ControlFile:
     Attributes:
       name: Name of the control, as in results.
       description: What the control is, in a line.
-      group: Fingers by the name of a group, counted from 0, for pressures.
+      group: Names of groups of fingers, to which a `pressure` may refer. Fingers are counted from
+        0.
     """
 
     name: str

@@ -106,9 +106,9 @@ class _ShapeFile:
         `"stable:2"` for the second of them.
       mass: Mass; or give `density` instead.
       density: Density.
-      inertia: Inertia about the centre of mass in the axes of its file: xx, yy and zz, of a mesh
-        and with a centre of mass also xy, xz and yz; goes with a mass. Not given: that of a
-        homogeneous body about its centre.
+      inertia: Inertia about the centre of mass in the axes of its file: xx, yy and zz. For a mesh,
+        or if `centre_of_mass` is given, xy, xz and yz may follow. It needs `mass`. Not given: that
+        of a homogeneous body about its centre.
       centre_of_mass: Centre of mass in the frame of its file; for a primitive, from its centre, and
         the primitive is then simulated as a mesh. Not given: that of a homogeneous body.
       file: Mesh file, beside the object file if the path is relative.

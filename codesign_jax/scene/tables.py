@@ -86,8 +86,8 @@ class Fixture:
 class Phases:
     """End times of the phases of one grasp (paper Fig. 3) [s], from the end of the settling.
 
-    Each phase ends later than the one before it.  The number of time steps is structure: the end of
-    the last phase is no leaf of a scene.
+    Each phase ends later than the one before it.  The number of time steps belongs to the structure
+    of a scene: another end of the last phase needs a new compilation.
 
     Attributes:
       approach: End of the approach: the arm is at the grasp's height.
@@ -119,8 +119,8 @@ class Arm:
     Attributes:
       start_height: Height of the arm frame above the table at the start and after the lift.
       zero_height: Height of the arm frame above the table at which the parameter `arm_z` is zero.
-      shake_frequency: Frequency of the disturbance, whose whole periods alternate between roll and
-        pitch.
+      shake_frequency: Frequency of the disturbance. Its periods alternate: one turns the arm by
+        roll, the next by pitch.
       shake_amplitude: Amplitude of the disturbance at its end, to which it grows linearly.
     """
 
@@ -138,8 +138,8 @@ class Cost:
     Attributes:
       maximum: Cost of a trial that loses its object at the start of the lift, and the cost that
         tables show for a failed trial; a kept object costs 0.
-      lost_distance: Distance between the centres of object and hand from which on the object is
-        lost.
+      lost_distance: The object is lost if the centres of object and hand are at least this far
+        apart.
       failure: How a failed trial counts in its particle's mean cost: "exclude" leaves it out (the
         paper's rule), "worst" counts it with `maximum`.
     """
@@ -154,8 +154,9 @@ class Cost:
 class Contact:
     """Contact of the rubber skin; see docs/hull.md.
 
-    A contact of normal force N resists spin with `torsional_friction` N and rolling with
-    `rolling_friction` N, both lengths as in MuJoCo, if the effect `friction` is "full".
+    If the effect `friction` is "full", a contact with the normal force F resists spin with moments
+    up to `torsional_friction` * F, and rolling with moments up to `rolling_friction` * F. Both
+    numbers are lengths, as in MuJoCo.
 
     Attributes:
       normal_stiffness: Normal stiffness of a square of skin as wide as the finger, and of a contact
@@ -239,8 +240,8 @@ class Discretization:
 class Solver:
     """MuJoCo's options of its contact solver, which the engines `mujoco` and `mjx` read.
 
-    The engine `structured` measures convergence otherwise, see `Newton`, and refuses other values
-    than those of an accuracy where `[newton]` is not set as well.
+    The engine `structured` measures convergence otherwise, see `Newton`. If the values are not
+    those of an accuracy, it requires that `[newton]` is set as well.
 
     Attributes:
       iterations: Largest number of Newton iterations.
@@ -261,8 +262,8 @@ class Newton:
 
     Attributes:
       iterations: Largest number of Newton iterations of a step.
-      evaluations: Largest number of line-search evaluations of an iteration; where no kernel runs
-        a line search has at most six.
+      evaluations: Largest number of line-search evaluations of an iteration. Without a kernel, a
+        line search has at most six evaluations.
       decrement: Relative Newton decrement at which a world has converged, a share of the cost's
         scale. A step that ends above it has stopped at the limit of iterations.
       residual: A step that ends at the limit of iterations with a residual (root of its decrement)

@@ -299,7 +299,8 @@ def details(study: Study) -> str:
         f"{name}: {study.plan['runs']} runs a strategy, {study.episodes} of "
         f"{study.plan['episodes']} episodes; intervals of 95 %",
         "",
-        "| strategy | success | failed trials at the maximum | mean cost stays below 1 "
+        "| strategy | success | success with failed trials at the maximum cost "
+        "| mean cost stays below 1 "
         "| simulations until then: median [quartiles] | until it first is below 1 | failed trials "
         "| trials in which the solver met its limit |",
         "|---|---|---|---|---|---|---|---|",

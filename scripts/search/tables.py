@@ -28,7 +28,7 @@ def order(row: dict[str, Any]) -> tuple:
 def table(rows: list[dict[str, Any]]) -> str:
     """A row for each optimiser: what its recommended designs keep at its last mark."""
     head = "optimiser|preset|hand|objects|seeds|grasps of a seed|median kept|"
-    head += "kept share that 5 % of the seeds miss|"
+    head += "kept share, 5th percentile of the seeds|"
     head += "share of seeds that keep 95 % (95 % interval)|commit"
     table_rows = [head.split("|")]
     for row in sorted(rows, key=order):

@@ -69,7 +69,7 @@ test-gpu: $(STAMP)
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -q -m "slow and not gpu" -n 2 --dist loadfile --durations=10
 
-# All hard cases; their margins go to docs/notes/stability.md. About four minutes on two cores.
+# All hard cases; their margins go to docs/notes/stability.md.
 stability: $(STAMP)
 	$(BIN)/python -m pytest -q tests/stability -m stability --stability-table docs $(ARGS)
 

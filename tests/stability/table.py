@@ -145,13 +145,16 @@ def write(docs: Path, new: list[dict[str, Any]], commit: str | None = None) -> N
     path = docs / "data" / "stability.json"
     page = docs / "notes" / "stability.md"
     old = json.loads(path.read_text())["rows"] if path.exists() else []
-    rows = current(old)
+    rows = {(r["name"], r["step"], r["precision"]): r for r in old}
     for row in new:
         # JSON has no infinite numbers.
         plain = {k: None if v in (math.inf, -math.inf) else v for k, v in row.items()}
         plain |= {"commit": made, "kernel": provenance.KERNEL, **made_with}
         rows[row["name"], row["step"], row["precision"]] = plain
-    kept = sorted(rows.values(), key=lambda r: (r["case"], r["name"], r["precision"], -r["step"]))
+    kept = sorted(
+        current(list(rows.values())).values(),
+        key=lambda r: (r["case"], r["name"], r["precision"], -r["step"]),
+    )
     data = {"command": "make stability", "rows": kept}
     path.write_text(json.dumps(data, indent=1) + "\n")
     head, tail = page.read_text().split("<!-- table:begin -->")

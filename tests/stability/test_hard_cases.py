@@ -4,6 +4,8 @@ The quick variants run with `make test`; all of them with `make stability`, whic
 docs/notes/stability.md.
 """
 
+import json
+
 import pytest
 
 from tests.stability import (  # noqa: F401  (they register their cases)
@@ -35,3 +37,24 @@ def test_hard_case(case, variant, rows):
     text = f"{row['measured']:.4g} {row['unit']} against {row['bound']:.4g}: {row['note']}"
     # A case that passes again loses the cause of its failure.
     assert row["passed"] == (not row["failure"]), text
+
+
+def test_a_run_replaces_its_rows_and_drops_those_of_no_case(tmp_path):
+    (tmp_path / "data").mkdir()
+    (tmp_path / "notes").mkdir()
+    page = tmp_path / "notes" / "stability.md"
+    page.write_text("before\n<!-- table:begin --><!-- table:end -->\nafter\n")
+    kept = {"case": 14, "name": "spawned-mujoco", "step": 0.5, "precision": "float64"}
+    names = {"title": "t", "invariant": "i", "engine": "mujoco", "lower": False, "unit": "m/s"}
+    kept |= names | {"measured": 0.5, "bound": 1.0, "margin": 2.0, "note": "", "passed": True}
+    renewed = kept | {"step": 1.0}
+    obsolete = kept | {"name": "no_case"}
+    table.write(tmp_path, [kept, renewed, obsolete], "aaaaaaa")
+    table.write(tmp_path, [renewed | {"measured": 0.25, "margin": 4.0}], "bbbbbbb")
+    rows = json.loads((tmp_path / "data" / "stability.json").read_text())["rows"]
+    assert [(r["name"], r["commit"], r["measured"]) for r in rows] == [
+        ("spawned-mujoco", "bbbbbbb", 0.25),
+        ("spawned-mujoco", "aaaaaaa", 0.5),
+    ]
+    assert "0.25; 0.5 (h; h/2) m/s" in page.read_text()
+    assert page.read_text().startswith("before") and page.read_text().endswith("after\n")

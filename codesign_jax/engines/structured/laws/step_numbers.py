@@ -20,7 +20,8 @@ class StepNumber(NamedTuple):
     on: Callable[[Any], bool]  # Whether a scene with these effects has it
     shape: tuple[int, ...] = ()
     # Force at a body's centre of mass, (3, ...), of the number and the body's mass; None of numbers
-    # that `Body.smooth_force` takes
+    # that `Body.smooth_force` takes. A hand of three fingers has a fourth without mass in its
+    # lanes (model/held.py): the force must be zero where the mass is.
     force: Callable[[jax.Array, jax.Array], jax.Array] | None = None
     bodies: tuple[str, ...] = ()  # On which it acts: "palm", "object", "link"
 

@@ -22,7 +22,6 @@ from codesign_jax.runs import scene_files
 from codesign_jax.scene import InputError, library, meshes, objects, parameters, schema
 from codesign_jax.scene.meshes import grid, reading, surface
 from scripts import faults
-from scripts.faults import shim  # noqa: F401  (a fixture)
 from tests.helpers import oracles
 from tests.helpers.grasps import batch_inputs, hurried, nth, pinch, stack, still
 from tests.helpers.solids import box, bracket, object_file

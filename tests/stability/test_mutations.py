@@ -27,7 +27,7 @@ class Fault(NamedTuple):
 FAULTS = {
     "spring sign": Fault(
         "model/spec.py",
-        (("stiffness=stiffness", "stiffness=-stiffness"),),
+        (('{"stiffness": stiffness', '{"stiffness": -stiffness'),),
         "tests/test_beam_oracles.py::test_small_load_cantilever",
     ),
     "friction": Fault(

@@ -167,7 +167,7 @@ def section(hand: Hand) -> str:
     words = f"{hand.sentence} The hand {judged[0][2:]}"
     words += " (earlier model)." if hand.earlier else "."
     if judged[1].startswith("# of heavier"):
-        words += f" O{judged[1][3:]}."
+        words += f" Of {judged[1].removeprefix('# of ')}."
     picture = f"![{hand.name}: {hand.sentence}](gallery/{hand.name}.webp)"
     command = f"```\n{hand.command}\n```"
     design = f"[Design](gallery/{hand.name}.toml)"

@@ -1,6 +1,6 @@
-"""Figures of the documentation that no study draws: turns of the arm, parts to print, the studio.
+"""Figures of the documentation that no study draws: the arm, film strips, parts, the studio.
 
-    python -m scripts.page_figures [axes] [parts] [studio]
+    python -m scripts.page_figures [axes] [strategies] [parts] [studio]
 
 All of them without a name.  The studio's needs Chromium and playwright.
 """
@@ -22,6 +22,7 @@ from codesign_jax.export import casting, meshes, palm, posture, process, sheet
 from codesign_jax.report import painter
 from codesign_jax.report.bodies import Part
 from codesign_jax.report.replay import Camera
+from scripts import gallery
 
 DOCS = Path(__file__).parents[1] / "docs"
 FIGURES = DOCS / "figures"
@@ -32,6 +33,8 @@ CORE = (0.93, 0.72, 0.40)
 DARK = (0.42, 0.44, 0.49)
 VIEW = "{ azimuth: 1.9, elevation: 0.25, distance: 0.45, target: [0.02, -0.02, 0.27] }"
 """The studio's camera, as web/replay.js has it."""
+STRIP = (0.0, 2.0, 2.7, 3.5, 4.5, 7.9, 8.9)
+"""Times of the pictures of a film strip [s]."""
 
 
 def axes() -> None:
@@ -49,6 +52,20 @@ def axes() -> None:
         posture.draw(panel, fingers, (1e3 * disc.radius, 1e3 * disc.thickness), angles, words)
         panel.title.set_fontsize(8)
     figure.savefig(FIGURES / "axes.png", dpi=110)
+
+
+def strategies() -> None:
+    """Film strips of the gallery's three further strategies, one below the other."""
+    strips = []
+    for name in ("two_stage", "push_close", "slide"):
+        with Image.open(DOCS / "gallery" / f"{name}.webp") as film:
+            pictures = []
+            for time in STRIP:
+                film.seek(round(time * gallery.RATE))
+                pictures.append(np.asarray(film.convert("RGB")))
+        strips.append(np.hstack(pictures))
+    size = 1400, 600
+    Image.fromarray(np.vstack(strips)).resize(size).save(FIGURES / "strategies.png", optimize=True)
 
 
 def parts() -> None:
@@ -130,7 +147,12 @@ def _page(address: str):
         browser.close()
 
 
-FUNCTIONS: dict[str, Callable[[], None]] = {"axes": axes, "parts": parts, "studio": studio}
+FUNCTIONS: dict[str, Callable[[], None]] = {
+    "axes": axes,
+    "strategies": strategies,
+    "parts": parts,
+    "studio": studio,
+}
 
 if __name__ == "__main__":
     for chosen in sys.argv[1:] or FUNCTIONS:

@@ -17,7 +17,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from codesign_jax import scene as scenes
@@ -40,13 +39,14 @@ def main() -> int:
     start = time.monotonic()
     studies = make_studies(worlds, args)
     for arm, study in studies.items():
-        while not study.finished:
-            study.step()
-            study.save()  # the next command goes on here, whatever ends this one
+
+        def progress(_: int, arm: str = arm, study: lock_step.Study = study) -> None:
             seconds = time.monotonic() - start
             print(f"{arm}: episode {study.done}/{study.marks[-1]}, {seconds:.0f} s", flush=True)
-    kept = {words: judged(studies, arm, worlds) for words, arm in ARMS.items()}
-    rows, differences = compared(kept)
+
+        study.run(progress)
+    kept = {words: judge_designs(studies, arm, worlds) for words, arm in ARMS.items()}
+    rows, differences = compare(kept)
     text = output.markdown(rows)
     print(text)
     grasps = studies["drawn"].row()["grasps"][-1]
@@ -114,7 +114,6 @@ def make_studies(worlds: dict[str, Scene], args: argparse.Namespace) -> dict[str
             budget=args.budget,
             tests=args.grasps,
             marks=1,
-            chunk=512 if jax.default_backend() == "cpu" else 16_384,
             path=args.out / f"{name}-{arm}.npz",
         )
     # One program simulates both: its numbers are those of the scene that it gets.
@@ -122,7 +121,7 @@ def make_studies(worlds: dict[str, Scene], args: argparse.Namespace) -> dict[str
     return studies
 
 
-def judged(
+def judge_designs(
     studies: dict[str, lock_step.Study], arm: str, worlds: dict[str, Scene]
 ) -> dict[str, list[float]]:
     """Share of grasps that the design of each seed keeps in each scene, in the same trials."""
@@ -136,7 +135,7 @@ def judged(
     return kept
 
 
-def compared(kept: dict[str, dict[str, list[float]]]) -> tuple[list[list[str]], np.ndarray]:
+def compare(kept: dict[str, dict[str, list[float]]]) -> tuple[list[list[str]], np.ndarray]:
     """The table, and the paired differences of the shares with drawn constants [%]."""
     rows = [["searched", "kept with drawn constants %", "the worst seed %", "kept in the middle %"]]
     for words, shares in kept.items():

@@ -211,7 +211,7 @@ def test_pairs_of_designs_are_compared_by_seed():
         "under": {"drawn": [0.9, 0.8, 1.0], "middle": [0.9, 0.9, 0.9]},
         "at": {"drawn": [0.8, 0.7, 0.9], "middle": [0.9, 0.9, 0.9]},
     }
-    rows, differences = uncertainty.compared(kept)
+    rows, differences = uncertainty.compare(kept)
     np.testing.assert_allclose(differences, 10)
     assert rows[1] == ["under", "90.0", "80", "90.0"]
     assert rows[3] == ["difference, 3 pairs", "+10.0 (+10.0 to +10.0)", "", "+0.0 (+0.0 to +0.0)"]

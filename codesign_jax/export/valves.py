@@ -8,6 +8,7 @@ import numpy as np
 from codesign_jax.export.tables import write_table
 from codesign_jax.model import morphology
 from codesign_jax.scene import InputError, Scene, key_frames
+from codesign_jax.scene.hand_tables import partition
 from codesign_jax.types import Params
 
 VALVES = "valves.csv"
@@ -58,9 +59,7 @@ def lines(scene: Scene, params: Params) -> list[tuple[int, ...]]:
             words = f"the design needs {len(groups)} pressure lines, and the hand has valves.lines"
             raise InputError([f"{words} = {most}"])
         return groups
-    shared = valves.known(count)
-    others = {*range(count)} - {k for group in shared for k in group}
-    return sorted([*shared, *((k,) for k in others)], key=min)
+    return partition(valves.known(count), count)
 
 
 def name_of(line: int, fingers: Sequence[int]) -> str:

@@ -241,6 +241,15 @@ class PressureLimit:
         return self.per_wall * wall
 
 
+def partition(groups: tuple[tuple[int, ...], ...], count: int) -> list[tuple[int, ...]]:
+    """Groups among `count` values, and every other value as a group of its own.
+
+    The groups are ordered by their first members.
+    """
+    others = {*range(count)} - {k for group in groups for k in group}
+    return sorted([*groups, *((k,) for k in others)], key=min)
+
+
 @dataclasses.dataclass(frozen=True)
 class Valves:
     """Pressure lines, each with a regulator and a valve: fingers of one line have one pressure.
@@ -323,9 +332,7 @@ class Free:
         """Groups of tied values among `count`, ordered by their first members."""
         if self.tied is True:
             return [tuple(range(count))]
-        groups = () if self.tied is False else self.tied
-        others = {*range(count)} - {k for group in groups for k in group}
-        return sorted([*groups, *((k,) for k in others)], key=min)
+        return partition(() if self.tied is False else self.tied, count)
 
     def joined(self, groups: tuple[tuple[int, ...], ...], count: int) -> "Free":
         """The parameter where further groups among `count` values are tied."""

@@ -181,9 +181,9 @@ def table(rows: list[tuple[Row, dict[str, Interval]]]) -> str:
     """The measures of every row, in Markdown."""
     cells = [["chosen by", "verdicts that flip", "rank correlation", "regret, points"]]
     for row, intervals in rows:
-        told = [interval(intervals["flipped"]), interval(intervals["rank"], ".2f")]
+        measures = [interval(intervals["flipped"]), interval(intervals["rank"], ".2f")]
         regret = points(intervals["regret"])
-        cells.append([row.words, *told, "–" if row.variant == TRUTH else regret])
+        cells.append([row.words, *measures, "–" if row.variant == TRUTH else regret])
     return output.markdown(cells)
 
 

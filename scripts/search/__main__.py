@@ -20,7 +20,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from codesign_jax import optimize, use_compilation_cache
@@ -86,19 +85,21 @@ def search(args: argparse.Namespace, name: str) -> None:
     if len(stem) > LONGEST_STEM:
         stem = f"{stem[:LONGEST_STEM]}-{zlib.crc32(stem.encode()):08x}"
     arguments = {n: getattr(args, n) for n in ("seeds", "budget", "tests", "marks", "at")}
-    arguments["chunk"] = 512 if jax.default_backend() == "cpu" else 16_384
     study = Study(case, scene, engine, space, **arguments, path=args.out / f"{stem}.npz")
     row = {"preset": args.preset, "scene": args.scene, "hand": args.hand, "objects": args.objects}
     row["changes"] = changed
     row |= {"tests": args.tests, "optimizer": name}
     grasps = 0
     start = time.monotonic()
-    while not study.finished and args.designs is None:
-        grasps += study.step()
-        study.save()  # the next command goes on here, whatever ends this one
+
+    def progress(more: int) -> None:
+        nonlocal grasps
+        grasps += more
         rate = grasps / (time.monotonic() - start)
         print(f"{name}: episode {study.done}/{study.marks[-1]}, {rate:.0f} grasps/s", flush=True)
+
     if args.designs is None:
+        study.run(progress)
         row |= study.row()
     if args.masses:
         designs = work.winners(args.designs or study.path)[: args.seeds]

@@ -199,7 +199,7 @@ def main() -> int:
     scene = scenes.load("paper")
     space = design_space(scene.hand, args.preset)
     case = make_case(f"random:particles={args.particles},trials=3", space, args.preset)
-    sizes = {"seeds": args.seeds, "budget": args.budget, "tests": args.tests, "chunk": 512}
+    sizes = {"seeds": args.seeds, "budget": args.budget, "tests": args.tests}
     path = args.out / f"{args.preset}-turbo.npz"
     study = Study(case, scene, make_engine("structured", scene), space, **sizes, path=path)
     searches = Searches(study, args.workers)

@@ -1,7 +1,7 @@
 """The episodes of an optimiser over many seeds, and what its recommended designs keep."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import codesign, optimize, rollout, runs
-from codesign_jax.batch import in_chunks
+from codesign_jax.batch import LIMIT, WORLDS, in_chunks
 from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
@@ -92,7 +92,6 @@ class Study:
         tests: int,
         marks: int = 9,
         at: Sequence[int] = (),
-        chunk: int,
         path: Path,
     ):
         self.case = case
@@ -100,13 +99,13 @@ class Study:
         self.engine = engine
         self.space = space
         self.tests = tests
-        self.chunk = chunk
         self.path = path
         self.keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
         self.mask = jnp.ones(space.num_parameters, bool)
         objects = len(scene.objects.object)
         self.rounds = -(-case.tests // objects) * objects
-        self.batch = min(chunk, seeds * case.worlds)
+        most = WORLDS.get(jax.default_backend(), LIMIT)
+        self.batch = min(most, seeds * case.worlds)
         self.simulate = SceneProgram(scene, jax.jit(self._simulate))
         task = codesign.Task(scene, space, case.trials, engine)
         self.episode = task.side_by_side(case.optimizer)
@@ -142,6 +141,16 @@ class Study:
     @property
     def finished(self) -> bool:
         return len(self.kept) == len(self.marks)
+
+    def run(self, progress: Callable[[int], None]) -> None:
+        """Goes on to the last mark, and calls progress(grasps) after every step.
+
+        Every step is saved, so that a later call goes on behind it, whatever ends this one.
+        """
+        while not self.finished:
+            grasps = self.step()
+            self.save()
+            progress(grasps)
 
     def step(self) -> int:
         """Simulates an episode, or judges the designs of a mark; returns its grasps."""

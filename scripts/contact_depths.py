@@ -15,7 +15,6 @@ import argparse
 import json
 import multiprocessing
 import os
-import shlex
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -26,14 +25,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from codesign_jax import files, model, provenance, rollout, types
+from codesign_jax import files, model, rollout, types
 from codesign_jax import scene as scenes
 from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.engines import make_engine
 from codesign_jax.model.layout import PALM_FROM, beyond_base
 from codesign_jax.scene import InputError, Scene, keypaths, parameters
 from codesign_jax.scene.primitives import PRIMITIVES
-from scripts.shared import work
+from scripts.shared import provenance, work
 
 # sections a link; the cap's length in links, that of one section
 STATIONS = 4
@@ -362,8 +361,7 @@ def main() -> None:
     scene = scenes.load("paper", overrides=keypaths.parse(args.set))
     designs = np.stack([v for path in args.files for v in designs_of(path)[: args.count]])
     rows = grasps(scene, designs, args)
-    notes = {"command": shlex.join(["python", "-m", "scripts.contact_depths", *sys.argv[1:]])}
-    notes |= {**provenance.git_state(args.commit), **provenance.environment()}
+    notes = provenance.results(args.commit)
     content = [{"vector": v.tolist()} for v in designs]
     for row in rows:
         content[row["design"]].setdefault("grasps", []).append(row)

@@ -164,9 +164,8 @@ def commits(text):
 
 
 BEFORE = {
-    "budget.json": ("docs/accuracy.md", "docs/notes/accuracy.md"),
-    "contact_depths.json": ("docs/hull.md",),
-    "experiments": ("docs/results.md", "docs/notes/results.md"),
+    "experiments/23d.json": ("docs/results.md", "docs/notes/results.md"),
+    "experiments/fresh.json": ("docs/results.md", "docs/notes/results.md"),
 }
 """Files or folders of docs/data with what was measured with another kernel; pages that show it."""
 

@@ -64,7 +64,7 @@ CHANGES = (
     Change("fingers creep on one another", "standard", "fingers creep", MODELS),
     Change("pressure resists sideways bending", "standard", "lateral threshold", MODELS),
     Change("a mass of air in each chamber", "standard", "air mass", MODELS),
-    Change("the other bending law", "standard", "linear law", MODELS),
+    Change("the linear bending law", "standard", "linear law", MODELS),
     Change("spheres in place of the hull", "standard", "spheres", MODELS),
     Change("fingers pass one another", "standard", "fingers pass each other", MODELS),
     Change("fingers pass the palm", "standard", "fingers pass the palm", MODELS),
@@ -121,10 +121,15 @@ class Budget:
             self._compared[of, to] = compare(self.costs[of], self.costs[to])
         return self._compared[of, to]
 
+    @property
+    def machines(self) -> list[str]:
+        """Machines whose rates were measured, in the order of the columns."""
+        return [machine for machine in RATED if machine in self.rates]
+
     def row(self, name: str, words: str) -> list[str]:
         beside = self.compared(name, "truth")
         repeated = self.compared(name, f"{name}, moved")
-        rates = [self.rates.get(machine, {}).get(name) for machine in RATED]
+        rates = [self.rates[machine].get(name) for machine in self.machines]
         cells = [words, *["–"] * 5]
         if beside:
             cells[1] = points(beside["success_difference"])
@@ -159,10 +164,10 @@ def presets_table(results: Budget) -> list[list[str]]:
     head = ["setting", "kept share, points from the truth", "verdicts that flip"]
     head += ["rank correlation", "verdicts that flip if the object moves by a micrometre"]
     head += ["error of the finger tip in the air"]
-    rows = [[*head, *(f"grasps/s, {m}" for m in RATED.values())]]
+    rows = [[*head, *(f"grasps/s, {RATED[m]}" for m in results.machines)]]
     rows += [results.row(name, f"`{name}`") for name in PRESETS]
     rows += [results.row(n, words) for n, words in CANDIDATES.items() if n in results.costs]
-    return rows if results.rates else [row[: -len(RATED)] for row in rows]
+    return rows
 
 
 def budget_table(results: Budget) -> list[list[str]]:

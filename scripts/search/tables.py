@@ -71,9 +71,8 @@ def lines_table(rows: list[dict[str, Any]]) -> str:
 
     Empty without such a search.
     """
-    usual = (LIMITED, None, DEFAULT)
-    rows = [r for r in rows if (r["preset"], r.get("objects"), r.get("optimizer")) == usual]
-    rows = [row for row in rows if "kept" in row]
+    usual = {"preset": LIMITED, "hand": None, "objects": None, "optimizer": DEFAULT}
+    rows = [row for row in rows if usual.items() <= row.items() and "kept" in row]
     shared = [row for row in rows if "".join(row["changes"]).startswith(LINES)]
     if not shared:
         return ""

@@ -24,19 +24,26 @@ from codesign_jax.scene.schema import InputError, nearest
 UNITS = {
     "Pa": ("pressure", 1.0),
     "kPa": ("pressure", 1e3),
+    "MPa": ("pressure", 1e6),
+    "mbar": ("pressure", 1e2),
     "bar": ("pressure", 1e5),
     "psi": ("pressure", 6894.757293168),
     "deg": ("angle", math.pi / 180),
     "rad": ("angle", 1.0),
     "mN": ("force", 1e-3),
     "N": ("force", 1.0),
+    "g": ("force", 9.80665e-3),
+    "kg": ("force", 9.80665),
     "mm": ("length", 1e-3),
     "cm": ("length", 1e-2),
     "m": ("length", 1.0),
     "s": ("time", 1.0),
     "ms": ("time", 1e-3),
 }
-"""Units of a column: what they measure, and how many SI units they are."""
+"""Units of a column: what they measure, and how many SI units they are.
+
+A mass stands for its weight under standard gravity, 9.80665 m/s^2.
+"""
 
 COLUMNS = {
     "pressure": ("pressure", "gauge pressure of the chamber; 0 where a file has no such column"),
@@ -66,6 +73,8 @@ MOST_CHARACTERS = 1_000_000
 """Largest size of a file."""
 _SEPARATORS = (";", "\t", ",")
 """What stands between cells; the first of them that the head has."""
+_HEAD = re.compile(r"(?P<name>.*?)[\s_]*[\[(](?P<unit>[^\])]*)[\])]")
+"""A name with its unit in brackets."""
 _EXCEL = re.compile(r"sep=(.)\s*")
 """A first line that names the separator."""
 
@@ -74,8 +83,9 @@ def read(path: Path) -> dict[str, np.ndarray]:
     """Reads measurements.
 
     Cells are separated by commas, or by semicolons or tabs as spreadsheets write them, beside which
-    a decimal sign may be a comma.  Lines that begin with # are comments.  A cell without a value
-    leaves that quantity out of its row.
+    a decimal sign may be a comma.  The unit of a column stands behind its name, after an underscore
+    or in brackets.  Lines that begin with # are comments.  A cell without a value leaves that
+    quantity out of its row.
 
     Returns:
       Columns of `COLUMNS` that the file has [SI units], shape (row,); NaN for an empty cell.
@@ -92,11 +102,15 @@ def read(path: Path) -> dict[str, np.ndarray]:
     problems: list[str] = []
     head, rows = _rows(lines, separator, problems)
     names, factors = _columns(head, problems)
-    values = [
-        [_cell(c, separator, f"line {n}, {h}", problems) for c, h in zip(row, head, strict=True)]
-        for n, row in rows
-    ]
     table: dict[str, np.ndarray] = {}
+    if not problems:
+        values = [
+            [
+                _cell(c, separator, f"line {n}, {h}", problems)
+                for h, c in zip(head, row, strict=True)
+            ]
+            for n, row in rows
+        ]
     if not problems:
         columns = np.array(values).reshape(-1, len(names)).T * np.array(factors)[:, None]
         table = dict(zip(names, columns, strict=True))
@@ -112,7 +126,7 @@ def _lines(path: Path) -> list[tuple[int, str]]:
         with path.open(newline="", encoding="utf-8-sig") as file:
             text = file.read(MOST_CHARACTERS + 1)
     except (OSError, UnicodeDecodeError) as error:
-        why = getattr(error, "strerror", None) or "no UTF-8 text"
+        why = getattr(error, "strerror", None) or "no UTF-8 text; save it as CSV UTF-8"
         raise InputError([f"{path}: {why}"]) from error
     if len(text) > MOST_CHARACTERS:
         raise InputError([f"{path} has more than {MOST_CHARACTERS:,} characters"])
@@ -139,8 +153,10 @@ def _rows(
         except (csv.Error, ValueError) as error:
             problems.append(f"line {number} is no row of cells: {error}")
             continue
-        rows.append((number, [cell.strip() for cell in cells]))
-    if problems:
+        stripped = [cell.strip() for cell in cells]
+        if any(stripped):  # a spreadsheet writes its empty rows as well
+            rows.append((number, stripped))
+    if problems or not rows:
         return [], []
     (_, head), *rows = rows
     # A spreadsheet writes its empty columns as well.
@@ -163,9 +179,9 @@ def _columns(head: list[str], problems: list[str]) -> tuple[list[str], list[floa
     names = []
     factors = []
     for column in head:
-        name, _, unit = column.rpartition("_")
+        name, unit = _name_and_unit(column)
         if name not in COLUMNS:
-            problems.append(f"column {column!r} is not valid; {_valid(column)}")
+            problems.append(f"column {column!r} is not valid: {_valid(column, name)}")
             continue
         kind = COLUMNS[name][0]
         units = [u for u, (k, _) in UNITS.items() if k == kind]
@@ -179,17 +195,24 @@ def _columns(head: list[str], problems: list[str]) -> tuple[list[str], list[floa
     return names, factors
 
 
-def _valid(column: str) -> str:
+def _name_and_unit(column: str) -> tuple[str, str]:
+    """Of `tip_force_N` as well as of `Tip force [N]`."""
+    if parts := _HEAD.fullmatch(column):
+        name = parts["name"]
+        unit = parts["unit"].strip().replace("\N{DEGREE SIGN}", "deg")
+    else:
+        name, _, unit = column.rpartition("_")
+    return "_".join(name.lower().split()), unit
+
+
+def _valid(column: str, name: str) -> str:
     """What a column could be instead."""
-    known = [
-        f"{name}_{unit}"
-        for name, (kind, _) in COLUMNS.items()
-        for unit, (measures, _) in UNITS.items()
-        if measures == kind
-    ]
-    if any(name in column for name in known):
-        return "columns are separated by commas, semicolons or tabs"
-    return nearest(column, known)
+    if any(known in column.lower() for known in COLUMNS):
+        return (
+            "a column is a quantity and its unit, such as pressure_kPa; columns are separated by "
+            "commas, semicolons or tabs"
+        )
+    return f"no quantity {name!r}; {nearest(name, COLUMNS)}"
 
 
 def _cell(text: str, separator: str, where: str, problems: list[str]) -> float:
@@ -203,7 +226,7 @@ def _cell(text: str, separator: str, where: str, problems: list[str]) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        problems.append(f"{where} = {texts.shown(text)} must be a number")
+        problems.append(f"{where} = {texts.shown(text)} must be a number, or empty")
     return value
 
 

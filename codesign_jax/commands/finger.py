@@ -188,7 +188,8 @@ def _of_fit(fit: Posterior, mine: Finger) -> list[str]:
         number = f"{value[name] / size:.4g} {unit}".rstrip()
         doubt = "" if identified[name] else "; hardly told by these measurements"
         lines.append(f"fitted: {label} = {number}, {_error(fit, name)}{doubt}")
-    if {"shear_modulus", "moment_factor"} <= set(fit.names) and not identified["moment_factor"]:
+    bends = {"angle", "tip_x", "tip_y"} & set(fit.noise)
+    if bends and not identified["moment_factor"]:
         lines.append(
             "angles alone give the ratio of modulus and moment, here with a standard error of "
             f"{100 * fit.ratio_sd:.2g} %; a column tip_force or blocked_force tells them apart"

@@ -2,10 +2,10 @@
 
 The most likely constants, in their logarithms, are those of least squares over measured values and
 priors.  Their posterior is Laplace's: the Gaussian whose precision is the Gauss-Newton matrix of
-those squares.  The noise of a column is estimated from its residuals, and is taken as larger by as
-much as Student's 90 % interval is wider than the Gaussian's.  Residuals of one release follow one
-another closely; by their correlation r between neighbours n of them count as n (1 - r) / (1 + r),
-as those of a first-order process do.
+those squares.  The noise of a column is estimated from its own residuals, and is taken as larger by
+as much as Student's 90 % interval is wider than the Gaussian's.  Residuals of one release follow
+one another closely; by their correlation r between neighbours n of them count as
+n (1 - r) / (1 + r), as those of a first-order process do.
 """
 
 import functools
@@ -36,10 +36,19 @@ ROUNDS = 3
 """Gauss-Newton steps, each with the noise that the last one left."""
 STEP = 1e-4
 """Step of logarithms in differences."""
+_FAR = 1.0
+"""Largest step of a logarithm: least squares begin so near that a larger one tells of no valley."""
+_OFFSET = 0.25
+"""Share of a column's largest value that noise does not reach at rest [chosen]."""
 _EXACT = 1e-7
 """Least noise relative to a column's size."""
-_FEW = 4.0
-"""Degrees of freedom below which a column's noise is joined with that of all."""
+_FEW = 1.0
+"""Degrees of freedom below which a column's noise is joined with that of the other columns.
+
+Of one degree Student's interval is 3.8 times as wide as the Gaussian's, so that it holds also where
+relative noises differ by a factor of two or three.  More degrees of other columns would make the
+interval of a noisier one too narrow.
+"""
 _HALF = 1.6448536
 """Half of the Gaussian's 90 % interval."""
 
@@ -98,17 +107,20 @@ def fit(finger: Finger, table: Table) -> Posterior:
       ValueError: If the measurement does not give them, its signs are not the model's, or the
         finger has no rest where something was measured.
     """
-    columns = [n for n in MEASURED if n in table and np.isfinite(table[n]).any()]
-    refuse_values(finger, table, columns)
+    refuse_values(finger, table, _measured(table))
+    table = telling(table)
+    columns = _measured(table)
     problem = _Problem(finger, table, columns)
     logs = problem.solved(problem.start())
     scales = np.full(len(columns), 0.02)
     for _ in range(ROUNDS):
         step, scales = problem.improved(logs, scales)
+        if np.abs(step).max() > _FAR:
+            raise ValueError("the measured values hardly depend on what is fitted to them")
         logs = logs + step
     covariance = problem.covariance
     narrowed = np.sqrt(np.diag(covariance)) < [priors()[n] / 1.5 for n in problem.names]
-    if _different_values(table, columns) - problem.effective_constants < 0.5:
+    if len(problem.column) - problem.effective_constants < 0.5:
         covariance = np.full_like(covariance, math.nan)
     mean = logs + np.log([getattr(finger.constants, n) for n in problem.names])
     return Posterior(
@@ -128,7 +140,10 @@ class _Problem:
         self.finger = finger
         self.table = table
         self.columns = columns
-        self.names = tuple(n for n, by in TOLD_BY.items() if set(by) & set(columns))
+        told = {n for n, by in TOLD_BY.items() if set(by) & set(columns)}
+        if table["pressure"].any():  # a bent finger gives way otherwise than a straight one
+            told.add("moment_factor")
+        self.names = tuple(n for n in TOLD_BY if n in told)
         self.sizes = np.array([math.sqrt(np.nanmean(table[n] ** 2)) for n in columns])
         self.rows = [np.isfinite(table[n]) for n in columns]
         self.column = np.repeat(np.arange(len(columns)), [r.sum() for r in self.rows])
@@ -233,28 +248,38 @@ def _noise(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Noise of each column, and by how much Student's interval is wider than the Gaussian's.
 
-    A column with few degrees of freedom joins as many of all columns'.
+    A column with few degrees of freedom joins those of the other columns.
     """
     from scipy import stats
 
     degrees = np.maximum(np.bincount(column, share) - leverage, 0.0)
     squares = np.bincount(column, share * residuals**2)
-    whole = float(degrees.sum())
-    if whole < 0.5:  # as many constants as values: nothing tells the noise
+    if degrees.sum() < 0.5:  # as many constants as values: nothing tells the noise
         return np.full_like(degrees, _EXACT), np.ones_like(degrees)
-    joined = np.minimum(np.maximum(_FEW - degrees, 0.0), whole)
-    variance = (squares + joined * squares.sum() / whole) / (degrees + joined)
+    others = degrees.sum() - degrees
+    theirs = (squares.sum() - squares) / np.maximum(others, 1e-9)
+    joined = np.minimum(np.maximum(_FEW - degrees, 0.0), others)
+    variance = (squares + joined * theirs) / (degrees + joined)
     wider = stats.t.ppf(0.95, np.maximum(degrees + joined, 0.5)) / _HALF
     return np.sqrt(np.maximum(variance, _EXACT**2)), wider
 
 
 def refuse_values(finger: Finger, table: Table, columns: list[str]) -> None:
-    """Refuses columns that no material explains: of zeros, and of the other sign."""
+    """Refuses columns that no material explains: zeros, offsets, and the other sign."""
     for name in columns:
         if not np.nan_to_num(table[name]).any():
             raise ValueError(f"every measured {words(name)} is 0: there is nothing to fit")
     if not table["pressure"].any() and set(columns) <= set(BY_PRESSURE):
         raise ValueError("every pressure is 0: there is nothing to fit")
+    load = np.nan_to_num(table.get("load", np.zeros(1)))
+    if not load.any() and set(columns) <= {"deflection", "sideways"}:
+        raise ValueError("every load is 0: there is nothing to fit")
+    for name in set(columns) & {"angle", "tip_y", "tip_force", "blocked_force"}:
+        at_rest = np.abs(table[name][table["pressure"] == 0])
+        if (at_rest > _OFFSET * np.nanmax(np.abs(table[name]))).any():
+            raise ValueError(
+                f"the measured {words(name)} is not 0 at zero pressure: subtract its value there"
+            )
     if wrong := opposed(table, predict(finger, table)):
         raise ValueError(
             f"{' and '.join(map(words, wrong))} of the other sign than the model's: bending "
@@ -262,15 +287,28 @@ def refuse_values(finger: Finger, table: Table, columns: list[str]) -> None:
         )
 
 
-def _different_values(table: Table, columns: list[str]) -> int:
-    """Number of measured values; a row that is repeated to the last digit counts once."""
+def _measured(table: Table) -> list[str]:
+    """Columns that have a measured value."""
+    return [n for n in MEASURED if n in table and np.isfinite(table[n]).any()]
+
+
+def telling(table: Table) -> dict[str, np.ndarray]:
+    """The table without values that tell nothing, which would make the noise too small.
+
+    They are those of a finger at rest, which are zero for any constants, and those that are
+    repeated to the last digit, as by an export.  Drops of a release are all kept.
+    """
     blank = np.zeros_like(table["pressure"])
-    beside = [np.nan_to_num(table.get(n, blank)) for n in ("load", "time")]
-    count = 0
-    for name in columns:
-        rows = np.stack([table["pressure"], *beside, table[name]], 1)
-        count += len(np.unique(rows[np.isfinite(table[name])], axis=0))
-    return count
+    load = np.nan_to_num(table.get("load", blank))
+    kept = dict(table)
+    for name in [n for n in _measured(table) if n != "drop"]:
+        moved = table["pressure"] if name in BY_PRESSURE else load
+        rows = np.flatnonzero(np.isfinite(table[name]) & (moved != 0))
+        values = np.stack([table["pressure"], load, table[name]], 1)[rows]
+        first = rows[np.unique(values, axis=0, return_index=True)[1]]
+        kept[name] = np.full_like(blank, math.nan)
+        kept[name][first] = table[name][first]
+    return kept
 
 
 def words(name: str) -> str:

@@ -415,6 +415,7 @@ def test_a_standard_error_needs_more_values_than_numbers(text, tmp_path, capsys)
     errors = [float(e) for e in re.findall(r"standard error ([0-9.e+-]+) %", output)]
     if FITTED[text] is None:
         assert not errors and "no standard error (as many numbers as values)" in output
+        assert "nan" not in output
     else:
         low, high = FITTED[text]
         assert all(low < error < high for error in errors) and errors

@@ -190,9 +190,11 @@ def _of_fit(fit: Posterior, mine: Finger) -> list[str]:
         lines.append(f"fitted: {label} = {number}, {_error(fit, name)}{doubt}")
     bends = {"angle", "tip_x", "tip_y"} & set(fit.noise)
     if bends and not identified["moment_factor"]:
+        error = fit.ratio_sd
+        size = "" if math.isnan(error) else f", here with a standard error of {100 * error:.2g} %"
         lines.append(
-            "angles alone give the ratio of modulus and moment, here with a standard error of "
-            f"{100 * fit.ratio_sd:.2g} %; a column tip_force or blocked_force tells them apart"
+            f"angles alone give the ratio of modulus and moment{size}; a column tip_force or "
+            "blocked_force tells them apart"
         )
     taken = [f"hand.material.{n}={value[n]:.4g}" for n in fit.names if identified[n]]
     if "shear_modulus" in fit.names:

@@ -69,35 +69,47 @@ def exact(scene, fields):
     return compiled
 
 
-def against_mujoco(scene, fields, ctrl, trajectory, stride=1):
-    """Errors of a path's steps against MuJoCo C, which converges at each of its states.
+def at_states(scene, fields, ctrl, trajectory, stride=1):
+    """MuJoCo C at the states of a path: yields world, number of the step, model and data.
 
-    Relative ones of accelerations, of distances [m], and numbers of contacts, (world, state). The
-    start is left out: there the object is so exactly on the table that rounding decides whether
-    it touches.
+    It converges at each of them. The start is left out: there the object is so exactly on the
+    table that rounding decides whether it touches.
+    """
+    for world in range(len(ctrl)):
+        world_fields = grasps.nth(fields, world)
+        compiled = exact(scene, world_fields)
+        data = mujoco.MjData(compiled)
+        for k in range(1, ctrl.shape[1] - 1, stride):
+            data.qpos[:] = trajectory.qpos[world, k]
+            data.qvel[:] = trajectory.qvel[world, k]
+            data.ctrl[:] = ctrl[world, k]
+            soften(scene, world_fields, data)
+            mujoco.mj_forward(compiled, data)
+            yield world, k, compiled, data
+
+
+def against_mujoco(scene, fields, ctrl, trajectory, stride=1):
+    """Errors of a path's steps against MuJoCo C, see `at_states`.
+
+    Relative ones of accelerations, of distances [m], and numbers of contacts, (world, state).
     """
     h = scene.discretization.timestep
     lay = model.layout(scene)
     errors = []
     far = []
     touching = []
-    for world in range(len(ctrl)):
-        world_fields = grasps.nth(fields, world)
-        data = mujoco.MjData(compiled := exact(scene, world_fields))
-        for k in range(1, ctrl.shape[1] - 1, stride):
-            qpos = trajectory.qpos[world, k]
-            qvel, after = trajectory.qvel[world, k : k + 2]
-            data.qpos[:] = qpos
-            data.qvel[:] = qvel
-            data.ctrl[:] = ctrl[world, k]
-            soften(scene, world_fields, data)
-            mujoco.mj_forward(compiled, data)
-            scale = max(np.linalg.norm(data.qacc), FLOOR)
-            errors.append(np.linalg.norm((after - qvel) / h - data.qacc) / scale)
-            away = data.xipos[lay.object] - lay.centre_weights @ data.xipos
-            far.append(abs(np.linalg.norm(away) - trajectory.distance[world, k]))
-            touching.append(data.ncon)
+    for world, k, _, data in at_states(scene, fields, ctrl, trajectory, stride):
+        qvel, after = trajectory.qvel[world, k : k + 2]
+        errors.append(relative_change((after - qvel) / h, data.qacc))
+        away = data.xipos[lay.object] - lay.centre_weights @ data.xipos
+        far.append(abs(np.linalg.norm(away) - trajectory.distance[world, k]))
+        touching.append(data.ncon)
     return (np.array(v).reshape(len(ctrl), -1) for v in (errors, far, touching))
+
+
+def relative_change(acceleration, exactly):
+    """How far accelerations are from exact ones, relative to these or to `FLOOR`."""
+    return np.linalg.norm(acceleration - exactly) / max(np.linalg.norm(exactly), FLOOR)
 
 
 def soften(scene, fields, data):

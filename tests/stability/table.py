@@ -44,7 +44,6 @@ class Case:
       quick: The engine whose first step and precision `make test` runs.
       lower: Whether the bound is a lower one.
       failure: Cause of its failure, if it fails.
-      fails_at: Pairs of step and precision that fail; all of them if there is none.
     """
 
     number: int
@@ -59,7 +58,6 @@ class Case:
     quick: str = ""
     lower: bool = False
     failure: str = ""
-    fails_at: tuple[tuple[float, str], ...] = ()
 
     @property
     def variants(self) -> list[tuple[float, str]]:
@@ -73,8 +71,7 @@ class Case:
         row = {"case": self.number, "precision": precision, "step": step, "note": result.note}
         names = ("name", "title", "invariant", "engine", "lower", "unit")
         row |= {name: getattr(self, name) for name in names}
-        fails = not self.fails_at or (step, precision) in self.fails_at
-        row["failure"] = self.failure if fails else ""
+        row["failure"] = self.failure
         # of NumPy's, JSON has none
         measured = float(result.measured)
         bound = float(result.bound)
@@ -179,7 +176,7 @@ def to_markdown(rows: list[dict[str, Any]]) -> str:
         least = min(math.inf if r["margin"] is None else r["margin"] for r in part)
         causes = {r.get("failure") or "not explained" for r in part if not r["passed"]}
         remarks = ["**fails**: " + "; ".join(sorted(causes))] if causes else []
-        remarks += ["; ".join(sorted({r["note"] for r in part if r["note"]}))]
+        remarks += ["; ".join(dict.fromkeys(r["note"] for r in part if r["note"]))]
         made = ", ".join(sorted({r["commit"] + provenance.before(r) for r in part}))
         engine = "MuJoCo C" if first["engine"] == "mujoco" else first["engine"]
         lines.append(

@@ -111,6 +111,7 @@ def _masses(model: Chain) -> jax.Array:
     return jnp.append(model.bodies.mass, model.load)
 
 
+@jax.jit
 def _mass(model: Chain, q: jax.Array) -> jax.Array:
     """The mass matrix, shape (N, N)."""
     slopes = jax.jacfwd(partial(_places, model))(q)

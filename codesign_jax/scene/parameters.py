@@ -133,8 +133,14 @@ class DesignSpace:
         return jnp.where(source >= 0, filled, jnp.asarray(self.base, values.dtype))
 
     def params(self, design: jax.typing.ArrayLike) -> Params:
-        """Returns the named parameters of a design vector [SI], shape (parameter,)."""
-        return unflatten(self.hand, self.expand(design))
+        """Returns the named parameters of a design vector [SI], shape (parameter,).
+
+        Raises:
+          InputError: As `expand`.
+        """
+        self._refuse_shape(design, "")
+        self.refuse_unit_slips(design)
+        return _named(self, jnp.asarray(design))
 
     def project(self, design: jax.typing.ArrayLike) -> jax.Array:
         """The nearest design that a search may propose, parameter by parameter.
@@ -338,6 +344,12 @@ class DesignSpace:
 
 
 @functools.partial(jax.jit, static_argnums=0)
+def _named(space: DesignSpace, design: jax.Array) -> Params:
+    """`DesignSpace.params`; one program a space."""
+    return unflatten(space.hand, space.expand(design))
+
+
+@functools.partial(jax.jit, static_argnums=0)
 def _projected(space: DesignSpace, design: jax.Array) -> jax.Array:
     """`DesignSpace.project` of a design whose units are known to be right; one program a space."""
     if space.buildable is not None:
@@ -449,13 +461,13 @@ def _refuse_draws(key: Any, n: Any) -> None:
         raise schema.InputError([words])
 
 
-@functools.partial(jax.jit, static_argnums=0)
 def fingers_of(name: str) -> list[int]:
     """The fingers of a parameter's name, such as [0, 3] of "length[0+3]"; none for all of them."""
     _, _, inside = name.partition("[")
     return [int(k) for k in inside.removesuffix("]").split("+") if k]
 
 
+@functools.partial(jax.jit, static_argnums=0)
 def params_of(space: DesignSpace, designs: jax.typing.ArrayLike) -> Params:
     """Named parameters of designs [SI], shape (design, parameter); one program a space."""
     return jax.vmap(space.params)(designs)

@@ -1,6 +1,7 @@
 """What can be built as a constraint of a search: closed forms, every optimiser, each limit off."""
 
 import dataclasses
+import functools
 import itertools
 
 import jax
@@ -8,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from codesign_jax import codesign, control, optimize, rollout, scene, stress
+from codesign_jax import codesign, optimize, scene, stress
 from codesign_jax.model import morphology
 from codesign_jax.scene import InputError, buildable, parameters, silicones
+from tests.helpers import grasps
 
 PAPER = scene.load("paper")
 SPACE = parameters.design_space(PAPER.hand, "23d")
@@ -39,8 +41,17 @@ def drawn(space, count=200):
     return np.asarray(space.sample(jax.random.key(3), count))
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def projection(space, designs):
+    """One program a space; a function that is jitted anew is compiled anew."""
+    return jax.vmap(space.project)(designs)
+
+
 def projected(space, designs):
-    return np.asarray(jax.jit(jax.vmap(space.project))(designs))
+    return np.asarray(projection(space, designs))
+
+
+share = jax.jit(buildable.on_lines, static_argnums=2)
 
 
 def each_params(space, designs):
@@ -196,8 +207,13 @@ def test_every_optimiser_proposes_and_recommends_what_can_be_built(name):
         made = dataclasses.replace(made, screening=1, retests=1)
     count = 12
     mask = np.ones(SPACE.num_parameters, bool)
-    first = optimize.candidates(jax.random.key(1), made.space, np.arange(1))[0]
-    state = made.init(jax.random.key(0), first, count)
+
+    @jax.jit
+    def begin(key):
+        first = optimize.candidates(jax.random.key(1), made.space, np.arange(1))[0]
+        return made.init(key, first, count)
+
+    state = begin(jax.random.key(0))
     ask = jax.jit(made.ask)
     tell = jax.jit(made.tell)
     random = np.random.default_rng(0)
@@ -253,7 +269,7 @@ def with_valves(**valves):
     ],
 )
 def test_fingers_share_the_nearest_pressures(pressures, highest, lines, expected):
-    allowed = buildable.on_lines(jnp.array(pressures, float), jnp.array(highest, float), lines)
+    allowed = share(np.array(pressures, float), np.array(highest, float), lines)
     np.testing.assert_allclose(allowed, expected, rtol=1e-6)
 
 
@@ -262,7 +278,7 @@ def test_fingers_of_lines_are_those_of_the_nearest_groups():
     random = np.random.default_rng(1)
     for lines in (2, 3):
         for pressures in random.random((20, 5)):
-            allowed = np.asarray(buildable.on_lines(jnp.asarray(pressures), jnp.ones(5), lines))
+            allowed = np.asarray(share(pressures, np.ones(5), lines))
             least = np.inf
             for line in itertools.product(range(lines), repeat=5):
                 means = [pressures[np.equal(line, k)].mean() for k in line]
@@ -291,8 +307,9 @@ def test_searched_lines_limit_the_pressures_of_each_proposal():
 def test_fingers_of_one_line_get_the_same_pressure_course():
     made, space = with_valves(groups=[[0, 1], [2, 3]])
     assert [n for n in space.names if "pressure" in n] == ["pressure[0+1]", "pressure[2+3]"]
-    params = space.params(space.default())._replace(pressure=jnp.array([9e4, 9e4, 7e4, 7e4]))
-    course = np.asarray(control.commands(made, params, rollout.nominal_trial(made)))[:, -4:]
+    [params] = each_params(space, space.default()[None])
+    params = params._replace(pressure=np.array([9e4, 9e4, 7e4, 7e4], np.float32))
+    course = np.asarray(grasps.world_inputs(made, params, grasps.still())[1])[:, -4:]
     np.testing.assert_array_equal(course[:, 0], course[:, 1])
     np.testing.assert_array_equal(course[:, 2], course[:, 3])
     assert course[:, 0].max() == pytest.approx(9e4) and course[:, 2].max() == pytest.approx(7e4)

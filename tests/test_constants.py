@@ -98,13 +98,13 @@ def test_changing_any_number_compiles_nothing(monkeypatch):
     the_scene = short(**BARE)
     compiled = []
     engine = make_engine("structured", the_scene)
-    original = launch.launch
+    original = launch.describe
 
-    def counting(call, inputs, outputs, kernel):
+    def counting(inputs, outputs, kernel):
         compiled.append(kernel.origin)
-        return original(call, inputs, outputs, kernel)
+        return original(inputs, outputs, kernel)
 
-    monkeypatch.setattr("codesign_jax.engines.structured.kernel.program.launch", counting)
+    monkeypatch.setattr(launch, "describe", counting)
     world = in_float32(hand_world(the_scene))
     params, trials = jax.tree.map(lambda v: jnp.broadcast_to(v, (2, *v.shape)), world)
     trials = trials._replace(shape=jnp.zeros(2, jnp.int32))
@@ -242,7 +242,7 @@ def test_every_trial_has_constants_of_its_own(tmp_path):
     assert np.corrcoef(np.log(factor), shift)[0, 1] == pytest.approx(-0.8, abs=0.08)
     assert 0.8 <= friction.min() and friction.max() <= 1.1
     trial = jax.tree.map(lambda v: v[0], trials)
-    trial_scene = constants.with_trial(drawing, trial)
+    trial_scene = jax.jit(constants.with_trial)(drawing, trial)
     assert trial_scene.hand.material.shear_modulus == pytest.approx(90e3 * factor[0])
     assert trial_scene.hand.material.damping_time == pytest.approx(5e-3 + shift[0])
     tilts = [

@@ -95,7 +95,7 @@ def test_a_stuck_object_fails_the_trial():
     assert evaluate(trace(400, distance={last: 0.05}, height={last: 0.25})).status == Status.OK
     without = scene.load("paper_spheres", overrides={"effects": {"ungrasp": False}})
     without_release = jax.tree.map(lambda v: v[: without.num_steps], trace())
-    assert cost.outcome(without, without_release).status == Status.OK
+    assert grasps.outcome(without, without_release).status == Status.OK
 
 
 def test_whether_an_object_rests_is_told_by_its_own_size():

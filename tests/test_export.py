@@ -1316,7 +1316,7 @@ def test_the_table_of_valves_is_what_the_control_commands(tmp_path):
     rows, limits = play_valves.read(tmp_path / valves.VALVES)
     assert [row[0] for row in rows] == [0.5, 2.5, 2.5, 5.0] and len(limits) == 4
     nominal = jax.tree.map(np.asarray, rollout.nominal_trial(the_scene))
-    commanded = 1e-3 * np.asarray(control.plan(the_scene, params, nominal).pressure)
+    commanded = 1e-3 * np.asarray(jax.jit(control.plan)(the_scene, params, nominal).pressure)
     times = np.arange(len(commanded)) * the_scene.discretization.timestep
     sent = np.array([play_valves.at(rows, time) for time in times])
     # The time of a jump is a step's beginning, whose rounding belongs to either side.

@@ -312,15 +312,20 @@ def test_household_distances_in_lanes(household):
     """The jitted interpolation against the exact distance of every mesh, a world each."""
     the_scene = scene.load("paper_spheres", object_set="household")
     count = len(household)
-    shape = jnp.arange(count)[None]
+    shape = np.arange(count)[None]
     size = 1.03 * np.array([s.half_sizes for s in household]).T[:, None]
     rng = np.random.default_rng(4)
     points = np.stack([s.mesh.vertices[rng.integers(len(s.mesh.vertices), size=80)]
                        for s in household], -1).swapaxes(0, 1)  # fmt: skip
     points = 1.03 * (points + rng.normal(scale=0.005, size=points.shape))
-    lanes = mesh_lanes.mesh_lanes(the_scene, shape, jnp.asarray(size, jnp.float32))
-    distance, gradient = jax.jit(mesh_lanes.signed_distance)(lanes, jnp.asarray(points))
-    np.testing.assert_allclose(jnp.linalg.norm(gradient, axis=0), 1.0, atol=1e-5)
+
+    @jax.jit
+    def interpolated(size, points):
+        lanes = mesh_lanes.mesh_lanes(the_scene, shape, size)
+        return mesh_lanes.signed_distance(lanes, points)
+
+    distance, gradient = map(np.asarray, interpolated(np.float32(size), np.float32(points)))
+    np.testing.assert_allclose(np.linalg.norm(gradient, axis=0), 1.0, atol=1e-5)
     for i, s in enumerate(household):
         body = s.mesh.vertices, s.mesh.faces
         exact = 1.03 * surface.signed_distance(*body, points[..., i].T / 1.03)

@@ -16,6 +16,7 @@ import pytest
 
 from codesign_jax import control, env, model, policy, rollout
 from codesign_jax import scene as scenes
+from codesign_jax.compiler import launch
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured.world_model import world_constants
@@ -102,23 +103,26 @@ def test_who_replays_the_key_frames_simulates_the_open_loop(worlds):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("reads", [True, False])
-def test_forces_are_found_for_policies_that_read_them(worlds, monkeypatch, reads):
+def test_forces_are_found_for_policies_that_read_them(worlds, monkeypatch):
     """Others compile no kernel for them."""
-    calls = []
+    kernels = set()
+    original = launch.describe
 
-    def record(scene, fields, world):
-        calls.append(fields)
-        return policy._no_forces(scene, world)
+    def describe(inputs, outputs, kernel):
+        kernels.add(kernel.origin)
+        return original(inputs, outputs, kernel)
 
-    def step(carry, seen):
-        light = jnp.where(seen.forces.grip.sum() > 0, 0.5, 1.0) if reads else 1.0
+    def lighter(carry, seen):
+        light = jnp.where(seen.forces.grip.sum() > 0, 0.5, 1.0)
         return carry, seen.plan._replace(pressure=light * seen.plan.pressure)
 
-    monkeypatch.setattr(policy, "_forces", record)
-    simulate = partial(rollout.simulate, SCENE, loop(SCENE, step, period=0.25))
-    jax.eval_shape(simulate, *worlds[0])
-    assert bool(calls) == reads
+    monkeypatch.setattr(launch, "describe", describe)
+    # The period of the environment below, whose kernels these are.
+    for step, count in ((replay, 1), (lighter, 2)):
+        kernels.clear()
+        simulate = partial(rollout.simulate, SCENE, loop(SCENE, step, period=0.1))
+        jax.eval_shape(simulate, *worlds[0])
+        assert len(kernels) == count
 
 
 def test_what_is_observed_is_where_mujoco_has_it(worlds):

@@ -318,7 +318,7 @@ def test_triangles_lie_on_the_surface_and_have_its_inertia(kind):
     with jax.enable_x64(True):
         sizes = jnp.asarray(size)[:, None, None]
         points = jnp.asarray(mesh.vertices.T[:, None])
-        distance, _ = shapes.SHAPES[kind].distance(sizes, points)
+        distance, _ = jax.jit(shapes.SHAPES[kind].distance)(sizes, points)
     assert np.abs(distance).max() < 1e-9  # trimesh rounds corners that it merges to 1e-8
 
 

@@ -88,8 +88,8 @@ class FingerCollision:
         return self._gathered(self.scratch, f"pair.{name}", item, lane)
 
     def _gathered(self, table: BoundTable, name: str, item: Any, lane: Any) -> Lanes:
-        item = jnp.zeros_like(self.block.own) + item
-        return table.gather(name, item, self.block.own if lane is None else lane)
+        item = jnp.zeros_like(self.block.column) + item
+        return table.gather(name, item, self.block.column if lane is None else lane)
 
     def ring(self, item: Any, lane: jax.Array | None = None) -> Lanes:
         if lane is None and not jnp.ndim(item):
@@ -309,7 +309,7 @@ class FingerCollision:
         candidate |= {"other": self._number(other)}
         candidate |= self.pairs.remembered({"owner": 1.0, "ring": item})
         which = mine & (candidate["share"].lane > 0)
-        any_of(which, lambda: self.pairs.add(0, which, candidate, self.block.own))
+        any_of(which, lambda: self.pairs.add(0, which, candidate, self.block.column))
 
     def _on_palm(self, item: Any, mine: jax.Array) -> None:
         row, numbers, frame, centre = self.body(item)
@@ -388,7 +388,7 @@ class FingerCollision:
 
     def _along(self, item: Any) -> jax.Array:
         """Place of a ring along the finger, in links from its base."""
-        item = jnp.zeros_like(self.block.own) + item
+        item = jnp.zeros_like(self.block.column) + item
         k = jnp.full_like(item, self.p.k)
         link = jax.lax.div(item, k)
         number = jax.lax.rem(item, k)

@@ -229,7 +229,7 @@ class BoundFingerContacts(BoundSlots):
             field: lanewise(jnp.where, side, value, theirs[field]) for field, value in mine.items()
         }
         touch = which | (~owner & (fields["share"].lane > 0))
-        self.add(row, touch, fields | alike, self.block.own)
+        self.add(row, touch, fields | alike, self.block.column)
 
     def each(self, body: Callable, start: Any) -> Any:
         """Folds body(item, pairing, tree of lanes) over all slots in use."""
@@ -296,7 +296,7 @@ class BoundFingerContacts(BoundSlots):
         """Motions of the links in a field of a slot's lanes; zeros where nothing touches."""
         if self.set.gathers:
             row = self.read(field, item).lane.astype(jnp.int32)
-            return self.table.gather("side.motion", row, self.block.own)
+            return self.table.gather("side.motion", row, self.block.column)
         start = zeros((6,), self.like)
 
         def take(row: Any, chosen: jax.Array, motions: Lanes) -> Lanes:
@@ -375,7 +375,7 @@ class BoundFingerContacts(BoundSlots):
         if not self.set.gathers:
             return OwnSide(self.place(item), None, None)
         row = self.read("row", item).lane.astype(jnp.int32)
-        wrench = self.table.gather("side.push", row, self.block.own)
+        wrench = self.table.gather("side.push", row, self.block.column)
         return OwnSide(self.place(item), row, wrench)
 
     def load(self, item: Any, side: OwnSide, force: Lanes, pairing: FingerPairing) -> None:
@@ -400,9 +400,9 @@ class BoundFingerContacts(BoundSlots):
         if self.set.gathers:
             if row is None or sums is None:
                 row = self.read(field, item).lane.astype(jnp.int32)
-                sums = self.table.gather("side.push", row, self.block.own)
+                sums = self.table.gather("side.push", row, self.block.column)
             sums = lanewise(jnp.add, sums, more)
-            self.table.scatter("side.push", sums, row, self.block.own)
+            self.table.scatter("side.push", sums, row, self.block.column)
             return
 
         def add(row: Any, chosen: jax.Array, nothing: list) -> list:

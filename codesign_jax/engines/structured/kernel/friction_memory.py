@@ -73,7 +73,7 @@ def of_ring(
     """`of_item` of rings, one on each of a team's lanes, shape (lane,)."""
     if not contacts.set.holds:
         return None
-    grip = step.finger_state.gather(f"held.{contacts.set.name}", ring, step.block.own)
+    grip = step.finger_state.gather(f"held.{contacts.set.name}", ring, step.block.column)
     return _both(step, contacts, lanewise(lambda v: v[:, None], grip))
 
 

@@ -238,7 +238,7 @@ class Block:
       lane: The lanes, shape (lane,).
       world: World of each lane, shape (lane,).
       finger: Finger of each lane, shape (lane,).
-      mate: Number of each lane in its team, shape (lane,); `own`: column of its finger in tables.
+      mate: Number of each lane in its team, shape (lane,); `column`: of its finger in tables.
     """
 
     def __init__(self, fingers: int, worlds: int, team: int = 1):
@@ -250,11 +250,11 @@ class Block:
         count = jnp.int32(worlds)
         self.world = jax.lax.rem(lane, count)
         self.finger = jax.lax.div(lane, count)
-        self.own = lane
+        self.column = lane
         if team > 1:
             self.mate = jax.lax.rem(self.finger, jnp.int32(team))
             self.finger = jax.lax.div(self.finger, jnp.int32(team))
-            self.own = self.finger * worlds + self.world
+            self.column = self.finger * worlds + self.world
 
     def over_team(self, array: jax.Array, combine: Callable) -> jax.Array:
         """`fold` over the lanes of each team."""

@@ -69,7 +69,7 @@ class ResidualVjp:
         self.bars = bars
         self.block = step.block
         self.like = step.like
-        self.one = lanes([self.like + 1.0], (), wide=True)
+        self.power_bar = lanes([self.like + 1.0], (), wide=True)
         self.object = {"columns": bodies["columns"], "object_vel": bodies["object_vel"]}
         self.object |= {"height": state["position"][2]}
         if self.p.scene.fixture:
@@ -127,7 +127,7 @@ class ResidualVjp:
         run = partial(residual.of_link, self.p.scene)
         joint = joint | {"pressure": pressure}
         before, bars, moved = pull(
-            run, (self.chain(i), numbers, joint), (still,), (after, self.one)
+            run, (self.chain(i), numbers, joint), (still,), (after, self.power_bar)
         )
         self.bars.add({n: bars.pop(n) for n in LINK_CONSTANTS}, i)
         sections = {n: bars.pop(n) for n in FINGER_CONSTANTS if n in bars}
@@ -149,7 +149,9 @@ class ResidualVjp:
 
         weight = lanewise(jnp.multiply, centre_bar, read("centre_weight"))
         given = (palm, *(read(n) for n in names))
-        (place, frame), *bars = pull(run, given, (weight,), (base.frame, base.origin, self.one))
+        (place, frame), *bars = pull(
+            run, given, (weight,), (base.frame, base.origin, self.power_bar)
+        )
         self.bars.add(dict(zip(names, bars, strict=True)))
         return base._replace(origin=place, frame=frame)
 
@@ -194,7 +196,7 @@ class ResidualVjp:
                     still = still | {"values_again": self._values(again)}
             run = partial(residual.of_rings, self.p.scene, name)
             args = place, numbers, variables, self.held(name, i)
-            body_bars, ring_bars, shared, held = pull(run, args, (still,), self.one)
+            body_bars, ring_bars, shared, held = pull(run, args, (still,), self.power_bar)
             friction_memory.add_held(self.bars, self.contacts[name], i, held)
             for j in range(k):
                 self.bars.add({table: ring_bars[:, j]}, i * k + j)
@@ -236,7 +238,7 @@ class ResidualVjp:
                 run = partial(residual.of_table, p.scene, p.fingers, i)
                 constants = still | self.of_contacts(residual.TABLE, i)
                 args = variables, self.held(residual.TABLE, i)
-                bars, held = pull(run, args, (finger, constants), self.one)
+                bars, held = pull(run, args, (finger, constants), self.power_bar)
                 friction_memory.add_held(self.bars, contacts, i, held)
                 self.bars.add(bars)
 
@@ -353,7 +355,7 @@ class FingerContactsVjp:
         args = (self._body(row), ring), palm, step.constant("palm_disc"), step.constant(ON_PALM)
         run = partial(residual.on_palm, self.p.scene)
         (place, ring_bar), palm, disc, cone = only_on(
-            self._side(live), pull(run, args, (), self._one)
+            self._side(live), pull(run, args, (), self._power_bar)
         )
         self.bars.add({ON_PALM: cone, "palm_disc": disc})
         self.bars.add({"ring": ring_bar}, number, self.lane)
@@ -374,7 +376,7 @@ class FingerContactsVjp:
         other = jax.lax.div(self.pairs.read("ring", item).lane.astype(jnp.int32), self._count)
         theirs = self._body(row_of(other, self.p.k), pairing.lane), self._numbers(other, pairing)
         args = (self._body(row), ring), theirs, self.sweep.step.constant(CONE)
-        bars = pull(partial(residual.between_spheres, self.p.scene), args, (), self._one)
+        bars = pull(partial(residual.between_spheres, self.p.scene), args, (), self._power_bar)
         (place, ring_bar), swapped, cone = only_on(self._side(live), bars)
         self.bars.add({CONE: cone})
         self.bars.add({"ring": ring_bar}, number, self.lane)
@@ -417,7 +419,7 @@ class FingerContactsVjp:
         still |= {"last": self._float(jnp.where(other == self.p.links, self.like + 1.0, self.like))}
         held = friction_memory.hold_of_pairing(self.sweep.step, pairing)
         args = (self._body(row), ring), line, self.sweep.step.constant(CONE), held
-        bars = pull(partial(residual.between_rings, self.p.scene), args, (still,), self._one)
+        bars = pull(partial(residual.between_rings, self.p.scene), args, (still,), self._power_bar)
         (place, own_ring), line, cone, kept = only_on(self._side(live), bars)
         friction_memory.leave(self.bars, pairing, kept)
         self.bars.add({CONE: cone})
@@ -444,8 +446,8 @@ class FingerContactsVjp:
     # Both
 
     @property
-    def _one(self) -> Lanes:
-        return self.sweep.one
+    def _power_bar(self) -> Lanes:
+        return self.sweep.power_bar
 
     @property
     def _count(self) -> jax.Array:

@@ -101,7 +101,7 @@ class SdfCollision:
                 contacts: BoundContacts = contacts,
             ) -> list:
                 row, numbers, frame, centre = search.body(item)
-                numbers, centre = (lanewise(one_of, v) for v in (numbers, centre))
+                numbers, centre = (lanewise(as_item, v) for v in (numbers, centre))
                 moves = self.moves(name, *(search.side_of(n, row) for n in ("motion", "vel")))
                 hold = friction_memory.of_ring(self.step, contacts, item)
                 self.on_field(name, slot, numbers, frame, centre, moves, hold)
@@ -162,7 +162,7 @@ class SdfCollision:
         bodies = self.bodies
         palm = [name for name in ("palm_object", "palm_table") if name in self.contacts]
         for i in range(p.palm_groups if palm else 0):
-            numbers = lanewise(one_of, self.step.hand.read("palm_ring", i))
+            numbers = lanewise(as_item, self.step.hand.read("palm_ring", i))
             centre = lanewise(ring_centres, bodies["place"], bodies["frame"], numbers)
             for name in palm:
                 moves = self.moves(name, None, None)
@@ -279,5 +279,5 @@ def any_closes(gap, most):
     return sum(closes[k] for k in range(closes.shape[0]))
 
 
-def one_of(numbers):
+def as_item(numbers):
     return numbers[:, None]

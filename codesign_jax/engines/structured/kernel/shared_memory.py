@@ -63,13 +63,13 @@ class SharedColumns:
 
     def __init__(self, block: Block, ref: Any):
         self.ref = ref
-        self.own = block.own
+        self.column = block.column
         self.dtype = ref.dtype
         self.shape = (*ref.shape[:-1], block.size)
 
     def _at(self, index: Any) -> tuple:
         index = index if isinstance(index, tuple) else (index,)
-        return index if len(index) == len(self.shape) else (*index, self.own)
+        return index if len(index) == len(self.shape) else (*index, self.column)
 
     def __getitem__(self, index: Any) -> jax.Array:
         """The lanes' elements; without a last index those of their own column."""
@@ -90,7 +90,7 @@ class TeamRows:
 
     def _at(self, name: str, item: Any, first: int, step: int) -> tuple:
         row = item * self.layout.stride[name] + self.block.mate * step
-        return row + (self.layout.offset[name] + first), self.block.own
+        return row + (self.layout.offset[name] + first), self.block.column
 
     def get(self, name: str, item: Any = 0, first: int = 0, step: int = 1) -> jax.Array:
         """Row `first` + lane * `step` of an item, shape (lane,)."""

@@ -52,7 +52,7 @@ class BoundTeamSdfContacts(BoundSlots):
         self.block = Block(*self.set.block)
 
     def _lane(self) -> jax.Array:
-        return self.block.own
+        return self.block.column
 
     def slot(self, k: Any) -> tuple[Slot, jax.Array]:
         """Items of the lanes in a round, and the rings that they are of."""
@@ -123,7 +123,7 @@ class BoundTeamSdfContacts(BoundSlots):
 
         def add(item: Slot, ring: jax.Array, sums: Lanes) -> Lanes:
             row = jax.lax.div(ring, jnp.full_like(ring, k)) + 1
-            motion = pairs.table.gather("side.motion", row, self.block.own)
+            motion = pairs.table.gather("side.motion", row, self.block.column)
             if self.set.on_object:
                 motion = lanewise(jnp.subtract, motion, obj)
             return lanewise(jnp.add, sums, self.prepare_linesearch(item, motion))
@@ -165,7 +165,7 @@ class BoundTeamFingerContacts(BoundFingerContacts):
         self._loaded = False
 
     def _lane(self) -> jax.Array:
-        return self.block.own
+        return self.block.column
 
     def used(self, row: Any) -> jax.Array:
         """Rounds of a row."""

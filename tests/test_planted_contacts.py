@@ -19,8 +19,8 @@ import pytest
 from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.forces import forces
 from codesign_jax.engines.structured.kernel import memory_tables
-from codesign_jax.engines.structured.kernel.finger_contacts import BoundFingerContacts
 from codesign_jax.engines.structured.kernel.ring_pairs import RingPairs
+from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.slots import BoundSlots, SlotCounts
 from codesign_jax.engines.structured.lanewise import lanes, lanewise
 from codesign_jax.engines.structured.laws.rings import Place
@@ -195,16 +195,14 @@ PAIRS = {
     ),
     # contacts between fingers, with spheres and with rings
     "both fingers are pushed the same way": Fault(
-        {}, methods={(BoundFingerContacts, "enter"): same_way}
+        {}, methods={(BoundSelfContacts, "enter"): same_way}
     ),
-    "contacts act on the link before": Fault(
-        {}, methods={(BoundFingerContacts, "enter"): on_parent}
-    ),
+    "contacts act on the link before": Fault({}, methods={(BoundSelfContacts, "enter"): on_parent}),
     "the other finger does not feel the contact": Fault(
         {LOAD: lambda f, *a: jnp.zeros_like(f(*a))}, finger=1
     ),
     "links do not feel contacts between fingers": Fault({LINK: without_pairs}),
-    "relative motion of one side": Fault({}, methods={(BoundFingerContacts, "relative"): own_half}),
+    "relative motion of one side": Fault({}, methods={(BoundSelfContacts, "relative"): own_half}),
     "half the Hessian between fingers": Fault({TIMES: lambda f, *a: 0.5 * f(*a)}),
     "conjugate gradients without forces on the object": Fault({PALM_AGAIN: without_last}),
     "conjugate gradients without forces on links": Fault({AGAIN: without_last}),
@@ -232,7 +230,7 @@ HULL = {
     "a line search of one stiffness": Fault({RAY: one_stiffness, SLOPES: one_stiffness}),
     # one lane with both sides
     "one side of a contact alone": Fault(
-        {}, methods={(BoundFingerContacts, "_add_wrench"): one_side}
+        {}, methods={(BoundSelfContacts, "_add_wrench"): one_side}
     ),
     "the palm rubs as fingers do": cone_of("finger_palm", "finger_finger"),
     # state
@@ -257,7 +255,7 @@ HULL = {
 SPHERES = {
     "the palm pulls": Fault({"ball_on_field": pulled}),
     "the palm does not feel fingers": Fault(
-        {}, methods={(BoundFingerContacts, "_add_wrench"): one_side}
+        {}, methods={(BoundSelfContacts, "_add_wrench"): one_side}
     ),
     "the palm rubs as fingers do": cone_of("finger_palm", "finger_finger"),
     "contacts between spheres in the centre": place(BALLS, point=lambda v: 0.9 * v),

@@ -152,11 +152,9 @@ FAULTS = {
         "distance",
     ),
     # wrong cone
-    "twice the friction": Fault(
-        cones(lambda c: c._replace(friction=2 * c.friction, ratio=2 * c.ratio))
-    ),
+    "twice the friction": Fault(cones(lambda c: c.of_friction(2 * c.friction))),
     "friction as soft as normal contact": Fault(
-        cones(lambda c: c._replace(tangent=c.normal, ratio=c.friction))
+        cones(lambda c: c._replace(tangential_mass=c.normal_mass, regularized_friction=c.friction))
     ),
     "a softer contact": Fault(cones(lambda c: c._replace(spring=0.9 * c.spring))),
 }

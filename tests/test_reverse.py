@@ -25,7 +25,7 @@ from codesign_jax.engines.structured.kernel import (
     friction_memory,
     residual_vjp,
 )
-from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, RecordedPath
+from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, StatePath
 from codesign_jax.engines.structured.kernel.adjoint_step import AdjointSolve
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables
 from codesign_jax.engines.structured.kernel.program import Limits, Program
@@ -103,7 +103,7 @@ FAULTS = {
     "links do not hand on what velocities cause": Fault(results={"of_link": without(0, "bias")}),
     "links do not hand on virtual motions": Fault(seeds={"of_link": without(0, "along")}),
     "links have no power": Fault(seeds={"of_link": without(1)}),
-    "the palm does not feel the fingers": Fault(seeds={"of_palm": without(0, "motion", "along")}),
+    "the palm does not feel the fingers": Fault(seeds={"of_palm": without(0, "link_acc", "along")}),
     "the arm's commands do nothing": Fault(results={"of_palm": without(1)}),
     "angles hand on nothing": Fault(seeds={"_turned": without(1)}),
     "the object's frame stands still": Fault(names=("columns",)),
@@ -398,7 +398,7 @@ def ptx(the_scene):
     inputs = hand, world, *state, shape(steps, 6, block), shape(steps, size)
     ends = shape(1, rows[0], size), shape(1, rows[1], block)
     whole = shape(steps, rows[0], size), shape(steps, rows[1], block)
-    path = RecordedPath(*whole, *ends, shape(1, 1, block))
+    path = StatePath(*whole, *ends, shape(1, 1, block))
     arguments = program._arguments(inputs, path, Cotangents(*ends, shape(steps, 3, block)))
 
     def code(call, outputs, arguments, scratch):

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.engines.structured import StructuredEngine, coordinates
-from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, recorded
+from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, state_path
 from tests.helpers import grasps
 from tests.helpers.curled_hands import state
 
@@ -214,7 +214,7 @@ class Case:
         taken = program.by_block(trace["moved"].sum(1)[:, None, None, None])
         rows = Cotangents(*program.rows_of_end(last), entries[..., None], program.rows_of(qpos))
         rows = jax.tree.map(program.by_block, rows)
-        hand, world, *rest = program.adjoint(tables, recorded(out, taken), rows)
+        hand, world, *rest = program.adjoint(tables, state_path(out, taken), rows)
         return hand, program.summed(world), *rest
 
     def along(self, bars, world=0):

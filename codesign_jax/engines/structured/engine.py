@@ -12,7 +12,7 @@ from codesign_jax.compiler.launch import KernelUnavailable
 from codesign_jax.engines.base import Equal
 from codesign_jax.engines.structured import coordinates, forces, transforms
 from codesign_jax.engines.structured.kernel import Limits, Program
-from codesign_jax.engines.structured.kernel.adjoint import RecordedPath, recorded
+from codesign_jax.engines.structured.kernel.adjoint import StatePath, state_path
 from codesign_jax.engines.structured.kernel.memory import lengthened
 from codesign_jax.engines.structured.laws import meshes
 from codesign_jax.engines.structured.laws.kinematics import State
@@ -141,7 +141,7 @@ class StructuredEngine(Equal):
           tables: Those of the fields, see `tables`.
         """
         settings = transforms.Settings(self.scene, self.limits, self.segment, self.truncate)
-        run = partial(transforms.rollout, self.simulate, self.record, settings)
+        run = partial(transforms.rollout, self.simulate, self.simulate_with_path, settings)
         return run(fields, ctrl, tables, trajectory=trajectory)
 
     def tables(self, fields: ModelFields) -> tuple[jax.Array, ...]:
@@ -177,9 +177,9 @@ class StructuredEngine(Equal):
         out = _execute(program, inputs, trajectory=trajectory)
         return self._trace(*program.outputs(out, len(ctrl), trajectory=trajectory), trajectory)
 
-    def recording(self, *, touch: bool = False) -> "Recording":
+    def recording(self, *, touch: bool = False) -> "RecordingEngine":
         """As an engine whose traces have the contact forces, see `base.recording`."""
-        return Recording(self, touch=touch)
+        return RecordingEngine(self, touch=touch)
 
     def states(
         self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False
@@ -211,9 +211,9 @@ class StructuredEngine(Equal):
         """The hands' tables."""
         return program.pack_hand(world_constants(self.scene, fields))
 
-    def record(
+    def simulate_with_path(
         self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False
-    ) -> tuple[Trace, RecordedPath]:
+    ) -> tuple[Trace, StatePath]:
         """`simulate`, and what a derivative reads of it."""
         # A lane a finger, as the reverse pass has it, which simulates segments again.
         program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl), team=1)
@@ -221,7 +221,7 @@ class StructuredEngine(Equal):
         out = _execute(program, inputs, trajectory=trajectory, states=self.segment or 1)
         series, end = program.outputs(out, len(ctrl), trajectory=trajectory)
         taken = program.by_block(series["moved"].sum(1)[:, None, None, None])
-        path = jax.tree.map(lambda x: program.by_world(x, len(ctrl)), recorded(out, taken))
+        path = jax.tree.map(lambda x: program.by_world(x, len(ctrl)), state_path(out, taken))
         return self._trace(series, end, trajectory), path
 
     def _trace(self, entries: dict[str, jax.Array], end: State, trajectory: bool) -> Trace:
@@ -244,7 +244,7 @@ class StructuredEngine(Equal):
         return status | jnp.where(series["overflow"] > 0, int(Status.CONTACT_OVERFLOW), 0)
 
 
-class Recording(Equal):
+class RecordingEngine(Equal):
     """The engine `structured` as one whose traces have `Trace.forces`; without derivatives."""
 
     def __init__(self, engine: StructuredEngine, *, touch: bool = False):
@@ -257,8 +257,8 @@ class Recording(Equal):
     def _key(self) -> tuple:
         return self.engine, self.touch
 
-    def recording(self, *, touch: bool = False) -> "Recording":
-        return Recording(self.engine, touch=touch or self.touch)
+    def recording(self, *, touch: bool = False) -> "RecordingEngine":
+        return RecordingEngine(self.engine, touch=touch or self.touch)
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
         run = jax.custom_vjp(transforms.folded(partial(self._simulate, trajectory)))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.engines.structured.kernel.contact_forces import ForceProgram
-from codesign_jax.engines.structured.kernel.finger_contacts import FingerContactSet
+from codesign_jax.engines.structured.kernel.self_contacts import SelfContactSet
 from codesign_jax.engines.structured.lanes import dot
 from codesign_jax.engines.structured.laws.kinematics import State
 from codesign_jax.engines.structured.world_model import WorldModel
@@ -69,7 +69,7 @@ def _summed(
     grip = none[0, 0, 0]
     if "finger_object.force" in stored:
         grip = _pressing(stored, "finger_object").sum((0, 1))
-    fields = [s.name for s in program.sets if not isinstance(s, FingerContactSet)]
+    fields = [s.name for s in program.sets if not isinstance(s, SelfContactSet)]
     depth = {name: _deepest(stored, name) for name in fields}
     between, on_palm, more = _between_fingers(program, stored, none[0, 0, 0])
     return Forces(
@@ -99,21 +99,21 @@ def _between_fingers(
     pressing = stored.get("finger_finger.pressing")
     if pressing is None:
         return between, none, {}
-    (pairs,) = (s for s in program.sets if isinstance(s, FingerContactSet))
+    (self_contacts,) = (s for s in program.sets if isinstance(s, SelfContactSet))
     finger = np.arange(lanes)
-    for row in range(pairs.rows):
-        partner = finger ^ (row + pairs.first)
+    for row in range(self_contacts.rows):
+        partner = finger ^ (row + self_contacts.first)
         between = between.at[finger, partner].set(pressing[row, 0])
     deepest = stored["finger_finger.depth"].max(2)
     effects = program.scene.effects
     depth = {}
     if effects.finger_finger and program.scene.num_fingers > 1:
-        depth["finger_finger"] = deepest[int(pairs.alone) :, 0].max(0)
+        depth["finger_finger"] = deepest[int(self_contacts.alone) :, 0].max(0)
     if touches_itself(program.scene):
         depth["finger_itself"] = deepest[0, 0]
     if effects.finger_palm:
         depth["finger_palm"] = deepest[0, 1]
-    return between, pressing[0, 1] if pairs.alone else none, depth
+    return between, pressing[0, 1] if self_contacts.alone else none, depth
 
 
 def _touches(

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured.kernel import finger_collision, memory_tables
+from codesign_jax.engines.structured.kernel import memory_tables, self_collision
 from codesign_jax.engines.structured.lanes import once
 from codesign_jax.engines.structured.laws import shapes, surroundings
 from codesign_jax.engines.structured.laws.kinematics import Kinematics
@@ -77,10 +77,10 @@ def depth_in_palm(scene: Scene, hand: WorldModel, kin: Kinematics) -> jax.Array:
     frame = kin.link[:, :, link]
     centre = once(ring_centre, kin.origin[:, link], frame, inner)
     disc = kin.place[:, None], kin.palm[:, :, None], hand.palm_disc[:, None]
-    look = partial(finger_collision.palm_distance, palm=disc)
+    look = partial(self_collision.palm_distance, palm=disc)
     place = _touch(scene, look, inner, frame, centre)
     row = link[:, None, None] + 1
-    free = finger_collision.free_of_palm(row, inner, hand.offset[0], numbers[:, 0])
+    free = self_collision.free_of_palm(row, inner, hand.offset[0], numbers[:, 0])
     depth = jnp.where(place.share * free > 0, -place.gap, -jnp.inf)
     return depth.reshape(-1, depth.shape[-1]).max(0)
 

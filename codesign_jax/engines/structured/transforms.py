@@ -30,8 +30,8 @@ from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.kernel.adjoint import (
     AdjointProgram,
     Cotangents,
-    RecordedPath,
-    recorded,
+    StatePath,
+    state_path,
 )
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.model import ModelFields
@@ -51,7 +51,7 @@ class Settings(NamedTuple):
 
 def rollout(
     simulate: Callable,
-    record: Callable,
+    simulate_with_path: Callable,
     settings: Settings,
     fields: ModelFields,
     ctrl: jax.Array,
@@ -62,13 +62,13 @@ def rollout(
     """`StructuredEngine.simulate`'s trace, under any of JAX's transformations but forward mode.
 
     Args:
-      simulate: That method; `record`: `StructuredEngine.record`.
+      simulate: That method; `simulate_with_path`: that of the same name.
 
     Raises:
       NotImplementedError: If a derivative is differentiated again.
     """
     plain = folded(partial(simulate, trajectory=trajectory))
-    recording = _once(folded(partial(record, trajectory=trajectory)))
+    with_path = _once(folded(partial(simulate_with_path, trajectory=trajectory)))
     adjoint = _once(folded(partial(_adjoint, settings, trajectory)))
 
     @jax.custom_vjp
@@ -76,7 +76,7 @@ def rollout(
         return plain(fields, ctrl, tables)
 
     def forward(fields: ModelFields, ctrl: jax.Array, _: tuple[jax.Array, ...]):
-        trace, path = recording(fields, ctrl)
+        trace, path = with_path(fields, ctrl)
         return trace, (fields, ctrl, path, trace.speed)
 
     def backward(saved: tuple, cotangent: Trace):
@@ -127,7 +127,7 @@ def _adjoint(
     trajectory: bool,
     fields: ModelFields,
     ctrl: jax.Array,
-    path: RecordedPath,
+    path: StatePath,
     speed: jax.Array,
     cotangent: Trace,
 ) -> tuple[ModelFields, jax.Array]:
@@ -187,7 +187,7 @@ def _reversed(
     settings: Settings,
     program: Any,
     inputs: tuple,
-    path: RecordedPath,
+    path: StatePath,
     bars: Cotangents,
     *,
     trajectory: bool,
@@ -213,7 +213,7 @@ def _reversed_by_segment(
     settings: Settings,
     program: Any,
     inputs: tuple,
-    path: RecordedPath,
+    path: StatePath,
     bars: Cotangents,
     *,
     trajectory: bool,
@@ -237,7 +237,7 @@ def _reversed_by_segment(
         taken = jnp.clip(path.taken - number * size, 0, size)
         given_inputs = (hand, world, *start, *commands, *grid)
         out = again.execute(given_inputs, trajectory=trajectory, states=1)
-        here = recorded(out, taken)
+        here = state_path(out, taken)
         finger_bar, state_bar, *sums = ends
         cotangents = Cotangents(finger_bar, state_bar, shown[0], shown[1:])
         cotangents_before = program.adjoint(given_inputs, here, cotangents, tuple(sums))

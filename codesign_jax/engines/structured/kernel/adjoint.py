@@ -1,7 +1,7 @@
 """The reverse-mode derivative of a whole rollout as one kernel.
 
-It goes through the recorded steps backwards, with the forward kernel's own functions and tables,
-and leaves the cotangents of the forward kernel's arguments.  A block begins at the last step that
+It goes through the stored path backwards, with the forward kernel's own functions and tables, and
+leaves the cotangents of the forward kernel's arguments.  A block begins at the last step that
 any of its worlds took.
 """
 
@@ -16,21 +16,21 @@ from codesign_jax import reuse
 from codesign_jax.compiler.launch import Kernel, launch
 from codesign_jax.engines.structured.kernel.adjoint_step import ReverseStep, TraceCotangents
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, of_step
-from codesign_jax.engines.structured.kernel.finger_contacts import FingerContactSet
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
 from codesign_jax.engines.structured.kernel.program import Program, copy_rows
 from codesign_jax.engines.structured.kernel.residual import BodyMotion
 from codesign_jax.engines.structured.kernel.residual_vjp import SHAPES
+from codesign_jax.engines.structured.kernel.self_contacts import SelfContactSet
 from codesign_jax.engines.structured.lanewise import lanes, of_code
 
 
-class RecordedPath(NamedTuple):
+class StatePath(NamedTuple):
     """What the reverse pass reads of a rollout, with a leading world axis.
 
     In a kernel the rows are those of blocks, see `Packing.by_block`.
     """
 
-    # Fingers' state before the steps that are recorded, shape (world, time, row, finger)
+    # Fingers' state before the steps that are stored, shape (world, time, row, finger)
     finger: jax.Array
     world: jax.Array  # Wrist and object alike, shape (world, time, row, 1)
     finger_end: jax.Array  # The same after the last step, shape (world, 1, row, finger)
@@ -38,15 +38,15 @@ class RecordedPath(NamedTuple):
     taken: jax.Array  # Number of steps that each world took, shape (world, 1, 1, 1)
 
 
-def recorded(out: Any, taken: jax.Array) -> RecordedPath:
-    """What `Program.execute` has recorded in blocks; `taken` as in `RecordedPath`, of blocks."""
+def state_path(out: Any, taken: jax.Array) -> StatePath:
+    """What `Program.execute` has stored in blocks; `taken` as in `StatePath`, of blocks."""
     finger_end = out[0][:, None]
     world_end = out[1][:, None]
-    return RecordedPath(out[-2], out[-1], finger_end, world_end, taken)
+    return StatePath(out[-2], out[-1], finger_end, world_end, taken)
 
 
 class Cotangents(NamedTuple):
-    """Cotangents of a rollout's results, laid out as `RecordedPath`."""
+    """Cotangents of a rollout's results, laid out as `StatePath`."""
 
     finger: jax.Array  # Of the fingers' state at the end, shape (world, 1, row, finger)
     world: jax.Array  # Of wrist and object at the end, shape (world, 1, row, 1)
@@ -74,7 +74,7 @@ class AdjointProgram(Program):
             more |= {"grip_bar": (pairings, (4,))}
         more |= {f"{s.name}.held_bar": (s.count, (3, s.k)) for s in self.sets if s.holds}
         more |= {f"bar.{k}": (1, shape) for k, shape in of_step(self.scene).items()}
-        if any(isinstance(s, FingerContactSet) for s in self.sets):
+        if any(isinstance(s, SelfContactSet) for s in self.sets):
             more |= {f"pairbar.{k}": (n + 1, getattr(SHAPES, k)) for k in BodyMotion._fields}
         if self.scene.effects.finger_palm:
             more |= {f"palmbar.{k}": (1, getattr(SHAPES, k)) for k in BodyMotion._fields}
@@ -82,7 +82,7 @@ class AdjointProgram(Program):
         self.world_bars = MemoryLayout(True, **self.world.groups)
 
     def adjoint(
-        self, inputs: tuple, path: RecordedPath, bars: Cotangents, sums: tuple | None = None
+        self, inputs: tuple, path: StatePath, bars: Cotangents, sums: tuple | None = None
     ) -> tuple:
         """Cotangents of `Program.inputs`; where a world took no step they need not be numbers.
 
@@ -122,7 +122,7 @@ class AdjointProgram(Program):
         return (*cleared, *bars[6:])
 
     def _arguments(
-        self, inputs: tuple, path: RecordedPath, bars: Cotangents, sums: tuple | None = None
+        self, inputs: tuple, path: StatePath, bars: Cotangents, sums: tuple | None = None
     ) -> tuple:
         hand, world, _, _, arm, pressure, *grid = inputs
         if sums is None:
@@ -210,8 +210,8 @@ class AdjointProgram(Program):
     ) -> None:
         """Loads the state before a step, with the step's accelerations.
 
-        A recorded row has the acceleration of the step before it, the solver's warm start.  Where a
-        world stands still they are of no use, nor need they be numbers.
+        A row of the path has the acceleration of the step before it, the solver's warm start. Where
+        a world took no step they are of no use, and need not be numbers.
         """
         fingers, worlds, finger_end, world_end = states
         after = jnp.minimum(t + 1, steps - 1)

@@ -17,12 +17,12 @@ from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, only_on, plus, pull
 from codesign_jax.engines.structured.kernel.coupling import Coupling
-from codesign_jax.engines.structured.kernel.finger_contacts import BoundFingerContacts
 from codesign_jax.engines.structured.kernel.linear_system import Elimination
 from codesign_jax.engines.structured.kernel.memory import Block, choose, loop
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
 from codesign_jax.engines.structured.kernel.residual import LinkMotion
-from codesign_jax.engines.structured.kernel.residual_vjp import FingerContactsVjp, ResidualVjp
+from codesign_jax.engines.structured.kernel.residual_vjp import ResidualVjp, SelfContactsVjp
+from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step import Step, body_after_step, joint_after_step
 from codesign_jax.engines.structured.kernel.step_memory import KernelLayout, StepMemory
@@ -86,8 +86,8 @@ class ReverseStep(Step):
         problem = Problem(self, bodies["palm"]._replace(**right))
         virtual = AdjointSolve(problem).solve()
         sweep = ResidualVjp(self, state, bodies, world_object, virtual, bars)
-        if problem.finger_pairs:
-            FingerContactsVjp(sweep, problem.finger_pairs).run()
+        if problem.self_contacts:
+            SelfContactsVjp(sweep, problem.self_contacts).run()
         metered = p.scene.effects.air_mass
         end = chambers.end_pressures(self, pressure) if metered else pressure
         base = sweep.fingers(end, self._centre_bar(centre, shown.distance))
@@ -107,7 +107,7 @@ class ReverseStep(Step):
         h = self.p.scene.discretization.timestep
         old = {n: state[n] for n in MOVED}
         after = {n: self.bars.world_state.read(n) for n in MOVED}
-        given = old, bodies["columns"], now.wrist, now.object_motion
+        given = old, bodies["columns"], now.wrist, now.object_acc
         run = partial(body_after_step, h)
         state_bars, columns, wrist, obj = pull(run, given, (), only_on(go, after))
         self.bars.add_once({"columns": columns})
@@ -150,8 +150,8 @@ class ReverseStep(Step):
         """Adds palm, wrist and object; stores their cotangents and returns those of the arm."""
         p = self.p
         now, virtual, wrist_bar = accelerations
-        still = {"acc_wrist": now.wrist, "acc_object": now.object_motion}
-        still |= {"virtual_wrist": virtual.wrist, "object_along": virtual.object_motion}
+        fixed = {"acc_wrist": now.wrist, "acc_object": now.object_acc}
+        fixed |= {"virtual_wrist": virtual.wrist, "object_along": virtual.object_acc}
         step_bars = {n: self.bars.of_step(n) for n in self.bars.names if n != "pressure"}
         base, step_bars = self.block.sum((base, step_bars))
         unit = lanes([self.like + 1.0], (), wide=False)
@@ -160,7 +160,7 @@ class ReverseStep(Step):
         acc = wrist_bar if not p.scene.effects.wrist else lanewise(jnp.zeros_like, wrist_bar)
         height = plus(step_bars["height"], lanes([shown.height], (), wide=False))
         bars = base, step_bars["columns"], step_bars["object_vel"], height, acc, unit
-        state_bars, arm_bar, constant_bars = pull(run, given, (still,), bars)
+        state_bars, arm_bar, constant_bars = pull(run, given, (fixed,), bars)
         self.bars.add_once(constant_bars)
         if p.scene.fixture:
             state_bars["position"] = plus(state_bars["position"], step_bars["position"])
@@ -187,7 +187,7 @@ class AdjointSolve(Elimination):
     """
 
     def accelerations(self, i: Any, alpha: Lanes) -> list[Lanes]:
-        return [_none(v) for v in self.problem.read("acc_bar", "motion", item=i)]
+        return [_none(v) for v in self.problem.read("acc_bar", "link_acc", item=i)]
 
     def smooth(self, i: Any) -> list[Lanes]:
         smooth, right = self.problem.read("smooth", "acc_bar", item=i)
@@ -199,30 +199,32 @@ class AdjointSolve(Elimination):
             return matrix, friction_memory.asks(self.problem, contacts, item)
         return matrix, _none(wrench)
 
-    def between_fingers(self, pairs: BoundFingerContacts, alpha: Lanes) -> None:
-        pairs.update_constraints(alpha)
-        pairs.clear_wrenches()
+    def between_fingers(self, self_contacts: BoundSelfContacts, alpha: Lanes) -> None:
+        self_contacts.update_constraints(alpha)
+        self_contacts.clear_wrenches()
         if friction_memory.pairings(self.problem.m):
-            friction_memory.load_cotangents(self.problem, pairs)
+            friction_memory.load_cotangents(self.problem, self_contacts)
 
     def solve(self) -> Iterate:
-        """Virtual accelerations of the wrist, and virtual motions of palm and object.
+        """Virtual accelerations of the wrist, and those of palm and object.
 
         Those of the fingers stay behind as "virtual" of the joints and "chain.along" of the links.
         """
         problem = self.problem
         size = self.block.size
-        still = zeros((), self.like)
-        node, work = self.backward(still)
+        no_step = zeros((), self.like)
+        node, work = self.backward(no_step)
         palm = problem.palm
         none = Iterate(*(_none(v) for v in (palm.smooth_wrist, *[palm.smooth_object] * 2)))
-        step, done = self.at_palm(none, node, self.dealt_pushes(still))
-        if (pairs := problem.finger_pairs) is not None:
+        step, done = self.at_palm(none, node, self.dealt_pushes(no_step))
+        if (self_contacts := problem.self_contacts) is not None:
             done = done._replace(work=lanewise(jnp.add, done.work, work))
             exact = float(jnp.finfo(self.like.dtype).eps) ** 1.5
-            coupling = Coupling(problem, pairs, done, tolerance=exact, iterations=ITERATIONS)
+            coupling = Coupling(
+                problem, self_contacts, done, tolerance=exact, iterations=ITERATIONS
+            )
             idle = jnp.zeros_like(self.like) > 0
-            touching = pairs.touching_now()
+            touching = self_contacts.touching_now()
             step = choose(touching, lambda: coupling.correct(step, idle), step, size)
         self._substitute(step)
         return step
@@ -236,12 +238,12 @@ class AdjointSolve(Elimination):
             def move(axes, factors, parent, obj):
                 return el.substitute(axes, el.Factors(*factors), parent, obj)
 
-            virtual, along = lanewise(move, axes, factors, parent, step.object_motion)
+            virtual, along = lanewise(move, axes, factors, parent, step.object_acc)
             problem.write("virtual", virtual, i)
             problem.write("chain.along", along, i + 1)
             return along
 
-        parent = problem.widened(step.palm_motion)
+        parent = problem.widened(step.palm_acc)
         problem.write("chain.along", parent, 0)
         loop(self.links, link, parent, self.block.size)
 

@@ -160,14 +160,14 @@ class Chambers:
 
         return lanewise(less, r, ro, total, *self._of_finger("series", "palm", "object"))
 
-    def substitute(self, z: str, motion: Lanes, object_motion: Lanes) -> None:
+    def substitute(self, z: str, palm_acc: Lanes, object_acc: Lanes) -> None:
         """Takes the chambers' part from the joints' factors, once palm and object are known."""
 
-        def pressure(series, total, palm, obj, motion, object_motion):
-            return series * (total + dot(palm, motion) + dot(obj, object_motion))
+        def pressure(series, total, palm, obj, palm_acc, object_acc):
+            return series * (total + dot(palm, palm_acc) + dot(obj, object_acc))
 
         known = self._of_finger("series", "sum", "palm", "object")
-        change = lanewise(pressure, *known, motion, object_motion)
+        change = lanewise(pressure, *known, palm_acc, object_acc)
 
         def take(z, y, inverse, change):
             return z - change * contract(inverse, y[None], 1)

@@ -22,13 +22,13 @@ from codesign_jax.engines.structured.kernel.contact_sets import (
     with_held,
     zeros,
 )
-from codesign_jax.engines.structured.kernel.finger_contacts import (
-    BoundFingerContacts,
-    FingerContactSet,
-)
 from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, MemoryLayout
 from codesign_jax.engines.structured.kernel.program import Limits, Program
 from codesign_jax.engines.structured.kernel.sdf_collision import SdfCollision
+from codesign_jax.engines.structured.kernel.self_contacts import (
+    BoundSelfContacts,
+    SelfContactSet,
+)
 from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise, of_code
@@ -43,14 +43,14 @@ FAR = 1e3
 """A gap that no ring has [m]."""
 PAIR = ("pressing", "depth")
 """Sum of the normal forces [N] and largest depth [m] of a pairing of fingers, see
-`finger_contacts`: with the other finger, or itself, and with the palm."""
+`self_contacts`: with the other finger, or itself, and with the palm."""
 
 
 class ForceProgram(Program):
     """Tables and kernel of the contact forces of states.
 
     Attributes:
-      record: Rows of what the kernel stores: for each item of a contact set the `Place` of its k
+      stored_rows: What the kernel stores: for each item of a contact set the `Place` of its k
         contacts, and "force", shape (3, k): the force on the first body [N], world axes, which is
         the finger, the palm, or the object on table and fixtures. For each pairing of fingers
         `PAIR`, shape (2,).
@@ -64,15 +64,15 @@ class ForceProgram(Program):
 
     def _tables(self) -> None:
         super()._tables()
-        record: dict[str, tuple[int, tuple[int, ...]]] = {}
+        groups: dict[str, tuple[int, tuple[int, ...]]] = {}
         for contacts in self.sets:
-            if isinstance(contacts, FingerContactSet):
-                record |= {f"{contacts.name}.{field}": (contacts.rows, (2,)) for field in PAIR}
+            if isinstance(contacts, SelfContactSet):
+                groups |= {f"{contacts.name}.{field}": (contacts.rows, (2,)) for field in PAIR}
                 continue
             shapes = place_shapes(contacts.k) | {"force": (3, contacts.k)}
             for field, shape in shapes.items():
-                record[f"{contacts.name}.{field}"] = contacts.count, shape
-        self.record = MemoryLayout(True, **record)
+                groups[f"{contacts.name}.{field}"] = contacts.count, shape
+        self.stored_rows = MemoryLayout(True, **groups)
 
     def stored(self, hand: WorldModel, state: State) -> dict[str, jax.Array]:
         """What the kernel stores, by name, shape (item, ..., finger of the block, world).
@@ -80,19 +80,19 @@ class ForceProgram(Program):
         What does not touch has no share; where no finger touches another one, nothing is stored.
         """
         worlds = state.wrist.shape[-1]
-        if not self.record.rows:
+        if not self.stored_rows.rows:
             return {}
         inputs = self.inputs(hand, state, self._commands(state))
-        (record,) = self._run(inputs)
-        unpacked = self.record.unpack(record, self.fingers, self.fingers, worlds)
-        return {name: unpacked[name] for name in self.record.groups}
+        (stored,) = self._run(inputs)
+        unpacked = self.stored_rows.unpack(stored, self.fingers, self.fingers, worlds)
+        return {name: unpacked[name] for name in self.stored_rows.groups}
 
     def shapes(self, worlds: int, dtype: Any) -> dict[str, jax.ShapeDtypeStruct]:
         """Shapes of what `stored` returns."""
         lane = self.fingers, worlds
         return {
             name: jax.ShapeDtypeStruct((count, *shape, *lane), dtype)
-            for name, (count, shape) in self.record.groups.items()
+            for name, (count, shape) in self.stored_rows.groups.items()
         }
 
     def _commands(self, state: State) -> jax.Array:
@@ -108,7 +108,10 @@ class ForceProgram(Program):
 
     def _run(self, inputs: tuple) -> list[jax.Array]:
         blocks = inputs[0].shape[0]
-        shapes = [(blocks, self.record.rows, self.size), (blocks, self.scratch.rows, self.size)]
+        shapes = [
+            (blocks, self.stored_rows.rows, self.size),
+            (blocks, self.scratch.rows, self.size),
+        ]
         call, outputs = self.call(self._force_kernel, "forces", inputs, shapes, inputs[4].dtype)
         if self.backend == "interpreter":
             return call(*inputs)[:1]
@@ -121,56 +124,56 @@ class ForceProgram(Program):
     def _force_kernel(self, *refs: Any) -> None:
         hand, world, finger_state, world_state, arm, pressure, *rest = refs
         grid = rest.pop(0) if self.meshes else None
-        record, scratch = rest
+        stored, scratch = rest
         block = Block(self.fingers, self.block)
         tables = hand, world, finger_state, world_state, scratch, grid
         step = ForceStep(self, block, *tables)
         commands = lanes([arm[0, k, block.world] for k in range(6)], (6,), wide=False)
         chamber = lanes([pressure[(0,)]], (), wide=True)
-        step.store(BoundTable(self.record, record), commands, chamber)
+        step.store(BoundTable(self.stored_rows, stored), commands, chamber)
 
 
 class ForceStep(Step):
     """The forward pass of a step, which stores the force of each contact."""
 
-    record: BoundTable
+    stored: BoundTable
 
-    def store(self, record: BoundTable, arm: Lanes, pressure: Lanes) -> None:
+    def store(self, stored: BoundTable, arm: Lanes, pressure: Lanes) -> None:
         """Stores the forces of the state's contacts; arguments as `Step.assemble`."""
-        self.record = record
+        self.stored = stored
         self.assemble(arm, pressure)
-        pairs = self.contacts.get("finger_finger")
-        if isinstance(pairs, BoundFingerContacts):
-            self._store_pairs(pairs)
+        self_contacts = self.contacts.get("finger_finger")
+        if isinstance(self_contacts, BoundSelfContacts):
+            self._store_self_contacts(self_contacts)
 
     def bound(self, contacts: ContactSet) -> BoundContacts:
         """See `Step`; contacts of fields are stored as soon as they are found."""
-        if isinstance(contacts, FingerContactSet):
+        if isinstance(contacts, SelfContactSet):
             return super().bound(contacts)
-        return StoredContacts(contacts, self.record, contacts.cone(self.constant))
+        return StoredContacts(contacts, self.stored, contacts.cone(self.constant))
 
     def fields(self, bodies: dict[str, Any], world_object: Any) -> SdfCollision:
         return EveryRing(self, bodies, world_object)
 
-    def _store_pairs(self, pairs: BoundFingerContacts) -> None:
+    def _store_self_contacts(self, contacts: BoundSelfContacts) -> None:
         def of_row(row: jax.Array, x: jax.Array) -> jax.Array:
-            alone = pairs.pairing(row).alone
+            alone = contacts.pairing(row).alone
 
             def add(item: Any, sums: list[Lanes]) -> list[Lanes]:
                 palm = jnp.zeros_like(self.like)
                 if alone is not None:
-                    palm = jnp.where(alone & (pairs.read("other", item).lane < 0.5), 1.0, palm)
+                    palm = jnp.where(alone & (contacts.read("other", item).lane < 0.5), 1.0, palm)
                 side = lanes([palm], (), wide=True)
-                with pairs.with_cone(row, item):
-                    given = pairs.place(item), pairs.cone, pairs.read("jar", item)
+                with contacts.with_cone(row, item):
+                    given = contacts.place(item), contacts.cone, contacts.read("jar", item)
                     return lanewise(with_slot, sums, side, *given)
 
             none = zeros((2,), self.like)
-            for name, value in zip(PAIR, pairs.fold(row, add, [none, none]), strict=True):
-                self.record.write(f"{pairs.set.name}.{name}", value, row)
+            for name, value in zip(PAIR, contacts.fold(row, add, [none, none]), strict=True):
+                self.stored.write(f"{contacts.set.name}.{name}", value, row)
             return x
 
-        jax.lax.fori_loop(0, pairs.set.rows, of_row, jnp.int32(0))
+        jax.lax.fori_loop(0, contacts.set.rows, of_row, jnp.int32(0))
 
 
 class StoredContacts(BoundContacts):
@@ -180,8 +183,8 @@ class StoredContacts(BoundContacts):
         self,
         item: Any,
         place: Place,
-        motion: Lanes,
-        velocity: Lanes,
+        acc: Lanes,
+        vel: Lanes,
         friction: Lanes | None = None,
         hold: tuple[Lanes, Lanes] | None = None,
     ) -> None:
@@ -189,7 +192,7 @@ class StoredContacts(BoundContacts):
         cone = self.cone
         if friction is not None:
             cone = lanewise(Cone.of_friction, cone, friction[0])
-        place, jar = lanewise(partial(begun, margin(self.set.scene)), place, cone, motion, velocity)
+        place, jar = lanewise(partial(begun, margin(self.set.scene)), place, cone, acc, vel)
         if hold is not None:
             jar = lanewise(with_held, jar, place, cone, hold[0])
         force = lanewise(solved_force, place, cone, jar)

@@ -1,6 +1,8 @@
-"""Contacts in the kernel, one item (a link, or a group of slots) at a time.
+"""Contact sets: the contacts of a pair of bodies, one item (a link, or a group of slots) at a time.
 
-Where no lane of the block has an active contact, the item is skipped.
+Where no lane of the block has an active contact, the item is skipped.  Here a contact has a fixed
+place in memory.  Derived from it are contacts that get a slot (`slots`), contacts of the hand with
+itself (`self_contacts`), and contacts that the lanes of a team share (`team_contacts`).
 """
 
 from collections.abc import Callable
@@ -32,7 +34,7 @@ from codesign_jax.scene import Scene
 ROWS = {"none": (3, 2), "coulomb": (3, 5), "full": (6, 5)}
 # Fields of a cone that a friction model does not need.
 NEEDLESS = {
-    "none": ("tangent", "friction", "ratio", "spin", "roll"),
+    "none": ("tangential_mass", "friction", "regularized_friction", "spin", "roll"),
     "coulomb": ("spin", "roll"),
     "full": (),
 }
@@ -72,7 +74,7 @@ class ContactSet:
         self.size = size
         self.on_object = name.endswith("_object")
         self.own_friction = own_friction(scene, name)
-        # Contacts between fingers share what they hold, see `friction_memory`.
+        # Self-contacts share what they hold, see `friction_memory`.
         self.holds = name in held(scene) and name != "finger_finger"
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
@@ -147,21 +149,21 @@ class BoundContacts:
         self,
         item: Any,
         place: Place,
-        motion: Lanes,
-        velocity: Lanes,
+        acc: Lanes,
+        vel: Lanes,
         friction: Lanes | None = None,
         hold: tuple[Lanes, Lanes] | None = None,
     ) -> None:
         """Stores contacts of a link's or a group's places.
 
         Args:
-          motion: Relative motion of the bodies, (6, ...); `velocity`: their relative velocity.
+          acc: Relative spatial acceleration of the bodies, (6, ...); `vel`: relative velocity.
           friction: Coulomb coefficients (1, k) of contacts that have their own.
           hold: What they hold of friction, (3, k), along the world's axes and as it is kept.
         """
         if friction is not None:
             self.write("friction", friction, item)
-        place, jar = self.begin(item, place, motion, velocity)
+        place, jar = self.begin(item, place, acc, vel)
         more = {}
         if hold is not None:
             jar = lanewise(with_held, jar, place, self.cone_at(item), hold[0])
@@ -174,10 +176,10 @@ class BoundContacts:
 
         jax.lax.cond(self.touching(item), store, lambda: None)
 
-    def begin(self, item: Any, place: Place, motion: Lanes, velocity: Lanes) -> tuple[Place, Lanes]:
+    def begin(self, item: Any, place: Place, acc: Lanes, vel: Lanes) -> tuple[Place, Lanes]:
         """Places whose share is zero where no candidate is, and their jar."""
         run = partial(begun, margin(self.set.scene))
-        return lanewise(run, place, self.cone_at(item), motion, velocity)
+        return lanewise(run, place, self.cone_at(item), acc, vel)
 
     def each_item(self, body: Callable[[Any], None]) -> None:
         """Runs body(item), which stores something, for all items."""
@@ -204,7 +206,7 @@ class BoundContacts:
         return full(triangle), wrench
 
     def _inertia_and_wrench(self, item: Any, alpha: Lanes) -> list[Lanes]:
-        # All is read before anything is stored, see `finger_contacts.OwnSide`.
+        # All is read before anything is stored, see `self_contacts.OwnSide`.
         jar = self.read("jar", item)
         step = self.read("step", item)
         place = self.place(item)
@@ -246,7 +248,7 @@ class BoundContacts:
         return lanewise(count, share, cone, self.read("ray", item), alpha)
 
     def prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:
-        """Stores the contacts' cost along a relative motion (6, ...); returns its slope at 0."""
+        """Stores the cost along a step (6, ...) of the acceleration; returns its slope at 0."""
         return self.if_touching(item, lambda: [self._prepare_linesearch(item, step)], [()])[0]
 
     def _prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:
@@ -317,10 +319,10 @@ def kept(place: Place, jar: Lanes) -> dict[str, Lanes]:
 
 
 def begun(
-    margin: float, place: Place, cone: Cone, motion: jax.Array, velocity: jax.Array
+    margin: float, place: Place, cone: Cone, acc: jax.Array, vel: jax.Array
 ) -> tuple[Place, jax.Array]:
     c = ContactSet.contacts(place, cone)
-    speed = c.relative(velocity[:, None])
+    speed = c.relative(vel[:, None])
     approach = -dot(place.normal, speed)
     share = contact.candidates(place.share, place.gap, approach, cone, margin)
-    return place._replace(share=share), c.relative(motion[:, None]) - c.reference(speed)
+    return place._replace(share=share), c.relative(acc[:, None]) - c.reference(speed)

@@ -1,7 +1,7 @@
-"""Newton steps with contacts between fingers, inside a kernel: conjugate gradients in their forces.
+"""Newton steps with self-contacts, inside a kernel: conjugate gradients in their forces.
 
 With these contacts the Newton matrix is H = P + J'KJ, P what the elimination solves, K the Hessians
-of the contacts between fingers and J their Jacobian.  H x = g is solved by conjugate gradients
+of the self-contacts and J their Jacobian.  H x = g is solved by conjugate gradients
 preconditioned with P, started at P^-1 g (Nocedal and Wright, Numerical Optimization, 2006, ch. 5).
 P^-1 H is the identity but for three directions a contact, so that the iteration ends after at most
 3 n + 1 steps for n contacts, and often far earlier.  Since H >= P, the residual r has
@@ -21,12 +21,12 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
-from codesign_jax.engines.structured.kernel.finger_contacts import (
-    BoundFingerContacts,
-    FingerPairing,
-)
 from codesign_jax.engines.structured.kernel.memory import anywhere, loop
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
+from codesign_jax.engines.structured.kernel.self_contacts import (
+    BoundSelfContacts,
+    FingerPairing,
+)
 from codesign_jax.engines.structured.lanes import contract, dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 
@@ -50,19 +50,19 @@ class Eliminated(NamedTuple):
 
 
 class Coupling:
-    """Corrects a Newton step for the contacts between fingers."""
+    """Corrects a Newton step for the self-contacts."""
 
     def __init__(
         self,
         problem: Problem,
-        pairs: BoundFingerContacts,
+        self_contacts: BoundSelfContacts,
         done: Eliminated,
         *,
         tolerance: float = TOLERANCE,
         iterations: int = ITERATIONS,
     ):
         self.problem = problem
-        self.pairs = pairs
+        self.contacts = self_contacts
         self.done = done
         self.tolerance = tolerance
         self.iterations = iterations
@@ -93,7 +93,7 @@ class Coupling:
             sound = misses(size, work) & (curvature > 0)
             length = jnp.where(sound, size / jnp.where(sound, curvature, ones), none)
             # The step of a world that has converged has length zero: its contacts add nothing.
-            with self.pairs.only(sound):
+            with self.contacts.only(sound):
                 work = work + length * self._advance(length, turn)
                 new, bent = self._products()
             # A world that has converged keeps its values: they must not depend on other worlds.
@@ -114,44 +114,46 @@ class Coupling:
         jax.lax.fori_loop(0, self.links, add, jnp.int32(0))
 
     def _begin(self, busy: Lanes) -> None:
-        """Stores the first residual, and the contacts' relative motion by the uncorrected step."""
-        pairs = self.pairs
-        pairs.clear_wrenches()
+        """Stores the first residual, and the relative accelerations by the uncorrected step."""
+        contacts = self.contacts
+        contacts.clear_wrenches()
 
         def store(item: Any, pairing: FingerPairing) -> None:
-            side = pairs.own_side(item)
-            hessian = pairs.read("hessian", item)
-            change = pairs.relative(item, pairing)
-            left = lanewise(lambda b, f: jnp.where(b, -f, 0.0), busy, pairs.stiff(hessian, change))
+            side = contacts.own_side(item)
+            hessian = contacts.read("hessian", item)
+            change = contacts.relative(item, pairing)
+            left = lanewise(
+                lambda b, f: jnp.where(b, -f, 0.0), busy, contacts.stiff(hessian, change)
+            )
             none = lanewise(jnp.zeros_like, left)
             fields = {"first": change, "left": left, "along": none, "moved": none, "sum": none}
             for field, value in fields.items():
-                pairs.write(field, value, item)
-            pairs.load(item, side, left, pairing)
+                contacts.write(field, value, item)
+            contacts.load(item, side, left, pairing)
 
-        pairs.do(store)
+        contacts.do(store)
 
     def _products(self) -> tuple[jax.Array, jax.Array]:
-        """Applies P^-1 J' to the residual; "answer" is the contacts' relative motion by that.
+        """Applies P^-1 J' to the residual; "answer" is the contacts' relative acceleration by that.
 
         Returns the product of the residual with it, and its curvature, shape (lane,) each.
         """
-        pairs = self.pairs
+        contacts = self.contacts
         self.substitute("z_again", self.again())
 
         def add(item: Any, pairing: FingerPairing, sums: list[Lanes]) -> list[Lanes]:
-            left = pairs.read("left", item)
-            hessian = pairs.read("hessian", item)
-            answer = pairs.relative(item, pairing)
-            pairs.write("answer", answer, item)
+            left = contacts.read("left", item)
+            hessian = contacts.read("hessian", item)
+            answer = contacts.relative(item, pairing)
+            contacts.write("answer", answer, item)
 
             def both(sums, half, left, answer, force):
                 product, stiff = (half * sum_axis(dot(v, answer), 0) for v in (left, force))
                 return [sums[0] + product, sums[1] + product + stiff]
 
-            return lanewise(both, sums, pairing.half, left, answer, pairs.stiff(hessian, answer))
+            return lanewise(both, sums, pairing.half, left, answer, contacts.stiff(hessian, answer))
 
-        sums = pairs.each(add, [zeros((), self.problem.like)] * 2)
+        sums = contacts.each(add, [zeros((), self.problem.like)] * 2)
         size, bent = (self.block.total(v.lane) for v in sums)
         return size, bent
 
@@ -160,8 +162,8 @@ class Coupling:
 
         What is left of the residual is laid on the sides.
         """
-        pairs = self.pairs
-        pairs.clear_wrenches()
+        contacts = self.contacts
+        contacts.clear_wrenches()
         alpha, beta = (lanes([v], (), wide=False) for v in (length, turn))
         names = ("left", "answer", "along", "moved", "sum")
 
@@ -171,35 +173,35 @@ class Coupling:
             return along, moved, total_ + alpha * along, left - alpha * along
 
         def store(item: Any, pairing: FingerPairing, gain: Lanes) -> Lanes:
-            side = pairs.own_side(item)
-            hessian = pairs.read("hessian", item)
-            old = [pairs.read(name, item) for name in names]
-            first = pairs.read("first", item)
+            side = contacts.own_side(item)
+            hessian = contacts.read("hessian", item)
+            old = [contacts.read(name, item) for name in names]
+            first = contacts.read("first", item)
             along, moved, total_, left = lanewise(move, alpha, beta, *old)
-            stiff = pairs.stiff(hessian, moved)
+            stiff = contacts.stiff(hessian, moved)
             left = lanewise(lambda a, r, f: r - a * f, alpha, left, stiff)
             for name, value in zip(("left", *names[2:]), (left, along, moved, total_), strict=True):
-                pairs.write(name, value, item)
-            pairs.load(item, side, left, pairing)
+                contacts.write(name, value, item)
+            contacts.load(item, side, left, pairing)
 
             def add(gain, half, along, first):
                 return gain + half * sum_axis(dot(along, first), 0)
 
             return lanewise(add, gain, pairing.half, along, first)
 
-        gain = pairs.each(store, zeros((), self.problem.like))
+        gain = contacts.each(store, zeros((), self.problem.like))
         return self.block.total(gain.lane)
 
     def _result(self, kept: Lanes) -> Iterate:
         """Solves once more, with the sum of all steps; where that is no descent, without it."""
-        pairs = self.pairs
-        pairs.clear_wrenches()
+        contacts = self.contacts
+        contacts.clear_wrenches()
 
         def store(item: Any, pairing: FingerPairing) -> None:
-            value = lanewise(lambda k, s: jnp.where(k, s, 0.0), kept, pairs.read("sum", item))
-            pairs.load(item, pairs.own_side(item), value, pairing)
+            value = lanewise(lambda k, s: jnp.where(k, s, 0.0), kept, contacts.read("sum", item))
+            contacts.load(item, contacts.own_side(item), value, pairing)
 
-        pairs.do(store)
+        contacts.do(store)
         return self.again()
 
     # One more right side
@@ -210,7 +212,7 @@ class Coupling:
 
         def step(i: Any, carry: tuple) -> tuple:
             names = ("axes", "w", "g", "inverse")
-            push = self.pairs.pushed(i + 1)
+            push = self.contacts.pushed(i + 1)
             factors = self.problem.read(*names, item=i)
             r, ro, z = lanewise(_again, carry, factors, push)
             self.problem.write("z_again", z, i)
@@ -222,7 +224,7 @@ class Coupling:
         r = self.problem.add_first(r)
         at_palm = self._palm(*self.block.sum((r, ro)))
         if chambers:
-            chambers.substitute("z_again", at_palm.palm_motion, at_palm.object_motion)
+            chambers.substitute("z_again", at_palm.palm_acc, at_palm.object_acc)
         return at_palm
 
     def _palm(self, r: Lanes, ro: Lanes) -> Iterate:
@@ -230,7 +232,7 @@ class Coupling:
         return lanewise(solve_palm_again, self.done, palm.axes, palm.armature, r, ro)
 
     def substitute(self, z: str, step: Iterate) -> None:
-        """Leaves the links' motion with the sides, see `LineSearch.prepare`."""
+        """Leaves the links' accelerations with the sides, see `LineSearch.prepare`."""
 
         def link(i: Any, parent: Lanes) -> Lanes:
             axes, *factors = self.problem.read("axes", "w", "g", z, item=i)
@@ -238,12 +240,12 @@ class Coupling:
             def move(axes, factors, parent, obj):
                 return el.substitute(axes, el.Factors(*factors), parent, obj)[1]
 
-            moved = lanewise(move, axes, factors, parent, step.object_motion)
-            self.pairs.put("motion", moved, i + 1)
+            moved = lanewise(move, axes, factors, parent, step.object_acc)
+            self.contacts.put("link_acc", moved, i + 1)
             return moved
 
-        parent = self.problem.widened(step.palm_motion)
-        self.pairs.put("motion", parent, 0)
+        parent = self.problem.widened(step.palm_acc)
+        self.contacts.put("link_acc", parent, 0)
         loop(self.links, link, parent, self.block.size)
 
 
@@ -274,9 +276,9 @@ def solve_palm_again(
         kept.append(new)
         work = None if work is None else work + dot(y, new.z)
     obj = el.solve_object(done.q, ro)
-    first, motion = el.substitute(slides, kept[1], jnp.zeros_like(obj), obj)
-    second, motion = el.substitute(axes, kept[0], motion, obj)
-    step = Iterate(jnp.concatenate([first, second]), motion, obj)
+    first, slides_acc = el.substitute(slides, kept[1], jnp.zeros_like(obj), obj)
+    second, palm_acc = el.substitute(axes, kept[0], slides_acc, obj)
+    step = Iterate(jnp.concatenate([first, second]), palm_acc, obj)
     return step if work is None else (step, work + dot(ro, obj))
 
 

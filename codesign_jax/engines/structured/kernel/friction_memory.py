@@ -23,12 +23,12 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, only_on, plus, pull
-from codesign_jax.engines.structured.kernel.finger_contacts import (
-    BoundFingerContacts,
-    FingerPairing,
-)
 from codesign_jax.engines.structured.kernel.memory import tree_add_scaled
 from codesign_jax.engines.structured.kernel.problem import Problem
+from codesign_jax.engines.structured.kernel.self_contacts import (
+    BoundSelfContacts,
+    FingerPairing,
+)
 from codesign_jax.engines.structured.kernel.shared_memory import team_sum
 from codesign_jax.engines.structured.kernel.slots import any_of, only
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
@@ -50,11 +50,11 @@ def pairings(step: StepMemory) -> int:
     return step.p.held.get("finger_finger", 0)
 
 
-def of_row(step: StepMemory, pairs: BoundFingerContacts, row: Any) -> list[Lanes]:
+def of_row(step: StepMemory, self_contacts: BoundSelfContacts, row: Any) -> list[Lanes]:
     """What the fingers of a pairing's row hold, (3,) or nothing if the scene has no such state."""
     if not pairings(step):
         return []
-    return [step.finger_state.read(GRIP, row + pairs.set.first)]
+    return [step.finger_state.read(GRIP, row + self_contacts.set.first)]
 
 
 def of_item(step: StepMemory, contacts: BoundContacts, item: Any) -> tuple[Lanes, Lanes] | None:
@@ -127,10 +127,10 @@ def _store(step: StepMemory, contacts: BoundContacts, mask: Lanes) -> None:
     jax.lax.fori_loop(0, step.p.held[contacts.set.name] // k, store_item, jnp.int32(0))
 
 
-def sums(pairs: BoundFingerContacts, row: Any, alpha: Lanes, grip: Lanes) -> Lanes:
+def sums(self_contacts: BoundSelfContacts, row: Any, alpha: Lanes, grip: Lanes) -> Lanes:
     """Sums of `holding.hold`, (4,), of a row's contacts where the last step has moved jar."""
-    contacts = pairs.set.contacts
-    pairing = pairs.pairing(row)
+    contacts = self_contacts.set.contacts
+    pairing = self_contacts.pairing(row)
 
     def add(sums, place, cone, alpha, jar, step, grip, counts):
         c = contacts(place, cone)
@@ -138,15 +138,24 @@ def sums(pairs: BoundFingerContacts, row: Any, alpha: Lanes, grip: Lanes) -> Lan
         return sums + counts * sum_axis(holding.hold(c, force, grip[:, None]), 1)
 
     def slot(item: Any, sums: Lanes) -> Lanes:
-        jar = pairs.read("jar", item)
-        step = pairs.read("step", item)
-        counts = pairs.holds(item, pairing)
-        with pairs.with_cone(row, item):
-            args = sums, pairs.place(item), pairs.cone, alpha, jar, step, grip, counts
+        jar = self_contacts.read("jar", item)
+        step = self_contacts.read("step", item)
+        counts = self_contacts.holds(item, pairing)
+        with self_contacts.with_cone(row, item):
+            args = (
+                sums,
+                self_contacts.place(item),
+                self_contacts.cone,
+                alpha,
+                jar,
+                step,
+                grip,
+                counts,
+            )
             return lanewise(add, *args)
 
-    added = pairs.fold(row, slot, zeros((4,), pairs.like))
-    return added if pairs.block.team == 1 else team_sum(pairs.block, added)
+    added = self_contacts.fold(row, slot, zeros((4,), self_contacts.like))
+    return added if self_contacts.block.team == 1 else team_sum(self_contacts.block, added)
 
 
 def keep(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
@@ -206,23 +215,23 @@ def behind(
 
 
 def _keep_of_fingers(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
-    pairs = problem.finger_pairs
-    assert pairs is not None
+    self_contacts = problem.self_contacts
+    assert self_contacts is not None
 
     def keep_all() -> None:
         mask = lanes([which], (), wide=True)
-        first = pairs.set.first
+        first = self_contacts.set.first
 
         def keep_row(row: jax.Array, x: jax.Array) -> jax.Array:
             before, old = problem.read(GRIP, "new_grip", item=row + first)
-            new = lanewise(holding.quotient, sums(pairs, row, alpha, before))
+            new = lanewise(holding.quotient, sums(self_contacts, row, alpha, before))
             problem.write("new_grip", lanewise(jnp.where, mask, new, old), row + first)
             return x
 
-        jax.lax.fori_loop(0, pairs.set.rows, keep_row, jnp.int32(0))
+        jax.lax.fori_loop(0, self_contacts.set.rows, keep_row, jnp.int32(0))
 
-    with only([pairs], which):
-        any_of(which & pairs.touching_worlds(), keep_all)
+    with only([self_contacts], which):
+        any_of(which & self_contacts.touching_worlds(), keep_all)
 
 
 def reverse(step: StepMemory, bars: CotangentTables, go: Lanes) -> None:
@@ -298,22 +307,22 @@ def asks(problem: Problem, contacts: BoundContacts, item: Any) -> Lanes:
 
 
 def _reverse_fingers(
-    step: StepMemory, bars: CotangentTables, pairs: BoundFingerContacts, go: Lanes
+    step: StepMemory, bars: CotangentTables, self_contacts: BoundSelfContacts, go: Lanes
 ) -> None:
     """Makes the cotangents of the state after the step those of the sums of `holding.hold`.
 
     What a finger holds is the opposite of what its partner holds.
     """
     state = bars.finger_state
-    still = zeros((), step.like)
+    no_step = zeros((), step.like)
 
     for item in range(pairings(step)):
-        row = item - pairs.set.first
+        row = item - self_contacts.set.first
         mine = state.read(GRIP, item)
         grip_bar = zeros((4,), step.like)
-        if 0 <= row < pairs.set.rows:
-            ended = sums(pairs, row, still, step.finger_state.read(GRIP, item))
-            theirs = pairs.pairing(row).swap(mine)
+        if 0 <= row < self_contacts.set.rows:
+            ended = sums(self_contacts, row, no_step, step.finger_state.read(GRIP, item))
+            theirs = self_contacts.pairing(row).swap(mine)
             both = lanewise(jnp.subtract, mine, theirs) if item else mine
             (grip_bar,) = pull(holding.quotient, (ended,), (), only_on(go, both))
         step.scratch.write("grip_bar", grip_bar, item)
@@ -342,13 +351,13 @@ def leave(bars: CotangentTables, pairing: FingerPairing, grip_bars: tuple) -> No
     state.scatter(GRIP, new, item, lane)
 
 
-def load_cotangents(problem: Problem, pairs: BoundFingerContacts) -> None:
+def load_cotangents(problem: Problem, self_contacts: BoundSelfContacts) -> None:
     """Loads the links with what "grip_bar" asks of the step's accelerations.
 
     A change of jar changes a contact's force by -K; with r the derivative of the sums by the
     force, the cotangent of jar is -K r.
     """
-    contacts = pairs.set.contacts
+    contacts = self_contacts.set.contacts
     lane = problem.block.lane
 
     def of_held(force, place, cone, held, bars):
@@ -356,22 +365,22 @@ def load_cotangents(problem: Problem, pairs: BoundFingerContacts) -> None:
 
     def load(item: Any, pairing: FingerPairing) -> None:
         which = pairing.number
-        side = pairs.own_side(item)
-        jar = pairs.read("jar", item)
+        side = self_contacts.own_side(item)
+        jar = self_contacts.read("jar", item)
 
         def response(place, cone, jar):
             return contact.constraint_update(contacts(place, cone), jar).force
 
-        force = lanewise(response, side.place, pairs.cone, jar)
+        force = lanewise(response, side.place, self_contacts.cone, jar)
         held = problem.m.finger_state.gather(GRIP, which, lane)
         bars = problem.m.scratch.gather("grip_bar", which, lane)
         unit = lanes([problem.like + 1.0], (), wide=True)
-        (r,) = pull(of_held, (force,), (side.place, pairs.cone, held, bars), unit)
-        r = lanewise(jnp.multiply, pairs.holds(item, pairing), r)
-        change = lanewise(jnp.negative, pairs.stiff(pairs.read("hessian", item), r))
-        pairs.load(item, side, change, pairing)
+        (r,) = pull(of_held, (force,), (side.place, self_contacts.cone, held, bars), unit)
+        r = lanewise(jnp.multiply, self_contacts.holds(item, pairing), r)
+        change = lanewise(jnp.negative, self_contacts.stiff(self_contacts.read("hessian", item), r))
+        self_contacts.load(item, side, change, pairing)
 
-    pairs.do(load)
+    self_contacts.do(load)
 
 
 def held_work(

@@ -35,7 +35,7 @@ def steady(problem: Problem, alpha: Lanes, *, between: bool) -> jax.Array:
 
     Args:
       alpha: Length of the step.
-      between: Whether contacts between fingers count.
+      between: Whether self-contacts count.
     """
     block = problem.block
     count = zeros((), problem.like)
@@ -62,7 +62,7 @@ class ChordStep:
     ch. 7), at a sixth of an iteration's cost, and their decrement is what the iteration would have
     found.
 
-    The matrix P lacks the contacts between fingers, whose cost is convex: with them the decrement
+    The matrix P lacks the self-contacts, whose cost is convex: with them the decrement
     is smaller than the one that P gives. Such a world does not go along the step, as P may be too
     soft.
     """
@@ -87,15 +87,15 @@ class ChordStep:
         problem = self.problem
         if chambers := problem.chambers:
             chambers.move(alpha)
-        if problem.finger_pairs:
-            problem.finger_pairs.update_wrenches(alpha)
+        if problem.self_contacts:
+            problem.self_contacts.update_wrenches(alpha)
 
         def again(alpha, carry, body, moved, forces, factors, pushes, pair):
             r, ro, work = carry
             axes, armature, *kept = factors
-            acc, motion = (a + alpha * b for a, b in moved)
+            acc, link_acc = (a + alpha * b for a, b in moved)
             smooth, tau = forces
-            push = total([smooth - make_body(*body).times(motion), *pushes.values()])
+            push = total([smooth - make_body(*body).times(link_acc), *pushes.values()])
             ro = total([ro, *(-w for name, w in pushes.items() if name == "finger_object")])
             tau = tau - armature * acc
             r = r + push if pair is None else r + push + pair
@@ -105,10 +105,10 @@ class ChordStep:
             return (r, ro, work + dot(y, new.z)), new.z
 
         def link(i: Any, carry: tuple) -> tuple:
-            names = [("acc", "step_acc"), ("motion", "step_motion")]
+            names = [("acc", "step_acc"), ("link_acc", "step_link_acc")]
             moved = [problem.read(*pair, item=i) for pair in names]
             pushes = {c.set.name: c.wrench(i, alpha) for c in problem.per_link}
-            pair = problem.finger_pairs.pushed(i + 1) if problem.finger_pairs else None
+            pair = problem.self_contacts.pushed(i + 1) if problem.self_contacts else None
             factors = problem.read("axes", "armature", "w", "g", "inverse", item=i)
             forces = problem.read("smooth", "tau", item=i)
             args = alpha, carry, problem.body_of(i), moved, forces, factors, pushes, pair
@@ -122,12 +122,12 @@ class ChordStep:
         if chambers:
             r, ro, less = chambers.close_again("z_again", r, ro)
             work = lanewise(jnp.subtract, work, less)
-        r = problem.add_first(r) if problem.finger_pairs else r
+        r = problem.add_first(r) if problem.self_contacts else r
         r, ro, work = self.block.sum((r, ro, work))
         given = now, problem.palm, done, r, ro, work, self._pushes(alpha)
         step, work = lanewise(self._at_palm, *given)
         if chambers:
-            chambers.substitute("z_again", step.palm_motion, step.object_motion)
+            chambers.substitute("z_again", step.palm_acc, step.object_acc)
         return step, work
 
     def _pushes(self, alpha: Lanes) -> dict[str, Lanes]:
@@ -144,8 +144,8 @@ class ChordStep:
 
     @staticmethod
     def _at_palm(now: Iterate, palm, done: Eliminated, r, ro, work, pushes: dict) -> tuple:
-        r = r + palm.smooth_palm - palm.palm.times(now.palm_motion)
-        ro = ro + palm.smooth_object - palm.object.times(now.object_motion)
+        r = r + palm.smooth_palm - palm.palm.times(now.palm_acc)
+        ro = ro + palm.smooth_object - palm.object.times(now.object_acc)
         for name, wrench in pushes.items():
             r = r + wrench if name.startswith("palm") else r
             ro = ro - wrench if name == "palm_object" else ro
@@ -162,15 +162,15 @@ class ChordStep:
         mask = lanes([taken], (), wide=True)
 
         def move(parent, obj, axes, factors, before, alpha, taken):
-            a, motion = el.substitute(axes, el.Factors(*factors), parent, obj)
-            return motion, jnp.where(taken, tree_add_scaled(alpha, a, before), before)
+            a, link_acc = el.substitute(axes, el.Factors(*factors), parent, obj)
+            return link_acc, jnp.where(taken, tree_add_scaled(alpha, a, before), before)
 
         def link(i: Any, parent: Lanes) -> Lanes:
             axes, before = problem.read("axes", "step_acc", item=i)
             factors = problem.read("w", "g", "z_again", item=i)
-            args = step.object_motion, axes, factors, before, alpha, mask
-            motion, acc = lanewise(move, parent, *args)
+            args = step.object_acc, axes, factors, before, alpha, mask
+            link_acc, acc = lanewise(move, parent, *args)
             problem.write("step_acc", acc, i)
-            return motion
+            return link_acc
 
-        loop(self.links, link, problem.widened(step.palm_motion), self.block.size)
+        loop(self.links, link, problem.widened(step.palm_acc), self.block.size)

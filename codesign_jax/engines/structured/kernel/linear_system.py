@@ -10,17 +10,17 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.coupling import Eliminated
-from codesign_jax.engines.structured.kernel.finger_contacts import BoundFingerContacts
 from codesign_jax.engines.structured.kernel.memory import choose, either, full, loop, upper
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem, make_body
+from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.lanes import contract, dot, sum_fingers, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 
 
-def load_link(node, body, motion, smooth, pair):
-    """Adds a link's inertia, and the forces that its motion leaves unbalanced, to a node."""
+def load_link(node, body, link_acc, smooth, pair):
+    """Adds a link's inertia, and the forces that its acceleration leaves unbalanced, to a node."""
     link = make_body(*body)
-    push = smooth - link.times(motion)
+    push = smooth - link.times(link_acc)
     push = push if pair is None else push + pair
     return node._replace(p=node.p + link.matrix(), r=node.r + push)
 
@@ -52,7 +52,7 @@ class Elimination:
     def backward(self, alpha: Lanes) -> tuple[el.Quadratic, Lanes]:
         """Eliminates the fingers from their tips.
 
-        Accelerations, motions and jar move by `alpha`, the length of the last step, first: so they
+        Accelerations and jar move by `alpha`, the length of the last step, first: so they
         are read once an iteration.
 
         Returns:
@@ -61,17 +61,17 @@ class Elimination:
         problem = self.problem
         if problem.chambers:
             problem.chambers.move(alpha)
-        if problem.finger_pairs:
-            self.between_fingers(problem.finger_pairs, alpha)
+        if problem.self_contacts:
+            self.between_fingers(problem.self_contacts, alpha)
 
         def step(i: Any, carry: tuple) -> tuple:
             node, work = carry
-            acc, motion = self.accelerations(i, alpha)
+            acc, link_acc = self.accelerations(i, alpha)
             smooth, tau = self.smooth(i)
             axes, armature = problem.read("axes", "armature", item=i)
-            pair = problem.finger_pairs.pushed(i + 1) if problem.finger_pairs else None
+            pair = problem.self_contacts.pushed(i + 1) if problem.self_contacts else None
             node = node._replace(p=full(node.p), q=full(node.q))
-            node = lanewise(load_link, node, problem.body_of(i), motion, smooth, pair)
+            node = lanewise(load_link, node, problem.body_of(i), link_acc, smooth, pair)
             for contacts in problem.per_link:
                 node = self.add_contacts(node, contacts, i, alpha)
             forces = axes, armature, tau, acc
@@ -89,7 +89,7 @@ class Elimination:
                 node, more = ways[1]()
             else:
                 node, more = either(i <= last_touching, *ways, self.block.size)
-            return node, lanewise(jnp.add, work, more) if problem.finger_pairs else work
+            return node, lanewise(jnp.add, work, more) if problem.self_contacts else work
 
         empty = [zeros(s, self.like) for s in ((21,), (6, 6), (21,), (6,), (6,))]
         start = (el.Quadratic(*empty), zeros((), self.like))
@@ -97,7 +97,7 @@ class Elimination:
         node, work = loop(self.links, step, start, self.block.size, reverse=True)
         if problem.chambers:
             node, work = problem.chambers.close(node, work)
-        if problem.finger_pairs:
+        if problem.self_contacts:
             node = node._replace(r=problem.add_first(node.r))
             work = self.block.sum(work)
         node = self.block.sum(node)
@@ -107,7 +107,7 @@ class Elimination:
 
     def accelerations(self, i: Any, alpha: Lanes) -> list[Lanes]:
         """Accelerations of a joint and of the link behind it."""
-        return [self.problem.move(name, i, alpha) for name in ("acc", "motion")]
+        return [self.problem.move(name, i, alpha) for name in ("acc", "link_acc")]
 
     def smooth(self, i: Any) -> list[Lanes]:
         """Smooth forces on a link and on the joint before it."""
@@ -116,8 +116,8 @@ class Elimination:
     def of_contacts(self, contacts: BoundContacts, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
         return contacts.inertia_and_wrench(item, alpha)
 
-    def between_fingers(self, pairs: BoundFingerContacts, alpha: Lanes) -> None:
-        pairs.update_constraints(alpha)
+    def between_fingers(self, self_contacts: BoundSelfContacts, alpha: Lanes) -> None:
+        self_contacts.update_constraints(alpha)
 
     def add_contacts(
         self, node: el.Quadratic, contacts: BoundContacts, i: Any, alpha: Lanes
@@ -177,15 +177,15 @@ class Elimination:
                 kept.append(new)
                 work.append(dot(y, new.factors.z))
             obj = el.solve_object(node.q, node.r_object)
-            first, motion = el.substitute(axes[1], kept[1].factors, jnp.zeros_like(obj), obj)
-            second, motion = el.substitute(axes[0], kept[0].factors, motion, obj)
-            step = Iterate(jnp.concatenate([first, second]), motion, obj)
+            first, slides_acc = el.substitute(axes[1], kept[1].factors, jnp.zeros_like(obj), obj)
+            second, palm_acc = el.substitute(axes[0], kept[0].factors, slides_acc, obj)
+            step = Iterate(jnp.concatenate([first, second]), palm_acc, obj)
             work = total([*work, dot(node.r_object, obj)])
             return step, Eliminated(kept[0], kept[1], node.q, work)
 
         step, done = lanewise(solve, now, self.problem.palm, node, slots)
         if self.problem.chambers:
-            self.problem.chambers.substitute("z", step.palm_motion, step.object_motion)
+            self.problem.chambers.substitute("z", step.palm_acc, step.object_acc)
         return step, done
 
 

@@ -42,10 +42,10 @@ class LineSearch:
         """
         problem = self.problem
 
-        def substitute(parent, obj, body, motion, smooth, tau, axes, armature, acc, factors):
+        def substitute(parent, obj, body, link_acc, smooth, tau, axes, armature, acc, factors):
             a, moved = el.substitute(axes, el.Factors(*factors), parent, obj)
             link = make_body(*body)
-            force = smooth - link.times(motion)
+            force = smooth - link.times(link_acc)
             joints = [(armature[k] * acc[k] - tau[k]) * a[k] for k in range(a.shape[0])]
             slope = total(joints) - dot(force, moved)
             stiff = total([armature[k] * a[k] * a[k] for k in range(a.shape[0])])
@@ -53,37 +53,37 @@ class LineSearch:
 
         def link(i: Any, carry: tuple) -> tuple:
             parent, slope, curvature, contact_slope = carry
-            names = ("motion", "smooth", "tau", "axes", "armature", "acc")
+            names = ("link_acc", "smooth", "tau", "axes", "armature", "acc")
             a, moved, s, c = lanewise(
                 substitute,
                 parent,
-                step.object_motion,
+                step.object_acc,
                 problem.body_of(i),
                 *problem.read(*names, item=i),
                 problem.read("w", "g", "z", item=i),
             )
             problem.write("step_acc", a, i)
-            problem.write("step_motion", moved, i)
-            if problem.finger_pairs:
-                problem.finger_pairs.put("motion", moved, i + 1)
+            problem.write("step_link_acc", moved, i)
+            if problem.self_contacts:
+                problem.self_contacts.put("link_acc", moved, i + 1)
             terms = [contact_slope]
             for contacts in problem.per_link:
-                rel = relative(contacts.set.name, moved, step.palm_motion, step.object_motion)
+                rel = relative(contacts.set.name, moved, step.palm_acc, step.object_acc)
                 terms.append(contacts.prepare_linesearch(i, rel))
             contact_slope = lanewise(lambda t: total(t), terms)
             slope, curvature = lanewise(lambda a, b, c, d: (a + b, c + d), slope, s, curvature, c)
             return moved, slope, curvature, contact_slope
 
         none = zeros((), self.like)
-        parent = problem.widened(step.palm_motion)
-        if problem.finger_pairs:
-            problem.finger_pairs.put("motion", parent, 0)
+        parent = problem.widened(step.palm_acc)
+        if problem.self_contacts:
+            problem.self_contacts.put("link_acc", parent, 0)
         _, slope, curvature, contact_slope = loop(
             self.links, link, (parent, none, none, none), self.block.size
         )
         if problem.chambers:
             curvature = lanewise(jnp.add, curvature, problem.chambers.curvature())
-        between = [problem.finger_pairs.prepare_all()] if problem.finger_pairs else []
+        between = [problem.self_contacts.prepare_all()] if problem.self_contacts else []
         contact_slope = lanewise(lambda t: total(t), [contact_slope, *between])
         contact_slope = self.prepare_slots(contact_slope, step)
         slope, curvature, contact_slope = self.block.sum((slope, curvature, contact_slope))
@@ -95,7 +95,7 @@ class LineSearch:
         for contacts in self.problem.dealt:
 
             def add(i: Any, sum_: Lanes, contacts: BoundContacts = contacts) -> Lanes:
-                rel = relative(contacts.set.name, None, step.palm_motion, step.object_motion)
+                rel = relative(contacts.set.name, None, step.palm_acc, step.object_acc)
                 return lanewise(jnp.add, sum_, contacts.prepare_linesearch(i, rel))
 
             touch = loop(contacts.set.count, add, touch, self.block.size)
@@ -119,8 +119,8 @@ class LineSearch:
             sums = loop(self.links, lambda i, s: add(i, s, sets), sums, self.block.size)
         for c in problem.dealt:
             sums = loop(c.set.count, lambda i, s, c=c: add(i, s, [c]), sums, self.block.size)
-        if problem.finger_pairs:
-            sums = problem.finger_pairs.slopes_of_all(alpha, sums)
+        if problem.self_contacts:
+            sums = problem.self_contacts.slopes_of_all(alpha, sums)
         return sums
 
     def find(
@@ -165,10 +165,10 @@ class LineSearch:
 def _rest(now: Iterate, step: Iterate, palm: Palm, slope, curvature):
     """Adds wrist, palm and object to the smooth part's slope and curvature."""
     push, pull, twist = palm.unbalanced(now)
-    slope = slope - dot(push, step.palm_motion) - dot(pull, step.object_motion)
+    slope = slope - dot(push, step.palm_acc) - dot(pull, step.object_acc)
     slope = slope - dot(twist, step.wrist)
-    bent = dot(palm.palm.times(step.palm_motion), step.palm_motion)
-    bent = bent + dot(palm.object.times(step.object_motion), step.object_motion)
+    bent = dot(palm.palm.times(step.palm_acc), step.palm_acc)
+    bent = bent + dot(palm.object.times(step.object_acc), step.object_acc)
     return slope, curvature + bent + dot(palm.armature * step.wrist, step.wrist)
 
 

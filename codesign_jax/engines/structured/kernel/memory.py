@@ -43,11 +43,11 @@ class MemoryLayout:
         distances from one address.
         """
         table = cls(wide, **groups)
-        records = {}
+        names_by_items = {}
         for name, (count, _) in groups.items():
-            records.setdefault((name.rpartition(".")[0], count), []).append(name)
+            names_by_items.setdefault((name.rpartition(".")[0], count), []).append(name)
         table.rows = 0
-        for (_, count), names in records.items():
+        for (_, count), names in names_by_items.items():
             sizes = {name: table.stride[name] for name in names}
             for name in names:
                 table.offset[name] = table.rows

@@ -13,19 +13,19 @@ import numpy as np
 from codesign_jax import verdict
 from codesign_jax.engines.structured.kernel import (
     chambers,
-    finger_collision,
     objects,
+    self_collision,
     shared_memory,
 )
 from codesign_jax.engines.structured.kernel.contact_sets import ContactSet
-from codesign_jax.engines.structured.kernel.finger_collision import TIP, ring_places
-from codesign_jax.engines.structured.kernel.finger_contacts import FingerContactSet, pair_slots
 from codesign_jax.engines.structured.kernel.memory import MemoryLayout, lengthened
+from codesign_jax.engines.structured.kernel.self_collision import TIP, ring_places
+from codesign_jax.engines.structured.kernel.self_contacts import SelfContactSet, pair_slots
 from codesign_jax.engines.structured.kernel.slots import SlotSet
 from codesign_jax.engines.structured.kernel.step_memory import KernelLayout
 from codesign_jax.engines.structured.kernel.team_contacts import (
-    TeamFingerContactSet,
     TeamSdfContactSet,
+    TeamSelfContactSet,
 )
 from codesign_jax.engines.structured.laws import shapes, surroundings
 from codesign_jax.engines.structured.laws.air import volumes
@@ -49,7 +49,7 @@ class Tables(KernelLayout):
     """Contacts and tables of a scene's kernel for one size of block."""
 
     remembers: tuple[str, ...] = ()
-    """Further numbers of the slots of contacts between fingers."""
+    """Further numbers of the slots of self-contacts."""
 
     def __init__(self, scene: Scene, *, backend: str, width: int, team: int | None = None):
         self.backend = backend
@@ -91,10 +91,10 @@ class Tables(KernelLayout):
             slots = pair_slots(self.scene)
             options = {"gathers": self.gathers, "remembers": self.remembers}
             if self.team == 1:
-                sets.append(FingerContactSet(self.scene, block, self.links, slots, **options))
+                sets.append(SelfContactSet(self.scene, block, self.links, slots, **options))
             else:
                 block = (*block, self.team)
-                sets.append(TeamFingerContactSet(self.scene, block, self.links, slots, **options))
+                sets.append(TeamSelfContactSet(self.scene, block, self.links, slots, **options))
         on = {"palm_object": int(e.palm_object), "palm_table": n * e.palm_table}
         sets += [make(name, self.palm_groups, on[name]) for name in on if on[name]]
         groups = -(-surroundings.slots(self.scene) // self.fingers)
@@ -204,14 +204,14 @@ class Tables(KernelLayout):
             "axes": (n, (a, 6)),
             "body_centre": (n, (3,)),
             "tensor": (n, (6,)),
-            "motion": (n, (6,)),
+            "link_acc": (n, (6,)),
             "smooth": (n, (6,)),
             "tau": (n, (a,)),
             "w": (n, (a, 6)),
             "g": (n, (a, 6)),
             "z": (n, (a,)),
             "step_acc": (n, (a,)),
-            "step_motion": (n, (6,)),
+            "step_link_acc": (n, (6,)),
             "new_finger": (n, (a,)),
             "new_finger_vel": (n, (a,)),
         }
@@ -225,8 +225,8 @@ class Tables(KernelLayout):
             fields |= chambers.fields(n, a)
         if self.has_slots or self.scene.effects.air_mass:
             fields |= {"inverse": (n, (a, a)), "z_again": (n, (a,))}
-        if any(isinstance(s, FingerContactSet) for s in self.sets):
-            fields |= finger_collision.fields(n)
+        if any(isinstance(s, SelfContactSet) for s in self.sets):
+            fields |= self_collision.fields(n)
         return fields
 
 
@@ -235,7 +235,7 @@ LENGTH = 6
 
 
 class Packing(Tables):
-    """Packs the constants, states and controls of worlds; unpacks states and recorded rows."""
+    """Packs the constants, states and controls of worlds; unpacks states and paths."""
 
     def pack_hand(self, hand: WorldModel) -> tuple[jax.Array, jax.Array]:
         """The hand's tables; padded fingers have no mass."""
@@ -327,13 +327,13 @@ class Packing(Tables):
         return arm, jnp.pad(pressure, pad).reshape(*arm.shape[:2], self.columns)
 
     def path_rows(self, states: bool) -> tuple[int, int]:
-        """Numbers of rows of the state's tables that are recorded: all, or the positions."""
+        """Numbers of rows of the state's tables that a path has: all, or the positions."""
         if states:
             return self.finger_state.rows, self.world_state.rows
         return self.finger_state.offset["finger_vel"], self.world_state.offset["wrist_vel"]
 
     def path(self, fingers: jax.Array, worlds: jax.Array, states: bool) -> dict[str, jax.Array]:
-        """Coordinates of recorded rows (block, time, row, lane or world)."""
+        """Coordinates of a path's rows (block, time, row, lane or world)."""
         steps = fingers.shape[1]
         size = self.links * self.axes
         names = [("qpos", "finger", ("wrist", "position", "quat"))]

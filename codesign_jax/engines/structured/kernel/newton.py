@@ -87,9 +87,7 @@ class Newton:
             with only(problem.in_slots, busy):
                 step, done = self.direction(now, last, ~busy)
                 slope, curvature, first = self.search.prepare(now, step)
-                decrement, scale = lanewise(
-                    _decrement, slope, first, problem.palm, now.object_motion
-                )
+                decrement, scale = lanewise(_decrement, slope, first, problem.palm, now.object_acc)
                 floor = jnp.where(busy, LINE_TOLERANCE * tolerance * scale.lane, FAR)
                 alpha = self.search.find(slope, curvature, first, floor, evaluations)
             alpha, decrement = lanewise(hold, before, alpha, decrement)
@@ -159,7 +157,7 @@ class Newton:
           Iterate, length and decrement, see `ChordStep`; the length is that of "step_acc".
         """
         chord = self.chord
-        pairs = self.problem.finger_pairs
+        self_contacts = self.problem.self_contacts
         size = self.block.size
         assert chord is not None
 
@@ -167,7 +165,9 @@ class Newton:
             more, work = chord.step(now, done, alpha)
             new = lanewise(jnp.divide, work, scale)
             converged = likely & (new.lane >= 0) & (new.lane <= tolerance)
-            taken = converged if pairs is None else converged & ~pairs.touching_worlds()
+            taken = (
+                converged if self_contacts is None else converged & ~self_contacts.touching_worlds()
+            )
 
             def take() -> tuple[Iterate, Lanes]:
                 chord.take(more, alpha, taken)
@@ -185,26 +185,26 @@ class Newton:
             return there, length, lanewise(jnp.where, small, new, decrement)
 
         with only(self.problem.in_slots, likely):
-            still = likely & steady(self.problem, alpha, between=False)
+            ending = likely & steady(self.problem, alpha, between=False)
             as_was = now, alpha, decrement
-            return choose(anywhere(still), lambda: look(still), as_was, size)
+            return choose(anywhere(ending), lambda: look(ending), as_was, size)
 
     def direction(self, now: Iterate, last: Lanes, idle: jax.Array) -> tuple[Iterate, Eliminated]:
         """Newton's step: the fingers' factors, and the step of wrist and object.
 
         Last is the length of the last step; the step of idle lanes is of no use.
         """
-        pairs = self.problem.finger_pairs
+        self_contacts = self.problem.self_contacts
         node, work = self.elimination.backward(last)
         step, done = self.elimination.at_palm(now, node, self.elimination.dealt_pushes(last))
-        if pairs is None:
+        if self_contacts is None:
             return step, done
         done = done._replace(work=lanewise(jnp.add, done.work, work))
 
         def correct() -> Iterate:
-            return self.coupling(self.problem, pairs, done).correct(step, idle)
+            return self.coupling(self.problem, self_contacts, done).correct(step, idle)
 
-        return choose(pairs.touching_now(), correct, step, self.block.size), done
+        return choose(self_contacts.touching_now(), correct, step, self.block.size), done
 
 
 WEIGHT_SQUARE = 100.0
@@ -212,8 +212,8 @@ WEIGHT_SQUARE = 100.0
 tolerance is relative to the objective at this acceleration."""
 
 
-def _decrement(slope, first, palm: Palm, motion):
-    # Typical size of the objective: object and palm at g, plus the object's present motion.
+def _decrement(slope, first, palm: Palm, object_acc):
+    # Typical size of the objective: object and palm at g, plus the object's present acceleration.
     mass = palm.object.mass
-    scale = WEIGHT_SQUARE * (mass + palm.palm.mass) + mass * dot(motion[3:], motion[3:])
+    scale = WEIGHT_SQUARE * (mass + palm.palm.mass) + mass * dot(object_acc[3:], object_acc[3:])
     return jnp.maximum(-slope - first, 0.0) / scale, scale

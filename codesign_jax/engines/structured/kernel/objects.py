@@ -138,24 +138,24 @@ def signed_distance(scene: Scene, world_object: WorldObject, local: Lanes) -> tu
     return _for_both(scene, world_object, primitive, meshed, none)
 
 
-def distance_of(scene: Scene, local: jax.Array, variables: dict, still: dict) -> tuple:
+def distance_of(scene: Scene, local: jax.Array, variables: dict, fixed: dict) -> tuple:
     """`signed_distance` as a function of arrays that has a derivative.
 
     Args:
       scene: The scene.
       local: Points (3, ...) in the object's frame.
       variables: Sizes of the object, and origin, cell and factor of a mesh's grid, by name.
-      still: Index of the object and, with meshes, first value and nodes of the grid, whether the
+      fixed: Index of the object and, with meshes, first value and nodes of the grid, whether the
         object is a mesh, and the distances at the corners of the points' cells, see `cell_values`.
     """
     nearest = None
-    shape = still["object_id"].astype(jnp.int32)
+    shape = fixed["object_id"].astype(jnp.int32)
     if len(shapes.mesh_indices(scene)) < len(scene.objects.object):
         nearest = shapes.primitive_distance(scene, variables["object_size"], shape, local)
-    if "meshed" in still:
-        grid = GridLanes(**{k: (variables | still)[f"grid_{k}"] for k in GridLanes._fields})
-        new = meshes.interpolate(grid, meshes.locate(grid, local), still["values"])
-        nearest = new if nearest is None else _pick(still["meshed"], new, nearest)
+    if "meshed" in fixed:
+        grid = GridLanes(**{k: (variables | fixed)[f"grid_{k}"] for k in GridLanes._fields})
+        new = meshes.interpolate(grid, meshes.locate(grid, local), fixed["values"])
+        nearest = new if nearest is None else _pick(fixed["meshed"], new, nearest)
     assert nearest is not None
     return nearest
 
@@ -168,24 +168,24 @@ def cell_values(world_object: WorldObject, local: Lanes) -> Lanes:
     return _gather(world_object.mesh.values, index, local.dtype)
 
 
-def points_of(scene: Scene, variables: dict, still: dict) -> jax.Array:
+def points_of(scene: Scene, variables: dict, fixed: dict) -> jax.Array:
     """`table_points` as a function of arrays that has a derivative.
 
     Args:
       scene: The scene.
       variables: Columns, sizes and, of meshes, factor of the object, by name.
-      still: As in `distance_of`; of meshes the points themselves, in the object's frame, and the
+      fixed: As in `distance_of`; of meshes the points themselves, in the object's frame, and the
         factor that they have.
     """
     points = None
-    shape = still["object_id"].astype(jnp.int32)
+    shape = fixed["object_id"].astype(jnp.int32)
     columns = variables["columns"][:, :, 0]
     if len(shapes.mesh_indices(scene)) < len(scene.objects.object):
         points = shapes.primitive_points(scene, variables["object_size"][:, 0], shape, columns)
-    if "meshed" in still:
-        support = still["support"] * (variables["grid_factor"] / still["factor"])
+    if "meshed" in fixed:
+        support = fixed["support"] * (variables["grid_factor"] / fixed["factor"])
         new = meshes.turned(columns, support)
-        points = new if points is None else _pick(still["meshed"], new, points)
+        points = new if points is None else _pick(fixed["meshed"], new, points)
     assert points is not None
     return points
 

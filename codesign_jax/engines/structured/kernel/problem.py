@@ -7,8 +7,8 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.chambers import Chambers
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
-from codesign_jax.engines.structured.kernel.finger_contacts import BoundFingerContacts
 from codesign_jax.engines.structured.kernel.memory import tree_add_scaled
+from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 from codesign_jax.engines.structured.laws.inertia import Body, Centred
@@ -27,17 +27,17 @@ class Palm(NamedTuple):
 
     def unbalanced(self, now: "Iterate") -> tuple[Any, Any, Any]:
         """Forces that an iterate leaves on the palm, the object and the wrist's joints."""
-        push = self.smooth_palm - self.palm.times(now.palm_motion)
-        pull = self.smooth_object - self.object.times(now.object_motion)
+        push = self.smooth_palm - self.palm.times(now.palm_acc)
+        pull = self.smooth_object - self.object.times(now.object_acc)
         return push, pull, self.smooth_wrist - self.armature * now.wrist
 
 
 class Iterate(NamedTuple):
-    """Accelerations of the wrist, and motion of palm and object; lanes of a world."""
+    """Accelerations of the wrist, of palm and of object; lanes of a world."""
 
     wrist: Any
-    palm_motion: Any
-    object_motion: Any
+    palm_acc: Any
+    object_acc: Any
 
 
 class Problem:
@@ -48,7 +48,7 @@ class Problem:
       palm: Palm, wrist and object.
       links: Moving links of a finger; `block`: the lanes; `like`: zeros of their shape and type.
       rigid: Whether the wrist's accelerations are known and no unknowns.
-      finger_pairs: Contacts between fingers, with themselves and with the palm; None without.
+      self_contacts: Contacts of the hand with itself; None without.
       in_slots: The contact sets that are kept in slots: these, or none.
       per_link: Contacts of the fingers with the object and the table, whose items are links.
       dealt: Contacts of the palm, and of the object with the table, whose items are dealt to the
@@ -63,10 +63,10 @@ class Problem:
         self.block = m.block
         self.rigid = not m.p.scene.effects.wrist
         sets = m.contacts
-        self.finger_pairs: BoundFingerContacts | None = sets.get("finger_finger")  # type: ignore[assignment]
+        self.self_contacts: BoundSelfContacts | None = sets.get("finger_finger")  # type: ignore[assignment]
         self.per_link = [sets[n] for n in ("finger_object", "finger_table") if n in sets]
         self.dealt = [c for n, c in sets.items() if not n.startswith("finger")]
-        self.in_slots = [self.finger_pairs] if self.finger_pairs else []
+        self.in_slots = [self.self_contacts] if self.self_contacts else []
         self.like = jnp.zeros((self.block.size,), palm.armature.dtype)
         self.chambers = Chambers(m) if "air_step" in m.scratch else None
 
@@ -80,7 +80,7 @@ class Problem:
         self.m.write(name, value, item)
 
     def move(self, name: str, item: Any, alpha: Lanes) -> Lanes:
-        """Adds the last step to a link's "acc" or "motion", and returns the sum."""
+        """Adds the last step to a link's "acc" or "link_acc", and returns the sum."""
         value = lanewise(tree_add_scaled, alpha, *self.read(name, f"step_{name}", item=item))
         self.write(name, value, item)
         return value
@@ -89,12 +89,12 @@ class Problem:
         return self.read("mass", "body_centre", "tensor", item=item)
 
     def add_first(self, r: Lanes) -> Lanes:
-        """Adds the contacts between fingers that act on the palm."""
-        assert self.finger_pairs is not None
-        return lanewise(jnp.add, r, self.finger_pairs.pushed(0))
+        """Adds the self-contacts that act on the palm."""
+        assert self.self_contacts is not None
+        return lanewise(jnp.add, r, self.self_contacts.pushed(0))
 
-    def widened(self, motion: Lanes) -> Lanes:
-        return lanewise(jnp.add, motion, zeros(motion.shape[:-2], self.like))
+    def widened(self, acc: Lanes) -> Lanes:
+        return lanewise(jnp.add, acc, zeros(acc.shape[:-2], self.like))
 
 
 def relative(name: str, link: Any, palm: Lanes, obj: Lanes) -> Lanes:

@@ -102,14 +102,14 @@ class Program(Packing):
           hand: Constants of the worlds.
           state: Their start states.
           ctrl: Controls, shape (world, time, nu).
-          trajectory: Whether to record qpos, and to simulate worlds that lost their object to the
+          trajectory: Whether to store qpos, and to simulate worlds that lost their object to the
             end.
-          states: Whether to record qpos, qvel, the accelerations of every step, and the friction
+          states: Whether to store qpos, qvel, the accelerations of every step, and the friction
             that contacts hold before it.
 
         Returns:
           `trace` by name, shape (world, time), with "qpos", "qvel" and "acc", shape (world, time,
-          nq or nv), of what is recorded; and the last states.
+          nq or nv), of what is stored; and the last states.
         """
         inputs = self.inputs(hand, state, ctrl)
         out = self.execute(inputs, trajectory=trajectory, states=states)
@@ -120,7 +120,7 @@ class Program(Packing):
     ) -> list[jax.Array | None]:
         """Runs the blocks, which do not depend on each other; None in the place of scratch memory.
 
-        States are steps from one recorded state to the next, beginning with the first; 0 for none.
+        States are steps from one stored state to the next, beginning with the first; 0 for none.
         """
         call, outputs = self._call(inputs, trajectory, states)
         if self.backend == "interpreter":
@@ -179,7 +179,7 @@ class Program(Packing):
             (blocks, self.scratch.rows, self.columns),
             (blocks, steps, len(self.trace), self.block),
         ]
-        for stride, whole in _records(trajectory, states):
+        for stride, whole in path_parts(trajectory, states):
             angles, places = self.path_rows(whole)
             count = -(-steps // stride)
             shapes += [(blocks, count, angles, self.columns), (blocks, count, places, self.block)]
@@ -207,7 +207,7 @@ class Program(Packing):
         return call, outputs
 
     def _kernel(self, steps: int, to_end: bool, states: int, *refs: Any) -> None:
-        rollout = BlockRollout(self, refs, _records(to_end, states))
+        rollout = BlockRollout(self, refs, path_parts(to_end, states))
         rollout.start()
         done = rollout.run(steps, to_end=to_end)
         rollout.repeat_last(done, steps)
@@ -216,8 +216,8 @@ class Program(Packing):
 class BlockRollout:
     """The rollout of a block of worlds in the kernel of a program."""
 
-    def __init__(self, program: Program, refs: tuple, records: list[tuple[int, bool]]):
-        """Takes the references to inputs and outputs; `records` as `_records` returns them."""
+    def __init__(self, program: Program, refs: tuple, parts: list[tuple[int, bool]]):
+        """Takes the references to inputs and outputs; `parts` as `path_parts` returns them."""
         (hand, world, finger_start, world_start, arm, pressure, *rest) = refs
         grid = rest.pop(0) if program.meshes else None
         (finger_state, world_state, scratch, trace, *path) = rest
@@ -231,7 +231,7 @@ class BlockRollout:
             path[::2] = map(share, path[::2])
         tables = hand, world, finger_state, world_state, scratch, grid, onchip
         self.program = program
-        self.records = records
+        self.path_parts = parts
         self.step = Step(program, block, *tables)
         self.world = block.world
         self.start_state = finger_start, world_start
@@ -267,7 +267,7 @@ class BlockRollout:
             def undecided(distance: jax.Array, height: jax.Array) -> jax.Array:
                 return verdict.goes_on(bounds, distance, height, fastest, now, to_end=to_end)
 
-            self._record(t)
+            self._store_path(t)
             command = self._command(t)
             entry, new_speed, moved = step.advance(
                 *command, undecided, going > 0, fastest, self.program.limits
@@ -296,7 +296,7 @@ class BlockRollout:
         trace = self.trace
 
         def repeat(t: jax.Array, x: jax.Array) -> jax.Array:
-            self._record(t)
+            self._store_path(t)
             for k, name in enumerate(self.program.trace):
                 trace[t, k, world] = ended.get(name, trace[done - 1, k, world])
             self._keep(step=self._number("step") + 1.0)
@@ -317,19 +317,19 @@ class BlockRollout:
         for name, value in numbers.items():
             self.step.world_state.write(name, lanes([value], (), wide=False))
 
-    def _record(self, t: jax.Array) -> None:
-        """Records the state before step t where it is asked for."""
-        for k, (stride, whole) in enumerate(self.records):
+    def _store_path(self, t: jax.Array) -> None:
+        """Stores the state before step t where it is part of the path."""
+        for k, (stride, whole) in enumerate(self.path_parts):
             target = self.path[2 * k : 2 * k + 2]
             if stride == 1:
-                self._store(t, whole, *target)
+                self._store_state(t, whole, *target)
             else:
                 every = jnp.int32(stride)
-                put = partial(self._store, jax.lax.div(t, every), whole, *target)
+                put = partial(self._store_state, jax.lax.div(t, every), whole, *target)
                 jax.lax.cond(jax.lax.rem(t, every) == 0, put, lambda: None)
 
-    def _store(self, place: jax.Array, whole: bool, fingers: Any, worlds: Any) -> None:
-        """Stores the whole state, or its positions, at a place of the record."""
+    def _store_state(self, place: jax.Array, whole: bool, fingers: Any, worlds: Any) -> None:
+        """Stores the whole state, or its positions, at a place of the path."""
         finger_state, world_state = self.state
         world = self.world
         angles, places = self.program.path_rows(whole)
@@ -337,10 +337,10 @@ class BlockRollout:
         copy_rows((0, places), lambda k: world_state[k, world], worlds, world, at=(place,))
 
 
-def _records(trajectory: bool, states: int) -> list[tuple[int, bool]]:
-    """What is recorded: every how many steps, and whether whole states or positions."""
-    records = [(1, states == 1)] if trajectory or states == 1 else []
-    return records + ([(states, True)] if states > 1 else [])
+def path_parts(trajectory: bool, states: int) -> list[tuple[int, bool]]:
+    """What the kernel stores: every how many steps, and whether whole states or positions."""
+    parts = [(1, states == 1)] if trajectory or states == 1 else []
+    return parts + ([(states, True)] if states > 1 else [])
 
 
 def block_spec(shape: tuple[int, ...], blocks: int) -> pl.BlockSpec:

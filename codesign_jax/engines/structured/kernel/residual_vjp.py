@@ -1,6 +1,6 @@
 """The reverse pass of a step through `residual`: palm, fingers and contacts, from the tips inwards.
 
-The power of a contact between fingers is counted on the lane of its ring, which reads both sides;
+The power of a self-contact is counted on the lane of its ring, which reads both sides;
 the other finger's cotangents go to its own lane by a swap.  A contact of a finger with itself or
 with the palm has one lane; what it leaves for the palm is kept as "palmbar".
 """
@@ -13,17 +13,13 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import (
-    finger_collision,
     friction_memory,
     objects,
     residual,
+    self_collision,
 )
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, only_on, plus, pull
-from codesign_jax.engines.structured.kernel.finger_contacts import (
-    BoundFingerContacts,
-    FingerPairing,
-)
 from codesign_jax.engines.structured.kernel.memory import choose, loop
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.problem import Iterate
@@ -31,6 +27,10 @@ from codesign_jax.engines.structured.kernel.residual import (
     BodyMotion,
     CentreLineSegment,
     LinkMotion,
+)
+from codesign_jax.engines.structured.kernel.self_contacts import (
+    BoundSelfContacts,
+    FingerPairing,
 )
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step import Step
@@ -76,12 +76,12 @@ class ResidualVjp:
             self.object |= {"position": state["position"]}
         names = ("object_size", "grid_origin", "grid_cell", "grid_factor")
         self.object |= {n: step.constant(n) for n in names if n in step.world}
-        self.still: dict[str, Any] = {"object_id": step.constant("object_id")}
-        self.still |= {"object_motion": bodies["now"].object_motion}
-        self.still |= {"object_along": virtual.object_motion}
+        self.fixed: dict[str, Any] = {"object_id": step.constant("object_id")}
+        self.fixed |= {"object_acc": bodies["now"].object_acc}
+        self.fixed |= {"object_along": virtual.object_acc}
         if world_object.mesh is not None:
-            self.still |= {n: step.constant(n) for n in ("grid_first", "grid_nodes")}
-            self.still |= {"meshed": world_object.mesh.meshed}
+            self.fixed |= {n: step.constant(n) for n in ("grid_first", "grid_nodes")}
+            self.fixed |= {"meshed": world_object.mesh.meshed}
 
     def chain(self, i: Any) -> LinkMotion:
         """What the link before joint i hands on."""
@@ -112,7 +112,7 @@ class ResidualVjp:
         return zeros(getattr(SHAPES, name), self.like)
 
     def more(self, bars: LinkMotion, i: Any) -> LinkMotion:
-        """Adds what contacts between fingers have left for a link."""
+        """Adds what self-contacts have left for a link."""
         if "pairbar.origin" not in self.scratch:
             return bars
         return _add(bars, **{n: self.scratch.read(f"pairbar.{n}", i) for n in BodyMotion._fields})
@@ -120,14 +120,14 @@ class ResidualVjp:
     def _link(self, i: Any, after: LinkMotion, pressure: Lanes, centre_bar: Lanes) -> LinkMotion:
         numbers = self.step.link_constants(i)
         joint = self.step.joint(i)
-        still = {"acc": joint.pop("acc"), "order": self.step.order(i)}
-        still["virtual"] = self.scratch.read("virtual", i)
+        fixed = {"acc": joint.pop("acc"), "order": self.step.order(i)}
+        fixed["virtual"] = self.scratch.read("virtual", i)
         weight = self.step.hand.read("centre_weight", i + 1)
-        still["centre_bar"] = lanewise(jnp.multiply, centre_bar, weight)
+        fixed["centre_bar"] = lanewise(jnp.multiply, centre_bar, weight)
         run = partial(residual.of_link, self.p.scene)
         joint = joint | {"pressure": pressure}
         before, bars, moved = pull(
-            run, (self.chain(i), numbers, joint), (still,), (after, self.power_bar)
+            run, (self.chain(i), numbers, joint), (fixed,), (after, self.power_bar)
         )
         self.bars.add({n: bars.pop(n) for n in LINK_CONSTANTS}, i)
         sections = {n: bars.pop(n) for n in FINGER_CONSTANTS if n in bars}
@@ -166,8 +166,8 @@ class ResidualVjp:
             bodies["place"],
             bodies["frame"],
             bodies["vel"],
-            now.palm_motion,
-            self.virtual.palm_motion,
+            now.palm_acc,
+            self.virtual.palm_acc,
         )
         if "palmbar.origin" in self.scratch:
             more = {n: self.scratch.read(f"palmbar.{n}") for n in BodyMotion._fields}
@@ -186,17 +186,17 @@ class ResidualVjp:
         rows = [self.step.hand.read(table, i * k + j) for j in range(k)]
         numbers = lanewise(lambda rows: jnp.stack(rows, 1), rows)
 
-        def compute(variables: dict, still: dict) -> BodyMotion:
-            if "meshed" in still and name.endswith("_object"):
+        def compute(variables: dict, fixed: dict) -> BodyMotion:
+            if "meshed" in fixed and name.endswith("_object"):
                 centre = lanewise(ring_centres, place.origin, place.frame, numbers)
-                still = still | {"values": self._values(centre)}
+                fixed = fixed | {"values": self._values(centre)}
                 if self.p.hull:
                     run = partial(residual.second_look, self.p.scene, name)
-                    again = lanewise(run, place, numbers, variables, still)
-                    still = still | {"values_again": self._values(again)}
+                    again = lanewise(run, place, numbers, variables, fixed)
+                    fixed = fixed | {"values_again": self._values(again)}
             run = partial(residual.of_rings, self.p.scene, name)
             args = place, numbers, variables, self.held(name, i)
-            body_bars, ring_bars, shared, held = pull(run, args, (still,), self.power_bar)
+            body_bars, ring_bars, shared, held = pull(run, args, (fixed,), self.power_bar)
             friction_memory.add_held(self.bars, self.contacts[name], i, held)
             for j in range(k):
                 self.bars.add({table: ring_bars[:, j]}, i * k + j)
@@ -211,32 +211,32 @@ class ResidualVjp:
         variables = self._object(name)
         empty = BodyMotion(*(self.none(n) for n in BodyMotion._fields))
         contacts = self.contacts[name]
-        still = self.still | self.of_contacts(name, i)
-        return choose(contacts.touching(i), lambda: compute(variables, still), empty, self.p.size)
+        fixed = self.fixed | self.of_contacts(name, i)
+        return choose(contacts.touching(i), lambda: compute(variables, fixed), empty, self.p.size)
 
     def _table(self) -> None:
         contacts = self.contacts[residual.TABLE]
         p = self.p
         finger = lanes([self.block.finger.astype(self.like.dtype)], (), wide=True)
         variables = self._object(residual.TABLE)
-        still = self.still
-        if "meshed" in still:
+        fixed = self.fixed
+        if "meshed" in fixed:
             columns = self.bodies["columns"]
-            still = still | {"factor": self.object["grid_factor"]}
-            still |= {"support": self._support(columns, self.object["height"])}
+            fixed = fixed | {"factor": self.object["grid_factor"]}
+            fixed |= {"support": self._support(columns, self.object["height"])}
             for j, fixture in enumerate(p.scene.fixture):
                 position = self.object["position"]
                 gap, rows = lanewise(partial(surroundings.towards, fixture), position)
                 turned = lanewise(surroundings.faced, rows, columns)
-                still |= {f"support_{j}": self._support(turned, gap)}
+                fixed |= {f"support_{j}": self._support(turned, gap)}
                 if held.EDGES[fixture.type]:
                     point = lanewise(partial(surroundings.edges, fixture), position)
-                    still |= {f"values_{j}": self._values(point)}
+                    fixed |= {f"values_{j}": self._values(point)}
         for i in range(contacts.set.count):
 
             def compute(i: int = i) -> None:
                 run = partial(residual.of_table, p.scene, p.fingers, i)
-                constants = still | self.of_contacts(residual.TABLE, i)
+                constants = fixed | self.of_contacts(residual.TABLE, i)
                 args = variables, self.held(residual.TABLE, i)
                 bars, held = pull(run, args, (finger, constants), self.power_bar)
                 friction_memory.add_held(self.bars, contacts, i, held)
@@ -295,12 +295,12 @@ CONE = "cone.finger_finger"
 ON_PALM = "cone.finger_palm"
 
 
-class FingerContactsVjp:
-    """Leaves the cotangents of the links with contacts between fingers as "pairbar"."""
+class SelfContactsVjp:
+    """Leaves the cotangents of the links with self-contacts as "pairbar"."""
 
-    def __init__(self, sweep: ResidualVjp, pairs: BoundFingerContacts):
+    def __init__(self, sweep: ResidualVjp, self_contacts: BoundSelfContacts):
         self.sweep = sweep
-        self.pairs = pairs
+        self.contacts = self_contacts
         self.p = sweep.p
         self.bars = sweep.bars
         self.like = sweep.like
@@ -324,7 +324,7 @@ class FingerContactsVjp:
             )
 
         def slot(item: Any, pairing: FingerPairing) -> None:
-            read = self.pairs.read
+            read = self.contacts.read
             owner = read("owner", item).lane > 0.5
             live = owner & (read("share", item).lane > 0)
             if pairing.alone is not None:
@@ -340,7 +340,7 @@ class FingerContactsVjp:
                 reverse = self._on_finger if hull else self._spheres
                 any_of(live, lambda: reverse(item, pairing, live))
 
-        self.pairs.do(slot)
+        self.contacts.do(slot)
 
     # The palm
 
@@ -373,7 +373,7 @@ class FingerContactsVjp:
 
     def _spheres(self, item: Any, pairing: FingerPairing, live: jax.Array) -> None:
         number, row, ring = self._ring(item)
-        other = jax.lax.div(self.pairs.read("ring", item).lane.astype(jnp.int32), self._count)
+        other = jax.lax.div(self.contacts.read("ring", item).lane.astype(jnp.int32), self._count)
         theirs = self._body(row_of(other, self.p.k), pairing.lane), self._numbers(other, pairing)
         args = (self._body(row), ring), theirs, self.sweep.step.constant(CONE)
         bars = pull(partial(residual.between_spheres, self.p.scene), args, (), self._power_bar)
@@ -388,38 +388,38 @@ class FingerContactsVjp:
 
     def _on_finger(self, item: Any, pairing: FingerPairing, live: jax.Array) -> None:
         """Adds the cotangents of a ring and of another finger's segment."""
-        row = self.pairs.read("row", item)
+        row = self.contacts.read("row", item)
         other = pairing.swap(row).lane.astype(jnp.int32)
-        still = {"end": self._float(1)}
-        theirs = self._rings(item, pairing, live, other, pairing.lane, still)
+        fixed = {"end": self._float(1)}
+        theirs = self._rings(item, pairing, live, other, pairing.lane, fixed)
         line, where = pairing.swap((theirs, self._float(other)))
         self._leave_line(line, where.lane.astype(jnp.int32))
 
     def _on_itself(self, item: Any, pairing: FingerPairing, live: jax.Array) -> None:
         """Adds the cotangents of a ring and of its own finger's segment."""
-        other = self.pairs.read("other", item).lane.astype(jnp.int32)
+        other = self.contacts.read("other", item).lane.astype(jnp.int32)
         search = self.sweep.step.search
         assert search is not None
         end = search.last_of(self._ring(item)[0], other)
-        still = {"end": self._float(end)}
-        line = self._rings(item, pairing, live, other, self.lane, still)
+        fixed = {"end": self._float(end)}
+        line = self._rings(item, pairing, live, other, self.lane, fixed)
         self._leave_line(line, other)
 
     def _rings(
-        self, item: Any, pairing: FingerPairing, live: jax.Array, other: Any, lane: Any, still: dict
+        self, item: Any, pairing: FingerPairing, live: jax.Array, other: Any, lane: Any, fixed: dict
     ) -> CentreLineSegment:
         """Adds the cotangents of a ring; returns those of the segment that it touches."""
         number, row, ring = self._ring(item)
-        before, link, after = finger_collision.neighbours(other, self.p.links)
+        before, link, after = self_collision.neighbours(other, self.p.links)
         frames = tuple(self._chain("frame", r, lane) for r in (before, after))
         sections = [self._numbers(n, pairing, lane) for n in self._sections(other)]
         line = CentreLineSegment(
             self._body(link, lane), self._chain("origin", after, lane), frames, *sections
         )
-        still |= {"last": self._float(jnp.where(other == self.p.links, self.like + 1.0, self.like))}
+        fixed |= {"last": self._float(jnp.where(other == self.p.links, self.like + 1.0, self.like))}
         held = friction_memory.hold_of_pairing(self.sweep.step, pairing)
         args = (self._body(row), ring), line, self.sweep.step.constant(CONE), held
-        bars = pull(partial(residual.between_rings, self.p.scene), args, (still,), self._power_bar)
+        bars = pull(partial(residual.between_rings, self.p.scene), args, (fixed,), self._power_bar)
         (place, own_ring), line, cone, kept = only_on(self._side(live), bars)
         friction_memory.leave(self.bars, pairing, kept)
         self.bars.add({CONE: cone})
@@ -428,7 +428,7 @@ class FingerContactsVjp:
         return line
 
     def _leave_line(self, line: CentreLineSegment, row: jax.Array) -> None:
-        before, link, after = finger_collision.neighbours(row, self.p.links)
+        before, link, after = self_collision.neighbours(row, self.p.links)
         self._leave(line.place._asdict(), link)
         self._leave({"frame": line.frames[0]}, before)
         self._leave({"origin": line.origin, "frame": line.frames[1]}, after)
@@ -461,7 +461,7 @@ class FingerContactsVjp:
 
     def _ring(self, item: Any) -> tuple[jax.Array, jax.Array, Lanes]:
         """Number of a slot's ring, its link and its numbers."""
-        number = self.pairs.read("ring", item).lane.astype(jnp.int32)
+        number = self.contacts.read("ring", item).lane.astype(jnp.int32)
         number = jax.lax.rem(number, self._count)
         ring = self.hand.gather("ring", number, self.lane)
         return number, row_of(number, self.p.k), ring

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import friction_memory
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
-from codesign_jax.engines.structured.kernel.finger_contacts import FingerPairing
 from codesign_jax.engines.structured.kernel.memory import anywhere, choose, loop
+from codesign_jax.engines.structured.kernel.self_contacts import FingerPairing
 from codesign_jax.engines.structured.kernel.shared_memory import where
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.lanes import dot
@@ -21,7 +21,7 @@ from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 
 SAFE = 1e-4
 """Distance that a ring keeps from being near [m]: above any rounding of places, and above what
-`finger_collision.SURELY` leaves open of a distance below a metre."""
+`self_collision.SURELY` leaves open of a distance below a metre."""
 
 
 class RingPairs:
@@ -33,9 +33,9 @@ class RingPairs:
     """
 
     def __init__(self, search: Any, row: jax.Array, pairing: FingerPairing, first: jax.Array):
-        """Begins the search of a row of slots; search: the `FingerCollision` that begins it."""
+        """Begins the search of a row of slots; search: the `SelfCollision` that begins it."""
         self.search = search
-        self.pairs = search.pairs
+        self.contacts = search.contacts
         self.row = row
         self.pairing = pairing
         self.first = first
@@ -108,7 +108,7 @@ class RingPairs:
 
         Args:
           items: The rings that the lanes `first` and `second` look with.
-          first: The first ring's body, `second`: the other's, see `FingerCollision.body`.
+          first: The first ring's body, `second`: the other's, see `SelfCollision.body`.
           centre: The lanes' ring's centre; `looks`: lanes that have a ring.
         """
         search = self.search
@@ -125,9 +125,9 @@ class RingPairs:
             def add(close: jax.Array) -> None:
                 place = search.place(numbers, frame, centre, faced)
                 mine = self.mixed(search.moves(first[0]), search.moves(second[0]))
-                held = friction_memory.of_row(search.step, self.pairs, self.row)
+                held = friction_memory.of_row(search.step, self.contacts, self.row)
                 held = self.mixed(held, held)
-                cone = self.pairs.of_row(self.row)
+                cone = self.contacts.of_row(self.row)
                 link = jnp.where(self.first, first[0], second[0])
                 candidate = search.begun(place, cone, link, mine, moves, held)
                 self._enter(candidate, other, close, items)
@@ -138,7 +138,7 @@ class RingPairs:
         return lanes([square], (), wide=True)
 
     def _segment(self, row: jax.Array, near: jax.Array) -> Any:
-        """Segments of the second finger and their links' motion on both lanes of the pairs."""
+        """Segments of the second finger and their links' moves on both lanes of the pairs."""
         search = self.search
         theirs = search.of_rows(search.segment, row, near & self.first, self.pairing)
         same = search.of_rows(search.segment, row, near & self.second, None)
@@ -148,7 +148,7 @@ class RingPairs:
         """Gives contacts a slot, the first ring's before the second's.
 
         Args:
-          contact: See `FingerCollision.begun`.
+          contact: See `SelfCollision.begun`.
           other: The second finger's links.
           items: The rings that the lanes `first` and `second` have looked with.
         """

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import friction_memory, objects
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
-from codesign_jax.engines.structured.kernel.finger_collision import FingerCollision, closed
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.problem import relative
+from codesign_jax.engines.structured.kernel.self_collision import SelfCollision, closed
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import cross, dot, total
@@ -68,26 +68,26 @@ class SdfCollision:
             lambda v: jnp.stack([v[i] for i in which])[None], self.step.constant("friction")
         )
 
-    def moves(self, name: str, motion: Lanes | None, vel: Lanes | None) -> tuple[Lanes, Lanes]:
+    def moves(self, name: str, link_acc: Lanes | None, vel: Lanes | None) -> tuple[Lanes, Lanes]:
         bodies = self.bodies
         now = self.bodies["now"]
         return (
-            relative(name, motion, now.palm_motion, now.object_motion),
+            relative(name, link_acc, now.palm_acc, now.object_acc),
             relative(name, vel, bodies["vel"], bodies["object_vel"]),
         )
 
     def of_link(self, i: Any, carry: tuple) -> None:
-        """Contacts of a link; carry: its origin, frame, velocity, bias and motion."""
+        """Contacts of a link; carry: its origin, frame, velocity, bias and acceleration."""
         if self.p.team > 1:  # see `of_rings`
             return
-        origin, frame, vel, _, motion = carry
+        origin, frame, vel, _, link_acc = carry
         for name in self.names:
             numbers = self.numbers(i)
             centre = lanewise(ring_centres, origin, frame, numbers)
             hold = friction_memory.of_item(self.step, self.contacts[name], i)
-            self.on_field(name, i, numbers, frame, centre, self.moves(name, motion, vel), hold)
+            self.on_field(name, i, numbers, frame, centre, self.moves(name, link_acc, vel), hold)
 
-    def of_rings(self, search: FingerCollision) -> None:
+    def of_rings(self, search: SelfCollision) -> None:
         """Contacts of the fingers' rings, dealt to the lanes of a team."""
         for name in self.names:
             contacts = self.contacts[name]
@@ -102,7 +102,7 @@ class SdfCollision:
             ) -> list:
                 row, numbers, frame, centre = search.body(item)
                 numbers, centre = (lanewise(as_item, v) for v in (numbers, centre))
-                moves = self.moves(name, *(search.side_of(n, row) for n in ("motion", "vel")))
+                moves = self.moves(name, *(search.side_of(n, row) for n in ("link_acc", "vel")))
                 hold = friction_memory.of_ring(self.step, contacts, item)
                 self.on_field(name, slot, numbers, frame, centre, moves, hold)
                 return nothing

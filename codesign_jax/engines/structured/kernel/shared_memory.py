@@ -50,7 +50,7 @@ def layout(links: int, axes: int) -> dict[str, tuple[int, tuple[int, ...]]]:
     rows = axes, TEAM
     shapes: dict[str, tuple[int, ...]] = {"axes": rows, "w": rows, "g": rows}
     shapes |= {"inverse": (axes, axes), "matrix": (6, TEAM)}
-    for name in ("motion", "step_motion"):
+    for name in ("link_acc", "step_link_acc"):
         shapes |= {name: (6,), f"{name}_spare": (TEAM - 6,)}
     shared = {"u": rows, "h": rows, "q": (6, TEAM), "f": (TEAM,)}
     return {name: (links, shape) for name, shape in shapes.items()} | {

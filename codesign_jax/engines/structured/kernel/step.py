@@ -9,13 +9,13 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import chambers, friction_memory, objects
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, ContactSet, zeros
-from codesign_jax.engines.structured.kernel.finger_collision import FingerCollision
-from codesign_jax.engines.structured.kernel.finger_contacts import BoundFingerContacts
 from codesign_jax.engines.structured.kernel.memory import loop
 from codesign_jax.engines.structured.kernel.newton import Newton
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem, triangle
 from codesign_jax.engines.structured.kernel.sdf_collision import SdfCollision
+from codesign_jax.engines.structured.kernel.self_collision import SelfCollision
+from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.kernel.team_solver import team_rows
 from codesign_jax.engines.structured.lanes import dot, total
@@ -24,7 +24,11 @@ from codesign_jax.engines.structured.laws import inertia
 from codesign_jax.engines.structured.laws import kinematics as kin
 from codesign_jax.engines.structured.laws.inertia import Body, Centred
 from codesign_jax.engines.structured.laws.integration import integrate, rigid_arm
-from codesign_jax.engines.structured.laws.kinematics import State, next_motion, palm_motion
+from codesign_jax.engines.structured.laws.kinematics import (
+    State,
+    next_acceleration,
+    palm_acceleration,
+)
 from codesign_jax.engines.structured.laws.step_numbers import pushed
 from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model.layout import joint_axes
@@ -34,7 +38,7 @@ from codesign_jax.scene import Scene
 class Step(StepMemory):
     """One time step of a block."""
 
-    search: FingerCollision | None = None
+    search: SelfCollision | None = None
 
     def advance(
         self,
@@ -105,7 +109,7 @@ class Step(StepMemory):
 
     def _overflow(self, waiting: jax.Array) -> jax.Array:
         """One for worlds that had too few slots for their contacts in this step, else zero."""
-        lists = [c.overflow() for c in self.contacts.values() if isinstance(c, BoundFingerContacts)]
+        lists = [c.overflow() for c in self.contacts.values() if isinstance(c, BoundSelfContacts)]
         most = self.block.fold(total(lists), jnp.maximum)
         return jnp.where(waiting & (most > 0), 1.0, 0.0).astype(most.dtype)
 
@@ -113,7 +117,7 @@ class Step(StepMemory):
         """Called with what the forward pass carries before joint i, and behind the last one."""
 
     def _bases(self, bodies: dict) -> tuple[Lanes, ...]:
-        """The fingers' bases: origin, frame, velocity, bias, motion, and weighted centre."""
+        """The fingers' bases: origin, frame, velocity, bias, acceleration, and weighted centre."""
         names = ("mount", "base", "centre_weight", "stub_centre")
         mount, base, weight, stub = (self.hand.read(n) for n in names)
         frame, origin = lanewise(kin.mounted, bodies["place"], bodies["frame"], mount, base)
@@ -123,9 +127,9 @@ class Step(StepMemory):
 
         weight = lanewise(weighted, bodies["place"], bodies["frame"], stub, weight)
         wide = zeros((6,), self.like)
-        palm = bodies["vel"], bodies["bias"], bodies["now"].palm_motion
-        vel, bias, motion = (lanewise(jnp.add, v, wide) for v in palm)
-        return origin, frame, vel, bias, motion, weight
+        palm = bodies["vel"], bodies["bias"], bodies["now"].palm_acc
+        vel, bias, link_acc = (lanewise(jnp.add, v, wide) for v in palm)
+        return origin, frame, vel, bias, link_acc, weight
 
     def _forward(self, state: dict, bodies: dict, pressure: Lanes, world_object: WorldObject):
         """Bodies, forces and contacts from the palm to the tips, left in the scratch table.
@@ -136,28 +140,30 @@ class Step(StepMemory):
         now = bodies["now"]
         like = self.like
         start = self._bases(bodies)
-        origin, frame, vel, _, motion, _ = start
+        origin, frame, vel, _, link_acc, _ = start
         if p.scene.effects.air_mass:
             pressure = chambers.end_pressures(self, pressure)
-        pairs = self.contacts.get("finger_finger")
+        self_contacts = self.contacts.get("finger_finger")
         search = (
-            FingerCollision(self, pairs, bodies) if isinstance(pairs, BoundFingerContacts) else None
+            SelfCollision(self, self_contacts, bodies)
+            if isinstance(self_contacts, BoundSelfContacts)
+            else None
         )
         self.search = search
         if search:
-            search.start(motion, vel, frame, origin)
+            search.start(link_acc, vel, frame, origin)
         fields = self.fields(bodies, world_object)
-        still = zeros((6,), like)
+        zero_acc = zeros((6,), like)
 
         def link(i: Any, carry: tuple) -> tuple:
-            origin, frame, vel, bias, motion, middle = carry
+            origin, frame, vel, bias, link_acc, middle = carry
             self.keep(i, carry[:5])
             joint = self.joint(i) | {"pressure": pressure, "order": self.order(i)}
             run = partial(link_forces, p.scene)
             constants = self.link_constants(i)
             carry, stored = lanewise(run, carry[:5], constants, joint)
             centre = stored["body_centre"]
-            stored |= {"step_acc": zeros((p.axes,), like), "step_motion": still}
+            stored |= {"step_acc": zeros((p.axes,), like), "step_link_acc": zero_acc}
             if p.team > 1:
                 stored = team_rows(stored, (constants["mass"], centre, stored["tensor"]))
             for name, value in stored.items():
@@ -169,14 +175,14 @@ class Step(StepMemory):
                 search.link(i, carry[4], carry[2], carry[1], carry[0])
             return (*carry, middle)
 
-        origin, frame, vel, bias, motion, middle = loop(p.links, link, start, p.size)
-        self.keep(p.links, (origin, frame, vel, bias, motion))
+        origin, frame, vel, bias, link_acc, middle = loop(p.links, link, start, p.size)
+        self.keep(p.links, (origin, frame, vel, bias, link_acc))
         if search:
             search.find()
         if search and p.team > 1:
             fields.of_rings(search)
         for contacts in self.contacts.values():
-            if isinstance(contacts, BoundFingerContacts):
+            if isinstance(contacts, BoundSelfContacts):
                 contacts.keep_counts()
         fields.of_palm_and_object(state)
         count = p.num_fingers * p.links
@@ -212,7 +218,7 @@ def palm_and_object(timestep: float, state: dict, arm, constants: dict) -> dict[
     acc = state["acc_wrist"], state["acc_object"]
     if k is None:
         acc = rigid_arm(arm, state["wrist"], state["wrist_vel"], timestep), acc[1]
-    now = Iterate(acc[0], palm_motion(acc[0], axes), acc[1])
+    now = Iterate(acc[0], palm_acceleration(acc[0], axes), acc[1])
     smooth_palm = palm.smooth_force(vel, bias, g)
     smooth_palm = pushed("palm", smooth_palm, palm.mass, centre, constants)
     smooth_object = grasped.smooth_force(object_vel, g)
@@ -235,14 +241,14 @@ def link_forces(scene: Scene, parent: tuple, constants: dict, joint: dict):
     """A link's kinematics, inertia and forces.
 
     Args:
-      parent: Origin, frame, velocity, bias and motion of the link before it.
+      parent: Origin, frame, velocity, bias and acceleration of the link before it.
       joint: Angles, velocities and accelerations of the joint, the chamber's pressure, and the
         order of the hinges, see `hinge_sign`, by name.
 
     Returns:
       What `parent` is for the next link, and what the solver needs, by name.
     """
-    origin, frame, vel, bias, motion = parent
+    origin, frame, vel, bias, link_acc = parent
     q = joint["finger"]
     rate = joint["finger_vel"]
     pressure = joint["pressure"]
@@ -253,7 +259,7 @@ def link_forces(scene: Scene, parent: tuple, constants: dict, joint: dict):
         joint_axes(scene), origin, frame, constants["offset"], cos, sin, joint["order"]
     )
     vel, bias = kin._link_velocity(vel, bias, axes, rate, joint["order"])
-    motion = next_motion(motion, axes, joint["acc"])
+    link_acc = next_acceleration(link_acc, axes, joint["acc"])
     body = Body(
         constants["mass"],
         origin + apply_columns(frame, constants["centre"]),
@@ -272,13 +278,13 @@ def link_forces(scene: Scene, parent: tuple, constants: dict, joint: dict):
         "axes": axes,
         "body_centre": body.centre,
         "tensor": triangle(body.tensor),
-        "motion": motion,
+        "link_acc": link_acc,
         "smooth": pushed("link", smooth, body.mass, body.centre, constants),
         "tau": tau,
     }
     if springs.moment is not None:
         stored["armature_now"] = springs.armature
-    return (origin, frame, vel, bias, motion), stored
+    return (origin, frame, vel, bias, link_acc), stored
 
 
 def semi_implicit_euler(
@@ -290,9 +296,7 @@ def semi_implicit_euler(
     """
     p = step.p
     h = step.p.scene.discretization.timestep
-    new = lanewise(
-        partial(body_after_step, h), state, bodies["columns"], now.wrist, now.object_motion
-    )
+    new = lanewise(partial(body_after_step, h), state, bodies["columns"], now.wrist, now.object_acc)
     size = lanewise(_largest, new)
 
     def link(i: Any, largest: Lanes) -> Lanes:
@@ -305,7 +309,7 @@ def semi_implicit_euler(
     largest = _worse(size.lane, step.block.fold(fingers, _worse))
     limit = step.constant("speed").lane
     good = goes_on & (largest <= limit)
-    acc = {"acc_wrist": now.wrist, "acc_object": now.object_motion}
+    acc = {"acc_wrist": now.wrist, "acc_object": now.object_acc}
     for name, value in {**new, **acc}.items():
         kept = lanewise(jnp.where, lanes([good], (), wide=False), value, state[name])
         step.world_state.write(name, kept)

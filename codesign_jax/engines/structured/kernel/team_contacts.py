@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.contact_sets import ROWS, ContactSet
-from codesign_jax.engines.structured.kernel.finger_contacts import (
-    BoundFingerContacts,
-    FingerContactSet,
+from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, choose, loop
+from codesign_jax.engines.structured.kernel.self_contacts import (
+    BoundSelfContacts,
     FingerPairing,
     OwnSide,
+    SelfContactSet,
     _times,
 )
-from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, choose, loop
 from codesign_jax.engines.structured.kernel.shared_memory import TEAM, TeamRows, ranks
 from codesign_jax.engines.structured.kernel.slots import BoundSlots, Slot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -97,8 +97,9 @@ class BoundTeamSdfContacts(BoundSlots):
     def columns(self, i: Any, k: int, unit: Lanes, forces: Lanes) -> Lanes:
         """The lanes' columns, (6,), of the sum of X'KX over the k contacts of link i.
 
-        Unit is the motion that a lane's column belongs to, `forces` the lanes whose column are the
-        forces.
+        Args:
+          unit: The acceleration that a lane's column belongs to.
+          forces: Lanes whose column has the forces.
         """
         contacts = self.set.contacts
 
@@ -118,24 +119,24 @@ class BoundTeamSdfContacts(BoundSlots):
             sums = choose(self.touching(item), add, sums, self.set.size)
         return sums
 
-    def prepare_all(self, pairs: BoundFingerContacts, k: int, obj: Lanes) -> Lanes:
+    def prepare_all(self, self_contacts: BoundSelfContacts, k: int, obj: Lanes) -> Lanes:
         """`prepare_linesearch` of all items, k a link; slopes at 0, each on its lane."""
 
         def add(item: Slot, ring: jax.Array, sums: Lanes) -> Lanes:
             row = jax.lax.div(ring, jnp.full_like(ring, k)) + 1
-            motion = pairs.table.gather("side.motion", row, self.block.column)
+            link_acc = self_contacts.table.gather("side.link_acc", row, self.block.column)
             if self.set.on_object:
-                motion = lanewise(jnp.subtract, motion, obj)
-            return lanewise(jnp.add, sums, self.prepare_linesearch(item, motion))
+                link_acc = lanewise(jnp.subtract, link_acc, obj)
+            return lanewise(jnp.add, sums, self.prepare_linesearch(item, link_acc))
 
         return self.every(add, self._zeros(())[0])
 
 
-class TeamFingerContactSet(FingerContactSet):
+class TeamSelfContactSet(SelfContactSet):
     """Contacts between fingers, a pairing's slots dealt to the lanes."""
 
     def __init__(self, scene: Scene, block: tuple[int, int, int], *rest: Any, **options: Any):
-        """As `FingerContactSet`; block: fingers, worlds and lanes of a team."""
+        """As `SelfContactSet`; block: fingers, worlds and lanes of a team."""
         super().__init__(scene, block[:2], *rest, **options)
         # type: ignore[assignment]
         self.block = block
@@ -143,20 +144,20 @@ class TeamFingerContactSet(FingerContactSet):
         self.more |= {"wrench": 6, "wrench_spare": TEAM - 6}
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
-        """See `FingerContactSet`; spare rows take what lanes without a component store."""
+        """See `SelfContactSet`; spare rows take what lanes without a component store."""
         groups: dict[str, tuple[int, tuple[int, ...]]] = {}
         for name, (count, shape) in super().groups().items():
             groups[name] = count, shape
-            if name in ("side.motion", "side.push"):
+            if name in ("side.link_acc", "side.push"):
                 groups[f"{name}_spare"] = count, (TEAM - 6,)
         return groups
 
-    def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundTeamFingerContacts":
+    def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundTeamSelfContacts":
         cones = {name: self.cone(read, name) for name in self._names()}
-        return BoundTeamFingerContacts(self, table, cones)
+        return BoundTeamSelfContacts(self, table, cones)
 
 
-class BoundTeamFingerContacts(BoundFingerContacts):
+class BoundTeamSelfContacts(BoundSelfContacts):
     """The contacts with their memory."""
 
     def __init__(self, *bound: Any):
@@ -195,7 +196,7 @@ class BoundTeamFingerContacts(BoundFingerContacts):
         self.write("count", lanes([count + number.astype(count.dtype)], (), wide=True), row)
 
     def own_side(self, item: Any) -> OwnSide:
-        """See `BoundFingerContacts`; wrenches are added up later."""
+        """See `BoundSelfContacts`; wrenches are added up later."""
         return OwnSide(self.place(item), None, None)
 
     def load(self, item: Any, side: OwnSide, force: Lanes, pairing: FingerPairing) -> None:
@@ -209,7 +210,7 @@ class BoundTeamFingerContacts(BoundFingerContacts):
         self._loaded = True
 
     def each(self, body: Callable, start: Any) -> Any:
-        """See `BoundFingerContacts`; adds up the wrenches of the pass."""
+        """See `BoundSelfContacts`; adds up the wrenches of the pass."""
         result = super().each(body, start)
         if self._loaded:
             self._loaded = False

@@ -112,7 +112,7 @@ class TeamLanes:
     def accelerations(
         self, kept: el.Kept, parent: jax.Array, obj: jax.Array, z: Lanes | None, at: int = FORCES
     ) -> Lanes:
-        """Joint accelerations of the lanes' components of the parent's and the object's motion.
+        """Joint accelerations of the lanes' components of the parent and the object.
 
         Lanes without a component have zero.  Without z a lane, `at`, has the joint accelerations at
         rest in its column of w.
@@ -124,8 +124,8 @@ class TeamLanes:
             return moved if z is not None else jnp.where(at_rest, w, moved)
 
         w, g, _ = kept.factors
-        motions = self.as_lanes(parent), self.as_lanes(obj)
-        acc = team_sum(self.block, lanewise(part, w, g, *motions, at_rest))
+        accs = self.as_lanes(parent), self.as_lanes(obj)
+        acc = team_sum(self.block, lanewise(part, w, g, *accs, at_rest))
         return acc if z is None else lanewise(jnp.add, acc, z)
 
     def again(self, axes: list, kept: el.Kept, r: jax.Array, ro: jax.Array) -> tuple:
@@ -148,7 +148,7 @@ class TeamLanes:
         return el.Kept(factors, self.problem.read("inverse", item=i)[0])
 
     def outward(self, i: Any, parent: jax.Array, obj: jax.Array, at: int) -> tuple:
-        """A joint's accelerations and its link's motion, by components; see `accelerations`."""
+        """A joint's accelerations and its link's, by components; see `accelerations`."""
         a = self.accelerations(self.link(i), parent, obj, None, at)
         axes = self.chip.rows("axes", i)
         return a, lanewise(lambda p, s, a: p + dot(s, a), self.as_lanes(parent), axes, a).lane
@@ -159,15 +159,15 @@ class TeamLanes:
 
     def wrist(self, kept: list[el.Kept], axes: list[Lanes], obj: Lanes, z: list | None) -> Iterate:
         """Substitutes back at the wrist: slides, then hinges."""
-        motion = lanewise(jnp.zeros_like, obj)
+        palm_acc = lanewise(jnp.zeros_like, obj)
         joints = []
         part = chosen(self.block, obj)
         for k in (1, 0):
-            a = self.accelerations(kept[k], chosen(self.block, motion), part, z and z[k])
+            a = self.accelerations(kept[k], chosen(self.block, palm_acc), part, z and z[k])
             joints.append(a)
-            motion = lanewise(lambda m, s, a: m + contract(s, a[:, None], 0), motion, axes[k], a)
+            palm_acc = lanewise(add_joint, palm_acc, axes[k], a)
         wrist = lanewise(lambda a: jnp.concatenate(a), joints)
-        return Iterate(self.narrowed(wrist), self.narrowed(motion), obj)
+        return Iterate(self.narrowed(wrist), self.narrowed(palm_acc), obj)
 
 
 class TeamElimination(Elimination):
@@ -185,9 +185,9 @@ class TeamElimination(Elimination):
         """See `Elimination`; the node is the lanes' columns of P with r, C, and Q with r_o."""
         problem = self.problem
         team = self.team
-        pairs = self.problem.finger_pairs
-        assert pairs is not None
-        pairs.update_constraints(alpha)
+        self_contacts = self.problem.self_contacts
+        assert self_contacts is not None
+        self_contacts.update_constraints(alpha)
         for contacts in problem.per_link:
             contacts.update_constraints(alpha)  # type: ignore[attr-defined]
 
@@ -201,11 +201,11 @@ class TeamElimination(Elimination):
             (p, c, q), work = carry
             axes = team.axes(i)
             acc = problem.move("acc", i, alpha)
-            part = team.chip.get("motion", i) + alpha.lane * team.chip.get("step_motion", i)
-            team.chip.put("motion", part, i)
+            part = team.chip.get("link_acc", i) + alpha.lane * team.chip.get("step_link_acc", i)
+            team.chip.put("link_acc", part, i)
             column = team.chip.rows("matrix", i)
-            (motion,) = problem.read("motion", item=i)
-            force = team.scratch.get("smooth", i) - lanewise(dot, column, motion).lane
+            (link_acc,) = problem.read("link_acc", item=i)
+            force = team.scratch.get("smooth", i) - lanewise(dot, column, link_acc).lane
             force = team.vector(force + team.scratch.get("side.push", i + 1))
             p = lanewise(add_link, p, team.forces, force, column)
             tau, armature = problem.read("tau", "armature", item=i)
@@ -221,7 +221,7 @@ class TeamElimination(Elimination):
         none = zeros((6,), self.like)
         start = [none] * 3, zeros((), self.like)
         (p, c, q), work = loop(self.links, step, start, self.block.size, reverse=True)
-        first = pairs.pushed(0)
+        first = self_contacts.pushed(0)
         p = lanewise(add_link, p, team.forces, first, none)
         whole = self.block.fold(self.block.over_team(work.lane, jnp.add), jnp.add)
         return self.block.sum((p, c, q)), lanes([whole], (), wide=False)
@@ -349,14 +349,14 @@ class TeamCoupling(Coupling):
     def substitute(self, z: str, step: Iterate) -> None:
         team = self.team
         at = FORCES if z == "z" else AGAIN
-        palm, obj = (chosen(self.block, v) for v in (step.palm_motion, step.object_motion))
+        palm, obj = (chosen(self.block, v) for v in (step.palm_acc, step.object_acc))
 
         def link(i: Any, parent: Lanes) -> Lanes:
-            _, motion = team.outward(i, parent.lane, obj, at)
-            team.scratch.put("side.motion", motion, i + 1)
-            return team.as_lanes(motion)
+            _, link_acc = team.outward(i, parent.lane, obj, at)
+            team.scratch.put("side.link_acc", link_acc, i + 1)
+            return team.as_lanes(link_acc)
 
-        self.pairs.put("motion", self.problem.widened(step.palm_motion), 0)
+        self.contacts.put("link_acc", self.problem.widened(step.palm_acc), 0)
         loop(self.links, link, team.as_lanes(palm + 0 * obj), self.block.size)
 
 
@@ -371,40 +371,40 @@ class TeamLineSearch(LineSearch):
     def prepare(self, now: Iterate, step: Iterate) -> tuple[Lanes, Lanes, Lanes]:
         problem = self.problem
         team = self.team
-        pairs = self.problem.finger_pairs
-        assert pairs is not None
-        palm, obj = (chosen(self.block, v) for v in (step.palm_motion, step.object_motion))
+        self_contacts = self.problem.self_contacts
+        assert self_contacts is not None
+        palm, obj = (chosen(self.block, v) for v in (step.palm_acc, step.object_acc))
         first = team.as_lanes(jnp.where(self.block.mate == 0, jnp.ones_like(self.like), 0.0))
 
-        def smooth(sums, column, motion, moved, smooth, part, first, armature, acc, tau, a):
+        def smooth(sums, column, link_acc, moved, smooth, part, first, armature, acc, tau, a):
             slope, curvature = sums
             joints = total([(armature[k] * acc[k] - tau[k]) * a[k] for k in range(a.shape[0])])
             stiff = total([armature[k] * a[k] * a[k] for k in range(a.shape[0])])
-            slope = slope + first * joints - (smooth - dot(column, motion)) * part
+            slope = slope + first * joints - (smooth - dot(column, link_acc)) * part
             return [slope, curvature + first * stiff + dot(column, moved) * part]
 
         def link(i: Any, carry: tuple) -> tuple:
             parent, sums = carry
             a, part = team.outward(i, parent.lane, obj, FORCES)
             problem.write("step_acc", a, i)
-            team.chip.put("step_motion", part, i)
-            team.scratch.put("side.motion", part, i + 1)
+            team.chip.put("step_link_acc", part, i)
+            team.scratch.put("side.link_acc", part, i + 1)
             numbers = problem.read("armature", "acc", "tau", item=i)
             push = team.as_lanes(team.scratch.get("smooth", i))
             column = team.chip.rows("matrix", i)
-            motion, moved = problem.read("motion", "step_motion", item=i)
+            link_acc, moved = problem.read("link_acc", "step_link_acc", item=i)
             sums = lanewise(
-                smooth, sums, column, motion, moved, push, team.as_lanes(part), first, *numbers, a
+                smooth, sums, column, link_acc, moved, push, team.as_lanes(part), first, *numbers, a
             )
             return team.as_lanes(part), sums
 
-        pairs.put("motion", problem.widened(step.palm_motion), 0)
+        self_contacts.put("link_acc", problem.widened(step.palm_acc), 0)
         start = team.as_lanes(palm + 0 * obj), [zeros((), self.like)] * 2
         _, (slope, curvature) = loop(self.links, link, start, self.block.size)
         touch = self.prepare_slots(zeros((), self.like), step)
-        terms = [lanewise(jnp.multiply, touch, first), pairs.prepare_all()]
+        terms = [lanewise(jnp.multiply, touch, first), self_contacts.prepare_all()]
         for contacts in problem.per_link:
-            terms.append(contacts.prepare_all(pairs, self.rings, step.object_motion))  # type: ignore[attr-defined]
+            terms.append(contacts.prepare_all(self_contacts, self.rings, step.object_acc))  # type: ignore[attr-defined]
         touch = lanewise(lambda t: total(t), terms)
         slope, curvature, touch = self.total([slope, curvature, touch])
         slope, curvature = lanewise(_rest, now, step, problem.palm, slope, curvature)
@@ -427,8 +427,8 @@ class TeamLineSearch(LineSearch):
         sums = [lanewise(jnp.multiply, v, first) for v in sums]
         for c in problem.per_link:
             sums = c.every(lambda item, _, s, c=c: plus(s, c.slopes(item, alpha)), sums)  # type: ignore[attr-defined]
-        assert problem.finger_pairs is not None
-        return problem.finger_pairs.slopes_of_all(alpha, sums)
+        assert problem.self_contacts is not None
+        return problem.self_contacts.slopes_of_all(alpha, sums)
 
 
 def team_rows(stored: dict[str, Lanes], body: tuple) -> dict[str, Lanes]:
@@ -444,6 +444,11 @@ def team_rows(stored: dict[str, Lanes], body: tuple) -> dict[str, Lanes]:
     axes, matrix = lanewise(wide, stored["axes"], *body)
     unused = UNUSED
     return {k: v for k, v in stored.items() if k not in unused} | {"axes": axes, "matrix": matrix}
+
+
+def add_joint(parent, axes, a):
+    """A body's spatial acceleration from its parent's and its joint's."""
+    return parent + contract(axes, a[:, None], 0)
 
 
 def _plus(first, second):

@@ -39,12 +39,13 @@ def make_cone(scene: Scene, friction: Any, *, bodies: int, ratio: Any, stiffer: 
     c = scene.contact
     h = scene.discretization.timestep
     surface = {"ahead": scene.effects.surface == "hull"}
-    normal = 2.0 / bodies * stiffer * contact_mass(scene, **surface)
-    reference = 1.0 / (h * (h + dissipation(scene, **surface))), 1.0 / h + 0.0 * normal
+    normal_mass = 2.0 / bodies * stiffer * contact_mass(scene, **surface)
+    reference = 1.0 / (h * (h + dissipation(scene, **surface))), 1.0 / h + 0.0 * normal_mass
     if scene.effects.friction == "none":
-        return Cone(normal, None, None, None, *reference)  # type: ignore[arg-type]
+        return Cone(normal_mass, None, None, None, *reference)  # type: ignore[arg-type]
     impratio = friction_ratio(scene, ratio, **surface)
-    cone = Cone(normal, impratio * normal, friction, friction / jnp.sqrt(impratio), *reference)
+    tangential_mass = impratio * normal_mass
+    cone = Cone(normal_mass, tangential_mass, friction, friction / jnp.sqrt(impratio), *reference)
     if scene.effects.friction != "full":
         return cone
     least = jnp.maximum(friction, LEAST)

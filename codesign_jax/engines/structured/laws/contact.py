@@ -31,10 +31,11 @@ class Cone(NamedTuple):
     What a friction model does not need is None: it has no place in the program.
     """
 
-    normal: jax.Array | float  # D of the normal row at the scene's stiffness [kg]
-    tangent: jax.Array | float  # D of the tangential rows [kg]
+    # MuJoCo's constraint mass D of the normal row, at the scene's stiffness [kg]
+    normal_mass: jax.Array | float
+    tangential_mass: jax.Array | float  # D of the tangential rows [kg]
     friction: jax.Array | float  # Coulomb coefficient mu
-    ratio: jax.Array | float  # mu sqrt(D / D_t), MuJoCo's regularized cone
+    regularized_friction: jax.Array | float  # mu sqrt(D / D_t), `mu` of MuJoCo's contacts
     spring: jax.Array | float  # K, coefficient of the penetration in aref [1/s^2]
     damper: jax.Array | float  # Coefficient of the velocity in aref, 1/h [1/s]
     spin: jax.Array | float | None = None  # Torsional friction over Coulomb friction [m]
@@ -42,15 +43,15 @@ class Cone(NamedTuple):
 
     def of_share(self, share: jax.Array) -> "Cone":
         """This cone with its stiffness scaled by `share`, which is 0 where there is no contact."""
-        tangent = None if self.tangent is None else self.tangent * share
-        return self._replace(normal=self.normal * share, tangent=tangent)
+        tangential_mass = None if self.tangential_mass is None else self.tangential_mass * share
+        return self._replace(normal_mass=self.normal_mass * share, tangential_mass=tangential_mass)
 
     def of_friction(self, friction: jax.Array) -> "Cone":
         """This cone with other Coulomb coefficients and the same stiffness."""
         if self.friction is None:
             return self
-        ratio = friction * jnp.sqrt(self.normal / self.tangent)
-        cone = self._replace(friction=friction, ratio=ratio)
+        regularized_friction = friction * jnp.sqrt(self.normal_mass / self.tangential_mass)
+        cone = self._replace(friction=friction, regularized_friction=regularized_friction)
         if self.spin is None or self.roll is None:
             return cone
         change = jnp.maximum(self.friction, LEAST) / jnp.maximum(friction, LEAST)
@@ -67,7 +68,7 @@ class Contacts(NamedTuple):
 
     @property
     def active(self) -> jax.Array:
-        return jnp.asarray(self.cone.normal > 0)
+        return jnp.asarray(self.cone.normal_mass > 0)
 
     @property
     def direction(self) -> jax.Array:
@@ -77,7 +78,13 @@ class Contacts(NamedTuple):
         return jnp.concatenate([self.normal, jnp.zeros_like(self.normal)])
 
     def relative(self, motion: jax.Array) -> jax.Array:
-        """Point motion, (3, ...), of a relative spatial motion, (6, ...); see `turning`."""
+        """Relative velocity of the points, shape (3, ...); with turning, see `turning`, (6, ...).
+
+        Accelerations without velocity terms, and virtual ones, are related in the same way.
+
+        Args:
+          motion: Relative spatial velocity or acceleration, shape (6, ...).
+        """
         moving = motion[3:6] + cross(motion[:3], self.point)
         if self.cone.spin is None:
             return moving
@@ -141,17 +148,19 @@ def constraint_update(contacts: Contacts, jar: jax.Array) -> ConeResponse:
     n = contacts.direction
     if cone.friction is None:
         return _update_frictionless(contacts, jar)
-    normal = dot(n, jar)
-    tangent = jar - normal * n
-    length = jnp.sqrt(dot(tangent, tangent) + 1e-30)
-    e = tangent / length
-    bottom, middle = _zones(contacts, normal, length)
-    slip = normal - cone.friction * length
-    stiff = jnp.where(middle, cone.normal / (1.0 + cone.ratio**2), 0.0)
-    kappa = jnp.where(bottom, cone.tangent, -stiff * slip * cone.friction / length)
-    force = jnp.where(bottom, cone.normal * normal, stiff * slip) * -n
-    force = force + jnp.where(bottom, -cone.tangent * length, stiff * slip * cone.friction) * e
-    nn = jnp.where(bottom, cone.normal, stiff) - kappa
+    jar_normal = dot(n, jar)
+    jar_tangent = jar - jar_normal * n
+    length = jnp.sqrt(dot(jar_tangent, jar_tangent) + 1e-30)
+    e = jar_tangent / length
+    bottom, middle = _zones(contacts, jar_normal, length)
+    slip = jar_normal - cone.friction * length
+    stiff = jnp.where(middle, cone.normal_mass / (1.0 + cone.regularized_friction**2), 0.0)
+    kappa = jnp.where(bottom, cone.tangential_mass, -stiff * slip * cone.friction / length)
+    force = jnp.where(bottom, cone.normal_mass * jar_normal, stiff * slip) * -n
+    sticking = -cone.tangential_mass * length
+    sliding = stiff * slip * cone.friction
+    force = force + jnp.where(bottom, sticking, sliding) * e
+    nn = jnp.where(bottom, cone.normal_mass, stiff) - kappa
     ne = -stiff * cone.friction
     ee = jnp.where(bottom, 0.0, stiff * cone.friction**2 - kappa)
     size = n.shape[0]
@@ -165,7 +174,7 @@ def constraint_update(contacts: Contacts, jar: jax.Array) -> ConeResponse:
             for i, j in pairs
         ]
     )
-    quadratic = cone.normal * normal**2 + cone.tangent * length**2
+    quadratic = cone.normal_mass * jar_normal**2 + cone.tangential_mass * length**2
     cost = 0.5 * jnp.where(bottom, quadratic, stiff * slip**2)
     return ConeResponse(force, hessian, cost)
 
@@ -173,18 +182,22 @@ def constraint_update(contacts: Contacts, jar: jax.Array) -> ConeResponse:
 def _update_frictionless(contacts: Contacts, jar: jax.Array) -> ConeResponse:
     """One row a contact: quadratic in the normal part where that is negative."""
     n = contacts.normal
-    normal = dot(n, jar)
-    stiff = jnp.where(contacts.active & (normal < 0), contacts.cone.normal, 0.0)
+    jar_normal = dot(n, jar)
+    stiff = jnp.where(contacts.active & (jar_normal < 0), contacts.cone.normal_mass, 0.0)
     pairs = [(i, j) for i in range(3) for j in range(i, 3)]
     hessian = jnp.stack([stiff * n[i] * n[j] for i, j in pairs])
-    return ConeResponse(-stiff * normal * n, hessian, 0.5 * stiff * normal**2)
+    return ConeResponse(-stiff * jar_normal * n, hessian, 0.5 * stiff * jar_normal**2)
 
 
-def _zones(contacts: Contacts, normal: jax.Array, length: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _zones(
+    contacts: Contacts, jar_normal: jax.Array, length: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     cone = contacts.cone
     # With D_n / D_t = 1 / impratio; where friction is zero nothing sticks.
-    bottom = contacts.active & (cone.friction * cone.normal * normal + cone.tangent * length <= 0)
-    middle = contacts.active & ~bottom & (normal < cone.friction * length)
+    bottom = contacts.active & (
+        cone.friction * cone.normal_mass * jar_normal + cone.tangential_mass * length <= 0
+    )
+    middle = contacts.active & ~bottom & (jar_normal < cone.friction * length)
     return bottom, middle
 
 
@@ -214,35 +227,38 @@ def line(contacts: Contacts, jar: jax.Array, step: jax.Array) -> LineCost:
 
 def same_zone(contacts: Contacts, ray: LineCost, alpha: jax.Array) -> jax.Array:
     """Whether the contacts are in one zone of the cone, see `constraint_update`, at 0 and alpha."""
-    normals = ray.n0, ray.n0 + alpha * ray.n1
+    jar_normals = ray.n0, ray.n0 + alpha * ray.n1
     if contacts.cone.friction is None:
-        before, after = (normal < 0 for normal in normals)
+        before, after = (jar_normal < 0 for jar_normal in jar_normals)
         return ~contacts.active | (before == after)
     squares = ray.uu, ray.uu + alpha * (2 * ray.uv + alpha * ray.vv)
     lengths = [jnp.sqrt(jnp.maximum(s, 0.0) + 1e-30) for s in squares]
-    before, after = (_zones(contacts, n, size) for n, size in zip(normals, lengths, strict=True))
+    before, after = (
+        _zones(contacts, n, size) for n, size in zip(jar_normals, lengths, strict=True)
+    )
     return (before[0] == after[0]) & (before[1] == after[1])
 
 
 def slopes(contacts: Contacts, ray: LineCost, alpha: jax.Array) -> tuple[jax.Array, jax.Array]:
     """First and second derivative of the cost along the line, shape (...)."""
     cone = contacts.cone
-    normal = ray.n0 + alpha * ray.n1
+    jar_normal = ray.n0 + alpha * ray.n1
     if cone.friction is None:
-        stiff = jnp.where(contacts.active & (normal < 0), cone.normal, 0.0)
-        return stiff * normal * ray.n1, stiff * ray.n1**2
+        stiff = jnp.where(contacts.active & (jar_normal < 0), cone.normal_mass, 0.0)
+        return stiff * jar_normal * ray.n1, stiff * ray.n1**2
     square = jnp.maximum(ray.uu + alpha * (2 * ray.uv + alpha * ray.vv), 0.0)
     length = jnp.sqrt(square + 1e-30)
     half = ray.uv + alpha * ray.vv
     rate = half / length
-    bottom, middle = _zones(contacts, normal, length)
-    slip = normal - cone.friction * length
+    bottom, middle = _zones(contacts, jar_normal, length)
+    slip = jar_normal - cone.friction * length
     slip_rate = ray.n1 - cone.friction * rate
-    stiff = cone.normal / (1.0 + cone.ratio**2)
+    stiff = cone.normal_mass / (1.0 + cone.regularized_friction**2)
     curve = jnp.maximum(ray.vv - rate**2, 0.0) / length
-    first = jnp.where(bottom, cone.normal * normal * ray.n1 + cone.tangent * half, 0.0)
+    sticking = cone.normal_mass * jar_normal * ray.n1 + cone.tangential_mass * half
+    first = jnp.where(bottom, sticking, 0.0)
     first = jnp.where(middle, stiff * slip * slip_rate, first)
-    second = jnp.where(bottom, cone.normal * ray.n1**2 + cone.tangent * ray.vv, 0.0)
+    second = jnp.where(bottom, cone.normal_mass * ray.n1**2 + cone.tangential_mass * ray.vv, 0.0)
     bent = stiff * (slip_rate**2 - slip * cone.friction * curve)
     return first, jnp.where(middle, bent, second)
 

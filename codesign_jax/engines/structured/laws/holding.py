@@ -24,8 +24,8 @@ def held(contacts: Contacts, grip: jax.Array) -> jax.Array:
     cone = contacts.cone
     n = contacts.normal
     # A slot in which a lane has no contact may have no stiffness either.
-    some = contacts.active & (cone.tangent > 0)
-    elastic = jnp.where(some, _elastic(contacts) / jnp.where(some, cone.tangent, 1.0), 0.0)
+    some = contacts.active & (cone.tangential_mass > 0)
+    elastic = jnp.where(some, _elastic(contacts) / jnp.where(some, cone.tangential_mass, 1.0), 0.0)
     tangent = elastic * (grip - dot(n, grip) * n)
     if cone.spin is None:
         return tangent
@@ -53,7 +53,7 @@ def hold(contacts: Contacts, force: jax.Array, grip: jax.Array) -> jax.Array:
 def _elastic(contacts: Contacts) -> jax.Array:
     """Normal force of a contact at rest."""
     cone = contacts.cone
-    return cone.normal * cone.spring * jnp.maximum(-contacts.gap, 0.0)
+    return cone.normal_mass * cone.spring * jnp.maximum(-contacts.gap, 0.0)
 
 
 def quotient(sums: jax.Array) -> jax.Array:

@@ -192,9 +192,9 @@ def _turn_link(names: tuple[str, ...], origin, frame, offset, cos, sin, order):
         axis = frame[1]
         columns = rotate(list(frame), 1, cos[0], sin[0])
         return origin, jnp.stack(columns), spatial(axis, cross(origin, axis))[None]
-    still = jnp.ones_like(cos[0]), jnp.zeros_like(sin[0])
+    no_turn = jnp.ones_like(cos[0]), jnp.zeros_like(sin[0])
     turns = {name: (cos[a], sin[a]) for a, name in enumerate(names)}
-    bend, lateral, twist = (turns.get(name, still) for name in ("bend", "lateral", "twist"))
+    bend, lateral, twist = (turns.get(name, no_turn) for name in ("bend", "lateral", "twist"))
     forward = order > 0
 
     def swapped(a, b):
@@ -236,24 +236,24 @@ def _object(state: State):
     return columns, spatial(apply_columns(columns, state.angular_vel), state.linear_vel)
 
 
-def palm_motion(wrist: jax.Array, axes: jax.Array) -> jax.Array:
+def palm_acceleration(wrist_acc: jax.Array, axes: jax.Array) -> jax.Array:
     """The palm's spatial acceleration of the wrist's slides and hinges."""
-    moving = spatial(jnp.zeros_like(wrist[:3]), wrist[:3])
-    return moving + total([axes[k] * wrist[3 + k] for k in range(3)])
+    moving = spatial(jnp.zeros_like(wrist_acc[:3]), wrist_acc[:3])
+    return moving + total([axes[k] * wrist_acc[3 + k] for k in range(3)])
 
 
-def next_motion(parent: jax.Array, axes: jax.Array, a: jax.Array) -> jax.Array:
+def next_acceleration(parent: jax.Array, axes: jax.Array, a: jax.Array) -> jax.Array:
     """A link's spatial acceleration from its parent's and its joint's."""
     return parent + total([axes[k] * a[k] for k in range(axes.shape[0])])
 
 
 def propagate(kin: Kinematics, acc: Acc) -> Spatial:
     """Spatial accelerations J a of all bodies, without velocity terms."""
-    palm = once(palm_motion, acc.wrist, kin.wrist_axes)
+    palm = once(palm_acceleration, acc.wrist, kin.wrist_axes)
 
     def step(parent: jax.Array, link: tuple):
-        motion = once(next_motion, parent, *link)
-        return motion, motion
+        link_acc = once(next_acceleration, parent, *link)
+        return link_acc, link_acc
 
     first = palm + jnp.zeros_like(kin.vel[:, 0])
     _, links = scan_links(step, first, (kin.axes, acc.finger))

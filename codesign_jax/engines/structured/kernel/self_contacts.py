@@ -1,6 +1,6 @@
-"""Contacts between fingers in the kernel.
+"""Self-contacts: contacts of the hand with itself, of fingers with one another and with the palm.
 
-A contact is stored on the lanes of both fingers; each lane keeps its own finger's side of it.
+A contact of two fingers is stored on the lanes of both: each lane keeps its own finger's side.
 Fingers are paired by the exclusive or of their indices with 1, 2, and so on, which reaches every
 pair; a row of slots belongs to one such number.  Both lanes of a pair put the same contact into the
 same slot, so that they process it at the same time and exchange numbers in registers.  The side of
@@ -89,8 +89,8 @@ def pair_slots(scene: Scene) -> int:
     return min(4 * d.links * d.spheres_per_link, (d.links * d.spheres_per_link) ** 2)
 
 
-class FingerContactSet(SlotSet):
-    """Contacts between fingers, with themselves and the palm; a row is a pairing of all fingers."""
+class SelfContactSet(SlotSet):
+    """Contacts of the hand with itself; a row of slots belongs to a pairing of all fingers."""
 
     def __init__(
         self,
@@ -135,16 +135,16 @@ class FingerContactSet(SlotSet):
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         """See `ContactSet`; and the sides of all fingers, from the palm to the tips."""
-        sides = {f"side.{name}": (self.links + 1, (6,)) for name in ("motion", "vel", "push")}
+        sides = {f"side.{name}": (self.links + 1, (6,)) for name in ("link_acc", "vel", "push")}
         return super().groups() | sides
 
-    def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundFingerContacts":
+    def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundSelfContacts":
         cones = {name: self.cone(read, name) for name in self._names()}
-        return BoundFingerContacts(self, table, cones)
+        return BoundSelfContacts(self, table, cones)
 
 
 class OwnSide(NamedTuple):
-    """What `BoundFingerContacts.load` needs of a slot's own side, read before anything is stored.
+    """What `BoundSelfContacts.load` needs of a slot's own side, read before anything is stored.
 
     NVIDIA's assembler moves no load before a store that might be to the same place, so a thread
     waits a second time for what is read behind a store.
@@ -156,12 +156,12 @@ class OwnSide(NamedTuple):
     wrench: Lanes | None  # Wrench of all contacts so far on that row, (6, ...); None likewise
 
 
-class BoundFingerContacts(BoundSlots):
+class BoundSelfContacts(BoundSlots):
     """Contacts between fingers with their memory."""
 
-    set: FingerContactSet  # type: ignore[assignment]
+    set: SelfContactSet  # type: ignore[assignment]
 
-    def __init__(self, of: FingerContactSet, table: BoundTable, cones: dict[str, contact.Cone]):
+    def __init__(self, of: SelfContactSet, table: BoundTable, cones: dict[str, contact.Cone]):
         super().__init__(of, table, next(iter(cones.values())))
         self.block = Block(*of.block)
         self._cones = cones
@@ -199,7 +199,7 @@ class BoundFingerContacts(BoundSlots):
         return lanes([kept], (), wide=True)
 
     def put(self, name: str, value: Lanes, row: Any) -> None:
-        """Stores a link's "motion", "vel" or "push"; row 0 is the palm's."""
+        """Stores a link's "link_acc", "vel" or "push"; row 0 is the palm's."""
         self.table.write(f"side.{name}", value, row)
 
     def pushed(self, row: Any) -> Lanes:
@@ -273,17 +273,17 @@ class BoundFingerContacts(BoundSlots):
     # One side's part of a contact
 
     def relative(self, item: Any, pairing: FingerPairing) -> Lanes:
-        """How the links' motion moves a slot's sides to each other, on its own side's lanes."""
+        """Relative acceleration of a slot's sides by the links', on its own side's lanes."""
         contacts = self.set.contacts
         place = self.place(item)
 
         def of_side(field: str) -> Lanes:
-            motion = self._on_rows(item, field)
+            link_acc = self._on_rows(item, field)
 
-            def moved(place, cone, motion):
-                return contacts(place, cone).relative(motion[:, None])
+            def moved(place, cone, link_acc):
+                return contacts(place, cone).relative(link_acc[:, None])
 
-            return lanewise(moved, place, self.cone, motion)
+            return lanewise(moved, place, self.cone, link_acc)
 
         mine = of_side("row")
         if pairing.alone is None:
@@ -293,15 +293,15 @@ class BoundFingerContacts(BoundSlots):
         return lanewise(jnp.subtract, mine, theirs)
 
     def _on_rows(self, item: Any, field: str) -> Lanes:
-        """Motions of the links in a field of a slot's lanes; zeros where nothing touches."""
+        """Accelerations of the links in a field of a slot's lanes; zeros where nothing touches."""
         if self.set.gathers:
             row = self.read(field, item).lane.astype(jnp.int32)
-            return self.table.gather("side.motion", row, self.block.column)
+            return self.table.gather("side.link_acc", row, self.block.column)
         start = zeros((6,), self.like)
 
-        def take(row: Any, chosen: jax.Array, motions: Lanes) -> Lanes:
-            new = self.table.read("side.motion", row)
-            return lanewise(jnp.where, lanes([chosen], (), wide=True), new, motions)
+        def take(row: Any, chosen: jax.Array, accs: Lanes) -> Lanes:
+            new = self.table.read("side.link_acc", row)
+            return lanewise(jnp.where, lanes([chosen], (), wide=True), new, accs)
 
         return self._each_row(item, field, take, start)
 

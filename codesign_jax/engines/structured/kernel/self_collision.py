@@ -22,12 +22,12 @@ from codesign_jax.engines.structured.kernel.contact_sets import (
     with_held,
     zeros,
 )
-from codesign_jax.engines.structured.kernel.finger_contacts import (
-    BoundFingerContacts,
-    FingerPairing,
-)
 from codesign_jax.engines.structured.kernel.memory import BoundTable, loop, solid
 from codesign_jax.engines.structured.kernel.ring_pairs import RingPairs
+from codesign_jax.engines.structured.kernel.self_contacts import (
+    BoundSelfContacts,
+    FingerPairing,
+)
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import cross, dot
@@ -59,12 +59,12 @@ def fields(links: int) -> dict[str, tuple[int, tuple[int, ...]]]:
     return {f"pair.{name}": group for name, group in rows_by_name.items()}
 
 
-class FingerCollision:
+class SelfCollision:
     """Gives a slot to each contact of fingers with one another, with themselves and the palm."""
 
-    def __init__(self, step: StepMemory, pairs: BoundFingerContacts, bodies: dict[str, Any]):
+    def __init__(self, step: StepMemory, self_contacts: BoundSelfContacts, bodies: dict[str, Any]):
         self.step = step
-        self.pairs = pairs
+        self.contacts = self_contacts
         self.p = step.p
         self.scratch = step.scratch
         self.block = step.block
@@ -111,34 +111,34 @@ class FingerCollision:
         tip = self.ring(self.count - 1)
         return lanewise(jnp.maximum, tip, self.ring(0)) if self.p.tapered else tip
 
-    def start(self, motion: Lanes, vel: Lanes, frame: Lanes, base: Lanes) -> None:
+    def start(self, link_acc: Lanes, vel: Lanes, frame: Lanes, base: Lanes) -> None:
         """Empties the slots; stores what belongs to the palm."""
-        for row in range(self.pairs.set.rows):
-            self.pairs.clear(row)
+        for row in range(self.contacts.set.rows):
+            self.contacts.clear(row)
         friction_memory.clear(self.step)
         self.write("fastest", zeros((), self.like))
-        self._side(0, motion, vel, frame, base)
+        self._side(0, link_acc, vel, frame, base)
         self.write("end", lanewise(above, base, frame, frame, self.ring(self.ring_at(0))), 0)
 
-    def link(self, i: Any, motion: Lanes, vel: Lanes, frame: Lanes, origin: Lanes) -> None:
+    def link(self, i: Any, link_acc: Lanes, vel: Lanes, frame: Lanes, origin: Lanes) -> None:
         before = self.read("frame", i)
-        self._side(i + 1, motion, vel, frame, origin)
+        self._side(i + 1, link_acc, vel, frame, origin)
         numbers = self.ring(self.ring_at(i + 1))
         self.write("end", lanewise(above, origin, before, frame, numbers), i + 1)
         size = self.read("fastest"), vel, self.palm_vel, origin, self.ring(0)
         self.write("fastest", lanewise(_faster, *size))
 
-    def _side(self, row: Any, motion: Lanes, vel: Lanes, frame: Lanes, joint: Lanes) -> None:
-        self.pairs.put("motion", motion, row)
-        self.pairs.put("vel", vel, row)
+    def _side(self, row: Any, link_acc: Lanes, vel: Lanes, frame: Lanes, joint: Lanes) -> None:
+        self.contacts.put("link_acc", link_acc, row)
+        self.contacts.put("vel", vel, row)
         self.write("frame", frame, row)
         self.write("joint", joint, row)
 
     def side_of(self, name: str, row: Any, lane: jax.Array | None = None) -> Lanes:
-        """Motions of links, see `BoundFingerContacts.put`; arguments as `read`."""
+        """Links' "link_acc" or "vel", see `BoundSelfContacts.put`; arguments as `read`."""
         if lane is None and not jnp.ndim(row):
-            return self.pairs.table.read(f"side.{name}", row)
-        return self._gathered(self.pairs.table, f"side.{name}", row, lane)
+            return self.contacts.table.read(f"side.{name}", row)
+        return self._gathered(self.contacts.table, f"side.{name}", row, lane)
 
     def _lines(self) -> None:
         """Ends the centre lines at the tips' rings; stores their segments."""
@@ -171,10 +171,10 @@ class FingerCollision:
             return
 
         def pairing(row: jax.Array, x: jax.Array) -> jax.Array:
-            pairing = self.pairs.pairing(row)
+            pairing = self.contacts.pairing(row)
             other = jax.lax.div(pairing.lane, jnp.int32(self.p.block))
             owner = (self.block.finger < other) & (other < self.p.num_fingers)
-            if self.hull and not self.pairs.set.gathers:
+            if self.hull and not self.contacts.set.gathers:
                 RingPairs(self, row, pairing, owner).find()
                 return x
             if self.hull:
@@ -187,7 +187,9 @@ class FingerCollision:
             self._each_ring(0, lambda *ring: search(row, pairing, owner, *ring))
             return x
 
-        jax.lax.fori_loop(int(self.pairs.set.alone), self.pairs.set.rows, pairing, jnp.int32(0))
+        jax.lax.fori_loop(
+            int(self.contacts.set.alone), self.contacts.set.rows, pairing, jnp.int32(0)
+        )
 
     def _each_ring(self, link: int, search: Callable) -> None:
         """Runs search(item, lanes that have it) for all rings from a link on, dealt to lanes."""
@@ -247,7 +249,7 @@ class FingerCollision:
 
         Args:
           row: The link.
-          mine: Its motion and velocity, see `moves`; `theirs`: those of the other body.
+          mine: Its acceleration and velocity, see `moves`; `theirs`: those of the other body.
           held: What the contact holds of friction, (3,), or nothing.
         """
         place = lanewise(with_axis, place)
@@ -259,8 +261,8 @@ class FingerCollision:
         return kept(place, jar) | {"row": self._number(row)}
 
     def moves(self, row: Any, lane: jax.Array | None = None) -> list[Lanes]:
-        """Motion and velocity of links; arguments as `read`."""
-        return [self.side_of(name, row, lane) for name in ("motion", "vel")]
+        """Accelerations and velocities of links; arguments as `read`."""
+        return [self.side_of(name, row, lane) for name in ("link_acc", "vel")]
 
     def of_rows(
         self, read: Callable, row: jax.Array, which: jax.Array, pairing: FingerPairing | None
@@ -274,7 +276,7 @@ class FingerCollision:
           row: int32, shape (lane,).
           pairing: Whose partner has the rows; None for the lanes' own fingers.
         """
-        if self.pairs.set.gathers:
+        if self.contacts.set.gathers:
             return read(row, None if pairing is None else pairing.lane)
         # The lanes that have the rows read them, and then pass them on.
         left = jnp.where(which, row, -1)
@@ -307,9 +309,9 @@ class FingerCollision:
           other: Link of the other side, 0 for the palm; `item`: the ring.
         """
         candidate |= {"other": self._number(other)}
-        candidate |= self.pairs.remembered({"owner": 1.0, "ring": item})
+        candidate |= self.contacts.remembered({"owner": 1.0, "ring": item})
         which = mine & (candidate["share"].lane > 0)
-        any_of(which, lambda: self.pairs.add(0, which, candidate, self.block.column))
+        any_of(which, lambda: self.contacts.add(0, which, candidate, self.block.column))
 
     def _on_palm(self, item: Any, mine: jax.Array) -> None:
         row, numbers, frame, centre = self.body(item)
@@ -325,7 +327,7 @@ class FingerCollision:
 
         def add(place: Place) -> None:
             palm = jnp.zeros_like(jnp.asarray(row))
-            cone = self.pairs.of_row(0)
+            cone = self.contacts.of_row(0)
             theirs = self.moves(palm)
             candidate = self.begun(place, cone, row, self.moves(row), theirs, [])
             self._alone(candidate, palm, item, mine)
@@ -361,9 +363,9 @@ class FingerCollision:
 
             def add(close: jax.Array) -> None:
                 place = self.place(numbers, frame, centre, faced)
-                held = friction_memory.of_row(self.step, self.pairs, 0)
+                held = friction_memory.of_row(self.step, self.contacts, 0)
                 candidate = self.begun(
-                    place, self.pairs.of_row(1), row, self.moves(row), moves, held
+                    place, self.contacts.of_row(1), row, self.moves(row), moves, held
                 )
                 self._alone(candidate, other, item, close)
 
@@ -413,9 +415,9 @@ class FingerCollision:
 
             def add(close: jax.Array) -> None:
                 place = self.place(numbers, frame, centre, faced)
-                held = friction_memory.of_row(self.step, self.pairs, row)
+                held = friction_memory.of_row(self.step, self.contacts, row)
                 candidate = self.begun(
-                    place, self.pairs.of_row(row), link, self.moves(link), moves, held
+                    place, self.contacts.of_row(row), link, self.moves(link), moves, held
                 )
                 self.enter(row, close, owner, candidate, other, item)
 
@@ -448,12 +450,12 @@ class FingerCollision:
         mine = {name: value for name, value in contact.items() if name != "step"}
         theirs = mine | {"row": self._number(other)}
         theirs |= {name: lanewise(jnp.negative, mine[name]) for name in ("normal", "jar")}
-        none = {"other": zeros((1, 1), self.like)} if self.pairs.set.alone else {}
+        none = {"other": zeros((1, 1), self.like)} if self.contacts.set.alone else {}
 
-        alike = self.pairs.remembered({"owner": owner, "ring": item}) | none | {"step": step}
+        alike = self.contacts.remembered({"owner": owner, "ring": item}) | none | {"step": step}
         fields = (mine, theirs) if second is None else (theirs, mine)
         finder = owner if second is None else second
-        any_of(which, lambda: self.pairs.enter(row, which, finder, *fields, alike))
+        any_of(which, lambda: self.contacts.enter(row, which, finder, *fields, alike))
 
     def nearest(self, name: str, centre: Lanes, itself: Any = None) -> tuple:
         """The nearest place of a centre line: squared distance, segment, and where along it.
@@ -484,14 +486,14 @@ class FingerCollision:
         best = lanes([self.like + 1.0, self.like, self.like], (3,), wide=True)
         first = int(itself is not None)  # a finger's half link at the palm is the palm's
         count: Any = last + 1 - first
-        if itself is not None and not self.pairs.set.gathers:
+        if itself is not None and not self.contacts.set.gathers:
             count = jnp.clip(self._rows_back(itself), 0, count)
         best = loop(count, lambda k, b: nearer(k + first, b), best, self.block.size)
         square, number, t = (best[k].lane for k in range(3))
         return square, number.astype(jnp.int32), t
 
     def segment(self, row: Any, lane: jax.Array | None = None) -> tuple[tuple, list[Lanes]]:
-        """Segments' ends, frames and sections, and their links' motion; arguments as `read`."""
+        """Segments' ends, frames and sections, and their links' `moves`; arguments as `read`."""
         frames = tuple(self.read("frame", r, lane) for r in neighbours(row, self.p.links))
         ends = self.read("end", row, lane), self.read("end", row + 1, lane)
         return (ends, frames, self.ring(self.ring_at(row + 1), lane)), self.moves(row, lane)
@@ -531,7 +533,7 @@ class FingerCollision:
                 other = jax.lax.div(j, jnp.full_like(j, apart)) + 1
                 moves = pairing.swap(self.moves(other))
                 candidate = self.begun(
-                    place, self.pairs.of_row(row), link, self.moves(link), moves, []
+                    place, self.contacts.of_row(row), link, self.moves(link), moves, []
                 )
                 number = item + self.count * j
                 self.enter(row, near, owner, candidate, other, number)

@@ -105,69 +105,25 @@ class MujocoEngine(Equal):
         ctrl: np.ndarray,
         trajectory: bool,
     ) -> Trace:
-        worlds, steps = ctrl.shape[:2]
         scene = self.scene
-        nq = self.template.nq
+        worlds, steps = ctrl.shape[:2]
         batch = self._batch(worlds)
-        write_fields(self.scene, batch, fields)
-        start = split(scene, fields.start)
-        last = np.concatenate(start, 1)
-        end = split(scene, last)  # views
-        batch.bind("qacc_warmstart")[:] = start.acc
-        distance, height, speed = np.zeros((3, worlds, steps))
-        status = np.zeros((worlds, steps), np.int32)
-        qpos = np.zeros((worlds, steps, nq * trajectory))
-        series = (distance, height, speed, qpos, status)
-        bounds = verdict.Bounds(*(v[:, None] for v in bounds))
-        going = np.arange(worlds)
+        write_fields(scene, batch, fields)
+        rollout = _ChunkedRollout(scene, fields, bounds, steps, to_end=trajectory)
+        batch.bind("qacc_warmstart")[:] = rollout.start.acc
         chunk = 1 if scene.effects.neo_hookean else _CHUNK  # its moments change with every step
         for first in range(0, steps, chunk):
             part = slice(first, min(first + chunk, steps))
+            going = rollout.going
             if scene.effects.neo_hookean:
                 _apply_softening(scene, batch, fields, going)
             new, taken, states = self.advance(batch, going, ctrl[going, part], trajectory)
-            # MuJoCo warned (a bad control, state or inertia, a full contact list) and stopped.
-            stopped = batch.warning[going, :, 0].any(1) | (taken == 0)
-            count = part.stop - first
-            new.speed[stopped[:, None] & (np.arange(count) >= taken[:, None])] = np.nan
-            for array, values in zip(series, new[: len(series)], strict=True):
-                array[going, part] = np.asarray(values)
-            full = batch.warning[:, _FULL, 0].any(1)[going]
-            status[going[full], first + taken[full] - 1] |= int(Status.CONTACT_OVERFLOW)
-            mine = verdict.Bounds(*(v[going] for v in bounds))
-            entry, kept = _decisions(mine, new, start.step[going] + first, to_end=trajectory)
-            if not first:  # worlds that were decided before
-                stay = start.going[:, 0] == 0
-                entry[stay] = 0
-                kept[stay] = 0
-                speed[stay, 0] = start.speed[stay, 0]
-                status[stay, 0] = 0
-            done = (entry < count) | stopped
-            here = kept >= 0
-            last[going[here], : states.shape[-1]] = states[here, kept[here]]
-            for world, at, state in zip(going[done], entry[done], kept[done], strict=True):
-                rest = slice(first + at, None)
-                for array in (distance, height, qpos):
-                    array[world, rest] = array[world, max(first + state, 0)]
-                # What MuJoCo told of the deciding step stays, also where its state does not.
-                status[world, rest] = status[world, first + at if at < count else first + state]
-                speed[world, rest] = end.speed[world] = (
-                    speed[world, first + at] if at < count else np.nan
-                )
-                end.acc[world] = 0
-                end.going[world] = 0
-            going = going[~done]
-            if not going.size:
+            stopped = rollout.store(part, new, taken, batch.warning[going, :, 0])
+            rollout.decide(part, new, states, stopped)
+            if not rollout.going.size:
                 break
-        state = [batch.bind(name)[going] for name in ("qpos", "qvel", "qacc_warmstart")]
-        end.speed[going] = np.abs(state[1]).max(1, keepdims=True)
-        state = np.concatenate(state, 1)
-        mine = verdict.Bounds(*(v[going] for v in bounds))
-        good = np.isfinite(state).all(1) & verdict.slow(mine, end.speed[going])[:, 0]
-        last[going[good], : state.shape[1]] = state[good]
-        end.going[going] = good[:, None]
-        end.step[:] = start.step + steps
-        return Trace(*series, last)
+        names = ("qpos", "qvel", "qacc_warmstart")
+        return rollout.trace(*(batch.bind(name)[rollout.going] for name in names))
 
     def advance(
         self, batch: mujoco.batch.Batch, ids: np.ndarray, ctrl: np.ndarray, trajectory: bool
@@ -201,6 +157,122 @@ class MujocoEngine(Equal):
 
 
 _bounds = jax.jit(verdict.bounds)
+
+
+class _ChunkedRollout:
+    """The trace of a batch of worlds, which grows chunk by chunk until all worlds are decided.
+
+    Attributes:
+      start: The state in which the worlds start.
+      going: Indices of the worlds that are not decided, shape (world,).
+      last: `Trace.last`, shape (world, n); `end`: its parts, which are views of it.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        fields: ModelFields,
+        bounds: verdict.Bounds,
+        steps: int,
+        *,
+        to_end: bool,
+    ):
+        """Begins a rollout.
+
+        Args:
+          bounds: Bounds of the worlds, of shape (world,).
+          steps: Number of time steps.
+          to_end: Whether qpos is kept, and worlds that lost their object go on.
+        """
+        self.start = split(scene, fields.start)
+        self.last = np.concatenate(self.start, 1)
+        self.end = split(scene, self.last)
+        self.steps = steps
+        self.to_end = to_end
+        self._bounds = verdict.Bounds(*(v[:, None] for v in bounds))
+        worlds = len(self.last)
+        self.going = np.arange(worlds)
+        self.distance, self.height, self.speed = np.zeros((3, worlds, steps))
+        self.status = np.zeros((worlds, steps), np.int32)
+        self.qpos = np.zeros((worlds, steps, self.start.qpos.shape[1] * to_end))
+
+    def store(self, part: slice, new: Trace, taken: np.ndarray, warnings: np.ndarray) -> np.ndarray:
+        """Stores the entries of a chunk; returns which worlds MuJoCo stopped, bool (world,).
+
+        Args:
+          part: Its steps.
+          new: Its trace, of the worlds that were going; `taken`: the steps that each has taken.
+          warnings: MuJoCo's warnings so far, shape (world, kind).
+        """
+        # MuJoCo warned (a bad control, state or inertia, a full contact list) and stopped.
+        stopped = warnings.any(1) | (taken == 0)
+        count = part.stop - part.start
+        new.speed[stopped[:, None] & (np.arange(count) >= taken[:, None])] = np.nan
+        series = self._series()
+        for array, values in zip(series, new[: len(series)], strict=True):
+            array[self.going, part] = np.asarray(values)
+        full = warnings[:, _FULL].any(1)
+        overflow = int(Status.CONTACT_OVERFLOW)
+        self.status[self.going[full], part.start + taken[full] - 1] |= overflow
+        return stopped
+
+    def decide(self, part: slice, new: Trace, states: np.ndarray, stopped: np.ndarray) -> None:
+        """Ends the worlds that a chunk decides; arguments as in `store`, and qpos and qvel."""
+        first = part.start
+        count = part.stop - first
+        going = self.going
+        step = self.start.step[going] + first
+        entry, kept = _decisions(self._bounds_of(going), new, step, to_end=self.to_end)
+        if not first:
+            stay = self.start.going[:, 0] == 0  # decided before this rollout
+            entry[stay] = 0
+            kept[stay] = 0
+            self.speed[stay, 0] = self.start.speed[stay, 0]
+            self.status[stay, 0] = 0
+        sound = kept >= 0
+        self.last[going[sound], : states.shape[-1]] = states[sound, kept[sound]]
+        done = (entry < count) | stopped
+        for world, at, state in zip(going[done], entry[done], kept[done], strict=True):
+            self._repeat(world, first + at, first + state, decided=at < count)
+        self.going = going[~done]
+
+    def _repeat(self, world: int, entry: int, kept: int, *, decided: bool) -> None:
+        """Repeats the state of a world that has ended.
+
+        Args:
+          entry: The entry that decides it, or the first one behind the chunk.
+          kept: The entry whose state it keeps, -1 for the start of the rollout.
+          decided: Whether there is such an entry; False if MuJoCo stopped behind the chunk.
+        """
+        rest = slice(entry, None)
+        for array in (self.distance, self.height, self.qpos):
+            array[world, rest] = array[world, max(kept, 0)]
+        # What MuJoCo told of the deciding step stays, also where its state does not.
+        self.status[world, rest] = self.status[world, entry if decided else kept]
+        speed = self.speed[world, entry] if decided else np.nan
+        self.speed[world, rest] = speed
+        self.end.speed[world] = speed
+        self.end.acc[world] = 0
+        self.end.going[world] = 0
+
+    def trace(self, qpos: np.ndarray, qvel: np.ndarray, acc: np.ndarray) -> Trace:
+        """The whole trace, given the states of the worlds that are still going."""
+        going = self.going
+        speed = np.abs(qvel).max(1, keepdims=True)
+        self.end.speed[going] = speed
+        state = np.concatenate([qpos, qvel, acc], 1)
+        good = np.isfinite(state).all(1) & verdict.slow(self._bounds_of(going), speed)[:, 0]
+        self.last[going[good], : state.shape[1]] = state[good]
+        self.end.going[going] = good[:, None]
+        self.end.step[:] = self.start.step + self.steps
+        return Trace(*self._series(), self.last)
+
+    def _series(self) -> tuple[np.ndarray, ...]:
+        """What the trace has of every step, in its order."""
+        return self.distance, self.height, self.speed, self.qpos, self.status
+
+    def _bounds_of(self, worlds: np.ndarray) -> verdict.Bounds:
+        return verdict.Bounds(*(v[worlds] for v in self._bounds))
 
 
 def _decisions(

@@ -17,7 +17,7 @@ from codesign_jax.engines.structured import coordinates, overlaps
 from codesign_jax.engines.structured.kernel.contact_sets import margin
 from codesign_jax.engines.structured.lanes import dot
 from codesign_jax.engines.structured.laws import surroundings
-from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
+from codesign_jax.engines.structured.laws.cones import friction_by_contact, which_cone
 from codesign_jax.engines.structured.laws.contact import (
     Cone,
     Contacts,
@@ -125,7 +125,7 @@ def touching(scene, hand, kin: Kinematics, position, velocity: Spatial):
     for name, place in overlaps.places(scene, hand, kin, position).items():
         cone = getattr(hand.cones, which_cone(name))
         fingers = name.startswith("finger")
-        if own_friction(scene, name):
+        if friction_by_contact(scene, name):
             fields = 1 if name.endswith("_object") else len(surroundings.fields(scene))
             count = place.gap.shape[int(fingers)] // fields
             friction = hand.friction[np.array(surroundings.touched(scene, name, count))]

@@ -108,12 +108,12 @@ def _between_fingers(
     effects = program.scene.effects
     depth = {}
     if effects.finger_finger and program.scene.num_fingers > 1:
-        depth["finger_finger"] = deepest[int(self_contacts.alone) :, 0].max(0)
+        depth["finger_finger"] = deepest[int(self_contacts.with_itself) :, 0].max(0)
     if touches_itself(program.scene):
         depth["finger_itself"] = deepest[0, 0]
     if effects.finger_palm:
         depth["finger_palm"] = deepest[0, 1]
-    return between, pressing[0, 1] if self_contacts.alone else none, depth
+    return between, pressing[0, 1] if self_contacts.with_itself else none, depth
 
 
 def _touches(

@@ -71,7 +71,7 @@ class AdjointProgram(Program):
         more = {f"chain.{k}": (n + 1, shape) for k, shape in SHAPES._asdict().items()}
         more |= {"acc_bar": (n, (a,)), "virtual": (n, (a,))}
         if pairings := self.held.get("finger_finger"):
-            more |= {"grip_bar": (pairings, (4,))}
+            more |= {"sums_bar": (pairings, (4,))}
         more |= {f"{s.name}.held_bar": (s.count, (3, s.k)) for s in self.sets if s.holds}
         more |= {f"bar.{k}": (1, shape) for k, shape in of_step(self.scene).items()}
         if any(isinstance(s, SelfContactSet) for s in self.sets):

@@ -72,13 +72,13 @@ class ReverseStep(Step):
         Returns:
           Cotangents of the arm's commands.
         """
-        p = self.p
+        layout = self.layout
         bars = self.bars
         bars.begin()
         state, bodies, world_object, now, centre = self.assemble(arm, pressure)
         go = lanes([moved], (), wide=False)
         before, acc_bar = self._integration(state, bodies, now, go)
-        if p.held:
+        if layout.held:
             friction_memory.reverse(self, bars, go)
         # The right side of wrist and object stands in the place of their only forces.
         right = {"smooth_wrist": acc_bar[0], "smooth_object": acc_bar[1]}
@@ -88,7 +88,7 @@ class ReverseStep(Step):
         sweep = ResidualVjp(self, state, bodies, world_object, virtual, bars)
         if problem.self_contacts:
             SelfContactsVjp(sweep, problem.self_contacts).run()
-        metered = p.scene.effects.air_mass
+        metered = layout.scene.effects.air_mass
         end = chambers.end_pressures(self, pressure) if metered else pressure
         base = sweep.fingers(end, self._centre_bar(centre, shown.distance))
         if metered:
@@ -103,8 +103,8 @@ class ReverseStep(Step):
 
         Of wrist and object; those of the fingers' accelerations go to the scratch table, "acc_bar".
         """
-        p = self.p
-        h = self.p.scene.discretization.timestep
+        layout = self.layout
+        h = self.layout.scene.discretization.timestep
         old = {n: state[n] for n in MOVED}
         after = {n: self.bars.world_state.read(n) for n in MOVED}
         given = old, bodies["columns"], now.wrist, now.object_acc
@@ -122,13 +122,13 @@ class ReverseStep(Step):
             self.scratch.write("acc_bar", acc, i)
             return x
 
-        jax.lax.fori_loop(0, p.links, joint, jnp.int32(0))
+        jax.lax.fori_loop(0, layout.links, joint, jnp.int32(0))
         before = {n: lanewise(jnp.where, go, state_bars[n], after[n]) for n in MOVED}
         return before, (wrist, obj)
 
     def _centre_bar(self, centre: Lanes, bar: jax.Array) -> Lanes:
         """Cotangent of the sum of the segments' weighted centres, of that of the distance."""
-        count = self.p.num_fingers * self.p.links
+        count = self.layout.num_fingers * self.layout.links
 
         def slope(centre, bar):
             square = dot(centre, centre)
@@ -148,7 +148,7 @@ class ReverseStep(Step):
         shown: TraceCotangents,
     ) -> Lanes:
         """Adds palm, wrist and object; stores their cotangents and returns those of the arm."""
-        p = self.p
+        layout = self.layout
         now, virtual, wrist_bar = accelerations
         fixed = {"acc_wrist": now.wrist, "acc_object": now.object_acc}
         fixed |= {"virtual_wrist": virtual.wrist, "object_along": virtual.object_acc}
@@ -156,13 +156,13 @@ class ReverseStep(Step):
         base, step_bars = self.block.sum((base, step_bars))
         unit = lanes([self.like + 1.0], (), wide=False)
         given = {n: state[n] for n in MOVED}, arm, self.palm_constants()
-        run = partial(residual.of_palm, p.scene.discretization.timestep)
-        acc = wrist_bar if not p.scene.effects.wrist else lanewise(jnp.zeros_like, wrist_bar)
+        run = partial(residual.of_palm, layout.scene.discretization.timestep)
+        acc = wrist_bar if not layout.scene.effects.wrist else lanewise(jnp.zeros_like, wrist_bar)
         height = plus(step_bars["height"], lanes([shown.height], (), wide=False))
         bars = base, step_bars["columns"], step_bars["object_vel"], height, acc, unit
         state_bars, arm_bar, constant_bars = pull(run, given, (fixed,), bars)
         self.bars.add_once(constant_bars)
-        if p.scene.fixture:
+        if layout.scene.fixture:
             state_bars["position"] = plus(state_bars["position"], step_bars["position"])
         for name, value in plus(state_bars, before).items():
             self.bars.world_state.write(name, value)
@@ -202,7 +202,7 @@ class AdjointSolve(Elimination):
     def between_fingers(self, self_contacts: BoundSelfContacts, alpha: Lanes) -> None:
         self_contacts.update_constraints(alpha)
         self_contacts.clear_wrenches()
-        if friction_memory.pairings(self.problem.m):
+        if friction_memory.pairings(self.problem.memory):
             friction_memory.load_cotangents(self.problem, self_contacts)
 
     def solve(self) -> Iterate:
@@ -216,7 +216,7 @@ class AdjointSolve(Elimination):
         node, work = self.backward(no_step)
         palm = problem.palm
         none = Iterate(*(_none(v) for v in (palm.smooth_wrist, *[palm.smooth_object] * 2)))
-        step, done = self.at_palm(none, node, self.dealt_pushes(no_step))
+        step, done = self.at_palm(none, node, self.of_dealt_contacts(no_step))
         if (self_contacts := problem.self_contacts) is not None:
             done = done._replace(work=lanewise(jnp.add, done.work, work))
             exact = float(jnp.finfo(self.like.dtype).eps) ** 1.5
@@ -259,7 +259,7 @@ def add_speed_cotangent(
     step: StepMemory, bars: CotangentTables, state: dict[str, Lanes], bar: jax.Array
 ) -> None:
     """Adds the cotangent of the trace's speed; equal velocities share it."""
-    p = step.p
+    layout = step.layout
     top = _folded(step, state, _largest, jnp.maximum)
     number = _folded(step, state, _count, jnp.add, top)
     each = lanewise(_divided, lanes([bar], (), wide=False), number)
@@ -268,7 +268,7 @@ def add_speed_cotangent(
         bars.add_joint({"finger_vel": lanewise(_slope, _rates(step, i), top, each)}, i)
         return x
 
-    jax.lax.fori_loop(0, p.links, link, jnp.int32(0))
+    jax.lax.fori_loop(0, layout.links, link, jnp.int32(0))
     for name in VELOCITIES:
         old = bars.world_state.read(name)
         bars.world_state.write(name, plus(old, lanewise(_slope, state[name], top, each)))
@@ -282,14 +282,16 @@ def _folded(
     step: StepMemory, state: dict[str, Lanes], function: Callable, combine: Callable, *more: Lanes
 ) -> Lanes:
     """function(x, velocities, *more) folded over all velocities of a world."""
-    p = step.p
+    layout = step.layout
 
     def link(i: Any, x: Lanes) -> Lanes:
         return lanewise(function, x, _rates(step, i), *more)
 
     first = zeros((), step.like)
     result = lanes(
-        [step.block.fold(loop(p.links, link, first, p.size).lane, combine)], (), wide=False
+        [step.block.fold(loop(layout.links, link, first, layout.size).lane, combine)],
+        (),
+        wide=False,
     )
     for name in VELOCITIES:
         result = lanewise(function, result, state[name], *more)

@@ -46,7 +46,7 @@ def end_pressures(step: StepMemory, charge: Lanes) -> Lanes:
 
 def reverse(step: StepMemory, bars: CotangentTables, charge: Lanes) -> None:
     """Makes the cotangents of the pressures at a step's end those of the charges."""
-    p = step.p
+    layout = step.layout
     law = _law(step)
     given = _given(step, charge)
     bar = bars.of_step("pressure")
@@ -55,36 +55,36 @@ def reverse(step: StepMemory, bars: CotangentTables, charge: Lanes) -> None:
     step.scratch.write("bar.pressure", charge)
 
     def moments(gain, joint, grown):
-        turned = [jnp.stack([gain * v] + [0 * v] * (p.axes - 1)) for v in grown[:2]]
+        turned = [jnp.stack([gain * v] + [0 * v] * (layout.axes - 1)) for v in grown[:2]]
         return turned, sum(joint[n][0] * v for n, v in zip(JOINT, grown, strict=True))
 
     def link(i: Any, x: jax.Array) -> jax.Array:
-        row = i if p.tapered else 0
+        row = i if layout.tapered else 0
         gain = step.hand.read("gain", row)
         turned, gain_bar = lanewise(moments, gain, step.joint(i), grown)
         bars.add_joint(dict(zip(JOINT[:2], turned, strict=True)), i)
         bars.add({"gain": gain_bar}, row)
         return x
 
-    jax.lax.fori_loop(0, p.links, link, jnp.int32(0))
+    jax.lax.fori_loop(0, layout.links, link, jnp.int32(0))
 
 
 def _law(step: StepMemory) -> Callable:
-    return partial(end_pressure, step.p.scene.discretization.timestep)
+    return partial(end_pressure, step.layout.scene.discretization.timestep)
 
 
 def _given(step: StepMemory, charge: Lanes) -> tuple:
-    p = step.p
+    layout = step.layout
     like = step.like
 
     def add(sums, gain, joint):
         return [v + gain * joint[n][0] for v, n in zip(sums, JOINT, strict=True)]
 
     def link(i: Any, sums: list[Lanes]) -> list[Lanes]:
-        gain = step.hand.read("gain", i if p.tapered else 0)
+        gain = step.hand.read("gain", i if layout.tapered else 0)
         return lanewise(add, sums, gain, step.joint(i))
 
-    grown = loop(p.links, link, [zeros((), like)] * 3, p.size)
+    grown = loop(layout.links, link, [zeros((), like)] * 3, layout.size)
     return charge, step.hand.read("volume"), step.constant("air"), grown
 
 
@@ -93,7 +93,7 @@ class Chambers:
 
     def __init__(self, step: StepMemory):
         self.step = step
-        self.links = step.p.links
+        self.links = step.layout.links
         self.size = step.block.size
 
     def move(self, alpha: Lanes) -> None:
@@ -184,7 +184,7 @@ class Chambers:
         return [self.step.read(f"air_{n}") for n in names]
 
     def _read(self, i: Any, *names: Any) -> list[Lanes]:
-        row = {"gain": i if self.step.p.tapered else 0}
+        row = {"gain": i if self.step.layout.tapered else 0}
         read = self.step.read
         return [read(n, row.get(n, i)) if isinstance(n, str) else n for n in names]
 

@@ -157,12 +157,12 @@ class ForceStep(Step):
 
     def _store_self_contacts(self, contacts: BoundSelfContacts) -> None:
         def of_row(row: jax.Array, x: jax.Array) -> jax.Array:
-            alone = contacts.pairing(row).alone
+            itself = contacts.pairing(row).itself
 
             def add(item: Any, sums: list[Lanes]) -> list[Lanes]:
                 palm = jnp.zeros_like(self.like)
-                if alone is not None:
-                    palm = jnp.where(alone & (contacts.read("other", item).lane < 0.5), 1.0, palm)
+                if itself is not None:
+                    palm = jnp.where(itself & (contacts.read("other", item).lane < 0.5), 1.0, palm)
                 side = lanes([palm], (), wide=True)
                 with contacts.with_cone(row, item):
                     given = contacts.place(item), contacts.cone, contacts.read("jar", item)

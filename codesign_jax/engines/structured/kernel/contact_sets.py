@@ -24,7 +24,7 @@ from codesign_jax.engines.structured.kernel.memory import (
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact, holding
-from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
+from codesign_jax.engines.structured.laws.cones import friction_by_contact, which_cone
 from codesign_jax.engines.structured.laws.contact import Cone, Contacts, LineCost
 from codesign_jax.engines.structured.laws.rings import Place
 from codesign_jax.model.held import held
@@ -73,7 +73,7 @@ class ContactSet:
         self.k = k
         self.size = size
         self.on_object = name.endswith("_object")
-        self.own_friction = own_friction(scene, name)
+        self.friction_by_contact = friction_by_contact(scene, name)
         # Self-contacts share what they hold, see `friction_memory`.
         self.holds = name in held(scene) and name != "finger_finger"
 
@@ -81,7 +81,7 @@ class ContactSet:
         rows, ray = ROWS[self.scene.effects.friction]
         shapes = place_shapes(self.k)
         shapes |= {"jar": (rows, self.k), "step": (rows, self.k), "ray": (ray, self.k)}
-        shapes |= {"friction": (1, self.k)} if self.own_friction else {}
+        shapes |= {"friction": (1, self.k)} if self.friction_by_contact else {}
         shapes |= {"held": (3, self.k)} if self.holds else {}
         return {f"{self.name}.{field}": (self.count, shape) for field, shape in shapes.items()}
 
@@ -141,7 +141,7 @@ class BoundContacts:
         return rebuild(jax.lax.cond(self.touching(item), some, lambda: none))
 
     def cone_at(self, item: Any) -> Cone:
-        if not self.set.own_friction:
+        if not self.set.friction_by_contact:
             return self.cone
         return lanewise(Cone.of_friction, self.cone, self.read("friction", item)[0])
 
@@ -308,9 +308,9 @@ def margin(scene: Scene) -> float:
     return contact.MARGIN if scene.effects.surface == "hull" else 0.0
 
 
-def with_held(jar: jax.Array, place: Place, cone: Cone, grip: jax.Array) -> jax.Array:
+def with_held(jar: jax.Array, place: Place, cone: Cone, held_friction: jax.Array) -> jax.Array:
     """The jar of contacts with the friction that they hold, see `holding.held`."""
-    return jar + holding.held(ContactSet.contacts(place, cone), grip)
+    return jar + holding.held(ContactSet.contacts(place, cone), held_friction)
 
 
 def kept(place: Place, jar: Lanes) -> dict[str, Lanes]:

@@ -12,6 +12,10 @@ need no memory but a few numbers a contact, and x = P^-1 (g + J's) with the sum 
 The iteration is that of Chronopoulos and Gear (s-step iterative methods for symmetric linear
 systems, J. Comput. Appl. Math. 25, 1989, with s = 1): both products of a step are taken in one
 pass through the contacts, and everything else is updated in a second one.
+
+At each contact are kept, as vectors like jar: "residual", the force f; "response", J P^-1 J'f;
+"direction", along which the forces go; "direction_response", the same of it; "force", the sum s;
+and "first_response", J P^-1 g.
 """
 
 from typing import Any, NamedTuple
@@ -122,19 +126,20 @@ class Coupling:
             side = contacts.own_side(item)
             hessian = contacts.read("hessian", item)
             change = contacts.relative(item, pairing)
-            left = lanewise(
-                lambda b, f: jnp.where(b, -f, 0.0), busy, contacts.stiff(hessian, change)
+            residual = lanewise(
+                lambda b, f: jnp.where(b, -f, 0.0), busy, contacts.times_hessian(hessian, change)
             )
-            none = lanewise(jnp.zeros_like, left)
-            fields = {"first": change, "left": left, "along": none, "moved": none, "sum": none}
+            none = lanewise(jnp.zeros_like, residual)
+            fields = {"first_response": change, "residual": residual}
+            fields |= {"direction": none, "direction_response": none, "force": none}
             for field, value in fields.items():
                 contacts.write(field, value, item)
-            contacts.load(item, side, left, pairing)
+            contacts.load(item, side, residual, pairing)
 
         contacts.do(store)
 
     def _products(self) -> tuple[jax.Array, jax.Array]:
-        """Applies P^-1 J' to the residual; "answer" is the contacts' relative acceleration by that.
+        """Applies P^-1 J' to the residual, and J to that: "response".
 
         Returns the product of the residual with it, and its curvature, shape (lane,) each.
         """
@@ -142,16 +147,23 @@ class Coupling:
         self.substitute("z_again", self.again())
 
         def add(item: Any, pairing: FingerPairing, sums: list[Lanes]) -> list[Lanes]:
-            left = contacts.read("left", item)
+            residual = contacts.read("residual", item)
             hessian = contacts.read("hessian", item)
-            answer = contacts.relative(item, pairing)
-            contacts.write("answer", answer, item)
+            response = contacts.relative(item, pairing)
+            contacts.write("response", response, item)
 
-            def both(sums, half, left, answer, force):
-                product, stiff = (half * sum_axis(dot(v, answer), 0) for v in (left, force))
+            def both(sums, half, residual, response, force):
+                product, stiff = (half * sum_axis(dot(v, response), 0) for v in (residual, force))
                 return [sums[0] + product, sums[1] + product + stiff]
 
-            return lanewise(both, sums, pairing.half, left, answer, contacts.stiff(hessian, answer))
+            return lanewise(
+                both,
+                sums,
+                pairing.half,
+                residual,
+                response,
+                contacts.times_hessian(hessian, response),
+            )
 
         sums = contacts.each(add, [zeros((), self.problem.like)] * 2)
         size, bent = (self.block.total(v.lane) for v in sums)
@@ -160,34 +172,37 @@ class Coupling:
     def _advance(self, length: jax.Array, turn: jax.Array) -> jax.Array:
         """Turns the direction and goes along it; returns what that gains of the work.
 
-        What is left of the residual is laid on the sides.
+        The new residual is laid on the sides.
         """
         contacts = self.contacts
         contacts.clear_wrenches()
         alpha, beta = (lanes([v], (), wide=False) for v in (length, turn))
-        names = ("left", "answer", "along", "moved", "sum")
+        names = ("residual", "response", "direction", "direction_response", "force")
 
-        def move(alpha, beta, left, answer, along, moved, total_):
-            along = left + beta * along
-            moved = answer + beta * moved
-            return along, moved, total_ + alpha * along, left - alpha * along
+        def move(alpha, beta, residual, response, direction, direction_response, force):
+            direction = residual + beta * direction
+            direction_response = response + beta * direction_response
+            force = force + alpha * direction
+            return direction, direction_response, force, residual - alpha * direction
 
         def store(item: Any, pairing: FingerPairing, gain: Lanes) -> Lanes:
             side = contacts.own_side(item)
             hessian = contacts.read("hessian", item)
             old = [contacts.read(name, item) for name in names]
-            first = contacts.read("first", item)
-            along, moved, total_, left = lanewise(move, alpha, beta, *old)
-            stiff = contacts.stiff(hessian, moved)
-            left = lanewise(lambda a, r, f: r - a * f, alpha, left, stiff)
-            for name, value in zip(("left", *names[2:]), (left, along, moved, total_), strict=True):
+            first_response = contacts.read("first_response", item)
+            direction, direction_response, force, residual = lanewise(move, alpha, beta, *old)
+            stiff = contacts.times_hessian(hessian, direction_response)
+            residual = lanewise(lambda a, r, f: r - a * f, alpha, residual, stiff)
+            new = {"residual": residual, "direction": direction}
+            new |= {"direction_response": direction_response, "force": force}
+            for name, value in new.items():
                 contacts.write(name, value, item)
-            contacts.load(item, side, left, pairing)
+            contacts.load(item, side, residual, pairing)
 
-            def add(gain, half, along, first):
-                return gain + half * sum_axis(dot(along, first), 0)
+            def add(gain, half, direction, first_response):
+                return gain + half * sum_axis(dot(direction, first_response), 0)
 
-            return lanewise(add, gain, pairing.half, along, first)
+            return lanewise(add, gain, pairing.half, direction, first_response)
 
         gain = contacts.each(store, zeros((), self.problem.like))
         return self.block.total(gain.lane)
@@ -198,7 +213,7 @@ class Coupling:
         contacts.clear_wrenches()
 
         def store(item: Any, pairing: FingerPairing) -> None:
-            value = lanewise(lambda k, s: jnp.where(k, s, 0.0), kept, contacts.read("sum", item))
+            value = lanewise(lambda k, s: jnp.where(k, s, 0.0), kept, contacts.read("force", item))
             contacts.load(item, contacts.own_side(item), value, pairing)
 
         contacts.do(store)
@@ -212,7 +227,7 @@ class Coupling:
 
         def step(i: Any, carry: tuple) -> tuple:
             names = ("axes", "w", "g", "inverse")
-            push = self.contacts.pushed(i + 1)
+            push = self.contacts.wrench_on(i + 1)
             factors = self.problem.read(*names, item=i)
             r, ro, z = lanewise(_again, carry, factors, push)
             self.problem.write("z_again", z, i)
@@ -221,7 +236,7 @@ class Coupling:
         r, ro = loop(self.links, step, (none, none), self.block.size, reverse=True)
         if chambers := self.problem.chambers:
             r, ro, _ = chambers.close_again("z_again", r, ro)
-        r = self.problem.add_first(r)
+        r = self.problem.add_palm_wrench(r)
         at_palm = self._palm(*self.block.sum((r, ro)))
         if chambers:
             chambers.substitute("z_again", at_palm.palm_acc, at_palm.object_acc)

@@ -8,7 +8,7 @@ Its law is `holding.held`.  What is held is state, `model.held`:
   step, then those behind it.
 * Fingers that touch one another hold three numbers for each of their pairings, on both fingers'
   lanes, equal and opposite: all contacts of two fingers share them, as none of them stays at one
-  ring.  A step leaves what it ends with in "new_grip".
+  ring.  A step leaves what it ends with in "new_held_friction".
 
 The state after a step is a quotient of sums over contacts, of their forces f(jar(a, theta)).  With
 b the cotangents of the sums it adds to the step's derivative two things: -J' K r, with r = b times
@@ -37,24 +37,24 @@ from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact, holding
 from codesign_jax.engines.structured.world_model import apply_columns, apply_rows
 
-GRIP = "held.finger_finger"
+BETWEEN_FINGERS = "held.finger_finger"
 """What fingers hold on one another, a row a pairing."""
 
 
 def kept(problem: Problem) -> bool:
-    return bool(problem.m.p.held)
+    return bool(problem.memory.layout.held)
 
 
 def pairings(step: StepMemory) -> int:
     """Pairings of fingers that hold on one another."""
-    return step.p.held.get("finger_finger", 0)
+    return step.layout.held.get("finger_finger", 0)
 
 
 def of_row(step: StepMemory, self_contacts: BoundSelfContacts, row: Any) -> list[Lanes]:
     """What the fingers of a pairing's row hold, (3,) or nothing if the scene has no such state."""
     if not pairings(step):
         return []
-    return [step.finger_state.read(GRIP, row + self_contacts.set.first)]
+    return [step.finger_state.read(BETWEEN_FINGERS, row + self_contacts.set.first)]
 
 
 def of_item(step: StepMemory, contacts: BoundContacts, item: Any) -> tuple[Lanes, Lanes] | None:
@@ -73,25 +73,25 @@ def of_ring(
     """`of_item` of rings, one on each of a team's lanes, shape (lane,)."""
     if not contacts.set.holds:
         return None
-    grip = step.finger_state.gather(f"held.{contacts.set.name}", ring, step.block.column)
-    return _both(step, contacts, lanewise(lambda v: v[:, None], grip))
+    held_friction = step.finger_state.gather(f"held.{contacts.set.name}", ring, step.block.column)
+    return _both(step, contacts, lanewise(lambda v: v[:, None], held_friction))
 
 
-def _both(step: StepMemory, contacts: BoundContacts, grip: Lanes) -> tuple[Lanes, Lanes]:
+def _both(step: StepMemory, contacts: BoundContacts, held_friction: Lanes) -> tuple[Lanes, Lanes]:
     if not contacts.set.on_object:
-        return grip, grip
-    return lanewise(in_world, step.columns, grip), grip
+        return held_friction, held_friction
+    return lanewise(in_world, step.columns, held_friction), held_friction
 
 
-def in_world(columns: jax.Array, grip: jax.Array) -> jax.Array:
+def in_world(columns: jax.Array, held_friction: jax.Array) -> jax.Array:
     """What contacts on the object hold, along the world's axes."""
-    return apply_columns(columns, grip)
+    return apply_columns(columns, held_friction)
 
 
 def clear(step: StepMemory) -> None:
     """Begins a step: fingers that do not touch hold nothing."""
     for item in range(pairings(step)):
-        step.scratch.write("new_grip", zeros((3,), step.like), item)
+        step.scratch.write("new_held_friction", zeros((3,), step.like), item)
 
 
 def store(step: StepMemory, good: jax.Array) -> None:
@@ -99,9 +99,9 @@ def store(step: StepMemory, good: jax.Array) -> None:
     state = step.finger_state
     mask = lanes([good], (), wide=False)
     for item in range(pairings(step)):
-        new = step.scratch.read("new_grip", item)
-        old = state.read(GRIP, item)
-        state.write(GRIP, lanewise(jnp.where, mask, new, old), item)
+        new = step.scratch.read("new_held_friction", item)
+        old = state.read(BETWEEN_FINGERS, item)
+        state.write(BETWEEN_FINGERS, lanewise(jnp.where, mask, new, old), item)
     for contacts in step.contacts.values():
         if contacts.set.holds:
             _store(step, contacts, mask)
@@ -124,18 +124,18 @@ def _store(step: StepMemory, contacts: BoundContacts, mask: Lanes) -> None:
             state.write(name, lanewise(after, mask, share[j], new[:, j], old), item * k + j)
         return x
 
-    jax.lax.fori_loop(0, step.p.held[contacts.set.name] // k, store_item, jnp.int32(0))
+    jax.lax.fori_loop(0, step.layout.held[contacts.set.name] // k, store_item, jnp.int32(0))
 
 
-def sums(self_contacts: BoundSelfContacts, row: Any, alpha: Lanes, grip: Lanes) -> Lanes:
+def sums(self_contacts: BoundSelfContacts, row: Any, alpha: Lanes, held_friction: Lanes) -> Lanes:
     """Sums of `holding.hold`, (4,), of a row's contacts where the last step has moved jar."""
     contacts = self_contacts.set.contacts
     pairing = self_contacts.pairing(row)
 
-    def add(sums, place, cone, alpha, jar, step, grip, counts):
+    def add(sums, place, cone, alpha, jar, step, held_friction, counts):
         c = contacts(place, cone)
         force = contact.constraint_update(c, tree_add_scaled(alpha, jar, step)).force
-        return sums + counts * sum_axis(holding.hold(c, force, grip[:, None]), 1)
+        return sums + counts * sum_axis(holding.hold(c, force, held_friction[:, None]), 1)
 
     def slot(item: Any, sums: Lanes) -> Lanes:
         jar = self_contacts.read("jar", item)
@@ -149,7 +149,7 @@ def sums(self_contacts: BoundSelfContacts, row: Any, alpha: Lanes, grip: Lanes) 
                 alpha,
                 jar,
                 step,
-                grip,
+                held_friction,
                 counts,
             )
             return lanewise(add, *args)
@@ -168,14 +168,14 @@ def keep(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
 
     if some:
         any_of(which, keep_all)
-    if pairings(problem.m):
+    if pairings(problem.memory):
         _keep_of_fingers(problem, alpha, which)
 
 
 def _keep_of_set(problem: Problem, contacts: BoundContacts, alpha: Lanes, mask: Lanes) -> None:
     """Keeps what a set's contacts hold behind the step, in the worlds of the mask."""
     build = contacts.set.contacts
-    axes = turning(problem.m, contacts)
+    axes = turning(problem.memory, contacts)
 
     def after(mask, place, cone, alpha, jar, step, old, axes):
         new = behind(build(place, cone), jar + alpha * step, old, axes)
@@ -208,10 +208,10 @@ def behind(
       jar: Theirs at the step's accelerations.
       axes: Columns of their axes; None for the world's.
     """
-    grip = before if axes is None else apply_columns(axes, before)
+    held_friction = before if axes is None else apply_columns(axes, before)
     force = contact.constraint_update(contacts, jar).force
-    grip_after = holding.quotient(holding.hold(contacts, force, grip))
-    return grip_after if axes is None else apply_rows(axes, grip_after)
+    held_after = holding.quotient(holding.hold(contacts, force, held_friction))
+    return held_after if axes is None else apply_rows(axes, held_after)
 
 
 def _keep_of_fingers(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
@@ -223,9 +223,9 @@ def _keep_of_fingers(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
         first = self_contacts.set.first
 
         def keep_row(row: jax.Array, x: jax.Array) -> jax.Array:
-            before, old = problem.read(GRIP, "new_grip", item=row + first)
+            before, old = problem.read(BETWEEN_FINGERS, "new_held_friction", item=row + first)
             new = lanewise(holding.quotient, sums(self_contacts, row, alpha, before))
-            problem.write("new_grip", lanewise(jnp.where, mask, new, old), row + first)
+            problem.write("new_held_friction", lanewise(jnp.where, mask, new, old), row + first)
             return x
 
         jax.lax.fori_loop(0, self_contacts.set.rows, keep_row, jnp.int32(0))
@@ -237,7 +237,7 @@ def _keep_of_fingers(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
 def reverse(step: StepMemory, bars: CotangentTables, go: Lanes) -> None:
     """Leaves the cotangents of what contacts hold after the step to the contacts.
 
-    As "held_bar" of each, and as "grip_bar" of fingers on one another.  The state's become those
+    As "held_bar" of each, and as "sums_bar" of fingers on one another.  The state's become those
     before a step of which contacts add their part.
     """
     for contacts in step.contacts.values():
@@ -287,7 +287,7 @@ def asks(problem: Problem, contacts: BoundContacts, item: Any) -> Lanes:
     It is the cotangent of jar, through the force, of what they hold behind the step.
     """
     build = contacts.set.contacts
-    axes = turning(problem.m, contacts)
+    axes = turning(problem.memory, contacts)
 
     def of_jar(jar, place, cone, held, bars, axes):
         return sum_axis(dot(bars, behind(build(place, cone), jar, held, axes)), 0)
@@ -318,41 +318,41 @@ def _reverse_fingers(
 
     for item in range(pairings(step)):
         row = item - self_contacts.set.first
-        mine = state.read(GRIP, item)
-        grip_bar = zeros((4,), step.like)
+        mine = state.read(BETWEEN_FINGERS, item)
+        sums_bar = zeros((4,), step.like)
         if 0 <= row < self_contacts.set.rows:
-            ended = sums(self_contacts, row, no_step, step.finger_state.read(GRIP, item))
+            ended = sums(self_contacts, row, no_step, step.finger_state.read(BETWEEN_FINGERS, item))
             theirs = self_contacts.pairing(row).swap(mine)
             both = lanewise(jnp.subtract, mine, theirs) if item else mine
-            (grip_bar,) = pull(holding.quotient, (ended,), (), only_on(go, both))
-        step.scratch.write("grip_bar", grip_bar, item)
+            (sums_bar,) = pull(holding.quotient, (ended,), (), only_on(go, both))
+        step.scratch.write("sums_bar", sums_bar, item)
         rest = only_on(lanewise(jnp.logical_not, go), mine)
-        state.write(GRIP, rest, item)
+        state.write(BETWEEN_FINGERS, rest, item)
 
 
 def hold_of_pairing(step: StepMemory, pairing: FingerPairing) -> tuple[Lanes, ...]:
-    """What the lanes' fingers hold, and "grip_bar"; nothing if the scene has no such state."""
+    """What the lanes' fingers hold, and "sums_bar"; nothing if the scene has no such state."""
     if not pairings(step):
         return ()
     item = pairing.number
     lane = step.block.lane
-    held = step.finger_state.gather(GRIP, item, lane)
-    return held, step.scratch.gather("grip_bar", item, lane)
+    held = step.finger_state.gather(BETWEEN_FINGERS, item, lane)
+    return held, step.scratch.gather("sums_bar", item, lane)
 
 
-def leave(bars: CotangentTables, pairing: FingerPairing, grip_bars: tuple) -> None:
+def leave(bars: CotangentTables, pairing: FingerPairing, sums_bars: tuple) -> None:
     """Adds a contact's cotangents of `hold_of_pairing` to those of the state."""
-    if not grip_bars:
+    if not sums_bars:
         return
     item = pairing.number
     lane = bars.block.lane
     state = bars.finger_state
-    new = lanewise(jnp.add, state.gather(GRIP, item, lane), grip_bars[0])
-    state.scatter(GRIP, new, item, lane)
+    new = lanewise(jnp.add, state.gather(BETWEEN_FINGERS, item, lane), sums_bars[0])
+    state.scatter(BETWEEN_FINGERS, new, item, lane)
 
 
 def load_cotangents(problem: Problem, self_contacts: BoundSelfContacts) -> None:
-    """Loads the links with what "grip_bar" asks of the step's accelerations.
+    """Loads the links with what "sums_bar" asks of the step's accelerations.
 
     A change of jar changes a contact's force by -K; with r the derivative of the sums by the
     force, the cotangent of jar is -K r.
@@ -372,19 +372,21 @@ def load_cotangents(problem: Problem, self_contacts: BoundSelfContacts) -> None:
             return contact.constraint_update(contacts(place, cone), jar).force
 
         force = lanewise(response, side.place, self_contacts.cone, jar)
-        held = problem.m.finger_state.gather(GRIP, which, lane)
-        bars = problem.m.scratch.gather("grip_bar", which, lane)
+        held = problem.memory.finger_state.gather(BETWEEN_FINGERS, which, lane)
+        bars = problem.memory.scratch.gather("sums_bar", which, lane)
         unit = lanes([problem.like + 1.0], (), wide=True)
         (r,) = pull(of_held, (force,), (side.place, self_contacts.cone, held, bars), unit)
         r = lanewise(jnp.multiply, self_contacts.holds(item, pairing), r)
-        change = lanewise(jnp.negative, self_contacts.stiff(self_contacts.read("hessian", item), r))
+        change = lanewise(
+            jnp.negative, self_contacts.times_hessian(self_contacts.read("hessian", item), r)
+        )
         self_contacts.load(item, side, change, pairing)
 
     self_contacts.do(load)
 
 
 def held_work(
-    contacts: contact.Contacts, force: jax.Array, grip: jax.Array, bars: jax.Array
+    contacts: contact.Contacts, force: jax.Array, held_friction: jax.Array, bars: jax.Array
 ) -> jax.Array:
     """Cotangents of the sums of `holding.hold` times what contacts add to them."""
-    return sum_axis(dot(bars[:, None], holding.hold(contacts, force, grip[:, None])), 0)
+    return sum_axis(dot(bars[:, None], holding.hold(contacts, force, held_friction[:, None])), 0)

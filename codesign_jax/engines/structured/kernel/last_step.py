@@ -90,7 +90,7 @@ class ChordStep:
         if problem.self_contacts:
             problem.self_contacts.update_wrenches(alpha)
 
-        def again(alpha, carry, body, moved, forces, factors, pushes, pair):
+        def again(alpha, carry, body, moved, forces, factors, pushes, self_wrench):
             r, ro, work = carry
             axes, armature, *kept = factors
             acc, link_acc = (a + alpha * b for a, b in moved)
@@ -98,7 +98,7 @@ class ChordStep:
             push = total([smooth - make_body(*body).times(link_acc), *pushes.values()])
             ro = total([ro, *(-w for name, w in pushes.items() if name == "finger_object")])
             tau = tau - armature * acc
-            r = r + push if pair is None else r + push + pair
+            r = r + push if self_wrench is None else r + push + self_wrench
             y = contract(axes, r[None], 1) + tau
             kept = el.Kept(el.Factors(kept[0], kept[1], kept[0]), kept[2])
             r, ro, new = el.eliminate_again(axes, kept, r, ro, tau)
@@ -106,12 +106,12 @@ class ChordStep:
 
         def link(i: Any, carry: tuple) -> tuple:
             names = [("acc", "step_acc"), ("link_acc", "step_link_acc")]
-            moved = [problem.read(*pair, item=i) for pair in names]
+            moved = [problem.read(*rows, item=i) for rows in names]
             pushes = {c.set.name: c.wrench(i, alpha) for c in problem.per_link}
-            pair = problem.self_contacts.pushed(i + 1) if problem.self_contacts else None
+            self_wrench = problem.self_contacts.wrench_on(i + 1) if problem.self_contacts else None
             factors = problem.read("axes", "armature", "w", "g", "inverse", item=i)
             forces = problem.read("smooth", "tau", item=i)
-            args = alpha, carry, problem.body_of(i), moved, forces, factors, pushes, pair
+            args = alpha, carry, problem.body_of(i), moved, forces, factors, pushes, self_wrench
             carry, z = lanewise(again, *args)
             problem.write("z_again", z, i)
             return carry
@@ -122,7 +122,7 @@ class ChordStep:
         if chambers:
             r, ro, less = chambers.close_again("z_again", r, ro)
             work = lanewise(jnp.subtract, work, less)
-        r = problem.add_first(r) if problem.self_contacts else r
+        r = problem.add_palm_wrench(r) if problem.self_contacts else r
         r, ro, work = self.block.sum((r, ro, work))
         given = now, problem.palm, done, r, ro, work, self._pushes(alpha)
         step, work = lanewise(self._at_palm, *given)

@@ -17,11 +17,11 @@ from codesign_jax.engines.structured.lanes import contract, dot, sum_fingers, to
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 
 
-def load_link(node, body, link_acc, smooth, pair):
+def load_link(node, body, link_acc, smooth, self_wrench):
     """Adds a link's inertia, and the forces that its acceleration leaves unbalanced, to a node."""
     link = make_body(*body)
     push = smooth - link.times(link_acc)
-    push = push if pair is None else push + pair
+    push = push if self_wrench is None else push + self_wrench
     return node._replace(p=node.p + link.matrix(), r=node.r + push)
 
 
@@ -69,9 +69,9 @@ class Elimination:
             acc, link_acc = self.accelerations(i, alpha)
             smooth, tau = self.smooth(i)
             axes, armature = problem.read("axes", "armature", item=i)
-            pair = problem.self_contacts.pushed(i + 1) if problem.self_contacts else None
+            self_wrench = problem.self_contacts.wrench_on(i + 1) if problem.self_contacts else None
             node = node._replace(p=full(node.p), q=full(node.q))
-            node = lanewise(load_link, node, problem.body_of(i), link_acc, smooth, pair)
+            node = lanewise(load_link, node, problem.body_of(i), link_acc, smooth, self_wrench)
             for contacts in problem.per_link:
                 node = self.add_contacts(node, contacts, i, alpha)
             forces = axes, armature, tau, acc
@@ -98,7 +98,7 @@ class Elimination:
         if problem.chambers:
             node, work = problem.chambers.close(node, work)
         if problem.self_contacts:
-            node = node._replace(r=problem.add_first(node.r))
+            node = node._replace(r=problem.add_palm_wrench(node.r))
             work = self.block.sum(work)
         node = self.block.sum(node)
         return node._replace(p=full(node.p), q=full(node.q)), work
@@ -138,7 +138,7 @@ class Elimination:
 
         return jax.lax.fori_loop(0, self.links, later, jnp.int32(-1)) if on_object else None
 
-    def dealt_pushes(self, alpha: Lanes) -> dict[str, tuple[Lanes, Lanes]]:
+    def of_dealt_contacts(self, alpha: Lanes) -> dict[str, tuple[Lanes, Lanes]]:
         """Contact inertia and wrench of the palm's and the object's contacts; see `backward`."""
         pushes = {}
         for c in self.problem.dealt:
@@ -155,7 +155,7 @@ class Elimination:
         return pushes
 
     def at_palm(self, now: Iterate, node: el.Quadratic, slots: dict) -> tuple[Iterate, Eliminated]:
-        """Solves for wrist and object; slots: what `dealt_pushes` returns."""
+        """Solves for wrist and object; slots: what `of_dealt_contacts` returns."""
         rigid = self.problem.rigid
 
         def solve(now: Iterate, palm: Palm, node: el.Quadratic, pushes: dict) -> tuple:

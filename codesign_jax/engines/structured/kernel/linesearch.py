@@ -87,7 +87,7 @@ class LineSearch:
         contact_slope = lanewise(lambda t: total(t), [contact_slope, *between])
         contact_slope = self.prepare_slots(contact_slope, step)
         slope, curvature, contact_slope = self.block.sum((slope, curvature, contact_slope))
-        slope, curvature = lanewise(_rest, now, step, problem.palm, slope, curvature)
+        slope, curvature = lanewise(with_palm_and_object, now, step, problem.palm, slope, curvature)
         return slope, curvature, contact_slope
 
     def prepare_slots(self, touch: Lanes, step: Iterate) -> Lanes:
@@ -162,7 +162,7 @@ class LineSearch:
         return rebuild(jax.lax.while_loop(going, body, [jnp.int32(0), *start])[1:])[0]
 
 
-def _rest(now: Iterate, step: Iterate, palm: Palm, slope, curvature):
+def with_palm_and_object(now: Iterate, step: Iterate, palm: Palm, slope, curvature):
     """Adds wrist, palm and object to the smooth part's slope and curvature."""
     push, pull, twist = palm.unbalanced(now)
     slope = slope - dot(push, step.palm_acc) - dot(pull, step.object_acc)

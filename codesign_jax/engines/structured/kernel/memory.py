@@ -270,10 +270,6 @@ class Block:
         item = k * self.team + self.mate
         return jnp.minimum(item, count - 1), item < count
 
-    def alone(self, which: jax.Array) -> jax.Array:
-        """Of the lanes of a team, which are all true or all false, only the first one."""
-        return which if self.team == 1 else which & (self.mate == 0)
-
     def rounds(self, count: int) -> int:
         return -(-count // self.team)
 

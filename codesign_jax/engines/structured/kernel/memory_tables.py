@@ -29,7 +29,7 @@ from codesign_jax.engines.structured.kernel.team_contacts import (
 )
 from codesign_jax.engines.structured.laws import shapes, surroundings
 from codesign_jax.engines.structured.laws.air import volumes
-from codesign_jax.engines.structured.laws.cones import own_friction
+from codesign_jax.engines.structured.laws.cones import friction_by_contact
 from codesign_jax.engines.structured.laws.kinematics import Acc, State
 from codesign_jax.engines.structured.laws.rings import RING_OVERLAP
 from codesign_jax.engines.structured.laws.step_numbers import step_numbers
@@ -63,14 +63,14 @@ class Tables(KernelLayout):
         if scene.fixture or scene.effects.air_mass:
             self.team = 1
         # On a GPU a team's block is one world: nothing depends on what others do.
-        alone = self.team > 1 and backend == "gpu"
+        single_world = self.team > 1 and backend == "gpu"
         self.num_fingers = n
-        self.block = 1 if alone else max(1, width // (self.fingers * self.team))
+        self.block = 1 if single_world else max(1, width // (self.fingers * self.team))
         self.columns = self.fingers * self.block
         self.size = self.columns * self.team
         e = scene.effects
         self.between = (e.finger_finger and n > 1) or e.finger_palm or touches_itself(scene)
-        self.k = rings_of_link(scene)
+        self.rings_per_link = rings_of_link(scene)
         self.palm_groups = palm_groups(scene)
         self.meshes = bool(shapes.mesh_indices(scene))
         self.sets = self._sets()
@@ -80,7 +80,7 @@ class Tables(KernelLayout):
 
     def _sets(self) -> list[ContactSet]:
         e = self.scene.effects
-        k = self.k
+        k = self.rings_per_link
         n = len(surroundings.fields(self.scene))
         make = partial(ContactSet, self.scene, size=self.size)
         on = {"finger_object": k * e.finger_object, "finger_table": n * k * e.finger_table}
@@ -136,7 +136,7 @@ class Tables(KernelLayout):
         n = self.links
         a = self.axes
         scalar: tuple[int, ...] = ()
-        more = {"ring": (n * self.k, (8,))} if self.k else {}
+        more = {"ring": (n * self.rings_per_link, (8,))} if self.rings_per_link else {}
         if palm_touches(self.scene):
             more |= {"palm_ring": (self.palm_groups, (8,))}
         if self.scene.effects.neo_hookean:
@@ -171,7 +171,7 @@ class Tables(KernelLayout):
         for contacts in self.sets:
             some |= contacts.cone_rows()
         some |= {name: (1, number.shape) for name, number in step_numbers(self.scene).items()}
-        if own_friction(self.scene, "object_table"):
+        if friction_by_contact(self.scene, "object_table"):
             some |= {"friction": (1, (2 * len(surroundings.fields(self.scene)),))}
         if self.scene.effects.wrist:
             some |= {"wrist_stiffness": (1, (6,))}
@@ -218,7 +218,7 @@ class Tables(KernelLayout):
         if self.scene.effects.lateral_threshold:
             fields |= {"armature_now": (n, (a,))}
         if pairings := self.held.get("finger_finger"):
-            fields |= {"new_grip": (pairings, (3,))}
+            fields |= {"new_held_friction": (pairings, (3,))}
         for contacts in self.sets:
             fields |= contacts.groups()
         if self.scene.effects.air_mass:
@@ -264,8 +264,8 @@ class Packing(Tables):
             arrays["section"] = joint_sections(hand, self.links)
         if hand.air is not None:
             arrays["volume"] = volumes(hand, self.links)
-        if self.k:
-            arrays["ring"] = ring_numbers(self.scene, hand, self.k)
+        if self.rings_per_link:
+            arrays["ring"] = ring_numbers(self.scene, hand, self.rings_per_link)
         if hand.mesh is not None:
             arrays |= objects.rows(hand.mesh, self.fingers, dtype)
         extra = self.fingers - n
@@ -273,7 +273,7 @@ class Packing(Tables):
             for name in ("centre_weight", "mass", "inertia", "gain"):
                 pad = [(0, 0)] * (arrays[name].ndim - 2) + [(0, extra), (0, 0)]
                 arrays[name] = jnp.pad(arrays[name], pad)
-            if self.k:
+            if self.rings_per_link:
                 ring = jnp.pad(arrays["ring"], [(0, 0), (0, 0), (0, extra), (0, 0)], "edge")
                 arrays["ring"] = ring.at[:, LENGTH, n:].set(0.0)
         wide = {k: self._widen(arrays[k]) for k in self.hand.groups}
@@ -306,8 +306,8 @@ class Packing(Tables):
             "acc": state.acc.finger,
         }
         for name, rows in held.rows(self.scene).items():
-            grips = state.held[rows]
-            finger_state[f"held.{name}"] = grips.reshape(-1, 3, *grips.shape[1:])
+            held_friction = state.held[rows]
+            finger_state[f"held.{name}"] = held_friction.reshape(-1, 3, *held_friction.shape[1:])
         wide = {k: self._widen(v) for k, v in finger_state.items()}
         narrow = {k: arrays[k] for k in self.world_state.groups}
         packed = self.world_state.pack(1, self.block, **narrow)

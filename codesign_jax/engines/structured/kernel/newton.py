@@ -53,14 +53,16 @@ class Newton:
     def __init__(self, problem: Problem):
         self.problem = problem
         self.block = problem.block
-        alone = problem.block.team == 1
-        self.elimination = (Elimination if alone else TeamElimination)(problem)
-        self.search = (LineSearch if alone else TeamLineSearch)(problem)
-        self.coupling = Coupling if alone else TeamCoupling
+        single_lanes = problem.block.team == 1
+        self.elimination = (Elimination if single_lanes else TeamElimination)(problem)
+        self.search = (LineSearch if single_lanes else TeamLineSearch)(problem)
+        self.coupling = Coupling if single_lanes else TeamCoupling
         # A chord's step would take a GPU as long as it saves: there an iteration ends without one.
         threads = bool(problem.in_slots) and problem.in_slots[0].set.gathers
         self.accepts_steady = threads
-        self.chord = ChordStep(problem) if problem.in_slots and alone and not threads else None
+        self.chord = (
+            ChordStep(problem) if problem.in_slots and single_lanes and not threads else None
+        )
 
     def solve(
         self, now: Iterate, waiting: jax.Array, iterations: int, evaluations: int, tolerance: float
@@ -74,7 +76,7 @@ class Newton:
         """
         problem = self.problem
 
-        def hold(before, alpha, decrement):
+        def unless_converged(before, alpha, decrement):
             # A world that has converged keeps its iterate: it must not depend on other worlds.
             going = before > tolerance
             return jnp.where(going, alpha, 0.0), jnp.where(going, decrement, before)
@@ -90,7 +92,7 @@ class Newton:
                 decrement, scale = lanewise(_decrement, slope, first, problem.palm, now.object_acc)
                 floor = jnp.where(busy, LINE_TOLERANCE * tolerance * scale.lane, FAR)
                 alpha = self.search.find(slope, curvature, first, floor, evaluations)
-            alpha, decrement = lanewise(hold, before, alpha, decrement)
+            alpha, decrement = lanewise(unless_converged, before, alpha, decrement)
             newton = alpha  # of the contacts, which the chord's step does not move
             now = lanewise(tree_add_scaled, alpha, now, step)
             if self.chord:
@@ -196,7 +198,7 @@ class Newton:
         """
         self_contacts = self.problem.self_contacts
         node, work = self.elimination.backward(last)
-        step, done = self.elimination.at_palm(now, node, self.elimination.dealt_pushes(last))
+        step, done = self.elimination.at_palm(now, node, self.elimination.of_dealt_contacts(last))
         if self_contacts is None:
             return step, done
         done = done._replace(work=lanewise(jnp.add, done.work, work))

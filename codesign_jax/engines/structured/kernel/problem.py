@@ -44,7 +44,7 @@ class Problem:
     """The solver's problem of one step.
 
     Attributes:
-      m: The step's memory, in which the forward pass has left its results.
+      memory: The step's memory, in which the forward pass has left its results.
       palm: Palm, wrist and object.
       links: Moving links of a finger; `block`: the lanes; `like`: zeros of their shape and type.
       rigid: Whether the wrist's accelerations are known and no unknowns.
@@ -56,28 +56,28 @@ class Problem:
       chambers: Chambers with a mass of air; None without the effect.
     """
 
-    def __init__(self, m: StepMemory, palm: Palm):
-        self.m = m
+    def __init__(self, memory: StepMemory, palm: Palm):
+        self.memory = memory
         self.palm = palm
-        self.links = m.p.links
-        self.block = m.block
-        self.rigid = not m.p.scene.effects.wrist
-        sets = m.contacts
+        self.links = memory.layout.links
+        self.block = memory.block
+        self.rigid = not memory.layout.scene.effects.wrist
+        sets = memory.contacts
         self.self_contacts: BoundSelfContacts | None = sets.get("finger_finger")  # type: ignore[assignment]
         self.per_link = [sets[n] for n in ("finger_object", "finger_table") if n in sets]
         self.dealt = [c for n, c in sets.items() if not n.startswith("finger")]
         self.in_slots = [self.self_contacts] if self.self_contacts else []
         self.like = jnp.zeros((self.block.size,), palm.armature.dtype)
-        self.chambers = Chambers(m) if "air_step" in m.scratch else None
+        self.chambers = Chambers(memory) if "air_step" in memory.scratch else None
 
     def read(self, *names: str, item: Any = 0) -> list[Lanes]:
         """Reads names; of the joints' armature that of this step, if it changes."""
-        if "armature_now" in self.m.scratch:
+        if "armature_now" in self.memory.scratch:
             names = tuple("armature_now" if n == "armature" else n for n in names)
-        return [self.m.read(name, item) for name in names]
+        return [self.memory.read(name, item) for name in names]
 
     def write(self, name: str, value: Lanes, item: Any) -> None:
-        self.m.write(name, value, item)
+        self.memory.write(name, value, item)
 
     def move(self, name: str, item: Any, alpha: Lanes) -> Lanes:
         """Adds the last step to a link's "acc" or "link_acc", and returns the sum."""
@@ -88,10 +88,10 @@ class Problem:
     def body_of(self, item: Any) -> list[Lanes]:
         return self.read("mass", "body_centre", "tensor", item=item)
 
-    def add_first(self, r: Lanes) -> Lanes:
+    def add_palm_wrench(self, r: Lanes) -> Lanes:
         """Adds the self-contacts that act on the palm."""
         assert self.self_contacts is not None
-        return lanewise(jnp.add, r, self.self_contacts.pushed(0))
+        return lanewise(jnp.add, r, self.self_contacts.wrench_on(0))
 
     def widened(self, acc: Lanes) -> Lanes:
         return lanewise(jnp.add, acc, zeros(acc.shape[:-2], self.like))
@@ -103,8 +103,8 @@ def relative(name: str, link: Any, palm: Lanes, obj: Lanes) -> Lanes:
         return lanewise(difference, link, obj)
     if name == "palm_object":
         return lanewise(difference, palm, obj)
-    alone = {"finger_table": link, "palm_table": palm, "object_table": obj}
-    return alone[name]
+    first = {"finger_table": link, "palm_table": palm, "object_table": obj}
+    return first[name]
 
 
 def make_body(mass: jax.Array, centre: jax.Array, tensor: jax.Array) -> Body:

@@ -21,7 +21,7 @@ from codesign_jax.engines.structured.kernel.problem import make_body
 from codesign_jax.engines.structured.kernel.step import link_forces, palm_and_object
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.laws import contact, holding, rings, shapes, surroundings
-from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
+from codesign_jax.engines.structured.laws.cones import friction_by_contact, which_cone
 from codesign_jax.engines.structured.laws.contact import Contacts
 from codesign_jax.engines.structured.laws.kinematics import next_acceleration, palm_acceleration
 from codesign_jax.engines.structured.laws.rings import Segment
@@ -67,10 +67,10 @@ def of_contacts(
     jar = contacts.relative(link_acc) - contacts.reference(contacts.relative(vel))
     work = 0.0
     if hold:
-        grip, bars, axes = hold
-        world_grip = grip if axes is None else apply_columns(axes, grip)
-        jar = jar + holding.held(contacts, world_grip)
-        work = sum_axis(dot(bars, behind(contacts, jar, grip, axes)), 0)
+        held_friction, bars, axes = hold
+        held_in_world = held_friction if axes is None else apply_columns(axes, held_friction)
+        jar = jar + holding.held(contacts, held_in_world)
+        work = sum_axis(dot(bars, behind(contacts, jar, held_friction, axes)), 0)
     force = contact.constraint_update(contacts, jar).force
     return sum_axis(dot(force, contacts.relative(along)), 0) + work
 
@@ -130,7 +130,7 @@ def of_rings(
     candidates = sdf_collision.beside(places)
     candidates = candidates._replace(share=jnp.where(fixed["share"] > 0, candidates.share, 0.0))
     cone = _cone(scene, name, variables)
-    if own_friction(scene, name):
+    if friction_by_contact(scene, name):
         which = surroundings.touched(scene, name, numbers.shape[1])
         cone = cone.of_friction(jnp.stack([variables["friction"][i] for i in which]))
     contacts = ContactSet.contacts(candidates, cone)
@@ -166,7 +166,7 @@ def of_table(
     point, normal, gap = map(deal, _of_object(scene, variables, fixed))
     used = (finger < slots - item * fingers) & (fixed["share"][0] > 0)
     cone = _cone(scene, TABLE, variables)
-    if own_friction(scene, TABLE):
+    if friction_by_contact(scene, TABLE):
         which = surroundings.touched(scene, TABLE, 1)
         rubs = jnp.stack([variables["friction"][i, 0] for i in which])
         cone = cone.of_friction(deal(rubs)[None])
@@ -315,9 +315,11 @@ def _between(
     if not held:
         force = contact.constraint_update(contacts, jar).force
         return sum_axis(dot(force, along), 0)
-    grip, bars = held
-    force = contact.constraint_update(contacts, jar + holding.held(contacts, grip[:, None])).force
-    return sum_axis(dot(force, along), 0) + held_work(contacts, force, grip, bars)
+    held_friction, bars = held
+    force = contact.constraint_update(
+        contacts, jar + holding.held(contacts, held_friction[:, None])
+    ).force
+    return sum_axis(dot(force, along), 0) + held_work(contacts, force, held_friction, bars)
 
 
 def _from_object(name: str, moves: Any, variables: dict, fixed: dict) -> list:

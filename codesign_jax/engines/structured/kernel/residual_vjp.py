@@ -37,7 +37,7 @@ from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.kernel.step_memory import FINGER_CONSTANTS, LINK_CONSTANTS
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import shapes, surroundings
-from codesign_jax.engines.structured.laws.cones import own_friction, which_cone
+from codesign_jax.engines.structured.laws.cones import friction_by_contact, which_cone
 from codesign_jax.engines.structured.laws.kinematics import mounted
 from codesign_jax.engines.structured.laws.touch import ring_centres
 from codesign_jax.engines.structured.world_model import apply_columns
@@ -60,7 +60,7 @@ class ResidualVjp:
         bars: CotangentTables,
     ):
         self.step = step
-        self.p = step.p
+        self.layout = step.layout
         self.bodies = bodies
         self.world_object = world_object
         self.contacts = step.contacts
@@ -72,7 +72,7 @@ class ResidualVjp:
         self.power_bar = lanes([self.like + 1.0], (), wide=True)
         self.object = {"columns": bodies["columns"], "object_vel": bodies["object_vel"]}
         self.object |= {"height": state["position"][2]}
-        if self.p.scene.fixture:
+        if self.layout.scene.fixture:
             self.object |= {"position": state["position"]}
         names = ("object_size", "grid_origin", "grid_cell", "grid_factor")
         self.object |= {n: step.constant(n) for n in names if n in step.world}
@@ -90,8 +90,8 @@ class ResidualVjp:
 
     def fingers(self, pressure: Lanes, centre_bar: Lanes) -> LinkMotion:
         """From the tips inwards; cotangents of what the palm hands on, on each lane."""
-        p = self.p
-        tips = self.p.links
+        layout = self.layout
+        tips = self.layout.links
         touching = [n for n in ("finger_object", "finger_table") if n in self.contacts]
 
         def link(i: Any, after: LinkMotion) -> LinkMotion:
@@ -105,7 +105,7 @@ class ResidualVjp:
 
         after = LinkMotion(*(zeros(shape, self.like) for shape in SHAPES))
         after = self.more(after, tips)
-        base = loop(tips, link, after, p.size, reverse=True)
+        base = loop(tips, link, after, layout.size, reverse=True)
         return self._mount(base, centre_bar)
 
     def none(self, name: str) -> Lanes:
@@ -124,14 +124,14 @@ class ResidualVjp:
         fixed["virtual"] = self.scratch.read("virtual", i)
         weight = self.step.hand.read("centre_weight", i + 1)
         fixed["centre_bar"] = lanewise(jnp.multiply, centre_bar, weight)
-        run = partial(residual.of_link, self.p.scene)
+        run = partial(residual.of_link, self.layout.scene)
         joint = joint | {"pressure": pressure}
         before, bars, moved = pull(
             run, (self.chain(i), numbers, joint), (fixed,), (after, self.power_bar)
         )
         self.bars.add({n: bars.pop(n) for n in LINK_CONSTANTS}, i)
         sections = {n: bars.pop(n) for n in FINGER_CONSTANTS if n in bars}
-        self.bars.add(sections, i if self.p.tapered else 0)
+        self.bars.add(sections, i if self.layout.tapered else 0)
         self.bars.add(bars | {"pressure": moved.pop("pressure")})
         self.bars.add_joint(moved, i)
         return before
@@ -172,7 +172,7 @@ class ResidualVjp:
         if "palmbar.origin" in self.scratch:
             more = {n: self.scratch.read(f"palmbar.{n}") for n in BodyMotion._fields}
             base = _add(base, **more)
-        for i in range(self.p.palm_groups if names else 0):
+        for i in range(self.layout.palm_groups if names else 0):
             for name in names:
                 new = self.rings(name, i, place, "palm_ring")
                 base = _add(base, **new._asdict())
@@ -182,7 +182,7 @@ class ResidualVjp:
 
     def rings(self, name: str, i: Any, place: BodyMotion, table: str = "ring") -> BodyMotion:
         """Cotangents of a body, of an item of the contacts of its rings."""
-        k = self.p.k if table == "ring" else 1
+        k = self.layout.rings_per_link if table == "ring" else 1
         rows = [self.step.hand.read(table, i * k + j) for j in range(k)]
         numbers = lanewise(lambda rows: jnp.stack(rows, 1), rows)
 
@@ -190,11 +190,11 @@ class ResidualVjp:
             if "meshed" in fixed and name.endswith("_object"):
                 centre = lanewise(ring_centres, place.origin, place.frame, numbers)
                 fixed = fixed | {"values": self._values(centre)}
-                if self.p.hull:
-                    run = partial(residual.second_look, self.p.scene, name)
+                if self.layout.hull:
+                    run = partial(residual.second_look, self.layout.scene, name)
                     again = lanewise(run, place, numbers, variables, fixed)
                     fixed = fixed | {"values_again": self._values(again)}
-            run = partial(residual.of_rings, self.p.scene, name)
+            run = partial(residual.of_rings, self.layout.scene, name)
             args = place, numbers, variables, self.held(name, i)
             body_bars, ring_bars, shared, held = pull(run, args, (fixed,), self.power_bar)
             friction_memory.add_held(self.bars, self.contacts[name], i, held)
@@ -212,11 +212,13 @@ class ResidualVjp:
         empty = BodyMotion(*(self.none(n) for n in BodyMotion._fields))
         contacts = self.contacts[name]
         fixed = self.fixed | self.of_contacts(name, i)
-        return choose(contacts.touching(i), lambda: compute(variables, fixed), empty, self.p.size)
+        return choose(
+            contacts.touching(i), lambda: compute(variables, fixed), empty, self.layout.size
+        )
 
     def _table(self) -> None:
         contacts = self.contacts[residual.TABLE]
-        p = self.p
+        layout = self.layout
         finger = lanes([self.block.finger.astype(self.like.dtype)], (), wide=True)
         variables = self._object(residual.TABLE)
         fixed = self.fixed
@@ -224,7 +226,7 @@ class ResidualVjp:
             columns = self.bodies["columns"]
             fixed = fixed | {"factor": self.object["grid_factor"]}
             fixed |= {"support": self._support(columns, self.object["height"])}
-            for j, fixture in enumerate(p.scene.fixture):
+            for j, fixture in enumerate(layout.scene.fixture):
                 position = self.object["position"]
                 gap, rows = lanewise(partial(surroundings.towards, fixture), position)
                 turned = lanewise(surroundings.faced, rows, columns)
@@ -235,7 +237,7 @@ class ResidualVjp:
         for i in range(contacts.set.count):
 
             def compute(i: int = i) -> None:
-                run = partial(residual.of_table, p.scene, p.fingers, i)
+                run = partial(residual.of_table, layout.scene, layout.fingers, i)
                 constants = fixed | self.of_contacts(residual.TABLE, i)
                 args = variables, self.held(residual.TABLE, i)
                 bars, held = pull(run, args, (finger, constants), self.power_bar)
@@ -257,19 +259,19 @@ class ResidualVjp:
     def _object(self, name: str) -> dict[str, Lanes]:
         """What contacts of a pair of bodies depend on beside the hand, by name."""
         cone = f"cone.{which_cone(name)}"
-        surrounded = bool(self.p.scene.fixture)
+        surrounded = bool(self.layout.scene.fixture)
         names = {"height", "position"} if surrounded else {"height"}
         if not name.endswith("_table"):
             names = set(self.object) - names
         if name == residual.TABLE:
             names = set(self.object) - (set() if surrounded else {"grid_origin", "grid_cell"})
         chosen = {n: v for n, v in self.object.items() if n in names}
-        names = [cone] + ["friction"] * own_friction(self.p.scene, name)
+        names = [cone] + ["friction"] * friction_by_contact(self.layout.scene, name)
         return chosen | {n: self.step.constant(n) for n in names}
 
     def _support(self, columns: Lanes, height: Lanes) -> Lanes:
         """Points that may touch a table of these axes, in the object's frame."""
-        points = objects.table_points(self.p.scene, self.world_object, columns, height)
+        points = objects.table_points(self.layout.scene, self.world_object, columns, height)
         return lanewise(_turned_back, columns, points)
 
     def _values(self, centre: Lanes) -> Lanes:
@@ -301,7 +303,7 @@ class SelfContactsVjp:
     def __init__(self, sweep: ResidualVjp, self_contacts: BoundSelfContacts):
         self.sweep = sweep
         self.contacts = self_contacts
-        self.p = sweep.p
+        self.layout = sweep.layout
         self.bars = sweep.bars
         self.like = sweep.like
         self.lane = sweep.block.lane
@@ -315,9 +317,9 @@ class SelfContactsVjp:
                 self.scratch.write(name, zeros(self.scratch.shape(name), self.like), i)
             return x
 
-        jax.lax.fori_loop(0, self.p.links + 1, clear, jnp.int32(0))
-        effects = self.p.scene.effects
-        hull = self.p.scene.effects.surface == "hull"
+        jax.lax.fori_loop(0, self.layout.links + 1, clear, jnp.int32(0))
+        effects = self.layout.scene.effects
+        hull = self.layout.scene.effects.surface == "hull"
         if effects.finger_palm:
             self._leave_palm(
                 BodyMotion(*(self.sweep.none(n) for n in BodyMotion._fields)), first=True
@@ -327,15 +329,15 @@ class SelfContactsVjp:
             read = self.contacts.read
             owner = read("owner", item).lane > 0.5
             live = owner & (read("share", item).lane > 0)
-            if pairing.alone is not None:
+            if pairing.itself is not None:
                 other = read("other", item).lane.astype(jnp.int32)
                 if effects.finger_palm:
-                    palm = live & pairing.alone & (other == 0)
+                    palm = live & pairing.itself & (other == 0)
                     any_of(palm, lambda: self._on_palm(item, palm))
-                if touches_itself(self.p.scene):
-                    itself = live & pairing.alone & (other > 0)
+                if touches_itself(self.layout.scene):
+                    itself = live & pairing.itself & (other > 0)
                     any_of(itself, lambda: self._on_itself(item, pairing, itself))
-                live = live & ~pairing.alone
+                live = live & ~pairing.itself
             if effects.finger_finger:
                 reverse = self._on_finger if hull else self._spheres
                 any_of(live, lambda: reverse(item, pairing, live))
@@ -353,7 +355,7 @@ class SelfContactsVjp:
             origin=bodies["place"], frame=bodies["frame"]
         )
         args = (self._body(row), ring), palm, step.constant("palm_disc"), step.constant(ON_PALM)
-        run = partial(residual.on_palm, self.p.scene)
+        run = partial(residual.on_palm, self.layout.scene)
         (place, ring_bar), palm, disc, cone = only_on(
             self._side(live), pull(run, args, (), self._power_bar)
         )
@@ -374,9 +376,12 @@ class SelfContactsVjp:
     def _spheres(self, item: Any, pairing: FingerPairing, live: jax.Array) -> None:
         number, row, ring = self._ring(item)
         other = jax.lax.div(self.contacts.read("ring", item).lane.astype(jnp.int32), self._count)
-        theirs = self._body(row_of(other, self.p.k), pairing.lane), self._numbers(other, pairing)
+        theirs = (
+            self._body(row_of(other, self.layout.rings_per_link), pairing.lane),
+            self._numbers(other, pairing),
+        )
         args = (self._body(row), ring), theirs, self.sweep.step.constant(CONE)
-        bars = pull(partial(residual.between_spheres, self.p.scene), args, (), self._power_bar)
+        bars = pull(partial(residual.between_spheres, self.layout.scene), args, (), self._power_bar)
         (place, ring_bar), swapped, cone = only_on(self._side(live), bars)
         self.bars.add({CONE: cone})
         self.bars.add({"ring": ring_bar}, number, self.lane)
@@ -384,7 +389,7 @@ class SelfContactsVjp:
         (place, ring_bar), other = pairing.swap((swapped, self._float(other)))
         other = other.lane.astype(jnp.int32)
         self.bars.add({"ring": ring_bar}, other, self.lane)
-        self._leave(place._asdict(), row_of(other, self.p.k))
+        self._leave(place._asdict(), row_of(other, self.layout.rings_per_link))
 
     def _on_finger(self, item: Any, pairing: FingerPairing, live: jax.Array) -> None:
         """Adds the cotangents of a ring and of another finger's segment."""
@@ -410,16 +415,20 @@ class SelfContactsVjp:
     ) -> CentreLineSegment:
         """Adds the cotangents of a ring; returns those of the segment that it touches."""
         number, row, ring = self._ring(item)
-        before, link, after = self_collision.neighbours(other, self.p.links)
+        before, link, after = self_collision.neighbours(other, self.layout.links)
         frames = tuple(self._chain("frame", r, lane) for r in (before, after))
         sections = [self._numbers(n, pairing, lane) for n in self._sections(other)]
         line = CentreLineSegment(
             self._body(link, lane), self._chain("origin", after, lane), frames, *sections
         )
-        fixed |= {"last": self._float(jnp.where(other == self.p.links, self.like + 1.0, self.like))}
+        fixed |= {
+            "last": self._float(jnp.where(other == self.layout.links, self.like + 1.0, self.like))
+        }
         held = friction_memory.hold_of_pairing(self.sweep.step, pairing)
         args = (self._body(row), ring), line, self.sweep.step.constant(CONE), held
-        bars = pull(partial(residual.between_rings, self.p.scene), args, (fixed,), self._power_bar)
+        bars = pull(
+            partial(residual.between_rings, self.layout.scene), args, (fixed,), self._power_bar
+        )
         (place, own_ring), line, cone, kept = only_on(self._side(live), bars)
         friction_memory.leave(self.bars, pairing, kept)
         self.bars.add({CONE: cone})
@@ -428,7 +437,7 @@ class SelfContactsVjp:
         return line
 
     def _leave_line(self, line: CentreLineSegment, row: jax.Array) -> None:
-        before, link, after = self_collision.neighbours(row, self.p.links)
+        before, link, after = self_collision.neighbours(row, self.layout.links)
         self._leave(line.place._asdict(), link)
         self._leave({"frame": line.frames[0]}, before)
         self._leave({"origin": line.origin, "frame": line.frames[1]}, after)
@@ -440,7 +449,7 @@ class SelfContactsVjp:
         """Rings whose sections segments have, and the one before has; see `ring_at`."""
         search = self.sweep.step.search
         assert search is not None
-        places = (1, 0) if self.p.tapered else (1,)
+        places = (1, 0) if self.layout.tapered else (1,)
         return [jnp.zeros_like(row) + search.ring_at(row + k) for k in places]
 
     # Both
@@ -451,7 +460,9 @@ class SelfContactsVjp:
 
     @property
     def _count(self) -> jax.Array:
-        return jnp.full((self.p.size,), self.p.links * self.p.k, jnp.int32)
+        return jnp.full(
+            (self.layout.size,), self.layout.links * self.layout.rings_per_link, jnp.int32
+        )
 
     def _side(self, live: jax.Array) -> Lanes:
         return lanes([live], (), wide=True)
@@ -464,7 +475,7 @@ class SelfContactsVjp:
         number = self.contacts.read("ring", item).lane.astype(jnp.int32)
         number = jax.lax.rem(number, self._count)
         ring = self.hand.gather("ring", number, self.lane)
-        return number, row_of(number, self.p.k), ring
+        return number, row_of(number, self.layout.rings_per_link), ring
 
     def _numbers(self, number: jax.Array, pairing: FingerPairing, lane: Any = None) -> Lanes:
         lane = pairing.lane if lane is None else lane

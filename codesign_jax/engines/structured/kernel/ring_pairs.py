@@ -68,7 +68,7 @@ class RingPairs:
             return nothing
 
         size = search.block.size
-        loop(search.p.links + 1, copy, [], size)
+        loop(search.layout.links + 1, copy, [], size)
         start = zeros((3,), search.like), zeros((), search.like)
         loop(-(-search.count // 2), lambda k, seen: self._look(2 * k, *seen), start, size)
 

@@ -21,7 +21,7 @@ from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import cross, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import shapes, surroundings
-from codesign_jax.engines.structured.laws.cones import own_friction
+from codesign_jax.engines.structured.laws.cones import friction_by_contact
 from codesign_jax.engines.structured.laws.rings import Facing, Place
 from codesign_jax.engines.structured.laws.touch import (
     ball_on_field,
@@ -39,31 +39,33 @@ class SdfCollision:
 
     def __init__(self, step: StepMemory, bodies: dict[str, Any], world_object: WorldObject):
         self.step = step
-        self.p = step.p
+        self.layout = step.layout
         self.bodies = bodies
         self.world_object = world_object
         self.contacts = step.contacts
         self.names = [n for n in ("finger_object", "finger_table") if n in self.contacts]
-        self.surface = step.p.scene.effects.surface
+        self.surface = step.layout.scene.effects.surface
 
     def looks(self, name: str) -> list[Callable[[Lanes], tuple[Lanes, Lanes]]]:
         """The object, or table and fixtures: from points (3, k) to distances (k,) and gradients."""
         if name.endswith("_object"):
             return [self._object]
         position = self.step.world_state.read("position")
-        return [partial(lanewise, field, position) for field in surroundings.fields(self.p.scene)]
+        return [
+            partial(lanewise, field, position) for field in surroundings.fields(self.layout.scene)
+        ]
 
     def _object(self, point: Lanes) -> tuple[Lanes, Lanes]:
         columns = self.bodies["columns"]
         local = lanewise(shapes.in_object, columns, point)
-        distance, gradient = objects.signed_distance(self.p.scene, self.world_object, local)
+        distance, gradient = objects.signed_distance(self.layout.scene, self.world_object, local)
         return distance, lanewise(apply_columns, columns, gradient)
 
     def frictions(self, name: str, count: int = 1) -> Lanes | None:
         """Coefficients (1, k) of an item of `count` rings a field; None where all are alike."""
-        if not own_friction(self.p.scene, name):
+        if not friction_by_contact(self.layout.scene, name):
             return None
-        which = surroundings.touched(self.p.scene, name, count)
+        which = surroundings.touched(self.layout.scene, name, count)
         return lanewise(
             lambda v: jnp.stack([v[i] for i in which])[None], self.step.constant("friction")
         )
@@ -78,7 +80,7 @@ class SdfCollision:
 
     def of_link(self, i: Any, carry: tuple) -> None:
         """Contacts of a link; carry: its origin, frame, velocity, bias and acceleration."""
-        if self.p.team > 1:  # see `of_rings`
+        if self.layout.team > 1:  # see `of_rings`
             return
         origin, frame, vel, _, link_acc = carry
         for name in self.names:
@@ -110,7 +112,7 @@ class SdfCollision:
             contacts.every(ring, [])  # type: ignore[attr-defined]
 
     def numbers(self, i: Any) -> Lanes:
-        k = self.p.k
+        k = self.layout.rings_per_link
         read = partial(self.step.hand.read, "ring")
         return lanewise(lambda rows: jnp.stack(rows, 1), [read(i * k + j) for j in range(k)])
 
@@ -132,7 +134,9 @@ class SdfCollision:
         if self.surface == "spheres":
             places = [lanewise(ball_on_field, numbers, centre, *first) for first in seen]
             return contacts.create(i, joined(places), *moves, friction=friction)
-        flat = not name.endswith("_object") and self.p.scene.effects.table  # the table comes first
+        flat = (
+            not name.endswith("_object") and self.layout.scene.effects.table
+        )  # the table comes first
         most = self.closing_gap(numbers, centre, moves[1])
         near = [lanewise(may_touch, numbers, first[0], most).lane for first in seen]
         contacts.write("share", zeros((contacts.set.k,), self.step.like), i)
@@ -153,15 +157,15 @@ class SdfCollision:
 
     def closing_gap(self, numbers: Lanes, centre: Lanes, velocity: Lanes) -> Lanes:
         """Largest gaps that rings may close within the step, see `closed_gap`."""
-        run = partial(closed_gap, self.p.scene.discretization.timestep)
+        run = partial(closed_gap, self.layout.scene.discretization.timestep)
         return lanewise(run, numbers, centre, velocity)
 
     def of_palm_and_object(self, state: dict) -> None:
         """Contacts of the palm's rings or spheres, and of the object with the table."""
-        p = self.p
+        layout = self.layout
         bodies = self.bodies
         palm = [name for name in ("palm_object", "palm_table") if name in self.contacts]
-        for i in range(p.palm_groups if palm else 0):
+        for i in range(layout.palm_groups if palm else 0):
             numbers = lanewise(as_item, self.step.hand.read("palm_ring", i))
             centre = lanewise(ring_centres, bodies["place"], bodies["frame"], numbers)
             for name in palm:
@@ -173,7 +177,7 @@ class SdfCollision:
         rubs = self.frictions("object_table")
         for i in range(on_table.set.count if on_table else 0):
             assert on_table is not None
-            mine = range(i * p.fingers, min((i + 1) * p.fingers, len(slots)))
+            mine = range(i * layout.fingers, min((i + 1) * layout.fingers, len(slots)))
             place = Place(*self._deal([slots[k] for k in mine]))
             friction = None
             if rubs is not None:
@@ -184,7 +188,7 @@ class SdfCollision:
 
     def _table_points(self, state: dict) -> list[Place]:
         """Each slot of the object on the table and the fixtures, lanes of a world."""
-        scene = self.p.scene
+        scene = self.layout.scene
         columns = self.bodies["columns"]
         places = []
         position = state["position"]

@@ -65,15 +65,15 @@ class SelfCollision:
     def __init__(self, step: StepMemory, self_contacts: BoundSelfContacts, bodies: dict[str, Any]):
         self.step = step
         self.contacts = self_contacts
-        self.p = step.p
+        self.layout = step.layout
         self.scratch = step.scratch
         self.block = step.block
         self.like = step.like
-        self.count = self.p.links * self.p.k
+        self.count = self.layout.links * self.layout.rings_per_link
         self.palm_vel = bodies["vel"]
-        self.hull = step.p.scene.effects.surface == "hull"
+        self.hull = step.layout.scene.effects.surface == "hull"
         self.palm = None
-        if step.p.scene.effects.finger_palm:
+        if step.layout.scene.effects.finger_palm:
             self.palm = bodies["place"], bodies["frame"], step.constant("palm_disc")
 
     # Where fingers are
@@ -101,15 +101,15 @@ class SelfCollision:
 
         All sections are alike but for a tapered finger's: there it is the ring before that place.
         """
-        if not self.p.tapered:
+        if not self.layout.tapered:
             return self.count - 1
-        first = (jnp.asarray(row) - 1) * self.p.k - 1
+        first = (jnp.asarray(row) - 1) * self.layout.rings_per_link - 1
         return jnp.maximum(first, 0)
 
     def largest(self) -> Lanes:
         """Numbers of the largest ring of a finger: of its last one, or of either end's."""
         tip = self.ring(self.count - 1)
-        return lanewise(jnp.maximum, tip, self.ring(0)) if self.p.tapered else tip
+        return lanewise(jnp.maximum, tip, self.ring(0)) if self.layout.tapered else tip
 
     def start(self, link_acc: Lanes, vel: Lanes, frame: Lanes, base: Lanes) -> None:
         """Empties the slots; stores what belongs to the palm."""
@@ -143,28 +143,28 @@ class SelfCollision:
     def _lines(self) -> None:
         """Ends the centre lines at the tips' rings; stores their segments."""
         tip = self.ring(self.count - 1)
-        place = self.read("joint", self.p.links), self.read("frame", self.p.links)
-        self.write("end", lanewise(ring_centre, *place, tip), self.p.links + 1)
+        place = self.read("joint", self.layout.links), self.read("frame", self.layout.links)
+        self.write("end", lanewise(ring_centre, *place, tip), self.layout.links + 1)
 
         def segment(row: Any) -> None:
             ends = self.read("end", row), self.read("end", row + 1)
             self.write("line", lanewise(_line, *ends), row)
 
-        each(self.p.links + 1, segment)
+        each(self.layout.links + 1, segment)
 
     def body(self, item: Any) -> tuple[Any, Lanes, Lanes, Lanes]:
         """A ring's link, its numbers, the link's frame and the ring's centre."""
-        row = jax.lax.div(item, jnp.full_like(item, self.p.k)) + 1
+        row = jax.lax.div(item, jnp.full_like(item, self.layout.rings_per_link)) + 1
         frame = self.read("frame", row)
         numbers = self.ring(item)
         return row, numbers, frame, lanewise(ring_centre, self.read("joint", row), frame, numbers)
 
     def find(self) -> None:
-        scene = self.p.scene
+        scene = self.layout.scene
         if self.hull:
             self._lines()
         if self.palm is not None:
-            self._each_ring(first_on_palm(self.p.links) - 1, self._on_palm)
+            self._each_ring(first_on_palm(self.layout.links) - 1, self._on_palm)
         if touches_itself(scene):
             self._each_ring(0, self._on_itself)
         if not scene.effects.finger_finger:
@@ -172,15 +172,15 @@ class SelfCollision:
 
         def pairing(row: jax.Array, x: jax.Array) -> jax.Array:
             pairing = self.contacts.pairing(row)
-            other = jax.lax.div(pairing.lane, jnp.int32(self.p.block))
-            owner = (self.block.finger < other) & (other < self.p.num_fingers)
+            other = jax.lax.div(pairing.lane, jnp.int32(self.layout.block))
+            owner = (self.block.finger < other) & (other < self.layout.num_fingers)
             if self.hull and not self.contacts.set.gathers:
                 RingPairs(self, row, pairing, owner).find()
                 return x
             if self.hull:
                 # The segments of the other finger's centre line.
                 copy = lambda i: self.write("other", pairing.swap(self.read("line", i)), i)  # noqa: E731, B023
-                each(self.p.links + 1, copy)
+                each(self.layout.links + 1, copy)
                 size = lanewise(_stacked, self.reach(self.largest()), self.read("fastest"))
                 self.write("other_size", pairing.swap(size))
             search = self._on_finger if self.hull else self._on_spheres
@@ -188,12 +188,12 @@ class SelfCollision:
             return x
 
         jax.lax.fori_loop(
-            int(self.contacts.set.alone), self.contacts.set.rows, pairing, jnp.int32(0)
+            int(self.contacts.set.with_itself), self.contacts.set.rows, pairing, jnp.int32(0)
         )
 
     def _each_ring(self, link: int, search: Callable) -> None:
         """Runs search(item, lanes that have it) for all rings from a link on, dealt to lanes."""
-        first = link * self.p.k
+        first = link * self.layout.rings_per_link
         count = self.count - first
 
         def ring(k: Any) -> None:
@@ -210,7 +210,7 @@ class SelfCollision:
 
     def gap(self, speed: Lanes) -> jax.Array:
         """Largest gap that bodies of this speed to each other may close in this step [m]."""
-        return lanewise(partial(closed, self.p.scene.discretization.timestep), speed).lane
+        return lanewise(partial(closed, self.layout.scene.discretization.timestep), speed).lane
 
     def near(self, square: jax.Array, mine: Lanes, theirs: Lanes, speed: Lanes) -> jax.Array:
         """Whether rings may touch in this step.
@@ -253,7 +253,7 @@ class SelfCollision:
           held: What the contact holds of friction, (3,), or nothing.
         """
         place = lanewise(with_axis, place)
-        run = partial(begun, margin(self.p.scene))
+        run = partial(begun, margin(self.layout.scene))
         moves = lanewise(_differences, mine, theirs)
         place, jar = lanewise(run, place, cone, *moves)
         for g in held:
@@ -353,7 +353,7 @@ class SelfCollision:
     def _on_itself(self, item: Any, mine: jax.Array) -> None:
         row, numbers, frame, centre = self.body(item)
         square, other, t = self.nearest("line", centre, item)
-        theirs = self.largest() if self.p.tapered else numbers
+        theirs = self.largest() if self.layout.tapered else numbers
         reaches = self.reach(numbers), self.reach(theirs)
         near = mine & self.near(square, *reaches, self.read("fastest"))
 
@@ -385,19 +385,19 @@ class SelfCollision:
     def last_of(self, item: Any, row: Any) -> jax.Array:
         """The last place on a segment, 0 to 1, that rings of the same finger touch."""
         start = self.like + jnp.asarray(row).astype(self.like.dtype) - 0.5
-        length = jnp.where(jnp.equal(row, self.p.links), self.like + TIP, 1.0)
+        length = jnp.where(jnp.equal(row, self.layout.links), self.like + TIP, 1.0)
         return jnp.minimum((self._end(item) - start) / length, 1.0)
 
     def _along(self, item: Any) -> jax.Array:
         """Place of a ring along the finger, in links from its base."""
         item = jnp.zeros_like(self.block.column) + item
-        k = jnp.full_like(item, self.p.k)
+        k = jnp.full_like(item, self.layout.rings_per_link)
         link = jax.lax.div(item, k)
         number = jax.lax.rem(item, k)
-        places = ring_places(self.p.links, self.p.k)
-        part = (number.astype(self.like.dtype) + 0.5) / self.p.k
+        places = ring_places(self.layout.links, self.layout.rings_per_link)
+        part = (number.astype(self.like.dtype) + 0.5) / self.layout.rings_per_link
         last = jnp.where(number == k - 1, places[-1, -1], 0.5 * part)
-        along = jnp.where(link == self.p.links - 1, last, part)
+        along = jnp.where(link == self.layout.links - 1, last, part)
         return link.astype(self.like.dtype) + (0.5 + along)
 
     def _on_finger(
@@ -450,7 +450,7 @@ class SelfCollision:
         mine = {name: value for name, value in contact.items() if name != "step"}
         theirs = mine | {"row": self._number(other)}
         theirs |= {name: lanewise(jnp.negative, mine[name]) for name in ("normal", "jar")}
-        none = {"other": zeros((1, 1), self.like)} if self.contacts.set.alone else {}
+        none = {"other": zeros((1, 1), self.like)} if self.contacts.set.with_itself else {}
 
         alike = self.contacts.remembered({"owner": owner, "ring": item}) | none | {"step": step}
         fields = (mine, theirs) if second is None else (theirs, mine)
@@ -463,7 +463,7 @@ class SelfCollision:
         Args:
           name: "line", the finger's own, or "other"; `itself`: the ring on the finger's own line.
         """
-        last = self.p.links
+        last = self.layout.links
 
         def compare(segment, centre, best, number, end):
             start = segment[:3]
@@ -494,7 +494,7 @@ class SelfCollision:
 
     def segment(self, row: Any, lane: jax.Array | None = None) -> tuple[tuple, list[Lanes]]:
         """Segments' ends, frames and sections, and their links' `moves`; arguments as `read`."""
-        frames = tuple(self.read("frame", r, lane) for r in neighbours(row, self.p.links))
+        frames = tuple(self.read("frame", r, lane) for r in neighbours(row, self.layout.links))
         ends = self.read("end", row, lane), self.read("end", row + 1, lane)
         return (ends, frames, self.ring(self.ring_at(row + 1), lane)), self.moves(row, lane)
 
@@ -507,7 +507,9 @@ class SelfCollision:
           segment: Their ends, frames and sections, see `segment`.
           row: Their links.
         """
-        last = lanes([jnp.where(row == self.p.links, self.like + 1.0, self.like)], (), wide=True)
+        last = lanes(
+            [jnp.where(row == self.layout.links, self.like + 1.0, self.like)], (), wide=True
+        )
         where = lanes([t], (), wide=True)
         return lanewise(facing_line, numbers, frame, centre, (*segment, last), where)
 
@@ -522,7 +524,7 @@ class SelfCollision:
     ) -> None:
         """A sphere of the finger that comes first, with all of the other one's."""
         link, numbers, _, centre = self.body(item)
-        apart = self.p.k
+        apart = self.layout.rings_per_link
 
         def with_other(j: Any) -> None:
             theirs = pairing.swap(self.body(j)[1:])
@@ -642,8 +644,8 @@ def _differences(mine: list, theirs: list) -> list:
     return [a - b for a, b in zip(mine, theirs, strict=True)]
 
 
-def _with_held(jar, place, cone, grip):
-    return with_held(jar, place, cone, grip[:, None])
+def _with_held(jar, place, cone, held_friction):
+    return with_held(jar, place, cone, held_friction[:, None])
 
 
 def each(count: int, body: Callable[[Any], None]) -> None:

@@ -35,6 +35,16 @@ from codesign_jax.engines.structured.laws.rings import Place
 from codesign_jax.model.layout import touches_itself
 from codesign_jax.scene import Scene
 
+CONJUGATE_GRADIENTS = (
+    "first_response",
+    "residual",
+    "response",
+    "direction",
+    "direction_response",
+    "force",
+)
+"""What conjugate gradients keep of a slot, see `coupling`."""
+
 
 class FingerPairing:
     """Fingers in pairs: those whose numbers differ by an exclusive or with the pairing's number.
@@ -43,18 +53,18 @@ class FingerPairing:
 
     Attributes:
       lane: Lane of the finger that each lane's finger is paired with, shape (lane,).
-      alone: Whether the number is 0, shape (lane,); None if it never is.
+      itself: Whether a lane's finger is its own partner, shape (lane,); None if it never is.
       half: The fraction of a contact that a lane counts: two fingers' is on two lanes.
     """
 
-    def __init__(self, block: Block, number: Any, dtype: Any, *, alone: bool):
+    def __init__(self, block: Block, number: Any, dtype: Any, *, with_itself: bool):
         self.block = block
         self.number = (jnp.zeros_like(block.finger) + number).astype(jnp.int32)
         same = self.number == 0
         ones = jnp.ones_like(block.finger, dtype)
-        self.alone = same if alone else None
+        self.itself = same if with_itself else None
         self.half = lanes(
-            [jnp.where(same, ones, 0.5 * ones) if alone else 0.5 * ones], (), wide=True
+            [jnp.where(same, ones, 0.5 * ones) if with_itself else 0.5 * ones], (), wide=True
         )
         other = jax.lax.bitwise_xor(block.finger, self.number)
         self.lane = other * block.worlds + block.world
@@ -104,8 +114,8 @@ class SelfContactSet(SlotSet):
     ):
         fingers, worlds = block
         e = scene.effects
-        self.alone = e.finger_palm or touches_itself(scene)
-        self.first = int(not self.alone)
+        self.with_itself = e.finger_palm or touches_itself(scene)
+        self.first = int(not self.with_itself)
         rows = fingers - self.first if e.finger_finger else 1
         sizes = "finger_finger", rows, slots, fingers * worlds
         super().__init__(scene, *sizes, gathers=gathers, remembers=remembers)
@@ -113,11 +123,11 @@ class SelfContactSet(SlotSet):
         self.links = links
         n = ROWS[scene.effects.friction][0]
         self.more = {"row": 1, "hessian": n * (n + 1) // 2}
-        self.more |= {f: n for f in ("first", "left", "answer", "along", "moved", "sum")}
-        if self.alone:
+        self.more |= dict.fromkeys(CONJUGATE_GRADIENTS, n)
+        if self.with_itself:
             self.more |= {"other": 1}
         # The fields of a slot that say which link each lane's side is on.
-        self.row_fields = ("row", "other") if self.alone else ("row",)
+        self.row_fields = ("row", "other") if self.with_itself else ("row",)
         if not gathers:
             for field in self.row_fields:
                 self.more |= {f"{field}_listed": 1, f"{field}_count": 1}
@@ -135,7 +145,7 @@ class SelfContactSet(SlotSet):
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         """See `ContactSet`; and the sides of all fingers, from the palm to the tips."""
-        sides = {f"side.{name}": (self.links + 1, (6,)) for name in ("link_acc", "vel", "push")}
+        sides = {f"side.{name}": (self.links + 1, (6,)) for name in ("link_acc", "vel", "wrench")}
         return super().groups() | sides
 
     def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundSelfContacts":
@@ -168,7 +178,7 @@ class BoundSelfContacts(BoundSlots):
 
     def pairing(self, row: Any) -> FingerPairing:
         return FingerPairing(
-            self.block, row + self.set.first, self.table.dtype, alone=self.set.alone
+            self.block, row + self.set.first, self.table.dtype, with_itself=self.set.with_itself
         )
 
     def of_row(self, row: Any, other: Any = None) -> contact.Cone:
@@ -184,7 +194,7 @@ class BoundSelfContacts(BoundSlots):
     @contextlib.contextmanager
     def with_cone(self, row: Any, item: Any = None) -> Iterator[None]:
         """Within this context contacts have the cone of a row's slot, or of the palm's."""
-        mixed = item is not None and self.set.alone and touches_itself(self.set.scene)
+        mixed = item is not None and self.set.with_itself and touches_itself(self.set.scene)
         before = self.cone
         self.cone = self.of_row(row, self.read("other", item).lane if mixed else None)
         yield
@@ -193,18 +203,18 @@ class BoundSelfContacts(BoundSlots):
     def holds(self, item: Any, pairing: FingerPairing) -> Lanes:
         """One for contacts whose friction is kept, zero for those with the palm."""
         kept = jnp.ones_like(self.like)
-        if pairing.alone is not None:
-            palm = pairing.alone & (self.read("other", item).lane < 0.5)
+        if pairing.itself is not None:
+            palm = pairing.itself & (self.read("other", item).lane < 0.5)
             kept = jnp.where(palm, 0.0, kept)
         return lanes([kept], (), wide=True)
 
     def put(self, name: str, value: Lanes, row: Any) -> None:
-        """Stores a link's "link_acc", "vel" or "push"; row 0 is the palm's."""
+        """Stores a link's "link_acc", "vel" or "wrench"; row 0 is the palm's."""
         self.table.write(f"side.{name}", value, row)
 
-    def pushed(self, row: Any) -> Lanes:
+    def wrench_on(self, row: Any) -> Lanes:
         """Wrench of all contacts on a link, (6, ...)."""
-        return self.table.read("side.push", row)
+        return self.table.read("side.wrench", row)
 
     def rows(self) -> int:
         return self.set.links + 1
@@ -286,10 +296,10 @@ class BoundSelfContacts(BoundSlots):
             return lanewise(moved, place, self.cone, link_acc)
 
         mine = of_side("row")
-        if pairing.alone is None:
+        if pairing.itself is None:
             return lanewise(jnp.subtract, mine, pairing.swap(mine))
         ways = (lambda: of_side("other")), (lambda: pairing.swap(mine))
-        theirs = either(anywhere(pairing.alone), *ways, self.set.size)
+        theirs = either(anywhere(pairing.itself), *ways, self.set.size)
         return lanewise(jnp.subtract, mine, theirs)
 
     def _on_rows(self, item: Any, field: str) -> Lanes:
@@ -313,8 +323,8 @@ class BoundSelfContacts(BoundSlots):
 
         def store(item: Any, pairing: FingerPairing) -> None:
             self._list_rows(item, "row")
-            if pairing.alone is not None:
-                any_of(pairing.alone, lambda: self._list_rows(item, "other"))
+            if pairing.itself is not None:
+                any_of(pairing.itself, lambda: self._list_rows(item, "other"))
 
         self.do(store)
 
@@ -365,7 +375,7 @@ class BoundSelfContacts(BoundSlots):
 
     def clear_wrenches(self) -> None:
         def clear(row: Any, x: jax.Array) -> jax.Array:
-            self.put("push", zeros((6,), self.like), row)
+            self.put("wrench", zeros((6,), self.like), row)
             return x
 
         jax.lax.fori_loop(0, self.rows(), clear, jnp.int32(0))
@@ -375,19 +385,19 @@ class BoundSelfContacts(BoundSlots):
         if not self.set.gathers:
             return OwnSide(self.place(item), None, None)
         row = self.read("row", item).lane.astype(jnp.int32)
-        wrench = self.table.gather("side.push", row, self.block.column)
+        wrench = self.table.gather("side.wrench", row, self.block.column)
         return OwnSide(self.place(item), row, wrench)
 
     def load(self, item: Any, side: OwnSide, force: Lanes, pairing: FingerPairing) -> None:
         """Adds a slot's force to its own side's wrench, and takes it from the other side's."""
         more = lanewise(wrench_of_force, side.place, self.cone, force)
         self._add_wrench(item, "row", more, side.wrench, side.row)
-        if pairing.alone is not None:
+        if pairing.itself is not None:
 
             def opposite() -> None:
                 self._add_wrench(item, "other", lanewise(jnp.negative, more))
 
-            any_of(pairing.alone, opposite)
+            any_of(pairing.itself, opposite)
 
     def _add_wrench(
         self,
@@ -400,14 +410,14 @@ class BoundSelfContacts(BoundSlots):
         if self.set.gathers:
             if row is None or sums is None:
                 row = self.read(field, item).lane.astype(jnp.int32)
-                sums = self.table.gather("side.push", row, self.block.column)
+                sums = self.table.gather("side.wrench", row, self.block.column)
             sums = lanewise(jnp.add, sums, more)
-            self.table.scatter("side.push", sums, row, self.block.column)
+            self.table.scatter("side.wrench", sums, row, self.block.column)
             return
 
         def add(row: Any, chosen: jax.Array, nothing: list) -> list:
             mask = lanes([chosen], (), wide=True)
-            self.put("push", lanewise(_add_where, mask, self.pushed(row), more), row)
+            self.put("wrench", lanewise(_add_where, mask, self.wrench_on(row), more), row)
             return nothing
 
         self._each_row(item, field, add, [])
@@ -443,7 +453,7 @@ class BoundSelfContacts(BoundSlots):
         self.do(load)
 
     @staticmethod
-    def stiff(hessian: Lanes, change: Lanes) -> Lanes:
+    def times_hessian(hessian: Lanes, change: Lanes) -> Lanes:
         return lanewise(_times, hessian, change)
 
     def prepare_all(self) -> Lanes:

@@ -63,14 +63,14 @@ class Step(StepMemory):
           Trace entries distance, height, residual, iterations and, with slots, overflow; speed
           after the step; worlds that have moved, and so go on.
         """
-        p = self.p
+        layout = self.layout
         state, geometry, _, now, centre = self.assemble(arm, pressure)
         now, quality = Newton(Problem(self, geometry["palm"])).solve(now, waiting, *limits)
         distance = lanewise(lambda c: jnp.sqrt(dot(c, c)), centre).lane
         height = state["position"][2].lane
         goes_on = waiting & undecided(distance, height)
         slots = []
-        if p.has_slots:
+        if layout.has_slots:
             slots = [self._overflow(waiting)]
             goes_on &= slots[0] == 0
         new_speed, good = semi_implicit_euler(self, state, geometry, now, goes_on, speed)
@@ -90,13 +90,13 @@ class Step(StepMemory):
           The state of wrist and object by name, what `palm_and_object` finds, the objects, the warm
           start, and the hand's centre from the object's.
         """
-        p = self.p
-        state = {name: self.world_state.read(name) for name in p.world_state.groups}
-        run = partial(palm_and_object, p.scene.discretization.timestep)
+        layout = self.layout
+        state = {name: self.world_state.read(name) for name in layout.world_state.groups}
+        run = partial(palm_and_object, layout.scene.discretization.timestep)
         bodies = lanewise(run, state, arm, self.palm_constants())
-        world_object = objects.read(p.scene, self.block, self.world, self.hand, self.grid)
+        world_object = objects.read(layout.scene, self.block, self.world, self.hand, self.grid)
         self.columns = bodies["columns"]
-        self.contacts = {c.name: self.bound(c) for c in p.sets}
+        self.contacts = {c.name: self.bound(c) for c in layout.sets}
         return state, bodies, world_object, *self._forward(state, bodies, pressure, world_object)
 
     def bound(self, contacts: ContactSet) -> BoundContacts:
@@ -136,12 +136,12 @@ class Step(StepMemory):
 
         Returns the warm start and the hand's centre from the object's.
         """
-        p = self.p
+        layout = self.layout
         now = bodies["now"]
         like = self.like
         start = self._bases(bodies)
         origin, frame, vel, _, link_acc, _ = start
-        if p.scene.effects.air_mass:
+        if layout.scene.effects.air_mass:
             pressure = chambers.end_pressures(self, pressure)
         self_contacts = self.contacts.get("finger_finger")
         search = (
@@ -159,12 +159,12 @@ class Step(StepMemory):
             origin, frame, vel, bias, link_acc, middle = carry
             self.keep(i, carry[:5])
             joint = self.joint(i) | {"pressure": pressure, "order": self.order(i)}
-            run = partial(link_forces, p.scene)
+            run = partial(link_forces, layout.scene)
             constants = self.link_constants(i)
             carry, stored = lanewise(run, carry[:5], constants, joint)
             centre = stored["body_centre"]
-            stored |= {"step_acc": zeros((p.axes,), like), "step_link_acc": zero_acc}
-            if p.team > 1:
+            stored |= {"step_acc": zeros((layout.axes,), like), "step_link_acc": zero_acc}
+            if layout.team > 1:
                 stored = team_rows(stored, (constants["mass"], centre, stored["tensor"]))
             for name, value in stored.items():
                 self.write(name, value, i)
@@ -175,17 +175,17 @@ class Step(StepMemory):
                 search.link(i, carry[4], carry[2], carry[1], carry[0])
             return (*carry, middle)
 
-        origin, frame, vel, bias, link_acc, middle = loop(p.links, link, start, p.size)
-        self.keep(p.links, (origin, frame, vel, bias, link_acc))
+        origin, frame, vel, bias, link_acc, middle = loop(layout.links, link, start, layout.size)
+        self.keep(layout.links, (origin, frame, vel, bias, link_acc))
         if search:
             search.find()
-        if search and p.team > 1:
+        if search and layout.team > 1:
             fields.of_rings(search)
         for contacts in self.contacts.values():
             if isinstance(contacts, BoundSelfContacts):
                 contacts.keep_counts()
         fields.of_palm_and_object(state)
-        count = p.num_fingers * p.links
+        count = layout.num_fingers * layout.links
         middle = self.block.sum(middle)
         return now, lanewise(lambda c: c / count, middle)
 
@@ -198,30 +198,33 @@ def add_weighted(total, centre, weight):
 def palm_and_object(timestep: float, state: dict, arm, constants: dict) -> dict[str, Any]:
     """Geometry, motion, inertia and smooth forces of palm, wrist and object.
 
-    Arm are the commands of the arm frame, `constants` those of `PALM_CONSTANTS` that the scene has.
-    Without a stiffness of the wrist its accelerations follow from the commands.
+    Args:
+      state: State of wrist and object, by the names of `State`, with "acc_wrist" and "acc_object".
+      arm: Commands of the arm frame, shape (6, ...). Without a stiffness of the wrist its
+        accelerations follow from them.
+      constants: Those of `PALM_CONSTANTS` that the scene has.
     """
-    k = constants.get("wrist_stiffness")
-    g = constants.get("gravity")
-    s = State(**{k: state.get(k) for k in State._fields})
-    place = kin._place(s)
-    frame, axes, vel, bias = kin._wrist(place, s.wrist, s.wrist_vel)
-    columns, object_vel = kin._object(s)
+    stiffness = constants.get("wrist_stiffness")
+    gravity = constants.get("gravity")
+    lanes_state = State(**{name: state.get(name) for name in State._fields})
+    place = kin.palm_place(lanes_state)
+    frame, axes, vel, bias = kin.wrist_kinematics(place, state["wrist"], state["wrist_vel"])
+    columns, object_vel = kin.object_kinematics(lanes_state)
     centre = place + apply_columns(frame, constants["palm_centre"])
     turned = inertia.turned_tensor(frame, constants["palm_inertia"])
     palm = Body(constants["palm_mass"], centre, turned)
     tensor = inertia.principal_tensor(columns, constants["object_inertia"])
     grasped = Centred(constants["object_mass"], tensor)
     spring = -constants["wrist_damping"] * state["wrist_vel"]
-    if k is not None:
-        spring = k * (arm - state["wrist"]) + spring
+    if stiffness is not None:
+        spring = stiffness * (arm - state["wrist"]) + spring
     acc = state["acc_wrist"], state["acc_object"]
-    if k is None:
+    if stiffness is None:
         acc = rigid_arm(arm, state["wrist"], state["wrist_vel"], timestep), acc[1]
     now = Iterate(acc[0], palm_acceleration(acc[0], axes), acc[1])
-    smooth_palm = palm.smooth_force(vel, bias, g)
+    smooth_palm = palm.smooth_force(vel, bias, gravity)
     smooth_palm = pushed("palm", smooth_palm, palm.mass, centre, constants)
-    smooth_object = grasped.smooth_force(object_vel, g)
+    smooth_object = grasped.smooth_force(object_vel, gravity)
     origin = jnp.zeros_like(smooth_object[:3])  # the object's centre
     smooth_object = pushed("object", smooth_object, grasped.mass, origin, constants)
     smooth = smooth_palm, smooth_object
@@ -255,10 +258,10 @@ def link_forces(scene: Scene, parent: tuple, constants: dict, joint: dict):
     hinges = [constants[n] for n in ("stiffness", "damping", "armature")]
     cos = jnp.cos(q)
     sin = jnp.sin(q)
-    origin, frame, axes = kin._turn_link(
+    origin, frame, axes = kin.turn_link(
         joint_axes(scene), origin, frame, constants["offset"], cos, sin, joint["order"]
     )
-    vel, bias = kin._link_velocity(vel, bias, axes, rate, joint["order"])
+    vel, bias = kin.link_velocity(vel, bias, axes, rate, joint["order"])
     link_acc = next_acceleration(link_acc, axes, joint["acc"])
     body = Body(
         constants["mass"],
@@ -292,10 +295,15 @@ def semi_implicit_euler(
 ):
     """Semi-implicit Euler; worlds that are decided or whose step fails stay as they were.
 
+    Args:
+      bodies: What `palm_and_object` returns; `now`: the accelerations of the step.
+      goes_on: Worlds that are undecided and take the step, bool, shape (lane,).
+      speed: Largest velocity before the step, shape (lane,).
+
     Returns the largest velocity after the step, and whether the world has moved.
     """
-    p = step.p
-    h = step.p.scene.discretization.timestep
+    layout = step.layout
+    h = layout.scene.discretization.timestep
     new = lanewise(partial(body_after_step, h), state, bodies["columns"], now.wrist, now.object_acc)
     size = lanewise(_largest, new)
 
@@ -305,7 +313,7 @@ def semi_implicit_euler(
         step.scratch.write("new_finger_vel", rate, i)
         return lanewise(_worse, largest, top)
 
-    fingers = loop(p.links, link, zeros((), step.like), p.size).lane
+    fingers = loop(layout.links, link, zeros((), step.like), layout.size).lane
     largest = _worse(size.lane, step.block.fold(fingers, _worse))
     limit = step.constant("speed").lane
     good = goes_on & (largest <= limit)
@@ -322,7 +330,7 @@ def semi_implicit_euler(
             step.finger_state.write(name, kept, i)
         return x
 
-    jax.lax.fori_loop(0, p.links, store, jnp.int32(0))
+    jax.lax.fori_loop(0, layout.links, store, jnp.int32(0))
     friction_memory.store(step, good)
     return jnp.where(goes_on, largest, speed), good
 

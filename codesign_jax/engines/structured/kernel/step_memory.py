@@ -44,7 +44,7 @@ class KernelLayout:
     size: int  # Its lanes
     team: int  # Lanes of a finger
     columns: int  # Columns of the tables of fingers, which the lanes of a team share
-    k: int  # Rings or contact spheres of a link
+    rings_per_link: int  # Rings or contact spheres of a link
     palm_groups: int  # Those of the palm, for each finger's lanes
     hull: bool  # Whether fingers have rings
     meshes: bool  # Whether there are objects with meshes
@@ -68,7 +68,7 @@ class StepMemory:
     """A block's tables with their references.
 
     Attributes:
-      p: Their layout.
+      layout: Their rows, and what the kernel knows of the scene.
       block: The lanes.
       grid: Distances of all meshes, a reference; None without meshes.
       like: Zeros of the lanes' shape and type.
@@ -89,7 +89,7 @@ class StepMemory:
         onchip: Any = None,
     ):
         """Takes the references; `onchip`: the table of shared memory, of teams."""
-        self.p = layout
+        self.layout = layout
         self.block = block
         self.grid = grid
         self.hand = BoundTable(layout.hand, hand)
@@ -126,13 +126,13 @@ class StepMemory:
     def link_constants(self, i: Any) -> dict[str, Lanes]:
         """Constants that `link_forces` takes, by name, of those that the scene has."""
         constants = {n: self.hand.read(n, i) for n in LINK_CONSTANTS}
-        row = i if self.p.tapered else 0
+        row = i if self.layout.tapered else 0
         constants |= {n: self.hand.read(n, row) for n in FINGER_CONSTANTS if n in self.hand}
         return constants | self.step_numbers()
 
     def step_numbers(self) -> dict[str, Lanes]:
         """Those of `laws.step_numbers` that the scene has, by name."""
-        return {n: self.constant(n) for n in step_numbers(self.p.scene)}
+        return {n: self.constant(n) for n in step_numbers(self.layout.scene)}
 
     def joint(self, i: Any) -> dict[str, Lanes]:
         """Angles, velocities and accelerations of a joint, by name."""

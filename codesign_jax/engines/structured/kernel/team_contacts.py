@@ -148,7 +148,7 @@ class TeamSelfContactSet(SelfContactSet):
         groups: dict[str, tuple[int, tuple[int, ...]]] = {}
         for name, (count, shape) in super().groups().items():
             groups[name] = count, shape
-            if name in ("side.link_acc", "side.push"):
+            if name in ("side.link_acc", "side.wrench"):
                 groups[f"{name}_spare"] = count, (TEAM - 6,)
         return groups
 
@@ -219,7 +219,7 @@ class BoundTeamSelfContacts(BoundSelfContacts):
 
     def clear_wrenches(self) -> None:
         def clear(row: Any, x: jax.Array) -> jax.Array:
-            self.parts.put("side.push", self.like, row)
+            self.parts.put("side.wrench", self.like, row)
             return x
 
         jax.lax.fori_loop(0, self.rows(), clear, jnp.int32(0))
@@ -234,11 +234,11 @@ class BoundTeamSelfContacts(BoundSelfContacts):
                 # Lanes without a component read what nobody wrote, which may be no number.
                 more = jnp.where(self.block.mate < 6, self.parts.get(name, slot.source), 0.0)
                 sides = {"row": more}
-                if self.set.alone:
+                if self.set.with_itself:
                     sides["other"] = jnp.where(jnp.equal(row, 0), -more, 0.0)
                 for field, push in sides.items():
                     side = self.read(field, slot).lane.astype(jnp.int32)
-                    self.parts.put("side.push", self.parts.get("side.push", side) + push, side)
+                    self.parts.put("side.wrench", self.parts.get("side.wrench", side) + push, side)
                 return x
 
             assert self._counts is not None

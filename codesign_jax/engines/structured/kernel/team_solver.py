@@ -9,7 +9,7 @@ from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.coupling import Coupling, Eliminated
 from codesign_jax.engines.structured.kernel.linear_system import Elimination, with_palm
-from codesign_jax.engines.structured.kernel.linesearch import LineSearch, _rest
+from codesign_jax.engines.structured.kernel.linesearch import LineSearch, with_palm_and_object
 from codesign_jax.engines.structured.kernel.memory import loop
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem, make_body
 from codesign_jax.engines.structured.kernel.shared_memory import (
@@ -29,14 +29,14 @@ class TeamLanes:
     """A problem's numbers as the lanes of a team share them."""
 
     def __init__(self, problem: Problem):
-        m = problem.m
+        memory = problem.memory
         block = problem.block
         self.problem = problem
         self.block = block
         self.like = problem.like
-        assert m.onchip is not None
-        self.chip = TeamRows(block, m.onchip)
-        self.scratch = TeamRows(block, m.scratch)
+        assert memory.onchip is not None
+        self.chip = TeamRows(block, memory.onchip)
+        self.scratch = TeamRows(block, memory.scratch)
         self.forces = self.mask(block.mate == FORCES)
 
     def mask(self, which: jax.Array, *, wide: bool = True) -> Lanes:
@@ -176,7 +176,7 @@ class TeamElimination(Elimination):
     def __init__(self, problem: Problem):
         super().__init__(problem)
         self.team = TeamLanes(problem)
-        self.rings = problem.m.p.k
+        self.rings = problem.memory.layout.rings_per_link
         ones = jnp.ones_like(self.like)
         unit = [jnp.where(self.block.mate == k, ones, 0.0) for k in range(6)]
         self.unit = lanes(unit, (6,), wide=True)
@@ -206,7 +206,7 @@ class TeamElimination(Elimination):
             column = team.chip.rows("matrix", i)
             (link_acc,) = problem.read("link_acc", item=i)
             force = team.scratch.get("smooth", i) - lanewise(dot, column, link_acc).lane
-            force = team.vector(force + team.scratch.get("side.push", i + 1))
+            force = team.vector(force + team.scratch.get("side.wrench", i + 1))
             p = lanewise(add_link, p, team.forces, force, column)
             tau, armature = problem.read("tau", "armature", item=i)
             more = lanewise(joint, armature, tau, acc, team.forces)
@@ -221,7 +221,7 @@ class TeamElimination(Elimination):
         none = zeros((6,), self.like)
         start = [none] * 3, zeros((), self.like)
         (p, c, q), work = loop(self.links, step, start, self.block.size, reverse=True)
-        first = self_contacts.pushed(0)
+        first = self_contacts.wrench_on(0)
         p = lanewise(add_link, p, team.forces, first, none)
         whole = self.block.fold(self.block.over_team(work.lane, jnp.add), jnp.add)
         return self.block.sum((p, c, q)), lanes([whole], (), wide=False)
@@ -293,7 +293,7 @@ class TeamCoupling(Coupling):
         def step(i: Any, carry: tuple) -> tuple:
             r, ro = (v.lane for v in carry)
             axes = [team.chip.get("axes", i, TEAM * k) for k in range(self._axes)]
-            r = r + team.scratch.get("side.push", i + 1)
+            r = r + team.scratch.get("side.wrench", i + 1)
             r, ro, z = team.again(axes, team.link(i), r, ro)
             for k, part in enumerate(z.parts.ravel()):
                 self._row(i, k, AGAIN, part)
@@ -301,7 +301,7 @@ class TeamCoupling(Coupling):
 
         start = team.as_lanes(none), team.as_lanes(none)
         r, ro = loop(self.links, step, start, self.block.size, reverse=True)
-        r = r.lane + team.scratch.get("side.push", 0)
+        r = r.lane + team.scratch.get("side.wrench", 0)
         r, ro = (self.block.fold(v, jnp.add) for v in (r, ro.lane))
         return self._wrist(r, ro)
 
@@ -366,7 +366,7 @@ class TeamLineSearch(LineSearch):
     def __init__(self, problem: Problem):
         super().__init__(problem)
         self.team = TeamLanes(problem)
-        self.rings = problem.m.p.k
+        self.rings = problem.memory.layout.rings_per_link
 
     def prepare(self, now: Iterate, step: Iterate) -> tuple[Lanes, Lanes, Lanes]:
         problem = self.problem
@@ -407,7 +407,7 @@ class TeamLineSearch(LineSearch):
             terms.append(contacts.prepare_all(self_contacts, self.rings, step.object_acc))  # type: ignore[attr-defined]
         touch = lanewise(lambda t: total(t), terms)
         slope, curvature, touch = self.total([slope, curvature, touch])
-        slope, curvature = lanewise(_rest, now, step, problem.palm, slope, curvature)
+        slope, curvature = lanewise(with_palm_and_object, now, step, problem.palm, slope, curvature)
         return slope, curvature, touch
 
     def total(self, sums: list[Lanes]) -> list[Lanes]:

@@ -82,7 +82,7 @@ def make_cones(scene: Scene, shape: jax.Array) -> Cones:
     )
 
 
-def own_friction(scene: Scene, pair: str) -> bool:
+def friction_by_contact(scene: Scene, pair: str) -> bool:
     """Whether contacts of a pair of bodies have friction one by one, and not by the pair."""
     rubs = any(fixture.friction is not None for fixture in scene.fixture)
     return rubs and pair.endswith("_table") and scene.effects.friction != "none"
@@ -93,7 +93,7 @@ def frictions(scene: Scene) -> jax.Array | None:
 
     They are in the order of `surroundings.fields`; None if all have the table's.
     """
-    if not own_friction(scene, "object_table"):
+    if not friction_by_contact(scene, "object_table"):
         return None
     tables = scene.contact.finger_table_friction, scene.objects.table.friction
     coefficients = []

@@ -7,7 +7,7 @@ from codesign_jax.engines.structured.lanes import dot
 from codesign_jax.engines.structured.laws.contact import Contacts
 
 
-def held(contacts: Contacts, grip: jax.Array) -> jax.Array:
+def held(contacts: Contacts, held_friction: jax.Array) -> jax.Array:
     """What a contact's jar has of the friction that its two bodies hold, shaped as jar.
 
     With the effect `friction_memory` the tangential force of a contact that sticks is
@@ -19,20 +19,20 @@ def held(contacts: Contacts, grip: jax.Array) -> jax.Array:
     tangential stiffness D_t b / h with a slider (Cundall and Strack 1979, Geotechnique 29, 47).
 
     Args:
-      grip: g, world axes, shape (3, ...).
+      held_friction: g, world axes, shape (3, ...).
     """
     cone = contacts.cone
     n = contacts.normal
     # A slot in which a lane has no contact may have no stiffness either.
     some = contacts.active & (cone.tangential_mass > 0)
     elastic = jnp.where(some, _elastic(contacts) / jnp.where(some, cone.tangential_mass, 1.0), 0.0)
-    tangent = elastic * (grip - dot(n, grip) * n)
+    tangent = elastic * (held_friction - dot(n, held_friction) * n)
     if cone.spin is None:
         return tangent
     return jnp.concatenate([tangent, jnp.zeros_like(tangent)])
 
 
-def hold(contacts: Contacts, force: jax.Array, grip: jax.Array) -> jax.Array:
+def hold(contacts: Contacts, force: jax.Array, held_friction: jax.Array) -> jax.Array:
     """What a contact adds to the friction that its two bodies hold, shape (4, ...).
 
     The quotient of the sums over their contacts is the next g: minus the tangential forces over
@@ -41,13 +41,15 @@ def hold(contacts: Contacts, force: jax.Array, grip: jax.Array) -> jax.Array:
     touch with several normals would lose g as fast as those differ.
 
     Args:
-      grip: As in `held`.
+      held_friction: As in `held`.
     """
     n = contacts.normal
     force = force[:3]
-    normal = dot(n, force)
-    weight = jnp.where(contacts.active, jnp.maximum(normal, _elastic(contacts)), 0.0)
-    return jnp.concatenate([(normal + weight * dot(n, grip)) * n - force, weight[None]])
+    normal_force = dot(n, force)
+    weight = jnp.where(contacts.active, jnp.maximum(normal_force, _elastic(contacts)), 0.0)
+    return jnp.concatenate(
+        [(normal_force + weight * dot(n, held_friction)) * n - force, weight[None]]
+    )
 
 
 def _elastic(contacts: Contacts) -> jax.Array:

@@ -89,8 +89,10 @@ class Kinematics(NamedTuple):
 
 def kinematics(hand: WorldModel, axis_names: tuple[str, ...], state: State) -> Kinematics:
     """Kinematics of a state; the axes' names are those of `model.joint_axes`."""
-    place = _place(state)
-    palm, wrist_axes, palm_vel, palm_bias = once(_wrist, place, state.wrist, state.wrist_vel)
+    place = palm_place(state)
+    palm, wrist_axes, palm_vel, palm_bias = once(
+        wrist_kinematics, place, state.wrist, state.wrist_vel
+    )
     frame, origin = once(mounted, place, palm, hand.mount, hand.base)
     vel = palm_vel
     bias = palm_bias
@@ -99,9 +101,9 @@ def kinematics(hand: WorldModel, axis_names: tuple[str, ...], state: State) -> K
     def next_link(carry, link):
         origin, frame, vel, bias = carry
         offset, cos, sin, rate, order = link
-        turn = partial(_turn_link, axis_names)
+        turn = partial(turn_link, axis_names)
         origin, frame, subspace = once(turn, origin, frame, offset, cos, sin, order)
-        vel, bias = once(_link_velocity, vel, bias, subspace, rate, order)
+        vel, bias = once(link_velocity, vel, bias, subspace, rate, order)
         return (origin, frame, vel, bias), (origin, frame, vel, bias, subspace)
 
     order = hinge_sign(jnp.arange(len(hand.offset)))[:, None, None]
@@ -109,7 +111,7 @@ def kinematics(hand: WorldModel, axis_names: tuple[str, ...], state: State) -> K
     lanes = jnp.zeros_like(hand.offset[0])
     first = (origin, frame, vel + lanes, bias + lanes)
     _, (origins, frames, vels, biases, axes) = scan_links(next_link, first, over)
-    columns, object_vel = once(_object, state)
+    columns, object_vel = once(object_kinematics, state)
     return Kinematics(
         place=place,
         palm=palm,
@@ -128,7 +130,7 @@ def kinematics(hand: WorldModel, axis_names: tuple[str, ...], state: State) -> K
 
 def straight(hand: WorldModel, state: State) -> Kinematics:
     """Places of all bodies with straight fingers: no loop along the links, and nothing else."""
-    place = _place(state)
+    place = palm_place(state)
     palm = _palm_columns(state.wrist)
     frame, base = mounted(place, palm, hand.mount, hand.base)
     origin = base[:, None] + frame[0][:, None] * jnp.cumsum(hand.offset, axis=0)
@@ -138,11 +140,13 @@ def straight(hand: WorldModel, state: State) -> Kinematics:
     return Kinematics(place, palm, none, none, none, link, origin, none, none, none, columns, none)
 
 
-def _place(state: State) -> jax.Array:
+def palm_place(state: State) -> jax.Array:
+    """The palm's position from the object's centre [m], shape (3, 1, world)."""
     return state.wrist[:3] - state.position
 
 
-def _wrist(place: jax.Array, wrist: jax.Array, wrist_vel: jax.Array):
+def wrist_kinematics(place: jax.Array, wrist: jax.Array, wrist_vel: jax.Array):
+    """The palm's orientation as columns, the wrist's axes, and the palm's velocity and bias."""
     ones = jnp.ones_like(wrist[0])
     zero = jnp.zeros_like(wrist[0])
     frame = [jnp.stack([ones if i == k else zero for i in range(3)]) for k in range(3)]
@@ -162,7 +166,7 @@ def _wrist(place: jax.Array, wrist: jax.Array, wrist_vel: jax.Array):
 
 
 def _palm_columns(wrist: jax.Array) -> jax.Array:
-    """Columns of the palm's orientation, as `_wrist` has them beside axes and velocities."""
+    """Columns of the palm's orientation, the first result of `wrist_kinematics`."""
     frame = list(jnp.eye(3, dtype=wrist.dtype).reshape(3, 3, *[1] * (wrist.ndim - 1)))
     cos = jnp.unstack(jnp.cos(wrist[3:]))
     sin = jnp.unstack(jnp.sin(wrist[3:]))
@@ -172,11 +176,12 @@ def _palm_columns(wrist: jax.Array) -> jax.Array:
 
 
 def mounted(place: jax.Array, palm: jax.Array, mount: jax.Array, base: jax.Array):
+    """Columns of the orientations of the fingers' bases, and their positions."""
     frame = turn_columns(palm, mount)
     return frame, place + apply_columns(palm, base)
 
 
-def _turn_link(names: tuple[str, ...], origin, frame, offset, cos, sin, order):
+def turn_link(names: tuple[str, ...], origin, frame, offset, cos, sin, order):
     """Position, orientation and motion subspace of a link from its parent's.
 
     Seen in a mirror that swaps the axes x and y, the hinges of the opposite order twist, lateral,
@@ -215,7 +220,7 @@ def _turn_link(names: tuple[str, ...], origin, frame, offset, cos, sin, order):
     return origin, jnp.stack(columns), jnp.stack(subspace)
 
 
-def _link_velocity(
+def link_velocity(
     vel: jax.Array, bias: jax.Array, subspace: jax.Array, rate: jax.Array, order: jax.Array
 ):
     """Velocity and bias of a link from its parent's; each hinge is carried by those before it."""
@@ -231,7 +236,8 @@ def _link_velocity(
     return vel + motion, bias
 
 
-def _object(state: State):
+def object_kinematics(state: State):
+    """Columns of the object's orientation, and its spatial velocity."""
     columns = rotation_columns(state.quat)
     return columns, spatial(apply_columns(columns, state.angular_vel), state.linear_vel)
 

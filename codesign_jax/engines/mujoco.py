@@ -267,8 +267,8 @@ class _ChunkedRollout:
         self.end.step[:] = self.start.step + self.steps
         return Trace(*self._series(), self.last)
 
-    def _series(self) -> tuple[np.ndarray, ...]:
-        """What the trace has of every step, in its order."""
+    def _series(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The trace's entries of every step, in its order."""
         return self.distance, self.height, self.speed, self.qpos, self.status
 
     def _bounds_of(self, worlds: np.ndarray) -> verdict.Bounds:

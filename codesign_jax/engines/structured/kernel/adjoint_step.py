@@ -54,7 +54,7 @@ class ReverseStep(Step):
         super().__init__(layout, block, *refs)
         self.bars = bars
 
-    def keep(self, i: Any, chain: tuple) -> None:
+    def store_chain(self, i: Any, chain: tuple) -> None:
         for name, value in zip(LinkMotion._fields, chain, strict=False):
             self.scratch.write(f"chain.{name}", value, i)
 

@@ -64,8 +64,8 @@ class Step(StepMemory):
           after the step; worlds that have moved, and so go on.
         """
         layout = self.layout
-        state, geometry, _, now, centre = self.assemble(arm, pressure)
-        now, quality = Newton(Problem(self, geometry["palm"])).solve(now, waiting, *limits)
+        state, bodies, _, now, centre = self.assemble(arm, pressure)
+        now, convergence = Newton(Problem(self, bodies["palm"])).solve(now, waiting, *limits)
         distance = lanewise(lambda c: jnp.sqrt(dot(c, c)), centre).lane
         height = state["position"][2].lane
         goes_on = waiting & undecided(distance, height)
@@ -73,10 +73,10 @@ class Step(StepMemory):
         if layout.has_slots:
             slots = [self._overflow(waiting)]
             goes_on &= slots[0] == 0
-        new_speed, good = semi_implicit_euler(self, state, geometry, now, goes_on, speed)
-        count = jnp.full_like(height, quality.count)
+        new_speed, good = semi_implicit_euler(self, state, bodies, now, goes_on, speed)
+        count = jnp.full_like(height, convergence.count)
         # Residuals of decided worlds are reported as 0; no iterations are spent on them.
-        residual = jnp.where(waiting, quality.decrement.lane, 0.0)
+        residual = jnp.where(waiting, convergence.decrement.lane, 0.0)
         return (distance, height, residual, count, *slots), new_speed, good
 
     def assemble(self, arm: Lanes, pressure: Lanes) -> tuple:
@@ -113,7 +113,7 @@ class Step(StepMemory):
         most = self.block.fold(total(lists), jnp.maximum)
         return jnp.where(waiting & (most > 0), 1.0, 0.0).astype(most.dtype)
 
-    def keep(self, i: Any, chain: tuple) -> None:
+    def store_chain(self, i: Any, chain: tuple) -> None:
         """Called with what the forward pass carries before joint i, and behind the last one."""
 
     def _bases(self, bodies: dict) -> tuple[Lanes, ...]:
@@ -157,7 +157,7 @@ class Step(StepMemory):
 
         def link(i: Any, carry: tuple) -> tuple:
             origin, frame, vel, bias, link_acc, middle = carry
-            self.keep(i, carry[:5])
+            self.store_chain(i, carry[:5])
             joint = self.joint(i) | {"pressure": pressure, "order": self.order(i)}
             run = partial(link_forces, layout.scene)
             constants = self.link_constants(i)
@@ -176,7 +176,7 @@ class Step(StepMemory):
             return (*carry, middle)
 
         origin, frame, vel, bias, link_acc, middle = loop(layout.links, link, start, layout.size)
-        self.keep(layout.links, (origin, frame, vel, bias, link_acc))
+        self.store_chain(layout.links, (origin, frame, vel, bias, link_acc))
         if search:
             search.find()
         if search and layout.team > 1:

@@ -6,7 +6,8 @@ The hands are those of docs/gallery/hands.toml, the design of each is docs/galle
 that is not there, its search is run, in runs/gallery/NAME, where an interrupted one goes on.  A
 design is judged at the accuracy of the search: in 100 fresh trials, in 48 with objects of each of
 some masses, and as 64 hands that are cast with the usual tolerances.  Its grasp without noise is
-drawn; look.png in runs/gallery/NAME shows it from two sides, to be looked at.
+drawn; look.png in runs/gallery/NAME shows it from two sides, to be looked at.  A hand that has a
+warning of its design is refused.
 """
 
 import dataclasses
@@ -21,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from codesign_jax import cli, codesign, rollout, runs, tolerances, verdict
+from codesign_jax import cli, codesign, rollout, runs, stress, tolerances, verdict
 from codesign_jax.commands import common
 from codesign_jax.commands.flags import Evaluate
 from codesign_jax.report import animation
@@ -56,7 +57,6 @@ class Hand:
       sentence: What the hand does.
       shown: Objects that it is seen with.
       camera: What its camera has of its own.
-      earlier: Whether design and verdict are of an earlier model, until the search is run again.
     """
 
     name: str
@@ -65,7 +65,6 @@ class Hand:
     shown: list[str]
     names: dict[str, str] = dataclasses.field(default_factory=dict)
     camera: dict[str, Any] = dataclasses.field(default_factory=dict)
-    earlier: bool = False
 
     @property
     def command(self) -> str:
@@ -95,6 +94,18 @@ def find(hand: Hand) -> None:
     preset = runs.read_run(folder)[1].preset
     text = common.design_text(case.space, common.DesignFile(preset, {}, **hand.names), case.design)
     hand.design.write_text(text, encoding="utf-8")
+
+
+def check(hand: Hand, case: cases.Case) -> None:
+    """Refuses a hand whose design has a warning, as the page says that none has one.
+
+    Raises:
+      ValueError: With the warnings.
+    """
+    params = case.space.params(jnp.asarray(case.design, jnp.float32))
+    warnings = stress.of_design(case.scene, jax.tree.map(np.asarray, params))
+    if warnings:
+        raise ValueError(f"{hand.design}: {'; '.join(warnings)}")
 
 
 def judge(hand: Hand, case: cases.Case) -> None:
@@ -164,8 +175,7 @@ def draw(hand: Hand, case: cases.Case) -> None:
 def section(hand: Hand) -> str:
     """What the page shows and says of a hand."""
     judged = hand.design.read_text(encoding="utf-8").splitlines()
-    words = f"{hand.sentence} The hand {judged[0][2:]}"
-    words += " (earlier model)." if hand.earlier else "."
+    words = f"{hand.sentence} The hand {judged[0][2:]}."
     if judged[1].startswith("# of heavier"):
         words += f" Of {judged[1].removeprefix('# of ')}."
     picture = f"![{hand.name}: {hand.sentence}](gallery/{hand.name}.webp)"
@@ -181,6 +191,7 @@ def main(names: list[str]) -> None:
             if not hand.design.exists():
                 find(hand)
             case = common.find_case(Evaluate(design=((str(hand.design),),)))
+            check(hand, case)
             judge(hand, case)
             draw(hand, case)
     write_page()
@@ -208,11 +219,7 @@ hand.
   verdict if the kept share stayed the same.
 * **Heavier objects.** For each stated mass, all objects have this mass in 48 trials.
 * **Cast hands.** We simulated 64 hands with the usual [tolerances](uncertainty.md#cast-hands) of
-  casting, in 24 grasps each. The page states how many of these hands keep at least 95 %.
-
-The exceptions are marked *earlier model*: hands of a model with a linear wall of 40 kPa, implicit
-Euler, no friction memory in the contacts of objects, and no limits of what can be built. Evaluate
-such a hand again before you use it."""
+  casting, in 24 grasps each. The page states how many of these hands keep at least 95 %."""
 
 if __name__ == "__main__":
     main(sys.argv[1:])

@@ -11,6 +11,7 @@ from codesign_jax import rollout, scene
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import parameters
+from scripts.shared.statistics import two_way
 from tests.stability.bench import floats, refined
 from tests.stability.table import Found, case
 
@@ -18,8 +19,14 @@ DESIGNS = 40
 TRIALS = 24
 TRIALS_IN_C = 6
 """MuJoCo C simulates 8 grasps a second: it is compared over fewer trials."""
-RANKS = 0.9
-"""Bound of rank correlations, which was set before any was measured."""
+RANKS = 0.77
+"""Bound of rank correlations: a setting changes the order no more than other trials do.  Of 4,000
+pairs of disjoint sets of 24 among 120 trials in `paper_spheres`, the costs of `standard` in one set
+and in the other have a correlation of 0.885 in the median, and of 0.77 or more in 97.5 %."""
+RANKS_IN_C = 0.95
+"""The same bound between two engines, whose trials are the same: of 4,000 sets of 6 among 120
+trials, a micrometre's move of the objects gives a correlation of 0.959 or more in 97.5 %."""
+RESAMPLES = 2000
 LATE = np.array([[0.050, -0.055], [0.130, 0.060]])
 """Length and arm height [m] among which an optimisation ends: most designs there keep some of their
 objects and lose others.  Of designs of the whole space most lose all of them and tie."""
@@ -55,14 +62,23 @@ def compared(measured, bound, first, second):
     return Found(measured, bound, note + f"{flips:.1%} of the verdicts flip")
 
 
-def ranks(first, second):
-    return compared(stats.spearmanr(first[1], second[1])[0], RANKS, first, second)
+def ranks(first, second, bound=RANKS):
+    return compared(stats.spearmanr(first[1], second[1])[0], bound, first, second)
+
+
+def ranks_in_c(first, second):
+    return ranks(first, second, RANKS_IN_C)
 
 
 def rates(first, second):
-    """Difference of the success rates over the half width of its 95 % interval (paired)."""
+    """Difference of the success rates over the half width of its 95 % interval (paired).
+
+    All designs share the trials, so that the interval is over designs and trials at once: 960
+    grasps taken for independent ones would give an interval of half the width.
+    """
     change = second[0].astype(float) - first[0]
-    half = 1.96 * max(change.std() / np.sqrt(change.size), 1 / change.size)
+    interval = two_way(lambda drawn: [drawn.mean()], change, resamples=RESAMPLES)[0]
+    half = max((interval.high - interval.low) / 2, 1 / change.size)
     return compared(abs(change.mean()) / half, 1.0, first, second)
 
 
@@ -84,8 +100,8 @@ def by_links(judge, name, engine, step, precision):
 
 def by_engine(judge, engine, step, precision):
     """MuJoCo C and the structured engine in the trials that the former simulates."""
-    mujoco = evaluated("paper_spheres", "mujoco", 1.0, "float64", trials=TRIALS_IN_C)
-    structured = evaluated("paper_spheres", "structured", 1.0, precision, trials=TRIALS_IN_C)
+    mujoco = evaluated("paper_spheres", "mujoco", step, "float64", trials=TRIALS_IN_C)
+    structured = evaluated("paper_spheres", "structured", step, precision, trials=TRIALS_IN_C)
     return judge(mujoco, structured)
 
 
@@ -125,9 +141,9 @@ def register(scene_name, suffix, title):
 register("paper_spheres", "", "")
 register("paper", "_default", ", default scene")
 FEWER = f"decision of the structured engine, {DESIGNS} late designs, {TRIALS_IN_C} trials"
-with_c = {"steps": (1.0,)}
+with_c = {"steps": (1.0, 0.5)}
 case(24, FEWER, "rank correlation with C", name="ranks_by_engine", lower=True, **with_c)(
-    bound_to(ranks, by_engine)
+    bound_to(ranks_in_c, by_engine)
 )
 case(24, FEWER, "success rate: change over interval with C", name="rates_by_engine", **with_c)(
     bound_to(rates, by_engine)

@@ -64,8 +64,9 @@ def strategies() -> None:
                 film.seek(round(time * gallery.RATE))
                 pictures.append(np.asarray(film.convert("RGB")))
         strips.append(np.hstack(pictures))
-    size = 1400, 600
-    Image.fromarray(np.vstack(strips)).resize(size).save(FIGURES / "strategies.png", optimize=True)
+    picture = Image.fromarray(np.vstack(strips)).resize((1400, 600))
+    # A palette of 128 colours: photographs compress badly as PNG.
+    picture.quantize(128).save(FIGURES / "strategies.png", optimize=True)
 
 
 def parts() -> None:

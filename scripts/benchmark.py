@@ -216,8 +216,7 @@ def peers(files: list[dict[str, Any]]) -> str:
             shown = [_rounded(n) for n in numbers]
             ratio = f"{numbers[1] / numbers[0]:.0f}"
             same = _same(ours.get("verdicts", ""), theirs.get("verdicts", ""))
-            peer = theirs["engine"] + provenance.before(content["runs"][theirs["run"]])
-            rows.append([theirs["scene"], where, peer, *shown, ratio, same])
+            rows.append([theirs["scene"], where, theirs["engine"], *shown, ratio, same])
     return output.markdown(rows)
 
 

@@ -163,13 +163,6 @@ def commits(text):
     return re.findall(r"\b(?=[0-9a-f]*[a-f])(?=[0-9a-f]*[0-9])[0-9a-f]{7,40}\b", text)
 
 
-BEFORE = {
-    "experiments/23d.json": ("docs/results.md", "docs/notes/results.md"),
-    "experiments/fresh.json": ("docs/results.md", "docs/notes/results.md"),
-}
-"""Files or folders of docs/data with what was measured with another kernel; pages that show it."""
-
-
 def records(content):
     """What made a file's results: the outermost tables that name a commit."""
     if isinstance(content, dict) and "commit" in content:
@@ -178,24 +171,14 @@ def records(content):
     return [r for v in inner if isinstance(v, dict | list) for r in records(v)]
 
 
-def test_all_figures_are_of_one_kernel_or_their_pages_say_that_they_are_not():
-    data = ROOT / "docs" / "data"
-    older = {}
-    for path in data.rglob("*.json"):
+def test_all_figures_are_of_one_kernel_and_their_commands_of_no_machine():
+    for path in (ROOT / "docs" / "data").rglob("*.json"):
         made = records(json.loads(path.read_text()))
         assert made, f"{path} does not say what made it"
         for record in made:
-            if provenance.before(record):
-                place = path.relative_to(data)
-                key = place.parts[0] if place.parts[0] in BEFORE else str(place)
-                older.setdefault(key, set()).add(record["commit"][:7])
-    assert older.keys() == BEFORE.keys()
-    for key, pages in BEFORE.items():
-        for page in pages:
-            text = " ".join((ROOT / page).read_text().split())
-            assert re.search(r"earlier\S* model", text), (page, key)
-            if page.startswith("docs/notes"):
-                assert all(commit in text for commit in older[key]), (page, key, older[key])
+            assert record.get("kernel") == provenance.KERNEL, (path, record["commit"])
+            words = shlex.split(record.get("command", ""))
+            assert not [word for word in words if word.startswith("/")], path
 
 
 def links(text):

@@ -249,8 +249,11 @@ def simulate(study: Study, names: list[str], folder: Path, commit: str | None) -
 
 def measure(study: Study, names: list[str], folder: Path, commit: str | None) -> None:
     """Measures rates, one variant after another; a kind of device has a file of its own."""
-    path = folder / f"times_{jax.devices()[0].platform}.json"
+    platform = jax.devices()[0].platform
+    path = folder / f"times_{platform}.json"
     measured = json.loads(path.read_text()) if path.exists() else {"rates": {}}
+    if platform != "cpu":  # MuJoCo C would be measured on the host's cores
+        names = [n for n in names if VARIANTS[n].engine != "mujoco"]
     for name in [n for n in names if n not in measured["rates"]]:
         measured["rates"][name] = study.rate(name)
         measured["made"] = provenance.measurement(commit)

@@ -352,7 +352,7 @@ def _apart(axis: Axes, points: list[tuple[float, float]], least: float = 0.04) -
     height = scale.transform(np.reshape(points, (-1, 2)))[:, 1]
     order = np.argsort(height, kind="stable")
     steps = least * np.arange(len(order))
-    heights = height[order] - steps
+    heights = np.maximum(height[order] - steps, least / 2)  # above the axis
     # Between the lowest heights of which none is too low and the highest of which none too high.
     up = np.maximum.accumulate(heights)
     down = np.minimum.accumulate(heights[::-1])[::-1]

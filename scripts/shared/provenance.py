@@ -10,7 +10,6 @@ import sys
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import jax
 import mujoco
@@ -24,24 +23,23 @@ KERNEL = "a7ad6c4c"
 """The commit that last changed what the kernel of the default scene computes: results name it.
 
 A commit that changes the kernels' text (scripts.same_kernels tells) and what grasps do comes in its
-place; what is not measured again is marked as of the earlier model (tests/test_docs.py).
+place, and all of docs/data is measured again (tests/test_docs.py).
 """
 
 
-def before(run: dict[str, Any]) -> str:
-    """The mark of what was measured with another kernel."""
-    return "" if run.get("kernel") == KERNEL else ", earlier model"
-
-
 def command() -> str:
-    """This process's command line, as it can be entered in the checkout's folder."""
+    """This process's command line, as it can be entered in the checkout's folder.
+
+    Of an absolute path the last part stays: the folders before it are those of one machine.
+    """
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     if spec is not None:
         program = ["-m", spec.name.removesuffix(".__main__")]
     else:
         path = Path(sys.argv[0])
         program = [str(path) if not path.is_absolute() else f"scripts/{path.name}"]
-    return shlex.join(["python", *program, *sys.argv[1:]])
+    arguments = [Path(word).name if word.startswith("/") else word for word in sys.argv[1:]]
+    return shlex.join(["python", *program, *arguments])
 
 
 def parser(description: str | None) -> argparse.ArgumentParser:

@@ -177,7 +177,7 @@ def to_markdown(rows: list[dict[str, Any]]) -> str:
         causes = {r.get("failure") or "not explained" for r in part if not r["passed"]}
         remarks = ["**fails**: " + "; ".join(sorted(causes))] if causes else []
         remarks += ["; ".join(dict.fromkeys(r["note"] for r in part if r["note"]))]
-        made = ", ".join(sorted({r["commit"] + provenance.before(r) for r in part}))
+        made = ", ".join(sorted({r["commit"] for r in part}))
         engine = "MuJoCo C" if first["engine"] == "mujoco" else first["engine"]
         lines.append(
             f"| {first['case']} {first['title']} | {first['invariant']} | "

@@ -47,6 +47,7 @@ class Variant:
       drawn: Whether each trial has constants of its own, drawn from their calibrated range.
       few: Whether it is so dear that it has `FEW` trials.
       engine: Name of the engine.
+      platform: Platform of JAX that alone simulates it; any if it is empty.
     """
 
     accuracy: str = "standard"
@@ -55,6 +56,7 @@ class Variant:
     drawn: bool = False
     few: bool = False
     engine: str = "structured"
+    platform: str = ""
 
     def scene(self) -> Scene:
         overrides = keypaths.parse(self.changes)
@@ -85,7 +87,7 @@ VARIANTS: dict[str, Variant] = {
     "standard, moved": Variant(moved=True),
     "fast, moved": Variant("fast", moved=True),
     # Beside a GPU's: what rounding otherwise flips, and the base of variants that CPUs ran.
-    "standard, on CPUs": Variant(),
+    "standard, on CPUs": Variant(platform="cpu"),
     "2 ms": Variant(changes=("discretization.timestep=0.002",)),
     "5 ms": Variant(changes=("discretization.timestep=0.005",)),
     "20 links": Variant(changes=("discretization.links=20",)),
@@ -236,7 +238,9 @@ def path_of(folder: Path, name: str) -> Path:
 
 
 def simulate(study: Study, names: list[str], folder: Path, commit: str | None) -> None:
-    """Simulates the variants that have no file yet."""
+    """Simulates the variants that have no file yet and belong to this platform."""
+    platforms = ("", jax.devices()[0].platform)
+    names = [n for n in names if VARIANTS[n].platform in platforms]
     for name in [n for n in names if not path_of(folder, n).exists()]:
         try:
             record = study.run(name, commit)

@@ -225,11 +225,11 @@ WORDS = {
     "standard": "standard",
     "fine": "fine",
     "reference": "reference",
-    "1e-3": "10 ms, tolerance 1e-3",
-    "4 rings, 1e-3": "10 ms, 1e-3, four rings",
-    "5 ms, 1e-3": "5 ms, tolerance 1e-3",
-    "spheres": "spheres, no skin",
-    "spheres, MuJoCo C": "spheres, no skin",
+    "1e-3": "standard, 1e-3",
+    "4 rings, 1e-3": "standard, 1e-3, four rings",
+    "5 ms, 1e-3": "fine, 1e-3",
+    "spheres": "spheres",
+    "spheres, MuJoCo C": "spheres",
 }
 """Variants that are shown where their rate is known, and what they are called."""
 IN_THE_AIR = ("fast", "standard", "fine", "reference", "spheres", "spheres, MuJoCo C")

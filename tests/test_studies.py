@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import mujoco
@@ -321,6 +322,17 @@ def test_every_variant_is_a_scene_and_every_row_has_its_variants(tmp_path):
     assert named <= set(budget.VARIANTS)
     assert len({budget.path_of(tmp_path, name) for name in budget.VARIANTS}) == len(scenes)
     json.dumps(budget.merge(tmp_path))
+
+
+def test_a_gpu_leaves_out_what_cpus_alone_simulate(monkeypatch, capsys):
+    """A GPU's "standard, on CPUs" would compare the GPU with itself."""
+    alone = ["standard, on CPUs", "spheres, MuJoCo C"]
+    assert budget.of_platform(["standard", *alone]) == ["standard", *alone]
+    monkeypatch.setattr(budget.jax, "devices", lambda: [SimpleNamespace(platform="gpu")])
+    assert budget.of_platform(["standard", *alone]) == ["standard"]
+    assert [f"{name}: only with JAX_PLATFORMS=cpu" for name in alone] == (
+        capsys.readouterr().out.splitlines()
+    )
 
 
 def test_the_page_has_the_tables_of_its_data(monkeypatch):

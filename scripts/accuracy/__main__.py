@@ -10,7 +10,7 @@ python -m scripts.accuracy --merge docs/data/budget.json --report     # page and
 All variants have the same designs and the same trials.  The designs are those that the default
 search recommended in its first seeds, or those of a file (--of).  The truth has the finer step,
 links and rings; `finer` refines all three again.  A variant has a file of its own, so that several
-processes share the work.
+processes share the work; variants of CPUs alone need one with JAX_PLATFORMS=cpu.
 """
 
 import json

@@ -47,7 +47,7 @@ class Variant:
       drawn: Whether each trial has constants of its own, drawn from their calibrated range.
       few: Whether it is so dear that it has `FEW` trials.
       engine: Name of the engine.
-      platform: Platform of JAX that alone simulates it; any if it is empty.
+      platform: The only platform of JAX that simulates it, such as "cpu"; empty for any.
     """
 
     accuracy: str = "standard"
@@ -104,7 +104,8 @@ VARIANTS: dict[str, Variant] = {
     ),
     "lateral threshold": Variant(changes=("effects.lateral_threshold=true",)),
     "spheres": Variant(changes=(SPHERES,)),
-    "spheres, MuJoCo C": Variant(changes=(SPHERES,), few=True, engine="mujoco"),
+    # On a machine with a GPU, MuJoCo C would be measured on the host's cores.
+    "spheres, MuJoCo C": Variant(changes=(SPHERES,), few=True, engine="mujoco", platform="cpu"),
     "fingers pass each other": Variant(changes=("effects.finger_finger=false",)),
     "fingers pass the palm": Variant(changes=("effects.finger_palm=false",)),
     "fingers creep": Variant(changes=("effects.friction_memory=false",)),
@@ -237,11 +238,20 @@ def path_of(folder: Path, name: str) -> Path:
     return folder / f"{''.join(c if c.isalnum() or c in '.-' else '_' for c in name)}.json"
 
 
+def of_platform(names: list[str]) -> list[str]:
+    """The variants that this platform simulates; says which ones it leaves out."""
+    here = jax.devices()[0].platform
+    kept = [n for n in names if VARIANTS[n].platform in ("", here)]
+    for name in names:
+        if name not in kept:
+            print(f"{name}: only with JAX_PLATFORMS={VARIANTS[name].platform}", flush=True)
+    return kept
+
+
 def simulate(study: Study, names: list[str], folder: Path, commit: str | None) -> None:
-    """Simulates the variants that have no file yet and belong to this platform."""
-    platforms = ("", jax.devices()[0].platform)
-    names = [n for n in names if VARIANTS[n].platform in platforms]
-    for name in [n for n in names if not path_of(folder, n).exists()]:
+    """Simulates the variants of this platform that have no file yet."""
+    missing = [n for n in of_platform(names) if not path_of(folder, n).exists()]
+    for name in missing:
         try:
             record = study.run(name, commit)
         except InputError as error:  # an effect that the surface does not have: a result as well
@@ -253,12 +263,10 @@ def simulate(study: Study, names: list[str], folder: Path, commit: str | None) -
 
 def measure(study: Study, names: list[str], folder: Path, commit: str | None) -> None:
     """Measures rates, one variant after another; a kind of device has a file of its own."""
-    platform = jax.devices()[0].platform
-    path = folder / f"times_{platform}.json"
+    path = folder / f"times_{jax.devices()[0].platform}.json"
     measured = json.loads(path.read_text()) if path.exists() else {"rates": {}}
-    if platform != "cpu":  # MuJoCo C would be measured on the host's cores
-        names = [n for n in names if VARIANTS[n].engine != "mujoco"]
-    for name in [n for n in names if n not in measured["rates"]]:
+    missing = [n for n in of_platform(names) if n not in measured["rates"]]
+    for name in missing:
         measured["rates"][name] = study.rate(name)
         measured["made"] = provenance.measurement(commit)
         output.write_json(path, measured)

@@ -104,7 +104,8 @@ def run(args: argparse.Namespace) -> None:
         for key, value in new.items():
             name, kind = key.split("|")
             arrays[f"{name}|{label}|{kind}"] = value
-        notes["runs"].append({"label": label, **provenance.results(args.commit)})
+        made = provenance.results(args.commit)
+        notes["runs"].append({"label": label, "experiments": list(every), **made})
         write(args.data, "fresh", arrays, notes)
         print(f"{label}: {sum(new[f'{n}|cost'].size for n in every):,} grasps", flush=True)
 

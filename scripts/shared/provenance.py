@@ -30,7 +30,7 @@ place, and all of docs/data is measured again (tests/test_docs.py).
 def command() -> str:
     """This process's command line, as it can be entered in the checkout's folder.
 
-    Of an absolute path the last part stays: the folders before it are those of one machine.
+    An absolute path is cut to its last part, because its folders exist on one machine only.
     """
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     if spec is not None:
@@ -38,8 +38,17 @@ def command() -> str:
     else:
         path = Path(sys.argv[0])
         program = [str(path) if not path.is_absolute() else f"scripts/{path.name}"]
-    arguments = [Path(word).name if word.startswith("/") else word for word in sys.argv[1:]]
-    return shlex.join(["python", *program, *arguments])
+    return shlex.join(["python", *program, *(portable(word) for word in sys.argv[1:])])
+
+
+def portable(word: str) -> str:
+    """A word of a command line, its absolute path cut to the last part: /a/b, or --out=/a/b."""
+    option, equals, value = word.partition("=")
+    if option.startswith("/"):
+        return Path(word).name
+    if value.startswith("/"):
+        return option + equals + Path(value).name
+    return word
 
 
 def parser(description: str | None) -> argparse.ArgumentParser:

@@ -1,4 +1,4 @@
-"""What MkDocs asks for when it builds the site: pages from files that lie outside of docs/.
+"""What MkDocs asks for when it builds the site: pages from files outside of docs/, and fonts.
 
 README.md becomes the front page, the other files of `PAGES` become pages, and so does each
 notebook. Links between them and docs/ are those of the repository; here they are turned into those
@@ -10,6 +10,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import fontpkg
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parent.parent
@@ -27,6 +28,13 @@ PAGES |= {
     for path in sorted((ROOT / "notebooks").glob("*.py"))
 }
 
+# Family and style of each font that stylesheets/extra.css names.
+FONTS = {
+    "sans": ("IBM Plex Sans", "normal"),
+    "sans-italic": ("IBM Plex Sans", "italic"),
+    "mono": ("IBM Plex Mono", "normal"),
+}
+
 _LINK = re.compile(r"(\]\(|^\[[^\]]+\]: )([^)\s#]+)", re.M)
 _FILE_NAME = re.compile(r"\[`?(?:docs/)?([\w-]+)(?:/README)?\.md`?\](?=[(\[])")
 _CODE = re.compile(r"(^```.*?^```)", re.S | re.M)
@@ -34,9 +42,13 @@ _DIAGRAM = re.compile(r"^```mermaid\n.*?^```", re.S | re.M)
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Adds the pages that are made here, and the files of the repository that pages link to."""
+    """Adds the fonts, the pages that are made here, and the files that pages link to."""
+    for font, (family, style) in FONTS.items():
+        path = str(fontpkg.path(family, style=style))
+        files.append(File.generated(config, f"assets/fonts/{font}.ttf", abs_src_path=path))
     for source, page in PAGES.items():
         files.append(File.generated(config, page, content=_page(ROOT / source)))
+    files.append(File.generated(config, "notebooks/index.md", content=_notebooks()))
     for source in sorted({s for p in _sources() for s in _links_out(p)}):
         kept = File.generated(config, f"repository/{source}", abs_src_path=str(ROOT / source))
         files.append(kept)
@@ -54,12 +66,49 @@ def on_page_markdown(markdown: str, *, page: Any, config: Any, files: Files) -> 
     return "".join(parts)
 
 
-def _page(path: Path) -> str:
-    if path.suffix == ".py":
-        import jupytext  # it takes longer to import than everything else here
+def notebook_figure(stem: str, place: int) -> Path:
+    """The file of the figure that a notebook's cell shows; `scripts.run_notebooks` writes it."""
+    return ROOT / "docs" / "figures" / "notebooks" / f"{stem}_{place}.webp"
 
-        return jupytext.writes(jupytext.read(path), "md")
-    return path.read_text(encoding="utf-8")
+
+def _page(path: Path) -> str:
+    return _notebook(path) if path.suffix == ".py" else path.read_text(encoding="utf-8")
+
+
+def _notebook(path: Path) -> str:
+    """A notebook as a page, each figure below the cell that shows it."""
+    import jupytext  # it takes longer to import than everything else here
+    from nbformat.v4 import new_markdown_cell
+
+    notebook = jupytext.read(path)
+    cells = []
+    for place, cell in enumerate(notebook.cells):
+        cells.append(cell)
+        figure = notebook_figure(path.stem, place)
+        if figure.is_file():
+            picture = f"![Figure of the cell above](../figures/notebooks/{figure.name})"
+            cells.append(new_markdown_cell(picture))
+    notebook.cells = cells
+    return jupytext.writes(notebook, "md")
+
+
+def _notebooks() -> str:
+    """The page that lists the notebooks: title and first paragraph of each."""
+    lines = ["# Notebooks", ""]
+    for source, page in PAGES.items():
+        if source.startswith("notebooks/"):
+            text = (ROOT / source).read_text(encoding="utf-8")
+            title, summary = _opening(text)
+            lines.append(f"* [{title}]({posixpath.basename(page)}): {summary}")
+    return "\n".join(lines)
+
+
+def _opening(notebook: str) -> tuple[str, str]:
+    """Title and first paragraph of a notebook in jupytext's percent format."""
+    comment = re.compile(r"^# ?", re.M)
+    first = notebook.split("# %% [markdown]\n", 1)[1].split("\n# %%", 1)[0]
+    title, _, rest = comment.sub("", first).strip().partition("\n")
+    return title.lstrip("# "), " ".join(rest.strip().split("\n\n")[0].split())
 
 
 def _sources() -> list[Path]:

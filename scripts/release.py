@@ -18,6 +18,8 @@ from pathlib import Path
 
 import jupytext
 
+from scripts.shared import evidence
+
 ROOT = Path(__file__).parents[1]
 DIST = ROOT / "dist"
 NOTEBOOK = ROOT / "notebooks" / "01_start.py"
@@ -141,6 +143,10 @@ def remaining(root: Path = ROOT) -> list[str]:
     steps = []
     if re.search(rf"^## {re.escape(version)}.*unreleased", changelog, re.M):
         steps.append(f"write the date of {version} into CHANGELOG.md")
+    if ".dev" in version:
+        steps.append("give the version its final name, and measure again what pages show")
+    elif marked := [page for page in evidence.PAGES if evidence.is_marked(root / page)]:
+        steps.append(f"measure the figures of {', '.join(marked)} again, or say why not")
     if "urls" not in project:
         steps.append("add the repository's address to pyproject.toml (project.urls)")
     return [*steps, f"git tag v{version}", "twine upload dist/*.whl dist/*.tar.gz"]

@@ -27,7 +27,7 @@ from codesign_jax.commands import (
 )
 from codesign_jax.studio import studio
 from scripts import reference_page
-from scripts.shared import provenance
+from scripts.shared import evidence, provenance
 from tests.helpers import command_runs
 from tests.helpers.browsers import chromium, chromium_launcher  # noqa: F401
 from tests.helpers.toy_engine import TINY
@@ -163,22 +163,73 @@ def commits(text):
     return re.findall(r"\b(?=[0-9a-f]*[a-f])(?=[0-9a-f]*[0-9])[0-9a-f]{7,40}\b", text)
 
 
-def records(content):
-    """What made a file's results: the outermost tables that name a commit."""
-    if isinstance(content, dict) and "commit" in content:
-        return [content]
-    inner = content.values() if isinstance(content, dict) else content
-    return [r for v in inner if isinstance(v, dict | list) for r in records(v)]
-
-
-def test_all_figures_are_of_one_kernel_and_their_commands_name_no_absolute_path():
-    for path in (ROOT / "docs" / "data").rglob("*.json"):
-        made = records(json.loads(path.read_text()))
+def test_data_say_what_made_them_and_their_commands_name_no_absolute_path():
+    for path in evidence.DATA.rglob("*.json"):
+        made = evidence.records(json.loads(path.read_text()))
         assert made, f"{path} does not say what made it"
         for record in made:
-            assert record.get("kernel") == provenance.KERNEL, (path, record["commit"])
+            assert record["kernel"] and record.get("version", evidence.FIRST_VERSION), path
             words = shlex.split(record.get("command", ""))
             assert words == [provenance.portable(word) for word in words], path
+
+
+# Percentages of a setting, or files of data that are named without a figure.
+UNMEASURED = "docs/meshes.md", "docs/notes/effects.md", "docs/notes/extending.md"
+
+
+def has_figures(text):
+    """Whether a page has a table that a study writes, names data, or states a share or a rate."""
+    return re.search(r":begin -->|docs/data/\w|\d %|grasps/s|grasps a second", text) is not None
+
+
+def test_every_page_with_figures_names_its_data():
+    guides = ("CONTRIBUTING.md", "SECURITY.md", "scripts/README.md", *UNMEASURED)
+    texts = {p.relative_to(ROOT).as_posix(): p.read_text(encoding="utf-8") for p in PAGES}
+    assert {n for n, text in texts.items() if has_figures(text)} - {*guides} <= {*evidence.PAGES}
+    patterns = {pattern for patterns in evidence.PAGES.values() for pattern in patterns}
+    assert all(list(evidence.DATA.glob(pattern)) for pattern in patterns)
+
+
+@pytest.mark.parametrize("page", evidence.PAGES)
+def test_figures_of_another_version_are_marked(page):
+    again = "python -m scripts.shared.evidence"
+    assert (ROOT / page).read_text(encoding="utf-8") == evidence.current(page), again
+
+
+MADE = {
+    "the present one": ("0.2.0", {("0.2.0", "k")}, ""),
+    "an older version": ("0.2.0", {("0.1.0", "k"), ("0.2.0", "k")}, "0.1.0"),
+    "another kernel": ("0.2.0", {("0.2.0", "old"), ("0.2.0", "k")}, "0.2.0"),
+    "a development version": ("0.3.0.dev0", {("0.3.0.dev0", "k")}, "0.3.0.dev0"),
+    "two versions": ("0.3.0", {("0.1.0", "a"), ("0.2.0", "b")}, "0.1.0 and 0.2.0"),
+}
+
+
+@pytest.mark.parametrize("case", MADE)
+def test_a_mark_names_the_versions_of_older_figures(case):
+    version, measured, named = MADE[case]
+    page = "# Title\n\nText.\n"
+    text = evidence.marked(page, evidence.mark(measured, (version, "k")))
+    assert (f"version {named}; this" in text) if named else text == page
+    assert evidence.marked(text, evidence.mark(measured, (version, "k"))) == text
+    assert evidence.marked(text, "") == page
+
+
+def test_the_kernel_is_what_computes_without_its_words(tmp_path):
+    law = "codesign_jax/engines/structured/laws/contact.py"
+    for source in (source for pattern in evidence.SIMULATION for source in ROOT.glob(pattern)):
+        copy = tmp_path / source.relative_to(ROOT)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(source, copy)
+
+    def changed(addition):
+        text = (ROOT / law).read_text(encoding="utf-8")
+        (tmp_path / law).write_text(text + addition, encoding="utf-8")
+        evidence.kernel.cache_clear()
+        return evidence.kernel(tmp_path)
+
+    assert changed('\n\n# A comment.\n"A docstring."\n') == evidence.kernel()
+    assert changed("\nSTIFFER = 2.0\n") != evidence.kernel()
 
 
 PORTABLE = {

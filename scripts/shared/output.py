@@ -12,6 +12,7 @@ import matplotlib.figure
 import numpy as np
 
 from codesign_jax import files
+from scripts.shared import evidence
 
 
 def write_json(path: Path, content: Any, *, indent: int | None = 1) -> Path:
@@ -37,7 +38,10 @@ def markdown(rows: list[list[str]]) -> str:
 
 
 def fill(page: Path, text: str, mark: str) -> None:
-    """Replaces what stands between the marks of a page, NAME:begin and NAME:end in comments."""
+    """Replaces what stands between the marks of a page, NAME:begin and NAME:end in comments.
+
+    The page says which version its figures were measured with, if that is not the present one.
+    """
     begin = f"<!-- {mark}:begin -->"
     end = f"<!-- {mark}:end -->"
     old = page.read_text(encoding="utf-8")
@@ -47,6 +51,7 @@ def fill(page: Path, text: str, mark: str) -> None:
     tail = old.split(end)[1]
     with files.atomically(page) as part:
         part.write_text(f"{head}{begin}\n\n{text}\n\n{end}{tail}", encoding="utf-8")
+    evidence.write(page)
 
 
 def new_figure(width: float, height: float) -> matplotlib.figure.Figure:

@@ -18,13 +18,7 @@ import numpy as np
 from codesign_jax.provenance import environment, git_state
 from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene
-
-KERNEL = "a7ad6c4c"
-"""The commit that last changed what the kernel of the default scene computes: results name it.
-
-A commit that changes the kernels' text (scripts.same_kernels tells) and what grasps do comes in its
-place, and all of docs/data is measured again (tests/test_docs.py).
-"""
+from scripts.shared import evidence
 
 
 def command() -> str:
@@ -61,9 +55,14 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     return command_line
 
 
+def code(commit: str | None = None) -> dict[str, object]:
+    """The code that made a result: commit, the package's version, and kernel (`evidence`)."""
+    return {**git_state(commit), "version": evidence.version(), "kernel": evidence.kernel()}
+
+
 def results(commit: str | None = None) -> dict[str, object]:
-    """What results depend on: command, commit, versions, platform and device."""
-    return {"command": command(), **git_state(commit), "kernel": KERNEL, **environment()}
+    """What results depend on: command, code, versions, platform and device."""
+    return {"command": command(), **code(commit), **environment()}
 
 
 def scene_hash(scene: Scene) -> str:
@@ -73,12 +72,11 @@ def scene_hash(scene: Scene) -> str:
 
 
 def measurement(commit: str | None = None) -> dict:
-    """What times depend on: command, commit, versions, device, processor and its load."""
+    """What times depend on: command, code, versions, device, processor and its load."""
     device = jax.devices()[0]
     return {
         "command": command(),
-        **git_state(commit),
-        "kernel": KERNEL,
+        **code(commit),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "python": platform.python_version(),
         "jax": jax.__version__,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from codesign_jax.provenance import environment, git_state
-from scripts.shared import provenance
+from scripts.shared import evidence
 
 CASES: dict[str, "Case"] = {}
 STEPS = (1.0, 0.5, 0.25)
@@ -138,6 +138,7 @@ def write(docs: Path, new: list[dict[str, Any]], commit: str | None = None) -> N
     made = str(state["commit"])[:7] + (" with changes" if state.get("modified") else "")
     versions: Any = environment()["versions"]
     made_with = {name: versions[name] for name in ("jax", "mujoco")}
+    made_with |= {"version": evidence.version(), "kernel": evidence.kernel()}
     made_with["python"] = platform.python_version()
     path = docs / "data" / "stability.json"
     page = docs / "notes" / "stability.md"
@@ -146,7 +147,7 @@ def write(docs: Path, new: list[dict[str, Any]], commit: str | None = None) -> N
     for row in new:
         # JSON has no infinite numbers.
         plain = {k: None if v in (math.inf, -math.inf) else v for k, v in row.items()}
-        plain |= {"commit": made, "kernel": provenance.KERNEL, **made_with}
+        plain |= {"commit": made, **made_with}
         rows[row["name"], row["step"], row["precision"]] = plain
     kept = sorted(
         current(list(rows.values())).values(),
@@ -157,6 +158,7 @@ def write(docs: Path, new: list[dict[str, Any]], commit: str | None = None) -> N
     head, tail = page.read_text().split("<!-- table:begin -->")
     tail = tail.split("<!-- table:end -->")[1]
     page.write_text(f"{head}<!-- table:begin -->\n\n{to_markdown(kept)}\n<!-- table:end -->{tail}")
+    evidence.write(page)
 
 
 def to_markdown(rows: list[dict[str, Any]]) -> str:

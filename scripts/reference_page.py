@@ -14,6 +14,7 @@ import docstring_parser
 
 from codesign_jax import codesign, cost
 from codesign_jax import types as data
+from codesign_jax.export import arm
 from codesign_jax.export import tables as exported
 from codesign_jax.model.layout import AXES, WRIST, joint_axes, layout
 from codesign_jax.optimize import ParticleFilter
@@ -300,7 +301,7 @@ def _status() -> str:
 def _exported() -> str:
     parts = ["## Tables of an export", "[export.md](export.md) has the other files of an export."]
     for name, rows, columns in (
-        (exported.COMMANDS, "a time step", exported.COMMAND_COLUMNS),
+        (arm.COMMANDS, "a time step", arm.COLUMNS),
         (exported.GRASPS, "a model", exported.GRASP_COLUMNS),
     ):
         table = _table(("column", "meaning"), [(f"`{c}`", text) for c, text in columns.items()])

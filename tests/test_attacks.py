@@ -22,15 +22,15 @@ import numpy as np
 import pytest
 import rich.table
 
-from codesign_jax import array_files, files, runs, terminal
+from codesign_jax import array_files, files, runs, scene, terminal
 from codesign_jax.commands import check, hosts, reference, status
 from codesign_jax.compiler.ffi import KernelUnavailable
-from codesign_jax.export import sheet
+from codesign_jax.export import process, sheet
 from codesign_jax.runs import directory, manifest, progress, scene_files
 from codesign_jax.runs import record as records
 from codesign_jax.runs import run as run_of
 from codesign_jax.runs.columns import FILES, TABLES
-from codesign_jax.scene import InputError
+from codesign_jax.scene import InputError, parameters
 from codesign_jax.stress import Stress
 from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import command, own_workplace  # noqa: F401
@@ -191,16 +191,32 @@ def test_texts_of_a_run_are_one_line_each_where_it_goes_on(run):
     assert any(SHOWN in note for note in notes) and not any("\n" in note for note in notes)
 
 
+def build_sheet(folder, words):
+    """A build sheet whose texts from outside are the words."""
+    the_scene = scene.load("paper_spheres")
+    space = parameters.design_space(the_scene.hand, "full")
+    params = jax.tree.map(np.asarray, space.params(space.default()))
+    sizes = process.sizes(the_scene.hand, params, process.Process())
+    texts = {name: words[0] for name in ("design", "command", "version")}
+    origin = {**texts, "objects": words, "notes": words}
+    hand = sheet.Hand(the_scene, params, sizes, process.Process())
+    tests = sheet.Tests(verdict=words[0], warnings=words)
+    return sheet.write(folder, hand, tests, origin, (1.0, 1.0)).read_text()
+
+
 def test_texts_of_results_are_one_line_each_and_no_html_on_a_sheet(tmp_path):
     kept = {"warnings": np.array([HOSTILE, "<script>"]), "empty": np.array([], str)}
     array_files.save(tmp_path / "x.npz", kept)
     loaded = array_files.load(tmp_path / "x.npz")
     assert loaded["warnings"].tolist() == [SHOWN, "<script>"] and loaded["empty"].shape == (0,)
-    rows = [(HOSTILE, "<img src=x>", "![a](http://b)")]
-    section = sheet.SheetSection("t", ("a", "b", "c"), rows, [HOSTILE])
-    text = sheet.markdown(HOSTILE, ["<b>"], [section])
-    assert not {*text} & {"\x1b", "\r"} and "<" not in text and "](" not in text
-    assert text.count("\n") == sheet.markdown("", [""], [section]).count("\n")
+    harmless = ("a", "b", "c", "d")
+    hostile = (HOSTILE, "<img src=x>", "![a](http://b)", "a | b")
+    sheets = [build_sheet(tmp_path, words) for words in (harmless, hostile)]
+    assert not {*sheets[1]} & {"\x1b", "\r"} and "<" not in sheets[1] and "](" not in sheets[1]
+    lines = [text.splitlines() for text in sheets]
+    assert len(lines[0]) == len(lines[1])
+    cells = [[line.replace("\\|", "").count("|") for line in text] for text in lines]
+    assert cells[0] == cells[1]
 
 
 def test_a_log_without_a_terminal_gets_few_lines_with_counts_and_the_time_left(monkeypatch, capsys):

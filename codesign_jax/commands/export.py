@@ -15,7 +15,7 @@ from codesign_jax import files, preflight, provenance, rollout, runs, tolerances
 from codesign_jax.commands import common, reference
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Export
-from codesign_jax.export import grasps, motion, plain, process, sheet, tables, valves
+from codesign_jax.export import arm, grasps, plain, process, sheet, tables, valves
 from codesign_jax.export.process import Process, Size
 from codesign_jax.runs.cases import Case
 from codesign_jax.runs.progress import Busy
@@ -133,9 +133,7 @@ def write_files(
     """Writes all that is asked for."""
     _models(case, params, folder, options, console)
     nominal = jax.tree.map(np.asarray, rollout.nominal_trial(case.scene))
-    peaks = motion.write(folder, case.scene, params, nominal)
-    for warning in motion.warnings(peaks):
-        console.print(f"note: {warning}")
+    commands = arm.write(folder, case.scene, params, nominal)
     valves.write(folder, case.scene, params)
     printed = None if options.no_parts else _parts(case, params, sizes, folder, options, console)
     if not options.no_sheet:
@@ -143,7 +141,8 @@ def write_files(
         if options.tolerances != common.OFF:
             hand_yield = common.cast_hands(case, options, tolerances.TRIALS, console)
         with Busy(console, "writing the build sheet"):
-            lacking = _sheet(case, params, sizes, (hand_yield, printed, peaks), folder, options)
+            known = hand_yield, printed, arm.speeds(commands)
+            lacking = _sheet(case, params, sizes, known, folder, options)
         if lacking:
             console.print(
                 f"the PDF writes ? for letters that no font here has: {' '.join(lacking)} "
@@ -158,14 +157,10 @@ def _tell(case: Case, options: Export, console: Console) -> None:
         player = f"python {grasps.PLAYER.name} {models[0].name}"
         console.print(f"  {tables.MODELS}/: models for plain MuJoCo; there: {player}")
     console.print(
-        f"  {tables.COMMANDS}: commands of arm and valves; turns: roll about x, then yaw, then "
-        "pitch, positive towards +x, as above"
+        f"  {arm.COMMANDS}: the path of the arm without the shaking, and pressures; turns: roll "
+        "about x, then yaw, then pitch, positive towards +x, as above"
     )
-    console.print(
-        f"  {tables.STILL}, {motion.PLAYER.name}: the same without the shaking, and a player of "
-        "arm and valves together"
-    )
-    console.print(f"  {valves.VALVES}, {valves.PLAYER.name}: pressures for regulators")
+    console.print(f"  {valves.VALVES}: pressures of the key frames for regulators")
     if not options.no_parts:
         console.print("  parts/: fingers, moulds, palm and clamp bars, in millimetres")
     if not options.no_sheet:
@@ -248,41 +243,36 @@ def _sheet(
     case: Case,
     params: Params,
     sizes: list[Size],
-    added: tuple[tolerances.Yield | None, process.Printed | None, dict[str, motion.Peaks]],
+    known: tuple[tolerances.Yield | None, process.Printed | None, tuple[float, float]],
     folder: Path,
     options: Export,
 ) -> list[str]:
     """Writes the sheet; returns letters that its drawings lack."""
-    from codesign_jax.export import drawing, workshop  # needs the extra
+    from codesign_jax.export import drawing  # imports Matplotlib
 
     kept = reference.Kept(None, None, [])
     if options.run_folder:
         kept = reference.kept(options.run_folder, *runs.read_run(options.run_folder))
     for note in kept.notes:
         common.warn(note)
-    tested = None if kept.fresh is None else str(kept.fresh), kept.stress
-    hand_yield, printed, peaks = added
-    content = sheet.sheet_sections(case.scene, params, sizes, hand_yield, tested)
-    title = f"Build sheet: {case.scene.hand.name}"
-    origin = _origin(options)
+    hand_yield, printed, speeds = known
     code = provenance.git_state()
     version = provenance.environment()["versions"]["codesign-jax"]  # type: ignore[index]
-    objects = ", ".join(map(_described, case.scene.objects.object))
-    lines = [
-        f"Design: {origin['design']}. Export: {origin['command']}",
-        f"Scene {case.scene.name}, objects {objects}; "
-        f"codesign-jax {version}, commit {code['commit'] or 'unknown'}"
-        f"{' with changes' if code.get('modified') else ''}. Predictions of a simulation, not "
-        "measurements.",
-        *(f"Warning: {note}." for note in kept.notes),
-    ]
-    if printed:
-        content[0].notes.extend(f"Warning: the palm: {words}." for words in printed.problems)
-    doubts = motion.warnings(peaks) + motion.room_warnings(case.scene, params)
-    content[0].notes.extend(f"Warning: {words}." for words in doubts)
-    nominal = jax.tree.map(np.asarray, rollout.nominal_trial(case.scene))
-    content.insert(4, motion.section(case.scene, params, nominal, peaks))
-    content.insert(5, motion.room_section(case.scene, params, sheet.sag(case.scene, sizes)))
-    assembly = workshop.assembly_sections(case.scene, params, sizes, _process(options), printed)
-    sheet.write(folder, title, lines, [*content, *assembly])
+    commit = f"{code['commit'] or 'unknown'}{' with changes' if code.get('modified') else ''}"
+    origin = {
+        **_origin(options),
+        "objects": [*map(_described, case.scene.objects.object)],
+        "version": f"{version}, commit {commit}",
+        "notes": kept.notes,
+    }
+    doubts = [f"the palm: {words}" for words in (printed.problems if printed else ())]
+    if arm.spacer(case.scene, params) != 0:
+        doubts.append(
+            f"an arm's last link of {arm.LAST_LINK:.0f} mm radius right behind the palm would "
+            "stand in the table at the lowest key frame, see 'Arm'"
+        )
+    verdict = None if kept.fresh is None else str(kept.fresh)
+    hand = sheet.Hand(case.scene, params, sizes, _process(options), printed)
+    sheet.write(folder, hand, sheet.Tests(verdict, kept.stress, hand_yield, doubts), origin, speeds)
+    title = f"Build sheet: {case.scene.hand.name}"
     return drawing.write(folder, title, case.scene, params, sizes, printed, _process(options))

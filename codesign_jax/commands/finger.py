@@ -207,7 +207,7 @@ def _of_fit(fit: Posterior, mine: Finger) -> list[str]:
     if identified.get("moment_factor", False):
         lines.append(
             f"on the real hand divide the pressures of a design that was searched without it by "
-            f"{factor:.4g} (play_valves.py --divide {factor:.4g})"
+            f"{factor:.4g}"
         )
     return lines
 

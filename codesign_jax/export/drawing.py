@@ -12,9 +12,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from scipy.spatial import ConvexHull
 
-from codesign_jax.export import fonts, posture, valves
+from codesign_jax.export import arm, fonts, posture
 from codesign_jax.export.process import BACK, BAR, FABRIC, FLOOR, Printed, Process, Section, Size
-from codesign_jax.export.sheet import NAME, corners, places
+from codesign_jax.export.quantities import base_frames
+from codesign_jax.export.sheet import NAME, corners
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
 
@@ -156,7 +157,7 @@ def _mounting_page(
     for k, (words, angles) in enumerate(posture.TURNS.items()):
         axes = figure.add_axes((0.05 + 0.225 * k, 0.68, 0.21, 0.22))
         posture.draw(axes, hand, palm, angles, words)
-    keys = valves.key_poses(scene, params)
+    keys = arm.key_poses(scene, params)
     lowest = keys[np.argmin(keys[:, 3])]
     angles = dict(zip(("roll", "pitch", "yaw"), lowest[4:], strict=True))
     words = ", ".join(f"{name} {angles[name]:.1f}°" for name in ("roll", "yaw", "pitch"))
@@ -326,7 +327,7 @@ def _palm(axes: Axes, scene: Scene, params: Params) -> None:
     radius = 1e3 * scene.hand.palm.radius
     width = 1e3 * scene.hand.section.width
     axes.add_patch(matplotlib.patches.Circle((0, 0), radius, facecolor="0.93", edgecolor="0.4"))
-    position, azimuth = places(scene, params)
+    position, azimuth = base_frames(scene, params)
     for i, ((x, y), angle) in enumerate(zip(1e3 * position, azimuth, strict=True)):
         direction = np.array([np.cos(angle), np.sin(angle)])
         side = np.array([-direction[1], direction[0]]) * width / 2

@@ -1,4 +1,4 @@
-"""The tables of an export: controls of a grasp, commands for an arm and valves, list of grasps."""
+"""The grasps of an export: models, their controls, and the list of what became of them."""
 
 import csv
 import re
@@ -9,35 +9,15 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from codesign_jax.export import plain, pose
+from codesign_jax.export import plain
 from codesign_jax.export.grasps import PLAYER, Grasp
 from codesign_jax.model.layout import WRIST
 from codesign_jax.scene import Scene
 from codesign_jax.types import Status, Trial, failed
 
-COMMANDS = "commands.csv"
-STILL = "commands_still.csv"
 MODELS = "model"
 GRASPS = "grasps.csv"
 NOTES = "README.txt"
-
-COMMAND_COLUMNS = {
-    "time_s": "time from the start of the grasp",
-    "phase": "approach, inflate, lift, disturb or ungrasp",
-    "arm_x_mm": "position of the arm frame X_D, from the object's nominal place",
-    "arm_y_mm": "likewise",
-    "arm_z_mm": "height of the palm's underside above the table, if the wrist is not deflected",
-    "arm_roll_deg": "orientation of X_D: turned about x by this angle, ...",
-    "arm_yaw_deg": "... then about its own z, ...",
-    "arm_pitch_deg": "... then about its own y; a positive angle, which is a left-handed turn, "
-    "points the fingers towards +x, as in designs, control files and the build sheet",
-    "arm_qw": "the same orientation as a unit quaternion w, x, y, z, for arms that take one",
-    "arm_qx": "likewise",
-    "arm_qy": "likewise",
-    "arm_qz": "likewise",
-    "pressure_0_kPa": "gauge pressure in the chamber of finger 0; a column for each finger",
-}
-"""Meaning of the columns of commands.csv and commands_still.csv, a row for each time step."""
 
 GRASP_COLUMNS = {
     "model": "name of the model's files",
@@ -68,22 +48,6 @@ def control_columns(scene: Scene) -> list[str]:
     signs = {"pitch": "minus_"}
     arm = [f"{signs.get(name, '')}arm_{name}_{'m' if len(name) == 1 else 'rad'}" for name in WRIST]
     return ["time_s", *arm, *(f"pressure_{i}_Pa" for i in range(scene.num_fingers))]
-
-
-def write_commands(folder: Path, scene: Scene, schedule: np.ndarray, name: str = COMMANDS) -> Path:
-    """Writes commands in mm, degrees and kPa; `schedule` as of `grasps.timed_controls`."""
-    arm = pose.of_controls(schedule[:, 1:])
-    pressures = 1e-3 * schedule[:, 1 + len(WRIST) :]
-    values = np.column_stack([arm, pose.quaternion(*arm[:, 3:].T), pressures])
-    names, ends = zip(*scene.phase_ends.items(), strict=True)
-    rows = []
-    for time, row in zip(schedule[:, 0], values, strict=True):
-        # A step belongs to the phase in which it begins; 1e-9 s is rounding of k h.
-        phase = names[min(int(np.searchsorted(ends, time + 1e-9, "right")), len(names) - 1)]
-        # float32 has 7 digits; + 0.0 writes -0 as 0.
-        rows.append([f"{time:.9g}", phase, *(f"{v + 0.0:.7g}" for v in row)])
-    head = [*COMMAND_COLUMNS][:-1] + [f"pressure_{i}_kPa" for i in range(scene.num_fingers)]
-    return write_table(folder / name, head, rows)
 
 
 def write_grasps(

@@ -1,4 +1,4 @@
-"""Pressures of the key frames as a short table, and the program that sends them to regulators."""
+"""Pressures of the key frames as a short table for regulators."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,16 +12,6 @@ from codesign_jax.scene.hand_tables import partition
 from codesign_jax.types import Params
 
 VALVES = "valves.csv"
-PLAYER = Path(__file__).with_name("play_valves.py")
-
-
-def key_poses(scene: Scene, params: Params) -> np.ndarray:
-    """Time [s] and pose of each key frame: x, y, z [mm], roll, pitch, yaw [deg], (frame, 7).
-
-    Time counts from the start of the grasp, as in commands.csv: the object settles first.
-    """
-    pose = np.asarray(key_frames.poses(scene, params)) * ([1e3] * 3 + [180 / np.pi] * 3)
-    return np.column_stack([_times(scene, params), pose])
 
 
 def key_pressures(scene: Scene, params: Params) -> np.ndarray:
@@ -87,11 +77,7 @@ def _times(scene: Scene, params: Params) -> np.ndarray:
 
 
 def write(folder: Path, scene: Scene, params: Params) -> Path:
-    """Writes the table with the limits of the lines' walls, and the program beside it."""
-    limits = line_limits(scene, params)
-    head = ["time_s", *(f"pressure_{i}_kPa" for i in range(len(limits)))]
-    # Rounded upwards in the fourth digit behind the point: a pressure at its limit stays legal.
-    rows = [["# limit kPa", *(f"{v + 5e-4:.3f}" for v in limits)], head]
-    rows += [[f"{v:.9g}" for v in row] for row in line_pressures(scene, params)]
-    (folder / PLAYER.name).write_text(PLAYER.read_text(encoding="utf-8"), encoding="utf-8")
-    return write_table(folder / VALVES, rows[0], rows[1:])
+    """Writes the table of the pressure lines."""
+    rows = line_pressures(scene, params)
+    head = ["time_s", *(f"pressure_{i}_kPa" for i in range(rows.shape[1] - 1))]
+    return write_table(folder / VALVES, head, [[f"{v:.9g}" for v in row] for row in rows])

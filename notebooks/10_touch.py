@@ -50,9 +50,9 @@ hand = space.params(space.default() if FAST else space.from_units(np.array(desig
 # %% [markdown]
 # ## The task
 #
-# An action multiplies the pressures of the key frames by 0 to 2.  A grasp earns the share of the
-# time that counts in which it holds the object, and half of that if it takes all the pressure that
-# the walls stand.
+# An action multiplies the pressures of the key frames by 0 to 2, as in every environment.  A grasp
+# earns the share of the time that counts in which it holds the object, and half of that if it takes
+# all the pressure that the walls stand.
 
 
 # %%
@@ -69,9 +69,6 @@ class Touch(env.GraspEnv):
         bend = 0.5 * seen.joint[..., 0].sum(-1)
         felt = 0.2 * ones * carried, 0.2 * forces.finger[:, 2], 0.05 * forces.grip, bend
         return jnp.stack([*times, *felt], 1).ravel()
-
-    def act(self, seen, action):
-        return seen.plan._replace(pressure=seen.plan.pressure * (1.0 + action))
 
     def reward(self, before, command, after, held):
         return held * (1.0 - 0.5 * (command.pressure / self.limit).mean())

@@ -299,19 +299,12 @@ gymnasium = pytest.importorskip("gymnasium")
 vector = pytest.importorskip("codesign_jax.env.vector")
 
 
-class Replay(env.GraspEnv):
-    """Its action is what each finger has more than the key frames say [Pa]."""
-
-    def act(self, seen, action):
-        return seen.plan._replace(pressure=seen.plan.pressure + action)
-
-
 @pytest.fixture(scope="module")
 def episode():
     """A batch of grasps that actions of zero let the key frames command, and all of its states."""
     params = grasps.hand_world(SCENE)[0]
     params = jax.tree.map(lambda v: np.asarray(v, np.float32), params)
-    worlds = vector.VectorEnv(grasp := Replay(SCENE, params, period=0.1), 4, seed=1)
+    worlds = vector.VectorEnv(grasp := env.GraspEnv(SCENE, params, period=0.1), 4, seed=1)
     with pytest.raises(gymnasium.error.ResetNeeded):
         worlds.step(worlds.action_space.sample())
     first, _ = worlds.reset(seed=2)
@@ -339,6 +332,19 @@ def test_actions_that_change_nothing_make_the_grasp_of_the_key_frames(episode, s
     np.testing.assert_allclose(rewards, 1 - outcome.cost / SCENE.cost.maximum, atol=1e-6)
     assert [float(state.done.min()) for state in states[-2:]] == [0, 1]
     assert np.unique(trials.yaw).size == 4  # each its own
+
+
+def test_actions_scale_the_plan_from_nothing_to_twice_as_much(episode):
+    """Fingers that the plan keeps empty stay empty; no action says more than the ends do."""
+    grasp, states, _ = episode
+    seen = jax.tree.map(lambda v: v[0], jax.vmap(grasp.seen)(states[2].data))
+    plan = np.array([[0.0, 5e4], [1e4, 6e4]], np.float32)  # of two time steps
+    seen = seen._replace(plan=seen.plan._replace(pressure=plan))
+    shares = {-3.0: 0.0, -1.0: 0.0, -0.5: 0.5, 0.0: 1.0, 0.5: 1.5, 1.0: 2.0, 3.0: 2.0}
+    for action, share in shares.items():
+        command = grasp.act(seen, jnp.full(2, action))
+        np.testing.assert_allclose(command.pressure, share * plan, rtol=1e-6)
+        np.testing.assert_array_equal(command.pose, seen.plan.pose)
 
 
 def test_what_is_observed_is_what_a_hand_feels(episode):

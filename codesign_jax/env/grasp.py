@@ -140,9 +140,13 @@ class GraspEnv:
         return jnp.concatenate([times, seen.pressure / self.limit, bend, 0.1 * rate, *touch])
 
     def act(self, seen: Observation, action: jax.Array) -> Command:
-        """The command of an action: pressures from zero, at -1, to the limit of the walls, at 1."""
-        share = (jnp.clip(action, -1.0, 1.0) + 1.0) / 2
-        return seen.plan._replace(pressure=share * self.limit)
+        """The command of an action: the plan's pressures times 0, at -1, to 2, at 1; the plan at 0.
+
+        Fingers that the plan keeps empty, as before the hand has arrived, stay empty. A pressure
+        above the limit of the walls is that limit, see `Command`.
+        """
+        share = 1.0 + jnp.clip(action, -1.0, 1.0)
+        return seen.plan._replace(pressure=share * seen.plan.pressure)
 
     def reward(
         self, before: Observation, command: Command, after: Observation, held: jax.Array

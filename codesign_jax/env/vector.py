@@ -1,10 +1,11 @@
 """Grasps as environments of Gymnasium, for its trainers; needs the extra `gymnasium`.
 
 `VectorEnv` is a batch of grasps that one program simulates, `SingleEnv` one grasp, which trainers
-of single environments take, such as those of Stable-Baselines3.
+of single environments take. `env.stable_baselines` has the batch of Stable-Baselines3.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -36,27 +37,18 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         """
         self.env = env
         self.num_envs = num_envs
-        self.single_observation_space, self.single_action_space = _spaces(env)
+        self.single_observation_space, self.single_action_space = spaces(env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._keys = _keys([seed + i for i in range(num_envs)])
+        self._keys = seed_keys([seed + i for i in range(num_envs)])
         self._state: State | None = None
 
-        def reset(keys: jax.Array) -> tuple[jax.Array, State]:
-            pairs = jax.vmap(jax.random.split)(keys)
-            return pairs[:, 0], jax.vmap(env.reset)(pairs[:, 1])
-
         def step(keys: jax.Array, state: State, action: jax.Array) -> tuple[jax.Array, State]:
-            keys, fresh = reset(keys)
+            keys, fresh = begin(env, keys)
             after = jax.vmap(env.step)(state, action)
+            return keys, where_done(state, fresh, after)
 
-            def either(new: jax.Array, old: jax.Array) -> jax.Array:
-                done = state.done.reshape(-1, *[1] * (new.ndim - 1)) > 0
-                return jnp.where(done, new, old)
-
-            return keys, jax.tree.map(either, fresh, after)
-
-        self._reset = jax.jit(reset)
+        self._reset = jax.jit(partial(begin, env))
         self._step = jax.jit(step)
 
     def reset(
@@ -79,7 +71,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             self._seed(seed)
         self._keys, state = self._reset(self._keys)
         self._state = state
-        return _observed(state), _info(state)
+        return observed(state), metrics(state)
 
     def step(
         self, actions: np.ndarray
@@ -100,7 +92,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self._state = state
         reward = np.asarray(state.reward, np.float64)
         over = np.asarray(state.done) > 0
-        return _observed(state), reward, over, np.zeros(self.num_envs, bool), _info(state)
+        return observed(state), reward, over, np.zeros(self.num_envs, bool), metrics(state)
 
     def _seed(self, seed: Any) -> None:
         count = self.num_envs
@@ -109,7 +101,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         if len(seeds) != count:
             raise InputError([f"seed has {len(seeds)} entries for {count} environments"])
         drawn = jnp.array([s is None for s in seeds])
-        self._keys = jnp.where(drawn, self._keys, _keys([s or 0 for s in seeds]))
+        self._keys = jnp.where(drawn, self._keys, seed_keys([s or 0 for s in seeds]))
 
 
 class SingleEnv(gymnasium.Env):
@@ -120,7 +112,7 @@ class SingleEnv(gymnasium.Env):
     def __init__(self, env: GraspEnv):
         """Takes the environment."""
         self.env = env
-        self.observation_space, self.action_space = _spaces(env)
+        self.observation_space, self.action_space = spaces(env)
         self._state: State | None = None
         self._reset = jax.jit(env.reset)
         self._step = jax.jit(env.step)
@@ -130,9 +122,9 @@ class SingleEnv(gymnasium.Env):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begins a grasp in a random trial; see Gymnasium."""
         super().reset(seed=seed)
-        [key] = _keys([self.np_random.integers(2**32)])
+        [key] = seed_keys([self.np_random.integers(2**32)])
         self._state = state = self._reset(key)
-        return _observed(state), _info(state)
+        return observed(state), metrics(state)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Observation, reward, termination, truncation (never) and metrics; see Gymnasium.
@@ -143,25 +135,43 @@ class SingleEnv(gymnasium.Env):
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         self._state = state = self._step(self._state, jnp.asarray(action))
-        return _observed(state), float(state.reward), bool(state.done > 0), False, _info(state)
+        return observed(state), float(state.reward), bool(state.done > 0), False, metrics(state)
 
 
-def _spaces(env: GraspEnv) -> tuple[Box, Box]:
+def begin(env: GraspEnv, keys: jax.Array) -> tuple[jax.Array, State]:
+    """The beginning of a grasp for each key, shape (environment,), and the keys of the next."""
+    pairs = jax.vmap(jax.random.split)(keys)
+    return pairs[:, 0], jax.vmap(env.reset)(pairs[:, 1])
+
+
+def where_done(state: State, fresh: State, other: State) -> State:
+    """Fresh grasps in the environments whose grasp has ended in `state`, and those of `other`."""
+
+    def either(new: jax.Array, old: jax.Array) -> jax.Array:
+        done = state.done.reshape(-1, *[1] * (new.ndim - 1)) > 0
+        return jnp.where(done, new, old)
+
+    return jax.tree.map(either, fresh, other)
+
+
+def spaces(env: GraspEnv) -> tuple[Box, Box]:
     """Spaces of observations and actions, of float32 whatever precision JAX has."""
     observation = Box(-np.inf, np.inf, (env.observation_size,), np.float32)
     return observation, Box(-1.0, 1.0, (env.action_size,), np.float32)
 
 
-def _keys(seeds: Sequence[Any]) -> jax.Array:
+def seed_keys(seeds: Sequence[Any]) -> jax.Array:
     """A key of each seed, any whole number; of 32 bits, so that x64 draws the same."""
     if bad := [s for s in seeds if isinstance(s, bool) or not isinstance(s, int | np.integer)]:
         raise InputError([f"a seed is a whole number, not {bad[0]!r:.60}"])
     return jax.vmap(jax.random.key)(np.array([int(s) % 2**32 for s in seeds], np.uint32))
 
 
-def _observed(state: State) -> np.ndarray:
+def observed(state: State) -> np.ndarray:
+    """What the agents observe, shape (environment, observation)."""
     return np.asarray(state.obs, np.float32)
 
 
-def _info(state: State) -> dict[str, Any]:
+def metrics(state: State) -> dict[str, Any]:
+    """Numbers to watch by name, shape (environment,)."""
     return {name: np.asarray(value) for name, value in state.metrics.items()}

@@ -4,19 +4,29 @@ import dataclasses
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import InputError
-from codesign_jax.types import Params, Tip, Trial
+from codesign_jax.types import Params, Tip, Trial, random_key_problem
 
 _TRIAL = Trial._make([(), (2,), (), (2,), (), (), (), (), (), (2,), None])
 """Shapes of one trial, without constants of its own."""
 
 
 def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -> None:
-    """Refuses hands and trials without their leading axes."""
+    """Refuses what are no hands and trials, and those without their leading axes."""
+    kinds = [
+        ("params", params, Params, "space.params(design) makes those of a design"),
+        ("trials", trials, Trial, "rollout.sample_trials(scene, key, count) draws some"),
+    ]
+    problems = [
+        f"{name} are a {type(value).__name__}, not {kind.__name__}; {hint}"
+        for name, value, kind, hint in kinds
+        if not isinstance(value, kind)
+    ]
+    if problems:
+        raise InputError(problems)
     fingers = (scene.num_fingers,)
     shapes = Params(*[fingers, fingers, fingers, (), (6,), fingers])  # type: ignore[list-item]
     problems = _problems("params", params._replace(control=None, tip=None), shapes, axes[0])
@@ -56,6 +66,9 @@ def refuse_other(scene: Any, engine: Any) -> None:
     """Refuses a scene that is not one that the engine was made for."""
     if not isinstance(scene, Scene):
         raise InputError([f"scene is a {type(scene).__name__}, not a Scene; scene.load reads one"])
+    if not hasattr(engine, "rollout"):
+        hint = "make_engine('structured', scene) makes one"
+        raise InputError([f"engine is a {type(engine).__name__}, not an engine; {hint}"])
     engine_scene = getattr(engine, "scene", None)
     if engine_scene is None or engine_scene.structure == scene.structure:
         return
@@ -93,11 +106,8 @@ def refuse_draws(key: Any, count: int) -> None:
     """Refuses arguments of `rollout.sample_trials` from which no trials can be drawn."""
     if not isinstance(count, int | np.integer) or count < 1:
         raise InputError([f"num_trials = {count} must be a whole number, at least 1"])
-    shape = jnp.shape(key)
-    kind = jnp.result_type(key)
-    if shape or not jnp.issubdtype(kind, jax.dtypes.prng_key):
-        words = f"key must be one typed key from jax.random.key, got shape {shape} of {kind}"
-        raise InputError([words])
+    if problem := random_key_problem(key):
+        raise InputError([problem])
 
 
 def _problems(name: str, batch: Any, shapes: Any, axis: str) -> list[str]:

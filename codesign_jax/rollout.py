@@ -159,6 +159,10 @@ def simulate(
 ) -> tuple[Outcome, Trace]:
     """Simulates a batch of worlds; jit it, with scene and engine closed over.
 
+    The scene's cost counts the time steps after a loss of the object, so that it is flat almost
+    everywhere: `jax.grad` of `Outcome.cost` is 0.0, without a warning.  What has a useful gradient
+    is a trace over a short window, as of `grasp(..., steps=40).distance[-1]`; docs/gradients.md.
+
     Args:
       scene: The scene; its numbers of shape () or (world,).
       engine: The engine, which may be that of any scene of the same structure.

@@ -71,6 +71,18 @@ MEANINGS = {
 _FAILURES = sum(bit for bit in Status if bit not in WARNINGS)
 
 
+def random_key_problem(key: Any, name: str = "key") -> str:
+    """Why a value is not one typed key, in words; empty if it is one."""
+    kind = getattr(key, "dtype", None)
+    if kind is None:
+        got = f"a {type(key).__name__}"
+    elif jnp.shape(key) or not jnp.issubdtype(kind, jax.dtypes.prng_key):
+        got = f"shape {jnp.shape(key)} of {kind}"
+    else:
+        return ""
+    return f"{name} must be one typed key from jax.random.key, got {got}"
+
+
 def failed(status: Any) -> Any:
     """Whether trials failed, bool; status: int or integer array of any shape."""
     return (status & _FAILURES) != 0

@@ -29,7 +29,7 @@ from codesign_jax.report import animation
 from codesign_jax.report.replay import Camera
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import cases
-from codesign_jax.scene import draws
+from codesign_jax.scene import design_files, draws
 
 RUNS = Path("runs") / "gallery"
 DOCS = Path("docs")
@@ -92,7 +92,9 @@ def find(hand: Hand) -> None:
     cli.main([*words, "--out", str(folder)])
     case = cases.case_of_run(folder)
     preset = runs.read_run(folder)[1].preset
-    text = common.design_text(case.space, common.DesignFile(preset, {}, **hand.names), case.design)
+    text = common.design_text(
+        case.space, design_files.DesignFile(preset, {}, **hand.names), case.design
+    )
     hand.design.write_text(text, encoding="utf-8")
 
 

@@ -33,7 +33,7 @@ from codesign_jax.model import overlap
 from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import cases, columns
-from codesign_jax.scene import beams, draws, parameters
+from codesign_jax.scene import beams, design_files, draws, parameters
 from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import command, copied, finished_run, own_workplace  # noqa: F401
 from tests.helpers.toy_engine import TINY
@@ -268,7 +268,7 @@ def test_a_design_is_opened_from_its_file(workplace, capsys, monkeypatch):
     sliding = scene.load("paper", overrides={"control": "slide"})
     space = parameters.design_space(sliding.hand, "23d")
     design = np.asarray(space.sample(jax.random.key(3), 1)[0])
-    file = common.DesignFile("23d", {}, objects="plate", control="slide")
+    file = design_files.DesignFile("23d", {}, objects="plate", control="slide")
     text = common.design_text(space, file, design)
     (workplace / "mine.toml").write_text(text)
     assert tomllib.loads(text)["preset"] == "23d"
@@ -278,6 +278,10 @@ def test_a_design_is_opened_from_its_file(workplace, capsys, monkeypatch):
     flags = common.Subject(objects="paper", design=(("mine.toml",),))
     named = common.load_scene(flags)
     assert (named.control.name, named.objects.name) == ("slide", "paper"), "a flag holds"
+    read = parameters.read_design("mine.toml", overrides={"gravity": 3.7})
+    np.testing.assert_array_equal(read.design, opened)
+    assert (read.scene.control.name, read.scene.objects.name) == ("slide", "plate")
+    assert (read.space.names, read.scene.gravity) == (space.names, 3.7)
     assert command("evaluate", "--dry-run", "--design", "mine.toml", "length[1]=90") == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     lengths = [f"{v:.4g}" for v in 1e3 * design[:4]]

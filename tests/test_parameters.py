@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from codesign_jax import cli, codesign, make_engine, rollout, scene
-from codesign_jax.commands import common
-from codesign_jax.scene import InputError, hand, parameters, schema, unit_slips
+from codesign_jax.scene import InputError, design_files, hand, parameters, schema, unit_slips
 from tests.helpers.toy_engine import TINY, tiny
 
 HAND = hand.load("pneuflex4")
@@ -245,6 +244,7 @@ SCENE, SPACE, ENGINE = tiny()
 PARAMS = jax.tree.map(np.asarray, SPACE.params(SPACE.default()))
 TRIAL = jax.tree.map(np.asarray, rollout.nominal_trial(SCENE))
 OPTIMIZER = codesign.make_filter(SPACE)
+TASK = codesign.Task(SCENE, SPACE, 2, ENGINE)
 
 
 def batch(tree, count):
@@ -256,8 +256,7 @@ def simulate(params, trials, **more):
 
 
 def evaluate(population):
-    made = codesign.Task(SCENE, SPACE, 2, ENGINE).evaluate
-    return made(jnp.asarray(population), jax.random.key(0))
+    return TASK.evaluate(jnp.asarray(population), jax.random.key(0))
 
 
 def draw(key, count):
@@ -285,6 +284,54 @@ CASES = {
         lambda: draw(0, 3),
         r"key must be one typed key from jax.random.key, got shape \(\) of int32",
     ),
+    "trials for a key": (
+        lambda: TASK.evaluate(SPACE.default()[None], batch(TRIAL, 2)),  # type: ignore[arg-type]
+        "key must be one typed key .*, got a Trial; rollout.evaluate takes trials",
+    ),
+    "trials for a key that draws trials": (
+        lambda: draw(batch(TRIAL, 2), 3),
+        "key must be one typed key .*, got a Trial",
+    ),
+    "trials for a key that draws designs": (
+        lambda: SPACE.sample(batch(TRIAL, 2), 3),
+        "key must be one typed key .*, got a Trial",
+    ),
+    "trials for a key that a search begins with": (
+        lambda: OPTIMIZER.init(batch(TRIAL, 2), SPACE.default(), 3),
+        "key must be one typed key .*, got a Trial",
+    ),
+    "a word for a key": (
+        lambda: TASK.evaluate(SPACE.default()[None], "seed"),  # type: ignore[arg-type]
+        "key must be one typed key .*, got a str",
+    ),
+    "several keys": (
+        lambda: TASK.evaluate(SPACE.default()[None], jax.random.split(jax.random.key(0), 2)),
+        r"key must be one typed key .*, got shape \(2,\) of key",
+    ),
+    "named parameters for a population": (
+        lambda: TASK.evaluate(batch(PARAMS, 2), jax.random.key(0)),
+        "population is a Params, not an array .*; rollout.evaluate takes Params",
+    ),
+    "a key for a state": (
+        lambda: TASK.episode(OPTIMIZER, jax.random.key(0)),  # type: ignore[arg-type]
+        "state is a PRNGKeyArray, not an optimiser's state",
+    ),
+    "trials for a scene": (
+        lambda: TASK.evaluate(SPACE.default()[None], jax.random.key(0), batch(TRIAL, 2)),  # type: ignore[arg-type]
+        "scene is a Trial, not a Scene",
+    ),
+    "designs for named parameters": (
+        lambda: simulate(SPACE.default()[None], batch(TRIAL, 1)),
+        "params are a ndarray, not Params; space.params",
+    ),
+    "hands and trials that changed places": (
+        lambda: simulate(batch(TRIAL, 2), batch(PARAMS, 2)),
+        "params are a Trial, not Params(.|\n)*trials are a Params, not Trial",
+    ),
+    "an engine's name for an engine": (
+        lambda: rollout.simulate(SCENE, "mujoco", batch(PARAMS, 1), batch(TRIAL, 1)),  # type: ignore[arg-type]
+        "engine is a str, not an engine; make_engine",
+    ),
     "a scene's name for a scene": (
         lambda: make_engine("structured", "paper"),  # type: ignore[arg-type]
         r"scene is 'paper', not a Scene; scene.load\('paper'\) reads it",
@@ -308,9 +355,10 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_what_is_wrong_is_said(case):
     call, words = CASES[case]
-    with pytest.raises((InputError, ValueError), match=words) as caught:
+    with pytest.raises((InputError, ValueError, TypeError), match=words) as caught:
         call()
-    assert isinstance(caught.value, InputError) or case == "millimetres at the start"
+    of_optimizer = {"millimetres at the start", "trials for a key that a search begins with"}
+    assert isinstance(caught.value, InputError) or case in of_optimizer
 
 
 def test_it_is_said_while_tracing():
@@ -331,7 +379,7 @@ def test_a_spread_that_turns_no_finger_is_named_and_not_searched(capsys):
         whole.params(whole.default()).spread
     )
     with pytest.raises(InputError, match="--design 'spread' has no effect: every finger has"):
-        common.parse_design(space, ["spread=20"], space.default())
+        design_files.parse(space, ["spread=20"], space.default())
     spread = hand.Preset("one", (hand.Free("spread"),))
     alone = dataclasses.replace(bare, preset=(spread,))
     with pytest.raises(InputError, match="leaves nothing to search: spread has no effect"):

@@ -502,6 +502,25 @@ def test_single_environments_pass_gymnasium_s_check(x64):
         assert worlds.observation_space.contains(obs) and reward.dtype == np.float64
 
 
+def test_stable_baselines3_batches_as_its_own_vector_environments_do():
+    """Ended grasps begin anew in the same step, and what was observed last is in the info."""
+    pytest.importorskip("stable_baselines3")
+    from codesign_jax.env.stable_baselines import BatchEnv
+
+    worlds = BatchEnv(Counted(SCENE), 3, seed=7)
+    first = worlds.reset()
+    np.testing.assert_array_equal(first, vector.VectorEnv(Counted(SCENE), 3, seed=7).reset()[0])
+    for k in range(3):
+        obs, reward, done, infos = worlds.step(np.full((3, 2), 0.5, np.float32))
+        np.testing.assert_allclose(reward, 0.5 * (k + 1))
+        assert done.all() == (k == 2) and obs.dtype == np.float32
+    np.testing.assert_allclose([info["terminal_observation"][1] for info in infos], 1.5)
+    assert (obs[:, 1] == 0).all() and not (obs[:, 0] == first[:, 0]).any()
+    worlds.seed(7)
+    np.testing.assert_array_equal(worlds.reset(), first)
+    assert worlds.env_is_wrapped(object) == [False] * 3 and worlds.get_attr("dt", [1]) == [0.05]
+
+
 @pytest.mark.slow  # a program and PyTorch; quick: Gymnasium's check above
 def test_stable_baselines3_trains_on_a_single_environment():
     """Its own check of environments, and PPO for two updates."""

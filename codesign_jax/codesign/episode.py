@@ -19,7 +19,7 @@ from codesign_jax.optimize import Info, Optimizer, OptimizerState, ParticleFilte
 from codesign_jax.reuse import SceneProgram, shared
 from codesign_jax.scene import InputError, Scene
 from codesign_jax.scene.parameters import DesignSpace
-from codesign_jax.types import Outcome, Params, Trial
+from codesign_jax.types import Outcome, Params, Trial, random_key_problem
 
 # Four ASCII letters, as the optimiser's streams and `experiment`'s, so that no two streams of a
 # seed meet.
@@ -46,13 +46,14 @@ class EpisodeInfo(NamedTuple):
     drawn: Trial
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Task:
     """A problem to optimise: grasps by hands of a design space, and their cost.
 
     Its functions are programs that all scenes of one structure share (`programs`): another scene of
     the same structure, as by `dataclasses.replace(scene, gravity=3.7)`, compiles nothing.
-    `jax.jit`, `jax.vmap` and so on work on them.
+    `jax.jit`, `jax.vmap` and so on work on them.  A cost by the scene's rule is flat almost
+    everywhere, and its gradient 0.0; see `rollout.simulate`.
 
     Attributes:
       space: Design space of the particles.
@@ -69,6 +70,10 @@ class Task:
     >>> task = Task(grasping, parameters.design_space(grasping.hand, "2d"), trials=3)
     >>> task.engine.name
     'structured'
+    >>> print(task)
+    3 trials of each design, engine structured, the scene's cost
+    2 parameters: length 10 to 180 mm, arm_z -60 to 200 mm
+    scene paper: ...
     """
 
     scene: Scene
@@ -94,7 +99,7 @@ class Task:
             hint = "parameters.design_space(scene.hand, '2d') makes one"
             problems.append(f"space is {self.space!r:.40}, not a DesignSpace; {hint}")
         if not isinstance(self.trials, int | np.integer) or self.trials < 1:
-            problems.append(f"trials = {self.trials!r} must be a whole number, at least 1")
+            problems.append(f"trials = {self.trials!r:.60} must be a whole number, at least 1")
         if problems:
             raise InputError(problems)
         if self.engine is None:
@@ -104,6 +109,15 @@ class Task:
         axes.refuse_other(self.scene, self.engine)
         self._options.refuse()
         devices.take(self.devices)
+
+    def __str__(self) -> str:
+        """In a few lines."""
+        name = getattr(self.cost, "__name__", type(self.cost).__name__)
+        cost = "the scene's cost" if self.cost is None else f"cost {name}"
+        words = f"{self.trials} trials of each design, engine {self.engine.name}, {cost}"
+        return f"{words}\n{self.space}\n{self.scene}"
+
+    __repr__ = __str__
 
     @property
     def _options(self) -> rollout.Options:
@@ -125,9 +139,12 @@ class Task:
           scene: A scene with other numbers, of shape () or (trial,).
 
         Raises:
-          InputError: If the population or the scene do not fit, and see `DesignSpace.check`,
-            which warns of designs that are not legal.
+          InputError: If the population, the key or the scene do not fit, and see
+            `DesignSpace.check`, which warns of designs that are not legal.
         """
+        if problem := random_key_problem(key):
+            hint = "; rollout.evaluate takes trials" if isinstance(key, Trial) else ""
+            raise InputError([problem + hint])
         self.space.refuse_population(population)
         self.space.check(population)
         return SceneProgram(self.scene, self._programs.evaluate)(
@@ -153,6 +170,7 @@ class Task:
           scene: A scene with other numbers, of shape () or (trial,), but for `cost.maximum`, which
             is one number.
         """
+        _refuse_state(state)
         mask = np.ones(self.space.num_parameters, bool) if mask is None else mask
         return self._joined(self._programs.episode, optimizer)(state, mask, scene)
 
@@ -186,6 +204,7 @@ class Task:
         Returns:
           The state at the end, and reports with leading axis (episode,).
         """
+        _refuse_state(state)
         return self._joined(self._programs.run, optimizer)(state, masks, scene)
 
     @functools.cached_property
@@ -265,6 +284,13 @@ def _programs(
         return jax.lax.scan(step, state, jnp.asarray(masks))
 
     return _Programs(evaluate, episode, jax.vmap(episode, in_axes=(0, 0, None, None)), run)
+
+
+def _refuse_state(state: Any) -> None:
+    if not hasattr(state, "particles"):
+        kind = type(state).__name__
+        hint = "optimizer.init(key, design, num_particles) makes the first"
+        raise InputError([f"state is a {kind}, not an optimiser's state; {hint}"])
 
 
 def _refuse_mask(space: DesignSpace, mask: jax.typing.ArrayLike) -> None:

@@ -2,10 +2,8 @@
 
 import dataclasses
 import importlib.util
-import math
 import re
 import tempfile
-from collections import Counter
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
@@ -25,7 +23,8 @@ from codesign_jax.runs import cases, tables
 from codesign_jax.runs.cases import Case
 from codesign_jax.runs.progress import Meter
 from codesign_jax.runs.reading import Tell
-from codesign_jax.scene import Scene, draws, keypaths, library, objects, schema, texts
+from codesign_jax.scene import Scene, design_files, draws, keypaths, objects, schema
+from codesign_jax.scene.design_files import DesignFile
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.scene.schema import InputError
 from codesign_jax.terminal import Console
@@ -34,11 +33,6 @@ from codesign_jax.user_code import make_policy
 
 MOST = 1000
 """Most runs of one command: a guard against a slip such as 0-99999."""
-SCENE = "paper"
-PRESET = "2d"
-"""Scene and design space where none is named."""
-
-
 OFF = ("off",)
 """Value of --tolerances where it is not given."""
 
@@ -67,18 +61,6 @@ def changes(options: TrialFlags) -> dict[keypaths.Path, Any]:
     noise = dataclasses.asdict(objects.ROBUST) if options.robust else {}
     values |= {("objects", "noise", name): value for name, value in noise.items()}
     return values | keypaths.parse(chain.from_iterable(options.overrides))
-
-
-@dataclasses.dataclass(frozen=True)
-class DesignFile:
-    """A design as a .toml file, see `design_text`; what it is simulated in, unless flags say it."""
-
-    preset: str  # design space that the names belong to
-    design: dict  # numbers by name in the hand file's units, or arrays with one for each finger
-    scene: str = SCENE
-    hand: str = ""
-    objects: str = ""
-    control: str = ""
 
 
 def design_file(options: SceneFlags) -> DesignFile:
@@ -171,23 +153,15 @@ def design_text(space: DesignSpace, file: DesignFile, design: np.ndarray) -> str
 def open_designs(words: Sequence[str]) -> tuple[dict[str, list[str]], DesignFile]:
     """Splits the words of --design into NAME=VALUE pairs, by the file that has them; the file."""
     pairs_by_file: dict[str, list[str]] = {}
-    file = DesignFile(PRESET, {})
+    file = DesignFile(design_files.PRESET, {})
     direct = []
     for word in keypaths.joined(words):
         if "=" in word or not word.endswith(".toml"):
             direct.append(word)
             continue
-        problems: list[str] = []
         path = Path(word)
-        file = schema.parse(DesignFile, library.read(path), path.name, problems)
-        if file is None:
-            raise InputError(problems)
-        pairs = pairs_by_file.setdefault(path.name, [])
-        for name, value in file.design.items():
-            if isinstance(value, list):
-                pairs += [f"{name}[{k}]={v}" for k, v in enumerate(value)]
-            else:
-                pairs.append(f"{name}={value}")
+        file = design_files.read(path)
+        pairs_by_file.setdefault(path.name, []).extend(file.pairs)
     return pairs_by_file | {"--design": direct}, file
 
 
@@ -195,57 +169,14 @@ def find_design(space: DesignSpace, words: Sequence[str]) -> np.ndarray:
     """The design that --design names: files and NAME=VALUE, later words hold; SI, (parameter,)."""
     design = space.default()
     for where, pairs in open_designs(words)[0].items():
-        design = parse_design(space, pairs, design, where)
+        design = design_files.parse(space, pairs, design, where)
     return design
-
-
-def parse_design(
-    space: DesignSpace, pairs: Sequence[str], base: np.ndarray, where: str = "--design"
-) -> np.ndarray:
-    """A design after NAME=VALUE in the hand file's units; base and result in SI, (parameter,)."""
-    values = dict(zip(space.names, space.in_units(base), strict=True))
-    lows = dict(zip(space.names, space.in_units(np.array(space.low)), strict=True))
-    highs = dict(zip(space.names, space.in_units(np.array(space.high)), strict=True))
-    units = dict(zip(space.names, space.units, strict=True))
-    entries = [pair.partition("=") for pair in pairs]
-    # A name without an index is all fingers' parameter: one value for each of them.
-    entries = [(each, v) for name, _, v in entries for each in _members(name, space)]
-    problems = [
-        f"{where} {name!r} is given more than once: {', '.join(v for n, v in entries if n == name)}"
-        for name, count in Counter(name for name, _ in entries).items()
-        if count > 1
-    ]
-    for name, text in entries:
-        if name in dict(space.idle):
-            words = f"{where} {name!r} has no effect: {dict(space.idle)[name]}; leave it out"
-            problems.append(words)
-            continue
-        if name not in values:
-            problems.append(f"{where} {name!r} is not a parameter; {schema.nearest(name, values)}")
-            continue
-        value = number(text)
-        # Bounds went to SI and back; the last bit of that is no reason to refuse one.
-        low, high = (round(float(b[name]), 9) for b in (lows, highs))
-        if value is None:
-            problems.append(f"{where} {name} = {text!r} must be a number in {units[name]}")
-        elif problem := schema.range_problem(f"{where} {name}", value, units[name], low, high):
-            problems.append(problem)
-        else:
-            values[name] = value
-    if problems:
-        raise InputError(problems)
-    return np.clip(space.from_units(np.array(list(values.values()))), space.low, space.high)
-
-
-def _members(name: str, space: DesignSpace) -> list[str]:
-    each = [n for n in space.names if n.split("[")[0] == name]
-    return each if name not in space.names and each else [name]
 
 
 def by_default(space: DesignSpace, words: Sequence[str]) -> str:
     """Says which parameters of a design are the hand file's defaults; empty if none is."""
     pairs = chain.from_iterable(open_designs(words)[0].values())
-    names = {each for pair in pairs for each in _members(pair.partition("=")[0], space)}
+    names = {each for pair in pairs for each in design_files.members(pair.partition("=")[0], space)}
     defaults = [name for name in space.names if name not in names]
     if not defaults:
         return ""
@@ -317,14 +248,6 @@ def engine_problems(name: str, overrides: Sequence[Sequence[str]] = ()) -> list[
 def counted(number: int, noun: str, plural: str = "s") -> str:
     """A number of things in words, such as "1 call" and "2 calls"."""
     return f"{number} {noun}{'' if number == 1 else plural}"
-
-
-def number(text: str) -> float | None:
-    try:
-        value = float(texts.typed(text))
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
 
 
 def policy_notes(engine: Engine, params: Params) -> list[str]:

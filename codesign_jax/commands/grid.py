@@ -10,7 +10,7 @@ import numpy as np
 from codesign_jax.commands import common
 from codesign_jax.commands.flags import Landscape as Options
 from codesign_jax.runs.cases import Case
-from codesign_jax.scene import Scene, schema
+from codesign_jax.scene import Scene, design_files, schema
 from codesign_jax.scene.schema import InputError
 
 
@@ -64,8 +64,8 @@ def _problem(word: str, case: Case) -> str:
 def _range(text: str) -> list[float]:
     """The two numbers of LOW:HIGH, or nothing."""
     low, _, high = text.partition(":")
-    first = common.number(low)
-    last = common.number(high)
+    first = design_files.number(low)
+    last = design_files.number(high)
     return [first, last] if first is not None and last is not None and first < last else []
 
 

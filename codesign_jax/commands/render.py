@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from codesign_jax.commands import common, grasp
 from codesign_jax.commands.flags import Render
 from codesign_jax.runs.progress import Busy
-from codesign_jax.scene import schema
+from codesign_jax.scene import design_files, schema
 from codesign_jax.terminal import Console
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def _camera(words: Sequence[str]) -> "Camera":
             problems.append(f"--camera {name!r} is no view and no number of a camera; {hint}")
             continue
         unit, most = _LIMITS[name]
-        value = common.number(text)
+        value = design_files.number(text)
         least = 0.05 if name == "distance" else -most  # MuJoCo cuts what is nearer than 1 cm
         if value is None:
             problems.append(f"--camera {name}={text} must be a number [{unit}]")

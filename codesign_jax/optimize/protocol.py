@@ -18,6 +18,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from codesign_jax.optimize.bounds import Space
+from codesign_jax.types import random_key_problem
 
 
 class OptimizerState(NamedTuple):
@@ -100,7 +101,7 @@ class Optimizer(Protocol):
           num_particles: Particles that every episode evaluates.
 
         Raises:
-          TypeError: If `key` is not a typed key.
+          TypeError: If `key` is not one typed key.
           ValueError: If the shape of the seed particle or the number of particles is wrong, or the
             seed particle lies far outside the box.
         """
@@ -136,8 +137,8 @@ def check_start(
     space: Space, key: jax.Array, seed_particle: ArrayLike, num_particles: int, most: int
 ) -> jax.Array:
     """Checks the arguments of `init`; returns the seed particle as an array of floats."""
-    if not jnp.issubdtype(kind := jnp.result_type(key), jax.dtypes.prng_key):
-        raise TypeError(f"key must be a typed key from jax.random.key, got {kind}")
+    if problem := random_key_problem(key):
+        raise TypeError(problem)
     seed_particle = jnp.asarray(seed_particle, float)
     if seed_particle.shape != jnp.shape(space.low):
         raise ValueError(f"{seed_particle.shape=}, expected {jnp.shape(space.low)}")

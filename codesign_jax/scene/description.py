@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
+import numpy as np
 
 from codesign_jax.scene import draws, hand, key_frames, objects, schema
 from codesign_jax.scene.schema import quantity
@@ -106,12 +107,31 @@ class Scene(SceneFile):
         """The other scene if there is one, else this one, with numbers in their ranges.
 
         Raises:
-          InputError: See `scene.constants.check`.
+          InputError: If the other one is no scene, and see `scene.constants.check`.
         """
         from codesign_jax.scene.constants import check
 
-        check(scene := other or self)
+        scene = self if other is None else other
+        if not isinstance(scene, Scene):
+            kind = type(scene).__name__
+            raise schema.InputError([f"scene is a {kind}, not a Scene; scene.load reads one"])
+        check(scene)
         return scene
+
+    def __str__(self) -> str:
+        """In a few lines; `repr` has every number."""
+        shapes = ", ".join(shape.name for shape in self.objects.object)
+        ends = ", ".join(f"{name} {_number(end)}" for name, end in self.phase_ends.items())
+        step = _number(1e3 * self.discretization.timestep)
+        return "\n".join(
+            [
+                f"scene {self.name}: {self.description}",
+                f"hand {self.hand.name}: {self.num_fingers} fingers",
+                f"objects {self.objects.name}: {shapes}",
+                f"control {self.control.name}: {self.control.description}",
+                f"{self.num_steps} steps of {step} ms; phases end at [s]: {ends}",
+            ]
+        )
 
     @functools.cached_property
     def bare(self) -> "Scene":
@@ -211,6 +231,11 @@ class Scene(SceneFile):
                 f"grasp ends with {[*self.phase_ends][-1]!r}"
             )
         return f"phase {phase!r} unknown; {schema.nearest(str(phase), self.phase_ends)}"
+
+
+def _number(value: Any) -> str:
+    """A number of a scene, which may be an array or traced."""
+    return f"{value:g}" if isinstance(value, int | float) else f"<{np.shape(value)}>"
 
 
 @functools.cache

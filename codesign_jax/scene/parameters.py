@@ -20,19 +20,21 @@ import dataclasses
 import functools
 import re
 import warnings
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.scene import schema, unit_slips
+from codesign_jax.scene import design_files, loading, schema, unit_slips
 from codesign_jax.scene.buildable import Buildable, on_lines
+from codesign_jax.scene.description import Scene
 from codesign_jax.scene.hand import UNITS, Free, Hand, Parameter, Preset, Valves, structure
 from codesign_jax.scene.hand_tables import PARAMETERS, TIP, highest_pressure, per_finger
-from codesign_jax.types import Params, Tip
+from codesign_jax.types import Params, Tip, random_key_problem
 
 # The limit is strict (p_i < d_i * 80 kPa / 2 mm); this margin keeps it so in float32.
 _STRICT = 1.0 - 1e-6
@@ -68,6 +70,16 @@ class DesignSpace:
     source: tuple[int, ...]
     idle: tuple[tuple[str, str], ...] = ()
     buildable: Buildable | None = None
+
+    def __str__(self) -> str:
+        """In a line or two; parameters of several fingers with the same bounds stand together."""
+        entries = zip(self.names, self.units, self.scale, *self.bounds, strict=True)
+        counts: dict[str, int] = {}
+        for name, unit, scale, low, high in entries:
+            words = f"{name.split('[')[0]}{{}} {low / scale:.6g} to {high / scale:.6g} {unit}"
+            counts[words] = counts.get(words, 0) + 1
+        rows = [words.format(f" ({n})" if n > 1 else "") for words, n in counts.items()]
+        return f"{self.num_parameters} parameters: {', '.join(rows)}"
 
     @property
     def low(self) -> np.ndarray:
@@ -286,6 +298,11 @@ class DesignSpace:
         Raises:
           InputError: If the shape is another one.
         """
+        rows = isinstance(population, list | tuple) and not isinstance(population, Params)
+        if not rows and not hasattr(population, "ndim"):
+            words = f"population is a {type(population).__name__}, not an array of designs [SI]"
+            hint = "; rollout.evaluate takes Params" if isinstance(population, Params) else ""
+            raise schema.InputError([words + hint])
         if np.ndim(population) != 2:
             shape = np.shape(population)
             hint = "; population[None] makes a batch of one" if len(shape) == 1 else ""
@@ -454,11 +471,8 @@ def _representable(space: DesignSpace) -> tuple[np.ndarray, np.ndarray]:
 def _refuse_draws(key: Any, n: Any) -> None:
     if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
         raise schema.InputError([f"n = {n!r} designs must be a whole number, at least 1"])
-    shape = jnp.shape(key)
-    kind = jnp.result_type(key)
-    if shape or not jnp.issubdtype(kind, jax.dtypes.prng_key):
-        words = f"key must be one typed key from jax.random.key, got shape {shape} of {kind}"
-        raise schema.InputError([words])
+    if problem := random_key_problem(key):
+        raise schema.InputError([problem])
 
 
 def fingers_of(name: str) -> list[int]:
@@ -518,6 +532,61 @@ def design_space(hand: Hand, preset: str = "full") -> DesignSpace:
             raise schema.InputError([f"preset {preset!r} unknown for hand {hand.name}; {hint}"])
         chosen = known[preset]
     return _build(hand, chosen, everything=chosen.whole)
+
+
+class Design(NamedTuple):
+    """A design with its scene.
+
+    Attributes:
+      scene: The scene that its file names.
+      space: Design space of its preset.
+      design: The design [SI units], shape (parameter,).
+    """
+
+    scene: Scene
+    space: DesignSpace
+    design: np.ndarray
+
+
+def read_design(
+    path: str | Path,
+    *,
+    accuracy: str | Path | None = None,
+    overrides: Mapping[Any, Any] | None = None,
+) -> Design:
+    r"""Reads a design file, as `codesign studio` writes it and every command takes it.
+
+    Parameters that the file leaves out have the hand file's defaults.
+
+    Args:
+      path: The file, .toml.
+      accuracy: As of `scene.load`.
+      overrides: As of `scene.load`.
+
+    Raises:
+      InputError: With every problem of the file, or of the scene that it names.
+
+    >>> import pathlib, tempfile
+    >>> from codesign_jax import parameters
+    >>> path = pathlib.Path(tempfile.mkdtemp(), "mine.toml")
+    >>> _ = path.write_text('preset = "2d"\n[design]\nlength = 95\narm_z = 30')  # mm
+    >>> grasping, space, design = parameters.read_design(path)
+    >>> space.names, design
+    (('length', 'arm_z'), array([0.095, 0.03 ]))
+    """
+    file = design_files.read(Path(path))
+    control = {("control",): file.control} if file.control else {}
+    scene = loading.load(
+        file.scene,
+        hand_name=file.hand or None,
+        object_set=file.objects or None,
+        accuracy=accuracy,
+        overrides=control | dict(overrides or {}),
+    )
+    space = design_space(scene.hand, file.preset)
+    return Design(
+        scene, space, design_files.parse(space, file.pairs, space.default(), Path(path).name)
+    )
 
 
 def without_effect(hand: Hand) -> dict[str, str]:

@@ -19,9 +19,7 @@ import gc
 import hashlib
 import importlib.metadata
 import os
-import sys
 import time
-import types
 import zlib
 from collections.abc import Callable, Hashable
 from pathlib import Path
@@ -32,11 +30,8 @@ from codesign_jax import files  # NumPy and JAX are imported where they are used
 ROOT = Path(__file__).parent
 UNRELATED = ("commands", "export", "optimize", "report", "runs", "studio")
 """Folders that no simulation depends on: they import engines, never the other way."""
-_UNTRACED = ("compiler", "files", "reuse", "array_files")
-"""What is not traced: to replace a name there is to change the machinery and no physics."""
-
 # The code that runs.  An editor or `git checkout` may change files after the import, so their state
-# is noted before the first module is imported, and what modules define when the engine is.
+# is noted before the first module is imported.
 
 
 def _state() -> dict[str, tuple[int, ...]]:
@@ -57,16 +52,14 @@ def _state() -> dict[str, tuple[int, ...]]:
 
 
 at_import = _state()
-_defined: dict[str, dict[str, object]] = {}
 
 
-def code_digest(*, traced: bool = True) -> str | None:
+def code_digest() -> str | None:
     """Digest of the code that this process runs; None if it is not known: nothing is reused then.
 
-    It is not known once a file was edited after the import, or, of what is `traced`, once a name
-    was replaced, as by IPython's autoreload.
+    It is not known once a file was edited after the import.
     """
-    if (traced and replaced()) or _state() != at_import:
+    if _state() != at_import:
         return None
     current = _content_digest()
     return current if _state() == at_import else None  # edited while it was read
@@ -81,44 +74,9 @@ def _content_digest() -> str:
     return sha.hexdigest()
 
 
-def note() -> None:
-    """Notes what the modules that have been imported so far define, see `replaced`."""
-    for name, module in list(sys.modules.items()):
-        parts = name.split(".")
-        if parts[0] == __package__ and parts[1:2] and name not in _defined:
-            if parts[1] not in (*UNRELATED, *_UNTRACED):
-                _defined[name] = _names(module)
-
-
-def replaced() -> list[str]:
-    """Names of modules and classes that are not what they were when their module was noted."""
-    note()
-    return [
-        f"{module}.{name}"
-        for module, names in _defined.items()
-        for now in [_names(sys.modules.get(module))]
-        for name, value in names.items()
-        if now.get(name) is not value
-    ]
-
-
-def _names(module: object) -> dict[str, object]:
-    members = {}
-    home = getattr(module, "__name__", None)
-    for name, value in getattr(module, "__dict__", {}).items():
-        if name.startswith("__"):
-            continue
-        members[name] = value
-        if getattr(value, "__module__", None) == home and isinstance(value, types.FunctionType):
-            members[f"{name}()"] = value.__code__
-        elif getattr(value, "__module__", None) == home and isinstance(value, type):
-            members |= {f"{name}.{key}": v for key, v in vars(value).items() if key[:2] != "__"}
-    return members
-
-
-def key(*parts: object, traced: bool = True) -> str | None:
+def key(*parts: object) -> str | None:
     """Name of what this code and these versions make of the parts; None: see `code_digest`."""
-    code = code_digest(traced=traced)
+    code = code_digest()
     return None if code is None else digest(code, *map(_version, _COMPILERS), *parts)
 
 

@@ -374,6 +374,3 @@ def _by_own(
     status = result.status | as_bit(~jnp.isfinite(value), Status.NONFINITE)
     value = jnp.where(failed(status), scene.cost.maximum, value)
     return result._replace(cost=value.astype(result.cost.dtype), status=status)
-
-
-reuse.note()  # what programs are traced from has been imported

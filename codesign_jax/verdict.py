@@ -293,48 +293,6 @@ def _goes_on(outcomes: Outcome, most: int) -> bool:
     return counts.total < most and word(counts.kept, counts.total) == OPEN
 
 
-class Characteristic(NamedTuple):
-    """Behaviour of the test `sequential` for a design with a given true share of kept grasps."""
-
-    good: float  # probabilities of the three ends
-    not_good: float
-    undecided: float
-    grasps: float  # expected number of grasps
-
-
-def characteristic(share: float, batch: int = BATCH, most: int = MOST) -> Characteristic:
-    """Operating characteristic and average sample number of the test, exactly.
-
-    The distribution of the number of losses is followed from batch to batch.
-
-    Args:
-      share: Share of its grasps that the design keeps.
-      batch: Grasps between two looks.
-      most: Most grasps.
-    """
-    from scipy import stats  # takes half a second to import: commands do so once they are done
-
-    undecided = np.ones(1)
-    ends = np.zeros(2)
-    expected = 0.0
-    total = 0
-    while total < most:
-        count = min(batch, most - total)
-        total += count
-        losses = stats.binom.pmf(np.arange(count + 1), count, 1 - share)
-        undecided = np.convolve(undecided, losses)
-        ratio = evidence(total - np.arange(undecided.size), total)  # type: ignore[arg-type]
-        decided = ratio >= _DECISIVE - 1e-9, ratio <= -_DECISIVE + 1e-9
-        now = np.array([undecided[region].sum() for region in decided])
-        ends += now
-        expected += total * now.sum()
-        undecided = np.where(decided[0] | decided[1], 0.0, undecided)
-    undecided_share = float(undecided.sum())
-    return Characteristic(
-        float(ends[0]), float(ends[1]), undecided_share, float(expected + total * undecided_share)
-    )
-
-
 def _percent(share: float) -> str:
     text = f"{100 * share:.0f}"
     lifted = text in ("95", "100") and 100 * share < float(text)

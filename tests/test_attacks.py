@@ -23,7 +23,7 @@ import pytest
 import rich.table
 
 from codesign_jax import array_files, files, runs, scene, terminal
-from codesign_jax.commands import check, hosts, reference, status
+from codesign_jax.commands import check, reference, status
 from codesign_jax.compiler.ffi import KernelUnavailable
 from codesign_jax.export import process, sheet
 from codesign_jax.runs import directory, manifest, progress, scene_files
@@ -35,7 +35,6 @@ from codesign_jax.stress import Stress
 from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import command, own_workplace  # noqa: F401
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*they have no effect any more")
 DATA = Path(__file__).parent / "data"
 HOSTILE = "\x1b]0;owned\x07\nsecond\r\u202e\u2028line"
 SHOWN = r"\x1b]0;owned\x07\nsecond\r\u202e\u2028line"
@@ -419,24 +418,3 @@ def test_a_cost_that_is_no_number_is_blamed_itself(bad_step, blamed):
         run_of.refuse_all_failed(outcome, Path("r"), "mine:c")
     assert ("--cost mine:c returned NaN" in str(error.value)) == blamed
     assert ("timestep" in str(error.value)) != blamed
-
-
-def test_a_process_says_for_whom_it_waits(monkeypatch, capsys):
-    """JAX's own wait is a stand-in that ticks for the thread."""
-    now = [0.0]
-    monkeypatch.setattr(progress, "time", types.SimpleNamespace(monotonic=lambda: now[0]))
-    shown = []
-    begin = progress.Busy.begin
-    monkeypatch.setattr(progress.Busy, "begin", lambda s, t: (shown.append(s), begin(s, t))[1])
-
-    def wait(*where, **options):
-        now[0] = 6.0
-        shown[-1].tick()
-
-    monkeypatch.setattr(jax.distributed, "initialize", wait)
-    before = jax.config.jax_platforms
-    try:
-        hosts.join("node0:1234,3,1")
-    finally:
-        jax.config.update("jax_platforms", before)
-    assert "waiting for 2 other processes at node0:1234" in capsys.readouterr().err

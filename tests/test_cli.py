@@ -56,7 +56,6 @@ WRONG = {
     "optimize --particles 0": "--particles = 0 is outside [1, 32768]",
     "optimize --set discretization.links=3.5": "discretization.links = 3.5 must be a whole number",
     "optimize --seeds 0-": "--seeds '0-' must be seeds such as 0-9 or 1,3,5",
-    "optimize --seeds 0-1 --distributed node0:1234,2,2": "must be auto or ADDRESS:PORT,PROCESSES",
     "optimize --seeds 0-1 --seed 1": "--seeds exclude",
     "optimize --set solver.tolerance=1e-9": "engine structured: --set solver.tolerance=1e-09",
     "optimize --hand pneuflex5 --engine mujco --seed -1 --set gravity=1000 cost.failur=worst": (

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from codesign_jax import reuse
 from codesign_jax import scene as scenes
 from codesign_jax.compiler import launch
 from codesign_jax.engines.structured import StructuredEngine, lanewise
@@ -112,7 +113,8 @@ def test_a_step_reads_nothing_that_it_has_not_written(monkeypatch):
         return advance(self, *args, **kwargs)
 
     monkeypatch.setattr(Step, "advance", spoiled)
-    # Kernels are kept by their scene and limits: nobody else has this tolerance.
+    monkeypatch.setattr(reuse, "code_digest", lambda: None)  # no kernel of the whole step is found
+    # Programs are kept by their scene and limits: nobody else has this tolerance.
     options = {"backend": "cpu", "width": 4 * shared_memory.TEAM, "team": shared_memory.TEAM}
     program = Program(scene, Limits(8, 8, 1.02e-6), **options)
     start = StructuredEngine(scene).reset(fields)

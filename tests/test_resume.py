@@ -9,7 +9,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 
 import jax
 import numpy as np
@@ -208,7 +207,7 @@ def test_a_run_keeps_its_optimiser(finished, tmp_path, capsys):
     assert runs.read_run(copy)[1].optimizer == "particle-filter"
 
 
-# --- many runs of one command: in one batch, on several hosts, and how they end ----------------
+# --- many runs of one command: in one batch, and how they end ------------------------------------
 
 
 BASE = without(RUN, "--seed")
@@ -292,30 +291,3 @@ def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch
     assert "of 3 runs found a good design" in capsys.readouterr().out
     assert command(*run, "--out", tmp_path / "whole") == 0
     assert_same_run(runs_folder / "seed-4", tmp_path / "whole" / "seed-4")
-
-
-@pytest.mark.slow
-def test_hosts_share_the_seeds(tmp_path, capsys):
-    """Two processes of JAX's distributed runtime on this host."""
-    run = [*BASE, "--episodes", "2", "--seeds", "3-5"]
-    assert command(*run, "--out", tmp_path / "one") == 0
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    hosts = [
-        launch(*run, "--out", tmp_path / "two", "--distributed", f"{address},2,{k}") for k in (0, 1)
-    ]
-    outputs = [host.communicate()[0] for host in hosts]
-    assert [host.returncode for host in hosts] == [0, 0], outputs
-    # Each seed beside other ones: it draws the same numbers, and rounds otherwise.
-    names = ("seed-3", "seed-4", "seed-5")
-    first, second = (
-        [runs.load_record(tmp_path / k / name) for name in names] for k in ("one", "two")
-    )
-    for a, b in zip(first, second, strict=True):
-        np.testing.assert_allclose(a.history.population[0], b.history.population[0], rtol=1e-5)
-        assert b.done == 2 and b.test is not None
-    tables = [(tmp_path / name / "seeds.csv").read_text().count("\n") for name in ("one", "two")]
-    assert tables == [4, 4]
-    assert "of 3 runs found a good design" in outputs[0]
-    assert "seed 4: final test" not in outputs[0] and "of 3 runs" not in outputs[1]

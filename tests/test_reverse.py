@@ -218,7 +218,7 @@ def planted(faults):
 
         patch.setattr(adjoint_step.ReverseStep, "__init__", prepare)
         # Sound kernels must neither be found in the place of this one nor find it.
-        patch.setattr(reuse, "code_digest", lambda **_: f"planted: {sorted(faults)}")
+        patch.setattr(reuse, "code_digest", lambda: f"planted: {sorted(faults)}")
         patch.setattr(adjoint, "of_code", lambda _: None)
         patch.setattr(reuse, "kept", lambda path, build: build())
         yield

@@ -185,7 +185,6 @@ def test_an_unexpected_error_keeps_its_traceback(run, monkeypatch, capsys):
 # --- runs that commit e99f8c5 made ----------------------------------------------------------------
 
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*they have no effect any more")
 DATA = Path(__file__).parent / "data"
 # Archive, run folder in it, episodes that are done and those that were asked for. The search in 23D
 # was stopped; the seeds grasp a sphere and a mesh.

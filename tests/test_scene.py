@@ -325,15 +325,6 @@ def test_phases_out_of_order():
     ]
 
 
-def test_keys_of_earlier_scene_files_are_read_with_a_warning():
-    gone = {"contact.time_constant": 0.04, "effects.soft_touch": True}
-    with pytest.warns(UserWarning, match="without effects.soft_touch, contact.time_constant:"):
-        loaded = scene.load("paper", overrides=gone)
-    assert loaded == scene.load("paper")
-    with pytest.raises(schema.InputError, match="contact.impedence"):
-        scene.load("paper", overrides={"contact.impedence": 0.9})
-
-
 def test_all_problems_of_all_files_at_once(tmp_path):
     hand_path = edited(
         tmp_path, "hands", "pneuflex4", ("width = 0.024", "width = 18"), ("low = 10", "low = 190")

@@ -192,9 +192,6 @@ class Optimize(Command, SceneFlags):
     """Most grasps that a device simulates in one call; default: 16384. Runs that have no
     room go on when the others have ended. Larger calls are faster on a GPU that has memory
     for them (docs/performance.md)."""
-    distributed: Text = None
-    """With --seeds, one process on each of several hosts, which share the seeds: auto under SLURM
-    or MPI, or ADDRESS:PORT,PROCESSES,INDEX. The folder must be one that all see."""
     out: File = None
     """Run folder; default: runs/HAND-PRESET-SCHEDULE-SEED, with the optimiser before the seed if
     it is another. With --seeds or several --schedule a folder of run folders."""

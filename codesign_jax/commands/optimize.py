@@ -1,7 +1,6 @@
 """`codesign optimize`."""
 
 import dataclasses
-import functools
 import os
 import shlex
 import sys
@@ -14,7 +13,7 @@ import jax
 import numpy as np
 
 from codesign_jax import codesign, engines, files, optimize, preflight, runs, stress, verdict
-from codesign_jax.commands import common, compare, hosts, reference, status
+from codesign_jax.commands import common, compare, reference, status
 from codesign_jax.commands.flags import Optimize
 from codesign_jax.report import verdicts
 from codesign_jax.report.verdicts import Judged
@@ -36,8 +35,6 @@ _LONGEST = 200
 
 def main(options: Optimize) -> int:
     common.use_compilation_cache()
-    if options.distributed is not None:
-        return _distributed(options)
     scene, settings = resolve(options)
     every = runs_of(options, scene, settings)
     plan = runs.prepare(scene, settings)
@@ -85,21 +82,6 @@ def _tell_error(name: str, error: Exception) -> None:
         say(*"".join(traceback.format_exception(error)).splitlines(), error=True)
         name += f"{type(error).__name__}: "
     say(f"error: {name}{status.words(error)}", error=True)
-
-
-def _distributed(options: Optimize) -> int:
-    """Runs this host's share of the seeds; the first host compares all of them."""
-    hosts.check(options.distributed or "")
-    problems = []
-    if options.seeds is None:
-        problems.append("--distributed needs --seeds: the hosts share the runs of several seeds")
-    if options.dry_run:
-        problems.append("--dry-run knows one host: leave out --distributed")
-    common.refuse(problems)
-    code, index = hosts.run(options)
-    if index or code == 2 or code >= 128:
-        return code
-    return hosts.in_a_process(functools.partial(_compare, options)) or code
 
 
 def _compare(options: Optimize) -> int:

@@ -1,7 +1,6 @@
 """Scene files: read with hand, objects and an accuracy, and checked as a whole."""
 
 import dataclasses
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,16 +22,6 @@ from codesign_jax.scene.description import Scene, SceneFile
 from codesign_jax.scene.primitives import PRIMITIVES
 from codesign_jax.scene.tables import Accuracy, Fixture
 
-GONE = (
-    "effects.soft_touch",
-    "effects.speculative_palm",
-    "contact.touch_depth",
-    "contact.time_constant",
-    "contact.impedance",
-    "discretization.spring_damping",
-)
-"""Keys of earlier scene files, which have no effect any more; see docs/hull.md and, for the last,
-`discretization.integrator` in docs/physics.md, whose default is the former "added"."""
 _OF_ACCURACY = ("discretization", "solver", "newton")
 """Tables of a scene that an accuracy replaces values of."""
 
@@ -64,7 +53,6 @@ def load(
     table = library.read(path)
     problems: list[str] = []
     changes = keypaths.flatten(_preset(accuracy, problems)) | keypaths.flatten(overrides or {})
-    _leave_out(table, changes, path.name)
     inside = {key: keypaths.below(changes, key) for key in ("hand", "objects", "control")}
     top_level = {p: v for p, v in changes.items() if p[0] not in inside or len(p) == 1}
     key_paths = keypaths.apply(table, top_level, path.name, problems)
@@ -152,20 +140,6 @@ def _with_law(scene: SceneFile, material: hand.Material, where: str, problems: l
         problems.append(problem)
     law = silicones.of_law(material.law) if law is None else law
     return dataclasses.replace(scene, effects=dataclasses.replace(scene.effects, neo_hookean=law))
-
-
-def _leave_out(table: dict[str, Any], changes: dict[tuple[Any, ...], Any], where: str) -> None:
-    left_out = []
-    for key in (tuple(name.split(".")) for name in GONE):
-        inside = table.get(key[0])
-        if isinstance(inside, dict) and inside.pop(key[1], None) is not None:
-            left_out.append(".".join(key))
-        if changes.pop(key, None) is not None:
-            left_out.append(".".join(key))
-    if left_out:
-        names = ", ".join(left_out)
-        text = f"{where} is read without {names}: they have no effect any more"
-        warnings.warn(text, stacklevel=3)
 
 
 def load_accuracy(name: str | Path) -> Accuracy:

@@ -15,7 +15,7 @@ from codesign_jax import model
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import coordinates, overlaps
 from codesign_jax.engines.structured.kernel.contact_sets import margin
-from codesign_jax.engines.structured.lanes import dot
+from codesign_jax.engines.structured.lanes import dot, once, scan_links
 from codesign_jax.engines.structured.laws import surroundings
 from codesign_jax.engines.structured.laws.cones import friction_by_contact, which_cone
 from codesign_jax.engines.structured.laws.contact import (
@@ -29,7 +29,8 @@ from codesign_jax.engines.structured.laws.kinematics import (
     Kinematics,
     Spatial,
     kinematics,
-    propagate,
+    next_acceleration,
+    palm_acceleration,
     relative,
 )
 from codesign_jax.engines.structured.world_model import world_constants
@@ -37,6 +38,19 @@ from tests.helpers import grasps
 
 FLOOR = 100.0
 """Smallest scale of relative errors of accelerations, ten g: at rest they are rounding."""
+
+
+def propagate(kin: Kinematics, acc: Acc) -> Spatial:
+    """Spatial accelerations J a of all bodies, without velocity terms."""
+    palm = once(palm_acceleration, acc.wrist, kin.wrist_axes)
+
+    def step(parent: jax.Array, link: tuple):
+        link_acc = once(next_acceleration, parent, *link)
+        return link_acc, link_acc
+
+    first = palm + jnp.zeros_like(kin.vel[:, 0])
+    _, links = scan_links(step, first, (kin.axes, acc.finger))
+    return Spatial(palm, jnp.moveaxis(links, 0, 1), acc.object)
 
 
 class Path(NamedTuple):

@@ -153,7 +153,7 @@ def planted(faults: Mapping[str, Fault]) -> Iterator[Planted]:
         patch.setattr(step.Step, "__init__", prepare)
         # Sound kernels must neither be found in the place of this one nor find it.
         digest = f"planted: {sorted(faults)}"
-        patch.setattr(reuse, "code_digest", lambda **_: digest)
+        patch.setattr(reuse, "code_digest", lambda: digest)
         # What has no fault is traced once for all.
         patch.setattr(program, "of_code", lambda _: None)
         patch.setattr(reuse, "kept", lambda path, build: build())

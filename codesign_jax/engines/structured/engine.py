@@ -6,7 +6,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax import reuse
 from codesign_jax.compiler import launch
 from codesign_jax.compiler.launch import KernelUnavailable
 from codesign_jax.engines.base import Equal
@@ -314,6 +313,3 @@ def _unavailable(reason: str) -> KernelUnavailable:
         f"engine structured cannot run here: {reason}; engine mjx runs on every device of JAX, "
         "engine mujoco on every CPU"
     )
-
-
-reuse.note()  # everything that a kernel is traced from has been imported

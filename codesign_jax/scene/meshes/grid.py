@@ -129,7 +129,7 @@ def _nodes(low: np.ndarray, cell: float, shape: np.ndarray) -> np.ndarray:
 
 def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float) -> Grid:
     """Like `build`; grids that take longer than a tenth of a second are kept on disk."""
-    name = reuse.key(key, bound, reach, traced=False)
+    name = reuse.key(key, bound, reach)
     if name is None or reuse.limit() is None:
         return build(vertices, faces, bound, reach)
     path = reuse.folder() / "meshes" / f"{name}.kept"

@@ -253,19 +253,6 @@ def next_acceleration(parent: jax.Array, axes: jax.Array, a: jax.Array) -> jax.A
     return parent + total([axes[k] * a[k] for k in range(axes.shape[0])])
 
 
-def propagate(kin: Kinematics, acc: Acc) -> Spatial:
-    """Spatial accelerations J a of all bodies, without velocity terms."""
-    palm = once(palm_acceleration, acc.wrist, kin.wrist_axes)
-
-    def step(parent: jax.Array, link: tuple):
-        link_acc = once(next_acceleration, parent, *link)
-        return link_acc, link_acc
-
-    first = palm + jnp.zeros_like(kin.vel[:, 0])
-    _, links = scan_links(step, first, (kin.axes, acc.finger))
-    return Spatial(palm, jnp.moveaxis(links, 0, 1), acc.object)
-
-
 def relative(name: str, motion: Spatial) -> jax.Array:
     """Relative spatial motion of a pair of bodies, with axes for the contacts' items."""
     obj = motion.object

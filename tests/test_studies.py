@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,6 +22,8 @@ from codesign_jax.scene import draws, parameters, silicones
 from codesign_jax.types import Outcome
 from scripts import benchmark, calibration, reality, uncertainty
 from scripts.accuracy import budget, decisions, report
+from scripts.agree import __main__ as agree
+from scripts.agree import judgement, sides
 from scripts.calibration import OPEN
 from scripts.experiments import report as results
 from scripts.experiments import simulate
@@ -459,3 +462,81 @@ def test_the_results_page_has_the_tables_of_its_data():
     studies = {name: results.load_study(data, name) for name in ("2d", "23d")}
     text = results.tables(studies, results.load(data, "landscape"))
     assert text in (ROOT / "docs" / "notes" / "results.md").read_text(encoding="utf-8")
+
+
+# --- an older version beside this one -------------------------------------------------------------
+
+VERDICTS = np.random.default_rng(3)
+KEPT = VERDICTS.random((40, 30)) < 0.8
+
+
+def flipped(share, seed):
+    """The verdicts with so many of them flipped, the same ones for a seed."""
+    return KEPT ^ (np.random.default_rng(seed).random(KEPT.shape) < share)
+
+
+@pytest.mark.parametrize(
+    ("changed", "chance", "passed"),
+    [(0.0, 0.0, True), (0.01, 0.01, True), (0.04, 0.01, False), (0.02, 0.0, False)],
+)
+def test_a_change_without_physics_flips_no_more_than_a_micrometre(changed, chance, passed):
+    row = judgement.same("hard", KEPT, flipped(changed, 1), flipped(chance, 2))
+    assert row.passed == passed
+
+
+def test_equal_versions_pass_nearly_always():
+    """Both flip one verdict in a hundred by chance; an interval of 95 % is above in one of 40."""
+    rows = [judgement.same("", KEPT, flipped(0.01, s), flipped(0.01, 99 + s)) for s in range(30)]
+    assert sum(row.passed for row in rows) >= 27  # fewer with a probability below 1 %
+
+
+def test_flips_of_a_changed_physics_are_those_that_were_expected():
+    new = flipped(0.03, 1)
+    for low, high, passed in ((0.02, 0.04, True), (0.0, 0.01, False), (0.06, 0.1, False)):
+        expected = judgement.Expected(low, high)
+        assert judgement.physics("hard", KEPT, new, KEPT, expected).passed == passed
+
+
+def test_a_rate_fails_only_if_its_interval_lies_below_the_bound():
+    noise = np.exp(0.02 * VERDICTS.normal(size=8))
+    for factor, passed in ((1.0, True), (1.03, True), (1.1, False), (0.8, True)):
+        old = (2.0 + 0.1 * np.arange(8)).tolist()  # the machine gets slower: pairs cancel it
+        assert judgement.rate(old, (factor * noise * old).tolist()).passed == passed
+
+
+@pytest.mark.parametrize("words", [[], ["hard=1"], ["hard=2-1"], ["soft=1"], ["hard=few"]])
+def test_expected_flips_are_stated_for_every_group(words):
+    with pytest.raises(ValueError):
+        agree.expectations(words)
+
+
+def test_a_side_is_a_commit_or_a_folder_and_tells_what_failed(tmp_path):
+    with pytest.raises(ValueError, match="no commit"):
+        sides.checkout("no-such-commit", tmp_path)
+    with pytest.raises(ValueError, match="no package"):
+        sides.checkout(str(tmp_path), tmp_path)
+    with sides.running(ROOT) as side:
+        assert Path(side.ask("device")["package"]).is_relative_to(ROOT)
+        with pytest.raises(RuntimeError, match="KeyError"):
+            side.ask("nothing")
+        assert side.ask("device")["backend"] == jax.default_backend()
+
+
+TINY_SIZE = agree.Size(designs=4, trials=6, call=24, pairs=2, worlds=2, slopes=2)
+LAW = "codesign_jax/engines/structured/laws/contact.py"
+SPRING = "jnp.where(gap < 0, cone.spring, "
+
+
+@pytest.mark.slow  # five minutes: two versions are compiled, and the derivative of one
+@pytest.mark.parametrize("planted", [SPRING, SPRING.replace("cone", "0.5 * cone")])
+def test_an_equal_version_agrees_and_a_wrong_law_does_not(planted, tmp_path, monkeypatch):
+    """The wrong law corrects half of a contact's depth in a step."""
+    for name in ("codesign_jax", "hands", "objects"):
+        shutil.copytree(ROOT / name, tmp_path / name)
+    law = (ROOT / LAW).read_text(encoding="utf-8")
+    assert SPRING in law
+    (tmp_path / LAW).write_text(law.replace(SPRING, planted), encoding="utf-8")
+    monkeypatch.setattr(sides, "ROOT", tmp_path)
+    monkeypatch.setattr(agree, "QUICK", TINY_SIZE)
+    status = agree.main([str(ROOT), "--kind", "same", "--quick"])
+    assert status == (planted != SPRING)

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import verdict
+from codesign_jax.judge import verdict
 from codesign_jax.scene import Scene
 from codesign_jax.types import Forces, Outcome, Status, Trace, Trial, failed
 

@@ -28,12 +28,12 @@ from codesign_jax import axes, control, model, reuse
 from codesign_jax.cost import outcome, shown
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording
+from codesign_jax.judge.verdict import as_bit
 from codesign_jax.preflight import invalid_start
 from codesign_jax.preflight import nominal_trial as nominal_trial
 from codesign_jax.scene import Scene, draws, mesh_margins, schema, unit_slips
 from codesign_jax.scene.constants import batch_axes
 from codesign_jax.types import Outcome, Params, Status, Trace, Trial, failed
-from codesign_jax.verdict import as_bit
 
 CostFunction = Callable[[Scene, Trace, jax.Array], jax.Array]
 """A cost of one's own: from the scene, the trace of one world (arrays of shape (time,) and qpos of

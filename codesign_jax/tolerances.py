@@ -15,11 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import optimize, special
 
-from codesign_jax import batch, rollout, verdict
+from codesign_jax import batch, rollout
 from codesign_jax.engines import Engine
+from codesign_jax.interrupts import interruptible
+from codesign_jax.judge import verdict
+from codesign_jax.judge.cases import Case
 from codesign_jax.reuse import SceneProgram, shared
-from codesign_jax.runs.cases import Case
-from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.scene import Scene, draws, schema
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.statistics import Interval, wilson

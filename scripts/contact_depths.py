@@ -334,10 +334,10 @@ def grasps(scene: Scene, designs: np.ndarray, args: argparse.Namespace) -> list[
 def designs_of(path: Path) -> list[np.ndarray]:
     """Designs of a file or of run folders [SI units]."""
     if path.is_dir():
-        from codesign_jax.runs import cases, read_run
+        from codesign_jax.runs import read_run, selection
 
         folders = sorted(p.parent for p in path.rglob("provenance.json"))
-        return [cases.choose(read_run(p)[0], cases.read_record(p)).design for p in folders]
+        return [selection.choose(read_run(p)[0], selection.read_record(p)).design for p in folders]
     if path.suffix == ".json":
         return [np.array(d["vector"]) for d in json.loads(path.read_text())["designs"]]
     return list(work.winners(path))

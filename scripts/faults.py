@@ -38,10 +38,10 @@ from hypothesis import strategies as st
 
 from codesign_jax import cli, runs
 from codesign_jax import scene as scenes
-from codesign_jax.runs import manifest, scene_files
+from codesign_jax.runs import manifest
 from codesign_jax.runs.checkpoint import digest
 from codesign_jax.runs.record import to_arrays
-from codesign_jax.scene import InputError, keypaths, library, meshes
+from codesign_jax.scene import InputError, keypaths, library, meshes, scene_files
 
 CASES = int(os.environ.get("FAULTS", "10"))
 COMMAND = (

@@ -22,13 +22,14 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from codesign_jax import cli, codesign, rollout, runs, stress, tolerances, verdict
+from codesign_jax import cli, rollout, runs, tolerances
 from codesign_jax.commands import common
 from codesign_jax.commands.flags import Evaluate
+from codesign_jax.judge import cases, stress, verdict
+from codesign_jax.judge.sentences import Judged
 from codesign_jax.report import animation
 from codesign_jax.report.replay import Camera
-from codesign_jax.report.verdicts import Judged
-from codesign_jax.runs import cases
+from codesign_jax.runs import selection
 from codesign_jax.scene import design_files, draws
 
 RUNS = Path("runs") / "gallery"
@@ -90,7 +91,7 @@ def find(hand: Hand) -> None:
     folder = RUNS / hand.name
     words = [*shlex.split(hand.command)[1:], "--reference-trials", "0"]
     cli.main([*words, "--out", str(folder)])
-    case = cases.case_of_run(folder)
+    case = selection.case_of_run(folder)
     preset = runs.read_run(folder)[1].preset
     text = common.design_text(
         case.space, design_files.DesignFile(preset, {}, **hand.names), case.design
@@ -149,7 +150,7 @@ def draw(hand: Hand, case: cases.Case) -> None:
     named = [rollout.nominal_trial(scene, name) for name in hand.shown]
     trials = jax.tree.map(lambda *v: jnp.stack(v), *named)
     shown = animation.replay(scene, case.make_engine(), params, trials)
-    ends = [codesign.VERDICTS[int(codesign.verdicts(grasp.outcome))] for grasp in shown]
+    ends = [verdict.VERDICTS[int(verdict.verdicts(grasp.outcome))] for grasp in shown]
     print(hand.name, *zip(hand.shown, ends, strict=True))
     seen = animation.CAMERA._replace(**({"distance": CLOSE} | hand.camera))
 

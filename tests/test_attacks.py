@@ -23,15 +23,16 @@ import pytest
 import rich.table
 
 from codesign_jax import array_files, files, runs, scene, terminal
-from codesign_jax.commands import check, reference, status
+from codesign_jax.commands import check, status
 from codesign_jax.compiler.ffi import KernelUnavailable
 from codesign_jax.export import process, sheet
-from codesign_jax.runs import directory, manifest, progress, scene_files
+from codesign_jax.judge import fresh_trials
+from codesign_jax.judge.stress import Stress
+from codesign_jax.runs import directory, manifest, progress, reference
 from codesign_jax.runs import record as records
 from codesign_jax.runs import run as run_of
 from codesign_jax.runs.columns import FILES, TABLES
-from codesign_jax.scene import InputError, parameters
-from codesign_jax.stress import Stress
+from codesign_jax.scene import InputError, parameters, scene_files
 from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import command, own_workplace  # noqa: F401
 
@@ -265,7 +266,7 @@ def outcomes(**changed):
 
 def test_results_that_are_not_shown_are_told(run, monkeypatch):
     """Damaged, gone, or with arrays that no run has under a right digest: each is a note."""
-    monkeypatch.setattr(reference, "ACCURACY", "fast")
+    monkeypatch.setattr(fresh_trials, "ACCURACY", "fast")
     scene, settings = runs.read_run(run)
     places = run / reference.FILE, run / reference.STRESS_FILE
     abouts = [

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from codesign_jax import codesign, optimize, scene, stress
+from codesign_jax import codesign, optimize, scene
+from codesign_jax.judge import stress
 from codesign_jax.model import morphology
 from codesign_jax.scene import InputError, buildable, parameters, silicones
 from tests.helpers import grasps

@@ -12,7 +12,7 @@ import pytest
 
 from codesign_jax import cli
 from codesign_jax.commands import status
-from codesign_jax.runs import cases
+from codesign_jax.judge import cases
 from codesign_jax.scene import library
 from tests.helpers.command_runs import EPISODES, RUN, command, finished_run, own_workplace  # noqa: F401
 from tests.helpers.toy_engine import TINY

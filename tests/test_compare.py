@@ -16,24 +16,13 @@ import numpy as np
 import pytest
 from scipy import integrate, optimize, stats
 
-from codesign_jax import (
-    constants,
-    model,
-    preflight,
-    rollout,
-    runs,
-    sampling,
-    scene,
-    statistics,
-    stress,
-    verdict,
-)
-from codesign_jax.commands import common, compare, reference
+from codesign_jax import constants, model, preflight, rollout, runs, sampling, scene, statistics
+from codesign_jax.commands import common, compare
 from codesign_jax.engines import make_engine
+from codesign_jax.judge import cases, fresh_trials, sentences, stress, verdict
+from codesign_jax.judge.sentences import Judged
 from codesign_jax.model import overlap
-from codesign_jax.report import verdicts
-from codesign_jax.report.verdicts import Judged
-from codesign_jax.runs import cases, columns
+from codesign_jax.runs import columns
 from codesign_jax.scene import beams, design_files, draws, parameters
 from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import command, copied, finished_run, own_workplace  # noqa: F401
@@ -186,7 +175,7 @@ FINER = "fine"
 @pytest.fixture(autouse=True)
 def less_fine(monkeypatch):
     """MuJoCo C takes half a minute at `reference`: five times the steps, twice the links."""
-    monkeypatch.setattr(reference, "ACCURACY", FINER)
+    monkeypatch.setattr(fresh_trials, "ACCURACY", FINER)
 
 
 def read_numbers(capsys, *arguments):
@@ -553,13 +542,13 @@ def test_verdicts_count_all_trials_and_means_follow_the_rule(rule, mean, mean_in
     tiny = scene.load(TINY, overrides={"cost.failure": rule})
     outcomes = trials_of([0.0, 1.0, 3.0], [0, Status.SOLVER_CAP, Status.STUCK], lost=[1])
     judged = Judged(tiny, outcomes)
-    row = verdicts.of_trials(tiny, outcomes)
+    row = sentences.of_trials(tiny, outcomes)
     assert row == f"kept 1 of 3, 1 lost, 1 not released; {mean_in_words}; warnings: SOLVER_CAP 1"
     assert str(judged).startswith("keeps 33 % of 3 fresh") and row in judged.details
-    [warning] = verdicts.warnings(judged)
+    [warning] = sentences.warnings(judged)
     assert warning.startswith("warning: 1 of 3 trials failed (STUCK 1); STUCK: the hand did not")
     assert ("--set cost.failure=worst" in warning) == (rule == "exclude")
-    alone = verdicts.of_trials(tiny, trials_of([3.0], [Status.STUCK]))
+    alone = sentences.of_trials(tiny, trials_of([3.0], [Status.STUCK]))
     assert alone.endswith("no mean cost" if rule == "exclude" else "1 that failed")
 
 

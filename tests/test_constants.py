@@ -25,8 +25,7 @@ from codesign_jax.engines.structured.laws.step_numbers import (
     pushed,
 )
 from codesign_jax.engines.structured.world_model import world_constants
-from codesign_jax.runs import scene_files
-from codesign_jax.scene import constants, effects, schema
+from codesign_jax.scene import constants, effects, scene_files, schema
 from tests.helpers import grasps
 from tests.helpers.grasps import hand_world, hurried, off, pinch, random_constants
 

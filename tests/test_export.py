@@ -45,8 +45,8 @@ from codesign_jax.export import (
 )
 from codesign_jax.export.play import play
 from codesign_jax.export.process import Process, Section, Size
+from codesign_jax.judge import cases
 from codesign_jax.model import build_spec
-from codesign_jax.runs import cases
 from codesign_jax.scene import beams, hand, parameters, silicones
 from codesign_jax.scene.schema import InputError
 from tests.helpers.command_runs import command

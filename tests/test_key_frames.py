@@ -12,8 +12,8 @@ import pytest
 import tomli_w
 
 from codesign_jax import control, parameters, rollout, scene
-from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import key_frames, library, sums
+from codesign_jax.scene.scene_files import write_scene
 
 CONTROLS = library.available("controls")
 PAGE = Path(__file__).parent.parent / "docs" / "control.md"

@@ -14,20 +14,22 @@ ROOT = Path(__file__).parents[1]
 
 # What stands in a line may import lines before it, and its own folder.
 LAYERS = """
-files sizes statistics terminal
+files interrupts sizes statistics terminal
 reuse
 array_files
-types provenance compiler optimize
+types provenance
+compiler optimize
 scene
-axes model control verdict devices
+axes model control judge.verdict devices
 engines cost
 preflight policy
 rollout
 user_code measurements
 codesign env finger sampling
 batch
+judge
+tolerances
 runs
-stress tolerances
 report
 export
 commands
@@ -118,15 +120,22 @@ def wrong(name, other):
             if mine[1] == "shared" or theirs[1] in STUDIES:
                 return "studies share through scripts.shared"
         return None
-    if len(mine) == 1 or len(theirs) == 1 or mine[1] == theirs[1]:
+    if len(mine) == 1 or len(theirs) == 1:
         return None
-    if not ORDER[theirs[1]] < ORDER[mine[1]]:
-        return f"{theirs[1]} comes after {mine[1]}, or beside it"
+    before, after = layer(theirs), layer(mine)
+    if before != after and not ORDER[before] < ORDER[after]:
+        return f"{before} comes after {after}, or beside it"
     return None
 
 
+def layer(parts):
+    """Name in `LAYERS` of a module: its own, or that of its part of the package."""
+    alone = ".".join(parts[1:3])
+    return alone if alone in ORDER else parts[1]
+
+
 def test_every_part_of_the_package_has_its_layer():
-    parts = {name.split(".")[1] for name in modules() if name.startswith("codesign_jax.")}
+    parts = {layer(name.split(".")) for name in modules() if name.startswith("codesign_jax.")}
     assert parts == set(ORDER)
 
 
@@ -134,7 +143,7 @@ def test_the_map_of_contributing_has_the_same_order():
     """Its rows are the lines of `LAYERS`."""
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     table = text.split("of `codesign_jax` | content |\n|---|---|\n")[1].split("\n\n")[0]
-    named = [re.findall(r"`([a-z_]+)/?`", row.split("|")[1]) for row in table.splitlines()]
+    named = [re.findall(r"`([a-z_.]+)/?`", row.split("|")[1]) for row in table.splitlines()]
     assert [set(row) for row in named] == [set(line.split()) for line in LAYERS.strip().split("\n")]
 
 
@@ -156,6 +165,11 @@ def test_imports_point_one_way():
         ("codesign_jax.optimize.schedule", "codesign_jax.scene.hand", True),
         ("codesign_jax.compiler.cpu", "codesign_jax.scene", True),
         ("codesign_jax.runs.loop", "scripts.shared.output", True),
+        ("codesign_jax.engines.mjx", "codesign_jax.judge.verdict", False),
+        ("codesign_jax.engines.mjx", "codesign_jax.judge.cases", True),
+        ("codesign_jax.judge.verdict", "codesign_jax.judge.cases", True),
+        ("codesign_jax.judge.stress", "codesign_jax.runs.selection", True),
+        ("codesign_jax.tolerances", "codesign_jax.runs.selection", True),
         (f"{ENGINE}.laws.rings", f"{ENGINE}.kernel.newton", True),
         (f"{ENGINE}.kernel.newton", f"{ENGINE}.laws.rings", False),
         ("scripts.shared.output", "scripts.experiments.report", True),

@@ -18,8 +18,7 @@ from codesign_jax import scene
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.laws import meshes as mesh_lanes
-from codesign_jax.runs import scene_files
-from codesign_jax.scene import InputError, library, meshes, objects, parameters, schema
+from codesign_jax.scene import InputError, library, meshes, objects, parameters, scene_files, schema
 from codesign_jax.scene.meshes import grid, reading, surface
 from scripts import faults
 from tests.helpers import oracles

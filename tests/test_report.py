@@ -15,10 +15,10 @@ from PIL import Image
 from scipy import stats
 
 from codesign_jax import array_files, cli, model, rollout, runs, scene
-from codesign_jax.commands import reference
 from codesign_jax.engines import make_engine
-from codesign_jax.report import animation, bodies, painter, raster, verdicts, viewer
-from codesign_jax.runs import cases
+from codesign_jax.judge import sentences
+from codesign_jax.report import animation, bodies, painter, raster, viewer
+from codesign_jax.runs import reference, selection
 from codesign_jax.scene import parameters
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome, Status, failed
@@ -189,7 +189,7 @@ def test_report_shows_the_best_tested_particle_with_its_interval(run, text):
     rows = list(csv.DictReader((run / "tests.csv").read_text().splitlines()))
     best = min(rows, key=lambda row: float(row["test_cost"]))  # the first of equal ones
     the_scene, _ = runs.read_run(run)
-    chosen = cases.choose(the_scene, cases.read_record(run))
+    chosen = selection.choose(the_scene, selection.read_record(run))
     kept = int(((chosen.outcomes.cost < 0.01) & ~failed(chosen.outcomes.status)).sum())
     low, high = stats.binomtest(kept, int(best["trials"])).proportion_ci(0.95, method="wilson")
     share = f"({100 * low:.0f} to {100 * high:.0f} %): not good"
@@ -215,22 +215,22 @@ def test_report_is_one_small_file_that_names_its_origin(run, text):
 def test_grasp_is_the_one_of_the_table(run):
     """Noise, design and verdict of a row of trials.csv come back from its three numbers."""
     the_scene, _ = runs.read_run(run)
-    record = cases.read_record(run)
+    record = selection.read_record(run)
     trials = csv.DictReader((run / "trials.csv").read_text().splitlines())
     rows = {tuple(int(r[n]) for n in ("episode", "particle", "trial")): r for r in trials}
     for place in ((1, 2, 0), (2, 0, 1)):
         episode, particle, trial = place
-        row_grasp = cases.find_grasp(
+        row_grasp = selection.find_grasp(
             the_scene, record, episode=episode, particle=particle, trial=trial
         )
         assert row_grasp.place == place
         assert float(rows[place]["cost"]) == pytest.approx(float(row_grasp.outcome.cost), rel=1e-6)
     # The best one is the chosen particle's ancestor.
-    best = cases.find_grasp(the_scene, record)
-    chosen = cases.choose(the_scene, record)
+    best = selection.find_grasp(the_scene, record)
+    chosen = selection.choose(the_scene, record)
     np.testing.assert_array_equal(best.design, chosen.design)
     with pytest.raises(InputError) as error:
-        cases.find_grasp(the_scene, record, episode=4, trial=3)
+        selection.find_grasp(the_scene, record, episode=4, trial=3)
     assert len(error.value.problems) == 2 and "--episode = 4 is outside [1, 3]" in str(error.value)
 
 
@@ -261,7 +261,7 @@ def test_fresh_trials_at_reference_are_in_the_report(run, tmp_path, capsys):
     lost = np.where(cost == 2.0, 5.0, np.inf)
     outcomes = Outcome(cost, status, lost, np.full(trials, -1))
     for design, words in (("own", True), ("other", False)):
-        case = cases.case_of_run(copy, accuracy="reference")
+        case = selection.case_of_run(copy, accuracy="reference")
         tested = case if design == "own" else case._replace(design=case.design + 1)
         array_files.save_results(
             copy / reference.FILE, tested.digest(settings.seed), outcomes._asdict()
@@ -270,7 +270,7 @@ def test_fresh_trials_at_reference_are_in_the_report(run, tmp_path, capsys):
         assert cli.main(["report", str(copy), "--no-replay", "--out", str(page)]) == 0
         low, high = stats.binomtest(3, 5).proportion_ci(0.95, method="wilson")
         text = page.read_text(encoding="utf-8")
-        grasps = f"fresh grasps of {verdicts.objects(case.scene)}"
+        grasps = f"fresh grasps of {sentences.objects(case.scene)}"
         share = (
             f"keeps 60 % of 5 {grasps} ({100 * low:.0f} to {100 * high:.0f} %): not enough trials"
         )

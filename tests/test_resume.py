@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 
 from codesign_jax import array_files, runs
-from codesign_jax.commands import reference
-from codesign_jax.runs.cases import Case
+from codesign_jax.interrupts import Interrupts
+from codesign_jax.judge import fresh_trials
+from codesign_jax.judge.cases import Case
+from codesign_jax.runs import reference
 from codesign_jax.runs.checkpoint import Checkpoints
-from codesign_jax.runs.interrupts import Interrupts
 from tests.helpers.command_runs import (  # noqa: F401
     EPISODES,
     RESULTS,
@@ -111,7 +112,7 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
 
     At five times the steps and three times the links: with 20 times MuJoCo C takes long.
     """
-    monkeypatch.setattr(reference, "ACCURACY", "fine")
+    monkeypatch.setattr(fresh_trials, "ACCURACY", "fine")
     folder = shutil.copytree(finished, tmp_path / "run")
     assert command(*RUN, "--reference-trials", "2", "--out", folder) == 0
     settings = runs.read_run(folder)[1]

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from codesign_jax import runs
-from codesign_jax.runs import cases, manifest, tables
+from codesign_jax.interrupts import Interrupts
+from codesign_jax.runs import manifest, selection, tables
 from codesign_jax.runs.checkpoint import Checkpoints
-from codesign_jax.runs.interrupts import Interrupts
 from codesign_jax.scene.schema import InputError
 from scripts import faults
 from tests.helpers.command_runs import (  # noqa: F401
@@ -205,13 +205,13 @@ def test_an_earlier_run_is_read_and_reported(archive, name, done, episodes, tmp_
     """Its arrays are the numbers of the tables that were written beside them."""
     folder = unpacked(archive, tmp_path) / name
     scene, settings = runs.read_run(folder)
-    record = cases.read_record(folder)
+    record = selection.read_record(folder)
     assert (record.done, settings.episodes) == (done, episodes)
     assert (record.test is not None) == (done == episodes)
     trials = csv.DictReader((folder / "trials.csv").read_text().splitlines())
     costs = np.array([float(row["cost"]) for row in trials], np.float32)
     np.testing.assert_array_equal(np.ravel(record.history.outcomes.cost[:done]), costs)
-    chosen = cases.choose(scene, record)
+    chosen = selection.choose(scene, record)
     assert chosen.design.dtype == np.float32
     simulated = record.history.population[chosen.episode, chosen.row]
     np.testing.assert_array_equal(simulated, chosen.design)

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from codesign_jax import codesign, files, optimize, runs, scene
-from codesign_jax.runs import columns, directory, scene_files, tables
+from codesign_jax.runs import columns, directory, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs import settings as settings_module
 from codesign_jax.runs.directory import open_run
 from codesign_jax.runs.plan import finalists as finalists_of_plan
 from codesign_jax.runs.record import Record
-from codesign_jax.runs.scene_files import write_scene
-from codesign_jax.scene import library, parameters
+from codesign_jax.scene import library, parameters, scene_files
+from codesign_jax.scene.scene_files import write_scene
 from codesign_jax.scene.schema import InputError
 from tests.helpers.command_runs import RUN, command, copied, own_workplace, snapshot, without  # noqa: F401
 from tests.helpers.toy_engine import tiny

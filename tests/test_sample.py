@@ -5,9 +5,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from codesign_jax import cli, codesign, objects, rollout, sampling, scene
+from codesign_jax import cli, objects, rollout, sampling, scene
 from codesign_jax.commands import sample
 from codesign_jax.export import process
+from codesign_jax.judge import verdict
 from codesign_jax.runs import dataset, directory
 from codesign_jax.scene import parameters
 from tests.helpers.grasps import nth
@@ -131,7 +132,7 @@ def test_a_row_has_design_noise_and_outcome(place, capsys):
     assert [v is None for v in rows["first_bad_step"]] == (~bad).tolist()
     # The toy engine has no solver: nothing is told of it.
     assert {*rows["steps_at_limit"], *rows["residual"]} == {None}
-    counts = {name: int((rows["verdict"] == name).sum()) for name in codesign.VERDICTS}
+    counts = {name: int((rows["verdict"] == name).sum()) for name in verdict.VERDICTS}
     shares = ", ".join(f"{name} {n} ({5 * n:.1f} %)" for name, n in counts.items())
     assert f"of 20 grasps: {shares}" in capsys.readouterr().out and counts["lost"] > 0
 

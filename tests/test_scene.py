@@ -11,7 +11,6 @@ import pytest
 from codesign_jax import model, scene
 from codesign_jax.commands import common
 from codesign_jax.engines import make_engine
-from codesign_jax.runs.scene_files import write_scene
 from codesign_jax.scene import (
     constants,
     hand,
@@ -23,6 +22,7 @@ from codesign_jax.scene import (
     schema,
     silicones,
 )
+from codesign_jax.scene.scene_files import write_scene
 from tests.helpers.grasps import batch_inputs, nth, repeat, stack, still
 
 NAMES = silicones.SILICONES

@@ -85,7 +85,9 @@ def torsion_constant(width: int, height: int, wall: int) -> float:
     count = int(((margin > 0) & (margin < wall)).sum())
     number = np.where(margin >= wall, count, -1)
     number[(margin > 0) & (margin < wall)] = np.arange(count)
-    rows, columns, values = [], [], []
+    rows = []
+    columns = []
+    values = []
     inside = (margin > 0) & (margin < wall)
     hole = margin >= wall
     for axis, way in ((0, 1), (0, -1), (1, 1), (1, -1)):

@@ -17,7 +17,7 @@ from codesign_jax.commands import common, flags, grid
 from codesign_jax.commands import landscape as landscapes
 from codesign_jax.engines import make_engine
 from codesign_jax.report import animation, landscape
-from codesign_jax.runs import cases
+from codesign_jax.runs import selection
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.types import failed
 from tests.helpers.command_runs import small_run  # noqa: F401
@@ -80,7 +80,7 @@ def test_replay_writes_the_best_grasp_of_a_run(run, simulated, tmp_path, capsys)
     assert cli.main(["replay", str(run), "--out", str(out)]) == 0
     assert simulated == [1]
     the_scene, _ = runs.read_run(run)
-    best = cases.find_grasp(the_scene, cases.read_record(run))
+    best = selection.find_grasp(the_scene, selection.read_record(run))
     assert "episode {}, particle {}, trial {}:".format(*best.place) in capsys.readouterr().out
     page = out.read_text(encoding="utf-8")
     [data] = re.findall(r"startReplay\(.*?, (\{.*\})\);", page)

@@ -12,8 +12,7 @@ import pytest
 from codesign_jax import control, model, preflight
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.runs import scene_files
-from codesign_jax.scene import schema
+from codesign_jax.scene import scene_files, schema
 from tests.helpers import grasps, oracles
 from tests.helpers.fixtures import POST, SHELF, SLOPES, WALL, loaded
 

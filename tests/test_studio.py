@@ -22,7 +22,7 @@ from websockets.sync.client import connect
 import codesign_jax
 from codesign_jax import cli
 from codesign_jax.commands import common
-from codesign_jax.runs import cases
+from codesign_jax.runs import selection
 from codesign_jax.scene.schema import InputError
 from codesign_jax.studio import process, server
 from codesign_jax.studio import studio as studios
@@ -222,7 +222,7 @@ def test_a_tab_shows_judges_improves_and_saves(desk, capsys, monkeypatch):
     verdict = capsys.readouterr().out.split("verdict: ")[1].strip()
     assert messages["verdict"]["sentence"] == verdict.replace("fresh ", "")
     tab.receive('{"run": [2, 1]}')
-    kept = cases.find_grasp(desk.case.scene, desk.record, episode=2, particle=1).design
+    kept = selection.find_grasp(desk.case.scene, desk.record, episode=2, particle=1).design
     messages = settled(tab)["grasp"]
     assert messages["design"] == pytest.approx(desk.case.space.in_units(kept).tolist(), rel=1e-6)
     monkeypatch.setattr(tabs, "EPISODES", 2)

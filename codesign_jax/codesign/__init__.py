@@ -35,7 +35,6 @@ from codesign_jax.codesign.experiment import (
 )
 from codesign_jax.codesign.optimizers import make_filter, make_optimizer
 from codesign_jax.cost import particle_cost
-from codesign_jax.verdict import VERDICTS, verdicts
 
 __all__ = [
     "CONVERGED_COST",
@@ -44,7 +43,6 @@ __all__ = [
     "STREAM_TEST",
     "STREAM_TRIAL",
     "SUCCESS_COST",
-    "VERDICTS",
     "EpisodeInfo",
     "FinalTest",
     "Task",
@@ -58,5 +56,4 @@ __all__ = [
     "stream_key",
     "summarize_test",
     "test_key",
-    "verdicts",
 ]

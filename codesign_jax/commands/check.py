@@ -11,14 +11,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import optimize, preflight, runs, sampling, user_code, verdict
-from codesign_jax.commands import common, reference
+from codesign_jax import optimize, preflight, runs, sampling, user_code
+from codesign_jax.commands import common
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Check
 from codesign_jax.engines import Engine
-from codesign_jax.runs import Settings, cases
-from codesign_jax.runs.cases import Case
-from codesign_jax.runs.interrupts import interruptible
+from codesign_jax.interrupts import interruptible
+from codesign_jax.judge import fresh_trials, verdict
+from codesign_jax.judge.cases import Case
+from codesign_jax.runs import Settings, reference, selection
 from codesign_jax.runs.progress import Busy, duration
 from codesign_jax.scene import Scene, with_accuracy
 from codesign_jax.statistics import wilson
@@ -63,7 +64,7 @@ def main(options: Check) -> int:
     common.use_compilation_cache()
     load = os.getloadavg()[0]
     case = find_case(options)
-    finer = with_accuracy(case.scene, reference.ACCURACY)
+    finer = with_accuracy(case.scene, fresh_trials.ACCURACY)
     _refuse(options, case, finer)
     console = Console()
     for line in _head(case, load):
@@ -91,11 +92,11 @@ def simulate(
             (_time_call(run, designs, drawn) for _ in range(2)), key=lambda m: m[1]
         )
         usual = Measured(case.scene, outcomes, seconds, compiling)
-        few = options.seconds * usual.rate / reference.steps_and_links(case.scene) / trials
+        few = options.seconds * usual.rate / fresh_trials.steps_and_links(case.scene) / trials
         few = int(np.clip(few, _LEAST, count))
-        busy.say(f"compiling at accuracy {reference.ACCURACY}")
+        busy.say(f"compiling at accuracy {fresh_trials.ACCURACY}")
         run, compiling = _compile(finer, engines[1], case, few)
-        busy.say(f"simulating {few * trials} grasps at accuracy {reference.ACCURACY}")
+        busy.say(f"simulating {few * trials} grasps at accuracy {fresh_trials.ACCURACY}")
         some = designs[:few], jax.tree.map(lambda v: v[:few], drawn)
         fine = Measured(finer, *_time_call(run, *some), compiling)
     return words, usual, fine
@@ -108,7 +109,7 @@ def _refuse(options: Check, case: Case, finer: Scene) -> None:
     problems += common.engine_problems(case.engine, options.overrides)
     if finer == case.scene:
         problems.append(
-            f"accuracy {reference.ACCURACY} is what others are compared with: choose another by "
+            f"accuracy {fresh_trials.ACCURACY} is what others are compared with: choose another by "
             "--accuracy"
         )
     common.refuse(problems)
@@ -173,7 +174,7 @@ def _time_call(run: Run, designs: jax.Array, trials: Trial) -> tuple[Outcome, fl
 def _sample(options: Check, case: Case, run: Run, count: int) -> tuple[jax.Array, str]:
     """Designs of shape (count, parameter), repeated where there are fewer, and what they are."""
     if options.run_folder:
-        particles = cases.read_record(options.run_folder).state.particles
+        particles = selection.read_record(options.run_folder).state.particles
         designs = np.unique(np.asarray(particles), axis=0)
         words = f"the {common.counted(len(designs), 'final particle')} of {options.run_folder} "
         words += "that differ"
@@ -215,14 +216,14 @@ def tell(
     share = wilson(differ, theirs.size)
     grasps = runs.prepare(case.scene, _without_own_code(settings)).grasps
     tested = min(reference.most_trials(None, settings), verdict.USUAL)
-    test = f", and {duration(tested / fine.rate)} for its test at accuracy {reference.ACCURACY}"
-    causes = runs.failure_counts(usual.outcomes.status)
+    test = f", and {duration(tested / fine.rate)} for its test at accuracy {fresh_trials.ACCURACY}"
+    causes = verdict.failure_counts(usual.outcomes.status)
     lines = [
         *f"designs: {words}".split("\n"),
         str(usual),
-        f"accuracy {reference.ACCURACY}, {fine}",
+        f"accuracy {fresh_trials.ACCURACY}, {fine}",
         *([f"failed: {causes}"] if causes else []),
-        f"kept: {ours.sum()} of {ours.size} grasps, at accuracy {reference.ACCURACY} "
+        f"kept: {ours.sum()} of {ours.size} grasps, at accuracy {fresh_trials.ACCURACY} "
         f"{theirs.sum()}; verdicts differ in {differ}: {100 * share.value:.2g} % "
         f"(95 % interval {100 * share.low:.2g} to {100 * share.high:.2g} %)",
         f"a search ({settings.optimizer}, preset {settings.preset}, {grasps} grasps): about "

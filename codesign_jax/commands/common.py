@@ -18,9 +18,9 @@ from codesign_jax import engines, policy, rollout, terminal, tolerances
 from codesign_jax import scene as scenes
 from codesign_jax.commands.flags import Evaluate, Export, SceneFlags, Subject, TrialFlags
 from codesign_jax.engines import Engine
+from codesign_jax.judge.cases import Case
 from codesign_jax.reuse import use_compilation_cache as use_compilation_cache
-from codesign_jax.runs import cases, tables
-from codesign_jax.runs.cases import Case
+from codesign_jax.runs import selection, tables
 from codesign_jax.runs.progress import Meter
 from codesign_jax.runs.reading import Tell
 from codesign_jax.scene import Scene, design_files, draws, keypaths, objects, schema
@@ -112,10 +112,10 @@ def find_case(options: Subject, *, tell: Tell = warn) -> Case:
         "accuracy": options.accuracy,
         "engine": options.engine,
     }
-    case = cases.case_of_run(
+    case = selection.case_of_run(
         options.run_folder, overrides=changes(options), tell=tell, **replacements
     )
-    cases.refuse_other_policy(case.policy, options.policy)
+    selection.refuse_other_policy(case.policy, options.policy)
     return case
 
 

@@ -14,14 +14,14 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from codesign_jax import codesign, cost, runs, statistics, verdict
-from codesign_jax.commands import common, flags, reference
+from codesign_jax import codesign, cost, runs, statistics
+from codesign_jax.commands import common, flags
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Compare
-from codesign_jax.report import verdicts
-from codesign_jax.report.verdicts import Judged
-from codesign_jax.runs import RunResult, Settings, columns, manifest, tables
-from codesign_jax.runs.cases import Case
+from codesign_jax.judge import fresh_trials, sentences, verdict
+from codesign_jax.judge.cases import Case
+from codesign_jax.judge.sentences import Judged
+from codesign_jax.runs import RunResult, Settings, columns, manifest, reference, tables
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import InputError
@@ -118,7 +118,7 @@ def read_all(every: Mapping[Path, tuple[Scene, Settings]]) -> dict[Path, Compare
                 common.warn(f"{folder / reference.FILE} {why}{judge}")
             if kept is not None:
                 other, _ = reference.stored_stress(folder, settings)
-                fresh = reference.judged(scene, kept, other)
+                fresh = fresh_trials.judged(scene, kept, other)
         compared[folder] = Compared(scene, settings, result, fresh)
     return compared
 
@@ -238,7 +238,7 @@ def compare(every: Mapping[Path, Compared], console: Console, *, named: bool = F
     if good and len(groups) == 1:
         console.print(f"{good} runs found a good design: {interval} of such runs (95 % interval)")
     if good:
-        object_words = {verdicts.objects(run.judged.scene) for run in every.values() if run.judged}
+        object_words = {sentences.objects(run.judged.scene) for run in every.values() if run.judged}
         console.print(f"{verdict.RULE}; for {', or '.join(sorted(object_words))}")
 
 

@@ -6,18 +6,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import preflight, rollout, runs, stress, tolerances, types, verdict
-from codesign_jax.commands import common, forces, reference
+from codesign_jax import preflight, rollout, runs, tolerances, types
+from codesign_jax.commands import common, forces
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Evaluate
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording
-from codesign_jax.report import verdicts
-from codesign_jax.runs import cases, tables
-from codesign_jax.runs.cases import Case
+from codesign_jax.judge import fresh_trials, sentences, stress, verdict
+from codesign_jax.judge.cases import Case
+from codesign_jax.judge.stress import Stress
+from codesign_jax.runs import reference, selection, tables
 from codesign_jax.runs.progress import Busy, Meter
 from codesign_jax.scene.schema import InputError
-from codesign_jax.stress import Stress
 from codesign_jax.terminal import Console
 
 
@@ -79,7 +79,7 @@ def _of_particle(case: Case, options: Evaluate) -> Case:
         return case
     if options.run_folder is None:
         raise InputError(["--particle is one of a run: give its folder, or leave it out"])
-    record = cases.read_record(options.run_folder)
+    record = selection.read_record(options.run_folder)
     particles = np.asarray(record.state.particles)
     common.refuse(common.number_problems(("--particle", options.particle, 0, len(particles) - 1)))
     return case._replace(design=particles[options.particle])
@@ -107,16 +107,18 @@ def simulate(case: Case, options: Evaluate, console: Console) -> types.Outcome:
     if trials is None:
         later = _of_each(options) * stress.sets(case.scene) if options.stress else 0
         with Meter("trials", verdict.USUAL, console, later=later) as meter:
-            outcomes = reference.decide(case, key, verdict.MOST, meter)
+            outcomes = fresh_trials.decide(
+                case, key, verdict.MOST, keep=lambda o: reference.show(meter, o, verdict.MOST)
+            )
     else:
         with Busy(console, f"simulating {common.counted(trials, 'grasp')}"):
             outcomes = case.simulate(trials, key)
     names = [shape.name for shape in case.scene.objects.object]
     for k, name in enumerate(names[: outcomes.cost.size]):
         object_outcomes = jax.tree.map(lambda v, k=k: v[k :: len(names)], outcomes)
-        console.print(f"{name:>12}: {verdicts.of_trials(case.scene, object_outcomes)}")
-    judged = verdicts.Judged(case.scene, outcomes, options.accuracy)
-    for line in [f"{'all':>12}: {judged.details}", *verdicts.solver(outcomes)]:
+        console.print(f"{name:>12}: {sentences.of_trials(case.scene, object_outcomes)}")
+    judged = sentences.Judged(case.scene, outcomes, options.accuracy)
+    for line in [f"{'all':>12}: {judged.details}", *sentences.solver(outcomes)]:
         console.print(line)
     if case.policy:
         with Busy(console, "asking what the policy commanded"):
@@ -147,8 +149,8 @@ def tell_verdict(
     console: Console,
 ) -> None:
     """Prints the verdict of the trials, and what speaks against it."""
-    judged = verdicts.Judged(case.scene, outcomes, options.accuracy, stress=other)
-    for line in [*verdicts.warnings(judged), f"verdict: {judged}"]:
+    judged = sentences.Judged(case.scene, outcomes, options.accuracy, stress=other)
+    for line in [*sentences.warnings(judged), f"verdict: {judged}"]:
         console.print(line)
 
 

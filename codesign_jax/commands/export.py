@@ -12,12 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import files, preflight, provenance, rollout, runs, tolerances
-from codesign_jax.commands import common, reference
+from codesign_jax.commands import common
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Export
 from codesign_jax.export import arm, grasps, plain, process, sheet, tables, valves
 from codesign_jax.export.process import Process, Size
-from codesign_jax.runs.cases import Case
+from codesign_jax.judge.cases import Case
+from codesign_jax.runs import reference
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.objects import Shape
 from codesign_jax.scene.schema import InputError

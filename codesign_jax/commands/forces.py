@@ -13,8 +13,8 @@ import numpy as np
 
 from codesign_jax import model, rollout
 from codesign_jax.engines import Engine
+from codesign_jax.judge import sentences
 from codesign_jax.policy import ControlLoop
-from codesign_jax.report import verdicts
 from codesign_jax.report.replay import Replay
 from codesign_jax.runs import tables
 from codesign_jax.scene import InputError, Scene
@@ -66,7 +66,7 @@ def tell(scene: Scene, grasps: list[Replay], console: Console) -> None:
         grip = " + ".join(f"{v:.2g}" for v in np.median(forces.grip, 0))
         console.print(
             f"{_object(scene, grasp):>12}: grip {grip} N by finger (median); depths: "
-            f"{verdicts.depths(forces)}"
+            f"{sentences.depths(forces)}"
         )
 
 

@@ -12,8 +12,9 @@ from codesign_jax.commands import common
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import GraspFlags
 from codesign_jax.engines.base import recording, tells_forces
-from codesign_jax.runs import cases
-from codesign_jax.runs.cases import Case
+from codesign_jax.judge import verdict
+from codesign_jax.judge.cases import Case
+from codesign_jax.runs import selection
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Trial
 
@@ -50,15 +51,15 @@ def _of_run(case: Case, options: GraspFlags, folder: Path) -> PlannedGrasp:
     if options.objects is not None and options.object is None:
         raise InputError(["--objects replaces the run's: --object must say which one to grasp"])
     numbers = {"episode": options.episode, "particle": options.particle, "trial": options.trial}
-    record = cases.read_record(folder, tell=lambda text: None)  # `find_case` has said it
-    grasp = cases.find_grasp(runs.read_run(folder)[0], record, **numbers)
+    record = selection.read_record(folder, tell=lambda text: None)  # `find_case` has said it
+    grasp = selection.find_grasp(runs.read_run(folder)[0], record, **numbers)
     case = case._replace(design=grasp.design)
     if options.object is not None:
         return _nominal(case, options.object)
     name = case.scene.objects.object[int(grasp.trial.shape)].name
     episode, particle, trial = grasp.place
     text = f"episode {episode}, particle {particle}, trial {trial}: object {name}"
-    return PlannedGrasp(case, grasp.trial, text, cases.ending(grasp.outcome))
+    return PlannedGrasp(case, grasp.trial, text, verdict.ending(grasp.outcome))
 
 
 def _nominal(case: Case, shape: int | str) -> PlannedGrasp:
@@ -82,7 +83,7 @@ def simulate(planned: PlannedGrasp, *, forces: bool = False) -> "Replay":
 
 def description(planned: PlannedGrasp, shown: "Replay") -> list[str]:
     """Lines that say which grasp it is and how it ended."""
-    again = cases.ending(shown.outcome)
+    again = verdict.ending(shown.outcome)
     ending = f"in the run: {planned.recorded}; here: {again}" if planned.recorded else again
     design = runs.describe(planned.case.space, planned.case.design)
     lines = [design, f"{planned.text}; {ending}"]

@@ -9,7 +9,7 @@ import numpy as np
 
 from codesign_jax.commands import common
 from codesign_jax.commands.flags import Landscape as Options
-from codesign_jax.runs.cases import Case
+from codesign_jax.judge.cases import Case
 from codesign_jax.scene import Scene, design_files, schema
 from codesign_jax.scene.schema import InputError
 

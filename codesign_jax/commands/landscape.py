@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import batch, codesign, files, preflight, rollout, runs, verdict
+from codesign_jax import batch, codesign, files, preflight, rollout, runs
 from codesign_jax.codesign import Task
 from codesign_jax.commands import common, grid
 from codesign_jax.commands.common import find_case
@@ -16,10 +16,11 @@ from codesign_jax.commands.flags import Landscape as Options
 from codesign_jax.commands.grid import Axis
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
+from codesign_jax.judge import verdict
+from codesign_jax.judge.cases import Case
 from codesign_jax.report import landscape
 from codesign_jax.report.landscape import Landscape
 from codesign_jax.reuse import SceneProgram, shared
-from codesign_jax.runs.cases import Case
 from codesign_jax.runs.progress import Meter
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace

@@ -12,16 +12,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from codesign_jax import codesign, engines, files, optimize, preflight, runs, stress, verdict
-from codesign_jax.commands import common, compare, reference, status
+from codesign_jax import codesign, engines, files, optimize, preflight, runs
+from codesign_jax.commands import common, compare, status
 from codesign_jax.commands.flags import Optimize
-from codesign_jax.report import verdicts
-from codesign_jax.report.verdicts import Judged
-from codesign_jax.runs import Plan, RunResult, Settings, columns
+from codesign_jax.judge import fresh_trials, sentences, stress, verdict
+from codesign_jax.judge.sentences import Judged
+from codesign_jax.runs import Plan, RunResult, Settings, columns, reference
 from codesign_jax.runs.progress import Busy
-from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene, schema
 from codesign_jax.scene.parameters import DesignSpace
+from codesign_jax.scene.scene_files import scene_texts
 from codesign_jax.scene.schema import InputError
 from codesign_jax.terminal import Console, say
 from codesign_jax.user_code import is_user_code, make_policy
@@ -103,7 +103,7 @@ def _after(scene: Scene, most: int) -> float:
     """What a run simulates once it has ended, in grasps of its accuracy."""
     if not most:
         return 0.0
-    fresh = min(most, verdict.USUAL) * reference.steps_and_links(scene)
+    fresh = min(most, verdict.USUAL) * fresh_trials.steps_and_links(scene)
     return fresh + reference.STRESS_TRIALS * stress.sets(scene)
 
 
@@ -119,13 +119,13 @@ def _tell(
     elif not most:
         _judge(plan, result, None, folder, console)
     else:
-        slower = reference.steps_and_links(plan.scene)
+        slower = fresh_trials.steps_and_links(plan.scene)
         others = stress.sets(plan.scene)
         coming = (later + reference.STRESS_TRIALS * others) / slower
         outcomes = reference.test(folder, plan.settings, most, console, coming)
         case, other = reference.stress_run(folder, plan.settings, console, later)
         reference.tell_stress(case, other, console)
-        _judge(plan, result, reference.judged(plan.scene, outcomes, other), folder, console)
+        _judge(plan, result, fresh_trials.judged(plan.scene, outcomes, other), folder, console)
     path = folder / "figures" / "cost_evolution.png"
     with Busy(console, "drawing"), files.naming(path):
         from codesign_jax.report import figures
@@ -175,7 +175,7 @@ def _dry_run(plan: Plan, count: int, options: Optimize) -> None:
     say(f"disk: about {3 * rows * row / 1e6:.1f} MB")
     if most := reference.most_trials(options.reference_trials, settings):
         usual = f"until the verdict is decided, about {verdict.USUAL} for a good design"
-        say(f"reference test: at most {most} grasps at accuracy {reference.ACCURACY}, {usual}")
+        say(f"reference test: at most {most} grasps at accuracy {fresh_trials.ACCURACY}, {usual}")
         say(f"other conditions: {reference.STRESS_TRIALS * stress.sets(scene)} grasps")
     say("time: `codesign check` measures it on this machine")
 
@@ -217,11 +217,11 @@ def _judge(
             f"{chosen}, by a test that flatters it: {verdict.tally(test.outcomes)}",
             f"its fresh grasps: {fresh.details}",
         ]
-    flags = ["--run", str(folder), "--accuracy", reference.ACCURACY]
+    flags = ["--run", str(folder), "--accuracy", fresh_trials.ACCURACY]
     again = shlex.join(["codesign", "evaluate", *flags])
     judged = test if fresh is None else fresh
     last = [f"verdict: {judged}", f"more fresh trials: {again}"]
-    for line in [*lines, *verdicts.warnings(judged), *last]:
+    for line in [*lines, *sentences.warnings(judged), *last]:
         console.print(line)
 
 

@@ -10,9 +10,11 @@ import numpy as np
 from codesign_jax import rollout, runs
 from codesign_jax.commands import common, grasp
 from codesign_jax.commands.flags import Replay
+from codesign_jax.judge import verdict
+from codesign_jax.judge.cases import Case
 from codesign_jax.runs import failures, manifest
-from codesign_jax.runs.cases import Case, refuse_other_policy
 from codesign_jax.runs.progress import Busy
+from codesign_jax.runs.selection import refuse_other_policy
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.terminal import Console, say
 from codesign_jax.types import MEANINGS, Status, Trace
@@ -95,7 +97,7 @@ def explain(path: Path, engine: str | None, policy: str | None) -> int:
 
 def _verdict(status: int, bad_step: int, h: float) -> str:
     when = f", first bad step {bad_step} ({bad_step * h:.2f} s)" if bad_step >= 0 else ""
-    return runs.status_names(status) + when
+    return verdict.status_names(status) + when
 
 
 def _where(trace: Trace, k: int) -> str:

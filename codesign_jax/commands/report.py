@@ -3,12 +3,12 @@
 from typing import TYPE_CHECKING
 
 from codesign_jax import runs
-from codesign_jax.commands import common, grasp, reference
+from codesign_jax.commands import common, grasp
 from codesign_jax.commands.flags import Report
+from codesign_jax.judge.cases import Case
 from codesign_jax.report import page
 from codesign_jax.report.of_run import Run
-from codesign_jax.runs import Settings, cases, directory
-from codesign_jax.runs.cases import Case
+from codesign_jax.runs import Settings, directory, reference, selection
 from codesign_jax.runs.manifest import read_provenance
 from codesign_jax.runs.progress import Busy
 from codesign_jax.runs.record import Record
@@ -24,16 +24,16 @@ def main(options: Report) -> int:
     common.use_compilation_cache()
     scene, settings = runs.read_run(options.folder)
     if not options.no_replay:
-        cases.refuse_other_policy(settings.policy, options.policy)
+        selection.refuse_other_policy(settings.policy, options.policy)
     name = options.engine or settings.engine
     common.refuse(common.engine_problems(name))
     path = options.out or options.folder / "report.html"
     common.refuse(common.place_problems("--out", path))
     notes: list[str] = []
-    record = cases.read_record(options.folder, tell=notes.append)
+    record = selection.read_record(options.folder, tell=notes.append)
     whole = not notes
-    chosen = cases.choose(scene, record)
-    notes += [text for text in [cases.doubt(chosen)] if text]
+    chosen = selection.choose(scene, record)
+    notes += [text for text in [selection.doubt(chosen)] if text]
     kept = reference.kept(options.folder, scene, settings)
     notes += kept.notes
     for note in notes:
@@ -63,9 +63,9 @@ def main(options: Report) -> int:
 
 def best_grasp(
     scene: Scene, settings: Settings, record: Record, engine: str, console: Console
-) -> "tuple[cases.Grasp, animation.Replay]":
+) -> "tuple[selection.Grasp, animation.Replay]":
     """The best grasp of the chosen design, simulated again to see how it moves."""
-    planned = cases.find_grasp(scene, record)
+    planned = selection.find_grasp(scene, record)
     space = design_space(scene.hand, settings.preset)
     case = Case(scene, space, planned.design, engine, settings.policy)
     with Busy(console, "simulating the best grasp again"):

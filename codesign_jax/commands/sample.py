@@ -6,14 +6,14 @@ import jax
 import numpy as np
 
 from codesign_jax import batch, files, preflight, sampling
-from codesign_jax.codesign import VERDICTS, verdicts
 from codesign_jax.commands import common
 from codesign_jax.commands.flags import Sample
 from codesign_jax.engines import Engine, make_engine
+from codesign_jax.interrupts import Interrupts, Stopped
+from codesign_jax.judge.verdict import VERDICTS, verdicts
 from codesign_jax.runs import dataset
 from codesign_jax.runs.dataset import Question, Shards
 from codesign_jax.runs.directory import locked
-from codesign_jax.runs.interrupts import Interrupts, Stopped
 from codesign_jax.runs.progress import Meter
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
@@ -96,7 +96,7 @@ def _simulate(
     interrupts: Interrupts,
     console: Console,
 ) -> np.ndarray:
-    """Simulates the shards that are missing; numbers of grasps by `codesign.VERDICTS`."""
+    """Simulates the shards that are missing; numbers of grasps by `verdict.VERDICTS`."""
     simulate = sampling.make_simulate(question.scene, engine, question.space)
     counts = np.zeros(len(VERDICTS), int)
     total = question.shards(designs)

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx
 
-from codesign_jax import verdict
 from codesign_jax.engines.base import Equal, refuse_meshes
+from codesign_jax.judge import verdict
 from codesign_jax.model import (
     ModelFields,
     MujocoFields,

@@ -9,8 +9,8 @@ import mujoco
 import mujoco.batch
 import numpy as np
 
-from codesign_jax import verdict
 from codesign_jax.engines.base import Equal, refuse_meshes
+from codesign_jax.judge import verdict
 from codesign_jax.model import (
     ModelFields,
     compile_template,

@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax import control, model, policy, rollout, verdict
+from codesign_jax import control, model, policy, rollout
 from codesign_jax.control import Plan
 from codesign_jax.engines import DEFAULT, Engine, make_engine
 from codesign_jax.engines.structured.world_model import world_constants
+from codesign_jax.judge import verdict
 from codesign_jax.model import ModelFields
 from codesign_jax.policy import Command, Observation, World
 from codesign_jax.scene import Scene

@@ -8,10 +8,11 @@ import jax
 import mujoco
 import numpy as np
 
-from codesign_jax import control, model, verdict
+from codesign_jax import control, model
 from codesign_jax.cost import outcome
 from codesign_jax.export import plain, skin
 from codesign_jax.export.play import play
+from codesign_jax.judge import verdict
 from codesign_jax.scene import Scene
 from codesign_jax.types import Outcome, Params, Trace, Trial
 

@@ -9,13 +9,14 @@ import jinja2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from codesign_jax import stress, terminal
+from codesign_jax import terminal
 from codesign_jax.export import arm, pose, quantities, valves
 from codesign_jax.export.process import FABRIC, Printed, Process, Size, inlet
+from codesign_jax.judge import stress
+from codesign_jax.judge.stress import Stress
 from codesign_jax.model import morphology
 from codesign_jax.model.layout import mounts
 from codesign_jax.scene import Scene
-from codesign_jax.stress import Stress
 from codesign_jax.tolerances import Yield
 from codesign_jax.types import Params
 

@@ -2,6 +2,6 @@
 
 >>> from codesign_jax import scene
 >>> from codesign_jax.report import verdicts
->>> verdicts.objects(scene.load("paper"))  # what a verdict in this scene holds for
+>>> sentences.objects(scene.load("paper"))  # what a verdict in this scene holds for
 'objects of 50 g, friction 0.85'
 """

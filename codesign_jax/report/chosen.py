@@ -3,10 +3,10 @@
 import jax
 import numpy as np
 
-from codesign_jax import stress, verdict
-from codesign_jax.report import markup, verdicts
+from codesign_jax.judge import sentences, stress, verdict
+from codesign_jax.judge.sentences import Judged
+from codesign_jax.report import markup
 from codesign_jax.report.of_run import Run
-from codesign_jax.report.verdicts import Judged
 from codesign_jax.runs import tables
 from codesign_jax.statistics import wilson
 
@@ -18,14 +18,14 @@ def design(run: Run) -> str:
     source = "the final test" if chosen.tested else "its last episode (there was no final test)"
     note = (
         f"Particle {chosen.particle}, chosen as the best by {source}, which flatters it: "
-        f"{verdicts.of_trials(run.scene, chosen.outcomes)}. "
+        f"{sentences.of_trials(run.scene, chosen.outcomes)}. "
     )
     again = ["evaluate", "--run", str(run.folder), "--accuracy", "reference"]
     parts = [
         markup.paragraph(f"Verdict: {judged}", "key"),
         markup.paragraph(f"{judged.details}. Rule: {verdict.RULE}."),
-        *(markup.paragraph(words, "warning") for words in verdicts.warnings(judged)),
-        *(markup.paragraph(words, "note") for words in verdicts.solver(judged.outcomes)),
+        *(markup.paragraph(words, "warning") for words in sentences.warnings(judged)),
+        *(markup.paragraph(words, "note") for words in sentences.solver(judged.outcomes)),
         markup.paragraph(note + "More fresh trials: ", "note", again),
         _by_object(run, judged),
         *_builder(run),

@@ -5,13 +5,13 @@ from typing import Any, NamedTuple
 
 import jax
 
-from codesign_jax.report.verdicts import Judged
+from codesign_jax.judge.sentences import Judged
+from codesign_jax.judge.stress import Stress
 from codesign_jax.runs import Settings
-from codesign_jax.runs.cases import Chosen
 from codesign_jax.runs.record import History, Record
+from codesign_jax.runs.selection import Chosen
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
-from codesign_jax.stress import Stress
 
 
 class Run(NamedTuple):

@@ -8,13 +8,14 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from codesign_jax import codesign, files, types, verdict
-from codesign_jax.report import chosen, figures, landscape, markup, verdicts, viewer
+from codesign_jax import codesign, files, types
+from codesign_jax.judge import sentences, verdict
+from codesign_jax.report import chosen, figures, landscape, markup, viewer
 from codesign_jax.report.of_run import Run
 from codesign_jax.report.replay import Replay
-from codesign_jax.runs import SCENE_COST, cases, tables
-from codesign_jax.runs.cases import Grasp
-from codesign_jax.runs.scene_files import NAMES
+from codesign_jax.runs import SCENE_COST, tables
+from codesign_jax.runs.selection import Grasp
+from codesign_jax.scene.scene_files import NAMES
 from codesign_jax.types import MEANINGS, WARNINGS
 
 
@@ -96,7 +97,7 @@ def _grasp(run: Run, grasp: tuple[Grasp, Replay] | None) -> str:
     planned, shown = grasp
     episode, particle, trial = planned.place
     name = run.scene.objects.object[int(planned.trial.shape)].name
-    before, again = (cases.ending(o) for o in (planned.outcome, shown.outcome))
+    before, again = (verdict.ending(o) for o in (planned.outcome, shown.outcome))
     note = (
         f"The chosen design with the object {name}: trial {trial} of particle {particle} in "
         f"episode {episode}, simulated again. In the run: {before}; here: {again}."
@@ -111,7 +112,7 @@ def _grasp(run: Run, grasp: tuple[Grasp, Replay] | None) -> str:
     if shown.trace is not None and (forces := shown.trace.forces) is not None:
         text = (
             "Below: the fingers' normal forces on the object, and the palm's force. Largest depths "
-            f"in one another over this grasp: {verdicts.depths(forces)}."
+            f"in one another over this grasp: {sentences.depths(forces)}."
         )
         chart = figures.html(figures.grip(forces, run.scene), "grip")
         parts += [markup.paragraph(text), chart]

@@ -16,7 +16,7 @@ from codesign_jax.runs.reading import load_record, read_run
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.run import FAILURES, RunResult
 from codesign_jax.runs.settings import SCENE_COST, Settings, check, make_settings
-from codesign_jax.runs.tables import describe, failure_counts, status_names, warning_counts
+from codesign_jax.runs.tables import describe
 
 __all__ = [
     "FAILURES",
@@ -32,7 +32,6 @@ __all__ = [
     "check",
     "check_folder",
     "describe",
-    "failure_counts",
     "load_record",
     "make_settings",
     "needs_poor_seed",
@@ -41,7 +40,5 @@ __all__ = [
     "read_run",
     "run_names",
     "setting_of",
-    "status_names",
     "variant",
-    "warning_counts",
 ]

@@ -18,16 +18,16 @@ import jax
 import numpy as np
 
 from codesign_jax import array_files, files, reuse, sampling
-from codesign_jax.codesign import VERDICTS, verdicts
+from codesign_jax.judge.verdict import VERDICTS, status_names, verdicts
 from codesign_jax.model import morphology
 from codesign_jax.provenance import environment
 from codesign_jax.runs.columns import GRASPS, MAY_BE_EMPTY, OF_DESIGNS
 from codesign_jax.runs.directory import LOCK
-from codesign_jax.runs.scene_files import contents, scene_texts
-from codesign_jax.runs.tables import design_columns, noise_values, status_names
+from codesign_jax.runs.tables import design_columns, noise_values
 from codesign_jax.sampling import Drawn
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space, params_of
+from codesign_jax.scene.scene_files import contents, scene_texts
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome, Status
 

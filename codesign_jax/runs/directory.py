@@ -20,13 +20,13 @@ from typing import Any
 from codesign_jax import files, terminal, user_code
 from codesign_jax import scene as scenes
 from codesign_jax.provenance import environment
-from codesign_jax.runs import manifest, reading, scene_files, tables
+from codesign_jax.runs import manifest, reading, tables
 from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.runs.columns import FILES, TABLES
 from codesign_jax.runs.manifest import LOCK, PROVENANCE
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.settings import Settings, masks_of
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, scene_files
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.scene.schema import InputError
 

@@ -24,9 +24,9 @@ from codesign_jax import codesign
 from codesign_jax.batch import LIMIT
 from codesign_jax.codesign import EpisodeInfo, Task
 from codesign_jax.devices import take
+from codesign_jax.interrupts import Interrupts, Stopped
 from codesign_jax.optimize import OptimizerState, candidates
 from codesign_jax.runs.directory import open_run
-from codesign_jax.runs.interrupts import Interrupts, Stopped
 from codesign_jax.runs.plan import Plan, finalists, needs_poor_seed, variant
 from codesign_jax.runs.progress import Progress, Voice
 from codesign_jax.runs.record import Start

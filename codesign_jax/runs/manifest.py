@@ -17,9 +17,9 @@ from typing import Any
 from codesign_jax import files, terminal, user_code
 from codesign_jax import scene as scenes
 from codesign_jax.provenance import environment, git_state
-from codesign_jax.runs import scene_files
 from codesign_jax.runs.columns import FILES, TABLES
 from codesign_jax.runs.settings import Settings, check
+from codesign_jax.scene import scene_files
 from codesign_jax.scene.schema import InputError
 
 PROVENANCE = "provenance.json"

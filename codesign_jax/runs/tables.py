@@ -15,12 +15,13 @@ import jax
 import numpy as np
 
 from codesign_jax import files, types
-from codesign_jax.codesign import VERDICTS, FinalTest, summarize_test, verdicts
+from codesign_jax.codesign import FinalTest, summarize_test
+from codesign_jax.judge.verdict import VERDICTS, status_names, verdicts
 from codesign_jax.runs.columns import MORE, REFERENCE, TABLES
 from codesign_jax.runs.record import History, Record
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, fingers_of
-from codesign_jax.types import WARNINGS, Outcome, Status, Trial
+from codesign_jax.types import Outcome, Trial
 
 TESTS = "tests.csv"
 
@@ -136,27 +137,6 @@ def _aligned(columns: list[list[str]]) -> list[str]:
     widths = [max(map(len, column)) for column in columns]
     rows = zip(*columns, strict=True)
     return ["  ".join(["", *map(str.rjust, row, widths)]) for row in rows]
-
-
-def status_names(status: int) -> str:
-    """Names of the status bits that are set, joined by "+", or "OK"."""
-    return "+".join(bit.name or "" for bit in Status(int(status))) or "OK"
-
-
-def failure_counts(status: jax.typing.ArrayLike) -> str:
-    """How often each cause of failure occurs, e.g. "SPEED 1, STUCK 3"; empty if none does."""
-    return _counts(status, [bit for bit in Status if bit not in WARNINGS])
-
-
-def warning_counts(status: jax.typing.ArrayLike) -> str:
-    """How often each warning occurs, which does not fail a trial, e.g. "SOLVER_CAP 3"."""
-    return _counts(status, [*WARNINGS])
-
-
-def _counts(status: jax.typing.ArrayLike, bits: Iterable[Status]) -> str:
-    every = np.asarray(status)
-    counts = {bit.name: int(((every & bit) != 0).sum()) for bit in bits}
-    return ", ".join(f"{name} {count}" for name, count in counts.items() if count)
 
 
 def _episodes(history: History, space: DesignSpace, span: range) -> Iterator[Row]:

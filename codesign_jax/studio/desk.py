@@ -17,9 +17,9 @@ from codesign_jax.commands import common
 from codesign_jax.commands.flags import Studio as Options
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording, tells_forces
+from codesign_jax.judge.cases import Case
 from codesign_jax.report import animation
-from codesign_jax.runs import cases
-from codesign_jax.runs.cases import Case
+from codesign_jax.runs import selection
 from codesign_jax.scene import Scene, library
 from codesign_jax.scene.loading import with_accuracy
 from codesign_jax.types import Outcome, Params, Trial
@@ -114,7 +114,9 @@ class Desk:
                 "scene": str(folder / "scene.toml"),
             }
             self.file = dataclasses.replace(self.file, **fields)
-            self.record = cases.read_record(folder, tell=lambda text: None)  # `find_case` said it
+            self.record = selection.read_record(
+                folder, tell=lambda text: None
+            )  # `find_case` said it
         self.accuracies = ("", *library.available("accuracy"))
         self.benches: dict[str, Bench] = {}
 

@@ -17,12 +17,12 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import Server, ServerConnection
 
 from codesign_jax import preflight
-from codesign_jax.codesign import VERDICTS
 from codesign_jax.commands import common
 from codesign_jax.commands.flags import Studio as Options
+from codesign_jax.interrupts import interruptible
+from codesign_jax.judge.verdict import VERDICTS
 from codesign_jax.report import viewer
-from codesign_jax.runs import cases, tables
-from codesign_jax.runs.interrupts import interruptible
+from codesign_jax.runs import selection, tables
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.schema import InputError
 from codesign_jax.studio import server
@@ -176,7 +176,7 @@ def about(desk: Desk) -> dict[str, Any]:
     ]
     run = None
     if desk.record:
-        chosen = cases.choose(scene, desk.record)
+        chosen = selection.choose(scene, desk.record)
         particles = desk.record.history.cost.shape[1]
         run = {"episodes": desk.record.done, "particles": particles}
         run["chosen"] = [chosen.episode + 1, chosen.row]

@@ -18,13 +18,14 @@ import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from codesign_jax import codesign, files, runs, stress
-from codesign_jax.codesign import VERDICTS
+from codesign_jax import codesign, files, runs
 from codesign_jax.commands import common
+from codesign_jax.judge import sentences, stress, verdict
+from codesign_jax.judge.verdict import VERDICTS
 from codesign_jax.model import morphology, overlap
 from codesign_jax.optimize import Screened
-from codesign_jax.report import animation, bodies, verdicts, viewer
-from codesign_jax.runs import cases
+from codesign_jax.report import animation, bodies, viewer
+from codesign_jax.runs import selection
 from codesign_jax.scene.parameters import fingers_of
 from codesign_jax.scene.schema import InputError
 from codesign_jax.studio import process
@@ -244,8 +245,8 @@ class Tab:
         cost = None
         if self._outcomes:
             outcomes = jax.tree.map(lambda *v: np.concatenate(v)[: view.trials], *self._outcomes)
-            ends = codesign.verdicts(outcomes).tolist()
-            sentence = str(verdicts.Judged(scene, outcomes, grasps="grasps"))
+            ends = verdict.verdicts(outcomes).tolist()
+            sentence = str(sentences.Judged(scene, outcomes, grasps="grasps"))
             if not failed(outcomes.status).all():
                 cost = float(codesign.particle_cost(scene, outcomes))
         design = common.shortest(shown.bench.case.space, view.design)
@@ -276,7 +277,7 @@ class Tab:
     def _improve(self, shown: ShownGrasp, optimizer: Any, state: Any, done: int) -> None:
         """One episode, whose answer so far is shown."""
         state, info = shown.bench.task.episode(optimizer, state)
-        ends = codesign.verdicts(jax.tree.map(np.asarray, info.outcomes))
+        ends = verdict.verdicts(jax.tree.map(np.asarray, info.outcomes))
         if self._asked:  # a slider was moved meanwhile
             return
         done += 1
@@ -302,7 +303,9 @@ class Tab:
         desk = self._desk
         if numbers is not None and desk.record is not None:
             e, p = numbers
-            design = cases.find_grasp(desk.case.scene, desk.record, episode=e, particle=p).design
+            design = selection.find_grasp(
+                desk.case.scene, desk.record, episode=e, particle=p
+            ).design
         view = self._current().view
         self._asked.append(view._replace(design=design, resting=True, number=None))
 
@@ -322,7 +325,7 @@ class Tab:
     def _page(self) -> None:
         view, bench, grasp = self._current()
         space = bench.case.space
-        lines = [runs.describe(space, view.design), cases.ending(grasp.outcome)]
+        lines = [runs.describe(space, view.design), verdict.ending(grasp.outcome)]
         with self._desk.reserved("grasp", ".html") as path:
             viewer.write(bench.case.scene, grasp, path, title="A grasp in 3D", text=lines)
         self.send("done", f"written: {path}, for any browser, offline")
@@ -380,7 +383,7 @@ def _grasp_message(shown: ShownGrasp) -> dict[str, Any]:
         "replay": replay,
         "design": common.shortest(space, view.design),
         "limits": limits,
-        "ending": cases.ending(grasp.outcome),
+        "ending": verdict.ending(grasp.outcome),
         "cost": float(grasp.outcome.cost),
         "warnings": stress.of_design(scene, grasp.params),
         "series": series | {"lost": 1e3 * scene.cost.lost_distance},

@@ -26,10 +26,10 @@ from codesign_jax import optimize, use_compilation_cache
 from codesign_jax import scene as scenes
 from codesign_jax.commands.common import changes
 from codesign_jax.engines import make_engine
+from codesign_jax.judge.verdict import WANTED
 from codesign_jax.runs.progress import duration
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
-from codesign_jax.verdict import WANTED
 from scripts.search.tables import LIMITED, lines_table, masses_table, table
 from scripts.shared import output, provenance, work
 from scripts.shared.lock_step import Study, make_case

@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
+from codesign_jax.judge.verdict import WANTED
 from codesign_jax.optimize import DEFAULT, NAMES
 from codesign_jax.statistics import wilson
-from codesign_jax.verdict import WANTED
 from scripts.shared import output, statistics
 
 LIMITED = "23d"

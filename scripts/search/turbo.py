@@ -28,8 +28,8 @@ import numpy as np
 from codesign_jax import codesign, use_compilation_cache
 from codesign_jax import scene as scenes
 from codesign_jax.engines import make_engine
+from codesign_jax.judge.verdict import WANTED
 from codesign_jax.scene.parameters import design_space
-from codesign_jax.verdict import WANTED
 from scripts.shared import output, provenance
 from scripts.shared.lock_step import Study, make_case
 

@@ -16,8 +16,8 @@ import mujoco
 import numpy as np
 
 from codesign_jax.provenance import environment, git_state
-from codesign_jax.runs.scene_files import scene_texts
 from codesign_jax.scene import Scene
+from codesign_jax.scene.scene_files import scene_texts
 from scripts.shared import evidence
 
 

@@ -24,7 +24,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax import verdict
 from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.kernel.adjoint import (
@@ -34,6 +33,7 @@ from codesign_jax.engines.structured.kernel.adjoint import (
     state_path,
 )
 from codesign_jax.engines.structured.world_model import world_constants
+from codesign_jax.judge import verdict
 from codesign_jax.model import ModelFields
 from codesign_jax.scene import Scene
 from codesign_jax.types import Trace

@@ -11,12 +11,12 @@ from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.laws.cones import Cones, frictions, make_cones
 from codesign_jax.engines.structured.laws.meshes import MeshLanes, mesh_lanes
 from codesign_jax.engines.structured.laws.step_numbers import step_numbers
+from codesign_jax.judge.verdict import Bounds, bounds
 from codesign_jax.model import Layout, ModelFields, layout
 from codesign_jax.model.layout import implicit_spring, palm_points, wrist_springs
 from codesign_jax.model.morphology import at_joints
 from codesign_jax.model.spec import palm_inertia
 from codesign_jax.scene import Scene
-from codesign_jax.verdict import Bounds, bounds
 
 
 class WorldModel(NamedTuple):

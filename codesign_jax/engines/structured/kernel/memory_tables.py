@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import verdict
 from codesign_jax.engines.structured.kernel import (
     chambers,
     objects,
@@ -34,6 +33,7 @@ from codesign_jax.engines.structured.laws.kinematics import Acc, State
 from codesign_jax.engines.structured.laws.rings import RING_OVERLAP
 from codesign_jax.engines.structured.laws.step_numbers import step_numbers
 from codesign_jax.engines.structured.world_model import WorldModel, joint_sections, sections
+from codesign_jax.judge import verdict
 from codesign_jax.model import held, layout
 from codesign_jax.model.held import palm_groups, rings_of_link
 from codesign_jax.model.layout import palm_touches, touches_itself

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
 
-from codesign_jax import reuse, verdict
+from codesign_jax import reuse
 from codesign_jax.compiler.launch import Kernel, block_lanes, kernel_jaxpr, launch
 from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.kernel import shared_memory
@@ -25,6 +25,7 @@ from codesign_jax.engines.structured.lanewise import Lanes, lanes, of_code
 from codesign_jax.engines.structured.laws import air
 from codesign_jax.engines.structured.laws.kinematics import State
 from codesign_jax.engines.structured.world_model import WorldModel
+from codesign_jax.judge import verdict
 from codesign_jax.model import held
 from codesign_jax.scene import Scene
 

@@ -12,15 +12,16 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from codesign_jax import model, rollout, verdict
+from codesign_jax import model, rollout
 from codesign_jax.engines import Engine
 from codesign_jax.engines.mujoco import world_model
+from codesign_jax.interrupts import interruptible
+from codesign_jax.judge import verdict
+from codesign_jax.judge.cases import Case
 from codesign_jax.model import morphology, overlap
 from codesign_jax.model.layout import touches_itself
 from codesign_jax.model.overlap import Overlaps
 from codesign_jax.reuse import SceneProgram, shared
-from codesign_jax.runs.cases import Case
-from codesign_jax.runs.interrupts import interruptible
 from codesign_jax.scene import Scene, draws, silicones
 from codesign_jax.scene.buildable import rim_drop
 from codesign_jax.scene.parameters import DesignSpace

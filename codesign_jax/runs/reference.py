@@ -7,7 +7,6 @@ much that changes), until its verdict is decided, and at the run's accuracy unde
 (`stress`).
 """
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,17 +14,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import array_files, codesign, engines, rollout, stress, verdict
-from codesign_jax.report.verdicts import Judged
+from codesign_jax import array_files, codesign, engines, rollout
+from codesign_jax.judge import fresh_trials, stress, verdict
+from codesign_jax.judge.cases import Case
+from codesign_jax.judge.sentences import Judged
+from codesign_jax.judge.stress import Stress
 from codesign_jax.runs import Settings, columns, tables
-from codesign_jax.runs.cases import Case, case_of_run
 from codesign_jax.runs.progress import Meter
-from codesign_jax.scene import Scene, with_accuracy
-from codesign_jax.stress import Stress
+from codesign_jax.runs.selection import case_of_run
+from codesign_jax.scene import Scene
 from codesign_jax.terminal import Console
 from codesign_jax.types import Outcome
 
-ACCURACY = "reference"
 FILE = "reference.npz"
 STRESS_FILE = "stress.npz"
 STRESS_TRIALS = 12
@@ -37,8 +37,6 @@ _LEFT_OUT = {
     FILE: "the design's fresh trials and their verdict are",
     STRESS_FILE: "its grasps under other conditions and their warnings are",
 }
-STREAM_REFERENCE = 0x72656665
-"""Stream of the fresh trials' noise ("refe")."""
 
 
 def most_trials(trials: int | None, settings: Settings) -> int:
@@ -60,7 +58,7 @@ def test(
       later: What is simulated after it, for the time left, in grasps of this accuracy.
     """
     case = _finer(folder, settings)
-    key = _noise(settings, STREAM_REFERENCE)
+    key = _noise(settings, fresh_trials.STREAM)
     about = case.digest(settings.seed)
     kept, why = _outcomes(folder, about)
     if why:
@@ -69,46 +67,21 @@ def test(
 
         def keep(outcomes: Outcome) -> None:
             array_files.save_results(folder / FILE, about, outcomes._asdict())
+            show(meter, outcomes, most)
 
-        outcomes = decide(case, key, most, meter, kept, keep)
+        meter.count(kept.cost.size if kept else 0)
+        outcomes = fresh_trials.decide(case, key, most, kept, keep)
     if kept is None or outcomes.cost.size > kept.cost.size:
         drawn = rollout.sample_trials(case.scene, key, outcomes.cost.size)
         tables.write_grasps(folder / columns.REFERENCE, case.scene, drawn, outcomes)
     return outcomes
 
 
-def decide(
-    case: Case,
-    key: jax.Array,
-    most: int,
-    meter: Meter,
-    previous: Outcome | None = None,
-    keep: Callable[[Outcome], None] = lambda outcomes: None,
-) -> Outcome:
-    """Outcomes of as many trials as decide whether a design is good, see `verdict.sequential`.
-
-    Args:
-      case: The design.
-      key: Key of the trials.
-      most: Most trials; at least 1.
-      meter: Counts the grasps, and estimates how many there are to come.
-      previous: Outcomes of the first trials, which are known.
-      keep: Is called with all outcomes so far after each batch.
-    """
-
-    def simulate(first: int, count: int) -> Outcome:
-        return case.simulate(count, key, first)
-
-    outcomes = previous
-    if previous is not None:
-        meter.count(previous.cost.size)
-    for outcomes in verdict.sequential(simulate, most, previous):
-        keep(outcomes)
-        ends = verdict.tally(outcomes)
-        meter.total = min(most, ends.total + verdict.judge(ends.kept, ends.total).more)
-        meter.advance(ends.total - meter.done)
-    assert outcomes is not None
-    return outcomes
+def show(meter: Meter, outcomes: Outcome, most: int) -> None:
+    """Shows on a meter how many trials there are, and how many are to come."""
+    total = outcomes.cost.size
+    meter.total = min(most, total + fresh_trials.lacking(outcomes))
+    meter.advance(total - meter.done)
 
 
 def _outcomes(folder: Path, about: str, *, any_code: bool = False) -> tuple[Outcome | None, str]:
@@ -119,18 +92,6 @@ def _outcomes(folder: Path, about: str, *, any_code: bool = False) -> tuple[Outc
     if not {*_OUTCOME} <= {*arrays} <= {*Outcome._fields} or {len(s) for s in shapes} != {1}:
         return None, _NO_RESULT
     return (Outcome(**arrays), why) if len(shapes) == 1 else (None, _NO_RESULT)
-
-
-def judged(scene: Scene, outcomes: Outcome, other: Stress | None = None) -> Judged:
-    """Outcomes of the test with the scene that was simulated, and those of other conditions."""
-    return Judged(with_accuracy(scene, ACCURACY), outcomes, ACCURACY, stress=other)
-
-
-def steps_and_links(scene: Scene) -> float:
-    """How much more time a grasp of the test takes than one of the scene, by steps and links."""
-    finer = with_accuracy(scene, ACCURACY)
-    sizes = [s.num_steps * s.discretization.links for s in (finer, scene)]
-    return sizes[0] / sizes[1]
 
 
 def stored(folder: Path, settings: Settings) -> tuple[Outcome | None, str]:
@@ -217,8 +178,8 @@ def kept(folder: Path, scene: Scene, settings: Settings) -> Kept:
             notes.append(f"{text}. {again}")
         elif reason:
             notes.append(f"{folder / name} {reason}. {again}")
-    fresh = None if outcome is None else judged(scene, outcome, conditions)
-    return Kept(fresh, conditions, notes)
+    trials = None if outcome is None else fresh_trials.judged(scene, outcome, conditions)
+    return Kept(trials, conditions, notes)
 
 
 def _stress_case(folder: Path, settings: Settings) -> tuple[Case, str]:
@@ -227,7 +188,7 @@ def _stress_case(folder: Path, settings: Settings) -> tuple[Case, str]:
 
 
 def _finer(folder: Path, settings: Settings) -> Case:
-    return case_of_run(folder, accuracy=ACCURACY, engine=settings.engine)
+    return case_of_run(folder, accuracy=fresh_trials.ACCURACY, engine=settings.engine)
 
 
 def _noise(settings: Settings, stream: int) -> jax.Array:

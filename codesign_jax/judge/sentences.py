@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from codesign_jax import cost, runs
+from codesign_jax import cost
+from codesign_jax.judge import verdict
+from codesign_jax.judge.stress import Stress
+from codesign_jax.judge.verdict import Verdict, judge, tally
 from codesign_jax.scene import Scene
-from codesign_jax.stress import Stress
 from codesign_jax.types import Forces, Outcome, failed
-from codesign_jax.verdict import Verdict, judge, tally
 
 MANY = 0.1
 """Share of failed trials from which on a verdict comes with a warning."""
@@ -54,7 +55,7 @@ class Judged(NamedTuple):
         """The verdict in a sentence; that there is none if every trial failed."""
         counts = tally(self.outcomes)
         if counts.fault == counts.total:
-            causes = runs.failure_counts(self.outcomes.status)
+            causes = verdict.failure_counts(self.outcomes.status)
             return f"no verdict: every trial failed ({causes})"
         sentence = self.verdict.sentence(f"{self.grasps} of {objects(self.scene)}")
         return "; ".join([sentence, *([self.limits] if self.limits else [])])
@@ -87,9 +88,9 @@ def _span(values: Iterable[float]) -> str:
 
 def of_trials(scene: Scene, outcomes: Outcome) -> str:
     """Numbers of trials by outcome, their mean cost, and warnings."""
-    warnings = runs.warning_counts(outcomes.status)
+    warnings = verdict.warning_counts(outcomes.status)
     counts = tally(outcomes)
-    causes = f" ({runs.failure_counts(outcomes.status)})" if counts.fault else ""
+    causes = f" ({verdict.failure_counts(outcomes.status)})" if counts.fault else ""
     text = f"{counts}{causes}; {mean_cost(scene, outcomes)}"
     return text + (f"; warnings: {warnings}" if warnings else "")
 
@@ -133,7 +134,7 @@ def warnings(judged: Judged) -> list[str]:
     count = counts.not_released + counts.fault
     if count <= MANY * counts.total or counts.fault == counts.total:
         return []
-    causes = runs.failure_counts(judged.outcomes.status)
+    causes = verdict.failure_counts(judged.outcomes.status)
     text = f"warning: {count} of {counts.total} trials failed ({causes})"
     text += "; STUCK: the hand did not let go of the object" if counts.not_released else ""
     if scene.cost.failure == "exclude":

@@ -11,13 +11,13 @@ are false.
 A design is judged by the outcomes of its trials (`judge`), by Wald's sequential probability ratio
 test of the share of its grasps that it keeps.
 
->>> from codesign_jax import verdict
+>>> from codesign_jax.judge import verdict
 >>> verdict.judge(60, 60).word, verdict.judge(24, 24).word
 ('good', 'not enough trials')
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -26,7 +26,7 @@ import numpy as np
 
 from codesign_jax.scene import Scene
 from codesign_jax.statistics import Interval, wilson
-from codesign_jax.types import Outcome, Status, Trace, failed
+from codesign_jax.types import WARNINGS, Outcome, Status, Trace, failed
 
 FAR = 3e38
 """Larger than any distance, and still a number in float32."""
@@ -171,6 +171,35 @@ class Tally(NamedTuple):
 def tally(outcomes: Outcome) -> Tally:
     """Counts trials, given as arrays of any shape."""
     return Tally(*np.bincount(verdicts(outcomes).ravel(), minlength=len(VERDICTS)).tolist())
+
+
+def status_names(status: int) -> str:
+    """Names of the status bits that are set, joined by "+", or "OK"."""
+    return "+".join(bit.name or "" for bit in Status(int(status))) or "OK"
+
+
+def failure_counts(status: jax.typing.ArrayLike) -> str:
+    """How often each cause of failure occurs, e.g. "SPEED 1, STUCK 3"; empty if none does."""
+    return _counts(status, [bit for bit in Status if bit not in WARNINGS])
+
+
+def warning_counts(status: jax.typing.ArrayLike) -> str:
+    """How often each warning occurs, which does not fail a trial, e.g. "SOLVER_CAP 3"."""
+    return _counts(status, [*WARNINGS])
+
+
+def _counts(status: jax.typing.ArrayLike, bits: Iterable[Status]) -> str:
+    every = np.asarray(status)
+    counts = {bit.name: int(((every & bit) != 0).sum()) for bit in bits}
+    return ", ".join(f"{name} {count}" for name, count in counts.items() if count)
+
+
+def ending(outcome: Outcome) -> str:
+    """How a trial ended, in words; its entries are numbers."""
+    if failed(int(outcome.status)):
+        return f"failed ({status_names(int(outcome.status))})"
+    lost = float(outcome.lost_time)
+    return f"object lost at {lost:.2f} s" if np.isfinite(lost) else "object kept"
 
 
 # ---- whether a design is good

@@ -8,7 +8,8 @@ Environment variables, which the commands check before they do anything:
   that of JAX included.
 * CODESIGN_CACHE_BYTES: the most bytes on disk of JAX's programs, of kernels and of grids, each, by
   default 512 MiB; what was not used for the longest time goes first.
-* XDG_CACHE_HOME: where the folder `codesign-jax` is, by default `~/.cache`.
+* XDG_CACHE_HOME: where the folder `codesign-jax` is, by default `~/.cache`. It must be an absolute
+  path; another is ignored, as its specification says.
 * JAX_COMPILATION_CACHE_DIR: JAX's own variable. Programs and kernels are in that folder then, and
   nobody checks or deletes the programs.
 """
@@ -20,6 +21,7 @@ import hashlib
 import importlib.metadata
 import os
 import time
+import warnings
 import zlib
 from collections.abc import Callable, Hashable
 from pathlib import Path
@@ -94,7 +96,10 @@ MOST = str(512 * 2**20)  # bytes of each cache on disk, if the environment does 
 
 def folder() -> Path:
     """Folder of all caches; it may not exist yet, and begins with `~` for a user without a home."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "codesign-jax")
+    chosen = os.environ.get("XDG_CACHE_HOME", "")
+    # The XDG Base Directory Specification: "consider the path invalid and ignore it".
+    base = chosen if os.path.isabs(chosen) else os.path.expanduser("~/.cache")
+    return Path(base, "codesign-jax")
 
 
 def _environment() -> tuple[str, str]:
@@ -145,6 +150,7 @@ def kept(path: Path | None, build: Callable[[], bytes], *, worth: float = 0.0) -
     content = build()
     if time.perf_counter() - start >= worth:
         with contextlib.suppress(OSError):
+            files.make_folder_of(path)
             files.clear_place(path)
             with files.atomically(path) as part:
                 part.write_bytes(hashlib.sha256(path.name.encode() + content).digest() + content)
@@ -172,9 +178,9 @@ def _evict(newest: Path, most: int) -> None:
 def use_compilation_cache() -> None:
     """Keeps compiled programs between processes, in `folder`, as the commands do.
 
-    For scripts and notebooks, before their first simulation. Damaged programs are deleted first. A
-    place that was chosen already (`jax_compilation_cache_dir`) stays. With CODESIGN_CACHE=off JAX
-    keeps and finds nothing.
+    For scripts and notebooks, before their first simulation. Programs that are not as they were
+    written are deleted first. A place that was chosen already (`jax_compilation_cache_dir`) stays.
+    With CODESIGN_CACHE=off JAX keeps and finds nothing.
 
     Raises:
       ValueError: If an environment variable has a wrong value.
@@ -191,9 +197,15 @@ def use_compilation_cache() -> None:
     if most is None:
         jax.config.update("jax_enable_compilation_cache", False)
     elif jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
-        programs = folder() / "jax"
-        check_programs(programs)
+        # JAX reads no programs of its other way of compression, and writes over none.
+        programs = folder() / ("jax" if _unzstd() is None else "jax-zstd")
+        if not check_programs(programs):
+            text = f"{programs} holds damaged programs that cannot be deleted: none is used or kept"
+            warnings.warn(text, stacklevel=2)
+            jax.config.update("jax_enable_compilation_cache", False)
+            return
         jax.config.update("jax_compilation_cache_dir", str(programs))
+        _note_from_now_on(programs)
         # JAX locks a folder that has a limit.
         if os.access(programs, os.W_OK) or not programs.exists():
             jax.config.update("jax_compilation_cache_max_size", most)
@@ -201,36 +213,107 @@ def use_compilation_cache() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
-def check_programs(programs: Path) -> None:
-    """Deletes what JAX wrote since the last check and cannot be unpacked, and dates the rest.
+# JAX (`lru_cache.py`) writes no program as a whole and writes over nothing: what a full disk or a
+# power cut left would stay.  It compresses them by zlib, which has a checksum, or, where it finds
+# zstd, without any: a flipped bit would be run as machine code.  So each program has its digest
+# beside it, which is written as soon as JAX has written the program.
 
-    JAX (`lru_cache.py`) writes no program as a whole and writes over nothing: what a full disk or a
-    power cut left would stay, with a warning in each process.
+
+def check_programs(programs: Path) -> bool:
+    """Deletes the programs of a folder that are not as they were written, and dates the rest.
+
+    Returns:
+      Whether all that are left are sound: in a folder that cannot be written to they may not be.
     """
-    checked = programs / "checked"
-    now = time.time_ns()
-    with contextlib.suppress(OSError):  # no folder, a read-only one, or a full disk: no matter
-        last = checked.stat().st_mtime_ns - 10**9 if checked.exists() else 0
-        for path in programs.glob("*-cache"):
-            with contextlib.suppress(OSError):  # another process deletes as well
-                files.clear_place(path)
-                used = path.with_name(f"{path.name[:-6]}-atime")
-                written = path.stat().st_mtime_ns
-                if written > last and not _complete(path.read_bytes()):
-                    path.unlink()
-                elif not used.exists():  # JAX's limit of size needs it of every program
-                    used.write_bytes(written.to_bytes(8, "little"))
-        checked.touch()
-        os.utime(checked, ns=(now, now))
+    sound = True
+    for path in sorted(programs.glob("*-cache")):
+        try:
+            files.clear_place(path)
+            if path.exists() and not _is_sound(path):
+                _digest_beside(path).unlink(missing_ok=True)
+                path.unlink()
+        except OSError:  # another process deletes as well, or nobody may
+            sound = sound and not path.exists()
+        with contextlib.suppress(OSError):
+            used = _beside(path, "atime")
+            if path.exists() and not used.exists():  # JAX's limit of size needs it of every program
+                used.write_bytes(path.stat().st_mtime_ns.to_bytes(8, "little"))
+    for path in programs.glob("*-digest"):  # of programs that JAX has deleted
+        with contextlib.suppress(OSError):
+            if not _beside(path, "cache").exists():
+                path.unlink()
+    return sound
 
 
-def _complete(content: bytes) -> bool:
+def _is_sound(path: Path) -> bool:
+    content = path.read_bytes()
+    beside = _digest_beside(path)
+    if beside.exists():
+        return beside.read_bytes() == _program_digest(path, content)
+    if _unzstd() is None and _unpacks(content):  # by zlib, with its checksum
+        with contextlib.suppress(OSError):
+            beside.write_bytes(_program_digest(path, content))
+        return True
+    return False
+
+
+def _note_programs(programs: Path, known: set[str]) -> None:
+    """Writes the digests of programs that are not `known`, to which they are added."""
+    with contextlib.suppress(OSError):  # another process deletes as well; a full disk
+        for name in {entry.name for entry in os.scandir(programs)} - known:
+            path = programs / name
+            if name.endswith("-cache") and not _digest_beside(path).exists():
+                content = path.read_bytes()
+                if not _unpacks(content):  # another process is writing it, and will note it
+                    continue
+                _digest_beside(path).write_bytes(_program_digest(path, content))
+            known.add(name)
+
+
+@functools.cache
+def _note_from_now_on(programs: Path) -> None:
+    """Has `_note_programs` called whenever JAX has compiled, and written, a program."""
+    import jax
+
+    known: set[str] = set()
+
+    def note(event: str, duration: float, **more: object) -> None:
+        if event.endswith("backend_compile_duration"):
+            _note_programs(programs, known)
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+
+
+def _beside(path: Path, what: str) -> Path:
+    return path.with_name(f"{path.name.rpartition('-')[0]}-{what}")
+
+
+def _digest_beside(path: Path) -> Path:
+    return _beside(path, "digest")
+
+
+def _program_digest(path: Path, content: bytes) -> bytes:
+    return hashlib.sha256(path.name.encode() + content).digest()
+
+
+@functools.cache
+def _unzstd() -> Callable[[bytes], bytes] | None:
+    """What unpacks zstd, where JAX finds it (`compilation_cache.py`); None: it takes zlib then."""
+    with contextlib.suppress(ImportError):
+        from compression import zstd  # type: ignore[import-not-found]  # Python 3.14
+
+        return zstd.decompress
+    with contextlib.suppress(ImportError):
+        import zstandard  # type: ignore[import-not-found]
+
+        return zstandard.ZstdDecompressor().decompress
+    return None
+
+
+def _unpacks(content: bytes) -> bool:
+    """Whether a program is there to its end."""
     try:
-        if content.startswith(b"\x28\xb5\x2f\xfd"):
-            import zstandard  # type: ignore[import-not-found]
-
-            return bool(zstandard.ZstdDecompressor().decompress(content))
-        return bool(zlib.decompress(content))
+        return bool((_unzstd() or zlib.decompress)(content))
     except Exception:  # each library has errors of its own, for whatever it finds
         return False
 

@@ -299,4 +299,62 @@ def test_jax_compiles_again_what_was_damaged_and_keeps_it(damage, place):
         path.write_bytes(damage)
     assert run() == want
     assert sorted((place / "jax").glob("*-cache")) == paths
-    assert all(reuse._complete(path.read_bytes()) for path in paths)
+    assert all(reuse._is_sound(path) for path in paths)
+
+
+@pytest.mark.parametrize("way", ["flipped", "no digest", "another's", "cut short", "a folder"])
+@pytest.mark.parametrize("checksum", [True, False])
+def test_a_program_that_is_not_as_it_was_written_is_not_used(way, checksum, place, monkeypatch):
+    """Also one that can be unpacked: zstd, as JAX calls it, has no checksum."""
+    if not checksum:
+        monkeypatch.setattr(reuse, "_unzstd", lambda: lambda content: content)
+    reuse.use_compilation_cache()
+    folder = Path(jax.config.jax_compilation_cache_dir)
+    assert folder.name == ("jax" if checksum else "jax-zstd")
+    jax.jit(lambda v: v * 5.25 + len(way))(2.0)
+    paths = sorted(folder.glob("*-cache"))
+    assert paths and all(reuse._digest_beside(path).exists() for path in paths)
+    path = paths[0]
+    content = path.read_bytes()
+    assert reuse.check_programs(folder) and path.read_bytes() == content
+    if way == "flipped":
+        middle = len(content) // 2
+        path.write_bytes(content[:middle] + bytes([content[middle] ^ 4]) + content[middle + 1 :])
+    elif way == "no digest":
+        reuse._digest_beside(path).unlink()
+    elif way == "another's":
+        other = path.with_name("other-cache")
+        path.rename(other)
+        reuse._digest_beside(path).rename(reuse._digest_beside(other))
+        path = other
+    elif way == "cut short":
+        path.write_bytes(content[:-9])
+    else:
+        path.unlink()
+        path.mkdir()
+    os.utime(path, (0, 0))  # whatever its times say
+    assert reuse.check_programs(folder)
+    # By its checksum a whole program is known again.
+    assert path.exists() == (checksum and way == "no digest")
+    assert path.exists() == reuse._digest_beside(path).exists()
+
+
+def test_damage_that_cannot_be_deleted_turns_the_cache_off(place, monkeypatch):
+    (place / "jax").mkdir(parents=True)
+    (place / "jax" / "x-cache").write_bytes(b"damaged")
+
+    def refuse(path, **options):
+        raise PermissionError
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with pytest.warns(UserWarning, match="damaged programs that cannot be deleted"):
+        reuse.use_compilation_cache()
+    assert not jax.config.jax_enable_compilation_cache
+
+
+@pytest.mark.parametrize("text", ["cache", "~/.cache", "./x", "$HOME/.cache", ""])
+def test_a_cache_that_is_no_absolute_path_is_ignored(text, monkeypatch, tmp_path):
+    """As the XDG Base Directory Specification asks for."""
+    monkeypatch.setenv("XDG_CACHE_HOME", text)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert reuse.folder() == tmp_path / ".cache" / "codesign-jax"

@@ -12,12 +12,14 @@ array([20000., 40000.])
 
 import csv
 import io
+import itertools
 import math
 import re
 from pathlib import Path
 
 import numpy as np
 
+from codesign_jax import files
 from codesign_jax.scene import texts
 from codesign_jax.scene.schema import InputError, nearest
 
@@ -71,6 +73,11 @@ NEEDED = {"deflection": "load", "sideways": "load", "drop": "time"}
 """Columns that stand beside another one."""
 MOST_CHARACTERS = 1_000_000
 """Largest size of a file."""
+MOST_PROBLEMS = 20
+"""Most problems of a file that its error names: a log may have one in each of thousands of rows."""
+_NUMBER = re.compile(r"[+-]?[0-9.,]+([eE][+-]?[0-9]+)?")
+_THOUSANDS = re.compile(r"[+-]?[1-9][0-9]{0,2}(,[0-9]{3})+")
+"""A number whose commas may separate thousands as well as decimals."""
 _SEPARATORS = (";", "\t", ",")
 """What stands between cells; the first of them that the head has."""
 _HEAD = re.compile(r"(?P<name>.*?)[\s_]*[\[(](?P<unit>[^\])]*)[\])]")
@@ -83,7 +90,8 @@ def read(path: Path) -> dict[str, np.ndarray]:
     """Reads measurements.
 
     Cells are separated by commas, or by semicolons or tabs as spreadsheets write them, beside which
-    a decimal sign may be a comma.  The unit of a column stands behind its name, after an underscore
+    a decimal sign may be a comma, the same in the whole file.  Numbers have no separators of
+    thousands.  The unit of a column stands behind its name, after an underscore
     or in brackets.  Lines that begin with # are comments.  A cell without a value leaves that
     quantity out of its row.
 
@@ -104,11 +112,10 @@ def read(path: Path) -> dict[str, np.ndarray]:
     names, factors = _columns(head, problems)
     table: dict[str, np.ndarray] = {}
     if not problems:
+        comma = separator != "," and _has_decimal_commas(head, rows, problems)
+    if not problems:
         values = [
-            [
-                _cell(c, separator, f"line {n}, {h}", problems)
-                for h, c in zip(head, row, strict=True)
-            ]
+            [_cell(c, comma, f"line {n}, {h}", problems) for h, c in zip(head, row, strict=True)]
             for n, row in rows
         ]
     if not problems:
@@ -116,18 +123,24 @@ def read(path: Path) -> dict[str, np.ndarray]:
         table = dict(zip(names, columns, strict=True))
         problems = _missing(table)
     if problems:
-        raise InputError([f"{path}: {p}" for p in problems])
+        rest = len(problems) - MOST_PROBLEMS
+        shown = [*problems[:MOST_PROBLEMS], *([f"and {rest:,} problems more"] if rest > 0 else [])]
+        raise InputError([f"{path}: {p}" for p in shown])
     return table
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
     """Lines of a file that have something to read, with their numbers."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            text = file.read(MOST_CHARACTERS + 1)
-    except (OSError, UnicodeDecodeError) as error:
-        why = getattr(error, "strerror", None) or "no UTF-8 text; save it as CSV UTF-8"
-        raise InputError([f"{path}: {why}"]) from error
+        with files.opened(path) as file:
+            content = file.read(4 * MOST_CHARACTERS + 1)
+        if foreign := texts.foreign(content):
+            raise InputError([f"{path}: {foreign}"])
+        text = content.decode("utf-8-sig")
+    except OSError as error:
+        raise InputError([f"{path}: {error.strerror}"]) from error
+    except UnicodeDecodeError as error:
+        raise InputError([f"{path}: no UTF-8 text; save it as CSV UTF-8"]) from error
     if len(text) > MOST_CHARACTERS:
         raise InputError([f"{path} has more than {MOST_CHARACTERS:,} characters"])
     lines = [(n, v) for n, v in enumerate(io.StringIO(text, newline=""), 1) if v.strip()]
@@ -215,11 +228,37 @@ def _valid(column: str, name: str) -> str:
     return f"no quantity {name!r}; {nearest(name, COLUMNS)}"
 
 
-def _cell(text: str, separator: str, where: str, problems: list[str]) -> float:
+def _has_decimal_commas(
+    head: list[str], rows: list[tuple[int, list[str]]], problems: list[str]
+) -> bool:
+    """Whether the file's decimal sign is a comma; a problem where its numbers leave it open."""
+    columns: dict[str, list[str]] = {name: [] for name in head}
+    with_sign: dict[str, str] = {}
+    for line, row in rows:
+        for name, cell in zip(head, row, strict=True):
+            number = texts.typed(cell)
+            if _NUMBER.fullmatch(number):
+                columns[name].append(number)
+                for sign in {*number} & {*",."}:
+                    with_sign.setdefault(sign, f"{cell!r} (line {line}, {name})")
+    remedy = "write numbers without separators of thousands"
+    if len(with_sign) == 2:
+        both = f"{with_sign[',']} has a comma and {with_sign['.']} a point"
+        problems.append(f"{both}, and a file has one decimal sign: {remedy}")
+    commas = {name: [n for n in numbers if "," in n] for name, numbers in columns.items()}
+    grouped = all(map(_THOUSANDS.fullmatch, itertools.chain.from_iterable(commas.values())))
+    whole = any(numbers and not commas[name] for name, numbers in columns.items())
+    if not problems and "," in with_sign and grouped and whole:
+        either = "may be thousands or decimals, and no other number tells"
+        problems.append(f"the comma in {with_sign[',']} {either}: {remedy}, or more decimals")
+    return "," in with_sign
+
+
+def _cell(text: str, comma: bool, where: str, problems: list[str]) -> float:
     if not text:
         return math.nan
     plain = texts.typed(text)
-    if separator != "," and plain.count(",") == 1 and "." not in plain:
+    if comma:
         plain = plain.replace(",", ".")
     try:
         value = float(plain)

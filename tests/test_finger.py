@@ -309,7 +309,10 @@ SPELLINGS = {
     "commas": "pressure_kPa,angle_deg\n20,18.9\n40,-37.2\n",
     "semicolons and decimal commas": "pressure_kPa;angle_deg\n20;18,9\n40;-37,2\n",
     "semicolons and points": "pressure_kPa;angle_deg\r\n20;18.9\r\n40;-37.2\r\n",
-    "tabs": "pressure_kPa\tangle_deg\n20\t18,9\n40\t-37.2\n",
+    "tabs": "pressure_kPa\tangle_deg\n20\t18,9\n40\t-37,2\n",
+    "decimals of three digits": "pressure_kPa\tangle_deg\n20,000\t18,900\n40,000\t-37,200\n",
+    "an exponent": "pressure_Pa;angle_deg\n2,0e4;18,9\n4E+4;-37,2\n",
+    "points of a logger": "pressure_kPa;angle_deg\n20.000;18.900\n40.000;-37.200\n",
     "a line for Excel": "\ufeffsep=;\npressure_kPa;angle_deg\n20;18,9\n40;-37,2\n",
     "empty columns": "pressure_kPa;angle_deg;;\n20;18,9;;\n40;-37,2;;\n",
     "a typographic minus": "pressure_kPa,angle_deg\n20,18.9\n40,\N{MINUS SIGN}37.2\n",
@@ -331,7 +334,18 @@ def test_a_table_is_read_as_spreadsheets_write_it(spelling, tmp_path):
 
 WRONG = {
     "pressure_kPa,angle_deg\n20,18,9": "line 2 has 3 cells, the head 2; beside a decimal comma",
-    "pressure_kPa;angle_deg\n20;1.018,9": "line 2, angle_deg = '1.018,9' must be a number",
+    "pressure_kPa;angle_deg\n20;1.018,9": "a file has one decimal sign",
+    "pressure_Pa\tangle_deg\n20,000\t18.9": "'20,000' (line 2, pressure_Pa) has a comma and '18.9'",
+    "pressure_Pa;angle_deg\n20.000;18,9": "'18,9' (line 2, angle_deg) has a comma and '20.000'",
+    "pressure_Pa\tangle_deg\n20,000\t19\n40,000\t37": "may be thousands or decimals",
+    "pressure_Pa;angle_deg\n1.020.000;19": "'1.020.000' must be a number",
+    "pressure_Pa;angle_deg\n20'000;19": "must be a number",
+    "pressure_Pa;angle_deg\n20 000;19": "'20 000' must be a number",
+    'pressure_Pa,angle_deg\n"20,000",18.9': "'20,000' must be a number",
+    "pressure_kPa,angle_deg\n" + "1,n/a\n" * 3000: "and 2,980 problems more",
+    "pressure_kPa,angle_deg\n" + "1\n" * 3000: "and 2,980 problems more",
+    "version https://git-lfs.github.com/spec/v1\noid": "Git LFS pointer",
+    "<!DOCTYPE html><html></html>": "web page",
     "pressure_kPa angle_deg\n20 18.9": "columns are separated by commas, semicolons or tabs",
     'pressure_kPa,angle_deg\n"1,2\n3,4': "line 2 is no row of cells: unexpected end of data",
     "presure_kPa,angle_deg\n1,2": "no quantity 'presure'; did you mean 'pressure'?",
@@ -359,7 +373,7 @@ def test_a_wrong_file_is_refused(text, tmp_path):
     path.write_text(text)
     with pytest.raises(InputError, match="finger.csv") as error:
         finger.read(path)
-    assert WRONG[text] in str(error.value)
+    assert WRONG[text] in str(error.value) and len(error.value.problems) < 22
 
 
 def rubber(shear_modulus):
@@ -372,6 +386,9 @@ UNFIT = {
     "angle_deg\n20,0\n40,0": "every measured angle is 0: there is nothing to fit",
     "blocked_force_N\n20,0\n40,": "every measured blocked force is 0",
     "angle_deg\n0,1\n0,2": "every pressure is 0",
+    "angle_deg\n101.3,0\n121.3,18.9\n141.3,37.2\n161.3,57": "begins at 101",
+    "angle_deg\n121.3,18.9\n141.3,37.2\n161.3,57": "gauge pressures are meant",
+    "blocked_force_N\n40,0\n60,0.5\n80,1": "blocked force begins at 40 kPa",
     "angle_deg\n0,90\n20,108.9": "angle is not 0 at zero pressure: subtract its value there",
     "load_N,deflection_mm\n0,0,2\n0,0,4": "every load is 0: there is nothing to fit",
     "angle_deg\n20,-18.9\n40,-37.2": "angle of the other sign than the model's",

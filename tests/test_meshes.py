@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import json
+import re
 import zipfile
 
 import hypothesis
@@ -109,14 +110,18 @@ def test_open_inverted_and_flipped(tmp_path):
 @pytest.mark.parametrize(
     ("size", "unit", "hint"),
     [
-        (60.0, "m", "looks like millimetres: set unit = 'mm'"),
-        (0.06, "mm", "looks like metres: set unit = 'm'"),
-        (2.4, "mm", "looks like centimetres: set unit = 'cm'"),
+        (60.0, "m", ["mm"]),
+        (0.06, "mm", ["m"]),
+        (2.4, "mm", ["cm", "in"]),
+        (4.0, "m", ["cm", "in"]),
+        (19.0, "m", ["cm", "mm", "in"]),
+        (1e-4, "m", []),
     ],
 )
 def test_unit_slips(tmp_path, size, unit, hint):
+    """Every unit in which the size is possible is named: inches are not centimetres."""
     (problem,) = problems(tmp_path, box(size, size, size), unit=unit)
-    assert hint in problem
+    assert re.findall(r"unit = '(\w+)' \(", problem) == hint
 
 
 def test_all_problems_at_once(tmp_path):
@@ -489,6 +494,10 @@ def test_files_of_another_kind_are_named(tmp_path, kind, message):
         ("#" * 300_000, "has more than 262,144 bytes"),
         ("\n".join(f"x{i} = 1" for i in range(9000)), "has 8,980 more unknown keys"),
         ('x = "\x1b[2J"', "not valid TOML: Illegal character"),
+        ("x = { a = 1, }", "a table in braces stands in one line and has no comma at its end"),
+        ("x = [\n {\n a = 1 },\n]", "a table in braces stands in one line"),
+        ("x = { a = 1\n}", "a table in braces stands in one line"),
+        ("x = [{ a = 1, b = 2,\n c = 3 }]", "a table in braces stands in one line"),
     ],
 )
 def test_files_that_are_too_much(tmp_path, line, message):
@@ -563,13 +572,64 @@ def test_gltf_holds_all_of_itself_and_does_not_grow(tmp_path):
     def huge(tree):
         tree["accessors"][0]["count"] = 10**12
 
+    def bodies(tree):
+        """A mesh of 300 primitives, in four places."""
+        tree["meshes"][0]["primitives"] *= 300
+        tree["nodes"] += [{"mesh": 0}] * 4
+
+    def unused(tree):
+        tree["meshes"] += [{"primitives": tree["meshes"][0]["primitives"] * 1001}]
+
+    def shared(tree):
+        """Many primitives of few corners each, which share a long list of positions."""
+        tree["accessors"].append({**tree["accessors"][0], "type": "VEC3", "count": 10_000})
+        primitive = tree["meshes"][0]["primitives"][0]
+        primitive["attributes"]["POSITION"] = len(tree["accessors"]) - 1
+        tree["meshes"][0]["primitives"] *= 70
+
     for change, message in (
         (elsewhere, "in another file, 'box.bin'; save it as .glb"),
         (doubled, "a node has two parents"),
         (huge, "more than 200,000 faces"),
+        (bodies, "bodies, more than 1,000"),
+        (unused, "bodies, more than 1,000"),
+        (shared, "more than 200,000 faces"),
     ):
         (problem,) = refusals(load_mesh, gltf(tmp_path, change))
         assert message in problem
+
+
+@pytest.mark.parametrize("kind", reading.FORMATS)
+def test_what_a_format_says_of_the_way_up_holds(tmp_path, kind):
+    """Of glTF, whose specification has y upwards; its exporters turn bodies so.  Others: z."""
+    body = trimesh.creation.box((0.02, 0.04, 0.12))
+    body.apply_translation((0, 0.01, 0.06))  # it stands, and is not in the middle
+    turned = trimesh.transformations.rotation_matrix(-np.pi / 2, (1, 0, 0))
+    if kind in ("glb", "gltf"):
+        body.apply_transform(turned)
+    path = tmp_path / f"body.{kind}"
+    if kind == "gltf":
+        parts = trimesh.Scene([body]).export(file_type="gltf")
+        tree = json.loads(parts["model.gltf"])
+        for buffer in tree["buffers"]:
+            data = base64.b64encode(parts[buffer["uri"]]).decode()
+            buffer["uri"] = f"data:application/octet-stream;base64,{data}"
+        path.write_text(json.dumps(tree))
+    else:
+        body.export(path)
+    vertices = reading.read(path).vertices
+    bounds = [[-0.01, -0.01, 0], [0.01, 0.03, 0.12]]
+    np.testing.assert_allclose([vertices.min(0), vertices.max(0)], bounds, atol=1e-7)
+
+
+def test_an_obj_of_large_polygons_is_refused_before_it_is_cut(tmp_path):
+    """2,000 polygons with 3 to 2,002 corners each, two million triangles."""
+    corners = [f"v {np.cos(t):.6f} {np.sin(t):.6f} 0" for t in np.linspace(0, 6, 2002)]
+    faces = ["f " + " ".join(map(str, range(1, 4 + k))) for k in range(2000)]
+    path = tmp_path / "polygons.obj"
+    path.write_text("\n".join(corners + faces))
+    (problem,) = refusals(load_mesh, path)
+    assert "more than 200,000 faces" in problem
 
 
 def test_a_run_has_the_bytes_that_were_read(tmp_path):

@@ -8,13 +8,13 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
+from codesign_jax import files
 from codesign_jax import finger as fingers
 from codesign_jax.commands import common
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Finger as Options
-from codesign_jax.files import atomically
 from codesign_jax.finger import Finger, Posterior
-from codesign_jax.finger.posterior import words
+from codesign_jax.finger.posterior import shift_in_words, words
 from codesign_jax.measurements import MEASURED
 from codesign_jax.runs import tables
 from codesign_jax.scene import draws, schema
@@ -121,6 +121,8 @@ def compare(mine: Finger, table: dict[str, np.ndarray], options: Options, consol
             console.print(f"{label}: {_errors(table, values)}")
         for name in fingers.opposed(table, predictions["model"]):
             console.print(f"warning: measured and predicted {words(name)} differ in sign")
+        for name, start in fingers.shifted(table, predictions["model"]).items():
+            console.print(f"warning: {shift_in_words(name, start)}")
     if fit:
         for line in [*_of_fit(fit, mine), *_next(mine, fit, table)]:
             console.print(line)
@@ -130,6 +132,7 @@ def compare(mine: Finger, table: dict[str, np.ndarray], options: Options, consol
     if options.out:
         texts = {n: ["" if math.isnan(v) else f"{v:.9g}" for v in c] for n, c in columns.items()}
         rows = (dict(zip(texts, row, strict=True)) for row in zip(*texts.values(), strict=True))
+        files.make_folder_of(options.out)
         tables.write(options.out, [*texts], rows)
         console.print(f"table: {options.out}")
 
@@ -242,5 +245,6 @@ def _write(fit: Posterior, mine: Finger, options: Options) -> None:
     law = LAWS[mine.neo_hookean]
     table = draws.of_logs(keys, fit.mean, fit.covariance, law, source)
     assert options.posterior is not None
-    with atomically(options.posterior) as part:
+    files.make_folder_of(options.posterior)
+    with files.atomically(options.posterior) as part:
         part.write_text(draws.text(table), encoding="utf-8")

@@ -18,7 +18,7 @@ True
 
 from codesign_jax.finger.advice import Advice, advice
 from codesign_jax.finger.posterior import Posterior, fit
-from codesign_jax.finger.prediction import opposed, predict, without_rest
+from codesign_jax.finger.prediction import opposed, predict, shifted, without_rest
 from codesign_jax.finger.rest import TOO_FAR, Constants, Finger, NoRest, Rest, of_design
 from codesign_jax.measurements import MEASURED, read
 
@@ -37,5 +37,6 @@ __all__ = [
     "opposed",
     "predict",
     "read",
+    "shifted",
     "without_rest",
 ]

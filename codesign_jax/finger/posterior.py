@@ -16,7 +16,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy import optimize
 
-from codesign_jax.finger.prediction import Table, opposed, predict, releases, without_rest
+from codesign_jax.finger.prediction import (
+    BENDING,
+    Table,
+    opposed,
+    predict,
+    releases,
+    shifted,
+    without_rest,
+)
 from codesign_jax.finger.rest import TOO_FAR, Finger, NoRest
 from codesign_jax.measurements import BY_PRESSURE, MEASURED
 from codesign_jax.scene import draws
@@ -274,13 +282,16 @@ def refuse_values(finger: Finger, table: Table, columns: list[str]) -> None:
     load = np.nan_to_num(table.get("load", np.zeros(1)))
     if not load.any() and set(columns) <= {"deflection", "sideways"}:
         raise ValueError("every load is 0: there is nothing to fit")
-    for name in set(columns) & {"angle", "tip_y", "tip_force", "blocked_force"}:
+    for name in set(columns) & {*BENDING}:
         at_rest = np.abs(table[name][table["pressure"] == 0])
         if (at_rest > _OFFSET * np.nanmax(np.abs(table[name]))).any():
             raise ValueError(
                 f"the measured {words(name)} is not 0 at zero pressure: subtract its value there"
             )
-    if wrong := opposed(table, predict(finger, table)):
+    predicted = predict(finger, table)
+    for name, start in shifted(table, predicted).items():
+        raise ValueError(shift_in_words(name, start))
+    if wrong := opposed(table, predicted):
         raise ValueError(
             f"{' and '.join(map(words, wrong))} of the other sign than the model's: bending "
             "under pressure, and what resists it, count as positive; change the signs in the file"
@@ -309,6 +320,14 @@ def telling(table: Table) -> dict[str, np.ndarray]:
         kept[name] = np.full_like(blank, math.nan)
         kept[name][first] = table[name][first]
     return kept
+
+
+def shift_in_words(name: str, start: float) -> str:
+    """What is to be done about a column that begins at a pressure [Pa]; see `shifted`."""
+    return (
+        f"the measured {words(name)} begins at {start / 1e3:.4g} kPa by a line through it: gauge "
+        "pressures are meant; subtract the atmosphere's from absolute ones, or the sensor's offset"
+    )
 
 
 def words(name: str) -> str:

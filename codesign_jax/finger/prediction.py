@@ -4,6 +4,7 @@ import contextlib
 from collections.abc import Mapping
 
 import numpy as np
+from scipy import stats
 
 from codesign_jax.finger import swing
 from codesign_jax.finger.rest import Finger, NoRest, Rest, sideways, tip_place
@@ -11,6 +12,12 @@ from codesign_jax.measurements import MEASURED
 
 FREE = ("angle", "tip_x", "tip_y", "deflection", "sideways")
 """Columns that are told of the free finger."""
+BENDING = ("angle", "tip_y", "tip_force", "blocked_force")
+"""Columns that are 0 without pressure and grow with it."""
+_SHIFT = 0.25
+"""Share of the largest pressure by which a column may begin later than the model's [chosen]."""
+_DEVIATIONS = 3.0
+"""Standard errors of both starts that are granted beside it [chosen]."""
 HELD_TIP = 0.25
 """Share of a period by which the first picture of a release may be off."""
 
@@ -122,6 +129,27 @@ def without_rest(table: Table, predicted: Table) -> dict[str, np.ndarray]:
     """
     lacking = {n: np.isfinite(table[n]) & np.isnan(v) for n, v in predicted.items()}
     return {n: np.unique(table["pressure"][rows]) for n, rows in lacking.items() if rows.any()}
+
+
+def shifted(table: Table, predicted: Table) -> dict[str, float]:
+    """Pressures [Pa] at which columns begin, by their name, where the model's begin far below.
+
+    Of absolute pressures, or of a sensor with an offset, a line through the measured values begins
+    at the atmosphere's pressure or the offset.  At least three different rows of a column tell.
+    """
+    load = np.nan_to_num(table.get("load", np.zeros_like(table["pressure"])))
+    starts = {}
+    for name in {*BENDING} & {*predicted}:
+        rows = np.isfinite(table[name]) & np.isfinite(predicted[name]) & (load == 0)
+        pressure = table["pressure"][rows]
+        if len({*table[name][rows]}) < 3 or len({*predicted[name][rows]}) < 3:
+            continue
+        measured = stats.linregress(table[name][rows], pressure)
+        model = stats.linregress(predicted[name][rows], pressure)
+        doubt = _DEVIATIONS * np.hypot(measured.intercept_stderr, model.intercept_stderr)
+        if measured.intercept - model.intercept > _SHIFT * pressure.max() + doubt:
+            starts[name] = float(measured.intercept)
+    return starts
 
 
 def opposed(table: Table, predicted: Table) -> list[str]:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from codesign_jax import files
 from codesign_jax.scene import schema, texts
 
 _PACKAGE = Path(__file__).parents[1]
@@ -23,17 +24,19 @@ MOST_BYTES = 1 << 18
 """Largest file that is read; those that come with the package have 4 kB."""
 _LONG_KEY = re.compile(r"""(?<![\w-])[\w-]++(?:\s*+\.\s*+(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')){100}""")
 """A dotted key for whose parts the parser needs time that grows with the square of their number."""
+_OF_INLINE_TABLES = ("Invalid initial character for a key part", "Unclosed inline table")
+"""What tomllib says of a table in braces over several lines, or with a comma at its end."""
 DEEPEST = 12
 """Most tables and arrays inside of one another; a preset's fixed value has three."""
 
 
 def available(kind: str) -> dict[str, Path]:
     """Returns the built-in files of a kind of `_FOLDERS` by name."""
-    files: dict[str, Path] = {}
+    paths: dict[str, Path] = {}
     for folder in _FOLDERS[kind]:
         if folder.is_dir():
-            files |= {p.stem: p for p in sorted(folder.glob("*.toml"))}
-    return files
+            paths |= {p.stem: p for p in sorted(folder.glob("*.toml"))}
+    return paths
 
 
 def find(kind: str, name: str | Path) -> Path:
@@ -80,7 +83,7 @@ def is_file(path: Path) -> bool:
 def read(path: Path) -> dict[str, Any]:
     """Reads a TOML file."""
     try:
-        with path.open("rb") as file:
+        with files.opened(path) as file:
             data = file.read(MOST_BYTES + 1)
     except OSError as error:
         raise schema.InputError([f"{path.name}: {error.strerror}"]) from error
@@ -112,7 +115,10 @@ def why_not(error: Exception) -> str:
         return f"tables and arrays are nested more than {DEEPEST} deep"
     if "integer string conversion" in str(error):
         return "a whole number has thousands of digits"
-    return schema.shown(str(error))[1:-1]
+    text = schema.shown(str(error))[1:-1]
+    if any(words in text for words in _OF_INLINE_TABLES):
+        text += "; a table in braces stands in one line and has no comma at its end"
+    return text
 
 
 def too_deep(value: Any) -> bool:

@@ -29,6 +29,13 @@ class Grid(NamedTuple):
     worst: float  # largest error at any of these points [m]: sharp corners are rounded by so much
 
 
+_LAYOUT = {
+    "origin": array_files.Array("f", (3,)),
+    "values": array_files.Array("f", ("x", "y", "z")),
+    **dict.fromkeys(("cell", "error", "worst"), array_files.Array("f", ())),
+}
+
+
 def build(vertices: np.ndarray, faces: np.ndarray, bound: float, reach: float) -> Grid:
     """Builds the coarsest grid whose error near the surface stays under a bound.
 
@@ -138,7 +145,7 @@ def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float, reac
         return array_files.packed(build(vertices, faces, bound, reach)._asdict())
 
     arrays: dict[str, Any] = array_files.unpacked(
-        io.BytesIO(reuse.kept(path, build_packed, worth=WORTH_KEEPING)), path
+        io.BytesIO(reuse.kept(path, build_packed, worth=WORTH_KEEPING)), path, _LAYOUT
     )
     for name in ("cell", "error", "worst"):
         arrays[name] = float(arrays[name])

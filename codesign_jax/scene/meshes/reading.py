@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 
+from codesign_jax import files
 from codesign_jax.scene import library, texts
 from codesign_jax.scene.schema import InputError, shown
 
@@ -34,6 +35,8 @@ _STL_FACE = 50
 """Bytes of a binary STL before its faces, the last four of them their number, and of a face."""
 _GROUP = re.compile(r"^[ \t]*+(?:usemtl|g|o|s|mtllib)\b.*$", re.MULTILINE)
 """Lines of an OBJ that name parts and materials: trimesh takes quadratic time for them."""
+_FACE = re.compile(r"^[ \t]*+f[ \t]++(.*)$", re.MULTILINE)
+"""Lines of an OBJ with the corners of a polygon."""
 _COMMA = re.compile(
     r"^[ \t]*+(?:v|vertex|facet[ \t]++normal)?[ \t]*+[-+]?[0-9]++,[0-9]", re.MULTILINE
 )
@@ -58,7 +61,7 @@ def read(path: Path) -> Read:
         valid = ", ".join(f".{name}" for name in FORMATS)
         raise InputError([f"{path.name}: is no mesh file that is read; valid: {valid}"])
     try:
-        with path.open("rb") as file:
+        with files.opened(path) as file:
             content = file.read(MOST_BYTES + 1)
     except OSError as error:
         raise InputError([f"{path.name}: {error.strerror}"]) from error
@@ -96,7 +99,10 @@ def _parse(content: bytes, kind: str) -> tuple[np.ndarray, np.ndarray]:
         mesh = trimesh.load_mesh(io.BytesIO(content), file_type=kind, **options)
         # Seams of texture and shading are no holes.
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    return np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+    vertices = np.asarray(mesh.vertices, float)
+    if kind in ("glb", "gltf"):  # the one format that says which way is up (glTF 2.0, 3.4): y
+        vertices = vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
+    return vertices, np.asarray(mesh.faces)
 
 
 def _end_of_binary_stl(content: bytes) -> int:
@@ -123,6 +129,11 @@ def _text(content: bytes, kind: str) -> str:
         raise ValueError(f"more than {MOST_PARTS:,} solids")
     if _COMMA.search(text):
         raise ValueError("its numbers have decimal commas; save it with decimal points")
+    if (
+        kind == "obj"
+        and sum(len(face[1].split()) - 2 for face in _FACE.finditer(text)) > MOST_FACES
+    ):
+        raise ValueError(f"more than {MOST_FACES:,} faces")
     if kind == "obj" and sum(1 for _ in _GROUP.finditer(text)) > MOST_PARTS:
         text = _GROUP.sub("", text)
     return text
@@ -136,21 +147,29 @@ def _check_gltf(content: bytes) -> None:
         if not str(buffer.get("uri", "data:")).startswith("data:"):
             uri = shown(buffer["uri"])
             raise ValueError(f"its numbers are in another file, {uri}; save it as .glb")
-    for key in ("nodes", "meshes"):
-        if len(parts[key]) > MOST_PARTS:
-            raise ValueError(f"{len(parts[key]):,} {key}, more than {MOST_PARTS:,}")
+    if len(parts["nodes"]) > MOST_PARTS:
+        raise ValueError(f"{len(parts['nodes']):,} nodes, more than {MOST_PARTS:,}")
     children = [child for node in parts["nodes"] for child in node.get("children", [])]
     if len(children) != len({*children}):
         raise ValueError("a node has two parents")
     counts = [int(accessor["count"]) for accessor in parts["accessors"]]
-    sizes = [
-        sum(counts[p.get("indices", p["attributes"]["POSITION"])] for p in m["primitives"])
-        for m in parts["meshes"]
-    ]
-    # A mesh may stand in many places.
-    placed = sum(sizes[node["mesh"]] for node in parts["nodes"] if "mesh" in node)
-    if max([placed, *counts]) > 3 * MOST_FACES:
+    bodies = [mesh["primitives"] for mesh in parts["meshes"]]
+    corners = [sum(_corners(body, counts) for body in primitives) for primitives in bodies]
+    # A mesh may stand in many places, and is read if it stands in none.
+    used = [*range(len(bodies)), *(node["mesh"] for node in parts["nodes"] if "mesh" in node)]
+    if (number := sum(len(bodies[k]) for k in used)) > MOST_PARTS:
+        raise ValueError(f"{number:,} bodies, more than {MOST_PARTS:,}")
+    if max([sum(corners[k] for k in used), *counts]) > 3 * MOST_FACES:
         raise ValueError(f"more than {MOST_FACES:,} faces")
+
+
+def _corners(primitive: dict[str, Any], counts: list[int]) -> int:
+    """Length of the longest list of numbers that is read of a body in a glTF file."""
+    named = [
+        *primitive["attributes"].values(),
+        *([primitive["indices"]] * ("indices" in primitive)),
+    ]
+    return max(counts[k] for k in named)
 
 
 def _problem(vertices: np.ndarray, faces: np.ndarray) -> str | None:

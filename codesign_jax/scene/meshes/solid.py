@@ -13,7 +13,6 @@ from codesign_jax.scene.meshes import grid, mass, reading, repair, support, surf
 from codesign_jax.scene.schema import InputError
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
-_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
 # longest side of the bounding box [m]
 SMALLEST = 0.005
 LARGEST = 0.5
@@ -166,10 +165,12 @@ def _size_problems(longest: float, unit: str) -> list[str]:
         f"is {longest * UNITS[unit]:.3g} m long in unit = {unit!r}, outside "
         f"[{SMALLEST * 1e3:g}, {LARGEST * 1e3:g}] mm"
     )
-    for other in ("mm", "m", "cm", "in"):
-        if SMALLEST <= longest * UNITS[other] <= LARGEST:
-            return [f"{message}; looks like {_NAMES[other]}: set unit = {other!r}"]
-    return [message]
+    fitting = [
+        f"unit = {other!r} ({1e3 * longest * factor:.3g} mm long)"
+        for other, factor in UNITS.items()
+        if SMALLEST <= longest * factor <= LARGEST
+    ]
+    return [f"{message}; set {' or '.join(fitting)}" if fitting else message]
 
 
 def surface_problems(vertices: np.ndarray, faces: np.ndarray, repaired: bool = False) -> list[str]:

@@ -1,4 +1,4 @@
-"""Writes files as a whole or not at all, and says which files of a folder are to be opened."""
+"""Writes files as a whole or not at all, and opens none that is a link, a FIFO or a device."""
 
 import contextlib
 import errno
@@ -12,15 +12,16 @@ import shutil
 import stat
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import BinaryIO
 
 
 @contextlib.contextmanager
 def atomically(path: Path) -> Iterator[Path]:
     """Replaces a file as a whole: readers find the old one or the new one, at any time.
 
-    Yields a path beside it; a killed process leaves that behind, with a name in .tmp.
+    Yields a path beside it; a killed process leaves that behind, with a name in .tmp. The folder
+    must exist: one that was moved while a command runs is not made again under its old name.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     # Of this call alone: threads may write the same file, and so may hosts that share a disk.
     temporary = path.with_name(f"{path.name}.{secrets.randbits(64)}.tmp")
     try:
@@ -37,9 +38,8 @@ def append(path: Path, text: str) -> None:
     """Adds text to a file of this name alone; makes the file if there is none.
 
     A link is not followed (OSError), and a FIFO is not waited for. Of a file that has other names
-    too, such as of a copy by `cp -al`, the others stay as they are.
+    too, such as of a copy by `cp -al`, the others stay as they are. The folder must exist.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
     with naming(path), os.fdopen(os.open(path, flags, 0o666), "ab") as file:
         if os.fstat(file.fileno()).st_nlink == 1:
@@ -47,6 +47,37 @@ def append(path: Path, text: str) -> None:
             return
     with atomically(path) as part:
         part.write_bytes(path.read_bytes() + text.encode())
+
+
+def make_folder_of(path: Path) -> None:
+    """Makes the folder of a file that a flag names, and those above it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+
+
+def opened(path: Path) -> BinaryIO:
+    """Opens a regular file for reading.
+
+    Raises:
+      OSError: If it cannot be opened, or is a folder, a FIFO or a device: the reader of a FIFO
+        waits until somebody writes to it, and some devices have no end.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        mode = os.fstat(descriptor).st_mode
+        if stat.S_ISDIR(mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        if not stat.S_ISREG(mode):
+            raise OSError(errno.EINVAL, "is no file but a FIFO or a device", str(path))
+        return os.fdopen(descriptor, "rb")
+    except OSError:
+        os.close(descriptor)
+        raise
+
+
+def read(path: Path) -> bytes:
+    """Content of a regular file; errors as of `opened`."""
+    with opened(path) as file:
+        return file.read()
 
 
 def special(folder: Path, names: Iterable[str]) -> list[str]:

@@ -8,7 +8,9 @@ import gc
 import io
 import json
 import os
+import re
 import signal
+import socket
 import sys
 import time
 import types
@@ -22,17 +24,19 @@ import numpy as np
 import pytest
 import rich.table
 
-from codesign_jax import array_files, files, runs, scene, terminal
-from codesign_jax.commands import check, status
+from codesign_jax import array_files, files, measurements, runs, scene, terminal
+from codesign_jax.commands import check, common, status
 from codesign_jax.compiler.ffi import KernelUnavailable
 from codesign_jax.export import process, sheet
 from codesign_jax.judge import fresh_trials
 from codesign_jax.judge.stress import Stress
-from codesign_jax.runs import directory, manifest, progress, reference
+from codesign_jax.report import landscape
+from codesign_jax.runs import directory, failures, manifest, progress, reference
 from codesign_jax.runs import record as records
 from codesign_jax.runs import run as run_of
 from codesign_jax.runs.columns import FILES, TABLES
-from codesign_jax.scene import InputError, parameters, scene_files
+from codesign_jax.scene import InputError, draws, parameters, scene_files
+from codesign_jax.scene.meshes import reading
 from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import command, own_workplace  # noqa: F401
 
@@ -95,6 +99,40 @@ def test_no_file_of_a_run_is_opened_through_a_link_or_waited_for(kind, run, tmp_
         if before.exists():
             before.rename(place)
     assert runs.load_record(run) is not None  # the same folder without them
+
+
+READERS = {
+    "scene.toml": scene.load,
+    "design.toml": lambda path: common.open_designs([str(path)]),
+    "constants.toml": draws.read,
+    "finger.csv": measurements.read,
+    "body.stl": reading.read,
+    "landscape.npz": landscape.load,
+    "failure.npz": failures.load,
+    "arrays.npz": array_files.load,
+}
+"""Files that a flag, or a file that a flag names, may name, and what reads them."""
+
+
+@pytest.mark.parametrize("kind", ["FIFO", "link to a FIFO", "device", "socket", "folder"])
+@pytest.mark.parametrize("name", READERS)
+def test_no_file_that_a_flag_names_is_waited_for(name, kind, tmp_path):
+    """Bash's <(...) is a FIFO; /dev/zero has no end."""
+    path = tmp_path / name
+    if kind == "FIFO":
+        os.mkfifo(path)
+    elif kind == "link to a FIFO":
+        os.mkfifo(tmp_path / "fifo")
+        path.symlink_to("fifo")
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as listener:
+            listener.bind(str(path))
+    else:
+        path.mkdir()
+    with pytest.raises((InputError, OSError, array_files.ArrayFileError), match=re.escape(name)):
+        READERS[name](path)
 
 
 def test_a_folder_in_the_place_of_a_run_s_file_is_refused_before_anything_changes(run):
@@ -207,7 +245,9 @@ def build_sheet(folder, words):
 def test_texts_of_results_are_one_line_each_and_no_html_on_a_sheet(tmp_path):
     kept = {"warnings": np.array([HOSTILE, "<script>"]), "empty": np.array([], str)}
     array_files.save(tmp_path / "x.npz", kept)
-    loaded = array_files.load(tmp_path / "x.npz")
+    texts = array_files.Array("U", ("n",))
+    layout = {"warnings": texts, "empty": texts._replace(shape=("m",))}
+    loaded = array_files.load(tmp_path / "x.npz", layout)
     assert loaded["warnings"].tolist() == [SHOWN, "<script>"] and loaded["empty"].shape == (0,)
     harmless = ("a", "b", "c", "d")
     hostile = (HOSTILE, "<img src=x>", "![a](http://b)", "a | b")
@@ -260,8 +300,8 @@ def stress(**changed):
 
 
 def outcomes(**changed):
-    numbers = np.zeros(4, np.float32)
-    return dict.fromkeys(("cost", "status", "lost_time", "bad_step"), numbers) | changed
+    arrays = dict.fromkeys(("cost", "lost_time"), np.zeros(4, np.float32))
+    return arrays | dict.fromkeys(("status", "bad_step"), np.zeros(4, np.int32)) | changed
 
 
 def test_results_that_are_not_shown_are_told(run, monkeypatch):
@@ -294,7 +334,7 @@ def test_results_that_are_not_shown_are_told(run, monkeypatch):
     for fresh, conditions in wrong:
         write(fresh, conditions)
         [note] = reference.kept(run, scene, settings).notes
-        assert "does not hold what such a file has" in note
+        assert "left out" in note
     for place in places:
         write(outcomes(), stress())
         place.write_bytes(place.read_bytes()[:-100])
@@ -320,6 +360,10 @@ def leaves(arrays, place=()):
             yield from leaves(value, (*place, name))
         else:
             yield (*place, name), value
+
+
+def described(arrays):
+    return {"/".join(place): (value.dtype, value.shape) for place, value in leaves(arrays)}
 
 
 def replaced(arrays, place, value):
@@ -349,6 +393,10 @@ def test_arrays_that_no_run_has_are_refused_in_words(archive, tmp_path):
         if "memory" not in place:
             wrong = (value[..., None], value.astype(bool), {"a": value}, np.zeros((0, 0, 0)))
             cases += [(place, other) for other in wrong]
+    records.refuse_other_arrays(described(arrays))
+    for place, value in cases:  # and so they are before they are read
+        with pytest.raises(runs.RunError, match="checkpoints hold"):
+            records.refuse_other_arrays(described(replaced(arrays, place, value)))
     size = arrays["history"]["ancestors"].shape
     cases += [(("history", "ancestors"), np.full(size, n, np.int32)) for n in (-2, 10**6)]
     cases += [(("state", "episode"), np.array(n, np.int32)) for n in (-1, 10**6)]

@@ -160,6 +160,9 @@ def test_every_file_and_column_is_described_on_the_page(toy_run, tmp_path):
 
 def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path):
     path = tmp_path / "new" / "file.txt"
+    with pytest.raises(FileNotFoundError), files.atomically(path):
+        pass
+    files.make_folder_of(path)
     with files.atomically(path) as part:
         part.write_text("old")
         assert not path.exists()
@@ -286,3 +289,29 @@ def test_a_run_has_no_files_but_its_own(run):
     directory._refuse_to_delete(run)
     directory._delete_run(run)
     assert os.listdir(run) == [".lock"]
+
+
+@pytest.mark.parametrize("way", ["moved", "deleted", "replaced", "link"])
+def test_a_run_writes_nothing_once_its_folder_is_another(way, tmp_path):
+    """It says where its data are; the folder is not made again, and another's stays as it is."""
+    path = tmp_path / "run"
+    moved = tmp_path / "moved"
+    scene = tiny()[0]
+    with open_run(path, scene, SETTINGS, ["codesign", "optimize"]) as (folder, _):
+        folder.log("before")
+        path.rename(moved)
+        if way == "deleted":
+            shutil.rmtree(moved)
+        elif way == "replaced":
+            path.mkdir()
+            (path / ".lock").touch()
+        elif way == "link":  # the same folder by another way is not another one
+            path.symlink_to(moved)
+            folder.log("after")
+            return
+        before = [*path.rglob("*")]
+        expected = "data are lost" if way == "deleted" else f"--out {moved}"
+        for write in (folder.here, lambda: folder.log("after")):
+            with pytest.raises(runs.RunError, match=re.escape(expected)):
+                write()
+        assert [*path.rglob("*")] == before

@@ -14,7 +14,7 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from codesign_jax import codesign, cost, runs, statistics
+from codesign_jax import codesign, cost, files, runs, statistics
 from codesign_jax.commands import common, flags
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Compare
@@ -270,6 +270,7 @@ def _summary(group: list[Compared]) -> tuple[str, ...]:
 
 def write_table(every: Mapping[Path, Compared], path: Path) -> None:
     head = [*columns.MORE[columns.SEEDS].columns]
+    files.make_folder_of(path)
     tables.write(path, head, (_values(folder, run, path) for folder, run in every.items()))
 
 

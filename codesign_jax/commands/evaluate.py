@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import preflight, rollout, runs, tolerances, types
+from codesign_jax import files, preflight, rollout, runs, tolerances, types
 from codesign_jax.commands import common, forces
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Evaluate
@@ -126,6 +126,7 @@ def simulate(case: Case, options: Evaluate, console: Console) -> types.Outcome:
         console.print(f"policy {case.policy} {report}")
     if options.out:
         drawn = rollout.sample_trials(case.scene, key, outcomes.cost.size)
+        files.make_folder_of(options.out)
         tables.write_grasps(options.out, case.scene, jax.tree.map(np.asarray, drawn), outcomes)
         console.print(f"table: {options.out}")
     return outcomes

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import model, rollout
+from codesign_jax import files, model, rollout
 from codesign_jax.engines import Engine
 from codesign_jax.judge import sentences
 from codesign_jax.policy import ControlLoop
@@ -55,6 +55,7 @@ def write(path: Path, scene: Scene, grasps: list[Replay]) -> None:
         for k in range(len(grasp.qpos)):
             head = {"trial": trial, "object": _object(scene, grasp), "time_s": step * k}
             rows.append(head | {column: series[k] for column, series in named.items()})
+    files.make_folder_of(path)
     tables.write(path, [*rows[0]], rows)
 
 

@@ -104,6 +104,7 @@ def write_film(
     times = np.arange(0.0, scene.end_time, 1 / rate)
     # One at a time: those of a large film together would fill the memory.
     films = [_pictures(scene, grasp, times, size, camera) for grasp in grasps]
+    files.make_folder_of(path)
     with files.atomically(path) as part:
         write(map(np.hstack, zip(*films, strict=True)), part, rate)
     return path
@@ -153,6 +154,7 @@ def write_strip(
     chosen = times or (0.0, *ends, scene.end_time)
     rows = [frames(scene, g, np.array(chosen), size=size, camera=camera) for g in grasps]
     picture = np.concatenate([np.concatenate(list(row), axis=1) for row in rows])
+    files.make_folder_of(path)
     with files.atomically(path) as part:  # whose name does not say the kind of picture
         kind = Image.registered_extensions().get(path.suffix.lower(), "PNG")
         Image.fromarray(picture).quantize(128).save(part, kind)

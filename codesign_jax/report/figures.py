@@ -26,6 +26,7 @@ _COLUMNS = 3  # of the grid of parameters
 
 def save(figure: matplotlib.figure.Figure, path: Path) -> Path:
     """Writes a figure as a whole or not at all."""
+    path.parent.mkdir(exist_ok=True)
     with files.atomically(path) as part:  # whose name does not say the kind of picture
         figure.savefig(part, format=path.suffix.lstrip(".") or "png")
     return path

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from codesign_jax import array_files
+from codesign_jax.array_files import Array
 from codesign_jax.runs import columns, tables
 from codesign_jax.scene.schema import InputError
 
@@ -27,6 +28,17 @@ class Landscape(NamedTuple):
     seed: np.ndarray  # root of their noise, shape ()
     # What the other parameters stay at: the whole design [SI units], shape (parameter,)
     design: np.ndarray
+
+
+_LAYOUT = {
+    **dict.fromkeys(("names", "units"), Array("U", (2,))),
+    "first": Array("f", ("first",)),
+    "second": Array("f", ("second",)),
+    "cost": Array("f", ("first", "second")),
+    **dict.fromkeys(("kept", "counted"), Array("iu", ("first", "second"))),
+    **dict.fromkeys(("trials", "seed"), Array("iu", ())),
+    "design": Array("f", ("parameter",)),
+}
 
 
 def save(landscape: Landscape, folder: Path) -> list[Path]:
@@ -53,9 +65,8 @@ def save(landscape: Landscape, folder: Path) -> list[Path]:
 def load(path: Path) -> Landscape:
     """Reads the arrays of a landscape."""
     try:
-        stored = array_files.load(path)
-        return Landscape(**{name: stored[name] for name in Landscape._fields})
-    except (OSError, array_files.ArrayFileError, KeyError) as error:
+        return Landscape(**array_files.load(path, _LAYOUT))
+    except (OSError, array_files.ArrayFileError) as error:
         problem = (
             f"{path} is not a landscape of this version ({error}); codesign landscape writes one"
         )

@@ -39,6 +39,7 @@ def write(run: Run, grasp: tuple[Grasp, Replay] | None, path: Path) -> Path:
     title = f"Co-design run {run.folder.resolve().name}"
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="minutes")
     head = f"<h1>{markup.text(title)}</h1>\n<p class='note'>codesign-jax, report of {now}</p>\n"
+    files.make_folder_of(path)
     with files.atomically(path) as part:
         body = head + "\n".join(sections)
         part.write_text(viewer.page(title, body), encoding="utf-8")

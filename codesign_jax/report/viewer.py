@@ -85,6 +85,7 @@ def write(scene: Scene, grasp: Replay, path: Path, *, title: str, text: list[str
         f"<{tag}>{html.escape(line)}</{tag}>\n" for tag, line in zip(tags, text, strict=True)
     )
     body = f"<h1>{html.escape(title)}</h1>\n{lines}{fragment(scene, grasp)}"
+    files.make_folder_of(path)
     with files.atomically(path) as part:
         part.write_text(page(title, body), encoding="utf-8")
     return path

@@ -23,6 +23,7 @@ from codesign_jax.model import morphology
 from codesign_jax.provenance import environment
 from codesign_jax.runs.columns import GRASPS, MAY_BE_EMPTY, OF_DESIGNS
 from codesign_jax.runs.directory import LOCK
+from codesign_jax.runs.record import outcome_layout
 from codesign_jax.runs.tables import design_columns, noise_values
 from codesign_jax.sampling import Drawn
 from codesign_jax.scene import Scene
@@ -86,7 +87,7 @@ class Shards:
     def question(self) -> dict[str, Any] | None:
         """`Question.described` of what has begun; None if nothing has."""
         try:
-            question = json.loads(self._question.read_text("utf-8"))
+            question = json.loads(files.read(self._question))
         except (OSError, ValueError):
             return None
         return question if isinstance(question, dict) else None
@@ -112,7 +113,8 @@ class Shards:
 
     def load(self, shard: int) -> Outcome | None:
         try:
-            return Outcome(**array_files.load(self.folder / f"{shard}.npz"))
+            layout = outcome_layout("design", "trial")
+            return Outcome(**array_files.load(self.folder / f"{shard}.npz", layout))
         except (OSError, array_files.ArrayFileError):
             return None
 

@@ -23,6 +23,7 @@ from codesign_jax.provenance import environment
 from codesign_jax.runs import manifest, reading, tables
 from codesign_jax.runs.checkpoint import Checkpoints
 from codesign_jax.runs.columns import FILES, TABLES
+from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.manifest import LOCK, PROVENANCE
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.settings import Settings, masks_of
@@ -47,10 +48,39 @@ _INSIDE = {
 
 
 class RunDirectory:
-    """An open run folder; see `open_run`."""
+    """An open run folder; see `open_run`.
 
-    def __init__(self, path: Path):
+    Attributes:
+      path: Where it was when it was opened.
+    """
+
+    def __init__(self, path: Path, lock: int):
+        """Takes the descriptor of the folder's lock, which is held."""
         self.path = path
+        self._lock = lock
+
+    def here(self) -> Path:
+        """The folder to write to: its path, where it still is.
+
+        Raises:
+          RunError: If it was moved, deleted or replaced, such as by a disk mounted over it.
+        """
+        own = os.fstat(self._lock)
+        with contextlib.suppress(OSError):
+            there = os.stat(self.path / LOCK, follow_symlinks=False)
+            if os.path.samestat(own, there):
+                return self.path
+        problem = f"{self.path} was moved, deleted or replaced while its run was going on"
+        if own.st_nlink == 0:
+            raise RunError(f"{problem}: the run's data are lost")
+        try:
+            place = Path(os.readlink(f"/proc/self/fd/{self._lock}")).parent
+        except OSError:  # a system without /proc
+            raise RunError(f"{problem}; it goes on from where its folder is now") from None
+        raise RunError(
+            f"{problem}. Its data are in {place}; it goes on by the same command where that is "
+            f"put back, or with --out {place}"
+        )
 
     def store(self, *, tell: Callable[[str], None]) -> Checkpoints:
         identity = manifest.read_provenance(self.path)["id"]
@@ -59,7 +89,7 @@ class RunDirectory:
     def log(self, message: str) -> None:
         """Appends a line with the time to events.log."""
         now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-        files.append(self.path / EVENTS, f"{now} {terminal.line(message)}\n")
+        files.append(self.here() / EVENTS, f"{now} {terminal.line(message)}\n")
 
 
 @contextlib.contextmanager
@@ -74,11 +104,11 @@ def open_run(
     """Opens a run folder: makes it, or checks that it is this very run; locks it meanwhile."""
     check_folder(path, scene, settings, fresh=fresh)
     path.mkdir(parents=True, exist_ok=True)
-    with locked(path):
+    with locked(path) as lock:
         # Again: another process may have been here.
         check_folder(path, scene, settings, fresh=fresh)
         contents = _contents(scene, settings)
-        run = RunDirectory(path)
+        run = RunDirectory(path, lock)
         notes = []
         if fresh:
             _delete_run(path)
@@ -129,8 +159,11 @@ def setting_of(paths: Iterable[Path], name: str) -> Any:
 
 
 @contextlib.contextmanager
-def locked(path: Path) -> Iterator[None]:
-    """Holds the folder's lock; the kernel releases it with the process, however it ends."""
+def locked(path: Path) -> Iterator[int]:
+    """Holds the folder's lock, and yields the descriptor of its file.
+
+    The kernel releases it with the process, however that ends.
+    """
     descriptor = os.open(path / LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     with os.fdopen(descriptor, "r+") as file:
         try:
@@ -144,7 +177,7 @@ def locked(path: Path) -> Iterator[None]:
         file.truncate(0)
         file.write(str(os.getpid()))
         file.flush()
-        yield
+        yield descriptor
 
 
 def write_tables(path: Path, scene: Scene, settings: Settings, record: Record) -> None:
@@ -238,7 +271,7 @@ def _own_command(stored: dict[str, Any]) -> list[str]:
 
 
 def _diff(path: Path, name: str, text: str) -> list[str]:
-    old = (path / name).read_text("utf-8").splitlines()
+    old = files.read(path / name).decode().splitlines()
     ends = f"run/{name}", f"asked/{name}"
     lines = [*difflib.unified_diff(old, text.splitlines(), *ends, n=0)]
     rest = len(lines) - _MOST_LINES

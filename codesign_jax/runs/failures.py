@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from codesign_jax import array_files, types
+from codesign_jax.array_files import Array
 from codesign_jax.codesign import EpisodeInfo
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Trial
@@ -28,6 +29,22 @@ class Failure(NamedTuple):
     place: tuple[int, int, int]  # number of the episode, from 1, and indices of particle and trial
 
 
+_REAL = {"position": (2,), "arm_tilt": (2,), "tilt": (2,), "constants": ("constant",)}
+"""Shapes of a trial's arrays of real numbers that are no single number."""
+_LAYOUT = {
+    "design": Array("f", ("parameter",)),
+    "state": Array("f", ("coordinate",)),
+    **dict.fromkeys(("status", "bad_step"), Array("iu", ())),
+    "place": Array("iu", (3,)),
+    "trial_shape": Array("iu", ()),
+    **{
+        f"trial_{name}": Array("f", _REAL.get(name, ()), name in Trial._field_defaults)
+        for name in Trial._fields
+        if name != "shape"
+    },
+}
+
+
 def save(folder: Path, episode: int, info: EpisodeInfo) -> list[Path]:
     """Saves an episode's first failed worlds, a file each; returns the files."""
     # From the device as a whole: to index there would be a program for each number.
@@ -47,6 +64,7 @@ def save(folder: Path, episode: int, info: EpisodeInfo) -> list[Path]:
             "place": np.array([episode, p, t]),
         }
         trial_arrays = {f"trial_{k}": v for k, v in trial._asdict().items() if v is not None}
+        path.parent.mkdir(exist_ok=True)
         array_files.save(path, arrays | trial_arrays)
         files.append(path)
     return files
@@ -56,7 +74,7 @@ def load(path: Path) -> Failure:
     if not path.exists():
         raise InputError([f"{path}: there is no such file or folder"])
     try:
-        values = array_files.load(path)
+        values = array_files.load(path, _LAYOUT)
         # Earlier runs have no tilt, and most scenes no constants that are drawn.
         left_out = {n for n in ("tilt", "constants") if f"trial_{n}" not in values}
         drawn = [n for n in Trial._fields if n not in left_out]

@@ -96,10 +96,11 @@ def read_provenance(path: Path) -> dict[str, Any]:
     refuse_links(path, [PROVENANCE, *scene_files.NAMES, scene_files.MESHES, user_code.FOLDER])
     file = path / PROVENANCE
     try:
-        size = file.stat().st_size
-        if not file.is_file() or size > _MOST_BYTES:
-            raise _damaged(file, "it is no file" if size <= _MOST_BYTES else f"it has {size} bytes")
-        text = file.read_text(encoding="utf-8")
+        with files.opened(file) as opened:
+            content = opened.read(_MOST_BYTES + 1)
+        if len(content) > _MOST_BYTES:
+            raise _damaged(file, f"it has more than {_MOST_BYTES:,} bytes")
+        text = content.decode()
     except OSError as error:
         if isinstance(error, FileNotFoundError | NotADirectoryError):
             why = f"it has no {PROVENANCE}" if path.exists() else "there is no such folder"
@@ -181,7 +182,7 @@ def _damaged(file: Path, why: str) -> InputError:
 def _digest(path: Path) -> str:
     """A file's digest; nothing where there is no file that can be read."""
     try:
-        return sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+        return sha256(files.read(path)).hexdigest()
     except OSError:
         return ""
 

@@ -67,7 +67,7 @@ def load_record(folder: Path, *, tell: Tell | None = None) -> Record | None:
     settings = Settings(**stored["settings"])
     try:
         with Checkpoints(folder / "checkpoints", run=stored["id"], read_only=True) as store:
-            restored = store.restore()
+            restored = store.restore(records.refuse_other_arrays)
         record = records.from_arrays(restored.arrays) if restored.arrays else None
         if record is not None:
             records.refuse_other(record, settings)

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from codesign_jax import array_files
+from codesign_jax.array_files import Array, Described
 from codesign_jax.codesign import EpisodeInfo
 from codesign_jax.optimize import OptimizerState
 from codesign_jax.runs.errors import RunError
@@ -172,10 +174,48 @@ def _shapes(record: Any, settings: Settings) -> Iterator[tuple[str, Any, tuple]]
         yield "start/candidates", record.start.candidates, ()
 
 
+_MOST_MEMORY = 100
+"""Most arrays that an optimiser keeps for itself."""
 _NOT_EVERYWHERE = {"capped", "residual"}
 """Arrays that not every engine tells."""
 _WHOLE = {"episode", "ancestors", "status", "bad_step", "candidates"}
 """Arrays of whole numbers; the others have real ones."""
+
+
+def outcome_layout(*axes: str) -> dict[str, Array]:
+    """Arrays of outcomes, each with these axes."""
+    return {
+        name: Array("iu" if name in _WHOLE else "f", axes, name in _NOT_EVERYWHERE)
+        for name in Outcome._fields
+    }
+
+
+def refuse_other_arrays(described: Described) -> None:
+    """Refuses arrays that no run's checkpoint has, before they are read.
+
+    What the optimiser keeps for itself, below `state/memory`, may be anything of numbers.
+    """
+    layout: dict[str, Array] = {
+        "state/particles": Array("f", ("particle", "parameter")),
+        "state/episode": Array("iu", ()),
+        "state/key": Array("u", ("word",)),
+        "history/population": Array("f", ("episode", "particle", "parameter")),
+        **dict.fromkeys(("history/cost", "history/weight"), Array("f", ("episode", "particle"))),
+        "history/ancestors": Array("iu", ("episode", "particle")),
+        "start/design": Array("f", ("parameter",), True),
+        "start/cost": Array("f", (), True),
+        "start/candidates": Array("iu", (), True),
+    }
+    trials = outcome_layout("episode", "particle", "trial")
+    tests = outcome_layout("particle", "tested")
+    layout |= {f"history/trials/{name}": array for name, array in trials.items()}
+    layout |= {f"test/{name}": array._replace(optional=True) for name, array in tests.items()}
+    memory = [name for name in described if name.startswith("state/memory")][:_MOST_MEMORY]
+    layout |= {n: Array("biuf", tuple(described[n][1])) for n in memory}
+    if wrong := array_files.problem(described, layout):
+        raise RunError(
+            f"its checkpoints hold what no run has ({wrong}): put checkpoints/ back from a copy"
+        )
 
 
 def _problem(record: Record, settings: Settings) -> str:

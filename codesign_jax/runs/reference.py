@@ -15,12 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import array_files, codesign, engines, rollout
+from codesign_jax.array_files import Array
 from codesign_jax.judge import fresh_trials, stress, verdict
 from codesign_jax.judge.cases import Case
 from codesign_jax.judge.sentences import Judged
 from codesign_jax.judge.stress import Stress
 from codesign_jax.runs import Settings, columns, tables
 from codesign_jax.runs.progress import Meter
+from codesign_jax.runs.record import outcome_layout
 from codesign_jax.runs.selection import case_of_run
 from codesign_jax.scene import Scene
 from codesign_jax.terminal import Console
@@ -30,8 +32,12 @@ FILE = "reference.npz"
 STRESS_FILE = "stress.npz"
 STRESS_TRIALS = 12
 """Grasps of each condition."""
-_OUTCOME = ("cost", "status", "lost_time", "bad_step")
-"""Arrays that every outcome has."""
+_STRESS = {
+    "conditions": Array("U", ("set",)),
+    "kept": Array("iu", ("set",)),
+    "trials": Array("iu", ()),
+    "warnings": Array("U", ("warning",)),
+}
 _NO_RESULT = "does not hold what such a file has"
 _LEFT_OUT = {
     FILE: "the design's fresh trials and their verdict are",
@@ -85,13 +91,9 @@ def show(meter: Meter, outcomes: Outcome, most: int) -> None:
 
 
 def _outcomes(folder: Path, about: str, *, any_code: bool = False) -> tuple[Outcome | None, str]:
-    arrays, why = array_files.load_results(folder / FILE, about, any_code=any_code)
-    if arrays is None:
-        return None, why
-    shapes = {v.shape if v.dtype.kind in "biuf" else () for v in arrays.values()}
-    if not {*_OUTCOME} <= {*arrays} <= {*Outcome._fields} or {len(s) for s in shapes} != {1}:
-        return None, _NO_RESULT
-    return (Outcome(**arrays), why) if len(shapes) == 1 else (None, _NO_RESULT)
+    layout = outcome_layout("trial")
+    arrays, why = array_files.load_results(folder / FILE, about, layout, any_code=any_code)
+    return (None if arrays is None else Outcome(**arrays)), why
 
 
 def stored(folder: Path, settings: Settings) -> tuple[Outcome | None, str]:
@@ -141,16 +143,13 @@ def stored_stress(folder: Path, settings: Settings) -> tuple[Stress | None, str]
 
 
 def _stress(folder: Path, about: str, *, any_code: bool = False) -> tuple[Stress | None, str]:
-    arrays, why = array_files.load_results(folder / STRESS_FILE, about, any_code=any_code)
+    path = folder / STRESS_FILE
+    arrays, why = array_files.load_results(path, about, _STRESS, any_code=any_code)
     if arrays is None:
         return None, why
-    try:
-        texts = {k: tuple(map(str, arrays[k].tolist())) for k in ("conditions", "warnings")}
-        result = Stress(kept=arrays["kept"].astype(int), trials=int(arrays["trials"]), **texts)
-    except (KeyError, TypeError, ValueError):
-        return None, _NO_RESULT
-    whole = result.kept.shape == (len(result.conditions),) and result.trials > 0
-    if not whole or not ((0 <= result.kept) & (result.kept <= result.trials)).all():
+    texts = {k: tuple(map(str, arrays[k].tolist())) for k in ("conditions", "warnings")}
+    result = Stress(kept=arrays["kept"].astype(int), trials=int(arrays["trials"]), **texts)
+    if result.trials < 1 or not ((0 <= result.kept) & (result.kept <= result.trials)).all():
         return None, _NO_RESULT
     return result, why
 

@@ -90,7 +90,7 @@ class Run:
 
     def restore(self) -> None:
         """Goes on from the newest whole checkpoint, if there is any."""
-        restored = self._store.restore()
+        restored = self._store.restore(records.refuse_other_arrays)
         if restored.step is None and (problem := reading.lost(self._directory.path, restored)):
             raise RunError(problem)
         if restored.step is not None:
@@ -171,7 +171,7 @@ class Run:
         """Ends the run; events.log has the traceback as well, where it is none of `FAILURES`."""
         self.error = error
         text = str(error) if isinstance(error, FAILURES) else "".join(format_exception(error))
-        with contextlib.suppress(OSError):  # a full disk may be why it failed
+        with contextlib.suppress(OSError, RunError):  # a full disk may be why it failed
             for line in f"failed: {text.rstrip()}".splitlines():
                 self.log(line)
 
@@ -184,16 +184,17 @@ class Run:
 
     def _keep(self, step: int) -> None:
         assert self.record is not None
+        self._directory.here()
         self._store.save(step, records.to_arrays(self.record))
 
     def _write_tables(self, since: int) -> None:
         assert self.record is not None
         plan = self.plan
-        tables.write_run(self._directory.path, plan.scene, plan.space, self.record, since)
+        tables.write_run(self._directory.here(), plan.scene, plan.space, self.record, since)
 
     def _save_failures(self, info: EpisodeInfo) -> None:
         if types.failed(info.outcomes.status).any():
-            for path in failures.save(self._directory.path, self.done, info):
+            for path in failures.save(self._directory.here(), self.done, info):
                 self.log(f"failed world: codesign replay {path}")
 
     def _report(self) -> None:

@@ -4,6 +4,7 @@ Numbers have nine significant digits, which name a float32 exactly.  Times of da
 events.log.
 """
 
+import contextlib
 import csv
 import io
 import re
@@ -253,4 +254,6 @@ def _replace(path: Path, text: str) -> None:
 
 
 def _content(path: Path) -> bytes | None:
-    return path.read_bytes() if path.is_file() else None
+    with contextlib.suppress(FileNotFoundError, IsADirectoryError):
+        return files.read(path)
+    return None

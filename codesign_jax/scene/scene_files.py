@@ -60,6 +60,7 @@ def digest(scene: Scene, engine: str, designs: np.ndarray, *numbers: int) -> str
 def write_scene(scene: Scene, folder: Path, written: Mapping[str, bytes] | None = None) -> None:
     """Writes a resolved scene, meshes included; `scene.load` of it returns an equal one."""
     for name, content in (contents(scene) if written is None else written).items():
+        (folder / name).parent.mkdir(exist_ok=True)  # of the meshes, of code
         with files.atomically(folder / name) as part:
             part.write_bytes(content)
     again = scenes.load(folder / "scene.toml")

@@ -159,6 +159,7 @@ def draw_evolution(study: Study, path: Path) -> Path:
     run = typical_run(study)
     title = f"{study.strategies[-1]}, run {run} of {study.plan['runs']}"
     costs = study.data["particle_cost"][run].astype(float)
+    path.parent.mkdir(parents=True, exist_ok=True)
     return figures.save(figures.cost_evolution(costs, title=title), path)
 
 

@@ -18,6 +18,7 @@ from scripts.shared import evidence
 def write_json(path: Path, content: Any, *, indent: int | None = 1) -> Path:
     """Writes a JSON file, its folder included."""
     separators = (",", ":") if indent is None else None
+    files.make_folder_of(path)
     with files.atomically(path) as part:
         text = json.dumps(content, indent=indent, separators=separators)
         part.write_text(text + "\n", encoding="utf-8")
@@ -26,6 +27,7 @@ def write_json(path: Path, content: Any, *, indent: int | None = 1) -> Path:
 
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> Path:
     """Writes arrays by name as a compressed .npz file, its folder included."""
+    files.make_folder_of(path)
     with files.atomically(path) as part, part.open("wb") as file:
         np.savez_compressed(file, **arrays)
     return path

@@ -13,7 +13,7 @@ from codesign_jax.judge import sentences, verdict
 from codesign_jax.report import chosen, figures, landscape, markup, viewer
 from codesign_jax.report.of_run import Run
 from codesign_jax.report.replay import Replay
-from codesign_jax.runs import SCENE_COST, tables
+from codesign_jax.runs import SCENE_COST
 from codesign_jax.runs.selection import Grasp
 from codesign_jax.scene.scene_files import NAMES
 from codesign_jax.types import MEANINGS, WARNINGS
@@ -175,7 +175,7 @@ def _failures(run: Run) -> str:
     note = f"{failed:,} of {total:,} trials failed ({100 * failed / total:.2f} %); they {rule}."
     bits = [bit for bit in MEANINGS if bit not in WARNINGS]
     counts = {bit: int(((status & bit) != 0).sum()) for bit in bits}
-    if warned := tables.warning_counts(status):
+    if warned := verdict.warning_counts(status):
         note += f" Warnings, which fail no trial: {warned}."
     rows = [
         (b.name, f"{n:,}", f"{100 * n / total:.2f} %", MEANINGS[b]) for b, n in counts.items() if n

@@ -11,6 +11,7 @@ import numpy as np
 from codesign_jax import codesign, types
 from codesign_jax.codesign import EpisodeInfo, FinalTest
 from codesign_jax.compiler.ffi import KernelUnavailable
+from codesign_jax.judge import verdict
 from codesign_jax.optimize import NoSeed, OptimizerState
 from codesign_jax.runs import failures, reading, tables
 from codesign_jax.runs import record as records
@@ -202,7 +203,7 @@ class Run:
         history = self.record.history
         status = history.outcomes.status[self.done - 1]
         cost = history.cost[self.done - 1]
-        ends = tables.failure_counts(status), tables.warning_counts(status)
+        ends = verdict.failure_counts(status), verdict.warning_counts(status)
         failed = int(types.failed(status).sum())
         report = Report(
             self.done, float(cost.mean()), float(cost.min()), failed, status.size, *ends
@@ -231,7 +232,7 @@ def refuse_all_failed(outcomes: Outcome, folder: Path, cost: str) -> None:
             "be finite whatever a grasp does.",
         )
     raise AllFailed(
-        f"every one of {status.size} trials failed ({tables.failure_counts(status)}); see "
+        f"every one of {status.size} trials failed ({verdict.failure_counts(status)}); see "
         f"trials.csv and codesign replay {folder}. " + " ".join(advice)
     )
 

@@ -65,13 +65,13 @@ class RunDirectory:
         Raises:
           RunError: If it was moved, deleted or replaced, such as by a disk mounted over it.
         """
-        own = os.fstat(self._lock)
+        locked_file = os.fstat(self._lock)
         with contextlib.suppress(OSError):
             there = os.stat(self.path / LOCK, follow_symlinks=False)
-            if os.path.samestat(own, there):
+            if os.path.samestat(locked_file, there):
                 return self.path
         problem = f"{self.path} was moved, deleted or replaced while its run was going on"
-        if own.st_nlink == 0:
+        if locked_file.st_nlink == 0:
             raise RunError(f"{problem}: the run's data are lost")
         try:
             place = Path(os.readlink(f"/proc/self/fd/{self._lock}")).parent
@@ -265,7 +265,7 @@ def _other_code(path: Path, settings: Settings, stored: dict[str, Any]) -> list[
 def _own_command(stored: dict[str, Any]) -> list[str]:
     """By which command a run goes on, in words; nothing if it was begun from Python."""
     program, *arguments = [stored["started"], *stored.get("resumed", [])][-1]["command"] or [""]
-    if Path(program).name not in ("codesign", "cli.py"):
+    if Path(program).name not in ("codesign", "cli.py", "__main__.py"):
         return []
     return [f"the run in it goes on by its own command: {shlex.join(['codesign', *arguments])}"]
 

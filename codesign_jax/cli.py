@@ -59,6 +59,8 @@ def main(arguments: list[str] | None = None) -> int:
         if arguments is None:
             # XLA's alarm of a compilation of two minutes reads like a crash; what fails is raised.
             os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+            # Matplotlib refuses to be imported if it names nothing; pictures need no window.
+            os.environ.pop("MPLBACKEND", None)
             warnings.showwarning = lambda text, *_: terminal.say(f"warning: {text}", error=True)
         if words == ["--version"]:
             return _version()

@@ -35,6 +35,7 @@ export
 commands
 studio
 cli
+__main__
 """
 ORDER = {name: level for level, line in enumerate(LAYERS.split("\n")) for name in line.split()}
 TOPS = ("codesign_jax", "scripts")

@@ -8,16 +8,18 @@ import shutil
 import av
 import jax
 import jax.numpy as jnp
+import matplotlib
 import mujoco
 import numpy as np
 import pytest
 from PIL import Image
 from scipy import stats
 
-from codesign_jax import array_files, cli, model, rollout, runs, scene
+from codesign_jax import array_files, cli, model, rollout, runs, scene, terminal
+from codesign_jax.commands import optimize
 from codesign_jax.engines import make_engine
 from codesign_jax.judge import sentences
-from codesign_jax.report import animation, bodies, painter, raster, viewer
+from codesign_jax.report import animation, bodies, figures, painter, raster, viewer
 from codesign_jax.runs import reference, selection
 from codesign_jax.scene import parameters
 from codesign_jax.scene.schema import InputError
@@ -447,3 +449,40 @@ def test_browser_skins_as_python_does(browser, tmp_path):
             ours = bodies.vertices(part, pose)
             np.testing.assert_allclose(np.reshape(theirs, (-1, 3)), ours, atol=2e-6)  # float32
     page.close()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"text.usetex": True},
+        {"font.family": "no such font", "mathtext.fontset": "stix"},
+        {"savefig.format": "no such", "savefig.bbox": "tight", "figure.dpi": 3},
+        {"axes.prop_cycle": matplotlib.cycler(color=["red"]), "svg.fonttype": "path"},
+    ],
+    ids=["LaTeX", "fonts", "sizes", "colours"],
+)
+def test_a_picture_is_drawn_by_our_settings_not_the_users(settings, tmp_path):
+    """Without LaTeX too; the user's settings are as they were afterwards."""
+    costs = np.array([[5.0, 3.0], [2.0, 0.5]])
+
+    def drawn(name):
+        figures.save(figures.cost_evolution(costs), tmp_path / name)
+        return (tmp_path / name).read_bytes(), figures.html(figures.cost_evolution(costs), "c")
+
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        plain, _ = drawn("plain.png")
+        matplotlib.rcParams.update(settings)
+        users = dict(matplotlib.rcParams)
+        other, page = drawn("other.png")
+        assert other == plain and "<img" in page
+        assert dict(matplotlib.rcParams) == users
+
+
+def test_a_picture_that_fails_costs_no_result(tmp_path, monkeypatch, capsys):
+    def fail(cost):
+        raise RuntimeError("no such letter")
+
+    monkeypatch.setattr(figures, "cost_evolution", fail)
+    optimize._draw(np.zeros((2, 2)), tmp_path / "figures" / "a.png", terminal.Console())
+    assert "could not be drawn (RuntimeError: no such letter)" in capsys.readouterr().err

@@ -126,14 +126,24 @@ def _tell(
         case, other = reference.stress_run(folder, plan.settings, console, later)
         reference.tell_stress(case, other, console)
         _judge(plan, result, fresh_trials.judged(plan.scene, outcomes, other), folder, console)
-    path = folder / "figures" / "cost_evolution.png"
-    with Busy(console, "drawing"), files.naming(path):
-        from codesign_jax.report import figures
-
-        figures.save(figures.cost_evolution(result.record.history.cost), path)
-    console.print(f"figure: {path}")
+    _draw(result.record.history.cost, folder / "figures" / "cost_evolution.png", console)
     console.print(f"results: {folder}")
     console.print(f"to look at: {shlex.join(['codesign', 'report', str(folder)])}")
+
+
+def _draw(cost: np.ndarray, path: Path, console: Console) -> None:
+    """Draws the episodes' costs; a picture that fails costs no result."""
+    try:
+        with Busy(console, "drawing"), files.naming(path):
+            from codesign_jax.report import figures
+
+            figures.save(figures.cost_evolution(cost), path)
+    except OSError:  # a full disk fails the command
+        raise
+    except Exception as error:  # of matplotlib, which has many
+        common.warn(f"{path} could not be drawn ({type(error).__name__}: {error})")
+    else:
+        console.print(f"figure: {path}")
 
 
 def _refuse_links(options: Optimize, folders: Iterable[Path]) -> None:

@@ -1,8 +1,11 @@
 """Figures of a run (matplotlib), as files and as pictures of its report."""
 
 import base64
+import functools
 import io
+from collections.abc import Callable
 from pathlib import Path
+from typing import ParamSpec, TypeVar
 
 import matplotlib
 import matplotlib.figure
@@ -23,7 +26,26 @@ _BLUE = "tab:blue"
 _ORANGE = "tab:orange"
 _COLUMNS = 3  # of the grid of parameters
 
+P = ParamSpec("P")
+R = TypeVar("R")
 
+
+def own_settings(draw: Callable[P, R]) -> Callable[P, R]:
+    """Has a function draw by matplotlib's own settings, whatever the user's are.
+
+    A matplotlibrc of another machine may ask for LaTeX (`text.usetex`) or fonts that are not here.
+    """
+
+    @functools.wraps(draw)
+    def drawn(*arguments: P.args, **options: P.kwargs) -> R:
+        with matplotlib.rc_context():
+            matplotlib.rcdefaults()
+            return draw(*arguments, **options)
+
+    return drawn
+
+
+@own_settings
 def save(figure: matplotlib.figure.Figure, path: Path) -> Path:
     """Writes a figure as a whole or not at all."""
     path.parent.mkdir(exist_ok=True)
@@ -32,6 +54,7 @@ def save(figure: matplotlib.figure.Figure, path: Path) -> Path:
     return path
 
 
+@own_settings
 def html(figure: matplotlib.figure.Figure, name: str) -> str:
     """A figure as a piece of a page that needs no other file."""
     buffer = io.BytesIO()
@@ -51,6 +74,7 @@ def _above(axes: Axes, columns: int = 3) -> None:
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=columns, frameon=False)
 
 
+@own_settings
 def cost_evolution(
     cost: ArrayLike, *, threshold: float = CONVERGED_COST, title: str = ""
 ) -> matplotlib.figure.Figure:
@@ -78,6 +102,7 @@ def cost_evolution(
     return figure
 
 
+@own_settings
 def landscape(surface: Landscape) -> matplotlib.figure.Figure:
     """The mean cost over a grid of two parameters as Fig. 8 of the paper: white where low.
 
@@ -108,6 +133,7 @@ def _landscape(axes: Axes, surface: Landscape) -> None:
     axes.figure.colorbar(image, ax=axes, label=label)
 
 
+@own_settings
 def designs(
     history: History, space: DesignSpace, chosen: np.ndarray, surface: Landscape | None
 ) -> matplotlib.figure.Figure:
@@ -132,6 +158,7 @@ def designs(
     return figure
 
 
+@own_settings
 def parameters(
     history: History, space: DesignSpace, chosen: np.ndarray
 ) -> matplotlib.figure.Figure:
@@ -163,6 +190,7 @@ def parameters(
     return figure
 
 
+@own_settings
 def grip(forces: Forces, scene: Scene) -> matplotlib.figure.Figure:
     """Normal force of each finger on the object, and the palm's force, over time.
 
@@ -185,6 +213,7 @@ def grip(forces: Forces, scene: Scene) -> matplotlib.figure.Figure:
     return figure
 
 
+@own_settings
 def failures(status: np.ndarray) -> matplotlib.figure.Figure:
     """Frequency of each cause of failure in each episode.
 

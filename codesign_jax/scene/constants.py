@@ -47,7 +47,8 @@ def _check(scene: Scene) -> None:
     lengths = {np.shape(v) for v in leaves.values()} - {()}
     for path, value in leaves.items():
         problems += _leaf_problems(path, value, ranges[path], len(lengths) > 1)
-    if not problems and _known(scene):
+    # Without compilation (`jax.disable_jit`) the numbers of a bare scene are known as well.
+    if not problems and scene.hand.parameter and _known(scene):
         problems = check_together(scene, "scene")
     if problems:
         raise schema.InputError(problems)

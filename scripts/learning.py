@@ -144,7 +144,7 @@ def draw(table: Path) -> None:
         axes.plot(chosen["seconds"] / 60, chosen["held"], ".-", label=f"seed {seed:.0f}")
     axes.axhline(rows["held"][rows["actions"] == 0][0], color="black", ls=":", label="key frames")
     axes.set(xlabel="minutes", ylabel="share of the time held", ylim=(0, 1))
-    axes.legend()
+    axes.legend(loc="lower left", ncols=4)
     figure.savefig(DOCS / "figures" / "learning.png", dpi=110)
 
 

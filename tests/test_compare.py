@@ -17,12 +17,12 @@ import pytest
 from scipy import integrate, optimize, stats
 
 from codesign_jax import constants, model, preflight, rollout, runs, sampling, scene, statistics
-from codesign_jax.commands import common, compare
+from codesign_jax.commands import common, compare, flags
 from codesign_jax.engines import make_engine
 from codesign_jax.judge import cases, fresh_trials, sentences, stress, verdict
 from codesign_jax.judge.sentences import Judged
 from codesign_jax.model import overlap
-from codesign_jax.runs import columns
+from codesign_jax.runs import columns, selection
 from codesign_jax.scene import beams, design_files, draws, parameters
 from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import command, copied, finished_run, own_workplace  # noqa: F401
@@ -52,12 +52,42 @@ def test_runs_of_folders_are_rows(place, tmp_path, monkeypatch, capsys):
     assert any(line.startswith("seeds/seed-1 tiny pinch mesh") for line in lines)
     # Neither a test nor fresh trials: the search was stopped after five episodes.
     [stopped] = [line for line in lines if line.startswith("screened")]
-    assert stopped.endswith("screened-es 23d structured 0 episode 6")
+    beginning, _, air = stopped.rpartition(" ")
+    assert beginning.endswith("screened-es 23d structured 0 episode 6") and float(air) > 0
     rows = [*csv.DictReader(table.read_text().splitlines())]
     assert [row["seed"] for row in rows] == ["3", "0", "0", "1"]
     there = [(tmp_path / row["run"]).resolve() for row in rows]
     assert there[-1] == (place / "seeds" / "seed-1").resolve()
     assert command("compare", *folders, "--out", table) == 0  # it is such a table
+
+
+def test_a_design_is_compared_in_two_settings_and_a_run_with_a_file(place, workplace, capsys):
+    """Each side has its own values, which its name says, beside those of both."""
+    run = place / "today"
+    case = selection.case_of_run(run)
+    settings = runs.read_run(run)[1]
+    file = design_files.DesignFile(settings.preset, {}, scene=str(run / "scene.toml"))
+    Path("mine.toml").write_text(common.design_text(case.space, file, case.design))
+    sides = ["--set-a", "hand.material.shear_modulus=5e4", "--set-b", "gravity=3"]
+    options = flags.Compare(
+        folders=(Path("mine.toml"),),
+        set_a=(("hand.material.shear_modulus=5e4",),),
+        set_b=(("gravity=3",),),
+        overrides=(("contact.friction_ratio=20",),),
+    )
+    pair = compare._pair(options, [*options.folders])
+    names = ["mine.toml with hand.material.shear_modulus=5e4", "mine.toml with gravity=3"]
+    assert [*pair] == names
+    soft, light = pair.values()
+    assert (soft.scene.hand.material.shear_modulus, light.scene.gravity) == (5e4, 3)
+    assert soft.scene.gravity == case.scene.gravity
+    assert soft.scene.contact.friction_ratio == light.scene.contact.friction_ratio == 20
+    np.testing.assert_array_equal(np.float32(soft.design), np.float32(case.design))
+    assert command("compare", "mine.toml", run, "--trials", "3") == 0
+    output = capsys.readouterr().out
+    assert f"0 by mine.toml alone, 0 by {run} alone" in output
+    assert output.count(f"{case.air:.1f} cm³") == 2
+    assert command("compare", "mine.toml", *sides, "--set", "gravity=1000") == 2
 
 
 def test_two_designs_meet_the_same_trials(place, capsys):
@@ -81,9 +111,16 @@ def test_two_designs_meet_the_same_trials(place, capsys):
         (["today", "screened"], ["--trials", "3"], "other objects or noise: --objects says which"),
         (["today"], ["--out", "a.txt"], "--out a.txt must end in .csv"),
         (["today", "screened"], ["--trials", "0"], "--trials = 0 is outside"),
-        (["a.toml"], [], "compare takes two design files, or one with --policy against none"),
-        (["a.toml"] * 3, [], "compare takes two design files, or one with --policy"),
-        (["a.toml", "today"], [], "compare takes design files (.toml) or run folders, not both"),
+        (["a.toml"], [], "compare takes two designs, or one with --policy against none"),
+        (["a.toml"] * 3, [], "compare takes two designs, or one with --policy"),
+        (["a.toml", "today"], [], "a.toml: No such file or directory"),
+        (["seeds", "today"], ["--set-b", "gravity=3"], "are of two designs; there are 3 runs"),
+        (["today"], ["--set-b", "gravity=1000"], "gravity = 1000 is outside"),
+        (
+            ["today"],
+            ["--set-a", "objects.object.0.mass=0.2"],
+            "other objects or noise: --objects says which",
+        ),
         (["a.toml"] * 2, ["--out", "a.csv"], "--out is a table of runs"),
         (["a.toml"] * 2, ["--policy", "a:B", "c:D"], "--policy takes one policy beside design"),
     ],

@@ -6,6 +6,7 @@
 import math
 import os
 from collections.abc import Mapping
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,9 +22,19 @@ from codesign_jax.commands.flags import Compare
 from codesign_jax.judge import fresh_trials, sentences, verdict
 from codesign_jax.judge.cases import Case
 from codesign_jax.judge.sentences import Judged
-from codesign_jax.runs import RunResult, Settings, columns, manifest, reference, tables
+from codesign_jax.model import morphology
+from codesign_jax.runs import (
+    RunResult,
+    Settings,
+    columns,
+    manifest,
+    reference,
+    selection,
+    tables,
+)
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene
+from codesign_jax.scene.parameters import design_space
 from codesign_jax.scene.schema import InputError
 from codesign_jax.terminal import Console
 
@@ -57,6 +68,15 @@ class Compared(NamedTuple):
         return self.fresh
 
     @property
+    def air(self) -> float | None:
+        """Air in all unloaded chambers of its design [cm^3]; None without a finished episode."""
+        if self.result is None or self.result.record is None:
+            return None
+        design = selection.choose(self.scene, self.result.record).design
+        space = design_space(self.scene.hand, self.settings.preset)
+        return float(morphology.air(self.scene.hand, space.params(design)))
+
+    @property
     def kind(self) -> dict[str, str]:
         """Properties besides the seed in which runs may differ, by column."""
         properties = {"scene": self.scene.name, "hand": self.scene.hand.name}
@@ -65,26 +85,29 @@ class Compared(NamedTuple):
 
 
 def main(options: Compare) -> int:
-    designs = [path for path in options.folders if path.suffix == ".toml"]
+    designs = [path for path in options.folders if flags.is_design(path)]
     folders = [] if designs else [run for folder in options.folders for run in _runs_in(folder)]
     problems = common.number_problems(
         ("--trials", options.trials, 1, 100_000), ("--seed", options.seed, 0, 2**31 - 1)
     )
     if not options.folders:
         problems.append("compare needs at least one run folder")
-    if designs and len(designs) < len(options.folders):
-        problems.append("compare takes design files (.toml) or run folders, not both")
     if designs and options.out is not None:
         problems.append("--out is a table of runs; leave it out beside design files")
-    paths = designs or folders
-    alone = len(paths) == 1 and len(options.policy) == 1
-    if designs and len(designs) != 2 and not alone:
-        problems.append("compare takes two design files, or one with --policy against none")
+    paths = [*options.folders] if designs else folders
+    sides = bool(options.set_a or options.set_b)
+    alone = len(paths) == 1 and (len(options.policy) == 1 or sides)
+    if designs and len(paths) != 2 and not alone:
+        problems.append(
+            "compare takes two designs, or one with --policy against none or with --set-b"
+        )
+    if sides and len(paths) not in (1, 2):
+        problems.append(f"--set-a and --set-b are of two designs; there are {len(paths)} runs")
     if options.trials is not None and len(paths) != 2 and not alone:
         problems.append(f"--trials compares two designs; the folders have {len(folders)} runs")
     common.refuse(problems + common.place_problems("--out", options.out, ".csv"))
-    simulates = bool(designs) or options.trials is not None
-    pair = _pair(options, paths, runs=not designs) if simulates else {}
+    simulates = bool(designs) or options.trials is not None or sides
+    pair = _pair(options, paths) if simulates else {}
     console = Console()
     if folders:
         every = read_all({folder: runs.read_run(folder) for folder in folders})
@@ -123,31 +146,38 @@ def read_all(every: Mapping[Path, tuple[Scene, Settings]]) -> dict[Path, Compare
     return compared
 
 
-def _pair(options: Compare, paths: list[Path], *, runs: bool) -> dict[str, Case]:
+def _pair(options: Compare, paths: list[Path]) -> dict[str, Case]:
     """The two designs by what they are called; one alone is with its policy and without it."""
-    subjects = [_subject(options, path, of_run=runs) for path in paths]
-    if runs and (unknown := {*options.policy} - {subject.policy for subject in subjects}):
+    sides = options.set_a, options.set_b
+    if len(paths) == 1 and any(sides):
+        paths = 2 * paths
+    subjects = [_subject(options, path, side) for path, side in zip(paths, sides, strict=False)]
+    of_runs = not any(map(flags.is_design, paths))
+    if of_runs and (unknown := {*options.policy} - {subject.policy for subject in subjects}):
         raise InputError([f"--policy {name}: neither run was made with it" for name in unknown])
-    cases = [find_case(subject) for subject in subjects]
-    names = [str(path) for path in paths]
-    if len(cases) == 1:
-        [case] = cases
+    every = [find_case(subject) for subject in subjects]
+    words = [" ".join(chain.from_iterable(side)) for side in sides]
+    named = zip(paths, words, strict=False)
+    names = [f"{path} with {more}" if more else str(path) for path, more in named]
+    if len(every) == 1:
+        [case] = every
         return {f"{names[0]} with {case.policy}": case, "without": case._replace(policy="")}
-    first, other = cases
+    first, other = every
     if first.scene.objects != other.scene.objects:
-        compared = "runs" if runs else "designs"
+        compared = "runs" if of_runs else "designs"
         raise InputError(
             [f"the two {compared} have other objects or noise: --objects says which to take"]
         )
     if names[0] == names[1]:
         names[1] += " again"
-    return dict(zip(names, cases, strict=True))
+    return dict(zip(names, every, strict=True))
 
 
-def _subject(options: Compare, path: Path, *, of_run: bool) -> flags.Subject:
-    names = ("accuracy", "objects", "overrides", "constants", "robust", "engine")
+def _subject(options: Compare, path: Path, side: tuple[tuple[str, ...], ...]) -> flags.Subject:
+    names = ("accuracy", "objects", "constants", "robust", "engine")
     arguments = {n: getattr(options, n) for n in names}
-    if of_run:
+    arguments["overrides"] = (*options.overrides, *side)
+    if not flags.is_design(path):
         policy_of_run = runs.read_run(path)[1].policy
         policy = policy_of_run if policy_of_run in options.policy else None
         return flags.Subject(run_folder=path, policy=policy, **arguments)
@@ -166,6 +196,7 @@ def compare_pair(pair: dict[str, Case], options: Compare, console: Console) -> N
         with Busy(console, f"simulating {common.counted(count, 'grasp')}"):
             outcome, departure = case.observe(count, jax.random.key(options.seed))
         console.print(f"{name} {Judged(case.scene, outcome, options.accuracy)}")
+        console.print(f"{name}: {case.air:.1f} cm³ of air in all unloaded chambers")
         if departure is not None:
             console.print(f"policy {case.policy} {departure}")
         kept.append(verdict.kept(outcome))
@@ -228,7 +259,7 @@ def compare(every: Mapping[Path, Compared], console: Console, *, named: bool = F
         name = [folder.as_posix()] if named else []
         rows.append((*name, *key, str(run.settings.seed), *_row(run)))
     head = ("seed", "converged", "judged by", "kept", "lost", "not released", "faults", "verdict")
-    head += ("other conditions",)
+    head += ("other conditions", "air [cm³]")
     common.print_table(console, _table((*["run"] * named, *differ, *head), rows))
     rows = [(*kind, *_summary(group)) for kind, group in groups.items()]
     if len(groups) > 1:
@@ -293,6 +324,7 @@ def _values(folder: Path, run: Compared, path: Path) -> dict[str, object]:
         "trials": chosen.outcomes.cost.size,
         "paper_successes": int(np.asarray(test.paper_success)[first].sum()),
         "particles": first.size,
+        "chamber_volume_cm3": f"{run.air:.9g}",
         "verdict": (run.fresh or chosen).verdict.word,
         "other_conditions": (run.fresh or chosen).limits,
     }
@@ -306,15 +338,16 @@ def _values(folder: Path, run: Compared, path: Path) -> dict[str, object]:
 
 def _row(run: Compared) -> tuple[str, ...]:
     if run.result is None or run.result.record is None:
-        return ("failed", *[""] * 7)
+        return ("failed", *[""] * 8)
     converged = f"episode {run.converged}" if run.converged else "no"
     judged = run.judged
     if judged is None:
-        return (converged, *[""] * 7)
+        return (converged, *[""] * 7, f"{run.air:.1f}")
     where = "final test" if run.fresh is None else f"{judged.accuracy}"
     tally = verdict.tally(judged.outcomes)
     numbers = f"{tally.kept} of {tally.total}", *map(str, tally[1:])
-    return (converged, where, *numbers, judged.verdict.word, judged.limits)
+    words = judged.verdict.word, judged.limits
+    return (converged, where, *numbers, *words, f"{run.air:.1f}")
 
 
 def read(scene: Scene, folder: Path) -> RunResult | None:

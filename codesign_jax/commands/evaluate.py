@@ -34,6 +34,7 @@ def main(options: Evaluate) -> int:
         )
         console.print(f"{subject} of {options.run_folder}")
     console.print(*runs.describe(case.space, case.design).split("\n"), sep="\n")
+    console.print(f"air in all unloaded chambers: {case.air:.1f} cm³")
     if not options.run_folder:
         words = [*chain.from_iterable(options.design)]
         if note := common.by_default(case.space, words):

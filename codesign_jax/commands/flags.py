@@ -9,20 +9,21 @@ import tyro
 
 from codesign_jax import sizes
 
-# A repeated flag adds to its earlier values.
-Overrides = Annotated[
-    tuple[tuple[str, ...], ...],
-    tyro.conf.UseAppendAction,
-    tyro.conf.arg(
-        name="set",
-        metavar="KEY=VALUE ...",
-        help="Replace values of the scene, hand and objects files, by key path: "
-        "gravity=3.7 discretization.links=5 hand.material=dragon_skin_10 "
-        "objects.object.sphere.mass=0.2",
-        help_behavior_hint="",
-    ),
-]
 
+def _overrides(name: str, text: str) -> Any:
+    """A flag of values by key path; repeated, it adds to its earlier values."""
+    return Annotated[
+        tuple[tuple[str, ...], ...],
+        tyro.conf.UseAppendAction,
+        tyro.conf.arg(name=name, metavar="KEY=VALUE ...", help=text, help_behavior_hint=""),
+    ]
+
+
+Overrides = _overrides(
+    "set",
+    "Replace values of the scene, hand and objects files, by key path: gravity=3.7 "
+    "discretization.links=5 hand.material=dragon_skin_10 objects.object.sphere.mass=0.2",
+)
 # Without a default of its own: the help text says which value is used instead.
 Text = Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="")]
 Count = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
@@ -39,6 +40,11 @@ Tolerances = Annotated[
 ]
 File = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
+
+
+def is_design(path: Path) -> bool:
+    """Whether a path means a design file rather than a run folder."""
+    return path.suffix == ".toml" and not path.is_dir()
 
 
 @dataclasses.dataclass
@@ -96,17 +102,26 @@ class Subject(SceneFlags):
 
 @dataclasses.dataclass
 class RunOrDesign(Subject):
-    """Like `Subject`; the run may also be the first argument, as in `codesign report RUN`."""
+    """Like `Subject`; a run or design file may be the first argument, as in `codesign replay RUN`.
+
+    Once it is made, `run_folder` or `design` has it, and `first` is None.
+    """
 
     first: Annotated[
-        Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[RUN]", help_behavior_hint="")
+        Path | None,
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="[RUN|FILE]", help_behavior_hint=""),
     ] = None
-    """A run folder (as --run)."""
+    """A run folder (as --run), or a design file, .toml (as --design)."""
 
     def __post_init__(self) -> None:
         if self.first is not None and self.run_folder is not None:
             raise ValueError(f"{self.first} and --run {self.run_folder}: give one of them")
         self.run_folder = self.first or self.run_folder
+        self.first = None
+        if self.run_folder is not None and is_design(self.run_folder):
+            self.design = ((str(self.run_folder),), *self.design)
+            self.run_folder = None
 
 
 @dataclasses.dataclass
@@ -206,8 +221,8 @@ class Compare(Command, TrialFlags):
     """Compare runs: one row for each, and the share of runs that found a good design.
 
     With --trials, the designs of two runs are simulated in the same trials, and their difference is
-    given with its 95 % interval. Two design files can be compared in the same way, and one design
-    with and without a policy.
+    given with its 95 % interval. Two design files can be compared in the same way; one design with
+    and without a policy; and, with --set-a and --set-b, one design in two settings.
     """
 
     folders: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER ...")]
@@ -217,6 +232,12 @@ class Compare(Command, TrialFlags):
     results are listed instead."""
     seed: int = 0
     """Seed of the trials' noise."""
+    set_a: _overrides("set-a", "As --set, for the first of the two designs alone.") = ()
+    set_b: _overrides(
+        "set-b",
+        "As --set, for the second of the two designs alone; or for one that is named once, such as "
+        "the same hand in another silicone: --set-b hand.material=ecoflex_00_50.",
+    ) = ()
     engine: Text = None
     """Simulation engine; default: the runs' engine."""
     policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="STR ...", help_behavior_hint="")] = ()
@@ -329,7 +350,11 @@ class Landscape(Command, RunOrDesign):
     """The two parameters, such as length arm_z=20:60 (in the hand file's units), or keys with their
     ranges, such as objects.object.friction=0.2:1 objects.object.mass=0.05:0.5; a key without the
     name of an entry sets all entries of a list. Default: the parameters of a design space of two.
-    All other numbers stay fixed."""
+    All other numbers stay fixed, unless --search adapts them."""
+    search: int = 0
+    """Episodes of a search of all other parameters at each point, 12 designs each by CMA-ES: what
+    is best there if everything else may adapt. Its trials are others than those of the point. 0:
+    the other parameters stay fixed."""
     points: int = 20
     """Points along each range, including its ends."""
     trials: int = 6

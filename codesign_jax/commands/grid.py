@@ -97,10 +97,7 @@ def _axis(word: str, case: Case, options: Options) -> Axis:
 def _changed(case: Case, options: Options, paths: list[tuple[str, ...]], value: float) -> Scene:
     """The scene with another number, as --set makes it, with its checks."""
     pairs = tuple(f"{'.'.join(path)}={float(value)!r}" for path in paths)
-    # Of a run that came first, `run_folder` has it already.
-    changed_options = dataclasses.replace(
-        options, first=None, overrides=(*options.overrides, pairs)
-    )
+    changed_options = dataclasses.replace(options, overrides=(*options.overrides, pairs))
     scene = common.find_case(changed_options, tell=lambda text: None).scene
     if scene.structure != case.scene.structure:
         key = ".".join(paths[0])

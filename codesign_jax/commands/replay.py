@@ -25,8 +25,8 @@ MOST = 10
 
 def main(options: Replay) -> int:
     common.use_compilation_cache()
-    if options.first is not None and not options.first.is_dir():
-        return explain(options.first, options.engine, options.policy)
+    if options.run_folder is not None and options.run_folder.suffix == ".npz":
+        return explain(options.run_folder, options.engine, options.policy)
     path = options.out or (options.run_folder or Path()) / "replay.html"
     common.refuse(common.place_problems("--out", path, ".html"))
     planned = grasp.find(options)

@@ -11,6 +11,7 @@ import numpy as np
 from codesign_jax import control, rollout, user_code
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.interrupts import interruptible
+from codesign_jax.model import morphology
 from codesign_jax.policy import ControlLoop
 from codesign_jax.reuse import SceneProgram, shared
 from codesign_jax.scene import Scene, scene_files
@@ -55,6 +56,11 @@ class Case(NamedTuple):
     def commanded(self) -> str:
         """Names of engine and policy."""
         return f"{self.engine} {self.policy}".strip()
+
+    @property
+    def air(self) -> float:
+        """Air in all unloaded chambers [cm^3]."""
+        return float(morphology.air(self.scene.hand, self.space.params(self.design)))
 
     def make_engine(self, scene: Scene | None = None) -> Engine:
         """The engine of the scene, or of one that differs from it, with the policy if any."""

@@ -58,6 +58,11 @@ def chamber_volumes(hand: Hand, params: Params) -> Any:
     return params.length * (area(*base) + 4 * area(*middle) + area(*tip)) / 6
 
 
+def air(hand: Hand, params: Params) -> Any:
+    """Air in all unloaded chambers of a hand [cm^3], shape (...); see `chamber_volumes`."""
+    return 1e6 * np.asarray(chamber_volumes(hand, params)).sum(-1)
+
+
 def pressure_limits(hand: Hand, params: Params) -> np.ndarray:
     """Highest pressures of a hand's fingers by Table I [Pa], shaped as their walls."""
     wall = np.asarray(params.wall, float)

@@ -5,6 +5,7 @@ import numpy as np
 
 from codesign_jax.judge import sentences, stress, verdict
 from codesign_jax.judge.sentences import Judged
+from codesign_jax.model import morphology
 from codesign_jax.report import markup
 from codesign_jax.report.of_run import Run
 from codesign_jax.runs import tables
@@ -80,7 +81,9 @@ def _parameters(run: Run) -> str:
     def named(name: str, k: int) -> str:
         return f"{name} {space.units[k]}"
 
-    parts = [markup.paragraph("Below each value its place in its range.", "note")]
+    air = morphology.air(run.scene.hand, space.params(run.chosen.design))
+    note = f"Below each value its place in its range. Air in all unloaded chambers: {air:.1f} cm³."
+    parts = [markup.paragraph(note, "note")]
     if per_finger:
         head = ("finger", *(named(name, at[0]) for name, at in per_finger.items()))
         count = len(next(iter(per_finger.values())))

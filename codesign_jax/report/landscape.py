@@ -8,6 +8,7 @@ import numpy as np
 from codesign_jax import array_files
 from codesign_jax.array_files import Array
 from codesign_jax.runs import columns, tables
+from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.scene.schema import InputError
 
 FILE = "landscape.npz"
@@ -26,8 +27,11 @@ class Landscape(NamedTuple):
     counted: np.ndarray  # trials that did not fail, shape (n, m)
     trials: np.ndarray  # trials of a point, shape ()
     seed: np.ndarray  # root of their noise, shape ()
-    # What the other parameters stay at: the whole design [SI units], shape (parameter,)
+    # What the other parameters begin or stay at: a whole design [SI units], shape (parameter,)
     design: np.ndarray
+    designs: np.ndarray  # the points' whole designs [SI units], shape (n, m, parameter)
+    search: np.ndarray  # episodes of each point's search of the other parameters, shape ()
+    air: np.ndarray  # air in all unloaded chambers [cm^3], shape (n, m)
 
 
 _LAYOUT = {
@@ -36,12 +40,14 @@ _LAYOUT = {
     "second": Array("f", ("second",)),
     "cost": Array("f", ("first", "second")),
     **dict.fromkeys(("kept", "counted"), Array("iu", ("first", "second"))),
-    **dict.fromkeys(("trials", "seed"), Array("iu", ())),
+    **dict.fromkeys(("trials", "seed", "search"), Array("iu", ())),
     "design": Array("f", ("parameter",)),
+    "designs": Array("f", ("first", "second", "parameter")),
+    "air": Array("f", ("first", "second")),
 }
 
 
-def save(landscape: Landscape, folder: Path) -> list[Path]:
+def save(landscape: Landscape, folder: Path, space: DesignSpace) -> list[Path]:
     """Writes a landscape as arrays and as a table of its points; returns the files."""
     npz = folder / FILE
     table = folder / TABLE
@@ -51,13 +57,19 @@ def save(landscape: Landscape, folder: Path) -> list[Path]:
         for n, u in zip(landscape.names, landscape.units, strict=True)
     ]
 
+    names = tables.design_columns(space)
+    values = space.in_units(landscape.designs)
+    searched = [n for n in names if n not in axes] if landscape.search else []
+
     def row(i: int, j: int) -> tables.Row:
         point = dict(zip(axes, (landscape.first[i], landscape.second[j]), strict=True))
-        numbers = {n: f"{v:.9g}" for n, v in (point | {"mean_cost": landscape.cost[i, j]}).items()}
+        point |= {"mean_cost": landscape.cost[i, j], "chamber_volume_cm3": landscape.air[i, j]}
+        point |= {n: v for n, v in zip(names, values[i, j], strict=True) if n in searched}
+        numbers = {n: f"{v:.9g}" for n, v in point.items()}
         counts = {"kept_trials": landscape.kept[i, j], "counted_trials": landscape.counted[i, j]}
         return numbers | {n: int(v) for n, v in (counts | {"trials": landscape.trials}).items()}
 
-    head = [*axes, *columns.MORE[TABLE].columns]
+    head = [*axes, *columns.MORE[TABLE].columns, *searched]
     tables.write(table, head, (row(*point) for point in np.ndindex(*landscape.cost.shape)))
     return [npz, table]
 

@@ -157,7 +157,10 @@ def _landscape(run: Run) -> str:
         else:
             same = np.allclose(grid.design, run.chosen.design)
             around = "the chosen design" if same else "another design, which landscape.npz has"
-            words = f"In grey {grey} The other parameters are those of {around}."
+            others = f"The other parameters are those of {around}."
+            if grid.search:
+                others = "At each point a search chose the other parameters."
+            words = f"In grey {grey} {others}"
             figure = figures.landscape(grid)
     section = markup.paragraph(words, "", command), figures.html(figure, "landscape")
     return markup.section("Landscape", *section)

@@ -67,13 +67,16 @@ MORE = {
     SEEDS: CsvTable(
         (
             *("seed", "schedule", "first", "finished", "converged_episode", "best_test_cost"),
-            *("kept_trials", "trials", "paper_successes", "particles", "verdict"),
+            *("kept_trials", "trials", "paper_successes", "particles"),
+            *("chamber_volume_cm3", "verdict"),
             "other_conditions",
             *("fresh_kept_trials", "fresh_lost_trials", "fresh_not_released_trials"),
             *("fresh_fault_trials", "fresh_cost", "run"),
         )
     ),
-    LANDSCAPE: CsvTable(("mean_cost", "kept_trials", "counted_trials", "trials")),
+    LANDSCAPE: CsvTable(
+        ("mean_cost", "kept_trials", "counted_trials", "trials", "chamber_volume_cm3")
+    ),
     REFERENCE: CsvTable(tuple(name for name in GRASPS if name != "design")),
 }
 """Tables that are not of a run alone."""

@@ -192,8 +192,7 @@ def rows(question: Question, shard: int, drawn: Drawn, outcomes: Outcome) -> dic
     designs = question.space.in_units(drawn.designs)
     columns = design_columns(question.space)
     hands = params_of(question.space, drawn.designs)
-    air = 1e6 * np.asarray(morphology.chamber_volumes(question.scene.hand, hands)).sum(-1)
-    values["chamber_volume_cm3"] = air[:, None]
+    values["chamber_volume_cm3"] = morphology.air(question.scene.hand, hands)[:, None]
     return values | {name: designs[:, k, None] for k, name in enumerate(columns)}
 
 

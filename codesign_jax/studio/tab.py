@@ -310,17 +310,17 @@ class Tab:
         self._asked.append(view._replace(design=design, resting=True, number=None))
 
     def _save(self) -> None:
-        words = ["codesign", "evaluate", *self._saved()]
+        words = ["codesign", "studio", *self._saved()]
         self.send("done", f"saved; to open it again:\n{shlex.join(words)}")
 
     def _saved(self) -> list[str]:
-        """Saves the design that is shown; flags that name it to another command."""
+        """Saves the design that is shown; words that name it to another command."""
         view = self._current().view
         space = self._desk.case.space
         text = common.design_text(space, self._desk.file, view.design)
         with self._desk.reserved("design", ".toml") as path, files.atomically(path) as part:
             part.write_text(text, encoding="utf-8")
-        return ["--design", str(path), *self._desk.flags(view.accuracy)]
+        return [str(path), *self._desk.flags(view.accuracy)]
 
     def _page(self) -> None:
         view, bench, grasp = self._current()

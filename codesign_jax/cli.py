@@ -75,10 +75,14 @@ def main(arguments: list[str] | None = None) -> int:
             prog="codesign",
             description="Co-design of hand morphology and control; --version prints the version.",
         )
+        if arguments is None:
+            terminal.waits.append(True)
+        # Before the modules that take seconds to import.
+        terminal.wait(f"codesign {type(command).__name__.lower()}: loading")
         return command.run()
 
     code = status.of(run)
-    if arguments is None and code == status.INTERRUPTED:
+    if arguments is None and code in (status.INTERRUPTED, status.TERMINATED):
         status.leave(code)
     return code
 

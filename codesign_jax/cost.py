@@ -19,9 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.judge import verdict
+from codesign_jax.model.layout import layout
 from codesign_jax.scene import Scene
 from codesign_jax.types import Forces, Outcome, Status, Trace, Trial, failed
 
+MOVED = 1e-3
+"""Distance on the table from which on an object was moved [m] [chosen]: contacts of the hand give
+way by less before they shift an object, and one that is not touched stays where it is."""
 _ROUNDING = 1.001
 """A ball's centre rests just as high as its radius: in float32 it may be a little higher."""
 
@@ -60,6 +64,7 @@ def outcome(
     # An engine that does not tell how much is left warns of any step at its limit.
     above = capped > 0 if trace.residual is None else residual > scene.newton.residual
     status |= verdict.as_bit(above, Status.SOLVER_CAP)
+    status |= verdict.as_bit(lost & _unmoved(scene, trace, trial), Status.UNMOVED)
     cost = jnp.where(failed(status), scene.cost.maximum, cost).astype(dtype)
     return Outcome(cost, status, lost_time, jnp.where(bad, bad_step, -1), capped, residual)
 
@@ -168,6 +173,18 @@ def _solved(trace: Trace, decided: jax.Array) -> tuple[jax.Array, jax.Array]:
     if trace.residual is None:
         return share, untold
     return share, jnp.where(capped, trace.residual, 0.0).max().astype(dtype)
+
+
+def _unmoved(scene: Scene, trace: Trace, trial: Trial | None) -> jax.Array:
+    """Whether the object ends where it was put on the table; False where that is not known.
+
+    Above the table it may have sunk by its weight, so that its height does not say.
+    """
+    if trace.last is None or trial is None:
+        return jnp.zeros((), bool)
+    first = layout(scene).dofs.size + 6  # of the object's position, behind wrist and fingers
+    place = trace.last[first : first + 2]
+    return jnp.hypot(*(place - trial.position)) < MOVED
 
 
 def _stuck(scene: Scene, trace: Trace, trial: Trial | None) -> jax.Array:

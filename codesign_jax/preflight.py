@@ -5,16 +5,26 @@ named designs by the same depths and say in words what is wrong.  The scene's ow
 number at a time; these look at the world that a design makes of them.
 """
 
+import dataclasses
+import itertools
 import math
 import operator
 from collections.abc import Mapping
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import model
-from codesign_jax.engines.overlaps import depth, depth_between, depth_in_palm
+from codesign_jax.engines.structured import overlaps
+from codesign_jax.engines.structured.coordinates import reset
+from codesign_jax.engines.structured.laws.kinematics import Kinematics, straight
+from codesign_jax.engines.structured.world_model import (
+    WorldModel,
+    apply_columns,
+    world_constants,
+)
 from codesign_jax.model import ModelFields, morphology
 from codesign_jax.scene import Scene, key_frames
 from codesign_jax.scene.parameters import DesignSpace, params_of
@@ -28,6 +38,11 @@ FALL = 5
 that stand are a little oblique in their files."""
 ROLL = 0.5e-3
 """How far it sinks besides [m]: a lying cylinder that is drawn with edges rolls onto a facet."""
+ROOM = 0.01
+"""Distance between fingers and the tallest object at the start that is advised [m] [chosen]."""
+CLOSES = 20.0
+"""Free bend of a finger below which it hardly closes a hand [deg] [chosen]: recommended hands bend
+by more than 90."""
 SINK = 1e-3
 """Depth at rest [m] above which a contact is called soft: the paper's objects are 60 mm wide."""
 
@@ -77,6 +92,65 @@ def _rows(*arrays: jax.Array) -> jax.Array:
     return jnp.concatenate([x.reshape(x.shape[0], -1) for x in arrays], 1)
 
 
+@partial(jax.jit, static_argnums=0)
+def depth(scene: Scene, fields: ModelFields) -> jax.Array:
+    """Deepest overlap of a finger, the palm or the object with another of them or the table [m].
+
+    The structured engine's contacts serve every engine: same spheres, shapes and pairs.  Fingers
+    are straight; how deep they stand in one another says `depth_between`.
+    """
+    alone = dataclasses.replace(scene.effects, finger_finger=False)
+    hand, kin, position = _straight(scene, fields)
+    scene = dataclasses.replace(scene, effects=alone)
+    every = overlaps.places(scene, hand, kin, position)
+    depths = [(-place.gap).reshape(-1, place.gap.shape[-1]).max(0) for place in every.values()]
+    if not depths:
+        return jnp.zeros_like(fields.object_mass)
+    return jnp.stack(depths).max(0)
+
+
+@partial(jax.jit, static_argnums=0)
+def depth_between(scene: Scene, fields: ModelFields) -> jax.Array:
+    """Deepest overlap of two straight fingers that may touch [m], shape (world,).
+
+    As spheres around the links' middles, as high as the section: the vertices of two hulls in one
+    and the same place would not stand inside one another.
+    """
+    worlds = fields.start.shape[0]
+    count = scene.num_fingers
+    if not scene.effects.finger_finger or count == 1:
+        return jnp.full((worlds,), -jnp.inf, fields.start.dtype)
+    hand, kin, _ = _straight(scene, fields)
+    up = hand.centre[2]
+    middle = kin.origin + apply_columns(kin.link, hand.centre)
+    deepest = []
+    for a, b in itertools.combinations(range(count), 2):
+        away = middle[:, :, None, a] - middle[:, None, :, b]
+        reach = up[:, None, a] + up[None, :, b]
+        deepest.append((reach - jnp.sqrt((away**2).sum(0))).reshape(-1, worlds).max(0))
+    return jnp.stack(deepest).max(0)
+
+
+@partial(jax.jit, static_argnums=0)
+def depth_in_palm(scene: Scene, fields: ModelFields) -> jax.Array:
+    """Deepest overlap of a straight finger with the palm's disc [m], shape (world,).
+
+    By the rings or spheres that touch it in a simulation, of those that may.
+    """
+    if not scene.effects.finger_palm:
+        return jnp.full((fields.start.shape[0],), -jnp.inf, fields.start.dtype)
+    hand, kin, _ = _straight(scene, fields)
+    return overlaps.depth_in_palm(scene, hand, kin)
+
+
+@partial(jax.jit, static_argnums=0)
+def _straight(scene: Scene, fields: ModelFields) -> tuple[WorldModel, Kinematics, jax.Array]:
+    """Worlds with straight fingers, and the place of the object's centre, (3, 1, world)."""
+    state = reset(scene, fields)
+    hand = world_constants(scene, fields)
+    return hand, straight(hand, state), state.position
+
+
 def notes(scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray]) -> list[str]:
     """Warnings of named designs [SI units], and how exact the scene's meshes are."""
     params = params_of(space, np.array([*designs.values()], np.float32))
@@ -91,9 +165,11 @@ def notes(scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray]) -
 def warnings(scene: Scene, designs: Params, names: list[str]) -> list[str]:
     """What designs, arrays with leading axis (design,), may not mean as they seem to."""
     doubts = _scene_warnings(scene)
-    for i, name in enumerate(names):
-        doubts += _reach(scene, jax.tree.map(operator.itemgetter(i), designs), name)
-    return doubts
+    each = [jax.tree.map(operator.itemgetter(i), designs) for i in range(len(names))]
+    for design, name in zip(each, names, strict=True):
+        doubts += _reach(scene, design, name)
+    low = [text for design in each for text in low_starts(scene, design)]
+    return doubts + low[:1] + _stiffness(scene, each)
 
 
 def refusals(scene: Scene, designs: Params, names: list[str]) -> list[str]:
@@ -176,6 +252,44 @@ def _reach(scene: Scene, design: Params, name: str) -> list[str]:
             f"(palm at {1e3 * palm:.0f} mm): nothing can be touched"
         ]
     return []
+
+
+def low_starts(scene: Scene, design: Params) -> list[str]:
+    """A warning where fingers reach below the top of the tallest object as the arm starts.
+
+    Whether one then starts inside it depends on the arm's pose and on the trial's noise.
+    """
+    if not scene.effects.finger_object:
+        return []
+    x, y, height = (float(v) for v in key_frames.poses(scene, design, 1)[0][:3])
+    longest = float(np.max(design.length))
+    tallest = max(scene.objects.object, key=lambda shape: float(shape.height))
+    noise = scene.objects.noise
+    top = float(tallest.height) * (1 + 2 * float(noise.size))
+    outside = np.hypot(x, y) > longest + float(tallest.radius)
+    if height - longest > top or outside:
+        return []
+    needed = math.ceil(100 * (top + longest + ROOM)) / 100
+    return [
+        f"fingers of {1e3 * longest:.0f} mm begin {1e3 * (height - longest):.0f} mm above the "
+        f"table, and object {tallest.name!r} is {1e3 * float(tallest.height):.0f} mm high: grasps "
+        f"may begin with a finger inside it (INVALID_START); --set arm.start_height={needed:g} "
+        "begins above it"
+    ]
+
+
+def _stiffness(scene: Scene, designs: list[Params]) -> list[str]:
+    """A warning where no finger of the designs bends far enough to close a hand."""
+    law = bool(scene.effects.neo_hookean)
+    bends = [morphology.free_bends(scene.hand, design, neo_hookean=law) for design in designs]
+    most = float(np.degrees(np.abs(bends).max()))
+    if most >= CLOSES:
+        return []
+    return [
+        f"fingers bend by at most {most:.2g} degrees without load, too little to close around an "
+        "object: a softer silicone, thinner walls, longer fingers or more pressure bend them "
+        "further"
+    ]
 
 
 def _overlaps(scene: Scene, designs: Params, names: list[str]) -> list[str]:

@@ -213,6 +213,19 @@ def use_compilation_cache() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
+def why_nothing_is_kept() -> str:
+    """Why compiled programs are not kept between commands though nobody asked for that; or ""."""
+    if os.environ.get("JAX_COMPILATION_CACHE_DIR") or _environment()[0] == "off":
+        return ""
+    place = folder()
+    if place.parts[0] == "~":
+        return "there is no home folder: set HOME or XDG_CACHE_HOME"
+    existing = next(path for path in (place / "jax", *(place / "jax").parents) if path.exists())
+    if not (existing.is_dir() and os.access(existing, os.W_OK)):
+        return f"{existing} cannot be written to: XDG_CACHE_HOME names another place"
+    return ""
+
+
 # JAX (`lru_cache.py`) writes no program as a whole and writes over nothing: what a full disk or a
 # power cut left would stay.  It compresses them by zlib, which has a checksum, or, where it finds
 # zstd, without any: a flipped bit would be run as machine code.  So each program has its digest

@@ -57,6 +57,16 @@ def say(*lines: str, error: bool = False) -> None:
     print(*map(line, lines), sep="\n", file=stream, flush=error)
 
 
+def wait(text: str) -> None:
+    """Says what takes a while, where a command has asked for it; in the library nothing is said."""
+    if waits:
+        say(f"{text} ...", error=True)
+
+
+waits: list[bool] = []
+"""Not empty in a process that is a command: then what takes a while is said."""
+
+
 def tolerate(stream: TextIO) -> None:
     """Has a stream write what its encoding lacks as escapes, in place of an error."""
     reconfigure = getattr(stream, "reconfigure", None)

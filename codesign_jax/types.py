@@ -19,7 +19,7 @@ import jax.numpy as jnp
 class Status(enum.IntFlag):
     """Faults of a world, as bits; OK is zero.
 
-    Every bit but those of `WARNINGS` makes the trial a failed one, see `failed`: it is not kept,
+    Every bit but those of `HARMLESS` makes the trial a failed one, see `failed`: it is not kept,
     and a mean cost excludes it or takes the maximum for it (`cost.failure`). All of these but STUCK
     are faults of the simulation; a STUCK hand does not release the object.
 
@@ -35,6 +35,8 @@ class Status(enum.IntFlag):
         structured engine for those between fingers.
       INVALID_START: Bad model fields, or bodies deep inside one another before the first step.
       STUCK: The released object neither left the hand nor rests on the table.
+      UNMOVED: The lost object is where it was put: the hand has not moved it sideways. No failure,
+        but why the object was lost.
 
     >>> from codesign_jax import Status
     >>> Status(10)
@@ -49,9 +51,12 @@ class Status(enum.IntFlag):
     CONTACT_OVERFLOW = 16
     INVALID_START = 32
     STUCK = 64
+    UNMOVED = 128
 
 
 WARNINGS = Status.SOLVER_CAP
+"""Bits that warn of a trial's accuracy."""
+HARMLESS = WARNINGS | Status.UNMOVED
 """Bits that do not make a trial a failed one."""
 
 MEANINGS = {
@@ -64,11 +69,12 @@ MEANINGS = {
     Status.INVALID_START: "bodies deep inside one another before the first step",
     Status.STUCK: "the hand did not let go: the released object neither left it nor rests on the "
     "table",
+    Status.UNMOVED: "no failure: the lost object is where it was put, the hand has not moved it",
 }
 """What the bits of `Status` mean, in words for readers of reports."""
 
 
-_FAILURES = sum(bit for bit in Status if bit not in WARNINGS)
+_FAILURES = sum(bit for bit in Status if bit not in HARMLESS)
 
 
 def random_key_problem(key: Any, name: str = "key") -> str:
@@ -106,7 +112,7 @@ class Params(NamedTuple):
     """Morphology and control parameters of one hand (Table I), SI units and radians.
 
     Attributes:
-      length: Finger length x_i [m], shape (finger,).
+      length: Finger length x_i [m], shape (finger,); 0 of a finger that is absent.
       height: Section height h_i [m], shape (finger,).
       wall: Hull thickness d_i [m], shape (finger,).
       spread: Spread gamma between the finger pairs [rad], shape ().

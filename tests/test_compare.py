@@ -14,14 +14,26 @@ from typing import NamedTuple
 import jax
 import numpy as np
 import pytest
+import tyro
 from scipy import integrate, optimize, stats
 
-from codesign_jax import constants, model, preflight, rollout, runs, sampling, scene, statistics
+from codesign_jax import (
+    cli,
+    constants,
+    model,
+    preflight,
+    rollout,
+    runs,
+    sampling,
+    scene,
+    statistics,
+)
 from codesign_jax.commands import common, compare, flags
 from codesign_jax.engines import make_engine
 from codesign_jax.judge import cases, fresh_trials, sentences, stress, verdict
 from codesign_jax.judge.sentences import Judged
 from codesign_jax.model import overlap
+from codesign_jax.report import advice
 from codesign_jax.runs import columns, selection
 from codesign_jax.scene import beams, design_files, draws, parameters
 from codesign_jax.types import Outcome, Status
@@ -580,7 +592,8 @@ def test_verdicts_count_all_trials_and_means_follow_the_rule(rule, mean, mean_in
     outcomes = trials_of([0.0, 1.0, 3.0], [0, Status.SOLVER_CAP, Status.STUCK], lost=[1])
     judged = Judged(tiny, outcomes)
     row = sentences.of_trials(tiny, outcomes)
-    assert row == f"kept 1 of 3, 1 lost, 1 not released; {mean_in_words}; warnings: SOLVER_CAP 1"
+    ends = "kept 1 of 3, 1 lost (1 thrown in the shaking), 1 not released"
+    assert row == f"{ends}; {mean_in_words}; warnings: SOLVER_CAP 1"
     assert str(judged).startswith("keeps 33 % of 3 fresh") and row in judged.details
     [warning] = sentences.warnings(judged)
     assert warning.startswith("warning: 1 of 3 trials failed (STUCK 1); STUCK: the hand did not")
@@ -593,6 +606,91 @@ def trials_of(cost, status, lost=()):
     """Outcomes of trials; the indices in `lost` lost their objects at 1 s."""
     times = np.where(np.isin(np.arange(len(cost)), list(lost)), 1.0, np.inf)
     return Outcome(np.array(cost), np.array(status, int), times, np.full(len(cost), -1))
+
+
+LIFTED = scene.load(TINY).phase_ends["lift"]
+
+
+@pytest.mark.parametrize(
+    ("status", "times", "counts"),
+    [
+        ([0, 0], [np.inf, np.inf], (0, 0, 0)),
+        ([Status.UNMOVED, 0, 0], [LIFTED - 0.1, LIFTED - 0.1, LIFTED + 0.1], (1, 1, 1)),
+        ([Status.UNMOVED | Status.SOLVER_CAP, 0], [LIFTED + 0.1, np.inf], (1, 0, 0)),
+        ([Status.STUCK, Status.SPEED, 0], [np.inf, np.inf, LIFTED], (0, 0, 1)),
+    ],
+)
+def test_every_lost_trial_has_a_cause(status, times, counts):
+    n = len(status)
+    outcomes = Outcome(np.zeros(n), np.array(status, int), np.array(times), np.full(n, -1))
+    causes = verdict.losses(scene.load(TINY), outcomes)
+    assert causes == counts and sum(causes) == verdict.tally(outcomes).lost
+    texts = str(causes).split(", ") if any(counts) else []
+    assert len(texts) == sum(n > 0 for n in counts)
+
+
+ANEW = ["--seed 4 --out runs/a-seed4", "--episodes 60"]
+SEARCH = ["codesign", "optimize", "--preset", "23d", "--seed=3", "--out", "runs/a", "--fresh"]
+
+
+@pytest.mark.parametrize(
+    ("kept", "total", "words", "commands"),
+    [
+        (60, 60, SEARCH, []),
+        (57, 60, SEARCH, ["--reference-trials 600"]),  # undecided
+        (128, 138, SEARCH, [*ANEW, "--hand pneuflex4_wide"]),  # undecided for long
+        (10, 60, SEARCH, [*ANEW, "--hand pneuflex4_wide"]),
+        (10, 60, ["codesign", "optimize", "--seeds", "0-3"], ["--episodes 60", "pneuflex4_wide"]),
+    ],
+)
+def test_what_is_not_good_is_followed_by_commands_to_try(kept, total, words, commands):
+    """Each is a command of this run with other flags, which the parser of flags takes."""
+    settings = runs.make_settings("23d", "concurrent", "morphology", "structured", 3, episodes=30)
+    judged = Judged(PAPER, trials_of([0.0] * total, [0] * total, lost=range(total - kept)))
+    tips = advice.after_search(judged, settings, words, Path("runs/a"))
+    assert len(tips) == len(commands)
+    for tip, text in zip(tips, commands, strict=True):
+        assert text in " ".join(tip.command)
+        options = tyro.cli(cli.COMMANDS, args=tip.command)
+        assert options.fresh is False and options.seeds == ("0-3" if "--seeds" in words else None)
+
+
+def test_a_design_that_keeps_little_of_its_own_test_is_not_tested_further():
+    """Nothing to judge at `reference`: the test that chose it flatters it."""
+    every = [(0, 48, True), (0, 3, False), (16, 48, True), (24, 48, False), (48, 48, False)]
+    for kept, total, hopeless in every:
+        trials = trials_of([0.0] * total, [0] * total, lost=range(total - kept))
+        assert fresh_trials.hopeless(trials) == hopeless, (kept, total)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "warning"),
+    [
+        ({}, None),
+        ({"objects.object.cylinder.size": [0.03, 0.08]}, "--set arm.start_height=0.37"),
+        ({"objects.object.cylinder.size": [0.03, 0.08], "arm.start_height": 0.37}, None),
+        ({"objects.object.cuboid.size": [0.03, 0.03, 0.1]}, "object 'cuboid' is 200 mm high"),
+        (
+            {
+                "hand.material": {
+                    "law": "neo_hookean",
+                    "shear_modulus": 1.07e6,  # Smooth-Sil 950, see docs/measurements.md
+                    "density": 1240.0,
+                    "damping_time": 0.003,
+                }
+            },
+            "too little to close",
+        ),
+    ],
+)
+def test_what_a_scene_makes_impossible_is_told_before(overrides, warning):
+    """Fingers that begin inside a tall object, and those that hardly bend."""
+    the_scene = scene.load("paper", overrides=overrides)
+    longest = parameters.design_space(the_scene.hand, "full")
+    params = longest.params(np.where(longest.is_morphology, longest.high, longest.default()))
+    designs = jax.tree.map(lambda v: np.asarray(v)[None], params)
+    texts = preflight.warnings(the_scene, designs, ["it"])
+    assert [warning in text for text in texts] == ([True] if warning else []), texts
 
 
 # --- a design under other conditions, and what is amiss with the design itself --------------------

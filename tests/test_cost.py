@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from codesign_jax import cost, rollout, scene
+from codesign_jax.model import layout
 from codesign_jax.types import Outcome, Status, Trace, failed
 from tests.helpers import grasps
 
@@ -109,6 +110,27 @@ def test_whether_an_object_rests_is_told_by_its_own_size():
     ):
         trial = rollout.nominal_trial(SCENE, name)._replace(size=jnp.float32(size))
         assert judge(distant, trial).status == status, (name, size)
+
+
+@pytest.mark.parametrize(
+    ("shift", "lost_from", "status"),
+    [
+        ((0.0, 0.0), 400, Status.UNMOVED),
+        ((0.0, 0.9e-3), 400, Status.UNMOVED),
+        ((0.0, 1.1e-3), 400, Status.OK),
+        ((-0.03, 0.0), 400, Status.OK),
+        ((0.0, 0.0), None, Status.OK),  # kept, and put back where it was
+    ],
+)
+def test_a_lost_object_that_stayed_where_it_was_put_is_told(shift, lost_from, status):
+    """By its place on the table alone: under its weight it sinks."""
+    trial = rollout.nominal_trial(SCENE, "sphere")._replace(position=jnp.array([0.01, -0.02]))
+    place = np.zeros(7)
+    place[:3] = 0.01 + shift[0], -0.02 + shift[1], 0.02
+    last = np.concatenate([np.zeros(6 + layout(SCENE).dofs.size), place])
+    result = judge(trace(lost_from)._replace(last=jnp.asarray(last, jnp.float32)), trial)
+    assert result.status == status and not failed(int(result.status))
+    assert judge(trace(lost_from), trial).status == Status.OK  # where no state is known
 
 
 CAP = Status.SOLVER_CAP

@@ -20,7 +20,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 import codesign_jax
-from codesign_jax import cli
+from codesign_jax import cli, codesign
 from codesign_jax.commands import common
 from codesign_jax.runs import selection
 from codesign_jax.scene.schema import InputError
@@ -219,8 +219,11 @@ def test_a_tab_shows_judges_improves_and_saves(desk, capsys, monkeypatch):
     assert len(messages["grasp"]["series"]["height"]) == messages["grasp"]["replay"]["frames"]
     design = ["--scene", TINY, "--engine", "mujoco", "--design", "length=100", "arm_z=0"]
     assert command("evaluate", *design, "--trials", COUNTS[0]) == 0
-    verdict = capsys.readouterr().out.split("verdict: ")[1].strip()
-    assert messages["verdict"]["sentence"] == verdict.replace("fresh ", "")
+    [verdict] = re.findall(r"^verdict: (.*)$", capsys.readouterr().out, re.M)
+    sentence, _, causes = messages["verdict"]["sentence"].partition(". Lost: ")
+    assert sentence == verdict.replace("fresh ", "")
+    lost = messages["verdict"]["ends"].count(codesign.VERDICTS.index("lost"))
+    assert sum(map(int, re.findall(r"\d+", causes))) == lost
     tab.receive('{"run": [2, 1]}')
     kept = selection.find_grasp(desk.case.scene, desk.record, episode=2, particle=1).design
     messages = settled(tab)["grasp"]

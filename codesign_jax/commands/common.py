@@ -14,12 +14,11 @@ import numpy as np
 import tomli_w
 from rich.table import Table
 
-from codesign_jax import engines, policy, rollout, terminal, tolerances
+from codesign_jax import engines, policy, reuse, rollout, terminal, tolerances
 from codesign_jax import scene as scenes
 from codesign_jax.commands.flags import Evaluate, Export, SceneFlags, Subject, TrialFlags
 from codesign_jax.engines import Engine
 from codesign_jax.judge.cases import Case
-from codesign_jax.reuse import use_compilation_cache as use_compilation_cache
 from codesign_jax.runs import selection, tables
 from codesign_jax.runs.progress import Meter
 from codesign_jax.runs.reading import Tell
@@ -35,6 +34,13 @@ MOST = 1000
 """Most runs of one command: a guard against a slip such as 0-99999."""
 OFF = ("off",)
 """Value of --tolerances where it is not given."""
+
+
+def use_compilation_cache() -> None:
+    """Keeps compiled programs between commands, or says why none are kept."""
+    reuse.use_compilation_cache()
+    if why := reuse.why_nothing_is_kept():
+        terminal.say(f"compiled programs are not kept for the next command: {why}", error=True)
 
 
 def cast_hands(
@@ -98,7 +104,7 @@ def find_case(options: Subject, *, tell: Tell = warn) -> Case:
         space = design_space(scene.hand, design_file(options).preset)
         design = find_design(space, words)
         engine_and_policy = options.engine or engines.DEFAULT, options.policy or ""
-        return Case(scene, space, design, *engine_and_policy)
+        return _with_fewer_fingers(Case(scene, space, design, *engine_and_policy), options)
     subject_flags = {"--hand": options.hand, "--scene": options.scene, "--preset": options.preset}
     foreign = ["--design"] * bool(options.design) + [
         f for f, v in subject_flags.items() if v is not None
@@ -116,7 +122,13 @@ def find_case(options: Subject, *, tell: Tell = warn) -> Case:
         options.run_folder, overrides=changes(options), tell=tell, **replacements
     )
     selection.refuse_other_policy(case.policy, options.policy)
-    return case
+    return _with_fewer_fingers(case, options)
+
+
+def _with_fewer_fingers(case: Case, options: Subject) -> Case:
+    """The case without the fingers that --without names, of a command that has this flag."""
+    fingers = getattr(options, "without", ())
+    return case.without(fingers) if fingers else case
 
 
 def shortest(space: DesignSpace, design: np.ndarray) -> list[float]:

@@ -193,7 +193,7 @@ def compare_pair(pair: dict[str, Case], options: Compare, console: Console) -> N
     kept = []
     count = TRIALS if options.trials is None else options.trials
     for name, case in pair.items():
-        with Busy(console, f"simulating {common.counted(count, 'grasp')}"):
+        with Busy(console, f"compiling, then simulating {common.counted(count, 'grasp')}"):
             outcome, departure = case.observe(count, jax.random.key(options.seed))
         console.print(f"{name} {Judged(case.scene, outcome, options.accuracy)}")
         console.print(f"{name}: {case.air:.1f} cm³ of air in all unloaded chambers")

@@ -1,12 +1,14 @@
 """`codesign evaluate`."""
 
+import shlex
+import sys
 from itertools import chain
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import files, preflight, rollout, runs, tolerances, types
+from codesign_jax import files, preflight, rollout, runs, terminal, tolerances, types
 from codesign_jax.commands import common, forces
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Evaluate
@@ -15,7 +17,9 @@ from codesign_jax.engines.base import recording
 from codesign_jax.judge import fresh_trials, sentences, stress, verdict
 from codesign_jax.judge.cases import Case
 from codesign_jax.judge.stress import Stress
+from codesign_jax.report import advice
 from codesign_jax.runs import reference, selection, tables
+from codesign_jax.runs.manifest import read_provenance
 from codesign_jax.runs.progress import Busy, Meter
 from codesign_jax.scene.schema import InputError
 from codesign_jax.terminal import Console
@@ -26,6 +30,7 @@ def main(options: Evaluate) -> int:
     case = _of_particle(find_case(options), options)
     _check(options, case.engine)
     engine = case.make_engine()
+    terminal.wait("checking how the hand begins")
     notes = preflight.notes(case.scene, case.space, {"the design": case.design})
     console = Console()
     if options.run_folder:
@@ -112,7 +117,7 @@ def simulate(case: Case, options: Evaluate, console: Console) -> types.Outcome:
                 case, key, verdict.MOST, keep=lambda o: reference.show(meter, o, verdict.MOST)
             )
     else:
-        with Busy(console, f"simulating {common.counted(trials, 'grasp')}"):
+        with Busy(console, f"compiling, then simulating {common.counted(trials, 'grasp')}"):
             outcomes = case.simulate(trials, key)
     names = [shape.name for shape in case.scene.objects.object]
     for k, name in enumerate(names[: outcomes.cost.size]):
@@ -154,6 +159,27 @@ def tell_verdict(
     judged = sentences.Judged(case.scene, outcomes, options.accuracy, stress=other)
     for line in [*sentences.warnings(judged), f"verdict: {judged}"]:
         console.print(line)
+    for what, command in _advice(judged, options):
+        console.print(f"to try {what}: {shlex.join(['codesign', *command])}")
+
+
+def _advice(judged: sentences.Judged, options: Evaluate) -> list[advice.Advice]:
+    """What to try where the design is not good, or its trials do not decide."""
+    verdict_now = judged.verdict
+    if verdict_now.word == verdict.OPEN:
+        trials = {"--trials": str(verdict_now.total + verdict_now.more)}
+        return [advice.Advice("more trials", advice.changed(sys.argv[1:], trials))]
+    if verdict_now.word == "good":
+        return []
+    if options.run_folder is None:
+        words = ["studio", "--design", *chain.from_iterable(options.design)]
+        for name in ("preset", "scene", "hand", "objects"):
+            if value := getattr(options, name):
+                words += [f"--{name}", value]
+        return [advice.Advice("designs around it, by the page's button Improve", words)]
+    settings = runs.read_run(options.run_folder)[1]
+    command = read_provenance(options.run_folder)["started"]["command"]
+    return advice.after_search(judged, settings, command, options.run_folder)
 
 
 def _untried(case: Case, options: Evaluate) -> list[str]:
@@ -179,13 +205,13 @@ def of_objects(case: Case, engine: Engine, options: Evaluate, console: Console) 
     params = case.space.params(jnp.asarray(case.design, jnp.float32))
     grasps = []
     if options.forces:
-        with Busy(console, "recording forces"):
+        with Busy(console, "compiling, then recording forces"):
             grasps = animation.replay(scene, recording(engine), params, trials)
         forces.tell(scene, grasps, console)
         forces.write(options.forces, scene, grasps)
         console.print(f"table: {options.forces}")
     if options.pull:
-        with Busy(console, "pulling"):
+        with Busy(console, "compiling, then pulling"):
             along = forces.direction(options.pull)
             pulls = forces.pull(scene, engine, params, trials, along)
         for shape, force in zip(np.asarray(trials.shape), pulls, strict=True):
@@ -193,7 +219,7 @@ def of_objects(case: Case, engine: Engine, options: Evaluate, console: Console) 
             console.print(f"{name:>12}: {forces.in_words(force)}")
     if options.render:
         if not grasps:
-            with Busy(console, "simulating what is drawn"):
+            with Busy(console, "compiling, then simulating what is drawn"):
                 grasps = animation.replay(scene, engine, params, trials)
         with Busy(console, "drawing"):
             animation.write(scene, grasps, options.render)

@@ -252,7 +252,7 @@ def _sheet(
     from codesign_jax.export import drawing  # imports Matplotlib
 
     kept = reference.Kept(None, None, [])
-    if options.run_folder:
+    if options.run_folder and not options.without:  # another hand than the run's was not judged
         kept = reference.kept(options.run_folder, *runs.read_run(options.run_folder))
     for note in kept.notes:
         common.warn(note)
@@ -274,6 +274,7 @@ def _sheet(
         )
     verdict = None if kept.fresh is None else str(kept.fresh)
     hand = sheet.Hand(case.scene, params, sizes, _process(options), printed)
-    sheet.write(folder, hand, sheet.Tests(verdict, kept.stress, hand_yield, doubts), origin, speeds)
+    tests = sheet.Tests(verdict, kept.stress, kept.worth, hand_yield, doubts)
+    sheet.write(folder, hand, tests, origin, speeds)
     title = f"Build sheet: {case.scene.hand.name}"
     return drawing.write(folder, title, case.scene, params, sizes, printed, _process(options))

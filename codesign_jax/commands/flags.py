@@ -39,6 +39,13 @@ Tolerances = Annotated[
     tuple[str, ...], tyro.conf.arg(metavar="[NAME=VALUE ...]", help_behavior_hint="")
 ]
 File = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
+WITHOUT = tyro.conf.arg(
+    metavar="FINGER ...",
+    help="Leave out fingers, counted from 0: the hand that has the others, counted anew "
+    "(docs/verdict.md).",
+    help_behavior_hint="",
+)
+Without = Annotated[tuple[int, ...], WITHOUT]
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
 
 
@@ -270,6 +277,7 @@ class Evaluate(Command, RunOrDesign):
     two standard deviations each (docs/uncertainty.md)."""
     hands: int = 64
     """With --tolerances: hands that are cast, with 24 grasps each or --trials."""
+    without: Without = ()
     forces: File = None
     """Write contact forces and depths of the first trial of each object, one row per time step
     (.csv, docs/files.md), and print the grip forces of the fingers."""
@@ -311,6 +319,7 @@ class Export(Command, RunOrDesign):
     """Grasps with noise to export as models, beside one without noise for each object."""
     seed: int = 0
     """Seed of the trials' noise."""
+    without: Without = ()
     no_parts: Flag = False
     """Leave out the fingers and their moulds."""
     end_wall: float = 0.0

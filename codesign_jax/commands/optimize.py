@@ -1,23 +1,26 @@
 """`codesign optimize`."""
 
+import contextlib
 import dataclasses
 import os
 import shlex
 import sys
 import traceback
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from codesign_jax import codesign, engines, files, optimize, preflight, runs
+from codesign_jax import codesign, engines, files, optimize, preflight, runs, terminal
 from codesign_jax.commands import common, compare, status
 from codesign_jax.commands.flags import Optimize
-from codesign_jax.judge import fresh_trials, sentences, stress, verdict
+from codesign_jax.judge import fresh_trials, sentences, stress, verdict, worth
 from codesign_jax.judge.sentences import Judged
+from codesign_jax.report import advice
 from codesign_jax.runs import Plan, RunResult, Settings, columns, reference
+from codesign_jax.runs.directory import RunDirectory
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene, schema
 from codesign_jax.scene.parameters import DesignSpace
@@ -40,6 +43,7 @@ def main(options: Optimize) -> int:
     plan = runs.prepare(scene, settings)
     plans = {folder: runs.variant(plan, run_settings) for folder, run_settings in every.items()}
     _refuse(options, scene, every)
+    terminal.wait("checking how hands of the design space begin")
     for note in preflight.notes(scene, plan.space, _ends(plan.space)):
         say(note)
     if options.dry_run:
@@ -63,9 +67,23 @@ def main(options: Optimize) -> int:
         if names:
             console.print(f"{names[folder]}:")
         later = (len(ended) - k - 1) * after
-        _tell(plans[folder], result, folder, (most, later), console)
+        with _resumable(ended):
+            _tell(plans[folder], result, folder, (most, later), console)
     compared = _compare(options) if names else 0
     return compared or int(bool(errors))
+
+
+@contextlib.contextmanager
+def _resumable(folders: Iterable[Path]) -> Iterator[None]:
+    """Says to the terminal and to the runs' logs that tests which are stopped go on later."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        words = "stopped in the tests behind the search; the same command resumes"
+        say(words, error=True)
+        for folder in folders:
+            RunDirectory(folder).log(words)
+        raise
 
 
 def _refuse(options: Optimize, scene: Scene, every: Mapping[Path, Settings]) -> None:
@@ -104,7 +122,7 @@ def _after(scene: Scene, most: int) -> float:
     if not most:
         return 0.0
     fresh = min(most, verdict.USUAL) * fresh_trials.steps_and_links(scene)
-    return fresh + reference.STRESS_TRIALS * stress.sets(scene)
+    return fresh + reference.STRESS_TRIALS * stress.sets(scene) + worth.grasps(scene.num_fingers)
 
 
 def _tell(
@@ -116,6 +134,12 @@ def _tell(
     most, later = work
     if result.test is None:
         pass
+    elif most and fresh_trials.hopeless(compare.of_test(plan.scene, result).outcomes):
+        console.print(
+            "reference test and other conditions left out: even the test that chose the design, "
+            "which flatters it, kept less than half of its grasps"
+        )
+        _judge(plan, result, None, folder, console)
     elif not most:
         _judge(plan, result, None, folder, console)
     else:
@@ -125,7 +149,12 @@ def _tell(
         outcomes = reference.test(folder, plan.settings, most, console, coming)
         case, other = reference.stress_run(folder, plan.settings, console, later)
         reference.tell_stress(case, other, console)
-        _judge(plan, result, fresh_trials.judged(plan.scene, outcomes, other), folder, console)
+        judged = fresh_trials.judged(plan.scene, outcomes, other)
+        if judged.verdict.word != "not good":
+            fingers = reference.worth_run(folder, plan.settings, console)
+            if fingers is not None:
+                reference.tell_worth(fingers, folder, console)
+        _judge(plan, result, judged, folder, console)
     _draw(result.record.history.cost, folder / "figures" / "cost_evolution.png", console)
     console.print(f"results: {folder}")
     console.print(f"to look at: {shlex.join(['codesign', 'report', str(folder)])}")
@@ -157,7 +186,9 @@ def _refuse_links(options: Optimize, folders: Iterable[Path]) -> None:
 
 
 def _ends(space: DesignSpace) -> dict[str, np.ndarray]:
+    thin = np.where([name.split("[")[0] == "wall" for name in space.names], space.low, space.high)
     ends = {"default": space.default(), "lower ends": space.low, "upper ends": space.high}
+    ends |= {"thinnest walls": thin}
     projected = jax.vmap(space.project)(np.array([*ends.values()], np.float32))
     names = [f"design of the space's {n}" for n in ends]
     return dict(zip(names, np.asarray(projected), strict=True))
@@ -187,6 +218,8 @@ def _dry_run(plan: Plan, count: int, options: Optimize) -> None:
         usual = f"until the verdict is decided, about {verdict.USUAL} for a good design"
         say(f"reference test: at most {most} grasps at accuracy {fresh_trials.ACCURACY}, {usual}")
         say(f"other conditions: {reference.STRESS_TRIALS * stress.sets(scene)} grasps")
+        if scene.num_fingers > 1:
+            say(f"worth of fingers: about {worth.grasps(scene.num_fingers)} grasps")
     say("time: `codesign check` measures it on this machine")
 
 
@@ -227,12 +260,11 @@ def _judge(
             f"{chosen}, by a test that flatters it: {verdict.tally(test.outcomes)}",
             f"its fresh grasps: {fresh.details}",
         ]
-    flags = ["--run", str(folder), "--accuracy", fresh_trials.ACCURACY]
-    again = shlex.join(["codesign", "evaluate", *flags])
     judged = test if fresh is None else fresh
-    last = [f"verdict: {judged}", f"more fresh trials: {again}"]
-    for line in [*lines, *sentences.warnings(judged), *last]:
+    for line in [*lines, *sentences.warnings(judged), f"verdict: {judged}"]:
         console.print(line)
+    for what, command in advice.after_search(judged, plan.settings, sys.argv, folder):
+        console.print(f"to try {what}: {shlex.join(['codesign', *command])}")
 
 
 def resolve(options: Optimize) -> tuple[Scene, Settings]:

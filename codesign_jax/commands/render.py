@@ -68,7 +68,7 @@ def _camera(words: Sequence[str]) -> "Camera":
 
 
 def draw(planned: grasp.PlannedGrasp, options: Render, camera: "Camera", console: Console) -> None:
-    with Busy(console, "simulating the grasp"):
+    with Busy(console, "compiling, then simulating the grasp"):
         shown = grasp.simulate(planned)
     from codesign_jax.report import animation
 

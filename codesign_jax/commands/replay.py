@@ -42,7 +42,7 @@ def main(options: Replay) -> int:
 
 
 def write_page(planned: grasp.PlannedGrasp, path: Path, console: Console) -> Path:
-    with Busy(console, "simulating the grasp"):
+    with Busy(console, "compiling, then simulating the grasp"):
         shown = grasp.simulate(planned)
     from codesign_jax.report import viewer
 

@@ -49,6 +49,7 @@ def main(options: Report) -> int:
         kept.fresh,
         tuple(notes),
         kept.stress,
+        kept.worth,
     )
     console = Console()
     shown = None if options.no_replay else best_grasp(scene, settings, record, name, console)
@@ -68,7 +69,7 @@ def best_grasp(
     planned = selection.find_grasp(scene, record)
     space = design_space(scene.hand, settings.preset)
     case = Case(scene, space, planned.design, engine, settings.policy)
-    with Busy(console, "simulating the best grasp again"):
+    with Busy(console, "compiling, then simulating the best grasp again"):
         return planned, grasp.simulate(
             grasp.PlannedGrasp(case, planned.trial, "", None), forces=True
         )

@@ -15,6 +15,8 @@ from codesign_jax.terminal import say
 
 INTERRUPTED = 128 + signal.SIGINT
 """Exit status of a command that Ctrl-C ended."""
+TERMINATED = 128 + signal.SIGTERM
+"""Exit status of a command that SIGTERM ended."""
 
 
 _REMEDIES = dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "make room")
@@ -32,18 +34,32 @@ def words(error: Exception) -> str:
     return text
 
 
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, as of a scheduler whose time is over: ends a command as Ctrl-C does."""
+
+
+_DEFAULTS = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+
+
 @contextlib.contextmanager
 def _interruptible() -> Iterator[None]:
-    """Has Ctrl-C raise KeyboardInterrupt also where Python's own handler would lose it."""
-    is_default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    is_default = is_default and threading.current_thread() is threading.main_thread()
-    if is_default:
-        signal.signal(signal.SIGINT, _interrupt)
+    """Has Ctrl-C raise KeyboardInterrupt also where Python's own handler would lose it.
+
+    SIGTERM raises `Terminated`.  A handler that somebody else has set stays.
+    """
+    numbers = [
+        number
+        for number, default in _DEFAULTS.items()
+        if threading.current_thread() is threading.main_thread()
+        and signal.getsignal(number) is default
+    ]
+    for number in numbers:
+        signal.signal(number, _interrupt)
     try:
         yield
     finally:
-        if is_default:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        for number in numbers:
+            signal.signal(number, _DEFAULTS[number])
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
@@ -57,7 +73,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
             threading.Timer(0.05, os.kill, (os.getpid(), number)).start()
             return
         frame = frame.f_back
-    raise KeyboardInterrupt
+    raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
 
 
 def of(run: Callable[[], int]) -> int:
@@ -92,10 +108,10 @@ def of(run: Callable[[], int]) -> int:
             raise
         say(f"error: {words(error)}", error=True)
         return 2 if error.errno == errno.ENAMETOOLONG else 1
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         # Commands with something to save have saved it, and said so, before this.
         say("stopped", error=True)
-        return INTERRUPTED
+        return TERMINATED if isinstance(stop, Terminated) else INTERRUPTED
 
 
 def _known(error: Exception) -> str | None:

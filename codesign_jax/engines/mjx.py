@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -13,8 +12,7 @@ import jax.numpy as jnp
 with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx
 
-from codesign_jax.engines.base import Bodies, Equal, refuse_forces, refuse_meshes
-from codesign_jax.engines.structured import bodies
+from codesign_jax.engines.base import Equal, refuse_meshes
 from codesign_jax.judge import verdict
 from codesign_jax.model import (
     ModelFields,
@@ -26,9 +24,10 @@ from codesign_jax.model import (
     softening_moments,
     split,
 )
+from codesign_jax.model.layout import centre_weights
 from codesign_jax.scene import Scene, effects
 from codesign_jax.scene.schema import InputError
-from codesign_jax.types import Forces, Trace
+from codesign_jax.types import Trace
 
 _STATIC = ("wrap_prm",)
 """Fields that MJX takes for constants: what a world has of its own is applied as a force."""
@@ -93,12 +92,6 @@ class MjxEngine(Equal):
             data = data.replace(qfrc_applied=data.qfrc_applied.at[bend].set(moments))
         return mjx.step(self.model(arrays), data.replace(ctrl=ctrl))
 
-    def observe(self, fields: ModelFields) -> Callable[[jax.Array], Bodies]:
-        return bodies.observer(self.scene, fields)
-
-    def contacts(self, fields: ModelFields, state: jax.Array, *, find: bool = True) -> Forces:
-        refuse_forces(self.name)
-
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
         """See `Engine.rollout`.
 
@@ -131,7 +124,7 @@ class MjxEngine(Equal):
         )
         new = self.step(arrays, fields, data, u)
         # Positions computed by a step belong to the state before it.
-        weights = jnp.asarray(lay.centre_weights, u.dtype)
+        weights = jnp.asarray(centre_weights(lay, fields.share), u.dtype)
         centre = weights @ new.xipos
         middle = new.xipos[lay.object]
         distance = jnp.linalg.norm(middle - centre)

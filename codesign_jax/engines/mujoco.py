@@ -1,7 +1,6 @@
 """MuJoCo C in float64, the oracle: `mujoco.batch` on all cores, called from jitted programs."""
 
 import threading
-from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -10,8 +9,7 @@ import mujoco
 import mujoco.batch
 import numpy as np
 
-from codesign_jax.engines.base import Bodies, Equal, refuse_forces, refuse_meshes
-from codesign_jax.engines.structured import bodies
+from codesign_jax.engines.base import Equal, refuse_meshes
 from codesign_jax.judge import verdict
 from codesign_jax.model import (
     ModelFields,
@@ -21,8 +19,9 @@ from codesign_jax.model import (
     softening_moments,
     split,
 )
+from codesign_jax.model.layout import centre_weights
 from codesign_jax.scene import Scene, effects
-from codesign_jax.types import Forces, Status, Trace
+from codesign_jax.types import Status, Trace
 
 # Steps between looking at the worlds: a lost object or a failed world stops being simulated at this
 # grain.
@@ -51,12 +50,6 @@ class MujocoEngine(Equal):
 
     def _key(self) -> tuple:
         return self.scene.structure, self.num_threads
-
-    def observe(self, fields: ModelFields) -> Callable[[jax.Array], Bodies]:
-        return bodies.observer(self.scene, fields)
-
-    def contacts(self, fields: ModelFields, state: jax.Array, *, find: bool = True) -> Forces:
-        refuse_forces(self.name)
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
         """See `Engine.rollout`."""
@@ -118,6 +111,7 @@ class MujocoEngine(Equal):
         batch = self._batch(worlds)
         write_fields(scene, batch, fields)
         rollout = _ChunkedRollout(scene, fields, bounds, steps, to_end=trajectory)
+        weights = centre_weights(layout(scene), fields.share)
         batch.bind("qacc_warmstart")[:] = rollout.start.acc
         chunk = 1 if scene.effects.neo_hookean else _CHUNK  # its moments change with every step
         for first in range(0, steps, chunk):
@@ -125,7 +119,8 @@ class MujocoEngine(Equal):
             going = rollout.going
             if scene.effects.neo_hookean:
                 _apply_softening(scene, batch, fields, going)
-            new, taken, states = self.advance(batch, going, ctrl[going, part], trajectory)
+            middle = weights[going]
+            new, taken, states = self.advance(batch, going, ctrl[going, part], middle, trajectory)
             stopped = rollout.store(part, new, taken, batch.warning[going, :, 0])
             rollout.decide(part, new, states, stopped)
             if not rollout.going.size:
@@ -134,9 +129,14 @@ class MujocoEngine(Equal):
         return rollout.trace(*(batch.bind(name)[rollout.going] for name in names))
 
     def advance(
-        self, batch: mujoco.batch.Batch, ids: np.ndarray, ctrl: np.ndarray, trajectory: bool
+        self,
+        batch: mujoco.batch.Batch,
+        ids: np.ndarray,
+        ctrl: np.ndarray,
+        weights: np.ndarray,
+        trajectory: bool,
     ) -> tuple[Trace, np.ndarray, np.ndarray]:
-        """Steps the given worlds through a chunk.
+        """Steps the given worlds, with their bodies' weights in the hand's centre, through a chunk.
 
         Returns the chunk's trace, whose entry k describes the state before step k; the steps taken
         by each world, fewer than asked for where MuJoCo stopped; and qpos and qvel of those states.
@@ -148,7 +148,7 @@ class MujocoEngine(Equal):
         taken = 1 + np.count_nonzero(np.diff(record[_TIME][..., 0], axis=1), axis=1)
         taken[raised] = 0
         xipos = record["xipos"]
-        centre = np.tensordot(xipos, lay.centre_weights, axes=(2, 0))
+        centre = np.einsum("wtbx,wb->wtx", xipos, weights)
         middle = xipos[:, :, lay.object]
         # Records of state follow the step, derived fields precede it: shift the former by one.
         qvel = np.concatenate([before[0], record["qvel"][:, :-1]], 1)

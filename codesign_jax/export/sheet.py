@@ -14,6 +14,7 @@ from codesign_jax.export import arm, pose, quantities, valves
 from codesign_jax.export.process import FABRIC, Printed, Process, Size, inlet
 from codesign_jax.judge import stress
 from codesign_jax.judge.stress import Stress
+from codesign_jax.judge.worth import Worth
 from codesign_jax.model import morphology
 from codesign_jax.model.layout import mounts
 from codesign_jax.scene import Scene
@@ -32,6 +33,7 @@ class Tests(NamedTuple):
 
     verdict: str | None = None
     stress: Stress | None = None
+    worth: Worth | None = None
     cast: Yield | None = None
     warnings: Sequence[str] = ()
 
@@ -117,6 +119,7 @@ def _tested(hand: Hand, tests: Tests) -> dict[str, Any]:
     return {
         "verdict": tests.verdict,
         "stress": tests.stress,
+        "worth": tests.worth,
         "cast": tests.cast,
         "warnings": [*warnings, *tests.warnings],
     }

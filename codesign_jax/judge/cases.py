@@ -1,5 +1,6 @@
 """A design with what simulates it, and where its commands leave the key frames."""
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -14,8 +15,10 @@ from codesign_jax.interrupts import interruptible
 from codesign_jax.model import morphology
 from codesign_jax.policy import ControlLoop
 from codesign_jax.reuse import SceneProgram, shared
-from codesign_jax.scene import Scene, scene_files
-from codesign_jax.scene.parameters import DesignSpace
+from codesign_jax.scene import Scene, key_frames, scene_files
+from codesign_jax.scene.hand import lacking
+from codesign_jax.scene.parameters import DesignSpace, design_space
+from codesign_jax.scene.schema import InputError, range_problem
 from codesign_jax.types import Outcome
 
 
@@ -69,6 +72,32 @@ class Case(NamedTuple):
         if not self.policy:
             return engine
         return ControlLoop(engine, user_code.make_policy(self.policy, scene)[0])
+
+    def without(self, fingers: tuple[int, ...]) -> "Case":
+        """The design with fewer fingers: another hand, whose fingers are counted anew.
+
+        Raises:
+          InputError: If the hand has not these fingers, or no other ones, or it has a policy.
+        """
+        count = self.scene.num_fingers
+        problems = [
+            range_problem("--without", f, "", 0, count - 1)
+            for f in fingers
+            if f not in range(count)
+        ]
+        if len({*fingers}) == count:
+            problems.append("--without names all fingers of the hand")
+        if self.policy:
+            problems.append("--without: a policy commands all fingers of its hand; leave it out")
+        if problems:
+            raise InputError(problems)
+        leaving = tuple(sorted({*fingers}))
+        hand = lacking(self.scene.hand, self.space.table(self.design), leaving)
+        scene = dataclasses.replace(
+            self.scene, hand=hand, control=key_frames.lacking(self.scene.control, leaving)
+        )
+        space = design_space(hand, "full")
+        return self._replace(scene=scene, space=space, design=space.default())
 
     def simulate(self, trials: int, key: jax.Array, first: int = 0) -> Outcome:
         """Outcomes in trials that depend on objects and key alone, arrays of shape (trial,).

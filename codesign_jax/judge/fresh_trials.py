@@ -13,12 +13,24 @@ from codesign_jax.judge.cases import Case
 from codesign_jax.judge.sentences import Judged
 from codesign_jax.judge.stress import Stress
 from codesign_jax.scene import Scene, with_accuracy
+from codesign_jax.statistics import wilson
 from codesign_jax.types import Outcome
 
 ACCURACY = "reference"
 """Accuracy of fresh trials; docs/results.md has how much the finer steps change."""
+HALF = 0.5
+"""Share of kept grasps below which a design is not tested further [chosen]."""
 STREAM = 0x72656665
 """Stream of the trials' noise ("refe")."""
+
+
+def hopeless(outcomes: Outcome) -> bool:
+    """Whether the trials that chose a design, which flatter it, say that it keeps less than half.
+
+    Finer steps and other conditions cannot make it good: neither is worth its time.
+    """
+    counts = verdict.tally(outcomes)
+    return wilson(counts.kept, counts.total).high < HALF
 
 
 def decide(

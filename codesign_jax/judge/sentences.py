@@ -13,7 +13,7 @@ import numpy as np
 from codesign_jax import cost
 from codesign_jax.judge import verdict
 from codesign_jax.judge.stress import Stress
-from codesign_jax.judge.verdict import Verdict, judge, tally
+from codesign_jax.judge.verdict import Verdict, judge, losses, tally
 from codesign_jax.scene import Scene
 from codesign_jax.types import Forces, Outcome, failed
 
@@ -61,6 +61,13 @@ class Judged(NamedTuple):
         return "; ".join([sentence, *([self.limits] if self.limits else [])])
 
     @property
+    def headline(self) -> str:
+        """The verdict with the accuracy of its trials, for the head of a page."""
+        size = self.scene.discretization
+        named = f"accuracy {self.accuracy}" if self.accuracy else "the run's accuracy"
+        return f"{self} [{named}, steps of {1e3 * size.timestep:g} ms]"
+
+    @property
     def limits(self) -> str:
         """Under what other conditions the design is not good; empty where nobody asks."""
         if self.stress is not None:
@@ -87,11 +94,12 @@ def _span(values: Iterable[float]) -> str:
 
 
 def of_trials(scene: Scene, outcomes: Outcome) -> str:
-    """Numbers of trials by outcome, their mean cost, and warnings."""
+    """Numbers of trials by outcome and cause of loss, their mean cost, and warnings."""
     warnings = verdict.warning_counts(outcomes.status)
     counts = tally(outcomes)
     causes = f" ({verdict.failure_counts(outcomes.status)})" if counts.fault else ""
-    text = f"{counts}{causes}; {mean_cost(scene, outcomes)}"
+    ends = counts.text(losses(scene, outcomes))
+    text = f"{ends}{causes}; {mean_cost(scene, outcomes)}"
     return text + (f"; warnings: {warnings}" if warnings else "")
 
 

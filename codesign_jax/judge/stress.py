@@ -144,19 +144,31 @@ def sets(scene: Scene) -> int:
     return 2 + len([*variants(scene)])
 
 
-def variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
-    """Scenes with other numbers, and the names of these conditions; draws have one name."""
+def heavier(scene: Scene) -> list[tuple[str, Scene]]:
+    """Scenes with objects of four and of ten times the mass, as far as they are heavier."""
     masses = [shape.mass for shape in scene.objects.object]
     sets = [tuple(max(min(n * m, HEAVIEST), m) for m in masses) for n in (4, 10)]
-    for heavier in dict.fromkeys(sets):
-        if heavier != (*masses,):
-            grams = dict.fromkeys(f"{1e3 * m:.0f}" for m in (min(heavier), max(heavier)))
+    scenes = []
+    for larger in dict.fromkeys(sets):
+        if larger != (*masses,):
+            grams = dict.fromkeys(f"{1e3 * m:.0f}" for m in (min(larger), max(larger)))
             path = ("objects", "object", "mass")
-            each = iter(heavier)
+            each = iter(larger)
             heavier_scene = draws.changed(scene, path, lambda _, each=each: next(each))
-            yield f"objects of {' to '.join(grams)} g", heavier_scene
-    slippery = draws.changed(scene, ("objects", "object", "friction"), lambda _: FRICTION)
-    yield f"friction {FRICTION} on the hand", slippery
+            scenes.append((f"objects of {' to '.join(grams)} g", heavier_scene))
+    return scenes
+
+
+def slippery(scene: Scene) -> tuple[str, Scene]:
+    """The scene with objects on which the hand slips."""
+    changed = draws.changed(scene, ("objects", "object", "friction"), lambda _: FRICTION)
+    return f"friction {FRICTION} on the hand", changed
+
+
+def variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
+    """Scenes with other numbers, and the names of these conditions; draws have one name."""
+    yield from heavier(scene)
+    yield slippery(scene)
     table = unknown(scene)
     if not table.constant:
         return

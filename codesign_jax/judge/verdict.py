@@ -26,7 +26,7 @@ import numpy as np
 
 from codesign_jax.scene import Scene
 from codesign_jax.statistics import Interval, wilson
-from codesign_jax.types import WARNINGS, Outcome, Status, Trace, failed
+from codesign_jax.types import HARMLESS, WARNINGS, Outcome, Status, Trace, failed
 
 FAR = 3e38
 """Larger than any distance, and still a number in float32."""
@@ -163,7 +163,12 @@ class Tally(NamedTuple):
 
     def __str__(self) -> str:
         """In words, such as "kept 20 of 24, 3 lost, 1 not released"."""
-        words = f"kept {self.kept} of {self.total}, {self.lost} lost"
+        return self.text()
+
+    def text(self, losses: "Losses | None" = None) -> str:
+        """In words, with the causes of losses if they are given."""
+        causes = f" ({losses})" if losses and self.lost else ""
+        words = f"kept {self.kept} of {self.total}, {self.lost} lost{causes}"
         words += f", {self.not_released} not released"
         return words + (f", {self.fault} fault" + "s" * (self.fault > 1) if self.fault else "")
 
@@ -173,6 +178,32 @@ def tally(outcomes: Outcome) -> Tally:
     return Tally(*np.bincount(verdicts(outcomes).ravel(), minlength=len(VERDICTS)).tolist())
 
 
+class Losses(NamedTuple):
+    """Numbers of lost trials by what the hand had done by then; they add up to `Tally.lost`."""
+
+    unmoved: int  # the object is where it was put, see `Status.UNMOVED`
+    lift: int  # it slipped as the arm lifted it, or was left behind
+    shaking: int  # it was thrown as the arm shook it
+
+    def __str__(self) -> str:
+        """In words, without what did not happen; such as "2 never moved, 1 slipped in the lift"."""
+        words = "never moved", "slipped in the lift", "thrown in the shaking"
+        return ", ".join(f"{n} {text}" for n, text in zip(self, words, strict=True) if n)
+
+
+def losses(scene: Scene, outcomes: Outcome) -> Losses:
+    """Counts the lost ones among trials by their cause.
+
+    Args:
+      scene: The scene that was simulated, for the times of its phases.
+      outcomes: Outcomes, arrays of any shape.
+    """
+    lost = verdicts(outcomes) == VERDICTS.index("lost")
+    unmoved = lost & ((np.asarray(outcomes.status) & Status.UNMOVED) != 0)
+    lifted = lost & ~unmoved & (np.asarray(outcomes.lost_time) < scene.phase_ends["lift"])
+    return Losses(*(int(v.sum()) for v in (unmoved, lifted, lost & ~unmoved & ~lifted)))
+
+
 def status_names(status: int) -> str:
     """Names of the status bits that are set, joined by "+", or "OK"."""
     return "+".join(bit.name or "" for bit in Status(int(status))) or "OK"
@@ -180,7 +211,7 @@ def status_names(status: int) -> str:
 
 def failure_counts(status: jax.typing.ArrayLike) -> str:
     """How often each cause of failure occurs, e.g. "SPEED 1, STUCK 3"; empty if none does."""
-    return _counts(status, [bit for bit in Status if bit not in WARNINGS])
+    return _counts(status, [bit for bit in Status if bit not in HARMLESS])
 
 
 def warning_counts(status: jax.typing.ArrayLike) -> str:

@@ -19,6 +19,13 @@ from codesign_jax.scene import Scene, key_frames
 from codesign_jax.scene.constants import with_trial
 from codesign_jax.types import Params, Trial
 
+ABSENT = 1e-6
+"""Length [m] with which a finger of length 0 is computed: it weighs less than a milligram."""
+AWAY = (0.0, 0.0, 0.25)
+"""Where it stands in the palm's frame [m]: above the palm, where no other finger reaches."""
+UPWARDS = (0.5**0.5, 0.0, -(0.5**0.5), 0.0)
+"""Its orientation: it points away from the palm."""
+
 
 class ModelFields(NamedTuple):
     """The hand and the object of a world as numbers, and the state in which it starts.
@@ -48,6 +55,8 @@ class ModelFields(NamedTuple):
       object_inertia: Its principal inertia [kg m^2], shape (3,).
       object_size: Sizes of all shapes of the object set [m], shape (shape, 3).
       shape: Index of the trial's object in the object set, int32 of shape ().
+      share: Share of each finger in the hand's centre, times their number, shape (finger,): 1, but
+        for a hand with a finger of length 0, which is absent.
       start: Initial qpos in MuJoCo's order, shape (nq,), or the state in which another rollout
         ended, `Trace.last`, see `RolloutState`.
       constants: The scene's numbers with the trial's factors. Engines read from them everything
@@ -74,6 +83,7 @@ class ModelFields(NamedTuple):
     object_inertia: jax.Array
     object_size: jax.Array
     shape: jax.Array
+    share: jax.Array
     start: jax.Array
     constants: Scene
     section: jax.Array | None = None
@@ -128,6 +138,10 @@ def finger_springs(scene: Scene, params: Params) -> tuple[jax.Array, jax.Array]:
 def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
     """Returns the numbers of one world; pure, vmap it for batches.
 
+    A finger of length 0 is absent, so that a hand with fewer fingers is data of the same program:
+    it is computed as one of a micrometre, which has no weight to speak of, stands where nothing
+    reaches it, and does not count in the hand's centre.
+
     Args:
       scene: The scene; its numbers may be traced.
       params: Parameters of the hand; all physics in the float type of these.
@@ -135,12 +149,17 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
     """
     lay = layout(scene)
     dtype = params.length.dtype
+    present = params.length > 0
+    params = params._replace(length=jnp.where(present, params.length, ABSENT))
     scene = _in_type(with_trial(scene, trial), dtype)
     beam = morphology.finger_beams(scene.hand, params, lay.links)
     links = morphology.segments(scene.hand, params, lay.links)
     bodies = links.mass.shape
     centre = [jnp.broadcast_to(v, bodies) for v in (links.along, links.up)]
-    base, mount = mounts(scene.hand, params.spread)
+    base, mount = (
+        jnp.where(present[:, None], here, jnp.asarray(there, dtype))
+        for here, there in zip(mounts(scene.hand, params.spread), (AWAY, UPWARDS), strict=True)
+    )
     stiffness, own_damping = finger_springs(scene, params)
     damping, armature = implicit_spring(scene, stiffness, own_damping)
     size, object_mass, object_inertia = object_size(scene.objects, trial)
@@ -164,6 +183,7 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
         object_inertia=object_inertia,
         object_size=size,
         shape=jnp.asarray(trial.shape, jnp.int32),
+        share=present * (len(lay.bodies) / jnp.maximum(present.sum(), 1)),
         start=_start(scene, params, trial),
         constants=scene.bare,
         section=_section(scene, params),

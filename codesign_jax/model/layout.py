@@ -62,6 +62,18 @@ class Layout(NamedTuple):
         return np.argsort(self.dofs, axis=None).astype(np.int32)
 
 
+def centre_weights(lay: Layout, share: Any) -> Any:
+    """Weight of each body in the hand's centre, shape (..., nbody), for `ModelFields.share`.
+
+    Args:
+      share: Arrays of JAX or NumPy, shape (..., finger).
+    """
+    finger = np.zeros(len(lay.centre_weights), int)
+    finger[lay.stubs] = np.arange(len(lay.stubs))
+    finger[lay.bodies] = np.arange(len(lay.stubs))[:, None]
+    return share[..., finger] * lay.centre_weights
+
+
 def joint_axes(scene: Scene) -> tuple[str, ...]:
     """Names of the finger joints' axes that the scene's effects call for, as `AXES` has them."""
     on = {"bend": True, "lateral": scene.effects.lateral_bending, "twist": scene.effects.twist}
@@ -247,18 +259,6 @@ def first_on_palm(links: int) -> int:
     Link 0 is the half one at its base.
     """
     return math.ceil(PALM_FROM * links)
-
-
-RING_TIP = 0.25
-"""Length of the last link's segment, which ends in the tip's ring, in links."""
-
-
-def ring_places(links: int, k: int) -> np.ndarray:
-    """Places of the rings from their links' joints, in links, shape (link, k)."""
-    places = np.tile((np.arange(k) + 0.5) / k, (links, 1))
-    places[-1] *= 0.5
-    places[-1, -1] = RING_TIP
-    return places
 
 
 def beyond_base(along: Any, height: Any) -> Any:

@@ -6,7 +6,7 @@ import numpy as np
 from codesign_jax.judge import sentences, stress, verdict
 from codesign_jax.judge.sentences import Judged
 from codesign_jax.model import morphology
-from codesign_jax.report import markup
+from codesign_jax.report import advice, markup
 from codesign_jax.report.of_run import Run
 from codesign_jax.runs import tables
 from codesign_jax.statistics import wilson
@@ -29,10 +29,18 @@ def design(run: Run) -> str:
         *(markup.paragraph(words, "note") for words in sentences.solver(judged.outcomes)),
         markup.paragraph(note + "More fresh trials: ", "note", again),
         _by_object(run, judged),
+        *_advice(run),
         *_builder(run),
+        *_fingers(run),
         _parameters(run),
     ]
     return markup.section("Chosen design", *parts)
+
+
+def _advice(run: Run) -> list[str]:
+    command = run.provenance["started"]["command"]
+    tips = advice.after_search(run.judged, run.settings, command, run.folder)
+    return [markup.paragraph(f"To try {tip.what}: ", "note", tip.command) for tip in tips]
 
 
 def _builder(run: Run) -> list[str]:
@@ -43,6 +51,24 @@ def _builder(run: Run) -> list[str]:
         words = f"Under other conditions, {result.trials} grasps each at the run's accuracy:"
         parts = [markup.paragraph(words), markup.table(result.head, result.rows, (1, 2))]
     return [*parts, *(markup.paragraph(f"Warning: {words}.", "warning") for words in warnings)]
+
+
+def _fingers(run: Run) -> list[str]:
+    """What each finger is worth, and the command that judges the hand that lacks some."""
+    if (result := run.worth) is None:
+        return []
+    words = (
+        "What each finger is worth: kept grasps of the hand without it, and of the whole hand in "
+        "the same trials."
+    )
+    parts = [markup.paragraph(words), markup.table(result.head, result.rows)]
+    command = []
+    if result.least:
+        command = ["evaluate", "--run", str(run.folder), "--accuracy", "reference", "--stress"]
+        command += ["--without", *map(str, result.least)]
+    text = result.sentence[:1].upper() + result.sentence[1:]
+    text += ". To judge that hand: " if command else "."
+    return [*parts, markup.paragraph(text, "note", command)]
 
 
 def _by_object(run: Run, judged: Judged) -> str:
@@ -60,9 +86,12 @@ def _by_object(run: Run, judged: Judged) -> str:
             counts = verdict.tally(mine)
             share = wilson(counts.kept, counts.total)
             span = f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
-            rows.append((name, f"{counts.kept} of {counts.total}", span, *counts[1:]))
-    head = ("object", "kept", "95 % interval of all", "lost", "not released", "faults")
-    return markup.table(head, rows, (1, 2, 3, 4, 5))
+            causes = verdict.losses(judged.scene, mine)
+            kept = f"{counts.kept} of {counts.total}"
+            rows.append((name, kept, span, *causes, counts.not_released, counts.fault))
+    head = ("object", "kept", "95 % interval of all", "lost: never moved", "slipped in the lift")
+    head += ("thrown in the shaking", "not released", "faults")
+    return markup.table(head, rows, (*range(1, len(head)),))
 
 
 def _parameters(run: Run) -> str:

@@ -20,7 +20,7 @@ from codesign_jax.report.markup import text
 from codesign_jax.runs.record import History
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
-from codesign_jax.types import WARNINGS, Forces, Status
+from codesign_jax.types import HARMLESS, Forces, Status
 
 _BLUE = "tab:blue"
 _ORANGE = "tab:orange"
@@ -224,7 +224,7 @@ def failures(status: np.ndarray) -> matplotlib.figure.Figure:
     axes = figure.add_subplot()
     episode = np.arange(1, len(status) + 1)
     below = np.zeros(len(status))
-    for bit in (b for b in Status if b and b not in WARNINGS):
+    for bit in (b for b in Status if b and b not in HARMLESS):
         count = ((status & bit) != 0).sum((1, 2))
         if count.any():
             axes.bar(episode, count, bottom=below, label=bit.name)

@@ -7,6 +7,7 @@ import jax
 
 from codesign_jax.judge.sentences import Judged
 from codesign_jax.judge.stress import Stress
+from codesign_jax.judge.worth import Worth
 from codesign_jax.runs import Settings
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.selection import Chosen
@@ -27,12 +28,12 @@ class Run(NamedTuple):
     reference: Judged | None = None
     notes: tuple[str, ...] = ()  # what is amiss with the run, in sentences
     stress: Stress | None = None  # the design's grasps under other conditions; None without them
+    worth: Worth | None = None  # its grasps without some of its fingers; None without them
 
     @property
     def judged(self) -> Judged:
         """The trials that judge the design: the fresh ones, or else those that chose it."""
-        grasps = "grasps of " + ("its final test" if self.chosen.tested else "its last episode")
-        return self.reference or Judged(self.scene, self.chosen.outcomes, None, grasps, self.stress)
+        return self.reference or self.chosen.judged(self.scene, self.stress)
 
     @property
     def space(self) -> DesignSpace:

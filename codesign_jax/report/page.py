@@ -16,7 +16,7 @@ from codesign_jax.report.replay import Replay
 from codesign_jax.runs import SCENE_COST
 from codesign_jax.runs.selection import Grasp
 from codesign_jax.scene.scene_files import NAMES
-from codesign_jax.types import MEANINGS, WARNINGS
+from codesign_jax.types import HARMLESS, MEANINGS
 
 
 def write(run: Run, grasp: tuple[Grasp, Replay] | None, path: Path) -> Path:
@@ -39,6 +39,7 @@ def write(run: Run, grasp: tuple[Grasp, Replay] | None, path: Path) -> Path:
     title = f"Co-design run {run.folder.resolve().name}"
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="minutes")
     head = f"<h1>{markup.text(title)}</h1>\n<p class='note'>codesign-jax, report of {now}</p>\n"
+    head += markup.paragraph(f"Verdict: {run.judged.headline}", "key")
     files.make_folder_of(path)
     with files.atomically(path) as part:
         body = head + "\n".join(sections)
@@ -176,7 +177,7 @@ def _failures(run: Run) -> str:
         else "count with the maximum"
     )
     note = f"{failed:,} of {total:,} trials failed ({100 * failed / total:.2f} %); they {rule}."
-    bits = [bit for bit in MEANINGS if bit not in WARNINGS]
+    bits = [bit for bit in MEANINGS if bit not in HARMLESS]
     counts = {bit: int(((status & bit) != 0).sum()) for bit in bits}
     if warned := verdict.warning_counts(status):
         note += f" Warnings, which fail no trial: {warned}."

@@ -16,6 +16,11 @@ class CsvTable(NamedTuple):
 
 
 _OUTCOME = "cost", "lost_time_s", "status", "first_bad_step", "steps_at_limit", "residual"
+ENDS = (
+    *("kept_trials", "unmoved_trials", "slipped_trials", "thrown_trials"),
+    *("not_released_trials", "fault_trials"),
+)
+"""Numbers of trials by how they ended: kept, the three causes of a loss, and the failed ones."""
 TABLES = {
     "episodes.csv": CsvTable(
         ("episode", "mean_cost", "best_cost", "failed_trials", "effective_sample_size"), "best_"
@@ -25,7 +30,7 @@ TABLES = {
     ),
     "trials.csv": CsvTable(("episode", "particle", "trial", "object", *_OUTCOME)),
     "tests.csv": CsvTable(
-        ("particle", "test_cost", "trials", "failed_trials", "paper_success"), ""
+        ("particle", "test_cost", "trials", "failed_trials", "paper_success", *ENDS), ""
     ),
 }
 
@@ -84,6 +89,6 @@ MORE = {
 FILES = {
     *("scene.toml", "hand.toml", "objects.toml", "control.toml", "meshes", "code", "checkpoints"),
     *("provenance.json", "events.log", "failures", "figures", "landscape.npz", LANDSCAPE),
-    *("reference.npz", REFERENCE, "stress.npz", "replay.html", "report.html"),
+    *("reference.npz", REFERENCE, "stress.npz", "fingers.npz", "replay.html", "report.html"),
 }
 """Names at the top of a run folder, beside those of `TABLES`."""

@@ -7,6 +7,7 @@ much that changes), until its verdict is decided, and at the run's accuracy unde
 (`stress`).
 """
 
+import shlex
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,10 +17,12 @@ import numpy as np
 
 from codesign_jax import array_files, codesign, engines, rollout
 from codesign_jax.array_files import Array
-from codesign_jax.judge import fresh_trials, stress, verdict
+from codesign_jax.interrupts import interruptible
+from codesign_jax.judge import fresh_trials, stress, verdict, worth
 from codesign_jax.judge.cases import Case
 from codesign_jax.judge.sentences import Judged
 from codesign_jax.judge.stress import Stress
+from codesign_jax.judge.worth import Worth
 from codesign_jax.runs import Settings, columns, tables
 from codesign_jax.runs.progress import Meter
 from codesign_jax.runs.record import outcome_layout
@@ -30,8 +33,14 @@ from codesign_jax.types import Outcome
 
 FILE = "reference.npz"
 STRESS_FILE = "stress.npz"
+FINGERS_FILE = "fingers.npz"
 STRESS_TRIALS = 12
 """Grasps of each condition."""
+_FINGERS = {
+    "conditions": Array("U", ("condition",)),
+    "absent": Array("b", ("hand", "finger")),
+    **dict.fromkeys(("both", "whole", "fewer", "total"), Array("iu", ("hand", "condition"))),
+}
 _STRESS = {
     "conditions": Array("U", ("set",)),
     "kept": Array("iu", ("set",)),
@@ -154,12 +163,71 @@ def _stress(folder: Path, about: str, *, any_code: bool = False) -> tuple[Stress
     return result, why
 
 
+def worth_run(folder: Path, settings: Settings, console: Console) -> Worth | None:
+    """What each finger of the run's design is worth, simulated if not yet.
+
+    None where there is nothing to leave out, or the design has a policy.
+    """
+    case, about = _stress_case(folder, settings)
+    if case.policy or case.scene.num_fingers < 2 or settings.engine != engines.DEFAULT:
+        return None
+    result, why = _worth(folder, about)
+    if why:
+        console.print(f"{folder / FINGERS_FILE} {why}: simulated again")
+    if result is None:
+        with Meter("fingers", worth.grasps(case.scene.num_fingers), console) as meter:
+            noise = _noise(settings, worth.STREAM)
+            params = case.space.params(jnp.asarray(case.design, jnp.float32))
+            results: list[Worth] = []
+
+            def simulate() -> None:
+                engine = case.make_engine()
+                results.append(worth.simulate(case.scene, engine, params, noise, meter.advance))
+
+            interruptible(simulate)
+            [result] = results
+        array_files.save_results(folder / FINGERS_FILE, about, result._asdict())
+    return result
+
+
+def tell_worth(result: Worth, folder: Path, console: Console) -> None:
+    """Prints what each finger is worth, and how to judge the hand that lacks some."""
+    console.print("without a finger, in the trials of the whole hand:")
+    for line in [*result.lines(), result.sentence]:
+        console.print(line)
+    if result.least:
+        words = ["codesign", "evaluate", "--run", str(folder), "--stress"]
+        words += ["--accuracy", fresh_trials.ACCURACY, "--without", *map(str, result.least)]
+        console.print(f"to judge that hand: {shlex.join(words)}")
+
+
+def stored_worth(folder: Path, settings: Settings) -> tuple[Worth | None, str]:
+    """What `worth_run` kept of the run's design, or None; and what is amiss, as of `stored`."""
+    return _worth(folder, _stress_case(folder, settings)[1], any_code=True)
+
+
+def _worth(folder: Path, about: str, *, any_code: bool = False) -> tuple[Worth | None, str]:
+    path = folder / FINGERS_FILE
+    arrays, why = array_files.load_results(path, about, _FINGERS, any_code=any_code)
+    if arrays is None:
+        return None, why
+    names = tuple(map(str, arrays.pop("conditions").tolist()))
+    absent = arrays.pop("absent")
+    counts = {name: value.astype(int) for name, value in arrays.items()}
+    result = Worth(names, absent, **counts)
+    parts = np.array([result.both, result.whole, result.fewer])
+    if (parts < 0).any() or (parts.sum(0) > result.total).any() or (result.total < 1).any():
+        return None, _NO_RESULT
+    return result, why
+
+
 class Kept(NamedTuple):
     """What is kept of a run's design from the grasps after its search."""
 
     fresh: Judged | None
     stress: Stress | None
     notes: list[str]  # what is left out or of another version of the code, and why
+    worth: Worth | None = None
 
 
 def kept(folder: Path, scene: Scene, settings: Settings) -> Kept:
@@ -177,8 +245,12 @@ def kept(folder: Path, scene: Scene, settings: Settings) -> Kept:
             notes.append(f"{text}. {again}")
         elif reason:
             notes.append(f"{folder / name} {reason}. {again}")
+    fingers, cause = stored_worth(folder, settings)
+    if cause:
+        words = f"{folder / FINGERS_FILE} {cause}"
+        notes.append(f"{words}{': it is left out' if fingers is None else ''}. {again}")
     trials = None if outcome is None else fresh_trials.judged(scene, outcome, conditions)
-    return Kept(trials, conditions, notes)
+    return Kept(trials, conditions, notes, fingers)
 
 
 def _stress_case(folder: Path, settings: Settings) -> tuple[Case, str]:

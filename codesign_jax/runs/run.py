@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from codesign_jax import codesign, types
+from codesign_jax import codesign, preflight, types
 from codesign_jax.codesign import EpisodeInfo, FinalTest
 from codesign_jax.compiler.ffi import KernelUnavailable
 from codesign_jax.judge import verdict
@@ -61,6 +61,7 @@ class Run:
         self._store = store
         self._voice = voice
         self._unsaved: EpisodeInfo | None = None
+        self._explained = False  # whether it was said why worlds cannot start
 
     @property
     def state(self) -> OptimizerState:
@@ -197,6 +198,13 @@ class Run:
         if types.failed(info.outcomes.status).any():
             for path in failures.save(self._directory.here(), self.done, info):
                 self.log(f"failed world: codesign replay {path}")
+        started_inside = (np.asarray(info.outcomes.status) & Status.INVALID_START) != 0
+        if started_inside.any() and not self._explained:
+            self._explained = True
+            first = int(started_inside.any(-1).argmax())
+            params = self.plan.space.params(info.population[first])
+            for text in preflight.low_starts(self.plan.scene, params):
+                self.say(f"warning: {text}")
 
     def _report(self) -> None:
         assert self.record is not None

@@ -10,6 +10,8 @@ import numpy as np
 from codesign_jax.codesign import episode_trials
 from codesign_jax.cost import particle_cost
 from codesign_jax.judge.cases import Case
+from codesign_jax.judge.sentences import Judged
+from codesign_jax.judge.stress import Stress
 from codesign_jax.judge.verdict import failure_counts
 from codesign_jax.runs.reading import Tell, load_record, read_run
 from codesign_jax.runs.record import Record
@@ -39,6 +41,11 @@ class Chosen(NamedTuple):
     tested: bool  # whether they are those of the final test, or its episode's
     row: int  # its index in its episode's population
     episode: int  # index of an episode that simulated it: the last, where that did
+
+    def judged(self, scene: Scene, stress: Stress | None) -> Judged:
+        """The trials that chose the design, where there are no fresh ones to judge it by."""
+        grasps = "grasps of " + ("its final test" if self.tested else "its last episode")
+        return Judged(scene, self.outcomes, None, grasps, stress)
 
 
 def refuse_other_policy(policy: str, named: str | None) -> None:

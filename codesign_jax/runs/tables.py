@@ -17,8 +17,9 @@ import numpy as np
 
 from codesign_jax import files, types
 from codesign_jax.codesign import FinalTest, summarize_test
+from codesign_jax.judge import verdict
 from codesign_jax.judge.verdict import VERDICTS, status_names, verdicts
-from codesign_jax.runs.columns import MORE, REFERENCE, TABLES
+from codesign_jax.runs.columns import ENDS, MORE, REFERENCE, TABLES
 from codesign_jax.runs.record import History, Record
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, fingers_of
@@ -55,7 +56,7 @@ def write_run(
         (folder / TESTS).unlink(missing_ok=True)
     else:
         test = summarize_test(scene, record.test)
-        rows = _of_test(space, np.asarray(record.state.particles), test)
+        rows = _of_test(scene, space, np.asarray(record.state.particles), test)
         _replace(folder / TESTS, _text(TESTS, space, rows))
 
 
@@ -213,7 +214,9 @@ def _of_episodes(
     }
 
 
-def _of_test(space: DesignSpace, particles: np.ndarray, test: FinalTest) -> Iterator[Row]:
+def _of_test(
+    scene: Scene, space: DesignSpace, particles: np.ndarray, test: FinalTest
+) -> Iterator[Row]:
     failed = types.failed(np.asarray(test.outcomes.status))
     for i, design in enumerate(_designs(TESTS, space, particles)):
         yield {
@@ -222,8 +225,17 @@ def _of_test(space: DesignSpace, particles: np.ndarray, test: FinalTest) -> Iter
             "trials": failed.shape[1],
             "failed_trials": failed[i].sum(),
             "paper_success": int(test.paper_success[i]),
+            **_ends(scene, jax.tree.map(lambda v, i=i: np.asarray(v)[i], test.outcomes)),
             **design,
         }
+
+
+def _ends(scene: Scene, outcomes: Outcome) -> Row:
+    """Numbers of trials by how they ended, the columns `columns.ENDS`."""
+    counts = verdict.tally(outcomes)
+    causes = verdict.losses(scene, outcomes)
+    numbers = (counts.kept, *causes, counts.not_released, counts.fault)
+    return dict(zip(ENDS, numbers, strict=True))
 
 
 def write(path: Path, head: list[str], rows: Iterable[Row]) -> None:

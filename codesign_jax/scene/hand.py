@@ -342,3 +342,42 @@ __all__ = [
     "load",
     "structure",
 ]
+
+
+def lacking(hand: Hand, values: Mapping[str, Any], fingers: tuple[int, ...]) -> Hand:
+    """The hand without some of its fingers, and with a design as the defaults of its table.
+
+    The other fingers are counted anew; there is no preset, so that "full" is its design space.
+
+    Args:
+      values: Values of the table's rows by name, in their units; an array of all fingers' for those
+        that each finger has of its own.
+      fingers: Numbers of the fingers that leave.
+    """
+    count = len(hand.finger)
+    left = [f for f in range(count) if f not in fingers]
+    rows = []
+    for row in hand.parameter:
+        entries = values[row.name]
+        if row.per == "finger":
+            numbers = [[per_finger(v, count)[f] for f in left] for v in (row.low, row.high)]
+            default = [float(entries[f]) for f in left]
+            low = tuple(map(min, numbers[0], default))
+            high = tuple(map(max, numbers[1], default))
+            rows.append(dataclasses.replace(row, low=low, high=high, default=tuple(default)))
+        else:
+            value = float(entries)
+            ends = {"low": min(row.low, value), "high": max(row.high, value)}
+            rows.append(dataclasses.replace(row, **ends, default=value))
+    number = {f: k for k, f in enumerate(left)}
+    groups = [tuple(number[f] for f in group if f in number) for group in hand.valves.groups or ()]
+    lines = hand.valves.lines and min(hand.valves.lines, len(left))
+    some = tuple(group for group in groups if len(group) > 1) or None
+    return dataclasses.replace(
+        hand,
+        name=f"{hand.name} without finger {', '.join(map(str, fingers))}",
+        finger=tuple(hand.finger[f] for f in left),
+        parameter=tuple(rows),
+        preset=(),
+        valves=Valves(lines=lines, groups=some),
+    )

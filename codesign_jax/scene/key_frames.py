@@ -559,3 +559,16 @@ def _too_high(
                 if least < 0:
                     yield f"{key} = {text} of finger {finger} may be {least:.6g} Pa, below zero"
                     break
+
+
+def lacking(control: Control, fingers: tuple[int, ...]) -> Control:
+    """The control of a hand without some of its fingers, which are counted from 0."""
+    frames = [
+        frame
+        if frame.pressure is None
+        else dataclasses.replace(
+            frame, pressure=tuple(p for f, p in enumerate(frame.pressure) if f not in fingers)
+        )
+        for frame in control.frame
+    ]
+    return dataclasses.replace(control, frame=tuple(frames))

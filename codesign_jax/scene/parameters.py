@@ -154,6 +154,20 @@ class DesignSpace:
         self.refuse_unit_slips(design)
         return _named(self, jnp.asarray(design))
 
+    def table(self, design: np.typing.ArrayLike) -> dict[str, Any]:
+        """Values of a design [SI] by the rows of the hand's table, in the rows' units.
+
+        Those that each finger has of its own are arrays, shape (finger,).
+        """
+        full = np.asarray(self.expand(np.asarray(design, float)), float)
+        rows: dict[str, Any] = {}
+        for row in self.hand.parameter:
+            width = self.hand.width(row)
+            entries = full[:width] / UNITS[row.unit][1]
+            full = full[width:]
+            rows[row.name] = entries if row.per == "finger" else entries[0]
+        return rows
+
     def project(self, design: jax.typing.ArrayLike) -> jax.Array:
         """The nearest design that a search may propose, parameter by parameter.
 

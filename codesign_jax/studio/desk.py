@@ -19,7 +19,7 @@ from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording, tells_forces
 from codesign_jax.judge.cases import Case
 from codesign_jax.report import animation
-from codesign_jax.runs import selection
+from codesign_jax.runs import reference, selection
 from codesign_jax.scene import Scene, library
 from codesign_jax.scene.loading import with_accuracy
 from codesign_jax.types import Outcome, Params, Trial
@@ -128,6 +128,21 @@ class Desk:
                 case = case._replace(scene=with_accuracy(case.scene, accuracy))
             self.benches[accuracy] = Bench(case)
         return self.benches[accuracy]
+
+    @functools.cached_property
+    def verdict(self) -> str:
+        """The verdict of the run on its recommended design, with its accuracy; empty without a run.
+
+        A page says what it simulates itself: other trials, at the accuracy that is chosen there.
+        """
+        folder = self.options.run_folder
+        if folder is None or self.record is None:
+            return ""
+        scene, settings = runs.read_run(folder)
+        kept = reference.kept(folder, scene, settings)
+        chosen = selection.choose(scene, self.record)
+        judged = kept.fresh or chosen.judged(scene, kept.stress)
+        return f"The run's verdict on its recommended design: {judged.headline}"
 
     def flags(self, accuracy: str) -> list[str]:
         """Flags that name to another command what a design's file does not."""

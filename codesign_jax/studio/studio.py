@@ -178,7 +178,7 @@ def about(desk: Desk) -> dict[str, Any]:
     if desk.record:
         chosen = selection.choose(scene, desk.record)
         particles = desk.record.history.cost.shape[1]
-        run = {"episodes": desk.record.done, "particles": particles}
+        run = {"episodes": desk.record.done, "particles": particles, "verdict": desk.verdict}
         run["chosen"] = [chosen.episode + 1, chosen.row]
     source = f"run {desk.options.run_folder}" if run else f"hand {scene.hand.name}"
     return {

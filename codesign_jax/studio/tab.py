@@ -247,6 +247,8 @@ class Tab:
             outcomes = jax.tree.map(lambda *v: np.concatenate(v)[: view.trials], *self._outcomes)
             ends = verdict.verdicts(outcomes).tolist()
             sentence = str(sentences.Judged(scene, outcomes, grasps="grasps"))
+            if causes := str(verdict.losses(scene, outcomes)):
+                sentence += f". Lost: {causes}"
             if not failed(outcomes.status).all():
                 cost = float(codesign.particle_cost(scene, outcomes))
         design = common.shortest(shown.bench.case.space, view.design)

@@ -244,7 +244,7 @@ def landscape(
 
 # --- what is kept ---------------------------------------------------------------------------------
 
-BITS = tuple(s for s in Status if s)
+BITS = tuple(s for s in Status if s and s is not Status.UNMOVED)
 """Status bits in the order of the `failed` arrays' last axis."""
 
 

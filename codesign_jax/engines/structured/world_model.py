@@ -25,6 +25,7 @@ class WorldModel(NamedTuple):
     # Columns of the finger bases' orientations in the palm frame, shape (3, 3, finger, world)
     mount: jax.Array
     base: jax.Array  # Base positions in the palm frame, shape (3, finger, world)
+    share: jax.Array  # Share of a finger in the hand's centre, see `ModelFields`, (finger, world)
     offset: jax.Array  # Joint positions along the previous link, shape (link, finger, world)
     mass: jax.Array  # Link masses, shape (link, finger, world)
     centre: jax.Array  # Link centres of mass in the link frame, shape (3, link, finger, world)
@@ -178,6 +179,7 @@ def _world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
     return WorldModel(
         mount=mount,
         base=base,
+        share=last(fields.share),
         offset=by_link(fields.offset),
         mass=by_link(fields.mass)[1:],
         centre=centre[:, 1:],

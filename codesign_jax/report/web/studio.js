@@ -135,6 +135,8 @@ function startStudio(root) {
     find("count").append(...about.counts.map((count) => option(count, count)));
     for (const element of root.querySelectorAll(".of-run")) element.hidden = !about.run;
     if (about.run) {
+      find("of-run-verdict").textContent = about.run.verdict;
+      find("of-run-verdict").hidden = false;
       find("episode").max = about.run.episodes;
       find("particle").max = about.run.particles - 1;
       [find("episode").value, find("particle").value] = about.run.chosen;

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 
-from codesign_jax import array_files, reuse
+from codesign_jax import array_files, reuse, terminal
 from codesign_jax.scene.meshes.surface import signed_distance
 
 # The error grows in proportion to the cell at edges and with its square elsewhere.
@@ -138,10 +138,12 @@ def cached(key: str, vertices: np.ndarray, faces: np.ndarray, bound: float, reac
     """Like `build`; grids that take longer than a tenth of a second are kept on disk."""
     name = reuse.key(key, bound, reach)
     if name is None or reuse.limit() is None:
+        terminal.wait(f"computing the distances around a mesh of {len(faces):,} faces")
         return build(vertices, faces, bound, reach)
     path = reuse.folder() / "meshes" / f"{name}.kept"
 
     def build_packed() -> bytes:
+        terminal.wait(f"computing the distances around a mesh of {len(faces):,} faces")
         return array_files.packed(build(vertices, faces, bound, reach)._asdict())
 
     arrays: dict[str, Any] = array_files.unpacked(

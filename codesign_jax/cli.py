@@ -65,7 +65,8 @@ def main(arguments: list[str] | None = None) -> int:
         if words == ["--version"]:
             return _version()
         bad = [a for a in words if a.encode(errors="replace").decode() != a]
-        if problems := [f"{a[:100]!r} is no UTF-8 text" for a in bad] + reuse.problems():
+        problems = [f"{a[:100]!r} is no UTF-8 text" for a in bad] + reuse.problems()
+        if problems := problems + mode_problems():
             from codesign_jax.scene.schema import InputError
 
             raise InputError(problems)
@@ -85,6 +86,30 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments is None and code in (status.INTERRUPTED, status.TERMINATED):
         status.leave(code)
     return code
+
+
+_ON = {"y", "yes", "t", "true", "on", "1"}
+"""What JAX takes for yes."""
+MODES = {
+    "JAX_DISABLE_JIT": (_ON, "kernels run within compiled programs"),
+    "JAX_ENABLE_X64": (_ON, "the commands simulate in float32, but for engine mujoco (float64)"),
+    "JAX_NUMPY_DTYPE_PROMOTION": ({"strict"}, "types are promoted in many places"),
+    "JAX_NUMPY_RANK_PROMOTION": ({"raise"}, "ranks are promoted in many places"),
+    "JAX_TRANSFER_GUARD": (
+        {"disallow", "disallow_explicit"},
+        "numbers of a scene are given to programs in many places",
+    ),
+}
+"""Modes of JAX, mostly for debugging, in which the commands fail: their values, and why."""
+
+
+def mode_problems() -> list[str]:
+    """Environment variables that ask for one of `MODES`, which somebody set for other programs."""
+    return [
+        f"{name}={value} asks for a mode of JAX in which this command fails: {why}; leave it out"
+        for name, (values, why) in MODES.items()
+        if (value := os.environ.get(name, "").lower()) in values
+    ]
 
 
 def _version() -> int:

@@ -357,6 +357,8 @@ def memory_problem() -> str | None:
     )
 
 
+STRUCTURES = 8
+"""Scenes of different structure whose programs are kept at a time: each has 45 MB [chosen]."""
 forgetters: list[Callable[[], object]] = []  # drop the programs that `shared` keeps
 
 
@@ -385,7 +387,7 @@ def shared(build: Callable[..., Any]) -> Callable[..., Any]:
         _relieve()
         return jax.tree.map(jax.jit, build(*arguments))
 
-    cached = functools.lru_cache(maxsize=32)(jitted)
+    cached = functools.lru_cache(maxsize=STRUCTURES)(jitted)
     forgetters.append(cached.cache_clear)
 
     @functools.wraps(build)

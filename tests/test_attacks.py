@@ -4,6 +4,7 @@ SECURITY.md names these tests beside its promises.
 """
 
 import copy
+import csv
 import gc
 import io
 import json
@@ -20,6 +21,7 @@ from pathlib import Path
 
 import hypothesis
 import jax
+import mujoco
 import numpy as np
 import pytest
 import rich.table
@@ -31,11 +33,11 @@ from codesign_jax.export import process, sheet
 from codesign_jax.judge import fresh_trials
 from codesign_jax.judge.stress import Stress
 from codesign_jax.report import landscape
-from codesign_jax.runs import directory, failures, manifest, progress, reference
+from codesign_jax.runs import directory, failures, manifest, progress, reference, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs import run as run_of
 from codesign_jax.runs.columns import FILES, TABLES
-from codesign_jax.scene import InputError, draws, parameters, scene_files
+from codesign_jax.scene import InputError, draws, parameters, scene_files, texts
 from codesign_jax.scene.meshes import reading
 from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import command, own_workplace  # noqa: F401
@@ -133,6 +135,41 @@ def test_no_file_that_a_flag_names_is_waited_for(name, kind, tmp_path):
         path.mkdir()
     with pytest.raises((InputError, OSError, array_files.ArrayFileError), match=re.escape(name)):
         READERS[name](path)
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ('=HYPERLINK("http://a","x")', '\'=HYPERLINK("http://a","x")'),
+        ("@SUM(1)", "'@SUM(1)"),
+        ("+a", "'+a"),
+        ("-2+3+cmd|' /C calc'!A0", "'-2+3+cmd|' /C calc'!A0"),
+        ("\tx", "'\tx"),
+        ("-2.5e-3", "-2.5e-3"),
+        ("+inf", "+inf"),
+        ("a=b", "a=b"),
+        (-2, -2),
+    ],
+)
+def test_no_cell_of_a_table_is_a_formula(text, shown):
+    assert texts.cell(text) == shown
+    expected = io.StringIO()
+    csv.writer(expected, lineterminator="\n").writerow([shown])
+    assert tables.written(["a"], [{"a": text}], named=False) == expected.getvalue()
+
+
+def test_mujoco_leaves_no_file_where_it_warns(tmp_path, capsys):
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    mujoco.mj_saveModel(model, str(tmp_path / "none" / "a.mjb"))
+    assert not Path("MUJOCO_LOG.TXT").exists()
+    assert "warning: MuJoCo: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", [0, 3, 4, 4000])
+def test_a_long_list_is_cut(number):
+    text = texts.some([f"{k}: it is damaged" for k in range(number)], "; ")
+    assert text.count("damaged") == min(number, 3) and len(text) < 100
+    assert (f" and {number - 3:,} more" in text) == (number > 3)
 
 
 def test_a_folder_in_the_place_of_a_run_s_file_is_refused_before_anything_changes(run):

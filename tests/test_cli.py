@@ -106,6 +106,17 @@ def test_wrong_input_exits_2_and_creates_nothing(line, workplace, capsys):
     assert list(workplace.iterdir()) == []
 
 
+@pytest.mark.parametrize("name", cli.MODES)
+def test_a_mode_of_jax_in_which_a_command_fails_is_refused_by_name(name, monkeypatch, capsys):
+    for value in cli.MODES[name][0]:
+        monkeypatch.setenv(name, value.upper())
+        assert cli.main(["scenes", "hands"]) == 2
+        assert f"error: {name}={value} asks for a mode of JAX" in capsys.readouterr().err
+    for value in ("", "0", "false", "allow", "standard", "log"):
+        monkeypatch.setenv(name, value)
+        assert cli.main(["scenes"]) == 0
+
+
 def test_dry_run_writes_nothing(workplace, capsys):
     assert command(*RUN, "--out", "run", "--dry-run") == 0
     output = capsys.readouterr().out

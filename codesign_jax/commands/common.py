@@ -1,6 +1,7 @@
 """Helpers of several commands: designs, notes and JAX's compilation cache."""
 
 import dataclasses
+import functools
 import importlib.util
 import re
 import tempfile
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import mujoco
 import numpy as np
 import tomli_w
 from rich.table import Table
@@ -92,6 +94,15 @@ def load_scene(options: SceneFlags) -> Scene:
 def warn(text: str) -> None:
     """Prints a warning that concerns the result, apart from the result."""
     terminal.say(f"warning: {text}", error=True)
+
+
+@functools.cache
+def _warn_of_mujoco(text: str) -> None:
+    warn(f"MuJoCo: {text}")
+
+
+# MuJoCo's own way appends to MUJOCO_LOG.TXT in the working directory.
+mujoco.set_mju_user_warning(_warn_of_mujoco)
 
 
 def find_case(options: Subject, *, tell: Tell = warn) -> Case:

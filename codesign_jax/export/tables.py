@@ -1,6 +1,7 @@
 """The grasps of an export: models, their controls, and the list of what became of them."""
 
 import csv
+import itertools
 import re
 import unicodedata
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,7 +13,7 @@ import numpy as np
 from codesign_jax.export import plain
 from codesign_jax.export.grasps import PLAYER, Grasp
 from codesign_jax.model.layout import WRIST
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, texts
 from codesign_jax.types import Status, Trial, failed
 
 MODELS = "model"
@@ -65,7 +66,10 @@ def write_grasps(
     for (name, trial), grasp in zip(trials, grasps, strict=True):
         if grasp.xml is not None:
             (folder / f"{name}.xml").write_text(grasp.xml, encoding="utf-8")
-        mujoco.mj_saveModel(grasp.binary, str(folder / f"{name}.mjb"))
+        # Not to a file: of one that it cannot write MuJoCo warns in another, MUJOCO_LOG.TXT.
+        binary = np.zeros(mujoco.mj_sizeModel(grasp.binary), np.uint8)
+        mujoco.mj_saveModel(grasp.binary, None, binary)
+        (folder / f"{name}.mjb").write_bytes(binary.tobytes())
         # repr names a float64 exactly: the player's controls are these.
         exact = ([repr(float(v)) for v in row] for row in grasp.controls)
         write_table(folder / f"{name}_controls.csv", control_columns(scene), exact)
@@ -119,5 +123,6 @@ def _cut(name: str) -> str:
 
 def write_table(path: Path, head: Sequence[str], rows: Iterable[Sequence[str]]) -> Path:
     with path.open("w", encoding="utf-8", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([head, *rows])
+        cells = ([*map(texts.cell, row)] for row in itertools.chain([head], rows))
+        csv.writer(file, lineterminator="\n").writerows(cells)
     return path

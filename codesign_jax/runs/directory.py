@@ -27,7 +27,7 @@ from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.manifest import LOCK, PROVENANCE
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.settings import Settings, masks_of
-from codesign_jax.scene import Scene, scene_files
+from codesign_jax.scene import Scene, scene_files, texts
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.scene.schema import InputError
 
@@ -314,7 +314,7 @@ def _refuse_foreign(path: Path) -> None:
         hint = "choose another folder, or delete these files yourself, if nobody needs them"
         if (path / "checkpoints").exists():
             hint = f"if it is a run that lost {PROVENANCE}, put that back from a copy; or {hint}"
-        problem = f"--out {path} holds {_some(others)} and no {PROVENANCE}: {hint}"
+        problem = f"--out {path} holds {texts.some(others)} and no {PROVENANCE}: {hint}"
         raise InputError([f"{problem}. Nothing was changed"])
 
 
@@ -336,8 +336,8 @@ def _refuse_to_delete(path: Path) -> None:
     if others:
         raise InputError(
             [
-                f"--fresh would delete {_some(others)} in {path}, which are no files of a run: "
-                "move them elsewhere first, or choose another folder"
+                f"--fresh would delete {texts.some(others)} in {path}, which are no files of a "
+                "run: move them elsewhere first, or choose another folder"
             ]
         )
 
@@ -382,7 +382,3 @@ def _is_of_a_run(path: Path, name: str) -> bool:
     if folder:
         return _INSIDE[folder].fullmatch(_named(inside)) is not None
     return _named(name) in {*FILES, *TABLES, LOCK} - {*_INSIDE} and not (path / name).is_dir()
-
-
-def _some(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

@@ -16,7 +16,7 @@ from codesign_jax.runs.checkpoint import Checkpoints, Restored
 from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.settings import Settings
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, texts
 from codesign_jax.scene.schema import InputError
 
 Tell = Callable[[str], None]
@@ -78,7 +78,7 @@ def load_record(folder: Path, *, tell: Tell | None = None) -> Record | None:
             raise InputError([problem])
         return None
     if restored.damaged:
-        steps = "; ".join(f"{step}: {reason}" for step, reason in restored.damaged)
+        steps = texts.some([f"{step}: {reason}" for step, reason in restored.damaged], "; ")
         test = "with" if record.test is not None else "without"
         tell(
             f"{folder} has damaged checkpoints ({steps}). Read instead is checkpoint "
@@ -95,7 +95,7 @@ def lost(folder: Path, restored: Restored | None = None) -> str:
     if not episodes or (restored is None and (folder / "checkpoints").is_dir()):
         return ""
     damaged = restored.damaged if restored else ()
-    steps = "; ".join(f"{step}: {reason}" for step, reason in damaged)
+    steps = texts.some([f"{step}: {reason}" for step, reason in damaged], "; ")
     loss = f"no checkpoint that is whole ({steps})" if steps else "lost its checkpoints"
     return (
         f"run {folder} has {loss}, while its tables have {episodes} "

@@ -22,6 +22,7 @@ from codesign_jax.runs.plan import Plan
 from codesign_jax.runs.progress import Report, Voice
 from codesign_jax.runs.record import Record, Start
 from codesign_jax.runs.settings import SCENE_COST
+from codesign_jax.scene import texts
 from codesign_jax.types import Outcome, Status
 
 FAILURES = (OSError, RunError, NoSeed, KernelUnavailable)
@@ -100,8 +101,10 @@ class Run:
             records.refuse_other(record, self.plan.settings)
             self.record = record
         instead = "the run begins anew" if self.record is None else "using an older one"
-        for step, reason in restored.damaged:
+        for step, reason in restored.damaged[: texts.FEW]:
             self.say(f"checkpoint {step} is lost: {reason}; {instead}")
+        if (rest := len(restored.damaged) - texts.FEW) > 0:
+            self.say(f"{rest:,} more checkpoints are lost; {instead}")
         self._store.discard([step for step, _ in restored.damaged])
         if self.record is not None:
             self._go_on(self.record, restored.step)

@@ -21,7 +21,7 @@ from codesign_jax.judge import verdict
 from codesign_jax.judge.verdict import VERDICTS, status_names, verdicts
 from codesign_jax.runs.columns import ENDS, MORE, REFERENCE, TABLES
 from codesign_jax.runs.record import History, Record
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, texts
 from codesign_jax.scene.parameters import DesignSpace, fingers_of
 from codesign_jax.types import Outcome, Trial
 
@@ -256,7 +256,7 @@ def written(head: list[str], rows: Iterable[Row], *, named: bool = True) -> str:
     for row in rows:
         if missing := [name for name in head if name not in row]:
             raise ValueError(f"a row of the table has no {', '.join(missing)}")
-        writer.writerow(row)
+        writer.writerow({name: texts.cell(value) for name, value in row.items()})
     return text.getvalue()
 
 

@@ -2,12 +2,17 @@
 
 import codecs
 import unicodedata
+from collections.abc import Sequence
 from typing import Any
 
 from codesign_jax.terminal import CONTROL
 
 MOST_LETTERS = 1000
 """Most characters of a text."""
+FEW = 3
+"""Items of a long list that a message names."""
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""How a formula begins in a spreadsheet."""
 SHOWN = 120
 """Most characters of a value in a message."""
 _TYPESET = str.maketrans(
@@ -42,6 +47,27 @@ def problem(path: str, text: str, *, lines: bool = False) -> str | None:
         if unicodedata.category(c) in CONTROL and c not in allowed:
             return f"{path} = {shown(text)} has a character that is no text, U+{ord(c):04X}"
     return None
+
+
+def some(items: Sequence[str], between: str = ", ") -> str:
+    """The first items of a list and the number of the others."""
+    rest = len(items) - FEW
+    return between.join(items[:FEW]) + (f" and {rest:,} more" if rest > 0 else "")
+
+
+def cell(value: Any) -> Any:
+    r"""A cell of a table: a text that a spreadsheet would take for a formula gets an apostrophe.
+
+    >>> cell('=HYPERLINK("http://a", "b")'), cell("-0.5"), cell(-3)
+    ('\'=HYPERLINK("http://a", "b")', '-0.5', -3)
+    """
+    if not isinstance(value, str) or not value.startswith(_FORMULA):
+        return value
+    try:
+        float(value)
+    except ValueError:
+        return f"'{value}"
+    return value
 
 
 def foreign(content: bytes) -> str | None:

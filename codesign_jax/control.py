@@ -27,7 +27,7 @@ class Plan(NamedTuple):
       pose: Pose of the arm frame: x, y, z [m], roll, pitch, yaw [rad], shape (time, 6); positive
         pitch points the fingers towards +x.
       pressure: Wanted pressure of each finger [Pa], shape (time, finger).
-      shake: Roll and pitch that the disturbance adds [rad], shape (time, 2).
+      shake: Roll and pitch [rad], then x, y, z [m] that the disturbance adds, shape (time, 5).
       tilt: Roll and pitch of the trial's noise [rad], shape (2,).
       params: Parameters of the hand.
     """
@@ -66,18 +66,20 @@ def plan(scene: Scene, params: Params, trial: Trial) -> Plan:
     pressure = jnp.zeros((len(time), scene.num_fingers), jnp.result_type(params.pressure))
     for value, factors in key_frames.pressures(scene, params):
         pressure = pressure + value * _between(place, factors)
-    return Plan(pose, pressure, jnp.stack(_shake(scene, time), 1), trial.arm_tilt, params)
+    shake = jnp.stack([*_rotation(scene, time), *_transport(scene, time)], 1)
+    return Plan(pose, pressure, shake, trial.arm_tilt, params)
 
 
 def actuated(pose: jax.Array, pressure: jax.Array, shake: jax.Array, tilt: jax.Array) -> jax.Array:
     """Controls, shape (time, nu), from what `Plan` has of as many time steps."""
-    x, y, z, roll, pitch, yaw = pose.T
+    roll, pitch, yaw = pose.T[3:]
+    place = pose[:, :3] + shake[:, 2:]
     # Positive pitch points the fingers towards +x, so that Table I's x = -20 mm with 15 degrees
     # aims the hand at the object [ours]; the wrist's hinge turns about +y, which points them
     # towards -x.
     roll = roll + tilt[0] + shake[:, 0]
     pitch = shake[:, 1] - pitch + tilt[1]
-    return jnp.concatenate([jnp.stack([x, y, z, roll, yaw, pitch], 1), pressure], 1)
+    return jnp.concatenate([place, jnp.stack([roll, yaw, pitch], 1), pressure], 1)
 
 
 def _place(scene: Scene, params: Params, time: np.ndarray) -> tuple[jax.Array, ...]:
@@ -135,7 +137,7 @@ def reachable(scene: Scene, commanded: jax.Array) -> jax.Array:
     return jnp.minimum(commanded, scene.pneumatics.maximum)
 
 
-def _shake(scene: Scene, time: np.ndarray) -> tuple[jax.Array, jax.Array]:
+def _rotation(scene: Scene, time: np.ndarray) -> tuple[jax.Array, jax.Array]:
     """Roll and pitch that the disturbance adds [rad], each of shape (time,).
 
     A sine whose amplitude grows linearly over the phase; whole periods alternate between roll and
@@ -152,3 +154,22 @@ def _shake(scene: Scene, time: np.ndarray) -> tuple[jax.Array, jax.Array]:
     angle = angle * jnp.clip(1 - (time - p.disturb) / p.deflate_time, 0, 1)
     odd = jnp.floor(period).astype(int) % 2 == 1
     return jnp.where(odd, 0.0, angle), jnp.where(odd, angle, 0.0)
+
+
+def _transport(scene: Scene, time: np.ndarray) -> list[jax.Array]:
+    """Displacement along the world's x, y, z that the disturbance adds [m], each of shape (time,).
+
+    Each axis has a third of the phase, T: the arm accelerates by +a for T/4, by -a for T/2 and by
+    +a for T/4, which brings it back to rest where it began, over a distance of a T^2/16.
+    """
+    if not scene.effects.disturb:
+        return [jnp.zeros(len(time))] * 3
+    p = scene.phases
+    third = (p.disturb - p.lift) / 3
+    displacements = []
+    for k in range(3):
+        now = jnp.clip(time - p.lift - k * third, 0, third)
+        turns = (1.0, 0.0), (-2.0, 0.25), (2.0, 0.75)  # changes of acceleration over a, and when
+        squares = [change * jnp.maximum(now - at * third, 0) ** 2 for change, at in turns]
+        displacements.append(scene.arm.shake_acceleration / 2 * sum(squares))
+    return displacements

@@ -103,7 +103,7 @@ SIMULATES = {
     "finger": [(finger, "compare")],
     "landscape": [
         (landscape, name)
-        for name in ("simulate_designs", "summarize", "print_summary", "write_files")
+        for name in ("search", "simulate_points", "summarize", "print_summary", "write_files")
     ],
     "render": [(render, "draw")],
     "replay": [(replay, "explain"), (replay, "write_page")],

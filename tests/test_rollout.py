@@ -109,6 +109,67 @@ def pneuflex():
     return the_scene, *jax.tree.map(lambda v: np.reshape(v, (5, 3, *v.shape[1:])), results)
 
 
+ACCELERATED = {"effects.wrist": False, "arm.shake_amplitude": 0.0, "arm.shake_acceleration": 2.0}
+"""A rigid mount that moves by 2 m/s^2 in place of the turns."""
+
+
+def transported(the_scene, axis):
+    """Times of the third of the phase in which an axis moves [s]: begin, three quarters, end."""
+    p = the_scene.phases
+    third = (p.disturb - p.lift) / 3
+    return p.lift + third * (axis + np.array([0.0, 0.25, 0.5, 0.75, 1.0]))
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_the_arm_accelerates_along_each_axis_of_the_world(axis):
+    """By +a, -a for twice as long and +a again: from rest at its place to rest at its place."""
+    the_scene = scene.load("paper", overrides=ACCELERATED)
+    params, trial = hand_world(the_scene)
+    turned = params._replace(arm=np.array([0.0, 0.0, 0.0, 0.3, 0.2, 0.1]))
+    place = np.asarray(jax.jit(partial(control.commands, the_scene))(turned, trial), float)[:, axis]
+    h = the_scene.discretization.timestep
+    time = np.arange(len(place)) * h
+    begin, first, middle, last, end = transported(the_scene, axis)
+    place = place - place[int(begin / h)]
+    size = 2.0 * (end - begin) ** 2 / 16
+    peak = place[(time >= begin) & (time <= end)].max()
+    assert peak == pytest.approx(size, rel=1e-3) and time[place.argmax()] == pytest.approx(
+        middle, abs=h
+    )
+    # Second differences in float32 of a few tenths of a metre: 3e-8 m over h^2 is 3e-4 m/s^2.
+    acceleration = np.diff(place, 2) / h**2
+    centre = time[1:-1]
+    for low, high, sign in ((begin, first, 1), (first, last, -1), (last, end, 1)):
+        inside = (centre > low + h) & (centre < high - h)
+        np.testing.assert_allclose(acceleration[inside], sign * 2.0, atol=5e-3)
+    shaken = (time > the_scene.phases.lift) & (time <= the_scene.phases.disturb)
+    at_rest = shaken & ((time < begin) | (time > end))
+    np.testing.assert_allclose(place[at_rest], 0, atol=1e-6)
+
+
+def test_what_a_rigid_hand_holds_is_accelerated_with_it():
+    """In MuJoCo C: it goes and comes back with the arm, but for what soft fingers yield."""
+    the_scene = scene.load("paper_spheres", overrides=ACCELERATED)
+    with jax.enable_x64(True):  # a prescribed palm is a heavy body there
+        engine = make_engine("mujoco", the_scene)
+        hand, trial = design(the_scene), rollout.nominal_trial(the_scene, 2)
+        trace = rollout.grasp(the_scene, engine, hand, trial, record_qpos=True)
+        ctrl = control.commands(the_scene, hand, trial)
+    held = np.asarray(trace.qpos)[:, -7:-4]  # the free joint comes last
+    h = the_scene.discretization.timestep
+    for axis in range(3):
+        begin, first, middle, last, end = (round(t / h) for t in transported(the_scene, axis))
+        path = held[begin:end, axis] - held[begin - 1, axis]
+        arm = np.asarray(ctrl)[begin:end, axis] - float(ctrl[begin - 1, axis])
+        assert arm.max() == pytest.approx(2.0 * ((end - begin) * h) ** 2 / 16, rel=0.02)
+        # Fingers of 60 to 90 mm yield by millimetres to 0.1 N, a tenth of the way of 0.17 m.
+        np.testing.assert_allclose(path, arm, atol=0.1 * arm.max())
+        # Over the half in which the arm decelerates the object's velocity changes by a T/2.
+        speed = np.gradient(held[:, axis], h)
+        change = speed[last] - speed[first]
+        assert change == pytest.approx(-2.0 * (last - first) * h, rel=0.25)
+
+
 def test_a_good_design_grasps_every_object(pneuflex):
     _, outcome, _ = pneuflex
     np.testing.assert_array_equal(outcome.status[0], Status.OK)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from codesign_jax import model, scene
-from codesign_jax.commands import common
+from codesign_jax.commands import common, flags
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import (
     constants,
@@ -74,6 +74,8 @@ BY_PATH = {
     ),
     "hand.preset.2d.free.arm_z.high=150": lambda s: s.hand.preset[0].free[1].high == 150.0,
     "objects.object.sphere.mass=0.2": lambda s: s.objects.object[2].mass == 0.2,
+    "objects.object.mass=0.2": lambda s: [o.mass for o in s.objects.object] == [0.2] * 3,
+    "hand.finger.tilt=50": lambda s: [f.tilt for f in s.hand.finger] == [50.0] * 4,
 }
 
 
@@ -151,6 +153,8 @@ WRONG_PATHS = {
     "hand.section.width=18": (
         "hand.section.width = 18 is outside [0.005, 0.1] m; did you mean 0.018? (mm given"
     ),
+    "objects.object.mas=1": "objects.object has no entry 'mas'; valid: cuboid, cylinder, sphere",
+    "objects.object.mass=99": "objects.object[2].mass = 99 is outside",
     "objects.object.spher.mass=1": "objects.object has no entry 'spher'; did you mean 'sphere'?",
     "discretization.links=10.0": "discretization.links = 10.0 must be a whole number in [1, 200]",
     # A number without a unit has no slip of units.
@@ -257,6 +261,13 @@ def test_blanks_around_the_sign_of_a_value_are_let_pass(words):
     assert keypaths.parse(["discretization.links=5", *words]) == values
     design = [w.replace("gravity", "length") for w in words]
     assert common.open_designs(design)[0]["--design"] == ["length=3.7"]
+
+
+def test_a_rigid_mount_is_the_effect_and_set_holds():
+    wrist = ("effects", "wrist")
+    assert common.changes(flags.Evaluate(rigid_mount=True)) == {wrist: False}
+    compliant = flags.Evaluate(rigid_mount=True, overrides=(("effects.wrist=true",),))
+    assert common.changes(compliant) == {wrist: True}
 
 
 def test_signs_of_an_editor_are_read_in_numbers_and_kept_in_names():

@@ -61,11 +61,16 @@ def cast_hands(
 
 
 def changes(options: TrialFlags) -> dict[keypaths.Path, Any]:
-    """Values by key path that --constants, --robust and --set replace; what --set names holds."""
+    """Values by key path that --constants, --rigid-mount, --robust and --set replace.
+
+    What --set names holds.
+    """
     values: dict[keypaths.Path, Any] = {}
     if options.constants is not None:
         table = draws.read(options.constants)
         values |= draws.nominal(table) | {("drawn",): draws.plain(table)}
+    if options.rigid_mount:
+        values[("effects", "wrist")] = False
     noise = dataclasses.asdict(objects.ROBUST) if options.robust else {}
     values |= {("objects", "noise", name): value for name, value in noise.items()}
     return values | keypaths.parse(chain.from_iterable(options.overrides))

@@ -174,7 +174,7 @@ def _pair(options: Compare, paths: list[Path]) -> dict[str, Case]:
 
 
 def _subject(options: Compare, path: Path, side: tuple[tuple[str, ...], ...]) -> flags.Subject:
-    names = ("accuracy", "objects", "constants", "robust", "engine")
+    names = ("accuracy", "objects", "constants", "rigid_mount", "robust", "engine")
     arguments = {n: getattr(options, n) for n in names}
     arguments["overrides"] = (*options.overrides, *side)
     if not flags.is_design(path):

@@ -22,7 +22,8 @@ def _overrides(name: str, text: str) -> Any:
 Overrides = _overrides(
     "set",
     "Replace values of the scene, hand and objects files, by key path: gravity=3.7 "
-    "discretization.links=5 hand.material=dragon_skin_10 objects.object.sphere.mass=0.2",
+    "discretization.links=5 hand.material=dragon_skin_10 objects.object.sphere.mass=0.2, or "
+    "objects.object.mass=0.2 for all objects",
 )
 # Without a default of its own: the help text says which value is used instead.
 Text = Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="")]
@@ -68,6 +69,9 @@ class TrialFlags:
     """Draw constants for every trial from a table of what is known of them: a .toml that `codesign
     finger --posterior` wrote, or unmeasured for those of a hand of which nothing was measured; none
     for those of the scene or run alone (docs/uncertainty.md)."""
+    rigid_mount: Flag = False
+    """Bolt the palm to the arm, as a gripper on an industrial robot, in place of the paper's
+    compliant wrist (effects.wrist = false)."""
     robust: Flag = False
     """Vary friction, mass, size, stiffness and placement more widely between trials, for a hand
     that depends on none of them (docs/optimisers.md). --set objects.noise... overrides this."""

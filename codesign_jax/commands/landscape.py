@@ -70,9 +70,7 @@ def main(options: Options) -> int:
     simulate = Simulation(case, options.trials, size)
     if options.search:
         plane = search(case, plane, simulate, options, console)
-    with Meter("landscape", points * options.trials, console) as meter:
-        key = jax.random.key(options.seed)
-        simulated = simulate(plane.designs, plane.numbers, key, meter.advance)
+    simulated = simulate_points(plane, simulate, options, console)
     result = summarize(case, plane, simulated, options)
     print_summary(case, result, console)
     write_files(case, result, folder, console)
@@ -143,6 +141,15 @@ class Simulation(NamedTuple):
             task = Task(case.scene, case.space, self.trials, case.make_engine())
             return batch.evaluate(task, key, designs, self.size, advance)
         return _in_scenes(self, designs, numbers, key, advance)
+
+
+def simulate_points(
+    plane: Plane, simulate: Simulation, options: Options, console: Console
+) -> Outcome:
+    """Outcomes of the points' designs, arrays of shape (point, trial)."""
+    key = jax.random.key(options.seed)
+    with Meter("landscape", len(plane.designs) * options.trials, console) as meter:
+        return simulate(plane.designs, plane.numbers, key, meter.advance)
 
 
 def search(

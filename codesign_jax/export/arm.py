@@ -42,7 +42,8 @@ COLUMNS = {
 
 def still(scene: Scene) -> Scene:
     """The scene without the shaking that tests a grasp; its phases stay."""
-    return dataclasses.replace(scene, arm=dataclasses.replace(scene.arm, shake_amplitude=0.0))
+    arm = dataclasses.replace(scene.arm, shake_amplitude=0.0, shake_acceleration=0.0)
+    return dataclasses.replace(scene, arm=arm)
 
 
 def write(folder: Path, scene: Scene, params: Params, trial: Trial) -> Path:

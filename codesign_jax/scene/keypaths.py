@@ -172,6 +172,10 @@ def _apply(
         return
     if isinstance(node, list):
         index = _index(node, key)
+        if index is None and any(isinstance(entry, dict) and key in entry for entry in node):
+            for k in range(len(node)):  # a key without the name of an entry is that of all
+                _apply(node, (str(k), *path), value, where, problems, key_paths)
+            return
         if index is None:
             hint = schema.nearest(key, _names(node))
             problems.append(f"{place_name} has no entry {schema.shown(key)}; {hint}")

@@ -122,12 +122,15 @@ class Arm:
       shake_frequency: Frequency of the disturbance. Its periods alternate: one turns the arm by
         roll, the next by pitch.
       shake_amplitude: Amplitude of the disturbance at its end, to which it grows linearly.
+      shake_acceleration: Acceleration by which the disturbance also moves the arm frame there and
+        back along the world's x, y and z, a third of the phase each.
     """
 
     start_height: float = quantity("m", 0.05, 2)
     zero_height: float = quantity("m", 0, 1)
     shake_frequency: float = quantity("Hz", 0, 20)
     shake_amplitude: float = quantity("deg", 0, 90)
+    shake_acceleration: float = quantity("m/s^2", 0, 100, default=0.0)
 
 
 @table

@@ -153,6 +153,7 @@ class Desk:
         flags = [word for k, v in named.items() if v is not None for word in (f"--{k}", v)]
         for words in options.overrides:
             flags += ["--set", *words]
+        flags += ["--rigid-mount"] * options.rigid_mount
         return flags + ["--robust"] * options.robust
 
     @contextlib.contextmanager

@@ -18,7 +18,7 @@ from codesign_jax.engines.structured.kernel.adjoint_step import ReverseStep, Tra
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, of_step
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
 from codesign_jax.engines.structured.kernel.program import Program, copy_rows
-from codesign_jax.engines.structured.kernel.residual import BodyMotion
+from codesign_jax.engines.structured.kernel.residual import Before, BodyMotion
 from codesign_jax.engines.structured.kernel.residual_vjp import SHAPES
 from codesign_jax.engines.structured.kernel.self_contacts import SelfContactSet
 from codesign_jax.engines.structured.lanewise import lanes, of_code
@@ -69,6 +69,7 @@ class AdjointProgram(Program):
         n = self.links
         a = self.axes
         more = {f"chain.{k}": (n + 1, shape) for k, shape in SHAPES._asdict().items()}
+        more |= {f"before.{k}": (n, getattr(SHAPES, k)) for k in Before._fields}
         more |= {"acc_bar": (n, (a,)), "virtual": (n, (a,))}
         if pairings := self.held.get("finger_finger"):
             more |= {"sums_bar": (pairings, (4,))}

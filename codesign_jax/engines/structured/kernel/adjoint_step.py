@@ -20,7 +20,7 @@ from codesign_jax.engines.structured.kernel.coupling import Coupling
 from codesign_jax.engines.structured.kernel.linear_system import Elimination
 from codesign_jax.engines.structured.kernel.memory import Block, choose, loop
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
-from codesign_jax.engines.structured.kernel.residual import LinkMotion
+from codesign_jax.engines.structured.kernel.residual import Before, LinkMotion
 from codesign_jax.engines.structured.kernel.residual_vjp import ResidualVjp, SelfContactsVjp
 from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.slots import any_of
@@ -58,6 +58,10 @@ class ReverseStep(Step):
         for name, value in zip(LinkMotion._fields, chain, strict=False):
             self.scratch.write(f"chain.{name}", value, i)
 
+    def store_before(self, i: Any, chain: tuple) -> None:
+        for name, value in zip(Before._fields, chain, strict=True):
+            self.scratch.write(f"before.{name}", value, i)
+
     def reverse(
         self, arm: Lanes, pressure: Lanes, moved: jax.Array, shown: TraceCotangents
     ) -> Lanes:
@@ -90,10 +94,11 @@ class ReverseStep(Step):
             SelfContactsVjp(sweep, problem.self_contacts).run()
         metered = layout.scene.effects.air_mass
         end = chambers.end_pressures(self, pressure) if metered else pressure
-        base = sweep.fingers(end, self._centre_bar(centre, shown.distance))
+        base, wrist = sweep.fingers(end, self._centre_bar(centre, shown.distance))
         if metered:
             chambers.reverse(self, bars, pressure)
         base = sweep.palm_and_table(base)
+        before = before | plus({n: before[n] for n in wrist}, wrist)
         return self._palm_bars(state, arm, base, before, (now, virtual, acc_bar[0]), shown)
 
     def _integration(

@@ -18,7 +18,11 @@ from codesign_jax.engines.structured.kernel import objects, sdf_collision, self_
 from codesign_jax.engines.structured.kernel.contact_sets import ContactSet, cone_of
 from codesign_jax.engines.structured.kernel.friction_memory import behind, held_work
 from codesign_jax.engines.structured.kernel.problem import make_body
-from codesign_jax.engines.structured.kernel.step import link_forces, palm_and_object
+from codesign_jax.engines.structured.kernel.step import (
+    carried_momentum,
+    link_forces,
+    palm_and_object,
+)
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.laws import contact, holding, rings, shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import friction_by_contact, which_cone
@@ -40,6 +44,23 @@ class LinkMotion(NamedTuple):
     bias: Any  # Spatial acceleration at zero joint acceleration, same shape
     link_acc: Any  # Spatial acceleration without velocity terms, same shape
     along: Any  # Virtual spatial acceleration, same shape
+
+
+class FastMotion(NamedTuple):
+    """What they inherit of what they carry over, see `inertia.carried_force`: as `LinkMotion`."""
+
+    origin: Any
+    frame: Any
+    vel: Any
+    along: Any
+
+
+class Before(NamedTuple):
+    """The same as the last step ended."""
+
+    origin: Any
+    frame: Any
+    vel: Any
 
 
 class BodyMotion(NamedTuple):
@@ -219,6 +240,16 @@ def of_link(scene: Scene, chain: LinkMotion, numbers: dict, joint: dict, fixed: 
     inertial = armature * fixed["acc"] - stored["tau"]
     power = dot(body.times(after[4]) - stored["smooth"], along) + dot(inertial, fixed["virtual"])
     return LinkMotion(*after, along), dot(fixed["centre_bar"], stored["body_centre"]) - power
+
+
+def of_fast_link(
+    scene: Scene, now: FastMotion, before: Before, numbers: dict, joint: dict, fixed: dict
+):
+    """What a link hands on, and the power of the momentum that it carries over; see `of_link`."""
+    joint = joint | {"order": fixed["order"]}
+    after, behind, axes, force = carried_momentum(scene, now[:3], before, numbers, joint)
+    along = next_acceleration(now.along, axes, fixed["virtual"])
+    return FastMotion(*after, along), Before(*behind), dot(force, along)
 
 
 def of_palm(timestep: float, state: dict, arm, constants: dict, fixed: dict) -> tuple:

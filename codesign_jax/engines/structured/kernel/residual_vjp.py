@@ -24,8 +24,10 @@ from codesign_jax.engines.structured.kernel.memory import choose, loop
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.problem import Iterate
 from codesign_jax.engines.structured.kernel.residual import (
+    Before,
     BodyMotion,
     CentreLineSegment,
+    FastMotion,
     LinkMotion,
 )
 from codesign_jax.engines.structured.kernel.self_contacts import (
@@ -33,7 +35,7 @@ from codesign_jax.engines.structured.kernel.self_contacts import (
     FingerPairing,
 )
 from codesign_jax.engines.structured.kernel.slots import any_of
-from codesign_jax.engines.structured.kernel.step import Step
+from codesign_jax.engines.structured.kernel.step import WRIST, Step, bases_before
 from codesign_jax.engines.structured.kernel.step_memory import FINGER_CONSTANTS, LINK_CONSTANTS
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import shapes, surroundings
@@ -70,6 +72,7 @@ class ResidualVjp:
         self.block = step.block
         self.like = step.like
         self.power_bar = lanes([self.like + 1.0], (), wide=True)
+        self.wrist = {n: state[n] for n in WRIST}
         self.object = {"columns": bodies["columns"], "object_vel": bodies["object_vel"]}
         self.object |= {"height": state["position"][2]}
         if self.layout.scene.fixture:
@@ -88,8 +91,11 @@ class ResidualVjp:
         names = (f"chain.{n}" for n in LinkMotion._fields)
         return LinkMotion(*(self.scratch.read(n, i) for n in names))
 
-    def fingers(self, pressure: Lanes, centre_bar: Lanes) -> LinkMotion:
-        """From the tips inwards; cotangents of what the palm hands on, on each lane."""
+    def fingers(self, pressure: Lanes, centre_bar: Lanes) -> tuple[LinkMotion, dict[str, Lanes]]:
+        """From the tips inwards; cotangents of what the palm hands on, on each lane.
+
+        Also returns those of `WRIST` by the momenta that fast links carry over.
+        """
         layout = self.layout
         tips = self.layout.links
         touching = [n for n in ("finger_object", "finger_table") if n in self.contacts]
@@ -106,7 +112,8 @@ class ResidualVjp:
         after = LinkMotion(*(zeros(shape, self.like) for shape in SHAPES))
         after = self.more(after, tips)
         base = loop(tips, link, after, layout.size, reverse=True)
-        return self._mount(base, centre_bar)
+        base, wrist = self._fast_links(base)
+        return self._mount(base, centre_bar), wrist
 
     def none(self, name: str) -> Lanes:
         return zeros(getattr(SHAPES, name), self.like)
@@ -135,6 +142,43 @@ class ResidualVjp:
         self.bars.add(bars | {"pressure": moved.pop("pressure")})
         self.bars.add_joint(moved, i)
         return before
+
+    def _fast_links(self, base: LinkMotion) -> tuple[LinkMotion, dict[str, Lanes]]:
+        """Adds the momenta that links carry over to what the fingers' bases hand on.
+
+        Also returns their cotangents of `WRIST`.
+        """
+        wrist = {n: zeros(value.shape[:1], self.like) for n, value in self.wrist.items()}
+        empty = FastMotion(*(self.none(n) for n in FastMotion._fields)), wrist
+        bars, wrist = choose(self.step.fast, self._carried_momenta, empty, self.layout.size)
+        return _add(base, **bars._asdict()), self.block.sum(wrist)
+
+    def _carried_momenta(self) -> tuple[FastMotion, dict[str, Lanes]]:
+        run = partial(residual.of_fast_link, self.layout.scene)
+
+        def link(i: Any, after: tuple) -> tuple:
+            chain = self.chain(i)
+            now = FastMotion(*(getattr(chain, n) for n in FastMotion._fields))
+            before = Before(*(self.scratch.read(f"before.{n}", i) for n in Before._fields))
+            constants = self.step.link_constants(i)
+            numbers = {n: constants[n] for n in ("offset", "mass", "centre", "inertia")}
+            joint = self.step.joint(i)
+            fixed = {"order": self.step.order(i), "virtual": self.scratch.read("virtual", i)}
+            del joint["acc"]
+            given = now, before, numbers, joint
+            *bars, numbers, joint = pull(run, given, (fixed,), (*after, self.power_bar))
+            self.bars.add(numbers, i)
+            self.bars.add_joint(joint, i)
+            return tuple(bars)
+
+        tips = (t(*(self.none(n) for n in t._fields)) for t in (FastMotion, Before))
+        now, before = loop(self.layout.links, link, tuple(tips), self.layout.size, reverse=True)
+        names = ("mount", "base")
+        given = *self.wrist.values(), *(self.step.hand.read(n) for n in names)
+        run = partial(bases_before, self.layout.scene.discretization.timestep)
+        *wrist, mount, place = pull(run, given, (), tuple(before))
+        self.bars.add({"mount": mount, "base": place})
+        return now, dict(zip(self.wrist, wrist, strict=True))
 
     def _mount(self, base: LinkMotion, centre_bar: Lanes) -> LinkMotion:
         read = self.step.hand.read

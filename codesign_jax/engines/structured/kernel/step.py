@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import chambers, friction_memory, objects
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, ContactSet, zeros
-from codesign_jax.engines.structured.kernel.memory import loop
+from codesign_jax.engines.structured.kernel.memory import anywhere, loop
 from codesign_jax.engines.structured.kernel.newton import Newton
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem, triangle
@@ -39,6 +39,7 @@ class Step(StepMemory):
     """One time step of a block."""
 
     search: SelfCollision | None = None
+    fast: jax.Array  # Whether a link turns by more than `inertia.LARGEST_TURN` in this step
 
     def advance(
         self,
@@ -116,6 +117,29 @@ class Step(StepMemory):
     def store_chain(self, i: Any, chain: tuple) -> None:
         """Called with what the forward pass carries before joint i, and behind the last one."""
 
+    def store_before(self, i: Any, chain: tuple) -> None:
+        """Called with origin, frame and velocity before joint i where the last step began."""
+
+    def _carry_momenta(self, state: dict, chain: tuple[Lanes, ...]) -> None:
+        """Adds the forces that carry over the momenta of links that turn fast.
+
+        Args:
+          chain: Origin, frame and velocity of the fingers' bases.
+        """
+        scene = self.layout.scene
+        given = *(state[n] for n in WRIST), *(self.hand.read(n) for n in ("mount", "base"))
+        before = lanewise(partial(bases_before, scene.discretization.timestep), *given)
+
+        def link(i: Any, chains: tuple) -> tuple:
+            self.store_before(i, chains[1])
+            joint = self.joint(i) | {"order": self.order(i)}
+            run = partial(carried_momentum, scene)
+            now, before, _, force = lanewise(run, *chains, self.link_constants(i), joint)
+            self.write("smooth", lanewise(jnp.add, self.read("smooth", i), force), i)
+            return now, before
+
+        loop(self.layout.links, link, (chain, before), self.layout.size)
+
     def _bases(self, bodies: dict) -> tuple[Lanes, ...]:
         """The fingers' bases: origin, frame, velocity, bias, acceleration, and weighted centre."""
         names = ("mount", "base", "centre_weight", "stub_centre")
@@ -156,12 +180,13 @@ class Step(StepMemory):
         zero_acc = zeros((6,), like)
 
         def link(i: Any, carry: tuple) -> tuple:
-            origin, frame, vel, bias, link_acc, middle = carry
-            self.store_chain(i, carry[:5])
+            *chain, middle, least = carry
+            self.store_chain(i, chain)
             joint = self.joint(i) | {"pressure": pressure, "order": self.order(i)}
             run = partial(link_forces, layout.scene)
             constants = self.link_constants(i)
-            carry, stored = lanewise(run, carry[:5], constants, joint)
+            chain, stored = lanewise(run, tuple(chain), constants, joint)
+            least = lanewise(jnp.minimum, least, stored.pop("share"))
             centre = stored["body_centre"]
             stored |= {"step_acc": zeros((layout.axes,), like), "step_link_acc": zero_acc}
             if layout.team > 1:
@@ -170,13 +195,16 @@ class Step(StepMemory):
                 self.write(name, value, i)
             weight = self.hand.read("centre_weight", i + 1)
             middle = lanewise(add_weighted, middle, centre, weight)
-            fields.of_link(i, carry)
+            fields.of_link(i, chain)
             if search:
-                search.link(i, carry[4], carry[2], carry[1], carry[0])
-            return (*carry, middle)
+                search.link(i, chain[4], chain[2], chain[1], chain[0])
+            return (*chain, middle, least)
 
-        origin, frame, vel, bias, link_acc, middle = loop(layout.links, link, start, layout.size)
-        self.store_chain(layout.links, (origin, frame, vel, bias, link_acc))
+        start = (*start, lanewise(jnp.ones_like, start[0][0]))
+        *chain, middle, least = loop(layout.links, link, start, layout.size)
+        self.store_chain(layout.links, tuple(chain))
+        self.fast = anywhere(least.lane < 1)
+        jax.lax.cond(self.fast, lambda: self._carry_momenta(state, start[:3]), lambda: None)
         if search:
             search.find()
         if search and layout.team > 1:
@@ -224,7 +252,8 @@ def palm_and_object(timestep: float, state: dict, arm, constants: dict) -> dict[
     now = Iterate(acc[0], palm_acceleration(acc[0], axes), acc[1])
     smooth_palm = palm.smooth_force(vel, bias, gravity)
     smooth_palm = pushed("palm", smooth_palm, palm.mass, centre, constants)
-    smooth_object = grasped.smooth_force(object_vel, gravity)
+    inverse = inertia.principal_tensor(columns, 1 / constants["object_inertia"])
+    smooth_object = grasped.smooth_force(object_vel, gravity, inverse, timestep)
     origin = jnp.zeros_like(smooth_object[:3])  # the object's centre
     smooth_object = pushed("object", smooth_object, grasped.mass, origin, constants)
     smooth = smooth_palm, smooth_object
@@ -276,7 +305,8 @@ def link_forces(scene: Scene, parent: tuple, constants: dict, joint: dict):
     if "section" in constants:
         bend = bend + inertia.softening_moment(constants["section"], hinges[0][:1], q[:1])
     tau = jnp.concatenate([bend, tau[1:]])
-    smooth = body.smooth_force(vel, bias, constants.get("gravity"))
+    share = inertia.share_of_products(vel[:3], scene.discretization.timestep)
+    smooth = body.smooth_force(vel, bias, constants.get("gravity"), share)
     stored = {
         "axes": axes,
         "body_centre": body.centre,
@@ -284,10 +314,61 @@ def link_forces(scene: Scene, parent: tuple, constants: dict, joint: dict):
         "link_acc": link_acc,
         "smooth": pushed("link", smooth, body.mass, body.centre, constants),
         "tau": tau,
+        "share": share,
     }
     if springs.moment is not None:
         stored["armature_now"] = springs.armature
     return (origin, frame, vel, bias, link_acc), stored
+
+
+WRIST = ("wrist", "wrist_vel", "position")
+"""What `bases_before` takes of the state."""
+
+
+def bases_before(timestep: float, wrist, wrist_vel, position, mount, base) -> tuple:
+    """Origin, frame and velocity of the fingers' bases as the last step ended.
+
+    See `inertia.carried_force`.
+    """
+    wrist = wrist - timestep * wrist_vel
+    place = wrist[:3] - position
+    palm, _, vel, _ = kin.wrist_kinematics(place, wrist, wrist_vel)
+    frame, origin = kin.mounted(place, palm, mount, base)
+    return origin, frame, vel
+
+
+def carried_momentum(scene: Scene, now: tuple, before: tuple, constants: dict, joint: dict):
+    """What a link that turns fast gets for the rest of its velocity products.
+
+    Args:
+      now: Origin, frame and velocity of the link before it; `before`: as the last step ended.
+
+    Returns:
+      Both for the next link, the joint's axes, and the force, see `inertia.carried_force`.
+    """
+    h = scene.discretization.timestep
+    q = joint["finger"]
+    rate = joint["finger_vel"]
+    momenta = []
+    chains = []
+    for (origin, frame, vel), angles in ((before, q - h * rate), (now, q)):
+        origin, frame, axes = kin.turn_link(
+            joint_axes(scene),
+            origin,
+            frame,
+            constants["offset"],
+            jnp.cos(angles),
+            jnp.sin(angles),
+            joint["order"],
+        )
+        vel = vel + total([axes[k] * rate[k] for k in range(rate.shape[0])])
+        centre = origin + apply_columns(frame, constants["centre"])
+        body = constants["mass"], constants["inertia"], frame, centre
+        momenta.append(inertia.momentum(*body, vel))
+        chains.append((origin, frame, vel))
+    rest = (1 - inertia.share_of_products(vel[:3], h)) / h
+    force = inertia.carried_force(momenta[1], momenta[0], frame, centre, rest)
+    return chains[1], chains[0], axes, force
 
 
 def semi_implicit_euler(

@@ -1,12 +1,20 @@
-"""Spatial inertia and smooth forces: gravity, gyroscopic terms, springs, damping, actuators."""
+"""Spatial inertia and smooth forces: gravity, gyroscopic terms, springs, damping, actuators.
 
-from typing import NamedTuple
+Velocity products are the inertial forces at zero joint acceleration: centrifugal and Coriolis
+forces and gyroscopic moments. Taken at a step's start, as MuJoCo takes them, they are forward Euler
+on a rotation: a point that turns by x a step gains speed by the root of 1 + x^2. So a body gets
+them whole up to a turn, and beyond it the share of `share_of_products`; what stands in the place of
+the rest is `carried_force` of the fingers' links, and the mid-step rotation of
+`gyroscopic_moment` of the object. The palm turns by less than 0.05 rad a step and gets them whole.
+"""
+
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.lanes import cross, dot, spatial, total
-from codesign_jax.engines.structured.world_model import apply_columns, turn_columns
+from codesign_jax.engines.structured.world_model import apply_columns, apply_rows, turn_columns
 from codesign_jax.model.layout import implicit_spring
 from codesign_jax.model.morphology import softening, threshold_moments
 from codesign_jax.scene import Scene
@@ -49,22 +57,120 @@ class Body(NamedTuple):
             rows.append(jnp.stack([skew[j][i] for j in range(3)] + moving))
         return jnp.stack(rows)
 
-    def smooth_force(self, vel: jax.Array, bias: jax.Array, gravity: jax.Array | None) -> jax.Array:
+    def smooth_force(
+        self,
+        vel: jax.Array,
+        bias: jax.Array,
+        gravity: jax.Array | None,
+        share: jax.Array | float = 1.0,
+    ) -> jax.Array:
         """External minus inertial force at zero joint acceleration, shape (6, ...).
 
         Args:
           gravity: Magnitude of gravity, along -z [m/s^2]; None without the effect.
+          share: What is taken of the velocity products, see `share_of_products`.
         """
         omega = vel[:3]
         alpha = bias[:3]
         point_vel = vel[3:] + cross(omega, self.centre)
-        acc = bias[3:] + cross(alpha, self.centre) + cross(omega, point_vel)
+        acc = share * (bias[3:] + cross(alpha, self.centre) + cross(omega, point_vel))
         if gravity is not None:
             acc = jnp.stack([acc[0], acc[1], acc[2] + gravity])
         force = -self.mass * acc
         spin = apply_columns(self.tensor, omega)
-        moment = -apply_columns(self.tensor, alpha) - cross(omega, spin)
+        moment = -share * (apply_columns(self.tensor, alpha) + cross(omega, spin))
         return spatial(moment + cross(self.centre, force), force)
+
+
+LARGEST_TURN = 0.5
+"""Turn of a link in a step [rad] up to which its velocity products are taken whole [measured]: with
+1 rad long, thin fingers still gain energy after a release, and with 0.25 rad their path after it is
+less accurate."""
+
+
+LARGEST_FREE_TURN = 0.1
+"""The same of the object, whose spin nothing damps [chosen]: in half a second of flight, 10 ms a
+step, a box gains at most 5 % of its energy by such turns."""
+
+
+def share_of_products(
+    omega: jax.Array, timestep: float, largest: float = LARGEST_TURN
+) -> jax.Array:
+    """Share of a body's velocity products that a step takes, of its angular velocity (3, ...).
+
+    They are of second order in the velocities, so that a body which turns further than `largest` in
+    a step gets those of that turn along the same motion.
+    """
+    most = (largest / timestep) ** 2
+    return most / jnp.maximum(dot(omega, omega), most)
+
+
+def momentum(mass: Any, inertia: Any, frame: Any, centre: Any, vel: Any) -> jax.Array:
+    """Momentum about the centre of mass, in the body's axes, and that of the centre, (6, ...).
+
+    Args:
+      inertia: Principal moments of inertia, shape (3, ...).
+      frame: Columns of the orientation, shape (3, 3, ...).
+      vel: Spatial velocity, shape (6, ...).
+    """
+    return spatial(inertia * apply_rows(frame, vel[:3]), mass * (vel[3:] + cross(vel[:3], centre)))
+
+
+def carried_force(
+    now: jax.Array, before: jax.Array, frame: jax.Array, centre: jax.Array, rest: jax.Array
+) -> jax.Array:
+    """Force on a link that carries its momentum over from step to step, shape (6, ...).
+
+    The last step ended with velocities v at the place q - h v where it had begun; this one begins
+    with them at q. With the difference of both momenta over the step as inertial force, the new
+    velocities are the old motion's projection, in the metric of the masses, on what the joints
+    allow at q, and no kinetic energy arises. It is of first order in the step, and products of the
+    last velocities are of second order, which is why only fast links have it. The momentum about
+    the centre turns with the body, in whose axes its metric stays as it is: the moment that this
+    leaves out is a thousandth of the others, whose arm is the finger and not the link.
+
+    Args:
+      now: `momentum` at q; `before`: at q - h v.
+      frame: Columns of the orientation at q; `centre`: the centre of mass there.
+      rest: What `share_of_products` leaves, over the step [1/s].
+    """
+    change = rest * (before - now)
+    force = change[3:]
+    return spatial(apply_columns(frame, change[:3]) + cross(centre, force), force)
+
+
+ROTATIONS = 3
+"""Iterations of `gyroscopic_moment` [measured]: two let the energy of a box at 100 rad/s double."""
+
+
+def gyroscopic_moment(
+    tensor: jax.Array, inverse: jax.Array, omega: jax.Array, timestep: float
+) -> jax.Array:
+    """Gyroscopic moment on a free body, shape (3, ...).
+
+    Velocities are those of the middle between two places. So beyond `LARGEST_FREE_TURN` the new
+    one, v, has the body's angular momentum when the body has turned on by h v / 2, as the last one
+    has it half a step ago. Each iterate has the length of that momentum: the energy is bounded at
+    any speed.
+
+    Args:
+      tensor: Rotational inertia about the centre, world axes, and its inverse, (3, 3, ...).
+    """
+    spin = apply_columns(tensor, omega)
+    carried = _turned(spin, -timestep / 2 * omega)
+    new = omega
+    for _ in range(ROTATIONS):
+        new = apply_columns(inverse, _turned(carried, -timestep / 2 * new))
+    share = share_of_products(omega, timestep, LARGEST_FREE_TURN)
+    rest = (1 - share) / timestep
+    return rest * apply_columns(tensor, new - omega) - share * cross(omega, spin)
+
+
+def _turned(vector: jax.Array, angle: jax.Array) -> jax.Array:
+    """Vector turned by a rotation vector, to the second order of its angle; keeps the length."""
+    half = angle / 2
+    aside = cross(half, vector)
+    return vector + 2 / (1 + dot(half, half)) * (aside + cross(half, aside))
 
 
 class Centred(NamedTuple):
@@ -86,18 +192,20 @@ class Centred(NamedTuple):
             rows.append(jnp.concatenate([none, moving]))
         return jnp.stack(rows)
 
-    def smooth_force(self, vel: jax.Array, gravity: jax.Array | None) -> jax.Array:
+    def smooth_force(
+        self, vel: jax.Array, gravity: jax.Array | None, inverse: jax.Array, timestep: float
+    ) -> jax.Array:
         """Gravity and gyroscopic moment, shape (6, ...); see `Body.smooth_force`.
 
         The velocity of the centre causes no force: the body's coordinates are its own velocity.
 
         Args:
           gravity: Magnitude of gravity, along -z [m/s^2]; None without the effect.
+          inverse: Of the rotational inertia.
         """
-        omega = vel[:3]
         zero = jnp.zeros_like(vel[0])
         weight = zero if gravity is None else -self.mass * gravity + zero
-        moment = -cross(omega, apply_columns(self.tensor, omega))
+        moment = gyroscopic_moment(self.tensor, inverse, vel[:3], timestep)
         return spatial(moment, jnp.stack([zero, zero, weight]))
 
 

@@ -35,6 +35,7 @@ __all__ = [
     "sphere_radii",
     "softening",
     "sphere_places",
+    "threshold_energy",
     "threshold_moments",
     "thresholds",
 ]
@@ -294,3 +295,11 @@ def threshold_moments(numbers: tuple, pressure: Any, bend: Any, lateral: Any) ->
     taut = moment > 0
     length = lateral.__array_namespace__().sqrt(lateral**2 + angle**2)
     return moment * taut / length, loss * (length - angle) * taut
+
+
+def threshold_energy(numbers: tuple, pressure: Any, bend: Any, lateral: Any) -> Any:
+    """The energy of `threshold_moments`, with its arguments [J]."""
+    per_pressure, loss, angle = numbers
+    moment = per_pressure * pressure - loss * bend
+    length = lateral.__array_namespace__().sqrt(lateral**2 + angle**2)
+    return moment * (moment > 0) * (length - angle)

@@ -4,6 +4,7 @@ Section frame: y = height above the inextensible bottom layer, z = width, x alon
 outer section is width x height with walls of equal thickness around one air chamber.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -86,13 +87,30 @@ def softening(curvature: Any, height: Any, wall: Any, *, width: Any) -> Any:
       wall: Wall thickness d [m], likewise.
       width: Outer width w [m].
     """
+    return _lacking(
+        lambda e: e * (3 + 2 * e) / (2 * (1 + e) ** 2), curvature, height, wall, width=width
+    )
+
+
+def softening_energy(curvature: Any, height: Any, wall: Any, *, width: Any) -> Any:
+    """Share of the linear bending energy that it lacks; `softening`'s integral, and its arguments.
+
+    A neo-Hookean block of width b from 0 to y stores G/2 int (lambda^2 + lambda^-2 - 2) dA per
+    length, 2/3 G b y^3 kappa^2 (1 - 3/4 e / (1 + e)) with e = kappa y, so that the moment
+    M = dU / d kappa of the energy U = E I kappa^2 / 2 (1 - u) has in u the sum of `softening` with
+    e / (1 + e) in the place of r(e).
+    """
+    return _lacking(lambda e: e / (1 + e), curvature, height, wall, width=width)
+
+
+def _lacking(of_strain: Callable, curvature: Any, height: Any, wall: Any, *, width: Any) -> Any:
+    """[w h^3 f(kappa h) - w_c ((h-d)^3 f(kappa (h-d)) - d^3 f(kappa d))] / (4 I_0) of f(e)."""
     kappa = curvature * (curvature > 0)
     inner = height - wall
     chamber = width - 2 * wall
 
     def missing(y: Any) -> Any:
-        e = kappa * y
-        return y**3 * e * (3 + 2 * e) / (2 * (1 + e) ** 2)
+        return y**3 * of_strain(kappa * y)
 
     second_moment = (width * height**3 - chamber * (inner**3 - wall**3)) / 3
     lacking = width * missing(height) - chamber * (missing(inner) - missing(wall))

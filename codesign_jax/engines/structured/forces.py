@@ -32,6 +32,24 @@ def forces(scene: Scene, hand: WorldModel, state: State, *, touch: bool = False)
     return _summed(program, stored, state.position, touch=touch)
 
 
+def contact_energy(scene: Scene, hand: WorldModel, state: State) -> jax.Array:
+    """Energy of the springs of all contacts and of the friction that they hold [J], shape (world,).
+
+    See `holding.stored_energy`.
+    """
+    program = ForceProgram.of(scene, state.wrist.dtype, state.wrist.shape[-1])
+    stored = program.stored(hand, state)
+    total = jnp.zeros_like(state.wrist[0, 0])
+    for contacts in program.sets:
+        energy = stored[f"{contacts.name}.energy"]
+        if isinstance(contacts, SelfContactSet):
+            # Both fingers of a pair have the contact; rows of a finger with itself have it once.
+            single = np.arange(contacts.rows) < contacts.with_itself
+            energy = energy * np.where(single, 1.0, 0.5)[:, None, None, None]
+        total = total + energy.reshape(-1, total.shape[0]).sum(0)
+    return total
+
+
 def shapes(scene: Scene, worlds: int, dtype: Any) -> Forces:
     """Shapes of the forces of so many worlds, without `Forces.touch`."""
     program = ForceProgram.of(scene, dtype, worlds)

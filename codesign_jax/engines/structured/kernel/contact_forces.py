@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from codesign_jax import reuse
 from codesign_jax.compiler.launch import Kernel, launch
+from codesign_jax.engines.structured.kernel import friction_memory
 from codesign_jax.engines.structured.kernel.contact_sets import (
     BoundContacts,
     ContactSet,
@@ -32,7 +33,7 @@ from codesign_jax.engines.structured.kernel.self_contacts import (
 from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise, of_code
-from codesign_jax.engines.structured.laws import contact
+from codesign_jax.engines.structured.laws import contact, holding
 from codesign_jax.engines.structured.laws.contact import Cone
 from codesign_jax.engines.structured.laws.kinematics import State
 from codesign_jax.engines.structured.laws.rings import Place
@@ -41,8 +42,8 @@ from codesign_jax.scene import Scene
 
 FAR = 1e3
 """A gap that no ring has [m]."""
-PAIR = ("pressing", "depth")
-"""Sum of the normal forces [N] and largest depth [m] of a pairing of fingers, see
+PAIR = ("pressing", "depth", "energy")
+"""Sum of the normal forces [N], largest depth [m] and energy [J] of a pairing of fingers, see
 `self_contacts`: with the other finger, or itself, and with the palm."""
 
 
@@ -51,9 +52,9 @@ class ForceProgram(Program):
 
     Attributes:
       stored_rows: What the kernel stores: for each item of a contact set the `Place` of its k
-        contacts, and "force", shape (3, k): the force on the first body [N], world axes, which is
-        the finger, the palm, or the object on table and fixtures. For each pairing of fingers
-        `PAIR`, shape (2,).
+        contacts, "force", shape (3, k): the force on the first body [N], world axes, which is
+        the finger, the palm, or the object on table and fixtures, and "energy", shape (k,): that
+        of `holding.stored_energy`. For each pairing of fingers `PAIR`, shape (2,).
     """
 
     @classmethod
@@ -69,7 +70,8 @@ class ForceProgram(Program):
             if isinstance(contacts, SelfContactSet):
                 groups |= {f"{contacts.name}.{field}": (contacts.rows, (2,)) for field in PAIR}
                 continue
-            shapes = place_shapes(contacts.k) | {"force": (3, contacts.k)}
+            shapes = place_shapes(contacts.k)
+            shapes |= {"force": (3, contacts.k), "energy": (contacts.k,)}
             for field, shape in shapes.items():
                 groups[f"{contacts.name}.{field}"] = contacts.count, shape
         self.stored_rows = MemoryLayout(True, **groups)
@@ -157,7 +159,9 @@ class ForceStep(Step):
 
     def _store_self_contacts(self, contacts: BoundSelfContacts) -> None:
         def of_row(row: jax.Array, x: jax.Array) -> jax.Array:
-            itself = contacts.pairing(row).itself
+            pairing = contacts.pairing(row)
+            itself = pairing.itself
+            hold = friction_memory.of_row(self, contacts, row)
 
             def add(item: Any, sums: list[Lanes]) -> list[Lanes]:
                 palm = jnp.zeros_like(self.like)
@@ -166,10 +170,11 @@ class ForceStep(Step):
                 side = lanes([palm], (), wide=True)
                 with contacts.with_cone(row, item):
                     given = contacts.place(item), contacts.cone, contacts.read("jar", item)
-                    return lanewise(with_slot, sums, side, *given)
+                    held = [lanewise(jnp.multiply, h, contacts.holds(item, pairing)) for h in hold]
+                    return lanewise(with_slot, sums, side, *given, *held)
 
             none = zeros((2,), self.like)
-            for name, value in zip(PAIR, contacts.fold(row, add, [none, none]), strict=True):
+            for name, value in zip(PAIR, contacts.fold(row, add, [none] * 3), strict=True):
                 self.stored.write(f"{contacts.set.name}.{name}", value, row)
             return x
 
@@ -196,7 +201,8 @@ class StoredContacts(BoundContacts):
         if hold is not None:
             jar = lanewise(with_held, jar, place, cone, hold[0])
         force = lanewise(solved_force, place, cone, jar)
-        for field, value in (place._asdict() | {"force": force}).items():
+        energy = lanewise(stored_energy, place, cone, None if hold is None else hold[0])
+        for field, value in (place._asdict() | {"force": force, "energy": energy}).items():
             self.write(field, value, item)
 
 
@@ -214,10 +220,17 @@ def solved_force(place, cone, jar):
     return jnp.where(contacts.active, force, 0.0)
 
 
-def with_slot(sums, palm, place, cone, jar):
+def stored_energy(place, cone, held_friction):
+    """Energies (k,) of an item's contacts."""
+    return holding.stored_energy(ContactSet.contacts(place, cone), held_friction)
+
+
+def with_slot(sums, palm, place, cone, jar, held_friction=None):
     """Adds a slot's contact to a pairing's `PAIR`; palm: 1 for a contact with the palm, else 0."""
-    pressing, depth = sums
+    pressing, depth, energy = sums
+    held_friction = None if held_friction is None else held_friction[:, None]
+    stored = sum_axis(stored_energy(place, cone, held_friction), 0)
     force = sum_axis(dot(place.normal, solved_force(place, cone, jar)), 0)
     deep = jnp.where(place.share[0] > 0, jnp.maximum(-place.gap[0], 0.0), 0.0)
     side = jnp.stack([1.0 - palm, palm])
-    return [pressing + side * force, jnp.maximum(depth, side * deep)]
+    return [pressing + side * force, jnp.maximum(depth, side * deep), energy + side * stored]

@@ -52,6 +52,16 @@ def hold(contacts: Contacts, force: jax.Array, held_friction: jax.Array) -> jax.
     )
 
 
+def stored_energy(contacts: Contacts, held_friction: jax.Array | None) -> jax.Array:
+    """Energy of contacts' springs [J]: the normal one's, and that of `held`, if there is any."""
+    cone = contacts.cone
+    energy = _elastic(contacts) * jnp.maximum(-contacts.gap, 0.0) / 2
+    if held_friction is None or cone.tangential_mass is None:
+        return energy
+    tangent = held(contacts, held_friction)[:3] / cone.damper
+    return energy + cone.tangential_mass * dot(tangent, tangent) / 2
+
+
 def _elastic(contacts: Contacts) -> jax.Array:
     """Normal force of a contact at rest."""
     cone = contacts.cone

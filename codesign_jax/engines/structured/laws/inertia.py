@@ -16,8 +16,9 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.lanes import cross, dot, spatial, total
 from codesign_jax.engines.structured.world_model import apply_columns, apply_rows, turn_columns
 from codesign_jax.model.layout import implicit_spring
-from codesign_jax.model.morphology import softening, threshold_moments
+from codesign_jax.model.morphology import softening, threshold_energy, threshold_moments
 from codesign_jax.scene import Scene
+from codesign_jax.scene.beams import softening_energy
 
 
 class Body(NamedTuple):
@@ -225,6 +226,30 @@ def softening_moment(section: jax.Array, stiffness: jax.Array, angle: jax.Array)
     """As `model.softening_moments`: of a section (4, finger, world), stiffness and bend angles."""
     height, wall, segment, width = section
     return stiffness * angle * softening(angle / segment, height, wall, width=width)
+
+
+def joint_energy(constants: dict, pressure: jax.Array, q: jax.Array) -> jax.Array:
+    """Energy of a joint's springs, less the work that its chamber does at a pressure [J].
+
+    The moments of `springs`, of `softening_moment` and of the chamber are minus its slopes by the
+    angles. At a constant pressure they can only exchange it with other energy.
+
+    Args:
+      constants: What `link_forces` takes of the springs, "stiffness" and "gain", and, of scenes
+        with these effects, "section" and "threshold".
+      pressure: Of the chamber [Pa].
+      q: Angles, shape (axis, ...).
+    """
+    stiffness = constants["stiffness"]
+    energy = total([k * x**2 / 2 for k, x in zip(stiffness, q, strict=True)])
+    energy = energy - constants["gain"] * pressure * q[0]
+    if "section" in constants:
+        height, wall, segment, width = constants["section"]
+        share = softening_energy(q[0] / segment, height, wall, width=width)
+        energy = energy - stiffness[0] * q[0] ** 2 / 2 * share
+    if "threshold" in constants:
+        energy = energy + threshold_energy(tuple(constants["threshold"]), pressure, q[0], q[1])
+    return energy
 
 
 class Springs(NamedTuple):

@@ -1,0 +1,159 @@
+"""The energy audit: what simulated worlds gain beyond the work of chambers, wrist and arm.
+
+A hand and its object have kinetic energy, that of gravity, of the fingers' springs, of contacts'
+springs and of the friction that these hold. Dampers and sliding only take from it, so that it may
+grow by the work of the chambers and of the arm, which moves the wrist's springs, and by no more.
+The audit reads a path only, and so holds for every engine, law and time step.
+
+A step leaves velocities v and the place q that they led to: they are those of the middle of the
+step, where the audit takes the energy, at q - h v / 2. With the default integrator the balance of
+linear springs and dampers is then exact at any step, but for what dampers take.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from codesign_jax.engines.structured import coordinates, forces
+from codesign_jax.engines.structured.lanes import cross, dot
+from codesign_jax.engines.structured.laws import inertia, integration
+from codesign_jax.engines.structured.laws import kinematics as kin
+from codesign_jax.engines.structured.world_model import (
+    WorldModel,
+    apply_columns,
+    joint_sections,
+    world_constants,
+)
+from codesign_jax.model import joint_axes
+from codesign_jax.scene import Scene
+
+
+class Path(NamedTuple):
+    """States before every step; `StructuredEngine.states` has them by these names."""
+
+    qpos: Any  # Shape (world, time, nq)
+    qvel: Any  # Shape (world, time, nv)
+    held: Any = None  # Friction that contacts hold, (world, time, n); None for none
+
+
+class Audit(NamedTuple):
+    """What worlds gain from the middle of each step to that of the next one.
+
+    Attributes:
+      gain: Energy beyond the work done [J], shape (world, time - 1).
+      stored: Kinetic energy and that of the fingers' springs [J], in the middle of each step before
+        the states, shape (world, time): what a gain is compared with.
+    """
+
+    gain: np.ndarray
+    stored: np.ndarray
+
+    def rise(self, first: int = 0, steps: int | None = None) -> np.ndarray:
+        """Largest gain over consecutive steps [J], any number or at most `steps`, shape (world,).
+
+        Args:
+          first: The first step that counts.
+          steps: Largest number of steps.
+        """
+        total = np.cumsum(np.pad(self.gain[:, first:], ((0, 0), (1, 0))), axis=1)
+        length = total.shape[1]
+        spans = range(1, length if steps is None else min(steps + 1, length))
+        if steps is None:
+            return (total - np.minimum.accumulate(total, 1)).max(1)
+        return np.max([(total[:, n:] - total[:, : length - n]).max(1) for n in spans], axis=0)
+
+
+def audit(scene: Scene, fields: Any, ctrl: Any, path: Path) -> Audit:
+    """Audits paths.
+
+    Args:
+      scene: The scene, with a wrist and without `effects.air_mass`: an arm without a wrist does
+        work that a path does not tell, and the air of sealed chambers stores energy.
+      fields: Model fields of the worlds.
+      ctrl: Their controls, shape (world, time, nu).
+      path: Their paths.
+
+    Raises:
+      ValueError: If the scene has effects whose work cannot be told from a path.
+    """
+    if scene.effects.air_mass or not scene.effects.wrist:
+        raise ValueError("an energy audit needs effects.wrist and no effects.air_mass")
+    run = jax.jit(partial(_world, scene))
+    worlds = []
+    for k in range(len(ctrl)):
+        held = () if path.held is None else (jnp.asarray(path.held[k]),)
+        one = jax.tree.map(lambda v, k=k: jnp.asarray(v[k]), fields)
+        rows = (jnp.asarray(v[k]) for v in (ctrl, path.qpos, path.qvel))
+        worlds.append([np.asarray(v, float) for v in run(one, *rows, *held)])
+    at_mid, carried, stored = (np.stack(v) for v in zip(*worlds, strict=True))
+    return Audit(carried[:, 1:] - at_mid[:, :-1], stored)
+
+
+def _world(scene: Scene, fields: Any, ctrl: Any, qpos: Any, qvel: Any, *held: Any) -> tuple:
+    """Energies of a world in the middles of steps, shape (time,).
+
+    That with the controls of the step that follows, that with those of the step before it and less
+    the wrist's work in between, and the kinetic one with that of the springs.
+    """
+    times = len(qpos)
+    hand = world_constants(scene, jax.tree.map(lambda v: jnp.repeat(v[None], times, 0), fields))
+    state = coordinates.make(scene, qpos, qvel, jnp.zeros_like(qvel), *held)
+    state = integration.before(state, scene.discretization.timestep / 2)
+    kinetic, height = _bodies(hand, kin.kinematics(hand, joint_axes(scene), state), state)
+    other = kinetic + forces.contact_energy(scene, hand, state)
+    if scene.effects.gravity:
+        other = other + hand.step_numbers["gravity"][0] * height
+    constants = _joints(scene, hand)
+    q = jnp.moveaxis(state.finger, 1, 0)
+
+    def joints(pressure: jax.Array) -> jax.Array:
+        return inertia.joint_energy(constants, pressure, q).sum((0, 1))
+
+    pressure = ctrl[:, 6:].T
+    springs = joints(jnp.zeros_like(pressure))
+    before = jnp.roll(pressure, 1, 1)
+    wrist = state.wrist[:, 0]
+    last = jnp.roll(wrist, 1, 1)
+    arm = jnp.roll(ctrl[:, :6].T, 1, 1)
+    work = (hand.wrist_stiffness[:, 0] * (arm - (wrist + last) / 2) * (wrist - last)).sum(0)
+    return other + joints(pressure), other + joints(before) - work, kinetic + springs
+
+
+def _bodies(hand: WorldModel, kinematics: kin.Kinematics, state: kin.State) -> tuple:
+    """Kinetic energy of all bodies [J], and the sum of their masses times heights [kg m]."""
+    k = kinematics
+    links = inertia.Body(
+        hand.mass,
+        k.origin + apply_columns(k.link, hand.centre),
+        inertia.principal_tensor(k.link, hand.inertia),
+    )
+    palm = inertia.Body(
+        hand.palm_mass,
+        k.place + apply_columns(k.palm, hand.palm_centre),
+        inertia.turned_tensor(k.palm, hand.palm_inertia),
+    )
+    tensor = inertia.principal_tensor(k.object, hand.object_inertia)
+    grasped = inertia.Body(hand.object_mass, jnp.zeros_like(state.position), tensor)
+    kinetic = 0.0
+    height = 0.0
+    for body, vel in ((links, k.vel), (palm, k.palm_vel), (grasped, k.object_vel)):
+        point = vel[3:] + cross(vel[:3], body.centre)
+        spin = dot(vel[:3], apply_columns(body.tensor, vel[:3]))
+        energy = (body.mass * dot(point, point) + spin) / 2
+        kinetic = kinetic + energy.reshape(-1, energy.shape[-1]).sum(0)
+        lifted = body.mass * (body.centre[2] + state.position[2])
+        height = height + lifted.reshape(-1, lifted.shape[-1]).sum(0)
+    return kinetic, height
+
+
+def _joints(scene: Scene, hand: WorldModel) -> dict[str, jax.Array]:
+    """What `inertia.joint_energy` takes, of all joints: shapes (..., link, finger, world)."""
+    constants = {"stiffness": jnp.moveaxis(hand.stiffness, 1, 0), "gain": hand.gain}
+    if scene.effects.neo_hookean:
+        constants["section"] = jnp.moveaxis(joint_sections(hand, len(hand.stiffness)), 1, 0)
+    if hand.threshold is not None:
+        constants["threshold"] = jnp.moveaxis(hand.threshold, 1, 0)
+    return constants

@@ -28,7 +28,11 @@ from codesign_jax import axes, control, model, reuse
 from codesign_jax.cost import outcome, shown
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording
+from codesign_jax.engines.structured import coordinates
+from codesign_jax.engines.structured.laws.kinematics import kinematics
+from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.judge.verdict import as_bit
+from codesign_jax.model.layout import layout
 from codesign_jax.preflight import invalid_start
 from codesign_jax.preflight import nominal_trial as nominal_trial
 from codesign_jax.scene import Scene, draws, mesh_margins, schema, unit_slips
@@ -244,6 +248,49 @@ def evaluate(
     shape = params.length.shape[0], trials.yaw.shape[0]
     scene, params, trials = crossed(scene, params, trials)
     return grid(simulate(scene, engine, params, trials, **options)[0], shape)
+
+
+def tips(scene: Scene, params: Params, trial: Trial, qpos: jax.typing.ArrayLike) -> jax.Array:
+    """Positions of the finger tips in the world frame [m], shape (..., finger, 3).
+
+    A tip is the middle of the far end of the finger's inextensible side, on which the finger is
+    mounted.
+
+    Args:
+      scene: The scene.
+      params: Parameters of one hand.
+      trial: One trial.
+      qpos: Recorded positions, shape (..., nq), as `grasp(..., record_qpos=True).qpos`.
+
+    Raises:
+      InputError: If the positions are not those of this scene's hand and object, and as `simulate`.
+    """
+    batch = jax.tree.map(lambda v: jnp.asarray(v)[None], (params, trial))
+    axes.refuse(scene, *batch, ("world", "world"))
+    size = 13 + layout(scene).dofs.size  # of wrist, joints and the object's pose
+    if jnp.shape(qpos)[-1:] != (size,):
+        hint = "record_qpos=True records it" if jnp.shape(qpos)[-1:] == (0,) else "of this scene"
+        raise schema.InputError([f"qpos has shape {jnp.shape(qpos)}, not (..., {size}): {hint}"])
+    numbers = jax.tree.map(lambda v: jnp.asarray(v, float), scene.bare)
+    rows = jnp.reshape(jnp.asarray(qpos), (-1, size))
+    return _tips(numbers, params, trial, rows).reshape(*jnp.shape(qpos)[:-1], -1, 3)
+
+
+@jax.jit
+def _tips(scene: Scene, params: Params, trial: Trial, qpos: jax.Array) -> jax.Array:
+    """`tips` of positions of shape (time, nq)."""
+    fields = jax.tree.map(lambda v: v[None], model.model_fields(scene, params, trial))
+    hand = world_constants(scene, fields)
+
+    def at(row: jax.Array) -> jax.Array:
+        motionless = jnp.zeros((1, len(row) - 1), row.dtype)
+        state = coordinates.make(scene, row[None], motionless, motionless)
+        motion = kinematics(hand, layout(scene).axes, state)
+        origin = motion.origin[:, -1, :, 0] + state.position[:, 0]  # kinematics is about the object
+        along = motion.link[0, :, -1, :, 0]  # the first column of each orientation
+        return (origin + params.length / (2 * scene.discretization.links) * along).T
+
+    return jax.vmap(at)(qpos)
 
 
 def crossed(scene: Scene, params: Params, trials: Trial) -> tuple[Scene, Params, Trial]:

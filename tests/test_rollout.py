@@ -109,6 +109,38 @@ def pneuflex():
     return the_scene, *jax.tree.map(lambda v: np.reshape(v, (5, 3, *v.shape[1:])), results)
 
 
+@pytest.mark.parametrize("hand", ["pneuflex4", "tapered4", "tripod3"])
+def test_tips_are_where_mujoco_has_the_ends_of_the_last_links(hand):
+    """Of random postures, by its kinematics of the model that is compiled and exported."""
+    the_scene = scene.load("paper", hand_name=hand, overrides={"discretization.links": 4})
+    params, trial = hand_world(the_scene)
+    params = jax.tree.map(np.asarray, params)
+    compiled = model.compile_model(the_scene, params, trial)
+    data = mujoco.MjData(compiled)
+    rng = np.random.default_rng(3)
+    postures = rng.normal(0.0, 0.3, (2, 3, compiled.nq))
+    postures[..., -4:] /= np.linalg.norm(postures[..., -4:], axis=-1, keepdims=True)
+    found = rollout.tips(the_scene, params, trial, postures)
+    assert found.shape == (2, 3, the_scene.num_fingers, 3)
+    for index in np.ndindex(2, 3):
+        data.qpos = postures[index]
+        mujoco.mj_kinematics(compiled, data)
+        for k, length in enumerate(params.length):
+            end = data.body(f"finger_{k}_link_4")
+            tip = end.xpos + end.xmat.reshape(3, 3) @ [length / 8, 0, 0]
+            # Chains of a dozen rotations in float32, over up to a metre of a random wrist.
+            np.testing.assert_allclose(found[index][k], tip, atol=2e-6)
+
+
+def test_positions_of_another_kind_have_no_tips():
+    params, trial = hand_world(PAPER)
+    for shape, words in {(5, 0): "record_qpos=True records it", (5, 12): "of this scene"}.items():
+        with pytest.raises(scene.InputError, match=words):
+            rollout.tips(PAPER, params, trial, np.zeros(shape))
+    with pytest.raises(scene.InputError, match="params have no axis|has shape"):
+        rollout.tips(PAPER, jax.tree.map(lambda v: v[None], params), trial, np.zeros((5, 53)))
+
+
 ACCELERATED = {"effects.wrist": False, "arm.shake_amplitude": 0.0, "arm.shake_acceleration": 2.0}
 """A rigid mount that moves by 2 m/s^2 in place of the turns."""
 

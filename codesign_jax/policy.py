@@ -28,14 +28,9 @@ import numpy as np
 
 from codesign_jax import control, model
 from codesign_jax.control import Plan
-from codesign_jax.engines.base import Engine, Equal, recording
-from codesign_jax.engines.structured import coordinates, forces
-from codesign_jax.engines.structured.laws.integration import before
-from codesign_jax.engines.structured.laws.kinematics import kinematics
-from codesign_jax.engines.structured.transforms import folded
-from codesign_jax.engines.structured.world_model import WorldModel, world_constants
+from codesign_jax.engines.base import Bodies, Engine, Equal, Pose, recording, tells_forces
 from codesign_jax.model import ModelFields
-from codesign_jax.model.layout import WRIST, layout
+from codesign_jax.model.layout import WRIST
 from codesign_jax.scene import Scene, key_frames, unit_slips
 from codesign_jax.scene.hand import highest_pressure
 from codesign_jax.scene.schema import InputError
@@ -43,18 +38,6 @@ from codesign_jax.types import Forces, Params, Trace, Trial
 
 PERIOD = 0.05
 """Seconds between two calls of a policy that does not say so itself."""
-
-
-class Pose(NamedTuple):
-    """Pose of a body in the world frame.
-
-    Attributes:
-      position: Origin of its frame [m], shape (..., 3).
-      rotation: Its axes as the columns of a matrix, shape (..., 3, 3).
-    """
-
-    position: jax.Array
-    rotation: jax.Array
 
 
 class Command(NamedTuple):
@@ -119,6 +102,10 @@ Attributes that it may have:
 """
 
 
+Look = Callable[[jax.Array], Bodies]
+"""A function of states, see `Engine.observe`."""
+
+
 class World(NamedTuple):
     """Worlds between two periods, every array with a leading axis (world,).
 
@@ -150,7 +137,7 @@ class ControlLoop(Equal):
         self.engine = engine
         self.policy = policy
         self.name = engine.name
-        self.scene: Scene = engine.scene  # type: ignore[attr-defined]
+        self.scene = engine.scene
         self.steps = period_steps(self.scene, getattr(policy, "period", None))
 
     def _key(self) -> tuple:
@@ -171,7 +158,7 @@ class ControlLoop(Equal):
             a command that is not finite: inside of `jax.jit` such a world has failed (NONFINITE).
         """
         plan: Plan = ctrl
-        hand = world_constants(self.scene, fields)
+        look = self.engine.observe(fields)
         pack = getattr(self.engine, "tables", None)
         # Worlds keep their constants, which a GPU would take a millisecond a period to lay out.
         arguments = {} if pack is None else {"tables": pack(fields)}
@@ -180,7 +167,7 @@ class ControlLoop(Equal):
         def period(carry: tuple, now: dict[str, jax.Array]) -> tuple[tuple, Trace]:
             world, memory = carry
             ahead = plan._replace(**now)
-            answer, command = self._asked(hand, fields, world, memory, ahead)
+            answer, command = self._asked(look, fields, world, memory, ahead)
             world, trace = advance(
                 self.engine, fields, world, ahead, command, trajectory=trajectory, **arguments
             )
@@ -225,7 +212,7 @@ class ControlLoop(Equal):
         plan = jax.vmap(partial(control.plan, self.scene))(params, trial)
         steps = min(self.steps, self.scene.num_steps)
         series = {k: getattr(plan, k)[:, : periods * steps] for k in ("pose", "pressure", "shake")}
-        hand = world_constants(self.scene, fields)
+        look = self.engine.observe(fields)
         world = begin(self.scene, fields, plan)
         state = model.split(self.scene, world.state)
 
@@ -233,7 +220,7 @@ class ControlLoop(Equal):
             taken, ahead = now
             at = jnp.full_like(state.step, taken)
             there = world._replace(state=jnp.concatenate(state._replace(step=at), -1))
-            return self._asked(hand, fields, there, memory, plan._replace(**ahead))
+            return self._asked(look, fields, there, memory, plan._replace(**ahead))
 
         cut = {k: _split(v, periods) for k, v in series.items()}
         memory = self._remembered(params)
@@ -244,11 +231,14 @@ class ControlLoop(Equal):
         return jax.tree.map(lambda v: _joined(v)[0], command)
 
     def _asked(
-        self, hand: WorldModel, fields: ModelFields, world: World, memory: Any, plan: Plan
+        self, look: Look, fields: ModelFields, world: World, memory: Any, plan: Plan
     ) -> tuple[Any, Command]:
-        seen = observe(self.engine, hand, fields, world, plan, with_forces=False)
-        if seen.forces is not None and reads_forces(self.policy, memory, seen):
-            seen = seen._replace(forces=_forces(self.scene, fields, world))
+        seen = observe(self.scene, look, fields, world, plan)
+        if tells_forces(self.engine):
+            contacts = partial(self.engine.contacts, fields, world.state)
+            seen = seen._replace(forces=contacts(find=False))
+            if reads_forces(self.policy, memory, seen):
+                seen = seen._replace(forces=contacts())
         answer = jax.vmap(self.policy)(memory, seen)
         if not (isinstance(answer, tuple) and [*map(type, answer[1:])] == [Command]):
             raise InputError([f"{self.called} must return (carry, policy.Command)"])
@@ -351,84 +341,27 @@ def reads_forces(policy: Policy, memory: Any, seen: Observation) -> bool:
     return any(id(value) in read for value in program.invars)
 
 
-def observe(
-    engine: Engine,
-    hand: WorldModel,
-    fields: ModelFields,
-    world: World,
-    plan: Plan,
-    *,
-    with_forces: bool = True,
-) -> Observation:
-    """Observations for policies; every array has the leading axis (world,).
+def observe(scene: Scene, look: Look, fields: ModelFields, world: World, plan: Plan) -> Observation:
+    """Observations for policies, without forces; every array has the leading axis (world,).
 
     Args:
-      with_forces: Whether contact forces are found; else zeros stand for them.
+      scene: The engine's scene.
+      look: What `Engine.observe` returns for the fields.
+      fields: Model fields.
+      world: The worlds.
+      plan: What the key frames command over this period.
     """
-    scene: Scene = engine.scene  # type: ignore[attr-defined]
-    state = coordinates.reset(scene, fields._replace(start=world.state))
-    motion = kinematics(hand, layout(scene).axes, state)
-
-    def pose(place: jax.Array, columns: jax.Array) -> Pose:
-        """From lanes (3, ...) about the object and (column, 3, ...) with the worlds last."""
-        place = place + state.position.reshape(3, *[1] * (place.ndim - 2), -1)
-        return Pose(
-            jnp.moveaxis(place, (-1, 0), (0, -1)), jnp.moveaxis(columns, (-1, 1, 0), (0, -2, -1))
-        )
-
-    none = jnp.zeros_like(motion.place)
-    velocity = motion.object_vel[:, 0].T
+    bodies = look(world.state)
     step = model.split(scene, world.state).step[:, 0]
     phase, since = jax.vmap(_phase)(fields.constants, step)
-    joint, rate = (jnp.moveaxis(v, (3, 2), (0, 1)) for v in (state.finger, state.finger_vel))
-    palm = pose(motion.place[:, 0], motion.palm[:, :, 0])
-    object_pose = pose(none[:, 0], motion.object[:, :, 0])
-    contact_forces = None
-    if hasattr(engine, "recording"):
-        contact_forces = _forces(scene, fields, world) if with_forces else _no_forces(scene, world)
     return Observation(
         time=step * scene.discretization.timestep,
         phase=phase,
         phase_time=since,
         plan=Command(plan.pose, plan.pressure),
         pressure=world.pressure,
-        joint=joint,
-        joint_velocity=rate,
-        palm=palm,
-        link=pose(jnp.swapaxes(motion.origin, 1, 2), jnp.swapaxes(motion.link, 2, 3)),
-        object=object_pose,
-        object_velocity=jnp.concatenate([velocity[:, 3:], velocity[:, :3]], 1),
-        forces=contact_forces,
+        **bodies._asdict(),
     )
-
-
-def _forces(scene: Scene, fields: ModelFields, world: World) -> Forces:
-    """Contact forces of the steps that led to the worlds' states.
-
-    What fingers hold on one another is that after the step, from which the force between two that
-    slide differs a little.
-    """
-
-    def of_worlds(fields: ModelFields, start: jax.Array) -> Forces:
-        state = coordinates.reset(scene, fields._replace(start=start))
-        hand = world_constants(scene, fields)
-        earlier = before(state, scene.discretization.timestep)
-        contact_forces = forces.forces(scene, hand, earlier)
-        stepped = (state.step[0, 0] > 0) & (state.going[0, 0] > 0)
-
-        def kept(v: jax.Array) -> jax.Array:
-            return jnp.where(stepped.reshape(-1, *[1] * (v.ndim - 1)), v, 0.0)
-
-        return jax.tree.map(kept, contact_forces)
-
-    # Accelerations of a rollout have no derivative.
-    given = jax.lax.stop_gradient((fields, world.state))
-    return folded(of_worlds)(*given)
-
-
-def _no_forces(scene: Scene, world: World) -> Forces:
-    shapes = forces.shapes(scene, len(world.state), world.state.dtype)
-    return jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
 
 
 def _phase(scene: Scene, step: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -478,7 +411,7 @@ def advance(
     **options: Any,
 ) -> tuple[World, Trace]:
     """Simulates a period under commands of shape (world, step, ...); `options`: of the engine."""
-    scene: Scene = engine.scene  # type: ignore[attr-defined]
+    scene = engine.scene
 
     def controls(
         constants: Scene, now: jax.Array, shake: jax.Array, tilt: jax.Array, command: Command

@@ -5,26 +5,16 @@ named designs by the same depths and say in words what is wrong.  The scene's ow
 number at a time; these look at the world that a design makes of them.
 """
 
-import dataclasses
-import itertools
 import math
 import operator
 from collections.abc import Mapping
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import model
-from codesign_jax.engines.structured import overlaps
-from codesign_jax.engines.structured.coordinates import reset
-from codesign_jax.engines.structured.laws.kinematics import Kinematics, straight
-from codesign_jax.engines.structured.world_model import (
-    WorldModel,
-    apply_columns,
-    world_constants,
-)
+from codesign_jax.engines.overlaps import depth, depth_between, depth_in_palm
 from codesign_jax.model import ModelFields, morphology
 from codesign_jax.scene import Scene, key_frames
 from codesign_jax.scene.parameters import DesignSpace, params_of
@@ -90,65 +80,6 @@ def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
 def _rows(*arrays: jax.Array) -> jax.Array:
     """All numbers of each world, of arrays with leading axis (world,), shape (world, number)."""
     return jnp.concatenate([x.reshape(x.shape[0], -1) for x in arrays], 1)
-
-
-@partial(jax.jit, static_argnums=0)
-def depth(scene: Scene, fields: ModelFields) -> jax.Array:
-    """Deepest overlap of a finger, the palm or the object with another of them or the table [m].
-
-    The structured engine's contacts serve every engine: same spheres, shapes and pairs.  Fingers
-    are straight; how deep they stand in one another says `depth_between`.
-    """
-    alone = dataclasses.replace(scene.effects, finger_finger=False)
-    hand, kin, position = _straight(scene, fields)
-    scene = dataclasses.replace(scene, effects=alone)
-    every = overlaps.places(scene, hand, kin, position)
-    depths = [(-place.gap).reshape(-1, place.gap.shape[-1]).max(0) for place in every.values()]
-    if not depths:
-        return jnp.zeros_like(fields.object_mass)
-    return jnp.stack(depths).max(0)
-
-
-@partial(jax.jit, static_argnums=0)
-def depth_between(scene: Scene, fields: ModelFields) -> jax.Array:
-    """Deepest overlap of two straight fingers that may touch [m], shape (world,).
-
-    As spheres around the links' middles, as high as the section: the vertices of two hulls in one
-    and the same place would not stand inside one another.
-    """
-    worlds = fields.start.shape[0]
-    count = scene.num_fingers
-    if not scene.effects.finger_finger or count == 1:
-        return jnp.full((worlds,), -jnp.inf, fields.start.dtype)
-    hand, kin, _ = _straight(scene, fields)
-    up = hand.centre[2]
-    middle = kin.origin + apply_columns(kin.link, hand.centre)
-    deepest = []
-    for a, b in itertools.combinations(range(count), 2):
-        away = middle[:, :, None, a] - middle[:, None, :, b]
-        reach = up[:, None, a] + up[None, :, b]
-        deepest.append((reach - jnp.sqrt((away**2).sum(0))).reshape(-1, worlds).max(0))
-    return jnp.stack(deepest).max(0)
-
-
-@partial(jax.jit, static_argnums=0)
-def depth_in_palm(scene: Scene, fields: ModelFields) -> jax.Array:
-    """Deepest overlap of a straight finger with the palm's disc [m], shape (world,).
-
-    By the rings or spheres that touch it in a simulation, of those that may.
-    """
-    if not scene.effects.finger_palm:
-        return jnp.full((fields.start.shape[0],), -jnp.inf, fields.start.dtype)
-    hand, kin, _ = _straight(scene, fields)
-    return overlaps.depth_in_palm(scene, hand, kin)
-
-
-@partial(jax.jit, static_argnums=0)
-def _straight(scene: Scene, fields: ModelFields) -> tuple[WorldModel, Kinematics, jax.Array]:
-    """Worlds with straight fingers, and the place of the object's centre, (3, 1, world)."""
-    state = reset(scene, fields)
-    hand = world_constants(scene, fields)
-    return hand, straight(hand, state), state.position
 
 
 def notes(scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray]) -> list[str]:

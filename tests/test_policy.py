@@ -19,7 +19,6 @@ from codesign_jax import scene as scenes
 from codesign_jax.compiler import launch
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import world_model
-from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.model import morphology
 from codesign_jax.model.layout import layout
 from codesign_jax.report import figures
@@ -137,8 +136,9 @@ def test_what_is_observed_is_where_mujoco_has_it(worlds):
         recorded = engine.recording().rollout(fields, ctrl[:, :25])
         pushed = jax.tree.map(lambda v: v[:, -1], recorded.forces)
         world = policy.begin(scene, fields, plan)._replace(state=recorded.last)
-        hand = world_constants(scene, fields)
-        return recorded.last, fields, pushed, policy.observe(engine, hand, fields, world, plan)
+        seen = policy.observe(scene, engine.observe(fields), fields, world, plan)
+        seen = seen._replace(forces=engine.contacts(fields, recorded.last))
+        return recorded.last, fields, pushed, seen
 
     last, fields, pushed, seen = grasps.nth(look(*worlds[0]), ...)
     state = model.split(scene, last)

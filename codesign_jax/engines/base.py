@@ -1,13 +1,46 @@
 """The interface behind which every engine stands."""
 
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any, NamedTuple, NoReturn, Protocol
 
 import jax
 
 from codesign_jax.model import ModelFields
 from codesign_jax.scene import Scene
 from codesign_jax.scene.schema import InputError
-from codesign_jax.types import Trace
+from codesign_jax.types import Forces, Trace
+
+
+class Pose(NamedTuple):
+    """Pose of a body in the world frame.
+
+    Attributes:
+      position: Origin of its frame [m], shape (..., 3).
+      rotation: Its axes as the columns of a matrix, shape (..., 3, 3).
+    """
+
+    position: jax.Array
+    rotation: jax.Array
+
+
+class Bodies(NamedTuple):
+    """Where the bodies of worlds are, every array with a leading axis (world,).
+
+    Attributes:
+      joint: Angles of the fingers' joints [rad], shape (world, finger, link, axis).
+      joint_velocity: Their velocities [rad/s], likewise.
+      palm: Pose of the palm.
+      link: Poses of the fingers' links, whose origins are at their joints, (world, finger, link).
+      object: Pose of the object, whose origin is its centre of mass.
+      object_velocity: Its linear [m/s] and angular [rad/s] velocity, shape (world, 6).
+    """
+
+    joint: jax.Array
+    joint_velocity: jax.Array
+    palm: Pose
+    link: Pose
+    object: Pose
+    object_velocity: jax.Array
 
 
 class Engine(Protocol):
@@ -18,9 +51,11 @@ class Engine(Protocol):
 
     Attributes:
       name: Name on the command line and in results.
+      scene: The scene.
     """
 
     name: str
+    scene: Scene
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
         """Simulates one grasp in each world; traceable, with the batch as leading axis.
@@ -37,6 +72,33 @@ class Engine(Protocol):
         """
         ...
 
+    def observe(self, fields: ModelFields) -> Callable[[jax.Array], Bodies]:
+        """What policies and environments see of worlds: a function of their states.
+
+        Args:
+          fields: Model fields, every array with a leading world axis.
+
+        Returns:
+          A function of states, see `model.RolloutState`, shape (world, n): those of `Trace.last`.
+        """
+        ...
+
+    def contacts(self, fields: ModelFields, state: jax.Array, *, find: bool = True) -> Forces:
+        """Contact forces of the time steps that led to states; they have no derivative.
+
+        Args:
+          fields: Model fields, every array with a leading world axis.
+          state: States, shape (world, n).
+          find: Whether the forces are found; else zeros stand for them, which take no time.
+
+        Returns:
+          The forces, every array with a leading world axis; zero at the beginning of a grasp.
+
+        Raises:
+          InputError: If the engine tells no forces, see `tells_forces`.
+        """
+        ...
+
 
 def tells_forces(engine: Engine) -> bool:
     """Whether the engine tells contact forces; one that asks a policy, whether its own does."""
@@ -47,8 +109,13 @@ def recording(engine: Engine, *, touch: bool = False) -> Engine:
     """The engine as one whose traces have the contact forces; `touch`: ring by ring as well."""
     method: Any = getattr(engine, "recording", None)
     if method is None or not tells_forces(engine):
-        raise InputError([f"engine {engine.name} records no forces; engine structured does"])
+        refuse_forces(engine.name)
     return method(touch=touch)
+
+
+def refuse_forces(name: str) -> NoReturn:
+    """The error of an engine that tells no contact forces."""
+    raise InputError([f"engine {name} records no forces; engine structured does"])
 
 
 class Equal:

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -12,7 +13,8 @@ import jax.numpy as jnp
 with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx
 
-from codesign_jax.engines.base import Equal, refuse_meshes
+from codesign_jax.engines.base import Bodies, Equal, refuse_forces, refuse_meshes
+from codesign_jax.engines.structured import bodies
 from codesign_jax.judge import verdict
 from codesign_jax.model import (
     ModelFields,
@@ -27,7 +29,7 @@ from codesign_jax.model import (
 from codesign_jax.model.layout import centre_weights
 from codesign_jax.scene import Scene, effects
 from codesign_jax.scene.schema import InputError
-from codesign_jax.types import Trace
+from codesign_jax.types import Forces, Trace
 
 _STATIC = ("wrap_prm",)
 """Fields that MJX takes for constants: what a world has of its own is applied as a force."""
@@ -91,6 +93,12 @@ class MjxEngine(Equal):
         if moments is not None:
             data = data.replace(qfrc_applied=data.qfrc_applied.at[bend].set(moments))
         return mjx.step(self.model(arrays), data.replace(ctrl=ctrl))
+
+    def observe(self, fields: ModelFields) -> Callable[[jax.Array], Bodies]:
+        return bodies.observer(self.scene, fields)
+
+    def contacts(self, fields: ModelFields, state: jax.Array, *, find: bool = True) -> Forces:
+        refuse_forces(self.name)
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
         """See `Engine.rollout`.

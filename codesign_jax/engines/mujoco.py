@@ -1,6 +1,7 @@
 """MuJoCo C in float64, the oracle: `mujoco.batch` on all cores, called from jitted programs."""
 
 import threading
+from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -9,7 +10,8 @@ import mujoco
 import mujoco.batch
 import numpy as np
 
-from codesign_jax.engines.base import Equal, refuse_meshes
+from codesign_jax.engines.base import Bodies, Equal, refuse_forces, refuse_meshes
+from codesign_jax.engines.structured import bodies
 from codesign_jax.judge import verdict
 from codesign_jax.model import (
     ModelFields,
@@ -21,7 +23,7 @@ from codesign_jax.model import (
 )
 from codesign_jax.model.layout import centre_weights
 from codesign_jax.scene import Scene, effects
-from codesign_jax.types import Status, Trace
+from codesign_jax.types import Forces, Status, Trace
 
 # Steps between looking at the worlds: a lost object or a failed world stops being simulated at this
 # grain.
@@ -50,6 +52,12 @@ class MujocoEngine(Equal):
 
     def _key(self) -> tuple:
         return self.scene.structure, self.num_threads
+
+    def observe(self, fields: ModelFields) -> Callable[[jax.Array], Bodies]:
+        return bodies.observer(self.scene, fields)
+
+    def contacts(self, fields: ModelFields, state: jax.Array, *, find: bool = True) -> Forces:
+        refuse_forces(self.name)
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:
         """See `Engine.rollout`."""

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from codesign_jax import control, model, policy, rollout
 from codesign_jax.control import Plan
 from codesign_jax.engines import DEFAULT, Engine, make_engine
-from codesign_jax.engines.structured.world_model import world_constants
+from codesign_jax.engines.base import tells_forces
 from codesign_jax.judge import verdict
 from codesign_jax.model import ModelFields
 from codesign_jax.policy import Command, Observation, World
@@ -265,8 +265,10 @@ class GraspEnv:
     def seen(self, data: Data) -> Observation:
         """The observation of a world."""
         fields, world, plan = _batch((data.fields, data.world, self._ahead(data)))
-        hand = world_constants(self.scene, fields)
-        return _one(policy.observe(self.engine, hand, fields, world, plan))
+        seen = policy.observe(self.scene, self.engine.observe(fields), fields, world, plan)
+        if tells_forces(self.engine):
+            seen = seen._replace(forces=self.engine.contacts(fields, world.state))
+        return _one(seen)
 
     def _held(self, data: Data, trace: Trace, world: World) -> tuple[jax.Array, jax.Array]:
         """Share of the window in which the object was held, and whether the grasp is decided."""

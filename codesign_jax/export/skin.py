@@ -12,9 +12,8 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from codesign_jax.engines.structured.kernel.self_collision import ring_places
 from codesign_jax.model import pairs
-from codesign_jax.model.layout import beyond_base, first_on_palm, touches_itself
+from codesign_jax.model.layout import beyond_base, first_on_palm, ring_places, touches_itself
 from codesign_jax.model.morphology import at_joints, sections
 from codesign_jax.model.spec import add_pair, surroundings
 from codesign_jax.scene import Scene

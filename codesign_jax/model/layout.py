@@ -261,6 +261,18 @@ def first_on_palm(links: int) -> int:
     return math.ceil(PALM_FROM * links)
 
 
+RING_TIP = 0.25
+"""Length of the last link's segment, which ends in the tip's ring, in links."""
+
+
+def ring_places(links: int, k: int) -> np.ndarray:
+    """Places of the rings from their links' joints, in links, shape (link, k)."""
+    places = np.tile((np.arange(k) + 0.5) / k, (links, 1))
+    places[-1] *= 0.5
+    places[-1, -1] = RING_TIP
+    return places
+
+
 def beyond_base(along: Any, height: Any) -> Any:
     """Whether a part of a finger is so far from its base that it may touch the palm.
 

@@ -54,6 +54,9 @@ PARAMETERS = {
     "tip_width": Kind("finger", "m", 1e-3, 0.1, "width at the tip, if `section.tapered`"),
 }
 """Every parameter that the hand model understands."""
+LEAST_REACH = 0.014
+"""Reach of the grid of every mesh [m]: contact spheres of fingers up to 25 mm high, on objects that
+the noise makes a tenth smaller."""
 TIP = ("tip_height", "tip_wall", "tip_width")
 """Those of tapered fingers alone."""
 

@@ -13,12 +13,9 @@ import jax.core
 import numpy as np
 
 from codesign_jax.scene import schema
-from codesign_jax.scene.hand_tables import UNITS, Hand, Numbers, per_finger
+from codesign_jax.scene.hand_tables import LEAST_REACH, UNITS, Hand, Numbers, per_finger
 from codesign_jax.scene.objects import ObjectSet
 
-LEAST = 0.014
-"""Reach of every grid [m]: contact spheres of fingers up to 25 mm high, on objects that the noise
-makes a tenth smaller."""
 _STEP = 0.005
 """Step of larger ones [m]: hands that differ a little share grids and programs."""
 _DEVIATIONS = 2
@@ -32,7 +29,7 @@ def needed(radius: float, size_noise: float) -> float:
       radius: Largest radius of a contact sphere [m].
     """
     margin = radius / (1 - _DEVIATIONS * size_noise)
-    return LEAST if margin <= LEAST else math.ceil(margin / _STEP - 1e-9) * _STEP
+    return LEAST_REACH if margin <= LEAST_REACH else math.ceil(margin / _STEP - 1e-9) * _STEP
 
 
 def contact_radius(hand: Hand) -> float:

@@ -12,8 +12,9 @@ import mujoco
 import numpy as np
 
 from codesign_jax import model
+from codesign_jax.engines import overlaps
 from codesign_jax.engines.mujoco import world_model
-from codesign_jax.engines.structured import coordinates, overlaps
+from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.kernel.contact_sets import margin
 from codesign_jax.engines.structured.lanes import dot, once, scan_links
 from codesign_jax.engines.structured.laws import surroundings

@@ -1,5 +1,6 @@
 """Step and rollout of the structured engine behind the common interface."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -8,12 +9,13 @@ import jax.numpy as jnp
 
 from codesign_jax.compiler import launch
 from codesign_jax.compiler.launch import KernelUnavailable
-from codesign_jax.engines.base import Equal
-from codesign_jax.engines.structured import coordinates, forces, transforms
+from codesign_jax.engines.base import Bodies, Equal
+from codesign_jax.engines.structured import bodies, coordinates, forces, transforms
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.kernel.adjoint import StatePath, state_path
 from codesign_jax.engines.structured.kernel.memory import lengthened
 from codesign_jax.engines.structured.laws import meshes
+from codesign_jax.engines.structured.laws.integration import before
 from codesign_jax.engines.structured.laws.kinematics import State
 from codesign_jax.engines.structured.world_model import WorldModel, world_constants
 from codesign_jax.model import ModelFields
@@ -176,6 +178,33 @@ class StructuredEngine(Equal):
         out = _execute(program, inputs, trajectory=trajectory)
         return self._trace(*program.outputs(out, len(ctrl), trajectory=trajectory), trajectory)
 
+    def observe(self, fields: ModelFields) -> Callable[[jax.Array], Bodies]:
+        return bodies.observer(self.scene, fields)
+
+    def contacts(self, fields: ModelFields, state: jax.Array, *, find: bool = True) -> Forces:
+        """See `Engine.contacts`.
+
+        What fingers hold on one another is that after the step, from which the force between two
+        that slide differs a little.
+        """
+        if not find:
+            shapes = forces.shapes(self.scene, len(state), state.dtype)
+            return jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
+
+        def of_worlds(fields: ModelFields, start: jax.Array) -> Forces:
+            after = self.reset(fields._replace(start=start))
+            earlier = before(after, self.scene.discretization.timestep)
+            every = forces.forces(self.scene, world_constants(self.scene, fields), earlier)
+            stepped = (after.step[0, 0] > 0) & (after.going[0, 0] > 0)
+
+            def masked(v: jax.Array) -> jax.Array:
+                return jnp.where(stepped.reshape(-1, *[1] * (v.ndim - 1)), v, 0.0)
+
+            return jax.tree.map(masked, every)
+
+        # Accelerations of a rollout have no derivative.
+        return transforms.folded(of_worlds)(*jax.lax.stop_gradient((fields, state)))
+
     def recording(self, *, touch: bool = False) -> "RecordingEngine":
         """As an engine whose traces have the contact forces, see `base.recording`."""
         return RecordingEngine(self, touch=touch)
@@ -255,6 +284,12 @@ class RecordingEngine(Equal):
 
     def _key(self) -> tuple:
         return self.engine, self.touch
+
+    def observe(self, fields: ModelFields) -> Callable[[jax.Array], Bodies]:
+        return self.engine.observe(fields)
+
+    def contacts(self, fields: ModelFields, state: jax.Array, *, find: bool = True) -> Forces:
+        return self.engine.contacts(fields, state, find=find)
 
     def recording(self, *, touch: bool = False) -> "RecordingEngine":
         return RecordingEngine(self.engine, touch=touch or self.touch)

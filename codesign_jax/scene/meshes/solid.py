@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from codesign_jax.scene.mesh_margins import LEAST
+from codesign_jax.scene.hand_tables import LEAST_REACH
 from codesign_jax.scene.meshes import grid, mass, reading, repair, support, surface
 from codesign_jax.scene.schema import InputError
 
@@ -37,7 +37,7 @@ class Solid:
     upright: tuple[float, ...]
     voxel_error: float  # bound on the error of the signed distance [m]
     repairs: tuple[str, ...]  # what a repair changed
-    reach: float = LEAST  # how far beyond the surface distances are known [m]
+    reach: float = LEAST_REACH  # how far beyond the surface distances are known [m]
 
     def reaching(self, reach: float) -> "Solid":
         """The solid with distances up to `reach` [m] from its surface; see `mesh_margins`."""

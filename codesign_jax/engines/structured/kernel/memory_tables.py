@@ -18,7 +18,6 @@ from codesign_jax.engines.structured.kernel import (
 )
 from codesign_jax.engines.structured.kernel.contact_sets import ContactSet
 from codesign_jax.engines.structured.kernel.memory import MemoryLayout, lengthened
-from codesign_jax.engines.structured.kernel.self_collision import TIP, ring_places
 from codesign_jax.engines.structured.kernel.self_contacts import SelfContactSet, pair_slots
 from codesign_jax.engines.structured.kernel.slots import SlotSet
 from codesign_jax.engines.structured.kernel.step_memory import KernelLayout
@@ -36,7 +35,7 @@ from codesign_jax.engines.structured.world_model import WorldModel, joint_sectio
 from codesign_jax.judge import verdict
 from codesign_jax.model import held, layout
 from codesign_jax.model.held import palm_groups, rings_of_link
-from codesign_jax.model.layout import palm_touches, touches_itself
+from codesign_jax.model.layout import RING_TIP, palm_touches, ring_places, touches_itself
 from codesign_jax.scene import Scene
 
 PALM = ((1, 0), (0, 1), (-1, 0), (0, -1))
@@ -429,7 +428,7 @@ def ring_numbers(scene: Scene, hand: WorldModel, k: int) -> jax.Array:
     length = np.full((links, k), 1.0 / k)
     length[-1] *= 0.5
     half = RING_OVERLAP * length
-    half[-1, -1] = TIP
+    half[-1, -1] = RING_TIP
     along, length, half = (v.reshape(-1, 1, 1) for v in (along, length, half))
     tip = (np.arange(links * k) == links * k - 1).reshape(-1, 1, 1)
     rows = [along * segment, 0.0, 0.5 * height, half * segment, 0.5 * width, 0.5 * height]

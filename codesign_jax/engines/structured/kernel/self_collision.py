@@ -12,7 +12,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from codesign_jax.engines.structured.kernel import friction_memory
 from codesign_jax.engines.structured.kernel.contact_sets import (
@@ -35,7 +34,13 @@ from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact, rings, shapes, touch
 from codesign_jax.engines.structured.laws.rings import Facing, Place, Ring, Segment
 from codesign_jax.engines.structured.world_model import apply_columns
-from codesign_jax.model.layout import beyond_base, first_on_palm, touches_itself
+from codesign_jax.model.layout import (
+    RING_TIP,
+    beyond_base,
+    first_on_palm,
+    ring_places,
+    touches_itself,
+)
 
 SURELY = 1.0 - 1e-4
 """At a joint two segments have one nearest place, which is the first one's, whatever is rounded."""
@@ -385,7 +390,7 @@ class SelfCollision:
     def last_of(self, item: Any, row: Any) -> jax.Array:
         """The last place on a segment, 0 to 1, that rings of the same finger touch."""
         start = self.like + jnp.asarray(row).astype(self.like.dtype) - 0.5
-        length = jnp.where(jnp.equal(row, self.layout.links), self.like + TIP, 1.0)
+        length = jnp.where(jnp.equal(row, self.layout.links), self.like + RING_TIP, 1.0)
         return jnp.minimum((self._end(item) - start) / length, 1.0)
 
     def _along(self, item: Any) -> jax.Array:
@@ -545,18 +550,6 @@ class SelfCollision:
         each(self.count, with_other)
 
 
-TIP = 0.25
-"""Length of the last link's segment, which ends in the tip's ring, in links."""
-
-
-def ring_places(links: int, k: int) -> np.ndarray:
-    """Places of the rings from their links' joints, in links, shape (link, k)."""
-    places = np.tile((np.arange(k) + 0.5) / k, (links, 1))
-    places[-1] *= 0.5
-    places[-1, -1] = TIP
-    return places
-
-
 def neighbours(row: jax.Array, links: int) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The link before each of some links, itself, and the next one; the ends are their own."""
     return jnp.maximum(row - 1, 0), row, jnp.minimum(row + 1, links)
@@ -594,7 +587,7 @@ def palm_distance(point, palm):
 def arc(tip, largest):
     """Least distance along a finger at which it touches itself, in links."""
     heights = APART_HEIGHTS * 2.0 * Ring.of(largest).half[2]
-    link = Ring.of(tip).half[0] / TIP
+    link = Ring.of(tip).half[0] / RING_TIP
     return jnp.maximum(APART_LINKS, heights / link)
 
 

@@ -1,9 +1,11 @@
-"""Places at which bodies touch or nearly do, over arrays of all worlds: for checks before a start.
+"""Where and how deep bodies touch, over arrays of all worlds: for checks before a start.
 
 A kernel finds contacts link by link, where one can be compiled; here the same laws are called on
 whole arrays, for every engine and device.
 """
 
+import dataclasses
+import itertools
 from collections.abc import Callable
 from functools import partial
 
@@ -11,20 +13,80 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from codesign_jax.engines.structured.coordinates import reset
 from codesign_jax.engines.structured.kernel import memory_tables, self_collision
 from codesign_jax.engines.structured.lanes import once
 from codesign_jax.engines.structured.laws import shapes, surroundings
-from codesign_jax.engines.structured.laws.kinematics import Kinematics
+from codesign_jax.engines.structured.laws.kinematics import Kinematics, straight
 from codesign_jax.engines.structured.laws.rings import Place
 from codesign_jax.engines.structured.laws.touch import ring_centre, touch
-from codesign_jax.engines.structured.world_model import WorldModel, apply_columns
-from codesign_jax.model import held
+from codesign_jax.engines.structured.world_model import WorldModel, apply_columns, world_constants
+from codesign_jax.model import ModelFields, held
 from codesign_jax.model.held import rings_of_link
 from codesign_jax.model.layout import first_on_palm, palm_touches
 from codesign_jax.scene import Scene
 
 Look = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
 """From points to their distance from a body and its gradient, see `laws.touch`."""
+
+
+@partial(jax.jit, static_argnums=0)
+def depth(scene: Scene, fields: ModelFields) -> jax.Array:
+    """Deepest overlap of a finger, the palm or the object with another of them or the table [m].
+
+    The structured engine's contacts serve every engine: same spheres, shapes and pairs.  Fingers
+    are straight; how deep they stand in one another says `depth_between`.
+    """
+    alone = dataclasses.replace(scene.effects, finger_finger=False)
+    hand, kin, position = _straight(scene, fields)
+    scene = dataclasses.replace(scene, effects=alone)
+    every = places(scene, hand, kin, position)
+    depths = [(-place.gap).reshape(-1, place.gap.shape[-1]).max(0) for place in every.values()]
+    if not depths:
+        return jnp.zeros_like(fields.object_mass)
+    return jnp.stack(depths).max(0)
+
+
+@partial(jax.jit, static_argnums=0)
+def depth_between(scene: Scene, fields: ModelFields) -> jax.Array:
+    """Deepest overlap of two straight fingers that may touch [m], shape (world,).
+
+    As spheres around the links' middles, as high as the section: the vertices of two hulls in one
+    and the same place would not stand inside one another.
+    """
+    worlds = fields.start.shape[0]
+    count = scene.num_fingers
+    if not scene.effects.finger_finger or count == 1:
+        return jnp.full((worlds,), -jnp.inf, fields.start.dtype)
+    hand, kin, _ = _straight(scene, fields)
+    up = hand.centre[2]
+    middle = kin.origin + apply_columns(kin.link, hand.centre)
+    deepest = []
+    for a, b in itertools.combinations(range(count), 2):
+        away = middle[:, :, None, a] - middle[:, None, :, b]
+        reach = up[:, None, a] + up[None, :, b]
+        deepest.append((reach - jnp.sqrt((away**2).sum(0))).reshape(-1, worlds).max(0))
+    return jnp.stack(deepest).max(0)
+
+
+@partial(jax.jit, static_argnums=0)
+def depth_in_palm(scene: Scene, fields: ModelFields) -> jax.Array:
+    """Deepest overlap of a straight finger with the palm's disc [m], shape (world,).
+
+    By the rings or spheres that touch it in a simulation, of those that may.
+    """
+    if not scene.effects.finger_palm:
+        return jnp.full((fields.start.shape[0],), -jnp.inf, fields.start.dtype)
+    hand, kin, _ = _straight(scene, fields)
+    return _depth_of_rings(scene, hand, kin)
+
+
+@partial(jax.jit, static_argnums=0)
+def _straight(scene: Scene, fields: ModelFields) -> tuple[WorldModel, Kinematics, jax.Array]:
+    """Worlds with straight fingers, and the place of the object's centre, (3, 1, world)."""
+    state = reset(scene, fields)
+    hand = world_constants(scene, fields)
+    return hand, straight(hand, state), state.position
 
 
 def places(
@@ -65,7 +127,7 @@ def places(
     return by_pair
 
 
-def depth_in_palm(scene: Scene, hand: WorldModel, kin: Kinematics) -> jax.Array:
+def _depth_of_rings(scene: Scene, hand: WorldModel, kin: Kinematics) -> jax.Array:
     """Deepest overlap with the palm's disc of rings or spheres that may touch it [m], (world,)."""
     assert hand.palm_disc is not None
     k = rings_of_link(scene)

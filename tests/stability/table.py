@@ -162,30 +162,25 @@ def write(docs: Path, new: list[dict[str, Any]], commit: str | None = None) -> N
 
 
 def to_markdown(rows: list[dict[str, Any]]) -> str:
-    """A line for each invariant, engine and precision: measured values over the time steps."""
+    """A line for each invariant: the measurement of the least margin; the data have the others."""
     lines = [
-        "| case | invariant | engine | measured (h; h/2; h/4) | bound | least margin | commit | |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| case | invariant | least margin | of | measured | bound | |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
     ]
-    for _, group in itertools.groupby(rows, lambda r: (r["name"], r["precision"])):
-        part = list(group)
-        first = part[0]
-        steps = [r["step"] for r in part]
-        values = "; ".join(number(r["measured"]) for r in part)
-        if tuple(steps) != STEPS:
-            values += f" ({'; '.join('h' if s == 1 else f'h/{1 / s:g}' for s in steps)})"
-        bounds = ", ".join(sorted({number(r["bound"]) for r in part}))
-        least = min(math.inf if r["margin"] is None else r["margin"] for r in part)
-        causes = {r.get("failure") or "not explained" for r in part if not r["passed"]}
-        remarks = ["**fails**: " + "; ".join(sorted(causes))] if causes else []
-        remarks += ["; ".join(dict.fromkeys(r["note"] for r in part if r["note"]))]
-        made = ", ".join(sorted({r["commit"] for r in part}))
-        engine = "MuJoCo C" if first["engine"] == "mujoco" else first["engine"]
+    groups: dict[tuple, list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((row["case"], row["title"], row["invariant"]), []).append(row)
+    for (number_of_case, title, invariant), group in groups.items():
+        least = min(group, key=lambda r: math.inf if r["margin"] is None else r["margin"])
+        causes = {r.get("failure") or "not explained" for r in group if not r["passed"]}
+        remark = "**fails**: " + "; ".join(sorted(causes)) if causes else ""
+        engine = "MuJoCo C" if least["engine"] == "mujoco" else least["engine"]
+        step = "h" if least["step"] == 1 else f"h/{1 / least['step']:g}"
+        measured = f"{number(least['measured'])} {least['unit']}"
         lines.append(
-            f"| {first['case']} {first['title']} | {first['invariant']} | "
-            f"{engine}, {first['precision']} | {values} {first['unit']} | "
-            f"{'>=' if first['lower'] else '<='} {bounds} | {number(least)} | "
-            f"{made} | {' '.join(remarks).strip()} |"
+            f"| {number_of_case} {title} | {invariant} | {number(least['margin'])} | "
+            f"{engine}, {least['precision']}, {step} | {measured} | "
+            f"{'>=' if least['lower'] else '<='} {number(least['bound'])} | {remark} |"
         )
     return "\n".join(lines) + "\n"
 

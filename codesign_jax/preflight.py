@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import model
-from codesign_jax.engines.overlaps import depth, depth_between, depth_in_palm
+from codesign_jax.engines.overlaps import depth, depth_between, depth_by_pair, depth_in_palm
 from codesign_jax.model import ModelFields, morphology
 from codesign_jax.scene import Scene, key_frames
 from codesign_jax.scene.parameters import DesignSpace, params_of
@@ -207,6 +207,54 @@ def low_starts(scene: Scene, design: Params) -> list[str]:
         f"may begin with a finger inside it (INVALID_START); --set arm.start_height={needed:g} "
         "begins above it"
     ]
+
+
+_BODIES = {
+    "finger_object": "finger {finger} in object {object!r}",
+    "finger_table": "finger {finger} in the table{fixture}",
+    "palm_object": "the palm in object {object!r}",
+    "palm_table": "the palm in the table{fixture}",
+    "object_table": "object {object!r} in the table{fixture}",
+    "finger_finger": "two fingers in one another",
+    "finger_palm": "a finger in the palm",
+}
+"""Bodies that overlap, by the names of `depth_by_pair`."""
+_LIFTED = ("finger_object", "finger_table", "palm_object", "palm_table")
+"""Those that an arm which begins higher takes apart."""
+
+
+def why_invalid(scene: Scene, design: Params, trial: Trial) -> list[str]:
+    """Which bodies overlap too far for a grasp to start, deepest first, and what helps.
+
+    Args:
+      design: Parameters of one hand.
+      trial: One trial.
+    """
+    singles = jax.tree.map(np.float32, (scene.bare, design))
+    depths = jax.tree.map(lambda v: np.asarray(v)[..., 0], _depth_by_pair(*singles, trial))
+    name = scene.objects.object[int(trial.shape)].name
+    words = {"object": name, "fixture": " or a fixture" if scene.fixture else ""}
+    inside = []
+    for pair, deep in depths.items():
+        text = _BODIES[pair].format(finger=int(np.argmax(deep)), **words)
+        inside.append((float(np.max(deep)), text, pair))
+    limit = float(scene.limits.penetration)
+    deepest = sorted((row for row in inside if not row[0] <= limit), reverse=True)
+    texts = [f"{text} by {1e3 * deep:.0f} mm" for deep, text, _ in deepest]
+    if not texts:
+        return []
+    line = f"INVALID_START: {', '.join(texts)} at the start"
+    higher = [deep for deep, _, pair in deepest if pair in _LIFTED]
+    if higher and np.isfinite(higher[0]):
+        height = math.ceil(100 * (scene.arm.start_height + higher[0] + ROOM)) / 100
+        line += f"; --set arm.start_height={height:g} begins higher"
+    return [line]
+
+
+@jax.jit
+def _depth_by_pair(scene: Scene, design: Params, trial: Trial) -> dict[str, jax.Array]:
+    fields = jax.tree.map(lambda v: v[None], model.model_fields(scene, design, trial))
+    return depth_by_pair(scene.structure, fields)
 
 
 def _stiffness(scene: Scene, designs: list[Params]) -> list[str]:

@@ -217,6 +217,26 @@ def test_fingers_and_palm_are_as_deep_in_one_another_as_mujocos_geoms():
     assert {line.split(":")[0] for line in messages} == {str(i) for i in np.flatnonzero(deep)}
 
 
+@pytest.mark.parametrize(
+    ("height", "bodies"),
+    [
+        (0.3, set()),
+        (0.06, {"finger 0 in the table", "finger 0 in object 'box'"}),
+    ],
+)
+def test_bodies_that_keep_a_grasp_from_starting_are_named_with_a_remedy(height, bodies):
+    """A hand straight above a box; the height that the remedy names is one from which it starts."""
+    the_scene = pinch("box", arm__start_height=height)
+    design, trial = hand_world(the_scene)
+    texts = preflight.why_invalid(the_scene, design, trial)
+    assert bool(texts) == bool(bodies)
+    if texts:
+        assert any(name in texts[0] for name in bodies), texts
+        [remedy] = re.findall(r"arm.start_height=([0-9.]+)", texts[0])
+        higher = pinch("box", arm__start_height=float(remedy))
+        assert preflight.why_invalid(higher, design, trial) == []
+
+
 @pytest.mark.slow  # 9 s
 def test_straight_fingers_rest_beside_the_palm():
     """Of any length, by the rings that press; a finger that is mounted into the palm is refused.

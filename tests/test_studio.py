@@ -205,6 +205,8 @@ def test_a_tab_shows_judges_improves_and_saves(desk, capsys, monkeypatch):
     """The verdict is that of `codesign evaluate`; a design of the run is the one in its record."""
     tab = Tab(desk)
     description = about(desk)
+    judged = description["run"]["verdict"]
+    assert judged.startswith("The run's verdict") and "steps of 20 ms" in judged
     assert description["groups"] == [
         {"title": "Hand", "members": [0]},
         {"title": "Control", "members": [1]},

@@ -52,6 +52,7 @@ def main(options: Evaluate) -> int:
         console.print(_size(case, options))
         return 0
     outcomes = simulate(case, options, console)
+    _explain_starts(case, outcomes, options, console)
     other = other_conditions(case, options, console) if options.stress else None
     tell_verdict(case, outcomes, other, options, console)
     if options.tolerances != common.OFF:
@@ -136,6 +137,19 @@ def simulate(case: Case, options: Evaluate, console: Console) -> types.Outcome:
         tables.write_grasps(options.out, case.scene, jax.tree.map(np.asarray, drawn), outcomes)
         console.print(f"table: {options.out}")
     return outcomes
+
+
+def _explain_starts(
+    case: Case, outcomes: types.Outcome, options: Evaluate, console: Console
+) -> None:
+    """Names the bodies of the first trial that could not start, if there is any."""
+    inside = np.flatnonzero(np.asarray(outcomes.status) & types.Status.INVALID_START)
+    if inside.size:
+        number = int(inside[0])
+        drawn = rollout.sample_trials(case.scene, jax.random.key(options.seed), number + 1)
+        trial = jax.tree.map(lambda v: np.asarray(v)[number], drawn)
+        for text in preflight.why_invalid(case.scene, case.space.params(case.design), trial):
+            console.print(f"warning: trial {number}: {text}")
 
 
 def other_conditions(case: Case, options: Evaluate, console: Console) -> Stress:

@@ -47,6 +47,18 @@ def depth(scene: Scene, fields: ModelFields) -> jax.Array:
     return jnp.stack(depths).max(0)
 
 
+def depth_by_pair(scene: Scene, fields: ModelFields) -> dict[str, jax.Array]:
+    """Deepest overlap [m] by pair of bodies, shape (world,), of fingers (finger, world)."""
+    hand, kin, position = _straight(scene, fields)
+    by_pair = {}
+    for name, place in places(scene, hand, kin, position).items():
+        rows = place.gap.shape[-2:] if name.startswith("finger") else place.gap.shape[-1:]
+        by_pair[name] = (-place.gap).reshape(-1, *rows).max(0)
+    by_pair["finger_finger"] = depth_between(scene, fields)
+    by_pair["finger_palm"] = depth_in_palm(scene, fields)
+    return by_pair
+
+
 @partial(jax.jit, static_argnums=0)
 def depth_between(scene: Scene, fields: ModelFields) -> jax.Array:
     """Deepest overlap of two straight fingers that may touch [m], shape (world,).

@@ -204,10 +204,11 @@ class Run:
         started_inside = (np.asarray(info.outcomes.status) & Status.INVALID_START) != 0
         if started_inside.any() and not self._explained:
             self._explained = True
-            first = int(started_inside.any(-1).argmax())
-            params = self.plan.space.params(info.population[first])
-            for text in preflight.low_starts(self.plan.scene, params):
-                self.say(f"warning: {text}")
+            particle, number = np.argwhere(started_inside)[0]
+            params = self.plan.space.params(info.population[particle])
+            trial = jax.tree.map(lambda v: np.asarray(v)[number], info.drawn)
+            for text in preflight.why_invalid(self.plan.scene, params, trial):
+                self.say(f"warning: particle {particle}, trial {number}: {text}")
 
     def _report(self) -> None:
         assert self.record is not None

@@ -120,16 +120,16 @@ def test_tips_are_where_mujoco_has_the_ends_of_the_last_links(hand):
     rng = np.random.default_rng(3)
     postures = rng.normal(0.0, 0.3, (2, 3, compiled.nq))
     postures[..., -4:] /= np.linalg.norm(postures[..., -4:], axis=-1, keepdims=True)
-    found = rollout.tips(the_scene, params, trial, postures)
-    assert found.shape == (2, 3, the_scene.num_fingers, 3)
+    tips = rollout.tips(the_scene, params, trial, postures)
+    assert tips.shape == (2, 3, the_scene.num_fingers, 3)
     for index in np.ndindex(2, 3):
         data.qpos = postures[index]
         mujoco.mj_kinematics(compiled, data)
         for k, length in enumerate(params.length):
             end = data.body(f"finger_{k}_link_4")
-            tip = end.xpos + end.xmat.reshape(3, 3) @ [length / 8, 0, 0]
+            there = end.xpos + end.xmat.reshape(3, 3) @ [length / 8, 0, 0]
             # Chains of a dozen rotations in float32, over up to a metre of a random wrist.
-            np.testing.assert_allclose(found[index][k], tip, atol=2e-6)
+            np.testing.assert_allclose(tips[index][k], there, atol=2e-6)
 
 
 def test_positions_of_another_kind_have_no_tips():

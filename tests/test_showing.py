@@ -206,10 +206,12 @@ def test_a_search_at_each_point_adapts_the_rest_alone():
         whole = np.zeros(cost.shape, np.int32)
         return Outcome(cost.astype(np.float32), whole, np.full(cost.shape, np.inf), whole - 1)
 
-    found = landscapes.search(case, plane, simulate, options, Console())
-    np.testing.assert_array_equal(found.designs[:, length], plane.designs[:, length])
+    adapted = landscapes.search(case, plane, simulate, options, Console())
+    np.testing.assert_array_equal(adapted.designs[:, length], plane.designs[:, length])
     # Thirty steps of CMA-ES shrink a quarter of 200 mm to well below a tenth of it.
-    np.testing.assert_allclose(found.designs[:, height], best(plane.designs, gravities), atol=5e-3)
+    np.testing.assert_allclose(
+        adapted.designs[:, height], best(plane.designs, gravities), atol=5e-3
+    )
 
 
 @pytest.mark.parametrize(

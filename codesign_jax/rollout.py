@@ -26,11 +26,8 @@ from jax.scipy.stats import norm
 
 from codesign_jax import axes, control, model, reuse
 from codesign_jax.cost import outcome, shown
-from codesign_jax.engines import Engine
+from codesign_jax.engines import DEFAULT, Engine, make_engine
 from codesign_jax.engines.base import recording
-from codesign_jax.engines.structured import coordinates
-from codesign_jax.engines.structured.laws.kinematics import kinematics
-from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.judge.verdict import as_bit
 from codesign_jax.model.layout import layout
 from codesign_jax.preflight import invalid_start
@@ -273,22 +270,21 @@ def tips(scene: Scene, params: Params, trial: Trial, qpos: jax.typing.ArrayLike)
         raise schema.InputError([f"qpos has shape {jnp.shape(qpos)}, not (..., {size}): {hint}"])
     numbers = jax.tree.map(lambda v: jnp.asarray(v, float), scene.bare)
     rows = jnp.reshape(jnp.asarray(qpos), (-1, size))
-    return _tips(numbers, params, trial, rows).reshape(*jnp.shape(qpos)[:-1], -1, 3)
+    places = _tips(make_engine(DEFAULT, scene), numbers, params, trial, rows)
+    return places.reshape(*jnp.shape(qpos)[:-1], -1, 3)
 
 
-@jax.jit
-def _tips(scene: Scene, params: Params, trial: Trial, qpos: jax.Array) -> jax.Array:
+@partial(jax.jit, static_argnums=0)
+def _tips(engine: Engine, scene: Scene, params: Params, trial: Trial, qpos: jax.Array) -> jax.Array:
     """`tips` of positions of shape (time, nq)."""
-    fields = jax.tree.map(lambda v: v[None], model.model_fields(scene, params, trial))
-    hand = world_constants(scene, fields)
+    fields = model.model_fields(scene, params, trial)
+    observe = engine.observe(jax.tree.map(lambda v: v[None], fields))
+    after = fields.start[qpos.shape[1] :]  # the rest of a state, which moves no tip
 
     def at(row: jax.Array) -> jax.Array:
-        motionless = jnp.zeros((1, len(row) - 1), row.dtype)
-        state = coordinates.make(scene, row[None], motionless, motionless)
-        motion = kinematics(hand, layout(scene).axes, state)
-        origin = motion.origin[:, -1, :, 0] + state.position[:, 0]  # kinematics is about the object
-        along = motion.link[0, :, -1, :, 0]  # the first column of each orientation
-        return (origin + params.length / (2 * scene.discretization.links) * along).T
+        link = observe(jnp.concatenate([row, after])[None]).link
+        half = params.length / (2 * scene.discretization.links)
+        return link.position[0, :, -1] + half[:, None] * link.rotation[0, :, -1, :, 0]
 
     return jax.vmap(at)(qpos)
 

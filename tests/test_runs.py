@@ -1,6 +1,7 @@
 """Run folders: scene files, settings, tables, signals, and what is deleted of them."""
 
 import csv
+import dataclasses
 import os
 import re
 import shutil
@@ -315,3 +316,17 @@ def test_a_run_writes_nothing_once_its_folder_is_another(way, tmp_path):
             with pytest.raises(runs.RunError, match=re.escape(expected)):
                 write()
         assert [*path.rglob("*")] == before
+
+
+def test_results_are_added_to_the_run_that_has_ended_alone(run, tmp_path):
+    """Its folder may be moved, or another's put in its place, while its design is tested again."""
+    settings = runs.read_run(run)[1]
+    with runs.reopened(run, settings) as folder:
+        assert folder.here() == run
+        run.rename(tmp_path / "moved")
+        with pytest.raises(runs.RunError, match="data are in .*moved"):
+            folder.here()
+    shutil.copytree(tmp_path / "moved", run)
+    other = dataclasses.replace(settings, seed=settings.seed + 1)
+    with pytest.raises(InputError, match="of another run"), runs.reopened(run, other):
+        pass

@@ -131,7 +131,7 @@ def _tell(
     """Tells how a run ended, with its verdict; `work`: most fresh grasps, and grasps after it."""
     assert result.record is not None
     _summarize(plan, result, console)
-    most, later = work
+    most = work[0]
     if result.test is None:
         pass
     elif most and fresh_trials.hopeless(compare.of_test(plan.scene, result).outcomes):
@@ -143,21 +143,31 @@ def _tell(
     elif not most:
         _judge(plan, result, None, folder, console)
     else:
-        slower = fresh_trials.steps_and_links(plan.scene)
-        others = stress.sets(plan.scene)
-        coming = (later + reference.STRESS_TRIALS * others) / slower
-        outcomes = reference.test(folder, plan.settings, most, console, coming)
-        case, other = reference.stress_run(folder, plan.settings, console, later)
-        reference.tell_stress(case, other, console)
-        judged = fresh_trials.judged(plan.scene, outcomes, other)
-        if judged.verdict.word != "not good":
-            fingers = reference.worth_run(folder, plan.settings, console)
-            if fingers is not None:
-                reference.tell_worth(fingers, folder, console)
+        with runs.reopened(folder, plan.settings) as run:
+            judged = _test_again(plan, run, work, console)
         _judge(plan, result, judged, folder, console)
     _draw(result.record.history.cost, folder / "figures" / "cost_evolution.png", console)
     console.print(f"results: {folder}")
     console.print(f"to look at: {shlex.join(['codesign', 'report', str(folder)])}")
+
+
+def _test_again(
+    plan: Plan, run: runs.RunDirectory, work: tuple[int, float], console: Console
+) -> Judged:
+    """The design in fresh grasps and under other conditions, and without each finger; tells so."""
+    most, later = work
+    slower = fresh_trials.steps_and_links(plan.scene)
+    others = stress.sets(plan.scene)
+    coming = (later + reference.STRESS_TRIALS * others) / slower
+    outcomes = reference.test(run, plan.settings, most, console, coming)
+    case, other = reference.stress_run(run, plan.settings, console, later)
+    reference.tell_stress(case, other, console)
+    judged = fresh_trials.judged(plan.scene, outcomes, other)
+    if judged.verdict.word != "not good":
+        fingers = reference.worth_run(run, plan.settings, console)
+        if fingers is not None:
+            reference.tell_worth(fingers, run.path, console)
+    return judged
 
 
 def _draw(cost: np.ndarray, path: Path, console: Console) -> None:

@@ -8,7 +8,7 @@ The numerical modules know nothing of files; this package knows nothing of physi
 (10, 6, 64, 6)
 """
 
-from codesign_jax.runs.directory import check_folder, setting_of
+from codesign_jax.runs.directory import RunDirectory, check_folder, reopened, setting_of
 from codesign_jax.runs.errors import AllFailed, RunError
 from codesign_jax.runs.loop import Results, optimize, run_names
 from codesign_jax.runs.plan import Plan, needs_poor_seed, prepare, variant
@@ -25,6 +25,7 @@ __all__ = [
     "History",
     "Plan",
     "Record",
+    "RunDirectory",
     "Results",
     "RunError",
     "RunResult",
@@ -38,6 +39,7 @@ __all__ = [
     "optimize",
     "prepare",
     "read_run",
+    "reopened",
     "run_names",
     "setting_of",
     "variant",

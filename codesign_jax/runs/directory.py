@@ -128,6 +128,23 @@ def open_run(
         yield run, notes
 
 
+@contextlib.contextmanager
+def reopened(path: Path, settings: Settings) -> Iterator[RunDirectory]:
+    """The folder of a run that has ended, to add results to it; it is not locked.
+
+    Raises:
+      InputError: If it is no run any more, or of other settings.
+    """
+    stored = manifest.read_provenance(path)
+    if stored["settings"] != dataclasses.asdict(settings):
+        raise InputError([f"{path} is of another run: it was replaced since this one ended"])
+    descriptor = os.open(path / LOCK, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    try:
+        yield RunDirectory(path, descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def check_folder(path: Path, scene: Scene, settings: Settings, *, fresh: bool = False) -> None:
     """Checks that a run could start or go on in a folder; changes nothing."""
     manifest.refuse_links(path)

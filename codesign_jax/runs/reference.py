@@ -24,6 +24,7 @@ from codesign_jax.judge.sentences import Judged
 from codesign_jax.judge.stress import Stress
 from codesign_jax.judge.worth import Worth
 from codesign_jax.runs import Settings, columns, tables
+from codesign_jax.runs.directory import RunDirectory
 from codesign_jax.runs.progress import Meter
 from codesign_jax.runs.record import outcome_layout
 from codesign_jax.runs.selection import case_of_run
@@ -62,7 +63,7 @@ def most_trials(trials: int | None, settings: Settings) -> int:
 
 
 def test(
-    folder: Path, settings: Settings, most: int, console: Console, later: float = 0.0
+    run: RunDirectory, settings: Settings, most: int, console: Console, later: float = 0.0
 ) -> Outcome:
     """Outcomes of the run's design in fresh trials at `reference`, as many as decide its verdict.
 
@@ -72,6 +73,7 @@ def test(
       most: Most trials; at least 1.
       later: What is simulated after it, for the time left, in grasps of this accuracy.
     """
+    folder = run.path
     case = _finer(folder, settings)
     key = _noise(settings, fresh_trials.STREAM)
     about = case.digest(settings.seed)
@@ -81,14 +83,14 @@ def test(
     with Meter("reference test", min(verdict.USUAL, most), console, later=later) as meter:
 
         def keep(outcomes: Outcome) -> None:
-            array_files.save_results(folder / FILE, about, outcomes._asdict())
+            array_files.save_results(run.here() / FILE, about, outcomes._asdict())
             show(meter, outcomes, most)
 
         meter.count(kept.cost.size if kept else 0)
         outcomes = fresh_trials.decide(case, key, most, kept, keep)
     if kept is None or outcomes.cost.size > kept.cost.size:
         drawn = rollout.sample_trials(case.scene, key, outcomes.cost.size)
-        tables.write_grasps(folder / columns.REFERENCE, case.scene, drawn, outcomes)
+        tables.write_grasps(run.here() / columns.REFERENCE, case.scene, drawn, outcomes)
     return outcomes
 
 
@@ -126,13 +128,14 @@ def tell_stress(case: Case, result: Stress, console: Console) -> None:
 
 
 def stress_run(
-    folder: Path, settings: Settings, console: Console, later: float = 0.0
+    run: RunDirectory, settings: Settings, console: Console, later: float = 0.0
 ) -> tuple[Case, Stress]:
     """The run's design, and what it keeps under other conditions, simulated if not yet.
 
     Args:
       later: What is simulated after it, for the time left, in grasps of the run's accuracy.
     """
+    folder = run.path
     case, about = _stress_case(folder, settings)
     result, why = _stress(folder, about)
     if why:
@@ -142,7 +145,7 @@ def stress_run(
         with Meter("other conditions", total, console, later=later) as meter:
             noise = _noise(settings, stress.STREAM)
             result = stress.simulate(case, STRESS_TRIALS, noise, done=meter.advance)
-        array_files.save_results(folder / STRESS_FILE, about, result._asdict())
+        array_files.save_results(run.here() / STRESS_FILE, about, result._asdict())
     return case, result
 
 
@@ -163,11 +166,12 @@ def _stress(folder: Path, about: str, *, any_code: bool = False) -> tuple[Stress
     return result, why
 
 
-def worth_run(folder: Path, settings: Settings, console: Console) -> Worth | None:
+def worth_run(run: RunDirectory, settings: Settings, console: Console) -> Worth | None:
     """What each finger of the run's design is worth, simulated if not yet.
 
     None where there is nothing to leave out, or the design has a policy.
     """
+    folder = run.path
     case, about = _stress_case(folder, settings)
     if case.policy or case.scene.num_fingers < 2 or settings.engine != engines.DEFAULT:
         return None
@@ -186,7 +190,7 @@ def worth_run(folder: Path, settings: Settings, console: Console) -> Worth | Non
 
             interruptible(simulate)
             [result] = results
-        array_files.save_results(folder / FINGERS_FILE, about, result._asdict())
+        array_files.save_results(run.here() / FINGERS_FILE, about, result._asdict())
     return result
 
 

@@ -1,8 +1,10 @@
 """What is reused belongs to the code that this process imported, and is what was kept."""
 
+import gc
 import os
 import types
 import warnings
+import weakref
 import zlib
 from functools import partial
 from pathlib import Path
@@ -141,6 +143,31 @@ def test_programs_go_when_many_maps_are_taken(monkeypatch):
     full(monkeypatch, 0.1)
     assert get(0) is not first and get(2) is get(2) and cleared == [1]
     assert first(1) == 2
+
+
+def test_programs_of_few_structures_are_kept(monkeypatch):
+    """Those of more go with their memory, first the ones not used for the longest time."""
+    monkeypatch.setattr(reuse, "forgetters", [])
+    built = []
+
+    def build(engine, structure, number):
+        built.append(number)
+        return lambda v: v + number
+
+    find = reuse.shared(build)
+
+    def get(number):
+        return find("engine", types.SimpleNamespace(structure=number), number)
+
+    first = weakref.ref(get(0))
+    assert get(0)(1) == 1
+    for number in range(1, reuse.STRUCTURES):
+        get(number)
+    assert get(0) is first() and built == [*range(reuse.STRUCTURES)]
+    for number in range(reuse.STRUCTURES, 2 * reuse.STRUCTURES):
+        get(number)
+    gc.collect()
+    assert first() is None and get(0)(1) == 1 and built[-1] == 0
 
 
 def test_a_kernel_is_refused_before_the_limit(monkeypatch):

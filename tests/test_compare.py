@@ -641,6 +641,7 @@ SEARCH = ["codesign", "optimize", "--preset", "23d", "--seed=3", "--out", "runs/
         (128, 138, SEARCH, [*ANEW, "--hand pneuflex4_wide"]),  # undecided for long
         (10, 60, SEARCH, [*ANEW, "--hand pneuflex4_wide"]),
         (10, 60, ["codesign", "optimize", "--seeds", "0-3"], ["--episodes 60", "pneuflex4_wide"]),
+        (10, 60, ["demo.py", "--fresh"], [*ANEW, "--hand pneuflex4_wide"]),
     ],
 )
 def test_what_is_not_good_is_followed_by_commands_to_try(kept, total, words, commands):

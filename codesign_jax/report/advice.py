@@ -36,7 +36,10 @@ def after_search(
       command: The command line that made it, or a later one that went on with it.
       folder: Its folder.
     """
-    words = command[1:]
+    words = [*command[1:]]
+    if words[:1] != ["optimize"]:  # a program called it
+        words = ["optimize", "--hand", judged.scene.hand.name, "--preset", settings.preset]
+        words += ["--seed", str(settings.seed), "--out", str(folder)]
     verdict = judged.verdict
     if verdict.word == "good":
         return []
@@ -45,8 +48,7 @@ def after_search(
         trials = {"--reference-trials": str(needed)}
         return [Advice("more fresh trials, which go on with these", changed(words, trials))]
     searches = []
-    several = any(word.split("=")[0] == "--seeds" for word in words)
-    if not several:
+    if value_of(words, "--seeds") is None:
         seed = settings.seed + 1
         searches.append(("another seed", {"--seed": str(seed)}, f"seed{seed}"))
     searches.append(
@@ -56,16 +58,24 @@ def after_search(
         searches.append(("all parameters of the hand", {"--preset": "full"}, "full"))
     if wider := WIDER.get(judged.scene.hand.name):
         searches.append(("the hand with wider fingers", {"--hand": wider}, "wide"))
-    return [Advice(what, elsewhere(words, flags, folder, name)) for what, flags, name in searches]
+    return [Advice(what, elsewhere(words, flags, name)) for what, flags, name in searches]
 
 
-def elsewhere(words: Sequence[str], flags: Mapping[str, str], folder: Path, name: str) -> list[str]:
+def elsewhere(words: Sequence[str], flags: Mapping[str, str], name: str) -> list[str]:
     """A command with other flags, and another folder if it names one; without a name the same."""
-    named = any(word.split("=")[0] == "--out" for word in words)
-    if name and named:
-        out = folder if not any(w.split("=")[0] == "--seeds" for w in words) else folder.parent
-        flags = {**flags, "--out": f"{out}-{name}"}
+    place = value_of(words, "--out")
+    if name and place:
+        flags = {**flags, "--out": f"{place.rstrip('/')}-{name}"}
     return changed(words, flags)
+
+
+def value_of(words: Sequence[str], flag: str) -> str | None:
+    """The value of a flag of a command line, or None."""
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        name, equals, value = word.partition("=")
+        if name == flag:
+            return value if equals else following
+    return None
 
 
 def changed(words: Sequence[str], flags: Mapping[str, str]) -> list[str]:

@@ -11,6 +11,7 @@ from jax.extend import core
 
 from codesign_jax.compiler.instructions import Instructions
 from codesign_jax.compiler.rules import RULES
+from codesign_jax.compiler.straight_line import StraightLine
 from codesign_jax.compiler.values import Ref, Value
 
 _INLINE = ("jit", "pjit", "closed_call", "custom_jvp_call", "remat2", "checkpoint")
@@ -231,6 +232,8 @@ class Writer(Instructions):
         if name in _INLINE:
             inner = params.get("jaxpr", params.get("call_jaxpr"))
             return self.run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), args)
+        if name == "straight_line":
+            return self.straight_line(params["program"], args)
         if name in _NO_OPERATION:
             return [self.splat(args[0]) if equation.outvars[0].aval.shape else args[0]]
         control = {"scan": self.loop, "while": self.while_loop, "cond": self.branch}
@@ -252,6 +255,17 @@ class Writer(Instructions):
                 f"write it with others or add a rule to {RULES_FILE}"
             )
         return [RULES[name](self, equation, *args)]
+
+    def straight_line(self, program: StraightLine, args: list) -> list:
+        """Many operations that JAX has as one; their values are all as wide as the lanes."""
+
+        def known(number: Any) -> Value:
+            return self.splat(self.constant(np.asarray(number)))
+
+        def apply(operation: Any, operands: list) -> Value:
+            return RULES[operation.primitive.name](self, operation, *operands)
+
+        return program.run(args, known, apply)
 
 
 RULES_FILE = "codesign_jax/compiler/rules.py"

@@ -13,6 +13,8 @@ import jax
 import numpy as np
 from jax.extend import core
 
+from codesign_jax.compiler.straight_line import Symbol
+
 # Stand for the lane axes while a function is traced: sizes that no other axis has.
 FINGER = 1009
 WORLD = 1013
@@ -112,6 +114,10 @@ def _fold(equation: Any, parts: tuple) -> Any:
 
 
 def _bind(equation: Any, parts: tuple) -> Any:
+    for part in parts:
+        if isinstance(part, Symbol):
+            types = [v.aval.dtype for v in equation.invars]
+            return part.program.record(equation, parts, types, equation.outvars[0].aval.dtype)
     shape = next(p.shape for p in parts if not is_number(p))
     arrays = [splat(p, shape, v.aval.dtype) for p, v in zip(parts, equation.invars, strict=True)]
     return equation.primitive.bind(*arrays, **equation.params)

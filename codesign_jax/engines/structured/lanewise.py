@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from codesign_jax.compiler.straight_line import StraightLine
 from codesign_jax.engines.structured import identity
 from codesign_jax.engines.structured.components import FINGER, WORLD, evaluate, is_number
 
@@ -129,31 +130,32 @@ class _Place(int):
 
 @functools.lru_cache(maxsize=1024)
 def _program(call: _Call) -> Callable[[list], Any]:
-    """What calls of one key compute: one jitted function, so that JAX's cache of traces has it.
+    """What calls of one key compute: one operation of JAX, recorded once.
 
     Tracing is most of the time that a kernel takes to compile, and its functions come again: for
     each pair of bodies, and in the kernel of the next scene.
     """
-    result: list = []  # As the function is traced: its result, with places instead of values
+    recorded: list = []  # The program, and the function's result with places instead of values
 
-    def run(*values: Any) -> list:
+    def record(values: list) -> None:
+        line = StraightLine(values)
         filled = [
-            Lanes(_fill(x.parts, values), x.shape, x.dtype) if isinstance(x, Lanes) else x
+            Lanes(_fill(x.parts, line.arguments), x.shape, x.dtype) if isinstance(x, Lanes) else x
             for x in call.leaves
         ]
         out = _components(call.function, call.tree, filled)
         leaves, tree = jax.tree.flatten(out, is_leaf=lambda x: isinstance(x, Lanes))
-        arrays: list = []
+        symbols: list = []
         places: dict[int, int] = {}
-        result[:] = [_emptied(leaf, arrays, places) for leaf in leaves], tree
-        return arrays
-
-    run.__name__ = getattr(call.function, "__name__", "lanewise")
-    jitted = jax.jit(run)
+        shells = [_emptied(leaf, symbols, places) for leaf in leaves]
+        line.end(symbols)
+        recorded[:] = line, shells, tree
 
     def use(values: list) -> Any:
-        arrays = jitted(*values)
-        shells, tree = result
+        if not recorded:
+            record(values)
+        line, shells, tree = recorded
+        arrays = line.bind(values)
         leaves = [Lanes(_fill(x.parts, arrays), x.shape, x.dtype) for x in shells]
         return jax.tree.unflatten(tree, leaves)
 

@@ -43,6 +43,9 @@ interpreter:
 demo: $(DEMO)
 	$(BIN)/python -m scripts.demo
 
+# Programs and kernels of the tests stay for the next run: each belongs to the code that made it.
+test: export JAX_COMPILATION_CACHE_DIR ?= $(abspath $(VENV))/tests-cache
+test: export JAX_COMPILATION_CACHE_MAX_SIZE ?= 2147483648
 test: $(STAMP)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=10
 

@@ -138,6 +138,7 @@ class ControlLoop(Equal):
         self.policy = policy
         self.name = engine.name
         self.scene = engine.scene
+        self.fills = getattr(engine, "fills", False)
         self.steps = period_steps(self.scene, getattr(policy, "period", None))
 
     def _key(self) -> tuple:
@@ -164,28 +165,31 @@ class ControlLoop(Equal):
         arguments = {} if pack is None else {"tables": pack(fields)}
         series = {"pose": plan.pose, "pressure": plan.pressure, "shake": plan.shake}
 
-        def period(carry: tuple, now: dict[str, jax.Array]) -> tuple[tuple, Trace]:
+        def period(carry: tuple, now: dict[str, jax.Array]) -> tuple[tuple, tuple]:
             world, memory = carry
             ahead = plan._replace(**now)
             answer, command = self._asked(look, fields, world, memory, ahead)
             world, trace = advance(
                 self.engine, fields, world, ahead, command, trajectory=trajectory, **arguments
             )
-            return (world, answer), trace._replace(last=None)
+            return (world, answer), (trace._replace(last=None, overlap=None), trace.overlap)
 
         carry = (begin(self.scene, fields, plan), self._remembered(plan.params))
         parts = []
+        deepest = None
         periods, rest = divmod(plan.pose.shape[1], self.steps)
         if periods:
             now = {k: _split(v[:, : periods * self.steps], periods) for k, v in series.items()}
-            carry, traces = jax.lax.scan(period, carry, now)
+            carry, (traces, overlaps) = jax.lax.scan(period, carry, now)
+            deepest = None if overlaps is None else overlaps[0]  # the grasp begins in the first one
             parts.append(jax.tree.map(_joined, traces))
         if rest:
-            carry, trace = period(carry, {k: v[:, -rest:] for k, v in series.items()})
+            carry, (trace, overlap) = period(carry, {k: v[:, -rest:] for k, v in series.items()})
+            deepest = deepest if parts else overlap
             parts.append(trace)
         trace = jax.tree.map(lambda *v: jnp.concatenate(v, 1), *parts)
         self._refuse_nonfinite(trace.ctrl)
-        return trace._replace(last=carry[0].state)
+        return trace._replace(last=carry[0].state, overlap=deepest)
 
     def first_command(self, params: Params, trial: Trial) -> Command:
         """The policy's command for the first period of a grasp, without a simulation.

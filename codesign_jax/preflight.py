@@ -1,8 +1,9 @@
 """Before anything is simulated: which worlds may start, and warnings of scenes and designs.
 
-`invalid_start` judges the worlds of a batch as a part of its program; `notes` and `refusals` judge
-named designs by the same depths and say in words what is wrong.  The scene's own checks look at one
-number at a time; these look at the world that a design makes of them.
+`invalid_start` judges the worlds of a batch as a part of its program, by the overlap that the
+structured engine finds in its first step, or by `overlap` for engines that tell none; `notes` and
+`refusals` judge named designs by the same depths and say in words what is wrong.  The scene's own
+checks look at one number at a time; these look at the world that a design makes of them.
 """
 
 import math
@@ -16,6 +17,7 @@ import numpy as np
 from codesign_jax import model
 from codesign_jax.engines.overlaps import depth, depth_between, depth_by_pair, depth_in_palm
 from codesign_jax.model import ModelFields, morphology
+from codesign_jax.reuse import quickly_compiled
 from codesign_jax.scene import Scene, key_frames
 from codesign_jax.scene.parameters import DesignSpace, params_of
 from codesign_jax.scene.schema import InputError, nearest
@@ -54,19 +56,23 @@ def nominal_trial(scene: Scene, shape: int | str = 0) -> Trial:
     return Trial(jnp.int32(index), none, zero, none, unity, unity, unity, unity, unity, none)
 
 
-def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
+def invalid_start(scene: Scene, fields: ModelFields, deepest: jax.Array | None = None) -> jax.Array:
     """Returns INVALID_START for worlds that cannot start, shape (world,) int32, else 0.
 
     A world is refused if a field is not finite, a moving body has no mass or inertia, a spring or
     damper is negative (walls that leave no chamber, a negative length), or if at the start any two
     bodies that may touch overlap by more than the scene's limit of penetration: soft contacts would
     drive them apart with energy that no actuator gave.
+
+    Args:
+      deepest: Their largest overlaps [m], shape (world,), as `Trace.overlap` of an engine has them;
+        None for those of `overlap`, six thousand operations for XLA to compile.
     """
     fields = jax.lax.stop_gradient(fields)  # a verdict has no derivative
     scene = scene.structure
-    deep = jnp.maximum(depth(scene, fields), depth_between(scene, fields))
-    deep = jnp.maximum(deep, depth_in_palm(scene, fields))
-    bad = ~(deep <= fields.constants.limits.penetration)
+    if deepest is None:
+        deepest = overlap(scene, fields)
+    bad = ~(jax.lax.stop_gradient(deepest) <= fields.constants.limits.penetration)
     # Constants in their ranges have a finite sum, for which XLA writes one loop; as rows of an
     # array they would be one loop each.
     bad |= ~jnp.isfinite(sum(jax.tree.leaves(fields.constants)))
@@ -80,6 +86,12 @@ def invalid_start(scene: Scene, fields: ModelFields) -> jax.Array:
 def _rows(*arrays: jax.Array) -> jax.Array:
     """All numbers of each world, of arrays with leading axis (world,), shape (world, number)."""
     return jnp.concatenate([x.reshape(x.shape[0], -1) for x in arrays], 1)
+
+
+def overlap(scene: Scene, fields: ModelFields) -> jax.Array:
+    """Largest overlap of two bodies that may touch [m], shape (world,); fingers are straight."""
+    others = jnp.maximum(depth_between(scene, fields), depth_in_palm(scene, fields))
+    return jnp.maximum(depth(scene, fields), others)
 
 
 def notes(scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray]) -> list[str]:
@@ -307,7 +319,7 @@ def _overlaps(scene: Scene, designs: Params, names: list[str]) -> list[str]:
     return problems
 
 
-@jax.jit
+@quickly_compiled
 def _depths(scene: Scene, designs: Params) -> tuple[jax.Array, ...]:
     """What `invalid_start` judges by, each of shape (object, design); one program for all."""
 

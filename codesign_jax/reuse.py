@@ -374,8 +374,43 @@ def _relieve() -> None:
         gc.collect()
 
 
+def quickly_compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    """`jax.jit` of a program that runs few times: XLA for CPUs takes a fifth of the time.
+
+    It then leaves the code much as it is, which costs a kernel's program a few percent when it
+    runs; last bits may differ.  As part of another program the function is compiled with that.
+    """
+    import jax
+
+    part = jax.jit(function, **options)
+    whole = functools.cache(lambda: jax.jit(function, compiler_options=_quick(), **options))
+
+    @functools.wraps(function)
+    def call(*arguments: Any) -> Any:
+        traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(arguments))
+        return (part if traced else whole())(*arguments)
+
+    call.lower = lambda *arguments: whole().lower(*arguments)  # type: ignore[attr-defined]
+    return call
+
+
+def _quick() -> dict[str, Any]:
+    """Options of XLA for CPUs; the release of jaxlib that has emitters knows how to do without."""
+    import jax
+
+    if jax.default_backend() != "cpu":
+        return {}
+    options = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+    if _version("jaxlib").startswith("0.10."):
+        options |= {"xla_cpu_use_fusion_emitters": False}
+    return options
+
+
 def shared(build: Callable[..., Any]) -> Callable[..., Any]:
-    """Jits the functions that build(engine, space, *more) returns once for all that are equal.
+    """Compiles the functions that build(*arguments) returns once for all that are equal.
+
+    Engines and design spaces are equal if they have one structure. Functions that are not jitted
+    are `quickly_compiled`.
 
     They get their scene as an argument, so that another one of the same structure compiles nothing;
     with a `cost` of the user's own, or code that is not known, nothing is shared.
@@ -385,17 +420,20 @@ def shared(build: Callable[..., Any]) -> Callable[..., Any]:
         import jax
 
         _relieve()
-        return jax.tree.map(jax.jit, build(*arguments))
+        return jax.tree.map(
+            lambda f: f if hasattr(f, "lower") else quickly_compiled(f), build(*arguments)
+        )
 
     cached = functools.lru_cache(maxsize=STRUCTURES)(jitted)
     forgetters.append(cached.cache_clear)
 
     @functools.wraps(build)
-    def find(engine: Any, space: Any, *arguments: Any) -> Any:
+    def find(*arguments: Any) -> Any:
         if getattr(arguments[-1], "cost", None) is not None:
-            return jitted(engine, space, *arguments)
-        known = isinstance(engine, Hashable) and code_digest() is not None
-        return (cached if known else jitted)(engine, space.structure, *arguments)
+            return jitted(*arguments)
+        structures = [getattr(a, "structure", a) for a in arguments]
+        known = all(isinstance(a, Hashable) for a in arguments) and code_digest() is not None
+        return (cached if known else jitted)(*structures)
 
     return find
 

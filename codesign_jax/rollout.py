@@ -118,7 +118,7 @@ def sample_trials(
     )
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(reuse.quickly_compiled, static_argnums=(0, 1))
 def _draw(
     num_trials: int, shapes: int, key: jax.Array, noises: Any, first: jax.typing.ArrayLike
 ) -> Trial:
@@ -181,10 +181,26 @@ def simulate(
         finger is so high that its contacts begin farther from a mesh than distances reach; of
         traced ones no values are known.
     """
-    chosen_options = Options(**options)
+    return simulated(scene, engine, params, trials, Options(**options))[:2]
+
+
+def simulated(
+    scene: Scene,
+    engine: Engine,
+    params: Params,
+    trials: Trial,
+    options: Options,
+    counts: jax.Array | None = None,
+) -> tuple[Outcome, Trace, Any]:
+    """`simulate`, and the controls of shape (world, time, nu), or the `control.Plan`.
+
+    Args:
+      counts: Which worlds are simulated, bool, shape (world,); the others fill a batch up, and what
+        is returned of them means nothing.  None for all.
+    """
     _check(scene, engine, params, trials)
-    trace, ctrl, initial = _traced(scene, engine, params, trials, chosen_options)
-    return judge(scene, trace, ctrl, initial, trials, chosen_options), trace
+    trace, ctrl, initial = _traced(scene, engine, params, trials, options, counts=counts)
+    return judge(scene, trace, ctrl, initial, trials, options), trace, ctrl
 
 
 def grasp(
@@ -323,20 +339,31 @@ def _traced(
     trials: Trial,
     options: Options,
     steps: int | None = None,
+    counts: jax.Array | None = None,
 ) -> tuple[Trace, Any, jax.Array]:
     options.refuse()
     needed = options.record_forces or options.record_touch
     if needed or getattr(options.cost, "record_forces", False):
         engine = recording(engine, touch=options.record_touch)
     ctrl: Any
-    fields, ctrl, initial = prepare(scene, params, trials, engine)
+    fields, ctrl = prepare(scene, params, trials, engine)
+    if counts is not None:
+        fields = fields._replace(start=decided(scene, fields.start, ~counts))
     if steps is not None and isinstance(ctrl, control.Plan):
         series = {k: getattr(ctrl, k)[:, :steps] for k in ("pose", "pressure", "shake")}
         ctrl = ctrl._replace(**series)
     elif steps is not None:
         ctrl = ctrl[:, :steps]
     trace = engine.rollout(fields, ctrl, trajectory=options.to_end)
+    initial = invalid_start(scene, fields, trace.overlap)
     return trace if options.record_qpos else trace._replace(qpos=trace.qpos[..., :0]), ctrl, initial
+
+
+def decided(scene: Scene, start: jax.Array, which: jax.Array) -> jax.Array:
+    """Start states of which some are those of decided worlds, which no engine simulates."""
+    state = model.split(scene, start)
+    going = jnp.where(which[:, None], 0, state.going).astype(start.dtype)
+    return jnp.concatenate(state._replace(going=going), -1)
 
 
 def prepare(
@@ -344,7 +371,7 @@ def prepare(
     params: Params,
     trials: Trial,
     engine: Engine | None = None,
-) -> tuple[model.ModelFields, Any, jax.Array]:
+) -> tuple[model.ModelFields, Any]:
     """Inputs of an engine for a batch of worlds.
 
     Args:
@@ -353,15 +380,12 @@ def prepare(
       trials: Trials with leading axis (world,).
 
     Returns:
-      Model fields, controls of shape (world, time, nu), or a `control.Plan` for such an engine,
-      and bits of `Status` that the worlds start
-      with, shape (world,).
+      Model fields, and controls of shape (world, time, nu), or a `control.Plan` for such an engine.
     """
     reuse.begin()
     numbers = jax.tree.map(lambda v: jnp.asarray(v, float), scene.bare)
     world = partial(_world, getattr(engine, "commands", control.commands))
-    fields, ctrl = jax.vmap(world, in_axes=(batch_axes(numbers), 0, 0))(numbers, params, trials)
-    return fields, ctrl, invalid_start(scene, fields)
+    return jax.vmap(world, in_axes=(batch_axes(numbers), 0, 0))(numbers, params, trials)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -387,20 +411,30 @@ def judge(
       initial: Bits of `Status` that they started with, shape (world,).
       trials: Their trials, with leading axis (world,).
     """
-    if trace.ctrl is not None:
-        ctrl = trace.ctrl
+    outcomes = jax.vmap(outcome, in_axes=(batch_axes(scene), 0, 0, 0))(
+        scene, trace, initial, trials
+    )
+    return outcomes if options.cost is None else by_own(scene, options, trace, ctrl, outcomes)
 
-    def world(
-        world_scene: Scene, t: Trace, u: jax.Array | None, i: jax.Array, trial: Trial
-    ) -> Outcome:
-        result = outcome(world_scene, t, i, trial)
-        if options.cost is None:
-            return result
+
+def by_own(
+    scene: Scene, options: Options, trace: Trace, ctrl: jax.Array | None, outcomes: Outcome
+) -> Outcome:
+    """Outcomes of a batch of worlds by a cost of one's own, from those by the scene's.
+
+    Args:
+      ctrl: As a policy gave them in the trace, or as they were known, shape (world, time, nu).
+    """
+    cost = options.cost
+    assert cost is not None
+
+    def world(world_scene: Scene, t: Trace, u: jax.Array | None, result: Outcome) -> Outcome:
         seen = shown(t, options.record_qpos, options.stop_when_lost)
-        return _by_own(world_scene, options.cost, seen, u, result)
+        return _by_own(world_scene, cost, seen, u, result)
 
-    every = jax.vmap(world, in_axes=(batch_axes(scene), 0, 0, 0, 0))
-    return every(scene, trace, ctrl, initial, trials)
+    commands = ctrl if trace.ctrl is None else trace.ctrl
+    every = jax.vmap(world, in_axes=(batch_axes(scene), 0, 0, 0))
+    return every(scene, trace, commands, outcomes)
 
 
 def _by_own(

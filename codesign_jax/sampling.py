@@ -113,4 +113,4 @@ def _simulation(
         outcomes, _ = rollout.simulate(scene, engine, hands, flat, **options._asdict())
         return rollout.grid(outcomes, shape)
 
-    return simulate
+    return jax.jit(simulate)  # thousands of grasps

@@ -328,7 +328,7 @@ def _cast(
         outcomes, _ = rollout.simulate(changed, engine, params, worlds)
         return rollout.grid(outcomes, (hands, count))
 
-    return simulated
+    return jax.jit(simulated)  # thousands of grasps
 
 
 def deviating(params: Params, path: tuple[str, ...], shift: jax.Array) -> Params:

@@ -277,6 +277,9 @@ class Trace(NamedTuple):
         shape (time,), or None if the engine does not tell.
       ctrl: Controls that a policy gave, shape (time, nu); None of those that were known beforehand.
       forces: Contact forces over the step taken from each state, if they were recorded.
+      overlap: Largest overlap of two bodies as the grasp began [m], zero where there was none or
+        the rollout went on from a later state, shape (); None if the engine does not tell, see
+        `preflight.overlap`.
 
     An object that leaves the hand after six seconds, as its cost sees it:
 
@@ -298,6 +301,7 @@ class Trace(NamedTuple):
     residual: jax.Array | None = None
     ctrl: jax.Array | None = None
     forces: "Forces | None" = None
+    overlap: jax.Array | None = None
 
     def at(self, scene: Phased, phase: str | None = None) -> "Trace":
         """The trace in the last time step of a phase, without the axis time.

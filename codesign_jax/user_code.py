@@ -79,14 +79,15 @@ def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
         raise InputError([f"{flag}: its attribute record_forces must be True or False"])
 
     def judge(trace: Trace, params: Params, trials: Any) -> Outcome:
-        _, ctrl, initial = rollout.prepare(scene, params, trials)
+        ctrl = rollout.prepare(scene, params, trials)[1]
+        initial = jnp.zeros(len(ctrl), jnp.int32)
         options = rollout.Options(record_qpos=not stops, stop_when_lost=stops, cost=cost)
         return rollout.judge(scene, trace, ctrl, initial, trials, options)
 
     world = jax.tree.map(
         lambda v: jnp.asarray(v)[None], (_hand(scene), rollout.nominal_trial(scene))
     )
-    fields, ctrl, _ = jax.eval_shape(lambda p, t: rollout.prepare(scene, p, t), *world)
+    fields, ctrl = jax.eval_shape(lambda p, t: rollout.prepare(scene, p, t), *world)
     dtype = jnp.result_type(float)
     series: Any = jax.ShapeDtypeStruct((1, scene.num_steps), dtype)
     size = (1, scene.num_steps, fields.start.shape[-1] if not stops else 0)

@@ -41,7 +41,7 @@ space = parameters.design_space(grasping.hand, "2d")  # finger length and arm he
 count = 6 if FAST else 24
 trials = rollout.sample_trials(grasping, jax.random.key(0), count)
 hands = jax.tree.map(lambda v: jnp.stack([v] * count), space.params(space.default()))
-fields, ctrl, _ = rollout.prepare(grasping, hands, trials)
+fields, ctrl = rollout.prepare(grasping, hands, trials)
 
 # %% [markdown]
 # ## Windows
@@ -68,7 +68,7 @@ def ends(logs):
     )
     contact = grasping.contact
     contact = replace(contact, normal_stiffness=stiffness * contact.normal_stiffness)
-    new, *_ = rollout.prepare(replace(grasping, contact=contact), hands, scaled_trials)
+    new, _ = rollout.prepare(replace(grasping, contact=contact), hands, scaled_trials)
     driven = window.at[:, :, 6:].multiply(gain[:, None, None])
     return engine.rollout(new._replace(start=state), driven).last[:, : fields.qpos.shape[1]]
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from codesign_jax import codesign
+from codesign_jax import batch, codesign
 from codesign_jax.optimize import schedule
 from tests.helpers.toy_engine import tiny
 
@@ -22,6 +22,26 @@ def setup():
     optimizer = codesign.make_filter(space)
     task = codesign.Task(the_scene, space, TRIALS, engine)
     return the_scene, task, optimizer, partial(task.episode, optimizer)
+
+
+def test_batches_of_any_size_are_one_program():
+    """Of worlds that are filled up to one size; a traced call is a program of its own."""
+    the_scene, space, engine = tiny()
+    engine.fills = True
+    task = codesign.Task(the_scene, space, TRIALS, engine)
+    low, high = np.array(space.low), np.array(space.high)
+    key = jax.random.key(0)
+    for count in (1, 5, 40):  # the last fills two calls on CPUs
+        draws = np.random.default_rng(count).random((count, 2))
+        population = (low + (high - low) * draws).astype(np.float32)
+        outcomes = task.evaluate(population, key)
+        assert engine.traced == 1
+        whole = jax.jit(task.evaluate)(population, key)
+        np.testing.assert_allclose(outcomes.cost, whole.cost, rtol=1e-6)
+        engine.traced = 1
+    sizes = {worlds: batch.call_size(worlds) for worlds in range(1, 2 * batch.LIMIT, 97)}
+    assert len({*sizes.values()}) <= 8
+    assert all(-(-worlds // size) * size >= worlds for worlds, size in sizes.items())
 
 
 def start(optimizer, seed=0, particles=PARTICLES, design=(0.05, 0.0)):

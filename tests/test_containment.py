@@ -6,11 +6,13 @@ import re
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from codesign_jax import cli, model, preflight, rollout, runs, scene
+from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import MujocoEngine
 from codesign_jax.runs.run import Run
 from codesign_jax.types import Status
@@ -278,6 +280,50 @@ def test_fingers_inside_one_another_are_refused(surface):
     assert len(refusals) == 1 and refusals[0].startswith(
         "together: fingers start 20 mm inside one another (limits.penetration = 10 mm)"
     )
+
+
+@pytest.mark.parametrize("surface", ["hull", pytest.param("spheres", marks=pytest.mark.slow)])
+def test_the_kernel_finds_the_overlaps_of_a_start(surface):
+    """As `preflight` does: with table and object, of fingers in the palm, and in one another."""
+    effects = {"surface": surface, "finger_finger": True, "finger_palm": True}
+    sizes = {"arm": {"start_height": 0.14}, "discretization": {"links": 3}, "effects": effects}
+    the_scene = scene.load("paper_spheres", overrides=sizes)
+    inwards = dataclasses.replace(the_scene.hand.finger[0], azimuth=180.0, tilt=-20.0)
+    mounted = dataclasses.replace(the_scene.hand, finger=(inwards, *the_scene.hand.finger[1:]))
+    the_scene = dataclasses.replace(the_scene, hand=mounted)
+    count = 30
+    designs, trials = random_worlds(the_scene, 0, count)
+    third = np.arange(count) % 3
+    designs = designs._replace(
+        length=np.where(third[:, None] == 0, designs.length, 0.07).astype(np.float32),
+        spread=np.where(third == 1, 0.0, 1.0).astype(np.float32),
+    )
+    engine = make_engine("structured", the_scene)
+
+    @jax.jit
+    def overlaps(designs, trials):
+        fields, ctrl = rollout.prepare(the_scene, designs, trials)
+        tests = preflight.depth, preflight.depth_between, preflight.depth_in_palm
+        depths = [test(the_scene.structure, fields) for test in tests]
+        trace = engine.rollout(fields, ctrl[:, :2])
+        flags = preflight.invalid_start(the_scene, fields, trace.overlap)
+        start = rollout.decided(the_scene, fields.start, third > 0)
+        filled = engine.rollout(fields._replace(start=start), ctrl[:, :2])
+        ends = trace.last, filled.last, fields.qpos
+        return trace.overlap, jnp.stack(depths), flags, *ends
+
+    results = map(np.asarray, overlaps(designs, trials))
+    by_kernel, depths, flags, last, last_of_filled, places = results
+    deepest = np.maximum(depths.max(0), 0.0)
+    np.testing.assert_allclose(by_kernel, deepest, atol=1e-6)  # m; rounding in float32
+    refused = deepest > the_scene.limits.penetration
+    np.testing.assert_array_equal(flags == Status.INVALID_START, refused)
+    assert {*depths.argmax(0)[deepest > 0]} == {0, 1, 2} and 0 < refused.sum() < count
+    # Worlds that fill a batch up stay where they are, and the others do not notice them.
+    np.testing.assert_array_equal(last_of_filled[third == 0], last[third == 0])
+    stay = last_of_filled[third > 0, : places.shape[1]]
+    np.testing.assert_array_equal(stay, places[third > 0])
+    assert (last[third > 0, : places.shape[1]] != places[third > 0]).any(1).all()
 
 
 @pytest.mark.parametrize("spread", [0.0, 1.1])

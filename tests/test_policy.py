@@ -131,7 +131,7 @@ def test_what_is_observed_is_where_mujoco_has_it(worlds):
 
     @jax.jit
     def look(params, trials):
-        fields, ctrl, _ = rollout.prepare(scene, params, trials)
+        fields, ctrl = rollout.prepare(scene, params, trials)
         plan = rollout.prepare(scene, params, trials, loop(scene, replay))[1]
         recorded = engine.recording().rollout(fields, ctrl[:, :25])
         pushed = jax.tree.map(lambda v: v[:, -1], recorded.forces)

@@ -19,7 +19,7 @@ from codesign_jax import cli, reuse, rollout
 from codesign_jax.compiler.ffi import KernelUnavailable
 from codesign_jax.engines.structured import lanewise
 from codesign_jax.scene.meshes import grid
-from tests.helpers import grasps, kernels
+from tests.helpers import grasps, kernels, planted_faults
 
 
 @pytest.fixture
@@ -91,6 +91,20 @@ def test_a_kernel_of_code_that_changed_is_neither_kept_nor_found(code, folder, m
     imported(monkeypatch)
     jax.jit(lambda *v: run(*v))(x, table)
     assert len(list(folder.rglob("kernels/*.kept"))) == 2
+
+
+def test_a_planted_fault_finds_no_sound_kernel_and_leaves_none(folder):
+    """In a folder that is kept from one session to the next."""
+    run = partial(kernels.run, rounds=8)
+    x, table = kernels.numbers(2)
+    jax.jit(run)(x, table)
+    sound = {path: path.stat().st_mtime_ns for path in folder.rglob("kernels/*.kept")}
+    names = [reuse.key("kernel")]
+    with planted_faults.planted({}):
+        names.append(reuse.key("kernel"))
+        jax.jit(lambda *v: run(*v))(x, table)
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("kernels/*.kept")} == sound
+    assert len(sound) == 1 and names[0] != names[1]
 
 
 def test_nothing_traced_is_found_once_the_code_is_not_known(monkeypatch):

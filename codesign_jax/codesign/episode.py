@@ -11,7 +11,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import axes, devices, engines, rollout
+from codesign_jax import axes, batch, devices, engines, rollout
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording
@@ -147,9 +147,35 @@ class Task:
             raise InputError([problem + hint])
         self.space.refuse_population(population)
         self.space.check(population)
-        return SceneProgram(self.scene, self._programs.evaluate)(
-            jnp.asarray(population), key, scene
-        )
+        population = jnp.asarray(population)
+        if _is_whole(population, key, scene):
+            return SceneProgram(self.scene, self._programs.evaluate)(population, key, scene)
+        trials = rollout.sample_trials(scene or self.scene, key, self.trials)
+        return self.outcomes(*_alone((population, trials)), scene)[0]
+
+    def outcomes(
+        self,
+        populations: jax.Array,
+        trials: Trial,
+        scene: Scene | None = None,
+        *,
+        size: int | None = None,
+        advance: Callable[[int], Any] = lambda worlds: None,
+    ) -> list[Outcome]:
+        """Outcomes of populations that meet trials of their own, each of shape (particle, trial).
+
+        Args:
+          populations: Particles [SI units], shape (population, particle, parameter).
+          trials: The trials of each population, leading axes (population, trial).
+          scene: A scene with other numbers, of shape ().
+          size: Worlds of a call; None for `call_size`.
+          advance: Is told the worlds of each call that has ended.
+        """
+        hands, worlds = self._pieces.cross(populations, trials)
+        shape = (*populations.shape[:2], trials.yaw.shape[1])
+        every, _ = self._batch.simulate(hands, worlds, scene, size=size, advance=advance)
+        every = jax.tree.map(lambda v: v.reshape(shape), every)
+        return [jax.tree.map(lambda v, k=k: v[k], every) for k in range(shape[0])]
 
     def episode(
         self,
@@ -172,15 +198,18 @@ class Task:
         """
         _refuse_state(state)
         mask = np.ones(self.space.num_parameters, bool) if mask is None else mask
-        return self._joined(self._programs.episode, optimizer)(state, mask, scene)
+        if _is_whole((state, mask), optimizer, scene):
+            return self._joined(self._programs.episode, optimizer)(state, mask, scene)
+        _refuse_mask(self.space, mask)
+        self.space.refuse_population(state.particles)
+        results = self.side_by_side(optimizer)(*_alone((state, np.asarray(mask))), scene)
+        if self._weighs(optimizer):
+            _warn_of_negative(results[1].selection.cost)
+        return _first(results)
 
-    def side_by_side(self, optimizer: Optimizer) -> SceneProgram:
-        """`episode` of several runs: a function of states and masks with a leading axis (run,).
-
-        It is `jax.vmap` of `episode`: one program simulates the worlds of all runs, and rounds
-        otherwise than one of another number of runs.
-        """
-        return SceneProgram(self.scene, self._programs.episodes, optimizer)
+    def side_by_side(self, optimizer: Optimizer) -> "SideBySide":
+        """`episode` of several runs: a function of states and masks with a leading axis (run,)."""
+        return SideBySide(self, optimizer)
 
     def run(
         self,
@@ -207,14 +236,33 @@ class Task:
         _refuse_state(state)
         return self._joined(self._programs.run, optimizer)(state, masks, scene)
 
+    def call_size(self, worlds: int) -> int | None:
+        """Worlds of a call of what simulates so many, for other calls to be alike; None for any."""
+        return self._batch.size(worlds) if self._batch.fills else None
+
+    def first_trials(self, keys: jax.Array) -> Trial:
+        """Trials of the first episodes of runs with these root keys, leading axes (run, trial)."""
+        return SceneProgram(self.scene, self._pieces.first_trials)(keys, None)
+
+    @functools.cached_property
+    def _batch(self) -> batch.Batch:
+        return batch.Batch(self.scene, self.engine, self._options, self.devices)
+
+    @functools.cached_property
+    def _pieces(self) -> "_Pieces":
+        return _pieces(self.space, self.trials)
+
     @functools.cached_property
     def _programs(self) -> "_Programs":
         return _programs(self.engine, self.space, self.trials, self.devices, self._options)
 
     def _joined(self, program: Callable, optimizer: Optimizer) -> SceneProgram:
         """A program with its optimiser, which warns where that does not see costs of one's own."""
-        weighs = self.cost is not None and isinstance(optimizer, ParticleFilter)
-        return (_Weighing if weighs else SceneProgram)(self.scene, program, optimizer)
+        kind = _Weighing if self._weighs(optimizer) else SceneProgram
+        return kind(self.scene, program, optimizer)
+
+    def _weighs(self, optimizer: Optimizer) -> bool:
+        return self.cost is not None and isinstance(optimizer, ParticleFilter)
 
 
 class _Weighing(SceneProgram):
@@ -223,15 +271,150 @@ class _Weighing(SceneProgram):
     def __call__(self, first: Any, second: Any, scene: Scene | None = None) -> Any:
         """Like `SceneProgram`, but warns of negative particle costs, except traced ones."""
         results = super().__call__(first, second, scene)
-        costs = results[1].selection.cost
-        if not isinstance(costs, jax.core.Tracer) and (np.asarray(costs) < 0).any():
-            warnings.warn(
-                "a cost of your own is negative: the particle filter weighs by 1 / (alpha + cost) "
-                "and takes negative costs for 0, so that it does not tell them apart; add a "
-                "constant, or take an optimiser that compares, such as cma-es",
-                stacklevel=2,
-            )
+        _warn_of_negative(results[1].selection.cost)
         return results
+
+
+def _warn_of_negative(costs: Any) -> None:
+    if not isinstance(costs, jax.core.Tracer) and (np.asarray(costs) < 0).any():
+        warnings.warn(
+            "a cost of your own is negative: the particle filter weighs by 1 / (alpha + cost) "
+            "and takes negative costs for 0, so that it does not tell them apart; add a "
+            "constant, or take an optimiser that compares, such as cma-es",
+            stacklevel=3,
+        )
+
+
+class SideBySide:
+    """Episodes of several runs: a function of their states and masks, see `Task.side_by_side`.
+
+    Called with arrays it is three programs: one asks the optimiser, one simulates the worlds in
+    calls of few sizes (`batch.Batch`), and one tells the costs; only the first and the last depend
+    on space, optimiser and numbers of particles. Called with traced arrays it is one program.
+    """
+
+    def __init__(self, task: Task, optimizer: Optimizer):
+        """Compiles nothing yet."""
+        self._task = task
+        self._optimizer = optimizer
+
+    def __call__(
+        self, states: OptimizerState, masks: jax.typing.ArrayLike, scene: Scene | None = None
+    ) -> tuple[OptimizerState, EpisodeInfo]:
+        """The states after an episode, and reports, with a leading axis (run,)."""
+        task = self._task
+        if _is_whole((states, masks), self._optimizer, scene):
+            return SceneProgram(task.scene, task._programs.episodes, self._optimizer)(
+                states, masks, scene
+            )
+        asked = self._ask(states, masks, scene)
+        return self._tell(states, masks, scene, asked, task._batch.simulate(*asked[2:], scene))
+
+    def compile(self, states: OptimizerState, masks: jax.typing.ArrayLike) -> Callable:
+        """Compiles ahead for arguments like these, by worlds that are not simulated.
+
+        An engine that simulates all worlds of a batch gets one program, as if it were traced.
+        """
+        task = self._task
+        if not task._batch.fills:
+            whole = SceneProgram(task.scene, task._programs.episodes, self._optimizer)
+            return whole.compile(states, masks)
+        asked = self._ask(states, masks, None)
+        nothing = task._batch.compile(*asked[2:])
+        jax.block_until_ready(self._tell(states, masks, None, asked, nothing))
+        return self
+
+    def _ask(self, states: OptimizerState, masks: Any, scene: Scene | None) -> tuple:
+        program = SceneProgram(self._task.scene, self._task._pieces.ask, self._optimizer)
+        return program(states, masks, scene)
+
+    def _tell(
+        self, states: OptimizerState, masks: Any, scene: Scene | None, asked: tuple, results: tuple
+    ) -> tuple[OptimizerState, EpisodeInfo]:
+        population, trials, *_ = asked
+        shape = (*population.shape[:2], self._task.trials)
+        results = jax.tree.map(lambda v: jnp.asarray(v.reshape(*shape, *v.shape[1:])), results)
+        outcomes, last = results
+        program = SceneProgram(self._task.scene, self._task._pieces.tell, self._optimizer)
+        new, selection = program((states, masks), (population, outcomes), scene)
+        return new, EpisodeInfo(population, outcomes, selection, last, trials)
+
+
+# One program, not one an operation.
+
+
+@jax.jit
+def _alone(tree: Any) -> Any:
+    """Arrays with a leading axis of one run."""
+    return jax.tree.map(lambda v: jnp.asarray(v)[None], tree)
+
+
+@jax.jit
+def _first(tree: Any) -> Any:
+    """Arrays of the first run."""
+    return jax.tree.map(lambda v: v[0], tree)
+
+
+def _is_whole(*arguments: Any) -> bool:
+    """Whether a call is one program: what is traced, or has numbers that differ between trials."""
+    *_, scene = arguments
+    if any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(arguments)):
+        return True
+    return scene is not None and any(jnp.ndim(v) for v in jax.tree.leaves(scene.bare))
+
+
+class _Pieces(NamedTuple):
+    """Programs around the simulation; all arrays have a leading axis (run,) or (population,)."""
+
+    ask: Any
+    tell: Any
+    cross: Any
+    first_trials: Any
+
+
+@shared
+def _pieces(space: DesignSpace, num_trials: int) -> _Pieces:
+    def cross(population: jax.Array, trials: Trial) -> tuple[Params, Trial]:
+        particles, count = len(population), trials.yaw.shape[0]
+        hands = jax.vmap(space.params)(population)
+        hands = jax.tree.map(lambda v: jnp.repeat(v, count, axis=0), hands)
+        return hands, jax.tree.map(
+            lambda v: jnp.tile(v, (particles,) + (1,) * (v.ndim - 1)), trials
+        )
+
+    def worlds(populations: jax.Array, trials: Trial) -> tuple[Params, Trial]:
+        every = jax.vmap(cross)(populations, trials)
+        return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), every)
+
+    def ask(
+        states: OptimizerState, masks: jax.Array, scene: Scene, optimizer: Optimizer
+    ) -> tuple[jax.Array, Trial, Params, Trial]:
+        def one(state: OptimizerState, mask: jax.Array) -> tuple[jax.Array, Trial]:
+            _refuse_mask(space, mask)
+            space.refuse_population(state.particles)
+            trials = episode_trials(scene, state.key, state.episode, num_trials)
+            return optimizer.ask(state, mask), trials
+
+        populations, trials = jax.vmap(one)(states, masks)
+        return populations, trials, *worlds(populations, trials)
+
+    def tell(
+        before: tuple[OptimizerState, jax.Array],
+        simulated: tuple[jax.Array, Outcome],
+        scene: Scene,
+        optimizer: Optimizer,
+    ) -> tuple[OptimizerState, Info]:
+        def one(
+            state: OptimizerState, mask: jax.Array, population: jax.Array, outcomes: Outcome
+        ) -> tuple[OptimizerState, Info]:
+            return optimizer.tell(state, population, particle_cost(scene, outcomes), mask)
+
+        return jax.vmap(one)(*before, *simulated)
+
+    def first_trials(keys: jax.Array, _: Any, scene: Scene) -> Trial:
+        return jax.vmap(lambda key: episode_trials(scene, key, 0, num_trials))(keys)
+
+    return _Pieces(ask, tell, worlds, first_trials)
 
 
 class _Programs(NamedTuple):
@@ -283,7 +466,8 @@ def _programs(
 
         return jax.lax.scan(step, state, jnp.asarray(masks))
 
-    return _Programs(evaluate, episode, jax.vmap(episode, in_axes=(0, 0, None, None)), run)
+    episodes = jax.vmap(episode, in_axes=(0, 0, None, None))
+    return _Programs(jax.jit(evaluate), episode, jax.jit(episodes), jax.jit(run))
 
 
 def _refuse_state(state: Any) -> None:

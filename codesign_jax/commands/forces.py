@@ -119,7 +119,7 @@ def pull(
 
     @jax.jit
     def run(hands: Params, trials: Trial) -> jax.Array:
-        fields, ctrl, _ = rollout.prepare(scene, hands, trials)
+        fields, ctrl = rollout.prepare(scene, hands, trials)
         begun = engine.rollout(fields, ctrl[:, :steps], trajectory=True)
         still = ctrl[:, steps - 1 : steps]
         assert begun.last is not None

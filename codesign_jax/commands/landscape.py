@@ -220,7 +220,7 @@ def _worlds(engine: Engine, space: DesignSpace, num_trials: int) -> Callable:
         assert designs.shape[0] % num_trials == 0
         return rollout.simulate(scene, engine, jax.vmap(space.params)(designs), trials)[0]
 
-    return simulated
+    return jax.jit(simulated)  # thousands of grasps
 
 
 def summarize(case: Case, plane: Plane, outcomes: Outcome, options: Options) -> Landscape:

@@ -52,6 +52,9 @@ class Engine(Protocol):
     Attributes:
       name: Name on the command line and in results.
       scene: The scene.
+
+    An attribute `fills` that is True says that worlds which are decided when they start cost next
+    to nothing: batches are then filled up to few sizes, so that one program serves, see `batch`.
     """
 
     name: str

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import control, rollout, user_code
+from codesign_jax import batch, control, rollout, user_code
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.interrupts import interruptible
 from codesign_jax.model import morphology
@@ -116,8 +116,19 @@ class Case(NamedTuple):
         """As `simulate`, and where a policy left the key frames; None without a policy."""
         design = jnp.asarray(self.design, jnp.float32)
         self.space.check(design[None])
+        if not self.policy:
+            return interruptible(self._in_batch, trials, key, first), None
         run = SceneProgram(self.scene, _in_trials(self.make_engine(), self.space, trials))
         return jax.tree.map(np.asarray, interruptible(run, design, (key, jnp.asarray(first))))
+
+    def _in_batch(self, trials: int, key: jax.Array, first: int) -> Outcome:
+        """Outcomes by the program that other batches have as well, see `batch.Batch`."""
+        design = np.asarray(self.design, np.float32)
+        noise = rollout.sample_trials(self.scene, key, trials, first)
+        hand = jax.jit(self.space.params)(design)
+        hands = jax.tree.map(lambda v: np.repeat(np.asarray(v)[None], trials, 0), hand)
+        every = batch.Batch(self.scene, self.make_engine(), rollout.Options())
+        return every.simulate(hands, noise)[0]
 
     def digest(self, *numbers: int) -> str:
         """Digest of what determines outcomes, beside code, versions and device."""

@@ -8,12 +8,11 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from codesign_jax import model, rollout
-from codesign_jax.engines import Engine
+from codesign_jax.batch import Batch
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.interrupts import interruptible
 from codesign_jax.judge import verdict
@@ -21,13 +20,11 @@ from codesign_jax.judge.cases import Case
 from codesign_jax.model import morphology, overlap
 from codesign_jax.model.layout import touches_itself
 from codesign_jax.model.overlap import Overlaps
-from codesign_jax.reuse import SceneProgram, shared
 from codesign_jax.scene import Scene, draws, silicones
 from codesign_jax.scene.buildable import rim_drop
-from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.scene.schema import InputError
 from codesign_jax.statistics import wilson
-from codesign_jax.types import Outcome, Params, Trial
+from codesign_jax.types import Outcome, Params, Trace, Trial
 
 AS_IT_IS = "as it is"
 """Name of the condition in which nothing is changed, the first one."""
@@ -114,27 +111,29 @@ def simulate(
 ) -> Stress:
     """Simulates the design under every condition, in the same trials; `done` counts the grasps."""
     scene = case.scene
-    design = jnp.asarray(case.design, jnp.float32)
+    params = jax.tree.map(np.asarray, jax.jit(case.space.params)(np.asarray(case.design, float)))
+    hands = jax.tree.map(lambda v: np.repeat(v[None], trials, 0), params)
 
-    def simulated(run: SceneProgram, *constants: Scene) -> tuple[Outcome, jax.Array, Trial]:
-        result = interruptible(run, design, key, *constants)
+    def simulated(conditions: Batch, scene: Scene) -> tuple[Outcome, Trace, Trial]:
+        drawn = rollout.sample_trials(scene, key, trials)
+        outcomes, trace = interruptible(conditions.shown, hands, drawn, scene)
         done(trials)
-        return result
+        return outcomes, trace, jax.tree.map(np.asarray, drawn)
 
-    run = _program(scene, case, trials)
-    outcomes, qpos, drawn = simulated(run)
-    params = jax.tree.map(np.asarray, jax.jit(case.space.params)(design))
-    warnings = _in_grasps(scene, params, *jax.tree.map(np.asarray, (outcomes, qpos, drawn)))
+    recorded = Batch(scene, case.make_engine(), rollout.Options(record_qpos=True))
+    outcomes, trace, drawn = simulated(recorded, scene)
+    warnings = _in_grasps(scene, params, outcomes, trace.qpos[:, ::HELD], drawn)
     every = [(AS_IT_IS, outcomes)]
-    every += [(name, simulated(run, c)[0]) for name, c in variants(scene)]
+    conditions = Batch(scene, case.make_engine(), rollout.Options())
+    every += [(name, simulated(conditions, c)[0]) for name, c in variants(scene)]
     other = silicones.under(scene, neo_hookean=not scene.effects.neo_hookean)
     name = f"{'neo-Hookean' if other.effects.neo_hookean else 'linear'} bending law"
     try:
-        run = _program(other, case, trials)
+        conditions = Batch(other, case.make_engine(other), rollout.Options())
     except InputError:  # an engine that has one law only
         pass
     else:
-        every.append((name, simulated(run)[0]))
+        every.append((name, simulated(conditions, other)[0]))
     kept = [verdict.kept(outcome).sum() for _, outcome in every]
     return Stress(tuple(name for name, _ in every), np.array(kept), trials, tuple(warnings))
 
@@ -195,24 +194,6 @@ def unknown(scene: Scene) -> draws.Constants:
         if entry.key not in known:
             constants.append(entry)
     return draws.Constants(constant=tuple(constants))
-
-
-def _program(scene: Scene, case: Case, trials: int) -> SceneProgram:
-    return SceneProgram(scene, _recorded(case.make_engine(scene), case.space, trials))
-
-
-@shared
-def _recorded(engine: Engine, space: DesignSpace, num_trials: int) -> Callable:
-    def simulated(
-        design: jax.Array, key: jax.Array, scene: Scene
-    ) -> tuple[Outcome, jax.Array, Trial]:
-        trials = rollout.sample_trials(scene, key, num_trials)
-        hand = jax.tree.map(lambda v: v[None], space.params(design))
-        scene, hands, trials = rollout.crossed(scene, hand, trials)
-        outcomes, trace = rollout.simulate(scene, engine, hands, trials, record_qpos=True)
-        return outcomes, trace.qpos[:, ::HELD], trials
-
-    return simulated
 
 
 def _in_grasps(

@@ -1,14 +1,13 @@
 """A grasp to be drawn, and the camera that sees it."""
 
-import functools
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import rollout
+from codesign_jax.batch import Batch
 from codesign_jax.engines import Engine
+from codesign_jax.rollout import Options
 from codesign_jax.scene import Scene
 from codesign_jax.types import Outcome, Params, Trace, Trial
 
@@ -50,8 +49,8 @@ class Replay(NamedTuple):
 def replay(scene: Scene, engine: Engine, params: Params, trials: Trial) -> list[Replay]:
     """Simulates one hand in several trials and keeps the trajectories."""
     count = trials.yaw.shape[0]
-    worlds = jax.tree.map(lambda v: jnp.broadcast_to(v, (count, *jnp.shape(v))), params)
-    outcomes, trace = jax.tree.map(np.asarray, _simulate(scene, engine, worlds, trials))
+    worlds = jax.tree.map(lambda v: np.broadcast_to(v, (count, *np.shape(v))), params)
+    outcomes, trace = Batch(scene, engine, Options(record_qpos=True)).shown(worlds, trials)
 
     def at_index(tree, i: int):
         return jax.tree.map(lambda v: np.asarray(v)[i], tree)
@@ -60,8 +59,3 @@ def replay(scene: Scene, engine: Engine, params: Params, trials: Trial) -> list[
         Replay(*(at_index(v, i) for v in (worlds, trials, outcomes, trace.qpos, trace)))
         for i in range(count)
     ]
-
-
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _simulate(scene: Scene, engine: Engine, worlds: Params, trials: Trial) -> tuple:
-    return rollout.simulate(scene, engine, worlds, trials, record_qpos=True)

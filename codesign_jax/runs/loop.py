@@ -139,7 +139,9 @@ class Search:
         self._task = task
         self._plan = runs[0].plan
         self._episode = task.side_by_side(self._plan.optimizer)
-        self._compiled: dict[Any, Callable] = {}
+        self._compiled: Callable | None = None
+        worlds = len(runs) * self._plan.settings.particles * self._plan.settings.trials
+        self._size = task.call_size(worlds)  # of every call, so that one program serves
         self._rows: list[Run] = []  # runs that are simulated
         self._progress = progress
         self._interrupts = interrupts
@@ -187,9 +189,32 @@ class Search:
         run.begin(seed, start)
 
     def _outcomes(self, population: jax.Array, key: jax.Array) -> Outcome:
-        """Outcomes of one run's particles, by an episode that moves nothing."""
-        [(_, info)] = self._simulate([codesign.frozen(self._plan.optimizer, population, key)])
-        return info.outcomes
+        """Outcomes of one run's particles in the trials of an episode that moves nothing."""
+        (outcomes,) = self._tested([population], [key])
+        return outcomes
+
+    def _tested(
+        self,
+        populations: list[Any],
+        keys: list[jax.Array],
+        advance: Callable[[int], Any] = lambda worlds: None,
+    ) -> list[Outcome]:
+        """Outcomes of particles in the first trials of these root keys, in calls of a search."""
+        task = self._task
+
+        def checked(worlds: int) -> None:
+            advance(worlds)
+            if self._interrupts.signum:
+                raise Stopped(self._interrupts.signum)
+
+        def simulate() -> list[Outcome]:
+            trials = task.first_trials(jnp.stack(keys))
+            particles = jnp.asarray(np.stack(populations))
+            return task.outcomes(particles, trials, size=self._size, advance=checked)
+
+        wait = self._interrupts.begin(simulate)
+        self._save()
+        return wait()
 
     def _run_episodes(self) -> None:
         """The loop of Fig. 5; runs that were ahead of the others wait for them.
@@ -212,7 +237,6 @@ class Search:
     def _test(self) -> None:
         """The final test: the final particles in trials of its own."""
         settings = self._plan.settings
-        optimizer = self._plan.optimizer
         runs = self._rows
         going = self._going()
         if not going:
@@ -221,14 +245,12 @@ class Search:
         size = max(len(few) for few, _ in chosen)
         particles = [few[np.arange(size) % len(few)] for few, _ in chosen]
         self._progress.begin("testing the final particles")
-        rounds = []
-        for k in range(settings.test_rounds):
-            keys = [codesign.test_key(run.plan.key, k) for run in runs]
-            questions = zip(particles, keys, strict=True)
-            rounds.append(self._simulate([codesign.frozen(optimizer, *each) for each in questions]))
-            self._progress.tested(len(going) * size * settings.trials)
-        for run, (_, rows), *parts in zip(runs, chosen, *rounds, strict=True):
-            outcomes = [info.outcomes for _, info in parts]
+        rounds = settings.test_rounds
+        keys = [codesign.test_key(run.plan.key, k) for run in runs for k in range(rounds)]
+        populations = [few for few in particles for _ in range(rounds)]
+        parts = self._tested(populations, keys, self._progress.tested) if rounds else []
+        for i, (run, (_, rows)) in enumerate(zip(runs, chosen, strict=True)):
+            outcomes = parts[i * rounds : (i + 1) * rounds]
             test = jax.tree.map(lambda *v: np.concatenate(v, axis=1), *outcomes)
             if run in going and run.error is None:
                 self._let(run, run.finish, jax.tree.map(lambda v, p=rows: v[p], test))
@@ -259,12 +281,11 @@ class Search:
 
     def _program(self, states: OptimizerState, masks: np.ndarray) -> Callable:
         """Compiles apart from the first call, so that its time is not an episode's."""
-        shape = np.shape(states.particles)
-        if shape not in self._compiled:
+        if self._compiled is None:
             text = self._progress.text
             self._progress.begin("compiling")
             start = time.perf_counter()
-            self._compiled[shape] = self._interrupts.call(self._episode.compile, states, masks)
+            self._compiled = self._interrupts.call(self._episode.compile, states, masks)
             count = self._task.devices
             where = self._task.engine.name + (f", {count} devices" if count > 1 else "")
             message = f"compiled in {time.perf_counter() - start:.1f} s (engine {where})"
@@ -272,7 +293,7 @@ class Search:
             self._progress.begin(text)
             for run in self._going():
                 run.log(message)
-        return self._compiled[shape]
+        return self._compiled
 
     def _save(self) -> None:
         for run in self._runs:

@@ -32,7 +32,7 @@ class ToyEngine:
         worlds, steps = ctrl.shape[:2]
         length = 2 * self.scene.discretization.links * fields.offset[:, 0, 0]
         # From the start of the window at 0.5 s to past its end at 1.0 s, and a little noise.
-        noise = 20 * fields.start[:, -7]
+        noise = 20 * fields.qpos[:, -7]
         lost = 0.5 + 8 * (length - 0.03) + 0.3 * ctrl[:, 20, 2] + noise
         time = np.arange(steps) * self.scene.discretization.timestep
         distance = jnp.where(time >= lost[:, None], 1.0, 0.0).astype(ctrl.dtype)

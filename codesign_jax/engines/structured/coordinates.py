@@ -53,6 +53,7 @@ def _in_lanes(scene: Scene, start: model.RolloutState) -> State:
         step=step,
         going=going,
         speed=speed,
+        overlap=jnp.zeros_like(speed),
         held=jnp.asarray(start.held).T.reshape(-1, held.lanes(scene), q.shape[-1]),
     )
 

@@ -37,6 +37,7 @@ class StructuredEngine(Equal):
     """
 
     name = "structured"
+    fills = True  # see `Engine`
 
     def __init__(
         self,
@@ -260,7 +261,12 @@ class StructuredEngine(Equal):
         # step that converged leaves is rounding.
         left = jnp.where(entries["residual"] > self.limits.tolerance, entries["residual"], 0.0)
         return Trace(
-            *series, qpos, self._status(entries), coordinates.whole(end), residual=jnp.sqrt(left)
+            *series,
+            qpos,
+            self._status(entries),
+            coordinates.whole(end),
+            residual=jnp.sqrt(left),
+            overlap=end.overlap[0, 0],
         )
 
     def _status(self, series: dict[str, jax.Array]) -> jax.Array:

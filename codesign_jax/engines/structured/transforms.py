@@ -80,7 +80,7 @@ def rollout(
         return trace, (fields, ctrl, path, trace.speed)
 
     def backward(saved: tuple, cotangent: Trace):
-        return *adjoint(*saved, cotangent._replace(status=None, residual=None)), None
+        return *adjoint(*saved, cotangent._replace(status=None, residual=None, overlap=None)), None
 
     run.defvjp(forward, backward)
     return run(fields, ctrl, tables)
@@ -135,7 +135,7 @@ def _adjoint(
 
     Args:
       speed: Its largest velocities, as in `Trace`.
-      cotangent: Cotangent of its trace, without status and residual.
+      cotangent: Cotangent of its trace, without status, residual and overlap.
     """
     scene = settings.scene
     program = AdjointProgram.here(scene, settings.limits, ctrl.dtype, len(ctrl))

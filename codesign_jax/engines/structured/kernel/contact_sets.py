@@ -197,6 +197,13 @@ class BoundContacts:
     def place(self, item: Any) -> Place:
         return Place(*(self.read(field, item) for field in Place._fields))
 
+    def deepest(self) -> Lanes:
+        """The largest depth of the lanes' contacts [m], zero where nothing overlaps."""
+        return self.fold_items(self._deeper, zeros((), self.like))
+
+    def _deeper(self, item: Any, depth: Lanes) -> Lanes:
+        return lanewise(_deeper, depth, self.read("share", item), self.read("gap", item))
+
     def inertia_and_wrench(self, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
         """Adds the last step to jar; returns the contacts' inertia (6, 6) and wrench (6,) there."""
         parts: list[tuple] = [(21,), (6,)]
@@ -302,6 +309,13 @@ def slopes_along_line(share, cone, ray, alpha):
     line = LineCost(*(ray[i] if i < ray.shape[0] else None for i in range(5)))
     first, second = contact.slopes(c, line, alpha)
     return [sum_axis(first, 0), sum_axis(second, 0)]
+
+
+def _deeper(depth, share, gap):
+    """The larger of a depth and those of contacts that touch."""
+    for k in range(gap.shape[0]):
+        depth = jnp.maximum(depth, jnp.where(share[k] > 0, -gap[k], 0.0))
+    return depth
 
 
 def margin(scene: Scene) -> float:

@@ -118,7 +118,7 @@ class Tables(KernelLayout):
         hold = {f"held.{name}": (n, (3,)) for name, n in self.held.items()}
         self.finger_state = MemoryLayout(True, finger=joint, finger_vel=joint, **hold, acc=joint)
         world_state = dict(wrist=6, position=3, quat=4, wrist_vel=6, linear_vel=3, angular_vel=3)
-        world_state |= dict(step=1, going=1, speed=1, acc_wrist=6, acc_object=6)
+        world_state |= dict(step=1, going=1, speed=1, overlap=1, acc_wrist=6, acc_object=6)
         self.world_state = MemoryLayout(
             False, **{name: (1, (size,)) for name, size in world_state.items()}
         )

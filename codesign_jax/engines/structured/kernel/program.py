@@ -271,7 +271,7 @@ class BlockRollout:
             self._store_path(t)
             command = self._command(t)
             entry, new_speed, moved = step.advance(
-                *command, undecided, going > 0, fastest, self.program.limits
+                *command, undecided, going > 0, fastest, self.program.limits, t == 0
             )
             going = jnp.where(moved, going, 0.0)
             for k, value in enumerate((*entry[:2], fastest, *entry[2:4], going, *entry[4:])):

@@ -207,6 +207,43 @@ class SelfCollision:
 
         each(self.block.rounds(count), ring)
 
+    # As a grasp begins
+
+    def deepest(self) -> Lanes:
+        """The largest overlap of fingers with one another and with the palm [m], or zero.
+
+        See `engines.overlaps.depth_between` and `depth_in_palm`.
+        """
+        depth = zeros((), self.like)
+        if self.palm is not None:
+            depth = self.contacts.deepest_in_palm(depth)
+        if not self.layout.scene.effects.finger_finger:
+            return depth
+
+        def pairing(number: Any, depth: Lanes) -> Lanes:
+            partner = FingerPairing(self.block, number + 1, self.like.dtype, with_itself=False)
+            return self._deepest_of_pair(partner, depth)
+
+        return loop(self.block.fingers - 1, pairing, depth, self.block.size)
+
+    def _deepest_of_pair(self, pairing: FingerPairing, depth: Lanes) -> Lanes:
+        """The larger of a depth and those of the spheres around two fingers' links."""
+        fingers = self.layout.num_fingers
+        other = jax.lax.div(pairing.lane, jnp.int32(self.layout.block))
+        both = lanes([(self.block.finger < fingers) & (other < fingers)], (), wide=True)
+
+        def with_other(j: Any, depth: Lanes) -> Lanes:
+            theirs = pairing.swap(self._sphere(j))
+            deeper = lambda i, d: lanewise(_deeper, d, both, self._sphere(i), theirs)  # noqa: E731
+            return loop(self.layout.links, deeper, depth, self.block.size)
+
+        return loop(self.layout.links, with_other, depth, self.block.size)
+
+    def _sphere(self, i: Any) -> Lanes:
+        """Middle and radius [m] of the sphere around a link, as high as its section, (4,)."""
+        where = self.read("joint", i + 1), self.read("frame", i + 1)
+        return lanewise(_sphere, *where, self.step.hand.read("centre", i))
+
     # Contacts
 
     def reach(self, numbers: Lanes) -> Lanes:
@@ -605,6 +642,16 @@ def between(numbers, frame, centre, other, t):
 
 def balls(numbers, centre, theirs, their_centre):
     return rings.ball_on_ball(numbers[3] * numbers[6], centre, theirs[3] * theirs[6], their_centre)
+
+
+def _sphere(origin, frame, centre):
+    return jnp.concatenate([origin + apply_columns(frame, centre), centre[2:]])
+
+
+def _deeper(depth, both, mine, theirs):
+    away = mine[:3] - theirs[:3]
+    overlap = mine[3] + theirs[3] - jnp.sqrt(dot(away, away))
+    return jnp.maximum(depth, jnp.where(both, overlap, 0.0))
 
 
 def above(origin, before, frame, numbers):

@@ -176,6 +176,15 @@ class BoundSelfContacts(BoundSlots):
         self.block = Block(*of.block)
         self._cones = cones
 
+    def deepest_in_palm(self, depth: Lanes) -> Lanes:
+        """The larger of a depth and those of the fingers' contacts with the palm [m]."""
+
+        def deeper(item: Any, depth: Lanes) -> Lanes:
+            fields = (self.read(name, item)[0] for name in ("share", "gap"))
+            return lanewise(_deeper_in_palm, depth, self.read("other", item)[0, 0], *fields)
+
+        return self.fold(0, deeper, depth)
+
     def pairing(self, row: Any) -> FingerPairing:
         return FingerPairing(
             self.block, row + self.set.first, self.table.dtype, with_itself=self.set.with_itself
@@ -475,6 +484,12 @@ class BoundSelfContacts(BoundSlots):
 
 def _only_where(mask, value):
     return jnp.where(mask, value, 0.0)
+
+
+def _deeper_in_palm(depth, other, share, gap):
+    """The larger of a depth and that of a contact with the palm, whose link is 0."""
+    touches = (share[0] > 0) & (other < 0.5)
+    return jnp.maximum(depth, jnp.where(touches, -gap[0], 0.0))
 
 
 def _where(mask, chosen, other):

@@ -49,6 +49,7 @@ class Step(StepMemory):
         waiting: Any,
         speed: Any,
         limits: tuple[int, int, float],
+        begins: Any,
     ) -> tuple:
         """Advances the block.
 
@@ -59,6 +60,7 @@ class Step(StepMemory):
           waiting: Undecided worlds, which must converge.
           speed: Largest velocity before the step.
           limits: See `program.Limits`.
+          begins: Whether the rollout begins, a scalar; see `_keep_overlap`.
 
         Returns:
           Trace entries distance, height, residual, iterations and, with slots, overflow; speed
@@ -66,6 +68,7 @@ class Step(StepMemory):
         """
         layout = self.layout
         state, bodies, _, now, centre = self.assemble(arm, pressure)
+        jax.lax.cond(begins, lambda: self._keep_overlap(state), lambda: None)
         now, convergence = Newton(Problem(self, bodies["palm"])).solve(now, waiting, *limits)
         distance = lanewise(lambda c: jnp.sqrt(dot(c, c)), centre).lane
         height = state["position"][2].lane
@@ -107,6 +110,25 @@ class Step(StepMemory):
     def fields(self, bodies: dict[str, Any], world_object: WorldObject) -> SdfCollision:
         """The search for contacts with distance fields; arguments as `assemble` has them."""
         return SdfCollision(self, bodies, world_object)
+
+    def _keep_overlap(self, state: dict) -> None:
+        """Keeps the largest overlap of two bodies of worlds whose grasp begins in this step.
+
+        A world with a larger one than the scene's limit is refused; `preflight.overlap` says the
+        same of worlds that no kernel simulates.
+        """
+        fields = [c for c in self.contacts.values() if not isinstance(c, BoundSelfContacts)]
+        depths = [c.deepest().lane for c in fields]
+        if self.search:
+            depths.append(self.search.deepest().lane)
+        deepest = self.like
+        for depth in depths:
+            deepest = jnp.maximum(deepest, depth)
+        if self.layout.team > 1:
+            deepest = self.block.over_team(deepest, jnp.maximum)
+        deepest = self.block.fold(deepest, jnp.maximum)
+        begun = jnp.where(state["step"].lane > 0, state["overlap"].lane, deepest)
+        self.world_state.write("overlap", lanes([begun], (), wide=False))
 
     def _overflow(self, waiting: jax.Array) -> jax.Array:
         """One for worlds that had too few slots for their contacts in this step, else zero."""

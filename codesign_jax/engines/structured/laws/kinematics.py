@@ -49,6 +49,7 @@ class State(NamedTuple):
     going: Any = None  # Zero for a world that is decided, else one, likewise
     # Largest absolute velocity, for a failed world that of the failed step, likewise
     speed: Any = None
+    overlap: Any = None  # Largest overlap of two bodies as the grasp began [m], likewise
     # Friction that contacts hold, see `holding.held`, rows as in `model.held`, shape
     # (row, lane, world), lanes of fingers; no rows without `effects.friction_memory`
     held: Any = None

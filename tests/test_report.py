@@ -40,6 +40,24 @@ def bent_grasp(the_scene):
     return animation.Replay(params, trial, Outcome(*np.zeros(4)), qpos)
 
 
+def test_a_design_file_has_a_report_of_what_evaluate_says(tmp_path, capsys):
+    """The same trials, so the same verdict; its parameters, its air and its own text."""
+    file = tmp_path / "mine.toml"
+    file.write_text(f'preset = "2d"\nscene = "{TINY}"\n[design]\nlength = 96.5\narm_z = 0\n')
+    assert cli.main(["evaluate", str(file), "--engine", "mujoco"]) == 0
+    printed = capsys.readouterr().out
+    assert cli.main(["report", str(file), "--engine", "mujoco"]) == 0
+    assert f"report: {tmp_path / 'mine.html'}" in capsys.readouterr().out
+    shown = (tmp_path / "mine.html").read_text(encoding="utf-8")
+    [details] = re.findall("^ *all: (.*)$", printed, re.M)
+    [air] = re.findall(r"chambers: (\S+) cm", printed)
+    assert details in shown and f"unloaded chambers: {air} cm" in shown
+    assert "Design mine.toml" in shown and "length = 96.5" in shown
+    assert all(f">{o.name}</td>" in shown for o in scene.load(TINY).objects.object)
+    assert "canvas" in shown, "the grasp in 3D"
+    assert cli.main(["report", str(tmp_path / "none.toml")]) == 2
+
+
 @pytest.fixture(scope="module")
 def grasp():
     """A scene and one simulated grasp in it."""

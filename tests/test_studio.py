@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tyro
 from rich.console import Console
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
@@ -247,9 +248,13 @@ def test_a_tab_shows_judges_improves_and_saves(desk, capsys, monkeypatch):
     tab.receive(show([100.0, 0.0], number=8))
     settled(tab)
     tab.receive('{"save": true}')
-    assert "design-1.toml" in settled(tab)["done"]
+    told = settled(tab)["done"]
     saved = desk.options.out / "design-1.toml"
-    assert command("evaluate", "--scene", TINY, "--dry-run", "--design", saved) == 0
+    words = shlex.split(told.splitlines()[-1])
+    assert words[:3] == ["codesign", "studio", str(saved)], "the command that opens it"
+    opened = common.find_case(tyro.cli(cli.COMMANDS, args=words[1:]))
+    np.testing.assert_allclose(opened.space.in_units(opened.design), [100.0, 0.0], atol=1e-4)
+    assert command("evaluate", "--scene", TINY, "--dry-run", saved) == 0
     assert "design: length=100 mm arm_z=0 mm" in capsys.readouterr().out
 
 
@@ -391,7 +396,7 @@ def test_one_command_runs_at_a_time(desk, monkeypatch, tmp_path):
     assert printed == "exported: it"
     design = place / "design-1.toml"
     folder = place / "export-1"
-    expected = ["codesign", "export", "--design", design, "--engine", "mujoco", "--out", folder]
+    expected = ["codesign", "export", design, "--engine", "mujoco", "--out", folder]
     assert shlex.split(line) == [str(word) for word in expected]
     python = [sys.executable, "-P", "-m", "codesign_jax.cli"]
     assert children.lines == [[*python, *shlex.split(line)[1:]]]

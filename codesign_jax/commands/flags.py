@@ -404,19 +404,20 @@ class Report(Command):
     """Write the report of a run: one HTML file with the best grasp in 3D, which works offline.
 
     The report shows the chosen design and its success, cost and parameters over the episodes, the
-    landscape (after `codesign landscape --run`), failures by cause, and provenance.
+    landscape (after `codesign landscape --run`), failures by cause, and provenance. Of a design
+    file it shows the verdict by fresh trials, as `codesign evaluate` has it, and a grasp.
     """
 
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """The run folder."""
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FILE")]
+    """The run folder, or a design file (.toml)."""
     out: File = None
-    """The file; default: report.html in the run folder."""
+    """The file; default: report.html in the run folder, or beside the design file as .html."""
     engine: Text = None
-    """Engine for the grasp in 3D; default: the run's engine."""
+    """Engine for the grasp in 3D, and of a design's trials; default: the run's, or structured."""
     policy: Text = None
-    """MODULE:CLASS, the policy of the run, if it was made with one."""
+    """MODULE:CLASS, the policy of the run, if it was made with one, or of the design."""
     no_replay: Flag = False
-    """Omit the grasp in 3D, and simulate nothing."""
+    """Omit the grasp in 3D; of a run, simulate nothing."""
 
 
 @dataclasses.dataclass(kw_only=True)

@@ -43,7 +43,7 @@ def find(options: GraspFlags) -> PlannedGrasp:
     case = find_case(options)
     common.refuse(common.engine_problems(case.engine))
     if options.run_folder is None:
-        return _nominal(case, options.object or 0)
+        return nominal(case, options.object or 0)
     return _of_run(case, options, options.run_folder)
 
 
@@ -55,14 +55,15 @@ def _of_run(case: Case, options: GraspFlags, folder: Path) -> PlannedGrasp:
     grasp = selection.find_grasp(runs.read_run(folder)[0], record, **numbers)
     case = case._replace(design=grasp.design)
     if options.object is not None:
-        return _nominal(case, options.object)
+        return nominal(case, options.object)
     name = case.scene.objects.object[int(grasp.trial.shape)].name
     episode, particle, trial = grasp.place
     text = f"episode {episode}, particle {particle}, trial {trial}: object {name}"
     return PlannedGrasp(case, grasp.trial, text, verdict.ending(grasp.outcome))
 
 
-def _nominal(case: Case, shape: int | str) -> PlannedGrasp:
+def nominal(case: Case, shape: int | str = 0) -> PlannedGrasp:
+    """A grasp of an object without noise."""
     trial = jax.tree.map(np.asarray, rollout.nominal_trial(case.scene, shape))
     name = case.scene.objects.object[int(trial.shape)].name
     return PlannedGrasp(case, trial, f"object {name}, without noise", None)

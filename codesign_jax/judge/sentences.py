@@ -64,7 +64,7 @@ class Judged(NamedTuple):
     def headline(self) -> str:
         """The verdict with the accuracy of its trials, for the head of a page."""
         size = self.scene.discretization
-        named = f"accuracy {self.accuracy}" if self.accuracy else "the run's accuracy"
+        named = f"accuracy {self.accuracy}" if self.accuracy else "the scene's accuracy"
         return f"{self} [{named}, steps of {1e3 * size.timestep:g} ms]"
 
     @property

@@ -9,6 +9,8 @@ from codesign_jax.model import morphology
 from codesign_jax.report import advice, markup
 from codesign_jax.report.of_run import Run
 from codesign_jax.runs import tables
+from codesign_jax.scene import Scene
+from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.statistics import wilson
 
 
@@ -28,11 +30,11 @@ def design(run: Run) -> str:
         *(markup.paragraph(words, "warning") for words in sentences.warnings(judged)),
         *(markup.paragraph(words, "note") for words in sentences.solver(judged.outcomes)),
         markup.paragraph(note + "More fresh trials: ", "note", again),
-        _by_object(run, judged),
+        by_object(judged, _turns(run)),
         *_advice(run),
         *_builder(run),
         *_fingers(run),
-        _parameters(run),
+        parameters(run.scene, run.space, chosen.design),
     ]
     return markup.section("Chosen design", *parts)
 
@@ -71,11 +73,19 @@ def _fingers(run: Run) -> list[str]:
     return [*parts, markup.paragraph(text, "note", command)]
 
 
-def _by_object(run: Run, judged: Judged) -> str:
-    """How the judging trials ended with each object; batches take turns between the objects."""
-    names = [shape.name for shape in run.scene.objects.object]
-    count = judged.outcomes.cost.size
-    turns = np.arange(count) % (count if run.reference is not None else run.settings.trials)
+def _turns(run: Run) -> np.ndarray:
+    """Indices of the judging trials in their batch, shape (trial,)."""
+    count = run.judged.outcomes.cost.size
+    return np.arange(count) % (count if run.reference is not None else run.settings.trials)
+
+
+def by_object(judged: Judged, turns: np.ndarray) -> str:
+    """How the judging trials ended with each object.
+
+    Args:
+      turns: Indices of the trials in their batch, which takes turns between the objects.
+    """
+    names = [shape.name for shape in judged.scene.objects.object]
     rows = []
     for k, name in enumerate(names):
         of_object = turns % len(names) == k
@@ -94,11 +104,9 @@ def _by_object(run: Run, judged: Judged) -> str:
     return markup.table(head, rows, (*range(1, len(head)),))
 
 
-def _parameters(run: Run) -> str:
-    space = run.space
-    values, low, high = (
-        space.in_units(np.asarray(v)) for v in (run.chosen.design, space.low, space.high)
-    )
+def parameters(scene: Scene, space: DesignSpace, design: np.ndarray) -> str:
+    """A design [SI units] within the ranges of its parameters."""
+    values, low, high = (space.in_units(np.asarray(v)) for v in (design, space.low, space.high))
     per_finger, others = tables.by_finger(space)
 
     def scale(k: int) -> markup.Html:
@@ -110,7 +118,7 @@ def _parameters(run: Run) -> str:
     def named(name: str, k: int) -> str:
         return f"{name} {space.units[k]}"
 
-    air = morphology.air(run.scene.hand, space.params(run.chosen.design))
+    air = morphology.air(scene.hand, space.params(design))
     note = f"Below each value its place in its range. Air in all unloaded chambers: {air:.1f} cm³."
     parts = [markup.paragraph(note, "note")]
     if per_finger:

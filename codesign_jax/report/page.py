@@ -10,11 +10,13 @@ import numpy as np
 
 from codesign_jax import codesign, files, types
 from codesign_jax.judge import sentences, verdict
+from codesign_jax.judge.sentences import Judged
 from codesign_jax.report import chosen, figures, landscape, markup, viewer
 from codesign_jax.report.of_run import Run
 from codesign_jax.report.replay import Replay
 from codesign_jax.runs import SCENE_COST
 from codesign_jax.runs.selection import Grasp
+from codesign_jax.scene import Scene
 from codesign_jax.scene.scene_files import NAMES
 from codesign_jax.types import HARMLESS, MEANINGS
 
@@ -36,10 +38,14 @@ def write(run: Run, grasp: tuple[Grasp, Replay] | None, path: Path) -> Path:
         _failures(run),
         _provenance(run),
     ]
-    title = f"Co-design run {run.folder.resolve().name}"
+    return save(f"Co-design run {run.folder.resolve().name}", run.judged, sections, path)
+
+
+def save(title: str, judged: Judged, sections: list[str], path: Path) -> Path:
+    """Writes a page whose head has the verdict."""
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="minutes")
     head = f"<h1>{markup.text(title)}</h1>\n<p class='note'>codesign-jax, report of {now}</p>\n"
-    head += markup.paragraph(f"Verdict: {run.judged.headline}", "key")
+    head += markup.paragraph(f"Verdict: {judged.headline}", "key")
     files.make_folder_of(path)
     with files.atomically(path) as part:
         body = head + "\n".join(sections)
@@ -51,14 +57,10 @@ def _summary(run: Run) -> str:
     scene = run.scene
     s = run.settings
     record = run.record
-    objects = ", ".join(f"{o.name} ({o.type}, {1000 * o.mass:.0f} g)" for o in scene.objects.object)
-    fingers = f"{scene.num_fingers} fingers of {scene.discretization.links} links"
     done = f"{record.done} of {s.episodes} episodes"
     sizes = f"{s.particles} particles × {s.trials} trials × {done}"
     rows = [
-        ("scene", f"{scene.name}: {scene.description}"),
-        ("hand", f"{scene.hand.name}, {fingers}; surface: {scene.effects.surface}"),
-        ("objects", objects),
+        *surroundings(scene),
         ("design space", f"{s.preset}: {run.space.num_parameters} free parameters"),
         ("strategy", s.schedule),
         ("optimizer", s.optimizer),
@@ -70,6 +72,17 @@ def _summary(run: Run) -> str:
         ("final particles", _solved(run)),
     ]
     return markup.section("Summary", markup.table((), rows))
+
+
+def surroundings(scene: Scene) -> list[tuple[str, str]]:
+    """What is simulated, in rows of a table."""
+    objects = ", ".join(f"{o.name} ({o.type}, {1000 * o.mass:.0f} g)" for o in scene.objects.object)
+    fingers = f"{scene.num_fingers} fingers of {scene.discretization.links} links"
+    return [
+        ("scene", f"{scene.name}: {scene.description}"),
+        ("hand", f"{scene.hand.name}, {fingers}; surface: {scene.effects.surface}"),
+        ("objects", objects),
+    ]
 
 
 def _converged(run: Run) -> str:
@@ -104,21 +117,27 @@ def _grasp(run: Run, grasp: tuple[Grasp, Replay] | None) -> str:
         f"The chosen design with the object {name}: trial {trial} of particle {particle} in "
         f"episode {episode}, simulated again. In the run: {before}; here: {again}."
     )
-    parts = [viewer.fragment(run.scene, shown)]
+    parts = in_motion(run.scene, shown)
     if before != again:
         text = (
             "The two differ: contact is chaotic, and a batch of another size or another machine "
             "rounds differently."
         )
         parts = [markup.paragraph(text, "warning"), *parts]
+    return markup.section("Best grasp", markup.paragraph(note), *parts)
+
+
+def in_motion(scene: Scene, shown: Replay) -> list[str]:
+    """A grasp in 3D, and its forces where the engine tells them."""
+    parts = [viewer.fragment(scene, shown)]
     if shown.trace is not None and (forces := shown.trace.forces) is not None:
         text = (
             "Below: the fingers' normal forces on the object, and the palm's force. Largest depths "
             f"in one another over this grasp: {sentences.depths(forces)}."
         )
-        chart = figures.html(figures.grip(forces, run.scene), "grip")
+        chart = figures.html(figures.grip(forces, scene), "grip")
         parts += [markup.paragraph(text), chart]
-    return markup.section("Best grasp", markup.paragraph(note), *parts)
+    return parts
 
 
 def _cost_note(run: Run) -> str:

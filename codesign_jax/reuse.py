@@ -110,6 +110,10 @@ def problems() -> list[str]:
     """Problems with the environment variables, in words."""
     switch, most = _environment()
     messages = [] if switch in ("on", "off") else [f"CODESIGN_CACHE = {switch!r} must be on or off"]
+    place = os.environ.get("JAX_COMPILATION_CACHE_DIR", "")
+    if place.startswith("~"):
+        words = "begins with ~, which JAX takes for a folder's name: give the whole path"
+        messages.append(f"JAX_COMPILATION_CACHE_DIR = {place[:40]!r} {words}")
     if not (most.isascii() and most.isdecimal() and len(most) <= 18):
         messages.append(f"CODESIGN_CACHE_BYTES = {most[:40]!r} must be a number of bytes")
     return messages

@@ -393,6 +393,13 @@ def test_damage_that_cannot_be_deleted_turns_the_cache_off(place, monkeypatch):
     assert not jax.config.jax_enable_compilation_cache
 
 
+def test_a_folder_of_jax_that_nobody_meant_is_refused(monkeypatch, capsys):
+    """JAX makes a folder named ~ in each working directory."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "~/cache")
+    assert cli.main(["scenes"]) == 2
+    assert "error: JAX_COMPILATION_CACHE_DIR = '~/cache' begins with ~" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("text", ["cache", "~/.cache", "./x", "$HOME/.cache", ""])
 def test_a_cache_that_is_no_absolute_path_is_ignored(text, monkeypatch, tmp_path):
     """As the XDG Base Directory Specification asks for."""

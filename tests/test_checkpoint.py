@@ -160,6 +160,14 @@ def test_after_a_failed_save_its_threads_are_silent_and_no_others(tmp_path, monk
     assert reports == [other]
 
 
+@pytest.mark.parametrize(("number", "step"), [(99, 4), (150, None)])
+def test_of_any_number_of_steps_the_newest_are_tried(number, step, folder):
+    for k in range(number):
+        (folder / str(1000 + k)).mkdir()
+    restored = restore(folder)
+    assert restored.step == step and len(restored.damaged) == min(number, 100)
+
+
 @pytest.mark.parametrize("way", ["flipped", "longer", "deleted"])
 def test_damage_of_any_file_falls_back_to_the_step_before(folder, way):
     for path in [p for p in sorted((folder / "4").rglob("*")) if p.is_file()]:

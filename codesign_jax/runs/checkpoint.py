@@ -38,6 +38,8 @@ from codesign_jax.runs.manifest import SCHEMA
 _DAMAGE = {errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EINVAL, errno.ELOOP, errno.ENAMETOOLONG}
 """Errors of files that are gone or replaced; all others may pass, such as missing permission."""
 _DESCRIPTORS = Path("/proc/self/fd")
+_MOST_STEPS = 100
+"""Newest steps that are tried: a run keeps three, a stranger's folder may have any number."""
 _CAUSES = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EACCES, errno.EFBIG)
 """Causes that Orbax's and TensorStore's errors name as the system does."""
 _LABEL = "run"
@@ -208,7 +210,7 @@ class Checkpoints:
             such as `state/key`; raises a `RunError` if they are not the run's.
         """
         damaged: list[tuple[int, str]] = []
-        for step in sorted(self._steps(), reverse=True):
+        for step in sorted(self._steps(), reverse=True)[:_MOST_STEPS]:
             arrays, reason = self._read(step, refuse)
             if not reason:
                 self._check_label(step, arrays.pop(_LABEL, None))

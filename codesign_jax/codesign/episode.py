@@ -389,13 +389,13 @@ def _pieces(space: DesignSpace, num_trials: int) -> _Pieces:
     def ask(
         states: OptimizerState, masks: jax.Array, scene: Scene, optimizer: Optimizer
     ) -> tuple[jax.Array, Trial, Params, Trial]:
-        def one(state: OptimizerState, mask: jax.Array) -> tuple[jax.Array, Trial]:
+        def ask_run(state: OptimizerState, mask: jax.Array) -> tuple[jax.Array, Trial]:
             _refuse_mask(space, mask)
             space.refuse_population(state.particles)
             trials = episode_trials(scene, state.key, state.episode, num_trials)
             return optimizer.ask(state, mask), trials
 
-        populations, trials = jax.vmap(one)(states, masks)
+        populations, trials = jax.vmap(ask_run)(states, masks)
         return populations, trials, *worlds(populations, trials)
 
     def tell(
@@ -404,12 +404,12 @@ def _pieces(space: DesignSpace, num_trials: int) -> _Pieces:
         scene: Scene,
         optimizer: Optimizer,
     ) -> tuple[OptimizerState, Info]:
-        def one(
+        def tell_run(
             state: OptimizerState, mask: jax.Array, population: jax.Array, outcomes: Outcome
         ) -> tuple[OptimizerState, Info]:
             return optimizer.tell(state, population, particle_cost(scene, outcomes), mask)
 
-        return jax.vmap(one)(*before, *simulated)
+        return jax.vmap(tell_run)(*before, *simulated)
 
     def first_trials(keys: jax.Array, _: Any, scene: Scene) -> Trial:
         return jax.vmap(lambda key: episode_trials(scene, key, 0, num_trials))(keys)

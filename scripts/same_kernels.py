@@ -28,7 +28,6 @@ SCENES: dict[str, dict[str, Any]] = {
         "effects": {"pressure_dynamics": True, "lateral_threshold": True}
     },
     "air_mass, no friction_memory": {"effects": {"air_mass": True, "friction_memory": False}},
-    "friction with torsion and rolling": {"name": "paper_spheres", "effects": {"friction": "full"}},
     "fixtures": {"name": "edge"},
     "derivative of paper": {"derivative": True},
     "forces of paper": {"forces": True},

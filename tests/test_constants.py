@@ -132,7 +132,7 @@ def test_changing_any_number_compiles_nothing(monkeypatch):
 @pytest.mark.slow  # 7 s
 def test_derivatives_equal_differences():
     """Of every number that the engine reads, with respect to all constants, along a line."""
-    the_scene = short(effects__friction="full", effects__neo_hookean=True)
+    the_scene = short(effects__neo_hookean=True)
     random = np.random.default_rng(0)
     with jax.enable_x64(True):
         params, trial = jax.tree.map(jnp.asarray, hand_world(the_scene))
@@ -366,7 +366,6 @@ CONSTANTS = {
     "wrist": ("hand.wrist", "linear_stiffness", 777.0),
     "finger_table": ("contact", "finger_table_friction", 0.31),
     "object_table": ("objects.table", "friction", 0.29),
-    "friction": ("contact", "torsional_friction", 0.017),
     "disturb": ("arm", "shake_amplitude", 13.0),
     "pressure_dynamics": ("pneumatics", "lag", 0.3),
     "air_mass": ("pneumatics", "exponent", 1.3),
@@ -432,7 +431,7 @@ def test_an_effect_that_is_off_is_not_in_the_program(bare):
 )
 def test_an_effect_that_is_on_is_in_the_program(name):
     """The same comparison fails for every effect that is on."""
-    scene = effects_scene(OFF | {name: "full" if name == "friction" else True})
+    scene = effects_scene(OFF | {name: True})
     assert program(changed(scene, *CONSTANTS[name])) != program(scene)
 
 
@@ -458,10 +457,8 @@ COMBINATIONS = st.fixed_dictionaries(
         for f in dataclasses.fields(grasps.pinch().effects)
     }
 )
-# The hull has no friction with torsion and rolling; the threshold of sideways bending needs that
-# hinge, and pressures that are known beforehand.
+# The threshold of sideways bending needs that hinge, and pressures that are known beforehand.
 REFUSED = {
-    "effects.surface = 'hull' needs friction": {"surface": "hull", "friction": "full"},
     "lateral_bending = false leaves out": {"lateral_threshold": True, "lateral_bending": False},
     "air_mass = true has a volume": {"lateral_threshold": True, "air_mass": True},
 }

@@ -38,7 +38,7 @@ def grasp():
             pytest.param(effects, marks=pytest.mark.slow)
             for effects in (
                 {"neo_hookean": True, "wrist": False, "surface": "hull", "finger_finger": True},
-                {"friction": "full", "wrist": False},
+                {"friction": "none", "wrist": False},
             )
         ),
     ],

@@ -179,11 +179,9 @@ def test_every_kind_of_pair_has_its_own_numbers():
         "contact__finger_finger_friction": 0.41,
         "contact__finger_palm_friction": 0.51,
         "contact__finger_palm_stiffness": 5000.0,
-        "contact__torsional_friction": 0.003,
-        "contact__rolling_friction": 0.0004,
     }
     on = {f"effects__{name}": True for name in ("finger_finger", "finger_palm", "palm_object")}
-    the_scene = pinch("capsule", links=4, effects__friction="full", **on, **values)
+    the_scene = pinch("capsule", links=4, **on, **values)
     compiled = model.compile_model(the_scene, *hand_world(the_scene))
     want = {
         ("object", "table"): the_scene.objects.table.friction,

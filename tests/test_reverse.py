@@ -326,7 +326,7 @@ HULL = {"effects__surface": "hull"}
 MIXED = DATA / "mixed.toml"  # a mesh, which still trials take, and a primitive
 SCENES = {
     "spheres": {"discretization__spheres_per_link": 2, "effects__finger_finger": True},
-    "full friction": {"effects__friction": "full", "effects__finger_finger": True},
+    "neo-Hookean": {"effects__neo_hookean": True, "effects__finger_finger": True},
     "no friction": {"effects__friction": "none", **HULL},
     "rigid wrist": {"effects__wrist": False},
     "bending alone": {"effects__twist": False, "effects__lateral_bending": False},

@@ -28,7 +28,6 @@ SCENES = {
     "new models": (
         "box",
         {
-            "effects.friction": "full",
             "effects.wrist": False,
             "effects.neo_hookean": True,
             # With an inertia of its own, and it falls from an edge.
@@ -119,7 +118,7 @@ def test_steps_of_the_kernel_equal_mujocos(tmp_path, name):
     ("effects", "fixtures"),
     [
         ({}, ""),
-        ({"effects.friction": "full", "effects.neo_hookean": True}, ""),
+        ({"effects.neo_hookean": True}, ""),
         ({}, SLOPES),  # on boxes and cylinders spheres differ from MuJoCo C's by a percent
     ],
 )

@@ -46,11 +46,9 @@ def margin(touching: Any) -> Any:
 
 
 def numbers(scene: Scene, friction: Any, impedance: Any) -> tuple[list, list, list]:
-    """MuJoCo's friction (5), solref (2) and solimp (5) of a pair."""
-    c = scene.contact
-    turning = [c.torsional_friction, c.rolling_friction, c.rolling_friction]
+    """MuJoCo's friction (5, without torsion and rolling), solref (2) and solimp (5) of a pair."""
     h = scene.discretization.timestep
     spring = 1.0 / (h * (h + dissipation(scene)))
     damper = 1.0 / h
     reference = [-impedance * spring, -impedance * damper]
-    return [friction, friction, *turning], reference, [impedance] * 2 + [*SOLIMP]
+    return [friction] * 2 + [0.0] * 3, reference, [impedance] * 2 + [*SOLIMP]

@@ -330,7 +330,7 @@ def add_pair(
     scene: Scene, spec: mujoco.MjSpec, first: str, second: str, kind: int
 ) -> mujoco.MjsPair:
     """Adds a contact pair."""
-    condim = {"none": 1, "coulomb": 3, "full": 6}[scene.effects.friction]
+    condim = {"none": 1, "coulomb": 3}[scene.effects.friction]
     pair = spec.add_pair(geomname1=first, geomname2=second, condim=condim)
     properties = pairs.frictions(scene)[kind], pairs.impedances(scene)[kind]
     pair.friction, pair.solref, pair.solimp = pairs.numbers(scene, *properties)

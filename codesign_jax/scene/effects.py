@@ -55,7 +55,7 @@ EFFECTS: Mapping[str, Effect] = {
         {"mjx": {"hull": _SKIN}, "mujoco": {"hull": _SKIN}},
     ),
     "friction": Effect(
-        "friction of all contacts: none, coulomb, or full with torsion and rolling",
+        "friction of all contacts: none or coulomb",
         {"mjx": {"none": "MJX has no frictionless contacts with elliptic cones"}},
     ),
     "friction_memory": Effect(

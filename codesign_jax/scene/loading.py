@@ -199,12 +199,6 @@ def _check(scene: SceneFile, where: str, problems: list[str]) -> None:
     problems += buildable.problems(scene.limits, where)
     for fixture in scene.fixture:
         problems += _fixture_problems(fixture, f"{where}.fixture {fixture.name}")
-    e = scene.effects
-    if e.surface == "hull" and e.friction == "full":
-        problems.append(
-            f"{where}.effects.surface = 'hull' needs friction = 'coulomb' or 'none', not 'full': "
-            "a vertex has no patch of its own, its neighbours resist turning"
-        )
     if scene.discretization.hull_points % 4:
         problems.append(
             f"{where}.discretization.hull_points = {scene.discretization.hull_points} "

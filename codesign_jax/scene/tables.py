@@ -33,7 +33,7 @@ class Effects:
     finger_palm: bool = False
     finger_itself: bool = False
     surface: str = choice("spheres", "hull", default="spheres")
-    friction: str = choice("none", "coulomb", "full", default="coulomb")
+    friction: str = choice("none", "coulomb", default="coulomb")
     friction_memory: bool = False
     disturb: bool = True
     ungrasp: bool = True
@@ -157,10 +157,6 @@ class Cost:
 class Contact:
     """Contact of the rubber skin; see docs/hull.md.
 
-    If the effect `friction` is "full", a contact with the normal force F resists spin with moments
-    up to `torsional_friction` * F, and rolling with moments up to `rolling_friction` * F. Both
-    numbers are lengths, as in MuJoCo.
-
     Attributes:
       normal_stiffness: Normal stiffness of a square of skin as wide as the finger, and of a contact
         sphere; the same for every morphology and time step. A contact with the table is twice as
@@ -171,10 +167,6 @@ class Contact:
       held_friction_ratio: `friction_ratio` of contacts with object, table and fixtures that hold
         friction by `effects.friction_memory`: they do not creep.
       finger_table_friction: Coulomb coefficient of fingers and palm on the table.
-      torsional_friction: Length by which a contact's normal force resists spin, only with
-        `effects.friction = "full"`.
-      rolling_friction: Length by which a contact's normal force resists rolling, only with
-        `effects.friction = "full"`.
       finger_finger_friction: Coulomb coefficient of fingers on fingers and on themselves, only with
         `effects.finger_finger` or `effects.finger_itself`.
       finger_finger_friction_ratio: `friction_ratio` of fingers on one another, on themselves and on
@@ -189,8 +181,6 @@ class Contact:
     finger_table_friction: float = quantity("", 0, 5)
     dissipation_time: float = quantity("s", 0, 1, default=0.006)
     held_friction_ratio: float = quantity("", 0.01, 1000, default=5.0)
-    torsional_friction: float = quantity("m", 1e-5, 0.1, default=0.003)
-    rolling_friction: float = quantity("m", 1e-5, 0.1, default=0.0005)
     finger_finger_friction: float = quantity("", 0, 5, default=0.8)
     finger_finger_friction_ratio: float = quantity("", 0.01, 1000, default=1.0)
     finger_palm_friction: float = quantity("", 0, 5, default=0.8)

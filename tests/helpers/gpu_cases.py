@@ -21,7 +21,7 @@ STEPS = 230
 EFFECTS = {
     "spheres": {},
     "no friction, rigid arm": {"effects__friction": "none", "effects__wrist": False},
-    "full friction, neo-Hookean": {"effects__friction": "full", "effects__neo_hookean": True},
+    "neo-Hookean": {"effects__neo_hookean": True},
     "bending only, no table, no gravity, air supply": {
         "effects__lateral_bending": False,
         "effects__twist": False,

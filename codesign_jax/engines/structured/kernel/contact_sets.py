@@ -30,13 +30,12 @@ from codesign_jax.engines.structured.laws.rings import Place
 from codesign_jax.model.held import held
 from codesign_jax.scene import Scene
 
-# Rows of a contact's jar and numbers of its line, by friction model.
-ROWS = {"none": (3, 2), "coulomb": (3, 5), "full": (6, 5)}
+# Numbers of a contact's line, by friction model.
+LINE = {"none": 2, "coulomb": 5}
 # Fields of a cone that a friction model does not need.
 NEEDLESS = {
-    "none": ("tangential_mass", "friction", "regularized_friction", "spin", "roll"),
-    "coulomb": ("spin", "roll"),
-    "full": (),
+    "none": ("tangential_mass", "friction", "regularized_friction"),
+    "coulomb": (),
 }
 
 
@@ -78,9 +77,9 @@ class ContactSet:
         self.holds = name in held(scene) and name != "finger_finger"
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
-        rows, ray = ROWS[self.scene.effects.friction]
+        ray = LINE[self.scene.effects.friction]
         shapes = place_shapes(self.k)
-        shapes |= {"jar": (rows, self.k), "step": (rows, self.k), "ray": (ray, self.k)}
+        shapes |= {"jar": (3, self.k), "step": (3, self.k), "ray": (ray, self.k)}
         shapes |= {"friction": (1, self.k)} if self.friction_by_contact else {}
         shapes |= {"held": (3, self.k)} if self.holds else {}
         return {f"{self.name}.{field}": (self.count, shape) for field, shape in shapes.items()}

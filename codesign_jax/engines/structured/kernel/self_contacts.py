@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel.contact_sets import ROWS, ContactSet, zeros
+from codesign_jax.engines.structured.kernel.contact_sets import ContactSet, zeros
 from codesign_jax.engines.structured.kernel.memory import (
     Block,
     BoundTable,
@@ -121,9 +121,8 @@ class SelfContactSet(SlotSet):
         super().__init__(scene, *sizes, gathers=gathers, remembers=remembers)
         self.block = block
         self.links = links
-        n = ROWS[scene.effects.friction][0]
-        self.more = {"row": 1, "hessian": n * (n + 1) // 2}
-        self.more |= dict.fromkeys(CONJUGATE_GRADIENTS, n)
+        self.more = {"row": 1, "hessian": 6}
+        self.more |= dict.fromkeys(CONJUGATE_GRADIENTS, 3)
         if self.with_itself:
             self.more |= {"other": 1}
         # The fields of a slot that say which link each lane's side is on.

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel.contact_sets import ROWS, ContactSet
+from codesign_jax.engines.structured.kernel.contact_sets import ContactSet
 from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, choose, loop
 from codesign_jax.engines.structured.kernel.self_contacts import (
     BoundSelfContacts,
@@ -33,8 +33,7 @@ class TeamSdfContactSet(ContactSet):
 
     def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
         """See `ContactSet`; with the Hessian and the force of each."""
-        n = ROWS[self.scene.effects.friction][0]
-        fields = {"hessian": n * (n + 1) // 2, "force": n}
+        fields = {"hessian": 6, "force": 3}
         more = {f"{self.name}.{f}": (self.count, (size, 1)) for f, size in fields.items()}
         return super().groups() | more
 

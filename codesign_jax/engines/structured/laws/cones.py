@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.laws.contact import LEAST, Cone
+from codesign_jax.engines.structured.laws.contact import Cone
 from codesign_jax.model.held import keeps
 from codesign_jax.model.layout import contact_mass, dissipation, friction_ratio
 from codesign_jax.scene import Scene
@@ -36,7 +36,6 @@ def make_cone(scene: Scene, friction: Any, *, bodies: int, ratio: Any, stiffer: 
       ratio: How much harder friction is.
       stiffer: Stiffness over `contact.normal_stiffness`.
     """
-    c = scene.contact
     h = scene.discretization.timestep
     surface = {"ahead": scene.effects.surface == "hull"}
     normal_mass = 2.0 / bodies * stiffer * contact_mass(scene, **surface)
@@ -45,11 +44,7 @@ def make_cone(scene: Scene, friction: Any, *, bodies: int, ratio: Any, stiffer: 
         return Cone(normal_mass, None, None, None, *reference)  # type: ignore[arg-type]
     impratio = friction_ratio(scene, ratio, **surface)
     tangential_mass = impratio * normal_mass
-    cone = Cone(normal_mass, tangential_mass, friction, friction / jnp.sqrt(impratio), *reference)
-    if scene.effects.friction != "full":
-        return cone
-    least = jnp.maximum(friction, LEAST)
-    return cone._replace(spin=c.torsional_friction / least, roll=c.rolling_friction / least)
+    return Cone(normal_mass, tangential_mass, friction, friction / jnp.sqrt(impratio), *reference)
 
 
 def make_cones(scene: Scene, shape: jax.Array) -> Cones:

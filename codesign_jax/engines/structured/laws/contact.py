@@ -7,9 +7,8 @@ K = 1/(h (h + tau)).  A gap closes within the step at the earliest: there K = 1/
 
 A contact's relative velocity and acceleration are those of the hand's (or, on the table, the
 object's) point minus the other body's, with the normal pointing the same way; jar = J a - aref as
-in MuJoCo.  With full friction jar has three more components, see `Contacts.turning`; without
-friction its tangential part is ignored.  Within a set of contacts every array has the item axes
-(link, k, finger), (sphere, 1) or (slot, 1) before the world's.
+in MuJoCo. Without friction its tangential part is ignored. Within a set of contacts every array has
+the item axes (link, k, finger), (sphere, 1) or (slot, 1) before the world's.
 """
 
 from typing import NamedTuple
@@ -21,8 +20,6 @@ from codesign_jax.engines.structured.lanes import cross, dot
 
 MARGIN = 2e-3
 """Gap below which a contact is a candidate, whatever its velocity [m]."""
-LEAST = 1e-5
-"""Coefficient to which torsional and rolling friction relate at the least, MuJoCo's mjMINMU."""
 
 
 class Cone(NamedTuple):
@@ -38,8 +35,6 @@ class Cone(NamedTuple):
     regularized_friction: jax.Array | float  # mu sqrt(D / D_t), `mu` of MuJoCo's contacts
     spring: jax.Array | float  # K, coefficient of the penetration in aref [1/s^2]
     damper: jax.Array | float  # Coefficient of the velocity in aref, 1/h [1/s]
-    spin: jax.Array | float | None = None  # Torsional friction over Coulomb friction [m]
-    roll: jax.Array | float | None = None  # Rolling friction over Coulomb friction [m]
 
     def of_share(self, share: jax.Array) -> "Cone":
         """This cone with its stiffness scaled by `share`, which is 0 where there is no contact."""
@@ -51,11 +46,7 @@ class Cone(NamedTuple):
         if self.friction is None:
             return self
         regularized_friction = friction * jnp.sqrt(self.normal_mass / self.tangential_mass)
-        cone = self._replace(friction=friction, regularized_friction=regularized_friction)
-        if self.spin is None or self.roll is None:
-            return cone
-        change = jnp.maximum(self.friction, LEAST) / jnp.maximum(friction, LEAST)
-        return cone._replace(spin=self.spin * change, roll=self.roll * change)
+        return self._replace(friction=friction, regularized_friction=regularized_friction)
 
 
 class Contacts(NamedTuple):
@@ -70,46 +61,22 @@ class Contacts(NamedTuple):
     def active(self) -> jax.Array:
         return jnp.asarray(self.cone.normal_mass > 0)
 
-    @property
-    def direction(self) -> jax.Array:
-        """The normal as a direction of jar, shape (3, ...) or (6, ...)."""
-        if self.cone.spin is None:
-            return self.normal
-        return jnp.concatenate([self.normal, jnp.zeros_like(self.normal)])
-
     def relative(self, motion: jax.Array) -> jax.Array:
-        """Relative velocity of the points, shape (3, ...); with turning, see `turning`, (6, ...).
+        """Relative velocity of the points, shape (3, ...).
 
         Accelerations without velocity terms, and virtual ones, are related in the same way.
 
         Args:
           motion: Relative spatial velocity or acceleration, shape (6, ...).
         """
-        moving = motion[3:6] + cross(motion[:3], self.point)
-        if self.cone.spin is None:
-            return moving
-        turning = self.turning(motion[:3])
-        return jnp.concatenate([moving, jnp.broadcast_to(turning, moving.shape)])
-
-    def turning(self, omega: jax.Array) -> jax.Array:
-        """Relative turning as lengths that slide alike: S omega, with full friction.
-
-        MuJoCo's cone of six dimensions limits the norm of (f_t / mu, m_spin / mu_spin, m_roll /
-        mu_roll) and regularises each row by R_i = R_t mu^2 / mu_i^2.  In the scaled turning S omega
-        with S = (mu_roll (1 - n n') + mu_spin n n') / mu both are isotropic: torsion and rolling
-        are further tangential components of the cone of three dimensions.  S is symmetric.
-        """
-        cone = self.cone
-        n = self.normal
-        assert cone.spin is not None and cone.roll is not None
-        return cone.roll * omega + (cone.spin - cone.roll) * dot(n, omega) * n
+        return motion[3:6] + cross(motion[:3], self.point)
 
     def reference(self, velocity: jax.Array) -> jax.Array:
         """Reference acceleration aref from the relative point velocity, shaped as that."""
         cone = self.cone
         gap = self.gap
         spring = jnp.where(gap < 0, cone.spring, cone.damper**2) * gap
-        return -cone.damper * velocity - spring * self.direction
+        return -cone.damper * velocity - spring * self.normal
 
 
 def candidates(
@@ -130,9 +97,8 @@ def candidates(
 class ConeResponse(NamedTuple):
     """Cone force and Hessian at jar."""
 
-    force: jax.Array  # -ds/d(jar), shape (3, ...); with full friction (6, ...)
-    # Upper triangle xx, xy, xz, yy, yz, zz, shape (6, ...); with full friction of the 6 x 6 matrix,
-    # row by row, shape (21, ...)
+    force: jax.Array  # -ds/d(jar), shape (3, ...)
+    # Upper triangle xx, xy, xz, yy, yz, zz, shape (6, ...)
     hessian: jax.Array
     cost: jax.Array  # s(jar), shape (...)
 
@@ -145,7 +111,7 @@ def constraint_update(contacts: Contacts, jar: jax.Array) -> ConeResponse:
     zero.
     """
     cone = contacts.cone
-    n = contacts.direction
+    n = contacts.normal
     if cone.friction is None:
         return _update_frictionless(contacts, jar)
     jar_normal = dot(n, jar)
@@ -163,8 +129,7 @@ def constraint_update(contacts: Contacts, jar: jax.Array) -> ConeResponse:
     nn = jnp.where(bottom, cone.normal_mass, stiff) - kappa
     ne = -stiff * cone.friction
     ee = jnp.where(bottom, 0.0, stiff * cone.friction**2 - kappa)
-    size = n.shape[0]
-    pairs = [(i, j) for i in range(size) for j in range(i, size)]
+    pairs = [(i, j) for i in range(3) for j in range(i, 3)]
     hessian = jnp.stack(
         [
             nn * n[i] * n[j]
@@ -220,8 +185,8 @@ def line(contacts: Contacts, jar: jax.Array, step: jax.Array) -> LineCost:
     n1 = dot(contacts.normal, step)
     if contacts.cone.friction is None:
         return LineCost(n0, n1, None, None, None)
-    u = jar - n0 * contacts.direction
-    v = step - n1 * contacts.direction
+    u = jar - n0 * contacts.normal
+    v = step - n1 * contacts.normal
     return LineCost(n0, n1, dot(u, u), dot(u, v), dot(v, v))
 
 
@@ -264,12 +229,7 @@ def slopes(contacts: Contacts, ray: LineCost, alpha: jax.Array) -> tuple[jax.Arr
 
 
 def contact_inertia(contacts: Contacts, hessian: jax.Array) -> jax.Array:
-    """X'KX with X = [-[r], 1]: a contact's Hessian in spatial accelerations, rows (6, 6, ...).
-
-    With full friction X = [-[r], 1; S, 0], see `Contacts.turning`.
-    """
-    if contacts.cone.spin is not None:
-        return _full_inertia(contacts, hessian)
+    """X'KX with X = [-[r], 1]: a contact's Hessian in spatial accelerations, rows (6, 6, ...)."""
     xx, xy, xz, yy, yz, zz = hessian
     k = [jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])]
     r = contacts.point
@@ -286,33 +246,4 @@ def _crossed(r: jax.Array, k: list[jax.Array]) -> list[jax.Array]:
 
 def contact_wrench(contacts: Contacts, force: jax.Array) -> jax.Array:
     """Spatial force (moment about the origin, force), shape (6, ...)."""
-    if contacts.cone.spin is None:
-        return jnp.concatenate([cross(contacts.point, force), force])
-    moment = cross(contacts.point, force[:3]) + contacts.turning(force[3:])
-    return jnp.concatenate([moment, force[:3]])
-
-
-def _full_inertia(contacts: Contacts, hessian: jax.Array) -> jax.Array:
-    """As `contact_inertia`, for K = [A B; B' C]: the part of A, and what turning adds.
-
-    With E = B S the added blocks are [r] E + ([r] E)' + S C S in the corner of turning, and E
-    beside it.
-    """
-    place = {(i, j): k for k, (i, j) in enumerate((i, j) for i in range(6) for j in range(i, 6))}
-
-    def row(i: int, columns: range) -> jax.Array:
-        return jnp.stack([hessian[place[min(i, j), max(i, j)]] for j in columns])
-
-    top = jnp.stack([hessian[place[i, j]] for i in range(3) for j in range(i, 3)])
-    coulomb = contacts._replace(cone=contacts.cone._replace(spin=None, roll=None))
-    matrix = contact_inertia(coulomb, top)
-    r = contacts.point
-    e = [contacts.turning(row(i, range(3, 6))) for i in range(3)]
-    c = jnp.stack([contacts.turning(row(3 + i, range(3, 6))) for i in range(3)])  # C S
-    turned = [contacts.turning(jnp.stack([c[i][j] for i in range(3)])) for j in range(3)]
-    moment = [r[1] * e[2] - r[2] * e[1], r[2] * e[0] - r[0] * e[2], r[0] * e[1] - r[1] * e[0]]
-    corner = [[moment[i][j] + moment[j][i] + turned[j][i] for j in range(3)] for i in range(3)]
-    none = jnp.zeros_like(matrix[0, 0])
-    upper = [jnp.stack([*corner[i], *(e[j][i] for j in range(3))]) for i in range(3)]
-    lower = [jnp.stack([*e[i], none, none, none]) for i in range(3)]
-    return matrix + jnp.stack(upper + lower)
+    return jnp.concatenate([cross(contacts.point, force), force])

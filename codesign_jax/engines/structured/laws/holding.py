@@ -26,10 +26,7 @@ def held(contacts: Contacts, held_friction: jax.Array) -> jax.Array:
     # A slot in which a lane has no contact may have no stiffness either.
     some = contacts.active & (cone.tangential_mass > 0)
     elastic = jnp.where(some, _elastic(contacts) / jnp.where(some, cone.tangential_mass, 1.0), 0.0)
-    tangent = elastic * (held_friction - dot(n, held_friction) * n)
-    if cone.spin is None:
-        return tangent
-    return jnp.concatenate([tangent, jnp.zeros_like(tangent)])
+    return elastic * (held_friction - dot(n, held_friction) * n)
 
 
 def hold(contacts: Contacts, force: jax.Array, held_friction: jax.Array) -> jax.Array:

@@ -68,7 +68,10 @@ waits: list[bool] = []
 
 
 def tolerate(stream: TextIO) -> None:
-    """Has a stream write what its encoding lacks as escapes, in place of an error."""
+    """Has a stream write what its encoding lacks as escapes, in place of an error.
+
+    Python's way with a stream is `strict`, and in the C locale `surrogateescape`.
+    """
     reconfigure = getattr(stream, "reconfigure", None)
-    if reconfigure is not None and getattr(stream, "errors", None) == "strict":
+    if reconfigure is not None and stream.errors in ("strict", "surrogateescape"):
         reconfigure(errors="backslashreplace")

@@ -237,10 +237,11 @@ def test_a_printed_text_is_one_line_without_commands(text):
     assert shown == text or not text.isprintable()
 
 
+@pytest.mark.parametrize("errors", ["strict", "surrogateescape"])
 @pytest.mark.parametrize("encoding", ["utf-8", "ascii", "latin-1"])
-def test_every_way_to_print_shows_what_a_terminal_would_obey(encoding, monkeypatch):
-    """Also in encodings that lack a letter."""
-    stream = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+def test_every_way_to_print_shows_what_a_terminal_would_obey(encoding, errors, monkeypatch):
+    """Also in encodings that lack a letter, and in the C locale."""
+    stream = io.TextIOWrapper(io.BytesIO(), encoding=encoding, errors=errors)
     monkeypatch.setattr(sys, "stdout", stream)
     table = rich.table.Table("Größe")
     table.add_row(HOSTILE)

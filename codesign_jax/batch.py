@@ -6,7 +6,7 @@ engines get the worlds that there are.
 """
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +17,6 @@ from codesign_jax.engines import Engine
 from codesign_jax.reuse import SceneProgram, shared
 from codesign_jax.scene import Scene
 from codesign_jax.types import Outcome, Params, Trace, Trial
-
-if TYPE_CHECKING:
-    from codesign_jax.codesign import Task
 
 LIMIT = 16_384
 """Most worlds of one device in one call."""
@@ -170,13 +167,13 @@ def size(designs: int, trials: int, *, most: int | None = None, devices: int = 1
 
 
 def evaluate(
-    task: "Task",
+    task: Any,
     key: jax.Array,
     designs: np.ndarray,
     size: int,
     advance: Callable[[int], Any] = lambda worlds: None,
 ) -> Outcome:
-    """Outcomes of designs [SI units] in a task's trials, arrays of shape (design, trial).
+    """Outcomes of designs [SI units] in a `Task`'s trials, arrays of shape (design, trial).
 
     So many designs at a time, and `advance` is told the worlds of each call.
     """

@@ -436,7 +436,7 @@ def shared(build: Callable[..., Any]) -> Callable[..., Any]:
         if getattr(arguments[-1], "cost", None) is not None:
             return jitted(*arguments)
         structures = [getattr(a, "structure", a) for a in arguments]
-        known = all(isinstance(a, Hashable) for a in arguments) and code_digest() is not None
+        known = all(isinstance(a, Hashable) for a in structures) and code_digest() is not None
         return (cached if known else jitted)(*structures)
 
     return find

@@ -25,8 +25,8 @@ engines cost
 preflight policy
 rollout
 user_code measurements
-codesign env finger sampling
 batch
+codesign env finger sampling
 judge
 tolerances
 runs

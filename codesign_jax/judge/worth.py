@@ -13,9 +13,9 @@ import jax
 import numpy as np
 
 from codesign_jax import rollout, statistics
+from codesign_jax.batch import Batch
 from codesign_jax.engines import Engine
 from codesign_jax.judge import stress, verdict
-from codesign_jax.reuse import SceneProgram, shared
 from codesign_jax.scene import Scene
 from codesign_jax.types import Outcome, Params, Trial
 
@@ -30,8 +30,6 @@ interval of 10 points.  Two looks at intervals of 95 % are wrong in at most 5 of
 are worse by the margin in any condition."""
 DOUBTFUL = 2 * MARGIN
 """Difference from which on a hand is given up after the first look."""
-CALL = 72
-"""Worlds of a call."""
 STREAM = 0x66696E67
 """Stream of the trials' noise ("fing")."""
 NEEDED = "needed"
@@ -141,14 +139,6 @@ def without(params: Params, fingers: Fingers) -> Params:
     return jax.tree.map(np.asarray, params)._replace(length=length, pressure=pressure)
 
 
-@shared
-def _worlds(engine: Engine, scene: Scene, count: int) -> Callable:
-    def simulated(inputs: tuple[Params, Trial], _: None, scene: Scene) -> Outcome:
-        return rollout.simulate(scene, engine, *inputs)[0]
-
-    return simulated
-
-
 class _Trials:
     """Kept grasps of hands in the same trials, as far as they were simulated."""
 
@@ -163,7 +153,7 @@ class _Trials:
         self._params = params
         self._key = key
         self._done = done
-        self._program = SceneProgram(scene, _worlds(engine, scene, CALL))
+        self._batch = Batch(scene, engine, rollout.Options())
         self._scenes = dict(_conditions(scene))
         # By hand and condition: whether it kept the object, shape (trial,)
         self.kept: dict[Fingers, dict[str, np.ndarray]] = {}
@@ -192,17 +182,7 @@ class _Trials:
                 self.kept[hand][name] = np.concatenate([self.kept[hand][name], more])
 
     def _outcomes(self, hands: Params, trials: Trial, scene: Scene) -> Outcome:
-        """Outcomes of worlds, in calls of one size, so that they are one program."""
-        count = len(trials.yaw)
-        parts = []
-        for first in range(0, count, CALL):
-            rows = np.minimum(np.arange(first, first + CALL), count - 1)
-            inputs = jax.tree.map(lambda v, rows=rows: v[rows], (hands, trials))
-            outcomes = self._program(inputs, None, scene)
-            new = min(CALL, count - first)
-            parts.append(jax.tree.map(lambda v, n=new: np.asarray(v)[:n], outcomes))
-            self._done(new)
-        return jax.tree.map(lambda *v: np.concatenate(v), *parts)
+        return self._batch.simulate(hands, trials, scene, advance=self._done)[0]
 
     def _hand(self, fingers: Fingers) -> Params:
         return without(self._params, fingers)

@@ -26,7 +26,7 @@ from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.types import failed
 from scripts.agree import judgement, sides
 from scripts.agree.judgement import Expected, Row
-from scripts.shared import output, work
+from scripts.shared import energy, output, work
 
 GROUPS = ("recommended", "hard", "random")
 HARD = sides.ROOT / "docs" / "data" / "search" / "hard.npz"
@@ -144,7 +144,9 @@ def exact_rows(
 
 def energy_rows() -> Iterator[Row]:
     """The audit of energy, of this checkout."""
-    yield Row("energy audit", "left out: this checkout has none", True)
+    for rise in energy.rises():
+        figures = f"{rise.gained:.2%} gained, at most {rise.bound:.0%}"
+        yield Row(f"energy, {rise.name}", figures, rise.gained <= rise.bound)
 
 
 def compare(

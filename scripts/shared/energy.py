@@ -6,8 +6,10 @@ grow by the work of the chambers and of the arm, which moves the wrist's springs
 The audit reads a path only, and so holds for every engine, law and time step.
 
 A step leaves velocities v and the place q that they led to: they are those of the middle of the
-step, where the audit takes the energy, at q - h v / 2. With the default integrator the balance of
-linear springs and dampers is then exact at any step, but for what dampers take.
+step, where the audit takes the energy, at q - h v / 2. A step's force -K q - C v - A a of a spring
+and damper, see `model.layout.implicit_spring`, is -K times the mean of both middles, -C times the
+mean velocity, and -(A - h C / 2 - h^2 K / 4) a, which is an inertia. With its kinetic energy the
+balance of linear springs and dampers is exact at any step, but for what dampers take.
 """
 
 from functools import partial
@@ -107,6 +109,12 @@ def _world(scene: Scene, fields: Any, ctrl: Any, qpos: Any, qvel: Any, *held: An
     other = kinetic + forces.contact_energy(scene, hand, state)
     if scene.effects.gravity:
         other = other + hand.step_numbers["gravity"][0] * height
+    h = scene.discretization.timestep
+    joints_of = (hand.armature, hand.damping, hand.stiffness, state.finger_vel)
+    wrists_of = (hand.wrist_armature, hand.wrist_damping, hand.wrist_stiffness, state.wrist_vel)
+    for armature, damping, stiffness, rate in (joints_of, wrists_of):
+        left = (armature - h * damping / 2 - h**2 * stiffness / 4) * rate**2 / 2
+        other = other + left.reshape(-1, times).sum(0)
     constants = _joints(scene, hand)
     q = jnp.moveaxis(state.finger, 1, 0)
 

@@ -116,7 +116,6 @@ for accuracy in ACCURACIES:
         RELEASED,
         name=f"in_the_air_{name}",
         steps=(1.0,),
-        quick="structured" if accuracy == "standard" else "",
     )(functools.partial(in_the_air, accuracy))
     case(
         40,

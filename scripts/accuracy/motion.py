@@ -92,7 +92,7 @@ def simulate(name: str, file: Path, commit: str | None) -> None:
     params = jax.vmap(space.params)(jnp.asarray(vectors))
     trial = rollout.sample_trials(the_scene, jax.random.key(SEED), 1)
     trials = jax.tree.map(lambda v: jnp.repeat(v, HANDS, 0), trial)
-    fields, ctrl, _ = rollout.prepare(the_scene, params, trials, engine)
+    fields, ctrl = rollout.prepare(the_scene, params, trials, engine)
     series = jax.jit(lambda f, c: engine.states(f, c, trajectory=True)[1])(fields, ctrl)
     audit = energy.audit(the_scene, fields, ctrl, energy.Path(series["qpos"], series["qvel"]))
     first = round(the_scene.phases.disturb / h)

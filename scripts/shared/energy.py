@@ -236,6 +236,6 @@ def simulated(scene: Scene, designs: np.ndarray, seed: int = 3) -> Audit:
     space = parameters.design_space(scene.hand)
     params = jax.vmap(space.params)(jnp.asarray(designs, jnp.zeros(0).dtype))
     trials = rollout.sample_trials(scene, jax.random.key(seed), len(designs))
-    fields, ctrl, _ = rollout.prepare(scene, params, trials, engine)
+    fields, ctrl = rollout.prepare(scene, params, trials, engine)
     series = jax.jit(lambda f, c: engine.states(f, c, trajectory=True)[1])(fields, ctrl)
     return audit(scene, fields, ctrl, Path(series["qpos"], series["qvel"], series.get("held")))

@@ -50,7 +50,7 @@ def structured(the_scene, designs, trials, precision) -> energy.Audit:
         engine = StructuredEngine(the_scene)
         space = parameters.design_space(the_scene.hand)
         params = jax.vmap(space.params)(jnp.asarray(designs, jnp.zeros(0).dtype))
-        fields, ctrl, _ = rollout.prepare(the_scene, params, trials, engine)
+        fields, ctrl = rollout.prepare(the_scene, params, trials, engine)
         series = jax.jit(lambda f, c: engine.states(f, c, trajectory=True)[1])(fields, ctrl)
         path = energy.Path(series["qpos"], series["qvel"], series.get("held"))
         return energy.audit(the_scene, fields, ctrl, path)

@@ -1,3 +1,4 @@
+# pyright: reportMissingImports=false
 """A learning curve of docs/control.md: PPO of Stable-Baselines3 on the default environment.
 
     taskset -c 0,1 python -m scripts.learning [--seeds 0 1 2] [--minutes 10] [--out TABLE]

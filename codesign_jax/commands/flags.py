@@ -10,21 +10,26 @@ import tyro
 from codesign_jax import sizes
 
 
-def _overrides(name: str, text: str) -> Any:
-    """A flag of values by key path; repeated, it adds to its earlier values."""
-    return Annotated[
-        tuple[tuple[str, ...], ...],
-        tyro.conf.UseAppendAction,
-        tyro.conf.arg(name=name, metavar="KEY=VALUE ...", help=text, help_behavior_hint=""),
-    ]
+def _set(name: str, text: str) -> Any:
+    """A flag of values by key path."""
+    return tyro.conf.arg(name=name, metavar="KEY=VALUE ...", help=text, help_behavior_hint="")
 
 
-Overrides = _overrides(
+Pairs = tuple[tuple[str, ...], ...]
+"""Words of a flag that may be repeated, which adds to its earlier values."""
+_SET = _set(
     "set",
     "Replace values of the scene, hand and objects files, by key path: gravity=3.7 "
     "discretization.links=5 hand.material=dragon_skin_10 objects.object.sphere.mass=0.2, or "
     "objects.object.mass=0.2 for all objects",
 )
+_SET_A = _set("set-a", "As --set, for the first of the two designs alone.")
+_SET_B = _set(
+    "set-b",
+    "As --set, for the second of the two designs alone; or for one that is named once, such as the "
+    "same hand in another silicone: --set-b hand.material=ecoflex_00_50.",
+)
+Overrides = Annotated[Pairs, tyro.conf.UseAppendAction, _SET]
 # Without a default of its own: the help text says which value is used instead.
 Text = Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="")]
 Count = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
@@ -243,12 +248,8 @@ class Compare(Command, TrialFlags):
     results are listed instead."""
     seed: int = 0
     """Seed of the trials' noise."""
-    set_a: _overrides("set-a", "As --set, for the first of the two designs alone.") = ()
-    set_b: _overrides(
-        "set-b",
-        "As --set, for the second of the two designs alone; or for one that is named once, such as "
-        "the same hand in another silicone: --set-b hand.material=ecoflex_00_50.",
-    ) = ()
+    set_a: Annotated[Pairs, tyro.conf.UseAppendAction, _SET_A] = ()
+    set_b: Annotated[Pairs, tyro.conf.UseAppendAction, _SET_B] = ()
     engine: Text = None
     """Simulation engine; default: the runs' engine."""
     policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="STR ...", help_behavior_hint="")] = ()

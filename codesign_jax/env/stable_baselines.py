@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 
 from codesign_jax.env import vector
 from codesign_jax.env.grasp import GraspEnv, State
@@ -52,8 +52,9 @@ class BatchEnv(VecEnv):
         if any(seed is not None for seed in self._seeds):
             self._keys = vector.seed_keys([seed or 0 for seed in self._seeds])
             self._reset_seeds()
-        self._keys, self._state = self._reset(self._keys)
-        return vector.observed(self._state)
+        self._keys, state = self._reset(self._keys)
+        self._state = state
+        return vector.observed(state)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Takes the actions, shape (environment, action)."""
@@ -64,7 +65,8 @@ class BatchEnv(VecEnv):
         if self._state is None:
             raise RuntimeError("call reset before step")
         actions = jnp.asarray(self._actions)
-        self._keys, after, self._state = self._step(self._keys, self._state, actions)
+        self._keys, after, begun = self._step(self._keys, self._state, actions)
+        self._state = begun
         done = np.asarray(after.done) > 0
         last = vector.observed(after)
         metrics = vector.metrics(after)
@@ -73,7 +75,7 @@ class BatchEnv(VecEnv):
             info = {name: float(value[i]) for name, value in metrics.items()}
             ending = {"terminal_observation": last[i], "TimeLimit.truncated": False}
             infos.append(info | ending if done[i] else info)
-        return vector.observed(self._state), np.asarray(after.reward, np.float32), done, infos
+        return vector.observed(begun), np.asarray(after.reward, np.float32), done, infos
 
     def close(self) -> None:
         """Nothing is open."""

@@ -103,7 +103,7 @@ class Scene(SceneFile):
             count = round((end + self.phases.settle) / self.discretization.timestep)
             object.__setattr__(self, "num_steps", count)
 
-    def checked(self, other: "Scene | None" = None) -> "Scene":
+    def checked(self, other: Any = None) -> "Scene":
         """The other scene if there is one, else this one, with numbers in their ranges.
 
         Raises:

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from codesign_jax.scene import Scene
-from codesign_jax.scene.schema import InputError
+from codesign_jax.scene.schema import InputError, Problem
 from codesign_jax.types import Params, Tip, Trial, random_key_problem
 
 _TRIAL = Trial._make([(), (2,), (), (2,), (), (), (), (), (), (2,), None])
@@ -32,7 +32,9 @@ def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -
     problems = _problems("params", params._replace(control=None, tip=None), shapes, axes[0])
     problems += _control_problems(scene, params)
     if scene.hand.section.tapered != (params.tip is not None):
-        problems.append("params.tip is for hands with section.tapered, which need it")
+        problems.append(
+            Problem("unsupported", "params.tip is for hands with section.tapered, which need it")
+        )
     elif params.tip is not None:
         problems += _problems("params.tip", params.tip, Tip(fingers, fingers, fingers), axes[0])
     one_trial = _TRIAL._replace(constants=(len(scene.drawn.constant),))
@@ -65,10 +67,12 @@ def _control_problems(scene: Scene, params: Params) -> list[str]:
 def refuse_other(scene: Any, engine: Any) -> None:
     """Refuses a scene that is not one that the engine was made for."""
     if not isinstance(scene, Scene):
-        raise InputError([f"scene is a {type(scene).__name__}, not a Scene; scene.load reads one"])
+        raise InputError.of(
+            "type", f"scene is a {type(scene).__name__}, not a Scene; scene.load reads one"
+        )
     if not hasattr(engine, "rollout"):
         hint = "make_engine('structured', scene) makes one"
-        raise InputError([f"engine is a {type(engine).__name__}, not an engine; {hint}"])
+        raise InputError.of("type", f"engine is a {type(engine).__name__}, not an engine; {hint}")
     engine_scene = getattr(engine, "scene", None)
     if engine_scene is None or engine_scene.structure == scene.structure:
         return
@@ -76,11 +80,10 @@ def refuse_other(scene: Any, engine: Any) -> None:
         dataclasses.asdict(engine_scene.structure), dataclasses.asdict(scene.structure), ""
     )
     some = ", ".join(keys[:3]) + (", ..." if len(keys) > 3 else "")
-    raise InputError(
-        [
-            f"engine {engine.name} was made for a scene of another structure (other: {some}); "
-            f"make_engine({engine.name!r}, scene) makes one for this scene"
-        ]
+    raise InputError.of(
+        "unsupported",
+        f"engine {engine.name} was made for a scene of another structure (other: {some}); "
+        f"make_engine({engine.name!r}, scene) makes one for this scene",
     )
 
 
@@ -97,15 +100,16 @@ def refuse_numbers(scene: Scene, count: int, axis: str) -> None:
     for path, value in jax.tree_util.tree_leaves_with_path(scene):
         if np.ndim(value) == 1 and np.shape(value)[0] != count:
             key = jax.tree_util.keystr(path)
-            raise InputError(
-                [f"scene{key} has {np.shape(value)[0]} values, one a {axis}: there are {count}"]
+            raise InputError.of(
+                "size",
+                f"scene{key} has {np.shape(value)[0]} values, one a {axis}: there are {count}",
             )
 
 
 def refuse_draws(key: Any, count: int) -> None:
     """Refuses arguments of `rollout.sample_trials` from which no trials can be drawn."""
     if not isinstance(count, int | np.integer) or count < 1:
-        raise InputError([f"num_trials = {count} must be a whole number, at least 1"])
+        raise InputError.of("range", f"num_trials = {count} must be a whole number, at least 1")
     if problem := random_key_problem(key):
         raise InputError([problem])
 
@@ -113,17 +117,19 @@ def refuse_draws(key: Any, count: int) -> None:
 def _problems(name: str, batch: Any, shapes: Any, axis: str) -> list[str]:
     array_shapes = {k: np.shape(v) for k, v in batch._asdict().items() if v is not None}
     if all(shape == getattr(shapes, k) for k, shape in array_shapes.items()):
-        return [
-            f"{name} have no axis ({axis},); of one, jax.tree.map(lambda v: v[None], {name}) "
-            "makes a batch"
-        ]
+        hint = f"jax.tree.map(lambda v: v[None], {name}) makes a batch"
+        return [Problem("size", f"{name} have no axis ({axis},); of one, {hint}")]
     counts = {shape[0] for shape in array_shapes.values() if shape}
     problems = [
-        f"{name}.{k} has shape {shape}, not ({', '.join(map(str, (axis, *getattr(shapes, k))))})"
+        Problem(
+            "size",
+            f"{name}.{k} has shape {shape}, not "
+            f"({', '.join(map(str, (axis, *getattr(shapes, k))))})",
+        )
         for k, shape in array_shapes.items()
         if not shape or shape[1:] != getattr(shapes, k)
     ]
     if not problems and len(counts) > 1:
         lengths = ", ".join(f"{k} {shape[0]}" for k, shape in array_shapes.items())
-        problems = [f"the arrays of {name} have different lengths: {lengths}"]
+        problems = [Problem("size", f"the arrays of {name} have different lengths: {lengths}")]
     return problems

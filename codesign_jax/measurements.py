@@ -21,7 +21,7 @@ import numpy as np
 
 from codesign_jax import files
 from codesign_jax.scene import texts
-from codesign_jax.scene.schema import InputError, nearest
+from codesign_jax.scene.schema import InputError, Problem, nearest
 
 UNITS = {
     "Pa": ("pressure", 1.0),
@@ -104,8 +104,8 @@ def read(path: Path) -> dict[str, np.ndarray]:
     lines = _lines(path)
     separator, lines = _separator(lines)
     if not lines:
-        raise InputError(
-            [f"{path} is empty; its head names columns, such as pressure_kPa,angle_deg"]
+        raise InputError.of(
+            "syntax", f"{path} is empty; its head names columns, such as pressure_kPa,angle_deg"
         )
     problems: list[str] = []
     head, rows = _rows(lines, separator, problems)
@@ -135,14 +135,14 @@ def _lines(path: Path) -> list[tuple[int, str]]:
         with files.opened(path) as file:
             content = file.read(4 * MOST_CHARACTERS + 1)
         if foreign := texts.foreign(content):
-            raise InputError([f"{path}: {foreign}"])
+            raise InputError.of("syntax", f"{path}: {foreign}")
         text = content.decode("utf-8-sig")
     except OSError as error:
-        raise InputError([f"{path}: {error.strerror}"]) from error
+        raise InputError.of("syntax", f"{path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise InputError([f"{path}: no UTF-8 text; save it as CSV UTF-8"]) from error
+        raise InputError.of("syntax", f"{path}: no UTF-8 text; save it as CSV UTF-8") from error
     if len(text) > MOST_CHARACTERS:
-        raise InputError([f"{path} has more than {MOST_CHARACTERS:,} characters"])
+        raise InputError.of("range", f"{path} has more than {MOST_CHARACTERS:,} characters")
     lines = [(n, v) for n, v in enumerate(io.StringIO(text, newline=""), 1) if v.strip()]
     return [(n, line) for n, line in lines if not line.lstrip().startswith("#")]
 
@@ -164,7 +164,7 @@ def _rows(
         try:
             [cells] = csv.reader([line.rstrip("\r\n")], delimiter=separator, strict=True)
         except (csv.Error, ValueError) as error:
-            problems.append(f"line {number} is no row of cells: {error}")
+            problems.append(Problem("syntax", f"line {number} is no row of cells: {error}"))
             continue
         stripped = [cell.strip() for cell in cells]
         if any(stripped):  # a spreadsheet writes its empty rows as well
@@ -194,15 +194,21 @@ def _columns(head: list[str], problems: list[str]) -> tuple[list[str], list[floa
     for column in head:
         name, unit = _name_and_unit(column)
         if name not in COLUMNS:
-            problems.append(f"column {column!r} is not valid: {_valid(column, name)}")
+            problems.append(
+                Problem("unknown", f"column {column!r} is not valid: {_valid(column, name)}")
+            )
             continue
         kind = COLUMNS[name][0]
         units = [u for u, (k, _) in UNITS.items() if k == kind]
         if unit not in units:
-            problems.append(f"column {column!r}: unit {unit!r} is not one of {', '.join(units)}")
+            problems.append(
+                Problem(
+                    "unknown", f"column {column!r}: unit {unit!r} is not one of {', '.join(units)}"
+                )
+            )
             continue
         if name in names:
-            problems.append(f"column {name!r} is given more than once")
+            problems.append(Problem("conflict", f"column {name!r} is given more than once"))
         names.append(name)
         factors.append(UNITS[unit][1])
     return names, factors
@@ -244,13 +250,15 @@ def _has_decimal_commas(
     remedy = "write numbers without separators of thousands"
     if len(with_sign) == 2:
         both = f"{with_sign[',']} has a comma and {with_sign['.']} a point"
-        problems.append(f"{both}, and a file has one decimal sign: {remedy}")
+        problems.append(Problem("syntax", f"{both}, and a file has one decimal sign: {remedy}"))
     commas = {name: [n for n in numbers if "," in n] for name, numbers in columns.items()}
     grouped = all(map(_THOUSANDS.fullmatch, itertools.chain.from_iterable(commas.values())))
     whole = any(numbers and not commas[name] for name, numbers in columns.items())
     if not problems and "," in with_sign and grouped and whole:
         either = "may be thousands or decimals, and no other number tells"
-        problems.append(f"the comma in {with_sign[',']} {either}: {remedy}, or more decimals")
+        problems.append(
+            Problem("syntax", f"the comma in {with_sign[',']} {either}: {remedy}, or more decimals")
+        )
     return "," in with_sign
 
 
@@ -265,7 +273,9 @@ def _cell(text: str, comma: bool, where: str, problems: list[str]) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        problems.append(f"{where} = {texts.shown(text)} must be a number, or empty")
+        problems.append(
+            Problem("type", f"{where} = {texts.shown(text)} must be a number, or empty")
+        )
     return value
 
 
@@ -279,19 +289,24 @@ def _missing(table: dict[str, np.ndarray]) -> list[str]:
         table["pressure"] = np.zeros(rows)
     problems = []
     if not names:
-        problems.append(f"no measured value; columns of them: {', '.join(MEASURED)}")
+        problems.append(
+            Problem("missing", f"no measured value; columns of them: {', '.join(MEASURED)}")
+        )
     loads_alone = np.all([np.isnan(table[n]) for n in BY_PRESSURE if n in table] or [True], axis=0)
     table["pressure"] = np.where(loads_alone, np.nan_to_num(table["pressure"]), table["pressure"])
     if np.isnan(table["pressure"]).any():
-        problems.append("a row has no pressure")
+        problems.append(Problem("missing", "a row has no pressure"))
     elif (table["pressure"] < 0).any():
-        problems.append("a pressure is below 0; gauge pressures are meant")
+        problems.append(Problem("range", "a pressure is below 0; gauge pressures are meant"))
     for name, other in NEEDED.items():
         if name in table:
             beside = table.get(other, np.full(rows, np.nan))
             if np.isnan(beside[np.isfinite(table[name])]).any():
                 unit = {"load": "N", "time": "s"}[other]
                 problems.append(
-                    f"a {name} has no {other} beside it, in a column such as {other}_{unit}"
+                    Problem(
+                        "missing",
+                        f"a {name} has no {other} beside it, in a column such as {other}_{unit}",
+                    )
                 )
     return problems

@@ -245,7 +245,7 @@ class ControlLoop(Equal):
                 seen = seen._replace(forces=contacts())
         answer = jax.vmap(self.policy)(memory, seen)
         if not (isinstance(answer, tuple) and [*map(type, answer[1:])] == [Command]):
-            raise InputError([f"{self.called} must return (carry, policy.Command)"])
+            raise InputError.of("type", f"{self.called} must return (carry, policy.Command)")
         self._refuse_memory(memory, answer[0])
         return answer[0], spread(self.scene, answer[1], plan, of=self.called)
 
@@ -269,11 +269,10 @@ class ControlLoop(Equal):
         kinds = [[(v.shape[1:], v.dtype.name) for v in map(jnp.asarray, t[0])] for t in trees]
         if trees[0][1] != trees[1][1] or kinds[0] != kinds[1]:
             words = [f"{k}, in the tree {t[1]}" for k, t in zip(kinds, trees, strict=True)]
-            raise InputError(
-                [
-                    f"{self.called} must remember arrays like those of its init: {words[0]}; "
-                    f"it returned {words[1]}"
-                ]
+            raise InputError.of(
+                "type",
+                f"{self.called} must remember arrays like those of its init: {words[0]}; "
+                f"it returned {words[1]}",
             )
 
     def _refuse_nonfinite(self, ctrl: Any) -> None:
@@ -284,7 +283,7 @@ class ControlLoop(Equal):
         names = [*WRIST, *(f"pressure[{i}]" for i in range(ctrl.shape[2] - 6))]
         time = f"{step * self.scene.discretization.timestep:.4g} s"
         value = f"{names[column]} = {float(ctrl[world, step, column])}"
-        raise InputError([f"{self.called} commands {value} at {time} in world {world}"])
+        raise InputError.of("range", f"{self.called} commands {value} at {time} in world {world}")
 
 
 def searched(scene: Scene, policy: Policy) -> Scene:
@@ -316,7 +315,9 @@ def period_steps(scene: Scene, period: float | None) -> int:
         return max(1, round(PERIOD / h))
     steps = round(period / h) if np.isfinite(period) else 0
     if steps < 1 or abs(steps * h - period) > 1e-6 * h:
-        raise InputError([f"period = {period:g} s is not a whole number of time steps of {h:g} s"])
+        raise InputError.of(
+            "type", f"period = {period:g} s is not a whole number of time steps of {h:g} s"
+        )
     return steps
 
 
@@ -430,7 +431,9 @@ def advance(
     ctrl, pressure = jax.vmap(controls)(*inputs)
     trace = engine.rollout(fields._replace(start=world.state), ctrl, **options)
     if trace.last is None:
-        raise InputError([f"engine {engine.name} does not tell states to go on from"])
+        raise InputError.of(
+            "unsupported", f"engine {engine.name} does not tell states to go on from"
+        )
     return World(trace.last, pressure), trace._replace(ctrl=ctrl)
 
 

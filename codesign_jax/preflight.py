@@ -48,7 +48,7 @@ def nominal_trial(scene: Scene, shape: int | str = 0) -> Trial:
     names = [s.name for s in scene.objects.object]
     if shape not in names and shape not in range(len(names)):
         hint = nearest(str(shape), names)
-        raise InputError([f"object {shape!r} unknown in {scene.objects.name}; {hint}"])
+        raise InputError.of("unknown", f"object {shape!r} unknown in {scene.objects.name}; {hint}")
     index = names.index(shape) if isinstance(shape, str) else shape
     zero = jnp.zeros(())
     none = jnp.zeros(2)

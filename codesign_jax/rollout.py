@@ -227,7 +227,9 @@ def grasp(
       InputError: As `simulate`, or if there are no such steps.
     """
     if steps is not None and not 0 < steps <= scene.num_steps:
-        raise schema.InputError([f"steps = {steps}: the grasp has 1 to {scene.num_steps}"])
+        raise schema.InputError.of(
+            "range", f"steps = {steps}: the grasp has 1 to {scene.num_steps}"
+        )
     params, trial = jax.tree.map(lambda v: jnp.asarray(v)[None], (params, trial))
     _check(scene, engine, params, trial)
     trace, *_ = _traced(scene, engine, params, trial, Options(**options), steps)
@@ -283,7 +285,9 @@ def tips(scene: Scene, params: Params, trial: Trial, qpos: jax.typing.ArrayLike)
     size = 13 + layout(scene).dofs.size  # of wrist, joints and the object's pose
     if jnp.shape(qpos)[-1:] != (size,):
         hint = "record_qpos=True records it" if jnp.shape(qpos)[-1:] == (0,) else "of this scene"
-        raise schema.InputError([f"qpos has shape {jnp.shape(qpos)}, not (..., {size}): {hint}"])
+        raise schema.InputError.of(
+            "size", f"qpos has shape {jnp.shape(qpos)}, not (..., {size}): {hint}"
+        )
     numbers = jax.tree.map(lambda v: jnp.asarray(v, float), scene.bare)
     rows = jnp.reshape(jnp.asarray(qpos), (-1, size))
     places = _tips(make_engine(DEFAULT, scene), numbers, params, trial, rows)

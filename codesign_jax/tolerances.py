@@ -231,7 +231,11 @@ def read(words: tuple[str, ...]) -> dict[str, float]:
     for word in words:
         name, _, text = word.partition("=")
         if name not in KINDS:
-            problems.append(f"--tolerances {schema.shown(word)}: {schema.nearest(name, KINDS)}")
+            problems.append(
+                schema.Problem(
+                    "unknown", f"--tolerances {schema.shown(word)}: {schema.nearest(name, KINDS)}"
+                )
+            )
             continue
         try:
             value = float(text)
@@ -239,7 +243,11 @@ def read(words: tuple[str, ...]) -> dict[str, float]:
             value = math.nan
         if not 0 <= value <= 20 * KINDS[name].usual:
             most = f"{20 * KINDS[name].usual:g} {KINDS[name].unit}"
-            problems.append(f"--tolerances {schema.shown(word)} must be a number from 0 to {most}")
+            problems.append(
+                schema.Problem(
+                    "range", f"--tolerances {schema.shown(word)} must be a number from 0 to {most}"
+                )
+            )
         values[name] = value
     if problems:
         raise schema.InputError(problems)

@@ -72,11 +72,11 @@ def make_cost(name: str, scene: Scene) -> tuple[CostFunction, bool]:
     _refuse_signature(flag, cost, ("scene", "trace", "ctrl"))
     stops = getattr(cost, "stop_when_lost", False)
     if not isinstance(stops, bool):
-        raise InputError([f"{flag}: its attribute stop_when_lost must be True or False"])
+        raise InputError.of("type", f"{flag}: its attribute stop_when_lost must be True or False")
 
     forces = getattr(cost, "record_forces", False)
     if not isinstance(forces, bool):
-        raise InputError([f"{flag}: its attribute record_forces must be True or False"])
+        raise InputError.of("type", f"{flag}: its attribute record_forces must be True or False")
 
     def judge(trace: Trace, params: Params, trials: Any) -> Outcome:
         ctrl = rollout.prepare(scene, params, trials)[1]
@@ -132,13 +132,14 @@ def make_optimizer(name: str, space: Space, num_particles: int | None = None) ->
         n for n in ("space", "keeps_best", "init", "ask", "tell") if not hasattr(optimizer, n)
     ]
     if missing:
-        raise InputError([f"{flag}: it lacks {', '.join(missing)} of optimize.Optimizer"])
+        raise InputError.of(
+            "missing", f"{flag}: it lacks {', '.join(missing)} of optimize.Optimizer"
+        )
     if any(leaf is optimizer for leaf in jax.tree.leaves(optimizer)):
-        raise InputError(
-            [
-                f"{flag}: it is no pytree: make it a dataclass and register that with "
-                "jax.tree_util.register_dataclass"
-            ]
+        raise InputError.of(
+            "type",
+            f"{flag}: it is no pytree: make it a dataclass and register that with "
+            "jax.tree_util.register_dataclass",
         )
     if num_particles is not None:
         _try(flag, make, optimizer, num_particles)
@@ -152,11 +153,9 @@ def _try(flag: str, make: Any, optimizer: Optimizer, n: int) -> None:
     mask = np.ones(low.shape, bool)
     state = _tried(flag, make, lambda: optimizer.init(jax.random.key(0), seed, n))
     if not isinstance(state, OptimizerState) or np.shape(state.particles) != (n, low.size):
-        raise InputError(
-            [
-                f"{flag}: init must return an optimize.OptimizerState with particles "
-                f"({n}, {low.size})"
-            ]
+        raise InputError.of(
+            "type",
+            f"{flag}: init must return an optimize.OptimizerState with particles ({n}, {low.size})",
         )
 
     def episode(state: OptimizerState) -> tuple[jax.Array, Any]:
@@ -165,13 +164,14 @@ def _try(flag: str, make: Any, optimizer: Optimizer, n: int) -> None:
 
     population, result = _tried(flag, make, lambda: jax.eval_shape(episode, state))
     if population.shape != (n, low.size):
-        raise InputError([f"{flag}: ask returns {population.shape}, not ({n}, {low.size})"])
+        raise InputError.of(
+            "size", f"{flag}: ask returns {population.shape}, not ({n}, {low.size})"
+        )
     if not (isinstance(result, tuple) and len(result) == 2 and _same(state, result[0])):
-        raise InputError(
-            [
-                f"{flag}: tell must return a state, with the arrays of init's in shape and type, "
-                "and an optimize.Info (`optimize.protocol.summarize` makes one)"
-            ]
+        raise InputError.of(
+            "size",
+            f"{flag}: tell must return a state, with the arrays of init's in shape and type, "
+            "and an optimize.Info (`optimize.protocol.summarize` makes one)",
         )
 
 
@@ -201,17 +201,20 @@ def _load(name: str, flag: str = "") -> Any:
         imported = importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise InputError([f"{begin}: {_where(error, None)}"]) from error
-        raise InputError(
-            [f"{begin}: there is no module {module!r} in {folder} or among the installed packages"]
+            raise InputError.of("user_code", f"{begin}: {_where(error, None)}") from error
+        raise InputError.of(
+            "missing",
+            f"{begin}: there is no module {module!r} in {folder} or among the installed packages",
         ) from error
     except (Exception, SystemExit) as error:
-        raise InputError([f"{begin}: importing it fails: {_where(error, None)}"]) from error
+        raise InputError.of(
+            "user_code", f"{begin}: importing it fails: {_where(error, None)}"
+        ) from error
     finally:
         sys.path.remove(folder)
     if not hasattr(imported, attribute):
         place = getattr(imported, "__file__", None) or module
-        raise InputError([f"{begin}: {place} has no {attribute!r}"])
+        raise InputError.of("user_code", f"{begin}: {place} has no {attribute!r}")
     return getattr(imported, attribute)
 
 
@@ -219,28 +222,29 @@ def _source(name: str, module: str) -> Path:
     try:
         return Path(inspect.getsourcefile(sys.modules[module]) or "").resolve(strict=True)
     except (TypeError, OSError) as error:
-        raise InputError(
-            [f"{name}: module {module} has no file of Python code, which a run keeps a copy of"]
+        raise InputError.of(
+            "missing",
+            f"{name}: module {module} has no file of Python code, which a run keeps a copy of",
         ) from error
 
 
 def _refuse_signature(flag: str, function: Any, arguments: tuple[str, ...]) -> None:
     expected = f"a function of ({', '.join(arguments)})"
     if not callable(function):
-        raise InputError([f"{flag}: it is {type(function).__name__}, not {expected}"])
+        raise InputError.of("type", f"{flag}: it is {type(function).__name__}, not {expected}")
     try:
         inspect.signature(function).bind(*arguments)
     except ValueError:  # it does not tell
         pass
     except TypeError as error:
-        raise InputError([f"{flag}: it must be {expected}: {error}"]) from error
+        raise InputError.of("type", f"{flag}: it must be {expected}: {error}") from error
 
 
 def _tried(flag: str, code: Any, call: Callable[[], Any]) -> Any:
     try:
         return call()
     except Exception as error:
-        raise InputError([f"{flag}: {_where(error, code)}"]) from error
+        raise InputError.of("user_code", f"{flag}: {_where(error, code)}") from error
 
 
 def _where(error: BaseException, code: Any) -> str:

@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 import pickle
-import re
 from functools import partial
 
 import jax
@@ -25,9 +24,10 @@ from codesign_jax.engines.structured.laws.step_numbers import (
     pushed,
 )
 from codesign_jax.engines.structured.world_model import world_constants
-from codesign_jax.scene import constants, effects, scene_files, schema
+from codesign_jax.scene import constants, effects, scene_files
 from tests.helpers import grasps
 from tests.helpers.grasps import hand_world, hurried, off, pinch, random_constants
+from tests.helpers.refusals import refusal
 
 # Compiling takes longer than all that is done with a program here.
 QUICK = {"xla_backend_optimization_level": 0}
@@ -269,71 +269,71 @@ def test_tables_of_other_numbers_share_their_programs(tmp_path):
 
 
 NO_TABLES = {
-    'key = "hand.material.shear_modulus"': ('key = "hand.material.modulus"', "is not a known key"),
-    'key = "hand.finger.1.tilt"': ('key = "objects.object.friction"', "given more than once"),
-    'key = "objects.object.friction"': ('key = "phases.lift"', "'phases.lift' is no constant"),
-    "correlation = [-0.8]": ("correlation = [0.1, 0.2]", "correlation has 2 numbers, 1 before it"),
-    "sd = 0.2": ("sd = -0.2", "is outside [0, 1e+09]"),
-    "low = 0.8": ("low = 1.2", "low = 1.2 must be below high = 1.1"),
-    "mean = 90e3": ("mean = 0.0", "mean of a lognormal is above 0"),
-    "sd = 2.0": ("low = 1.0", "has mean and sd, and no other number"),
+    'key = "hand.material.shear_modulus"': (
+        'key = "hand.material.modulus"',
+        ("unknown", "hand.material.modulus"),
+    ),
+    'key = "hand.finger.1.tilt"': (
+        'key = "objects.object.friction"',
+        ("conflict", "constants.toml.constant objects.object.friction"),
+    ),
+    'key = "objects.object.friction"': ('key = "phases.lift"', ("unknown", "constants")),
+    "correlation = [-0.8]": (
+        "correlation = [0.1, 0.2]",
+        ("unknown", "constants.toml.constant hand.material.damping_time"),
+    ),
+    "sd = 0.2": ("sd = -0.2", ("range", "constants.toml.constant[0].sd")),
+    "low = 0.8": ("low = 1.2", ("order", "constants.toml.constant objects.object.friction")),
+    "mean = 90e3": ("mean = 0.0", ("range", "constants.toml.constant hand.material.shear_modulus")),
+    "sd = 2.0": ("low = 1.0", ("conflict", "constants.toml.constant hand.finger.1.tilt")),
 }
 
 
 @pytest.mark.parametrize("right", NO_TABLES)
 def test_a_table_that_is_none_is_refused(right, tmp_path):
     wrong, why = NO_TABLES[right]
-    with pytest.raises(schema.InputError) as error:
-        with_draws(tmp_path, DRAWN.replace(right, wrong))
-    assert why in str(error.value)
+    assert why in refusal(with_draws, tmp_path, DRAWN.replace(right, wrong))
     law = 'law = "linear"\n' + DRAWN
-    with pytest.raises(schema.InputError, match="that of the law 'linear', and the scene has"):
-        with_draws(tmp_path, law, **{"hand.material.law": "neo_hookean"})
+    told = refusal(with_draws, tmp_path, law, **{"hand.material.law": "neo_hookean"})
+    assert ("conflict", "paper_spheres.toml") in told
 
 
-BAD = {
-    "scene.contact.friction_ratio = nan is outside [0.01, 1000]": {
-        "contact.friction_ratio": np.nan
-    },
-    "scene.hand.palm.mass = 250.0 is outside [0.01, 10] kg; did you mean 0.25?": {
-        "hand.palm.mass": 250.0
-    },
-    "scene.objects.object[0].mass has shape (2, 2)": {"objects.object[0].mass": np.ones((2, 2))},
-    "scene.phases.inflate = 0.05 s must come after approach = 0.1 s": {"phases.inflate": 0.05},
-}
+BAD = [
+    (("range", "scene.contact.friction_ratio"), {"contact.friction_ratio": np.nan}),
+    (("range", "scene.hand.palm.mass"), {"hand.palm.mass": 250.0}),
+    (("size", "scene.objects.object[0].mass"), {"objects.object[0].mass": np.ones((2, 2))}),
+    (("order", "scene.phases.inflate"), {"phases.inflate": 0.05}),
+]
 
 
-@pytest.mark.parametrize("message", BAD)
-def test_bad_numbers_are_named_before_anything_runs(message):
-    the_scene = short()
-    [(key, value)] = BAD[message].items()
-    other = with_leaf(the_scene, key, lambda _: value)
-    with pytest.raises(schema.InputError) as error:
-        constants.check(other)
-    assert message in str(error.value)
+@pytest.mark.parametrize(("kind", "change"), BAD)
+def test_bad_numbers_are_named_before_anything_runs(kind, change):
+    [(key, value)] = change.items()
+    assert kind in refusal(constants.check, with_leaf(short(), key, lambda _: value))
 
 
-NOT_OF_A_FILE = {
-    "scene.gravity = -9.81 is outside [0, 100] m/s^2": lambda s: ("gravity", -9.81),
-    "scene.gravity = '3.7' must be a number in [0, 100]": lambda s: ("gravity", "3.7"),
-    "scene.gravity = nan is outside": lambda s: ("gravity", np.float32("nan")),
-    "scene.gravity = -1.0 is outside": lambda s: ("gravity", np.array([1.0, -1.0])),
-    "scene.gravity = 200.0 is outside": lambda s: ("gravity", jnp.float32(200)),
-    "material.shear_modulus = 60.0 is outside [1000, 1e+07] Pa; did you mean 60000?": lambda s: (
+NOT_OF_A_FILE = [
+    (("range", "scene.gravity"), lambda s: ("gravity", -9.81)),
+    (("type", "scene.gravity"), lambda s: ("gravity", "3.7")),
+    (("range", "scene.gravity"), lambda s: ("gravity", np.float32("nan"))),
+    (("range", "scene.gravity"), lambda s: ("gravity", np.array([1.0, -1.0]))),
+    (("range", "scene.gravity"), lambda s: ("gravity", jnp.float32(200))),
+    (("range", "material.shear_modulus"), lambda s: (
         "hand", dataclasses.replace(s.hand.material, shear_modulus=60)
-    ),
-    "finger.base[1] = 36.0 is outside [-0.2, 0.2] m": lambda s: (
+    )),
+    (("range", "finger.base[1]"), lambda s: (
         "hand", dataclasses.replace(s.hand.finger[0], base=(0.0, 36.0), radius=None)
-    ),
-}  # fmt: skip
+    )),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("message", NOT_OF_A_FILE)
-def test_what_a_file_is_refused_no_scene_is_made_of(message):
-    the_scene = short()
-    with pytest.raises(schema.InputError, match=re.escape(message)):
-        name, value = NOT_OF_A_FILE[message](the_scene)
-        dataclasses.replace(the_scene, **{name: value})
+@pytest.mark.parametrize(("kind", "change"), NOT_OF_A_FILE)
+def test_what_a_file_is_refused_no_scene_is_made_of(kind, change):
+    def made():
+        name, value = change(short())
+        dataclasses.replace(short(), **{name: value})
+
+    assert refusal(made) == [kind]
 
 
 def test_what_is_not_known_and_what_jax_makes_is_let_pass():
@@ -444,8 +444,7 @@ def test_every_effect_is_in_the_table():
 
 def test_unsupported_effect_names_itself_and_the_engine():
     scene = effects_scene({"wrist": False})
-    with pytest.raises(schema.InputError, match="engine mjx: effects.wrist = false .*float64"):
-        make_engine("mjx", scene)
+    assert [kind for kind, _ in refusal(make_engine, "mjx", scene)] == ["unsupported"]
     assert effects.state(scene.effects, "wrist", "mjx") == "unsupported (false)"
     assert effects.state(scene.effects, "wrist", "mujoco") == "off"
     assert effects.state(scene.effects, "friction", "mujoco") == "coulomb"
@@ -459,8 +458,8 @@ COMBINATIONS = st.fixed_dictionaries(
 )
 # The threshold of sideways bending needs that hinge, and pressures that are known beforehand.
 REFUSED = {
-    "lateral_bending = false leaves out": {"lateral_threshold": True, "lateral_bending": False},
-    "air_mass = true has a volume": {"lateral_threshold": True, "air_mass": True},
+    "lateral_threshold": {"lateral_threshold": True, "lateral_bending": False},
+    "air_mass": {"lateral_threshold": True, "air_mass": True},
 }
 
 
@@ -469,19 +468,17 @@ REFUSED = {
 def test_a_combination_builds_or_is_refused(values, shape):
     """Every engine takes a step that is finite, or traces one, or says what it cannot do."""
     chosen = {f"effects__{k}": v for k, v in values.items()}
-    for words, wrong in REFUSED.items():
+    for effect, wrong in REFUSED.items():
         if wrong.items() <= values.items():
-            with pytest.raises(schema.InputError, match=words):
-                grasps.pinch(shape, links=1, **chosen)
+            told = refusal(grasps.pinch, shape, links=1, **chosen)
+            assert ("unsupported", f"effects.{effect}") in told
             return
     scene = grasps.pinch(shape, links=1, **chosen)
     for name in effects.ENGINES:
         refused = effects.refusals(scene.effects, name)
         if refused:
-            with pytest.raises(schema.InputError) as caught:
-                make_engine(name, scene)
-            assert len(caught.value.problems) == len(refused)
-            assert all(f"engine {name}: effects." in p for p in caught.value.problems)
+            told = refusal(make_engine, name, scene)
+            assert [kind for kind, _ in told] == ["unsupported"] * len(refused)
             continue
         engine = make_engine(name, scene)
         if name == "mujoco":

@@ -24,6 +24,7 @@ from codesign_jax.scene.meshes import grid, reading, surface
 from scripts import faults
 from tests.helpers import oracles
 from tests.helpers.grasps import batch_inputs, hurried, nth, pinch, stack, still
+from tests.helpers.refusals import refusal
 from tests.helpers.solids import box, bracket, object_file
 
 
@@ -481,23 +482,22 @@ def test_files_of_another_kind_are_named(tmp_path, kind, message):
     path = tmp_path / f"file.{kind}"
     path.write_bytes(FOREIGN[message])
     call = scene.load if kind == "toml" else reading.read
-    [problem] = refusals(call, path)
-    assert message in problem
+    assert refusal(call, path) == [("file", path.name)]
 
 
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("gravity = " + "9" * 400, "characters) is outside [0, 100] m/s^2"),
-        ("gravity = " + "9" * 5000, "not valid TOML: a whole number has thousands of digits"),
-        ("a" + ".a" * 4000 + " = 1", "not valid TOML: tables and arrays are nested more than"),
-        ("#" * 300_000, "has more than 262,144 bytes"),
-        ("\n".join(f"x{i} = 1" for i in range(9000)), "has 8,980 more unknown keys"),
-        ('x = "\x1b[2J"', "not valid TOML: Illegal character"),
-        ("x = { a = 1, }", "a table in braces stands in one line and has no comma at its end"),
-        ("x = [\n {\n a = 1 },\n]", "a table in braces stands in one line"),
-        ("x = { a = 1\n}", "a table in braces stands in one line"),
-        ("x = [{ a = 1, b = 2,\n c = 3 }]", "a table in braces stands in one line"),
+        ("gravity = " + "9" * 400, ("range", "scene.toml.gravity")),
+        ("gravity = " + "9" * 5000, ("syntax", "scene.toml")),
+        ("a" + ".a" * 4000 + " = 1", ("syntax", "scene.toml")),
+        ("#" * 300_000, ("range", "scene.toml")),
+        ("\n".join(f"x{i} = 1" for i in range(9000)), ("unknown", "scene.toml")),
+        ('x = "\x1b[2J"', ("syntax", "scene.toml")),
+        ("x = { a = 1, }", ("syntax", "scene.toml")),
+        ("x = [\n {\n a = 1 },\n]", ("syntax", "scene.toml")),
+        ("x = { a = 1\n}", ("syntax", "scene.toml")),
+        ("x = [{ a = 1, b = 2,\n c = 3 }]", ("syntax", "scene.toml")),
     ],
 )
 def test_files_that_are_too_much(tmp_path, line, message):
@@ -505,7 +505,7 @@ def test_files_that_are_too_much(tmp_path, line, message):
     text = PAPER.read_text()
     path.write_text(line + "\n" + text.replace("gravity = 9.81", "", line.startswith("gravity")))
     problems = refusals(scene.load, path)
-    assert any(message in p for p in problems), problems
+    assert message in [(p.code, p.key) for p in problems]
     assert len(problems) < 40 and all(len(p) < 1000 for p in problems)
 
 
@@ -517,16 +517,15 @@ def test_an_error_never_speaks_to_the_terminal():
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        ({"gravity": 10**6000}, "too long to show"),
-        ({".".join("a" * 3000): 1}, "3,000 parts"),
-        ({(): 2}, "() is no key path"),
-        ({"hand.finger." + "9" * 5000 + ".tilt": 1}, "hand.finger has no entry"),
-        ({"hand.finger": [{}] * 1001}, "1,001 entries, more than 1,000"),
+        ({"gravity": 10**6000}, ("range", "gravity")),
+        ({".".join("a" * 3000): 1}, ("type", "")),
+        ({(): 2}, ("syntax", "")),
+        ({"hand.finger." + "9" * 5000 + ".tilt": 1}, ("unknown", "hand.finger")),
+        ({"hand.finger": [{}] * 1001}, ("range", "hand.finger")),
     ],
 )
 def test_values_that_are_too_much(overrides, message):
-    problems = refusals(scene.load, "paper_spheres", overrides=overrides)
-    assert any(message in p for p in problems), problems
+    assert message in refusal(scene.load, "paper_spheres", overrides=overrides)
 
 
 def load_mesh(path, **options):
@@ -538,8 +537,7 @@ def test_archives_and_formats_that_are_not_read(tmp_path):
         archive.writestr("a.stl", b"\0" * 1_000_000)
     for name in ("bomb.zip", "bomb.3mf", "bomb.tar.gz", "bomb"):
         (tmp_path / name).write_bytes((tmp_path / "bomb.zip").read_bytes())
-        (problem,) = refusals(load_mesh, tmp_path / name)
-        assert "no mesh file that is read; valid: .glb" in problem
+        assert refusal(load_mesh, tmp_path / name) == [("unsupported", name)]
 
 
 def gltf(tmp_path, change=lambda tree: None):

@@ -1,7 +1,6 @@
 """Scene, hand and object files: every problem is found, said once, and said helpfully."""
 
 import dataclasses
-import re
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +23,7 @@ from codesign_jax.scene import (
 )
 from codesign_jax.scene.scene_files import write_scene
 from tests.helpers.grasps import batch_inputs, nth, repeat, stack, still
+from tests.helpers.refusals import refusal
 
 NAMES = silicones.SILICONES
 HANDS = sorted(library.available("hands"))
@@ -107,27 +107,25 @@ def test_numbers_arrays_and_paths_of_libraries_are_taken(key, value, expected):
     assert [type(v) for v in np.atleast_1d(expected)] == [type(v) for v in np.atleast_1d(loaded)]
 
 
-OF_NO_FILE = {
-    "gravity = [3.7, 1.0] must be a number": {"gravity": np.array([3.7, 1])},
-    "gravity = '3' must be a number": {"gravity": np.str_("3")},
-    "gravity = nan is outside": {"gravity": np.float32("nan")},
-    "links = 5.0 must be a whole number": {"discretization": {"links": np.float64(5)}},
-    "gravity = (1+0j) must be a number": {"gravity": np.complex64(1)},
-}
+OF_NO_FILE = [
+    (("type", "gravity"), {"gravity": np.array([3.7, 1])}),
+    (("type", "gravity"), {"gravity": np.str_("3")}),
+    (("range", "gravity"), {"gravity": np.float32("nan")}),
+    (("type", "discretization.links"), {"discretization": {"links": np.float64(5)}}),
+    (("type", "gravity"), {"gravity": np.complex64(1)}),
+]
 
 
-@pytest.mark.parametrize("problem", OF_NO_FILE)
-def test_what_a_file_could_not_have_is_refused_by_its_value(problem):
-    with pytest.raises(schema.InputError, match=re.escape(problem)):
-        scene.load("paper", overrides=OF_NO_FILE[problem])
+@pytest.mark.parametrize(("kind", "changes"), OF_NO_FILE)
+def test_what_a_file_could_not_have_is_refused_by_its_value(kind, changes):
+    assert refusal(scene.load, "paper", overrides=changes) == [kind]
 
 
 def test_a_traced_override_is_refused_with_what_takes_it():
     def weigh(gravity):
         return scene.load("paper", overrides={"gravity": gravity}).gravity
 
-    with pytest.raises(schema.InputError, match="gravity is traced; dataclasses.replace puts"):
-        jax.eval_shape(weigh, 1.0)
+    assert refusal(jax.eval_shape, weigh, 1.0) == [("type", "gravity")]
 
 
 @pytest.mark.parametrize("pair", BY_PATH)
@@ -148,21 +146,18 @@ def test_key_paths_may_be_nested_or_dotted_and_the_last_of_a_key_holds():
 
 # Key paths, and what is said of each.
 WRONG_PATHS = {
-    "objects.noise.size=2": "objects.noise.size = 2 is outside",
-    "gravty=3": "gravty is not a known key; did you mean 'gravity'?",
-    "hand.section.width=18": (
-        "hand.section.width = 18 is outside [0.005, 0.1] m; did you mean 0.018? (mm given"
-    ),
-    "objects.object.mas=1": "objects.object has no entry 'mas'; valid: cuboid, cylinder, sphere",
-    "objects.object.mass=99": "objects.object[2].mass = 99 is outside",
-    "objects.object.spher.mass=1": "objects.object has no entry 'spher'; did you mean 'sphere'?",
-    "discretization.links=10.0": "discretization.links = 10.0 must be a whole number in [1, 200]",
-    # A number without a unit has no slip of units.
-    "cost.maximum=2000": "cost.maximum = 2000 is outside [0.1, 100]",
-    "hand.material=dragonskin": f"silicone = 'dragonskin' unknown; valid: {', '.join(NAMES)}",
-    "hand.material=5": "hand.material must be a table, not int",
-    "hand.material.silicone=[1]": "hand.material.silicone = [1] unknown; valid: dragon_skin_10,",
-    "hand.material.law=mooney_rivlin": "valid: linear, neo_hookean",
+    "objects.noise.size=2": ("range", "objects.noise.size"),
+    "gravty=3": ("unknown", "gravty"),
+    "hand.section.width=18": ("range", "hand.section.width"),
+    "objects.object.mas=1": ("unknown", "objects.object"),
+    "objects.object.mass=99": ("range", "objects.object[2].mass"),
+    "objects.object.spher.mass=1": ("unknown", "objects.object"),
+    "discretization.links=10.0": ("type", "discretization.links"),
+    "cost.maximum=2000": ("range", "cost.maximum"),
+    "hand.material=dragonskin": ("unknown", "hand.material.silicone"),
+    "hand.material=5": ("type", "hand.material"),
+    "hand.material.silicone=[1]": ("unknown", "hand.material.silicone"),
+    "hand.material.law=mooney_rivlin": ("unknown", "hand.material.law"),
 }
 
 
@@ -174,21 +169,14 @@ LAWS = {
     (GIVEN, "hand.material.damping_time=0.005"): (True, 88.0),
     (GIVEN, "hand.material.law=linear", "hand.material.shear_modulus=50e3"): (False, 50.0),
     ("hand.material.law=neo_hookean", "hand.material.shear_modulus=70e3"): (True, 70.0),
-    (GIVEN, "effects.neo_hookean=false"): (
-        "effects.neo_hookean = false stands against hand.material.law = 'neo_hookean' "
-        "(silicone 'dragon_skin_10')"
-    ),
-    (GIVEN, "hand.material.shear_modulus=60e3"): (
-        "hand.material.shear_modulus = 60000.0 stands beside silicone = 'dragon_skin_10'"
-    ),
-    (GIVEN, "hand.material.law=linear"): (
-        "hand.material.law = 'linear' stands beside silicone = 'dragon_skin_10'"
-    ),
+    (GIVEN, "effects.neo_hookean=false"): "effects.neo_hookean",
+    (GIVEN, "hand.material.shear_modulus=60e3"): "hand.material.shear_modulus",
+    (GIVEN, "hand.material.law=linear"): "hand.material.law",
     (
         "hand.material.law=linear",
         "hand.material.shear_modulus=50e3",
         "effects.neo_hookean=true",
-    ): "effects.neo_hookean = true stands against hand.material.law = 'linear'",
+    ): "effects.neo_hookean",
 }
 
 
@@ -198,8 +186,7 @@ def test_a_modulus_comes_with_its_law(pairs):
         return scene.load(name, overrides=keypaths.parse(pairs))
 
     if isinstance(LAWS[pairs], str):
-        (problem,) = problems_of(load, "paper")
-        assert LAWS[pairs] in problem
+        assert refusal(load, "paper") == [("conflict", LAWS[pairs])]
         return
     loaded = load("paper")
     material = loaded.hand.material
@@ -212,8 +199,7 @@ def test_a_modulus_comes_with_its_law(pairs):
     law = silicones.LAWS[not loaded.effects.neo_hookean]
     other = dataclasses.replace(material, law=law)
     changed = dataclasses.replace(loaded, hand=dataclasses.replace(loaded.hand, material=other))
-    with pytest.raises(schema.InputError, match="stands against hand.material.law"):
-        constants.check(changed)
+    assert refusal(constants.check, changed) == [("conflict", "scene.effects.neo_hookean")]
     # Names of silicones and laws are no part of what is compiled: numbers are data.
     plain = dataclasses.replace(material, law=None, silicone=None, shear_modulus=1e5)
     changed = dataclasses.replace(loaded, hand=dataclasses.replace(loaded.hand, material=plain))
@@ -230,8 +216,7 @@ def test_a_hand_file_names_its_silicone_in_a_line(tmp_path):
     assert scene.load("paper", hand_name=tmp_path / "mine.toml").effects.neo_hookean
     material = hand.load(tmp_path / "mine.toml", overrides={"material": "dragon_skin_20"}).material
     assert material.shear_modulus == silicones.get("dragon_skin_20").shear_modulus
-    with pytest.raises(schema.InputError, match="'ecoflex' unknown; valid: dragon_skin_10, "):
-        silicones.get("ecoflex")
+    assert refusal(silicones.get, "ecoflex")[0][0] == "unknown"
 
 
 def test_silicones_lie_within_their_measurements():
@@ -299,40 +284,40 @@ def test_centimetres_are_guessed_where_nothing_nearer_explains_a_length(
 
 
 @pytest.mark.parametrize("pair", WRONG_PATHS)
-def test_a_wrong_key_path_is_told_in_words(pair):
-    problems = problems_of(lambda name: scene.load(name, overrides=keypaths.parse([pair])), "paper")
-    assert any(WRONG_PATHS[pair] in p for p in problems), problems
+def test_a_wrong_key_path_is_told_by_its_key(pair):
+    assert WRONG_PATHS[pair] in refusal(scene.load, "paper", overrides=keypaths.parse([pair]))
 
 
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ("size = [0.030]", "size = [30]", "did you mean 0.03?"),  # millimetres for metres
-        ("[table]\nfriction = 0.37", "", "objects.toml.table is missing"),
-        ("size = [0.030, 0.036]", "size = [0.030]", "size of a cylinder has 2 values, not 1"),
-        ('name = "sphere"', 'name = "cuboid"', "cuboid"),
+        # millimetres for metres
+        ("size = [0.030]", "size = [30]", ("range", "objects.toml.object[2].size[0]")),
+        ("[table]\nfriction = 0.37", "", ("missing", "objects.toml.table")),
+        ("size = [0.030, 0.036]", "size = [0.030]", ("size", "objects.toml.object cylinder")),
+        ('name = "sphere"', 'name = "cuboid"', ("conflict", "objects.toml.object cuboid")),
     ],
 )
 def test_a_wrong_object_file(tmp_path, old, new, expected):
-    problems = problems_of(objects.load, edited(tmp_path, "objects", "paper", (old, new)))
-    assert len([p for p in problems if expected in p]) == 1, problems
+    told = refusal(objects.load, edited(tmp_path, "objects", "paper", (old, new)))
+    assert told.count(expected) == 1, told
 
 
 @pytest.mark.parametrize("bad", ["nan", "inf", "-inf"])
 def test_not_finite_values_are_refused(tmp_path, bad):
-    (problem,) = hand_problems(tmp_path, ("mass = 0.25", f"mass = {bad}"))
-    assert "palm.mass" in problem and "did you mean" not in problem
-    problems = hand_problems(tmp_path, ("high = 180\ndefault", f"high = {bad}\ndefault"))
-    assert any("high" in p and "length" in p for p in problems)
+    edit = "mass = 0.25", f"mass = {bad}"
+    told = refusal(hand.load, edited(tmp_path, "hands", "pneuflex4", edit))
+    assert told == [("range", "hands.toml.palm.mass")]
+    edit = "high = 180\ndefault", f"high = {bad}\ndefault"
+    told = refusal(hand.load, edited(tmp_path, "hands", "pneuflex4", edit))
+    assert any("length" in key for _, key in told)
 
 
 def test_phases_out_of_order():
     phases = {"phases": {"inflate": 5.0, "lift": 4.5, "disturb": 8.6}}
-    problems = problems_of(lambda name: scene.load(name, overrides=phases), "paper")
-    assert problems == [
-        "phases.lift = 4.5 s must come after inflate = 5 s",
-        "paper.toml.phases.deflate_time = 0.5 s does not fit between disturb = 8.6 s "
-        "and ungrasp = 9 s",
+    assert refusal(scene.load, "paper", overrides=phases) == [
+        ("order", "phases.lift"),
+        ("order", "paper.toml.phases.deflate_time"),
     ]
 
 
@@ -363,66 +348,90 @@ LOW = "low = 10\nhigh = 180\ndefault"  # of the length
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ("thickness = 0", "thicknes = 0", "thicknes is not a known key; did you mean 'thickness'?"),
+        ("thickness = 0", "thicknes = 0", ("unknown", "palm.thicknes")),
         # What does not fit together
-        (LOW, "low = 200\nhigh = 180\ndefault", "must be below"),
-        ('name = "wall"', 'name = "height"', "'wall' must be given once, not 0 times"),
-        ("\nwall = 5", "\nwall = 2.5", "limit"),  # 120 kPa exceeds 40 kPa/mm * 2.5 mm
-        ("[preset.fixed]", "[preset.fixed]\nlength = 100", "both free and fixed"),
-        ('[[preset]]\nname = "2d"', '[[preset]]\nname = "full"', "full"),
+        (LOW, "low = 200\nhigh = 180\ndefault", ("order", "parameter length")),
+        ('name = "wall"', 'name = "height"', ("conflict", "parameter 'wall'")),
+        (
+            "\nwall = 5",
+            "\nwall = 2.5",
+            ("range", "preset 2d"),
+        ),  # 120 kPa exceeds 40 kPa/mm * 2.5 mm
+        ("[preset.fixed]", "[preset.fixed]\nlength = 100", ("conflict", "preset 2d")),
+        (
+            '[[preset]]\nname = "2d"',
+            '[[preset]]\nname = "full"',
+            ("conflict", "preset full"),
+        ),
         # Mounts of fingers
-        (BASE, "", "finger[0] has no base point: give base = [x, y]"),
-        (BASE, f"{BASE}radius = 0.035\n", f"leave out {BASE.strip()} or radius = 0.035"),
-        ("base = [0.037", "base = [37", "base[0] = 37 is outside [-0.2, 0.2] m"),
-        # Numbers of fingers that do not fit the hand: with key, what was given, how many there are
+        (BASE, "", ("missing", "finger[0]")),
+        (BASE, f"{BASE}radius = 0.035\n", ("conflict", "finger[0]")),
+        ("base = [0.037", "base = [37", ("range", "finger[0].base[0]")),
+        # Numbers of fingers that do not fit the hand
         (
             "\npressure = 120",
             "\npressure = [120, 110]",
-            "preset 2d.fixed.pressure = [120, 110] must be a number [kPa] for all fingers or 4, "
-            "one for each, not 2",
+            ("size", "preset 2d.fixed.pressure"),
         ),
-        ("\nwall = 5", "\nwall = [5, 5, 2.5, 5]", "120000 Pa is not below the limit of 100000 Pa"),
-        ("\nspread = 45", "\nspread = [45]", "= [45] must be a number [deg]: the hand has one spr"),
-        ("tied = true\nlow = 10", "tied = [[0, 4]]\nlow = 10", "fingers are numbered from 0 to 3"),
-        ("tied = true\nlow = 10", "tied = [[0], [1, 2]]\nlow = 10", "a group has two or more"),
-        ("tied = true\nlow = 10", "tied = [[0, 1], [1, 2]]\nlow = 10", "is in one group only"),
-        ("tied = true\nlow = 10", "tied = [0, 1]\nlow = 10", "tied[0] must be an array"),
-        ("tied = true\nlow = 10", "tied = 'all'\nlow = 10", "must be true or false"),
+        ("\nwall = 5", "\nwall = [5, 5, 2.5, 5]", ("range", "preset 2d")),
+        ("\nspread = 45", "\nspread = [45]", ("size", "preset 2d.fixed.spread")),
+        (
+            "tied = true\nlow = 10",
+            "tied = [[0, 4]]\nlow = 10",
+            ("size", "preset 2d.free length.tied"),
+        ),
+        (
+            "tied = true\nlow = 10",
+            "tied = [[0], [1, 2]]\nlow = 10",
+            ("size", "preset 2d.free length.tied"),
+        ),
+        (
+            "tied = true\nlow = 10",
+            "tied = [[0, 1], [1, 2]]\nlow = 10",
+            ("size", "preset 2d.free length.tied"),
+        ),
+        (
+            "tied = true\nlow = 10",
+            "tied = [0, 1]\nlow = 10",
+            ("type", "preset[0].free[0].tied[0]"),
+        ),
+        (
+            "tied = true\nlow = 10",
+            "tied = 'all'\nlow = 10",
+            ("type", "preset[0].free[0].tied"),
+        ),
         (
             "tied = true\nlow = 10",
             "tied = true\nlow = [10, 10, 10, 20]",
-            "2d.free length.low = [10.0, 10.0, 10.0, 20.0] must be a number [mm]: tied = true",
+            ("type", "preset 2d.free length.low"),
         ),
     ],
 )
 def test_a_wrong_hand_file(tmp_path, old, new, expected):
     """Each problem is told once."""
-    problems = hand_problems(tmp_path, (old, new))
-    assert len([p for p in problems if expected in p]) == 1, problems
+    told = refusal(hand.load, edited(tmp_path, "hands", "pneuflex4", (old, new)))
+    code, key = expected
+    assert told.count((code, f"hands.toml.{key}")) == 1, told
 
 
 def test_sections_at_the_tips_are_for_tapered_fingers():
-    def problem_of(hand_name, changes):
-        with pytest.raises(schema.InputError) as error:
-            scene.load("paper", hand_name=hand_name, overrides=changes)
-        return " ".join(error.value.problems)
-
-    missing = problem_of("pneuflex4", {"hand.section.tapered": True})
-    assert "parameter 'tip_wall' must be given once, not 0 times" in missing
-    needless = problem_of("tapered4", {"hand.section.tapered": False})
-    assert "parameter 'tip_width' needs section.tapered = true" in needless
-    thick = problem_of("tapered4", {"hand.parameter.tip_height.low": 7})
-    assert "a tip_height of 0.007 m leaves no air chamber between walls of 0.004 m" in thick
+    cases = (
+        ("pneuflex4", {"hand.section.tapered": True}, "conflict", "parameter 'tip_wall'"),
+        ("tapered4", {"hand.section.tapered": False}, "unsupported", "parameter 'tip_width'"),
+        ("tapered4", {"hand.parameter.tip_height.low": 7}, "geometry", ""),
+    )
+    for name, changes, code, key in cases:
+        told = refusal(scene.load, "paper", hand_name=name, overrides=changes)
+        assert (code, f"{name}.toml.{key}".rstrip(".")) in told, told
 
 
 def test_unknown_names_and_files(tmp_path):
-    assert "did you mean 'pneuflex4'?" in problems_of(hand.load, "pneuflex")[0]
-    assert "no file" in problems_of(hand.load, "nowhere/hand.toml")[0]
     (tmp_path / "myhand.toml").write_text("")
-    (problem,) = problems_of(hand.load, tmp_path / "myhand")
-    assert "did you mean the file" in problem and "myhand.toml'?" in problem
     (tmp_path / "broken.toml").write_text("a = = 1")
-    assert "not valid TOML" in problems_of(hand.load, tmp_path / "broken.toml")[0]
+    files = {"pneuflex": "unknown", "nowhere/hand.toml": "missing"}
+    files |= {tmp_path / "myhand": "unknown", tmp_path / "broken.toml": "syntax"}
+    for path, code in files.items():
+        assert [kind for kind, _ in refusal(hand.load, path)] == [code], path
 
 
 def test_paths_in_a_scene_file_are_relative_to_it(tmp_path):

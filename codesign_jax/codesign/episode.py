@@ -17,7 +17,7 @@ from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording
 from codesign_jax.optimize import Info, Optimizer, OptimizerState, ParticleFilter
 from codesign_jax.reuse import SceneProgram, shared
-from codesign_jax.scene import InputError, Scene
+from codesign_jax.scene import InputError, Problem, Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.types import Outcome, Params, Trial, random_key_problem
 
@@ -97,9 +97,13 @@ class Task:
         problems = []
         if not isinstance(self.space, DesignSpace):
             hint = "parameters.design_space(scene.hand, '2d') makes one"
-            problems.append(f"space is {self.space!r:.40}, not a DesignSpace; {hint}")
+            problems.append(
+                Problem("type", f"space is {self.space!r:.40}, not a DesignSpace; {hint}")
+            )
         if not isinstance(self.trials, int | np.integer) or self.trials < 1:
-            problems.append(f"trials = {self.trials!r:.60} must be a whole number, at least 1")
+            problems.append(
+                Problem("range", f"trials = {self.trials!r:.60} must be a whole number, at least 1")
+            )
         if problems:
             raise InputError(problems)
         if self.engine is None:
@@ -474,14 +478,15 @@ def _refuse_state(state: Any) -> None:
     if not hasattr(state, "particles"):
         kind = type(state).__name__
         hint = "optimizer.init(key, design, num_particles) makes the first"
-        raise InputError([f"state is a {kind}, not an optimiser's state; {hint}"])
+        raise InputError.of("type", f"state is a {kind}, not an optimiser's state; {hint}")
 
 
 def _refuse_mask(space: DesignSpace, mask: jax.typing.ArrayLike) -> None:
     if np.shape(mask) != (space.num_parameters,):
         names = ", ".join(space.names)
-        raise InputError(
-            [f"the mask has shape {np.shape(mask)}, not ({space.num_parameters},), that is {names}"]
+        raise InputError.of(
+            "size",
+            f"the mask has shape {np.shape(mask)}, not ({space.num_parameters},), that is {names}",
         )
 
 

@@ -22,6 +22,7 @@ from codesign_jax.judge.cases import Case
 from codesign_jax.runs import Settings, reference, selection
 from codesign_jax.runs.progress import Busy, duration
 from codesign_jax.scene import Scene, with_accuracy
+from codesign_jax.scene.schema import Problem
 from codesign_jax.statistics import wilson
 from codesign_jax.terminal import Console
 from codesign_jax.types import Outcome, Trial, failed
@@ -108,10 +109,11 @@ def _refuse(options: Check, case: Case, finer: Scene) -> None:
     )
     problems += common.engine_problems(case.engine, options.overrides)
     if finer == case.scene:
-        problems.append(
+        sentence = (
             f"accuracy {fresh_trials.ACCURACY} is what others are compared with: choose another by "
             "--accuracy"
         )
+        problems.append(Problem("unsupported", sentence))
     common.refuse(problems)
 
 

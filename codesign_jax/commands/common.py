@@ -126,8 +126,9 @@ def find_case(options: Subject, *, tell: Tell = warn) -> Case:
         f for f, v in subject_flags.items() if v is not None
     ]
     if foreign:
-        raise InputError(
-            [f"--run brings design, hand and scene of its own; leave out {' and '.join(foreign)}"]
+        raise InputError.of(
+            "conflict",
+            f"--run brings design, hand and scene of its own; leave out {' and '.join(foreign)}",
         )
     replacements = {
         "objects": options.objects,
@@ -257,7 +258,12 @@ def picture_problems(flag: str, path: Path | None) -> list[str]:
     """Problems with the path of a picture."""
     problems = place_problems(flag, path, ".gif", ".mp4", ".png")
     if path and path.suffix == ".mp4" and importlib.util.find_spec("av") is None:
-        problems.append(f"{flag} {path} needs PyAV: pip install -e '.[report]' in the checkout")
+        problems.append(
+            schema.Problem(
+                "unsupported",
+                f"{flag} {path} needs PyAV: pip install -e '.[report]' in the checkout",
+            )
+        )
     return problems
 
 
@@ -293,8 +299,8 @@ def parse_seeds(text: str) -> list[int]:
         match = re.fullmatch(r"\s*([0-9]{1,10})(?:-([0-9]{1,10}))?\s*", part)
         first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, -1)
         if last < first or last >= 2**31:
-            raise InputError([f"--seeds {text!r} must be seeds such as 0-9 or 1,3,5"])
+            raise InputError.of("syntax", f"--seeds {text!r} must be seeds such as 0-9 or 1,3,5")
         if last - first >= MOST or len(seeds) > MOST:
-            raise InputError([f"--seeds {text!r} names more than {MOST} runs"])
+            raise InputError.of("range", f"--seeds {text!r} names more than {MOST} runs")
         seeds |= set(range(first, last + 1))
     return sorted(seeds)

@@ -35,7 +35,7 @@ from codesign_jax.runs import (
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
-from codesign_jax.scene.schema import InputError
+from codesign_jax.scene.schema import InputError, Problem
 from codesign_jax.terminal import Console
 
 _OF_SETTINGS = ("schedule", "optimizer", "preset", "engine", "cost")
@@ -91,20 +91,33 @@ def main(options: Compare) -> int:
         ("--trials", options.trials, 1, 100_000), ("--seed", options.seed, 0, 2**31 - 1)
     )
     if not options.folders:
-        problems.append("compare needs at least one run folder")
+        problems.append(Problem("range", "compare needs at least one run folder"))
     if designs and options.out is not None:
-        problems.append("--out is a table of runs; leave it out beside design files")
+        problems.append(
+            Problem("conflict", "--out is a table of runs; leave it out beside design files")
+        )
     paths = [*options.folders] if designs else folders
     sides = bool(options.set_a or options.set_b)
     alone = len(paths) == 1 and (len(options.policy) == 1 or sides)
     if designs and len(paths) != 2 and not alone:
         problems.append(
-            "compare takes two designs, or one with --policy against none or with --set-b"
+            Problem(
+                "type",
+                "compare takes two designs, or one with --policy against none or with --set-b",
+            )
         )
     if sides and len(paths) not in (1, 2):
-        problems.append(f"--set-a and --set-b are of two designs; there are {len(paths)} runs")
+        problems.append(
+            Problem(
+                "conflict", f"--set-a and --set-b are of two designs; there are {len(paths)} runs"
+            )
+        )
     if options.trials is not None and len(paths) != 2 and not alone:
-        problems.append(f"--trials compares two designs; the folders have {len(folders)} runs")
+        problems.append(
+            Problem(
+                "conflict", f"--trials compares two designs; the folders have {len(folders)} runs"
+            )
+        )
     common.refuse(problems + common.place_problems("--out", options.out, ".csv"))
     simulates = bool(designs) or options.trials is not None or sides
     pair = _pair(options, paths) if simulates else {}
@@ -165,8 +178,9 @@ def _pair(options: Compare, paths: list[Path]) -> dict[str, Case]:
     first, other = every
     if first.scene.objects != other.scene.objects:
         compared = "runs" if of_runs else "designs"
-        raise InputError(
-            [f"the two {compared} have other objects or noise: --objects says which to take"]
+        raise InputError.of(
+            "missing",
+            f"the two {compared} have other objects or noise: --objects says which to take",
         )
     if names[0] == names[1]:
         names[1] += " again"
@@ -182,7 +196,7 @@ def _subject(options: Compare, path: Path, side: tuple[tuple[str, ...], ...]) ->
         policy = policy_of_run if policy_of_run in options.policy else None
         return flags.Subject(run_folder=path, policy=policy, **arguments)
     if len(options.policy) > 1:
-        raise InputError(["--policy takes one policy beside design files"])
+        raise InputError.of("conflict", "--policy takes one policy beside design files")
     return flags.Subject(
         design=((str(path),),), policy=next(iter(options.policy), None), **arguments
     )

@@ -85,7 +85,9 @@ def _of_particle(case: Case, options: Evaluate) -> Case:
     if options.particle is None:
         return case
     if options.run_folder is None:
-        raise InputError(["--particle is one of a run: give its folder, or leave it out"])
+        raise InputError.of(
+            "missing", "--particle is one of a run: give its folder, or leave it out"
+        )
     record = selection.read_record(options.run_folder)
     particles = np.asarray(record.state.particles)
     common.refuse(common.number_problems(("--particle", options.particle, 0, len(particles) - 1)))

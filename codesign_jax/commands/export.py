@@ -21,7 +21,7 @@ from codesign_jax.judge.cases import Case
 from codesign_jax.runs import reference
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.objects import Shape
-from codesign_jax.scene.schema import InputError
+from codesign_jax.scene.schema import InputError, Problem
 from codesign_jax.terminal import Console
 from codesign_jax.types import Params, Trial
 
@@ -54,7 +54,7 @@ def main(options: Export) -> int:
         with files.whole_folder(options.out, replace=options.overwrite, facts=about) as folder:
             write_files(case, params, sizes, folder, options, console)
     except OSError as error:
-        raise InputError([f"--out {options.out}: {error.strerror}"]) from error
+        raise InputError.of("file", f"--out {options.out}: {error.strerror}") from error
     _tell(case, options, console)
     if earlier:
         console.print("  the files of the earlier export there are gone or replaced")
@@ -103,9 +103,11 @@ def _check(options: Export, case: Case) -> None:
         tolerances.read(options.tolerances)
     out = options.out
     if out.exists() and (not out.is_dir() or any(out.iterdir())) and not options.overwrite:
-        problems.append(f"--out {out} exists; choose another folder, or give --overwrite")
+        problems.append(
+            Problem("file", f"--out {out} exists; choose another folder, or give --overwrite")
+        )
     elif out.exists() and not out.is_dir():
-        problems.append(f"--out {out} is a file")
+        problems.append(Problem("file", f"--out {out} is a file"))
     else:
         problems += common.place_problems("--out", out, folder=True)
     problems += process.problems(_process(options)) + _missing(options)
@@ -194,7 +196,9 @@ def _parts(
         console.print(f"part {part.name}: {edges} mm, {part.volume / 1e3:.1f} cm^3")
     problems = list(built.problems)
     if not any(part.name == "palm" for part in parts):
-        problems.append("its surface does not close, so that no file of it was written")
+        problems.append(
+            Problem("missing", "its surface does not close, so that no file of it was written")
+        )
     for problem in problems:
         console.print(f"note: the palm cannot be built as it is: {problem}")
     if built.flange is None:

@@ -59,9 +59,13 @@ def main(options: Options) -> int:
     params = case.space.params(np.asarray(case.design))
     problems = common.number_problems(("--finger", options.finger, 0, case.scene.num_fingers - 1))
     if options.fit and options.measured is None:
-        problems.append("--fit needs measurements: give a file, codesign finger FILE.csv --fit")
+        problems.append(
+            schema.Problem(
+                "syntax", "--fit needs measurements: give a file, codesign finger FILE.csv --fit"
+            )
+        )
     if options.posterior and not options.fit:
-        problems.append("--posterior is that of a fit: add --fit")
+        problems.append(schema.Problem("missing", "--posterior is that of a fit: add --fit"))
     problems += common.place_problems("--posterior", options.posterior, ".toml")
     common.refuse(problems + common.place_problems("--out", options.out, ".csv"))
     measured = options.measured and fingers.read(options.measured)

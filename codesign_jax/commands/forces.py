@@ -89,7 +89,7 @@ def direction(text: str) -> np.ndarray:
         vector = np.zeros(0)
     if vector.shape != (3,) or not np.isfinite(vector).all() or not vector.any():
         words = "must be down, x, y, z or three numbers in the world frame, such as 1,0,-1"
-        raise InputError([f"--pull {text} {words}"])
+        raise InputError.of("syntax", f"--pull {text} {words}")
     return vector / np.linalg.norm(vector)
 
 
@@ -105,7 +105,7 @@ def pull(
       along: Direction of the force on the object's centre of mass, world frame, shape (3,).
     """
     if isinstance(engine, ControlLoop):
-        raise InputError(["--pull holds the hand as key frames do: leave out --policy"])
+        raise InputError.of("syntax", "--pull holds the hand as key frames do: leave out --policy")
     steps = int(scene.last_step("lift")) + 1
     step = scene.discretization.timestep
     hands = jax.tree.map(lambda v: jnp.repeat(v[None], len(trials.yaw), 0), params)

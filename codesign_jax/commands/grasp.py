@@ -37,9 +37,13 @@ def find(options: GraspFlags) -> PlannedGrasp:
     numbers |= {"--trial": options.trial}
     flags = " and ".join(flag for flag, value in numbers.items() if value is not None)
     if flags and not options.run_folder:
-        raise InputError([f"{flags}: numbers of a run's trials.csv, so --run must say of which"])
+        raise InputError.of(
+            "missing", f"{flags}: numbers of a run's trials.csv, so --run must say of which"
+        )
     if options.trial is not None and options.object is not None:
-        raise InputError(["--trial and --object exclude each other: a trial has its object"])
+        raise InputError.of(
+            "conflict", "--trial and --object exclude each other: a trial has its object"
+        )
     case = find_case(options)
     common.refuse(common.engine_problems(case.engine))
     if options.run_folder is None:
@@ -49,7 +53,9 @@ def find(options: GraspFlags) -> PlannedGrasp:
 
 def _of_run(case: Case, options: GraspFlags, folder: Path) -> PlannedGrasp:
     if options.objects is not None and options.object is None:
-        raise InputError(["--objects replaces the run's: --object must say which one to grasp"])
+        raise InputError.of(
+            "missing", "--objects replaces the run's: --object must say which one to grasp"
+        )
     numbers = {"episode": options.episode, "particle": options.particle, "trial": options.trial}
     record = selection.read_record(folder, tell=lambda text: None)  # `find_case` has said it
     grasp = selection.find_grasp(runs.read_run(folder)[0], record, **numbers)

@@ -38,7 +38,7 @@ def axes(case: Case, options: Options) -> tuple[Axis, Axis]:
     names = {word.partition("=")[0] for word in words}
     if len(words) != 2 or len(names) != 2:
         text = f"--parameters must name two of {', '.join(known)}, or keys with their ranges"
-        raise InputError([f"{text}, such as objects.object.mass=0.05:0.5"])
+        raise InputError.of("syntax", f"{text}, such as objects.object.mass=0.05:0.5")
     first, second = (_axis(word, case, options) for word in words)
     return first, second
 
@@ -101,7 +101,9 @@ def _changed(case: Case, options: Options, paths: list[tuple[str, ...]], value: 
     scene = common.find_case(changed_options, tell=lambda text: None).scene
     if scene.structure != case.scene.structure:
         key = ".".join(paths[0])
-        raise InputError([f"--parameters {key} is structure, not a number: --set changes it"])
+        raise InputError.of(
+            "unsupported", f"--parameters {key} is structure, not a number: --set changes it"
+        )
     return scene
 
 

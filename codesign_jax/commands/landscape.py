@@ -51,7 +51,9 @@ def main(options: Options) -> int:
     _check(options, case)
     pair = grid.axes(case, options)
     if options.search and case.space.num_parameters == sum(a.column is not None for a in pair):
-        raise InputError(["--search: no other parameter is free; --preset names a space with more"])
+        raise InputError.of(
+            "missing", "--search: no other parameter is free; --preset names a space with more"
+        )
     folder = _folder(options, case, pair)
     plane = make_plane(case, pair)
     console = Console()

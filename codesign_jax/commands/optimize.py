@@ -324,13 +324,22 @@ def resolve(options: Optimize) -> tuple[Scene, Settings]:
 def _flag_problems(options: Optimize) -> list[str]:
     problems = []
     if options.seeds is not None and options.seed != 0:
-        problems.append("--seed and --seeds exclude each other")
+        problems.append(schema.Problem("conflict", "--seed and --seeds exclude each other"))
     schedules = options.schedule.split(",")
     if len({*schedules}) < len(schedules):
-        problems.append(f"--schedule {options.schedule!r} names a strategy more than once")
+        problems.append(
+            schema.Problem(
+                "conflict", f"--schedule {options.schedule!r} names a strategy more than once"
+            )
+        )
     available = jax.local_device_count()
     if options.devices is not None and not 1 <= options.devices <= available:
-        problems.append(f"--devices = {options.devices} is not valid; this process has {available}")
+        problems.append(
+            schema.Problem(
+                "unknown",
+                f"--devices = {options.devices} is not valid; this process has {available}",
+            )
+        )
     return problems + common.number_problems(
         ("--reference-trials", options.reference_trials, 0, 100_000),
         ("--chunk", options.chunk, 1, 10_000_000),
@@ -384,5 +393,7 @@ def _folder(options: Optimize, scene: Scene, settings: Settings) -> Path:
     # Whoever wrote the files would choose a place on this disk.
     if name[0] in ".-~" or "/" in name or "\\" in name or len(os.fsencode(name)) > _LONGEST:
         text = schema.shown(name)
-        raise InputError([f"{text}, of hand and preset, is no name of a folder: give --out"])
+        raise InputError.of(
+            "file", f"{text}, of hand and preset, is no name of a folder: give --out"
+        )
     return Path("runs") / name

@@ -28,7 +28,11 @@ def main(options: Render) -> int:
 def _check(options: Render) -> None:
     problems = common.picture_problems("--out", options.out)
     if options.times and options.out.suffix != ".png":
-        problems.append("--times are those of a strip (.png); a film shows the whole grasp")
+        problems.append(
+            schema.Problem(
+                "unsupported", "--times are those of a strip (.png); a film shows the whole grasp"
+            )
+        )
     common.refuse(problems + common.number_problems(("--size", options.size, 16, 4096)))
 
 
@@ -50,13 +54,19 @@ def _camera(words: Sequence[str]) -> "Camera":
             continue
         if name not in _LIMITS:
             hint = schema.nearest(name, [*VIEWS, *_LIMITS])
-            problems.append(f"--camera {name!r} is no view and no number of a camera; {hint}")
+            problems.append(
+                schema.Problem(
+                    "syntax", f"--camera {name!r} is no view and no number of a camera; {hint}"
+                )
+            )
             continue
         unit, most = _LIMITS[name]
         value = design_files.number(text)
         least = 0.05 if name == "distance" else -most  # MuJoCo cuts what is nearer than 1 cm
         if value is None:
-            problems.append(f"--camera {name}={text} must be a number [{unit}]")
+            problems.append(
+                schema.Problem("type", f"--camera {name}={text} must be a number [{unit}]")
+            )
         elif problem := schema.range_problem(f"--camera {name}", value, unit, least, most):
             problems.append(problem)
         else:

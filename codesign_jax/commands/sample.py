@@ -17,6 +17,7 @@ from codesign_jax.runs.directory import locked
 from codesign_jax.runs.progress import Meter
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
+from codesign_jax.scene.schema import Problem
 from codesign_jax.terminal import Console
 from codesign_jax.types import Outcome
 
@@ -66,7 +67,9 @@ def _check(options: Sample) -> None:
     )
     problems += common.place_problems("--out", options.out, ".parquet")
     if options.out.exists():
-        problems.append(f"--out {options.out} is there already: choose another, or delete it")
+        problems.append(
+            Problem("file", f"--out {options.out} is there already: choose another, or delete it")
+        )
     common.refuse(problems + common.engine_problems(options.engine, options.overrides))
     dataset.pyarrow_module("codesign sample")
 

@@ -13,7 +13,7 @@ from codesign_jax.terminal import Console
 def main(options: Scenes) -> int:
     if options.engine is not None and options.engine not in effects.ENGINES:
         hint = schema.nearest(options.engine, effects.ENGINES)
-        raise InputError([f"--engine {options.engine!r} is not valid; {hint}"])
+        raise InputError.of("unknown", f"--engine {options.engine!r} is not valid; {hint}")
     engines = effects.ENGINES if options.engine is None else (options.engine,)
     names = library.available("scenes") if options.name is None else [options.name]
     console = Console(soft_wrap=False)

@@ -36,7 +36,7 @@ def make_engine(name: str, scene: Scene) -> Engine:
     """
     if not isinstance(scene, Scene):
         words = f"scene is {scene!r}, not a Scene; scene.load({scene!r}) reads it"
-        raise schema.InputError([words])
+        raise schema.InputError.of("type", words)
     if name == "mjx":
         from codesign_jax.engines.mjx import MjxEngine
 
@@ -51,7 +51,7 @@ def make_engine(name: str, scene: Scene) -> Engine:
         if problems := solver_problems(scene):
             raise schema.InputError(problems)
         return StructuredEngine(scene)
-    raise schema.InputError([f"engine {name!r} unknown; {schema.nearest(name, NAMES)}"])
+    raise schema.InputError.of("unknown", f"engine {name!r} unknown; {schema.nearest(name, NAMES)}")
 
 
 _INSTEAD = {"iterations": "iterations", "ls_iterations": "evaluations", "tolerance": "decrement"}
@@ -77,10 +77,11 @@ def solver_problems(scene: Scene) -> list[str]:
 def solver_problem(given: str, key: str = "") -> str:
     """Says that a value of the [solver] table has no effect in engine structured."""
     instead = f"newton.{_INSTEAD[key]}" if key in _INSTEAD else "the table [newton]"
-    return (
+    sentence = (
         f"not supported by engine structured: {given} (MuJoCo's own solver); set {instead}, which "
         "limits the solver of engine structured, or use engine mujoco or mjx"
     )
+    return schema.Problem("unsupported", sentence)
 
 
 @functools.cache

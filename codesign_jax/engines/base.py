@@ -7,7 +7,7 @@ import jax
 
 from codesign_jax.model import ModelFields
 from codesign_jax.scene import Scene
-from codesign_jax.scene.schema import InputError
+from codesign_jax.scene.schema import InputError, Problem
 from codesign_jax.types import Forces, Trace
 
 
@@ -118,7 +118,7 @@ def recording(engine: Engine, *, touch: bool = False) -> Engine:
 
 def refuse_forces(name: str) -> NoReturn:
     """The error of an engine that tells no contact forces."""
-    raise InputError([f"engine {name} records no forces; engine structured does"])
+    raise InputError.of("unsupported", f"engine {name} records no forces; engine structured does")
 
 
 class Equal:
@@ -141,7 +141,11 @@ def refuse_meshes(scene: Scene, engine: str) -> None:
     differ between the worlds of a batch, as the size noise asks for.
     """
     problems = [
-        f"not supported by engine {engine}: object {shape.name!r} is a mesh; use engine structured"
+        Problem(
+            "unsupported",
+            f"not supported by engine {engine}: object {shape.name!r} is a mesh; "
+            "use engine structured",
+        )
         for shape in scene.objects.object
         if shape.mesh
     ]

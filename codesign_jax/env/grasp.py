@@ -116,7 +116,9 @@ class GraspEnv:
         self._steps = policy.period_steps(scene, period)
         if self._steps > scene.num_steps:
             end = scene.num_steps * scene.discretization.timestep
-            raise InputError([f"period = {period:g} s is longer than a grasp, of {end:g} s"])
+            raise InputError.of(
+                "order", f"period = {period:g} s is longer than a grasp, of {end:g} s"
+            )
         self.dt = period
         self.episode_length = -(-scene.num_steps // self._steps)
 
@@ -128,11 +130,10 @@ class GraspEnv:
         the object [N], and how much of the object it carries [N].
         """
         if seen.forces is None:
-            raise InputError(
-                [
-                    f"engine {self.engine.name} tells no contact forces, which `observe` of "
-                    "GraspEnv shows: take engine structured, or replace the method"
-                ]
+            raise InputError.of(
+                "unsupported",
+                f"engine {self.engine.name} tells no contact forces, which `observe` of "
+                "GraspEnv shows: take engine structured, or replace the method",
             )
         bend = seen.joint[..., 0].sum(-1)
         rate = seen.joint_velocity[..., 0].sum(-1)
@@ -248,7 +249,7 @@ class GraspEnv:
         size = self.action_size
         if shape != (size,):
             hint = "; jax.vmap maps over environments" if shape[1:] == (size,) else ""
-            raise InputError([f"an action has shape {shape}, not ({size},){hint}"])
+            raise InputError.of("size", f"an action has shape {shape}, not ({size},){hint}")
 
     def _ahead(self, data: Data) -> Plan:
         """The plan over the period that begins; a last one that is shorter overlaps."""
@@ -289,7 +290,7 @@ def _one_key(rng: Any) -> jax.Array:
         with contextlib.suppress(TypeError, ValueError):  # of another shape than a key's data
             rng = jax.random.wrap_key_data(rng)
     if dtype is None or not jnp.issubdtype(rng.dtype, jax.dtypes.prng_key):
-        raise InputError([f"reset takes a key, as of jax.random.key(0), not {rng!r:.60}"])
+        raise InputError.of("type", f"reset takes a key, as of jax.random.key(0), not {rng!r:.60}")
     if rng.shape:
         words = f"reset takes one key, not {rng.shape}: jax.vmap(env.reset)(keys) begins several"
         raise InputError([words])

@@ -99,7 +99,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         single = isinstance(seed, int | np.integer)
         seeds = [int(seed) + i for i in range(count)] if single else list(seed)
         if len(seeds) != count:
-            raise InputError([f"seed has {len(seeds)} entries for {count} environments"])
+            raise InputError.of("size", f"seed has {len(seeds)} entries for {count} environments")
         drawn = jnp.array([s is None for s in seeds])
         self._keys = jnp.where(drawn, self._keys, seed_keys([s or 0 for s in seeds]))
 
@@ -163,7 +163,7 @@ def spaces(env: GraspEnv) -> tuple[Box, Box]:
 def seed_keys(seeds: Sequence[Any]) -> jax.Array:
     """A key of each seed, any whole number; of 32 bits, so that x64 draws the same."""
     if bad := [s for s in seeds if isinstance(s, bool) or not isinstance(s, int | np.integer)]:
-        raise InputError([f"a seed is a whole number, not {bad[0]!r:.60}"])
+        raise InputError.of("type", f"a seed is a whole number, not {bad[0]!r:.60}")
     return jax.vmap(jax.random.key)(np.array([int(s) % 2**32 for s in seeds], np.uint32))
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from codesign_jax.scene.hand import Hand
-from codesign_jax.scene.schema import InputError, quantity, range_problem
+from codesign_jax.scene.schema import InputError, Problem, quantity, range_problem
 from codesign_jax.types import Params
 
 
@@ -126,10 +126,11 @@ def sizes(hand: Hand, params: Params, process: Process) -> list[Size]:
         size = Size(length, *ends, process.end_wall or ends[0].wall, process.root)
         fingers.append(size)
         if size.length - 2 * size.end < 1.0:
-            problems.append(
+            sentence = (
                 f"finger {i} of {length:g} mm has no room for a chamber of 1 mm between end walls "
                 f"of {size.end:g} mm; give --end-wall (mm), or --no-parts and --no-sheet"
             )
+            problems.append(Problem("geometry", sentence))
     if problems:
         raise InputError(problems)
     return fingers

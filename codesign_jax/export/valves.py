@@ -47,7 +47,7 @@ def lines(scene: Scene, params: Params) -> list[tuple[int, ...]]:
         groups = [tuple(fingers) for fingers in courses.values()]
         if len(groups) > most:
             words = f"the design needs {len(groups)} pressure lines, and the hand has valves.lines"
-            raise InputError([f"{words} = {most}"])
+            raise InputError.of("geometry", f"{words} = {most}")
         return groups
     return partition(valves.known(count), count)
 

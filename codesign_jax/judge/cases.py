@@ -18,7 +18,7 @@ from codesign_jax.reuse import SceneProgram, shared
 from codesign_jax.scene import Scene, key_frames, scene_files
 from codesign_jax.scene.hand import lacking
 from codesign_jax.scene.parameters import DesignSpace, design_space
-from codesign_jax.scene.schema import InputError, range_problem
+from codesign_jax.scene.schema import InputError, Problem, range_problem
 from codesign_jax.types import Outcome
 
 
@@ -86,9 +86,13 @@ class Case(NamedTuple):
             if f not in range(count)
         ]
         if len({*fingers}) == count:
-            problems.append("--without names all fingers of the hand")
+            problems.append(Problem("conflict", "--without names all fingers of the hand"))
         if self.policy:
-            problems.append("--without: a policy commands all fingers of its hand; leave it out")
+            problems.append(
+                Problem(
+                    "conflict", "--without: a policy commands all fingers of its hand; leave it out"
+                )
+            )
         if problems:
             raise InputError(problems)
         leaving = tuple(sorted({*fingers}))

@@ -63,7 +63,7 @@ def split(scene: Scene, start: Any) -> RolloutState:
     n = start.shape[-1]
     if n not in {*ends[[0, 1, 6]]}:
         problem = f"start has {n} numbers; a state of the scene has {ends[-1]}, its beginning"
-        raise InputError([f"{problem} {ends[0]} (qpos) or {ends[1]} (qpos, qvel)"])
+        raise InputError.of("size", f"{problem} {ends[0]} (qpos) or {ends[1]} (qpos, qvel)")
     parts = [
         start[..., end - size : end]
         if end <= n

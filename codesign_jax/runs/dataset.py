@@ -97,11 +97,13 @@ class Shards:
         part = self.folder
         before = self.question
         if part.exists() and before is None and not (part.is_dir() and {*self.names} <= {LOCK}):
-            raise InputError([f"{part} is no part of a data set; choose another --out"])
+            raise InputError.of("file", f"{part} is no part of a data set; choose another --out")
         others = [n for n, v in question.described.items() if before and before.get(n) != v]
         if others:
             difference = f"{part} has a part of other grasps ({', '.join(others)} differ)"
-            raise InputError([f"{difference}; choose another --out, or delete the folder"])
+            raise InputError.of(
+                "damaged", f"{difference}; choose another --out, or delete the folder"
+            )
 
     @property
     def names(self) -> list[str]:

@@ -29,7 +29,7 @@ from codesign_jax.runs.record import Record
 from codesign_jax.runs.settings import Settings, masks_of
 from codesign_jax.scene import Scene, scene_files, texts
 from codesign_jax.scene.parameters import design_space
-from codesign_jax.scene.schema import InputError
+from codesign_jax.scene.schema import InputError, Problem
 
 EVENTS = "events.log"
 """Log of a run folder: what happened when, a line each."""
@@ -187,7 +187,7 @@ def locked(path: Path) -> Iterator[int]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             owner = file.read(64).strip() or "?"
-            raise InputError([f"--out {path} is in use by process {owner}"]) from error
+            raise InputError.of("file", f"--out {path} is in use by process {owner}") from error
         except OSError as error:
             problem = f"--out {path} cannot be locked: {error.strerror}; choose another folder"
             raise InputError([problem]) from error
@@ -237,7 +237,9 @@ def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str
             extension = _extension_problems(scene, settings, stood)
         elif stood != value:
             flag = name.replace("_", "-")
-            problems.append(f"--{flag}: the run has {stood}, asked for is {value}")
+            problems.append(
+                Problem("damaged", f"--{flag}: the run has {stood}, asked for is {value}")
+            )
     if not problems and _is_cut_short(path, scene, settings, stored):
         return
     manifest.refuse_changed(path, stored)
@@ -248,7 +250,7 @@ def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str
         other = [word for word, (was, now) in names.items() if was.name != now.name]
         for word in other:
             was, now = (v.name for v in names[word])
-            problems.append(f"--{word}: the run has {was}, asked for is {now}")
+            problems.append(Problem("damaged", f"--{word}: the run has {was}, asked for is {now}"))
         for name, text in scene_files.scene_texts(scene).items():
             if name.removesuffix(".toml") not in other:  # of those every line may differ
                 problems += _diff(path, name, text)
@@ -323,16 +325,16 @@ def _differences(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
 
 def _refuse_foreign(path: Path) -> None:
     if path.is_symlink() and not path.exists():
-        raise InputError([f"--out {path} is a symbolic link to nothing"])
+        raise InputError.of("file", f"--out {path} is a symbolic link to nothing")
     if path.exists() and not path.is_dir():
-        raise InputError([f"--out {path} is a file"])
+        raise InputError.of("file", f"--out {path} is a file")
     others = [name for name in _all(path) if name != LOCK and _named(name) != PROVENANCE]
     if others and not (path / PROVENANCE).exists():
         hint = "choose another folder, or delete these files yourself, if nobody needs them"
         if (path / "checkpoints").exists():
             hint = f"if it is a run that lost {PROVENANCE}, put that back from a copy; or {hint}"
         problem = f"--out {path} holds {texts.some(others)} and no {PROVENANCE}: {hint}"
-        raise InputError([f"{problem}. Nothing was changed"])
+        raise InputError.of("file", f"{problem}. Nothing was changed")
 
 
 def _refuse_folders(path: Path) -> None:
@@ -351,11 +353,10 @@ def _refuse_folders(path: Path) -> None:
 def _refuse_to_delete(path: Path) -> None:
     others = [name for name in _all(path) if not _is_of_a_run(path, name)]
     if others:
-        raise InputError(
-            [
-                f"--fresh would delete {texts.some(others)} in {path}, which are no files of a "
-                "run: move them elsewhere first, or choose another folder"
-            ]
+        raise InputError.of(
+            "file",
+            f"--fresh would delete {texts.some(others)} in {path}, which are no files of a "
+            "run: move them elsewhere first, or choose another folder",
         )
 
 

@@ -72,7 +72,7 @@ def save(folder: Path, episode: int, info: EpisodeInfo) -> list[Path]:
 
 def load(path: Path) -> Failure:
     if not path.exists():
-        raise InputError([f"{path}: there is no such file or folder"])
+        raise InputError.of("missing", f"{path}: there is no such file or folder")
     try:
         values = array_files.load(path, _LAYOUT)
         # Earlier runs have no tilt, and most scenes no constants that are drawn.

@@ -106,7 +106,7 @@ def read_provenance(path: Path) -> dict[str, Any]:
             why = f"it has no {PROVENANCE}" if path.exists() else "there is no such folder"
         else:
             why = f"{PROVENANCE} cannot be read: {error.strerror}"
-        raise InputError([f"{path} is not a run folder: {why}{_hint(path)}"]) from error
+        raise InputError.of("damaged", f"{path} is not a run folder: {why}{_hint(path)}") from error
     except UnicodeDecodeError as error:
         raise _damaged(file, "it is no text in UTF-8") from error
     try:
@@ -118,11 +118,10 @@ def read_provenance(path: Path) -> dict[str, Any]:
     if problem := _problem(stored):
         raise _damaged(file, problem)
     if stored["schema"] > SCHEMA:
-        raise InputError(
-            [
-                f"{path} was made by a newer version of codesign-jax (its folders have schema "
-                f"{stored['schema']}, this version reads up to {SCHEMA}): use that version"
-            ]
+        raise InputError.of(
+            "damaged",
+            f"{path} was made by a newer version of codesign-jax (its folders have schema "
+            f"{stored['schema']}, this version reads up to {SCHEMA}): use that version",
         )
     settings = Settings(**stored["settings"])
     if problems := check(settings, None):
@@ -162,20 +161,19 @@ def refuse_changed(path: Path, stored: Mapping[str, Any]) -> None:
         return
     missing = [name for name in changed if not (path / name).exists()]
     state = "is missing" if missing == changed else "was changed"
-    raise InputError(
-        [
-            f"{', '.join(str(path / name) for name in changed)} {state} since the run was made, so "
-            "that its results are not those of this scene. Put back the file as it was. To try "
-            "other values on the run's design leave the file and give --set KEY=VALUE; a run of "
-            f"the new scene needs a folder of its own. Or, to accept the files as they are, delete "
-            f'their lines under "files" in {path / PROVENANCE}'
-        ]
+    raise InputError.of(
+        "damaged",
+        f"{', '.join(str(path / name) for name in changed)} {state} since the run was made, so "
+        "that its results are not those of this scene. Put back the file as it was. To try "
+        "other values on the run's design leave the file and give --set KEY=VALUE; a run of "
+        f"the new scene needs a folder of its own. Or, to accept the files as they are, delete "
+        f'their lines under "files" in {path / PROVENANCE}',
     )
 
 
 def _damaged(file: Path, why: str) -> InputError:
-    return InputError(
-        [f"{file} is damaged: {why}. Put it back from a copy, or choose another folder"]
+    return InputError.of(
+        "damaged", f"{file} is damaged: {why}. Put it back from a copy, or choose another folder"
     )
 
 

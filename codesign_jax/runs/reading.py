@@ -72,7 +72,7 @@ def load_record(folder: Path, *, tell: Tell | None = None) -> Record | None:
         if record is not None:
             records.refuse_other(record, settings)
     except (RunError, OSError) as error:
-        raise InputError([f"run {folder}: {error}"]) from error
+        raise InputError.of("damaged", f"run {folder}: {error}") from error
     if record is None:
         if problem := lost(folder, restored):
             raise InputError([problem])

@@ -52,8 +52,8 @@ def refuse_other_policy(policy: str, named: str | None) -> None:
     """Refuses to import a run's policy that the command line does not name, or to leave it out."""
     if policy != (named or ""):
         policy_words = f"--policy {policy}" if policy else "no policy"
-        raise InputError(
-            [f"the run was made with {policy_words}; --policy is {named or 'not given'}"]
+        raise InputError.of(
+            "damaged", f"the run was made with {policy_words}; --policy is {named or 'not given'}"
         )
 
 
@@ -75,11 +75,10 @@ def case_of_run(
         tell(problem)
     space = design_space(scene.hand, settings.preset)
     if len(chosen.design) != space.num_parameters:
-        raise InputError(
-            [
-                f"--set leaves {space.num_parameters} parameters free in preset "
-                f"{settings.preset!r}; the run's designs have {len(chosen.design)}"
-            ]
+        raise InputError.of(
+            "size",
+            f"--set leaves {space.num_parameters} parameters free in preset "
+            f"{settings.preset!r}; the run's designs have {len(chosen.design)}",
         )
     return Case(scene, space, chosen.design, engine or settings.engine, settings.policy)
 
@@ -88,7 +87,7 @@ def read_record(folder: Path, *, tell: Tell | None = None) -> Record:
     """Reads a run's newest whole checkpoint."""
     record = load_record(folder, tell=tell)
     if record is None or record.done == 0:
-        raise InputError([f"run {folder} has no finished episode yet"])
+        raise InputError.of("missing", f"run {folder} has no finished episode yet")
     return record
 
 

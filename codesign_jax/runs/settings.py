@@ -115,22 +115,24 @@ def check(settings: Settings, hand: Hand | None) -> list[str]:
             problems.append(problem)
     if settings.engine not in engines.NAMES:
         hint = schema.nearest(settings.engine, engines.NAMES)
-        problems.append(f"--engine = {settings.engine!r} is not valid; {hint}")
+        problems.append(
+            schema.Problem("unknown", f"--engine = {settings.engine!r} is not valid; {hint}")
+        )
     if user_code.is_user_code(settings.optimizer):
         problem = user_code.problem(settings.optimizer)
     else:
         problem = optimize.problem(settings.optimizer, max(settings.particles, 0) or None)
     problems += [f"--optimizer: {problem}"] if problem else []
     if settings.cost != SCENE_COST and (problem := user_code.problem(settings.cost)):
-        problems.append(f"--cost: {problem}")
+        problems.append(schema.Problem("damaged", f"--cost: {problem}"))
     if settings.policy and (problem := user_code.problem(settings.policy)):
-        problems.append(f"--policy: {problem}")
+        problems.append(schema.Problem("damaged", f"--policy: {problem}"))
     space = None
     if hand is not None:
         try:
             space = design_space(hand, settings.preset)
         except schema.InputError as error:
-            problems += [f"--{problem}" for problem in error.problems]
+            problems += [problem.told(f"--{problem}") for problem in error.problems]
     low, high = _RANGES["episodes"]
     if low <= settings.episodes <= high:  # it is as long as the run
         problems += _schedule_problems(settings, space)

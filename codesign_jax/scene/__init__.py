@@ -15,7 +15,7 @@ codesign_jax.scene.schema.InputError: gravty is not a known key; did you mean 'g
 
 from codesign_jax.scene.description import Scene, by_structure
 from codesign_jax.scene.loading import check_together, load, load_accuracy, with_accuracy
-from codesign_jax.scene.schema import InputError
+from codesign_jax.scene.schema import InputError, Problem
 from codesign_jax.scene.tables import (
     Accuracy,
     Arm,
@@ -43,6 +43,7 @@ __all__ = [
     "Pneumatics",
     "Scene",
     "InputError",
+    "Problem",
     "Solver",
     "by_structure",
     "check_together",

@@ -15,6 +15,7 @@ import numpy as np
 
 from codesign_jax.scene.beams import strain_pressure
 from codesign_jax.scene.hand_tables import Hand
+from codesign_jax.scene.schema import Problem
 from codesign_jax.scene.tables import Arm, Limits
 
 Value = Callable[[str], Any]
@@ -152,9 +153,10 @@ def problems(limits: Limits, where: str) -> list[str]:
         return []
     key = f"{where}.limits.finger_length = {list(pair)}"
     if len(pair) != 2:
-        return [f"{key} must have two entries, least and largest length [m], not {len(pair)}"]
+        words = f"must have two entries, least and largest length [m], not {len(pair)}"
+        return [Problem("size", f"{key} {words}")]
     if not pair[0] < pair[1]:
-        return [f"{key}: the least length must be below the largest one"]
+        return [Problem("order", f"{key}: the least length must be below the largest one")]
     return []
 
 

@@ -67,12 +67,13 @@ def _leaf_problems(path: str, value: Any, expected: schema.Range, mixed: bool) -
     key = f"scene.{path}"
     shape = np.shape(value)
     if len(shape) > 1 or (shape and mixed):
-        return [f"{key} has shape {shape}: numbers have shape (), or all of them the same (n,)"]
+        words = "numbers have shape (), or all of them the same (n,)"
+        return [schema.Problem("size", f"{key} has shape {shape}: {words}")]
     if isinstance(value, jax.core.Tracer):
         return []
     numbers = np.asarray(value)
     if numbers.dtype.kind not in "fiu" and numbers.dtype != jnp.bfloat16:
-        return [f"{key} = {value!r} must be a number"]
+        return [schema.Problem("type", f"{key} = {value!r} must be a number")]
     every = numbers.astype(float).reshape(-1)
     problems = (schema.near_problem(key, float(v), expected) for v in np.unique(every))
     return [p for p in problems if p][:1]

@@ -114,7 +114,9 @@ class Scene(SceneFile):
         scene = self if other is None else other
         if not isinstance(scene, Scene):
             kind = type(scene).__name__
-            raise schema.InputError([f"scene is a {kind}, not a Scene; scene.load reads one"])
+            raise schema.InputError.of(
+                "type", f"scene is a {kind}, not a Scene; scene.load reads one"
+            )
         check(scene)
         return scene
 

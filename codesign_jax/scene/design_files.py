@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from codesign_jax.scene import library, schema, texts
-from codesign_jax.scene.schema import InputError
+from codesign_jax.scene.schema import InputError, Problem
 
 SCENE = "paper"
 PRESET = "2d"
@@ -77,16 +77,25 @@ def parse(
     for name, text in entries:
         if name in dict(space.idle):
             words = f"{where} {name!r} has no effect: {dict(space.idle)[name]}; leave it out"
-            problems.append(words)
+            problems.append(Problem("unsupported", words))
             continue
         if name not in values:
-            problems.append(f"{where} {name!r} is not a parameter; {schema.nearest(name, values)}")
+            problems.append(
+                schema.Problem(
+                    "unknown",
+                    f"{where} {name!r} is not a parameter; {schema.nearest(name, values)}",
+                )
+            )
             continue
         value = number(text)
         # Bounds went to SI and back; the last bit of that is no reason to refuse one.
         low, high = (round(float(b[name]), 9) for b in (lows, highs))
         if value is None:
-            problems.append(f"{where} {name} = {text!r} must be a number in {units[name]}")
+            problems.append(
+                schema.Problem(
+                    "type", f"{where} {name} = {text!r} must be a number in {units[name]}"
+                )
+            )
         elif problem := schema.range_problem(f"{where} {name}", value, units[name], low, high):
             problems.append(problem)
         else:

@@ -161,20 +161,32 @@ def check(table: Constants, where: str) -> list[str]:
         numbers = [getattr(entry, n) for n in names]
         present = {n for n in ("mean", "sd", "low", "high") if getattr(entry, n) is not None}
         if present != set(names):
-            words = f"{' and '.join(names)}, and no other number"
-            problems.append(f"{key}: distribution {entry.distribution!r} has {words}")
+            words = f"has {' and '.join(names)}, and no other number"
+            sentence = f"{key}: distribution {entry.distribution!r} {words}"
+            problems.append(schema.Problem("conflict", sentence))
         elif entry.logarithmic and numbers[0] <= 0:
-            problems.append(f"{key}: {names[0]} of a {entry.distribution} is above 0")
+            problems.append(
+                schema.Problem("range", f"{key}: {names[0]} of a {entry.distribution} is above 0")
+            )
         elif names[0] == "low" and not numbers[0] < numbers[1]:
-            problems.append(f"{key}: low = {numbers[0]:g} must be below high = {numbers[1]:g}")
+            problems.append(
+                schema.Problem(
+                    "order", f"{key}: low = {numbers[0]:g} must be below high = {numbers[1]:g}"
+                )
+            )
         if entry.key in keys[:i]:
-            problems.append(f"{key} is given more than once")
+            problems.append(schema.Problem("conflict", f"{key} is given more than once"))
         if len(entry.correlation) > i:
             problems.append(
-                f"{key}: correlation has {len(entry.correlation)} numbers, {i} before it"
+                schema.Problem(
+                    "unknown",
+                    f"{key}: correlation has {len(entry.correlation)} numbers, {i} before it",
+                )
             )
     if not problems and (np.linalg.eigvalsh(correlations(table)) < -1e-6).any():
-        problems.append(f"{where}: the correlations contradict one another")
+        problems.append(
+            schema.Problem("conflict", f"{where}: the correlations contradict one another")
+        )
     return problems
 
 
@@ -259,7 +271,10 @@ def key_problems(scene: Any, table: Constants, where: str) -> list[str]:
     for entry in table.constant:
         if entry.key not in known:
             problems.append(
-                f"{where}: {entry.key!r} is no constant; {schema.nearest(entry.key, known)}"
+                schema.Problem(
+                    "unknown",
+                    f"{where}: {entry.key!r} is no constant; {schema.nearest(entry.key, known)}",
+                )
             )
     return problems
 

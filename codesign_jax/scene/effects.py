@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from codesign_jax.scene.schema import InputError
+from codesign_jax.scene.schema import InputError, Problem
 
 ENGINES = ("structured", "mujoco", "mjx")
 """Names of the engines; `engines.make_engine` builds them."""
@@ -97,10 +97,11 @@ def refuse(effects: Any, engine: str) -> None:
     problems = []
     for name, reason in refusals(effects, engine).items():
         able = [e for e in ENGINES if name not in refusals(effects, e)]
-        problems.append(
+        sentence = (
             f"not supported by engine {engine}: effects.{name} = {setting(effects, name)} "
             f"({reason}); use engine {' or '.join(able)}"
         )
+        problems.append(Problem("unsupported", sentence))
     if problems:
         raise InputError(problems)
 

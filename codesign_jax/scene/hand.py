@@ -67,7 +67,9 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Han
     silicones.complete(table, path.name, problems)
     hand = schema.parse(Hand, table, path.name, problems)
     if hand is not None and not hand.finger:
-        problems.append(f"{path.name}.finger must name at least one finger")
+        problems.append(
+            schema.Problem("missing", f"{path.name}.finger must name at least one finger")
+        )
     elif hand is not None:
         _check_mounts(hand, path.name, problems)
         problems += valve_problems(hand.valves, len(hand.finger), f"{path.name}.valves")
@@ -84,20 +86,23 @@ def _check_mounts(hand: Hand, where: str, problems: list[str]) -> None:
     for i, finger in enumerate(hand.finger):
         path = f"{where}.finger[{i}]"
         if finger.base is None and finger.radius is None:
-            problems.append(
+            sentence = (
                 f"{path} has no base point: give base = [x, y] in the palm's frame (unit m), "
                 "or the radius of the circle on which the base point lies (unit m)"
             )
+            problems.append(schema.Problem("missing", sentence))
         elif finger.base is not None and finger.radius is not None:
-            problems.append(
+            sentence = (
                 f"{path} gives its base point twice: leave out base = {list(finger.base)} "
                 f"or radius = {finger.radius:g}"
             )
+            problems.append(schema.Problem("conflict", sentence))
         if finger.base is not None and len(finger.base) != 2:
-            problems.append(
+            sentence = (
                 f"{path}.base = {list(finger.base)} must have two entries, x and y in the palm's "
                 f"frame [m], not {len(finger.base)}"
             )
+            problems.append(schema.Problem("size", sentence))
 
 
 def _check_table(hand: Hand, where: str, problems: list[str]) -> dict[str, Parameter]:
@@ -107,31 +112,46 @@ def _check_table(hand: Hand, where: str, problems: list[str]) -> dict[str, Param
     for name in PARAMETERS:
         if name in TIP and not hand.section.tapered:
             if name in names:
-                problems.append(f"{where}.parameter {name!r} needs section.tapered = true")
+                problems.append(
+                    schema.Problem(
+                        "unsupported", f"{where}.parameter {name!r} needs section.tapered = true"
+                    )
+                )
         elif names.count(name) != 1:
             problems.append(
-                f"{where}.parameter {name!r} must be given once, not {names.count(name)} times"
+                schema.Problem(
+                    "conflict",
+                    f"{where}.parameter {name!r} must be given once, not {names.count(name)} times",
+                )
             )
     for p in hand.parameter:
         path = f"{where}.parameter {p.name}"
         kind = PARAMETERS[p.name]
         unit, factor = UNITS[p.unit]
         if p.per != kind.per:
-            problems.append(f"{path}.per must be {kind.per!r}")
+            problems.append(schema.Problem("type", f"{path}.per must be {kind.per!r}"))
         keys = ("low", "high", "default")
         fits = all([_fits(f"{path}.{key}", getattr(p, key), p, hand, problems) for key in keys])
         if fits:
             rows[p.name] = p
         if unit != kind.unit:
             fitting = ", ".join(repr(u) for u, (si, _) in UNITS.items() if si == kind.unit)
-            problems.append(f"{path}.unit = {p.unit!r} does not fit; valid: {fitting}")
+            problems.append(
+                schema.Problem(
+                    "unknown", f"{path}.unit = {p.unit!r} does not fit; valid: {fitting}"
+                )
+            )
         if not fits or unit != kind.unit:
             continue
         for name in ("low", "high"):
             _check_range(f"{path}.{name}", getattr(p, name), p.unit, kind, factor, problems)
         for finger, (low, high, default) in _by_finger(p.low, p.high, p.default):
             if low >= high:
-                problems.append(f"{path}{finger}: low {low:g} must be below high {high:g} {p.unit}")
+                problems.append(
+                    schema.Problem(
+                        "order", f"{path}{finger}: low {low:g} must be below high {high:g} {p.unit}"
+                    )
+                )
             name = f"{path}.default{finger}"
             if problem := schema.range_problem(name, default, p.unit, low, high):
                 problems.append(problem)
@@ -148,7 +168,7 @@ def _fits(path: str, value: Numbers, row: Parameter, hand: Hand, problems: list[
             f"must be a number [{row.unit}] for all fingers or {len(hand.finger)}, one for each, "
             f"not {len(value)}"
         )
-    problems.append(f"{path} = {list(value)} {why}")
+    problems.append(schema.Problem("size", f"{path} = {list(value)} {why}"))
     return False
 
 
@@ -177,26 +197,33 @@ def _check_presets(
     for preset in hand.preset:
         path = f"{where}.preset {preset.name}"
         if names.count(preset.name) > 1 or preset.name == "full":
-            problems.append(f"{path}: the name is taken")
+            problems.append(schema.Problem("conflict", f"{path}: the name is taken"))
         if len(preset.fixed) > schema.MOST_ENTRIES:
-            problems.append(f"{path}.fixed has {len(preset.fixed):,} keys")
+            problems.append(schema.Problem("size", f"{path}.fixed has {len(preset.fixed):,} keys"))
             continue
         for key, value in preset.fixed.items():
             if key not in table:
                 problems.append(
-                    f"{path}.fixed.{key} is not a parameter; {schema.nearest(key, table)}"
+                    schema.Problem(
+                        "unknown",
+                        f"{path}.fixed.{key} is not a parameter; {schema.nearest(key, table)}",
+                    )
                 )
                 continue
             if key in rows:
                 _check_fixed(f"{path}.fixed.{key}", value, rows[key], hand, problems)
         free = [f.name for f in preset.free]
         if not free and preset.fixed:
-            problems.append(f"{path} leaves no parameter free")
+            problems.append(schema.Problem("missing", f"{path} leaves no parameter free"))
         for f in preset.free:
             if f.name in preset.fixed:
-                problems.append(f"{path}: {f.name} is both free and fixed")
+                problems.append(
+                    schema.Problem("conflict", f"{path}: {f.name} is both free and fixed")
+                )
             if free.count(f.name) > 1:
-                problems.append(f"{path}: {f.name} is free more than once")
+                problems.append(
+                    schema.Problem("conflict", f"{path}: {f.name} is free more than once")
+                )
             if f.name in rows:
                 _check_free(f, rows[f.name], f"{path}.free {f.name}", hand, problems)
 
@@ -206,7 +233,11 @@ def _check_fixed(path: str, value: Any, row: Parameter, hand: Hand, problems: li
         if isinstance(number, bool) or not isinstance(number, int | float):
             numbers = list(value) if isinstance(value, tuple) else value
             many = ", or one for each finger" if row.per == "finger" else ""
-            problems.append(f"{path} = {schema.shown(numbers)} must be a number [{row.unit}]{many}")
+            problems.append(
+                schema.Problem(
+                    "type", f"{path} = {schema.shown(numbers)} must be a number [{row.unit}]{many}"
+                )
+            )
             return
     if _fits(path, value, row, hand, problems):
         for finger, (number, low, high) in _by_finger(value, row.low, row.high):
@@ -225,31 +256,47 @@ def _check_free(free: Free, row: Parameter, path: str, hand: Hand, problems: lis
             return
         _check_range(f"{path}.{name}", value, row.unit, kind, factor, problems)
         if free.tied is True and isinstance(value, tuple):
-            problems.append(
+            sentence = (
                 f"{path}.{name} = {list(value)} must be a number [{row.unit}]: "
                 "tied = true gives all fingers one value"
             )
+            problems.append(schema.Problem("type", sentence))
     width = hand.width(row)
     if width == 1 and not isinstance(free.tied, bool):
-        problems.append(f"{path}.tied: {free.name} is one value, which no groups of fingers share")
+        problems.append(
+            schema.Problem(
+                "unsupported",
+                f"{path}.tied: {free.name} is one value, which no groups of fingers share",
+            )
+        )
         return
     if not isinstance(free.tied, bool) and (problem := group_problem(free.tied, width)):
-        problems.append(f"{path}.tied: {problem}")
+        problems.append(schema.Problem("size", f"{path}.tied: {problem}"))
         return
     for low, high in dict.fromkeys(zip(*free.bounds(row, hand.width(row)), strict=True)):
         if low >= high:
-            problems.append(f"{path}: low {low:g} must be below high {high:g}")
+            problems.append(
+                schema.Problem("order", f"{path}: low {low:g} must be below high {high:g}")
+            )
 
 
 def valve_problems(valves: Valves, fingers: int, where: str) -> list[str]:
     """What is wrong with the pressure lines of a hand with so many fingers."""
     problems = []
     if valves.lines is not None and valves.groups is not None:
-        problems.append(f"{where}: give the number of lines, or the groups of fingers, not both")
+        problems.append(
+            schema.Problem(
+                "conflict", f"{where}: give the number of lines, or the groups of fingers, not both"
+            )
+        )
     if valves.lines is not None and valves.lines > fingers:
-        problems.append(f"{where}.lines = {valves.lines} must be at most {fingers}, the fingers")
+        problems.append(
+            schema.Problem(
+                "conflict", f"{where}.lines = {valves.lines} must be at most {fingers}, the fingers"
+            )
+        )
     if valves.groups is not None and (problem := group_problem(valves.groups, fingers)):
-        problems.append(f"{where}.groups: {problem}")
+        problems.append(schema.Problem("size", f"{where}.groups: {problem}"))
     return problems
 
 
@@ -290,16 +337,18 @@ def _check_sections(hand: Hand, where: str, problems: list[str]) -> None:
         for prefix, across, height, width, wall, thinnest, pressure in fingers:
             for name, size in ((f"{prefix}height", height), (across, width)):
                 if size <= 2 * wall:
-                    problems.append(
+                    sentence = (
                         f"{path}: a {name} of {size:g} m leaves no air chamber "
                         f"between walls of {wall:g} m"
                     )
+                    problems.append(schema.Problem("geometry", sentence))
             limit = hand.pressure_limit.per_wall * thinnest
             if not pressure < limit:
-                problems.append(
+                sentence = (
                     f"{path}: a pressure of {pressure:g} Pa is not below the limit of "
                     f"{limit:g} Pa for walls of {thinnest:g} m"
                 )
+                problems.append(schema.Problem("range", sentence))
 
 
 def all_bounds(hand: Hand) -> Iterator[dict[str, tuple[tuple[float, ...], tuple[float, ...]]]]:

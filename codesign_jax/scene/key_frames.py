@@ -307,31 +307,45 @@ class _Reader:
             frames.append(frame)
             now = frame.pressure or now
         if not frames or frames[0].time != Sum("s", 0.0):
-            self.problems.append(f"{self.where}.frame[0].time must be 0: a grasp begins with it")
+            self.problems.append(
+                schema.Problem(
+                    "order", f"{self.where}.frame[0].time must be 0: a grasp begins with it"
+                )
+            )
         return Control(file.name, file.description, tuple(frames), file.parameter)
 
     def parameter(self, row: ControlParameter, path: str) -> None:
         if not _NAME.fullmatch(row.name) or row.name in self.units or row.name in PARAMETERS:
             self.problems.append(
-                f"{path}.name = {schema.shown(row.name)} must be a lower-case word not taken"
+                schema.Problem(
+                    "conflict",
+                    f"{path}.name = {schema.shown(row.name)} must be a lower-case word not taken",
+                )
             )
         if not row.low < row.high:
-            self.problems.append(f"{path}: low {row.low:g} must be below high {row.high:g}")
+            self.problems.append(
+                schema.Problem("order", f"{path}: low {row.low:g} must be below high {row.high:g}")
+            )
         elif not row.low <= row.default <= row.high:
             key = f"{path}.default"
             why = schema.range_problem(key, row.default, row.unit, row.low, row.high)
-            self.problems.append(str(why))
+            self.problems.append(schema.Problem("range", str(why)))
         if row.per == "finger" and UNITS[row.unit][0] != "Pa":
-            self.problems.append(f"{path}.per = 'finger' is for pressures, not for {row.unit}")
+            self.problems.append(
+                schema.Problem(
+                    "unsupported", f"{path}.per = 'finger' is for pressures, not for {row.unit}"
+                )
+            )
         self.units[row.name] = UNITS[row.unit][0]
 
     def _group(self, name: str, fingers: Any) -> None:
         whole = isinstance(fingers, list) and all(type(f) is int for f in fingers)
         if not whole or not all(0 <= f < self.fingers for f in fingers):
-            self.problems.append(
+            sentence = (
                 f"{self.where}.group.{name} = {schema.shown(fingers)} must be an array of fingers, "
                 f"0 to {self.fingers - 1}"
             )
+            self.problems.append(schema.Problem("type", sentence))
             fingers = []
         self.groups[name] = fingers
 
@@ -341,17 +355,23 @@ class _Reader:
         for key, value in entry.items():
             if key not in known:
                 why = schema.nearest(key, known)
-                self.problems.append(f"{path}.{schema.shown(key)[1:-1]} is not a known key; {why}")
+                self.problems.append(
+                    schema.Problem(
+                        "unknown", f"{path}.{schema.shown(key)[1:-1]} is not a known key; {why}"
+                    )
+                )
             elif key == "interpolation":
                 if value not in ("linear", "held"):
-                    self.problems.append(f"{path}.{key} must be 'linear' or 'held'")
+                    self.problems.append(
+                        schema.Problem("unknown", f"{path}.{key} must be 'linear' or 'held'")
+                    )
                 values[key] = value
             elif key == "pressure":
                 values[key] = self._pressure(value, f"{path}.{key}", now)
             else:
                 values[key] = self._sum(value, f"{path}.{key}", _UNITS[key])
         if "time" not in entry:
-            self.problems.append(f"{path}.time is missing (unit s)")
+            self.problems.append(schema.Problem("missing", f"{path}.time is missing (unit s)"))
         return Frame(**values)
 
     def _pressure(self, value: Any, path: str, now: tuple[Sum, ...]) -> tuple[Sum, ...]:
@@ -360,7 +380,9 @@ class _Reader:
             for name, entry in value.items():
                 if name not in self.groups:
                     why = schema.nearest(name, self.groups)
-                    self.problems.append(f"{path}.{name} is not a group; {why}")
+                    self.problems.append(
+                        schema.Problem("unknown", f"{path}.{name} is not a group; {why}")
+                    )
                     continue
                 total = self._sum(entry, f"{path}.{name}", "Pa")
                 for finger in self.groups[name]:
@@ -368,7 +390,9 @@ class _Reader:
         elif isinstance(value, list):
             if len(value) != self.fingers:
                 self.problems.append(
-                    f"{path} has {len(value)} entries, the hand {self.fingers} fingers"
+                    schema.Problem(
+                        "size", f"{path} has {len(value)} entries, the hand {self.fingers} fingers"
+                    )
                 )
             per_finger = [self._sum(v, f"{path}[{i}]", "Pa") for i, v in enumerate(value)]
         else:
@@ -378,7 +402,9 @@ class _Reader:
     def _sum(self, value: Any, path: str, unit: str) -> Sum:
         total = sums.read(value, unit)
         if isinstance(total, str):
-            self.problems.append(f"{path} = {schema.shown(value)} {total}")
+            self.problems.append(
+                schema.Problem("syntax", f"{path} = {schema.shown(value)} {total}")
+            )
             return Sum(unit, 0.0)
         expected = UNITS[unit][0]
         fitting = [name for name, u in self.units.items() if u == expected]
@@ -386,15 +412,22 @@ class _Reader:
             if term.name not in self.units and (
                 why := sums.unit_words(term.name, term.factor, unit)
             ):
-                self.problems.append(f"{path} = {schema.shown(value)} {why}")
+                self.problems.append(
+                    schema.Problem("syntax", f"{path} = {schema.shown(value)} {why}")
+                )
             elif term.name not in self.units:
                 why = schema.nearest(term.name, fitting)
-                self.problems.append(f"{path} names an unknown parameter {term.name!r}; {why}")
-            elif self.units[term.name] != expected:
                 self.problems.append(
+                    schema.Problem(
+                        "unknown", f"{path} names an unknown parameter {term.name!r}; {why}"
+                    )
+                )
+            elif self.units[term.name] != expected:
+                sentence = (
                     f"{path}: {term.name!r} has the unit {self.units[term.name]}, not {expected}; "
                     f"valid: {', '.join(fitting)}"
                 )
+                self.problems.append(schema.Problem("type", sentence))
         return total
 
 
@@ -515,10 +548,11 @@ def _falling(frames: tuple[Frame, ...], ends: Mapping[str, Any], where: str) -> 
         if least < -1e-9 or (changes and least < 1e-9):
             earlier = f"{-least:g} s before it" if least < -1e-9 else "at that time"
             before, after = (schema.shown(sums.text(frame.time)) for frame in (a, b))
-            yield (
+            sentence = (
                 f"{where}.frame[{i}].time = {after} must come after that of frame[{i - 1}], "
                 f"{before}, and is {earlier} in some design"
             )
+            yield schema.Problem("order", sentence)
 
 
 def _walls(hand: Hand) -> Iterator[tuple[Any, ...]]:
@@ -551,13 +585,15 @@ def _too_high(
                 key = f"{where}.frame[{i}].pressure"
                 text = schema.shown(sums.text(value))
                 if most > limit * (1 + 1e-9):
-                    yield (
+                    sentence = (
                         f"{key} = {text} of finger {finger} may be {most:.6g} Pa, above the limit "
                         f"of {limit:.6g} Pa of its wall"
                     )
+                    yield schema.Problem("range", sentence)
                     break
                 if least < 0:
-                    yield f"{key} = {text} of finger {finger} may be {least:.6g} Pa, below zero"
+                    words = f"of finger {finger} may be {least:.6g} Pa, below zero"
+                    yield schema.Problem("range", f"{key} = {text} {words}")
                     break
 
 

@@ -49,7 +49,11 @@ def parse(pairs: Iterable[str]) -> dict[Path, Any]:
         path = _path(key.strip())
         if not equals or not all(path):
             shown = schema.shown(pair)
-            problems.append(f"--set {shown} must be KEY=VALUE, such as discretization.links=5")
+            problems.append(
+                schema.Problem(
+                    "syntax", f"--set {shown} must be KEY=VALUE, such as discretization.links=5"
+                )
+            )
         else:
             values.pop(path, None)  # values are applied in the order in which they were given
             values[path] = _toml_value(text)
@@ -79,13 +83,13 @@ def flatten(values: Mapping[Any, Any]) -> dict[Path, Any]:
     """Key paths of nested tables: {"solver": {"iterations": 5}} has ("solver", "iterations")."""
     if library.too_deep(values):
         deepest = library.DEEPEST
-        raise schema.InputError([f"values are nested more than {deepest} tables deep"])
+        raise schema.InputError.of("range", f"values are nested more than {deepest} tables deep")
     leaves: dict[Path, Any] = {}
     for key, value in values.items():
         path = _path(key) if isinstance(key, str) else key
         if not (isinstance(path, tuple) and path and all(isinstance(part, str) for part in path)):
-            raise schema.InputError(
-                [f"{schema.shown(key)} is no key path such as 'solver.iterations'"]
+            raise schema.InputError.of(
+                "syntax", f"{schema.shown(key)} is no key path such as 'solver.iterations'"
             )
         if isinstance(value, Mapping):
             leaves |= {path + rest: v for rest, v in flatten(value).items()}
@@ -102,7 +106,7 @@ def plain(value: Any, key: str) -> Any:
     """
     if isinstance(value, jax.core.Tracer):
         words = "is traced; dataclasses.replace puts traced numbers into a scene that was read"
-        raise schema.InputError([f"{key} {words}"])
+        raise schema.InputError.of("type", f"{key} {words}")
     if isinstance(value, pathlib.PurePath):
         return str(value)
     if isinstance(value, Mapping):
@@ -151,7 +155,7 @@ def _as_given(problem: str, longest: list[str], key_paths: Mapping[str, str]) ->
             parent = key.rpartition(".")[0]
             if parent:
                 hint = hint.replace("did you mean '", f"did you mean '{parent}.")
-            return key + unknown + hint
+            return schema.Problem.of(problem).told(key + unknown + hint)
     return problem
 
 
@@ -168,7 +172,11 @@ def _apply(
     rest = path[1:]
     key: Any = path[0]
     if len(rest) >= library.DEEPEST:
-        problems.append(f"{schema.shown('.'.join(path))} is no key: it has {len(path):,} parts")
+        problems.append(
+            schema.Problem(
+                "type", f"{schema.shown('.'.join(path))} is no key: it has {len(path):,} parts"
+            )
+        )
         return
     if isinstance(node, list):
         index = _index(node, key)
@@ -178,7 +186,9 @@ def _apply(
             return
         if index is None:
             hint = schema.nearest(key, _names(node))
-            problems.append(f"{place_name} has no entry {schema.shown(key)}; {hint}")
+            problems.append(
+                schema.Problem("unknown", f"{place_name} has no entry {schema.shown(key)}; {hint}")
+            )
             return
         # The schema names an entry by its index, other checks by its name.
         names = tuple(n + form for n in names for form in (f"[{index}]", f" {key}"))
@@ -187,7 +197,11 @@ def _apply(
         names = tuple(f"{name}.{key}" for name in names)
     else:
         value = schema.shown(node)
-        problems.append(f"{place_name} = {value} is no table: it has no key {schema.shown(key)}")
+        problems.append(
+            schema.Problem(
+                "type", f"{place_name} = {value} is no table: it has no key {schema.shown(key)}"
+            )
+        )
         return
     place_name += f"[{path[0]}]" if path[0].isdecimal() else "." * bool(place_name) + path[0]
     if not rest or (isinstance(node, dict) and key not in node):

@@ -45,18 +45,20 @@ def find(kind: str, name: str | Path) -> Path:
     if path.suffix == ".toml":
         if is_file(path):
             return path
-        raise schema.InputError([f"{kind}: no file {schema.shown(str(path))}"])
+        raise schema.InputError.of("missing", f"{kind}: no file {schema.shown(str(path))}")
     built_in = available(kind)
     if str(name) in built_in:
         return built_in[str(name)]
     if os.path.isdir(path) or path.suffix:  # never raises, as of a name that is too long
-        raise schema.InputError([f"{kind}: {schema.shown(str(path))} {_no_file(kind, path)}"])
+        raise schema.InputError.of(
+            "file", f"{kind}: {schema.shown(str(path))} {_no_file(kind, path)}"
+        )
     beside = path.with_name(path.name + ".toml") if path.name else path
     if is_file(beside):
         hint = f"did you mean the file {schema.shown(str(beside))}?"
     else:
         hint = schema.nearest(str(name), built_in)
-    raise schema.InputError([f"{kind}: {schema.shown(str(name))} unknown; {hint}"])
+    raise schema.InputError.of("unknown", f"{kind}: {schema.shown(str(name))} unknown; {hint}")
 
 
 def _no_file(kind: str, path: Path) -> str:
@@ -77,7 +79,7 @@ def is_file(path: Path) -> bool:
         return path.is_file()
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name, of some versions
         why = error.strerror if isinstance(error, OSError) else error
-        raise schema.InputError([f"{schema.shown(str(path))}: {why}"]) from error
+        raise schema.InputError.of("file", f"{schema.shown(str(path))}: {why}") from error
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -86,15 +88,17 @@ def read(path: Path) -> dict[str, Any]:
         with files.opened(path) as file:
             data = file.read(MOST_BYTES + 1)
     except OSError as error:
-        raise schema.InputError([f"{path.name}: {error.strerror}"]) from error
+        raise schema.InputError.of("file", f"{path.name}: {error.strerror}") from error
     if len(data) > MOST_BYTES:
-        raise schema.InputError([f"{path.name}: has more than {MOST_BYTES:,} bytes"])
+        raise schema.InputError.of("range", f"{path.name}: has more than {MOST_BYTES:,} bytes")
     if foreign := texts.foreign(data):
-        raise schema.InputError([f"{path.name}: {foreign}"])
+        raise schema.InputError.of("file", f"{path.name}: {foreign}")
     try:
         table = parse(data.decode("utf-8-sig"))
     except (ValueError, OverflowError, RecursionError) as error:
-        raise schema.InputError([f"{path.name}: not valid TOML: {why_not(error)}"]) from error
+        raise schema.InputError.of(
+            "syntax", f"{path.name}: not valid TOML: {why_not(error)}"
+        ) from error
     return table
 
 

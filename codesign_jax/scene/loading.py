@@ -126,10 +126,11 @@ def _draw_problems(scene: Scene, where: str) -> list[str]:
     modulus = any(entry.key == "hand.material.shear_modulus" for entry in table.constant)
     law = silicones.LAWS[bool(scene.effects.neo_hookean)]
     if modulus and table.law not in (None, law):
-        problems.append(
+        sentence = (
             f"{where}: the shear modulus of the constants is that of the law {table.law!r}, and "
             f"the scene has {law!r}"
         )
+        problems.append(schema.Problem("conflict", sentence))
     return problems
 
 
@@ -200,22 +201,27 @@ def _check(scene: SceneFile, where: str, problems: list[str]) -> None:
     for fixture in scene.fixture:
         problems += _fixture_problems(fixture, f"{where}.fixture {fixture.name}")
     if scene.discretization.hull_points % 4:
-        problems.append(
+        sentence = (
             f"{where}.discretization.hull_points = {scene.discretization.hull_points} "
             "must be a multiple of 4: every side of the section has as many"
         )
+        problems.append(schema.Problem("size", sentence))
 
 
 def _fixture_problems(fixture: Fixture, where: str) -> list[str]:
     sizes = PRIMITIVES[fixture.type].sizes if fixture.type in PRIMITIVES else ()
     problems = []
     if len(fixture.position) != 3:
-        problems.append(f"{where}: position must have three coordinates")
+        problems.append(schema.Problem("size", f"{where}: position must have three coordinates"))
     if len(fixture.size or ()) != len(sizes):
         words = f"{len(sizes)} values ({', '.join(sizes)})" if sizes else "no size"
-        problems.append(f"{where}: a {fixture.type} has {words}, not {list(fixture.size or ())}")
+        problems.append(
+            schema.Problem(
+                "size", f"{where}: a {fixture.type} has {words}, not {list(fixture.size or ())}"
+            )
+        )
     if fixture.orientation and (why := rigid_bodies.orientation_problem(fixture.orientation)):
-        problems.append(f"{where}: orientation {why}")
+        problems.append(schema.Problem("size", f"{where}: orientation {why}"))
     return problems
 
 
@@ -228,29 +234,37 @@ def check_together(scene: SceneFile, where: str) -> list[str]:
     times += [("disturb", p.disturb), ("ungrasp", p.ungrasp)]
     for (first, a), (second, b) in zip(times, times[1:], strict=False):
         if not a < b:
-            problems.append(f"{where}.phases.{second} = {b:g} s must come after {first} = {a:g} s")
+            problems.append(
+                schema.Problem(
+                    "order", f"{where}.phases.{second} = {b:g} s must come after {first} = {a:g} s"
+                )
+            )
     if p.ungrasp < p.disturb + p.deflate_time:
-        problems.append(
+        sentence = (
             f"{where}.phases.deflate_time = {p.deflate_time:g} s does not fit between "
             f"disturb = {p.disturb:g} s and ungrasp = {p.ungrasp:g} s"
         )
+        problems.append(schema.Problem("order", sentence))
     if scene.effects.lateral_threshold and not scene.effects.lateral_bending:
-        problems.append(
+        sentence = (
             f"{where}.effects.lateral_threshold = true resists sideways bending, which "
             "effects.lateral_bending = false leaves out"
         )
+        problems.append(schema.Problem("unsupported", sentence))
     if scene.effects.air_mass and scene.effects.lateral_threshold:
-        problems.append(
+        sentence = (
             f"{where}.effects.air_mass = true has a volume that sideways bending does not change, "
             "which effects.lateral_threshold = true says it does"
         )
+        problems.append(schema.Problem("unsupported", sentence))
     if isinstance(scene, Scene):
         problems += key_frames.check(scene, f"{where}.control")
         law = silicones.law_problem(scene.effects.neo_hookean, scene.hand.material, where)
         problems += [law] if law else []
     if isinstance(scene, Scene) and round(scene.end_time / h) != scene.num_steps:
-        problems.append(
+        sentence = (
             f"{where}.phases ends after {scene.end_time:g} s: the number of steps is structure, "
             f"{scene.num_steps} of {h:g} s"
         )
+        problems.append(schema.Problem("unsupported", sentence))
     return problems

@@ -267,10 +267,17 @@ def load(name: str | Path, *, overrides: Mapping[Any, Any] | None = None) -> Obj
     if parsed is None:
         raise schema.InputError(problems)
     if not parsed.object:
-        problems.append(f"{path.name}.object must name at least one object")
+        problems.append(
+            schema.Problem("missing", f"{path.name}.object must name at least one object")
+        )
     names = [shape.name for shape in parsed.object]
     for name in sorted({n for n in names if names.count(n) > 1}):
-        problems.append(f"{path.name}.object {name}: the name is given {names.count(name)} times")
+        problems.append(
+            schema.Problem(
+                "conflict",
+                f"{path.name}.object {name}: the name is given {names.count(name)} times",
+            )
+        )
     if too_large := _size_problems(parsed, path):
         raise schema.InputError(problems + too_large)
     shapes = [_shape(shape, path, problems) for shape in parsed.object]
@@ -295,17 +302,23 @@ def _key_problems(entry: _ShapeFile, where: str) -> list[str]:
     problems = []
     kind = entry.type
     if (entry.mass is None) == (entry.density is None):
-        problems.append(f"{where}: a {kind} has either a mass or a density")
+        problems.append(
+            schema.Problem("conflict", f"{where}: a {kind} has either a mass or a density")
+        )
     if entry.inertia is not None and entry.mass is None:
-        problems.append(f"{where}: inertia goes with a mass, not with a density")
+        problems.append(
+            schema.Problem("conflict", f"{where}: inertia goes with a mass, not with a density")
+        )
     if entry.pose is not None and entry.orientation is not None:
-        problems.append(f"{where}: give either orientation or pose")
+        problems.append(schema.Problem("conflict", f"{where}: give either orientation or pose"))
     if entry.orientation is not None and (
         why := rigid_bodies.orientation_problem(entry.orientation)
     ):
-        problems.append(f"{where}: orientation {why}")
+        problems.append(schema.Problem("size", f"{where}: orientation {why}"))
     if entry.centre_of_mass is not None and len(entry.centre_of_mass) != 3:
-        problems.append(f"{where}: centre_of_mass must have three coordinates")
+        problems.append(
+            schema.Problem("size", f"{where}: centre_of_mass must have three coordinates")
+        )
     if kind == "mesh":
         missing = ["file"] if entry.file is None else []
         foreign = ["size"] if entry.size is not None else []
@@ -314,15 +327,22 @@ def _key_problems(entry: _ShapeFile, where: str) -> list[str]:
         foreign = [k for k in _MESH_KEYS if getattr(entry, k) is not None]
         sizes = PRIMITIVES[kind].sizes
         if entry.size is not None and len(entry.size) != len(sizes):
-            problems.append(
+            sentence = (
                 f"{where}: size of a {kind} has {len(sizes)} values, not {len(entry.size)}"
                 f" ({', '.join(sizes)})"
             )
+            problems.append(schema.Problem("size", sentence))
         shifted = entry.centre_of_mass is not None
         if entry.inertia is not None and any(entry.inertia[3:]) and not shifted:
-            problems.append(f"{where}: inertia of a {kind} is xx, yy and zz in its own axes")
-    problems += [f"{where}: {key} of a {kind} is missing" for key in missing]
-    problems += [f"{where}: a {kind} has no {key}" for key in foreign]
+            problems.append(
+                schema.Problem(
+                    "size", f"{where}: inertia of a {kind} is xx, yy and zz in its own axes"
+                )
+            )
+    problems += [
+        schema.Problem("missing", f"{where}: {key} of a {kind} is missing") for key in missing
+    ]
+    problems += [schema.Problem("unknown", f"{where}: a {kind} has no {key}") for key in foreign]
     return problems
 
 
@@ -342,7 +362,7 @@ def _shape(entry: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
         else:
             shape = _primitive(values)
     except schema.InputError as error:  # a density that makes no mass within its range
-        problems += [f"{where}: {problem.removeprefix('shape.')}" for problem in error.problems]
+        problems += [p.told(f"{where}: {p.removeprefix('shape.')}") for p in error.problems]
         return None
     if shape is None:
         return None
@@ -352,7 +372,9 @@ def _shape(entry: _ShapeFile, path: Path, problems: list[str]) -> Shape | None:
     if entry.pose is not None:
         resting = rigid_bodies.chosen(entry.pose, shape.resting)
         if isinstance(resting, str):
-            problems.append(f"{where}: pose = {schema.shown(entry.pose)} {resting}")
+            problems.append(
+                schema.Problem("range", f"{where}: pose = {schema.shown(entry.pose)} {resting}")
+            )
             return None
         # Written back as an orientation, so that another trimesh reads the same object.
         shape = dataclasses.replace(shape, pose=None, orientation=resting.orientation)
@@ -406,7 +428,7 @@ def _mesh_shape(
             content=content,
         )
     except schema.InputError as error:
-        problems += [f"{where}: {p}" for p in error.problems]
+        problems += [p.told(f"{where}: {p}") for p in error.problems]
         return None
     # Written back as a mass, so that the same file read again gives the same object.
     mass = values["density"] * mesh.volume if mass is None else mass

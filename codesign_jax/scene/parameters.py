@@ -254,15 +254,17 @@ class DesignSpace:
         units = [UNITS[unit][0] for unit in self.units]
         problems = self._outside(units, self.low, self.high, rows)
         if above := self._above_the_limit(rows):
-            problems.append(
+            sentence = (
                 f"{above} of {len(rows)} designs with a pressure above the limit of the wall, to "
                 "which space.project lowers it"
             )
+            problems.append(schema.Problem("range", sentence))
         if several := self._off_the_lines(rows):
-            problems.append(
+            sentence = (
                 f"{several} of {len(rows)} designs with more pressures than the hand's "
                 f"{self.hand.valves.lines} lines, which space.project groups"
             )
+            problems.append(schema.Problem("conflict", sentence))
         if problems:
             text = f"designs that are not legal, simulated all the same: {'; '.join(problems)}"
             warnings.warn(text, stacklevel=3)
@@ -320,8 +322,8 @@ class DesignSpace:
         if np.ndim(population) != 2:
             shape = np.shape(population)
             hint = "; population[None] makes a batch of one" if len(shape) == 1 else ""
-            raise schema.InputError(
-                [f"population has shape {shape}, not (particle, parameter){hint}"]
+            raise schema.InputError.of(
+                "size", f"population has shape {shape}, not (particle, parameter){hint}"
             )
         self._refuse_shape(population, "particle, ")
 
@@ -331,8 +333,8 @@ class DesignSpace:
         if shape[-1:] != (count,) or (not leading and len(shape) > 1):
             names = ", ".join(self.names)
             hint = "; jax.vmap maps over designs" if not leading and len(shape) > 1 else ""
-            raise schema.InputError(
-                [f"designs have shape {shape}, not ({leading}{count},): {names}{hint}"]
+            raise schema.InputError.of(
+                "size", f"designs have shape {shape}, not ({leading}{count},): {names}{hint}"
             )
 
     def default(self) -> np.ndarray:
@@ -484,7 +486,7 @@ def _representable(space: DesignSpace) -> tuple[np.ndarray, np.ndarray]:
 
 def _refuse_draws(key: Any, n: Any) -> None:
     if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
-        raise schema.InputError([f"n = {n!r} designs must be a whole number, at least 1"])
+        raise schema.InputError.of("range", f"n = {n!r} designs must be a whole number, at least 1")
     if problem := random_key_problem(key):
         raise schema.InputError([problem])
 
@@ -543,7 +545,9 @@ def design_space(hand: Hand, preset: str = "full") -> DesignSpace:
         known = {p.name: p for p in hand.preset}
         if preset not in known:
             hint = _hint(preset, [*known, "full", f"{total}d"])
-            raise schema.InputError([f"preset {preset!r} unknown for hand {hand.name}; {hint}"])
+            raise schema.InputError.of(
+                "unknown", f"preset {preset!r} unknown for hand {hand.name}; {hint}"
+            )
         chosen = known[preset]
     return _build(hand, chosen, everything=chosen.whole)
 
@@ -650,7 +654,7 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
     if not columns:
         reasons = "; ".join(f"{name} has no effect: {why}" for name, why in idle.items())
         words = f"preset {preset.name!r} of hand {hand.name} leaves nothing to search"
-        raise schema.InputError([f"{words}: {reasons}"])
+        raise schema.InputError.of("missing", f"{words}: {reasons}")
     names, units, scale, low, high, domain = zip(*columns, strict=True)
     space = DesignSpace(
         _table_alone(hand),
@@ -697,17 +701,30 @@ def _refuse_unlike_fingers(space: DesignSpace, where: str) -> None:
     for group in valves.known(count):
         line = [*group]
         if not free and np.ptp(fixed[line]) > 0:
-            problems.append(f"{where} fixes unlike pressures of fingers {line} of one line")
+            problems.append(
+                schema.Problem(
+                    "conflict", f"{where} fixes unlike pressures of fingers {line} of one line"
+                )
+            )
         if free and low[line].max() >= high[line].min():
-            problems.append(f"{where}: fingers {line} of one line have no pressure in common")
+            problems.append(
+                schema.Problem(
+                    "conflict", f"{where}: fingers {line} of one line have no pressure in common"
+                )
+            )
     if lines := valves.searched(count):
         if not free and len(np.unique(fixed)) > lines:
-            problems.append(f"{where} fixes more pressures than valves.lines = {lines}")
-        if free and (np.ptp(low) > 0 or np.ptp(high) > 0):
             problems.append(
+                schema.Problem(
+                    "conflict", f"{where} fixes more pressures than valves.lines = {lines}"
+                )
+            )
+        if free and (np.ptp(low) > 0 or np.ptp(high) > 0):
+            sentence = (
                 f"{where}: valves.lines = {lines} needs pressures with the same bounds for all "
                 "fingers; give valves.groups instead"
             )
+            problems.append(schema.Problem("unsupported", sentence))
     if problems:
         raise schema.InputError(problems)
 

@@ -22,6 +22,7 @@ import numpy as np
 from codesign_jax import terminal
 from codesign_jax.scene import texts
 from codesign_jax.scene.texts import SHOWN, shown
+from codesign_jax.scene.texts import Problem as Problem
 
 T = TypeVar("T")
 
@@ -51,7 +52,7 @@ class InputError(ValueError):
     """Bad input, with all of its problems.
 
     Attributes:
-      problems: One message for each problem found.
+      problems: Each problem that was found, a sentence with `code` and `key`, see `Problem`.
 
     >>> from codesign_jax import InputError, scene
     >>> try:
@@ -62,10 +63,16 @@ class InputError(ValueError):
     gravity = -1 is outside [0, 100] m/s^2
     """
 
-    def __init__(self, problems: list[str]):
+    def __init__(self, problems: typing.Sequence[str]):
         """Joins the problems into one message, a line each."""
-        self.problems = [terminal.line(problem) for problem in problems]
+        every = map(Problem.of, problems)
+        self.problems = [problem.told(terminal.line(problem)) for problem in every]
         super().__init__("\n".join(self.problems))
+
+    @classmethod
+    def of(cls, code: str, problem: str) -> "InputError":
+        """The error of one problem, by its kind (`texts.CODES`)."""
+        return cls([Problem(code, problem)])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,10 +165,10 @@ def _slips(unit: str) -> typing.Iterator[tuple[float, str]]:
         yield 10.0 ** (_CENTI - power_of_unit), f"cm{rest} given where {unit} is expected"
 
 
-def range_problem(path: str, value: float, unit: str, low: float, high: float) -> str | None:
+def range_problem(path: str, value: float, unit: str, low: float, high: float) -> Problem | None:
     """Returns why a value lies outside its range, or None."""
     words = range_words(value, unit, low, high)
-    return f"{path} = {shown(value)} {words}" if words else None
+    return Problem("range", f"{path} = {shown(value)} {words}") if words else None
 
 
 def range_words(value: float, unit: str, low: float, high: float) -> str | None:
@@ -178,7 +185,8 @@ def field_problem(path: str, value: float, cls: type, name: str) -> str | None:
     limits = next(_range(field) for field in dataclasses.fields(cls) if field.name == name)
     if limits.low <= value <= limits.high:
         return None
-    return f"{path} = {value:g} is outside [{limits.low:g}, {limits.high:g}] {limits.unit}".rstrip()
+    words = f"is outside [{limits.low:g}, {limits.high:g}] {limits.unit}".rstrip()
+    return Problem("range", f"{path} = {value:g} {words}")
 
 
 @functools.cache
@@ -190,23 +198,31 @@ def _hints(cls: type) -> dict[str, Any]:
 def parse(cls: type[T], table: Any, path: str, problems: list[str]) -> T | None:
     """Builds a frozen dataclass from a TOML table, appending every problem to `problems`."""
     if not isinstance(table, dict):
-        problems.append(f"{path} must be a table, not {type(table).__name__}")
+        problems.append(Problem("type", f"{path} must be a table, not {type(table).__name__}"))
         return None
     before = len(problems)
     fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     hints = _hints(cls)
     unknown = [key for key in table if key not in fields]
     for key in unknown[:_UNKNOWN]:
-        problems.append(f"{path}.{key[:SHOWN]} is not a known key; {nearest(key, fields)}")
+        problems.append(
+            Problem("unknown", f"{path}.{key[:SHOWN]} is not a known key; {nearest(key, fields)}")
+        )
     if len(unknown) > _UNKNOWN:
-        problems.append(f"{path} has {len(unknown) - _UNKNOWN:,} more unknown keys")
+        problems.append(
+            Problem("unknown", f"{path} has {len(unknown) - _UNKNOWN:,} more unknown keys")
+        )
     values = {}
     for name, field in fields.items():
         if name in table:
             values[name] = _value(hints[name], table[name], f"{path}.{name}", field, problems)
         elif _required(field):
             unit = field.metadata.get("unit", "")
-            problems.append(f"{path}.{name} is missing" + (f" (unit {unit})" if unit else ""))
+            problems.append(
+                Problem(
+                    "missing", f"{path}.{name} is missing" + (f" (unit {unit})" if unit else "")
+                )
+            )
     return cls(**values) if len(problems) == before else None
 
 
@@ -275,7 +291,7 @@ def _known_problem(path: str, value: Any, field: dataclasses.Field[Any]) -> str 
         entry_problems = (_known_problem(f"{path}[{i}]", v, field) for i, v in enumerate(value))
         return next(filter(None, entry_problems), None)
     if isinstance(value, bool | str):
-        return f"{path} = {shown(value)} must be {_kind(float, field)}"
+        return Problem("type", f"{path} = {shown(value)} must be {_kind(float, field)}")
     known = isinstance(value, int | float | np.number | np.ndarray)
     if isinstance(value, jax.Array) and not isinstance(value, jax.core.Tracer):
         known = value.is_fully_addressable
@@ -352,10 +368,12 @@ def _value(
         hint = many[0] if many and isinstance(value, list) else kinds[0]
     if typing.get_origin(hint) is tuple:
         if not isinstance(value, list):
-            problems.append(f"{path} must be an array, not {type(value).__name__}")
+            problems.append(Problem("type", f"{path} must be an array, not {type(value).__name__}"))
             return None
         if len(value) > MOST_ENTRIES:
-            problems.append(f"{path} has {len(value):,} entries, more than {MOST_ENTRIES:,}")
+            problems.append(
+                Problem("range", f"{path} has {len(value):,} entries, more than {MOST_ENTRIES:,}")
+            )
             return None
         item = typing.get_args(hint)[0]
         return tuple(_value(item, v, f"{path}[{i}]", field, problems) for i, v in enumerate(value))
@@ -363,7 +381,7 @@ def _value(
         return parse(hint, value, path, problems)  # type: ignore[arg-type]
     if typing.get_origin(hint) is dict:
         if not isinstance(value, dict):
-            problems.append(f"{path} must be a table, not {type(value).__name__}")
+            problems.append(Problem("type", f"{path} must be a table, not {type(value).__name__}"))
         return value
     return _scalar(hint, value, path, field, problems)
 
@@ -373,7 +391,7 @@ def _scalar(
 ) -> Any:
     accepted = (int, float) if hint is float else hint
     if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):
-        problems.append(f"{path} = {shown(value)} must be {_kind(hint, field)}")
+        problems.append(Problem("type", f"{path} = {shown(value)} must be {_kind(hint, field)}"))
         return None
     if isinstance(value, str):
         problem = texts.problem(path, value, lines=field.name == "description")
@@ -382,7 +400,11 @@ def _scalar(
             return None
     options = field.metadata.get("options")
     if options and value not in options:
-        problems.append(f"{path} = {shown(value)} is not valid; {nearest(str(value), options)}")
+        problems.append(
+            Problem(
+                "unknown", f"{path} = {shown(value)} is not valid; {nearest(str(value), options)}"
+            )
+        )
     if "low" in field.metadata and not isinstance(value, str):
         problem = range_problem(path, value, *dataclasses.astuple(_range(field)))
         if problem:
@@ -391,7 +413,7 @@ def _scalar(
     try:
         return float(value) if hint is float else value
     except OverflowError:
-        problems.append(f"{path} = {shown(value)} is too large")
+        problems.append(Problem("range", f"{path} = {shown(value)} is too large"))
         return None
 
 

@@ -172,7 +172,7 @@ def get(name: str) -> Silicone:
       InputError: If there is none; the message lists those that there are.
     """
     if name not in SILICONES:
-        raise schema.InputError([f"silicone {schema.shown(name)} {_unknown()}"])
+        raise schema.InputError.of("unknown", f"silicone {schema.shown(name)} {_unknown()}")
     return SILICONES[name]
 
 
@@ -216,18 +216,21 @@ def complete(table: dict[str, Any], where: str, problems: list[str]) -> None:
     path = f"{where}.material"
     known = isinstance(name, str) and name in SILICONES
     if not known:
-        problems.append(f"{path}.silicone = {schema.shown(name)} {_unknown()}")
+        problems.append(
+            schema.Problem("unknown", f"{path}.silicone = {schema.shown(name)} {_unknown()}")
+        )
         material["silicone"] = name = next(iter(SILICONES))  # for the other problems of the file
     mine = SILICONES[name]
     pair = [key for key in ("shear_modulus", "law") if key in material]
     if known and len(pair) == 1:
         [key] = pair
         other = "law" if key == "shear_modulus" else "shear_modulus"
-        problems.append(
+        sentence = (
             f"{path}.{key} = {schema.shown(material[key])} stands beside silicone = {name!r}, "
             f"which has {mine.shear_modulus / 1e3:g} kPa under the law {mine.law!r}: a modulus "
             f"belongs to its law; give {other} as well, or leave one of the two out"
         )
+        problems.append(schema.Problem("conflict", sentence))
     for key in _GIVEN:
         material.setdefault(key, getattr(mine, key))
 
@@ -243,11 +246,12 @@ def law_problem(neo_hookean: bool | None, material: Any, where: str) -> str | No
     if neo_hookean is None or material.law is None or of_law(material.law) == neo_hookean:
         return None
     source = f" (silicone {material.silicone!r})" if material.silicone else ""
-    return (
+    sentence = (
         f"{where}.effects.neo_hookean = {str(neo_hookean).lower()} stands against "
         f"hand.material.law = {material.law!r}{source}: a modulus belongs to its law; leave out "
         "effects.neo_hookean, or give hand.material.law and hand.material.shear_modulus"
     )
+    return schema.Problem("conflict", sentence)
 
 
 def under(scene: Any, *, neo_hookean: bool) -> Any:

@@ -73,7 +73,7 @@ def slips(name: str, row: str, values: np.ndarray) -> list[str]:
     for value in outside.ravel()[:1]:
         if schema.unit_slip(float(value), kind.unit, kind.low, kind.high):
             problem = schema.range_problem(name, _plain(value), kind.unit, kind.low, kind.high)
-            return [f"{problem}; Python takes SI units and radians"]
+            return [schema.Problem("range", f"{problem}; Python takes SI units and radians")]
     return []
 
 

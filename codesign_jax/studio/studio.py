@@ -90,7 +90,7 @@ class Studio:
         try:
             listening = server.listen(self.guard, self.serve, host, port)
         except OSError as error:
-            raise InputError([f"--host {host} --port {port}: {error.strerror}"]) from error
+            raise InputError.of("file", f"--host {host} --port {port}: {error.strerror}") from error
         named = socket.gethostname() if host in ("0.0.0.0", "::") else host
         named = f"[{named}]" if ":" in named else named
         port = listening.socket.getsockname()[1]

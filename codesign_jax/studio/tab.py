@@ -296,7 +296,7 @@ class Tab:
 
     def _current(self) -> ShownGrasp:
         if self._shown is None:
-            raise InputError(["there is no grasp of this design; move a slider"])
+            raise InputError.of("missing", "there is no grasp of this design; move a slider")
         return self._shown
 
     def _of_run(self, numbers: list[int] | None) -> None:
@@ -339,7 +339,7 @@ class Tab:
 
     def _report(self) -> None:
         if self._desk.options.run_folder is None:
-            raise InputError(["there is no run to report"])
+            raise InputError.of("missing", "there is no run to report")
         self._command("report", str(self._desk.options.run_folder))
 
     def _command(self, *words: str) -> None:

@@ -42,7 +42,7 @@ class Side:
     def __init__(self, source: Path, *, double: bool = False):
         """Starts the process; double: in float64."""
         environment = os.environ | {
-            "PYTHONPATH": str(source),
+            "PYTHONPATH": os.pathsep.join([str(source), *os.environ.get("PYTHONPATH", "").split()]),
             "JAX_ENABLE_X64": str(int(double)),
             # Compile times are measured, and two processes share a GPU.
             "JAX_ENABLE_COMPILATION_CACHE": "false",

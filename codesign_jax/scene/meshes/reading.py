@@ -55,18 +55,22 @@ class Read(NamedTuple):
 def read(path: Path) -> Read:
     """Reads a mesh file of one of `FORMATS`."""
     if not library.is_file(path):
-        raise InputError([f"no file {shown(str(path))}"])
+        raise InputError.of("missing", f"no file {shown(str(path))}")
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
         valid = ", ".join(f".{name}" for name in FORMATS)
-        raise InputError([f"{path.name}: is no mesh file that is read; valid: {valid}"])
+        raise InputError.of(
+            "unsupported", f"{path.name}: is no mesh file that is read; valid: {valid}"
+        )
     try:
         with files.opened(path) as file:
             content = file.read(MOST_BYTES + 1)
     except OSError as error:
-        raise InputError([f"{path.name}: {error.strerror}"]) from error
+        raise InputError.of("file", f"{path.name}: {error.strerror}") from error
     if len(content) > MOST_BYTES:
-        raise InputError([f"{path.name}: has more than {MOST_BYTES >> 20} MiB; use fewer faces"])
+        raise InputError.of(
+            "range", f"{path.name}: has more than {MOST_BYTES >> 20} MiB; use fewer faces"
+        )
     return parsed(path, content)
 
 
@@ -74,14 +78,14 @@ def parsed(path: Path, content: bytes) -> Read:
     """The mesh in a file of this name and content."""
     kind = path.suffix.lower().removeprefix(".")
     if foreign := texts.foreign(content):
-        raise InputError([f"{path.name}: {foreign}"])
+        raise InputError.of("file", f"{path.name}: {foreign}")
     try:
         vertices, faces = _parse(content.removeprefix(codecs.BOM_UTF8), kind)
     except Exception as error:  # every format has its own parser with its own exceptions
         why = shown(str(error))[1:-1] or type(error).__name__
-        raise InputError([f"{path.name}: cannot be read as a mesh: {why}"]) from error
+        raise InputError.of("syntax", f"{path.name}: cannot be read as a mesh: {why}") from error
     if problem := _problem(vertices, faces):
-        raise InputError([f"{path.name}: {problem}"])
+        raise InputError.of("geometry", f"{path.name}: {problem}")
     return Read(vertices, faces, content, hashlib.sha256(content).hexdigest())
 
 

@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 
 from codesign_jax.scene.hand_tables import LEAST_REACH
 from codesign_jax.scene.meshes import grid, mass, reading, repair, support, surface
-from codesign_jax.scene.schema import InputError
+from codesign_jax.scene.schema import InputError, Problem
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 # longest side of the bounding box [m]
@@ -81,7 +81,7 @@ class Solid:
         except ValueError as error:
             # Of parts that overlap their walls are too close together, not the body too large.
             self._refuse_overlap()
-            raise InputError([f"{self.path.name}: {error}"]) from error
+            raise InputError.of("geometry", f"{self.path.name}: {error}") from error
         # Where parts overlap, the mesh counts a volume twice and the distance has inner walls.
         filled = np.clip(0.5 - built.values / built.cell, 0.0, 1.0).sum() * built.cell**3
         # A body that is thin for the cells fills another volume too.
@@ -94,12 +94,11 @@ class Solid:
         points = grid.near_surface(self.vertices, self.faces, 400, 1e-5 * self.radius)
         inside = float((surface.winding(self.vertices, self.faces, points) > 0.5).mean())
         if inside > 0.02:
-            raise InputError(
-                [
-                    f"{self.path.name}: the surface cuts through itself, as of parts that overlap: "
-                    f"{100 * inside:.0f} % of it lie inside the body. Unite the parts in the "
-                    "program that made them"
-                ]
+            raise InputError.of(
+                "geometry",
+                f"{self.path.name}: the surface cuts through itself, as of parts that overlap: "
+                f"{100 * inside:.0f} % of it lie inside the body. Unite the parts in the "
+                "program that made them",
             )
 
 
@@ -130,11 +129,13 @@ def load(
             vertices, faces, repairs = repair.repair(vertices, faces)
         problems += surface_problems(vertices, faces, repaired)
     if problems:
-        raise InputError([f"{path.name}: {p}" for p in problems])
+        raise InputError([Problem("geometry", f"{path.name}: {p}") for p in problems])
     vertices = vertices * UNITS[unit]
     if centre is not None and not _inside(vertices, centre):
         point = ", ".join(f"{1e3 * v:g}" for v in centre)
-        raise InputError([f"{path.name}: centre_of_mass at {point} mm is outside its convex hull"])
+        raise InputError.of(
+            "geometry", f"{path.name}: centre_of_mass at {point} mm is outside its convex hull"
+        )
     body = mass.body(vertices, faces, centre, tensor)
     options = f"{unit} {repaired} {voxel_error!r}"
     if centre is not None or tensor is not None:  # others keep the grids that they have on disk
@@ -181,20 +182,26 @@ def surface_problems(vertices: np.ndarray, faces: np.ndarray, repaired: bool = F
     )[1:]
     problems = []
     if (count == 1).any():
-        problems.append(f"not watertight: {(count == 1).sum()} edges belong to one face only")
+        problems.append(
+            Problem(
+                "geometry", f"not watertight: {(count == 1).sum()} edges belong to one face only"
+            )
+        )
     if (count > 2).any():
-        problems.append(f"{(count > 2).sum()} edges belong to more than two faces")
+        problems.append(
+            Problem("geometry", f"{(count > 2).sum()} edges belong to more than two faces")
+        )
     forward = np.bincount(
         edge_numbers.reshape(-1), weights=np.where(edges[:, 0] < edges[:, 1], 1, -1)
     )
     if clashing := int(((count == 2) & (forward != 0)).sum()):
-        problems.append(f"faces point to different sides at {clashing} edges")
+        problems.append(Problem("geometry", f"faces point to different sides at {clashing} edges"))
     a, b, c = (vertices[faces[:, k]] - vertices.mean(0) for k in range(3))
     volume = np.einsum("fi,fi", a, np.cross(b, c)) / 6
     smallest = 1e-6 * np.ptp(vertices, axis=0).max() ** 3
     if not problems and volume < -smallest:
-        problems.append("inside out: its faces point inwards")
+        problems.append(Problem("geometry", "inside out: its faces point inwards"))
     elif not problems and volume < smallest:
-        problems.append("encloses no volume")
+        problems.append(Problem("geometry", "encloses no volume"))
     hint = "; even after the repair" if repaired else "; repair = true tries to mend it"
     return [p + hint for p in problems]

@@ -61,7 +61,7 @@ def tables(scene: Scene) -> MeshTables | None:
             grids[i] = shape.mesh.grid
             supports[i] = shape.mesh.support
         except InputError as error:
-            problems += [f"object {shape.name!r}: {p}" for p in error.problems]
+            problems += [p.told(f"object {shape.name!r}: {p}") for p in error.problems]
     if problems:
         raise InputError(problems)
     if not grids:

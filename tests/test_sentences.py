@@ -1,0 +1,96 @@
+"""What is said of bad input, word by word: one golden file, data/sentences.txt.
+
+    python -m tests.test_sentences     # writes it, after a change of words
+
+Other tests assert kind and key of a problem (helpers/refusals.py), so that words may change here.
+"""
+
+from pathlib import Path
+
+from codesign_jax import parameters, scene
+from codesign_jax.engines import make_engine
+from codesign_jax.scene import InputError, hand, keypaths, schema, silicones, sums
+
+GOLDEN = Path(__file__).parent / "data" / "sentences.txt"
+OVERRIDES = (
+    "gravity=-1",
+    "gravity=three",
+    "gravty=3",
+    "discretization.links=10.0",
+    "hand.section.width=18",
+    "hand.palm.mass=250",
+    "hand.material=5",
+    "hand.material=dragonskin",
+    "hand.material.law=mooney_rivlin",
+    "hand.material.shear_modulus=60e3",
+    "hand.finger.0.base=[37, 0]",
+    "hand.finger.0.bse=1",
+    "hand.finger.9.tilt=1",
+    "hand.section.tapered=true",
+    "hand.preset.2d.fixed.pressure=[120, 110]",
+    "hand.preset.2d.fixed.wall=2.5",
+    "objects.object.spher.mass=1",
+    "objects.object.sphere.size=[0.03, 0.04]",
+    "objects.object.sphere.density=1000",
+    "phases.lift=3.0",
+    "phases.disturb=8.8",
+    "cost.failure=ignore",
+    "control.frame.1.time=approach - 9",
+    "control.frame.1.z=arm_w",
+    "control.frame.1.z=pressure",
+)
+SUMS = ("2 * (arm_z)", "arm_z -", "arm_z - 0,01", "30°", "150 kPa", "1e3 * arm_z", "95")
+CALLS = {
+    "a file that there is not": lambda: hand.load("nowhere/hand.toml"),
+    "a misspelt hand": lambda: hand.load("pneuflex"),
+    "a misspelt silicone": lambda: silicones.get("ecoflex"),
+    "a pair without a value": lambda: keypaths.parse(["gravity"]),
+    "a misspelt engine": lambda: make_engine("mujocco", scene.load("paper")),
+    "a name for a scene": lambda: make_engine("mujoco", "paper"),  # type: ignore[arg-type]
+    "a misspelt preset": lambda: parameters.design_space(scene.load("paper").hand, "24d"),
+    "a field with control characters": lambda: scene.load("paper\x1b[2J"),
+}
+
+
+def told(call) -> list[str]:
+    """The sentences of what a call refuses."""
+    try:
+        call()
+    except InputError as error:
+        return [f"[{problem.code}] {problem}" for problem in error.problems]
+    return []
+
+
+def sentences() -> str:
+    """All cases, each with what is said."""
+    said = {}
+    for pair in OVERRIDES:
+        changes = keypaths.parse([pair])
+        said[pair] = told(lambda changes=changes: scene.load("paper", overrides=changes))
+    said |= {f"the sum {text}": [str(sums.read(text, "m"))] for text in SUMS}
+    said |= {name: told(call) for name, call in CALLS.items()}
+    assert all(said.values())
+    blocks = ["\n".join([name, *(f"    {line}" for line in lines)]) for name, lines in said.items()]
+    return "\n".join(blocks) + "\n"
+
+
+def test_sentences_are_those_of_the_golden_file():
+    again = "python -m tests.test_sentences"
+    assert sentences() == GOLDEN.read_text(encoding="utf-8"), again
+
+
+def test_what_a_problem_is_about_begins_its_sentence():
+    cases = {
+        "gravity = -1 is outside [0, 100]": "gravity",
+        "hand.finger[0].bse is not a known key": "hand.finger[0].bse",
+        "hands.toml.preset 2d.fixed.pressure = [1] must be": "hands.toml.preset 2d.fixed.pressure",
+        "object a: open.off: not watertight": "object a",
+        "params have no axis (world,)": "params",
+        "its surface does not close": "",
+    }
+    for sentence, key in cases.items():
+        assert schema.Problem("invalid", sentence).key == key
+
+
+if __name__ == "__main__":
+    GOLDEN.write_text(sentences(), encoding="utf-8")

@@ -163,7 +163,8 @@ def test_a_full_disk_names_the_file_that_could_not_be_written(name, run, monkeyp
     report = ["report", run, "--no-replay"]
     assert command(*(report if name == "report.html" else [*RUN, "--out", run])) == 1
     error = capsys.readouterr().err
-    assert error.startswith(f"error: {run / name}: No space left on device; make room, and give")
+    last = error.splitlines()[-1]  # behind what a slow machine says of its waits
+    assert last.startswith(f"error: {run / name}: No space left on device; make room, and give")
     assert error.count("\n") == 1
 
 

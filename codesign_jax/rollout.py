@@ -280,8 +280,8 @@ def tips(scene: Scene, params: Params, trial: Trial, qpos: jax.typing.ArrayLike)
     Raises:
       InputError: If the positions are not those of this scene's hand and object, and as `simulate`.
     """
-    batch = jax.tree.map(lambda v: jnp.asarray(v)[None], (params, trial))
-    axes.refuse(scene, *batch, ("world", "world"))
+    hands, trials = jax.tree.map(lambda v: jnp.asarray(v)[None], (params, trial))
+    axes.refuse(scene, hands, trials, ("world", "world"))
     size = 13 + layout(scene).dofs.size  # of wrist, joints and the object's pose
     if jnp.shape(qpos)[-1:] != (size,):
         hint = "record_qpos=True records it" if jnp.shape(qpos)[-1:] == (0,) else "of this scene"

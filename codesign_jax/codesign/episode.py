@@ -151,6 +151,7 @@ class Task:
             raise InputError([problem + hint])
         self.space.refuse_population(population)
         self.space.check(population)
+        self.scene.checked(scene)
         population = jnp.asarray(population)
         if _is_whole(population, key, scene):
             return SceneProgram(self.scene, self._programs.evaluate)(population, key, scene)
@@ -201,6 +202,7 @@ class Task:
             is one number.
         """
         _refuse_state(state)
+        self.scene.checked(scene)
         mask = np.ones(self.space.num_parameters, bool) if mask is None else mask
         if _is_whole((state, mask), optimizer, scene):
             return self._joined(self._programs.episode, optimizer)(state, mask, scene)

@@ -230,6 +230,9 @@ def test_it_lifts_shakes_and_releases(pneuflex):
 def test_bad_designs_drop_every_object(pneuflex, index):
     """Too short, without pressure, too high, or beside the object: lost as the hand lifts."""
     the_scene, outcome, trace = pneuflex
-    np.testing.assert_array_equal(outcome.status[index], Status.OK)
+    status = np.asarray(outcome.status[index])
+    assert np.isin(status, [Status.OK, Status.UNMOVED]).all()
+    if index == 3:  # too high to touch anything
+        assert (status == Status.UNMOVED).all()
     assert (outcome.cost[index] > 2.0).all()
     assert (outcome.lost_time[index] < the_scene.phases.lift).all()

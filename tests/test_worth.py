@@ -6,9 +6,10 @@ import jax
 import numpy as np
 import pytest
 
-from codesign_jax import rollout, scene
+from codesign_jax import model, rollout, scene
 from codesign_jax.judge import stress, verdict, worth
 from codesign_jax.judge.cases import Case
+from codesign_jax.model.fields import AWAY
 from codesign_jax.runs import reference
 from codesign_jax.scene import parameters
 from codesign_jax.scene.schema import InputError
@@ -50,6 +51,16 @@ def test_an_absent_finger_is_as_none(engine, within):
         ours, theirs, other = (np.asarray(getattr(t, name)) for t in (absent, none, present))
         np.testing.assert_allclose(ours, theirs, atol=within, err_msg=name)
         assert abs(other - theirs).max() > 1e-3, "the finger would be seen"
+
+
+@pytest.mark.parametrize("length", [np.nan, -0.1])
+def test_a_length_that_is_none_is_no_absent_finger(length):
+    """It stays what it is, and the world is refused."""
+    bad = np.asarray(PARAMS.length).copy()
+    bad[1] = length
+    fields = model.model_fields(PAPER, PARAMS._replace(length=bad), grasps.still())
+    assert not np.allclose(fields.base[1], AWAY)
+    assert float(fields.share[1]) == 1.0 and not (np.asarray(fields.mass[1]) > 0).all()
 
 
 def test_a_hand_without_fingers_has_the_numbers_of_the_others():

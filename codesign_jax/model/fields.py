@@ -149,7 +149,7 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
     """
     lay = layout(scene)
     dtype = params.length.dtype
-    present = params.length > 0
+    present = params.length != 0  # what is no number, or below 0, is refused as such
     params = params._replace(length=jnp.where(present, params.length, ABSENT))
     scene = _in_type(with_trial(scene, trial), dtype)
     beam = morphology.finger_beams(scene.hand, params, lay.links)

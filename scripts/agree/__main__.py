@@ -33,7 +33,7 @@ HARD = sides.ROOT / "docs" / "data" / "search" / "hard.npz"
 # Both solved to rounding (worker.EXACT), grasps to the end of the lift agree within 1e-8; a
 # difference in a formula of a contact or a joint is larger than a micrometre or a microradian.
 TRACE_BOUND = 1e-6
-TRACE_STEPS = 60
+TRACE_STEPS = 300
 # Differences of 1e-6 of a range lose up to 1e-5 where a contact begins in between.
 GRADIENT_BOUND = 1e-4
 

@@ -143,8 +143,30 @@ def _replay(*values: Any, program: StraightLine) -> list[Any]:
 
 
 def _jvp(primals: Any, tangents: Any, *, program: StraightLine) -> Any:
-    tangents = tuple(map(ad.instantiate_zeros, tangents))
-    return jax.jvp(partial(_replay, program=program), tuple(primals), tangents)
+    """Of floats alone: the tangents of other types are no numbers that a kernel could have."""
+    moving = [
+        k
+        for k, (value, tangent) in enumerate(zip(primals, tangents, strict=True))
+        if type(tangent) is not ad.Zero and _has_derivative(value)
+    ]
+
+    def run(*values: Any) -> tuple[list[Any], list[Any]]:
+        arguments = dict(enumerate(primals)) | dict(zip(moving, values, strict=True))
+        results = _replay(*arguments.values(), program=program)
+        return [r for r in results if _has_derivative(r)], results
+
+    given = [tuple(of[k] for k in moving) for of in (primals, tangents)]
+    _, slopes, results = jax.jvp(run, *given, has_aux=True)
+    rest = iter(slopes)
+    return results, [next(rest) if _has_derivative(r) else _no_tangent(r) for r in results]
+
+
+def _has_derivative(value: Any) -> bool:
+    return np.issubdtype(value.dtype, np.floating)
+
+
+def _no_tangent(value: Any) -> Any:
+    return ad.Zero(jax.typeof(value).to_tangent_aval())
 
 
 def _batched(values: Any, axes: Any, *, program: StraightLine) -> tuple[list[Any], list[int]]:

@@ -2,7 +2,6 @@
 
 import ast
 import functools
-import re
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -153,14 +152,6 @@ def test_what_stands_on_an_engine_knows_its_interface_alone():
 def test_every_part_of_the_package_has_its_layer():
     parts = {layer(name.split(".")) for name in modules() if name.startswith("codesign_jax.")}
     assert parts == set(ORDER)
-
-
-def test_the_map_of_contributing_has_the_same_order():
-    """Its rows are the lines of `LAYERS`."""
-    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    table = text.split("of `codesign_jax` | content |\n|---|---|\n")[1].split("\n\n")[0]
-    named = [re.findall(r"`([a-z_.]+)/?`", row.split("|")[1]) for row in table.splitlines()]
-    assert [set(row) for row in named] == [set(line.split()) for line in LAYERS.strip().split("\n")]
 
 
 def test_imports_point_one_way():

@@ -5,6 +5,7 @@
 Other tests assert kind and key of a problem (helpers/refusals.py), so that words may change here.
 """
 
+import pickle
 from pathlib import Path
 
 from codesign_jax import parameters, scene
@@ -90,6 +91,12 @@ def test_what_a_problem_is_about_begins_its_sentence():
     }
     for sentence, key in cases.items():
         assert schema.Problem("invalid", sentence).key == key
+
+
+def test_an_error_keeps_its_kinds_in_another_process():
+    error = InputError.of("range", "gravity = -1 is outside [0, 100]")
+    [problem] = pickle.loads(pickle.dumps(error)).problems
+    assert (problem.code, problem.key) == ("range", "gravity") and problem == error.problems[0]
 
 
 if __name__ == "__main__":

@@ -69,6 +69,10 @@ class InputError(ValueError):
         self.problems = [problem.told(terminal.line(problem)) for problem in every]
         super().__init__("\n".join(self.problems))
 
+    def __reduce__(self) -> tuple[type, tuple[list[Problem]]]:
+        """What a copy or a pickle of it is made of."""
+        return type(self), (self.problems,)
+
     @classmethod
     def of(cls, code: str, problem: str) -> "InputError":
         """The error of one problem, by its kind (`texts.CODES`)."""

@@ -60,6 +60,10 @@ class Problem(str):
         problem.code = code
         return problem
 
+    def __getnewargs__(self) -> tuple[str, str]:
+        """What a copy or a pickle of it is made of."""
+        return self.code, str(self)
+
     @staticmethod
     def of(text: str) -> "Problem":
         """A text as a problem, of no particular kind if it is none yet."""

@@ -141,7 +141,9 @@ def test_joint_moments_are_the_slopes_of_the_energy(threshold):
 
 def test_bending_energy_is_that_of_a_neo_hookean_section():
     """By quadrature of the strain energy G/2 (lambda^2 + lambda^-2 - 2) over the section."""
-    height, wall, width = 0.0165, 0.002, 0.02
+    height = 0.0165
+    wall = 0.002
+    width = 0.02
     x, w = np.polynomial.legendre.leggauss(60)
     for kappa in (1.0, 30.0, 150.0):
         energy_per_length = 0.0

@@ -5,5 +5,6 @@
 * `cases`: a design with what simulates it.
 * `fresh_trials`: trials that a search has not met, until they decide.
 * `stress`: the same design under other conditions.
+* `worth`: the same design without some of its fingers.
 * `sentences`: all of it in words.
 """

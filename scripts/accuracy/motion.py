@@ -99,8 +99,8 @@ def simulate(name: str, file: Path, commit: str | None) -> None:
     run = jax.jit(partial(tips, the_scene))
     paths = []
     for k in range(HANDS):
-        one = jax.tree.map(lambda v, k=k: v[k], fields)
-        paths.append(np.asarray(run(one, series["qpos"][k, :: round(EVERY / h)])))
+        hand = jax.tree.map(lambda v, k=k: v[k], fields)
+        paths.append(np.asarray(run(hand, series["qpos"][k, :: round(EVERY / h)])))
     arrays = {
         "tips": np.stack(paths),
         "thin": thin,

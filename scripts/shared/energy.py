@@ -88,9 +88,9 @@ def audit(scene: Scene, fields: Any, ctrl: Any, path: Path) -> Audit:
     worlds = []
     for k in range(len(ctrl)):
         held = () if path.held is None else (jnp.asarray(path.held[k]),)
-        one = jax.tree.map(lambda v, k=k: jnp.asarray(v[k]), fields)
+        world = jax.tree.map(lambda v, k=k: jnp.asarray(v[k]), fields)
         rows = (jnp.asarray(v[k]) for v in (ctrl, path.qpos, path.qvel))
-        worlds.append([np.asarray(v, float) for v in run(one, *rows, *held)])
+        worlds.append([np.asarray(v, float) for v in run(world, *rows, *held)])
     at_mid, carried, stored = (np.stack(v) for v in zip(*worlds, strict=True))
     return Audit(carried[:, 1:] - at_mid[:, :-1], stored)
 
@@ -224,9 +224,9 @@ def rises(accuracy: str = "standard") -> list[Rise]:
     """The audit as lines of a table: hands with thin fingers in the air."""
     scene = load("paper", accuracy=accuracy, overrides=FREE)
     designs = thin_designs(scene)
-    found = simulated(scene, designs)
+    measured = simulated(scene, designs)
     first = round(scene.phases.disturb / scene.discretization.timestep)
-    gained = found.rise(first) / found.stored[:, first]
+    gained = measured.rise(first) / measured.stored[:, first]
     return [Rise(f"thin fingers in the air, {accuracy}", float(gained.max()), FREE_BOUND)]
 
 

@@ -188,6 +188,7 @@ class Model:
 
         self.chamber = contour(1.0, around // 2)
         self.threads = contour(section.thread_depth, around // 2)
+        self.outside = contour(0.0, around // 2)
         self.fabric = contour(0.0, first)
         self._prepare()
         self.rest()

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from scripts.section.elements import CURVATURES, Model, NoEquilibrium, Section
-from scripts.shared import output
+from scripts.shared import evidence, output
 
 SHEAR_MODULUS = 88e3
 PRESSURES = (10e3, 20e3, 35e3, 50e3, 75e3, 100e3)
@@ -189,7 +189,7 @@ def merge(folder: Path, path: Path) -> None:
         arrays[source.stem] = np.array(
             [_numbers(s) for s in content["states"] if "failed" not in s], np.float32
         )
-    output.write_arrays(path, arrays)
+    output.write_arrays(path, {"version": np.array(evidence.version())} | arrays)
 
 
 def _numbers(values: dict[str, Any]) -> list[float]:
@@ -205,4 +205,5 @@ def read(path: Path) -> dict[str, tuple[Section, dict[str, np.ndarray]]]:
         return {
             n: (sections[n], dict(zip(COLUMNS, file[n].T.astype(float), strict=True)))
             for n in file.files
+            if n in sections
         }

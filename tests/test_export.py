@@ -419,8 +419,8 @@ def test_the_sheet_s_lists_add_up(page, tmp_path):
     weight = 9.81 * (0.25 + 4 * 34e-6 * 1070)
     hangs = 1e3 * weight / the_scene.hand.wrist.linear_stiffness
     assert quantities.sag(the_scene, sizes) == pytest.approx(hangs, rel=1e-3)
-    # 110 mm of 80 mm around, a turn every 2 mm, four times, and a fifth more.
-    assert bought["thread"][0] == f"{1.2 * 4 * 110 / 2 * 0.08:.1f} m"
+    # 110 mm of 80 mm around, a turn every 4 mm there and back, four times, and a fifth more.
+    assert bought["thread"][0] == f"{1.2 * 4 * 2 * 110 / 4 * 0.08:.1f} m"
     # 10 cm^3 rise by 120 kPa within 1.5 s: l/min at standard pressure, of one and of all.
     flow = 60 * 0.01 * 120 / 1.5 / 101.325
     np.testing.assert_allclose(quantities.flows(the_scene, params, sizes), flow, rtol=1e-6)

@@ -15,8 +15,15 @@ from codesign_jax.scene.hand import Material
 from codesign_jax.scene.silicones import Silicone
 from codesign_jax.types import Params
 
-PITCH = 2.0
-"""A turn of the thread along a finger [mm] [chosen]."""
+PITCH = 4.0
+"""A turn of the thread along a finger, there and back [mm] [chosen].
+
+A thread that is wound one way twists a finger under pressure; wound there and back it stiffens
+twist (docs/notes/section.md).
+"""
+FIRST_INFLATION = 0.2
+"""Pressure at which the bend test begins, over the design's [chosen]: by the law of sections a
+finger may bend several times further than by beam theory."""
 SPARE = 0.2
 """Thread beyond what is wound, for ends and a second try, as a share [chosen]."""
 LOSS = 0.15
@@ -53,7 +60,7 @@ def fabric(size: Size) -> tuple[float, float]:
 def thread(sizes: Sequence[Size]) -> float:
     """Thread that is wound around the fingers [m]."""
     middle = [(size, size.at(size.length / 2)) for size in sizes]
-    return sum(z.length / PITCH * 2 * (m.width + m.height) for z, m in middle) / 1e3
+    return sum(2 * z.length / PITCH * 2 * (m.width + m.height) for z, m in middle) / 1e3
 
 
 def bottom(size: Size) -> float:

@@ -116,6 +116,7 @@ def _tested(hand: Hand, tests: Tests) -> dict[str, Any]:
     warnings = stress.of_design(hand.scene, hand.params)
     warnings += [*(tests.stress.warnings if tests.stress else ())]
     warnings += idle_fingers(hand.scene, hand.params, hand.sizes)
+    warnings += twisting_fingers(hand.scene, hand.params, hand.sizes)
     return {
         "verdict": tests.verdict,
         "stress": tests.stress,
@@ -143,12 +144,27 @@ def idle_fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> list[st
     return sentences
 
 
+def twisting_fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> list[str]:
+    """Fingers that twist where an object holds them straight, a sentence each."""
+    around = np.mean([2 * (size.base.width + size.base.height) for size in sizes])
+    angle = float(np.arctan(quantities.PITCH / around))
+    unstable = morphology.twists_by_itself(scene.hand, params, winding_angle=angle)
+    return [
+        f"finger {i} twists by itself where it is held straight at "
+        f"{float(params.pressure[i]) / 1e3:.0f} kPa: its walls are thin for that pressure; the "
+        "simulation lacks it"
+        for i in np.flatnonzero(unstable)
+    ]
+
+
 def _fingers(hand: Hand) -> dict[str, Any]:
     scene, params, sizes, *_ = hand
     density = scene.hand.material.density
     limits = morphology.pressure_limits(scene.hand, params)
     law = bool(scene.effects.neo_hookean)
     bends = morphology.free_bends(scene.hand, params, neo_hookean=law)
+    outside = morphology.section_bends(scene.hand, params)
+    inside = morphology.section_bends(scene.hand, params, thread_depth=1.0)
     rows = []
     for i, (size, angle) in enumerate(zip(sizes, bends, strict=True)):
         ends = list(dict.fromkeys((size.base, size.tip)))  # one, unless it is tapered
@@ -165,6 +181,7 @@ def _fingers(hand: Hand) -> dict[str, Any]:
                 f"{1e-6 * size.volume * density:.1f}",
                 f"{float(params.pressure[i]) / 1e3:.1f} ({limits[i] / 1e3:.0f})",
                 f"{np.degrees(angle):.0f}",
+                f"{np.degrees(inside[i]):.0f} to {np.degrees(outside[i]):.0f}",
             )
         )
     end_walls = "as thick as the others"
@@ -178,7 +195,7 @@ def _fingers(hand: Hand) -> dict[str, Any]:
         )
     ]
     head = ("finger", "length mm", "width mm", "height mm", "wall mm", "chamber mm")
-    head += ("silicone cm³", "mass g", "pressure kPa (limit)", "free bend °")
+    head += ("silicone cm³", "mass g", "pressure kPa (limit)", "free bend °", "by elements °")
     strains = None if params.tip is not None else quantities.limit_strains(scene, params)
     return {
         "finger_head": head,
@@ -288,6 +305,7 @@ def _castings(hand: Hand) -> dict[str, Any]:
         "thread": quantities.thread(hand.sizes),
         "spare": quantities.SPARE,
         "pitch": quantities.PITCH,
+        "first_inflation": quantities.FIRST_INFLATION,
         "pins": sum(inlet(size, hand.process) > 0 for size in hand.sizes),
     }
 

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from codesign_jax.model.layout import beyond_base
-from codesign_jax.scene import silicones
+from codesign_jax.scene import section_law, silicones
 from codesign_jax.scene.beams import Beam, beam, softening
 from codesign_jax.scene.hand import Hand, highest_pressure
 from codesign_jax.scene.primitives import block_inertia
@@ -30,6 +30,7 @@ __all__ = [
     "free_bends",
     "joint_springs",
     "pressure_limits",
+    "section_bends",
     "sections",
     "segments",
     "sphere_radii",
@@ -38,6 +39,7 @@ __all__ = [
     "threshold_energy",
     "threshold_moments",
     "thresholds",
+    "twists_by_itself",
 ]
 
 
@@ -138,6 +140,44 @@ def free_bends(hand: Hand, params: Params, *, neo_hookean: bool | None = None) -
     if law:
         curvature = _softened(curvature, sections(hand, exact, at_joints(links)))
     return np.asarray(curvature.mean(1) * exact.length)
+
+
+def section_bends(hand: Hand, params: Params, *, thread_depth: float = 0.0) -> np.ndarray:
+    """Angles by which free fingers bend by the law of their sections [rad], shape (finger,).
+
+    Other than `free_bends` it knows where the thread is, see `section_law`.
+
+    Args:
+      thread_depth: Place of the thread in the wall: 0 outside, 1 on the chamber.
+    """
+    numbers, pressure = _section_numbers(hand, params, thread_depth=thread_depth)
+    curvature = section_law.free_bend(numbers, pressure)
+    return curvature.mean(1) * np.asarray(params.length, float)
+
+
+def twists_by_itself(hand: Hand, params: Params, *, winding_angle: float) -> np.ndarray:
+    """Whether fingers that are held straight at their pressures twist, shape (finger,).
+
+    Their stiffness of twist is negative by the law of their sections, see `section_law`.
+
+    Args:
+      winding_angle: Angle to the hoop direction of a thread that is wound there and back [rad].
+    """
+    numbers, pressure = _section_numbers(hand, params, winding_angle=winding_angle)
+    straight = np.zeros(np.broadcast_shapes(numbers.height.shape, pressure.shape))
+    return (section_law.twist_stiffness(numbers, pressure, straight) < 0).any(1)
+
+
+def _section_numbers(
+    hand: Hand, params: Params, **winding: float
+) -> tuple[section_law.Numbers, np.ndarray]:
+    """Numbers of the sections at a finger's joints, and pressures, shapes (finger, place)."""
+    exact = jax.tree.map(lambda v: np.asarray(v, float), params)
+    links = 1 if params.tip is None else 20
+    height, wall, width = sections(hand, exact, at_joints(links))
+    modulus = hand.material.shear_modulus
+    numbers = section_law.numbers(height, wall, width, shear_modulus=modulus, **winding)
+    return numbers, exact.pressure[:, None]
 
 
 def _softened(linear: np.ndarray, section: Section) -> np.ndarray:

@@ -251,18 +251,18 @@ def test_law_is_smooth():
 
     def slopes(at):
         step = 1e-5 * np.eye(3)[:, :, None]
-        values = [
+        ends = [
             section_law.energy(n, pressure, *(at + s)) - section_law.energy(n, pressure, *(at - s))
             for s in step
         ]
-        return np.array(values) / 2e-5
+        return np.array(ends) / 2e-5
 
-    found = slopes(kappa)
-    assert np.isfinite(found).all()
+    values = slopes(kappa)
+    assert np.isfinite(values).all()
     for way in np.eye(3):
         step = 1e-3 * way[:, None]
         # The taut fabric, k w^3 / 12 = 0.12 N m^2, is the stiffest part.
-        assert np.abs(slopes(kappa + step) - found).max() < 0.2 * 1e-3
+        assert np.abs(slopes(kappa + step) - values).max() < 0.2 * 1e-3
 
 
 def test_law_in_float32():
@@ -271,8 +271,8 @@ def test_law_in_float32():
     grid = jnp.asarray(np.meshgrid([-20e3, 0, 60e3], [0, 5], [-40, 0, 40], [0, 5]), jnp.float32)
     states = grid.reshape(4, -1)
     many = jax.tree.map(lambda v: jnp.broadcast_to(v, states[0].shape), n)
-    found = [*section_law.moments(many, *states), section_law.volume(many, *states)]
-    assert all(np.isfinite(v).all() for v in found)
+    values = [*section_law.moments(many, *states), section_law.volume(many, *states)]
+    assert all(np.isfinite(v).all() for v in values)
 
 
 def test_thin_straight_finger_twists_by_itself():
@@ -322,5 +322,5 @@ def test_thin_walls_twist_by_themselves(wall, twists):
     params = params._replace(
         wall=np.full_like(params.wall, wall), pressure=np.full_like(params.pressure, 80e3)
     )
-    found = morphology.twists_by_itself(the_scene.hand, params, winding_angle=0.0)
-    assert (found == twists).all()
+    values = morphology.twists_by_itself(the_scene.hand, params, winding_angle=0.0)
+    assert (values == twists).all()

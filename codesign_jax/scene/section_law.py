@@ -145,11 +145,11 @@ def numbers(
       fitted: Constants; None for those of the package.
     """
     c = constants() if fitted is None else fitted
-    one = height / height
-    w = width / height * one
-    d = wall / height * one
-    depth = thread_depth * one
-    numpy = one.__array_namespace__()
+    unit = height / height
+    w = width / height * unit
+    d = wall / height * unit
+    depth = thread_depth * unit
+    numpy = unit.__array_namespace__()
     features = _features(numpy, d, w, depth)
     values = {}
     for name, row in zip(FITTED, c.functions, strict=True):
@@ -158,7 +158,7 @@ def numbers(
     area = w - (w - 2 * d) * (1 - 2 * d)
     upright = (w**3 - (1 - 2 * d) * (w - 2 * d) ** 3) / 12
     axial = 4 * c.axial * area
-    shear = 3 * (height / length) ** 2 / shear_area(1.0 * one, d, w)
+    shear = 3 * (height / length) ** 2 / shear_area(1.0 * unit, d, w)
     unsheared = 1 / (1 + shear * (4 * c.upright * upright + axial * w**2 / 4))
     upright = unsheared * (4 * c.upright * upright + (1 - unsheared) * axial * w**2 / 4)
     middle = 2 * (w + 1 - 2 * d)
@@ -168,12 +168,12 @@ def numbers(
     thread_height = 1 - 2 * depth * d
     enclosed = thread_width * thread_height
     around = 2 * (thread_width + thread_height)
-    sine = numpy.sin(winding_angle * one)
-    cosine = numpy.cos(winding_angle * one)
+    sine = numpy.sin(winding_angle * unit)
+    cosine = numpy.cos(winding_angle * unit)
     membrane = thread_stiffness * (sine * cosine) ** 2 / (shear_modulus * height)
     return Numbers(
-        height=height * one,
-        modulus=shear_modulus * one,
+        height=height * unit,
+        modulus=shear_modulus * unit,
         width=w,
         wall=d,
         slackness=shear_modulus * height / (fabric_stiffness * w),
@@ -376,5 +376,5 @@ def twist_stiffness(n: Numbers, pressure: Any, bend: Any) -> Any:
 
 def volume(n: Numbers, pressure: Any, twist: Any, bend: Any, lateral: Any) -> Any:
     """Volume of the chamber per length [m^2]: minus the energy's slope by the pressure."""
-    one = jax.numpy.ones_like(pressure)
-    return -jax.jvp(lambda p: energy(n, p, twist, bend, lateral), (pressure,), (one,))[1]
+    unit = jax.numpy.ones_like(pressure)
+    return -jax.jvp(lambda p: energy(n, p, twist, bend, lateral), (pressure,), (unit,))[1]

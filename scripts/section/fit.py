@@ -42,7 +42,11 @@ class States(NamedTuple):
 
 def states(path: Path, highest: float) -> States:
     """The states under pressures up to the highest [Pa], and those sideways at rest."""
-    names, sections, strains, values, scales = [], [], [], [], []
+    names = []
+    sections = []
+    strains = []
+    values = []
+    scales = []
     for name, (section, column) in study.read(path).items():
         h = section.height
         count = len(column["pressure"])
@@ -55,7 +59,8 @@ def states(path: Path, highest: float) -> States:
             section.thread_stiffness / (G * h),
             section.fabric_stiffness / (G * h),
         ]
-        d, w = row[:2]
+        d = row[0]
+        w = row[1]
         pressure = column["pressure"] / G
         lateral = column["lateral"] * h
         bend = column["bend"] * h
@@ -130,7 +135,8 @@ def predicted(fitted: Constants, data: States) -> np.ndarray:
         return section_law.energy(n, *at, fitted)
 
     middle = energy()
-    after, before = energy(x=STEP), energy(x=-STEP)
+    after = energy(x=STEP)
+    before = energy(x=-STEP)
     volume = (energy(p=-STEP) - energy(p=STEP)) / (2 * STEP)
     # The energy is quadratic in the twist.
     torsion = energy(t=1.0) - 2 * middle + energy(t=-1.0)
@@ -204,7 +210,7 @@ def write(path: Path, fitted: Constants) -> None:
 
 def report(fitted: Constants, data: States) -> list[list[str]]:
     """Root mean squares of the errors by family, of fitted and of held-out sections."""
-    found = errors(fitted, data)
+    relative = errors(fitted, data)
     held = np.array([study.held_out(n) for n in data.name])
     family = np.array([n[:-2] for n in data.name])
     rows = [["sections", "", *QUANTITIES]]
@@ -213,17 +219,17 @@ def report(fitted: Constants, data: States) -> list[list[str]]:
         for kind, chosen in (("fitted", ~held), ("held out", held)):
             mask = (family == name) & chosen & low
             if mask.any():
-                rows.append([name, kind, *_percent(found[mask], data.scale[mask])])
+                rows.append([name, kind, *_percent(relative[mask], data.scale[mask])])
     inside = weights(data) == 1
     for kind, chosen in (("fitted", ~held), ("held out", held)):
         mask = chosen & inside
-        rows.append(["all usual", kind, *_percent(found[mask], data.scale[mask])])
+        rows.append(["all usual", kind, *_percent(relative[mask], data.scale[mask])])
     for kind, chosen in (("fitted", ~held), ("held out", held)):
         mask = chosen & ~low
-        rows.append(["75, 100 kPa", kind, *_percent(found[mask], data.scale[mask])])
+        rows.append(["75, 100 kPa", kind, *_percent(relative[mask], data.scale[mask])])
     return rows
 
 
-def _percent(found: np.ndarray, scale: np.ndarray) -> list[str]:
-    columns = zip(found.T, np.isfinite(scale).T, strict=True)
+def _percent(relative: np.ndarray, scale: np.ndarray) -> list[str]:
+    columns = zip(relative.T, np.isfinite(scale).T, strict=True)
     return [f"{100 * np.sqrt(np.mean(v[m] ** 2)):.1f}" if m.any() else "–" for v, m in columns]

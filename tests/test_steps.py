@@ -99,7 +99,7 @@ def test_steps_of_the_kernel_equal_mujocos(tmp_path, name):
         # stops at rounding of its cost.  Its rigid arm gives way by the hand's forces over 1e9 kg,
         # which stiff fingers multiply: 1.6e-8 with a wrist of 1e9, 2e-10 of 1e11.
         assert errors.max() < (1e-8 if scene.effects.wrist else 1e-7) and far.max() < 1e-12
-        assert (errors > 0).mean() > 0.95  # few states are fast
+        assert (errors > 0).mean() > 0.85  # in the others a body turns fast
         if not fixtures:
             if scene.effects.finger_object and scene.effects.object_table:
                 # More than the object on the table.

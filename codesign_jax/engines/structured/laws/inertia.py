@@ -103,7 +103,9 @@ def share_of_products(
     a step gets those of that turn along the same motion.
     """
     most = (largest / timestep) ** 2
-    return most / jnp.maximum(dot(omega, omega), most)
+    square = dot(omega, omega)
+    # A GPU's quotient of a number and itself need not be one, and slow bodies must have all.
+    return jnp.where(square > most, most / jnp.maximum(square, most), 1.0)
 
 
 def momentum(mass: Any, inertia: Any, frame: Any, centre: Any, vel: Any) -> jax.Array:

@@ -58,7 +58,7 @@ class Batch:
         shows = options.cost is not None or options.record_qpos
         programs = _worlds(engine, shared_options, count, shows)
         self._programs = _Sizes(*(SceneProgram(scene, program) for program in programs))
-        self._by_own = jax.jit(self._own_cost)
+        self._by_user_cost = jax.jit(self._user_cost)
 
     def simulate(
         self,
@@ -126,11 +126,11 @@ class Batch:
         program = self._programs.small if small else self._programs.large
         outcomes, trace, ctrl = program(inputs, counts if self.fills else None, scene)
         if self.options.cost is not None:
-            outcomes = self._by_own((scene or self.scene).bare, trace, ctrl, outcomes)
+            outcomes = self._by_user_cost((scene or self.scene).bare, trace, ctrl, outcomes)
         return outcomes, trace if self.options.record_qpos else _last_alone(trace.last)
 
-    def _own_cost(self, scene: Scene, trace: Any, ctrl: Any, outcomes: Outcome) -> Outcome:
-        return rollout.by_own(scene, self.options, trace, ctrl, outcomes)
+    def _user_cost(self, scene: Scene, trace: Any, ctrl: Any, outcomes: Outcome) -> Outcome:
+        return rollout.by_user_cost(scene, self.options, trace, ctrl, outcomes)
 
 
 class _Sizes(NamedTuple):

@@ -418,10 +418,10 @@ def judge(
     outcomes = jax.vmap(outcome, in_axes=(batch_axes(scene), 0, 0, 0))(
         scene, trace, initial, trials
     )
-    return outcomes if options.cost is None else by_own(scene, options, trace, ctrl, outcomes)
+    return outcomes if options.cost is None else by_user_cost(scene, options, trace, ctrl, outcomes)
 
 
-def by_own(
+def by_user_cost(
     scene: Scene, options: Options, trace: Trace, ctrl: jax.Array | None, outcomes: Outcome
 ) -> Outcome:
     """Outcomes of a batch of worlds by a cost of one's own, from those by the scene's.
@@ -434,14 +434,14 @@ def by_own(
 
     def world(world_scene: Scene, t: Trace, u: jax.Array | None, result: Outcome) -> Outcome:
         seen = shown(t, options.record_qpos, options.stop_when_lost)
-        return _by_own(world_scene, cost, seen, u, result)
+        return _by_user_cost(world_scene, cost, seen, u, result)
 
     commands = ctrl if trace.ctrl is None else trace.ctrl
     every = jax.vmap(world, in_axes=(batch_axes(scene), 0, 0, 0))
     return every(scene, trace, commands, outcomes)
 
 
-def _by_own(
+def _by_user_cost(
     scene: Scene, cost: CostFunction, trace: Trace, ctrl: jax.Array | None, result: Outcome
 ) -> Outcome:
     if ctrl is None:

@@ -21,8 +21,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 import codesign_jax
-from codesign_jax import cli, codesign
+from codesign_jax import cli
 from codesign_jax.commands import common
+from codesign_jax.judge.verdict import VERDICTS
 from codesign_jax.runs import selection
 from codesign_jax.scene.schema import InputError
 from codesign_jax.studio import process, server
@@ -225,7 +226,7 @@ def test_a_tab_shows_judges_improves_and_saves(desk, capsys, monkeypatch):
     [verdict] = re.findall(r"^verdict: (.*)$", capsys.readouterr().out, re.M)
     sentence, _, causes = messages["verdict"]["sentence"].partition(". Lost: ")
     assert sentence == verdict.replace("fresh ", "")
-    lost = messages["verdict"]["ends"].count(codesign.VERDICTS.index("lost"))
+    lost = messages["verdict"]["ends"].count(VERDICTS.index("lost"))
     assert sum(map(int, re.findall(r"\d+", causes))) == lost
     tab.receive('{"run": [2, 1]}')
     kept = selection.find_grasp(desk.case.scene, desk.record, episode=2, particle=1).design

@@ -16,7 +16,7 @@ from codesign_jax.export import arm, fonts, posture
 from codesign_jax.export.process import BACK, BAR, FABRIC, FLOOR, Printed, Process, Section, Size
 from codesign_jax.export.quantities import base_frames
 from codesign_jax.export.sheet import NAME, corners
-from codesign_jax.report.figures import own_settings
+from codesign_jax.report.figures import default_style
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
 
@@ -28,7 +28,7 @@ _WIDE = 64
 _LINES = 2
 
 
-@own_settings
+@default_style
 def write(
     folder: Path,
     title: str,
@@ -51,7 +51,7 @@ def write(
     return fonts.of_text(title).lacking
 
 
-@own_settings
+@default_style
 def pages(
     title: str,
     scene: Scene,

@@ -30,7 +30,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def own_settings(draw: Callable[P, R]) -> Callable[P, R]:
+def default_style(draw: Callable[P, R]) -> Callable[P, R]:
     """Has a function draw by matplotlib's own settings, whatever the user's are.
 
     A matplotlibrc of another machine may ask for LaTeX (`text.usetex`) or fonts that are not here.
@@ -45,7 +45,7 @@ def own_settings(draw: Callable[P, R]) -> Callable[P, R]:
     return drawn
 
 
-@own_settings
+@default_style
 def save(figure: matplotlib.figure.Figure, path: Path) -> Path:
     """Writes a figure as a whole or not at all."""
     path.parent.mkdir(exist_ok=True)
@@ -54,7 +54,7 @@ def save(figure: matplotlib.figure.Figure, path: Path) -> Path:
     return path
 
 
-@own_settings
+@default_style
 def html(figure: matplotlib.figure.Figure, name: str) -> str:
     """A figure as a piece of a page that needs no other file."""
     buffer = io.BytesIO()
@@ -74,7 +74,7 @@ def _above(axes: Axes, columns: int = 3) -> None:
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=columns, frameon=False)
 
 
-@own_settings
+@default_style
 def cost_evolution(
     cost: ArrayLike, *, threshold: float = CONVERGED_COST, title: str = ""
 ) -> matplotlib.figure.Figure:
@@ -102,7 +102,7 @@ def cost_evolution(
     return figure
 
 
-@own_settings
+@default_style
 def landscape(surface: Landscape) -> matplotlib.figure.Figure:
     """The mean cost over a grid of two parameters as Fig. 8 of the paper: white where low.
 
@@ -133,7 +133,7 @@ def _landscape(axes: Axes, surface: Landscape) -> None:
     axes.figure.colorbar(image, ax=axes, label=label)
 
 
-@own_settings
+@default_style
 def designs(
     history: History, space: DesignSpace, chosen: np.ndarray, surface: Landscape | None
 ) -> matplotlib.figure.Figure:
@@ -158,7 +158,7 @@ def designs(
     return figure
 
 
-@own_settings
+@default_style
 def parameters(
     history: History, space: DesignSpace, chosen: np.ndarray
 ) -> matplotlib.figure.Figure:
@@ -190,7 +190,7 @@ def parameters(
     return figure
 
 
-@own_settings
+@default_style
 def grip(forces: Forces, scene: Scene) -> matplotlib.figure.Figure:
     """Normal force of each finger on the object, and the palm's force, over time.
 
@@ -213,7 +213,7 @@ def grip(forces: Forces, scene: Scene) -> matplotlib.figure.Figure:
     return figure
 
 
-@own_settings
+@default_style
 def failures(status: np.ndarray) -> matplotlib.figure.Figure:
     """Frequency of each cause of failure in each episode.
 

@@ -32,7 +32,7 @@ FAULTS = {
     ),
     "friction": Fault(
         "model/pairs.py",
-        (("[friction, friction,", "[friction / 2, friction / 2,"),),
+        (("[friction] * 2 + [0.0]", "[friction / 2] * 2 + [0.0]"),),
         "tests/test_contact.py::test_incline_below_the_friction_angle_holds",
     ),
     "time step x 10": Fault(
@@ -41,7 +41,7 @@ FAULTS = {
         "tests/test_beam_oracles.py::test_free_fall",
     ),
     "NaN guard": Fault(
-        "verdict.py",
+        "judge/verdict.py",
         (("as_bit(~numbers, Status", "as_bit(numbers & ~numbers, Status"),),
         "tests/test_cost.py::test_failures_are_flagged_with_their_step",
     ),
@@ -59,7 +59,10 @@ FAULTS = {
         "runs/checkpoint.py",
         (
             ("if file_digest(file) != expected_file", "if not expected_file"),
-            ("if digest(arrays) == expected else", "if expected else"),
+            (
+                'return (arrays, "") if digest(arrays) == expected else',
+                'return (arrays, "") if expected else',
+            ),
         ),
         "tests/test_checkpoint.py::test_damage_of_any_file_falls_back_to_the_step_before",
     ),

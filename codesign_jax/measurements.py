@@ -138,7 +138,7 @@ def _lines(path: Path) -> list[tuple[int, str]]:
             raise InputError.of("syntax", f"{path}: {foreign}")
         text = content.decode("utf-8-sig")
     except OSError as error:
-        raise InputError.of("syntax", f"{path}: {error.strerror}") from error
+        raise InputError.of("file", f"{path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise InputError.of("syntax", f"{path}: no UTF-8 text; save it as CSV UTF-8") from error
     if len(text) > MOST_CHARACTERS:

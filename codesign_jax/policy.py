@@ -316,7 +316,7 @@ def period_steps(scene: Scene, period: float | None) -> int:
     steps = round(period / h) if np.isfinite(period) else 0
     if steps < 1 or abs(steps * h - period) > 1e-6 * h:
         raise InputError.of(
-            "type", f"period = {period:g} s is not a whole number of time steps of {h:g} s"
+            "range", f"period = {period:g} s is not a whole number of time steps of {h:g} s"
         )
     return steps
 

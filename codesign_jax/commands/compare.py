@@ -91,7 +91,7 @@ def main(options: Compare) -> int:
         ("--trials", options.trials, 1, 100_000), ("--seed", options.seed, 0, 2**31 - 1)
     )
     if not options.folders:
-        problems.append(Problem("range", "compare needs at least one run folder"))
+        problems.append(Problem("missing", "compare needs at least one run folder"))
     if designs and options.out is not None:
         problems.append(
             Problem("conflict", "--out is a table of runs; leave it out beside design files")
@@ -102,7 +102,7 @@ def main(options: Compare) -> int:
     if designs and len(paths) != 2 and not alone:
         problems.append(
             Problem(
-                "type",
+                "conflict",
                 "compare takes two designs, or one with --policy against none or with --set-b",
             )
         )
@@ -179,7 +179,7 @@ def _pair(options: Compare, paths: list[Path]) -> dict[str, Case]:
     if first.scene.objects != other.scene.objects:
         compared = "runs" if of_runs else "designs"
         raise InputError.of(
-            "missing",
+            "conflict",
             f"the two {compared} have other objects or noise: --objects says which to take",
         )
     if names[0] == names[1]:

@@ -336,7 +336,7 @@ def _flag_problems(options: Optimize) -> list[str]:
     if options.devices is not None and not 1 <= options.devices <= available:
         problems.append(
             schema.Problem(
-                "unknown",
+                "range",
                 f"--devices = {options.devices} is not valid; this process has {available}",
             )
         )

@@ -238,7 +238,7 @@ def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str
         elif stood != value:
             flag = name.replace("_", "-")
             problems.append(
-                Problem("damaged", f"--{flag}: the run has {stood}, asked for is {value}")
+                Problem("conflict", f"--{flag}: the run has {stood}, asked for is {value}")
             )
     if not problems and _is_cut_short(path, scene, settings, stored):
         return
@@ -250,7 +250,7 @@ def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str
         other = [word for word, (was, now) in names.items() if was.name != now.name]
         for word in other:
             was, now = (v.name for v in names[word])
-            problems.append(Problem("damaged", f"--{word}: the run has {was}, asked for is {now}"))
+            problems.append(Problem("conflict", f"--{word}: the run has {was}, asked for is {now}"))
         for name, text in scene_files.scene_texts(scene).items():
             if name.removesuffix(".toml") not in other:  # of those every line may differ
                 problems += _diff(path, name, text)

@@ -119,7 +119,7 @@ def read_provenance(path: Path) -> dict[str, Any]:
         raise _damaged(file, problem)
     if stored["schema"] > SCHEMA:
         raise InputError.of(
-            "damaged",
+            "unsupported",
             f"{path} was made by a newer version of codesign-jax (its folders have schema "
             f"{stored['schema']}, this version reads up to {SCHEMA}): use that version",
         )

@@ -53,7 +53,7 @@ def refuse_other_policy(policy: str, named: str | None) -> None:
     if policy != (named or ""):
         policy_words = f"--policy {policy}" if policy else "no policy"
         raise InputError.of(
-            "damaged", f"the run was made with {policy_words}; --policy is {named or 'not given'}"
+            "conflict", f"the run was made with {policy_words}; --policy is {named or 'not given'}"
         )
 
 

@@ -124,9 +124,9 @@ def check(settings: Settings, hand: Hand | None) -> list[str]:
         problem = optimize.problem(settings.optimizer, max(settings.particles, 0) or None)
     problems += [f"--optimizer: {problem}"] if problem else []
     if settings.cost != SCENE_COST and (problem := user_code.problem(settings.cost)):
-        problems.append(schema.Problem("damaged", f"--cost: {problem}"))
+        problems.append(schema.Problem("user_code", f"--cost: {problem}"))
     if settings.policy and (problem := user_code.problem(settings.policy)):
-        problems.append(schema.Problem("damaged", f"--policy: {problem}"))
+        problems.append(schema.Problem("user_code", f"--policy: {problem}"))
     space = None
     if hand is not None:
         try:

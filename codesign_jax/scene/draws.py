@@ -179,7 +179,7 @@ def check(table: Constants, where: str) -> list[str]:
         if len(entry.correlation) > i:
             problems.append(
                 schema.Problem(
-                    "unknown",
+                    "size",
                     f"{key}: correlation has {len(entry.correlation)} numbers, {i} before it",
                 )
             )

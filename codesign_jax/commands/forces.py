@@ -105,7 +105,9 @@ def pull(
       along: Direction of the force on the object's centre of mass, world frame, shape (3,).
     """
     if isinstance(engine, ControlLoop):
-        raise InputError.of("conflict", "--pull holds the hand as key frames do: leave out --policy")
+        raise InputError.of(
+            "conflict", "--pull holds the hand as key frames do: leave out --policy"
+        )
     steps = int(scene.last_step("lift")) + 1
     step = scene.discretization.timestep
     hands = jax.tree.map(lambda v: jnp.repeat(v[None], len(trials.yaw), 0), params)

@@ -1,9 +1,12 @@
 """Pages are right: commands run, figures are those of the data, keys are complete, links lead."""
 
+import ast
+import importlib
 import json
 import re
 import shlex
 import shutil
+import textwrap
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
@@ -261,6 +264,19 @@ def links(text):
 def test_what_a_page_links_to_is_there(page):
     missing = [x for x in links(page.read_text()) if not (page.parent / x.split("#")[0]).exists()]
     assert not missing
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_what_an_example_imports_is_there(page):
+    """Also of examples that are too slow to run."""
+    fenced = re.findall(r"^( *)```python\n(.*?)^ *```", page.read_text(), re.S | re.M)
+    for _, example in fenced:
+        for node in ast.walk(ast.parse(textwrap.dedent(example))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("codesign_jax"):
+                module = importlib.import_module(node.module)
+                for name in (alias.name for alias in node.names):
+                    if not hasattr(module, name):
+                        importlib.import_module(f"{node.module}.{name}")
 
 
 # --- the site of the documentation: the reference is up to date, links, search without a network --

@@ -112,8 +112,9 @@ def simulate(name: str, file: Path, commit: str | None) -> None:
 
 
 def merge(folder: Path) -> dict:
-    """Errors of every setting against the finest, and what its hands gain."""
-    stored = {name: np.load(file_of(folder, name)) for name in SETTINGS}
+    """Errors of every setting that was simulated against the finest, and what its hands gain."""
+    files = {name: file_of(folder, name) for name in SETTINGS}
+    stored = {name: np.load(file) for name, file in files.items() if file.exists()}
     phases = free_scene("standard", {}).phases
     ends = [round(t / EVERY) for t in (phases.lift, phases.disturb, phases.ungrasp)]
     windows = {"shaken": slice(*ends[:2]), "released": slice(*ends[1:])}

@@ -29,7 +29,7 @@ EVERY = ("**/*.json",)
 """The data of pages that quote several studies, or none by a file: old while any figure is."""
 PAGES: dict[str, tuple[str, ...]] = {
     "README.md": EVERY,
-    "docs/accuracy.md": ("budget.json", "decisions.json", "free_motion.json"),
+    "docs/accuracy.md": ("budget.json", "decisions.json", "free_motion.json", "hard_designs.json"),
     "docs/calibration.md": ("calibration/*.json",),
     "docs/control.md": EVERY,
     "docs/effects.md": ("effects.json",),

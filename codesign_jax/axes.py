@@ -114,7 +114,7 @@ def refuse_draws(key: Any, count: int) -> None:
         raise InputError([problem])
 
 
-def _problems(name: str, batch: Any, shapes: Any, axis: str) -> list[str]:
+def _problems(name: str, batch: Any, shapes: Any, axis: str) -> list[Problem]:
     array_shapes = {k: np.shape(v) for k, v in batch._asdict().items() if v is not None}
     if all(shape == getattr(shapes, k) for k, shape in array_shapes.items()):
         hint = f"jax.tree.map(lambda v: v[None], {name}) makes a batch"

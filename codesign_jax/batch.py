@@ -68,7 +68,7 @@ class Batch:
         *,
         size: int | None = None,
         advance: Callable[[int], Any] = lambda worlds: None,
-    ) -> tuple[Outcome, np.ndarray | None]:
+    ) -> tuple[Outcome, jax.Array | None]:
         """Outcomes and last states of worlds, arrays of NumPy with leading axis (world,).
 
         Args:

@@ -148,6 +148,14 @@ class ControlLoop(Equal):
         """As an engine whose traces have the contact forces, see `base.recording`."""
         return ControlLoop(recording(self.engine, touch=touch), self.policy)
 
+    def observe(self, fields: ModelFields) -> Callable[[jax.Array], Bodies]:
+        """As of the engine."""
+        return self.engine.observe(fields)
+
+    def contacts(self, fields: ModelFields, state: jax.Array, *, find: bool = True) -> Forces:
+        """As of the engine."""
+        return self.engine.contacts(fields, state, find=find)
+
     commands = staticmethod(control.plan)
     """What `rollout.prepare` makes for `rollout`: the plan instead of controls."""
 

@@ -294,7 +294,7 @@ def _note_from_now_on(programs: Path) -> None:
 
     known: set[str] = set()
 
-    def note(event: str, duration: float, **more: object) -> None:
+    def note(event: str, duration_secs: float, **more: str | int) -> None:
         if event.endswith("backend_compile_duration"):
             _note_programs(programs, known)
 
@@ -385,13 +385,14 @@ def quickly_compiled(function: Callable[..., Any], **options: Any) -> Callable[.
     runs; last bits may differ.  As part of another program the function is compiled with that.
     """
     import jax
+    from jax.core import Tracer
 
     part = jax.jit(function, **options)
     whole = functools.cache(lambda: jax.jit(function, compiler_options=_quick(), **options))
 
     @functools.wraps(function)
     def call(*arguments: Any) -> Any:
-        traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(arguments))
+        traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(arguments))
         return (part if traced else whole())(*arguments)
 
     call.lower = lambda *arguments: whole().lower(*arguments)  # type: ignore[attr-defined]

@@ -156,7 +156,8 @@ class Task:
         if _is_whole(population, key, scene):
             return SceneProgram(self.scene, self._programs.evaluate)(population, key, scene)
         trials = rollout.sample_trials(scene or self.scene, key, self.trials)
-        return self.outcomes(*_alone((population, trials)), scene)[0]
+        populations, trials = _alone((population, trials))
+        return self.outcomes(populations, trials, scene)[0]
 
     def outcomes(
         self,
@@ -208,7 +209,8 @@ class Task:
             return self._joined(self._programs.episode, optimizer)(state, mask, scene)
         _refuse_mask(self.space, mask)
         self.space.refuse_population(state.particles)
-        results = self.side_by_side(optimizer)(*_alone((state, np.asarray(mask))), scene)
+        states, masks = _alone((state, np.asarray(mask)))
+        results = self.side_by_side(optimizer)(states, masks, scene)
         if self._weighs(optimizer):
             _warn_of_negative(results[1].selection.cost)
         return _first(results)
@@ -314,7 +316,8 @@ class SideBySide:
                 states, masks, scene
             )
         asked = self._ask(states, masks, scene)
-        return self._tell(states, masks, scene, asked, task._batch.simulate(*asked[2:], scene))
+        hands, trials = asked[2:]
+        return self._tell(states, masks, scene, asked, task._batch.simulate(hands, trials, scene))
 
     def compile(self, states: OptimizerState, masks: jax.typing.ArrayLike) -> Callable:
         """Compiles ahead for arguments like these, by worlds that are not simulated.

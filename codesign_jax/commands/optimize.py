@@ -20,7 +20,7 @@ from codesign_jax.judge import fresh_trials, sentences, stress, verdict, worth
 from codesign_jax.judge.sentences import Judged
 from codesign_jax.report import advice
 from codesign_jax.runs import Plan, RunResult, Settings, columns, reference
-from codesign_jax.runs.directory import RunDirectory
+from codesign_jax.runs.directory import reopened
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene, schema
 from codesign_jax.scene.parameters import DesignSpace
@@ -67,22 +67,23 @@ def main(options: Optimize) -> int:
         if names:
             console.print(f"{names[folder]}:")
         later = (len(ended) - k - 1) * after
-        with _resumable(ended):
+        with _resumable({f: plans[f].settings for f in ended}):
             _tell(plans[folder], result, folder, (most, later), console)
     compared = _compare(options) if names else 0
     return compared or int(bool(errors))
 
 
 @contextlib.contextmanager
-def _resumable(folders: Iterable[Path]) -> Iterator[None]:
+def _resumable(ended: Mapping[Path, Settings]) -> Iterator[None]:
     """Says to the terminal and to the runs' logs that tests which are stopped go on later."""
     try:
         yield
     except KeyboardInterrupt:
         words = "stopped in the tests behind the search; the same command resumes"
         say(words, error=True)
-        for folder in folders:
-            RunDirectory(folder).log(words)
+        for folder, settings in ended.items():
+            with reopened(folder, settings) as directory:
+                directory.log(words)
         raise
 
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
@@ -75,7 +76,7 @@ class StraightLine:
 
     def shapes(self) -> list[Any]:
         """Shapes and types of the results."""
-        return [jax.core.ShapedArray(self._shape, self._types[k]) for k in self.results]
+        return [ShapedArray(self._shape, self._types[k]) for k in self.results]
 
     def run(self, values: list[Any], known: Callable, apply: Callable) -> list[Any]:
         """The results of known(number) and apply(operation, operands) from arguments."""

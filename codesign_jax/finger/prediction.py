@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -144,8 +145,8 @@ def shifted(table: Table, predicted: Table) -> dict[str, float]:
         pressure = table["pressure"][rows]
         if len({*table[name][rows]}) < 3 or len({*predicted[name][rows]}) < 3:
             continue
-        measured = stats.linregress(table[name][rows], pressure)
-        model = stats.linregress(predicted[name][rows], pressure)
+        measured: Any = stats.linregress(table[name][rows], pressure)
+        model: Any = stats.linregress(predicted[name][rows], pressure)
         doubt = _DEVIATIONS * np.hypot(measured.intercept_stderr, model.intercept_stderr)
         if measured.intercept - model.intercept > _SHIFT * pressure.max() + doubt:
             starts[name] = float(measured.intercept)

@@ -80,11 +80,8 @@ class Case(NamedTuple):
           InputError: If the hand has not these fingers, or no other ones, or it has a policy.
         """
         count = self.scene.num_fingers
-        problems = [
-            range_problem("--without", f, "", 0, count - 1)
-            for f in fingers
-            if f not in range(count)
-        ]
+        outside = [range_problem("--without", f, "", 0, count - 1) for f in fingers]
+        problems = [problem for problem in outside if problem]
         if len({*fingers}) == count:
             problems.append(Problem("conflict", "--without names all fingers of the hand"))
         if self.policy:

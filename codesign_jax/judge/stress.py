@@ -122,7 +122,7 @@ def simulate(
 
     recorded = Batch(scene, case.make_engine(), rollout.Options(record_qpos=True))
     outcomes, trace, drawn = simulated(recorded, scene)
-    warnings = _in_grasps(scene, params, outcomes, trace.qpos[:, ::HELD], drawn)
+    warnings = _in_grasps(scene, params, outcomes, np.asarray(trace.qpos)[:, ::HELD], drawn)
     every = [(AS_IT_IS, outcomes)]
     conditions = Batch(scene, case.make_engine(), rollout.Options())
     every += [(name, simulated(conditions, c)[0]) for name, c in variants(scene)]

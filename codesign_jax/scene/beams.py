@@ -103,7 +103,9 @@ def softening_energy(curvature: Any, height: Any, wall: Any, *, width: Any) -> A
     return _lacking(lambda e: e / (1 + e), curvature, height, wall, width=width)
 
 
-def _lacking(of_strain: Callable, curvature: Any, height: Any, wall: Any, *, width: Any) -> Any:
+def _lacking(
+    of_strain: Callable[[Any], Any], curvature: Any, height: Any, wall: Any, *, width: Any
+) -> Any:
     """[w h^3 f(kappa h) - w_c ((h-d)^3 f(kappa (h-d)) - d^3 f(kappa d))] / (4 I_0) of f(e)."""
     kappa = curvature * (curvature > 0)
     inner = height - wall

@@ -111,7 +111,8 @@ def constants() -> Constants:
     table = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
     functions = table.pop("functions")
     rows = np.array([functions[name] for name in FITTED])
-    return Constants(rows, **{n: tuple(v) if isinstance(v, list) else v for n, v in table.items()})
+    others: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in table.items()}
+    return Constants(rows, **others)
 
 
 def numbers(
@@ -342,7 +343,7 @@ def energy(
     return n.modulus * n.height**2 * total
 
 
-def moments(n: Numbers, pressure: Any, twist: Any, bend: Any, lateral: Any) -> tuple:
+def moments(n: Numbers, pressure: Any, twist: Any, bend: Any, lateral: Any) -> tuple[Any, ...]:
     """External moments (twist, bend, lateral) that hold the curvatures [N m]; see `energy`."""
     _, pull = jax.vjp(lambda *kappa: energy(n, pressure, *kappa), twist, bend, lateral)
     return pull(jax.numpy.ones_like(twist * bend * lateral * n.height))

@@ -453,7 +453,7 @@ class Model:
         # Residuals are forces per length, moments and, of the pressures, areas times G.
         scale = np.full(self._size, self.section.shear_modulus * height)
         scale[self._unknowns[:, 27:30]] *= height
-        scale[self._strains[0]] *= height
+        scale[int(self._strains[0])] *= height
         scale[self._strains[1:]] *= height**2
         for _ in range(rounds):
             _, gradient, hessian = self.derivatives(state)
@@ -462,7 +462,8 @@ class Model:
                 self.state = state
                 return gradient[self._strains[1:]]
             step = np.zeros(self._size)
-            step[free] = scipy.sparse.linalg.spsolve(hessian[free][:, free], -residual)
+            solved = scipy.sparse.linalg.spsolve(hessian[free][:, free], -residual)
+            step[free] = np.asarray(solved)
             if not np.isfinite(step).all():
                 break
             largest = np.abs(step[self._places]).max() / height

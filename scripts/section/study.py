@@ -38,7 +38,7 @@ def design() -> dict[str, Section]:
 
     def spread(name: str, count: int, ranges: dict[str, tuple[float, float]], **fixed: Any) -> None:
         seed = sum(map(ord, name))
-        sampler = qmc.Sobol(len(ranges), seed=seed)
+        sampler: Any = qmc.Sobol(len(ranges), seed=seed)  # type: ignore[call-arg]
         units = sampler.random_base2(math.ceil(math.log2(count)))[:count]
         for k, unit in enumerate(units):
             at = zip(ranges.items(), unit, strict=True)

@@ -249,7 +249,8 @@ def of_fast_link(
     joint = joint | {"order": fixed["order"]}
     after, behind, axes, force = carried_momentum(scene, now[:3], before, numbers, joint)
     along = next_acceleration(now.along, axes, fixed["virtual"])
-    return FastMotion(*after, along), Before(*behind), dot(force, along)
+    origin, frame, vel = after
+    return FastMotion(origin, frame, vel, along), Before(*behind), dot(force, along)
 
 
 def of_palm(timestep: float, state: dict, arm, constants: dict, fixed: dict) -> tuple:

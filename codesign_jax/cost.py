@@ -24,7 +24,7 @@ from codesign_jax.scene import Scene
 from codesign_jax.types import Forces, Outcome, Status, Trace, Trial, failed
 
 MOVED = 1e-3
-"""Distance on the table from which on an object was moved [m] [chosen]: contacts of the hand give
+"""Distance on the table from which on an object was moved [m] (chosen): contacts of the hand give
 way by less before they shift an object, and one that is not touched stays where it is."""
 _ROUNDING = 1.001
 """A ball's centre rests just as high as its radius: in float32 it may be a little higher."""

@@ -280,7 +280,7 @@ NO_TABLES = {
     'key = "objects.object.friction"': ('key = "phases.lift"', ("unknown", "constants")),
     "correlation = [-0.8]": (
         "correlation = [0.1, 0.2]",
-        ("unknown", "constants.toml.constant hand.material.damping_time"),
+        ("size", "constants.toml.constant hand.material.damping_time"),
     ),
     "sd = 0.2": ("sd = -0.2", ("range", "constants.toml.constant[0].sd")),
     "low = 0.8": ("low = 1.2", ("order", "constants.toml.constant objects.object.friction")),

@@ -104,6 +104,13 @@ def at_states(scene, fields, ctrl, trajectory, stride=1):
             yield world, k, compiled, data
 
 
+def turns_fast(scene, data):
+    """Whether a body turns so fast that its velocity products are not MuJoCo's."""
+    lay = model.layout(scene)
+    turns = scene.discretization.timestep * np.linalg.norm(data.cvel[:, :3], axis=1)
+    return turns[lay.bodies].max() > LARGEST_TURN or turns[lay.object] > LARGEST_FREE_TURN
+
+
 def against_mujoco(scene, fields, ctrl, trajectory, stride=1):
     """Errors of a path's steps against MuJoCo C, see `at_states`.
 
@@ -117,8 +124,7 @@ def against_mujoco(scene, fields, ctrl, trajectory, stride=1):
     touching = []
     for world, k, _, data in at_states(scene, fields, ctrl, trajectory, stride):
         qvel, after = trajectory.qvel[world, k : k + 2]
-        turns = h * np.linalg.norm(data.cvel[:, :3], axis=1)
-        fast = turns[lay.bodies].max() > LARGEST_TURN or turns[lay.object] > LARGEST_FREE_TURN
+        fast = turns_fast(scene, data)
         errors.append(0.0 if fast else relative_change((after - qvel) / h, data.qacc))
         away = data.xipos[lay.object] - lay.centre_weights @ data.xipos
         far.append(abs(np.linalg.norm(away) - trajectory.distance[world, k]))
@@ -174,7 +180,7 @@ def unbalanced(scene, fields, ctrl, trajectory, stride):
     Mass matrix and smooth forces are MuJoCo C's.  Forces of contacts are found over whole arrays,
     by the functions of geometry and friction cone that the kernel calls.  The largest on wrist,
     which is compliant, joints and object, each over the largest of all states if nothing were
-    accelerated, shape (3, state).
+    accelerated, shape (3, state); NaN where a body turns fast, see `turns_fast`.
     """
     end = 6 + model.layout(scene).dofs.size
     count = -(-ctrl.shape[1] // stride)
@@ -208,6 +214,7 @@ def unbalanced(scene, fields, ctrl, trajectory, stride):
     compiled = pushes.lower(many, qpos, qvel, acc).compile({"xla_backend_optimization_level": 0})
     pushed, at_rest = (np.asarray(v) for v in compiled(many, qpos, qvel, acc))
     left = np.empty((2, *pushed.shape))
+    fast = np.zeros(len(qpos), bool)
     for k in range(len(qpos)):
         if k % count == 0:
             world_fields = grasps.nth(fields, k // count)
@@ -224,7 +231,8 @@ def unbalanced(scene, fields, ctrl, trajectory, stride):
         smooth = turn.T @ data.qfrc_smooth
         left[0, k] = turn.T @ mass @ turn @ acc[k] - smooth - pushed[k]
         left[1, k] = -smooth - at_rest[k]
+        fast[k] = turns_fast(scene, data)
     parts = slice(0, 6), slice(6, end), slice(end, None)
     worst = np.array([[np.abs(v[:, part]).max(1) for part in parts] for v in left])
     # At rest nothing is accelerated, and what is left is rounding of forces that cancel.
-    return worst[0] / worst[1].max(1, keepdims=True)
+    return np.where(fast, np.nan, worst[0] / worst[1].max(1, keepdims=True))

@@ -20,6 +20,7 @@ import gc
 import hashlib
 import importlib.metadata
 import os
+import stat
 import time
 import warnings
 import zlib
@@ -203,8 +204,13 @@ def use_compilation_cache() -> None:
     elif jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
         # JAX reads no programs of its other way of compression, and writes over none.
         programs = folder() / ("jax" if _unzstd() is None else "jax-zstd")
-        if not check_programs(programs):
+        text = ""
+        if place := _open_to_others(programs):
+            text = f"{place} may be changed by others, whose programs would run here: none is used "
+            text += "or kept; make it your own, without write permission for others (chmod o-w)"
+        elif not check_programs(programs):
             text = f"{programs} holds damaged programs that cannot be deleted: none is used or kept"
+        if text:
             warnings.warn(text, stacklevel=2)
             jax.config.update("jax_enable_compilation_cache", False)
             return
@@ -228,6 +234,19 @@ def why_nothing_is_kept() -> str:
     if not (existing.is_dir() and os.access(existing, os.W_OK)):
         return f"{existing} cannot be written to: XDG_CACHE_HOME names another place"
     return ""
+
+
+def _open_to_others(programs: Path) -> Path | None:
+    """A folder of programs or kernels that somebody besides this user and root may write to.
+
+    A group may: that of many users has nobody else in it, and their umask lets it write.
+    """
+    for place in (programs.parent, programs, programs / "kernels"):
+        with contextlib.suppress(OSError):  # it is not there
+            state = place.stat()
+            if state.st_mode & stat.S_IWOTH or state.st_uid not in (0, os.getuid()):
+                return place
+    return None
 
 
 # JAX (`lru_cache.py`) writes no program as a whole and writes over nothing: what a full disk or a

@@ -393,6 +393,30 @@ def test_damage_that_cannot_be_deleted_turns_the_cache_off(place, monkeypatch):
     assert not jax.config.jax_enable_compilation_cache
 
 
+@pytest.mark.parametrize("inner", ["", "jax", "jax/kernels"])
+@pytest.mark.parametrize("way", ["mode", "owner"])
+def test_programs_that_others_may_have_written_are_not_used(inner, way, place, monkeypatch):
+    use_all(monkeypatch)
+    if not (place / "jax").exists():  # where JAX compresses by zstd
+        (place / "jax-zstd").rename(place / "jax")
+        monkeypatch.setattr(reuse, "_unzstd", lambda: None)
+    jax.config.update("jax_compilation_cache_dir", None)
+    (place / inner).chmod(0o775)  # a group's
+    reuse.use_compilation_cache()
+    assert jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", None)
+    if way == "mode":
+        (place / inner).chmod(0o777)
+    elif os.getuid() == 0:
+        os.chown(place / inner, 4711, -1)
+    else:
+        monkeypatch.setattr(os, "getuid", lambda: 4711)
+    with pytest.warns(UserWarning, match="may be changed by others"):
+        reuse.use_compilation_cache()
+    assert not jax.config.jax_enable_compilation_cache
+    assert reuse.kernel_file("kernel") is None
+
+
 def test_a_folder_of_jax_that_nobody_meant_is_refused(monkeypatch, capsys):
     """JAX makes a folder named ~ in each working directory."""
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "~/cache")

@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import devices, rollout
+from codesign_jax import devices, preflight, rollout
 from codesign_jax.engines import Engine
 from codesign_jax.reuse import SceneProgram, shared
 from codesign_jax.scene import Scene
-from codesign_jax.types import Outcome, Params, Trace, Trial
+from codesign_jax.types import Outcome, Params, Status, Trace, Trial
 
 LIMIT = 16_384
 """Most worlds of one device in one call."""
@@ -120,6 +120,22 @@ class Batch:
         outcomes, trace = self._call(chosen, rows > 0, None)
         nothing = np.zeros(worlds, int)
         return jax.tree.map(lambda v: np.asarray(v)[nothing], (outcomes, trace.last))
+
+    def start(self, hands: Params, *, size: int | None = None) -> bool:
+        """Whether hands, leading axis (hand,), may start with each object as it lies without noise.
+
+        By grasps of an engine that `fills`; False where it is not known.
+        """
+        scene = self.scene
+        if not self.fills or scene.drawn.constant:
+            return False
+        shapes = range(len(scene.objects.object))
+        each = [jax.tree.map(np.asarray, preflight.nominal_trial(scene, k)) for k in shapes]
+        count = len(np.asarray(hands.length))
+        worlds = jax.tree.map(lambda v: np.repeat(np.asarray(v), len(each), 0), hands)
+        trials = jax.tree.map(lambda *v: np.stack(v * count), *each)
+        outcomes, _ = self.simulate(worlds, trials, size=size)
+        return not (outcomes.status & Status.INVALID_START).any()
 
     def _call(self, inputs: tuple, counts: np.ndarray, scene: Scene | None) -> tuple:
         small = len(counts) <= QUICK * self.count

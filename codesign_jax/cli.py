@@ -76,6 +76,7 @@ def main(arguments: list[str] | None = None) -> int:
             prog="codesign",
             description="Co-design of hand morphology and control; --version prints the version.",
         )
+        command.words = words
         if arguments is None:
             terminal.waits.append(True)
         # Before the modules that take seconds to import.

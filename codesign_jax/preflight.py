@@ -1,21 +1,27 @@
 """Before anything is simulated: which worlds may start, and warnings of scenes and designs.
 
 `invalid_start` judges the worlds of a batch as a part of its program, by the overlap that the
-structured engine finds in its first step, or by `overlap` for engines that tell none; `notes` and
-`refusals` judge named designs by the same depths and say in words what is wrong.  The scene's own
-checks look at one number at a time; these look at the world that a design makes of them.
+structured engine finds in its first step, or by `engines.depths` for those that tell none; `notes`
+and `refusals` judge named designs by the same depths and say in words what is wrong.  The scene's
+own checks look at one number at a time; these look at the world that a design makes of them.
 """
 
 import math
 import operator
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import model
-from codesign_jax.engines.overlaps import depth, depth_between, depth_by_pair, depth_in_palm
+from codesign_jax.engines.depths import (
+    depth,
+    depth_between,
+    depth_by_pair,
+    depth_in_palm,
+    largest_depth,
+)
 from codesign_jax.model import ModelFields, morphology
 from codesign_jax.reuse import quickly_compiled
 from codesign_jax.scene import Scene, key_frames
@@ -66,12 +72,12 @@ def invalid_start(scene: Scene, fields: ModelFields, deepest: jax.Array | None =
 
     Args:
       deepest: Their largest overlaps [m], shape (world,), as `Trace.overlap` of an engine has them;
-        None for those of `overlap`, six thousand operations for XLA to compile.
+        None for those of `depths.largest_depth`, six thousand operations for XLA to compile.
     """
     fields = jax.lax.stop_gradient(fields)  # a verdict has no derivative
     scene = scene.structure
     if deepest is None:
-        deepest = overlap(scene, fields)
+        deepest = largest_depth(scene, fields)
     bad = ~(jax.lax.stop_gradient(deepest) <= fields.constants.limits.penetration)
     # Constants in their ranges have a finite sum, for which XLA writes one loop; as rows of an
     # array they would be one loop each.
@@ -88,16 +94,20 @@ def _rows(*arrays: jax.Array) -> jax.Array:
     return jnp.concatenate([x.reshape(x.shape[0], -1) for x in arrays], 1)
 
 
-def overlap(scene: Scene, fields: ModelFields) -> jax.Array:
-    """Largest overlap of two bodies that may touch [m], shape (world,); fingers are straight."""
-    others = jnp.maximum(depth_between(scene, fields), depth_in_palm(scene, fields))
-    return jnp.maximum(depth(scene, fields), others)
+def notes(
+    scene: Scene,
+    space: DesignSpace,
+    designs: Mapping[str, np.ndarray],
+    start: Callable[[Params], bool] = lambda designs: False,
+) -> list[str]:
+    """Warnings of named designs [SI units], and how exact the scene's meshes are.
 
-
-def notes(scene: Scene, space: DesignSpace, designs: Mapping[str, np.ndarray]) -> list[str]:
-    """Warnings of named designs [SI units], and how exact the scene's meshes are."""
+    Args:
+      start: Whether a simulation says that all of the designs start apart from everything, as
+        `batch.Batch.start`: then no program is compiled that measures depths.
+    """
     params = params_of(space, np.array([*designs.values()], np.float32))
-    problems = refusals(scene, params, [*designs])
+    problems = refusals(scene, params, [*designs], start)
     if problems:
         raise InputError(problems)
     lines = [f"warning: {text}" for text in warnings(scene, params, [*designs])]
@@ -115,15 +125,22 @@ def warnings(scene: Scene, designs: Params, names: list[str]) -> list[str]:
     return doubts + low[:1] + _stiffness(scene, each)
 
 
-def refusals(scene: Scene, designs: Params, names: list[str]) -> list[str]:
-    """Why designs, arrays with leading axis (design,), must not be simulated."""
+def refusals(
+    scene: Scene,
+    designs: Params,
+    names: list[str],
+    start: Callable[[Params], bool] = lambda designs: False,
+) -> list[str]:
+    """Why designs, with leading axis (design,), must not be simulated; `start`: see `notes`."""
     limit = morphology.pressure_limits(scene.hand, designs)
     problems = [
         f"{names[i]}: finger {f}: pressure {designs.pressure[i, f]:.4g} Pa is above the limit of "
         f"{limit[i, f]:.4g} Pa for a wall of {designs.wall[i, f]:g} m"
         for i, f in np.argwhere(np.asarray(designs.pressure) > limit * (1 + 1e-6))
     ]
-    return problems + _overlaps(scene, designs, names)
+    if problems or not start(designs):
+        problems += _overlaps(scene, designs, names)
+    return problems
 
 
 def mesh_notes(scene: Scene) -> list[str]:

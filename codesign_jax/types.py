@@ -279,7 +279,7 @@ class Trace(NamedTuple):
       forces: Contact forces over the step taken from each state, if they were recorded.
       overlap: Largest overlap of two bodies as the grasp began [m], zero where there was none or
         the rollout went on from a later state, shape (); None if the engine does not tell, see
-        `preflight.overlap`.
+        `engines.depths`.
 
     An object that leaves the hand after six seconds, as its cost sees it:
 

@@ -9,7 +9,7 @@ import pytest
 
 from codesign_jax import batch, codesign
 from codesign_jax.optimize import schedule
-from tests.helpers.toy_engine import tiny
+from tests.helpers.toy_engine import frozen, tiny
 
 PARTICLES = 8
 TRIALS = 3
@@ -69,7 +69,7 @@ def test_noise_differs_between_episodes_seeds_and_the_test(setup):
     seen = [info, episode(first, mask)[1], episode(start(optimizer, seed=1), mask)[1]]
     rows = [i.outcomes.cost[0] for i in seen]
     keys = [codesign.test_key(first.key, k) for k in range(2)]
-    tests = [codesign.frozen(optimizer, first.particles, key) for key in keys]
+    tests = [frozen(optimizer, first.particles, key) for key in keys]
     rows += [episode(*test)[1].outcomes.cost[0] for test in tests]
     assert len(np.unique(np.asarray(rows), axis=0)) == 5
 
@@ -103,7 +103,7 @@ def test_seed_is_poor_and_reproducible(setup):
     space = task.space
 
     def evaluate(population, key):
-        _, info = episode(*codesign.frozen(optimizer, population, key))
+        _, info = episode(*frozen(optimizer, population, key))
         np.testing.assert_array_equal(info.population, population)
         return info.outcomes
 

@@ -117,14 +117,14 @@ def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, m
     assert command(*RUN, "--reference-trials", "2", "--out", folder) == 0
     settings = runs.read_run(folder)[1]
     text = capsys.readouterr().out
-    stress, _ = reference.stored_stress(folder, settings)
+    stress, _ = reference.read_stress(folder, reference.tested(folder, settings)[1])
     assert stress is not None
     assert [*dict.fromkeys(stress.conditions)][-1] == "neo-Hookean bending law"
     assert f"; {stress.limits}" in text
     for words in ("under other conditions, 12 grasps each", *stress.lines()):
         assert " ".join(words.split()) in " ".join(text.split())
     other = dataclasses.replace(settings, seed=settings.seed + 1)
-    assert reference.stored_stress(folder, other)[0] is None
+    assert reference.read_stress(folder, reference.tested(folder, other)[1])[0] is None
     assert command("report", folder, "--no-replay") == 0
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert "Under other conditions, 12 grasps each" in page and "neo-Hookean bending law" in page

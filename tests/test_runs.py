@@ -5,6 +5,8 @@ import dataclasses
 import os
 import re
 import shutil
+import threading
+import time
 from functools import partial
 from pathlib import Path
 
@@ -13,18 +15,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from codesign_jax import codesign, files, optimize, runs, scene
-from codesign_jax.runs import columns, directory, tables
+from codesign_jax import codesign, files, optimize, rollout, runs, scene
+from codesign_jax.compiler import handlers
+from codesign_jax.judge import fresh_trials, stress
+from codesign_jax.judge.cases import Case
+from codesign_jax.runs import columns, directory, reference, tables
 from codesign_jax.runs import record as records
 from codesign_jax.runs import settings as settings_module
 from codesign_jax.runs.directory import open_run
 from codesign_jax.runs.plan import finalists as finalists_of_plan
+from codesign_jax.runs.programs import Programs
 from codesign_jax.runs.record import Record
 from codesign_jax.scene import library, parameters, scene_files
 from codesign_jax.scene.scene_files import write_scene
 from codesign_jax.scene.schema import InputError
+from tests.helpers import grasps
 from tests.helpers.command_runs import RUN, command, copied, own_workplace, snapshot, without  # noqa: F401
-from tests.helpers.toy_engine import tiny
+from tests.helpers.toy_engine import frozen, tiny
 
 ROOT = Path(__file__).parent.parent
 
@@ -51,7 +58,7 @@ def toy_run():
     particles = record.state.particles
     key = record.state.key
     keys = [codesign.test_key(key, k) for k in range(s.test_rounds)]
-    tests = [codesign.frozen(optimizer, particles, key) for key in keys]
+    tests = [frozen(optimizer, particles, key) for key in keys]
     parts = [record.last_outcomes(), *(episode(*test)[1].outcomes for test in tests)]
     record.test = jax.tree.map(lambda *v: np.concatenate(v, axis=1), *parts)
     test = codesign.summarize_test(the_scene, record.test)
@@ -82,11 +89,11 @@ def test_sizes_default_to_the_papers():
     assert of("full", optimize.DEFAULT, objects=8) == (25, 8, 30, 48)
     assert of("full", optimize.DEFAULT, objects=1) == (25, 3, 30, 48)
     # Its final test simulates three averages, or designs of 2D, and no copies of them.
-    for preset, grasps in (("23d", 30 * 75 + 3 * 48), ("2d", 22 * 36 + 3 * 48)):
+    for preset, expected in (("23d", 30 * 75 + 3 * 48), ("2d", 22 * 36 + 3 * 48)):
         made = settings_module.make_settings(
             preset, "concurrent", "control", "structured", 0, optimizer=optimize.DEFAULT
         )
-        assert runs.prepare(scene.load(), made).grasps == grasps
+        assert runs.prepare(scene.load(), made).grasps == expected
 
 
 @pytest.mark.parametrize(
@@ -121,6 +128,87 @@ def test_settings_report_every_problem():
     for part in ("--trials = -1", "--seed = -5", "--schedule: unknown schedule 'x'"):
         assert part in text
     assert settings_module.check(settings(), scene.load().hand) == []
+
+
+class Compiled:
+    """Programs that end when they are told to, in place of a compiler."""
+
+    def __init__(self, *names):
+        self.begun = []
+        self.ends = {name: threading.Event() for name in names}
+        self.programs = Programs({name: partial(self._compile, name) for name in names})
+
+    def _compile(self, name):
+        self.begun.append(name)
+        self.ends[name].wait()
+        if name == "broken":
+            raise RuntimeError("whoever needs the program meets this")
+
+
+def test_programs_are_compiled_one_behind_another_while_others_run():
+    compiled = Compiled("fine", "broken", "last")
+    with compiled.programs as programs:
+        assert programs.words() == "compiling 1 of 4" and not compiled.begun
+        programs.begin()
+        assert programs.words("last") == "compiling 4 of 4"
+        said = []
+
+        def tell(words):
+            """The wait is told before it begins: only then may the program end."""
+            said.append(words)
+            for event in [*compiled.ends.values()][:2]:
+                event.set()
+
+        programs.wait("broken", tell)
+        assert said == ["compiling 3 of 4", ""]
+        assert programs.words("fine") == programs.words("broken") == ""
+        programs.wait("another's", said.append)  # is compiled where it is used
+        assert said[2:] == ["compiling"]
+        compiled.ends["last"].set()
+    assert compiled.begun == ["fine", "broken", "last"]
+    assert Programs().words() == "compiling"
+
+
+def test_a_command_that_ends_waits_for_one_program_and_begins_no_other():
+    compiled = Compiled("first", "second")
+    with compiled.programs as programs:
+        programs.begin()
+        while not compiled.begun:
+            time.sleep(0.01)
+        threading.Timer(0.3, compiled.ends["first"].set).start()
+    assert compiled.ends["first"].is_set() and compiled.begun == ["first"]
+    interrupted = Compiled("first")
+    with pytest.raises(KeyboardInterrupt), interrupted.programs as programs:
+        programs.begin()
+        raise KeyboardInterrupt  # ends at once, though the program never does
+    interrupted.ends["first"].set()
+
+
+@pytest.mark.slow  # five kernels; the test above has the order in which they are compiled
+def test_what_is_compiled_during_a_search_is_what_its_tests_run(monkeypatch):
+    made = settings(preset="2d", engine="structured", optimizer=optimize.DEFAULT)
+    plan = runs.prepare(grasps.short_grasp(), made)
+    case = Case(plan.scene, plan.space, plan.space.default(), "structured")
+    case.compile(reference.STRESS_TRIALS, rollout.Options())  # as a search does
+    compiled = []
+    register = handlers.register
+
+    def counting(name, *arguments):
+        compiled.append(name)
+        register(name, *arguments)
+
+    monkeypatch.setattr(handlers, "register", counting)
+    said = []
+    with reference.programs_of(plan, 20) as programs:
+        names = [reference.FRESH, stress.RECORDED, stress.OTHER_LAW]
+        assert [programs.words(n)[:11] for n in names] == [f"compiling {k}" for k in (2, 3, 4)]
+        for name in names:
+            programs.wait(name, said.append)
+    assert len(compiled) == 3
+    finer = case._replace(scene=scene.with_accuracy(plan.scene, fresh_trials.ACCURACY))
+    finer.simulate(20, jax.random.key(0))
+    stress.simulate(case, reference.STRESS_TRIALS, jax.random.key(0))
+    assert len(compiled) == 3
 
 
 def read(path):

@@ -175,12 +175,12 @@ def test_results_are_kept_and_damaged_ones_are_not_taken(monkeypatch, tmp_path):
     path = tmp_path / reference.FINGERS_FILE
     about = "a design"
     reference.array_files.save_results(path, about, result._asdict())
-    again, why = reference._worth(tmp_path, about)
+    again, why = reference.read_worth(tmp_path, about)
     assert not why and again.least == result.least and again.rows == result.rows
     for name, value in {"both": result.both + 99, "absent": result.absent[0]}.items():
         reference.array_files.save_results(path, about, result._asdict() | {name: value})
-        assert reference._worth(tmp_path, about)[0] is None
-    assert reference._worth(tmp_path / "other", about) == (None, "")
+        assert reference.read_worth(tmp_path, about)[0] is None
+    assert reference.read_worth(tmp_path / "other", about) == (None, "")
 
 
 def test_conditions_are_those_of_the_stress_test():

@@ -18,7 +18,6 @@ from codesign_jax.codesign.episode import (
     EpisodeInfo,
     Task,
     episode_trials,
-    frozen,
     stream_key,
 )
 from codesign_jax.codesign.experiment import (
@@ -48,7 +47,6 @@ __all__ = [
     "Task",
     "convergence_episode",
     "episode_trials",
-    "frozen",
     "make_filter",
     "make_optimizer",
     "particle_cost",

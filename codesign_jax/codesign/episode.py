@@ -248,6 +248,13 @@ class Task:
         """Worlds of a call of what simulates so many, for other calls to be alike; None for any."""
         return self._batch.size(worlds) if self._batch.fills else None
 
+    def start(self, hands: Params, worlds: int) -> bool:
+        """Whether hands, leading axis (hand,), are known to start apart from everything.
+
+        By the program that simulates so many worlds, see `batch.Batch.start`.
+        """
+        return self._batch.start(hands, size=self.call_size(worlds))
+
     def first_trials(self, keys: jax.Array) -> Trial:
         """Trials of the first episodes of runs with these root keys, leading axes (run, trial)."""
         return SceneProgram(self.scene, self._pieces.first_trials)(keys, None)
@@ -500,21 +507,6 @@ def episode_trials(
 ) -> Trial:
     """Trials of an episode of the run with this root key, leading axis (trial,)."""
     return rollout.sample_trials(scene, stream_key(key, STREAM_TRIAL, episode), num_trials)
-
-
-def frozen(
-    optimizer: Optimizer, population: jax.Array, key: jax.Array
-) -> tuple[OptimizerState, np.ndarray]:
-    """State and mask of an episode that moves nothing: it simulates particles as they are.
-
-    Its trials are those of the first episode of a run with this root key.
-
-    Args:
-      population: Particles [SI units], shape (particle, parameter).
-    """
-    state = optimizer.init(key, population[0], len(population))
-    mask = np.zeros(np.shape(optimizer.space.low), bool)
-    return state._replace(particles=jnp.asarray(population)), mask
 
 
 def stream_key(key: jax.Array, stream: int, index: jax.typing.ArrayLike = 0) -> jax.Array:

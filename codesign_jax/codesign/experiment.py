@@ -55,8 +55,7 @@ def seed_search(
     Args:
       optimizer: Optimiser whose space is sampled.
       key: Root key of the run.
-      evaluate: From candidates and the root key of an episode that moves nothing (`frozen`) to
-        their outcomes.
+      evaluate: From candidates and the root key of an episode that moves nothing to their outcomes.
       batch: Candidates of one call.
       threshold: Cost above which a candidate is poor enough.
 
@@ -77,7 +76,7 @@ def seed_search(
 
 
 def test_key(key: jax.Array, index: int) -> jax.Array:
-    """Root key of a round of the final test of a run, an episode that moves nothing (`frozen`).
+    """Root key of a round of the final test of a run, an episode that moves nothing.
 
     The paper's test is 36 more trials of the final particles in 2D, which makes 42 with the last
     episode's 6, and 72 more in 23D, which makes 78; a round is as many trials as an episode's.

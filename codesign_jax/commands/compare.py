@@ -153,7 +153,8 @@ def read_all(every: Mapping[Path, tuple[Scene, Settings]]) -> dict[Path, Compare
                 judge = "" if kept else ": the final test, which flatters the design, judges it"
                 common.warn(f"{folder / reference.FILE} {why}{judge}")
             if kept is not None:
-                other, _ = reference.stored_stress(folder, settings)
+                about = reference.tested(folder, settings)[1]
+                other, _ = reference.read_stress(folder, about, any_code=True)
                 fresh = fresh_trials.judged(scene, kept, other)
         compared[folder] = Compared(scene, settings, result, fresh)
     return compared

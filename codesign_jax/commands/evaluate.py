@@ -1,7 +1,6 @@
 """`codesign evaluate`."""
 
 import shlex
-import sys
 from itertools import chain
 
 import jax
@@ -184,7 +183,7 @@ def _advice(judged: sentences.Judged, options: Evaluate) -> list[advice.Advice]:
     verdict_now = judged.verdict
     if verdict_now.word == verdict.OPEN:
         trials = {"--trials": str(verdict_now.total + verdict_now.more)}
-        return [advice.Advice("more trials", advice.changed(sys.argv[1:], trials))]
+        return [advice.Advice("more trials", advice.changed(options.words, trials))]
     if verdict_now.word == "good":
         return []
     if options.run_folder is None:

@@ -3,7 +3,6 @@
 import dataclasses
 import importlib.util
 import shlex
-import sys
 from itertools import chain
 from pathlib import Path
 
@@ -70,7 +69,7 @@ def _origin(options: Export) -> dict[str, str]:
         design = f"best final design of the run {options.run_folder}, seed {settings.seed}"
     else:
         design = " ".join(chain.from_iterable(options.design)) or "the default of the hand"
-    return {"design": design, "command": shlex.join(["codesign", *sys.argv[1:]])}
+    return {"design": design, "command": shlex.join(["codesign", *options.words])}
 
 
 def _some(names: list[str], most: int = 8) -> str:

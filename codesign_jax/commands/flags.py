@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -164,6 +165,8 @@ class Command:
     """A command: its fields are flags, and `main` of the module of its name implements it."""
 
     package = "commands"
+    words: Sequence[str] = ()
+    """The command line behind `codesign`, as it was given; nothing if a program made the flags."""
 
     def run(self) -> int:
         """Runs the command and returns the exit status."""

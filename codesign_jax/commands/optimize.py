@@ -6,14 +6,15 @@ import os
 import shlex
 import sys
 import traceback
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from codesign_jax import codesign, engines, files, optimize, preflight, runs, terminal
+from codesign_jax import codesign, devices, engines, files, optimize, preflight, runs, terminal
 from codesign_jax.commands import common, compare, status
 from codesign_jax.commands.flags import Optimize
 from codesign_jax.judge import fresh_trials, sentences, stress, verdict, worth
@@ -21,12 +22,14 @@ from codesign_jax.judge.sentences import Judged
 from codesign_jax.report import advice
 from codesign_jax.runs import Plan, RunResult, Settings, columns, reference
 from codesign_jax.runs.directory import reopened
+from codesign_jax.runs.programs import Programs
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene import Scene, schema
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.scene.scene_files import scene_texts
 from codesign_jax.scene.schema import InputError
 from codesign_jax.terminal import Console, say
+from codesign_jax.types import Params
 from codesign_jax.user_code import is_user_code, make_policy
 
 ALTERNATE = "alternate"
@@ -36,6 +39,15 @@ _LONGEST = 200
 """Most bytes of a folder's name; file systems take 255, temporary files add to it."""
 
 
+class _After(NamedTuple):
+    """What is simulated of a run's design once the run has ended."""
+
+    most: int  # fresh grasps at most
+    later: float  # grasps after those of this run, of the run's accuracy
+    programs: Programs
+    words: Sequence[str]  # the command line behind `codesign`
+
+
 def main(options: Optimize) -> int:
     common.use_compilation_cache()
     scene, settings = resolve(options)
@@ -43,10 +55,10 @@ def main(options: Optimize) -> int:
     plan = runs.prepare(scene, settings)
     plans = {folder: runs.variant(plan, run_settings) for folder, run_settings in every.items()}
     _refuse(options, scene, every)
-    terminal.wait("checking how hands of the design space begin")
-    for note in preflight.notes(scene, plan.space, _ends(plan.space)):
-        say(note)
     if options.dry_run:
+        terminal.wait("checking how hands of the design space begin")
+        for note in preflight.notes(scene, plan.space, _ends(plan.space)):
+            say(note)
         for note in common.policy_notes(plan.task.engine, plan.space.params(plan.space.default())):
             say(note)
         _dry_run(plan, len(every), options)
@@ -54,8 +66,36 @@ def main(options: Optimize) -> int:
     most = reference.most_trials(options.reference_trials, settings)
     after = _after(scene, most)
     arguments = {"devices": options.devices, "chunk": options.chunk, "after": after}
-    done = runs.optimize(plans, sys.argv, fresh=options.fresh, **arguments)
-    names = runs.run_names(every) if several(options) else {}
+    with reference.programs_of(plan, most) as programs:
+        terminal.wait(programs.words())
+        with programs.first():
+            start = _start(plan, len(every), options)
+            notes = preflight.notes(scene, plan.space, _ends(plan.space), start)
+        for note in notes:
+            say(note)
+        done = runs.optimize(plans, sys.argv, fresh=options.fresh, programs=programs, **arguments)
+        if done.signum:
+            programs.abandon()
+        return _tell_all(plans, done, _After(most, after, programs, options.words), options)
+
+
+def _start(plan: Plan, count: int, options: Optimize) -> Callable[[Params], bool]:
+    """Whether hands are known to start apart from everything, by the program of the search.
+
+    Code of the user's own is not called before a run's folder can tell of its errors.
+    """
+    settings = plan.settings
+    user_code = settings.policy or plan.task.cost is not None
+    if user_code or len(devices.take(options.devices)) > 1:
+        return lambda hands: False
+    return partial(plan.task.start, worlds=count * settings.particles * settings.trials)
+
+
+def _tell_all(
+    plans: Mapping[Path, Plan], done: runs.Results, work: _After, options: Optimize
+) -> int:
+    """Tells how each run ended, with its tests; the exit status."""
+    names = runs.run_names({f: p.settings for f, p in plans.items()}) if several(options) else {}
     errors = {folder: r for folder, r in done.runs.items() if isinstance(r, Exception)}
     for folder, error in errors.items():
         _tell_error(f"{names[folder]}: " if names else "", error)
@@ -66,9 +106,9 @@ def main(options: Optimize) -> int:
     for k, (folder, result) in enumerate(ended.items()):
         if names:
             console.print(f"{names[folder]}:")
-        later = (len(ended) - k - 1) * after
+        later = (len(ended) - k - 1) * work.later
         with _resumable({f: plans[f].settings for f in ended}):
-            _tell(plans[folder], result, folder, (most, later), console)
+            _tell(plans[folder], result, folder, work._replace(later=later), console)
     compared = _compare(options) if names else 0
     return compared or int(bool(errors))
 
@@ -126,13 +166,11 @@ def _after(scene: Scene, most: int) -> float:
     return fresh + reference.STRESS_TRIALS * stress.sets(scene) + worth.grasps(scene.num_fingers)
 
 
-def _tell(
-    plan: Plan, result: RunResult, folder: Path, work: tuple[int, float], console: Console
-) -> None:
-    """Tells how a run ended, with its verdict; `work`: most fresh grasps, and grasps after it."""
+def _tell(plan: Plan, result: RunResult, folder: Path, work: _After, console: Console) -> None:
+    """Tells how a run ended, with its verdict."""
     assert result.record is not None
     _summarize(plan, result, console)
-    most = work[0]
+    most = work.most
     if result.test is None:
         pass
     elif most and fresh_trials.hopeless(compare.of_test(plan.scene, result).outcomes):
@@ -140,28 +178,26 @@ def _tell(
             "reference test and other conditions left out: even the test that chose the design, "
             "which flatters it, kept less than half of its grasps"
         )
-        _judge(plan, result, None, folder, console)
+        _judge(plan, result, None, folder, work.words, console)
     elif not most:
-        _judge(plan, result, None, folder, console)
+        _judge(plan, result, None, folder, work.words, console)
     else:
         with runs.reopened(folder, plan.settings) as run:
             judged = _test_again(plan, run, work, console)
-        _judge(plan, result, judged, folder, console)
+        _judge(plan, result, judged, folder, work.words, console)
     _draw(result.record.history.cost, folder / "figures" / "cost_evolution.png", console)
     console.print(f"results: {folder}")
     console.print(f"to look at: {shlex.join(['codesign', 'report', str(folder)])}")
 
 
-def _test_again(
-    plan: Plan, run: runs.RunDirectory, work: tuple[int, float], console: Console
-) -> Judged:
+def _test_again(plan: Plan, run: runs.RunDirectory, work: _After, console: Console) -> Judged:
     """The design in fresh grasps and under other conditions, and without each finger; tells so."""
-    most, later = work
+    most, later, programs, _ = work
     slower = fresh_trials.steps_and_links(plan.scene)
     others = stress.sets(plan.scene)
     coming = (later + reference.STRESS_TRIALS * others) / slower
-    outcomes = reference.test(run, plan.settings, most, console, coming)
-    case, other = reference.stress_run(run, plan.settings, console, later)
+    outcomes = reference.test(run, plan.settings, most, console, programs, coming)
+    case, other = reference.stress_run(run, plan.settings, console, programs, later)
     reference.tell_stress(case, other, console)
     judged = fresh_trials.judged(plan.scene, outcomes, other)
     if judged.verdict.word != "not good":
@@ -257,7 +293,12 @@ def _summarize(plan: Plan, result: RunResult, console: Console) -> None:
 
 
 def _judge(
-    plan: Plan, result: RunResult, fresh: Judged | None, folder: Path, console: Console
+    plan: Plan,
+    result: RunResult,
+    fresh: Judged | None,
+    folder: Path,
+    words: Sequence[str],
+    console: Console,
 ) -> None:
     assert result.test is not None
     test = compare.of_test(plan.scene, result)
@@ -274,7 +315,8 @@ def _judge(
     judged = test if fresh is None else fresh
     for line in [*lines, *sentences.warnings(judged), f"verdict: {judged}"]:
         console.print(line)
-    for what, command in advice.after_search(judged, plan.settings, sys.argv, folder):
+    tips = advice.after_search(judged, plan.settings, ["codesign", *words], folder)
+    for what, command in tips:
         console.print(f"to try {what}: {shlex.join(['codesign', *command])}")
 
 

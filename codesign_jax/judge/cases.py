@@ -19,7 +19,7 @@ from codesign_jax.scene import Scene, key_frames, scene_files
 from codesign_jax.scene.hand import lacking
 from codesign_jax.scene.parameters import DesignSpace, design_space
 from codesign_jax.scene.schema import InputError, Problem, range_problem
-from codesign_jax.types import Outcome
+from codesign_jax.types import Outcome, Params, Trial
 
 
 class Departure(NamedTuple):
@@ -124,12 +124,23 @@ class Case(NamedTuple):
 
     def _in_batch(self, trials: int, key: jax.Array, first: int) -> Outcome:
         """Outcomes by the program that other batches have as well, see `batch.Batch`."""
+        every = batch.Batch(self.scene, self.make_engine(), rollout.Options())
+        return every.simulate(*self._worlds(trials, key, first))[0]
+
+    def _worlds(self, trials: int, key: jax.Array, first: int) -> tuple[Params, Trial]:
+        """The hand in each trial, and the trials, leading axis (trial,)."""
         design = np.asarray(self.design, np.float32)
         noise = rollout.sample_trials(self.scene, key, trials, first)
         hand = jax.jit(self.space.params)(design)
-        hands = jax.tree.map(lambda v: np.repeat(np.asarray(v)[None], trials, 0), hand)
-        every = batch.Batch(self.scene, self.make_engine(), rollout.Options())
-        return every.simulate(hands, noise)[0]
+        return jax.tree.map(lambda v: np.repeat(np.asarray(v)[None], trials, 0), hand), noise
+
+    def compile(self, trials: int, options: rollout.Options) -> None:
+        """Compiles ahead what simulates so many trials, of a design that has no policy.
+
+        By an engine that fills its batches, see `Engine`.
+        """
+        every = batch.Batch(self.scene, self.make_engine(), options)
+        every.compile(*self._worlds(trials, jax.random.key(0), 0))
 
     def digest(self, *numbers: int) -> str:
         """Digest of what determines outcomes, beside code, versions and device."""

@@ -5,6 +5,7 @@ Mass, friction and other constants are data of one program; the other bending la
 
 import dataclasses
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -26,6 +27,8 @@ from codesign_jax.scene.schema import InputError
 from codesign_jax.statistics import wilson
 from codesign_jax.types import Outcome, Params, Trace, Trial
 
+RECORDED, OTHER_LAW = "recorded states", "other bending law"
+"""Names of the programs that a design's tests have beside that of its search."""
 AS_IT_IS = "as it is"
 """Name of the condition in which nothing is changed, the first one."""
 DRAWS = 6
@@ -106,10 +109,40 @@ class Stress(NamedTuple):
         return ["  " + "  ".join(row).rstrip() for row in cells]
 
 
+def compilers(case: Case, trials: int) -> dict[str, Callable[[], None]]:
+    """What compiles the programs of `simulate` that no search has, by their names in their order.
+
+    See `Case.compile`.
+    """
+    other = case._replace(scene=other_law(case.scene)[1])
+    return {
+        RECORDED: partial(case.compile, trials, rollout.Options(record_qpos=True)),
+        OTHER_LAW: partial(other.compile, trials, rollout.Options()),
+    }
+
+
+def other_law(scene: Scene) -> tuple[str, Scene]:
+    """The scene with the other bending law of its fingers, and the name of the condition."""
+    other = silicones.under(scene, neo_hookean=not scene.effects.neo_hookean)
+    return f"{'neo-Hookean' if other.effects.neo_hookean else 'linear'} bending law", other
+
+
 def simulate(
-    case: Case, trials: int, key: jax.Array, done: Callable[[int], None] = lambda grasps: None
+    case: Case,
+    trials: int,
+    key: jax.Array,
+    done: Callable[[int], None] = lambda grasps: None,
+    wait: Callable[[str], None] = lambda program: None,
 ) -> Stress:
-    """Simulates the design under every condition, in the same trials; `done` counts the grasps."""
+    """Simulates the design under every condition, in the same trials.
+
+    Args:
+      case: The design.
+      trials: Trials under each condition.
+      key: Key of the trials.
+      done: Counts the grasps.
+      wait: Is called with the name of each program of `compilers` before its first use.
+    """
     scene = case.scene
     params = jax.tree.map(np.asarray, jax.jit(case.space.params)(np.asarray(case.design, float)))
     hands = jax.tree.map(lambda v: np.repeat(v[None], trials, 0), params)
@@ -120,14 +153,15 @@ def simulate(
         done(trials)
         return outcomes, trace, jax.tree.map(np.asarray, drawn)
 
+    wait(RECORDED)
     recorded = Batch(scene, case.make_engine(), rollout.Options(record_qpos=True))
     outcomes, trace, drawn = simulated(recorded, scene)
     warnings = _in_grasps(scene, params, outcomes, np.asarray(trace.qpos)[:, ::HELD], drawn)
     every = [(AS_IT_IS, outcomes)]
     conditions = Batch(scene, case.make_engine(), rollout.Options())
     every += [(name, simulated(conditions, c)[0]) for name, c in variants(scene)]
-    other = silicones.under(scene, neo_hookean=not scene.effects.neo_hookean)
-    name = f"{'neo-Hookean' if other.effects.neo_hookean else 'linear'} bending law"
+    name, other = other_law(scene)
+    wait(OTHER_LAW)
     try:
         conditions = Batch(other, case.make_engine(other), rollout.Options())
     except InputError:  # an engine that has one law only

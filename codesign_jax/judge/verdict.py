@@ -339,7 +339,7 @@ def sequential(
     """
     count = min(BATCH, most)
     so_far = previous
-    while so_far is None or _goes_on(so_far, most):
+    while so_far is None or undecided(so_far, most):
         first = 0 if so_far is None else so_far.cost.size
         batch = simulate(first, count)
         parts = [batch] if so_far is None else [so_far, batch]
@@ -348,7 +348,8 @@ def sequential(
         yield so_far
 
 
-def _goes_on(outcomes: Outcome, most: int) -> bool:
+def undecided(outcomes: Outcome, most: int) -> bool:
+    """Whether `sequential` goes on behind these outcomes, with so many trials at most."""
     counts = tally(outcomes)
     return counts.total < most and word(counts.kept, counts.total) == OPEN
 

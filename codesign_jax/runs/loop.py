@@ -1,8 +1,9 @@
 """Optimisations in their folders, one or many: seeds, episodes, final tests.
 
 `optimize` does what section VI of the paper describes.  Several runs go side by side, each in a
-folder of its own: one program simulates an episode of all of them (`Task.side_by_side`).  They may
-differ in seed, schedule and first domain, and one that fails does not stop the others.
+folder of its own: three programs ask, simulate and tell an episode of all of them
+(`Task.side_by_side`).  They may differ in seed, schedule and first domain, and one that fails does
+not stop the others.
 
 An episode is saved while the devices simulate the next one, so that no device waits for a disk.  A
 process that is killed leaves the checkpoints of all episodes but the last one or two, and tables
@@ -28,6 +29,7 @@ from codesign_jax.interrupts import Interrupts, Stopped
 from codesign_jax.optimize import OptimizerState, candidates
 from codesign_jax.runs.directory import open_run
 from codesign_jax.runs.plan import Plan, finalists, needs_poor_seed, variant
+from codesign_jax.runs.programs import Programs
 from codesign_jax.runs.progress import Progress, Voice
 from codesign_jax.runs.record import Start
 from codesign_jax.runs.run import Run, RunResult
@@ -58,6 +60,7 @@ def optimize(
     devices: int | None = None,
     chunk: int | None = None,
     after: float = 0.0,
+    programs: Programs | None = None,
 ) -> Results:
     """Runs optimisations, or goes on with them; the same call does both.
 
@@ -70,6 +73,7 @@ def optimize(
         go on when the others have ended.
       after: What the caller simulates of each run afterwards, as a number of its grasps: the time
         left that is shown includes it.
+      programs: What the caller simulates afterwards, to be compiled while the search runs.
 
     Raises:
       InputError: If a folder cannot be used; see `open_run`.
@@ -86,7 +90,7 @@ def optimize(
     folders = list(plans)
     for start in range(0, len(folders), size):
         group = {folder: plans[folder] for folder in folders[start : start + size]}
-        more = _optimize_group(group, task, command, fresh, after)
+        more = _optimize_group(group, task, command, fresh, after, programs or Programs())
         results = Results(results.runs | more.runs, more.signum)
         if results.signum:
             break
@@ -103,7 +107,12 @@ def run_names(every: Mapping[Path, Settings]) -> dict[Path, str]:
 
 
 def _optimize_group(
-    plans: Mapping[Path, Plan], task: Task, command: list[str], fresh: bool, after: float
+    plans: Mapping[Path, Plan],
+    task: Task,
+    command: list[str],
+    fresh: bool,
+    after: float,
+    programs: Programs,
 ) -> Results:
     plan = next(iter(plans.values()))
     names = run_names({folder: each.settings for folder, each in plans.items()})
@@ -115,7 +124,7 @@ def _optimize_group(
             voice = Voice(progress, names[folder] if len(plans) > 1 else "")
             runs[folder] = stack.enter_context(_opened(folder, each, command, fresh, voice))
         interrupts = stack.enter_context(Interrupts(progress.message))
-        Search([*runs.values()], task, progress, interrupts).run()
+        Search([*runs.values()], task, progress, interrupts, programs).run()
         return Results({folder: run.result for folder, run in runs.items()}, interrupts.signum)
 
 
@@ -133,7 +142,14 @@ def _opened(
 class Search:
     """Several runs side by side: seeds, episodes, final tests."""
 
-    def __init__(self, runs: list[Run], task: Task, progress: Progress, interrupts: Interrupts):
+    def __init__(
+        self,
+        runs: list[Run],
+        task: Task,
+        progress: Progress,
+        interrupts: Interrupts,
+        programs: Programs,
+    ):
         """Takes runs of one task, in their open folders; compiles nothing yet."""
         self._runs = runs
         self._task = task
@@ -145,6 +161,7 @@ class Search:
         self._rows: list[Run] = []  # runs that are simulated
         self._progress = progress
         self._interrupts = interrupts
+        self._programs = programs
         self._seconds = 0.0  # that the last simulation took
 
     def run(self) -> None:
@@ -283,16 +300,17 @@ class Search:
         """Compiles apart from the first call, so that its time is not an episode's."""
         if self._compiled is None:
             text = self._progress.text
-            self._progress.begin("compiling")
-            start = time.perf_counter()
-            self._compiled = self._interrupts.call(self._episode.compile, states, masks)
+            self._progress.begin(self._programs.words())
+            with self._programs.first():
+                self._compiled = self._interrupts.call(self._episode.compile, states, masks)
             count = self._task.devices
             where = self._task.engine.name + (f", {count} devices" if count > 1 else "")
-            message = f"compiled in {time.perf_counter() - start:.1f} s (engine {where})"
+            message = f"compiled in {self._programs.seconds:.1f} s (engine {where})"
             self._progress.message(message)
             self._progress.begin(text)
             for run in self._going():
                 run.log(message)
+            self._programs.begin()
         return self._compiled
 
     def _save(self) -> None:

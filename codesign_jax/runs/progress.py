@@ -113,7 +113,13 @@ class Meter(Live):
         self._name = text
         self._compiled = None
         self.later = later
-        self.begin(f"{text}: compiling, then {total} grasps")
+        self.begin("")
+        self.compiling("compiling")
+
+    def compiling(self, words: str) -> None:
+        """Says by these words that a program is waited for, or "" for none, and what is left."""
+        words += ", then " if words else ""
+        self.say(f"{self._name}: {words}{self.total - self.done} grasps")
 
     def count(self, grasps: int) -> None:
         """Counts grasps that an earlier process simulated."""

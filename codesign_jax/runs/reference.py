@@ -8,6 +8,7 @@ much that changes), until its verdict is decided, and at the run's accuracy unde
 """
 
 import shlex
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,13 +26,17 @@ from codesign_jax.judge.stress import Stress
 from codesign_jax.judge.worth import Worth
 from codesign_jax.runs import Settings, columns, tables
 from codesign_jax.runs.directory import RunDirectory
+from codesign_jax.runs.plan import Plan
+from codesign_jax.runs.programs import Programs
 from codesign_jax.runs.progress import Meter
 from codesign_jax.runs.record import outcome_layout
 from codesign_jax.runs.selection import case_of_run
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, with_accuracy
 from codesign_jax.terminal import Console
 from codesign_jax.types import Outcome
 
+FRESH = "fresh trials"
+"""Name of the program of `test`."""
 FILE = "reference.npz"
 STRESS_FILE = "stress.npz"
 FINGERS_FILE = "fingers.npz"
@@ -62,8 +67,30 @@ def most_trials(trials: int | None, settings: Settings) -> int:
     return verdict.MOST if settings.engine == engines.DEFAULT and settings.test_trials else 0
 
 
+def programs_of(plan: Plan, most: int) -> Programs:
+    """The programs of a search and of what is simulated of its design, in the order of their use.
+
+    Args:
+      most: Most fresh trials; with 0 nothing is simulated behind the search.
+    """
+    settings = plan.settings
+    if not most or settings.policy or not getattr(plan.task.engine, "fills", False):
+        return Programs()
+    case = Case(plan.scene, plan.space, plan.space.default(), settings.engine)
+    finer = case._replace(scene=with_accuracy(plan.scene, fresh_trials.ACCURACY))
+    fresh = {FRESH: partial(finer.compile, verdict.BATCH, rollout.Options())}
+    if finer.scene.structure == case.scene.structure:
+        fresh = {}
+    return Programs(fresh | stress.compilers(case, STRESS_TRIALS))
+
+
 def test(
-    run: RunDirectory, settings: Settings, most: int, console: Console, later: float = 0.0
+    run: RunDirectory,
+    settings: Settings,
+    most: int,
+    console: Console,
+    programs: Programs,
+    later: float = 0.0,
 ) -> Outcome:
     """Outcomes of the run's design in fresh trials at `reference`, as many as decide its verdict.
 
@@ -71,6 +98,7 @@ def test(
 
     Args:
       most: Most trials; at least 1.
+      programs: As of `programs_of`.
       later: What is simulated after it, for the time left, in grasps of this accuracy.
     """
     folder = run.path
@@ -87,6 +115,8 @@ def test(
             show(meter, outcomes, most)
 
         meter.count(kept.cost.size if kept else 0)
+        if kept is None or verdict.undecided(kept, most):
+            programs.wait(FRESH, meter.compiling)
         outcomes = fresh_trials.decide(case, key, most, kept, keep)
     if kept is None or outcomes.cost.size > kept.cost.size:
         drawn = rollout.sample_trials(case.scene, key, outcomes.cost.size)
@@ -128,33 +158,40 @@ def tell_stress(case: Case, result: Stress, console: Console) -> None:
 
 
 def stress_run(
-    run: RunDirectory, settings: Settings, console: Console, later: float = 0.0
+    run: RunDirectory,
+    settings: Settings,
+    console: Console,
+    programs: Programs,
+    later: float = 0.0,
 ) -> tuple[Case, Stress]:
     """The run's design, and what it keeps under other conditions, simulated if not yet.
 
     Args:
+      programs: As of `programs_of`.
       later: What is simulated after it, for the time left, in grasps of the run's accuracy.
     """
     folder = run.path
-    case, about = _stress_case(folder, settings)
-    result, why = _stress(folder, about)
+    case, about = tested(folder, settings)
+    result, why = read_stress(folder, about)
     if why:
         console.print(f"{folder / STRESS_FILE} {why}: simulated again")
     if result is None:
         total = STRESS_TRIALS * stress.sets(case.scene)
         with Meter("other conditions", total, console, later=later) as meter:
             noise = _noise(settings, stress.STREAM)
-            result = stress.simulate(case, STRESS_TRIALS, noise, done=meter.advance)
+            wait = partial(programs.wait, tell=meter.compiling)
+            result = stress.simulate(case, STRESS_TRIALS, noise, meter.advance, wait)
         array_files.save_results(run.here() / STRESS_FILE, about, result._asdict())
     return case, result
 
 
-def stored_stress(folder: Path, settings: Settings) -> tuple[Stress | None, str]:
-    """What `stress_run` kept of the run's design, or None; and what is amiss, as of `stored`."""
-    return _stress(folder, _stress_case(folder, settings)[1], any_code=True)
+def read_stress(folder: Path, about: str, *, any_code: bool = False) -> tuple[Stress | None, str]:
+    """What `stress_run` kept of a design, or None; and what is amiss with it.
 
-
-def _stress(folder: Path, about: str, *, any_code: bool = False) -> tuple[Stress | None, str]:
+    Args:
+      about: Digest of design and trials.
+      any_code: Whether results of another version of the code are taken, to be shown.
+    """
     path = folder / STRESS_FILE
     arrays, why = array_files.load_results(path, about, _STRESS, any_code=any_code)
     if arrays is None:
@@ -172,10 +209,10 @@ def worth_run(run: RunDirectory, settings: Settings, console: Console) -> Worth 
     None where there is nothing to leave out, or the design has a policy.
     """
     folder = run.path
-    case, about = _stress_case(folder, settings)
+    case, about = tested(folder, settings)
     if case.policy or case.scene.num_fingers < 2 or settings.engine != engines.DEFAULT:
         return None
-    result, why = _worth(folder, about)
+    result, why = read_worth(folder, about)
     if why:
         console.print(f"{folder / FINGERS_FILE} {why}: simulated again")
     if result is None:
@@ -205,12 +242,8 @@ def tell_worth(result: Worth, folder: Path, console: Console) -> None:
         console.print(f"to judge that hand: {shlex.join(words)}")
 
 
-def stored_worth(folder: Path, settings: Settings) -> tuple[Worth | None, str]:
-    """What `worth_run` kept of the run's design, or None; and what is amiss, as of `stored`."""
-    return _worth(folder, _stress_case(folder, settings)[1], any_code=True)
-
-
-def _worth(folder: Path, about: str, *, any_code: bool = False) -> tuple[Worth | None, str]:
+def read_worth(folder: Path, about: str, *, any_code: bool = False) -> tuple[Worth | None, str]:
+    """What `worth_run` kept of a design, or None; arguments as of `read_stress`."""
     path = folder / FINGERS_FILE
     arrays, why = array_files.load_results(path, about, _FINGERS, any_code=any_code)
     if arrays is None:
@@ -220,7 +253,8 @@ def _worth(folder: Path, about: str, *, any_code: bool = False) -> tuple[Worth |
     counts = {name: value.astype(int) for name, value in arrays.items()}
     result = Worth(names, absent, **counts)
     parts = np.array([result.both, result.whole, result.fewer])
-    if (parts < 0).any() or (parts.sum(0) > result.total).any() or (result.total < 1).any():
+    tried = result.total.any(1).all()
+    if (parts < 0).any() or (parts.sum(0) > result.total).any() or not tried:
         return None, _NO_RESULT
     return result, why
 
@@ -237,7 +271,8 @@ class Kept(NamedTuple):
 def kept(folder: Path, scene: Scene, settings: Settings) -> Kept:
     """Both results of a run's design, and notes where one cannot be shown or is gone."""
     outcome, why = stored(folder, settings)
-    conditions, cause = stored_stress(folder, settings)
+    about = tested(folder, settings)[1]
+    conditions, cause = read_stress(folder, about, any_code=True)
     gone = (outcome is None) != (conditions is None)  # a run that ended has both, or neither
     reasons = {FILE: why, STRESS_FILE: cause}
     lacking = {FILE: outcome is None, STRESS_FILE: conditions is None}
@@ -249,7 +284,7 @@ def kept(folder: Path, scene: Scene, settings: Settings) -> Kept:
             notes.append(f"{text}. {again}")
         elif reason:
             notes.append(f"{folder / name} {reason}. {again}")
-    fingers, cause = stored_worth(folder, settings)
+    fingers, cause = read_worth(folder, about, any_code=True)
     if cause:
         words = f"{folder / FINGERS_FILE} {cause}"
         notes.append(f"{words}{': it is left out' if fingers is None else ''}. {again}")
@@ -257,7 +292,8 @@ def kept(folder: Path, scene: Scene, settings: Settings) -> Kept:
     return Kept(trials, conditions, notes, fingers)
 
 
-def _stress_case(folder: Path, settings: Settings) -> tuple[Case, str]:
+def tested(folder: Path, settings: Settings) -> tuple[Case, str]:
+    """The run's design at the run's accuracy, and the digest of what it is tested by."""
     case = case_of_run(folder, engine=settings.engine)
     return case, case.digest(STRESS_TRIALS, settings.seed)
 

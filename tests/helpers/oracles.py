@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from codesign_jax import model
-from codesign_jax.engines import overlaps
+from codesign_jax.engines import depths
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.kernel.contact_sets import margin
@@ -147,7 +147,7 @@ def soften(scene, fields, data):
 def touching(scene, hand, kin: Kinematics, position, velocity: Spatial):
     """Contacts with object, table and fixtures over whole arrays, by pair of bodies."""
     by_pair = {}
-    for name, place in overlaps.places(scene, hand, kin, position).items():
+    for name, place in depths.places(scene, hand, kin, position).items():
         cone = getattr(hand.cones, which_cone(name))
         fingers = name.startswith("finger")
         if friction_by_contact(scene, name):

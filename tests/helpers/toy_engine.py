@@ -45,3 +45,13 @@ def tiny(**overrides):
     """The tiny scene, its two-parameter design space, and a toy engine."""
     the_scene = scene.load(TINY, overrides=overrides)
     return the_scene, parameters.design_space(the_scene.hand, "2d"), ToyEngine(the_scene)
+
+
+def frozen(optimizer, population, key):
+    """State and mask of an episode that moves nothing: it simulates particles as they are.
+
+    Its trials are those of the first episode of a run with this root key.
+    """
+    state = optimizer.init(key, population[0], len(population))
+    mask = np.zeros(np.shape(optimizer.space.low), bool)
+    return state._replace(particles=jnp.asarray(population)), mask

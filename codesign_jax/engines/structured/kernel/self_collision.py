@@ -212,7 +212,7 @@ class SelfCollision:
     def deepest(self) -> Lanes:
         """The largest overlap of fingers with one another and with the palm [m], or zero.
 
-        See `engines.overlaps.depth_between` and `depth_in_palm`.
+        See `engines.depths.depth_between` and `depth_in_palm`.
         """
         depth = zeros((), self.like)
         if self.palm is not None:

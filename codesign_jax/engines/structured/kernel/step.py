@@ -114,7 +114,7 @@ class Step(StepMemory):
     def _keep_overlap(self, state: dict) -> None:
         """Keeps the largest overlap of two bodies of worlds whose grasp begins in this step.
 
-        A world with a larger one than the scene's limit is refused; `preflight.overlap` says the
+        A world with a larger one than the scene's limit is refused; `engines.depths` says the
         same of worlds that no kernel simulates.
         """
         fields = [c for c in self.contacts.values() if not isinstance(c, BoundSelfContacts)]

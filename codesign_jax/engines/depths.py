@@ -30,6 +30,12 @@ Look = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
 """From points to their distance from a body and its gradient, see `laws.touch`."""
 
 
+def largest_depth(scene: Scene, fields: ModelFields) -> jax.Array:
+    """Deepest overlap of two bodies that may touch [m], shape (world,); fingers are straight."""
+    others = jnp.maximum(depth_between(scene, fields), depth_in_palm(scene, fields))
+    return jnp.maximum(depth(scene, fields), others)
+
+
 @partial(jax.jit, static_argnums=0)
 def depth(scene: Scene, fields: ModelFields) -> jax.Array:
     """Deepest overlap of a finger, the palm or the object with another of them or the table [m].

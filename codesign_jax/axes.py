@@ -21,7 +21,7 @@ def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -
         ("trials", trials, Trial, "rollout.sample_trials(scene, key, count) draws some"),
     ]
     problems = [
-        f"{name} are a {type(value).__name__}, not {kind.__name__}; {hint}"
+        Problem("type", f"{name} are a {type(value).__name__}, not {kind.__name__}; {hint}")
         for name, value, kind, hint in kinds
         if not isinstance(value, kind)
     ]
@@ -42,7 +42,8 @@ def refuse(scene: Scene, params: Params, trials: Trial, axes: tuple[str, str]) -
     if not problems and axes[0] == axes[1]:
         counts = len(params.length), len(trials.yaw)
         if counts[0] != counts[1]:
-            problems = [f"params have {counts[0]} {axes[0]}s and trials {counts[1]}"]
+            words = f"params have {counts[0]} {axes[0]}s and trials {counts[1]}"
+            problems = [Problem("size", words)]
     if problems:
         raise InputError(problems)
 
@@ -52,13 +53,11 @@ def _control_problems(scene: Scene, params: Params) -> list[str]:
     shapes = {k: np.shape(v) for k, v in (params.control or {}).items()}
     if shapes.keys() != expected.keys():
         names = [", ".join(v) or "none" for v in (shapes, expected)]
-        return [
-            f"params.control has {names[0]}; the scene's control {scene.control.name!r} needs "
-            f"{names[1]}"
-        ]
+        words = f"the scene's control {scene.control.name!r} needs {names[1]}"
+        return [Problem("unknown", f"params.control has {names[0]}; {words}")]
     leading = np.shape(params.length)[:-1]
     return [
-        f"params.control[{k!r}] has shape {shapes[k]}, not {(*leading, *shape)}"
+        Problem("size", f"params.control.{k} has shape {shapes[k]}, not {(*leading, *shape)}")
         for k, shape in expected.items()
         if shapes[k] != (*leading, *shape)
     ]
@@ -111,7 +110,7 @@ def refuse_draws(key: Any, count: int) -> None:
     if not isinstance(count, int | np.integer) or count < 1:
         raise InputError.of("range", f"num_trials = {count} must be a whole number, at least 1")
     if problem := random_key_problem(key):
-        raise InputError([problem])
+        raise InputError.of("type", problem)
 
 
 def _problems(name: str, batch: Any, shapes: Any, axis: str) -> list[Problem]:

@@ -52,41 +52,49 @@ def main(arguments: list[str] | None = None) -> int:
     Args:
       arguments: Arguments without the program's name; default: those of the process.
     """
-    words = sys.argv[1:] if arguments is None else arguments
-
-    def run() -> int:
-        terminal.tolerate(sys.stdout)  # the parser of flags prints too
-        if arguments is None:
-            # XLA's alarm of a compilation of two minutes reads like a crash; what fails is raised.
-            os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-            # Matplotlib refuses to be imported if it names nothing; pictures need no window.
-            os.environ.pop("MPLBACKEND", None)
-            warnings.showwarning = lambda text, *_: terminal.say(f"warning: {text}", error=True)
-        if words == ["--version"]:
-            return _version()
-        bad = [a for a in words if a.encode(errors="replace").decode() != a]
-        problems = [f"{a[:100]!r} is no UTF-8 text" for a in bad] + reuse.problems()
-        if problems := problems + mode_problems():
-            from codesign_jax.scene.schema import InputError
-
-            raise InputError(problems)
-        command = tyro.cli(
-            COMMANDS,  # type: ignore[arg-type]
-            args=arguments,
-            prog="codesign",
-            description="Co-design of hand morphology and control; --version prints the version.",
-        )
-        command.words = words
-        if arguments is None:
-            terminal.waits.append(True)
-        # Before the modules that take seconds to import.
-        terminal.wait(f"codesign {type(command).__name__.lower()}: loading")
-        return command.run()
-
-    code = status.of(run)
+    code = status.of(lambda: run(arguments))
     if arguments is None and code in (status.INTERRUPTED, status.TERMINATED):
         status.leave(code)
     return code
+
+
+def run(arguments: list[str] | None = None) -> int:
+    """Runs the command as `main` does, whose errors are raised.
+
+    Args:
+      arguments: As of `main`.
+
+    Raises:
+      InputError: The input is refused.
+    """
+    words = sys.argv[1:] if arguments is None else arguments
+    terminal.tolerate(sys.stdout)  # the parser of flags prints too
+    if arguments is None:
+        # XLA's alarm of a compilation of two minutes reads like a crash; what fails is raised.
+        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+        # Matplotlib refuses to be imported if it names nothing; pictures need no window.
+        os.environ.pop("MPLBACKEND", None)
+        warnings.showwarning = lambda text, *_: terminal.say(f"warning: {text}", error=True)
+    if words == ["--version"]:
+        return _version()
+    bad = [a for a in words if a.encode(errors="replace").decode() != a]
+    problems = [f"{a[:100]!r} is no UTF-8 text" for a in bad] + reuse.problems()
+    if problems := problems + mode_problems():
+        from codesign_jax.scene.schema import InputError, Problem
+
+        raise InputError([Problem("unsupported", problem) for problem in problems])
+    command = tyro.cli(
+        COMMANDS,  # type: ignore[arg-type]
+        args=arguments,
+        prog="codesign",
+        description="Co-design of hand morphology and control; --version prints the version.",
+    )
+    command.words = words
+    if arguments is None:
+        terminal.waits.append(True)
+    # Before the modules that take seconds to import.
+    terminal.wait(f"codesign {type(command).__name__.lower()}: loading")
+    return command.run()
 
 
 _ON = {"y", "yes", "t", "true", "on", "1"}
@@ -107,7 +115,7 @@ MODES = {
 def mode_problems() -> list[str]:
     """Environment variables that ask for one of `MODES`, which somebody set for other programs."""
     return [
-        f"{name}={value} asks for a mode of JAX in which this command fails: {why}; leave it out"
+        f"{name} = {value} asks for a mode of JAX in which this command fails: {why}; leave it out"
         for name, (values, why) in MODES.items()
         if (value := os.environ.get(name, "").lower()) in values
     ]

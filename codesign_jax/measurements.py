@@ -124,8 +124,10 @@ def read(path: Path) -> dict[str, np.ndarray]:
         problems = _missing(table)
     if problems:
         rest = len(problems) - MOST_PROBLEMS
-        shown = [*problems[:MOST_PROBLEMS], *([f"and {rest:,} problems more"] if rest > 0 else [])]
-        raise InputError([f"{path}: {p}" for p in shown])
+        shown = problems[:MOST_PROBLEMS]
+        if rest > 0:
+            shown.append(Problem("range", f"and {rest:,} problems more"))
+        raise InputError([Problem.of(p).told(f"{path}: {p}") for p in shown])
     return table
 
 
@@ -183,7 +185,7 @@ def _rows(
             fitting.append((number, row))
             continue
         words = f"line {number} has {len(row)} cells, the head {len(head)}"
-        problems.append(words + hint * (len(row) > len(head)))
+        problems.append(Problem("size", words + hint * (len(row) > len(head))))
     return head, fitting
 
 
@@ -285,7 +287,7 @@ def _missing(table: dict[str, np.ndarray]) -> list[str]:
     rows = len(next(iter(table.values())))
     if "pressure" not in table:
         if not names or any(n in BY_PRESSURE for n in names):
-            return ["no column of the pressure, such as pressure_kPa"]
+            return [Problem("missing", "no column of the pressure, such as pressure_kPa")]
         table["pressure"] = np.zeros(rows)
     problems = []
     if not names:

@@ -33,7 +33,7 @@ from codesign_jax.model import ModelFields
 from codesign_jax.model.layout import WRIST
 from codesign_jax.scene import Scene, key_frames, unit_slips
 from codesign_jax.scene.hand import highest_pressure
-from codesign_jax.scene.schema import InputError
+from codesign_jax.scene.schema import InputError, Problem
 from codesign_jax.types import Forces, Params, Trace, Trial
 
 PERIOD = 0.05
@@ -133,7 +133,7 @@ class ControlLoop(Equal):
         """
         if not callable(policy):
             words = f"policy is {policy!r:.60}, not a function of (carry, observation)"
-            raise InputError([words])
+            raise InputError.of("type", words)
         self.engine = engine
         self.policy = policy
         self.name = engine.name
@@ -301,7 +301,7 @@ def searched(scene: Scene, policy: Policy) -> Scene:
     new = tuple(row for row in rows if there.get(row.name) != row)
     if taken := [row.name for row in new if row.name in there]:
         words = f"{', '.join(taken)} of the policy: the scene's control has such a parameter"
-        raise InputError([words])
+        raise InputError.of("conflict", words)
     more = dataclasses.replace(scene.control, parameter=(*scene.control.parameter, *new))
     hand = key_frames.with_parameters(scene.hand, dataclasses.replace(more, parameter=new))
     return dataclasses.replace(scene, control=more, hand=hand)
@@ -400,7 +400,8 @@ def spread(scene: Scene, command: Command, plan: Plan, *, of: str) -> Command:
             series = jnp.broadcast_to(series[:, None], like.shape)
         elif series.shape != like.shape:
             shapes = series.shape[1:], like.shape[2:], like.shape[1:]
-            problems.append("{} returned {} of shape {}, not {} or {}".format(of, name, *shapes))
+            words = "{} returned {} of shape {}, not {} or {}".format(of, name, *shapes)
+            problems.append(Problem("size", words))
         commands.append(series)
     if problems:
         raise InputError(problems)

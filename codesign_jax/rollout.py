@@ -77,7 +77,7 @@ class Options(NamedTuple):
         """Refuses worlds that are to stop, and to be recorded: an engine records whole grasps."""
         if self.record_qpos and self.stop_when_lost:
             problem = "record_qpos=True records whole grasps: leave out stop_when_lost=True"
-            raise schema.InputError([problem])
+            raise schema.InputError.of("conflict", problem)
 
 
 # Folded into a trial's key for draws that came later, so that earlier ones stay as they are.

@@ -192,7 +192,7 @@ def _hand(scene: Scene) -> Params:
 def _load(name: str, flag: str = "") -> Any:
     begin = f"{flag} {name}".strip()
     if words := problem(name):
-        raise InputError([f"{flag}: {words}".removeprefix(": ")])
+        raise InputError.of("syntax", f"{flag}: {words}".removeprefix(": "))
     module, _, attribute = name.partition(":")
     folder = str(Path.cwd())
     sys.path.insert(0, folder)

@@ -38,6 +38,7 @@ from codesign_jax.runs import columns, selection
 from codesign_jax.scene import beams, design_files, draws, parameters
 from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import command, copied, finished_run, own_workplace  # noqa: F401
+from tests.helpers.refusals import refusal_of_command
 from tests.helpers.toy_engine import TINY
 
 DATA = Path(__file__).parent / "data"
@@ -114,32 +115,29 @@ def test_two_designs_meet_the_same_trials(place, capsys):
     assert f"0 by {place / 'today'} alone, 0 by {copy} alone" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("names", "flags", "expected"),
-    [
-        ([], [], "compare needs at least one run folder"),
-        (["none"], [], "none is not a run folder: there is no such folder"),
-        (["today"], ["--trials", "3"], "--trials compares two designs; the folders have 1 runs"),
-        (["today", "screened"], ["--trials", "3"], "other objects or noise: --objects says which"),
-        (["today"], ["--out", "a.txt"], "--out a.txt must end in .csv"),
-        (["today", "screened"], ["--trials", "0"], "--trials = 0 is outside"),
-        (["a.toml"], [], "compare takes two designs, or one with --policy against none"),
-        (["a.toml"] * 3, [], "compare takes two designs, or one with --policy"),
-        (["a.toml", "today"], [], "a.toml: No such file or directory"),
-        (["seeds", "today"], ["--set-b", "gravity=3"], "are of two designs; there are 3 runs"),
-        (["today"], ["--set-b", "gravity=1000"], "gravity = 1000 is outside"),
-        (
-            ["today"],
-            ["--set-a", "objects.object.0.mass=0.2"],
-            "other objects or noise: --objects says which",
-        ),
-        (["a.toml"] * 2, ["--out", "a.csv"], "--out is a table of runs"),
-        (["a.toml"] * 2, ["--policy", "a:B", "c:D"], "--policy takes one policy beside design"),
-    ],
-)
-def test_what_cannot_be_compared_is_refused(names, flags, expected, place, capsys):
-    assert command("compare", *(place / name for name in names), *flags) == 2
-    assert expected in capsys.readouterr().err
+REFUSED = [
+    ([], [], ("missing", "compare")),
+    (["none"], [], ("damaged", "none")),
+    (["today"], ["--trials", "3"], ("conflict", "--trials")),
+    (["today", "screened"], ["--trials", "3"], ("conflict", "the two runs")),
+    (["today"], ["--out", "a.txt"], ("file", "--out a.txt")),
+    (["today", "screened"], ["--trials", "0"], ("range", "--trials")),
+    (["a.toml"], [], ("conflict", "compare")),
+    (["a.toml"] * 3, [], ("conflict", "compare")),
+    (["a.toml", "today"], [], ("file", "a.toml")),
+    (["seeds", "today"], ["--set-b", "gravity=3"], ("conflict", "--set-a and --set-b")),
+    (["today"], ["--set-b", "gravity=1000"], ("range", "gravity")),
+    (["today"], ["--set-a", "objects.object.0.mass=0.2"], ("conflict", "the two runs")),
+    (["a.toml"] * 2, ["--out", "a.csv"], ("conflict", "--out")),
+    (["a.toml"] * 2, ["--policy", "a:B", "c:D"], ("conflict", "--policy")),
+]
+"""Runs or files, flags, and kind and key of the problem."""
+
+
+@pytest.mark.parametrize(("names", "flags", "expected"), REFUSED)
+def test_what_cannot_be_compared_is_refused(names, flags, expected, place, monkeypatch):
+    monkeypatch.chdir(place)
+    assert refusal_of_command("compare", *names, *flags) == [expected]
 
 
 def test_the_interval_of_a_difference_covers_as_often_as_it_says():
@@ -296,8 +294,8 @@ def test_what_is_not_given_is_said_to_be_a_default(capsys, monkeypatch):
     assert max(map(len, shown.splitlines()[:9])) < 80
     assert "defaults: height, wall, spread, arm_roll" in shown
     twice = ["--preset", "23d", "--design", "length=95", "length[1]=90"]
-    assert command("evaluate", "--dry-run", *twice) == 2
-    assert "'length[1]' is given more than once: 95, 90" in capsys.readouterr().err
+    problems = refusal_of_command("evaluate", "--dry-run", *twice)
+    assert problems == [("conflict", "--design 'length[1]'")]
 
 
 def test_a_design_is_opened_from_its_file(workplace, capsys, monkeypatch):
@@ -328,10 +326,9 @@ def test_a_design_is_opened_from_its_file(workplace, capsys, monkeypatch):
     (workplace / "wrong.toml").write_text(
         "design.lenght = 95\ndesign.arm_z = [1, 2]\npreset = '2d'"
     )
-    assert command("evaluate", "--dry-run", "--design", "wrong.toml") == 2
-    errors = capsys.readouterr().err
-    assert "wrong.toml 'lenght' is not a parameter; did you mean 'length'?" in errors
-    assert "wrong.toml 'arm_z[0]' is not a parameter" in errors
+    problems = refusal_of_command("evaluate", "--dry-run", "--design", "wrong.toml")
+    names = ["lenght", "arm_z[0]", "arm_z[1]"]
+    assert problems == [("unknown", f"wrong.toml '{name}'") for name in names]
 
 
 def test_a_table_of_trials_has_noise_and_endings(finished, tmp_path, capsys):
@@ -351,13 +348,12 @@ def test_a_table_of_trials_has_noise_and_endings(finished, tmp_path, capsys):
         assert float(row["noise_mass_factor"]) == pytest.approx(float(mass), rel=1e-6)
     kept = sum(row["verdict"] == "kept" for row in written)
     assert f"all: kept {kept} of 3, " in output
-    for wrong, words in (
-        ([finished, "--particle", "99"], "--particle = 99 is outside"),
-        (["--particle", "0"], "--particle is one of a run"),
-        (["--out", "trials.txt"], "--out trials.txt must end in .csv"),
+    for wrong, problem in (
+        ([finished, "--particle", "99"], ("range", "--particle")),
+        (["--particle", "0"], ("missing", "--particle")),
+        (["--out", "trials.txt"], ("file", "--out trials.txt")),
     ):
-        assert command("evaluate", *wrong) == 2
-        assert words in capsys.readouterr().err
+        assert refusal_of_command("evaluate", *wrong) == [problem]
 
 
 @pytest.mark.parametrize(

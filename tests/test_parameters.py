@@ -1,7 +1,6 @@
 """Design spaces: Table I, presets, ties, units, limits; arguments of another shape or unit."""
 
 import dataclasses
-import re
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from codesign_jax import cli, codesign, make_engine, rollout, scene
-from codesign_jax.scene import InputError, design_files, hand, parameters, schema, unit_slips
+from codesign_jax.scene import design_files, hand, parameters, unit_slips
+from tests.helpers.refusals import refusal
 from tests.helpers.toy_engine import TINY, tiny
 
 HAND = hand.load("pneuflex4")
@@ -51,27 +51,15 @@ def test_params_are_named_and_in_si_units():
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "expected"),
-    [
-        (
-            "length[1]",
-            97.0,
-            "length[1] = 97.0 is outside [0.001, 1] m; did you mean 0.097? (mm giv",
-        ),
-        ("arm_pitch", 15.0, "did you mean 0.261799? (degrees given where radians are expected)"),
-        ("pressure[3]", 120e6, "did you mean 120000? (mPa given"),
-    ],
+    ("name", "value"), [("length[1]", 97.0), ("arm_pitch", 15.0), ("pressure[3]", 120e6)]
 )
-def test_other_units_than_si_are_refused_in_words(name, value, expected):
+def test_other_units_than_si_are_refused(name, value):
     design = FULL.default()
     design[FULL.names.index(name)] = value
     for call in (FULL.params, FULL.project, FULL.refuse_unit_slips):
-        with pytest.raises(schema.InputError) as caught:
-            call(jnp.asarray(design))
-        assert expected in str(caught.value) and "Python takes SI units" in str(caught.value)
-    full = parameters.unflatten(HAND, design)
-    with pytest.raises(schema.InputError, match=r"did you mean"):
-        unit_slips.refuse(full)
+        assert refusal(call, jnp.asarray(design)) == [("range", name)]
+    [(code, _)] = refusal(unit_slips.refuse, parameters.unflatten(HAND, design))
+    assert code == "range"
 
 
 def test_designs_of_another_length_are_refused_by_the_conversion_of_units():
@@ -80,18 +68,15 @@ def test_designs_of_another_length_are_refused_by_the_conversion_of_units():
     for convert in (space.from_units, space.in_units):
         assert convert([[95.0, 30.0]] * 3).shape == (3, 2)
         for design in (95.0, [95.0], [95.0, 30.0, 1.0], np.ones((2, 3))):
-            with pytest.raises(schema.InputError, match=r"designs have shape .*: length, arm_z"):
-                convert(design)
+            assert refusal(convert, design) == [("size", "designs")]
 
 
 def test_designs_outside_of_the_bounds_are_converted_with_a_warning():
     """At the boundary of units; what is in SI already is simulated as it is."""
     space = parameters.design_space(HAND, "2d")
-    words = re.escape("length = 0.095 is outside [10, 180] mm; did you mean 95? (m given where mm")
-    with pytest.warns(UserWarning, match=words):
+    with pytest.warns(UserWarning, match=r"length = 0.095"):
         np.testing.assert_allclose(space.from_units([0.095, 30.0]), [95e-6, 0.03])
-    words = r"length = 190.0 is outside .*; arm_z = -70.0 is outside \[-60, 200\] mm"
-    with pytest.warns(UserWarning, match=words):
+    with pytest.warns(UserWarning, match=r"length = 190.*arm_z = -70"):
         space.from_units([[100.0, 30.0], [190.0, -70.0]])
     for end in space.bounds:  # float32's rounding of a bound is none
         space.from_units(space.in_units(np.array(end, np.float32)))
@@ -106,10 +91,10 @@ def test_designs_that_are_not_legal_are_simulated_with_a_warning():
     FULL.check(legal)
     above = int((uniform - legal > 1.0).any(1).sum())  # Pa, beyond float32's rounding
     assert 5 < above < 25
-    with pytest.warns(UserWarning, match=f"{above} of 50 designs with a pressure above the limit"):
+    with pytest.warns(UserWarning, match=f"{above} of 50 designs"):
         FULL.check(uniform)
     wide = FULL.default() + (FULL.high - FULL.low) * (np.asarray(FULL.names) == "arm_z")
-    with pytest.warns(UserWarning, match=r"arm_z = 0.295\d* is outside \[-0.05, 0.15\] m"):
+    with pytest.warns(UserWarning, match=r"arm_z = 0.295"):
         FULL.check(wide)
     jax.eval_shape(lambda design: FULL.check(design), uniform)  # traced: the shape alone
 
@@ -266,104 +251,86 @@ def draw(key, count):
 
 FINER = scene.load(TINY, overrides={"discretization.links": 4, "effects.twist": True})
 LONG = dataclasses.replace(SCENE, gravity=np.full(5, 9.81))
+KEY = ("type", "key")
 CASES = {
     "an engine of another scene": (
         lambda: rollout.simulate(FINER, ENGINE, batch(PARAMS, 1), batch(TRIAL, 1)),
-        r"engine toy was made for a scene of another structure \(other: effects.twist, "
-        r"discretization.links\); make_engine\('toy', scene\) makes one",
+        [("unsupported", "engine toy")],
     ),
-    "one hand": (
-        lambda: simulate(PARAMS, batch(TRIAL, 3)),
-        r"params have no axis \(world,\); of one, jax.tree.map\(lambda v: v\[None\], params\)",
-    ),
+    "one hand": (lambda: simulate(PARAMS, batch(TRIAL, 3)), [("size", "params")]),
     "an array of another length": (
         lambda: simulate(batch(PARAMS, 2)._replace(spread=np.zeros(3)), batch(TRIAL, 2)),
-        "the arrays of params have different lengths: length 2, .*spread 3",
+        [("size", "")],
     ),
-    "a number for a key": (
-        lambda: draw(0, 3),
-        r"key must be one typed key from jax.random.key, got shape \(\) of int32",
-    ),
+    "a number for a key": (lambda: draw(0, 3), [KEY]),
     "trials for a key": (
         lambda: TASK.evaluate(SPACE.default()[None], batch(TRIAL, 2)),  # type: ignore[arg-type]
-        "key must be one typed key .*, got a Trial; rollout.evaluate takes trials",
+        [KEY],
     ),
-    "trials for a key that draws trials": (
-        lambda: draw(batch(TRIAL, 2), 3),
-        "key must be one typed key .*, got a Trial",
-    ),
-    "trials for a key that draws designs": (
-        lambda: SPACE.sample(batch(TRIAL, 2), 3),
-        "key must be one typed key .*, got a Trial",
-    ),
-    "trials for a key that a search begins with": (
-        lambda: OPTIMIZER.init(batch(TRIAL, 2), SPACE.default(), 3),
-        "key must be one typed key .*, got a Trial",
-    ),
+    "trials for a key that draws trials": (lambda: draw(batch(TRIAL, 2), 3), [KEY]),
+    "trials for a key that draws designs": (lambda: SPACE.sample(batch(TRIAL, 2), 3), [KEY]),
     "a word for a key": (
         lambda: TASK.evaluate(SPACE.default()[None], "seed"),  # type: ignore[arg-type]
-        "key must be one typed key .*, got a str",
+        [KEY],
     ),
     "several keys": (
         lambda: TASK.evaluate(SPACE.default()[None], jax.random.split(jax.random.key(0), 2)),
-        r"key must be one typed key .*, got shape \(2,\) of key",
+        [KEY],
     ),
     "named parameters for a population": (
         lambda: TASK.evaluate(batch(PARAMS, 2), jax.random.key(0)),
-        "population is a Params, not an array .*; rollout.evaluate takes Params",
+        [("type", "population")],
     ),
     "a key for a state": (
         lambda: TASK.episode(OPTIMIZER, jax.random.key(0)),  # type: ignore[arg-type]
-        "state is a PRNGKeyArray, not an optimiser's state",
+        [("type", "state")],
     ),
     "trials for a scene": (
         lambda: TASK.evaluate(SPACE.default()[None], jax.random.key(0), batch(TRIAL, 2)),  # type: ignore[arg-type]
-        "scene is a Trial, not a Scene",
+        [("type", "scene")],
     ),
     "designs for named parameters": (
         lambda: simulate(SPACE.default()[None], batch(TRIAL, 1)),
-        "params are a ndarray, not Params; space.params",
+        [("type", "params")],
     ),
     "hands and trials that changed places": (
         lambda: simulate(batch(TRIAL, 2), batch(PARAMS, 2)),
-        "params are a Trial, not Params(.|\n)*trials are a Params, not Trial",
+        [("type", "params"), ("type", "trials")],
     ),
     "an engine's name for an engine": (
         lambda: rollout.simulate(SCENE, "mujoco", batch(PARAMS, 1), batch(TRIAL, 1)),  # type: ignore[arg-type]
-        "engine is a str, not an engine; make_engine",
+        [("type", "engine")],
     ),
     "a scene's name for a scene": (
         lambda: make_engine("structured", "paper"),  # type: ignore[arg-type]
-        r"scene is 'paper', not a Scene; scene.load\('paper'\) reads it",
+        [("type", "scene")],
     ),
     "numbers": (
         lambda: rollout.simulate(LONG, ENGINE, batch(PARAMS, 2), batch(TRIAL, 2)),
-        "scene.gravity has 5 values, one a world: there are 2",
+        [("size", "scene.gravity")],
     ),
-    "one design": (
-        lambda: evaluate(SPACE.default()),
-        r"population has shape \(2,\), not \(particle, parameter\); population\[None\] makes",
-    ),
-    "millimetres": (lambda: evaluate([[97.0, 0.02]]), "length = 97.0 .* did you mean 0.097"),
-    "millimetres at the start": (
-        lambda: OPTIMIZER.init(jax.random.key(0), np.array([97.0, 20.0]), 3),
-        r"seed_particle\[0\] = 97 is far outside its bounds, 0.01 to 0.18",
+    "one design": (lambda: evaluate(SPACE.default()), [("size", "population")]),
+    "millimetres": (lambda: evaluate([[97.0, 0.02]]), [("range", "length")]),
+    "one hand while tracing": (
+        lambda: jax.jit(lambda p, t: simulate(p, t))(PARAMS, batch(TRIAL, 3)),
+        [("size", "params")],
     ),
 }
+"""Calls, and kind and key of their problems."""
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_what_is_wrong_is_said(case):
-    call, words = CASES[case]
-    with pytest.raises((InputError, ValueError, TypeError), match=words) as caught:
-        call()
-    of_optimizer = {"millimetres at the start", "trials for a key that a search begins with"}
-    assert isinstance(caught.value, InputError) or case in of_optimizer
+    call, problems = CASES[case]
+    assert refusal(call) == problems
 
 
-def test_it_is_said_while_tracing():
-    with pytest.raises(InputError, match="params have no axis"):
-        jax.jit(lambda p, t: simulate(p, t))(PARAMS, batch(TRIAL, 3))
+def test_an_optimiser_refuses_what_is_no_key_and_what_is_no_start():
+    """By errors of Python's own kinds: the package of optimisers knows no scenes."""
+    with pytest.raises((TypeError, ValueError)):
+        OPTIMIZER.init(batch(TRIAL, 2), SPACE.default(), 3)
+    with pytest.raises(ValueError, match=r"seed_particle\[0\]"):
+        OPTIMIZER.init(jax.random.key(0), np.array([97.0, 20.0]), 3)  # millimetres
 
 
 def test_a_spread_that_turns_no_finger_is_named_and_not_searched(capsys):
@@ -378,12 +345,12 @@ def test_a_spread_that_turns_no_finger_is_named_and_not_searched(capsys):
     assert float(space.params(space.default()).spread) == float(
         whole.params(whole.default()).spread
     )
-    with pytest.raises(InputError, match="--design 'spread' has no effect: every finger has"):
-        design_files.parse(space, ["spread=20"], space.default())
+    problems = refusal(design_files.parse, space, ["spread=20"], space.default())
+    assert problems == [("unsupported", "--design 'spread'")]
     spread = hand.Preset("one", (hand.Free("spread"),))
     alone = dataclasses.replace(bare, preset=(spread,))
-    with pytest.raises(InputError, match="leaves nothing to search: spread has no effect"):
-        parameters.design_space(alone, "one")
+    [(code, _)] = refusal(parameters.design_space, alone, "one")
+    assert code == "missing"
     words = ["effects.finger_finger=false", *(f"{key}={value}" for key, value in flat.items())]
     line = ["evaluate", "--hand", "tripod3", "--preset", "full", "--dry-run", "--set", *words]
     assert cli.main(line) == 0

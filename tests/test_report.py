@@ -22,11 +22,11 @@ from codesign_jax.judge import sentences
 from codesign_jax.report import animation, bodies, figures, painter, raster, viewer
 from codesign_jax.runs import reference, selection
 from codesign_jax.scene import parameters
-from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Outcome, Status, failed
 from tests.helpers import grasps
 from tests.helpers.browsers import chromium, chromium_launcher  # noqa: F401
 from tests.helpers.command_runs import small_run  # noqa: F401
+from tests.helpers.refusals import refusal, refusal_of_command
 from tests.helpers.toy_engine import TINY
 
 
@@ -249,9 +249,8 @@ def test_grasp_is_the_one_of_the_table(run):
     best = selection.find_grasp(the_scene, record)
     chosen = selection.choose(the_scene, record)
     np.testing.assert_array_equal(best.design, chosen.design)
-    with pytest.raises(InputError) as error:
-        selection.find_grasp(the_scene, record, episode=4, trial=3)
-    assert len(error.value.problems) == 2 and "--episode = 4 is outside [1, 3]" in str(error.value)
+    problems = refusal(selection.find_grasp, the_scene, record, episode=4, trial=3)
+    assert problems == [("range", "--episode"), ("range", "--trial")]
 
 
 def test_unfinished_run_reports_its_finished_episodes(run, tmp_path, capsys):
@@ -299,16 +298,16 @@ def test_fresh_trials_at_reference_are_in_the_report(run, tmp_path, capsys):
         assert ("1 of 5 trials failed (STUCK 1)" in text) == words
 
 
-def test_errors_are_words(run, tmp_path, capsys):
-    assert cli.main(["report", str(tmp_path)]) == 2
-    assert "is not a run folder" in capsys.readouterr().err
+def test_what_is_no_run_is_refused(run, tmp_path, capsys):
+    assert refusal_of_command("report", tmp_path) == [("damaged", str(tmp_path))]
     for seed in (0, 1):
         folder = tmp_path / "seeds" / f"seed-{seed}"
         folder.mkdir(parents=True)
         shutil.copy(run / "provenance.json", folder)
-    assert cli.main(["report", str(tmp_path / "seeds")]) == 2
-    hint = f"it holds 2 runs: give one, such as {tmp_path / 'seeds' / 'seed-0'}"
-    assert hint in capsys.readouterr().err
+    folder = tmp_path / "seeds"
+    capsys.readouterr()
+    assert refusal_of_command("report", folder) == [("damaged", str(folder))]
+    assert str(folder / "seed-0") in capsys.readouterr().err  # one to give
 
 
 # --- the report and its 3D replay in a headless Chromium ------------------------------------------

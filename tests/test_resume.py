@@ -7,6 +7,7 @@ import fcntl
 import io
 import json
 import os
+import shlex
 import shutil
 import signal
 
@@ -34,6 +35,7 @@ from tests.helpers.command_runs import (  # noqa: F401
     wait_for,
     without,
 )
+from tests.helpers.refusals import refusal_of_command
 
 
 def test_same_command_again_changes_no_result(finished, tmp_path, capsys):
@@ -73,12 +75,14 @@ def test_losing_every_checkpoint_is_refused_until_fresh(lost, finished, tmp_path
     for path in (folder / "checkpoints").glob(lost):
         path.unlink()
     before = {name: (folder / name).read_bytes() for name in RESULTS}
-    assert command(*RUN, "--out", folder) == (2 if lost == "folder" else 1)
-    error = capsys.readouterr().err
-    assert f"while its tables have {EPISODES} episodes" in error and "--fresh" in error
+    if lost == "folder":
+        assert refusal_of_command(*RUN, "--out", folder) == [("damaged", f"run {folder}")]
+    else:
+        assert command(*RUN, "--out", folder) == 1
+        assert capsys.readouterr().err.count("sha256") == 3
     assert before == {name: (folder / name).read_bytes() for name in RESULTS}
     if lost == "*.sha256":
-        assert error.count(".sha256 is missing") == 3 and (folder / "checkpoints" / "3").is_dir()
+        assert (folder / "checkpoints" / "3").is_dir()
         assert command(*RUN, "--out", folder, "--fresh") == 0
         assert_same_run(folder, finished)
 
@@ -89,11 +93,11 @@ def test_resume_with_other_settings_is_refused(finished, capsys):
     content["started"]["command"] = ["/usr/bin/codesign", *RUN, "--out", "my runs"]
     path.write_text(json.dumps(content))
     before = snapshot(finished)
-    assert command(*RUN, "--out", finished, "--particles", "5", "--schedule", "switch-2") == 2
-    error = capsys.readouterr().err
-    assert "particles: the run has 4, asked for is 5" in error
-    assert "--schedule: the run has concurrent, asked for is switch-2" in error
-    assert "goes on by its own command: codesign optimize --scene" in error and "'my runs'" in error
+    other = ["--particles", "5", "--schedule", "switch-2"]
+    problems = refusal_of_command(*RUN, "--out", finished, *other)
+    keys = [f"--out {finished}", "", "--particles", "--schedule"]
+    assert sorted(problems) == sorted(("conflict", key) for key in keys)
+    assert shlex.join(["codesign", *RUN, "--out", "my runs"]) in capsys.readouterr().err
     assert snapshot(finished) == before
 
 
@@ -102,8 +106,8 @@ def test_second_process_on_a_folder_is_refused(finished, capsys):
     before = snapshot(finished)
     with (finished / ".lock").open("r+") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        assert command(*RUN, "--out", finished) == 2
-    assert f"is in use by process {holder}" in capsys.readouterr().err
+        assert refusal_of_command(*RUN, "--out", finished) == [("file", f"--out {finished}")]
+    assert holder in capsys.readouterr().err
     assert snapshot(finished) == before
 
 
@@ -191,10 +195,9 @@ def test_more_episodes_extend_a_run_bit_for_bit(finished, tmp_path, capsys):
     ((step, command_line),) = [(e, e.pop("command")) for e in provenance["extended"]]
     assert (step["from"], step["to"]) == (3, 5) and command_line
     before = snapshot(grown)
-    assert command(*run, "--episodes", "4", "--out", grown) == 2
-    error = capsys.readouterr().err
-    assert "can be extended, but not shortened; leave out --episodes" in error
-    assert "--fresh" not in error and snapshot(grown) == before
+    problems = refusal_of_command(*run, "--episodes", "4", "--out", grown)
+    assert problems == [("conflict", f"--out {grown}")]
+    assert "--fresh" not in capsys.readouterr().err and snapshot(grown) == before
     # Without --episodes the command goes on with the run, whatever it was extended to.
     assert command(*without(run, "--episodes"), "--out", grown) == 0
     assert "all 5 episodes are done" in capsys.readouterr().out

@@ -5,10 +5,13 @@
 Other tests assert kind and key of a problem (helpers/refusals.py), so that words may change here.
 """
 
+import contextlib
 import pickle
+import shlex
+import tempfile
 from pathlib import Path
 
-from codesign_jax import parameters, scene
+from codesign_jax import cli, finger, parameters, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import InputError, hand, keypaths, schema, silicones, sums
 
@@ -51,6 +54,63 @@ CALLS = {
     "a misspelt preset": lambda: parameters.design_space(scene.load("paper").hand, "24d"),
     "a field with control characters": lambda: scene.load("paper\x1b[2J"),
 }
+COMMANDS = (
+    "compare",
+    "compare nowhere",
+    "compare a.toml",
+    "compare a.toml b.toml --out a.csv",
+    "compare a.toml b.toml --policy a:B c:D",
+    "evaluate --particle 0",
+    "evaluate --out trials.txt",
+    "evaluate --engine mujocco",
+    "evaluate --dry-run --policy mine.py:Pull",
+    "evaluate --dry-run --preset 23d --design length=95 length[1]=90 lenght=80 arm_z=high",
+    "evaluate --dry-run --set solver.iterations=31",
+    "render --trial 0",
+    "render --object spheer",
+    "render --out a.mp4 --times 0",
+    "render --camera frnt",
+    "render --camera side zoom=2",
+    "render --size 5000",
+    "landscape --parameters length arm_q",
+    "landscape --parameters gravity length",
+    "landscape --parameters gravity=9:3 length",
+    "landscape --parameters gravity=3:900 length",
+    "finger --fit",
+    "finger nowhere.csv",
+    "export --out parts --tolerances wal=0.5 mount=x length=-1",
+    "optimize --optimizer mine",
+    "optimize --schedule switch-2 --episodes 1",
+    "optimize --optimizer cma-es --particles 1",
+    "optimize --seeds 0-",
+    "optimize --seeds 0-1 --seed 1",
+    "optimize --hand pneuflex5 --engine mujco --seed -1 --set gravity=1000 cost.failur=worst",
+    "evaluate --run nowhere --hand tripod3 --preset 23d",
+    "evaluate --design length=0.148",
+    "evaluate --pull 1,2",
+    "landscape --search 3",
+    "check --accuracy reference",
+)
+MEASUREMENTS = (
+    "pressure_kPa,angle_deg\n20,18,9",
+    "pressure_Pa\tangle_deg\n20,000\t18.9",
+    "pressure_Pa\tangle_deg\n20,000\t19\n40,000\t37",
+    'pressure_Pa,angle_deg\n"20,000",18.9',
+    "version https://git-lfs.github.com/spec/v1\noid",
+    "pressure_kPa angle_deg\n20 18.9",
+    "Druck (mbar);angle_deg\n1;2",
+    "presure_kPa,angle_deg\n1,2",
+    "pressure_kPa,load_N\n1,2",
+    "pressure_kPa,deflection_mm\n1,2",
+    'pressure_kPa,angle_deg\n"1,2\n3,4\n',
+)
+"""Files of measurements."""
+
+
+def measured(text: str):
+    """Reads a file of measurements with this text."""
+    Path("finger.csv").write_text(text, encoding="utf-8")
+    return finger.read(Path("finger.csv"))
 
 
 def told(call) -> list[str]:
@@ -70,7 +130,12 @@ def sentences() -> str:
         said[pair] = told(lambda changes=changes: scene.load("paper", overrides=changes))
     said |= {f"the sum {text}": [str(sums.read(text, "m"))] for text in SUMS}
     said |= {name: told(call) for name, call in CALLS.items()}
-    assert all(said.values())
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        for line in COMMANDS:
+            said[f"codesign {line}"] = told(lambda line=line: cli.run(shlex.split(line)))
+        for text in MEASUREMENTS:
+            said[f"the file {text!r}"] = told(lambda text=text: measured(text))
+    assert all(said.values()), [name for name, lines in said.items() if not lines]
     blocks = ["\n".join([name, *(f"    {line}" for line in lines)]) for name, lines in said.items()]
     return "\n".join(blocks) + "\n"
 

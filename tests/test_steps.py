@@ -12,9 +12,10 @@ import pytest
 from codesign_jax import control, model, preflight
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine
-from codesign_jax.scene import scene_files, schema
+from codesign_jax.scene import scene_files
 from tests.helpers import grasps, oracles
 from tests.helpers.fixtures import POST, SHELF, SLOPES, WALL, loaded
+from tests.helpers.refusals import refusal
 
 SLOWLY = pytest.mark.slow
 # Faults of fixtures, which the comparison must notice: what is sound, and what is wrong.
@@ -99,7 +100,7 @@ def test_steps_of_the_kernel_equal_mujocos(tmp_path, name):
         # stops at rounding of its cost.  Its rigid arm gives way by the hand's forces over 1e9 kg,
         # which stiff fingers multiply: 1.6e-8 with a wrist of 1e9, 2e-10 of 1e11.
         assert errors.max() < (1e-8 if scene.effects.wrist else 1e-7) and far.max() < 1e-12
-        assert (errors > 0).mean() > 0.85  # in the others a body turns fast
+        assert oracles.share(errors) > 0.85
         if not fixtures:
             if scene.effects.finger_object and scene.effects.object_table:
                 # More than the object on the table.
@@ -164,7 +165,7 @@ def test_the_kernel_balances_rings_and_edges(tmp_path, shape):
         scene = loaded(tmp_path, WALL + POST + SHELF, shape, **alone)
         fields, ctrl, trajectory = path_of(scene)
         later = oracles.Path(*(v[:, 1:] for v in trajectory))
-        assert np.nanmax(oracles.unbalanced(scene, fields, ctrl[:, 1:], later, 10)) < 1e-8
+        assert oracles.unbalanced(scene, fields, ctrl[:, 1:], later, 10).max() < 1e-8
 
 
 # --- fixtures: boxes, cylinders and planes that fingers, palm and object touch, against MuJoCo C --
@@ -194,19 +195,19 @@ def test_an_object_rests_on_a_shelf_or_tips_over_its_edge(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "expected"),
+    ("change", "code"),
     [
-        (("size = [0.01, 0.1, 0.05]", "size = [0.01, 0.1]"), "a box has 3 values"),
-        (("size = [0.01, 0.1, 0.05]", ""), "a box has 3 values"),
-        (('type = "box"', 'type = "plane"'), "a plane has no size"),
-        (("position = [0.06, 0.0, 0.05]", "position = [0.06, 0.0]"), "three coordinates"),
-        (("[0, 10, 0]", "[0, 10]"), "orientation must be roll, pitch and yaw"),
-        (('type = "box"', 'type = "mesh"'), "'mesh' is not valid"),
+        (("size = [0.01, 0.1, 0.05]", "size = [0.01, 0.1]"), "size"),
+        (("size = [0.01, 0.1, 0.05]", ""), "size"),
+        (('type = "box"', 'type = "plane"'), "size"),
+        (("position = [0.06, 0.0, 0.05]", "position = [0.06, 0.0]"), "size"),
+        (("[0, 10, 0]", "[0, 10]"), "size"),
+        (('type = "box"', 'type = "mesh"'), "unknown"),
     ],
 )
-def test_wrong_fixtures_are_told(tmp_path, change, expected):
-    with pytest.raises(schema.InputError, match=expected):
-        loaded(tmp_path, WALL.replace(*change), "box")
+def test_wrong_fixtures_are_told(tmp_path, change, code):
+    [(told, _)] = refusal(loaded, tmp_path, WALL.replace(*change), "box")
+    assert told == code
 
 
 def test_a_hand_that_starts_in_a_fixture_is_refused(tmp_path):
@@ -219,10 +220,8 @@ def test_a_hand_that_starts_in_a_fixture_is_refused(tmp_path):
 
 
 def test_what_mjx_does_not_collide_is_refused(tmp_path):
-    with pytest.raises(
-        schema.InputError, match="engine mjx: object 'box', a box, with fixture 'post'"
-    ):
-        make_engine("mjx", loaded(tmp_path, POST, "box"))
+    problems = refusal(make_engine, "mjx", loaded(tmp_path, POST, "box"))
+    assert problems == [("unsupported", "object 'box'")]
 
 
 def test_a_scene_with_fixtures_is_kept(tmp_path):

@@ -9,6 +9,7 @@ import pytest
 
 from codesign_jax import cli, preflight, runs, user_code
 from tests.helpers.command_runs import assert_same_run, snapshot
+from tests.helpers.refusals import refusal_of_command
 from tests.helpers.toy_engine import TINY
 
 MINE = '''
@@ -154,11 +155,11 @@ def test_a_run_of_ones_own_code_goes_on_bit_for_bit(workdir, capsys):
     assert record is not None and np.ptp(record.history.outcomes.cost[1]) > 0.01
 
 
-def test_a_cost_of_forces_asks_for_them_of_an_engine_that_has_them(workdir, capsys):
-    assert cli.main([*RUN, "--cost", "mine:gripped", "--out", "run"]) == 2
-    assert "engine mujoco records no forces" in capsys.readouterr().err
-    assert cli.main([*RUN, "--cost", "mine:unrecorded", "--out", "run"]) == 2
-    assert "give it the attribute record_forces = True" in capsys.readouterr().err
+def test_a_cost_of_forces_asks_for_them_of_an_engine_that_has_them(workdir):
+    problems = refusal_of_command(*RUN, "--cost", "mine:gripped", "--out", "run")
+    assert problems == [("unsupported", "")]
+    problems = refusal_of_command(*RUN, "--cost", "mine:unrecorded", "--out", "run")
+    assert problems == [("user_code", "--cost mine")]
 
 
 @pytest.mark.slow  # a kernel; quick: forces are recorded (test_forces), and the refusals above
@@ -176,18 +177,17 @@ def test_changed_code_is_refused_with_what_changed(workdir, capsys):
     before = snapshot(workdir / "run")
     (workdir / "mine.py").write_text(MINE.replace("0.2 - trace", "0.3 - trace"))
     sys.modules.pop("mine")  # as in another process
-    assert cli.main([*OWN, "--episodes", "2", "--out", "run"]) == 2
+    problems = refusal_of_command(*OWN, "--episodes", "2", "--out", "run")
+    assert problems[0] == ("conflict", "--out run") and ("conflict", "mine") in problems
     output = capsys.readouterr().err
-    assert "mine was changed since the run was made" in output
-    assert (
-        "-    return jnp.abs(0.2 - trace" in output and "+    return jnp.abs(0.3 - trace" in output
-    )
-    assert cli.main([*OWN[:-1], "mine:until_lost", "--out", "run"]) == 2
-    assert "--cost: the run has mine:low, asked for is mine:until_lost" in capsys.readouterr().err
+    assert "-    return jnp.abs(0.2 - trace" in output
+    assert "+    return jnp.abs(0.3 - trace" in output
+    problems = refusal_of_command(*OWN[:-1], "mine:until_lost", "--out", "run")
+    assert problems[0] == ("conflict", "--out run") and problems[-1] == ("conflict", "--cost")
     # What is the run's is not imported for whoever reads it, or asks for nothing.
     (workdir / "mine.py").unlink()
     sys.modules.pop("mine")
-    assert cli.main([*RUN, "--out", "run"]) == 2
+    assert refusal_of_command(*RUN, "--out", "run")
     assert "mine" not in sys.modules
     assert runs.load_record(workdir / "run") is not None
     assert snapshot(workdir / "run") == before
@@ -202,8 +202,7 @@ def test_a_policy_is_searched_and_said_wherever_it_acts(workdir, capsys):
     the_scene, settings = runs.read_run(workdir / "run")
     assert settings.policy == "mine:Pull" and the_scene.control.parameter[0].name == "share"
     trials = ["--trials", "2", "--run", "run"]
-    assert cli.main(["evaluate", *trials]) == 2
-    assert "the run was made with --policy mine:Pull" in capsys.readouterr().err
+    assert refusal_of_command("evaluate", *trials) == [("conflict", "--policy")]
     kept = []
     for share in ("0", "1"):
         design = ["--scene", str(TINY), "--engine", "mujoco", "--design", f"share={share}"]
@@ -218,10 +217,9 @@ def test_a_policy_is_searched_and_said_wherever_it_acts(workdir, capsys):
         "--trials",
         "2",
     ]
-    assert cli.main(pair) == 2
-    assert "the run was made with --policy mine:Pull" in capsys.readouterr().err
-    assert cli.main([*pair, "--policy", "mine:Pull", "mine:Narrow"]) == 2
-    assert "--policy mine:Narrow: neither run was made with it" in capsys.readouterr().err
+    assert refusal_of_command(*pair) == [("conflict", "--policy")]
+    problems = refusal_of_command(*pair, "--policy", "mine:Pull", "mine:Narrow")
+    assert problems == [("conflict", "--policy mine")]
     capsys.readouterr()
     assert cli.main(["compare", "run", "--policy", "mine:Pull", "--trials", "2"]) == 0
     output = capsys.readouterr().out
@@ -254,25 +252,26 @@ def test_a_dry_run_tells_of_a_policy_that_commands_kilopascals(workdir, capsys):
 
 
 WRONG = {
-    "--cost nobodys:low": "there is no module 'nobodys' in ",
-    "--cost mine:no_function": "it is int, not a function of (scene, trace, ctrl)",
-    "--cost mine:series": "ValueError: a cost is one number for each world, not an array",
-    "--cost broken:low": "importing it fails: ZeroDivisionError: division by zero (",
-    "--policy mine.py:Pull": "names a file in place of a module; did you mean mine:Pull?",
-    "--cost ./mine.py:low": "names a file in place of a module; did you mean mine:low?",
-    "--optimizer ideas/mine.py:Climber": "did you mean ideas.mine:Climber?",
-    "--policy mine:Narrow": "returned pressure of shape (7,), not (2,) or (5, 2)",
-    "--optimizer mine:Forgetful": "tell must return a state, with the arrays of init's",
-    "--optimizer mine:low": "it must be a function of (space): ",
+    "--cost nobodys:low": "missing",
+    "--cost mine:no_function": "type",
+    "--cost mine:series": "user_code",
+    "--cost broken:low": "user_code",
+    "--policy mine.py:Pull": "syntax",
+    "--cost ./mine.py:low": "syntax",
+    "--optimizer ideas/mine.py:Climber": "syntax",
+    "--policy mine:Narrow": "user_code",
+    "--optimizer mine:Forgetful": "size",
+    "--optimizer mine:low": "type",
 }
+"""Flags, and the kind of their problem."""
 
 
 @pytest.mark.parametrize("flags", WRONG)
-def test_what_is_wrong_is_said_before_anything_is_created(flags, workdir, capsys):
+def test_what_is_wrong_is_said_before_anything_is_created(flags, workdir):
     (workdir / "broken.py").write_text("1 / 0\n")
     before = snapshot(workdir)
-    assert cli.main([*RUN, *flags.split(), "--episodes", "1", "--out", "run"]) == 2
-    output = capsys.readouterr().err
-    assert output.startswith(f"error: {flags.split()[0]}") and WRONG[flags] in output, output
+    flag, name = flags.split()
+    [(code, key)] = refusal_of_command(*RUN, flag, name, "--episodes", "1", "--out", "run")
+    assert (code, key.split()[0]) == (WRONG[flags], flag)
     sys.modules.pop("broken", None)
     assert {k: v for k, v in snapshot(workdir).items() if "__pycache__" not in str(k)} == before

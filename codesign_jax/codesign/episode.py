@@ -148,7 +148,7 @@ class Task:
         """
         if problem := random_key_problem(key):
             hint = "; rollout.evaluate takes trials" if isinstance(key, Trial) else ""
-            raise InputError([problem + hint])
+            raise InputError.of("type", problem + hint)
         self.space.refuse_population(population)
         self.space.check(population)
         self.scene.checked(scene)

@@ -230,17 +230,19 @@ def place_problems(flag: str, path: Path | None, *suffixes: str, folder: bool = 
     if path is None:
         return []
     if suffixes and path.suffix not in suffixes:
-        return [f"{flag} {path} must end in {' or '.join(suffixes)}"]
+        return [schema.Problem("file", f"{flag} {path} must end in {' or '.join(suffixes)}")]
     parent = path.absolute() if folder else path.absolute().parent
     try:
         if not folder and path.is_dir():
-            return [f"{flag} {path} cannot be written: it is a folder"]
+            words = f"{flag} {path} cannot be written: it is a folder"
+            return [schema.Problem("file", words)]
         while not parent.exists():
             parent = parent.parent
         with tempfile.TemporaryFile(dir=parent):
             return []
     except OSError as error:
-        return [f"{flag} {path} cannot be written: {error.strerror} ({parent})"]
+        words = f"{flag} {path} cannot be written: {error.strerror} ({parent})"
+        return [schema.Problem("file", words)]
 
 
 def number_problems(*numbers: tuple[str, float | None, float, float]) -> list[str]:
@@ -270,10 +272,11 @@ def picture_problems(flag: str, path: Path | None) -> list[str]:
 def engine_problems(name: str, overrides: Sequence[Sequence[str]] = ()) -> list[str]:
     """An engine that there is not, or values of [solver] for one that does not read them."""
     if name not in engines.NAMES:
-        return [f"--engine = {name!r} is not valid; {schema.nearest(name, engines.NAMES)}"]
+        hint = schema.nearest(name, engines.NAMES)
+        return [schema.Problem("unknown", f"--engine = {name!r} is not valid; {hint}")]
     values = keypaths.parse(chain.from_iterable(overrides)) if name == "structured" else {}
     return [
-        engines.solver_problem(f"--set {'.'.join(path)}={value}", path[1] if path[1:] else "")
+        engines.solver_problem(f"--set {'.'.join(path)} = {value}", path[1] if path[1:] else "")
         for path, value in values.items()
         if path[0] == "solver"
     ]

@@ -168,7 +168,12 @@ def _pair(options: Compare, paths: list[Path]) -> dict[str, Case]:
     subjects = [_subject(options, path, side) for path, side in zip(paths, sides, strict=False)]
     of_runs = not any(map(flags.is_design, paths))
     if of_runs and (unknown := {*options.policy} - {subject.policy for subject in subjects}):
-        raise InputError([f"--policy {name}: neither run was made with it" for name in unknown])
+        raise InputError(
+            [
+                Problem("conflict", f"--policy {name}: neither run was made with it")
+                for name in unknown
+            ]
+        )
     every = [find_case(subject) for subject in subjects]
     words = [" ".join(chain.from_iterable(side)) for side in sides]
     named = zip(paths, words, strict=False)

@@ -83,8 +83,10 @@ def main(options: Options) -> int:
         table |= {n: np.zeros(POINTS) for n in ("angle", "tip_force", "blocked_force")}
     try:
         compare(mine, table, options, console)
+    except InputError:
+        raise
     except ValueError as error:
-        raise InputError([str(error)]) from error
+        raise InputError.of("unsupported", str(error)) from error
     return 0
 
 
@@ -191,7 +193,7 @@ def _of_fit(fit: Posterior, mine: Finger) -> list[str]:
         label, unit, size = CONSTANTS[name]
         if wrong := schema.field_problem(label, float(f"{value[name]:.4g}"), Material, name):
             reason = "the table's units, signs and the design's section do not fit one another"
-            raise ValueError(f"fitted: {wrong}: {reason}")
+            raise InputError.of("range", f"fitted: {wrong}: {reason}")
         number = f"{value[name] / size:.4g} {unit}".rstrip()
         doubt = "" if identified[name] else "; hardly told by these measurements"
         lines.append(f"fitted: {label} = {number}, {_error(fit, name)}{doubt}")

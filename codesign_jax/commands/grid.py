@@ -11,7 +11,7 @@ from codesign_jax.commands import common
 from codesign_jax.commands.flags import Landscape as Options
 from codesign_jax.judge.cases import Case
 from codesign_jax.scene import Scene, design_files, schema
-from codesign_jax.scene.schema import InputError
+from codesign_jax.scene.schema import InputError, Problem
 
 
 class Axis(NamedTuple):
@@ -43,22 +43,24 @@ def axes(case: Case, options: Options) -> tuple[Axis, Axis]:
     return first, second
 
 
-def _problem(word: str, case: Case) -> str:
+def _problem(word: str, case: Case) -> Problem | None:
     name, equals, text = word.partition("=")
     ends = _range(text)
     if equals and not ends:
-        return f"--parameters {word!r} must be NAME=LOW:HIGH, two numbers, the lower one first"
+        words = f"--parameters {word!r} must be NAME=LOW:HIGH, two numbers, the lower one first"
+        return Problem("syntax", words)
     if name in case.space.names:
         k = case.space.names.index(name)
         limits = [case.space.in_units(np.array(v))[k] for v in (case.space.low, case.space.high)]
         bounds = [round(float(limit), 9) for limit in limits]
         for value in ends:
             if problem := schema.range_problem(name, value, case.space.units[k], *bounds):
-                return f"--parameters {problem}"
-        return ""
+                return problem.told(f"--parameters {problem}")
+        return None
     if not equals:
-        return f"--parameters {name!r} is not a parameter; {_meant(name, case.space.names)}"
-    return ""
+        words = f"--parameters {name!r} is not a parameter; {_meant(name, case.space.names)}"
+        return Problem("unknown", words)
+    return None
 
 
 def _range(text: str) -> list[float]:

@@ -229,7 +229,7 @@ def _refuse_links(options: Optimize, folders: Iterable[Path]) -> None:
     every = {parent for folder in folders for parent in (folder, *folder.parents)}
     links = sorted(p for p in every if options.out in p.parents and p.is_symlink())
     hint = "is a symbolic link: put the folder itself in its place"
-    common.refuse([f"{link} {hint}" for link in links])
+    common.refuse([schema.Problem("file", f"{link} {hint}") for link in links])
 
 
 def _ends(space: DesignSpace) -> dict[str, np.ndarray]:

@@ -20,7 +20,8 @@ def main(options: Render) -> int:
     planned = grasp.find(options)
     end = planned.case.scene.end_time
     late = [t for t in options.times if not 0 <= t <= end]
-    common.refuse([f"--times {t:g} is outside [0, {end:g}] s, a grasp" for t in late])
+    problems = [f"--times = {t:g} is outside [0, {end:g}] s, a grasp" for t in late]
+    common.refuse([schema.Problem("range", problem) for problem in problems])
     draw(planned, options, camera, Console())
     return 0
 

@@ -78,8 +78,8 @@ def solver_problem(given: str, key: str = "") -> str:
     """Says that a value of the [solver] table has no effect in engine structured."""
     instead = f"newton.{_INSTEAD[key]}" if key in _INSTEAD else "the table [newton]"
     sentence = (
-        f"not supported by engine structured: {given} (MuJoCo's own solver); set {instead}, which "
-        "limits the solver of engine structured, or use engine mujoco or mjx"
+        f"{given} has no effect in engine structured, whose solver is not MuJoCo's: set {instead}, "
+        "which limits it, or use engine mujoco or mjx"
     )
     return schema.Problem("unsupported", sentence)
 

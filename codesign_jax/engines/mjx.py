@@ -28,7 +28,7 @@ from codesign_jax.model import (
 )
 from codesign_jax.model.layout import centre_weights
 from codesign_jax.scene import Scene, effects
-from codesign_jax.scene.schema import InputError
+from codesign_jax.scene.schema import InputError, Problem
 from codesign_jax.types import Forces, Trace
 
 _STATIC = ("wrap_prm",)
@@ -37,8 +37,11 @@ _STATIC = ("wrap_prm",)
 
 def _refuse_fixtures(scene: Scene) -> None:
     problems = [
-        f"not supported by engine mjx: object {shape.name!r}, a {shape.type}, with fixture "
-        f"{fixture.name!r}, a {fixture.type}; use engine structured or mujoco"
+        Problem(
+            "unsupported",
+            f"object {shape.name!r} is a {shape.type}, and engine mjx has no contact of it with "
+            f"fixture {fixture.name!r}, a {fixture.type}; use engine structured or mujoco",
+        )
         for shape in scene.objects.object
         for fixture in scene.fixture
         if scene.effects.object_table and {shape.type, fixture.type} == {"box", "cylinder"}

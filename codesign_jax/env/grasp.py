@@ -293,7 +293,7 @@ def _one_key(rng: Any) -> jax.Array:
         raise InputError.of("type", f"reset takes a key, as of jax.random.key(0), not {rng!r:.60}")
     if rng.shape:
         words = f"reset takes one key, not {rng.shape}: jax.vmap(env.reset)(keys) begins several"
-        raise InputError([words])
+        raise InputError.of("size", words)
     return rng
 
 

@@ -87,7 +87,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         expected = self.action_space.shape
         if shape != expected:
             words = f"{self.num_envs} environments take actions of shape {expected}, not {shape}"
-            raise InputError([words])
+            raise InputError.of("size", words)
         self._keys, state = self._step(self._keys, self._state, jnp.asarray(actions))
         self._state = state
         reward = np.asarray(state.reward, np.float64)

@@ -28,6 +28,7 @@ from codesign_jax.finger.prediction import (
 from codesign_jax.finger.rest import TOO_FAR, Finger, NoRest
 from codesign_jax.measurements import BY_PRESSURE, MEASURED
 from codesign_jax.scene import draws
+from codesign_jax.scene.schema import InputError, Problem
 
 TOLD_BY = {
     "shear_modulus": ("angle", "tip_x", "tip_y", "deflection", "sideways", "drop"),
@@ -276,25 +277,31 @@ def refuse_values(finger: Finger, table: Table, columns: list[str]) -> None:
     """Refuses columns that no material explains: zeros, offsets, and the other sign."""
     for name in columns:
         if not np.nan_to_num(table[name]).any():
-            raise ValueError(f"every measured {words(name)} is 0: there is nothing to fit")
+            raise InputError.of("missing", f"{name}: every measured value is 0: nothing to fit")
     if not table["pressure"].any() and set(columns) <= set(BY_PRESSURE):
-        raise ValueError("every pressure is 0: there is nothing to fit")
+        raise InputError.of("missing", "pressure: every one is 0: there is nothing to fit")
     load = np.nan_to_num(table.get("load", np.zeros(1)))
     if not load.any() and set(columns) <= {"deflection", "sideways"}:
-        raise ValueError("every load is 0: there is nothing to fit")
+        raise InputError.of("missing", "load: every one is 0: there is nothing to fit")
     for name in set(columns) & {*BENDING}:
         at_rest = np.abs(table[name][table["pressure"] == 0])
         if (at_rest > _OFFSET * np.nanmax(np.abs(table[name]))).any():
-            raise ValueError(
-                f"the measured {words(name)} is not 0 at zero pressure: subtract its value there"
+            raise InputError.of(
+                "range", f"{name}: it is not 0 at zero pressure: subtract its value there"
             )
     predicted = predict(finger, table)
     for name, start in shifted(table, predicted).items():
-        raise ValueError(shift_in_words(name, start))
+        raise InputError.of("range", f"{name}: {shift_in_words(name, start)}")
     if wrong := opposed(table, predicted):
-        raise ValueError(
-            f"{' and '.join(map(words, wrong))} of the other sign than the model's: bending "
-            "under pressure, and what resists it, count as positive; change the signs in the file"
+        remedy = (
+            "bending under pressure, and what resists it, count as positive; change the signs in "
+            "the file"
+        )
+        raise InputError(
+            [
+                Problem("conflict", f"{name}: the sign is not the model's: {remedy}")
+                for name in wrong
+            ]
         )
 
 

@@ -79,7 +79,5 @@ def load(path: Path) -> Landscape:
     try:
         return Landscape(**array_files.load(path, _LAYOUT))
     except (OSError, array_files.ArrayFileError) as error:
-        problem = (
-            f"{path} is not a landscape of this version ({error}); codesign landscape writes one"
-        )
-        raise InputError([problem]) from error
+        words = f"{path} is not a landscape of this version ({error})"
+        raise InputError.of("damaged", f"{words}; codesign landscape writes one") from error

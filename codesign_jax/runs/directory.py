@@ -137,7 +137,9 @@ def reopened(path: Path, settings: Settings) -> Iterator[RunDirectory]:
     """
     stored = manifest.read_provenance(path)
     if stored["settings"] != dataclasses.asdict(settings):
-        raise InputError([f"{path} is of another run: it was replaced since this one ended"])
+        raise InputError.of(
+            "damaged", f"{path} is of another run: it was replaced since this one ended"
+        )
     descriptor = os.open(path / LOCK, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
         yield RunDirectory(path, descriptor)
@@ -171,7 +173,7 @@ def setting_of(paths: Iterable[Path], name: str) -> Any:
         words = f"{value} {name}" if isinstance(value, int) else f"{name} {value}"
         problem = f"{least} has {words} and {most} {values[most]}: say by --{name} what all "
         problem += "are to have"
-        raise InputError([problem])
+        raise InputError.of("conflict", problem)
     return next(iter(values.values()), None)
 
 
@@ -190,7 +192,7 @@ def locked(path: Path) -> Iterator[int]:
             raise InputError.of("file", f"--out {path} is in use by process {owner}") from error
         except OSError as error:
             problem = f"--out {path} cannot be locked: {error.strerror}; choose another folder"
-            raise InputError([problem]) from error
+            raise InputError.of("file", problem) from error
         file.truncate(0)
         file.write(str(os.getpid()))
         file.flush()
@@ -259,10 +261,12 @@ def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str
     if problems:
         head = f"--out {path} holds another run; choose another folder, or --fresh to delete it"
         shown = [head, *_own_command(stored), *(p.rstrip() for p in problems + extension)]
-        raise InputError(shown)
+        raise InputError([Problem("conflict", sentence) for sentence in shown])
     if extension:
         hint = "leave out --episodes to go on with it, or choose another folder"
-        raise InputError([f"--out {path}: {problem}; {hint}" for problem in extension])
+        raise InputError(
+            [Problem("conflict", f"--out {path}: {problem}; {hint}") for problem in extension]
+        )
 
 
 def _is_cut_short(path: Path, scene: Scene, settings: Settings, stored: dict[str, Any]) -> bool:
@@ -341,8 +345,11 @@ def _refuse_folders(path: Path) -> None:
     """Refuses folders where a run has files, which it could not write when it gets there."""
     names = {*FILES, *TABLES, LOCK} - {*_INSIDE}
     problems = [
-        f"{path / name} is a folder, and a run has a file of this name: move it elsewhere. "
-        "Nothing was changed"
+        Problem(
+            "file",
+            f"{path / name} is a folder, and a run has a file of this name: move it elsewhere. "
+            "Nothing was changed",
+        )
         for name in sorted(names)
         if (path / name).is_dir()
     ]

@@ -85,4 +85,4 @@ def load(path: Path) -> Failure:
         return Failure(values["design"], trial, values["state"], status, bad_step, numbers)  # type: ignore[arg-type]
     except (OSError, ValueError, KeyError, TypeError) as error:
         problem = f"{path} is not a failed world of a run, which are .npz files in its {FOLDER}/"
-        raise InputError([problem]) from error
+        raise InputError.of("damaged", problem) from error

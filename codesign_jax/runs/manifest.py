@@ -20,7 +20,7 @@ from codesign_jax.provenance import environment, git_state
 from codesign_jax.runs.columns import FILES, TABLES
 from codesign_jax.runs.settings import Settings, check
 from codesign_jax.scene import scene_files
-from codesign_jax.scene.schema import InputError
+from codesign_jax.scene.schema import InputError, Problem
 
 PROVENANCE = "provenance.json"
 """File that makes a folder a run."""
@@ -83,8 +83,11 @@ def refuse_links(path: Path, names: Iterable[str] = (*FILES, *TABLES, LOCK)) -> 
       names: Files and folders at its top that are about to be opened.
     """
     problems = [
-        f"{path / name} is a symbolic link, or no file: a run is read and written in its folder "
-        "alone. Put the file or folder itself in its place"
+        Problem(
+            "file",
+            f"{path / name} is a symbolic link, or no file: a run is read and written in its "
+            "folder alone. Put the file or folder itself in its place",
+        )
         for name in files.special(path, names)
     ]
     if problems:

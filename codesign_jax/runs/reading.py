@@ -17,7 +17,7 @@ from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.record import Record
 from codesign_jax.runs.settings import Settings
 from codesign_jax.scene import Scene, texts
-from codesign_jax.scene.schema import InputError
+from codesign_jax.scene.schema import InputError, Problem
 
 Tell = Callable[[str], None]
 """Takes a sentence about what is amiss with a run."""
@@ -97,8 +97,9 @@ def lost(folder: Path, restored: Restored | None = None) -> str:
     damaged = restored.damaged if restored else ()
     steps = texts.some([f"{step}: {reason}" for step, reason in damaged], "; ")
     loss = f"no checkpoint that is whole ({steps})" if steps else "lost its checkpoints"
-    return (
+    return Problem(
+        "damaged",
         f"run {folder} has {loss}, while its tables have {episodes} "
         f"episode{'s' * (episodes != 1)}. Put checkpoints/ back from a copy; or copy the tables, "
-        "if they are wanted, and begin anew with codesign optimize --fresh"
+        "if they are wanted, and begin anew with codesign optimize --fresh",
     )

@@ -119,14 +119,15 @@ def check(settings: Settings, hand: Hand | None) -> list[str]:
             schema.Problem("unknown", f"--engine = {settings.engine!r} is not valid; {hint}")
         )
     if user_code.is_user_code(settings.optimizer):
-        problem = user_code.problem(settings.optimizer)
+        code, problem = "syntax", user_code.problem(settings.optimizer)
     else:
-        problem = optimize.problem(settings.optimizer, max(settings.particles, 0) or None)
-    problems += [f"--optimizer: {problem}"] if problem else []
+        particles = max(settings.particles, 0) or None
+        code, problem = "unknown", optimize.problem(settings.optimizer, particles)
+    problems += [schema.Problem(code, f"--optimizer: {problem}")] if problem else []
     if settings.cost != SCENE_COST and (problem := user_code.problem(settings.cost)):
-        problems.append(schema.Problem("user_code", f"--cost: {problem}"))
+        problems.append(schema.Problem("syntax", f"--cost: {problem}"))
     if settings.policy and (problem := user_code.problem(settings.policy)):
-        problems.append(schema.Problem("user_code", f"--policy: {problem}"))
+        problems.append(schema.Problem("syntax", f"--policy: {problem}"))
     space = None
     if hand is not None:
         try:
@@ -144,5 +145,5 @@ def _schedule_problems(settings: Settings, space: DesignSpace | None) -> list[st
     try:
         schedule(settings.schedule, list(domains), settings.episodes, settings.first)  # type: ignore[arg-type]
     except ValueError as error:
-        return [f"--schedule: {error}"]
+        return [schema.Problem("conflict", f"--schedule: {error}")]
     return []

@@ -6,7 +6,6 @@ reads one with its scene.
 
 import dataclasses
 import math
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -69,10 +68,13 @@ def parse(
     entries = [pair.partition("=") for pair in pairs]
     # A name without an index is all fingers' parameter: one value for each of them.
     entries = [(each, v) for name, _, v in entries for each in members(name, space)]
+    given: dict[str, list[str]] = {}
+    for name, text in entries:
+        given.setdefault(name, []).append(text)
     problems = [
-        f"{where} {name!r} is given more than once: {', '.join(v for n, v in entries if n == name)}"
-        for name, count in Counter(name for name, _ in entries).items()
-        if count > 1
+        Problem("conflict", f"{where} {name!r} is given more than once: {', '.join(each)}")
+        for name, each in given.items()
+        if len(each) > 1
     ]
     for name, text in entries:
         if name in dict(space.idle):

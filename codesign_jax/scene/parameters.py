@@ -274,7 +274,7 @@ class DesignSpace:
         bad: np.ndarray = ~np.isfinite(rows)
         names = zip(self.names, np.asarray(bad.any(0)), rows.T, bad.T, strict=True)
         problems = [
-            f"{name} = {column[where][0]} is not a finite number"
+            schema.Problem("range", f"{name} = {column[where][0]} is not a finite number")
             for name, any_bad, column, where in names
             if any_bad
         ]
@@ -318,7 +318,7 @@ class DesignSpace:
         if not rows and not hasattr(population, "ndim"):
             words = f"population is a {type(population).__name__}, not an array of designs [SI]"
             hint = "; rollout.evaluate takes Params" if isinstance(population, Params) else ""
-            raise schema.InputError([words + hint])
+            raise schema.InputError.of("type", words + hint)
         if np.ndim(population) != 2:
             shape = np.shape(population)
             hint = "; population[None] makes a batch of one" if len(shape) == 1 else ""
@@ -488,7 +488,7 @@ def _refuse_draws(key: Any, n: Any) -> None:
     if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
         raise schema.InputError.of("range", f"n = {n!r} designs must be a whole number, at least 1")
     if problem := random_key_problem(key):
-        raise schema.InputError([problem])
+        raise schema.InputError.of("type", problem)
 
 
 def fingers_of(name: str) -> list[int]:
@@ -678,8 +678,11 @@ def _refuse_empty(space: DesignSpace, hand_name: str) -> None:
     columns = map(space.in_units, (*space.box, *space.bounds))
     ends = zip(space.names, space.units, *columns, strict=True)
     problems = [
-        f"{name}: limits of the scene ({least:g} to {most:g} {unit}) leave nothing of the range of "
-        f"hand {hand_name}, {low:g} to {high:g} {unit}"
+        schema.Problem(
+            "range",
+            f"{name}: limits of the scene ({least:g} to {most:g} {unit}) leave nothing of the "
+            f"range of hand {hand_name}, {low:g} to {high:g} {unit}",
+        )
         for name, unit, least, most, low, high in ends
         if least > most
     ]

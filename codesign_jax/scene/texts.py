@@ -35,7 +35,8 @@ CODES = {
 """Kinds of bad input."""
 _ABOUT = re.compile(
     r"(?P<key>(?:--)?[\w./\[\]-]+(?: '?[\w./\[\]-]+'?){0,2}?)"
-    r"(?=:| = | (?:is|are|must|has|have|needs|names|leaves|gives|lacks|takes|asks|stands)\b)"
+    r"(?=:| = | (?:is|are|was|has|have|must|cannot|needs|names|leaves|gives|lacks|takes|asks|stands"
+    r"|holds|compares)\b)"
 )
 
 

@@ -28,13 +28,13 @@ def under_way() -> bool:
 def check() -> None:
     """Refuses a command, as an InputError, while another one runs."""
     if under_way():
-        raise InputError([_BUSY])
+        raise InputError.of("conflict", _BUSY)
 
 
 def start(words: Sequence[str], tell: Callable[[str], None]) -> None:
     """Starts `codesign words`; tells the line at once, and with what it printed at its end."""
     if not _under_way.acquire(blocking=False):
-        raise InputError([_BUSY])
+        raise InputError.of("conflict", _BUSY)
     tell(shlex.join(["codesign", *words]) + RUNNING)
     threading.Thread(target=_run, args=(words, tell), daemon=True).start()
 

@@ -105,7 +105,7 @@ def at_states(scene, fields, ctrl, trajectory, stride=1):
 
 
 def turns_fast(scene, data):
-    """Whether a body turns so fast that its velocity products are not MuJoCo's."""
+    """Whether a body turns so fast that its velocity products are not MuJoCo's: `laws.inertia`."""
     lay = model.layout(scene)
     turns = scene.discretization.timestep * np.linalg.norm(data.cvel[:, :3], axis=1)
     return turns[lay.bodies].max() > LARGEST_TURN or turns[lay.object] > LARGEST_FREE_TURN
@@ -114,22 +114,29 @@ def turns_fast(scene, data):
 def against_mujoco(scene, fields, ctrl, trajectory, stride=1):
     """Errors of a path's steps against MuJoCo C, see `at_states`.
 
-    Relative ones of accelerations, of distances [m], and numbers of contacts, (world, state). Where
-    a body turns fast, see `laws.inertia`, accelerations are not MuJoCo's: the error is given as 0.
+    Relative ones of accelerations, masked where `turns_fast`, of distances [m], and numbers of
+    contacts, (world, state).
     """
     h = scene.discretization.timestep
     lay = model.layout(scene)
     errors = []
+    fast = []
     far = []
     touching = []
     for world, k, _, data in at_states(scene, fields, ctrl, trajectory, stride):
         qvel, after = trajectory.qvel[world, k : k + 2]
-        fast = turns_fast(scene, data)
-        errors.append(0.0 if fast else relative_change((after - qvel) / h, data.qacc))
+        fast.append(turns_fast(scene, data))
+        errors.append(relative_change((after - qvel) / h, data.qacc))
         away = data.xipos[lay.object] - lay.centre_weights @ data.xipos
         far.append(abs(np.linalg.norm(away) - trajectory.distance[world, k]))
         touching.append(data.ncon)
-    return (np.array(v).reshape(len(ctrl), -1) for v in (errors, far, touching))
+    compared = np.ma.array(errors, mask=fast)
+    return (v.reshape(len(ctrl), -1) for v in (compared, np.array(far), np.array(touching)))
+
+
+def share(errors):
+    """Share of masked errors that are compared."""
+    return errors.count() / errors.size
 
 
 def relative_change(acceleration, exactly):
@@ -180,7 +187,7 @@ def unbalanced(scene, fields, ctrl, trajectory, stride):
     Mass matrix and smooth forces are MuJoCo C's.  Forces of contacts are found over whole arrays,
     by the functions of geometry and friction cone that the kernel calls.  The largest on wrist,
     which is compliant, joints and object, each over the largest of all states if nothing were
-    accelerated, shape (3, state); NaN where a body turns fast, see `turns_fast`.
+    accelerated, shape (3, state); masked where `turns_fast`.
     """
     end = 6 + model.layout(scene).dofs.size
     count = -(-ctrl.shape[1] // stride)
@@ -235,4 +242,5 @@ def unbalanced(scene, fields, ctrl, trajectory, stride):
     parts = slice(0, 6), slice(6, end), slice(end, None)
     worst = np.array([[np.abs(v[:, part]).max(1) for part in parts] for v in left])
     # At rest nothing is accelerated, and what is left is rounding of forces that cancel.
-    return np.where(fast, np.nan, worst[0] / worst[1].max(1, keepdims=True))
+    left_over = worst[0] / worst[1].max(1, keepdims=True)
+    return np.ma.array(left_over, mask=np.broadcast_to(fast, left_over.shape))

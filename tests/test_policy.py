@@ -21,7 +21,7 @@ from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.model import morphology
 from codesign_jax.model.layout import layout
-from codesign_jax.report import figures
+from codesign_jax.report import charts
 from codesign_jax.scene import parameters
 from codesign_jax.types import Status
 from tests.helpers import grasps
@@ -68,9 +68,14 @@ def worlds(simulate):
 def test_recording_changes_no_bit_and_a_lost_object_has_no_forces(worlds):
     _, plain, (outcome, trace) = worlds
     jax.tree.map(np.testing.assert_array_equal, plain, (outcome, trace._replace(forces=None)))
-    drawn = figures.grip(grasps.nth(trace.forces, 0), SCENE).axes[0].lines[:3]
-    assert [line.get_label() for line in drawn] == ["finger 0", "finger 1", "palm"]
-    assert len(drawn[0].get_ydata()) == SCENE.num_steps
+    drawn = charts.grip(grasps.nth(trace.forces, 0), SCENE)["layers"]
+    assert [line["name"] for line in drawn] == ["finger 0", "finger 1", "palm"]
+    first = np.interp(
+        drawn[0]["x"],
+        SCENE.discretization.timestep * np.arange(SCENE.num_steps),
+        trace.forces.grip[0, :, 0],
+    )
+    np.testing.assert_allclose(drawn[0]["y"], first, rtol=1e-3, atol=1e-6)  # four digits
     lost = np.asarray(outcome.lost_time)
     assert np.isfinite(lost).any()
     for world in np.flatnonzero(np.isfinite(lost)):

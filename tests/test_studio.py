@@ -441,7 +441,7 @@ def test_the_page_is_served_while_the_simulation_is_compiled(desk, monkeypatch, 
     """A tab is told that, and what a command prints, though it was connected later."""
     heard = []
 
-    def warm(bench, design):
+    def warm(bench, design, tell):
         """Stands in for the compiler: meanwhile somebody opens the printed address."""
         [address] = re.findall(r"http:\S+", capsys.readouterr().out)
         port, token = re.search(r":(\d+)/\?token=(\S+)", address).groups()

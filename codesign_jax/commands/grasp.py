@@ -84,7 +84,7 @@ def simulate(planned: PlannedGrasp, *, forces: bool = False) -> "Replay":
     trials = jax.tree.map(lambda v: v[None], planned.trial)
     engine = case.make_engine()
     if forces and tells_forces(engine):
-        engine = recording(engine)
+        engine = recording(engine, touch=True)
     return animation.replay(case.scene, engine, params, trials)[0]
 
 

@@ -88,7 +88,9 @@ def draw(planned: grasp.PlannedGrasp, options: Render, camera: "Camera", console
     scene = planned.case.scene
     size = (options.size, options.size)
     with Busy(console, "drawing"):
-        arguments: Any = {"size": size, "camera": camera}
+        # A place that is named is looked at; else the camera goes with hand and object.
+        named = any(word.partition("=")[0] in "xyz" for word in options.camera)
+        arguments: Any = {"size": size, "camera": camera, "follow": not named}
         if options.times:
             arguments["times"] = options.times
         animation.write(scene, [shown], options.out, **arguments)

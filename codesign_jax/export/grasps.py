@@ -13,6 +13,7 @@ from codesign_jax.cost import outcome
 from codesign_jax.export import plain, skin
 from codesign_jax.export.play import play
 from codesign_jax.judge import verdict
+from codesign_jax.report.replay import Camera
 from codesign_jax.scene import Scene
 from codesign_jax.types import Outcome, Params, Trace, Trial
 
@@ -79,7 +80,8 @@ def _spec(scene: Scene, params: Params, trial: Trial) -> tuple[mujoco.MjSpec, Ma
 
 
 def _light(spec: mujoco.MjSpec) -> None:
-    """Light, sky and colours: any renderer shows the hand, none of it is physics."""
+    """Light, sky, colours and cameras: any renderer shows the hand, none of it is physics."""
+    _look(spec)
     head = spec.visual.headlight
     head.ambient = [0.3] * 3
     head.diffuse = [0.5] * 3
@@ -102,6 +104,24 @@ def _light(spec: mujoco.MjSpec) -> None:
     for geom in spec.worldbody.geoms:
         if geom.name == "table":
             geom.rgba = [0.8, 0.78, 0.75, 1]
+
+
+def _look(spec: mujoco.MjSpec) -> None:
+    """The view of `codesign render`: a camera, and where a viewer's free camera begins."""
+    camera = Camera()
+    azimuth, elevation = np.radians([camera.azimuth, camera.elevation])
+    flat = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    forward = np.cos(elevation) * flat + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
+    right = np.array([flat[1], -flat[0], 0.0])
+    place = np.array(camera.lookat) - camera.distance * forward
+    turn = np.empty(4)
+    mujoco.mju_mat2Quat(turn, np.stack([right, np.cross(right, forward), -forward], 1).ravel())
+    spec.worldbody.add_camera(name="grasp", pos=place, quat=turn)
+    spec.stat.center = camera.lookat
+    spec.stat.extent = camera.distance / 1.5  # where MuJoCo's free camera begins
+    view: Any = spec.visual.global_
+    view.azimuth = camera.azimuth
+    view.elevation = camera.elevation
 
 
 def timed_controls(scene: Scene, params: Params, trial: Trial) -> np.ndarray:

@@ -89,12 +89,15 @@ def write_film(
     frames_per_second: float | None = None,
     size: tuple[int, int] = (320, 320),
     camera: Camera = CAMERA,
+    follow: bool = False,
 ) -> Path:
     """Writes grasps side by side as a film, GIF or MP4 (H.264) by the path's ending.
 
     Args:
       frames_per_second: Frames of a second of simulated time, which is shown in real time; default:
         12.5 of a GIF, 25 of an MP4.
+      follow: Whether the camera follows hand and object, as of `following`, instead of looking at
+        its place.
 
     Raises:
       ImportError: Without PyAV, which writes MP4.
@@ -103,11 +106,20 @@ def write_film(
     rate = frames_per_second or (25.0 if path.suffix == ".mp4" else 12.5)
     times = np.arange(0.0, scene.end_time, 1 / rate)
     # One at a time: those of a large film together would fill the memory.
-    films = [_pictures(scene, grasp, times, size, camera) for grasp in grasps]
+    films = [
+        _pictures(scene, grasp, times, size, _cameras(scene, grasp, times, camera, follow=follow))
+        for grasp in grasps
+    ]
     files.make_folder_of(path)
     with files.atomically(path) as part:
         write(map(np.hstack, zip(*films, strict=True)), part, rate)
     return path
+
+
+def _cameras(
+    scene: Scene, grasp: Replay, times: np.ndarray, camera: Camera, *, follow: bool
+) -> Camera | list[Camera]:
+    return following(scene, grasp, times, camera) if follow else camera
 
 
 def _write_gif(pictures: Iterator[np.ndarray], path: Path, rate: float) -> None:
@@ -143,21 +155,28 @@ def write_strip(
     times: tuple[float, ...] | None = None,
     size: tuple[int, int] = (240, 240),
     camera: Camera = CAMERA,
+    follow: bool = False,
 ) -> Path:
     """Writes a film strip, one row a grasp, by default one frame at the end of each phase.
 
     Args:
       times: Times of the frames [s].
+      follow: As of `write_film`.
     """
     p = scene.phases
     ends = [p.settle + t for t in (p.approach, p.inflate, p.lift, p.disturb)]
-    chosen = times or (0.0, *ends, scene.end_time)
-    rows = [frames(scene, g, np.array(chosen), size=size, camera=camera) for g in grasps]
+    chosen = np.array(times or (0.0, *ends, scene.end_time))
+    rows = [
+        frames(
+            scene, g, chosen, size=size, camera=_cameras(scene, g, chosen, camera, follow=follow)
+        )
+        for g in grasps
+    ]
     picture = np.concatenate([np.concatenate(list(row), axis=1) for row in rows])
     files.make_folder_of(path)
     with files.atomically(path) as part:  # whose name does not say the kind of picture
         kind = Image.registered_extensions().get(path.suffix.lower(), "PNG")
-        Image.fromarray(picture).quantize(128).save(part, kind)
+        Image.fromarray(picture).quantize(256).save(part, kind)
     return path
 
 
@@ -172,4 +191,4 @@ def _common_palette(images: list[Image.Image]) -> Image.Image:
     glued = Image.new("RGB", (width, height * len(chosen)))
     for i, image in enumerate(chosen):
         glued.paste(image, (0, i * height))
-    return glued.quantize(128)
+    return glued.quantize(256)

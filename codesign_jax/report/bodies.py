@@ -4,23 +4,39 @@ Every vertex follows two bodies by linear blend skinning; those of rigid parts f
 are hulls (`codesign_jax.model.hull`), whatever surface the scene's contacts have.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
+import trimesh
 
 from codesign_jax import model
 from codesign_jax.model import hull
+from codesign_jax.model.layout import mounts
 from codesign_jax.report.replay import Replay
 from codesign_jax.scene import Scene
 from codesign_jax.scene.primitives import PRIMITIVES
 from codesign_jax.scene.tables import Fixture
 from codesign_jax.types import Tip
 
-FINGER = (0.36, 0.57, 0.80)
+FINGERS = ("#0072b2", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#b59f00", "#5a4fa0", "#5a6776")
+"""Colours of the fingers in pictures, plots and pages, which repeat.
+
+Those of Okabe and Ito (Color Universal Design, 2008) without orange, which the object has, their
+yellow darker for lines on white; then two of ours.
+"""
 OBJECT = (0.95, 0.58, 0.20)
 PALM = (0.36, 0.38, 0.43)
+SEAT = (0.50, 0.53, 0.58)
+TUBE = (0.80, 0.84, 0.88)
 FIXTURE = (0.62, 0.60, 0.55)
+# What is drawn of the mounting, all ours [m]: length of a seat and its walls, radius of a tube, and
+# radius and length of the wrist's stump.
+_SEAT = 0.016
+_CHEEK = 0.002
+_TUBE = 0.002
+_STUMP = (0.018, 0.07)
 _MOST_FACES = 40_000
 """Faces of an object's mesh above which a coarser one is drawn: pages are to stay small."""
 
@@ -46,11 +62,28 @@ class Motion(NamedTuple):
     rate: float  # frames of a second
 
 
+def finger_color(finger: int) -> str:
+    """The colour of a finger as CSS writes it."""
+    return FINGERS[finger % len(FINGERS)]
+
+
+def finer(scene: Scene, rings: int, points: int) -> Scene:
+    """The scene with at least so many rings of a link and points of a ring in its skin's mesh."""
+    d = scene.discretization
+    mesh = {"hull_rings": max(d.hull_rings, rings), "hull_points": max(d.hull_points, points)}
+    return dataclasses.replace(scene, discretization=dataclasses.replace(d, **mesh))
+
+
 def parts(scene: Scene, grasp: Replay) -> list[Part]:
-    """Meshes of fingers, palm and object; bodies are numbered as in MuJoCo's model."""
+    """Meshes of fingers, palm and object; bodies are numbered as in MuJoCo's model.
+
+    The fingers come first, in order, then their seats and tubes, the wrist, the palm, fixtures and
+    last the object.  Seats, tubes and wrist are for the eye: nothing of them is simulated.
+    """
     lay = model.layout(scene)
     palm = scene.hand.palm
     bodies = [_finger(scene, grasp, f, lay) for f in range(scene.num_fingers)]
+    bodies += _mounting(scene, grasp)
     disc = PRIMITIVES["cylinder"].triangles((palm.radius, palm.thickness / 2))
     disc.apply_translation([0, 0, palm.thickness / 2])
     bodies.append(_rigid("palm", PALM, disc.vertices, disc.faces, 1))
@@ -125,8 +158,71 @@ def _finger(scene: Scene, grasp: Replay, f: int, lay: model.Layout) -> Part:
     bodies = np.array([lay.stubs[f], *lay.bodies[f]])
     first, second = straight - along
     return Part(
-        f"finger {f}", FINGER, first, second, bodies[mesh.link], mesh.weight[:, 1], mesh.face
+        f"finger {f}",
+        _rgb(finger_color(f)),
+        first,
+        second,
+        bodies[mesh.link],
+        mesh.weight[:, 1],
+        mesh.face,
     )
+
+
+def _mounting(scene: Scene, grasp: Replay) -> list[Part]:
+    """Seats and tubes of the fingers and the stump of the wrist, rigid in the palm's frame."""
+    thick = scene.hand.palm.thickness
+    position, quaternion = (np.asarray(v) for v in mounts(scene.hand, grasp.params.spread))
+    top = thick + _STUMP[1]
+    stump = trimesh.creation.cylinder(_STUMP[0], _STUMP[1], sections=32)
+    stump.apply_translation([0, 0, thick + _STUMP[1] / 2])
+    seats = []
+    tubes = []
+    for f in range(scene.num_fingers):
+        if float(grasp.params.length[f]) == 0:  # a finger that was left out
+            continue
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, quaternion[f].astype(float))
+        turn = turn.reshape(3, 3)
+        height = float(grasp.params.height[f])
+        size = np.array([_SEAT, scene.hand.section.width + 2 * _CHEEK, height + 2 * _CHEEK])
+        middle = np.array([_CHEEK - _SEAT / 2, 0, height / 2])
+        box = trimesh.creation.box(size)
+        seats.append(trimesh.Trimesh((box.vertices + middle) @ turn.T + position[f], box.faces))
+        start = position[f] + turn @ (middle - [_SEAT / 2, 0, 0])
+        above = start + turn @ [-0.015, 0, 0]
+        away = np.array([*position[f][:2], 0]) / max(np.hypot(*position[f][:2]), 1e-9)
+        end = (_STUMP[0] + _TUBE) * away + [0, 0, top]
+        tubes.append(_tube(_curve(start, above, end - [0, 0, 0.03], end)))
+    named = (("seats", SEAT, seats), ("tubes", TUBE, tubes), ("wrist", SEAT, [stump]))
+    return [
+        _rigid(name, color, joined.vertices, joined.faces, 1)
+        for name, color, meshes in named
+        if meshes and (joined := trimesh.util.concatenate(meshes))
+    ]
+
+
+def _curve(*points: np.ndarray) -> np.ndarray:
+    """A cubic Bézier curve by its four points, shape (place, 3)."""
+    t = np.linspace(0, 1, 12)[:, None]
+    weights = ((1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t**2 * (1 - t), t**3)
+    return sum(w * p for w, p in zip(weights, points, strict=True))  # type: ignore[return-value]
+
+
+def _tube(path: np.ndarray) -> trimesh.Trimesh:
+    """A tube along a path, with open ends."""
+    sides = 8
+    along = np.gradient(path, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.cross(along, [0.37, 0.61, 0.70])  # a direction that no tube has
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    angle = 2 * np.pi * np.arange(sides)[:, None, None] / sides
+    rings = path + _TUBE * (np.cos(angle) * across + np.sin(angle) * np.cross(along, across))
+    vertices = rings.swapaxes(0, 1).reshape(-1, 3)
+    first = sides * np.arange(len(path) - 1)[:, None]
+    k = np.arange(sides)
+    a, b = first + k, first + (k + 1) % sides
+    faces = np.stack([np.stack([a, b, b + sides], -1), np.stack([a, b + sides, a + sides], -1)])
+    return trimesh.Trimesh(vertices, faces.reshape(-1, 3), process=False)
 
 
 def _fixture(fixture: Fixture) -> list[Part]:
@@ -138,6 +234,11 @@ def _fixture(fixture: Fixture) -> list[Part]:
     mujoco.mju_quat2Mat(turn, np.array(fixture.quaternion))
     vertices = body.vertices @ turn.reshape(3, 3).T + fixture.position
     return [_rigid(fixture.name, FIXTURE, vertices, np.asarray(body.faces), 0)]
+
+
+def _rgb(color: str) -> tuple[float, float, float]:
+    red, green, blue = (int(color[k : k + 2], 16) / 255 for k in (1, 3, 5))
+    return red, green, blue
 
 
 def _rigid(name: str, color, vertices: np.ndarray, faces: np.ndarray, body: int) -> Part:

@@ -13,9 +13,12 @@ from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.statistics import wilson
 
+ENDS = ("kept", "unmoved", "lift", "shaking", "not_released", "fault")
+"""How a trial ends, with the causes of a loss, as style.css colours them."""
 
-def design(run: Run) -> str:
-    """The verdict on the design, its parameters within their ranges, and its trials by object."""
+
+def endings(run: Run) -> str:
+    """How the judging trials of the design ended, and what to try."""
     chosen = run.chosen
     judged = run.judged
     source = "the final test" if chosen.tested else "its last episode (there was no final test)"
@@ -24,53 +27,86 @@ def design(run: Run) -> str:
         f"{sentences.of_trials(run.scene, chosen.outcomes)}. "
     )
     again = ["evaluate", "--run", str(run.folder), "--accuracy", "reference"]
-    parts = [
-        markup.paragraph(f"Verdict: {judged}", "key"),
-        markup.paragraph(f"{judged.details}. Rule: {verdict.RULE}."),
+    return markup.section(
+        "How the grasps ended",
+        by_object(judged, _turns(run)),
+        *trials(judged),
+        *_advice(run),
+        markup.paragraph(note + "More fresh trials: ", "note", again),
+    )
+
+
+def trials(judged: Judged) -> list[str]:
+    """The judging trials in words, with the rule and warnings."""
+    return [
+        markup.paragraph(f"{judged.details}. Rule: {verdict.RULE}.", "note"),
         *(markup.paragraph(words, "warning") for words in sentences.warnings(judged)),
         *(markup.paragraph(words, "note") for words in sentences.solver(judged.outcomes)),
-        markup.paragraph(note + "More fresh trials: ", "note", again),
-        by_object(judged, _turns(run)),
-        *_advice(run),
-        *_builder(run),
-        *_fingers(run),
-        parameters(run.scene, run.space, chosen.design),
     ]
-    return markup.section("Chosen design", *parts)
 
 
 def _advice(run: Run) -> list[str]:
     command = run.provenance["started"]["command"]
     tips = advice.after_search(run.judged, run.settings, command, run.folder)
-    return [markup.paragraph(f"To try {tip.what}: ", "note", tip.command) for tip in tips]
+    return [markup.paragraph(f"To try {tip.what}: ", "advice", tip.command) for tip in tips]
 
 
-def _builder(run: Run) -> list[str]:
+def design(run: Run) -> str:
+    """Warnings of the design, and its parameters within their ranges."""
     warnings = stress.of_design(run.scene, run.space.params(run.chosen.design))
-    parts = []
-    if result := run.stress:
-        warnings += result.warnings
-        words = f"Under other conditions, {result.trials} grasps each at the run's accuracy:"
-        parts = [markup.paragraph(words), markup.table(result.head, result.rows, (1, 2))]
-    return [*parts, *(markup.paragraph(f"Warning: {words}.", "warning") for words in warnings)]
+    warnings += run.stress.warnings if run.stress else ()
+    return markup.section(
+        "Design",
+        *(markup.paragraph(f"Warning: {words}.", "warning") for words in warnings),
+        parameters(run.scene, run.space, run.chosen.design),
+    )
 
 
-def _fingers(run: Run) -> list[str]:
+def conditions(run: Run) -> str:
+    """What the design keeps under other conditions."""
+    if (result := run.stress) is None:
+        return ""
+    bars = []
+    for kept in result.by_condition.values():
+        total = result.trials * kept.size
+        counts = {"kept": int(kept.sum()), "lost": total - int(kept.sum())}
+        bars.append(markup.shares(counts, total))
+    words = f"{result.trials} grasps each, at the run's accuracy."
+    table = markup.table(
+        ("condition", "", *result.head[1:]),
+        [(name, bar, *rest) for (name, *rest), bar in zip(result.rows, bars, strict=True)],
+        (2, 3),
+    )
+    return markup.section("Other conditions", table, markup.paragraph(words, "note"))
+
+
+def fingers(run: Run) -> str:
     """What each finger is worth, and the command that judges the hand that lacks some."""
     if (result := run.worth) is None:
-        return []
-    words = (
-        "What each finger is worth: kept grasps of the hand without it, and of the whole hand in "
-        "the same trials."
-    )
-    parts = [markup.paragraph(words), markup.table(result.head, result.rows)]
+        return ""
+    rows = []
+    for hand, (name, *cells, word) in zip(result.hands, result.rows, strict=True):
+        alone = len(hand) == 1
+        label = markup.finger(hand[0], name) if alone else name
+        rows.append((label, word, *cells))
+    head = (result.head[0], result.head[-1], *result.head[1:-1])
+    named = {k: f"finger {hand[0]}" for k, hand in enumerate(result.hands) if len(hand) == 1}
     command = []
     if result.least:
         command = ["evaluate", "--run", str(run.folder), "--accuracy", "reference", "--stress"]
         command += ["--without", *map(str, result.least)]
     text = result.sentence[:1].upper() + result.sentence[1:]
     text += ". To judge that hand: " if command else "."
-    return [*parts, markup.paragraph(text, "note", command)]
+    return markup.section(
+        "What each finger is worth",
+        markup.paragraph(text, "", command),
+        markup.table(head, rows, (*range(2, len(head)),), named),
+        markup.paragraph(
+            "Kept grasps of the hand without it, and of the whole hand in the same trials. A click "
+            "on a finger shows it in the grasp above.",
+            "note",
+        ),
+    )
 
 
 def _turns(run: Run) -> np.ndarray:
@@ -96,12 +132,18 @@ def by_object(judged: Judged, turns: np.ndarray) -> str:
             counts = verdict.tally(mine)
             share = wilson(counts.kept, counts.total)
             span = f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
-            causes = verdict.losses(judged.scene, mine)
+            ends = (*verdict.losses(judged.scene, mine), counts.not_released, counts.fault)
+            bar = markup.shares(dict(zip(ENDS, (counts.kept, *ends), strict=True)), counts.total)
             kept = f"{counts.kept} of {counts.total}"
-            rows.append((name, kept, span, *causes, counts.not_released, counts.fault))
-    head = ("object", "kept", "95 % interval of all", "lost: never moved", "slipped in the lift")
-    head += ("thrown in the shaking", "not released", "faults")
-    return markup.table(head, rows, (*range(1, len(head)),))
+            rows.append((name, bar, kept, *ends, span))
+    words = ("lost: never moved", "slipped in the lift", "thrown in the shaking")
+    words += ("not released", "faults")
+    colored = [
+        markup.Html(f"<i class='swatch {kind}'></i>{markup.text(word)}")
+        for kind, word in zip(ENDS[1:], words, strict=True)
+    ]
+    head = ("object", "", "kept", *colored, "95 % interval of all")
+    return markup.table(head, rows, (*range(2, len(head)),))
 
 
 def parameters(scene: Scene, space: DesignSpace, design: np.ndarray) -> str:
@@ -124,8 +166,11 @@ def parameters(scene: Scene, space: DesignSpace, design: np.ndarray) -> str:
     if per_finger:
         head = ("finger", *(named(name, at[0]) for name, at in per_finger.items()))
         count = len(next(iter(per_finger.values())))
-        rows = [(str(f), *(scale(at[f]) for at in per_finger.values())) for f in range(count)]
-        parts.append(markup.table(head, rows, (*range(1, len(head)),)))
+        rows = [
+            (markup.finger(f), *(scale(at[f]) for at in per_finger.values())) for f in range(count)
+        ]
+        fingers = {f: f"finger {f}" for f in range(count)}
+        parts.append(markup.table(head, rows, (*range(1, len(head)),), fingers))
     if others:
         head = [named(space.names[k], k) for k in others]
         parts.append(markup.table(head, [[scale(k) for k in others]], (*range(len(head)),)))

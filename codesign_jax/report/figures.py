@@ -1,8 +1,6 @@
-"""Figures of a run (matplotlib), as files and as pictures of its report."""
+"""Figures of a run as files (matplotlib); a report has those of `charts`."""
 
-import base64
 import functools
-import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import ParamSpec, TypeVar
@@ -16,15 +14,9 @@ from numpy.typing import ArrayLike
 from codesign_jax import files
 from codesign_jax.codesign import CONVERGED_COST, SUCCESS_COST
 from codesign_jax.report.landscape import Landscape
-from codesign_jax.report.markup import text
-from codesign_jax.runs.record import History
-from codesign_jax.scene import Scene
-from codesign_jax.scene.parameters import DesignSpace
-from codesign_jax.types import HARMLESS, Forces, Status
 
 _BLUE = "tab:blue"
 _ORANGE = "tab:orange"
-_COLUMNS = 3  # of the grid of parameters
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -52,17 +44,6 @@ def save(figure: matplotlib.figure.Figure, path: Path) -> Path:
     with files.atomically(path) as part:  # whose name does not say the kind of picture
         figure.savefig(part, format=path.suffix.lstrip(".") or "png")
     return path
-
-
-@default_style
-def html(figure: matplotlib.figure.Figure, name: str) -> str:
-    """A figure as a piece of a page that needs no other file."""
-    buffer = io.BytesIO()
-    with matplotlib.rc_context({"svg.fonttype": "none"}):  # the browser's letters
-        figure.savefig(buffer, format="svg")
-    data = base64.b64encode(buffer.getvalue()).decode()
-    source = f"data:image/svg+xml;base64,{data}"
-    return f"<img class='figure' id='{name}' alt='{text(name)}' src='{source}'>"
 
 
 def _figure(width: float, height: float) -> matplotlib.figure.Figure:
@@ -131,105 +112,3 @@ def _landscape(axes: Axes, surface: Landscape) -> None:
     image = axes.pcolormesh(*grid, cmap="gray_r", shading="nearest", vmin=0, rasterized=True)
     label = f"mean cost of {int(surface.trials)} trials"
     axes.figure.colorbar(image, ax=axes, label=label)
-
-
-@default_style
-def designs(
-    history: History, space: DesignSpace, chosen: np.ndarray, surface: Landscape | None
-) -> matplotlib.figure.Figure:
-    """All particles of a run with two parameters, over the landscape where there is one.
-
-    Args:
-      chosen: The chosen design [SI units], shape (2,).
-    """
-    figure = _figure(6.4, 4.4)
-    axes = figure.add_subplot()
-    if surface is not None:
-        _landscape(axes, surface)
-    x, y = space.in_units(history.population.reshape(-1, 2)).T
-    dots = {"s": 14, "edgecolors": "white", "linewidths": 0.4, "vmin": 0, "rasterized": True}
-    scatter = axes.scatter(x, y, c=history.cost.ravel(), label="particle", **dots)
-    figure.colorbar(scatter, ax=axes, label="cost")
-    star = {"marker": "*", "s": 200, "color": _ORANGE, "edgecolors": "black", "linewidths": 0.8}
-    axes.scatter(*space.in_units(chosen)[:, None], label="chosen design", **star)
-    labels = [f"{n} [{u}]" for n, u in zip(space.names, space.units, strict=True)]
-    axes.set(xlabel=labels[0], ylabel=labels[1])
-    _above(axes)
-    return figure
-
-
-@default_style
-def parameters(
-    history: History, space: DesignSpace, chosen: np.ndarray
-) -> matplotlib.figure.Figure:
-    """Distribution of every parameter over the episodes: range, quartiles and median.
-
-    Args:
-      chosen: The chosen design [SI units], shape (parameter,), drawn as a line.
-    """
-    columns = min(_COLUMNS, space.num_parameters)
-    rows = -(-space.num_parameters // columns)
-    figure = _figure(9.6, 0.6 + 1.9 * rows)
-    grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    values, low, high, shown = (
-        space.in_units(np.array(v)) for v in (history.population, space.low, space.high, chosen)
-    )
-    episode = np.arange(1, len(values) + 1)
-    for k, axes in enumerate(grid[: space.num_parameters]):
-        for ends, shade, name in (((0, 100), 0.15, "range"), ((25, 75), 0.3, "quartiles")):
-            between = np.percentile(values[..., k], ends, axis=1)
-            axes.fill_between(episode, *between, color=_BLUE, alpha=shade, lw=0, label=name)
-        axes.plot(episode, np.median(values[..., k], 1), color=_BLUE, label="median")
-        axes.axhline(shown[k], color=_ORANGE, lw=1.2, ls=":", label="chosen design")
-        axes.set(ylim=(low[k], high[k]), title=f"{space.names[k]} [{space.units[k]}]")
-        axes.locator_params(axis="x", integer=True)
-    for axes in grid[space.num_parameters :]:
-        axes.set_visible(False)
-    handles, names = grid[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside upper center", ncols=4, frameon=False)
-    return figure
-
-
-@default_style
-def grip(forces: Forces, scene: Scene) -> matplotlib.figure.Figure:
-    """Normal force of each finger on the object, and the palm's force, over time.
-
-    Args:
-      forces: Forces of a grasp, arrays of shape (time, ...).
-    """
-    figure = _figure(7.6, 3.0)
-    axes = figure.add_subplot()
-    time = scene.discretization.timestep * np.arange(len(forces.grip))
-    series = {f"finger {i}": forces.grip[:, i] for i in range(forces.grip.shape[1])}
-    series["palm"] = np.linalg.norm(forces.palm, axis=1)
-    for name, force in series.items():
-        axes.plot(time, force, lw=1.2, label=name)
-    for name, end in scene.phase_ends.items():
-        axes.axvline(end, color="0.5", lw=0.8, ls=":")
-        style = {"rotation": 90, "ha": "right", "va": "top", "fontsize": 7, "color": "0.4"}
-        axes.text(end, 1.0, f"{name} ", transform=axes.get_xaxis_transform(), **style)
-    axes.set(xlabel="time [s]", ylabel="force [N]")
-    _above(axes, len(series))
-    return figure
-
-
-@default_style
-def failures(status: np.ndarray) -> matplotlib.figure.Figure:
-    """Frequency of each cause of failure in each episode.
-
-    Args:
-      status: Bits of `Status`, shape (episode, particle, trial).
-    """
-    figure = _figure(6.4, 2.8)
-    axes = figure.add_subplot()
-    episode = np.arange(1, len(status) + 1)
-    below = np.zeros(len(status))
-    for bit in (b for b in Status if b and b not in HARMLESS):
-        count = ((status & bit) != 0).sum((1, 2))
-        if count.any():
-            axes.bar(episode, count, bottom=below, label=bit.name)
-            below = below + count
-    axes.set(xlabel="episode", ylabel="trials")
-    axes.locator_params(axis="x", integer=True)
-    _above(axes)
-    return figure

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from codesign_jax.judge import sentences, stress, verdict
+from codesign_jax.judge import stress, verdict
 from codesign_jax.judge.cases import Case
 from codesign_jax.judge.sentences import Judged
 from codesign_jax.report import chosen, markup, page
@@ -19,24 +19,25 @@ def write(case: Case, judged: Judged, shown: Replay | None, file: Path, path: Pa
     rows = [*page.surroundings(scene), ("engine", case.commanded)]
     again = ["evaluate", str(file), "--accuracy", "reference", "--stress"]
     text = file.read_text(encoding="utf-8")
-    sections = [
-        markup.section("Scene", markup.table((), rows)),
-        markup.section(
-            "Design",
-            markup.paragraph(f"{judged.details}. Rule: {verdict.RULE}."),
-            *(markup.paragraph(words, "warning") for words in sentences.warnings(judged)),
-            *(markup.paragraph(words, "note") for words in sentences.solver(judged.outcomes)),
-            markup.paragraph("Finer steps and other conditions: ", "note", again),
-            chosen.by_object(judged, turns),
-            *(markup.paragraph(f"Warning: {words}.", "warning") for words in warnings),
-            chosen.parameters(scene, case.space, case.design),
-        ),
-    ]
+    sections = []
     if shown is not None:
         name = scene.objects.object[int(shown.trial.shape)].name
         note = f"With the object {name}, without noise: {verdict.ending(shown.outcome)}."
         parts = page.in_motion(scene, shown)
-        sections.append(markup.section("Grasp", markup.paragraph(note), *parts))
-    details = f"<details><summary>{markup.text(file.name)}</summary><pre>{markup.text(text)}</pre>"
-    sections.append(markup.section("Design file", markup.Html(f"{details}</details>")))
+        sections.append(markup.section("Grasp", *parts, markup.paragraph(note, "note")))
+    sections += [
+        markup.section(
+            "How the grasps ended",
+            chosen.by_object(judged, turns),
+            *chosen.trials(judged),
+            markup.paragraph("Finer steps and other conditions: ", "note", again),
+        ),
+        markup.section(
+            "Design",
+            *(markup.paragraph(f"Warning: {words}.", "warning") for words in warnings),
+            chosen.parameters(scene, case.space, case.design),
+        ),
+        markup.section("Settings", markup.table((), rows)),
+        markup.section("Design file", markup.folded(file.name, f"<pre>{markup.text(text)}</pre>")),
+    ]
     return page.save(f"Design {file.name}", judged, sections, path)

@@ -11,7 +11,7 @@ import numpy as np
 from codesign_jax import codesign, files, types
 from codesign_jax.judge import sentences, verdict
 from codesign_jax.judge.sentences import Judged
-from codesign_jax.report import chosen, figures, landscape, markup, viewer
+from codesign_jax.report import charts, chosen, landscape, markup, viewer
 from codesign_jax.report.of_run import Run
 from codesign_jax.report.replay import Replay
 from codesign_jax.runs import SCENE_COST
@@ -25,17 +25,21 @@ def write(run: Run, grasp: tuple[Grasp, Replay] | None, path: Path) -> Path:
     """Writes the report of a run."""
     sections = [
         *(markup.paragraph(f"Warning: {note}.", "warning") for note in run.notes),
-        _summary(run),
-        chosen.design(run),
         _grasp(run, grasp),
+        chosen.endings(run),
+        chosen.fingers(run),
+        chosen.conditions(run),
+        chosen.design(run),
         markup.section(
-            "Cost",
+            "Search",
             markup.paragraph(_cost_note(run)),
-            figures.html(figures.cost_evolution(run.history.cost), "cost"),
+            charts.html(charts.cost_evolution(run.history.cost), "cost"),
+            markup.paragraph(_solved(run), "note"),
         ),
-        _parameters(run),
         _landscape(run),
+        _parameters(run),
         _failures(run),
+        _settings(run),
         _provenance(run),
     ]
     return save(f"Co-design run {run.folder.resolve().name}", run.judged, sections, path)
@@ -44,16 +48,31 @@ def write(run: Run, grasp: tuple[Grasp, Replay] | None, path: Path) -> Path:
 def save(title: str, judged: Judged, sections: list[str], path: Path) -> Path:
     """Writes a page whose head has the verdict."""
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="minutes")
-    head = f"<h1>{markup.text(title)}</h1>\n<p class='note'>codesign-jax, report of {now}</p>\n"
-    head += markup.paragraph(f"Verdict: {judged.headline}", "key")
+    head = f"<h1>{markup.text(title)}</h1>\n{_verdict(judged)}"
+    foot = markup.paragraph(f"codesign-jax, report of {now}", "note")
     files.make_folder_of(path)
     with files.atomically(path) as part:
-        body = head + "\n".join(sections)
-        part.write_text(viewer.page(title, body), encoding="utf-8")
+        body = "\n".join([head, *sections, foot])
+        part.write_text(viewer.page(title, body, viewer.web("report.js")), encoding="utf-8")
     return path
 
 
-def _summary(run: Run) -> str:
+def _verdict(judged: Judged) -> str:
+    """The verdict in its colour: its word, the share that is kept, and the sentence."""
+    counts = verdict.tally(judged.outcomes)
+    word = judged.verdict.word
+    kind = {"good": "good", verdict.OPEN: "open"}.get(word, "bad")
+    if counts.fault == counts.total:
+        word = "no verdict"
+        kind = "bad"
+    share = f"kept {counts.kept} of {counts.total}"
+    return (
+        f"<div class='verdict {kind}'><p><strong>{markup.text(word)}</strong> {share}</p>"
+        f"{markup.paragraph(f'Verdict: {judged.headline}')}</div>"
+    )
+
+
+def _settings(run: Run) -> str:
     scene = run.scene
     s = run.settings
     record = run.record
@@ -69,9 +88,8 @@ def _summary(run: Run) -> str:
         ("grasps", f"{record.done * s.particles * s.trials:,} ({sizes})"),
         ("seed", s.seed),
         ("converged", _converged(run)),
-        ("final particles", _solved(run)),
     ]
-    return markup.section("Summary", markup.table((), rows))
+    return markup.section("Settings", markup.table((), rows))
 
 
 def surroundings(scene: Scene) -> list[tuple[str, str]]:
@@ -98,12 +116,12 @@ def _converged(run: Run) -> str:
 
 def _solved(run: Run) -> str:
     if run.record.test is None:
-        return "not tested"
+        return "The final particles were not tested."
     test = run.record.test
     first = np.unique(np.asarray(run.record.state.particles), axis=0, return_index=True)[1]
     good = verdict.good(jax.tree.map(lambda v: np.asarray(v)[first], test))
     trials = f"{test.cost.shape[1]} trials of the final test"
-    return f"{good.sum()} of {good.size} are good in {trials}; copies count once"
+    return f"Of {good.size} final particles {good.sum()} are good in {trials}; copies count once."
 
 
 def _grasp(run: Run, grasp: tuple[Grasp, Replay] | None) -> str:
@@ -123,8 +141,8 @@ def _grasp(run: Run, grasp: tuple[Grasp, Replay] | None) -> str:
             "The two differ: contact is chaotic, and a batch of another size or another machine "
             "rounds differently."
         )
-        parts = [markup.paragraph(text, "warning"), *parts]
-    return markup.section("Best grasp", markup.paragraph(note), *parts)
+        parts = [*parts, markup.paragraph(text, "warning")]
+    return markup.section("Best grasp", *parts, markup.paragraph(note, "note"))
 
 
 def in_motion(scene: Scene, shown: Replay) -> list[str]:
@@ -132,19 +150,18 @@ def in_motion(scene: Scene, shown: Replay) -> list[str]:
     parts = [viewer.fragment(scene, shown)]
     if shown.trace is not None and (forces := shown.trace.forces) is not None:
         text = (
-            "Below: the fingers' normal forces on the object, and the palm's force. Largest depths "
-            f"in one another over this grasp: {sentences.depths(forces)}."
+            "Normal forces of the fingers on the object, and the palm's force; a click goes to "
+            f"that time. Largest depths in one another: {sentences.depths(forces)}."
         )
-        chart = figures.html(figures.grip(forces, scene), "grip")
-        parts += [markup.paragraph(text), chart]
+        parts += [charts.html(charts.grip(forces, scene), "grip"), markup.paragraph(text, "note")]
     return parts
 
 
 def _cost_note(run: Run) -> str:
     return (
         "A dot is a particle: the mean cost of its trials, 0 if it kept the object in all, "
-        f"{run.scene.cost.maximum:g} if it lost it at once in all. The dashed line is the paper's "
-        "threshold of convergence."
+        f"{run.scene.cost.maximum:g} if it lost it at once in all. The threshold of convergence is "
+        "the paper's. Drag across a chart to zoom, double-click to see all of it."
     )
 
 
@@ -153,8 +170,9 @@ def _parameters(run: Run) -> str:
         "Distribution of the particles over the episodes; an axis spans the parameter's range. "
         "A band that stays wide says that selection did not narrow the parameter."
     )
-    figure = figures.parameters(run.history, run.space, run.chosen.design)
-    return markup.section("Parameters", markup.paragraph(note), figures.html(figure, "parameters"))
+    small = charts.parameters(run.history, run.space, run.chosen.design)
+    shown = markup.paragraph(note), charts.grid(small, "parameters")
+    return markup.folded("Parameters over the episodes", *shown)
 
 
 def _landscape(run: Run) -> str:
@@ -168,12 +186,12 @@ def _landscape(run: Run) -> str:
             return ""
         words = words + "The whole landscape: "
         command = ["landscape", "--run", str(run.folder)]
-        figure = figures.designs(run.history, space, run.chosen.design, None)
+        figure = charts.designs(run.history, space, run.chosen.design, None)
     else:
         grey = f"the mean cost over {int(grid.trials)} trials a point, white where all are kept."
         if tuple(grid.names) == space.names:
             words += f"In grey {grey}"
-            figure = figures.designs(run.history, space, run.chosen.design, grid)
+            figure = charts.designs(run.history, space, run.chosen.design, grid)
         else:
             same = np.allclose(grid.design, run.chosen.design)
             around = "the chosen design" if same else "another design, which landscape.npz has"
@@ -181,8 +199,8 @@ def _landscape(run: Run) -> str:
             if grid.search:
                 others = "At each point a search chose the other parameters."
             words = f"In grey {grey} {others}"
-            figure = figures.landscape(grid)
-    section = markup.paragraph(words, "", command), figures.html(figure, "landscape")
+            figure = charts.landscape(grid)
+    section = markup.paragraph(words, "", command), charts.html(figure, "landscape")
     return markup.section("Landscape", *section)
 
 
@@ -204,10 +222,10 @@ def _failures(run: Run) -> str:
         (b.name, f"{n:,}", f"{100 * n / total:.2f} %", MEANINGS[b]) for b, n in counts.items() if n
     ]
     if not rows:
-        return markup.section("Failures by cause", markup.paragraph(note))
+        return markup.section("Failures of the simulation", markup.paragraph(note))
     table = markup.table(("status", "trials", "share", "meaning"), rows, (1, 2))
-    figure = figures.html(figures.failures(status), "failures")
-    return markup.section("Failures by cause", markup.paragraph(note), table, figure)
+    figure = charts.html(charts.failures(status), "failures")
+    return markup.section("Failures of the simulation", markup.paragraph(note), table, figure)
 
 
 def _provenance(run: Run) -> str:
@@ -225,7 +243,6 @@ def _provenance(run: Run) -> str:
     files_shown = {path.name: path.read_text(encoding="utf-8") for path in texts if path.exists()}
     files_shown["provenance.json"] = json.dumps(p, indent=2)
     details = [
-        f"<details><summary>{markup.text(name)}</summary><pre>{markup.text(text)}</pre></details>"
-        for name, text in files_shown.items()
+        markup.folded(name, f"<pre>{markup.text(text)}</pre>") for name, text in files_shown.items()
     ]
     return markup.section("Provenance", markup.table((), rows), *details)

@@ -4,7 +4,6 @@ No OpenGL is needed, so that a picture always exists and is the same everywhere.
 above beside the camera; what it does not reach is lit by the sky alone.
 """
 
-import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -104,7 +103,7 @@ def paint(
       camera: One that stays, or one for each picture.
     """
     start, *poses = bodies.poses(scene, grasp, np.concatenate([grasp.qpos[:1], qpos]))
-    body = _body(bodies.parts(_finer(scene), grasp), start)
+    body = _body(bodies.parts(bodies.finer(scene, _RINGS, _POINTS), grasp), start)
     cameras = [camera] * len(qpos) if isinstance(camera, Camera) else camera
     picture = None
     before = None
@@ -122,16 +121,6 @@ def still(parts: Sequence[Part], camera: Camera, size: tuple[int, int]) -> np.nd
     body = _body([*parts], world)
     body.checked[:] = np.nan
     return _picture(body, world, camera, size, table=True)
-
-
-def _finer(scene: Scene) -> Scene:
-    """The scene with a finer mesh of the same skin."""
-    d = scene.discretization
-    finer = {
-        "hull_rings": max(d.hull_rings, _RINGS),
-        "hull_points": max(d.hull_points, _POINTS),
-    }
-    return dataclasses.replace(scene, discretization=dataclasses.replace(d, **finer))
 
 
 def _body(parts: list[Part], start: np.ndarray) -> _Body:

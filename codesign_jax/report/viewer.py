@@ -9,6 +9,7 @@ import html
 import io
 import itertools
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,12 @@ from codesign_jax.scene import Scene
 
 _WEB = Path(__file__).parent / "web"
 _TABLE = 0.6  # half side of the table that is drawn [m]
+# The skin is drawn with at least so many rings of a link and points of a ring.
+_RINGS = 2
+_POINTS = 16
+_NEAR = 0.5  # distance of the strip's camera [m]
+_LEAST_FORCE = 1e-3
+"""Force [N] from which on a contact is shown."""
 
 _FRAGMENT = """
 <div class="replay" id="{name}">
@@ -34,12 +41,14 @@ _FRAGMENT = """
 <option value="0.5">0.5 x</option><option value="0.25">0.25 x</option>
 <option value="0.1">0.1 x</option>
 </select>
+<label hidden><input type="checkbox" class="forces"> forces</label>
+<label><input type="checkbox" class="turning"> turn</label>
 <button class="home" type="button">Reset view</button>
 </div>
 <div class="label"></div>
 </div>
 <p class="note turn">Drag to turn, scroll to zoom, shift-drag to move; click a phase to go there.
-A square of the table is 5 cm.</p>
+Forces: contact points, and the force of each finger on the object. A square of the table: 5 cm.</p>
 """
 _START = """<script>startReplay(document.getElementById("{name}"), {data});</script>
 """
@@ -55,8 +64,8 @@ _PAGE = """<!DOCTYPE html>
 
 
 def fragment(scene: Scene, grasp: Replay, name: str = "replay") -> str:
-    """HTML of a grasp, for a page that `page` makes."""
-    shown = data(scene, grasp) | {"strip": strip(scene, grasp)}
+    """HTML of a grasp, for a page that `page` makes; it plays and turns once it is seen."""
+    shown = data(scene, grasp) | {"strip": strip(scene, grasp), "turn": True}
     # "<" appears in no JSON but inside strings, where its escape means the same.
     text = json.dumps(shown).replace("<", "\\u003c")
     return element(name) + _START.format(name=html.escape(name), data=text)
@@ -69,7 +78,7 @@ def element(name: str) -> str:
 
 def page(title: str, body: str, *scripts: str) -> str:
     """A whole page."""
-    script = "\n".join([*scripts, web("replay.js")])
+    script = "\n".join([*scripts, web("charts.js"), web("replay.js")])
     return _PAGE.format(title=html.escape(title), style=web("style.css"), script=script, body=body)
 
 
@@ -94,7 +103,7 @@ def write(scene: Scene, grasp: Replay, path: Path, *, title: str, text: list[str
 def data(scene: Scene, grasp: Replay) -> dict[str, Any]:
     """What web/replay.js reads of a grasp, of JSON's types."""
     motion = bodies.motion(scene, grasp)
-    parts = bodies.parts(scene, grasp)
+    parts = shown_parts(scene, grasp)
     frames, count = motion.pose.shape[:2]
     return {
         "parts": [_part(part) for part in parts],
@@ -103,6 +112,7 @@ def data(scene: Scene, grasp: Replay) -> dict[str, Any]:
         "bodies": count,
         "rate": motion.rate,
         "object": int(parts[-1].body[0, 0]),
+        "contacts": _contacts(scene, grasp, motion.rate, [part.name for part in parts]),
         "phases": phases(scene),
         "still": scene.phase_ends["lift"],
         "table": _TABLE,
@@ -110,8 +120,42 @@ def data(scene: Scene, grasp: Replay) -> dict[str, Any]:
     }
 
 
+def shown_parts(scene: Scene, grasp: Replay) -> list[bodies.Part]:
+    """The parts that the viewer shows, their skin's mesh fine enough for the eye."""
+    return bodies.parts(bodies.finer(scene, _RINGS, _POINTS), grasp)
+
+
+def _contacts(
+    scene: Scene, grasp: Replay, rate: float, names: Sequence[str]
+) -> dict[str, str] | None:
+    """What presses on the object in each frame, see web/replay.js; None where nobody recorded it.
+
+    Args:
+      rate: Frames of a second.
+      names: Names of the parts.
+    """
+    touch = grasp.trace and grasp.trace.forces and grasp.trace.forces.touch
+    if not touch:
+        return None
+    every = round(1 / (rate * scene.discretization.timestep))
+    numbers = {"palm": [names.index("palm")], "finger": [*range(scene.num_fingers)]}
+    sets = []
+    for kind, contacts in touch.items():
+        force = contacts.tangential - np.asarray(contacts.pressing)[..., None] * contacts.normal
+        rows = np.concatenate([contacts.point, force], -1)[::every]
+        rows = rows.reshape(len(rows), len(numbers[kind]), -1, 6)
+        part = np.broadcast_to(np.array(numbers[kind])[:, None, None], (*rows.shape[:-1], 1))
+        sets.append(np.concatenate([part, rows], -1).reshape(len(rows), -1, 7))
+    every_contact = np.concatenate(sets, 1)
+    acts = np.linalg.norm(every_contact[..., 4:], axis=-1) > _LEAST_FORCE
+    return {
+        "count": _encode(acts.sum(1), np.uint16),
+        "values": _encode(every_contact[acts], np.float32),
+    }
+
+
 def strip(scene: Scene, grasp: Replay) -> list[tuple[str, str]]:
-    """Pictures of a grasp at the ends of its phases: captions, and PNG files in base64."""
+    """Pictures of a grasp at the ends of its phases: captions, and WebP files in base64."""
     ends = [("start", 0.0), *phases(scene)]
     spans = [
         (later - first, k) for k, ((_, first), (_, later)) in enumerate(itertools.pairwise(ends))
@@ -122,10 +166,11 @@ def strip(scene: Scene, grasp: Replay) -> list[tuple[str, str]]:
     moments.insert(k + 1, amid)
     times = np.array([time for _, time in moments])
     captioned = []
-    pictures = animation.frames(scene, grasp, times, size=(240, 240))
+    camera = animation.following(scene, grasp, times, animation.CAMERA._replace(distance=_NEAR))
+    pictures = animation.frames(scene, grasp, times, size=(240, 240), camera=camera)
     for (caption, time), frame in zip(moments, pictures, strict=True):
         file = io.BytesIO()
-        Image.fromarray(frame).quantize(64).save(file, "png", optimize=True)
+        Image.fromarray(frame).save(file, "webp", quality=80)
         picture = base64.b64encode(file.getvalue()).decode()
         captioned.append((f"{caption}, {time:g} s", picture))
     return captioned

@@ -4,9 +4,9 @@ import contextlib
 import dataclasses
 import functools
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from codesign_jax.commands.flags import Studio as Options
 from codesign_jax.engines import Engine
 from codesign_jax.engines.base import recording, tells_forces
 from codesign_jax.judge.cases import Case
+from codesign_jax.judge.sentences import Judged
 from codesign_jax.report import animation
 from codesign_jax.runs import reference, selection
 from codesign_jax.scene import Scene, library
@@ -51,8 +52,17 @@ class Bench:
     def __init__(self, case: Case) -> None:
         self.case = case
         self.engine = case.make_engine()
-        self.recorder = recording(self.engine) if tells_forces(self.engine) else None
+        self.recorder = recording(self.engine, touch=True) if tells_forces(self.engine) else None
         self.objects = len(case.scene.objects.object)
+        self.stages = ("the grasp", *(["its forces"] if self.recorder else []), "the verdict")
+        self._compiled: set[str] = set()
+
+    def stage(self, name: str) -> dict[str, Any] | None:
+        """What is compiled now if a stage is simulated; None if it was simulated before."""
+        if name in self._compiled:
+            return None
+        self._compiled.add(name)
+        return {"name": name, "number": self.stages.index(name) + 1, "of": len(self.stages)}
 
     @functools.cached_property
     def trials(self) -> Trial:
@@ -84,13 +94,18 @@ class Bench:
         outcomes = _outcomes(self.case.scene, self.engine, self.params(design), trials)
         return jax.tree.map(np.asarray, outcomes)
 
-    def warm(self, design: np.ndarray) -> None:
-        """Compiles the programs that a moved slider needs."""
+    def warm(self, design: np.ndarray, tell: Callable[[dict[str, Any] | None], None]) -> None:
+        """Compiles what a moved slider needs; tells each stage, and None at the end."""
         view = View(design, "", 0, None, 0, False, None)
-        self.grasp(view)
-        if self.recorder:
-            self.grasp(view, self.recorder)
-        self.outcomes(design, 0)
+        work = {
+            "the grasp": lambda: self.grasp(view),
+            "its forces": lambda: self.grasp(view, self.recorder),
+            "the verdict": lambda: self.outcomes(design, 0),
+        }
+        for name in self.stages:
+            tell(self.stage(name))
+            work[name]()
+        tell(None)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -130,19 +145,25 @@ class Desk:
         return self.benches[accuracy]
 
     @functools.cached_property
-    def verdict(self) -> str:
-        """The verdict of the run on its recommended design, with its accuracy; empty without a run.
+    def judged(self) -> Judged | None:
+        """The trials that judge the run's recommended design; None without a run.
 
         A page says what it simulates itself: other trials, at the accuracy that is chosen there.
         """
         folder = self.options.run_folder
         if folder is None or self.record is None:
-            return ""
+            return None
         scene, settings = runs.read_run(folder)
         kept = reference.kept(folder, scene, settings)
         chosen = selection.choose(scene, self.record)
-        judged = kept.fresh or chosen.judged(scene, kept.stress)
-        return f"The run's verdict on its recommended design: {judged.headline}"
+        return kept.fresh or chosen.judged(scene, kept.stress)
+
+    @property
+    def accuracy(self) -> str:
+        """The scene's own accuracy in words, by the name of the one that it equals."""
+        scene = self.case.scene
+        same = [name for name in self.accuracies if name and with_accuracy(scene, name) == scene]
+        return f"{same[0]} (the scene's)" if same else "the scene's own"
 
     def flags(self, accuracy: str) -> list[str]:
         """Flags that name to another command what a design's file does not."""

@@ -21,7 +21,7 @@ from codesign_jax.commands import common
 from codesign_jax.commands.flags import Studio as Options
 from codesign_jax.interrupts import interruptible
 from codesign_jax.judge.verdict import VERDICTS
-from codesign_jax.report import viewer
+from codesign_jax.report import bodies, viewer
 from codesign_jax.runs import selection, tables
 from codesign_jax.runs.progress import Busy
 from codesign_jax.scene.schema import InputError
@@ -98,7 +98,8 @@ class Studio:
 
     def begin(self) -> None:
         """Compiles what a moved slider needs; from then on tabs get what they ask for."""
-        interruptible(self.desk.bench("").warm, self.desk.case.design)
+        warm = self.desk.bench("").warm
+        interruptible(warm, self.desk.case.design, lambda stage: self.tell("stage", stage))
         self._begun = True
         threading.Thread(target=self._work, daemon=True).start()
 
@@ -160,6 +161,9 @@ def about(desk: Desk) -> dict[str, Any]:
     per_finger, others = tables.by_finger(space)
     fingers = range(scene.num_fingers if per_finger else 0)
     groups = {f"Finger {f}": {k[f]: name for name, k in per_finger.items()} for f in fingers}
+    parts = {
+        f"Finger {f}": {"part": f"finger {f}", "color": bodies.finger_color(f)} for f in fingers
+    }
     for title, morphology in (("Hand", True), ("Control", False)):
         groups[title] = {k: space.names[k] for k in others if space.is_morphology[k] == morphology}
     low, high = (space.in_units(v) for v in (space.low, space.high))
@@ -178,16 +182,25 @@ def about(desk: Desk) -> dict[str, Any]:
     if desk.record:
         chosen = selection.choose(scene, desk.record)
         particles = desk.record.history.cost.shape[1]
-        run = {"episodes": desk.record.done, "particles": particles, "verdict": desk.verdict}
+        run = {"episodes": desk.record.done, "particles": particles}
+        if judged := desk.judged:
+            words = f"The run's verdict on its recommended design: {judged.headline}"
+            run |= {"verdict": words, "word": judged.verdict.word}
         run["chosen"] = [chosen.episode + 1, chosen.row]
     source = f"run {desk.options.run_folder}" if run else f"hand {scene.hand.name}"
     return {
         "title": f"{source}, objects {scene.objects.name}, design space {desk.file.preset}",
         "parameters": parameters,
-        "groups": [{"title": t, "members": [*members]} for t, members in groups.items() if members],
+        "groups": [
+            {"title": t, "members": [*members]} | parts.get(t, {})
+            for t, members in groups.items()
+            if members
+        ],
+        "colors": [bodies.finger_color(f) for f in range(scene.num_fingers)],
         "design": common.shortest(space, desk.case.design),
         "objects": [shape.name for shape in scene.objects.object],
         "accuracies": desk.accuracies,
+        "accuracy": desk.accuracy,
         "counts": COUNTS,
         "ends": VERDICTS,
         "worst": scene.cost.maximum,

@@ -198,10 +198,12 @@ class Tab:
         self.send("pictures", viewer.strip(shown.bench.case.scene, shown.grasp))
 
     def _tell_forces(self, shown: ShownGrasp) -> None:
+        self._compiling(shown.bench, "its forces")
         self._shown = shown._replace(grasp=shown.bench.grasp(shown.view, shown.bench.recorder))
         self.send("grasp", _grasp_message(self._shown))
 
     def _tell_trials(self, shown: ShownGrasp) -> None:
+        self._compiling(shown.bench, "the verdict")
         remaining = shown.view.trials - self._total
         outcomes = shown.bench.outcomes(shown.view.design, self._total)
         self._outcomes.append(jax.tree.map(lambda v: v[:remaining], outcomes))
@@ -215,9 +217,11 @@ class Tab:
     def _total(self) -> int:
         return sum(len(part.cost) for part in self._outcomes)
 
+    def _compiling(self, bench: Bench, name: str) -> None:
+        """Says which program of an accuracy is compiled by what follows, if one is."""
+        self.send("stage", bench.stage(name))
+
     def _show(self, view: View) -> None:
-        if view.accuracy not in self._desk.benches:
-            self.send("state", "compiling for this accuracy: up to a minute the first time ...")
         bench = self._desk.bench(view.accuracy)
         before = self._shown
         space = bench.case.space.of_table
@@ -229,6 +233,7 @@ class Tab:
         if before and (before.view.shape, before.view.noise) == (view.shape, view.noise):
             shown = before._replace(view=view)  # a slider was let go where it has been seen
         else:
+            self._compiling(bench, "the grasp")
             shown = ShownGrasp(view, bench, bench.grasp(view))
         self._shown = shown
         self._looked = False
@@ -242,18 +247,23 @@ class Tab:
         scene = shown.bench.case.scene
         ends: list[int] = []
         sentence = "the verdict comes ..."
+        word = ""
         cost = None
         if self._outcomes:
             outcomes = jax.tree.map(lambda *v: np.concatenate(v)[: view.trials], *self._outcomes)
             ends = verdict.verdicts(outcomes).tolist()
-            sentence = str(sentences.Judged(scene, outcomes, grasps="grasps"))
+            judged = sentences.Judged(scene, outcomes, grasps="grasps")
+            sentence = str(judged)
+            word = judged.verdict.word
+            self.send("stage", None)
             if causes := str(verdict.losses(scene, outcomes)):
                 sentence += f". Lost: {causes}"
             if not failed(outcomes.status).all():
                 cost = float(codesign.particle_cost(scene, outcomes))
         design = common.shortest(shown.bench.case.space, view.design)
         message = {"number": view.number, "total": view.trials, "design": design}
-        self.send("verdict", message | {"ends": ends, "sentence": sentence, "cost": cost})
+        said = {"sentence": sentence, "word": word}
+        self.send("verdict", message | said | {"ends": ends, "cost": cost})
 
     # ---- a search from here
 

@@ -9,12 +9,7 @@ function startStudio(root) {
     element.append(...inside);
     return element;
   };
-  const svg = (tag, attributes, text = "") => {
-    const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
-    for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
-    element.textContent = text;
-    return element;
-  };
+  const kinds = { good: "good", "not good": "bad" };  // classes of verdicts; of all others: open
   let socket, about, grasp, asked = 0, rows = [], tried = [], running = false;
 
   // ---- the connection, which a sleeping computer or a tunnel loses; the design stays on the page
@@ -62,6 +57,7 @@ function startStudio(root) {
     const noise = find("noise").value;
     asked += 1;
     takes.state("simulating ...");
+    find("verdict").classList.add("stale");
     send({ show: { number: asked, resting, design: rows.map((row) => row.value),
       object: Number(find("object").value), noise: noise === "" ? null : Number(noise),
       accuracy: find("accuracy").value, trials: Number(find("count").value),
@@ -92,10 +88,18 @@ function startStudio(root) {
     row.number.value = Number(value.toPrecision(4));
   }
 
-  // ---- sliders, a group for each finger and for the rest
+  // ---- sliders, a group for each finger and for the rest, in the colour that the finger has everywhere
+  const FEW = 12;  // parameters up to which all groups begin open
   function addSliders() {
-    for (const { title, members } of about.groups) {
-      find("parameters").append(make("h2", { textContent: title }));
+    about.groups.forEach(({ title, members, part, color }, first) => {
+      const group = make("details", { className: "group", open: !first || about.parameters.length <= FEW },
+        make("summary", { textContent: title }));
+      if (color) group.style.setProperty("--part", color);
+      if (part) {
+        group.dataset.part = part;
+        group.addEventListener("pointerenter", () => stage.replay && stage.replay.highlight(part));
+        group.addEventListener("pointerleave", () => stage.replay && stage.replay.highlight(null));
+      }
       for (const k of members) {
         const { name, label, unit, low, high, step } = about.parameters[k];
         const number = make("input", { type: "number", min: low, max: high, step: "any", ariaLabel: `${name} [${unit}]` });
@@ -107,10 +111,20 @@ function startStudio(root) {
         slider.addEventListener("change", () => show());
         number.addEventListener("change", () => { if (number.reportValidity()) { set(row, Number(number.value)); show(); } });
         slider.title = `${low} to ${high} ${unit}`;
-        find("parameters").append(make("label", { className: "parameter" }, make("span", { textContent: label }), slider, number, words));
+        group.append(make("label", { className: "parameter" }, make("span", { textContent: label }), slider, number, words));
       }
-    }
+      find("parameters").append(group);
+    });
   }
+  stage.addEventListener("pick", ({ detail }) => {
+    for (const group of root.querySelectorAll(".group")) {
+      group.classList.toggle("picked", group.dataset.part === detail);
+      if (group.dataset.part !== detail) continue;
+      group.open = true;
+      group.scrollIntoView({ block: "nearest" });
+    }
+    stage.replay.highlight(find("picked") ? detail : null);
+  });
   const option = (value, textContent) => make("option", { value, textContent });
   function noises() {
     const object = Number(find("object").value), objects = about.objects.length;
@@ -131,11 +145,12 @@ function startStudio(root) {
     about = message;
     find("what").textContent = about.title;
     find("object").append(...about.objects.map((name, k) => option(k, name)));
-    find("accuracy").append(...about.accuracies.map((name) => option(name, name || "the scene's")));
+    find("accuracy").append(...about.accuracies.map((name) => option(name, name || about.accuracy)));
     find("count").append(...about.counts.map((count) => option(count, count)));
     for (const element of root.querySelectorAll(".of-run")) element.hidden = !about.run;
     if (about.run) {
       find("of-run-verdict").textContent = about.run.verdict;
+      find("of-run-verdict").classList.add(kinds[about.run.word] || "open");
       find("of-run-verdict").hidden = false;
       find("episode").max = about.run.episodes;
       find("particle").max = about.run.particles - 1;
@@ -148,80 +163,43 @@ function startStudio(root) {
     show();
   }
 
-  // ---- charts
-  const left = 34, bottom = 92;
-  const drawn = (name, ...parts) => {
-    find(name).setAttribute("viewBox", `0 0 ${find(name).clientWidth} 120`);
-    find(name).replaceChildren(...parts);
-  };
-  const right = (name) => find(name).clientWidth - 4;
-  const ending = () => (grasp.replay.frames - 1) / grasp.replay.rate;  // of the grasp [s]
-  const across = (name, time) => left + (right(name) - left) * time / ending();
-  const level = (name, y, text) => [svg("line", { x1: left, x2: right(name), y1: y, y2: y, stroke: "#e4e9ef" }),
-    svg("text", { x: left - 6, y: y + 4, "text-anchor": "end" }, text)];
-  // Lines over the time of the grasp, [values, colour] each, with its phases and a cursor.
-  function plotLines(name, lines, least, dashed = null) {
-    const top = Math.max(least, ...lines.flatMap(([values]) => values)), parts = [];
-    const up = (value) => bottom - 86 * Math.max(value, 0) / top;
-    const step = [1, 2, 5, 10, 20, 50, 100, 200, 500].find((v) => top / v <= 4) || 1000;
-    for (let v = 0; v <= top; v += step) parts.push(...level(name, up(v), v));
-    let from = 0;
-    for (const [phase, end] of grasp.replay.phases) {
-      parts.push(svg("line", { x1: across(name, end), x2: across(name, end), y1: 6, y2: bottom, stroke: "#d7dde4" }),
-        svg("text", { class: "phase", x: across(name, (from + end) / 2), "text-anchor": "middle" }, phase));
-      from = end;
-    }
-    if (dashed !== null) parts.push(svg("line", { x1: left, x2: right(name), y1: up(dashed), y2: up(dashed), stroke: "#cf4b3f", "stroke-dasharray": "4 3" }));
-    for (const [values, stroke] of lines)
-      parts.push(svg("polyline", { fill: "none", stroke, "stroke-width": 1.6,
-        points: values.map((v, k) => `${across(name, k / grasp.replay.rate).toFixed(1)},${up(v).toFixed(1)}`).join(" ") }));
-    if (stage.replay) parts.push(svg("line", { class: "cursor", x1: left, x2: left, y1: 6, y2: bottom, stroke: "#1d2733" }));
-    drawn(name, ...parts);
-    placePhases(name);
+  // ---- charts over the time of the grasp, with its phases, and of the designs tried
+  const charts = {};
+  function plot(name, spec) {
+    if (charts[name]) charts[name].load(spec);
+    else charts[name] = startChart(find(name), spec);
   }
-  // Names of phases within the chart, each in the first of two lines that has room for it.
-  function placePhases(name) {
-    const ends = [-Infinity, -Infinity], gap = 5;
-    for (const text of find(name).querySelectorAll(".phase")) {
-      const half = text.getComputedTextLength() / 2;
-      const x = Math.min(Math.max(Number(text.getAttribute("x")), left + half), right(name) - half);
-      const line = ends.findIndex((end) => end + gap <= x - half);
-      if (line < 0) {
-        text.remove();
-        continue;
-      }
-      ends[line] = x + half;
-      text.setAttribute("x", x);
-      text.setAttribute("y", 104 + 12 * line);
-    }
+  function plotLines(name, layers, least, lines = []) {
+    const { rate, phases, frames } = grasp.replay, x = Array.from({ length: frames }, (_, k) => k / rate);
+    const top = Math.max(least, ...layers.flatMap(({ y }) => y));
+    plot(name, { x: { low: 0, high: (frames - 1) / rate }, y: { low: 0, high: 1.04 * top }, marks: phases, lines, height: 130,
+      layers: layers.map((layer) => ({ kind: "line", x, ...layer })) });
   }
-  const colors = ["#2f6fab", "#c96a10", "#3d9a5f", "#8a63b3", "#cf4b3f", "#5a6776", "#b59f00", "#00909e"];
   function plotGrasp() {
     const { distance, height, lost, grip } = grasp.series;
     if (grip) find("gripping").hidden = false;  // before the widths of the others are asked for
-    plotLines("distance", [[height, "#c96a10"], [distance, "#2f6fab"]], 250, lost);
+    plotLines("distance", [{ name: "object above the table", color: "#c96a10", y: height },
+      { name: "object to hand", color: "#2f6fab", y: distance }], 250, [{ y: lost, color: "#cf4b3f", text: "farther is lost" }]);
     find("grip").style.opacity = grip ? 1 : 0.3;  // of the grasp before, while a slider moves
-    if (!grip) return;
-    plotLines("grip", grip.map((values, f) => [values, colors[f % colors.length]]), 2);
-    find("fingers").replaceChildren(...grip.map((_, f) => make("span", { textContent: ` ${f}`, style: `color: ${colors[f % colors.length]}` })));
+    if (grip) plotLines("grip", grip.map((y, f) => ({ name: `finger ${f}`, color: about.colors[f], y })), 2);
   }
   function plotTried() {
-    const last = tried.slice(-40), up = (cost) => bottom - 82 * Math.min(cost / about.worst, 1);
-    const parts = [0, about.worst / 2, about.worst].flatMap((cost) => level("tried", up(cost), cost));
-    last.forEach((one, k) => {
-      const x = left + 8 + (right("tried") - left - 16) * k / Math.max(last.length - 1, 12);
-      const dot = svg("circle", { cx: x, cy: up(one.cost), r: 4.5, style: "cursor: pointer", fill: one === tried.at(-1) ? "#1d2733" : "#2f6fab" });
-      dot.append(svg("title", {}, `${one.sentence}; mean cost ${one.cost.toFixed(2)}`));
-      dot.addEventListener("click", () => { one.design.forEach((value, i) => set(rows[i], value)); show(); });
-      parts.push(dot);
-    });
-    drawn("tried", ...parts);
+    const last = tried.slice(-40), x = last.map((_, k) => k), worst = about.worst;
+    plot("tried", { x: { low: -0.5, high: Math.max(last.length - 0.5, 12), whole: true }, y: { low: 0, high: 1.05 * worst }, height: 130,
+      layers: [{ kind: "dots", x, y: last.map(({ cost }) => Math.min(cost, worst)), radius: 4.5,
+        color: last.map((one) => (one === tried.at(-1) ? "#1d2733" : "#2f6fab")),
+        title: last.map(({ sentence, cost }) => `mean cost ${cost.toFixed(2)}: ${sentence.split(" fresh")[0].slice(0, 40)}`) }] });
   }
-  new ResizeObserver(() => { if (grasp) { plotGrasp(); plotTried(); } }).observe(find("charts"));
-  stage.addEventListener("time", (event) => {
-    for (const name of ["distance", "grip"])
-      for (const cursor of find(name).querySelectorAll(".cursor"))
-        for (const end of ["x1", "x2"]) cursor.setAttribute(end, across(name, event.detail));
+  find("tried").addEventListener("at", ({ detail }) => {
+    const one = tried.slice(-40)[Math.max(Math.round(detail), 0)];
+    if (!one) return;
+    one.design.forEach((value, i) => set(rows[i], value));
+    show();
+  });
+  for (const name of ["distance", "grip"])
+    find(name).addEventListener("at", ({ detail }) => { if (stage.replay) { stage.replay.pause(); stage.replay.seek(detail); } });
+  stage.addEventListener("time", ({ detail }) => {
+    for (const name of ["distance", "grip"]) if (charts[name]) charts[name].cursor(detail);
   });
 
   // ---- what comes
@@ -236,7 +214,7 @@ function startStudio(root) {
     if (grasp.number === null || grasp.number === asked) {  // else a slider has moved on
       grasp.design.forEach((value, k) => set(rows[k], value));
       if (grasp.number === null) keep();
-      else takes.state("");
+      else if (!find("verdict").classList.contains("stale")) takes.state("");
     }
     rows.forEach((row, k) => {
       const limit = grasp.limits[k];
@@ -248,9 +226,15 @@ function startStudio(root) {
     find("warnings").replaceChildren(...grasp.warnings.map((textContent) => make("li", { textContent })));
     plotGrasp();
   }
-  function judged({ number, ends, total, sentence, cost, design }) {
+  function judged({ number, ends, total, sentence, word, cost, design }) {
     if (number !== null && number !== asked) return;
-    find("verdict").textContent = sentence;
+    const complete = ends.length === total;
+    if (complete || !find("verdict").textContent) {
+      find("verdict").textContent = sentence;
+      find("verdict").className = `verdict ${kinds[word] || "open"}`;
+    }
+    find("verdict").classList.toggle("stale", !complete);  // that of the design before, until the new one is there
+    if (number !== null) takes.state(complete ? "" : ends.length ? `so far: ${sentence}` : "the verdict comes ...");
     find("trials").replaceChildren(...Array.from({ length: total }, (_, k) => {
       const object = k % about.objects.length, end = about.ends[ends[k]] || "";
       const dot = make("button", { type: "button", className: end, title: `trial ${k}, ${about.objects[object]}: ${(end || "to come").replace("_", " ")}` });
@@ -282,8 +266,16 @@ function startStudio(root) {
       running = text.endsWith("\n...");  // a command, one at a time
       enable();
     },
+    stage: (step) => {
+      find("compiling").hidden = !step;
+      if (!step) return;
+      find("compiling").max = step.of;
+      find("compiling").value = step.number - 0.5;
+      takes.state(`compiling ${step.number} of ${step.of}: ${step.name}; up to a minute each the first time ...`);
+    },
     improving: (on) => { find("improve").textContent = on ? "Stop improving" : "Improve"; },
     error: (text) => {
+      takes.stage(null);
       find("error").textContent = text;
       find("error").hidden = false;
       takes.state("");

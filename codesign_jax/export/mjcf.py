@@ -104,6 +104,7 @@ _NAMED: dict[str, tuple[Callable[[mujoco.MjModel], Callable], dict[str, str]]] =
         {"stiffness": "stiffness", "damping": "damping", "armature": "armature"},
     ),
     "geom": (lambda m: m.geom, {"size": "size", "pos": "pos", "quat": "quat"}),
+    "camera": (lambda m: m.camera, {"pos": "pos", "quat": "quat"}),
     "general": (lambda m: m.actuator, {"gainprm": "gainprm", "biasprm": "biasprm"}),
     "key": (lambda m: m.key, {"time": "time", "qpos": "qpos", "qvel": "qvel", "ctrl": "ctrl"}),
     "numeric": (lambda m: m.numeric, {"data": "data"}),

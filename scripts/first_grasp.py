@@ -10,6 +10,7 @@ the processor time of all threads, which other processes disturb less, and where
 
 import argparse
 import collections
+import compileall
 import json
 import os
 import subprocess
@@ -33,6 +34,11 @@ STAGES = {
 """Functions whose time is told, by what they do; one that a checkout lacks has none."""
 
 
+IGNORED = ("JAX_COMPILATION_CACHE_DIR", "PYTHONDONTWRITEBYTECODE")
+"""Environment variables that no user has: programs elsewhere, and sources compiled at each start,
+which takes seconds."""
+
+
 def worker() -> None:
     """The process that is timed; prints seconds of processor and wall by stage as JSON."""
     begun = float(os.environ["FIRST_GRASP_BEGUN"])
@@ -53,6 +59,9 @@ def worker() -> None:
     task = Task(grasping, space, trials=3)
     optimizer = codesign.make_filter(space)
     spent["imports, scene"] = time.process_time()
+    if "--imports" in sys.argv:
+        print(json.dumps({"seconds": spent}))
+        return
     state = optimizer.init(jax.random.key(0), space.from_units([130.0, 150.0]), num_particles=10)
     state, info = task.episode(optimizer, state)
     costs = np.asarray(info.outcomes.cost)
@@ -83,12 +92,12 @@ def _time(stage: str, module: str, name: str, spent: dict, calls: dict) -> None:
     setattr(home, name, timed)
 
 
-def measured(source: Path, caches: Path) -> dict[str, Any]:
+def measured(source: Path, caches: Path, *flags: str) -> dict[str, Any]:
     """What a worker prints with the package of a checkout and caches below a folder."""
-    environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    environment = {k: v for k, v in os.environ.items() if k not in IGNORED}
     environment |= {"PYTHONPATH": str(source), "XDG_CACHE_HOME": str(caches)}
     environment["FIRST_GRASP_BEGUN"] = str(time.time())
-    command = [sys.executable, str(Path(__file__).resolve()), "--worker"]
+    command = [sys.executable, str(Path(__file__).resolve()), "--worker", *flags]
     done = subprocess.run(command, cwd=source, env=environment, stdout=subprocess.PIPE, check=True)
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -96,6 +105,10 @@ def measured(source: Path, caches: Path) -> dict[str, Any]:
 def compare(sources: dict[str, Path], pairs: int) -> dict[str, dict[str, list[dict[str, Any]]]]:
     """Measurements by checkout and by `cold` or `warm`, in turns."""
     every = {name: {"cold": [], "warm": []} for name in sources}
+    for source in sources.values():  # an installed package has its bytecode, and so have others
+        compileall.compile_dir(source / "codesign_jax", quiet=1)
+        with tempfile.TemporaryDirectory() as caches:
+            measured(source, Path(caches), "--imports")
     for _ in range(pairs):
         for name, source in sources.items():
             with tempfile.TemporaryDirectory() as caches:
@@ -140,7 +153,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["--worker"]:
+    if sys.argv[1:2] == ["--worker"]:
         worker()
     else:
         sys.exit(main())

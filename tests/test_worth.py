@@ -1,7 +1,5 @@
 """Hands that lack fingers: as data, as another hand, and what each finger is worth."""
 
-import itertools
-
 import jax
 import numpy as np
 import pytest
@@ -189,11 +187,8 @@ def test_conditions_are_those_of_the_stress_test():
     assert names == [stress.AS_IT_IS, "objects of 200 g", "friction 0.4 on the hand"]
 
 
-def test_the_margin_is_reached_by_the_first_look():
-    """Else no hand could be no worse after it; and a look less would not do."""
-    differences = {n: worth.statistics.paired(n, 0, 0, n).low for n in worth.LOOKS}
-    assert all(low >= -worth.MARGIN for low in differences.values())
-    assert worth.statistics.paired(worth.SCREENED, 0, 0, worth.SCREENED).low < -worth.MARGIN
-    grams = [verdict.WANTED, verdict.POOR]
-    assert worth.MARGIN == 2 * round(grams[0] - grams[1], 9)
-    assert [*itertools.pairwise(worth.LOOKS)] == [(36, 72)]
+def test_the_margin_is_reached_by_so_many_trials():
+    """Else no hand could be no worse after them; and a first look would not do."""
+    low = {n: worth.statistics.paired(n, 0, 0, n).low for n in (worth.SCREENED, worth.DECISIVE)}
+    assert low[worth.SCREENED] < -worth.MARGIN <= low[worth.DECISIVE]
+    assert worth.MARGIN == 2 * round(verdict.WANTED - verdict.POOR, 9)

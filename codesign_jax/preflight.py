@@ -120,7 +120,7 @@ def warnings(scene: Scene, designs: Params, names: list[str]) -> list[str]:
     doubts = _scene_warnings(scene)
     each = [jax.tree.map(operator.itemgetter(i), designs) for i in range(len(names))]
     for design, name in zip(each, names, strict=True):
-        doubts += _reach(scene, design, name)
+        doubts += _reach(scene, design, name) + _twists(scene, design, name)
     low = [text for design in each for text in low_starts(scene, design)]
     return doubts + low[:1] + _stiffness(scene, each)
 
@@ -284,6 +284,18 @@ def why_invalid(scene: Scene, design: Params, trial: Trial) -> list[str]:
 def _depth_by_pair(scene: Scene, design: Params, trial: Trial) -> dict[str, jax.Array]:
     fields = jax.tree.map(lambda v: v[None], model.model_fields(scene, design, trial))
     return depth_by_pair(scene.structure, fields)
+
+
+def _twists(scene: Scene, design: Params, name: str) -> list[str]:
+    """A warning of fingers whose sections are unstable in twist, where their law has that."""
+    if scene.hand.section.law == "chamber":
+        return []
+    return [
+        f"{name}: finger {i} twists by itself where it is held straight at "
+        f"{float(design.pressure[i]) / 1e3:.0f} kPa: thicker walls, less pressure or a thread that "
+        "is wound there and back keep it from that"
+        for i in np.flatnonzero(morphology.twists_by_itself(scene.hand, design))
+    ]
 
 
 def _stiffness(scene: Scene, designs: list[Params]) -> list[str]:

@@ -113,6 +113,30 @@ def test_a_lowered_pressure_bends_the_free_finger_by_the_limit(law):
     np.testing.assert_array_equal(legal[:, others], designs[:, others])
 
 
+def test_a_section_by_elements_bends_by_the_limit_and_does_not_twist_by_itself():
+    """By `free_bends`, which halves intervals of the bend and not of the pressure."""
+    law = {"hand.section.law": "elements", "hand.section.winding": "single"}
+    limits = {f"limits.{n}": v for n, v in {**UNLIMITED, "free_bend": 90.0}.items()}
+    made = scene.load("paper", overrides=limits | law)
+    space = parameters.design_space(made.hand, "23d")
+    designs = drawn(TABLE, 60)
+    pressures = columns("pressure")
+    legal = projected(space, designs)
+    lowered = legal[:, pressures] < designs[:, pressures] * (1 - 1e-5)
+    bends = []
+    straight = []
+    for before, after in zip(each_params(space, designs), each_params(space, legal), strict=True):
+        bends.append(np.degrees(morphology.free_bends(made.hand, after)))
+        assert not morphology.twists_by_itself(made.hand, after).any()
+        straight.append(morphology.twists_by_itself(made.hand, before))
+    bends = np.array(bends)
+    # A pressure of single precision bends a thin finger by some 1e-5 more or less.
+    assert lowered.mean() > 0.5 and (bends <= 90 * (1 + 1e-4)).all()
+    by_bend = lowered & ~np.array(straight)
+    np.testing.assert_allclose(bends[by_bend], 90, rtol=2e-4)
+    assert np.array(straight).any()
+
+
 def test_a_lowered_pressure_strains_the_wall_by_the_limit_less_the_margin():
     """Strain is curvature times height; half the margin's pressure is half the limit's."""
     _, space = limited(strain=0.5)

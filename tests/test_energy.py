@@ -10,7 +10,7 @@ import pytest
 
 from codesign_jax import model
 from codesign_jax.engines.structured.laws import inertia
-from codesign_jax.scene import beams
+from codesign_jax.scene import beams, section_numbers
 from scripts.shared import energy
 from tests.helpers import grasps
 from tests.helpers.planted_faults import Fault, planted, simulate
@@ -111,6 +111,31 @@ def test_sound_worlds_gain_nothing(audited):
 @pytest.mark.parametrize("name", SOURCES)
 def test_a_source_of_energy_is_seen(audited, name):
     assert audited[name] > 10 * BOUND, audited
+
+
+def test_moments_of_a_section_are_the_slopes_of_its_energy():
+    """By JAX, with a thread that is wound one way: slack and taut, bent, twisted and sideways."""
+    with jax.enable_x64(True):
+        the_scene = grasps.pinch(section__law="elements", effects__neo_hookean=True)
+        n = section_numbers.numbers(
+            np.array(20e-3),
+            np.array(4e-3),
+            np.array(24e-3),
+            shear_modulus=88e3,
+            length=0.1,
+            thread_depth=0.4,
+            winding_angle=0.02,
+            crossed=False,
+        )
+        law = jnp.stack([*map(jnp.asarray, n), jnp.array(0.01)])
+        constants = [jnp.ones(3)] * 3
+        for pressure in (-10e3, 0.0, 50e3):
+            energy_of = partial(inertia.joint_energy, {"law": law}, jnp.array(pressure))
+            for q in jnp.array([[0.15, 0.05, -0.2], [-0.1, -0.08, 0.1], [1e-3, 0.002, 0.06]]):
+                springs = inertia.section_springs(the_scene, constants, law, jnp.array(pressure), q)
+                slope = jax.grad(energy_of)(q)
+                np.testing.assert_allclose(springs.moments, -slope, rtol=1e-9, atol=1e-13)
+                assert (springs.stiffness >= 1).all()  # never less than at rest
 
 
 @pytest.mark.parametrize("threshold", [False, True])

@@ -323,6 +323,7 @@ def test_derivatives_do_not_depend_on_company():
 
 
 HULL = {"effects__surface": "hull"}
+ELEMENTS = {"effects__neo_hookean": True, "section__thread_depth": 0.3}
 MIXED = DATA / "mixed.toml"  # a mesh, which still trials take, and a primitive
 SCENES = {
     "spheres": {"discretization__spheres_per_link": 2, "effects__finger_finger": True},
@@ -337,6 +338,14 @@ SCENES = {
     "capsule": {"shape": "capsule"},
     "fast": {"shape": "box", "links": 3},
     "fixtures": {},
+    "sections by elements": {"section__law": "elements", **ELEMENTS, **HULL},
+    "tapered sections by elements": {
+        "hand": DATA / "tapered.toml",
+        "section__law": "elements",
+        "section__winding": "single",
+        **ELEMENTS,
+        **HULL,
+    },
     "tapered": {
         "hand": DATA / "tapered.toml",
         "effects__finger_finger": True,

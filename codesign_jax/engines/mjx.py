@@ -23,6 +23,7 @@ from codesign_jax.model import (
     compile_template,
     layout,
     mujoco_fields,
+    section_springs,
     softening_moments,
     split,
 )
@@ -85,7 +86,16 @@ class MjxEngine(Equal):
         self, arrays: MujocoFields, fields: ModelFields, data: mjx.Data, ctrl: jax.Array
     ) -> mjx.Data:
         """Advances one world by one time step under controls of shape (nu,)."""
-        bend = layout(self.scene).dofs[..., 0]
+        dofs = layout(self.scene).dofs
+        if fields.law is not None:
+            springs = section_springs(self.scene, fields, data.qpos[dofs], ctrl[6:])
+            data = data.replace(qfrc_applied=data.qfrc_applied.at[dofs].set(springs[0]))
+            arrays = arrays._replace(
+                dof_damping=jnp.asarray(arrays.dof_damping).at[dofs].set(springs[1]),
+                dof_armature=jnp.asarray(arrays.dof_armature).at[dofs].set(springs[2]),
+            )
+            return mjx.step(self.model(arrays), data.replace(ctrl=ctrl))
+        bend = dofs[..., 0]
         moments = None
         if self.scene.effects.neo_hookean:
             moments = softening_moments(self.scene, fields, data.qpos[bend])

@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from codesign_jax.model import (
     compile_template,
     layout,
     mujoco_fields,
+    section_springs,
     softening_moments,
     split,
 )
@@ -121,11 +123,14 @@ class MujocoEngine(Equal):
         rollout = _ChunkedRollout(scene, fields, bounds, steps, to_end=trajectory)
         weights = centre_weights(layout(scene), fields.share)
         batch.bind("qacc_warmstart")[:] = rollout.start.acc
-        chunk = 1 if scene.effects.neo_hookean else _CHUNK  # its moments change with every step
+        # Moments that change with every step
+        chunk = 1 if scene.effects.neo_hookean else _CHUNK
         for first in range(0, steps, chunk):
             part = slice(first, min(first + chunk, steps))
             going = rollout.going
-            if scene.effects.neo_hookean:
+            if fields.law is not None:
+                _apply_section(scene, batch, fields, going, ctrl[going, first, 6:])
+            elif scene.effects.neo_hookean:
                 _apply_softening(scene, batch, fields, going)
             middle = weights[going]
             new, taken, states = self.advance(batch, going, ctrl[going, part], middle, trajectory)
@@ -354,6 +359,22 @@ def _apply_softening(
     angles = batch.bind("qpos")[ids][:, bend]
     mine = jax.tree.map(lambda v: v[ids], fields._replace(constants=()))
     batch.bind("qfrc_applied")[ids[:, None, None], bend] = softening_moments(scene, mine, angles)
+
+
+def _apply_section(
+    scene: Scene, batch: mujoco.batch.Batch, fields: ModelFields, ids: np.ndarray, pressure: Any
+) -> None:
+    """Gives joints the moments of their sections, and the springs that are implicit there."""
+    dofs = layout(scene).dofs
+    mine = jax.tree.map(lambda v: v[ids], fields._replace(constants=()))
+    springs = section_springs(scene, mine, batch.bind("qpos")[ids][:, dofs], pressure)
+    arrays = (
+        batch.bind("qfrc_applied"),
+        batch.expand("dof_damping"),
+        batch.expand("dof_armature"),
+    )
+    for array, values in zip(arrays, springs, strict=True):
+        array[ids[:, None, None, None], dofs] = values
 
 
 def write_fields(scene: Scene, batch: mujoco.batch.Batch, fields: ModelFields) -> None:

@@ -35,7 +35,7 @@ class Grasp(NamedTuple):
 
 def grasp(scene: Scene, params: Params, trial: Trial) -> Grasp:
     """Builds a grasp and plays it in plain MuJoCo, for its key frames and its outcome."""
-    scene, trial = plain.single_object(scene, trial)
+    scene, trial = plain.single_object(scene, params, trial)
     wide = _wide(params), _wide(trial)
     start = _float64(_start, scene, *wide)
     controls = timed_controls(scene, params, trial)
@@ -68,7 +68,7 @@ def grasp(scene: Scene, params: Params, trial: Trial) -> Grasp:
 
 def world(scene: Scene, params: Params, trial: Trial) -> mujoco.MjModel:
     """The model of one world as `Grasp.binary` is, without key frames; arguments as of `grasp`."""
-    scene, trial = plain.single_object(scene, trial)
+    scene, trial = plain.single_object(scene, params, trial)
     return plain.engine_model(scene, *_spec(scene, _wide(params), _wide(trial)))
 
 

@@ -21,11 +21,11 @@ import mujoco
 import numpy as np
 
 from codesign_jax.export import mjcf
-from codesign_jax.model import contact_invweight
+from codesign_jax.model import contact_invweight, morphology
 from codesign_jax.model.held import keeps
 from codesign_jax.model.pairs import SOLIMP
 from codesign_jax.scene import Scene, effects, silicones
-from codesign_jax.types import Trial
+from codesign_jax.types import Params, Trial
 
 _SOFTNESS = (1e-4 / (1 - 1e-4), (1 - 1e-4) / 1e-4)
 """Of (1 - d) / d, as MuJoCo keeps an impedance d between 0.0001 and 0.9999."""
@@ -48,6 +48,11 @@ def differences(scene: Scene) -> list[str]:
         for name, sentence in left_out.items()
         if acts[name]
     ]
+    if scene.hand.section.law == "elements":
+        sentences.append(
+            'the model is without hand.section.law = "elements": springs and moments of joints '
+            "are linear, with the moment per pressure that bends free fingers as far"
+        )
     sentences.append(
         "the model takes centrifugal and Coriolis forces whole: bodies that turn by more than half "
         "a radian a step gain energy, which engine structured prevents"
@@ -63,11 +68,26 @@ def differences(scene: Scene) -> list[str]:
     ]
 
 
-def single_object(scene: Scene, trial: Trial) -> tuple[Scene, Trial]:
+def single_object(scene: Scene, params: Params, trial: Trial) -> tuple[Scene, Trial]:
     """The scene with the trial's object alone and linear walls, and the trial in it."""
-    scene = silicones.under(scene, neo_hookean=False)
+    scene = silicones.under(_with_chambers(scene, params), neo_hookean=False)
     alone = dataclasses.replace(scene.objects, object=(scene.objects.object[int(trial.shape)],))
     return dataclasses.replace(scene, objects=alone), trial._replace(shape=np.int32(0))
+
+
+def _with_chambers(scene: Scene, params: Params) -> Scene:
+    """A scene whose sections have the law "chamber", and bend as far without load as before."""
+    if scene.hand.section.law == "chamber":
+        return scene
+    section = dataclasses.replace(scene.hand.section, law="chamber")
+    hand = dataclasses.replace(scene.hand, section=section)
+    plain = silicones.under(dataclasses.replace(scene, hand=hand), neo_hookean=False).hand
+    wanted = morphology.free_bends(scene.hand, params)
+    bends = morphology.free_bends(plain, params, neo_hookean=False)
+    factor = np.where(bends > 0, wanted / np.where(bends > 0, bends, 1.0), 1.0)
+    moment = scene.hand.material.moment_factor * factor[:, None]  # a factor of each finger
+    material = dataclasses.replace(hand.material, moment_factor=moment)
+    return dataclasses.replace(scene, hand=dataclasses.replace(hand, material=material))
 
 
 def engine_model(

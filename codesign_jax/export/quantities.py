@@ -12,15 +12,12 @@ from codesign_jax.model import morphology
 from codesign_jax.model.layout import mounts
 from codesign_jax.scene import Scene, silicones
 from codesign_jax.scene.hand import Material
+from codesign_jax.scene.hand_tables import THREAD_PITCH
 from codesign_jax.scene.silicones import Silicone
 from codesign_jax.types import Params
 
-PITCH = 4.0
-"""A turn of the thread along a finger, there and back [mm] [chosen].
-
-A thread that is wound one way twists a finger under pressure; wound there and back it stiffens
-twist (docs/notes/section.md).
-"""
+PITCH = 1e3 * THREAD_PITCH
+"""A turn of a thread that is wound there and back along a finger [mm]."""
 FIRST_INFLATION = 0.2
 """Pressure at which the bend test begins, over the design's [chosen]: by the law of sections a
 finger may bend several times further than by beam theory."""

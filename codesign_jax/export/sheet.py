@@ -116,7 +116,8 @@ def _tested(hand: Hand, tests: Tests) -> dict[str, Any]:
     warnings = stress.of_design(hand.scene, hand.params)
     warnings += [*(tests.stress.warnings if tests.stress else ())]
     warnings += idle_fingers(hand.scene, hand.params, hand.sizes)
-    warnings += twisting_fingers(hand.scene, hand.params, hand.sizes)
+    warnings += twisting_fingers(hand.scene, hand.params)
+    warnings += thread_inside(hand.scene)
     return {
         "verdict": tests.verdict,
         "stress": tests.stress,
@@ -144,16 +145,26 @@ def idle_fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> list[st
     return sentences
 
 
-def twisting_fingers(scene: Scene, params: Params, sizes: Sequence[Size]) -> list[str]:
+def twisting_fingers(scene: Scene, params: Params) -> list[str]:
     """Fingers that twist where an object holds them straight, a sentence each."""
-    around = np.mean([2 * (size.base.width + size.base.height) for size in sizes])
-    angle = float(np.arctan(quantities.PITCH / around))
-    unstable = morphology.twists_by_itself(scene.hand, params, winding_angle=angle)
+    lacks = "; the simulation lacks it" if scene.hand.section.law == "chamber" else ""
+    unstable = morphology.twists_by_itself(scene.hand, params)
     return [
         f"finger {i} twists by itself where it is held straight at "
-        f"{float(params.pressure[i]) / 1e3:.0f} kPa: its walls are thin for that pressure; the "
-        "simulation lacks it"
+        f"{float(params.pressure[i]) / 1e3:.0f} kPa: its walls are thin for that pressure" + lacks
         for i in np.flatnonzero(unstable)
+    ]
+
+
+def thread_inside(scene: Scene) -> list[str]:
+    """A sentence where the thread's place is not the one that the sheet's steps give it."""
+    depth = float(scene.hand.section.thread_depth)
+    if not depth:
+        return []
+    return [
+        f"hand.section.thread_depth = {depth:g}: the thread lies in the wall, but the steps "
+        "of this sheet wind it around the outside, where fingers bend further; cast the wall in "
+        "two layers with the thread between them"
     ]
 
 
@@ -163,7 +174,7 @@ def _fingers(hand: Hand) -> dict[str, Any]:
     limits = morphology.pressure_limits(scene.hand, params)
     law = bool(scene.effects.neo_hookean)
     bends = morphology.free_bends(scene.hand, params, neo_hookean=law)
-    outside = morphology.section_bends(scene.hand, params)
+    outside = morphology.section_bends(scene.hand, params, thread_depth=0.0)
     inside = morphology.section_bends(scene.hand, params, thread_depth=1.0)
     rows = []
     for i, (size, angle) in enumerate(zip(sizes, bends, strict=True)):
@@ -202,6 +213,9 @@ def _fingers(hand: Hand) -> dict[str, Any]:
         "finger_rows": rows,
         "end_walls": end_walls,
         "limit_strains": strains,
+        "law_of_bends": (
+            "beam theory" if scene.hand.section.law == "chamber" else "the law of its section"
+        ),
         "mount_rows": mount_rows,
         "spread": np.degrees(float(params.spread)),
     }
@@ -288,6 +302,7 @@ def _castings(hand: Hand) -> dict[str, Any]:
     silicone = named or quantities.nearest_silicone(material, neo_hookean=law)
     grams = 1e-6 * material.density * (1 + quantities.LOSS)
     bottoms = [quantities.bottom(size) for size in hand.sizes]
+    crossed = hand.scene.hand.section.winding == "crossed"
     return {
         "source": "the makers' technical bulletins (Smooth-On, Dragon Skin and Ecoflex series)",
         "silicone": silicone,
@@ -304,7 +319,8 @@ def _castings(hand: Hand) -> dict[str, Any]:
         "fabric_room": FABRIC,
         "thread": quantities.thread(hand.sizes),
         "spare": quantities.SPARE,
-        "pitch": quantities.PITCH,
+        "crossed": crossed,
+        "pitch": quantities.PITCH if crossed else quantities.PITCH / 2,
         "first_inflation": quantities.FIRST_INFLATION,
         "pins": sum(inlet(size, hand.process) > 0 for size in hand.sizes),
     }

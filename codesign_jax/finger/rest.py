@@ -22,6 +22,7 @@ from scipy import optimize
 from codesign_jax.model import morphology
 from codesign_jax.scene import Scene
 from codesign_jax.scene.hand import Hand
+from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Params
 
 
@@ -99,6 +100,12 @@ class Finger(NamedTuple):
 def of_design(scene: Scene, params: Params, index: int) -> Finger:
     """A hand's finger."""
     hand = scene.hand
+    if hand.section.law == "elements":
+        raise InputError.of(
+            "unsupported",
+            'hand.section.law = "elements": the finger on the bench has the law "chamber"; compare '
+            "measurements with it, or with the bends of the build sheet",
+        )
     links = scene.discretization.links
     params = jax.tree.map(lambda v: np.asarray(v, float), params)
     beams = morphology.finger_beams(hand, params, links)

@@ -122,7 +122,18 @@ def compilers(case: Case, trials: int) -> dict[str, Callable[[], None]]:
 
 
 def other_law(scene: Scene) -> tuple[str, Scene]:
-    """The scene with the other bending law of its fingers, and the name of the condition."""
+    """The scene with the other bending law of its fingers, and the name of the condition.
+
+    Of sections by elements, whose walls are neo-Hookean, it is the other winding of the thread.
+    """
+    section = scene.hand.section
+    if section.law == "elements":
+        other, name = {"crossed": ("single", "one way"), "single": ("crossed", "there and back")}[
+            section.winding
+        ]
+        section = dataclasses.replace(section, winding=other)
+        hand = dataclasses.replace(scene.hand, section=section)
+        return f"thread wound {name}", dataclasses.replace(scene, hand=hand)
     other = silicones.under(scene, neo_hookean=not scene.effects.neo_hookean)
     return f"{'neo-Hookean' if other.effects.neo_hookean else 'linear'} bending law", other
 

@@ -26,6 +26,7 @@ from codesign_jax.model.fields import (
     ModelFields,
     joint_springs,
     model_fields,
+    section_springs,
     softening_moments,
 )
 from codesign_jax.model.layout import Layout, contact_invweight, joint_axes, layout
@@ -47,6 +48,7 @@ __all__ = [
     "layout",
     "model_fields",
     "mujoco_fields",
+    "section_springs",
     "softening_moments",
     "split",
 ]

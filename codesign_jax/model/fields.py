@@ -15,7 +15,7 @@ from codesign_jax.model.layout import (
     object_size,
     wrist_springs,
 )
-from codesign_jax.scene import Scene, key_frames
+from codesign_jax.scene import Scene, key_frames, section_law, section_numbers
 from codesign_jax.scene.constants import with_trial
 from codesign_jax.types import Params, Trial
 
@@ -65,6 +65,8 @@ class ModelFields(NamedTuple):
         where neither `neo_hookean`, `air_mass` nor a hull needs them.
       threshold: Numbers of `morphology.thresholds`; None without the effect `lateral_threshold`.
       tip: Height, wall and width at the tips of tapered fingers [m], shape (finger, 3), or None.
+      law: What `section_law` needs of the sections at the joints, and last the length of a segment
+        [m], shape (finger, N, number), N = 1 where they are alike; None with the law "chamber".
     """
 
     base: jax.Array
@@ -89,6 +91,7 @@ class ModelFields(NamedTuple):
     section: jax.Array | None = None
     threshold: jax.Array | None = None
     tip: jax.Array | None = None
+    law: jax.Array | None = None
 
     @property
     def num_dofs(self) -> int:
@@ -189,6 +192,7 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
         section=_section(scene, params),
         threshold=threshold,
         tip=None if params.tip is None else jnp.stack(params.tip, -1),
+        law=_law(scene, params),
     )
     return _in_type(fields, dtype)
 
@@ -227,6 +231,43 @@ def _section(scene: Scene, params: Params) -> jax.Array | None:
         return None
     width = scene.hand.section.width + 0 * params.height
     return jnp.stack([params.height, params.wall, params.length / layout(scene).links, width], -1)
+
+
+def _law(scene: Scene, params: Params) -> jax.Array | None:
+    if scene.hand.section.law == "chamber":
+        return None
+    links = layout(scene).links
+    numbers = morphology.law_numbers(scene.hand, params, links)
+    segment = (params.length / links)[:, None]
+    return jnp.stack(jnp.broadcast_arrays(*numbers, segment), -1)
+
+
+def section_springs(
+    scene: Scene, fields: ModelFields, angles: Any, pressure: Any
+) -> tuple[Any, Any, Any]:
+    """Moments of the joints by the law of their sections, see `section_law.at_joint`.
+
+    Args:
+      fields: Fields with `law`; leading axes as `angles`.
+      angles: Angles of the joints [rad], shape (..., finger, N, axis); NumPy or JAX arrays.
+      pressure: Of the chambers [Pa], shape (..., finger).
+
+    Returns:
+      Moments [N m], and damping and armature with the implicit terms, see
+      `layout.implicit_spring`, each shaped as `angles`.
+    """
+    assert fields.law is not None
+    axes = layout(scene).axes
+    *numbers, segment = (fields.law[..., k] for k in range(fields.law.shape[-1]))
+    by_axis = [{n: v[..., k] for k, n in enumerate(axes)} for v in (fields.stiffness, angles)]
+    held, more = section_law.at_joint(
+        section_numbers.Numbers(*numbers), segment, by_axis[0], pressure[..., None], by_axis[1]
+    )
+    numpy = angles.__array_namespace__()
+    moments = numpy.stack([-held[name] for name in axes], -1)
+    added = numpy.stack([more[name] for name in axes], -1)
+    damping, armature = implicit_spring(scene, added, 0.0 * added)
+    return moments, fields.damping + damping, fields.armature + armature
 
 
 def softening_moments(scene: Scene, fields: ModelFields, angles: Any) -> Any:

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from codesign_jax.model.layout import beyond_base
-from codesign_jax.scene import section_law, silicones
+from codesign_jax.scene import section_law, section_numbers, silicones
 from codesign_jax.scene.beams import Beam, beam, softening
 from codesign_jax.scene.hand import Hand, highest_pressure
 from codesign_jax.scene.primitives import block_inertia
@@ -29,6 +29,7 @@ __all__ = [
     "finger_beams",
     "free_bends",
     "joint_springs",
+    "law_numbers",
     "pressure_limits",
     "section_bends",
     "sections",
@@ -128,8 +129,11 @@ def free_bends(hand: Hand, params: Params, *, neo_hookean: bool | None = None) -
     """Angles by which free fingers bend at their pressures [rad], shape (finger,).
 
     Args:
-      neo_hookean: The bending law; None for that of the hand's material.
+      neo_hookean: The bending law; None for that of the hand's material.  The section's law
+        "elements" is neo-Hookean.
     """
+    if hand.section.law == "elements":
+        return section_bends(hand, params)
     law = silicones.of_law(hand.material.law) if neo_hookean is None else neo_hookean
     exact = jax.tree.map(lambda v: np.asarray(v, float), params)
     links = 1
@@ -142,42 +146,54 @@ def free_bends(hand: Hand, params: Params, *, neo_hookean: bool | None = None) -
     return np.asarray(curvature.mean(1) * exact.length)
 
 
-def section_bends(hand: Hand, params: Params, *, thread_depth: float = 0.0) -> np.ndarray:
+def section_bends(hand: Hand, params: Params, *, thread_depth: float | None = None) -> np.ndarray:
     """Angles by which free fingers bend by the law of their sections [rad], shape (finger,).
 
-    Other than `free_bends` it knows where the thread is, see `section_law`.
+    Other than beam theory it knows where the thread is, see `section_law`.
 
     Args:
-      thread_depth: Place of the thread in the wall: 0 outside, 1 on the chamber.
+      thread_depth: Place of the thread in the wall: 0 outside, 1 on the chamber; None for that of
+        the hand.
     """
-    numbers, pressure = _section_numbers(hand, params, thread_depth=thread_depth)
+    numbers, pressure = _exact_numbers(hand, params, thread_depth)
     curvature = section_law.free_bend(numbers, pressure)
     return curvature.mean(1) * np.asarray(params.length, float)
 
 
-def twists_by_itself(hand: Hand, params: Params, *, winding_angle: float) -> np.ndarray:
-    """Whether fingers that are held straight at their pressures twist, shape (finger,).
+def twists_by_itself(hand: Hand, params: Params) -> np.ndarray:
+    """Whether fingers twist at their pressures, held straight or bent freely, shape (finger,).
 
     Their stiffness of twist is negative by the law of their sections, see `section_law`.
+    """
+    numbers, pressure = _exact_numbers(hand, params)
+    free = section_law.free_bend(numbers, pressure)
+    bends = (0.0 * free, free)
+    stiffness = [section_law.twist_stiffness(numbers, pressure, bend) for bend in bends]
+    return (np.minimum(*stiffness) < 0).any(1)
+
+
+def _exact_numbers(
+    hand: Hand, params: Params, thread_depth: float | None = None
+) -> tuple[section_numbers.Numbers, np.ndarray]:
+    """Numbers of the sections along fingers, and pressures, shapes (finger, place)."""
+    exact = jax.tree.map(lambda v: np.asarray(v, float), params)
+    numbers = law_numbers(hand, exact, 1 if params.tip is None else 20, thread_depth)
+    return numbers, exact.pressure[:, None]
+
+
+def law_numbers(
+    hand: Hand, params: Params, links: int, thread_depth: float | None = None
+) -> section_numbers.Numbers:
+    """What `section_law` needs of the sections at fingers' joints, shape (finger, N).
+
+    N is 1 where they are the same all along.
 
     Args:
-      winding_angle: Angle to the hoop direction of a thread that is wound there and back [rad].
+      thread_depth: Place of the thread; None for that of the hand.
     """
-    numbers, pressure = _section_numbers(hand, params, winding_angle=winding_angle)
-    straight = np.zeros(np.broadcast_shapes(numbers.height.shape, pressure.shape))
-    return (section_law.twist_stiffness(numbers, pressure, straight) < 0).any(1)
-
-
-def _section_numbers(
-    hand: Hand, params: Params, **winding: float
-) -> tuple[section_law.Numbers, np.ndarray]:
-    """Numbers of the sections at a finger's joints, and pressures, shapes (finger, place)."""
-    exact = jax.tree.map(lambda v: np.asarray(v, float), params)
-    links = 1 if params.tip is None else 20
-    height, wall, width = sections(hand, exact, at_joints(links))
-    modulus = hand.material.shear_modulus
-    numbers = section_law.numbers(height, wall, width, shear_modulus=modulus, **winding)
-    return numbers, exact.pressure[:, None]
+    shapes = sections(hand, params, at_joints(links))
+    length = params.length[:, None]
+    return section_numbers.of_hand(hand, *shapes, length, thread_depth=thread_depth)
 
 
 def _softened(linear: np.ndarray, section: Section) -> np.ndarray:
@@ -273,12 +289,16 @@ def joint_springs(
 ) -> tuple[jax.Array, jax.Array]:
     """Stiffness k = EI / l or GJ / l of a segment's length l, and damping beta k (Kelvin-Voigt).
 
+    With the law "elements" the stiffness is that of a straight finger without pressure.
+
     Returns:
       Stiffness [N m/rad] and damping [N m s/rad] of each finger's joints, shape (finger, N, axis)
       with the beams' N.
     """
     numpy = beams.bending.__array_namespace__()
     by_axis = {"bend": beams.bending, "lateral": beams.lateral, "twist": beams.torsion}
+    if hand.section.law == "elements":
+        by_axis = section_law.rest(law_numbers(hand, params, links))._asdict()
     segment = (params.length / links)[:, None]
     stiffness = numpy.stack([by_axis[name] / segment for name in axes], -1)
     return stiffness, hand.material.damping_time * stiffness

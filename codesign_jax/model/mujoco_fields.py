@@ -84,6 +84,8 @@ def mujoco_fields(scene: Scene, fields: ModelFields, numpy: Any = jnp) -> Mujoco
     wrist, damping, armature = _dofs(numpy, scene, fields)
     gain = numpy.broadcast_to(fields.gain, lay.dofs.shape[:2])
     tapered = scene.hand.section.tapered
+    # The law of sections has the moments of springs and chambers, which engines apply.
+    passive = 1.0 if fields.law is None else 0.0
     geom_size, rbound, aabb = _geom_fields(numpy, scene, fields, filled)
     friction, solref, solimp = _pairs(numpy, numbers, dtype)
     return MujocoFields(
@@ -93,7 +95,7 @@ def mujoco_fields(scene: Scene, fields: ModelFields, numpy: Any = jnp) -> Mujoco
         geom_rbound=rbound,
         geom_aabb=aabb,
         # The wrist's springs are its position actuators; only the fingers have passive ones.
-        jnt_stiffness=filled("jnt_stiffness", (lay.dofs, fields.stiffness)),
+        jnt_stiffness=filled("jnt_stiffness", (lay.dofs, passive * fields.stiffness)),
         dof_damping=damping,
         dof_armature=armature,
         # MuJoCo takes the inertia of a free body from this constant; of other bodies it does not.
@@ -105,7 +107,7 @@ def mujoco_fields(scene: Scene, fields: ModelFields, numpy: Any = jnp) -> Mujoco
         actuator_gainprm=filled(
             "actuator_gainprm",
             ((slice(6), 0), wrist),
-            ((slice(6, None), 0), gain[:, 0]),
+            ((slice(6, None), 0), passive * gain[:, 0]),
         ),
         actuator_biasprm=filled("actuator_biasprm", ((slice(6), 1), -wrist)),
         pair_friction=friction,

@@ -1,8 +1,8 @@
 """What can be built, as a constraint of a search: `[limits]` of a scene, projected onto designs.
 
-Each limit of the table has a closed form in the parameters, so that nothing is simulated to hold
-it: a pressure is lowered, a length, an angle or the arm's height is clipped.  The projection is
-differentiable wherever it is not exactly at a limit.
+Each limit of the table has a closed form in the parameters, or is the root of one, so that nothing
+is simulated to hold it: a pressure is lowered, a length, an angle or the arm's height is clipped.
+The projection is differentiable wherever it is not exactly at a limit.
 """
 
 import dataclasses
@@ -13,6 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from codesign_jax.scene import section_law, section_numbers
 from codesign_jax.scene.beams import strain_pressure
 from codesign_jax.scene.hand_tables import Hand
 from codesign_jax.scene.schema import Problem
@@ -40,6 +41,7 @@ class Buildable:
       zero_height: Height of the palm at which `arm_z` is zero [m].
       stiffness: Stiffness of the wrist's slides [N/m].
       top: Height of the tallest object on the table [m].
+      hand: The hand, where its section's law is "elements", or None.
     """
 
     limits: Limits
@@ -50,6 +52,7 @@ class Buildable:
     zero_height: float
     stiffness: float
     top: float
+    hand: Hand | None = None
 
     def bounds(self, name: str, low: float, high: float) -> tuple[float, float]:
         """The bounds of a parameter [SI] within the limits that concern it alone."""
@@ -73,6 +76,8 @@ class Buildable:
           value: Parameters of the fingers.
           tip: Height, wall and width at the tip of tapered fingers, or None.  No section of a
             tapered finger may bend as a whole finger of that section must not.
+
+        By the law "elements" a finger that is held straight must not twist by itself either.
         """
         base = value("height"), value("wall"), self.width
         sections = [base]
@@ -82,9 +87,10 @@ class Buildable:
                 for share in PLACES
             ]
         caps = table
-        for height, wall, width in sections:
-            for strain in self._strains(height, value("length")):
-                caps = _smaller(caps, self._pressure(strain, height, wall, width))
+        for section in sections:
+            strains = self._strains(section[0], value("length"))
+            for pressure in self._pressures(strains, section, value("length")):
+                caps = _smaller(caps, pressure)
         return caps * (1 - (self.limits.pressure_margin or 0.0))
 
     def least_height(self, roll: Any, pitch: Any, yaw: Any) -> Any:
@@ -110,15 +116,18 @@ class Buildable:
             strains.append(np.radians(self.limits.free_bend) * height / length)
         return strains
 
-    def _pressure(self, strain: Any, height: Any, wall: Any, width: Any) -> Any:
-        return strain_pressure(
-            strain,
-            height,
-            wall,
-            width=width,
-            shear_modulus=self.shear_modulus,
-            neo_hookean=self.neo_hookean,
-        )
+    def _pressures(self, strains: list[Any], section: tuple, length: Any) -> list[Any]:
+        """Pressures that fingers of a section must not exceed."""
+        height, wall, width = section
+        if self.hand is not None:
+            numbers = section_numbers.of_hand(self.hand, height, wall, width, length)
+            bending = [section_law.strain_pressure(numbers, strain) for strain in strains]
+            return [*bending, section_law.steady_pressure(numbers)]
+        beam = {"width": width, "shear_modulus": self.shear_modulus}
+        return [
+            strain_pressure(strain, height, wall, **beam, neo_hookean=self.neo_hookean)
+            for strain in strains
+        ]
 
 
 def buildable(hand: Hand, limits: Limits, arm: Arm, top: float, *, neo_hookean: bool) -> Any:
@@ -143,6 +152,7 @@ def buildable(hand: Hand, limits: Limits, arm: Arm, top: float, *, neo_hookean: 
         arm.zero_height,
         hand.wrist.linear_stiffness,
         top,
+        hand if hand.section.law == "elements" else None,
     )
 
 

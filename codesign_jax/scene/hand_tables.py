@@ -59,6 +59,9 @@ LEAST_REACH = 0.014
 the noise makes a tenth smaller."""
 TIP = ("tip_height", "tip_wall", "tip_width")
 """Those of tapered fingers alone."""
+THREAD_PITCH = 4e-3
+"""A turn of a layer of the thread along a finger [m] [chosen]: wound there and back it has two
+layers.  Wound one way, in one layer, a turn is half of it, so that the thread is as long."""
 
 
 Numbers = float | tuple[float, ...]
@@ -121,10 +124,18 @@ class Section:
       width: Outer width of the section, of a tapered finger at its base.
       tapered: Whether height, wall and width change linearly along a finger, from those at its base
         to the parameters `tip_height`, `tip_wall` and `tip_width`.
+      law: What holds a finger's joints: "chamber", beam theory with a pressure that acts on the
+        chamber's area; or "elements", the energy that finite elements of the section support.
+      thread_depth: Place of the thread in the wall: 0 outside, 1 on the chamber; for the law
+        "elements" and the build sheet.
+      winding: How the thread is wound, likewise: "crossed", there and back, or "single", one way.
     """
 
     width: float = quantity("m", 0.005, 0.1)
     tapered: bool = False
+    law: str = choice("chamber", "elements", default="chamber")
+    thread_depth: float = quantity("", 0, 1, default=0.0)
+    winding: str = choice("crossed", "single", default="crossed")
 
 
 @table
@@ -147,7 +158,8 @@ class Material:
       shear_modulus: Shear modulus G; required without a silicone, as the next two.
       density: Density.
       damping_time: Kelvin-Voigt damping time beta: a joint's damping is beta times its stiffness.
-      lateral_factor: Factor on the stiffness of bending sideways.
+      lateral_factor: Factor on the stiffness of bending sideways; as the next two of the section's
+        law "chamber".
       torsion_factor: Factor on the stiffness of twist.
       moment_factor: Factor on the bending moment per pressure, which follows from the section.
     """

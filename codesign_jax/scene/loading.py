@@ -64,6 +64,7 @@ def load(
     parts = _hand_and_objects(path, table, chosen, inside, problems)
     if parsed is not None and "hand" in parts:
         parsed = _with_law(parsed, parts["hand"].material, path.name, problems)
+        problems += _section_problems(parsed.effects, parts["hand"].section, path.name)
         problems = keypaths.as_given(problems, key_paths)
         # A path that the caller gives is not beside the scene's file.
         from_caller = ("control",) in top_level
@@ -261,10 +262,31 @@ def check_together(scene: SceneFile, where: str) -> list[str]:
         problems += key_frames.check(scene, f"{where}.control")
         law = silicones.law_problem(scene.effects.neo_hookean, scene.hand.material, where)
         problems += [law] if law else []
+        problems += _section_problems(scene.effects, scene.hand.section, where)
     if isinstance(scene, Scene) and round(scene.end_time / h) != scene.num_steps:
         sentence = (
             f"{where}.phases ends after {scene.end_time:g} s: the number of steps is structure, "
             f"{scene.num_steps} of {h:g} s"
         )
         problems.append(schema.Problem("unsupported", sentence))
+    return problems
+
+
+def _section_problems(effects: Any, section: Any, where: str) -> list[schema.Problem]:
+    """Effects that the law of a hand's section has, or cannot have."""
+    if section.law == "chamber":
+        return []
+    reasons = {
+        ("neo_hookean", False): "has neo-Hookean walls, also at large strain",
+        ("lateral_threshold", True): "has the taut fabric's resistance itself",
+        ("air_mass", True): "has a chamber that grows with its pressure as well as with the bend",
+    }
+    problems = []
+    for (name, value), reason in reasons.items():
+        if getattr(effects, name) == value:
+            sentence = (
+                f"{where}.effects.{name} = {str(value).lower()} stands against hand.section.law = "
+                f'"elements", which {reason}'
+            )
+            problems.append(schema.Problem("conflict", sentence))
     return problems

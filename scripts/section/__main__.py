@@ -12,7 +12,7 @@ Half a minute of one core for each of the 130 sections.
 import argparse
 from pathlib import Path
 
-from codesign_jax.scene import section_law
+from codesign_jax.scene import section_numbers
 from scripts.section import fit, report, study
 from scripts.shared import output
 
@@ -35,8 +35,8 @@ def main() -> None:
         return
     if args.fit:
         data = fit.states(args.fit, HIGHEST)
-        fitted = fit.fit(section_law.constants(), data, args.rounds)
-        fit.write(Path(section_law.__file__).with_suffix(".toml"), fitted)
+        fitted = fit.fit(section_numbers.constants(), data, args.rounds)
+        fit.write(Path(section_numbers.__file__).with_suffix(".toml"), fitted)
         print(output.markdown(fit.report(fitted, data)))
         return
     if args.report:

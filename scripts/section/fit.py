@@ -10,8 +10,8 @@ import numpy as np
 import tomli_w
 from scipy import optimize
 
-from codesign_jax.scene import section_law
-from codesign_jax.scene.section_law import FITTED, Constants
+from codesign_jax.scene import section_law, section_numbers
+from codesign_jax.scene.section_numbers import FITTED, Constants
 from scripts.section import study
 from scripts.section.study import SHEAR_MODULUS as G
 
@@ -116,7 +116,7 @@ def _walls(d: float, w: float, bend: float) -> Any:
 def predicted(fitted: Constants, data: States) -> np.ndarray:
     """`QUANTITIES` by the law, shape (state, quantity); slopes are central differences."""
     d, w, depth, angle, crossed, thread, fabric = data.section.T
-    n = section_law.numbers(
+    n = section_numbers.numbers(
         np.ones_like(d),
         d,
         w,
@@ -138,8 +138,7 @@ def predicted(fitted: Constants, data: States) -> np.ndarray:
     after = energy(x=STEP)
     before = energy(x=-STEP)
     volume = (energy(p=-STEP) - energy(p=STEP)) / (2 * STEP)
-    # The energy is quadratic in the twist.
-    torsion = energy(t=1.0) - 2 * middle + energy(t=-1.0)
+    torsion = section_law.response(n, pressure, 0.0, bend, lateral, fitted).torsion
     sideways = (energy(y=STEP) - energy(y=-STEP)) / (2 * STEP)
     return np.stack(
         [
@@ -195,7 +194,7 @@ def fit(start: Constants, data: States, rounds: int, every: int = 1) -> Constant
 
 
 def write(path: Path, fitted: Constants) -> None:
-    """Writes section_law.toml."""
+    """Writes section_numbers.toml."""
     table: dict[str, Any] = {}
     for name, value in zip(Constants._fields[1:], fitted[1:], strict=True):
         number = np.round(np.asarray(value, float), 4).tolist()

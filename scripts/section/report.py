@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from codesign_jax.scene import beams, section_law
-from codesign_jax.scene.section_law import FITTED, Constants
+from codesign_jax.scene import beams, section_law, section_numbers
+from codesign_jax.scene.section_numbers import FITTED, Constants
 from scripts.section import fit, study
 from scripts.section.elements import Model, Section
 from scripts.section.study import SHEAR_MODULUS
@@ -54,7 +54,7 @@ def comparison(data: Path) -> str:
     for name, (section, column) in study.read(data).items():
         if not name.startswith("nominal"):
             continue
-        n = section_law.numbers(
+        n = section_numbers.numbers(
             np.array(section.height),
             section.wall,
             section.width,
@@ -90,10 +90,8 @@ def comparison(data: Path) -> str:
     return output.markdown(rows)
 
 
-def _moment(n: section_law.Numbers, pressure: float) -> float:
-    step = 1e-3
-    values = [section_law.energy(n, pressure, 0.0, np.array(k), 0.0) for k in (step, -step)]
-    return float(values[0] - values[1]) / (2 * step)
+def _moment(n: section_numbers.Numbers, pressure: float) -> float:
+    return float(section_law.response(n, pressure, 0.0, np.array(0.0), 0.0).bend)
 
 
 def _beam_bend(section: Section, pressure: float) -> float:
@@ -133,7 +131,7 @@ def draw(path: Path) -> Path:
 
 def fill(data: Path, docs: Path, highest: float) -> None:
     page = docs / "notes" / "section.md"
-    fitted = section_law.constants()
+    fitted = section_numbers.constants()
     states = fit.states(data, highest)
     output.fill(page, constants_table(fitted), "section_constants")
     output.fill(page, output.markdown(fit.report(fitted, states)), "section_residuals")

@@ -110,7 +110,7 @@ def _world(scene: Scene, fields: Any, ctrl: Any, qpos: Any, qvel: Any, *held: An
     if scene.effects.gravity:
         other = other + hand.step_numbers["gravity"][0] * height
     h = scene.discretization.timestep
-    joints_of = (hand.armature, hand.damping, hand.stiffness, state.finger_vel)
+    joints_of = (*_implicit(scene, hand, state.finger, ctrl), state.finger_vel)
     wrists_of = (hand.wrist_armature, hand.wrist_damping, hand.wrist_stiffness, state.wrist_vel)
     for armature, damping, stiffness, rate in (joints_of, wrists_of):
         left = (armature - h * damping / 2 - h**2 * stiffness / 4) * rate**2 / 2
@@ -129,6 +129,18 @@ def _world(scene: Scene, fields: Any, ctrl: Any, qpos: Any, qvel: Any, *held: An
     arm = jnp.roll(ctrl[:, :6].T, 1, 1)
     work = (hand.wrist_stiffness[:, 0] * (arm - (wrist + last) / 2) * (wrist - last)).sum(0)
     return other + joints(pressure), other + joints(before) - work, kinetic + springs
+
+
+def _implicit(scene: Scene, hand: WorldModel, angles: Any, ctrl: Any) -> list[Any]:
+    """Armature, damping and implicit stiffness of the joints, shape (link, axis, finger, time)."""
+    if hand.law is None:
+        return [hand.armature, hand.damping, hand.stiffness]
+    first = (jnp.moveaxis(v, 1, 0) for v in (hand.stiffness, hand.damping, hand.armature, angles))
+    *constants, q = first
+    law = jnp.moveaxis(hand.law, 1, 0)
+    springs = inertia.section_springs(scene, constants, law, ctrl[:, 6:].T, q)
+    values = springs.armature, springs.damping, springs.stiffness
+    return [jnp.moveaxis(v, 0, 1) for v in values]
 
 
 def _bodies(hand: WorldModel, kinematics: kin.Kinematics, state: kin.State) -> tuple:
@@ -161,7 +173,9 @@ def _bodies(hand: WorldModel, kinematics: kin.Kinematics, state: kin.State) -> t
 def _joints(scene: Scene, hand: WorldModel) -> dict[str, jax.Array]:
     """What `inertia.joint_energy` takes, of all joints: shapes (..., link, finger, world)."""
     constants = {"stiffness": jnp.moveaxis(hand.stiffness, 1, 0), "gain": hand.gain}
-    if scene.effects.neo_hookean:
+    if hand.law is not None:
+        constants["law"] = jnp.moveaxis(hand.law, 1, 0)
+    elif scene.effects.neo_hookean:
         constants["section"] = jnp.moveaxis(joint_sections(hand, len(hand.stiffness)), 1, 0)
     if hand.threshold is not None:
         constants["threshold"] = jnp.moveaxis(hand.threshold, 1, 0)

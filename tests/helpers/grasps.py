@@ -29,6 +29,7 @@ def pinch(shape="box", links=3, *, hand=DATA / "pinch.toml", objects=None, **set
     overrides = {"discretization": {"links": links}}
     for key, value in settings.items():
         table, name = key.split("__")
+        table = "hand.section" if table == "section" else table
         overrides.setdefault(table, {})[name] = list(value) if type(value) is tuple else value
     files = {"hand_name": hand, "object_set": objects or DATA / f"{shape}.toml"}
     return scene.load("paper_spheres", **files, overrides=overrides)

@@ -99,7 +99,7 @@ def at_states(scene, fields, ctrl, trajectory, stride=1):
             data.qpos[:] = trajectory.qpos[world, k]
             data.qvel[:] = trajectory.qvel[world, k]
             data.ctrl[:] = ctrl[world, k]
-            soften(scene, world_fields, data)
+            soften(scene, world_fields, compiled, data)
             mujoco.mj_forward(compiled, data)
             yield world, k, compiled, data
 
@@ -144,9 +144,16 @@ def relative_change(acceleration, exactly):
     return np.linalg.norm(acceleration - exactly) / max(np.linalg.norm(exactly), FLOOR)
 
 
-def soften(scene, fields, data):
+def soften(scene, fields, compiled, data):
     """What the engine `mujoco` applies before a step."""
-    if scene.effects.neo_hookean:
+    if scene.hand.section.law == "elements":
+        dofs = model.layout(scene).dofs
+        fields = jax.tree.map(np.asarray, fields)
+        springs = model.section_springs(scene, fields, data.qpos[dofs], data.ctrl[6:])
+        arrays = data.qfrc_applied, compiled.dof_damping, compiled.dof_armature
+        for array, values in zip(arrays, springs, strict=True):
+            array[dofs] = values
+    elif scene.effects.neo_hookean:
         bend = model.layout(scene).dofs[..., 0]
         data.qfrc_applied[bend] = model.softening_moments(scene, fields, data.qpos[bend])
 
@@ -231,7 +238,7 @@ def unbalanced(scene, fields, ctrl, trajectory, stride):
         data.qpos[:] = qpos[k]
         data.qvel[:] = qvel[k]
         data.ctrl[:] = u[k]
-        soften(scene, world_fields, data)
+        soften(scene, world_fields, oracle, data)
         mujoco.mj_forward(oracle, data)
         mujoco.mj_fullM(oracle, data, mass)
         turn = to_mujoco(data, end)

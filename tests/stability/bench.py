@@ -168,7 +168,7 @@ class Bench:
                     )
                     compiled.dof_M0[-6:-3], compiled.dof_M0[-3:] = (factor * v for v in properties)
                 data.ctrl[:] = u
-                oracles.soften(self.scene, grasps.nth(fields, w), data)
+                oracles.soften(self.scene, grasps.nth(fields, w), compiled, data)
                 mujoco.mj_step(compiled, data)
                 rows.append((data.qpos.copy(), data.qvel.copy()))
             out.append([np.stack(v) for v in zip(*rows, strict=True)])

@@ -74,6 +74,9 @@ class WorldModel(NamedTuple):
     air: jax.Array | None = None
     # See `cones.frictions`, shape (n, 1, world); None where all is as the table
     friction: jax.Array | None = None
+    # See `ModelFields`, shape (1, number, finger, world), of tapered fingers (link, number, finger,
+    # world); None with the law "chamber"
+    law: jax.Array | None = None
 
 
 def sections(hand: WorldModel, places: np.ndarray) -> tuple[Any, Any, Any]:
@@ -207,6 +210,7 @@ def _world_constants(scene: Scene, fields: ModelFields) -> WorldModel:
         section=None if fields.section is None else fields.section.transpose(2, 1, 0),
         tip=None if fields.tip is None else fields.tip.transpose(2, 1, 0),
         threshold=None if fields.threshold is None else fields.threshold.transpose(2, 3, 1, 0),
+        law=None if fields.law is None else fields.law.transpose(2, 3, 1, 0),
         palm_disc=_disc(numbers) if lay.disc.size or lay.palm.size else None,
         air=_air(numbers) if scene.effects.air_mass else None,
     )

@@ -37,6 +37,7 @@ from codesign_jax.model import held, layout
 from codesign_jax.model.held import palm_groups, rings_of_link
 from codesign_jax.model.layout import RING_TIP, palm_touches, ring_places, touches_itself
 from codesign_jax.scene import Scene
+from codesign_jax.scene.section_numbers import Numbers
 
 PALM = ((1, 0), (0, 1), (-1, 0), (0, -1))
 """Places of the rings that the palm's disc is made of, and their half axes, in half radii."""
@@ -138,7 +139,9 @@ class Tables(KernelLayout):
         more = {"ring": (n * self.rings_per_link, (8,))} if self.rings_per_link else {}
         if palm_touches(self.scene):
             more |= {"palm_ring": (self.palm_groups, (8,))}
-        if self.scene.effects.neo_hookean:
+        if self.scene.hand.section.law == "elements":
+            more |= {"law": (self.rows, (len(Numbers._fields) + 1,))}
+        elif self.scene.effects.neo_hookean:
             more |= {"section": (self.rows, (4,))}
         if self.scene.effects.lateral_threshold:
             more |= {"threshold": (self.rows, (3,))}
@@ -214,7 +217,7 @@ class Tables(KernelLayout):
             "new_finger": (n, (a,)),
             "new_finger_vel": (n, (a,)),
         }
-        if self.scene.effects.lateral_threshold:
+        if self.scene.effects.lateral_threshold or self.scene.hand.section.law == "elements":
             fields |= {"armature_now": (n, (a,))}
         if pairings := self.held.get("finger_finger"):
             fields |= {"new_held_friction": (pairings, (3,))}

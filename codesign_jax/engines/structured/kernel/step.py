@@ -319,14 +319,18 @@ def link_forces(scene: Scene, parent: tuple, constants: dict, joint: dict):
         origin + apply_columns(frame, constants["centre"]),
         inertia.principal_tensor(frame, constants["inertia"]),
     )
-    springs = inertia.springs(scene, tuple(hinges), constants.get("threshold"), pressure, q)
-    tau = -springs.stiffness * q - springs.damping * rate
-    bend = tau[:1] + constants["gain"] * pressure
-    if springs.moment is not None:
-        bend = bend + springs.moment
-    if "section" in constants:
-        bend = bend + inertia.softening_moment(constants["section"], hinges[0][:1], q[:1])
-    tau = jnp.concatenate([bend, tau[1:]])
+    if "law" in constants:
+        springs = inertia.section_springs(scene, hinges, constants["law"], pressure, q)
+        tau = springs.moments - springs.damping * rate
+    else:
+        springs = inertia.springs(scene, tuple(hinges), constants.get("threshold"), pressure, q)
+        tau = -springs.stiffness * q - springs.damping * rate
+        bend = tau[:1] + constants["gain"] * pressure
+        if springs.moment is not None:
+            bend = bend + springs.moment
+        if "section" in constants:
+            bend = bend + inertia.softening_moment(constants["section"], hinges[0][:1], q[:1])
+        tau = jnp.concatenate([bend, tau[1:]])
     share = inertia.share_of_products(vel[:3], scene.discretization.timestep)
     smooth = body.smooth_force(vel, bias, constants.get("gravity"), share)
     stored = {
@@ -338,7 +342,7 @@ def link_forces(scene: Scene, parent: tuple, constants: dict, joint: dict):
         "tau": tau,
         "share": share,
     }
-    if springs.moment is not None:
+    if "law" in constants or "threshold" in constants:
         stored["armature_now"] = springs.armature
     return (origin, frame, vel, bias, link_acc), stored
 

@@ -26,7 +26,7 @@ PALM_CONSTANTS = (
 the last one."""
 LINK_CONSTANTS = ("offset", "mass", "centre", "inertia", "stiffness", "damping", "armature")
 """Constants of each link that `link_forces` takes."""
-FINGER_CONSTANTS = ("gain", "section", "threshold")
+FINGER_CONSTANTS = ("gain", "section", "threshold", "law")
 """Constants of each finger, of each link of tapered ones, that it takes; some scenes lack all but
 the first."""
 

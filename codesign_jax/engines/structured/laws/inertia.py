@@ -15,10 +15,11 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.lanes import cross, dot, spatial, total
 from codesign_jax.engines.structured.world_model import apply_columns, apply_rows, turn_columns
-from codesign_jax.model.layout import implicit_spring
+from codesign_jax.model.layout import implicit_spring, joint_axes
 from codesign_jax.model.morphology import softening, threshold_energy, threshold_moments
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, section_law
 from codesign_jax.scene.beams import softening_energy
+from codesign_jax.scene.section_numbers import Numbers
 
 
 class Body(NamedTuple):
@@ -238,10 +239,12 @@ def joint_energy(constants: dict, pressure: jax.Array, q: jax.Array) -> jax.Arra
 
     Args:
       constants: What `link_forces` takes of the springs, "stiffness" and "gain", and, of scenes
-        with these effects, "section" and "threshold".
+        with these effects, "section" and "threshold"; with the law "elements" it is "law".
       pressure: Of the chamber [Pa].
       q: Angles, shape (axis, ...).
     """
+    if "law" in constants:
+        return _section_energy(constants["law"], pressure, q)
     stiffness = constants["stiffness"]
     energy = total([k * x**2 / 2 for k, x in zip(stiffness, q, strict=True)])
     energy = energy - constants["gain"] * pressure * q[0]
@@ -252,6 +255,44 @@ def joint_energy(constants: dict, pressure: jax.Array, q: jax.Array) -> jax.Arra
     if "threshold" in constants:
         energy = energy + threshold_energy(tuple(constants["threshold"]), pressure, q[0], q[1])
     return energy
+
+
+def _section_energy(law: jax.Array, pressure: jax.Array, q: jax.Array) -> jax.Array:
+    """`joint_energy` by the law of sections; of hinges on all three axes."""
+    *numbers, segment = jnp.unstack(law)
+    bend, lateral, twist = jnp.unstack(q / segment)
+    return segment * section_law.energy(Numbers(*numbers), pressure, twist, bend, lateral)
+
+
+class SectionSprings(NamedTuple):
+    """A joint's springs by the law of its section; (axis, ...)."""
+
+    moments: jax.Array  # With those of the chamber
+    stiffness: jax.Array  # What a step takes implicitly
+    damping: jax.Array  # With the implicit term
+    armature: jax.Array  # With the implicit terms
+
+
+def section_springs(
+    scene: Scene, constants: list, law: jax.Array, pressure: jax.Array, q: jax.Array
+) -> SectionSprings:
+    """A joint's springs by the law of its section, as `model.section_springs`.
+
+    Args:
+      constants: Stiffness at rest, damping and armature of the hinges, shape (axis, ...).
+      law: See `WorldModel`, shape (number, ...).
+      pressure: Of the chamber [Pa].
+      q: Angles, shape (axis, ...).
+    """
+    stiffness, damping, armature = constants
+    axes = joint_axes(scene)
+    *numbers, segment = jnp.unstack(law)
+    rest, angles = (dict(zip(axes, jnp.unstack(v), strict=True)) for v in (stiffness, q))
+    held, more = section_law.at_joint(Numbers(*numbers), segment, rest, pressure, angles)
+    added = jnp.stack([more[name] for name in axes])
+    implicit = implicit_spring(scene, added, jnp.zeros_like(added))
+    moments = jnp.stack([-held[name] for name in axes])
+    return SectionSprings(moments, stiffness + added, damping + implicit[0], armature + implicit[1])
 
 
 class Springs(NamedTuple):

@@ -30,6 +30,40 @@ def made(links=10, law="linear"):
     return finger.of_design(loaded, space.params(design), 0)
 
 
+def of_elements(**section):
+    """The finger of a hand whose section has the law "elements"."""
+    keys = {f"hand.section.{name}": value for name, value in section.items()}
+    loaded = scene.load("paper", overrides={"hand.section.law": "elements", **keys})
+    space = parameters.design_space(loaded.hand, "2d")
+    params = space.params(space.from_units([110.0, 0.0]))
+    return loaded.hand, params, finger.of_design(loaded, params, 0)
+
+
+def test_a_finger_with_the_law_of_elements():
+    """Its free bend is that of the section, and its modulus is what angles and swings tell."""
+    hand, params, mine = of_elements(thread_depth=0.5)
+    pressure = np.array([20e3, 50e3])
+    released = np.full(40, 0.0)
+    table = {"pressure": pressure, "angle": pressure, "blocked_force": pressure}
+    predicted = finger.predict(mine, table)
+    for row, value in enumerate(pressure):
+        bent = morphology.free_bends(hand, params._replace(pressure=0 * params.pressure + value))
+        # The law's free bend is halved to rounding, the chain's is that of its joints.
+        assert predicted["angle"][row] == pytest.approx(bent[0], rel=1e-6)
+    forces = predicted["blocked_force"] * mine.length
+    assert (forces > pressure * mine.gain[0]).all()  # which is that at little pressure
+    softer = mine.of_material(shear_modulus=0.9 * mine.constants.shear_modulus)
+    time = np.linspace(0.0, 0.2, len(released))
+    swing = {"pressure": released, "time": time, "drop": released + 1e-3, "load": released}
+    for given in (table, swing):
+        given = given | finger.predict(softer, given)
+        fitted = finger.fit(mine, given)
+        assert set(fitted.names) <= {"shear_modulus", "damping_time"}
+        assert fitted.value["shear_modulus"] == pytest.approx(
+            softer.constants.shear_modulus, rel=1e-3
+        )
+
+
 @pytest.mark.parametrize("links", [3, 10])
 def test_closed_forms_of_beams(links):
     """M L / EI; M / L; 3 M / 2 L and P L^3 / 3 EI, both up to the chain's 1 - 1 / (4 N^2)."""

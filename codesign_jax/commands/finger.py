@@ -198,7 +198,7 @@ def _of_fit(fit: Posterior, mine: Finger) -> list[str]:
         doubt = "" if identified[name] else "; hardly told by these measurements"
         lines.append(f"fitted: {label} = {number}, {_error(fit, name)}{doubt}")
     bends = {"angle", "tip_x", "tip_y"} & set(fit.noise)
-    if bends and not identified["moment_factor"]:
+    if bends and not identified.get("moment_factor", True):
         error = fit.ratio_sd
         size = "" if math.isnan(error) else f", here with a standard error of {100 * error:.2g} %"
         lines.append(

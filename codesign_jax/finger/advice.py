@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from codesign_jax.finger import swing
-from codesign_jax.finger.posterior import Posterior, gram, priors, scaled, slopes_of
+from codesign_jax.finger.posterior import OF_CHAMBERS, Posterior, gram, priors, scaled, slopes_of
 from codesign_jax.finger.prediction import Table, predict
 from codesign_jax.finger.rest import Constants, Finger, NoRest
 
@@ -49,6 +49,8 @@ def advice(finger: Finger, posterior: Posterior, table: Table) -> list[Advice]:
         raise ValueError("the posterior has no variance: more values first")
     likely = scaled(finger, posterior.names, posterior.mean - _own(finger, posterior.names))
     names = tuple(n for n in Constants._fields if getattr(likely.constants, n) > 0)
+    if finger.law is not None:
+        names = tuple(n for n in names if n not in OF_CHAMBERS)
     before = _precision(posterior, names)
     start = np.trace(np.linalg.inv(before))
     suggestions = []

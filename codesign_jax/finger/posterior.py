@@ -39,6 +39,8 @@ TOLD_BY = {
 }
 """Columns that tell of a constant; the angle of a free tip depends on modulus and moment by their
 ratio alone, forces on a held tip (nearly) on the moment, deflections on the modulus."""
+OF_CHAMBERS = ("moment_factor", "lateral_factor", "torsion_factor")
+"""Constants of the law "chamber" alone."""
 HAND = "hand.material."
 """Where the keys of a finger's constants begin."""
 ROUNDS = 3
@@ -152,6 +154,8 @@ class _Problem:
         told = {n for n, by in TOLD_BY.items() if set(by) & set(columns)}
         if table["pressure"].any():  # a bent finger gives way otherwise than a straight one
             told.add("moment_factor")
+        if finger.law is not None:  # its moments depend on the modulus, and have no factors
+            told = (told - {*OF_CHAMBERS}) | {"shear_modulus"}
         self.names = tuple(n for n in TOLD_BY if n in told)
         self.sizes = np.array([math.sqrt(np.nanmean(table[n] ** 2)) for n in columns])
         self.rows = [np.isfinite(table[n]) for n in columns]

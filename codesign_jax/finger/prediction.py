@@ -41,7 +41,7 @@ def predict(finger: Finger, table: Table) -> dict[str, np.ndarray]:
         pressure = float(table["pressure"][row])
         names = {n for n in predicted if np.isfinite(table[n][row])}
         if "blocked_force" in names:
-            predicted["blocked_force"][row] = pressure * finger.gain[0] / finger.length
+            predicted["blocked_force"][row] = _blocked(finger, pressure)
         if "tip_force" in names:
             with contextlib.suppress(NoRest):
                 blocked = Rest.of(finger, pressure, held=True, start=blocked)
@@ -57,6 +57,11 @@ def predict(finger: Finger, table: Table) -> dict[str, np.ndarray]:
     return predicted
 
 
+def _blocked(finger: Finger, pressure: float) -> float:
+    """Force with which the straight finger's tip presses, of the moment at its base [N]."""
+    return -float(finger.held(pressure, np.zeros(finger.links))[0]) / finger.length
+
+
 def _of_free(
     finger: Finger, free: Rest, pressure: float, load: float, names: set[str]
 ) -> dict[str, float]:
@@ -68,7 +73,7 @@ def _of_free(
         coordinates = dict(zip(("tip_x", "tip_y"), tip_place(finger, free), strict=True))
         values |= {name: value for name, value in coordinates.items() if name in names}
     if "sideways" in names:
-        values["sideways"] = sideways(finger, free, load)
+        values["sideways"] = sideways(finger, free, pressure, load)
     if "deflection" in names:
         values["deflection"] = free.height - Rest.of(finger, pressure, load, start=free).height
     return values

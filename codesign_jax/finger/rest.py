@@ -20,9 +20,9 @@ import numpy as np
 from scipy import optimize
 
 from codesign_jax.model import morphology
-from codesign_jax.scene import Scene
+from codesign_jax.scene import Scene, section_law, section_numbers
 from codesign_jax.scene.hand import Hand
-from codesign_jax.scene.schema import InputError
+from codesign_jax.scene.section_numbers import Numbers
 from codesign_jax.types import Params
 
 
@@ -58,6 +58,9 @@ class Finger(NamedTuple):
     lateral: np.ndarray  # stiffness of bending sideways [N m/rad]
     twist: np.ndarray  # stiffness of twist [N m/rad]
     bodies: Bodies
+    # What the law of its sections needs of them; None with the law "chamber".  Stiffness is then
+    # that of the straight finger without pressure, and the gain that at little pressure.
+    law: Numbers | None = None
 
     @property
     def length(self) -> float:
@@ -81,31 +84,35 @@ class Finger(NamedTuple):
         softer = new.shear_modulus / old.shear_modulus
         return self._replace(
             constants=new,
+            law=None if self.law is None else section_numbers.softened(self.law, softer),
             stiffness=softer * self.stiffness,
             lateral=softer * new.lateral_factor / old.lateral_factor * self.lateral,
             twist=softer * new.torsion_factor / old.torsion_factor * self.twist,
             gain=new.moment_factor / old.moment_factor * self.gain,
         )
 
-    def moment(self, angle: np.ndarray) -> np.ndarray:
-        """Moment of a joint at an angle [rad], in N m; any shape."""
-        linear = self.stiffness * angle
-        if not self.neo_hookean:
-            return linear
-        height, wall, width = self.section
-        lacking = morphology.softening(angle / self.segment, height, wall, width=width)
-        return linear * (1 - np.asarray(lacking))
+    def held(self, pressure: float, angle: np.ndarray) -> np.ndarray:
+        """Moment that holds joints at angles [rad] under a pressure [Pa], in N m; shape (N,)."""
+        if self.law is not None:
+            return section_law.response(self.law, pressure, 0.0, angle / self.segment, 0.0).bend
+        moment = self.stiffness * angle
+        if self.neo_hookean:
+            height, wall, width = self.section
+            lacking = morphology.softening(angle / self.segment, height, wall, width=width)
+            moment = moment * (1 - np.asarray(lacking))
+        return moment - pressure * self.gain
+
+    def sideways(self, pressure: float, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Stiffness of bending sideways and of twist at angles of bend [N m/rad], shape (N,)."""
+        if self.law is None:
+            return self.lateral, self.twist
+        state = section_law.response(self.law, pressure, 0.0, angle / self.segment, 0.0)
+        return state.sideways / self.segment, state.torsion / self.segment
 
 
 def of_design(scene: Scene, params: Params, index: int) -> Finger:
     """A hand's finger."""
     hand = scene.hand
-    if hand.section.law == "elements":
-        raise InputError.of(
-            "unsupported",
-            'hand.section.law = "elements": the finger on the bench has the law "chamber"; compare '
-            "measurements with it, or with the bends of the build sheet",
-        )
     links = scene.discretization.links
     params = jax.tree.map(lambda v: np.asarray(v, float), params)
     beams = morphology.finger_beams(hand, params, links)
@@ -113,17 +120,24 @@ def of_design(scene: Scene, params: Params, index: int) -> Finger:
     springs, _ = morphology.joint_springs(hand, params, beams, links, axes)
     sections = morphology.sections(hand, params, morphology.at_joints(links))
     stiffness, lateral, twist = np.moveaxis(np.asarray(springs[index]), -1, 0)
+    gain = np.asarray(beams.moment_per_pressure[index])
+    law = None
+    if hand.section.law == "elements":
+        every = np.broadcast_arrays(*morphology.law_numbers(hand, params, links))
+        law = Numbers(*(v[index] for v in every))
+        gain = law.lever * law.height**3
     return Finger(
         segment=float(params.length[index]) / links,
         links=links,
         section=morphology.Section(*(v[min(index, len(v) - 1)] for v in sections)),
         constants=Constants(*(float(getattr(hand.material, n)) for n in Constants._fields)),
         stiffness=stiffness,
-        gain=np.asarray(beams.moment_per_pressure[index]),
+        gain=gain,
         neo_hookean=bool(scene.effects.neo_hookean),
         lateral=lateral,
         twist=twist,
         bodies=_bodies(hand, params, links, index),
+        law=law,
     )
 
 
@@ -170,7 +184,6 @@ class Rest(NamedTuple):
           NoRest: If the joints cannot be balanced.
         """
         n = finger.links
-        moment = pressure * finger.gain
         unit = float(finger.stiffness[0])
         reach = finger.segment * np.append(np.ones(n - 1), 0.5)  # of the bodies behind the joints
 
@@ -187,13 +200,14 @@ class Rest(NamedTuple):
 
         def residual(x: np.ndarray) -> np.ndarray:
             lever, rise = levers(x[:n])
-            out = (finger.moment(x[:n]) - moment + force(x) * lever) / unit
+            out = (finger.held(pressure, x[:n]) + force(x) * lever) / unit
             return np.append(out, rise[0] / finger.length) if held else out
 
         def slopes(x: np.ndarray) -> np.ndarray:
             lever, rise = levers(x[:n])
             small = 1e-5
-            tangent = (finger.moment(x[:n] + small) - finger.moment(x[:n] - small)) / (2 * small)
+            after, before = (finger.held(pressure, x[:n] + s) for s in (small, -small))
+            tangent = (after - before) / (2 * small)
             out = (np.diag(tangent) - force(x) * rise[later]) / unit
             if not held:
                 return out
@@ -210,7 +224,7 @@ class Rest(NamedTuple):
         return cls(solution.x[:n], force(solution.x), float(levers(solution.x[:n])[1][0]))
 
 
-def sideways(finger: Finger, rest: Rest, load: float) -> float:
+def sideways(finger: Finger, rest: Rest, pressure: float, load: float) -> float:
     """How far a small load on the tip moves it out of the plane in which a finger is bent [m].
 
     To first order in the load: a joint gives way about its axis across the bend by k_lat and about
@@ -225,7 +239,8 @@ def sideways(finger: Finger, rest: Rest, load: float) -> float:
     up = np.cumsum((reach * np.sin(before))[::-1])[::-1]
     across = np.cos(middle) * along + np.sin(middle) * up
     aside = np.cos(middle) * up - np.sin(middle) * along
-    return float(load * (across**2 / finger.lateral + aside**2 / finger.twist).sum())
+    lateral, twist = finger.sideways(pressure, rest.angles)
+    return float(load * (across**2 / lateral + aside**2 / twist).sum())
 
 
 def tip_place(finger: Finger, rest: Rest) -> tuple[float, float]:

@@ -17,6 +17,7 @@ import numpy as np
 
 from codesign_jax.finger.rest import Finger
 from codesign_jax.model import morphology
+from codesign_jax.scene import section_law
 
 STEPS = 150
 """Time steps of the first mode's period."""
@@ -32,12 +33,14 @@ class Chain(NamedTuple):
     """Numbers of a finger that swings; joints' of shape (N,), all SI."""
 
     stiffness: Any
-    moment: Any  # of pressure
+    moment: Any  # of pressure on the straight finger
     damping: Any
     segment: Any
     section: morphology.Section
     bodies: Any
     load: Any  # mass of the weight at the tip [kg]
+    # See `Finger`, and the pressure [Pa]; None with the law "chamber"
+    law: Any = None
 
 
 def chain(finger: Finger, load: float, pressure: float) -> Chain:
@@ -52,6 +55,7 @@ def chain(finger: Finger, load: float, pressure: float) -> Chain:
         section=morphology.Section(*map(whole, finger.section)),
         bodies=finger.bodies,
         load=load / GRAVITY,
+        law=None if finger.law is None else (finger.law, pressure),
     )
 
 
@@ -130,7 +134,11 @@ def _acceleration(model: Chain, neo_hookean: bool, q: jax.Array, rate: jax.Array
     fall = jnp.array([0.0, GRAVITY]) - bias
     forces = jnp.einsum("b,bdi,bd->i", _masses(model), slopes, fall)
     spring = model.stiffness * q
-    if neo_hookean:
+    if model.law is not None:
+        law, pressure = model.law
+        held = section_law.response(law, pressure, 0.0, q / model.segment, 0.0).bend
+        spring = held + model.moment  # which is added below
+    elif neo_hookean:
         height, wall, width = model.section
         spring *= 1 - morphology.softening(q / model.segment, height, wall, width=width)
     forces += model.moment - spring - model.damping * rate

@@ -20,6 +20,11 @@ SCREENED = {"2d": Sizes(12, 3, 22, 48), "": Sizes(25, 3, 30, 48)}
 meets every object."""
 
 
+SEARCH_EPISODES = {"2d": 45, "": 62}
+"""Episodes of a screened search at a coarser accuracy than its test: as many as take the time of
+`SCREENED` at the accuracy `standard`; docs/accuracy.md has the rates."""
+
+
 def text(name: str) -> str:
     """The defaults of a size, as in "12 in 2d, 25 otherwise; the paper's are 10 and 60"."""
     two, many, paper_two, paper_many = (
@@ -27,4 +32,10 @@ def text(name: str) -> str:
     )
     if name == "trials":
         return f"one with each object, and at least {many}; the paper's are {paper_many}"
+    if name == "episodes":
+        coarse_two, coarse_many = (SEARCH_EPISODES[preset] for preset in ("2d", ""))
+        return (
+            f"{coarse_two} in 2d, {coarse_many} otherwise; with one accuracy for search and test "
+            f"{two} and {many}; the paper's are {paper_two} and {paper_many}"
+        )
     return f"{two} in 2d, {many} otherwise; the paper's are {paper_two} and {paper_many}"

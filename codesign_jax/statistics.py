@@ -9,6 +9,8 @@
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 
 class Interval(NamedTuple):
     """A value with its 95 % interval."""
@@ -59,3 +61,26 @@ def mcnemar(first: int, second: int) -> float:
     from scipy import stats
 
     return float(stats.binomtest(first, first + second).pvalue) if first + second else 1.0
+
+
+def halves(kept: np.ndarray) -> np.ndarray:
+    """Kept grasps (design, trial) as (design, trial of a half, half)."""
+    most = kept.shape[1] // 2
+    return np.stack([kept[:, :most], kept[:, most : 2 * most]], axis=-1).astype(float)
+
+
+def gain(by: np.ndarray, truth: np.ndarray) -> float:
+    """What choosing between two designs gains, a share of grasps, over a toss of a coin.
+
+    A design is chosen by half of the trials and valued by the other half, so that no trial counts
+    on both sides; the mean is over all pairs of designs.
+
+    Args:
+      by: Kept grasps at the setting that chooses, (design, trial of a half, half).
+      truth: At the setting that values; each half of the trials is valued by the other one.
+    """
+    chooses = by.mean(1)
+    values = truth.mean(1)[:, ::-1]
+    first, second = np.triu_indices(len(by), 1)
+    choice = np.sign(chooses[first] - chooses[second])
+    return float((choice * (values[first] - values[second]) / 2).mean())

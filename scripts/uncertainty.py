@@ -117,7 +117,7 @@ def make_studies(worlds: dict[str, Scene], args: argparse.Namespace) -> dict[str
             path=args.out / f"{name}-{arm}.npz",
         )
     # One program simulates both: its numbers are those of the scene that it gets.
-    studies["middle"].simulate = studies["drawn"].simulate
+    studies["middle"].programs = studies["drawn"].programs
     return studies
 
 

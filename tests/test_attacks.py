@@ -316,11 +316,11 @@ def test_check_imports_nothing_that_a_run_names(key, run, workplace, monkeypatch
     (workplace / "stranger.py").write_text("open('executed', 'w')\ndef X(*a): pass\n")
     noted(run, lambda stored: stored["settings"].update({key: "stranger:X"}))
 
-    def simulate(case, settings, finer, options, console):
+    def simulate(case, settings, levels, options, console):
         size = (2, 3)
         outcomes = Outcome(*(np.zeros(size, int) for _ in range(4)))  # type: ignore[arg-type]
         measured = check.Measured(case.scene, outcomes, 1.0, 0.0)
-        return "designs", measured, measured
+        return "designs", [measured, measured]
 
     monkeypatch.setattr(check, "simulate", simulate)
     assert command("check", "--run", run) == 0

@@ -121,7 +121,7 @@ def test_every_command_goes_as_far_as_its_simulation(example, workdir, monkeypat
     arguments = here_alone(example)
     reached = []
     monkeypatch.setattr(preflight, "refusals", lambda *rest: [])  # the slow test below has it
-    monkeypatch.setattr(check, "simulate", lambda *rest: ())
+    monkeypatch.setattr(check, "simulate", lambda *rest: ("", []))
     # The exit code is what is handed on, or made of a status.
     kept = SimpleNamespace(status=np.zeros(1, int))
     code = {"check": 0, "replay": 0, "evaluate": kept}.get(arguments[0])

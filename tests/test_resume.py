@@ -15,12 +15,17 @@ import jax
 import numpy as np
 import pytest
 
-from codesign_jax import array_files, runs
+from codesign_jax import array_files, codesign, rollout, runs, scene
+from codesign_jax.commands import grasp
+from codesign_jax.commands.flags import GraspFlags
+from codesign_jax.engines import make_engine
 from codesign_jax.interrupts import Interrupts
-from codesign_jax.judge import fresh_trials
+from codesign_jax.judge import fresh_trials, verdict
 from codesign_jax.judge.cases import Case
 from codesign_jax.runs import reference
 from codesign_jax.runs.checkpoint import Checkpoints
+from codesign_jax.scene.parameters import design_space
+from codesign_jax.types import Outcome
 from tests.helpers.command_runs import (  # noqa: F401
     EPISODES,
     RESULTS,
@@ -36,6 +41,7 @@ from tests.helpers.command_runs import (  # noqa: F401
     without,
 )
 from tests.helpers.refusals import refusal_of_command
+from tests.helpers.toy_engine import TINY
 
 
 def test_same_command_again_changes_no_result(finished, tmp_path, capsys):
@@ -295,3 +301,108 @@ def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch
     assert "of 3 runs found a good design" in capsys.readouterr().out
     assert command(*run, "--out", tmp_path / "whole") == 0
     assert_same_run(runs_folder / "seed-4", tmp_path / "whole" / "seed-4")
+
+
+COARSE = """description = "coarse"
+[discretization]
+timestep = 0.025
+links = 2
+[solver]
+[newton]
+"""
+
+
+FASTEST = """def fastest(scene, trace, ctrl):
+    return trace.speed.max()
+"""
+
+
+def simulates(the_scene):
+    """A function from designs and a root key to costs `FASTEST` in its first trials, by MuJoCo C.
+
+    The cost tells accuracies apart: objects of the tiny scene are lost at once at either.
+    """
+    names: dict = {}
+    exec(FASTEST, names)
+    engine = make_engine("mujoco", the_scene)
+    space = design_space(the_scene.hand, "2d")
+
+    @jax.jit
+    def run(designs, key):
+        trials = codesign.episode_trials(the_scene, key, 0, 3)
+        worlds = rollout.crossed(the_scene, jax.vmap(space.params)(designs), trials)
+        options = {"record_qpos": True, "cost": names["fastest"]}
+        return rollout.simulate(worlds[0], engine, *worlds[1:], **options)[0].cost.reshape(-1, 3)
+
+    return lambda designs, key: np.asarray(run(np.asarray(designs, np.float32), key))
+
+
+def test_a_search_has_its_own_accuracy_and_its_test_that_of_the_scene(tmp_path, workplace, capsys):
+    """Costs of episodes and test are those of grasps that are simulated apart, at each accuracy."""
+    coarse = tmp_path / "coarse.toml"
+    coarse.write_text(COARSE)
+    (workplace / "own.py").write_text(FASTEST)
+    folder = tmp_path / "run"
+    run = [*RUN, "--search-accuracy", coarse, "--cost", "own:fastest", "--out", folder]
+    assert command(*run) == 0
+    output = capsys.readouterr().out
+    settings = runs.read_run(folder)[1]
+    assert settings.search_accuracy == str(coarse)
+    searched = runs.read_search_scene(folder)
+    usual = runs.read_run(folder)[0]
+    assert searched == scene.load(TINY, accuracy=coarse) != usual
+    record = runs.load_record(folder)
+    history = record.history
+    key = jax.random.key(settings.seed)
+    at_search, at_test = simulates(searched), simulates(usual)
+    # Batches of other sizes round differently; the accuracies differ by a third.
+    close = {"rtol": 1e-2}
+    np.testing.assert_allclose(
+        history.outcomes.cost[0], at_search(history.population[0], key), **close
+    )
+    # Two rounds of three trials; no trial of the last episode, which had the other accuracy.
+    assert record.test.cost.shape == record.searched.cost.shape == (4, 6)
+    arguments = record.state.particles, codesign.test_key(key, 1)
+    costs = at_search(*arguments), at_test(*arguments)
+    assert not np.allclose(*costs, **close)
+    np.testing.assert_allclose(record.searched.cost[:, 3:], costs[0], **close)
+    np.testing.assert_allclose(record.test.cost[:, 3:], costs[1], **close)
+    rows = csv.DictReader((folder / "tests.csv").read_text().splitlines())
+    kept = [int(row["search_kept_trials"]) for row in rows]
+    assert kept == verdict.kept(record.searched).sum(1).tolist()
+    assert record.retest.sentence(str(coarse)) in output
+    assert f"search at accuracy {coarse} (time step 25 ms, 2 links)" in report_of(folder)
+    # A grasp that its numbers name is repeated at the accuracy that it had.
+    options = GraspFlags(run_folder=folder, episode=2, particle=1, trial=2)
+    assert grasp.find(options).case.scene == searched
+    assert grasp.find(GraspFlags(run_folder=folder)).case.scene == usual
+    before = snapshot(folder)
+    refused = {
+        "--search-accuracy: the run has": without(run, "--search-accuracy"),
+        "-timestep = 0.025": run,
+        "needs a final test": [*run, "--fresh", "--test-trials", "0"],
+        "'quick' unknown": [*run, "--search-accuracy", "quick"],
+    }
+    coarse.write_text(COARSE.replace("0.025", "0.030"))
+    for words, arguments in refused.items():
+        assert command(*arguments) == 2
+        assert words in capsys.readouterr().err
+    assert snapshot(folder) == before
+
+
+def report_of(folder):
+    assert command("report", folder, "--no-replay") == 0
+    return (folder / "report.html").read_text()
+
+
+def test_finalists_that_the_accuracy_of_the_search_alone_likes_are_counted():
+    """Of 48 trials at both: 48 and 40 (p = 0.008), 46 and 45, 40 and 20; copies count once."""
+
+    def outcomes(*kept):
+        lost_time = np.where(np.arange(48) < np.array(kept)[:, None], np.inf, 5.0)
+        zeros = np.zeros((len(kept), 48), int)
+        return Outcome(zeros, zeros, lost_time, zeros - 1)
+
+    particles = np.array([[1.0], [2.0], [3.0], [1.0]])
+    counted = fresh_trials.retest(particles, outcomes(40, 45, 20, 40), outcomes(48, 46, 40, 48))
+    assert counted == (1, 3)

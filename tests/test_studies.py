@@ -1,6 +1,7 @@
 """Studies: constants, rates, searches, accuracy, and the paper's experiments, by known answers."""
 
 import dataclasses
+import itertools
 import json
 import re
 import shutil
@@ -8,12 +9,13 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 import scipy.stats
 
-from codesign_jax import cli, codesign, rollout, scene
+from codesign_jax import cli, codesign, rollout, runs, scene
 from codesign_jax.commands import optimize
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import world_model
@@ -262,20 +264,96 @@ def test_presets_replace_the_scene_s_values_and_overrides_replace_theirs():
     fine = scene.load("paper_spheres", accuracy="reference")
     assert fine.discretization == scene.Discretization(0.001, 20, 1, integrator="newmark")
     fast = scene.load("paper_spheres", accuracy="fast", overrides={"discretization": {"links": 7}})
-    assert (fast.discretization.links, fast.newton.iterations) == (7, 4)
-    for name, iterations in {"fast": 4, "fine": 6}.items():
+    assert (fast.discretization.links, fast.discretization.timestep) == (7, 0.02)
+    for name, tolerance in {
+        "fast": 1e-3,
+        "standard": 1e-3,
+        "fine": 1e-3,
+        "reference": 1e-6,
+    }.items():
         loaded = scene.load("paper", accuracy=name)
-        assert StructuredEngine(loaded).limits.iterations == iterations
+        assert StructuredEngine(loaded).limits.tolerance == tolerance
+
+
+PRESETS = ("fast", "standard", "fine", "reference")
+"""The built-in accuracies, the cheapest first."""
+
+
+def test_presets_are_ordered_in_steps_and_links():
+    assert sorted(PRESETS) == sorted(scene.library.available("accuracy"))
+    scenes = [scene.load("paper", accuracy=name) for name in PRESETS]
+    sizes = [s.num_steps * s.discretization.links for s in scenes]
+    assert sizes == sorted(set(sizes))
+
+
+@pytest.mark.slow  # the quick test above has the sizes; here they are simulated
+def test_presets_are_ordered_in_counted_work_and_in_the_error_of_the_finger_tip():
+    """Work: Newton iterations of a grasp times links. Error: against MuJoCo C, see `budget.motion`.
+
+    Each preset costs at least half more than the one before, and errs at most half as much; on two
+    hands and 0.9 s in the air.
+    """
+    work_of = []
+    errors = []
+    exact = budget.motion((2e-4, 30, "newmark"), "mujoco", 2, 0.9)
+    for name in PRESETS:
+        the_scene = scene.load("paper", accuracy=name)
+        engine = StructuredEngine(the_scene)
+        space = parameters.design_space(the_scene.hand)
+        params = jax.vmap(space.params)(jnp.asarray(work.winners()[:2], jnp.float32))
+        trials = rollout.sample_trials(the_scene, jax.random.key(4), 2)
+        fields, ctrl = rollout.prepare(the_scene, params, trials, engine)
+        _, series = jax.jit(engine.states)(fields, ctrl)
+        work_of.append(float(series["iterations"].sum()) * the_scene.discretization.links)
+        d = the_scene.discretization
+        setting = (d.timestep, d.links, d.integrator)
+        errors.append(budget.error(budget.motion(setting, hands=2, seconds=0.9), exact))
+    assert all(b > 1.5 * a for a, b in itertools.pairwise(work_of)), work_of
+    assert all(2 * b < a for a, b in itertools.pairwise(errors)), errors
 
 
 def test_the_command_line_takes_a_preset(capsys):
     resolved, _ = optimize.resolve(
         cli.Optimize(accuracy="fast", engine="mujoco", overrides=(("solver.iterations=7",),))
     )
-    assert resolved.discretization == scene.Discretization(0.01, 10, 1, integrator="newmark")
+    assert resolved.discretization == scene.Discretization(0.02, 6, 1, integrator="newmark")
     assert resolved.solver.iterations == 7
     assert cli.main(["evaluate", "--accuracy", "fastest"]) == 2
     assert "'fastest' unknown; did you mean 'fast'" in capsys.readouterr().err
+
+
+ONE_ACCURACY = [
+    {"accuracy": "standard"},
+    {"accuracy": "fine"},
+    {"search_accuracy": "scene"},
+    {"optimizer": "cma-es"},
+    {"test_trials": 0},
+    {"scene": "paper_spheres"},
+    {"scene": "paper_spheres", "engine": "mujoco"},
+    {"overrides": (("discretization.links=5",),)},
+    {"overrides": (("newton.decrement=1e-6",),)},
+]
+"""Flags with which search and final test have the scene's accuracy."""
+
+
+def test_a_default_search_is_coarse_and_has_the_episodes_that_its_time_allows(tmp_path):
+    def resolved(**flags):
+        out = tmp_path / "run"
+        return optimize.resolve(cli.Optimize(preset="23d", out=out, **flags))
+
+    the_scene, settings = resolved()
+    assert (settings.search_accuracy, settings.episodes) == ("fast", 62)
+    plan = runs.prepare(the_scene, settings)
+    assert plan.task.scene == scene.load("paper", accuracy="fast")
+    assert plan.scene == plan.test_task.scene == scene.load("paper")
+    assert plan.grasps == 4794
+    for flags in ONE_ACCURACY:
+        the_scene, settings = resolved(**flags)
+        plan = runs.prepare(the_scene, settings)
+        assert plan.task is plan.test_task and plan.scene == the_scene, flags
+        assert settings.search_accuracy == "scene", flags
+        assert settings.episodes == (128 if "optimizer" in flags else 30), flags
+    assert resolved(accuracy="fine", search_accuracy="standard")[1].search_accuracy == "standard"
 
 
 def test_mujoco_converges_with_the_scene_s_own_limits():
@@ -319,7 +397,8 @@ def test_every_variant_is_a_scene_and_every_row_has_its_variants(tmp_path):
     scenes = {name: variant.scene() for name, variant in budget.VARIANTS.items()}
     fine = scenes["truth"].discretization
     assert (fine.timestep, fine.links, fine.hull_rings) == (0.002, 20, 4)
-    assert scenes["1e-3"].newton.decrement == 1e-3 and scenes["4 iterations"].newton.iterations == 4
+    tolerances = [scenes[name].newton.decrement for name in ("standard", report.BASE, "truth")]
+    assert tolerances == [1e-3, 1e-6, 1e-6] and scenes["4 iterations"].newton.iterations == 4
     named = {n for c in report.CHANGES for n in (c.of, c.to)}
     named |= {*report.PRESETS, *report.CANDIDATES, *budget.TIMED, *report.WORDS}
     assert named <= set(budget.VARIANTS)
@@ -358,7 +437,7 @@ def test_a_choice_between_two_hands_gains_half_of_their_difference(monkeypatch):
     assert decisions.rank(truth, truth) == pytest.approx(1)
     monkeypatch.setattr(decisions, "RESAMPLES", 20)
     wrong = decisions.compared(truth[::-1], truth)
-    assert wrong["flipped"].value == pytest.approx(2 / 3)
+    assert wrong["flipped"].value == pytest.approx(2 / 3) and wrong["kept"].value == 0
     assert wrong["rank"].value == pytest.approx(-1)
     assert wrong["regret"].value == pytest.approx(2 / 3)
     assert decisions.compared(truth, truth)["regret"] == (0, 0, 0)

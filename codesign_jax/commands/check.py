@@ -10,8 +10,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from rich import box
+from rich.table import Table
 
-from codesign_jax import optimize, preflight, runs, sampling, user_code
+from codesign_jax import optimize, preflight, runs, sampling, statistics, user_code
 from codesign_jax.commands import common
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Check
@@ -21,7 +23,7 @@ from codesign_jax.judge import fresh_trials, verdict
 from codesign_jax.judge.cases import Case
 from codesign_jax.runs import Settings, reference, selection
 from codesign_jax.runs.progress import Busy, duration
-from codesign_jax.scene import Scene, with_accuracy
+from codesign_jax.scene import Scene, accuracy_name, library, scene_files, with_accuracy
 from codesign_jax.scene.schema import Problem
 from codesign_jax.statistics import wilson
 from codesign_jax.terminal import Console
@@ -31,6 +33,10 @@ _ROUNDS = 4
 """Batches of random designs of which a mixed sample takes the best."""
 _LEAST = 4
 """Designs that are simulated at accuracy reference, however long that takes."""
+_GRASPS = 360
+"""Grasps in the batch with --presets: flips of few verdicts tell nothing."""
+_REPEATS = 4
+"""Times that a mixed sample has each design with --presets, for a choice between two of them."""
 
 
 class Measured(NamedTuple):
@@ -40,6 +46,8 @@ class Measured(NamedTuple):
     outcomes: Outcome  # arrays of shape (design, trial)
     seconds: float  # wall time of the batch, compiled before
     compiling: float  # time to compile the program, or to load it [s]
+    name: str = ""  # the accuracy; empty for the scene's own
+    rows: np.ndarray | None = None  # index of each row's design among the different ones
 
     @property
     def rate(self) -> float:
@@ -54,10 +62,11 @@ class Measured(NamedTuple):
         """Rate and sizes in a line."""
         size = self.scene.discretization
         count = self.outcomes.cost.size
+        named = f"accuracy {self.name}, " if self.name else ""
         return (
-            f"steps of {1e3 * size.timestep:g} ms, {size.links} links a finger: {self.rate:.3g} "
-            f"grasps/s ({count} grasps in {self.seconds:.3g} s; compiled or loaded in "
-            f"{self.compiling:.1f} s)"
+            f"{named}steps of {1e3 * size.timestep:g} ms, {size.links} links a finger: "
+            f"{self.rate:.3g} grasps/s ({count} grasps in {self.seconds:.3g} s; compiled or "
+            f"loaded in {self.compiling:.1f} s)"
         )
 
 
@@ -65,42 +74,73 @@ def main(options: Check) -> int:
     common.use_compilation_cache()
     load = os.getloadavg()[0]
     case = find_case(options)
-    finer = with_accuracy(case.scene, fresh_trials.ACCURACY)
-    _refuse(options, case, finer)
+    settings = _settings(options, case)
+    levels = _levels(options, case, settings)
+    _refuse(options, case, levels[fresh_trials.ACCURACY])
     console = Console()
     for line in _head(case, load):
         console.print(line)
-    settings = _settings(options, case)
-    return tell(case, settings, *simulate(case, settings, finer, options, console), console)
+    words, measured = simulate(case, settings, levels, options, console)
+    return tell(case, settings, words, measured, console, table=options.presets)
+
+
+def _levels(options: Check, case: Case, settings: Settings) -> dict[str, Scene]:
+    """The scene, at its own accuracy first, at each accuracy to measure; `reference` is the last.
+
+    It is measured at its own, and at that of a search if that is another one.
+    """
+    others = {}
+    if settings.search_accuracy != runs.SCENE_ACCURACY:
+        others[settings.search_accuracy] = _search_scene(options, case, settings)
+    for name in library.available("accuracy") if options.presets else ():
+        others.setdefault(name, with_accuracy(case.scene, name))
+    finer = {fresh_trials.ACCURACY: with_accuracy(case.scene, fresh_trials.ACCURACY)}
+    preset = accuracy_name(case.scene) if options.presets else ""
+    others = {n: scene for n, scene in others.items() if n not in (preset, fresh_trials.ACCURACY)}
+    return {preset: case.scene} | others | finer
+
+
+def _search_scene(options: Check, case: Case, settings: Settings) -> Scene:
+    """The scene at the accuracy of a search; a run's has that in its folder."""
+    if options.run_folder is None:
+        return runs.search_scene(case.scene, settings)
+    file = options.run_folder / scene_files.SEARCH
+    return find_case(dataclasses.replace(options, accuracy=str(file))).scene
 
 
 def simulate(
-    case: Case, settings: Settings, finer: Scene, options: Check, console: Console
-) -> tuple[str, Measured, Measured]:
-    """A description of the designs, and their grasps in the scene and in the finer scene.
+    case: Case, settings: Settings, levels: dict[str, Scene], options: Check, console: Console
+) -> tuple[str, list[Measured]]:
+    """A description of the designs, and their grasps at every accuracy, in the same trials.
 
-    The second are the first of the first ones: the same designs and trials.
+    Those at the last one, `reference`, are the first of them.
     """
-    engines = [case.make_engine(scene) for scene in (case.scene, finer)]
     trials = len(case.scene.objects.object)
-    count = max(_LEAST, (options.grasps or settings.particles * settings.trials) // trials)
+    usual = _GRASPS if options.presets else settings.particles * settings.trials
+    count = max(_LEAST, (options.grasps or usual) // trials)
+    measured: list[Measured] = []
     with Busy(console, "compiling") as busy:
-        run, compiling = _compile(case.scene, engines[0], case, count)
+        engine = case.make_engine()
+        run, compiling = _compile(case.scene, engine, case, count)
         busy.say("simulating at the scene's accuracy")
         designs, words = _sample(options, case, run, count)
         drawn = _draw(case, 1, 0, count).trials
-        outcomes, seconds = min(
-            (_time_call(run, designs, drawn) for _ in range(2)), key=lambda m: m[1]
-        )
-        usual = Measured(case.scene, outcomes, seconds, compiling)
-        few = options.seconds * usual.rate / fresh_trials.steps_and_links(case.scene) / trials
-        few = int(np.clip(few, _LEAST, count))
-        busy.say(f"compiling at accuracy {fresh_trials.ACCURACY}")
-        run, compiling = _compile(finer, engines[1], case, few)
-        busy.say(f"simulating {few * trials} grasps at accuracy {fresh_trials.ACCURACY}")
-        some = designs[:few], jax.tree.map(lambda v: v[:few], drawn)
-        fine = Measured(finer, *_time_call(run, *some), compiling)
-    return words, usual, fine
+        for name, scene in levels.items():
+            number = count
+            if name == fresh_trials.ACCURACY:
+                slower = fresh_trials.steps_and_links(case.scene)
+                few = options.seconds * measured[0].rate / slower / trials
+                number = int(np.clip(few, _LEAST, count))
+            if measured:
+                busy.say(f"compiling at accuracy {name}")
+                run, compiling = _compile(scene, case.make_engine(scene), case, number)
+                busy.say(f"simulating {number * trials} grasps at accuracy {name}")
+            some = designs[:number], jax.tree.map(lambda v, n=number: v[:n], drawn)
+            calls = [_time_call(run, *some) for _ in range(1 if number < count else 2)]
+            outcomes, seconds = min(calls, key=lambda call: call[1])
+            rows = np.unique(np.asarray(some[0]), axis=0, return_inverse=True)[1].ravel()
+            measured.append(Measured(scene, outcomes, seconds, compiling, name, rows))
+    return words, measured
 
 
 def _refuse(options: Check, case: Case, finer: Scene) -> None:
@@ -140,14 +180,19 @@ def _settings(options: Check, case: Case) -> Settings:
         return runs.read_run(options.run_folder)[1]
     objects = len(case.scene.objects.object)
     arguments = {"optimizer": optimize.DEFAULT, "objects": objects}
-    preset = common.design_file(options).preset
-    return runs.make_settings(preset, "concurrent", "morphology", case.engine, 0, **arguments)
+    arguments |= {"policy": case.policy}
+    names = common.design_file(options).preset, "concurrent", "morphology", case.engine
+    settings = runs.make_settings(*names, 0, **arguments)
+    if options.accuracy is None and runs.coarse_search(case.scene, settings):
+        arguments["search_accuracy"] = runs.COARSE
+    return runs.make_settings(*names, 0, **arguments)
 
 
 def _without_own_code(settings: Settings) -> Settings:
     """Settings of as many grasps that import nothing: a run's are a stranger's, maybe."""
     optimizer = optimize.PAPER if user_code.is_user_code(settings.optimizer) else settings.optimizer
     replaced = {"optimizer": optimizer, "cost": runs.SCENE_COST, "policy": ""}
+    replaced["search_accuracy"] = runs.SCENE_ACCURACY  # which may be a file
     return dataclasses.replace(settings, **replaced)
 
 
@@ -185,6 +230,8 @@ def _sample(options: Check, case: Case, run: Run, count: int) -> tuple[jax.Array
         words = runs.describe(case.space, case.design)
     else:
         designs, words = _mixed(options, case, run, count)
+        if options.presets:
+            designs = designs[: max(2, count // _REPEATS)]
     return jnp.asarray(np.resize(designs, (count, designs.shape[1])), jnp.float32), words
 
 
@@ -209,28 +256,106 @@ def _mixed(options: Check, case: Case, run: Run, count: int) -> tuple[np.ndarray
 
 
 def tell(
-    case: Case, settings: Settings, words: str, usual: Measured, fine: Measured, console: Console
+    case: Case,
+    settings: Settings,
+    words: str,
+    measured: list[Measured],
+    console: Console,
+    *,
+    table: bool,
 ) -> int:
     """Prints what `simulate` found; the exit status."""
-    ours = usual.kept[: len(fine.kept)]
-    theirs = fine.kept
-    differ = int((ours != theirs).sum())
-    share = wilson(differ, theirs.size)
-    grasps = runs.prepare(case.scene, _without_own_code(settings)).grasps
-    tested = min(reference.most_trials(None, settings), verdict.USUAL)
-    test = f", and {duration(tested / fine.rate)} for its test at accuracy {fresh_trials.ACCURACY}"
+    usual, fine = measured[0], measured[-1]
     causes = verdict.failure_counts(usual.outcomes.status)
     lines = [
         *f"designs: {words}".split("\n"),
-        str(usual),
-        f"accuracy {fresh_trials.ACCURACY}, {fine}",
+        *map(str, measured),
         *([f"failed: {causes}"] if causes else []),
-        f"kept: {ours.sum()} of {ours.size} grasps, at accuracy {fresh_trials.ACCURACY} "
-        f"{theirs.sum()}; verdicts differ in {differ}: {100 * share.value:.2g} % "
-        f"(95 % interval {100 * share.low:.2g} to {100 * share.high:.2g} %)",
-        f"a search ({settings.optimizer}, preset {settings.preset}, {grasps} grasps): about "
-        f"{duration(usual.compiling + grasps / usual.rate)}{test if tested else ''}",
+        _kept(usual, fine),
+        _search(case, settings, measured),
     ]
     for line in lines:
         console.print(line)
+    if table:
+        common.print_table(console, _table(measured))
     return int(any(failed(m.outcomes.status).all() for m in (usual, fine)))
+
+
+def _kept(usual: Measured, fine: Measured) -> str:
+    """Kept grasps at both accuracies, and how many verdicts differ."""
+    theirs = fine.kept
+    ours = usual.kept[: len(theirs)]
+    differ = int((ours != theirs).sum())
+    share = wilson(differ, theirs.size)
+    return (
+        f"kept: {ours.sum()} of {ours.size} grasps, at accuracy {fresh_trials.ACCURACY} "
+        f"{theirs.sum()}; verdicts differ in {differ}: {100 * share.value:.2g} % "
+        f"(95 % interval {100 * share.low:.2g} to {100 * share.high:.2g} %)"
+    )
+
+
+def _search(case: Case, settings: Settings, measured: list[Measured]) -> str:
+    """How long a search of these settings takes, with its test, and the verdict behind it."""
+    usual, fine = measured[0], measured[-1]
+    searched = next((m for m in measured if m.name == settings.search_accuracy), usual)
+    plan = runs.prepare(case.scene, _without_own_code(settings))
+    episodes = plan.grasps - plan.test_grasps
+    seconds = searched.compiling + episodes / searched.rate + plan.test_grasps / usual.rate
+    if searched is not usual:
+        seconds += usual.compiling + plan.test_grasps / searched.rate
+    tested = min(reference.most_trials(None, settings), verdict.USUAL)
+    test = f", and {duration(tested / fine.rate)} for its test at accuracy {fresh_trials.ACCURACY}"
+    return (
+        f"a search ({settings.optimizer}, preset {settings.preset}, {plan.grasps} grasps): about "
+        f"{duration(seconds)}{test if tested else ''}"
+    )
+
+
+def _table(measured: list[Measured]) -> Table:
+    """A row for each accuracy: what it costs, and what it loses against the last one."""
+    table = Table(box=box.SIMPLE, collapse_padding=True, pad_edge=False)
+    head = ("accuracy", "step [ms]", "links", "ms a grasp", "kept", "verdicts that differ")
+    for name in (*head, "95 % interval", "regret, points"):
+        table.add_column(name, no_wrap=True)
+    truth = measured[-1].kept
+    for level in sorted(measured, key=lambda m: fresh_trials.steps_and_links(m.scene))[::-1]:
+        kept = level.kept[: len(truth)]
+        size = level.scene.discretization
+        differ = int((kept != truth).sum())
+        share = wilson(differ, truth.size)
+        numbers = (
+            f"{1e3 * size.timestep:g}",
+            str(size.links),
+            f"{1e3 / level.rate:.3g}",
+            f"{100 * kept.mean():.1f} %",
+            f"{differ} of {truth.size}",
+            f"{100 * share.low:.1f} to {100 * share.high:.1f} %",
+        )
+        table.add_row(level.name or "the scene's", *numbers, _regret(level, measured[-1]))
+    return table
+
+
+def _regret(level: Measured, fine: Measured) -> str:
+    """What is lost by choosing between two designs at an accuracy, in points of the kept share."""
+    by, truth = (_by_design(m, fine) for m in (level, fine))
+    if by is None or truth is None or level is fine:
+        return "–"
+    truth = statistics.halves(truth)
+    lost = statistics.gain(truth, truth) - statistics.gain(statistics.halves(by), truth)
+    return f"{100 * lost:+.1f}"
+
+
+def _by_design(level: Measured, fine: Measured) -> np.ndarray | None:
+    """Kept grasps of each different design, as many of each, shape (design, trial).
+
+    None without two designs that have a trial for each half at both accuracies.
+    """
+    rows = fine.rows
+    if rows is None:
+        return None
+    kept = level.kept[: len(rows)]
+    groups = [kept[rows == k].ravel() for k in range(rows.max() + 1)]
+    least = min(len(group) for group in groups)
+    if len(groups) < 2 or least < 2:
+        return None
+    return np.stack([group[:least] for group in groups])

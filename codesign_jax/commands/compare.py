@@ -38,10 +38,10 @@ from codesign_jax.scene.parameters import design_space
 from codesign_jax.scene.schema import InputError, Problem
 from codesign_jax.terminal import Console
 
-_OF_SETTINGS = ("schedule", "optimizer", "preset", "engine", "cost")
+_OF_SETTINGS = ("schedule", "optimizer", "preset", "engine", "cost", "search_accuracy")
 TRIALS = 150
 """Trials in which designs are compared by default."""
-_WORDS = {"schedule": "strategy"}
+_WORDS = {"schedule": "strategy", "search_accuracy": "search"}
 
 
 class Compared(NamedTuple):

@@ -201,6 +201,10 @@ class Optimize(Command, SceneFlags):
     """MODULE:CLASS, your own policy that observes the grasp and commands the hand; its parameters
     are searched too (docs/control.md)."""
     engine: Engine = None
+    search_accuracy: Text = None
+    """Accuracy of the episodes, as of --accuracy, which is that of the final test; scene: the same
+    for both. Default: fast, where --accuracy is not given, the scene has the accuracy standard, and
+    optimiser, engine and cost are the defaults, without a policy (docs/accuracy.md)."""
     particles: Annotated[int | None, _size("particles", "Particles")] = None
     trials: Annotated[
         int | None,
@@ -302,14 +306,18 @@ class Evaluate(Command, RunOrDesign):
 class Check(Command, RunOrDesign):
     """Measure speed and accuracy of a scene on this machine, in about a minute.
 
-    Simulates a batch of grasps at the scene's accuracy, and as many of them at accuracy reference
-    as time allows. Prints grasps per second, the share of verdicts that differ, and the duration of
-    a search. The designs are the last ones of a run, a given one, or a mixture of random and better
-    ones.
+    Simulates a batch of grasps at the scene's accuracy, at that of a search, and as many of them at
+    accuracy reference as time allows. Prints grasps per second, the share of verdicts that differ,
+    and the duration of a search. The designs are the last ones of a run, a given one, or a mixture
+    of random and better ones.
     """
 
+    presets: Flag = False
+    """Print a table of all accuracies as well: time of a grasp, kept share, verdicts that differ
+    from those at reference and, for several designs, what is lost by choosing between them
+    (docs/accuracy.md). Compiles each of them."""
     grasps: Count = None
-    """Grasps in the batch; default: the size of an episode."""
+    """Grasps in the batch; default: the size of an episode, or 360 with --presets."""
     seconds: float = 30.0
     """Approximate time for the grasps at accuracy reference [s]."""
 

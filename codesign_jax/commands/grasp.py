@@ -1,5 +1,6 @@
 """The one grasp that `render` and `replay` show: of a design, or a row of a run's trials.csv."""
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,6 +16,7 @@ from codesign_jax.engines.base import recording, tells_forces
 from codesign_jax.judge import verdict
 from codesign_jax.judge.cases import Case
 from codesign_jax.runs import selection
+from codesign_jax.scene import scene_files
 from codesign_jax.scene.schema import InputError
 from codesign_jax.types import Trial
 
@@ -29,6 +31,7 @@ class PlannedGrasp(NamedTuple):
     trial: Trial  # object and noise, no leading axis
     text: str  # what grasp it is, in words
     recorded: str | None  # how it ended in its run, in words; None if it is of no run
+    recorded_at: str = ""  # step and links of the run's search, if they are others
 
 
 def find(options: GraspFlags) -> PlannedGrasp:
@@ -44,11 +47,25 @@ def find(options: GraspFlags) -> PlannedGrasp:
         raise InputError.of(
             "conflict", "--trial and --object exclude each other: a trial has its object"
         )
+    searched = _search_accuracy(options)
+    if flags and options.accuracy is None and searched:
+        # What trials.csv has was simulated at the accuracy of the search.
+        options = dataclasses.replace(options, accuracy=str(searched))
     case = find_case(options)
     common.refuse(common.engine_problems(case.engine))
     if options.run_folder is None:
         return nominal(case, options.object or 0)
     return _of_run(case, options, options.run_folder)
+
+
+def _search_accuracy(options: GraspFlags) -> Path | None:
+    """The accuracy of the run's search, where that is not its scene's."""
+    if options.run_folder is None:
+        return None
+    settings = runs.read_run(options.run_folder)[1]
+    if settings.search_accuracy == runs.SCENE_ACCURACY:
+        return None
+    return options.run_folder / scene_files.SEARCH
 
 
 def _of_run(case: Case, options: GraspFlags, folder: Path) -> PlannedGrasp:
@@ -65,7 +82,10 @@ def _of_run(case: Case, options: GraspFlags, folder: Path) -> PlannedGrasp:
     name = case.scene.objects.object[int(grasp.trial.shape)].name
     episode, particle, trial = grasp.place
     text = f"episode {episode}, particle {particle}, trial {trial}: object {name}"
-    return PlannedGrasp(case, grasp.trial, text, verdict.ending(grasp.outcome))
+    searched = runs.read_search_scene(folder).discretization
+    other = searched != case.scene.discretization
+    at = f" (steps of {1e3 * searched.timestep:g} ms, {searched.links} links)" if other else ""
+    return PlannedGrasp(case, grasp.trial, text, verdict.ending(grasp.outcome), at)
 
 
 def nominal(case: Case, shape: int | str = 0) -> PlannedGrasp:
@@ -91,7 +111,8 @@ def simulate(planned: PlannedGrasp, *, forces: bool = False) -> "Replay":
 def description(planned: PlannedGrasp, shown: "Replay") -> list[str]:
     """Lines that say which grasp it is and how it ended."""
     again = verdict.ending(shown.outcome)
-    ending = f"in the run: {planned.recorded}; here: {again}" if planned.recorded else again
+    before = f"in the run{planned.recorded_at}: {planned.recorded}"
+    ending = f"{before}; here: {again}" if planned.recorded else again
     design = runs.describe(planned.case.space, planned.case.design)
     lines = [design, f"{planned.text}; {ending}"]
     if planned.recorded not in (None, again):

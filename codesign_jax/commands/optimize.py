@@ -24,7 +24,7 @@ from codesign_jax.runs import Plan, RunResult, Settings, columns, reference
 from codesign_jax.runs.directory import reopened
 from codesign_jax.runs.programs import Programs
 from codesign_jax.runs.progress import Busy
-from codesign_jax.scene import Scene, schema
+from codesign_jax.scene import Scene, accuracy_name, schema
 from codesign_jax.scene.parameters import DesignSpace
 from codesign_jax.scene.scene_files import scene_texts
 from codesign_jax.scene.schema import InputError
@@ -65,8 +65,11 @@ def main(options: Optimize) -> int:
         return 0
     most = reference.most_trials(options.reference_trials, settings)
     after = _after(scene, most)
-    arguments = {"devices": options.devices, "chunk": options.chunk, "after": after}
-    with reference.programs_of(plan, most) as programs:
+    slower = fresh_trials.steps_and_links(plan.task.scene) / fresh_trials.steps_and_links(scene)
+    arguments = {"devices": options.devices, "chunk": options.chunk, "after": slower * after}
+    worlds = len(every) * settings.particles * settings.trials
+    alone = len(devices.take(options.devices)) == 1
+    with reference.programs_of(plan, most, worlds if alone else 0) as programs:
         terminal.wait(programs.words())
         with programs.first():
             start = _start(plan, len(every), options)
@@ -256,6 +259,12 @@ def _dry_run(plan: Plan, count: int, options: Optimize) -> None:
         many = plan.test_grasps
         few = plan.finalists
         say(f"final test: {many} of these grasps, {tested} trials of {few} particles{whole}")
+        if plan.retests:
+            say(
+                f"search at accuracy {settings.search_accuracy}, final test at "
+                f"{accuracy_name(scene) or 'that of the scene'}, and {many} grasps more of it at "
+                "the search's"
+            )
     if count > 1:
         say(f"runs: {count}, in one batch; grasps and disk are those of each")
     row = 40 + 12 * plan.space.num_parameters
@@ -339,29 +348,62 @@ def resolve(options: Optimize) -> tuple[Scene, Settings]:
             optimizer, episodes = _of_the_runs(options, scene)
         except InputError as error:
             problems += error.problems
-    settings = runs.make_settings(
-        options.preset,
-        schedules[0],
-        DOMAINS[0] if options.first == ALTERNATE else options.first,
-        options.engine or engines.DEFAULT,
-        options.seed,
-        particles=options.particles,
-        trials=options.trials,
-        episodes=episodes,
-        test_trials=options.test_trials,
-        optimizer=optimizer or optimize.DEFAULT,
-        cost=options.cost or runs.SCENE_COST,
-        policy=options.policy or "",
-        objects=len(scene.objects.object) if scene else 1,
-    )
+    settings = _settings(options, scene, optimizer or optimize.DEFAULT, episodes)
     problems += _flag_problems(options)
     for name in schedules:
         candidate = dataclasses.replace(settings, schedule=name)
         messages = runs.check(candidate, scene.hand if scene else None)
         problems += [problem for problem in messages if problem not in problems]
+    problems += _accuracy_problems(scene, settings) if scene else []
     if problems or scene is None:
         raise InputError(problems)
     return scene, settings
+
+
+def _settings(
+    options: Optimize, scene: Scene | None, optimizer: str, episodes: int | None
+) -> Settings:
+    """Settings of the first run that the flags ask for."""
+    arguments = {
+        "particles": options.particles,
+        "trials": options.trials,
+        "episodes": episodes,
+        "test_trials": options.test_trials,
+        "optimizer": optimizer,
+        "cost": options.cost or runs.SCENE_COST,
+        "policy": options.policy or "",
+        "objects": len(scene.objects.object) if scene else 1,
+    }
+    names = (
+        options.preset,
+        options.schedule.split(",")[0],
+        DOMAINS[0] if options.first == ALTERNATE else options.first,
+        options.engine or engines.DEFAULT,
+    )
+    settings = runs.make_settings(*names, options.seed, **arguments)
+    accuracy = options.search_accuracy
+    if accuracy is None and options.accuracy is None and scene is not None:
+        accuracy = runs.COARSE if runs.coarse_search(scene, settings) else None
+    if accuracy is None:
+        return settings
+    return runs.make_settings(*names, options.seed, search_accuracy=accuracy, **arguments)
+
+
+def _accuracy_problems(scene: Scene, settings: Settings) -> list[str]:
+    """Why the search cannot have its accuracy."""
+    if settings.search_accuracy == runs.SCENE_ACCURACY:
+        return []
+    try:
+        runs.search_scene(scene, settings)
+    except InputError as error:
+        return [problem.told(f"--search-accuracy: {problem}") for problem in error.problems]
+    if not settings.test_trials:
+        sentence = (
+            f"--search-accuracy {settings.search_accuracy} needs a final test at the scene's "
+            "accuracy, and --test-trials is 0"
+        )
+        return [schema.Problem("conflict", sentence)]
+    return []
 
 
 def _flag_problems(options: Optimize) -> list[str]:

@@ -53,7 +53,7 @@ def write_page(planned: grasp.PlannedGrasp, path: Path, console: Console) -> Pat
 
 def show_failures(folder: Path) -> None:
     """Prints the first failed worlds of a run folder."""
-    scene, _ = runs.read_run(folder)
+    scene = runs.read_search_scene(folder)
     paths = sorted((folder / failures.FOLDER).glob("*.npz"))
     for path in paths[:MOST]:
         failure = failures.load(path)
@@ -68,7 +68,8 @@ def explain(path: Path, engine: str | None, policy: str | None) -> int:
     folder = path.parent.resolve().parent
     manifest.refuse_links(folder)
     failure = failures.load(path)
-    scene, settings = runs.read_run(folder)
+    settings = runs.read_run(folder)[1]
+    scene = runs.read_search_scene(folder)
     refuse_other_policy(settings.policy, policy)
     name = engine or settings.engine
     common.refuse(common.engine_problems(name))

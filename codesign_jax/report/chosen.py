@@ -26,6 +26,8 @@ def endings(run: Run) -> str:
         f"Particle {chosen.particle}, chosen as the best by {source}, which flatters it: "
         f"{sentences.of_trials(run.scene, chosen.outcomes)}. "
     )
+    if (retest := run.record.retest) is not None:
+        note += f"Of its finalists: {retest.sentence(run.settings.search_accuracy)}. "
     again = ["evaluate", "--run", str(run.folder), "--accuracy", "reference"]
     return markup.section(
         "How the grasps ended",

@@ -8,7 +8,7 @@ import jax
 from codesign_jax.judge.sentences import Judged
 from codesign_jax.judge.stress import Stress
 from codesign_jax.judge.worth import Worth
-from codesign_jax.runs import Settings
+from codesign_jax.runs import Settings, read_search_scene
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.selection import Chosen
 from codesign_jax.scene import Scene
@@ -33,7 +33,13 @@ class Run(NamedTuple):
     @property
     def judged(self) -> Judged:
         """The trials that judge the design: the fresh ones, or else those that chose it."""
-        return self.reference or self.chosen.judged(self.scene, self.stress)
+        scene = self.scene if self.chosen.tested else self.search_scene
+        return self.reference or self.chosen.judged(scene, self.stress)
+
+    @property
+    def search_scene(self) -> Scene:
+        """The scene that the episodes simulated."""
+        return read_search_scene(self.folder)
 
     @property
     def space(self) -> DesignSpace:

@@ -14,10 +14,10 @@ from codesign_jax.judge.sentences import Judged
 from codesign_jax.report import charts, chosen, landscape, markup, viewer
 from codesign_jax.report.of_run import Run
 from codesign_jax.report.replay import Replay
-from codesign_jax.runs import SCENE_COST
+from codesign_jax.runs import SCENE_ACCURACY, SCENE_COST
 from codesign_jax.runs.selection import Grasp
-from codesign_jax.scene import Scene
-from codesign_jax.scene.scene_files import NAMES
+from codesign_jax.scene import Scene, accuracy_name
+from codesign_jax.scene.scene_files import NAMES, SEARCH
 from codesign_jax.types import HARMLESS, MEANINGS
 
 
@@ -84,12 +84,26 @@ def _settings(run: Run) -> str:
         ("strategy", s.schedule),
         ("optimizer", s.optimizer),
         ("cost", "the scene's" if s.cost == SCENE_COST else f"{s.cost}, of the user's own"),
-        ("engine", f"{s.engine}, time step {1000 * scene.discretization.timestep:g} ms"),
+        ("engine", f"{s.engine}, {_accuracies(run)}"),
         ("grasps", f"{record.done * s.particles * s.trials:,} ({sizes})"),
         ("seed", s.seed),
         ("converged", _converged(run)),
     ]
     return markup.section("Settings", markup.table((), rows))
+
+
+def _accuracies(run: Run) -> str:
+    """The time step, or those of search and final test."""
+    usual, searched = run.scene.discretization, run.search_scene.discretization
+    name = accuracy_name(run.scene)
+    words = f"time step {1000 * usual.timestep:g} ms"
+    if run.settings.search_accuracy == SCENE_ACCURACY:
+        return words
+    return (
+        f"search at accuracy {run.settings.search_accuracy} (time step "
+        f"{1000 * searched.timestep:g} ms, {searched.links} links), final test at "
+        f"{f'accuracy {name} ({words})' if name else words}"
+    )
 
 
 def surroundings(scene: Scene) -> list[tuple[str, str]]:
@@ -133,7 +147,7 @@ def _grasp(run: Run, grasp: tuple[Grasp, Replay] | None) -> str:
     before, again = (verdict.ending(o) for o in (planned.outcome, shown.outcome))
     note = (
         f"The chosen design with the object {name}: trial {trial} of particle {particle} in "
-        f"episode {episode}, simulated again. In the run: {before}; here: {again}."
+        f"episode {episode}, simulated again. In the run{_at(run)}: {before}; here: {again}."
     )
     parts = in_motion(run.scene, shown)
     if before != again:
@@ -143,6 +157,11 @@ def _grasp(run: Run, grasp: tuple[Grasp, Replay] | None) -> str:
         )
         parts = [*parts, markup.paragraph(text, "warning")]
     return markup.section("Best grasp", *parts, markup.paragraph(note, "note"))
+
+
+def _at(run: Run) -> str:
+    name = run.settings.search_accuracy
+    return "" if name == SCENE_ACCURACY else f", at accuracy {name}"
 
 
 def in_motion(scene: Scene, shown: Replay) -> list[str]:
@@ -239,7 +258,7 @@ def _provenance(run: Run) -> str:
     steps = [("started", p["started"]), *(("resumed", step) for step in p.get("resumed", []))]
     for word, step in steps:
         rows.append((f"{word} {step['time']}", shlex.join(["codesign", *step["command"][1:]])))
-    texts = [(run.folder / name) for name in NAMES]
+    texts = [(run.folder / name) for name in (*NAMES, SEARCH)]
     files_shown = {path.name: path.read_text(encoding="utf-8") for path in texts if path.exists()}
     files_shown["provenance.json"] = json.dumps(p, indent=2)
     details = [

@@ -12,14 +12,25 @@ from codesign_jax.runs.directory import RunDirectory, check_folder, reopened, se
 from codesign_jax.runs.errors import AllFailed, RunError
 from codesign_jax.runs.loop import Results, optimize, run_names
 from codesign_jax.runs.plan import Plan, needs_poor_seed, prepare, variant
-from codesign_jax.runs.reading import load_record, read_run
+from codesign_jax.runs.reading import load_record, read_run, read_search_scene
 from codesign_jax.runs.record import History, Record
 from codesign_jax.runs.run import FAILURES, RunResult
-from codesign_jax.runs.settings import SCENE_COST, Settings, check, make_settings
+from codesign_jax.runs.settings import (
+    COARSE,
+    SCENE_ACCURACY,
+    SCENE_COST,
+    Settings,
+    check,
+    coarse_search,
+    make_settings,
+    search_scene,
+)
 from codesign_jax.runs.tables import describe
 
 __all__ = [
+    "COARSE",
     "FAILURES",
+    "SCENE_ACCURACY",
     "SCENE_COST",
     "AllFailed",
     "History",
@@ -32,6 +43,7 @@ __all__ = [
     "Settings",
     "check",
     "check_folder",
+    "coarse_search",
     "describe",
     "load_record",
     "make_settings",
@@ -39,8 +51,10 @@ __all__ = [
     "optimize",
     "prepare",
     "read_run",
+    "read_search_scene",
     "reopened",
     "run_names",
+    "search_scene",
     "setting_of",
     "variant",
 ]

@@ -30,7 +30,11 @@ TABLES = {
     ),
     "trials.csv": CsvTable(("episode", "particle", "trial", "object", *_OUTCOME)),
     "tests.csv": CsvTable(
-        ("particle", "test_cost", "trials", "failed_trials", "paper_success", *ENDS), ""
+        (
+            *("particle", "test_cost", "trials", "failed_trials", "paper_success", *ENDS),
+            "search_kept_trials",
+        ),
+        "",
     ),
 }
 
@@ -87,7 +91,8 @@ MORE = {
 """Tables that are not of a run alone."""
 
 FILES = {
-    *("scene.toml", "hand.toml", "objects.toml", "control.toml", "meshes", "code", "checkpoints"),
+    *("scene.toml", "hand.toml", "objects.toml", "control.toml", "search.toml"),
+    *("meshes", "code", "checkpoints"),
     *("provenance.json", "events.log", "failures", "figures", "landscape.npz", LANDSCAPE),
     *("reference.npz", REFERENCE, "stress.npz", "fingers.npz", "replay.html", "report.html"),
 }

@@ -26,7 +26,7 @@ from codesign_jax.runs.columns import FILES, TABLES
 from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.manifest import LOCK, PROVENANCE
 from codesign_jax.runs.record import Record
-from codesign_jax.runs.settings import Settings, masks_of
+from codesign_jax.runs.settings import SCENE_ACCURACY, Settings, masks_of, search_scene
 from codesign_jax.scene import Scene, scene_files, texts
 from codesign_jax.scene.parameters import design_space
 from codesign_jax.scene.schema import InputError, Problem
@@ -227,7 +227,15 @@ def _resume(path: Path, settings: Settings, command: list[str]) -> list[str]:
 
 
 def _contents(scene: Scene, settings: Settings) -> dict[str, bytes]:
-    return scene_files.contents(scene) | user_code.contents(settings.user_code)
+    files_of_run = scene_files.contents(scene) | user_code.contents(settings.user_code)
+    if settings.search_accuracy != SCENE_ACCURACY:
+        files_of_run[scene_files.SEARCH] = _search_text(scene, settings).encode()
+    return files_of_run
+
+
+def _search_text(scene: Scene, settings: Settings) -> str:
+    description = f"of the search: {settings.search_accuracy}"
+    return scene_files.accuracy_text(search_scene(scene, settings), description)
 
 
 def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str, Any]) -> None:
@@ -256,6 +264,8 @@ def _refuse_other(path: Path, scene: Scene, settings: Settings, stored: dict[str
         for name, text in scene_files.scene_texts(scene).items():
             if name.removesuffix(".toml") not in other:  # of those every line may differ
                 problems += _diff(path, name, text)
+    if not problems and settings.search_accuracy != SCENE_ACCURACY:
+        problems = _diff(path, scene_files.SEARCH, _search_text(scene, settings))
     if not problems:
         problems = _other_code(path, settings, stored)
     if problems:

@@ -29,7 +29,7 @@ from codesign_jax.interrupts import Interrupts, Stopped
 from codesign_jax.optimize import OptimizerState, candidates
 from codesign_jax.runs.directory import open_run
 from codesign_jax.runs.plan import Plan, finalists, needs_poor_seed, variant
-from codesign_jax.runs.programs import Programs
+from codesign_jax.runs.programs import RETEST, Programs
 from codesign_jax.runs.progress import Progress, Voice
 from codesign_jax.runs.record import Start
 from codesign_jax.runs.run import Run, RunResult
@@ -71,8 +71,8 @@ def optimize(
       devices: Devices that simulate; None for all of this host.
       chunk: Most worlds of one device in one call; None for `batch.LIMIT`.  Runs that have no room
         go on when the others have ended.
-      after: What the caller simulates of each run afterwards, as a number of its grasps: the time
-        left that is shown includes it.
+      after: What the caller simulates of each run afterwards, as a number of its episodes' grasps:
+        the time left that is shown includes it.
       programs: What the caller simulates afterwards, to be compiled while the search runs.
 
     Raises:
@@ -83,18 +83,25 @@ def optimize(
     for other in plans.values():
         variant(plan, other.settings)
     many = len(take(devices))
-    task = dataclasses.replace(plan.task, devices=many)
     room = many * (chunk or LIMIT) // (plan.settings.particles * plan.settings.trials)
     results = Results({}, 0)
     size = max(1, min(MOST, room))
     folders = list(plans)
     for start in range(0, len(folders), size):
         group = {folder: plans[folder] for folder in folders[start : start + size]}
-        more = _optimize_group(group, task, command, fresh, after, programs or Programs())
+        plan_here = _on_devices(plan, many)
+        more = _optimize_group(group, plan_here, command, fresh, after, programs or Programs())
         results = Results(results.runs | more.runs, more.signum)
         if results.signum:
             break
     return results
+
+
+def _on_devices(plan: Plan, count: int) -> Plan:
+    """The plan with tasks whose worlds so many devices share."""
+    task = dataclasses.replace(plan.task, devices=count)
+    test = dataclasses.replace(plan.test_task, devices=count) if plan.retests else task
+    return plan._replace(task=task, test_task=test)
 
 
 def run_names(every: Mapping[Path, Settings]) -> dict[Path, str]:
@@ -108,23 +115,22 @@ def run_names(every: Mapping[Path, Settings]) -> dict[Path, str]:
 
 def _optimize_group(
     plans: Mapping[Path, Plan],
-    task: Task,
+    plan: Plan,
     command: list[str],
     fresh: bool,
     after: float,
     programs: Programs,
 ) -> Results:
-    plan = next(iter(plans.values()))
     names = run_names({folder: each.settings for folder, each in plans.items()})
     with contextlib.ExitStack() as stack:
-        ahead = {"test": plan.test_grasps, "after": after}
+        ahead = {"test": len(plan.tests) * plan.test_grasps, "after": after}
         progress = stack.enter_context(Progress(plan.settings.episodes, len(plans), **ahead))
         runs = {}
         for folder, each in plans.items():
             voice = Voice(progress, names[folder] if len(plans) > 1 else "")
             runs[folder] = stack.enter_context(_opened(folder, each, command, fresh, voice))
         interrupts = stack.enter_context(Interrupts(progress.message))
-        Search([*runs.values()], task, progress, interrupts, programs).run()
+        Search([*runs.values()], plan, progress, interrupts, programs).run()
         return Results({folder: run.result for folder, run in runs.items()}, interrupts.signum)
 
 
@@ -145,19 +151,20 @@ class Search:
     def __init__(
         self,
         runs: list[Run],
-        task: Task,
+        plan: Plan,
         progress: Progress,
         interrupts: Interrupts,
         programs: Programs,
     ):
-        """Takes runs of one task, in their open folders; compiles nothing yet."""
+        """Takes runs of one plan, in their open folders; compiles nothing yet."""
         self._runs = runs
-        self._task = task
-        self._plan = runs[0].plan
-        self._episode = task.side_by_side(self._plan.optimizer)
+        self._plan = plan
+        self._task = plan.task
+        self._episode = plan.task.side_by_side(plan.optimizer)
         self._compiled: Callable | None = None
-        worlds = len(runs) * self._plan.settings.particles * self._plan.settings.trials
-        self._size = task.call_size(worlds)  # of every call, so that one program serves
+        worlds = len(runs) * plan.settings.particles * plan.settings.trials
+        # Of every call, so that one program of each task serves.
+        self._size = plan.task.call_size(worlds)
         self._rows: list[Run] = []  # runs that are simulated
         self._progress = progress
         self._interrupts = interrupts
@@ -207,17 +214,17 @@ class Search:
 
     def _outcomes(self, population: jax.Array, key: jax.Array) -> Outcome:
         """Outcomes of one run's particles in the trials of an episode that moves nothing."""
-        (outcomes,) = self._tested([population], [key])
+        (outcomes,) = self._tested(self._task, [population], [key])
         return outcomes
 
     def _tested(
         self,
+        task: Task,
         populations: list[Any],
         keys: list[jax.Array],
         advance: Callable[[int], Any] = lambda worlds: None,
     ) -> list[Outcome]:
         """Outcomes of particles in the first trials of these root keys, in calls of a search."""
-        task = self._task
 
         def checked(worlds: int) -> None:
             advance(worlds)
@@ -261,16 +268,24 @@ class Search:
         chosen = [finalists(run.plan, np.asarray(run.state.particles)) for run in runs]
         size = max(len(few) for few, _ in chosen)
         particles = [few[np.arange(size) % len(few)] for few, _ in chosen]
-        self._progress.begin("testing the final particles")
         rounds = settings.test_rounds
         keys = [codesign.test_key(run.plan.key, k) for run in runs for k in range(rounds)]
         populations = [few for few in particles for _ in range(rounds)]
-        parts = self._tested(populations, keys, self._progress.tested) if rounds else []
+        self._programs.wait(RETEST, lambda words: self._progress.begin(words) if words else None)
+        self._progress.begin("testing the final particles")
+        tests = [
+            self._tested(task, populations, keys, self._progress.tested)
+            for task in self._plan.tests
+        ]
         for i, (run, (_, rows)) in enumerate(zip(runs, chosen, strict=True)):
-            outcomes = parts[i * rounds : (i + 1) * rounds]
-            test = jax.tree.map(lambda *v: np.concatenate(v, axis=1), *outcomes)
-            if run in going and run.error is None:
-                self._let(run, run.finish, jax.tree.map(lambda v, p=rows: v[p], test))
+            if run not in going or run.error is not None:
+                continue
+            of_run = []
+            for parts in tests:
+                outcomes = parts[i * rounds : (i + 1) * rounds]
+                every = jax.tree.map(lambda *v: np.concatenate(v, axis=1), *outcomes)
+                of_run.append(jax.tree.map(lambda v, p=rows: v[p], every))
+            self._let(run, run.finish, *of_run)
 
     def _simulate(
         self, episodes: list[tuple[OptimizerState, np.ndarray]]
@@ -305,6 +320,8 @@ class Search:
                 self._compiled = self._interrupts.call(self._episode.compile, states, masks)
             count = self._task.devices
             where = self._task.engine.name + (f", {count} devices" if count > 1 else "")
+            name = self._plan.settings.search_accuracy
+            where += f", accuracy {name}" if self._plan.retests else ""
             message = f"compiled in {self._programs.seconds:.1f} s (engine {where})"
             self._progress.message(message)
             self._progress.begin(text)

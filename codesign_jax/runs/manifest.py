@@ -18,7 +18,7 @@ from codesign_jax import files, terminal, user_code
 from codesign_jax import scene as scenes
 from codesign_jax.provenance import environment, git_state
 from codesign_jax.runs.columns import FILES, TABLES
-from codesign_jax.runs.settings import Settings, check
+from codesign_jax.runs.settings import SCENE_ACCURACY, Settings, check
 from codesign_jax.scene import scene_files
 from codesign_jax.scene.schema import InputError, Problem
 
@@ -26,8 +26,9 @@ PROVENANCE = "provenance.json"
 """File that makes a folder a run."""
 LOCK = ".lock"
 """File that a process holds while it writes to a run."""
-SCHEMA = 1
+SCHEMA = 2
 """Version of what a run folder holds: it grows when the code before can no longer read a folder."""
+_FURTHER = (scene_files.SEARCH, scene_files.MESHES, user_code.FOLDER)
 _MOST_BYTES = 20_000_000
 _MOST_PROBLEMS = 3
 """Links of a folder that an error names."""
@@ -96,7 +97,7 @@ def refuse_links(path: Path, names: Iterable[str] = (*FILES, *TABLES, LOCK)) -> 
 
 def read_provenance(path: Path) -> dict[str, Any]:
     """What is noted of a run; texts in it are one line each."""
-    refuse_links(path, [PROVENANCE, *scene_files.NAMES, scene_files.MESHES, user_code.FOLDER])
+    refuse_links(path, [PROVENANCE, *scene_files.NAMES, *_FURTHER])
     file = path / PROVENANCE
     try:
         with files.opened(file) as opened:
@@ -117,7 +118,8 @@ def read_provenance(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise _damaged(file, "it is no valid JSON") from error
     if isinstance(stored, dict) and isinstance(stored.get("settings"), dict):
-        stored["settings"] = {"policy": ""} | stored["settings"]  # older runs have none
+        older = {"policy": "", "search_accuracy": SCENE_ACCURACY}  # runs that name neither
+        stored["settings"] = older | stored["settings"]
     if problem := _problem(stored):
         raise _damaged(file, problem)
     if stored["schema"] > SCHEMA:
@@ -208,7 +210,8 @@ def _problem(stored: Any) -> str:
     wrong = [name for name, types in _TYPES.items() if not _fits(stored.get(name), types)]
     if not wrong:
         folders = ([scene_files.MESHES], [user_code.FOLDER])
-        ours = (n in scene_files.NAMES or n.split("/")[:-1] in folders for n in stored["files"])
+        names = (*scene_files.NAMES, scene_files.SEARCH)
+        ours = (n in names or n.split("/")[:-1] in folders for n in stored["files"])
         right = {
             "settings": stored["settings"].keys() == _TYPES["settings"].keys(),  # type: ignore[attr-defined]
             "id": re.fullmatch("[0-9a-f]{32}", stored["id"]) is not None,

@@ -11,7 +11,7 @@ from codesign_jax.codesign import Task
 from codesign_jax.engines import make_engine
 from codesign_jax.optimize import Optimizer
 from codesign_jax.policy import ControlLoop
-from codesign_jax.runs.settings import SCENE_COST, Settings, masks_of
+from codesign_jax.runs.settings import SCENE_COST, Settings, masks_of, search_scene
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import DesignSpace, design_space
 
@@ -19,15 +19,27 @@ from codesign_jax.scene.parameters import DesignSpace, design_space
 class Plan(NamedTuple):
     """A run that was checked and can start; see `prepare`."""
 
-    task: Task
+    task: Task  # of the episodes, at the accuracy of the search
     settings: Settings
     optimizer: Optimizer
     mask: np.ndarray
     key: jax.Array
+    test_task: Task  # of the final test, at the scene's own accuracy; `task` where they are alike
 
     @property
     def scene(self) -> Scene:
-        return self.task.scene
+        """The run's scene, which its final test simulates."""
+        return self.test_task.scene
+
+    @property
+    def retests(self) -> bool:
+        """Whether the final test has another accuracy than the search."""
+        return self.test_task is not self.task
+
+    @property
+    def tests(self) -> tuple[Task, ...]:
+        """Tasks of the final test: at the scene's accuracy and, for comparison, at the search's."""
+        return (self.test_task, self.task) if self.retests else (self.task,)
 
     @property
     def space(self) -> DesignSpace:
@@ -63,18 +75,24 @@ def prepare(scene: Scene, settings: Settings) -> Plan:
     """
     space = design_space(scene.hand, settings.preset)
     mask = masks_of(scene, settings)
+    n = settings.particles
+    optimizer = codesign.make_optimizer(settings.optimizer, space, num_particles=n)
+    test_task = _task(scene, space, settings)
+    searched = search_scene(scene, settings)
+    task = test_task if searched == scene else _task(searched, space, settings)
+    key = jax.random.key(settings.seed)
+    return Plan(task, settings, optimizer, mask, key, test_task)
+
+
+def _task(scene: Scene, space: DesignSpace, settings: Settings) -> Task:
     engine = make_engine(settings.engine, scene)
     if settings.policy:
         engine = ControlLoop(engine, user_code.make_policy(settings.policy, scene)[0])
-    n = settings.particles
-    optimizer = codesign.make_optimizer(settings.optimizer, space, num_particles=n)
     task = Task(scene, space, settings.trials, engine)
-    key = jax.random.key(settings.seed)
-    if settings.cost != SCENE_COST:
-        cost, stops = user_code.make_cost(settings.cost, scene)
-        changes = {"record_qpos": not stops, "stop_when_lost": stops}
-        task = dataclasses.replace(task, cost=cost, **changes)
-    return Plan(task, settings, optimizer, mask, key)
+    if settings.cost == SCENE_COST:
+        return task
+    cost, stops = user_code.make_cost(settings.cost, scene)
+    return dataclasses.replace(task, cost=cost, record_qpos=not stops, stop_when_lost=stops)
 
 
 def variant(plan: Plan, settings: Settings) -> Plan:

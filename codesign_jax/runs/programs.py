@@ -11,6 +11,9 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Self
 
+RETEST = "re-test"
+"""Name of the program of a final test at another accuracy than the search."""
+
 
 class Programs:
     """The first program of a command, which its caller compiles, and later ones in their order."""

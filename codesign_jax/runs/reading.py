@@ -15,8 +15,8 @@ from codesign_jax.runs import record as records
 from codesign_jax.runs.checkpoint import Checkpoints, Restored
 from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.record import Record
-from codesign_jax.runs.settings import Settings
-from codesign_jax.scene import Scene, texts
+from codesign_jax.runs.settings import SCENE_ACCURACY, Settings
+from codesign_jax.scene import Scene, scene_files, texts
 from codesign_jax.scene.schema import InputError, Problem
 
 Tell = Callable[[str], None]
@@ -46,6 +46,14 @@ def read_run(
         path / "scene.toml", object_set=object_set, accuracy=accuracy, overrides=overrides
     )
     return scene, Settings(**stored["settings"])
+
+
+def read_search_scene(path: Path) -> Scene:
+    """Reads the scene that a run's episodes simulate: at the accuracy of the search."""
+    scene, settings = read_run(path)
+    if settings.search_accuracy == SCENE_ACCURACY:
+        return scene
+    return read_run(path, accuracy=path / scene_files.SEARCH)[0]
 
 
 def load_record(folder: Path, *, tell: Tell | None = None) -> Record | None:

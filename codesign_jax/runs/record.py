@@ -11,6 +11,8 @@ import numpy as np
 from codesign_jax import array_files
 from codesign_jax.array_files import Array, Described
 from codesign_jax.codesign import EpisodeInfo
+from codesign_jax.judge import fresh_trials
+from codesign_jax.judge.fresh_trials import Retest
 from codesign_jax.optimize import OptimizerState
 from codesign_jax.runs.errors import RunError
 from codesign_jax.runs.settings import Settings
@@ -89,10 +91,20 @@ class Record:
     test: Outcome | None = None
     # What the run started from; None if its optimiser looks for its start by itself
     start: Start | None = None
+    # Outcomes of the final test's trials at the accuracy of the search, shape (particle, trial);
+    # None where the test has that accuracy itself
+    searched: Outcome | None = None
 
     @property
     def done(self) -> int:
         return int(self.state.episode)
+
+    @property
+    def retest(self) -> Retest | None:
+        """How the finalists did at both accuracies, where search and test have two."""
+        if self.test is None or self.searched is None:
+            return None
+        return fresh_trials.retest(np.asarray(self.state.particles), self.test, self.searched)
 
     def failed_outcomes(self) -> Outcome | None:
         """The final test or the last episode, where every trial of it failed."""
@@ -125,6 +137,8 @@ def to_arrays(record: Record) -> dict:
         arrays["test"] = record.test._asdict()
     if record.start is not None:
         arrays["start"] = record.start._asdict()
+    if record.searched is not None:
+        arrays["searched"] = record.searched._asdict()
     return jax.tree.map(np.asarray, arrays)
 
 
@@ -136,10 +150,13 @@ def from_arrays(arrays: dict) -> Record:
         key = jax.random.wrap_key_data(jnp.asarray(s["key"]))
         memory = jax.tree.map(jnp.asarray, s.get("memory"))
         state = OptimizerState(jnp.asarray(s["particles"]), jnp.asarray(s["episode"]), key, memory)
-        test = Outcome(**jax.tree.map(jnp.asarray, arrays["test"])) if "test" in arrays else None
+        tests = {
+            name: Outcome(**jax.tree.map(jnp.asarray, arrays[name])) if name in arrays else None
+            for name in _TESTS
+        }
         start = Start(**arrays["start"]) if "start" in arrays else None
         history = History(outcomes=Outcome(**h.pop("trials")), **h)
-        return Record(state, history, test, start)
+        return Record(state, history, start=start, **tests)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise RunError(
             f"its checkpoints hold other arrays than this version of codesign-jax has ({error}): "
@@ -162,18 +179,22 @@ def _shapes(record: Any, settings: Settings) -> Iterator[tuple[str, Any, tuple]]
     yield "population", history.population, (e, n, p)
     for name in ("cost", "weight", "ancestors"):
         yield name, getattr(history, name), (e, n)
-    if record.test is not None:
+    for group in _TESTS:
+        if (test := getattr(record, group)) is None:
+            continue
         # The last episode's trials may be among them, see `run.Run.finish`.
-        tested = n, max(np.shape(record.test.cost)[-1], settings.test_rounds * settings.trials)
-        for name, value in record.test._asdict().items():
+        tested = n, max(np.shape(test.cost)[-1], settings.test_rounds * settings.trials)
+        for name, value in test._asdict().items():
             if value is not None or name not in _NOT_EVERYWHERE:
-                yield f"test/{name}", value, tested
+                yield f"{group}/{name}", value, tested
     if record.start is not None:
         yield "start/design", record.start.design, (p,)
         yield "start/cost", record.start.cost, ()
         yield "start/candidates", record.start.candidates, ()
 
 
+_TESTS = ("test", "searched")
+"""Outcomes of final particles in a record."""
 _MOST_MEMORY = 100
 """Most arrays that an optimiser keeps for itself."""
 _NOT_EVERYWHERE = {"capped", "residual"}
@@ -209,7 +230,8 @@ def refuse_other_arrays(described: Described) -> None:
     trials = outcome_layout("episode", "particle", "trial")
     tests = outcome_layout("particle", "tested")
     layout |= {f"history/trials/{name}": array for name, array in trials.items()}
-    layout |= {f"test/{name}": array._replace(optional=True) for name, array in tests.items()}
+    for group in _TESTS:
+        layout |= {f"{group}/{n}": array._replace(optional=True) for n, array in tests.items()}
     memory = [name for name in described if name.startswith("state/memory")][:_MOST_MEMORY]
     layout |= {n: Array("biuf", tuple(described[n][1])) for n in memory}
     if wrong := array_files.problem(described, layout):

@@ -27,7 +27,7 @@ from codesign_jax.judge.worth import Worth
 from codesign_jax.runs import Settings, columns, tables
 from codesign_jax.runs.directory import RunDirectory
 from codesign_jax.runs.plan import Plan
-from codesign_jax.runs.programs import Programs
+from codesign_jax.runs.programs import RETEST, Programs
 from codesign_jax.runs.progress import Meter
 from codesign_jax.runs.record import outcome_layout
 from codesign_jax.runs.selection import case_of_run
@@ -67,21 +67,27 @@ def most_trials(trials: int | None, settings: Settings) -> int:
     return verdict.MOST if settings.engine == engines.DEFAULT and settings.test_trials else 0
 
 
-def programs_of(plan: Plan, most: int) -> Programs:
+def programs_of(plan: Plan, most: int, worlds: int = 0) -> Programs:
     """The programs of a search and of what is simulated of its design, in the order of their use.
 
     Args:
       most: Most fresh trials; with 0 nothing is simulated behind the search.
+      worlds: Worlds of an episode of all runs, where one device simulates them; 0 if several do.
     """
     settings = plan.settings
-    if not most or settings.policy or not getattr(plan.task.engine, "fills", False):
+    if settings.policy or not getattr(plan.task.engine, "fills", False):
         return Programs()
     case = Case(plan.scene, plan.space, plan.space.default(), settings.engine)
+    retest = {}
+    if plan.retests and plan.task.cost is None and worlds:
+        retest = {RETEST: partial(case.compile, worlds, rollout.Options())}
+    if not most:
+        return Programs(retest)
     finer = case._replace(scene=with_accuracy(plan.scene, fresh_trials.ACCURACY))
     fresh = {FRESH: partial(finer.compile, verdict.BATCH, rollout.Options())}
     if finer.scene.structure == case.scene.structure:
         fresh = {}
-    return Programs(fresh | stress.compilers(case, STRESS_TRIALS))
+    return Programs(retest | fresh | stress.compilers(case, STRESS_TRIALS))
 
 
 def test(

@@ -22,7 +22,7 @@ from codesign_jax.runs.plan import Plan
 from codesign_jax.runs.progress import Report, Voice
 from codesign_jax.runs.record import Record, Start
 from codesign_jax.runs.settings import SCENE_COST
-from codesign_jax.scene import texts
+from codesign_jax.scene import accuracy_name, texts
 from codesign_jax.types import Outcome, Status
 
 FAILURES = (OSError, RunError, NoSeed, KernelUnavailable)
@@ -114,7 +114,7 @@ class Run:
         if record.done < total and record.test is not None and step is not None:
             # The run was extended: its test was of particles that are no longer final, and the next
             # episode takes the step of that test.
-            record.test = None
+            record.test = record.searched = None
             self._store.discard([step])
         record.history = records.with_room(record.history, total)
         where = self._directory.path
@@ -159,18 +159,27 @@ class Run:
         self._report()
         self._refuse_all_failed()
 
-    def finish(self, test: Outcome) -> None:
-        """Keeps the final test: outcomes of the final particles in its own trials."""
+    def finish(self, test: Outcome, searched: Outcome | None = None) -> None:
+        """Keeps the final test: outcomes of the final particles in its own trials.
+
+        Args:
+          searched: Outcomes in the same trials at the accuracy of the search, if it is another.
+        """
         assert self.record is not None
-        if not self.plan.optimizer.keeps_best:
+        if not self.plan.optimizer.keeps_best and searched is None:
             # Outcomes by which the best particles so far were chosen are too good to count.
             last = self.record.last_outcomes()
             test = jax.tree.map(lambda *v: np.concatenate(v, axis=1), last, test)
         self.record.test = test
+        self.record.searched = searched
         self._keep(self.plan.settings.episodes + 1)
         self._write_tables(self.done)
         self._refuse_all_failed()
-        self.say(f"final test: {self.plan.test_grasps} grasps")
+        words = f"final test: {self.plan.test_grasps} grasps"
+        if (again := self.record.retest) is not None:
+            words += f" at accuracy {accuracy_name(self.plan.scene) or 'of the scene'}"
+            words += f"; {again.sentence(self.plan.settings.search_accuracy)}"
+        self.say(words)
 
     def fail(self, error: Exception) -> None:
         """Ends the run; events.log has the traceback as well, where it is none of `FAILURES`."""
@@ -207,7 +216,7 @@ class Run:
             particle, number = np.argwhere(started_inside)[0]
             params = self.plan.space.params(info.population[particle])
             trial = jax.tree.map(lambda v: np.asarray(v)[number], info.drawn)
-            for text in preflight.why_invalid(self.plan.scene, params, trial):
+            for text in preflight.why_invalid(self.plan.task.scene, params, trial):
                 self.say(f"warning: particle {particle}, trial {number}: {text}")
 
     def _report(self) -> None:

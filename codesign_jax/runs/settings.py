@@ -7,12 +7,16 @@ import numpy as np
 
 from codesign_jax import engines, optimize, sizes, user_code
 from codesign_jax.optimize import MAX_PARTICLES, schedule
-from codesign_jax.scene import Scene, schema
+from codesign_jax.scene import Scene, schema, with_accuracy
 from codesign_jax.scene.hand import Hand
 from codesign_jax.scene.parameters import DesignSpace, design_space
 
 SCENE_COST = "scene"
 """Name of the scene's own cost."""
+SCENE_ACCURACY = "scene"
+"""Name of the scene's own accuracy, for a search at the accuracy of its test."""
+COARSE = "fast"
+"""Accuracy of a search where none is asked for and `coarse_search` says that it is known to do."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +37,7 @@ class Settings:
       optimizer: One of `optimize.NAMES`, or MODULE:NAME of one of the user's own.
       cost: `SCENE_COST`, or MODULE:NAME of a cost of the user's own.
       policy: MODULE:NAME of a policy of the user's own; empty without one.
+      search_accuracy: Accuracy of the episodes; the final test has that of the scene.
     """
 
     preset: str
@@ -47,6 +52,7 @@ class Settings:
     optimizer: str = optimize.PAPER
     cost: str = SCENE_COST
     policy: str = ""
+    search_accuracy: str = SCENE_ACCURACY
 
     @property
     def user_code(self) -> tuple[str, ...]:
@@ -82,6 +88,7 @@ def make_settings(
     optimizer: str = optimize.PAPER,
     cost: str = SCENE_COST,
     policy: str = "",
+    search_accuracy: str = SCENE_ACCURACY,
     objects: int = 3,
 ) -> Settings:
     """Fills sizes that are not given: those of `sizes`, in a scene with so many `objects`."""
@@ -90,9 +97,36 @@ def make_settings(
     usual = by_preset.get(preset, by_preset[""])
     if screens:
         usual = usual._replace(trials=max(objects, usual.trials))
+    if screens and search_accuracy != SCENE_ACCURACY:
+        longer = sizes.SEARCH_EPISODES
+        usual = usual._replace(episodes=longer.get(preset, longer[""]))
     given_sizes = (particles, trials, episodes, test_trials)
     n, t, e, test = (s if a is None else a for a, s in zip(given_sizes, usual, strict=True))
-    return Settings(preset, schedule, first, engine, n, t, e, seed, test, optimizer, cost, policy)
+    names = optimizer, cost, policy, search_accuracy
+    return Settings(preset, schedule, first, engine, n, t, e, seed, test, *names)
+
+
+def coarse_search(scene: Scene, settings: Settings) -> bool:
+    """Whether a search at `COARSE` is known to find hands that are as good or better.
+
+    It was measured with the default optimiser and engine, in scenes that have the accuracy
+    `standard`; what the user's own code makes of fewer and longer steps is not known. A final test
+    has to follow.
+    """
+    return (
+        (settings.optimizer, settings.engine) == (optimize.DEFAULT, engines.DEFAULT)
+        and (settings.cost, settings.policy) == (SCENE_COST, "")
+        and settings.test_trials > 0
+        and scene.effects.surface == "hull"
+        and with_accuracy(scene, "standard") == scene
+    )
+
+
+def search_scene(scene: Scene, settings: Settings) -> Scene:
+    """The scene that the episodes simulate."""
+    if settings.search_accuracy == SCENE_ACCURACY:
+        return scene
+    return with_accuracy(scene, settings.search_accuracy)
 
 
 def masks_of(scene: Scene, settings: Settings) -> np.ndarray:

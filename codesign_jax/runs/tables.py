@@ -56,7 +56,8 @@ def write_run(
         (folder / TESTS).unlink(missing_ok=True)
     else:
         test = summarize_test(scene, record.test)
-        rows = _of_test(scene, space, np.asarray(record.state.particles), test)
+        particles = np.asarray(record.state.particles)
+        rows = _of_test(scene, space, particles, test, record.searched)
         _replace(folder / TESTS, _text(TESTS, space, rows))
 
 
@@ -215,9 +216,14 @@ def _of_episodes(
 
 
 def _of_test(
-    scene: Scene, space: DesignSpace, particles: np.ndarray, test: FinalTest
+    scene: Scene,
+    space: DesignSpace,
+    particles: np.ndarray,
+    test: FinalTest,
+    searched: Outcome | None,
 ) -> Iterator[Row]:
     failed = types.failed(np.asarray(test.outcomes.status))
+    at_search = [""] * len(particles) if searched is None else verdict.kept(searched).sum(1)
     for i, design in enumerate(_designs(TESTS, space, particles)):
         yield {
             "particle": i,
@@ -226,6 +232,7 @@ def _of_test(
             "failed_trials": failed[i].sum(),
             "paper_success": int(test.paper_success[i]),
             **_ends(scene, jax.tree.map(lambda v, i=i: np.asarray(v)[i], test.outcomes)),
+            "search_kept_trials": at_search[i],
             **design,
         }
 

@@ -14,7 +14,13 @@ codesign_jax.scene.schema.InputError: gravty is not a known key; did you mean 'g
 """
 
 from codesign_jax.scene.description import Scene, by_structure
-from codesign_jax.scene.loading import check_together, load, load_accuracy, with_accuracy
+from codesign_jax.scene.loading import (
+    accuracy_name,
+    check_together,
+    load,
+    load_accuracy,
+    with_accuracy,
+)
 from codesign_jax.scene.schema import InputError, Problem
 from codesign_jax.scene.tables import (
     Accuracy,
@@ -48,6 +54,7 @@ __all__ = [
     "by_structure",
     "check_together",
     "load",
+    "accuracy_name",
     "load_accuracy",
     "with_accuracy",
 ]

@@ -22,7 +22,7 @@ from codesign_jax.scene.description import Scene, SceneFile
 from codesign_jax.scene.primitives import PRIMITIVES
 from codesign_jax.scene.tables import Accuracy, Fixture
 
-_OF_ACCURACY = ("discretization", "solver", "newton")
+OF_ACCURACY = ("discretization", "solver", "newton")
 """Tables of a scene that an accuracy replaces values of."""
 
 
@@ -171,12 +171,18 @@ def with_accuracy(scene: Scene, name: str | Path) -> Scene:
     Raises:
       InputError: with every problem of the preset's file.
     """
-    tables = {key: getattr(scene, key) for key in _OF_ACCURACY}
+    tables = {key: getattr(scene, key) for key in OF_ACCURACY}
     preset = load_accuracy(name)
     return dataclasses.replace(
         scene,
         **{key: dataclasses.replace(t, **getattr(preset, key)) for key, t in tables.items()},
     )
+
+
+def accuracy_name(scene: Scene) -> str:
+    """Name of the built-in accuracy whose values a scene has; empty if it has those of none."""
+    names = library.available("accuracy")
+    return next((name for name in names if with_accuracy(scene, name) == scene), "")
 
 
 def _preset(name: str | Path | None, problems: list[str]) -> dict[str, dict[str, Any]]:
@@ -188,7 +194,7 @@ def _preset(name: str | Path | None, problems: list[str]) -> dict[str, dict[str,
     except schema.InputError as error:
         problems += error.problems
         return {}
-    return {key: getattr(preset, key) for key in _OF_ACCURACY}
+    return {key: getattr(preset, key) for key in OF_ACCURACY}
 
 
 def _beside(path: Path, name: str) -> str | Path:

@@ -12,10 +12,13 @@ import tomli_w
 from codesign_jax import files, reuse
 from codesign_jax import scene as scenes
 from codesign_jax.scene import Scene, key_frames
+from codesign_jax.scene.loading import OF_ACCURACY
 from codesign_jax.scene.objects import Shape
 
 NAMES = ("scene.toml", "hand.toml", "objects.toml", "control.toml")
 MESHES = "meshes"  # folder of the objects' meshes
+SEARCH = "search.toml"
+"""The accuracy of a run's search, where it is another one than its scene's."""
 
 
 def scene_texts(scene: Scene) -> dict[str, str]:
@@ -48,6 +51,13 @@ def contents(scene: Scene) -> dict[str, bytes]:
         if shape.mesh:
             file_bytes[_mesh_name(shape, i)] = shape.mesh.content
     return file_bytes
+
+
+def accuracy_text(scene: Scene, description: str) -> str:
+    """All values of a scene's accuracy as a file that `scene.load_accuracy` reads."""
+    tables = {name: getattr(scene, name) for name in OF_ACCURACY}
+    units = {f"{n}.{key}": unit for n, t in tables.items() for key, unit in _units(t).items()}
+    return _document({"description": description} | _plain(tables), units)
 
 
 def digest(scene: Scene, engine: str, designs: np.ndarray, *numbers: int) -> str:

@@ -265,7 +265,7 @@ class Newton:
 
     iterations: int = quantity("", 1, 1000, structure=True, default=24)
     evaluations: int = quantity("", 1, 1000, structure=True, default=14)
-    decrement: float = quantity("", 1e-16, 1, structure=True, default=1e-6)
+    decrement: float = quantity("", 1e-16, 1, structure=True, default=1e-3)
     residual: float = quantity("", 1e-8, 1e8, structure=True, default=0.01)
 
 

@@ -21,7 +21,7 @@ from codesign_jax.judge.cases import Case
 from codesign_jax.judge.sentences import Judged
 from codesign_jax.report import animation
 from codesign_jax.runs import reference, selection
-from codesign_jax.scene import Scene, library
+from codesign_jax.scene import Scene, accuracy_name, library
 from codesign_jax.scene.loading import with_accuracy
 from codesign_jax.types import Outcome, Params, Trial
 
@@ -156,14 +156,15 @@ class Desk:
         scene, settings = runs.read_run(folder)
         kept = reference.kept(folder, scene, settings)
         chosen = selection.choose(scene, self.record)
+        if not chosen.tested:
+            scene = runs.read_search_scene(folder)
         return kept.fresh or chosen.judged(scene, kept.stress)
 
     @property
     def accuracy(self) -> str:
         """The scene's own accuracy in words, by the name of the one that it equals."""
-        scene = self.case.scene
-        same = [name for name in self.accuracies if name and with_accuracy(scene, name) == scene]
-        return f"{same[0]} (the scene's)" if same else "the scene's own"
+        name = accuracy_name(self.case.scene)
+        return f"{name} (the scene's)" if name else "the scene's own"
 
     def flags(self, accuracy: str) -> list[str]:
         """Flags that name to another command what a design's file does not."""

@@ -36,7 +36,6 @@ EVERY = 0.02
 """Time between compared states [s], a multiple of all steps."""
 FINEST = "0.5 ms, 20 links"
 SETTINGS: dict[str, tuple[str, dict]] = {
-    "20 ms, 6 links": ("standard", {"timestep": 0.02, "links": 6}),
     "`fast`": ("fast", {}),
     "`standard`": ("standard", {}),
     "`fine`": ("fine", {}),

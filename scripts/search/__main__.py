@@ -3,6 +3,8 @@
 python -m scripts.search --out runs/search                      # again to go on where it stopped
 python -m scripts.search --robust --masses 0.05 0.2 0.5         # what its winners keep at 500 g
 python -m scripts.search --report docs/data/search              # tables of the note
+python -m scripts.search --search-accuracy fast --judged reference --first 60000 --tests 100 \\
+    --budget 4794 --at 4794    # as codesign optimize searches; 2394 at the scene's own accuracy
 
 At every mark the optimiser's best particles meet fresh trials, and the one that costs least in
 these is what it recommends there: 25 particles in 12 trials each, or the final test of an optimiser
@@ -60,7 +62,12 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         default=[optimize.DEFAULT],
         help="names, each with changes if wanted: screened-es:sigma=0.2,particles=13,trials=6",
     )
+    parser.add_argument("--search-accuracy", help="of the episodes; default: the scene's")
+    parser.add_argument(
+        "--judged", metavar="ACCURACY", help="at which designs are judged; likewise"
+    )
     parser.add_argument("--seeds", type=int, default=100)
+    parser.add_argument("--first", type=int, default=0, help="first of the seeds")
     parser.add_argument("--budget", type=int, default=2400, help="grasps of a seed, all counted")
     parser.add_argument("--tests", type=int, default=400, help="trials of a recommended design")
     parser.add_argument("--marks", type=int, default=9, help="times at which one is recommended")
@@ -79,12 +86,16 @@ def search(args: argparse.Namespace, name: str) -> None:
     case = make_case(name, space, args.preset, len(scene.objects.object))
     changed = ["--robust"] * args.robust + [*chain.from_iterable(args.overrides)]
     changed += [f"--constants={Path(args.constants).stem}"] if args.constants else []
+    accuracies = {"searched": args.search_accuracy, "judged": args.judged}
+    changed += [f"--{name}={accuracy}" for name, accuracy in accuracies.items() if accuracy]
+    changed += [f"--first={args.first}"] if args.first else []
     words = [Path(name).stem for name in (args.hand, args.objects) if name]
     words += [args.preset, name, *(re.sub(r"^--|^[a-z_.]+[.](?=.*=)", "", c) for c in changed)]
     stem = re.sub("[:,]", "-", "-".join(dict.fromkeys(words))).replace("=", "")
     if len(stem) > LONGEST_STEM:
         stem = f"{stem[:LONGEST_STEM]}-{zlib.crc32(stem.encode()):08x}"
-    arguments = {n: getattr(args, n) for n in ("seeds", "budget", "tests", "marks", "at")}
+    arguments = {n: getattr(args, n) for n in ("seeds", "budget", "tests", "marks", "at", "first")}
+    arguments |= {n: scenes.with_accuracy(scene, a) for n, a in accuracies.items() if a}
     study = Study(case, scene, engine, space, **arguments, path=args.out / f"{stem}.npz")
     row = {"preset": args.preset, "scene": args.scene, "hand": args.hand, "objects": args.objects}
     row["changes"] = changed

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from codesign_jax import codesign, optimize, rollout, runs
 from codesign_jax.batch import LIMIT, WORLDS, in_chunks
 from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.cost import particle_cost
-from codesign_jax.engines import Engine
+from codesign_jax.engines import Engine, make_engine
 from codesign_jax.optimize import Optimizer, OptimizerState
 from codesign_jax.reuse import SceneProgram
 from codesign_jax.scene import Scene
@@ -93,28 +94,40 @@ class Study:
         marks: int = 9,
         at: Sequence[int] = (),
         path: Path,
+        first: int = 0,
+        searched: Scene | None = None,
+        judged: Scene | None = None,
     ):
+        """Starts a study, or goes on with that of its file.
+
+        Args:
+          first: The first of the seeds.
+          searched: The scene at the accuracy of the episodes; by default the scene.
+          judged: The scene at the accuracy at which recommended designs are judged; likewise.
+        """
         self.case = case
         self.scene = scene
+        self.judged = judged or scene
         self.engine = engine
         self.space = space
         self.tests = tests
         self.path = path
-        self.keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
+        self.keys = jax.vmap(jax.random.key)(first + jnp.arange(seeds))
         self.mask = jnp.ones(space.num_parameters, bool)
         objects = len(scene.objects.object)
         self.rounds = -(-case.tests // objects) * objects
         most = WORLDS.get(jax.default_backend(), LIMIT)
         self.batch = min(most, seeds * case.worlds)
-        self.simulate = SceneProgram(scene, jax.jit(self._simulate))
-        task = codesign.Task(scene, space, case.trials, engine)
+        self.programs: dict[Any, SceneProgram] = {}
+        searched = searched or scene
+        task = codesign.Task(searched, space, case.trials, self._engine(searched))
         self.episode = task.side_by_side(case.optimizer)
         episodes = self._episodes(budget)
-        first = getattr(case.optimizer, "screening", 0) + getattr(case.optimizer, "retests", 0) + 1
+        begins = getattr(case.optimizer, "screening", 0) + getattr(case.optimizer, "retests", 0) + 1
         self.marks = sorted(
             {*map(self._episodes, at)}
             # Backwards, so that a single mark is the last one.
-            or {*np.geomspace(episodes, min(first, episodes), marks).round().astype(int)}
+            or {*np.geomspace(episodes, min(begins, episodes), marks).round().astype(int)}
         )
         self.kept: dict[int, np.ndarray] = {}
         self.designs: dict[int, np.ndarray] = {}
@@ -219,11 +232,11 @@ class Study:
             grasps = tested.size * self.rounds
         design = chosen[jnp.arange(len(chosen)), best][:, None]
         self.designs[mark] = np.asarray(design[:, 0])
-        self.kept[mark] = self.judge(self.designs[mark], self.scene)
+        self.kept[mark] = self.judge(self.designs[mark], self.judged)
         return grasps + len(chosen) * self.tests
 
     def judge(self, designs: np.ndarray, scene: Scene) -> np.ndarray:
-        """Share of the judging trials that each seed's design keeps; the scene's numbers differ."""
+        """Share of the judging trials that each seed's design keeps, in another scene."""
         noise = self.noise(STREAM_JUDGE, 0)
         outcome = self.outcomes(jnp.asarray(designs)[:, None], noise, self.tests, scene)
         kept = ~failed(np.asarray(outcome.status)) & (np.asarray(outcome.cost) < SUCCESS_COST)
@@ -240,6 +253,7 @@ class Study:
     ) -> Outcome:
         """Outcomes of shape (seed, particle, trial) in the trials of these keys, by one program."""
         scene = scene or self.scene
+        simulate = self._program(scene)
         draw = lambda key: rollout.sample_trials(scene, key, count)  # noqa: E731
         trials = jax.tree.map(np.asarray, jax.vmap(draw)(keys))
         shape = (*populations.shape[:2], count)
@@ -248,15 +262,27 @@ class Study:
 
         def run(rows: np.ndarray) -> Outcome:
             drawn = jax.tree.map(lambda v: v[seed[rows], trial[rows]], trials)
-            return self.simulate(designs[seed[rows], particle[rows]], drawn, scene)
+            return simulate(designs[seed[rows], particle[rows]], drawn, scene)
 
         parts = in_chunks(run, len(seed), self.batch)
         outcomes = jax.tree.map(lambda *v: np.concatenate(v), *parts)
         return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]), outcomes)
 
-    def _simulate(self, designs: jax.Array, trials: Trial, scene: Scene) -> Outcome:
+    def _engine(self, scene: Scene) -> Engine:
+        """The engine of a scene, which may have another accuracy."""
+        alike = scene.structure == self.scene.structure
+        return self.engine if alike else make_engine(self.engine.name, scene)
+
+    def _program(self, scene: Scene) -> SceneProgram:
+        """What simulates designs in trials of a scene, one program for each accuracy."""
+        if scene.structure not in self.programs:
+            simulate = partial(self._simulate, self._engine(scene))
+            self.programs[scene.structure] = SceneProgram(scene, jax.jit(simulate))
+        return self.programs[scene.structure]
+
+    def _simulate(self, engine: Engine, designs: jax.Array, trials: Trial, scene: Scene) -> Outcome:
         hands = jax.vmap(self.space.params)(designs)
-        return rollout.simulate(scene, self.engine, hands, trials)[0]
+        return rollout.simulate(scene, engine, hands, trials)[0]
 
     def _leaves(self) -> list[jax.Array]:
         state = self.state._replace(key=jax.vmap(jax.random.key_data)(self.state.key))

@@ -13,13 +13,7 @@ from scripts.shared import energy, work
 from tests.stability.bench import bench, floats
 from tests.stability.table import Found, case
 
-ACCURACIES: dict[str, dict] = {
-    "standard": {},
-    "fast": {},
-    "fine": {},
-    "reference": {},
-    "20 ms, 6 links": {"discretization.timestep": 0.02, "discretization.links": 6},
-}
+ACCURACIES = ("standard", "fast", "fine", "reference")
 CONTACT_BOUND = 0.5
 """Largest rise in contact over the largest energy of fingers and bodies [chosen]. A contact between
 fingers that appears at once at a depth, as another segment comes next to a ring, stores up to a
@@ -33,15 +27,12 @@ OTHERS = 8
 
 @functools.cache
 def free(accuracy: str, **changes):
-    name = accuracy if not ACCURACIES[accuracy] else "standard"
-    overrides = energy.FREE | ACCURACIES[accuracy] | changes
-    return scene.load("paper", accuracy=name, overrides=overrides)
+    return scene.load("paper", accuracy=accuracy, overrides=energy.FREE | changes)
 
 
 @functools.cache
 def grasping(accuracy: str):
-    name = accuracy if not ACCURACIES[accuracy] else "standard"
-    return scene.load("paper", accuracy=name, overrides=ACCURACIES[accuracy])
+    return scene.load("paper", accuracy=accuracy)
 
 
 def structured(the_scene, designs, trials, precision) -> energy.Audit:

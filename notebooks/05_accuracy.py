@@ -63,8 +63,8 @@ def costs(engine, step, links, calls=2):
 # %% [markdown]
 # ## Settings: time step [ms], links of a finger
 #
-# The presets of `--accuracy` have 20 ms and 6 links (`fast`), 10 ms and 10 (`standard`), 5 ms and 10
-# (`fine`), 1 ms and 20 (`reference`).
+# The presets of `--accuracy` have 20 ms and 6 links (`fast`), 10 ms and 10 (`standard`), 5 ms and
+# 10 (`fine`), 1 ms and 20 (`reference`).
 
 # %%
 settings = [("structured", 10, 2), ("mujoco", 10, 2)]

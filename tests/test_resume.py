@@ -377,16 +377,16 @@ def test_a_search_has_its_own_accuracy_and_its_test_that_of_the_scene(tmp_path, 
     assert grasp.find(options).case.scene == searched
     assert grasp.find(GraspFlags(run_folder=folder)).case.scene == usual
     before = snapshot(folder)
-    refused = {
-        "--search-accuracy: the run has": without(run, "--search-accuracy"),
-        "-timestep = 0.025": run,
-        "needs a final test": [*run, "--fresh", "--test-trials", "0"],
-        "'quick' unknown": [*run, "--search-accuracy", "quick"],
-    }
     coarse.write_text(COARSE.replace("0.025", "0.030"))
-    for words, arguments in refused.items():
-        assert command(*arguments) == 2
-        assert words in capsys.readouterr().err
+    one_accuracy = without(run, "--search-accuracy")
+    conflict = ("conflict", "--search-accuracy")
+    assert conflict in refusal_of_command(*one_accuracy)
+    assert "-timestep = 0.03" not in capsys.readouterr().err
+    assert refusal_of_command(*run)  # the file has another step
+    assert "-timestep = 0.025" in capsys.readouterr().err
+    assert conflict in refusal_of_command(*run, "--fresh", "--test-trials", "0")
+    unknown = refusal_of_command(*run, "--search-accuracy", "quick")
+    assert unknown == [("unknown", "--search-accuracy")]
     assert snapshot(folder) == before
 
 

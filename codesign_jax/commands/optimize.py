@@ -399,7 +399,7 @@ def _accuracy_problems(scene: Scene, settings: Settings) -> list[str]:
         return [problem.told(f"--search-accuracy: {problem}") for problem in error.problems]
     if not settings.test_trials:
         sentence = (
-            f"--search-accuracy {settings.search_accuracy} needs a final test at the scene's "
+            f"--search-accuracy: {settings.search_accuracy} needs a final test at the scene's "
             "accuracy, and --test-trials is 0"
         )
         return [schema.Problem("conflict", sentence)]

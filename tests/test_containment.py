@@ -269,7 +269,8 @@ def test_straight_fingers_rest_beside_the_palm():
     assert deep.sum() > 10 and into[1][deep].all()
 
 
-@pytest.mark.parametrize("surface", ["hull", pytest.param("spheres", marks=pytest.mark.slow)])
+@pytest.mark.slow  # 8 s; quick: the kernel's overlaps below, and a refusal (test_steps)
+@pytest.mark.parametrize("surface", ["hull", "spheres"])
 def test_fingers_inside_one_another_are_refused(surface):
     """Without a spread two pairs of the paper's fingers stand in one place: 20 mm deep."""
     effects = {"surface": surface, "finger_finger": True}

@@ -325,8 +325,11 @@ def test_sheet_has_dimensions_pressures_and_tolerances(page, tmp_path):
     assert "| walls of each finger | 0.5 mm | +4" in text and "cast hands keep 95 %" in text
 
 
+LONG = "Build sheet: " + "a_name_as_data_sets_have " * 20
+
+
 @pytest.mark.parametrize(
-    "title", ["Build sheet", "Build sheet: " + "a_name_as_data_sets_have " * 20, "日本の手" * 30]
+    "title", [pytest.param("Build sheet", marks=pytest.mark.slow), LONG + "日本の手" * 30]
 )
 def test_drawings_stand_apart_and_within_their_pages(page, title):
     the_scene, params, sizes, _ = page

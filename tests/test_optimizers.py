@@ -116,7 +116,13 @@ def by_evosax(name, count, std):
     return strategy, strategy.default_params
 
 
-@pytest.mark.parametrize("name", EVOSAX)
+QUICK = "open-es", "random"
+"""The others pass through the same functions, and compile longer."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in EVOSAX]
+)
 def test_populations_are_those_of_evosax_called_directly(name):
     made = make_optimizer(name, SPACE)
     count = 4

@@ -340,10 +340,18 @@ def test_actions_that_change_nothing_make_the_grasp_of_the_key_frames(episode, s
     assert np.unique(trials.yaw).size == 4  # each its own
 
 
-def test_actions_scale_the_plan_from_nothing_to_twice_as_much(episode):
-    """Fingers that the plan keeps empty stay empty; no action says more than the ends do."""
+@pytest.fixture(scope="module")
+def seen_at(episode):
+    """What is observed in a state of the episode: one program."""
     grasp, states, _ = episode
-    seen = jax.tree.map(lambda v: v[0], jax.vmap(grasp.seen)(states[2].data))
+    look = jax.jit(jax.vmap(grasp.seen))
+    return lambda k: look(states[k].data)
+
+
+def test_actions_scale_the_plan_from_nothing_to_twice_as_much(episode, seen_at):
+    """Fingers that the plan keeps empty stay empty; no action says more than the ends do."""
+    grasp, *_ = episode
+    seen = grasps.nth(seen_at(2), 0)
     plan = np.array([[0.0, 5e4], [1e4, 6e4]], np.float32)  # of two time steps
     seen = seen._replace(plan=seen.plan._replace(pressure=plan))
     shares = {-3.0: 0.0, -1.0: 0.0, -0.5: 0.5, 0.0: 1.0, 0.5: 1.5, 1.0: 2.0, 3.0: 2.0}
@@ -353,9 +361,9 @@ def test_actions_scale_the_plan_from_nothing_to_twice_as_much(episode):
         np.testing.assert_array_equal(command.pose, seen.plan.pose)
 
 
-def test_what_is_observed_is_what_a_hand_feels(episode):
+def test_what_is_observed_is_what_a_hand_feels(episode, seen_at):
     grasp, states, _ = episode
-    seen = jax.jit(jax.vmap(grasp.seen))(states[-1].data)
+    seen = seen_at(-1)
     felt = states[-1].obs
     np.testing.assert_allclose(felt[:, 0], SCENE.end_time, rtol=1e-6)
     np.testing.assert_allclose(felt[:, 2:4] * grasp.limit, seen.pressure, rtol=1e-5)
@@ -485,7 +493,7 @@ def test_each_environment_draws_from_its_own_seed():
     assert worlds.observation_space.contains(again)
 
 
-@pytest.mark.parametrize("x64", [False, True])
+@pytest.mark.parametrize("x64", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_single_environments_pass_gymnasium_s_check(x64):
     """And what is observed lies in its space whatever precision JAX has."""
     from gymnasium.utils import env_checker

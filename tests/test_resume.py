@@ -54,22 +54,31 @@ def test_same_command_again_changes_no_result(finished, tmp_path, capsys):
     assert_same_run(folder, finished)
 
 
-def test_a_killed_run_resumes_bit_for_bit(tmp_path, capsys):
+def test_a_killed_run_resumes_bit_for_bit(long, tmp_path, capsys):
     """Signals within this process: test_runs_of_a_batch_stop_fail_and_go_on_by_themselves."""
-    # Enough episodes that a signal after the second finds the run on its way.
     folder = tmp_path / "run"
-    run = [*RUN, "--episodes", "10"]
-    process = launch(*run, "--out", folder)
+    process = launch(*LONG, "--out", folder)
     wait_for(folder / "events.log", "episode  2/", process)
     process.kill()
     output, _ = process.communicate()
     assert process.returncode == -signal.SIGKILL, output
     done = runs.load_record(folder)
     assert done is not None and 2 <= done.done < 10, "it was to stop on the way"
-    assert command(*run, "--out", folder) == 0
+    assert command(*LONG, "--out", folder) == 0
     assert f"resuming episode {done.done + 1}/10" in capsys.readouterr().out
-    assert command(*run, "--out", tmp_path / "whole") == 0
-    assert_same_run(folder, tmp_path / "whole")
+    assert_same_run(folder, long)
+
+
+LONG = [*RUN, "--episodes", "10"]
+"""Enough episodes that a signal after the second finds the run on its way."""
+
+
+@pytest.fixture(scope="module")
+def long(tmp_path_factory):
+    """A run of ten episodes, which nothing interrupted."""
+    folder = tmp_path_factory.mktemp("long") / "run"
+    assert command(*LONG, "--out", folder) == 0
+    return folder
 
 
 @pytest.mark.parametrize("lost", ["*.sha256", "folder"])
@@ -187,26 +196,24 @@ def test_the_engine_decides_how_many_fresh_trials_there_are(finished):
     assert reference.most_trials(None, dataclasses.replace(quick, test_trials=0)) == 0
 
 
-def test_more_episodes_extend_a_run_bit_for_bit(finished, tmp_path, capsys):
+def test_more_episodes_extend_a_run_bit_for_bit(long, finished, tmp_path, capsys):
     run = RUN
-    long = tmp_path / "long"
     grown = tmp_path / "grown"
-    assert command(*run, "--episodes", "5", "--out", long) == 0
     shutil.copytree(finished, grown)
-    assert command(*run, "--episodes", "5", "--out", grown) == 0
-    assert "extended from 3 to 5 episodes" in capsys.readouterr().out
+    assert command(*LONG, "--out", grown) == 0
+    assert "extended from 3 to 10 episodes" in capsys.readouterr().out
     assert_same_run(grown, long)
     provenance = json.loads((grown / "provenance.json").read_text())
-    assert provenance["settings"]["episodes"] == 5
+    assert provenance["settings"]["episodes"] == 10
     ((step, command_line),) = [(e, e.pop("command")) for e in provenance["extended"]]
-    assert (step["from"], step["to"]) == (3, 5) and command_line
+    assert (step["from"], step["to"]) == (3, 10) and command_line
     before = snapshot(grown)
     problems = refusal_of_command(*run, "--episodes", "4", "--out", grown)
     assert problems == [("conflict", f"--out {grown}")]
     assert "--fresh" not in capsys.readouterr().err and snapshot(grown) == before
     # Without --episodes the command goes on with the run, whatever it was extended to.
     assert command(*without(run, "--episodes"), "--out", grown) == 0
-    assert "all 5 episodes are done" in capsys.readouterr().out
+    assert "all 10 episodes are done" in capsys.readouterr().out
     assert_same_run(grown, long)
 
 
@@ -223,7 +230,7 @@ def test_a_run_keeps_its_optimiser(finished, tmp_path, capsys):
 BASE = without(RUN, "--seed")
 
 
-THREE = [*BASE, "--episodes", "2", "--seeds", "2-4"]
+THREE = [*BASE, "--episodes", "3", "--seeds", "3-5"]
 
 
 @pytest.fixture(scope="module")
@@ -239,19 +246,19 @@ def compared(tmp_path_factory):
 def test_seeds_are_compared(compared):
     folder, output = compared
     assert "  3 runs  mean" in output
-    assert len({stored(folder / f"seed-{seed}") for seed in (2, 3, 4)}) == 3
+    assert len({stored(folder / f"seed-{seed}") for seed in (3, 4, 5)}) == 3
     table = output[output.rindex("judged by") :]
     rows = [line for line in table.splitlines() if "final test" in line]
-    assert [row.split()[0] for row in rows] == ["2", "3", "4"]
+    assert [row.split()[0] for row in rows] == ["3", "4", "5"]
     assert "of 3 runs found a good design" in table and "Wald's sequential test" in table
     assert "; for objects of " in table
     assert "% of such runs (95 % interval)" in table
     rows = [*csv.DictReader((folder / "seeds.csv").read_text().splitlines())]
     names = ("seed", "schedule", "first", "finished", "run")
     assert [tuple(row[name] for name in names) for row in rows] == [
-        ("2", "concurrent", "morphology", "1", "seed-2"),
         ("3", "concurrent", "morphology", "1", "seed-3"),
         ("4", "concurrent", "morphology", "1", "seed-4"),
+        ("5", "concurrent", "morphology", "1", "seed-5"),
     ]
     for row in rows:
         tests = csv.DictReader((folder / row["run"] / "tests.csv").read_text().splitlines())
@@ -260,10 +267,10 @@ def test_seeds_are_compared(compared):
         assert int(row["paper_successes"]) <= int(row["particles"]) and row["verdict"]
 
 
-def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch, capsys):
+def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(compared, tmp_path, monkeypatch, capsys):
     """A signal, a disk that is full for one of them, and runs that are at other episodes."""
     runs_folder = tmp_path / "runs"
-    run = [*BASE, "--episodes", "3", "--seeds", "3-5"]
+    run = THREE
     assert command(*RUN, "--episodes", "1", "--out", runs_folder / "seed-3") == 0
     save = Checkpoints.save
     begin = Interrupts.begin
@@ -299,8 +306,7 @@ def test_runs_of_a_batch_stop_fail_and_go_on_by_themselves(tmp_path, monkeypatch
     monkeypatch.setattr(Checkpoints, "save", save)
     assert command(*run, "--out", runs_folder) == 0
     assert "of 3 runs found a good design" in capsys.readouterr().out
-    assert command(*run, "--out", tmp_path / "whole") == 0
-    assert_same_run(runs_folder / "seed-4", tmp_path / "whole" / "seed-4")
+    assert_same_run(runs_folder / "seed-4", compared[0] / "seed-4")
 
 
 COARSE = """description = "coarse"

@@ -53,9 +53,7 @@ EVERYTHING = {
 
 
 SMALL = {
-    "effects__surface": "hull",
     "effects__finger_finger": True,
-    "effects__friction_memory": True,
     **grasps.off("palm_object palm_table finger_table twist"),
 }
 """For what quick tests ask of one kernel."""
@@ -307,17 +305,22 @@ def test_differences_notice_a_fault(name):
     assert not error < 10 * BOUND
 
 
-def test_derivatives_are_linear_in_the_cotangents():
-    first, second, both, zero = small().sound
+SOUND = [small, pytest.param(checked, marks=pytest.mark.slow)]  # spheres, and everything
+
+
+@pytest.mark.parametrize("worlds", SOUND)
+def test_derivatives_are_linear_in_the_cotangents(worlds):
+    first, second, both, zero = worlds().sound
     largest = np.abs(first).max() + 2 * np.abs(second).max()
     # Rounding of float64, and of what conjugate gradients leave of a direction: 1e-12 of it.
     assert np.abs(first + 2 * second - both).max() < 1e-10 * largest
     assert (zero == 0).all()
 
 
-def test_derivatives_do_not_depend_on_company():
+@pytest.mark.parametrize("worlds", SOUND)
+def test_derivatives_do_not_depend_on_company(worlds):
     """The same world between others, at another place: the same bits."""
-    for mine, other in zip(*small().alone, strict=True):
+    for mine, other in zip(*worlds().alone, strict=True):
         for a, b in zip(mine, other, strict=True):
             np.testing.assert_array_equal(a, b)
 

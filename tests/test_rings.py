@@ -529,6 +529,7 @@ def test_spheres_keep_nothing():
     make_engine("mujoco", chosen)
 
 
+@pytest.mark.slow  # 10 s; quick: a policy's periods (test_policy), what is held (planted faults)
 def test_a_rollout_in_pieces_is_that_of_one_piece():
     """Of two fingers that close on one another and on the object: equal bits.
 

@@ -12,7 +12,17 @@ from codesign_jax import control, model, rollout, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import parameters
 from codesign_jax.types import Status
-from tests.helpers.grasps import GOOD, hand_world, hurried, nth, pinch, random_designs, stack
+from tests.helpers.grasps import (
+    GOOD,
+    hand_world,
+    hurried,
+    nth,
+    pinch,
+    random_designs,
+    repeat,
+    stack,
+    world_inputs,
+)
 
 PAPER = scene.load("paper_spheres")
 KEY = jax.random.key(5)
@@ -185,9 +195,10 @@ def test_what_a_rigid_hand_holds_is_accelerated_with_it():
     with jax.enable_x64(True):  # a prescribed palm is a heavy body there
         engine = make_engine("mujoco", the_scene)
         hand, trial = design(the_scene), rollout.nominal_trial(the_scene, 2)
-        trace = rollout.grasp(the_scene, engine, hand, trial, record_qpos=True)
-        ctrl = control.commands(the_scene, hand, trial)
-    held = np.asarray(trace.qpos)[:, -7:-4]  # the free joint comes last
+        inputs = world_inputs(the_scene, hand, trial)
+        trace = engine.rollout(*(repeat(each, 1) for each in inputs), trajectory=True)
+    ctrl = inputs[1]
+    held = np.asarray(trace.qpos)[0, :, -7:-4]  # the free joint comes last
     h = the_scene.discretization.timestep
     for axis in range(3):
         begin, first, middle, last, end = (round(t / h) for t in transported(the_scene, axis))

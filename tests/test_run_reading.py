@@ -205,14 +205,14 @@ def test_an_earlier_run_is_read_and_reported(archive, name, done, episodes, tmp_
     assert chosen.design.dtype == np.float32
     simulated = record.history.population[chosen.episode, chosen.row]
     np.testing.assert_array_equal(simulated, chosen.design)
-    assert command("report", folder, "--no-replay") == 0
-    assert f"{done} of {episodes} episodes" in (folder / "report.html").read_text()
+    if done != episodes:  # `test_report` has runs that ended
+        assert command("report", folder, "--no-replay") == 0
+        assert f"{done} of {episodes} episodes" in (folder / "report.html").read_text()
 
 
-def test_an_earlier_run_is_evaluated_and_goes_on(tmp_path, capsys):
+def test_an_earlier_run_goes_on_and_is_evaluated(tmp_path, capsys):
     folder = unpacked("run_particle_filter", tmp_path) / "particle-filter"
     before = (folder / "trials.csv").read_text()
-    assert command("evaluate", "--run", folder, "--trials", "2") == 0
     # By the scene that the run keeps: the files of tests/data may change.
     arguments = ["--scene", folder / "scene.toml", "--engine", "mujoco", "--particles", "4"]
     arguments += ["--trials", "2", "--test-trials", "2", "--seed", "3", "--episodes", "4"]

@@ -24,6 +24,8 @@ FAULTS = {
     "a normal turned by half a degree": ("orientation = [70,", "orientation = [70.5,"),
     "a slope as slippery as the table": ("friction = 1.1\n", ""),
 }
+FEW = 5
+"""Of so many steps one is enough to notice them."""
 # Object, effects and other values by key, and fixtures.
 SCENES = {
     "new models": (
@@ -118,11 +120,11 @@ def test_steps_of_the_kernel_equal_mujocos(tmp_path, name):
                 assert touching.max() > (1 if shape == "sphere" else 4)
             return
         plain = loaded(tmp_path, "", shape)
-        _, _, fewer = oracles.against_mujoco(plain, a_grasp(plain)[0], ctrl, trajectory)
-        assert (touching > fewer).mean() > 0.3  # fixtures are touched in many steps
+        _, _, fewer = oracles.against_mujoco(plain, a_grasp(plain)[0], ctrl, trajectory, FEW)
+        assert (touching[:, ::FEW] > fewer).mean() > 0.3  # fixtures are touched in many steps
         for fault, (sound, wrong) in FAULTS.items():
             other = loaded(tmp_path, fixtures.replace(sound, wrong), shape)
-            errors, *_ = oracles.against_mujoco(other, a_grasp(other)[0], ctrl, trajectory)
+            errors, *_ = oracles.against_mujoco(other, a_grasp(other)[0], ctrl, trajectory, FEW)
             assert errors.max() > 1e-3, fault
 
 

@@ -173,16 +173,17 @@ def test_a_cost_reads_forces_if_it_asks_for_them(workdir):
 
 
 def test_changed_code_is_refused_with_what_changed(workdir, capsys):
-    assert cli.main([*OWN, "--episodes", "1", "--out", "run"]) == 0
+    begun = [*OWN, "--test-trials", "0"]
+    assert cli.main([*begun, "--episodes", "1", "--out", "run"]) == 0
     before = snapshot(workdir / "run")
     (workdir / "mine.py").write_text(MINE.replace("0.2 - trace", "0.3 - trace"))
     sys.modules.pop("mine")  # as in another process
-    problems = refusal_of_command(*OWN, "--episodes", "2", "--out", "run")
+    problems = refusal_of_command(*begun, "--episodes", "2", "--out", "run")
     assert problems[0] == ("conflict", "--out run") and ("conflict", "mine") in problems
     output = capsys.readouterr().err
     assert "-    return jnp.abs(0.2 - trace" in output
     assert "+    return jnp.abs(0.3 - trace" in output
-    problems = refusal_of_command(*OWN[:-1], "mine:until_lost", "--out", "run")
+    problems = refusal_of_command(*begun, "--cost", "mine:until_lost", "--out", "run")
     assert problems[0] == ("conflict", "--out run") and problems[-1] == ("conflict", "--cost")
     # What is the run's is not imported for whoever reads it, or asks for nothing.
     (workdir / "mine.py").unlink()
@@ -247,8 +248,6 @@ def test_a_dry_run_tells_of_a_policy_that_commands_kilopascals(workdir, capsys):
         "policy late: the highest pressure that it commands while nothing moves is 80 Pa" in output
     )
     assert "did you mean 80000?" in output
-    assert cli.main([*RUN, "--policy", "mine:late", "--out", "run", "--dry-run"]) == 0
-    assert "did you mean 80000?" in capsys.readouterr().out
 
 
 WRONG = {

@@ -1,5 +1,7 @@
 """Hands that lack fingers: as data, as another hand, and what each finger is worth."""
 
+from functools import partial
+
 import jax
 import numpy as np
 import pytest
@@ -37,14 +39,15 @@ def test_an_absent_finger_is_as_none(engine, within):
     fewer = whole.without((1,))
     trials = rollout.sample_trials(whole.scene, jax.random.key(3), 4)
 
-    def trace(of_case, params):
-        batch = jax.tree.map(lambda v: np.repeat(np.asarray(v)[None], 4, 0), params)
-        return rollout.simulate(of_case.scene, of_case.make_engine(), batch, trials)[1]
+    def program(of_case):
+        simulate = partial(rollout.simulate, of_case.scene, of_case.make_engine())
+        return jax.jit(lambda params: simulate(params, trials)[1])
 
     both = whole.space.params(whole.design)
-    absent = trace(whole, worth.without(both, (1,)))
-    none = trace(fewer, fewer.space.params(fewer.design))
-    present = trace(whole, both)
+    trace = program(whole)
+    absent = trace(grasps.repeat(worth.without(both, (1,)), 4))
+    none = program(fewer)(grasps.repeat(fewer.space.params(fewer.design), 4))
+    present = trace(grasps.repeat(both, 4))
     for name in ("distance", "height"):
         ours, theirs, other = (np.asarray(getattr(t, name)) for t in (absent, none, present))
         np.testing.assert_allclose(ours, theirs, atol=within, err_msg=name)

@@ -1,7 +1,7 @@
 """Whole grasps a second, of this engine with random and with good designs, and of its peers.
 
 python -m scripts.benchmark --json docs/data/rates_cpu.json     # three minutes on two idle cores
-python -m scripts.benchmark --page                              # README's table and the page's
+python -m scripts.benchmark --page                              # the tables of the pages
 
 On a GPU the batches are larger, and MuJoCo Warp is measured where it is installed.  A file that
 exists is extended, and a case that is measured again is replaced, so that another MuJoCo can be
@@ -31,7 +31,7 @@ from scripts.shared import output, provenance, work
 
 ROOT = Path(__file__).parents[1]
 FILES = "docs/data/rates_*.json"
-PAGES = {"README.md": ("rates",), "docs/performance.md": ("rates", "measured", "peers")}
+PAGES = {"docs/comparison.md": ("peers",), "docs/performance.md": ("rates", "measured", "peers")}
 """Pages with the marks of the tables that they hold."""
 BATCHES = {
     60: " (an episode of the paper with 2 parameters)",
@@ -204,7 +204,7 @@ def machines(files: list[dict[str, Any]]) -> str:
 def peers(files: list[dict[str, Any]]) -> str:
     """This engine beside each peer: the same grasps on the same machine, in Markdown."""
     head = "scene, machine, peer, peer's grasps a second, this engine's, times as many"
-    rows = [[*head.split(", "), "same verdicts"]]
+    rows = [[*head.split(", "), "same verdicts", "the same where either keeps the object"]]
     for content in files:
         for theirs in content["records"]:
             if theirs["engine"] == "structured":
@@ -215,8 +215,10 @@ def peers(files: list[dict[str, Any]]) -> str:
             numbers = [theirs["grasps_per_s"], ours["grasps_per_s"]]
             shown = [_rounded(n) for n in numbers]
             ratio = f"{numbers[1] / numbers[0]:.0f}"
-            same = _same(ours.get("verdicts", ""), theirs.get("verdicts", ""))
-            rows.append([theirs["scene"], where, theirs["engine"], *shown, ratio, same])
+            verdicts = list(zip(ours["verdicts"], theirs["verdicts"], strict=True))
+            kept = [pair for pair in verdicts if "1" in pair]
+            same = [_same(verdicts), _same(kept)]
+            rows.append([theirs["scene"], where, theirs["engine"], *shown, ratio, *same])
     return output.markdown(rows)
 
 
@@ -230,9 +232,8 @@ def _beside(records: Iterable[dict[str, Any]], theirs: dict[str, Any]) -> dict[s
     return ours
 
 
-def _same(a: str, b: str) -> str:
-    pairs = list(zip(a, b, strict=False))
-    return f"{sum(x == y for x, y in pairs)} of {len(pairs)}" if pairs else "–"
+def _same(pairs: list[tuple[str, str]]) -> str:
+    return f"{sum(ours == theirs for ours, theirs in pairs)} of {len(pairs)}"
 
 
 def _rounded(number: float) -> str:

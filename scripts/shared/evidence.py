@@ -31,6 +31,7 @@ PAGES: dict[str, tuple[str, ...]] = {
     "README.md": EVERY,
     "docs/accuracy.md": ("budget.json", "decisions.json", "free_motion.json", "hard_designs.json"),
     "docs/calibration.md": ("calibration/*.json",),
+    "docs/comparison.md": ("rates_*.json",),
     "docs/control.md": EVERY,
     "docs/effects.md": ("effects.json",),
     "docs/export.md": EVERY,

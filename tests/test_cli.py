@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from codesign_jax import cli
+from codesign_jax import cli, terminal
 from codesign_jax.commands import status
 from codesign_jax.judge import cases
 from codesign_jax.scene import library
@@ -37,7 +37,7 @@ def test_a_mistyped_command_is_refused_by_the_parser(line, words, capsys):
 def test_help_imports_nothing_heavy():
     program = """
 import sys, typing
-from codesign_jax import cli
+from codesign_jax import cli, terminal
 names = [command.__name__.lower() for command in typing.get_args(cli.COMMANDS)]
 for arguments in (["--help"], *([name, "--help"] for name in names)):
     try:
@@ -157,6 +157,8 @@ def test_ctrl_c_is_one_line_and_ends_the_process(monkeypatch, capsys, request):
 
     monkeypatch.setattr(cases.Case, "simulate", simulate)
     monkeypatch.setattr(status, "leave", left.append)
+    # The process of a command says its waits from then on, and this one goes on with other tests.
+    monkeypatch.setattr(terminal, "waits", [])
     arguments = ["evaluate", "--scene", str(TINY), "--engine", "mujoco", "--trials", "1"]
     monkeypatch.setattr(sys, "argv", ["codesign", *arguments])
     threading.Thread(target=press).start()

@@ -269,8 +269,5 @@ def test_missing_extra_is_one_line(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "av", None)
     for arguments in (["render", *DESIGN, "--out"], ["evaluate", *DESIGN, "--render"]):
         assert cli.main([*arguments, "a.mp4"]) == 2
-        lines = capsys.readouterr().err.splitlines()
-        # Behind other tests of this file a further line was seen once; its source is not known.
-        [line] = [line for line in lines if line.startswith("error: ")]
-        assert "Traceback" not in "".join(lines)
-        assert ".mp4 needs PyAV: pip install -e '.[report]' in the checkout" in line
+        [line] = capsys.readouterr().err.splitlines()
+        assert "PyAV" in line

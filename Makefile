@@ -54,16 +54,17 @@ test: $(STAMP)
 
 # The quick core: a minute for another Python and MuJoCo, in an environment of its own.
 CORE := scene parameters optimizers compiler planted_faults codesign runs
+WORKERS ?= 2
 quick: $(QUICK)
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(CORE:%=tests/test_%.py)
+	$(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile $(CORE:%=tests/test_%.py)
 
 # What needs a browser: the report, its 3D replay, the studio and the documentation's site.
 test-browser: docs
 	$(BIN)/python -m pytest -q -m browser -rs $$(grep -l mark.browser tests/test_*.py)
 
-# Kernels for GPUs by NVIDIA's assembler, without a GPU: a minute of one core.
+# Kernels of the default scene for GPUs by NVIDIA's assembler, without a GPU: a minute of one core.
 test-ptx: $(STAMP)
-	$(BIN)/python -m pytest -q -rs -m slow tests/test_reverse.py -k assembler
+	$(BIN)/python -m pytest -q -rs -m slow tests/test_reverse.py -k "assembler and not spheres"
 
 # Tests that need a GPU; GPU is the file that says how each ended.
 GPU ?= runs/gpu_suite.json

@@ -39,11 +39,12 @@ def pytest_configure(config):
 # Files of more than five seconds, the longest first: what is left for the end is short, so that no
 # worker waits for the other. Before them a file with planted faults, which forgets what was traced.
 LONG = """
-test_planted_contacts test_resume test_policy test_export test_rings test_run_reading test_engines
-test_docs test_buildable test_steps test_reverse test_constants test_library test_finger
-test_user_code test_meshes test_compare test_kernel test_runs test_containment test_attacks
-test_forces test_air test_optimizers test_codesign test_hard_cases test_scene test_rollout
-test_sample test_rigid_bodies test_report
+test_planted_contacts test_resume test_policy test_export test_docs test_engines test_buildable
+test_finger test_containment test_codesign test_energy test_constants test_run_reading test_library
+test_rollout test_compare test_steps test_reuse test_kernel test_meshes test_air test_forces
+test_worth test_rings test_reverse test_attacks test_report test_user_code test_rigid_bodies
+test_sample test_scene test_runs test_hard_cases test_model test_cli test_key_frames
+test_particle_filter test_planted_faults test_optimizers
 """.split()
 
 

@@ -436,8 +436,8 @@ def test_the_kernel_balances_all_forces_on_meshes(grasps):
     # A decrement of 1e-24 is an error of 1e-12 as the whole problem measures it; what is lost are
     # digits of the largest forces on a body that nearly cancel.
     assert left.max() < 1e-8
-    # 0.91 of the states: in the others a finger turns fast.  What is left out is less than any phase
-    # has, 23 % at the least.
+    # 0.91 of the states; in the others a finger turns fast.  What is left out is less than any
+    # phase has, 23 % at the least.
     assert oracles.share(left) > 0.8
 
 

@@ -20,7 +20,9 @@ import numpy as np
 
 from codesign_jax.judge import verdict
 from codesign_jax.model.layout import layout
+from codesign_jax.reuse import quickly_compiled
 from codesign_jax.scene import Scene
+from codesign_jax.scene.tables import Cost
 from codesign_jax.types import Forces, Outcome, Status, Trace, Trial, failed
 
 MOVED = 1e-3
@@ -81,12 +83,17 @@ def particle_cost(scene: Scene, outcomes: Outcome) -> jax.Array:
     Returns:
       Costs without the trial axis.
     """
-    good = ~failed(outcomes.status)
-    if scene.cost.failure == "worst":
-        return jnp.where(good, outcomes.cost, scene.cost.maximum).mean(-1)
-    count = good.sum(-1)
-    mean = jnp.where(good, outcomes.cost, 0.0).sum(-1) / jnp.maximum(count, 1)
-    return jnp.where(count > 0, mean, scene.cost.maximum)
+    return _mean(scene.cost, outcomes.cost, failed(outcomes.status))
+
+
+@quickly_compiled
+def _mean(rule: Cost, costs: jax.Array, bad: jax.Array) -> jax.Array:
+    """`particle_cost`; one program, not one an operation."""
+    if rule.failure == "worst":
+        return jnp.where(bad, rule.maximum, costs).mean(-1)
+    count = (~bad).sum(-1)
+    mean = jnp.where(bad, 0.0, costs).sum(-1) / jnp.maximum(count, 1)
+    return jnp.where(count > 0, mean, rule.maximum)
 
 
 def shown(trace: Trace, record_qpos: bool, stop_when_lost: bool | None) -> Trace:

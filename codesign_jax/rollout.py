@@ -20,6 +20,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.stats import norm
@@ -109,13 +110,31 @@ def sample_trials(
     reuse.begin()
     axes.refuse_draws(key, num_trials)
     axes.refuse_numbers(scene.checked(), num_trials, "trial")
-    trials = _draw(num_trials, len(scene.objects.object), key, scene.objects.noise, first)
+    trials = _drawn(num_trials, len(scene.objects.object), key, scene.objects.noise, first)
     if not scene.drawn.constant:
         return trials
     constants_key = jax.random.fold_in(key, _CONSTANTS)
     return trials._replace(
         constants=draws.deviations(scene.drawn, constants_key, num_trials, first)
     )
+
+
+LEAST = 64
+"""Least number of trials that are drawn at once: fewer are cut, so that one program serves."""
+
+
+def _drawn(
+    num_trials: int, shapes: int, key: jax.Array, noises: Any, first: jax.typing.ArrayLike
+) -> Trial:
+    """`_draw` in programs of few sizes, where it is not a part of another program."""
+    arguments = jax.tree.leaves((key, noises, first))
+    if any(isinstance(v, jax.core.Tracer) or jnp.ndim(v) for v in arguments):
+        return _draw(num_trials, shapes, key, noises, first)
+    size = LEAST
+    while size < num_trials:
+        size *= 2
+    more = _draw(size, shapes, key, noises, first)
+    return jax.tree.map(lambda v: jnp.asarray(np.asarray(v)[:num_trials]), more)
 
 
 @partial(reuse.quickly_compiled, static_argnums=(0, 1))

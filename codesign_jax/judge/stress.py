@@ -21,6 +21,7 @@ from codesign_jax.judge.cases import Case
 from codesign_jax.model import morphology, overlap
 from codesign_jax.model.layout import touches_itself
 from codesign_jax.model.overlap import Overlaps
+from codesign_jax.reuse import quickly_compiled
 from codesign_jax.scene import Scene, draws, silicones
 from codesign_jax.scene.buildable import rim_drop
 from codesign_jax.scene.schema import InputError
@@ -266,7 +267,7 @@ def _poses(
     scene: Scene, params: Params, trial: Trial, qpos: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places (state, body, 3) and orientations (state, body, 3, 3) of bodies, by MuJoCo C."""
-    fields = jax.jit(model.model_fields, static_argnums=0)(scene, params, trial)
+    fields = quickly_compiled(model.model_fields, static_argnums=0)(scene, params, trial)
     compiled = world_model(scene, jax.tree.map(np.asarray, fields))
     data = mujoco.MjData(compiled)
     poses = []

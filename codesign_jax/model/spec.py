@@ -29,6 +29,7 @@ from codesign_jax.model.layout import (
     wrist_springs,
 )
 from codesign_jax.model.morphology import Beam
+from codesign_jax.reuse import quickly_compiled
 from codesign_jax.scene import Scene, by_structure
 from codesign_jax.scene.constants import with_trial
 from codesign_jax.scene.hand import Hand
@@ -85,7 +86,7 @@ def compile_model(
     return model
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@functools.partial(quickly_compiled, static_argnums=0)
 def _numbers(links: int, hand: Hand, objects: ObjectSet, params: Params, trial: Trial) -> tuple:
     """Beams, mounts, and the object's size and orientation; one program, not one an operation."""
     beams = morphology.finger_beams(hand, params, links)

@@ -177,7 +177,8 @@ def get(name: str) -> Silicone:
 
 
 def _unknown() -> str:
-    return f"unknown; valid: {', '.join(SILICONES)}"
+    names = ", ".join(SILICONES)
+    return f"unknown; valid: {names}; another one has a law, and a shear_modulus that fits its data"
 
 
 def prepare(table: dict[str, Any], changes: dict[tuple[str, ...], Any]) -> None:

@@ -79,7 +79,9 @@ def test_no_proposal_has_a_warning_and_the_paper_s_space_has_table_i_alone():
     assert parameters.design_space(spheres.hand).buildable is None
 
 
-@pytest.mark.parametrize("name", ["bin", "edge", "shelf"])
+@pytest.mark.parametrize(
+    "name", ["bin", *(pytest.param(n, marks=pytest.mark.slow) for n in ("edge", "shelf"))]
+)
 def test_no_proposal_for_surroundings_has_a_warning_of_a_finger(name):
     """The palm of `shelf` is upright and that of `edge` tilted: they have no limit there."""
     made = scene.load(name)

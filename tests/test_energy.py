@@ -104,10 +104,12 @@ def audited():
     return dict(zip(names, audit.rise() / audit.stored[:, 0], strict=True))
 
 
+@pytest.mark.slow  # 15 s; quick: closed forms of the energy, and planted faults of the same laws
 def test_sound_worlds_gain_nothing(audited):
     assert audited["none"] < BOUND and audited[f"none, {FAST}"] < BOUND, audited
 
 
+@pytest.mark.slow  # as the test before it
 @pytest.mark.parametrize("name", SOURCES)
 def test_a_source_of_energy_is_seen(audited, name):
     assert audited[name] > 10 * BOUND, audited

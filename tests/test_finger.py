@@ -226,7 +226,10 @@ def beam(links, modulus):
     return cantilever, beam
 
 
-@pytest.mark.parametrize("weight, modulus", [(0, (94, 104)), (1, (88, 97))])
+@pytest.mark.parametrize(
+    "weight, modulus",
+    [pytest.param(0, (94, 104), marks=pytest.mark.slow), (1, (88, 97))],  # 4 s of fitting
+)
 def test_a_release_gives_eth_s_modulus_and_damping(weight, modulus):
     """By drop, period and decrement of ETH's film (docs/data/measured.toml), from a wrong modulus.
 

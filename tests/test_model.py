@@ -52,7 +52,10 @@ SCENES = {
 }
 
 
-@pytest.fixture(params=SCENES, scope="module")
+@pytest.fixture(
+    params=["tripod3, two spheres", pytest.param("tapered", marks=pytest.mark.slow)],
+    scope="module",
+)
 def worlds(request):
     """A scene with fields of six random worlds in float64 and their fresh compiles.
 

@@ -49,7 +49,10 @@ def test_angles_turn_as_mujocos():
     np.testing.assert_allclose(rigid_bodies.turned(theirs, (1, 0, 0, 0)), theirs, atol=1e-15)
 
 
-@pytest.mark.parametrize("kind", SHAPES)
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(k, marks=[pytest.mark.slow] * (k in ("capsule", "sphere"))) for k in SHAPES],
+)
 def test_an_object_touches_the_table_however_it_is_turned(tmp_path, kind):
     """By MuJoCo's own distance at the start of trials with noise about all axes."""
     path = object_file(tmp_path, SHAPES[kind] + "; orientation = [50, 20, 10]")

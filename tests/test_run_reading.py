@@ -210,7 +210,7 @@ def test_an_earlier_run_is_read_and_reported(archive, name, done, episodes, tmp_
         assert f"{done} of {episodes} episodes" in (folder / "report.html").read_text()
 
 
-def test_an_earlier_run_goes_on_and_is_evaluated(tmp_path, capsys):
+def test_an_earlier_run_goes_on(tmp_path, capsys):
     folder = unpacked("run_particle_filter", tmp_path) / "particle-filter"
     before = (folder / "trials.csv").read_text()
     # By the scene that the run keeps: the files of tests/data may change.
@@ -219,4 +219,3 @@ def test_an_earlier_run_goes_on_and_is_evaluated(tmp_path, capsys):
     assert command("optimize", *arguments, "--out", folder) == 0
     assert "resuming episode 4/4" in capsys.readouterr().out
     assert (folder / "trials.csv").read_text().startswith(before)
-    assert command("evaluate", "--run", folder, "--trials", "2") == 0

@@ -29,7 +29,8 @@ def case(the_scene, engine="structured"):
 @pytest.mark.parametrize(
     ("engine", "within"),
     [
-        ("mujoco", 1e-6),  # float64: what is left is the micrometre's mass and the palm's
+        # float64: what is left is the micrometre's mass and the palm's
+        pytest.param("mujoco", 1e-6, marks=pytest.mark.slow),
         ("structured", 1e-4),  # float32, of places after 0.6 s in contact
     ],
 )

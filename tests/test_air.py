@@ -379,7 +379,9 @@ def slow_but(name, *values):
     return pytest.param(name, *values, marks=marks)
 
 
-@pytest.mark.parametrize("name", map(slow_but, ["air", "sideways", "sideways, by Newmark"]))
+@pytest.mark.parametrize(
+    "name", [slow_but(name) for name in ("air", "sideways", "sideways, by Newmark")]
+)
 def test_accelerations_equal_mujoco_with_the_chambers_of_the_state(name):
     assert simulated(name)[-1] < BOUND
 

@@ -55,7 +55,9 @@ def test_episode_is_move_evaluate_weigh_and_resample(setup):
     mask = np.array([True, True])
     new, info = episode(state, mask)
     # The same arithmetic in another program, where the compiler fuses it: the last bit may differ.
-    np.testing.assert_allclose(info.population, optimizer.ask(state, mask), rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(
+        info.population, jax.jit(optimizer.ask)(state, mask), rtol=1e-6, atol=1e-8
+    )
     assert info.outcomes.cost.shape == info.outcomes.status.shape == (PARTICLES, TRIALS)
     np.testing.assert_allclose(info.selection.cost, info.outcomes.cost.mean(1), rtol=1e-6)
     np.testing.assert_array_equal(new.particles, info.population[info.selection.ancestors])

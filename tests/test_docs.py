@@ -115,7 +115,19 @@ SIMULATES = {
 }
 
 
-@pytest.mark.parametrize("example", CODESIGN)
+def question(example):
+    """Command and flags of an example, without their values."""
+    name, *words = shlex.split(example) or [""]
+    return name, *sorted(word for word in words if word.startswith("--"))
+
+
+def one_of_each(calls):
+    """Examples; of those that ask the same with other values, all but the first are slow."""
+    first = {question(example): example for example in reversed(calls)}.values()
+    return [pytest.param(e, marks=[pytest.mark.slow] * (e not in first)) for e in calls]
+
+
+@pytest.mark.parametrize("example", one_of_each(CODESIGN))
 def test_every_command_goes_as_far_as_its_simulation(example, workdir, monkeypatch):
     """Scene, design and files are the example's own; nothing is compiled that places or steps."""
     arguments = here_alone(example)

@@ -40,6 +40,7 @@ def bent_grasp(the_scene):
     return animation.Replay(params, trial, Outcome(*np.zeros(4)), qpos)
 
 
+@pytest.mark.slow  # 5 s; quick: a run's report below, and a design's verdict (test_compare)
 def test_a_design_file_has_a_report_of_what_evaluate_says(tmp_path, capsys):
     """The same trials, so the same verdict; its parameters, its air and its own text."""
     file = tmp_path / "mine.toml"

@@ -126,6 +126,7 @@ def test_second_process_on_a_folder_is_refused(finished, capsys):
     assert snapshot(finished) == before
 
 
+@pytest.mark.slow  # 10 s; quick: kept results are read (test_attacks), shown (test_report), judged
 def test_the_best_particle_meets_fresh_trials_at_reference(finished, tmp_path, monkeypatch, capsys):
     """And grasps of other conditions, which are told, kept and reported.
 

@@ -442,7 +442,7 @@ def assembler():
     return shutil.which("ptxas", path=os.pathsep.join([*folders, os.environ["PATH"]]))
 
 
-@pytest.mark.slow  # .ci/run has this one; quick: the forward kernel becomes PTX (test_kernel)
+@pytest.mark.slow  # .ci/run has that of the default scene
 @pytest.mark.skipif(assembler() is None, reason="ptxas, NVIDIA's assembler, is not installed")
 @pytest.mark.parametrize("name", ["paper", "paper_spheres"])
 def test_nvidias_assembler_takes_the_kernels(name, tmp_path):

@@ -2,15 +2,17 @@
 
     python -m scripts.gallery [NAME ...]
 
-The hands are those of docs/gallery/hands.toml, the design of each is docs/gallery/NAME.toml; where
-that is not there, its search is run, in runs/gallery/NAME, where an interrupted one goes on.  A
-design is judged at the accuracy of the search: in 100 fresh trials, in 48 with objects of each of
-some masses, and as 64 hands that are cast with the usual tolerances.  Its grasp without noise is
+The hands are those of docs/gallery/hands.toml; `first` is the one of README's own command and
+pictures.  The design of each is docs/gallery/NAME.toml; where that is not there, its search is run,
+in runs/gallery/NAME, where an interrupted one goes on.  A design is judged at the accuracy of the
+search: in 100 fresh trials, in 48 with objects of each of some masses, and as 64 hands that are
+cast with the usual tolerances.  Its grasp without noise is
 drawn; look.png in runs/gallery/NAME shows it from two sides, to be looked at.  A hand that has a
 warning of its design is refused.
 """
 
 import dataclasses
+import re
 import shlex
 import sys
 import tomllib
@@ -25,7 +27,8 @@ from PIL import Image
 from codesign_jax import cli, rollout, runs, tolerances
 from codesign_jax.commands import common
 from codesign_jax.commands.flags import Evaluate
-from codesign_jax.judge import cases, stress, verdict
+from codesign_jax.export import valves
+from codesign_jax.judge import cases, stress, verdict, worth
 from codesign_jax.judge.sentences import Judged
 from codesign_jax.report import animation
 from codesign_jax.report.replay import Camera
@@ -36,10 +39,10 @@ RUNS = Path("runs") / "gallery"
 DOCS = Path("docs")
 FOLDER = DOCS / "gallery"
 RATE = 10.0
-SIZE = (280, 280)
+SIZE = (480, 480)
 QUALITY = 45
-"""Frames of a second, pixels, and WebP's quality: a film of 9 s of one object has about 270 kB."""
-CLOSE = 0.42
+"""Frames of a second, pixels, and WebP's quality."""
+CLOSE = 0.36
 """Distance of the camera [m]."""
 TRIALS = 100
 SEED = 1000
@@ -53,6 +56,7 @@ class Hand:
     """A hand of docs/gallery/hands.toml.
 
     Attributes:
+      title: What the hand is called.
       names: Scene, hand, objects or control, where they are not the default ones.
       search: Flags that `codesign optimize` has beside these.
       sentence: What the hand does.
@@ -61,6 +65,7 @@ class Hand:
     """
 
     name: str
+    title: str
     search: str
     sentence: str
     shown: list[str]
@@ -112,7 +117,7 @@ def check(hand: Hand, case: cases.Case) -> None:
 
 
 def judge(hand: Hand, case: cases.Case) -> None:
-    """Writes verdict, masses and yield before the design in its file, if they are not there."""
+    """Writes verdict, masses, yield and fingers before the design, if they are not there."""
     text = hand.design.read_text(encoding="utf-8")
     if not text.startswith("# keeps"):
         judged = Judged(case.scene, case.simulate(TRIALS, jax.random.key(SEED)))
@@ -121,6 +126,8 @@ def judge(hand: Hand, case: cases.Case) -> None:
     if not second.startswith("# of heavier"):
         rest = [second, *rest]
         second = f"# of heavier objects {heavier(case)}; {cast(case)}"
+    if not second.endswith("needed"):
+        second = f"{second}; {needed(case)}"
     hand.design.write_text("\n".join([first, second, *rest, ""]), encoding="utf-8")
 
 
@@ -143,6 +150,14 @@ def cast(case: cases.Case) -> str:
     return f"{good} of {len(hands.kept) - 1} cast hands keep {100 * verdict.WANTED:.0f} %"
 
 
+def needed(case: cases.Case) -> str:
+    """How many of its fingers the hand needs, in words; see `codesign_jax.judge.worth`."""
+    params = case.space.params(jnp.asarray(case.design, jnp.float32))
+    tried = worth.simulate(case.scene, case.make_engine(), params, jax.random.key(SEED + 3))
+    count = case.scene.num_fingers
+    return f"{count - len(tried.least)} of {count} fingers needed"
+
+
 def draw(hand: Hand, case: cases.Case) -> None:
     """Simulates a grasp of each object without noise, and writes them as a film."""
     scene = case.scene
@@ -157,10 +172,8 @@ def draw(hand: Hand, case: cases.Case) -> None:
     def row(times: np.ndarray, camera: Camera) -> list[np.ndarray]:
         parts = []
         for grasp in shown:
-            # A hand that names a place is looked at there.
             moving = animation.following(scene, grasp, times, camera)
-            cameras = camera if "lookat" in hand.camera else moving
-            parts.append(animation.frames(scene, grasp, times, size=SIZE, camera=cameras))
+            parts.append(animation.frames(scene, grasp, times, size=SIZE, camera=moving))
         return [*np.concatenate(parts, axis=2)]
 
     frames = row(np.arange(0.0, scene.end_time, 1 / RATE), seen)
@@ -179,12 +192,39 @@ def section(hand: Hand) -> str:
     """What the page shows and says of a hand."""
     judged = hand.design.read_text(encoding="utf-8").splitlines()
     words = f"{hand.sentence} The hand {judged[0][2:]}."
-    if judged[1].startswith("# of heavier"):
-        words += f" Of {judged[1].removeprefix('# of ')}."
-    picture = f"![{hand.name}: {hand.sentence}](gallery/{hand.name}.webp)"
+    picture = f"![{hand.title}](gallery/{hand.name}.webp)"
     command = f"```\n{hand.command}\n```"
     design = f"[Design](gallery/{hand.name}.toml)"
-    return "\n\n".join([f"## {hand.name}", picture, f"{words} {design}", command])
+    return "\n\n".join([f"## {hand.title}", picture, f"{words} {design}", command])
+
+
+def table() -> str:
+    """All hands beside one another: what they keep, and what they need."""
+    masses = [f"{1e3 * mass:.0f} g" for mass in MASSES]
+    head = ("hand", "kept", *(f"kept at {mass}" for mass in masses), "cast hands that are good")
+    head += ("fingers needed", "pressure lines")
+    rows = [_row(hand, masses) for hand in hands() if hand.design.exists()]
+    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _row(hand: Hand, masses: list[str]) -> tuple[str, ...]:
+    first, second = hand.design.read_text(encoding="utf-8").splitlines()[:2]
+    kept = re.search(r"keeps (\S+ %)", first)
+    shares = {mass: share for share, mass in re.findall(r"(\d+ %) at (\d+ g)", second)}
+    cast_hands = re.search(r"(\d+ of \d+) cast hands", second)
+    case = common.find_case(Evaluate(design=((str(hand.design),),)))
+    params = jax.tree.map(np.asarray, case.space.params(jnp.asarray(case.design, jnp.float32)))
+    fingers = re.search(r"(\d+ of \d+) fingers needed", second)
+    link = f"[{hand.title}](#{re.sub(r'[^a-z0-9]+', '-', hand.title.lower()).strip('-')})"
+    return (
+        link,
+        kept[1] if kept else "–",
+        *(shares.get(mass, "–") for mass in masses),
+        cast_hands[1] if cast_hands else "–",
+        fingers[1] if fingers else "–",
+        str(len(valves.lines(case.scene, params))),
+    )
 
 
 def main(names: list[str]) -> None:
@@ -203,7 +243,7 @@ def main(names: list[str]) -> None:
 def write_page() -> None:
     """Writes docs/gallery.md."""
     sections = [section(hand) for hand in hands() if hand.design.exists()]
-    text = "\n\n".join([HEAD, *sections])
+    text = "\n\n".join([HEAD, table(), *sections])
     (DOCS / "gallery.md").write_text(f"{text}\n", encoding="utf-8")
 
 
@@ -216,13 +256,15 @@ hand.
 
 * **Verdict.** Each hand met 100 fresh trials at the accuracy of its search, `standard`. *Friction*
   is between object and hand. `codesign evaluate --design docs/gallery/shelf.toml --trials 100
-  --seed 1000` repeats the verdict of `shelf`; the file names scene, hand, objects and control where
+  --seed 1000` repeats the verdict of the hand *From a shelf*; the file names scene, hand, objects and control where
   they are not the default.
 * **More trials.** *N more at this share would decide* means that N further trials would decide the
   verdict if the kept share stayed the same.
 * **Heavier objects.** For each stated mass, all objects have this mass in 48 trials.
 * **Cast hands.** We simulated 64 hands with the usual [tolerances](uncertainty.md#cast-hands) of
-  casting, in 24 grasps each. The page states how many of these hands keep at least 95 %."""
+  casting, in 24 grasps each. The page states how many of these hands keep at least 95 %.
+
+On the site a click on the head of a column sorts the table."""
 
 if __name__ == "__main__":
     main(sys.argv[1:])

@@ -26,7 +26,7 @@ from scripts import gallery
 
 DOCS = Path(__file__).parents[1] / "docs"
 FIGURES = DOCS / "figures"
-DESIGN = DOCS / "gallery" / "four.toml"
+DESIGN = DOCS / "gallery" / "first.toml"  # of README's own command
 SILICONE = (0.36, 0.57, 0.80)
 PRINTED = (0.80, 0.80, 0.78)
 CORE = (0.93, 0.72, 0.40)

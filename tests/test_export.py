@@ -336,7 +336,7 @@ def test_drawings_stand_apart_and_within_their_pages(page, title):
     sizes = [*sizes[:2], TAPERED, *sizes[3:]]
     printed = process.Printed(["palm"], 1e5, None, 0.0)
     drawn = drawing.pages(title, the_scene, params, sizes, printed, Process())
-    _, fingers, moulds, _ = drawn
+    _, _, fingers, moulds, _ = drawn
     for figure in drawn:
         FigureCanvasAgg(figure).draw()
         edge = figure.bbox
@@ -351,7 +351,7 @@ def test_drawings_stand_apart_and_within_their_pages(page, title):
     titles = [axes.get_title() for axes in fingers.axes]
     assert "finger 0, 1, 3" in titles and {"finger 2, base", "finger 2, tip"} < {*titles}
     assert sum("bottom wall, cut" in axes.get_title() for axes in moulds.axes) == 1
-    assert len(drawing.pages(title, the_scene, params, sizes)) == 3  # no parts, no moulds
+    assert len(drawing.pages(title, the_scene, params, sizes)) == 4  # no parts, no moulds
 
 
 @pytest.mark.parametrize(("plane", "at"), [("along", 0.0), ("along", 4.0), ("across", 50.0)])
@@ -396,7 +396,7 @@ def test_letters_of_a_title(tmp_path, page):
     the_scene, params, sizes, _ = page
     assert drawing.write(tmp_path, "\U0010fffd $\\frac", the_scene, params, sizes) == ["\U0010fffd"]
     data = (tmp_path / "build_sheet.pdf").read_bytes()
-    assert data.startswith(b"%PDF") and b"/Count 3" in data
+    assert data.startswith(b"%PDF") and b"/Count 4" in data
 
 
 def test_the_sheet_s_lists_add_up(page, tmp_path):

@@ -1,6 +1,7 @@
 """`codesign export`."""
 
 import dataclasses
+import datetime
 import importlib.util
 import shlex
 from itertools import chain
@@ -14,7 +15,7 @@ from codesign_jax import files, preflight, provenance, rollout, runs, tolerances
 from codesign_jax.commands import common
 from codesign_jax.commands.common import find_case
 from codesign_jax.commands.flags import Export
-from codesign_jax.export import arm, grasps, plain, process, sheet, tables, valves
+from codesign_jax.export import arm, grasps, plain, process, quantities, sheet, tables, valves
 from codesign_jax.export.process import Process, Size
 from codesign_jax.judge.cases import Case
 from codesign_jax.runs import reference
@@ -252,7 +253,7 @@ def _sheet(
     options: Export,
 ) -> list[str]:
     """Writes the sheet; returns letters that its drawings lack."""
-    from codesign_jax.export import drawing  # imports Matplotlib
+    from codesign_jax.export import drawing, hand_drawing  # import Matplotlib
 
     kept = reference.Kept(None, None, [])
     if options.run_folder and not options.without:  # another hand than the run's was not judged
@@ -280,4 +281,15 @@ def _sheet(
     tests = sheet.Tests(verdict, kept.stress, kept.worth, hand_yield, doubts)
     sheet.write(folder, hand, tests, origin, speeds)
     title = f"Build sheet: {case.scene.hand.name}"
-    return drawing.write(folder, title, case.scene, params, sizes, printed, _process(options))
+    material = case.scene.hand.material
+    silicone = quantities.silicone_of(material)
+    about = hand_drawing.About(
+        design=str(origin["design"]),
+        date=datetime.datetime.now(datetime.UTC).date().isoformat(),
+        version=str(origin["version"]),
+        silicone=silicone.name if silicone else f"G {material.shear_modulus / 1e3:.0f} kPa",
+        verdict=verdict or "",
+        warnings=sheet.warnings(hand, tests),
+    )
+    parts = case.scene, params, sizes, printed, _process(options)
+    return drawing.write(folder, title, *parts, about)

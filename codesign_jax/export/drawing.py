@@ -10,11 +10,10 @@ import matplotlib.figure
 import matplotlib.patches
 import numpy as np
 from matplotlib.axes import Axes
-from scipy.spatial import ConvexHull
 
-from codesign_jax.export import arm, fonts, posture
+from codesign_jax.export import arm, fonts, hand_drawing, posture
+from codesign_jax.export.hand_drawing import About
 from codesign_jax.export.process import BACK, BAR, FABRIC, FLOOR, Printed, Process, Section, Size
-from codesign_jax.export.quantities import base_frames
 from codesign_jax.export.sheet import NAME, corners
 from codesign_jax.report.figures import default_style
 from codesign_jax.scene import Scene
@@ -26,6 +25,8 @@ _ROWS = 6  # fingers on a page
 # letters in a line of the title, and its lines
 _WIDE = 64
 _LINES = 2
+NOTHING = About()
+"""A title block of nothing but the scale."""
 
 
 @default_style
@@ -37,16 +38,18 @@ def write(
     sizes: Sequence[Size],
     printed: Printed | None = None,
     process: Process | None = None,
+    about: About = NOTHING,
 ) -> list[str]:
     """Writes the PDF; returns letters of the title that no font of this system has.
 
     Args:
       printed: The printed parts; None where they were left out.
       process: What is decided about them; None: no drawing of the moulds.
+      about: What the title block and the first page say.
     """
     path = folder / f"{NAME}.pdf"
     with matplotlib.backends.backend_pdf.PdfPages(path) as file:
-        for page in pages(title, scene, params, sizes, printed, process):
+        for page in pages(title, scene, params, sizes, printed, process, about):
             file.savefig(page)
     return fonts.of_text(title).lacking
 
@@ -59,13 +62,17 @@ def pages(
     sizes: Sequence[Size],
     printed: Printed | None = None,
     process: Process | None = None,
+    about: About = NOTHING,
 ) -> list[matplotlib.figure.Figure]:
-    """The pages: the hand, its fingers, their moulds, and how it is held and turned."""
+    """The pages: the hand, its palm and fingers, their moulds, and how it is held and turned."""
     alike = {}
     for i, size in enumerate(sizes):
         alike.setdefault(size, []).append(i)
     rows = [*alike.items()]
-    figures = [_hand_page(title, scene, params, sizes)]
+    first, second = _page(title), _page(title)
+    hand_drawing.hand_page(first, scene, params, sizes, about)
+    hand_drawing.palm_page(second, scene, params, sizes, printed, process, about)
+    figures = [first, second]
     for first in range(0, len(rows), _ROWS):
         figures.append(_fingers_page(title, rows[first : first + _ROWS]))
     if printed and process:
@@ -93,25 +100,6 @@ def _page(title: str) -> matplotlib.figure.Figure:
         family=font.family,
         parse_math=False,
     )
-    return figure
-
-
-def _hand_page(
-    title: str, scene: Scene, params: Params, sizes: Sequence[Size]
-) -> matplotlib.figure.Figure:
-    figure = _page(title)
-    points = corners(scene, params, sizes)
-    _view(figure.add_axes((0.08, 0.56, 0.40, 0.32)), scene, points, "front: x, z", 0, 2)
-    _view(figure.add_axes((0.54, 0.56, 0.40, 0.32)), scene, points, "side: y, z", 1, 2)
-    _view(figure.add_axes((0.08, 0.16, 0.40, 0.32)), scene, points, "from above: x, y", 0, 1)
-    _palm(figure.add_axes((0.54, 0.16, 0.40, 0.32)), scene, params)
-    extent = np.ptp(np.concatenate(points), axis=0)
-    words = (
-        f"Straight fingers, without pressure, span {extent[0]:.0f} x {extent[1]:.0f} x "
-        f"{extent[2]:.0f} mm. Red: fabric, which faces inwards. z = 0: the palm's underside. "
-        f"Numbers of fingers at their tips. Tables and the order of work: {NAME}.md."
-    )
-    figure.text(0.06, 0.08, textwrap.fill(words, 120), fontsize=7, va="top")
     return figure
 
 
@@ -170,32 +158,6 @@ def _mounting_page(
     if scene.effects.wrist:
         _wrist(figure.add_axes((0.08, 0.07, 0.84, 0.24)), scene, printed)
     return figure
-
-
-def _view(axes: Axes, scene: Scene, fingers: np.ndarray, title: str, across: int, up: int) -> None:
-    radius = 1e3 * scene.hand.palm.radius
-    thick = 1e3 * scene.hand.palm.thickness
-    depth = 3 - across - up
-    near = -1 if depth == 1 else 1  # the front is seen from -y
-    order = np.argsort(near * fingers[..., depth].mean(1))
-    disc: Any = matplotlib.patches.Circle((0, 0), radius)
-    if up == 2:
-        disc = matplotlib.patches.Rectangle((-radius, 0), 2 * radius, thick)
-    disc.set(facecolor="0.93", edgecolor="0.4", lw=0.7)
-    axes.add_patch(disc)
-    for i in order:
-        flat = fingers[i][:, [across, up]]
-        outline = flat[ConvexHull(flat).vertices]
-        axes.fill(*outline.T, facecolor="#cfdcec", edgecolor="black", lw=0.7)
-        fabric = flat[[0, 1, 5, 4, 0]]
-        axes.plot(*fabric.T, color="tab:red", lw=0.9)
-        x, y = flat[4:].mean(0)
-        axes.text(x, y, str(i), ha="center", va="center", fontsize=8)
-    _finish(axes, f"{title} [mm]")
-    axes.axis("on")
-    axes.tick_params(labelsize=_SMALL)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.margins(0.05)
 
 
 def _rectangle(axes: Axes, low: tuple[float, float], size: Sequence[float], color: str) -> None:
@@ -324,31 +286,6 @@ def _wrist(axes: Axes, scene: Scene, printed: Printed | None) -> None:
         axes, "the wrist of the simulation, built (not to scale; or an arm with impedance control)"
     )
     axes.set(xlim=(0, 175), ylim=(0, 84))
-
-
-def _palm(axes: Axes, scene: Scene, params: Params) -> None:
-    radius = 1e3 * scene.hand.palm.radius
-    width = 1e3 * scene.hand.section.width
-    axes.add_patch(matplotlib.patches.Circle((0, 0), radius, facecolor="0.93", edgecolor="0.4"))
-    position, azimuth = base_frames(scene, params)
-    for i, ((x, y), angle) in enumerate(zip(1e3 * position, azimuth, strict=True)):
-        direction = np.array([np.cos(angle), np.sin(angle)])
-        side = np.array([-direction[1], direction[0]]) * width / 2
-        start = np.array([x, y])
-        axes.plot(*np.transpose([start - side, start + side]), color="tab:red", lw=1.5)
-        axes.annotate(
-            "",
-            start + 22 * direction,
-            start,
-            arrowprops={"arrowstyle": "->", "lw": 0.8, "color": "tab:blue"},
-        )
-        along, across = start + 28 * direction
-        axes.text(along, across, str(i), ha="center", va="center", fontsize=7)
-    axes.plot([0, 12], [0, 0], color="black", lw=0.6)
-    axes.text(13, 0, "x", fontsize=6, va="center")
-    _finish(axes, "palm from above: edges of the fingers' fabric")
-    reach = max(radius, 1e3 * float(np.abs(position).max()) + 32) + 2
-    axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
 
 
 def _finish(axes: Axes, title: str) -> None:

@@ -112,18 +112,23 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return _Safe("\n".join(f"| {' | '.join(map(_plain, line))} |" for line in lines))
 
 
+def warnings(hand: Hand, tests: Tests) -> list[str]:
+    """Warnings of the design and of its parts, a sentence each."""
+    sentences = stress.of_design(hand.scene, hand.params)
+    sentences += [*(tests.stress.warnings if tests.stress else ())]
+    sentences += idle_fingers(hand.scene, hand.params, hand.sizes)
+    sentences += twisting_fingers(hand.scene, hand.params)
+    sentences += thread_inside(hand.scene)
+    return [*sentences, *tests.warnings]
+
+
 def _tested(hand: Hand, tests: Tests) -> dict[str, Any]:
-    warnings = stress.of_design(hand.scene, hand.params)
-    warnings += [*(tests.stress.warnings if tests.stress else ())]
-    warnings += idle_fingers(hand.scene, hand.params, hand.sizes)
-    warnings += twisting_fingers(hand.scene, hand.params)
-    warnings += thread_inside(hand.scene)
     return {
         "verdict": tests.verdict,
         "stress": tests.stress,
         "worth": tests.worth,
         "cast": tests.cast,
-        "warnings": [*warnings, *tests.warnings],
+        "warnings": warnings(hand, tests),
     }
 
 

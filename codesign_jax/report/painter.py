@@ -29,8 +29,6 @@ _LINE = np.array([0.72, 0.70, 0.665])
 _GRID = 0.05  # distance of the table's lines [m]
 _WIDTH = 0.0012  # of a line [m]
 _REACH = 0.75  # distance from the middle at which the table has faded into the sky [m]
-_CHECK = 0.02  # squares on the object, by which one sees it turn [m]
-_DARKER = 0.84
 # The light's direction: from the camera's to the right, and down [deg].
 _ASIDE = -50.0
 _STEEP = 58.0
@@ -85,7 +83,6 @@ class _Body(NamedTuple):
     parts: list[Part]
     face: np.ndarray  # corners as vertices of all parts, shape (face, 3)
     color: np.ndarray  # of each face, shape (face, 3)
-    checked: np.ndarray  # places in the object's frame, NaN elsewhere [m], shape (vertex, 3)
     # Which faces give a corner its normal, shape (3 face, face)
     around: scipy.sparse.csr_array
 
@@ -119,7 +116,6 @@ def still(parts: Sequence[Part], camera: Camera, size: tuple[int, int]) -> np.nd
     """A picture of rigid parts in the world's frame on the table, as `paint` makes them."""
     world = np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
     body = _body([*parts], world)
-    body.checked[:] = np.nan
     return _picture(body, world, camera, size, table=True)
 
 
@@ -128,8 +124,6 @@ def _body(parts: list[Part], start: np.ndarray) -> _Body:
     first = np.cumsum([0, *(len(part.first) for part in parts)])
     face = np.concatenate([part.face + k for part, k in zip(parts, first, strict=False)])
     color = np.repeat([part.color for part in parts], [len(part.face) for part in parts], axis=0)
-    checked = np.full((first[-1], 3), np.nan)
-    checked[first[-2] :] = parts[-1].first
     # A mesh may have a place several times.
     vertices = np.concatenate([np.column_stack([p.first, p.second]) for p in parts])
     owner = np.repeat(np.arange(len(parts)), [len(part.first) for part in parts])
@@ -137,7 +131,7 @@ def _body(parts: list[Part], start: np.ndarray) -> _Body:
     _, same = np.unique(keys, axis=0, return_inverse=True)
     triangles = np.concatenate([bodies.vertices(part, start) for part in parts])[face]
     around = _around(same.ravel()[face].ravel(), _areas(triangles))
-    return _Body(parts, face, color, checked, around)
+    return _Body(parts, face, color, around)
 
 
 def _around(vertex: np.ndarray, area: np.ndarray) -> scipy.sparse.csr_array:
@@ -191,11 +185,10 @@ def _picture(
     points = view.eye + seen.away[:, None] * rays
     normals = (body.around @ area).reshape(-1, 3, 3)
     normal = _unit((share * _unit(normals[face])).sum(1))
-    local = (share * body.checked[body.face[face]]).sum(1)
-    check = np.floor(local / _CHECK + 0.25).sum(1) % 2 == 1  # NaN, of other parts, is not 1
-    color = np.where(check[:, None], _DARKER, 1.0) * body.color[face]
     lit = shadows.lit(points + 0.002 * normal)
-    colors[seen.at] = _shaded(color, normal, -_unit(rays), shadows.light, lit, points[:, 2])
+    colors[seen.at] = _shaded(
+        body.color[face], normal, -_unit(rays), shadows.light, lit, points[:, 2]
+    )
     levels = (255 * np.clip(colors, 0, 1)).astype(np.uint8)
     image = Image.fromarray(levels.reshape(_SMOOTH * size[1], _SMOOTH * size[0], 3))
     return np.asarray(image.resize(size, Image.Resampling.BOX))

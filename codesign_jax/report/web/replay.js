@@ -205,7 +205,7 @@ function startReplay(root, data) {
       float shade = 0.62 + 0.12 * n.z + 0.40 * max(dot(n, light), 0.0);
       float shine = 0.16 * pow(max(dot(n, normalize(light + back)), 0.0), 32.0);
       float rim = 0.10 * pow(1.0 - max(dot(n, back), 0.0), 3.0);
-      result = vec4(color.rgb * shade + shine + rim, 1.0);
+      result = vec4(color.rgb * shade + shine + rim, color.a);
     }`;
   // What the context holds beside the meshes' buffers.
   let program, uniform, table, scratch;
@@ -309,15 +309,24 @@ function startReplay(root, data) {
     gl.disable(gl.STENCIL_TEST);
     gl.disable(gl.BLEND);
     gl.enable(gl.DEPTH_TEST);
-    for (const p of parts) triangles(p.buffer, p.face.length, 0, [...shown(p), 1], 0);
-    if (contacts && find("forces").checked) drawForces();
+    // With forces the fingers are glass, through which one sees where they press.
+    const glass = contacts && find("forces").checked, clear = (p) => glass && p.name.startsWith("finger");
+    for (const p of parts) if (!clear(p)) triangles(p.buffer, p.face.length, 0, [...shown(p), 1], 0);
+    if (!glass) return;
+    drawForces();
+    gl.enable(gl.BLEND);
+    gl.enable(gl.CULL_FACE);
+    gl.depthMask(false);
+    for (const p of parts) if (clear(p)) triangles(p.buffer, p.face.length, 0, [...shown(p), 0.3], 0);
+    gl.depthMask(true);
+    gl.disable(gl.CULL_FACE);
+    gl.disable(gl.BLEND);
   }
 
-  // ---- contact points and forces, in front of what hides them: an arrow for each part, whose head is where it presses
+  // ---- contact points and forces: an arrow for each part, whose head is where it presses
   const LONGEST = 0.07;  // arrow of the grasp's largest force [m]
   function drawForces() {
     const most = Math.max(...contacts.flat().map(({ force }) => Math.hypot(...force)), 1e-9);
-    gl.clear(gl.DEPTH_BUFFER_BIT);
     for (const { part, force, point, points } of contacts[Math.round(time * data.rate)] || []) {
       const corners = points.flatMap((at) => cone(at, [0, 0, 0.004], 0.002, 4).concat(cone(at, [0, 0, -0.004], 0.002, 4)));
       const long = LONGEST / most * Math.hypot(...force), along = normal(force), head = Math.min(0.014, long);

@@ -40,8 +40,9 @@ import numpy as np
 
 from codesign_jax import codesign, rollout, scene, use_compilation_cache
 from codesign_jax.engines import make_engine
+from codesign_jax.engines.base import recording
 from codesign_jax.optimize import schedule
-from codesign_jax.report import animation
+from codesign_jax.report import animation, bodies, viewer
 from codesign_jax.scene import parameters
 
 use_compilation_cache()  # compiled programs are kept: the second start takes seconds
@@ -105,17 +106,28 @@ axes.legend()
 plt.show()
 
 # %% [markdown]
-# And the picture: start, end of approach, inflation, lift, shaking and release.
+# And the grasp in 3D: it turns, and *forces* shows where each finger presses.  An engine that
+# records forces ring by ring is another program.
 
 # %%
-grasps = animation.replay(grasping, engine, space.params(jnp.asarray(design)), trials)
-times = np.array(
-    [0, grasping.phases.approach, grasping.phases.inflate, grasping.phases.lift, 8.0, 8.9]
-)
-shown = animation.frames(grasping, grasps[0], times[:2] if FAST else times, size=(200, 200))
-plt.figure(figsize=(12, 2.2), layout="constrained")
-plt.imshow(np.concatenate(list(shown), axis=1))
-plt.axis("off")
+hand = space.params(jnp.asarray(design))
+grasps = animation.replay(grasping, recording(engine, touch=True), hand, trials)
+viewer.Notebook(grasping, grasps[0])
+
+# %% [markdown]
+# The tips over the table, and what the fingers press with, in the colours of the viewer.
+
+# %%
+trial = jax.tree.map(lambda value: value[0], trials)
+tips = rollout.tips(grasping, hand, trial, grasps[0].qpos)
+figure, (high, strong) = plt.subplots(1, 2, figsize=(9, 3), layout="constrained")
+for finger in range(grasping.num_fingers):
+    style = {"color": bodies.finger_color(finger), "label": f"finger {finger}"}
+    high.plot(time, 1e3 * np.asarray(tips[:, finger, 2]), **style)
+    strong.plot(time, grasps[0].trace.forces.grip[:, finger], **style)
+high.set(xlabel="time [s]", ylabel="tip over the table [mm]")
+strong.set(xlabel="time [s]", ylabel="normal force on the object [N]")
+high.legend()
 plt.show()
 
 # %% [markdown]

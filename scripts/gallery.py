@@ -256,8 +256,8 @@ hand.
 
 * **Verdict.** Each hand met 100 fresh trials at the accuracy of its search, `standard`. *Friction*
   is between object and hand. `codesign evaluate --design docs/gallery/shelf.toml --trials 100
-  --seed 1000` repeats the verdict of the hand *From a shelf*; the file names scene, hand, objects and control where
-  they are not the default.
+  --seed 1000` repeats the verdict of the hand *From a shelf*; the file names scene, hand, objects
+  and control where they are not the default.
 * **More trials.** *N more at this share would decide* means that N further trials would decide the
   verdict if the kept share stayed the same.
 * **Heavier objects.** For each stated mass, all objects have this mass in 48 trials.

@@ -488,6 +488,23 @@ def test_a_grasp_turns_until_somebody_takes_it(run, browser):
 
 
 @pytest.mark.browser
+def test_a_notebook_shows_the_same_viewer(grasp, browser, tmp_path):
+    """In a frame of its own, without a network."""
+    path = tmp_path / "cell.html"
+    path.write_text(f"<p>cell</p>{viewer.Notebook(*grasp)._repr_html_()}", encoding="utf-8")
+    page = browser.new_page(viewport={"width": 900, "height": 800}, reduced_motion="reduce")
+    complaints = []
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("request", lambda r: complaints.append(r.url) if r.url.startswith("http") else None)
+    page.goto(path.as_uri())
+    view = "document.getElementById('replay').replay"
+    page.frames[1].wait_for_function(f"{view} && {view}.time() > 0")
+    assert page.frames[1].locator("html").evaluate("e => e.scrollHeight <= e.clientHeight")
+    assert complaints == []
+    page.close()
+
+
+@pytest.mark.browser
 def test_forces_are_drawn_where_they_press(browser, tmp_path):
     """Sums of contacts by finger on the page are those of the trace, and the picture shows them."""
     the_scene = grasps.pinch("box", links=4, effects__surface="hull")

@@ -11,7 +11,7 @@ import itertools
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -26,6 +26,7 @@ _TABLE = 0.6  # half side of the table that is drawn [m]
 # The skin is drawn with at least so many rings of a link and points of a ring.
 _RINGS = 2
 _POINTS = 16
+_FRAME = 680  # height of a notebook's frame [px]
 _NEAR = 0.5  # distance of the strip's camera [m]
 _LEAST_FORCE = 1e-3
 """Force [N] from which on a contact is shown."""
@@ -98,6 +99,19 @@ def write(scene: Scene, grasp: Replay, path: Path, *, title: str, text: list[str
     with files.atomically(path) as part:
         part.write_text(page(title, body), encoding="utf-8")
     return path
+
+
+class Notebook(NamedTuple):
+    """A grasp in 3D as the value of a notebook's cell: it plays and turns, see `fragment`."""
+
+    scene: Scene
+    grasp: Replay
+
+    def _repr_html_(self) -> str:
+        """A page in a frame: whatever a notebook's own page has, the viewer does not meet it."""
+        whole = html.escape(page("A grasp in 3D", fragment(self.scene, self.grasp)))
+        style = f"width: 100%; height: {_FRAME}px; border: 0"
+        return f'<iframe title="a grasp in 3D" srcdoc="{whole}" style="{style}"></iframe>'
 
 
 def data(scene: Scene, grasp: Replay) -> dict[str, Any]:

@@ -26,7 +26,7 @@ _TABLE = 0.6  # half side of the table that is drawn [m]
 # The skin is drawn with at least so many rings of a link and points of a ring.
 _RINGS = 2
 _POINTS = 16
-_FRAME = 680  # height of a notebook's frame [px]
+_FRAME = 780  # height of a notebook's frame [px]
 _NEAR = 0.5  # distance of the strip's camera [m]
 _LEAST_FORCE = 1e-3
 """Force [N] from which on a contact is shown."""

@@ -28,12 +28,12 @@ from codesign_jax import rollout, scene, use_compilation_cache
 from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import parameters
-from codesign_jax.statistics import Interval, gain, halves, wilson
+from codesign_jax.statistics import Interval, gain, halves
 from codesign_jax.types import failed
 from scripts.accuracy import budget
 from scripts.accuracy.report import interval, points
 from scripts.shared import output, provenance, work
-from scripts.shared.statistics import bootstrap, spearman, two_way
+from scripts.shared.statistics import RESAMPLES, bootstrap, spearman, two_way
 
 DOCS = Path(__file__).parents[2] / "docs"
 HARD = DOCS / "data" / "search" / "hard.npz"
@@ -56,7 +56,6 @@ SEED = 11
 LEAST = 0.3
 MOST = 0.95
 TRUTH = "reference"
-RESAMPLES = 1000
 
 
 class Row(NamedTuple):
@@ -235,19 +234,21 @@ def rank_interval(rank: float, designs: int) -> Interval:
 
 
 def draw_changes(content: dict[str, Any], path: Path) -> Path:
-    """A bar for each change, shortest first, with the rank correlation of the designs' shares."""
+    """A bar for each change, shortest first, with the rank correlation of the designs' shares.
+
+    The bars have no intervals: the file has sums, and grasps of one design or of one trial are not
+    independent.
+    """
     trials = content["designs"] * content["trials"]
     rows = sorted(content["variants"], key=lambda row: -row["gained"] - row["lost"])
     figure = output.new_figure(9, 4.6)
     axes = figure.subplots()
     for y, row in enumerate(rows):
-        flips = wilson(row["gained"] + row["lost"], trials)
-        share, low, high = (100 * value for value in flips)
+        share = 100 * (row["gained"] + row["lost"]) / trials
         axes.barh(y, share, color=KINDS[row["kind"]][1], alpha=0.85)
-        axes.plot([low, high], [y, y], color="0.2", lw=1)
         ranks = rank_interval(row["rank"], content["designs"])
         text = f"{share:.0f} %, ranks {ranks.value:.2f} ({ranks.low:.2f} to {ranks.high:.2f})"
-        axes.text(high + 0.4, y, text, va="center", fontsize=8)
+        axes.text(share + 0.4, y, text, va="center", fontsize=8)
     axes.set_yticks(range(len(rows)), [row["variant"].replace("`", "") for row in rows], fontsize=8)
     axes.set_xlim(0, 34)
     axes.set_xlabel(f"verdicts that change [%], {content['designs']} designs that keep 30 to 95 %")

@@ -14,9 +14,8 @@ from codesign_jax.scene import load
 from codesign_jax.statistics import Interval
 from scripts.accuracy import budget
 from scripts.shared import output
-from scripts.shared.statistics import spearman, two_way
+from scripts.shared.statistics import RESAMPLES, spearman, two_way
 
-RESAMPLES = 500
 PRESETS = ("fast", "standard", "fine", "reference")
 CANDIDATES = {
     "1e-6": "`standard` with a tolerance of 1e-6",

@@ -125,7 +125,7 @@ def summary(data: Path) -> str:
 
 
 def _table(name: str, arrays: dict[str, np.ndarray], labels: Sequence[str]) -> str:
-    """Kept grasps and runs of each strategy; differences to the first label, run by run.
+    """Kept grasps and runs of each strategy; differences to the first label and the last strategy.
 
     They are differences in the same trials: fewer trials are the first ones of more.
     """
@@ -134,31 +134,62 @@ def _table(name: str, arrays: dict[str, np.ndarray], labels: Sequence[str]) -> s
         head += [f"{label}: grasps kept", "runs whose particle keeps all"]
         head += [f"change from {labels[0]}, points"] if i else []
     rows = [head]
-    for s, strategy in enumerate(arrays[f"{name}|strategies"]):
-        kept = [_kept(arrays, name, label)[s] for label in labels]
-        cells = [str(strategy)]
-        for i, share in enumerate(kept):
+    strategies = [str(s) for s in arrays[f"{name}|strategies"]]
+    for s, strategy in enumerate(strategies):
+        cells = [strategy]
+        for i, label in enumerate(labels):
+            kept, good = _grasps(arrays, name, label)[:, s]
+            share = kept.sum(-1) / np.maximum(good.sum(-1), 1)
             whole = wilson(int((share == 1).sum()), share.size)
             cells += [f"{100 * share.mean():.1f} %"]
             cells += [f"{int((share == 1).sum())} of {share.size} [{100 * whole.low:.0f}, "]
             cells[-1] += f"{100 * whole.high:.0f} %]"
             if i:
-                count = arrays[f"{name}|{labels[i]}|cost"].shape[-1]
-                change = 100 * (share - _kept(arrays, name, labels[0], count)[s])
-                middle = statistics.bootstrap(lambda k, c=change: c[k].mean(-1), change.size)
-                cells += [f"{middle.value:+.1f} [{middle.low:+.1f}, {middle.high:+.1f}]"]
+                before = _grasps(arrays, name, labels[0], kept.shape[-1])[:, s]
+                cells += [_difference((kept, good), before)]
         rows.append(cells)
     trials = arrays[f"{name}|{labels[0]}|cost"].shape[-1]
-    return f"{name}: {trials} fresh trials of each run's best particle\n\n{output.markdown(rows)}"
+    return (
+        f"{name}: {trials} fresh trials of each run's best particle\n\n{output.markdown(rows)}\n\n"
+        f"{name}: grasps kept by {strategies[-1]}, less those of another strategy, points\n\n"
+        f"{_against_last(name, arrays, labels)}"
+    )
 
 
-def _kept(
+def _against_last(name: str, arrays: dict[str, np.ndarray], labels: Sequence[str]) -> str:
+    """The last strategy's share less that of each other one; runs of one number are pairs."""
+    strategies = [str(s) for s in arrays[f"{name}|strategies"]]
+    rows = [["strategy", *labels]]
+    for s, strategy in enumerate(strategies[:-1]):
+        tables = [_grasps(arrays, name, label) for label in labels]
+        rows.append([strategy, *(_difference(t[:, -1], t[:, s]) for t in tables)])
+    return output.markdown(rows)
+
+
+def _difference(of: Sequence[np.ndarray], to: Sequence[np.ndarray]) -> str:
+    """Points by which the share of kept grasps differs, its interval over runs and trials.
+
+    Args:
+      of: Kept grasps and grasps that did not fail, each of shape (run, trial).
+      to: The same of what is subtracted.
+    """
+
+    def points(*tables: np.ndarray) -> list[float]:
+        shares = [t.sum(-1) for t in tables]
+        of, to = (100 * k / np.maximum(g, 1) for k, g in (shares[:2], shares[2:]))
+        return [float((of - to).mean())]
+
+    [middle] = statistics.two_way(points, *of, *to)
+    return f"{middle.value:+.1f} [{middle.low:+.1f}, {middle.high:+.1f}]"
+
+
+def _grasps(
     arrays: dict[str, np.ndarray], name: str, label: str, trials: int | None = None
 ) -> np.ndarray:
-    """Share of grasps that kept the object, failed trials left out, shape (strategy, run)."""
+    """Kept grasps, and grasps that did not fail, shape (2, strategy, run, trial)."""
     cost, status = (arrays[f"{name}|{label}|{kind}"][..., :trials] for kind in ("cost", "status"))
     good = ~failed(status)
-    return ((cost == 0) & good).sum(-1) / np.maximum(good.sum(-1), 1)
+    return np.stack([(cost == 0) & good, good])
 
 
 def parse() -> argparse.Namespace:

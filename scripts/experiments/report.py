@@ -115,10 +115,17 @@ class Region(NamedTuple):
     points: np.ndarray
 
 
+SMALLEST = 0.005
+"""Least share of the landscape that is called a region; smaller parts come and go with trials."""
+
+
 def regions(
-    data: dict[str, np.ndarray], threshold: float, rule: str = "exclude", smallest: float = 0.005
+    data: dict[str, np.ndarray], threshold: float, rule: str = "exclude", smallest: float = SMALLEST
 ) -> list[Region]:
-    """Connected components with cost below a threshold, largest first; points meet at edges."""
+    """Connected components with cost below a threshold, largest first; points meet at edges.
+
+    Components below `smallest` are left out.
+    """
     cost = data[rule]
     labels, count = ndimage.label(cost < threshold)  # type: ignore[misc]
     axes = np.meshgrid(data["first_axis"], data["second_axis"], indexing="ij")
@@ -414,7 +421,7 @@ def _growth_row(two: Study, many: Study) -> tuple[str, str]:
     if np.isfinite(a).all() and np.isfinite(b).all():
         # Of all pairs of resamples, as the runs of the two experiments are independent.
         rng = np.random.default_rng(0)
-        drawn = [v[rng.integers(0, len(v), (2000, len(v)))].mean(1) for v in (a, b)]
+        drawn = [v[rng.integers(0, len(v), (statistics.RESAMPLES, len(v)))].mean(1) for v in (a, b)]
         low, high = np.quantile(drawn[0] / drawn[1], [0.025, 0.975])
         text += f", {_interval(Interval(a.mean() / b.mean(), low, high), 3)} by means"
     return (
@@ -436,7 +443,7 @@ def _grasps_row(studies: dict[str, Study | None], grid) -> tuple[str, str]:
 
 
 def _regions(grid) -> str:
-    parts = []
+    parts = [f"regions of at least {100 * SMALLEST:.1f} % of the landscape"]
     for threshold in _THRESHOLDS:
         components = regions(grid[0], threshold)
         shares = " and ".join(f"{100 * r.share:.1f} %" for r in components)

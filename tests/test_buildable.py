@@ -12,8 +12,9 @@ import pytest
 from codesign_jax import codesign, optimize, scene
 from codesign_jax.judge import stress
 from codesign_jax.model import morphology
-from codesign_jax.scene import InputError, buildable, parameters, silicones
+from codesign_jax.scene import buildable, parameters, silicones
 from tests.helpers import grasps
+from tests.helpers.refusals import refusal
 
 PAPER = scene.load("paper")
 SPACE = parameters.design_space(PAPER.hand, "23d")
@@ -261,26 +262,25 @@ def test_every_optimiser_proposes_and_recommends_what_can_be_built(name):
 
 
 @pytest.mark.parametrize(
-    ("changes", "expected"),
+    ("changes", "code", "keys"),
     [
-        ({"finger_length": [0.04]}, "must have two entries, least and largest length [m], not 1"),
-        ({"finger_length": [0.2, 0.1]}, "the least length must be below the largest one"),
-        ({"finger_length": 0.04}, "limits.finger_length must be an array, not float"),
-        ({"finger_length": [0.2, 0.3]}, "(200 to 180 mm) leave nothing of the range of hand pneu"),
-        (
-            {"free_bend": 6.28},
-            "limits.free_bend = 6.28 is outside [10, 36000] deg; did you mean 359.8",
-        ),
-        ({"strain": 120}, "limits.strain = 120 is outside [0.05, 10]"),
-        ({"wrist_force": "soft"}, "limits.wrist_force = 'soft' must be a number in [0, 1e+06] N"),
-        ({"free_bent": 360}, "did you mean 'limits.free_bend'?"),
+        ({"finger_length": [0.04]}, "size", ["limits.finger_length"]),
+        ({"finger_length": [0.2, 0.1]}, "order", ["limits.finger_length"]),
+        ({"finger_length": 0.04}, "type", ["limits.finger_length"]),
+        ({"finger_length": [0.2, 0.3]}, "range", [f"length[{i}]" for i in range(4)]),
+        ({"free_bend": 6.28}, "range", ["limits.free_bend"]),
+        ({"strain": 120}, "range", ["limits.strain"]),
+        ({"wrist_force": "soft"}, "type", ["limits.wrist_force"]),
+        ({"free_bent": 360}, "unknown", ["limits.free_bent"]),
     ],
 )
-def test_bad_limits_are_refused(changes, expected):
+def test_bad_limits_are_refused(changes, code, keys):
     limits = {f"limits.{name}": value for name, value in changes.items()}
-    with pytest.raises(InputError) as error:
-        parameters.design_space(scene.load("paper", overrides=limits).hand)
-    assert expected in str(error.value)
+
+    def space():
+        return parameters.design_space(scene.load("paper", overrides=limits).hand)
+
+    assert refusal(space) == [(code, key) for key in keys]
 
 
 # --- pressure lines ------------------------------------------------------------------------------
@@ -359,25 +359,28 @@ def test_fingers_of_one_line_get_the_same_pressure_course():
 
 
 @pytest.mark.parametrize(
-    ("hand", "changes", "expected"),
+    ("hand", "changes", "code", "key"),
     [
-        ("pneuflex4", {"lines": 5}, "lines = 5 must be at most 4, the fingers"),
-        ("pneuflex4", {"lines": 0}, "lines = 0 is outside [1, 100]"),
-        ("pneuflex4", {"lines": 2, "groups": [[0, 1]]}, "not both"),
-        ("pneuflex4", {"groups": [[0, 7]]}, "fingers are numbered from 0 to 3"),
-        ("pneuflex4", {"groups": [[0, 1], [1, 2]]}, "a finger is in one group only"),
-        ("pneuflex4", {"groups": [[0]]}, "a group has two or more fingers"),
-        ("pneuflex4", {"line": 2}, "did you mean 'hand.valves.lines'?"),
-        ("thumb4", {"groups": [[2, 3]]}, "fixes unlike pressures of fingers [2, 3] of one line"),
-        ("two_stage", {"groups": [[1, 2]]}, "fingers [1, 2] may share a pressure line, and have"),
-        ("two_stage", {"lines": 2}, "give hand.valves.groups in place of lines"),
+        ("pneuflex4", {"lines": 5}, "conflict", "hand.valves.lines"),
+        ("pneuflex4", {"lines": 0}, "range", "hand.valves.lines"),
+        ("pneuflex4", {"lines": 2, "groups": [[0, 1]]}, "conflict", "hand.valves"),
+        ("pneuflex4", {"groups": [[0, 7]]}, "size", "hand.valves.groups"),
+        ("pneuflex4", {"groups": [[0, 1], [1, 2]]}, "size", "hand.valves.groups"),
+        ("pneuflex4", {"groups": [[0]]}, "size", "hand.valves.groups"),
+        ("pneuflex4", {"line": 2}, "unknown", "hand.valves.line"),
+        ("thumb4", {"groups": [[2, 3]]}, "conflict", ""),
+        ("two_stage", {"groups": [[1, 2]]}, "conflict", "control.frame[2].pressure"),
+        ("two_stage", {"lines": 2}, "conflict", "control.frame[2].pressure"),
     ],
 )
-def test_bad_lines_are_refused(hand, changes, expected):
+def test_bad_lines_are_refused(hand, changes, code, key):
     overrides = {f"hand.valves.{name}": value for name, value in changes.items()}
     if hand == "two_stage":
         overrides["control"] = hand
         hand = "pneuflex4"
-    with pytest.raises(InputError) as error:
-        parameters.design_space(scene.load("paper", hand_name=hand, overrides=overrides).hand, "2d")
-    assert expected in str(error.value)
+
+    def space():
+        loaded = scene.load("paper", hand_name=hand, overrides=overrides)
+        return parameters.design_space(loaded.hand, "2d")
+
+    assert refusal(space) == [(code, key)]

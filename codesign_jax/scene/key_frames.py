@@ -455,14 +455,16 @@ def _unlike_lines(control: Control, hand: Hand, where: str) -> Iterator[str]:
         hint = "; give hand.valves.groups in place of lines"
         for row in control.parameter:
             if row.per == "finger":
-                yield f"{where}.parameter {row.name}: fingers may share a pressure line{hint}"
+                words = f"fingers may share a pressure line{hint}"
+                yield schema.Problem("conflict", f"{where}.parameter {row.name}: {words}")
     for i, frame in enumerate(control.frame):
         for group in groups:
             if frame.pressure is not None and len({frame.pressure[k] for k in group}) > 1:
                 words = (
                     f"fingers {list(group)} may share a pressure line, and have unlike pressures"
                 )
-                yield f"{where}.frame[{i}].pressure: {words}{hint}"
+                key = f"{where}.frame[{i}].pressure"
+                yield schema.Problem("conflict", f"{key}: {words}{hint}")
 
 
 def doubts(scene: Any, where: str) -> list[str]:

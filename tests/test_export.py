@@ -850,8 +850,23 @@ def assert_declared(alone, spec, shares):
 def test_contacts_have_the_declared_stiffness(friction):
     the_scene = pinch("box", effects__friction=friction, effects__finger_finger=True)
     params, trial = hand_world(the_scene)
-    alone, trial = plain.single_object(the_scene, trial)
+    alone, trial = plain.single_object(the_scene, params, trial)
     assert_declared(alone, build_spec(alone, params, trial), {})
+
+
+def test_sections_by_elements_bend_as_far_in_the_model():
+    """Free bends of linear springs under the exported gains, with a finger without pressure."""
+    the_scene = pinch("box", section__law="elements", effects__neo_hookean=True)
+    params, trial = hand_world(the_scene)
+    params = params._replace(pressure=np.array([40e3, 0.0]))
+    exported = grasps.world(the_scene, params, trial)
+    dofs = model.layout(the_scene).dofs[..., 0]
+    gain = exported.actuator_gainprm[6:, 0]
+    bends = (params.pressure * gain)[:, None] / exported.jnt_stiffness[exported.dof_jntid[dofs]]
+    expected = model.morphology.free_bends(the_scene.hand, params)
+    np.testing.assert_allclose(bends.sum(1), expected, rtol=1e-6)
+    assert expected[0] > 0.3
+    assert any("hand.section.law" in sentence for sentence in plain.differences(the_scene))
 
 
 @pytest.fixture(scope="module")
@@ -861,7 +876,7 @@ def skinned():
         "box", links=2, effects__surface="hull", effects__finger_finger=True, **HURRIED
     )
     params, trial = hand_world(the_scene, length=0.08)
-    alone, trial = plain.single_object(the_scene, trial)
+    alone, trial = plain.single_object(the_scene, params, trial)
     spec = build_spec(alone, params, trial)
     return alone, params, trial, spec, skin.add(alone, spec, params)
 

@@ -10,12 +10,14 @@ import pytest
 from scipy import stats
 
 from codesign_jax import cli, finger, scene
-from codesign_jax.finger import posterior, rest
+from codesign_jax.finger import posterior, rest, threads
 from codesign_jax.model import morphology
 from codesign_jax.scene import draws, keypaths, parameters
+from scripts.section import study
 from tests.helpers.refusals import refusal, refusal_of_command
 
-MEASURED = Path(__file__).parents[1] / "docs" / "data" / "measured.toml"
+PAGES = Path(__file__).parents[1] / "docs"
+MEASURED = PAGES / "data" / "measured.toml"
 
 
 def material(law="linear"):
@@ -62,6 +64,53 @@ def test_a_finger_with_the_law_of_elements():
         assert fitted.value["shear_modulus"] == pytest.approx(
             softer.constants.shear_modulus, rel=1e-3
         )
+
+
+@pytest.fixture(scope="module")
+def bends_of_elements():
+    """Angles of 110 mm of the section of 24 x 20 mm with walls of 5 mm, by finite elements."""
+    data = study.read(PAGES / "data" / "section.npz")
+    [column] = [
+        c
+        for n, (s, c) in data.items()
+        if n.startswith("nominal") and (s.wall, s.height, s.width) == (5e-3, 20e-3, 24e-3)
+    ]
+    free = (column["pressure"] > 0) & (np.abs(column["moment_bend"]) < 1e-6)
+    free &= column["pressure"] < 60e3  # the law's range
+    pressure, first = np.unique(column["pressure"][free], return_index=True)
+    return pressure, column["bend"][free][first] * 0.11
+
+
+@pytest.mark.parametrize("modulus", [1.0, 0.85])
+def test_angles_by_elements_support_a_thread_outside(bends_of_elements, modulus):
+    """Also where the rubber is softer than its name says; two angles suffice."""
+    loaded = scene.load("paper")
+    space = parameters.design_space(loaded.hand, "2d")
+    params = space.params(space.from_units([110.0, 0.0]))
+    pressure, angle = bends_of_elements
+    table = {"pressure": modulus * pressure, "angle": angle}
+    odds = finger.odds(loaded, params, 0, table)
+    assert odds["thread outside"] > 0.9 and sum(odds.values()) == pytest.approx(1)
+    mine = finger.of_design(loaded, params, 0)
+    bends = {"pressure": pressure, "angle": threads.free_angles(mine, pressure)}
+    assert finger.odds(loaded, params, 0, bends)["beam theory"] > 0.5
+    at_rest = finger.Rest.of(mine, pressure[-1]).angles.sum()
+    assert bends["angle"][-1] == pytest.approx(at_rest, rel=1e-6)
+
+
+def test_no_odds_without_angles():
+    loaded = scene.load("paper")
+    space = parameters.design_space(loaded.hand, "2d")
+    params = space.params(space.from_units([110.0, 0.0]))
+    for table in (
+        {"pressure": np.array([2e4, 4e4]), "tip_force": np.ones(2)},
+        {"pressure": np.array([2e4]), "angle": np.array([0.2])},
+        {"pressure": np.zeros(3), "angle": np.zeros(3)},
+    ):
+        assert finger.odds(loaded, params, 0, table) == {}
+    linear = scene.load("paper", overrides=material("linear"))
+    table = {"pressure": np.array([2e4, 4e4]), "angle": np.array([0.2, 0.5])}
+    assert finger.odds(linear, params, 0, table) == {}
 
 
 @pytest.mark.parametrize("links", [3, 10])

@@ -43,6 +43,11 @@ OVERRIDES = (
     "control.frame.1.z=arm_w",
     "control.frame.1.z=pressure",
 )
+OF_ELEMENTS = {
+    "hand.section.law": "elements",
+    "effects.lateral_threshold": True,
+    "effects.air_mass": True,
+}
 SUMS = ("2 * (arm_z)", "arm_z -", "arm_z - 0,01", "30°", "150 kPa", "1e3 * arm_z", "95")
 CALLS = {
     "a file that there is not": lambda: hand.load("nowhere/hand.toml"),
@@ -51,6 +56,7 @@ CALLS = {
     "a pair without a value": lambda: keypaths.parse(["gravity"]),
     "a misspelt engine": lambda: make_engine("mujocco", scene.load("paper")),
     "a name for a scene": lambda: make_engine("mujoco", "paper"),  # type: ignore[arg-type]
+    "effects that a section's law has": lambda: scene.load("paper", overrides=OF_ELEMENTS),
     "a misspelt preset": lambda: parameters.design_space(scene.load("paper").hand, "24d"),
     "a field with control characters": lambda: scene.load("paper\x1b[2J"),
 }

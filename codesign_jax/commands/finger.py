@@ -83,6 +83,9 @@ def main(options: Options) -> int:
         table |= {n: np.zeros(POINTS) for n in ("angle", "tip_force", "blocked_force")}
     try:
         compare(mine, table, options, console)
+        if odds := fingers.odds(case.scene, params, options.finger, table) if measured else {}:
+            shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in odds.items())
+            console.print(f"odds by the angles: {shares}")
     except InputError:
         raise
     except ValueError as error:

@@ -20,6 +20,7 @@ from codesign_jax.finger.advice import Advice, advice
 from codesign_jax.finger.posterior import Posterior, fit
 from codesign_jax.finger.prediction import opposed, predict, shifted, without_rest
 from codesign_jax.finger.rest import TOO_FAR, Constants, Finger, NoRest, Rest, of_design
+from codesign_jax.finger.threads import odds
 from codesign_jax.measurements import MEASURED, read
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "Rest",
     "advice",
     "fit",
+    "odds",
     "of_design",
     "opposed",
     "predict",

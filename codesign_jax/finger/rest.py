@@ -91,8 +91,8 @@ class Finger(NamedTuple):
             gain=new.moment_factor / old.moment_factor * self.gain,
         )
 
-    def held(self, pressure: float, angle: np.ndarray) -> np.ndarray:
-        """Moment that holds joints at angles [rad] under a pressure [Pa], in N m; shape (N,)."""
+    def held(self, pressure: float | np.ndarray, angle: np.ndarray) -> np.ndarray:
+        """Moment that holds joints at angles [rad] under a pressure [Pa], in N m; (..., N)."""
         if self.law is not None:
             return section_law.response(self.law, pressure, 0.0, angle / self.segment, 0.0).bend
         moment = self.stiffness * angle

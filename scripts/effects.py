@@ -22,9 +22,9 @@ from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import Effects, Scene, parameters, silicones
 from codesign_jax.scene.effects import EFFECTS, ENGINES, refusals
-from codesign_jax.statistics import wilson
 from codesign_jax.types import failed
 from scripts.shared import output, provenance, work
+from scripts.shared.statistics import two_way
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE = DOCS / "effects.md"
@@ -101,6 +101,7 @@ def measure(everything: dict[str, Scene], path: Path, *, commit: str | None, qui
     """Measures all and writes the file."""
     designs, trials = (6, 3) if quick else (30, 12)
     results: dict[str, Any] = {"designs": designs, "trials": trials, "effects": {}}
+    results["intervals"] = "over designs and trials"
     results["provenance"] = provenance.measurement(commit)
     worlds = grasps(everything[AS_IT_IS], designs, trials)
     few = jax.tree.map(lambda v: np.asarray(v)[: TIMED * trials], worlds)
@@ -109,8 +110,8 @@ def measure(everything: dict[str, Scene], path: Path, *, commit: str | None, qui
     for name, variant in everything.items():
         kept, start = decide(variant, worlds)
         expected = kept if expected is None else expected
-        rate = wilson(int(kept.sum()), kept.size)
-        shares = {"success": float(kept.mean()), "success_low": rate.low, "success_high": rate.high}
+        [rate] = two_way(lambda k: [float(k.mean())], kept.reshape(designs, trials))
+        shares = {"success": rate.value, "success_low": rate.low, "success_high": rate.high}
         results["effects"][name] = shares | {"same_verdict": float((kept == expected).mean())}
         print(name, results["effects"][name], flush=True)
         programs[name] = program(variant, few, start[: TIMED * trials])
@@ -164,9 +165,9 @@ def measured(results: dict[str, Any]) -> str:
     p = results["provenance"]
     load = results["load"]
     caption = (
-        f"{results['designs']} designs in {results['trials']} trials each; {p['cpus']} cores, "
-        f"jax {p['jax']}; timed while other programs used the machine (load average "
-        f"{max(load):.0f})."
+        f"{results['designs']} designs in {results['trials']} trials each; intervals of success "
+        f"{results.get('intervals', 'as if all grasps were independent')}; {p['cpus']} cores, jax "
+        f"{p['jax']}; timed while other programs used the machine (load average {max(load):.0f})."
     )
     return f"{caption}\n\n{output.markdown(table)}"
 

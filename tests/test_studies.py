@@ -27,8 +27,8 @@ from scripts.accuracy import budget, decisions, report
 from scripts.agree import __main__ as agree
 from scripts.agree import judgement, sides
 from scripts.calibration import OPEN
+from scripts.experiments import fresh, simulate
 from scripts.experiments import report as results
-from scripts.experiments import simulate
 from scripts.experiments.simulate import PAPER, TOTAL_GRASPS
 from scripts.search import __main__ as search
 from scripts.search import tables as search_tables
@@ -619,3 +619,14 @@ def test_an_equal_version_agrees_and_a_wrong_law_does_not(planted, tmp_path, mon
     monkeypatch.setattr(agree, "QUICK", TINY_SIZE)
     status = agree.main([str(ROOT), "--kind", "same", "--quick"])
     assert status == (planted != SPRING)
+
+
+def test_an_interval_of_fresh_trials_has_what_one_trial_does_to_all_runs():
+    """Every run loses one of 24 trials: resampled trials hold it as often as a binomial says."""
+    good = np.ones((30, 24), bool)
+    lost = good.copy()
+    lost[:, 5] = False
+    worst, best = scipy.stats.binom.ppf([0.975, 0.025], 24, 1 / 24) / -24
+    words = f"{-100 / 24:+.1f} [{100 * worst:+.1f}, {100 * best + 0.0:+.1f}]"
+    assert fresh._difference((lost, good), (good, good)).replace("-0.0", "+0.0") == words
+    assert fresh._difference((lost, good), (lost, good)) == "+0.0 [+0.0, +0.0]"

@@ -158,11 +158,17 @@ def mesh_notes(scene: Scene) -> list[str]:
     return lines
 
 
+def shaken_coarsely(scene: Scene) -> bool:
+    """Whether a period of the shaking has fewer than `SHAKE_STEPS` time steps."""
+    step = scene.discretization.timestep
+    return bool(scene.effects.disturb and scene.arm.shake_frequency * step * SHAKE_STEPS > 1)
+
+
 def _scene_warnings(scene: Scene) -> list[str]:
     h = scene.discretization.timestep
     doubts = key_frames.doubts(scene, "control")
     rate = scene.arm.shake_frequency
-    if scene.effects.disturb and rate * h * SHAKE_STEPS > 1:
+    if shaken_coarsely(scene):
         doubts.append(
             f"arm.shake_frequency = {rate:g} Hz has {1 / (rate * h):.1f} time steps of {h:g} s in "
             f"a period: below {SHAKE_STEPS} the shaking is not the sine asked for"

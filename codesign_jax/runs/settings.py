@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from codesign_jax import engines, optimize, sizes, user_code
+from codesign_jax import engines, optimize, preflight, sizes, user_code
 from codesign_jax.optimize import MAX_PARTICLES, schedule
 from codesign_jax.scene import Scene, schema, with_accuracy
 from codesign_jax.scene.hand import Hand
@@ -110,8 +110,8 @@ def coarse_search(scene: Scene, settings: Settings) -> bool:
     """Whether a search at `COARSE` is known to find hands that are as good or better.
 
     It was measured with the default optimiser and engine, in scenes that have the accuracy
-    `standard`; what the user's own code makes of fewer and longer steps is not known. A final test
-    has to follow.
+    `standard`; what the user's own code makes of fewer and longer steps is not known, and a fast
+    shaking needs short ones. A final test has to follow.
     """
     return (
         (settings.optimizer, settings.engine) == (optimize.DEFAULT, engines.DEFAULT)
@@ -119,6 +119,7 @@ def coarse_search(scene: Scene, settings: Settings) -> bool:
         and settings.test_trials > 0
         and scene.effects.surface == "hull"
         and with_accuracy(scene, "standard") == scene
+        and not preflight.shaken_coarsely(with_accuracy(scene, COARSE))
     )
 
 

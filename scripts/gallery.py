@@ -44,6 +44,8 @@ QUALITY = 45
 """Frames of a second, pixels, and WebP's quality."""
 CLOSE = 0.36
 """Distance of the camera [m]."""
+ACCURACY = "standard"
+"""Accuracy of the searches, at which their hands are judged."""
 TRIALS = 100
 SEED = 1000
 MASSES = (0.1, 0.2, 0.3, 0.5)
@@ -77,7 +79,7 @@ class Hand:
         """The search."""
         flags = {"control": "--set control="}
         named = [flags.get(key, f"--{key} ") + name for key, name in self.names.items()]
-        return " ".join(["codesign optimize", *named, self.search])
+        return " ".join(["codesign optimize", *named, self.search, f"--accuracy {ACCURACY}"])
 
     @property
     def design(self) -> Path:

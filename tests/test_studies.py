@@ -7,6 +7,7 @@ import re
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -322,12 +323,14 @@ def test_the_command_line_takes_a_preset(capsys):
     assert "'fastest' unknown; did you mean 'fast'" in capsys.readouterr().err
 
 
-ONE_ACCURACY = [
+ONE_ACCURACY: list[dict[str, Any]] = [
+    {"preset": "2d"},
     {"accuracy": "standard"},
     {"accuracy": "fine"},
     {"search_accuracy": "scene"},
     {"optimizer": "cma-es"},
     {"test_trials": 0},
+    {"scene": "shelf"},
     {"scene": "paper_spheres"},
     {"scene": "paper_spheres", "engine": "mujoco"},
     {"overrides": (("discretization.links=5",),)},
@@ -338,9 +341,8 @@ ONE_ACCURACY = [
 
 
 def test_a_default_search_is_coarse_and_has_the_episodes_that_its_time_allows(tmp_path):
-    def resolved(**flags):
-        out = tmp_path / "run"
-        return optimize.resolve(cli.Optimize(preset="23d", out=out, **flags))
+    def resolved(preset="23d", **flags):
+        return optimize.resolve(cli.Optimize(preset=preset, out=tmp_path / "run", **flags))
 
     the_scene, settings = resolved()
     assert (settings.search_accuracy, settings.episodes) == ("fast", 62)
@@ -353,7 +355,8 @@ def test_a_default_search_is_coarse_and_has_the_episodes_that_its_time_allows(tm
         plan = runs.prepare(the_scene, settings)
         assert plan.task is plan.test_task and plan.scene == the_scene, flags
         assert settings.search_accuracy == "scene", flags
-        assert settings.episodes == (128 if "optimizer" in flags else 30), flags
+        episodes = {"optimizer": 128, "preset": 22}
+        assert settings.episodes == next((episodes[n] for n in flags if n in episodes), 30), flags
     assert resolved(accuracy="fine", search_accuracy="standard")[1].search_accuracy == "standard"
 
 

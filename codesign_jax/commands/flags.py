@@ -203,8 +203,8 @@ class Optimize(Command, SceneFlags):
     engine: Engine = None
     search_accuracy: Text = None
     """Accuracy of the episodes, as of --accuracy, which is that of the final test; scene: the same
-    for both. Default: fast, where --accuracy is not given, the scene has the accuracy standard, and
-    optimiser, engine and cost are the defaults, without a policy (docs/accuracy.md)."""
+    for both. Default: fast for more than three parameters, where --accuracy is not given, the scene
+    has the accuracy standard, and all else is the default (docs/accuracy.md)."""
     particles: Annotated[int | None, _size("particles", "Particles")] = None
     trials: Annotated[
         int | None,

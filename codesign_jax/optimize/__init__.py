@@ -20,7 +20,7 @@ array([[ True, False],
 
 from codesign_jax.optimize.bounds import Space, reflect, strictly_below
 from codesign_jax.optimize.evolution import EVOSAX, Evolution
-from codesign_jax.optimize.names import DEFAULT, NAMES, PAPER, make_optimizer, problem
+from codesign_jax.optimize.names import DEFAULT, FEW, NAMES, PAPER, make_optimizer, problem
 from codesign_jax.optimize.particle_filter import ParticleFilter
 from codesign_jax.optimize.protocol import Info, Optimizer, OptimizerState
 from codesign_jax.optimize.resampling import MAX_PARTICLES, stochastic_universal
@@ -35,6 +35,7 @@ from codesign_jax.optimize.seeding import (
 
 __all__ = [
     "DEFAULT",
+    "FEW",
     "EVOSAX",
     "MAX_PARTICLES",
     "NAMES",

@@ -97,9 +97,8 @@ def make_settings(
     usual = by_preset.get(preset, by_preset[""])
     if screens:
         usual = usual._replace(trials=max(objects, usual.trials))
-    if screens and search_accuracy != SCENE_ACCURACY:
-        longer = sizes.SEARCH_EPISODES
-        usual = usual._replace(episodes=longer.get(preset, longer[""]))
+    if screens and search_accuracy != SCENE_ACCURACY and preset not in by_preset:
+        usual = usual._replace(episodes=sizes.SEARCH_EPISODES)
     given_sizes = (particles, trials, episodes, test_trials)
     n, t, e, test = (s if a is None else a for a, s in zip(given_sizes, usual, strict=True))
     names = optimizer, cost, policy, search_accuracy
@@ -109,15 +108,22 @@ def make_settings(
 def coarse_search(scene: Scene, settings: Settings) -> bool:
     """Whether a search at `COARSE` is known to find hands that are as good or better.
 
-    It was measured with the default optimiser and engine, in scenes that have the accuracy
-    `standard`; what the user's own code makes of fewer and longer steps is not known, and a fast
-    shaking needs short ones. A final test has to follow.
+    It was measured with the default optimiser and engine, with 23 parameters and the objects on a
+    table, in scenes that have the accuracy `standard`; what the user's own code makes of fewer and
+    longer steps is not known, and a fast shaking needs short ones. A search of few parameters takes
+    less time than the program of another accuracy compiles. A final test has to follow.
     """
+    try:
+        many = design_space(scene.hand, settings.preset).num_parameters > optimize.FEW
+    except schema.InputError:  # which `check` tells
+        return False
     return (
-        (settings.optimizer, settings.engine) == (optimize.DEFAULT, engines.DEFAULT)
+        many
+        and (settings.optimizer, settings.engine) == (optimize.DEFAULT, engines.DEFAULT)
         and (settings.cost, settings.policy) == (SCENE_COST, "")
         and settings.test_trials > 0
         and scene.effects.surface == "hull"
+        and not scene.fixture
         and with_accuracy(scene, "standard") == scene
         and not preflight.shaken_coarsely(with_accuracy(scene, COARSE))
     )

@@ -215,7 +215,7 @@ def by_default(space: DesignSpace, words: Sequence[str]) -> str:
     return f"not given, so the hand file's defaults: {', '.join(groups)}"
 
 
-def refuse(problems: list[str]) -> None:
+def refuse(problems: Sequence[str]) -> None:
     """Ends the command if anything is wrong with its input."""
     if problems:
         raise InputError(problems)

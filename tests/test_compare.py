@@ -36,6 +36,7 @@ from codesign_jax.model import overlap
 from codesign_jax.report import advice
 from codesign_jax.runs import columns, selection
 from codesign_jax.scene import beams, design_files, draws, parameters
+from codesign_jax.terminal import Console
 from codesign_jax.types import Outcome, Status
 from tests.helpers.command_runs import command, copied, finished_run, own_workplace  # noqa: F401
 from tests.helpers.refusals import refusal_of_command
@@ -272,10 +273,41 @@ def test_check_ends_with_an_error_where_every_grasp_fails(monkeypatch):
 
     def simulate(case, *arguments):
         measured = check.Measured(case.scene, batch, 1.0, 0.0)
-        return "designs", measured, measured
+        return "designs", [measured, measured]
 
     monkeypatch.setattr(check, "simulate", simulate)
     assert command(*SUBJECT) == 1
+
+
+def test_the_table_of_presets_has_flips_and_regret_of_known_grasps(capsys):
+    """Two designs in four grasps each: one keeps all, the other none, and `fast` swaps them.
+
+    A choice between them gains half of their difference, and loses as much if they are swapped.
+    """
+    case = common.find_case(flags.Check(scene=str(TINY), engine="mujoco"))
+    rows = np.array([0, 1, 0, 1])
+
+    def measured(name, kept, seconds):
+        lost_time = np.where(np.repeat(kept, 2).reshape(4, 2), np.inf, 0.5)
+        zeros = np.zeros((4, 2), int)
+        the_scene = scene.with_accuracy(case.scene, name)
+        outcomes = Outcome(zeros, zeros, lost_time, zeros - 1)
+        return check.Measured(the_scene, outcomes, seconds, 0.0, name, rows)
+
+    levels = [
+        measured("standard", rows == 0, 4.0),
+        measured("fast", rows == 1, 2.0),
+        measured("reference", rows == 0, 40.0),
+    ]
+    settings = runs.make_settings("2d", "concurrent", "morphology", "mujoco", 0)
+    assert check.tell(case, settings, "two", levels, Console(), table=True) == 0
+    output = capsys.readouterr().out
+    lines = [line.split() for line in output.splitlines() if line.strip()]
+    cells = {words[0]: words for words in lines}
+    assert cells["fast"][1:4] == ["20", "6", "250"]  # ms, links, ms a grasp
+    assert cells["fast"][6:9] == ["8", "of", "8"] and cells["fast"][-1] == "+100.0"
+    assert cells["standard"][6:9] == ["0", "of", "8"] and cells["standard"][-1] == "+0.0"
+    assert cells["reference"][-1] == "–"
 
 
 # --- `codesign evaluate`: rows and verdict of a design, of its own or of a run --------------------

@@ -68,8 +68,10 @@ class Batch:
         *,
         size: int | None = None,
         advance: Callable[[int], Any] = lambda worlds: None,
-    ) -> tuple[Outcome, jax.Array | None]:
-        """Outcomes and last states of worlds, arrays of NumPy with leading axis (world,).
+    ) -> tuple[Outcome, Trace]:
+        """Outcomes and traces of worlds, arrays of NumPy with leading axis (world,).
+
+        Without qpos nothing is known of a trace but its last state.
 
         Args:
           hands: Their hands, leading axis (world,).
@@ -78,23 +80,6 @@ class Batch:
           size: Worlds of a call; None for `size`.
           advance: Is told the worlds of each call that has ended.
         """
-        outcomes, trace = self.shown(hands, trials, scene, size=size, advance=advance)
-        return outcomes, trace.last
-
-    def size(self, worlds: int) -> int:
-        """Worlds of each call for so many."""
-        return call_size(worlds, self.count) if self.fills else min(worlds, self.count * LIMIT)
-
-    def shown(
-        self,
-        hands: Params,
-        trials: Trial,
-        scene: Scene | None = None,
-        *,
-        size: int | None = None,
-        advance: Callable[[int], Any] = lambda worlds: None,
-    ) -> tuple[Outcome, Trace]:
-        """As `simulate`, with the traces; without qpos nothing of them but the last states."""
         worlds = len(trials.yaw)
         size = size or self.size(worlds)
         inputs = jax.tree.map(np.asarray, (hands, trials))
@@ -107,6 +92,10 @@ class Batch:
             parts.append(jax.tree.map(lambda v, n=number: np.asarray(v)[:n], results))
             advance(number)
         return jax.tree.map(lambda *v: np.concatenate(v), *parts)
+
+    def size(self, worlds: int) -> int:
+        """Worlds of each call for so many."""
+        return call_size(worlds, self.count) if self.fills else min(worlds, self.count * LIMIT)
 
     def compile(self, hands: Params, trials: Trial, *, size: int | None = None) -> tuple:
         """Compiles ahead for worlds like these; what it returns of them means nothing.

@@ -324,7 +324,8 @@ class SideBySide:
             )
         asked = self._ask(states, masks, scene)
         hands, trials = asked[2:]
-        return self._tell(states, masks, scene, asked, task._batch.simulate(hands, trials, scene))
+        outcomes, trace = task._batch.simulate(hands, trials, scene)
+        return self._tell(states, masks, scene, asked, (outcomes, trace.last))
 
     def compile(self, states: OptimizerState, masks: jax.typing.ArrayLike) -> Callable:
         """Compiles ahead for arguments like these, by worlds that are not simulated.

@@ -164,7 +164,7 @@ def simulate(
 
     def simulated(conditions: Batch, scene: Scene) -> tuple[Outcome, Trace, Trial]:
         drawn = rollout.sample_trials(scene, key, trials)
-        outcomes, trace = interruptible(conditions.shown, hands, drawn, scene)
+        outcomes, trace = interruptible(conditions.simulate, hands, drawn, scene)
         done(trials)
         return outcomes, trace, jax.tree.map(np.asarray, drawn)
 

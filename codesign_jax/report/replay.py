@@ -50,7 +50,7 @@ def replay(scene: Scene, engine: Engine, params: Params, trials: Trial) -> list[
     """Simulates one hand in several trials and keeps the trajectories."""
     count = trials.yaw.shape[0]
     worlds = jax.tree.map(lambda v: np.broadcast_to(v, (count, *np.shape(v))), params)
-    outcomes, trace = Batch(scene, engine, Options(record_qpos=True)).shown(worlds, trials)
+    outcomes, trace = Batch(scene, engine, Options(record_qpos=True)).simulate(worlds, trials)
 
     def at_index(tree, i: int):
         return jax.tree.map(lambda v: np.asarray(v)[i], tree)

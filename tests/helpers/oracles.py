@@ -111,7 +111,9 @@ def turns_fast(scene, data):
     return turns[lay.bodies].max() > LARGEST_TURN or turns[lay.object] > LARGEST_FREE_TURN
 
 
-def against_mujoco(scene, fields, ctrl, trajectory, stride=1):
+def against_mujoco(
+    scene, fields, ctrl, trajectory, stride=1
+) -> tuple[np.ma.MaskedArray, np.ndarray, np.ndarray]:
     """Errors of a path's steps against MuJoCo C, see `at_states`.
 
     Relative ones of accelerations, masked where `turns_fast`, of distances [m], and numbers of
@@ -130,8 +132,9 @@ def against_mujoco(scene, fields, ctrl, trajectory, stride=1):
         away = data.xipos[lay.object] - lay.centre_weights @ data.xipos
         far.append(abs(np.linalg.norm(away) - trajectory.distance[world, k]))
         touching.append(data.ncon)
-    compared = np.ma.array(errors, mask=fast)
-    return (v.reshape(len(ctrl), -1) for v in (compared, np.array(far), np.array(touching)))
+    shape = len(ctrl), -1
+    compared = np.ma.MaskedArray(errors, fast).reshape(shape)
+    return compared, np.reshape(far, shape), np.reshape(touching, shape)
 
 
 def share(errors):
@@ -250,4 +253,4 @@ def unbalanced(scene, fields, ctrl, trajectory, stride):
     worst = np.array([[np.abs(v[:, part]).max(1) for part in parts] for v in left])
     # At rest nothing is accelerated, and what is left is rounding of forces that cancel.
     left_over = worst[0] / worst[1].max(1, keepdims=True)
-    return np.ma.array(left_over, mask=np.broadcast_to(fast, left_over.shape))
+    return np.ma.MaskedArray(left_over, np.broadcast_to(fast, left_over.shape))

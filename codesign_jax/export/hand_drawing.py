@@ -177,7 +177,8 @@ def _view(axes: Axes, fingers: np.ndarray, disc: tuple[float, float], across: in
         outline = flat[ConvexHull(flat).vertices]
         axes.fill(*outline.T, facecolor="#cfdcec", edgecolor="black", lw=0.7, clip_on=False)
         axes.plot(*flat[[0, 1, 5, 4, 0]].T, color="tab:red", lw=0.9, clip_on=False)
-        axes.text(*flat[4:].mean(0), str(f), ha="center", va="center", fontsize=8)
+        x, y = flat[4:].mean(0)
+        axes.text(x, y, str(f), ha="center", va="center", fontsize=8)
 
 
 def _dimensions(axes: Axes, low: np.ndarray, high: np.ndarray, scale: int, *, wide: bool) -> None:
@@ -261,7 +262,8 @@ def _seat(
     forward = turn.apply((1.0, 0.0, 0.0))
     azimuth = np.degrees(np.arctan2(forward[1], forward[0]))
     words = f"finger {finger}\n({place[0]:.1f}, {place[1]:.1f}), {azimuth:.1f}°"
-    axes.text(*((furthest + 9) * away), words, fontsize=_FONT, ha="center", va="center")
+    x, y = (furthest + 9) * away
+    axes.text(x, y, words, fontsize=_FONT, ha="center", va="center")
 
 
 def _circle_of_screws(axes: Axes, diameter: float, start: float) -> None:

@@ -172,33 +172,38 @@ def _mounting(scene: Scene, grasp: Replay) -> list[Part]:
     """Seats and tubes of the fingers and the stump of the wrist, rigid in the palm's frame."""
     thick = scene.hand.palm.thickness
     position, quaternion = (np.asarray(v) for v in mounts(scene.hand, grasp.params.spread))
-    top = thick + _STUMP[1]
-    stump = trimesh.creation.cylinder(_STUMP[0], _STUMP[1], sections=32)
-    stump.apply_translation([0, 0, thick + _STUMP[1] / 2])
-    seats = []
-    tubes = []
-    for f in range(scene.num_fingers):
-        if float(grasp.params.length[f]) == 0:  # a finger that was left out
-            continue
+    present = np.flatnonzero(np.asarray(grasp.params.length) > 0)  # others were left out
+    mounting = []
+    for f in present:
         turn = np.zeros(9)
         mujoco.mju_quat2Mat(turn, quaternion[f].astype(float))
-        turn = turn.reshape(3, 3)
+        frame = turn.reshape(3, 3), position[f]
         height = float(grasp.params.height[f])
-        size = np.array([_SEAT, scene.hand.section.width + 2 * _CHEEK, height + 2 * _CHEEK])
-        middle = np.array([_CHEEK - _SEAT / 2, 0, height / 2])
-        box = trimesh.creation.box(size)
-        seats.append(trimesh.Trimesh((box.vertices + middle) @ turn.T + position[f], box.faces))
-        start = position[f] + turn @ (middle - [_SEAT / 2, 0, 0])
-        above = start + turn @ [-0.015, 0, 0]
-        away = np.array([*position[f][:2], 0]) / max(np.hypot(*position[f][:2]), 1e-9)
-        end = (_STUMP[0] + _TUBE) * away + [0, 0, top]
-        tubes.append(_tube(_curve(start, above, end - [0, 0, 0.03], end)))
-    named = (("seats", SEAT, seats), ("tubes", TUBE, tubes), ("wrist", SEAT, [stump]))
-    return [
-        _rigid(name, color, joined.vertices, joined.faces, 1)
-        for name, color, meshes in named
-        if meshes and (joined := trimesh.util.concatenate(meshes))
-    ]
+        seat = _seat(scene.hand.section.width, height, *frame)
+        tube = _finger_tube(height, thick + _STUMP[1], *frame)
+        mounting += [
+            _rigid(f"seat {f}", SEAT, seat.vertices, seat.faces, 1),
+            _rigid(f"tube {f}", TUBE, tube.vertices, tube.faces, 1),
+        ]
+    stump = trimesh.creation.cylinder(_STUMP[0], _STUMP[1], sections=32)
+    stump.apply_translation([0, 0, thick + _STUMP[1] / 2])
+    return [*mounting, _rigid("wrist", SEAT, stump.vertices, stump.faces, 1)]
+
+
+def _seat(width: float, height: float, turn: np.ndarray, place: np.ndarray) -> trimesh.Trimesh:
+    """The box around a finger's root, by the frame of the finger's base."""
+    box = trimesh.creation.box((_SEAT, width + 2 * _CHEEK, height + 2 * _CHEEK))
+    middle = np.array([_CHEEK - _SEAT / 2, 0, height / 2])
+    return trimesh.Trimesh((box.vertices + middle) @ turn.T + place, box.faces)
+
+
+def _finger_tube(height: float, top: float, turn: np.ndarray, place: np.ndarray) -> trimesh.Trimesh:
+    """The tube from behind a finger's root up along the wrist, to a height above the palm."""
+    start = place + turn @ [_CHEEK - _SEAT, 0, height / 2]
+    behind = start + turn @ [-0.015, 0, 0]
+    away = np.array([*place[:2], 0]) / max(np.hypot(*place[:2]), 1e-9)
+    end = (_STUMP[0] + _TUBE) * away + [0, 0, top]
+    return _tube(_curve(start, behind, end - [0, 0, 0.03], end))
 
 
 def _curve(*points: np.ndarray) -> np.ndarray:

@@ -43,7 +43,7 @@ def main(options: Replay) -> int:
 
 def write_page(planned: grasp.PlannedGrasp, path: Path, console: Console) -> Path:
     with Busy(console, "compiling, then simulating the grasp"):
-        shown = grasp.simulate(planned)
+        shown = grasp.simulate(planned, forces=True)
     from codesign_jax.report import viewer
 
     lines = grasp.description(planned, shown)

@@ -24,6 +24,7 @@ import codesign_jax
 from codesign_jax import cli
 from codesign_jax.commands import common
 from codesign_jax.judge.verdict import VERDICTS
+from codesign_jax.report import bodies
 from codesign_jax.runs import selection
 from codesign_jax.scene.schema import InputError
 from codesign_jax.studio import process, server
@@ -555,6 +556,39 @@ def test_a_moved_slider_changes_the_verdict_and_the_timeline_plays(page):
     at = cursor.get_attribute("x1")
     assert page.evaluate(f"{view}.playing()")
     until(lambda: cursor.get_attribute("x1") != at, page)
+
+
+@pytest.mark.browser
+def test_a_click_on_a_finger_opens_its_sliders(browser, tmp_path):
+    """Its sliders have its colour; the verdict is that of the design before until the next one."""
+    options = {**OPTIONS, "preset": "full", "out": tmp_path / "saved"}
+    with served(Desk(cli.Studio(**options))) as (studio, address):
+        studio.begin()
+        with visited(browser, address) as page:
+            page.wait_for_selector(COMPLETE)
+            group = page.locator("#studio .group[data-part='finger 1']")
+            group.evaluate("e => { e.open = false; }")
+            view = "document.querySelector('.replay').replay"
+            page.evaluate(f"{view}.pause()")
+            canvas = page.locator("#studio .view").bounding_box()
+            spots = itertools.product(
+                range(10, int(canvas["width"]), 8), range(10, int(canvas["height"]), 8)
+            )
+            named = f"([x, y]) => {view}.pick(x, y)"
+            spot = next(spot for spot in spots if page.evaluate(named, list(spot)) == "finger 1")
+            page.mouse.click(canvas["x"] + spot[0], canvas["y"] + spot[1])
+            until(lambda: group.evaluate("e => e.open"), page)
+            assert "picked" in group.get_attribute("class")
+            color = group.evaluate("e => getComputedStyle(e).borderLeftColor")
+            hue = bodies.finger_color(1)
+            assert color == f"rgb({', '.join(str(int(hue[k : k + 2], 16)) for k in (1, 3, 5))})"
+            verdict = page.locator("#studio .verdict")
+            before = verdict.inner_text()
+            slider = group.locator("input[type=range]").first
+            slider.evaluate("e => { e.value = e.min; e.dispatchEvent(new Event('input')); }")
+            assert "stale" in verdict.get_attribute("class") and verdict.inner_text() == before
+            slider.evaluate("e => e.dispatchEvent(new Event('change'))")
+            until(lambda: "stale" not in verdict.get_attribute("class"), page)
 
 
 @pytest.mark.browser

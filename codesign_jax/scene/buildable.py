@@ -116,7 +116,7 @@ class Buildable:
             strains.append(np.radians(self.limits.free_bend) * height / length)
         return strains
 
-    def _pressures(self, strains: list[Any], section: tuple, length: Any) -> list[Any]:
+    def _pressures(self, strains: list[Any], section: tuple[Any, ...], length: Any) -> list[Any]:
         """Pressures that fingers of a section must not exceed."""
         height, wall, width = section
         if self.hand is not None:

@@ -284,14 +284,14 @@ def steady_pressure(n: Numbers) -> Any:
     return _root(stiffness, n, 0.0 * n.height)
 
 
-def _root(function: Callable, n: Numbers, other: Any) -> Any:
+def _root(function: Callable[..., Any], n: Numbers, other: Any) -> Any:
     """Pressure at which a function falls below zero, differentiable by its other arguments."""
     fixed = n, other
     traced = n.height.__array_namespace__() is not np
     if traced:
         fixed = jax.lax.stop_gradient(fixed)
 
-    def halve(_: Any, ends: tuple) -> tuple:
+    def halve(_: Any, ends: tuple[Any, Any]) -> tuple[Any, Any]:
         low, high = ends
         middle = (low + high) / 2
         higher = function(*fixed, middle) > 0

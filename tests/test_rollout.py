@@ -36,6 +36,17 @@ def test_more_trials_do_not_change_the_first():
         np.testing.assert_array_equal(a, b[:4])
 
 
+def test_a_number_of_trials_needs_no_program_of_its_own():
+    """Fewer are cut from more, also where another program closes over the key."""
+    seven = rollout.sample_trials(PAPER, KEY, 7, 3)
+    many = rollout.sample_trials(PAPER, KEY, 2 * rollout.LEAST + 1)  # a larger program
+    closed = jax.jit(lambda x: x + rollout.sample_trials(PAPER, KEY, 7, 3).position)(0.0)
+    for a, b in zip(jax.tree.leaves(seven), jax.tree.leaves(many), strict=True):
+        np.testing.assert_allclose(a, b[3:10], rtol=1e-6, atol=1e-9)  # the last bit, see XLA
+        assert isinstance(a, jax.Array)
+    np.testing.assert_array_equal(closed, seven.position)
+
+
 def test_noise_has_the_declared_spread():
     """Means and standard deviations over 20,000 trials, to four standard errors."""
     count = 20_000

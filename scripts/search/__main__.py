@@ -51,6 +51,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--objects", help="object set instead of the scene's")
     parser.add_argument("--robust", action="store_true", help="as of codesign optimize")
     parser.add_argument("--constants", help="as of codesign optimize")
+    parser.add_argument("--rigid-mount", action="store_true", help="as of codesign optimize")
     flag: dict[str, Any] = {"dest": "overrides", "nargs": "+", "action": "append", "default": []}
     parser.add_argument("--set", **flag, help="KEY=VALUE, as of codesign optimize")
     text = "judge the last designs once more with all objects at each of these masses [kg]"
@@ -84,10 +85,16 @@ def search(args: argparse.Namespace, name: str) -> None:
     engine = make_engine("structured", scene)
     space = design_space(scene.hand, args.preset)
     case = make_case(name, space, args.preset, len(scene.objects.object))
-    changed = ["--robust"] * args.robust + [*chain.from_iterable(args.overrides)]
+    changed = (
+        ["--robust"] * args.robust
+        + ["--rigid-mount"] * args.rigid_mount
+        + [*chain.from_iterable(args.overrides)]
+    )
     changed += [f"--constants={Path(args.constants).stem}"] if args.constants else []
     accuracies = {"searched": args.search_accuracy, "judged": args.judged}
-    changed += [f"--{name}={accuracy}" for name, accuracy in accuracies.items() if accuracy]
+    changed += [
+        f"--{name}={Path(accuracy).stem}" for name, accuracy in accuracies.items() if accuracy
+    ]
     changed += [f"--first={args.first}"] if args.first else []
     words = [Path(name).stem for name in (args.hand, args.objects) if name]
     words += [args.preset, name, *(re.sub(r"^--|^[a-z_.]+[.](?=.*=)", "", c) for c in changed)]

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from codesign_jax import model
+from codesign_jax import model, preflight
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.model import morphology
@@ -153,3 +153,17 @@ def test_effects_that_the_law_has_or_cannot_have_are_refused(settings, key):
 )
 def test_bad_keys_of_a_section(settings, kind, key):
     assert refusal(grasps.pinch, **settings) == [(kind, key)]
+
+
+def test_a_warning_names_fingers_that_twist_by_themselves():
+    """Before a simulation, of thin fingers alone and where the law has that."""
+    thin = np.array([2.2e-3, 6e-3])
+    told = []
+    for law in ("elements", "chamber"):
+        the_scene = grasps.pinch(**LAW | {"section__law": law})
+        pressure = 1.2 * float(the_scene.hand.material.shear_modulus)
+        params, _ = grasps.hand_world(the_scene, length=0.1, wall=thin, pressure=pressure)
+        told.append(preflight.warnings(the_scene, grasps.repeat(params, 1), ["design"]))
+    named = [[line for line in lines if "finger 0 twists" in line] for lines in told]
+    assert [len(lines) for lines in named] == [1, 0]
+    assert not [line for line in told[0] if "finger 1 twists" in line]

@@ -411,10 +411,8 @@ def quickly_compiled(function: Callable[..., Any], **options: Any) -> Callable[.
 
     @functools.wraps(function)
     def call(*arguments: Any) -> Any:
-        if any(isinstance(x, Tracer) for x in jax.tree.leaves(arguments)):
-            return part(*arguments)
-        with jax.ensure_compile_time_eval():  # of numbers that another program closes over, too
-            return whole()(*arguments)
+        traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(arguments))
+        return (part if traced else whole())(*arguments)
 
     call.lower = lambda *arguments: whole().lower(*arguments)  # type: ignore[attr-defined]
     return call

@@ -133,7 +133,8 @@ def _drawn(
     size = LEAST
     while size < num_trials:
         size *= 2
-    more = _draw(size, shapes, key, noises, first)
+    with jax.ensure_compile_time_eval():  # another program may close over the key
+        more = _draw(size, shapes, key, noises, first)
     return jax.tree.map(lambda v: jnp.asarray(np.asarray(v)[:num_trials]), more)
 
 

@@ -48,8 +48,12 @@ def hurried(*ends, without=""):
 
 @functools.cache
 def short_grasp():
-    """0.6 s: the hand comes down beside the box, closes by a real air supply, lifts and shakes."""
+    """0.6 s: the hand comes down beside the box, closes by a real air supply, lifts and shakes.
+
+    Contact forces are solved so far that two programs of a grasp end within 10 um of one another.
+    """
     settings = hurried(0.2, 0.35, 0.5, 0.6, without="ungrasp palm_object palm_table")
+    settings |= {"newton__decrement": 1e-6}
     return pinch("box", effects__pressure_dynamics=True, arm__start_height=0.15, **settings)
 
 

@@ -121,7 +121,8 @@ def test_changing_any_number_compiles_nothing(monkeypatch):
     other = in_float32(random_constants(the_scene, 2))
     changed = height(other)
     assert height._cache_size() == 1 and len(compiled) == 1
-    assert not np.allclose(first[0], changed[0], rtol=1e-2)
+    # The numbers act: by a thousandth, of heights that are rounded to 1e-7.
+    assert not np.allclose(first[0], changed[0], rtol=1e-4)
     # A scene read from other files asks for the same kernel.
     again = as_file(other)
     other_engine = make_engine("structured", again)

@@ -118,7 +118,7 @@ def test_changing_any_number_compiles_nothing(monkeypatch):
     # One number of each table alone, then all of them.
     for key in sorted({key.rsplit(".", 1)[0]: key for key in named(constants)}.values()):
         height(with_leaf(constants, key, lambda v: v * 1.01 + 1e-3))
-    other = in_float32(random_constants(the_scene, 2))
+    other = in_float32(random_constants(the_scene, 3))
     changed = height(other)
     assert height._cache_size() == 1 and len(compiled) == 1
     # The numbers act: by a thousandth, of heights that are rounded to 1e-7.

@@ -332,8 +332,9 @@ def test_actions_that_change_nothing_make_the_grasp_of_the_key_frames(episode, s
     (outcome, trace), _ = simulate(params, trials)
     assert simulate._cache_size() == 1
     ends = [model.split(SCENE, s).qpos for s in (states[-1].data.world.state, trace.last)]
-    # Two programs round model fields differently, and contact lets that grow.
-    np.testing.assert_allclose(*ends, atol=1e-5)
+    # Two programs round model fields differently; contact and a solver that stops at a tolerance of
+    # 1e-3 let that grow, to 3e-5.
+    np.testing.assert_allclose(*ends, atol=1e-4)
     rewards = sum(state.reward for state in states)
     np.testing.assert_allclose(rewards, 1 - outcome.cost / SCENE.cost.maximum, atol=1e-6)
     assert [float(state.done.min()) for state in states[-2:]] == [0, 1]

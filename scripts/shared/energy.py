@@ -54,19 +54,22 @@ class Audit(NamedTuple):
     gain: np.ndarray
     stored: np.ndarray
 
-    def rise(self, first: int = 0, steps: int | None = None) -> np.ndarray:
+    def rise(self, first: int = 0, steps: int | None = None, settle: int = 0) -> np.ndarray:
         """Largest gain over consecutive steps [J], any number or at most `steps`, shape (world,).
 
         Args:
           first: The first step that counts.
           steps: Largest number of steps.
+          settle: A gain that is gone within so many further steps does not count.
         """
         total = np.cumsum(np.pad(self.gain[:, first:], ((0, 0), (1, 0))), axis=1)
         length = total.shape[1]
+        later = (np.pad(total, ((0, 0), (0, n)), "edge")[:, n:] for n in range(settle + 1))
+        left = np.min([*later], axis=0)
         spans = range(1, length if steps is None else min(steps + 1, length))
         if steps is None:
-            return (total - np.minimum.accumulate(total, 1)).max(1)
-        return np.max([(total[:, n:] - total[:, : length - n]).max(1) for n in spans], axis=0)
+            return (left - np.minimum.accumulate(total, 1)).max(1)
+        return np.max([(left[:, n:] - total[:, : length - n]).max(1) for n in spans], axis=0)
 
 
 def audit(scene: Scene, fields: Any, ctrl: Any, path: Path) -> Audit:

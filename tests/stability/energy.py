@@ -14,10 +14,13 @@ from tests.stability.bench import bench, floats
 from tests.stability.table import Found, case
 
 ACCURACIES = ("standard", "fast", "fine", "reference")
-CONTACT_BOUND = 0.5
-"""Largest rise in contact over the largest energy of fingers and bodies [chosen]. A contact between
-fingers that appears at once at a depth, as another segment comes next to a ring, stores up to a
-third of it, which the next two steps take away."""
+SETTLE = 5
+"""Steps within which a gain in contact is taken again. A contact that a step finds at a depth
+stores energy at once, at `fast` up to all that a hand has. Three steps later 0.5 % of it are left,
+but in one world of twelve another such contact comes in between."""
+CONTACT_BOUND = 0.05
+"""Largest rise that stays in contact over the largest energy of fingers and bodies [chosen], as in
+the air: 0.2 % is measured at `standard`, 0.5 % at `fast`."""
 WHIPPED = 15
 TRIALS = 4
 """The recommended design whose finger is held twisted, and its trials."""
@@ -93,9 +96,9 @@ def in_contact(accuracy, engine, step, precision) -> Found:
     designs = winners[[WHIPPED] * TRIALS + [*range(OTHERS)]]
     trials = drawn(the_scene, precision, 11, len(designs))
     audit = structured(the_scene, designs, trials, precision)
-    gained = audit.rise() / audit.stored.max(1)
-    rises = (audit.gain > 1e-3).mean()
-    return Found(gained.max(), CONTACT_BOUND, f"{rises:.1%} of the steps gain more than 1 mJ")
+    gained = audit.rise(settle=SETTLE) / audit.stored.max(1)
+    at_once = (audit.rise(steps=1) / audit.stored.max(1)).max()
+    return Found(gained.max(), CONTACT_BOUND, f"{at_once:.0%} in one step at most")
 
 
 RELEASED = "largest gain of energy after the release, over that of the hand"
@@ -111,7 +114,7 @@ for accuracy in ACCURACIES:
     case(
         40,
         f"grasps of recommended hands, {accuracy}",
-        "largest gain of energy, over the largest energy",
+        "largest gain of energy that stays, over the largest energy",
         name=f"in_contact_{name}",
         steps=(1.0,),
     )(functools.partial(in_contact, accuracy))

@@ -253,7 +253,7 @@ def _sheet(
     options: Export,
 ) -> list[str]:
     """Writes the sheet; returns letters that its drawings lack."""
-    from codesign_jax.export import drawing, hand_drawing  # import Matplotlib
+    from codesign_jax.export import drawing, paper  # import Matplotlib
 
     kept = reference.Kept(None, None, [])
     if options.run_folder and not options.without:  # another hand than the run's was not judged
@@ -283,7 +283,7 @@ def _sheet(
     title = f"Build sheet: {case.scene.hand.name}"
     material = case.scene.hand.material
     silicone = quantities.silicone_of(material)
-    about = hand_drawing.About(
+    about = paper.About(
         design=str(origin["design"]),
         date=datetime.datetime.now(datetime.UTC).date().isoformat(),
         version=str(origin["version"]),

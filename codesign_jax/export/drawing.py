@@ -11,17 +11,17 @@ import matplotlib.patches
 import numpy as np
 from matplotlib.axes import Axes
 
-from codesign_jax.export import arm, fonts, hand_drawing, posture
-from codesign_jax.export.hand_drawing import About
-from codesign_jax.export.process import BACK, BAR, FABRIC, FLOOR, Printed, Process, Section, Size
+from codesign_jax.export import arm, finger_drawing, fonts, hand_drawing, paper, posture
+from codesign_jax.export.paper import EDGE, PAPER, About
+from codesign_jax.export.process import BACK, BAR, FABRIC, FLOOR, Printed, Process, Size
 from codesign_jax.export.sheet import NAME, corners
 from codesign_jax.report.figures import default_style
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
 
 _A4 = (8.27, 11.69)
-_SMALL = 5.6
 _ROWS = 6  # fingers on a page
+_SEAT_SCALE = 2
 # letters in a line of the title, and its lines
 _WIDE = 64
 _LINES = 2
@@ -64,7 +64,7 @@ def pages(
     process: Process | None = None,
     about: About = NOTHING,
 ) -> list[matplotlib.figure.Figure]:
-    """The pages: the hand, its palm and fingers, their moulds, and how it is held and turned."""
+    """The pages: hand, palm, fingers and how they bend, moulds, and how it is held and turned."""
     alike = {}
     for i, size in enumerate(sizes):
         alike.setdefault(size, []).append(i)
@@ -74,10 +74,13 @@ def pages(
     hand_drawing.palm_page(second, scene, params, sizes, printed, process, about)
     figures = [first, second]
     for first in range(0, len(rows), _ROWS):
-        figures.append(_fingers_page(title, rows[first : first + _ROWS]))
+        figures.append(_page(title))
+        finger_drawing.fingers_page(figures[-1], rows[first : first + _ROWS], about)
+    figures.append(_page(title))
+    finger_drawing.bends_page(figures[-1], scene, params, about)
     if printed and process:
-        figures.append(_moulds_page(title, rows, process))
-    figures.append(_mounting_page(title, scene, params, sizes, printed))
+        figures.append(_moulds_page(title, rows, process, about))
+    figures.append(_mounting_page(title, scene, params, sizes, printed, about))
     for k, page in enumerate(figures, 1):
         page.text(0.94, 0.025, f"{k} of {len(figures)}", fontsize=7, ha="right")
     return figures
@@ -103,60 +106,49 @@ def _page(title: str) -> matplotlib.figure.Figure:
     return figure
 
 
-def _fingers_page(title: str, rows: list[tuple[Size, list[int]]]) -> matplotlib.figure.Figure:
-    figure = _page(title)
-    high = 0.88 / _ROWS
-    for k, (size, fingers) in enumerate(rows):
-        label = f"finger {', '.join(map(str, fingers))}"
-        bottom = 0.92 - (k + 1) * high + 0.02
-        tapered = size.base != size.tip
-        tall = high - 0.045
-        first = figure.add_axes((0.06, bottom, 0.14 if tapered else 0.30, tall))
-        _section(first, size.base, f"{label}{', base' if tapered else ''}")
-        if tapered:
-            _section(figure.add_axes((0.22, bottom, 0.14, tall)), size.tip, f"{label}, tip")
-        _side_view(figure.add_axes((0.40, bottom, 0.54, tall)), size, f"{label}, along")
-    figure.text(
-        0.06, 0.05, "All in mm. Red: fabric. Left of the dashed line: the root.", fontsize=7
-    )
-    return figure
-
-
 def _moulds_page(
-    title: str, rows: list[tuple[Size, list[int]]], process: Process
+    title: str, rows: list[tuple[Size, list[int]]], process: Process, about: About
 ) -> matplotlib.figure.Figure:
     from codesign_jax.export import mould_drawing  # needs the extra
 
     figure = _page(title)
     size, fingers = max(rows, key=lambda row: row[0].length)
-    mould_drawing.page(figure, size, process, f"finger {', '.join(map(str, fingers))}")
+    label = f"finger {', '.join(map(str, fingers))}"
+    scale = mould_drawing.page(figure, size, process, label)
     words = (
         "The longest finger's moulds, cut along the finger's middle and across it between two "
         "bars; those of the others differ in size alone. The fabric's end hangs out over the root "
         "as the flap that the clamp bar holds."
     )
-    figure.text(0.06, 0.08, textwrap.fill(words, 120), fontsize=7, va="top")
+    paper.note(figure, paper.BOTTOM + 10, textwrap.fill(words, 120))
+    paper.title_block(figure, about, scale)
     return figure
 
 
 def _mounting_page(
-    title: str, scene: Scene, params: Params, sizes: Sequence[Size], printed: Printed | None
+    title: str,
+    scene: Scene,
+    params: Params,
+    sizes: Sequence[Size],
+    printed: Printed | None,
+    about: About,
 ) -> matplotlib.figure.Figure:
     figure = _page(title)
     hand = corners(scene, params, sizes)
     palm = 1e3 * scene.hand.palm.radius, 1e3 * scene.hand.palm.thickness
     for k, (words, angles) in enumerate(posture.TURNS.items()):
-        axes = figure.add_axes((0.05 + 0.225 * k, 0.68, 0.21, 0.22))
+        axes = figure.add_axes((0.05 + 0.225 * k, 0.72, 0.21, 0.19))
         posture.draw(axes, hand, palm, angles, words)
     keys = arm.key_poses(scene, params)
     lowest = keys[np.argmin(keys[:, 3])]
     angles = dict(zip(("roll", "pitch", "yaw"), lowest[4:], strict=True))
     words = ", ".join(f"{name} {angles[name]:.1f}°" for name in ("roll", "yaw", "pitch"))
-    axes = figure.add_axes((0.05, 0.36, 0.36, 0.27))
+    axes = figure.add_axes((0.05, 0.45, 0.36, 0.23))
     posture.draw(axes, hand, palm, angles, f"this hand at its lowest key frame: {words}")
-    _seat(figure.add_axes((0.50, 0.36, 0.44, 0.27)), sizes[0], scene.hand.finger[0].tilt)
+    _seat(figure, 0.46 * PAPER[1], sizes[0], scene.hand.finger[0].tilt)
     if scene.effects.wrist:
-        _wrist(figure.add_axes((0.08, 0.07, 0.84, 0.24)), scene, printed)
+        _wrist(figure.add_axes((0.08, 0.18, 0.84, 0.23)), scene, printed)
+    paper.title_block(figure, about, None)
     return figure
 
 
@@ -168,48 +160,22 @@ def _rectangle(axes: Axes, low: tuple[float, float], size: Sequence[float], colo
     axes.add_patch(patch)
 
 
-def _section(axes: Axes, section: Section, label: str) -> None:
-    width, height, wall = section
-    chamber = section.chamber
-    _rectangle(axes, (-width / 2, 0), (width, height), "0.8")
-    _rectangle(axes, (-chamber[0] / 2, wall), chamber, "white")
-    axes.plot([-width / 2, width / 2], [0, 0], color="tab:red", lw=2)
-    axes.text(0, -0.06 * height, f"{width:.1f}", ha="center", va="top", fontsize=6)
-    axes.text(-0.53 * width, height / 2, f"{height:.1f}", ha="right", va="center", fontsize=6)
-    axes.text(0, wall / 2, f"{wall:.2f}", ha="center", va="center", fontsize=6)
-    _finish(axes, label)
-    axes.set(xlim=(-0.85 * width, 0.85 * width), ylim=(-5, height + 2))
+def _seat(figure: matplotlib.figure.Figure, low: float, size: Size, tilt: float) -> None:
+    """A cut through the middle of a seat, in the plane of the finger.
 
-
-def _side_view(axes: Axes, size: Size, label: str) -> None:
-    start, end = size.chamber_ends
-    first = size.at(start)
-    last = size.at(end)
-    root = size.at(-size.root).height
-    outer = [(-size.root, 0), (size.length, 0), (size.length, size.tip.height), (-size.root, root)]
-    inner = [(start, first.wall), (end, last.wall)]
-    inner += [(end, last.height - last.wall), (start, first.height - first.wall)]
-    for outline, color in ((outer, "0.8"), (inner, "white")):
-        axes.add_patch(
-            matplotlib.patches.Polygon(outline, facecolor=color, edgecolor="0.3", lw=0.8)
-        )
-    axes.plot([-size.root, size.length], [0, 0], color="tab:red", lw=2)
-    axes.plot([0, 0], [0, size.base.height], color="black", lw=0.8, ls="--")
-    axes.text(size.length / 2, -1.5, f"{size.length:.1f}", ha="center", va="top", fontsize=6)
-    if size.root:
-        axes.text(-size.root / 2, -1.5, f"{size.root:g}", ha="center", va="top", fontsize=6)
-    chambers = dict.fromkeys("{:.2f} x {:.2f}".format(*s.chamber) for s in (first, last))
-    text = f"chamber {end - start:.2f} x {' to '.join(chambers)}"
-    above = max(size.base.height, size.tip.height) + 1.5
-    axes.text(size.length / 2, above, text, ha="center", va="bottom", fontsize=6)
-    _finish(axes, label)
-    axes.set(xlim=(-size.root - 3, max(size.length, 60) + 3), ylim=(-8, above + 8))
-
-
-def _seat(axes: Axes, size: Size, tilt: float) -> None:
-    """A cut through the middle of a seat, in the plane of the finger."""
+    Args:
+      low: Its lower edge on the page [mm].
+    """
+    root = size.root
+    height = size.base.height
+    rim = size.pressed
     cosine = np.cos(np.radians(tilt))
     sine = np.sin(np.radians(tilt))
+    right = (height + BAR) * sine + 40 * cosine + 12
+    left = PAPER[0] - EDGE - (right + 85) / _SEAT_SCALE
+    span = (-45.0, -50.0), (right + 40, 48.0)
+    title = f"a seat, cut along finger 0 (tilt {tilt:g}°), 1:{_SEAT_SCALE}"
+    axes = paper.view(figure, (left, low), span, _SEAT_SCALE, title)
 
     def put(points: Sequence[tuple[float, float]], **style: Any) -> None:
         flat = [(x * cosine + z * sine, -x * sine + z * cosine) for x, z in points]
@@ -223,9 +189,6 @@ def _seat(axes: Axes, size: Size, tilt: float) -> None:
         arrow = {"arrowstyle": "-", "lw": 0.5}
         axes.annotate(text, at, to, fontsize=6, arrowprops=arrow, va="center")
 
-    root = size.root
-    height = size.base.height
-    rim = size.pressed
     back = (-root - BACK, -root - FABRIC)
     box((-root - BACK, 0), (-FLOOR - 6, 0), facecolor="0.85")
     box(back, (0, rim), facecolor="0.85")
@@ -241,17 +204,15 @@ def _seat(axes: Axes, size: Size, tilt: float) -> None:
     path = [(x * cosine + z * sine, -x * sine + z * cosine) for x, z in flap]
     axes.plot(*np.transpose(path), color="tab:red", lw=1.6)
     axes.axhline(0, color="0.4", lw=0.6, ls=":")
-    right = (height + BAR) * sine + 40 * cosine + 12
     note(middle, rim + BAR + 3, "screw M3", (right, 32))
-    note(-3, rim + BAR, "clamp bar", (right, 22))
-    note(-root / 2, height * 0.75, "root", (right, 12))
+    note(-3, rim + BAR, f"clamp bar, {BAR:g} thick", (right, 22))
+    note(-root / 2, height * 0.75, f"root, {root:g} long", (right, 12))
     note(5, height, "finger", (right, 2))
     note(-root - 0.25, rim * 0.25, "flap of fabric", (-42, 30))
     note(-root - BACK - 10, height / 2, "tube", (-42, 20))
     note(-root - 4, -FLOOR - 3, "palm", (-42, 10))
+    note(-root - BACK / 2, rim * 0.6, f"back wall {BACK:g}, rim {rim:.1f} high", (right, -8))
     axes.text(-42, 0, "underside, z = 0", fontsize=6, va="bottom")
-    _finish(axes, f"a seat, cut along finger 0 (tilt {tilt:g}°)")
-    axes.set(xlim=(-45, right + 22), ylim=(-50, 48))
 
 
 def _wrist(axes: Axes, scene: Scene, printed: Printed | None) -> None:

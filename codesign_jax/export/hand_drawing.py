@@ -8,7 +8,6 @@ the warnings.
 import itertools
 import textwrap
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import matplotlib.figure
 import matplotlib.patches
@@ -17,34 +16,18 @@ from matplotlib.axes import Axes
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from codesign_jax.export import fonts
+from codesign_jax.export import fonts, paper
+from codesign_jax.export.paper import BLOCK, EDGE, PAPER, About
 from codesign_jax.export.process import BACK, CHEEK, FLOOR, Printed, Process, Size
 from codesign_jax.export.sheet import NAME, corners
 from codesign_jax.model.layout import mounts
 from codesign_jax.scene import Scene
 from codesign_jax.types import Params
 
-PAPER = (210.0, 297.0)
-"""Width and height of a page [mm]."""
-SCALES = (1, 2, 5, 10, 20, 50)
-"""Reductions of ISO 5455."""
-_EDGE = 12.0  # margin of a page [mm]
-_BLOCK = 30.0  # height of the title block [mm]
 _ROOM = 14.0  # around a view, for its dimensions [mm on paper]
 _LINES = 14  # of verdict and warnings
 _WIDE = 128  # letters in one of them
 _FONT = 6.0
-
-
-class About(NamedTuple):
-    """What the title block says."""
-
-    design: str = ""  # where the design is from: its run, or its file
-    date: str = ""
-    version: str = ""  # of codesign-jax
-    silicone: str = ""
-    verdict: str = ""
-    warnings: Sequence[str] = ()
 
 
 def hand_page(
@@ -63,11 +46,11 @@ def hand_page(
     disc = 1e3 * scene.hand.palm.radius, 1e3 * scene.hand.palm.thickness
     low, high = _extent(points, disc)
     size = high - low
-    bottom = _EDGE + _BLOCK + 6
-    top = PAPER[1] - 24 - _told(figure, about)
+    bottom = paper.BOTTOM
+    top = paper.TOP - _told(figure, about)
     wide, deep, tall = size
-    room = PAPER[0] - 2 * _EDGE - 3 * _ROOM, top - bottom - 4 * _ROOM
-    scale = _scale(max((wide + deep) / room[0], (deep + tall) / room[1]))
+    room = PAPER[0] - 2 * EDGE - 3 * _ROOM, top - bottom - 4 * _ROOM
+    scale = paper.scale_of(max((wide + deep) / room[0], (deep + tall) / room[1]))
     left = (PAPER[0] - (wide + deep) / scale - 2 * _ROOM) / 2
     front = (bottom + top - (deep + tall) / scale) / 2 - _ROOM
     beside = left + wide / scale + 2 * _ROOM
@@ -76,13 +59,13 @@ def hand_page(
     views["side"] = (1, 2, beside, front)
     for name, (across, up, x, y) in views.items():
         shown = [across, up]
-        axes = _paper_axes(figure, (x, y), (low[shown], high[shown]), scale)
+        axes = paper.view(figure, (x, y), (low[shown], high[shown]), scale, name)
         _view(axes, points, disc, across, up)
-        _dimensions(axes, low[shown], high[shown], scale, wide=up == 1)
-        axes.set_title(name, fontsize=7, pad=2)
+        paper.dimension(axes, (low[up], high[up]), high[across], 8.0, scale, vertical=True)
         if up == 1:
+            paper.dimension(axes, (low[0], high[0]), low[1], -8.0, scale)
             _diameter(axes, disc[0], f"Ø{2 * disc[0]:.1f}", 90.0)
-    _title_block(figure, about, scale)
+    paper.title_block(figure, about, scale)
 
 
 def palm_page(
@@ -99,11 +82,12 @@ def palm_page(
     position, turn = (np.asarray(v) for v in mounts(scene.hand, np.asarray(params.spread)))
     turns = Rotation.from_quat(turn, scalar_first=True)
     reach = max(radius, 1e3 * float(np.hypot(*position[:, :2].T).max()) + 34)
-    scale = _scale(2 * reach / (PAPER[0] - 2 * _EDGE - 20))
+    scale = paper.scale_of(2 * reach / (PAPER[0] - 2 * EDGE - 20))
     side = 2 * reach / scale
     low = np.array([-reach, -reach])
-    bottom = (PAPER[1] + _BLOCK - side) / 2
-    axes = _paper_axes(figure, ((PAPER[0] - side) / 2, bottom), (low, -low), scale)
+    bottom = (PAPER[1] + BLOCK - side) / 2
+    corner = (PAPER[0] - side) / 2, bottom
+    axes = paper.view(figure, corner, (low, -low), scale, "palm from above")
     axes.add_patch(matplotlib.patches.Circle((0, 0), radius, facecolor="0.95", edgecolor="0.3"))
     screws = _screws(sizes, process) if printed and process else [[] for _ in sizes]
     for f, place in enumerate(1e3 * position):
@@ -122,9 +106,8 @@ def palm_page(
         words += ", heads sunk. " if sunk else ". "
     axes.annotate("", (14, 0), (0, 0), arrowprops={"arrowstyle": "->", "lw": 0.7})
     axes.text(15, 0, "x", fontsize=_FONT, va="center")
-    axes.set_title("palm from above", fontsize=7, pad=2)
     figure.text(0.06, 0.2, textwrap.fill(words, 120), fontsize=7, va="top")
-    _title_block(figure, about, scale)
+    paper.title_block(figure, about, scale)
 
 
 def _extent(points: np.ndarray, disc: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
@@ -134,32 +117,6 @@ def _extent(points: np.ndarray, disc: tuple[float, float]) -> tuple[np.ndarray, 
     palm = np.array([[-radius, -radius, 0.0], [radius, radius, thick]])
     every = np.concatenate([flat, palm])
     return every.min(0), every.max(0)
-
-
-def _scale(least: float) -> int:
-    """The least reduction that is not below a ratio of drawing and room."""
-    return next((n for n in SCALES if n >= least), SCALES[-1])
-
-
-def _paper_axes(
-    figure: matplotlib.figure.Figure,
-    place: tuple[float, float],
-    span: tuple[np.ndarray, np.ndarray],
-    scale: int,
-) -> Axes:
-    """Axes whose units are millimetres of the hand, drawn to scale.
-
-    Args:
-      place: Their lower left corner on the page [mm].
-      span: Lowest and highest coordinates that they show [mm].
-    """
-    low, high = span
-    width, height = (high - low) / scale
-    rectangle = (place[0] / PAPER[0], place[1] / PAPER[1], width / PAPER[0], height / PAPER[1])
-    axes = figure.add_axes(rectangle)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    axes.axis("off")
-    return axes
 
 
 def _view(axes: Axes, fingers: np.ndarray, disc: tuple[float, float], across: int, up: int) -> None:
@@ -179,27 +136,6 @@ def _view(axes: Axes, fingers: np.ndarray, disc: tuple[float, float], across: in
         axes.plot(*flat[[0, 1, 5, 4, 0]].T, color="tab:red", lw=0.9, clip_on=False)
         x, y = flat[4:].mean(0)
         axes.text(x, y, str(f), ha="center", va="center", fontsize=8)
-
-
-def _dimensions(axes: Axes, low: np.ndarray, high: np.ndarray, scale: int, *, wide: bool) -> None:
-    """Extents of a view beside it, the horizontal one where it is asked for."""
-    off = 8.0 * scale
-    style = {"lw": 0.5, "color": "black", "clip_on": False}
-    arrow = {"arrowstyle": "<|-|>", "lw": 0.5, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 6}
-    text = {"fontsize": _FONT + 1, "ha": "center", "va": "center"}
-    ground = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}
-    x = high[0] + off
-    for y in (low[1], high[1]):
-        axes.plot([high[0] + 1.5 * scale, x + 2 * scale], [y, y], **style)
-    axes.annotate("", (x, low[1]), (x, high[1]), arrowprops=arrow, annotation_clip=False)
-    middle = (low + high) / 2
-    axes.text(x, middle[1], f"{high[1] - low[1]:.1f}", rotation=90, bbox=ground, **text)
-    if wide:
-        y = low[1] - off
-        for x in (low[0], high[0]):
-            axes.plot([x, x], [low[1] - 1.5 * scale, y - 2 * scale], **style)
-        axes.annotate("", (low[0], y), (high[0], y), arrowprops=arrow, annotation_clip=False)
-        axes.text(middle[0], y, f"{high[0] - low[0]:.1f}", bbox=ground, **text)
 
 
 def _diameter(axes: Axes, radius: float, words: str, angle: float) -> None:
@@ -297,43 +233,3 @@ def _told(figure: matplotlib.figure.Figure, about: About) -> float:
         parse_math=False,
     )
     return 3.4 * len(lines)
-
-
-def _title_block(figure: matplotlib.figure.Figure, about: About, scale: int) -> None:
-    """Cells at the foot of a page: what is drawn, from where, and how."""
-    width = PAPER[0] - 2 * _EDGE
-    axes = figure.add_axes(
-        (_EDGE / PAPER[0], _EDGE / PAPER[1], width / PAPER[0], _BLOCK / PAPER[1])
-    )
-    axes.set(xlim=(0, width), ylim=(0, _BLOCK), xticks=[], yticks=[])
-    rows = (
-        (("design", about.design, 1.0),),
-        (("codesign-jax", about.version, 0.7), ("date", about.date, 0.3)),
-        (
-            ("silicone", about.silicone, 0.4),
-            ("scale", f"1:{scale}, on A4", 0.2),
-            ("projection", "third angle", 0.2),
-            ("dimensions", "mm", 0.2),
-        ),
-    )
-    height = _BLOCK / len(rows)
-    for r, row in enumerate(rows):
-        top = _BLOCK - r * height
-        axes.axhline(top, color="black", lw=0.6)
-        x = 0.0
-        for name, words, share in row:
-            axes.text(x + 1.5, top - 1.2, name, fontsize=4.8, color="0.4", va="top")
-            font = fonts.of_text(words)
-            most = int(share * width / 1.55)
-            short = font.text if len(font.text) <= most else f"{font.text[: most - 1]}…"
-            axes.text(
-                x + 1.5,
-                top - height + 2.2,
-                short,
-                fontsize=7,
-                va="bottom",
-                family=font.family,
-                parse_math=False,
-            )
-            x += share * width
-            axes.plot([x, x], [top - height, top], color="black", lw=0.6)

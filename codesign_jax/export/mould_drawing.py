@@ -10,11 +10,17 @@ from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
-from codesign_jax.export import casting
+from codesign_jax.export import casting, paper
 from codesign_jax.export.casting import half_width, prism, shifted
+from codesign_jax.export.paper import BOTTOM, EDGE, PAPER, TOP
 from codesign_jax.export.process import FABRIC, Process, Size, inlet
 
 Solid = manifold3d.Manifold
+Shaded = tuple[str, Sequence[Any]]
+"""A colour, and outlines that have it."""
+_ROOM = 18.0  # of a view for its title and dimensions [mm on paper]
+_TITLE = 90.0  # width of the longest title [mm on paper]
+_LEGEND = BOTTOM + 30.0  # upper edge of the legend [mm]
 
 COLORS = {
     "tray": "0.78",
@@ -59,27 +65,73 @@ def castings(size: Size, process: Process) -> tuple[dict[str, Solid], dict[str, 
     return {name: solid.rotate([180, 0, 0]) for name, solid in first.items()}, second
 
 
-def page(figure: Figure, size: Size, process: Process, label: str) -> None:
-    """Draws both castings of a finger on a page, along the finger and across its middle."""
+def page(figure: Figure, size: Size, process: Process, label: str) -> int:
+    """Draws both castings of a finger on a page, along the finger and across its middle.
+
+    Returns:
+      The reduction of the views.
+    """
     first, second = castings(size, process)
     middles = [x for x, _ in casting.bars_of(size)]
     across = sum(middles[:2]) / 2 if len(middles) > 1 else size.length / 2
-    above = figure.add_axes((0.07, 0.74, 0.62, 0.16))
-    for name in ("tray", "silicone", "core"):
-        _fill(above, first[name].project().to_polygons(), COLORS[name])
-    _finish(above, f"{label}, shell, from above: silicone is poured between the bars")
-    for bottom, solids, words in (
-        (0.54, first, "shell, cut: the core hangs from its bars"),
-        (0.32, second, "bottom wall, cut: cast on the fabric, the cured shell set into it"),
+    names = ("tray", "silicone", "core")
+    above = [(COLORS[name], first[name].project().to_polygons()) for name in names]
+    cuts = [
+        {plane: _cuts(solids, plane, at) for plane, at in (("along", 0.0), ("across", across))}
+        for solids in (first, second)
+    ]
+    wide = sum(max(_extent(views[p])[1][0] for views in cuts) for p in ("along", "across"))
+    tall = sum(_extent(v)[1][1] for v in (above, *(views["along"] for views in cuts)))
+    room = PAPER[0] - 2 * EDGE - 2 * _ROOM, TOP - _LEGEND - 3 * _ROOM
+    scale = paper.scale_of(max(wide / room[0], tall / room[1]))
+    words = f"{label}, shell, from above: silicone is poured between the bars"
+    top = _view(figure, (EDGE, TOP), above, scale, words)
+    for views, solids, words in (
+        (cuts[0], first, "shell, cut: the core hangs from its bars"),
+        (cuts[1], second, "bottom wall, cut: cast on the fabric, the cured shell set into it"),
     ):
-        for plane, at, left, width in (("along", 0.0, 0.07, 0.62), ("across", across, 0.77, 0.18)):
-            axes = figure.add_axes((left, bottom, width, 0.16))
-            for name, solid in solids.items():
-                _fill(axes, cut(solid, plane, at), COLORS[name])
-            if solids is second:
-                axes.plot(*_fabric(size, process, plane).T, color="tab:red", lw=1.6)
-            _finish(axes, f"{label}, {words}" if plane == "along" else f"across, at {at:.0f} mm")
+        fabric = {p: _fabric(size, process, p) if solids is second else None for p in views}
+        title = f"{label}, {words}"
+        below = _view(figure, (EDGE, top), views["along"], scale, title, fabric["along"])
+        left = EDGE + max(_extent(views["along"])[1][0] / scale + 2 * _ROOM, _TITLE)
+        title = f"across, at {across:.0f} mm"
+        _view(figure, (left, top), views["across"], scale, title, fabric["across"])
+        top = below
     _legend(figure)
+    return scale
+
+
+def _cuts(solids: dict[str, Solid], plane: str, at: float) -> list[Shaded]:
+    return [(COLORS[name], cut(solid, plane, at)) for name, solid in solids.items()]
+
+
+def _extent(shapes: Sequence[Shaded]) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest coordinates of outlines and their size [mm]."""
+    every = np.concatenate([np.asarray(v) for _, outlines in shapes for v in outlines])
+    return every.min(0), np.ptp(every, 0)
+
+
+def _view(
+    figure: Figure,
+    corner: tuple[float, float],
+    shapes: Sequence[Shaded],
+    scale: int,
+    title: str,
+    fabric: np.ndarray | None = None,
+) -> float:
+    """A view with its dimensions below an upper left corner; returns where the next one begins."""
+    low, size = _extent(shapes)
+    left, top = corner
+    bottom = top - 6 - size[1] / scale
+    high = low + size
+    axes = paper.view(figure, (left, bottom), (low, high), scale, title, left=True)
+    for color, outlines in shapes:
+        _fill(axes, outlines, color)
+    if fabric is not None:
+        axes.plot(*fabric.T, color="tab:red", lw=1.6, clip_on=False)
+    paper.dimension(axes, (low[0], high[0]), low[1], -6.0, scale)
+    paper.dimension(axes, (low[1], high[1]), high[0], 6.0, scale, vertical=True)
+    return bottom - _ROOM + 6
 
 
 def _fabric(size: Size, process: Process, plane: str) -> np.ndarray:
@@ -100,15 +152,7 @@ def _fill(axes: Axes, outlines: Sequence[Any], color: str) -> None:
         return
     loops = (Path(np.vstack([v, v[:1]])) for v in map(np.asarray, outlines))
     whole = Path.make_compound_path(*loops)
-    axes.add_patch(PathPatch(whole, facecolor=color, edgecolor="0.2", lw=0.6))
-
-
-def _finish(axes: Axes, title: str) -> None:
-    axes.autoscale_view()
-    axes.set_aspect("equal")
-    axes.tick_params(labelsize=5.6)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.set_title(f"{title} [mm]", fontsize=7, parse_math=False)
+    axes.add_patch(PathPatch(whole, facecolor=color, edgecolor="0.2", lw=0.6, clip_on=False))
 
 
 def _legend(figure: Figure) -> None:
@@ -125,7 +169,7 @@ def _legend(figure: Figure) -> None:
         marks,
         [words for words, _ in shown],
         loc="upper left",
-        bbox_to_anchor=(0.06, 0.27),
+        bbox_to_anchor=(EDGE / PAPER[0], _LEGEND / PAPER[1]),
         fontsize=7,
         frameon=False,
         ncols=2,

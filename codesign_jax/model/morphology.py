@@ -28,6 +28,7 @@ __all__ = [
     "beam",
     "finger_beams",
     "free_bends",
+    "free_curvatures",
     "joint_springs",
     "law_numbers",
     "pressure_limits",
@@ -129,21 +130,31 @@ def free_bends(hand: Hand, params: Params, *, neo_hookean: bool | None = None) -
     """Angles by which free fingers bend at their pressures [rad], shape (finger,).
 
     Args:
+      neo_hookean: As of `free_curvatures`.
+    """
+    curvatures = free_curvatures(hand, params, neo_hookean=neo_hookean)
+    return curvatures.mean(1) * np.asarray(params.length, float)
+
+
+def free_curvatures(hand: Hand, params: Params, *, neo_hookean: bool | None = None) -> np.ndarray:
+    """Curvatures of free fingers at their pressures [1/m], shape (finger, place).
+
+    Places are `at_joints`, one if a finger is the same all along.
+
+    Args:
       neo_hookean: The bending law; None for that of the hand's material.  The section's law
         "elements" is neo-Hookean.
     """
     if hand.section.law == "elements":
-        return section_bends(hand, params)
+        return section_law.free_bend(*_exact_numbers(hand, params))
     law = silicones.of_law(hand.material.law) if neo_hookean is None else neo_hookean
     exact = jax.tree.map(lambda v: np.asarray(v, float), params)
-    links = 1
-    if params.tip is not None:
-        links = 100
+    links = 1 if params.tip is None else 100
     beams = finger_beams(hand, exact, links)
     curvature = np.asarray(exact.pressure)[:, None] * beams.moment_per_pressure / beams.bending
     if law:
         curvature = _softened(curvature, sections(hand, exact, at_joints(links)))
-    return np.asarray(curvature.mean(1) * exact.length)
+    return np.asarray(curvature)
 
 
 def section_bends(hand: Hand, params: Params, *, thread_depth: float | None = None) -> np.ndarray:

@@ -392,6 +392,29 @@ def test_the_site_is_read_and_searched_without_a_network(browser):
     assert not complaints
 
 
+@pytest.mark.browser
+def test_the_gallery_s_table_sorts_by_the_column_that_is_clicked(browser):
+    page = browser.new_page(viewport={"width": 1300, "height": 900})
+    page.goto((ROOT / "site" / "gallery.html").as_uri())
+    head = page.locator("article table thead th", has_text="kept at 100 g")
+    rows = page.locator("article table tbody tr")
+
+    def shown():
+        column = head.evaluate("head => head.cellIndex")
+        cells = [row.locator("td").all_inner_texts() for row in rows.all()]
+        numbers = [float(row[column].rstrip(" %")) for row in cells if row[column] != "–"]
+        return cells, numbers
+
+    before, _ = shown()
+    for way, falls in (("descending", True), ("ascending", False)):
+        head.click()
+        cells, numbers = shown()
+        assert len(numbers) > 5 and numbers == sorted(numbers, reverse=falls)
+        assert sorted(cells) == sorted(before) and cells != before, "rows move as a whole"
+        assert head.get_attribute("aria-sort") == way
+    page.close()
+
+
 # --- constants by evidence ------------------------------------------------------------------------
 
 KINDS = "measured", "chosen", "fitted"

@@ -226,7 +226,11 @@ def test_a_tab_shows_judges_improves_and_saves(desk, capsys, monkeypatch):
     assert command("evaluate", *design, "--trials", COUNTS[0]) == 0
     [verdict] = re.findall(r"^verdict: (.*)$", capsys.readouterr().out, re.M)
     sentence, _, causes = messages["verdict"]["sentence"].partition(". Lost: ")
-    assert sentence == verdict.replace("fresh ", "")
+    objects, further = re.search(
+        r"grasps of (.*) \(.*\): not enough trials, (.*)", verdict
+    ).groups()
+    kept = messages["verdict"]["ends"].count(VERDICTS.index("kept"))
+    assert sentence == f"{kept} of {COUNTS[0]} grasps kept of {objects}; {further}"
     lost = messages["verdict"]["ends"].count(VERDICTS.index("lost"))
     assert sum(map(int, re.findall(r"\d+", causes))) == lost
     tab.receive('{"run": [2, 1]}')
@@ -617,16 +621,31 @@ def test_two_tabs_work_and_a_closed_one_costs_nothing(page, opened, monkeypatch)
 
 
 @pytest.mark.browser
-def test_a_page_waits_for_the_compiler(browser, opened):
-    with served(opened[0].desk) as (studio, address), visited(browser, address) as page:
+def test_a_page_waits_for_the_compiler(browser, tmp_path):
+    """And shows by a bar which of the programs is compiled."""
+    desk = Desk(cli.Studio(**OPTIONS, out=tmp_path))
+    stages = len(desk.bench("").stages)
+    with served(desk) as (studio, address), visited(browser, address) as page:
         state = page.locator("#studio .state")
         view = page.locator("#studio .message")
         until(lambda: "compiling the simulation" in state.inner_text(), page)
         assert "compiling the simulation" in view.inner_text()
         assert page.locator(LENGTH).is_visible(), "sliders are there"
+        bar = page.locator("#studio .compiling")
+        assert not bar.is_visible()
+        bar.evaluate(
+            """bar => {
+              bar.seen = [];
+              const look = () => { if (!bar.hidden) bar.seen.push(bar.value / bar.max); };
+              new MutationObserver(look).observe(bar, { attributes: true });
+            }"""
+        )
         studio.begin()
         page.wait_for_selector(COMPLETE)
         assert (state.inner_text(), view.inner_text()) == ("", "")
+        shares = dict.fromkeys(bar.evaluate("bar => bar.seen"))
+        assert [*shares] == pytest.approx([(k + 0.5) / stages for k in range(stages)])
+        assert not bar.is_visible()
 
 
 @pytest.mark.browser

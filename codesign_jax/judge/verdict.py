@@ -277,10 +277,13 @@ class Verdict(NamedTuple):
         """Such as "keeps 97 % of 150 fresh grasps (93 to 99 %): good"."""
         share, low, high = (_percent(v) for v in self.share)
         text = f"keeps {share} % of {self.total} {grasps} ({low} to {high} %): {self.word}"
-        if not self.more:
-            return text
-        some = f"{self.more:,}" if self.more <= _MANY else f"more than {_MANY:,}"
-        return f"{text}, {some} more at this share would decide"
+        return f"{text}, {self.further}" if self.more else text
+
+    @property
+    def further(self) -> str:
+        """How many grasps are missing, such as "225 more at this share would decide"."""
+        missing = f"{self.more:,}" if self.more <= _MANY else f"more than {_MANY:,}"
+        return f"{missing} more at this share would decide"
 
 
 def evidence(kept: int, total: int) -> float:

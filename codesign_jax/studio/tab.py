@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from codesign_jax import codesign, files, runs
 from codesign_jax.commands import common
 from codesign_jax.judge import sentences, stress, verdict
+from codesign_jax.judge.sentences import Judged
 from codesign_jax.judge.verdict import VERDICTS
 from codesign_jax.model import morphology, overlap
 from codesign_jax.optimize import Screened
@@ -253,7 +254,7 @@ class Tab:
             outcomes = jax.tree.map(lambda *v: np.concatenate(v)[: view.trials], *self._outcomes)
             ends = verdict.verdicts(outcomes).tolist()
             judged = sentences.Judged(scene, outcomes, grasps="grasps")
-            sentence = str(judged)
+            sentence = _sentence(judged)
             word = judged.verdict.word
             self.send("stage", None)
             if causes := str(verdict.losses(scene, outcomes)):
@@ -370,6 +371,15 @@ def _words(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return f"{os.fsdecode(error.filename or 'a file')}: {error.strerror}"
     return f"{type(error).__name__}: {error}"[:1000]
+
+
+def _sentence(judged: Judged) -> str:
+    """The verdict, or what is known before it: the few trials of a page seldom decide."""
+    if judged.verdict.word != verdict.OPEN:
+        return str(judged)
+    counts = verdict.tally(judged.outcomes)
+    grasps = f"{counts.kept} of {counts.total} grasps kept of {sentences.objects(judged.scene)}"
+    return f"{grasps}; {judged.verdict.further}"
 
 
 def _grasp_message(shown: ShownGrasp) -> dict[str, Any]:

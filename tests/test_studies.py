@@ -411,8 +411,8 @@ def test_every_variant_is_a_scene_and_every_row_has_its_variants(tmp_path):
 
 
 def test_a_gpu_leaves_out_what_cpus_alone_simulate(monkeypatch, capsys):
-    """A GPU's "standard, on CPUs" would compare the GPU with itself."""
-    alone = ["standard, on CPUs", "spheres, MuJoCo C"]
+    """A GPU's "1e-6, on CPUs" would compare the GPU with itself."""
+    alone = ["1e-6, on CPUs", "spheres, MuJoCo C"]
     assert budget.of_platform(["standard", *alone]) == ["standard", *alone]
     monkeypatch.setattr(budget.jax, "devices", lambda: [SimpleNamespace(platform="gpu")])
     assert budget.of_platform(["standard", *alone]) == ["standard"]

@@ -28,6 +28,7 @@ from codesign_jax.commands import (
     replay,
     report,
 )
+from codesign_jax.scene import library
 from codesign_jax.studio import studio
 from scripts import reference_page
 from scripts.shared import evidence, provenance
@@ -372,6 +373,17 @@ def test_every_key_of_the_built_in_files_is_in_the_reference(heading):
     files = sorted(BUILT_IN[heading].glob("*.toml"))
     keys = {key for f in files for key in used(heading, "", tomllib.loads(f.read_text("utf-8")))}
     assert files and keys and not keys - on_page
+
+
+LISTED = {"hands": "meshes", "objects": "meshes", "controls": "control", "accuracy": "accuracy"}
+"""Kinds of built-in files, and the page of docs that lists them."""
+
+
+@pytest.mark.parametrize("kind", LISTED)
+def test_every_built_in_file_is_named_on_its_page(kind):
+    page = (ROOT / "docs" / f"{LISTED[kind]}.md").read_text(encoding="utf-8")
+    names = library.available(kind)
+    assert names and not [name for name in names if f"`{name}`" not in page]
 
 
 @pytest.mark.browser

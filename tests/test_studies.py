@@ -495,6 +495,12 @@ def test_counts_are_the_papers():
     assert (PAPER["2d"].worlds, PAPER["23d"].worlds) == (14_400, 32_400)
 
 
+def test_smaller_sizes_have_the_paper_s_experiments():
+    grasps = {n: sum(p.grasps for p in plans.values()) for n, (plans, _) in simulate.SIZES.items()}
+    assert grasps == {"paper": TOTAL_GRASPS, "small": 59_856, "tiny": 156}
+    assert all(plans.keys() == PAPER.keys() for plans, _ in simulate.SIZES.values())
+
+
 def test_means_by_either_rule():
     scene, *_ = tiny()
     cost = np.array([[0.0, 1.0, 3.0], [3.0, 3.0, 3.0]], np.float32)

@@ -2,7 +2,8 @@
 
 python -m scripts.experiments 2d --out runs/reproduction           # on a GPU; again to resume
 timeout -s INT 500 python -m scripts.experiments 2d --out runs/reproduction    # stop after a time
-python -m scripts.experiments 2d --out runs/tiny --size tiny       # seconds on a CPU
+python -m scripts.experiments 2d --out runs/small --size small     # fewer runs, on a CPU
+python -m scripts.experiments 2d --out runs/tiny --size tiny       # two links, to see that it works
 python -m scripts.experiments figures                                # of docs/data/experiments
 """
 

@@ -20,7 +20,7 @@ from codesign_jax.scene import Scene
 from codesign_jax.types import Params
 
 _A4 = (8.27, 11.69)
-_ROWS = 6  # fingers on a page
+_ROWS = 4  # sizes of fingers on a page, so that usual fingers are drawn at 1:2 at least
 _SEAT_SCALE = 2
 # letters in a line of the title, and its lines
 _WIDE = 64

@@ -52,7 +52,7 @@ def fingers_page(
         left = EDGE + sections * (wide / scale + _SIDE) + _SIDE
         _side_view(figure, (left, top), size, scale, f"{label}, along")
         top -= _BELOW
-    words = "Red: fabric. Left of the dashed line: the root. In a section, the number: the wall."
+    words = "Red: fabric. Left of the dashed line: the root. Right of a section: its walls."
     paper.note(figure, BOTTOM + 2, words)
     paper.title_block(figure, about, scale)
 
@@ -78,7 +78,8 @@ def _section(
     _box(axes, (-width / 2, 0), (width, height), "0.8")
     _box(axes, (-section.chamber[0] / 2, wall), section.chamber, "white")
     axes.plot([-width / 2, width / 2], [0, 0], color="tab:red", lw=2, clip_on=False)
-    axes.text(0, height - wall / 2, f"{wall:.2f}", ha="center", va="center", fontsize=6)
+    ends = 0.0, wall
+    paper.dimension(axes, ends, width / 2, 4.0, scale, vertical=True, words=f"{wall:.2f}")
     paper.dimension(axes, (-width / 2, width / 2), 0.0, -6.0, scale)
     paper.dimension(axes, (0.0, height), -width / 2, -6.0, scale, vertical=True)
 

@@ -36,7 +36,8 @@ _FRAGMENT = """
 <canvas class="view"></canvas><p class="message"></p><div class="strip"></div>
 <div class="controls">
 <button class="play" type="button">Play</button>
-<div class="track"><input class="time" type="range" min="0" step="0.01" aria-label="time [s]">
+<div class="track">
+<input class="time" type="range" min="0" value="0" step="0.01" aria-label="time [s]">
 <div class="phases"></div></div>
 <select class="speed" aria-label="speed"><option value="1">1 x</option>
 <option value="0.5">0.5 x</option><option value="0.25">0.25 x</option>

@@ -267,7 +267,9 @@ function startStudio(root) {
       enable();
     },
     stage: (step) => {
+      const ends = !step && !find("compiling").hidden;
       find("compiling").hidden = !step;
+      if (ends) takes.state("simulating ...");
       if (!step) return;
       find("compiling").max = step.of;
       find("compiling").value = step.number - 0.5;

@@ -24,7 +24,7 @@ from codesign_jax.runs import reference, selection
 from codesign_jax.scene import parameters
 from codesign_jax.types import Forces, Outcome, Status, Touch, Trace, failed
 from tests.helpers import grasps
-from tests.helpers.browsers import chromium, chromium_launcher  # noqa: F401
+from tests.helpers.browsers import chromium, chromium_launcher, spot_of  # noqa: F401
 from tests.helpers.command_runs import small_run  # noqa: F401
 from tests.helpers.refusals import refusal, refusal_of_command
 from tests.helpers.toy_engine import TINY
@@ -403,15 +403,7 @@ def test_a_finger_has_one_colour_and_answers_where_it_is_clicked(grasp, browser,
         f"rgb({int(c[1:3], 16)}, {int(c[3:5], 16)}, {int(c[5:], 16)})" for c in fingers
     ]
     page.evaluate(f"{view}.seek(0)")
-    place = page.evaluate(
-        f"""() => {{
-          const canvas = document.querySelector("#replay .view");
-          for (let y = 5; y < canvas.clientHeight; y += 6)
-            for (let x = 5; x < canvas.clientWidth; x += 6)
-              if ({view}.pick(x, y) === "finger 1") return [x, y];
-        }}"""
-    )
-    assert place, "it is in sight"
+    place = spot_of(page, "#replay .view", view, "finger 1")
     row = page.locator("tr[data-part='finger 1']").first
     page.locator("#replay .view").click(position={"x": place[0], "y": place[1]})
     assert "picked" in row.get_attribute("class")

@@ -34,7 +34,7 @@ from codesign_jax.studio.desk import COUNTS, Bench, Desk
 from codesign_jax.studio.studio import Studio, about
 from codesign_jax.studio.tab import Tab
 from tests.helpers import command_runs
-from tests.helpers.browsers import chromium, chromium_launcher  # noqa: F401
+from tests.helpers.browsers import chromium, chromium_launcher, spot_of  # noqa: F401
 from tests.helpers.command_runs import command, own_workplace  # noqa: F401
 from tests.helpers.toy_engine import TINY
 
@@ -575,11 +575,7 @@ def test_a_click_on_a_finger_opens_its_sliders(browser, tmp_path):
             view = "document.querySelector('.replay').replay"
             page.evaluate(f"{view}.pause()")
             canvas = page.locator("#studio .view").bounding_box()
-            spots = itertools.product(
-                range(10, int(canvas["width"]), 8), range(10, int(canvas["height"]), 8)
-            )
-            named = f"([x, y]) => {view}.pick(x, y)"
-            spot = next(spot for spot in spots if page.evaluate(named, list(spot)) == "finger 1")
+            spot = spot_of(page, "#studio .view", view, "finger 1")
             page.mouse.click(canvas["x"] + spot[0], canvas["y"] + spot[1])
             until(lambda: group.evaluate("e => e.open"), page)
             assert "picked" in group.get_attribute("class")

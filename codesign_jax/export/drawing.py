@@ -172,7 +172,7 @@ def _seat(figure: matplotlib.figure.Figure, low: float, size: Size, tilt: float)
     cosine = np.cos(np.radians(tilt))
     sine = np.sin(np.radians(tilt))
     right = (height + BAR) * sine + 40 * cosine + 12
-    left = PAPER[0] - EDGE - (right + 85) / _SEAT_SCALE
+    left = PAPER[0] - EDGE - (right + 105) / _SEAT_SCALE
     span = (-45.0, -50.0), (right + 40, 48.0)
     title = f"a seat, cut along finger 0 (tilt {tilt:g}°), 1:{_SEAT_SCALE}"
     axes = paper.view(figure, (left, low), span, _SEAT_SCALE, title)

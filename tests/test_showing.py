@@ -119,6 +119,10 @@ def test_wrong_grasps_are_refused(run, workplace, capsys):
             "unknown",
             "--parameters 'contact.friction_ratio'",
         ),
+        ("landscape", "--preset", "23d", "--parameters", "length=60:90", "gravity=3:9"): (
+            "unknown",
+            "--parameters 'length'",
+        ),
         (*GRID, "gravity=3", "length"): ("syntax", ""),
         (*GRID, "gravity=9:3", "length"): ("syntax", ""),
         (*GRID, "gravity=3:9"): ("syntax", "--parameters"),

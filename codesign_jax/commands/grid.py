@@ -57,7 +57,8 @@ def _problem(word: str, case: Case) -> Problem | None:
             if problem := schema.range_problem(name, value, case.space.units[k], *bounds):
                 return problem.told(f"--parameters {problem}")
         return None
-    if not equals:
+    by_finger = any(n.startswith(f"{name}[") for n in case.space.names)
+    if by_finger or not equals:
         words = f"--parameters {name!r} is not a parameter; {_meant(name, case.space.names)}"
         return Problem("unknown", words)
     return None

@@ -92,17 +92,28 @@ def test_no_proposal_for_surroundings_has_a_warning_of_a_finger(name):
     assert not [w for w in warned if name == "bin" or w.startswith("finger")]
 
 
+def bent_at_most(overrides):
+    """Designs as drawn and with a free bend of at most 90 degrees, and which pressures are lower.
+
+    Returns:
+      The scene, its design space, both designs, shape (design, parameter), and for each finger
+      whether its pressure was lowered, shape (design, finger).
+    """
+    limits = {f"limits.{n}": v for n, v in {**UNLIMITED, "free_bend": 90.0}.items()}
+    made = scene.load("paper", overrides=limits | overrides)
+    space = parameters.design_space(made.hand, "23d")
+    designs = drawn(TABLE, 60)
+    legal = projected(space, designs)
+    pressures = columns("pressure")
+    lowered = legal[:, pressures] < designs[:, pressures] * (1 - 1e-5)
+    return made, space, designs, legal, lowered
+
+
 @pytest.mark.parametrize("law", silicones.LAWS)
 def test_a_lowered_pressure_bends_the_free_finger_by_the_limit(law):
     """By `free_bends`, which halves intervals where the projection inverts in closed form."""
     material = {"hand.material.law": law, "hand.material.shear_modulus": 40e3}
-    limits = {f"limits.{n}": v for n, v in {**UNLIMITED, "free_bend": 90.0}.items()}
-    made = scene.load("paper", overrides=limits | material)
-    space = parameters.design_space(made.hand, "23d")
-    designs = drawn(TABLE, 60)
-    pressures = columns("pressure")
-    legal = projected(space, designs)
-    lowered = legal[:, pressures] < designs[:, pressures] * (1 - 1e-5)
+    made, space, designs, legal, lowered = bent_at_most(material)
     bends = np.degrees(
         [
             morphology.free_bends(made.hand, p, neo_hookean=silicones.of_law(law))
@@ -112,20 +123,14 @@ def test_a_lowered_pressure_bends_the_free_finger_by_the_limit(law):
     # Pressures are rounded to float32, and stay below the limit by 1e-6 of it.
     np.testing.assert_allclose(bends[lowered], 90, rtol=2e-5)
     assert lowered.mean() > 0.3 and (bends <= 90 * (1 + 1e-6)).all()
-    others = np.setdiff1d(np.arange(len(space.names)), pressures)
+    others = np.setdiff1d(np.arange(len(space.names)), columns("pressure"))
     np.testing.assert_array_equal(legal[:, others], designs[:, others])
 
 
 def test_a_section_by_elements_bends_by_the_limit_and_does_not_twist_by_itself():
     """By `free_bends`, which halves intervals of the bend and not of the pressure."""
     law = {"hand.section.law": "elements", "hand.section.winding": "single"}
-    limits = {f"limits.{n}": v for n, v in {**UNLIMITED, "free_bend": 90.0}.items()}
-    made = scene.load("paper", overrides=limits | law)
-    space = parameters.design_space(made.hand, "23d")
-    designs = drawn(TABLE, 60)
-    pressures = columns("pressure")
-    legal = projected(space, designs)
-    lowered = legal[:, pressures] < designs[:, pressures] * (1 - 1e-5)
+    made, space, designs, legal, lowered = bent_at_most(law)
     bends = []
     straight = []
     for before, after in zip(each_params(space, designs), each_params(space, legal), strict=True):

@@ -25,7 +25,7 @@ from codesign_jax.runs import Settings, reference, selection
 from codesign_jax.runs.progress import Busy, duration
 from codesign_jax.scene import Scene, accuracy_name, library, scene_files, with_accuracy
 from codesign_jax.scene.schema import Problem
-from codesign_jax.statistics import wilson
+from codesign_jax.statistics import Interval, wilson
 from codesign_jax.terminal import Console
 from codesign_jax.types import Outcome, Trial, failed
 
@@ -285,13 +285,19 @@ def _kept(usual: Measured, fine: Measured) -> str:
     """Kept grasps at both accuracies, and how many verdicts differ."""
     theirs = fine.kept
     ours = usual.kept[: len(theirs)]
-    differ = int((ours != theirs).sum())
-    share = wilson(differ, theirs.size)
+    differ, share = _flips(usual, fine)
     return (
         f"kept: {ours.sum()} of {ours.size} grasps, at accuracy {fresh_trials.ACCURACY} "
         f"{theirs.sum()}; verdicts differ in {differ}: {100 * share.value:.2g} % "
         f"(95 % interval {100 * share.low:.2g} to {100 * share.high:.2g} %)"
     )
+
+
+def _flips(level: Measured, fine: Measured) -> tuple[int, Interval]:
+    """Verdicts that differ from those at the finest accuracy, and their share."""
+    theirs = fine.kept
+    differ = int((level.kept[: len(theirs)] != theirs).sum())
+    return differ, wilson(differ, theirs.size)
 
 
 def _search(case: Case, settings: Settings, measured: list[Measured]) -> str:
@@ -321,8 +327,7 @@ def _table(measured: list[Measured]) -> Table:
     for level in sorted(measured, key=lambda m: fresh_trials.steps_and_links(m.scene))[::-1]:
         kept = level.kept[: len(truth)]
         size = level.scene.discretization
-        differ = int((kept != truth).sum())
-        share = wilson(differ, truth.size)
+        differ, share = _flips(level, measured[-1])
         numbers = (
             f"{1e3 * size.timestep:g}",
             str(size.links),

@@ -14,7 +14,7 @@ import numpy as np
 from codesign_jax.finger.prediction import Table
 from codesign_jax.finger.rest import Finger, of_design
 from codesign_jax.scene import Scene
-from codesign_jax.scene.section_law import FURTHEST
+from codesign_jax.scene.section_law import FURTHEST, bisected
 from codesign_jax.types import Params
 
 MODULUS = 0.15
@@ -79,12 +79,10 @@ def _evidence(finger: Finger, pressure: np.ndarray, angle: np.ndarray) -> float:
 
 def free_angles(finger: Finger, pressure: np.ndarray) -> np.ndarray:
     """Angles of a free finger without load [rad], shape as the pressures [Pa]."""
-    height = finger.section.height
-    low = np.zeros((len(pressure), finger.links))
-    high = low + FURTHEST * finger.segment / height
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        further = finger.held(pressure[:, None], middle) < 0
-        low = np.where(further, middle, low)
-        high = np.where(further, high, middle)
-    return ((low + high) / 2).sum(-1)
+    straight = np.zeros((len(pressure), finger.links))
+    most = straight + FURTHEST * finger.segment / finger.section.height
+
+    def bends_further(angles: np.ndarray) -> np.ndarray:
+        return finger.held(pressure[:, None], angles) < 0
+
+    return bisected(bends_further, straight, most, HALVINGS).sum(-1)

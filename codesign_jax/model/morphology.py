@@ -213,15 +213,12 @@ def _softened(linear: np.ndarray, section: Section) -> np.ndarray:
     At large strain they carry a quarter of the linear moment, so that it is at most four times as
     large; halved 50 times the interval is as short as rounding.
     """
-    low = linear
-    high = 4 * linear
-    for _ in range(50):
-        middle = (low + high) / 2
-        lacking = softening(middle, section.height, section.wall, width=section.width)
-        enough = middle * (1 - lacking) >= linear
-        low = np.where(enough, low, middle)
-        high = np.where(enough, middle, high)
-    return (low + high) / 2
+
+    def bends_further(curvature: np.ndarray) -> np.ndarray:
+        lacking = softening(curvature, section.height, section.wall, width=section.width)
+        return curvature * (1 - lacking) < linear
+
+    return section_law.bisected(bends_further, linear, 4 * linear, 50)
 
 
 class Segments(NamedTuple):

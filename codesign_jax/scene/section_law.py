@@ -250,14 +250,32 @@ def energy(
 
 def free_bend(n: Numbers, pressure: Any) -> np.ndarray:
     """Curvature of a free finger [1/m], NumPy arrays; its strain kappa h is at most `FURTHEST`."""
-    low = 0.0 * n.height * pressure
-    high = low + FURTHEST / n.height
-    for _ in range(40):
+    straight = 0.0 * n.height * pressure
+
+    def bends_further(bend: np.ndarray) -> np.ndarray:
+        return response(n, pressure, 0.0, bend, 0.0).bend < 0
+
+    bend = bisected(bends_further, straight, straight + FURTHEST / n.height, 40)
+    return np.where(np.asarray(pressure) > 0, bend, 0.0)
+
+
+def bisected(
+    lies_below: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray, halvings: int
+) -> np.ndarray:
+    """Roots between two ends by bisection, NumPy arrays of any shape.
+
+    Args:
+      lies_below: Whether values lie below the roots.
+      low: Lower ends.
+      high: Upper ends.
+      halvings: Number of halvings of the intervals.
+    """
+    for _ in range(halvings):
         middle = (low + high) / 2
-        further = response(n, pressure, 0.0, middle, 0.0).bend < 0
-        low = np.where(further, middle, low)
-        high = np.where(further, high, middle)
-    return np.where(np.asarray(pressure) > 0, (low + high) / 2, 0.0)
+        below = lies_below(middle)
+        low = np.where(below, middle, low)
+        high = np.where(below, high, middle)
+    return (low + high) / 2
 
 
 def strain_pressure(n: Numbers, strain: Any) -> Any:

@@ -59,7 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def run(arguments: list[str] | None = None) -> int:
-    """Runs the command as `main` does, whose errors are raised.
+    """Runs a command and returns its exit status; unlike `main` it lets errors through.
 
     Args:
       arguments: As of `main`.

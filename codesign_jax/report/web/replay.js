@@ -113,9 +113,12 @@ function startReplay(root, data) {
       const size = Math.hypot(...n) || 1;
       for (let i = 0; i < 3; i++) {
         const at = 3 * p.face[c + i], key = [0, 1, 2].map((a) => Math.round(1e6 * p.vertices[at + a])).join();
-        const own = known.get(key) || known.set(key, []).get(key);
-        let match = own.find((one) => (one.n[0] * n[0] + one.n[1] * n[1] + one.n[2] * n[2]) / size > EDGE);
-        if (!match) own.push(match = { n: n.map((x) => x / size), slot: count++ });
+        const normals = known.get(key) || known.set(key, []).get(key);
+        let match = normals.find((other) => (other.n[0] * n[0] + other.n[1] * n[1] + other.n[2] * n[2]) / size > EDGE);
+        if (!match) {
+          match = { n: n.map((x) => x / size), slot: count++ };
+          normals.push(match);
+        }
         slot[c + i] = match.slot;
       }
     }
@@ -343,10 +346,11 @@ function startReplay(root, data) {
   // Triangles of a cone from its base's middle to its tip, or with top = 1 of a cylinder, with normals.
   function cone(from, axis, radius, sides, top = 0) {
     const long = Math.hypot(...axis), up = axis.map((v) => v / long), corners = [];
-    const one = normal(cross(up, Math.abs(up[2]) > 0.9 ? [1, 0, 0] : [0, 0, 1])), other = cross(up, one);
+    const first = normal(cross(up, Math.abs(up[2]) > 0.9 ? [1, 0, 0] : [0, 0, 1]));
+    const second = cross(up, first);
     const ring = (k, share) => {
       const [c, s] = [Math.cos(2 * Math.PI * k / sides), Math.sin(2 * Math.PI * k / sides)];
-      const out = one.map((v, i) => c * v + s * other[i]);
+      const out = first.map((v, i) => c * v + s * second[i]);
       return [...from.map((v, i) => v + share * axis[i] + radius * (share && !top ? 0 : 1) * out[i]), ...out];
     };
     for (let k = 0; k < sides; k++) {

@@ -187,13 +187,13 @@ function startStudio(root) {
     const last = tried.slice(-40), x = last.map((_, k) => k), worst = about.worst;
     plot("tried", { x: { low: -0.5, high: Math.max(last.length - 0.5, 12), whole: true }, y: { low: 0, high: 1.05 * worst }, height: 130,
       layers: [{ kind: "dots", x, y: last.map(({ cost }) => Math.min(cost, worst)), radius: 4.5,
-        color: last.map((one) => (one === tried.at(-1) ? "#1d2733" : "#2f6fab")),
+        color: last.map((design) => (design === tried.at(-1) ? "#1d2733" : "#2f6fab")),
         title: last.map(({ sentence, cost }) => `mean cost ${cost.toFixed(2)}: ${sentence.split(" fresh")[0].slice(0, 40)}`) }] });
   }
   find("tried").addEventListener("at", ({ detail }) => {
-    const one = tried.slice(-40)[Math.max(Math.round(detail), 0)];
-    if (!one) return;
-    one.design.forEach((value, i) => set(rows[i], value));
+    const before = tried.slice(-40)[Math.max(Math.round(detail), 0)];
+    if (!before) return;
+    before.design.forEach((value, i) => set(rows[i], value));
     show();
   });
   for (const name of ["distance", "grip"])

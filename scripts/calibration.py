@@ -32,7 +32,14 @@ from codesign_jax.batch import LIMIT
 from codesign_jax.codesign import stream_key
 from codesign_jax.engines import Engine, make_engine
 from codesign_jax.optimize import OptimizerState, ParticleFilter, candidates, schedule
-from codesign_jax.scene import InputError, Scene, keypaths, parameters
+from codesign_jax.scene import (
+    InputError,
+    Scene,
+    keypaths,
+    parameters,
+    section_law,
+    section_numbers,
+)
 from codesign_jax.scene import constants as checks
 from codesign_jax.scene.beams import strain_pressure
 from codesign_jax.scene.hand import Hand
@@ -412,6 +419,13 @@ def free_strain(chosen: Mapping[str, np.ndarray], hand: Hand, *, neo_hookean: bo
     of = {p.name: p for p in hand.parameter}
     height, wall = (1e-3 * np.linspace(of[n].low, of[n].high, 11) for n in ("height", "wall"))
     height = height[:, None]
+    if hand.section.law == "elements":
+        limits = hand.pressure_limit.per_wall * wall
+        largest = []
+        for width in 1e-3 * chosen["width"]:
+            numbers = section_numbers.of_hand(hand, height, wall, width, np.inf)
+            largest.append((height * section_law.free_bend(numbers, limits)).max())
+        return np.array(largest)
     strain = np.linspace(0.05, 4.0, 400)  # between which a law that softens is straight enough
     limit = np.broadcast_to(hand.pressure_limit.per_wall * wall, (len(height), len(wall)))
     largest = []

@@ -87,7 +87,9 @@ def test_who_replays_the_key_frames_simulates_the_open_loop():
     jax.tree.map(np.testing.assert_array_equal, run(engine), run(replay)._replace(ctrl=None))
 
 
-@pytest.mark.parametrize("name", ["spheres", "fingers", "hull and fingers", "mesh"])
+@pytest.mark.parametrize(
+    "name", ["spheres", "law of the section", "fingers", "hull and fingers", "mesh"]
+)
 def test_derivatives(on_cpu, name):
     """The reverse pass in float64, by every group of numbers of the kernel's tables."""
     read = on_cpu(f"slopes/{name}")

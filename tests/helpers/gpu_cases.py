@@ -22,6 +22,7 @@ EFFECTS = {
     "spheres": {},
     "no friction, rigid arm": {"effects__friction": "none", "effects__wrist": False},
     "neo-Hookean": {"effects__neo_hookean": True},
+    "law of the section": {"section__law": "elements", "effects__neo_hookean": True},
     "bending only, no table, no gravity, air supply": {
         "effects__lateral_bending": False,
         "effects__twist": False,
@@ -37,7 +38,7 @@ EFFECTS = {
         "effects__friction_memory": True,
     },
 }
-"""Effects of the scenes that are compared, by name."""
+"""Settings of the scenes that are compared, by name."""
 
 GRASPS = 384
 WHOLE = {"spheres": {}, "hull and fingers": EFFECTS["hull and fingers"]}

@@ -4,6 +4,7 @@ python -m scripts.calibration wave --sets 200 --out runs/wave.npz     # again to
 python -m scripts.calibration score runs/wave.npz                     # writes runs/wave_scores.npz
 python -m scripts.calibration wave --near runs/wave_scores.npz --sets 200 --out runs/wave2.npz
 python -m scripts.calibration score runs/wave2.npz --set hand.material=dragon_skin_10
+python -m scripts.calibration tables                                  # of docs/calibration.md
 
 A wave simulates a coarse landscape of the 2D experiment for each set of constants, all sets by one
 compiled program; what is measured, the fingers' silicone, is the scene's and does not vary.  A
@@ -11,6 +12,7 @@ second wave draws its sets around the best of a first one.  The score runs the p
 these landscapes and compares them with the paper's text: implausibility is the distance to a
 statement in standard deviations, and a set beyond `CUTOFF` of any of them is ruled out.  The 23D
 experiment is held out.  --set changes what the scene holds fixed, in `wave` and `score` alike.
+docs/data/calibration has the scores of two waves by each law of the fingers' sections.
 """
 
 import dataclasses
@@ -25,7 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy import ndimage
-from scipy.stats import qmc
+from scipy.stats import fisher_exact, qmc
 
 from codesign_jax import codesign, rollout, scene
 from codesign_jax.batch import LIMIT
@@ -52,7 +54,14 @@ CUTOFF = 3.0
 distribution as long as it has one peak (Pukelsheim 1994)."""
 CLEARANCE = 0.002
 """Smallest gap between the sections of a pair of fingers at a spread of zero [m]."""
-DATA = Path("docs/data/calibration/scores.npz")
+DATA = Path("docs/data/calibration")
+LAWS = {
+    "chamber": "`chamber`",
+    "elements": "`elements`, thread outside",
+    "elements_inside": "`elements`, thread on the chamber",
+}
+"""Laws of the section: file names of their scores, second wave, and what tables call them."""
+PAGE = Path("docs/calibration.md")
 BEST = 10
 NEAR = 0.15
 """Sets of a first wave around which a second one draws, and how far, as a share of each range."""
@@ -91,6 +100,24 @@ OPEN = {
     "friction_ratio": Open("", 3, 100, log=True),
     "cost_maximum": Open("", 2.2, 4),
 }
+
+
+WORDS = {
+    "tilt": "tilt of the fingers",
+    "base_x": "base points to the palm's middle plane",
+    "pair_gap": "gap between the two fingers of a side",
+    "zero_height": "height of the palm at `arm_z` = 0",
+    "width": "width of a finger",
+    "lateral": "lateral stiffness ×",
+    "torsion": "torsional stiffness ×",
+    "friction": "friction of the hand",
+    "table_friction": "friction of the table",
+    "wrist_linear": "wrist, linear",
+    "wrist_angular": "wrist, angular",
+    "shake_amplitude": "shaking, amplitude",
+    "shake_frequency": "shaking, frequency",
+}
+"""What the page calls the constants that its waves varied."""
 
 
 def space_filling(count: int, seed: int) -> np.ndarray:
@@ -254,10 +281,57 @@ def load_scores(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return units[:, [names.index(name) for name in OPEN]], distances
 
 
-def remaining_sets(path: Path = DATA) -> np.ndarray:
-    """Sets that no target ruled out, of a file of scores, in the unit cube, (set, constant)."""
+def remaining_sets(path: Path = DATA / "chamber.npz", *, strain: bool = True) -> np.ndarray:
+    """Sets that no statement ruled out, of a file of scores, in the unit cube, (set, constant).
+
+    Without `strain` the statement about free strains, the last one, does not count.
+    """
     units, distances = load_scores(path)
-    return units[(distances <= CUTOFF).all(-1)]
+    counted = distances if strain else distances[:, :-1]
+    return units[(counted <= CUTOFF).all(-1)]
+
+
+def laws_table() -> str:
+    """How many sets each law leaves, with Fisher's exact test against the law "chamber"."""
+    rows = [["law", "wave", "sets", "left", "p", "left without the free strain", "p"]]
+    for suffix, wave in (("_first", "first"), ("", "second")):
+        reference: dict[bool, tuple[int, int]] = {}
+        for law, words in LAWS.items():
+            path = DATA / f"{law}{suffix}.npz"
+            total = len(load_scores(path)[0])
+            row = [words, wave, str(total)]
+            for strain in (True, False):
+                left = len(remaining_sets(path, strain=strain))
+                counts = left, total - left
+                chance = fisher_exact([counts, reference.setdefault(strain, counts)]).pvalue
+                row += [str(left), "–" if law == "chamber" else f"{chance:.1g}"]
+            rows.append(row)
+    return output.markdown(rows)
+
+
+def _rounded(value: float) -> str:
+    return f"{float(f'{value:.3g}'):g}"
+
+
+def constants_table(the_scene: Scene) -> str:
+    """The scene's constants and the ranges of the sets that two laws leave, 5 to 95 %."""
+    left = [
+        values(remaining_sets()),
+        values(remaining_sets(DATA / "chamber_first.npz", strain=False)),
+        values(remaining_sets(DATA / "elements_first.npz", strain=False)),
+    ]
+    heads = ["`chamber`, second wave", "`chamber`, first wave", "`elements`, first wave"]
+    counts = [f"{h}: {len(v['tilt'])} sets" for h, v in zip(heads, left, strict=True)]
+    rows = [["constant", "default", *counts]]
+    defaults = values(own_set(the_scene)[None])
+    for name, words in WORDS.items():
+        spans = []
+        for law_values in left:
+            low, high = np.percentile(law_values[name], [5, 95])
+            spans.append("–" if low == high else f"{_rounded(low)} to {_rounded(high)}")
+        unit = f" [{OPEN[name].unit}]" if OPEN[name].unit else ""
+        rows.append([words + unit, f"{defaults[name][0]:.3g}", *spans])
+    return output.markdown(rows)
 
 
 # --- a wave ---------------------------------------------------------------------------------------
@@ -550,7 +624,7 @@ def sets_of(args: Any, the_scene: Scene) -> np.ndarray:
 
 def main() -> int:
     parser = provenance.parser(__doc__)
-    parser.add_argument("command", choices=("wave", "score"))
+    parser.add_argument("command", choices=("wave", "score", "tables"))
     parser.add_argument("file", type=Path, nargs="?", help="file of a wave to score")
     parser.add_argument("--out", type=Path, default=Path("runs/wave.npz"))
     parser.add_argument("--sets", type=int, default=200)
@@ -567,6 +641,10 @@ def main() -> int:
     args = parser.parse_args()
     try:
         the_scene = scene.load("paper", overrides=keypaths.parse(args.set))
+        if args.command == "tables":
+            output.fill(PAGE, laws_table(), "calibration_laws")
+            output.fill(PAGE, constants_table(the_scene), "calibration_constants")
+            return 0
         if args.command == "score":
             return score_file(args.file or args.out, the_scene)
         units = sets_of(args, the_scene)

@@ -136,6 +136,22 @@ def test_statements_rule_out_what_they_should():
     assert good["two regions"] == bad["two regions"] == pytest.approx(1 / 0.3)
 
 
+def test_a_set_remains_by_all_statements_or_without_the_last(tmp_path):
+    """One set beyond the last statement only, one beyond another, one beyond none."""
+    path = tmp_path / "scores.npz"
+    units = calibration.space_filling(3, seed=5)
+    distances = [[0.0, 3.1], [3.1, 0.0], [3.0, 3.0]]
+    output.write_arrays(path, dict(units=units, distances=distances, names=[*OPEN]))
+    np.testing.assert_array_equal(calibration.remaining_sets(path), units[[2]])
+    np.testing.assert_array_equal(calibration.remaining_sets(path, strain=False), units[[0, 2]])
+
+
+@pytest.mark.parametrize("table", (calibration.laws_table, calibration.constants_table))
+def test_the_page_has_the_tables_of_its_scores(table):
+    scenes = [scene.load("paper")] if table is calibration.constants_table else []
+    assert table(*scenes) in calibration.PAGE.read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("ties", (False, True))
 def test_rank_correlation_equals_its_definition(ties):
     rng = np.random.default_rng(1)

@@ -10,6 +10,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 
 class Interval(NamedTuple):
@@ -26,6 +27,36 @@ def wilson(successes: int, total: int) -> Interval:
 
     interval = stats.binomtest(successes, total).proportion_ci(0.95, method="wilson")
     return Interval(successes / total, float(interval.low), float(interval.high))
+
+
+def clustered(successes: ArrayLike, totals: ArrayLike) -> Interval:
+    """Share of successes in the trials of several designs, with an interval over both.
+
+    Trials of a design are alike, so that they tell less than as many independent ones.  The
+    interval is Wilson's, of as many independent trials as have the standard error between designs
+    (Korn, Graubard, Survey Methodology 24, 1998; Dean, Pagano, J. Survey Statistics and Methodology
+    3, 2015).  One design tells nothing of others: its interval is that of its trials.
+
+    Args:
+      successes: Successes of each design, shape (design,).
+      totals: Trials of each design, which no other design meets, shape (design,).
+    """
+    from scipy import stats
+
+    kept, trials = (np.asarray(v, float) for v in (successes, totals))
+    total = trials.sum()
+    share = kept.sum() / total
+    designs = len(trials)
+    alone = share * (1 - share) / total  # variance if all trials were independent
+    if designs < 2 or not alone:
+        return wilson(int(kept.sum()), int(total))
+    normal, student = stats.norm.ppf(0.975), stats.t.ppf(0.975, designs - 1)
+    variance = designs / (designs - 1) * ((kept - share * trials) ** 2).sum() / total**2
+    effect = max(variance / alone * (student / normal) ** 2, 1.0)
+    weight = normal**2 * effect / total
+    middle = (share + weight / 2) / (1 + weight)
+    half = math.sqrt(weight * share * (1 - share) + weight**2 / 4) / (1 + weight)
+    return Interval(float(share), float(middle - half), float(middle + half))
 
 
 def paired(both: int, first: int, second: int, total: int) -> Interval:

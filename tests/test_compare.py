@@ -266,6 +266,32 @@ def test_its_counts_are_those_of_the_grasps_simulated_again(capsys):
     assert 60 * minutes + seconds >= 0.99 * grasps / rates[0][0] - 1
 
 
+def test_the_interval_over_designs_and_trials_covers_the_share():
+    """Of the share of flips where designs differ, as 95 % of intervals should.
+
+    A flip's probability is beta distributed over designs, with a mean of 8 % and a correlation of
+    0.25 within a design.  Wilson's interval takes all trials as independent.  2,000 draws leave
+    0.5 points; the skew of few designs takes two.
+    """
+    rng = np.random.default_rng(0)
+    share = 0.08
+    size = (2000, 40)
+    probability = rng.beta(share * 3, (1 - share) * 3, size)
+    flips = rng.binomial(12, probability)
+    both = [statistics.clustered(f, np.full(size[1], 12)) for f in flips]
+    alone = [statistics.wilson(int(f.sum()), 12 * size[1]) for f in flips]
+    covered, too_few = (np.mean([i.low <= share <= i.high for i in v]) for v in (both, alone))
+    assert 0.93 < covered < 0.97 and too_few < 0.75
+    # Independent trials, and those of one design: SciPy's interval.
+    for kept, total in (([3], [12]), ([0, 0, 0], [4, 4, 4]), ([2, 2], [2, 2])):
+        expected = stats.binomtest(sum(kept), sum(total)).proportion_ci(method="wilson")
+        assert statistics.clustered(kept, total)[1:] == pytest.approx(expected, abs=1e-12)
+    single = statistics.clustered(rng.permutation(np.arange(400) < 30), np.ones(400))
+    expected = stats.binomtest(30, 400).proportion_ci(method="wilson")
+    # Student's quantile of 399 degrees of freedom is 0.3 % above the normal one.
+    assert single[1:] == pytest.approx(expected, rel=5e-3)
+
+
 def test_check_ends_with_an_error_where_every_grasp_fails(monkeypatch):
     """Its simulations are stand-ins."""
     outcomes = trials_of(np.zeros(4), np.full(4, Status.SPEED))

@@ -25,7 +25,7 @@ from codesign_jax.runs import Settings, reference, selection
 from codesign_jax.runs.progress import Busy, duration
 from codesign_jax.scene import Scene, accuracy_name, library, scene_files, with_accuracy
 from codesign_jax.scene.schema import Problem
-from codesign_jax.statistics import Interval, wilson
+from codesign_jax.statistics import Interval, clustered
 from codesign_jax.terminal import Console
 from codesign_jax.types import Outcome, Trial, failed
 
@@ -296,8 +296,10 @@ def _kept(usual: Measured, fine: Measured) -> str:
 def _flips(level: Measured, fine: Measured) -> tuple[int, Interval]:
     """Verdicts that differ from those at the finest accuracy, and their share."""
     theirs = fine.kept
-    differ = int((level.kept[: len(theirs)] != theirs).sum())
-    return differ, wilson(differ, theirs.size)
+    differ = level.kept[: len(theirs)] != theirs
+    rows = np.arange(len(theirs)) if fine.rows is None else fine.rows
+    of_design = np.bincount(rows, weights=differ.sum(1))
+    return int(differ.sum()), clustered(of_design, np.bincount(rows) * theirs.shape[1])
 
 
 def _search(case: Case, settings: Settings, measured: list[Measured]) -> str:

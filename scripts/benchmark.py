@@ -27,7 +27,7 @@ from codesign_jax import cost, rollout, sampling, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import Scene, parameters
 from codesign_jax.types import Outcome, failed
-from scripts.shared import output, provenance, work
+from scripts.shared import evidence, output, provenance, work
 
 ROOT = Path(__file__).parents[1]
 FILES = "docs/data/rates_*.json"
@@ -165,9 +165,16 @@ def machine(run: dict[str, Any]) -> str:
     return f"one {run['device'].removeprefix('NVIDIA ').split()[0]}"
 
 
+def newest(files: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The file that was measured last, of each platform."""
+    ordered = sorted(files, key=lambda content: content["runs"][0]["date"])
+    return [*{content["runs"][0]["platform"]: content for content in ordered}.values()]
+
+
 def rates(files: list[dict[str, Any]]) -> str:
     """Grasps a second in the default scene: batches against machines and designs, in Markdown."""
     cells: dict[tuple[str, str], dict[int, str]] = {}
+    files = newest(files)
     for content in files:
         for record in content["records"]:
             if record["scene"] == "paper" and record["engine"] == "structured":
@@ -193,11 +200,11 @@ def rates(files: list[dict[str, Any]]) -> str:
 def machines(files: list[dict[str, Any]]) -> str:
     """What measured the default scene's rates, in a line; the files have the commits."""
     lines: dict[str, None] = {}
-    for content in files:
+    for content in newest(files):
         for record in content["records"]:
             run = content["runs"][record["run"]]
             if record["scene"] == "paper":
-                lines[f"{machine(run)}, JAX {run['jax']}, {run['date'][:10]}"] = None
+                lines[f"{machine(run)}, version {_version(run)}, JAX {run['jax']}"] = None
     return f"Measured on {'; on '.join(lines)} (`docs/data/rates_*.json`)."
 
 
@@ -205,6 +212,7 @@ def peers(files: list[dict[str, Any]]) -> str:
     """This engine beside each peer: the same grasps on the same machine, in Markdown."""
     head = "scene, machine, peer, peer's grasps a second, this engine's, times as many"
     rows = [[*head.split(", "), "same verdicts", "the same where either keeps the object"]]
+    rows[0] += ["version"]
     for content in files:
         for theirs in content["records"]:
             if theirs["engine"] == "structured":
@@ -218,8 +226,14 @@ def peers(files: list[dict[str, Any]]) -> str:
             verdicts = list(zip(ours["verdicts"], theirs["verdicts"], strict=True))
             kept = [pair for pair in verdicts if "1" in pair]
             same = [_same(verdicts), _same(kept)]
-            rows.append([theirs["scene"], where, theirs["engine"], *shown, ratio, *same])
+            version = _version(content["runs"][ours["run"]])
+            rows.append([theirs["scene"], where, theirs["engine"], *shown, ratio, *same, version])
     return output.markdown(rows)
+
+
+def _version(run: dict[str, Any]) -> str:
+    """The package's version that a run measured."""
+    return run.get("version", evidence.FIRST_VERSION)
 
 
 def _beside(records: Iterable[dict[str, Any]], theirs: dict[str, Any]) -> dict[str, Any]:

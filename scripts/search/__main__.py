@@ -2,7 +2,7 @@
 
 python -m scripts.search --out runs/search                      # again to go on where it stopped
 python -m scripts.search --robust --masses 0.05 0.2 0.5         # what its winners keep at 500 g
-python -m scripts.search --report docs/data/search              # tables of the note
+python -m scripts.search --report docs/data/search              # tables of the pages
 python -m scripts.search --search-accuracy fast --judged reference --first 60000 --tests 100 \\
     --budget 4794 --at 4794    # as codesign optimize searches; 2394 at the scene's own accuracy
 
@@ -10,6 +10,8 @@ At every mark the optimiser's best particles meet fresh trials, and the one that
 these is what it recommends there: 25 particles in 12 trials each, or the final test of an optimiser
 that says how many finalists it has.  These trials count as the search's; those by which the
 recommended design is judged do not.  100 seeds with two marks take five minutes of an H200.
+--retest repeats a finished search's last test at both of its accuracies: which of the finalists
+only the coarse one likes.
 """
 
 import argparse
@@ -32,7 +34,7 @@ from codesign_jax.judge.verdict import WANTED
 from codesign_jax.runs.progress import duration
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
-from scripts.search.tables import LIMITED, lines_table, masses_table, table
+from scripts.search.tables import LIMITED, accuracies_table, lines_table, masses_table, table
 from scripts.shared import output, provenance, work
 from scripts.shared.lock_step import Study, make_case
 
@@ -40,6 +42,7 @@ LONGEST_STEM = 100
 """Longest name of a study's files that says all of its changes."""
 PAGE = Path("docs/notes/search.md")
 LINES_PAGE = Path("docs/optimisers.md")
+ACCURACY_PAGE = Path("docs/accuracy.md")
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
@@ -57,6 +60,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     text = "judge the last designs once more with all objects at each of these masses [kg]"
     parser.add_argument("--masses", nargs="+", default=[], help=text)
     parser.add_argument("--designs", type=Path, help="judge those of an .npz at --masses alone")
+    parser.add_argument("--retest", action="store_true", help="test finalists at both accuracies")
     parser.add_argument(
         "--optimizers",
         nargs="+",
@@ -116,7 +120,9 @@ def search(args: argparse.Namespace, name: str) -> None:
         rate = grasps / (time.monotonic() - start)
         print(f"{name}: episode {study.done}/{study.marks[-1]}, {rate:.0f} grasps/s", flush=True)
 
-    if args.designs is None:
+    if args.retest:
+        row["retest"] = study.retest()
+    elif args.designs is None:
         study.run(progress)
         row |= study.row()
     if args.masses:
@@ -124,7 +130,8 @@ def search(args: argparse.Namespace, name: str) -> None:
         row["masses"] = {m: study.judge(designs, at_mass(args, m)).tolist() for m in args.masses}
     row["seconds"] = round(time.monotonic() - start)
     row["provenance"] = provenance.results(args.commit)
-    output.write_json(args.out / f"{stem}{'-masses' * bool(args.designs)}.json", row)
+    part = "-retest" if args.retest else "-masses" if args.designs else ""
+    output.write_json(args.out / f"{stem}{part}.json", row)
     shares = [sum(k >= WANTED for k in kept) / len(kept) for kept in study.row()["kept"]]
     print(name, study.row()["grasps"], shares, duration(row["seconds"]), flush=True)
     print({m: float(np.mean(kept)) for m, kept in row.get("masses", {}).items()}, flush=True)
@@ -150,6 +157,8 @@ def main(arguments: list[str] | None = None) -> int:
         output.fill(args.page, table(plain), "search")
         if text := lines_table(rows):
             output.fill(LINES_PAGE, text, "valves")
+        if text := accuracies_table(rows):
+            output.fill(ACCURACY_PAGE, text, "search")
         if any("masses" in row for row in rows):
             output.fill(args.page, masses_table(rows), "masses")
         return 0

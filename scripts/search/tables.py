@@ -1,4 +1,4 @@
-"""Tables of the note on the search, from the files of its studies."""
+"""Tables of the pages on searches, from the files of their studies."""
 
 from typing import Any
 
@@ -13,6 +13,9 @@ LIMITED = "23d"
 """Preset of the whole table within the scene's limits."""
 TABLE = "paper-23d"
 """Preset of the whole table without them."""
+SEARCHED = "--searched="
+JUDGED = "--judged="
+"""Options of a search with accuracies of its own for the episodes and for the judging trials."""
 LINES = "hand.valves.lines="
 """Change of a search in which fingers share pressure lines."""
 
@@ -91,6 +94,39 @@ def lines_table(rows: list[dict[str, Any]]) -> str:
         lines = row["changes"][0].removeprefix(LINES)
         table_rows.append([lines, *cells, f"{kept.mean():.1f}", words])
     return output.markdown(table_rows)
+
+
+def accuracies_table(rows: list[dict[str, Any]]) -> str:
+    """Searches whose designs were judged at another accuracy than the scene's, hand by hand.
+
+    The differences are paired by seed: from the first search of the hand, the one that has one
+    accuracy for all of its grasps.  A bootstrap over seeds is also one over the judging trials,
+    which each seed has for itself.  Empty without such a search.
+    """
+    judged = [r for r in rows if "kept" in r and _option(r, JUDGED)]
+    head = ["hand", "accuracy of the episodes", "grasps of a seed", "seeds"]
+    head += ["kept on average %", "seeds that keep 95 % (95 % interval)"]
+    head += ["more kept than with `standard`, points"]
+    table_rows = [head]
+    first: dict[str, np.ndarray] = {}
+    for row in sorted(judged, key=lambda r: (r["hand"] or "", bool(_option(r, SEARCHED)))):
+        hand = row["hand"] or "pneuflex4"
+        kept = 100 * np.array(row["kept"][-1])
+        more = kept - first.setdefault(hand, kept)
+        words = "–"
+        if more.any():
+            gain = statistics.bootstrap(lambda seeds, v=more: v[seeds].mean(-1), more.size)
+            words = f"{gain.value:+.1f} ({gain.low:+.1f} to {gain.high:+.1f})"
+        cells = [f"`{hand}`", f"`{_option(row, SEARCHED) or 'standard'}`"]
+        cells += [f"{row['grasps'][-1]:,}", str(kept.size), f"{kept.mean():.1f}"]
+        table_rows.append([*cells, share_of(kept / 100), words])
+    return output.markdown(table_rows) if judged else ""
+
+
+def _option(row: dict[str, Any], name: str) -> str:
+    """Value of a change such as "--judged=reference"; empty without it."""
+    values = [c.removeprefix(name) for c in row.get("changes", ()) if c.startswith(name)]
+    return values[0] if values else ""
 
 
 def share_of(kept: np.ndarray) -> str:

@@ -29,11 +29,16 @@ EVERY = ("**/*.json",)
 """The data of pages that quote several studies, or none by a file: old while any figure is."""
 PAGES: dict[str, tuple[str, ...]] = {
     "README.md": EVERY,
-    "docs/accuracy.md": ("budget.json", "decisions.json", "free_motion.json", "hard_designs.json"),
+    "docs/accuracy.md": (
+        "budget.json",
+        "free_motion.json",
+        "hard_designs.json",
+        "search/*judged*.json",
+    ),
     "docs/calibration.md": ("calibration/*.json",),
     "docs/comparison.md": ("rates_*.json",),
     "docs/control.md": EVERY,
-    "docs/effects.md": ("effects.json",),
+    "docs/effects.md": ("budget.json", "effects.json", "hard_designs.json"),
     "docs/export.md": EVERY,
     "docs/gallery.md": EVERY,
     "docs/gradients.md": EVERY,

@@ -15,6 +15,7 @@ from codesign_jax.batch import LIMIT, WORLDS, in_chunks
 from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.cost import particle_cost
 from codesign_jax.engines import Engine, make_engine
+from codesign_jax.judge import fresh_trials
 from codesign_jax.optimize import Optimizer, OptimizerState
 from codesign_jax.reuse import SceneProgram
 from codesign_jax.scene import Scene
@@ -120,6 +121,7 @@ class Study:
         self.batch = min(most, seeds * case.worlds)
         self.programs: dict[Any, SceneProgram] = {}
         searched = searched or scene
+        self.searched = searched
         task = codesign.Task(searched, space, case.trials, self._engine(searched))
         self.episode = task.side_by_side(case.optimizer)
         episodes = self._episodes(budget)
@@ -216,24 +218,52 @@ class Study:
 
     def _mark(self) -> int:
         """Chooses from particles by fresh trials, and judges the chosen one by others."""
-        assert self.last is not None
-        particles = self.state.particles
         mark = self.done
-        if not self.case.optimizer.keeps_best:
-            order = jnp.argsort(jnp.asarray(self.last[1]), axis=1)[..., None]
-            particles = jnp.take_along_axis(jnp.asarray(self.last[0]), order, 1)
-        chosen = particles[:, : self.case.finalists]
+        chosen = self._finalists()
         best = jnp.zeros(len(chosen), int)
         grasps = 0
         if self.rounds:
-            noise = self.noise(codesign.STREAM_TEST, mark)
-            tested = self.costs(self.outcomes(chosen, noise, self.rounds))
+            tested = self.costs(self._test(chosen, self.scene))
             best = tested.argmin(1)
             grasps = tested.size * self.rounds
         design = chosen[jnp.arange(len(chosen)), best][:, None]
         self.designs[mark] = np.asarray(design[:, 0])
         self.kept[mark] = self.judge(self.designs[mark], self.judged)
         return grasps + len(chosen) * self.tests
+
+    def retest(self) -> dict[str, int]:
+        """The finalists at the end, in the same trials at the accuracies of episodes and test.
+
+        Returns:
+          Finalists, those of them that the accuracy of the episodes alone likes
+          (`fresh_trials.retest`), and seeds for which the two accuracies choose different designs.
+        """
+        chosen = self._finalists()
+        searched, tested = (self._test(chosen, s) for s in (self.searched, self.scene))
+        finalists = lost = 0
+        for seed, particles in enumerate(np.asarray(chosen)):
+            of_seed = (jax.tree.map(lambda v, s=seed: v[s], o) for o in (tested, searched))
+            counts = fresh_trials.retest(particles, *of_seed)
+            finalists += counts.finalists
+            lost += counts.lost
+        best = [np.asarray(self.costs(outcome)).argmin(1) for outcome in (searched, tested)]
+        seeds = np.arange(len(chosen))
+        others = (np.asarray(chosen)[seeds, best[0]] != np.asarray(chosen)[seeds, best[1]]).any(1)
+        return {"finalists": finalists, "lost": lost, "chosen_otherwise": int(others.sum())}
+
+    def _finalists(self) -> jax.Array:
+        """Particles that a mark chooses from, shape (seed, finalist, parameter)."""
+        assert self.last is not None
+        particles = self.state.particles
+        if not self.case.optimizer.keeps_best:
+            order = jnp.argsort(jnp.asarray(self.last[1]), axis=1)[..., None]
+            particles = jnp.take_along_axis(jnp.asarray(self.last[0]), order, 1)
+        return jnp.asarray(particles[:, : self.case.finalists])
+
+    def _test(self, chosen: jax.Array, scene: Scene) -> Outcome:
+        """Outcomes of the trials by which a mark chooses, shape (seed, finalist, trial)."""
+        noise = self.noise(codesign.STREAM_TEST, self.done)
+        return self.outcomes(chosen, noise, self.rounds, scene)
 
     def judge(self, designs: np.ndarray, scene: Scene) -> np.ndarray:
         """Share of the judging trials that each seed's design keeps, in another scene."""

@@ -56,9 +56,9 @@ CLEARANCE = 0.002
 """Smallest gap between the sections of a pair of fingers at a spread of zero [m]."""
 DATA = Path("docs/data/calibration")
 LAWS = {
-    "chamber": "`chamber`",
-    "elements": "`elements`, thread outside",
-    "elements_inside": "`elements`, thread on the chamber",
+    "chamber": "chamber",
+    "elements": "elements, thread outside",
+    "elements_inside": "elements, thread on the chamber",
 }
 """Laws of the section: file names of their scores, second wave, and what tables call them."""
 PAGE = Path("docs/calibration.md")

@@ -564,8 +564,7 @@ def test_both_readings_of_converged():
 
 def test_the_results_page_has_the_tables_of_its_data():
     data = ROOT / "docs" / "data" / "experiments"
-    studies = {name: results.load_study(data, name) for name in ("2d", "23d")}
-    text = results.tables(studies, results.load(data, "landscape"))
+    text = results.tables(results.read(data))
     assert text in (ROOT / "docs" / "notes" / "results.md").read_text(encoding="utf-8")
 
 

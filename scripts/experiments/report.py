@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
 from scipy import ndimage
 
 from codesign_jax.codesign import CONVERGED_COST, SUCCESS_COST, convergence_episode
@@ -95,6 +97,32 @@ def load_study(folder: Path, name: str) -> Study | None:
     return Study(notes["settings"]["plan"], notes, data)
 
 
+class Results(NamedTuple):
+    """The experiments by one law of the fingers' section.
+
+    Attributes:
+      studies: Experiments on strategies by name, None where one was not made.
+      grid: Arrays and notes of the landscape; None likewise.
+    """
+
+    studies: dict[str, Study | None]
+    grid: tuple[dict[str, np.ndarray], dict[str, Any]] | None
+
+
+LAWS = {"chamber": "", "elements": "elements"}
+"""Laws of the section, and the folders of their results."""
+
+
+def read(data: Path) -> dict[str, Results]:
+    """Results by each law that a folder has some of."""
+    folders = {law: data / folder for law, folder in LAWS.items()}
+    every = {
+        law: Results({n: load_study(folder, n) for n in ("2d", "23d")}, load(folder, "landscape"))
+        for law, folder in folders.items()
+    }
+    return {law: r for law, r in every.items() if any(r.studies.values()) or r.grid}
+
+
 class Region(NamedTuple):
     """A connected region of the landscape.
 
@@ -146,6 +174,8 @@ LABELS = {"single": "s.d.", "concurrent": "conc."}
 _COLORS = {"exclude": "tab:blue", "worst": "tab:orange"}
 _RULE_LABELS = {"exclude": "failed trials excluded", "worst": "failed trials cost the maximum"}
 
+COST_MAXIMUM = 3.0
+"""Cost of a grasp that never holds the object (Sec. IV.3): the dark end of the landscape."""
 LANDSCAPE_THRESHOLD = CONVERGED_COST
 """Cost below which a point of the landscape belongs to a region."""
 
@@ -214,13 +244,23 @@ def draw_convergence(study: Study, path: Path) -> Path:
     return output.save_figure(figure, path)
 
 
-def draw_landscape(data: dict[str, np.ndarray], path: Path) -> Path:
-    """Draws Fig. 8: the mean cost, white where low, with the regions below the threshold."""
-    figure, axes = _axes(5.4, 4.4)
+def draw_landscapes(grids: dict[str, dict[str, np.ndarray]], path: Path) -> Path:
+    """Draws Fig. 8 by each law side by side: white where the cost is low, regions in lines."""
+    figure = output.new_figure(5.0 * len(grids) + 0.4, 4.4)
+    panels = figure.subplots(1, len(grids), squeeze=False)[0]
+    for axes, (law, data) in zip(panels, grids.items(), strict=True):
+        image = _landscape(axes, data)
+        axes.set_title(f"law of the section: {law}", fontsize=10)
+    figure.colorbar(image, ax=panels, label="mean cost")
+    return output.save_figure(figure, path)
+
+
+def _landscape(axes: Axes, data: dict[str, np.ndarray]) -> QuadMesh:
     x = data["first_axis"]
     y = data["second_axis"]
-    image = axes.pcolormesh(x, y, data["exclude"].T, cmap="gray_r", shading="nearest", vmin=0)
-    figure.colorbar(image, label="mean cost")
+    most = float(data["exclude"].max())
+    look = {"cmap": "gray_r", "shading": "nearest", "vmin": 0, "vmax": max(most, COST_MAXIMUM)}
+    image = axes.pcolormesh(x, y, data["exclude"].T, **look)
     for letter, region in zip("abcdefgh", regions(data, LANDSCAPE_THRESHOLD), strict=False):
         if not region.points.all():
             axes.contour(x, y, region.points.T.astype(float), [0.5], colors="tab:red", linewidths=1)
@@ -233,7 +273,7 @@ def draw_landscape(data: dict[str, np.ndarray], path: Path) -> Path:
     names = data["parameters"]
     units = data["units"]
     axes.set(xlabel=f"{names[0]} [{units[0]}]", ylabel=f"{names[1]} [{units[1]}]")
-    return output.save_figure(figure, path)
+    return image
 
 
 def _axes(width: float = 6.0, height: float = 3.4):
@@ -252,7 +292,6 @@ def _strategies(axes, study: Study, below: list[str] | None = None) -> None:
 # --- tables ---------------------------------------------------------------------------------------
 
 _THRESHOLDS = (0.1, 0.5, 1.0)
-_HEAD = "| the paper | here |\n|---|---|"
 
 
 def make(data: Path, pictures: Path, page: Path | None = None) -> str:
@@ -261,43 +300,55 @@ def make(data: Path, pictures: Path, page: Path | None = None) -> str:
     Returns:
       The table in Markdown.
     """
-    studies = {name: load_study(data, name) for name in ("2d", "23d")}
-    grid = load(data, "landscape")
-    text = tables(studies, grid)
-    for study in studies.values():
-        if study and len(study.strategies) > 1:
-            _draw(study, pictures)
+    results = read(data)
+    text = tables(results)
+    for law, (studies, _) in results.items():
+        for study in studies.values():
+            if study and len(study.strategies) > 1:
+                _draw(study, pictures, f"_{law}" if LAWS[law] else "")
     if page:
         fill(page, text, "results")
-    if grid:
-        draw_landscape(grid[0], pictures / "fig8_landscape.png")
+    if grids := {law: r.grid[0] for law, r in results.items() if r.grid}:
+        draw_landscapes(grids, pictures / "fig8_landscape.png")
     return text
 
 
-def _draw(study: Study, pictures: Path) -> None:
+def _draw(study: Study, pictures: Path, law: str) -> None:
+    """Draws an experiment's figures; `law` ends their names."""
     name = study.plan["name"]
-    if name == "2d":
+    if name == "2d" and not law:
         draw_evolution(study, pictures / "fig6_cost_evolution.png")
     number = {"2d": 7, "23d": 9}[name]
     if study.tested:
-        draw_success(study, pictures / f"fig{number}a_success.png")
-    draw_convergence(study, pictures / f"fig{number}b_convergence.png")
+        draw_success(study, pictures / f"fig{number}a_success{law}.png")
+    draw_convergence(study, pictures / f"fig{number}b_convergence{law}.png")
 
 
-def tables(studies: dict[str, Study | None], grid) -> str:
+def tables(results: dict[str, Results]) -> str:
     """All tables of the page, in Markdown."""
-    return "\n\n".join([comparison(studies, grid), *(details(s) for s in studies.values() if s)])
+    named = [(law, study) for law, r in results.items() for study in r.studies.values() if study]
+    parts = [f"**Law `{law}`.** {details(study)}" for law, study in named]
+    return "\n\n".join([comparison(results), *parts])
 
 
-def comparison(studies: dict[str, Study | None], grid) -> str:
-    """The paper's statements beside ours, as a Markdown table."""
+def comparison(results: dict[str, Results]) -> str:
+    """The paper's statements beside ours, a column for each law, as a Markdown table."""
+    columns = [dict(_statements(*r)) for r in results.values()]
+    rows = [["the paper", *(f"here, law `{law}`" for law in results)]]
+    for statement in columns[0]:
+        rows.append([statement, *(column.get(statement, "not run") for column in columns)])
+    return output.markdown(rows)
+
+
+def _statements(studies: dict[str, Study | None], grid) -> list[tuple[str, str]]:
+    """The paper's statements with what was found here."""
     rows = [_grasps_row(studies, grid)]
     for name, study in studies.items():
         rows += _rows(name, study) if study else [(f"{name} experiment", "not run")]
     if all(studies.values()):
         rows.append(_growth_row(studies["2d"], studies["23d"]))  # type: ignore[arg-type]
     rows.append(("two separate regions of success (Fig. 8)", _regions(grid) if grid else "not run"))
-    return "\n".join([_HEAD, *(f"| {a} | {b} |" for a, b in rows)])
+    return rows
 
 
 def details(study: Study) -> str:

@@ -44,7 +44,7 @@ def texts(values: dict[str, Any], backend: str) -> list[str]:
     from codesign_jax import rollout, scene
     from codesign_jax.compiler import cpu, launch, thread
     from codesign_jax.engines.structured import StructuredEngine
-    from codesign_jax.engines.structured.kernel import adjoint, contact_forces, program
+    from codesign_jax.engines.structured.kernel import program
     from codesign_jax.scene import parameters
 
     chosen = scene.load(
@@ -85,8 +85,6 @@ def texts(values: dict[str, Any], backend: str) -> list[str]:
         mock.patch.object(jax, "default_backend", lambda: backend),
         mock.patch.object(launch, "available", lambda platform: None),
         mock.patch.object(program, "launch", record),
-        mock.patch.object(adjoint, "launch", record),
-        mock.patch.object(contact_forces, "launch", record),
     ):
         jax.clear_caches()  # what was traced for the other backend
         jax.eval_shape(function, jnp.asarray(space.default(), jnp.float32), trials)

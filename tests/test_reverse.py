@@ -28,7 +28,7 @@ from codesign_jax.engines.structured.kernel import (
 from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, StatePath
 from codesign_jax.engines.structured.kernel.adjoint_step import AdjointSolve
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables
-from codesign_jax.engines.structured.kernel.program import Limits, Program
+from codesign_jax.engines.structured.kernel.program import Inputs, Limits, Program
 from codesign_jax.engines.structured.lanewise import lanewise
 from tests.helpers import fixtures, grasps
 from tests.helpers.differences import Case, curled, weights_of
@@ -412,17 +412,17 @@ def ptx(the_scene):
     hand = shape(program.hand.rows, size)
     world = shape(program.world.rows, block)
     state = shape(rows[0], size), shape(rows[1], block)
-    inputs = hand, world, *state, shape(steps, 6, block), shape(steps, size)
+    inputs = Inputs(hand, world, *state, shape(steps, 6, block), shape(steps, size))
     ends = shape(1, rows[0], size), shape(1, rows[1], block)
     whole = shape(steps, rows[0], size), shape(steps, rows[1], block)
     path = StatePath(*whole, *ends, shape(1, 1, block))
     arguments = program._arguments(inputs, path, Cotangents(*ends, shape(steps, 3, block)))
 
     def code(call, outputs, arguments, scratch):
-        layout = launch.describe(
-            arguments, outputs, launch.Kernel("test", "gpu", size, scratch=scratch)
-        )
-        return gpu.device_code(launch.kernel_jaxpr(call, list(arguments)), layout)
+        arrays = jax.tree.leaves(arguments)
+        kernel = launch.Kernel("test", "gpu", size, scratch=scratch)
+        layout = launch.describe(arrays, jax.tree.leaves(outputs), kernel)
+        return gpu.device_code(launch.kernel_jaxpr(call, arrays), layout)
 
     yield code(*program._adjoint_call(arguments), arguments, (6, 7, 8))
     forward = Program(the_scene, program.limits, backend="gpu", width=32)

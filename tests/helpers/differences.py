@@ -13,6 +13,7 @@ import numpy as np
 
 from codesign_jax.engines.structured import StructuredEngine, coordinates
 from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, state_path
+from codesign_jax.engines.structured.kernel.program import Inputs
 from tests.helpers import grasps
 from tests.helpers.curled_hands import state
 
@@ -83,7 +84,8 @@ class Case:
         self._reverse = jax.jit(self._cotangents)
         self.start, (hand, state) = start, self._lanes(scene, engine, start)
         ctrl = jnp.asarray(start.ctrl)[None]
-        self.tables = [np.array(x) for x in jax.jit(self.program.inputs)(hand, state, ctrl)]
+        inputs = jax.jit(self.program.inputs)(hand, state, ctrl)
+        self.tables = [np.array(x) for x in jax.tree.leaves(inputs)]
         random = np.random.default_rng(1)
         for name in self.program.held:  # contacts hold friction from the start
             hold = np.zeros(self.world(self.tables[2]).shape)
@@ -197,16 +199,17 @@ class Case:
 
     def execute(self, tables):
         """What the forward kernel makes of tables, all states recorded."""
-        run = jax.jit(lambda *x: self.program.execute(x, states=1))
-        return run(*map(jnp.asarray, tables))
+        run = jax.jit(lambda x: self.program.execute(x, states=1))
+        return run(Inputs(*map(jnp.asarray, tables)))
 
     def bars(self, tables, out, weights):
         """Cotangents of tables for weights of each world, by what `execute` made of them."""
         count = tables[0].shape[0] * self.program.block
         missing = [weights[0].times(0.0)] * (count - len(weights))
         last, entries, qpos = (np.stack(x) for x in zip(*weights, *missing, strict=True))
-        tables = tuple(map(jnp.asarray, tables))
-        return [np.asarray(x) for x in self._reverse(tables, out, last, entries, qpos)]
+        tables = Inputs(*map(jnp.asarray, tables))
+        bars = self._reverse(tables, out, last, entries, qpos)
+        return [np.asarray(x) for x in jax.tree.leaves(bars)]
 
     def _cotangents(self, tables, out, last, entries, qpos):
         program = self.program
@@ -214,8 +217,8 @@ class Case:
         taken = program.by_block(trace["moved"].sum(1)[:, None, None, None])
         rows = Cotangents(*program.rows_of_end(last), entries[..., None], program.rows_of(qpos))
         rows = jax.tree.map(program.by_block, rows)
-        hand, world, *rest = program.adjoint(tables, state_path(out, taken), rows)
-        return hand, program.summed(world), *rest
+        bars = program.adjoint(tables, state_path(out, taken), rows)
+        return bars._replace(world=program.summed(bars.world))
 
     def along(self, bars, world=0):
         """Derivatives of a world along the groups' directions."""

@@ -14,6 +14,7 @@ from codesign_jax.engines.structured import bodies, coordinates, forces, transfo
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.kernel.adjoint import StatePath, state_path
 from codesign_jax.engines.structured.kernel.memory import lengthened
+from codesign_jax.engines.structured.kernel.program import Inputs, Outputs
 from codesign_jax.engines.structured.laws import meshes
 from codesign_jax.engines.structured.laws.integration import before
 from codesign_jax.engines.structured.laws.kinematics import State
@@ -226,15 +227,14 @@ class StructuredEngine(Equal):
         fields: ModelFields,
         ctrl: jax.Array,
         tables: tuple[jax.Array, ...] = (),
-    ) -> tuple:
+    ) -> Inputs:
         """The kernel's arguments, see `Program.inputs`."""
         hand = world_constants(self.scene, fields)
         state = self.reset(fields)
         if program.team == 1:
             return program.inputs(hand, state, ctrl)
         tables = tables or self._tables(program, fields)
-        mesh = () if hand.mesh is None else (hand.mesh.values[None],)
-        return (*tables, *program.pack_state(state), *program.pack_controls(ctrl), *mesh)
+        return program.joined(tables, hand, state, ctrl)
 
     def _tables(self, program: Program, fields: ModelFields) -> tuple[jax.Array, ...]:
         """The hands' tables."""
@@ -341,7 +341,7 @@ class RecordingEngine(Equal):
         return trace._replace(forces=jax.tree.map(joined, every))
 
 
-def _execute(program: Program, inputs: tuple, **outputs: Any) -> list[jax.Array | None]:
+def _execute(program: Program, inputs: Inputs, **outputs: Any) -> Outputs:
     try:
         return program.execute(inputs, **outputs)
     except KernelUnavailable as error:

@@ -32,6 +32,7 @@ from codesign_jax.engines.structured.kernel.adjoint import (
     StatePath,
     state_path,
 )
+from codesign_jax.engines.structured.kernel.program import Inputs
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.judge import verdict
 from codesign_jax.model import ModelFields
@@ -140,7 +141,7 @@ def _adjoint(
     scene = settings.scene
     program = AdjointProgram.here(scene, settings.limits, ctrl.dtype, len(ctrl))
 
-    def inputs(fields: ModelFields, ctrl: jax.Array) -> tuple:
+    def inputs(fields: ModelFields, ctrl: jax.Array) -> Inputs:
         start = coordinates.reset(scene, fields)
         return program.inputs(world_constants(scene, fields), start, ctrl)
 
@@ -158,8 +159,7 @@ def _adjoint(
         bars = bars._replace(path=program.rows_of(_gathered(taken, cotangent.qpos)))
     path, bars = jax.tree.map(program.by_block, (path, bars))
     bars_of_inputs = _reversed(settings, program, tables, path, bars, trajectory=trajectory)
-    sound = program.sound  # pyright: ignore[reportAttributeAccessIssue]  # an AdjointProgram here
-    fields_bar, ctrl_bar = pull_inputs(sound(bars_of_inputs, path.taken))
+    fields_bar, ctrl_bar = pull_inputs(program.sound(bars_of_inputs, path.taken))
     fields_bar = fields_bar._replace(shape=None)  # an index has no derivative
     # A world of fields that are not numbers never moved, and has no derivative.
     return jax.tree.map(partial(_of_worlds, taken[:, 0] > 0), (fields_bar, ctrl_bar))
@@ -185,13 +185,13 @@ def _of_worlds(keep: jax.Array, x: jax.Array) -> jax.Array:
 
 def _reversed(
     settings: Settings,
-    program: Any,
-    inputs: tuple,
+    program: AdjointProgram,
+    inputs: Inputs,
     path: StatePath,
     bars: Cotangents,
     *,
     trajectory: bool,
-) -> tuple:
+) -> Inputs:
     """Cotangents of a rollout's inputs, see `AdjointProgram.adjoint`.
 
     Of segments only the first states were stored.  Their steps are simulated once more, by the
@@ -204,25 +204,24 @@ def _reversed(
       bars: Cotangents of its results, as tables of blocks.
     """
     if settings.segment is None:
-        hand_bar, world_bar, *rest = program.adjoint(inputs, path, bars)
-        return hand_bar, program.summed(world_bar), *rest
+        input_bars = program.adjoint(inputs, path, bars)
+        return input_bars._replace(world=program.summed(input_bars.world))
     return _reversed_by_segment(settings, program, inputs, path, bars, trajectory=trajectory)
 
 
 def _reversed_by_segment(
     settings: Settings,
-    program: Any,
-    inputs: tuple,
+    program: AdjointProgram,
+    inputs: Inputs,
     path: StatePath,
     bars: Cotangents,
     *,
     trajectory: bool,
-) -> tuple:
+) -> Inputs:
     """`_reversed` of a path of which the first states of segments were stored."""
     size = settings.segment
     assert size is not None
-    hand, world, _, _, arm, pressure, *grid = inputs
-    steps = arm.shape[1]
+    steps = inputs.arm.shape[1]
     count = path.finger.shape[1]
     options = {"backend": program.backend, "width": program.size, "team": 1}
     again = Program(settings.scene, settings.limits, **options)  # type: ignore[arg-type]
@@ -233,30 +232,38 @@ def _reversed_by_segment(
         return jnp.moveaxis(x.reshape(x.shape[0], count, size, *x.shape[2:]), 1, 0)
 
     def segment(ends: tuple, given: tuple) -> tuple[tuple, tuple]:
-        number, start, commands, shown = given
+        number, (finger_start, world_start), (arm, pressure), shown = given
         taken = jnp.clip(path.taken - number * size, 0, size)
-        given_inputs = (hand, world, *start, *commands, *grid)
+        given_inputs = inputs._replace(
+            finger_start=finger_start, world_start=world_start, arm=arm, pressure=pressure
+        )
         out = again.execute(given_inputs, trajectory=trajectory, states=1)
         here = state_path(out, taken)
         finger_bar, state_bar, *sums = ends
         cotangents = Cotangents(finger_bar, state_bar, shown[0], shown[1:])
-        cotangents_before = program.adjoint(given_inputs, here, cotangents, tuple(sums))
-        hand_bar, world_bar, *state, arm_bar, pressure_bar = cotangents_before[:6]
+        before = program.adjoint(given_inputs, here, cotangents, tuple(sums))
+        state = before.finger_start, before.world_start
         state = [(jnp.zeros_like(x) if settings.truncate else x)[:, None] for x in state]
-        return (*state, hand_bar, world_bar), (arm_bar, pressure_bar)
+        return (*state, before.hand, before.world), (before.arm, before.pressure)
 
-    every = jnp.arange(count, dtype=arm.dtype)
+    every = jnp.arange(count, dtype=inputs.arm.dtype)
     starts = tuple(jnp.moveaxis(x, 1, 0) for x in path[:2])
     shown = tuple(split(x) for x in (bars.trace, *bars.path))
-    given = every, starts, (split(arm), split(pressure)), shown
-    sums = program.no_sums(arm.shape[0], arm.dtype)
-    (*ends, hand_bar, world_bar), commands = jax.lax.scan(
+    given = every, starts, (split(inputs.arm), split(inputs.pressure)), shown
+    sums = program.no_sums(inputs.arm.shape[0], inputs.arm.dtype)
+    (finger_bar, state_bar, hand_bar, world_bar), (arm_bar, pressure_bar) = jax.lax.scan(
         segment, (bars.finger, bars.world, *sums), given, reverse=True
     )
 
     def join(x: jax.Array) -> jax.Array:
         return jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])[:, :steps]
 
-    state = (x[:, 0] for x in ends)
-    none = [jnp.zeros_like(x) for x in grid]
-    return hand_bar, program.summed(world_bar), *state, *map(join, commands), *none
+    return Inputs(
+        hand=hand_bar,
+        world=program.summed(world_bar),
+        finger_start=finger_bar[:, 0],
+        world_start=state_bar[:, 0],
+        arm=join(arm_bar),
+        pressure=join(pressure_bar),
+        grid=None if inputs.grid is None else jnp.zeros_like(inputs.grid),
+    )

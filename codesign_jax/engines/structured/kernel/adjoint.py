@@ -7,21 +7,34 @@ any of its worlds took.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from codesign_jax import reuse
-from codesign_jax.compiler.launch import Kernel, launch
 from codesign_jax.engines.structured.kernel.adjoint_step import ReverseStep, TraceCotangents
-from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, of_step
+from codesign_jax.engines.structured.kernel.cotangents import CotangentTables
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
-from codesign_jax.engines.structured.kernel.program import Program, copy_rows
-from codesign_jax.engines.structured.kernel.residual import Before, BodyMotion
-from codesign_jax.engines.structured.kernel.residual_vjp import SHAPES
-from codesign_jax.engines.structured.kernel.self_contacts import SelfContactSet
-from codesign_jax.engines.structured.lanewise import lanes, of_code
+from codesign_jax.engines.structured.kernel.program import (
+    Inputs,
+    Outputs,
+    Program,
+    copy_rows,
+    numbered,
+)
+from codesign_jax.engines.structured.kernel.rows import (
+    Chain,
+    ChainBefore,
+    FingerState,
+    HeldBar,
+    PairBar,
+    PalmBar,
+    Remembered,
+    StepBar,
+    Virtual,
+    WorldState,
+)
+from codesign_jax.engines.structured.lanewise import lanes
 
 
 class StatePath(NamedTuple):
@@ -38,11 +51,9 @@ class StatePath(NamedTuple):
     taken: jax.Array  # Number of steps that each world took, shape (world, 1, 1, 1)
 
 
-def state_path(out: Any, taken: jax.Array) -> StatePath:
+def state_path(out: Outputs, taken: jax.Array) -> StatePath:
     """What `Program.execute` has stored in blocks; `taken` as in `StatePath`, of blocks."""
-    finger_end = out[0][:, None]
-    world_end = out[1][:, None]
-    return StatePath(out[-2], out[-1], finger_end, world_end, taken)
+    return StatePath(*out.path[-1], out.finger_state[:, None], out.world_state[:, None], taken)
 
 
 class Cotangents(NamedTuple):
@@ -56,35 +67,57 @@ class Cotangents(NamedTuple):
     path: tuple[jax.Array, ...] = ()
 
 
+class AdjointInputs(NamedTuple):
+    """What the adjoint reads, tables of blocks; `bars` are cotangents."""
+
+    hand: Any  # As in `Inputs`
+    world: Any  # As in `Inputs`
+    arm: Any  # As in `Inputs`
+    pressure: Any  # As in `Inputs`
+    path: StatePath
+    finger_bar: Any  # As `Cotangents.finger`
+    world_bar: Any  # As `Cotangents.world`
+    hand_sum: Any  # What is added to the cotangents of `hand`, shape (block, row, lane)
+    world_sum: Any  # The same of `world`, on the lanes of each finger, shape (block, row, lane)
+    trace_bar: Any  # As `Cotangents.trace`
+    path_bar: tuple[Any, ...]  # As `Cotangents.path`
+    grid: Any = None  # As in `Inputs`
+
+
+class AdjointOutputs(NamedTuple):
+    """What the adjoint writes: cotangents of `Inputs`, and memory that is not read."""
+
+    hand: Any  # As in `Inputs`
+    world: Any  # On the lanes of each finger, shape (block, row, lane)
+    finger_start: Any  # As in `Inputs`
+    world_start: Any  # As in `Inputs`
+    arm: Any  # As in `Inputs`
+    pressure: Any  # As in `Inputs`
+    scratch: Any  # Memory of a step
+    finger_state: Any  # The state before a step
+    world_state: Any  # Likewise
+
+
 class AdjointProgram(Program):
     """Tables and kernel of a rollout's derivative."""
 
     def __init__(self, *args: Any, **options: Any):
         super().__init__(*args, **{**options, "team": 1})
 
-    remembers = ("owner", "ring")
+    remembers = (Remembered,)
 
     def _tables(self) -> None:
         super()._tables()
-        n = self.links
-        a = self.axes
-        more = {f"chain.{k}": (n + 1, shape) for k, shape in SHAPES._asdict().items()}
-        more |= {f"before.{k}": (n, getattr(SHAPES, k)) for k in Before._fields}
-        more |= {"acc_bar": (n, (a,)), "virtual": (n, (a,))}
-        if pairings := self.held.get("finger_finger"):
-            more |= {"sums_bar": (pairings, (4,))}
-        more |= {f"{s.name}.held_bar": (s.count, (3, s.k)) for s in self.sets if s.holds}
-        more |= {f"bar.{k}": (1, shape) for k, shape in of_step(self.scene).items()}
-        if any(isinstance(s, SelfContactSet) for s in self.sets):
-            more |= {f"pairbar.{k}": (n + 1, getattr(SHAPES, k)) for k in BodyMotion._fields}
-        if self.scene.effects.finger_palm:
-            more |= {f"palmbar.{k}": (1, getattr(SHAPES, k)) for k in BodyMotion._fields}
+        more = self._groups(Chain, ChainBefore, Virtual)
+        for contacts in self.sets:
+            more |= contacts.groups_of(HeldBar)
+        more |= self._groups(StepBar, PairBar, PalmBar)
         self.scratch = MemoryLayout.by_item(True, **(self.scratch.groups | more))
         self.world_bars = MemoryLayout(True, **self.world.groups)
 
     def adjoint(
-        self, inputs: tuple, path: StatePath, bars: Cotangents, sums: tuple | None = None
-    ) -> tuple:
+        self, inputs: Inputs, path: StatePath, bars: Cotangents, sums: tuple | None = None
+    ) -> Inputs:
         """Cotangents of `Program.inputs`; where a world took no step they need not be numbers.
 
         Those of the worlds' constants are for each of their fingers, see `summed`; `sums` is what
@@ -92,17 +125,21 @@ class AdjointProgram(Program):
         """
         given = self._arguments(inputs, path, bars, sums)
         call, outputs = self._adjoint_call(given)
-        if self.backend == "interpreter":
-            cotangents = call(*given)[:6]
-        else:
-            of_code(reuse.code_digest())
-            origin = repr((self.scene.structure, "adjoint"))
-            shared = (len(given) - 1,) if self.meshes else ()
-            # At LLVM's level 1 it is as fast, with the same bits, after two thirds of LLVM's time.
-            kernel = Kernel(origin, self.backend, self.size, shared, scratch=(6, 7, 8), level=1)
-            cotangents = launch(call, given, outputs, kernel)[:6]
-        grid = (jnp.zeros_like(inputs[-1]),) if self.meshes else ()
-        return (*cast("list[jax.Array]", cotangents), *grid)
+        places = numbered(outputs)
+        scratch = places.scratch, places.finger_state, places.world_state
+        # At LLVM's level 1 it is as fast, with the same bits, after two thirds of LLVM's time.
+        origin = repr((self.scene.structure, "adjoint"))
+        out = self.launch(call, given, outputs, origin, scratch=scratch, level=1)
+        grid = None if inputs.grid is None else jnp.zeros_like(inputs.grid)
+        return Inputs(
+            out.hand,
+            out.world,
+            out.finger_start,
+            out.world_start,
+            out.arm,
+            out.pressure,
+            grid,
+        )
 
     def no_sums(self, blocks: int, dtype: Any) -> tuple:
         """Cotangents of the constants before the last step: those of the hand, and the worlds'."""
@@ -113,68 +150,81 @@ class AdjointProgram(Program):
         """Cotangents of the worlds' constants, of those on each of the fingers' lanes."""
         return world.reshape(*world.shape[:2], self.fingers, self.block).sum(2)
 
-    def sound(self, bars: tuple, taken: jax.Array) -> tuple:
+    def sound(self, bars: Inputs, taken: jax.Array) -> Inputs:
         """Cotangents of the inputs, zero where a world took no step and they are no numbers."""
         some = taken[:, 0] > 0
         lane = jnp.tile(some, (1, 1, self.fingers))
-        masks = lane, some, lane, some, some[:, None], lane
-        pairs = zip(masks, bars, strict=False)
-        cleared = [jnp.where(mask | jnp.isfinite(x), x, 0.0) for mask, x in pairs]
-        return (*cleared, *bars[6:])
+        masks = Inputs(lane, some, lane, some, some[:, None], lane)
+        cleared = [
+            jnp.where(mask | jnp.isfinite(x), x, 0.0)
+            for mask, x in zip(masks[:6], bars[:6], strict=True)
+        ]
+        return bars._replace(**dict(zip(Inputs._fields, cleared, strict=False)))
 
     def _arguments(
-        self, inputs: tuple, path: StatePath, bars: Cotangents, sums: tuple | None = None
-    ) -> tuple:
-        hand, world, _, _, arm, pressure, *grid = inputs
+        self, inputs: Inputs, path: StatePath, bars: Cotangents, sums: tuple | None = None
+    ) -> AdjointInputs:
         if sums is None:
-            sums = self.no_sums(hand.shape[0], hand.dtype)
-        ends = bars.finger, bars.world, *sums, bars.trace, *bars.path
-        return (hand, world, arm, pressure, *path, *ends, *grid)
+            sums = self.no_sums(inputs.hand.shape[0], inputs.hand.dtype)
+        hand_sum, world_sum = sums
+        return AdjointInputs(
+            inputs.hand,
+            inputs.world,
+            inputs.arm,
+            inputs.pressure,
+            path,
+            bars.finger,
+            bars.world,
+            hand_sum,
+            world_sum,
+            bars.trace,
+            bars.path,
+            inputs.grid,
+        )
 
-    def _adjoint_call(self, given: tuple) -> tuple[Callable, list[jax.ShapeDtypeStruct]]:
-        blocks = given[0].shape[0]
-        steps = given[2].shape[1]
-        dtype = given[2].dtype
-        shapes = [
-            (blocks, self.hand.rows, self.size),
-            (blocks, self.world_bars.rows, self.size),
-            (blocks, self.finger_state.rows, self.size),
-            (blocks, self.world_state.rows, self.block),
-            (blocks, steps, 6, self.block),
-            (blocks, steps, self.size),
-            # Scratch memory: that of a step, and the state before it.
-            (blocks, self.scratch.rows, self.size),
-            (blocks, self.finger_state.rows, self.size),
-            (blocks, self.world_state.rows, self.block),
-        ]
-        trajectory = len(given) - int(self.meshes) > 14
-        kernel = partial(self._adjoint_kernel, steps, trajectory)
-        return self.call(kernel, "grasp_adjoint", given, shapes, dtype)
+    def _adjoint_call(self, given: AdjointInputs) -> tuple[Callable, AdjointOutputs]:
+        blocks, steps = given.arm.shape[:2]
 
-    def _adjoint_kernel(self, steps: int, trajectory: bool, *refs: Any) -> None:
-        hand, world, arm, pressure, *rest = refs
-        *states, taken, finger_seed, world_seed, hand_sum, world_sum, trace = rest[:10]
-        rest = rest[10:]
-        path = [rest.pop(0), rest.pop(0)] if trajectory else []
-        grid = rest.pop(0) if self.meshes else None
-        hand_bar, world_bar, finger_bar, state_bar, arm_bar, pressure_bar, *rest = rest
-        scratch, finger_state, world_state = rest
+        def shape(*sizes: int) -> jax.ShapeDtypeStruct:
+            return jax.ShapeDtypeStruct((blocks, *sizes), given.arm.dtype)
+
+        finger_state = shape(self.finger_state.rows, self.size)
+        world_state = shape(self.world_state.rows, self.block)
+        outputs = AdjointOutputs(
+            hand=shape(self.hand.rows, self.size),
+            world=shape(self.world_bars.rows, self.size),
+            finger_start=finger_state,
+            world_start=world_state,
+            arm=shape(steps, 6, self.block),
+            pressure=shape(steps, self.size),
+            scratch=shape(self.scratch.rows, self.size),
+            finger_state=finger_state,
+            world_state=world_state,
+        )
+        kernel = partial(self._adjoint_kernel, steps)
+        return self.call(kernel, "grasp_adjoint", given, outputs), outputs
+
+    def _adjoint_kernel(self, steps: int, given: AdjointInputs, out: AdjointOutputs) -> None:
+        hand_bar, world_bar, finger_bar, state_bar, arm_bar, pressure_bar = out[:6]
+        scratch, finger_state, world_state = out[6:]
+        arm = given.arm
+        pressure = given.pressure
         block = Block(self.fingers, self.block)
         lane_world = block.world
         none = jnp.zeros((self.size,), scratch.dtype)
         bars = CotangentTables(self, block, (hand_bar, world_bar, finger_bar, state_bar), scratch)
-        tables = hand, world, finger_state, world_state, scratch, grid
+        tables = given.hand, given.world, finger_state, world_state, scratch, given.grid
         step = ReverseStep(self, block, tables, bars)
-        copy_rows((0, self.hand.rows), lambda k: hand_sum[(k,)], hand_bar)
-        copy_rows((0, self.world_bars.rows), lambda k: world_sum[(k,)], world_bar)
-        copy_rows((0, self.finger_state.rows), lambda k: finger_seed[(0, k)], finger_bar)
+        copy_rows((0, self.hand.rows), lambda k: given.hand_sum[(k,)], hand_bar)
+        copy_rows((0, self.world_bars.rows), lambda k: given.world_sum[(k,)], world_bar)
+        copy_rows((0, self.finger_state.rows), lambda k: given.finger_bar[(0, k)], finger_bar)
         copy_rows(
             (0, self.world_state.rows),
-            lambda k: world_seed[0, k, lane_world],
+            lambda k: given.world_bar[0, k, lane_world],
             state_bar,
             lane_world,
         )
-        count = taken[0, 0, lane_world]
+        count = given.path.taken[0, 0, lane_world]
         last = jnp.minimum(jnp.max(count.astype(jnp.int32)), steps - 1)
 
         def quiet(t: jax.Array, x: jax.Array) -> jax.Array:
@@ -186,9 +236,10 @@ class AdjointProgram(Program):
         def reverse(back: jax.Array, x: jax.Array) -> jax.Array:
             t = last - back
             moved = t.astype(count.dtype) < count
-            self._load(t, steps, moved, states, (finger_state, world_state), lane_world)
+            self._load(t, steps, moved, given.path, (finger_state, world_state), lane_world)
             commands = [jnp.where(moved, arm[t, k, lane_world], 0.0) for k in range(6)]
             chamber = jnp.where(moved, pressure[(t,)], 0.0)
+            trace = given.trace_bar
             shown = TraceCotangents(*(trace[t, k, lane_world] for k in range(3)))
             arms = step.reverse(
                 lanes(commands, (6,), wide=False), lanes([chamber], (), wide=True), moved, shown
@@ -196,10 +247,11 @@ class AdjointProgram(Program):
             for k in range(6):
                 arm_bar[t, k, lane_world] = jnp.where(moved, arms[k].lane, 0.0)
             pressure_bar[(t, slice(None))] = jnp.where(moved, bars.of_step("pressure").lane, 0.0)
-            if path:
+            if given.path_bar:
+                fingers, worlds = given.path_bar
                 angles, places = self.path_rows(states=False)
-                copy_rows((0, angles), lambda k: finger_bar[(k,)] + path[0][(t, k)], finger_bar)
-                rows = lambda k: state_bar[k, lane_world] + path[1][t, k, lane_world]  # noqa: E731
+                copy_rows((0, angles), lambda k: finger_bar[(k,)] + fingers[(t, k)], finger_bar)
+                rows = lambda k: state_bar[k, lane_world] + worlds[t, k, lane_world]  # noqa: E731
                 copy_rows((0, places), rows, state_bar, lane_world)
             return x
 
@@ -207,17 +259,20 @@ class AdjointProgram(Program):
         jax.lax.fori_loop(0, last + 1, reverse, jnp.int32(0))
 
     def _load(
-        self, t: Any, steps: int, moved: Any, states: list, target: tuple, lane_world: Any
+        self, t: Any, steps: int, moved: Any, path: StatePath, target: tuple, lane_world: Any
     ) -> None:
         """Loads the state before a step, with the step's accelerations.
 
         A row of the path has the acceleration of the step before it, the solver's warm start. Where
         a world took no step they are of no use, and need not be numbers.
         """
-        fingers, worlds, finger_end, world_end = states
+        fingers, worlds, finger_end, world_end, _ = path
         after = jnp.minimum(t + 1, steps - 1)
         more = t + 1 < steps
-        first = self.finger_state.offset["acc"], self.world_state.offset["acc_wrist"]
+        first = (
+            self.finger_state.offset[FingerState.acc],
+            self.world_state.offset[WorldState.acc_wrist],
+        )
         ends = self.finger_state.rows, self.world_state.rows
 
         def of_finger(k: jax.Array) -> jax.Array:

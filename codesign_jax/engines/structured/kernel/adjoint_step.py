@@ -22,6 +22,14 @@ from codesign_jax.engines.structured.kernel.memory import Block, choose, loop
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
 from codesign_jax.engines.structured.kernel.residual import Before, LinkMotion
 from codesign_jax.engines.structured.kernel.residual_vjp import ResidualVjp, SelfContactsVjp
+from codesign_jax.engines.structured.kernel.rows import (
+    Chain,
+    ChainBefore,
+    FingerState,
+    Scratch,
+    Virtual,
+    WorldState,
+)
 from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step import Step, body_after_step, joint_after_step
@@ -29,9 +37,16 @@ from codesign_jax.engines.structured.kernel.step_memory import KernelLayout, Ste
 from codesign_jax.engines.structured.lanes import dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 
-MOVED = ("wrist", "position", "quat", "wrist_vel", "linear_vel", "angular_vel")
+MOVED = (
+    WorldState.wrist,
+    WorldState.position,
+    WorldState.quat,
+    WorldState.wrist_vel,
+    WorldState.linear_vel,
+    WorldState.angular_vel,
+)
 """Positions and velocities of wrist and object."""
-JOINT = ("finger", "finger_vel", "acc")
+JOINT = FingerState.finger, FingerState.finger_vel, FingerState.acc
 """Angles, velocities and accelerations of the fingers' joints."""
 
 
@@ -56,11 +71,11 @@ class ReverseStep(Step):
 
     def store_chain(self, i: Any, chain: tuple) -> None:
         for name, value in zip(LinkMotion._fields, chain, strict=False):
-            self.scratch.write(f"chain.{name}", value, i)
+            self.scratch.write(getattr(Chain, name), value, i)
 
     def store_before(self, i: Any, chain: tuple) -> None:
         for name, value in zip(Before._fields, chain, strict=True):
-            self.scratch.write(f"before.{name}", value, i)
+            self.scratch.write(getattr(ChainBefore, name), value, i)
 
     def reverse(
         self, arm: Lanes, pressure: Lanes, moved: jax.Array, shown: TraceCotangents
@@ -124,7 +139,7 @@ class ReverseStep(Step):
             for name, new_bar, bar in zip(JOINT, new, bars, strict=False):
                 value = lanewise(jnp.where, go, new_bar, bar)
                 self.bars.finger_state.write(name, value, i)
-            self.scratch.write("acc_bar", acc, i)
+            self.scratch.write(Virtual.acc_bar, acc, i)
             return x
 
         jax.lax.fori_loop(0, layout.links, joint, jnp.int32(0))
@@ -192,10 +207,10 @@ class AdjointSolve(Elimination):
     """
 
     def accelerations(self, i: Any, alpha: Lanes) -> list[Lanes]:
-        return [_none(v) for v in self.problem.read("acc_bar", "link_acc", item=i)]
+        return [_none(v) for v in self.problem.read(Virtual.acc_bar, Scratch.link_acc, item=i)]
 
     def smooth(self, i: Any) -> list[Lanes]:
-        smooth, right = self.problem.read("smooth", "acc_bar", item=i)
+        smooth, right = self.problem.read(Scratch.smooth, Virtual.acc_bar, item=i)
         return [_none(smooth), right]
 
     def of_contacts(self, contacts: BoundContacts, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
@@ -238,18 +253,18 @@ class AdjointSolve(Elimination):
         problem = self.problem
 
         def link(i: Any, parent: Lanes) -> Lanes:
-            axes, *factors = problem.read("axes", "w", "g", "z", item=i)
+            axes, *factors = problem.read(Scratch.axes, Scratch.w, Scratch.g, Scratch.z, item=i)
 
             def move(axes, factors, parent, obj):
                 return el.substitute(axes, el.Factors(*factors), parent, obj)
 
             virtual, along = lanewise(move, axes, factors, parent, step.object_acc)
-            problem.write("virtual", virtual, i)
-            problem.write("chain.along", along, i + 1)
+            problem.write(Virtual.virtual, virtual, i)
+            problem.write(Chain.along, along, i + 1)
             return along
 
         parent = problem.widened(step.palm_acc)
-        problem.write("chain.along", parent, 0)
+        problem.write(Chain.along, parent, 0)
         loop(self.links, link, parent, self.block.size)
 
 
@@ -280,7 +295,7 @@ def add_speed_cotangent(
 
 
 def _rates(step: StepMemory, i: Any) -> Lanes:
-    return step.finger_state.read("finger_vel", i)
+    return step.finger_state.read(FingerState.finger_vel, i)
 
 
 def _folded(

@@ -21,26 +21,30 @@ from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, pull
 from codesign_jax.engines.structured.kernel.memory import loop, upper
+from codesign_jax.engines.structured.kernel.rows import (
+    Again,
+    Air,
+    Field,
+    FingerState,
+    Hand,
+    Scratch,
+    StepBar,
+    WorldOptions,
+)
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import contract, dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 from codesign_jax.engines.structured.laws.air import end_pressure
 
-JOINT = ("finger", "finger_vel", "acc")
+JOINT = FingerState.finger, FingerState.finger_vel, FingerState.acc
 """Angles of a joint and their derivatives by time, which move the volume and its derivatives."""
-
-
-def fields(links: int, axes: int) -> dict[str, tuple[int, tuple[int, ...]]]:
-    """Rows of scratch memory: c, g'a of the last step, w, s, r_1, r_o1, and y_1 of the joints."""
-    rows = dict.fromkeys(("air_stiffness", "air_step", "air_series", "air_sum"), (1, ()))
-    return {**rows, "air_palm": (1, (6,)), "air_object": (1, (6,)), "air_joint": (links, (axes,))}
 
 
 def end_pressures(step: StepMemory, charge: Lanes) -> Lanes:
     """Pressures at a step's end by the accelerations of its warm start; leaves c behind."""
     pressure, stiffness = lanewise(_law(step), *_given(step, charge))
-    step.scratch.write("air_stiffness", stiffness)
-    step.scratch.write("air_step", lanewise(jnp.zeros_like, stiffness))
+    step.scratch.write(Air.air_stiffness, stiffness)
+    step.scratch.write(Air.air_step, lanewise(jnp.zeros_like, stiffness))
     return pressure
 
 
@@ -51,8 +55,8 @@ def reverse(step: StepMemory, bars: CotangentTables, charge: Lanes) -> None:
     given = _given(step, charge)
     bar = bars.of_step("pressure")
     charge, volume, air, grown = pull(lambda *v: law(*v)[0], given, (), bar)
-    bars.add({"volume": volume, "air": air})
-    step.scratch.write("bar.pressure", charge)
+    bars.add({Hand.volume: volume, WorldOptions.air: air})
+    step.scratch.write(StepBar.pressure, charge)
 
     def moments(gain, joint, grown):
         turned = [jnp.stack([gain * v] + [0 * v] * (layout.axes - 1)) for v in grown[:2]]
@@ -60,10 +64,10 @@ def reverse(step: StepMemory, bars: CotangentTables, charge: Lanes) -> None:
 
     def link(i: Any, x: jax.Array) -> jax.Array:
         row = i if layout.tapered else 0
-        gain = step.hand.read("gain", row)
+        gain = step.hand.read(Hand.gain, row)
         turned, gain_bar = lanewise(moments, gain, step.joint(i), grown)
         bars.add_joint(dict(zip(JOINT[:2], turned, strict=True)), i)
-        bars.add({"gain": gain_bar}, row)
+        bars.add({Hand.gain: gain_bar}, row)
         return x
 
     jax.lax.fori_loop(0, layout.links, link, jnp.int32(0))
@@ -81,11 +85,11 @@ def _given(step: StepMemory, charge: Lanes) -> tuple:
         return [v + gain * joint[n][0] for v, n in zip(sums, JOINT, strict=True)]
 
     def link(i: Any, sums: list[Lanes]) -> list[Lanes]:
-        gain = step.hand.read("gain", i if layout.tapered else 0)
+        gain = step.hand.read(Hand.gain, i if layout.tapered else 0)
         return lanewise(add, sums, gain, step.joint(i))
 
     grown = loop(layout.links, link, [zeros((), like)] * 3, layout.size)
-    return charge, step.hand.read("volume"), step.constant("air"), grown
+    return charge, step.hand.read(Hand.volume), step.constant(WorldOptions.air), grown
 
 
 class Chambers:
@@ -98,13 +102,15 @@ class Chambers:
 
     def move(self, alpha: Lanes) -> None:
         """Moves the pressures, which are part of "tau", by the last step, and forgets that step."""
-        fall = lanewise(lambda c, a, t: c * a * t, *self._of_finger("stiffness", "step"), alpha)
+        fall = lanewise(
+            lambda c, a, t: c * a * t, *self._of_finger(Air.air_stiffness, Air.air_step), alpha
+        )
 
         def push(tau, gain, fall):
             return jnp.concatenate([tau[:1] - gain * fall, tau[1:]])
 
-        self._change("tau", push, "gain", fall)
-        self.step.write("air_step", lanewise(jnp.zeros_like, fall))
+        self._change(Scratch.tau, push, Hand.gain, fall)
+        self.step.write(Air.air_step, lanewise(jnp.zeros_like, fall))
 
     def close(self, node: el.Quadratic, work: Lanes) -> tuple[el.Quadratic, Lanes]:
         """Adds the chambers to eliminated fingers.
@@ -122,23 +128,26 @@ class Chambers:
             r, ro, new = el.eliminate_again(axes, el.Kept(el.Factors(w, g, y), inverse), r, ro, tau)
             return (r, ro, give + dot(y, new.z)), y
 
+        names = Hand.gain, Scratch.axes, Scratch.w, Scratch.g, Again.inverse
+
         def link(i: Any, carry: tuple) -> tuple:
-            carry, y = lanewise(again, carry, *self._read(i, "gain", "axes", "w", "g", "inverse"))
-            self.step.write("air_joint", y, i)
+            carry, y = lanewise(again, carry, *self._read(i, *names))
+            self.step.write(Air.air_joint, y, i)
             return carry
 
         start = none, none, zeros((), self.step.like)
         palm, obj, give = loop(self.links, link, start, self.size, reverse=True)
         # Stiffness of the air in series with the finger's compliance `give`
-        series = lanewise(lambda c, e: c / (1 + c * e), *self._of_finger("stiffness"), give)
-        for name, value in (("palm", palm), ("object", obj), ("series", series)):
-            self.step.write(f"air_{name}", value)
+        series = lanewise(lambda c, e: c / (1 + c * e), *self._of_finger(Air.air_stiffness), give)
+        solved = {Air.air_palm: palm, Air.air_object: obj, Air.air_series: series}
+        for name, value in solved.items():
+            self.step.write(name, value)
 
         def square(series, a, b):
             return series * a[:, None] * b[None]
 
         pp, po, oo = (lanewise(square, series, *v) for v in ((palm, palm), (palm, obj), (obj, obj)))
-        r, ro, less = self.close_again("z", node.r, node.r_object)
+        r, ro, less = self.close_again(Scratch.z, node.r, node.r_object)
         p = lanewise(jnp.add, node.p, upper(pp))
         q = lanewise(jnp.add, node.q, upper(oo))
         c = lanewise(jnp.subtract, node.c, po)
@@ -152,13 +161,15 @@ class Chambers:
           The forces that the fingers leave to palm and object, and what the chambers take of the
           product of all forces with the step.
         """
-        total = self._sum(dot, "air_joint", z)
-        self.step.write("air_sum", total)
+        total = self._sum(dot, Air.air_joint, z)
+        self.step.write(Air.air_sum, total)
 
         def less(r, ro, total, series, palm, obj):
             return r - series * total * palm, ro - series * total * obj, series * total * total
 
-        return lanewise(less, r, ro, total, *self._of_finger("series", "palm", "object"))
+        return lanewise(
+            less, r, ro, total, *self._of_finger(Air.air_series, Air.air_palm, Air.air_object)
+        )
 
     def substitute(self, z: str, palm_acc: Lanes, object_acc: Lanes) -> None:
         """Takes the chambers' part from the joints' factors, once palm and object are known."""
@@ -166,27 +177,27 @@ class Chambers:
         def pressure(series, total, palm, obj, palm_acc, object_acc):
             return series * (total + dot(palm, palm_acc) + dot(obj, object_acc))
 
-        known = self._of_finger("series", "sum", "palm", "object")
+        known = self._of_finger(Air.air_series, Air.air_sum, Air.air_palm, Air.air_object)
         change = lanewise(pressure, *known, palm_acc, object_acc)
 
         def take(z, y, inverse, change):
             return z - change * contract(inverse, y[None], 1)
 
-        self._change(z, take, "air_joint", "inverse", change)
+        self._change(z, take, Air.air_joint, Again.inverse, change)
 
     def curvature(self) -> Lanes:
         """Curvature along the joints' step, on each finger's lanes; leaves g'a behind."""
-        moved = self._sum(lambda gain, a: gain * a[0], "gain", "step_acc")
-        self.step.write("air_step", moved)
-        return lanewise(lambda c, a: c * a * a, *self._of_finger("stiffness"), moved)
+        moved = self._sum(lambda gain, a: gain * a[0], Hand.gain, Scratch.step_acc)
+        self.step.write(Air.air_step, moved)
+        return lanewise(lambda c, a: c * a * a, *self._of_finger(Air.air_stiffness), moved)
 
-    def _of_finger(self, *names: str) -> list[Lanes]:
-        return [self.step.read(f"air_{n}") for n in names]
+    def _of_finger(self, *names: Field) -> list[Lanes]:
+        return [self.step.read(n) for n in names]
 
     def _read(self, i: Any, *names: Any) -> list[Lanes]:
-        row = {"gain": i if self.step.layout.tapered else 0}
+        row = {Hand.gain: i if self.step.layout.tapered else 0}
         read = self.step.read
-        return [read(n, row.get(n, i)) if isinstance(n, str) else n for n in names]
+        return [read(n, row.get(n, i)) if isinstance(n, Field) else n for n in names]
 
     def _change(self, name: str, function: Callable, *names: Any) -> None:
         """Replaces what is kept of each joint by a function of it and of more."""

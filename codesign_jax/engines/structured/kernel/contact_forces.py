@@ -6,25 +6,23 @@ alone.  Here it is stored beside the contact's place, for every kind of contact 
 """
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from codesign_jax import reuse
-from codesign_jax.compiler.launch import Kernel, launch
 from codesign_jax.engines.structured.kernel import friction_memory
 from codesign_jax.engines.structured.kernel.contact_sets import (
     BoundContacts,
     ContactSet,
     begun,
     margin,
-    place_shapes,
     with_held,
     zeros,
 )
 from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, MemoryLayout
-from codesign_jax.engines.structured.kernel.program import Limits, Program
+from codesign_jax.engines.structured.kernel.program import Inputs, Limits, Program, numbered
+from codesign_jax.engines.structured.kernel.rows import Contact, Force, Group, PairForce, Slot
 from codesign_jax.engines.structured.kernel.sdf_collision import SdfCollision
 from codesign_jax.engines.structured.kernel.self_contacts import (
     BoundSelfContacts,
@@ -32,7 +30,7 @@ from codesign_jax.engines.structured.kernel.self_contacts import (
 )
 from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.lanes import dot, sum_axis
-from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise, of_code
+from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact, holding
 from codesign_jax.engines.structured.laws.contact import Cone
 from codesign_jax.engines.structured.laws.kinematics import State
@@ -42,9 +40,13 @@ from codesign_jax.scene import Scene
 
 FAR = 1e3
 """A gap that no ring has [m]."""
-PAIR = ("pressing", "depth", "energy")
-"""Sum of the normal forces [N], largest depth [m] and energy [J] of a pairing of fingers, see
-`self_contacts`: with the other finger, or itself, and with the palm."""
+
+
+class ForceOutputs(NamedTuple):
+    """What the kernel writes, tables of blocks."""
+
+    stored: Any  # `ForceProgram.stored_rows`, shape (block, row, lane)
+    scratch: Any  # Memory that is not read
 
 
 class ForceProgram(Program):
@@ -54,26 +56,21 @@ class ForceProgram(Program):
       stored_rows: What the kernel stores: for each item of a contact set the `Place` of its k
         contacts, "force", shape (3, k): the force on the first body [N], world axes, which is
         the finger, the palm, or the object on table and fixtures, and "energy", shape (k,): that
-        of `holding.stored_energy`. For each pairing of fingers `PAIR`, shape (2,).
+        of `holding.stored_energy`. For each pairing of fingers `rows.PairForce`, shape (2,).
     """
 
     @classmethod
     def of(cls, scene: Scene, dtype: Any, worlds: int) -> "ForceProgram":
         """The program for this device, type and number of worlds."""
         unused = Limits(0, 0, 0.0)
-        return cls.here(scene, unused, dtype, worlds, team=1)  # type: ignore[return-value]
+        return cls.here(scene, unused, dtype, worlds, team=1)
 
     def _tables(self) -> None:
         super()._tables()
-        groups: dict[str, tuple[int, tuple[int, ...]]] = {}
+        groups: dict[str, Group] = {}
         for contacts in self.sets:
-            if isinstance(contacts, SelfContactSet):
-                groups |= {f"{contacts.name}.{field}": (contacts.rows, (2,)) for field in PAIR}
-                continue
-            shapes = place_shapes(contacts.k)
-            shapes |= {"force": (3, contacts.k), "energy": (contacts.k,)}
-            for field, shape in shapes.items():
-                groups[f"{contacts.name}.{field}"] = contacts.count, shape
+            of_pair = isinstance(contacts, SelfContactSet)
+            groups |= contacts.groups_of(PairForce if of_pair else Force)
         self.stored_rows = MemoryLayout(True, **groups)
 
     def stored(self, hand: WorldModel, state: State) -> dict[str, jax.Array]:
@@ -85,7 +82,7 @@ class ForceProgram(Program):
         if not self.stored_rows.rows:
             return {}
         inputs = self.inputs(hand, state, self._commands(state))
-        (stored,) = self._run(inputs)
+        stored = self._run(inputs)
         unpacked = self.stored_rows.unpack(stored, self.fingers, self.fingers, worlds)
         return {name: unpacked[name] for name in self.stored_rows.groups}
 
@@ -108,31 +105,23 @@ class ForceProgram(Program):
         none = jnp.zeros((len(arm), self.num_fingers), arm.dtype)
         return jnp.concatenate([arm, none], 1)[:, None]
 
-    def _run(self, inputs: tuple) -> list[jax.Array]:
-        blocks = inputs[0].shape[0]
-        shapes = [
-            (blocks, self.stored_rows.rows, self.size),
-            (blocks, self.scratch.rows, self.size),
-        ]
-        call, outputs = self.call(self._force_kernel, "forces", inputs, shapes, inputs[4].dtype)
-        if self.backend == "interpreter":
-            return call(*inputs)[:1]
-        of_code(reuse.code_digest())
-        origin = repr((self.scene.structure, "forces"))
-        shared = (len(inputs) - 1,) if self.meshes else ()
-        kernel = Kernel(origin, self.backend, self.size, shared, scratch=(1,), level=1)
-        return launch(call, inputs, outputs, kernel)[:1]  # type: ignore[return-value]
+    def _run(self, inputs: Inputs) -> jax.Array:
+        def shape(rows: int) -> jax.ShapeDtypeStruct:
+            return jax.ShapeDtypeStruct((len(inputs.arm), rows, self.size), inputs.arm.dtype)
 
-    def _force_kernel(self, *refs: Any) -> None:
-        hand, world, finger_state, world_state, arm, pressure, *rest = refs
-        grid = rest.pop(0) if self.meshes else None
-        stored, scratch = rest
+        outputs = ForceOutputs(shape(self.stored_rows.rows), shape(self.scratch.rows))
+        call = self.call(self._force_kernel, "forces", inputs, outputs)
+        origin = repr((self.scene.structure, "forces"))
+        scratch = (numbered(outputs).scratch,)
+        return self.launch(call, inputs, outputs, origin, scratch=scratch, level=1).stored
+
+    def _force_kernel(self, inputs: Inputs, out: ForceOutputs) -> None:
         block = Block(self.fingers, self.block)
-        tables = hand, world, finger_state, world_state, scratch, grid
-        step = ForceStep(self, block, *tables)
-        commands = lanes([arm[0, k, block.world] for k in range(6)], (6,), wide=False)
-        chamber = lanes([pressure[(0,)]], (), wide=True)
-        step.store(BoundTable(self.stored_rows, stored), commands, chamber)
+        state = inputs.finger_start, inputs.world_start
+        step = ForceStep(self, block, inputs.hand, inputs.world, *state, out.scratch, inputs.grid)
+        commands = lanes([inputs.arm[0, k, block.world] for k in range(6)], (6,), wide=False)
+        chamber = lanes([inputs.pressure[(0,)]], (), wide=True)
+        step.store(BoundTable(self.stored_rows, out.stored), commands, chamber)
 
 
 class ForceStep(Step):
@@ -166,15 +155,19 @@ class ForceStep(Step):
             def add(item: Any, sums: list[Lanes]) -> list[Lanes]:
                 palm = jnp.zeros_like(self.like)
                 if itself is not None:
-                    palm = jnp.where(itself & (contacts.read("other", item).lane < 0.5), 1.0, palm)
+                    palm = jnp.where(
+                        itself & (contacts.read(Slot.other, item).lane < 0.5), 1.0, palm
+                    )
                 side = lanes([palm], (), wide=True)
                 with contacts.with_cone(row, item):
-                    given = contacts.place(item), contacts.cone, contacts.read("jar", item)
+                    given = contacts.place(item), contacts.cone, contacts.read(Contact.jar, item)
                     held = [lanewise(jnp.multiply, h, contacts.holds(item, pairing)) for h in hold]
                     return lanewise(with_slot, sums, side, *given, *held)
 
             none = zeros((2,), self.like)
-            for name, value in zip(PAIR, contacts.fold(row, add, [none] * 3), strict=True):
+            for name, value in zip(
+                PairForce.fields(), contacts.fold(row, add, [none] * 3), strict=True
+            ):
                 self.stored.write(f"{contacts.set.name}.{name}", value, row)
             return x
 
@@ -226,7 +219,7 @@ def stored_energy(place, cone, held_friction):
 
 
 def with_slot(sums, palm, place, cone, jar, held_friction=None):
-    """Adds a slot's contact to a pairing's `PAIR`; palm: 1 for a contact with the palm, else 0."""
+    """Adds a slot's contact to a pairing's `PairForce`; palm: 1 for one with the palm, else 0."""
     pressing, depth, energy = sums
     held_friction = None if held_friction is None else held_friction[:, None]
     stored = sum_axis(stored_energy(place, cone, held_friction), 0)

@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from codesign_jax.engines.structured.kernel import rows
 from codesign_jax.engines.structured.kernel.memory import (
     BoundTable,
     anywhere,
@@ -21,6 +22,7 @@ from codesign_jax.engines.structured.kernel.memory import (
     tree_add_scaled,
     upper,
 )
+from codesign_jax.engines.structured.kernel.rows import Contact, Group, Rows
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact, holding
@@ -49,11 +51,6 @@ def cone_of(scene: Scene, numbers: Any) -> Cone:
     return Cone(**fields | {name: numbers[i] for i, name in enumerate(cone_fields(scene))})
 
 
-def place_shapes(k: int) -> dict[str, tuple[int, ...]]:
-    """Shapes of the fields of a `Place` of k contacts, as they are stored."""
-    return {"point": (3, k), "normal": (3, k), "gap": (k,), "share": (k,)}
-
-
 def zeros(shape: tuple[int, ...], like: jax.Array) -> Lanes:
     """Lanes of zeros of a finger each, like an array over the lanes."""
     count = 1
@@ -76,19 +73,29 @@ class ContactSet:
         # Self-contacts share what they hold, see `friction_memory`.
         self.holds = name in held(scene) and name != "finger_finger"
 
-    def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Lengths of the axes of `rows`."""
         ray = LINE[self.scene.effects.friction]
-        shapes = place_shapes(self.k)
-        shapes |= {"jar": (3, self.k), "step": (3, self.k), "ray": (ray, self.k)}
-        shapes |= {"friction": (1, self.k)} if self.friction_by_contact else {}
-        shapes |= {"held": (3, self.k)} if self.holds else {}
-        return {f"{self.name}.{field}": (self.count, shape) for field, shape in shapes.items()}
+        return {rows.ITEM: self.count, rows.CONTACTS: self.k, rows.RAY: ray}
+
+    def groups_of(self, *tables: type[Rows]) -> dict[str, Group]:
+        """The rows of declared ones that the set has."""
+        groups: dict[str, Group] = {}
+        for table in tables:
+            for field, group in table.groups(self, self.sizes).items():
+                groups[f"{self.name}.{field}"] = group
+        return groups
+
+    def groups(self) -> dict[str, Group]:
+        """All rows of the set in scratch memory."""
+        return self.groups_of(Contact)
 
     def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundContacts":
         """The set in a kernel's memory; `read` reads constants of the worlds by name."""
         return BoundContacts(self, table, self.cone(read))
 
-    def cone_rows(self) -> dict[str, tuple[int, tuple[int, ...]]]:
+    def cone_rows(self) -> dict[str, Group]:
         return {f"cone.{which_cone(self.name)}": (1, (len(cone_fields(self.scene)),))}
 
     def cone(self, read: Callable[[str], Lanes], pair: str = "") -> Cone:
@@ -123,7 +130,7 @@ class BoundContacts:
 
     def touching(self, item: Any) -> jax.Array:
         """Whether any lane's contact is active, a scalar."""
-        shares = self.read("share", item).parts.ravel()
+        shares = self.read(Contact.share, item).parts.ravel()
         mask = shares[0] > 0
         for share in shares[1:]:
             mask = mask | (share > 0)
@@ -142,7 +149,7 @@ class BoundContacts:
     def cone_at(self, item: Any) -> Cone:
         if not self.set.friction_by_contact:
             return self.cone
-        return lanewise(Cone.of_friction, self.cone, self.read("friction", item)[0])
+        return lanewise(Cone.of_friction, self.cone, self.read(Contact.friction, item)[0])
 
     def create(
         self,
@@ -161,13 +168,13 @@ class BoundContacts:
           hold: What they hold of friction, (3, k), along the world's axes and as it is kept.
         """
         if friction is not None:
-            self.write("friction", friction, item)
+            self.write(Contact.friction, friction, item)
         place, jar = self.begin(item, place, acc, vel)
         more = {}
         if hold is not None:
             jar = lanewise(with_held, jar, place, self.cone_at(item), hold[0])
-            more = {"held": hold[1]}
-        self.write("share", place.share, item)
+            more = {Contact.held: hold[1]}
+        self.write(Contact.share, place.share, item)
 
         def store() -> None:
             for field, value in (kept(place, jar) | more).items():
@@ -201,7 +208,9 @@ class BoundContacts:
         return self.fold_items(self._deeper, zeros((), self.like))
 
     def _deeper(self, item: Any, depth: Lanes) -> Lanes:
-        return lanewise(_deeper, depth, self.read("share", item), self.read("gap", item))
+        return lanewise(
+            _deeper, depth, self.read(Contact.share, item), self.read(Contact.gap, item)
+        )
 
     def inertia_and_wrench(self, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
         """Adds the last step to jar; returns the contacts' inertia (6, 6) and wrench (6,) there."""
@@ -213,11 +222,11 @@ class BoundContacts:
 
     def _inertia_and_wrench(self, item: Any, alpha: Lanes) -> list[Lanes]:
         # All is read before anything is stored, see `self_contacts.OwnSide`.
-        jar = self.read("jar", item)
-        step = self.read("step", item)
+        jar = self.read(Contact.jar, item)
+        step = self.read(Contact.step, item)
         place = self.place(item)
         jar = lanewise(tree_add_scaled, alpha, jar, step)
-        self.write("jar", jar, item)
+        self.write(Contact.jar, jar, item)
         matrix, wrench = lanewise(inertia_and_wrench, place, self.cone_at(item), jar)
         return [upper(matrix), wrench]
 
@@ -233,8 +242,8 @@ class BoundContacts:
             force = contact.constraint_update(c, jar + alpha * step).force
             return sum_axis(contact.contact_wrench(c, force), 1)
 
-        jar = self.read("jar", item)
-        step = self.read("step", item)
+        jar = self.read(Contact.jar, item)
+        step = self.read(Contact.step, item)
         return lanewise(response, self.place(item), self.cone_at(item), alpha, jar, step)
 
     def changes(self, item: Any, alpha: Lanes) -> Lanes:
@@ -249,9 +258,9 @@ class BoundContacts:
             line = LineCost(*(ray[i] if i < ray.shape[0] else None for i in range(5)))
             return sum_axis(jnp.where(contact.same_zone(c, line, alpha), 0.0, 1.0), 0)
 
-        share = self.read("share", item)
+        share = self.read(Contact.share, item)
         cone = self.cone_at(item)
-        return lanewise(count, share, cone, self.read("ray", item), alpha)
+        return lanewise(count, share, cone, self.read(Contact.ray, item), alpha)
 
     def prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:
         """Stores the cost along a step (6, ...) of the acceleration; returns its slope at 0."""
@@ -267,10 +276,10 @@ class BoundContacts:
 
     def line(self, item: Any, change: Lanes) -> Lanes:
         """Stores the contacts' cost along a change of jar; returns its slope at 0."""
-        given = self.place(item), self.cone_at(item), self.read("jar", item), change
+        given = self.place(item), self.cone_at(item), self.read(Contact.jar, item), change
         line, slope = lanewise(cost_along_line, *given)
-        self.write("step", change, item)
-        self.write("ray", line, item)
+        self.write(Contact.step, change, item)
+        self.write(Contact.ray, line, item)
         return slope
 
     def slopes(self, item: Any, alpha: Lanes) -> list[Lanes]:
@@ -278,9 +287,9 @@ class BoundContacts:
         return self.if_touching(item, lambda: self._slopes(item, alpha), [(), ()])
 
     def _slopes(self, item: Any, alpha: Lanes) -> list[Lanes]:
-        share = self.read("share", item)
+        share = self.read(Contact.share, item)
         cone = self.cone_at(item)
-        return lanewise(slopes_along_line, share, cone, self.read("ray", item), alpha)
+        return lanewise(slopes_along_line, share, cone, self.read(Contact.ray, item), alpha)
 
 
 # Stages that the kernel evaluates lane by lane
@@ -328,7 +337,7 @@ def with_held(jar: jax.Array, place: Place, cone: Cone, held_friction: jax.Array
 
 def kept(place: Place, jar: Lanes) -> dict[str, Lanes]:
     """What is kept of new contacts, by field."""
-    return {**place._asdict(), "jar": jar, "step": lanewise(jnp.zeros_like, jar)}
+    return {**place._asdict(), Contact.jar: jar, Contact.step: lanewise(jnp.zeros_like, jar)}
 
 
 def begun(

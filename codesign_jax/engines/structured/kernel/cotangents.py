@@ -15,9 +15,9 @@ import numpy as np
 from codesign_jax.engines.structured.components import FINGER, is_number, splat
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, MemoryLayout
+from codesign_jax.engines.structured.kernel.rows import StepBar
 from codesign_jax.engines.structured.kernel.step_memory import KernelLayout
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.scene import Scene
 
 
 def pull(function: Callable, args: tuple, fixed: tuple, bars: Any) -> Any:
@@ -90,15 +90,6 @@ def _nothing(leaf: Lanes) -> Lanes:
     return Lanes(parts, (*leaf.shape[:-2], FINGER, leaf.shape[-1]), leaf.dtype)
 
 
-STEP = {"columns": (3, 3), "object_vel": (6,), "height": (), "pressure": ()}
-"""What several parts of a step add to, beside constants: names and shapes."""
-
-
-def of_step(scene: Scene) -> dict[str, tuple[int, ...]]:
-    """`STEP`, with the object's place where fixtures are touched."""
-    return STEP | ({"position": (3,)} if scene.fixture else {})
-
-
 class CotangentTables:
     """Cotangents by the name of what they belong to.
 
@@ -107,7 +98,7 @@ class CotangentTables:
       world: Of the worlds' constants, with a value for each finger, to be summed.
       finger_state: Of the fingers' state after the step, then before it.
       world_state: Likewise of wrist and object.
-      names: What several parts of a step add to beside these, see `STEP`; in scratch memory.
+      names: What several parts of a step add to beside these, in scratch memory: `rows.StepBar`.
     """
 
     def __init__(self, layout: KernelLayout, block: Block, refs: tuple, scratch: Any):
@@ -119,23 +110,24 @@ class CotangentTables:
         self.finger_state = BoundTable(layout.finger_state, finger_state)
         self.world_state = BoundTable(layout.world_state, world_state, block.world)
         self.like = jnp.zeros((layout.size,), scratch.dtype)
-        self.names = of_step(layout.scene)
+        self.names = [n for n, row in StepBar.by_attribute().items() if row in self.scratch]
 
     def begin(self) -> None:
-        for name, shape in self.names.items():
-            self.scratch.write(f"bar.{name}", zeros(shape, self.like))
+        for name in self.names:
+            row = StepBar.by_attribute()[name]
+            self.scratch.write(row, zeros(self.scratch.shape(row), self.like))
 
     def of_step(self, name: str) -> Lanes:
-        """What was added to a name of `STEP`, on each lane."""
-        return self.scratch.read(f"bar.{name}")
+        """What was added to a name of `rows.StepBar`, on each lane."""
+        return self.scratch.read(StepBar.by_attribute()[name])
 
     def add(self, values: dict[str, Lanes], item: Any = 0, lane: jax.Array | None = None) -> None:
-        """Adds to cotangents of constants and of `STEP`; lane: if items differ by lane."""
+        """Adds to cotangents of constants and of `rows.StepBar`; lane: if items differ by lane."""
         for name, value in values.items():
             table = self.hand if name in self.hand else self.world
             if name in self.names:
                 table = self.scratch
-                name = f"bar.{name}"
+                name = StepBar.by_attribute()[name]
             if lane is None:
                 table.write(name, plus(table.read(name, item), value), item)
             else:

@@ -27,6 +27,7 @@ from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import anywhere, loop
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
+from codesign_jax.engines.structured.kernel.rows import Again, Scratch, Side, Slot
 from codesign_jax.engines.structured.kernel.self_contacts import (
     BoundSelfContacts,
     FingerPairing,
@@ -76,7 +77,7 @@ class Coupling:
     def correct(self, step: Iterate, idle: jax.Array) -> Iterate:
         """Adds the correction to the fingers' factors z and returns the step of palm and object."""
         work = self.done.work.lane
-        self.substitute("z", step)
+        self.substitute(Scratch.z, step)
         self._begin(lanes([~idle], (), wide=False))
         none = jnp.zeros_like(work)
         ones = jnp.ones_like(work)
@@ -111,8 +112,8 @@ class Coupling:
 
     def _add_correction(self) -> None:
         def add(i: Any, x: jax.Array) -> jax.Array:
-            z = lanewise(jnp.add, *self.problem.read("z", "z_again", item=i))
-            self.problem.write("z", z, i)
+            z = lanewise(jnp.add, *self.problem.read(Scratch.z, Again.z_again, item=i))
+            self.problem.write(Scratch.z, z, i)
             return x
 
         jax.lax.fori_loop(0, self.links, add, jnp.int32(0))
@@ -124,14 +125,14 @@ class Coupling:
 
         def store(item: Any, pairing: FingerPairing) -> None:
             side = contacts.own_side(item)
-            hessian = contacts.read("hessian", item)
+            hessian = contacts.read(Slot.hessian, item)
             change = contacts.relative(item, pairing)
             residual = lanewise(
                 lambda b, f: jnp.where(b, -f, 0.0), busy, contacts.times_hessian(hessian, change)
             )
             none = lanewise(jnp.zeros_like, residual)
-            fields = {"first_response": change, "residual": residual}
-            fields |= {"direction": none, "direction_response": none, "force": none}
+            fields = {Slot.first_response: change, Slot.residual: residual}
+            fields |= {Slot.direction: none, Slot.direction_response: none, Slot.force: none}
             for field, value in fields.items():
                 contacts.write(field, value, item)
             contacts.load(item, side, residual, pairing)
@@ -144,13 +145,13 @@ class Coupling:
         Returns the product of the residual with it, and its curvature, shape (lane,) each.
         """
         contacts = self.contacts
-        self.substitute("z_again", self.again())
+        self.substitute(Again.z_again, self.again())
 
         def add(item: Any, pairing: FingerPairing, sums: list[Lanes]) -> list[Lanes]:
-            residual = contacts.read("residual", item)
-            hessian = contacts.read("hessian", item)
+            residual = contacts.read(Slot.residual, item)
+            hessian = contacts.read(Slot.hessian, item)
             response = contacts.relative(item, pairing)
-            contacts.write("response", response, item)
+            contacts.write(Slot.response, response, item)
 
             def both(sums, half, residual, response, force):
                 product, stiff = (half * sum_axis(dot(v, response), 0) for v in (residual, force))
@@ -177,7 +178,13 @@ class Coupling:
         contacts = self.contacts
         contacts.clear_wrenches()
         alpha, beta = (lanes([v], (), wide=False) for v in (length, turn))
-        names = ("residual", "response", "direction", "direction_response", "force")
+        names = (
+            Slot.residual,
+            Slot.response,
+            Slot.direction,
+            Slot.direction_response,
+            Slot.force,
+        )
 
         def move(alpha, beta, residual, response, direction, direction_response, force):
             direction = residual + beta * direction
@@ -187,14 +194,14 @@ class Coupling:
 
         def store(item: Any, pairing: FingerPairing, gain: Lanes) -> Lanes:
             side = contacts.own_side(item)
-            hessian = contacts.read("hessian", item)
+            hessian = contacts.read(Slot.hessian, item)
             old = [contacts.read(name, item) for name in names]
-            first_response = contacts.read("first_response", item)
+            first_response = contacts.read(Slot.first_response, item)
             direction, direction_response, force, residual = lanewise(move, alpha, beta, *old)
             stiff = contacts.times_hessian(hessian, direction_response)
             residual = lanewise(lambda a, r, f: r - a * f, alpha, residual, stiff)
-            new = {"residual": residual, "direction": direction}
-            new |= {"direction_response": direction_response, "force": force}
+            new = {Slot.residual: residual, Slot.direction: direction}
+            new |= {Slot.direction_response: direction_response, Slot.force: force}
             for name, value in new.items():
                 contacts.write(name, value, item)
             contacts.load(item, side, residual, pairing)
@@ -213,7 +220,9 @@ class Coupling:
         contacts.clear_wrenches()
 
         def store(item: Any, pairing: FingerPairing) -> None:
-            value = lanewise(lambda k, s: jnp.where(k, s, 0.0), kept, contacts.read("force", item))
+            value = lanewise(
+                lambda k, s: jnp.where(k, s, 0.0), kept, contacts.read(Slot.force, item)
+            )
             contacts.load(item, contacts.own_side(item), value, pairing)
 
         contacts.do(store)
@@ -226,20 +235,20 @@ class Coupling:
         none = zeros((6,), self.problem.like)
 
         def step(i: Any, carry: tuple) -> tuple:
-            names = ("axes", "w", "g", "inverse")
+            names = (Scratch.axes, Scratch.w, Scratch.g, Again.inverse)
             push = self.contacts.wrench_on(i + 1)
             factors = self.problem.read(*names, item=i)
             r, ro, z = lanewise(_again, carry, factors, push)
-            self.problem.write("z_again", z, i)
+            self.problem.write(Again.z_again, z, i)
             return r, ro
 
         r, ro = loop(self.links, step, (none, none), self.block.size, reverse=True)
         if chambers := self.problem.chambers:
-            r, ro, _ = chambers.close_again("z_again", r, ro)
+            r, ro, _ = chambers.close_again(Again.z_again, r, ro)
         r = self.problem.add_palm_wrench(r)
         at_palm = self._palm(*self.block.sum((r, ro)))
         if chambers:
-            chambers.substitute("z_again", at_palm.palm_acc, at_palm.object_acc)
+            chambers.substitute(Again.z_again, at_palm.palm_acc, at_palm.object_acc)
         return at_palm
 
     def _palm(self, r: Lanes, ro: Lanes) -> Iterate:
@@ -250,17 +259,17 @@ class Coupling:
         """Leaves the links' accelerations with the sides, see `LineSearch.prepare`."""
 
         def link(i: Any, parent: Lanes) -> Lanes:
-            axes, *factors = self.problem.read("axes", "w", "g", z, item=i)
+            axes, *factors = self.problem.read(Scratch.axes, Scratch.w, Scratch.g, z, item=i)
 
             def move(axes, factors, parent, obj):
                 return el.substitute(axes, el.Factors(*factors), parent, obj)[1]
 
             moved = lanewise(move, axes, factors, parent, step.object_acc)
-            self.contacts.put("link_acc", moved, i + 1)
+            self.contacts.put(Side.link_acc, moved, i + 1)
             return moved
 
         parent = self.problem.widened(step.palm_acc)
-        self.contacts.put("link_acc", parent, 0)
+        self.contacts.put(Side.link_acc, parent, 0)
         loop(self.links, link, parent, self.block.size)
 
 

@@ -25,6 +25,7 @@ from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, z
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, only_on, plus, pull
 from codesign_jax.engines.structured.kernel.memory import tree_add_scaled
 from codesign_jax.engines.structured.kernel.problem import Problem
+from codesign_jax.engines.structured.kernel.rows import Contact, HeldBar, Scratch, Slot, Virtual
 from codesign_jax.engines.structured.kernel.self_contacts import (
     BoundSelfContacts,
     FingerPairing,
@@ -91,7 +92,7 @@ def in_world(columns: jax.Array, held_friction: jax.Array) -> jax.Array:
 def clear(step: StepMemory) -> None:
     """Begins a step: fingers that do not touch hold nothing."""
     for item in range(pairings(step)):
-        step.scratch.write("new_held_friction", zeros((3,), step.like), item)
+        step.scratch.write(Scratch.new_held_friction, zeros((3,), step.like), item)
 
 
 def store(step: StepMemory, good: jax.Array) -> None:
@@ -99,7 +100,7 @@ def store(step: StepMemory, good: jax.Array) -> None:
     state = step.finger_state
     mask = lanes([good], (), wide=False)
     for item in range(pairings(step)):
-        new = step.scratch.read("new_held_friction", item)
+        new = step.scratch.read(Scratch.new_held_friction, item)
         old = state.read(BETWEEN_FINGERS, item)
         state.write(BETWEEN_FINGERS, lanewise(jnp.where, mask, new, old), item)
     for contacts in step.contacts.values():
@@ -117,8 +118,8 @@ def _store(step: StepMemory, contacts: BoundContacts, mask: Lanes) -> None:
         return jnp.where(mask, jnp.where(share > 0, new, 0.0), old)
 
     def store_item(item: jax.Array, x: jax.Array) -> jax.Array:
-        share = contacts.read("share", item)
-        new = contacts.read("held", item)
+        share = contacts.read(Contact.share, item)
+        new = contacts.read(Contact.held, item)
         for j in range(k):
             old = state.read(name, item * k + j)
             state.write(name, lanewise(after, mask, share[j], new[:, j], old), item * k + j)
@@ -138,8 +139,8 @@ def sums(self_contacts: BoundSelfContacts, row: Any, alpha: Lanes, held_friction
         return sums + counts * sum_axis(holding.hold(c, force, held_friction[:, None]), 1)
 
     def slot(item: Any, sums: Lanes) -> Lanes:
-        jar = self_contacts.read("jar", item)
-        step = self_contacts.read("step", item)
+        jar = self_contacts.read(Contact.jar, item)
+        step = self_contacts.read(Contact.step, item)
         counts = self_contacts.holds(item, pairing)
         with self_contacts.with_cone(row, item):
             args = (
@@ -185,9 +186,11 @@ def _keep_of_set(problem: Problem, contacts: BoundContacts, alpha: Lanes, mask: 
         def store() -> None:
             place = contacts.place(item)
             cone = contacts.cone_at(item)
-            jar, step, old = (contacts.read(n, item) for n in ("jar", "step", "held"))
+            jar, step, old = (
+                contacts.read(n, item) for n in (Contact.jar, Contact.step, Contact.held)
+            )
             new = lanewise(after, mask, place, cone, alpha, jar, step, old, axes)
-            contacts.write("held", new, item)
+            contacts.write(Contact.held, new, item)
 
         jax.lax.cond(contacts.touching(item), store, lambda: None)
 
@@ -223,9 +226,11 @@ def _keep_of_fingers(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
         first = self_contacts.set.first
 
         def keep_row(row: jax.Array, x: jax.Array) -> jax.Array:
-            before, old = problem.read(BETWEEN_FINGERS, "new_held_friction", item=row + first)
+            before, old = problem.read(BETWEEN_FINGERS, Scratch.new_held_friction, item=row + first)
             new = lanewise(holding.quotient, sums(self_contacts, row, alpha, before))
-            problem.write("new_held_friction", lanewise(jnp.where, mask, new, old), row + first)
+            problem.write(
+                Scratch.new_held_friction, lanewise(jnp.where, mask, new, old), row + first
+            )
             return x
 
         jax.lax.fori_loop(0, self_contacts.set.rows, keep_row, jnp.int32(0))
@@ -253,7 +258,7 @@ def _reverse(step: StepMemory, bars: CotangentTables, contacts: BoundContacts, g
 
     def reverse_item(item: Any) -> None:
         held_bar = held_bars(bars, contacts, item)
-        contacts.write("held_bar", only_on(go, held_bar), item)
+        contacts.write(HeldBar.held_bar, only_on(go, held_bar), item)
         _write_bars(bars, contacts, item, only_on(rest, held_bar))
 
     contacts.each_item(reverse_item)
@@ -298,7 +303,9 @@ def asks(problem: Problem, contacts: BoundContacts, item: Any) -> Lanes:
     def wrenches() -> list[Lanes]:
         place = contacts.place(item)
         cone = contacts.cone_at(item)
-        jar, held, bars = (contacts.read(n, item) for n in ("jar", "held", "held_bar"))
+        jar, held, bars = (
+            contacts.read(n, item) for n in (Contact.jar, Contact.held, HeldBar.held_bar)
+        )
         unit = lanes([problem.like + 1.0], (), wide=True)
         (change,) = pull(of_jar, (jar,), (place, cone, held, bars, axes), unit)
         return [lanewise(wrench, place, cone, change)]
@@ -325,7 +332,7 @@ def _reverse_fingers(
             theirs = self_contacts.pairing(row).swap(mine)
             both = lanewise(jnp.subtract, mine, theirs) if item else mine
             (sums_bar,) = pull(holding.quotient, (ended,), (), only_on(go, both))
-        step.scratch.write("sums_bar", sums_bar, item)
+        step.scratch.write(Virtual.sums_bar, sums_bar, item)
         rest = only_on(lanewise(jnp.logical_not, go), mine)
         state.write(BETWEEN_FINGERS, rest, item)
 
@@ -337,7 +344,7 @@ def hold_of_pairing(step: StepMemory, pairing: FingerPairing) -> tuple[Lanes, ..
     item = pairing.number
     lane = step.block.lane
     held = step.finger_state.gather(BETWEEN_FINGERS, item, lane)
-    return held, step.scratch.gather("sums_bar", item, lane)
+    return held, step.scratch.gather(Virtual.sums_bar, item, lane)
 
 
 def leave(bars: CotangentTables, pairing: FingerPairing, sums_bars: tuple) -> None:
@@ -366,19 +373,19 @@ def load_cotangents(problem: Problem, self_contacts: BoundSelfContacts) -> None:
     def load(item: Any, pairing: FingerPairing) -> None:
         which = pairing.number
         side = self_contacts.own_side(item)
-        jar = self_contacts.read("jar", item)
+        jar = self_contacts.read(Contact.jar, item)
 
         def response(place, cone, jar):
             return contact.constraint_update(contacts(place, cone), jar).force
 
         force = lanewise(response, side.place, self_contacts.cone, jar)
         held = problem.memory.finger_state.gather(BETWEEN_FINGERS, which, lane)
-        bars = problem.memory.scratch.gather("sums_bar", which, lane)
+        bars = problem.memory.scratch.gather(Virtual.sums_bar, which, lane)
         unit = lanes([problem.like + 1.0], (), wide=True)
         (r,) = pull(of_held, (force,), (side.place, self_contacts.cone, held, bars), unit)
         r = lanewise(jnp.multiply, self_contacts.holds(item, pairing), r)
         change = lanewise(
-            jnp.negative, self_contacts.times_hessian(self_contacts.read("hessian", item), r)
+            jnp.negative, self_contacts.times_hessian(self_contacts.read(Slot.hessian, item), r)
         )
         self_contacts.load(item, side, change, pairing)
 

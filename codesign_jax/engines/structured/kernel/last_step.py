@@ -11,6 +11,7 @@ from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, z
 from codesign_jax.engines.structured.kernel.coupling import Eliminated, solve_palm_again
 from codesign_jax.engines.structured.kernel.memory import loop, tree_add_scaled
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem, make_body
+from codesign_jax.engines.structured.kernel.rows import Again, FingerState, Hand, Scratch
 from codesign_jax.engines.structured.kernel.shared_memory import team_sum
 from codesign_jax.engines.structured.lanes import contract, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -105,29 +106,34 @@ class ChordStep:
             return (r, ro, work + dot(y, new.z)), new.z
 
         def link(i: Any, carry: tuple) -> tuple:
-            names = [("acc", "step_acc"), ("link_acc", "step_link_acc")]
+            names = [
+                (FingerState.acc, Scratch.step_acc),
+                (Scratch.link_acc, Scratch.step_link_acc),
+            ]
             moved = [problem.read(*rows, item=i) for rows in names]
             pushes = {c.set.name: c.wrench(i, alpha) for c in problem.per_link}
             self_wrench = problem.self_contacts.wrench_on(i + 1) if problem.self_contacts else None
-            factors = problem.read("axes", "armature", "w", "g", "inverse", item=i)
-            forces = problem.read("smooth", "tau", item=i)
+            factors = problem.read(
+                Scratch.axes, Hand.armature, Scratch.w, Scratch.g, Again.inverse, item=i
+            )
+            forces = problem.read(Scratch.smooth, Scratch.tau, item=i)
             args = alpha, carry, problem.body_of(i), moved, forces, factors, pushes, self_wrench
             carry, z = lanewise(again, *args)
-            problem.write("z_again", z, i)
+            problem.write(Again.z_again, z, i)
             return carry
 
         none = zeros((6,), self.like)
         start = none, none, zeros((), self.like)
         r, ro, work = loop(self.links, link, start, self.block.size, reverse=True)
         if chambers:
-            r, ro, less = chambers.close_again("z_again", r, ro)
+            r, ro, less = chambers.close_again(Again.z_again, r, ro)
             work = lanewise(jnp.subtract, work, less)
         r = problem.add_palm_wrench(r) if problem.self_contacts else r
         r, ro, work = self.block.sum((r, ro, work))
         given = now, problem.palm, done, r, ro, work, self._pushes(alpha)
         step, work = lanewise(self._at_palm, *given)
         if chambers:
-            chambers.substitute("z_again", step.palm_acc, step.object_acc)
+            chambers.substitute(Again.z_again, step.palm_acc, step.object_acc)
         return step, work
 
     def _pushes(self, alpha: Lanes) -> dict[str, Lanes]:
@@ -166,11 +172,11 @@ class ChordStep:
             return link_acc, jnp.where(taken, tree_add_scaled(alpha, a, before), before)
 
         def link(i: Any, parent: Lanes) -> Lanes:
-            axes, before = problem.read("axes", "step_acc", item=i)
-            factors = problem.read("w", "g", "z_again", item=i)
+            axes, before = problem.read(Scratch.axes, Scratch.step_acc, item=i)
+            factors = problem.read(Scratch.w, Scratch.g, Again.z_again, item=i)
             args = step.object_acc, axes, factors, before, alpha, mask
             link_acc, acc = lanewise(move, parent, *args)
-            problem.write("step_acc", acc, i)
+            problem.write(Scratch.step_acc, acc, i)
             return link_acc
 
         loop(self.links, link, problem.widened(step.palm_acc), self.block.size)

@@ -12,6 +12,7 @@ from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, z
 from codesign_jax.engines.structured.kernel.coupling import Eliminated
 from codesign_jax.engines.structured.kernel.memory import choose, either, full, loop, upper
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem, make_body
+from codesign_jax.engines.structured.kernel.rows import Again, FingerState, Hand, Scratch
 from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.lanes import contract, dot, sum_fingers, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
@@ -68,7 +69,7 @@ class Elimination:
             node, work = carry
             acc, link_acc = self.accelerations(i, alpha)
             smooth, tau = self.smooth(i)
-            axes, armature = problem.read("axes", "armature", item=i)
+            axes, armature = problem.read(Scratch.axes, Hand.armature, item=i)
             self_wrench = problem.self_contacts.wrench_on(i + 1) if problem.self_contacts else None
             node = node._replace(p=full(node.p), q=full(node.q))
             node = lanewise(load_link, node, problem.body_of(i), link_acc, smooth, self_wrench)
@@ -78,10 +79,12 @@ class Elimination:
 
             def eliminated(eliminate: Callable) -> tuple[el.Quadratic, Lanes]:
                 new, kept, more = lanewise(eliminate, node, *forces)
-                for name, value in zip(("w", "g", "z"), kept.factors, strict=True):
+                for name, value in zip(
+                    (Scratch.w, Scratch.g, Scratch.z), kept.factors, strict=True
+                ):
                     problem.write(name, value, i)
                 if problem.in_slots or problem.chambers:
-                    problem.write("inverse", kept.inverse, i)
+                    problem.write(Again.inverse, kept.inverse, i)
                 return new._replace(p=upper(new.p), q=upper(new.q)), more
 
             ways = (partial(eliminated, eliminate_joint), partial(eliminated, eliminate_free_joint))
@@ -107,11 +110,11 @@ class Elimination:
 
     def accelerations(self, i: Any, alpha: Lanes) -> list[Lanes]:
         """Accelerations of a joint and of the link behind it."""
-        return [self.problem.move(name, i, alpha) for name in ("acc", "link_acc")]
+        return [self.problem.move(name, i, alpha) for name in (FingerState.acc, Scratch.link_acc)]
 
     def smooth(self, i: Any) -> list[Lanes]:
         """Smooth forces on a link and on the joint before it."""
-        return self.problem.read("smooth", "tau", item=i)
+        return self.problem.read(Scratch.smooth, Scratch.tau, item=i)
 
     def of_contacts(self, contacts: BoundContacts, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
         return contacts.inertia_and_wrench(item, alpha)
@@ -185,7 +188,7 @@ class Elimination:
 
         step, done = lanewise(solve, now, self.problem.palm, node, slots)
         if self.problem.chambers:
-            self.problem.chambers.substitute("z", step.palm_acc, step.object_acc)
+            self.problem.chambers.substitute(Scratch.z, step.palm_acc, step.object_acc)
         return step, done
 
 

@@ -15,6 +15,7 @@ from codesign_jax.engines.structured.kernel.problem import (
     make_body,
     relative,
 )
+from codesign_jax.engines.structured.kernel.rows import FingerState, Hand, Scratch, Side
 from codesign_jax.engines.structured.kernel.slots import only
 from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -53,19 +54,26 @@ class LineSearch:
 
         def link(i: Any, carry: tuple) -> tuple:
             parent, slope, curvature, contact_slope = carry
-            names = ("link_acc", "smooth", "tau", "axes", "armature", "acc")
+            names = (
+                Scratch.link_acc,
+                Scratch.smooth,
+                Scratch.tau,
+                Scratch.axes,
+                Hand.armature,
+                FingerState.acc,
+            )
             a, moved, s, c = lanewise(
                 substitute,
                 parent,
                 step.object_acc,
                 problem.body_of(i),
                 *problem.read(*names, item=i),
-                problem.read("w", "g", "z", item=i),
+                problem.read(Scratch.w, Scratch.g, Scratch.z, item=i),
             )
-            problem.write("step_acc", a, i)
-            problem.write("step_link_acc", moved, i)
+            problem.write(Scratch.step_acc, a, i)
+            problem.write(Scratch.step_link_acc, moved, i)
             if problem.self_contacts:
-                problem.self_contacts.put("link_acc", moved, i + 1)
+                problem.self_contacts.put(Side.link_acc, moved, i + 1)
             terms = [contact_slope]
             for contacts in problem.per_link:
                 rel = relative(contacts.set.name, moved, step.palm_acc, step.object_acc)
@@ -77,7 +85,7 @@ class LineSearch:
         none = zeros((), self.like)
         parent = problem.widened(step.palm_acc)
         if problem.self_contacts:
-            problem.self_contacts.put("link_acc", parent, 0)
+            problem.self_contacts.put(Side.link_acc, parent, 0)
         _, slope, curvature, contact_slope = loop(
             self.links, link, (parent, none, none, none), self.block.size
         )

@@ -1,7 +1,7 @@
 """The tables of a block in memory: their rows for a scene, and a batch's arrays packed into them.
 
 Tables of constants, state and scratch are in global memory; `onchip` is in a GPU's shared memory,
-see `shared_memory.layout`.
+see `rows.Chip`.
 """
 
 from functools import partial
@@ -10,14 +10,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured.kernel import (
-    chambers,
-    objects,
-    self_collision,
-    shared_memory,
-)
+from codesign_jax.engines.structured.kernel import objects, rows, shared_memory
 from codesign_jax.engines.structured.kernel.contact_sets import ContactSet
 from codesign_jax.engines.structured.kernel.memory import MemoryLayout, lengthened
+from codesign_jax.engines.structured.kernel.rows import (
+    Again,
+    Air,
+    Chip,
+    FingerState,
+    Group,
+    Hand,
+    Scratch,
+    Search,
+    Shared,
+    World,
+    WorldOptions,
+    WorldState,
+)
 from codesign_jax.engines.structured.kernel.self_contacts import SelfContactSet, pair_slots
 from codesign_jax.engines.structured.kernel.slots import SlotSet
 from codesign_jax.engines.structured.kernel.step_memory import KernelLayout
@@ -27,7 +36,6 @@ from codesign_jax.engines.structured.kernel.team_contacts import (
 )
 from codesign_jax.engines.structured.laws import shapes, surroundings
 from codesign_jax.engines.structured.laws.air import volumes
-from codesign_jax.engines.structured.laws.cones import friction_by_contact
 from codesign_jax.engines.structured.laws.kinematics import Acc, State
 from codesign_jax.engines.structured.laws.rings import RING_OVERLAP
 from codesign_jax.engines.structured.laws.step_numbers import step_numbers
@@ -48,8 +56,8 @@ GATHERING = ("gpu",)
 class Tables(KernelLayout):
     """Contacts and tables of a scene's kernel for one size of block."""
 
-    remembers: tuple[str, ...] = ()
-    """Further numbers of the slots of self-contacts."""
+    remembers: tuple[type[rows.Rows], ...] = ()
+    """What slots of self-contacts have further."""
 
     def __init__(self, scene: Scene, *, backend: str, width: int, team: int | None = None):
         self.backend = backend
@@ -73,6 +81,7 @@ class Tables(KernelLayout):
         self.rings_per_link = rings_of_link(scene)
         self.palm_groups = palm_groups(scene)
         self.meshes = bool(shapes.mesh_indices(scene))
+        self.support_points = objects.support_points(scene)
         self.sets = self._sets()
         self.held = held.held(scene)
         self.has_slots = any(isinstance(s, SlotSet) for s in self.sets)
@@ -102,134 +111,76 @@ class Tables(KernelLayout):
         return [*sets, *on_table]
 
     @property
-    def rows(self) -> int:
-        """Rows of what each finger has one of, or each of its links if it is tapered."""
-        return self.links if self.tapered else 1
-
-    @property
     def gathers(self) -> bool:
         """Whether lanes read rows of their own."""
         return self.backend in GATHERING or self.team > 1
 
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Lengths of the axes of `rows`."""
+        points = max(1, self.support_points // self.fingers)
+        return {
+            rows.ONE: 1,
+            rows.LINK: self.links,
+            rows.BODY: self.links + 1,
+            rows.END: self.links + 2,
+            rows.SECTION: self.links if self.tapered else 1,
+            rows.RING: self.links * self.rings_per_link,
+            rows.PALM_GROUP: self.palm_groups,
+            rows.SUPPORT: points,
+            rows.PAIRING: self.held.get("finger_finger", 0),
+            rows.AXES: self.axes,
+            rows.LAW: len(Numbers._fields) + 1,
+            rows.FRICTIONS: 2 * len(surroundings.fields(self.scene)),
+            rows.LANES: shared_memory.TEAM,
+            rows.SPARE: shared_memory.TEAM - 6,
+        }
+
+    def _groups(self, *tables: type[rows.Rows]) -> dict[str, Group]:
+        """The rows that the scene has of declared ones, in their order."""
+        groups: dict[str, Group] = {}
+        for table in tables:
+            groups |= table.groups(self, self.sizes)
+        return groups
+
     def _tables(self) -> None:
         """Lays out all tables."""
-        self.hand = self._hand_table()
-        self.world = self._world_table()
-        joint = (self.links, (self.axes,))
+        self.hand = MemoryLayout(True, **self._groups(Hand))
+        self.world = MemoryLayout(False, **self._world_groups())
+        state = self._groups(FingerState)
+        warm_start = {name: state.pop(name) for name in (FingerState.acc,)}
         hold = {f"held.{name}": (n, (3,)) for name, n in self.held.items()}
-        self.finger_state = MemoryLayout(True, finger=joint, finger_vel=joint, **hold, acc=joint)
-        world_state = dict(wrist=6, position=3, quat=4, wrist_vel=6, linear_vel=3, angular_vel=3)
-        world_state |= dict(step=1, going=1, speed=1, overlap=1, acc_wrist=6, acc_object=6)
-        self.world_state = MemoryLayout(
-            False, **{name: (1, (size,)) for name, size in world_state.items()}
-        )
+        self.finger_state = MemoryLayout(True, **state, **hold, **warm_start)
+        self.world_state = MemoryLayout(False, **self._groups(WorldState))
         scratch = self._scratch_groups()
         if self.team > 1:
-            onchip = shared_memory.layout(self.links, self.axes)
+            onchip = self._groups(Chip, Shared)
             self.onchip = MemoryLayout.by_item(True, **onchip)
             elsewhere = {*onchip, *shared_memory.UNUSED}
             scratch = {name: group for name, group in scratch.items() if name not in elsewhere}
         self.scratch = MemoryLayout.by_item(True, **scratch)
 
-    def _hand_table(self) -> MemoryLayout:
-        """Constants of fingers and links."""
-        n = self.links
-        a = self.axes
-        scalar: tuple[int, ...] = ()
-        more = {"ring": (n * self.rings_per_link, (8,))} if self.rings_per_link else {}
-        if palm_touches(self.scene):
-            more |= {"palm_ring": (self.palm_groups, (8,))}
-        if self.scene.hand.section.law == "elements":
-            more |= {"law": (self.rows, (len(Numbers._fields) + 1,))}
-        elif self.scene.effects.neo_hookean:
-            more |= {"section": (self.rows, (4,))}
-        if self.scene.effects.lateral_threshold:
-            more |= {"threshold": (self.rows, (3,))}
-        if self.scene.effects.air_mass:
-            more |= {"volume": (1, scalar)}
-        support, _ = objects.tables(self.scene, self.fingers)
-        return MemoryLayout(
-            True,
-            mount=(1, (3, 3)),
-            base=(1, (3,)),
-            stub_centre=(1, (3,)),
-            centre_weight=(n + 1, scalar),
-            gain=(self.rows, scalar),
-            offset=(n, scalar),
-            mass=(n, scalar),
-            centre=(n, (3,)),
-            inertia=(n, (3,)),
-            stiffness=(n, (a,)),
-            damping=(n, (a,)),
-            armature=(n, (a,)),
-            **more,
-            **support,
-        )
-
-    def _world_table(self) -> MemoryLayout:
-        """Constants of worlds: of palm, wrist, object, contacts and verdict."""
-        scalar: tuple[int, ...] = ()
-        some: dict[str, tuple[int, tuple[int, ...]]] = {}
+    def _world_groups(self) -> dict[str, Group]:
+        """Constants of worlds: of palm, wrist, object, verdict and contacts."""
+        groups = self._groups(World)
+        groups |= dict.fromkeys(verdict.Bounds._fields, (1, ()))
         for contacts in self.sets:
-            some |= contacts.cone_rows()
-        some |= {name: (1, number.shape) for name, number in step_numbers(self.scene).items()}
-        if friction_by_contact(self.scene, "object_table"):
-            some |= {"friction": (1, (2 * len(surroundings.fields(self.scene)),))}
-        if self.scene.effects.wrist:
-            some |= {"wrist_stiffness": (1, (6,))}
-        if self.scene.effects.finger_palm:
-            some |= {"palm_disc": (1, (2,))}
-        if self.scene.effects.air_mass:
-            some |= {"air": (1, (2,))}
-        _, grid = objects.tables(self.scene, self.fingers)
-        return MemoryLayout(
-            False,
-            palm_mass=(1, scalar),
-            palm_centre=(1, (3,)),
-            palm_inertia=(1, (3, 3)),
-            wrist_damping=(1, (6,)),
-            wrist_armature=(1, (6,)),
-            object_mass=(1, scalar),
-            object_inertia=(1, (3,)),
-            object_size=(1, (3,)),
-            object_id=(1, scalar),
-            **grid,
-            **dict.fromkeys(verdict.Bounds._fields, (1, scalar)),
-            **some,
-        )
+            groups |= contacts.cone_rows()
+        groups |= {name: (1, number.shape) for name, number in step_numbers(self.scene).items()}
+        return groups | self._groups(WorldOptions)
 
-    def _scratch_groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
+    def _scratch_groups(self) -> dict[str, Group]:
         """What a step leaves for its parts: bodies, forces, factors, contacts."""
-        n = self.links
-        a = self.axes
-        fields: dict[str, tuple[int, tuple[int, ...]]] = {
-            "axes": (n, (a, 6)),
-            "body_centre": (n, (3,)),
-            "tensor": (n, (6,)),
-            "link_acc": (n, (6,)),
-            "smooth": (n, (6,)),
-            "tau": (n, (a,)),
-            "w": (n, (a, 6)),
-            "g": (n, (a, 6)),
-            "z": (n, (a,)),
-            "step_acc": (n, (a,)),
-            "step_link_acc": (n, (6,)),
-            "new_finger": (n, (a,)),
-            "new_finger_vel": (n, (a,)),
-        }
-        if self.scene.effects.lateral_threshold or self.scene.hand.section.law == "elements":
-            fields |= {"armature_now": (n, (a,))}
-        if pairings := self.held.get("finger_finger"):
-            fields |= {"new_held_friction": (pairings, (3,))}
+        groups = self._groups(Scratch)
         for contacts in self.sets:
-            fields |= contacts.groups()
+            groups |= contacts.groups()
         if self.scene.effects.air_mass:
-            fields |= chambers.fields(n, a)
+            groups |= self._groups(Air)
         if self.has_slots or self.scene.effects.air_mass:
-            fields |= {"inverse": (n, (a, a)), "z_again": (n, (a,))}
-        if any(isinstance(s, SelfContactSet) for s in self.sets):
-            fields |= self_collision.fields(n)
-        return fields
+            groups |= self._groups(Again)
+        if self.has_slots:
+            groups |= self._groups(Search)
+        return groups
 
 
 LENGTH = 6
@@ -307,8 +258,8 @@ class Packing(Tables):
             "finger_vel": state.finger_vel,
             "acc": state.acc.finger,
         }
-        for name, rows in held.rows(self.scene).items():
-            held_friction = state.held[rows]
+        for name, numbers in held.rows(self.scene).items():
+            held_friction = state.held[numbers]
             finger_state[f"held.{name}"] = held_friction.reshape(-1, 3, *held_friction.shape[1:])
         wide = {k: self._widen(v) for k, v in finger_state.items()}
         narrow = {k: arrays[k] for k in self.world_state.groups}

@@ -30,6 +30,7 @@ from codesign_jax.engines.structured.kernel.memory import (
     tree_add_scaled,
 )
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem
+from codesign_jax.engines.structured.kernel.rows import FingerState
 from codesign_jax.engines.structured.kernel.slots import only
 from codesign_jax.engines.structured.kernel.team_solver import (
     TeamCoupling,
@@ -118,7 +119,12 @@ class Newton:
         start, rebuild = solid((now, far, none), self.block.size)
         count, *arrays = jax.lax.while_loop(going, body, [jnp.int32(0), *start])
         now, decrement, last = rebuild(arrays)
-        loop(problem.links, lambda i, _: (problem.move("acc", i, last), [])[1], [], self.block.size)
+        loop(
+            problem.links,
+            lambda i, _: (problem.move(FingerState.acc, i, last), [])[1],
+            [],
+            self.block.size,
+        )
         return now, Convergence(decrement, count)
 
     def accept_steady(

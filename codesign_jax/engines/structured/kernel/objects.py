@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, anywhere, choose, loop
+from codesign_jax.engines.structured.kernel.rows import World
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import meshes, shapes
 from codesign_jax.engines.structured.laws.meshes import GridLanes, MeshLanes
@@ -42,25 +43,14 @@ class WorldObject(NamedTuple):
     mesh: MeshMemory | None  # Meshes; None if the scene has none
 
 
-def tables(scene: Scene, fingers: int) -> tuple[dict, dict]:
-    """Groups that meshes add to the table of the hand and to the table of the worlds."""
-    if not (mesh := meshes.tables(scene)):
-        return {}, {}
-    scalar: tuple[int, ...] = ()
-    rows = max(1, mesh.support.shape[1] // fingers)
-    world = {
-        "first": scalar,
-        "nodes": (3,),
-        "origin": (3,),
-        "cell": scalar,
-        "factor": scalar,
-        "reach": scalar,
-    }
-    return {"support": (rows, (3,))}, {f"grid_{k}": (1, shape) for k, shape in world.items()}
+def support_points(scene: Scene) -> int:
+    """Support points that each mesh of a scene has, zero without meshes."""
+    mesh = meshes.tables(scene)
+    return 0 if mesh is None else mesh.support.shape[1]
 
 
 def rows(mesh: MeshLanes, fingers: int, dtype: Any) -> dict[str, jax.Array]:
-    """Arrays for the rows of `tables`: support points are dealt to the lanes of the fingers."""
+    """Arrays for `Hand.support`, whose points are dealt to lanes, and for the grid in `World`."""
     support = mesh.support
     if support.shape[1] < fingers:
         support = jnp.tile(support, (1, fingers // support.shape[1], 1))
@@ -75,8 +65,8 @@ def rows(mesh: MeshLanes, fingers: int, dtype: Any) -> dict[str, jax.Array]:
 def read(
     scene: Scene, block: Block, world: BoundTable, hand: BoundTable, values: Any
 ) -> WorldObject:
-    size = world.read("object_size")
-    shape = world.read("object_id")
+    size = world.read(World.object_size)
+    shape = world.read(World.object_id)
     if values is None:
         return WorldObject(size, shape, block, None)
     indices = np.array(shapes.mesh_indices(scene), np.int32)
@@ -86,7 +76,7 @@ def read(
         partial(hand.read, "support"),
         hand.layout.groups["support"][0],
         GridLanes(*(world.read(f"grid_{name}") for name in GridLanes._fields)),
-        world.read("grid_reach"),
+        world.read(World.grid_reach),
         meshed,
     )
     return WorldObject(size, shape, block, memory)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.kernel.chambers import Chambers
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import tree_add_scaled
+from codesign_jax.engines.structured.kernel.rows import Air, Hand, Scratch
 from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
@@ -68,12 +69,12 @@ class Problem:
         self.dealt = [c for n, c in sets.items() if not n.startswith("finger")]
         self.in_slots = [self.self_contacts] if self.self_contacts else []
         self.like = jnp.zeros((self.block.size,), palm.armature.dtype)
-        self.chambers = Chambers(memory) if "air_step" in memory.scratch else None
+        self.chambers = Chambers(memory) if Air.air_step in memory.scratch else None
 
     def read(self, *names: str, item: Any = 0) -> list[Lanes]:
         """Reads names; of the joints' armature that of this step, if it changes."""
-        if "armature_now" in self.memory.scratch:
-            names = tuple("armature_now" if n == "armature" else n for n in names)
+        if Scratch.armature_now in self.memory.scratch:
+            names = tuple(Scratch.armature_now if n == Hand.armature else n for n in names)
         return [self.memory.read(name, item) for name in names]
 
     def write(self, name: str, value: Lanes, item: Any) -> None:
@@ -86,7 +87,7 @@ class Problem:
         return value
 
     def body_of(self, item: Any) -> list[Lanes]:
-        return self.read("mass", "body_centre", "tensor", item=item)
+        return self.read(Hand.mass, Scratch.body_centre, Scratch.tensor, item=item)
 
     def add_palm_wrench(self, r: Lanes) -> Lanes:
         """Adds the self-contacts that act on the palm."""

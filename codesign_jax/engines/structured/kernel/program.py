@@ -8,7 +8,7 @@ worlds are decided.
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.kernel import shared_memory
 from codesign_jax.engines.structured.kernel.memory import Block, anywhere
 from codesign_jax.engines.structured.kernel.memory_tables import Packing
+from codesign_jax.engines.structured.kernel.rows import WorldState
 from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, of_code
 from codesign_jax.engines.structured.laws import air
@@ -28,6 +29,8 @@ from codesign_jax.engines.structured.world_model import WorldModel
 from codesign_jax.judge import verdict
 from codesign_jax.model import held
 from codesign_jax.scene import Scene
+
+Record = TypeVar("Record")
 
 TRACE = ("distance", "height", "speed", "residual", "iterations", "moved")
 
@@ -39,6 +42,37 @@ Worlds of a block wait for one another in every loop, most of all in those over 
 good designs are simulated 1.2 times as fast with two worlds a block as with the four that fill a
 vector of 64 bytes, and 1.1 times as fast as with one.
 """
+
+
+class Inputs(NamedTuple):
+    """What the kernel reads of worlds, tables of blocks; also their cotangents."""
+
+    hand: Any  # `rows.Hand`, shape (block, row, lane)
+    world: Any  # `rows.World`, shape (block, row, world)
+    finger_start: Any  # `rows.FingerState` at the start, shape (block, row, lane)
+    world_start: Any  # `rows.WorldState` at the start, shape (block, row, world)
+    arm: Any  # Commands of the arm frame, shape (block, time, 6, world)
+    pressure: Any  # Pressures of the chambers [Pa], shape (block, time, lane)
+    # Distances of all meshes, which all blocks share, shape (1, n); None without meshes
+    grid: Any = None
+
+
+class PathPart(NamedTuple):
+    """States that are stored, every so many steps: all rows, or those of positions."""
+
+    finger: Any  # Rows of `rows.FingerState`, shape (block, time, row, lane)
+    world: Any  # Rows of `rows.WorldState`, shape (block, time, row, world)
+
+
+class Outputs(NamedTuple):
+    """What the kernel writes of worlds, tables of blocks."""
+
+    finger_state: Any  # `rows.FingerState` at the end, shape (block, row, lane)
+    world_state: Any  # `rows.WorldState` at the end, shape (block, row, world)
+    scratch: Any  # Memory of a step, which is not read; None after the call
+    trace: Any  # `Program.trace`, shape (block, time, entry, world)
+    path: tuple[PathPart, ...] = ()  # See `path_parts`
+    onchip: Any = None  # Shared memory of a step, with teams only; None after the call
 
 
 class Limits(NamedTuple):
@@ -79,7 +113,7 @@ class Program(Packing):
     @classmethod
     def here(
         cls, scene: Scene, limits: Limits, dtype: Any, worlds: int | None = None, **options: Any
-    ) -> "Program":
+    ) -> Self:
         """The program for this device, type and number of worlds, see `lanes_here`."""
         width = lanes_here(scene, dtype, worlds)
         return cls(scene, limits, backend=jax.default_backend(), width=width, **options)
@@ -116,39 +150,34 @@ class Program(Packing):
         out = self.execute(inputs, trajectory=trajectory, states=states)
         return self.outputs(out, ctrl.shape[0], trajectory=trajectory, states=states)
 
-    def execute(
-        self, inputs: tuple, *, trajectory: bool = False, states: int = 0
-    ) -> list[jax.Array | None]:
+    def execute(self, inputs: Inputs, *, trajectory: bool = False, states: int = 0) -> Outputs:
         """Runs the blocks, which do not depend on each other; None in the place of scratch memory.
 
         States are steps from one stored state to the next, beginning with the first; 0 for none.
         """
-        call, outputs = self._call(inputs, trajectory, states)
-        if self.backend == "interpreter":
-            return call(*inputs)
-        of_code(reuse.code_digest())
         # Controls come as arrays: key frames are no part of the kernel.
         structure = replace(self.scene.structure, control=None)  # type: ignore[arg-type]
         origin = repr((structure, self.limits, trajectory, states))
-        shared = (len(inputs) - 1,) if self.meshes else ()
-        kernel = Kernel(origin, self.backend, self.size, shared, scratch=(2,))
+        call, outputs = self._call(inputs, trajectory, states)
+        places = numbered(outputs)
+        memory: dict[str, Any] = {"scratch": (places.scratch,)}
         if self.team > 1:
-            last = len(outputs) - 1
-            kernel = kernel._replace(origin=f"{origin} {self.team}", onchip=(last,))
-            kernel = kernel._replace(exchanged=(2, last))
-        return launch(call, inputs, outputs, kernel)
+            origin = f"{origin} {self.team}"
+            memory |= {"onchip": (places.onchip,), "exchanged": (places.scratch, places.onchip)}
+        return self.launch(call, inputs, outputs, origin, **memory)
 
     def outputs(
-        self, out: Any, worlds: int, *, trajectory: bool = False, states: bool = False
+        self, out: Outputs, worlds: int, *, trajectory: bool = False, states: bool = False
     ) -> tuple[dict[str, jax.Array], State]:
         """What `simulate` returns, from what the blocks of so many worlds wrote."""
         # (block, world, time, entry)
-        trace = jnp.moveaxis(out[3], 3, 1)
+        trace = jnp.moveaxis(out.trace, 3, 1)
         trace = trace.reshape(-1, trace.shape[2], len(self.trace))[:worlds]
         series = {name: trace[..., k] for k, name in enumerate(self.trace)}
         if trajectory or states:
-            series |= {k: v[:worlds] for k, v in self.path(out[4], out[5], states=states).items()}
-        last = self.unpack_state(out[0], out[1], worlds)
+            path = self.path(*out.path[0], states=states)
+            series |= {k: v[:worlds] for k, v in path.items()}
+        last = self.unpack_state(out.finger_state, out.world_state, worlds)
         if states:
             # A row holds the acceleration of the step before it, the solver's warm start.
             end = coordinates.flat_acc(last.acc)[:, None]
@@ -158,88 +187,133 @@ class Program(Packing):
     def jaxpr(self, hand: WorldModel, state: State, ctrl: jax.Array) -> Any:
         """The jaxpr of a block of a rollout's kernel; arguments may be `jax.ShapeDtypeStruct`."""
         inputs = jax.eval_shape(self.inputs, hand, state, ctrl)
-        return kernel_jaxpr(self._call(inputs, False, False)[0], list(inputs))
+        return kernel_jaxpr(self._call(inputs, False, False)[0], jax.tree.leaves(inputs))
 
-    def inputs(self, hand: WorldModel, state: State, ctrl: jax.Array) -> tuple:
-        """The kernel's arguments, which have a leading axis of blocks; the last may be shared."""
+    def inputs(self, hand: WorldModel, state: State, ctrl: jax.Array) -> Inputs:
+        """The kernel's arguments, of constants, start states and controls (world, time, nu)."""
         if self.scene.effects.air_mass:
             ctrl = air.charged(self.scene, hand, ctrl)
-        inputs = (*self.pack_hand(hand), *self.pack_state(state), *self.pack_controls(ctrl))
-        return inputs if hand.mesh is None else (*inputs, hand.mesh.values[None])
+        return self.joined(self.pack_hand(hand), hand, state, ctrl)
 
-    def _call(
-        self, inputs: tuple, trajectory: bool, states: int
-    ) -> tuple[Callable, list[jax.ShapeDtypeStruct]]:
-        """The kernel of arguments as a function of them, and its outputs."""
-        blocks = inputs[0].shape[0]
-        steps = inputs[4].shape[1]
-        dtype = inputs[4].dtype
-        shapes = [
-            (blocks, self.finger_state.rows, self.columns),
-            (blocks, self.world_state.rows, self.block),
-            (blocks, self.scratch.rows, self.columns),
-            (blocks, steps, len(self.trace), self.block),
-        ]
+    def joined(
+        self, tables: tuple[jax.Array, ...], hand: WorldModel, state: State, ctrl: jax.Array
+    ) -> Inputs:
+        """`inputs` of the hands' tables, see `Packing.pack_hand`."""
+        grid = None if hand.mesh is None else hand.mesh.values[None]
+        hand_table, world_table = tables
+        finger_start, world_start = self.pack_state(state)
+        arm, pressure = self.pack_controls(ctrl)
+        return Inputs(hand_table, world_table, finger_start, world_start, arm, pressure, grid)
+
+    def _call(self, inputs: Inputs, trajectory: bool, states: int) -> tuple[Callable, Outputs]:
+        """The kernel of inputs as a function of their arrays, and its outputs."""
+        blocks, steps = inputs.arm.shape[:2]
+
+        def shape(*sizes: int) -> jax.ShapeDtypeStruct:
+            return jax.ShapeDtypeStruct((blocks, *sizes), inputs.arm.dtype)
+
+        path = []
         for stride, whole in path_parts(trajectory, states):
             angles, places = self.path_rows(whole)
             count = -(-steps // stride)
-            shapes += [(blocks, count, angles, self.columns), (blocks, count, places, self.block)]
-        if self.team > 1:
-            shapes += [(blocks, self.onchip.rows, self.columns)]
-
+            path.append(
+                PathPart(shape(count, angles, self.columns), shape(count, places, self.block))
+            )
+        outputs = Outputs(
+            shape(self.finger_state.rows, self.columns),
+            shape(self.world_state.rows, self.block),
+            shape(self.scratch.rows, self.columns),
+            shape(steps, len(self.trace), self.block),
+            tuple(path),
+            shape(self.onchip.rows, self.columns) if self.team > 1 else None,
+        )
         kernel = partial(self._kernel, steps, trajectory, states)
-        return self.call(kernel, "grasp", inputs, shapes, dtype)
+        return self.call(kernel, "grasp", inputs, outputs), outputs
 
-    def call(
-        self, kernel: Callable, name: str, inputs: tuple, shapes: list, dtype: Any
-    ) -> tuple[Callable, list[jax.ShapeDtypeStruct]]:
-        """A kernel as a function of its inputs, and its outputs, whose shapes are given."""
-        blocks = inputs[0].shape[0]
-        outputs = [jax.ShapeDtypeStruct(s, dtype) for s in shapes]
-        call = pl.pallas_call(
-            kernel,
+    def call(self, kernel: Callable, name: str, inputs: Any, outputs: Any) -> Callable:
+        """A kernel as a function of the arrays of its inputs.
+
+        Args:
+          kernel: Function of references to inputs and outputs, records of the same structure.
+          name: The kernel's.
+          inputs: Record of arrays, or of their shapes.
+          outputs: Record of shapes of the results.
+        """
+        given, taken = jax.tree.structure(inputs), jax.tree.structure(outputs)
+        shapes = jax.tree.leaves(outputs)
+        blocks = shapes[0].shape[0]
+
+        def run(*refs: Any) -> None:
+            split = given.num_leaves
+            kernel(given.unflatten(refs[:split]), taken.unflatten(refs[split:]))
+
+        return pl.pallas_call(
+            run,
             grid=(blocks,),
-            in_specs=[block_spec(x.shape, blocks) for x in inputs],
-            out_specs=[block_spec(s, blocks) for s in shapes],
-            out_shape=outputs,
+            in_specs=[block_spec(x.shape, blocks) for x in jax.tree.leaves(inputs)],
+            out_specs=[block_spec(x.shape, blocks) for x in shapes],
+            out_shape=shapes,
             interpret=self.backend == "interpreter",
             name=name,
         )
-        return call, outputs
 
-    def _kernel(self, steps: int, to_end: bool, states: int, *refs: Any) -> None:
-        rollout = BlockRollout(self, refs, path_parts(to_end, states))
+    def launch(
+        self, call: Callable, inputs: Any, outputs: Record, origin: str, **options: Any
+    ) -> Record:
+        """Runs what `call` returns; results are a record as the outputs.
+
+        Args:
+          call: What `call` has made of the inputs.
+          inputs: Record of arrays, of which the last one is that of meshes if the scene has any.
+          outputs: Record of shapes of the results.
+          origin: What the kernel is made of, see `launch.Kernel`.
+          **options: Other fields of `launch.Kernel`.
+        """
+        arrays = jax.tree.leaves(inputs)
+        shapes, structure = jax.tree.flatten(outputs)
+        if self.backend == "interpreter":
+            return structure.unflatten(call(*arrays))
+        of_code(reuse.code_digest())
+        shared = (len(arrays) - 1,) if self.meshes else ()
+        kernel = Kernel(origin, self.backend, self.size, shared, **options)
+        return structure.unflatten(launch(call, tuple(arrays), shapes, kernel))
+
+    def _kernel(
+        self, steps: int, to_end: bool, states: int, inputs: Inputs, outputs: Outputs
+    ) -> None:
+        rollout = BlockRollout(self, inputs, outputs, path_parts(to_end, states))
         rollout.start()
         done = rollout.run(steps, to_end=to_end)
         rollout.repeat_last(done, steps)
 
 
+def numbered(record: Record) -> Record:
+    """A record with the places of its arrays among all of them."""
+    leaves, structure = jax.tree.flatten(record)
+    return structure.unflatten(range(len(leaves)))
+
+
 class BlockRollout:
     """The rollout of a block of worlds in the kernel of a program."""
 
-    def __init__(self, program: Program, refs: tuple, parts: list[tuple[int, bool]]):
+    def __init__(
+        self, program: Program, inputs: Inputs, outputs: Outputs, parts: list[tuple[int, bool]]
+    ):
         """Takes the references to inputs and outputs; `parts` as `path_parts` returns them."""
-        (hand, world, finger_start, world_start, arm, pressure, *rest) = refs
-        grid = rest.pop(0) if program.meshes else None
-        (finger_state, world_state, scratch, trace, *path) = rest
         block = Block(program.fingers, program.block, program.team)
-        onchip = None
         if program.team > 1:
-            share = partial(shared_memory.SharedColumns, block)
-            *path, onchip = path
-            hand, finger_start, pressure = map(share, (hand, finger_start, pressure))
-            finger_state, scratch, onchip = map(share, (finger_state, scratch, onchip))
-            path[::2] = map(share, path[::2])
-        tables = hand, world, finger_state, world_state, scratch, grid, onchip
+            inputs, outputs = _with_shared_columns(block, inputs, outputs)
         self.program = program
         self.path_parts = parts
-        self.step = Step(program, block, *tables)
+        state = outputs.finger_state, outputs.world_state
+        memory = outputs.scratch, inputs.grid, outputs.onchip
+        self.step = Step(program, block, inputs.hand, inputs.world, *state, *memory)
         self.world = block.world
-        self.start_state = finger_start, world_start
-        self.state = finger_state, world_state
-        self.commands = arm, pressure
-        self.trace = trace
-        self.path = path
+        self.start_state = inputs.finger_start, inputs.world_start
+        self.state = state
+        self.commands = inputs.arm, inputs.pressure
+        self.trace = outputs.trace
+        self.path = outputs.path
 
     def start(self) -> None:
         """Copies the start state to the state."""
@@ -262,8 +336,8 @@ class BlockRollout:
 
         def body(carry: tuple) -> tuple:
             t, going = carry
-            now = self._number("step")
-            fastest = self._number("speed")
+            now = self._number(WorldState.step)
+            fastest = self._number(WorldState.speed)
 
             def undecided(distance: jax.Array, height: jax.Array) -> jax.Array:
                 return verdict.goes_on(bounds, distance, height, fastest, now, to_end=to_end)
@@ -283,14 +357,14 @@ class BlockRollout:
             # The first step also tells where worlds are that were decided before.
             return (carry[0] < steps) & (anywhere(carry[1] > 0) | (carry[0] == 0))
 
-        return jax.lax.while_loop(goes_on, body, (jnp.int32(0), self._number("going")))[0]
+        return jax.lax.while_loop(goes_on, body, (jnp.int32(0), self._number(WorldState.going)))[0]
 
     def repeat_last(self, done: jax.Array, steps: int) -> None:
         """Repeats the trace's last entries from step `done` on.
 
         They are those of decided worlds of a block that goes on: no residual, and their speed.
         """
-        last_speed = self._number("speed")
+        last_speed = self._number(WorldState.speed)
         none = jnp.zeros_like(last_speed)
         ended = {"speed": last_speed, "residual": none, "overflow": none}
         world = self.world
@@ -300,7 +374,7 @@ class BlockRollout:
             self._store_path(t)
             for k, name in enumerate(self.program.trace):
                 trace[t, k, world] = ended.get(name, trace[done - 1, k, world])
-            self._keep(step=self._number("step") + 1.0)
+            self._keep(step=self._number(WorldState.step) + 1.0)
             return x
 
         jax.lax.fori_loop(done, steps, repeat, jnp.int32(0))
@@ -321,7 +395,7 @@ class BlockRollout:
     def _store_path(self, t: jax.Array) -> None:
         """Stores the state before step t where it is part of the path."""
         for k, (stride, whole) in enumerate(self.path_parts):
-            target = self.path[2 * k : 2 * k + 2]
+            target = self.path[k]
             if stride == 1:
                 self._store_state(t, whole, *target)
             else:
@@ -336,6 +410,27 @@ class BlockRollout:
         angles, places = self.program.path_rows(whole)
         copy_rows((0, angles), lambda k: finger_state[(k,)], fingers, at=(place,))
         copy_rows((0, places), lambda k: world_state[k, world], worlds, world, at=(place,))
+
+
+def _with_shared_columns(block: Block, inputs: Inputs, outputs: Outputs) -> tuple[Inputs, Outputs]:
+    """References of which the lanes of a team share the columns."""
+
+    def share(table: Any) -> Any:
+        return shared_memory.SharedColumns(block, table)
+
+    return (
+        inputs._replace(
+            hand=share(inputs.hand),
+            finger_start=share(inputs.finger_start),
+            pressure=share(inputs.pressure),
+        ),
+        outputs._replace(
+            finger_state=share(outputs.finger_state),
+            scratch=share(outputs.scratch),
+            path=tuple(part._replace(finger=share(part.finger)) for part in outputs.path),
+            onchip=share(outputs.onchip),
+        ),
+    )
 
 
 def path_parts(trajectory: bool, states: int) -> list[tuple[int, bool]]:

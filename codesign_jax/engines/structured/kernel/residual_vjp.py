@@ -30,6 +30,21 @@ from codesign_jax.engines.structured.kernel.residual import (
     FastMotion,
     LinkMotion,
 )
+from codesign_jax.engines.structured.kernel.rows import (
+    Chain,
+    ChainBefore,
+    Contact,
+    Field,
+    Hand,
+    HeldBar,
+    PairBar,
+    PalmBar,
+    Remembered,
+    Slot,
+    Virtual,
+    World,
+    WorldOptions,
+)
 from codesign_jax.engines.structured.kernel.self_contacts import (
     BoundSelfContacts,
     FingerPairing,
@@ -46,7 +61,7 @@ from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model import held
 from codesign_jax.model.layout import touches_itself
 
-SHAPES = LinkMotion((3,), (3, 3), (6,), (6,), (6,), (6,))
+SHAPES = LinkMotion(*(getattr(Chain, name).shape for name in LinkMotion._fields))
 
 
 class ResidualVjp:
@@ -79,7 +94,7 @@ class ResidualVjp:
             self.object |= {"position": state["position"]}
         names = ("object_size", "grid_origin", "grid_cell", "grid_factor")
         self.object |= {n: step.constant(n) for n in names if n in step.world}
-        self.fixed: dict[str, Any] = {"object_id": step.constant("object_id")}
+        self.fixed: dict[str, Any] = {"object_id": step.constant(World.object_id)}
         self.fixed |= {"object_acc": bodies["now"].object_acc}
         self.fixed |= {"object_along": virtual.object_acc}
         if world_object.mesh is not None:
@@ -88,7 +103,7 @@ class ResidualVjp:
 
     def chain(self, i: Any) -> LinkMotion:
         """What the link before joint i hands on."""
-        names = (f"chain.{n}" for n in LinkMotion._fields)
+        names = (getattr(Chain, n) for n in LinkMotion._fields)
         return LinkMotion(*(self.scratch.read(n, i) for n in names))
 
     def fingers(self, pressure: Lanes, centre_bar: Lanes) -> tuple[LinkMotion, dict[str, Lanes]]:
@@ -120,16 +135,18 @@ class ResidualVjp:
 
     def more(self, bars: LinkMotion, i: Any) -> LinkMotion:
         """Adds what self-contacts have left for a link."""
-        if "pairbar.origin" not in self.scratch:
+        if PairBar.origin not in self.scratch:
             return bars
-        return _add(bars, **{n: self.scratch.read(f"pairbar.{n}", i) for n in BodyMotion._fields})
+        return _add(
+            bars, **{n: self.scratch.read(getattr(PairBar, n), i) for n in BodyMotion._fields}
+        )
 
     def _link(self, i: Any, after: LinkMotion, pressure: Lanes, centre_bar: Lanes) -> LinkMotion:
         numbers = self.step.link_constants(i)
         joint = self.step.joint(i)
         fixed = {"acc": joint.pop("acc"), "order": self.step.order(i)}
-        fixed["virtual"] = self.scratch.read("virtual", i)
-        weight = self.step.hand.read("centre_weight", i + 1)
+        fixed["virtual"] = self.scratch.read(Virtual.virtual, i)
+        weight = self.step.hand.read(Hand.centre_weight, i + 1)
         fixed["centre_bar"] = lanewise(jnp.multiply, centre_bar, weight)
         run = partial(residual.of_link, self.layout.scene)
         joint = joint | {"pressure": pressure}
@@ -159,11 +176,13 @@ class ResidualVjp:
         def link(i: Any, after: tuple) -> tuple:
             chain = self.chain(i)
             now = FastMotion(*(getattr(chain, n) for n in FastMotion._fields))
-            before = Before(*(self.scratch.read(f"before.{n}", i) for n in Before._fields))
+            before = Before(
+                *(self.scratch.read(getattr(ChainBefore, n), i) for n in Before._fields)
+            )
             constants = self.step.link_constants(i)
             numbers = {n: constants[n] for n in ("offset", "mass", "centre", "inertia")}
             joint = self.step.joint(i)
-            fixed = {"order": self.step.order(i), "virtual": self.scratch.read("virtual", i)}
+            fixed = {"order": self.step.order(i), "virtual": self.scratch.read(Virtual.virtual, i)}
             del joint["acc"]
             given = now, before, numbers, joint
             *bars, numbers, joint = pull(run, given, (fixed,), (*after, self.power_bar))
@@ -191,7 +210,7 @@ class ResidualVjp:
             middle = place + apply_columns(frame, stub)
             return turned, origin, sum(weight[k] * middle[k] for k in range(3))
 
-        weight = lanewise(jnp.multiply, centre_bar, read("centre_weight"))
+        weight = lanewise(jnp.multiply, centre_bar, read(Hand.centre_weight))
         given = (palm, *(read(n) for n in names))
         (place, frame), *bars = pull(
             run, given, (weight,), (base.frame, base.origin, self.power_bar)
@@ -213,8 +232,8 @@ class ResidualVjp:
             now.palm_acc,
             self.virtual.palm_acc,
         )
-        if "palmbar.origin" in self.scratch:
-            more = {n: self.scratch.read(f"palmbar.{n}") for n in BodyMotion._fields}
+        if PalmBar.origin in self.scratch:
+            more = {n: self.scratch.read(getattr(PalmBar, n)) for n in BodyMotion._fields}
             base = _add(base, **more)
         for i in range(self.layout.palm_groups if names else 0):
             for name in names:
@@ -293,11 +312,11 @@ class ResidualVjp:
     def held(self, name: str, i: Any) -> dict[str, Lanes]:
         """What an item's contacts hold of friction; nothing where they hold none."""
         contacts = self.contacts[name]
-        return {"held": contacts.read("held", i)} if contacts.set.holds else {}
+        return {"held": contacts.read(Contact.held, i)} if contacts.set.holds else {}
 
     def of_contacts(self, name: str, i: Any) -> dict[str, Lanes]:
         """What an item's contacts have that has no derivative, by name."""
-        names = ["share", *["held_bar"] * self.contacts[name].set.holds]
+        names = [Contact.share, *[HeldBar.held_bar] * self.contacts[name].set.holds]
         return {n: self.contacts[name].read(n, i) for n in names}
 
     def _object(self, name: str) -> dict[str, Lanes]:
@@ -357,7 +376,7 @@ class SelfContactsVjp:
     def run(self) -> None:
         def clear(i: jax.Array, x: jax.Array) -> jax.Array:
             for name in BodyMotion._fields:
-                name = f"pairbar.{name}"
+                name = getattr(PairBar, name)
                 self.scratch.write(name, zeros(self.scratch.shape(name), self.like), i)
             return x
 
@@ -371,10 +390,10 @@ class SelfContactsVjp:
 
         def slot(item: Any, pairing: FingerPairing) -> None:
             read = self.contacts.read
-            owner = read("owner", item).lane > 0.5
-            live = owner & (read("share", item).lane > 0)
+            owner = read(Remembered.owner, item).lane > 0.5
+            live = owner & (read(Contact.share, item).lane > 0)
             if pairing.itself is not None:
-                other = read("other", item).lane.astype(jnp.int32)
+                other = read(Slot.other, item).lane.astype(jnp.int32)
                 if effects.finger_palm:
                     palm = live & pairing.itself & (other == 0)
                     any_of(palm, lambda: self._on_palm(item, palm))
@@ -398,7 +417,12 @@ class SelfContactsVjp:
         palm = self._body(jnp.zeros_like(row))._replace(
             origin=bodies["place"], frame=bodies["frame"]
         )
-        args = (self._body(row), ring), palm, step.constant("palm_disc"), step.constant(ON_PALM)
+        args = (
+            (self._body(row), ring),
+            palm,
+            step.constant(WorldOptions.palm_disc),
+            step.constant(ON_PALM),
+        )
         run = partial(residual.on_palm, self.layout.scene)
         (place, ring_bar), palm, disc, cone = only_on(
             self._side(live), pull(run, args, (), self._power_bar)
@@ -410,7 +434,7 @@ class SelfContactsVjp:
 
     def _leave_palm(self, bars: BodyMotion, *, first: bool = False) -> None:
         for name, value in bars._asdict().items():
-            name = f"palmbar.{name}"
+            name = getattr(PalmBar, name)
             if not first:
                 value = plus(self.scratch.read(name), value)
             self.scratch.write(name, value)
@@ -419,7 +443,9 @@ class SelfContactsVjp:
 
     def _spheres(self, item: Any, pairing: FingerPairing, live: jax.Array) -> None:
         number, row, ring = self._ring(item)
-        other = jax.lax.div(self.contacts.read("ring", item).lane.astype(jnp.int32), self._count)
+        other = jax.lax.div(
+            self.contacts.read(Remembered.ring, item).lane.astype(jnp.int32), self._count
+        )
         theirs = (
             self._body(row_of(other, self.layout.rings_per_link), pairing.lane),
             self._numbers(other, pairing),
@@ -437,7 +463,7 @@ class SelfContactsVjp:
 
     def _on_finger(self, item: Any, pairing: FingerPairing, live: jax.Array) -> None:
         """Adds the cotangents of a ring and of another finger's segment."""
-        row = self.contacts.read("row", item)
+        row = self.contacts.read(Slot.row, item)
         other = pairing.swap(row).lane.astype(jnp.int32)
         fixed = {"end": self._float(1)}
         theirs = self._rings(item, pairing, live, other, pairing.lane, fixed)
@@ -446,7 +472,7 @@ class SelfContactsVjp:
 
     def _on_itself(self, item: Any, pairing: FingerPairing, live: jax.Array) -> None:
         """Adds the cotangents of a ring and of its own finger's segment."""
-        other = self.contacts.read("other", item).lane.astype(jnp.int32)
+        other = self.contacts.read(Slot.other, item).lane.astype(jnp.int32)
         search = self.sweep.step.search
         assert search is not None
         end = search.last_of(self._ring(item)[0], other)
@@ -460,10 +486,10 @@ class SelfContactsVjp:
         """Adds the cotangents of a ring; returns those of the segment that it touches."""
         number, row, ring = self._ring(item)
         before, link, after = self_collision.neighbours(other, self.layout.links)
-        frames = tuple(self._chain("frame", r, lane) for r in (before, after))
+        frames = tuple(self._chain(Chain.frame, r, lane) for r in (before, after))
         sections = [self._numbers(n, pairing, lane) for n in self._sections(other)]
         line = CentreLineSegment(
-            self._body(link, lane), self._chain("origin", after, lane), frames, *sections
+            self._body(link, lane), self._chain(Chain.origin, after, lane), frames, *sections
         )
         fixed |= {
             "last": self._float(jnp.where(other == self.layout.links, self.like + 1.0, self.like))
@@ -516,25 +542,25 @@ class SelfContactsVjp:
 
     def _ring(self, item: Any) -> tuple[jax.Array, jax.Array, Lanes]:
         """Number of a slot's ring, its link and its numbers."""
-        number = self.contacts.read("ring", item).lane.astype(jnp.int32)
+        number = self.contacts.read(Remembered.ring, item).lane.astype(jnp.int32)
         number = jax.lax.rem(number, self._count)
-        ring = self.hand.gather("ring", number, self.lane)
+        ring = self.hand.gather(Hand.ring, number, self.lane)
         return number, row_of(number, self.layout.rings_per_link), ring
 
     def _numbers(self, number: jax.Array, pairing: FingerPairing, lane: Any = None) -> Lanes:
         lane = pairing.lane if lane is None else lane
-        return self.hand.gather("ring", number, lane)
+        return self.hand.gather(Hand.ring, number, lane)
 
     def _body(self, row: jax.Array, lane: Any = None) -> BodyMotion:
-        return BodyMotion(*(self._chain(n, row, lane) for n in BodyMotion._fields))
+        return BodyMotion(*(self._chain(getattr(Chain, n), row, lane) for n in BodyMotion._fields))
 
-    def _chain(self, name: str, row: jax.Array, lane: Any = None) -> Lanes:
+    def _chain(self, name: Field, row: jax.Array, lane: Any = None) -> Lanes:
         lane = self.lane if lane is None else lane
-        return self.scratch.gather(f"chain.{name}", row, lane)
+        return self.scratch.gather(name, row, lane)
 
     def _leave(self, values: dict[str, Lanes], row: jax.Array) -> None:
         for name, value in values.items():
-            name = f"pairbar.{name}"
+            name = getattr(PairBar, name)
             old = self.scratch.gather(name, row, self.lane)
             self.scratch.scatter(name, plus(old, value), row, self.lane)
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.kernel import friction_memory
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import anywhere, choose, loop
+from codesign_jax.engines.structured.kernel.rows import Search
 from codesign_jax.engines.structured.kernel.self_contacts import FingerPairing
 from codesign_jax.engines.structured.kernel.shared_memory import where
 from codesign_jax.engines.structured.kernel.slots import any_of
@@ -41,7 +42,7 @@ class RingPairs:
         self.first = first
         number = jnp.where(first, jnp.int32(1), jnp.int32(0))
         self.second = pairing.swap(lanes([number], (), wide=True)).lane > 0
-        mine = search.read("fastest")
+        mine = search.read(Search.fastest)
         reach = search.reach(search.largest())
         self.their_reach = self._second_finger(reach)
         their_speed = self._second_finger(mine)
@@ -64,7 +65,7 @@ class RingPairs:
         search = self.search
 
         def copy(i: Any, nothing: list) -> list:
-            search.write("other", self._second_finger(search.read("line", i)), i)
+            search.write(Search.other, self._second_finger(search.read(Search.line, i)), i)
             return nothing
 
         size = search.block.size
@@ -113,7 +114,7 @@ class RingPairs:
         """
         search = self.search
         reach = self.mixed(search.reach(first[1]), search.reach(second[1]))
-        square, other, t = search.nearest("other", centre)
+        square, other, t = search.nearest(Search.other, centre)
         near = looks & search.near(square, reach, self.their_reach, self.speed)
 
         def enter() -> None:

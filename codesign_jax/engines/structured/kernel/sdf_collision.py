@@ -15,6 +15,13 @@ from codesign_jax.engines.structured.kernel import friction_memory, objects
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.problem import relative
+from codesign_jax.engines.structured.kernel.rows import (
+    Contact,
+    Hand,
+    Side,
+    WorldOptions,
+    WorldState,
+)
 from codesign_jax.engines.structured.kernel.self_collision import SelfCollision, closed
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
@@ -50,7 +57,7 @@ class SdfCollision:
         """The object, or table and fixtures: from points (3, k) to distances (k,) and gradients."""
         if name.endswith("_object"):
             return [self._object]
-        position = self.step.world_state.read("position")
+        position = self.step.world_state.read(WorldState.position)
         return [
             partial(lanewise, field, position) for field in surroundings.fields(self.layout.scene)
         ]
@@ -67,7 +74,8 @@ class SdfCollision:
             return None
         which = surroundings.touched(self.layout.scene, name, count)
         return lanewise(
-            lambda v: jnp.stack([v[i] for i in which])[None], self.step.constant("friction")
+            lambda v: jnp.stack([v[i] for i in which])[None],
+            self.step.constant(WorldOptions.friction),
         )
 
     def moves(self, name: str, link_acc: Lanes | None, vel: Lanes | None) -> tuple[Lanes, Lanes]:
@@ -104,7 +112,9 @@ class SdfCollision:
             ) -> list:
                 row, numbers, frame, centre = search.body(item)
                 numbers, centre = (lanewise(as_item, v) for v in (numbers, centre))
-                moves = self.moves(name, *(search.side_of(n, row) for n in ("link_acc", "vel")))
+                moves = self.moves(
+                    name, *(search.side_of(n, row) for n in (Side.link_acc, Side.vel))
+                )
                 hold = friction_memory.of_ring(self.step, contacts, item)
                 self.on_field(name, slot, numbers, frame, centre, moves, hold)
                 return nothing
@@ -139,7 +149,7 @@ class SdfCollision:
         )  # the table comes first
         most = self.closing_gap(numbers, centre, moves[1])
         near = [lanewise(may_touch, numbers, first[0], most).lane for first in seen]
-        contacts.write("share", zeros((contacts.set.k,), self.step.like), i)
+        contacts.write(Contact.share, zeros((contacts.set.k,), self.step.like), i)
 
         def look_again() -> None:
             faced = []
@@ -166,7 +176,7 @@ class SdfCollision:
         bodies = self.bodies
         palm = [name for name in ("palm_object", "palm_table") if name in self.contacts]
         for i in range(layout.palm_groups if palm else 0):
-            numbers = lanewise(as_item, self.step.hand.read("palm_ring", i))
+            numbers = lanewise(as_item, self.step.hand.read(Hand.palm_ring, i))
             centre = lanewise(ring_centres, bodies["place"], bodies["frame"], numbers)
             for name in palm:
                 moves = self.moves(name, None, None)

@@ -23,6 +23,16 @@ from codesign_jax.engines.structured.kernel.contact_sets import (
 )
 from codesign_jax.engines.structured.kernel.memory import BoundTable, loop, solid
 from codesign_jax.engines.structured.kernel.ring_pairs import RingPairs
+from codesign_jax.engines.structured.kernel.rows import (
+    Contact,
+    Field,
+    Hand,
+    Remembered,
+    Search,
+    Side,
+    Slot,
+    WorldOptions,
+)
 from codesign_jax.engines.structured.kernel.self_contacts import (
     BoundSelfContacts,
     FingerPairing,
@@ -55,15 +65,6 @@ SURFACE_RADIUS = 4.0
 the speed with which it moves as the link turns [ours]."""
 
 
-def fields(links: int) -> dict[str, tuple[int, tuple[int, ...]]]:
-    """Where the fingers are, for the lanes of the others."""
-    rows = links + 1
-    rows_by_name = {"frame": (rows, (3, 3)), "joint": (rows, (3,)), "end": (rows + 1, (3,))}
-    rows_by_name |= {"line": (rows, (7,)), "other": (rows, (7,))}
-    rows_by_name |= {"fastest": (1, ()), "other_size": (1, (2,))}
-    return {f"pair.{name}": group for name, group in rows_by_name.items()}
-
-
 class SelfCollision:
     """Gives a slot to each contact of fingers with one another, with themselves and the palm."""
 
@@ -79,27 +80,28 @@ class SelfCollision:
         self.hull = step.layout.scene.effects.surface == "hull"
         self.palm = None
         if step.layout.scene.effects.finger_palm:
-            self.palm = bodies["place"], bodies["frame"], step.constant("palm_disc")
+            self.palm = bodies["place"], bodies["frame"], step.constant(WorldOptions.palm_disc)
 
     # Where fingers are
 
-    def write(self, name: str, value: Lanes, item: Any = 0) -> None:
-        self.scratch.write(f"pair.{name}", value, item)
+    def write(self, name: Field, value: Lanes, item: Any = 0) -> None:
+        """Stores a field of `rows.Search` of the lanes' own fingers."""
+        self.scratch.write(name, value, item)
 
-    def read(self, name: str, item: Any = 0, lane: jax.Array | None = None) -> Lanes:
+    def read(self, name: Field, item: Any = 0, lane: jax.Array | None = None) -> Lanes:
         """Where the lanes' own fingers are, or those of other lanes; items may be of lanes."""
         if lane is None and not jnp.ndim(item):
-            return self.scratch.read(f"pair.{name}", item)
-        return self._gathered(self.scratch, f"pair.{name}", item, lane)
+            return self.scratch.read(name, item)
+        return self._gathered(self.scratch, name, item, lane)
 
-    def _gathered(self, table: BoundTable, name: str, item: Any, lane: Any) -> Lanes:
+    def _gathered(self, table: BoundTable, name: Field, item: Any, lane: Any) -> Lanes:
         item = jnp.zeros_like(self.block.column) + item
         return table.gather(name, item, self.block.column if lane is None else lane)
 
     def ring(self, item: Any, lane: jax.Array | None = None) -> Lanes:
         if lane is None and not jnp.ndim(item):
-            return self.step.hand.read("ring", item)
-        return self._gathered(self.step.hand, "ring", item, lane)
+            return self.step.hand.read(Hand.ring, item)
+        return self._gathered(self.step.hand, Hand.ring, item, lane)
 
     def ring_at(self, row: Any) -> Any:
         """The ring whose section a finger has where a segment of its centre line begins.
@@ -121,48 +123,60 @@ class SelfCollision:
         for row in range(self.contacts.set.rows):
             self.contacts.clear(row)
         friction_memory.clear(self.step)
-        self.write("fastest", zeros((), self.like))
+        self.write(Search.fastest, zeros((), self.like))
         self._side(0, link_acc, vel, frame, base)
-        self.write("end", lanewise(above, base, frame, frame, self.ring(self.ring_at(0))), 0)
+        self.write(Search.end, lanewise(above, base, frame, frame, self.ring(self.ring_at(0))), 0)
 
     def link(self, i: Any, link_acc: Lanes, vel: Lanes, frame: Lanes, origin: Lanes) -> None:
-        before = self.read("frame", i)
+        before = self.read(Search.frame, i)
         self._side(i + 1, link_acc, vel, frame, origin)
         numbers = self.ring(self.ring_at(i + 1))
-        self.write("end", lanewise(above, origin, before, frame, numbers), i + 1)
-        size = self.read("fastest"), vel, self.palm_vel, origin, self.ring(0)
-        self.write("fastest", lanewise(_faster, *size))
+        self.write(Search.end, lanewise(above, origin, before, frame, numbers), i + 1)
+        size = self.read(Search.fastest), vel, self.palm_vel, origin, self.ring(0)
+        self.write(Search.fastest, lanewise(_faster, *size))
 
     def _side(self, row: Any, link_acc: Lanes, vel: Lanes, frame: Lanes, joint: Lanes) -> None:
-        self.contacts.put("link_acc", link_acc, row)
-        self.contacts.put("vel", vel, row)
-        self.write("frame", frame, row)
-        self.write("joint", joint, row)
+        self.contacts.put(Side.link_acc, link_acc, row)
+        self.contacts.put(Side.vel, vel, row)
+        self.write(Search.frame, frame, row)
+        self.write(Search.joint, joint, row)
 
-    def side_of(self, name: str, row: Any, lane: jax.Array | None = None) -> Lanes:
-        """Links' "link_acc" or "vel", see `BoundSelfContacts.put`; arguments as `read`."""
+    def _copy_line(self, pairing: FingerPairing, i: Any) -> None:
+        """Copies a segment of the other finger's centre line."""
+        self.write(Search.other, pairing.swap(self.read(Search.line, i)), i)
+
+    def side_of(self, name: Field, row: Any, lane: jax.Array | None = None) -> Lanes:
+        """A field of `rows.Side` of bodies, of the lanes' own fingers or those of other lanes."""
         if lane is None and not jnp.ndim(row):
-            return self.contacts.table.read(f"side.{name}", row)
-        return self._gathered(self.contacts.table, f"side.{name}", row, lane)
+            return self.contacts.table.read(name, row)
+        return self._gathered(self.contacts.table, name, row, lane)
 
     def _lines(self) -> None:
         """Ends the centre lines at the tips' rings; stores their segments."""
         tip = self.ring(self.count - 1)
-        place = self.read("joint", self.layout.links), self.read("frame", self.layout.links)
-        self.write("end", lanewise(ring_centre, *place, tip), self.layout.links + 1)
+        place = (
+            self.read(Search.joint, self.layout.links),
+            self.read(Search.frame, self.layout.links),
+        )
+        self.write(Search.end, lanewise(ring_centre, *place, tip), self.layout.links + 1)
 
         def segment(row: Any) -> None:
-            ends = self.read("end", row), self.read("end", row + 1)
-            self.write("line", lanewise(_line, *ends), row)
+            ends = self.read(Search.end, row), self.read(Search.end, row + 1)
+            self.write(Search.line, lanewise(_line, *ends), row)
 
         each(self.layout.links + 1, segment)
 
     def body(self, item: Any) -> tuple[Any, Lanes, Lanes, Lanes]:
         """A ring's link, its numbers, the link's frame and the ring's centre."""
         row = jax.lax.div(item, jnp.full_like(item, self.layout.rings_per_link)) + 1
-        frame = self.read("frame", row)
+        frame = self.read(Search.frame, row)
         numbers = self.ring(item)
-        return row, numbers, frame, lanewise(ring_centre, self.read("joint", row), frame, numbers)
+        return (
+            row,
+            numbers,
+            frame,
+            lanewise(ring_centre, self.read(Search.joint, row), frame, numbers),
+        )
 
     def find(self) -> None:
         scene = self.layout.scene
@@ -184,10 +198,9 @@ class SelfCollision:
                 return x
             if self.hull:
                 # The segments of the other finger's centre line.
-                copy = lambda i: self.write("other", pairing.swap(self.read("line", i)), i)  # noqa: E731, B023
-                each(self.layout.links + 1, copy)
-                size = lanewise(_stacked, self.reach(self.largest()), self.read("fastest"))
-                self.write("other_size", pairing.swap(size))
+                each(self.layout.links + 1, partial(self._copy_line, pairing))
+                size = lanewise(_stacked, self.reach(self.largest()), self.read(Search.fastest))
+                self.write(Search.other_size, pairing.swap(size))
             search = self._on_finger if self.hull else self._on_spheres
             self._each_ring(0, lambda *ring: search(row, pairing, owner, *ring))
             return x
@@ -241,8 +254,8 @@ class SelfCollision:
 
     def _sphere(self, i: Any) -> Lanes:
         """Middle and radius [m] of the sphere around a link, as high as its section, (4,)."""
-        where = self.read("joint", i + 1), self.read("frame", i + 1)
-        return lanewise(_sphere, *where, self.step.hand.read("centre", i))
+        where = self.read(Search.joint, i + 1), self.read(Search.frame, i + 1)
+        return lanewise(_sphere, *where, self.step.hand.read(Hand.centre, i))
 
     # Contacts
 
@@ -300,11 +313,11 @@ class SelfCollision:
         place, jar = lanewise(run, place, cone, *moves)
         for g in held:
             jar = lanewise(_with_held, jar, place, cone, g)
-        return kept(place, jar) | {"row": self._number(row)}
+        return kept(place, jar) | {Slot.row: self._number(row)}
 
     def moves(self, row: Any, lane: jax.Array | None = None) -> list[Lanes]:
         """Accelerations and velocities of links; arguments as `read`."""
-        return [self.side_of(name, row, lane) for name in ("link_acc", "vel")]
+        return [self.side_of(name, row, lane) for name in (Side.link_acc, Side.vel)]
 
     def of_rows(
         self, read: Callable, row: jax.Array, which: jax.Array, pairing: FingerPairing | None
@@ -350,9 +363,9 @@ class SelfCollision:
           candidate: See `begun`.
           other: Link of the other side, 0 for the palm; `item`: the ring.
         """
-        candidate |= {"other": self._number(other)}
-        candidate |= self.contacts.remembered({"owner": 1.0, "ring": item})
-        which = mine & (candidate["share"].lane > 0)
+        candidate |= {Slot.other: self._number(other)}
+        candidate |= self.contacts.remembered({Remembered.owner: 1.0, Remembered.ring: item})
+        which = mine & (candidate[Contact.share].lane > 0)
         any_of(which, lambda: self.contacts.add(0, which, candidate, self.block.column))
 
     def _on_palm(self, item: Any, mine: jax.Array) -> None:
@@ -363,7 +376,7 @@ class SelfCollision:
 
         field = look(centre)
         place = lanes([self.like + jnp.asarray(row, self.like.dtype)], (), wide=True)
-        sizes = self.step.hand.read("offset", 0), self.ring(0)
+        sizes = self.step.hand.read(Hand.offset, 0), self.ring(0)
         mine = mine & (lanewise(free_of_palm, place, numbers, *sizes).lane > 0)
         near = self._near_palm(field[0], numbers)
 
@@ -380,7 +393,7 @@ class SelfCollision:
             def add_ring(_: jax.Array) -> None:
                 add(lanewise(touch.ring_place, numbers, frame, centre, faced))
 
-            self.if_close(mine, faced, self.read("fastest"), add_ring)
+            self.if_close(mine, faced, self.read(Search.fastest), add_ring)
 
         def enter_ball() -> None:
             add(lanewise(touch.ball_on_field, numbers, centre, *field))
@@ -390,14 +403,14 @@ class SelfCollision:
     def _near_palm(self, distance: Lanes, numbers: Lanes) -> jax.Array:
         size = lanewise(jnp.maximum, distance, zeros((), self.like)).lane
         none = zeros((), self.like)
-        return self.near(size * size, self.reach(numbers), none, self.read("fastest"))
+        return self.near(size * size, self.reach(numbers), none, self.read(Search.fastest))
 
     def _on_itself(self, item: Any, mine: jax.Array) -> None:
         row, numbers, frame, centre = self.body(item)
-        square, other, t = self.nearest("line", centre, item)
+        square, other, t = self.nearest(Search.line, centre, item)
         theirs = self.largest() if self.layout.tapered else numbers
         reaches = self.reach(numbers), self.reach(theirs)
-        near = mine & self.near(square, *reaches, self.read("fastest"))
+        near = mine & self.near(square, *reaches, self.read(Search.fastest))
 
         def enter() -> None:
             segment, moves = self.of_rows(self.segment, other, near, None)
@@ -411,7 +424,7 @@ class SelfCollision:
                 )
                 self._alone(candidate, other, item, close)
 
-            self.if_close(near, faced, self.read("fastest"), add)
+            self.if_close(near, faced, self.read(Search.fastest), add)
 
         any_of(near, enter)
 
@@ -446,9 +459,9 @@ class SelfCollision:
         self, row: Any, pairing: FingerPairing, owner: jax.Array, item: Any, mine: Any
     ) -> None:
         link, numbers, frame, centre = self.body(item)
-        square, other, t = self.nearest("other", centre)
-        theirs = self.read("other_size")
-        speed = lanewise(jnp.add, self.read("fastest"), theirs[1])
+        square, other, t = self.nearest(Search.other, centre)
+        theirs = self.read(Search.other_size)
+        speed = lanewise(jnp.add, self.read(Search.fastest), theirs[1])
         near = owner & mine & self.near(square, self.reach(numbers), theirs[0], speed)
 
         def enter() -> None:
@@ -487,23 +500,30 @@ class SelfCollision:
           item: The ring.
           second: Lanes of the other finger, if they have looked; else the owners have.
         """
-        which = near & (contact["share"].lane > 0)
-        step = contact["step"]
-        mine = {name: value for name, value in contact.items() if name != "step"}
-        theirs = mine | {"row": self._number(other)}
-        theirs |= {name: lanewise(jnp.negative, mine[name]) for name in ("normal", "jar")}
-        none = {"other": zeros((1, 1), self.like)} if self.contacts.set.with_itself else {}
+        which = near & (contact[Contact.share].lane > 0)
+        step = contact[Contact.step]
+        mine = {name: value for name, value in contact.items() if name != Contact.step}
+        theirs = mine | {Slot.row: self._number(other)}
+        theirs |= {
+            name: lanewise(jnp.negative, mine[name]) for name in (Contact.normal, Contact.jar)
+        }
+        none = {Slot.other: zeros((1, 1), self.like)} if self.contacts.set.with_itself else {}
 
-        alike = self.contacts.remembered({"owner": owner, "ring": item}) | none | {"step": step}
+        alike = (
+            self.contacts.remembered({Remembered.owner: owner, Remembered.ring: item})
+            | none
+            | {Contact.step: step}
+        )
         fields = (mine, theirs) if second is None else (theirs, mine)
         finder = owner if second is None else second
         any_of(which, lambda: self.contacts.enter(row, which, finder, *fields, alike))
 
-    def nearest(self, name: str, centre: Lanes, itself: Any = None) -> tuple:
+    def nearest(self, name: Field, centre: Lanes, itself: Any = None) -> tuple:
         """The nearest place of a centre line: squared distance, segment, and where along it.
 
         Args:
-          name: "line", the finger's own, or "other"; `itself`: the ring on the finger's own line.
+          name: `Search.line`, the finger's own, or `Search.other`.
+          itself: The ring on the finger's own line.
         """
         last = self.layout.links
 
@@ -536,8 +556,8 @@ class SelfCollision:
 
     def segment(self, row: Any, lane: jax.Array | None = None) -> tuple[tuple, list[Lanes]]:
         """Segments' ends, frames and sections, and their links' `moves`; arguments as `read`."""
-        frames = tuple(self.read("frame", r, lane) for r in neighbours(row, self.layout.links))
-        ends = self.read("end", row, lane), self.read("end", row + 1, lane)
+        frames = tuple(self.read(Search.frame, r, lane) for r in neighbours(row, self.layout.links))
+        ends = self.read(Search.end, row, lane), self.read(Search.end, row + 1, lane)
         return (ends, frames, self.ring(self.ring_at(row + 1), lane)), self.moves(row, lane)
 
     def facing(

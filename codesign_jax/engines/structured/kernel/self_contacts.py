@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from codesign_jax.engines.structured.kernel import rows
 from codesign_jax.engines.structured.kernel.contact_sets import ContactSet, zeros
 from codesign_jax.engines.structured.kernel.memory import (
     Block,
@@ -27,6 +28,8 @@ from codesign_jax.engines.structured.kernel.memory import (
     solid,
     tree_add_scaled,
 )
+from codesign_jax.engines.structured.kernel.rows import Contact, Field, Group, Rows, Side, Slot
+from codesign_jax.engines.structured.kernel.shared_memory import TEAM
 from codesign_jax.engines.structured.kernel.slots import BoundSlots, SlotSet, any_of
 from codesign_jax.engines.structured.lanes import dot, sum_axis, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -34,16 +37,6 @@ from codesign_jax.engines.structured.laws import contact
 from codesign_jax.engines.structured.laws.rings import Place
 from codesign_jax.model.layout import touches_itself
 from codesign_jax.scene import Scene
-
-CONJUGATE_GRADIENTS = (
-    "first_response",
-    "residual",
-    "response",
-    "direction",
-    "direction_response",
-    "force",
-)
-"""What conjugate gradients keep of a slot, see `coupling`."""
 
 
 class FingerPairing:
@@ -110,7 +103,7 @@ class SelfContactSet(SlotSet):
         slots: int,
         *,
         gathers: bool,
-        remembers: tuple[str, ...] = (),
+        remembers: tuple[type[Rows], ...] = (),
     ):
         fingers, worlds = block
         e = scene.effects
@@ -121,17 +114,8 @@ class SelfContactSet(SlotSet):
         super().__init__(scene, *sizes, gathers=gathers, remembers=remembers)
         self.block = block
         self.links = links
-        self.more = {"row": 1, "hessian": 6}
-        self.more |= dict.fromkeys(CONJUGATE_GRADIENTS, 3)
-        if self.with_itself:
-            self.more |= {"other": 1}
-        # The fields of a slot that say which link each lane's side is on.
-        self.row_fields = ("row", "other") if self.with_itself else ("row",)
-        if not gathers:
-            for field in self.row_fields:
-                self.more |= {f"{field}_listed": 1, f"{field}_count": 1}
 
-    def cone_rows(self) -> dict[str, tuple[int, tuple[int, ...]]]:
+    def cone_rows(self) -> dict[str, Group]:
         """See `ContactSet`; one cone between fingers and one on the palm, if there are both."""
         (shape,) = super().cone_rows().values()
         return {f"cone.{name}": shape for name in self._names()}
@@ -142,10 +126,17 @@ class SelfContactSet(SlotSet):
         on = {"finger_finger": between, "finger_palm": e.finger_palm}
         return [name for name in on if on[name]]
 
-    def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
+    in_teams = False
+    """Whether the lanes of teams share slots."""
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """See `ContactSet`."""
+        return super().sizes | {rows.BODY: self.links + 1, rows.SPARE: TEAM - 6}
+
+    def groups(self) -> dict[str, Group]:
         """See `ContactSet`; and the sides of all fingers, from the palm to the tips."""
-        sides = {f"side.{name}": (self.links + 1, (6,)) for name in ("link_acc", "vel", "wrench")}
-        return super().groups() | sides
+        return super().groups() | Side.groups(self, self.sizes)
 
     def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundSelfContacts":
         cones = {name: self.cone(read, name) for name in self._names()}
@@ -179,8 +170,8 @@ class BoundSelfContacts(BoundSlots):
         """The larger of a depth and those of the fingers' contacts with the palm [m]."""
 
         def deeper(item: Any, depth: Lanes) -> Lanes:
-            fields = (self.read(name, item)[0] for name in ("share", "gap"))
-            return lanewise(_deeper_in_palm, depth, self.read("other", item)[0, 0], *fields)
+            fields = (self.read(name, item)[0] for name in (Contact.share, Contact.gap))
+            return lanewise(_deeper_in_palm, depth, self.read(Slot.other, item)[0, 0], *fields)
 
         return self.fold(0, deeper, depth)
 
@@ -204,7 +195,7 @@ class BoundSelfContacts(BoundSlots):
         """Within this context contacts have the cone of a row's slot, or of the palm's."""
         mixed = item is not None and self.set.with_itself and touches_itself(self.set.scene)
         before = self.cone
-        self.cone = self.of_row(row, self.read("other", item).lane if mixed else None)
+        self.cone = self.of_row(row, self.read(Slot.other, item).lane if mixed else None)
         yield
         self.cone = before
 
@@ -212,17 +203,17 @@ class BoundSelfContacts(BoundSlots):
         """One for contacts whose friction is kept, zero for those with the palm."""
         kept = jnp.ones_like(self.like)
         if pairing.itself is not None:
-            palm = pairing.itself & (self.read("other", item).lane < 0.5)
+            palm = pairing.itself & (self.read(Slot.other, item).lane < 0.5)
             kept = jnp.where(palm, 0.0, kept)
         return lanes([kept], (), wide=True)
 
-    def put(self, name: str, value: Lanes, row: Any) -> None:
-        """Stores a link's "link_acc", "vel" or "wrench"; row 0 is the palm's."""
-        self.table.write(f"side.{name}", value, row)
+    def put(self, name: Field, value: Lanes, row: Any) -> None:
+        """Stores a field of `rows.Side` of a body; row 0 is the palm's."""
+        self.table.write(name, value, row)
 
     def wrench_on(self, row: Any) -> Lanes:
         """Wrench of all contacts on a link, (6, ...)."""
-        return self.table.read("side.wrench", row)
+        return self.table.read(Side.wrench, row)
 
     def rows(self) -> int:
         return self.set.links + 1
@@ -240,13 +231,13 @@ class BoundSelfContacts(BoundSlots):
           mine: What the finder keeps, by field; `other`: its partner; `alike`: each of its own
             side.
         """
-        share = lanewise(_only_where, lanes([which], (), wide=True), other["share"])
-        theirs = self.pairing(row).swap(other | {"share": share})
+        share = lanewise(_only_where, lanes([which], (), wide=True), other[Contact.share])
+        theirs = self.pairing(row).swap(other | {Contact.share: share})
         side = lanes([owner], (), wide=True)
         fields = {
             field: lanewise(jnp.where, side, value, theirs[field]) for field, value in mine.items()
         }
-        touch = which | (~owner & (fields["share"].lane > 0))
+        touch = which | (~owner & (fields[Contact.share].lane > 0))
         self.add(row, touch, fields | alike, self.block.column)
 
     def each(self, body: Callable, start: Any) -> Any:
@@ -295,7 +286,7 @@ class BoundSelfContacts(BoundSlots):
         contacts = self.set.contacts
         place = self.place(item)
 
-        def of_side(field: str) -> Lanes:
+        def of_side(field: Field) -> Lanes:
             link_acc = self._on_rows(item, field)
 
             def moved(place, cone, link_acc):
@@ -303,22 +294,22 @@ class BoundSelfContacts(BoundSlots):
 
             return lanewise(moved, place, self.cone, link_acc)
 
-        mine = of_side("row")
+        mine = of_side(Slot.row)
         if pairing.itself is None:
             return lanewise(jnp.subtract, mine, pairing.swap(mine))
-        ways = (lambda: of_side("other")), (lambda: pairing.swap(mine))
+        ways = (lambda: of_side(Slot.other)), (lambda: pairing.swap(mine))
         theirs = either(anywhere(pairing.itself), *ways, self.set.size)
         return lanewise(jnp.subtract, mine, theirs)
 
-    def _on_rows(self, item: Any, field: str) -> Lanes:
+    def _on_rows(self, item: Any, field: Field) -> Lanes:
         """Accelerations of the links in a field of a slot's lanes; zeros where nothing touches."""
         if self.set.gathers:
             row = self.read(field, item).lane.astype(jnp.int32)
-            return self.table.gather("side.link_acc", row, self.block.column)
+            return self.table.gather(Side.link_acc, row, self.block.column)
         start = zeros((6,), self.like)
 
         def take(row: Any, chosen: jax.Array, accs: Lanes) -> Lanes:
-            new = self.table.read("side.link_acc", row)
+            new = self.table.read(Side.link_acc, row)
             return lanewise(jnp.where, lanes([chosen], (), wide=True), new, accs)
 
         return self._each_row(item, field, take, start)
@@ -330,13 +321,13 @@ class BoundSelfContacts(BoundSlots):
             return
 
         def store(item: Any, pairing: FingerPairing) -> None:
-            self._list_rows(item, "row")
+            self._list_rows(item, Slot.row)
             if pairing.itself is not None:
-                any_of(pairing.itself, lambda: self._list_rows(item, "other"))
+                any_of(pairing.itself, lambda: self._list_rows(item, Slot.other))
 
         self.do(store)
 
-    def _list_rows(self, item: Any, field: str) -> None:
+    def _list_rows(self, item: Any, field: Field) -> None:
         """Lists the different rows at which a slot's lanes touch.
 
         The k-th row is stored on the k-th lane of the field's list, their number on all lanes.
@@ -356,12 +347,12 @@ class BoundSelfContacts(BoundSlots):
         self.write(f"{field}_listed", lanes([listed], (1, 1), wide=True), item)
         self.write(f"{field}_count", lanes([counts], (1, 1), wide=True), item)
 
-    def _touched_rows(self, item: Any, field: str) -> jax.Array:
+    def _touched_rows(self, item: Any, field: Field) -> jax.Array:
         """Row of each lane's side of a slot, int32, shape (lane,); -1 where nothing touches."""
-        touches = self.read("share", item).lane > 0
+        touches = self.read(Contact.share, item).lane > 0
         return jnp.where(touches, self.read(field, item).lane.astype(jnp.int32), -1)
 
-    def _each_row(self, item: Any, field: str, body: Callable, start: Any) -> Any:
+    def _each_row(self, item: Any, field: Field, body: Callable, start: Any) -> Any:
         """Folds body(row, lanes that touch there, tree of lanes) over the rows of a slot's lanes.
 
         Few lanes of a block touch in one slot, at two rows if it is one contact: on CPUs whose
@@ -383,7 +374,7 @@ class BoundSelfContacts(BoundSlots):
 
     def clear_wrenches(self) -> None:
         def clear(row: Any, x: jax.Array) -> jax.Array:
-            self.put("wrench", zeros((6,), self.like), row)
+            self.put(Side.wrench, zeros((6,), self.like), row)
             return x
 
         jax.lax.fori_loop(0, self.rows(), clear, jnp.int32(0))
@@ -392,25 +383,25 @@ class BoundSelfContacts(BoundSlots):
         """Reads a slot's own side, for `load`; before anything of the slot is stored."""
         if not self.set.gathers:
             return OwnSide(self.place(item), None, None)
-        row = self.read("row", item).lane.astype(jnp.int32)
-        wrench = self.table.gather("side.wrench", row, self.block.column)
+        row = self.read(Slot.row, item).lane.astype(jnp.int32)
+        wrench = self.table.gather(Side.wrench, row, self.block.column)
         return OwnSide(self.place(item), row, wrench)
 
     def load(self, item: Any, side: OwnSide, force: Lanes, pairing: FingerPairing) -> None:
         """Adds a slot's force to its own side's wrench, and takes it from the other side's."""
         more = lanewise(wrench_of_force, side.place, self.cone, force)
-        self._add_wrench(item, "row", more, side.wrench, side.row)
+        self._add_wrench(item, Slot.row, more, side.wrench, side.row)
         if pairing.itself is not None:
 
             def opposite() -> None:
-                self._add_wrench(item, "other", lanewise(jnp.negative, more))
+                self._add_wrench(item, Slot.other, lanewise(jnp.negative, more))
 
             any_of(pairing.itself, opposite)
 
     def _add_wrench(
         self,
         item: Any,
-        field: str,
+        field: Field,
         more: Lanes,
         sums: Lanes | None = None,
         row: jax.Array | None = None,
@@ -418,14 +409,14 @@ class BoundSelfContacts(BoundSlots):
         if self.set.gathers:
             if row is None or sums is None:
                 row = self.read(field, item).lane.astype(jnp.int32)
-                sums = self.table.gather("side.wrench", row, self.block.column)
+                sums = self.table.gather(Side.wrench, row, self.block.column)
             sums = lanewise(jnp.add, sums, more)
-            self.table.scatter("side.wrench", sums, row, self.block.column)
+            self.table.scatter(Side.wrench, sums, row, self.block.column)
             return
 
         def add(row: Any, chosen: jax.Array, nothing: list) -> list:
             mask = lanes([chosen], (), wide=True)
-            self.put("wrench", lanewise(_add_where, mask, self.wrench_on(row), more), row)
+            self.put(Side.wrench, lanewise(_add_where, mask, self.wrench_on(row), more), row)
             return nothing
 
         self._each_row(item, field, add, [])
@@ -452,8 +443,8 @@ class BoundSelfContacts(BoundSlots):
 
         def load(item: Any, pairing: FingerPairing) -> None:
             side = self.own_side(item)
-            jar = self.read("jar", item)
-            step = self.read("step", item)
+            jar = self.read(Contact.jar, item)
+            step = self.read(Contact.step, item)
             self.load(
                 item, side, lanewise(response, side.place, self.cone, alpha, jar, step), pairing
             )

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.components import splat
 from codesign_jax.engines.structured.kernel.memory import Block, BoundTable
+from codesign_jax.engines.structured.kernel.rows import Again, Scratch
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.scene import Scene
 
@@ -28,7 +29,7 @@ FORCES = 6
 AGAIN = 7
 """Lanes of the forces, and of conjugate gradients' right side in the rows of w."""
 WARP = 32
-UNUSED = ("body_centre", "tensor", "z", "z_again")
+UNUSED = (Scratch.body_centre, Scratch.tensor, Scratch.z, Again.z_again)
 """Rows of the links' scratch memory that only the solver of single lanes has."""
 
 
@@ -40,22 +41,6 @@ def lanes_of_a_finger(scene: Scene, backend: str, fingers: int) -> int:
     e = scene.effects
     coupled = e.finger_finger and scene.num_fingers > 1
     return TEAM if backend == "gpu" and coupled and fingers * TEAM <= WARP else 1
-
-
-def layout(links: int, axes: int) -> dict[str, tuple[int, tuple[int, ...]]]:
-    """Rows on the chip: what the recursions over the links read, and what lanes hand to others.
-
-    Rows of eight are columns of the team; two spare rows take what lanes without a component store.
-    """
-    rows = axes, TEAM
-    shapes: dict[str, tuple[int, ...]] = {"axes": rows, "w": rows, "g": rows}
-    shapes |= {"inverse": (axes, axes), "matrix": (6, TEAM)}
-    for name in ("link_acc", "step_link_acc"):
-        shapes |= {name: (6,), f"{name}_spare": (TEAM - 6,)}
-    shared = {"u": rows, "h": rows, "q": (6, TEAM), "f": (TEAM,)}
-    return {name: (links, shape) for name, shape in shapes.items()} | {
-        f"shared.{name}": (1, shape) for name, shape in shared.items()
-    }
 
 
 class SharedColumns:

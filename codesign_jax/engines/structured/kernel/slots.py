@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from codesign_jax.engines.structured.kernel import rows
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, ContactSet, zeros
 from codesign_jax.engines.structured.kernel.memory import (
     BoundTable,
@@ -20,6 +21,7 @@ from codesign_jax.engines.structured.kernel.memory import (
     solid,
     tree_add_scaled,
 )
+from codesign_jax.engines.structured.kernel.rows import Contact, Group, Rows, Slot, SlotCount
 from codesign_jax.engines.structured.lanes import total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact
@@ -84,7 +86,7 @@ class SlotSet(ContactSet):
         size: int,
         *,
         gathers: bool,
-        remembers: tuple[str, ...] = (),
+        remembers: tuple[type[Rows], ...] = (),
     ):
         """Prepares the set.
 
@@ -100,22 +102,27 @@ class SlotSet(ContactSet):
         self.gathers = gathers
         self.remembers = remembers
 
-    def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
-        return self.fields() | {f"{self.name}.count": (self.rows, ())}
+    @property
+    def sizes(self) -> dict[str, int]:
+        """See `ContactSet`."""
+        return super().sizes | {rows.SLOT_ROW: self.rows}
 
-    def fields(self) -> dict[str, tuple[int, tuple[int, ...]]]:
-        fields = self.more | dict.fromkeys(self.remembers, 1)
-        more = {f"{self.name}.{field}": (self.count, (n, 1)) for field, n in fields.items()}
-        return super().groups() | more
+    def groups(self) -> dict[str, Group]:
+        """See `ContactSet`."""
+        return self.fields() | self.groups_of(SlotCount)
 
-    more: dict[str, int] = {}
-    """Components of further fields of a slot."""
+    def fields(self) -> dict[str, Group]:
+        """Rows that each slot has."""
+        return self.groups_of(Contact, *self.beside, *self.remembers)
+
+    beside: tuple[type[Rows], ...] = (Slot,)
+    """What a slot has beside its contact."""
 
     def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundSlots":
         return BoundSlots(self, table, self.cone(read))
 
 
-class Slot(NamedTuple):
+class UsedSlot(NamedTuple):
     """A slot in a pass through a row, where lanes gather.
 
     Lanes that have filled it, and whose worlds the pass is for, use it. All others read an item
@@ -134,17 +141,17 @@ class BoundSlots(BoundContacts):
     _counts: SlotCounts | None = None
 
     def clear(self, row: Any) -> None:
-        self.write("count", zeros((), self.like), row)
+        self.write(SlotCount.count, zeros((), self.like), row)
 
     def read(self, field: str, item: Any) -> Lanes:
-        """See `BoundContacts`; an item may be a `Slot`."""
-        if not isinstance(item, Slot):
+        """See `BoundContacts`; an item may be a `UsedSlot`."""
+        if not isinstance(item, UsedSlot):
             return super().read(field, item)
         return self.table.gather(f"{self.set.name}.{field}", item.source, self._lane())
 
     def write(self, field: str, value: Lanes, item: Any) -> None:
-        """See `BoundContacts`; an item may be a `Slot`."""
-        if not isinstance(item, Slot):
+        """See `BoundContacts`; an item may be a `UsedSlot`."""
+        if not isinstance(item, UsedSlot):
             super().write(field, value, item)
             return
         self.table.scatter(f"{self.set.name}.{field}", value, item.sink, self._lane())
@@ -156,7 +163,7 @@ class BoundSlots(BoundContacts):
         """Keeps in registers how many slots lanes have filled, when all contacts are found."""
         rows = range(self.set.rows)
         most = self.set.slots
-        counts = [self.read("count", row).lane.astype(jnp.int32) for row in rows]
+        counts = [self.read(SlotCount.count, row).lane.astype(jnp.int32) for row in rows]
         self._counts = SlotCounts.of_rows([jnp.minimum(n, most) for n in counts], most)
         if self.set.gathers:
             self.write_empty(self.set.fields(), self.set.count - 1)
@@ -194,24 +201,25 @@ class BoundSlots(BoundContacts):
     def remembered(self, numbers: dict[str, Any]) -> dict[str, Lanes]:
         """Fields of the numbers, the same or different on the lanes, that the set remembers."""
         none = self.like
+        names = [name for table in self.set.remembers for name in table.fields()]
         return {
             name: lanes([none + jnp.asarray(number).astype(none.dtype)], (1, 1), wide=True)
             for name, number in numbers.items()
-            if name in self.set.remembers
+            if name in names
         }
 
     def overflow(self) -> jax.Array:
         """One for lanes that had too few slots in any row, else zero, shape (lane,)."""
 
         def worst(row: jax.Array, most: jax.Array) -> jax.Array:
-            return jnp.maximum(most, self.read("count", row).lane)
+            return jnp.maximum(most, self.read(SlotCount.count, row).lane)
 
         most = jax.lax.fori_loop(0, self.set.rows, worst, self.like)
         return jnp.where(most > self.set.slots, 1.0, 0.0).astype(self.like.dtype)
 
     def add(self, row: Any, which: jax.Array, fields: dict[str, Lanes], lane: jax.Array) -> None:
         """Gives contacts, with what is kept of them, a slot of a row on the lanes `which`."""
-        count = self.read("count", row).lane
+        count = self.read(SlotCount.count, row).lane
         first = row * (self.set.slots + 1)
         filled = count.astype(jnp.int32)
         if not self.set.gathers:
@@ -227,7 +235,7 @@ class BoundSlots(BoundContacts):
         else:
             self._fill(first, jnp.where(which, mine, -1), fields)
         more = jnp.where(which, count + 1.0, count)
-        self.write("count", lanes([more], (), wide=True), row)
+        self.write(SlotCount.count, lanes([more], (), wide=True), row)
 
     def _fill(self, first: Any, slot: jax.Array, fields: dict[str, Lanes]) -> None:
         """Stores the lanes' contacts, one slot after the other: vectors scatter slowly.
@@ -272,7 +280,7 @@ class BoundSlots(BoundContacts):
         # that of the first row
         empty = self.set.count - 1
         spare = self.set.slots
-        return Slot(*(jnp.where(mine, item, jnp.int32(away)) for away in (empty, spare)))
+        return UsedSlot(*(jnp.where(mine, item, jnp.int32(away)) for away in (empty, spare)))
 
     def update_constraint(self, item: Any, place: Place, alpha: Lanes) -> Lanes:
         """Adds the last step to jar; stores the Hessian and returns the force, of one slot."""
@@ -282,10 +290,12 @@ class BoundSlots(BoundContacts):
             update = contact.constraint_update(contacts(place, cone), jar)
             return update.hessian, update.force
 
-        jar = lanewise(tree_add_scaled, alpha, self.read("jar", item), self.read("step", item))
-        self.write("jar", jar, item)
+        jar = lanewise(
+            tree_add_scaled, alpha, self.read(Contact.jar, item), self.read(Contact.step, item)
+        )
+        self.write(Contact.jar, jar, item)
         hessian, force = lanewise(response, place, self.cone, jar)
-        self.write("hessian", hessian, item)
+        self.write(Slot.hessian, hessian, item)
         return force
 
     def _zeros(self, *shapes: tuple[int, ...]) -> list[Lanes]:

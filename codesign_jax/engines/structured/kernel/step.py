@@ -13,6 +13,7 @@ from codesign_jax.engines.structured.kernel.memory import anywhere, loop
 from codesign_jax.engines.structured.kernel.newton import Newton
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem, triangle
+from codesign_jax.engines.structured.kernel.rows import Hand, Scratch, WorldState
 from codesign_jax.engines.structured.kernel.sdf_collision import SdfCollision
 from codesign_jax.engines.structured.kernel.self_collision import SelfCollision
 from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
@@ -128,7 +129,7 @@ class Step(StepMemory):
             deepest = self.block.over_team(deepest, jnp.maximum)
         deepest = self.block.fold(deepest, jnp.maximum)
         begun = jnp.where(state["step"].lane > 0, state["overlap"].lane, deepest)
-        self.world_state.write("overlap", lanes([begun], (), wide=False))
+        self.world_state.write(WorldState.overlap, lanes([begun], (), wide=False))
 
     def _overflow(self, waiting: jax.Array) -> jax.Array:
         """One for worlds that had too few slots for their contacts in this step, else zero."""
@@ -149,7 +150,7 @@ class Step(StepMemory):
           chain: Origin, frame and velocity of the fingers' bases.
         """
         scene = self.layout.scene
-        given = *(state[n] for n in WRIST), *(self.hand.read(n) for n in ("mount", "base"))
+        given = *(state[n] for n in WRIST), *(self.hand.read(n) for n in (Hand.mount, Hand.base))
         before = lanewise(partial(bases_before, scene.discretization.timestep), *given)
 
         def link(i: Any, chains: tuple) -> tuple:
@@ -157,14 +158,14 @@ class Step(StepMemory):
             joint = self.joint(i) | {"order": self.order(i)}
             run = partial(carried_momentum, scene)
             now, before, _, force = lanewise(run, *chains, self.link_constants(i), joint)
-            self.write("smooth", lanewise(jnp.add, self.read("smooth", i), force), i)
+            self.write(Scratch.smooth, lanewise(jnp.add, self.read(Scratch.smooth, i), force), i)
             return now, before
 
         loop(self.layout.links, link, (chain, before), self.layout.size)
 
     def _bases(self, bodies: dict) -> tuple[Lanes, ...]:
         """The fingers' bases: origin, frame, velocity, bias, acceleration, and weighted centre."""
-        names = ("mount", "base", "centre_weight", "stub_centre")
+        names = (Hand.mount, Hand.base, Hand.centre_weight, Hand.stub_centre)
         mount, base, weight, stub = (self.hand.read(n) for n in names)
         frame, origin = lanewise(kin.mounted, bodies["place"], bodies["frame"], mount, base)
 
@@ -215,7 +216,7 @@ class Step(StepMemory):
                 stored = team_rows(stored, (constants["mass"], centre, stored["tensor"]))
             for name, value in stored.items():
                 self.write(name, value, i)
-            weight = self.hand.read("centre_weight", i + 1)
+            weight = self.hand.read(Hand.centre_weight, i + 1)
             middle = lanewise(add_weighted, middle, centre, weight)
             fields.of_link(i, chain)
             if search:
@@ -416,8 +417,8 @@ def semi_implicit_euler(
 
     def link(i: Any, largest: Lanes) -> Lanes:
         rate, q, top = lanewise(partial(joint_after_step, h), *step.joint(i).values())
-        step.scratch.write("new_finger", q, i)
-        step.scratch.write("new_finger_vel", rate, i)
+        step.scratch.write(Scratch.new_finger, q, i)
+        step.scratch.write(Scratch.new_finger_vel, rate, i)
         return lanewise(_worse, largest, top)
 
     fingers = loop(layout.links, link, zeros((), step.like), layout.size).lane

@@ -6,27 +6,37 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, ContactSet
 from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, MemoryLayout
+from codesign_jax.engines.structured.kernel.rows import FingerState, Hand, World, WorldOptions
 from codesign_jax.engines.structured.lanewise import Lanes, lanes
+from codesign_jax.engines.structured.laws.cones import friction_by_contact
 from codesign_jax.engines.structured.laws.step_numbers import step_numbers
 from codesign_jax.model import Layout
-from codesign_jax.model.layout import hinge_sign
+from codesign_jax.model.layout import hinge_sign, palm_touches
 from codesign_jax.scene import Scene
 
 PALM_CONSTANTS = (
-    "palm_mass",
-    "palm_centre",
-    "palm_inertia",
-    "wrist_damping",
-    "wrist_armature",
-    "object_mass",
-    "object_inertia",
-    "wrist_stiffness",
+    World.palm_mass,
+    World.palm_centre,
+    World.palm_inertia,
+    World.wrist_damping,
+    World.wrist_armature,
+    World.object_mass,
+    World.object_inertia,
+    WorldOptions.wrist_stiffness,
 )
 """Constants of the worlds that `palm_and_object` takes beside `laws.step_numbers`; some scenes lack
 the last one."""
-LINK_CONSTANTS = ("offset", "mass", "centre", "inertia", "stiffness", "damping", "armature")
+LINK_CONSTANTS = (
+    Hand.offset,
+    Hand.mass,
+    Hand.centre,
+    Hand.inertia,
+    Hand.stiffness,
+    Hand.damping,
+    Hand.armature,
+)
 """Constants of each link that `link_forces` takes."""
-FINGER_CONSTANTS = ("gain", "section", "threshold", "law")
+FINGER_CONSTANTS = (Hand.gain, Hand.section, Hand.threshold, Hand.law)
 """Constants of each finger, of each link of tapered ones, that it takes; some scenes lack all but
 the first."""
 
@@ -48,6 +58,7 @@ class KernelLayout:
     palm_groups: int  # Those of the palm, for each finger's lanes
     hull: bool  # Whether fingers have rings
     meshes: bool  # Whether there are objects with meshes
+    support_points: int  # Support points of a mesh
     sets: list[ContactSet]  # The contacts
     has_slots: bool  # Whether any of them are in slots
     held: dict[str, int]  # What contacts hold of friction, see `model.held`
@@ -62,6 +73,21 @@ class KernelLayout:
     @property
     def tapered(self) -> bool:
         return self.scene.hand.section.tapered
+
+    @property
+    def by_elements(self) -> bool:
+        """Whether finite elements give the law of a finger's section."""
+        return self.scene.hand.section.law == "elements"
+
+    @property
+    def palm_touches(self) -> bool:
+        """Whether the palm has contacts with object or table."""
+        return palm_touches(self.scene)
+
+    @property
+    def friction_by_point(self) -> bool:
+        """Whether the object's points on table and fixtures have a friction each."""
+        return friction_by_contact(self.scene, "object_table")
 
 
 class StepMemory:
@@ -136,7 +162,7 @@ class StepMemory:
 
     def joint(self, i: Any) -> dict[str, Lanes]:
         """Angles, velocities and accelerations of a joint, by name."""
-        return {n: self.finger_state.read(n, i) for n in ("finger", "finger_vel", "acc")}
+        return {n: self.finger_state.read(n, i) for n in FingerState.fields()}
 
     def order(self, i: Any) -> Lanes:
         """In which order a joint's hinges follow one another, see `hinge_sign`."""

@@ -8,6 +8,15 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.contact_sets import ContactSet
 from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, choose, loop
+from codesign_jax.engines.structured.kernel.rows import (
+    Contact,
+    Group,
+    Side,
+    Slot,
+    SlotCount,
+    TeamRing,
+    TeamSlot,
+)
 from codesign_jax.engines.structured.kernel.self_contacts import (
     BoundSelfContacts,
     FingerPairing,
@@ -16,7 +25,7 @@ from codesign_jax.engines.structured.kernel.self_contacts import (
     _times,
 )
 from codesign_jax.engines.structured.kernel.shared_memory import TEAM, TeamRows, ranks
-from codesign_jax.engines.structured.kernel.slots import BoundSlots, Slot
+from codesign_jax.engines.structured.kernel.slots import BoundSlots, UsedSlot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact
 from codesign_jax.scene import Scene
@@ -31,11 +40,9 @@ class TeamSdfContactSet(ContactSet):
         self.block = (tables.fingers, tables.block, tables.team)
         self.rings = links * k
 
-    def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
+    def groups(self) -> dict[str, Group]:
         """See `ContactSet`; with the Hessian and the force of each."""
-        fields = {"hessian": 6, "force": 3}
-        more = {f"{self.name}.{f}": (self.count, (size, 1)) for f, size in fields.items()}
-        return super().groups() | more
+        return self.groups_of(Contact, TeamRing)
 
     def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundTeamSdfContacts":
         return BoundTeamSdfContacts(self, table, self.cone(read))
@@ -53,11 +60,11 @@ class BoundTeamSdfContacts(BoundSlots):
     def _lane(self) -> jax.Array:
         return self.block.column
 
-    def slot(self, k: Any) -> tuple[Slot, jax.Array]:
+    def slot(self, k: Any) -> tuple[UsedSlot, jax.Array]:
         """Items of the lanes in a round, and the rings that they are of."""
         item, mine = self.block.dealt(self.set.rings, k)
         spare = self.set.rings + 1
-        return Slot(jnp.where(mine, item, spare - 1), jnp.where(mine, item, spare)), item
+        return UsedSlot(jnp.where(mine, item, spare - 1), jnp.where(mine, item, spare)), item
 
     def begin_step(self) -> None:
         """Stores what lanes without an item read: no contact."""
@@ -71,7 +78,7 @@ class BoundTeamSdfContacts(BoundSlots):
     def each_item(self, body: Callable[[Any], None]) -> None:
         """See `BoundContacts`; a lane each."""
 
-        def step(item: Slot, _: Any, nothing: list) -> list:
+        def step(item: UsedSlot, _: Any, nothing: list) -> list:
             body(item)
             return nothing
 
@@ -84,9 +91,11 @@ class BoundTeamSdfContacts(BoundSlots):
     def update_constraints(self, alpha: Lanes) -> None:
         """Adds the last step of the line search to jar; stores Hessians and forces."""
 
-        def store(item: Slot, _: Any, nothing: list) -> list:
+        def store(item: UsedSlot, _: Any, nothing: list) -> list:
             def touches() -> None:
-                self.write("force", self.update_constraint(item, self.place(item), alpha), item)
+                self.write(
+                    TeamRing.force, self.update_constraint(item, self.place(item), alpha), item
+                )
 
             jax.lax.cond(self.touching(item), touches, lambda: None)
             return nothing
@@ -121,9 +130,9 @@ class BoundTeamSdfContacts(BoundSlots):
     def prepare_all(self, self_contacts: BoundSelfContacts, k: int, obj: Lanes) -> Lanes:
         """`prepare_linesearch` of all items, k a link; slopes at 0, each on its lane."""
 
-        def add(item: Slot, ring: jax.Array, sums: Lanes) -> Lanes:
+        def add(item: UsedSlot, ring: jax.Array, sums: Lanes) -> Lanes:
             row = jax.lax.div(ring, jnp.full_like(ring, k)) + 1
-            link_acc = self_contacts.table.gather("side.link_acc", row, self.block.column)
+            link_acc = self_contacts.table.gather(Side.link_acc, row, self.block.column)
             if self.set.on_object:
                 link_acc = lanewise(jnp.subtract, link_acc, obj)
             return lanewise(jnp.add, sums, self.prepare_linesearch(item, link_acc))
@@ -140,16 +149,9 @@ class TeamSelfContactSet(SelfContactSet):
         # type: ignore[assignment]
         self.block = block
         self.size = block[0] * block[1] * block[2]
-        self.more |= {"wrench": 6, "wrench_spare": TEAM - 6}
 
-    def groups(self) -> dict[str, tuple[int, tuple[int, ...]]]:
-        """See `SelfContactSet`; spare rows take what lanes without a component store."""
-        groups: dict[str, tuple[int, tuple[int, ...]]] = {}
-        for name, (count, shape) in super().groups().items():
-            groups[name] = count, shape
-            if name in ("side.link_acc", "side.wrench"):
-                groups[f"{name}_spare"] = count, (TEAM - 6,)
-        return groups
+    beside = (Slot, TeamSlot)
+    in_teams = True
 
     def bind(self, table: BoundTable, read: Callable[[str], Lanes]) -> "BoundTeamSelfContacts":
         cones = {name: self.cone(read, name) for name in self._names()}
@@ -171,28 +173,28 @@ class BoundTeamSelfContacts(BoundSelfContacts):
         """Rounds of a row."""
         return jax.lax.div(super().used(row) + (TEAM - 1), jnp.int32(TEAM))
 
-    def _slot(self, row: Any, first: Any, k: jax.Array) -> Slot:
+    def _slot(self, row: Any, first: Any, k: jax.Array) -> UsedSlot:
         return self._item(row, first, k * TEAM + self.block.mate)
 
-    def _item(self, row: Any, first: Any, number: jax.Array) -> Slot:
+    def _item(self, row: Any, first: Any, number: jax.Array) -> UsedSlot:
         assert self._counts is not None
         mine = number < self._counts.of(row)
         item = first + number
         empty = self.set.count - 1
         spare = self.set.slots
-        return Slot(jnp.where(mine, item, empty), jnp.where(mine, item, spare))
+        return UsedSlot(jnp.where(mine, item, empty), jnp.where(mine, item, spare))
 
     def add(self, row: Any, which: jax.Array, fields: dict[str, Lanes], lane: jax.Array) -> None:
         """See `BoundSlots`; lanes of a team append in their order."""
         slots = self.set.slots
-        count = self.read("count", row).lane
+        count = self.read(SlotCount.count, row).lane
         rank, number = ranks(self.block, which)
         mine = jnp.where(which, jnp.minimum(count.astype(jnp.int32) + rank, slots), slots)
         for field, value in fields.items():
             name = f"{self.set.name}.{field}"
             first = row * (slots + 1)
             self.table.scatter(name, value, first + mine, lane)
-        self.write("count", lanes([count + number.astype(count.dtype)], (), wide=True), row)
+        self.write(SlotCount.count, lanes([count + number.astype(count.dtype)], (), wide=True), row)
 
     def own_side(self, item: Any) -> OwnSide:
         """See `BoundSelfContacts`; wrenches are added up later."""
@@ -205,7 +207,7 @@ class BoundTeamSelfContacts(BoundSelfContacts):
         def wrench(place, cone, force):
             return contact.contact_wrench(contacts(place, cone), force)
 
-        self.write("wrench", lanewise(wrench, side.place, self.cone, force), item)
+        self.write(TeamSlot.wrench, lanewise(wrench, side.place, self.cone, force), item)
         self._loaded = True
 
     def each(self, body: Callable, start: Any) -> Any:
@@ -218,7 +220,7 @@ class BoundTeamSelfContacts(BoundSelfContacts):
 
     def clear_wrenches(self) -> None:
         def clear(row: Any, x: jax.Array) -> jax.Array:
-            self.parts.put("side.wrench", self.like, row)
+            self.parts.put(Side.wrench, self.like, row)
             return x
 
         jax.lax.fori_loop(0, self.rows(), clear, jnp.int32(0))
@@ -237,7 +239,7 @@ class BoundTeamSelfContacts(BoundSelfContacts):
                     sides["other"] = jnp.where(jnp.equal(row, 0), -more, 0.0)
                 for field, push in sides.items():
                     side = self.read(field, slot).lane.astype(jnp.int32)
-                    self.parts.put("side.wrench", self.parts.get("side.wrench", side) + push, side)
+                    self.parts.put(Side.wrench, self.parts.get(Side.wrench, side) + push, side)
                 return x
 
             assert self._counts is not None

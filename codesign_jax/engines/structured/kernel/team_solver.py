@@ -12,6 +12,15 @@ from codesign_jax.engines.structured.kernel.linear_system import Elimination, wi
 from codesign_jax.engines.structured.kernel.linesearch import LineSearch, with_palm_and_object
 from codesign_jax.engines.structured.kernel.memory import loop
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem, make_body
+from codesign_jax.engines.structured.kernel.rows import (
+    Again,
+    Chip,
+    FingerState,
+    Hand,
+    Scratch,
+    Shared,
+    Side,
+)
 from codesign_jax.engines.structured.kernel.shared_memory import (
     AGAIN,
     FORCES,
@@ -47,18 +56,18 @@ class TeamLanes:
 
     def axes(self, i: Any) -> Lanes:
         """A joint's motion subspace, all of it on all lanes, shape (axis, 6)."""
-        return self.problem.read("axes", item=i)[0][:, :6]
+        return self.problem.read(Scratch.axes, item=i)[0][:, :6]
 
     def spread(self, **columns: Lanes) -> list[Lanes]:
         """Columns (row,) of the lanes as matrices on all lanes, shape (row, TEAM)."""
         for name, value in columns.items():
-            self.chip.put_rows(f"shared.{name}", value)
-        return self.problem.read(*(f"shared.{name}" for name in columns))
+            self.chip.put_rows(getattr(Shared, name), value)
+        return self.problem.read(*(getattr(Shared, name) for name in columns))
 
     def vector(self, component: jax.Array) -> Lanes:
         """Components of lanes as a vector on all lanes, shape (6,)."""
-        self.chip.put("shared.f", component)
-        return self.problem.read("shared.f")[0][:6]
+        self.chip.put(Shared.f, component)
+        return self.problem.read(Shared.f)[0][:6]
 
     def column(self, matrix: Lanes, forces: Lanes) -> Lanes:
         """The lanes' columns of a matrix (6, 6) and of forces (6,) that all lanes have."""
@@ -144,13 +153,13 @@ class TeamLanes:
         return r.lane, ro.lane, z  # pyright: ignore[reportAttributeAccessIssue]  # lanewise gives Lanes
 
     def link(self, i: Any) -> el.Kept:
-        factors = el.Factors(self.chip.rows("w", i), self.chip.rows("g", i), None)  # type: ignore[arg-type]
-        return el.Kept(factors, self.problem.read("inverse", item=i)[0])
+        factors = el.Factors(self.chip.rows(Chip.w, i), self.chip.rows(Chip.g, i), None)  # type: ignore[arg-type]
+        return el.Kept(factors, self.problem.read(Again.inverse, item=i)[0])
 
     def outward(self, i: Any, parent: jax.Array, obj: jax.Array, at: int) -> tuple:
         """A joint's accelerations and its link's, by components; see `accelerations`."""
         a = self.accelerations(self.link(i), parent, obj, None, at)
-        axes = self.chip.rows("axes", i)
+        axes = self.chip.rows(Chip.axes, i)
         return a, lanewise(lambda p, s, a: p + dot(s, a), self.as_lanes(parent), axes, a).lane
 
     def narrowed(self, value: Lanes) -> Lanes:
@@ -200,22 +209,24 @@ class TeamElimination(Elimination):
         def step(i: Any, carry: tuple) -> tuple:
             (p, c, q), work = carry
             axes = team.axes(i)
-            acc = problem.move("acc", i, alpha)
-            part = team.chip.get("link_acc", i) + alpha.lane * team.chip.get("step_link_acc", i)
-            team.chip.put("link_acc", part, i)
-            column = team.chip.rows("matrix", i)
-            (link_acc,) = problem.read("link_acc", item=i)
-            force = team.scratch.get("smooth", i) - lanewise(dot, column, link_acc).lane
-            force = team.vector(force + team.scratch.get("side.wrench", i + 1))
+            acc = problem.move(FingerState.acc, i, alpha)
+            part = team.chip.get(Chip.link_acc, i) + alpha.lane * team.chip.get(
+                Chip.step_link_acc, i
+            )
+            team.chip.put(Chip.link_acc, part, i)
+            column = team.chip.rows(Chip.matrix, i)
+            (link_acc,) = problem.read(Scratch.link_acc, item=i)
+            force = team.scratch.get(Scratch.smooth, i) - lanewise(dot, column, link_acc).lane
+            force = team.vector(force + team.scratch.get(Side.wrench, i + 1))
             p = lanewise(add_link, p, team.forces, force, column)
-            tau, armature = problem.read("tau", "armature", item=i)
+            tau, armature = problem.read(Scratch.tau, Hand.armature, item=i)
             more = lanewise(joint, armature, tau, acc, team.forces)
             node, kept, done = team.eliminate(
                 self.with_contacts([p, c, q], i), axes, armature, more
             )
-            for name, value in zip("wg", kept.factors[:2], strict=True):
+            for name, value in zip((Chip.w, Chip.g), kept.factors[:2], strict=True):
                 team.chip.put_rows(name, value, i)
-            problem.write("inverse", kept.inverse, i)
+            problem.write(Again.inverse, kept.inverse, i)
             return node, lanewise(jnp.add, work, done)
 
         none = zeros((6,), self.like)
@@ -292,8 +303,8 @@ class TeamCoupling(Coupling):
 
         def step(i: Any, carry: tuple) -> tuple:
             r, ro = (v.lane for v in carry)
-            axes = [team.chip.get("axes", i, TEAM * k) for k in range(self._axes)]
-            r = r + team.scratch.get("side.wrench", i + 1)
+            axes = [team.chip.get(Chip.axes, i, TEAM * k) for k in range(self._axes)]
+            r = r + team.scratch.get(Side.wrench, i + 1)
             r, ro, z = team.again(axes, team.link(i), r, ro)
             for k, part in enumerate(z.parts.ravel()):
                 self._row(i, k, AGAIN, part)
@@ -301,19 +312,19 @@ class TeamCoupling(Coupling):
 
         start = team.as_lanes(none), team.as_lanes(none)
         r, ro = loop(self.links, step, start, self.block.size, reverse=True)
-        r = r.lane + team.scratch.get("side.wrench", 0)
+        r = r.lane + team.scratch.get(Side.wrench, 0)
         r, ro = (self.block.fold(v, jnp.add) for v in (r, ro.lane))
         return self._wrist(r, ro)
 
     @property
     def _axes(self) -> int:
-        return self.team.chip.layout.groups["axes"][1][0]
+        return self.team.chip.layout.groups[Chip.axes][1][0]
 
     def _row(self, i: Any, k: int, lane: int, value: jax.Array | None = None) -> jax.Array:
         """A lane's number in row k of w, on all lanes; or stores it."""
         table = self.team.chip.layout
         ref = self.team.chip.ref
-        place = i * table.stride["w"] + (table.offset["w"] + TEAM * k + lane)
+        place = i * table.stride[Chip.w] + (table.offset[Chip.w] + TEAM * k + lane)
         if value is not None:
             ref[place] = value
         return ref[place]
@@ -348,15 +359,15 @@ class TeamCoupling(Coupling):
 
     def substitute(self, z: str, step: Iterate) -> None:
         team = self.team
-        at = FORCES if z == "z" else AGAIN
+        at = FORCES if z == Scratch.z else AGAIN
         palm, obj = (chosen(self.block, v) for v in (step.palm_acc, step.object_acc))
 
         def link(i: Any, parent: Lanes) -> Lanes:
             _, link_acc = team.outward(i, parent.lane, obj, at)
-            team.scratch.put("side.link_acc", link_acc, i + 1)
+            team.scratch.put(Side.link_acc, link_acc, i + 1)
             return team.as_lanes(link_acc)
 
-        self.contacts.put("link_acc", self.problem.widened(step.palm_acc), 0)
+        self.contacts.put(Side.link_acc, self.problem.widened(step.palm_acc), 0)
         loop(self.links, link, team.as_lanes(palm + 0 * obj), self.block.size)
 
 
@@ -386,19 +397,19 @@ class TeamLineSearch(LineSearch):
         def link(i: Any, carry: tuple) -> tuple:
             parent, sums = carry
             a, part = team.outward(i, parent.lane, obj, FORCES)
-            problem.write("step_acc", a, i)
-            team.chip.put("step_link_acc", part, i)
-            team.scratch.put("side.link_acc", part, i + 1)
-            numbers = problem.read("armature", "acc", "tau", item=i)
-            push = team.as_lanes(team.scratch.get("smooth", i))
-            column = team.chip.rows("matrix", i)
-            link_acc, moved = problem.read("link_acc", "step_link_acc", item=i)
+            problem.write(Scratch.step_acc, a, i)
+            team.chip.put(Chip.step_link_acc, part, i)
+            team.scratch.put(Side.link_acc, part, i + 1)
+            numbers = problem.read(Hand.armature, FingerState.acc, Scratch.tau, item=i)
+            push = team.as_lanes(team.scratch.get(Scratch.smooth, i))
+            column = team.chip.rows(Chip.matrix, i)
+            link_acc, moved = problem.read(Scratch.link_acc, Scratch.step_link_acc, item=i)
             sums = lanewise(
                 smooth, sums, column, link_acc, moved, push, team.as_lanes(part), first, *numbers, a
             )
             return team.as_lanes(part), sums
 
-        self_contacts.put("link_acc", problem.widened(step.palm_acc), 0)
+        self_contacts.put(Side.link_acc, problem.widened(step.palm_acc), 0)
         start = team.as_lanes(palm + 0 * obj), [zeros((), self.like)] * 2
         _, (slope, curvature) = loop(self.links, link, start, self.block.size)
         touch = self.prepare_slots(zeros((), self.like), step)
@@ -432,7 +443,7 @@ class TeamLineSearch(LineSearch):
 
 
 def team_rows(stored: dict[str, Lanes], body: tuple) -> dict[str, Lanes]:
-    """What a link leaves for the solver, with columns in rows of eight; `shared_memory.layout`."""
+    """What a link leaves for the solver, with columns in rows of eight; `rows.Chip`."""
 
     def wide(axes, *body):
         matrix = make_body(*body).matrix()
@@ -441,9 +452,12 @@ def team_rows(stored: dict[str, Lanes], body: tuple) -> dict[str, Lanes]:
             for m in (axes, matrix)
         )
 
-    axes, matrix = lanewise(wide, stored["axes"], *body)
+    axes, matrix = lanewise(wide, stored[Scratch.axes], *body)
     unused = UNUSED
-    return {k: v for k, v in stored.items() if k not in unused} | {"axes": axes, "matrix": matrix}
+    return {k: v for k, v in stored.items() if k not in unused} | {
+        Chip.axes: axes,
+        Chip.matrix: matrix,
+    }
 
 
 def add_joint(parent, axes, a):

@@ -61,6 +61,18 @@ def each_params(space, designs):
     return [jax.tree.map(lambda v, i=i: v[i], every) for i in range(len(designs))]
 
 
+def all_fingers(space, designs):
+    """Parameters of the fingers of all designs, one behind the other as of a single hand."""
+    params = parameters.params_of(space, designs)
+    rows = {n: getattr(params, n) for n in ("length", "height", "wall", "pressure", "tip")}
+    return params._replace(**jax.tree.map(np.ravel, rows))
+
+
+def by_design(values, designs):
+    """Values of `all_fingers`, shape (design, finger)."""
+    return values.reshape(len(designs), -1)
+
+
 def columns(name):
     return [k for k, parameter in enumerate(SPACE.names) if parameter.split("[")[0] == name]
 
@@ -114,12 +126,9 @@ def test_a_lowered_pressure_bends_the_free_finger_by_the_limit(law):
     """By `free_bends`, which halves intervals where the projection inverts in closed form."""
     material = {"hand.material.law": law, "hand.material.shear_modulus": 40e3}
     made, space, designs, legal, lowered = bent_at_most(material)
-    bends = np.degrees(
-        [
-            morphology.free_bends(made.hand, p, neo_hookean=silicones.of_law(law))
-            for p in each_params(space, legal)
-        ]
-    )
+    fingers = all_fingers(space, legal)
+    bends = morphology.free_bends(made.hand, fingers, neo_hookean=silicones.of_law(law))
+    bends = by_design(np.degrees(bends), designs)
     # Pressures are rounded to float32, and stay below the limit by 1e-6 of it.
     np.testing.assert_allclose(bends[lowered], 90, rtol=2e-5)
     assert lowered.mean() > 0.3 and (bends <= 90 * (1 + 1e-6)).all()
@@ -131,18 +140,15 @@ def test_a_section_by_elements_bends_by_the_limit_and_does_not_twist_by_itself()
     """By `free_bends`, which halves intervals of the bend and not of the pressure."""
     law = {"hand.section.law": "elements", "hand.section.winding": "single"}
     made, space, designs, legal, lowered = bent_at_most(law)
-    bends = []
-    straight = []
-    for before, after in zip(each_params(space, designs), each_params(space, legal), strict=True):
-        bends.append(np.degrees(morphology.free_bends(made.hand, after)))
-        assert not morphology.twists_by_itself(made.hand, after).any()
-        straight.append(morphology.twists_by_itself(made.hand, before))
-    bends = np.array(bends)
+    before, after = (all_fingers(space, each) for each in (designs, legal))
+    bends = by_design(np.degrees(morphology.free_bends(made.hand, after)), designs)
+    assert not morphology.twists_by_itself(made.hand, after).any()
+    straight = by_design(morphology.twists_by_itself(made.hand, before), designs)
     # A pressure of single precision bends a thin finger by some 1e-5 more or less.
     assert lowered.mean() > 0.5 and (bends <= 90 * (1 + 1e-4)).all()
-    by_bend = lowered & ~np.array(straight)
+    by_bend = lowered & ~straight
     np.testing.assert_allclose(bends[by_bend], 90, rtol=2e-4)
-    assert np.array(straight).any()
+    assert straight.any()
 
 
 def test_a_lowered_pressure_strains_the_wall_by_the_limit_less_the_margin():
@@ -152,11 +158,10 @@ def test_a_lowered_pressure_strains_the_wall_by_the_limit_less_the_margin():
     legal = projected(space, designs)
     pressures = columns("pressure")
     lowered = legal[:, pressures] < designs[:, pressures] * (1 - 1e-5)
-    strains = []
-    for p in each_params(space, legal):
-        bends = morphology.free_bends(PAPER.hand, p, neo_hookean=True)
-        strains.append(bends / p.length * p.height)
-    np.testing.assert_allclose(np.array(strains)[lowered], 0.5, rtol=2e-5)
+    fingers = all_fingers(space, legal)
+    bends = morphology.free_bends(PAPER.hand, fingers, neo_hookean=True)
+    strains = by_design(bends / fingers.length * fingers.height, designs)
+    np.testing.assert_allclose(strains[lowered], 0.5, rtol=2e-5)
     _, half = limited(strain=0.5, pressure_margin=0.5)
     lower = projected(half, designs)[:, pressures]
     np.testing.assert_allclose(lower[lowered], 0.5 * legal[:, pressures][lowered], rtol=1e-6)
@@ -166,11 +171,9 @@ def test_no_tapered_finger_bends_by_more_than_the_limit():
     limits = {f"limits.{n}": v for n, v in {**UNLIMITED, "free_bend": 60.0}.items()}
     made = scene.load("paper", hand_name="tapered4", overrides=limits)
     space = parameters.design_space(made.hand, "full")
-    bends = [
-        np.degrees(morphology.free_bends(made.hand, p, neo_hookean=True)).max()
-        for p in each_params(space, drawn(space, 40))
-    ]
-    assert 45 < max(bends) <= 60 * (1 + 1e-5)
+    fingers = all_fingers(space, drawn(space, 40))
+    bends = np.degrees(morphology.free_bends(made.hand, fingers, neo_hookean=True))
+    assert 45 < bends.max() <= 60 * (1 + 1e-5)
 
 
 def test_lengths_angles_and_height_are_clipped():

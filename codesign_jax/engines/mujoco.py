@@ -41,6 +41,7 @@ class MujocoEngine(Equal):
     """
 
     name = "mujoco"
+    fills = True  # see `Engine`
 
     def __init__(self, scene: Scene, *, num_threads: int = 0):
         """Prepares the engine."""
@@ -378,15 +379,27 @@ def _apply_section(
 
 
 def write_fields(scene: Scene, batch: mujoco.batch.Batch, fields: ModelFields) -> None:
-    """Gives every simulation of a batch its model fields and start state."""
-    worlds = [jax.tree.map(lambda v, w=w: v[w], fields) for w in range(len(fields.start))]
+    """Gives every simulation of a batch its model fields and start state.
+
+    Each model is computed once: what fills up a batch has that of another world.
+    """
+    rows, place = _models(fields)
+    worlds = [jax.tree.map(lambda v, w=w: v[w], fields) for w in rows]
     models = [mujoco_fields(scene, world, np).of_model for world in worlds]
     batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
     batch.bind("qpos")[:] = fields.qpos
     batch.bind("qvel")[:] = fields.qvel
     for name in models[0]:
-        batch.expand(name)[:] = np.stack([model[name] for model in models])
+        batch.expand(name)[:] = np.stack([model[name] for model in models])[place]
     batch.bind("qacc_warmstart")[:] = 0.0
+
+
+def _models(fields: ModelFields) -> tuple[np.ndarray, np.ndarray]:
+    """A world with each different model, and the place of each world's model among them."""
+    numbers = jax.tree.leaves(fields._replace(start=()))
+    every = np.concatenate([v.reshape(len(v), -1) for v in numbers], 1)
+    _, rows, place = np.unique(every, axis=0, return_index=True, return_inverse=True)
+    return rows, place.ravel()
 
 
 def world_model(scene: Scene, fields: ModelFields) -> mujoco.MjModel:

@@ -126,8 +126,11 @@ class MujocoEngine(Equal):
         batch.bind("qacc_warmstart")[:] = rollout.start.acc
         # Moments that change with every step
         chunk = 1 if scene.effects.neo_hookean else _CHUNK
-        for first in range(0, steps, chunk):
-            part = slice(first, min(first + chunk, steps))
+        first = 0
+        while first < steps and rollout.going.size:
+            # Worlds that are decided when they start, as those that fill a batch, leave at once.
+            length = chunk if first or rollout.start.going.all() else 1
+            part = slice(first, min(first + length, steps))
             going = rollout.going
             if fields.law is not None:
                 _apply_section(scene, batch, fields, going, ctrl[going, first, 6:])
@@ -137,8 +140,7 @@ class MujocoEngine(Equal):
             new, taken, states = self.advance(batch, going, ctrl[going, part], middle, trajectory)
             stopped = rollout.store(part, new, taken, batch.warning[going, :, 0])
             rollout.decide(part, new, states, stopped)
-            if not rollout.going.size:
-                break
+            first = part.stop
         names = ("qpos", "qvel", "qacc_warmstart")
         return rollout.trace(*(batch.bind(name)[rollout.going] for name in names))
 

@@ -184,6 +184,7 @@ def law_of(section, **options):
 
 volume_of = jax.jit(section_law.volume)
 
+
 def test_law_without_pressure():
     """Bent away from the fabric a section has the stiffness of beam theory and Saint-Venant."""
     section = Section()

@@ -15,7 +15,7 @@ FOLDER = Path("runs") / "demo"
 
 def main() -> int:
     """Runs the demo and returns the exit status: 0 if it ran to its end."""
-    run = ["optimize", "--scene", "paper", "--hand", "pneuflex4_wide", "--preset", "23d"]
+    run = ["optimize", "--scene", "build", "--preset", "23d"]
     run += ["--reference-trials", "0", "--out", str(FOLDER)]
     status = cli.main([*run, *sys.argv[1:]])
     if status:

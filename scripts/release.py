@@ -37,7 +37,7 @@ IN_SDIST = (
 """Files whose absence from a source distribution would go unseen in the wheel."""
 COMMANDS = (
     ["--version"],
-    ["optimize", "--hand", "pneuflex4_wide", "--preset", "23d", "--dry-run"],
+    ["optimize", "--scene", "build", "--preset", "23d", "--dry-run"],
     ["evaluate", "--design", "length=110", "arm_z=20", "--trials", "1"],
 )
 """Calls of `codesign` in the empty environment; the last one compiles and simulates a grasp."""

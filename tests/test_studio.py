@@ -203,6 +203,12 @@ def desk(tmp_path_factory):
     return Desk(cli.Studio(first=run, out=folder / "saved"))
 
 
+def test_the_studio_begins_with_the_hand_to_build_or_with_what_is_named():
+    assert Desk(cli.Studio()).case.scene.name == "build"
+    assert Desk(cli.Studio(hand="tripod3")).case.scene.name == "paper"
+    assert Desk(cli.Studio(design=(("length=100",),))).case.scene.name == "paper"
+
+
 @pytest.mark.slow  # 15 s; the same in a browser: make test-browser
 def test_a_tab_shows_judges_improves_and_saves(desk, capsys, monkeypatch):
     """The verdict is that of `codesign evaluate`; a design of the run is the one in its record."""

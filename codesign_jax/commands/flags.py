@@ -490,7 +490,8 @@ class Studio(Command, RunOrDesign):
 
     The page simulates a moved slider at once; trials and the verdict follow. It can save a design,
     export it, improve it by a short search, and browse the designs of a run. It is served on
-    localhost only, to browsers that open the printed address.
+    localhost only, to browsers that open the printed address. Without a run, a design, a scene and
+    a hand it shows the hand to build, of the scene `build`.
     """
 
     package = "studio"
@@ -504,6 +505,11 @@ class Studio(Command, RunOrDesign):
     host: Annotated[str, tyro.conf.arg(metavar="HOST")] = "127.0.0.1"
     """Host name or address to serve on. Any but loopback can be reached by other machines that
     have the token."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not (self.run_folder or self.design or self.scene or self.hand):
+            self.scene = "build"
 
 
 @dataclasses.dataclass

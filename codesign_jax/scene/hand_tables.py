@@ -129,6 +129,10 @@ class Section:
       thread_depth: Place of the thread in the wall: 0 outside, 1 on the chamber; for the law
         "elements" and the build sheet.
       winding: How the thread is wound, likewise: "crossed", there and back, or "single", one way.
+      pressure_factor: Factor on what pressure does by the law "elements", as the next two: by how
+        much a finger differs from the elements that the law was fitted to.
+      sideways_factor: Factor on the walls' stiffness sideways.
+      twist_factor: Factor on the stiffness of twist.
     """
 
     width: float = quantity("m", 0.005, 0.1)
@@ -136,6 +140,9 @@ class Section:
     law: str = choice("chamber", "elements", default="chamber")
     thread_depth: float = quantity("", 0, 1, default=0.0)
     winding: str = choice("crossed", "single", default="crossed")
+    pressure_factor: float = quantity("", 0.2, 5, default=1.0)
+    sideways_factor: float = quantity("", 0.2, 5, default=1.0)
+    twist_factor: float = quantity("", 0.2, 5, default=1.0)
 
 
 @table

@@ -75,6 +75,11 @@ FITTED = (
     *("axial", "axial_round", "axial_growth", "crown"),
 )
 """Entries of `Numbers` that are fitted functions of the section's proportions."""
+BY_PRESSURE = (
+    *("lever", "bulge", "bulge_bent", "thinning", "rounding", "axial", "axial_round"),
+    "helix",
+)
+"""Entries of `Numbers` that the energy multiplies with the pressure."""
 POSITIVE = frozenset(("lever", "bulge", "bulge_bent", "rounding", "axial", "axial_round", "crown"))
 """Those whose logarithm is fitted."""
 
@@ -183,22 +188,44 @@ def numbers(
 def of_hand(
     hand: Hand, height: Any, wall: Any, width: Any, length: Any, *, thread_depth: Any = None
 ) -> Numbers:
-    """`numbers` of a hand's sections, with its silicone and its thread.
+    """`numbers` of a hand's sections, with its silicone, its thread and its factors.
 
     Args:
       thread_depth: Place of the thread; None for that of the hand.
     """
-    crossed = hand.section.winding == "crossed"
+    section = hand.section
+    crossed = section.winding == "crossed"
     pitch = THREAD_PITCH if crossed else THREAD_PITCH / 2
-    return numbers(
+    nominal = numbers(
         height,
         wall,
         width,
         shear_modulus=hand.material.shear_modulus,
         length=length,
-        thread_depth=hand.section.thread_depth if thread_depth is None else thread_depth,
+        thread_depth=section.thread_depth if thread_depth is None else thread_depth,
         winding_angle=height.__array_namespace__().atan(pitch / (2 * (width + height))),
         crossed=crossed,
+    )
+    return scaled(nominal, section.pressure_factor, section.sideways_factor, section.twist_factor)
+
+
+def scaled(n: Numbers, pressure: Any, sideways: Any, twist: Any) -> Numbers:
+    """The numbers of sections on which pressure does more, and of stiffer walls and twist.
+
+    The energy stays one: its slopes are its moments, whatever the factors.
+
+    Args:
+      pressure: Factor on the pressure that acts on the section, not on the chamber at rest.
+      sideways: Factor on the walls' stiffness sideways.
+      twist: Factor on the stiffness of twist.
+    """
+    with_pressure = {name: pressure * getattr(n, name) for name in BY_PRESSURE}
+    return n._replace(
+        upright=sideways * n.upright,
+        axial_stiffness=sideways * n.axial_stiffness,
+        torsion=twist * n.torsion,
+        crossing=twist * n.crossing,
+        **with_pressure,
     )
 
 

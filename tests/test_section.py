@@ -294,7 +294,7 @@ def test_thin_straight_finger_twists_by_itself():
 
 def test_factors_are_those_of_pressure_and_of_stiffness_at_rest():
     """As 1.3 times the pressure holds, and as stiff without pressure as the factors say."""
-    curvatures = 1.0, jnp.asarray(8.0), 2.0
+    curvatures = 1.0, np.asarray(8.0), 2.0
     n = law_of(Section(winding_angle=0.03), length=80e-3)
     more = section_law.response(section_numbers.scaled(n, 1.3, 1.0, 1.0), 40e3, *curvatures)
     higher = section_law.response(n, 52e3, *curvatures)

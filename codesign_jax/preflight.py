@@ -23,6 +23,7 @@ from codesign_jax.engines.depths import (
     largest_depth,
 )
 from codesign_jax.model import ModelFields, morphology
+from codesign_jax.model.clearance import starts_apart
 from codesign_jax.reuse import quickly_compiled
 from codesign_jax.scene import Scene, key_frames
 from codesign_jax.scene.parameters import DesignSpace, params_of
@@ -107,6 +108,7 @@ def notes(
         `batch.Batch.start`: then no program is compiled that measures depths.
     """
     params = params_of(space, np.array([*designs.values()], np.float32))
+    params = jax.tree.map(np.asarray, params)  # whose operations compile nothing
     problems = refusals(scene, params, [*designs], start)
     if problems:
         raise InputError(problems)
@@ -138,7 +140,8 @@ def refusals(
         f"{limit[i, f]:.4g} Pa for a wall of {designs.wall[i, f]:g} m"
         for i, f in np.argwhere(np.asarray(designs.pressure) > limit * (1 + 1e-6))
     ]
-    if problems or not start(designs):
+    each = [jax.tree.map(operator.itemgetter(i), designs) for i in range(len(names))]
+    if problems or not (all(starts_apart(scene, design) for design in each) or start(designs)):
         problems += _overlaps(scene, designs, names)
     return problems
 

@@ -14,6 +14,7 @@ import pytest
 from codesign_jax import cli, model, preflight, rollout, runs, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import MujocoEngine
+from codesign_jax.model.clearance import starts_apart
 from codesign_jax.runs.run import Run
 from codesign_jax.types import Status
 from tests.helpers.grasps import (
@@ -320,6 +321,15 @@ def test_the_kernel_finds_the_overlaps_of_a_start(surface):
     refused = deepest > the_scene.limits.penetration
     np.testing.assert_array_equal(flags == Status.INVALID_START, refused)
     assert {*depths.argmax(0)[deepest > 0]} == {0, 1, 2} and 0 < refused.sum() < count
+    # Bounds that compile nothing call no hand apart that is refused, low or high over the table.
+    high = dataclasses.replace(the_scene.arm, start_height=0.4)
+    raised = dataclasses.replace(the_scene, arm=high)
+    of_hand = depths[1:].max(0) > the_scene.limits.penetration
+    for where, wrong in ((the_scene, refused), (raised, of_hand)):
+        apart = np.array([starts_apart(where, nth(designs, k)) for k in range(count)])
+        assert wrong.any() and not (apart & wrong).any()
+    usual = scene.load("paper_spheres", overrides={"effects": effects})
+    assert starts_apart(usual, hand_world(usual)[0])
     # Worlds that fill a batch up stay where they are, and the others do not notice them.
     np.testing.assert_array_equal(last_of_filled[third == 0], last[third == 0])
     stay = last_of_filled[third > 0, : places.shape[1]]

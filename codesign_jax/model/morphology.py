@@ -65,7 +65,7 @@ def chamber_volumes(hand: Hand, params: Params) -> Any:
 
 def air(hand: Hand, params: Params) -> Any:
     """Air in all unloaded chambers of a hand [cm^3], shape (...); see `chamber_volumes`."""
-    return 1e6 * np.asarray(chamber_volumes(hand, params)).sum(-1)
+    return 1e6 * chamber_volumes(hand, jax.tree.map(np.asarray, params)).sum(-1)
 
 
 def pressure_limits(hand: Hand, params: Params) -> np.ndarray:

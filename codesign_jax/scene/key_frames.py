@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from codesign_jax.scene import hand as hands
 from codesign_jax.scene import keypaths, schema, sums, unit_slips
@@ -194,17 +195,22 @@ def times(scene: Any, params: Params) -> jax.Array:
 
 
 def poses(scene: Any, params: Params, count: int | None = None) -> jax.Array:
-    """Poses of the arm frame at the first `count` key frames [m, rad], shape (frame, 6)."""
+    """Poses of the arm frame at the first `count` key frames [m, rad], shape (frame, 6).
+
+    Of NumPy's numbers alone they are NumPy's: nothing is compiled then.
+    """
     names = _names(scene, params)
-    dtype = jnp.result_type(params.arm)
     pose: dict[str, Any] = {axis: params.arm[i] for i, axis in enumerate(POSE)}
     pose["z"] = scene.arm.start_height
     rows = []
     for frame in scene.control.frame[:count]:
         fields = {axis: getattr(frame, axis) for axis in POSE}
         pose |= {axis: _value(v, names) for axis, v in fields.items() if v is not None}
-        rows.append(jnp.stack([jnp.asarray(v, dtype) for v in pose.values()]))
-    return jnp.stack(rows)
+        rows.append([*pose.values()])
+    traced = any(isinstance(v, jax.Array) for row in rows for v in row)
+    numpy: Any = jnp if traced else np
+    dtype = params.arm.dtype
+    return numpy.stack([numpy.stack([numpy.asarray(v, dtype) for v in row]) for row in rows])
 
 
 def pressures(scene: Any, params: Params) -> list[tuple[Any, jax.Array]]:

@@ -303,7 +303,7 @@ def laws_table() -> str:
             for strain in (True, False):
                 left = len(remaining_sets(path, strain=strain))
                 counts = left, total - left
-                chance = fisher_exact([counts, reference.setdefault(strain, counts)]).pvalue
+                _, chance = fisher_exact([counts, reference.setdefault(strain, counts)])
                 row += [str(left), "–" if law == "chamber" else f"{chance:.1g}"]
             rows.append(row)
     return output.markdown(rows)

@@ -8,7 +8,7 @@ import shutil
 import subprocess
 from functools import partial
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,7 @@ from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotan
 from codesign_jax.engines.structured.kernel.adjoint_step import AdjointSolve
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables
 from codesign_jax.engines.structured.kernel.program import Inputs, Limits, Program
+from codesign_jax.engines.structured.kernel.rows import Record
 from codesign_jax.engines.structured.lanewise import lanewise
 from tests.helpers import fixtures, grasps
 from tests.helpers.differences import Case, curled, weights_of
@@ -398,35 +399,54 @@ def test_derivatives_of_scenes(name, tmp_path):
 
 
 def ptx(the_scene):
-    """PTX of the reverse pass, and then of the forward pass that records its states."""
+    """PTX of the reverse pass, of the forward pass before it, and of one that records forces."""
     program = AdjointProgram(the_scene, Limits(9, 9, 1e-6), backend="gpu", width=32)
-    blocks = 1
-    steps = 2
-
-    def shape(*sizes):
-        return jax.ShapeDtypeStruct((blocks, *sizes), np.float32)
-
+    inputs = kernel_inputs(program)
     rows = program.path_rows(states=True)
-    size = program.size
-    block = program.block
-    hand = shape(program.hand.rows, size)
-    world = shape(program.world.rows, block)
-    state = shape(rows[0], size), shape(rows[1], block)
-    inputs = Inputs(hand, world, *state, shape(steps, 6, block), shape(steps, size))
-    ends = shape(1, rows[0], size), shape(1, rows[1], block)
-    whole = shape(steps, rows[0], size), shape(steps, rows[1], block)
-    path = StatePath(*whole, *ends, shape(1, 1, block))
-    arguments = program._arguments(inputs, path, Cotangents(*ends, shape(steps, 3, block)))
+    ends = shape(1, rows[0], program.size), shape(1, rows[1], program.block)
+    whole = shape(STEPS, rows[0], program.size), shape(STEPS, rows[1], program.block)
+    path = StatePath(*whole, *ends, shape(1, 1, program.block))
+    bars = Cotangents(*ends, shape(STEPS, 3, program.block))
+    arguments = program._arguments(inputs, path, bars)
+    yield device_code(*program._adjoint_call(arguments), arguments, program.size, (6, 7, 8))
+    forward = Program(the_scene, program.limits, backend="gpu", width=32, team=1)
+    yield device_code(*forward._call(inputs, False, 1), inputs, program.size, (2,))
+    record = Record(touch=True)
+    recording = Program(the_scene, program.limits, backend="gpu", width=32, record=record)
+    inputs = kernel_inputs(recording)
+    call, outputs = recording._call(inputs, False, 0)
+    memory = (5,) if recording.team > 1 else ()
+    yield device_code(call, outputs, inputs, recording.size, (2,), memory)
 
-    def code(call, outputs, arguments, scratch):
-        arrays = jax.tree.leaves(arguments)
-        kernel = launch.Kernel("test", "gpu", size, scratch=scratch)
-        layout = launch.describe(arrays, jax.tree.leaves(outputs), kernel)
-        return gpu.device_code(launch.kernel_jaxpr(call, arrays), layout)
 
-    yield code(*program._adjoint_call(arguments), arguments, (6, 7, 8))
-    forward = Program(the_scene, program.limits, backend="gpu", width=32)
-    yield code(*forward._call(inputs, False, 1), inputs, (2,))
+STEPS = 2
+
+
+def shape(*sizes) -> Any:
+    return jax.ShapeDtypeStruct((1, *sizes), np.float32)
+
+
+def kernel_inputs(program):
+    """Shapes of the inputs of a block."""
+    rows = program.path_rows(states=True)
+    return Inputs(
+        shape(program.hand.rows, program.columns),
+        shape(program.world.rows, program.block),
+        shape(rows[0], program.columns),
+        shape(rows[1], program.block),
+        shape(STEPS, 6, program.block),
+        shape(STEPS, program.columns),
+    )
+
+
+def device_code(call, outputs, arguments, lanes, scratch, onchip=()):
+    arrays = jax.tree.leaves(arguments)
+    exchanged = (*scratch, *onchip) if onchip else ()
+    kernel = launch.Kernel(
+        "test", "gpu", lanes, scratch=scratch, onchip=onchip, exchanged=exchanged
+    )
+    layout = launch.describe(arrays, jax.tree.leaves(outputs), kernel)
+    return gpu.device_code(launch.kernel_jaxpr(call, arrays), layout)
 
 
 def valid(code):

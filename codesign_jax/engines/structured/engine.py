@@ -13,8 +13,8 @@ from codesign_jax.engines.base import Bodies, Equal
 from codesign_jax.engines.structured import bodies, coordinates, forces, transforms
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.kernel.adjoint import StatePath, state_path
-from codesign_jax.engines.structured.kernel.memory import lengthened
 from codesign_jax.engines.structured.kernel.program import Inputs, Outputs
+from codesign_jax.engines.structured.kernel.rows import Record
 from codesign_jax.engines.structured.laws import meshes
 from codesign_jax.engines.structured.laws.integration import before
 from codesign_jax.engines.structured.laws.kinematics import State
@@ -25,10 +25,6 @@ from codesign_jax.types import Forces, Status, Trace
 
 FAR = 1e30
 """A bound that no number exceeds."""
-
-
-LANES = 64
-"""Worlds, or steps of fewer ones, whose forces are computed at once."""
 
 
 class StructuredEngine(Equal):
@@ -253,6 +249,17 @@ class StructuredEngine(Equal):
         path = jax.tree.map(lambda x: program.by_world(x, len(ctrl)), state_path(out, taken))
         return self._trace(series, end, trajectory), path
 
+    def simulate_with_forces(
+        self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool, touch: bool
+    ) -> tuple[Trace, jax.Array, Forces]:
+        """`simulate`, which steps worlds took (world, time), and the forces of these steps."""
+        record = Record(touch=touch)
+        program = Program.here(self.scene, self.limits, ctrl.dtype, len(ctrl), record=record)
+        out = _execute(program, self._inputs(program, fields, ctrl), trajectory=trajectory)
+        series, end = program.outputs(out, len(ctrl), trajectory=trajectory)
+        every = forces.of_rollout(program, out, len(ctrl))
+        return self._trace(series, end, trajectory), series["moved"], every
+
     def _trace(self, entries: dict[str, jax.Array], end: State, trajectory: bool) -> Trace:
         series = entries["distance"], entries["height"], entries["speed"]
         shape = (*series[0].shape, 0)
@@ -310,35 +317,14 @@ class RecordingEngine(Equal):
         return run(fields, ctrl)
 
     def _simulate(self, trajectory: bool, fields: ModelFields, ctrl: jax.Array) -> Trace:
-        trace, states = self.engine.states(fields, ctrl, trajectory=trajectory)
-        worlds, steps = states["moved"].shape[:2]
-        # Several steps of few worlds at once: an operation on few numbers costs its start.
-        chunk = min(max(1, LANES // worlds), steps)
-        rounds = -(-steps // chunk)
-        many = jax.tree.map(lambda v: jnp.repeat(v, chunk, 0), fields)
-        hand = world_constants(self.scene, many)
+        trace, moved, every = self.engine.simulate_with_forces(
+            fields, ctrl, trajectory=trajectory, touch=self.touch
+        )
 
-        def split(series: jax.Array) -> jax.Array:  # to (round, world and step, n)
-            series = lengthened(series.reshape(worlds, steps, -1), 1, rounds * chunk)
-            series = series.reshape(worlds, rounds, chunk, series.shape[2])
-            return jnp.moveaxis(series, 1, 0).reshape(rounds, worlds * chunk, series.shape[3])
+        def masked(v: jax.Array) -> jax.Array:
+            return jnp.where(moved.reshape(*moved.shape, *[1] * (v.ndim - 2)) > 0, v, 0.0)
 
-        def joined(series: jax.Array) -> jax.Array:  # back
-            series = series.reshape(rounds, worlds, chunk, *series.shape[2:])
-            series = jnp.moveaxis(series, 0, 1)
-            return series.reshape(worlds, rounds * chunk, *series.shape[3:])[:, :steps]
-
-        def step(now: tuple) -> Forces:
-            qpos, qvel, acc, moved, *held = now
-            state = coordinates.make(self.scene, qpos, qvel, acc, *held)
-            every = forces.forces(self.scene, hand, state, touch=self.touch)
-            return jax.tree.map(
-                lambda v: jnp.where(moved.reshape(-1, *[1] * (v.ndim - 1)) > 0, v, 0.0), every
-            )
-
-        names = [k for k in ("qpos", "qvel", "acc", "moved", "held") if k in states]
-        every = jax.lax.map(step, tuple(split(states[k]) for k in names))
-        return trace._replace(forces=jax.tree.map(joined, every))
+        return trace._replace(forces=jax.tree.map(masked, every))
 
 
 def _execute(program: Program, inputs: Inputs, **outputs: Any) -> Outputs:

@@ -1,20 +1,34 @@
-"""Contact forces of states, as sums over the contacts that a kernel stores."""
+"""Contact forces as rollouts record them, in the terms of `types.Forces`."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured.kernel.contact_forces import ForceProgram
+from codesign_jax.engines.structured.kernel import Limits, Program
+from codesign_jax.engines.structured.kernel.program import Outputs
+from codesign_jax.engines.structured.kernel.rows import Record
 from codesign_jax.engines.structured.kernel.self_contacts import SelfContactSet
-from codesign_jax.engines.structured.lanes import dot
 from codesign_jax.engines.structured.laws.kinematics import State
 from codesign_jax.engines.structured.world_model import WorldModel
 from codesign_jax.model.held import PALM_RINGS
 from codesign_jax.model.layout import layout, touches_itself
 from codesign_jax.scene import Scene
 from codesign_jax.types import Forces, Touch
+
+Recorded = dict[str, jax.Array]
+"""What a kernel has recorded, by contact set and field, shape (world, time, item, ..., finger)."""
+
+
+def of_rollout(program: Program, out: Outputs, worlds: int) -> Forces:
+    """Forces of a recorded rollout, every array with leading axes (world, time).
+
+    Those of steps that a world did not take are of no use.
+    """
+    none = jnp.zeros((worlds, out.trace.shape[1], program.fingers), out.trace.dtype)
+    return _summed(program, program.by_name(out.recorded, worlds), none)
 
 
 def forces(scene: Scene, hand: WorldModel, state: State, *, touch: bool = False) -> Forces:
@@ -27,9 +41,9 @@ def forces(scene: Scene, hand: WorldModel, state: State, *, touch: bool = False)
     Returns:
       The forces, every array with a leading axis (world,).
     """
-    program = ForceProgram.of(scene, state.wrist.dtype, state.wrist.shape[-1])
-    stored = program.stored(hand, state)
-    return _summed(program, stored, state.position, touch=touch)
+    program, out = _of_states(scene, hand, state, Record(touch=touch))
+    every = of_rollout(program, out, state.wrist.shape[-1])
+    return jax.tree.map(lambda v: v[:, 0], every)
 
 
 def contact_energy(scene: Scene, hand: WorldModel, state: State) -> jax.Array:
@@ -37,159 +51,164 @@ def contact_energy(scene: Scene, hand: WorldModel, state: State) -> jax.Array:
 
     See `holding.stored_energy`.
     """
-    program = ForceProgram.of(scene, state.wrist.dtype, state.wrist.shape[-1])
-    stored = program.stored(hand, state)
+    program, out = _of_states(scene, hand, state, Record(energy=True))
+    recorded = program.by_name(out.recorded, state.wrist.shape[-1])
     total = jnp.zeros_like(state.wrist[0, 0])
     for contacts in program.sets:
-        energy = stored[f"{contacts.name}.energy"]
+        energy = recorded[f"{contacts.name}.energy"]
         if isinstance(contacts, SelfContactSet):
             # Both fingers of a pair have the contact; rows of a finger with itself have it once.
             single = np.arange(contacts.rows) < contacts.with_itself
-            energy = energy * np.where(single, 1.0, 0.5)[:, None, None, None]
-        total = total + energy.reshape(-1, total.shape[0]).sum(0)
+            energy = energy * np.where(single, 1.0, 0.5)[:, None, None]
+        total = total + energy.reshape(len(total), -1).sum(1)
     return total
 
 
 def shapes(scene: Scene, worlds: int, dtype: Any) -> Forces:
     """Shapes of the forces of so many worlds, without `Forces.touch`."""
-    program = ForceProgram.of(scene, dtype, worlds)
-    position = jax.ShapeDtypeStruct((3, 1, worlds), dtype)
+    program = _program(scene, dtype, worlds, Record())
+    blocks = -(-worlds // program.block)
 
-    def summed(stored: dict[str, jax.Array], position: jax.Array) -> Forces:
-        return _summed(program, stored, position, touch=False)
+    def summed() -> Forces:
+        recorded = jnp.zeros((blocks, 1, program.recorded.rows, program.size), dtype)
+        none = jnp.zeros((worlds, 1, program.fingers), dtype)
+        every = _summed(program, program.by_name(recorded, worlds), none)
+        return jax.tree.map(lambda v: v[:, 0], every)
 
-    return jax.eval_shape(summed, program.shapes(worlds, dtype), position)
+    return jax.eval_shape(summed)
 
 
-def _summed(
-    program: ForceProgram, stored: dict[str, jax.Array], position: jax.Array, *, touch: bool
-) -> Forces:
-    """Sums of what `ForceProgram.stored` returns.
+def _program(scene: Scene, dtype: Any, worlds: int, record: Record) -> Program:
+    """A program whose steps keep the accelerations that states have."""
+    return Program.here(scene, Limits(0, 0, 0.0), dtype, worlds, team=1, record=record)
+
+
+def _of_states(
+    scene: Scene, hand: WorldModel, state: State, record: Record
+) -> tuple[Program, Outputs]:
+    """What one step from states writes, with the accelerations that they have."""
+    worlds = state.wrist.shape[-1]
+    program = _program(scene, state.wrist.dtype, worlds, record)
+    h = scene.discretization.timestep
+    # By these commands a rigid wrist has the state's accelerations; chambers have no part in them.
+    arm = state.wrist + h * (state.wrist_vel + h * state.acc.wrist)
+    arm = arm.reshape(6, -1).T
+    ctrl = jnp.concatenate([arm, jnp.zeros((worlds, program.num_fingers), arm.dtype)], 1)
+    return program, program.execute(program.inputs(hand, state, ctrl[:, None]))
+
+
+def _summed(program: Program, recorded: Recorded, none: jax.Array) -> Forces:
+    """Sums of what a kernel has recorded, every array with leading axes (world, time).
 
     Args:
-      position: The object's centre, from which contact points are counted, shape (3, 1, world).
+      none: Zeros of each finger of a block, shape (world, time, finger).
     """
-    scene = program.scene
-    fingers = scene.num_fingers
-    lane = program.fingers, position.shape[-1]
-    none = jnp.zeros((1, 3, 1, *lane), position.dtype)
+    fingers = program.scene.num_fingers
+    vector = jnp.zeros((*none.shape[:2], 1, 3, none.shape[2]), none.dtype)
 
     def net(name: str) -> jax.Array:
-        """Sums over a set's contacts on each lane, shape (3, lane, world)."""
-        return stored.get(f"{name}.force", none).sum((0, 2))
+        """Force of a set on each lane, shape (world, time, 3, finger)."""
+        return recorded.get(f"{name}.force", vector)[:, :, 0]
 
-    def of_fingers(force: jax.Array) -> jax.Array:
-        return jnp.moveaxis(force[:, :fingers], (2, 1), (0, 1))
+    def of_fingers(name: str) -> jax.Array:
+        return jnp.moveaxis(net(name)[..., :fingers], -1, -2)
 
-    def of_body(force: jax.Array) -> jax.Array:
-        return force.sum(1).T
+    def of_body(name: str) -> jax.Array:
+        return net(name).sum(-1)
 
-    grip = none[0, 0, 0]
-    if "finger_object.force" in stored:
-        grip = _pressing(stored, "finger_object").sum((0, 1))
     fields = [s.name for s in program.sets if not isinstance(s, SelfContactSet)]
-    depth = {name: _deepest(stored, name) for name in fields}
-    between, on_palm, more = _between_fingers(program, stored, none[0, 0, 0])
+    depth = {name: recorded[f"{name}.depth"].max((2, 3)) for name in fields}
+    between, on_palm, more = _between_fingers(program, recorded, none)
+    grip = recorded.get("finger_object.pressing", vector[:, :, :, 0])[:, :, 0]
     return Forces(
-        finger=-of_fingers(net("finger_object")),
-        palm=-of_body(net("palm_object")),
-        table=of_body(net("object_table")),
-        grip=grip[:fingers].T,
-        finger_table=of_fingers(net("finger_table")),
-        palm_table=of_body(net("palm_table")),
-        finger_finger=jnp.moveaxis(between[:fingers, :fingers], -1, 0),
-        finger_palm=on_palm[:fingers].T,
+        finger=-of_fingers("finger_object"),
+        palm=-of_body("palm_object"),
+        table=of_body("object_table"),
+        grip=grip[..., :fingers],
+        finger_table=of_fingers("finger_table"),
+        palm_table=of_body("palm_table"),
+        finger_finger=between[..., :fingers, :fingers],
+        finger_palm=on_palm[..., :fingers],
         depth=depth | more,
-        touch=_touches(program, stored, position) if touch else None,
+        touch=_touches(program, recorded) if program.record and program.record.touch else None,
     )
 
 
 def _between_fingers(
-    program: ForceProgram, stored: dict[str, jax.Array], none: jax.Array
+    program: Program, recorded: Recorded, none: jax.Array
 ) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
-    """Normal forces between fingers, shape (lane, lane, world), and on the palm; largest depths.
+    """Normal forces between fingers (..., finger, finger) and on the palm (..., finger); depths.
 
     Args:
-      none: Zeros of the shape (lane, world).
+      none: As in `_summed`.
     """
-    lanes, worlds = none.shape
-    between = jnp.zeros((lanes, lanes, worlds), none.dtype)
-    pressing = stored.get("finger_finger.pressing")
+    lanes = none.shape[2]
+    between = jnp.zeros((*none.shape, lanes), none.dtype)
+    pressing = recorded.get("finger_finger.pressing")  # (world, time, row, 2, finger)
     if pressing is None:
         return between, none, {}
     (self_contacts,) = (s for s in program.sets if isinstance(s, SelfContactSet))
     finger = np.arange(lanes)
     for row in range(self_contacts.rows):
         partner = finger ^ (row + self_contacts.first)
-        between = between.at[finger, partner].set(pressing[row, 0])
-    deepest = stored["finger_finger.depth"].max(2)
+        between = between.at[:, :, finger, partner].set(pressing[:, :, row, 0])
+    deepest = recorded["finger_finger.depth"].max(4)
     effects = program.scene.effects
     depth = {}
     if effects.finger_finger and program.scene.num_fingers > 1:
-        depth["finger_finger"] = deepest[int(self_contacts.with_itself) :, 0].max(0)
+        pairs = deepest[:, :, int(self_contacts.with_itself) :, 0]
+        depth["finger_finger"] = pairs.max(2)
     if touches_itself(program.scene):
-        depth["finger_itself"] = deepest[0, 0]
+        depth["finger_itself"] = deepest[:, :, 0, 0]
     if effects.finger_palm:
-        depth["finger_palm"] = deepest[0, 1]
-    return between, pressing[0, 1] if self_contacts.with_itself else none, depth
+        depth["finger_palm"] = deepest[:, :, 0, 1]
+    return between, pressing[:, :, 0, 1] if self_contacts.with_itself else none, depth
 
 
-def _touches(
-    program: ForceProgram, stored: dict[str, jax.Array], position: jax.Array
-) -> dict[str, Touch]:
+def _touches(program: Program, recorded: Recorded) -> dict[str, Touch]:
     """The object's contacts with the rings of fingers and palm, if the scene has them."""
     scene = program.scene
     touches = {}
-    if "finger_object.force" in stored:
+    if "finger_object.force" in recorded:
+        count = program.links * program.rings_per_link
 
         def by_ring(values: jax.Array) -> jax.Array:
-            # (link, component, ring of the link, finger, world)
-            rings = jnp.moveaxis(values[:, :, :, : scene.num_fingers], (4, 3), (0, 1))
-            # (world, finger, link, component, ring of the link)
-            rings = jnp.swapaxes(rings, 3, 4)
-            return rings.reshape(*rings.shape[:2], -1, rings.shape[4])
+            """(world, time, ring, 3, lane) as (world, time, finger, ring, 3)."""
+            return jnp.moveaxis(values[:, :, :count, :, : scene.num_fingers], 4, 2)
 
-        touches["finger"] = _touch(stored, "finger_object", position, by_ring)
-    if "palm_object.force" in stored:
+        touches["finger"] = _touch(recorded, "finger_object", by_ring)
+    if "palm_object.force" in recorded:
         spheres = layout(scene).palm.size
-        count = PALM_RINGS if scene.effects.surface == "hull" else spheres
+        rings = PALM_RINGS if scene.effects.surface == "hull" else spheres
 
         def by_palm_ring(values: jax.Array) -> jax.Array:
-            # (group, component, 1, lane, world): the groups' rings are dealt to the lanes.
-            rings = jnp.moveaxis(values[:, :, 0], (3, 1), (0, 3))
-            return rings.reshape(rings.shape[0], -1, rings.shape[3])[:, :count]
+            """(world, time, group, 3, lane) as (world, time, ring, 3); dealt to the lanes."""
+            dealt = jnp.moveaxis(values, 4, 3)
+            return dealt.reshape(*dealt.shape[:2], -1, 3)[:, :, :rings]
 
-        touches["palm"] = _touch(stored, "palm_object", position, by_palm_ring)
+        touches["palm"] = _touch(recorded, "palm_object", by_palm_ring)
     return touches
 
 
-def _touch(stored: dict[str, jax.Array], name: str, position: jax.Array, by_ring: Any) -> Touch:
+def _touch(recorded: Recorded, name: str, by_ring: Callable) -> Touch:
     """Contacts of the object ring by ring.
 
     Args:
-      by_ring: From values (item, component, k, lane, world) to (world, ..., ring, component).
+      by_ring: From values (world, time, item, component, lane) to (world, time, ..., component).
     """
-    point = stored[f"{name}.point"] + position[:, None]
-    normal = stored[f"{name}.normal"]
-    force = stored[f"{name}.force"]
-    pressing = _pressing(stored, name)[:, None]
-    return Touch(
-        point=by_ring(point),
-        normal=by_ring(normal),
-        gap=by_ring(stored[f"{name}.gap"][:, None])[..., 0],
-        pressing=by_ring(pressing)[..., 0],
-        tangential=by_ring(pressing * normal - force),
+    point, normal, force = (
+        by_ring(recorded[f"{name}.ring_{n}"]) for n in ("point", "normal", "force")
     )
-
-
-def _pressing(stored: dict[str, jax.Array], name: str) -> jax.Array:
-    """Normal forces of a set's contacts, shape (item, k, lane, world)."""
-    normal, force = (jnp.moveaxis(stored[f"{name}.{field}"], 1, 0) for field in ("normal", "force"))
-    return dot(normal, force)
-
-
-def _deepest(stored: dict[str, jax.Array], name: str) -> jax.Array:
-    """Largest depth of a set's contacts, shape (world,)."""
-    touches = stored[f"{name}.share"] > 0
-    depth = jnp.where(touches, jnp.maximum(-stored[f"{name}.gap"], 0.0), 0.0)
-    return depth.reshape(-1, depth.shape[-1]).max(0)
+    pressing = (normal * force).sum(-1, keepdims=True)
+    gap = by_ring(
+        jnp.broadcast_to(
+            recorded[f"{name}.ring_gap"][:, :, :, None], recorded[f"{name}.ring_point"].shape
+        )
+    )
+    return Touch(
+        point=point,
+        normal=normal,
+        gap=gap[..., 0],
+        pressing=pressing[..., 0],
+        tangential=pressing * normal - force,
+    )

@@ -60,7 +60,13 @@ def zeros(shape: tuple[int, ...], like: jax.Array) -> Lanes:
 
 
 class ContactSet:
-    """The contacts of one pair of bodies: items are links or groups of slots, k contacts each."""
+    """The contacts of one pair of bodies: items are links or groups of slots, k contacts each.
+
+    Attributes:
+      in_teams: Whether each lane of a team has contacts of its own, and not all of them the same.
+    """
+
+    in_teams = False
 
     def __init__(self, scene: Scene, name: str, count: int, k: int, size: int):
         self.scene = scene
@@ -72,12 +78,15 @@ class ContactSet:
         self.friction_by_contact = friction_by_contact(scene, name)
         # Self-contacts share what they hold, see `friction_memory`.
         self.holds = name in held(scene) and name != "finger_finger"
+        # Whether places are stored where nothing touches as well, to be recorded
+        self.stores_all = False
 
     @property
     def sizes(self) -> dict[str, int]:
         """Lengths of the axes of `rows`."""
         ray = LINE[self.scene.effects.friction]
-        return {rows.ITEM: self.count, rows.CONTACTS: self.k, rows.RAY: ray}
+        sizes = {rows.ONE: 1, rows.ITEM: self.count, rows.CONTACTS: self.k, rows.RAY: ray}
+        return sizes | {rows.TOUCH: self.count * self.k}
 
     def groups_of(self, *tables: type[Rows]) -> dict[str, Group]:
         """The rows of declared ones that the set has."""
@@ -180,7 +189,10 @@ class BoundContacts:
             for field, value in (kept(place, jar) | more).items():
                 self.write(field, value, item)
 
-        jax.lax.cond(self.touching(item), store, lambda: None)
+        if self.set.stores_all:
+            store()
+        else:
+            jax.lax.cond(self.touching(item), store, lambda: None)
 
     def begin(self, item: Any, place: Place, acc: Lanes, vel: Lanes) -> tuple[Place, Lanes]:
         """Places whose share is zero where no candidate is, and their jar."""
@@ -267,12 +279,21 @@ class BoundContacts:
         return self.if_touching(item, lambda: [self._prepare_linesearch(item, step)], [()])[0]
 
     def _prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:
+        return self.line(item, self.relative_acceleration(item, step))
+
+    def relative_acceleration(self, item: Any, acc: Lanes) -> Lanes:
+        """Accelerations (3, k) of contact points in their axes, by that of the bodies (6, ...)."""
         contacts = self.set.contacts
 
-        def relative(place, cone, step):
-            return contacts(place, cone).relative(step[:, None])
+        def relative(place, cone, acc):
+            return contacts(place, cone).relative(acc[:, None])
 
-        return self.line(item, lanewise(relative, self.place(item), self.cone_at(item), step))
+        return lanewise(relative, self.place(item), self.cone_at(item), acc)
+
+    def record(self, table: BoundTable, name: str, value: Lanes, item: Any) -> None:
+        """Writes a field of `rows.TouchForce` of an item's contacts, (..., k)."""
+        for j in range(self.set.k):
+            table.write(name, value[..., j, :, :], item * self.set.k + j)
 
     def line(self, item: Any, change: Lanes) -> Lanes:
         """Stores the contacts' cost along a change of jar; returns its slope at 0."""
@@ -317,6 +338,13 @@ def slopes_along_line(share, cone, ray, alpha):
     line = LineCost(*(ray[i] if i < ray.shape[0] else None for i in range(5)))
     first, second = contact.slopes(c, line, alpha)
     return [sum_axis(first, 0), sum_axis(second, 0)]
+
+
+def force_of_jar(place, cone, jar):
+    """Forces (3, k) of contacts on their first body [N], world axes."""
+    contacts = ContactSet.contacts(place, cone)
+    force = contact.constraint_update(contacts, jar).force[:3]
+    return jnp.where(contacts.active, force, 0.0)
 
 
 def _deeper(depth, share, gap):

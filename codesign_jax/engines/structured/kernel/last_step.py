@@ -177,6 +177,9 @@ class ChordStep:
             args = step.object_acc, axes, factors, before, alpha, mask
             link_acc, acc = lanewise(move, parent, *args)
             problem.write(Scratch.step_acc, acc, i)
+            if Scratch.chord_link_acc in problem.memory.scratch:
+                change = lanewise(lambda t, v: jnp.where(t, v, 0.0), mask, link_acc)
+                problem.write(Scratch.chord_link_acc, change, i)
             return link_acc
 
         loop(self.links, link, problem.widened(step.palm_acc), self.block.size)

@@ -144,6 +144,25 @@ class BoundTable:
             self.ref[row, lane] = splat(part, lane.shape, value.dtype)
 
 
+class TimeStep:
+    """Reference to a table of one time step, of an array (time, row, lane)."""
+
+    def __init__(self, ref: Any, t: jax.Array):
+        self.ref = ref
+        self.t = t
+        self.dtype = ref.dtype
+        self.shape = ref.shape[1:]
+
+    def _at(self, index: Any) -> tuple:
+        return (self.t, *index) if isinstance(index, tuple) else (self.t, index)
+
+    def __getitem__(self, index: Any) -> jax.Array:
+        return self.ref[self._at(index)]
+
+    def __setitem__(self, index: Any, value: jax.Array) -> None:
+        self.ref[self._at(index)] = value
+
+
 def lengthened(array: jax.Array, axis: int, length: int) -> jax.Array:
     """The array with its last item along an axis repeated; `jnp.pad` is 20 operations for it."""
     missing = length - array.shape[axis]

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.engines.structured.kernel import objects, rows, shared_memory
+from codesign_jax.engines.structured.kernel import record as recording
 from codesign_jax.engines.structured.kernel.contact_sets import ContactSet
 from codesign_jax.engines.structured.kernel.memory import MemoryLayout, lengthened
 from codesign_jax.engines.structured.kernel.rows import (
@@ -20,6 +21,7 @@ from codesign_jax.engines.structured.kernel.rows import (
     FingerState,
     Group,
     Hand,
+    Record,
     Scratch,
     Search,
     Shared,
@@ -59,7 +61,15 @@ class Tables(KernelLayout):
     remembers: tuple[type[rows.Rows], ...] = ()
     """What slots of self-contacts have further."""
 
-    def __init__(self, scene: Scene, *, backend: str, width: int, team: int | None = None):
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        backend: str,
+        width: int,
+        team: int | None = None,
+        record: Record | None = None,
+    ):
         self.backend = backend
         self.scene = scene
         self.lay = layout(scene)
@@ -82,7 +92,10 @@ class Tables(KernelLayout):
         self.palm_groups = palm_groups(scene)
         self.meshes = bool(shapes.mesh_indices(scene))
         self.support_points = objects.support_points(scene)
+        self.record = record
         self.sets = self._sets()
+        for contacts in self.sets:
+            contacts.stores_all = bool(record and record.touch and contacts.on_object)
         self.held = held.held(scene)
         self.has_slots = any(isinstance(s, SlotSet) for s in self.sets)
         self._tables()
@@ -159,6 +172,8 @@ class Tables(KernelLayout):
             elsewhere = {*onchip, *shared_memory.UNUSED}
             scratch = {name: group for name, group in scratch.items() if name not in elsewhere}
         self.scratch = MemoryLayout.by_item(True, **scratch)
+        if self.record is not None:
+            self.recorded = MemoryLayout(True, **recording.groups(self))
 
     def _world_groups(self) -> dict[str, Group]:
         """Constants of worlds: of palm, wrist, object, verdict and contacts."""
@@ -342,6 +357,22 @@ class Packing(Tables):
             jnp.pad(x, [(0, 0), (0, 0), (0, n - x.shape[2]), (0, 0)])
             for x, n in zip(cotangents, rows, strict=True)
         )  # type: ignore[return-value]
+
+    def by_name(self, recorded: jax.Array | None, worlds: int) -> dict[str, jax.Array]:
+        """What a rollout has recorded, by name, shape (world, time, item, ..., finger).
+
+        Args:
+          recorded: Rows of blocks, shape (block, time, row, lane); None where there are none.
+        """
+        if recorded is None:
+            return {}
+        rows = self.by_world(recorded, worlds)
+        arrays = {}
+        for name, (count, shape) in self.recorded.groups.items():
+            first = self.recorded.offset[name]
+            part = rows[:, :, first : first + count * self.recorded.stride[name]]
+            arrays[name] = part.reshape(*rows.shape[:2], count, *shape, self.fingers)
+        return arrays
 
     def by_world(self, rows: jax.Array, worlds: int) -> jax.Array:
         """Rows (block, time, row, lane or world) as (world, time, row, finger or 1)."""

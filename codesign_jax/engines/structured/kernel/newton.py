@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import friction_memory
+from codesign_jax.engines.structured.kernel import friction_memory, record
 from codesign_jax.engines.structured.kernel.coupling import Coupling, Eliminated
 from codesign_jax.engines.structured.kernel.last_step import (
     LARGEST,
@@ -31,7 +31,7 @@ from codesign_jax.engines.structured.kernel.memory import (
 )
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem
 from codesign_jax.engines.structured.kernel.rows import FingerState
-from codesign_jax.engines.structured.kernel.slots import only
+from codesign_jax.engines.structured.kernel.slots import any_of, only
 from codesign_jax.engines.structured.kernel.team_solver import (
     TeamCoupling,
     TeamElimination,
@@ -96,6 +96,7 @@ class Newton:
             alpha, decrement = lanewise(unless_converged, before, alpha, decrement)
             newton = alpha  # of the contacts, which the chord's step does not move
             now = lanewise(tree_add_scaled, alpha, now, step)
+            behind_newton = now
             if self.chord:
                 likely = busy & (decrement.lane > tolerance) & (decrement.lane <= LARGEST)
                 iterate = now, alpha, decrement
@@ -106,9 +107,9 @@ class Newton:
                 likely = busy & (decrement.lane > tolerance) & (decrement.lane <= largest)
                 accept = partial(self.accept_steady, decrement, alpha, likely, tolerance)
                 decrement = choose(anywhere(likely), accept, decrement, self.block.size)
-            if friction_memory.kept(problem):
+            if friction_memory.kept(problem) or problem.memory.layout.record:
                 ends = busy & ((decrement.lane <= tolerance) | (count + 1 >= iterations))
-                friction_memory.keep(problem, newton, ends)
+                self._end(newton, ends, now, behind_newton)
             return [count + 1, *solid((now, decrement, alpha), self.block.size)[0]]
 
         def going(carry: list) -> jax.Array:
@@ -126,6 +127,21 @@ class Newton:
             self.block.size,
         )
         return now, Convergence(decrement, count)
+
+    def _end(self, alpha: Lanes, ends: jax.Array, now: Iterate, behind_newton: Iterate) -> None:
+        """Leaves behind what contacts hold, and where they are recorded their jar.
+
+        Args:
+          alpha: Length of Newton's last step.
+          ends: Lanes of the worlds whose iteration ends.
+          now: The iterate at the end; `behind_newton`: before a chord step.
+        """
+        problem = self.problem
+        if friction_memory.kept(problem):
+            friction_memory.keep(problem, alpha, ends)
+        if problem.memory.layout.record:
+            chord = lanewise(partial(jax.tree.map, jnp.subtract), now, behind_newton)
+            any_of(ends, lambda: record.settle(problem, alpha, ends, chord))
 
     def accept_steady(
         self, decrement: Lanes, alpha: Lanes, likely: jax.Array, tolerance: float

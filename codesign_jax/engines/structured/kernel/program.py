@@ -18,9 +18,9 @@ from codesign_jax import reuse
 from codesign_jax.compiler.launch import Kernel, block_lanes, kernel_jaxpr, launch
 from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.kernel import shared_memory
-from codesign_jax.engines.structured.kernel.memory import Block, anywhere
+from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, TimeStep, anywhere
 from codesign_jax.engines.structured.kernel.memory_tables import Packing
-from codesign_jax.engines.structured.kernel.rows import WorldState
+from codesign_jax.engines.structured.kernel.rows import Record, WorldState
 from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, of_code
 from codesign_jax.engines.structured.laws import air
@@ -30,7 +30,7 @@ from codesign_jax.judge import verdict
 from codesign_jax.model import held
 from codesign_jax.scene import Scene
 
-Record = TypeVar("Record")
+Arrays = TypeVar("Arrays")
 
 TRACE = ("distance", "height", "speed", "residual", "iterations", "moved")
 
@@ -72,13 +72,15 @@ class Outputs(NamedTuple):
     scratch: Any  # Memory of a step, which is not read; None after the call
     trace: Any  # `Program.trace`, shape (block, time, entry, world)
     path: tuple[PathPart, ...] = ()  # See `path_parts`
+    recorded: Any = None  # Forces by `kernel.record`, shape (block, time, row, lane)
     onchip: Any = None  # Shared memory of a step, with teams only; None after the call
 
 
 class Limits(NamedTuple):
     """How hard each step is solved."""
 
-    iterations: int  # Largest number of Newton iterations
+    # Largest number of Newton iterations; with none the accelerations stay those of the state
+    iterations: int
     evaluations: int  # Largest number of line-search evaluations of an iteration
     tolerance: float  # Relative Newton decrement at which a world has converged
 
@@ -94,6 +96,7 @@ class Program(Packing):
         backend: str = "gpu",
         width: int = 32,
         team: int | None = None,
+        record: Record | None = None,
     ):
         """Lays out the memory.
 
@@ -105,8 +108,9 @@ class Program(Packing):
             those of a warp.
           team: Lanes that share the work of a finger, 1 or `shared_memory.TEAM`; by default what
             the scene and the backend make faster. Sums depend on it, and so do last bits.
+          record: What rollouts record of the contacts' forces, None for nothing.
         """
-        super().__init__(scene, backend=backend, width=width, team=team)
+        super().__init__(scene, backend=backend, width=width, team=team, record=record)
         self.limits = limits
         self.trace = (*TRACE, "overflow") if self.has_slots else TRACE
 
@@ -161,6 +165,10 @@ class Program(Packing):
         call, outputs = self._call(inputs, trajectory, states)
         places = numbered(outputs)
         memory: dict[str, Any] = {"scratch": (places.scratch,)}
+        if self.record is not None:
+            origin = f"{origin} {self.record}"
+        if not self.limits.iterations:
+            memory |= {"level": 1}  # what has no solver is as fast at LLVM's level 1
         if self.team > 1:
             origin = f"{origin} {self.team}"
             memory |= {"onchip": (places.onchip,), "exchanged": (places.scratch, places.onchip)}
@@ -219,12 +227,15 @@ class Program(Packing):
             path.append(
                 PathPart(shape(count, angles, self.columns), shape(count, places, self.block))
             )
+        some = self.record is not None and self.recorded.rows > 0
+        recorded = shape(steps, self.recorded.rows, self.columns) if some else None
         outputs = Outputs(
             shape(self.finger_state.rows, self.columns),
             shape(self.world_state.rows, self.block),
             shape(self.scratch.rows, self.columns),
             shape(steps, len(self.trace), self.block),
             tuple(path),
+            recorded,
             shape(self.onchip.rows, self.columns) if self.team > 1 else None,
         )
         kernel = partial(self._kernel, steps, trajectory, states)
@@ -258,8 +269,8 @@ class Program(Packing):
         )
 
     def launch(
-        self, call: Callable, inputs: Any, outputs: Record, origin: str, **options: Any
-    ) -> Record:
+        self, call: Callable, inputs: Any, outputs: Arrays, origin: str, **options: Any
+    ) -> Arrays:
         """Runs what `call` returns; results are a record as the outputs.
 
         Args:
@@ -287,7 +298,7 @@ class Program(Packing):
         rollout.repeat_last(done, steps)
 
 
-def numbered(record: Record) -> Record:
+def numbered(record: Arrays) -> Arrays:
     """A record with the places of its arrays among all of them."""
     leaves, structure = jax.tree.flatten(record)
     return structure.unflatten(range(len(leaves)))
@@ -314,6 +325,7 @@ class BlockRollout:
         self.commands = inputs.arm, inputs.pressure
         self.trace = outputs.trace
         self.path = outputs.path
+        self.recorded = outputs.recorded
 
     def start(self) -> None:
         """Copies the start state to the state."""
@@ -344,9 +356,9 @@ class BlockRollout:
 
             self._store_path(t)
             command = self._command(t)
-            entry, new_speed, moved = step.advance(
-                *command, undecided, going > 0, fastest, self.program.limits, t == 0
-            )
+            limits = self.program.limits
+            given = undecided, going > 0, fastest, limits, t == 0, self._recorded(t)
+            entry, new_speed, moved = step.advance(*command, *given)
             going = jnp.where(moved, going, 0.0)
             for k, value in enumerate((*entry[:2], fastest, *entry[2:4], going, *entry[4:])):
                 self.trace[t, k, self.world] = value
@@ -384,6 +396,12 @@ class BlockRollout:
         arm, pressure = self.commands
         pose = lanes([arm[t, k, self.world] for k in range(6)], (6,), wide=False)
         return pose, lanes([pressure[t]], (), wide=True)
+
+    def _recorded(self, t: jax.Array) -> BoundTable | None:
+        """Where a step's forces are recorded."""
+        if self.recorded is None:
+            return None
+        return BoundTable(self.program.recorded, TimeStep(self.recorded, t))
 
     def _number(self, name: str) -> jax.Array:
         return self.step.world_state.read(name).lane
@@ -427,6 +445,7 @@ def _with_shared_columns(block: Block, inputs: Inputs, outputs: Outputs) -> tupl
         outputs._replace(
             finger_state=share(outputs.finger_state),
             scratch=share(outputs.scratch),
+            recorded=None if outputs.recorded is None else share(outputs.recorded),
             path=tuple(part._replace(finger=share(part.finger)) for part in outputs.path),
             onchip=share(outputs.onchip),
         ),

@@ -11,7 +11,7 @@ there are several of each: `contacts.read(Contact.jar, item)`.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 Group = tuple[int, tuple[int, ...]]
 """Number of items, and shape of an item."""
@@ -28,6 +28,7 @@ SUPPORT = "support"  # support points of a mesh, one for each finger's lanes
 PAIRING = "pairing"  # pairings of fingers that hold friction on one another
 ITEM = "item"  # of a contact set: links, groups, or slots
 SLOT_ROW = "slot_row"  # rows of slots
+TOUCH = "touch"  # contacts of a set that are recorded one by one
 
 # Axes of an item
 AXES = "axes"  # hinges of a joint
@@ -48,7 +49,7 @@ class Field(str):
     Attributes:
       items: Axis of the items.
       shape: Shape of an item: numbers, and axes.
-      on: Whether a kernel's layout, or a contact set, has it.
+      on: Whether a kernel's layout, a contact set or a record has it.
     """
 
     items: str
@@ -90,7 +91,7 @@ class Rows:
         """Items and shapes by name, of the fields that an owner has.
 
         Args:
-          owner: A kernel's layout, or a contact set.
+          owner: A kernel's layout, a contact set, or a record.
           sizes: Lengths of the axes.
         """
 
@@ -218,6 +219,8 @@ class Scratch(Rows):
     armature_now = field(
         LINK, AXES, on=lambda layout: layout.scene.effects.lateral_threshold or layout.by_elements
     )
+    # Change of the links' accelerations by a chord step, in rollouts that record forces
+    chord_link_acc = field(LINK, 6, on=lambda layout: layout.record and layout.team == 1)
     new_held_friction = field(PAIRING, 3, on=lambda layout: "finger_finger" in layout.held)
 
 
@@ -318,15 +321,29 @@ class TeamRing(Rows):
     force = field(ITEM, 3, CONTACTS)
 
 
-class Force(Rows):
-    """What is recorded of the contacts of an item: their place, and what they do."""
+class Record(NamedTuple):
+    """What a rollout records of its contacts beside the sums of each pair of bodies."""
 
-    point = field(ITEM, 3, CONTACTS)
-    normal = field(ITEM, 3, CONTACTS)
-    gap = field(ITEM, CONTACTS)
-    share = field(ITEM, CONTACTS)
-    force = field(ITEM, 3, CONTACTS)  # On the first body [N], world axes
-    energy = field(ITEM, CONTACTS)  # See `holding.stored_energy` [J]
+    touch: bool = False  # Place and force of each ring on the object
+    energy: bool = False  # Energy of the contacts' springs, see `holding.stored_energy`
+
+
+class ForceSum(Rows):
+    """What is recorded of a set's contacts on each lane; conditions are of `Record`."""
+
+    force = field(ONE, 3)  # On the first body [N], world axes
+    pressing = field(ONE)  # Sum of the normal forces [N]
+    depth = field(ONE)  # The largest one [m]
+    energy = field(ONE, on=lambda record: record.energy)  # [J]
+
+
+class TouchForce(Rows):
+    """What is recorded of each ring's contact with the object."""
+
+    ring_point = field(TOUCH, 3)  # [m], world axes
+    ring_normal = field(TOUCH, 3)
+    ring_gap = field(TOUCH)
+    ring_force = field(TOUCH, 3)  # On the ring [N], world axes
 
 
 class PairForce(Rows):
@@ -334,7 +351,7 @@ class PairForce(Rows):
 
     pressing = field(SLOT_ROW, 2)  # Sum of the normal forces [N]
     depth = field(SLOT_ROW, 2)  # The largest one [m]
-    energy = field(SLOT_ROW, 2)  # [J]
+    energy = field(SLOT_ROW, 2, on=lambda record: record.energy)  # [J]
 
 
 class Side(Rows, prefix="side"):

@@ -126,9 +126,6 @@ class SelfContactSet(SlotSet):
         on = {"finger_finger": between, "finger_palm": e.finger_palm}
         return [name for name in on if on[name]]
 
-    in_teams = False
-    """Whether the lanes of teams share slots."""
-
     @property
     def sizes(self) -> dict[str, int]:
         """See `ContactSet`."""

@@ -7,10 +7,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import chambers, friction_memory, objects
-from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, ContactSet, zeros
-from codesign_jax.engines.structured.kernel.memory import anywhere, loop
-from codesign_jax.engines.structured.kernel.newton import Newton
+from codesign_jax.engines.structured.kernel import chambers, friction_memory, objects, record
+from codesign_jax.engines.structured.kernel.contact_sets import zeros
+from codesign_jax.engines.structured.kernel.memory import BoundTable, anywhere, loop
+from codesign_jax.engines.structured.kernel.newton import Convergence, Newton
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem, triangle
 from codesign_jax.engines.structured.kernel.rows import Hand, Scratch, WorldState
@@ -51,6 +51,7 @@ class Step(StepMemory):
         speed: Any,
         limits: tuple[int, int, float],
         begins: Any,
+        recorded: BoundTable | None = None,
     ) -> tuple:
         """Advances the block.
 
@@ -62,6 +63,7 @@ class Step(StepMemory):
           speed: Largest velocity before the step.
           limits: See `program.Limits`.
           begins: Whether the rollout begins, a scalar; see `_keep_overlap`.
+          recorded: Where the contacts' forces are written; None to record none.
 
         Returns:
           Trace entries distance, height, residual, iterations and, with slots, overflow; speed
@@ -70,7 +72,12 @@ class Step(StepMemory):
         layout = self.layout
         state, bodies, _, now, centre = self.assemble(arm, pressure)
         jax.lax.cond(begins, lambda: self._keep_overlap(state), lambda: None)
-        now, convergence = Newton(Problem(self, bodies["palm"])).solve(now, waiting, *limits)
+        convergence = Convergence(lanes([self.like], (), wide=False), jnp.int32(0))
+        if limits[0]:
+            problem = Problem(self, bodies["palm"])
+            now, convergence = Newton(problem).solve(now, waiting, *limits)
+        if recorded is not None:
+            record.write(self, recorded)
         distance = lanewise(lambda c: jnp.sqrt(dot(c, c)), centre).lane
         height = state["position"][2].lane
         goes_on = waiting & undecided(distance, height)
@@ -101,16 +108,8 @@ class Step(StepMemory):
         bodies = lanewise(run, state, arm, self.palm_constants())
         world_object = objects.read(layout.scene, self.block, self.world, self.hand, self.grid)
         self.columns = bodies["columns"]
-        self.contacts = {c.name: self.bound(c) for c in layout.sets}
+        self.contacts = {c.name: c.bind(self.scratch, self.constant) for c in layout.sets}
         return state, bodies, world_object, *self._forward(state, bodies, pressure, world_object)
-
-    def bound(self, contacts: ContactSet) -> BoundContacts:
-        """A contact set with its memory."""
-        return contacts.bind(self.scratch, self.constant)
-
-    def fields(self, bodies: dict[str, Any], world_object: WorldObject) -> SdfCollision:
-        """The search for contacts with distance fields; arguments as `assemble` has them."""
-        return SdfCollision(self, bodies, world_object)
 
     def _keep_overlap(self, state: dict) -> None:
         """Keeps the largest overlap of two bodies of worlds whose grasp begins in this step.
@@ -199,7 +198,7 @@ class Step(StepMemory):
         self.search = search
         if search:
             search.start(link_acc, vel, frame, origin)
-        fields = self.fields(bodies, world_object)
+        fields = SdfCollision(self, bodies, world_object)
         zero_acc = zeros((6,), like)
 
         def link(i: Any, carry: tuple) -> tuple:
@@ -212,6 +211,8 @@ class Step(StepMemory):
             least = lanewise(jnp.minimum, least, stored.pop("share"))
             centre = stored["body_centre"]
             stored |= {"step_acc": zeros((layout.axes,), like), "step_link_acc": zero_acc}
+            if Scratch.chord_link_acc in self.scratch:
+                stored |= {Scratch.chord_link_acc: zero_acc}
             if layout.team > 1:
                 stored = team_rows(stored, (constants["mass"], centre, stored["tensor"]))
             for name, value in stored.items():

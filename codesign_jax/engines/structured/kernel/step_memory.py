@@ -6,7 +6,13 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, ContactSet
 from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, MemoryLayout
-from codesign_jax.engines.structured.kernel.rows import FingerState, Hand, World, WorldOptions
+from codesign_jax.engines.structured.kernel.rows import (
+    FingerState,
+    Hand,
+    Record,
+    World,
+    WorldOptions,
+)
 from codesign_jax.engines.structured.lanewise import Lanes, lanes
 from codesign_jax.engines.structured.laws.cones import friction_by_contact
 from codesign_jax.engines.structured.laws.step_numbers import step_numbers
@@ -61,6 +67,7 @@ class KernelLayout:
     support_points: int  # Support points of a mesh
     sets: list[ContactSet]  # The contacts
     has_slots: bool  # Whether any of them are in slots
+    record: Record | None  # What a rollout records of its contacts
     held: dict[str, int]  # What contacts hold of friction, see `model.held`
     # Rows of the tables; `onchip` with teams only.
     hand: MemoryLayout
@@ -69,6 +76,8 @@ class KernelLayout:
     world_state: MemoryLayout
     scratch: MemoryLayout
     onchip: MemoryLayout
+    # Rows of what is recorded of a step, with `record` only.
+    recorded: MemoryLayout
 
     @property
     def tapered(self) -> bool:

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from codesign_jax.engines.structured.kernel import rows
 from codesign_jax.engines.structured.kernel.contact_sets import ContactSet
 from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, choose, loop
 from codesign_jax.engines.structured.kernel.rows import (
@@ -34,11 +35,18 @@ from codesign_jax.scene import Scene
 class TeamSdfContactSet(ContactSet):
     """Contacts of a finger's rings with object or table, dealt to the lanes of its team."""
 
+    in_teams = True
+
     def __init__(self, scene: Scene, tables: Any, name: str, links: int, k: int):
         """As `ContactSet`; one item more is no contact, another one takes what nobody reads."""
         super().__init__(scene, name, links * k + 2, 1, tables.size)
         self.block = (tables.fingers, tables.block, tables.team)
         self.rings = links * k
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """See `ContactSet`; one more contact is recorded for lanes without an item."""
+        return super().sizes | {rows.TOUCH: self.rings + 1}
 
     def groups(self) -> dict[str, Group]:
         """See `ContactSet`; with the Hessian and the force of each."""
@@ -87,6 +95,10 @@ class BoundTeamSdfContacts(BoundSlots):
     def fold_items(self, body: Callable, start: Any) -> Any:
         """See `BoundContacts`; a lane each."""
         return self.every(lambda item, _, carry: body(item, carry), start)
+
+    def record(self, table: BoundTable, name: str, value: Lanes, item: UsedSlot) -> None:
+        """See `BoundContacts`; a lane each."""
+        table.scatter(name, value[..., 0, :, :], item.source, self.block.column)
 
     def update_constraints(self, alpha: Lanes) -> None:
         """Adds the last step of the line search to jar; stores Hessians and forces."""

@@ -1,0 +1,253 @@
+"""Recorded contact forces: what a step writes of its contacts when its accelerations are known.
+
+The force of a contact is a function of its place and of its jar (`contact.constraint_update`).  A
+recording rollout writes sums of it for each pair of bodies, and with `rows.Record.touch` the force
+of each ring on the object beside its place.  Jar is the one at the end of the step: where a world's
+iteration ends, `settle` adds the last step of Newton's method to it, and a chord step behind that.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from codesign_jax.engines.structured.kernel import friction_memory
+from codesign_jax.engines.structured.kernel.contact_sets import (
+    BoundContacts,
+    ContactSet,
+    force_of_jar,
+    zeros,
+)
+from codesign_jax.engines.structured.kernel.memory import BoundTable, choose
+from codesign_jax.engines.structured.kernel.problem import Iterate, Problem, relative
+from codesign_jax.engines.structured.kernel.rows import (
+    Contact,
+    ForceSum,
+    Group,
+    PairForce,
+    Scratch,
+    Slot,
+    TouchForce,
+    WorldState,
+)
+from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts, FingerPairing
+from codesign_jax.engines.structured.kernel.shared_memory import team_sum
+from codesign_jax.engines.structured.kernel.slots import only
+from codesign_jax.engines.structured.kernel.step_memory import StepMemory
+from codesign_jax.engines.structured.lanes import dot, sum_axis
+from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.laws import holding
+
+SELF = "finger_finger"
+"""The set of the hand's contacts with itself."""
+
+
+def groups(layout: Any) -> dict[str, Group]:
+    """Rows that a kernel's layout records, by the name of a contact set and of a field."""
+    recorded: dict[str, Group] = {}
+    for contacts in layout.sets:
+        for table in tables(layout, contacts):
+            for field, group in table.groups(layout.record, contacts.sizes).items():
+                recorded[f"{contacts.name}.{field}"] = group
+    return recorded
+
+
+def tables(layout: Any, contacts: ContactSet) -> tuple:
+    """The declarations of what is recorded of a set."""
+    if contacts.name == SELF:
+        return (PairForce,)
+    return (ForceSum, TouchForce) if contacts.stores_all else (ForceSum,)
+
+
+def settle(problem: Problem, alpha: Lanes, ends: jax.Array, chord: Iterate) -> None:
+    """Moves jar to the end of the step, of worlds whose iteration ends.
+
+    Args:
+      problem: The solver's problem.
+      alpha: Length of Newton's last step.
+      ends: Lanes of these worlds, bool, shape (lane,).
+      chord: Change of the accelerations of wrist, palm and object by a chord step behind it; that
+        of the links is `Scratch.chord_link_acc`. Self-contacts have none, see `ChordStep`.
+    """
+    mask = lanes([ends], (), wide=True)
+    step = problem.memory
+
+    def moved(contacts: BoundContacts, item: Any) -> Lanes:
+        jar = contacts.read(Contact.jar, item)
+        return lanewise(_moved, mask, jar, alpha, contacts.read(Contact.step, item))
+
+    def put(contacts: BoundContacts, item: Any, jar: Lanes) -> None:
+        old = contacts.read(Contact.step, item)
+        contacts.write(Contact.jar, jar, item)
+        contacts.write(Contact.step, lanewise(_zero_where, mask, old), item)
+
+    for contacts in (*problem.per_link, *problem.dealt):
+
+        def settle_item(item: Any, contacts: BoundContacts = contacts) -> None:
+            def store() -> None:
+                jar = moved(contacts, item)
+                if Scratch.chord_link_acc in step.scratch:
+                    acc = _chord_of(problem, contacts, item, chord)
+                    jar = lanewise(jnp.add, jar, contacts.relative_acceleration(item, acc))
+                put(contacts, item, jar)
+
+            jax.lax.cond(contacts.touching(item), store, lambda: None)
+
+        contacts.each_item(settle_item)
+    if problem.self_contacts is not None:
+        self_contacts = problem.self_contacts
+
+        def settle_slot(item: Any, pairing: FingerPairing) -> None:
+            put(self_contacts, item, moved(self_contacts, item))
+
+        with only([self_contacts], ends):
+            self_contacts.do(settle_slot)
+    if Scratch.chord_link_acc in step.scratch:
+        _each(problem.links, lambda i: step.scratch.write(
+            Scratch.chord_link_acc, zeros((6,), step.like), i
+        ))  # fmt: skip
+
+
+def _chord_of(problem: Problem, contacts: BoundContacts, item: Any, chord: Iterate) -> Lanes:
+    """Change of a set's relative acceleration by the chord step, shape (6,)."""
+    name = contacts.set.name
+    link = None
+    if name.startswith("finger"):
+        link = problem.memory.scratch.read(Scratch.chord_link_acc, item)
+    return relative(name, link, chord.palm_acc, chord.object_acc)
+
+
+def write(step: StepMemory, table: BoundTable) -> None:
+    """Writes the forces of the step's contacts, at its accelerations; before it is integrated."""
+    for name, contacts in step.contacts.items():
+        if isinstance(contacts, BoundSelfContacts):
+            _each(contacts.set.rows, lambda row, c=contacts: _write_pairing(step, c, row, table))
+        else:
+            _write_set(step, name, contacts, table)
+
+
+def _write_set(step: StepMemory, name: str, contacts: BoundContacts, table: BoundTable) -> None:
+    """Writes what a set's contacts do, and with `stores_all` each of them."""
+    energy = f"{name}.{ForceSum.energy}" in table
+    none = [zeros((3,), step.like), *[zeros((), step.like)] * (2 + energy)]
+
+    def add(item: Any, sums: list[Lanes]) -> list[Lanes]:
+        def added() -> list[Lanes]:
+            numbers = contacts.place(item), contacts.cone_at(item), contacts.read(Contact.jar, item)
+            held = friction_memory.of_item(step, contacts, item) if energy else None
+            return lanewise(_add_item, sums, *numbers, None if held is None else held[0])
+
+        return choose(contacts.touching(item), added, sums, contacts.set.size)
+
+    force, pressing, depth, *stored = contacts.fold_items(add, none)
+    if contacts.set.in_teams:
+        force, pressing = (team_sum(step.block, v) for v in (force, pressing))
+        depth = _most_of_team(step, depth)
+    fields = [ForceSum.force, ForceSum.pressing, ForceSum.depth, ForceSum.energy]
+    for field, value in zip(fields, (force, pressing, depth, *stored), strict=False):
+        table.write(f"{name}.{field}", value)
+    if contacts.set.stores_all:
+        _write_rings(step, name, contacts, table)
+
+
+def _write_rings(step: StepMemory, name: str, contacts: BoundContacts, table: BoundTable) -> None:
+    """Writes place and force of each of a set's rings, those that do not touch as well."""
+    position = step.world_state.read(WorldState.position)
+
+    def put(item: Any) -> None:
+        place = contacts.place(item)
+        numbers = place, contacts.cone_at(item), contacts.read(Contact.jar, item)
+        force = lanewise(force_of_jar, *numbers)
+        point = lanewise(lambda x, p: x + p[:, None], place.point, position)
+        values = point, place.normal, place.gap, force
+        for field, value in zip(TouchForce.fields(), values, strict=True):
+            contacts.record(table, f"{name}.{field}", value, item)
+
+    contacts.each_item(put)
+
+
+def _write_pairing(
+    step: StepMemory, contacts: BoundSelfContacts, row: Any, table: BoundTable
+) -> None:
+    """Writes what the fingers of a pairing do to one another, to themselves and to the palm."""
+    energy = f"{SELF}.{PairForce.energy}" in table
+    pairing = contacts.pairing(row)
+    hold = friction_memory.of_row(step, contacts, row) if energy else []
+
+    def add(item: Any, sums: list[Lanes]) -> list[Lanes]:
+        palm = jnp.zeros_like(step.like)
+        if pairing.itself is not None:
+            other = contacts.read(Slot.other, item).lane
+            palm = jnp.where(pairing.itself & (other < 0.5), 1.0, palm)
+        side = lanes([palm], (), wide=True)
+        with contacts.with_cone(row, item):
+            numbers = contacts.place(item), contacts.cone, contacts.read(Contact.jar, item)
+            held = [lanewise(jnp.multiply, h, contacts.holds(item, pairing)) for h in hold]
+            return lanewise(_add_slot, sums, side, *numbers, *held)
+
+    none = [zeros((2,), step.like)] * (2 + energy)
+    pressing, depth, *stored = contacts.fold(row, add, none)
+    if contacts.set.in_teams:
+        pressing = team_sum(step.block, pressing)
+        depth = _most_of_team(step, depth)
+    fields = [PairForce.pressing, PairForce.depth, PairForce.energy]
+    for field, value in zip(fields, (pressing, depth, *stored), strict=False):
+        table.write(f"{SELF}.{field}", value, row)
+
+
+def _most_of_team(step: StepMemory, value: Lanes) -> Lanes:
+    parts = [step.block.over_team(p, jnp.maximum) for p in value.parts.ravel()]
+    return lanes(parts, value.shape[:-2], wide=True)
+
+
+def _each(count: int, body: Callable[[Any], None]) -> None:
+    """Runs body(k), which stores something, for all k below a number."""
+
+    def run(k: jax.Array, x: jax.Array) -> jax.Array:
+        body(k)
+        return x
+
+    jax.lax.fori_loop(0, count, run, jnp.int32(0))
+
+
+# Stages that the kernel evaluates lane by lane
+
+
+def _moved(mask, jar, alpha, step):
+    return jnp.where(mask, jar + alpha * step, jar)
+
+
+def _zero_where(mask, value):
+    return jnp.where(mask, 0.0, value)
+
+
+def _add_item(sums, place, cone, jar, held_friction):
+    """Adds an item's contacts to force, normal force and, if there is a sum for it, energy."""
+    total, pressing, depth, *stored = sums
+    force = force_of_jar(place, cone, jar)
+    if stored:
+        contacts = ContactSet.contacts(place, cone)
+        stored = [stored[0] + sum_axis(holding.stored_energy(contacts, held_friction), 0)]
+    pressing = pressing + sum_axis(dot(place.normal, force), 0)
+    return [total + sum_axis(force, 1), pressing, _deeper(depth, place), *stored]
+
+
+def _deeper(depth, place):
+    for k in range(place.gap.shape[0]):
+        depth = jnp.maximum(depth, jnp.where(place.share[k] > 0, -place.gap[k], 0.0))
+    return depth
+
+
+def _add_slot(sums, palm, place, cone, jar, held_friction=None):
+    """Adds a slot's contact to a pairing's sums; palm: 1 for one with the palm, else 0."""
+    pressing, depth, *stored = sums
+    side = jnp.stack([1.0 - palm, palm])
+    force = sum_axis(dot(place.normal, force_of_jar(place, cone, jar)), 0)
+    deep = _deeper(jnp.zeros_like(palm), place)
+    if stored:
+        held_friction = None if held_friction is None else held_friction[:, None]
+        contacts = ContactSet.contacts(place, cone)
+        energy = sum_axis(holding.stored_energy(contacts, held_friction), 0)
+        stored = [stored[0] + side * energy]
+    return [pressing + side * force, jnp.maximum(depth, side * deep), *stored]

@@ -135,7 +135,8 @@ def _drawn(
         size *= 2
     with jax.ensure_compile_time_eval():  # another program may close over the key
         more = _draw(size, shapes, key, noises, first)
-    return jax.tree.map(lambda v: jnp.asarray(np.asarray(v)[:num_trials]), more)
+    # Not by JAX's operations: each would be a program for every shape.
+    return jax.device_put(jax.tree.map(lambda v: np.asarray(v)[:num_trials], more))
 
 
 @partial(reuse.quickly_compiled, static_argnums=(0, 1))

@@ -350,7 +350,7 @@ class SideBySide:
     ) -> tuple[OptimizerState, EpisodeInfo]:
         population, trials, *_ = asked
         shape = (*population.shape[:2], self._task.trials)
-        results = jax.tree.map(lambda v: jnp.asarray(v.reshape(*shape, *v.shape[1:])), results)
+        results = jax.device_put(jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]), results))
         outcomes, last = results
         program = SceneProgram(self._task.scene, self._task._pieces.tell, self._optimizer)
         new, selection = program((states, masks), (population, outcomes), scene)

@@ -131,7 +131,7 @@ class Case(NamedTuple):
         """The hand in each trial, and the trials, leading axis (trial,)."""
         design = np.asarray(self.design, np.float32)
         noise = rollout.sample_trials(self.scene, key, trials, first)
-        hand = jax.jit(self.space.params)(design)
+        hand = self.space.params(design)
         return jax.tree.map(lambda v: np.repeat(np.asarray(v)[None], trials, 0), hand), noise
 
     def compile(self, trials: int, options: rollout.Options) -> None:

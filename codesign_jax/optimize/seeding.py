@@ -1,6 +1,8 @@
 """Seed particles by rejection sampling."""
 
+import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from codesign_jax.optimize.bounds import Space
+from codesign_jax.reuse import quickly_compiled
 
 STREAM_SEED = 0x73656564
 """Stream of the candidates ("seed")."""
@@ -28,15 +31,24 @@ def candidates(key: jax.Array, space: Space, indices: ArrayLike) -> jax.Array:
     Returns:
       Particles, shape (particle, parameter).
     """
-    low = jnp.asarray(space.low, float)
-    high = jnp.asarray(space.high, float)
+    low, high = (np.asarray(v, jnp.result_type(float)) for v in (space.low, space.high))
+    numbers = indices if isinstance(indices, jax.Array) else np.asarray(indices)
+    unit: Any = _uniform(key, numbers, len(low))
+    if not isinstance(unit, jax.core.Tracer):
+        unit = np.asarray(unit)  # whose operations compile nothing
+    inside = unit.__array_namespace__().clip(low + unit * (high - low), low, high)
+    return space.constrain(jax.device_put(inside))
+
+
+@functools.partial(quickly_compiled, static_argnums=2)
+def _uniform(key: jax.Array, indices: Any, size: int) -> jax.Array:
+    """Numbers between 0 and 1, shape (index, size)."""
     key = jax.random.fold_in(key, STREAM_SEED)
 
     def draw(index: jax.Array) -> jax.Array:
-        return jax.random.uniform(jax.random.fold_in(key, index), low.shape, low.dtype)
+        return jax.random.uniform(jax.random.fold_in(key, index), (size,))
 
-    unit = jax.vmap(draw)(jnp.asarray(indices))
-    return space.constrain(jnp.clip(low + unit * (high - low), low, high))
+    return jax.vmap(draw)(indices)
 
 
 def rejection(

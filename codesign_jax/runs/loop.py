@@ -233,7 +233,7 @@ class Search:
 
         def simulate() -> list[Outcome]:
             trials = task.first_trials(jnp.stack(keys))
-            particles = jnp.asarray(np.stack(populations))
+            particles = np.stack(populations)
             return task.outcomes(particles, trials, size=self._size, advance=checked)
 
         wait = self._interrupts.begin(simulate)

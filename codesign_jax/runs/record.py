@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax import array_files
@@ -119,7 +118,8 @@ class Record:
         Every array has shape (particle, trial).
         """
         kept = self.history.ancestors[self.done - 1]
-        return jax.tree.map(lambda v: jnp.asarray(v[self.done - 1][kept]), self.history.outcomes)
+        last = jax.tree.map(lambda v: v[self.done - 1][kept], self.history.outcomes)
+        return jax.device_put(last)
 
 
 def to_arrays(record: Record) -> dict:
@@ -145,13 +145,12 @@ def to_arrays(record: Record) -> dict:
 def from_arrays(arrays: dict) -> Record:
     """Inverse of `to_arrays`; the history is copied, so that `add_report` may write to it."""
     try:
-        s = arrays["state"]
+        s = jax.device_put(arrays["state"])
         h = jax.tree.map(np.array, arrays["history"])
-        key = jax.random.wrap_key_data(jnp.asarray(s["key"]))
-        memory = jax.tree.map(jnp.asarray, s.get("memory"))
-        state = OptimizerState(jnp.asarray(s["particles"]), jnp.asarray(s["episode"]), key, memory)
+        key = jax.random.wrap_key_data(s["key"])
+        state = OptimizerState(s["particles"], s["episode"], key, s.get("memory"))
         tests = {
-            name: Outcome(**jax.tree.map(jnp.asarray, arrays[name])) if name in arrays else None
+            name: Outcome(**jax.device_put(arrays[name])) if name in arrays else None
             for name in _TESTS
         }
         start = Start(**arrays["start"]) if "start" in arrays else None

@@ -69,6 +69,7 @@ def episodes_in(folder: Path) -> int:
 
 def noise_values(trials: Trial) -> dict[str, Any]:
     """The noise of trials by the names of its columns in `columns.GRASPS`; of any shape."""
+    trials = jax.tree.map(np.asarray, trials)
     tilt = np.zeros_like(trials.position) if trials.tilt is None else trials.tilt
     return {
         "noise_x_m": trials.position[..., 0],
@@ -222,7 +223,8 @@ def _of_test(
     test: FinalTest,
     searched: Outcome | None,
 ) -> Iterator[Row]:
-    failed = types.failed(np.asarray(test.outcomes.status))
+    test = jax.tree.map(np.asarray, test)
+    failed = types.failed(test.outcomes.status)
     at_search = [""] * len(particles) if searched is None else verdict.kept(searched).sum(1)
     for i, design in enumerate(_designs(TESTS, space, particles)):
         yield {
@@ -231,7 +233,7 @@ def _of_test(
             "trials": failed.shape[1],
             "failed_trials": failed[i].sum(),
             "paper_success": int(test.paper_success[i]),
-            **_ends(scene, jax.tree.map(lambda v, i=i: np.asarray(v)[i], test.outcomes)),
+            **_ends(scene, jax.tree.map(lambda v, i=i: v[i], test.outcomes)),
             "search_kept_trials": at_search[i],
             **design,
         }

@@ -172,8 +172,9 @@ def problems(limits: Limits, where: str) -> list[str]:
 
 def rim_drop(radius: Any, roll: Any, pitch: Any, yaw: Any) -> Any:
     """How far the rim of a palm is below its centre [m], by the arm's angles [rad], any shape."""
-    up = jnp.cos(roll) * jnp.cos(pitch) + jnp.sin(roll) * jnp.sin(yaw) * jnp.sin(pitch)
-    return radius * jnp.sqrt(jnp.maximum(1 - up**2, FLAT))
+    numpy = roll.__array_namespace__()
+    up = numpy.cos(roll) * numpy.cos(pitch) + numpy.sin(roll) * numpy.sin(yaw) * numpy.sin(pitch)
+    return radius * numpy.sqrt(numpy.maximum(1 - up**2, FLAT))
 
 
 def on_lines(pressures: Any, highest: Any, lines: int) -> Any:

@@ -51,6 +51,7 @@ from codesign_jax.export.process import Process, Section, Size
 from codesign_jax.judge import cases
 from codesign_jax.model import build_spec
 from codesign_jax.scene import beams, hand, parameters, silicones
+from codesign_jax.types import failed
 from scripts.section import study
 from tests.helpers.command_runs import command
 from tests.helpers.grasps import (
@@ -914,10 +915,14 @@ def test_contacts_have_the_declared_stiffness(friction):
 
 def test_sections_by_elements_bend_as_far_in_the_model():
     """Free bends of linear springs under the exported gains, with a finger without pressure."""
-    the_scene = pinch("box", section__law="elements", effects__neo_hookean=True)
+    law = {"section__law": "elements", "effects__neo_hookean": True}
+    the_scene = pinch("box", links=2, **law, **HURRIED)
     params, trial = hand_world(the_scene)
     params = params._replace(pressure=np.array([40e3, 0.0]))
     exported = grasps.world(the_scene, params, trial)
+    played = grasps.grasp(the_scene, params, trial)
+    assert np.isfinite(played.states).all()
+    assert not failed(played.outcome.status)
     dofs = model.layout(the_scene).dofs[..., 0]
     gain = exported.actuator_gainprm[6:, 0]
     bends = (params.pressure * gain)[:, None] / exported.jnt_stiffness[exported.dof_jntid[dofs]]

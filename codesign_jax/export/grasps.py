@@ -170,7 +170,7 @@ def _judge(
     speed = np.abs(states[:, nq:]).max(1)
     trace = Trace(distance, states[:, nq - 5], speed, states[:, :0])
     with jax.enable_x64(True):
-        return jax.tree.map(np.asarray, _outcome(scene, trace, 0, trial))
+        return jax.tree.map(np.asarray, _outcome(scene.bare, trace, 0, trial))
 
 
-_outcome = jax.jit(outcome, static_argnums=0)
+_outcome = jax.jit(outcome)

@@ -73,6 +73,18 @@ def test_effects(on_cpu, name):
         np.testing.assert_array_less(np.abs(got[key] - value), tolerance, err_msg=key)
 
 
+@pytest.mark.parametrize("name", ["spheres", "hull and fingers"])
+def test_recorded_forces(on_cpu, name):
+    """Which lanes of a team record on a GPU, and single lanes on a CPU."""
+    read = on_cpu(f"recorded/{name}")
+    got = gpu_cases.recorded(name)
+    want = read()
+    assert np.abs(want["finger"]).max() > 0.1  # fingers push
+    for key, value in want.items():
+        # Places differ by less than 1e-7 m, see `test_effects`; a skin of 4 kN/m makes of that:
+        np.testing.assert_allclose(got[key], value, atol=4e-4, err_msg=key)
+
+
 def test_who_replays_the_key_frames_simulates_the_open_loop():
     """To the bit, though the tables of worlds are laid out once and not in each period."""
     scene = gpu_cases.short_scene("hull and fingers")

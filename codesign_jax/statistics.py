@@ -110,8 +110,15 @@ def gain(by: np.ndarray, truth: np.ndarray) -> float:
       by: Kept grasps at the setting that chooses, (design, trial of a half, half).
       truth: At the setting that values; each half of the trials is valued by the other one.
     """
-    chooses = by.mean(1)
-    values = truth.mean(1)[:, ::-1]
-    first, second = np.triu_indices(len(by), 1)
-    choice = np.sign(chooses[first] - chooses[second])
-    return float((choice * (values[first] - values[second]) / 2).mean())
+    return float(gains(by.mean(1), truth.mean(1)))
+
+
+def gains(by: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """`gain` by kept shares of designs instead of grasps, shape (..., design, half)."""
+    from scipy import stats
+
+    designs = by.shape[-2]
+    # Designs that keep less, less those that keep more: each pair counts its difference once.
+    beaten = 2 * stats.rankdata(by, axis=-2) - (designs + 1)
+    pairs = (beaten * truth[..., ::-1]).sum(-2)
+    return pairs.mean(-1) / (designs * (designs - 1))

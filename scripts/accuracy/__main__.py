@@ -5,7 +5,9 @@ python -m scripts.accuracy --out runs/budget --share 1/8        # beside 7 other
 python -m scripts.accuracy --out runs/budget --time             # then: rates, alone on the machine
 python -m scripts.accuracy --out runs/budget --tip              # errors of the finger tip
 python -m scripts.accuracy --out runs/budget --merge docs/data/budget.json
-python -m scripts.accuracy --merge docs/data/budget.json --report     # page and figures
+python -m scripts.accuracy --of docs/data/search/hard.npz --designs 67 --trials 24 --out runs/hard
+python -m scripts.accuracy --out runs/hard --merge docs/data/hard_designs.json
+python -m scripts.accuracy --report                             # page and figures
 
 All variants have the same designs and the same trials.  The designs are those that the default
 search recommended in its first seeds, or those of a file (--of).  The truth has the finer step,
@@ -13,13 +15,25 @@ links and rings; `finer` refines all three again.  A variant has a file of its o
 processes share the work; variants of CPUs alone need one with JAX_PLATFORMS=cpu.
 """
 
-import json
 import sys
 from pathlib import Path
 
 from codesign_jax import use_compilation_cache
-from scripts.accuracy import budget, report
+from scripts.accuracy import budget, decisions, report
 from scripts.shared import output, provenance, work
+
+
+def fill(docs: Path) -> None:
+    """Fills the tables of the page and draws its figures from both studies of docs/data."""
+    recommended, hard = (report.read(docs / "data", n) for n in (report.RECOMMENDED, report.HARD))
+    tables = report.tables(recommended, hard)
+    losses = decisions.losses_of(recommended, hard)
+    tables["decisions"] = decisions.table(losses)
+    for mark, text in tables.items():
+        print(f"{text}\n")
+        output.fill(docs / "accuracy.md", text, mark)
+    print(report.draw_budget(recommended, hard, docs / "figures" / "budget.png"))
+    print(decisions.draw(losses, recommended, docs / "figures" / "accuracy_time.png"))
 
 
 def main() -> int:
@@ -34,17 +48,12 @@ def main() -> int:
     parser.add_argument("--time", action="store_true", help="measure rates")
     parser.add_argument("--tip", action="store_true", help="measure errors of the finger tip")
     parser.add_argument("--merge", type=Path, help="write the files into this one and stop")
-    parser.add_argument("--report", action="store_true", help="draw what --merge holds and stop")
+    parser.add_argument("--report", action="store_true", help="fill the page, draw, and stop")
     parser.add_argument("--docs", type=Path, default=Path("docs"), help="folder that is drawn into")
     args = parser.parse_args()
     use_compilation_cache()
     if args.report:
-        results = report.Budget(json.loads(args.merge.read_text()))
-        for mark, text in results.tables().items():
-            print(f"{text}\n")
-            output.fill(args.docs / "accuracy.md", text, mark)
-        print(report.draw_budget(results, args.docs / "figures" / "budget.png"))
-        print(report.draw_against_time(results, args.docs / "figures" / "accuracy_time.png"))
+        fill(args.docs)
         return 0
     if args.merge:
         output.write_json(args.merge, budget.merge(args.out), indent=None)

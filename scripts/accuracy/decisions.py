@@ -1,12 +1,9 @@
-"""Which of two hands is better: the figures of the accuracy page on designs that are hard to judge.
+"""What an accuracy costs in time and loses, on designs that are hard to judge.
 
-python -m scripts.accuracy.decisions --pick     # designs that keep 30 to 95 %, in HARD
-python -m scripts.accuracy --of docs/data/search/hard.npz --designs 32 --trials 20 \\
-    --out runs/hard --only "fast;standard;fine;reference;..."          # the variants of ROWS
-python -m scripts.accuracy --out runs/hard --merge docs/data/decisions.json
-python -m scripts.accuracy.decisions            # the figures and the table of the page
+python -m scripts.accuracy.decisions     # designs that keep 30 to 95 %, in HARD
 
-The verdicts that one change flips are in CHANGES, a count for each change.
+`scripts.accuracy` simulates them by all variants, and fills the page.  Three questions: does a
+grasp hold, what share of its grasps does a design keep, and which of two designs is better?
 
 A hand is chosen from two by half of the trials at one setting, and valued by the other half at
 `reference`, so that no trial is counted on both sides.  The gain of a choice is the kept share of
@@ -14,40 +11,28 @@ the chosen hand beyond the mean of the two, in the mean over all pairs; the regr
 the gain of choosing by `reference` less its gain.
 """
 
-import json
-import sys
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib import ticker
 from matplotlib.axes import Axes
 
 from codesign_jax import rollout, scene, use_compilation_cache
 from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import parameters
-from codesign_jax.statistics import Interval, gain, halves
+from codesign_jax.statistics import Interval, gain, gains, halves
 from codesign_jax.types import failed
 from scripts.accuracy import budget
-from scripts.accuracy.report import interval, points
+from scripts.accuracy.report import Budget, interval, points
 from scripts.shared import output, provenance, work
-from scripts.shared.statistics import RESAMPLES, bootstrap, spearman, two_way
+from scripts.shared.statistics import RESAMPLES, bootstrap, spearman, two_way_means
 
-DOCS = Path(__file__).parents[2] / "docs"
-HARD = DOCS / "data" / "search" / "hard.npz"
-DATA = DOCS / "data" / "decisions.json"
-FIGURE = DOCS / "figures" / "choices.png"
-CHANGES = DOCS / "data" / "hard_designs.json"
-CHANGES_FIGURE = DOCS / "figures" / "decisions.png"
-KINDS = {
-    "chance": ("a micrometre", "0.6"),
-    "step": ("time step, integrator, accuracy", "tab:blue"),
-    "contact": ("constants of the contact", "tab:green"),
-    "rubber": ("constants of the rubber", "tab:red"),
-}
-"""What a change concerns: its words and its colour."""
+HARD = Path(__file__).parents[2] / "docs" / "data" / "search" / "hard.npz"
 SPREAD = 0.1
 """Standard deviation of a design near a winner, a share of each parameter's range."""
 TRIALS = 12
@@ -56,32 +41,33 @@ SEED = 11
 LEAST = 0.3
 MOST = 0.95
 TRUTH = "reference"
+"""What the table compares with: the finest preset."""
+EXACT = "truth"
+"""What the figure compares with, so that it has the finest preset as well."""
+MACHINES = {"gpu": "H200", "cpu": "CPU core"}
+"""What times are measured on, in words."""
 
 
 class Row(NamedTuple):
-    """A setting: its variant, its words and its kind."""
+    """A setting: its variant and its words."""
 
     variant: str
     words: str
-    kind: str
 
 
-PRESET = "accuracy"
-CHANCE = "chance"
-CONTACT = "contact"
-RUBBER = "rubber"
-COLORS = {PRESET: "tab:blue", CHANCE: "0.5", CONTACT: "tab:green", RUBBER: "tab:red"}
+PRESETS = ("fast", "standard", "fine", "reference")
+CANDIDATES = ("1e-6", "4 rings, 1e-3")
+"""Settings of the figure: those that are recommended, and others whose time is known."""
 ROWS = (
-    Row("fast", "`fast`", PRESET),
-    Row("standard", "`standard`", PRESET),
-    Row("fine", "`fine`", PRESET),
-    Row("reference", "`reference`", PRESET),
-    Row("1e-6", "`standard` with a tolerance of 1e-6", PRESET),
-    Row("1e-6, moved", "the same, objects moved by a micrometre", CHANCE),
-    Row("twice the stiffness", "the same, skin of 8 kN/m in place of 4", CONTACT),
-    Row("fingers creep", "the same, no friction memory", CONTACT),
-    Row("101 kPa", "the same, silicone of 101 kPa in place of 88", RUBBER),
-    Row("linear law", "the same, linear bending law", RUBBER),
+    *(Row(name, f"`{name}`") for name in PRESETS),
+    Row("1e-6", "`standard` with a tolerance of 1e-6"),
+    Row("1e-6, moved", "the same, objects moved by a micrometre"),
+    Row("4 rings, 1e-3", "`standard` with four rings a link"),
+    Row("truth", "step of 2 ms, 20 links, four rings"),
+    Row("twice the stiffness", "tolerance of 1e-6, skin of 8 kN/m in place of 4"),
+    Row("fingers creep", "the same, no friction memory"),
+    Row("101 kPa", "the same, silicone of 101 kPa in place of 88"),
+    Row("linear law", "the same, linear bending law"),
 )
 
 
@@ -119,11 +105,17 @@ def pick() -> Path:
 # --- choices --------------------------------------------------------------------------------------
 
 
-def rank(by: np.ndarray, truth: np.ndarray) -> float:
-    """Spearman's correlation of the shares in one half of the trials and in the other at truth."""
-    chooses = by.mean(1).T
-    values = truth.mean(1)[:, ::-1].T
-    return float(np.mean(spearman(chooses, values)))
+def ranks(by: np.ndarray, truth: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Spearman's correlation of the shares in one half of the trials and in the other at truth.
+
+    Args:
+      by: Kept grasps at the setting that ranks, (design, trial of a half, half).
+      truth: At the setting that values.
+      rows: Indices of designs, shape (..., design); a correlation for each row.
+    """
+    chooses = by.mean(1)
+    values = truth.mean(1)[:, ::-1]
+    return np.mean([spearman(chooses[rows, h], values[rows, h]) for h in (0, 1)], axis=0)
 
 
 def compared(by: np.ndarray, truth: np.ndarray) -> dict[str, Interval]:
@@ -134,148 +126,159 @@ def compared(by: np.ndarray, truth: np.ndarray) -> dict[str, Interval]:
     correlation.
     """
 
-    def values(by: np.ndarray, truth: np.ndarray) -> list[float]:
-        regret = gain(truth, truth) - gain(by, truth)
-        return [float((by != truth).mean()), float(by.mean() - truth.mean()), regret]
-
-    def ranks(rows: np.ndarray) -> np.ndarray:
-        return np.array([rank(by[row], truth[row]) for row in np.atleast_2d(rows)])
-
-    flipped, kept, regret = two_way(values, by, truth, resamples=RESAMPLES)
-    correlation = bootstrap(ranks, len(by), resamples=RESAMPLES)
+    more = (by - truth).reshape(len(by), -1)
+    kept, flipped = two_way_means(more, np.abs(more), resamples=RESAMPLES)
+    regret = regret_of(by, truth)
+    correlation = bootstrap(partial(ranks, by, truth), len(by), resamples=RESAMPLES)
     return {"flipped": flipped, "kept": kept, "rank": correlation, "regret": regret}
 
 
-def kept_of(content: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Halves of the kept grasps of every variant of a file."""
-    grasping = scene.load("paper")
-    records = content["variants"]
-    return {n: halves(budget.costs(grasping, r) < SUCCESS_COST) for n, r in records.items()}
+def regret_of(by: np.ndarray, truth: np.ndarray) -> Interval:
+    """Regret with its interval over designs and trials: `two_way`, all resamples at once."""
+    rng = np.random.default_rng(0)
+    designs, trials, _ = by.shape
+    rows = rng.integers(0, designs, (RESAMPLES, designs))
+    weights = rng.multinomial(trials, np.full(trials, 1 / trials), RESAMPLES) / trials
+
+    def shares(kept: np.ndarray) -> np.ndarray:
+        every = np.einsum("dth,bt->bdh", kept, weights)
+        return np.take_along_axis(every, rows[..., None], 1)
+
+    drawn = gains(shares(truth), shares(truth)) - gains(shares(by), shares(truth))
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    return Interval(gain(truth, truth) - gain(by, truth), float(low), float(high))
 
 
-def results(content: dict[str, Any]) -> list[tuple[Row, dict[str, Interval]]]:
-    """The rows that were simulated, with their measures."""
-    kept = kept_of(content)
-    simulated = [row for row in ROWS if row.variant in kept]
-    return [(row, compared(kept[row.variant], kept[TRUTH])) for row in simulated]
+class Losses(NamedTuple):
+    """What settings lose.
+
+    Attributes:
+      rows: Settings with their kept share, ranks, flips and regret, see `compared`.
+      toss: Regret of the toss of a coin, a share of grasps.
+      finer: Flips of `fine` less those of `standard`, in the same trials.
+      times: Time of a grasp [ms] by machine and variant; without those that were not timed.
+      shown: Flips and regret against `EXACT` of the settings in the figure.
+    """
+
+    rows: list[tuple[Row, dict[str, Interval]]]
+    toss: float
+    finer: Interval
+    times: dict[tuple[str, str], float]
+    shown: dict[str, dict[str, Interval]]
 
 
-def table(rows: list[tuple[Row, dict[str, Interval]]]) -> str:
-    """The measures of every row, in Markdown."""
-    head = ["simulated at", "does a grasp hold: verdicts that flip"]
+def losses_of(recommended: Budget, hard: Budget) -> Losses:
+    """Measures of hard designs, and times of recommended ones, which hold their objects."""
+    kept = {n: halves(costs < SUCCESS_COST) for n, costs in hard.costs.items()}
+    rows = [(r, compared(kept[r.variant], kept[TRUTH])) for r in ROWS if r.variant in kept]
+    named = ((m, n) for m in MACHINES for n in (*PRESETS, *CANDIDATES))
+    times = {(m, n): t for m, n in named if (t := recommended.milliseconds(m, n))}
+
+    fine, standard = (
+        np.abs(kept[n] - kept[TRUTH]).reshape(len(kept[n]), -1) for n in ("fine", "standard")
+    )
+    [finer] = two_way_means(fine - standard, resamples=RESAMPLES)
+    timed = [n for n in (*PRESETS, *CANDIDATES) if n in kept]
+    shown = {n: compared(kept[n], kept[EXACT]) for n in timed}
+    return Losses(rows, gain(kept[TRUTH], kept[TRUTH]), finer, times, shown)
+
+
+def table(losses: Losses) -> str:
+    """The measures of every row, in Markdown, and how `fine` differs from `standard`."""
+    head = ["simulated at", *(f"ms a grasp, one {words}" for words in MACHINES.values())]
+    head += ["does a grasp hold: verdicts that flip"]
     head += ["what share is kept: points from `reference`"]
     head += ["which of two is better: rank correlation", "regret of a choice, points"]
     cells = [head]
-    for row, intervals in rows:
+    for row, intervals in losses.rows:
+        times = [losses.times.get((machine, row.variant)) for machine in MACHINES]
+        shown = [f"{float(f'{t:.2g}'):g}" if t else "–" for t in times]
         flipped, rank = interval(intervals["flipped"]), interval(intervals["rank"], ".2f")
         kept, regret = (points(intervals[name]) for name in ("kept", "regret"))
         if row.variant == TRUTH:
-            kept = regret = "–"
-        cells.append([row.words, flipped, kept, rank, regret])
-    return output.markdown(cells)
+            flipped = kept = regret = "–"
+        cells.append([row.words, *shown, flipped, kept, rank, regret])
+    toss = f"A toss of a coin has a regret of {100 * losses.toss:.1f} points."
+    words = "the share of verdicts that flip changes by"
+    finer = f"From `standard` to `fine` {words} {points(losses.finer)} points."
+    return f"{output.markdown(cells)}\n\n{toss} {finer}"
 
 
 # --- the figure -----------------------------------------------------------------------------------
 
+LOOKS = {"gpu": ("tab:blue", "o"), "cpu": ("tab:orange", "s")}
+"""Colour and marker of a machine."""
 
-def draw(rows: list[tuple[Row, dict[str, Interval]]], toss: float, path: Path) -> Path:
-    """Rank correlations and regrets as dots with their intervals, a line for each setting.
 
-    Args:
-      rows: The settings with their measures.
-      toss: Regret of the toss of a coin, a share of grasps.
-      path: The figure's.
+def draw(losses: Losses, recommended: Budget, path: Path) -> Path:
+    """Three errors against the time of a grasp, a curve of the presets for each machine.
+
+    Crosses are other settings.  Errors: verdicts that flip against `EXACT`, regret of a choice, and
+    the finger tip in the air.
     """
-    figure = output.new_figure(9, 3.8)
-    left, right = figure.subplots(1, 2, sharey=True)
-    _dots(left, rows, "rank", 1.0)
-    left.set_xlim(0, 1)
-    left.set_xlabel("rank correlation of designs")
-    _dots(right, rows, "regret", 100.0)
-    right.axvline(0, color="0.7", lw=1, zorder=0)
-    right.axvline(100 * toss, color="0.4", lw=1, ls="--", zorder=0)
-    right.text(100 * toss, len(rows) - 0.4, "toss of a coin ", ha="right", va="bottom", fontsize=8)
-    right.set_xlabel("regret, points of success")
-    right.set_xlim(-3, 14)
-    right.set_xticks(range(-2, 14, 2))
-    words = {row.variant: row.words.replace("`", "") for row, _ in rows}
-    left.set_yticks(range(len(rows)), [*words.values()], fontsize=9)
-    left.set_ylim(len(rows) - 0.4, -0.6)
-    kinds = dict.fromkeys(row.kind for row, _ in rows)
-    dots = [left.plot([], [], "o", color=COLORS[kind], label=kind)[0] for kind in kinds]
-    figure.legend(handles=dots, loc="outside lower right", ncols=4, frameon=False, fontsize=8)
+    figure = output.new_figure(12.5, 4.4)
+    verdicts, choices, tips = figure.subplots(1, 3)
+    flipped, regret = (
+        {n: v[name] for n, v in losses.shown.items()} for name in ("flipped", "regret")
+    )
+    of_tips = {n: Interval(e, e, e) for n, e in recommended.tips.items()}
+    _curves(verdicts, losses.times, flipped, 100)
+    verdicts.set(title="Does a grasp hold?", ylabel="verdicts that flip [%]", ylim=(0, 25))
+    _curves(choices, losses.times, regret, 100)
+    choices.axhline(100 * losses.toss, color="0.4", lw=1, ls="--")
+    words = "toss of a coin "
+    right = choices.get_yaxis_transform()
+    choices.text(1, 100 * losses.toss, words, ha="right", va="top", fontsize=8, transform=right)
+    words = "regret of a choice [points]"
+    choices.set(title="Which of two designs is better?", ylabel=words, ylim=(-3, 13))
+    _curves(tips, losses.times, of_tips, 1)
+    tips.set(title="Where is the finger tip, in the air?", ylabel="error [mm]", yscale="log")
+    tips.set_ylim(0.03, 10)
+    tips.yaxis.set_major_formatter(ticker.FuncFormatter(lambda y, _: f"{y:g}"))
+    for axes in (verdicts, choices, tips):
+        axes.set(xlabel="time of a grasp [ms]", xscale="log")
+        axes.xaxis.set_major_formatter(ticker.FuncFormatter(lambda x, _: f"{x:g}"))
+        axes.grid(alpha=0.3, lw=0.4)
+        axes.margins(x=0.15)
+    handles, labels = verdicts.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
     return output.save_figure(figure, path)
 
 
-def _dots(axes: Axes, rows: list[tuple[Row, dict[str, Interval]]], name: str, scale: float) -> None:
-    """A dot with its interval for each row; the truth has no regret."""
-    for y, (row, intervals) in enumerate(rows):
-        if name == "regret" and row.variant == TRUTH:
-            continue
-        middle, low, high = (scale * v for v in intervals[name])
-        axes.plot([low, high], [y, y], color=COLORS[row.kind], lw=1.5)
-        axes.plot(middle, y, "o", color=COLORS[row.kind], ms=6)
+def _curves(
+    axes: Axes, times: dict[tuple[str, str], float], errors: dict[str, Interval], scale: float
+) -> None:
+    """The presets of each machine as a curve with intervals, other settings as crosses."""
+    for machine, words in MACHINES.items():
+        color, marker = LOOKS[machine]
 
+        def places(names: tuple[str, ...], machine: str = machine) -> list[tuple[str, float]]:
+            timed = [n for n in names if n in errors and (machine, n) in times]
+            return [(n, times[machine, n]) for n in timed]
 
-# --- changes --------------------------------------------------------------------------------------
-
-
-def rank_interval(rank: float, designs: int) -> Interval:
-    """Interval of 95 % of Spearman's correlation over designs, by Fisher's transformation.
-
-    Its variance for ranks: D. G. Bonett, T. A. Wright, Sample size requirements for estimating
-    Pearson, Kendall and Spearman correlations, Psychometrika 65, 2000.
-    """
-    # A correlation that is stored as 1.00 may be 0.995.
-    inside = np.clip(rank, -0.995, 0.995)
-    error = 1.96 * np.sqrt((1 + inside**2 / 2) / (designs - 3))
-    low, high = np.tanh(np.arctanh(inside) + np.array([-error, error]))
-    return Interval(rank, float(low), float(high))
-
-
-def draw_changes(content: dict[str, Any], path: Path) -> Path:
-    """A bar for each change, shortest first, with the rank correlation of the designs' shares.
-
-    The bars have no intervals: the file has sums, and grasps of one design or of one trial are not
-    independent.
-    """
-    trials = content["designs"] * content["trials"]
-    rows = sorted(content["variants"], key=lambda row: -row["gained"] - row["lost"])
-    figure = output.new_figure(9, 4.6)
-    axes = figure.subplots()
-    for y, row in enumerate(rows):
-        share = 100 * (row["gained"] + row["lost"]) / trials
-        axes.barh(y, share, color=KINDS[row["kind"]][1], alpha=0.85)
-        ranks = rank_interval(row["rank"], content["designs"])
-        text = f"{share:.0f} %, ranks {ranks.value:.2f} ({ranks.low:.2f} to {ranks.high:.2f})"
-        axes.text(share + 0.4, y, text, va="center", fontsize=8)
-    axes.set_yticks(range(len(rows)), [row["variant"].replace("`", "") for row in rows], fontsize=8)
-    axes.set_xlim(0, 34)
-    axes.set_xlabel(f"verdicts that change [%], {content['designs']} designs that keep 30 to 95 %")
-    for words, color in KINDS.values():
-        axes.bar(0, 0, color=color, label=words)
-    axes.legend(frameon=False, fontsize=8, loc="upper right")
-    return output.save_figure(figure, path)
-
-
-def main() -> int:
-    parser = provenance.parser(__doc__)
-    parser.add_argument("--pick", action="store_true", help="pick hard designs and stop")
-    args = parser.parse_args()
-    use_compilation_cache()
-    if args.pick:
-        print(pick())
-        return 0
-    print(draw_changes(json.loads(CHANGES.read_text()), CHANGES_FIGURE))
-    content = json.loads(DATA.read_text())
-    rows = results(content)
-    text = table(rows)
-    print(text)
-    output.fill(DOCS / "accuracy.md", text, "decisions")
-    truth = kept_of(content)[TRUTH]
-    print(draw(rows, gain(truth, truth), FIGURE))
-    return 0
+        for names, look, label in (
+            (PRESETS, {"marker": marker, "ls": "-"}, f"one {words}: presets"),
+            (CANDIDATES, {"marker": "x", "ls": "none"}, f"one {words}: other settings"),
+        ):
+            if not (shown := places(names)):
+                continue
+            values = scale * np.array([errors[n] for n, _ in shown])
+            x = [time for _, time in shown]
+            error = [values[:, 0] - values[:, 1], values[:, 2] - values[:, 0]]
+            axes.errorbar(
+                x, values[:, 0], yerr=error, color=color, label=label, elinewidth=0.8, lw=1,
+                capsize=2, **look,
+            )  # fmt: skip
+            if names is not PRESETS:
+                continue
+            for (name, time), (_, _, high) in zip(shown, values, strict=True):
+                axes.annotate(
+                    name, (time, high), xytext=(-2, 3), textcoords="offset points", fontsize=8,
+                    rotation=65, color=color,
+                )  # fmt: skip
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    provenance.parser(__doc__).parse_args()
+    use_compilation_cache()
+    print(pick())

@@ -88,6 +88,21 @@ def two_way(
     return [Interval(*map(float, v)) for v in zip(statistics(*tables), low, high, strict=True)]
 
 
+def two_way_means(*tables: np.ndarray, resamples: int = RESAMPLES, seed: int = 0) -> list[Interval]:
+    """`two_way` of the means of tables, by matrix products over how often rows and columns come."""
+    rng = np.random.default_rng(seed)
+    rows, columns = (
+        rng.multinomial(n, np.full(n, 1 / n), resamples) / n for n in tables[0].shape[:2]
+    )
+    tail = (1 - _CONFIDENCE) / 2
+    intervals = []
+    for table in tables:
+        drawn = ((rows @ table) * columns).sum(1)
+        low, high = np.quantile(drawn, [tail, 1 - tail])
+        intervals.append(Interval(float(table.mean()), float(low), float(high)))
+    return intervals
+
+
 def median(values: np.ndarray) -> Interval:
     """Median over runs with its bootstrap interval; values have shape (run,)."""
     return bootstrap(lambda i: quantile(values[i], 0.5), len(values))

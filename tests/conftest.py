@@ -39,12 +39,13 @@ def pytest_configure(config):
 # Files of more than five seconds, the longest first: what is left for the end is short, so that no
 # worker waits for the other. Before them a file with planted faults, which forgets what was traced.
 LONG = """
-test_planted_contacts test_resume test_policy test_export test_docs test_engines test_buildable
-test_finger test_containment test_codesign test_energy test_constants test_run_reading test_library
-test_rollout test_compare test_steps test_reuse test_kernel test_meshes test_air test_forces
-test_worth test_rings test_reverse test_attacks test_report test_user_code test_rigid_bodies
-test_sample test_scene test_runs test_hard_cases test_model test_cli test_key_frames
-test_particle_filter test_planted_faults test_optimizers
+test_planted_contacts test_resume test_policy test_export test_docs test_finger test_buildable
+test_containment test_engines test_rollout test_constants test_worth test_studies test_library
+test_codesign test_section_joints test_optimizers test_compare test_showing test_rings test_steps
+test_energy test_particle_filter test_kernel test_parameters test_meshes test_contact test_attacks
+test_run_reading test_hard_cases test_rigid_bodies test_forces test_sample test_runs test_reverse
+test_user_code test_cost test_scene test_air test_key_frames test_section test_report test_model
+test_planted_faults test_checkpoint test_cli test_studio test_compiler test_reuse
 """.split()
 
 

@@ -65,7 +65,11 @@ SOURCES = {
         {"link_forces": link(pressure=lambda b: b["pressure"] * (1 + outwards(b)[0]))}
     ),
     "contacts": Fault(
-        {"begun": lambda f, margin, place, cone, acc, vel: f(margin, place, cone, acc, -vel)}
+        {
+            "as_candidates": lambda f, margin, place, cone, acc, vel: f(
+                margin, place, cone, acc, -vel
+            )
+        }
     ),
 }
 

@@ -45,7 +45,7 @@ AIM = "aim"
 BETWEEN = "place_of"
 LINE = "facing_line"
 BALLS = "balls"
-BEGUN = "begun"
+CANDIDATES = "as_candidates"
 HELD = "_with_held"
 HOLD = "sums.<locals>.add"
 KEEP = "quotient"
@@ -208,8 +208,8 @@ PAIRS = {
     "conjugate gradients without forces on the object": Fault({PALM_AGAIN: without_last}),
     "conjugate gradients without forces on links": Fault({AGAIN: without_last}),
     # of all contacts
-    "no reference acceleration": Fault({BEGUN: unwanted}),
-    "contacts without velocity": Fault({BEGUN: at_rest}),
+    "no reference acceleration": Fault({CANDIDATES: unwanted}),
+    "contacts without velocity": Fault({CANDIDATES: at_rest}),
     "the object does not feel fingers": added("r_object"),
     "link and object apart": added("c"),
     "the object's matrix has no contacts": added("q"),
@@ -226,8 +226,8 @@ HULL = {
     "contacts beside the caps between fingers": place(BETWEEN, point=lambda v: 0.9 * v),
     "fields are looked at once": Fault({AIM: lambda f, *a: 0 * f(*a)}),
     "segments touch where they begin": Fault({LINE: without_last}),
-    "what does not touch is no contact": Fault({BEGUN: touched}),
-    "gaps close when they are half as wide": Fault({BEGUN: half_gap}),
+    "what does not touch is no contact": Fault({CANDIDATES: touched}),
+    "gaps close when they are half as wide": Fault({CANDIDATES: half_gap}),
     "a line search of one stiffness": Fault({RAY: one_stiffness, SLOPES: one_stiffness}),
     # one lane with both sides
     "one side of a contact alone": Fault(

@@ -25,7 +25,7 @@ STEPS = 8
 # Stages of the kernel: functions that it evaluates lane by lane.
 PALM = "palm_and_object"
 LINK = "link_forces"
-JAR = "begun"
+JAR = "as_candidates"
 RESPONSE = "inertia_and_wrench"
 RAY = "cost_along_line"
 SLOPES = "slopes_along_line"
@@ -64,10 +64,10 @@ def cones(change: Callable):
     def stage(right, place, cone, *rest):
         return right(place, change(cone), *rest)
 
-    def begun(right, margin, place, cone, *rest):
+    def candidates(right, margin, place, cone, *rest):
         return right(margin, place, change(cone), *rest)
 
-    return dict.fromkeys((RESPONSE, RAY, SLOPES), stage) | {JAR: begun}
+    return dict.fromkeys((RESPONSE, RAY, SLOPES), stage) | {JAR: candidates}
 
 
 def without_moment(right, *args):

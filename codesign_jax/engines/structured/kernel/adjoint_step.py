@@ -216,7 +216,7 @@ class AdjointSolve(Elimination):
     def of_contacts(self, contacts: BoundContacts, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
         matrix, wrench = contacts.inertia_and_wrench(item, alpha)
         if contacts.set.holds:
-            return matrix, friction_memory.asks(self.problem, contacts, item)
+            return matrix, friction_memory.wrench_of_cotangents(self.problem, contacts, item)
         return matrix, _none(wrench)
 
     def between_fingers(self, self_contacts: BoundSelfContacts, alpha: Lanes) -> None:

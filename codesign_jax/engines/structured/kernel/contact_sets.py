@@ -186,7 +186,7 @@ class BoundContacts:
         self.write(Contact.share, place.share, item)
 
         def store() -> None:
-            for field, value in (kept(place, jar) | more).items():
+            for field, value in (fields_of(place, jar) | more).items():
                 self.write(field, value, item)
 
         if self.set.stores_all:
@@ -196,7 +196,7 @@ class BoundContacts:
 
     def begin(self, item: Any, place: Place, acc: Lanes, vel: Lanes) -> tuple[Place, Lanes]:
         """Places whose share is zero where no candidate is, and their jar."""
-        run = partial(begun, margin(self.set.scene))
+        run = partial(as_candidates, margin(self.set.scene))
         return lanewise(run, place, self.cone_at(item), acc, vel)
 
     def each_item(self, body: Callable[[Any], None]) -> None:
@@ -363,12 +363,12 @@ def with_held(jar: jax.Array, place: Place, cone: Cone, held_friction: jax.Array
     return jar + holding.held(ContactSet.contacts(place, cone), held_friction)
 
 
-def kept(place: Place, jar: Lanes) -> dict[str, Lanes]:
+def fields_of(place: Place, jar: Lanes) -> dict[str, Lanes]:
     """What is kept of new contacts, by field."""
     return {**place._asdict(), Contact.jar: jar, Contact.step: lanewise(jnp.zeros_like, jar)}
 
 
-def begun(
+def as_candidates(
     margin: float, place: Place, cone: Cone, acc: jax.Array, vel: jax.Array
 ) -> tuple[Place, jax.Array]:
     c = ContactSet.contacts(place, cone)

@@ -42,7 +42,7 @@ BETWEEN_FINGERS = "held.finger_finger"
 """What fingers hold on one another, a row a pairing."""
 
 
-def kept(problem: Problem) -> bool:
+def any_held(problem: Problem) -> bool:
     return bool(problem.memory.layout.held)
 
 
@@ -51,14 +51,16 @@ def pairings(step: StepMemory) -> int:
     return step.layout.held.get("finger_finger", 0)
 
 
-def of_row(step: StepMemory, self_contacts: BoundSelfContacts, row: Any) -> list[Lanes]:
+def held_by_pairing(step: StepMemory, self_contacts: BoundSelfContacts, row: Any) -> list[Lanes]:
     """What the fingers of a pairing's row hold, (3,) or nothing if the scene has no such state."""
     if not pairings(step):
         return []
     return [step.finger_state.read(BETWEEN_FINGERS, row + self_contacts.set.first)]
 
 
-def of_item(step: StepMemory, contacts: BoundContacts, item: Any) -> tuple[Lanes, Lanes] | None:
+def held_by_item(
+    step: StepMemory, contacts: BoundContacts, item: Any
+) -> tuple[Lanes, Lanes] | None:
     """What an item's contacts hold, (3, k): along the world's axes, and as the state has it."""
     if not contacts.set.holds:
         return None
@@ -68,10 +70,10 @@ def of_item(step: StepMemory, contacts: BoundContacts, item: Any) -> tuple[Lanes
     return _both(step, contacts, lanewise(lambda rows: jnp.stack(rows, 1), rows))
 
 
-def of_ring(
+def held_by_ring(
     step: StepMemory, contacts: BoundContacts, ring: jax.Array
 ) -> tuple[Lanes, Lanes] | None:
-    """`of_item` of rings, one on each of a team's lanes, shape (lane,)."""
+    """`held_by_item` of rings, one on each of a team's lanes, shape (lane,)."""
     if not contacts.set.holds:
         return None
     held_friction = step.finger_state.gather(f"held.{contacts.set.name}", ring, step.block.column)
@@ -176,7 +178,7 @@ def keep(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
 def _keep_of_set(problem: Problem, contacts: BoundContacts, alpha: Lanes, mask: Lanes) -> None:
     """Keeps what a set's contacts hold behind the step, in the worlds of the mask."""
     build = contacts.set.contacts
-    axes = turning(problem.memory, contacts)
+    axes = held_axes(problem.memory, contacts)
 
     def after(mask, place, cone, alpha, jar, step, old, axes):
         new = behind(build(place, cone), jar + alpha * step, old, axes)
@@ -197,7 +199,7 @@ def _keep_of_set(problem: Problem, contacts: BoundContacts, alpha: Lanes, mask: 
     contacts.each_item(keep_item)
 
 
-def turning(step: StepMemory, contacts: BoundContacts) -> Lanes | None:
+def held_axes(step: StepMemory, contacts: BoundContacts) -> Lanes | None:
     """Columns of the axes along which contacts hold, None for the world's."""
     return step.columns if contacts.set.on_object else None
 
@@ -286,13 +288,13 @@ def add_held(bars: CotangentTables, contacts: BoundContacts, item: Any, held: di
         _write_bars(bars, contacts, item, plus(old, held["held"]))
 
 
-def asks(problem: Problem, contacts: BoundContacts, item: Any) -> Lanes:
+def wrench_of_cotangents(problem: Problem, contacts: BoundContacts, item: Any) -> Lanes:
     """Wrench (6,) of what "held_bar" of an item's contacts asks of the step's accelerations.
 
     It is the cotangent of jar, through the force, of what they hold behind the step.
     """
     build = contacts.set.contacts
-    axes = turning(problem.memory, contacts)
+    axes = held_axes(problem.memory, contacts)
 
     def of_jar(jar, place, cone, held, bars, axes):
         return sum_axis(dot(bars, behind(build(place, cone), jar, held, axes)), 0)
@@ -337,7 +339,7 @@ def _reverse_fingers(
         state.write(BETWEEN_FINGERS, rest, item)
 
 
-def hold_of_pairing(step: StepMemory, pairing: FingerPairing) -> tuple[Lanes, ...]:
+def held_and_cotangents(step: StepMemory, pairing: FingerPairing) -> tuple[Lanes, ...]:
     """What the lanes' fingers hold, and "sums_bar"; nothing if the scene has no such state."""
     if not pairings(step):
         return ()
@@ -347,8 +349,8 @@ def hold_of_pairing(step: StepMemory, pairing: FingerPairing) -> tuple[Lanes, ..
     return held, step.scratch.gather(Virtual.sums_bar, item, lane)
 
 
-def leave(bars: CotangentTables, pairing: FingerPairing, sums_bars: tuple) -> None:
-    """Adds a contact's cotangents of `hold_of_pairing` to those of the state."""
+def add_pairing_cotangents(bars: CotangentTables, pairing: FingerPairing, sums_bars: tuple) -> None:
+    """Adds a contact's cotangents of `held_and_cotangents` to those of the state."""
     if not sums_bars:
         return
     item = pairing.number

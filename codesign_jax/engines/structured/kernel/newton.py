@@ -107,7 +107,7 @@ class Newton:
                 likely = busy & (decrement.lane > tolerance) & (decrement.lane <= largest)
                 accept = partial(self.accept_steady, decrement, alpha, likely, tolerance)
                 decrement = choose(anywhere(likely), accept, decrement, self.block.size)
-            if friction_memory.kept(problem) or problem.memory.layout.record:
+            if friction_memory.any_held(problem) or problem.memory.layout.record:
                 ends = busy & ((decrement.lane <= tolerance) | (count + 1 >= iterations))
                 self._end(newton, ends, now, behind_newton)
             return [count + 1, *solid((now, decrement, alpha), self.block.size)[0]]
@@ -137,7 +137,7 @@ class Newton:
           now: The iterate at the end; `behind_newton`: before a chord step.
         """
         problem = self.problem
-        if friction_memory.kept(problem):
+        if friction_memory.any_held(problem):
             friction_memory.keep(problem, alpha, ends)
         if problem.memory.layout.record:
             chord = lanewise(partial(jax.tree.map, jnp.subtract), now, behind_newton)

@@ -135,7 +135,7 @@ def _write_set(step: StepMemory, name: str, contacts: BoundContacts, table: Boun
     def add(item: Any, sums: list[Lanes]) -> list[Lanes]:
         def added() -> list[Lanes]:
             numbers = contacts.place(item), contacts.cone_at(item), contacts.read(Contact.jar, item)
-            held = friction_memory.of_item(step, contacts, item) if energy else None
+            held = friction_memory.held_by_item(step, contacts, item) if energy else None
             return lanewise(_add_item, sums, *numbers, None if held is None else held[0])
 
         return choose(contacts.touching(item), added, sums, contacts.set.size)
@@ -173,7 +173,7 @@ def _write_pairing(
     """Writes what the fingers of a pairing do to one another, to themselves and to the palm."""
     energy = f"{SELF}.{PairForce.energy}" in table
     pairing = contacts.pairing(row)
-    hold = friction_memory.of_row(step, contacts, row) if energy else []
+    hold = friction_memory.held_by_pairing(step, contacts, row) if energy else []
 
     def add(item: Any, sums: list[Lanes]) -> list[Lanes]:
         palm = jnp.zeros_like(step.like)

@@ -494,13 +494,13 @@ class SelfContactsVjp:
         fixed |= {
             "last": self._float(jnp.where(other == self.layout.links, self.like + 1.0, self.like))
         }
-        held = friction_memory.hold_of_pairing(self.sweep.step, pairing)
+        held = friction_memory.held_and_cotangents(self.sweep.step, pairing)
         args = (self._body(row), ring), line, self.sweep.step.constant(CONE), held
         bars = pull(
             partial(residual.between_rings, self.layout.scene), args, (fixed,), self._power_bar
         )
         (place, own_ring), line, cone, kept = only_on(self._side(live), bars)
-        friction_memory.leave(self.bars, pairing, kept)
+        friction_memory.add_pairing_cotangents(self.bars, pairing, kept)
         self.bars.add({CONE: cone})
         self.bars.add({"ring": own_ring}, number, self.lane)
         self._leave(place._asdict(), row)

@@ -126,11 +126,11 @@ class RingPairs:
             def add(close: jax.Array) -> None:
                 place = search.place(numbers, frame, centre, faced)
                 mine = self.mixed(search.moves(first[0]), search.moves(second[0]))
-                held = friction_memory.of_row(search.step, self.contacts, self.row)
+                held = friction_memory.held_by_pairing(search.step, self.contacts, self.row)
                 held = self.mixed(held, held)
-                cone = self.contacts.of_row(self.row)
+                cone = self.contacts.cone_of_row(self.row)
                 link = jnp.where(self.first, first[0], second[0])
-                candidate = search.begun(place, cone, link, mine, moves, held)
+                candidate = search.candidate(place, cone, link, mine, moves, held)
                 self._enter(candidate, other, close, items)
 
             search.if_close(near, faced, self.speed, add)
@@ -149,7 +149,7 @@ class RingPairs:
         """Gives contacts a slot, the first ring's before the second's.
 
         Args:
-          contact: See `SelfCollision.begun`.
+          contact: See `SelfCollision.candidate`.
           other: The second finger's links.
           items: The rings that the lanes `first` and `second` have looked with.
         """

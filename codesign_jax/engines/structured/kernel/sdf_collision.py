@@ -97,7 +97,7 @@ class SdfCollision:
         for name in self.names:
             numbers = self.numbers(i)
             centre = lanewise(ring_centres, origin, frame, numbers)
-            hold = friction_memory.of_item(self.step, self.contacts[name], i)
+            hold = friction_memory.held_by_item(self.step, self.contacts[name], i)
             self.on_field(name, i, numbers, frame, centre, self.moves(name, link_acc, vel), hold)
 
     def of_rings(self, search: SelfCollision) -> None:
@@ -118,7 +118,7 @@ class SdfCollision:
                 moves = self.moves(
                     name, *(search.side_of(n, row) for n in (Side.link_acc, Side.vel))
                 )
-                hold = friction_memory.of_ring(self.step, contacts, item)
+                hold = friction_memory.held_by_ring(self.step, contacts, item)
                 self.on_field(name, slot, numbers, frame, centre, moves, hold)
                 return nothing
 
@@ -189,7 +189,7 @@ class SdfCollision:
             centre = lanewise(ring_centres, bodies["place"], bodies["frame"], numbers)
             for name in palm:
                 moves = self.moves(name, None, None)
-                hold = friction_memory.of_item(self.step, self.contacts[name], i)
+                hold = friction_memory.held_by_item(self.step, self.contacts[name], i)
                 self.on_field(name, i, numbers, bodies["frame"], centre, moves, hold)
         on_table = self.contacts.get("object_table")
         slots = self._table_points(state) if on_table else []
@@ -202,7 +202,7 @@ class SdfCollision:
             if rubs is not None:
                 (friction,) = self._deal([(rubs[:, k],) for k in mine])
             moves = self.moves("object_table", None, None)
-            hold = friction_memory.of_item(self.step, on_table, i)
+            hold = friction_memory.held_by_item(self.step, on_table, i)
             on_table.create(i, place, *moves, friction=friction, hold=hold)
 
     def _table_points(self, state: dict) -> list[Place]:

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import friction_memory
 from codesign_jax.engines.structured.kernel.contact_sets import (
-    begun,
-    kept,
+    as_candidates,
+    fields_of,
     margin,
     with_held,
     zeros,
@@ -291,7 +291,7 @@ class SelfCollision:
         close = near & (faced.gap.lane < self.gap(speed))
         any_of(close, lambda: add(close))
 
-    def begun(
+    def candidate(
         self,
         place: Place,
         cone: Any,
@@ -308,12 +308,12 @@ class SelfCollision:
           held: What the contact holds of friction, (3,), or nothing.
         """
         place = lanewise(with_axis, place)
-        run = partial(begun, margin(self.layout.scene))
+        run = partial(as_candidates, margin(self.layout.scene))
         moves = lanewise(_differences, mine, theirs)
         place, jar = lanewise(run, place, cone, *moves)
         for g in held:
             jar = lanewise(_with_held, jar, place, cone, g)
-        return kept(place, jar) | {Slot.row: self._number(row)}
+        return fields_of(place, jar) | {Slot.row: self._number(row)}
 
     def moves(self, row: Any, lane: jax.Array | None = None) -> list[Lanes]:
         """Accelerations and velocities of links; arguments as `read`."""
@@ -360,7 +360,7 @@ class SelfCollision:
         """Gives a slot to a contact of a finger with the palm or itself.
 
         Args:
-          candidate: See `begun`.
+          candidate: See `candidate`.
           other: Link of the other side, 0 for the palm; `item`: the ring.
         """
         candidate |= {Slot.other: self._number(other)}
@@ -382,9 +382,9 @@ class SelfCollision:
 
         def add(place: Place) -> None:
             palm = jnp.zeros_like(jnp.asarray(row))
-            cone = self.contacts.of_row(0)
+            cone = self.contacts.cone_of_row(0)
             theirs = self.moves(palm)
-            candidate = self.begun(place, cone, row, self.moves(row), theirs, [])
+            candidate = self.candidate(place, cone, row, self.moves(row), theirs, [])
             self._alone(candidate, palm, item, mine)
 
         def enter() -> None:
@@ -418,9 +418,9 @@ class SelfCollision:
 
             def add(close: jax.Array) -> None:
                 place = self.place(numbers, frame, centre, faced)
-                held = friction_memory.of_row(self.step, self.contacts, 0)
-                candidate = self.begun(
-                    place, self.contacts.of_row(1), row, self.moves(row), moves, held
+                held = friction_memory.held_by_pairing(self.step, self.contacts, 0)
+                candidate = self.candidate(
+                    place, self.contacts.cone_of_row(1), row, self.moves(row), moves, held
                 )
                 self._alone(candidate, other, item, close)
 
@@ -470,9 +470,9 @@ class SelfCollision:
 
             def add(close: jax.Array) -> None:
                 place = self.place(numbers, frame, centre, faced)
-                held = friction_memory.of_row(self.step, self.contacts, row)
-                candidate = self.begun(
-                    place, self.contacts.of_row(row), link, self.moves(link), moves, held
+                held = friction_memory.held_by_pairing(self.step, self.contacts, row)
+                candidate = self.candidate(
+                    place, self.contacts.cone_of_row(row), link, self.moves(link), moves, held
                 )
                 self.enter(row, close, owner, candidate, other, item)
 
@@ -495,7 +495,7 @@ class SelfCollision:
         Args:
           near: Lanes that may have found a contact.
           owner: Lanes of the rings' fingers.
-          contact: See `begun`.
+          contact: See `candidate`.
           other: The other finger's links.
           item: The ring.
           second: Lanes of the other finger, if they have looked; else the owners have.
@@ -596,8 +596,8 @@ class SelfCollision:
             def enter() -> None:
                 other = jax.lax.div(j, jnp.full_like(j, apart)) + 1
                 moves = pairing.swap(self.moves(other))
-                candidate = self.begun(
-                    place, self.contacts.of_row(row), link, self.moves(link), moves, []
+                candidate = self.candidate(
+                    place, self.contacts.cone_of_row(row), link, self.moves(link), moves, []
                 )
                 number = item + self.count * j
                 self.enter(row, near, owner, candidate, other, number)

@@ -177,7 +177,7 @@ class BoundSelfContacts(BoundSlots):
             self.block, row + self.set.first, self.table.dtype, with_itself=self.set.with_itself
         )
 
-    def of_row(self, row: Any, other: Any = None) -> contact.Cone:
+    def cone_of_row(self, row: Any, other: Any = None) -> contact.Cone:
         """The cone of a row's contacts; other: second sides, of which 0 is the palm."""
         if len(self._cones) == 1:
             return self.cone
@@ -192,7 +192,7 @@ class BoundSelfContacts(BoundSlots):
         """Within this context contacts have the cone of a row's slot, or of the palm's."""
         mixed = item is not None and self.set.with_itself and touches_itself(self.set.scene)
         before = self.cone
-        self.cone = self.of_row(row, self.read(Slot.other, item).lane if mixed else None)
+        self.cone = self.cone_of_row(row, self.read(Slot.other, item).lane if mixed else None)
         yield
         self.cone = before
 

@@ -237,10 +237,12 @@ def test_searches_at_two_accuracies_are_compared_by_seed():
 
     plain = row([0.94, 0.96, 0.90], "--judged=reference")
     coarse = row([0.96, 0.98, 0.92], "--searched=fast", "--judged=reference")
-    text = search_tables.accuracies_table([coarse, plain, row([0.1, 0.2, 0.3])])
+    again = {"hand": None, "changes": coarse["changes"]}
+    again["retest"] = {"finalists": 9, "lost": 1, "chosen_otherwise": 2}
+    text = search_tables.accuracies_table([coarse, again, plain, row([0.1, 0.2, 0.3])])
     first, second = (line.split(" | ") for line in text.splitlines()[2:])
     assert first[1] == "`standard`" and first[4:6] == ["93.3", "0.33 (0.06 to 0.79)"]
-    assert second[1] == "`fast`" and second[-1] == "+2.0 (+2.0 to +2.0) |"
+    assert second[1] == "`fast`" and second[6:] == ["+2.0 (+2.0 to +2.0)", "1 of 9", "2 |"]
     assert search_tables.accuracies_table([row([0.1])]) == ""
 
 

@@ -101,12 +101,15 @@ def accuracies_table(rows: list[dict[str, Any]]) -> str:
 
     The differences are paired by seed: from the first search of the hand, the one that has one
     accuracy for all of its grasps.  A bootstrap over seeds is also one over the judging trials,
-    which each seed has for itself.  Empty without such a search.
+    which each seed has for itself.  The last two columns are those of `--retest`.  Empty without
+    such a search.
     """
     judged = [r for r in rows if "kept" in r and _option(r, JUDGED)]
+    retests = {(r["hand"], *r["changes"]): r["retest"] for r in rows if "retest" in r}
     head = ["hand", "accuracy of the episodes", "grasps of a seed", "seeds"]
     head += ["kept on average %", "seeds that keep 95 % (95 % interval)"]
-    head += ["more kept than with `standard`, points"]
+    head += ["more kept than with `standard`, points", "finalists that `fast` alone likes"]
+    head += ["seeds in which a test at `fast` chooses another design"]
     table_rows = [head]
     first: dict[str, np.ndarray] = {}
     for row in sorted(judged, key=lambda r: (r["hand"] or "", bool(_option(r, SEARCHED)))):
@@ -119,7 +122,11 @@ def accuracies_table(rows: list[dict[str, Any]]) -> str:
             words = f"{gain.value:+.1f} ({gain.low:+.1f} to {gain.high:+.1f})"
         cells = [f"`{hand}`", f"`{_option(row, SEARCHED) or 'standard'}`"]
         cells += [f"{row['grasps'][-1]:,}", str(kept.size), f"{kept.mean():.1f}"]
-        table_rows.append([*cells, share_of(kept / 100), words])
+        again = retests.get((row["hand"], *row["changes"]))
+        tested = ["–", "–"]
+        if again:
+            tested = [f"{again['lost']} of {again['finalists']}", str(again["chosen_otherwise"])]
+        table_rows.append([*cells, share_of(kept / 100), words, *tested])
     return output.markdown(table_rows) if judged else ""
 
 

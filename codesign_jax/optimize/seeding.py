@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from codesign_jax.optimize.bounds import Space
@@ -34,7 +35,7 @@ def candidates(key: jax.Array, space: Space, indices: ArrayLike) -> jax.Array:
     low, high = (np.asarray(v, jnp.result_type(float)) for v in (space.low, space.high))
     numbers = indices if isinstance(indices, jax.Array) else np.asarray(indices)
     unit: Any = _uniform(key, numbers, len(low))
-    if not isinstance(unit, jax.core.Tracer):
+    if not isinstance(unit, Tracer):
         unit = np.asarray(unit)  # whose operations compile nothing
     inside = unit.__array_namespace__().clip(low + unit * (high - low), low, high)
     return space.constrain(jax.device_put(inside))

@@ -7,7 +7,8 @@ Environment variables, which the commands check before they do anything:
 * CODESIGN_CACHE: `on`, the default, or `off`: then nothing is read from a cache or written to one,
   that of JAX included.
 * CODESIGN_CACHE_BYTES: the most bytes on disk of JAX's programs, of kernels and of grids, each, by
-  default 512 MiB; what was not used for the longest time goes first.
+  default 512 MiB; what was not used for the longest time goes first, of JAX's programs the oldest
+  ones when a process begins.
 * XDG_CACHE_HOME: where the folder `codesign-jax` is, by default `~/.cache`. It must be an absolute
   path; another is ignored, as its specification says.
 * JAX_COMPILATION_CACHE_DIR: JAX's own variable. Programs and kernels are in that folder then, and
@@ -214,11 +215,9 @@ def use_compilation_cache() -> None:
             warnings.warn(text, stacklevel=2)
             jax.config.update("jax_enable_compilation_cache", False)
             return
+        _make_room(programs, most)
         jax.config.update("jax_compilation_cache_dir", str(programs))
         _note_from_now_on(programs)
-        # JAX locks a folder that has a limit.
-        if os.access(programs, os.W_OK) or not programs.exists():
-            jax.config.update("jax_compilation_cache_max_size", most)
         # Small programs too, of which a command has dozens: JAX keeps those that take a second.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
@@ -256,7 +255,7 @@ def _open_to_others(programs: Path) -> Path | None:
 
 
 def check_programs(programs: Path) -> bool:
-    """Deletes the programs of a folder that are not as they were written, and dates the rest.
+    """Deletes the programs of a folder that are not as they were written.
 
     Returns:
       Whether all that are left are sound: in a folder that cannot be written to they may not be.
@@ -270,15 +269,29 @@ def check_programs(programs: Path) -> bool:
                 path.unlink()
         except OSError:  # another process deletes as well, or nobody may
             sound = sound and not path.exists()
-        with contextlib.suppress(OSError):
-            used = _beside(path, "atime")
-            if path.exists() and not used.exists():  # JAX's limit of size needs it of every program
-                used.write_bytes(path.stat().st_mtime_ns.to_bytes(8, "little"))
-    for path in programs.glob("*-digest"):  # of programs that JAX has deleted
+    for path in programs.glob("*-digest"):  # of programs that are gone
         with contextlib.suppress(OSError):
             if not _beside(path, "cache").exists():
                 path.unlink()
     return sound
+
+
+def _make_room(programs: Path, most: int) -> None:
+    """Deletes the oldest programs of a folder that has more bytes.
+
+    A limit of JAX's own costs 60 us for every program that is there whenever it writes one.
+    """
+    states = []
+    for path in programs.glob("*-cache"):
+        with contextlib.suppress(OSError):  # another process deletes as well
+            state = path.stat()
+            states.append((state.st_mtime_ns, state.st_size, path))
+    total = sum(size for _, size, _ in states)
+    for _, size, path in sorted(states):
+        if total > most:
+            with contextlib.suppress(OSError):
+                path.unlink()
+            total -= size
 
 
 def _is_sound(path: Path) -> bool:

@@ -217,7 +217,6 @@ def place(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     names = [
         "jax_compilation_cache_dir",
-        "jax_compilation_cache_max_size",
         "jax_enable_compilation_cache",
         "jax_persistent_cache_min_compile_time_secs",
     ]
@@ -225,7 +224,6 @@ def place(tmp_path, monkeypatch):
     jax.config.update("jax_compilation_cache_dir", None)
     compilation_cache.reset_cache()
     yield tmp_path / "codesign-jax"
-    # The limit too: with one JAX asks for the age of every program that other tests share.
     for name, value in zip(names, previous, strict=True):
         jax.config.update(name, value)
     compilation_cache.reset_cache()
@@ -272,7 +270,7 @@ def test_one_switch_turns_all_caches_off(place, monkeypatch):
     np.testing.assert_array_equal(mesh_grid.values, use_all(monkeypatch).values)
     np.testing.assert_array_equal(mesh_grid.values, use_all(monkeypatch).values)
     names = {(p.parent.name, p.name.rpartition("-")[2]) for p in place.rglob("*") if p.is_file()}
-    assert {("jax", "cache"), ("jax", "atime")} <= names
+    assert {("jax", "cache"), ("jax", "digest")} <= names
     assert len([*place.glob("meshes/*.kept")]) == len([*place.glob("jax/kernels/*.kept")]) == 1
 
 
@@ -319,6 +317,28 @@ def test_what_is_not_used_goes(folder, monkeypatch):
             abandoned.write_bytes(b"part")
             os.utime(abandoned, (0, 0))
     assert {p.name for p in (folder / "kernels").iterdir()} == {f"k{k}.kept" for k in (0, 7, 8, 9)}
+
+
+def test_the_oldest_programs_go_when_a_process_begins(place, monkeypatch):
+    """Of four programs the two that fit into the limit, and nobody's limit but this one."""
+
+    def begin():
+        compilation_cache.reset_cache()
+        jax.config.update("jax_compilation_cache_dir", None)
+        reuse.use_compilation_cache()
+        return sorted((place / "jax").glob("*-cache"), key=lambda path: path.stat().st_mtime_ns)
+
+    begin()
+    for k in range(4):
+        jax.jit(lambda v, k=k: v * 7.5 + k)(2.0)
+    paths = begin()
+    for k, path in enumerate(paths):
+        os.utime(path, (k, k))
+    sizes = [path.stat().st_size for path in paths]
+    assert len(paths) >= 4
+    monkeypatch.setenv("CODESIGN_CACHE_BYTES", str(sum(sizes[-2:])))
+    assert begin() == paths[-2:]
+    assert jax.config.jax_compilation_cache_max_size == -1
 
 
 @pytest.mark.parametrize("damage", [b"", b"nothing", zlib.compress(b"program" * 99)[:-9]])

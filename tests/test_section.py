@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -13,7 +14,7 @@ from scipy import optimize
 from codesign_jax import parameters, scene
 from codesign_jax.model import morphology
 from codesign_jax.scene import beams, section_law, section_numbers
-from scripts.section import elements, study
+from scripts.section import elements, growth, study
 from scripts.section.elements import Model, Section
 
 G = 88e3
@@ -388,3 +389,23 @@ def test_pressures_of_the_hand_to_build_are_within_the_law():
     # The law errs by 7 % in the moment. The bend grows faster than the pressure, so that what is
     # interpolated between computed pressures is too large.
     assert len(strains) > 8 and max(strains) < 1.1 * largest
+
+
+def test_sections_grow_as_elements_do():
+    """At 20 and 50 kPa, of the section of the note; and not without pressure."""
+    coefficients, errors = growth.fitted()
+    _, states = study.read(DATA)["nominal02"]
+    free = (np.abs(states["moment_bend"]) < 1e-6) & (states["lateral"] == 0)
+    for pressure in (20e3, 50e3):
+        [k] = np.flatnonzero(free & (states["pressure"] == pressure))
+        section = np.array([[[20e-3, 5e-3, 8e-3, 24e-3]]])
+        params = SimpleNamespace(pressure=np.array([[pressure]]))
+        larger = np.asarray(growth.grown(section, params, G, coefficients))[0, 0]
+        sizes = states["high"][k] - states["low"][k], states["width"][k]
+        ratios = larger[[0, 3]] / sizes
+        # The fit's own errors are 3 %, root mean square.
+        np.testing.assert_allclose(ratios, 1, atol=3 * errors.max())
+        np.testing.assert_array_equal(larger[1:3], section[0, 0, 1:3].astype(larger.dtype))
+    params.pressure = np.zeros((1, 1))
+    same = np.asarray(growth.grown(section, params, G, coefficients))
+    np.testing.assert_allclose(same, section, rtol=1e-6)

@@ -250,7 +250,9 @@ def test_a_page_of_rates_has_the_last_file_of_each_platform():
     def file(platform, date):
         return {"runs": [{"platform": platform, "date": date}]}
 
-    old, new, cpu = file("gpu", "2026-01"), file("gpu", "2026-02"), file("cpu", "2025-12")
+    old = file("gpu", "2026-01")
+    new = file("gpu", "2026-02")
+    cpu = file("cpu", "2025-12")
     assert benchmark.newest([new, old, cpu]) == [cpu, new]
 
 

@@ -142,15 +142,21 @@ def to_arrays(record: Record) -> dict:
     return jax.tree.map(np.asarray, arrays)
 
 
+def _on_device(values: Any) -> jax.Array:
+    """An array of JAX's, without one of its operations: each is a program for every shape."""
+    return jax.device_put(np.asarray(values))
+
+
 def from_arrays(arrays: dict) -> Record:
     """Inverse of `to_arrays`; the history is copied, so that `add_report` may write to it."""
     try:
-        s = jax.device_put(arrays["state"])
+        s = arrays["state"]
         h = jax.tree.map(np.array, arrays["history"])
-        key = jax.random.wrap_key_data(s["key"])
-        state = OptimizerState(s["particles"], s["episode"], key, s.get("memory"))
+        key = jax.random.wrap_key_data(_on_device(s["key"]))
+        memory = jax.tree.map(_on_device, s.get("memory"))
+        state = OptimizerState(_on_device(s["particles"]), _on_device(s["episode"]), key, memory)
         tests = {
-            name: Outcome(**jax.device_put(arrays[name])) if name in arrays else None
+            name: Outcome(**jax.tree.map(_on_device, arrays[name])) if name in arrays else None
             for name in _TESTS
         }
         start = Start(**arrays["start"]) if "start" in arrays else None

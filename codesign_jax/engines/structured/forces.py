@@ -10,7 +10,6 @@ import numpy as np
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.kernel.program import Outputs
 from codesign_jax.engines.structured.kernel.rows import Record
-from codesign_jax.engines.structured.kernel.self_contacts import SelfContactSet
 from codesign_jax.engines.structured.laws.kinematics import State
 from codesign_jax.engines.structured.world_model import WorldModel
 from codesign_jax.model.held import PALM_RINGS
@@ -56,9 +55,9 @@ def contact_energy(scene: Scene, hand: WorldModel, state: State) -> jax.Array:
     total = jnp.zeros_like(state.wrist[0, 0])
     for contacts in program.sets:
         energy = recorded[f"{contacts.name}.energy"]
-        if isinstance(contacts, SelfContactSet):
+        if (pairs := program.self_set) is not None and contacts is pairs:
             # Both fingers of a pair have the contact; rows of a finger with itself have it once.
-            single = np.arange(contacts.rows) < contacts.with_itself
+            single = np.arange(pairs.rows) < pairs.with_itself
             energy = energy * np.where(single, 1.0, 0.5)[:, None, None]
         total = total + energy.reshape(len(total), -1).sum(1)
     return total
@@ -116,7 +115,7 @@ def _summed(program: Program, recorded: Recorded, none: jax.Array) -> Forces:
     def of_body(name: str) -> jax.Array:
         return net(name).sum(-1)
 
-    fields = [s.name for s in program.sets if not isinstance(s, SelfContactSet)]
+    fields = [s.name for s in program.sets if s is not program.self_set]
     depth = {name: recorded[f"{name}.depth"].max((2, 3)) for name in fields}
     between, on_palm, more = _between_fingers(program, recorded, none)
     grip = recorded.get("finger_object.pressing", vector[:, :, :, 0])[:, :, 0]
@@ -147,7 +146,8 @@ def _between_fingers(
     pressing = recorded.get("finger_finger.pressing")  # (world, time, row, 2, finger)
     if pressing is None:
         return between, none, {}
-    (self_contacts,) = (s for s in program.sets if isinstance(s, SelfContactSet))
+    self_contacts = program.self_set
+    assert self_contacts is not None
     finger = np.arange(lanes)
     for row in range(self_contacts.rows):
         partner = finger ^ (row + self_contacts.first)

@@ -251,7 +251,8 @@ def reverse(step: StepMemory, bars: CotangentTables, go: Lanes) -> None:
         if contacts.set.holds:
             _reverse(step, bars, contacts, go)
     if pairings(step):
-        _reverse_fingers(step, bars, step.contacts["finger_finger"], go)  # type: ignore[arg-type]
+        assert step.self_contacts is not None
+        _reverse_fingers(step, bars, step.self_contacts, go)
 
 
 def _reverse(step: StepMemory, bars: CotangentTables, contacts: BoundContacts, go: Lanes) -> None:

@@ -30,7 +30,6 @@ from codesign_jax.engines.structured.kernel.rows import (
     WorldState,
 )
 from codesign_jax.engines.structured.kernel.self_contacts import SelfContactSet, pair_slots
-from codesign_jax.engines.structured.kernel.slots import SlotSet
 from codesign_jax.engines.structured.kernel.step_memory import KernelLayout
 from codesign_jax.engines.structured.kernel.team_contacts import (
     TeamSdfContactSet,
@@ -86,19 +85,30 @@ class Tables(KernelLayout):
         self.block = 1 if single_world else max(1, width // (self.fingers * self.team))
         self.columns = self.fingers * self.block
         self.size = self.columns * self.team
-        e = scene.effects
-        self.between = (e.finger_finger and n > 1) or e.finger_palm or touches_itself(scene)
         self.rings_per_link = rings_of_link(scene)
         self.palm_groups = palm_groups(scene)
         self.meshes = bool(shapes.mesh_indices(scene))
         self.support_points = objects.support_points(scene)
         self.record = record
+        self.self_set = self._self_set()
         self.sets = self._sets()
         for contacts in self.sets:
             contacts.stores_all = bool(record and record.touch and contacts.on_object)
         self.held = held.held(scene)
-        self.has_slots = any(isinstance(s, SlotSet) for s in self.sets)
         self._tables()
+
+    def _self_set(self) -> SelfContactSet | None:
+        e = self.scene.effects
+        between = e.finger_finger and self.num_fingers > 1
+        if not (between or e.finger_palm or touches_itself(self.scene)):
+            return None
+        block = (self.fingers, self.block)
+        slots = pair_slots(self.scene)
+        options = {"gathers": self.gathers, "remembers": self.remembers}
+        if self.team == 1:
+            return SelfContactSet(self.scene, block, self.links, slots, **options)
+        block = (*block, self.team)
+        return TeamSelfContactSet(self.scene, block, self.links, slots, **options)
 
     def _sets(self) -> list[ContactSet]:
         e = self.scene.effects
@@ -108,15 +118,7 @@ class Tables(KernelLayout):
         on = {"finger_object": k * e.finger_object, "finger_table": n * k * e.finger_table}
         fields = make if self.team == 1 else partial(TeamSdfContactSet, self.scene, self)
         sets = [fields(name, self.links, on[name]) for name in on if on[name]]
-        if self.between:
-            block = (self.fingers, self.block)
-            slots = pair_slots(self.scene)
-            options = {"gathers": self.gathers, "remembers": self.remembers}
-            if self.team == 1:
-                sets.append(SelfContactSet(self.scene, block, self.links, slots, **options))
-            else:
-                block = (*block, self.team)
-                sets.append(TeamSelfContactSet(self.scene, block, self.links, slots, **options))
+        sets += [self.self_set] if self.self_set else []
         on = {"palm_object": int(e.palm_object), "palm_table": n * e.palm_table}
         sets += [make(name, self.palm_groups, on[name]) for name in on if on[name]]
         groups = -(-surroundings.slots(self.scene) // self.fingers)

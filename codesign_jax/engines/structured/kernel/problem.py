@@ -9,7 +9,6 @@ from codesign_jax.engines.structured.kernel.chambers import Chambers
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import tree_add_scaled
 from codesign_jax.engines.structured.kernel.rows import Air, Hand, Scratch
-from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 from codesign_jax.engines.structured.laws.inertia import Body, Centred
@@ -64,7 +63,7 @@ class Problem:
         self.block = memory.block
         self.rigid = not memory.layout.scene.effects.wrist
         sets = memory.contacts
-        self.self_contacts: BoundSelfContacts | None = sets.get("finger_finger")  # type: ignore[assignment]
+        self.self_contacts = memory.self_contacts
         self.per_link = [sets[n] for n in ("finger_object", "finger_table") if n in sets]
         self.dealt = [c for n, c in sets.items() if not n.startswith("finger")]
         self.in_slots = [self.self_contacts] if self.self_contacts else []

@@ -55,7 +55,7 @@ def groups(layout: Any) -> dict[str, Group]:
 
 def tables(layout: Any, contacts: ContactSet) -> tuple:
     """The declarations of what is recorded of a set."""
-    if contacts.name == SELF:
+    if contacts is layout.self_set:
         return (PairForce,)
     return (ForceSum, TouchForce) if contacts.stores_all else (ForceSum,)
 
@@ -120,11 +120,10 @@ def _chord_of(problem: Problem, contacts: BoundContacts, item: Any, chord: Itera
 
 def write(step: StepMemory, table: BoundTable) -> None:
     """Writes the forces of the step's contacts, at its accelerations; before it is integrated."""
-    for name, contacts in step.contacts.items():
-        if isinstance(contacts, BoundSelfContacts):
-            _each(contacts.set.rows, lambda row, c=contacts: _write_pairing(step, c, row, table))
-        else:
-            _write_set(step, name, contacts, table)
+    for contacts in step.field_contacts:
+        _write_set(step, contacts.set.name, contacts, table)
+    if (pairs := step.self_contacts) is not None:
+        _each(pairs.set.rows, lambda row: _write_pairing(step, pairs, row, table))
 
 
 def _write_set(step: StepMemory, name: str, contacts: BoundContacts, table: BoundTable) -> None:

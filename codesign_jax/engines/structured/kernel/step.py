@@ -16,7 +16,6 @@ from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Proble
 from codesign_jax.engines.structured.kernel.rows import Hand, Scratch, WorldState
 from codesign_jax.engines.structured.kernel.sdf_collision import SdfCollision
 from codesign_jax.engines.structured.kernel.self_collision import SelfCollision
-from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.kernel.team_solver import team_rows
 from codesign_jax.engines.structured.lanes import dot, total
@@ -108,7 +107,7 @@ class Step(StepMemory):
         bodies = lanewise(run, state, arm, self.palm_constants())
         world_object = objects.read(layout.scene, self.block, self.world, self.hand, self.grid)
         self.columns = bodies["columns"]
-        self.contacts = {c.name: c.bind(self.scratch, self.constant) for c in layout.sets}
+        self.bind_contacts()
         return state, bodies, world_object, *self._forward(state, bodies, pressure, world_object)
 
     def _keep_overlap(self, state: dict) -> None:
@@ -117,8 +116,7 @@ class Step(StepMemory):
         A world with a larger one than the scene's limit is refused; `engines.depths` says the
         same of worlds that no kernel simulates.
         """
-        fields = [c for c in self.contacts.values() if not isinstance(c, BoundSelfContacts)]
-        depths = [c.deepest().lane for c in fields]
+        depths = [c.deepest().lane for c in self.field_contacts]
         if self.search:
             depths.append(self.search.deepest().lane)
         deepest = self.like
@@ -132,8 +130,8 @@ class Step(StepMemory):
 
     def _overflow(self, waiting: jax.Array) -> jax.Array:
         """One for worlds that had too few slots for their contacts in this step, else zero."""
-        lists = [c.overflow() for c in self.contacts.values() if isinstance(c, BoundSelfContacts)]
-        most = self.block.fold(total(lists), jnp.maximum)
+        assert self.self_contacts is not None
+        most = self.block.fold(self.self_contacts.overflow(), jnp.maximum)
         return jnp.where(waiting & (most > 0), 1.0, 0.0).astype(most.dtype)
 
     def store_chain(self, i: Any, chain: tuple) -> None:
@@ -189,12 +187,8 @@ class Step(StepMemory):
         origin, frame, vel, _, link_acc, _ = start
         if layout.scene.effects.air_mass:
             pressure = chambers.end_pressures(self, pressure)
-        self_contacts = self.contacts.get("finger_finger")
-        search = (
-            SelfCollision(self, self_contacts, bodies)
-            if isinstance(self_contacts, BoundSelfContacts)
-            else None
-        )
+        self_contacts = self.self_contacts
+        search = None if self_contacts is None else SelfCollision(self, self_contacts, bodies)
         self.search = search
         if search:
             search.start(link_acc, vel, frame, origin)
@@ -233,9 +227,8 @@ class Step(StepMemory):
             search.find()
         if search and layout.team > 1:
             fields.of_rings(search)
-        for contacts in self.contacts.values():
-            if isinstance(contacts, BoundSelfContacts):
-                contacts.keep_counts()
+        if self_contacts is not None:
+            self_contacts.keep_counts()
         fields.of_palm_and_object(state)
         count = layout.num_fingers * layout.links
         middle = self.block.sum(middle)

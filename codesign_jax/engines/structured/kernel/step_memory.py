@@ -13,6 +13,7 @@ from codesign_jax.engines.structured.kernel.rows import (
     World,
     WorldOptions,
 )
+from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts, SelfContactSet
 from codesign_jax.engines.structured.lanewise import Lanes, lanes
 from codesign_jax.engines.structured.laws.cones import friction_by_contact
 from codesign_jax.engines.structured.laws.step_numbers import step_numbers
@@ -65,8 +66,8 @@ class KernelLayout:
     hull: bool  # Whether fingers have rings
     meshes: bool  # Whether there are objects with meshes
     support_points: int  # Support points of a mesh
-    sets: list[ContactSet]  # The contacts
-    has_slots: bool  # Whether any of them are in slots
+    sets: list[ContactSet]  # The contacts of each pair of bodies
+    self_set: SelfContactSet | None  # Those of the hand with itself, one of `sets`
     record: Record | None  # What a rollout records of its contacts
     held: dict[str, int]  # What contacts hold of friction, see `model.held`
     # Rows of the tables; `onchip` with teams only.
@@ -78,6 +79,11 @@ class KernelLayout:
     onchip: MemoryLayout
     # Rows of what is recorded of a step, with `record` only.
     recorded: MemoryLayout
+
+    @property
+    def has_slots(self) -> bool:
+        """Whether there are contacts in slots: those of the hand with itself."""
+        return self.self_set is not None
 
     @property
     def tapered(self) -> bool:
@@ -108,6 +114,8 @@ class StepMemory:
       grid: Distances of all meshes, a reference; None without meshes.
       like: Zeros of the lanes' shape and type.
       contacts: The contact sets with their memory, by name.
+      self_contacts: That of the hand with itself; None without.
+      field_contacts: The others, whose contacts have a fixed place.
       columns: Columns of the object's orientation, once they are known.
     """
 
@@ -135,7 +143,22 @@ class StepMemory:
         self.onchip = None if onchip is None else BoundTable(layout.onchip, onchip)
         self.like = jnp.zeros((layout.size,), finger_state.dtype)
         self.contacts: dict[str, BoundContacts] = {}
+        self.self_contacts: BoundSelfContacts | None = None
+        self.field_contacts: list[BoundContacts] = []
         self.columns: Lanes | None = None
+
+    def bind_contacts(self) -> None:
+        """Begins a step's contacts: the sets with their memory, which is empty."""
+        self_set = self.layout.self_set
+        self.field_contacts = []
+        for contacts in self.layout.sets:
+            if self_set is not None and contacts is self_set:
+                self.self_contacts = self_set.bind(self.scratch, self.constant)
+                self.contacts[contacts.name] = self.self_contacts
+            else:
+                bound = contacts.bind(self.scratch, self.constant)
+                self.field_contacts.append(bound)
+                self.contacts[contacts.name] = bound
 
     def _table(self, name: str) -> BoundTable:
         tables = self.hand, self.finger_state, self.scratch, self.onchip

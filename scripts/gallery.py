@@ -4,8 +4,8 @@
 
 The hands are those of docs/gallery/hands.toml; `first` is the one of README's own command and
 pictures.  The design of each is docs/gallery/NAME.toml; where that is not there, its search is run,
-in runs/gallery/NAME, where an interrupted one goes on.  A design is judged at the accuracy of the
-search: in 100 fresh trials, in 48 with objects of each of some masses, and as 64 hands that are
+in runs/gallery/NAME, where an interrupted one goes on.  A design is judged at the accuracy of its
+scene: in 100 fresh trials, in 48 with objects of each of some masses, and as 64 hands that are
 cast with the usual tolerances.  Its grasp without noise is
 drawn; look.png in runs/gallery/NAME shows it from two sides, to be looked at.  A hand that has a
 warning of its design is refused.
@@ -44,8 +44,6 @@ QUALITY = 45
 """Frames of a second, pixels, and WebP's quality."""
 CLOSE = 0.36
 """Distance of the camera [m]."""
-ACCURACY = "standard"
-"""Accuracy of the searches, at which their hands are judged."""
 TRIALS = 100
 SEED = 1000
 MASSES = (0.1, 0.2, 0.3, 0.5)
@@ -79,7 +77,7 @@ class Hand:
         """The search."""
         flags = {"control": "--set control="}
         named = [flags.get(key, f"--{key} ") + name for key, name in self.names.items()]
-        return " ".join(["codesign optimize", *named, self.search, f"--accuracy {ACCURACY}"])
+        return " ".join(["codesign optimize", *named, self.search])
 
     @property
     def design(self) -> Path:
@@ -256,9 +254,9 @@ can be built, and none of these designs has a [warning](verdict.md#before-you-bu
 in Dragon Skin 10. The command below each hand is its search; another machine may end with another
 hand.
 
-* **Verdict.** Each hand met 100 fresh trials at the accuracy of its search, `standard`. *Friction*
-  is between object and hand. `codesign evaluate --design docs/gallery/shelf.toml --trials 100
-  --seed 1000` repeats the verdict of the hand *From a shelf*; the file names scene, hand, objects
+* **Verdict.** Each hand met 100 fresh trials at the accuracy `standard`. *Friction* is between
+  object and hand. `codesign evaluate --design docs/gallery/shelf.toml --trials 100 --seed 1000`
+  repeats the verdict of the hand *From a shelf*; the file names scene, hand, objects
   and control where they are not the default.
 * **More trials.** *N more at this share would decide* means that N further trials would decide the
   verdict if the kept share stayed the same.

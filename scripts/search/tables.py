@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from codesign_jax import scene
 from codesign_jax.judge.verdict import WANTED
 from codesign_jax.optimize import DEFAULT, NAMES
 from codesign_jax.statistics import wilson
@@ -28,6 +29,11 @@ def order(row: dict[str, Any]) -> tuple:
     return few, row["preset"] != LIMITED, row.get("objects") or "", place, row["optimizer"]
 
 
+def hand_of(row: dict[str, Any]) -> str:
+    """Name of the hand that was searched: that of the scene, unless the row names another."""
+    return row.get("hand") or scene.load(row.get("scene", "paper")).hand.name
+
+
 def table(rows: list[dict[str, Any]]) -> str:
     """A row for each optimiser: what its recommended designs keep at its last mark."""
     head = "optimiser|preset|hand|objects|seeds|grasps of a seed|median kept|"
@@ -40,7 +46,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             [
                 f"`{row['optimizer']}`",
                 row["preset"],
-                row.get("hand") or "pneuflex4",
+                hand_of(row),
                 row.get("objects") or "three",
                 str(kept.size),
                 f"{row['grasps'][-1]:,}",
@@ -59,7 +65,7 @@ def masses_table(rows: list[dict[str, Any]]) -> str:
     for row in sorted((r for r in rows if "masses" in r), key=order):
         head = ["preset", "hand", "searched with"]
         objects = row.get("objects") or "objects as they are"
-        cells = [row["preset"], row.get("hand") or "pneuflex4"]
+        cells = [row["preset"], hand_of(row)]
         cells.append(" ".join(row["changes"]) or objects)
         for mass, kept in row["masses"].items():
             head += [f"{1e3 * float(mass):g} g: kept on average", "seeds that keep 95 %"]
@@ -105,15 +111,15 @@ def accuracies_table(rows: list[dict[str, Any]]) -> str:
     such a search.
     """
     judged = [r for r in rows if "kept" in r and _option(r, JUDGED)]
-    retests = {(r["hand"], *r["changes"]): r["retest"] for r in rows if "retest" in r}
+    retests = {(hand_of(r), *r["changes"]): r["retest"] for r in rows if "retest" in r}
     head = ["hand", "accuracy of the episodes", "grasps of a seed", "seeds"]
     head += ["kept on average %", "seeds that keep 95 % (95 % interval)"]
     head += ["more kept than with `standard`, points", "finalists that `fast` alone likes"]
     head += ["seeds in which a test at `fast` chooses another design"]
     table_rows = [head]
     first: dict[str, np.ndarray] = {}
-    for row in sorted(judged, key=lambda r: (r["hand"] or "", bool(_option(r, SEARCHED)))):
-        hand = row["hand"] or "pneuflex4"
+    for row in sorted(judged, key=lambda r: (hand_of(r), bool(_option(r, SEARCHED)))):
+        hand = hand_of(row)
         kept = 100 * np.array(row["kept"][-1])
         more = kept - first.setdefault(hand, kept)
         words = "–"
@@ -122,7 +128,7 @@ def accuracies_table(rows: list[dict[str, Any]]) -> str:
             words = f"{gain.value:+.1f} ({gain.low:+.1f} to {gain.high:+.1f})"
         cells = [f"`{hand}`", f"`{_option(row, SEARCHED) or 'standard'}`"]
         cells += [f"{row['grasps'][-1]:,}", str(kept.size), f"{kept.mean():.1f}"]
-        again = retests.get((row["hand"], *row["changes"]))
+        again = retests.get((hand, *row["changes"]))
         tested = ["–", "–"]
         if again:
             tested = [f"{again['lost']} of {again['finalists']}", str(again["chosen_otherwise"])]

@@ -32,13 +32,13 @@ def candidates(key: jax.Array, space: Space, indices: ArrayLike) -> jax.Array:
     Returns:
       Particles, shape (particle, parameter).
     """
-    low, high = (np.asarray(v, jnp.result_type(float)) for v in (space.low, space.high))
     numbers = indices if isinstance(indices, jax.Array) else np.asarray(indices)
-    unit: Any = _uniform(key, numbers, len(low))
-    if not isinstance(unit, Tracer):
-        unit = np.asarray(unit)  # whose operations compile nothing
-    inside = unit.__array_namespace__().clip(low + unit * (high - low), low, high)
-    return space.constrain(jax.device_put(inside))
+    unit = _uniform(key, numbers, len(space.low))
+    arrays = unit, space.low, space.high
+    traced = any(isinstance(v, Tracer) for v in arrays)
+    numpy: Any = jnp if traced else np  # NumPy's operations compile nothing
+    unit, low, high = (numpy.asarray(v, unit.dtype) for v in arrays)
+    return space.constrain(jax.device_put(numpy.clip(low + unit * (high - low), low, high)))
 
 
 @functools.partial(quickly_compiled, static_argnums=2)

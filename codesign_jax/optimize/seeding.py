@@ -33,7 +33,7 @@ def candidates(key: jax.Array, space: Space, indices: ArrayLike) -> jax.Array:
       Particles, shape (particle, parameter).
     """
     numbers = indices if isinstance(indices, jax.Array) else np.asarray(indices)
-    unit = _uniform(key, numbers, len(space.low))
+    unit = _uniform(key, numbers, jnp.shape(space.low)[0])
     arrays = unit, space.low, space.high
     traced = any(isinstance(v, Tracer) for v in arrays)
     numpy: Any = jnp if traced else np  # NumPy's operations compile nothing

@@ -100,8 +100,8 @@ def search(args: argparse.Namespace, name: str) -> None:
         f"--{name}={Path(accuracy).stem}" for name, accuracy in accuracies.items() if accuracy
     ]
     changed += [f"--first={args.first}"] if args.first else []
-    words = [args.scene] if args.scene != "paper" else []
-    words += [Path(name).stem for name in (args.hand, args.objects) if name]
+    named = (args.scene if args.scene != "paper" else None, args.hand, args.objects)
+    words = [Path(name).stem for name in named if name]
     words += [args.preset, name, *(re.sub(r"^--|^[a-z_.]+[.](?=.*=)", "", c) for c in changed)]
     stem = re.sub("[:,]", "-", "-".join(dict.fromkeys(words))).replace("=", "")
     if len(stem) > LONGEST_STEM:

@@ -249,7 +249,7 @@ def write_page() -> None:
 
 HEAD = """# Gallery
 
-The default search found these hands within the [limits](optimisers.md#what-can-be-built) of what
+`codesign optimize` found these hands within the [limits](optimisers.md#what-can-be-built) of what
 can be built, and none of these designs has a [warning](verdict.md#before-you-build). They are cast
 in Dragon Skin 10. The command below each hand is its search; another machine may end with another
 hand.

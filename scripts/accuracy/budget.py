@@ -168,10 +168,11 @@ class Study:
         seconds = []
         processor = []
         for _ in range(1 if name in DEAR else 3):
-            start = time.perf_counter(), time.process_time()
+            start = time.perf_counter()
+            spent = time.process_time()
             jax.block_until_ready(call())
-            seconds.append(time.perf_counter() - start[0])
-            processor.append(time.process_time() - start[1])
+            seconds.append(time.perf_counter() - start)
+            processor.append(time.process_time() - spent)
         count = len(self.designs) * self._trials(variant)
         return {
             "grasps": count,

@@ -70,9 +70,8 @@ def grown(section: Any, params: Params, modulus: float, coefficients: np.ndarray
     height, wall, segment, width = jnp.moveaxis(section, -1, 0)
     pressure = jnp.maximum(params.pressure, LEAST) / modulus
     share = jnp.minimum(params.pressure / LEAST, 1.0)
-    growth = terms(pressure, wall / height, width / height) @ jnp.asarray(
-        coefficients, height.dtype
-    )
+    matrix = terms(pressure, wall / height, width / height)
+    growth = matrix @ jnp.asarray(coefficients, height.dtype)
     growth = share[..., None] * jnp.clip(growth, 0.0, jnp.array(MOST))
     by_height, by_width = jnp.moveaxis(growth, -1, 0)
     return jnp.stack([height * (1 + by_height), wall, segment, width * (1 + by_width)], -1)

@@ -19,7 +19,8 @@ _PLACES = 50
 def starts_apart(scene: Scene, design: Params) -> bool:
     """Whether it is certain that a hand of straight fingers overlaps with nothing at its start.
 
-    With half of the depth that the scene allows, `limits.penetration`.
+    Overlaps of fingers with one another and with the palm count as none up to half of the depth
+    that the scene allows, `limits.penetration`.
 
     Args:
       design: Parameters of one hand, NumPy arrays.
@@ -65,10 +66,13 @@ def _mounted(scene: Scene, design: Params) -> tuple[np.ndarray, ...]:
     about z.
     """
     base, azimuth, tilt = mount_points(scene.hand, np.asarray(design.spread, float), np)
-    ca, sa, ct, st = (f(a) for a in (azimuth, tilt) for f in (np.cos, np.sin))
-    along = np.stack([ca * ct, sa * ct, -st], -1)
-    across = np.stack([-sa, ca, 0 * sa], -1)
-    up = np.stack([ca * st, sa * st, ct], -1)
+    outwards = np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], -1)
+    across = np.stack([-np.sin(azimuth), np.cos(azimuth), 0 * azimuth], -1)
+    downwards = np.array([0.0, 0.0, -1.0])
+    cosine = np.cos(tilt)[..., None]
+    sine = np.sin(tilt)[..., None]
+    along = cosine * outwards + sine * downwards
+    up = sine * outwards - cosine * downwards
     return base, along, across, up
 
 

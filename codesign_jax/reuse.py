@@ -137,31 +137,51 @@ def kernel_file(name: str) -> Path | None:
     return None if not cache or "://" in str(cache) else Path(cache) / "kernels" / f"{name}.kept"
 
 
-def kept(path: Path | None, build: Callable[[], bytes], *, worth: float = 0.0) -> bytes:
-    """Content of a file of a cache, or what `build` returns, which is kept if it took `worth` [s].
+class Kept:
+    """A file of a cache; one that cannot be read or written does not matter."""
 
-    A file that is damaged, or another one's, is built again. A folder that cannot be read or
-    written does not matter.
-    """
-    most = limit()
-    if path is None or most is None:
-        return build()
-    with contextlib.suppress(OSError):
-        stored = path.read_bytes()
-        if stored[:32] == hashlib.sha256(path.name.encode() + stored[32:]).digest():
-            with contextlib.suppress(OSError):  # of somebody else
-                os.utime(path)
-            return stored[32:]
+    def __init__(self, path: Path | None):
+        """Takes its place, and whether caches are on; without a path nothing is kept."""
+        self.most = limit()
+        self.path = None if self.most is None else path
+
+    def read(self) -> bytes | None:
+        """What was written; None if there is nothing, if it is damaged or of another name."""
+        if self.path is None:
+            return None
+        with contextlib.suppress(OSError):
+            stored = self.path.read_bytes()
+            if stored[:32] == self._digest(stored[32:]):
+                with contextlib.suppress(OSError):  # of somebody else
+                    os.utime(self.path)
+                return stored[32:]
+        return None
+
+    def write(self, content: bytes) -> bytes:
+        """Keeps the content, and returns it."""
+        if self.path is not None and self.most is not None:
+            with contextlib.suppress(OSError):
+                files.make_folder_of(self.path)
+                files.clear_place(self.path)
+                with files.atomically(self.path) as part:
+                    part.write_bytes(self._digest(content) + content)
+                _evict(self.path, self.most)
+        return content
+
+    def _digest(self, content: bytes) -> bytes:
+        assert self.path is not None
+        return hashlib.sha256(self.path.name.encode() + content).digest()
+
+
+def kept(path: Path | None, build: Callable[[], bytes], *, worth: float = 0.0) -> bytes:
+    """What a file of a cache holds, or `build` returns, which is kept if it took `worth` [s]."""
+    file = Kept(path)
+    content = file.read()
+    if content is not None:
+        return content
     start = time.perf_counter()
     content = build()
-    if time.perf_counter() - start >= worth:
-        with contextlib.suppress(OSError):
-            files.make_folder_of(path)
-            files.clear_place(path)
-            with files.atomically(path) as part:
-                part.write_bytes(hashlib.sha256(path.name.encode() + content).digest() + content)
-            _evict(path, most)
-    return content
+    return file.write(content) if time.perf_counter() - start >= worth else content
 
 
 def _evict(newest: Path, most: int) -> None:

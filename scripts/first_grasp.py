@@ -5,7 +5,8 @@
 OLD is a commit, or a folder with its source.  Each process does what README's eight lines do until
 their first line: an episode of the scene `paper`.  The checkouts take turns, A B A B.  *Cold* finds
 no program or kernel on disk, *warm* those of the cold process before it.  The table has wall time,
-the processor time of all threads, which other processes disturb less, and where it went.
+the processor time of all threads, which other processes disturb less, and where it went; a stage's
+includes that of what runs beside it, such as LLVM beside XLA.
 """
 
 import argparse

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import threading
+from concurrent import futures
 from ctypes import POINTER, c_char_p, c_int, c_int64, c_uint, c_void_p
 from functools import partial
 from pathlib import Path
@@ -22,6 +23,7 @@ from tests.helpers import kernels
 pytestmark = pytest.mark.usefixtures("optimized_kernels")
 
 FUNCTION = ctypes.CFUNCTYPE(c_void_p, c_void_p)
+NEVER_CALLED = 0xBAD
 STREAM = 0x57EA
 
 
@@ -157,8 +159,10 @@ def handler():
     """Address of the handler of `kernels.body`, not registered."""
     x, table = (jax.ShapeDtypeStruct(v.shape, v.dtype) for v in kernels.numbers(4))
     jaxpr = launch.kernel_jaxpr(kernels.call(x, table)[0], [x, table])
-    text = cpu.block_code(jaxpr, LAYOUT) + cpu.handler_code("plain", LAYOUT)
-    return handlers.Loaded(handlers.compile(text)).function("plain")
+    loaded = handlers.prepare("plain", cpu.handler_code("plain", LAYOUT), keep=False)
+    code = handlers.Loaded(handlers.compile(cpu.object_text(jaxpr, LAYOUT)))
+    handlers.supply("plain", loaded, lambda: code.function(cpu.ENTRY)).join()
+    return loaded.function("plain")
 
 
 @pytest.fixture
@@ -259,6 +263,9 @@ def test_kept_code_runs_in_another_process_on_several_devices(folder):
         patch.setattr(handlers, "known", lambda name: False)  # another test may have compiled it
         patch.setattr(handlers, "register", lambda *_: None)
         jax.jit(kernels.run).lower(x, table)
+    for thread in threading.enumerate():
+        if thread.name.startswith("compiles"):
+            thread.join()
     assert list(folder.rglob("*.kept"))
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([".", *sys.path])}
     done = subprocess.run(
@@ -299,12 +306,35 @@ def test_arrays_of_another_kind_are_refused():
                 call(*arguments)
 
 
+def test_a_call_waits_for_its_kernel():
+    """Which is compiled meanwhile; an error in that is the calls', whenever they begin."""
+    x, table = kernels.numbers(3)
+    out = np.zeros((3, 1, 8), np.float32)
+    compiled = threading.Event()
+
+    def fails():
+        compiled.wait()
+        raise RuntimeError("LLVM refused")
+
+    loaded = handlers.prepare("waits", cpu.handler_code("waits", LAYOUT), keep=False)
+    compiling = handlers.supply("waits", loaded, fails)
+    with futures.ThreadPoolExecutor() as pool:
+        call = pool.submit(Xla().call, loaded.function("waits"), [x, table], [out])
+        with pytest.raises(TimeoutError):
+            call.result(timeout=0.1)
+        compiled.set()
+        error = (ffi.INTERNAL, "kernel waits: LLVM refused")
+        assert call.result(timeout=10) == error
+    compiling.join()
+    assert Xla().call(loaded.function("waits"), [x, table], [out]) == error
+
+
 @pytest.mark.parametrize("threads", [1, 4])
 def test_missing_memory_is_an_error(threads):
     """Scratch memory of a petabyte: the call fails, and says why."""
     large = Layout((*LAYOUT.arrays[:3], Array((2**40, 256), "float32", SCRATCH)), 8)
-    block = "define internal void @block(ptr %a, ptr %b, ptr %c, ptr %d) {\nret void\n}\n"
-    loaded = handlers.Loaded(handlers.compile(block + cpu.handler_code("large", large)))
+    loaded = handlers.prepare("large", cpu.handler_code("large", large), keep=False)
+    handlers.supply("large", loaded, lambda: NEVER_CALLED).join()
     x, table = kernels.numbers(8)
     out = np.zeros((8, 1, 8), np.float32)
     xla = Xla(threads, "threads")
@@ -445,12 +475,13 @@ class FakeDriver:
 def prepared():
     """A handler and what sets the driver that it calls."""
     fake = FakeDriver()
-    loaded = gpu.prepare("fake", GPU_LAYOUT, KERNEL, gpu.Driver(fake))
+    loaded = gpu.prepare("fake", GPU_LAYOUT, gpu.Driver(fake), keep=False)
+    handlers.supply("fake", loaded, lambda: KERNEL).join()
 
     def use(driver):
-        table = loaded.numbers("fake_table", 1 + len(gpu.CALLS))
+        table = loaded.numbers("fake_table", len(gpu.CALLS))
         for k, name in enumerate(gpu.CALLS):
-            table[1 + k] = gpu.Driver(driver).address(name)
+            table[k] = gpu.Driver(driver).address(name)
         return driver
 
     return loaded.function("fake"), use, fake

@@ -24,14 +24,14 @@ _SLEEP = 50_000
 
 
 class Job(ctypes.Structure):
-    """A call's record, followed by the address of each array."""
+    """A call's record; the addresses of the arrays follow it in memory."""
 
     _fields_ = [
         ("next", c_int64),  # block that nobody has taken yet
         ("done", c_int64),  # blocks that have been run
         ("users", c_int64),  # tasks, and the handler, that may still look at the record
         ("blocks", c_int64),
-        ("arrays", c_int64),
+        ("kernel", ctypes.c_void_p),  # what runs a block
     ]
 
 
@@ -40,12 +40,19 @@ declare i32 @posix_memalign(ptr, i64, i64)
 declare ptr @malloc(i64)
 declare void @free(ptr)
 declare i32 @sched_yield()
-declare i32 @nanosleep(ptr, ptr)
 """
+
+ENTRY = "entry"
+"""Name by which a block's code is found in its object file."""
 
 
 def block_code(jaxpr: Any, layout: Layout) -> str:
     return vector.write(jaxpr, layout.blocks, layout.lanes)
+
+
+def object_text(jaxpr: Any, layout: Layout) -> str:
+    """Program of a kernel's object file, which tells the address of the block's code as `ENTRY`."""
+    return block_code(jaxpr, layout) + f"@{ENTRY} = alias i8, ptr @block\n"
 
 
 def handler_code(name: str, layout: Layout) -> str:
@@ -61,29 +68,20 @@ def register(
     its machine code may be kept on disk and be found there.
     """
     name = "kernel_" + reuse.digest("cpu", origin, layout, level, *handlers.identity())
-
-    def build() -> bytes:
-        text = block_code(trace(), layout) + handler_code(name, layout)
-        return handlers.compile(_declared_once(text), level)
-
     with handlers.LOCK:
         if not handlers.known(name):
-            code = reuse.kept(reuse.kernel_file(name) if keep else None, build)
-            handlers.register(name, handlers.Loaded(code), "cpu")
+            file = reuse.Kept(reuse.kernel_file(name) if keep else None)
+            code = file.read()
+            text = "" if code else object_text(trace(), layout)
+            loaded = handlers.prepare(name, handler_code(name, layout), keep=keep)
+            handlers.register(name, loaded, "cpu")
+
+            def load() -> int:
+                machine_code = code or file.write(handlers.compile(text, level))
+                return handlers.Loaded(machine_code).function(ENTRY)
+
+            handlers.supply(name, loaded, load)
     return name
-
-
-def _declared_once(text: str) -> str:
-    """A program without repeated declarations: block and handler may use the same function."""
-    lines = text.splitlines()
-    repeated = set()
-    seen = set()
-    for number, line in enumerate(lines):
-        if line.startswith("declare"):
-            if line in seen:
-                repeated.add(number)
-            seen.add(line)
-    return "\n".join(line for k, line in enumerate(lines) if k not in repeated) + "\n"
 
 
 def _work(layout: Layout) -> str:
@@ -106,8 +104,9 @@ def _work(layout: Layout) -> str:
         with c.when(c.let(f"icmp ne i32 {lacks}, 0")):
             c.end("ret i1 true")
         memory = c.let(f"load ptr, ptr {place}")
-    first = c.at("%job", Job, "arrays")
+    first = c.byte("%job", ctypes.sizeof(Job))
     bases = [c.let(f"load ptr, ptr {c.byte(first, 8 * k)}") for k in range(len(layout.arrays))]
+    kernel = c.get("%job", Job, "kernel")
     c.start("again")
     block = c.let(f"atomicrmw add ptr {following}, i64 1 monotonic")
     with c.when(c.let(f"icmp slt i64 {block}, {blocks}")):
@@ -118,7 +117,7 @@ def _work(layout: Layout) -> str:
             else:
                 offset = c.let(f"mul i64 {block}, {0 if array.shared else array.bytes}")
                 places.append(c.byte(bases[k], offset))
-        c.do(f"call void @block({', '.join(f'ptr {p}' for p in places)})")
+        c.do(f"call void {kernel}({', '.join(f'ptr {p}' for p in places)})")
         c.do(f"atomicrmw add ptr {c.at('%job', Job, 'done')}, i64 1 release")
         c.end("br label %again")
     if offsets:
@@ -154,7 +153,7 @@ def _handler(name: str, layout: Layout) -> str:
     with c.when(c.let(f"icmp eq i64 {blocks}, 0")):
         c.end("ret ptr null")
     workers = _smaller(c, _threads(h), blocks)
-    job = _job(h, workers)
+    job = _job(h, workers, h.kernel())
     _schedule(h, job, workers)
     short = c.local("i1")
     begun = c.local("i64")
@@ -199,16 +198,17 @@ def _destroy(h: Handler, error: str) -> None:
     h.code.do(f"call void {destroy}(ptr {record})")
 
 
-def _job(h: Handler, users: str) -> str:
+def _job(h: Handler, users: str, kernel: str) -> str:
     c = h.code
     arrays = h.layout.arrays
-    size = Job.arrays.offset + 8 * len(arrays)
+    size = ctypes.sizeof(Job) + 8 * len(arrays)
     job = c.let(f"call ptr @malloc(i64 {size})")
     with c.when(c.let(f"icmp eq ptr {job}, null")):
         h.fail(ffi.RESOURCE_EXHAUSTED, h.message(f"kernel {h.name}: no memory for a call's record"))
-    for field, value in (("next", 0), ("done", 0), ("users", users), ("blocks", h.blocks)):
+    numbers = {"next": 0, "done": 0, "users": users, "blocks": h.blocks, "kernel": kernel}
+    for field, value in numbers.items():
         c.put(job, Job, field, value)
-    first = c.at(job, Job, "arrays")
+    first = c.byte(job, ctypes.sizeof(Job))
     for k in range(len(arrays)):
         c.do(f"store ptr {h.data.get(k, 'null')}, ptr {c.byte(first, 8 * k)}")
     return job

@@ -1,8 +1,9 @@
 """Kernels on NVIDIA GPUs: device code in PTX, launched by a handler in host machine code.
 
 The driver translates the PTX into a library of its own, which belongs to no context: one handle
-serves every GPU of the host.  The handler asks XLA for the stream and calls `cuLaunchKernel` on it,
-one block of a warp for each block of the arrays.  Python and its lock take no part.
+serves every GPU of the host.  It does so in a thread, and keeps its translation on disk itself
+(CUDA_CACHE_PATH).  The handler asks XLA for the stream and calls `cuLaunchKernel` on it, one block
+of a warp for each block of the arrays.  Python and its lock take no part.
 
 A kernel's entry point has one pointer an array, in the layout's order, to the array's first block,
 and finds its own blocks (block index times size, or the first one where an array is shared).
@@ -129,29 +130,26 @@ def _translate(driver: Driver, kernel: ctypes.c_void_p, device: int) -> None:
         driver("cuDevicePrimaryCtxRelease_v2", device)
 
 
-def prepare(name: str, layout: Layout, kernel: int, driver: Driver) -> handlers.Loaded:
-    """The handler of a kernel, compiled and told the kernel's handle and the driver's functions."""
-    loaded = handlers.Loaded(handlers.compile(handler_code(name, layout)))
-    table = loaded.numbers(f"{name}_table", 1 + len(CALLS))
-    table[0] = kernel
+def prepare(name: str, layout: Layout, driver: Driver, *, keep: bool = True) -> handlers.Loaded:
+    """The handler of a kernel, compiled and told the driver's functions."""
+    loaded = handlers.prepare(name, handler_code(name, layout), keep=keep)
+    table = loaded.numbers(f"{name}_table", len(CALLS))
     for k, function in enumerate(CALLS):
-        table[1 + k] = driver.address(function)
+        table[k] = driver.address(function)
     return loaded
 
 
 def register(origin: str, trace: Callable[[], Any], layout: Layout, *, keep: bool = True) -> str:
     """As `cpu.register`."""
     name = "kernel_" + reuse.digest("cuda", origin, layout, *handlers.identity()[:2])
-
-    def build() -> bytes:
-        return device_code(trace(), layout).encode()
-
     with handlers.LOCK:
         if not handlers.known(name):
-            text = reuse.kept(reuse.kernel_file(name) if keep else None, build).decode()
+            file = reuse.Kept(reuse.kernel_file(name) if keep else None)
+            code = file.read() or file.write(device_code(trace(), layout).encode())
             device = jax.local_devices(backend="cuda")[0].local_hardware_id or 0
-            loaded = prepare(name, layout, load(driver(), text, device), driver())
+            loaded = prepare(name, layout, driver(), keep=keep)
             handlers.register(name, loaded, "CUDA")
+            handlers.supply(name, loaded, lambda: load(driver(), code.decode(), device))
     return name
 
 
@@ -159,9 +157,9 @@ _DECLARATIONS = "declare i32 @snprintf(ptr, i64, ptr, ...)\n"
 
 
 def handler_code(name: str, layout: Layout) -> str:
-    """The handler of a kernel, with a table of the kernel's handle and the driver's functions."""
+    """The handler of a kernel, with a table of the driver's functions."""
     h = Handler(name, layout)
-    h.globals.append(f"@{name}_table = global [{1 + len(CALLS)} x ptr] zeroinitializer\n")
+    h.globals.append(f"@{name}_table = global [{len(CALLS)} x ptr] zeroinitializer\n")
     c = h.code
     blocks = h.blocks
     places = [k for k, array in enumerate(layout.arrays) if array.role != ONCHIP]
@@ -169,6 +167,7 @@ def handler_code(name: str, layout: Layout) -> str:
         c.end("ret ptr null")
     with c.when(c.let(f"icmp sgt i64 {blocks}, {2**31 - 1}")):
         h.fail(ffi.INVALID_ARGUMENT, h.message(f"kernel {name}: more blocks than a grid has"))
+    kernel = h.kernel()
     stream = _stream(h)
     addresses = c.local("ptr", len(places))
     params = c.local("ptr", len(places))
@@ -181,7 +180,6 @@ def handler_code(name: str, layout: Layout) -> str:
     _check(h, "cuStreamGetCtx", got)
     pushed = _call(h, "cuCtxPushCurrent_v2", f"ptr {c.let(f'load ptr, ptr {context}')}")
     _check(h, "cuCtxPushCurrent", pushed)
-    kernel = c.let(f"load ptr, ptr @{name}_table")
     grid = c.let(f"trunc i64 {blocks} to i32")
     launched = _call(
         h,
@@ -206,7 +204,7 @@ def _stream(h: Handler) -> str:
 
 
 def _call(h: Handler, function: str, arguments: str) -> str:
-    place = h.code.byte(f"@{h.name}_table", 8 * (1 + CALLS.index(function)))
+    place = h.code.byte(f"@{h.name}_table", 8 * CALLS.index(function))
     pointer = h.code.let(f"load ptr, ptr {place}")
     return h.code.let(f"call i32 {pointer}({arguments})")
 

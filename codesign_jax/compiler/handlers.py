@@ -1,7 +1,9 @@
 """XLA's handlers in this computer's machine code, made and loaded by LLVM.  Needs llvmlite.
 
 A handler is the same for every device in its version, checks and errors.  It is written in LLVM's
-language, with instructions of its own (`LlvmFunction`): it is no kernel.
+language, with instructions of its own (`LlvmFunction`): it is no kernel.  XLA knows it before the
+kernel that it calls is compiled: a thread does this, for seconds, while JAX traces and XLA compiles
+the program around it.  A call waits until it is there.
 
 The environment variable CODESIGN_KERNEL_OPTIMIZATION says how much LLVM optimises: 2, the default,
 or 0, which takes half of LLVM's time, for programs that run for milliseconds.  A kernel may ask for
@@ -15,12 +17,13 @@ import ctypes
 import functools
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import llvmlite
 import llvmlite.binding as binding
 
+from codesign_jax import reuse
 from codesign_jax.compiler import ffi
 from codesign_jax.compiler.values import INPUT, OUTPUT, Layout
 
@@ -123,6 +126,20 @@ def seen(name: str) -> str:
     return f"{name}_seen"
 
 
+WAITING, FAILED = 0, 1
+"""What a handler finds in place of its kernel's address."""
+
+
+def awaited(name: str) -> str:
+    """Name of two 64-bit numbers: address of the kernel, see `WAITING`, and of an error's text."""
+    return f"{name}_awaited"
+
+
+DECLARATIONS = "declare i32 @nanosleep(ptr, ptr)\n"
+PAUSE = 1_000_000
+"""Pause of a handler that waits for its kernel [ns]; 50 us take a tenth of a core's time."""
+
+
 class Handler:
     """A handler that is being written; what it does with its arrays is added by the device.
 
@@ -138,7 +155,10 @@ class Handler:
         self.name = name
         self.layout = layout
         self.code = LlvmFunction(f"define ptr @{name}(ptr %frame) nounwind")
-        self.globals = [f"@{seen(name)} = global [{len(SEEN)} x i64] zeroinitializer\n"]
+        self.globals = [
+            f"@{seen(name)} = global [{len(SEEN)} x i64] zeroinitializer\n",
+            f"@{awaited(name)} = global [2 x i64] [i64 {WAITING}, i64 0]\n",
+        ]
         self.messages = 0
         self.api = self.code.get("%frame", ffi.CallFrame, "api")
         self._answer()
@@ -160,13 +180,28 @@ class Handler:
         error = c.let(f"call ptr {create}(ptr {record})")
         c.end(f"ret ptr {error}")
 
+    def kernel(self) -> str:
+        """Address of the kernel, for which the handler waits; an error if there will be none."""
+        c = self.code
+        pause = c.local("[2 x i64]")
+        c.do(f"store [2 x i64] [i64 0, i64 {PAUSE}], ptr {pause}")
+        c.start("await_kernel")
+        address = c.let(f"load atomic i64, ptr @{awaited(self.name)} acquire, align 8")
+        with c.when(c.let(f"icmp eq i64 {address}, {WAITING}")):
+            c.let(f"call i32 @nanosleep(ptr {pause}, ptr null)")
+            c.end("br label %await_kernel")
+        with c.when(c.let(f"icmp eq i64 {address}, {FAILED}")):
+            place = c.byte(f"@{awaited(self.name)}", 8)
+            self.fail(ffi.INTERNAL, c.let(f"load ptr, ptr {place}"))
+        return c.let(f"inttoptr i64 {address} to ptr")
+
     def call(self, function: str, record: str) -> str:
         """Calls one of XLA's functions; returns its error or null."""
         pointer = self.code.get(self.api, ffi.Api, function)
         return self.code.let(f"call ptr {pointer}(ptr {record})")
 
     def text(self) -> str:
-        return "".join(self.globals) + self.code.text()
+        return DECLARATIONS + "".join(self.globals) + self.code.text()
 
     def _answer(self) -> None:
         """Names the version that this was written for, if the structures are as large as they were.
@@ -292,11 +327,13 @@ def _machine(level: int = 2) -> Any:
     )
 
 
-def compile(text: str, level: int = 2) -> bytes:
+def compile(text: str, level: int = 2, *, passes: bool = True) -> bytes:
     """Object file of a program in LLVM's language.
 
     Args:
+      text: The program.
       level: At which machine code is chosen, 1 or 2, and the highest of other passes.
+      passes: Whether it is optimised before.
     """
     # Where the environment says 0, machine code is still chosen at this level. At 0 that would take
     # a fourth of the time, but multiplications and additions are fused here and not there, and the
@@ -304,6 +341,8 @@ def compile(text: str, level: int = 2) -> bytes:
     machine = _machine(level)
     module = binding.parse_assembly(text)
     module.triple = machine.triple
+    if not passes:
+        return machine.emit_object(module)
     options = binding.create_pipeline_tuning_options(speed_level=min(level, _level()))
     # Everything is in vectors already, and loops over links are to stay loops.
     options.slp_vectorization = options.loop_vectorization = options.loop_unrolling = False
@@ -336,7 +375,34 @@ def known(name: str) -> bool:
     return name in _loaded
 
 
+def prepare(name: str, text: str, *, keep: bool = True) -> Loaded:
+    """A handler in memory; `keep`: whether it may be found on disk, and kept there."""
+    file = reuse.Kept(reuse.kernel_file(f"{name}-handler") if keep else None)
+    # It runs for microseconds.
+    return Loaded(file.read() or file.write(compile(text, passes=False)))
+
+
+def supply(name: str, loaded: Loaded, make: Callable[[], int]) -> threading.Thread:
+    """Gives a handler the address of its kernel, which a thread makes; an error is its calls'."""
+    place = loaded.numbers(awaited(name), 2)
+
+    def work() -> None:
+        try:
+            place[0] = make()
+        except Exception as error:  # LLVM's, the driver's: whatever it is, nobody waits for ever
+            text = ctypes.create_string_buffer(f"kernel {name}: {error}".encode())
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(text))  # XLA's threads read it
+            place[1] = ctypes.addressof(text)
+            place[0] = FAILED
+
+    # The interpreter waits for it before it ends: LLVM's code is not taken away under it.
+    thread = threading.Thread(target=work, name=f"compiles {name}")
+    thread.start()
+    return thread
+
+
 def register(name: str, loaded: Loaded, platform: str) -> None:
+    """Makes a handler known to XLA."""
     try:
         ffi.register(name, loaded.function(name), platform)
     except ffi.KernelUnavailable as error:

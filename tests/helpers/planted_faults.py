@@ -156,7 +156,7 @@ def planted(faults: Mapping[str, Fault]) -> Iterator[Planted]:
         patch.setattr(reuse, "code_digest", lambda: digest)
         # What has no fault is traced once for all.
         patch.setattr(program, "of_code", lambda _: None)
-        patch.setattr(reuse, "kept", lambda path, build: build())
+        patch.setattr(reuse, "kernel_file", lambda name: None)
         yield fault
     missing = fault.expected_stages() - fault.used
     assert not missing, f"stages that the kernel has no more: {missing}"

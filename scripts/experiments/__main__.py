@@ -8,6 +8,7 @@ python -m scripts.experiments figures                                # of docs/d
 """
 
 import argparse
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -30,6 +31,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--out", type=Path, default=Path("runs/reproduction"), help="folder")
     parser.add_argument("--scene", default="paper", help="built-in scene or file")
     parser.add_argument("--size", choices=list(simulate.SIZES), default="paper")
+    parser.add_argument("--runs", type=int, help="runs of each strategy, by default the size's")
     parser.add_argument("--engine", choices=NAMES, default="structured")
     parser.add_argument("--seed", type=int, default=0, help="seed of run 0")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
@@ -47,6 +49,8 @@ def run(args: argparse.Namespace) -> int:
     common.use_compilation_cache()
     plans, changes = simulate.SIZES[args.size]
     the_plan = plans[args.experiment]
+    if args.runs and isinstance(the_plan, simulate.Strategies):
+        the_plan = dataclasses.replace(the_plan, runs=args.runs)
     overrides = keypaths.parse([*changes, *args.set])
     the_scene = scene.load(args.scene, overrides=overrides)
     path = args.out / f"{args.experiment}.json"

@@ -15,6 +15,7 @@ from codesign_jax import model, scene
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
+from codesign_jax.engines.structured.kernel import chambers
 from codesign_jax.engines.structured.laws import air
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.model import morphology
@@ -98,8 +99,8 @@ def test_a_free_finger_has_the_wanted_pressure(neo_hookean):
 
         @jax.jit
         def reached(hand, controls, grown):
-            charge = air.charged(the_scene, hand, controls)[0, 0, 6]
-            arguments = air.volumes(hand, 1)[0, 0], hand.air[:, 0, 0], (grown, 0.0, 0.0)
+            charge = chambers.charged(the_scene, hand, controls)[0, 0, 6]
+            arguments = hand.volume[0, 0], hand.air[:, 0, 0], (grown, 0.0, 0.0)
             return air.end_pressure(1.0, charge, *arguments)
 
         pressure, fall = reached(hand, controls, mine.gain * mine.free)

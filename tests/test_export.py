@@ -25,7 +25,6 @@ from numpy.polynomial import Polynomial
 from codesign_jax import cli, control, files, model, rollout, scene, tolerances
 from codesign_jax.cost import outcome
 from codesign_jax.engines.mujoco import MujocoEngine
-from codesign_jax.engines.structured.kernel import memory_tables
 from codesign_jax.export import (
     arm,
     casting,
@@ -949,7 +948,7 @@ def test_spheres_stand_where_the_engine_has_its_rings(skinned):
     alone, params, trial, _, shares = skinned
     fields, _ = world_inputs(alone, params, trial)
     hand = lanes(alone, repeat(fields, 1))
-    rings = np.asarray(memory_tables.ring_numbers(alone, hand, 2))[:, :, 1, 0]
+    rings = np.asarray(hand.ring)[:, :, 1, 0]
     segment = params.length[1] / alone.discretization.links
     spheres = skin.balls(alone, 1, params)
     np.testing.assert_allclose([b.place for b in spheres], rings[:, :3], atol=1e-6)

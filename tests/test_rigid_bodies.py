@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from codesign_jax import preflight, scene
 from codesign_jax.engines.mujoco import world_model
+from codesign_jax.engines.structured.lanes import apply_columns
 from codesign_jax.engines.structured.laws import rings, shapes
-from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.scene import objects, primitives, rigid_bodies, scene_files, schema
 from tests.helpers import grasps
 from tests.helpers.solids import box, object_file

@@ -12,7 +12,7 @@ import trimesh
 
 from codesign_jax import model, rollout, scene
 from codesign_jax.engines import make_engine
-from codesign_jax.engines.structured.kernel import memory_tables
+from codesign_jax.engines.structured import world_model
 from codesign_jax.engines.structured.laws import holding, rings
 from codesign_jax.engines.structured.laws.contact import Cone, Contacts, constraint_update
 from codesign_jax.model import held as friction_held
@@ -43,11 +43,10 @@ def ring_numbers(body):
 @functools.cache
 def _numbers(height, segment, width):
     scene = load("paper")
-    section = np.array([height, 0.0, segment, width])[:, None, None]
+    section = np.array([height, 0.0, segment, width])
     with jax.enable_x64(True):
-        hand = SimpleNamespace(section=jnp.asarray(section), tip=None)
-        numbers = memory_tables.ring_numbers(scene, hand, scene.discretization.hull_rings)
-        return np.asarray(numbers)[..., 0, 0].T
+        finger = SimpleNamespace(section=jnp.asarray(section), tip=None)
+        return np.asarray(world_model.ring_numbers(scene, finger)).T
 
 
 def ringed(bodies):

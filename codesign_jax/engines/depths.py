@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.engines.structured.coordinates import reset
-from codesign_jax.engines.structured.kernel import memory_tables, self_collision
-from codesign_jax.engines.structured.lanes import once
+from codesign_jax.engines.structured.kernel import self_collision
+from codesign_jax.engines.structured.lanes import apply_columns, once
 from codesign_jax.engines.structured.laws import shapes, surroundings
 from codesign_jax.engines.structured.laws.kinematics import Kinematics, straight
 from codesign_jax.engines.structured.laws.rings import Place
 from codesign_jax.engines.structured.laws.touch import ring_centre, touch
-from codesign_jax.engines.structured.world_model import WorldModel, apply_columns, world_constants
+from codesign_jax.engines.structured.world_model import WorldModel, world_constants
 from codesign_jax.model import ModelFields, held
 from codesign_jax.model.held import rings_of_link
 from codesign_jax.model.layout import first_on_palm, palm_touches
@@ -77,8 +77,9 @@ def depth_between(scene: Scene, fields: ModelFields) -> jax.Array:
     if not scene.effects.finger_finger or count == 1:
         return jnp.full((worlds,), -jnp.inf, fields.start.dtype)
     hand, kin, _ = _straight(scene, fields)
-    up = hand.centre[2]
-    middle = kin.origin + apply_columns(kin.link, hand.centre)
+    centre = jnp.moveaxis(hand.centre, 1, 0)
+    up = centre[2]
+    middle = kin.origin + apply_columns(kin.link, centre)
     deepest = []
     for a, b in itertools.combinations(range(count), 2):
         away = middle[:, :, None, a] - middle[:, None, :, b]
@@ -132,12 +133,14 @@ def places(
         by_pair[name] = _joined([_touch(scene, x, numbers, frame, centre) for x in looks], axis)
 
     if count := rings_of_link(scene):
-        numbers = memory_tables.ring_numbers(scene, hand, count)
-        numbers = jnp.moveaxis(numbers.reshape(-1, count, *numbers.shape[1:]), 2, 0)
+        assert hand.ring is not None
+        numbers = hand.ring.reshape(-1, count, *hand.ring.shape[1:])
+        numbers = jnp.moveaxis(numbers, 2, 0)
         for name in ("finger_object", "finger_table"):
             add(name, numbers, kin.origin[:, :, None], kin.link[:, :, :, None])
     if palm_touches(scene):
-        numbers = jnp.moveaxis(memory_tables.palm_numbers(scene, hand), 1, 0)
+        assert hand.palm_ring is not None
+        numbers = jnp.moveaxis(hand.palm_ring[:, :, 0], 1, 0)
         for name in ("palm_object", "palm_table"):
             add(name, numbers, kin.place, kin.palm)
     if effects.object_table and surroundings.slots(scene):
@@ -147,10 +150,10 @@ def places(
 
 def _depth_of_rings(scene: Scene, hand: WorldModel, kin: Kinematics) -> jax.Array:
     """Deepest overlap with the palm's disc of rings or spheres that may touch it [m], (world,)."""
-    assert hand.palm_disc is not None
+    assert hand.palm_disc is not None and hand.ring is not None
     k = rings_of_link(scene)
     first = (first_on_palm(scene.discretization.links) - 1) * k
-    numbers = jnp.moveaxis(memory_tables.ring_numbers(scene, hand, k), 1, 0)
+    numbers = jnp.moveaxis(hand.ring, 1, 0)
     numbers = jnp.broadcast_to(numbers, (*numbers.shape[:2], *kin.origin.shape[2:]))
     inner = numbers[:, first:]
     link = np.arange(first, numbers.shape[1]) // k

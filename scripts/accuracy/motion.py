@@ -76,7 +76,7 @@ def tips(the_scene: Scene, fields: Any, qpos: Any) -> jax.Array:
     still = jnp.zeros((len(qpos), qpos.shape[1] - 1), qpos.dtype)
     state = coordinates.make(the_scene, qpos, still, still)
     k = kin.kinematics(hand, joint_axes(the_scene), state)
-    along = hand.centre[0, -1] * 2
+    along = hand.centre[-1, 0] * 2
     end = k.origin[:, -1] + k.link[0, :, -1] * along
     return jnp.moveaxis(end + state.position, (0, 1, 2), (2, 1, 0))
 

@@ -21,15 +21,10 @@ import numpy as np
 
 from codesign_jax import rollout
 from codesign_jax.engines.structured import StructuredEngine, coordinates, forces
-from codesign_jax.engines.structured.lanes import cross, dot
+from codesign_jax.engines.structured.lanes import apply_columns, cross, dot
 from codesign_jax.engines.structured.laws import inertia, integration
 from codesign_jax.engines.structured.laws import kinematics as kin
-from codesign_jax.engines.structured.world_model import (
-    WorldModel,
-    apply_columns,
-    joint_sections,
-    world_constants,
-)
+from codesign_jax.engines.structured.world_model import WorldModel, world_constants
 from codesign_jax.model import joint_axes
 from codesign_jax.scene import Scene, load, parameters
 
@@ -151,8 +146,8 @@ def _bodies(hand: WorldModel, kinematics: kin.Kinematics, state: kin.State) -> t
     k = kinematics
     links = inertia.Body(
         hand.mass,
-        k.origin + apply_columns(k.link, hand.centre),
-        inertia.principal_tensor(k.link, hand.inertia),
+        k.origin + apply_columns(k.link, jnp.moveaxis(hand.centre, 1, 0)),
+        inertia.principal_tensor(k.link, jnp.moveaxis(hand.inertia, 1, 0)),
     )
     palm = inertia.Body(
         hand.palm_mass,
@@ -179,7 +174,8 @@ def _joints(scene: Scene, hand: WorldModel) -> dict[str, jax.Array]:
     if hand.law is not None:
         constants["law"] = jnp.moveaxis(hand.law, 1, 0)
     elif scene.effects.neo_hookean:
-        constants["section"] = jnp.moveaxis(joint_sections(hand, len(hand.stiffness)), 1, 0)
+        assert hand.section is not None
+        constants["section"] = jnp.moveaxis(hand.section, 1, 0)
     if hand.threshold is not None:
         constants["threshold"] = jnp.moveaxis(hand.threshold, 1, 0)
     return constants

@@ -103,6 +103,44 @@ def rotate(columns: list[jax.Array], axis: int, angle_cos: jax.Array, angle_sin:
     return turned
 
 
+def rotation_columns(quat: jax.Array) -> jax.Array:
+    """Columns of the rotation matrix of unit quaternions, (4, ...) to (3 columns, 3, ...)."""
+    w, x, y, z = jnp.unstack(quat)
+    return jnp.stack(
+        [
+            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]),
+            jnp.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]),
+            jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]),
+        ]
+    )
+
+
+def apply_columns(columns: jax.Array, v: jax.Array) -> jax.Array:
+    """Rotates vectors: columns times components, (3, 3, ...) and (3, ...); items broadcast."""
+    parts = jnp.unstack(_items(columns, v))
+    return total([column * x for column, x in zip(parts, jnp.unstack(v), strict=True)])
+
+
+def apply_rows(columns: jax.Array, v: jax.Array) -> jax.Array:
+    """Rotates vectors back, the inverse of `apply_columns`: rows times components."""
+    parts = jnp.unstack(_items(columns, v), axis=1)
+    return total([row * x for row, x in zip(parts, jnp.unstack(v), strict=True)])
+
+
+def turn_columns(columns: jax.Array, frames: jax.Array) -> jax.Array:
+    """Rotates frames given by their columns, (3, 3, ...) both: `apply_columns` of each column."""
+    turned = apply_columns(columns[:, :, None], jnp.moveaxis(frames, 1, 0))
+    return jnp.moveaxis(turned, 1, 0)
+
+
+def _items(columns: jax.Array, v: jax.Array) -> jax.Array:
+    """The columns with as many axes of items, behind the first two, as the vectors have."""
+    missing = v.ndim + 1 - columns.ndim
+    if missing <= 0:
+        return columns
+    return columns.reshape(3, 3, *[1] * missing, *columns.shape[2:])
+
+
 def sum_axis(x: jax.Array, axis: int) -> jax.Array:
     return total([jax.lax.index_in_dim(x, i, axis, keepdims=False) for i in range(x.shape[axis])])
 

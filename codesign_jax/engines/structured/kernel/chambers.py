@@ -34,8 +34,14 @@ from codesign_jax.engines.structured.kernel.rows import (
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import contract, dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
-from codesign_jax.engines.structured.laws.air import end_pressure
+from codesign_jax.engines.structured.laws.air import LEAST, end_pressure, power
+from codesign_jax.engines.structured.laws.inertia import softening_moment
+from codesign_jax.engines.structured.world_model import WorldModel
+from codesign_jax.scene import Scene
 
+ROUNDS = 8
+"""Newton iterations for the bend of a free neo-Hookean finger. They come from below, as the moment
+is concave in the angle."""
 JOINT = FingerState.finger, FingerState.finger_vel, FingerState.acc
 """Angles of a joint and their derivatives by time, which move the volume and its derivatives."""
 
@@ -215,3 +221,40 @@ class Chambers:
             return lanewise(lambda t, *v: t + function(*v), total, *self._read(i, *names))
 
         return loop(self.links, link, zeros((), self.step.like), self.size)
+
+
+def charged(scene: Scene, hand: WorldModel, ctrl: jax.Array) -> jax.Array:
+    """Controls (world, time, nu) with charges, see `end_pressure`, in the place of pressures.
+
+    A chamber gets the mass of air that has the wanted pressure while the finger bends freely.
+    """
+    assert hand.air is not None and hand.section is not None and hand.volume is not None
+    # (time, finger, world)
+    wanted = jnp.moveaxis(ctrl[..., 6:], 0, -1)
+    links = len(hand.stiffness)
+    alike = links // len(hand.gain)  # joints that one number stands for
+    grown = jnp.zeros_like(wanted)
+    for gain, stiffness, section in zip(
+        hand.gain, hand.stiffness[:, 0], hand.section, strict=False
+    ):
+        softening = section if scene.effects.neo_hookean else None
+        grown += alike * gain * _free_angle(gain * wanted, stiffness, softening)
+    ratio = 1 + grown / hand.volume
+    absolute = jnp.maximum(wanted + hand.air[1], 0.0)
+    charge = absolute * power(jnp.maximum(ratio, LEAST), hand.air[0])
+    return jnp.concatenate([ctrl[..., :6], jnp.moveaxis(charge, -1, 0)], -1)
+
+
+def _free_angle(moment: jax.Array, stiffness: jax.Array, section: jax.Array | None) -> jax.Array:
+    """Bend angle of a joint under a moment; `section` as in `softening_moment`, or None."""
+    angle = moment / stiffness
+    if section is None:
+        return angle
+
+    def carried(angle: jax.Array) -> jax.Array:
+        return stiffness * angle - softening_moment(section, stiffness, angle)
+
+    for _ in range(ROUNDS):
+        value, slope = jax.jvp(carried, (angle,), (jnp.ones_like(angle),))
+        angle = angle + (moment - value) / slope
+    return angle

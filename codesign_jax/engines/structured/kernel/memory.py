@@ -59,11 +59,14 @@ class MemoryLayout:
     def pack(self, fingers: int, block: int, **arrays: jax.Array) -> jax.Array:
         """The table of arrays (item, component, ..., finger or 1, world), worlds padded to blocks.
 
-        Padded worlds and fingers repeat the last one.
+        Padded worlds and fingers repeat the last one.  An item's axis may be left out where there
+        is one item only.
         """
         rows = []
         for name, (count, shape) in self.groups.items():
             array = arrays[name]
+            axes = array.shape[:-2]
+            assert axes == (count, *shape) or (count == 1 and axes == shape), (name, axes)
             flat = array.reshape(count * int(np.prod(shape)), *array.shape[-2:])
             rows.append(flat)
         stacked = jnp.concatenate(rows)

@@ -36,20 +36,16 @@ from codesign_jax.engines.structured.kernel.team_contacts import (
     TeamSelfContactSet,
 )
 from codesign_jax.engines.structured.laws import shapes, surroundings
-from codesign_jax.engines.structured.laws.air import volumes
 from codesign_jax.engines.structured.laws.kinematics import Acc, State
-from codesign_jax.engines.structured.laws.rings import RING_OVERLAP
 from codesign_jax.engines.structured.laws.step_numbers import step_numbers
-from codesign_jax.engines.structured.world_model import WorldModel, joint_sections, sections
+from codesign_jax.engines.structured.world_model import WorldModel
 from codesign_jax.judge import verdict
 from codesign_jax.model import held, layout
 from codesign_jax.model.held import palm_groups, rings_of_link
-from codesign_jax.model.layout import RING_TIP, palm_touches, ring_places, touches_itself
+from codesign_jax.model.layout import touches_itself
 from codesign_jax.scene import Scene
 from codesign_jax.scene.section_numbers import Numbers
 
-PALM = ((1, 0), (0, 1), (-1, 0), (0, -1))
-"""Places of the rings that the palm's disc is made of, and their half axes, in half radii."""
 GATHERING = ("gpu",)
 """Backends whose lanes read rows of their own as fast as a common one."""
 
@@ -202,6 +198,8 @@ class Tables(KernelLayout):
 
 LENGTH = 6
 """Which of a ring's numbers is its length: with none it is no ring, but can be divided by."""
+MASSLESS = (Hand.centre_weight, Hand.mass, Hand.inertia, Hand.gain)
+"""Constants that are zero on the lanes of no finger."""
 
 
 class Packing(Tables):
@@ -209,63 +207,40 @@ class Packing(Tables):
 
     def pack_hand(self, hand: WorldModel) -> tuple[jax.Array, jax.Array]:
         """The hand's tables; padded fingers have no mass."""
-        worlds = hand.object_id.shape[1]
-        n = self.num_fingers
         dtype = hand.mass.dtype
-        lane = (n, worlds)
-        links_first = ("centre", "inertia")
-        arrays = {
-            k: jnp.moveaxis(v, 1, 0) if k in links_first and v.size else v
-            for k, v in hand._asdict().items()
-        }
-        arrays |= hand.bounds._asdict()
-        arrays |= hand.step_numbers
-        for name, cone in hand.cones._asdict().items():
-            if cone is None:
-                continue
-            arrays[f"cone.{name}"] = jnp.stack([v for v in cone if v is not None])
-        # Weights of the segments in the hand's centre: half segments at the palm and at the tip.
-        weight = np.ones(self.links + 1, dtype)
-        weight[[0, -1]] = 0.5
-        arrays["centre_weight"] = weight[:, None, None] * jnp.broadcast_to(hand.share, lane)
-        if palm_touches(self.scene):
-            arrays["palm_ring"] = self._palm_slots(hand)
-        if "section" in self.hand.groups:
-            arrays["section"] = joint_sections(hand, self.links)
-        if hand.air is not None:
-            arrays["volume"] = volumes(hand, self.links)
-        if self.rings_per_link:
-            arrays["ring"] = ring_numbers(self.scene, hand, self.rings_per_link)
+        arrays = hand.by_row() | {"object_id": hand.object_id.astype(dtype)}
+        if hand.palm_ring is not None:
+            arrays["palm_ring"] = self._dealt(hand.palm_ring)
         if hand.mesh is not None:
             arrays |= objects.rows(hand.mesh, self.fingers, dtype)
-        extra = self.fingers - n
-        if extra:
-            for name in ("centre_weight", "mass", "inertia", "gain"):
-                pad = [(0, 0)] * (arrays[name].ndim - 2) + [(0, extra), (0, 0)]
-                arrays[name] = jnp.pad(arrays[name], pad)
-            if self.rings_per_link:
-                ring = jnp.pad(arrays["ring"], [(0, 0), (0, 0), (0, extra), (0, 0)], "edge")
-                arrays["ring"] = ring.at[:, LENGTH, n:].set(0.0)
-        wide = {k: self._widen(arrays[k]) for k in self.hand.groups}
-        arrays["object_id"] = hand.object_id.astype(dtype)
-        narrow = {k: arrays[k] for k in self.world.groups}
+        wide = {name: self._for_lanes(name, arrays[name]) for name in self.hand.groups}
+        narrow = {name: arrays[name] for name in self.world.groups}
         if self.team > 1:  # Alike in the program of `StructuredEngine.tables` and in a rollout
             wide, narrow = jax.lax.optimization_barrier((wide, narrow))
-        return self.hand.pack(self.fingers, self.block, **wide), self.world.pack(
-            1, self.block, **narrow
+        return (
+            self.hand.pack(self.fingers, self.block, **wide),
+            self.world.pack(1, self.block, **narrow),
         )
+
+    def _for_lanes(self, name: str, array: jax.Array) -> jax.Array:
+        """Constants of fingers (..., finger, world) with those of padded ones."""
+        n = self.num_fingers
+        wide = self._widen(array)
+        if self.fingers == n:
+            return wide
+        if name in MASSLESS:
+            return wide.at[..., n:, :].set(0.0)
+        return wide.at[:, LENGTH, n:].set(0.0) if name == Hand.ring else wide
 
     def _widen(self, array: jax.Array) -> jax.Array:
         return lengthened(array, array.ndim - 2, self.fingers)
 
-    def _palm_slots(self, hand: WorldModel) -> jax.Array:
-        """The palm's rings or spheres, shared out among the lanes."""
-        numbers = palm_numbers(self.scene, hand)
-        f = self.fingers
-        extra = self.palm_groups * f - len(numbers)
-        padded = jnp.pad(numbers, [(0, extra), (0, 0), (0, 0)], "edge")
-        padded = padded.at[len(numbers) :, LENGTH].set(0.0)
-        return jnp.moveaxis(padded.reshape(self.palm_groups, f, 8, -1), 1, 2)
+    def _dealt(self, rings: jax.Array) -> jax.Array:
+        """The palm's rings (ring, 8, 1, world) in groups, one for each finger's lanes."""
+        groups = self.palm_groups
+        padded = lengthened(rings, 0, groups * self.fingers)
+        padded = padded.at[len(rings) :, LENGTH].set(0.0)
+        return jnp.moveaxis(padded[:, :, 0].reshape(groups, self.fingers, 8, -1), 1, 2)
 
     def pack_state(self, state: State) -> tuple[jax.Array, jax.Array]:
         """The state's tables; padded worlds do not go on."""
@@ -398,49 +373,3 @@ class Packing(Tables):
         narrow = self.world_state.unpack(world_state, 1, 1, worlds)
         acc = Acc(narrow.pop("acc_wrist"), wide.pop("acc"), narrow.pop("acc_object"))
         return State(**wide, **narrow, acc=acc, held=jnp.concatenate(hold))
-
-
-def ring_numbers(scene: Scene, hand: WorldModel, k: int) -> jax.Array:
-    """Numbers of the fingers' rings or spheres, see `rings.Ring`, (link * k, 8, finger, world)."""
-    if scene.effects.surface == "spheres":
-        ones = jnp.ones_like(hand.radius)
-        rows = [*hand.sphere, *[hand.radius] * 3, ones, 0.0 * ones]
-        return jnp.stack(rows, 2).reshape(-1, 8, *ones.shape[2:])
-    assert hand.section is not None
-    segment, skin_width = hand.section[2:]
-    links = scene.discretization.links
-    along = ring_places(links, k)
-    places = (along + np.arange(links)[:, None] + 0.5) / links
-    height, _, width = sections(hand, places.ravel())
-    length = np.full((links, k), 1.0 / k)
-    length[-1] *= 0.5
-    half = RING_OVERLAP * length
-    half[-1, -1] = RING_TIP
-    along, length, half = (v.reshape(-1, 1, 1) for v in (along, length, half))
-    tip = (np.arange(links * k) == links * k - 1).reshape(-1, 1, 1)
-    rows = [along * segment, 0.0, 0.5 * height, half * segment, 0.5 * width, 0.5 * height]
-    # The skin is as stiff everywhere: a narrower section stands for less of it.
-    if hand.tip is None:
-        widths = length * segment / width
-    else:
-        widths = length * segment * width / skin_width**2
-    rows += [widths, tip.astype(width.dtype)]
-    shape = (links * k, *segment.shape)
-    return jnp.stack([jnp.broadcast_to(jnp.asarray(v, width.dtype), shape) for v in rows], 1)
-
-
-def palm_numbers(scene: Scene, hand: WorldModel) -> jax.Array:
-    """Numbers of the rings or spheres of the palm, as `ring_numbers`, (item, 8, world)."""
-    if scene.effects.surface == "spheres":
-        ones = jnp.ones_like(hand.palm_radius)
-        rows = [*hand.palm_point, *[hand.palm_radius] * 3, ones, 0.0 * ones]
-        return jnp.stack(rows, 1)
-    assert hand.palm_disc is not None and hand.section is not None
-    radius, thick = hand.palm_disc[:, 0]
-    width = hand.section[3, 0]
-    half = 0.5 * radius
-    rows = [
-        [x * half, y * half, thick, half, half, thick, 4.0 * half**2 / width**2, 0.0 * half]
-        for x, y in PALM
-    ]
-    return jnp.stack([jnp.stack(row) for row in rows])

@@ -17,13 +17,12 @@ from jax.experimental import pallas as pl
 from codesign_jax import reuse
 from codesign_jax.compiler.launch import Kernel, block_lanes, kernel_jaxpr, launch
 from codesign_jax.engines.structured import coordinates
-from codesign_jax.engines.structured.kernel import shared_memory
+from codesign_jax.engines.structured.kernel import chambers, shared_memory
 from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, TimeStep, anywhere
 from codesign_jax.engines.structured.kernel.memory_tables import Packing
 from codesign_jax.engines.structured.kernel.rows import Record, WorldState
 from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, of_code
-from codesign_jax.engines.structured.laws import air
 from codesign_jax.engines.structured.laws.kinematics import State
 from codesign_jax.engines.structured.world_model import WorldModel
 from codesign_jax.judge import verdict
@@ -200,7 +199,7 @@ class Program(Packing):
     def inputs(self, hand: WorldModel, state: State, ctrl: jax.Array) -> Inputs:
         """The kernel's arguments, of constants, start states and controls (world, time, nu)."""
         if self.scene.effects.air_mass:
-            ctrl = air.charged(self.scene, hand, ctrl)
+            ctrl = chambers.charged(self.scene, hand, ctrl)
         return self.joined(self.pack_hand(hand), hand, state, ctrl)
 
     def joined(

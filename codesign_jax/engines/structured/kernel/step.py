@@ -18,7 +18,7 @@ from codesign_jax.engines.structured.kernel.sdf_collision import SdfCollision
 from codesign_jax.engines.structured.kernel.self_collision import SelfCollision
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.kernel.team_solver import team_rows
-from codesign_jax.engines.structured.lanes import dot, total
+from codesign_jax.engines.structured.lanes import apply_columns, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import inertia
 from codesign_jax.engines.structured.laws import kinematics as kin
@@ -30,7 +30,6 @@ from codesign_jax.engines.structured.laws.kinematics import (
     palm_acceleration,
 )
 from codesign_jax.engines.structured.laws.step_numbers import pushed
-from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model.layout import joint_axes
 from codesign_jax.scene import Scene
 

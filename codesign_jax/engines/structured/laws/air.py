@@ -9,15 +9,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.laws.inertia import softening_moment
-from codesign_jax.engines.structured.world_model import WorldModel, joint_sections
-from codesign_jax.scene import Scene
-
 LEAST = 0.05
 """Smallest volume over that of the straight finger; at less the pressure stays what it is there."""
-ROUNDS = 8
-"""Newton iterations for the bend of a free neo-Hookean finger. They come from below, as the moment
-is concave in the angle."""
 
 
 def power(base: Any, exponent: Any) -> Any:
@@ -56,44 +49,14 @@ def end_pressure(timestep: float, charge: Any, volume: Any, air: Any, grown: Any
     return absolute - air[1] - timestep * fall * (rate + timestep * acc), timestep**2 * fall
 
 
-def volumes(hand: WorldModel, links: int) -> jax.Array:
-    """Volumes of the straight fingers' chambers [m^3], shape (finger, world)."""
-    height, _, segment, _ = jnp.unstack(joint_sections(hand, links), axis=1)
-    return links * (2 * hand.gain / height * segment).mean(0)
+def straight_volume(gain: jax.Array, section: jax.Array, links: int) -> jax.Array:
+    """Volume of a straight finger's chamber [m^3], shape (...).
 
-
-def charged(scene: Scene, hand: WorldModel, ctrl: jax.Array) -> jax.Array:
-    """Controls (world, time, nu) with charges, see `end_pressure`, in the place of pressures.
-
-    A chamber gets the mass of air that has the wanted pressure while the finger bends freely.
+    Args:
+      gain: Bending moment per pressure at the joints [m^3], shape (joint, ...); one for all joints
+        where they are alike.
+      section: Height, wall, segment length and width there [m], shape (joint, 4, ...).
+      links: Number of joints.
     """
-    assert hand.air is not None
-    # (time, finger, world)
-    wanted = jnp.moveaxis(ctrl[..., 6:], 0, -1)
-    links = len(hand.stiffness)
-    gains = hand.gain[None] if hand.tip is None else hand.gain
-    grown = jnp.zeros_like(wanted)
-    for gain, stiffness, section in zip(
-        gains, hand.stiffness[:, 0], joint_sections(hand, links), strict=False
-    ):
-        softening = section if scene.effects.neo_hookean else None
-        grown += links / len(gains) * gain * _free_angle(gain * wanted, stiffness, softening)
-    ratio = 1 + grown / volumes(hand, links)
-    absolute = jnp.maximum(wanted + hand.air[1], 0.0)
-    charge = absolute * power(jnp.maximum(ratio, LEAST), hand.air[0])
-    return jnp.concatenate([ctrl[..., :6], jnp.moveaxis(charge, -1, 0)], -1)
-
-
-def _free_angle(moment: jax.Array, stiffness: jax.Array, section: jax.Array | None) -> jax.Array:
-    """Bend angle of a joint under a moment; `section` as in `softening_moment`, or None."""
-    angle = moment / stiffness
-    if section is None:
-        return angle
-
-    def carried(angle: jax.Array) -> jax.Array:
-        return stiffness * angle - softening_moment(section, stiffness, angle)
-
-    for _ in range(ROUNDS):
-        value, slope = jax.jvp(carried, (angle,), (jnp.ones_like(angle),))
-        angle = angle + (moment - value) / slope
-    return angle
+    height, _, segment, _ = jnp.unstack(section, axis=1)
+    return links * (2 * gain / height * segment).mean(0)

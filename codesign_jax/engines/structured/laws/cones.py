@@ -13,7 +13,7 @@ from codesign_jax.scene import Scene
 
 
 class Cones(NamedTuple):
-    """Cones by what touches, numbers of shape (1, world); None where nothing of it does."""
+    """Cones by what touches; None where nothing of it does."""
 
     finger_object: Cone | None  # Fingers or palm on the object
     finger_table: Cone | None  # Fingers or palm on the table
@@ -48,7 +48,7 @@ def make_cone(scene: Scene, friction: Any, *, bodies: int, ratio: Any, stiffer: 
 
 
 def make_cones(scene: Scene, shape: jax.Array) -> Cones:
-    """The cones of a batch; the scene's numbers and the objects' indices are (1, world)."""
+    """The cones of worlds; the scene's numbers and the objects' indices have one shape."""
     on_object = scene.objects.object[0].friction
     for i, other in enumerate(scene.objects.object[1:], 1):
         on_object = jnp.where(shape == i, other.friction, on_object)
@@ -84,7 +84,7 @@ def friction_by_contact(scene: Scene, pair: str) -> bool:
 
 
 def frictions(scene: Scene) -> jax.Array | None:
-    """Coulomb coefficients of the hand, then of the object, on table and fixtures, (n, 1, world).
+    """Coulomb coefficients of the hand, then of the object, on table and fixtures, shape (n, ...).
 
     They are in the order of `surroundings.fields`; None if all have the table's.
     """

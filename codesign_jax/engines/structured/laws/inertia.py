@@ -13,8 +13,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.lanes import cross, dot, spatial, total
-from codesign_jax.engines.structured.world_model import apply_columns, apply_rows, turn_columns
+from codesign_jax.engines.structured.lanes import (
+    apply_columns,
+    apply_rows,
+    cross,
+    dot,
+    spatial,
+    total,
+    turn_columns,
+)
 from codesign_jax.model.layout import implicit_spring, joint_axes
 from codesign_jax.model.morphology import softening, threshold_energy, threshold_moments
 from codesign_jax.scene import Scene, section_law

@@ -3,9 +3,8 @@
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.lanes import total
+from codesign_jax.engines.structured.lanes import rotation_columns, total
 from codesign_jax.engines.structured.laws.kinematics import Acc, State
-from codesign_jax.engines.structured.world_model import rotation_columns
 
 
 def integrate(state: State, columns: jax.Array, acc: Acc, h: float) -> State:

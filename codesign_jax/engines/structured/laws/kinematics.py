@@ -14,20 +14,18 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.lanes import (
+    apply_columns,
     cross,
     motion_cross,
     once,
     rotate,
+    rotation_columns,
     scan_links,
     spatial,
     total,
-)
-from codesign_jax.engines.structured.world_model import (
-    WorldModel,
-    apply_columns,
-    rotation_columns,
     turn_columns,
 )
+from codesign_jax.engines.structured.world_model import WorldModel
 from codesign_jax.model.layout import hinge_sign
 
 _WRIST = (0, 2, 1)  # roll (x), yaw (z), pitch (y)

@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.lanes import cross, dot, total
-from codesign_jax.engines.structured.world_model import apply_columns, apply_rows
+from codesign_jax.engines.structured.lanes import apply_columns, apply_rows, cross, dot, total
 
 NOMINAL = 0.5e-3
 """Least depth of which a contact has the stiffness, also before it touches [m]."""

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured.lanes import cross, dot, once
+from codesign_jax.engines.structured.lanes import apply_columns, apply_rows, cross, dot, once
 from codesign_jax.engines.structured.laws import meshes
-from codesign_jax.engines.structured.world_model import WorldModel, apply_columns, apply_rows
+from codesign_jax.engines.structured.world_model import WorldModel
 from codesign_jax.scene import Scene, primitives
 
 _TINY = 1e-12

@@ -16,7 +16,7 @@ from codesign_jax.scene import Scene
 class StepNumber(NamedTuple):
     """A number of a world, or a vector of a few."""
 
-    value: Callable[[Scene], Any]  # From a scene's numbers of shape (1, world): (*shape, 1, world)
+    value: Callable[[Scene], Any]  # From a world's numbers to this one, of the shape below
     on: Callable[[Any], bool]  # Whether a scene with these effects has it
     shape: tuple[int, ...] = ()
     # Force at a body's centre of mass, (3, ...), of the number and the body's mass; None of numbers

@@ -14,9 +14,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from codesign_jax.engines.structured.lanes import apply_columns
 from codesign_jax.engines.structured.laws import rings
 from codesign_jax.engines.structured.laws.rings import Facing, Place, Ring
-from codesign_jax.engines.structured.world_model import apply_columns
 
 
 def directly(function: Callable, *args: Any) -> Any:

@@ -7,7 +7,6 @@ The projection is differentiable wherever it is not exactly at a limit.
 
 import dataclasses
 import itertools
-from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
@@ -18,9 +17,8 @@ from codesign_jax.scene.beams import strain_pressure
 from codesign_jax.scene.hand_tables import Hand
 from codesign_jax.scene.schema import Problem
 from codesign_jax.scene.tables import Arm, Limits
+from codesign_jax.types import Params
 
-Value = Callable[[str], Any]
-"""Values of a parameter by its name [SI]: of every finger, or of the hand."""
 FLAT = 1e-12
 """Squared sine of a palm's tilt below which its rim counts as level: its slope is infinite there,
 and the rim of a palm of 0.1 m is 0.1 um higher than that."""
@@ -68,28 +66,27 @@ class Buildable:
         """Least length of fingers of a height [m], any shape."""
         return (self.limits.finger_slenderness or 0.0) * height
 
-    def highest_pressure(self, table: Any, value: Value, tip: tuple[Any, ...] | None) -> Any:
+    def highest_pressure(self, table: Any, params: Params) -> Any:
         """Highest pressures of fingers [Pa], shape (..., finger).
 
         Args:
           table: Those of Table I.
-          value: Parameters of the fingers.
-          tip: Height, wall and width at the tip of tapered fingers, or None.  No section of a
-            tapered finger may bend as a whole finger of that section must not.
+          params: Parameters of hands, arrays of shape (..., finger).  No section of a tapered
+            finger may bend as a whole finger of that section must not.
 
         By the law "elements" a finger that is held straight must not twist by itself either.
         """
-        base = value("height"), value("wall"), self.width
+        base = params.height, params.wall, self.width
         sections = [base]
-        if tip is not None:
+        if params.tip is not None:
             sections = [
-                tuple(a + (b - a) * share for a, b in zip(base, tip, strict=True))
+                tuple(a + (b - a) * share for a, b in zip(base, params.tip, strict=True))
                 for share in PLACES
             ]
         caps = table
         for section in sections:
-            strains = self._strains(section[0], value("length"))
-            for pressure in self._pressures(strains, section, value("length")):
+            strains = self._strains(section[0], params.length)
+            for pressure in self._pressures(strains, section, params.length):
                 caps = _smaller(caps, pressure)
         return caps * (1 - (self.limits.pressure_margin or 0.0))
 

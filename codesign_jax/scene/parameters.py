@@ -1,8 +1,8 @@
 """Flat parameter vectors: names, units, bounds, presets and the pressure limit (Table I).
 
-A *full* vector holds every parameter of the hand's table in the table's order, one entry a finger
-where the row says so, in SI units and radians.  A *design* vector holds a preset's free parameters
-only.
+A *design* vector holds a preset's free parameters in the order of the hand's table, one entry a
+finger where the row says so, in SI units and radians.  `Params` has all of them by name, with those
+that the preset fixes or ties.
 
 >>> import numpy as np
 >>> from codesign_jax import parameters, scene
@@ -20,7 +20,7 @@ import dataclasses
 import functools
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,13 +36,15 @@ from codesign_jax.scene.hand import UNITS, Free, Hand, Parameter, Preset, Valves
 from codesign_jax.scene.hand_tables import PARAMETERS, TIP, highest_pressure, per_finger
 from codesign_jax.types import Params, Tip, random_key_problem
 
+ARM = tuple(f"arm_{axis}" for axis in ("x", "y", "z", "roll", "pitch", "yaw"))
+"""Rows of the hand's table in the order of `Params.arm`."""
 # The limit is strict (p_i < d_i * 80 kPa / 2 mm); this margin keeps it so in float32.
 _STRICT = 1.0 - 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
 class DesignSpace:
-    """The free parameters of a preset and how they fill the full vector.
+    """The free parameters of a preset and how they fill the hand's table.
 
     Attributes:
       hand: The hand's parameter table and pressure limit, without its other numbers: hands that
@@ -53,8 +55,9 @@ class DesignSpace:
       bounds: Lower and upper bounds [SI] of legal designs, as tuples, which can be hashed; `low`
         and `high` are arrays.
       is_morphology: True for morphology, False for control, shape (parameter,).
-      base: Full vector with the fixed values and defaults [SI], shape (full,).
-      source: For each full entry the design entry that fills it, or -1, shape (full,).
+      base: Fixed values and defaults [SI] of all rows of the table one behind the other, one entry
+        or one a finger, shape (entry,).
+      source: For each of them the design's entry that replaces it, or -1, shape (entry,).
       idle: Parameters that the preset leaves free, but which have no effect and are fixed at their
         default: name and why.
       buildable: The limits that proposals of a search keep besides; None for Table I alone.
@@ -131,24 +134,11 @@ class DesignSpace:
             base=tuple(0.0 if source >= 0 else value for value, source in entries),
         )
 
-    def expand(self, design: jax.typing.ArrayLike) -> jax.Array:
-        """Fills the full vector, shape (full,), from a design vector [SI], shape (parameter,).
-
-        Raises:
-          InputError: If it has another shape, and see `refuse_unit_slips`.
-        """
-        self._refuse_shape(design, "")
-        self.refuse_unit_slips(design)
-        values = jnp.asarray(design)
-        source = np.asarray(self.source)
-        filled = values[np.maximum(source, 0)]
-        return jnp.where(source >= 0, filled, jnp.asarray(self.base, values.dtype))
-
     def params(self, design: jax.typing.ArrayLike) -> Params:
         """Returns the named parameters of a design vector [SI], shape (parameter,).
 
         Raises:
-          InputError: As `expand`.
+          InputError: If it has another shape, and see `refuse_unit_slips`.
         """
         self._refuse_shape(design, "")
         self.refuse_unit_slips(design)
@@ -158,15 +148,22 @@ class DesignSpace:
         """Values of a design [SI] by the rows of the hand's table, in the rows' units.
 
         Those that each finger has of its own are arrays, shape (finger,).
+
+        Raises:
+          InputError: As `params`.
         """
-        full = np.asarray(self.expand(np.asarray(design, float)), float)
-        rows: dict[str, Any] = {}
-        for row in self.hand.parameter:
-            width = self.hand.width(row)
-            entries = full[:width] / UNITS[row.unit][1]
-            full = full[width:]
-            rows[row.name] = entries if row.per == "finger" else entries[0]
-        return rows
+        params = jax.tree.map(lambda v: np.asarray(v, float), self.params(design))
+        return {
+            row.name: _value(params, row.name) / UNITS[row.unit][1] for row in self.hand.parameter
+        }
+
+    def entries(self, name: str) -> np.ndarray:
+        """The design's entries that a row of the hand's table has, -1 for one that is fixed.
+
+        Returns:
+          Indices, shape (finger,), or (1,) of a row that all fingers share.
+        """
+        return np.array(self.source[_rows(self.hand)[name]])
 
     def project(self, design: jax.typing.ArrayLike) -> jax.Array:
         """The nearest design that a search may propose, parameter by parameter.
@@ -287,25 +284,19 @@ class DesignSpace:
         ends = zip(self.names, units, low, high, rows.T, strict=True)
         return [problem for end in ends if (problem := unit_slips.outside(*end))]
 
-    def _values_of(self, rows: np.ndarray) -> "_Values":
-        """Values by name of designs [SI], shape (design, parameter)."""
-        source = np.asarray(self.source)
-        full = np.where(source >= 0, rows[:, np.maximum(source, 0)], np.asarray(self.base))
-        return _Values(self, full)
-
     def _off_the_lines(self, rows: np.ndarray) -> int:
         """Number of designs [SI], shape (design, parameter), with more pressures than lines."""
         lines = self.hand.valves.searched(len(self.hand.finger))
         if not lines:
             return 0
-        pressures = np.sort(self._values_of(rows)("pressure"))
+        pressures = np.sort(_params(self, rows).pressure)
         return int(((np.diff(pressures) > 0).sum(1) >= lines).sum())
 
     def _above_the_limit(self, rows: np.ndarray) -> int:
         """Number of designs [SI], shape (design, parameter), with a pressure above its limit."""
-        values = self._values_of(rows)
+        params = _params(self, rows)
         # A pressure at its limit is a legal one, also as a float32.
-        above = values("pressure") > _caps(self.hand, values) * (1 + 1e-6)
+        above = params.pressure > _caps(self.hand, params) * (1 + 1e-6)
         return int(above.any(1).sum())
 
     def refuse_population(self, population: np.typing.ArrayLike) -> None:
@@ -379,7 +370,42 @@ class DesignSpace:
 @functools.partial(jax.jit, static_argnums=0)
 def _named(space: DesignSpace, design: jax.Array) -> Params:
     """`DesignSpace.params`; one program a space."""
-    return unflatten(space.hand, space.expand(design))
+    return _params(space, design)
+
+
+def _params(space: DesignSpace, designs: Any) -> Params:
+    """`DesignSpace.params` of designs of shape (..., parameter), NumPy's or JAX's as these are."""
+    numpy = designs.__array_namespace__()
+
+    def take(name: str) -> Any:
+        part = _rows(space.hand)[name]
+        source = space.entries(name)
+        fixed = np.array(space.base[part], designs.dtype)
+        values = numpy.where(source >= 0, designs[..., np.maximum(source, 0)], fixed)
+        return values if _row(space.hand, name).per == "finger" else values[..., 0]
+
+    rows = [row.name for row in space.hand.parameter if row.name not in PARAMETERS]
+    return Params(
+        length=take("length"),
+        height=take("height"),
+        wall=take("wall"),
+        spread=take("spread"),
+        arm=numpy.stack([take(name) for name in ARM], -1),
+        pressure=take("pressure"),
+        control={name: take(name) for name in rows} or None,
+        tip=Tip(*(take(name) for name in TIP)) if space.hand.section.tapered else None,
+    )
+
+
+def _value(params: Params, name: str) -> Any:
+    """The value of a row of the hand's table, shape (..., finger), or (...) if fingers share it."""
+    if name in ARM:
+        return params.arm[..., ARM.index(name)]
+    if name in TIP:
+        return params.tip[TIP.index(name)]  # type: ignore[index]
+    if name in PARAMETERS:
+        return getattr(params, name)
+    return params.control[name]  # type: ignore[index]
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -387,12 +413,11 @@ def _projected(space: DesignSpace, design: jax.Array) -> jax.Array:
     """`DesignSpace.project` of a design whose units are known to be right; one program a space."""
     if space.buildable is not None:
         design = _lengthened(space, jnp.clip(design, *_representable(space)))
-    values = _Values(space, space.expand(design))
-    caps = _caps(space.hand, values)
+    params = _params(space, design)
+    caps = _caps(space.hand, params)
     if space.buildable is not None:
-        tip = tuple(values(name) for name in TIP) if space.hand.section.tapered else None
-        caps = space.buildable.highest_pressure(caps, values, tip)
-    for i, j in enumerate(values.places("pressure")):
+        caps = space.buildable.highest_pressure(caps, params)
+    for i, j in enumerate(space.entries("pressure")):
         if j >= 0:
             design = design.at[j].min(caps[i] * _STRICT)
     design = _on_lines(space, design, caps * _STRICT)
@@ -405,8 +430,7 @@ def _on_lines(space: DesignSpace, design: jax.Array, highest: jax.Array) -> jax.
     Args:
       highest: Highest pressures of the fingers [Pa], shape (finger,).
     """
-    values = _Values(space, space.expand(design))
-    places = np.array(values.places("pressure"))
+    places = space.entries("pressure")
     lines = space.hand.valves.searched(len(places))
     if not lines or (places < 0).any():
         return design
@@ -416,9 +440,8 @@ def _on_lines(space: DesignSpace, design: jax.Array, highest: jax.Array) -> jax.
 def _lengthened(space: DesignSpace, design: jax.Array) -> jax.Array:
     """A design whose free lengths are the least ones of their fingers' heights, or more."""
     assert space.buildable is not None
-    values = _Values(space, space.expand(design))
-    least = space.buildable.least_length(values("height"))
-    for i, j in enumerate(values.places("length")):
+    least = space.buildable.least_length(_params(space, design).height)
+    for i, j in enumerate(space.entries("length")):
         if j >= 0:
             design = design.at[j].max(jnp.minimum(least[i], space.box[1][j]))
     return design
@@ -427,39 +450,16 @@ def _lengthened(space: DesignSpace, design: jax.Array) -> jax.Array:
 def _raised(space: DesignSpace, design: jax.Array) -> jax.Array:
     """A design whose arm is high enough, as far as its height is free and in its bounds."""
     assert space.buildable is not None
-    values = _Values(space, space.expand(design))
-    [j] = values.places("arm_z")
+    [j] = space.entries("arm_z")
     if j < 0:
         return design
-    angles = (values(name)[0] for name in ("arm_roll", "arm_pitch", "arm_yaw"))
-    least = space.buildable.least_height(*angles)
+    least = space.buildable.least_height(*_params(space, design).arm[3:])
     return design.at[j].max(jnp.minimum(least, space.box[1][j]))
 
 
-class _Values:
-    """Values of a full vector by name, and where a design has them."""
-
-    def __init__(self, space: DesignSpace, full: Any):
-        self.space = space
-        self.full = full
-
-    def __call__(self, name: str) -> Any:
-        return self.full[..., self._slice(name)]
-
-    def places(self, name: str) -> tuple[int, ...]:
-        """Entries of the design, -1 for a value that is fixed."""
-        return self.space.source[self._slice(name)]
-
-    def _slice(self, name: str) -> slice:
-        start = _offsets(self.space.hand)[name]
-        return slice(start, start + self.space.hand.width(_row(self.space.hand, name)))
-
-
-def _caps(hand: Hand, value: Callable[[str], Any]) -> Any:
+def _caps(hand: Hand, params: Params) -> Any:
     """Highest pressures by Table I [Pa], shape (..., finger)."""
-    return highest_pressure(
-        hand, value("wall"), value("tip_wall") if hand.section.tapered else None
-    )
+    return highest_pressure(hand, params.wall, None if params.tip is None else params.tip.wall)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -501,28 +501,6 @@ def fingers_of(name: str) -> list[int]:
 def params_of(space: DesignSpace, designs: jax.typing.ArrayLike) -> Params:
     """Named parameters of designs [SI], shape (design, parameter); one program a space."""
     return jax.vmap(space.params)(designs)
-
-
-def unflatten(hand: Hand, full: jax.Array) -> Params:
-    """Splits a full vector [SI], shape (full,), into named parameters."""
-    n = len(hand.finger)
-    offsets = _offsets(hand)
-
-    def take(name: str) -> jax.Array:
-        start = offsets[name]
-        return full[start : start + n] if _row(hand, name).per == "finger" else full[start]
-
-    arm = [take(f"arm_{axis}") for axis in ("x", "y", "z", "roll", "pitch", "yaw")]
-    return Params(
-        length=take("length"),
-        height=take("height"),
-        wall=take("wall"),
-        spread=take("spread"),
-        arm=jnp.stack(arm),
-        pressure=take("pressure"),
-        control={p.name: take(p.name) for p in hand.parameter if p.name not in PARAMETERS} or None,
-        tip=Tip(*(take(name) for name in TIP)) if hand.section.tapered else None,
-    )
 
 
 def design_space(hand: Hand, preset: str = "full") -> DesignSpace:
@@ -624,13 +602,12 @@ def _hint(preset: str, names: list[str]) -> str:
 
 def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
     base = _defaults(hand)
-    offsets = _offsets(hand)
+    parts = _rows(hand)
     source = np.full(base.shape, -1)
     for name, value in preset.fixed.items():
         row = _row(hand, name)
-        width = hand.width(row)
         factor = UNITS[row.unit][1]
-        base[offsets[name] : offsets[name] + width] = np.array(per_finger(value, width)) * factor
+        base[parts[name]] = np.array(per_finger(value, hand.width(row))) * factor
     free = {f.name: f for f in preset.free}
     idle = {n: why for n, why in without_effect(hand).items() if everything or n in free}
     columns: list[tuple[str, str, float, float, float, bool]] = []
@@ -646,7 +623,7 @@ def _build(hand: Hand, preset: Preset, *, everything: bool) -> DesignSpace:
             spec = spec.joined(hand.valves.known(width), width)
         low, high = spec.bounds(row, width)
         for group in spec.groups(width):
-            source[[offsets[row.name] + k for k in group]] = len(columns)
+            source[parts[row.name]][list(group)] = len(columns)
             fingers = "" if len(group) == width else f"[{'+'.join(map(str, group))}]"
             morphology = row.domain == "morphology"
             ends = low[group[0]] * factor, high[group[0]] * factor
@@ -692,9 +669,8 @@ def _refuse_empty(space: DesignSpace, hand_name: str) -> None:
 
 def _refuse_unlike_fingers(space: DesignSpace, where: str) -> None:
     """Refuses pressures that fingers of one pressure line cannot have."""
-    values = _Values(space, np.asarray(space.base))
-    places = np.array(values.places("pressure"))
-    fixed = values("pressure")
+    places = space.entries("pressure")
+    fixed = np.array(space.base[_rows(space.hand)["pressure"]])
     count = len(places)
     valves = space.hand.valves
     free = places[0] >= 0  # of all fingers, or of none
@@ -746,10 +722,11 @@ def _row(hand: Hand, name: str) -> Parameter:
 
 
 @functools.cache
-def _offsets(hand: Hand) -> dict[str, int]:
-    widths = [hand.width(p) for p in hand.parameter]
-    starts = np.concatenate([[0], np.cumsum(widths)])
-    return {p.name: int(s) for p, s in zip(hand.parameter, starts[:-1], strict=True)}
+def _rows(hand: Hand) -> dict[str, slice]:
+    """Where the entries of each row of the hand's table are, see `DesignSpace.base`."""
+    ends = np.cumsum([0] + [hand.width(row) for row in hand.parameter]).tolist()
+    names = (row.name for row in hand.parameter)
+    return {name: slice(*ends[k : k + 2]) for k, name in enumerate(names)}
 
 
 def _defaults(hand: Hand) -> np.ndarray:

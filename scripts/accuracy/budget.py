@@ -329,11 +329,10 @@ def motion(
     )
     stride = round(EVERY / step)
     count = round(seconds / step)
-    vectors = np.asarray(work.designs(the_scene, hands))
+    params = work.hands(the_scene, hands)
     drawn = rollout.sample_trials(the_scene, jax.random.key(work.SEED), work.TRIALS)
     with jax.enable_x64(engine == "mujoco"):
         float_type = np.float64 if engine == "mujoco" else np.float32
-        params = jax.vmap(lambda v: parameters.unflatten(the_scene.hand, v))(vectors)
         trials = jax.tree.map(lambda x: np.asarray(x)[np.arange(hands) % work.TRIALS], drawn)
         cast = lambda x: np.asarray(x).astype(float_type) if x.dtype.kind == "f" else x  # noqa: E731
         inputs = work.inputs(the_scene, work.Worlds(*jax.tree.map(cast, (params, trials))))

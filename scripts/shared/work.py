@@ -40,13 +40,13 @@ class Worlds(NamedTuple):
     trials: Trial
 
 
-def designs(chosen: Scene, count: int) -> jax.Array:
-    """Full parameter vectors, in turn random ones of the whole table and good ones.
+def hands(chosen: Scene, count: int) -> Params:
+    """Hands of in turn random designs of the whole table and good ones.
 
-    Vector i does not depend on the count, so that a small batch is the start of a large one.
+    Hand i does not depend on the count, so that a small batch is the start of a large one.
 
     Returns:
-      Vectors in SI units, shape (design, full).
+      Parameters, every array with a leading axis (design,).
     """
     rng = np.random.default_rng(SEED)
     table, plane = (parameters.design_space(chosen.hand, p) for p in ("full", "2d"))
@@ -59,14 +59,19 @@ def designs(chosen: Scene, count: int) -> jax.Array:
     turn = 2.0 * unit[:, len(low) :] - 1.0
     turn[:2] = 0.0  # the first good design is the middle itself
     good = jnp.asarray(plane.from_units(middle + half * turn))
-    every = jax.vmap(table.expand)(random), jax.vmap(plane.expand)(good)
-    return jnp.where((jnp.arange(count) % 2 == 0)[:, None], *every).astype(jnp.float32)
+    even = np.arange(count) % 2 == 0
+
+    def in_turn(first: jax.Array, second: jax.Array) -> jax.Array:
+        mask = even.reshape(-1, *[1] * (first.ndim - 1))
+        return jnp.where(mask, first, second).astype(jnp.float32)
+
+    both = parameters.params_of(table, random), parameters.params_of(plane, good)
+    return jax.tree.map(in_turn, *both)
 
 
 def make_worlds(chosen: Scene, count: int) -> Worlds:
     """The first worlds of designs x trials, design by design, every design in the same trials."""
-    vectors = designs(chosen, -(-count // TRIALS))
-    params = jax.vmap(lambda v: parameters.unflatten(chosen.hand, v))(vectors)
+    params = hands(chosen, -(-count // TRIALS))
     trials = rollout.sample_trials(chosen, jax.random.key(SEED), TRIALS)
     index = np.arange(count)
     return Worlds(

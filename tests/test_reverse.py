@@ -19,10 +19,10 @@ from codesign_jax import reuse, scene
 from codesign_jax.compiler import gpu, launch
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import (
-    adjoint,
     adjoint_step,
     cotangents,
     friction_memory,
+    program,
     residual_vjp,
 )
 from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, StatePath
@@ -218,7 +218,7 @@ def planted(faults):
         patch.setattr(adjoint_step.ReverseStep, "__init__", prepare)
         # Sound kernels must neither be found in the place of this one nor find it.
         patch.setattr(reuse, "code_digest", lambda: f"planted: {sorted(faults)}")
-        patch.setattr(adjoint, "of_code", lambda _: None)
+        patch.setattr(program, "of_code", lambda _: None)
         patch.setattr(reuse, "kept", lambda path, build: build())
         yield
     assert fault.used == set(faults), set(faults) - fault.used

@@ -151,6 +151,7 @@ def test_steps_of_mjx_equal_mujocos(tmp_path, effects, fixtures):
         fields = jax.tree.map(lambda v: v[0], fields)
         engine = make_engine("mjx", scene)
         oracle = oracles.exact(scene, fields)
+        arrays = model.mujoco_fields(scene.structure, fields)
         step = jax.jit(engine.step, compiler_options={"xla_backend_optimization_level": 0})
         data = mujoco.MjData(oracle)
         ours = engine.reset(fields)
@@ -161,7 +162,7 @@ def test_steps_of_mjx_equal_mujocos(tmp_path, effects, fixtures):
             oracles.soften(scene, fields, oracle, data)
             if k % 70 == 20:
                 ours = ours.replace(qpos=data.qpos.copy(), qvel=data.qvel.copy())
-                state = step(fields, ours, ctrl[0, k])
+                state = step(arrays, fields, ours, ctrl[0, k])
                 mujoco.mj_forward(oracle, data)
                 scale = max(np.linalg.norm(data.qacc), oracles.FLOOR)
                 # MJX keeps its warm start where it is good enough: 4e-9 at rest.

@@ -51,10 +51,9 @@ class Chosen(NamedTuple):
 def refuse_other_policy(policy: str, named: str | None) -> None:
     """Refuses to import a run's policy that the command line does not name, or to leave it out."""
     if policy != (named or ""):
-        policy_words = f"--policy {policy}" if policy else "no policy"
-        raise InputError.of(
-            "conflict", f"the run was made with {policy_words}; --policy is {named or 'not given'}"
-        )
+        given = named or "not given"
+        made = policy or "none"
+        raise InputError.of("conflict", f"--policy: {given}; the policy of the run is {made}")
 
 
 def case_of_run(

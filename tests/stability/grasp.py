@@ -13,18 +13,14 @@ from codesign_jax.scene import parameters
 from codesign_jax.types import HARMLESS, Params, Status
 from tests.helpers import grasps
 from tests.helpers.grasps import GOOD
-from tests.stability.bench import CREEP, FIRM, bench, floats
+from tests.stability.bench import CREEP, FIRM, bench, floats, loaded
 from tests.stability.oracle import Reader
 from tests.stability.table import BOTH, Found, case, case_of_both_scenes
 
 
 @functools.cache
 def paper(name="paper_spheres", **settings):
-    overrides: dict = {}
-    for key, value in settings.items():
-        table, entry = key.split("__")
-        overrides.setdefault(table, {})[entry] = value
-    return scene.load(name, overrides=overrides)
+    return loaded(name, **settings)
 
 
 def design(the_scene, **changes) -> Params:

@@ -3,6 +3,7 @@
 python -m scripts.experiments.fresh --experiments 23d --accuracies standard,reference
 python -m scripts.experiments.fresh --experiments 23d --objects household --label meshes   # adds
 python -m scripts.experiments.fresh --report --page docs/notes/results.md
+python -m scripts.experiments.fresh --data docs/data/experiments/elements --report --page ...
 
 An optimiser picks what the errors of its simulation favour (the winner's curse), so the order of
 the strategies is looked at once more: the particle of each run that tested best meets trials that
@@ -220,7 +221,8 @@ def main() -> int:
         sys.exit(f"error: {error}")
     print(text)
     if args.page:
-        output.fill(args.page, text, "fresh")
+        law = args.data.name if args.data.name in report.LAWS else ""
+        output.fill(args.page, text, f"fresh {law}".strip())
     return 0
 
 

@@ -57,7 +57,7 @@ def refined(base: Scene, step: float) -> Scene:
     )
 
 
-def loaded(name, hand_name=None, **settings) -> Scene:
+def scene_of(name, hand_name=None, **settings) -> Scene:
     """A built-in scene, with settings `table__entry`.
 
     What is compared with MuJoCo C, that is `paper_spheres`, is solved as closely as C solves it;
@@ -74,7 +74,7 @@ def loaded(name, hand_name=None, **settings) -> Scene:
 def pinch(name="paper_spheres", **settings) -> Scene:
     """Two opposed fingers of three links and the paper's three objects."""
     settings = {"discretization__links": 3} | settings
-    return loaded(name, hand_name=grasps.DATA / "pinch.toml", **settings)
+    return scene_of(name, hand_name=grasps.DATA / "pinch.toml", **settings)
 
 
 @functools.lru_cache(maxsize=8)

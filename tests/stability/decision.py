@@ -12,7 +12,7 @@ from codesign_jax.cost import particle_cost
 from codesign_jax.engines import make_engine
 from codesign_jax.scene import parameters
 from scripts.shared.statistics import two_way
-from tests.stability.bench import floats, loaded, refined
+from tests.stability.bench import floats, refined, scene_of
 from tests.stability.table import Found, case
 
 DESIGNS = 40
@@ -35,7 +35,7 @@ objects and lose others.  Of designs of the whole space most lose all of them an
 @functools.cache
 def evaluated(name, engine="structured", step=1.0, precision="float32", links=10, trials=TRIALS):
     """Whether late 2D designs keep their trials (design, trial), and the designs' costs."""
-    base = refined(loaded(name, discretization__links=links), step)
+    base = refined(scene_of(name, discretization__links=links), step)
     unit = np.random.default_rng(24).random((DESIGNS, 2))
     wide = precision == "float64" and engine == "structured"
     with floats(wide):

@@ -13,14 +13,14 @@ from codesign_jax.scene import parameters
 from codesign_jax.types import HARMLESS, Params, Status
 from tests.helpers import grasps
 from tests.helpers.grasps import GOOD
-from tests.stability.bench import CREEP, FIRM, bench, floats, loaded
+from tests.stability.bench import CREEP, FIRM, bench, floats, scene_of
 from tests.stability.oracle import Reader
 from tests.stability.table import BOTH, Found, case, case_of_both_scenes
 
 
 @functools.cache
 def paper(name="paper_spheres", **settings):
-    return loaded(name, **settings)
+    return scene_of(name, **settings)
 
 
 def design(the_scene, **changes) -> Params:

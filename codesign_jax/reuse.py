@@ -522,10 +522,13 @@ class SceneProgram:
 
     def _arrays(self, scene: Any) -> Any:
         import jax
+        import numpy as np
+
+        def array(value: Any) -> Any:
+            return value.astype(float) if isinstance(value, jax.Array) else np.asarray(value, float)
 
         # Python's floats would be traced apart from arrays.
-        checked = self._scene.checked(scene)
-        return jax.tree.map(lambda v: jax.numpy.asarray(v, float), checked.bare)
+        return jax.tree.map(array, self._scene.checked(scene).bare)
 
 
 # Whether programs have run in this process, and whether it was forked from one in which they had.

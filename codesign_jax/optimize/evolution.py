@@ -27,9 +27,11 @@ from codesign_jax.optimize.protocol import (
     check_start,
     check_told,
     episode_key,
+    first_state,
     summarize,
 )
 from codesign_jax.optimize.resampling import MAX_PARTICLES
+from codesign_jax.reuse import quickly_compiled
 
 # Four ASCII letters each, as the particle filter's.
 STREAM_ASK = 0x61736B20
@@ -84,14 +86,7 @@ class Evolution:
             raise ValueError(f"{num_particles=}: {self.name} needs at least {LEAST[self.name]}")
         if self.name == "open-es" and num_particles % 2:
             raise ValueError(f"{num_particles=}: open-es draws pairs, and needs an even number")
-        particles = jnp.tile(seed, (num_particles, 1))
-        state = OptimizerState(particles, jnp.zeros((), jnp.int32), key)
-        memory = {
-            "mask": jnp.ones(seed.shape, bool),
-            "cost": jnp.full(num_particles, jnp.inf, seed.dtype),
-            "strategy": arrays(self._start(state)),
-        }
-        return state._replace(memory=memory)
+        return _init(self, key, seed, num_particles)
 
     def ask(self, state: OptimizerState, mask: ArrayLike) -> jax.Array:
         # The space's constraint may change a closed parameter, as with the particle filter.
@@ -157,6 +152,19 @@ class Evolution:
 
     def _strategy(self, state: OptimizerState) -> "Strategy":
         return build(self.name, *state.particles.shape, self.sigma, str(state.particles.dtype))
+
+
+@functools.partial(quickly_compiled, static_argnums=3)  # one program, not one an operation
+def _init(
+    optimizer: Evolution, key: jax.Array, seed: jax.Array, num_particles: int
+) -> OptimizerState:
+    state = first_state(key, seed, num_particles)
+    memory = {
+        "mask": jnp.ones(seed.shape, bool),
+        "cost": jnp.full(num_particles, jnp.inf, seed.dtype),
+        "strategy": arrays(optimizer._start(state)),
+    }
+    return state._replace(memory=memory)
 
 
 class Strategy(NamedTuple):

@@ -22,9 +22,11 @@ from codesign_jax.optimize.protocol import (
     check_start,
     check_told,
     episode_key,
+    first_state,
     summarize,
 )
 from codesign_jax.optimize.resampling import MAX_PARTICLES, stochastic_universal
+from codesign_jax.reuse import quickly_compiled
 
 # Four ASCII letters each, so that they do not meet the small numbers others fold in.
 STREAM_MOVE = 0x6D6F7665
@@ -62,8 +64,7 @@ class ParticleFilter:
     def init(self, key: jax.Array, seed_particle: ArrayLike, num_particles: int) -> OptimizerState:
         """All particles at the seed particle."""
         seed_particle = check_start(self.space, key, seed_particle, num_particles, MAX_PARTICLES)
-        particles = jnp.tile(seed_particle, (num_particles, 1))
-        return OptimizerState(particles, jnp.zeros((), jnp.int32), key)
+        return _init(key, seed_particle, num_particles)
 
     def ask(self, state: OptimizerState, mask: ArrayLike) -> jax.Array:
         """Move the particles: step 1 of Fig. 5.
@@ -100,3 +101,7 @@ class ParticleFilter:
         ancestors = stochastic_universal(u, weight)
         next_state = OptimizerState(population[ancestors], state.episode + 1, state.key)
         return next_state, summarize(cost, jnp.where(finite.any(), weight, 1), ancestors)
+
+
+_init = quickly_compiled(first_state, static_argnums=2)
+"""One program, not one an operation."""

@@ -139,13 +139,21 @@ def check_start(
     """Checks the arguments of `init`; returns the seed particle as an array of floats."""
     if problem := random_key_problem(key):
         raise TypeError(problem)
-    seed_particle = jnp.asarray(seed_particle, float)
+    if not isinstance(seed_particle, jax.core.Tracer):
+        seed_particle = np.asarray(seed_particle, jnp.result_type(float))
+    seed_particle = jax.device_put(seed_particle)
     if seed_particle.shape != jnp.shape(space.low):
         raise ValueError(f"{seed_particle.shape=}, expected {jnp.shape(space.low)}")
     _refuse_far(space, seed_particle)
     if not 1 <= num_particles <= most:
         raise ValueError(f"{num_particles=}, expected 1 to {most}")
     return seed_particle
+
+
+def first_state(key: jax.Array, seed_particle: jax.Array, num_particles: int) -> OptimizerState:
+    """All particles at the seed particle."""
+    particles = jnp.tile(seed_particle, (num_particles, 1))
+    return OptimizerState(particles, jnp.zeros((), jnp.int32), key)
 
 
 def _refuse_far(space: Space, particle: jax.Array) -> None:

@@ -32,9 +32,11 @@ from codesign_jax.optimize.protocol import (
     check_start,
     check_told,
     episode_key,
+    first_state,
     summarize,
 )
 from codesign_jax.optimize.resampling import MAX_PARTICLES
+from codesign_jax.reuse import quickly_compiled
 
 # Four ASCII letters each, as the particle filter's.
 STREAM_SCREEN = 0x72616E64
@@ -97,13 +99,7 @@ class Screened:
         seed = check_start(self.space, key, seed_particle, num_particles, MAX_PARTICLES)
         if num_particles < LEAST:
             raise ValueError(f"{num_particles=}: a screened search needs at least {LEAST}")
-        state = OptimizerState(jnp.tile(seed, (num_particles, 1)), jnp.zeros((), jnp.int32), key)
-        memory = {
-            "mask": jnp.ones(seed.shape, bool),
-            "cost": jnp.full(num_particles, jnp.inf, seed.dtype),
-            "way": state.particles,
-        }
-        return state._replace(memory=memory | self._start(state))
+        return _init(self, key, seed, num_particles)
 
     def ask(self, state: OptimizerState, mask: ArrayLike) -> jax.Array:
         # The space's constraint may change a closed parameter, as with the particle filter.
@@ -201,3 +197,16 @@ class Screened:
         dtype = str(state.particles.dtype)
         # Its draws come in pairs; the last one of an even number of particles is its mean.
         return build("open-es", 2 * ((n - 1) // 2), width, self.sigma, dtype)
+
+
+@partial(quickly_compiled, static_argnums=3)  # one program, not one an operation
+def _init(
+    optimizer: Screened, key: jax.Array, seed: jax.Array, num_particles: int
+) -> OptimizerState:
+    state = first_state(key, seed, num_particles)
+    memory = {
+        "mask": jnp.ones(seed.shape, bool),
+        "cost": jnp.full(num_particles, jnp.inf, seed.dtype),
+        "way": state.particles,
+    }
+    return state._replace(memory=memory | optimizer._start(state))

@@ -104,12 +104,36 @@ def is_number(x: Any) -> bool:
     )
 
 
+_EXACT: dict[str, Callable] = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": np.divide,
+    "neg": np.negative,
+    "max": np.maximum,
+    "min": np.minimum,
+    "eq": np.equal,
+    "ne": np.not_equal,
+    "lt": np.less,
+    "le": np.less_equal,
+    "gt": np.greater,
+    "ge": np.greater_equal,
+    "and": np.bitwise_and,
+    "or": np.bitwise_or,
+    "not": np.invert,
+}
+"""NumPy's functions with JAX's bits, but for quotients of integers; JAX would compile programs."""
+
+
 def _fold(equation: Any, parts: tuple) -> Any:
     types = [v.aval.dtype for v in equation.invars]
+    name = equation.primitive.name
+    arrays = [np.asarray(p, t) for p, t in zip(parts, types, strict=True)]
+    if name == "convert_element_type":
+        return arrays[0].astype(equation.params["new_dtype"])[()]
+    if name in _EXACT and not (name == "div" and np.issubdtype(types[0], np.integer)):
+        return _EXACT[name](*arrays)
     with jax.ensure_compile_time_eval():
-        arrays = [np.asarray(p, t) for p, t in zip(parts, types, strict=True)]
-        if equation.primitive.name == "convert_element_type":
-            return arrays[0].astype(equation.params["new_dtype"])[()]
         return np.asarray(equation.primitive.bind(*arrays, **equation.params))[()]
 
 

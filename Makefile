@@ -6,10 +6,11 @@ PYTHON ?= $(shell for p in python3 python3.12 python3.13 python3.11 python; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo $$p; break; }; \
 	done)
 BIN := $(VENV)/bin
-# Of what is installed: everything; what the demo needs; what the quick core needs.
+# Of what is installed: everything; what the demo, the quick core and the study of whole fingers need.
 STAMP := $(VENV)/.installed
 DEMO := $(VENV)/.demo
 QUICK := $(VENV)/.quick
+FINGER3D := $(VENV)/.finger3d
 EXTRAS := notebooks,report,test,docs,dev
 SHOWN := report,export
 CHECKED := codesign_jax scripts tests notebooks
@@ -17,7 +18,7 @@ CHECKED := codesign_jax scripts tests notebooks
 # What is imported is compiled once: without its bytecode every process compiles it again, for 7 s.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo docs release interpreter test quick test-browser test-ptx test-gpu test-slow stability faults notebooks benchmark effects accuracy reality lint format types clean help
+.PHONY: demo docs release interpreter test quick test-browser test-ptx test-gpu test-slow stability faults notebooks benchmark effects accuracy reality finger3d lint format types clean help
 
 help:
 	@echo "make demo        co-design a gripper, 23 parameters, on the CPU, with figures and a film"
@@ -32,6 +33,7 @@ help:
 	@echo "make benchmark   measure rates: BENCHMARK=docs/data/rates_cpu.json"
 	@echo "make effects     what each effect costs and decides: docs/effects.md"
 	@echo "make reality     the simulation beside published measurements: docs/reality.md"
+	@echo "make finger3d    whole fingers by finite elements in 3D, with NGSolve: docs/notes/section.md"
 	@echo "make accuracy    what accuracy costs in time, and what moves a verdict"
 	@echo "make docs        the documentation as a site without a network: site/index.html"
 	@echo "make release     everything but the upload: wheel, sdist, an empty environment; dist/"
@@ -102,6 +104,12 @@ effects: $(STAMP)
 reality: $(STAMP)
 	$(BIN)/python -m scripts.reality --pages $(ARGS)
 
+# About 20 minutes on two idle cores; goes on where it stopped. No other target needs NGSolve.
+finger3d: export OPENBLAS_NUM_THREADS := 1
+finger3d: $(FINGER3D)
+	printf '1/2\n2/2\n' | xargs -P 2 -I{} $(BIN)/python -m scripts.section.finger3d --share {}
+	$(BIN)/python -m scripts.section.finger3d --merge --report
+
 # Hours of a GPU and its host; goes on where it stopped. Then ARGS="--merge FILE", "--merge FILE --report".
 accuracy: $(STAMP)
 	$(BIN)/python -m scripts.accuracy $(ARGS)
@@ -147,6 +155,10 @@ $(DEMO): pyproject.toml
 
 $(QUICK): pyproject.toml
 	$(call install,quick)
+	@touch $@
+
+$(FINGER3D): pyproject.toml
+	$(call install,finger3d)
 	@touch $@
 
 clean:

@@ -7,15 +7,13 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-import scipy.sparse
-import scipy.sparse.linalg
-from scipy import optimize
 
 from codesign_jax import parameters, scene
 from codesign_jax.model import morphology
 from codesign_jax.scene import beams, section_law, section_numbers
 from scripts.section import elements, growth, study
 from scripts.section.elements import Model, Section
+from tests.helpers import exact_sections
 
 G = 88e3
 DATA = Path(__file__).parents[1] / "docs" / "data" / "section.npz"
@@ -41,25 +39,6 @@ def test_derivatives():
     np.testing.assert_allclose(difference, expected, atol=1e-5 * np.abs(expected).max())
 
 
-def exact_tube(pressure: float, outer: float, inner: float) -> float:
-    """Stretch of a closed, incompressible neo-Hookean tube whose outer radius cannot change."""
-
-    points, weights = np.polynomial.legendre.leggauss(20)
-    radius = (outer + inner + (outer - inner) * points) / 2
-    area = np.pi * radius * (outer - inner) * weights
-
-    def energy(stretch: float) -> float:
-        hoop = (outer**2 - (outer**2 - radius**2) / stretch) / radius**2
-        return float(area @ (G / 2 * (stretch**2 + hoop + 1 / (hoop * stretch**2) - 3)))
-
-    def residual(stretch: float) -> float:
-        step = 1e-5
-        force = (energy(stretch + step) - energy(stretch - step)) / (2 * step)
-        return force - pressure * np.pi * outer**2
-
-    return optimize.brentq(residual, 1.0, 5.0)
-
-
 @pytest.mark.parametrize(
     ("layers", "around"),
     [(1, 4), pytest.param(2, 6, marks=pytest.mark.slow)],
@@ -81,35 +60,8 @@ def test_round_tube(layers, around):
     model = Model(section)
     for pressure in (20e3, 50e3, 100e3):
         model.reach(pressure, steps=4, twist=0.0, bend=0.0, lateral=0.0)
-        expected = exact_tube(pressure, 10e-3, 6e-3) - 1
+        expected = exact_sections.tube_stretch(pressure, 10e-3, 6e-3, G) - 1
         assert model.stretch - 1 == pytest.approx(expected, rel=1e-3)
-
-
-def torsion_constant(width: int, height: int, wall: int) -> float:
-    """Saint-Venant's torsion constant of a box by Prandtl's function; sides in cells."""
-    y, z = np.meshgrid(np.arange(width + 1), np.arange(height + 1), indexing="ij")
-    margin = np.minimum(np.minimum(y, width - y), np.minimum(z, height - z))
-    count = int(((margin > 0) & (margin < wall)).sum())
-    number = np.where(margin >= wall, count, -1)
-    number[(margin > 0) & (margin < wall)] = np.arange(count)
-    rows = []
-    columns = []
-    values = []
-    inside = (margin > 0) & (margin < wall)
-    hole = margin >= wall
-    for axis, way in ((0, 1), (0, -1), (1, 1), (1, -1)):
-        beside = np.roll(number, way, axis)
-        for nodes in (inside, hole & np.roll(inside, way, axis)):
-            rows += [number[nodes], number[nodes][beside[nodes] >= 0]]
-            columns += [number[nodes], beside[nodes][beside[nodes] >= 0]]
-            values += [np.ones(nodes.sum()), -np.ones((beside[nodes] >= 0).sum())]
-    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    matrix = scipy.sparse.csc_matrix(entries, (count + 1, count + 1))
-    # Around the hole the flux passes the middles of the cells beside it.
-    area = (width - 2 * wall + 1) * (height - 2 * wall + 1)
-    right = np.append(np.full(count, 2.0), 2.0 * area)
-    phi = scipy.sparse.linalg.spsolve(matrix, right)
-    return 2 * (phi[:-1].sum() + phi[-1] * area)
 
 
 @pytest.mark.parametrize(
@@ -133,7 +85,7 @@ def test_box(wall, sides):
     assert float(bend) == pytest.approx(3 * G * upright, rel=1e-3)
     assert lateral == pytest.approx(3 * G * across, rel=1e-3)
     cells = 6  # per mm
-    exact = torsion_constant(*(round(cells * v) for v in (width, height, wall)))
+    exact = exact_sections.torsion_constant(*(round(cells * v) for v in (width, height, wall)))
     assert twist == pytest.approx(G * exact / (1e3 * cells) ** 4, rel=0.02)
 
 
@@ -205,7 +157,7 @@ def test_law_without_pressure():
     volume = float(volume_of(n, 0.0, 0.0, 0.0, 0.0))
     # The fabric's smooth slack has a volume of its own.
     assert volume == pytest.approx(14e-3 * 10e-3, rel=1e-3)
-    exact = G * torsion_constant(96, 80, 20) / 4e3**4
+    exact = G * exact_sections.torsion_constant(96, 80, 20) / 4e3**4
     twist = section_law.twist_stiffness(n, 0.0, 0.0)
     assert float(twist) == pytest.approx(exact, rel=0.15)
 

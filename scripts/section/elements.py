@@ -96,7 +96,17 @@ def _line_slope(t: float) -> np.ndarray:
     return np.array([t - 0.5, -2 * t, t + 0.5])
 
 
-def _contours(section: Section) -> tuple[np.ndarray, np.ndarray]:
+def rectangle(low: np.ndarray, high: np.ndarray, sides: tuple[int, int, int, int]) -> np.ndarray:
+    """Nodes on a rectangle between two corners, counterclockwise, shape (2 n, 2)."""
+    corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+    parts = []
+    for start, end, count in zip(corners, np.roll(corners, -1, 0), sides, strict=True):
+        share = np.arange(2 * count)[:, None] / (2 * count)
+        parts.append((1 - share) * start + share * end)
+    return np.concatenate(parts)
+
+
+def contours(section: Section) -> tuple[np.ndarray, np.ndarray]:
     """Nodes on the outer contour and on the chamber's, from the bottom left, shape (2 n, 2)."""
     if section.round:
         count = 2 * sum(section.sides)
@@ -107,14 +117,9 @@ def _contours(section: Section) -> tuple[np.ndarray, np.ndarray]:
         return unit * radius + centre, unit * (radius - section.wall) + centre
 
     def box(margin: float) -> np.ndarray:
-        left = -section.width / 2 + margin
-        top = section.height - margin
-        corners = np.array([[left, margin], [-left, margin], [-left, top], [left, top]])
-        parts = []
-        for start, end, count in zip(corners, np.roll(corners, -1, 0), section.sides, strict=True):
-            share = np.arange(2 * count)[:, None] / (2 * count)
-            parts.append((1 - share) * start + share * end)
-        return np.concatenate(parts)
+        half = section.width / 2 - margin
+        low = np.array([-half, margin])
+        return rectangle(low, np.array([half, section.height - margin]), section.sides)
 
     return box(0.0), box(section.wall)
 
@@ -151,7 +156,7 @@ class Model:
 
     def __init__(self, section: Section):
         self.section = section
-        outer, inner = _contours(section)
+        outer, inner = contours(section)
         depths = section.depths()
         share = np.sort(np.concatenate([depths, (depths[1:] + depths[:-1]) / 2]))
         around, through = len(outer), len(share)

@@ -20,6 +20,7 @@ from codesign_jax.compiler import gpu, launch
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import (
     adjoint_step,
+    contacts_vjp,
     cotangents,
     friction_memory,
     program,
@@ -67,8 +68,8 @@ DEEP = 1e6
 class Fault(NamedTuple):
     """What is wrong in the reverse pass of a world: functions of the right cotangents or results.
 
-    By a stage's name of its results (`seeds`) and arguments (`results`), by class and name of
-    `methods`; and `names` of what no cotangent is kept.
+    By a stage's name, or a pair of bodies, of its results (`seeds`) and arguments (`results`), by
+    class and name of `methods`; and `names` of what no cotangent is kept.
     """
 
     seeds: dict = {}
@@ -96,6 +97,22 @@ def without(place, *fields):
     return change
 
 
+def without_frames(line):
+    """A segment of a centre line whose neighbours' frames have no cotangents."""
+    return line._replace(frames=none(line.frames))
+
+
+def inside(place, change):
+    """Of several cotangents one is wrong by `change`."""
+
+    def changed(values):
+        new = list(values)
+        new[place] = change(new[place])
+        return type(values)(new)
+
+    return changed
+
+
 CONTACTS = (AdjointSolve, "of_contacts")
 SMOOTH = (AdjointSolve, "smooth")
 FAULTS = {
@@ -108,17 +125,22 @@ FAULTS = {
     "the object's frame stands still": Fault(names=("columns",)),
     "the object's velocity does nothing": Fault(names=("object_vel",)),
     "the table stands still": Fault(names=("height",)),
-    "rings hand nothing to their link": Fault(results={"of_rings": without(0)}),
+    "rings hand nothing to their link": Fault(
+        results={"finger_object": inside(0, without(0)), "finger_table": inside(0, without(0))}
+    ),
     "rings of one size": Fault(names=("ring",)),
     "chambers of one volume": Fault(names=("volume",)),
     "a palm of one size": Fault(names=("palm_ring",)),
-    "rings on fingers stand still": Fault(results={"between_rings": without(0)}),
-    "the other finger's segment stands still": Fault(results={"between_rings": without(1)}),
-    "a segment's neighbours stand still": Fault(results={"between_rings": without(1, "frames")}),
-    "fingers held nothing in the step before": Fault(results={"between_rings": without(3)}),
-    "the palm's disc stands still": Fault(results={"on_palm": without(1)}),
-    "rings held nothing in the step before": Fault(results={"of_rings": without(3)}),
-    "points held nothing in the step before": Fault(results={"of_table": without(1)}),
+    "rings on fingers stand still": Fault(results={"finger_finger": inside(0, without(0))}),
+    "the other finger's segment stands still": Fault(results={"finger_finger": without(1)}),
+    "a segment's neighbours stand still": Fault(
+        results={"finger_finger": inside(1, inside(1, without_frames))}
+    ),
+    "a finger's own segment stands still": Fault(results={"finger_itself": without(1)}),
+    "fingers held nothing in the step before": Fault(results={"finger_finger": without(3)}),
+    "the palm's disc stands still": Fault(results={"finger_palm": without(1)}),
+    "rings held nothing in the step before": Fault(results={"finger_object": without(3)}),
+    "points held nothing in the step before": Fault(results={"object_table": without(3)}),
     "what rings hold asks nothing of accelerations": Fault(
         results={"asks.<locals>.of_jar": without(0)}
     ),
@@ -126,7 +148,7 @@ FAULTS = {
         results={"load_cotangents.<locals>.of_held": without(0)}
     ),
     "both fingers own a contact": Fault(
-        methods={(residual_vjp, "only_on"): lambda right, mask, tree: tree}
+        methods={(contacts_vjp, "only_on"): lambda right, mask, tree: tree}
     ),
     "contacts push on the right side": Fault(
         methods={CONTACTS: lambda right, self, contacts, *rest: contacts.inertia_and_wrench(*rest)}
@@ -165,6 +187,8 @@ class Planted:
     def pull(self, function, args, fixed, bars):
         """Instead of `pull`."""
         stage = name_of(function)
+        if stage == "power":
+            _, stage = function.args  # the pair of bodies
         for change, mine in self.each("seeds", stage):
             bars = chosen(mine, change(bars), bars)
         pulled = cotangents.pull(function, args, fixed, bars)
@@ -204,7 +228,7 @@ def planted(faults):
     """Kernels of derivatives that are made within have the faults."""
     fault = Planted(faults)
     with pytest.MonkeyPatch.context() as patch:
-        for module in (residual_vjp, friction_memory, adjoint_step):
+        for module in (residual_vjp, contacts_vjp, friction_memory, adjoint_step):
             patch.setattr(module, "pull", fault.pull)
         for owner, name in {key for f in faults.values() for key in f.methods}:
             patch.setattr(owner, name, fault.method(owner, name))

@@ -14,14 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.engines.structured.coordinates import reset
-from codesign_jax.engines.structured.kernel import self_collision
+from codesign_jax.engines.structured.kernel import kinds, self_collision
 from codesign_jax.engines.structured.lanes import apply_columns, once
 from codesign_jax.engines.structured.laws import shapes, surroundings
 from codesign_jax.engines.structured.laws.kinematics import Kinematics, straight
 from codesign_jax.engines.structured.laws.rings import Place
 from codesign_jax.engines.structured.laws.touch import ring_centre, touch
 from codesign_jax.engines.structured.world_model import WorldModel, world_constants
-from codesign_jax.model import ModelFields, held
+from codesign_jax.model import ModelFields
 from codesign_jax.model.held import rings_of_link
 from codesign_jax.model.layout import first_on_palm, palm_touches
 from codesign_jax.scene import Scene
@@ -160,7 +160,7 @@ def _depth_of_rings(scene: Scene, hand: WorldModel, kin: Kinematics) -> jax.Arra
     frame = kin.link[:, :, link]
     centre = once(ring_centre, kin.origin[:, link], frame, inner)
     disc = kin.place[:, None], kin.palm[:, :, None], hand.palm_disc[:, None]
-    look = partial(self_collision.palm_distance, palm=disc)
+    look = partial(kinds.palm_distance, palm=disc)
     place = _touch(scene, look, inner, frame, centre)
     row = link[:, None, None] + 1
     free = self_collision.free_of_palm(row, inner, hand.offset[0], numbers[:, 0])
@@ -198,21 +198,12 @@ def _of_object(
     scene: Scene, hand: WorldModel, kin: Kinematics, position: jax.Array, on_object: Look
 ) -> list[Place]:
     """Contacts of the object with table and fixtures, items first."""
-    each = []
-    ones = jnp.ones_like
-    if scene.effects.table:
-        place = shapes.object_on_table(scene, hand, kin.object, position[2])
-        each.append(Place(*place, ones(place[2])))
-    flat = [i for i, s in enumerate(scene.objects.object) if s.type not in held.ROUND]
-    for fixture in scene.fixture:
-        _, rows = surroundings.towards(fixture, position)
-        arms = shapes.lowest_points(scene, hand, surroundings.faced(rows, kin.object))
-        place = surroundings.object_on(fixture, position, rows[:, :, 0], arms)
-        each.append(Place(*place, ones(place[2])))
-        if flat and held.EDGES[fixture.type]:
-            point = surroundings.edges(fixture, position)
-            edges = surroundings.edge_on(point, *on_object(point))
-            on, normal, gap = (v[..., 0, :] for v in edges)
-            faces = jnp.isin(hand.object_id, jnp.array(flat))
-            each.append(Place(on, normal, gap, jnp.where(faces, ones(gap), 0.0)))
-    return each
+
+    def points(columns: jax.Array, height: jax.Array, fixture: int | None) -> jax.Array:
+        return shapes.lowest_points(scene, hand, columns)
+
+    def look(point: jax.Array, fixture: int) -> tuple[jax.Array, jax.Array]:
+        return on_object(point)
+
+    where = position, position[2], kin.object, hand.object_id
+    return surroundings.object_places(scene, *where, points, look, apply=once)

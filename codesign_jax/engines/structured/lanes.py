@@ -21,6 +21,11 @@ def once(function: Callable, *args: Any) -> Any:
     return jax.lax.optimization_barrier(function(*args))
 
 
+def directly(function: Callable, *args: Any) -> Any:
+    """Returns function(*args): the plain way to apply a stage of a law to arrays."""
+    return function(*args)
+
+
 def scan_links(step: Callable, first: Any, links: Any) -> tuple[Any, Any]:
     """`jax.lax.scan` over links, whose slices are rows to the compiler.
 

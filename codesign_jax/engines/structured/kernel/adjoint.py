@@ -23,12 +23,11 @@ from codesign_jax.engines.structured.kernel.program import (
     numbered,
 )
 from codesign_jax.engines.structured.kernel.rows import (
+    BodyBar,
     Chain,
     ChainBefore,
     FingerState,
     HeldBar,
-    PairBar,
-    PalmBar,
     Remembered,
     StepBar,
     Virtual,
@@ -111,7 +110,7 @@ class AdjointProgram(Program):
         more = self._groups(Chain, ChainBefore, Virtual)
         for contacts in self.sets:
             more |= contacts.groups_of(HeldBar)
-        more |= self._groups(StepBar, PairBar, PalmBar)
+        more |= self._groups(StepBar, BodyBar)
         self.scratch = MemoryLayout.by_item(True, **(self.scratch.groups | more))
         self.world_bars = MemoryLayout(True, **self.world.groups)
 

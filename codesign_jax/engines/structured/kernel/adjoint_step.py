@@ -15,13 +15,14 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.kernel import chambers, friction_memory, residual
 from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
+from codesign_jax.engines.structured.kernel.contacts_vjp import ContactsVjp
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, only_on, plus, pull
 from codesign_jax.engines.structured.kernel.coupling import Coupling
 from codesign_jax.engines.structured.kernel.linear_system import Elimination
 from codesign_jax.engines.structured.kernel.memory import Block, choose, loop
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
 from codesign_jax.engines.structured.kernel.residual import Before, LinkMotion
-from codesign_jax.engines.structured.kernel.residual_vjp import ResidualVjp, SelfContactsVjp
+from codesign_jax.engines.structured.kernel.residual_vjp import ResidualVjp
 from codesign_jax.engines.structured.kernel.rows import (
     Chain,
     ChainBefore,
@@ -104,15 +105,14 @@ class ReverseStep(Step):
         right["smooth_palm"] = _none(bodies["palm"].smooth_palm)
         problem = Problem(self, bodies["palm"]._replace(**right))
         virtual = AdjointSolve(problem).solve()
-        sweep = ResidualVjp(self, state, bodies, world_object, virtual, bars)
-        if problem.self_contacts:
-            SelfContactsVjp(sweep, problem.self_contacts).run()
+        ContactsVjp(self, state, bodies, world_object, virtual, bars).run()
+        sweep = ResidualVjp(self, state, bodies, bars)
         metered = layout.scene.effects.air_mass
         end = chambers.end_pressures(self, pressure) if metered else pressure
         base, wrist = sweep.fingers(end, self._centre_bar(centre, shown.distance))
         if metered:
             chambers.reverse(self, bars, pressure)
-        base = sweep.palm_and_table(base)
+        base = sweep.with_contacts(base, layout.links + 1)
         before = before | plus({n: before[n] for n in wrist}, wrist)
         return self._palm_bars(state, arm, base, before, (now, virtual, acc_bar[0]), shown)
 

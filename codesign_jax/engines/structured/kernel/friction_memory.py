@@ -340,24 +340,29 @@ def _reverse_fingers(
         state.write(BETWEEN_FINGERS, rest, item)
 
 
-def held_and_cotangents(step: StepMemory, pairing: FingerPairing) -> tuple[Lanes, ...]:
-    """What the lanes' fingers hold, and "sums_bar"; nothing if the scene has no such state."""
+def held_and_cotangents(
+    step: StepMemory, pairing: FingerPairing
+) -> tuple[dict[str, Lanes], dict[str, Lanes]]:
+    """What the lanes' fingers hold, "held", and "sums_bar"; nothing without such a state."""
     if not pairings(step):
-        return ()
+        return {}, {}
     item = pairing.number
     lane = step.block.lane
     held = step.finger_state.gather(BETWEEN_FINGERS, item, lane)
-    return held, step.scratch.gather(Virtual.sums_bar, item, lane)
+    sums_bar = step.scratch.gather(Virtual.sums_bar, item, lane)
+    return {Contact.held: held}, {Virtual.sums_bar: sums_bar}
 
 
-def add_pairing_cotangents(bars: CotangentTables, pairing: FingerPairing, sums_bars: tuple) -> None:
-    """Adds a contact's cotangents of `held_and_cotangents` to those of the state."""
-    if not sums_bars:
+def add_pairing_cotangents(
+    bars: CotangentTables, pairing: FingerPairing, held: dict[str, Lanes]
+) -> None:
+    """Adds a contact's cotangents of what fingers hold, "held", to those of the state."""
+    if not held:
         return
     item = pairing.number
     lane = bars.block.lane
     state = bars.finger_state
-    new = lanewise(jnp.add, state.gather(BETWEEN_FINGERS, item, lane), sums_bars[0])
+    new = lanewise(jnp.add, state.gather(BETWEEN_FINGERS, item, lane), held[Contact.held])
     state.scatter(BETWEEN_FINGERS, new, item, lane)
 
 

@@ -20,7 +20,7 @@ Group = tuple[int, tuple[int, ...]]
 ONE = "one"  # a finger or a world
 LINK = "link"  # moving links of a finger
 BODY = "body"  # the palm, then the moving links
-END = "end"  # ends of the segments of a centre line
+END = "end"  # ends of the segments of a centre line; also a finger's bodies and the palm
 SECTION = "section"  # links of a tapered finger, else the finger
 RING = "ring"  # rings, or balls, of a finger
 PALM_GROUP = "palm_group"  # groups of the palm's rings, one ring for each finger's lanes
@@ -437,21 +437,11 @@ class StepBar(Rows, prefix="bar"):
     position = field(ONE, 3, on=lambda layout: bool(layout.scene.fixture))
 
 
-class PairBar(Rows, prefix="pairbar"):
-    """Cotangents of bodies by self-contacts, see `residual.BodyMotion`."""
+class BodyBar(Rows, prefix="bodybar"):
+    """Cotangents of the fingers' bodies and of the palm by contacts, see `kinds.BodyMotion`."""
 
-    origin = field(BODY, 3, on=lambda layout: layout.has_slots)
-    frame = field(BODY, 3, 3, on=lambda layout: layout.has_slots)
-    vel = field(BODY, 6, on=lambda layout: layout.has_slots)
-    link_acc = field(BODY, 6, on=lambda layout: layout.has_slots)
-    along = field(BODY, 6, on=lambda layout: layout.has_slots)
-
-
-class PalmBar(Rows, prefix="palmbar"):
-    """The same of the palm by contacts with its disc."""
-
-    origin = field(ONE, 3, on=lambda layout: layout.scene.effects.finger_palm)
-    frame = field(ONE, 3, 3, on=lambda layout: layout.scene.effects.finger_palm)
-    vel = field(ONE, 6, on=lambda layout: layout.scene.effects.finger_palm)
-    link_acc = field(ONE, 6, on=lambda layout: layout.scene.effects.finger_palm)
-    along = field(ONE, 6, on=lambda layout: layout.scene.effects.finger_palm)
+    origin = field(END, 3)
+    frame = field(END, 3, 3)
+    vel = field(END, 6)
+    link_acc = field(END, 6)
+    along = field(END, 6)

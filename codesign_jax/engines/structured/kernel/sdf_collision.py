@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import friction_memory, objects
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
+from codesign_jax.engines.structured.kernel.kinds import beside
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.problem import relative
 from codesign_jax.engines.structured.kernel.rows import (
@@ -38,7 +39,6 @@ from codesign_jax.engines.structured.laws.touch import (
     ring_reach,
 )
 from codesign_jax.engines.structured.world_model import apply_columns
-from codesign_jax.model import held
 
 FAR = 1e3
 """A gap that no ring has [m]."""
@@ -206,39 +206,17 @@ class SdfCollision:
             on_table.create(i, place, *moves, friction=friction, hold=hold)
 
     def _table_points(self, state: dict) -> list[Place]:
-        """Each slot of the object on the table and the fixtures, lanes of a world."""
+        """Each point of the object on the table and the fixtures, lanes of a world."""
         scene = self.layout.scene
-        columns = self.bodies["columns"]
-        places = []
+
+        def points(columns: Lanes, height: Lanes, _: int | None) -> Lanes:
+            return objects.table_points(scene, self.world_object, columns, height)
+
         position = state["position"]
-        if scene.effects.table:
-            arms = objects.table_points(scene, self.world_object, columns, position[2])
-            places += lanewise(lambda a, h: slots_of(*shapes.on_table(a, h)), arms, position[2])
-        kinds = [shape.type in held.ROUND for shape in scene.objects.object]
-        for fixture in scene.fixture:
-            gap, rows = lanewise(partial(surroundings.towards, fixture), position)
-            turned = lanewise(surroundings.faced, rows, columns)
-            arms = objects.table_points(scene, self.world_object, turned, gap)
-
-            def on(position, rows, arms, fixture=fixture):
-                return slots_of(*surroundings.object_on(fixture, position, rows, arms))
-
-            places += lanewise(on, position, rows, arms)
-            if all(kinds) or fixture.type == "plane":
-                continue
-            point = lanewise(partial(surroundings.edges, fixture), position)
-            distance, gradient = self._object(point)
-
-            def back(point, distance, gradient, shape):
-                touched = [v[:, :, 0] if v.ndim == 4 else v[:, 0] for v in
-                           surroundings.edge_on(point, distance, gradient)]  # fmt: skip
-                slots = slots_of(*touched)
-                flat = [i for i, sphere in enumerate(kinds) if not sphere]
-                mine = jnp.isin(shape.astype(jnp.int32), jnp.array(flat))
-                return [s._replace(share=jnp.where(mine, s.share, 0.0)) for s in slots]
-
-            places += lanewise(back, point, distance, gradient, self.world_object.shape)
-        return places
+        where = position, position[2], self.bodies["columns"], self.world_object.shape
+        look = lambda point, _: self._object(point)  # noqa: E731
+        places = surroundings.object_places(scene, *where, points, look, apply=lanewise)
+        return [slot for place in places for slot in lanewise(slots_of, place)]
 
     def _deal(self, slots: list) -> list[Lanes]:
         """Deals the slots, each of several (component, 1, world), out to the finger lanes."""
@@ -260,21 +238,12 @@ def joined(places: list[Place]) -> Place:
     return places[0] if len(places) == 1 else lanewise(lambda *p: beside(list(p)), *places)
 
 
-def beside(places: list[Place]) -> Place:
-    """The same of arrays."""
-    if len(places) == 1:
-        return places[0]
-    axes = 1, 1, 0, 0  # of the items, by field
-    fields = zip(axes, zip(*places, strict=True), strict=True)
-    return Place(*(jnp.concatenate(values, axis) for axis, values in fields))
-
-
-def slots_of(point, normal, gap):
+def slots_of(place: Place) -> list[Place]:
     """Contacts of an object's points (3, point, world) as a place each."""
-    ones = jnp.ones_like(gap)
+    count = place.gap.shape[0]
     return [
-        Place(point[:, k : k + 1], normal[:, k : k + 1], gap[k : k + 1], ones[k : k + 1])
-        for k in range(gap.shape[0])
+        Place(*(v[:, k : k + 1] for v in place[:2]), *(v[k : k + 1] for v in place[2:]))
+        for k in range(count)
     ]
 
 

@@ -21,6 +21,14 @@ from codesign_jax.engines.structured.kernel.contact_sets import (
     with_held,
     zeros,
 )
+from codesign_jax.engines.structured.kernel.kinds import (
+    above,
+    balls,
+    facing_line,
+    palm_distance,
+    place_of,
+    with_axis,
+)
 from codesign_jax.engines.structured.kernel.memory import BoundTable, loop, solid
 from codesign_jax.engines.structured.kernel.ring_pairs import RingPairs
 from codesign_jax.engines.structured.kernel.rows import (
@@ -41,8 +49,9 @@ from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import cross, dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
-from codesign_jax.engines.structured.laws import contact, rings, shapes, touch
-from codesign_jax.engines.structured.laws.rings import Facing, Place, Ring, Segment
+from codesign_jax.engines.structured.laws import contact, touch
+from codesign_jax.engines.structured.laws.rings import Facing, Place, Ring
+from codesign_jax.engines.structured.laws.touch import ring_centre
 from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model.layout import (
     RING_TIP,
@@ -612,17 +621,9 @@ def neighbours(row: jax.Array, links: int) -> tuple[jax.Array, jax.Array, jax.Ar
     return jnp.maximum(row - 1, 0), row, jnp.minimum(row + 1, links)
 
 
-def ring_centre(origin, frame, numbers):
-    return origin + apply_columns(frame, numbers[:3])
-
-
 def closed(timestep, speed):
     """Largest gap that bodies of a speed to each other may close in a step [m]."""
     return jnp.maximum(contact.MARGIN, timestep * speed)
-
-
-def place_of(numbers, frame, centre, facing):
-    return rings.place(Ring.of(numbers), frame, centre, facing)
 
 
 def free_of_palm(row, numbers, offset, first):
@@ -637,31 +638,11 @@ def free_of_palm(row, numbers, offset, first):
     return jnp.where(beyond_base(along, 2.0 * first[5]), 1.0, 0.0)
 
 
-def palm_distance(point, palm):
-    return shapes.disc_distance(point, *palm)
-
-
 def arc(tip, largest):
     """Least distance along a finger at which it touches itself, in links."""
     heights = APART_HEIGHTS * 2.0 * Ring.of(largest).half[2]
     link = Ring.of(tip).half[0] / RING_TIP
     return jnp.maximum(APART_LINKS, heights / link)
-
-
-def facing_line(numbers, frame, centre, other, t):
-    """See `rings.facing_line`; other: ends, frames, a ring's section, if it is the last one."""
-    ends, frames, tip, last = other
-    segment = Segment(ends, frames, jnp.stack([last * tip[3], tip[4], tip[5]]))
-    return rings.facing_line(Ring.of(numbers), frame, centre, segment, t)
-
-
-def between(numbers, frame, centre, other, t):
-    """See `rings.between`; arguments as `facing_line`."""
-    return place_of(numbers, frame, centre, facing_line(numbers, frame, centre, other, t))
-
-
-def balls(numbers, centre, theirs, their_centre):
-    return rings.ball_on_ball(numbers[3] * numbers[6], centre, theirs[3] * theirs[6], their_centre)
 
 
 def _sphere(origin, frame, centre):
@@ -672,11 +653,6 @@ def _deeper(depth, both, mine, theirs):
     away = mine[:3] - theirs[:3]
     overlap = mine[3] + theirs[3] - jnp.sqrt(dot(away, away))
     return jnp.maximum(depth, jnp.where(both, overlap, 0.0))
-
-
-def above(origin, before, frame, numbers):
-    """Where the centre line passes a joint."""
-    return origin + 0.5 * numbers[5] * (before[2] + frame[2])
 
 
 def _line(start, end):
@@ -690,10 +666,6 @@ def _faster(most, vel, palm, origin, numbers):
     speed = moving[3:] + cross(moving[:3], origin)
     turning = jnp.sqrt(dot(moving[:3], moving[:3])) * SURFACE_RADIUS * numbers[5]
     return jnp.maximum(most, jnp.sqrt(dot(speed, speed)) + turning)
-
-
-def with_axis(place: Place) -> Place:
-    return Place(*(v[:, None] for v in place[:2]), *(v[None] for v in place[2:]))
 
 
 def _stacked(*numbers):

@@ -24,7 +24,12 @@ class Cones(NamedTuple):
 
 def which_cone(pair: str) -> str:
     """The field of `Cones` for a pair of bodies: the palm's contacts have the fingers' cones."""
-    return {"palm_object": "finger_object", "palm_table": "finger_table"}.get(pair, pair)
+    same = {
+        "palm_object": "finger_object",
+        "palm_table": "finger_table",
+        "finger_itself": "finger_finger",
+    }
+    return same.get(pair, pair)
 
 
 def make_cone(scene: Scene, friction: Any, *, bodies: int, ratio: Any, stiffer: Any = 1.0) -> Cone:

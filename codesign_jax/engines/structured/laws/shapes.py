@@ -126,12 +126,6 @@ def _capsule(size: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
     return _sphere(size, jnp.stack([p[0], p[1], p[2] - nearest]))
 
 
-def object_on_table(
-    scene: Scene, hand: WorldModel, columns: jax.Array, height: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    return once(on_table, lowest_points(scene, hand, columns), height)
-
-
 def lowest_points(scene: Scene, hand: WorldModel, columns: jax.Array) -> jax.Array:
     """Points of the object that may touch a table, from its centre, shape (3, 4, world).
 

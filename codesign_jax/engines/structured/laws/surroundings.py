@@ -13,9 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured.lanes import cross, dot
+from codesign_jax.engines.structured.lanes import cross, directly, dot
 from codesign_jax.engines.structured.laws import shapes
-from codesign_jax.model.held import object_points
+from codesign_jax.engines.structured.laws.rings import Place
+from codesign_jax.model.held import EDGES, ROUND, object_points
 from codesign_jax.scene import Scene
 from codesign_jax.scene.tables import Fixture
 
@@ -165,6 +166,67 @@ def edge_on(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Contacts of the `edges` with the object, by its distance and gradient: point, normal, gap."""
     return point - 0.5 * gap * gradient, -gradient, gap
+
+
+def object_places(
+    scene: Scene,
+    position: Any,
+    height: Any,
+    columns: Any,
+    shape: Any,
+    points: Callable[[Any, Any, int | None], Any],
+    on_object: Callable[[Any, int], tuple[Any, Any]],
+    apply: Callable = directly,
+) -> list[Place]:
+    """Contacts of the object with table and fixtures, points of shape (3, point, world).
+
+    A fixture with edges has theirs behind those of the object's own points, see `edges`.
+
+    Args:
+      scene: The scene.
+      position: The object's centre [m], shape (3, 1, world); needed with fixtures alone.
+      height: Its height above the table [m], shape (1, world).
+      columns: Columns of its orientation, shape (3, 3, 1, world).
+      shape: Index of the object in the scene, shape (1, world).
+      points: Points that would touch a table in axes, shape (3, point, world): from the columns in
+        these axes, the height above the table, and the fixture's number, None for the table.
+      on_object: The object's distance field: from points and a fixture's number.
+      apply: As in `touch.touch`.
+    """
+    places = []
+    if scene.effects.table:
+        places.append(apply(_points_on_table, points(columns, height, None), height))
+    flat = [i for i, other in enumerate(scene.objects.object) if other.type not in ROUND]
+    for j, fixture in enumerate(scene.fixture):
+        gap, rows = apply(partial(towards, fixture), position)
+        arms = points(apply(faced, rows, columns), gap, j)
+        places.append(apply(partial(_points_on_fixture, fixture), position, rows, arms))
+        if flat and EDGES[fixture.type]:
+            point = apply(partial(edges, fixture), position)
+            faces = partial(_edges_on_faces, tuple(flat))
+            places.append(apply(faces, shape, point, *on_object(point, j)))
+    return places
+
+
+def _points_on_table(arms: jax.Array, height: jax.Array) -> Place:
+    point, normal, gap = shapes.on_table(arms, height)
+    return Place(point, normal, gap, jnp.ones_like(gap))
+
+
+def _points_on_fixture(
+    fixture: Fixture, position: jax.Array, rows: jax.Array, arms: jax.Array
+) -> Place:
+    point, normal, gap = object_on(fixture, position, rows, arms)
+    return Place(point, normal, gap, jnp.ones_like(gap))
+
+
+def _edges_on_faces(
+    flat: tuple[int, ...], shape: jax.Array, point: jax.Array, gap: jax.Array, gradient: jax.Array
+) -> Place:
+    """Contacts of edges with objects that have faces; a round one's own point touches alone."""
+    on, normal, gap = (v[..., 0, :] for v in edge_on(point, gap, gradient))
+    faces = jnp.isin(shape.astype(jnp.int32), jnp.array(flat))
+    return Place(on, normal, gap, jnp.where(faces, jnp.ones_like(gap), 0.0))
 
 
 def slots(scene: Scene) -> int:

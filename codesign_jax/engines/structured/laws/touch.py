@@ -14,14 +14,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.lanes import apply_columns
+from codesign_jax.engines.structured.lanes import apply_columns, directly
 from codesign_jax.engines.structured.laws import rings
 from codesign_jax.engines.structured.laws.rings import Facing, Place, Ring
-
-
-def directly(function: Callable, *args: Any) -> Any:
-    """Calls a stage of `touch` on arrays."""
-    return function(*args)
 
 
 def touch(

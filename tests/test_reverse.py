@@ -142,7 +142,7 @@ FAULTS = {
     "rings held nothing in the step before": Fault(results={"finger_object": without(3)}),
     "points held nothing in the step before": Fault(results={"object_table": without(3)}),
     "what rings hold asks nothing of accelerations": Fault(
-        results={"asks.<locals>.of_jar": without(0)}
+        results={"wrench_of_cotangents.<locals>.of_jar": without(0)}
     ),
     "what fingers hold asks nothing of accelerations": Fault(
         results={"load_cotangents.<locals>.of_held": without(0)}

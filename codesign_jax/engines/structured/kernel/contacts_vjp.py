@@ -83,10 +83,11 @@ class ContactsVjp:
     def run(self) -> None:
         """Leaves the cotangents of bodies as `rows.BodyBar`; adds all others to their tables."""
         self._clear()
-        for name, contacts in self.step.contacts.items():
-            if contacts is self.step.self_contacts:
-                self.step.self_contacts.do(self._slot)
-            elif name == "object_table":
+        if (self_contacts := self.step.self_contacts) is not None:
+            self_contacts.do(self._slot)
+        for contacts in self.step.field_contacts:
+            name = contacts.set.name
+            if name == "object_table":
                 # The points that an item deals differ in number.
                 for i in range(contacts.set.count):
                     self._where_touching(contacts, i, partial(self._points, contacts, i))

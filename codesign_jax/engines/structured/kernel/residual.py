@@ -2,9 +2,9 @@
 
 The accelerations a of a step solve F(a, theta) = 0, see `transforms`; with virtual accelerations
 lambda the derivative by theta is that of the scalar -lambda' F, a virtual power and a sum over
-links, contacts, palm and object.  Here is what each of them adds, as a function of one link or of
-the contacts of one item, over arrays as in `lanewise`, made of the functions that the forward pass
-calls.
+links, contacts, palm and object.  Here is what links, palm and object add, as functions of arrays
+as in `lanewise`, made of the functions that the forward pass calls; what contacts add is
+`kinds.power`.
 """
 
 from typing import Any, NamedTuple

@@ -64,7 +64,7 @@ class ContactsVjp:
         self.scratch = step.scratch
         self.like = step.like
         self.lane = step.block.lane
-        self.one = self._float(1)
+        self.power_bar = self._float(1)
         self.palm_row = step.layout.links + 1
         now = bodies["now"]
         palm = bodies["place"], bodies["frame"], bodies["vel"], now.palm_acc, virtual.palm_acc
@@ -217,7 +217,7 @@ class ContactsVjp:
             held = {Contact.held: contacts.read(Contact.held, i)}
             fixed |= {HeldBar.held_bar: contacts.read(HeldBar.held_bar, i)}
         run = partial(kinds.power, self.layout.scene, name)
-        mine, _, bars, held_bars = pull(run, (mine, (), numbers, held), (fixed,), self.one)
+        mine, _, bars, held_bars = pull(run, (mine, (), numbers, held), (fixed,), self.power_bar)
         friction_memory.add_held(self.bars, contacts, i, held_bars)
         return mine, bars
 
@@ -237,16 +237,16 @@ class ContactsVjp:
 
     def _support_points(self) -> dict[str, Lanes]:
         """Points of meshes that may touch table and fixtures, and distances at these' edges."""
-        found = {"support_None": self._support(self.object["columns"], self.object["height"])}
+        points = {"support_None": self._support(self.object["columns"], self.object["height"])}
         position = self.object["position"]
         for j, fixture in enumerate(self.layout.scene.fixture):
             gap, rows = lanewise(partial(surroundings.towards, fixture), position)
             turned = lanewise(surroundings.faced, rows, self.object["columns"])
-            found |= {f"support_{j}": self._support(turned, gap)}
+            points |= {f"support_{j}": self._support(turned, gap)}
             if EDGES[fixture.type]:
                 point = lanewise(partial(surroundings.edges, fixture), position)
-                found |= {f"values_{j}": self._values(point)}
-        return found
+                points |= {f"values_{j}": self._values(point)}
+        return points
 
     def _support(self, columns: Lanes, height: Lanes) -> Lanes:
         """Points that may touch a table of these axes, in the object's frame."""
@@ -271,19 +271,19 @@ class ContactsVjp:
         owner = contacts.read(Remembered.owner, item).lane > 0.5
         live = owner & (contacts.read(Contact.share, item).lane > 0)
         effects = self.layout.scene.effects
-        found = {}
+        by_pair = {}
         if pairing.itself is not None:
             other = contacts.read(Slot.other, item).lane.astype(jnp.int32)
             itself = live & pairing.itself
-            found = {"finger_palm": itself & (other == 0), "finger_itself": itself & (other > 0)}
+            by_pair = {"finger_palm": itself & (other == 0), "finger_itself": itself & (other > 0)}
             live = live & ~pairing.itself
-        found["finger_finger"] = live
+        by_pair["finger_finger"] = live
         on = {
             "finger_palm": effects.finger_palm,
             "finger_itself": touches_itself(self.layout.scene),
             "finger_finger": effects.finger_finger,
         }
-        return {pair: which for pair, which in found.items() if on[pair]}
+        return {pair: which for pair, which in by_pair.items() if on[pair]}
 
     def _reverse_slot(self, pair: str, item: Any, pairing: FingerPairing, live: jax.Array) -> None:
         contacts = self.step.self_contacts
@@ -300,7 +300,7 @@ class ContactsVjp:
         )
         run = partial(kinds.power, self.layout.scene, pair)
         args = mine, theirs, self.numbers(pair), held
-        bars = pull(run, args, (fixed | sums_bar,), self.one)
+        bars = pull(run, args, (fixed | sums_bar,), self.power_bar)
         side = lanes([live], (), wide=True)
         (body, ring), theirs, numbers, held_bar = only_on(side, bars)
         self.bars.add(numbers)

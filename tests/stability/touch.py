@@ -140,7 +140,15 @@ def tunnelling(engine, step, precision):
     return Found(impulse / converged, 0.5, f"converged impulse {converged:.2f} m/s of 5")
 
 
-@case(*FAST, "error of the velocity over that of passing through", engines=BOTH)
+PASSING = *FAST, "error of the velocity over that of passing through"
+# The finger turns by 0.8 rad in a step of 10 ms, and beyond 0.5 the engine limits velocity
+# products, so that no energy comes of them (laws/inertia.py).
+LIMITED = "velocity products beyond a turn of 0.5 rad a step"
+
+
+@case(*PASSING, name="passing_h", failure=LIMITED, steps=(1.0,))
+@case(*PASSING, steps=(0.5, 0.25))
+@case(*PASSING, engines=("mujoco",))
 def passing(engine, step, precision):
     """Error of the sphere's velocity afterwards over that of passing through unhindered."""
     velocity = velocity_after_throw(bench(weightless(), engine, step, precision))

@@ -5,6 +5,7 @@ arithmetic on lanes.
 """
 
 import functools
+import math
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -76,32 +77,37 @@ def _apply(equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
             raise NotImplementedError(f"{name} over the lanes")
         return [_reduce(_REDUCE[name], inputs[0], params["axes"])]
     rule = _SIMPLIFY.get(name)
+    options = {"y": params["y"]} if name == "integer_pow" else {}
+    types = [v.aval.dtype for v in equation.invars]
 
     def each(*parts: Any) -> Any:
         if all(map(is_number, parts)):
-            return _fold(equation, parts)
+            return _fold(equation, parts, types)
         if rule is not None:
-            simple = rule(*parts, **{"y": params["y"]} if name == "integer_pow" else {})
+            simple = rule(*parts, **options)
             if simple is not None:
                 return simple
-        return _bind(equation, parts)
+        return _bind(equation, parts, types)
 
     return [_each(each, inputs, shape)]
 
 
 def _each(function: Callable, inputs: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
-    result = np.empty(shape, object)
-    inputs = [np.broadcast_to(x, shape) for x in inputs]
-    for index in np.ndindex(shape):
-        result[index] = function(*(x[index] for x in inputs))
-    return result
+    columns = [(x if x.shape == shape else np.broadcast_to(x, shape)).ravel() for x in inputs]
+    result = np.empty(math.prod(shape), object)
+    for k, parts in enumerate(zip(*columns, strict=True)):
+        result[k] = function(*parts)
+    return result.reshape(shape)
+
+
+_NUMBERS = (bool, int, float, np.generic)
 
 
 def is_number(x: Any) -> bool:
     """Whether a component is a number that is known at trace time."""
-    return isinstance(x, bool | int | float | np.generic) or (
-        isinstance(x, np.ndarray) and x.ndim == 0
-    )
+    if type(x) is Symbol:  # most are
+        return False
+    return isinstance(x, _NUMBERS) or (isinstance(x, np.ndarray) and x.ndim == 0)
 
 
 _EXACT: dict[str, Callable] = {
@@ -125,8 +131,7 @@ _EXACT: dict[str, Callable] = {
 """NumPy's functions with JAX's bits, but for quotients of integers; JAX would compile programs."""
 
 
-def _fold(equation: Any, parts: tuple) -> Any:
-    types = [v.aval.dtype for v in equation.invars]
+def _fold(equation: Any, parts: tuple, types: list) -> Any:
     name = equation.primitive.name
     arrays = [np.asarray(p, t) for p, t in zip(parts, types, strict=True)]
     if name == "convert_element_type":
@@ -137,13 +142,12 @@ def _fold(equation: Any, parts: tuple) -> Any:
         return np.asarray(equation.primitive.bind(*arrays, **equation.params))[()]
 
 
-def _bind(equation: Any, parts: tuple) -> Any:
+def _bind(equation: Any, parts: tuple, types: list) -> Any:
     for part in parts:
-        if isinstance(part, Symbol):
-            types = [v.aval.dtype for v in equation.invars]
+        if type(part) is Symbol:
             return part.program.record(equation, parts, types, equation.outvars[0].aval.dtype)
     shape = next(p.shape for p in parts if not is_number(p))
-    arrays = [splat(p, shape, v.aval.dtype) for p, v in zip(parts, equation.invars, strict=True)]
+    arrays = [splat(p, shape, kind) for p, kind in zip(parts, types, strict=True)]
     return equation.primitive.bind(*arrays, **equation.params)
 
 

@@ -89,7 +89,7 @@ faults: $(STAMP)
 	FAULTS=$(FAULTS) nice -n 5 $(BIN)/python -m pytest -q scripts/faults.py $(ARGS)
 
 notebooks: $(STAMP)
-	$(BIN)/python -m scripts.run_notebooks
+	$(BIN)/python -m scripts.run_notebooks --workers $(WORKERS)
 
 # Whole grasps of all engines; a file that exists is extended.
 BENCHMARK ?= runs/rates.json

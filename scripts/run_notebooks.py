@@ -59,15 +59,17 @@ def save_figures(notebook, stem: str) -> None:
 
 
 def main() -> int:
-    """Runs the notebooks, two at a time as they mostly compile, and returns the exit status."""
+    """Runs the notebooks, and returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--figures", action="store_true", help="keep figures in docs/figures")
-    execute = functools.partial(run, keep_figures=parser.parse_args().figures)
+    parser.add_argument("--workers", type=int, default=2, help="notebooks at a time")
+    arguments = parser.parse_args()
+    execute = functools.partial(run, keep_figures=arguments.figures)
     if os.environ.get("CODESIGN_FAST"):
         compile_flags.use()
     # The last ones take longest: first, so that neither process waits for the other at the end.
     paths = sorted((ROOT / "notebooks").glob("*.py"), reverse=True)
-    with ProcessPoolExecutor(2) as pool:
+    with ProcessPoolExecutor(arguments.workers) as pool:
         errors = [error for error in pool.map(execute, paths) if error]
     print(*errors, sep="\n", end="", file=sys.stderr)
     return 1 if errors else 0

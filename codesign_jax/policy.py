@@ -152,9 +152,11 @@ class ControlLoop(Equal):
         """As of the engine."""
         return self.engine.observe(fields)
 
-    def contacts(self, fields: ModelFields, state: jax.Array, *, find: bool = True) -> Forces:
+    def contacts(
+        self, fields: ModelFields, state: jax.Array, pressure: jax.Array, *, find: bool = True
+    ) -> Forces:
         """As of the engine."""
-        return self.engine.contacts(fields, state, find=find)
+        return self.engine.contacts(fields, state, pressure, find=find)
 
     commands = staticmethod(control.plan)
     """What `rollout.prepare` makes for `rollout`: the plan instead of controls."""
@@ -247,7 +249,7 @@ class ControlLoop(Equal):
     ) -> tuple[Any, Command]:
         seen = observe(self.scene, look, fields, world, plan)
         if tells_forces(self.engine):
-            contacts = partial(self.engine.contacts, fields, world.state)
+            contacts = partial(self.engine.contacts, fields, *world)
             seen = seen._replace(forces=contacts(find=False))
             if reads_forces(self.policy, memory, seen):
                 seen = seen._replace(forces=contacts())

@@ -142,7 +142,7 @@ def test_what_is_observed_is_where_mujoco_has_it(worlds):
         pushed = jax.tree.map(lambda v: v[:, -1], recorded.forces)
         world = policy.begin(scene, fields, plan)._replace(state=recorded.last)
         seen = policy.observe(scene, engine.observe(fields), fields, world, plan)
-        seen = seen._replace(forces=engine.contacts(fields, recorded.last))
+        seen = seen._replace(forces=engine.contacts(fields, recorded.last, ctrl[:, 24, 6:]))
         return recorded.last, fields, pushed, seen
 
     last, fields, pushed, seen = grasps.nth(look(*worlds[0]), ...)

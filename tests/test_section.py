@@ -2,7 +2,6 @@
 
 import dataclasses
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 
 from codesign_jax import parameters, scene
 from codesign_jax.model import morphology
-from codesign_jax.scene import beams, section_law, section_numbers
+from codesign_jax.scene import beams, section_growth, section_law, section_numbers
 from scripts.section import elements, growth, study
 from scripts.section.elements import Model, Section
 from tests.helpers import exact_sections
@@ -344,20 +343,37 @@ def test_pressures_of_the_hand_to_build_are_within_the_law():
 
 
 def test_sections_grow_as_elements_do():
-    """At 20 and 50 kPa, of the section of the note; and not without pressure."""
-    coefficients, errors = growth.fitted()
-    _, states = study.read(DATA)["nominal02"]
-    free = (np.abs(states["moment_bend"]) < 1e-6) & (states["lateral"] == 0)
-    for pressure in (20e3, 50e3):
-        [k] = np.flatnonzero(free & (states["pressure"] == pressure))
-        section = np.array([[[20e-3, 5e-3, 8e-3, 24e-3]]])
-        params = SimpleNamespace(pressure=np.array([[pressure]]))
-        larger = np.asarray(growth.grown(section, params, G, coefficients))[0, 0]
-        sizes = states["high"][k] - states["low"][k], states["width"][k]
-        ratios = larger[[0, 3]] / sizes
-        # The fit's own errors are 3 %, root mean square.
-        np.testing.assert_allclose(ratios, 1, atol=3 * errors.max())
-        np.testing.assert_array_equal(larger[1:3], section[0, 0, 1:3].astype(larger.dtype))
-    params.pressure = np.zeros((1, 1))
-    same = np.asarray(growth.grown(section, params, G, coefficients))
-    np.testing.assert_allclose(same, section, rtol=1e-6)
+    """Also those that took no part in the fit, whose constants are those of the package."""
+    data = growth.states()
+    wrong = growth.errors(data)
+    usual = data.held_out & data.usual
+    assert usual.sum() > 500
+    # Root mean square of height and width over those without pressure; the note has 1.8 and 1.7 %.
+    assert np.sqrt((wrong[usual] ** 2).mean(0)).max() < 0.02
+    # As large as at rest they would err by 25 and 11 %: growth is told from none.
+    assert (np.sqrt(((data.grown[usual] - 1) ** 2).mean(0)) > 0.1).all()
+    law = section_growth
+    package = law.HIGHEST, law.HEIGHT_RATE, law.WIDEST, law.WIDTH_RATE
+    np.testing.assert_allclose(growth.fitted(data), package, rtol=5e-3)  # as they are rounded
+
+
+def test_sections_grow_to_the_circle_of_their_thread():
+    """Of the thread's length, with the walls around it; without pressure and in a vacuum not."""
+    shape = np.array([20e-3, 16e-3]), np.array([2e-3, 3e-3]), np.array([24e-3, 30e-3])
+    height, wall, width = shape
+    for depth in (0.0, 0.5):
+        grows = section_growth.growth(*shape, shear_modulus=G, thread_depth=depth)
+        thread = 2 * (width + height - 4 * depth * wall)
+        diameter = thread / np.pi + 2 * depth * wall
+        most = section_growth.factors(grows, np.full(2, 1e9))
+        np.testing.assert_allclose((most[0] - 1) / section_growth.HIGHEST, diameter / height - 1)
+        np.testing.assert_allclose((most[1] - 1) / section_growth.WIDEST, diameter / width - 1)
+        for pressure in (0.0, -20e3):
+            same = section_growth.factors(grows, np.full(2, pressure))
+            np.testing.assert_array_equal(same, 1.0)
+        # Softer silicone grows as under a higher pressure.
+        soft = section_growth.growth(*shape, shear_modulus=G / 2, thread_depth=depth)
+        np.testing.assert_allclose(
+            section_growth.factors(soft, np.full(2, 20e3)),
+            section_growth.factors(grows, np.full(2, 40e3)),
+        )

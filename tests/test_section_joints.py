@@ -12,9 +12,10 @@ from codesign_jax import model, preflight
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.model import morphology
+from codesign_jax.scene import section_growth
 from scripts.section import study
 from scripts.shared import energy
-from tests.helpers import grasps, oracles
+from tests.helpers import curled_hands, grasps, oracles
 from tests.helpers.refusals import refusal
 
 DATA = Path(__file__).parents[1] / "docs" / "data"
@@ -101,6 +102,85 @@ def test_nothing_gains_energy(simulated):
     assert simulated.rise.max() < 0.01, simulated.rise
 
 
+GROWING = SETTINGS | {
+    "effects__section_growth": True,
+    "effects__finger_finger": True,
+    "effects__finger_palm": True,
+    "effects__finger_itself": True,
+    "effects__friction_memory": True,
+    **grasps.off("palm_object palm_table"),  # whose rings are as wide as a finger
+}
+
+
+@pytest.fixture(scope="module")
+def grown():
+    """Worlds whose fingers press on a box, the table, one another and the palm; pressures stay."""
+    starts = (3, 0.6, 0.07), (3, 0.8, 0.08), (1, 0.3, 0.09), (5, 1.3, 0.25)
+    with jax.enable_x64(True):
+        the_scene = grasps.pinch("box", **GROWING)
+        worlds = []
+        controls = []
+        for seed, bend, height in starts:
+            fields, qpos, qvel, ctrl = curled_hands.state(the_scene, seed, bend, height)
+            worlds.append(fields._replace(start=np.concatenate([qpos, qvel])))
+            controls.append(np.repeat(ctrl[None], 60, 0))
+        return the_scene, grasps.stack(*worlds), np.stack(controls)
+
+
+def recorded(the_scene, fields, ctrl):
+    engine = StructuredEngine(the_scene).recording()
+    with jax.enable_x64(True):
+        return grasps.nth(jax.jit(engine.rollout)(fields, ctrl), ...)
+
+
+def built_larger(fields, pressure):
+    """Fields of hands with sections as large as pressure makes them, of the same mass and springs.
+
+    Args:
+      pressure: Of the chambers [Pa], shape (world, finger).
+    """
+    assert fields.growth is not None
+    growth = section_growth.Growth(*np.moveaxis(fields.growth[:, :, 0], -1, 0))
+    height, width = section_growth.factors(growth, pressure)
+    ones = np.ones_like(height)
+    section = fields.section * np.stack([height, ones, ones, width], -1)
+    return fields._replace(section=section, growth=None, first_pressure=None)
+
+
+def test_sections_that_grow_touch_as_hands_that_are_built_larger(grown):
+    """At steady pressures: contact forces of the fingers, and motion."""
+    the_scene, fields, ctrl = grown
+    mine = recorded(the_scene, fields, ctrl)
+    still = grasps.pinch("box", **GROWING | {"effects__section_growth": False})
+    theirs = recorded(still, built_larger(fields, ctrl[:, 0, 6:]), ctrl)
+    plain = recorded(still, fields._replace(growth=None, first_pressure=None), ctrl)
+    # Rounding of sizes, 1e-16, that contacts multiply step by step; forces are up to 50 N.
+    np.testing.assert_allclose(mine.last, theirs.last, rtol=1e-6, atol=1e-8)
+    for name in ("finger", "finger_table", "finger_finger", "finger_palm"):
+        one, other, without = (getattr(t.forces, name) for t in (mine, theirs, plain))
+        np.testing.assert_allclose(one, other, atol=1e-6, err_msg=name)
+        assert np.abs(one - without).max() > 0.1, name
+
+
+@pytest.mark.slow  # two kernels; quick: forces are those of hands that are built larger
+def test_sections_that_grow_gain_no_energy(grown, monkeypatch):
+    """They push what they touch: that is work of the chambers, which the audit has to know."""
+    the_scene, fields, ctrl = grown
+    rising = ctrl.copy()
+    rising[:, :, 6:] *= np.interp(np.arange(60), [30, 59], [0.3, 1.0])[:, None]
+    with jax.enable_x64(True):
+        engine = StructuredEngine(the_scene)
+        run = jax.jit(functools.partial(engine.states, trajectory=True))
+        series = run(fields, rising)[1]
+        path = energy.Path(*(series[n] for n in energy.Path._fields))
+        known = energy.audit(the_scene, fields, rising, path)
+        monkeypatch.setattr(energy, "sections_grow", lambda _: False)
+        unknown = energy.audit(the_scene, fields, rising, path)
+    # While pressures rise: before that, contacts that begin deep are pushed apart.
+    rises = [audit.rise(first=30) / audit.stored.max(1) for audit in (known, unknown)]
+    assert rises[0].max() < 0.01 and rises[1].max() > 0.1, rises
+
+
 def test_a_crossed_winding_is_stiffer_and_a_single_one_twists():
     fields = []
     for winding in ("crossed", "single"):
@@ -143,6 +223,11 @@ def test_engines_of_mujoco_bend_fingers_alike(name):
 )
 def test_effects_that_the_law_has_or_cannot_have_are_refused(settings, key):
     assert refusal(grasps.pinch, **LAW | settings) == [("conflict", key)]
+
+
+def test_growth_is_refused_with_chambers_that_keep_their_section():
+    settings = {"effects__air_mass": True, "effects__section_growth": True}
+    assert refusal(grasps.pinch, **settings) == [("unsupported", "effects.air_mass")]
 
 
 @pytest.mark.parametrize(

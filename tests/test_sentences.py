@@ -47,6 +47,7 @@ OF_ELEMENTS = {
     "hand.section.law": "elements",
     "effects.lateral_threshold": True,
     "effects.air_mass": True,
+    "effects.section_growth": True,
 }
 SUMS = ("2 * (arm_z)", "arm_z -", "arm_z - 0,01", "30°", "150 kPa", "1e3 * arm_z", "95")
 CALLS = {

@@ -86,12 +86,15 @@ class Engine(Protocol):
         """
         ...
 
-    def contacts(self, fields: ModelFields, state: jax.Array, *, find: bool = True) -> Forces:
+    def contacts(
+        self, fields: ModelFields, state: jax.Array, pressure: jax.Array, *, find: bool = True
+    ) -> Forces:
         """Contact forces of the time steps that led to states; they have no derivative.
 
         Args:
           fields: Model fields, every array with a leading world axis.
           state: States, shape (world, n).
+          pressure: Pressures of the chambers in these steps [Pa], shape (world, finger).
           find: Whether the forces are found; else zeros stand for them, which take no time.
 
         Returns:

@@ -16,7 +16,7 @@ import numpy as np
 from codesign_jax.engines.structured.coordinates import reset
 from codesign_jax.engines.structured.kernel import kinds, self_collision
 from codesign_jax.engines.structured.lanes import apply_columns, once
-from codesign_jax.engines.structured.laws import shapes, surroundings
+from codesign_jax.engines.structured.laws import rings, shapes, surroundings
 from codesign_jax.engines.structured.laws.kinematics import Kinematics, straight
 from codesign_jax.engines.structured.laws.rings import Place
 from codesign_jax.engines.structured.laws.touch import ring_centre, touch
@@ -79,6 +79,8 @@ def depth_between(scene: Scene, fields: ModelFields) -> jax.Array:
     hand, kin, _ = _straight(scene, fields)
     centre = jnp.moveaxis(hand.centre, 1, 0)
     up = centre[2]
+    if hand.growth is not None:
+        up = up * _first_growth(hand)[0]
     middle = kin.origin + apply_columns(kin.link, centre)
     deepest = []
     for a, b in itertools.combinations(range(count), 2):
@@ -133,9 +135,8 @@ def places(
         by_pair[name] = _joined([_touch(scene, x, numbers, frame, centre) for x in looks], axis)
 
     if count := rings_of_link(scene):
-        assert hand.ring is not None
-        numbers = hand.ring.reshape(-1, count, *hand.ring.shape[1:])
-        numbers = jnp.moveaxis(numbers, 2, 0)
+        numbers = _first_rings(hand, count)
+        numbers = jnp.moveaxis(numbers.reshape(-1, count, *numbers.shape[1:]), 2, 0)
         for name in ("finger_object", "finger_table"):
             add(name, numbers, kin.origin[:, :, None], kin.link[:, :, :, None])
     if palm_touches(scene):
@@ -148,12 +149,37 @@ def places(
     return by_pair
 
 
+def _first_rings(hand: WorldModel, k: int) -> jax.Array:
+    """Numbers of the fingers' rings or spheres as a grasp begins, see `WorldModel.ring`.
+
+    Args:
+      k: Rings or spheres of a link.
+    """
+    numbers = hand.ring
+    assert numbers is not None
+    if hand.growth is None:
+        return numbers
+    factors = _first_growth(hand)
+    if factors.shape[1] > 1:
+        factors = jnp.repeat(factors, k, axis=1)
+    return jnp.moveaxis(once(rings.grown, jnp.moveaxis(numbers, 1, 0), factors), 0, 1)
+
+
+def _first_growth(hand: WorldModel) -> jax.Array:
+    """Height and width of sections as a grasp begins over those without pressure.
+
+    Shape (2, section, finger, world).
+    """
+    assert hand.growth is not None and hand.first_pressure is not None
+    return once(rings.growth_factors, jnp.moveaxis(hand.growth, 1, 0), hand.first_pressure[None])
+
+
 def _depth_of_rings(scene: Scene, hand: WorldModel, kin: Kinematics) -> jax.Array:
     """Deepest overlap with the palm's disc of rings or spheres that may touch it [m], (world,)."""
-    assert hand.palm_disc is not None and hand.ring is not None
+    assert hand.palm_disc is not None
     k = rings_of_link(scene)
     first = (first_on_palm(scene.discretization.links) - 1) * k
-    numbers = jnp.moveaxis(hand.ring, 1, 0)
+    numbers = jnp.moveaxis(_first_rings(hand, k), 1, 0)
     numbers = jnp.broadcast_to(numbers, (*numbers.shape[:2], *kin.origin.shape[2:]))
     inner = numbers[:, first:]
     link = np.arange(first, numbers.shape[1]) // k

@@ -110,7 +110,9 @@ class MjxEngine(Equal):
     def observe(self, fields: ModelFields) -> Callable[[jax.Array], Bodies]:
         return bodies.observer(self.scene, fields)
 
-    def contacts(self, fields: ModelFields, state: jax.Array, *, find: bool = True) -> Forces:
+    def contacts(
+        self, fields: ModelFields, state: jax.Array, pressure: jax.Array, *, find: bool = True
+    ) -> Forces:
         refuse_forces(self.name)
 
     def rollout(self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False) -> Trace:

@@ -268,7 +268,7 @@ class GraspEnv:
         fields, world, plan = _batch((data.fields, data.world, self._ahead(data)))
         seen = policy.observe(self.scene, self.engine.observe(fields), fields, world, plan)
         if tells_forces(self.engine):
-            seen = seen._replace(forces=self.engine.contacts(fields, world.state))
+            seen = seen._replace(forces=self.engine.contacts(fields, *world))
         return _one(seen)
 
     def _held(self, data: Data, trace: Trace, world: World) -> tuple[jax.Array, jax.Array]:

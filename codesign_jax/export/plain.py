@@ -23,6 +23,7 @@ import numpy as np
 from codesign_jax.export import mjcf
 from codesign_jax.model import contact_invweight, morphology
 from codesign_jax.model.held import keeps
+from codesign_jax.model.layout import sections_grow
 from codesign_jax.model.pairs import SOLIMP
 from codesign_jax.scene import Scene, effects, silicones
 from codesign_jax.types import Params, Trial
@@ -42,7 +43,7 @@ def differences(scene: Scene) -> list[str]:
     """What of a scene the model lacks or has in another form, a sentence each."""
     left_out = {name: effect.plain for name, effect in effects.EFFECTS.items() if effect.plain}
     acts = {name: getattr(scene.effects, name) for name in left_out}
-    acts |= {"friction_memory": keeps(scene)}
+    acts |= {"friction_memory": keeps(scene), "section_growth": sections_grow(scene)}
     sentences = [
         f"the model is without effects.{name}: {sentence}"
         for name, sentence in left_out.items()

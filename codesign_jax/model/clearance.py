@@ -7,8 +7,8 @@ import itertools
 
 import numpy as np
 
-from codesign_jax.model.layout import beyond_base, mount_points
-from codesign_jax.model.morphology import sections
+from codesign_jax.model.layout import beyond_base, mount_points, sections_grow
+from codesign_jax.model.morphology import growth_numbers, sections
 from codesign_jax.scene import Scene, key_frames
 from codesign_jax.types import Params
 
@@ -84,10 +84,14 @@ def _depth_in_palm(scene: Scene, points: np.ndarray) -> np.ndarray:
 
 
 def _largest_section(scene: Scene, design: Params) -> tuple[np.ndarray, np.ndarray]:
-    """Largest outer width and height of each finger [m], shape (finger,)."""
+    """Largest outer width and height of each finger as a grasp begins [m], shape (finger,)."""
     ends = sections(scene.hand, design, np.array([0.0, 1.0]))
-    sizes = np.broadcast_arrays(ends.width, ends.height)
-    width, height = (np.asarray(v, float).max(1) for v in sizes)
+    sizes = [ends.width, ends.height]
+    if sections_grow(scene) and scene.control.frame[0].pressure is not None:
+        grows = growth_numbers(scene.hand, design, np.array([0.0, 1.0]))
+        most = np.maximum(grows.width, 0.0), np.maximum(grows.height, 0.0)
+        sizes = [size * (1 + more) for size, more in zip(sizes, most, strict=True)]
+    width, height = (np.asarray(v, float).max(1) for v in np.broadcast_arrays(*sizes))
     return width, height
 
 

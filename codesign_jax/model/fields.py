@@ -13,6 +13,7 @@ from codesign_jax.model.layout import (
     mounts,
     object_pose,
     object_size,
+    sections_grow,
     wrist_springs,
 )
 from codesign_jax.scene import Scene, key_frames, section_law, section_numbers
@@ -67,6 +68,9 @@ class ModelFields(NamedTuple):
       tip: Height, wall and width at the tips of tapered fingers [m], shape (finger, 3), or None.
       law: What `section_law` needs of the sections at the joints, and last the length of a segment
         [m], shape (finger, N, number), N = 1 where they are alike; None with the law "chamber".
+      growth: How the sections at the joints grow, `section_growth.Growth`, shape (finger, N, 4),
+        N = 1 where they are alike; None without the effect `section_growth`.
+      first_pressure: Pressures with which the key frames begin [Pa], shape (finger,); likewise.
     """
 
     base: jax.Array
@@ -92,6 +96,8 @@ class ModelFields(NamedTuple):
     threshold: jax.Array | None = None
     tip: jax.Array | None = None
     law: jax.Array | None = None
+    growth: jax.Array | None = None
+    first_pressure: jax.Array | None = None
 
     @property
     def num_dofs(self) -> int:
@@ -193,6 +199,7 @@ def model_fields(scene: Scene, params: Params, trial: Trial) -> ModelFields:
         threshold=threshold,
         tip=None if params.tip is None else jnp.stack(params.tip, -1),
         law=_law(scene, params),
+        **_growth(scene, params),
     )
     return _in_type(fields, dtype)
 
@@ -240,6 +247,17 @@ def _law(scene: Scene, params: Params) -> jax.Array | None:
     numbers = morphology.law_numbers(scene.hand, params, links)
     segment = (params.length / links)[:, None]
     return jnp.stack(jnp.broadcast_arrays(*numbers, segment), -1)
+
+
+def _growth(scene: Scene, params: Params) -> dict[str, jax.Array]:
+    if not sections_grow(scene):
+        return {}
+    places = morphology.at_joints(layout(scene).links)
+    grows = morphology.growth_numbers(scene.hand, params, places)
+    return {
+        "growth": jnp.stack(jnp.broadcast_arrays(*grows), -1),
+        "first_pressure": key_frames.first_pressure(scene, params),
+    }
 
 
 def section_springs(

@@ -245,6 +245,11 @@ def touches_itself(scene: Scene) -> bool:
     return scene.effects.finger_itself and scene.effects.surface == "hull"
 
 
+def sections_grow(scene: Scene) -> bool:
+    """Whether contact surfaces of fingers grow with their pressure; spheres do not."""
+    return scene.effects.section_growth and scene.effects.surface == "hull"
+
+
 PALM_FROM = 0.25
 """Share of a finger's length from its base that is not tested against the palm, to which it is
 fixed."""

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from codesign_jax.model.layout import beyond_base
-from codesign_jax.scene import section_law, section_numbers, silicones
+from codesign_jax.scene import section_growth, section_law, section_numbers, silicones
 from codesign_jax.scene.beams import Beam, beam, softening
 from codesign_jax.scene.hand import Hand, highest_pressure
 from codesign_jax.scene.primitives import block_inertia
@@ -30,6 +30,7 @@ __all__ = [
     "free_bends",
     "free_curvatures",
     "joint_springs",
+    "growth_numbers",
     "law_numbers",
     "pressure_limits",
     "section_bends",
@@ -205,6 +206,11 @@ def law_numbers(
     shapes = sections(hand, params, at_joints(links))
     length = params.length[:, None]
     return section_numbers.of_hand(hand, *shapes, length, thread_depth=thread_depth)
+
+
+def growth_numbers(hand: Hand, params: Params, places: Any) -> section_growth.Growth:
+    """How sections at places along fingers grow, see `sections`; shape (finger, place)."""
+    return section_growth.of_hand(hand, *sections(hand, params, places))
 
 
 def _softened(linear: np.ndarray, section: Section) -> np.ndarray:

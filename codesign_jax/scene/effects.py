@@ -81,6 +81,11 @@ EFFECTS: Mapping[str, Effect] = {
         {"mujoco": {True: _SPRINGS}, "mjx": {True: _SPRINGS}},
         plain="pressures equal the commands, whatever the volumes of the chambers",
     ),
+    "section_growth": Effect(
+        "with the hull, sections of fingers grow with their pressure",
+        hull=True,
+        plain="sections keep their size under pressure",
+    ),
     "gravity": Effect("everything has weight"),
 }
 

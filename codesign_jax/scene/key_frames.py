@@ -241,6 +241,15 @@ def pressures(scene: Any, params: Params) -> list[tuple[Any, jax.Array]]:
     ]
 
 
+def first_pressure(scene: Any, params: Params) -> jax.Array:
+    """Pressures with which chambers begin [Pa], shape (finger,): those that the supply reaches."""
+    none = jnp.zeros_like(params.pressure)
+    wanted = sum((value * factors[0] for value, factors in pressures(scene, params)), none)
+    if scene.effects.pressure_dynamics:
+        return jnp.minimum(wanted, scene.pneumatics.maximum)
+    return wanted
+
+
 def _names(scene: Any, params: Params) -> dict[str, Any]:
     values = _scene_times(scene)
     values |= {key: getattr(scene.arm, key) for key in ("start_height", "zero_height")}

@@ -264,6 +264,12 @@ def check_together(scene: SceneFile, where: str) -> list[str]:
             "which effects.lateral_threshold = true says it does"
         )
         problems.append(schema.Problem("unsupported", sentence))
+    if scene.effects.air_mass and scene.effects.section_growth:
+        sentence = (
+            f"{where}.effects.air_mass = true has chambers that pressure does not enlarge, which "
+            "effects.section_growth = true says it does"
+        )
+        problems.append(schema.Problem("unsupported", sentence))
     if isinstance(scene, Scene):
         problems += key_frames.check(scene, f"{where}.control")
         law = silicones.law_problem(scene.effects.neo_hookean, scene.hand.material, where)

@@ -41,6 +41,7 @@ class Effects:
     lateral_threshold: bool = False
     pressure_dynamics: bool = False
     air_mass: bool = False
+    section_growth: bool = False
     gravity: bool = True
 
 

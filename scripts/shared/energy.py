@@ -26,6 +26,7 @@ from codesign_jax.engines.structured.laws import inertia, integration
 from codesign_jax.engines.structured.laws import kinematics as kin
 from codesign_jax.engines.structured.world_model import WorldModel, world_constants
 from codesign_jax.model import joint_axes
+from codesign_jax.model.layout import sections_grow
 from codesign_jax.scene import Scene, load, parameters
 
 
@@ -104,7 +105,7 @@ def _world(scene: Scene, fields: Any, ctrl: Any, qpos: Any, qvel: Any, *held: An
     state = coordinates.make(scene, qpos, qvel, jnp.zeros_like(qvel), *held)
     state = integration.before(state, scene.discretization.timestep / 2)
     kinetic, height = _bodies(hand, kin.kinematics(hand, joint_axes(scene), state), state)
-    other = kinetic + forces.contact_energy(scene, hand, state)
+    other = kinetic
     if scene.effects.gravity:
         other = other + hand.step_numbers["gravity"][0] * height
     h = scene.discretization.timestep
@@ -119,6 +120,9 @@ def _world(scene: Scene, fields: Any, ctrl: Any, qpos: Any, qvel: Any, *held: An
     def joints(pressure: jax.Array) -> jax.Array:
         return inertia.joint_energy(constants, pressure, q).sum((0, 1))
 
+    def contacts(pressure: jax.Array) -> jax.Array:
+        return forces.contact_energy(scene, hand, state, pressure.T)
+
     pressure = ctrl[:, 6:].T
     springs = joints(jnp.zeros_like(pressure))
     before = jnp.roll(pressure, 1, 1)
@@ -126,7 +130,11 @@ def _world(scene: Scene, fields: Any, ctrl: Any, qpos: Any, qvel: Any, *held: An
     last = jnp.roll(wrist, 1, 1)
     arm = jnp.roll(ctrl[:, :6].T, 1, 1)
     work = (hand.wrist_stiffness[:, 0] * (arm - (wrist + last) / 2) * (wrist - last)).sum(0)
-    return other + joints(pressure), other + joints(before) - work, kinetic + springs
+    # Sections that grow press on what they touch: that is work of the chambers.
+    touching = contacts(pressure)
+    touched = contacts(before) if sections_grow(scene) else touching
+    at_mid = other + touching + joints(pressure)
+    return at_mid, other + touched + joints(before) - work, kinetic + springs
 
 
 def _implicit(scene: Scene, hand: WorldModel, angles: Any, ctrl: Any) -> list[Any]:

@@ -179,7 +179,9 @@ class StructuredEngine(Equal):
     def observe(self, fields: ModelFields) -> Callable[[jax.Array], Bodies]:
         return bodies.observer(self.scene, fields)
 
-    def contacts(self, fields: ModelFields, state: jax.Array, *, find: bool = True) -> Forces:
+    def contacts(
+        self, fields: ModelFields, state: jax.Array, pressure: jax.Array, *, find: bool = True
+    ) -> Forces:
         """See `Engine.contacts`.
 
         What fingers hold on one another is that after the step, from which the force between two
@@ -189,10 +191,11 @@ class StructuredEngine(Equal):
             shapes = forces.shapes(self.scene, len(state), state.dtype)
             return jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
 
-        def of_worlds(fields: ModelFields, start: jax.Array) -> Forces:
+        def of_worlds(fields: ModelFields, start: jax.Array, pressure: jax.Array) -> Forces:
             after = self.reset(fields._replace(start=start))
             earlier = before(after, self.scene.discretization.timestep)
-            every = forces.forces(self.scene, world_constants(self.scene, fields), earlier)
+            hand = world_constants(self.scene, fields)
+            every = forces.forces(self.scene, hand, earlier, pressure)
             stepped = (after.step[0, 0] > 0) & (after.going[0, 0] > 0)
 
             def masked(v: jax.Array) -> jax.Array:
@@ -201,7 +204,7 @@ class StructuredEngine(Equal):
             return jax.tree.map(masked, every)
 
         # Accelerations of a rollout have no derivative.
-        return transforms.folded(of_worlds)(*jax.lax.stop_gradient((fields, state)))
+        return transforms.folded(of_worlds)(*jax.lax.stop_gradient((fields, state, pressure)))
 
     def recording(self, *, touch: bool = False) -> "RecordingEngine":
         """As an engine whose traces have the contact forces, see `base.recording`."""
@@ -301,8 +304,10 @@ class RecordingEngine(Equal):
     def observe(self, fields: ModelFields) -> Callable[[jax.Array], Bodies]:
         return self.engine.observe(fields)
 
-    def contacts(self, fields: ModelFields, state: jax.Array, *, find: bool = True) -> Forces:
-        return self.engine.contacts(fields, state, find=find)
+    def contacts(
+        self, fields: ModelFields, state: jax.Array, pressure: jax.Array, *, find: bool = True
+    ) -> Forces:
+        return self.engine.contacts(fields, state, pressure, find=find)
 
     def recording(self, *, touch: bool = False) -> "RecordingEngine":
         return RecordingEngine(self.engine, touch=touch or self.touch)

@@ -30,27 +30,30 @@ def of_rollout(program: Program, out: Outputs, worlds: int) -> Forces:
     return _summed(program, program.by_name(out.recorded, worlds), none)
 
 
-def forces(scene: Scene, hand: WorldModel, state: State, *, touch: bool = False) -> Forces:
+def forces(
+    scene: Scene, hand: WorldModel, state: State, pressure: jax.Array, *, touch: bool = False
+) -> Forces:
     """Forces of the step from states by the accelerations that they have.
 
     Args:
       state: States before the step, with the friction that contacts held then.
+      pressure: Pressures of the chambers in the step [Pa], shape (world, finger).
       touch: Whether to tell the object's contacts ring by ring, `Forces.touch`.
 
     Returns:
       The forces, every array with a leading axis (world,).
     """
-    program, out = _of_states(scene, hand, state, Record(touch=touch))
+    program, out = _of_states(scene, hand, state, pressure, Record(touch=touch))
     every = of_rollout(program, out, state.wrist.shape[-1])
     return jax.tree.map(lambda v: v[:, 0], every)
 
 
-def contact_energy(scene: Scene, hand: WorldModel, state: State) -> jax.Array:
+def contact_energy(scene: Scene, hand: WorldModel, state: State, pressure: jax.Array) -> jax.Array:
     """Energy of the springs of all contacts and of the friction that they hold [J], shape (world,).
 
-    See `holding.stored_energy`.
+    See `holding.stored_energy`; arguments as `forces`.
     """
-    program, out = _of_states(scene, hand, state, Record(energy=True))
+    program, out = _of_states(scene, hand, state, pressure, Record(energy=True))
     recorded = program.by_name(out.recorded, state.wrist.shape[-1])
     total = jnp.zeros_like(state.wrist[0, 0])
     for contacts in program.sets:
@@ -83,16 +86,16 @@ def _program(scene: Scene, dtype: Any, worlds: int, record: Record) -> Program:
 
 
 def _of_states(
-    scene: Scene, hand: WorldModel, state: State, record: Record
+    scene: Scene, hand: WorldModel, state: State, pressure: jax.Array, record: Record
 ) -> tuple[Program, Outputs]:
     """What one step from states writes, with the accelerations that they have."""
     worlds = state.wrist.shape[-1]
     program = _program(scene, state.wrist.dtype, worlds, record)
     h = scene.discretization.timestep
-    # By these commands a rigid wrist has the state's accelerations; chambers have no part in them.
+    # By these commands a rigid wrist has the state's accelerations.
     arm = state.wrist + h * (state.wrist_vel + h * state.acc.wrist)
     arm = arm.reshape(6, -1).T
-    ctrl = jnp.concatenate([arm, jnp.zeros((worlds, program.num_fingers), arm.dtype)], 1)
+    ctrl = jnp.concatenate([arm, pressure], 1)
     return program, program.execute(program.inputs(hand, state, ctrl[:, None]))
 
 

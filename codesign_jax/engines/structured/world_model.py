@@ -93,6 +93,8 @@ class WorldModel(NamedTuple):
     # (link, ...)
     threshold: jax.Array | None
     law: jax.Array | None  # See `ModelFields`, shape (1, n, finger, world), of tapered (link, ...)
+    growth: jax.Array | None  # Likewise, shape (1, 4, finger, world), of tapered (link, ...)
+    first_pressure: jax.Array | None  # Likewise, shape (finger, world)
     volume: jax.Array | None  # Of a straight finger's chamber, shape (finger, world)
     # Radius and half the thickness of the palm's disc, shape (2, 1, world)
     palm_disc: jax.Array | None
@@ -135,7 +137,7 @@ OF_FINGERS = {
     name: 0
     for name in (
         "base mount offset mass centre inertia stiffness damping armature gain spheres share "
-        "section threshold tip law"
+        "section threshold tip law growth first_pressure"
     ).split()
 }
 """Model fields with a leading axis (finger,), for `jax.vmap`."""
@@ -200,6 +202,8 @@ def _finger(scene: Scene, fields: ModelFields) -> dict[str, jax.Array | None]:
         "section": section,
         "threshold": fields.threshold,
         "law": fields.law,
+        "growth": fields.growth,
+        "first_pressure": fields.first_pressure,
         "volume": volume,
     }
 

@@ -105,7 +105,7 @@ class ReverseStep(Step):
         right["smooth_palm"] = _none(bodies["palm"].smooth_palm)
         problem = Problem(self, bodies["palm"]._replace(**right))
         virtual = AdjointSolve(problem).solve()
-        ContactsVjp(self, state, bodies, world_object, virtual, bars).run()
+        ContactsVjp(self, state, bodies, world_object, virtual, bars).run(pressure)
         sweep = ResidualVjp(self, state, bodies, bars)
         metered = layout.scene.effects.air_mass
         end = chambers.end_pressures(self, pressure) if metered else pressure
@@ -172,7 +172,8 @@ class ReverseStep(Step):
         now, virtual, wrist_bar = accelerations
         fixed = {"acc_wrist": now.wrist, "acc_object": now.object_acc}
         fixed |= {"virtual_wrist": virtual.wrist, "object_along": virtual.object_acc}
-        step_bars = {n: self.bars.of_step(n) for n in self.bars.names if n != "pressure"}
+        of_fingers = "pressure", "grown"
+        step_bars = {n: self.bars.of_step(n) for n in self.bars.names if n not in of_fingers}
         base, step_bars = self.block.sum((base, step_bars))
         unit = lanes([self.like + 1.0], (), wide=False)
         given = {n: state[n] for n in MOVED}, arm, self.palm_constants()

@@ -27,6 +27,7 @@ from codesign_jax.engines.structured.kernel.rows import (
     HeldBar,
     Remembered,
     Slot,
+    StepBar,
     World,
 )
 from codesign_jax.engines.structured.kernel.self_collision import neighbours
@@ -36,6 +37,7 @@ from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import friction_by_contact, which_cone
+from codesign_jax.engines.structured.laws.rings import grown, growth_factors
 from codesign_jax.engines.structured.laws.touch import ring_centres
 from codesign_jax.model.held import EDGES
 from codesign_jax.model.layout import touches_itself
@@ -80,8 +82,12 @@ class ContactsVjp:
             self.fixed |= {"meshed": world_object.mesh.meshed}
             self.fixed |= {"factor": self.object["grid_factor"]}
 
-    def run(self) -> None:
-        """Leaves the cotangents of bodies as `rows.BodyBar`; adds all others to their tables."""
+    def run(self, pressure: Lanes) -> None:
+        """Leaves the cotangents of bodies as `rows.BodyBar`; adds all others to their tables.
+
+        Args:
+          pressure: Of the chambers.
+        """
         self._clear()
         if (self_contacts := self.step.self_contacts) is not None:
             self_contacts.do(self._slot)
@@ -93,6 +99,8 @@ class ContactsVjp:
                     self._where_touching(contacts, i, partial(self._points, contacts, i))
             else:
                 self._each_link(name, contacts)
+        if self.layout.grows:
+            self._add_growth(pressure)
 
     def _each_link(self, name: str, contacts: BoundContacts) -> None:
         def reverse(i: Any) -> None:
@@ -116,25 +124,35 @@ class ContactsVjp:
         return BodyMotion(*(self._chain(getattr(Chain, n), row, lane) for n in BodyMotion._fields))
 
     def _chain(self, name: Field, row: Any, lane: Any) -> Lanes:
-        return self._item(self.scratch, name, row, lane)
-
-    @staticmethod
-    def _item(table: Any, name: Field, item: Any, lane: Any) -> Lanes:
-        return table.read(name, item) if lane is None else table.gather(name, item, lane)
+        return self.step.item_of(self.scratch, name, row, lane)
 
     def ring(self, item: Any, lane: Any = None) -> Lanes:
         """Numbers of a finger's ring or sphere; `lane`: lanes that have it, if items differ."""
-        return self._item(self.step.hand, Hand.ring, item, lane)
+        return self.step.ring(item, lane)
 
     def add_ring(self, bar: Lanes, item: Any, lane: Any = None) -> None:
-        """Adds to the cotangents of a finger's ring; arguments as `ring`."""
+        """Adds to the cotangents of a finger's ring, and of its growth; arguments as `ring`."""
+        if self.layout.grows:
+            numbers = self.step.item_of(self.step.hand, Hand.ring, item, lane)
+            factors = self.step.growth_of(item, lane)
+            bar, factors_bar = pull(grown, (numbers, factors), (), bar)
+            self.bars.add({"grown": factors_bar}, self.step.section_of(item), lane)
         self.bars.add({Hand.ring: bar}, item, lane)
+
+    def _add_growth(self, pressure: Lanes) -> None:
+        """Adds the cotangents of pressures and sections by all rings' growth."""
+        for i in range(self.layout.links if self.layout.tapered else 1):
+            given = self.step.hand.read(Hand.growth, i), pressure
+            bar = self.scratch.read(StepBar.grown, i)
+            growth, pressure_bar = pull(growth_factors, given, (), bar)
+            self.bars.add({Hand.growth: growth}, i)
+            self.bars.add({"pressure": pressure_bar})
 
     def add_body(self, bars: dict[str, Lanes], row: Any, lane: Any = None) -> None:
         """Adds to the cotangents of a body, by fields of `BodyMotion`; arguments as `body`."""
         for field, value in bars.items():
             name = getattr(BodyBar, field)
-            new = plus(self._item(self.scratch, name, row, lane), value)
+            new = plus(self.step.item_of(self.scratch, name, row, lane), value)
             if lane is None:
                 self.scratch.write(name, new, row)
             else:

@@ -115,7 +115,8 @@ class CotangentTables:
     def begin(self) -> None:
         for name in self.names:
             row = StepBar.by_attribute()[name]
-            self.scratch.write(row, zeros(self.scratch.shape(row), self.like))
+            for item in range(self.scratch.layout.groups[row][0]):
+                self.scratch.write(row, zeros(self.scratch.shape(row), self.like), item)
 
     def of_step(self, name: str) -> Lanes:
         """What was added to a name of `rows.StepBar`, on each lane."""

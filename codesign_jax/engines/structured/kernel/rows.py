@@ -124,6 +124,8 @@ class Hand(Rows):
     ring = field(RING, 8, on=lambda layout: bool(layout.rings_per_link))
     palm_ring = field(PALM_GROUP, 8, on=lambda layout: layout.palm_touches)
     law = field(SECTION, LAW, on=lambda layout: layout.by_elements)
+    # How sections grow, see `scene.section_growth`
+    growth = field(SECTION, 4, on=lambda layout: layout.grows)
     section = field(
         SECTION,
         4,
@@ -219,6 +221,8 @@ class Scratch(Rows):
     armature_now = field(
         LINK, AXES, on=lambda layout: layout.scene.effects.lateral_threshold or layout.by_elements
     )
+    # Height and width of sections over those without pressure
+    grown = field(SECTION, 2, on=lambda layout: layout.grows)
     # Change of the links' accelerations by a chord step, in rollouts that record forces
     chord_link_acc = field(LINK, 6, on=lambda layout: layout.record and layout.team == 1)
     new_held_friction = field(PAIRING, 3, on=lambda layout: "finger_finger" in layout.held)
@@ -435,6 +439,7 @@ class StepBar(Rows, prefix="bar"):
     height = field(ONE)
     pressure = field(ONE)
     position = field(ONE, 3, on=lambda layout: bool(layout.scene.fixture))
+    grown = field(SECTION, 2, on=lambda layout: layout.grows)
 
 
 class BodyBar(Rows, prefix="bodybar"):

@@ -126,8 +126,8 @@ class SdfCollision:
 
     def numbers(self, i: Any) -> Lanes:
         k = self.layout.rings_per_link
-        read = partial(self.step.hand.read, "ring")
-        return lanewise(lambda rows: jnp.stack(rows, 1), [read(i * k + j) for j in range(k)])
+        each = [self.step.ring(i * k + j) for j in range(k)]
+        return lanewise(lambda rows: jnp.stack(rows, 1), each)
 
     def on_field(
         self,

@@ -104,13 +104,17 @@ class SelfCollision:
         return self._gathered(self.scratch, name, item, lane)
 
     def _gathered(self, table: BoundTable, name: Field, item: Any, lane: Any) -> Lanes:
+        return table.gather(name, *self._places(item, lane))
+
+    def _places(self, item: Any, lane: Any) -> tuple[jax.Array, jax.Array]:
+        """Items of each lane, and lanes that have them; None for the lanes' own."""
         item = jnp.zeros_like(self.block.column) + item
-        return table.gather(name, item, self.block.column if lane is None else lane)
+        return item, self.block.column if lane is None else lane
 
     def ring(self, item: Any, lane: jax.Array | None = None) -> Lanes:
         if lane is None and not jnp.ndim(item):
-            return self.step.hand.read(Hand.ring, item)
-        return self._gathered(self.step.hand, Hand.ring, item, lane)
+            return self.step.ring(item)
+        return self.step.ring(*self._places(item, lane))
 
     def ring_at(self, row: Any) -> Any:
         """The ring whose section a finger has where a segment of its centre line begins.
@@ -264,7 +268,10 @@ class SelfCollision:
     def _sphere(self, i: Any) -> Lanes:
         """Middle and radius [m] of the sphere around a link, as high as its section, (4,)."""
         where = self.read(Search.joint, i + 1), self.read(Search.frame, i + 1)
-        return lanewise(_sphere, *where, self.step.hand.read(Hand.centre, i))
+        centre = self.step.hand.read(Hand.centre, i)
+        if self.layout.grows:
+            centre = lanewise(_raised, centre, self.step.growth_of(i * self.layout.rings_per_link))
+        return lanewise(_sphere, *where, centre)
 
     # Contacts
 
@@ -647,6 +654,10 @@ def arc(tip, largest):
 
 def _sphere(origin, frame, centre):
     return jnp.concatenate([origin + apply_columns(frame, centre), centre[2:]])
+
+
+def _raised(centre, factors):
+    return jnp.stack([centre[0], centre[1], factors[0] * centre[2]])
 
 
 def _deeper(depth, both, mine, theirs):

@@ -106,6 +106,8 @@ class Step(StepMemory):
         bodies = lanewise(run, state, arm, self.palm_constants())
         world_object = objects.read(layout.scene, self.block, self.world, self.hand, self.grid)
         self.columns = bodies["columns"]
+        if layout.grows:
+            self.grow(pressure)
         self.bind_contacts()
         return state, bodies, world_object, *self._forward(state, bodies, pressure, world_object)
 

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, ContactSet
@@ -10,15 +11,17 @@ from codesign_jax.engines.structured.kernel.rows import (
     FingerState,
     Hand,
     Record,
+    Scratch,
     World,
     WorldOptions,
 )
 from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts, SelfContactSet
-from codesign_jax.engines.structured.lanewise import Lanes, lanes
+from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws.cones import friction_by_contact
+from codesign_jax.engines.structured.laws.rings import grown, growth_factors
 from codesign_jax.engines.structured.laws.step_numbers import step_numbers
 from codesign_jax.model import Layout
-from codesign_jax.model.layout import hinge_sign, palm_touches
+from codesign_jax.model.layout import hinge_sign, palm_touches, sections_grow
 from codesign_jax.scene import Scene
 
 PALM_CONSTANTS = (
@@ -93,6 +96,11 @@ class KernelLayout:
     def by_elements(self) -> bool:
         """Whether finite elements give the law of a finger's section."""
         return self.scene.hand.section.law == "elements"
+
+    @property
+    def grows(self) -> bool:
+        """Whether sections of fingers grow with their pressure."""
+        return sections_grow(self.scene)
 
     @property
     def palm_touches(self) -> bool:
@@ -175,6 +183,45 @@ class StepMemory:
     def constant(self, name: str) -> Lanes:
         """A constant of the worlds."""
         return self.world.read(name)
+
+    def ring(self, item: Any, lane: Any = None) -> Lanes:
+        """Numbers of fingers' rings at the pressure of the step, see `rings.grown`.
+
+        Args:
+          item: The rings; of each lane, if there are lanes.
+          lane: The lanes whose rings they are, None for the lanes' own; see `BoundTable.gather`.
+        """
+        numbers = self.item_of(self.hand, Hand.ring, item, lane)
+        if not self.layout.grows:
+            return numbers
+        return lanewise(grown, numbers, self.growth_of(item, lane))
+
+    def growth_of(self, ring: Any, lane: Any = None) -> Lanes:
+        """Height and width of rings' sections over those without pressure; arguments as `ring`."""
+        return self.item_of(self.scratch, Scratch.grown, self.section_of(ring), lane)
+
+    def section_of(self, ring: Any) -> Any:
+        """Item of a ring's section among the rows of `rows.SECTION`."""
+        if not self.layout.tapered:
+            return jnp.zeros_like(ring) if jnp.ndim(ring) else 0
+        if isinstance(ring, int):
+            return ring // self.layout.rings_per_link
+        return jax.lax.div(ring, jnp.full_like(ring, self.layout.rings_per_link))
+
+    def item_of(self, table: BoundTable, name: str, item: Any, lane: Any = None) -> Lanes:
+        """An item of the lanes' own fingers, or one of each lane's fingers."""
+        return table.read(name, item) if lane is None else table.gather(name, item, lane)
+
+    def grow(self, pressure: Lanes) -> None:
+        """Stores how much larger sections are at the pressures of the chambers."""
+
+        def section(i: Any, x: jax.Array) -> jax.Array:
+            factors = lanewise(growth_factors, self.hand.read(Hand.growth, i), pressure)
+            self.scratch.write(Scratch.grown, factors, i)
+            return x
+
+        count = self.layout.links if self.layout.tapered else 1
+        jax.lax.fori_loop(0, count, section, jnp.int32(0))
 
     def palm_constants(self) -> dict[str, Lanes]:
         """Constants that `palm_and_object` takes, by name, of those that the scene has."""

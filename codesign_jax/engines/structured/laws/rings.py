@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.lanes import apply_columns, apply_rows, cross, dot, total
+from codesign_jax.scene import section_growth
 
 NOMINAL = 0.5e-3
 """Least depth of which a contact has the stiffness, also before it touches [m]."""
@@ -43,6 +44,28 @@ class Ring(NamedTuple):
     @classmethod
     def of(cls, numbers: jax.Array) -> "Ring":
         return cls(numbers[:3], numbers[3:6], numbers[6], numbers[7])
+
+
+def growth_factors(growth: jax.Array, pressure: jax.Array) -> jax.Array:
+    """Height and width of sections over those without pressure, shape (2, ...).
+
+    Args:
+      growth: How they grow, `section_growth.Growth`, shape (4, ...).
+      pressure: Of their chambers [Pa].
+    """
+    of_section = section_growth.Growth(*jnp.unstack(growth))
+    return jnp.stack(section_growth.factors(of_section, pressure))
+
+
+def grown(numbers: jax.Array, factors: jax.Array) -> jax.Array:
+    """Numbers of rings (8, ...) whose sections have these times their height and width, (2, ...).
+
+    The side of the fabric stays where it is, so that the centre rises; and a square of skin is as
+    wide as the finger.
+    """
+    height, width = factors
+    x, y, z, e, a, b, length, tip = jnp.unstack(numbers)
+    return jnp.stack([x, y, height * z, e, width * a, height * b, length / width, tip])
 
 
 class Segment(NamedTuple):

@@ -352,9 +352,7 @@ def test_sections_grow_as_elements_do():
     assert np.sqrt((wrong[usual] ** 2).mean(0)).max() < 0.02
     # As large as at rest they would err by 25 and 11 %: growth is told from none.
     assert (np.sqrt(((data.grown[usual] - 1) ** 2).mean(0)) > 0.1).all()
-    law = section_growth
-    package = law.HIGHEST, law.HEIGHT_RATE, law.WIDEST, law.WIDTH_RATE
-    np.testing.assert_allclose(growth.fitted(data), package, rtol=5e-3)  # as they are rounded
+    np.testing.assert_allclose(growth.fitted(data), growth.PACKAGE, rtol=5e-3)  # rounded
 
 
 def test_sections_grow_to_the_circle_of_their_thread():

@@ -32,6 +32,16 @@ LATE = 20
 HARD = (0.3, 0.95)
 """Share of kept grasps of a design that is hard."""
 
+PACKAGE = np.array(
+    [
+        section_growth.HIGHEST,
+        section_growth.HEIGHT_RATE,
+        section_growth.WIDEST,
+        section_growth.WIDTH_RATE,
+    ]
+)
+"""The constants of the law as the package has them."""
+
 
 class States(NamedTuple):
     """Sections under pressure, bent towards the fabric by any amount; one state a row."""
@@ -67,14 +77,12 @@ def errors(data: States, constants: np.ndarray | None = None) -> np.ndarray:
     """Height and width by the law less those of elements, over the size without pressure.
 
     Args:
-      constants: `HIGHEST`, `HEIGHT_RATE`, `WIDEST`, `WIDTH_RATE`; None for those of the package.
+      constants: As `PACKAGE`; None for these.
     """
     height, wall, width, modulus, depth = data.section.T
     law = section_growth.growth(height, wall, width, shear_modulus=modulus, thread_depth=depth)
     if constants is not None:
-        own = section_growth
-        package = own.HIGHEST, own.HEIGHT_RATE, own.WIDEST, own.WIDTH_RATE
-        highest, height_rate, widest, width_rate = constants / package
+        highest, height_rate, widest, width_rate = constants / PACKAGE
         law = section_growth.Growth(
             highest * law.height,
             widest * law.width,
@@ -88,10 +96,8 @@ def fitted(data: States) -> np.ndarray:
     """The four constants by least squares over the sections that are not held out."""
     use = ~data.held_out
     weight = np.where(data.usual, 1.0, fit.OUTSIDE)[use, None]
-    own = section_growth
-    start = np.array([own.HIGHEST, own.HEIGHT_RATE, own.WIDEST, own.WIDTH_RATE])
     chosen = States(*(v[use] for v in data))
-    solution = optimize.least_squares(lambda v: (weight * errors(chosen, v)).ravel(), start)
+    solution = optimize.least_squares(lambda v: (weight * errors(chosen, v)).ravel(), PACKAGE)
     return solution.x
 
 

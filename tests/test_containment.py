@@ -284,11 +284,19 @@ def test_fingers_inside_one_another_are_refused(surface):
     )
 
 
-@pytest.mark.parametrize("surface", ["hull", pytest.param("spheres", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "surface", ["hull", *(pytest.param(n, marks=pytest.mark.slow) for n in ("spheres", "grown"))]
+)
 def test_the_kernel_finds_the_overlaps_of_a_start(surface):
-    """As `preflight` does: with table and object, of fingers in the palm, and in one another."""
-    effects = {"surface": surface, "finger_finger": True, "finger_palm": True}
+    """As `preflight` does: with table and object, of fingers in the palm, and in one another.
+
+    Grown: of rings that are as large as the pressure of the first key frame makes them.
+    """
+    grown = surface == "grown"
+    effects = {"surface": "hull" if grown else surface, "section_growth": grown}
+    effects |= {"finger_finger": True, "finger_palm": True}
     sizes = {"arm": {"start_height": 0.14}, "discretization": {"links": 3}, "effects": effects}
+    sizes |= {"control": {"frame": {"0": {"pressure": "pressure"}}}} if grown else {}
     the_scene = scene.load("paper_spheres", overrides=sizes)
     inwards = dataclasses.replace(the_scene.hand.finger[0], azimuth=180.0, tilt=-20.0)
     mounted = dataclasses.replace(the_scene.hand, finger=(inwards, *the_scene.hand.finger[1:]))

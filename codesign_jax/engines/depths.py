@@ -77,10 +77,10 @@ def depth_between(scene: Scene, fields: ModelFields) -> jax.Array:
     if not scene.effects.finger_finger or count == 1:
         return jnp.full((worlds,), -jnp.inf, fields.start.dtype)
     hand, kin, _ = _straight(scene, fields)
-    centre = jnp.moveaxis(hand.centre, 1, 0)
-    up = centre[2]
+    along, across, up = jnp.moveaxis(hand.centre, 1, 0)
     if hand.growth is not None:
         up = up * _first_growth(hand)[0]
+    centre = jnp.stack([along, across, up])
     middle = kin.origin + apply_columns(kin.link, centre)
     deepest = []
     for a, b in itertools.combinations(range(count), 2):

@@ -87,7 +87,7 @@ def _largest_section(scene: Scene, design: Params) -> tuple[np.ndarray, np.ndarr
     """Largest outer width and height of each finger as a grasp begins [m], shape (finger,)."""
     ends = sections(scene.hand, design, np.array([0.0, 1.0]))
     sizes = [ends.width, ends.height]
-    if sections_grow(scene) and scene.control.frame[0].pressure is not None:
+    if sections_grow(scene) and not key_frames.begins_empty(scene):
         grows = growth_numbers(scene.hand, design, np.array([0.0, 1.0]))
         most = np.maximum(grows.width, 0.0), np.maximum(grows.height, 0.0)
         sizes = [size * (1 + more) for size, more in zip(sizes, most, strict=True)]

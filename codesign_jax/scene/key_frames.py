@@ -250,6 +250,12 @@ def first_pressure(scene: Any, params: Params) -> jax.Array:
     return wanted
 
 
+def begins_empty(scene: Any) -> bool:
+    """Whether the key frames begin with no pressure, whatever the design's numbers."""
+    first = scene.control.frame[0].pressure or ()
+    return not any(factor for total in first for factor in _factors(total).values())
+
+
 def _names(scene: Any, params: Params) -> dict[str, Any]:
     values = _scene_times(scene)
     values |= {key: getattr(scene.arm, key) for key in ("start_height", "zero_height")}

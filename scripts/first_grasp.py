@@ -28,7 +28,8 @@ STAGES = {
     "trace of the kernel": ("codesign_jax.compiler.launch", "kernel_jaxpr"),
     "writer": ("codesign_jax.compiler.cpu", "block_code"),
     "LLVM": ("codesign_jax.compiler.handlers", "compile"),
-    "PTX": ("codesign_jax.compiler.gpu", "device_code"),
+    "writer for a GPU": ("codesign_jax.compiler.thread", "write"),
+    "PTX": ("codesign_jax.compiler.thread", "assembly"),
     "driver": ("codesign_jax.compiler.gpu", "load"),
     "XLA": ("jax._src.compiler", "backend_compile_and_load"),
 }

@@ -31,7 +31,7 @@ HELD = {"links": 3} | grasps.hurried(0.8, 1.3, 2.0, without="disturb ungrasp")
 
 @functools.cache
 def grasp_of(surface, *, finger_finger=False):
-    """Scene, inputs, states and trace of one grasp that lifts its box and drops it, float64."""
+    """Scene, engine, inputs and trace of one grasp that lifts its box and drops it, float64."""
     effects = {"effects__surface": surface, "effects__finger_finger": finger_finger}
     scene = grasps.pinch("box", **effects, **HELD)
     with jax.enable_x64(True):
@@ -40,13 +40,9 @@ def grasp_of(surface, *, finger_finger=False):
         trial = trial._replace(arm_tilt=np.array([0.02, -0.03]), yaw=np.array(0.1))
         fields, ctrl = grasps.world_inputs(scene, hand, trial)
         inputs = jax.tree.map(lambda v: np.asarray(v)[None], (fields, ctrl))
-
-        def run(fields, ctrl):
-            recorded = engine.recording(touch=True).rollout(fields, ctrl, trajectory=True)
-            return engine.states(fields, ctrl, trajectory=True)[1], recorded
-
-        states, trace = jax.tree.map(np.asarray, jax.jit(run)(*inputs))
-    return scene, inputs, states, trace
+        run = jax.jit(partial(engine.recording(touch=True).rollout, trajectory=True))
+        trace = jax.tree.map(np.asarray, run(*inputs))
+    return scene, engine, inputs, trace
 
 
 @pytest.fixture(scope="module", params=["spheres", "hull"])
@@ -55,12 +51,14 @@ def grasp(request):
 
 
 def test_forces_on_the_object_are_what_its_momentum_gains(grasp):
-    scene, (fields, _), states, trace = grasp
+    scene, _, (fields, _), trace = grasp
     h = scene.discretization.timestep
     forces = trace.forces
     mass = fields.object_mass[0]
-    gained = np.diff(states["qvel"][0, :, -6:-3], axis=0) / h + [0, 0, scene.gravity]
-    total = (forces.finger.sum(2) + forces.palm + forces.table)[0, :-1]
+    # Places are those before each step, and a step ends with the velocity that it moves by.
+    velocity = np.diff(trace.qpos[0, :, -7:-4], axis=0) / h
+    gained = np.diff(velocity, axis=0) / h + [0, 0, scene.gravity]
+    total = (forces.finger.sum(2) + forces.palm + forces.table)[0, 1:-1]
     # What 100 Newton iterations leave, of a weight of one newton.
     np.testing.assert_allclose(total, mass * gained, atol=1e-4 * mass * scene.gravity)
     assert forces.table[0, 60, 2] == pytest.approx(mass * scene.gravity, rel=1e-3)
@@ -71,7 +69,7 @@ def test_forces_on_the_object_are_what_its_momentum_gains(grasp):
 @pytest.mark.slow  # three kernels; quick: forces are what the momentum gains
 def test_lanes_of_a_team_record_the_same_forces():
     """Which a GPU has, here on a CPU: beside those of single lanes, of every ring as well."""
-    scene, (fields, ctrl), _, trace = grasp_of("hull", finger_finger=True)
+    scene, _, (fields, ctrl), trace = grasp_of("hull", finger_finger=True)
     with jax.enable_x64(True):
         limits = StructuredEngine(scene, iterations=100, tolerance=1e-24).limits
         options = {"backend": "cpu", "width": 8, "team": TEAM, "record": Record(touch=True)}
@@ -112,7 +110,10 @@ def test_forces_of_the_rings_add_up(grasp):
 
 def test_forces_are_mujocos():
     """Of every contact, by its own solver, at the states and velocities of the path."""
-    scene, (fields, ctrl), states, trace = grasp_of("spheres")
+    scene, engine, (fields, ctrl), trace = grasp_of("spheres")
+    with jax.enable_x64(True):
+        run = jax.jit(partial(engine.states, trajectory=True))
+        states = jax.tree.map(np.asarray, run(fields, ctrl)[1])
     compiled = oracles.exact(scene, grasps.nth(fields, 0))
     data = mujoco.MjData(compiled)
     lay = model.layout(scene)

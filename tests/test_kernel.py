@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from codesign_jax import model
-from codesign_jax.compiler import gpu, launch, vector
+from codesign_jax.compiler import gpu, launch, thread, vector
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import Limits, Program
@@ -44,7 +44,7 @@ def test_kernel_becomes_ptx(effects, monkeypatch):
     texts = []
 
     def register(origin, trace, layout, *, keep):
-        texts.append(gpu.device_code(trace(), layout))
+        texts.append(thread.assembly(gpu.block_code(trace(), layout)))
         return "registered"
 
     monkeypatch.setattr(gpu, "register", register)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from codesign_jax import reuse, scene
-from codesign_jax.compiler import gpu, launch
+from codesign_jax.compiler import gpu, launch, thread
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import (
     adjoint_step,
@@ -481,7 +481,7 @@ def device_code(call, outputs, arguments, lanes, scratch, onchip=()):
         "test", "gpu", lanes, scratch=scratch, onchip=onchip, exchanged=exchanged
     )
     layout = launch.describe(arrays, jax.tree.leaves(outputs), kernel)
-    return gpu.device_code(launch.kernel_jaxpr(call, arrays), layout)
+    return thread.assembly(gpu.block_code(launch.kernel_jaxpr(call, arrays), layout))
 
 
 def valid(code):

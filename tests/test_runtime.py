@@ -159,7 +159,7 @@ def handler():
     """Address of the handler of `kernels.body`, not registered."""
     x, table = (jax.ShapeDtypeStruct(v.shape, v.dtype) for v in kernels.numbers(4))
     jaxpr = launch.kernel_jaxpr(kernels.call(x, table)[0], [x, table])
-    loaded = handlers.prepare("plain", cpu.handler_code("plain", LAYOUT), keep=False)
+    loaded = handlers.prepare(cpu.handler_code("plain", LAYOUT), keep=False)
     code = handlers.Loaded(handlers.compile(cpu.object_text(jaxpr, LAYOUT)))
     handlers.supply("plain", loaded, lambda: code.function(cpu.ENTRY)).join()
     return loaded.function("plain")
@@ -316,7 +316,7 @@ def test_a_call_waits_for_its_kernel():
         compiled.wait()
         raise RuntimeError("LLVM refused")
 
-    loaded = handlers.prepare("waits", cpu.handler_code("waits", LAYOUT), keep=False)
+    loaded = handlers.prepare(cpu.handler_code("waits", LAYOUT), keep=False)
     compiling = handlers.supply("waits", loaded, fails)
     with futures.ThreadPoolExecutor() as pool:
         call = pool.submit(Xla().call, loaded.function("waits"), [x, table], [out])
@@ -333,7 +333,7 @@ def test_a_call_waits_for_its_kernel():
 def test_missing_memory_is_an_error(threads):
     """Scratch memory of a petabyte: the call fails, and says why."""
     large = Layout((*LAYOUT.arrays[:3], Array((2**40, 256), "float32", SCRATCH)), 8)
-    loaded = handlers.prepare("large", cpu.handler_code("large", large), keep=False)
+    loaded = handlers.prepare(cpu.handler_code("large", large), keep=False)
     handlers.supply("large", loaded, lambda: NEVER_CALLED).join()
     x, table = kernels.numbers(8)
     out = np.zeros((8, 1, 8), np.float32)

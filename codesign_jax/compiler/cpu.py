@@ -73,7 +73,7 @@ def register(
             file = reuse.Kept(reuse.kernel_file(name) if keep else None)
             code = file.read()
             text = "" if code else object_text(trace(), layout)
-            loaded = handlers.prepare(name, handler_code(name, layout), keep=keep)
+            loaded = handlers.prepare(handler_code(name, layout), keep=keep)
             handlers.register(name, loaded, "cpu")
 
             def load() -> int:

@@ -1,9 +1,9 @@
 """Kernels on NVIDIA GPUs: device code in PTX, launched by a handler in host machine code.
 
-The driver translates the PTX into a library of its own, which belongs to no context: one handle
-serves every GPU of the host.  It does so in a thread, and keeps its translation on disk itself
-(CUDA_CACHE_PATH).  The handler asks XLA for the stream and calls `cuLaunchKernel` on it, one block
-of a warp for each block of the arrays.  Python and its lock take no part.
+A thread has LLVM write the PTX and the driver translate it, into a library of its own, which
+belongs to no context: one handle serves every GPU of the host.  The driver keeps its translation on
+disk itself (CUDA_CACHE_PATH).  The handler asks XLA for the stream and calls `cuLaunchKernel` on
+it, one block of a warp for each block of the arrays.  Python and its lock take no part.
 
 A kernel's entry point has one pointer an array, in the layout's order, to the array's first block,
 and finds its own blocks (block index times size, or the first one where an array is shared).
@@ -46,9 +46,9 @@ _MESSAGE_BYTES = 512
 _lent: list[Any] = []  # memory that the driver may write to whenever it translates for another GPU
 
 
-def device_code(jaxpr: Any, layout: Layout) -> str:
-    """PTX of a kernel with the entry point `ENTRY`."""
-    return thread.assembly(thread.write(jaxpr, layout, ENTRY))
+def block_code(jaxpr: Any, layout: Layout) -> str:
+    """A kernel with the entry point `ENTRY` in LLVM's language, of which PTX is made."""
+    return thread.write(jaxpr, layout, ENTRY)
 
 
 class Driver:
@@ -132,7 +132,7 @@ def _translate(driver: Driver, kernel: ctypes.c_void_p, device: int) -> None:
 
 def prepare(name: str, layout: Layout, driver: Driver, *, keep: bool = True) -> handlers.Loaded:
     """The handler of a kernel, compiled and told the driver's functions."""
-    loaded = handlers.prepare(name, handler_code(name, layout), keep=keep)
+    loaded = handlers.prepare(handler_code(name, layout), keep=keep)
     table = loaded.numbers(f"{name}_table", len(CALLS))
     for k, function in enumerate(CALLS):
         table[k] = driver.address(function)
@@ -145,11 +145,17 @@ def register(origin: str, trace: Callable[[], Any], layout: Layout, *, keep: boo
     with handlers.LOCK:
         if not handlers.known(name):
             file = reuse.Kept(reuse.kernel_file(name) if keep else None)
-            code = file.read() or file.write(device_code(trace(), layout).encode())
+            kept = file.read()
+            text = "" if kept else block_code(trace(), layout)
             device = jax.local_devices(backend="cuda")[0].local_hardware_id or 0
             loaded = prepare(name, layout, driver(), keep=keep)
             handlers.register(name, loaded, "CUDA")
-            handlers.supply(name, loaded, lambda: load(driver(), code.decode(), device))
+
+            def translated() -> int:
+                ptx = kept or file.write(thread.assembly(text).encode())
+                return load(driver(), ptx.decode(), device)
+
+            handlers.supply(name, loaded, translated)
     return name
 
 

@@ -375,9 +375,10 @@ def known(name: str) -> bool:
     return name in _loaded
 
 
-def prepare(name: str, text: str, *, keep: bool = True) -> Loaded:
+def prepare(text: str, *, keep: bool = True) -> Loaded:
     """A handler in memory; `keep`: whether it may be found on disk, and kept there."""
-    file = reuse.Kept(reuse.kernel_file(f"{name}-handler") if keep else None)
+    name = f"handler_{reuse.digest(text, *identity())}"
+    file = reuse.Kept(reuse.kernel_file(name) if keep else None)
     # It runs for microseconds.
     return Loaded(file.read() or file.write(compile(text, passes=False)))
 

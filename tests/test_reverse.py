@@ -19,6 +19,8 @@ from codesign_jax import reuse, scene
 from codesign_jax.compiler import gpu, launch, thread
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import (
+    Limits,
+    Program,
     adjoint_step,
     contacts_vjp,
     cotangents,
@@ -29,7 +31,7 @@ from codesign_jax.engines.structured.kernel import (
 from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, StatePath
 from codesign_jax.engines.structured.kernel.adjoint_step import AdjointSolve
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables
-from codesign_jax.engines.structured.kernel.program import Inputs, Limits, Program
+from codesign_jax.engines.structured.kernel.rollout import Inputs
 from codesign_jax.engines.structured.kernel.rows import Record
 from codesign_jax.engines.structured.lanewise import lanewise
 from tests.helpers import fixtures, grasps

@@ -152,7 +152,7 @@ class DesignSpace:
         Raises:
           InputError: As `params`.
         """
-        params = jax.tree.map(lambda v: np.asarray(v, float), self.params(design))
+        params = jax.tree.map(lambda v: np.asarray(v, float), self.params(np.asarray(design)))
         return {
             row.name: _value(params, row.name) / UNITS[row.unit][1] for row in self.hand.parameter
         }

@@ -13,7 +13,7 @@ import numpy as np
 
 from codesign_jax.engines.structured import StructuredEngine, coordinates
 from codesign_jax.engines.structured.kernel.adjoint import AdjointProgram, Cotangents, state_path
-from codesign_jax.engines.structured.kernel.program import Inputs
+from codesign_jax.engines.structured.kernel.rollout import Inputs
 from tests.helpers import grasps
 from tests.helpers.curled_hands import state
 

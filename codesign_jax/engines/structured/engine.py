@@ -13,7 +13,7 @@ from codesign_jax.engines.base import Bodies, Equal
 from codesign_jax.engines.structured import bodies, coordinates, forces, transforms
 from codesign_jax.engines.structured.kernel import Limits, Program
 from codesign_jax.engines.structured.kernel.adjoint import StatePath, state_path
-from codesign_jax.engines.structured.kernel.program import Inputs, Outputs
+from codesign_jax.engines.structured.kernel.rollout import Inputs, Outputs
 from codesign_jax.engines.structured.kernel.rows import Record
 from codesign_jax.engines.structured.laws import meshes
 from codesign_jax.engines.structured.laws.integration import before

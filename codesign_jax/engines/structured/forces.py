@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.engines.structured.kernel import Limits, Program
-from codesign_jax.engines.structured.kernel.program import Outputs
+from codesign_jax.engines.structured.kernel.rollout import Outputs
 from codesign_jax.engines.structured.kernel.rows import Record
 from codesign_jax.engines.structured.laws.kinematics import State
 from codesign_jax.engines.structured.world_model import WorldModel

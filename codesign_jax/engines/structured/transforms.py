@@ -32,7 +32,7 @@ from codesign_jax.engines.structured.kernel.adjoint import (
     StatePath,
     state_path,
 )
-from codesign_jax.engines.structured.kernel.program import Inputs
+from codesign_jax.engines.structured.kernel.rollout import Inputs
 from codesign_jax.engines.structured.world_model import world_constants
 from codesign_jax.judge import verdict
 from codesign_jax.model import ModelFields

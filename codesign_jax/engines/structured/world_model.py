@@ -168,7 +168,7 @@ def _world(scene: Scene, fields: ModelFields) -> WorldModel:
     return WorldModel(**fingers, **lanes, mesh=None)
 
 
-def _finger(scene: Scene, fields: ModelFields) -> dict[str, jax.Array | None]:
+def _finger(scene: Scene, fields: ModelFields) -> dict[str, Any]:
     """The constants of one finger by their names in `WorldModel`.
 
     Args:
@@ -340,7 +340,7 @@ def _palm(scene: Scene, fields: ModelFields, fingers: dict[str, Any]) -> dict[st
     palm = scene.hand.palm
     mount = fingers["mount"]
     none = jnp.zeros_like(palm.mass)
-    masses = jnp.concatenate([palm.mass[None], fields.mass[:, 0]])
+    masses = jnp.concatenate([jnp.asarray(palm.mass)[None], fields.mass[:, 0]])
     palm_centre = jnp.stack([none, none, palm.thickness / 2])[:, None]
     centres = jnp.concatenate([palm_centre, fingers["stub_centre"]], 1)
     unit = jnp.eye(3, dtype=masses.dtype)[:, :, None]

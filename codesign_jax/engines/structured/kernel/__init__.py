@@ -1,5 +1,6 @@
 """The structured engine's rollout as one kernel."""
 
-from codesign_jax.engines.structured.kernel.program import TRACE, Limits, Program
+from codesign_jax.engines.structured.kernel.newton import Limits
+from codesign_jax.engines.structured.kernel.program import TRACE, Program
 
 __all__ = ["TRACE", "Limits", "Program"]

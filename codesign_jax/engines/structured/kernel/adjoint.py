@@ -15,13 +15,9 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.kernel.adjoint_step import ReverseStep, TraceCotangents
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
-from codesign_jax.engines.structured.kernel.program import (
-    Inputs,
-    Outputs,
-    Program,
-    copy_rows,
-    numbered,
-)
+from codesign_jax.engines.structured.kernel.memory_tables import Tables
+from codesign_jax.engines.structured.kernel.program import Program, numbered
+from codesign_jax.engines.structured.kernel.rollout import Inputs, Outputs, copy_rows
 from codesign_jax.engines.structured.kernel.rows import (
     BodyBar,
     Chain,
@@ -33,6 +29,7 @@ from codesign_jax.engines.structured.kernel.rows import (
     Virtual,
     WorldState,
 )
+from codesign_jax.engines.structured.kernel.step_memory import References
 from codesign_jax.engines.structured.lanewise import lanes
 
 
@@ -131,13 +128,13 @@ class AdjointProgram(Program):
         out = self.launch(call, given, outputs, origin, scratch=scratch, level=1)
         grid = None if inputs.grid is None else jnp.zeros_like(inputs.grid)
         return Inputs(
-            out.hand,
-            out.world,
-            out.finger_start,
-            out.world_start,
-            out.arm,
-            out.pressure,
-            grid,
+            hand=out.hand,
+            world=out.world,
+            finger_start=out.finger_start,
+            world_start=out.world_start,
+            arm=out.arm,
+            pressure=out.pressure,
+            grid=grid,
         )
 
     def no_sums(self, blocks: int, dtype: Any) -> tuple:
@@ -153,12 +150,19 @@ class AdjointProgram(Program):
         """Cotangents of the inputs, zero where a world took no step and they are no numbers."""
         some = taken[:, 0] > 0
         lane = jnp.tile(some, (1, 1, self.fingers))
-        masks = Inputs(lane, some, lane, some, some[:, None], lane)
-        cleared = [
-            jnp.where(mask | jnp.isfinite(x), x, 0.0)
-            for mask, x in zip(masks[:6], bars[:6], strict=True)
-        ]
-        return bars._replace(**dict(zip(Inputs._fields, cleared, strict=False)))
+        masks = {
+            "hand": lane,
+            "world": some,
+            "finger_start": lane,
+            "world_start": some,
+            "arm": some[:, None],
+            "pressure": lane,
+        }
+        cleared = {}
+        for name, mask in masks.items():
+            bar = getattr(bars, name)
+            cleared[name] = jnp.where(mask | jnp.isfinite(bar), bar, 0.0)
+        return bars._replace(**cleared)
 
     def _arguments(
         self, inputs: Inputs, path: StatePath, bars: Cotangents, sums: tuple | None = None
@@ -167,18 +171,18 @@ class AdjointProgram(Program):
             sums = self.no_sums(inputs.hand.shape[0], inputs.hand.dtype)
         hand_sum, world_sum = sums
         return AdjointInputs(
-            inputs.hand,
-            inputs.world,
-            inputs.arm,
-            inputs.pressure,
-            path,
-            bars.finger,
-            bars.world,
-            hand_sum,
-            world_sum,
-            bars.trace,
-            bars.path,
-            inputs.grid,
+            hand=inputs.hand,
+            world=inputs.world,
+            arm=inputs.arm,
+            pressure=inputs.pressure,
+            path=path,
+            finger_bar=bars.finger,
+            world_bar=bars.world,
+            hand_sum=hand_sum,
+            world_sum=world_sum,
+            trace_bar=bars.trace,
+            path_bar=bars.path,
+            grid=inputs.grid,
         )
 
     def _adjoint_call(self, given: AdjointInputs) -> tuple[Callable, AdjointOutputs]:
@@ -204,85 +208,134 @@ class AdjointProgram(Program):
         return self.call(kernel, "grasp_adjoint", given, outputs), outputs
 
     def _adjoint_kernel(self, steps: int, given: AdjointInputs, out: AdjointOutputs) -> None:
-        hand_bar, world_bar, finger_bar, state_bar, arm_bar, pressure_bar = out[:6]
-        scratch, finger_state, world_state = out[6:]
-        arm = given.arm
-        pressure = given.pressure
-        block = Block(self.fingers, self.block)
-        lane_world = block.world
-        none = jnp.zeros((self.size,), scratch.dtype)
-        bars = CotangentTables(self, block, (hand_bar, world_bar, finger_bar, state_bar), scratch)
-        tables = given.hand, given.world, finger_state, world_state, scratch, given.grid
-        step = ReverseStep(self, block, tables, bars)
-        copy_rows((0, self.hand.rows), lambda k: given.hand_sum[(k,)], hand_bar)
-        copy_rows((0, self.world_bars.rows), lambda k: given.world_sum[(k,)], world_bar)
-        copy_rows((0, self.finger_state.rows), lambda k: given.finger_bar[(0, k)], finger_bar)
-        copy_rows(
-            (0, self.world_state.rows),
-            lambda k: given.world_bar[0, k, lane_world],
-            state_bar,
-            lane_world,
-        )
-        count = given.path.taken[0, 0, lane_world]
-        last = jnp.minimum(jnp.max(count.astype(jnp.int32)), steps - 1)
+        adjoint = BlockAdjoint(self, steps, given, out)
+        adjoint.start()
+        adjoint.run()
 
-        def quiet(t: jax.Array, x: jax.Array) -> jax.Array:
+
+class BlockAdjoint:
+    """The reverse pass of a block of worlds in a kernel."""
+
+    def __init__(self, tables: Tables, steps: int, given: AdjointInputs, out: AdjointOutputs):
+        """Takes what the kernel reads and writes.
+
+        Args:
+          tables: The rows of the tables.
+          steps: Steps of the path.
+          given: References to the tables of a block, without their axis of blocks.
+          out: Likewise.
+        """
+        block = Block(tables.fingers, tables.block)
+        self.tables = tables
+        self.steps = steps
+        self.given = given
+        self.out = out
+        self.world = block.world
+        self.none = jnp.zeros((tables.size,), out.scratch.dtype)
+        bars = References(
+            hand=out.hand,
+            world=out.world,
+            finger_state=out.finger_start,
+            world_state=out.world_start,
+            scratch=out.scratch,
+        )
+        references = References(
+            hand=given.hand,
+            world=given.world,
+            finger_state=out.finger_state,
+            world_state=out.world_state,
+            scratch=out.scratch,
+            grid=given.grid,
+        )
+        self.bars = CotangentTables(tables, block, bars)
+        self.step = ReverseStep(tables, block, references, self.bars)
+
+    def start(self) -> None:
+        """Copies the cotangents of the last state, and those of constants that are added to."""
+        given = self.given
+        out = self.out
+        world = self.world
+        rows = self.tables.finger_state.rows, self.tables.world_state.rows
+        copy_rows((0, self.tables.hand.rows), lambda k: given.hand_sum[(k,)], out.hand)
+        copy_rows((0, self.tables.world.rows), lambda k: given.world_sum[(k,)], out.world)
+        copy_rows((0, rows[0]), lambda k: given.finger_bar[(0, k)], out.finger_start)
+        copy_rows((0, rows[1]), lambda k: given.world_bar[0, k, world], out.world_start, world)
+
+    def run(self) -> None:
+        """Goes back from the last step that any world took; later commands have no cotangents."""
+        count = self.given.path.taken[0, 0, self.world]
+        last = jnp.minimum(jnp.max(count.astype(jnp.int32)), self.steps - 1)
+
+        def idle(t: jax.Array, x: jax.Array) -> jax.Array:
             for k in range(6):
-                arm_bar[t, k, lane_world] = none
-            pressure_bar[(t, slice(None))] = none
+                self.out.arm[t, k, self.world] = self.none
+            self.out.pressure[(t, slice(None))] = self.none
             return x
 
         def reverse(back: jax.Array, x: jax.Array) -> jax.Array:
             t = last - back
-            moved = t.astype(count.dtype) < count
-            self._load(t, steps, moved, given.path, (finger_state, world_state), lane_world)
-            commands = [jnp.where(moved, arm[t, k, lane_world], 0.0) for k in range(6)]
-            chamber = jnp.where(moved, pressure[(t,)], 0.0)
-            trace = given.trace_bar
-            shown = TraceCotangents(*(trace[t, k, lane_world] for k in range(3)))
-            arms = step.reverse(
-                lanes(commands, (6,), wide=False), lanes([chamber], (), wide=True), moved, shown
-            )
-            for k in range(6):
-                arm_bar[t, k, lane_world] = jnp.where(moved, arms[k].lane, 0.0)
-            pressure_bar[(t, slice(None))] = jnp.where(moved, bars.of_step("pressure").lane, 0.0)
-            if given.path_bar:
-                fingers, worlds = given.path_bar
-                angles, places = self.path_rows(states=False)
-                copy_rows((0, angles), lambda k: finger_bar[(k,)] + fingers[(t, k)], finger_bar)
-                rows = lambda k: state_bar[k, lane_world] + worlds[t, k, lane_world]  # noqa: E731
-                copy_rows((0, places), rows, state_bar, lane_world)
+            self._reverse(t, t.astype(count.dtype) < count)
             return x
 
-        jax.lax.fori_loop(last + 1, steps, quiet, jnp.int32(0))
+        jax.lax.fori_loop(last + 1, self.steps, idle, jnp.int32(0))
         jax.lax.fori_loop(0, last + 1, reverse, jnp.int32(0))
 
-    def _load(
-        self, t: Any, steps: int, moved: Any, path: StatePath, target: tuple, lane_world: Any
-    ) -> None:
+    def _reverse(self, t: jax.Array, moved: jax.Array) -> None:
+        """Makes the cotangents of the state after step t those before it; moved: who took it."""
+        given = self.given
+        out = self.out
+        world = self.world
+        self._load(t, moved)
+        commands = [jnp.where(moved, given.arm[t, k, world], 0.0) for k in range(6)]
+        chamber = jnp.where(moved, given.pressure[(t,)], 0.0)
+        shown = TraceCotangents(*(given.trace_bar[t, k, world] for k in range(3)))
+        arms = self.step.reverse(
+            lanes(commands, (6,), wide=False), lanes([chamber], (), wide=True), moved, shown
+        )
+        for k in range(6):
+            out.arm[t, k, world] = jnp.where(moved, arms[k].lane, 0.0)
+        pressure_bar = self.bars.of_step("pressure").lane
+        out.pressure[(t, slice(None))] = jnp.where(moved, pressure_bar, 0.0)
+        if given.path_bar:
+            self._add_path(t)
+
+    def _add_path(self, t: jax.Array) -> None:
+        """Adds the cotangents of the positions that the trajectory shows before step t."""
+        fingers, worlds = self.given.path_bar
+        finger_bar = self.out.finger_start
+        world_bar = self.out.world_start
+        world = self.world
+        angles, places = self.tables.path_rows(states=False)
+        copy_rows((0, angles), lambda k: finger_bar[(k,)] + fingers[(t, k)], finger_bar)
+        copy_rows(
+            (0, places), lambda k: world_bar[k, world] + worlds[t, k, world], world_bar, world
+        )
+
+    def _load(self, t: jax.Array, moved: jax.Array) -> None:
         """Loads the state before a step, with the step's accelerations.
 
         A row of the path has the acceleration of the step before it, the solver's warm start. Where
         a world took no step they are of no use, and need not be numbers.
         """
-        fingers, worlds, finger_end, world_end, _ = path
-        after = jnp.minimum(t + 1, steps - 1)
-        more = t + 1 < steps
-        first = (
-            self.finger_state.offset[FingerState.acc],
-            self.world_state.offset[WorldState.acc_wrist],
-        )
-        ends = self.finger_state.rows, self.world_state.rows
+        path = self.given.path
+        out = self.out
+        world = self.world
+        after = jnp.minimum(t + 1, self.steps - 1)
+        more = t + 1 < self.steps
+        finger_rows = self.tables.finger_state
+        world_rows = self.tables.world_state
+        finger_acc = finger_rows.offset[FingerState.acc]
+        world_acc = world_rows.offset[WorldState.acc_wrist]
 
         def of_finger(k: jax.Array) -> jax.Array:
-            acc = jnp.where(more, fingers[(after, k)], finger_end[(0, k)])
+            acc = jnp.where(more, path.finger[(after, k)], path.finger_end[(0, k)])
             return jnp.where(moved, acc, 0.0)
 
         def of_world(k: jax.Array) -> jax.Array:
-            acc = jnp.where(more, worlds[after, k, lane_world], world_end[0, k, lane_world])
+            acc = jnp.where(more, path.world[after, k, world], path.world_end[0, k, world])
             return jnp.where(moved, acc, 0.0)
 
-        copy_rows((0, first[0]), lambda k: fingers[(t, k)], target[0])
-        copy_rows((0, first[1]), lambda k: worlds[t, k, lane_world], target[1], lane_world)
-        copy_rows((first[0], ends[0]), of_finger, target[0])
-        copy_rows((first[1], ends[1]), of_world, target[1], lane_world)
+        copy_rows((0, finger_acc), lambda k: path.finger[(t, k)], out.finger_state)
+        copy_rows((0, world_acc), lambda k: path.world[t, k, world], out.world_state, world)
+        copy_rows((finger_acc, finger_rows.rows), of_finger, out.finger_state)
+        copy_rows((world_acc, world_rows.rows), of_world, out.world_state, world)

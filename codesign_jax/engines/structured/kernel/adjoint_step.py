@@ -34,7 +34,11 @@ from codesign_jax.engines.structured.kernel.rows import (
 from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step import Step, body_after_step, joint_after_step
-from codesign_jax.engines.structured.kernel.step_memory import KernelLayout, StepMemory
+from codesign_jax.engines.structured.kernel.step_memory import (
+    KernelLayout,
+    References,
+    StepMemory,
+)
 from codesign_jax.engines.structured.lanes import dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 
@@ -66,8 +70,11 @@ class ReverseStep(Step):
     as the forward pass does, solves for the virtual accelerations, and goes back to the palm.
     """
 
-    def __init__(self, layout: KernelLayout, block: Block, refs: tuple, bars: CotangentTables):
-        super().__init__(layout, block, *refs)
+    def __init__(
+        self, layout: KernelLayout, block: Block, references: References, bars: CotangentTables
+    ):
+        """Binds the tables; bars: those of the cotangents."""
+        super().__init__(layout, block, references)
         self.bars = bars
 
     def store_chain(self, i: Any, chain: tuple) -> None:

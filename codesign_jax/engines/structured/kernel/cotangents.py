@@ -16,7 +16,7 @@ from codesign_jax.engines.structured.components import FINGER, is_number, splat
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, MemoryLayout
 from codesign_jax.engines.structured.kernel.rows import StepBar
-from codesign_jax.engines.structured.kernel.step_memory import KernelLayout
+from codesign_jax.engines.structured.kernel.step_memory import KernelLayout, References
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 
 
@@ -101,15 +101,15 @@ class CotangentTables:
       names: What several parts of a step add to beside these, in scratch memory: `rows.StepBar`.
     """
 
-    def __init__(self, layout: KernelLayout, block: Block, refs: tuple, scratch: Any):
-        hand, world, finger_state, world_state = refs
+    def __init__(self, layout: KernelLayout, block: Block, bars: References):
+        """Binds the rows; bars: references to the cotangents, those of worlds on each lane."""
         self.block = block
-        self.scratch = BoundTable(layout.scratch, scratch)
-        self.hand = BoundTable(layout.hand, hand)
-        self.world = BoundTable(MemoryLayout(True, **layout.world.groups), world)
-        self.finger_state = BoundTable(layout.finger_state, finger_state)
-        self.world_state = BoundTable(layout.world_state, world_state, block.world)
-        self.like = jnp.zeros((layout.size,), scratch.dtype)
+        self.scratch = BoundTable(layout.scratch, bars.scratch)
+        self.hand = BoundTable(layout.hand, bars.hand)
+        self.world = BoundTable(MemoryLayout(True, **layout.world.groups), bars.world)
+        self.finger_state = BoundTable(layout.finger_state, bars.finger_state)
+        self.world_state = BoundTable(layout.world_state, bars.world_state, block.world)
+        self.like = jnp.zeros((layout.size,), bars.scratch.dtype)
         self.names = [n for n, row in StepBar.by_attribute().items() if row in self.scratch]
 
     def begin(self) -> None:

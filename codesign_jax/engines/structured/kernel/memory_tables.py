@@ -195,6 +195,12 @@ class Tables(KernelLayout):
             groups |= self._groups(Search)
         return groups
 
+    def path_rows(self, states: bool) -> tuple[int, int]:
+        """Numbers of rows of the state's tables that a path has: all, or the positions."""
+        if states:
+            return self.finger_state.rows, self.world_state.rows
+        return self.finger_state.offset["finger_vel"], self.world_state.offset["wrist_vel"]
+
 
 LENGTH = 6
 """Which of a ring's numbers is its length: with none it is no ring, but can be divided by."""
@@ -270,12 +276,6 @@ class Packing(Tables):
         pressure = blocks[:, :, 6:]
         pad = [(0, 0)] * 2 + [(0, self.fingers - self.num_fingers), (0, 0)]
         return arm, jnp.pad(pressure, pad).reshape(*arm.shape[:2], self.columns)
-
-    def path_rows(self, states: bool) -> tuple[int, int]:
-        """Numbers of rows of the state's tables that a path has: all, or the positions."""
-        if states:
-            return self.finger_state.rows, self.world_state.rows
-        return self.finger_state.offset["finger_vel"], self.world_state.offset["wrist_vel"]
 
     def path(self, fingers: jax.Array, worlds: jax.Array, states: bool) -> dict[str, jax.Array]:
         """Coordinates of a path's rows (block, time, row, lane or world)."""

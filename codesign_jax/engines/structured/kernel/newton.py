@@ -41,6 +41,15 @@ from codesign_jax.engines.structured.lanes import dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 
 
+class Limits(NamedTuple):
+    """How hard each step is solved."""
+
+    # Largest number of Newton iterations; with none the accelerations stay those of the state
+    iterations: int
+    evaluations: int  # Largest number of line-search evaluations of an iteration
+    tolerance: float  # Relative Newton decrement at which a world has converged
+
+
 class Convergence(NamedTuple):
     """How the iteration stands: relative decrement, lanes of a world; count, a scalar."""
 

@@ -8,7 +8,7 @@ worlds are decided.
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,15 +17,20 @@ from jax.experimental import pallas as pl
 from codesign_jax import reuse
 from codesign_jax.compiler.launch import Kernel, block_lanes, kernel_jaxpr, launch
 from codesign_jax.engines.structured import coordinates
-from codesign_jax.engines.structured.kernel import chambers, shared_memory
-from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, TimeStep, anywhere
+from codesign_jax.engines.structured.kernel import chambers
 from codesign_jax.engines.structured.kernel.memory_tables import Packing
-from codesign_jax.engines.structured.kernel.rows import Record, WorldState
-from codesign_jax.engines.structured.kernel.step import Step
-from codesign_jax.engines.structured.lanewise import Lanes, lanes, of_code
+from codesign_jax.engines.structured.kernel.newton import Limits
+from codesign_jax.engines.structured.kernel.rollout import (
+    BlockRollout,
+    Inputs,
+    Outputs,
+    PathRows,
+    path_parts,
+)
+from codesign_jax.engines.structured.kernel.rows import Record
+from codesign_jax.engines.structured.lanewise import of_code
 from codesign_jax.engines.structured.laws.kinematics import State
 from codesign_jax.engines.structured.world_model import WorldModel
-from codesign_jax.judge import verdict
 from codesign_jax.model import held
 from codesign_jax.scene import Scene
 
@@ -41,47 +46,6 @@ Worlds of a block wait for one another in every loop, most of all in those over 
 good designs are simulated 1.2 times as fast with two worlds a block as with the four that fill a
 vector of 64 bytes, and 1.1 times as fast as with one.
 """
-
-
-class Inputs(NamedTuple):
-    """What the kernel reads of worlds, tables of blocks; also their cotangents."""
-
-    hand: Any  # `rows.Hand`, shape (block, row, lane)
-    world: Any  # `rows.World`, shape (block, row, world)
-    finger_start: Any  # `rows.FingerState` at the start, shape (block, row, lane)
-    world_start: Any  # `rows.WorldState` at the start, shape (block, row, world)
-    arm: Any  # Commands of the arm frame, shape (block, time, 6, world)
-    pressure: Any  # Pressures of the chambers [Pa], shape (block, time, lane)
-    # Distances of all meshes, which all blocks share, shape (1, n); None without meshes
-    grid: Any = None
-
-
-class PathPart(NamedTuple):
-    """States that are stored, every so many steps: all rows, or those of positions."""
-
-    finger: Any  # Rows of `rows.FingerState`, shape (block, time, row, lane)
-    world: Any  # Rows of `rows.WorldState`, shape (block, time, row, world)
-
-
-class Outputs(NamedTuple):
-    """What the kernel writes of worlds, tables of blocks."""
-
-    finger_state: Any  # `rows.FingerState` at the end, shape (block, row, lane)
-    world_state: Any  # `rows.WorldState` at the end, shape (block, row, world)
-    scratch: Any  # Memory of a step, which is not read; None after the call
-    trace: Any  # `Program.trace`, shape (block, time, entry, world)
-    path: tuple[PathPart, ...] = ()  # See `path_parts`
-    recorded: Any = None  # Forces by `kernel.record`, shape (block, time, row, lane)
-    onchip: Any = None  # Shared memory of a step, with teams only; None after the call
-
-
-class Limits(NamedTuple):
-    """How hard each step is solved."""
-
-    # Largest number of Newton iterations; with none the accelerations stay those of the state
-    iterations: int
-    evaluations: int  # Largest number of line-search evaluations of an iteration
-    tolerance: float  # Relative Newton decrement at which a world has converged
 
 
 class Program(Packing):
@@ -210,7 +174,15 @@ class Program(Packing):
         hand_table, world_table = tables
         finger_start, world_start = self.pack_state(state)
         arm, pressure = self.pack_controls(ctrl)
-        return Inputs(hand_table, world_table, finger_start, world_start, arm, pressure, grid)
+        return Inputs(
+            hand=hand_table,
+            world=world_table,
+            finger_start=finger_start,
+            world_start=world_start,
+            arm=arm,
+            pressure=pressure,
+            grid=grid,
+        )
 
     def _call(self, inputs: Inputs, trajectory: bool, states: int) -> tuple[Callable, Outputs]:
         """The kernel of inputs as a function of their arrays, and its outputs."""
@@ -220,22 +192,22 @@ class Program(Packing):
             return jax.ShapeDtypeStruct((blocks, *sizes), inputs.arm.dtype)
 
         path = []
-        for stride, whole in path_parts(trajectory, states):
-            angles, places = self.path_rows(whole)
-            count = -(-steps // stride)
+        for part in path_parts(trajectory, states):
+            angles, places = self.path_rows(part.whole)
+            count = -(-steps // part.stride)
             path.append(
-                PathPart(shape(count, angles, self.columns), shape(count, places, self.block))
+                PathRows(shape(count, angles, self.columns), shape(count, places, self.block))
             )
         some = self.record is not None and self.recorded.rows > 0
         recorded = shape(steps, self.recorded.rows, self.columns) if some else None
         outputs = Outputs(
-            shape(self.finger_state.rows, self.columns),
-            shape(self.world_state.rows, self.block),
-            shape(self.scratch.rows, self.columns),
-            shape(steps, len(self.trace), self.block),
-            tuple(path),
-            recorded,
-            shape(self.onchip.rows, self.columns) if self.team > 1 else None,
+            finger_state=shape(self.finger_state.rows, self.columns),
+            world_state=shape(self.world_state.rows, self.block),
+            scratch=shape(self.scratch.rows, self.columns),
+            trace=shape(steps, len(self.trace), self.block),
+            path=tuple(path),
+            recorded=recorded,
+            onchip=shape(self.onchip.rows, self.columns) if self.team > 1 else None,
         )
         kernel = partial(self._kernel, steps, trajectory, states)
         return self.call(kernel, "grasp", inputs, outputs), outputs
@@ -291,7 +263,8 @@ class Program(Packing):
     def _kernel(
         self, steps: int, to_end: bool, states: int, inputs: Inputs, outputs: Outputs
     ) -> None:
-        rollout = BlockRollout(self, inputs, outputs, path_parts(to_end, states))
+        parts = path_parts(to_end, states)
+        rollout = BlockRollout(self, self.limits, self.trace, inputs, outputs, parts)
         rollout.start()
         done = rollout.run(steps, to_end=to_end)
         rollout.repeat_last(done, steps)
@@ -301,160 +274,6 @@ def numbered(record: Arrays) -> Arrays:
     """A record with the places of its arrays among all of them."""
     leaves, structure = jax.tree.flatten(record)
     return structure.unflatten(range(len(leaves)))
-
-
-class BlockRollout:
-    """The rollout of a block of worlds in the kernel of a program."""
-
-    def __init__(
-        self, program: Program, inputs: Inputs, outputs: Outputs, parts: list[tuple[int, bool]]
-    ):
-        """Takes the references to inputs and outputs; `parts` as `path_parts` returns them."""
-        block = Block(program.fingers, program.block, program.team)
-        if program.team > 1:
-            inputs, outputs = _with_shared_columns(block, inputs, outputs)
-        self.program = program
-        self.path_parts = parts
-        state = outputs.finger_state, outputs.world_state
-        memory = outputs.scratch, inputs.grid, outputs.onchip
-        self.step = Step(program, block, inputs.hand, inputs.world, *state, *memory)
-        self.world = block.world
-        self.start_state = inputs.finger_start, inputs.world_start
-        self.state = state
-        self.commands = inputs.arm, inputs.pressure
-        self.trace = outputs.trace
-        self.path = outputs.path
-        self.recorded = outputs.recorded
-
-    def start(self) -> None:
-        """Copies the start state to the state."""
-        finger_start, world_start = self.start_state
-        fingers, worlds = self.state
-        world = self.world
-        rows = self.program.finger_state.rows, self.program.world_state.rows
-        copy_rows((0, rows[0]), lambda k: finger_start[(k,)], fingers)
-        copy_rows((0, rows[1]), lambda k: world_start[k, world], worlds, world)
-
-    def run(self, steps: int, *, to_end: bool) -> jax.Array:
-        """Steps until all worlds are decided; returns the number of steps.
-
-        Args:
-          steps: Largest number of steps.
-          to_end: Whether worlds that lost their object go on.
-        """
-        step = self.step
-        bounds = verdict.Bounds(*(step.constant(n).lane for n in verdict.Bounds._fields))
-
-        def body(carry: tuple) -> tuple:
-            t, going = carry
-            now = self._number(WorldState.step)
-            fastest = self._number(WorldState.speed)
-
-            def undecided(distance: jax.Array, height: jax.Array) -> jax.Array:
-                return verdict.goes_on(bounds, distance, height, fastest, now, to_end=to_end)
-
-            self._store_path(t)
-            command = self._command(t)
-            limits = self.program.limits
-            given = undecided, going > 0, fastest, limits, t == 0, self._recorded(t)
-            entry, new_speed, moved = step.advance(*command, *given)
-            going = jnp.where(moved, going, 0.0)
-            for k, value in enumerate((*entry[:2], fastest, *entry[2:4], going, *entry[4:])):
-                self.trace[t, k, self.world] = value
-            self._keep(step=now + 1.0, going=going, speed=new_speed)
-            return t + 1, going
-
-        def goes_on(carry: tuple) -> jax.Array:
-            # The first step also tells where worlds are that were decided before.
-            return (carry[0] < steps) & (anywhere(carry[1] > 0) | (carry[0] == 0))
-
-        return jax.lax.while_loop(goes_on, body, (jnp.int32(0), self._number(WorldState.going)))[0]
-
-    def repeat_last(self, done: jax.Array, steps: int) -> None:
-        """Repeats the trace's last entries from step `done` on.
-
-        They are those of decided worlds of a block that goes on: no residual, and their speed.
-        """
-        last_speed = self._number(WorldState.speed)
-        none = jnp.zeros_like(last_speed)
-        ended = {"speed": last_speed, "residual": none, "overflow": none}
-        world = self.world
-        trace = self.trace
-
-        def repeat(t: jax.Array, x: jax.Array) -> jax.Array:
-            self._store_path(t)
-            for k, name in enumerate(self.program.trace):
-                trace[t, k, world] = ended.get(name, trace[done - 1, k, world])
-            self._keep(step=self._number(WorldState.step) + 1.0)
-            return x
-
-        jax.lax.fori_loop(done, steps, repeat, jnp.int32(0))
-
-    def _command(self, t: jax.Array) -> tuple[Lanes, Lanes]:
-        """Commands of the arm frame and pressures of the chambers at a step."""
-        arm, pressure = self.commands
-        pose = lanes([arm[t, k, self.world] for k in range(6)], (6,), wide=False)
-        return pose, lanes([pressure[t]], (), wide=True)
-
-    def _recorded(self, t: jax.Array) -> BoundTable | None:
-        """Where a step's forces are recorded."""
-        if self.recorded is None:
-            return None
-        return BoundTable(self.program.recorded, TimeStep(self.recorded, t))
-
-    def _number(self, name: str) -> jax.Array:
-        return self.step.world_state.read(name).lane
-
-    def _keep(self, **numbers: jax.Array) -> None:
-        for name, value in numbers.items():
-            self.step.world_state.write(name, lanes([value], (), wide=False))
-
-    def _store_path(self, t: jax.Array) -> None:
-        """Stores the state before step t where it is part of the path."""
-        for k, (stride, whole) in enumerate(self.path_parts):
-            target = self.path[k]
-            if stride == 1:
-                self._store_state(t, whole, *target)
-            else:
-                every = jnp.int32(stride)
-                put = partial(self._store_state, jax.lax.div(t, every), whole, *target)
-                jax.lax.cond(jax.lax.rem(t, every) == 0, put, lambda: None)
-
-    def _store_state(self, place: jax.Array, whole: bool, fingers: Any, worlds: Any) -> None:
-        """Stores the whole state, or its positions, at a place of the path."""
-        finger_state, world_state = self.state
-        world = self.world
-        angles, places = self.program.path_rows(whole)
-        copy_rows((0, angles), lambda k: finger_state[(k,)], fingers, at=(place,))
-        copy_rows((0, places), lambda k: world_state[k, world], worlds, world, at=(place,))
-
-
-def _with_shared_columns(block: Block, inputs: Inputs, outputs: Outputs) -> tuple[Inputs, Outputs]:
-    """References of which the lanes of a team share the columns."""
-
-    def share(table: Any) -> Any:
-        return shared_memory.SharedColumns(block, table)
-
-    return (
-        inputs._replace(
-            hand=share(inputs.hand),
-            finger_start=share(inputs.finger_start),
-            pressure=share(inputs.pressure),
-        ),
-        outputs._replace(
-            finger_state=share(outputs.finger_state),
-            scratch=share(outputs.scratch),
-            recorded=None if outputs.recorded is None else share(outputs.recorded),
-            path=tuple(part._replace(finger=share(part.finger)) for part in outputs.path),
-            onchip=share(outputs.onchip),
-        ),
-    )
-
-
-def path_parts(trajectory: bool, states: int) -> list[tuple[int, bool]]:
-    """What the kernel stores: every how many steps, and whether whole states or positions."""
-    parts = [(1, states == 1)] if trajectory or states == 1 else []
-    return parts + ([(states, True)] if states > 1 else [])
 
 
 def block_spec(shape: tuple[int, ...], blocks: int) -> pl.BlockSpec:
@@ -472,13 +291,3 @@ def lanes_here(scene: Scene, dtype: Any, worlds: int | None = None) -> int:
     if platform == "cpu" and scene.effects.finger_finger:
         return min(lanes, WORLDS_THAT_WAIT * fingers)
     return lanes
-
-
-def copy_rows(rows: tuple[Any, Any], read: Callable, target: Any, *where: Any, at: tuple = ()):
-    """Stores read(row) in rows of a table; what is before and behind the row in the index."""
-
-    def copy(k: jax.Array, x: jax.Array) -> jax.Array:
-        target[(*at, k, *where)] = read(k)
-        return x
-
-    jax.lax.fori_loop(*rows, copy, jnp.int32(0))

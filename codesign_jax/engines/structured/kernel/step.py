@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.kernel import chambers, friction_memory, objects, record
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import BoundTable, anywhere, loop
-from codesign_jax.engines.structured.kernel.newton import Convergence, Newton
+from codesign_jax.engines.structured.kernel.newton import Convergence, Limits, Newton
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem, triangle
 from codesign_jax.engines.structured.kernel.rows import Hand, Scratch, WorldState
@@ -47,7 +47,7 @@ class Step(StepMemory):
         undecided: Callable,
         waiting: Any,
         speed: Any,
-        limits: tuple[int, int, float],
+        limits: Limits,
         begins: Any,
         recorded: BoundTable | None = None,
     ) -> tuple:
@@ -59,7 +59,7 @@ class Step(StepMemory):
           undecided: Whether a world takes this step, from distance and height before it.
           waiting: Undecided worlds, which must converge.
           speed: Largest velocity before the step.
-          limits: See `program.Limits`.
+          limits: How hard the step is solved.
           begins: Whether the rollout begins, a scalar; see `_keep_overlap`.
           recorded: Where the contacts' forces are written; None to record none.
 
@@ -71,7 +71,7 @@ class Step(StepMemory):
         state, bodies, _, now, centre = self.assemble(arm, pressure)
         jax.lax.cond(begins, lambda: self._keep_overlap(state), lambda: None)
         convergence = Convergence(lanes([self.like], (), wide=False), jnp.int32(0))
-        if limits[0]:
+        if limits.iterations:
             problem = Problem(self, bodies["palm"])
             now, convergence = Newton(problem).solve(now, waiting, *limits)
         if recorded is not None:

@@ -1,6 +1,6 @@
 """A block's memory in a step: its tables with their references, and what is read of them."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -113,6 +113,18 @@ class KernelLayout:
         return friction_by_contact(self.scene, "object_table")
 
 
+class References(NamedTuple):
+    """Pallas' references to a block's tables: rows of `rows` by lanes, or by worlds."""
+
+    hand: Any  # `rows.Hand`, shape (row, lane)
+    world: Any  # `rows.World`, shape (row, world)
+    finger_state: Any  # `rows.FingerState`, shape (row, lane)
+    world_state: Any  # `rows.WorldState`, shape (row, world)
+    scratch: Any  # `rows.Scratch` and more, shape (row, lane)
+    grid: Any = None  # Distances of all meshes, shape (n,); None without meshes
+    onchip: Any = None  # `rows.Chip`, shared memory, shape (row, lane); None without teams
+
+
 class StepMemory:
     """A block's tables with their references.
 
@@ -127,29 +139,19 @@ class StepMemory:
       columns: Columns of the object's orientation, once they are known.
     """
 
-    def __init__(
-        self,
-        layout: KernelLayout,
-        block: Block,
-        hand: Any,
-        world: Any,
-        finger_state: Any,
-        world_state: Any,
-        scratch: Any,
-        grid: Any = None,
-        onchip: Any = None,
-    ):
-        """Takes the references; `onchip`: the table of shared memory, of teams."""
+    def __init__(self, layout: KernelLayout, block: Block, references: References):
+        """Binds the rows of the tables to their references."""
         self.layout = layout
         self.block = block
-        self.grid = grid
-        self.hand = BoundTable(layout.hand, hand)
-        self.world = BoundTable(layout.world, world, block.world)
-        self.finger_state = BoundTable(layout.finger_state, finger_state)
-        self.world_state = BoundTable(layout.world_state, world_state, block.world)
-        self.scratch = BoundTable(layout.scratch, scratch)
+        self.grid = references.grid
+        self.hand = BoundTable(layout.hand, references.hand)
+        self.world = BoundTable(layout.world, references.world, block.world)
+        self.finger_state = BoundTable(layout.finger_state, references.finger_state)
+        self.world_state = BoundTable(layout.world_state, references.world_state, block.world)
+        self.scratch = BoundTable(layout.scratch, references.scratch)
+        onchip = references.onchip
         self.onchip = None if onchip is None else BoundTable(layout.onchip, onchip)
-        self.like = jnp.zeros((layout.size,), finger_state.dtype)
+        self.like = jnp.zeros((layout.size,), references.finger_state.dtype)
         self.contacts: dict[str, BoundContacts] = {}
         self.self_contacts: BoundSelfContacts | None = None
         self.field_contacts: list[BoundContacts] = []

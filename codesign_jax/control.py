@@ -100,7 +100,6 @@ def _place(scene: Scene, params: Params, time: np.ndarray) -> tuple[jax.Array, .
 def _between(place: tuple[jax.Array, ...], knots: jax.Array) -> jax.Array:
     """Interpolates values at the key frames, shape (frame, n), to (time, n)."""
     before, after, share = place
-    knots = jnp.asarray(knots)  # NumPy takes no traced index
     return knots[before] + share[:, None] * (knots[after] - knots[before])
 
 

@@ -209,7 +209,7 @@ def _scene_warnings(scene: Scene) -> list[str]:
 def _reach(scene: Scene, design: Params, name: str) -> list[str]:
     if not scene.effects.finger_object:
         return []
-    palm = float(key_frames.poses(scene, design)[:, 2].min())
+    palm = float(key_frames.poses(scene, design, numpy=np)[:, 2].min())
     tilt = np.deg2rad([f.tilt for f in scene.hand.finger])
     lowest = float((palm - design.length * np.sin(tilt)).min())
     # An arm that is turned may bring a finger lower, by no more than its whole length.
@@ -230,7 +230,7 @@ def low_starts(scene: Scene, design: Params) -> list[str]:
     """
     if not scene.effects.finger_object:
         return []
-    x, y, height = (float(v) for v in key_frames.poses(scene, design, 1)[0][:3])
+    x, y, height = (float(v) for v in key_frames.poses(scene, design, 1, np)[0][:3])
     longest = float(np.max(design.length))
     tallest = max(scene.objects.object, key=lambda shape: float(shape.height))
     noise = scene.objects.noise

@@ -17,7 +17,7 @@ import pytest
 import scipy.stats
 
 from codesign_jax import cli, codesign, rollout, runs, scene
-from codesign_jax.commands import optimize
+from codesign_jax.commands import run_settings
 from codesign_jax.engines import make_engine
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import StructuredEngine
@@ -28,8 +28,8 @@ from scripts.accuracy import budget, decisions, report
 from scripts.agree import __main__ as agree
 from scripts.agree import judgement, sides
 from scripts.calibration import OPEN
-from scripts.experiments import fresh, simulate
-from scripts.experiments import report as results
+from scripts.experiments import fresh, results, simulate
+from scripts.experiments import report as experiments_report
 from scripts.experiments.simulate import PAPER, TOTAL_GRASPS
 from scripts.search import __main__ as search
 from scripts.search import tables as search_tables
@@ -362,7 +362,7 @@ def test_presets_are_ordered_in_counted_work_and_in_the_error_of_the_finger_tip(
 
 
 def test_the_command_line_takes_a_preset(capsys):
-    resolved, _ = optimize.resolve(
+    resolved, _ = run_settings.resolve(
         cli.Optimize(accuracy="fast", engine="mujoco", overrides=(("solver.iterations=7",),))
     )
     assert resolved.discretization == scene.Discretization(0.02, 6, 1, integrator="newmark")
@@ -390,7 +390,7 @@ ONE_ACCURACY: list[dict[str, Any]] = [
 
 def test_a_default_search_is_coarse_and_has_the_episodes_that_its_time_allows(tmp_path):
     def resolved(preset="23d", **flags):
-        return optimize.resolve(cli.Optimize(preset=preset, out=tmp_path / "run", **flags))
+        return run_settings.resolve(cli.Optimize(preset=preset, out=tmp_path / "run", **flags))
 
     the_scene, settings = resolved()
     assert (settings.search_accuracy, settings.episodes) == ("fast", 62)
@@ -599,7 +599,7 @@ def test_both_readings_of_converged():
 
 def test_the_results_page_has_the_tables_of_its_data():
     data = ROOT / "docs" / "data" / "experiments"
-    text = results.tables(results.read(data))
+    text = experiments_report.tables(results.read(data))
     assert text in (ROOT / "docs" / "notes" / "results.md").read_text(encoding="utf-8")
 
 

@@ -68,7 +68,7 @@ def key_poses(scene: Scene, params: Params) -> np.ndarray:
 
     Time counts from the start of the grasp, as in commands.csv: the object settles first.
     """
-    poses = np.asarray(key_frames.poses(scene, params)) * ([1e3] * 3 + [180 / np.pi] * 3)
+    poses = key_frames.poses(scene, params, numpy=np) * ([1e3] * 3 + [180 / np.pi] * 3)
     times = np.asarray(key_frames.times(scene, params)) + scene.phases.settle
     return np.column_stack([times, poses])
 

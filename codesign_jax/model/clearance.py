@@ -30,7 +30,7 @@ def starts_apart(scene: Scene, design: Params) -> bool:
 
 def _hangs_above(scene: Scene, design: Params) -> bool:
     """Whether all of the hand is above the tallest object, whichever way it is turned."""
-    height = float(key_frames.poses(scene, design, 1)[0, 2])
+    height = float(key_frames.poses(scene, design, 1, np)[0, 2])
     section = _largest_section(scene, design)
     fingers = max(f.base_distance for f in scene.hand.finger) + design.length.max()
     reach = max(fingers + np.hypot(*section).max(), np.hypot(*_palm_size(scene)))

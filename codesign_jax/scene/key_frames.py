@@ -13,7 +13,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from codesign_jax.scene import hand as hands
 from codesign_jax.scene import keypaths, schema, sums, unit_slips
@@ -194,10 +193,15 @@ def times(scene: Any, params: Params) -> jax.Array:
     return jnp.stack([jnp.asarray(t, float) for t in frame_times])
 
 
-def poses(scene: Any, params: Params, count: int | None = None) -> jax.Array:
-    """Poses of the arm frame at the first `count` key frames [m, rad], shape (frame, 6).
+def poses(scene: Any, params: Params, count: int | None = None, numpy: Any = jnp) -> Any:
+    """Poses of the arm frame at key frames [m, rad], shape (frame, 6).
 
-    Of NumPy's numbers alone they are NumPy's: nothing is compiled then.
+    Args:
+      scene: The scene.
+      params: Parameters of one hand.
+      count: Number of the first frames that are taken; None for all.
+      numpy: Module of the array that is returned: with NumPy, to which no traced number can be
+        given, nothing is compiled.
     """
     names = _names(scene, params)
     pose: dict[str, Any] = {axis: params.arm[i] for i, axis in enumerate(POSE)}
@@ -207,8 +211,6 @@ def poses(scene: Any, params: Params, count: int | None = None) -> jax.Array:
         fields = {axis: getattr(frame, axis) for axis in POSE}
         pose |= {axis: _value(v, names) for axis, v in fields.items() if v is not None}
         rows.append([*pose.values()])
-    traced = any(isinstance(v, jax.Array) for row in rows for v in row)
-    numpy: Any = jnp if traced else np
     dtype = params.arm.dtype
     return numpy.stack([numpy.stack([numpy.asarray(v, dtype) for v in row]) for row in rows])
 

@@ -28,7 +28,7 @@ from codesign_jax.engines import NAMES, make_engine
 from codesign_jax.scene import keypaths, parameters
 from codesign_jax.statistics import wilson
 from codesign_jax.types import failed
-from scripts.experiments import report
+from scripts.experiments import results
 from scripts.experiments.simulate import write
 from scripts.shared import output, provenance, statistics
 
@@ -44,7 +44,7 @@ def winners(data: Path, name: str) -> tuple[list[str], np.ndarray]:
     Returns:
       Names of the strategies, and particles [SI units] of shape (strategy, run, parameter).
     """
-    study = report.load_study(data, name)
+    study = results.load_study(data, name)
     if study is None or not study.tested:
         raise FileNotFoundError(f"{data} holds no {name} with a final test")
     best = np.argmin(study.data["test_exclude"], axis=-1)
@@ -113,7 +113,7 @@ def run(args: argparse.Namespace) -> None:
 
 def summary(data: Path) -> str:
     """The tables of what was simulated, one an experiment."""
-    loaded = report.load(data, "fresh")
+    loaded = results.load(data, "fresh")
     if loaded is None:
         raise FileNotFoundError(f"{data} holds no fresh.npz")
     arrays = loaded[0]

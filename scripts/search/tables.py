@@ -1,5 +1,6 @@
 """Tables of the pages on searches, from the files of their studies."""
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,12 @@ def order(row: dict[str, Any]) -> tuple:
 
 def hand_of(row: dict[str, Any]) -> str:
     """Name of the hand that was searched: that of the scene, unless the row names another."""
-    return row.get("hand") or scene.load(row.get("scene", "paper")).hand.name
+    return row.get("hand") or _hand_of_scene(row.get("scene", "paper"))
+
+
+@functools.cache
+def _hand_of_scene(name: str) -> str:
+    return scene.load(name).hand.name
 
 
 def table(rows: list[dict[str, Any]]) -> str:

@@ -12,6 +12,7 @@ from codesign_jax.scene import Scene
 
 
 def reset(scene: Scene, fields: ModelFields) -> State:
+    """The states in which rollouts of model fields begin, leading axis (world,), in lanes."""
     return _in_lanes(scene, model.split(scene, fields.start))
 
 
@@ -81,6 +82,7 @@ def flat_acc(acc: Acc) -> jax.Array:
 
 
 def flat(state: State) -> jax.Array:
+    """MuJoCo's qpos, then qvel, shape (world, nq + nv)."""
     return jnp.concatenate([qpos(state), qvel(state)], 1)
 
 

@@ -87,6 +87,7 @@ class StructuredEngine(Equal):
         return self.scene.structure, self.limits, self.segment, self.truncate
 
     def reset(self, fields: ModelFields) -> State:
+        """The states in which rollouts of model fields begin, leading axis (world,), in lanes."""
         return coordinates.reset(self.scene, fields)
 
     def place(
@@ -154,7 +155,8 @@ class StructuredEngine(Equal):
         def tables(fields: ModelFields) -> tuple[jax.Array, ...]:
             count = len(fields.start)
             dtype = fields.start.dtype
-            return self._tables(Program.here(self.scene, self.limits, dtype, count), fields)
+            program = Program.here(self.scene, self.limits, dtype, count)
+            return program.pack_hand(world_constants(self.scene, fields))
 
         return transforms.folded(tables)(jax.lax.stop_gradient(fields))
 
@@ -166,7 +168,13 @@ class StructuredEngine(Equal):
         *,
         trajectory: bool = False,
     ) -> Trace:
-        """The rollout itself, in one kernel; arguments as in `rollout`.
+        """The rollout itself, in one kernel, without JAX's transformations.
+
+        Args:
+          fields: Model fields, leading axis (world,).
+          ctrl: Controls, shape (world, time, nu).
+          tables: The fields' tables of `tables`; none to lay them out here.
+          trajectory: Whether the trace has qpos of every step, of whole grasps.
 
         Raises:
           KernelUnavailable: If the kernel cannot be compiled for this device, or called there.
@@ -229,15 +237,7 @@ class StructuredEngine(Equal):
     ) -> Inputs:
         """The kernel's arguments, see `Program.inputs`."""
         hand = world_constants(self.scene, fields)
-        state = self.reset(fields)
-        if program.team == 1:
-            return program.inputs(hand, state, ctrl)
-        tables = tables or self._tables(program, fields)
-        return program.joined(tables, hand, state, ctrl)
-
-    def _tables(self, program: Program, fields: ModelFields) -> tuple[jax.Array, ...]:
-        """The hands' tables."""
-        return program.pack_hand(world_constants(self.scene, fields))
+        return program.inputs(hand, self.reset(fields), ctrl, tables)
 
     def simulate_with_path(
         self, fields: ModelFields, ctrl: jax.Array, *, trajectory: bool = False

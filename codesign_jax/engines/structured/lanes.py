@@ -58,6 +58,7 @@ def scan_links(step: Callable, first: Any, links: Any) -> tuple[Any, Any]:
 
 
 def total(terms: Sequence[jax.Array]) -> jax.Array:
+    """Sum of arrays, written out."""
     result = terms[0]
     for term in terms[1:]:
         result = result + term
@@ -90,6 +91,7 @@ def cross(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def spatial(angular: jax.Array, linear: jax.Array) -> jax.Array:
+    """A spatial vector (6, ...) of its angular and linear parts, (3, ...) each."""
     return jnp.concatenate([angular, linear])
 
 
@@ -147,10 +149,12 @@ def _items(columns: jax.Array, v: jax.Array) -> jax.Array:
 
 
 def sum_axis(x: jax.Array, axis: int) -> jax.Array:
+    """Sum over an axis, written out; the axis leaves."""
     return total([jax.lax.index_in_dim(x, i, axis, keepdims=False) for i in range(x.shape[axis])])
 
 
 def sum_fingers(x: jax.Array) -> jax.Array:
+    """Sum over the fingers, (..., finger, world) to (..., 1, world), written out."""
     return sum_axis(x, x.ndim - 2)[..., None, :]
 
 

@@ -16,7 +16,7 @@ from codesign_jax.engines.structured.kernel.adjoint_step import ReverseStep, Tra
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables
 from codesign_jax.engines.structured.kernel.memory import Block, MemoryLayout
 from codesign_jax.engines.structured.kernel.memory_tables import Tables
-from codesign_jax.engines.structured.kernel.program import Program, numbered
+from codesign_jax.engines.structured.kernel.program import Program, leaf_indices
 from codesign_jax.engines.structured.kernel.rollout import Inputs, Outputs, copy_rows
 from codesign_jax.engines.structured.kernel.rows import (
     BodyBar,
@@ -116,13 +116,21 @@ class AdjointProgram(Program):
     ) -> Inputs:
         """Cotangents of `Program.inputs`; where a world took no step they need not be numbers.
 
-        Those of the worlds' constants are for each of their fingers, see `summed`; `sums` is what
-        is added to those of the constants, see `no_sums`.
+        Args:
+          inputs: What the rollout read.
+          path: What it stored, as tables of blocks.
+          bars: Cotangents of its results, as tables of blocks.
+          sums: What is added to the cotangents of `inputs.hand`, shape (block, row, lane), and of
+            `inputs.world`, on the lanes of each finger; None for zeros.
+
+        Returns:
+          Cotangents shaped as the inputs, but those of `world`, which are on the lanes of each
+          finger: `summed` adds them up.
         """
         given = self._arguments(inputs, path, bars, sums)
         call, outputs = self._adjoint_call(given)
-        places = numbered(outputs)
-        scratch = places.scratch, places.finger_state, places.world_state
+        index = leaf_indices(outputs)
+        scratch = index.scratch, index.finger_state, index.world_state
         # At LLVM's level 1 it is as fast, with the same bits, after two thirds of LLVM's time.
         origin = repr((self.scene.structure, "adjoint"))
         out = self.launch(call, given, outputs, origin, scratch=scratch, level=1)
@@ -222,8 +230,8 @@ class BlockAdjoint:
         Args:
           tables: The rows of the tables.
           steps: Steps of the path.
-          given: References to the tables of a block, without their axis of blocks.
-          out: Likewise.
+          given: References to a block's part of the tables that are read.
+          out: References to its part of those that are written.
         """
         block = Block(tables.fingers, tables.block)
         self.tables = tables

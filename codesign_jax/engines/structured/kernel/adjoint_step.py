@@ -78,10 +78,23 @@ class ReverseStep(Step):
         self.bars = bars
 
     def store_chain(self, i: Any, chain: tuple) -> None:
+        """Stores how a body moves, for the reverse sweep over the links.
+
+        Args:
+          i: Row of the body: 0 is the palm, then the links.
+          chain: Values of `residual.LinkMotion`, or of its first fields: vectors (3, ...), frames
+            as columns (3, 3, ...), spatial vectors (6, ...), lanes of a finger.
+        """
         for name, value in zip(LinkMotion._fields, chain, strict=False):
             self.scratch.write(getattr(Chain, name), value, i)
 
     def store_before(self, i: Any, chain: tuple) -> None:
+        """Stores how a link moved as the last step ended.
+
+        Args:
+          i: Number of the link.
+          chain: Values of `residual.Before`, shaped as `store_chain` takes them.
+        """
         for name, value in zip(Before._fields, chain, strict=True):
             self.scratch.write(getattr(ChainBefore, name), value, i)
 

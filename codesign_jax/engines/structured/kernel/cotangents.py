@@ -24,8 +24,9 @@ def pull(function: Callable, args: tuple, fixed: tuple, bars: Any) -> Any:
     """Cotangents of args: the transposed derivative of function(*args, *fixed) times bars.
 
     Args:
-      function: As in `lanewise`.
-      args: Trees of lanes by which to differentiate; `fixed`: further arguments.
+      function: Function of arrays whose two last axes are those of lanes.
+      args: Trees of lanes by which to differentiate.
+      fixed: Trees of lanes: its further arguments.
       bars: Cotangents of the function's results.
 
     Returns:
@@ -64,6 +65,7 @@ def pull(function: Callable, args: tuple, fixed: tuple, bars: Any) -> Any:
 
 
 def plus(first: Any, second: Any) -> Any:
+    """Sums of two trees of lanes, leaf by leaf."""
     return lanewise(_sum, first, second)
 
 
@@ -113,6 +115,7 @@ class CotangentTables:
         self.names = [n for n, row in StepBar.by_attribute().items() if row in self.scratch]
 
     def begin(self) -> None:
+        """Sets to zero what the parts of a step add to, the rows of `rows.StepBar`."""
         for name in self.names:
             row = StepBar.by_attribute()[name]
             for item in range(self.scratch.layout.groups[row][0]):
@@ -140,5 +143,11 @@ class CotangentTables:
         self.add({name: only_on(first, value) for name, value in values.items()})
 
     def add_joint(self, values: dict[str, Lanes], i: Any) -> None:
+        """Adds to cotangents of a joint's state.
+
+        Args:
+          values: Lanes of shape (axis, ...) by row of `rows.FingerState`.
+          i: Number of the joint's link.
+        """
         for name, value in values.items():
             self.finger_state.write(name, plus(self.finger_state.read(name, i), value), i)

@@ -231,7 +231,11 @@ class Coupling:
     # One more right side
 
     def again(self) -> Iterate:
-        """Eliminates the forces that lie on the sides; see `Elimination.backward`."""
+        """Eliminates the forces that lie on the sides, from the tips to the palm.
+
+        Returns:
+          The step of wrist, palm and object; that of each joint is left in `Again.z_again`.
+        """
         none = zeros((6,), self.problem.like)
 
         def step(i: Any, carry: tuple) -> tuple:
@@ -256,7 +260,12 @@ class Coupling:
         return lanewise(solve_palm_again, self.done, palm.axes, palm.armature, r, ro)
 
     def substitute(self, z: str, step: Iterate) -> None:
-        """Leaves the links' accelerations with the sides, see `LineSearch.prepare`."""
+        """Leaves the links' accelerations by a step with the sides of the contacts.
+
+        Args:
+          z: Row of what the elimination leaves of each joint, shape (axis, ...).
+          step: Accelerations of palm and object, shape (6, ...) each.
+        """
 
         def link(i: Any, parent: Lanes) -> Lanes:
             axes, *factors = self.problem.read(Scratch.axes, Scratch.w, Scratch.g, z, item=i)

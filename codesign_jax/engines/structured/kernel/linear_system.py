@@ -117,6 +117,13 @@ class Elimination:
         return self.problem.read(Scratch.smooth, Scratch.tau, item=i)
 
     def of_contacts(self, contacts: BoundContacts, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
+        """Contact inertia (6, 6, ...) and wrench (6, ...) of an item's contacts at a step's length.
+
+        Args:
+          contacts: A contact set.
+          item: Number of the item: a link, or a group.
+          alpha: Length of the last Newton step, by which jar is still behind, lanes of a world.
+        """
         return contacts.inertia_and_wrench(item, alpha)
 
     def between_fingers(self, self_contacts: BoundSelfContacts, alpha: Lanes) -> None:

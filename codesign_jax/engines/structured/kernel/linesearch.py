@@ -110,6 +110,7 @@ class LineSearch:
         return touch
 
     def total(self, sums: list[Lanes]) -> list[Lanes]:
+        """Sums of lanes over the fingers of each world."""
         return self.block.sum(sums)
 
     def contact_slopes(self, alpha: Lanes) -> list[Lanes]:

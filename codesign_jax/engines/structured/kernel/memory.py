@@ -71,8 +71,8 @@ class MemoryLayout:
             rows.append(flat)
         stacked = jnp.concatenate(rows)
         if self.wide:
-            stacked = lengthened(stacked, 1, fingers)
-        stacked = lengthened(stacked, 2, stacked.shape[2] + -stacked.shape[2] % block)
+            stacked = lengthen(stacked, 1, fingers)
+        stacked = lengthen(stacked, 2, stacked.shape[2] + -stacked.shape[2] % block)
         blocks = stacked.reshape(*stacked.shape[:2], -1, block)
         return jnp.moveaxis(blocks, 2, 0).reshape(blocks.shape[2], self.rows, -1)
 
@@ -114,6 +114,7 @@ class BoundTable:
         return name in self.layout.groups
 
     def shape(self, name: str) -> tuple[int, ...]:
+        """Shape of an item of a row."""
         return self.layout.groups[name][1]
 
     def _rows(self, name: str, item: Any) -> Iterator[Any]:
@@ -125,6 +126,12 @@ class BoundTable:
         return (first + k for k in places)
 
     def read(self, name: str, item: Any = 0) -> Lanes:
+        """An item of a row, lanes of the item's shape.
+
+        Args:
+          name: The row, a `rows.Field`.
+          item: Number of the item, the same for all lanes: an integer or a scalar.
+        """
         where = () if self.layout.wide else (self.world,)
         values = [self.ref[(row, *where)] for row in self._rows(name, item)]
         return lanes(values, self.shape(name), wide=self.layout.wide)
@@ -147,6 +154,14 @@ class BoundTable:
         return lanes(values, self.shape(name), wide=True)
 
     def scatter(self, name: str, value: Lanes, item: jax.Array, lane: jax.Array) -> None:
+        """Stores each lane's value in the item of a lane, inverse of `gather`.
+
+        Args:
+          name: The row, of a table of fingers.
+          value: Lanes of the item's shape.
+          item: Number of each lane's item, int32 of shape (lane,).
+          lane: Lane to which each value goes, likewise.
+        """
         for row, part in zip(self._rows(name, item), value.parts.ravel(), strict=True):
             self.ref[row, lane] = splat(part, lane.shape, value.dtype)
 
@@ -170,8 +185,8 @@ class TimeStep:
         self.ref[self._at(index)] = value
 
 
-def lengthened(array: jax.Array, axis: int, length: int) -> jax.Array:
-    """The array with its last item along an axis repeated; `jnp.pad` is 20 operations for it."""
+def lengthen(array: jax.Array, axis: int, length: int) -> jax.Array:
+    """Repeats an array's last item along an axis up to a length; `jnp.pad` is 20 operations."""
     missing = length - array.shape[axis]
     if not missing:
         return array
@@ -182,6 +197,7 @@ def lengthened(array: jax.Array, axis: int, length: int) -> jax.Array:
 
 
 def tree_add_scaled(alpha: jax.Array, value: Any, step: Any) -> Any:
+    """Value + alpha * step for two trees of one structure, leaf by leaf."""
     return jax.tree.map(lambda v, s: v + alpha * s, value, step)
 
 
@@ -287,6 +303,7 @@ class Block:
         return self._swapped(array, combine, self.worlds, self.worlds * self.team)
 
     def total(self, array: jax.Array) -> jax.Array:
+        """Sum of an array (lane,) over all lanes of each world, on all of them."""
         return self.fold(self.over_team(array, jnp.add), jnp.add)
 
     def dealt(self, count: int, k: jax.Array) -> tuple[jax.Array, jax.Array | None]:
@@ -297,6 +314,7 @@ class Block:
         return jnp.minimum(item, count - 1), item < count
 
     def rounds(self, count: int) -> int:
+        """How many rounds a team needs for so many items, one item a lane and round."""
         return -(-count // self.team)
 
     def fold(self, array: jax.Array, combine: Callable) -> jax.Array:
@@ -327,4 +345,5 @@ class Block:
 
 
 def anywhere(mask: jax.Array) -> jax.Array:
+    """Whether a mask (lane,) holds on any lane, a scalar."""
     return jnp.max(mask.astype(jnp.int32)) > 0

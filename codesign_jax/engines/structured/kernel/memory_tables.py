@@ -13,7 +13,7 @@ import numpy as np
 from codesign_jax.engines.structured.kernel import objects, rows, shared_memory
 from codesign_jax.engines.structured.kernel import record as recording
 from codesign_jax.engines.structured.kernel.contact_sets import ContactSet
-from codesign_jax.engines.structured.kernel.memory import MemoryLayout, lengthened
+from codesign_jax.engines.structured.kernel.memory import MemoryLayout, lengthen
 from codesign_jax.engines.structured.kernel.rows import (
     Again,
     Air,
@@ -239,12 +239,12 @@ class Packing(Tables):
         return wide.at[:, LENGTH, n:].set(0.0) if name == Hand.ring else wide
 
     def _widen(self, array: jax.Array) -> jax.Array:
-        return lengthened(array, array.ndim - 2, self.fingers)
+        return lengthen(array, array.ndim - 2, self.fingers)
 
     def _dealt(self, rings: jax.Array) -> jax.Array:
         """The palm's rings (ring, 8, 1, world) in groups, one for each finger's lanes."""
         groups = self.palm_groups
-        padded = lengthened(rings, 0, groups * self.fingers)
+        padded = lengthen(rings, 0, groups * self.fingers)
         padded = padded.at[len(rings) :, LENGTH].set(0.0)
         return jnp.moveaxis(padded[:, :, 0].reshape(groups, self.fingers, 8, -1), 1, 2)
 
@@ -270,7 +270,7 @@ class Packing(Tables):
     def pack_controls(self, ctrl: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Commands: arm (block, time, 6, world) and pressure (block, time, lane)."""
         worlds, steps, _ = ctrl.shape
-        ctrl = lengthened(ctrl, 0, worlds + -worlds % self.block)
+        ctrl = lengthen(ctrl, 0, worlds + -worlds % self.block)
         blocks = jnp.moveaxis(ctrl.reshape(-1, self.block, steps, ctrl.shape[2]), 1, 3)
         arm = blocks[:, :, :6]
         pressure = blocks[:, :, 6:]

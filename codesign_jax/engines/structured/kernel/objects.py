@@ -65,6 +65,15 @@ def rows(mesh: MeshLanes, fingers: int, dtype: Any) -> dict[str, jax.Array]:
 def read(
     scene: Scene, block: Block, world: BoundTable, hand: BoundTable, values: Any
 ) -> WorldObject:
+    """The object of each lane's world.
+
+    Args:
+      scene: The scene.
+      block: The lanes.
+      world: Constants of the worlds.
+      hand: Constants of the fingers, which have the support points of meshes.
+      values: Reference to the distances of all meshes, shape (n,); None without meshes.
+    """
     size = world.read(World.object_size)
     shape = world.read(World.object_id)
     if values is None:

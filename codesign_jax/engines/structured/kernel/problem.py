@@ -77,6 +77,7 @@ class Problem:
         return [self.memory.read(name, item) for name in names]
 
     def write(self, name: str, value: Lanes, item: Any) -> None:
+        """Stores an item of a row of fingers, lanes of the item's shape."""
         self.memory.write(name, value, item)
 
     def move(self, name: str, item: Any, alpha: Lanes) -> Lanes:
@@ -86,6 +87,7 @@ class Problem:
         return value
 
     def body_of(self, item: Any) -> list[Lanes]:
+        """Mass (...), centre (3, ...) and inertia (6, ...) of a link, for `make_body`."""
         return self.read(Hand.mass, Scratch.body_centre, Scratch.tensor, item=item)
 
     def add_palm_wrench(self, r: Lanes) -> Lanes:
@@ -94,10 +96,19 @@ class Problem:
         return lanewise(jnp.add, r, self.self_contacts.wrench_on(0))
 
     def widened(self, acc: Lanes) -> Lanes:
+        """Lanes of a world as those of its fingers."""
         return lanewise(jnp.add, acc, zeros(acc.shape[:-2], self.like))
 
 
 def relative(name: str, link: Any, palm: Lanes, obj: Lanes) -> Lanes:
+    """Motion of a pair's first body against its second one, lanes of shape (6, ...).
+
+    Args:
+      name: The pair of bodies.
+      link: Motion of the item's link; of pairs without a finger it is not read.
+      palm: Motion of the palm.
+      obj: Motion of the object.
+    """
     difference = jnp.subtract
     if name == "finger_object":
         return lanewise(difference, link, obj)
@@ -115,4 +126,5 @@ def make_body(mass: jax.Array, centre: jax.Array, tensor: jax.Array) -> Body:
 
 
 def triangle(tensor: jax.Array) -> jax.Array:
+    """Upper triangle of a symmetric tensor, (3, 3, ...) to (6, ...)."""
     return jnp.stack([tensor[i, j] for i in range(3) for j in range(i, 3)])

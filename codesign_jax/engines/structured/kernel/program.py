@@ -126,15 +126,15 @@ class Program(Packing):
         structure = replace(self.scene.structure, control=None)  # type: ignore[arg-type]
         origin = repr((structure, self.limits, trajectory, states))
         call, outputs = self._call(inputs, trajectory, states)
-        places = numbered(outputs)
-        memory: dict[str, Any] = {"scratch": (places.scratch,)}
+        index = leaf_indices(outputs)
+        memory: dict[str, Any] = {"scratch": (index.scratch,)}
         if self.record is not None:
             origin = f"{origin} {self.record}"
         if not self.limits.iterations:
             memory |= {"level": 1}  # what has no solver is as fast at LLVM's level 1
         if self.team > 1:
             origin = f"{origin} {self.team}"
-            memory |= {"onchip": (places.onchip,), "exchanged": (places.scratch, places.onchip)}
+            memory |= {"onchip": (index.onchip,), "exchanged": (index.scratch, index.onchip)}
         return self.launch(call, inputs, outputs, origin, **memory)
 
     def outputs(
@@ -160,18 +160,24 @@ class Program(Packing):
         inputs = jax.eval_shape(self.inputs, hand, state, ctrl)
         return kernel_jaxpr(self._call(inputs, False, False)[0], jax.tree.leaves(inputs))
 
-    def inputs(self, hand: WorldModel, state: State, ctrl: jax.Array) -> Inputs:
-        """The kernel's arguments, of constants, start states and controls (world, time, nu)."""
+    def inputs(
+        self,
+        hand: WorldModel,
+        state: State,
+        ctrl: jax.Array,
+        tables: tuple[jax.Array, ...] = (),
+    ) -> Inputs:
+        """The kernel's arguments.
+
+        Args:
+          hand: Constants of the worlds.
+          state: Their start states.
+          ctrl: Controls, shape (world, time, nu).
+          tables: The hands' tables, where they are at hand; see `Packing.pack_hand`.
+        """
         if self.scene.effects.air_mass:
             ctrl = chambers.charged(self.scene, hand, ctrl)
-        return self.joined(self.pack_hand(hand), hand, state, ctrl)
-
-    def joined(
-        self, tables: tuple[jax.Array, ...], hand: WorldModel, state: State, ctrl: jax.Array
-    ) -> Inputs:
-        """`inputs` of the hands' tables, see `Packing.pack_hand`."""
-        grid = None if hand.mesh is None else hand.mesh.values[None]
-        hand_table, world_table = tables
+        hand_table, world_table = tables or self.pack_hand(hand)
         finger_start, world_start = self.pack_state(state)
         arm, pressure = self.pack_controls(ctrl)
         return Inputs(
@@ -181,7 +187,7 @@ class Program(Packing):
             world_start=world_start,
             arm=arm,
             pressure=pressure,
-            grid=grid,
+            grid=None if hand.mesh is None else hand.mesh.values[None],
         )
 
     def _call(self, inputs: Inputs, trajectory: bool, states: int) -> tuple[Callable, Outputs]:
@@ -270,8 +276,8 @@ class Program(Packing):
         rollout.repeat_last(done, steps)
 
 
-def numbered(record: Arrays) -> Arrays:
-    """A record with the places of its arrays among all of them."""
+def leaf_indices(record: Arrays) -> Arrays:
+    """A record with the index of each of its arrays among all of them."""
     leaves, structure = jax.tree.flatten(record)
     return structure.unflatten(range(len(leaves)))
 

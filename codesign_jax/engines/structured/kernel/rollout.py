@@ -86,8 +86,8 @@ class BlockRollout:
           tables: The rows of the tables.
           limits: How hard each step is solved.
           names: Names of the trace's entries.
-          inputs: References to the tables of a block, without their axis of blocks.
-          outputs: Likewise.
+          inputs: References to a block's part of the tables that are read.
+          outputs: References to its part of those that are written.
           parts: Which states are stored, one for each of `outputs.path`.
         """
         block = Block(tables.fingers, tables.block, tables.team)

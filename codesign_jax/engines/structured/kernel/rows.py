@@ -79,6 +79,7 @@ class Rows:
 
     @classmethod
     def fields(cls) -> list[Field]:
+        """The declared fields, in their order."""
         return [value for value in vars(cls).values() if isinstance(value, Field)]
 
     @classmethod

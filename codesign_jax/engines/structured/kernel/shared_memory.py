@@ -92,6 +92,13 @@ class TeamRows:
         return lanes(parts, (count,), wide=True)
 
     def put_rows(self, name: str, value: Lanes, item: Any = 0) -> None:
+        """Stores an item whose components lie one behind the other, `TEAM` columns each.
+
+        Args:
+          name: The row.
+          value: Lanes of the item's shape.
+          item: Number of the item.
+        """
         for k, part in enumerate(value.parts.ravel()):
             self.put(name, splat(part, (self.block.size,), value.dtype), item, TEAM * k)
 
@@ -103,6 +110,7 @@ def team_sum(block: Block, value: Lanes) -> Lanes:
 
 
 def where(mask: jax.Array, first: Any, second: Any) -> Any:
+    """Trees of lanes, `first` where a mask (lane,) holds, else `second`."""
     which = lanes([mask], (), wide=True)
     return lanewise(lambda w, a, b: jax.tree.map(partial(jnp.where, w), a, b), which, first, second)
 

@@ -93,8 +93,8 @@ class Step(StepMemory):
         """Reads the state, and leaves bodies, forces and contacts in the scratch table.
 
         Args:
-          arm: As in `Step.advance`.
-          pressure: As in `Step.advance`.
+          arm: Commands of the arm frame [m, rad], shape (6, 1, world).
+          pressure: Pressures of the chambers [Pa], lanes of a finger; with `air_mass` charges.
 
         Returns:
           The state of wrist and object by name, what `palm_and_object` finds, the objects, the warm
@@ -439,6 +439,15 @@ def semi_implicit_euler(
 
 
 def body_after_step(h: float, state: dict, columns, wrist, obj) -> dict:
+    """Wrist and object after a step, by row of `rows.WorldState`.
+
+    Args:
+      h: Time step [s].
+      state: Their state before it, by the same names.
+      columns: Columns of the object's orientation before it, shape (3, 3, ...).
+      wrist: Accelerations of the wrist, shape (6, ...).
+      obj: Those of the object, shape (6, ...).
+    """
     names = ("wrist", "position", "quat", "wrist_vel", "linear_vel", "angular_vel")
     # The fingers' joints are moved link by link, see `joint_after_step`.
     old = State(finger=0.0, finger_vel=0.0, acc=None, **{n: state[n] for n in names})  # type: ignore[arg-type]

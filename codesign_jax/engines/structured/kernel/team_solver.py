@@ -153,6 +153,7 @@ class TeamLanes:
         return r.lane, ro.lane, z  # pyright: ignore[reportAttributeAccessIssue]  # lanewise gives Lanes
 
     def link(self, i: Any) -> el.Kept:
+        """What the elimination keeps of a link; its spatial vectors lie across a team's lanes."""
         factors = el.Factors(self.chip.rows(Chip.w, i), self.chip.rows(Chip.g, i), None)  # type: ignore[arg-type]
         return el.Kept(factors, self.problem.read(Again.inverse, item=i)[0])
 
@@ -250,6 +251,17 @@ class TeamElimination(Elimination):
         return node
 
     def at_palm(self, now: Iterate, node: Any, slots: dict) -> tuple[Iterate, Eliminated]:
+        """Solves for wrist, palm and object once the links are eliminated.
+
+        Args:
+          now: The iterate.
+          node: What the links leave for palm and object.
+          slots: Contact inertia and wrench of the palm's and the object's contacts, by pair of
+            bodies.
+
+        Returns:
+          The Newton step of wrist, palm and object, and what is eliminated.
+        """
         team = self.team
         rigid = self.problem.rigid
 
@@ -358,6 +370,12 @@ class TeamCoupling(Coupling):
         return team.wrist(kept, axes, obj, z)  # type: ignore[arg-type]
 
     def substitute(self, z: str, step: Iterate) -> None:
+        """Leaves the links' accelerations with the sides of the contacts.
+
+        Args:
+          z: Row of what the elimination leaves of each joint, shape (axis, ...).
+          step: Accelerations of palm and object, shape (6, ...) each.
+        """
         team = self.team
         at = FORCES if z == Scratch.z else AGAIN
         palm, obj = (chosen(self.block, v) for v in (step.palm_acc, step.object_acc))
@@ -380,6 +398,15 @@ class TeamLineSearch(LineSearch):
         self.rings = problem.memory.layout.rings_per_link
 
     def prepare(self, now: Iterate, step: Iterate) -> tuple[Lanes, Lanes, Lanes]:
+        """Substitutes back and prepares the line search.
+
+        Args:
+          now: The iterate.
+          step: The Newton step of wrist, palm and object.
+
+        Returns:
+          Slope and curvature of the smooth part, and the contacts' slope, all at 0, (1, world).
+        """
         problem = self.problem
         team = self.team
         self_contacts = self.problem.self_contacts
@@ -422,9 +449,15 @@ class TeamLineSearch(LineSearch):
         return slope, curvature, touch
 
     def total(self, sums: list[Lanes]) -> list[Lanes]:
+        """Sums of lanes over the teams of each world."""
         return self.block.sum([team_sum(self.block, v) for v in sums])
 
     def contact_slopes(self, alpha: Lanes) -> list[Lanes]:
+        """Slope and curvature of the contacts' cost along the step, sums of each finger's contacts.
+
+        Args:
+          alpha: Length of the step, lanes of a world.
+        """
         problem = self.problem
         sums = [zeros((), self.like)] * 2
         first = self.team.as_lanes(jnp.where(self.block.mate == 0, jnp.ones_like(self.like), 0.0))

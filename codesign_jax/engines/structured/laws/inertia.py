@@ -191,9 +191,11 @@ class Centred(NamedTuple):
     tensor: jax.Array  # Rotational inertia, world axes, shape (3, 3, ..., world)
 
     def times(self, acc: jax.Array) -> jax.Array:
+        """The wrench (6, ...) that gives the body a spatial acceleration (6, ...)."""
         return spatial(apply_columns(self.tensor, acc[:3]), self.mass * acc[3:])
 
     def matrix(self) -> jax.Array:
+        """The spatial inertia, shape (6, 6, ...)."""
         zero = jnp.zeros_like(self.mass + self.tensor[0, 0])
         none = jnp.stack([zero] * 3)
         mass = self.mass + zero
@@ -287,7 +289,8 @@ def section_springs(
 
     Args:
       constants: Stiffness at rest, damping and armature of the hinges, shape (axis, ...).
-      law: See `WorldModel`, shape (number, ...).
+      law: What `section_law` needs of the section, and last the length of a segment [m], shape
+        (number, ...).
       pressure: Of the chamber [Pa].
       q: Angles, shape (axis, ...).
     """
@@ -322,7 +325,7 @@ def springs(
 
     Args:
       constants: Stiffness, damping and armature of the hinges, shape (axis, ...).
-      threshold: See `WorldModel`, shape (3, ...); None without the effect.
+      threshold: Numbers of `model.morphology.thresholds`, shape (3, ...); None without the effect.
       q: Angles, shape (axis, ...); the second one is the lateral one.
     """
     stiffness, damping, armature = constants

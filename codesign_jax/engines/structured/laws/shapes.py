@@ -58,6 +58,7 @@ def signed_distance(
 
 
 def mesh_indices(scene: Scene) -> list[int]:
+    """Indices of the object set's meshes."""
     return [i for i, s in enumerate(scene.objects.object) if s.type == "mesh"]
 
 

@@ -221,7 +221,7 @@ def main() -> int:
         sys.exit(f"error: {error}")
     print(text)
     if args.page:
-        law = args.data.name if args.data.name in report.LAWS else ""
+        law = args.data.name if args.data.name in results.LAWS else ""
         output.fill(args.page, text, f"fresh {law}".strip())
     return 0
 

@@ -12,6 +12,7 @@ from codesign_jax import scene as scenes
 from codesign_jax.compiler import launch
 from codesign_jax.engines.structured import StructuredEngine, lanewise
 from codesign_jax.engines.structured.kernel import Limits, Program, shared_memory
+from codesign_jax.engines.structured.kernel.memory import MemoryLayout
 from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.lanewise import Lanes, lanes
 from codesign_jax.engines.structured.world_model import world_constants
@@ -57,6 +58,16 @@ def test_one_program_for_closures_of_one_code_over_equal_numbers():
         np.testing.assert_array_equal(results["first"].parts.ravel()[0], left.parts.ravel()[0])
         assert results["one"].lane == 1.0 and len(counted) == traces
     assert lanewise.lanewise(jnp.multiply, half, half).parts.ravel().tolist() == [0.25, 0.0625]
+
+
+def test_rows_with_their_axes_in_another_order_are_not_packed():
+    """By sizes alone centres (3, link) would pass for (link, 3)."""
+    layout = MemoryLayout(True, centre=(2, (3,)))
+    array = jnp.asarray(np.arange(120.0).reshape(2, 3, 4, 5))
+    packed = layout.pack(4, 5, centre=array)
+    np.testing.assert_array_equal(layout.unpack(packed, 4, 4, 5)["centre"], array)
+    with pytest.raises(AssertionError, match="centre"):
+        layout.pack(4, 5, centre=jnp.swapaxes(array, 0, 1))
 
 
 # --- teams of lanes, a GPU's way to share a finger's work, against a lane a finger; both on a CPU--

@@ -18,8 +18,8 @@ from codesign_jax import reuse
 from codesign_jax.compiler.launch import Kernel, block_lanes, kernel_jaxpr, launch
 from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.kernel import chambers
-from codesign_jax.engines.structured.kernel.memory_tables import Packing
 from codesign_jax.engines.structured.kernel.newton import Limits
+from codesign_jax.engines.structured.kernel.packing import Packing
 from codesign_jax.engines.structured.kernel.rollout import (
     BlockRollout,
     Inputs,

@@ -10,17 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax.engines.structured.lanes import (
-    apply_columns as apply_columns,
-)
-from codesign_jax.engines.structured.lanes import (
-    apply_rows as apply_rows,
-)
-from codesign_jax.engines.structured.lanes import (
-    dot,
-    rotation_columns,
-    total,
-)
+from codesign_jax.engines.structured.lanes import apply_columns, dot, rotation_columns, total
 from codesign_jax.engines.structured.laws.air import straight_volume
 from codesign_jax.engines.structured.laws.cones import Cones, frictions, make_cones
 from codesign_jax.engines.structured.laws.meshes import MeshLanes, mesh_lanes

@@ -33,10 +33,9 @@ from codesign_jax.engines.structured.kernel.self_contacts import (
 from codesign_jax.engines.structured.kernel.shared_memory import team_sum
 from codesign_jax.engines.structured.kernel.slots import any_of, only
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
-from codesign_jax.engines.structured.lanes import dot, sum_axis
+from codesign_jax.engines.structured.lanes import apply_columns, apply_rows, dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact, holding
-from codesign_jax.engines.structured.world_model import apply_columns, apply_rows
 
 BETWEEN_FINGERS = "held.finger_finger"
 """What fingers hold on one another, a row a pairing."""

@@ -26,7 +26,7 @@ from codesign_jax.engines.structured.kernel.rows import (
 from codesign_jax.engines.structured.kernel.self_collision import SelfCollision, closed
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
-from codesign_jax.engines.structured.lanes import cross, dot, total
+from codesign_jax.engines.structured.lanes import apply_columns, cross, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import friction_by_contact
@@ -38,7 +38,6 @@ from codesign_jax.engines.structured.laws.touch import (
     ring_place,
     ring_reach,
 )
-from codesign_jax.engines.structured.world_model import apply_columns
 
 FAR = 1e3
 """A gap that no ring has [m]."""

@@ -47,12 +47,11 @@ from codesign_jax.engines.structured.kernel.self_contacts import (
 )
 from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
-from codesign_jax.engines.structured.lanes import cross, dot
+from codesign_jax.engines.structured.lanes import apply_columns, cross, dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact, touch
 from codesign_jax.engines.structured.laws.rings import Facing, Place, Ring
 from codesign_jax.engines.structured.laws.touch import ring_centre
-from codesign_jax.engines.structured.world_model import apply_columns
 from codesign_jax.model.layout import (
     RING_TIP,
     beyond_base,

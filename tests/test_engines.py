@@ -45,25 +45,33 @@ OFF = "palm_object palm_table finger_table disturb ungrasp"
 SHORT = {"links": 2} | grasps.hurried(0.3, 0.5, 1.2, without=OFF)
 
 
+# The engine and numbers of `decided`, so that both have one kernel.
+IN_THE_AIR = SHORT | grasps.off("finger_object twist")
+EXACT = {"tolerance": 1e-16}
+
+
 def test_vmap_is_a_larger_batch():
     """Nested, over axes in any place, and with controls that all share: the same bits."""
-    scene = grasps.pinch("sphere", **SHORT, **grasps.off("finger_object twist"))
-    fields, ctrl = grasps.batch_inputs(scene, *grasps.random_worlds(scene, 3, 4))
-    engine = StructuredEngine(scene)
-    run = jax.jit(engine.rollout)
-    want = run(fields, ctrl)
-    fields, ctrl = jax.tree.map(np.asarray, (fields, ctrl))  # whose axes NumPy moves
-    two = jax.tree.map(lambda v: v.reshape(2, 2, 1, *v.shape[1:]), (fields, ctrl))
-    controls = np.moveaxis(two[1], 0, 3)
-    mixed = jax.jit(jax.vmap(jax.vmap(engine.rollout), in_axes=(0, 3)))(two[0], controls)
-    for name in ("distance", "height", "speed", "status", "last"):
-        expected = np.asarray(getattr(want, name))
-        values = np.asarray(getattr(mixed, name)).reshape(expected.shape)
-        np.testing.assert_array_equal(values, expected, err_msg=name)
-    shared = jax.jit(jax.vmap(engine.rollout, in_axes=(0, None)))(
-        jax.tree.map(lambda v: v[:, None], fields), ctrl[:1]
-    )
-    alone = run(fields, np.repeat(ctrl[:1], 4, 0))
+    scene = grasps.pinch("sphere", **IN_THE_AIR)
+    engine = StructuredEngine(scene, **EXACT)
+    with jax.enable_x64(True):
+        inputs = grasps.batch_inputs(scene, *grasps.random_worlds(scene, 3, 5))
+        # NumPy cuts them and moves their axes.
+        fields, ctrl = jax.tree.map(lambda v: np.asarray(v)[:4], inputs)
+        compiled = partial(jax.jit, compiler_options=QUICK)
+        run = compiled(engine.rollout)
+        want = run(fields, ctrl)
+        two = jax.tree.map(lambda v: v.reshape(2, 2, 1, *v.shape[1:]), (fields, ctrl))
+        controls = np.moveaxis(two[1], 0, 3)
+        mixed = compiled(jax.vmap(jax.vmap(engine.rollout), in_axes=(0, 3)))(two[0], controls)
+        for name in ("distance", "height", "speed", "status", "last"):
+            expected = np.asarray(getattr(want, name))
+            values = np.asarray(getattr(mixed, name)).reshape(expected.shape)
+            np.testing.assert_array_equal(values, expected, err_msg=name)
+        shared = compiled(jax.vmap(engine.rollout, in_axes=(0, None)))(
+            jax.tree.map(lambda v: v[:, None], fields), ctrl[:1]
+        )
+        alone = run(fields, np.repeat(ctrl[:1], 4, 0))
     np.testing.assert_array_equal(shared.distance[:, 0], alone.distance)
 
 
@@ -77,7 +85,7 @@ def decided(tmp_path_factory):
     world 1 starts below the table; a pressure of world 2 is not a number from step 10 on, and the
     length of world 3; the fingers of world 4 are inflated at once, by 1e12 Pa.
     """
-    scene = grasps.pinch("sphere", **SHORT, effects__finger_object=False, effects__twist=False)
+    scene = grasps.pinch("sphere", **IN_THE_AIR)
     with jax.enable_x64(True):
         params, trials = grasps.random_worlds(scene, 3, 5)
         params = params._replace(length=params.length.at[3].set(jnp.nan))
@@ -90,7 +98,7 @@ def decided(tmp_path_factory):
         params, fields = jax.tree.map(np.asarray, (params, fields))
     logs = tmp_path_factory.mktemp("log")  # where MuJoCo tells that a world went bad
     engines = {
-        "structured": lambda: StructuredEngine(scene, tolerance=1e-16),
+        "structured": lambda: StructuredEngine(scene, **EXACT),
         "mujoco": lambda: MujocoEngine(scene, num_threads=1),
         "mjx": lambda: make_engine("mjx", scene),
     }

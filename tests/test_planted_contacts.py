@@ -136,9 +136,9 @@ def no_flag(right, mine, self):
     return jnp.where(mine, 0 * flag, flag)
 
 
-def own_half(right, mine, self, item, pairing):
+def own_half(right, mine, self, item):
     """A relative motion without the other side's part."""
-    motion = right(self, item, pairing)
+    motion = right(self, item)
     return chosen(mine, lanewise(lambda m: 0.5 * m, motion), motion)
 
 

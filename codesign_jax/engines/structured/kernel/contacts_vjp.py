@@ -32,7 +32,7 @@ from codesign_jax.engines.structured.kernel.rows import (
 )
 from codesign_jax.engines.structured.kernel.self_collision import neighbours
 from codesign_jax.engines.structured.kernel.self_contacts import FingerPairing
-from codesign_jax.engines.structured.kernel.slots import any_of
+from codesign_jax.engines.structured.kernel.slots import UsedSlot, any_of
 from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import shapes, surroundings
@@ -90,7 +90,7 @@ class ContactsVjp:
         """
         self._clear()
         if (self_contacts := self.step.self_contacts) is not None:
-            self_contacts.do(self._slot)
+            self_contacts.each_item(self._slot)
         for contacts in self.step.field_contacts:
             name = contacts.set.name
             if name == "object_table":
@@ -277,13 +277,14 @@ class ContactsVjp:
 
     # Contacts in slots
 
-    def _slot(self, item: Any, pairing: FingerPairing) -> None:
+    def _slot(self, item: UsedSlot) -> None:
         """Adds the cotangents of a slot's contacts, whose kinds differ by lane."""
-        for pair, live in self._kinds_of(item, pairing).items():
-            any_of(live, partial(self._reverse_slot, pair, item, pairing, live))
+        for pair, live in self._kinds_of(item).items():
+            any_of(live, partial(self._reverse_slot, pair, item, live))
 
-    def _kinds_of(self, item: Any, pairing: FingerPairing) -> dict[str, jax.Array]:
+    def _kinds_of(self, item: UsedSlot) -> dict[str, jax.Array]:
         """Lanes of the rings of a slot's contacts, by pair of bodies."""
+        pairing = item.pairing
         contacts = self.step.self_contacts
         assert contacts is not None
         owner = contacts.read(Remembered.owner, item).lane > 0.5
@@ -303,18 +304,18 @@ class ContactsVjp:
         }
         return {pair: which for pair, which in by_pair.items() if on[pair]}
 
-    def _reverse_slot(self, pair: str, item: Any, pairing: FingerPairing, live: jax.Array) -> None:
+    def _reverse_slot(self, pair: str, item: UsedSlot, live: jax.Array) -> None:
         contacts = self.step.self_contacts
         assert contacts is not None
         remembered = contacts.read(Remembered.ring, item).lane.astype(jnp.int32)
         number = jax.lax.rem(remembered, self._count)
         row = self._row_of(number)
         mine = self.body(row, self.lane), self.ring(number, self.lane)
-        theirs, more, leave = self._second_side(pair, item, pairing, remembered)
+        theirs, more, leave = self._second_side(pair, item, remembered)
         fixed = {Contact.share: contacts.read(Contact.share, item)} | more
         hold = KINDS[pair].holds == "pairing"
         held, sums_bar = (
-            friction_memory.held_and_cotangents(self.step, pairing) if hold else ({}, {})
+            friction_memory.held_and_cotangents(self.step, item.pairing) if hold else ({}, {})
         )
         run = partial(kinds.power, self.layout.scene, pair)
         args = mine, theirs, self.numbers(pair), held
@@ -322,15 +323,16 @@ class ContactsVjp:
         side = lanes([live], (), wide=True)
         (body, ring), theirs, numbers, held_bar = only_on(side, bars)
         self.bars.add(numbers)
-        friction_memory.add_pairing_cotangents(self.bars, pairing, held_bar)
+        friction_memory.add_pairing_cotangents(self.bars, item.pairing, held_bar)
         self.add_body(body._asdict(), row, self.lane)
         self.add_ring(ring, number, self.lane)
         leave(theirs)
 
     def _second_side(
-        self, pair: str, item: Any, pairing: FingerPairing, remembered: jax.Array
+        self, pair: str, item: UsedSlot, remembered: jax.Array
     ) -> tuple[tuple, dict[str, Lanes], Callable[[tuple], None]]:
         """A slot's second side, what of it has no derivative, and what adds its cotangents."""
+        pairing = item.pairing
         if pair == "finger_palm":
             leave = lambda bars: self.add_body(bars[0]._asdict(), self.palm_row)  # noqa: E731
             return (self.palm, ()), {}, leave

@@ -30,8 +30,8 @@ from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
 from codesign_jax.engines.structured.kernel.rows import Again, Scratch, Side, Slot
 from codesign_jax.engines.structured.kernel.self_contacts import (
     BoundSelfContacts,
-    FingerPairing,
 )
+from codesign_jax.engines.structured.kernel.slots import UsedSlot
 from codesign_jax.engines.structured.lanes import contract, dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 
@@ -123,10 +123,10 @@ class Coupling:
         contacts = self.contacts
         contacts.clear_wrenches()
 
-        def store(item: Any, pairing: FingerPairing) -> None:
+        def store(item: UsedSlot) -> None:
             side = contacts.own_side(item)
             hessian = contacts.read(Slot.hessian, item)
-            change = contacts.relative(item, pairing)
+            change = contacts.relative(item)
             residual = lanewise(
                 lambda b, f: jnp.where(b, -f, 0.0), busy, contacts.times_hessian(hessian, change)
             )
@@ -135,9 +135,9 @@ class Coupling:
             fields |= {Slot.direction: none, Slot.direction_response: none, Slot.force: none}
             for field, value in fields.items():
                 contacts.write(field, value, item)
-            contacts.load(item, side, residual, pairing)
+            contacts.load(item, side, residual)
 
-        contacts.do(store)
+        contacts.each_item(store)
 
     def _products(self) -> tuple[jax.Array, jax.Array]:
         """Applies P^-1 J' to the residual, and J to that: "response".
@@ -147,10 +147,10 @@ class Coupling:
         contacts = self.contacts
         self.substitute(Again.z_again, self.again())
 
-        def add(item: Any, pairing: FingerPairing, sums: list[Lanes]) -> list[Lanes]:
+        def add(item: UsedSlot, sums: list[Lanes]) -> list[Lanes]:
             residual = contacts.read(Slot.residual, item)
             hessian = contacts.read(Slot.hessian, item)
-            response = contacts.relative(item, pairing)
+            response = contacts.relative(item)
             contacts.write(Slot.response, response, item)
 
             def both(sums, half, residual, response, force):
@@ -160,13 +160,13 @@ class Coupling:
             return lanewise(
                 both,
                 sums,
-                pairing.half,
+                item.pairing.half,
                 residual,
                 response,
                 contacts.times_hessian(hessian, response),
             )
 
-        sums = contacts.each(add, [zeros((), self.problem.like)] * 2)
+        sums = contacts.fold_items(add, [zeros((), self.problem.like)] * 2)
         size, bent = (self.block.total(v.lane) for v in sums)
         return size, bent
 
@@ -192,7 +192,7 @@ class Coupling:
             force = force + alpha * direction
             return direction, direction_response, force, residual - alpha * direction
 
-        def store(item: Any, pairing: FingerPairing, gain: Lanes) -> Lanes:
+        def store(item: UsedSlot, gain: Lanes) -> Lanes:
             side = contacts.own_side(item)
             hessian = contacts.read(Slot.hessian, item)
             old = [contacts.read(name, item) for name in names]
@@ -204,14 +204,14 @@ class Coupling:
             new |= {Slot.direction_response: direction_response, Slot.force: force}
             for name, value in new.items():
                 contacts.write(name, value, item)
-            contacts.load(item, side, residual, pairing)
+            contacts.load(item, side, residual)
 
             def add(gain, half, direction, first_response):
                 return gain + half * sum_axis(dot(direction, first_response), 0)
 
-            return lanewise(add, gain, pairing.half, direction, first_response)
+            return lanewise(add, gain, item.pairing.half, direction, first_response)
 
-        gain = contacts.each(store, zeros((), self.problem.like))
+        gain = contacts.fold_items(store, zeros((), self.problem.like))
         return self.block.total(gain.lane)
 
     def _result(self, kept: Lanes) -> Iterate:
@@ -219,13 +219,13 @@ class Coupling:
         contacts = self.contacts
         contacts.clear_wrenches()
 
-        def store(item: Any, pairing: FingerPairing) -> None:
+        def store(item: UsedSlot) -> None:
             value = lanewise(
                 lambda k, s: jnp.where(k, s, 0.0), kept, contacts.read(Slot.force, item)
             )
-            contacts.load(item, contacts.own_side(item), value, pairing)
+            contacts.load(item, contacts.own_side(item), value)
 
-        contacts.do(store)
+        contacts.each_item(store)
         return self.again()
 
     # One more right side

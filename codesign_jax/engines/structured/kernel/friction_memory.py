@@ -31,7 +31,7 @@ from codesign_jax.engines.structured.kernel.self_contacts import (
     FingerPairing,
 )
 from codesign_jax.engines.structured.kernel.shared_memory import team_sum
-from codesign_jax.engines.structured.kernel.slots import any_of, only
+from codesign_jax.engines.structured.kernel.slots import UsedSlot, any_of, only
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import apply_columns, apply_rows, dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -132,29 +132,18 @@ def _store(step: StepMemory, contacts: BoundContacts, mask: Lanes) -> None:
 def sums(self_contacts: BoundSelfContacts, row: Any, alpha: Lanes, held_friction: Lanes) -> Lanes:
     """Sums of `holding.hold`, (4,), of a row's contacts where the last step has moved jar."""
     contacts = self_contacts.set.contacts
-    pairing = self_contacts.pairing(row)
 
     def add(sums, place, cone, alpha, jar, step, held_friction, counts):
         c = contacts(place, cone)
         force = contact.constraint_update(c, tree_add_scaled(alpha, jar, step)).force
         return sums + counts * sum_axis(holding.hold(c, force, held_friction[:, None]), 1)
 
-    def slot(item: Any, sums: Lanes) -> Lanes:
+    def slot(item: UsedSlot, sums: Lanes) -> Lanes:
         jar = self_contacts.read(Contact.jar, item)
         step = self_contacts.read(Contact.step, item)
-        counts = self_contacts.holds(item, pairing)
-        with self_contacts.with_cone(row, item):
-            args = (
-                sums,
-                self_contacts.place(item),
-                self_contacts.cone,
-                alpha,
-                jar,
-                step,
-                held_friction,
-                counts,
-            )
-            return lanewise(add, *args)
+        counts = self_contacts.holds(item)
+        contact_numbers = self_contacts.place(item), self_contacts.cone_at(item)
+        return lanewise(add, sums, *contact_numbers, alpha, jar, step, held_friction, counts)
 
     added = self_contacts.fold(row, slot, zeros((4,), self_contacts.like))
     return added if self_contacts.block.team == 1 else team_sum(self_contacts.block, added)
@@ -377,26 +366,27 @@ def load_cotangents(problem: Problem, self_contacts: BoundSelfContacts) -> None:
     def of_held(force, place, cone, held, bars):
         return held_work(contacts(place, cone), force, held, bars)
 
-    def load(item: Any, pairing: FingerPairing) -> None:
-        which = pairing.number
+    def load(item: UsedSlot) -> None:
+        which = item.pairing.number
+        cone = self_contacts.cone_at(item)
         side = self_contacts.own_side(item)
         jar = self_contacts.read(Contact.jar, item)
 
         def response(place, cone, jar):
             return contact.constraint_update(contacts(place, cone), jar).force
 
-        force = lanewise(response, side.place, self_contacts.cone, jar)
+        force = lanewise(response, side.place, cone, jar)
         held = problem.memory.finger_state.gather(BETWEEN_FINGERS, which, lane)
         bars = problem.memory.scratch.gather(Virtual.sums_bar, which, lane)
         unit = lanes([problem.like + 1.0], (), wide=True)
-        (r,) = pull(of_held, (force,), (side.place, self_contacts.cone, held, bars), unit)
-        r = lanewise(jnp.multiply, self_contacts.holds(item, pairing), r)
+        (r,) = pull(of_held, (force,), (side.place, cone, held, bars), unit)
+        r = lanewise(jnp.multiply, self_contacts.holds(item), r)
         change = lanewise(
             jnp.negative, self_contacts.times_hessian(self_contacts.read(Slot.hessian, item), r)
         )
-        self_contacts.load(item, side, change, pairing)
+        self_contacts.load(item, side, change)
 
-    self_contacts.do(load)
+    self_contacts.each_item(load)
 
 
 def held_work(

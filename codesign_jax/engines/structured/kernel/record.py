@@ -31,9 +31,9 @@ from codesign_jax.engines.structured.kernel.rows import (
     TouchForce,
     WorldState,
 )
-from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts, FingerPairing
+from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.shared_memory import team_sum
-from codesign_jax.engines.structured.kernel.slots import only
+from codesign_jax.engines.structured.kernel.slots import UsedSlot, only
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -98,11 +98,11 @@ def settle(problem: Problem, alpha: Lanes, ends: jax.Array, chord: Iterate) -> N
     if problem.self_contacts is not None:
         self_contacts = problem.self_contacts
 
-        def settle_slot(item: Any, pairing: FingerPairing) -> None:
+        def settle_slot(item: UsedSlot) -> None:
             put(self_contacts, item, moved(self_contacts, item))
 
         with only([self_contacts], ends):
-            self_contacts.do(settle_slot)
+            self_contacts.each_item(settle_slot)
     if Scratch.chord_link_acc in step.scratch:
         _each(problem.links, lambda i: step.scratch.write(
             Scratch.chord_link_acc, zeros((6,), step.like), i
@@ -171,19 +171,18 @@ def _write_pairing(
 ) -> None:
     """Writes what the fingers of a pairing do to one another, to themselves and to the palm."""
     energy = f"{SELF}.{PairForce.energy}" in table
-    pairing = contacts.pairing(row)
     hold = friction_memory.held_by_pairing(step, contacts, row) if energy else []
 
-    def add(item: Any, sums: list[Lanes]) -> list[Lanes]:
+    def add(item: UsedSlot, sums: list[Lanes]) -> list[Lanes]:
+        itself = item.pairing.itself
         palm = jnp.zeros_like(step.like)
-        if pairing.itself is not None:
+        if itself is not None:
             other = contacts.read(Slot.other, item).lane
-            palm = jnp.where(pairing.itself & (other < 0.5), 1.0, palm)
+            palm = jnp.where(itself & (other < 0.5), 1.0, palm)
         side = lanes([palm], (), wide=True)
-        with contacts.with_cone(row, item):
-            numbers = contacts.place(item), contacts.cone, contacts.read(Contact.jar, item)
-            held = [lanewise(jnp.multiply, h, contacts.holds(item, pairing)) for h in hold]
-            return lanewise(_add_slot, sums, side, *numbers, *held)
+        numbers = contacts.place(item), contacts.cone_at(item), contacts.read(Contact.jar, item)
+        held = [lanewise(jnp.multiply, h, contacts.holds(item)) for h in hold]
+        return lanewise(_add_slot, sums, side, *numbers, *held)
 
     none = [zeros((2,), step.like)] * (2 + energy)
     pressing, depth, *stored = contacts.fold(row, add, none)

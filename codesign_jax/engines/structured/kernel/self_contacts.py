@@ -10,8 +10,7 @@ Contacts of a finger with the palm or with itself are a row of slots as well, wi
 they are on the finger's lane alone, which has both sides.
 """
 
-import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -30,7 +29,7 @@ from codesign_jax.engines.structured.kernel.memory import (
 )
 from codesign_jax.engines.structured.kernel.rows import Contact, Field, Group, Rows, Side, Slot
 from codesign_jax.engines.structured.kernel.shared_memory import TEAM
-from codesign_jax.engines.structured.kernel.slots import BoundSlots, SlotSet, any_of
+from codesign_jax.engines.structured.kernel.slots import BoundSlots, SlotSet, UsedSlot, any_of
 from codesign_jax.engines.structured.lanes import dot, sum_axis, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact
@@ -170,7 +169,7 @@ class BoundSelfContacts(BoundSlots):
             fields = (self.read(name, item)[0] for name in (Contact.share, Contact.gap))
             return lanewise(_deeper_in_palm, depth, self.read(Slot.other, item)[0, 0], *fields)
 
-        return self.fold(0, deeper, depth)
+        return super().fold(0, deeper, depth)
 
     def pairing(self, row: Any) -> FingerPairing:
         return FingerPairing(
@@ -187,17 +186,9 @@ class BoundSelfContacts(BoundSlots):
         here = lanes([palm], (), wide=other is not None)
         return lanewise(_where, here, self._cones["finger_palm"], self._cones["finger_finger"])
 
-    @contextlib.contextmanager
-    def with_cone(self, row: Any, item: Any = None) -> Iterator[None]:
-        """Within this context contacts have the cone of a row's slot, or of the palm's."""
-        mixed = item is not None and self.set.with_itself and touches_itself(self.set.scene)
-        before = self.cone
-        self.cone = self.cone_of_row(row, self.read(Slot.other, item).lane if mixed else None)
-        yield
-        self.cone = before
-
-    def holds(self, item: Any, pairing: FingerPairing) -> Lanes:
+    def holds(self, item: UsedSlot) -> Lanes:
         """One for contacts whose friction is kept, zero for those with the palm."""
+        pairing = item.pairing
         kept = jnp.ones_like(self.like)
         if pairing.itself is not None:
             palm = pairing.itself & (self.read(Slot.other, item).lane < 0.5)
@@ -237,32 +228,30 @@ class BoundSelfContacts(BoundSlots):
         touch = which | (~owner & (fields[Contact.share].lane > 0))
         self.add(row, touch, fields | alike, self.block.column)
 
-    def each(self, body: Callable, start: Any) -> Any:
-        """Folds body(item, pairing, tree of lanes) over all slots in use."""
+    def fold(self, row: Any, body: Callable, start: Any) -> Any:
+        """See `BoundSlots`; items have their row's pairing and their cone."""
+        pairing = self.pairing(row)
+        mixed = self.set.with_itself and touches_itself(self.set.scene)
 
-        def of_row(row: Any, carry: Any) -> Any:
-            pairing = self.pairing(row)
+        def slot(item: UsedSlot, carry: Any) -> Any:
+            other = self.read(Slot.other, item).lane if mixed else None
+            return body(item._replace(pairing=pairing, cone=self.cone_of_row(row, other)), carry)
 
-            def slot(item: Any, c: Any) -> Any:
-                with self.with_cone(row, item):
-                    return body(item, pairing, c)
-
-            return self.fold(row, slot, carry)
-
-        return loop(self.set.rows, of_row, start, self.set.size)
+        return super().fold(row, slot, start)
 
     def fold_items(self, body: Callable, start: Any) -> Any:
         """See `BoundContacts`; over all slots in use."""
-        return self.each(lambda item, _, carry: body(item, carry), start)
+        size = self.set.size
+        return loop(self.set.rows, lambda row, carry: self.fold(row, body, carry), start, size)
 
-    def do(self, body: Callable) -> None:
-        """Runs body(item, pairing), which stores something, over all slots in use."""
+    def each_item(self, body: Callable[[Any], None]) -> None:
+        """See `BoundContacts`; for all slots in use."""
 
-        def slot(item: Any, pairing: FingerPairing, carry: list) -> list:
-            body(item, pairing)
-            return carry
+        def slot(item: UsedSlot, nothing: list) -> list:
+            body(item)
+            return nothing
 
-        self.each(slot, [])
+        self.fold_items(slot, [])
 
     def touching_now(self) -> jax.Array:
         def most(row: Any, count: jax.Array) -> jax.Array:
@@ -278,9 +267,10 @@ class BoundSelfContacts(BoundSlots):
 
     # One side's part of a contact
 
-    def relative(self, item: Any, pairing: FingerPairing) -> Lanes:
+    def relative(self, item: UsedSlot) -> Lanes:
         """Relative acceleration of a slot's sides by the links', on its own side's lanes."""
         contacts = self.set.contacts
+        pairing = item.pairing
         place = self.place(item)
 
         def of_side(field: Field) -> Lanes:
@@ -289,7 +279,7 @@ class BoundSelfContacts(BoundSlots):
             def moved(place, cone, link_acc):
                 return contacts(place, cone).relative(link_acc[:, None])
 
-            return lanewise(moved, place, self.cone, link_acc)
+            return lanewise(moved, place, self.cone_at(item), link_acc)
 
         mine = of_side(Slot.row)
         if pairing.itself is None:
@@ -317,12 +307,12 @@ class BoundSelfContacts(BoundSlots):
         if self.set.gathers:
             return
 
-        def store(item: Any, pairing: FingerPairing) -> None:
+        def store(item: UsedSlot) -> None:
             self._list_rows(item, Slot.row)
-            if pairing.itself is not None:
-                any_of(pairing.itself, lambda: self._list_rows(item, Slot.other))
+            if item.pairing.itself is not None:
+                any_of(item.pairing.itself, lambda: self._list_rows(item, Slot.other))
 
-        self.do(store)
+        self.each_item(store)
 
     def _list_rows(self, item: Any, field: Field) -> None:
         """Lists the different rows at which a slot's lanes touch.
@@ -358,11 +348,12 @@ class BoundSelfContacts(BoundSlots):
         rows = self._touched_rows(item, field)
         arrays, rebuild = solid(start, self.set.size)
         name = f"{self.set.name}.{field}"
-        count = self.table.number(f"{name}_count", item, 0).astype(jnp.int32)
+        slot = item.source
+        count = self.table.number(f"{name}_count", slot, 0).astype(jnp.int32)
 
         def step(carry: list) -> list:
             k, *values = carry
-            row = self.table.number(f"{name}_listed", item, k).astype(jnp.int32)
+            row = self.table.number(f"{name}_listed", slot, k).astype(jnp.int32)
             new = solid(body(row, rows == row, rebuild(values)), self.set.size)[0]
             return [k + 1, *new]
 
@@ -384,9 +375,10 @@ class BoundSelfContacts(BoundSlots):
         wrench = self.table.gather(Side.wrench, row, self.block.column)
         return OwnSide(self.place(item), row, wrench)
 
-    def load(self, item: Any, side: OwnSide, force: Lanes, pairing: FingerPairing) -> None:
+    def load(self, item: UsedSlot, side: OwnSide, force: Lanes) -> None:
         """Adds a slot's force to its own side's wrench, and takes it from the other side's."""
-        more = lanewise(wrench_of_force, side.place, self.cone, force)
+        pairing = item.pairing
+        more = lanewise(wrench_of_force, side.place, self.cone_at(item), force)
         self._add_wrench(item, Slot.row, more, side.wrench, side.row)
         if pairing.itself is not None:
 
@@ -424,11 +416,11 @@ class BoundSelfContacts(BoundSlots):
         """Adds the last step of the line search to jar; stores Hessians and adds up wrenches."""
         self.clear_wrenches()
 
-        def store(item: Any, pairing: FingerPairing) -> None:
+        def store(item: UsedSlot) -> None:
             side = self.own_side(item)
-            self.load(item, side, self.update_constraint(item, side.place, alpha), pairing)
+            self.load(item, side, self.update_constraint(item, side.place, alpha))
 
-        self.do(store)
+        self.each_item(store)
 
     def update_wrenches(self, alpha: Lanes) -> None:
         """Adds up wrenches where the last step has moved jar, which is kept."""
@@ -438,35 +430,34 @@ class BoundSelfContacts(BoundSlots):
         def response(place, cone, alpha, jar, step):
             return contact.constraint_update(contacts(place, cone), jar + alpha * step).force
 
-        def load(item: Any, pairing: FingerPairing) -> None:
+        def load(item: UsedSlot) -> None:
             side = self.own_side(item)
             jar = self.read(Contact.jar, item)
             step = self.read(Contact.step, item)
-            self.load(
-                item, side, lanewise(response, side.place, self.cone, alpha, jar, step), pairing
-            )
+            force = lanewise(response, side.place, self.cone_at(item), alpha, jar, step)
+            self.load(item, side, force)
 
-        self.do(load)
+        self.each_item(load)
 
     @staticmethod
     def times_hessian(hessian: Lanes, change: Lanes) -> Lanes:
         return lanewise(_times, hessian, change)
 
     def prepare_all(self) -> Lanes:
-        def add(item: Any, pairing: FingerPairing, sums: Lanes) -> Lanes:
-            slope = self.line(item, self.relative(item, pairing))
-            return lanewise(lambda s, h, f: s + h * f, sums, pairing.half, slope)
+        def add(item: UsedSlot, sums: Lanes) -> Lanes:
+            slope = self.line(item, self.relative(item))
+            return lanewise(lambda s, h, f: s + h * f, sums, item.pairing.half, slope)
 
-        return self.each(add, self._zeros(())[0])
+        return self.fold_items(add, self._zeros(())[0])
 
     def slopes_of_all(self, alpha: Lanes, sums: list[Lanes]) -> list[Lanes]:
         """Sums of the first and second derivative of the cost by the step length."""
 
-        def add(item: Any, pairing: FingerPairing, sums: list[Lanes]) -> list[Lanes]:
+        def add(item: UsedSlot, sums: list[Lanes]) -> list[Lanes]:
             new = self._slopes(item, alpha)
-            return lanewise(tree_add_scaled, pairing.half, sums, new)
+            return lanewise(tree_add_scaled, item.pairing.half, sums, new)
 
-        return self.each(add, sums)
+        return self.fold_items(add, sums)
 
 
 def _only_where(mask, value):

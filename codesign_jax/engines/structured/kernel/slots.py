@@ -123,15 +123,18 @@ class SlotSet(ContactSet):
 
 
 class UsedSlot(NamedTuple):
-    """A slot in a pass through a row, where lanes gather.
+    """A slot in a pass through a row.
 
-    Lanes that have filled it, and whose worlds the pass is for, use it. All others read an item
-    where nothing touches, the same in every slot, and write to one that nobody reads. So a GPU's
-    memory, which is what its threads wait for, is asked for little that no lane uses.
+    Where lanes gather, those that have filled it, and whose worlds the pass is for, use it. All
+    others read an item where nothing touches, the same in every slot, and write to one that nobody
+    reads. So a GPU's memory, which is what its threads wait for, is asked for little that no lane
+    uses.
     """
 
-    source: jax.Array  # Item that each lane reads, int32, shape (lane,)
-    sink: jax.Array  # Item that each lane writes, int32, shape (lane,)
+    source: Any  # Item that each lane reads, int32, shape (lane,); a scalar if lanes do not gather
+    sink: Any  # Item that each lane writes, likewise
+    pairing: Any = None  # `self_contacts.FingerPairing` of a contact of the hand with itself
+    cone: Any = None  # The contact's cone, where those of a set differ
 
 
 class BoundSlots(BoundContacts):
@@ -145,16 +148,23 @@ class BoundSlots(BoundContacts):
 
     def read(self, field: str, item: Any) -> Lanes:
         """See `BoundContacts`; an item may be a `UsedSlot`."""
-        if not isinstance(item, UsedSlot):
-            return super().read(field, item)
-        return self.table.gather(f"{self.set.name}.{field}", item.source, self._lane())
+        source = item.source if isinstance(item, UsedSlot) else item
+        if not jnp.ndim(source):
+            return super().read(field, source)
+        return self.table.gather(f"{self.set.name}.{field}", source, self._lane())
 
     def write(self, field: str, value: Lanes, item: Any) -> None:
         """See `BoundContacts`; an item may be a `UsedSlot`."""
-        if not isinstance(item, UsedSlot):
-            super().write(field, value, item)
-            return
-        self.table.scatter(f"{self.set.name}.{field}", value, item.sink, self._lane())
+        sink = item.sink if isinstance(item, UsedSlot) else item
+        if jnp.ndim(sink):
+            self.table.scatter(f"{self.set.name}.{field}", value, sink, self._lane())
+        else:
+            super().write(field, value, sink)
+
+    def cone_at(self, item: Any) -> contact.Cone:
+        """See `BoundContacts`; a slot has its own where cones of the set differ."""
+        cone = item.cone if isinstance(item, UsedSlot) else None
+        return super().cone_at(item) if cone is None else cone
 
     def _lane(self) -> jax.Array:
         return jax.lax.broadcasted_iota(jnp.int32, (self.set.size,), 0)
@@ -270,10 +280,10 @@ class BoundSlots(BoundContacts):
 
         return rebuild(jax.lax.while_loop(lambda c: c[0] < used, step, [jnp.int32(0), *arrays])[1:])
 
-    def _slot(self, row: Any, first: Any, k: jax.Array) -> Any:
+    def _slot(self, row: Any, first: Any, k: jax.Array) -> UsedSlot:
         """A row's k-th slot, behind the row's first item."""
         if not self.set.gathers:
-            return first + k
+            return UsedSlot(first + k, first + k)
         assert self._counts is not None
         mine = k < self._counts.of(row)
         item = jnp.full((self.set.size,), first + k, jnp.int32)
@@ -294,7 +304,7 @@ class BoundSlots(BoundContacts):
             tree_add_scaled, alpha, self.read(Contact.jar, item), self.read(Contact.step, item)
         )
         self.write(Contact.jar, jar, item)
-        hessian, force = lanewise(response, place, self.cone, jar)
+        hessian, force = lanewise(response, place, self.cone_at(item), jar)
         self.write(Slot.hessian, hessian, item)
         return force
 

@@ -20,7 +20,6 @@ from codesign_jax.engines.structured.kernel.rows import (
 )
 from codesign_jax.engines.structured.kernel.self_contacts import (
     BoundSelfContacts,
-    FingerPairing,
     OwnSide,
     SelfContactSet,
     _times,
@@ -212,19 +211,19 @@ class BoundTeamSelfContacts(BoundSelfContacts):
         """See `BoundSelfContacts`; wrenches are added up later."""
         return OwnSide(self.place(item), None, None)
 
-    def load(self, item: Any, side: OwnSide, force: Lanes, pairing: FingerPairing) -> None:
+    def load(self, item: UsedSlot, side: OwnSide, force: Lanes) -> None:
         """Keeps a slot's wrench, which is added to its side's when the pass has ended."""
         contacts = self.set.contacts
 
         def wrench(place, cone, force):
             return contact.contact_wrench(contacts(place, cone), force)
 
-        self.write(TeamSlot.wrench, lanewise(wrench, side.place, self.cone, force), item)
+        self.write(TeamSlot.wrench, lanewise(wrench, side.place, self.cone_at(item), force), item)
         self._loaded = True
 
-    def each(self, body: Callable, start: Any) -> Any:
+    def fold_items(self, body: Callable, start: Any) -> Any:
         """See `BoundSelfContacts`; adds up the wrenches of the pass."""
-        result = super().each(body, start)
+        result = super().fold_items(body, start)
         if self._loaded:
             self._loaded = False
             self._add_wrenches()

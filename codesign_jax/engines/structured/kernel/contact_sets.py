@@ -64,6 +64,7 @@ class ContactSet:
 
     Attributes:
       in_teams: Whether each lane of a team has contacts of its own, and not all of them the same.
+      per_link: Whether its items are a finger's links.
     """
 
     in_teams = False
@@ -75,6 +76,7 @@ class ContactSet:
         self.k = k
         self.size = size
         self.on_object = name.endswith("_object")
+        self.per_link = name.startswith("finger_")
         self.friction_by_contact = friction_by_contact(scene, name)
         # Self-contacts share what they hold, see `friction_memory`.
         self.holds = name in held(scene) and name != "finger_finger"

@@ -50,7 +50,7 @@ class Problem:
       rigid: Whether the wrist's accelerations are known and no unknowns.
       self_contacts: Contacts of the hand with itself; None without.
       in_slots: The contact sets that are kept in slots: these, or none.
-      per_link: Contacts of the fingers with the object and the table, whose items are links.
+      per_link: Contacts of the fingers with what is no finger, whose items are links.
       dealt: Contacts of the palm, and of the object with the table, whose items are dealt to the
         fingers' lanes.
       chambers: Chambers with a mass of air; None without the effect.
@@ -62,10 +62,9 @@ class Problem:
         self.links = memory.layout.links
         self.block = memory.block
         self.rigid = not memory.layout.scene.effects.wrist
-        sets = memory.contacts
         self.self_contacts = memory.self_contacts
-        self.per_link = [sets[n] for n in ("finger_object", "finger_table") if n in sets]
-        self.dealt = [c for n, c in sets.items() if not n.startswith("finger")]
+        self.per_link = [c for c in memory.field_contacts if c.set.per_link]
+        self.dealt = [c for c in memory.field_contacts if not c.set.per_link]
         self.in_slots = [self.self_contacts] if self.self_contacts else []
         self.like = jnp.zeros((self.block.size,), palm.armature.dtype)
         self.chambers = Chambers(memory) if Air.air_step in memory.scratch else None
@@ -100,22 +99,20 @@ class Problem:
         return lanewise(jnp.add, acc, zeros(acc.shape[:-2], self.like))
 
 
-def relative(name: str, link: Any, palm: Lanes, obj: Lanes) -> Lanes:
-    """Motion of a pair's first body against its second one, lanes of shape (6, ...).
+def relative(pair: str, link: Any, palm: Lanes, obj: Lanes) -> Lanes:
+    """Motion (6, ...) of the first body of a pair against the second; table and fixtures rest.
 
     Args:
-      name: The pair of bodies.
+      pair: The pair of bodies.
       link: Motion of the item's link; of pairs without a finger it is not read.
       palm: Motion of the palm.
       obj: Motion of the object.
     """
-    difference = jnp.subtract
-    if name == "finger_object":
-        return lanewise(difference, link, obj)
-    if name == "palm_object":
-        return lanewise(difference, palm, obj)
-    first = {"finger_table": link, "palm_table": palm, "object_table": obj}
-    return first[name]
+    motions = {"finger": link, "palm": palm, "object": obj}
+    first, second = pair.split("_")
+    if second not in motions:
+        return motions[first]
+    return lanewise(jnp.subtract, motions[first], motions[second])
 
 
 def make_body(mass: jax.Array, centre: jax.Array, tensor: jax.Array) -> Body:

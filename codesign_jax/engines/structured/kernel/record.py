@@ -113,7 +113,7 @@ def _chord_of(problem: Problem, contacts: BoundContacts, item: Any, chord: Itera
     """Change of a set's relative acceleration by the chord step, shape (6,)."""
     name = contacts.set.name
     link = None
-    if name.startswith("finger"):
+    if contacts.set.per_link:
         link = problem.memory.scratch.read(Scratch.chord_link_acc, item)
     return relative(name, link, chord.palm_acc, chord.object_acc)
 

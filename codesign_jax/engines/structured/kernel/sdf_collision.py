@@ -52,7 +52,7 @@ class SdfCollision:
         self.bodies = bodies
         self.world_object = world_object
         self.contacts = step.contacts
-        self.names = [n for n in ("finger_object", "finger_table") if n in self.contacts]
+        self.names = [c.set.name for c in step.field_contacts if c.set.per_link]
         self.surface = step.layout.scene.effects.surface
 
     def looks(self, name: str) -> list[Callable[[Lanes], tuple[Lanes, Lanes]]]:

@@ -97,6 +97,7 @@ class SlotSet(ContactSet):
           remembers: Numbers that are kept of each slot beside its contact, see `remembered`.
         """
         super().__init__(scene, name, rows * (slots + 1) + int(gathers), 1, size)
+        self.per_link = False
         self.rows = rows
         self.slots = slots
         self.gathers = gathers

@@ -126,7 +126,7 @@ FAULTS = {
     "angles hand on nothing": Fault(seeds={"_joint_after_step": without(1)}),
     "the object's frame stands still": Fault(names=("columns",)),
     "the object's velocity does nothing": Fault(names=("object_vel",)),
-    "the table stands still": Fault(names=("height",)),
+    "the table stands still": Fault(names=("position",)),
     "rings hand nothing to their link": Fault(
         results={"finger_object": inside(0, without(0)), "finger_table": inside(0, without(0))}
     ),

@@ -231,5 +231,5 @@ def _of_object(
     def look(point: jax.Array, fixture: int) -> tuple[jax.Array, jax.Array]:
         return on_object(point)
 
-    where = position, position[2], kin.object, hand.object_id
+    where = position, kin.object, hand.object_id
     return surroundings.object_places(scene, *where, points, look, apply=once)

@@ -199,12 +199,11 @@ class ReverseStep(Step):
         given = {n: state[n] for n in MOVED}, arm, self.palm_constants()
         run = partial(residual.of_palm, layout.scene.discretization.timestep)
         acc = wrist_bar if not layout.scene.effects.wrist else lanewise(jnp.zeros_like, wrist_bar)
-        height = plus(step_bars["height"], lanes([shown.height], (), wide=False))
+        height = lanes([shown.height], (), wide=False)
         bars = base, step_bars["columns"], step_bars["object_vel"], height, acc, unit
         state_bars, arm_bar, constant_bars = pull(run, given, (fixed,), bars)
         self.bars.add_once(constant_bars)
-        if layout.scene.fixture:
-            state_bars["position"] = plus(state_bars["position"], step_bars["position"])
+        state_bars["position"] = plus(state_bars["position"], step_bars["position"])
         for name, value in plus(state_bars, before).items():
             self.bars.world_state.write(name, value)
         any_of(shown.speed != 0, lambda: add_speed_cotangent(self, self.bars, state, shown.speed))

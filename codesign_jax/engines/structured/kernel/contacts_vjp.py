@@ -72,15 +72,13 @@ class ContactsVjp:
         palm = bodies["place"], bodies["frame"], bodies["vel"], now.palm_acc, virtual.palm_acc
         self.palm = BodyMotion(*palm)
         self.object = {"columns": bodies["columns"], "object_vel": bodies["object_vel"]}
-        self.object |= {"height": state["position"][2], "position": state["position"]}
-        names = ("object_size", "grid_origin", "grid_cell", "grid_factor")
-        self.object |= {n: step.constant(n) for n in names if n in step.world}
+        self.object |= {"position": state["position"]}
         self.fixed: dict[str, Any] = {"object_id": step.constant(World.object_id)}
         self.fixed |= {"object_acc": now.object_acc, "object_along": virtual.object_acc}
         if world_object.mesh is not None:
             self.fixed |= {n: step.constant(n) for n in ("grid_first", "grid_nodes")}
             self.fixed |= {"meshed": world_object.mesh.meshed}
-            self.fixed |= {"factor": self.object["grid_factor"]}
+            self.fixed |= {"factor": step.constant(World.grid_factor)}
 
     def run(self, pressure: Lanes) -> None:
         """Leaves the cotangents of bodies as `rows.BodyBar`; adds all others to their tables.
@@ -92,25 +90,14 @@ class ContactsVjp:
         if (self_contacts := self.step.self_contacts) is not None:
             self_contacts.each_item(self._slot)
         for contacts in self.step.field_contacts:
-            name = contacts.set.name
-            if name == "object_table":
-                # The points that an item deals differ in number.
-                for i in range(contacts.set.count):
-                    self._where_touching(contacts, i, partial(self._points, contacts, i))
-            else:
-                self._each_link(name, contacts)
+            reverse = self._points if contacts.set.name == "object_table" else self._rings
+            contacts.each_item(partial(self._where_touching, contacts, reverse))
         if self.layout.grows:
             self._add_growth(pressure)
 
-    def _each_link(self, name: str, contacts: BoundContacts) -> None:
-        def reverse(i: Any) -> None:
-            self._where_touching(contacts, i, partial(self._rings, name, contacts, i))
-
-        contacts.each_item(reverse)
-
     @staticmethod
-    def _where_touching(contacts: BoundContacts, i: Any, reverse: Callable[[], None]) -> None:
-        jax.lax.cond(contacts.touching(i), reverse, lambda: None)
+    def _where_touching(contacts: BoundContacts, reverse: Callable, i: Any) -> None:
+        jax.lax.cond(contacts.touching(i), lambda: reverse(contacts, i), lambda: None)
 
     # What a side has, and what is left for it
 
@@ -168,23 +155,16 @@ class ContactsVjp:
 
     def numbers(self, pair: str) -> dict[str, Lanes]:
         """What contacts of a pair of bodies depend on beside the hand, by name."""
-        surrounded = bool(self.layout.scene.fixture)
-        constants = [f"cone.{which_cone(pair)}"]
-        constants += ["friction"] * friction_by_contact(self.layout.scene, pair)
-        constants += ["palm_disc"] * ("disc" in KINDS[pair].sides)
-        around = {"height", "position"} if surrounded else {"height"}
-        of_object = set(self.object) - {"height", "position"}
-        if pair == "object_table" and not surrounded:
-            of_object -= {"grid_origin", "grid_cell"}
-        names = around if "surroundings" in KINDS[pair].sides else set()
-        names = names | (of_object if "object" in KINDS[pair].sides else set())
-        chosen = {n: v for n, v in self.object.items() if n in names}
-        return chosen | {n: self.step.constant(n) for n in constants}
+        names = [*KINDS[pair].numbers, f"cone.{which_cone(pair)}"]
+        names += ["friction"] * friction_by_contact(self.layout.scene, pair)
+        constants = {n: self.step.constant(n) for n in names if n in self.step.world}
+        return constants | {n: self.object[n] for n in names if n in self.object}
 
     # Contacts with a fixed place
 
-    def _rings(self, name: str, contacts: BoundContacts, i: Any) -> None:
+    def _rings(self, contacts: BoundContacts, i: Any) -> None:
         """Adds the cotangents of an item's contacts, of the rings of a link or of the palm."""
+        name = contacts.set.name
         of_palm = name.startswith("palm")
         row = self.palm_row if of_palm else i + 1
         k = 1 if of_palm else self.layout.rings_per_link
@@ -194,7 +174,7 @@ class ContactsVjp:
         mine = self.palm if of_palm else self.body(row), rings
         numbers = self.numbers(name)
         fixed = self._grid_values(mine, numbers) if name.endswith("_object") else self.fixed
-        (body, ring_bars), bars = self._reverse_item(name, contacts, i, mine, numbers, fixed)
+        (body, ring_bars), bars = self._reverse_item(contacts, i, mine, numbers, fixed)
         self.bars.add(bars)
         self.add_body(body._asdict(), row)
         for j in range(k):
@@ -204,19 +184,18 @@ class ContactsVjp:
             else:
                 self.add_ring(bar, i * k + j)
 
-    def _points(self, contacts: BoundContacts, i: int) -> None:
+    def _points(self, contacts: BoundContacts, i: Any) -> None:
         """The same of the object's points on table and fixtures that an item deals to the lanes."""
-        finger = lanes([self.step.block.finger.astype(self.like.dtype)], (), wide=True)
-        fixed = self.fixed | {"finger": finger, "item": i, "fingers": self.layout.fingers}
+        point = self.step.block.finger + i * self.layout.fingers
+        fixed = self.fixed | {"point": self._float(point)}
         if "meshed" in fixed:
             fixed |= self._support_points()
         numbers = self.numbers("object_table")
-        _, bars = self._reverse_item("object_table", contacts, i, (), numbers, fixed)
+        _, bars = self._reverse_item(contacts, i, (), numbers, fixed)
         self.bars.add(bars)
 
     def _reverse_item(
         self,
-        name: str,
         contacts: BoundContacts,
         i: Any,
         mine: tuple,
@@ -226,7 +205,6 @@ class ContactsVjp:
         """Cotangents of the first side and of numbers by an item's contacts; adds held friction's.
 
         Args:
-          name: The pair of bodies.
           mine: The first side, see `kinds.Kind`; `numbers`, `fixed`: as in `kinds.power`.
         """
         fixed = fixed | {Contact.share: contacts.read(Contact.share, i)}
@@ -234,7 +212,7 @@ class ContactsVjp:
         if contacts.set.holds:
             held = {Contact.held: contacts.read(Contact.held, i)}
             fixed |= {HeldBar.held_bar: contacts.read(HeldBar.held_bar, i)}
-        run = partial(kinds.power, self.layout.scene, name)
+        run = partial(kinds.power, self.layout.scene, contacts.set.name)
         mine, _, bars, held_bars = pull(run, (mine, (), numbers, held), (fixed,), self.power_bar)
         friction_memory.add_held(self.bars, contacts, i, held_bars)
         return mine, bars
@@ -255,7 +233,7 @@ class ContactsVjp:
 
     def _support_points(self) -> dict[str, Lanes]:
         """Points of meshes that may touch table and fixtures, and distances at these' edges."""
-        points = {"support_None": self._support(self.object["columns"], self.object["height"])}
+        points = {"support_None": self._support(self.object["columns"], self.object["position"][2])}
         position = self.object["position"]
         for j, fixture in enumerate(self.layout.scene.fixture):
             gap, rows = lanewise(partial(surroundings.towards, fixture), position)

@@ -52,6 +52,9 @@ class Kind(NamedTuple):
     """
 
     sides: tuple[str, str]  # What meets what; the normal is from the second to the first
+    # Names of the world's numbers and of the object's state that it depends on, of which some
+    # scenes have not all; its cone's, and frictions of fixtures, come besides
+    numbers: tuple[str, ...]
     # Place of k contacts from (scene, pair, first side, second side, numbers of the world, fixed);
     # `fixed` has what has no derivative, see `power`
     evaluate: Callable[..., Place]
@@ -160,18 +163,12 @@ def rings_on_surroundings(
     place, ring = mine
     centre = ring_centres(place.origin, place.frame, ring)
     places = []
-    for n, field in enumerate(_around(scene, numbers)):
+    for n, of_position in enumerate(surroundings.fields(scene)):
+        field = partial(of_position, numbers["position"])
         plane = n < scene.effects.table
         surface = scene.effects.surface
         places.append(touch(surface, ring, place.frame, centre, field(centre), field, plane=plane))
     return beside(places)
-
-
-def _around(scene: Scene, numbers: dict) -> list[Callable]:
-    """Distance fields of table and fixtures: from points to distances and their gradients."""
-    if not scene.fixture:
-        return [partial(shapes.table_distance, numbers["height"])]
-    return [partial(field, numbers["position"]) for field in surroundings.fields(scene)]
 
 
 def object_on_surroundings(
@@ -189,25 +186,21 @@ def object_on_surroundings(
     def on_object(point: jax.Array, fixture: int) -> tuple[jax.Array, jax.Array]:
         return look(scene, point, numbers, fixed, fixed.get(f"values_{fixture}"))
 
-    where = numbers.get("position"), numbers["height"], numbers["columns"], fixed["object_id"]
+    where = numbers["position"], numbers["columns"], fixed["object_id"]
     places = surroundings.object_places(scene, *where, points, on_object)
     values = (jnp.concatenate(v, -2) for v in zip(*places, strict=True))
     return with_axis(Place(*(_deal(scene, fixed, v) for v in values)))
 
 
 def _deal(scene: Scene, fixed: dict, value: jax.Array) -> jax.Array:
-    """What an item deals of points (..., point, world) to the lanes, zeros where it has no more.
+    """The points (..., point, world) that the lanes have, zeros where they have none.
 
     Args:
-      fixed: With the number of each lane's finger, "finger", of the item, "item", and of the
-        block's fingers, "fingers".
+      fixed: With the number of each lane's point, "point".
     """
-    fingers = fixed["fingers"]
-    item = fixed["item"]
-    finger = fixed["finger"]
-    lane = jnp.zeros_like(value[..., 0, None, :]) + 0 * finger
-    for k in range(item * fingers, min((item + 1) * fingers, surroundings.slots(scene))):
-        lane = jnp.where(finger == k - item * fingers, value[..., k, None, :], lane)
+    lane = jnp.zeros_like(value[..., 0, None, :]) + 0 * fixed["point"]
+    for k in range(surroundings.slots(scene)):
+        lane = jnp.where(fixed["point"] == k, value[..., k, None, :], lane)
     return lane
 
 
@@ -248,15 +241,22 @@ def ring_on_segment(
     return with_axis(place_of(ring, place.frame, centre, faced))
 
 
+OBJECT = "columns", "object_vel", "object_size", "grid_origin", "grid_cell", "grid_factor"
+_ON_OBJECT = Kind(("rings", "object"), OBJECT, rings_on_object, "contact")
+_ON_TABLE = Kind(("rings", "surroundings"), ("position",), rings_on_surroundings, "contact")
+_OBJECT_ON_TABLE = Kind(
+    ("object", "surroundings"), (*OBJECT, "position"), object_on_surroundings, "contact"
+)
+_ON_SEGMENT = Kind(("rings", "segment"), (), ring_on_segment, "pairing")
 KINDS = {
-    "finger_object": Kind(("rings", "object"), rings_on_object, "contact"),
-    "palm_object": Kind(("rings", "object"), rings_on_object, "contact"),
-    "finger_table": Kind(("rings", "surroundings"), rings_on_surroundings, "contact"),
-    "palm_table": Kind(("rings", "surroundings"), rings_on_surroundings, "contact"),
-    "object_table": Kind(("object", "surroundings"), object_on_surroundings, "contact"),
-    "finger_finger": Kind(("rings", "segment"), ring_on_segment, "pairing"),
-    "finger_itself": Kind(("rings", "segment"), ring_on_segment, "pairing"),
-    "finger_palm": Kind(("rings", "disc"), ring_on_disc),
+    "finger_object": _ON_OBJECT,
+    "palm_object": _ON_OBJECT,
+    "finger_table": _ON_TABLE,
+    "palm_table": _ON_TABLE,
+    "object_table": _OBJECT_ON_TABLE,
+    "finger_finger": _ON_SEGMENT,
+    "finger_itself": _ON_SEGMENT,
+    "finger_palm": Kind(("rings", "disc"), ("palm_disc",), ring_on_disc),
 }
 """The kinds by pairs of bodies."""
 

@@ -437,9 +437,8 @@ class StepBar(Rows, prefix="bar"):
 
     columns = field(ONE, 3, 3)
     object_vel = field(ONE, 6)
-    height = field(ONE)
+    position = field(ONE, 3)
     pressure = field(ONE)
-    position = field(ONE, 3, on=lambda layout: bool(layout.scene.fixture))
     grown = field(SECTION, 2, on=lambda layout: layout.grows)
 
 

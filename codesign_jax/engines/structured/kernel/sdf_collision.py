@@ -212,7 +212,7 @@ class SdfCollision:
             return objects.table_points(scene, self.world_object, columns, height)
 
         position = state["position"]
-        where = position, position[2], self.bodies["columns"], self.world_object.shape
+        where = position, self.bodies["columns"], self.world_object.shape
         look = lambda point, _: self._object(point)  # noqa: E731
         places = surroundings.object_places(scene, *where, points, look, apply=lanewise)
         return [slot for place in places for slot in lanewise(slots_of, place)]

@@ -171,7 +171,6 @@ def edge_on(
 def object_places(
     scene: Scene,
     position: Any,
-    height: Any,
     columns: Any,
     shape: Any,
     points: Callable[[Any, Any, int | None], Any],
@@ -184,8 +183,7 @@ def object_places(
 
     Args:
       scene: The scene.
-      position: The object's centre [m], shape (3, 1, world); needed with fixtures alone.
-      height: Its height above the table [m], shape (1, world).
+      position: The object's centre [m], shape (3, 1, world).
       columns: Columns of its orientation, shape (3, 3, 1, world).
       shape: Index of the object in the scene, shape (1, world).
       points: Points that would touch a table in axes, shape (3, point, world): from the columns in
@@ -195,6 +193,7 @@ def object_places(
     """
     places = []
     if scene.effects.table:
+        height = position[2]
         places.append(apply(_points_on_table, points(columns, height, None), height))
     flat = [i for i, other in enumerate(scene.objects.object) if other.type not in ROUND]
     for j, fixture in enumerate(scene.fixture):

@@ -1,11 +1,12 @@
 """How much larger a finger's section is under pressure, in height and in width.
 
-Pressure rounds a section, at the most to the circle of its thread, which keeps its length: outside
-the thread's circle of diameter 2 (w + h - 4 z d) / pi lie the walls z d on both sides, z the
-thread's depth in a wall d.  The largest growth of height and width is thus that diameter over h and
-over w, less one.  How far a section is on this way says the moment p b^2 at the ends of a side b,
-over the G d^2 that a wall resists.  The top, b = w, bulges in proportion at first; the sides, b =
-h, pull the corners in by the square.  docs/notes/section.md has both against finite elements.
+Pressure rounds a section, at the most until its thread, which keeps its length, is a circle: of
+diameter 2 (w + h - 4 z d) / pi, with walls z d outside of it on both sides, where z is the thread's
+depth in a wall d.  The largest growth of height and width is thus the outer diameter over h and
+over w, less one.  How far a section has come on the way to the circle follows from the moment p b^2
+at the ends of a side b, over the resistance G d^2 of a wall.  The height, by the top, b = w, grows
+in proportion at first; the width, by the sides, b = h, begins with the square, because the bulging
+top pulls its corners inwards.  docs/notes/section.md compares both with finite elements.
 """
 
 from typing import Any, NamedTuple
@@ -19,9 +20,9 @@ HIGHEST = 0.926
 HEIGHT_RATE = 0.0829
 """Share of p w^2 / (G d^2) that makes a section grow [fitted]; a clamped strip's moment is 1/12."""
 WIDEST = 0.941
-"""As `HIGHEST`, of the width [fitted]."""
+"""Largest growth of the width over that of the circle [fitted], as `HIGHEST`."""
 WIDTH_RATE = 0.157
-"""As `HEIGHT_RATE`, of the width and p h^2 [fitted]."""
+"""Share of p h^2 / (G d^2) that makes the width grow [fitted], as `HEIGHT_RATE`."""
 
 
 class Growth(NamedTuple):
@@ -31,7 +32,7 @@ class Growth(NamedTuple):
       height: Largest growth of the height over the height.
       width: Largest growth of the width over the width; negative for wide sections.
       height_rate: Growth of the height per pressure at first, over the largest one [1/Pa].
-      width_rate: Pressure at which half of the width's growth is done, its inverse [1/Pa].
+      width_rate: Inverse of the pressure at which the width has half of its growth [1/Pa].
     """
 
     height: Any
@@ -51,6 +52,9 @@ def growth(
       width: Outer width [m].
       shear_modulus: G of the silicone [Pa].
       thread_depth: Place of the thread in the wall: 0 outside, 1 on the chamber.
+
+    Returns:
+      `Growth` of these sections, entries of the shape of `height`.
     """
     outside = 2 * thread_depth * wall
     circle = 2 * (width + height - 2 * outside) / np.pi + outside
@@ -75,8 +79,12 @@ def factors(grows: Growth, pressure: Any) -> tuple[Any, Any]:
     """Height and width of sections over those without pressure.
 
     Args:
-      grows: How they grow.
-      pressure: Gauge pressure of their chambers [Pa]; a vacuum leaves them as they are.
+      grows: How they grow, see `growth`.
+      pressure: Gauge pressure of their chambers [Pa], of the same shape or broadcasting to it; a
+        vacuum leaves them as they are.
+
+    Returns:
+      The factors of height and of width, 1 without pressure.
     """
     numpy = pressure.__array_namespace__()
     over = numpy.maximum(pressure, 0.0)

@@ -19,7 +19,7 @@ class Sections(NamedTuple):
       twist: Stiffness of twist [N m^2].
       lateral: Stiffness of bending sideways [N m^2].
       coupling: Twisting moment per curvature sideways [N m^2].
-      shear: Force across per angle of shear [N]; infinite: none.
+      shear: Force across per angle of shear [N]; infinite where sections do not shear.
     """
 
     bend: float
@@ -57,7 +57,7 @@ def arc(bend: float, length: float, *, height: float, end: float = 0.0, axis: fl
       length: With the end walls [m].
       height: Of the section [m]: a force acts on the middle of the tip.
       end: Thickness of rigid end walls [m].
-      axis: Height over the fabric about which the sections twist [m], as a force is concerned.
+      axis: Height over the fabric of the line about which a force across twists the sections [m].
     """
     edges = np.linspace(0, length, PARTS + 1)
     places = np.clip(edges, end, length - end) - end
@@ -86,7 +86,7 @@ def _tip(line: Arc, compliance: np.ndarray) -> np.ndarray:
 
 
 def of_moments(line: Arc, tip: np.ndarray, bend: float) -> Sections:
-    """The uniform sections whose tip rotates alike under moments on it.
+    """The uniform sections with which moments on the tip rotate it as they rotate the finger's.
 
     Args:
       line: The finger's.
@@ -106,7 +106,8 @@ def of_moments(line: Arc, tip: np.ndarray, bend: float) -> Sections:
 def shear_stiffness(line: Arc, tip: np.ndarray, sections: Sections) -> float:
     """Force across per angle of shear that explains the tip's displacement [N].
 
-    It is what the sections' bending and twist leave, and infinite or negative if that is nothing.
+    Shear explains the part of the displacement that the sections' bending and twist do not; without
+    such a part the result is infinite or negative.
     """
     return float(line.length.sum() / (tip[0, 0] - _tip(line, sections.compliance())[0, 0]))
 

@@ -7,7 +7,7 @@ import numpy as np
 from scripts.section.elements import Section, contours, rectangle
 
 SURFACES = ("base", "tip", "outside", "bottom", "chamber", "cap", "thread")
-"""Their names; `cap` is an end wall's face to the chamber, `thread` lies within the silicone."""
+"""Names of surfaces; `cap` is an end wall's face to the chamber, `thread` lies in the silicone."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,9 +19,9 @@ LOADS = ("force", "twist", "lateral")
 MM = 1e3
 """Lengths are in mm within NGSolve, stresses in MPa and forces in N."""
 UNITS = np.array([1.0, MM, MM])
-"""Of the loads in N and N mm."""
+"""Factors of the loads from N and N m to N and N mm, in the order of `LOADS`."""
 LARGEST_STEP = 0.3
-"""Largest displacement of an iteration, over the height."""
+"""Largest displacement in an iteration of Newton's method, over the height."""
 TOLERANCE = 1e-7
 """Residual of an equilibrium over G h^2."""
 
@@ -125,7 +125,7 @@ class Finger:
         return ngsolve.Integrate(value, self.mesh, ngsolve.BND, definedon=tip)
 
     def tip_direction(self) -> np.ndarray:
-        """Unit vector along the finger at its tip."""
+        """Unit vector along the finger at its tip, shape (3,)."""
         upright = self._upright()
         return np.array([upright[2], 0.0, -upright[0]])
 
@@ -165,7 +165,10 @@ class Finger:
             self._loads.append(form.vec.FV().NumPy().copy())
 
     def compliance(self) -> np.ndarray:
-        """Displacement and rotations of the tip over small loads, shape (tip, load) [SI]."""
+        """Displacement [m] and two rotations [rad] of the tip over small loads of 1, shape (3, 3).
+
+        Rows are what `moved` returns, columns the loads in the order of `LOADS`.
+        """
         self._form.AssembleLinearization(self.solution.vec)
         inverse = self._form.mat.Inverse(self._free, inverse="sparsecholesky")
         answer = ngsolve.GridFunction(self.space)
@@ -187,7 +190,7 @@ class Finger:
         return np.transpose([c.vec.FV().NumPy()[: self.mesh.nv] for c in parts]) / MM
 
     def moved(self) -> np.ndarray:
-        """Displacement and rotations of the tip that belong to the loads [m, rad, rad]."""
+        """Displacement and rotations of the tip in the order of `LOADS` [m, rad, rad]."""
         return self._moved(self.solution)
 
     def positions(self) -> np.ndarray:

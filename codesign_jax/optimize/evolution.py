@@ -129,7 +129,7 @@ class Evolution:
         """Points of the strategy in unit coordinates, and the strategy's state with them."""
         assert state.memory is not None
         strategy = self._strategy(state)
-        start = self._start(state)
+        start = self.start(state)
         same = jnp.all(mask == state.memory["mask"])
         kept = jax.tree.map(
             lambda old, new: jnp.where(same, old, new), state.memory["strategy"], arrays(start)
@@ -137,7 +137,7 @@ class Evolution:
         key = episode_key(state, STREAM_ASK)
         return strategy.algorithm.ask(key, start.replace(**kept), strategy.params)
 
-    def _start(self, state: OptimizerState) -> Any:
+    def start(self, state: OptimizerState) -> Any:
         """The strategy's state as it starts around the best particle."""
         algorithm, params = self._strategy(state)
         low = jnp.asarray(self.space.low)
@@ -162,7 +162,7 @@ def _init(
     memory = {
         "mask": jnp.ones(seed.shape, bool),
         "cost": jnp.full(num_particles, jnp.inf, seed.dtype),
-        "strategy": arrays(optimizer._start(state)),
+        "strategy": arrays(optimizer.start(state)),
     }
     return state._replace(memory=memory)
 

@@ -139,15 +139,16 @@ def check_start(
     """Checks the arguments of `init`; returns the seed particle as an array of floats."""
     if problem := random_key_problem(key):
         raise TypeError(problem)
-    if not isinstance(seed_particle, jax.core.Tracer):
-        seed_particle = np.asarray(seed_particle, jnp.result_type(float))
-    seed_particle = jax.device_put(seed_particle)
-    if seed_particle.shape != jnp.shape(space.low):
-        raise ValueError(f"{seed_particle.shape=}, expected {jnp.shape(space.low)}")
-    _refuse_far(space, seed_particle)
+    if isinstance(seed_particle, jax.core.Tracer):
+        particle = jnp.asarray(seed_particle, float)
+    else:  # JAX would compile a program to convert it
+        particle = jax.device_put(np.asarray(seed_particle, jnp.result_type(float)))
+    if particle.shape != jnp.shape(space.low):
+        raise ValueError(f"seed_particle.shape={particle.shape}, expected {jnp.shape(space.low)}")
+    _refuse_far(space, particle)
     if not 1 <= num_particles <= most:
         raise ValueError(f"{num_particles=}, expected 1 to {most}")
-    return seed_particle
+    return particle
 
 
 def first_state(key: jax.Array, seed_particle: jax.Array, num_particles: int) -> OptimizerState:

@@ -165,7 +165,7 @@ class Screened:
         """The average and the strategy's points, its state with them, and what was remembered."""
         assert state.memory is not None
         begun = jnp.all(mask == state.memory["mask"]) & (state.episode > self.begins)
-        first = self._start(state)
+        first = self.start(state)
         memory = jax.tree.map(
             partial(jnp.where, begun), {name: state.memory[name] for name in first}, first
         )
@@ -177,7 +177,7 @@ class Screened:
         rest = jnp.tile(strategy.mean, (len(state.particles) - 1 - len(points), 1))
         return jnp.concatenate([memory["average"][None], points, rest]), strategy, memory
 
-    def _start(self, state: OptimizerState) -> dict[str, Any]:
+    def start(self, state: OptimizerState) -> dict[str, Any]:
         """Average and strategy as they start, at particle 0."""
         algorithm, params = self._strategy(state)
         low = jnp.asarray(self.space.low)
@@ -209,4 +209,4 @@ def _init(
         "cost": jnp.full(num_particles, jnp.inf, seed.dtype),
         "way": state.particles,
     }
-    return state._replace(memory=memory | optimizer._start(state))
+    return state._replace(memory=memory | optimizer.start(state))

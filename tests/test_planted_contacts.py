@@ -412,7 +412,9 @@ def test_recorded_forces_are_the_oracle_s(surface):
         @jax.jit
         def run(fields, state):
             rows = coordinates.make(scene, *state)
-            return forces(scene, world_constants(scene, fields), rows)
+            # No number of these scenes depends on the chambers' pressures.
+            pressure = jnp.zeros((2, fingers))
+            return forces(scene, world_constants(scene, fields), rows, pressure)
 
         recorded = jax.tree.map(np.asarray, run(fields, state))
     second = worlds.solve(state[0][1], state[1][1], worlds.start[1])
